@@ -1,0 +1,37 @@
+# make demo   set up, run the whole system on a small synthetic room, print the error table
+# make test   set up, lint, type-check, test
+PYTHON ?= python3
+VENV   := .venv
+BIN    := $(VENV)/bin
+STAMP  := $(VENV)/.installed
+PIP    := $(BIN)/python -m pip install --quiet
+TORCH  := 2.13.0
+TORCH_CPU_INDEX := https://download.pytorch.org/whl/cpu
+
+.PHONY: demo test lint setup clean
+
+demo: $(STAMP)
+	$(BIN)/geogs demo -o out/demo
+
+test: $(STAMP) lint
+	$(BIN)/python -m pytest -n 2
+
+lint: $(STAMP)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/lint-imports
+	$(BIN)/mypy
+
+setup: $(STAMP)
+
+# constraints.txt pins every version that was tested. Where there is no NVIDIA driver the CPU build of
+# torch is taken first (from where pip already looks, else from PyTorch's own index).
+$(STAMP): pyproject.toml constraints.txt
+	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "geogs needs Python 3.11 or newer; set PYTHON=python3.11")'
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	command -v nvidia-smi >/dev/null || $(PIP) 'torch==$(TORCH)+cpu' || $(PIP) --index-url $(TORCH_CPU_INDEX) 'torch==$(TORCH)+cpu'
+	$(PIP) -c constraints.txt -e '.[dev]'
+	touch $(STAMP)
+
+clean:
+	rm -rf $(VENV) out .pytest_cache .mypy_cache .ruff_cache

@@ -1,0 +1,217 @@
+"""SO(3), SE(3) and Sim(3) as batched matrices: exp, log, inverse, adjoint, retraction.
+
+Elements are plain matrices, so composition is ``@`` and a batch is a leading dimension. Tangents
+are ``[tau(3), phi(3)(, sigma(1))]``. Every function is differentiable everywhere, zero included,
+and the logarithms hold up to (not at) a half turn.
+"""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+# Below this squared angle the closed forms lose digits and a Taylor series takes over.
+_SMALL = {torch.float64: 1e-4, torch.float32: 1e-3}
+
+
+def _is_small(x2: Tensor) -> Tensor:
+    return x2 < _SMALL.get(x2.dtype, 1e-3)
+
+
+def so3_hat(phi: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
+    """The skew matrix with ``hat(a) b = a x b``."""
+    x, y, z = phi.unbind(-1)
+    o = torch.zeros_like(x)
+    return torch.stack([o, -z, y, z, o, -x, -y, x, o], -1).unflatten(-1, (3, 3))
+
+
+def _angle_series(t2: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """sin(t)/t, (1-cos t)/t^2 and (t-sin t)/t^3 from t^2."""
+    small = _is_small(t2)
+    safe = torch.where(small, torch.ones_like(t2), t2)
+    t = safe.sqrt()
+    a = torch.where(small, 1 - t2 / 6 * (1 - t2 / 20 * (1 - t2 / 42)), t.sin() / t)
+    b = torch.where(
+        small, 0.5 - t2 / 24 * (1 - t2 / 30 * (1 - t2 / 56)), (1 - t.cos()) / safe
+    )
+    c = torch.where(
+        small, 1 / 6 - t2 / 120 * (1 - t2 / 42 * (1 - t2 / 72)), (t - t.sin()) / (safe * t)
+    )
+    return a, b, c
+
+
+def so3_exp(phi: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
+    """Rotation by ``|phi|`` radians about ``phi`` (Rodrigues)."""
+    a, b, _ = (x[..., None, None] for x in _angle_series((phi * phi).sum(-1)))
+    k = so3_hat(phi)
+    return torch.eye(3, dtype=phi.dtype, device=phi.device) + a * k + b * (k @ k)
+
+
+def so3_log(rotation: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:
+    """Rotation vector in radians, norm at most pi; through the quaternion, stable near pi."""
+    q = matrix_to_quaternion(rotation)
+    w, v = q[..., 0], q[..., 1:]
+    n2 = (v * v).sum(-1)
+    small = _is_small(n2)
+    n = torch.where(small, torch.ones_like(n2), n2).sqrt()
+    far = 2 * torch.atan2(n, w) / n
+    # 2 asin(n)/n with |q| = 1, so that the series needs only n^2.
+    near = 2 + n2 / 3 + 3 * n2 * n2 / 20 + 5 * n2**3 / 56
+    return v * torch.where(small, near, far)[..., None]
+
+
+def _left_jacobian(phi: Tensor) -> Tensor:
+    _, b, c = (x[..., None, None] for x in _angle_series((phi * phi).sum(-1)))
+    k = so3_hat(phi)
+    return torch.eye(3, dtype=phi.dtype, device=phi.device) + b * k + c * (k @ k)
+
+
+def _compose(linear: Tensor, translation: Tensor) -> Tensor:
+    top = torch.cat([linear, translation[..., None]], -1)
+    row = top.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(*top.shape[:-2], 1, 4)
+    return torch.cat([top, row], -2)
+
+
+def se3_exp(xi: Float[Tensor, "*b 6"]) -> Float[Tensor, "*b 4 4"]:
+    """Exponential map of SE(3); ``xi = [tau, phi]``."""
+    tau, phi = xi[..., :3], xi[..., 3:]
+    return _compose(so3_exp(phi), (_left_jacobian(phi) @ tau[..., None])[..., 0])
+
+
+def se3_log(T: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 6"]:
+    """Logarithm of SE(3), the inverse of :func:`se3_exp` for angles below pi."""
+    phi = so3_log(T[..., :3, :3])
+    tau = torch.linalg.solve(_left_jacobian(phi), T[..., :3, 3:])[..., 0]
+    return torch.cat([tau, phi], -1)
+
+
+def se3_inverse(T: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 4 4"]:
+    """Inverse of a rigid motion."""
+    Rt = T[..., :3, :3].mT
+    return _compose(Rt, -(Rt @ T[..., :3, 3:])[..., 0])
+
+
+def se3_adjoint(T: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 6 6"]:
+    """``Ad`` with ``T Exp(xi) T^-1 = Exp(Ad xi)``."""
+    R = T[..., :3, :3]
+    tR = so3_hat(T[..., :3, 3]) @ R
+    return torch.cat([torch.cat([R, tR], -1), torch.cat([torch.zeros_like(R), R], -1)], -2)
+
+
+def _sim3_v(phi: Tensor, sigma: Tensor) -> Tensor:
+    """V with translation = V tau: the integral of exp(s (sigma I + hat(phi))) over s in [0, 1].
+
+    V is a function of the matrix M = sigma I + hat(phi): V = sum M^k / (k+1)!. For small M the
+    series is summed; otherwise V = (exp(M) - I) M^-1 is solved for, M being invertible unless
+    sigma is near 0, where V equals the SE(3) Jacobian plus its first order in sigma.
+    """
+    eye = torch.eye(3, dtype=phi.dtype, device=phi.device)
+    m = sigma[..., None, None] * eye + so3_hat(phi)
+    # Halve M until it is small, sum the series, then double: V(2M) = (I + exp(M)) V(M) / 2.
+    halvings = 6
+    h = m / 2**halvings
+    term, v = eye.expand_as(m), eye.expand_as(m)
+    for k in range(2, 12):
+        term = term @ h / k
+        v = v + term
+    e = eye + h @ v
+    for _ in range(halvings):
+        v = (eye + e) @ v / 2
+        e = e @ e
+    return v
+
+
+def sim3_exp(xi: Float[Tensor, "*b 7"]) -> Float[Tensor, "*b 4 4"]:
+    """Exponential map of Sim(3), ``xi = [tau, phi, sigma]``; the linear part is ``e^sigma R``."""
+    tau, phi, sigma = xi[..., :3], xi[..., 3:6], xi[..., 6]
+    linear = sigma.exp()[..., None, None] * so3_exp(phi)
+    return _compose(linear, (_sim3_v(phi, sigma) @ tau[..., None])[..., 0])
+
+
+def sim3_scale(S: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b"]:
+    """The scale of a similarity."""
+    return torch.linalg.det(S[..., :3, :3]).pow(1 / 3)
+
+
+def sim3_log(S: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 7"]:
+    """Logarithm of Sim(3), the inverse of :func:`sim3_exp` for angles below pi."""
+    s = sim3_scale(S)
+    phi, sigma = so3_log(S[..., :3, :3] / s[..., None, None]), s.log()
+    tau = torch.linalg.solve(_sim3_v(phi, sigma), S[..., :3, 3:])[..., 0]
+    return torch.cat([tau, phi, sigma[..., None]], -1)
+
+
+def sim3_inverse(S: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 4 4"]:
+    """Inverse of a similarity."""
+    inv = S[..., :3, :3].mT / sim3_scale(S)[..., None, None] ** 2
+    return _compose(inv, -(inv @ S[..., :3, 3:])[..., 0])
+
+
+def sim3_adjoint(S: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 7 7"]:
+    """``Ad`` with ``S Exp(xi) S^-1 = Exp(Ad xi)``."""
+    s, t = sim3_scale(S), S[..., :3, 3]
+    R = S[..., :3, :3] / s[..., None, None]
+    zero = torch.zeros_like(R)
+    column = torch.zeros_like(t)[..., None]
+    top = torch.cat([S[..., :3, :3], so3_hat(t) @ R, -t[..., None]], -1)
+    middle = torch.cat([zero, R, column], -1)
+    bottom = torch.cat([zero[..., :1, :], zero[..., :1, :], torch.ones_like(column[..., :1, :])], -1)
+    return torch.cat([top, middle, bottom], -2)
+
+
+def retract(xi: Float[Tensor, "*b k"], T: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 4 4"]:
+    """Left retraction ``Exp(xi) T``; six numbers move an SE(3), seven a Sim(3)."""
+    return (se3_exp(xi) if xi.shape[-1] == 6 else sim3_exp(xi)) @ T
+
+
+def transform(
+    T: Float[Tensor, "*b 4 4"], points: Float[Tensor, "*b n 3"]
+) -> Float[Tensor, "*b n 3"]:
+    """Apply a rigid motion or similarity to points."""
+    return points @ T[..., :3, :3].mT + T[..., None, :3, 3]
+
+
+def quaternion_to_matrix(q: Float[Tensor, "*b 4"]) -> Float[Tensor, "*b 3 3"]:
+    """Rotation of a quaternion ``w, x, y, z`` of any non-zero norm."""
+    w, x, y, z = (q / q.norm(dim=-1, keepdim=True)).unbind(-1)
+    rows = [
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    ]  # fmt: skip
+    return torch.stack(rows, -1).unflatten(-1, (3, 3))
+
+
+def matrix_to_quaternion(R: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 4"]:
+    """Unit quaternion ``w, x, y, z`` with ``w >= 0``; the largest component is solved for first."""
+    m = R.flatten(-2).unbind(-1)
+    # Each row is 4 q_k (w, x, y, z) for one pivot k.
+    z, y, x = m[7] - m[5], m[2] - m[6], m[3] - m[1]
+    p, s, t = m[1] + m[3], m[2] + m[6], m[5] + m[7]
+    diagonal = [
+        1 + m[0] + m[4] + m[8], 1 + m[0] - m[4] - m[8],
+        1 - m[0] + m[4] - m[8], 1 - m[0] - m[4] + m[8],
+    ]  # fmt: skip
+    rows = torch.stack(
+        [
+            torch.stack([diagonal[0], z, y, x], -1),
+            torch.stack([z, diagonal[1], p, s], -1),
+            torch.stack([y, p, diagonal[2], t], -1),
+            torch.stack([x, s, t, diagonal[3]], -1),
+        ],
+        -2,
+    )
+    pivot = torch.stack(diagonal, -1).argmax(-1)
+    index = pivot[..., None, None].expand(*pivot.shape, 1, 4)
+    q = torch.gather(rows, -2, index)[..., 0, :]
+    q = q / q.norm(dim=-1, keepdim=True)
+    return torch.where(q[..., :1] < 0, -q, q)
+
+
+def quaternion_multiply(
+    a: Float[Tensor, "*b 4"], b: Float[Tensor, "*b 4"]
+) -> Float[Tensor, "*b 4"]:
+    """Hamilton product ``a b`` of quaternions ``w, x, y, z`` (first b, then a)."""
+    aw, av = a[..., :1], a[..., 1:]
+    bw, bv = b[..., :1], b[..., 1:]
+    vector = aw * bv + bw * av + torch.linalg.cross(av.expand_as(bv), bv)
+    return torch.cat([aw * bw - (av * bv).sum(-1, keepdim=True), vector], -1)

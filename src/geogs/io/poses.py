@@ -1,0 +1,197 @@
+"""Pose files: TUM trajectories, one matrix a row (Replica, KITTI), one file a frame (7-Scenes).
+
+All poses are camera to world in OpenCV axes. Rows that hold no pose (NaN, inf, all zero) are
+dropped, and the log says how many; a file whose numbers mean something else is an error.
+"""
+
+import logging
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+
+from geogs.errors import InputError
+from geogs.geometry.lie import quaternion_to_matrix
+from geogs.types import Trajectory
+
+FRAMES_PER_SECOND = 30.0
+"""Rate given to data sets that carry no time: frame k is at k / 30 s."""
+
+QuaternionOrder = Literal["auto", "xyzw", "wxyz"]
+
+_log = logging.getLogger(__name__)
+_POSE_FILE = re.compile(r"frame-(\d+)\.pose\.txt")
+
+
+def read_tum_trajectory(path: str | Path, quaternion_order: QuaternionOrder = "auto") -> Trajectory:
+    """Read ``t tx ty tz qx qy qz qw`` rows (spaces or commas, ``#`` starts a comment).
+
+    ``auto`` means qx qy qz qw, but refuses a file that begins with the quaternion 1 0 0 0: it is
+    the unit rotation with w first, and hardly ever a half turn about x. Quaternions are made unit;
+    rows are sorted by time.
+
+    Raises:
+        InputError: the file is missing, empty, not of eight columns, or its quaternions are not.
+    """
+    path = Path(path)
+    rows = _read_table(path, columns=(8,), layout="t tx ty tz qx qy qz qw")
+    quaternion = rows[:, 4:]
+    norm = np.linalg.norm(quaternion, axis=1)
+    valid = np.isfinite(rows).all(axis=1) & (np.abs(norm - 1) < 0.1)
+    _check_quaternions(path, rows, valid, quaternion_order)
+    rows = _keep_poses(path, rows, valid)
+    rows = rows[np.argsort(rows[:, 0], kind="stable")]
+    wxyz = rows[:, 4:] if quaternion_order == "wxyz" else rows[:, [7, 4, 5, 6]]
+    T_wc = np.tile(np.eye(4), (len(rows), 1, 1))
+    T_wc[:, :3, :3] = quaternion_to_matrix(torch.from_numpy(wxyz.copy())).numpy()
+    T_wc[:, :3, 3] = rows[:, 1:4]
+    return Trajectory(rows[:, 0].copy(), T_wc, np.ones(len(rows), dtype=bool))
+
+
+def read_matrix_rows(path: str | Path) -> Float[np.ndarray, "n 4 4"]:
+    """Read one camera-to-world matrix a row: 16 numbers (Replica) or the upper 12 (KITTI).
+
+    Rows without a pose are left out, so position and frame number may differ afterwards; use
+    :func:`read_replica_trajectory` where they must be matched to frames.
+    """
+    return read_replica_trajectory(path).T_wc
+
+
+def read_replica_trajectory(path: str | Path) -> Trajectory:
+    """Read one matrix a row, row k being frame k at k / 30 s, as a trajectory."""
+    path = Path(path)
+    rows = _read_table(path, columns=(16, 12), layout="a 4x4 matrix a row")
+    T_wc = np.tile(np.eye(4), (len(rows), 1, 1))
+    T_wc[:, :3] = rows[:, :12].reshape(-1, 3, 4)
+    valid = np.isfinite(rows).all(axis=1) & _is_rigid(T_wc)
+    seconds = np.arange(len(rows)) / FRAMES_PER_SECOND
+    return _trajectory(path, seconds, T_wc, valid)
+
+
+def read_seven_scenes_poses(folder: str | Path) -> Trajectory:
+    """Read the ``frame-<k>.pose.txt`` files of a 7-Scenes sequence; frame k is at k / 30 s."""
+    folder = Path(folder)
+    numbered = _pose_files(folder)
+    if not numbered:
+        raise InputError(f"{folder} holds no frame-*.pose.txt; give the folder of one sequence.")
+    T_wc = np.stack([_read_matrix(path) for _, path in numbered])
+    seconds = np.array([number for number, _ in numbered]) / FRAMES_PER_SECOND
+    return _trajectory(folder, seconds, T_wc, _is_rigid(T_wc))
+
+
+def read_poses(path: str | Path) -> Trajectory:
+    """Read poses in whichever of the formats above ``path`` is: a folder, or rows of 8, 12, 16."""
+    path = Path(path)
+    if path.is_dir():
+        for name in ("groundtruth.txt", "traj.txt"):
+            if (path / name).is_file():
+                return read_poses(path / name)
+        return read_seven_scenes_poses(path)
+    columns = len(next(_numbers_by_line(path), (0, []))[1])
+    return read_tum_trajectory(path) if columns == 8 else read_replica_trajectory(path)
+
+
+def _pose_files(folder: Path) -> list[tuple[int, Path]]:
+    if not folder.is_dir():
+        raise InputError(f"{folder} is not a folder; give the folder of one 7-Scenes sequence.")
+    matches = ((_POSE_FILE.fullmatch(path.name), path) for path in folder.iterdir())
+    return sorted((int(match[1]), path) for match, path in matches if match)
+
+
+def _read_matrix(path: Path) -> Float[np.ndarray, "4 4"]:
+    numbers = [number for _, line in _numbers_by_line(path) for number in line]
+    if len(numbers) != 16:
+        raise InputError(f"{path} should hold a 4x4 matrix but holds {len(numbers)} numbers.")
+    return np.array(numbers, dtype=np.float64).reshape(4, 4)
+
+
+def _read_table(path: Path, columns: tuple[int, ...], layout: str) -> Float[np.ndarray, "n k"]:
+    rows: list[list[float]] = []
+    for line, numbers in _numbers_by_line(path):
+        if len(numbers) not in columns or len(numbers) != len(rows[0] if rows else numbers):
+            raise InputError(
+                f"{path}, line {line}: expected {layout}, found {len(numbers)} numbers; "
+                f"is the file cut off or of another format?"
+            )
+        rows.append(numbers)
+    if not rows:
+        raise InputError(f"{path} holds no poses; expected {layout}.")
+    return np.array(rows, dtype=np.float64)
+
+
+def _numbers_by_line(path: Path) -> Iterator[tuple[int, list[float]]]:
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except FileNotFoundError:
+        raise InputError(f"{path} does not exist; give the file with the poses.") from None
+    except UnicodeDecodeError:
+        raise InputError(f"{path} is not a text file; expected poses as numbers.") from None
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror}.") from error
+    for line, content in enumerate(text.splitlines(), start=1):
+        words = content.split("#", 1)[0].replace(",", " ").split()
+        try:
+            numbers = [float(word) for word in words]
+        except ValueError:
+            raise InputError(f"{path}, line {line}: not a row of numbers.") from None
+        if numbers:
+            yield line, numbers
+
+
+def _check_quaternions(
+    path: Path,
+    rows: Float[np.ndarray, "n 8"],
+    valid: Bool[np.ndarray, "n"],
+    order: QuaternionOrder,
+) -> None:
+    norm = np.linalg.norm(rows[:, 4:], axis=1)
+    has_pose = np.isfinite(rows).all(axis=1) & (norm > 0)
+    if valid.sum() < 0.5 * has_pose.sum():
+        raise InputError(
+            f"{path}: columns 5 to 8 are no unit quaternions; expected t tx ty tz qx qy qz qw."
+        )
+    first = rows[valid][:1, 4:]
+    if order == "auto" and len(first) and abs(first[0, 0]) > 1 - 1e-6:
+        raise InputError(
+            f"{path} begins with the quaternion 1 0 0 0, which is w x y z order; "
+            f"TUM files hold qx qy qz qw, so move the w column to the end."
+        )
+
+
+def _is_rigid(T: Float[np.ndarray, "n 4 4"]) -> Bool[np.ndarray, "n"]:
+    finite = np.isfinite(T).all(axis=(1, 2))
+    rotation = np.where(finite[:, None, None], T[:, :3, :3], 0.0)
+    error = np.abs(rotation @ rotation.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+    return finite & (error < 1e-2) & (np.linalg.det(rotation) > 0)
+
+
+def _trajectory(
+    path: Path,
+    seconds: Float[np.ndarray, "n"],
+    T_wc: Float[np.ndarray, "n 4 4"],
+    valid: Bool[np.ndarray, "n"],
+) -> Trajectory:
+    finite = np.isfinite(T_wc).all(axis=(1, 2))
+    has_pose = finite & (np.abs(np.where(finite[:, None, None], T_wc, 0))[:, :3, :3].sum((1, 2)) > 0)
+    if valid.sum() < 0.5 * has_pose.sum():
+        raise InputError(
+            f"{path}: the matrices are no rigid motions; expected 4x4 camera-to-world matrices, "
+            f"row by row."
+        )
+    T_wc = _keep_poses(path, T_wc, valid)
+    return Trajectory(seconds[valid], T_wc, np.ones(len(T_wc), dtype=bool))
+
+
+def _keep_poses(
+    path: Path, rows: Float[np.ndarray, "n ..."], valid: Bool[np.ndarray, "n"]
+) -> Float[np.ndarray, "m ..."]:
+    dropped = int((~valid).sum())
+    if dropped == len(valid):
+        raise InputError(f"{path} holds no valid pose: all {dropped} rows are NaN, inf or zero.")
+    if dropped:
+        _log.warning("%s: dropped %d of %d poses (NaN, inf or zero).", path, dropped, len(valid))
+    return rows[valid]

@@ -1,0 +1,88 @@
+"""What flows between the parts: frozen records, no behaviour."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, UInt8
+from torch import Tensor
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """One undistorted image of the source at working resolution."""
+
+    index: int
+    """Position in the source after start, stop and stride; 0, 1, 2, ..."""
+    timestamp: float
+    """Seconds."""
+    image: UInt8[np.ndarray, "h w 3"]
+    """RGB."""
+
+
+@dataclass(frozen=True, slots=True)
+class Keyframe:
+    """The tracker's present state of one keyframe, as handed to the mapper."""
+
+    id: int
+    """Stable: never reused, increasing in time."""
+    frame_index: int
+    timestamp: float
+    image: UInt8[np.ndarray, "h w 3"]
+    """RGB at working resolution."""
+    T_cw: Float[Tensor, "4 4"]
+    """World to camera, float64."""
+    inverse_depth: Float[Tensor, "gh gw"]
+    """On the tracker's grid: cell (r, c) is pixel (4 + 8 c, 4 + 8 r)."""
+    information: Float[Tensor, "gh gw"]
+    """Sum over edges of w |dp/dd|^2; the relative depth deviation is z / sqrt(information)."""
+
+
+@dataclass(frozen=True, slots=True)
+class PoseCorrection:
+    """Keyframe poses before and after a global correction, by keyframe id."""
+
+    before: dict[int, Float[Tensor, "4 4"]]
+    after: dict[int, Float[Tensor, "4 4"]]
+    scale: dict[int, float]
+    """Factor by which lengths around the keyframe were divided; 1 where only the pose moved."""
+
+
+@dataclass(frozen=True, slots=True)
+class Trajectory:
+    """Camera poses over time."""
+
+    timestamps: Float[np.ndarray, "n"]
+    """Seconds."""
+    T_wc: Float[np.ndarray, "n 4 4"]
+    """Camera to world, float64."""
+    tracked: Bool[np.ndarray, "n"]
+    """False where the camera was lost and the pose is only interpolated."""
+
+
+@dataclass(frozen=True, slots=True)
+class MapSnapshot:
+    """The disks of a map as plain numbers, detached from training."""
+
+    position: Float[Tensor, "n 3"]
+    quaternion: Float[Tensor, "n 4"]
+    """w, x, y, z, unit norm."""
+    scale: Float[Tensor, "n 2"]
+    """Standard deviations along the two tangents, map units."""
+    opacity: Float[Tensor, "n"]
+    """In (0, 1)."""
+
+    def __len__(self) -> int:
+        return len(self.position)
+
+    @property
+    def normal(self) -> Float[Tensor, "n 3"]:
+        """Third axis of each disk, world frame."""
+        from geogs.geometry.lie import quaternion_to_matrix
+
+        return quaternion_to_matrix(self.quaternion)[..., 2]
+
+    def is_finite(self) -> bool:
+        """Whether every number is finite."""
+        parts = (self.position, self.quaternion, self.scale, self.opacity)
+        return all(bool(torch.isfinite(p).all()) for p in parts)
