@@ -86,3 +86,20 @@ class MapSnapshot:
         """Whether every number is finite."""
         parts = (self.position, self.quaternion, self.scale, self.opacity)
         return all(bool(torch.isfinite(p).all()) for p in parts)
+
+
+@dataclass(frozen=True, slots=True)
+class RenderedKeyframe:
+    """The map seen from a keyframe: what a surface is made from."""
+
+    keyframe_id: int
+    T_cw: Float[Tensor, "4 4"]
+    """World to camera, float64."""
+    depth: Float[Tensor, "h w"]
+    """Map units; 0 where the map is too thin to say."""
+    normal: Float[Tensor, "h w 3"]
+    """Camera frame, facing the camera, zero where there is no depth."""
+    weight: Float[Tensor, "h w"]
+    """How far the depth may be trusted, in [0, 1]; 0 where disks spread along the ray."""
+    image: UInt8[np.ndarray, "h2 w2 3"]
+    """RGB at working resolution."""

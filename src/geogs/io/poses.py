@@ -176,7 +176,9 @@ def _trajectory(
     valid: Bool[np.ndarray, "n"],
 ) -> Trajectory:
     finite = np.isfinite(T_wc).all(axis=(1, 2))
-    has_pose = finite & (np.abs(np.where(finite[:, None, None], T_wc, 0))[:, :3, :3].sum((1, 2)) > 0)
+    has_pose = finite & (
+        np.abs(np.where(finite[:, None, None], T_wc, 0))[:, :3, :3].sum((1, 2)) > 0
+    )
     if valid.sum() < 0.5 * has_pose.sum():
         raise InputError(
             f"{path}: the matrices are no rigid motions; expected 4x4 camera-to-world matrices, "

@@ -1,0 +1,1 @@
+"""The map of Gaussian disks and its differentiable renderer."""

@@ -1,0 +1,124 @@
+"""The ``geogs`` command: finds the sub-command and turns errors into sentences.
+
+Nothing heavy is imported before a sub-command is chosen, so that help appears at once.
+"""
+
+import importlib
+import logging
+import os
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from geogs import __version__
+from geogs.errors import GeogsError
+
+EXIT_ERROR = 2
+"""Exit code after an error that the user can mend."""
+EXIT_INTERRUPTED = 130
+"""Exit code after Ctrl-C, as shells give it (128 + SIGINT)."""
+
+
+@dataclass(frozen=True)
+class Command:
+    """A sub-command: the module whose ``main(argv) -> exit code`` runs it, and a line of help."""
+
+    module: str
+    help: str
+
+
+COMMANDS = {
+    "run": Command("geogs.cli.run", "reconstruct a video, a folder of images or a data set"),
+    "eval": Command("geogs.cli.eval", "compare a result with the ground truth"),
+    "synth": Command("geogs.cli.synth", "make a synthetic room sequence with exact ground truth"),
+    "demo": Command("geogs.cli.demo", "make a small room, reconstruct it and show the errors"),
+}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run ``geogs`` with the given arguments (those of the process if none).
+
+    Returns:
+        0 on success, 2 after an error of input, output or options, 130 after Ctrl-C.
+    """
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    name = arguments[0] if arguments else "--help"
+    if name in ("-h", "--help", "help"):
+        print(help_text())
+        return 0
+    if name in ("-V", "--version"):
+        print(f"geogs {__version__}")
+        return 0
+    if name not in COMMANDS:
+        print_error(_unknown_command(name))
+        return EXIT_ERROR
+    _show_warnings()
+    return _guarded(lambda: _load(COMMANDS[name])(arguments[1:]))
+
+
+def help_text() -> str:
+    """What ``geogs --help`` prints."""
+    width = max(map(len, COMMANDS))
+    rows = [f"  {name:<{width}}  {command.help}" for name, command in COMMANDS.items()]
+    return "\n".join([
+        "Dense monocular SLAM with a map of geometry-only Gaussian disks.",
+        "",
+        "usage: geogs COMMAND [OPTIONS]",
+        "",
+        "commands:",
+        *rows,
+        "",
+        "geogs COMMAND --help lists the options of a command; geogs --version tells the version.",
+    ])  # fmt: skip
+
+
+def print_error(sentence: str) -> None:
+    """Print one line to the standard error, in red on a terminal."""
+    is_coloured = sys.stderr.isatty() and "NO_COLOR" not in os.environ
+    text = f"error: {sentence}"
+    print(f"\033[31m{text}\033[0m" if is_coloured else text, file=sys.stderr)
+
+
+def _load(command: Command) -> Callable[[list[str]], int]:
+    return importlib.import_module(command.module).main
+
+
+def _guarded(run: Callable[[], int]) -> int:
+    """Run a command; errors of ours become one line and an exit code, others keep a traceback.
+
+    With ``GEOGS_DEBUG=1`` ours keep it, too.
+    """
+    try:
+        return run()
+    except SystemExit as stop:  # help and wrong options end this way
+        return stop.code if isinstance(stop.code, int) else 0 if stop.code is None else EXIT_ERROR
+    except KeyboardInterrupt:
+        print_error("interrupted.")
+        return EXIT_INTERRUPTED
+    except GeogsError as error:
+        if os.environ.get("GEOGS_DEBUG", "0") not in ("", "0"):
+            raise
+        print_error(str(error))
+        return EXIT_ERROR
+
+
+def _unknown_command(name: str) -> str:
+    import difflib
+
+    near = difflib.get_close_matches(name, COMMANDS, n=1)
+    hint = f"did you mean {near[0]}?" if near else f"choose one of {', '.join(COMMANDS)}."
+    return f"there is no command {name}; {hint}"
+
+
+def _show_warnings() -> None:
+    """Let the library's warnings appear on the standard error, one line each."""
+    handler = logging.StreamHandler()
+    handler.setFormatter(logging.Formatter("warning: %(message)s"))
+    handler.setLevel(logging.WARNING)
+    log = logging.getLogger("geogs")
+    log.handlers[:] = [handler]
+    log.propagate = False
+
+
+if __name__ == "__main__":
+    sys.exit(main())

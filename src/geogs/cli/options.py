@@ -1,0 +1,39 @@
+"""Command-line options from a dataclass, for every sub-command alike."""
+
+from collections.abc import Sequence
+from typing import TypeVar
+
+Options = TypeVar("Options")
+
+
+def parse_options(
+    options: type[Options],
+    argv: Sequence[str],
+    command: str,
+    description: str | None = None,
+    default: Options | None = None,
+) -> Options:
+    """Make ``options`` from arguments; its fields' docstrings are the help.
+
+    Nested dataclasses become dotted options (``--input.stride 2``), hyphens and underscores are
+    the same, a field of type ``tyro.conf.Positional`` needs no name.
+
+    Args:
+        options: the dataclass.
+        argv: arguments after the name of the sub-command.
+        command: the name of the sub-command.
+        description: first lines of its help; the docstring of ``options`` if none.
+        default: values other than the fields' defaults.
+
+    Raises:
+        SystemExit: with 0 after ``--help``, with 2 after an option that is wrong or missing.
+    """
+    import tyro
+
+    return tyro.cli(
+        options,
+        args=list(argv),
+        prog=f"geogs {command}",
+        description=description,
+        default=default,
+    )

@@ -1,0 +1,77 @@
+"""Iterative closest points: the last rigid motion between a reconstruction and the truth."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from geogs.evaluation.surface import SurfaceDistance
+from geogs.geometry.lie import se3_exp
+from geogs.geometry.umeyama import umeyama
+
+
+@dataclass(frozen=True)
+class IcpResult:
+    """The rigid motion that was found."""
+
+    T: Float[np.ndarray, "4 4"]
+    """Moves the source onto the target."""
+    fitness: float
+    """Part of the points that found a partner."""
+    rmse: float
+    """Of their distances, in the unit of the points."""
+    iterations: int
+
+
+def icp(
+    points: Float[np.ndarray, "n 3"],
+    target: SurfaceDistance,
+    max_distance: float = 0.1,
+    iterations: int = 30,
+    tolerance: float = 1e-6,
+) -> IcpResult:
+    """Rigid motion of ``points`` onto ``target`` from the identity.
+
+    Partners are the nearest surface points within ``max_distance``. Distances along the normals
+    are minimised for a mesh (point to plane, Chen and Medioni 1992), those between the points for
+    a point set (Besl and McKay 1992). Stops when fitness and RMSE change by less than
+    ``tolerance`` relatively. With fewer than six partners the identity is returned.
+    """
+    T, fitness, rmse = np.eye(4), 0.0, 0.0
+    for step in range(iterations):
+        moved = points @ T[:3, :3].T + T[:3, 3]
+        distance, closest, normal = target.nearest(moved)
+        near = distance < max_distance
+        if near.sum() < 6:
+            return IcpResult(np.eye(4), float(near.mean()), 0.0, step)
+        previous = fitness, rmse
+        fitness, rmse = float(near.mean()), float(np.sqrt((distance[near] ** 2).mean()))
+        change = max(abs(fitness - previous[0]), abs(rmse - previous[1]) / max(rmse, 1e-12))
+        if change < tolerance:
+            return IcpResult(T, fitness, rmse, step)
+        normals = None if normal is None else normal[near]
+        T = _step(moved[near], closest[near], normals) @ T
+    return IcpResult(T, fitness, rmse, iterations)
+
+
+def _step(
+    source: Float[np.ndarray, "k 3"],
+    target: Float[np.ndarray, "k 3"],
+    normals: Float[np.ndarray, "k 3"] | None,
+) -> Float[np.ndarray, "4 4"]:
+    if normals is None:
+        _, R, t = umeyama(torch.from_numpy(source), torch.from_numpy(target), with_scale=False)
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = R.numpy(), t.numpy()
+        return T
+    centre = source.mean(0)
+    jacobian = np.concatenate([normals, np.cross(source - centre, normals)], 1)
+    residual = ((target - source) * normals).sum(1)
+    hessian = jacobian.T @ jacobian
+    # Directions that no normal holds (sliding along one plane) stay where they are.
+    xi = np.linalg.pinv(hessian, rcond=1e-6, hermitian=True) @ (jacobian.T @ residual)
+    T = se3_exp(torch.from_numpy(xi)).numpy()
+    to_centre = np.eye(4)
+    to_centre[:3, 3] = centre
+    return to_centre @ T @ np.linalg.inv(to_centre)

@@ -1,0 +1,226 @@
+"""Surfaces to compare: reading them, sampling them, and exact distances to them."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from geogs.errors import InputError
+
+_DENSE_SAMPLES = 1_500_000
+_CANDIDATES = 4
+_BATCH = 100_000
+
+
+@dataclass(frozen=True)
+class Surface:
+    """A triangle mesh, or a point set where there are no faces."""
+
+    vertices: Float[np.ndarray, "n 3"]
+    faces: Int[np.ndarray, "m 3"]
+
+    @property
+    def is_mesh(self) -> bool:
+        """Whether there are triangles."""
+        return len(self.faces) > 0
+
+    @cached_property
+    def areas(self) -> Float[np.ndarray, "m"]:
+        """Area of each triangle."""
+        a, b, c = self._corners()
+        return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+
+    @cached_property
+    def face_normals(self) -> Float[np.ndarray, "m 3"]:
+        """Unit normal of each triangle; zero where it has no area."""
+        a, b, c = self._corners()
+        normal = np.cross(b - a, c - a)
+        length = np.linalg.norm(normal, axis=1, keepdims=True)
+        return normal / np.where(length > 0, length, 1)
+
+    def transformed(self, T: Float[np.ndarray, "4 4"]) -> "Surface":
+        """The surface moved by a rigid motion or similarity."""
+        return Surface(self.vertices @ T[:3, :3].T + T[:3, 3], self.faces)
+
+    def _corners(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        a, b, c = (self.vertices[self.faces[:, i]] for i in range(3))
+        return a, b, c
+
+
+def read_surface(path: str | Path) -> Surface:
+    """Read a PLY mesh (polygons are split into fans) or point cloud.
+
+    Vertices that are not finite are dropped together with their faces. Raises InputError if the
+    file is missing, no PLY, cut off, or holds no vertex.
+    """
+    from plyfile import PlyData, PlyParseError
+
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{path} does not exist; give a PLY mesh or point cloud.")
+    try:
+        data = PlyData.read(str(path), known_list_len={"face": {_face_list(path): 3}})
+    except PlyParseError:
+        try:
+            data = PlyData.read(str(path))
+        except (PlyParseError, ValueError) as error:
+            raise InputError(f"{path} is no readable PLY file ({error}).") from None
+    if "vertex" not in data or not len(data["vertex"]):
+        raise InputError(f"{path} holds no vertices.")
+    vertex = data["vertex"]
+    vertices = np.stack([np.asarray(vertex[axis], np.float64) for axis in "xyz"], -1)
+    faces = _triangles(data["face"].data) if "face" in data else np.zeros((0, 3), np.int64)
+    if len(faces) and (faces.min() < 0 or faces.max() >= len(vertices)):
+        raise InputError(f"{path} has faces that name vertices which are not there.")
+    return _finite_part(vertices, faces)
+
+
+def _face_list(path: Path) -> str:
+    """The name of the list of vertex numbers, by the file's header."""
+    with path.open("rb") as file:
+        header = file.read(4096).split(b"end_header")[0]
+    return "vertex_index" if b"vertex_index\n" in header.replace(b"\r", b"") else "vertex_indices"
+
+
+def _triangles(rows: np.ndarray) -> Int[np.ndarray, "m 3"]:
+    if not len(rows):
+        return np.zeros((0, 3), np.int64)
+    name = next(n for n in rows.dtype.names if n in ("vertex_index", "vertex_indices"))
+    lists = rows[name]
+    if lists.dtype != object:
+        return np.asarray(lists, np.int64)
+    fans = [[(p[0], p[i], p[i + 1]) for i in range(1, len(p) - 1)] for p in lists]
+    return np.array([t for fan in fans for t in fan], np.int64).reshape(-1, 3)
+
+
+def _finite_part(vertices: np.ndarray, faces: np.ndarray) -> Surface:
+    finite = np.isfinite(vertices).all(1)
+    if finite.all():
+        return Surface(vertices, faces)
+    number = np.cumsum(finite) - 1
+    return Surface(vertices[finite], number[faces[finite[faces].all(1)]])
+
+
+def sample_surface(
+    surface: Surface, n: int, rng: np.random.Generator
+) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "n"]]:
+    """``n`` points uniform by area and the triangle of each.
+
+    Points are stratified: each has its own n-th part of the area to fall in. A point set gives a
+    random choice of its points (all if there are fewer), with triangle -1.
+    """
+    if not surface.is_mesh:
+        m = len(surface.vertices)
+        index = rng.choice(m, n, replace=False) if m > n else np.arange(m)
+        return surface.vertices[index], np.full(len(index), -1)
+    cumulative = np.cumsum(surface.areas)
+    if not cumulative[-1] > 0:
+        raise InputError("The mesh has no area, so it cannot be sampled.")
+    at = (np.arange(n) + rng.random(n)) / n * cumulative[-1]
+    face = np.minimum(np.searchsorted(cumulative, at, side="right"), len(cumulative) - 1)
+    u, v = rng.random((2, n))
+    fold = u + v > 1
+    u, v = np.where(fold, 1 - u, u), np.where(fold, 1 - v, v)
+    a, b, c = (surface.vertices[surface.faces[face, i]] for i in range(3))
+    return a + u[:, None] * (b - a) + v[:, None] * (c - a), face
+
+
+class SurfaceDistance:
+    """Distances from points to a surface.
+
+    To a mesh they are exact point-to-triangle distances, over the triangles of the four nearest
+    of 1.5 million area-uniform samples: how densely the mesh is sampled or tessellated does not
+    enter. To a point set they are distances to the nearest point, which include its spacing.
+    """
+
+    def __init__(
+        self,
+        surface: Surface,
+        box: tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]] | None = None,
+        samples: int = _DENSE_SAMPLES,
+        seed: int = 0,
+    ) -> None:
+        """Only the part of a mesh within ``box`` (low, high) is considered if one is given."""
+        from scipy.spatial import cKDTree
+
+        self._surface = surface
+        points, face = surface.vertices, np.full(len(surface.vertices), -1)
+        if surface.is_mesh:
+            points, face = sample_surface(surface, samples, np.random.default_rng(seed))
+            if box is not None:
+                inside = _in_box(points, *box)
+                points, face = (points[inside], face[inside]) if inside.any() else (points, face)
+        self._face, self._points = face, points
+        self._tree = cKDTree(points, balanced_tree=False, compact_nodes=False)
+
+    def __call__(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+        """Unsigned distances in the unit of the points."""
+        return self.nearest(points)[0]
+
+    def nearest(
+        self, points: Float[np.ndarray, "n 3"]
+    ) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"] | None]:
+        """Distances, nearest surface points and, for a mesh, the normals there."""
+        parts = [self._nearest(p) for p in np.split(points, range(_BATCH, len(points), _BATCH))]
+        distance, closest = (np.concatenate([p[i] for p in parts]) for i in (0, 1))
+        if not self._surface.is_mesh:
+            return distance, closest, None
+        return distance, closest, np.concatenate([p[2] for p in parts])
+
+    def _nearest(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+        if not self._surface.is_mesh:
+            distance, index = self._tree.query(points, workers=-1)
+            return distance, self._points[index], None
+        k = min(_CANDIDATES, len(self._points))
+        index = self._tree.query(points, k=k, workers=-1)[1].reshape(len(points), k)
+        best = np.full(len(points), np.inf)
+        closest, normal = np.zeros_like(points), np.zeros_like(points)
+        for column in index.T:
+            face = self._face[column]
+            corners = (self._surface.vertices[self._surface.faces[face, i]] for i in range(3))
+            candidate = closest_point_on_triangle(points, *corners)
+            distance = np.linalg.norm(candidate - points, axis=1)
+            better = distance < best
+            best = np.where(better, distance, best)
+            closest[better] = candidate[better]
+            normal[better] = self._surface.face_normals[face[better]]
+        return best, closest, normal
+
+
+def closest_point_on_triangle(
+    p: Float[np.ndarray, "n 3"],
+    a: Float[np.ndarray, "n 3"],
+    b: Float[np.ndarray, "n 3"],
+    c: Float[np.ndarray, "n 3"],
+) -> Float[np.ndarray, "n 3"]:
+    """The point of triangle abc nearest to p, row by row.
+
+    The foot of the perpendicular where it falls inside, else the nearest point of the three edges.
+    """
+    normal = np.cross(b - a, c - a)
+    squared = (normal * normal).sum(1, keepdims=True)
+    safe = np.where(squared > 0, squared, 1)
+    height = ((p - a) * normal).sum(1, keepdims=True) / safe
+    foot = p - height * normal
+    inside = squared[:, 0] > 0
+    best, distance = foot, np.full(len(p), np.inf)
+    for start, end in ((a, b), (b, c), (c, a)):
+        inside &= (np.cross(end - start, foot - start) * normal).sum(1) >= 0
+        edge = end - start
+        length = (edge * edge).sum(1, keepdims=True)
+        s = ((p - start) * edge).sum(1, keepdims=True) / np.where(length > 0, length, 1)
+        on_edge = start + np.clip(s, 0, 1) * edge
+        d = ((on_edge - p) ** 2).sum(1)
+        best = np.where((d < distance)[:, None], on_edge, best)
+        distance = np.minimum(distance, d)
+    return np.where(inside[:, None], foot, best)
+
+
+def _in_box(
+    points: Float[np.ndarray, "n 3"],
+    low: Float[np.ndarray, "3"],
+    high: Float[np.ndarray, "3"],
+) -> Bool[np.ndarray, "n"]:
+    return ((points >= low) & (points <= high)).all(1)

@@ -1,0 +1,187 @@
+"""A source: working images in order, with their times and the camera that took them.
+
+A format supplies a :class:`Reader` (how images are stored); :class:`Source` adds what all have in
+common: the selection of frames, the calibration, the working resolution and reading ahead.
+"""
+
+import logging
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Protocol, TypeVar, runtime_checkable
+
+import numpy as np
+from jaxtyping import UInt8
+
+from geogs.config import InputConfig
+from geogs.errors import InputError
+from geogs.geometry.camera import Camera
+from geogs.io.sources.calibration import Calibration
+from geogs.io.sources.intrinsics import resolve_intrinsics
+from geogs.io.sources.undistort import Rectifier
+from geogs.types import Frame
+
+_log = logging.getLogger(__name__)
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, slots=True)
+class RawFrame:
+    """One image as stored, upright."""
+
+    label: str
+    """What to call it in a message: the file, or the frame of the video."""
+    timestamp: float
+    """Seconds."""
+    image: UInt8[np.ndarray, "h w 3"] | None
+    """RGB; none where it could not be read."""
+
+
+@runtime_checkable
+class Reader(Protocol):
+    """How one format stores its images."""
+
+    kind: str
+    """Name of the format."""
+    name: str
+    """Name of the sequence."""
+    width: int
+    """Of the upright images, pixels."""
+    height: int
+    quarter_turns: int
+    """Clockwise quarter turns from the stored to the upright images."""
+    fps: float
+    """Frames per second, nominal."""
+    length: int | None
+    """Images in the source; none where only reading to the end would tell."""
+    calibration: Calibration | None
+    """The camera as far as the data set says."""
+
+    def read(self, start: int, stop: int | None, stride: int) -> Iterator[RawFrame]:
+        """Read images ``start, start + stride, ...`` before ``stop``."""
+        ...
+
+
+class Source:
+    """Frames at working resolution, undistorted, in time order; can be iterated repeatedly."""
+
+    def __init__(self, reader: Reader, config: InputConfig) -> None:
+        _check_selection(config, reader.length)
+        self._reader = reader
+        self._config = config
+        self.calibration = resolve_intrinsics(
+            config.intrinsics,
+            reader.calibration,
+            reader.width,
+            reader.height,
+            reader.quarter_turns,
+        )
+        """The camera of the images as they came, upright, with its distortion."""
+        self._rectifier = Rectifier(self.calibration, config.long_edge)
+        self.skipped = 0
+        """Images that could not be read, so far in this iteration."""
+
+    @property
+    def name(self) -> str:
+        """Name of the sequence."""
+        return self._reader.name
+
+    @property
+    def kind(self) -> str:
+        """The format: video, images, replica, tum or 7scenes."""
+        return self._reader.kind
+
+    @property
+    def camera(self) -> Camera:
+        """The pinhole camera of every frame."""
+        return self._rectifier.camera
+
+    @property
+    def intrinsics_origin(self) -> str:
+        """Where the intrinsics come from."""
+        return self.calibration.origin
+
+    @property
+    def fps(self) -> float:
+        """Frames per second after the stride, nominal."""
+        return self._reader.fps / self._config.stride
+
+    @property
+    def length(self) -> int | None:
+        """Frames to expect, unreadable ones included; none where it is not known beforehand."""
+        if self._reader.length is None:
+            return None
+        stop = self._config.stop
+        stop = self._reader.length if stop is None else min(stop, self._reader.length)
+        return len(range(self._config.start, stop, self._config.stride))
+
+    def __iter__(self) -> Iterator[Frame]:
+        """Yield the frames; the next one is read while the present one is used.
+
+        Raises:
+            InputError: an image of another size, or no image that can be read.
+        """
+        self.skipped = 0
+        index = 0
+        for raw in read_ahead(self._rectified()):
+            if raw.image is None:
+                self.skipped += 1
+                if self.skipped == 1:
+                    _log.warning("%s cannot be read; skipped.", raw.label)
+                continue
+            yield Frame(index, raw.timestamp, raw.image)
+            index += 1
+        if index == 0:
+            raise InputError(self._why_empty())
+        if self.skipped > 1:
+            _log.warning("%s: skipped %d images that cannot be read.", self.name, self.skipped)
+
+    def _rectified(self) -> Iterator[RawFrame]:
+        config, reader = self._config, self._reader
+        for raw in reader.read(config.start, config.stop, config.stride):
+            if raw.image is not None:
+                _check_size(raw, reader)
+                raw = RawFrame(raw.label, raw.timestamp, self._rectifier(raw.image))
+            yield raw
+
+    def _why_empty(self) -> str:
+        if self.skipped:
+            return f"{self.name}: none of its {self.skipped} images can be read."
+        return f"{self.name} ends before frame {self._config.start}; give a smaller start."
+
+
+def read_ahead(items: Iterator[T]) -> Iterator[T]:
+    """Yield the items of a generator, the next one being made meanwhile in a thread."""
+    end = object()
+    with ThreadPoolExecutor(max_workers=1, thread_name_prefix="read-ahead") as thread:
+        pending = thread.submit(next, items, end)
+        while (item := pending.result()) is not end:
+            pending = thread.submit(next, items, end)
+            yield item  # type: ignore[misc]  # not the end mark
+
+
+def _check_selection(config: InputConfig, length: int | None) -> None:
+    if config.stride < 1:
+        raise InputError(f"stride is {config.stride}; it must be at least 1.")
+    if config.start < 0:
+        raise InputError(f"start is {config.start}; it must not be negative.")
+    if config.stop is not None and config.stop <= config.start:
+        raise InputError(
+            f"stop is {config.stop}, which is not after start, {config.start}; no frame is left."
+        )
+    if length is not None and config.start >= length:
+        raise InputError(
+            f"start is {config.start}, but the source has only {length} frames; give a smaller start."
+        )
+    if config.long_edge < 0:
+        raise InputError(f"long_edge is {config.long_edge}; it must not be negative.")
+
+
+def _check_size(raw: RawFrame, reader: Reader) -> None:
+    assert raw.image is not None
+    height, width = raw.image.shape[:2]
+    if (width, height) != (reader.width, reader.height):
+        raise InputError(
+            f"{raw.label} is {width}x{height} but the first image is "
+            f"{reader.width}x{reader.height}; leave it out or give images of one size."
+        )

@@ -1,0 +1,117 @@
+"""A camera as the user or the data set describes it: intrinsics, distortion, and where from."""
+
+import math
+from dataclasses import dataclass, replace
+
+from geogs.errors import InputError
+from geogs.geometry.camera import Camera
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Intrinsics in pixels (pixel centres at integers) with OpenCV distortion coefficients."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion: tuple[float, ...] = ()
+    """k1, k2, p1, p2(, k3(, k4, k5, k6)); empty for a pinhole."""
+    width: int | None = None
+    """Image size the numbers hold for; none where the description does not say."""
+    height: int | None = None
+    origin: str = "given"
+    """Where the numbers come from, for the log and ``intrinsics.json``."""
+    is_guess: bool = False
+    """Whether the focal length is only assumed."""
+
+    def __post_init__(self) -> None:
+        numbers = (self.fx, self.fy, self.cx, self.cy, *self.distortion)
+        if not all(math.isfinite(number) for number in numbers):
+            raise InputError(f"The intrinsics ({self.origin}) hold NaN or infinity; correct them.")
+        if self.fx <= 0 or self.fy <= 0:
+            raise InputError(
+                f"The focal length ({self.origin}) is {self.fx:g}, {self.fy:g}; "
+                f"it must be positive, in pixels."
+            )
+
+    @property
+    def is_distorted(self) -> bool:
+        """Whether there is any distortion to remove."""
+        return any(number != 0 for number in self.distortion)
+
+    def camera(self) -> Camera:
+        """The pinhole part, once the size is known."""
+        return Camera(self.fx, self.fy, self.cx, self.cy, *self._size())
+
+    def _size(self) -> tuple[int, int]:
+        assert self.width is not None, "fit() the calibration to the images first"
+        assert self.height is not None, "fit() the calibration to the images first"
+        return self.width, self.height
+
+    def fit(self, width: int, height: int, quarter_turns: int = 0) -> "Calibration":
+        """The calibration for images of ``width x height`` pixels.
+
+        Args:
+            width: width of the images as shown, in pixels.
+            height: their height.
+            quarter_turns: clockwise quarter turns between the stored and the shown images. A
+                calibration made for the stored ones is turned along: recognised by its size, or,
+                where it has none, by its principal point.
+
+        Raises:
+            InputError: the calibration is for another shape of image.
+        """
+        stored = (height, width) if quarter_turns % 2 else (width, height)
+        if self.width is None or self.height is None:
+            shown_offset = math.hypot(self.cx - width / 2, self.cy - height / 2)
+            stored_offset = math.hypot(self.cx - stored[0] / 2, self.cy - stored[1] / 2)
+            size = stored if stored_offset < shown_offset else (width, height)
+            return replace(self, width=size[0], height=size[1]).fit(width, height, quarter_turns)
+        if _same_shape(self.width, self.height, width, height):
+            return self._scaled(width, height)
+        if _same_shape(self.width, self.height, *stored):
+            return self._turned(quarter_turns)._scaled(width, height)
+        raise InputError(
+            f"The intrinsics ({self.origin}) are for {self.width}x{self.height} images, but the "
+            f"source has {width}x{height}; give those of this camera mode."
+        )
+
+    def _scaled(self, width: int, height: int) -> "Calibration":
+        camera = self.camera().resized(width, height)
+        if not (-0.5 <= camera.cx <= width - 0.5 and -0.5 <= camera.cy <= height - 0.5):
+            raise InputError(
+                f"The principal point ({self.origin}) {self.cx:g}, {self.cy:g} lies outside the "
+                f"{self.width}x{self.height} image; are the intrinsics for another resolution?"
+            )
+        return replace(
+            self,
+            fx=camera.fx, fy=camera.fy, cx=camera.cx, cy=camera.cy,
+            width=width, height=height,
+        )  # fmt: skip
+
+    def _turned(self, quarter_turns: int) -> "Calibration":
+        turned = self
+        for _ in range(quarter_turns % 4):
+            turned = turned._turned_clockwise()
+        return turned
+
+    def _turned_clockwise(self) -> "Calibration":
+        """Pixel (x, y) moves to (height - 1 - y, x); the tangential terms turn with the axes."""
+        width, height = self._size()
+        distortion = self.distortion
+        if len(distortion) >= 4:
+            k1, k2, p1, p2, *radial = distortion
+            distortion = (k1, k2, p2, -p1, *radial)
+        return replace(
+            self,
+            fx=self.fy, fy=self.fx, cx=height - 1 - self.cy, cy=self.cx,
+            width=height, height=width, distortion=distortion,
+        )  # fmt: skip
+
+
+def _same_shape(width: int, height: int, other_width: int, other_height: int) -> bool:
+    """Whether one size is the other scaled, up to rounding to whole pixels."""
+    scale = max(other_width, other_height) / max(width, height)
+    slack = max(1.0, scale) + 0.005 * max(other_width, other_height)
+    return abs(width * scale - other_width) <= slack and abs(height * scale - other_height) <= slack

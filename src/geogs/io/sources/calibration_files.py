@@ -1,0 +1,172 @@
+"""Calibration files: JSON (geogs, Replica, nerfstudio), COLMAP text, OpenCV/ROS YAML, numbers.
+
+COLMAP and nerfstudio put the centre of the first pixel at (1/2, 1/2); their principal points are
+moved by half a pixel to the convention used here.
+"""
+
+import json
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from geogs.errors import InputError
+from geogs.io.sources.calibration import Calibration
+
+Numbers = Sequence[float]
+
+# Where each COLMAP camera model keeps fx, fy, cx, cy and OpenCV's k1, k2, p1, p2, k3, ...
+# (https://colmap.github.io/cameras.html); none stands for zero.
+_COLMAP_MODELS: dict[str, tuple[int | None, ...]] = {
+    "SIMPLE_PINHOLE": (0, 0, 1, 2),
+    "PINHOLE": (0, 1, 2, 3),
+    "SIMPLE_RADIAL": (0, 0, 1, 2, 3, None, None, None),
+    "RADIAL": (0, 0, 1, 2, 3, 4, None, None),
+    "OPENCV": (0, 1, 2, 3, 4, 5, 6, 7),
+    "FULL_OPENCV": (0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11),
+}
+
+
+def read_calibration(path: str | Path) -> Calibration:
+    """Read the camera in ``path``; the format follows from the name and the content.
+
+    Raises:
+        InputError: the file is missing, unreadable, of no known format, or of a fisheye camera.
+    """
+    path = Path(path)
+    text = _read_text(path)
+    try:
+        if path.suffix == ".json":
+            return _from_json(json.loads(text), path)
+        if path.suffix in (".yaml", ".yml"):
+            return _from_yaml(text, path)
+        if any(model in text for model in ("PINHOLE", "RADIAL", "OPENCV", "FISHEYE", "FOV")):
+            return _from_colmap(text, path)
+        return _from_numbers(text, path)
+    except (KeyError, TypeError, ValueError, IndexError) as error:
+        raise InputError(
+            f"{path} is no calibration that can be understood ({_reason(error)}); "
+            f"give fx fy cx cy [k1 k2 p1 p2 [k3]]."
+        ) from error
+
+
+def calibration_from_numbers(numbers: Numbers, origin: str) -> Calibration:
+    """Build a calibration from fx, fy, cx, cy[, k1, k2, p1, p2[, k3]] in pixels."""
+    if len(numbers) not in (4, 8, 9):
+        raise InputError(
+            f"The intrinsics ({origin}) hold {len(numbers)} numbers; "
+            f"expected fx,fy,cx,cy[,k1,k2,p1,p2[,k3]]."
+        )
+    fx, fy, cx, cy, *distortion = numbers
+    return Calibration(fx, fy, cx, cy, distortion=tuple(distortion), origin=origin)
+
+
+def _read_text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8-sig")
+    except FileNotFoundError:
+        raise InputError(f"The calibration file {path} does not exist.") from None
+    except UnicodeDecodeError:
+        raise InputError(f"{path} is not a text file, so it is no calibration.") from None
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror}.") from error
+
+
+def _reason(error: Exception) -> str:
+    return f"no entry {error}" if isinstance(error, KeyError) else str(error)
+
+
+def _from_json(document: dict[str, Any], path: Path) -> Calibration:
+    # "source" is the camera of the images as they came, in the intrinsics.json of a result.
+    entry = document.get("source") or document.get("camera") or document
+    if "fl_x" in entry:
+        return _from_nerfstudio(entry, path)
+    return Calibration(
+        float(entry["fx"]),
+        float(entry["fy"]),
+        float(entry["cx"]),
+        float(entry["cy"]),
+        distortion=tuple(float(number) for number in entry.get("distortion", ())),
+        width=_optional_int(entry.get("width", entry.get("w"))),
+        height=_optional_int(entry.get("height", entry.get("h"))),
+        origin=str(path),
+        is_guess=bool(entry.get("is_guess", False)),
+    )
+
+
+def _from_nerfstudio(entry: dict[str, Any], path: Path) -> Calibration:
+    _refuse_fisheye(str(entry.get("camera_model", "OPENCV")), path)
+    distortion = tuple(float(entry.get(key, 0.0)) for key in ("k1", "k2", "p1", "p2", "k3"))
+    return Calibration(
+        float(entry["fl_x"]),
+        float(entry.get("fl_y", entry["fl_x"])),
+        float(entry["cx"]) - 0.5,
+        float(entry["cy"]) - 0.5,
+        distortion=distortion if any(distortion) else (),
+        width=_optional_int(entry.get("w")),
+        height=_optional_int(entry.get("h")),
+        origin=str(path),
+    )
+
+
+def _from_colmap(text: str, path: Path) -> Calibration:
+    lines = [line.split() for line in text.splitlines() if line.strip() and line[0] != "#"]
+    cameras = {tuple(words[1:]) for words in lines}
+    if len(cameras) != 1:
+        raise InputError(f"{path} holds {len(cameras)} different cameras; give a file with one.")
+    model, width, height, *words = next(iter(cameras))
+    _refuse_fisheye(model, path)
+    parameters = [float(word) for word in words]
+    fx, fy, cx, cy, *distortion = (
+        0.0 if index is None else parameters[index] for index in _COLMAP_MODELS[model]
+    )
+    return Calibration(
+        fx, fy, cx - 0.5, cy - 0.5,
+        distortion=tuple(distortion), width=int(width), height=int(height), origin=str(path),
+    )  # fmt: skip
+
+
+def _from_yaml(text: str, path: Path) -> Calibration:
+    import yaml
+
+    # OpenCV writes a directive and a tag that plain YAML readers refuse.
+    text = re.sub(r"^%YAML.*$|!!opencv-matrix", "", text, flags=re.MULTILINE)
+    document = yaml.safe_load(text)
+    if "intrinsics" in document:  # EuRoC and Kalibr
+        fx, fy, cx, cy = document["intrinsics"]
+        distortion = document.get("distortion_coefficients", [])
+        _refuse_fisheye(str(document.get("distortion_model", "")), path)
+    else:
+        fx, _, cx, _, fy, cy = document["camera_matrix"]["data"][:6]
+        distortion = document.get("distortion_coefficients", {}).get("data", [])
+        _refuse_fisheye(str(document.get("distortion_model", "")), path)
+    width, height = document.get("resolution", (None, None))
+    return Calibration(
+        float(fx), float(fy), float(cx), float(cy),
+        distortion=tuple(float(number) for number in distortion),
+        width=_optional_int(document.get("image_width", width)),
+        height=_optional_int(document.get("image_height", height)),
+        origin=str(path),
+    )  # fmt: skip
+
+
+def _from_numbers(text: str, path: Path) -> Calibration:
+    rows = [line.split("#", 1)[0].replace(",", " ").split() for line in text.splitlines()]
+    numbers = [[float(word) for word in row] for row in rows if row]
+    if len(numbers) >= 3 and all(len(row) == len(numbers) for row in numbers):
+        return Calibration(  # a 3x3 or 4x4 matrix
+            numbers[0][0], numbers[1][1], numbers[0][2], numbers[1][2], origin=str(path)
+        )
+    return calibration_from_numbers([number for row in numbers for number in row], str(path))
+
+
+def _refuse_fisheye(model: str, path: Path) -> None:
+    if any(word in model.upper() for word in ("FISHEYE", "FOV", "EQUIDISTANT", "EQUIRECT")):
+        raise InputError(
+            f"{path} describes a {model} camera, which is not supported; undistort the images "
+            f"first."
+        )
+
+
+def _optional_int(number: Any) -> int | None:
+    return None if number is None else int(number)

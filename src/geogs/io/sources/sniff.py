@@ -1,0 +1,52 @@
+"""Open whatever the user points at."""
+
+from pathlib import Path
+
+from geogs.config import InputConfig
+from geogs.errors import InputError
+from geogs.io.sources.base import Reader, Source
+from geogs.io.sources.images import SUFFIXES, open_image_folder
+from geogs.io.sources.replica import is_replica, open_replica
+from geogs.io.sources.seven_scenes import is_seven_scenes, open_seven_scenes
+from geogs.io.sources.tum import is_tum, open_tum
+from geogs.io.sources.video import VideoFile
+
+
+def open_source(path: str | Path, config: InputConfig | None = None) -> Source:
+    """Open a video, a folder of images, or a Replica, TUM RGB-D or 7-Scenes sequence.
+
+    The format follows from the content. Ground truth that lies beside the images is not read.
+
+    Args:
+        path: the file or folder.
+        config: selection of frames, intrinsics and working resolution; the defaults if none.
+
+    Raises:
+        InputError: nothing usable is there, or ``config`` does not fit it.
+    """
+    return Source(_reader(Path(path).expanduser()), config or InputConfig())
+
+
+def _reader(path: Path) -> Reader:
+    try:
+        if path.is_dir():
+            return _folder_reader(path)
+        if not path.exists():
+            raise InputError(f"{path} does not exist; give a video or a folder of images.")
+        if path.suffix.lower() in SUFFIXES:
+            raise InputError(f"{path} is a single picture; give a video or a folder of images.")
+        if path.stat().st_size == 0:
+            raise InputError(f"{path} is empty; is the copy or download complete?")
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror}.") from error
+    return VideoFile(path)
+
+
+def _folder_reader(folder: Path) -> Reader:
+    if is_tum(folder):
+        return open_tum(folder)
+    if is_seven_scenes(folder):
+        return open_seven_scenes(folder)
+    if is_replica(folder):
+        return open_replica(folder)
+    return open_image_folder(folder)

@@ -1,0 +1,65 @@
+"""TUM RGB-D: ``rgb.txt`` lists the colour images with their times."""
+
+from pathlib import Path
+
+from geogs.errors import InputError
+from geogs.io.sources.calibration import Calibration
+from geogs.io.sources.images import ImageFile, ImageList
+from geogs.io.sources.intrinsics import find_calibration
+
+# Published calibrations of the colour cameras (Sturm et al., "A benchmark for the evaluation of
+# RGB-D SLAM systems", IROS 2012); the images of Freiburg 3 are already undistorted.
+_FREIBURG_1 = Calibration(
+    517.306408, 516.469215, 318.643040, 255.313989,
+    distortion=(0.262383, -0.953104, -0.005358, 0.002628, 1.163314),
+    width=640, height=480, origin="the TUM RGB-D data set, Freiburg 1",
+)  # fmt: skip
+_FREIBURG_2 = Calibration(
+    520.908620, 521.007327, 325.141442, 249.701764,
+    distortion=(0.231222, -0.784899, -0.003257, -0.000105, 0.917205),
+    width=640, height=480, origin="the TUM RGB-D data set, Freiburg 2",
+)  # fmt: skip
+_FREIBURG_3 = Calibration(
+    535.4, 539.2, 320.1, 247.6, width=640, height=480, origin="the TUM RGB-D data set, Freiburg 3"
+)  # fmt: skip
+
+
+def is_tum(folder: Path) -> bool:
+    """Whether ``folder`` is a sequence."""
+    return (folder / "rgb.txt").is_file()
+
+
+def open_tum(folder: Path) -> ImageList:
+    """Read a sequence; times are those of ``rgb.txt``."""
+    name = folder.resolve().name
+    files = _read_list(folder)
+    return ImageList("tum", name, files, find_calibration(folder) or known_camera(name))
+
+
+def known_camera(name: str) -> Calibration | None:
+    """The published calibration for a sequence called ``..freiburg1..`` or ``fr1..``."""
+    for number, calibration in enumerate((_FREIBURG_1, _FREIBURG_2, _FREIBURG_3), start=1):
+        if f"freiburg{number}" in name.lower() or f"fr{number}" in name.lower():
+            return calibration
+    return None
+
+
+def _read_list(folder: Path) -> list[ImageFile]:
+    listing = folder / "rgb.txt"
+    try:
+        lines = listing.read_text(encoding="utf-8-sig").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{listing} cannot be read: {error}.") from error
+    files = []
+    for number, line in enumerate(lines, start=1):
+        words = line.split("#", 1)[0].split()
+        if not words:
+            continue
+        try:
+            time, image = words
+            files.append(ImageFile(folder / image, float(time)))
+        except ValueError:
+            raise InputError(f"{listing}, line {number}: expected a time and a file.") from None
+    if not files:
+        raise InputError(f"{listing} lists no images.")
+    return sorted(files, key=lambda file: file.timestamp)

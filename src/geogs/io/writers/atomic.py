@@ -1,0 +1,64 @@
+"""Files appear complete or not at all: written beside their place, then renamed."""
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import BinaryIO
+
+from geogs.errors import OutputError
+
+
+@contextmanager
+def atomic_file(path: str | Path) -> Iterator[BinaryIO]:
+    """Open ``path`` for binary writing; it is replaced when the block ends without an error.
+
+    Missing folders are made. After an error the former file is still there and the unfinished one
+    is gone.
+
+    Raises:
+        OutputError: the disk is full, or the place cannot be written.
+    """
+    path = Path(path)
+    unfinished = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with unfinished.open("wb") as stream:
+            yield stream
+            stream.flush()
+            os.fsync(stream.fileno())
+        os.replace(unfinished, path)
+    except OSError as error:
+        raise OutputError(_sentence(path, error)) from error
+    finally:
+        with suppress(OSError):
+            unfinished.unlink(missing_ok=True)
+
+
+def write_text(path: str | Path, text: str) -> None:
+    """Write a text file in UTF-8, completely or not at all."""
+    with atomic_file(path) as stream:
+        stream.write(text.encode("utf-8"))
+
+
+def prepare_output_folder(path: str | Path) -> Path:
+    """Make the folder for results and try that files can be written there.
+
+    Meant for the beginning of a run, so that hours of work do not end at a read-only disk.
+
+    Raises:
+        OutputError: it is a file, or cannot be made or written.
+    """
+    folder = Path(path).expanduser()
+    if folder.exists() and not folder.is_dir():
+        raise OutputError(f"{folder} is a file; give another folder for the results.")
+    probe = folder / ".writable"
+    write_text(probe, "")
+    with suppress(OSError):
+        probe.unlink()
+    return folder
+
+
+def _sentence(path: Path, error: OSError) -> str:
+    reason = error.strerror or str(error)
+    return f"{path} cannot be written ({reason}); free some space or give another output folder."

@@ -1,0 +1,41 @@
+"""``intrinsics.json``: the camera of the working images and that of the source."""
+
+import json
+from pathlib import Path
+
+from geogs.geometry.camera import Camera
+from geogs.io.sources.calibration import Calibration
+from geogs.io.writers.atomic import write_text
+
+
+def write_intrinsics(
+    path: str | Path, camera: Camera, calibration: Calibration | None = None
+) -> None:
+    """Write the pinhole of the frames, and with it the calibration of the images as they came.
+
+    All in pixels with the centre of the first pixel at (0, 0). Given as ``intrinsics``,
+    the file stands for the source's calibration where it has one.
+    """
+    document: dict[str, object] = {
+        "model": "PINHOLE",
+        "width": camera.width,
+        "height": camera.height,
+        "fx": camera.fx,
+        "fy": camera.fy,
+        "cx": camera.cx,
+        "cy": camera.cy,
+        "first_pixel_centre": [0, 0],
+    }
+    if calibration is not None:
+        document["source"] = {
+            "width": calibration.width,
+            "height": calibration.height,
+            "fx": calibration.fx,
+            "fy": calibration.fy,
+            "cx": calibration.cx,
+            "cy": calibration.cy,
+            "distortion": list(calibration.distortion),
+            "origin": calibration.origin,
+            "is_guess": calibration.is_guess,
+        }
+    write_text(path, json.dumps(document, indent=2) + "\n")

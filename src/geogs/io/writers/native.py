@@ -1,0 +1,76 @@
+"""``map.safetensors``: the disks, ten numbers each, with a description in JSON."""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+
+from geogs.errors import InputError
+from geogs.io.writers.atomic import atomic_file
+from geogs.types import MapSnapshot
+
+FORMAT_VERSION = 1
+"""Raised when older programs could not read the file any more."""
+
+_SHAPES = {"position": (3,), "quaternion": (4,), "scale": (2,), "opacity": ()}
+
+
+def save_map(path: str | Path, disks: MapSnapshot, metadata: Mapping[str, Any] = {}) -> None:
+    """Write the disks in float32.
+
+    Args:
+        path: the file.
+        disks: the map.
+        metadata: anything JSON can hold, kept beside the disks.
+    """
+    tensors = {name: getattr(disks, name).detach().cpu().float().contiguous() for name in _SHAPES}
+    header = {
+        "format": "geogs-map",
+        "version": str(FORMAT_VERSION),
+        "metadata": json.dumps(dict(metadata)),
+    }
+    with atomic_file(path) as stream:
+        stream.write(save(tensors, metadata=header))
+
+
+def load_map(path: str | Path, device: torch.device | str = "cpu") -> MapSnapshot:
+    """Read the disks of a map.
+
+    Raises:
+        InputError: the file is missing, damaged, no map, of a newer version, or holds NaN.
+    """
+    with _open(path) as file:
+        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    count = len(tensors["position"]) if "position" in tensors else 0
+    for name, shape in _SHAPES.items():
+        if name not in tensors or tensors[name].shape != (count, *shape):
+            raise InputError(f"{path} is no map of geogs: its {name} is missing or misshapen.")
+    disks = MapSnapshot(**{name: tensors[name].to(device) for name in _SHAPES})
+    if not disks.is_finite():
+        raise InputError(f"{path} holds NaN or infinity; the map is damaged.")
+    return disks
+
+
+def load_map_metadata(path: str | Path) -> dict[str, Any]:
+    """Read what was kept beside the disks."""
+    with _open(path) as file:
+        return json.loads(file.metadata()["metadata"])
+
+
+def _open(path: str | Path) -> "safe_open":
+    if not Path(path).is_file():
+        raise InputError(f"The map {path} does not exist.")
+    try:
+        file = safe_open(str(path), framework="pt")
+    except (SafetensorError, OSError) as error:
+        raise InputError(f"{path} is no map of geogs, or is damaged ({error}).") from error
+    header = file.metadata() or {}
+    if header.get("format") != "geogs-map":
+        raise InputError(f"{path} is no map of geogs.")
+    if int(header["version"]) > FORMAT_VERSION:
+        raise InputError(f"{path} was written by a newer geogs; update this one to read it.")
+    return file

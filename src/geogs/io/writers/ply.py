@@ -1,0 +1,77 @@
+"""PLY files: the coloured mesh, and the disks as splats for 3D Gaussian splatting viewers."""
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+from plyfile import PlyData, PlyElement
+
+from geogs.io.writers.atomic import atomic_file
+from geogs.types import MapSnapshot
+
+SPLAT_THICKNESS = 0.01
+"""Third standard deviation of an exported splat relative to its smaller one: flat, not zero."""
+
+_SH_DEGREE_0 = 0.28209479177387814  # 1 / (2 sqrt(pi)), the constant spherical harmonic
+
+
+def write_mesh(
+    path: str | Path,
+    vertices: Float[np.ndarray, "n 3"],
+    faces: Int[np.ndarray, "m 3"],
+    colors: UInt8[np.ndarray, "n 3"] | None = None,
+    normals: Float[np.ndarray, "n 3"] | None = None,
+) -> None:
+    """Write a triangle mesh as binary PLY, with RGB and normals at the vertices where given."""
+    columns = {axis: vertices[:, i].astype("<f4") for i, axis in enumerate("xyz")}
+    if normals is not None:
+        columns |= {f"n{axis}": normals[:, i].astype("<f4") for i, axis in enumerate("xyz")}
+    if colors is not None:
+        columns |= {name: colors[:, i] for i, name in enumerate(("red", "green", "blue"))}
+    triangles = np.empty(len(faces), dtype=[("vertex_indices", "<i4", (3,))])
+    triangles["vertex_indices"] = faces
+    _write(path, [_element("vertex", columns), PlyElement.describe(triangles, "face")])
+
+
+def write_splats(path: str | Path, disks: MapSnapshot, colors: Float[np.ndarray, "n 3"]) -> None:
+    """Write disks in the layout of 3D Gaussian splatting (Kerbl et al. 2023), no view dependence.
+
+    Scales are logarithms, opacity a logit, rotation w, x, y, z, colour the zeroth coefficient of
+    spherical harmonics; the third scale is made thin.
+
+    Args:
+        path: the file.
+        disks: the map.
+        colors: RGB of every disk in [0, 1]; the map itself has none.
+    """
+    position, normal = disks.position.cpu().numpy(), disks.normal.cpu().numpy()
+    scale, rotation = disks.scale.cpu().numpy(), disks.quaternion.cpu().numpy()
+    opacity = disks.opacity.cpu().double().numpy().clip(1e-6, 1 - 1e-6)
+    thin = SPLAT_THICKNESS * scale.min(axis=1, keepdims=True, initial=np.inf)
+    log_scale = np.log(np.concatenate([scale, thin], axis=1).clip(1e-12))
+    columns = {
+        **_columns(position, ("x", "y", "z")),
+        **_columns(normal, ("nx", "ny", "nz")),
+        **_columns((colors - 0.5) / _SH_DEGREE_0, ("f_dc_0", "f_dc_1", "f_dc_2")),
+        "opacity": np.log(opacity / (1 - opacity)).astype("<f4"),
+        **_columns(log_scale, ("scale_0", "scale_1", "scale_2")),
+        **_columns(rotation, ("rot_0", "rot_1", "rot_2", "rot_3")),
+    }
+    _write(path, [_element("vertex", columns)])
+
+
+def _columns(values: Float[np.ndarray, "n k"], names: tuple[str, ...]) -> dict[str, np.ndarray]:
+    return {name: values[:, i].astype("<f4") for i, name in enumerate(names)}
+
+
+def _element(name: str, columns: dict[str, np.ndarray]) -> PlyElement:
+    dtype = [(column, values.dtype.str) for column, values in columns.items()]
+    table = np.empty(len(next(iter(columns.values()))), dtype=dtype)
+    for column, values in columns.items():
+        table[column] = values
+    return PlyElement.describe(table, name)
+
+
+def _write(path: str | Path, elements: list[PlyElement]) -> None:
+    with atomic_file(path) as stream:
+        PlyData(elements, text=False, byte_order="<").write(stream)

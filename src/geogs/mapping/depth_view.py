@@ -1,0 +1,64 @@
+"""What the depth estimation needs to know of one keyframe."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Float32, Float64, UInt8
+
+from geogs.geometry.camera import Camera
+from geogs.types import Keyframe
+
+
+@dataclass(frozen=True, slots=True)
+class DepthView:
+    """One keyframe: images, pose, and the tracker's depth on its grid."""
+
+    id: int
+    """The keyframe's id."""
+    grey: Float32[np.ndarray, "h w"]
+    """Grey image in [0, 1] at the render size, where planes are swept."""
+    fine: Float32[np.ndarray, "fh fw"]
+    """Grey image in [0, 1] at the working size, a little blurred, where depth is refined."""
+    image: UInt8[np.ndarray, "wh ww 3"]
+    """RGB at the working size."""
+    T_cw: Float64[np.ndarray, "4 4"]
+    """World to camera."""
+    inverse_depth: Float32[np.ndarray, "gh gw"]
+    """The tracker's, on its grid; per map unit."""
+    information: Float32[np.ndarray, "gh gw"]
+    """Sum over edges of w |dp/dd|^2; 0 where the tracker knows nothing."""
+
+    @property
+    def center(self) -> Float64[np.ndarray, "3"]:
+        """Camera centre in the world."""
+        return -self.T_cw[:3, :3].T @ self.T_cw[:3, 3]
+
+    @property
+    def forward(self) -> Float64[np.ndarray, "3"]:
+        """Viewing direction in the world."""
+        return self.T_cw[2, :3]
+
+
+@dataclass(slots=True)
+class KeyframeDepth:
+    """Dense depth of one keyframe at the render size."""
+
+    depth: Float32[np.ndarray, "h w"]
+    """z in map units; positive everywhere."""
+    confidence: Float32[np.ndarray, "h w"]
+    """In [0, 1]; about the chance that the depth is right to 2 %."""
+
+
+def depth_view(keyframe: Keyframe, render: Camera) -> DepthView:
+    """The view of a keyframe for depths at the size of ``render``."""
+    grey = cv2.cvtColor(keyframe.image, cv2.COLOR_RGB2GRAY).astype(np.float32) * np.float32(1 / 255)
+    return DepthView(
+        id=keyframe.id,
+        grey=cv2.resize(grey, (render.width, render.height), interpolation=cv2.INTER_AREA),
+        fine=cv2.GaussianBlur(grey, (0, 0), 0.7),
+        image=keyframe.image,
+        T_cw=keyframe.T_cw.detach().cpu().numpy().astype(np.float64),
+        inverse_depth=keyframe.inverse_depth.detach().cpu().numpy().astype(np.float32),
+        information=keyframe.information.detach().cpu().numpy().astype(np.float32),
+    )

@@ -1,0 +1,288 @@
+"""The back end: keyframe depths in, a trained disk map and refined poses out."""
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from geogs.config import MappingConfig
+from geogs.geometry.camera import Camera
+from geogs.mapping.carve import vote
+from geogs.mapping.depth_fusion import check_depth
+from geogs.mapping.depth_view import KeyframeDepth
+from geogs.mapping.keyframe_depth import estimate_depth
+from geogs.mapping.map_update import MapUpdate, plan_update
+from geogs.mapping.pose_refine import refine_poses
+from geogs.mapping.sweep_neighbors import select_sweep_neighbours
+from geogs.mapping.training import Trainer, draw_partners, shown_depth
+from geogs.mapping.view import MapCameras, MapView
+from geogs.mapping.window import choose_partners, draw_views
+from geogs.splat.density import candidate_pixels, unexplained, worth_keeping
+from geogs.splat.init import initialise_disks
+from geogs.splat.map import GaussianMap
+from geogs.splat.render import render
+from geogs.types import Keyframe, PoseCorrection, RenderedKeyframe
+
+# Keyframes whose depth checks a new keyframe's depth and whose free space carves around it.
+_CHECKING_VIEWS = 8
+
+
+class Mapper:
+    """Grows and trains the map keyframe by keyframe.
+
+    ``observe`` takes settled keyframes as images to match with; ``map_keyframe`` makes one of them
+    part of the map. Everything is in the tracker's units; ``unit`` is the median depth of the first
+    keyframe, by which settings that are lengths are scaled.
+    """
+
+    def __init__(self, camera: Camera, config: MappingConfig, device: str = "cpu", seed: int = 0):
+        self.config = config
+        self.cameras = _cameras(camera, config)
+        self.map = GaussianMap.empty(device)
+        self.views: dict[int, MapView] = {}
+        self.mapped: list[int] = []
+        self._trainer: Trainer | None = None
+        self._random = np.random.default_rng(seed)
+        self._torch_random = torch.Generator().manual_seed(seed)
+
+    @property
+    def keyframe_ids(self) -> list[int]:
+        """Keyframes observed so far, in order."""
+        return list(self.views)
+
+    def observe(self, keyframe: Keyframe) -> None:
+        """A settled keyframe, from now on available for matching."""
+        self.views[keyframe.id] = MapView.of(keyframe, self.cameras, self.config.loss)
+
+    def follow(self, keyframes: list[Keyframe]) -> None:
+        """Take over the tracker's present poses and grid depths of known keyframes."""
+        for keyframe in keyframes:
+            if keyframe.id in self.views:
+                self.views[keyframe.id].follow(keyframe)
+
+    def map_keyframe(self, keyframe_id: int) -> None:
+        """Give a keyframe its depth, carve and grow the map with it, train the window."""
+        view = self.views[keyframe_id]
+        self._estimate_ahead(keyframe_id)
+        self._check(view)
+        self.mapped.append(keyframe_id)
+        self._choose_partners(view)
+        trainer = self._training()
+        self._carve([view, *self._near(view)])
+        self._insert(view, self.config.disk.insert_confidence)
+        if len(self.mapped) > self.config.window:
+            self._insert(self.views[self.mapped[-1 - self.config.window]], 0.0)
+        for step in range(self.config.iterations):
+            ids = draw_views(self.mapped, step, self.config, self._random)
+            trainer.step(self._batch(ids))
+        if len(self.mapped) % self.config.disk.carve_every == 0:
+            self.prune()
+
+    def refine_poses(self, active: list[int]) -> dict[int, Float[Tensor, "4 4"]]:
+        """Poses of the active keyframes that agree better with the map; the earliest stays."""
+        views = [self.views[i] for i in active if i in self.views and self.views[i].constants]
+        if len(views) < 2 or len(self.map) == 0:
+            return {}
+        poses = refine_poses(self.map, views, self.views, self.cameras, self.config, self.unit)
+        for i, T_cw in poses.items():
+            self.views[i].move(T_cw)
+        return poses
+
+    def correct(self, correction: PoseCorrection, keyframes: list[Keyframe]) -> MapUpdate:
+        """Move the map with a global correction of the poses, and take over the new keyframes."""
+        update = plan_update(
+            self.map.position, self.map.keyframe_id, correction, self.config.map_update
+        )
+        if len(self.map):
+            self._training().optimizer.transform(update.transform)
+        for i, scale in correction.scale.items():
+            if i in self.views:
+                self.views[i].rescale(1.0 / scale, self.cameras)
+        self.follow(keyframes)
+        return update
+
+    def refine(self, progress: Callable[[float], None] = lambda fraction: None) -> None:
+        """Train over all keyframes with the final poses, after searching their depths again."""
+        if not self.mapped or self.config.final_iterations <= 0:
+            return
+        views = [self.views[i] for i in self.mapped]
+        if self.config.final_depth:
+            self._estimate(views)
+            for view in views:
+                self._check(view)
+        for view in views:
+            self._choose_partners(view)
+        self.prune()
+        for view in views:
+            self._insert(view, self.config.disk.insert_confidence)
+        self._train_all(views, progress)
+        self.prune()
+
+    def prune(self) -> None:
+        """Drop transparent and broken disks, and those that the keyframes see in free space."""
+        self._training().optimizer.keep(worth_keeping(self.map, self.config.disk))
+        self._carve([self.views[i] for i in self.mapped])
+
+    @torch.no_grad()
+    def renders(self) -> list[RenderedKeyframe]:
+        """The map seen from every mapped keyframe, with the weight of each depth for fusion."""
+        return [self._rendered(self.views[i]) for i in self.mapped]
+
+    @property
+    def unit(self) -> float:
+        """Median depth of the first keyframe, map units."""
+        return self._training().unit
+
+    def _training(self) -> Trainer:
+        if self._trainer is None:
+            depth = self.views[self.mapped[0]].depth
+            sure = depth.depth[depth.confidence >= np.median(depth.confidence)]
+            self._trainer = Trainer(self.map, self.cameras, self.config, float(np.median(sure)))
+        return self._trainer
+
+    def _estimate_ahead(self, keyframe_id: int) -> None:
+        """Depths of the keyframe and of its next ones, which then check each other."""
+        later = [i for i in self.views if i >= keyframe_id][: 1 + self.config.lag // 2]
+        self._estimate([self.views[i] for i in later if self.views[i].depth is None])
+
+    def _estimate(self, views: list[MapView]) -> None:
+        candidates = [v.depth_view for v in self.views.values()]
+
+        def estimate(view: MapView) -> KeyframeDepth:
+            reference = view.depth_view
+            depth = _typical_depth(view)
+            chosen = select_sweep_neighbours(reference, candidates, depth, self.config.depth)
+            neighbours = [candidates[i] for i in chosen]
+            return estimate_depth(
+                reference, neighbours, self.cameras.render, self.cameras.working, self.config.depth
+            )
+
+        with ThreadPoolExecutor(torch.get_num_threads()) as pool:
+            for view, depth in zip(views, pool.map(estimate, views), strict=True):
+                view.set_depth(depth, self.cameras)
+
+    def _check(self, view: MapView) -> None:
+        """Let the neighbours' depths revise the confidence of a view's depth."""
+        others = self._near(view)
+        if others:
+            poses = [o.depth_view.T_cw for o in others]
+            depths = [o.depth for o in others]
+            checked = check_depth(
+                view.depth, view.depth_view.T_cw, depths, poses, self.cameras.render,
+                self.config.depth,
+            )  # fmt: skip
+            view.set_depth(checked, self.cameras)
+
+    def _near(self, view: MapView) -> list[MapView]:
+        """The keyframes with a depth that see a view's surface best from elsewhere."""
+        known = [v for v in self.views.values() if v.depth is not None and v.id != view.id]
+        views = [v.depth_view for v in known]
+        depth = float(np.median(view.depth.depth))
+        chosen = select_sweep_neighbours(view.depth_view, views, depth, self.config.depth)
+        return [known[i] for i in chosen[:_CHECKING_VIEWS]]
+
+    def _choose_partners(self, view: MapView) -> None:
+        """Photometric partners of a view; it becomes a candidate for those before it."""
+        photo = self.config.photo
+        depth = float(np.median(view.depth.depth))
+        mapped = [self.views[i] for i in self.mapped]
+        view.partners = choose_partners(view, mapped, depth, photo)
+        for i in view.partners:
+            other = self.views[i]
+            pool = [self.views[j] for j in {*other.partners, view.id} if j in self.views]
+            other.partners = choose_partners(other, pool, float(np.median(other.depth.depth)), photo)
+
+    def _batch(self, ids: list[int]) -> list[tuple[MapView, list[MapView]]]:
+        views = [self.views[i] for i in ids]
+        return [(v, draw_partners(v, self.views, self.config, self._random)) for v in views]
+
+    def _carve(self, views: list[MapView]) -> None:
+        if len(self.map):
+            points = self.map.position.detach().numpy()
+            self._training().optimizer.keep(torch.from_numpy(self._vote(points, views)))
+
+    def _vote(self, points: np.ndarray, views: list[MapView]) -> np.ndarray:
+        views = [v for v in views if v.depth is not None]
+        poses = [v.depth_view.T_cw for v in views]
+        depths = [v.depth for v in views]
+        return vote(points, poses, depths, self.cameras.render, self.config.depth)
+
+    @torch.no_grad()
+    def _insert(self, view: MapView, min_confidence: float) -> None:
+        """Disks where the map does not explain a view's depth, by local planes."""
+        disk, camera = self.config.disk, self.cameras.render
+        depth = torch.from_numpy(view.depth.depth)
+        confidence = torch.from_numpy(view.depth.confidence)
+        output = render(self.map, camera, view.T_cw)
+        needed = unexplained(output, depth, confidence, disk) & (confidence >= min_confidence)
+        v, u = candidate_pixels(camera.height, camera.width, disk.stride, self._torch_random)
+        chosen = needed[v, u]
+        v, u = v[chosen], u[chosen]
+        z = depth[v, u]
+        T_wc = view.T_wc.float()
+        points = (camera.rays()[v, u] * z[:, None]) @ T_wc[:3, :3].T + T_wc[:3, 3]
+        others = [self.views[i] for i in self.mapped if i != view.id]
+        kept = torch.from_numpy(self._vote(points.numpy(), others))
+        points, z = points[kept], z[kept]
+        if len(points) + len(self.map) < disk.neighbours or len(points) == 0:
+            return
+        new = initialise_disks(
+            points, T_wc[:3, 3], disk.stride * z / camera.fx, self.map.position.detach(),
+            neighbours=disk.neighbours, scale_factor=disk.scale_factor,
+            planarity_threshold=disk.planarity_threshold,
+            planarity_shrink=disk.planarity_shrink, opacity=disk.opacity,
+        )  # fmt: skip
+        self._training().optimizer.append(new, view.id)
+
+    def _train_all(self, views: list[MapView], progress: Callable[[float], None]) -> None:
+        """Single-view steps over all keyframes in random order, with falling learning rates."""
+        trainer, total = self._training(), self.config.final_iterations
+        fills, prunes = {total // 3, 2 * total // 3}, max(total // 4, 1)
+        order: list[int] = []
+        for step in range(1, total + 1):
+            if not order:
+                order = list(self._random.permutation(len(views)))
+            trainer.set_rate(self.config.lr_final ** (step / total))
+            trainer.step(self._batch([views[order.pop()].id]))
+            if step % prunes == 0 and step < total:
+                self.prune()
+            if step in fills:
+                for view in views:
+                    self._insert(view, 0.0)
+            progress(step / total)
+        trainer.set_rate(1.0)
+
+    def _rendered(self, view: MapView) -> RenderedKeyframe:
+        output = render(self.map, self.cameras.render, view.T_cw)
+        depth = shown_depth(output, self.config.loss.min_alpha)
+        # Of a normal distribution the mean absolute difference is 2 / sqrt(pi) deviations.
+        share = output.alpha.square().clamp(min=1e-6) * depth.clamp(min=1e-6)
+        spread = output.distortion / share * (np.pi**0.5 / 2)
+        weight = ((depth > 0) & (spread < self.config.max_spread)).float()
+        length = output.normal.norm(dim=-1, keepdim=True).clamp(min=1e-6)
+        return RenderedKeyframe(
+            keyframe_id=view.id,
+            T_cw=view.T_cw,
+            depth=depth,
+            normal=torch.where(depth[..., None] > 0, output.normal / length, 0.0),
+            weight=weight,
+            image=view.keyframe.image,
+        )
+
+
+def _cameras(camera: Camera, config: MappingConfig) -> MapCameras:
+    working = max(camera.width, camera.height)
+    long_edge = min(config.render_long_edge, working)
+    photo = min(round(config.photo_scale * long_edge), working)
+    return MapCameras(camera, camera.with_long_edge(long_edge), camera.with_long_edge(photo))
+
+
+def _typical_depth(view: MapView) -> float:
+    """Median depth of the cells that the tracker is fairly sure of, else of all."""
+    inverse, information = view.keyframe.inverse_depth, view.keyframe.information
+    z = 1 / inverse.clamp(min=1e-3)
+    sure = z / information.clamp(min=1e-12).sqrt() < 0.2
+    return float(z[sure].median() if int(sure.sum()) > 8 else z.median())

@@ -1,0 +1,221 @@
+"""Compiled loops of the refinement: photometric steps on slanted patches, local plane fits.
+
+A surface is described per pixel by its inverse depth and the two slopes of inverse depth in units
+per render pixel: a plane in space has constant slopes. Rows are processed sample by sample so that
+the loops over x vectorise; all but the gathering of image samples does.
+"""
+
+import numpy as np
+from numba import njit
+
+_FAST = {"cache": True, "nogil": True, "fastmath": True, "error_model": "numpy"}
+ZERO = np.float32(0.0)
+ONE = np.float32(1.0)
+
+
+@njit(**_FAST)
+def _sample_row(image, a, b, y, ox, oy, rho, slope_x, slope_y, index, fu, fv, value, slope, inside):
+    """Samples of one image along one row, and their derivatives by inverse depth.
+
+    The patch sample (ox, oy) of pixel (x, y) has inverse depth rho + slope_x ox + slope_y oy and
+    projects to a p + rho b (homogeneous).
+    """
+    h, w = image.shape
+    flat = image.ravel()
+    right, down = np.uint32(1), np.uint32(w)
+    last_u, last_v = np.float32(w - 1.001), np.float32(h - 1.001)
+    s0, s1, s2 = np.float32(a[0, 0]), np.float32(a[1, 0]), np.float32(a[2, 0])
+    b0, b1, b2 = np.float32(b[0]), np.float32(b[1]), np.float32(b[2])
+    py = y + oy
+    c0 = np.float32(a[0, 0] * ox + a[0, 1] * py + a[0, 2])
+    c1 = np.float32(a[1, 0] * ox + a[1, 1] * py + a[1, 2])
+    c2 = np.float32(a[2, 0] * ox + a[2, 1] * py + a[2, 2])
+    for x in range(rho.shape[0]):
+        column = np.float32(np.int32(x))
+        r = rho[x] + ox * slope_x[x] + oy * slope_y[x]
+        q2 = c2 + s2 * column + r * b2
+        inverse = ONE / max(q2, np.float32(1e-3))
+        u = (c0 + s0 * column + r * b0) * inverse
+        v = (c1 + s1 * column + r * b1) * inverse
+        cu = min(max(u, ZERO), last_u)
+        cv = min(max(v, ZERO), last_v)
+        gone = abs(cu - u) + abs(cv - v) + max(np.float32(1e-3) - q2, ZERO)
+        inside[x] = ZERO if gone > ZERO else inside[x]
+        whole_u, whole_v = np.floor(cu), np.floor(cv)
+        fu[x] = cu - whole_u
+        fv[x] = cv - whole_v
+        index[x] = np.uint32(np.int32(whole_v * np.float32(w) + whole_u))
+        value[x] = (b0 - cu * b2) * inverse
+        slope[x] = (b1 - cv * b2) * inverse
+    for x in range(rho.shape[0]):
+        k = index[x]
+        left_top, right_top = flat[k], flat[k + right]
+        k += down
+        left_low, right_low = flat[k], flat[k + right]
+        top = left_top + fu[x] * (right_top - left_top)
+        low = left_low + fu[x] * (right_low - left_low)
+        across = (right_top - left_top) * (ONE - fv[x]) + (right_low - left_low) * fv[x]
+        slope[x] = across * value[x] + (low - top) * slope[x]
+        value[x] = top + fv[x] * (low - top)
+
+
+@njit(**_FAST)
+def photometric_step(
+    patches, offsets, weights, images, a, b, rho, slope_x, slope_y, floor, step, likeness, precision
+):
+    """One Gauss-Newton step per pixel on the zero-mean normalised patches of all neighbours.
+
+    patches (s, h, w): the reference at each patch sample; offsets (s, 2): (x, y) in render pixels;
+    weights (s, h, w): support weights. Writes the step of inverse depth, the mean NCC of the
+    neighbours that match, and the curvature of their sum of (1 - NCC) by inverse depth.
+    """
+    count, h, w = patches.shape
+    n = images.shape[0]
+    index = np.empty(w, np.uint32)
+    fu, fv, value, slope = (
+        np.empty(w, np.float32),
+        np.empty(w, np.float32),
+        np.empty(w, np.float32),
+        np.empty(w, np.float32),
+    )
+    inside = np.empty(w, np.float32)
+    sums = np.empty((10, w), np.float32)
+    total = np.empty((4, w), np.float32)
+    for y in range(h):
+        total[:] = ZERO
+        for j in range(n):
+            sums[:] = ZERO
+            inside[:] = ONE
+            for s in range(count):
+                _sample_row(
+                    images[j], a[j], b[j], np.float32(y), offsets[s, 0], offsets[s, 1],
+                    rho[y], slope_x[y], slope_y[y], index, fu, fv, value, slope, inside,
+                )
+                _accumulate(patches[s, y], weights[s, y], value, slope, sums)
+            _add_neighbour(sums, inside, floor, total)
+        for x in range(w):
+            weight = total[0, x] + np.float32(1e-6)
+            likeness[y, x] = total[1, x] / weight
+            precision[y, x] = total[3, x]
+            step[y, x] = total[2, x] / (total[3, x] + np.float32(1e-6))
+
+
+@njit(**_FAST)
+def _accumulate(reference, weight, value, slope, sums):
+    """Weighted first and second moments of reference a, sample b and derivative g."""
+    sw, sa, sb, sg, saa = sums[0], sums[1], sums[2], sums[3], sums[4]
+    sbb, sgg, sab, sag, sbg = sums[5], sums[6], sums[7], sums[8], sums[9]
+    for x in range(value.shape[0]):
+        m, p, q, g = weight[x], reference[x], value[x], slope[x]
+        mp, mq, mg = m * p, m * q, m * g
+        sw[x] += m
+        sa[x] += mp
+        sb[x] += mq
+        sg[x] += mg
+        saa[x] += mp * p
+        sbb[x] += mq * q
+        sgg[x] += mg * g
+        sab[x] += mp * q
+        sag[x] += mp * g
+        sbg[x] += mq * g
+
+
+@njit(**_FAST)
+def _add_neighbour(sums, inside, floor, total):
+    """NCC of one neighbour, its derivative and Gauss-Newton curvature, added with its weight."""
+    for x in range(inside.shape[0]):
+        norm = ONE / sums[0, x]
+        ma, mb, mg = sums[1, x] * norm, sums[2, x] * norm, sums[3, x] * norm
+        va = max(sums[4, x] * norm - ma * ma, ZERO) + floor
+        vb = max(sums[5, x] * norm - mb * mb, ZERO) + floor
+        vg = max(sums[6, x] * norm - mg * mg, ZERO)
+        ab = sums[7, x] * norm - ma * mb
+        ag = sums[8, x] * norm - ma * mg
+        bg = sums[9, x] * norm - mb * mg
+        scale = ONE / np.sqrt(va * vb)
+        ncc = ab * scale
+        climb = ag * scale - ncc * bg / vb
+        curve = max(vg / vb - (bg / vb) * (bg / vb), ZERO)
+        good = max(ncc - np.float32(0.4), ZERO)
+        weight = inside[x] * good * good
+        total[0, x] += weight
+        total[1, x] += weight * ncc
+        total[2, x] += weight * climb
+        total[3, x] += weight * curve
+
+
+@njit(**_FAST)
+def fit_planes(
+    rho, slope_x, slope_y, confidence, guide, radius, stride, contrast, tolerance, stiffness,
+    new_rho, new_x, new_y, support,
+):
+    """Weighted least-squares plane of inverse depth around each pixel (bilateral, robust).
+
+    Samples every ``stride`` pixels within ``radius`` samples. A sample counts by its confidence, its
+    likeness in colour 1 / (1 + contrast |dI|^2) over the channels of ``guide`` (c, h, w), and how
+    near it lies to the present plane: 1 / (1 + (d rho / (tolerance rho))^2). ``stiffness`` holds
+    the slopes at their present values. ``support`` is the sum of weights.
+    """
+    h, w = rho.shape
+    channels = guide.shape[0]
+    sums = np.empty((9, w), np.float32)
+    for y in range(h):
+        sums[:] = ZERO
+        for j in range(-radius, radius + 1):
+            yy = y + j * stride
+            if yy < 0 or yy >= h:
+                continue
+            for i in range(-radius, radius + 1):
+                dx = i * stride
+                first, last = max(0, -dx), min(w, w - dx)
+                _add_samples(
+                    rho, slope_x, slope_y, confidence, guide, channels, y, yy, dx, first, last,
+                    contrast, tolerance, sums,
+                )
+        for x in range(w):
+            s0, sx, sy = sums[0, x] + np.float32(1e-9), sums[1, x], sums[2, x]
+            reach = np.float32(stride * stride)
+            hold = stiffness * reach
+            xx = sums[3, x] - sx * sx / s0 + hold
+            xy = sums[4, x] - sx * sy / s0
+            yy_ = sums[5, x] - sy * sy / s0 + hold
+            rx = sums[7, x] - sx * sums[6, x] / s0
+            ry = sums[8, x] - sy * sums[6, x] / s0
+            det = xx * yy_ - xy * xy + np.float32(1e-12)
+            gx = (rx * yy_ - ry * xy) / det
+            gy = (ry * xx - rx * xy) / det
+            new_rho[y, x] = rho[y, x] + (sums[6, x] - gx * sx - gy * sy) / s0
+            new_x[y, x] = slope_x[y, x] + gx
+            new_y[y, x] = slope_y[y, x] + gy
+            support[y, x] = sums[0, x]
+
+
+@njit(**_FAST)
+def _add_samples(
+    rho, slope_x, slope_y, confidence, guide, channels, y, yy, dx, first, last, contrast,
+    tolerance, sums,
+):
+    """Moments of the residuals to the present planes of row y at samples (dx, yy - y) away."""
+    here, there = rho[y], rho[yy]
+    gx, gy, sure = slope_x[y], slope_y[y], confidence[yy]
+    fx, fy = np.float32(dx), np.float32(yy - y)
+    t0, t1, t2, t3, t4 = sums[0], sums[1], sums[2], sums[3], sums[4]
+    t5, t6, t7, t8 = sums[5], sums[6], sums[7], sums[8]
+    g0, g1, g2 = guide[0, y], guide[1, y], guide[2, y]
+    k0, k1, k2 = guide[0, yy], guide[1, yy], guide[2, yy]
+    for x in range(first, last):
+        r = there[x + dx] - here[x] - fx * gx[x] - fy * gy[x]
+        c0, c1, c2 = g0[x] - k0[x + dx], g1[x] - k1[x + dx], g2[x] - k2[x + dx]
+        far = r / (tolerance * here[x])
+        m = sure[x + dx] / (
+            (ONE + contrast * (c0 * c0 + c1 * c1 + c2 * c2)) * (ONE + far * far)
+        )
+        t0[x] += m
+        t1[x] += m * fx
+        t2[x] += m * fy
+        t3[x] += m * fx * fx
+        t4[x] += m * fx * fy
+        t5[x] += m * fy * fy
+        t6[x] += m * r
+        t7[x] += m * r * fx
+        t8[x] += m * r * fy

@@ -1,0 +1,98 @@
+"""What the mapper keeps of a keyframe."""
+
+from dataclasses import dataclass, field, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from geogs.config import LossConfig
+from geogs.geometry.camera import Camera
+from geogs.geometry.lie import se3_inverse
+from geogs.losses.multi_view import PhotoView
+from geogs.losses.single_view import ViewConstants
+from geogs.mapping.depth_view import DepthView, KeyframeDepth, depth_view
+from geogs.types import Keyframe
+
+
+@dataclass(frozen=True)
+class MapCameras:
+    """One camera at the three sizes that mapping works with."""
+
+    working: Camera
+    """Of the images as the tracker sees them."""
+    render: Camera
+    """Of the rendered maps and keyframe depths."""
+    photo: Camera
+    """Of the images that L_mv compares."""
+
+
+@dataclass
+class MapView:
+    """A keyframe with everything its losses need; the pose and the depths change over time."""
+
+    keyframe: Keyframe
+    depth_view: DepthView
+    photo: PhotoView
+    depth: KeyframeDepth | None = None
+    constants: ViewConstants | None = None
+    """None until the keyframe has a depth."""
+    rendered_depth: Float[Tensor, "h w"] | None = None
+    """The map's last rendering from here, for occlusion tests by others."""
+    partners: list[int] = field(default_factory=list)
+    """Ids of the keyframes whose images check this one's depth, best first."""
+
+    @staticmethod
+    def of(keyframe: Keyframe, cameras: MapCameras, loss: LossConfig) -> "MapView":
+        """The view of a keyframe that the tracker settled."""
+        return MapView(
+            keyframe,
+            depth_view(keyframe, cameras.render),
+            PhotoView.prepare(keyframe.image, cameras.photo, keyframe.T_cw, loss.photo_blur),
+        )
+
+    @property
+    def id(self) -> int:
+        """The keyframe's id."""
+        return self.keyframe.id
+
+    @property
+    def T_cw(self) -> Float[Tensor, "4 4"]:
+        """World to camera, float64."""
+        return self.keyframe.T_cw
+
+    @property
+    def T_wc(self) -> Float[Tensor, "4 4"]:
+        """Camera to world, float64."""
+        return se3_inverse(self.keyframe.T_cw)
+
+    def follow(self, keyframe: Keyframe) -> None:
+        """Take over the tracker's new pose and grid depth."""
+        self.keyframe = keyframe
+        self.depth_view = replace(
+            self.depth_view,
+            T_cw=keyframe.T_cw.numpy(),
+            inverse_depth=keyframe.inverse_depth.cpu().numpy(),
+            information=keyframe.information.cpu().numpy(),
+        )
+        self.photo = self.photo.at(keyframe.T_cw)
+
+    def move(self, T_cw: Float[Tensor, "4 4"]) -> None:
+        """Take over a new pose alone."""
+        self.follow(replace(self.keyframe, T_cw=T_cw))
+
+    def set_depth(self, depth: KeyframeDepth, cameras: MapCameras) -> None:
+        """Take over a dense depth and what the losses derive from it."""
+        self.depth = depth
+        self.constants = ViewConstants.prepare(
+            self.keyframe.image,
+            cameras.render,
+            torch.from_numpy(depth.depth),
+            torch.from_numpy(depth.confidence),
+        )
+
+    def rescale(self, factor: float, cameras: MapCameras) -> None:
+        """Multiply the dense depth, after the map's unit changed around this keyframe."""
+        if self.depth is not None and factor != 1.0:
+            scaled = replace(self.depth, depth=self.depth.depth * factor)
+            self.set_depth(scaled, cameras)

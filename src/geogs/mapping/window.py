@@ -1,0 +1,45 @@
+"""Which views are trained together, and which check each other."""
+
+import numpy as np
+
+from geogs.config import MappingConfig, PhotoConfig
+from geogs.mapping.covisibility import pair_score
+from geogs.mapping.view import MapView
+
+
+def draw_views(
+    mapped: list[int], step: int, config: MappingConfig, random: np.random.Generator
+) -> list[int]:
+    """Ids of the views of one training step: from the recent window plus random older keyframes.
+
+    With ``views_per_step`` 0 the whole window and its history, as the paper sums them; otherwise
+    that many of them at random, the newest in every third step.
+    """
+    window, older = mapped[-config.window :], mapped[: -config.window]
+    drawn = min(config.history, len(older))
+    history = [older[i] for i in random.choice(len(older), drawn, replace=False)] if drawn else []
+    pool = window + history
+    if config.views_per_step <= 0:
+        return pool
+    newest = [mapped[-1]] if step % 3 == 0 else []
+    more = max(0, min(config.views_per_step, len(pool)) - len(newest))
+    rest = [pool[i] for i in random.choice(len(pool), more, replace=False)]
+    return list(dict.fromkeys(newest + rest))
+
+
+def choose_partners(
+    view: MapView, others: list[MapView], depth: float, config: PhotoConfig
+) -> list[int]:
+    """Ids of the keyframes best placed to check a view's depth by photo-consistency, best first."""
+    T_wc = view.T_wc.numpy()
+    scored = []
+    for other in others:
+        if other.id != view.id:
+            score = pair_score(
+                T_wc, other.T_wc.numpy(), depth, best=config.parallax,
+                smallest=config.min_parallax, largest=config.max_parallax,
+                looking_within=config.looking_within,
+            )  # fmt: skip
+            if np.isfinite(score):
+                scored.append((score, other.id))
+    return [i for _, i in sorted(scored)[: config.candidates]]

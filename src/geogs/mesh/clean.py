@@ -1,0 +1,67 @@
+"""What is removed from an extracted mesh."""
+
+import numpy as np
+from jaxtyping import Int
+
+from geogs.mesh.types import Mesh
+
+
+def remove_degenerate_faces(mesh: Mesh, tolerance: float = 1e-12) -> Mesh:
+    """Without faces that repeat a vertex or whose squared area is below ``tolerance`` of the
+    squared mean edge length squared, and without the vertices this leaves unused."""
+    corners = mesh.vertices.astype(np.float64)[mesh.faces]
+    edges = corners - np.roll(corners, 1, axis=1)
+    squared = (edges**2).sum(-1)
+    area = (np.cross(edges[:, 0], edges[:, 1]) ** 2).sum(-1)
+    distinct = (mesh.faces != np.roll(mesh.faces, 1, axis=1)).all(1)
+    scale = squared.mean() if len(squared) else 0.0
+    return keep_faces(mesh, distinct & (area > tolerance * scale**2))
+
+
+def keep_components(
+    mesh: Mesh, min_faces: int, min_fraction: float = 0.0, max_components: int | None = None
+) -> Mesh:
+    """Connected parts that are large enough.
+
+    A part stays if it has at least ``min_faces`` faces and at least ``min_fraction`` of the faces
+    of the largest; of those the ``max_components`` largest, all if none is given.
+    """
+    if not len(mesh.faces):
+        return mesh
+    label, count = _components(mesh)
+    keep = count >= max(min_faces, min_fraction * count.max())
+    if max_components is not None:
+        rank = np.empty(len(count), int)
+        rank[np.argsort(-count, kind="stable")] = np.arange(len(count))
+        keep &= rank < max_components
+    return keep_faces(mesh, keep[label])
+
+
+def keep_faces(mesh: Mesh, keep: np.ndarray) -> Mesh:
+    """The faces where ``keep`` is true and the vertices that they use."""
+    if keep.all():
+        return mesh
+    faces = mesh.faces[keep]
+    used = np.zeros(len(mesh.vertices), bool)
+    used[faces] = True
+    renumbered = (np.cumsum(used) - 1).astype(np.int32)
+    return Mesh(
+        mesh.vertices[used],
+        renumbered[faces].reshape(-1, 3),
+        mesh.normals[used],
+        None if mesh.colours is None else mesh.colours[used],
+    )
+
+
+def _components(mesh: Mesh) -> tuple[Int[np.ndarray, "m"], Int[np.ndarray, "c"]]:
+    """Label of each face and number of faces of each label; faces connect by a shared vertex."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    a, b = mesh.faces[:, [0, 1]].ravel(), mesh.faces[:, [1, 2]].ravel()
+    n = len(mesh.vertices)
+    links = coo_matrix((np.ones(len(a), np.int8), (a, b)), shape=(n, n))
+    _, of_vertex = connected_components(links, directed=False)
+    of_face = of_vertex[mesh.faces[:, 0]]
+    names, label, count = np.unique(of_face, return_inverse=True, return_counts=True)
+    return label.reshape(-1), count

@@ -1,0 +1,159 @@
+"""Mesh extraction from depth maps in one call."""
+
+import logging
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from geogs.config import MeshConfig
+from geogs.errors import InputError
+from geogs.mesh.clean import keep_components, remove_degenerate_faces
+from geogs.mesh.colour import colour_mesh
+from geogs.mesh.surface import extract_surface
+from geogs.mesh.tsdf import BLOCK, BYTES_PER_BLOCK, SparseTsdf, band_blocks, pack
+from geogs.mesh.types import DepthMapView, Mesh
+
+_log = logging.getLogger(__name__)
+_SAMPLED_VIEWS = 40
+_SAMPLED_POINTS = 400_000
+_FACES_PER_SQUARE = 2.4
+"""Marching cubes makes about so many triangles per voxel face of surface."""
+
+
+@dataclass(frozen=True, slots=True)
+class VolumePlan:
+    """How a scene is going to be fused, chosen from its depth maps."""
+
+    voxel: float
+    """Map units."""
+    truncation: float
+    """Voxels."""
+    max_depth: float
+    """Map units; pixels farther away are left out."""
+    blocks: int
+    """Estimated number."""
+
+    @property
+    def bytes(self) -> int:
+        """Estimated memory of the volume; extraction needs little more."""
+        return self.blocks * BYTES_PER_BLOCK
+
+
+def plan_volume(views: Sequence[DepthMapView], config: MeshConfig) -> VolumePlan:
+    """Choose voxel size and depth range from the depth maps, before anything is allocated.
+
+    The voxel is ``voxel_per_pixel`` footprints of a pixel at the median depth, larger if the
+    triangle budget or the memory limit demand it. The depth range is twice the 95 % quantile,
+    so that a few stray far pixels do not blow up the volume. Looks at 40 views at most.
+
+    Raises InputError if no pixel has a depth or a voxel size is given that does not fit into the
+    memory limit.
+    """
+    stride = max(1, len(views) // _SAMPLED_VIEWS)
+    sampled = [views[i] for i in range(0, len(views), stride)]
+    depths, footprints, points = _sample_points(sampled)
+    if not len(depths):
+        raise InputError("No depth map has a valid pixel, so there is no surface to extract.")
+    max_depth = config.max_depth or 2 * float(depths.quantile(0.95))
+    points = points[depths <= max_depth]
+    limit = config.memory_limit * 2**30
+    if config.voxel is not None:
+        blocks = len(band_blocks(points, config.voxel, config.truncation))
+        if blocks * BYTES_PER_BLOCK > limit:
+            raise InputError(
+                f"A voxel of {config.voxel:g} needs about {blocks * BYTES_PER_BLOCK / 2**30:.1f} "
+                f"GiB for the volume, more than the limit of {config.memory_limit:g}; use a "
+                f"larger voxel or leave it to be chosen."
+            )
+        return VolumePlan(config.voxel, config.truncation, max_depth, blocks)
+    voxel = config.voxel_per_pixel * float(footprints.median())
+    voxel = max(voxel, _budget_voxel(points, voxel, config.triangle_budget))
+    while (n := len(band_blocks(points, voxel, config.truncation))) * BYTES_PER_BLOCK > limit:
+        voxel *= 1.1
+    return VolumePlan(voxel, config.truncation, max_depth, n)
+
+
+def extract_mesh(
+    views: Sequence[DepthMapView],
+    config: MeshConfig | None = None,
+    progress: Callable[[str, int, int], None] | None = None,
+) -> Mesh:
+    """Fuse depth maps and return their surface, cleaned and coloured from the views' images.
+
+    ``views`` is gone through up to three times (plan, fuse, colour) in order, so a lazy sequence
+    may render on demand. The work is done on the device of the first depth map. ``progress`` is
+    called with the stage ("fuse", "colour"), the views done and their number.
+
+    Raises InputError if there are no views, no valid depth or no surface.
+    """
+    config = config or MeshConfig()
+    if not len(views):
+        raise InputError("There are no depth maps to make a mesh from.")
+    plan = plan_volume(views, config)
+    _log.info("voxel %.4g, about %.0f MiB", plan.voxel, plan.bytes / 2**20)
+    tsdf = fuse(views, plan, progress)
+    mesh = extract_surface(tsdf, config.min_weight)
+    del tsdf
+    mesh = remove_degenerate_faces(mesh)
+    mesh = keep_components(
+        mesh, config.min_component_faces, config.min_component_fraction, config.max_components
+    )
+    if not len(mesh.faces):
+        raise InputError(
+            f"No surface was seen with a total weight of {config.min_weight:g}; lower min-weight "
+            f"or use more views."
+        )
+    if config.colour and any(view.image is not None for view in views):
+        report = None if progress is None else lambda done, of: progress("colour", done, of)
+        mesh = colour_mesh(mesh, views, 2 * plan.voxel, report)
+    return mesh
+
+
+def fuse(
+    views: Sequence[DepthMapView],
+    plan: VolumePlan,
+    progress: Callable[[str, int, int], None] | None = None,
+) -> SparseTsdf:
+    """All views in one volume, on the device of the first depth map."""
+    device = views[0].depth.device
+    tsdf = SparseTsdf(plan.voxel, plan.truncation, device, plan.blocks)
+    for number, view in enumerate(views):
+        weight = torch.where(view.depth <= plan.max_depth, view.weight, 0.0)
+        tsdf.integrate(view.depth, weight, view.camera, view.T_cw)
+        if progress:
+            progress("fuse", number + 1, len(views))
+    return tsdf
+
+
+def _sample_points(
+    views: Sequence[DepthMapView],
+) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"], Float[Tensor, "n 3"]]:
+    """Depths, pixel footprints and world points of a regular part of all pixels, on the CPU."""
+    depths, footprints, points = [], [], []
+    pixels = sum(view.depth.numel() for view in views)
+    step = max(1, round((pixels / _SAMPLED_POINTS) ** 0.5))
+    for view in views:
+        valid = view.valid()[::step, ::step]
+        depth = view.depth[::step, ::step][valid].cpu().double()
+        rays = view.camera.rays(torch.float64)[::step, ::step][valid.cpu()]
+        T_cw = view.T_cw.cpu().double()
+        depths.append(depth)
+        footprints.append(depth / (0.5 * (view.camera.fx + view.camera.fy)))
+        points.append((rays * depth[:, None] - T_cw[:3, 3]) @ T_cw[:3, :3])
+    return torch.cat(depths), torch.cat(footprints), torch.cat(points)
+
+
+def _budget_voxel(points: Float[Tensor, "n 3"], voxel: float, triangles: int) -> float:
+    """The voxel with which the surface through the points has so many triangles.
+
+    The area is that of the cells of a coarse grid that hold a point: a plane at any slant meets
+    about 1.5 cells of area side^2 per side^2.
+    """
+    side = BLOCK * voxel
+    cells = len(torch.unique(pack(torch.floor(points / side).long())))
+    area = cells * side**2 / 1.5
+    return math.sqrt(_FACES_PER_SQUARE * area / triangles)

@@ -1,0 +1,233 @@
+"""Truncated signed distances of depth maps in sparse blocks of 8 x 8 x 8 voxels.
+
+Curless and Levoy 1996, in blocks allocated where surface was seen (voxel hashing, Niessner 2013).
+Blocks are found by binary search in their sorted keys, so everything is plain batched torch and
+runs on any device.
+"""
+
+import math
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from geogs.geometry.camera import Camera
+
+BLOCK = 8
+"""Voxels along a side of a block."""
+BYTES_PER_BLOCK = BLOCK**3 * 2 * 4
+_HALF = BLOCK // 2
+_BITS = 20
+_CHUNK = {"cpu": 128, "cuda": 32768}
+
+
+def pack(coordinates: Int[Tensor, "n 3"]) -> Int[Tensor, "n"]:
+    """One sortable key of integer coordinates in [-2^20, 2^20)."""
+    x, y, z = (coordinates.long() + 2**_BITS).unbind(-1)
+    return (((x << (_BITS + 1)) + y) << (_BITS + 1)) + z
+
+
+def unpack(keys: Int[Tensor, "n"]) -> Int[Tensor, "n 3"]:
+    """The coordinates of :func:`pack`."""
+    mask = 2 ** (_BITS + 1) - 1
+    parts = [keys >> (2 * (_BITS + 1)), (keys >> (_BITS + 1)) & mask, keys & mask]
+    return torch.stack(parts, -1) - 2**_BITS
+
+
+def band_blocks(
+    points: Float[Tensor, "n 3"], voxel: float, truncation: float
+) -> Int[Tensor, "k 3"]:
+    """Coordinates of every block that comes within the truncation of a point.
+
+    Points are first gathered into half blocks, whose neighbours in reach of the truncation cover
+    the band around all of their points. ``truncation`` is in voxels.
+    """
+    cell = torch.floor(points / (voxel * _HALF)).long()
+    cell = cell[(cell.abs() < 2**_BITS - 2 * _HALF).all(-1)]
+    cell = unpack(torch.unique(pack(cell)))
+    reach = math.ceil(truncation / _HALF)
+    low, high = (cell - reach) >> 1, (cell + reach) >> 1
+    steps = torch.arange(reach + 1, device=points.device)
+    offsets = torch.cartesian_prod(steps, steps, steps)
+    blocks = low[:, None] + offsets
+    inside = (blocks <= high[:, None]).all(-1)
+    return unpack(torch.unique(pack(blocks[inside])))
+
+
+class SparseTsdf:
+    """Distances and weights of the voxels near observed surfaces.
+
+    Voxel (i, j, k) is the sample at ``voxel * (i, j, k)`` in the world frame. A distance is in
+    units of the truncation, in [-1, 1], positive in front of the surface; a weight is the sum of
+    the weights of the observations, 0 where the voxel was never seen.
+    """
+
+    def __init__(
+        self,
+        voxel: float,
+        truncation: float = 4.0,
+        device: torch.device | str = "cpu",
+        expected_blocks: int = 1024,
+    ) -> None:
+        """``voxel`` in map units, ``truncation`` in voxels."""
+        self.voxel = voxel
+        self.truncation = truncation
+        self.device = torch.device(device)
+        self._keys = torch.empty(0, dtype=torch.long, device=self.device)
+        self._slots = torch.empty(0, dtype=torch.long, device=self.device)
+        self._coordinates = torch.empty((0, 3), dtype=torch.long, device=self.device)
+        shape = (max(expected_blocks, 1), BLOCK**3)
+        self._distance = torch.ones(shape, device=self.device)
+        self._weight = torch.zeros(shape, device=self.device)
+        steps = torch.arange(BLOCK, device=self.device)
+        self._offsets = torch.cartesian_prod(steps, steps, steps)
+
+    def __len__(self) -> int:
+        """Number of blocks."""
+        return len(self._keys)
+
+    @property
+    def coordinates(self) -> Int[Tensor, "k 3"]:
+        """Block coordinates; block (a, b, c) begins at voxel 8 (a, b, c)."""
+        return self._coordinates
+
+    @property
+    def distance(self) -> Float[Tensor, "k 8 8 8"]:
+        """Signed distances over truncation, by block and x, y, z; 1 where never seen."""
+        return self._distance[: len(self)].unflatten(1, (BLOCK, BLOCK, BLOCK))
+
+    @property
+    def weight(self) -> Float[Tensor, "k 8 8 8"]:
+        """Sums of observation weights."""
+        return self._weight[: len(self)].unflatten(1, (BLOCK, BLOCK, BLOCK))
+
+    def integrate(
+        self,
+        depth: Float[Tensor, "h w"],
+        weight: Float[Tensor, "h w"],
+        camera: Camera,
+        T_cw: Float[Tensor, "4 4"],
+    ) -> None:
+        """Average one depth map in.
+
+        Each pixel is a small plane: its inverse depth with its slopes, which is exact on flat
+        surfaces at any slant and does not mix the two sides of a depth step. Every voxel of every
+        block in view is updated up to one truncation behind the surface, so free space seen later
+        clears what an earlier view put there. Distances are along the optical axis.
+        """
+        depth = depth.to(self.device, torch.float32)
+        weight = weight.to(self.device, torch.float32)
+        valid = torch.isfinite(depth) & (depth > 0) & (weight > 0)
+        if not bool(valid.any()):
+            return
+        T_cw = T_cw.to(self.device, torch.float64)
+        points = camera.back_project(depth)[valid].double()
+        points = (points - T_cw[:3, 3]) @ T_cw[:3, :3]
+        self._allocate(band_blocks(points, self.voxel, self.truncation))
+        table = _plane_table(camera, depth, torch.where(valid, weight, 0.0), valid)
+        far = float(depth[valid].max()) + self.truncation * self.voxel
+        projection = camera.matrix().to(self.device) @ T_cw[:3]
+        visible = self._in_view(camera, T_cw, far)
+        for slots in visible.split(_CHUNK.get(self.device.type, _CHUNK["cuda"])):
+            self._update(slots, projection, table, camera)
+
+    def _allocate(self, blocks: Int[Tensor, "k 3"]) -> None:
+        keys = pack(blocks)
+        if len(self):
+            place = torch.searchsorted(self._keys, keys).clamp(max=len(self) - 1)
+            keys = keys[self._keys[place] != keys]
+        if not len(keys):
+            return
+        old, total = len(self), len(self) + len(keys)
+        self._reserve(total)
+        slots = torch.arange(old, total, device=self.device)
+        self._keys, order = torch.cat([self._keys, keys]).sort()
+        self._slots = torch.cat([self._slots, slots])[order]
+        self._coordinates = torch.cat([self._coordinates, unpack(keys)])
+
+    def _reserve(self, blocks: int) -> None:
+        capacity = len(self._distance)
+        if blocks <= capacity:
+            return
+        extra = (max(blocks, capacity + capacity // 2) - capacity, BLOCK**3)
+        ones, zeros = self._distance.new_ones(extra), self._weight.new_zeros(extra)
+        self._distance = torch.cat([self._distance, ones])
+        self._weight = torch.cat([self._weight, zeros])
+
+    def _in_view(self, camera: Camera, T_cw: Tensor, far: float) -> Int[Tensor, "k"]:
+        """Slots of the blocks whose bounding sphere meets the view frustum up to ``far``."""
+        side = self.voxel * BLOCK
+        radius = side * 0.5 * 3**0.5
+        centre = (self._coordinates + 0.5).double() * side
+        x, y, z = (centre @ T_cw[:3, :3].mT + T_cw[:3, 3]).unbind(-1)
+        inside = (z > -radius) & (z < far + radius)
+        for p, f, c, size in (
+            (x, camera.fx, camera.cx, camera.width),
+            (y, camera.fy, camera.cy, camera.height),
+        ):
+            for slope, sign in (((-0.5 - c) / f, 1.0), ((size - 0.5 - c) / f, -1.0)):
+                inside &= sign * (p - slope * z) > -radius * (1 + slope**2) ** 0.5
+        return inside.nonzero()[:, 0]
+
+    def _update(
+        self,
+        slots: Int[Tensor, "k"],
+        projection: Float[Tensor, "3 4"],
+        table: Float[Tensor, "p 5"],
+        camera: Camera,
+    ) -> None:
+        block = projection[:, :3] @ (self._coordinates[slots].double().mT * BLOCK * self.voxel)
+        block = (block + projection[:, 3:]).float()
+        local = (projection[:, :3] @ (self._offsets.double().mT * self.voxel)).float()
+        z = block[2, :, None] + local[2]
+        inverse = 1.0 / z
+        u = (block[0, :, None] + local[0]) * inverse
+        v = (block[1, :, None] + local[1]) * inverse
+        column, row = u.round(), v.round()
+        inside = (z > 1e-6) & (column >= 0) & (row >= 0)
+        inside &= (column < camera.width) & (row < camera.height)
+        pixel = torch.where(inside, row * camera.width + column, 0.0).long()
+        sample = table[pixel.flatten()].unflatten(0, z.shape)
+        surface = sample[..., 0] + sample[..., 1] * (u - column) + sample[..., 2] * (v - row)
+        ahead = (1.0 - z * surface) * sample[..., 4] / (self.truncation * self.voxel)
+        import os
+        F = float(os.environ.get("FADE", "1")) / self.truncation
+        M = int(os.environ.get("MODE", "0"))
+        along = (1.0 / surface - z) / (self.truncation * self.voxel)
+        if M == 0: ahead = along
+        fade = ((1.0 + along) / (1.0 - F)).clamp(max=1.0)
+        if M == 2: fade = fade * (ahead / along).clamp(0.1, 1)
+        gain = torch.where(inside & (along > -1.0), sample[..., 3] * fade, 0.0)
+        old = self._weight[slots]
+        new = old + gain
+        change = (ahead.clamp(max=1.0) - self._distance[slots]) * (gain / new.clamp(min=1e-20))
+        self._distance[slots] += torch.where(gain > 0, change, 0.0)
+        self._weight[slots] = new
+
+
+def _plane_table(
+    camera: Camera, depth: Float[Tensor, "h w"], weight: Float[Tensor, "h w"], valid: Bool[Tensor, "h w"]
+) -> Float[Tensor, "p 5"]:
+    """Inverse depth, its slopes along u and v (1 / map unit / pixel) and weight of each pixel.
+
+    A slope is the smaller of the differences to the two neighbours, zero where they disagree in
+    sign or a neighbour is invalid (minmod), so it never reaches across a depth step.
+    """
+    inverse = torch.where(valid, 1.0 / torch.where(valid, depth, 1.0), 1.0)
+
+    def slope(axis: int) -> Tensor:
+        difference = inverse.diff(dim=axis)
+        length = depth.shape[axis]
+        both = valid.narrow(axis, 1, length - 1) & valid.narrow(axis, 0, length - 1)
+        difference = torch.where(both, difference, 0.0)
+        edge = torch.zeros_like(inverse.narrow(axis, 0, 1))
+        before = torch.cat([edge, difference], axis)
+        after = torch.cat([difference, edge], axis)
+        smaller = torch.where(before.abs() < after.abs(), before, after)
+        return torch.where(before * after > 0, smaller, 0.0)
+
+    gu, gv = slope(1), slope(0)
+    u = torch.arange(depth.shape[1], device=depth.device) - camera.cx
+    v = torch.arange(depth.shape[0], device=depth.device)[:, None] - camera.cy
+    normal = torch.stack([camera.fx * gu, camera.fy * gv, inverse - gu * u - gv * v], -1)
+    return torch.stack([inverse, gu, gv, weight, 1 / normal.norm(dim=-1)], -1).flatten(0, 1)

@@ -1,0 +1,186 @@
+"""Disks into the camera: one record and one box of pixels each, and the way back.
+
+The arithmetic is float64 (disks are few compared with pixels), so that disks seen edge-on keep
+their digits. Vectors are tuples of three floats.
+"""
+
+import math
+
+import numba
+import numpy as np
+
+from geogs.splat.cpu.layout import (
+    MAX_REACH_RATIO,
+    MIN_ALPHA,
+    MIN_FACING,
+    PER_DISK,
+    TILE_HEIGHT,
+    TILE_WIDTH,
+)
+
+_INLINE = {**PER_DISK, "cache": False}
+_SQRT_HALF = math.sqrt(0.5)
+
+
+@numba.njit(**_INLINE)
+def dot(a, b):
+    """a . b"""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@numba.njit(**_INLINE)
+def rotate(T, v):
+    """R v for the left 3 x 3 block of T."""
+    return (
+        T[0, 0] * v[0] + T[0, 1] * v[1] + T[0, 2] * v[2],
+        T[1, 0] * v[0] + T[1, 1] * v[1] + T[1, 2] * v[2],
+        T[2, 0] * v[0] + T[2, 1] * v[1] + T[2, 2] * v[2],
+    )
+
+
+@numba.njit(**_INLINE)
+def axes_of(w, x, y, z):
+    """Columns of the rotation matrix of a unit quaternion."""
+    return (
+        (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)),
+        (2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)),
+        (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)),
+    )
+
+
+@numba.njit(**_INLINE)
+def unit_quaternion(quaternion, i):
+    """The normalised quaternion of disk i, and 1 / norm."""
+    w, x, y, z = (
+        np.float64(quaternion[i, 0]),
+        np.float64(quaternion[i, 1]),
+        np.float64(quaternion[i, 2]),
+        np.float64(quaternion[i, 3]),
+    )
+    inverse_norm = 1 / math.sqrt(w * w + x * x + y * y + z * z)
+    return (w * inverse_norm, x * inverse_norm, y * inverse_norm, z * inverse_norm), inverse_norm
+
+
+@numba.njit(**_INLINE)
+def place(position, i, T):
+    """Disk i's position in the world and in the camera."""
+    p = (np.float64(position[i, 0]), np.float64(position[i, 1]), np.float64(position[i, 2]))
+    c = rotate(T, p)
+    return p, (c[0] + T[0, 3], c[1] + T[1, 3], c[2] + T[2, 3])
+
+
+@numba.njit(**_INLINE)
+def bounded_facing(normal, center):
+    """n . c kept away from zero, and whether it had to be."""
+    facing = dot(normal, center)
+    least = MIN_FACING * math.sqrt(dot(center, center))
+    if abs(facing) < least:
+        return (-least if facing < 0 else least), True
+    return facing, False
+
+
+@numba.njit(**_INLINE)
+def pixel_range(middle, half, count):
+    """Pixels [first, last) of a row of ``count`` whose centres lie within middle +- half."""
+    low = min(max(middle - half, -1.0), float(count))
+    high = min(max(middle + half, -1.0), float(count))
+    return max(int(math.ceil(low)), 0), min(int(math.floor(high)) + 1, count)
+
+
+@numba.njit(**_INLINE)
+def extent(slope, axis, radius2, d):
+    """Offset of the middle and half the size, along one image axis, of a projected disk.
+
+    ``slope`` = derivative of the pixel times depth in the disk's two coordinates, ``axis`` that of
+    depth, d = radius2 |axis|^2 - c_z^2 < 0.
+    """
+    middle = radius2 * (slope[0] * axis[0] + slope[1] * axis[1]) / d
+    inside = middle * middle - radius2 * (slope[0] * slope[0] + slope[1] * slope[1]) / d
+    return middle, math.sqrt(max(inside, 0.0))
+
+
+@numba.njit(**_INLINE)
+def box_of(mx, my, c, u, v, opacity, intrinsics, width, height):
+    """Pixels (x0, x1, y0, y1) that the disk can reach with at least ``MIN_ALPHA``.
+
+    ``u`` and ``v`` are the scaled tangents in the camera. The radius in deviations follows from the
+    opacity; the low-pass Gaussian about the projected centre is included. A disk that reaches
+    behind the camera has no bounded outline and gets the whole image.
+    """
+    fx, fy = intrinsics[0], intrinsics[1]
+    radius2 = 2 * math.log(opacity / MIN_ALPHA)
+    blur = math.sqrt(radius2 / 2) + 0.01
+    d = radius2 * (u[2] * u[2] + v[2] * v[2]) - c[2] * c[2]
+    if d > -1e-6 * c[2] * c[2]:
+        return 0, width, 0, height
+    axis = (u[2], v[2])
+    x, y = c[0] / c[2], c[1] / c[2]
+    ox, hx = extent((fx * (u[0] - x * u[2]), fx * (v[0] - x * v[2])), axis, radius2, d)
+    oy, hy = extent((fy * (u[1] - y * u[2]), fy * (v[1] - y * v[2])), axis, radius2, d)
+    low, high = min(ox - hx, -blur), max(ox + hx, blur)
+    x0, x1 = pixel_range(mx + (low + high) / 2, (high - low) / 2 + 0.01, width)
+    low, high = min(oy - hy, -blur), max(oy + hy, blur)
+    y0, y1 = pixel_range(my + (low + high) / 2, (high - low) / 2 + 0.01, height)
+    return x0, x1, y0, y1
+
+
+@numba.njit(**_INLINE)
+def sigmoid(x):
+    """1 / (1 + exp(-x))"""
+    return 1 / (1 + math.exp(-np.float64(x)))
+
+
+@numba.njit(**_INLINE)
+def is_usable(position, quaternion, log_scale, opacity_logit, i):
+    """Whether disk i's numbers are finite, its quaternion not zero and its scale representable."""
+    total = position[i, 0] + position[i, 1] + position[i, 2] + opacity_logit[i]
+    q = abs(quaternion[i, 0]) + abs(quaternion[i, 1]) + abs(quaternion[i, 2])
+    q += abs(quaternion[i, 3])
+    s = max(abs(log_scale[i, 0]), abs(log_scale[i, 1])) + 0 * (log_scale[i, 0] + log_scale[i, 1])
+    return abs(total) < np.inf and 0 < q < np.inf and s < 80
+
+
+@numba.njit(**PER_DISK)
+def project_disks(
+    position, quaternion, log_scale, opacity_logit, T, intrinsics, near, width, height,
+    start, stop, records, boxes, pairs,
+):  # fmt: skip
+    """Fill records, boxes (x0, x1, y0, y1) and the number of tiles touched of disks start..stop.
+
+    ``T`` is (3, 4) world to camera, float64. A disk that no pixel can blend touches no tile.
+    """
+    fx, fy, cx, cy = intrinsics
+    for i in range(start, stop):
+        pairs[i] = 0
+        _, c = place(position, i, T)
+        if not c[2] > near or not is_usable(position, quaternion, log_scale, opacity_logit, i):
+            continue
+        opacity = sigmoid(opacity_logit[i])
+        if opacity < MIN_ALPHA:
+            continue
+        tu, tv, n = axes_of(*unit_quaternion(quaternion, i)[0])
+        a, b, n = rotate(T, tu), rotate(T, tv), rotate(T, n)
+        su, sv = math.exp(np.float64(log_scale[i, 0])), math.exp(np.float64(log_scale[i, 1]))
+        u, v = (su * a[0], su * a[1], su * a[2]), (sv * b[0], sv * b[1], sv * b[2])
+        mx, my = fx * c[0] / c[2] + cx, fy * c[1] / c[2] + cy
+        x0, x1, y0, y1 = box_of(mx, my, c, u, v, opacity, intrinsics, width, height)
+        if x0 >= x1 or y0 >= y1:
+            continue
+        boxes[i, 0], boxes[i, 1], boxes[i, 2], boxes[i, 3] = x0, x1, y0, y1
+        columns = (x1 - 1) // TILE_WIDTH - x0 // TILE_WIDTH + 1
+        pairs[i] = columns * ((y1 - 1) // TILE_HEIGHT - y0 // TILE_HEIGHT + 1)
+        facing, _ = bounded_facing(n, c)
+        ex, ey = n[0] / facing, n[1] / facing
+        ac, bc = dot(a, c), dot(b, c)
+        ku, kv = _SQRT_HALF / su, _SQRT_HALF / sv
+        reach = 3 * math.sqrt(u[2] * u[2] + v[2] * v[2])
+        away = -1.0 if facing > 0 else 1.0
+        record = records[i]
+        record[0], record[1] = mx, my
+        record[2], record[3] = ku * (a[0] - ac * ex) / fx, ku * (a[1] - ac * ey) / fy
+        record[4], record[5] = kv * (b[0] - bc * ex) / fx, kv * (b[1] - bc * ey) / fy
+        record[6], record[7], record[8] = ex / fx, ey / fy, 1 / c[2]
+        record[9] = opacity
+        record[10], record[11], record[12] = away * n[0], away * n[1], away * n[2]
+        record[13] = c[2] - min(reach, c[2] - near)
+        record[14] = c[2] + min(reach, MAX_REACH_RATIO * c[2])

@@ -1,0 +1,100 @@
+"""Local-plane driven initialisation of disks (paper, Sec. "Local-plane driven initialization")."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from geogs.geometry.lie import matrix_to_quaternion
+from geogs.geometry.neighbors import nearest_neighbors
+from geogs.splat.map import DiskParameters
+
+
+@dataclass(frozen=True)
+class LocalPlane:
+    """Plane fitted to the neighbourhood of each point."""
+
+    normal: Float[Tensor, "n 3"]
+    """Unit, the eigenvector of the smallest eigenvalue, sign arbitrary."""
+    tangent: Float[Tensor, "n 3"]
+    """Unit, the eigenvector of the largest eigenvalue."""
+    planarity: Float[Tensor, "n"]
+    """(l1 - l0) / l2 in [0, 1]: near 1 on an evenly sampled plane, 0 on a line or a blob."""
+    spacing: Float[Tensor, "n"]
+    """Root mean square distance to the three nearest other points, map units."""
+
+
+def fit_local_planes(
+    points: Float[Tensor, "n 3"], context: Float[Tensor, "m 3"], k: int
+) -> LocalPlane:
+    """PCA over the k nearest of ``points`` and ``context``, the point itself included.
+
+    Source: Eq. planarity of the paper; the spacing is 3DGS's rule for initial scales.
+    """
+    union = torch.cat([points, context]).double()
+    distances, indices = nearest_neighbors(points.double(), union, k + 1)
+    neighbours = union[indices]
+    centred = neighbours - neighbours.mean(1, keepdim=True)
+    eigenvalues, vectors = torch.linalg.eigh(centred.mT @ centred)
+    low, middle, high = eigenvalues.clamp(min=0).unbind(-1)
+    spacing = distances[:, 1:4].square().mean(1).sqrt()
+    return LocalPlane(
+        normal=vectors[..., 0].to(points.dtype),
+        tangent=vectors[..., 2].to(points.dtype),
+        planarity=((middle - low) / high.clamp(min=1e-30)).to(points.dtype),
+        spacing=spacing.to(points.dtype),
+    )
+
+
+def face_camera(
+    normal: Float[Tensor, "n 3"], to_camera: Float[Tensor, "n 3"], min_cosine: float
+) -> Float[Tensor, "n 3"]:
+    """Flip normals to the camera; lean those seen edge-on towards it until they can be seen.
+
+    A disk that its own camera sees edge-on receives no gradient, so one whose cosine to
+    ``to_camera`` (unit) is below ``min_cosine`` is turned just that far.
+    """
+    cosine = (normal * to_camera).sum(-1, keepdim=True)
+    normal = torch.where(cosine < 0, -normal, normal)
+    cosine = cosine.abs()
+    lean = (min_cosine - cosine).clamp(min=0)
+    normal = normal + lean * to_camera
+    return normal / normal.norm(dim=-1, keepdim=True)
+
+
+def initialise_disks(
+    points: Float[Tensor, "n 3"],
+    camera_centre: Float[Tensor, "3"],
+    footprint: Float[Tensor, "n"],
+    existing: Float[Tensor, "m 3"],
+    *,
+    neighbours: int,
+    scale_factor: float,
+    planarity_threshold: float,
+    planarity_shrink: float,
+    opacity: float,
+) -> DiskParameters:
+    """Disks at ``points`` (world frame), lying in the planes of their neighbourhoods.
+
+    ``footprint`` is the distance between neighbouring samples at each point's depth; the spacing
+    is kept within [0.3, 1.5] of it so that a stray point makes neither a speck nor a blanket.
+    Where planarity is under the threshold the scale shrinks, as the paper does with a factor 0.1.
+    """
+    if len(points) == 0:
+        empty = points.new_zeros
+        return DiskParameters(empty(0, 3), empty(0, 4), empty(0, 2), empty(0))
+    plane = fit_local_planes(points, existing, neighbours)
+    to_camera = camera_centre - points
+    to_camera = to_camera / to_camera.norm(dim=-1, keepdim=True)
+    normal = face_camera(plane.normal, to_camera, min_cosine=0.15)
+    tangent = plane.tangent - (plane.tangent * normal).sum(-1, keepdim=True) * normal
+    tangent = tangent / tangent.norm(dim=-1, keepdim=True).clamp(min=1e-12)
+    rotation = torch.stack([tangent, torch.linalg.cross(normal, tangent), normal], -1)
+    spacing = torch.minimum(torch.maximum(plane.spacing, 0.3 * footprint), 1.5 * footprint)
+    shrink = torch.where(plane.planarity < planarity_threshold, planarity_shrink, 1.0)
+    scale = scale_factor * spacing * shrink
+    logit = torch.logit(points.new_full((len(points),), opacity))
+    return DiskParameters(
+        points, matrix_to_quaternion(rotation), scale.log()[:, None].expand(-1, 2).clone(), logit
+    )

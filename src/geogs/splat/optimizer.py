@@ -1,0 +1,151 @@
+"""Adam for a map whose disks come, go and move."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from geogs.geometry.lie import matrix_to_quaternion, sim3_scale
+from geogs.splat.cpu.adam import adam_rows
+from geogs.splat.map import DiskParameters, GaussianMap
+
+
+@dataclass(frozen=True, slots=True)
+class LearningRates:
+    """Adam step sizes per group."""
+
+    position: float
+    """Map units."""
+    quaternion: float
+    log_scale: float
+    opacity_logit: float
+
+    def __iter__(self):
+        return iter((self.position, self.quaternion, self.log_scale, self.opacity_logit))
+
+
+class MapOptimizer:
+    """Adam (Kingma & Ba 2015) on a map's disks, with a step count per disk.
+
+    Only disks given as visible are stepped: the moments and the step counts of the others stand
+    still, so a disk out of view neither drifts nor forgets. Bias correction uses each disk's own
+    count, ``map.steps``. Add, drop and move disks through ``append``, ``keep`` and ``transform``
+    here, which do the same to the map and let the moments follow.
+    """
+
+    def __init__(
+        self,
+        disks: GaussianMap,
+        learning_rates: LearningRates,
+        betas: tuple[float, float] = (0.9, 0.99),
+        eps: float = 1e-8,
+    ) -> None:
+        self.disks = disks
+        self.learning_rates = learning_rates
+        self.betas = betas
+        self.eps = eps
+        self.first = [torch.zeros_like(p) for p in disks.parameters]
+        self.second = [torch.zeros_like(p) for p in disks.parameters]
+        device = disks.device
+        self._corrections = tuple(_bias_corrections(beta).to(device) for beta in betas)
+
+    def zero_grad(self) -> None:
+        """Forget the gradients."""
+        for p in self.disks.parameters:
+            p.grad = None
+
+    @torch.no_grad()
+    def step(self, visible: Bool[Tensor, "n"]) -> None:
+        """One Adam step of the visible disks by the gradients accumulated in the map's tensors.
+
+        A parameter group without gradient is left alone. Raises ValueError if disks were added to
+        or dropped from the map without telling the optimiser.
+        """
+        if len(self.first[0]) != len(self.disks) or len(visible) != len(self.disks):
+            raise ValueError(
+                f"{len(self.disks)} disks, {len(self.first[0])} moments and {len(visible)} "
+                "visibility flags: change the map through its optimiser."
+            )
+        self.disks.steps += visible
+        groups = zip(
+            self.disks.parameters, self.first, self.second, self.learning_rates, strict=True
+        )
+        update = adam_rows if self._is_fused() else adam_reference
+        for p, m, v, rate in groups:
+            if p.grad is not None:
+                update(
+                    p, p.grad, m, v, visible, self.disks.steps, self._corrections,
+                    rate, self.betas, self.eps,
+                )  # fmt: skip
+
+    @torch.no_grad()
+    def append(self, parameters: DiskParameters, keyframe_id: int | Tensor) -> None:
+        """Add disks to the map, with empty moments."""
+        n = len(parameters.position)
+        for moments in (self.first, self.second):
+            moments[:] = [torch.cat([m, m.new_zeros(n, *m.shape[1:])]) for m in moments]
+        self.disks.append(parameters, keyframe_id)
+
+    def keep(self, mask: Bool[Tensor, "n"]) -> None:
+        """Drop disks from the map, and their moments."""
+        for moments in (self.first, self.second):
+            moments[:] = [m[mask] for m in moments]
+        self.disks.keep(mask)
+
+    @torch.no_grad()
+    def transform(self, S: Float[Tensor, "*n 4 4"]) -> None:
+        """Move the map by a similarity (one, or one per disk) and its moments with it.
+
+        With x' = s R x + t the gradient becomes R g / s; a rotation of the world by r multiplies
+        quaternions and their gradients by the orthogonal matrix of q -> r q. Second moments are
+        treated as a diagonal covariance, of which the diagonal after the rotation is kept.
+        """
+        scale = sim3_scale(S)[..., None, None]
+        R = S[..., :3, :3] / scale
+        by = {0: R / scale, 1: _left_product(matrix_to_quaternion(R))}
+        for group, linear in by.items():
+            matrix = linear.to(self.first[group])
+            self.first[group] = (matrix @ self.first[group][..., None])[..., 0]
+            self.second[group] = (matrix.square() @ self.second[group][..., None])[..., 0]
+        self.disks.transform(S)
+
+    def _is_fused(self) -> bool:
+        p = self.disks.position
+        return p.device.type == "cpu" and p.dtype == torch.float32
+
+
+def adam_reference(
+    p: Tensor,
+    grad: Tensor,
+    first: Tensor,
+    second: Tensor,
+    visible: Tensor,
+    steps: Tensor,
+    corrections: tuple[Tensor, Tensor],
+    rate: float,
+    betas: tuple[float, float],
+    eps: float,
+) -> None:
+    """One Adam step of the visible rows in plain PyTorch, in place: the kernel's specification."""
+    g = grad[visible]
+    m = first[visible].lerp(g, 1 - betas[0])
+    v = second[visible].lerp(g * g, 1 - betas[1])
+    first[visible], second[visible] = m, v
+    row = (-1,) + (1,) * (p.dim() - 1)
+    c1, c2 = (c[steps[visible].clamp(max=len(c) - 1)].view(row).to(p.dtype) for c in corrections)
+    p[visible] -= rate * (m / c1) / ((v / c2).sqrt() + eps)
+
+
+def _bias_corrections(beta: float) -> Float[Tensor, "t"]:
+    """1 - beta^t for t = 0, 1, ... until it is one in float32."""
+    count = max(2, math.ceil(math.log(1e-8) / math.log(beta)) + 1) if beta > 0 else 2
+    return 1 - beta ** torch.arange(count, dtype=torch.float64)
+
+
+def _left_product(q: Float[Tensor, "*n 4"]) -> Float[Tensor, "*n 4 4"]:
+    """The matrix L(q) with L(q) p = q p (Hamilton product, w x y z)."""
+    w, x, y, z = q.unbind(-1)
+    rows = [w, -x, -y, -z, x, w, -z, y, y, z, w, -x, z, -y, x, w]
+    return torch.stack(rows, -1).unflatten(-1, (4, 4))

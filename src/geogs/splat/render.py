@@ -1,0 +1,61 @@
+"""Rendering the map: one contract, several backends."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from geogs.geometry.camera import Camera
+from geogs.splat.map import DiskParameters, GaussianMap
+from geogs.splat.reference import render_reference
+
+Backend = Literal["auto", "reference", "cpu"]
+
+NEAR = 0.05
+"""Depth in map units up to which a disk's centre and hits are ignored."""
+
+
+@dataclass(frozen=True, slots=True)
+class RenderOutput:
+    """Maps of one view. Gradients flow from all but ``median_depth`` and ``visible``."""
+
+    depth: Float[Tensor, "h w"]
+    """Ray-disk intersections blended and divided by alpha, z in map units; 0 where alpha is 0."""
+    normal: Float[Tensor, "h w 3"]
+    """Sum of weight times unit normal, camera frame, facing the camera; its length is at most
+    alpha."""
+    alpha: Float[Tensor, "h w"]
+    """Sum of the blending weights, in [0, 1)."""
+    distortion: Float[Tensor, "h w"]
+    """2 sum_i w_i |z_i A_i - Z_i| with A_i, Z_i the sums of w_j, w_j z_j in front of i: the paper's
+    sum_ij w_i w_j |z_i - z_j| where hits are sorted along the ray, never negative elsewhere."""
+    median_depth: Float[Tensor, "h w"]
+    """z of the last disk blended while more than half of the light is left; 0 where there is
+    none. No gradient."""
+    visible: Bool[Tensor, "n"]
+    """Disks blended into at least one pixel."""
+
+
+def render(
+    disks: GaussianMap | DiskParameters,
+    camera: Camera,
+    T_cw: Float[Tensor, "4 4"],
+    backend: Backend = "auto",
+    near: float = NEAR,
+) -> RenderOutput:
+    """Render depth, normals, opacity and distortion of the disks as seen from ``T_cw``.
+
+    Differentiable in the ten numbers of every disk and in the entries of ``T_cw``.
+
+    Blending follows 2-D Gaussian splatting (Huang et al. 2024): front to back in the order of
+    centre depths, weight w_i = a_i T_i with a_i = min(o_i exp(-rho_i / 2), 0.99), hits below 1/255
+    skipped, stopping before the disk that would leave less than 1e-4 of the light. rho is the
+    smaller of the squared distance on the disk (in deviations) and twice the squared pixel distance
+    from the projected centre.
+
+    ``reference`` works in the positions' dtype on any device, ``cpu`` in float32 on the CPU.
+    """
+    parameters = disks.parameters if isinstance(disks, GaussianMap) else disks
+    return RenderOutput(*render_reference(parameters, camera, T_cw, near))

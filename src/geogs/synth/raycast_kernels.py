@@ -1,0 +1,376 @@
+"""Ray-solid intersections and shading, compiled; rays are o + t d with d_z = 1 in the camera frame,
+so that t is the depth. Solids, faces and ``half`` are as in scene.py."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+_BOX, _FRUSTUM = 0, 1
+_NEAR = 1e-6
+_OPTIONS = {"cache": True, "nogil": True, "error_model": "numpy"}
+
+
+class Solids(NamedTuple):
+    """The scene's solids as one camera sees them."""
+
+    kind: np.ndarray  # n
+    half: np.ndarray  # n 3
+    rotation: np.ndarray  # n 3 3, local to world
+    origin: np.ndarray  # n 3, camera centre in each local frame
+    matrix: np.ndarray  # n 3 3, camera to local
+    texture: np.ndarray  # n 6
+    shift: np.ndarray  # n 2, metres
+    emission: np.ndarray  # n
+
+
+class Textures(NamedTuple):
+    """All textures with their pyramids in one array; level k is half as large as level k - 1."""
+
+    texels: np.ndarray  # flat uint8, RGB
+    start: np.ndarray  # m levels
+    width: np.ndarray  # m levels
+    height: np.ndarray  # m levels
+    texel: np.ndarray  # m, metres; 0 stretches over the face
+
+
+class Lighting(NamedTuple):
+    """Lights and how much of each is seen from every cell of the room."""
+
+    volume: np.ndarray  # nz ny nx 1+l: ambient, then each light, in [0, 1]
+    voxel: float
+    position: np.ndarray  # l 3
+    colour: np.ndarray  # l 3
+    above: np.ndarray  # 3, ambient from above
+    below: np.ndarray  # 3, ambient from below
+
+
+@njit(inline="always", **_OPTIONS)
+def _hit_box(ox, oy, oz, dx, dy, dz, hx, hy, hz):
+    """Depth and face of the first crossing in front (slab method); inf if missed."""
+    near, far = -np.inf, np.inf
+    near_face, far_face = 0, 0
+    for axis in range(3):
+        if axis == 0:
+            o, d, h = ox, dx, hx
+        elif axis == 1:
+            o, d, h = oy, dy, hy
+        else:
+            o, d, h = oz, dz, hz
+        if d == 0.0:
+            if abs(o) > h:
+                return np.inf, 0
+            continue
+        inverse = 1.0 / d
+        # The ray enters through the side that faces it.
+        enter_side = 2 * axis + (1 if d < 0.0 else 0)
+        enter = (-o - h if d > 0.0 else h - o) * inverse
+        leave = (h - o if d > 0.0 else -o - h) * inverse
+        if enter > near:
+            near, near_face = enter, enter_side
+        if leave < far:
+            far, far_face = leave, enter_side ^ 1
+    if near > far or far < _NEAR:
+        return np.inf, 0
+    if near > _NEAR:
+        return near, near_face
+    return far, far_face
+
+
+@njit(inline="always", **_OPTIONS)
+def _hit_frustum(ox, oy, oz, dx, dy, dz, r0, r1, h):
+    """First crossing of the side x^2 + y^2 = (m + k z)^2 or of a cap."""
+    best, face = np.inf, 0
+    middle, slope = 0.5 * (r0 + r1), 0.5 * (r1 - r0) / h
+    reach = middle + slope * oz
+    a = dx * dx + dy * dy - slope * slope * dz * dz
+    b = ox * dx + oy * dy - slope * dz * reach
+    c = ox * ox + oy * oy - reach * reach
+    disc = b * b - a * c
+    if disc >= 0.0 and a != 0.0:
+        root = math.sqrt(disc)
+        for sign in (-1.0, 1.0):
+            t = (-b + sign * root) / a
+            if _NEAR < t < best and abs(oz + t * dz) <= h and reach + slope * t * dz >= 0.0:
+                best = t
+    if dz != 0.0:
+        for side in range(2):
+            t = ((h if side else -h) - oz) / dz
+            x, y, radius = ox + t * dx, oy + t * dy, (r1 if side else r0)
+            if _NEAR < t < best and x * x + y * y <= radius * radius:
+                best, face = t, 4 + side
+    return best, face
+
+
+@njit(inline="always", **_OPTIONS)
+def _hit_ellipsoid(ox, oy, oz, dx, dy, dz, rx, ry, rz):
+    """First crossing of the unit sphere after scaling by the radii."""
+    ox, oy, oz, dx, dy, dz = ox / rx, oy / ry, oz / rz, dx / rx, dy / ry, dz / rz
+    a = dx * dx + dy * dy + dz * dz
+    b = ox * dx + oy * dy + oz * dz
+    disc = b * b - a * (ox * ox + oy * oy + oz * oz - 1.0)
+    if disc < 0.0:
+        return np.inf, 0
+    root = math.sqrt(disc)
+    t = (-b - root) / a
+    if t < _NEAR:
+        t = (-b + root) / a
+    return (t, 0) if t > _NEAR else (np.inf, 0)
+
+
+@njit(**_OPTIONS)
+def hit(kind, half, ox, oy, oz, dx, dy, dz):
+    """Distance and face of the first crossing of a local ray with one solid; inf if missed."""
+    if kind == _BOX:
+        return _hit_box(ox, oy, oz, dx, dy, dz, half[0], half[1], half[2])
+    if kind == _FRUSTUM:
+        return _hit_frustum(ox, oy, oz, dx, dy, dz, half[0], half[1], half[2])
+    return _hit_ellipsoid(ox, oy, oz, dx, dy, dz, half[0], half[1], half[2])
+
+
+@njit(**_OPTIONS)
+def _hit_pixel(solids, i, x, y):
+    """Depth and face at which the pixel ray (x, y, 1) meets solid i."""
+    o, m = solids.origin[i], solids.matrix[i]
+    return hit(
+        solids.kind[i],
+        solids.half[i],
+        o[0],
+        o[1],
+        o[2],
+        m[0, 0] * x + m[0, 1] * y + m[0, 2],
+        m[1, 0] * x + m[1, 1] * y + m[1, 2],
+        m[2, 0] * x + m[2, 1] * y + m[2, 2],
+    )
+
+
+@njit(**_OPTIONS)
+def cast_rows(solids, bounds, xs, ys, first, last, depth, solid, face):
+    """Nearest solid of rows [first, last); ``bounds`` are pixel boxes (left, top, right, bottom)."""
+    for i in range(len(solids.kind)):
+        for row in range(max(first, bounds[i, 1]), min(last, bounds[i, 3])):
+            for column in range(bounds[i, 0], bounds[i, 2]):
+                t, f = _hit_pixel(solids, i, xs[column], ys[row])
+                if t < depth[row, column]:
+                    depth[row, column] = t
+                    solid[row, column] = i
+                    face[row, column] = f
+
+
+@njit(**_OPTIONS)
+def _normal(kind, half, face, px, py, pz):
+    """Outward unit normal at a local surface point."""
+    if kind == _BOX or face >= 4:
+        sign = 1.0 if face & 1 else -1.0
+        axis = face >> 1
+        return (
+            sign if axis == 0 else 0.0,
+            sign if axis == 1 else 0.0,
+            sign if axis == 2 else 0.0,
+        )
+    if kind == _FRUSTUM:
+        slope = 0.5 * (half[1] - half[0]) / half[2]
+        nx, ny = px, py
+        nz = -slope * math.sqrt(px * px + py * py)
+    else:
+        nx, ny, nz = px / half[0] ** 2, py / half[1] ** 2, pz / half[2] ** 2
+    scale = 1.0 / math.sqrt(nx * nx + ny * ny + nz * nz)
+    return nx * scale, ny * scale, nz * scale
+
+
+@njit(**_OPTIONS)
+def _surface_coordinates(kind, half, face, px, py, pz):
+    """Metres to the right and up on the face as seen from outside, and the face's width, height."""
+    if kind == _BOX:
+        if face < 2:
+            return (py if face else -py), pz, 2.0 * half[1], 2.0 * half[2]
+        if face < 4:
+            return (-px if face == 3 else px), pz, 2.0 * half[0], 2.0 * half[2]
+        return (px if face == 5 else -px), py, 2.0 * half[0], 2.0 * half[1]
+    if kind == _FRUSTUM:
+        if face >= 4:
+            width = 2.0 * half[face - 4]
+            return px, py, width, width
+        radius = 0.5 * (half[0] + half[1])
+        return math.atan2(py, px) * radius, pz, 2.0 * math.pi * radius, 2.0 * half[2]
+    latitude = math.asin(min(1.0, max(-1.0, pz / half[2])))
+    longitude = math.atan2(py / half[1], px / half[0])
+    width = 2.0 * math.pi * half[0]
+    return longitude * half[0], latitude * half[2], width, math.pi * half[2]
+
+
+@njit(**_OPTIONS)
+def _add_bilinear(texels, start, w, h, u, v, wrap, weight, out):
+    """Adds ``weight`` times a w x h level of a texture at position (u, v) in [0, 1]."""
+    u, v = u * w - 0.5, v * h - 0.5
+    c, r = math.floor(u), math.floor(v)
+    fu, fv = u - c, v - r
+    c0, r0 = int(c), int(r)
+    c1, r1 = c0 + 1, r0 + 1
+    if wrap:
+        c0, c1, r0, r1 = c0 % w, c1 % w, r0 % h, r1 % h
+    else:
+        c0, c1 = min(max(c0, 0), w - 1), min(max(c1, 0), w - 1)
+        r0, r1 = min(max(r0, 0), h - 1), min(max(r1, 0), h - 1)
+    top, bottom = start + 3 * r0 * w, start + 3 * r1 * w
+    for k in range(3):
+        upper = (1.0 - fu) * texels[top + 3 * c0 + k] + fu * texels[top + 3 * c1 + k]
+        lower = (1.0 - fu) * texels[bottom + 3 * c0 + k] + fu * texels[bottom + 3 * c1 + k]
+        out[k] += weight * ((1.0 - fv) * upper + fv * lower)
+
+
+@njit(**_OPTIONS)
+def _texture_colour(solids, textures, i, face, point, footprint, out):
+    """Texture of a surface point, low-passed to ``footprint`` metres (trilinear filtering)."""
+    kind, half = solids.kind[i], solids.half[i]
+    across, up, face_width, face_height = _surface_coordinates(
+        kind, half, face, point[0], point[1], point[2]
+    )
+    j = solids.texture[i, face]
+    start, width, height = textures.start[j], textures.width[j], textures.height[j]
+    texel = textures.texel[j]
+    wrap = texel > 0.0 or kind != _BOX
+    if texel > 0.0:
+        u = (across + solids.shift[i, 0]) / (texel * width[0])
+        v = -(up + solids.shift[i, 1]) / (texel * height[0])
+    else:
+        u, v = across / face_width + 0.5, 0.5 - up / face_height
+        texel = max(face_width / width[0], face_height / height[0])
+    level = min(max(math.log2(footprint / texel), 0.0), len(start) - 1.0)
+    low = int(level)
+    part = level - low
+    out[:] = 0.0
+    _add_bilinear(textures.texels, start[low], width[low], height[low], u, v, wrap, 1 - part, out)
+    if part > 0.0:
+        k = low + 1
+        _add_bilinear(textures.texels, start[k], width[k], height[k], u, v, wrap, part, out)
+
+
+@njit(**_OPTIONS)
+def _light(lighting, point, normal, out):
+    """Display gain E^(1/2.2) of a diffuse surface from lights and ambient, with soft occlusion.
+
+    Textures hold display values c = albedo^(1/2.2), so c times this gain is the displayed radiance.
+    """
+    volume, voxel = lighting.volume, lighting.voxel
+    nz, ny, nx, channels = volume.shape
+    # Half a voxel off the surface, so that the cells read lie in front of it.
+    gx = min(max((point[0] + 0.7 * voxel * normal[0]) / voxel - 0.5, 0.0), nx - 1.001)
+    gy = min(max((point[1] + 0.7 * voxel * normal[1]) / voxel - 0.5, 0.0), ny - 1.001)
+    gz = min(max((point[2] + 0.7 * voxel * normal[2]) / voxel - 0.5, 0.0), nz - 1.001)
+    x, y, z = int(gx), int(gy), int(gz)
+    fx, fy, fz = gx - x, gy - y, gz - z
+    sky = 0.5 + 0.5 * normal[2]
+    for k in range(3):
+        out[k] = 0.0
+    for channel in range(channels):
+        seen = 0.0
+        for corner in range(8):
+            i, j, k = corner & 1, corner >> 1 & 1, corner >> 2
+            weight = (fx if i else 1 - fx) * (fy if j else 1 - fy) * (fz if k else 1 - fz)
+            seen += weight * volume[z + k, y + j, x + i, channel]
+        if channel == 0:
+            for k in range(3):
+                out[k] += seen * (lighting.above[k] * sky + lighting.below[k] * (1.0 - sky))
+            continue
+        lx = lighting.position[channel - 1, 0] - point[0]
+        ly = lighting.position[channel - 1, 1] - point[1]
+        lz = lighting.position[channel - 1, 2] - point[2]
+        square = lx * lx + ly * ly + lz * lz + 0.1
+        cosine = (lx * normal[0] + ly * normal[1] + lz * normal[2]) / math.sqrt(square)
+        if cosine > 0.0:
+            for k in range(3):
+                out[k] += seen * cosine / square * lighting.colour[channel - 1, k]
+    for k in range(3):
+        out[k] = out[k] ** (1.0 / 2.2)
+
+
+@njit(**_OPTIONS)
+def _surface(solids, camera, i, face, t, x, y, local, world, normal):
+    """Fills the local and world point and world normal of a hit; returns |cos| of the incidence."""
+    o, m, r = solids.origin[i], solids.matrix[i], solids.rotation[i]
+    for k in range(3):
+        local[k] = o[k] + t * (m[k, 0] * x + m[k, 1] * y + m[k, 2])
+    n = _normal(solids.kind[i], solids.half[i], face, local[0], local[1], local[2])
+    cosine = 0.0
+    for k in range(3):
+        ray = camera[k, 0] * x + camera[k, 1] * y + camera[k, 2]
+        world[k] = camera[k, 3] + t * ray
+        normal[k] = r[k, 0] * n[0] + r[k, 1] * n[1] + r[k, 2] * n[2]
+        cosine += normal[k] * ray
+    return abs(cosine) / math.sqrt(x * x + y * y + 1.0)
+
+
+@njit(**_OPTIONS)
+def _around(solid, row, column, found):
+    """Collects the distinct solids seen in the 3 x 3 pixels around one; returns their number."""
+    rows, columns = solid.shape
+    count = 0
+    for r in range(max(row - 1, 0), min(row + 2, rows)):
+        for c in range(max(column - 1, 0), min(column + 2, columns)):
+            i = solid[r, c]
+            known = i < 0
+            for k in range(count):
+                known = known or found[k] == i
+            if not known:
+                found[count] = i
+                count += 1
+    return count
+
+
+@njit(**_OPTIONS)
+def shade_rows(
+    solids, textures, lighting, camera, xs, ys, first, last, depth, solid, face, image, normals
+):
+    """Colour and camera-frame normal of rows [first, last) from what ``cast_rows`` found.
+
+    Four samples a pixel; each is cast against the solids seen in the 3 x 3 pixels around, so edges
+    are smooth without casting against the whole scene again.
+    """
+    found = np.empty(9, np.int64)
+    local, world, normal = np.empty(3), np.empty(3), np.empty(3)
+    gain, other_gain, colour = np.empty(3), np.empty(3), np.empty(3)
+    pixel_x, pixel_y = abs(xs[1] - xs[0]), abs(ys[1] - ys[0])
+    for row in range(first, last):
+        for column in range(len(xs)):
+            centre = solid[row, column]
+            if centre < 0:
+                continue
+            centre_face, t0 = face[row, column], depth[row, column]
+            x0, y0 = xs[column], ys[row]
+            cosine = _surface(
+                solids, camera, centre, centre_face, t0, x0, y0, local, world, normal
+            )
+            for k in range(3):
+                normals[row, column, k] = (
+                    camera[0, k] * normal[0] + camera[1, k] * normal[1] + camera[2, k] * normal[2]
+                )
+            if solids.emission[centre] > 0.0:
+                gain[:] = solids.emission[centre]
+            else:
+                _light(lighting, world, normal, gain)
+            count = _around(solid, row, column, found)
+            for sample in range(4):
+                x = x0 + (0.25 if sample & 1 else -0.25) * pixel_x
+                y = y0 + (0.25 if sample & 2 else -0.25) * pixel_y
+                t, i, f = np.inf, centre, centre_face
+                for k in range(count):
+                    tk, fk = _hit_pixel(solids, found[k], x, y)
+                    if tk < t:
+                        t, i, f = tk, found[k], fk
+                if t == np.inf:
+                    x, y, t = x0, y0, t0
+                cosine = _surface(solids, camera, i, f, t, x, y, local, world, normal)
+                footprint = 0.5 * t * pixel_x / math.sqrt(max(cosine, 0.05))
+                _texture_colour(solids, textures, i, f, local, footprint, colour)
+                if i == centre and f == centre_face:
+                    sample_gain = gain
+                else:
+                    sample_gain = other_gain
+                    if solids.emission[i] > 0.0:
+                        other_gain[:] = solids.emission[i]
+                    else:
+                        _light(lighting, world, normal, other_gain)
+                for k in range(3):
+                    image[row, column, k] += 0.25 * min(colour[k] * sample_gain[k], 255.0)

@@ -1,0 +1,54 @@
+"""What the tracker asks of a flow operator."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class FlowMatch:
+    """Where the cells of one image lie in another."""
+
+    pixels: Float[Tensor, "e p 2"]
+    """Position in the second image of each grid cell of the first."""
+    weight: Float[Tensor, "e p 2"]
+    """Inverse variance of x and y in 1 / pixel^2; zero where there is no match."""
+
+
+class FlowOperator(Protocol):
+    """Measures image motion between pairs of images, in both directions at once."""
+
+    def encode(self, image: UInt8[np.ndarray, "h w 3"]) -> Any:
+        """Whatever the operator keeps of an image; computed once per frame."""
+        ...
+
+    def texture(self, encoded: Any) -> float:
+        """Fraction of the grid on which the image has enough structure to be matched."""
+        ...
+
+    def measure(
+        self,
+        first: Sequence[Any],
+        second: Sequence[Any],
+        forward: Float[Tensor, "e p 2"] | None = None,
+        backward: Float[Tensor, "e p 2"] | None = None,
+        fine: bool = True,
+    ) -> tuple[FlowMatch, FlowMatch]:
+        """Match ``first[e]`` with ``second[e]``; returns first -> second and second -> first.
+
+        ``forward`` and ``backward`` are the present estimates of the matched positions in pixels
+        (the reprojection, right to a few pixels); None means nothing is known (a cold start).
+        ``fine`` False allows a cheaper, less precise measurement.
+        """
+        ...
+
+
+def select(match: FlowMatch, edges: Sequence[int]) -> FlowMatch:
+    """The given edges of a match."""
+    index = torch.as_tensor(list(edges), device=match.pixels.device)
+    return FlowMatch(match.pixels[index], match.weight[index])

@@ -1,0 +1,231 @@
+"""The frame graph: which keyframes see each other, and the flow measured between them."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from geogs.tracking.bundle import (
+    BundleOptions,
+    BundleProblem,
+    BundleResult,
+    DenseBundle,
+    project,
+    relative_motion,
+)
+from geogs.tracking.flow.base import FlowOperator
+from geogs.tracking.keyframes import KeyframeStore
+
+Pair = tuple[int, int]
+"""Two keyframe ids, the earlier first; an edge of the graph in both directions."""
+
+
+@dataclass
+class Edge:
+    """One direction of a measured pair."""
+
+    pixels: Float[Tensor, "p 2"]
+    weight: Float[Tensor, "p 2"]
+    reprojection: Float[Tensor, "p 2"]
+    """Where the cells fell when the flow was measured."""
+
+
+class FrameGraph:
+    """Pairs of keyframes with their flow in both directions."""
+
+    def __init__(self, keyframes: KeyframeStore, operator: FlowOperator) -> None:
+        self.keyframes = keyframes
+        self.operator = operator
+        self.edges: dict[Pair, Edge] = {}
+        self.bundle = DenseBundle(keyframes.grid)
+
+    @property
+    def pairs(self) -> list[Pair]:
+        """Measured pairs."""
+        return [(i, j) for i, j in self.edges if i < j]
+
+    def remove_keyframe(self, id: int) -> None:
+        """Forget every edge of a keyframe."""
+        self.edges = {e: v for e, v in self.edges.items() if id not in e}
+
+    def reprojections(self, directed: Sequence[Pair]) -> Float[Tensor, "e p 2"]:
+        """Present positions of the cells of i in j for each directed edge (i, j)."""
+        if not directed:
+            return self.keyframes.grid.pixels.new_zeros(0, self.keyframes.grid.size, 2)
+        store = self.keyframes
+        source, target = (store.poses([e[k] for e in directed]) for k in (0, 1))
+        index = torch.arange(len(directed), device=source.device)
+        T = relative_motion(torch.cat([source, target]), index, index + len(directed))
+        grid = store.grid
+        return project(grid.camera, grid.rays, T, store.inverse_depths([e[0] for e in directed])).pixels
+
+    def measure(self, pairs: Iterable[Pair], cold: bool = False, fine: bool = True) -> None:
+        """Measure the flow of pairs in both directions, starting from the reprojection."""
+        pairs = list(pairs)
+        if not pairs:
+            return
+        first, second = ([self.keyframes[p[k]].encoded for p in pairs] for k in (0, 1))
+        forward = self.reprojections(pairs)
+        backward = self.reprojections([(j, i) for i, j in pairs])
+        if cold:
+            there, back = self.operator.measure(first, second, fine=fine)
+        else:
+            there, back = self.operator.measure(first, second, forward, backward, fine=fine)
+        for n, (i, j) in enumerate(pairs):
+            self.edges[i, j] = Edge(there.pixels[n], there.weight[n], forward[n])
+            self.edges[j, i] = Edge(back.pixels[n], back.weight[n], backward[n])
+
+    def stale(self, pairs: Sequence[Pair], tolerance: float) -> list[Pair]:
+        """Pairs that are new or whose reprojection has moved more than ``tolerance`` pixels.
+
+        The median over the matched cells of the direction that moved more counts.
+        """
+        known = [p for p in pairs if p in self.edges]
+        new = [p for p in pairs if p not in self.edges]
+        if not known:
+            return new
+        directed = known + [(j, i) for i, j in known]
+        before = torch.stack([self.edges[e].reprojection for e in directed])
+        matched = torch.stack([self.edges[e].weight[:, 0] > 0 for e in directed])
+        moved = (self.reprojections(directed) - before).norm(dim=-1)
+        moved = moved.masked_fill(~matched, torch.nan).nanmedian(dim=1).values.nan_to_num(torch.inf)
+        worst = torch.maximum(*moved.split(len(known)))
+        return new + [p for p, m in zip(known, worst.tolist(), strict=True) if m > tolerance]
+
+    def problem(
+        self, directed: Sequence[Pair], free_pose: Iterable[int], free_depth: Iterable[int]
+    ) -> tuple[BundleProblem, list[int]]:
+        """The adjustment of the given edges, and the keyframe id of each of its frames."""
+        directed = sorted(directed)
+        poses, depths = set(free_pose), set(free_depth)
+        ids = sorted({k for e in directed for k in e} | poses | depths)
+        slot = {k: n for n, k in enumerate(ids)}
+        device = self.keyframes.grid.device
+        edges = [self.edges[e] for e in directed]
+        problem = BundleProblem(
+            T_cw=self.keyframes.poses(ids),
+            inverse_depth=self.keyframes.inverse_depths(ids),
+            source=torch.tensor([slot[i] for i, _ in directed], device=device),
+            target=torch.tensor([slot[j] for _, j in directed], device=device),
+            pixels=torch.stack([e.pixels for e in edges]),
+            weight=torch.stack([e.weight for e in edges]),
+            free_pose=torch.tensor([k in poses for k in ids], device=device),
+            free_depth=torch.tensor([k in depths for k in ids], device=device),
+        )
+        return problem, ids
+
+    def adjust(
+        self,
+        directed: Sequence[Pair],
+        free_pose: Sequence[int],
+        free_depth: Sequence[int],
+        options: BundleOptions,
+    ) -> BundleResult | None:
+        """Solve for poses and inverse depths and store them; None (nothing stored) on failure."""
+        if not directed:
+            return None
+        problem, ids = self.problem(directed, free_pose, free_depth)
+        result = self.bundle.solve(problem, options)
+        if not result.finite:
+            return None
+        depths, poses = set(free_depth), set(free_pose)
+        for n, k in enumerate(ids):
+            state = self.keyframes[k]
+            if k in poses:
+                state.T_cw = result.T_cw[n]
+            if k in depths:
+                information = result.information[n]
+                state.inverse_depth = self.keyframes.grid.fill(
+                    result.inverse_depth[n], information
+                )
+                state.information = information
+        return result
+
+
+def frame_distances(
+    store: KeyframeStore, directed: Sequence[Pair], rotation_weight: float = 0.3, step: int = 2
+) -> Float[Tensor, "e"]:
+    """DROID-SLAM's distance of directed keyframe pairs in pixels; infinite at little overlap.
+
+    Mean of the flow (weight ``rotation_weight``) and of the flow without the rotation (the rest)
+    over the cells that stay in front of the target; infinite where less than 3/4 do or where less
+    than a fifth falls into the image.
+    """
+    grid = store.grid
+    if not directed:
+        return grid.pixels.new_zeros(0)
+    keep = torch.zeros(grid.height, grid.width, dtype=torch.bool, device=grid.device)
+    keep[::step, ::step] = True
+    keep = keep.reshape(-1)
+    rays, pixels = grid.rays[keep], grid.pixels[keep]
+    source, target = (store.poses([e[k] for e in directed]) for k in (0, 1))
+    index = torch.arange(len(directed), device=source.device)
+    T = relative_motion(torch.cat([source, target]), index, index + len(directed))
+    d = store.inverse_depths([e[0] for e in directed])[:, keep]
+    shift = T.clone()
+    shift[:, :3, :3] = torch.eye(3, dtype=T.dtype, device=T.device)
+    total = valid = inside = 0
+    for motion, share in ((T, rotation_weight), (shift, 1 - rotation_weight)):
+        p = project(grid.camera, rays, motion, d)
+        flow = (p.pixels - pixels).norm(dim=-1)
+        total = total + share * (flow * p.valid).sum(1)
+        valid = valid + share * p.valid.float().sum(1)
+        if motion is T:
+            inside = (grid.inside(p.pixels) & p.valid).float().mean(1)
+    seen = (valid > 0.75 * int(keep.sum())) & (inside > 0.2)
+    return torch.where(seen, total / valid.clamp(min=1e-6), torch.inf)
+
+
+def proximity_pairs(
+    store: KeyframeStore,
+    later: Sequence[int],
+    earlier: Sequence[int],
+    existing: Iterable[Pair],
+    radius: int,
+    suppression: int,
+    max_distance: float,
+    max_pairs: int,
+) -> list[Pair]:
+    """Pairs to add between ``later`` and ``earlier`` keyframes (DROID-SLAM's proximity factors).
+
+    Every later keyframe is paired with its ``radius`` predecessors; then pairs are taken by growing
+    distance up to ``max_distance`` pixels, each suppressing those within ``suppression`` keyframes
+    of it, as the existing pairs do, until ``max_pairs`` are found.
+    """
+    position = {k: n for n, k in enumerate(store.ids)}
+    ids = store.ids
+    taken = {(position[i], position[j]) for i, j in existing if i in position and j in position}
+    found: list[Pair] = []
+    for k in later:
+        for back in range(1, radius + 1):
+            pair = (position[k] - back, position[k])
+            if pair[0] >= 0 and pair not in taken:
+                taken.add(pair)
+                found.append(pair)
+    blocked = {cell for pair in taken for cell in _neighbourhood(pair, suppression)}
+    candidates = [
+        (a, b)
+        for a in sorted(position[k] for k in earlier)
+        for b in sorted(position[k] for k in later)
+        if b - a > radius and (a, b) not in blocked
+    ]
+    directed = [(ids[a], ids[b]) for a, b in candidates]
+    there = frame_distances(store, directed)
+    back = frame_distances(store, [(j, i) for i, j in directed])
+    distance = (there + back) / 2
+    for n in torch.argsort(distance, stable=True).tolist():
+        if float(distance[n]) > max_distance or len(found) >= max_pairs:
+            break
+        if candidates[n] not in blocked:
+            found.append(candidates[n])
+            blocked.update(_neighbourhood(candidates[n], suppression))
+    return [(ids[a], ids[b]) for a, b in found]
+
+
+def _neighbourhood(pair: Pair, reach: int) -> list[Pair]:
+    a, b = pair
+    limit = max(min(abs(a - b) - 2, reach), 0)
+    span = range(-limit, limit + 1)
+    return [(a + x, b + y) for x in span for y in span if abs(x) + abs(y) <= limit]

@@ -1,0 +1,172 @@
+"""Start-up: poses and depths of the first keyframes from flow alone.
+
+Identity poses with unit depth fall into mirrored minima, so the pose of one keyframe against the
+first comes from the essential matrix, the others follow by PnP on flows chained from the first, and
+dense bundle adjustment with re-measured flow polishes the whole.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from geogs.geometry.lie import se3_inverse
+from geogs.tracking.bundle import BundleOptions
+from geogs.tracking.flow.base import FlowMatch
+from geogs.tracking.graph import FrameGraph
+from geogs.tracking.grid import SampleGrid
+from geogs.tracking.keyframes import KeyframeStore
+from geogs.tracking.motion import pnp, transfer_depth
+
+
+
+@dataclass(frozen=True)
+class TwoView:
+    """The relative pose of a pair of views and the depth that it gives, up to scale."""
+
+    T_ji: Float[Tensor, "4 4"]
+    inverse_depth: Float[Tensor, "p"]
+    """Of the first view, median 1."""
+    good: Bool[Tensor, "p"]
+    parallax: float
+    """Median motion in pixels that rotation does not explain."""
+
+
+def initialise(graph: FrameGraph, min_parallax: float, radius: int = 3) -> bool:
+    """Estimate all keyframes of the graph from nothing; False if they show no parallax.
+
+    On success poses, depths and information are set, the first pose is the identity and the median
+    depth over all keyframes is one unit.
+    """
+    store = graph.keyframes
+    flows = chained_flows(graph)
+    best = _best_two_view(store.grid, flows, min_parallax)
+    if best is None:
+        return False
+    _place_all(store, flows, best)
+    return _polish(graph, radius)
+
+
+def chained_flows(graph: FrameGraph) -> list[FlowMatch]:
+    """Flow from the first keyframe to each later one: chained from step to step, then re-measured."""
+    states = list(graph.keyframes)
+    grid, operator = graph.keyframes.grid, graph.operator
+    encoded = [s.encoded for s in states]
+    steps, back_steps = operator.measure(encoded[:-1], encoded[1:], fine=False)
+    there, back = steps.pixels[0], back_steps.pixels[0]
+    flows = []
+    for k in range(1, len(states)):
+        if k > 1:
+            step, back_step = steps.pixels[k - 1], back_steps.pixels[k - 1]
+            there = there + grid.sample_field(step - grid.pixels, there)
+            back = back_step + grid.sample_field(back - grid.pixels, back_step)
+        match, reverse = operator.measure(
+            [encoded[0]], [encoded[k]], there[None], back[None], fine=True
+        )
+        flows.append(match)
+        there = _filled(grid, match)
+        back = _filled(grid, reverse)
+    return flows
+
+
+def _filled(grid: SampleGrid, match: FlowMatch) -> Float[Tensor, "p 2"]:
+    """Positions with the unmatched cells filled in from their surroundings."""
+    flow, weight = match.pixels[0] - grid.pixels, match.weight[0, :, 0]
+    return grid.pixels + torch.stack([grid.fill(flow[:, k], weight) for k in (0, 1)], -1)
+
+
+def _best_two_view(
+    grid: SampleGrid, flows: list[FlowMatch], min_parallax: float
+) -> tuple[int, TwoView] | None:
+    best, best_score = None, 0.0
+    for n, match in enumerate(flows):
+        view = two_view(grid, match)
+        if view is None or view.parallax < min_parallax:
+            continue
+        # Parallax helps until the views no longer overlap.
+        score = min(view.parallax, 3 * min_parallax) * int(view.good.sum())
+        if score > best_score:
+            best, best_score = (n, view), score
+    return best
+
+
+def two_view(grid: SampleGrid, match: FlowMatch) -> TwoView | None:
+    """Relative pose by the essential matrix (MAGSAC) and depth by triangulation."""
+    weight = match.weight[0, :, 0]
+    used = (weight > 0).cpu().numpy()
+    if used.sum() < 0.1 * len(used):
+        return None
+    p, q = grid.pixels.double().cpu().numpy(), match.pixels[0].double().cpu().numpy()
+    K = grid.camera.matrix().numpy()
+    E, mask = cv2.findEssentialMat(p[used], q[used], K, cv2.USAC_MAGSAC, 0.9999, 0.7)
+    if E is None or E.shape != (3, 3):
+        return None
+    count, R, t, mask = cv2.recoverPose(E, p[used], q[used], K, mask=mask.copy())
+    if count < 0.3 * used.sum():
+        return None
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = R, t[:, 0]
+    homogeneous = cv2.triangulatePoints(K @ np.eye(3, 4), K @ T[:3], p.T, q.T)
+    z = homogeneous[2] / np.where(np.abs(homogeneous[3]) < 1e-12, 1e-12, homogeneous[3])
+    inlier = used.copy()
+    inlier[used] = mask[:, 0] > 0
+    good = inlier & (z > 0)
+    median = np.median(z[good])
+    good &= (z > 0.1 * median) & (z < 10 * median)
+    rotated = (np.c_[(p - K[:2, 2]) / K[[0, 1], [0, 1]], np.ones(len(p))]) @ (K @ R).T
+    parallax = np.median(np.linalg.norm(q - rotated[:, :2] / rotated[:, 2:], axis=1)[good])
+    T[:3, 3] /= median
+    device = grid.device
+    depth = torch.from_numpy(np.where(good, median / np.where(good, z, 1), 1.0)).float().to(device)
+    mask = torch.from_numpy(good).to(device)
+    return TwoView(
+        torch.from_numpy(T).to(device), grid.fill(depth, mask.float()), mask, float(parallax)
+    )
+
+
+def _place_all(store: KeyframeStore, flows: list[FlowMatch], best: tuple[int, TwoView]) -> None:
+    """Poses by PnP on the first keyframe's depth, depths by carrying it over."""
+    chosen, view = best
+    states = list(store)
+    first = states[0]
+    eye = torch.eye(4, dtype=torch.float64, device=store.grid.device)
+    first.T_cw, first.inverse_depth = eye, view.inverse_depth
+    first.information = view.good.float()
+    for n, (state, match) in enumerate(zip(states[1:], flows, strict=True)):
+        if n == chosen:
+            state.T_cw = view.T_ji
+        else:
+            good = view.good & (match.weight[0, :, 0] > 0)
+            T = pnp(store.grid, view.inverse_depth, match.pixels[0], good)
+            state.T_cw = states[n].T_cw if T is None else T
+        state.inverse_depth, state.information = transfer_depth(
+            store.grid, state.T_cw, first.inverse_depth, first.information
+        )
+
+
+def _polish(graph: FrameGraph, radius: int, rounds: int = 6) -> bool:
+    """Rounds of flow and adjustment, from forgiving to strict."""
+    store, ids = graph.keyframes, graph.keyframes.ids
+    near = [
+        (a, b) for n, a in enumerate(ids) for b in ids[n + 1 : n + 1 + radius]
+    ]
+    for n in range(rounds):
+        graph.measure(graph.stale(near, 0.25), fine=n >= 2)
+        options = BundleOptions(iterations=4, huber=(5.0, 2.0, 1.0)[min(n, 2)])
+        if graph.adjust(list(graph.edges), ids[1:], ids, options) is None:
+            return False
+        normalise(store)
+    return True
+
+
+def normalise(store: KeyframeStore) -> None:
+    """Move the first pose to the identity and scale so that the median depth is one unit."""
+    origin = se3_inverse(next(iter(store)).T_cw)
+    for state in store:
+        state.T_cw = state.T_cw @ origin
+    depths = torch.cat([s.inverse_depth[s.information > 0] for s in store])
+    if len(depths):
+        store.rescale(float(depths.median()))

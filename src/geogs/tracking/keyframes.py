@@ -1,0 +1,116 @@
+"""The keyframes a tracker holds, by stable id."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from geogs.tracking.grid import SampleGrid
+from geogs.types import Keyframe
+
+
+@dataclass
+class KeyframeState:
+    """What the tracker estimates and remembers of one keyframe; mutable."""
+
+    id: int
+    frame_index: int
+    timestamp: float
+    image: UInt8[np.ndarray, "h w 3"]
+    encoded: Any
+    """The flow operator's form of the image."""
+    T_cw: Float[Tensor, "4 4"]
+    """float64."""
+    inverse_depth: Float[Tensor, "p"]
+    information: Float[Tensor, "p"]
+
+
+class KeyframeStore:
+    """Keyframes in order of time; ids grow and are never used twice."""
+
+    def __init__(self, grid: SampleGrid) -> None:
+        self.grid = grid
+        self._states: dict[int, KeyframeState] = {}
+        self._next_id = 0
+
+    def __len__(self) -> int:
+        return len(self._states)
+
+    def __iter__(self) -> Iterator[KeyframeState]:
+        return iter(self._states.values())
+
+    def __getitem__(self, id: int) -> KeyframeState:
+        return self._states[id]
+
+    def __contains__(self, id: int) -> bool:
+        return id in self._states
+
+    @property
+    def ids(self) -> list[int]:
+        """All ids, earliest first."""
+        return list(self._states)
+
+    def add(
+        self,
+        frame_index: int,
+        timestamp: float,
+        image: UInt8[np.ndarray, "h w 3"],
+        encoded: Any,
+        T_cw: Float[Tensor, "4 4"],
+    ) -> KeyframeState:
+        """Append a keyframe with unit inverse depth and no information."""
+        ones = torch.ones(self.grid.size, device=self.grid.device)
+        state = KeyframeState(
+            self._next_id, frame_index, timestamp, image, encoded, T_cw, ones, 0 * ones
+        )
+        self._states[state.id] = state
+        self._next_id += 1
+        return state
+
+    def remove(self, id: int) -> KeyframeState:
+        """Take a keyframe out and return it."""
+        return self._states.pop(id)
+
+    def poses(self, ids: Sequence[int]) -> Float[Tensor, "n 4 4"]:
+        """World to camera, float64."""
+        return torch.stack([self._states[i].T_cw for i in ids])
+
+    def inverse_depths(self, ids: Sequence[int]) -> Float[Tensor, "n p"]:
+        """On the grid."""
+        return torch.stack([self._states[i].inverse_depth for i in ids])
+
+    def informations(self, ids: Sequence[int]) -> Float[Tensor, "n p"]:
+        """On the grid, pixels^2 per inverse depth^2."""
+        return torch.stack([self._states[i].information for i in ids])
+
+    def rescale(self, factor: float) -> None:
+        """Multiply every length by ``factor``."""
+        for state in self:
+            state.T_cw = scaled(state.T_cw, factor)
+            state.inverse_depth = state.inverse_depth / factor
+            state.information = state.information * factor**2
+
+    def export(self, id: int) -> Keyframe:
+        """The keyframe as the rest of the system sees it; tensors are copies."""
+        s = self._states[id]
+        shape = (self.grid.height, self.grid.width)
+        return Keyframe(
+            id=s.id,
+            frame_index=s.frame_index,
+            timestamp=s.timestamp,
+            image=s.image,
+            T_cw=s.T_cw.clone(),
+            inverse_depth=s.inverse_depth.reshape(shape).clone(),
+            information=s.information.reshape(shape).clone(),
+        )
+
+
+def scaled(T: Float[Tensor, "*b 4 4"], factor: float) -> Float[Tensor, "*b 4 4"]:
+    """The pose with its translation multiplied by ``factor``."""
+    out = T.clone()
+    out[..., :3, 3] *= factor
+    return out

@@ -1,0 +1,172 @@
+"""The motion of one frame against a keyframe of known depth."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from geogs.geometry.lie import se3_inverse
+from geogs.tracking.bundle import project, solve_poses
+from geogs.tracking.flow.base import FlowMatch, FlowOperator
+from geogs.tracking.grid import SampleGrid
+from geogs.tracking.keyframes import KeyframeState
+
+
+@dataclass(frozen=True)
+class FrameMotion:
+    """A frame located against a keyframe."""
+
+    keyframe: int
+    T_cw: Float[Tensor, "4 4"]
+    """float64."""
+    match: FlowMatch
+    """One edge, keyframe -> frame."""
+    flow: float
+    """Median motion of the matched cells in pixels: what the motion filter looks at."""
+    matched: float
+    """Fraction of the keyframe's cells with a match that agrees with the pose."""
+    residual: float
+    """Median distance in pixels between matches and reprojection."""
+
+
+class FrameLocator:
+    """Finds the pose of a frame from flow against keyframes, by motion-only adjustment."""
+
+    def __init__(
+        self,
+        grid: SampleGrid,
+        operator: FlowOperator,
+        min_matched: float,
+        max_residual: float,
+    ) -> None:
+        self.grid = grid
+        self.operator = operator
+        self.min_matched = min_matched
+        self.max_residual = max_residual
+
+    def locate(
+        self, keyframe: KeyframeState, encoded: Any, T_guess: Float[Tensor, "4 4"]
+    ) -> FrameMotion | None:
+        """Pose of a frame that is near ``T_guess``; None if too little agrees with any pose."""
+        forward, backward = both_reprojections(self.grid, keyframe, T_guess)
+        there, _ = self.operator.measure(
+            [keyframe.encoded], [encoded], forward[None], backward[None], fine=False
+        )
+        return self._solve(keyframe, there, T_guess)
+
+    def relocate(self, keyframe: KeyframeState, encoded: Any) -> FrameMotion | None:
+        """Pose of a frame about which nothing is known, by flow from a cold start and PnP."""
+        there, _ = self.operator.measure([keyframe.encoded], [encoded], fine=False)
+        good = (there.weight[0, :, 0] > 0) & (keyframe.information > 0)
+        T_rel = pnp(self.grid, keyframe.inverse_depth, there.pixels[0], good)
+        if T_rel is None:
+            return None
+        return self.locate(keyframe, encoded, T_rel.to(keyframe.T_cw) @ keyframe.T_cw)
+
+    def relocate_any(self, keyframes: Sequence[KeyframeState], encoded: Any) -> FrameMotion | None:
+        """The first success of :meth:`relocate` over several keyframes."""
+        for keyframe in keyframes:
+            motion = self.relocate(keyframe, encoded)
+            if motion is not None:
+                return motion
+        return None
+
+    def _solve(
+        self, keyframe: KeyframeState, match: FlowMatch, T_guess: Float[Tensor, "4 4"]
+    ) -> FrameMotion | None:
+        weight = match.weight * (keyframe.information > 0)[:, None]
+        used = weight[0, :, 0] > 0
+        if float(used.float().mean()) < self.min_matched:
+            return None
+        frame = torch.zeros(1, dtype=torch.long, device=weight.device)
+        T, residual = solve_poses(
+            self.grid.camera,
+            self.grid.rays,
+            T_guess[None],
+            keyframe.inverse_depth[None],
+            keyframe.T_cw[None],
+            frame,
+            match.pixels,
+            weight,
+            iterations=6,
+            huber=2.0,
+        )
+        error = residual[0].norm(dim=-1)
+        agree = float((used & (error < 2 * self.max_residual)).float().mean())
+        median = float(error[used].median())
+        if agree < self.min_matched or not median < self.max_residual:
+            return None
+        flow = float((match.pixels[0] - self.grid.pixels).norm(dim=-1)[used].median())
+        return FrameMotion(keyframe.id, T[0], match, flow, agree, median)
+
+
+def both_reprojections(
+    grid: SampleGrid, keyframe: KeyframeState, T_cw: Float[Tensor, "4 4"]
+) -> tuple[Float[Tensor, "p 2"], Float[Tensor, "p 2"]]:
+    """Cells of the keyframe in a frame at ``T_cw``, and cells of that frame in the keyframe.
+
+    The frame has no depth of its own; it borrows the keyframe's.
+    """
+    T = T_cw @ se3_inverse(keyframe.T_cw)
+    depth, _ = transfer_depth(grid, T, keyframe.inverse_depth, keyframe.information)
+    there = project(grid.camera, grid.rays, T[None], keyframe.inverse_depth[None])
+    back = project(grid.camera, grid.rays, se3_inverse(T)[None], depth[None])
+    return there.pixels[0], back.pixels[0]
+
+
+def transfer_depth(
+    grid: SampleGrid,
+    T_ji: Float[Tensor, "4 4"],
+    inverse_depth: Float[Tensor, "p"],
+    information: Float[Tensor, "p"],
+) -> tuple[Float[Tensor, "p"], Float[Tensor, "p"]]:
+    """Inverse depth and information of frame i as seen from frame j; nearest surface wins.
+
+    Cells that nothing falls on are filled from their surroundings and have no information.
+    """
+    R, t = T_ji[:3, :3].to(inverse_depth), T_ji[:3, 3].to(inverse_depth)
+    z = (grid.rays @ R.mT + inverse_depth[:, None] * t)[:, 2]
+    p = project(grid.camera, grid.rays, T_ji[None], inverse_depth[None])
+    cell, hit = grid.cells_of(p.pixels[0])
+    hit &= p.valid[0]
+    moved = torch.where(hit, inverse_depth / z.clamp(min=1e-6), torch.zeros_like(z))
+    depth = torch.zeros_like(moved).scatter_reduce(0, cell, moved, "amax")
+    nearest = hit & (moved >= 0.98 * depth[cell])
+    kept = torch.where(nearest, information * z.square(), torch.zeros_like(z))
+    transferred = torch.zeros_like(kept).scatter_reduce(0, cell, kept, "amax")
+    seen = depth > 0
+    # A token confidence lets cells without information still be filled from, if weakly.
+    return grid.fill(depth, torch.where(seen, transferred + 1e-6, 0.0)), transferred * seen
+
+
+def pnp(
+    grid: SampleGrid,
+    inverse_depth: Float[Tensor, "p"],
+    pixels: Float[Tensor, "p 2"],
+    good: Bool[Tensor, "p"],
+) -> Float[Tensor, "4 4"] | None:
+    """Pose T_ji of a view from cells with depth and their positions in it (RANSAC, SQPnP)."""
+    if int(good.sum()) < 50:
+        return None
+    points = (grid.rays[good] / inverse_depth[good, None]).double().cpu().numpy()
+    image = pixels[good].double().cpu().numpy()
+    threshold = max(grid.camera.width, grid.camera.height) / 250
+    ok, rotation, translation, inliers = cv2.solvePnPRansac(
+        points,
+        image,
+        grid.camera.matrix().numpy(),
+        None,
+        iterationsCount=200,
+        reprojectionError=threshold,
+        flags=cv2.SOLVEPNP_SQPNP,
+    )
+    if not ok or inliers is None or len(inliers) < 0.3 * len(points):
+        return None
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = cv2.Rodrigues(rotation)[0], translation[:, 0]
+    return torch.from_numpy(T).to(grid.device) if np.isfinite(T).all() else None

@@ -1,0 +1,239 @@
+"""The pose of every frame, solved at the end from sparse flow kept along the way."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from geogs.geometry.lie import retract, se3_inverse, se3_log
+from geogs.tracking.bundle import project, solve_poses
+from geogs.tracking.flow.base import FlowMatch, FlowOperator
+from geogs.tracking.grid import SampleGrid
+from geogs.tracking.keyframes import KeyframeState, KeyframeStore
+from geogs.tracking.motion import both_reprojections
+from geogs.types import Trajectory
+
+
+@dataclass
+class Observation:
+    """Flow from a keyframe to a frame on every second cell."""
+
+    keyframe: int
+    pixels: Float[Tensor, "s 2"]
+    weight: Float[Tensor, "s 2"]
+
+
+@dataclass
+class FrameRecord:
+    """One frame of the stream."""
+
+    index: int
+    timestamp: float
+    anchor: int | None
+    """Keyframe that the pose is relative to; None where the frame was not tracked."""
+    T_rel: Float[Tensor, "4 4"]
+    """Anchor keyframe to this frame."""
+    observations: list[Observation] = field(default_factory=list)
+
+
+@dataclass
+class _Pending:
+    record: FrameRecord
+    encoded: Any
+
+
+class TrajectoryRecorder:
+    """Keeps what is needed to place every frame once the keyframes are final.
+
+    Images wait only until the keyframes around them are safe from culling; then the flow from both
+    is measured and every second cell of it is kept.
+    """
+
+    def __init__(
+        self, store: KeyframeStore, operator: FlowOperator, max_pending: int = 64
+    ) -> None:
+        self.store, self.operator, self.max_pending = store, operator, max_pending
+        self.records: list[FrameRecord] = []
+        self._pending: list[_Pending] = []
+        self._subset = sparse_cells(store.grid)
+
+    def add_untracked(self, index: int, timestamp: float) -> None:
+        """A frame that could not be located."""
+        eye = torch.eye(4, dtype=torch.float64, device=self.store.grid.device)
+        self.records.append(FrameRecord(index, timestamp, None, eye))
+
+    def add(
+        self,
+        index: int,
+        timestamp: float,
+        encoded: Any,
+        anchor: int,
+        T_rel: Float[Tensor, "4 4"],
+        match: FlowMatch | None = None,
+    ) -> None:
+        """A frame at ``T_rel`` from the anchor keyframe, with the flow that located it."""
+        record = FrameRecord(index, timestamp, anchor, T_rel)
+        if match is not None:
+            self._observe(record, anchor, match, 0)
+        self.records.append(record)
+        self._pending.append(_Pending(record, encoded))
+        if len(self._pending) > self.max_pending:
+            del self._pending[: self.max_pending // 2]
+
+    def add_keyframe(self, id: int) -> None:
+        """A frame that is a keyframe."""
+        state = self.store[id]
+        eye = torch.eye(4, dtype=torch.float64, device=self.store.grid.device)
+        self.records.append(FrameRecord(state.frame_index, state.timestamp, id, eye))
+
+    def keyframe_removed(self, removed: KeyframeState, substitute: int) -> None:
+        """Make a culled keyframe an ordinary frame; frames anchored to it move to another one."""
+        base = removed.T_cw @ se3_inverse(self.store[substitute].T_cw)
+        for record in self.records:
+            if record.anchor == removed.id:
+                record.anchor, record.T_rel = substitute, record.T_rel @ base
+                record.observations = [o for o in record.observations if o.keyframe != removed.id]
+                if record.index == removed.frame_index:
+                    self._pending.append(_Pending(record, removed.encoded))
+        self._pending.sort(key=lambda p: p.record.index)
+
+    def anchor_to_keyframes(self) -> None:
+        """Give the frames seen before the map was started a pose between their keyframes."""
+        states = list(self.store)
+        indices = [s.frame_index for s in states]
+        for record in self.records:
+            if record.anchor is None or record.anchor not in self.store:
+                continue
+            n = indices.index(self.store[record.anchor].frame_index)
+            a, b = states[n], states[min(n + 1, len(states) - 1)]
+            span = max(b.frame_index - a.frame_index, 1)
+            share = (record.index - a.frame_index) / span
+            xi = se3_log(b.T_cw @ se3_inverse(a.T_cw))
+            record.T_rel = retract(share * xi, torch.eye(4).to(xi))
+
+    def finalise(self, before: int, after: int | None) -> None:
+        """Measure the waiting frames up to keyframe ``after`` against it and the one ``before``."""
+        end = None if after is None else self.store[after].frame_index
+        ready = [p for p in self._pending if end is None or p.record.index < end]
+        self._pending = [p for p in self._pending if end is not None and p.record.index >= end]
+        jobs = [
+            (p, k)
+            for p in ready
+            for k in (before, after)
+            if k is not None and all(o.keyframe != k for o in p.record.observations)
+        ]
+        for start in range(0, len(jobs), 8):
+            self._measure(jobs[start : start + 8])
+
+    def _measure(self, jobs: list[tuple[_Pending, int]]) -> None:
+        views = [
+            both_reprojections(self.store.grid, self.store[k], self._pose(p.record))
+            for p, k in jobs
+        ]
+        there, _ = self.operator.measure(
+            [self.store[k].encoded for _, k in jobs],
+            [p.encoded for p, _ in jobs],
+            torch.stack([v[0] for v in views]),
+            torch.stack([v[1] for v in views]),
+            fine=False,
+        )
+        for n, (p, k) in enumerate(jobs):
+            self._observe(p.record, k, there, n)
+
+    def _observe(self, record: FrameRecord, keyframe: int, match: FlowMatch, edge: int) -> None:
+        pixels, weight = match.pixels[edge, self._subset], match.weight[edge, self._subset]
+        if bool((weight > 0).any()):
+            record.observations.append(Observation(keyframe, pixels.clone(), weight.clone()))
+
+    def _pose(self, record: FrameRecord) -> Float[Tensor, "4 4"]:
+        return record.T_rel @ self.store[record.anchor].T_cw
+
+    def solve(self, chunk: int = 64) -> Trajectory:
+        """Poses of all frames seen so far on the present keyframes, real timestamps.
+
+        Untracked frames are interpolated between their neighbours.
+        """
+        records = sorted(self.records, key=lambda r: r.index)
+        keyframes = {s.frame_index: s.id for s in self.store}
+        for record in records:
+            if record.anchor is not None and record.anchor not in self.store:
+                record.anchor = None
+        tracked = [r for r in records if r.anchor is not None]
+        free = [r for r in tracked if r.index not in keyframes and r.observations]
+        solved: dict[int, Tensor] = {r.index: self._pose(r) for r in tracked}
+        for start in range(0, len(free), chunk):
+            part = free[start : start + chunk]
+            poses = self._solve_chunk(part)
+            solved.update({r.index: T for r, T in zip(part, poses, strict=True)})
+        timestamps = np.array([r.timestamp for r in records], dtype=np.float64)
+        known = np.array([r.anchor is not None for r in records], dtype=bool)
+        T_cw = [solved.get(r.index) for r in records]
+        return Trajectory(timestamps, interpolate(timestamps, T_cw), known)
+
+    def _solve_chunk(self, records: list[FrameRecord]) -> Float[Tensor, "n 4 4"]:
+        grid, cells = self.store.grid, self._subset
+        pairs = [
+            (n, o)
+            for n, r in enumerate(records)
+            for o in r.observations
+            if o.keyframe in self.store
+        ]
+        start = torch.stack([self._pose(r) for r in records])
+        if not pairs:
+            return start
+        ids = [o.keyframe for _, o in pairs]
+        frame = torch.tensor([n for n, _ in pairs], device=grid.device)
+        depth = self.store.inverse_depths(ids)[:, cells]
+        information = self.store.informations(ids)[:, cells]
+        source = self.store.poses(ids)
+        weight = torch.stack([o.weight for _, o in pairs])
+        p = project(
+            grid.camera, grid.rays[cells], start[frame] @ se3_inverse(source), depth, jacobians=True
+        )
+        weight = depth_aware_weight(weight, p.depth_jacobian, information)
+        pixels = torch.stack([o.pixels for _, o in pairs])
+        T, _ = solve_poses(
+            grid.camera, grid.rays[cells], start, depth, source, frame, pixels, weight, iterations=8
+        )
+        return T
+
+
+def sparse_cells(grid: SampleGrid) -> Bool[Tensor, "p"]:
+    """Every second cell in both directions."""
+    keep = torch.zeros(grid.height, grid.width, dtype=torch.bool, device=grid.device)
+    keep[::2, ::2] = True
+    return keep.reshape(-1)
+
+
+def depth_aware_weight(
+    weight: Float[Tensor, "e p 2"],
+    depth_jacobian: Float[Tensor, "e p 2"],
+    information: Float[Tensor, "e p"],
+) -> Float[Tensor, "e p 2"]:
+    """Inverse variance of a match plus that of the keyframe's depth carried into the image."""
+    depth = depth_jacobian.square() / information.clamp(min=1e-12)[..., None]
+    variance = 1 / weight.clamp(min=1e-12) + depth
+    return (weight > 0) * (information > 0)[..., None] / variance
+
+
+def interpolate(
+    timestamps: Float[np.ndarray, "n"], T_cw: list[Tensor | None]
+) -> Float[np.ndarray, "n 4 4"]:
+    """Camera to world of every frame; gaps are bridged by constant motion, ends are held."""
+    known = [n for n, T in enumerate(T_cw) if T is not None]
+    out = np.tile(np.eye(4), (len(T_cw), 1, 1))
+    if not known:
+        return out
+    for n, T in enumerate(T_cw):
+        if T is None:
+            a = max((k for k in known if k < n), default=known[0])
+            b = min((k for k in known if k > n), default=known[-1])
+            T = T_cw[a]
+            if a != b:
+                share = (timestamps[n] - timestamps[a]) / max(timestamps[b] - timestamps[a], 1e-9)
+                T = retract(share * se3_log(T_cw[b] @ se3_inverse(T)), T)
+        out[n] = se3_inverse(T).cpu().numpy()
+    return out
