@@ -120,6 +120,16 @@ class DepthConfig:
     """Semi-global matching: how fast the large step gets cheaper with the grey difference."""
     sure_deviation: float = 0.05
     """Relative deviation at which the tracker's confidence is one half."""
+    refine_steps: int = 3
+    """Refinement: photometric steps."""
+    support_contrast: float = 200.0
+    fit_radius: int = 3
+    fit_deviation: float = 0.01
+    fit_tolerance: float = 0.01
+    fit_stiffness: float = 0.5
+    guide_contrast: float = 200.0
+    plane_deviation: float = 0.005
+    step_limit: float = 0.03
     vote_confidence: float = 0.3
     """Least confidence of a pixel that votes."""
     vote_support: float = 0.04
@@ -333,3 +343,22 @@ class Config:
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
     mapping: MappingConfig = field(default_factory=MappingConfig)
     mesh: MeshConfig = field(default_factory=MeshConfig)
+
+Preset = Literal["fast", "default", "accurate"]
+
+
+def preset(name: Preset) -> Config:
+    """The settings of a preset.
+
+    ``fast`` stops after the online map; ``accurate`` works on larger images and trains longer.
+    """
+    base = Config()
+    if name == "fast":
+        mapping = replace(
+            base.mapping, iterations=10, pose_iterations=0, final_iterations=100, final_depth=False
+        )
+        return replace(base, mapping=mapping)
+    if name == "accurate":
+        mapping = replace(base.mapping, render_long_edge=400, iterations=20, final_iterations=1500)
+        return replace(base, input=replace(base.input, long_edge=640), mapping=mapping)
+    return base

@@ -7,6 +7,8 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
+from geogs.geometry.camera import Camera
+
 
 @dataclass(frozen=True, slots=True)
 class Frame:
@@ -93,6 +95,8 @@ class RenderedKeyframe:
     """The map seen from a keyframe: what a surface is made from."""
 
     keyframe_id: int
+    camera: Camera
+    """Of the maps."""
     T_cw: Float[Tensor, "4 4"]
     """World to camera, float64."""
     depth: Float[Tensor, "h w"]

@@ -95,6 +95,9 @@ def _guarded(run: Callable[[], int]) -> int:
     except KeyboardInterrupt:
         print_error("interrupted.")
         return EXIT_INTERRUPTED
+    except BrokenPipeError:  # the reader of our output, such as head, has enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return EXIT_ERROR
     except GeogsError as error:
         if os.environ.get("GEOGS_DEBUG", "0") not in ("", "0"):
             raise

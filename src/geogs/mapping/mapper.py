@@ -193,7 +193,8 @@ class Mapper:
         for i in view.partners:
             other = self.views[i]
             pool = [self.views[j] for j in {*other.partners, view.id} if j in self.views]
-            other.partners = choose_partners(other, pool, float(np.median(other.depth.depth)), photo)
+            depth = float(np.median(other.depth.depth))
+            other.partners = choose_partners(other, pool, depth, photo)
 
     def _batch(self, ids: list[int]) -> list[tuple[MapView, list[MapView]]]:
         views = [self.views[i] for i in ids]
@@ -265,6 +266,7 @@ class Mapper:
         length = output.normal.norm(dim=-1, keepdim=True).clamp(min=1e-6)
         return RenderedKeyframe(
             keyframe_id=view.id,
+            camera=self.cameras.render,
             T_cw=view.T_cw,
             depth=depth,
             normal=torch.where(depth[..., None] > 0, output.normal / length, 0.0),

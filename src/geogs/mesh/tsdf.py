@@ -113,7 +113,9 @@ class SparseTsdf:
         Each pixel is a small plane: its inverse depth with its slopes, which is exact on flat
         surfaces at any slant and does not mix the two sides of a depth step. Every voxel of every
         block in view is updated up to one truncation behind the surface, so free space seen later
-        clears what an earlier view put there. Distances are along the optical axis.
+        clears what an earlier view put there. Distances are along the optical axis. Beyond one
+        voxel behind the surface the weight falls to zero (Bylow et al. 2013), since what is
+        behind one view's silhouette is often in front of another's surface.
         """
         depth = depth.to(self.device, torch.float32)
         weight = weight.to(self.device, torch.float32)
@@ -124,7 +126,7 @@ class SparseTsdf:
         points = camera.back_project(depth)[valid].double()
         points = (points - T_cw[:3, 3]) @ T_cw[:3, :3]
         self._allocate(band_blocks(points, self.voxel, self.truncation))
-        table = _plane_table(camera, depth, torch.where(valid, weight, 0.0), valid)
+        table = _plane_table(depth, torch.where(valid, weight, 0.0), valid)
         far = float(depth[valid].max()) + self.truncation * self.voxel
         projection = camera.matrix().to(self.device) @ T_cw[:3]
         visible = self._in_view(camera, T_cw, far)
@@ -173,7 +175,7 @@ class SparseTsdf:
         self,
         slots: Int[Tensor, "k"],
         projection: Float[Tensor, "3 4"],
-        table: Float[Tensor, "p 5"],
+        table: Float[Tensor, "p 4"],
         camera: Camera,
     ) -> None:
         block = projection[:, :3] @ (self._coordinates[slots].double().mT * BLOCK * self.voxel)
@@ -189,15 +191,9 @@ class SparseTsdf:
         pixel = torch.where(inside, row * camera.width + column, 0.0).long()
         sample = table[pixel.flatten()].unflatten(0, z.shape)
         surface = sample[..., 0] + sample[..., 1] * (u - column) + sample[..., 2] * (v - row)
-        ahead = (1.0 - z * surface) * sample[..., 4] / (self.truncation * self.voxel)
-        import os
-        F = float(os.environ.get("FADE", "1")) / self.truncation
-        M = int(os.environ.get("MODE", "0"))
-        along = (1.0 / surface - z) / (self.truncation * self.voxel)
-        if M == 0: ahead = along
-        fade = ((1.0 + along) / (1.0 - F)).clamp(max=1.0)
-        if M == 2: fade = fade * (ahead / along).clamp(0.1, 1)
-        gain = torch.where(inside & (along > -1.0), sample[..., 3] * fade, 0.0)
+        ahead = (1.0 / surface - z) / (self.truncation * self.voxel)
+        fade = ((1.0 + ahead) / (1.0 - 1.0 / self.truncation)).clamp(max=1.0)
+        gain = torch.where(inside & (ahead > -1.0), sample[..., 3] * fade, 0.0)
         old = self._weight[slots]
         new = old + gain
         change = (ahead.clamp(max=1.0) - self._distance[slots]) * (gain / new.clamp(min=1e-20))
@@ -206,8 +202,8 @@ class SparseTsdf:
 
 
 def _plane_table(
-    camera: Camera, depth: Float[Tensor, "h w"], weight: Float[Tensor, "h w"], valid: Bool[Tensor, "h w"]
-) -> Float[Tensor, "p 5"]:
+    depth: Float[Tensor, "h w"], weight: Float[Tensor, "h w"], valid: Bool[Tensor, "h w"]
+) -> Float[Tensor, "p 4"]:
     """Inverse depth, its slopes along u and v (1 / map unit / pixel) and weight of each pixel.
 
     A slope is the smaller of the differences to the two neighbours, zero where they disagree in
@@ -226,8 +222,4 @@ def _plane_table(
         smaller = torch.where(before.abs() < after.abs(), before, after)
         return torch.where(before * after > 0, smaller, 0.0)
 
-    gu, gv = slope(1), slope(0)
-    u = torch.arange(depth.shape[1], device=depth.device) - camera.cx
-    v = torch.arange(depth.shape[0], device=depth.device)[:, None] - camera.cy
-    normal = torch.stack([camera.fx * gu, camera.fy * gv, inverse - gu * u - gv * v], -1)
-    return torch.stack([inverse, gu, gv, weight, 1 / normal.norm(dim=-1)], -1).flatten(0, 1)
+    return torch.stack([inverse, slope(1), slope(0), weight], -1).flatten(0, 1)

@@ -8,6 +8,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from geogs.geometry.camera import Camera
+from geogs.splat.cpu.pool import default_threads
+from geogs.splat.cpu.rasterize import rasterize_backward, rasterize_forward
 from geogs.splat.map import DiskParameters, GaussianMap
 from geogs.splat.reference import render_reference
 
@@ -58,4 +60,43 @@ def render(
     ``reference`` works in the positions' dtype on any device, ``cpu`` in float32 on the CPU.
     """
     parameters = disks.parameters if isinstance(disks, GaussianMap) else disks
-    return RenderOutput(*render_reference(parameters, camera, T_cw, near))
+    if backend == "auto":
+        position = parameters.position
+        fits = position.device.type == "cpu" and position.dtype == torch.float32
+        backend = "cpu" if fits else "reference"
+    if backend == "reference":
+        return RenderOutput(*render_reference(parameters, camera, T_cw, near))
+    if any(p.dtype != torch.float32 or p.device.type != "cpu" for p in parameters):
+        raise ValueError("The cpu backend renders float32 disks on the CPU.")
+    return RenderOutput(*_Rasterize.apply(*parameters, T_cw, camera, near, default_threads()))
+
+
+class _Rasterize(torch.autograd.Function):
+    """The cpu backend."""
+
+    @staticmethod
+    def forward(ctx, position, quaternion, log_scale, opacity_logit, T_cw, camera, near, threads):
+        disks = (position, quaternion, log_scale, opacity_logit)
+        arrays = tuple(p.detach().contiguous().numpy() for p in disks)
+        pose = T_cw.detach()[:3].to("cpu", torch.float64).contiguous().numpy()
+        with_trace = any(ctx.needs_input_grad)
+        maps, trace = rasterize_forward(arrays, camera, pose, near, threads, with_trace)
+        tensors = tuple(torch.from_numpy(getattr(maps, f)) for f in maps.__slots__)
+        if with_trace:
+            # Saved, so that PyTorch notices if they are changed before the backward pass.
+            ctx.save_for_backward(*disks, T_cw)
+            ctx.trace, ctx.threads = trace, threads
+            ctx.set_materialize_grads(True)
+        ctx.mark_non_differentiable(*tensors[4:])
+        return tensors
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, *gradients):
+        *_, T_cw = ctx.saved_tensors
+        maps = (g.to(torch.float32).contiguous().numpy() for g in gradients[:4])
+        result = rasterize_backward(ctx.trace, *maps, ctx.threads)
+        d_T = torch.zeros(4, 4, dtype=torch.float64)
+        d_T[:3] = torch.from_numpy(result.T_cw)
+        disks = (result.position, result.quaternion, result.log_scale, result.opacity_logit)
+        return *(torch.from_numpy(d) for d in disks), d_T.to(T_cw), None, None, None

@@ -203,16 +203,18 @@ def _surface_coordinates(kind, half, face, px, py, pz):
 @njit(**_OPTIONS)
 def _add_bilinear(texels, start, w, h, u, v, wrap, weight, out):
     """Adds ``weight`` times a w x h level of a texture at position (u, v) in [0, 1]."""
+    if wrap:
+        u, v = u - math.floor(u), v - math.floor(v)
     u, v = u * w - 0.5, v * h - 0.5
     c, r = math.floor(u), math.floor(v)
     fu, fv = u - c, v - r
     c0, r0 = int(c), int(r)
     c1, r1 = c0 + 1, r0 + 1
-    if wrap:
-        c0, c1, r0, r1 = c0 % w, c1 % w, r0 % h, r1 % h
-    else:
-        c0, c1 = min(max(c0, 0), w - 1), min(max(c1, 0), w - 1)
-        r0, r1 = min(max(r0, 0), h - 1), min(max(r1, 0), h - 1)
+    # Past the border follows the opposite border or the border itself.
+    c0 = (c0 if c0 >= 0 else (w - 1 if wrap else 0)) if c0 < w else w - 1
+    r0 = (r0 if r0 >= 0 else (h - 1 if wrap else 0)) if r0 < h else h - 1
+    c1 = c1 if c1 < w else (0 if wrap else w - 1)
+    r1 = r1 if r1 < h else (0 if wrap else h - 1)
     top, bottom = start + 3 * r0 * w, start + 3 * r1 * w
     for k in range(3):
         upper = (1.0 - fu) * texels[top + 3 * c0 + k] + fu * texels[top + 3 * c1 + k]
@@ -262,14 +264,16 @@ def _light(lighting, point, normal, out):
     x, y, z = int(gx), int(gy), int(gz)
     fx, fy, fz = gx - x, gy - y, gz - z
     sky = 0.5 + 0.5 * normal[2]
-    for k in range(3):
-        out[k] = 0.0
+    out[:] = 0.0
     for channel in range(channels):
-        seen = 0.0
-        for corner in range(8):
-            i, j, k = corner & 1, corner >> 1 & 1, corner >> 2
-            weight = (fx if i else 1 - fx) * (fy if j else 1 - fy) * (fz if k else 1 - fz)
-            seen += weight * volume[z + k, y + j, x + i, channel]
+        near = (1 - fy) * (
+            (1 - fx) * volume[z, y, x, channel] + fx * volume[z, y, x + 1, channel]
+        ) + fy * ((1 - fx) * volume[z, y + 1, x, channel] + fx * volume[z, y + 1, x + 1, channel])
+        z1 = z + 1
+        far = (1 - fy) * (
+            (1 - fx) * volume[z1, y, x, channel] + fx * volume[z1, y, x + 1, channel]
+        ) + fy * ((1 - fx) * volume[z1, y + 1, x, channel] + fx * volume[z1, y + 1, x + 1, channel])
+        seen = (1 - fz) * near + fz * far
         if channel == 0:
             for k in range(3):
                 out[k] += seen * (lighting.above[k] * sky + lighting.below[k] * (1.0 - sky))
@@ -303,20 +307,29 @@ def _surface(solids, camera, i, face, t, x, y, local, world, normal):
 
 
 @njit(**_OPTIONS)
-def _around(solid, row, column, found):
-    """Collects the distinct solids seen in the 3 x 3 pixels around one; returns their number."""
+def _around(solid, face, row, column, found):
+    """Collects the distinct faces (8 solid + face) seen in 3 x 3 pixels; returns their number."""
     rows, columns = solid.shape
     count = 0
     for r in range(max(row - 1, 0), min(row + 2, rows)):
         for c in range(max(column - 1, 0), min(column + 2, columns)):
-            i = solid[r, c]
-            known = i < 0
+            key = 8 * solid[r, c] + face[r, c]
+            known = key < 0
             for k in range(count):
-                known = known or found[k] == i
+                known = known or found[k] == key
             if not known:
-                found[count] = i
+                found[count] = key
                 count += 1
     return count
+
+
+@njit(**_OPTIONS)
+def _gain(solids, lighting, i, world, normal, out):
+    """What the texture of solid i is multiplied with."""
+    if solids.emission[i] > 0.0:
+        out[:] = solids.emission[i]
+    else:
+        _light(lighting, world, normal, out)
 
 
 @njit(**_OPTIONS)
@@ -325,52 +338,43 @@ def shade_rows(
 ):
     """Colour and camera-frame normal of rows [first, last) from what ``cast_rows`` found.
 
-    Four samples a pixel; each is cast against the solids seen in the 3 x 3 pixels around, so edges
-    are smooth without casting against the whole scene again.
+    Inside a face one sample with the texture low-passed to the pixel is enough. At an edge four
+    samples are cast, only against the solids seen in the 3 x 3 pixels around.
     """
     found = np.empty(9, np.int64)
     local, world, normal = np.empty(3), np.empty(3), np.empty(3)
-    gain, other_gain, colour = np.empty(3), np.empty(3), np.empty(3)
+    gain, edge_gain, colour = np.empty(3), np.empty(3), np.empty(3)
     pixel_x, pixel_y = abs(xs[1] - xs[0]), abs(ys[1] - ys[0])
     for row in range(first, last):
         for column in range(len(xs)):
-            centre = solid[row, column]
-            if centre < 0:
+            i, f, t, x, y = solid[row, column], face[row, column], depth[row, column], xs[column], ys[row]
+            if i < 0:
                 continue
-            centre_face, t0 = face[row, column], depth[row, column]
-            x0, y0 = xs[column], ys[row]
-            cosine = _surface(
-                solids, camera, centre, centre_face, t0, x0, y0, local, world, normal
-            )
+            cosine = _surface(solids, camera, i, f, t, x, y, local, world, normal)
             for k in range(3):
                 normals[row, column, k] = (
                     camera[0, k] * normal[0] + camera[1, k] * normal[1] + camera[2, k] * normal[2]
                 )
-            if solids.emission[centre] > 0.0:
-                gain[:] = solids.emission[centre]
-            else:
-                _light(lighting, world, normal, gain)
-            count = _around(solid, row, column, found)
-            for sample in range(4):
-                x = x0 + (0.25 if sample & 1 else -0.25) * pixel_x
-                y = y0 + (0.25 if sample & 2 else -0.25) * pixel_y
-                t, i, f = np.inf, centre, centre_face
-                for k in range(count):
-                    tk, fk = _hit_pixel(solids, found[k], x, y)
-                    if tk < t:
-                        t, i, f = tk, found[k], fk
-                if t == np.inf:
-                    x, y, t = x0, y0, t0
-                cosine = _surface(solids, camera, i, f, t, x, y, local, world, normal)
-                footprint = 0.5 * t * pixel_x / math.sqrt(max(cosine, 0.05))
-                _texture_colour(solids, textures, i, f, local, footprint, colour)
-                if i == centre and f == centre_face:
-                    sample_gain = gain
-                else:
-                    sample_gain = other_gain
-                    if solids.emission[i] > 0.0:
-                        other_gain[:] = solids.emission[i]
-                    else:
-                        _light(lighting, world, normal, other_gain)
+            _gain(solids, lighting, i, world, normal, gain)
+            footprint = t * pixel_x / math.sqrt(max(cosine, 0.05))
+            count = _around(solid, face, row, column, found)
+            if count == 1:
+                _texture_colour(solids, textures, i, f, local, 0.7 * footprint, colour)
                 for k in range(3):
-                    image[row, column, k] += 0.25 * min(colour[k] * sample_gain[k], 255.0)
+                    image[row, column, k] = min(colour[k] * gain[k], 255.0)
+                continue
+            for sample in range(4):
+                dx = (0.25 if sample & 1 else -0.25) * pixel_x
+                dy = (0.25 if sample & 2 else -0.25) * pixel_y
+                ts, js, fs = np.inf, i, f
+                for k in range(count):
+                    tk, fk = _hit_pixel(solids, found[k] >> 3, x + dx, y + dy)
+                    if tk < ts:
+                        ts, js, fs = tk, found[k] >> 3, fk
+                if ts == np.inf:
+                    ts, dx, dy = t, 0.0, 0.0
+                _surface(solids, camera, js, fs, ts, x + dx, y + dy, local, world, normal)
+                _texture_colour(solids, textures, js, fs, local, 0.5 * footprint, colour)
+                _gain(solids, lighting, js, world, normal, edge_gain)
+                for k in range(3):
+                    image[row, column, k] += 0.25 * min(colour[k] * edge_gain[k], 255.0)

@@ -21,19 +21,21 @@ def fractal_noise(
     octaves: int = 6,
     gain: float = 0.6,
 ) -> Float32[np.ndarray, "h w"]:
-    """Periodic value noise of unit deviation: cubic lattices, each octave twice as fine (Perlin).
+    """Periodic value noise of unit deviation: random lattices, each octave twice as fine (Perlin).
 
     ``cells`` counts the first octave's lattice cells down and across; octaves finer than a texel
-    are left out.
+    are left out. Coarse octaves are enlarged step by step, so only the last step is full size.
     """
-    total = np.zeros(shape, np.float32)
-    for k in range(octaves):
-        rows, columns = round(cells[0] * 2**k), round(cells[1] * 2**k)
-        if rows > shape[0] or columns > shape[1]:
+    rows, columns = max(round(cells[0]), 1), max(round(cells[1]), 1)
+    total = rng.standard_normal((rows, columns), np.float32)
+    for k in range(1, octaves):
+        finer = (2 * total.shape[0], 2 * total.shape[1])
+        if finer[0] > shape[0] or finer[1] > shape[1]:
             break
-        lattice = rng.standard_normal((max(rows, 1), max(columns, 1)), np.float32)
-        total += gain**k * _enlarge_periodic(lattice, shape)
-    return total / max(float(total.std()), 1e-6)
+        total = _enlarge_periodic(total, finer)
+        total += gain**k * rng.standard_normal(finer, np.float32)
+    total = _enlarge_periodic(total, shape)
+    return (total - total.mean()) / max(float(total.std()), 1e-6)
 
 
 def _enlarge_periodic(

@@ -171,7 +171,7 @@ def _check_selection(config: InputConfig, length: int | None) -> None:
         )
     if length is not None and config.start >= length:
         raise InputError(
-            f"start is {config.start}, but the source has only {length} frames; give a smaller start."
+            f"start is {config.start}, but the source has only {length} frames; give a smaller one."
         )
     if config.long_edge < 0:
         raise InputError(f"long_edge is {config.long_edge}; it must not be negative.")

@@ -13,9 +13,24 @@ from geogs.splat.cpu.layout import (
     MAX_REACH_RATIO,
     MIN_ALPHA,
     MIN_FACING,
+    MX,
+    MY,
+    NX,
+    NY,
+    NZ,
+    OPACITY,
     PER_DISK,
     TILE_HEIGHT,
     TILE_WIDTH,
+    UX,
+    UY,
+    VX,
+    VY,
+    WC,
+    WX,
+    WY,
+    Z_FURTHEST,
+    Z_NEAREST,
 )
 
 _INLINE = {**PER_DISK, "cache": False}
@@ -175,12 +190,11 @@ def project_disks(
         ku, kv = _SQRT_HALF / su, _SQRT_HALF / sv
         reach = 3 * math.sqrt(u[2] * u[2] + v[2] * v[2])
         away = -1.0 if facing > 0 else 1.0
-        record = records[i]
-        record[0], record[1] = mx, my
-        record[2], record[3] = ku * (a[0] - ac * ex) / fx, ku * (a[1] - ac * ey) / fy
-        record[4], record[5] = kv * (b[0] - bc * ex) / fx, kv * (b[1] - bc * ey) / fy
-        record[6], record[7], record[8] = ex / fx, ey / fy, 1 / c[2]
-        record[9] = opacity
-        record[10], record[11], record[12] = away * n[0], away * n[1], away * n[2]
-        record[13] = c[2] - min(reach, c[2] - near)
-        record[14] = c[2] + min(reach, MAX_REACH_RATIO * c[2])
+        r = records[i]
+        r[MX], r[MY], r[OPACITY] = mx, my, opacity
+        r[UX], r[UY] = ku * (a[0] - ac * ex) / fx, ku * (a[1] - ac * ey) / fy
+        r[VX], r[VY] = kv * (b[0] - bc * ex) / fx, kv * (b[1] - bc * ey) / fy
+        r[WX], r[WY], r[WC] = ex / fx, ey / fy, 1 / c[2]
+        r[NX], r[NY], r[NZ] = away * n[0], away * n[1], away * n[2]
+        r[Z_NEAREST] = c[2] - min(reach, c[2] - near)
+        r[Z_FURTHEST] = c[2] + min(reach, MAX_REACH_RATIO * c[2])

@@ -5,7 +5,33 @@ import math
 import numba
 import numpy as np
 
-from geogs.splat.cpu.layout import GRADIENT, PER_DISK
+from geogs.splat.cpu.layout import (
+    G_CLAMPED,
+    G_MX,
+    G_MY,
+    G_NX,
+    G_NY,
+    G_NZ,
+    G_OPACITY,
+    G_U,
+    G_UX,
+    G_UY,
+    G_V,
+    G_VX,
+    G_VY,
+    G_W,
+    G_WX,
+    G_WY,
+    GRADIENT,
+    OPACITY,
+    PER_DISK,
+    UX,
+    UY,
+    VX,
+    VY,
+    WX,
+    WY,
+)
 from geogs.splat.cpu.project import axes_of, bounded_facing, dot, place, rotate, unit_quaternion
 
 _INLINE = {**PER_DISK, "cache": False}
@@ -20,12 +46,6 @@ def rotate_back(T, v):
         T[0, 1] * v[0] + T[1, 1] * v[1] + T[2, 1] * v[2],
         T[0, 2] * v[0] + T[1, 2] * v[1] + T[2, 2] * v[2],
     )
-
-
-@numba.njit(**_INLINE)
-def combine(s, a, t, b):
-    """s a + t b"""
-    return (s * a[0] + t * b[0], s * a[1] + t * b[1], s * a[2] + t * b[2])
 
 
 @numba.njit(**_INLINE)
@@ -54,45 +74,96 @@ def quaternion_gradient(q, inverse_norm, a, b, n):
     )
 
 
+@numba.njit(**_INLINE)
+def sum_pairs(pair_gradients, first, last, total):
+    """Sum of rows first..last, always in this order."""
+    for k in range(GRADIENT):
+        total[k] = 0
+    for s in range(first, last):
+        for k in range(GRADIENT):
+            total[k] += pair_gradients[s, k]
+
+
+@numba.njit(**_INLINE)
+def record_backward(record, g, axes, c, ku, kv, intrinsics):
+    """Gradients of the camera-frame tangents, normal and centre from the pixels' sums ``g``.
+
+    ``ku``, ``kv`` are sqrt(1/2) over the scales. The record's formulas are in ``project_disks``.
+    """
+    fx, fy = intrinsics[0], intrinsics[1]
+    a, b, n = axes
+    facing, is_bounded = bounded_facing(n, c)
+    h = 1 / facing
+    ac, bc = dot(a, c), dot(b, c)
+    # With e = n / (n . c): u = ku (a - (a . c) e) / f, v = kv (b - (b . c) e) / f, w = e / f.
+    pu, pv = (ku * g[G_UX] / fx, ku * g[G_UY] / fy), (kv * g[G_VX] / fx, kv * g[G_VY] / fy)
+    g_ex = g[G_WX] / fx - ac * pu[0] - bc * pv[0]
+    g_ey = g[G_WY] / fy - ac * pu[1] - bc * pv[1]
+    g_ac = -h * (pu[0] * n[0] + pu[1] * n[1])
+    g_bc = -h * (pv[0] * n[0] + pv[1] * n[1])
+    g_facing = 0.0 if is_bounded else -h * h * (g_ex * n[0] + g_ey * n[1])
+    away = -1.0 if facing > 0 else 1.0
+    g_a = (pu[0] + g_ac * c[0], pu[1] + g_ac * c[1], g_ac * c[2])
+    g_b = (pv[0] + g_bc * c[0], pv[1] + g_bc * c[1], g_bc * c[2])
+    g_n = (
+        h * g_ex + g_facing * c[0] + away * g[G_NX],
+        h * g_ey + g_facing * c[1] + away * g[G_NY],
+        g_facing * c[2] + away * g[G_NZ],
+    )
+    # A pixel's offset is its position minus the projected centre, and enters u, v, w and rho2.
+    g_mx = fx * (g[G_MX] - g[G_U] * record[UX] - g[G_V] * record[VX] - g[G_W] * record[WX])
+    g_my = fy * (g[G_MY] - g[G_U] * record[UY] - g[G_V] * record[VY] - g[G_W] * record[WY])
+    # G_W is the sum for w where the plane gave the depth; where the depth was held at a constant
+    # distance from the centre, G_CLAMPED goes to c_z directly.
+    g_wc = g[G_W]
+    x, y, inverse_z = c[0] / c[2], c[1] / c[2], 1 / c[2]
+    g_c = (
+        g_ac * a[0] + g_bc * b[0] + g_facing * n[0] + g_mx * inverse_z,
+        g_ac * a[1] + g_bc * b[1] + g_facing * n[1] + g_my * inverse_z,
+        g_ac * a[2] + g_bc * b[2] + g_facing * n[2] + g[G_CLAMPED]
+        - (g_mx * x + g_my * y + g_wc * inverse_z) * inverse_z,
+    )  # fmt: skip
+    return g_a, g_b, g_n, g_c
+
+
 @numba.njit(**PER_DISK)
 def project_disks_backward(
-    position, quaternion, T, intrinsics, records, slots, pair_gradients, start, stop,
+    position, quaternion, log_scale, T, intrinsics, records, slots, pair_gradients, start, stop,
     d_position, d_quaternion, d_log_scale, d_opacity_logit, d_T,
 ):  # fmt: skip
     """Gradients of disks start..stop, and this range's share of the (3, 4) pose gradient.
 
     Disk i's pairs hold the slots ``slots[i]``..``slots[i + 1]``; they are summed in that order.
     """
-    fx, fy = intrinsics[0], intrinsics[1]
     g = np.empty(GRADIENT)
     for i in range(start, stop):
         if slots[i] == slots[i + 1]:
-            d_position[i] = 0
-            d_quaternion[i] = 0
-            d_log_scale[i] = 0
+            d_position[i, :] = 0
+            d_quaternion[i, :] = 0
+            d_log_scale[i, :] = 0
             d_opacity_logit[i] = 0
             continue
-        for k in range(GRADIENT):
-            g[k] = 0
-        for s in range(slots[i], slots[i + 1]):
-            for k in range(GRADIENT):
-                g[k] += pair_gradients[s, k]
-        record = records[i]
-        ux, uy, vx, vy = record[2], record[3], record[4], record[5]
-        opacity = np.float64(record[9])
+        sum_pairs(pair_gradients, slots[i], slots[i + 1], g)
+        r = records[i]
         p, c = place(position, i, T)
         q, inverse_norm = unit_quaternion(quaternion, i)
         tu, tv, tn = axes_of(*q)
-        a, b, n = rotate(T, tu), rotate(T, tv), rotate(T, tn)
-        facing, is_bounded = bounded_facing(n, c)
-        h = 1 / facing
-        away = -1.0 if facing > 0 else 1.0
-        ac, bc = dot(a, c), dot(b, c)
-
-        # The pixel's offset enters u, v, w and the low-pass distance; the centre with minus sign.
-        g_mx = g[10] - g[0] * ux - g[3] * vx - g[6] * record[6]
-        g_my = g[11] - g[0] * uy - g[3] * vy - g[6] * record[7]
-        # 1 / su and 1 / sv are read off the records' definition: u = k (a - (a . c) e) / f.
-        d_log_scale[i, 0] = -(g[1] * ux + g[2] * uy)
-        d_log_scale[i, 1] = -(g[4] * vx + g[5] * vy)
-        d_opacity_logit[i] = g[12] * opacity * (1 - opacity)
+        axes = rotate(T, tu), rotate(T, tv), rotate(T, tn)
+        ku = _SQRT_HALF * math.exp(-np.float64(log_scale[i, 0]))
+        kv = _SQRT_HALF * math.exp(-np.float64(log_scale[i, 1]))
+        g_a, g_b, g_n, g_c = record_backward(r, g, axes, c, ku, kv, intrinsics)
+        d_log_scale[i, 0] = -(g[G_UX] * r[UX] + g[G_UY] * r[UY])
+        d_log_scale[i, 1] = -(g[G_VX] * r[VX] + g[G_VY] * r[VY])
+        opacity = np.float64(r[OPACITY])
+        d_opacity_logit[i] = g[G_OPACITY] * opacity * (1 - opacity)
+        world = rotate_back(T, g_c)
+        d_position[i, 0], d_position[i, 1], d_position[i, 2] = world
+        columns = rotate_back(T, g_a), rotate_back(T, g_b), rotate_back(T, g_n)
+        turned = quaternion_gradient(q, inverse_norm, *columns)
+        d_quaternion[i, 0], d_quaternion[i, 1], d_quaternion[i, 2], d_quaternion[i, 3] = turned
+        add_outer(d_T, g_a, tu)
+        add_outer(d_T, g_b, tv)
+        add_outer(d_T, g_n, tn)
+        add_outer(d_T, g_c, p)
+        for k in range(3):
+            d_T[k, 3] += g_c[k]

@@ -1,0 +1,66 @@
+"""One progress line: frames, frames/s, keyframes, disks, memory, time left."""
+
+import sys
+import time
+from typing import TYPE_CHECKING
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+
+if TYPE_CHECKING:
+    from geogs.slam import SlamStatus
+
+
+def peak_memory() -> int:
+    """Largest resident size of this process so far, bytes."""
+    import resource
+
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak * 1024
+
+
+class RunProgress:
+    """Shows how far a run is; a context manager, on the standard error."""
+
+    def __init__(self, frames: int | None):
+        self._console = Console(stderr=True)
+        self._bar = Progress(
+            TextColumn("{task.description:<18}"),
+            BarColumn(bar_width=24),
+            TaskProgressColumn(),
+            TextColumn("{task.fields[info]}"),
+            TimeRemainingColumn(compact=True),
+            console=self._console,
+        )
+        self._frames = frames
+        self._start = time.perf_counter()
+        self._tasks = {"tracking": self._bar.add_task("tracking", total=frames, info="")}
+
+    def __enter__(self) -> "RunProgress":
+        self._bar.start()
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self._bar.stop()
+
+    def write(self, text: str) -> None:
+        """A line above the bars, if there is something to say."""
+        if text:
+            self._bar.console.print(text)
+
+    def frame(self, status: "SlamStatus") -> None:
+        """After each frame."""
+        rate = status.frames / max(time.perf_counter() - self._start, 1e-9)
+        info = (
+            f"{status.frames} frames  {rate:.1f}/s  {status.keyframes} keyframes  "
+            f"{status.disks / 1000:.1f}k disks  {peak_memory() / 2**30:.1f} GB"
+        )
+        if status.state.value != "tracking":
+            info += f"  [bold]{status.state.value}[/bold]"
+        self._bar.update(self._tasks["tracking"], completed=status.frames, info=info)
+
+    def stage(self, name: str, fraction: float) -> None:
+        """After each part of a later stage; ``fraction`` in [0, 1]."""
+        if name not in self._tasks:
+            self._tasks[name] = self._bar.add_task(name, total=1.0, info="")
+        self._bar.update(self._tasks[name], completed=fraction)

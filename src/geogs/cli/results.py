@@ -1,0 +1,145 @@
+"""Everything a run leaves in its folder."""
+
+import json
+import platform
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import torch
+
+import geogs
+from geogs.cli.progress import RunProgress, peak_memory
+from geogs.config import Config
+from geogs.errors import InputError
+from geogs.io.sources.base import Source
+from geogs.io.writers.atomic import write_text
+from geogs.io.writers.intrinsics import write_intrinsics
+from geogs.io.writers.native import save_map
+from geogs.io.writers.ply import write_mesh, write_splats
+from geogs.io.writers.tum import write_tum_trajectory
+from geogs.mesh.colour import colour_mesh
+from geogs.mesh.extract import extract_mesh
+from geogs.mesh.types import DepthMapView, Mesh
+from geogs.slam import Slam
+from geogs.types import MapSnapshot, RenderedKeyframe, Trajectory
+
+
+def write_results(
+    output: Path,
+    slam: Slam,
+    source: Source,
+    config: Config,
+    interrupted: bool,
+    progress: RunProgress,
+) -> None:
+    """Write poses first, then the map, the mesh, and the report on them."""
+    trajectory = slam.trajectory()
+    write_tum_trajectory(output / "trajectory.tum", trajectory)
+    write_tum_trajectory(output / "keyframes.tum", keyframe_trajectory(slam))
+    write_intrinsics(output / "intrinsics.json", source.camera, source.calibration)
+    write_config(output / "config.yaml", config)
+    disks = slam.snapshot()
+    save_map(output / "map.safetensors", disks, {"source": source.name, "seed": config.seed})
+    renders = slam.renders()
+    views = fusion_views(renders)
+    if len(disks):
+        write_splats(output / "splats.ply", disks, splat_colours(disks, views))
+    with slam.stopwatch("mesh"):
+        try:
+            mesh = extract_mesh(
+                views, config.mesh, lambda name, done, of: progress.stage(f"mesh: {name}", done / of)
+            )
+            write_mesh(output / "mesh.ply", mesh.vertices, mesh.faces, mesh.colours, mesh.normals)
+        except InputError as error:
+            mesh = None
+            progress.write(f"No mesh: {error}")
+    summary = summarise(slam, source, trajectory, disks, mesh, config, interrupted)
+    write_text(output / "summary.json", json.dumps(summary, indent=2))
+    with slam.stopwatch("report"):
+        write_report(output / "report", trajectory, renders, mesh)
+
+
+def keyframe_trajectory(slam: Slam) -> Trajectory:
+    """Poses of the keyframes alone."""
+    keyframes = [slam.tracker.keyframe(i) for i in slam.tracker.keyframe_ids]
+    T_wc = np.array([torch.linalg.inv(k.T_cw).numpy() for k in keyframes]).reshape(-1, 4, 4)
+    times = np.array([k.timestamp for k in keyframes], dtype=np.float64)
+    return Trajectory(times, T_wc, np.ones(len(keyframes), dtype=bool))
+
+
+def write_config(path: Path, config: Config) -> None:
+    """All settings as YAML."""
+    import yaml
+
+    plain = json.loads(json.dumps(asdict(config), default=str))
+    write_text(path, yaml.safe_dump(plain, sort_keys=False))
+
+
+def fusion_views(renders: list[RenderedKeyframe]) -> list[DepthMapView]:
+    """The renderings as what mesh extraction takes."""
+    return [DepthMapView(r.depth, r.weight, r.camera, r.T_cw, r.image) for r in renders]
+
+
+def splat_colours(disks: MapSnapshot, views: list[DepthMapView]) -> np.ndarray:
+    """RGB in [0, 1] of every disk, from the images that see it; the map itself has no colour."""
+    points = Mesh(
+        disks.position.cpu().numpy(), np.zeros((0, 3), np.int32), disks.normal.cpu().numpy()
+    )
+    tolerance = 4 * float(disks.scale.median())
+    colours = colour_mesh(points, views, tolerance).colours
+    return np.full((len(disks), 3), 0.5) if colours is None else colours / 255.0
+
+
+def summarise(
+    slam: Slam,
+    source: Source,
+    trajectory: Trajectory,
+    disks: MapSnapshot,
+    mesh: Mesh | None,
+    config: Config,
+    interrupted: bool,
+) -> dict[str, object]:
+    """What happened, in numbers."""
+    seconds = {name: round(s, 3) for name, s in slam.stopwatch.seconds.items()}
+    total = sum(seconds.values())
+    online = sum(seconds.get(k, 0.0) for k in ("tracking", "mapping", "pose refinement"))
+    return {
+        "source": source.name,
+        "kind": source.kind,
+        "frames": slam.frames,
+        "skipped_images": source.skipped,
+        "keyframes": len(slam.tracker.keyframe_ids),
+        "lost_spans": lost_spans(trajectory),
+        "disks": len(disks),
+        "mesh_faces": 0 if mesh is None else len(mesh.faces),
+        "seconds": {**seconds, "total": round(total, 3)},
+        "frames_per_second": {
+            "online": round(slam.frames / max(online, 1e-9), 3),
+            "with_final_stages": round(slam.frames / max(total, 1e-9), 3),
+        },
+        "peak_memory_bytes": peak_memory(),
+        "interrupted": interrupted,
+        "intrinsics": source.intrinsics_origin,
+        "scale": "arbitrary (monocular)",
+        "seed": config.seed,
+        "versions": {
+            "geogs": geogs.__version__,
+            "torch": torch.__version__,
+            "python": platform.python_version(),
+        },
+    }
+
+
+def lost_spans(trajectory: Trajectory) -> list[list[float]]:
+    """First and last time of every stretch where the camera was lost."""
+    lost = np.concatenate([[False], ~trajectory.tracked, [False]]).astype(int)
+    first, last = np.flatnonzero(np.diff(lost) == 1), np.flatnonzero(np.diff(lost) == -1) - 1
+    times = trajectory.timestamps
+    return [[float(times[a]), float(times[b])] for a, b in zip(first, last, strict=True)]
+
+
+def write_report(
+    folder: Path, trajectory: Trajectory, renders: list[RenderedKeyframe], mesh: Mesh | None
+) -> None:
+    """Plots that need no ground truth: the path, renders beside images, the shaded mesh."""

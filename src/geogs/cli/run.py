@@ -1,0 +1,116 @@
+"""``geogs run SOURCE``: a video in; trajectory, mesh and disk map out."""
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from geogs.cli.options import parse_options
+from geogs.cli.progress import RunProgress
+from geogs.config import Config, Preset, preset
+
+if TYPE_CHECKING:
+    from geogs.io.sources.base import Source
+    from geogs.slam import Slam
+
+# Options so common that they may be given without the name of their group.
+SHORT = {
+    "--intrinsics": "--input.intrinsics",
+    "--long-edge": "--input.long-edge",
+    "--start": "--input.start",
+    "--stop": "--input.stop",
+    "--stride": "--input.stride",
+    "-o": "--output",
+}
+
+
+@dataclass(frozen=True)
+class RunOptions(Config):
+    """Reconstruct a video, a folder of images, or a Replica, TUM RGB-D or 7-Scenes sequence.
+
+    Every default works: ``geogs run video.mp4``. Intrinsics: ``--intrinsics fx,fy,cx,cy``.
+    """
+
+    source: Annotated[Path, tyro.conf.Positional] = Path()
+    """Video file or folder."""
+    output: Path | None = None
+    """Folder for the results (also -o); out/NAME if none is given."""
+    preset: Preset = "default"
+    """Group of settings; single ones given beside it win."""
+    device: str = "cpu"
+    """Where to compute."""
+
+
+def main(argv: Sequence[str]) -> int:
+    """Run the command; returns the exit code."""
+    options = parse(argv)
+    run(options)
+    return 0
+
+
+def run(options: RunOptions) -> Path:
+    """Reconstruct, write the results, say where they are; returns their folder."""
+    from geogs.cli.results import write_results
+    from geogs.errors import InputError
+    from geogs.io.sources.sniff import open_source
+    from geogs.io.writers.atomic import prepare_output_folder
+    from geogs.slam import Slam
+
+    if options.device != "cpu":
+        raise InputError(f"There is no backend for {options.device} yet; use --device cpu.")
+    source = open_source(options.source, options.input)
+    output = prepare_output_folder(options.output or Path("out") / source.name)
+    slam = Slam(source.camera, options, options.device)
+    with RunProgress(source.length) as progress:
+        interrupted = _feed(slam, source, progress)
+        progress.write("Stopped early; keeping what there is." if interrupted else "")
+        slam.finish(progress.stage, correct=not interrupted)
+        write_results(output, slam, source, options, interrupted, progress)
+    print(f"Results are in {output}/")
+    return output
+
+
+def _feed(slam: "Slam", source: "Source", progress: RunProgress) -> bool:
+    """All frames through the system; true if Ctrl-C ended it early."""
+    try:
+        for frame in source:
+            status = slam.process(frame)
+            progress.frame(status)
+    except KeyboardInterrupt:
+        if slam.frames == 0:
+            raise
+        return True
+    return False
+
+
+def parse(argv: Sequence[str]) -> RunOptions:
+    """Options with the preset as defaults, over which single settings win."""
+    arguments = [_expand(a) for a in argv]
+    name = _preset_name(arguments)
+    base = preset(name)
+    default = RunOptions(
+        seed=base.seed, input=base.input, tracking=base.tracking, mapping=base.mapping,
+        mesh=base.mesh, source=tyro.MISSING, preset=name,
+    )  # fmt: skip
+    return parse_options(RunOptions, arguments, "run", default=default)
+
+
+def _expand(argument: str) -> str:
+    name, equals, value = argument.partition("=")
+    return SHORT.get(name, name) + equals + value
+
+
+def _preset_name(arguments: Sequence[str]) -> Preset:
+    """The preset asked for; a wrong one is left for the option parser to complain about."""
+    for i, argument in enumerate(arguments):
+        value = argument.partition("=")[2] or next(iter(arguments[i + 1 : i + 2]), "")
+        if argument.startswith("--preset") and value in ("fast", "default", "accurate"):
+            return value  # type: ignore[return-value]  # just tested
+    return "default"
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

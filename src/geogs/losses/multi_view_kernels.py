@@ -1,0 +1,284 @@
+"""The multi-view loss and its gradients over a span of rows, for float32 arrays.
+
+Three passes over the photometric image, each free to be cut into spans of rows: warp, correlate,
+pull back to the depth (and a fourth for the pose). A span writes only its own rows, and every sum
+has one order, so the result does not depend on how the image is cut. NaN must compare as NaN,
+hence no ``nnan``.
+"""
+
+import numpy as np
+from numba import njit
+
+FASTMATH = {"contract", "reassoc", "nsz", "arcp"}
+ZERO, HALF, ONE, TWO, HUGE = (np.float32(v) for v in (0, 0.5, 1, 2, 1e30))
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=FASTMATH)
+def sample_plain(image, i, j, fx, fy):
+    """Bilinear value between (j, i) and (j + 1, i + 1) and its derivatives along x and y."""
+    p, q, r, s = image[j, i], image[j, i + 1], image[j + 1, i], image[j + 1, i + 1]
+    upper, lower = p + (q - p) * fx, r + (s - r) * fx
+    return upper + (lower - upper) * fy, (q - p) * (ONE - fy) + (s - r) * fy, lower - upper
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=FASTMATH)
+def sample_sobel(image, i, j, fx, fy):
+    """The bilinear samples of the two 3x3 Sobel derivatives: one separable 4x4 filter each."""
+    height, width = image.shape
+    left, right = max(i - 1, 0), min(i + 2, width - 1)
+    dx = dy = ZERO
+    for k in range(4):
+        row = min(max(j + k - 1, 0), height - 1)
+        a, b, c, d = image[row, left], image[row, i], image[row, i + 1], image[row, right]
+        slope = (c - a) * (ONE - fx) + (d - b) * fx
+        smooth = (a + TWO * b + c) * (ONE - fx) + (b + TWO * c + d) * fx
+        near, far = (ONE - fy), fy
+        if k == 0:
+            dx, dy = dx + near * slope, dy - near * smooth
+        elif k == 1:
+            dx, dy = dx + (TWO * near + far) * slope, dy - far * smooth
+        elif k == 2:
+            dx, dy = dx + (near + TWO * far) * slope, dy + near * smooth
+        else:
+            dx, dy = dx + far * slope, dy + far * smooth
+    return dx / np.float32(8), dy / np.float32(8)
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=FASTMATH)
+def is_visible(depth, u, v, z, tolerance):
+    """Whether a point of depth ``z`` at (u, v) of the target's depth map is not hidden there."""
+    height, width = depth.shape
+    u, v = min(max(u, ZERO), np.float32(width - 1)), min(max(v, ZERO), np.float32(height - 1))
+    i, j = min(int(u), width - 2), min(int(v), height - 2)
+    p, q, r, s = depth[j, i], depth[j, i + 1], depth[j + 1, i], depth[j + 1, i + 1]
+    fx, fy = u - np.float32(i), v - np.float32(j)
+    upper, lower = p + (q - p) * fx, r + (s - r) * fx
+    known = (p > ZERO) & (q > ZERO) & (r > ZERO) & (s > ZERO)
+    return known and abs(z - upper - (lower - upper) * fy) < tolerance * z
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=FASTMATH)
+def robust(difference, huber, cut):
+    """Value and slope of the absolute difference, quadratic below huber, constant above cut."""
+    size = abs(difference)
+    if size >= cut:
+        return cut - HALF * huber, ZERO
+    if size < huber:
+        return HALF * size * size / huber, difference / huber
+    return size - HALF * huber, np.sign(difference)
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=FASTMATH)
+def enlarge_line(depth, y, rows, row_share, line):
+    """Row ``y`` of the depth enlarged along y only; 0 where a source pixel is unknown."""
+    i, k, f = rows[0, y], rows[1, y], row_share[y]
+    for x in range(depth.shape[1]):
+        a, b = depth[i, x], depth[k, x]
+        known = (a > ZERO) & (b > ZERO) & (a < HUGE) & (b < HUGE)
+        line[x] = a + (b - a) * f if known else ZERO
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=FASTMATH)
+def warp_rows(
+    first, last, depth, rows, row_share, columns, column_share, reference, target, target_depth,
+    lenses, T, options, sobel, warped, slope, mask, extra, loss,
+):  # fmt: skip
+    """The target image through the reference's depth, rows ``first <= y < last``.
+
+    rows, columns (2, n) and their shares: source pixels of the bilinear enlargement; lenses (3, 4):
+    fx, fy, cx, cy of the reference, of the target, and of the target at its depth map's size; T
+    (3, 4) reference to target; options: occlusion tolerance, least share of depth kept, L_1
+    weight, huber, cut. ``warped`` is filled from the reference where ``mask`` is 0; ``slope`` is
+    d warped / d depth; ``extra`` (3, h, w), unless empty, receives the derivatives along x and y
+    and the depth. ``loss[y]`` is the row's sum of the weighted L_1.
+    """
+    height, width = reference.shape
+    limit_u, limit_v = np.float32(target.shape[1] - 1), np.float32(target.shape[0] - 1)
+    fx, fy, cx, cy = lenses[0, 0], lenses[0, 1], lenses[0, 2], lenses[0, 3]
+    gx, gy, hx, hy = lenses[1, 0], lenses[1, 1], lenses[1, 2], lenses[1, 3]
+    zoom_u, zoom_v = lenses[2, 0] / gx, lenses[2, 1] / gy
+    occluded, with_extra = target_depth.shape[0] > 1, extra.shape[1] > 0
+    line = np.empty(depth.shape[1], np.float32)
+    for y in range(first, last):
+        total = ZERO
+        enlarge_line(depth, y, rows, row_share, line)
+        ry = (np.float32(y) - cy) / fy
+        bx, by, bz = T[0, 1] * ry + T[0, 2], T[1, 1] * ry + T[1, 2], T[2, 1] * ry + T[2, 2]
+        for x in range(width):
+            warped[y, x], slope[y, x], mask[y, x] = reference[y, x], ZERO, ZERO
+            if with_extra:
+                extra[0, y, x] = extra[1, y, x] = ZERO
+            near, far = line[columns[0, x]], line[columns[1, x]]
+            d = near + (far - near) * column_share[x]
+            rx = (np.float32(x) - cx) / fx
+            qx, qy, qz = T[0, 0] * rx + bx, T[1, 0] * rx + by, T[2, 0] * rx + bz
+            z = d * qz + T[2, 3]
+            if not ((near > ZERO) & (far > ZERO) & (z > options[1] * d)):
+                continue
+            inverse = ONE / z
+            px, py = (d * qx + T[0, 3]) * inverse, (d * qy + T[1, 3]) * inverse
+            u, v = gx * px + hx, gy * py + hy
+            if not ((u >= ZERO) & (v >= ZERO) & (u <= limit_u) & (v <= limit_v)):
+                continue
+            if occluded:
+                s, t = (u - hx) * zoom_u + lenses[2, 2], (v - hy) * zoom_v + lenses[2, 3]
+                if not is_visible(target_depth, s, t, z, options[0]):
+                    continue
+            i, j = min(int(u), target.shape[1] - 2), min(int(v), target.shape[0] - 2)
+            fu, fv = u - np.float32(i), v - np.float32(j)
+            value, du, dv = sample_plain(target, i, j, fu, fv)
+            if sobel:
+                du, dv = sample_sobel(target, i, j, fu, fv)
+            warped[y, x], mask[y, x] = value, ONE
+            slope[y, x] = (gx * du * (qx - px * qz) + gy * dv * (qy - py * qz)) * inverse
+            if with_extra:
+                extra[0, y, x], extra[1, y, x], extra[2, y, x] = du, dv, d
+            total += robust(value - reference[y, x], options[3], options[4])[0]
+        loss[y] = options[2] * total
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=FASTMATH)
+def correlate_rows(first, last, reference, warped, mask, half, options, fields, loss):
+    """L_ncc of windows centred in rows ``first <= y < last`` and what their pixels need of it.
+
+    options: weight, reject, least variance, texture, least coverage, variance floor. The gradient
+    at a pixel q is the sum over the windows p around it of
+    ``fields[0, p] + reference[q] fields[1, p] + warped[q] fields[2, p]``. Adds to ``loss[y]``.
+    """
+    height, width = reference.shape
+    side = 2 * half + 1
+    share = ONE / np.float32(side * side)
+    line, sums = np.empty((6, width), np.float32), np.empty((6, width), np.float32)
+    for y in range(first, last):
+        for x in range(width):
+            fields[0, y, x] = fields[1, y, x] = fields[2, y, x] = ZERO
+        if y < half or y >= height - half:
+            continue
+        line[:] = ZERO
+        for r in range(y - half, y + half + 1):
+            for x in range(width):
+                a, b = reference[r, x], warped[r, x]
+                line[0, x] += a
+                line[1, x] += a * a
+                line[2, x] += b
+                line[3, x] += b * b
+                line[4, x] += a * b
+                line[5, x] += mask[r, x]
+        inner = width - side + 1
+        sums[:] = ZERO
+        for k in range(side):
+            for c in range(6):
+                for x in range(inner):
+                    sums[c, x] += line[c, x + k]
+        total = ZERO
+        for x in range(inner):
+            mean_a, mean_b = share * sums[0, x], share * sums[2, x]
+            raw_a = max(share * sums[1, x] - mean_a * mean_a, ZERO)
+            raw_b = max(share * sums[3, x] - mean_b * mean_b, ZERO)
+            var_a, var_b = raw_a + options[5], raw_b + options[5]
+            inverse = ONE / np.sqrt(var_a * var_b)
+            ncc = (share * sums[4, x] - mean_a * mean_b) * inverse
+            used = (raw_a > options[2]) & (ONE - ncc < options[1])
+            used = used & (share * sums[5, x] > options[4] - np.float32(1e-4))
+            w = options[0] * raw_a / (raw_a + options[3]) if used else ZERO
+            total += w * (ONE - ncc)
+            cross = -w * share * inverse
+            own = w * share * ncc / var_b if raw_b > ZERO else ZERO
+            fields[0, y, x + half] = -cross * mean_a - own * mean_b
+            fields[1, y, x + half] = cross
+            fields[2, y, x + half] = own
+        loss[y] += total
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=FASTMATH)
+def image_gradient_row(y, reference, warped, mask, half, options, fields, line, sums, out):
+    """d loss / d warped of row ``y``: windows of the correlation and L_1; 0 outside the mask.
+
+    options as in :func:`warp_rows`; ``half`` is negative without correlation.
+    """
+    height, width = reference.shape
+    sums[:] = ZERO
+    if half >= 0:
+        line[:] = ZERO
+        for r in range(max(y - half, 0), min(y + half + 1, height)):
+            for c in range(3):
+                for x in range(width):
+                    line[c, x + half] += fields[c, r, x]
+        for k in range(2 * half + 1):
+            for c in range(3):
+                for x in range(width):
+                    sums[c, x] += line[c, x + k]
+    for x in range(width):
+        a, b = reference[y, x], warped[y, x]
+        e = b - a
+        push = min(max(e / options[3], -ONE), ONE) if abs(e) < options[4] else ZERO
+        g = sums[0, x] + a * sums[1, x] + b * sums[2, x] + options[2] * push
+        out[x] += g * mask[y, x]
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=FASTMATH)
+def depth_gradient_rows(
+    first, last, rows, row_share, columns, column_share, reference, warped, slope, mask, half,
+    options, fields, extra_gradient, g_image, g_depth,
+):  # fmt: skip
+    """d loss / d depth for the depth rows ``first <= y < last``: the enlargement's adjoint.
+
+    ``extra_gradient`` (h, w), unless empty, is added to d loss / d warped; ``g_image``, unless
+    empty, receives d loss / d warped. Image rows that feed two spans are computed in both.
+    """
+    height, width = reference.shape
+    line = np.empty((3, width + 2 * max(half, 0)), np.float32)
+    sums = np.empty((3, width), np.float32)
+    g = np.empty(width, np.float32)
+    pull = np.zeros((last - first, width), np.float32)
+    for y in range(height):
+        i, k, f = rows[0, y] - first, rows[1, y] - first, row_share[y]
+        own_i, own_k = 0 <= i < last - first, 0 <= k < last - first
+        if not (own_i or own_k):
+            continue
+        g[:] = ZERO
+        if len(extra_gradient) > 0:
+            g[:] = extra_gradient[y]
+        image_gradient_row(y, reference, warped, mask, half, options, fields, line, sums, g)
+        if len(g_image) > 0:
+            g_image[y] = g
+        if own_i:
+            for x in range(width):
+                pull[i, x] += (ONE - f) * slope[y, x] * g[x]
+        if own_k:
+            for x in range(width):
+                pull[k, x] += f * slope[y, x] * g[x]
+    for r in range(last - first):
+        for x in range(g_depth.shape[1]):
+            g_depth[first + r, x] = ZERO
+        for x in range(width):
+            f = column_share[x]
+            g_depth[first + r, columns[0, x]] += (ONE - f) * pull[r, x]
+            g_depth[first + r, columns[1, x]] += f * pull[r, x]
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=FASTMATH)
+def pose_gradient_rows(first, last, g_image, extra, lenses, T, g_T):
+    """d loss / d T (12 numbers of the 3x4 matrix) of each row ``first <= y < last``."""
+    fx, fy, cx, cy = lenses[0, 0], lenses[0, 1], lenses[0, 2], lenses[0, 3]
+    total = np.empty(12, np.float64)
+    for y in range(first, last):
+        total[:] = 0.0
+        for x in range(g_image.shape[1]):
+            g = g_image[y, x]
+            du, dv, d = g * extra[0, y, x], g * extra[1, y, x], extra[2, y, x]
+            if du == ZERO and dv == ZERO:
+                continue
+            X, Y = d * (np.float32(x) - cx) / fx, d * (np.float32(y) - cy) / fy
+            inverse = ONE / (T[2, 0] * X + T[2, 1] * Y + T[2, 2] * d + T[2, 3])
+            px = (T[0, 0] * X + T[0, 1] * Y + T[0, 2] * d + T[0, 3]) * inverse
+            py = (T[1, 0] * X + T[1, 1] * Y + T[1, 2] * d + T[1, 3]) * inverse
+            gx, gy = lenses[1, 0] * du * inverse, lenses[1, 1] * dv * inverse
+            gz = -gx * px - gy * py
+            for k in range(3):
+                s = gx if k == 0 else (gy if k == 1 else gz)
+                total[4 * k] += s * X
+                total[4 * k + 1] += s * Y
+                total[4 * k + 2] += s * d
+                total[4 * k + 3] += s
+        g_T[y] = total

@@ -1,0 +1,186 @@
+"""Compositing the disks of each tile, front to back."""
+
+import numba
+import numpy as np
+
+from geogs.splat.cpu.layout import (
+    HALF,
+    LANES,
+    MAX_ALPHA,
+    MIN_ALPHA,
+    MIN_HIT_RATIO,
+    MIN_TRANSMITTANCE,
+    MX,
+    MY,
+    NX,
+    NY,
+    NZ,
+    ONE,
+    OPACITY,
+    PER_PIXEL,
+    SAVED_LAST,
+    SAVED_LIGHT,
+    SAVED_MOMENT,
+    TILE_HEIGHT,
+    TILE_PIXELS,
+    TILE_WIDTH,
+    TWO,
+    UX,
+    UY,
+    VX,
+    VY,
+    WC,
+    WX,
+    WY,
+    Z_FURTHEST,
+    Z_NEAREST,
+    ZERO,
+    exp_minus,
+)
+
+_INLINE = {**PER_PIXEL, "cache": False}
+# State planes. Offsets are unsigned, so that the compiler need not handle negative indices.
+(
+    _X, _Y, _LIGHT, _MOMENT, _NORMAL_X, _NORMAL_Y, _NORMAL_Z, _DISTORTION, _MEDIAN, _LAST,
+) = (np.uint64(k * TILE_PIXELS) for k in range(10))  # fmt: skip
+_PLANES = 10
+_RUNS = TILE_PIXELS // LANES
+_CHECK_EVERY = 16
+
+
+@numba.njit(**_INLINE)
+def reference_depth(records, lists, first, last):
+    """Depth from which a tile's sums are measured, to keep their digits: the middle disk's."""
+    return ONE / records[lists[(first + last) // 2], WC]
+
+
+@numba.njit(**_INLINE)
+def run_of(boxes, i, top, first_run, last_run):
+    """The pixels of a tile from row ``top`` that disk i's box reaches, within some runs."""
+    low = max((boxes[i, 2] - top) * TILE_WIDTH // LANES, first_run)
+    high = min(((boxes[i, 3] - top) * TILE_WIDTH + LANES - 1) // LANES, last_run)
+    return np.uint64(low * LANES), np.uint64(max(low, high) * LANES)
+
+
+@numba.njit(**_INLINE)
+def blend_disk(state, start, stop, r, rank, z_reference, inverse_near):
+    """Blend one disk into the pixels start..stop of a tile; returns the sum of its weights.
+
+    A pixel's light is the transmittance, and turns negative when blending stops.
+    """
+    mx, my, opacity, wc = r[MX], r[MY], r[OPACITY], r[WC]
+    ux, uy, vx, vy, wx, wy = r[UX], r[UY], r[VX], r[VY], r[WX], r[WY]
+    nx, ny, nz = r[NX], r[NY], r[NZ]
+    nearest, furthest = r[Z_NEAREST], r[Z_FURTHEST]
+    least = wc * MIN_HIT_RATIO
+    shown = ZERO
+    for j in range(start, stop):
+        dx, dy = state[_X + j] - mx, state[_Y + j] - my
+        w = wx * dx + wy * dy + wc
+        bounded = min(max(w, least), inverse_near)
+        z = ONE / bounded
+        u, v = z * (ux * dx + uy * dy), z * (vx * dx + vy * dy)
+        rho3, rho2 = u * u + v * v, dx * dx + dy * dy
+        on_plane = (bounded == w) & (rho3 <= rho2)
+        z = z if on_plane else min(max(z, nearest), furthest)
+        a = min(opacity * exp_minus(rho3 if on_plane else rho2), MAX_ALPHA)
+        light = state[_LIGHT + j]
+        weight = light * a
+        left = light - weight
+        hit = a >= MIN_ALPHA
+        blended = hit & (left >= MIN_TRANSMITTANCE)
+        weight = weight if blended else ZERO
+        zc = z - z_reference
+        moment = state[_MOMENT + j]
+        state[_DISTORTION + j] += weight * abs(zc * (ONE - light) - moment)
+        state[_MOMENT + j] = moment + weight * zc
+        state[_NORMAL_X + j] += weight * nx
+        state[_NORMAL_Y + j] += weight * ny
+        state[_NORMAL_Z + j] += weight * nz
+        state[_MEDIAN + j] = z if blended & (light > HALF) else state[_MEDIAN + j]
+        state[_LAST + j] = rank if blended else state[_LAST + j]
+        stopped = -abs(light) if hit else light
+        state[_LIGHT + j] = left if blended else stopped
+        shown += weight
+    return shown
+
+
+@numba.njit(**_INLINE)
+def live_runs(state):
+    """First and last (exclusive) run in which some pixel still takes light."""
+    first, last = _RUNS, 0
+    for run in range(_RUNS):
+        most = -ONE
+        for j in range(np.uint64(run * LANES), np.uint64(run * LANES + LANES)):
+            most = max(most, state[_LIGHT + j])
+        if most > ZERO:
+            first, last = min(first, run), run + 1
+    return first, last
+
+
+@numba.njit(**_INLINE)
+def clear_state(state, left, top, width, height):
+    """Untouched pixels with full light; those outside the image take none."""
+    state[:] = ZERO
+    for row in range(TILE_HEIGHT):
+        for col in range(TILE_WIDTH):
+            j = np.uint64(row * TILE_WIDTH + col)
+            state[_X + j], state[_Y + j] = left + col, top + row
+            state[_LIGHT + j] = ONE if (left + col < width) & (top + row < height) else -ONE
+
+
+@numba.njit(**_INLINE)
+def write_maps(state, left, top, z_reference, depth, normal, alpha, distortion, median_depth):
+    """A tile's state into the image."""
+    height, width = depth.shape
+    for y in range(top, min(top + TILE_HEIGHT, height)):
+        for x in range(left, min(left + TILE_WIDTH, width)):
+            j = np.uint64((y - top) * TILE_WIDTH + x - left)
+            total = ONE - abs(state[_LIGHT + j])
+            covered = state[_LAST + j] > ZERO
+            depth[y, x] = z_reference + state[_MOMENT + j] / total if covered else ZERO
+            alpha[y, x] = total
+            normal[y, x, 0] = state[_NORMAL_X + j]
+            normal[y, x, 1] = state[_NORMAL_Y + j]
+            normal[y, x, 2] = state[_NORMAL_Z + j]
+            distortion[y, x] = TWO * state[_DISTORTION + j]
+            median_depth[y, x] = state[_MEDIAN + j]
+
+
+@numba.njit(**PER_PIXEL)
+def blend_tiles(
+    first_tile, stride, records, boxes, offsets, lists, inverse_near,
+    depth, normal, alpha, distortion, median_depth, visible, saved,
+):  # fmt: skip
+    """Render every ``stride``-th tile from ``first_tile`` on.
+
+    ``saved`` (tiles, SAVED, TILE_PIXELS) receives what the backward pass starts from; give it no
+    tiles if there will be none. ``visible`` is only ever set.
+    """
+    height, width = depth.shape
+    columns = (width + TILE_WIDTH - 1) // TILE_WIDTH
+    state = np.empty(_PLANES * TILE_PIXELS, np.float32)
+    for tile in range(first_tile, offsets.shape[0] - 1, stride):
+        left, top = tile % columns * TILE_WIDTH, tile // columns * TILE_HEIGHT
+        clear_state(state, left, top, width, height)
+        first, last = offsets[tile], offsets[tile + 1]
+        z_reference = reference_depth(records, lists, first, last) if last > first else ZERO
+        first_run, last_run = live_runs(state)
+        for k in range(first, last):
+            i = lists[k]
+            start, stop = run_of(boxes, i, top, first_run, last_run)
+            rank = np.float32(k - first + 1)
+            shown = blend_disk(state, start, stop, records[i], rank, z_reference, inverse_near)
+            if shown > ZERO:
+                visible[i] = True
+            if (k - first) % _CHECK_EVERY == _CHECK_EVERY - 1:
+                first_run, last_run = live_runs(state)
+                if first_run >= last_run:
+                    break
+        write_maps(state, left, top, z_reference, depth, normal, alpha, distortion, median_depth)
+        if saved.shape[0] > 0:
+            for j in range(TILE_PIXELS):
+                k = np.uint64(j)
+                saved[tile, SAVED_LIGHT, j] = abs(state[_LIGHT + k])
+                saved[tile, SAVED_MOMENT, j] = state[_MOMENT + k]
+                saved[tile, SAVED_LAST, j] = state[_LAST + k]

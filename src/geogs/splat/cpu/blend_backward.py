@@ -1,0 +1,234 @@
+"""Gradients through the compositing, back to front."""
+
+import numba
+import numpy as np
+
+from geogs.splat.cpu.blend import reference_depth, run_of
+from geogs.splat.cpu.layout import (
+    G_CLAMPED,
+    G_MX,
+    G_MY,
+    G_NX,
+    G_NY,
+    G_NZ,
+    G_OPACITY,
+    G_U,
+    G_UX,
+    G_UY,
+    G_V,
+    G_VX,
+    G_VY,
+    G_W,
+    G_WX,
+    G_WY,
+    GRADIENT,
+    LANES,
+    MAX_ALPHA,
+    MIN_ALPHA,
+    MIN_HIT_RATIO,
+    MX,
+    MY,
+    NX,
+    NY,
+    NZ,
+    ONE,
+    OPACITY,
+    PER_PIXEL,
+    SAVED_LAST,
+    SAVED_LIGHT,
+    SAVED_MOMENT,
+    TILE_HEIGHT,
+    TILE_PIXELS,
+    TILE_WIDTH,
+    TWO,
+    UX,
+    UY,
+    VX,
+    VY,
+    WC,
+    WX,
+    WY,
+    Z_FURTHEST,
+    Z_NEAREST,
+    ZERO,
+    exp_minus,
+)
+
+_INLINE = {**PER_PIXEL, "cache": False}
+(
+    _X, _Y, _LIGHT, _MOMENT, _LAST, _BEHIND, _SIGNS, _SIGNED_Z,
+    _D_CONSTANT, _D_Z, _D_NORMAL_X, _D_NORMAL_Y, _D_NORMAL_Z, _D_DISTORTION,
+) = (np.uint64(k * TILE_PIXELS) for k in range(14))  # fmt: skip
+_PLANES = 14
+_RUNS = TILE_PIXELS // LANES
+
+
+@numba.njit(**_INLINE)
+def unblend_disk(state, start, stop, r, rank, z_reference, inverse_near, g):
+    """Take one disk out of the pixels start..stop of a tile; ``g`` receives its gradients.
+
+    Going back to front, with sums over the disks i behind: BEHIND of w_i dL/dw_i, SIGNS of w_i s_i
+    and SIGNED_Z of w_i s_i z_i, where s_i is the sign of z_i A_i - Z_i; LIGHT and MOMENT become
+    those in front of the disk. With q = z A - Z the distortion gives
+
+        dL/dw = 2 |q| + 2 sum_{i behind} w_i s_i (z_i - z),
+        dL/dz = 2 w (s A - sum_{i behind} w_i s_i).
+    """
+    mx, my, opacity, wc = r[MX], r[MY], r[OPACITY], r[WC]
+    ux, uy, vx, vy, wx, wy = r[UX], r[UY], r[VX], r[VY], r[WX], r[WY]
+    nx, ny, nz = r[NX], r[NY], r[NZ]
+    nearest, furthest = r[Z_NEAREST], r[Z_FURTHEST]
+    least = wc * MIN_HIT_RATIO
+    s_u = s_ux = s_uy = s_v = s_vx = s_vy = s_w = s_wx = s_wy = ZERO
+    s_clamped = s_mx = s_my = s_opacity = s_nx = s_ny = s_nz = ZERO
+    for j in range(start, stop):
+        dx, dy = state[_X + j] - mx, state[_Y + j] - my
+        w = wx * dx + wy * dy + wc
+        bounded = min(max(w, least), inverse_near)
+        z = ONE / bounded
+        u, v = z * (ux * dx + uy * dy), z * (vx * dx + vy * dy)
+        rho3, rho2 = u * u + v * v, dx * dx + dy * dy
+        on_plane = (bounded == w) & (rho3 <= rho2)
+        z_kept = min(max(z, nearest), furthest)
+        free = on_plane | (z_kept == z)
+        z_hit = z if on_plane else z_kept
+        gauss = exp_minus(rho3 if on_plane else rho2)
+        a = opacity * gauss
+        blended = (a >= MIN_ALPHA) & (state[_LAST + j] >= rank)
+        is_free_alpha = blended & (a < MAX_ALPHA)
+        a = min(a, MAX_ALPHA) if blended else ZERO
+        inverse = ONE / (ONE - a)
+        light_behind = state[_LIGHT + j]
+        light = light_behind * inverse
+        weight = light * a
+        zc = z_hit - z_reference
+        moment = state[_MOMENT + j] - weight * zc
+        covered = ONE - light
+        q = zc * covered - moment
+        sign = ONE if q > ZERO else -ONE
+        d_z, d_distortion = state[_D_Z + j], state[_D_DISTORTION + j]
+        h_x, h_y, h_z = state[_D_NORMAL_X + j], state[_D_NORMAL_Y + j], state[_D_NORMAL_Z + j]
+        signs, signed_z, behind = state[_SIGNS + j], state[_SIGNED_Z + j], state[_BEHIND + j]
+        g_weight = state[_D_CONSTANT + j] + d_z * zc + h_x * nx + h_y * ny + h_z * nz
+        g_weight += d_distortion * (abs(q) + signed_z - zc * signs)
+        g_z = weight * (d_z + d_distortion * (sign * covered - signs))
+        g_alpha = (light_behind * g_weight - behind) * inverse
+        g_alpha = g_alpha if is_free_alpha else ZERO
+        state[_LIGHT + j] = light
+        state[_MOMENT + j] = moment
+        state[_BEHIND + j] = behind + weight * g_weight
+        state[_SIGNS + j] = signs + weight * sign
+        state[_SIGNED_Z + j] = signed_z + weight * sign * zc
+
+        g_rho = -g_alpha * a
+        g_rho3 = TWO * g_rho if on_plane else ZERO
+        g_rho2 = TWO * g_rho - g_rho3
+        g_u, g_v = g_rho3 * u * z, g_rho3 * v * z
+        g_w = -z * (z * g_z + g_rho3 * rho3)
+        g_w = g_w if free else ZERO
+        s_u += g_u
+        s_ux += g_u * dx
+        s_uy += g_u * dy
+        s_v += g_v
+        s_vx += g_v * dx
+        s_vy += g_v * dy
+        s_w += g_w
+        s_wx += g_w * dx
+        s_wy += g_w * dy
+        s_clamped += ZERO if free else g_z
+        s_mx -= g_rho2 * dx
+        s_my -= g_rho2 * dy
+        s_opacity += g_alpha * gauss
+        s_nx += weight * h_x
+        s_ny += weight * h_y
+        s_nz += weight * h_z
+    g[G_U], g[G_UX], g[G_UY], g[G_V], g[G_VX], g[G_VY] = s_u, s_ux, s_uy, s_v, s_vx, s_vy
+    g[G_W], g[G_WX], g[G_WY], g[G_CLAMPED] = s_w, s_wx, s_wy, s_clamped
+    g[G_MX], g[G_MY], g[G_OPACITY] = s_mx, s_my, s_opacity
+    g[G_NX], g[G_NY], g[G_NZ] = s_nx, s_ny, s_nz
+
+
+@numba.njit(**_INLINE)
+def load_state(
+    state, saved, left, top, z_reference, d_depth, d_normal, d_alpha, d_distortion
+):
+    """A tile's final state and the losses' gradients of its maps.
+
+    Depth is Z / A, so dL/dw_i collects d_depth / A (z_i - depth); the part without z_i and d_alpha
+    make D_CONSTANT.
+    """
+    height, width = d_depth.shape
+    state[:] = ZERO
+    for row in range(TILE_HEIGHT):
+        for col in range(TILE_WIDTH):
+            j = np.uint64(row * TILE_WIDTH + col)
+            x, y = left + col, top + row
+            state[_X + j], state[_Y + j] = x, y
+            state[_LIGHT + j] = saved[SAVED_LIGHT, row * TILE_WIDTH + col]
+            state[_MOMENT + j] = saved[SAVED_MOMENT, row * TILE_WIDTH + col]
+            state[_LAST + j] = saved[SAVED_LAST, row * TILE_WIDTH + col]
+            if (x < width) & (y < height) & (state[_LAST + j] > ZERO):
+                total = ONE - state[_LIGHT + j]
+                d_z = d_depth[y, x] / total
+                state[_D_Z + j] = d_z
+                state[_D_CONSTANT + j] = d_alpha[y, x] - d_z * state[_MOMENT + j] / total
+                state[_D_NORMAL_X + j] = d_normal[y, x, 0]
+                state[_D_NORMAL_Y + j] = d_normal[y, x, 1]
+                state[_D_NORMAL_Z + j] = d_normal[y, x, 2]
+                state[_D_DISTORTION + j] = TWO * d_distortion[y, x]
+
+
+@numba.njit(**_INLINE)
+def last_of_runs(state, last_of):
+    """Rank of the last disk blended in each run; returns the largest."""
+    most = ZERO
+    for run in range(_RUNS):
+        rank = ZERO
+        for j in range(np.uint64(run * LANES), np.uint64(run * LANES + LANES)):
+            rank = max(rank, state[_LAST + j])
+        last_of[run] = rank
+        most = max(most, rank)
+    return int(most)
+
+
+@numba.njit(**_INLINE)
+def slot_of(boxes, slots, i, tile, columns):
+    """Where disk i's pair with a tile keeps its gradients."""
+    first_column = boxes[i, 0] // TILE_WIDTH
+    count = (boxes[i, 1] - 1) // TILE_WIDTH - first_column + 1
+    row = tile // columns - boxes[i, 2] // TILE_HEIGHT
+    return slots[i] + row * count + tile % columns - first_column
+
+
+@numba.njit(**PER_PIXEL)
+def unblend_tiles(
+    first_tile, stride, records, boxes, slots, offsets, lists, inverse_near, saved,
+    d_depth, d_normal, d_alpha, d_distortion, pair_gradients,
+):  # fmt: skip
+    """Gradients of every pair of every ``stride``-th tile from ``first_tile`` on."""
+    width = d_depth.shape[1]
+    columns = (width + TILE_WIDTH - 1) // TILE_WIDTH
+    state = np.empty(_PLANES * TILE_PIXELS, np.float32)
+    last_of = np.empty(_RUNS, np.float32)
+    for tile in range(first_tile, offsets.shape[0] - 1, stride):
+        left, top = tile % columns * TILE_WIDTH, tile // columns * TILE_HEIGHT
+        first, last = offsets[tile], offsets[tile + 1]
+        if first == last:
+            continue
+        z_reference = reference_depth(records, lists, first, last)
+        load_state(
+            state, saved[tile], left, top, z_reference, d_depth, d_normal, d_alpha, d_distortion
+        )
+        used = last_of_runs(state, last_of)
+        for k in range(first + used, last):
+            pair_gradients[slot_of(boxes, slots, lists[k], tile, columns), :] = ZERO
+        first_run, last_run = _RUNS, 0
+        for k in range(first + used - 1, first - 1, -1):
+            i = lists[k]
+            rank = np.float32(k - first + 1)
+            for run in range(_RUNS):
+                if last_of[run] == rank:
+                    first_run, last_run = min(first_run, run), max(last_run, run + 1)
+            start, stop = run_of(boxes, i, top, first_run, last_run)
+            g = pair_gradients[slot_of(boxes, slots, i, tile, columns)]
+            unblend_disk(state, start, stop, records[i], rank, z_reference, inverse_near, g)
