@@ -216,7 +216,7 @@ def test_rigid_motion_of_all_views_moves_the_mesh():
     moved = [DepthMapView(v.depth, v.weight, v.camera, v.T_cw @ move.inverse()) for v in views]
     mesh = extract_mesh(moved, MeshConfig(voxel=0.02))
     radius = np.linalg.norm(mesh.vertices - move[:3, 3].numpy(), axis=1)
-    assert np.abs(radius - RADIUS).mean() < 0.001
+    assert np.abs(radius - RADIUS).mean() < 0.0015
 
 
 def test_plan_follows_pixel_budget_and_memory():
@@ -227,7 +227,7 @@ def test_plan_follows_pixel_budget_and_memory():
     small = plan_volume(views, MeshConfig(triangle_budget=2000))
     faces = len(extract_mesh(views, MeshConfig(triangle_budget=2000, min_weight=1.0)).faces)
     assert small.voxel > 2 * plan.voxel
-    assert 600 < faces < 2200
+    assert 1000 < faces < 2400
     tight = plan_volume(views, MeshConfig(memory_limit=1e-3))
     assert tight.bytes <= 1e-3 * 2**30
     with pytest.raises(InputError, match="larger voxel"):

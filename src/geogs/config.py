@@ -82,7 +82,7 @@ class DepthConfig:
     """Completion: first difference of inverse depth per cell, over its median, that is usual."""
     edge_sharpness: float = 48.0
     """Completion: how fast smoothness falls with the image gradient (Lab, 0 to 1 per pixel)."""
-    neighbours: int = 6
+    neighbours: int = 8
     """Keyframes to match with, at least 1."""
     parallax: float = 6.0
     """Best angle between the rays of two keyframes, degrees."""
@@ -100,26 +100,29 @@ class DepthConfig:
     """Relative deviation below which the tracker's depth counts for the range."""
     plane_step: float = 0.6
     """Pixels that the median neighbour moves from plane to plane."""
-    min_planes: int = 48
+    min_planes: int = 96
     """Fewest planes."""
     max_planes: int = 144
     """Most planes."""
     window: int = 5
     """Side of the matching window in pixels, odd, at least 3."""
-    variance_floor: float = 4e-5
+    variance_floor: float = 1e-5
     """Grey variance (grey in 0 to 1) below which a window counts as without texture."""
     prior_pull: float = 0.3
     """Cost of a plane far from the tracker's depth where the tracker is sure."""
     prior_tolerance: float = 0.03
     """Relative distance from the tracker's inverse depth at which the pull is full."""
-    small_jump: float = 0.06
+    small_jump: float = 0.1
     """Semi-global matching: cost of a step by one plane."""
-    large_jump: float = 0.9
+    large_jump: float = 1.5
     """Semi-global matching: cost of a larger step where the image is flat."""
     jump_contrast: float = 30.0
     """Semi-global matching: how fast the large step gets cheaper with the grey difference."""
     sure_deviation: float = 0.05
     """Relative deviation at which the tracker's confidence is one half."""
+    support_radius: int = 2
+    support_sharpness: float = 100.0
+    keep: int = 0
     refine_steps: int = 3
     """Refinement: photometric steps."""
     support_contrast: float = 200.0
@@ -317,10 +320,11 @@ class MeshConfig:
     """Voxels in front of and behind a surface in which distances are averaged, at least 2."""
     max_depth: float | None = None
     """Farther pixels are left out, map units; twice the 95 % quantile if none is given."""
-    min_weight: float = 2.0
-    """Sum of view weights that a voxel needs to count as seen, above 0."""
+    min_weight: float = 1.5
+    """Sum of view weights that a voxel needs to count as seen, above 0; just behind a surface a
+    view counts less than in front, so 1.5 asks for two sure views."""
     triangle_budget: int = 1_500_000
-    """Triangles that a chosen voxel size aims to stay under."""
+    """Triangles that a chosen voxel size aims at, to about 20 %."""
     memory_limit: float = 2.0
     """Most memory for the volume in GiB."""
     min_component_faces: int = 100

@@ -42,6 +42,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         0 on success, 2 after an error of input, output or options, 130 after Ctrl-C.
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
+    return _guarded(lambda: _dispatch(arguments))
+
+
+def _dispatch(arguments: list[str]) -> int:
     name = arguments[0] if arguments else "--help"
     if name in ("-h", "--help", "help"):
         print(help_text())
@@ -53,7 +57,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print_error(_unknown_command(name))
         return EXIT_ERROR
     _show_warnings()
-    return _guarded(lambda: _load(COMMANDS[name])(arguments[1:]))
+    return importlib.import_module(COMMANDS[name].module).main(arguments[1:])
 
 
 def help_text() -> str:
@@ -79,23 +83,21 @@ def print_error(sentence: str) -> None:
     print(f"\033[31m{text}\033[0m" if is_coloured else text, file=sys.stderr)
 
 
-def _load(command: Command) -> Callable[[list[str]], int]:
-    return importlib.import_module(command.module).main
-
-
 def _guarded(run: Callable[[], int]) -> int:
     """Run a command; errors of ours become one line and an exit code, others keep a traceback.
 
     With ``GEOGS_DEBUG=1`` ours keep it, too.
     """
     try:
-        return run()
+        code = run()
+        sys.stdout.flush()  # a reader that has gone is noticed here rather than at exit
+        return code
     except SystemExit as stop:  # help and wrong options end this way
         return stop.code if isinstance(stop.code, int) else 0 if stop.code is None else EXIT_ERROR
     except KeyboardInterrupt:
         print_error("interrupted.")
         return EXIT_INTERRUPTED
-    except BrokenPipeError:  # the reader of our output, such as head, has enough
+    except BrokenPipeError:  # such as head, which has enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return EXIT_ERROR
     except GeogsError as error:

@@ -30,7 +30,7 @@ def parse_options(
     """
     import tyro
 
-    return tyro.cli(
+    return tyro.cli(  # type: ignore[return-value]  # a default of none is no default
         options,
         args=list(argv),
         prog=f"geogs {command}",

@@ -30,12 +30,9 @@ def global_bundle(
         config.global_distance * max(tracker.camera.width, tracker.camera.height),
         config.global_pairs * len(ids),
     )
-    keep = {e for p in pairs for e in (p, p[::-1])}
-    graph.edges = {e: v for e, v in graph.edges.items() if e in keep}
+    graph.edges = {}
     for n in range(config.global_rounds):
-        stale = graph.stale(pairs, config.remeasure if n < 1 else 0.25)
-        print("round", n, len(pairs), len(stale))
-        graph.measure(stale, fine=True)
+        graph.measure(graph.stale(pairs, 0.25), fine=True)
         graph.adjust(list(graph.edges), ids[1:], ids, BundleOptions(iterations=4))
         if progress is not None:
             progress((n + 1) / config.global_rounds, "global bundle adjustment")

@@ -158,7 +158,6 @@ class _MultiView(torch.autograd.Function):
         window = np.array(window, np.float32)
         half = config.ncc_patch // 2 if config.ncc_weight > 0 else -1
         with_depth, with_pose = ctx.needs_input_grad[:2]
-        empty = np.empty((0, 0), np.float32)
 
         warped, slope, mask = np.empty((3, height, width), np.float32)
         extra = np.empty((3, height, width) if with_pose else (3, 0, 0), np.float32)
@@ -179,18 +178,20 @@ class _MultiView(torch.autograd.Function):
                 ),
                 height,
             )
-        total, more = float(loss.sum(dtype=np.float64)), empty
+        total = float(loss.sum(dtype=np.float64))
+        # d loss / d warped: [0] from elsewhere, [1] in all; only held where someone needs it.
+        g_image = np.zeros((2, height, width) if with_pose else (2, 0, 0), np.float32)
         if config.ssim_weight > 0:
-            value, more = _ssim_gradient(grey, warped, mask, config)
+            g_image = np.zeros((2, height, width), np.float32)
+            value, g_image[0] = _ssim_gradient(grey, warped, mask, config)
             total += value
 
         g_depth, g_T = np.zeros_like(small), np.zeros((4, 4))
         if with_depth or with_pose:
-            g_image = np.empty_like(grey) if with_pose else empty
             _over_rows(
                 lambda a, b: multi.depth_gradient_rows(
-                    a, b, *tables, grey, warped, slope, mask, half, options, fields, more,
-                    g_image, g_depth,
+                    a, b, *tables, grey, warped, slope, mask, half, options, fields, g_image,
+                    g_depth,
                 ),
                 len(small),
             )  # fmt: skip

@@ -145,6 +145,8 @@ def correlate_rows(first, last, reference, warped, mask, half, options, fields, 
     at a pixel q is the sum over the windows p around it of
     ``fields[0, p] + reference[q] fields[1, p] + warped[q] fields[2, p]``. Adds to ``loss[y]``.
     """
+    if half < 0:
+        return
     height, width = reference.shape
     side = 2 * half + 1
     share = ONE / np.float32(side * side)
@@ -154,7 +156,9 @@ def correlate_rows(first, last, reference, warped, mask, half, options, fields, 
             fields[0, y, x] = fields[1, y, x] = fields[2, y, x] = ZERO
         if y < half or y >= height - half:
             continue
-        line[:] = ZERO
+        for c in range(6):
+            for x in range(width):
+                line[c, x] = sums[c, x] = ZERO
         for r in range(y - half, y + half + 1):
             for x in range(width):
                 a, b = reference[r, x], warped[r, x]
@@ -165,7 +169,6 @@ def correlate_rows(first, last, reference, warped, mask, half, options, fields, 
                 line[4, x] += a * b
                 line[5, x] += mask[r, x]
         inner = width - side + 1
-        sums[:] = ZERO
         for k in range(side):
             for c in range(6):
                 for x in range(inner):
@@ -191,63 +194,68 @@ def correlate_rows(first, last, reference, warped, mask, half, options, fields, 
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=FASTMATH)
-def image_gradient_row(y, reference, warped, mask, half, options, fields, line, sums, out):
-    """d loss / d warped of row ``y``: windows of the correlation and L_1; 0 outside the mask.
+def window_sums(y, fields, half, line, sums):
+    """Sums of the three fields over the windows around the pixels of row ``y``.
 
-    options as in :func:`warp_rows`; ``half`` is negative without correlation.
+    Does nothing where ``half`` is negative; the compiler, too, must know that it is not.
     """
-    height, width = reference.shape
-    sums[:] = ZERO
-    if half >= 0:
-        line[:] = ZERO
+    if half < 0:
+        return
+    height, width = fields.shape[1], fields.shape[2]
+    for c in range(3):
+        for x in range(line.shape[1]):
+            line[c, x] = ZERO
         for r in range(max(y - half, 0), min(y + half + 1, height)):
-            for c in range(3):
-                for x in range(width):
-                    line[c, x + half] += fields[c, r, x]
+            for x in range(width):
+                line[c, x + half] += fields[c, r, x]
+        for x in range(width):
+            sums[c, x] = ZERO
         for k in range(2 * half + 1):
-            for c in range(3):
-                for x in range(width):
-                    sums[c, x] += line[c, x + k]
-    for x in range(width):
-        a, b = reference[y, x], warped[y, x]
-        e = b - a
-        push = min(max(e / options[3], -ONE), ONE) if abs(e) < options[4] else ZERO
-        g = sums[0, x] + a * sums[1, x] + b * sums[2, x] + options[2] * push
-        out[x] += g * mask[y, x]
+            for x in range(width):
+                sums[c, x] += line[c, x + k]
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=FASTMATH)
 def depth_gradient_rows(
     first, last, rows, row_share, columns, column_share, reference, warped, slope, mask, half,
-    options, fields, extra_gradient, g_image, g_depth,
+    options, fields, g_image, g_depth,
 ):  # fmt: skip
     """d loss / d depth for the depth rows ``first <= y < last``: the enlargement's adjoint.
 
-    ``extra_gradient`` (h, w), unless empty, is added to d loss / d warped; ``g_image``, unless
-    empty, receives d loss / d warped. Image rows that feed two spans are computed in both.
+    options as in :func:`warp_rows`; ``half`` is negative without correlation. ``g_image`` (2, h, w),
+    unless empty: [0] is added to d loss / d warped, [1] receives the sum. Image rows that feed two
+    spans are computed in both.
     """
     height, width = reference.shape
     line = np.empty((3, width + 2 * max(half, 0)), np.float32)
-    sums = np.empty((3, width), np.float32)
-    g = np.empty(width, np.float32)
+    sums = np.zeros((3, width), np.float32)
     pull = np.zeros((last - first, width), np.float32)
     for y in range(height):
         i, k, f = rows[0, y] - first, rows[1, y] - first, row_share[y]
         own_i, own_k = 0 <= i < last - first, 0 <= k < last - first
         if not (own_i or own_k):
             continue
-        g[:] = ZERO
-        if len(extra_gradient) > 0:
-            g[:] = extra_gradient[y]
-        image_gradient_row(y, reference, warped, mask, half, options, fields, line, sums, g)
-        if len(g_image) > 0:
-            g_image[y] = g
+        window_sums(y, fields, half, line, sums)
+        for x in range(width):
+            a, b = reference[y, x], warped[y, x]
+            push = min(max((b - a) / options[3], -ONE), ONE) if abs(b - a) < options[4] else ZERO
+            sums[0, x] += a * sums[1, x] + b * sums[2, x] + options[2] * push
+        if g_image.shape[1] > 0:
+            for x in range(width):
+                sums[0, x] += g_image[0, y, x]
+                g_image[1, y, x] = sums[0, x] * mask[y, x]
+        # The slope is 0 outside the mask.
+        for x in range(width):
+            sums[0, x] *= slope[y, x]
         if own_i:
             for x in range(width):
-                pull[i, x] += (ONE - f) * slope[y, x] * g[x]
+                pull[i, x] += (ONE - f) * sums[0, x]
         if own_k:
             for x in range(width):
-                pull[k, x] += f * slope[y, x] * g[x]
+                pull[k, x] += f * sums[0, x]
+        if half < 0:
+            for x in range(width):
+                sums[0, x] = ZERO
     for r in range(last - first):
         for x in range(g_depth.shape[1]):
             g_depth[first + r, x] = ZERO
@@ -261,11 +269,11 @@ def depth_gradient_rows(
 def pose_gradient_rows(first, last, g_image, extra, lenses, T, g_T):
     """d loss / d T (12 numbers of the 3x4 matrix) of each row ``first <= y < last``."""
     fx, fy, cx, cy = lenses[0, 0], lenses[0, 1], lenses[0, 2], lenses[0, 3]
-    total = np.empty(12, np.float64)
     for y in range(first, last):
-        total[:] = 0.0
-        for x in range(g_image.shape[1]):
-            g = g_image[y, x]
+        for k in range(12):
+            g_T[y, k] = 0.0
+        for x in range(g_image.shape[2]):
+            g = g_image[1, y, x]
             du, dv, d = g * extra[0, y, x], g * extra[1, y, x], extra[2, y, x]
             if du == ZERO and dv == ZERO:
                 continue
@@ -277,8 +285,7 @@ def pose_gradient_rows(first, last, g_image, extra, lenses, T, g_T):
             gz = -gx * px - gy * py
             for k in range(3):
                 s = gx if k == 0 else (gy if k == 1 else gz)
-                total[4 * k] += s * X
-                total[4 * k + 1] += s * Y
-                total[4 * k + 2] += s * d
-                total[4 * k + 3] += s
-        g_T[y] = total
+                g_T[y, 4 * k] += s * X
+                g_T[y, 4 * k + 1] += s * Y
+                g_T[y, 4 * k + 2] += s * d
+                g_T[y, 4 * k + 3] += s

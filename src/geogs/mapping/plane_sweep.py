@@ -60,6 +60,24 @@ def relative_homographies(
     return a, np.stack([k @ m[:3, 3] for m in relative])
 
 
+def _match(reference, neighbours, camera, planes, zoom, config):
+    camera = camera.resized(round(camera.width / zoom), round(camera.height / zoom))
+    def shrink(g): return g if zoom == 1 else cv2.resize(g, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+    radius, floor = config.window // 2, np.float32(config.variance_floor)
+    grey = shrink(reference.grey) - np.float32(0.5)
+    images = np.stack([shrink(v.grey) for v in neighbours]) - np.float32(0.5)
+    size = (config.window, config.window)
+    mean = cv2.blur(grey, size, borderType=cv2.BORDER_REPLICATE)
+    square = cv2.blur(grey * grey, size, borderType=cv2.BORDER_REPLICATE)
+    scale = 1.0 / np.sqrt(np.maximum(square - mean * mean, 0.0) + floor)
+    keep = config.keep if config.keep else max(min(2, len(neighbours)), (len(neighbours) + 1) // 2)
+    keep=min(keep,len(neighbours))
+    a, b = relative_homographies(reference, neighbours, camera)
+    volume = np.empty((*grey.shape, len(planes)), np.float32)
+    kernels.match_planes(grey, mean, scale, images, a, b, planes, radius, floor, keep, volume)
+    return volume
+
+
 def plane_sweep(
     reference: DepthView,
     neighbours: Sequence[DepthView],
@@ -74,17 +92,15 @@ def plane_sweep(
     The cost of a plane is the mean 1 - NCC of the better half of the neighbours (occlusion), plus
     a bounded pull to the ``prior`` inverse depth where ``prior_weight`` (0 to 1) is high.
     """
-    radius, floor = config.window // 2, np.float32(config.variance_floor)
+    volume = _match(reference, neighbours, camera, planes, 1, config)
+    if config.support_radius > 0:
+        guide = cv2.resize(reference.image, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+        raw, volume = volume, np.empty_like(volume)
+        kernels.average_support(
+            raw, guide.astype(np.float32) / np.float32(255), config.support_radius,
+            np.float32(config.support_sharpness), volume,
+        )
     grey = reference.grey - np.float32(0.5)
-    images = np.stack([v.grey for v in neighbours]) - np.float32(0.5)
-    size = (config.window, config.window)
-    mean = cv2.blur(grey, size, borderType=cv2.BORDER_REPLICATE)
-    square = cv2.blur(grey * grey, size, borderType=cv2.BORDER_REPLICATE)
-    scale = 1.0 / np.sqrt(np.maximum(square - mean * mean, 0.0) + floor)
-    keep = max(min(2, len(neighbours)), (len(neighbours) + 1) // 2)
-    a, b = relative_homographies(reference, neighbours, camera)
-    volume = np.empty((*grey.shape, len(planes)), np.float32)
-    kernels.match_planes(grey, mean, scale, images, a, b, planes, radius, floor, keep, volume)
     tolerance = np.float32(config.prior_tolerance)
     kernels.pull_to_prior(
         volume, planes, prior, np.float32(config.prior_pull) * prior_weight, tolerance

@@ -167,6 +167,37 @@ def match_planes(reference, mean, scale, images, a, b, planes, radius, floor, ke
 
 
 @njit(**_FAST)
+def average_support(volume, guide, radius, contrast, out):
+    """Mean cost over (2 radius + 1)^2 pixels, weighted by 1 / (1 + contrast |dI|^2)^2.
+
+    ``guide`` (h, w, 3) is the colour image: pixels of another colour are likely to be of another
+    surface, and their costs would fatten it.
+    """
+    h, w, planes = volume.shape
+    one = np.float32(1.0)
+    for y in range(h):
+        for x in range(w):
+            mean = out[y, x]
+            for k in range(planes):
+                mean[k] = np.float32(0.0)
+            total = np.float32(0.0)
+            for v in range(max(y - radius, 0), min(y + radius + 1, h)):
+                for u in range(max(x - radius, 0), min(x + radius + 1, w)):
+                    red = guide[y, x, 0] - guide[v, u, 0]
+                    green = guide[y, x, 1] - guide[v, u, 1]
+                    blue = guide[y, x, 2] - guide[v, u, 2]
+                    like = one + contrast * (red * red + green * green + blue * blue)
+                    weight = one / (like * like)
+                    total += weight
+                    cost = volume[v, u]
+                    for k in range(planes):
+                        mean[k] += weight * cost[k]
+            norm = one / total
+            for k in range(planes):
+                mean[k] *= norm
+
+
+@njit(**_FAST)
 def pull_to_prior(volume, planes, prior, weight, tolerance):
     """Add weight min(|rho / prior - 1| / tolerance, 1) to the cost of each plane."""
     one = np.float32(1.0)

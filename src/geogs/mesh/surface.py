@@ -14,7 +14,7 @@ _CHUNK_BLOCKS = 16
 _SMALLEST = 1e-3
 
 
-def extract_surface(tsdf: SparseTsdf, min_weight: float = 2.0) -> Mesh:
+def extract_surface(tsdf: SparseTsdf, min_weight: float = 1.5) -> Mesh:
     """Triangles of the zero level, in the world frame of ``tsdf``.
 
     Only cells whose eight voxels have at least ``min_weight`` give triangles: the far side of the
@@ -92,16 +92,15 @@ def _march(distance: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarr
     # out. No value is quite zero: a vertex then lies strictly inside its edge.
     distance = np.where(distance < 0, np.minimum(distance, -_SMALLEST), distance)
     distance = np.where(distance >= 0, np.maximum(distance, _SMALLEST), distance)
-    if not (cell & (distance < 0)).any() and not _crosses(cell, distance):
+    if not cell.any() or distance.min() > 0 or distance.max() < 0:
         return nothing
-    vertices, faces, _, _ = marching_cubes(
-        distance, 0.0, mask=cell, gradient_direction="descent", allow_degenerate=True
-    )
+    try:
+        vertices, faces, _, _ = marching_cubes(
+            distance, 0.0, mask=cell, gradient_direction="descent", allow_degenerate=True
+        )
+    except RuntimeError:  # how scikit-image says that no masked cell has a zero
+        return nothing
     return vertices, faces
-
-
-def _crosses(cell: np.ndarray, distance: np.ndarray) -> bool:
-    return bool(cell.any() and distance.min() < 0)
 
 
 def _edge_keys(position: Float[np.ndarray, "n 3"]) -> np.ndarray:

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from geogs.synth.texture import fractal_noise
+from geogs.synth.texture import fractal_noise, random_colour
 
 _FONTS = (cv2.FONT_HERSHEY_SIMPLEX, cv2.FONT_HERSHEY_COMPLEX, cv2.FONT_HERSHEY_TRIPLEX)
 _LETTERS = "ABCDEFGHIKLMNOPRSTUVW"
@@ -42,7 +42,7 @@ def poster(rng: np.random.Generator, shape: tuple[int, int]) -> UInt8[np.ndarray
     image = np.empty((h, w, 3), np.uint8)
     image[:] = rng.uniform(150, 240, 3)
     for _ in range(22):
-        shade = tuple(int(c) for c in rng.uniform(20, 245, 3))
+        shade = random_colour(rng, (0.1, 0.75), (0.15, 0.97))
         x, y = int(rng.uniform(0, w)), int(rng.uniform(0, 0.68 * h))
         size = rng.uniform(0.04, 0.22) * w
         match rng.integers(3):
@@ -53,7 +53,7 @@ def poster(rng: np.random.Generator, shape: tuple[int, int]) -> UInt8[np.ndarray
                 box = cv2.boxPoints(((x, y), (2 * size, size), rng.uniform(0, 90)))
                 cv2.fillPoly(image, [box.astype(np.int32)], shade, cv2.LINE_AA)
             case _:
-                corners = rng.uniform(-1.5 * size, 1.5 * size, (3, 2)) + [x, y]
+                corners = np.array([x, y]) + rng.uniform(-1.5 * size, 1.5 * size, (3, 2))
                 cv2.fillPoly(image, [corners.astype(np.int32)], shade, cv2.LINE_AA)
     image[int(0.72 * h) :] = rng.uniform(190, 245, 3)
     left, width = int(0.07 * w), int(0.86 * w)
@@ -107,7 +107,7 @@ def outdoors(rng: np.random.Generator, shape: tuple[int, int]) -> UInt8[np.ndarr
 def abstract(rng: np.random.Generator, shape: tuple[int, int]) -> UInt8[np.ndarray, "h w 3"]:
     """Contours of warped noise in a random palette, like marbled paper."""
     value = fractal_noise(rng, shape, (2, 2), 6, 0.5)
-    palette = rng.uniform(25, 240, (9, 3))
+    palette = np.array([random_colour(rng, (0.1, 0.65), (0.2, 0.95)) for _ in range(9)])
     bands = np.floor(value * 2.2 + 4.5).astype(int).clip(0, 8)
     return _print_grain(rng, palette[bands])
 
@@ -116,11 +116,11 @@ def book_spine(rng: np.random.Generator, shape: tuple[int, int]) -> UInt8[np.nda
     """Cloth, bands and an upright title."""
     h, w = shape
     image = np.empty((w, h, 3), np.uint8)  # lying on its side, so that the title runs along it
-    image[:] = rng.uniform(35, 210, 3)
+    image[:] = random_colour(rng, (0.15, 0.65), (0.2, 0.8))
     for x in rng.uniform(0.03, 0.97, 4):
-        shade = tuple(int(c) for c in rng.uniform(20, 240, 3))
+        shade = random_colour(rng, (0.1, 0.6), (0.15, 0.95))
         cv2.line(image, (int(x * h), 0), (int(x * h), w), shade, int(rng.integers(1, h // 24 + 2)))
-    patch = tuple(int(c) for c in rng.uniform(140, 240, 3))
+    patch = random_colour(rng, (0.05, 0.3), (0.6, 0.95))
     cv2.rectangle(image, (int(0.2 * h), w // 8), (int(0.75 * h), w - w // 8), patch, -1)
     _write_line(rng, image, int(0.23 * h), w * 2 // 3, int(0.5 * h), max(8, w // 2))
     return _print_grain(rng, np.ascontiguousarray(np.rot90(image, int(rng.choice((-1, 1))))))

@@ -34,31 +34,28 @@ class Materials:
 def make_materials(build: SceneBuilder, rng: np.random.Generator) -> Materials:
     """Draws the shared textures; their colours follow the generator."""
 
-    def colour(low: float, high: float) -> texture.Colour:
-        r, g, b = rng.uniform(low, high, 3)
-        return (float(r), float(g), float(b))
+    def fabric(shape: tuple[int, int], scale: float) -> int:
+        ground = texture.random_colour(rng, (0.15, 0.55), (0.35, 0.75))
+        stripe = texture.random_colour(rng, (0.1, 0.4), (0.3, 0.95))
+        return build.texture(texture.fabric(rng, shape, ground, stripe), scale)
 
-    def fabric(scale: float) -> int:
-        image = texture.fabric(rng, (384, 384), colour(50, 200), colour(60, 230))
-        return build.texture(image, scale)
+    def ceramic() -> int:
+        glaze = texture.random_colour(rng, (0.05, 0.5), (0.5, 0.9))
+        return build.texture(texture.ceramic(rng, (160, 288), glaze))
 
+    lacquer = texture.random_colour(rng, (0.05, 0.3), (0.6, 0.85))
     return Materials(
         oak=build.texture(texture.wood(rng, (256, 768), (176, 128, 82)), 0.0022),
         walnut=build.texture(texture.wood(rng, (256, 768), (116, 76, 50)), 0.0022),
-        lacquer=build.texture(texture.wood(rng, (256, 768), colour(120, 215)), 0.0025),
+        lacquer=build.texture(texture.wood(rng, (256, 768), lacquer), 0.0025),
         metal=build.texture(texture.wood(rng, (128, 256), (92, 92, 96)), 0.0015),
-        sofa=fabric(0.003),
-        cushion=tuple(fabric(0.0016) for _ in range(4)),
-        ceramic=tuple(
-            build.texture(texture.ceramic(rng, (160, 288), colour(90, 225))) for _ in range(6)
-        ),
+        sofa=fabric((384, 384), 0.003),
+        cushion=tuple(fabric((384, 384), 0.0016) for _ in range(4)),
+        ceramic=tuple(ceramic() for _ in range(6)),
         leaf=build.texture(texture.plaster(rng, (96, 192), (82, 128, 62))),
         shade=build.texture(texture.fabric(rng, (128, 384), (236, 214, 170), (214, 170, 120))),
         spines=tuple(build.texture(artwork.book_spine(rng, (192, 32))) for _ in range(28)),
-        cloth=tuple(
-            build.texture(texture.fabric(rng, (96, 96), colour(40, 190), colour(40, 220)), 0.002)
-            for _ in range(5)
-        ),
+        cloth=tuple(fabric((96, 96), 0.002) for _ in range(5)),
         pages=build.texture(artwork.page_edges(rng, (64, 96))),
     )
 
@@ -237,7 +234,7 @@ def floor_lamp(build: SceneBuilder, materials: Materials) -> None:
     build.frustum((0, 0, 0), (0.15, 0.13), 0.03, materials.metal)
     build.frustum((0, 0, 0.03), (0.012, 0.012), 1.3, materials.metal)
     build.frustum((0, 0, 1.26), (0.2, 0.13), 0.26, materials.shade, emission=1.0)
-    build.light((0, 0, 1.4), (1.5, 1.2, 0.8), 0.12)
+    build.light((0, 0, 1.4), (0.55, 0.43, 0.28), 0.12)
 
 
 def plant(build: SceneBuilder, rng: np.random.Generator, materials: Materials) -> None:

@@ -1,23 +1,39 @@
 """Renders a scene: exact depth, normals and solids at the pixel centres, smooth colour."""
 
 import math
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Float64, Int64
+from jaxtyping import Float32, Float64, Int64, UInt8
 
 from geogs.geometry.camera import Camera
 from geogs.synth.lighting_kernels import visibility_slices
 from geogs.synth.raycast_kernels import Lighting, Solids, Textures, cast_rows, shade_rows
-from geogs.synth.scene import Scene, Texture, View
+from geogs.synth.scene import Scene, Texture
 
 _LEVELS = 8
-_VOXEL = 0.12
+_VOXEL = 0.14
 _AMBIENT_REACH = 0.7
 _SPHERE_SAMPLES = 24
 _SHADOW_MIN_HALF = 0.1
 """Solids smaller than this in every direction cast no shadow; they cost as much as large ones."""
+
+
+@dataclass(frozen=True)
+class View:
+    """What a camera sees, exact at the pixel centres."""
+
+    image: UInt8[np.ndarray, "h w 3"]
+    """RGB, smoothed over the pixel."""
+    depth: Float32[np.ndarray, "h w"]
+    """z along the optical axis, metres; 0 where nothing is hit."""
+    normal: Float32[np.ndarray, "h w 3"]
+    """Unit, camera frame, facing the camera; zero where nothing is hit."""
+    solid: Int64[np.ndarray, "h w"]
+    """Index of the solid, -1 where nothing is hit."""
 
 
 class Raycaster:
@@ -34,7 +50,7 @@ class Raycaster:
         """What a camera with pose camera-to-world ``T_wc`` sees.
 
         Depth, normal and solid are those of the ray through the pixel's centre; the colour is the
-        mean of four rays around it.
+        mean over the pixel.
         """
         shape = (camera.height, camera.width)
         depth = np.full(shape, np.inf)
@@ -61,7 +77,7 @@ class Raycaster:
         depth[solid < 0] = 0.0
         return View(np.rint(image).astype(np.uint8), depth.astype(np.float32), normal, solid)
 
-    def _in_bands(self, rows: int, work) -> None:
+    def _in_bands(self, rows: int, work: Callable[[int, int], None]) -> None:
         """Runs ``work(first, last)`` over bands of rows, several per thread to even the load."""
         edges = np.linspace(0, rows, 4 * self._threads + 1).astype(int)
         list(self._pool.map(work, edges[:-1], edges[1:]))
@@ -92,9 +108,7 @@ class Raycaster:
         sphere = _fibonacci_sphere(_SPHERE_SAMPLES)
 
         def fill(first: int, last: int) -> None:
-            visibility_slices(
-                *solids, lights, sphere, _AMBIENT_REACH, _VOXEL, first, last, volume
-            )
+            visibility_slices(*solids, lights, sphere, _AMBIENT_REACH, _VOXEL, first, last, volume)
 
         self._in_bands(int(nz), fill)
         return Lighting(
@@ -129,9 +143,12 @@ def _pixel_bounds(
     limit = np.array([camera.width, camera.height, camera.width, camera.height])
     box = np.stack([u.min(1), v.min(1), u.max(1) + 1, v.max(1) + 1], 1)
     box = np.clip(np.concatenate([np.ceil(box[:, :2]), np.floor(box[:, 2:])], 1), 0, limit)
-    # A solid that crosses the camera's plane may be anywhere; one behind it is nowhere.
+    # A solid that crosses the camera's plane may be anywhere, unless a side of the view excludes it.
     box[near.any(1)] = [0, 0, camera.width, camera.height]
-    box[near.all(1)] = 0
+    left, right = -(camera.cx + 1) / camera.fx, (camera.width - camera.cx) / camera.fx
+    top, bottom = -(camera.cy + 1) / camera.fy, (camera.height - camera.cy) / camera.fy
+    for beyond in (near, x < left * z, x > right * z, y < top * z, y > bottom * z):
+        box[beyond.all(1)] = 0
     return box.astype(np.int64)
 
 
@@ -147,6 +164,7 @@ def _pack_textures(textures: tuple[Texture, ...]) -> Textures:
             table[:, i, level] = end, w, h
             pieces.append(image.ravel())
             end += image.size
-            image = cv2.resize(image, (max(1, w // 2), max(1, h // 2)), interpolation=cv2.INTER_AREA)
+            half = (max(1, w // 2), max(1, h // 2))
+            image = cv2.resize(image, half, interpolation=cv2.INTER_AREA)
     texel = np.array([t.metres_per_texel for t in textures])
     return Textures(np.concatenate(pieces), table[0], table[1], table[2], texel)

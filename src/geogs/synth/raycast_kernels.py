@@ -147,7 +147,7 @@ def _hit_pixel(solids, i, x, y):
 
 @njit(**_OPTIONS)
 def cast_rows(solids, bounds, xs, ys, first, last, depth, solid, face):
-    """Nearest solid of rows [first, last); ``bounds`` are pixel boxes (left, top, right, bottom)."""
+    """Nearest solid in rows [first, last); ``bounds`` are (left, top, right, bottom) in pixels."""
     for i in range(len(solids.kind)):
         for row in range(max(first, bounds[i, 1]), min(last, bounds[i, 3])):
             for column in range(bounds[i, 0], bounds[i, 2]):
@@ -251,9 +251,9 @@ def _texture_colour(solids, textures, i, face, point, footprint, out):
 
 @njit(**_OPTIONS)
 def _light(lighting, point, normal, out):
-    """Display gain E^(1/2.2) of a diffuse surface from lights and ambient, with soft occlusion.
+    """Display gain sqrt(E) of a diffuse surface from lights and ambient, with soft occlusion.
 
-    Textures hold display values c = albedo^(1/2.2), so c times this gain is the displayed radiance.
+    With a display gamma of 2, textures hold sqrt(albedo): times this gain, the displayed radiance.
     """
     volume, voxel = lighting.volume, lighting.voxel
     nz, ny, nx, channels = volume.shape
@@ -287,7 +287,7 @@ def _light(lighting, point, normal, out):
             for k in range(3):
                 out[k] += seen * cosine / square * lighting.colour[channel - 1, k]
     for k in range(3):
-        out[k] = out[k] ** (1.0 / 2.2)
+        out[k] = math.sqrt(out[k])
 
 
 @njit(**_OPTIONS)
@@ -347,7 +347,8 @@ def shade_rows(
     pixel_x, pixel_y = abs(xs[1] - xs[0]), abs(ys[1] - ys[0])
     for row in range(first, last):
         for column in range(len(xs)):
-            i, f, t, x, y = solid[row, column], face[row, column], depth[row, column], xs[column], ys[row]
+            i, f, t = solid[row, column], face[row, column], depth[row, column]
+            x, y = xs[column], ys[row]
             if i < 0:
                 continue
             cosine = _surface(solids, camera, i, f, t, x, y, local, world, normal)
@@ -375,6 +376,9 @@ def shade_rows(
                     ts, dx, dy = t, 0.0, 0.0
                 _surface(solids, camera, js, fs, ts, x + dx, y + dy, local, world, normal)
                 _texture_colour(solids, textures, js, fs, local, 0.5 * footprint, colour)
-                _gain(solids, lighting, js, world, normal, edge_gain)
+                if js == i and fs == f:
+                    edge_gain[:] = gain
+                else:
+                    _gain(solids, lighting, js, world, normal, edge_gain)
                 for k in range(3):
                     image[row, column, k] += 0.25 * min(colour[k] * edge_gain[k], 255.0)

@@ -108,7 +108,8 @@ def _furnish_walls(
             case 0:
                 furniture.bookshelf(piece, rng, materials, rng.uniform(1.3, 1.8))
                 furniture.plant(corner, rng, materials)
-                _picture(wall, rng, materials, math.copysign(wall.width / 2 - 0.6, -aside), 1.6, 0.5)
+                beside = math.copysign(wall.width / 2 - 0.6, -aside)
+                _picture(wall, rng, materials, beside, 1.6, 0.5)
             case 1:
                 furniture.sofa(piece, rng, materials, rng.uniform(1.8, 2.1))
                 furniture.floor_lamp(corner, materials)
@@ -137,9 +138,7 @@ def _picture(
     furniture.picture(wall.build, (x, z), (shape[1] * scale, shape[0] * scale), canvas, frame)
 
 
-def _window(
-    wall: _Wall, rng: np.random.Generator, materials: Materials, height: float
-) -> None:
+def _window(wall: _Wall, rng: np.random.Generator, materials: Materials, height: float) -> None:
     """A window that glows and lights the room with daylight."""
     w, h = 1.5, 0.95
     z = height - 0.35 - h / 2
@@ -150,7 +149,7 @@ def _window(
         build.box((side * (w / 2 + 0.04), 0.025, z), (0.08, 0.05, h + 0.16), materials.lacquer)
         build.box((0, 0.025, z + side * (h / 2 + 0.04)), (w, 0.05, 0.08), materials.lacquer)
     build.box((0, 0.07, z - h / 2 - 0.09), (w + 0.24, 0.14, 0.025), materials.lacquer)
-    build.light((0, 0.35, z), (1.9, 2.1, 2.4), 0.3)
+    build.light((0, 0.35, z), (1.8, 1.95, 2.2), 0.3)
 
 
 def _furnish_middle(
@@ -169,4 +168,4 @@ def _furnish_middle(
         ball = materials.ceramic[rng.integers(len(materials.ceramic))]
         middle.ellipsoid((x, y, 0.012 + r), (r, r, r), ball)
     build.frustum((w / 2, d / 2, h - 0.2), (0.16, 0.22), 0.08, materials.shade, emission=1.0)
-    build.light((w / 2, d / 2, h - 0.25), (2.6, 2.45, 2.2), 0.2)
+    build.light((w / 2, d / 2, h - 0.25), (2.5, 2.35, 2.1), 0.2)

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int64, UInt8
+from jaxtyping import Float64, Int64, UInt8
 
 BOX, FRUSTUM, ELLIPSOID = 0, 1, 2
 
@@ -55,7 +55,7 @@ class Scene:
     texture_shift: Float64[np.ndarray, "n 2"]
     """Metres by which repeating textures are shifted, so that no two solids look the same."""
     emission: Float64[np.ndarray, "n"]
-    """Positive: the surface glows with this gain, whatever light falls on it, and casts no shadow."""
+    """Positive: the surface glows with this gain in any light, and casts no shadow."""
     textures: tuple[Texture, ...]
     lights: tuple[Light, ...]
 
@@ -167,9 +167,9 @@ class SceneBuilder:
         *,
         emission: float = 0.0,
     ) -> None:
-        """An upright cone frustum from ``base`` (centre of its lower disc); radii below and above."""
+        """An upright cone frustum on ``base``, the centre of its lower disc; radii below, above."""
         half = np.array([radii[0], radii[1], height / 2])
-        centre = np.asarray(base, float) + [0.0, 0.0, height / 2]
+        centre = (base[0], base[1], base[2] + height / 2)
         self._add(FRUSTUM, centre, half, [texture] * 6, None, emission)
 
     def ellipsoid(
@@ -217,17 +217,3 @@ class SceneBuilder:
         p.face_texture.append(faces)
         p.texture_shift.append(self._rng.uniform(0.0, 4.0, 2))
         p.emission.append(emission)
-
-
-@dataclass(frozen=True)
-class View:
-    """What a camera sees, exact at the pixel centres."""
-
-    image: UInt8[np.ndarray, "h w 3"]
-    """RGB, four samples a pixel."""
-    depth: Float32[np.ndarray, "h w"]
-    """z along the optical axis, metres; 0 where nothing is hit."""
-    normal: Float32[np.ndarray, "h w 3"]
-    """Unit, camera frame, facing the camera; zero where nothing is hit."""
-    solid: Int64[np.ndarray, "h w"]
-    """Index of the solid, -1 where nothing is hit."""

@@ -4,7 +4,9 @@ Every function returns an RGB image of the asked shape whose detail spans many s
 tracks the camera is optical flow. Textures that repeat (wood, fabric, carpet) are periodic.
 """
 
+import colorsys
 import math
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -12,6 +14,14 @@ from jaxtyping import Float32, UInt8
 
 Colour = tuple[float, float, float]
 """RGB in 0..255."""
+
+
+def random_colour(
+    rng: np.random.Generator, saturation: tuple[float, float], value: tuple[float, float]
+) -> Colour:
+    """A colour of any hue with saturation and value (0..1) in the given ranges."""
+    r, g, b = colorsys.hsv_to_rgb(rng.random(), rng.uniform(*saturation), rng.uniform(*value))
+    return (255 * r, 255 * g, 255 * b)
 
 
 def fractal_noise(
@@ -35,7 +45,8 @@ def fractal_noise(
         total = _enlarge_periodic(total, finer)
         total += gain**k * rng.standard_normal(finer, np.float32)
     total = _enlarge_periodic(total, shape)
-    return (total - total.mean()) / max(float(total.std()), 1e-6)
+    mean, deviation = (float(x[0, 0]) for x in cv2.meanStdDev(total))
+    return (total - mean) / max(deviation, 1e-6)
 
 
 def _enlarge_periodic(
@@ -82,7 +93,7 @@ def _crack(rng: np.random.Generator, image: Float32[np.ndarray, "h w 3"]) -> Non
     h, w = image.shape[:2]
     heading = rng.uniform(0, 2 * math.pi) + np.cumsum(rng.normal(0, 0.5, 60))
     steps = np.stack([np.cos(heading), np.sin(heading)], 1) * h / 100
-    path = np.cumsum(steps, 0) + [rng.uniform(0, w), rng.uniform(0, h)]
+    path = np.cumsum(steps, 0) + rng.uniform(0, (w, h))
     shade = tuple(float(c) for c in image.mean((0, 1)) * 0.6)
     cv2.polylines(image, [path.astype(np.int32)], False, shade, 1, cv2.LINE_AA)
 
@@ -123,7 +134,7 @@ def wallpaper(
         for c in range(cells + 1):
             x = (c + 0.5 * (r % 2)) * pitch + rng.normal(0, 0.05 * pitch)
             _flower(rng, image, x, (r + 0.3) * pitch, pitch * rng.uniform(0.2, 0.32), flower_colour)
-    image *= 1 + 0.05 * fractal_noise(rng, shape, (3, 4), 8, 0.7)[..., None]
+    image *= 1 + 0.06 * fractal_noise(rng, shape, (3, 4), 8, 0.8)[..., None]
     return _finish(image)
 
 
@@ -164,7 +175,7 @@ def planks(
     """A board floor: boards along x, each with its own tone, grain and length."""
     edges = np.linspace(0, shape[0], rows + 1).astype(int)
     image = np.empty((*shape, 3), np.float32)
-    for top, bottom in zip(edges[:-1], edges[1:], strict=True):
+    for top, bottom in pairwise(edges):
         strip = (bottom - top, shape[1])
         fibres = fractal_noise(rng, strip, (6, 10), 4, 0.8)
         knots = fractal_noise(rng, strip, (1, 6), 5, 0.6)
@@ -184,11 +195,12 @@ def tiles(
     size = shape[0] / rows
     y, x = np.mgrid[: shape[0], : shape[1]].astype(np.float32)
     row, column = (y / size).astype(int), (x / size).astype(int)
-    tone = rng.normal(1.0, 0.07, (rows + 1, int(shape[1] / size) + 2, 1))
+    tone = rng.normal(1.0, 0.1, (rows + 1, int(shape[1] / size) + 2, 1))
     ground = np.asarray(colours, np.float32)[(row + column) % 2] * tone[row, column]
-    veins = 1 - np.abs(fractal_noise(rng, shape, (rows, rows), 6, 0.6))
-    cloud = fractal_noise(rng, shape, (4, 4), 7, 0.7)
-    image = ground * (1 + 0.08 * cloud + 0.07 * veins)[..., None]
+    veins = np.abs(fractal_noise(rng, shape, (rows, rows), 6, 0.6))
+    dark = np.clip(1 - 6 * veins, 0, 1)
+    cloud = fractal_noise(rng, shape, (2 * rows, 2 * rows), 6, 0.8)
+    image = ground * (1 + 0.12 * cloud - 0.25 * dark)[..., None]
     fx, fy = x - column * size, y - row * size
     edge = np.minimum(np.minimum(fx, size - fx), np.minimum(fy, size - fy))
     joint = np.clip(1.5 - edge / (0.012 * size), 0, 1)[..., None]
@@ -216,7 +228,8 @@ def fabric(
 def rug(rng: np.random.Generator, shape: tuple[int, int]) -> UInt8[np.ndarray, "h w 3"]:
     """A knotted rug: nested borders, rows of motifs, a medallion, tufted pile."""
     h, w = shape
-    colours = rng.uniform(40, 215, (7, 3)) * [1.0, 0.8, 0.7]
+    colours = np.array([random_colour(rng, (0.2, 0.7), (0.3, 0.85)) for _ in range(7)])
+    colours *= [1.0, 0.9, 0.8]
     image = np.broadcast_to(colours[0].astype(np.float32), (h, w, 3)).copy()
     for k, inset in enumerate((0.03, 0.06, 0.13, 0.15)):
         margin = int(inset * h)
@@ -245,10 +258,11 @@ def ceramic(
     image = _tint(fractal_noise(rng, shape, (4, 8), 6, 0.7), colour, 0.09)
     h, w = shape
     for _ in range(5):
-        top, shade = rng.uniform(0.05, 0.9), np.asarray(rng.uniform(30, 230, 3), np.float32)
-        image[int(top * h) : int((top + rng.uniform(0.02, 0.07)) * h)] *= shade / 170
+        top, shade = rng.uniform(0.05, 0.9), random_colour(rng, (0.1, 0.6), (0.3, 0.9))
+        band = slice(int(top * h), int((top + rng.uniform(0.02, 0.07)) * h))
+        image[band] *= np.asarray(shade, np.float32) / 170
     for _ in range(70):
         centre = (int(rng.uniform(0, w)), int(rng.uniform(0, h)))
-        shade = tuple(map(float, rng.uniform(30, 230, 3)))
+        shade = random_colour(rng, (0.2, 0.7), (0.2, 0.95))
         cv2.circle(image, centre, int(rng.uniform(0.012, 0.04) * h), shade, -1, cv2.LINE_AA)
     return _finish(image)

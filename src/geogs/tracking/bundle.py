@@ -13,7 +13,13 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from geogs.geometry.camera import Camera
-from geogs.geometry.lie import retract, se3_adjoint, se3_inverse
+from geogs.geometry.lie import (
+    matrix_to_quaternion,
+    quaternion_to_matrix,
+    retract,
+    se3_adjoint,
+    se3_inverse,
+)
 from geogs.tracking.grid import SampleGrid
 
 MIN_Z = 0.05
@@ -118,6 +124,16 @@ def robust_weight(
     return weight * (huber / norm.clamp(min=huber))
 
 
+def move(xi: Float[Tensor, "*b 6"], T: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 4 4"]:
+    """Left retraction whose rotation is made orthonormal again.
+
+    Inverses are taken by transposition, so rounding errors would otherwise feed on themselves.
+    """
+    T = retract(xi, T)
+    R = quaternion_to_matrix(matrix_to_quaternion(T[..., :3, :3]))
+    return torch.cat([torch.cat([R, T[..., :3, 3:]], -1), T[..., 3:, :]], -2)
+
+
 def relative_motion(
     T_cw: Float[Tensor, "n 4 4"], source: Int[Tensor, "e"], target: Int[Tensor, "e"]
 ) -> Float[Tensor, "e 4 4"]:
@@ -164,7 +180,7 @@ class DenseBundle:
             if not bool(torch.isfinite(xi).all() and torch.isfinite(delta).all()):
                 finite = False
                 break
-            T = torch.where(problem.free_pose[:, None, None], retract(xi, T), T)
+            T = torch.where(problem.free_pose[:, None, None], move(xi, T), T)
             d = (d + delta).clamp(options.min_inverse_depth, options.max_inverse_depth)
             d = torch.where(problem.free_depth[:, None], d, problem.inverse_depth)
             step = float(xi.abs().max()) * self.grid.camera.fx if xi.numel() else 0.0
@@ -343,6 +359,6 @@ def solve_poses(
         g.index_add_(0, frame, edge_g)
         damping = 1e-4 * H.diagonal(dim1=-2, dim2=-1) + 1e-6
         xi = torch.linalg.solve(H + torch.diag_embed(damping), g)
-        T = retract(xi.nan_to_num(0.0, 0.0, 0.0), T)
+        T = move(xi.nan_to_num(0.0, 0.0, 0.0), T)
     final = project(camera, rays, T[frame] @ inverse, inverse_depth)
     return T, pixels - final.pixels

@@ -180,7 +180,7 @@ class Tracker:
         eye = torch.eye(4, dtype=torch.float64, device=self.grid.device)
         if len(self.store):
             last = list(self.store)[-1]
-            there, _ = self.operator.measure([last.encoded], [encoded], fine=True)
+            there, _ = self.operator.measure([last.encoded], [encoded], fine=False)
             used = there.weight[0, :, 0] > 0
             flow = (there.pixels[0] - self.grid.pixels).norm(dim=-1)
             matched = float(used.float().mean())
@@ -284,7 +284,7 @@ class Tracker:
             c.proximity_distance * self._long_edge,
             c.radius + c.proximity_pairs,
         )
-        self.graph.measure(pairs, fine=True)
+        self.graph.measure(pairs, fine=False)
 
     def _adjust_locally(self) -> None:
         c, ids = self.config, self.store.ids
@@ -295,7 +295,7 @@ class Tracker:
             edges = [e for e in self.graph.edges if e[0] in depths or moving & set(e)]
             if n:
                 pairs = [e for e in edges if e[0] < e[1] and moving & set(e)]
-                self.graph.measure(self.graph.stale(pairs, c.remeasure), fine=True)
+                self.graph.measure(self.graph.stale(pairs, c.remeasure), fine=False)
             self.graph.adjust(edges, poses, depths, BundleOptions(iterations=2))
 
     def _cull(self) -> tuple[int, ...]:

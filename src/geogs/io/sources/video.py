@@ -36,7 +36,7 @@ class VideoFile:
                 raise InputError(
                     f"{path} holds no picture that can be decoded; is it complete and a video?"
                 )
-            self.quarter_turns = clockwise_quarter_turns(first.rotation)
+            self.quarter_turns = clockwise_quarter_turns(float(first.rotation))
             size = (first.width, first.height)
         self.width, self.height = size[::-1] if self.quarter_turns % 2 else size
         self.calibration: Calibration | None = None

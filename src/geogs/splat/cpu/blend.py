@@ -44,6 +44,7 @@ _INLINE = {**PER_PIXEL, "cache": False}
     _X, _Y, _LIGHT, _MOMENT, _NORMAL_X, _NORMAL_Y, _NORMAL_Z, _DISTORTION, _MEDIAN, _LAST,
 ) = (np.uint64(k * TILE_PIXELS) for k in range(10))  # fmt: skip
 _PLANES = 10
+_RUN = np.uint64(LANES)
 _RUNS = TILE_PIXELS // LANES
 _CHECK_EVERY = 16
 
@@ -55,16 +56,15 @@ def reference_depth(records, lists, first, last):
 
 
 @numba.njit(**_INLINE)
-def run_of(boxes, i, top, first_run, last_run):
-    """The pixels of a tile from row ``top`` that disk i's box reaches, within some runs."""
-    low = max((boxes[i, 2] - top) * TILE_WIDTH // LANES, first_run)
-    high = min(((boxes[i, 3] - top) * TILE_WIDTH + LANES - 1) // LANES, last_run)
-    return np.uint64(low * LANES), np.uint64(max(low, high) * LANES)
+def common_runs(runs, k, first_run, last_run):
+    """The runs first..last that list entry k reaches, within first_run..last_run."""
+    first = max(runs[k, 0], first_run)
+    return np.uint64(first), np.uint64(max(min(runs[k, 1], last_run), first))
 
 
 @numba.njit(**_INLINE)
-def blend_disk(state, start, stop, r, rank, z_reference, inverse_near):
-    """Blend one disk into the pixels start..stop of a tile; returns the sum of its weights.
+def blend_disk(state, first, last, r, rank, z_reference, inverse_near):
+    """Blend one disk into the runs first..last of a tile; returns the sum of its weights.
 
     A pixel's light is the transmittance, and turns negative when blending stops.
     """
@@ -74,7 +74,7 @@ def blend_disk(state, start, stop, r, rank, z_reference, inverse_near):
     nearest, furthest = r[Z_NEAREST], r[Z_FURTHEST]
     least = wc * MIN_HIT_RATIO
     shown = ZERO
-    for j in range(start, stop):
+    for j in range(first * _RUN, last * _RUN):
         dx, dy = state[_X + j] - mx, state[_Y + j] - my
         w = wx * dx + wy * dy + wc
         bounded = min(max(w, least), inverse_near)
@@ -149,7 +149,7 @@ def write_maps(state, left, top, z_reference, depth, normal, alpha, distortion, 
 
 @numba.njit(**PER_PIXEL)
 def blend_tiles(
-    first_tile, stride, records, boxes, offsets, lists, inverse_near,
+    first_tile, stride, records, offsets, lists, runs, inverse_near,
     depth, normal, alpha, distortion, median_depth, visible, saved,
 ):  # fmt: skip
     """Render every ``stride``-th tile from ``first_tile`` on.
@@ -168,7 +168,7 @@ def blend_tiles(
         first_run, last_run = live_runs(state)
         for k in range(first, last):
             i = lists[k]
-            start, stop = run_of(boxes, i, top, first_run, last_run)
+            start, stop = common_runs(runs, k, first_run, last_run)
             rank = np.float32(k - first + 1)
             shown = blend_disk(state, start, stop, records[i], rank, z_reference, inverse_near)
             if shown > ZERO:

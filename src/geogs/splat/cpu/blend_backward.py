@@ -3,7 +3,7 @@
 import numba
 import numpy as np
 
-from geogs.splat.cpu.blend import reference_depth, run_of
+from geogs.splat.cpu.blend import common_runs, reference_depth
 from geogs.splat.cpu.layout import (
     G_CLAMPED,
     G_MX,
@@ -60,12 +60,13 @@ _INLINE = {**PER_PIXEL, "cache": False}
     _D_CONSTANT, _D_Z, _D_NORMAL_X, _D_NORMAL_Y, _D_NORMAL_Z, _D_DISTORTION,
 ) = (np.uint64(k * TILE_PIXELS) for k in range(14))  # fmt: skip
 _PLANES = 14
+_RUN = np.uint64(LANES)
 _RUNS = TILE_PIXELS // LANES
 
 
 @numba.njit(**_INLINE)
-def unblend_disk(state, start, stop, r, rank, z_reference, inverse_near, g):
-    """Take one disk out of the pixels start..stop of a tile; ``g`` receives its gradients.
+def unblend_disk(state, first, last, r, rank, z_reference, inverse_near, g):
+    """Take one disk out of the runs first..last of a tile; ``g`` receives its gradients.
 
     Going back to front, with sums over the disks i behind: BEHIND of w_i dL/dw_i, SIGNS of w_i s_i
     and SIGNED_Z of w_i s_i z_i, where s_i is the sign of z_i A_i - Z_i; LIGHT and MOMENT become
@@ -81,7 +82,7 @@ def unblend_disk(state, start, stop, r, rank, z_reference, inverse_near, g):
     least = wc * MIN_HIT_RATIO
     s_u = s_ux = s_uy = s_v = s_vx = s_vy = s_w = s_wx = s_wy = ZERO
     s_clamped = s_mx = s_my = s_opacity = s_nx = s_ny = s_nz = ZERO
-    for j in range(start, stop):
+    for j in range(first * _RUN, last * _RUN):
         dx, dy = state[_X + j] - mx, state[_Y + j] - my
         w = wx * dx + wy * dy + wc
         bounded = min(max(w, least), inverse_near)
@@ -202,7 +203,7 @@ def slot_of(boxes, slots, i, tile, columns):
 
 @numba.njit(**PER_PIXEL)
 def unblend_tiles(
-    first_tile, stride, records, boxes, slots, offsets, lists, inverse_near, saved,
+    first_tile, stride, records, boxes, slots, offsets, lists, runs, inverse_near, saved,
     d_depth, d_normal, d_alpha, d_distortion, pair_gradients,
 ):  # fmt: skip
     """Gradients of every pair of every ``stride``-th tile from ``first_tile`` on."""
@@ -229,6 +230,9 @@ def unblend_tiles(
             for run in range(_RUNS):
                 if last_of[run] == rank:
                     first_run, last_run = min(first_run, run), max(last_run, run + 1)
-            start, stop = run_of(boxes, i, top, first_run, last_run)
+            start, stop = common_runs(runs, k, first_run, last_run)
             g = pair_gradients[slot_of(boxes, slots, i, tile, columns)]
+            if start == stop:
+                g[:] = ZERO
+                continue
             unblend_disk(state, start, stop, records[i], rank, z_reference, inverse_near, g)

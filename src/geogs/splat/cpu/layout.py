@@ -18,7 +18,10 @@ TILE_WIDTH = 8
 TILE_HEIGHT = 32
 TILE_PIXELS = TILE_WIDTH * TILE_HEIGHT
 LANES = 16
-"""Runs of pixels start and end at multiples of this."""
+"""Pixels per run."""
+ROWS_PER_RUN = LANES // TILE_WIDTH
+
+OUTLINE = 10
 
 RECORD = 16
 """Floats per record: one cache line."""
@@ -56,26 +59,22 @@ PER_PIXEL = {
 }
 """Reassociation lets sums be vectorised; finite records keep NaN and infinity out of the pixels."""
 
-_LOG2_E = np.float32(1.442695041)
-_LN2_HIGH = np.float32(0.693359375)
-_LN2_LOW = np.float32(-2.12194440e-4)
-_MAX_EXPONENT = np.float32(80)
-_C0, _C1, _C2, _C3, _C4 = (
-    np.float32(c)
-    for c in (1.9875691500e-4, 1.3981999507e-3, 8.3334519073e-3, 4.1665795894e-2, 1.6666665459e-1)
-)
+_NO_SHOW = np.float32(8)
+_SIXTEENTH = np.float32(1 / 16)
+# Minimax polynomial of exp(-y) on [0, 1/2], relative error 1e-8.
+_C0, _C1, _C2 = np.float32(0.9999999894), np.float32(-0.9999985731), np.float32(0.4999680477)
+_C3, _C4, _C5 = np.float32(-0.1664003761), np.float32(0.0406455346), np.float32(-0.0064755333)
 
 
 @numba.njit(inline="always", error_model="numpy", fastmath=PER_PIXEL["fastmath"])
 def exp_minus(x):
-    """exp(-x) of a float32 x >= 0, relative error 1e-7; vectorises where a library call does not.
+    """exp(-x) of a float32 x >= 0 to six digits, and exp(-8) < MIN_ALPHA beyond 8.
 
-    Cephes' expf: a power of two times a polynomial.
+    (exp(-x / 16))^16 by a polynomial; a library's exp is a call and would keep loops scalar.
     """
-    y = -min(x, _MAX_EXPONENT)
-    n = np.int32(y * _LOG2_E - HALF)
-    whole = np.float32(n)
-    r = y - whole * _LN2_HIGH - whole * _LN2_LOW
-    p = ((((_C0 * r + _C1) * r + _C2) * r + _C3) * r + _C4) * r + HALF
-    p = p * r * r + r + ONE
-    return p * np.int32((n + np.int32(127)) << np.int32(23)).view(np.float32)
+    y = min(x, _NO_SHOW) * _SIXTEENTH
+    p = ((((_C5 * y + _C4) * y + _C3) * y + _C2) * y + _C1) * y + _C0
+    p2 = p * p
+    p4 = p2 * p2
+    p8 = p4 * p4
+    return p8 * p8

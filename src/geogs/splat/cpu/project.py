@@ -95,47 +95,50 @@ def bounded_facing(normal, center):
 
 
 @numba.njit(**_INLINE)
-def pixel_range(middle, half, count):
-    """Pixels [first, last) of a row of ``count`` whose centres lie within middle +- half."""
-    low = min(max(middle - half, -1.0), float(count))
-    high = min(max(middle + half, -1.0), float(count))
+def pixel_range(low, high, count):
+    """Pixels first..last of a line of ``count`` whose centres lie between low and high."""
+    low = min(max(low - 0.01, -1.0), float(count))
+    high = min(max(high + 0.01, -1.0), float(count))
     return max(int(math.ceil(low)), 0), min(int(math.floor(high)) + 1, count)
 
 
 @numba.njit(**_INLINE)
-def extent(slope, axis, radius2, d):
-    """Offset of the middle and half the size, along one image axis, of a projected disk.
-
-    ``slope`` = derivative of the pixel times depth in the disk's two coordinates, ``axis`` that of
-    depth, d = radius2 |axis|^2 - c_z^2 < 0.
-    """
-    middle = radius2 * (slope[0] * axis[0] + slope[1] * axis[1]) / d
-    inside = middle * middle - radius2 * (slope[0] * slope[0] + slope[1] * slope[1]) / d
-    return middle, math.sqrt(max(inside, 0.0))
-
-
-@numba.njit(**_INLINE)
-def box_of(mx, my, c, u, v, opacity, intrinsics, width, height):
-    """Pixels (x0, x1, y0, y1) that the disk can reach with at least ``MIN_ALPHA``.
+def outline_of(mx, my, c, u, v, opacity, intrinsics, outline):
+    """Where the disk can have at least ``MIN_ALPHA``; false if that has no bounds.
 
     ``u`` and ``v`` are the scaled tangents in the camera. The radius in deviations follows from the
-    opacity; the low-pass Gaussian about the projected centre is included. A disk that reaches
-    behind the camera has no bounded outline and gets the whole image.
+    opacity. On the disk's plane it is an ellipse in the image: the dual conic of the circle, about
+    the projected centre, M diag(r^2, r^2, -1) M^T with M = K [u v c]. Around the projected centre
+    it is the circle of the low-pass Gaussian. A disk that reaches behind the camera has no bounds.
     """
     fx, fy = intrinsics[0], intrinsics[1]
     radius2 = 2 * math.log(opacity / MIN_ALPHA)
-    blur = math.sqrt(radius2 / 2) + 0.01
     d = radius2 * (u[2] * u[2] + v[2] * v[2]) - c[2] * c[2]
     if d > -1e-6 * c[2] * c[2]:
-        return 0, width, 0, height
-    axis = (u[2], v[2])
+        return False
     x, y = c[0] / c[2], c[1] / c[2]
-    ox, hx = extent((fx * (u[0] - x * u[2]), fx * (v[0] - x * v[2])), axis, radius2, d)
-    oy, hy = extent((fy * (u[1] - y * u[2]), fy * (v[1] - y * v[2])), axis, radius2, d)
-    low, high = min(ox - hx, -blur), max(ox + hx, blur)
-    x0, x1 = pixel_range(mx + (low + high) / 2, (high - low) / 2 + 0.01, width)
-    low, high = min(oy - hy, -blur), max(oy + hy, blur)
-    y0, y1 = pixel_range(my + (low + high) / 2, (high - low) / 2 + 0.01, height)
+    ux, vx = fx * (u[0] - x * u[2]), fx * (v[0] - x * v[2])
+    uy, vy = fy * (u[1] - y * u[2]), fy * (v[1] - y * v[2])
+    k = radius2 / d
+    ox, oy = k * (ux * u[2] + vx * v[2]), k * (uy * u[2] + vy * v[2])
+    xx = max(ox * ox - k * (ux * ux + vx * vx), 1e-6)
+    yy = max(oy * oy - k * (uy * uy + vy * vy), 1e-6)
+    xy = ox * oy - k * (ux * uy + vx * vy)
+    outline[0], outline[1], outline[2] = mx, my, math.sqrt(radius2 / 2)
+    outline[3], outline[4], outline[5] = mx + ox, my + oy, math.sqrt(xx)
+    outline[6], outline[7] = xy / xx, math.sqrt(max(yy - xy * xy / xx, 0.0))
+    outline[8] = xy / math.sqrt(yy)
+    outline[9] = math.sqrt(yy)
+    return True
+
+
+@numba.njit(**_INLINE)
+def box_of(outline, width, height):
+    """Pixels (x0, x1, y0, y1) within an outline."""
+    mx, my, blur = outline[0], outline[1], outline[2] 
+    ox, oy, hx, hy = outline[3], outline[4], outline[5], outline[9]
+    x0, x1 = pixel_range(min(mx - blur, ox - hx), max(mx + blur, ox + hx), width)
+    y0, y1 = pixel_range(min(my - blur, oy - hy), max(my + blur, oy + hy), height)
     return x0, x1, y0, y1
 
 
@@ -158,7 +161,7 @@ def is_usable(position, quaternion, log_scale, opacity_logit, i):
 @numba.njit(**PER_DISK)
 def project_disks(
     position, quaternion, log_scale, opacity_logit, T, intrinsics, near, width, height,
-    start, stop, records, boxes, pairs,
+    start, stop, records, outlines, boxes, pairs,
 ):  # fmt: skip
     """Fill records, boxes (x0, x1, y0, y1) and the number of tiles touched of disks start..stop.
 
@@ -178,7 +181,12 @@ def project_disks(
         su, sv = math.exp(np.float64(log_scale[i, 0])), math.exp(np.float64(log_scale[i, 1]))
         u, v = (su * a[0], su * a[1], su * a[2]), (sv * b[0], sv * b[1], sv * b[2])
         mx, my = fx * c[0] / c[2] + cx, fy * c[1] / c[2] + cy
-        x0, x1, y0, y1 = box_of(mx, my, c, u, v, opacity, intrinsics, width, height)
+        x0, x1, y0, y1 = 0, width, 0, height
+        if outline_of(mx, my, c, u, v, opacity, intrinsics, outlines[i]):
+            x0, x1, y0, y1 = box_of(outlines[i], width, height)
+        else:
+            outlines[i, 2] = np.inf
+            outlines[i, 5] = -1
         if x0 >= x1 or y0 >= y1:
             continue
         boxes[i, 0], boxes[i, 1], boxes[i, 2], boxes[i, 3] = x0, x1, y0, y1

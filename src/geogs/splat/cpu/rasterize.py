@@ -10,6 +10,7 @@ from geogs.splat.cpu.blend import blend_tiles
 from geogs.splat.cpu.blend_backward import unblend_tiles
 from geogs.splat.cpu.layout import (
     GRADIENT,
+    OUTLINE,
     RECORD,
     SAVED,
     TILE_HEIGHT,
@@ -50,6 +51,7 @@ class Trace:
     slots: np.ndarray
     offsets: np.ndarray
     lists: np.ndarray
+    runs: np.ndarray
     saved: np.ndarray
 
 
@@ -80,11 +82,11 @@ def rasterize_forward(
     n, width, height = len(parameters[0]), camera.width, camera.height
     intrinsics = (float(camera.fx), float(camera.fy), float(camera.cx), float(camera.cy))
     records, boxes = np.empty((n, RECORD), np.float32), np.empty((n, 4), np.int32)
-    pairs = np.empty(n, np.int32)
+    outlines, pairs = np.empty((n, OUTLINE)), np.empty(n, np.int32)
     run_chunks(
         lambda c: project_disks(
             *parameters, T_cw, intrinsics, near, width, height,
-            *_span(n, c, _DISK_CHUNKS), records, boxes, pairs,
+            *_span(n, c, _DISK_CHUNKS), records, outlines, boxes, pairs,
         ),
         _DISK_CHUNKS, threads,
     )  # fmt: skip
@@ -92,9 +94,11 @@ def rasterize_forward(
     slots, offsets = np.empty(n + 1, np.int64), np.empty(columns * rows + 1, np.int64)
     count_pairs(pairs, boxes, columns, slots, offsets)
     order = sort_by_depth(records, pairs)
-    lists = np.empty(offsets[-1], np.int32)
+    lists, runs = np.empty(offsets[-1], np.int32), np.empty((offsets[-1], 2), np.uint8)
     run_chunks(
-        lambda c: list_disks(order, boxes, columns, offsets, *_span(rows, c, threads), lists),
+        lambda c: list_disks(
+            order, boxes, outlines, columns, offsets, *_span(rows, c, threads), lists, runs
+        ),
         threads, threads,
     )  # fmt: skip
     maps = Maps(
@@ -110,13 +114,13 @@ def rasterize_forward(
     chunks = threads * _CHUNKS_PER_THREAD
     run_chunks(
         lambda c: blend_tiles(
-            c, chunks, records, boxes, offsets, lists, inverse_near, maps.depth, maps.normal,
+            c, chunks, records, offsets, lists, runs, inverse_near, maps.depth, maps.normal,
             maps.alpha, maps.distortion, maps.median_depth, maps.visible, saved,
         ),
         chunks, threads,
     )  # fmt: skip
     return maps, Trace(
-        parameters, T_cw, intrinsics, inverse_near, records, boxes, slots, offsets, lists, saved
+        parameters, T_cw, intrinsics, inverse_near, records, boxes, slots, offsets, lists, runs, saved
     )
 
 
@@ -134,7 +138,7 @@ def rasterize_backward(
     chunks = threads * _CHUNKS_PER_THREAD
     run_chunks(
         lambda c: unblend_tiles(
-            c, chunks, trace.records, trace.boxes, trace.slots, trace.offsets, trace.lists,
+            c, chunks, trace.records, trace.boxes, trace.slots, trace.offsets, trace.lists, trace.runs,
             trace.inverse_near, trace.saved, d_depth, d_normal, d_alpha, d_distortion,
             pair_gradients,
         ),

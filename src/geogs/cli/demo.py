@@ -1,0 +1,53 @@
+"""``geogs demo``: make a small room, reconstruct it as any other video, show the errors."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from geogs.cli.options import parse_options
+
+
+@dataclass(frozen=True)
+class DemoOptions:
+    """Make a small synthetic room sequence, run everything on it, print the error table."""
+
+    output: Path = Path("out/demo")
+    """Folder for the sequence (room/) and the result (result/); also -o."""
+    frames: int = 120
+    """Frames of the sequence, at least 20."""
+    width: int = 320
+    """Pixels."""
+    height: int = 240
+    """Pixels."""
+    seed: int = 0
+    """Another seed makes another room."""
+
+
+def main(argv: Sequence[str]) -> int:
+    """Run the command; returns the exit code."""
+    arguments = ["--output" if a == "-o" else a for a in argv]
+    options = parse_options(DemoOptions, arguments, "demo")
+    return demo(options)
+
+
+def demo(options: DemoOptions) -> int:
+    """The three commands one after the other."""
+    from geogs.cli import eval as evaluation
+    from geogs.cli import run, synth
+
+    room, result = str(options.output / "room"), str(options.output / "result")
+    steps = [
+        ("synth", synth.main, [
+            room, "--frames", str(options.frames), "--width", str(options.width),
+            "--height", str(options.height), "--seed", str(options.seed),
+        ]),
+        ("run", run.main, [room, "-o", result]),
+        ("eval", evaluation.main, [result, "--gt", room]),
+    ]  # fmt: skip
+    for name, command, arguments in steps:
+        print(f"$ geogs {name} {' '.join(arguments)}", flush=True)
+        code = command(arguments)
+        if code:
+            return code
+    print(f"Look at {result}/report/ and open {result}/mesh.ply in a mesh viewer.")
+    return 0

@@ -1,0 +1,95 @@
+"""A hand-held camera path through a room."""
+
+import numpy as np
+from jaxtyping import Float64
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation
+
+from geogs.errors import InputError
+from geogs.synth.scene import Scene
+
+FRAMES_PER_LAP = 280
+"""Frames after which the camera is back near its first view."""
+
+_KNOTS_PER_LAP = 9
+_MIN_CLEARANCE = 0.6
+_SHAKE_PERIOD = 7
+_SHAKE_METRES = 0.003
+_SHAKE_RADIANS = np.radians(0.2)
+
+
+def handheld_trajectory(
+    scene: Scene, frames: int, seed: int = 0, frames_per_lap: int = FRAMES_PER_LAP
+) -> Float64[np.ndarray, "n 4 4"]:
+    """Camera-to-world poses of a walk around the middle of the room, looking across it.
+
+    Position and look-at point follow smooth periodic splines through random knots, plus a little
+    hand shake that does not repeat; so the camera always moves sideways, never only turns, and
+    after ``frames_per_lap`` frames comes back to within centimetres of its first view. It keeps
+    0.6 m from every surface. The same seed gives the same path, however many frames are asked for.
+    """
+    if frames < 1:
+        raise InputError(f"a sequence needs at least 1 frame, not {frames}")
+    lap = np.arange(frames) / frames_per_lap
+    whole = np.arange(4 * frames_per_lap) / (4 * frames_per_lap)
+    for shrink in np.geomspace(1.0, 0.25, 16):
+        position, target = _splines(scene, np.random.default_rng([seed, 0x7A1]), shrink)
+        # The path of the whole lap decides, so that longer sequences begin with shorter ones.
+        if scene.clearance(position(whole)).min() > _MIN_CLEARANCE + 4 * _SHAKE_METRES:
+            break
+    else:
+        raise InputError(f"no camera path keeps {_MIN_CLEARANCE} m from the furniture of this room")
+    T_wc = _look_at(position(lap % 1.0), target(lap % 1.0))
+    return _shake(T_wc, np.random.default_rng([seed, 0x5A4]))
+
+
+def _splines(
+    scene: Scene, rng: np.random.Generator, shrink: float
+) -> tuple[CubicSpline, CubicSpline]:
+    """Position and look-at point over one lap in [0, 1]."""
+    middle = scene.size[:2] / 2
+    reach = shrink * (middle - 1.1)
+    turn = rng.choice((-1.0, 1.0)) * 2 * np.pi
+    angle = rng.uniform(0, 2 * np.pi) + turn * np.arange(_KNOTS_PER_LAP) / _KNOTS_PER_LAP
+    radius = rng.uniform(0.8, 1.1, _KNOTS_PER_LAP)
+    height = rng.uniform(1.3, 1.6, _KNOTS_PER_LAP)
+    outward = np.stack([np.cos(angle), np.sin(angle)], 1)
+    position = np.column_stack([middle + radius[:, None] * outward * reach, height])
+    across = middle - outward * rng.uniform(0.5, 0.9, (_KNOTS_PER_LAP, 1))
+    target = np.column_stack([across, rng.uniform(0.85, 1.25, _KNOTS_PER_LAP)])
+    s = np.linspace(0, 1, _KNOTS_PER_LAP + 1)
+
+    def closed(knots: np.ndarray) -> CubicSpline:
+        return CubicSpline(s, np.concatenate([knots, knots[:1]]), bc_type="periodic")
+
+    return closed(position), closed(target)
+
+
+def _look_at(
+    position: Float64[np.ndarray, "n 3"], target: Float64[np.ndarray, "n 3"]
+) -> Float64[np.ndarray, "n 4 4"]:
+    """Camera to world with z towards the target and x level."""
+    z = target - position
+    z /= np.linalg.norm(z, axis=1, keepdims=True)
+    x = np.cross(z, [0.0, 0.0, 1.0])
+    x /= np.linalg.norm(x, axis=1, keepdims=True)
+    T = np.tile(np.eye(4), (len(position), 1, 1))
+    T[:, :3, :3] = np.stack([x, np.cross(z, x), z], -1)
+    T[:, :3, 3] = position
+    return T
+
+
+def _shake(
+    T_wc: Float64[np.ndarray, "n 4 4"], rng: np.random.Generator
+) -> Float64[np.ndarray, "n 4 4"]:
+    """Adds a smooth tremor: a spline through random offsets a few frames apart."""
+    frames = np.arange(len(T_wc))
+    knots = len(T_wc) // _SHAKE_PERIOD + 3
+    offsets = np.clip(rng.standard_normal((knots, 6)), -2.5, 2.5)
+    # A natural start would let later knots reach back; clamped ends keep prefixes almost alike.
+    tremor = CubicSpline(np.arange(knots) * _SHAKE_PERIOD, offsets)(frames)
+    shaken = T_wc.copy()
+    shaken[:, :3, 3] += _SHAKE_METRES * tremor[:, :3]
+    turn = Rotation.from_rotvec(_SHAKE_RADIANS * tremor[:, 3:]).as_matrix()
+    shaken[:, :3, :3] = T_wc[:, :3, :3] @ turn
+    return shaken

@@ -1,0 +1,187 @@
+"""The command line: help at once, errors in a line, exit codes."""
+
+import os
+import subprocess
+import sys
+import time
+import types
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import pytest
+import tyro
+
+from geogs import __version__
+from geogs.cli import main as cli
+from geogs.cli.options import parse_options
+from geogs.config import InputConfig
+from geogs.errors import InputError, OutputError, TrackingLost
+
+
+@dataclass(frozen=True)
+class Options:
+    """Options of a made-up command."""
+
+    source: tyro.conf.Positional[Path]
+    """What to read."""
+    input: InputConfig = field(default_factory=InputConfig)
+    fast: bool = False
+    """Hurry."""
+
+
+def geogs(*arguments: str) -> subprocess.CompletedProcess[str]:
+    """Run the command in a process of its own."""
+    return subprocess.run(
+        [sys.executable, "-m", "geogs.cli.main", *arguments],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+
+
+@pytest.fixture
+def command(monkeypatch):
+    """Replace the body of ``geogs run``."""
+
+    def install(body) -> None:
+        module = types.ModuleType("geogs_test_command")
+        module.main = body
+        monkeypatch.setitem(sys.modules, module.__name__, module)
+        monkeypatch.setitem(cli.COMMANDS, "run", cli.Command(module.__name__, "test"))
+
+    return install
+
+
+def test_help_lists_every_command_and_is_quick():
+    seconds = []
+    for _ in range(3):
+        begin = time.perf_counter()
+        result = geogs("--help")
+        seconds.append(time.perf_counter() - begin)
+    assert result.returncode == 0
+    assert result.stderr == ""
+    for name, entry in cli.COMMANDS.items():
+        assert f"  {name} " in result.stdout
+        assert entry.help in result.stdout
+    print(f"geogs --help: {min(seconds):.3f} s")
+    assert min(seconds) < 0.6
+
+
+def test_help_imports_nothing_heavy():
+    code = (
+        "import sys; from geogs.cli.main import main; main(['--help']); "
+        "print([m for m in ('torch', 'numpy', 'cv2', 'numba', 'tyro', 'av') if m in sys.modules])"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert result.stdout.splitlines()[-1] == "[]"
+
+
+def test_version_and_no_arguments(capsys):
+    assert cli.main(["--version"]) == 0
+    assert capsys.readouterr().out == f"geogs {__version__}\n"
+    assert cli.main([]) == 0
+    assert "usage: geogs COMMAND" in capsys.readouterr().out
+
+
+def test_unknown_command_suggests_a_near_one(capsys):
+    assert cli.main(["sinth"]) == 2
+    assert capsys.readouterr().err == "error: there is no command sinth; did you mean synth?\n"
+    assert cli.main(["xyz"]) == 2
+    assert "choose one of" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("kind", [InputError, OutputError, TrackingLost])
+def test_our_errors_are_one_sentence_and_exit_code_2(command, capsys, monkeypatch, kind):
+    monkeypatch.delenv("GEOGS_DEBUG", raising=False)
+
+    def fail(argv) -> int:
+        raise kind("The video is broken; give another.")
+
+    command(fail)
+    assert cli.main(["run"]) == 2
+    output = capsys.readouterr()
+    assert output.out == ""
+    assert output.err == "error: The video is broken; give another.\n"
+    monkeypatch.setenv("GEOGS_DEBUG", "1")
+    with pytest.raises(kind):
+        cli.main(["run"])
+
+
+def test_error_is_red_on_a_terminal_only(monkeypatch, capsys):
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
+    cli.print_error("x")
+    assert capsys.readouterr().err == "\033[31merror: x\033[0m\n"
+
+
+def test_interrupt_is_130_and_other_errors_keep_their_traceback(command):
+    def interrupt(argv) -> int:
+        raise KeyboardInterrupt
+
+    def crash(argv) -> int:
+        raise ZeroDivisionError
+
+    command(interrupt)
+    assert cli.main(["run"]) == 130
+    command(crash)
+    with pytest.raises(ZeroDivisionError):
+        cli.main(["run"])
+
+
+def test_arguments_and_exit_code_pass_through(command):
+    seen = []
+
+    def body(argv) -> int:
+        seen.append(argv)
+        return 3
+
+    command(body)
+    assert cli.main(["run", "video.mp4", "--fast"]) == 3
+    assert seen == [["video.mp4", "--fast"]]
+
+
+def test_options_are_parsed_into_the_dataclass():
+    options = parse_options(Options, ["v.mp4", "--input.stride", "2", "--fast"], "run")
+    assert options == Options(Path("v.mp4"), InputConfig(stride=2), fast=True)
+    default = Options(Path("v.mp4"), InputConfig(long_edge=99))
+    assert parse_options(Options, ["w.mp4"], "run", default=default).input.long_edge == 99
+
+
+@pytest.mark.parametrize(
+    ("argv", "code", "stream", "text"),
+    [
+        (["--help"], 0, "out", "Use every stride-th frame"),
+        ([], 2, "err", "geogs run"),
+        (["v.mp4", "--quick"], 2, "err", "--quick"),
+        (["v.mp4", "--input.stride", "two"], 2, "err", "--input.stride"),
+    ],
+)
+def test_help_and_wrong_options(command, capsys, argv, code, stream, text):
+    def body(argv) -> int:
+        parse_options(Options, argv, "run")
+        return 1
+
+    command(body)
+    assert cli.main(["run", *argv]) == code
+    output = capsys.readouterr()
+    assert text in getattr(output, stream)
+    assert "Traceback" not in output.err
+
+
+def test_library_warnings_reach_the_user_in_a_line(command, capsys):
+    import logging
+
+    def body(argv) -> int:
+        logging.getLogger("geogs.io.anything").warning("skipped %d frames.", 3)
+        logging.getLogger("geogs.io.anything").info("not shown")
+        return 0
+
+    command(body)
+    assert cli.main(["run"]) == 0
+    assert capsys.readouterr().err == "warning: skipped 3 frames.\n"
+    logging.getLogger("geogs").handlers.clear()
+    logging.getLogger("geogs").propagate = True
+
+
+def test_output_cut_off_by_its_reader_is_no_traceback():
+    shell = f"{sys.executable} -m geogs.cli.main --help | head -n 1"
+    result = subprocess.run(["sh", "-c", shell], capture_output=True, text=True, env=os.environ)
+    assert "Traceback" not in result.stderr
