@@ -84,7 +84,7 @@ def box_views(half: torch.Tensor, count: int = 24) -> list[DepthMapView]:
 
 def boundary_edges(mesh: Mesh) -> np.ndarray:
     """Edges that do not belong to exactly two faces."""
-    edges = np.sort(np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]]))
+    edges = np.sort(mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2))
     unique, count = np.unique(edges, axis=0, return_counts=True)
     return unique[count != 2]
 
@@ -128,7 +128,9 @@ def test_sphere_is_accurate_closed_and_faces_outwards():
     outwards = (face_normals(mesh) * centre / np.linalg.norm(centre, axis=1, keepdims=True)).sum(1)
     assert outwards.min() > 0.8
     assert (mesh.normals * mesh.vertices).sum(1).min() > 0.9 * RADIUS
-    area = 0.5 * np.linalg.norm(np.cross(*np.diff(mesh.vertices[mesh.faces], axis=1).transpose(1, 0, 2)), axis=1).sum()
+    assert (mesh.colours == (200, 100, 50)).all()
+    a, b, c = (mesh.vertices[mesh.faces[:, i]] for i in range(3))
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2
     assert area == pytest.approx(4 * math.pi * RADIUS**2, rel=0.01)
 
 

@@ -75,7 +75,7 @@ class DepthConfig:
     """Dense depth of a keyframe before any disk is made."""
 
     sigma_scale: float = 0.14
-    """Real over expected deviation of the tracker's inverse depth, above 0."""
+    """Completion: real over expected deviation of the tracker's inverse depth, above 0."""
     bending: float = 0.02
     """Completion: second difference of inverse depth per cell, over its median, that is usual."""
     membrane: float = 0.3
@@ -101,40 +101,59 @@ class DepthConfig:
     plane_step: float = 0.6
     """Pixels that the median neighbour moves from plane to plane."""
     min_planes: int = 96
-    """Fewest planes."""
+    """Fewest planes, at least 2."""
     max_planes: int = 144
     """Most planes."""
-    window: int = 5
+    window: int = 3
     """Side of the matching window in pixels, odd, at least 3."""
     variance_floor: float = 1e-5
     """Grey variance (grey in 0 to 1) below which a window counts as without texture."""
+    support_radius: int = 3
+    """Pixels over which matching costs are averaged, at least 0."""
+    support_sharpness: float = 400.0
+    """How fast that average forgets pixels of another colour (RGB in 0 to 1, squared)."""
     prior_pull: float = 0.3
     """Cost of a plane far from the tracker's depth where the tracker is sure."""
     prior_tolerance: float = 0.03
     """Relative distance from the tracker's inverse depth at which the pull is full."""
+    sure_deviation: float = 0.05
+    """Relative deviation at which the tracker is half sure."""
     small_jump: float = 0.1
     """Semi-global matching: cost of a step by one plane."""
     large_jump: float = 1.5
     """Semi-global matching: cost of a larger step where the image is flat."""
     jump_contrast: float = 30.0
     """Semi-global matching: how fast the large step gets cheaper with the grey difference."""
-    sure_deviation: float = 0.05
-    """Relative deviation at which the tracker's confidence is one half."""
-    support_radius: int = 2
-    support_sharpness: float = 100.0
-    keep: int = 0
     refine_steps: int = 3
-    """Refinement: photometric steps."""
-    support_contrast: float = 200.0
-    fit_radius: int = 3
-    fit_deviation: float = 0.01
-    fit_tolerance: float = 0.01
-    fit_stiffness: float = 0.5
-    guide_contrast: float = 200.0
-    plane_deviation: float = 0.005
+    """Refinement: photometric steps, each with a fit of local planes; at least 1."""
+    patch_contrast: float = 200.0
+    """Refinement: how fast a patch sample's weight falls with its grey difference, squared."""
     step_limit: float = 0.03
-    vote_confidence: float = 0.3
-    """Least confidence of a pixel that votes."""
+    """Refinement: largest step, relative to inverse depth."""
+    photo_deviation: float = 0.07
+    """Refinement: deviation of a photometric optimum times the root of its curvature."""
+    tracker_scale: float = 0.2
+    """Refinement: real over expected relative deviation of the tracker's depth."""
+    fit_radius: int = 3
+    """Local planes: pixels around the centre that make the fit."""
+    fit_deviation: float = 0.01
+    """Local planes: relative deviation at which a pixel counts half."""
+    fit_tolerance: float = 0.01
+    """Local planes: relative distance from the plane at which a pixel counts half."""
+    fit_stiffness: float = 0.5
+    """Local planes: weight of the previous slopes, in sure pixels at distance 1."""
+    guide_contrast: float = 200.0
+    """Local planes: how fast a pixel's weight falls with its colour difference, squared."""
+    plane_deviation: float = 0.005
+    """Local planes: usual relative distance of a surface from them."""
+    average_reach: float = 0.01
+    """Check: relative distance within which depths of several keyframes are averaged."""
+    agreement_reach: float = 0.015
+    """Check: relative distance within which another keyframe's depth supports a pixel."""
+    violation_distance: float = 0.05
+    """Check: relative distance in front of another keyframe's depth that speaks against it."""
+    vote_confidence: float = 0.5
+    """Least confidence of a pixel that votes on points."""
     vote_support: float = 0.04
     """Relative distance from a depth within which a point lies on the surface."""
     vote_violation: float = 0.08

@@ -3,16 +3,18 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
-import tyro
+from tyro.conf import Positional
+
+from geogs.cli.options import parse_options
 
 
 @dataclass(frozen=True)
 class SynthOptions:
     """Renders a furnished room, drawn at random, along a hand-held camera path."""
 
-    output: Annotated[Path, tyro.conf.Positional]
+    output: Positional[Path]
     """Folder to write, in the layout of Replica."""
     frames: int = 120
     """Number of frames, at least 1; after 280 the camera is back at its start."""
@@ -32,13 +34,14 @@ class SynthOptions:
 
 def main(argv: Sequence[str]) -> int:
     """Runs the command; returns the exit code."""
-    options = tyro.cli(SynthOptions, prog="geogs synth", args=list(argv))
+    options = parse_options(SynthOptions, argv, "synth")
 
+    from rich.console import Console
     from rich.progress import Progress
 
     from geogs.synth.export import write_sequence
 
-    with Progress(transient=True) as progress:
+    with Progress(console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task("rendering", total=options.frames)
         write_sequence(
             options.output,

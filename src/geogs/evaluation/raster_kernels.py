@@ -25,10 +25,10 @@ def _box(vertex, cx, cy, fx, fy, width, height):
                 continue
             u, v = fx * x / z + cx, fy * y / z + cy
             u0, u1, v0, v1 = min(u0, u), max(u1, u), min(v0, v), max(v1, v)
-    left = int(math.ceil(min(max(u0, 0.0), width * 1.0)))
-    right = int(math.floor(max(min(u1, width - 1.0), -1.0)))
-    top = int(math.ceil(min(max(v0, 0.0), height * 1.0)))
-    bottom = int(math.floor(max(min(v1, height - 1.0), -1.0)))
+    left = math.ceil(min(max(u0, 0.0), width * 1.0))
+    right = math.floor(max(min(u1, width - 1.0), -1.0))
+    top = math.ceil(min(max(v0, 0.0), height * 1.0))
+    bottom = math.floor(max(min(v1, height - 1.0), -1.0))
     return left, right, top, bottom
 
 

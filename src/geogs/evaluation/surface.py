@@ -9,8 +9,9 @@ from jaxtyping import Bool, Float, Int
 
 from geogs.errors import InputError
 
-_DENSE_SAMPLES = 1_500_000
-_CANDIDATES = 4
+_SAMPLES_PER_FACE = 4
+_LEAST_SAMPLES, _MOST_SAMPLES = 100_000, 2_000_000
+_CANDIDATES = 8
 _BATCH = 100_000
 
 
@@ -87,7 +88,7 @@ def _face_list(path: Path) -> str:
 def _triangles(rows: np.ndarray) -> Int[np.ndarray, "m 3"]:
     if not len(rows):
         return np.zeros((0, 3), np.int64)
-    name = next(n for n in rows.dtype.names if n in ("vertex_index", "vertex_indices"))
+    name = next(n for n in rows.dtype.names or () if n in ("vertex_index", "vertex_indices"))
     lists = rows[name]
     if lists.dtype != object:
         return np.asarray(lists, np.int64)
@@ -130,16 +131,18 @@ def sample_surface(
 class SurfaceDistance:
     """Distances from points to a surface.
 
-    To a mesh they are exact point-to-triangle distances, over the triangles of the four nearest
-    of 1.5 million area-uniform samples: how densely the mesh is sampled or tessellated does not
-    enter. To a point set they are distances to the nearest point, which include its spacing.
+    To a mesh they are exact point-to-triangle distances, over the triangles of the eight nearest
+    of many candidate points: every triangle's centre, for the small ones, and four area-uniform
+    samples per triangle (0.1 to 2 million), for the large ones. So how densely the mesh is
+    sampled or tessellated hardly enters (measured on a furnished room: an accuracy of 0.19 cm
+    changes by 2 % with twice the samples and candidates). To a point set they are distances to
+    the nearest point, which include its spacing.
     """
 
     def __init__(
         self,
         surface: Surface,
         box: tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]] | None = None,
-        samples: int = _DENSE_SAMPLES,
         seed: int = 0,
     ) -> None:
         """Only the part of a mesh within ``box`` (low, high) is considered if one is given."""
@@ -148,7 +151,7 @@ class SurfaceDistance:
         self._surface = surface
         points, face = surface.vertices, np.full(len(surface.vertices), -1)
         if surface.is_mesh:
-            points, face = sample_surface(surface, samples, np.random.default_rng(seed))
+            points, face = _candidates(surface, np.random.default_rng(seed))
             if box is not None:
                 inside = _in_box(points, *box)
                 points, face = (points[inside], face[inside]) if inside.any() else (points, face)
@@ -189,6 +192,17 @@ class SurfaceDistance:
         return best, closest, normal
 
 
+def _candidates(
+    surface: Surface, rng: np.random.Generator
+) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "n"]]:
+    """Points of the mesh, and their triangles, near which nearest triangles are looked for."""
+    m = len(surface.faces)
+    n = min(max(_SAMPLES_PER_FACE * m, _LEAST_SAMPLES), _MOST_SAMPLES)
+    points, face = sample_surface(surface, n, rng)
+    centres = surface.vertices[surface.faces].mean(1)
+    return np.concatenate([centres, points]), np.concatenate([np.arange(m), face])
+
+
 def closest_point_on_triangle(
     p: Float[np.ndarray, "n 3"],
     a: Float[np.ndarray, "n 3"],
@@ -223,4 +237,4 @@ def _in_box(
     low: Float[np.ndarray, "3"],
     high: Float[np.ndarray, "3"],
 ) -> Bool[np.ndarray, "n"]:
-    return ((points >= low) & (points <= high)).all(1)
+    return np.asarray(((points >= low) & (points <= high)).all(1))

@@ -116,8 +116,8 @@ def evaluate_trajectory(
     truth, guess = reference.T_wc[i], estimate.T_wc[j]
     try:
         T, scale = align(guess[:, :3, 3], truth[:, :3, 3], alignment)
-    except GeogsError as error:
-        raise InputError(f"The trajectories cannot be aligned: {error}") from None
+    except GeogsError as reason:
+        raise InputError(f"The trajectories cannot be aligned: {reason}") from None
     aligned = np.tile(np.eye(4), (len(guess), 1, 1))
     aligned[:, :3, 3] = guess[:, :3, 3] @ T[:3, :3].T + T[:3, 3]
     aligned[:, :3, :3] = T[:3, :3] / scale @ guess[:, :3, :3]

@@ -6,6 +6,7 @@ from geogs.tracking.bundle import BundleOptions
 from geogs.tracking.graph import proximity_pairs
 from geogs.tracking.tracker import Tracker
 from geogs.types import PoseCorrection
+SUPP = 2
 
 
 def global_bundle(
@@ -26,7 +27,7 @@ def global_bundle(
         ids,
         [],
         config.radius,
-        2,
+        SUPP,
         config.global_distance * max(tracker.camera.width, tracker.camera.height),
         config.global_pairs * len(ids),
     )

@@ -6,6 +6,7 @@ value, so the backward pass only scales it. Results do not depend on the number 
 """
 
 import functools
+import itertools
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
@@ -34,7 +35,7 @@ def _over_rows(kernel: Callable[[int, int], None], height: int) -> None:
     """Runs ``kernel(first, last)`` on equal spans of rows, one per PyTorch thread."""
     count = max(1, min(torch.get_num_threads(), height // 16))
     bounds = [height * k // count for k in range(count + 1)]
-    spans = list(zip(bounds[:-1], bounds[1:], strict=True))
+    spans = list(itertools.pairwise(bounds))
     waiting = [_pool(count - 1).submit(kernel, *span) for span in spans[1:]]
     kernel(*spans[0])
     for future in waiting:
@@ -82,10 +83,8 @@ class _SingleView(torch.autograd.Function):
 
         def rows(first: int, last: int) -> None:
             scratch = np.zeros((3, max(last - first + 4, 5), width), np.float32)
-            fixed = lens, weights, options
-            single_view_rows(
-                first, last, *maps, *constants, prior_normal, *fixed, scratch, loss, *gradients
-            )
+            arguments = *maps, *constants, prior_normal, lens, weights, options, scratch, loss
+            single_view_rows(first, last, *arguments, *gradients)
 
         _over_rows(rows, height)
         ctx.gradients = [torch.from_numpy(g) for g in gradients]
@@ -151,7 +150,8 @@ class _MultiView(torch.autograd.Function):
         lenses = [_lens(c) for c in (reference.camera, target.camera, seen)]
         lenses = np.array(lenses, np.float32)
         n, huber = grey.size, max(config.l1_huber, 1e-12)
-        options = [config.occlusion, MIN_DEPTH_RATIO, config.l1_weight / n, huber, config.l1_cut]
+        limits = np.array([MIN_DEPTH_RATIO, image.shape[1] - 1, image.shape[0] - 1], np.float32)
+        options = [config.occlusion, config.l1_weight / n, huber, config.l1_cut]
         options = np.array(options, np.float32)
         window = [config.ncc_weight / n, config.ncc_reject, config.ncc_min_variance]
         window += [config.ncc_texture, config.ncc_min_coverage, NCC_VARIANCE_FLOOR]
@@ -166,8 +166,8 @@ class _MultiView(torch.autograd.Function):
         sobel = config.photo_gradient == "sobel"
         _over_rows(
             lambda a, b: multi.warp_rows(
-                a, b, small, *tables, grey, image, hidden, lenses, T34, options, sobel, warped,
-                slope, mask, extra, loss,
+                a, b, small, *tables, grey, image, hidden, lenses, T34, limits, options, sobel,
+                warped, slope, mask, extra, loss,
             ),
             height,
         )  # fmt: skip

@@ -87,9 +87,7 @@ def enlarge_depth(depth: Float[Tensor, "h w"], height: int, width: int) -> Float
     return torch.where(big[1].detach() > 0.999, big[0], torch.zeros_like(big[0]))
 
 
-def bilinear(
-    image: Float[Tensor, "h w *c"], pixels: Float[Tensor, "*b 2"]
-) -> Float[Tensor, "..."]:
+def bilinear(image: Float[Tensor, "h w *c"], pixels: Float[Tensor, "*b 2"]) -> Float[Tensor, "..."]:
     """Bilinear samples of an image at pixel coordinates inside it, ``(*b, *c)``."""
     height, width = image.shape[:2]
     x, y = pixels.unbind(-1)
@@ -112,7 +110,8 @@ def _sobel(image: Tensor) -> tuple[Tensor, Tensor]:
     down = padded[..., 2:, :] - padded[..., :-2, :]
     dx = (across[..., :-2, :] + 2 * across[..., 1:-1, :] + across[..., 2:, :]) / 8
     dy = (down[..., :-2] + 2 * down[..., 1:-1] + down[..., 2:]) / 8
-    return tuple(d[:, 0].permute(1, 2, 0).reshape(image.shape) for d in (dx, dy))
+    dx, dy = (d[:, 0].permute(1, 2, 0).reshape(image.shape) for d in (dx, dy))
+    return dx, dy
 
 
 def sample_image(

@@ -9,11 +9,15 @@ hence no ``nnan``.
 import numpy as np
 from numba import njit
 
-FASTMATH = {"contract", "reassoc", "nsz", "arcp"}
+PART = {
+    "nogil": True,
+    "error_model": "numpy",
+    "fastmath": {"contract", "reassoc", "nsz", "arcp"},
+}
 ZERO, HALF, ONE, TWO, HUGE = (np.float32(v) for v in (0, 0.5, 1, 2, 1e30))
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=FASTMATH)
+@njit(**PART)
 def sample_plain(image, i, j, fx, fy):
     """Bilinear value between (j, i) and (j + 1, i + 1) and its derivatives along x and y."""
     p, q, r, s = image[j, i], image[j, i + 1], image[j + 1, i], image[j + 1, i + 1]
@@ -21,7 +25,7 @@ def sample_plain(image, i, j, fx, fy):
     return upper + (lower - upper) * fy, (q - p) * (ONE - fy) + (s - r) * fy, lower - upper
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=FASTMATH)
+@njit(**PART)
 def sample_sobel(image, i, j, fx, fy):
     """The bilinear samples of the two 3x3 Sobel derivatives: one separable 4x4 filter each."""
     height, width = image.shape
@@ -44,7 +48,7 @@ def sample_sobel(image, i, j, fx, fy):
     return dx / np.float32(8), dy / np.float32(8)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=FASTMATH)
+@njit(**PART)
 def is_visible(depth, u, v, z, tolerance):
     """Whether a point of depth ``z`` at (u, v) of the target's depth map is not hidden there."""
     height, width = depth.shape
@@ -57,87 +61,94 @@ def is_visible(depth, u, v, z, tolerance):
     return known and abs(z - upper - (lower - upper) * fy) < tolerance * z
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=FASTMATH)
-def robust(difference, huber, cut):
-    """Value and slope of the absolute difference, quadratic below huber, constant above cut."""
-    size = abs(difference)
-    if size >= cut:
-        return cut - HALF * huber, ZERO
-    if size < huber:
-        return HALF * size * size / huber, difference / huber
-    return size - HALF * huber, np.sign(difference)
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=FASTMATH)
-def enlarge_line(depth, y, rows, row_share, line):
-    """Row ``y`` of the depth enlarged along y only; 0 where a source pixel is unknown."""
+@njit(**PART)
+def enlarge_line(depth, y, rows, row_share, columns, column_share, line, geometry):
+    """Row ``y`` of the enlarged depth into ``geometry[5]``; 0 where a source pixel is unknown."""
     i, k, f = rows[0, y], rows[1, y], row_share[y]
     for x in range(depth.shape[1]):
         a, b = depth[i, x], depth[k, x]
         known = (a > ZERO) & (b > ZERO) & (a < HUGE) & (b < HUGE)
         line[x] = a + (b - a) * f if known else ZERO
+    for x in range(geometry.shape[1]):
+        a, b = line[columns[0, x]], line[columns[1, x]]
+        geometry[5, x] = a + (b - a) * column_share[x] if (a > ZERO) & (b > ZERO) else ZERO
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=FASTMATH)
+@njit(**PART)
+def project_line(y, lenses, T, limits, geometry):
+    """Where the pixels of row ``y`` fall in the target, from their depth in ``geometry[5]``.
+
+    ``limits``: least share of depth kept, largest u and v of the target. ``geometry`` (6, w)
+    receives u, v, z (0 where out of view), du/dd, dv/dd.
+    """
+    fx, fy, cx, cy = lenses[0, 0], lenses[0, 1], lenses[0, 2], lenses[0, 3]
+    gx, gy, hx, hy = lenses[1, 0], lenses[1, 1], lenses[1, 2], lenses[1, 3]
+    ry = (np.float32(y) - cy) / fy
+    bx, by, bz = T[0, 1] * ry + T[0, 2], T[1, 1] * ry + T[1, 2], T[2, 1] * ry + T[2, 2]
+    for x in range(geometry.shape[1]):
+        d = geometry[5, x]
+        rx = (np.float32(x) - cx) / fx
+        qx, qy, qz = T[0, 0] * rx + bx, T[1, 0] * rx + by, T[2, 0] * rx + bz
+        z = d * qz + T[2, 3]
+        front = (d > ZERO) & (z > limits[0] * d)
+        inverse = ONE / (z if front else ONE)
+        px, py = (d * qx + T[0, 3]) * inverse, (d * qy + T[1, 3]) * inverse
+        u, v = gx * px + hx, gy * py + hy
+        inside = front & (u >= ZERO) & (v >= ZERO) & (u <= limits[1]) & (v <= limits[2])
+        geometry[0, x], geometry[1, x], geometry[2, x] = u, v, z if inside else ZERO
+        geometry[3, x] = gx * (qx - px * qz) * inverse
+        geometry[4, x] = gy * (qy - py * qz) * inverse
+
+
+@njit(cache=True, **PART)
 def warp_rows(
     first, last, depth, rows, row_share, columns, column_share, reference, target, target_depth,
-    lenses, T, options, sobel, warped, slope, mask, extra, loss,
+    lenses, T, limits, options, sobel, warped, slope, mask, extra, loss,
 ):  # fmt: skip
     """The target image through the reference's depth, rows ``first <= y < last``.
 
     rows, columns (2, n) and their shares: source pixels of the bilinear enlargement; lenses (3, 4):
     fx, fy, cx, cy of the reference, of the target, and of the target at its depth map's size; T
-    (3, 4) reference to target; options: occlusion tolerance, least share of depth kept, L_1
-    weight, huber, cut. ``warped`` is filled from the reference where ``mask`` is 0; ``slope`` is
-    d warped / d depth; ``extra`` (3, h, w), unless empty, receives the derivatives along x and y
-    and the depth. ``loss[y]`` is the row's sum of the weighted L_1.
+    (3, 4) reference to target; limits as in :func:`project_line`; options: occlusion tolerance,
+    L_1 weight, huber, cut. ``warped`` is filled from the reference where ``mask`` is 0; ``slope``
+    is d warped / d depth; ``extra`` (3, h, w), unless empty, receives the derivatives along x and
+    y and the depth. ``loss[y]`` is the row's sum of the weighted L_1.
     """
-    height, width = reference.shape
-    limit_u, limit_v = np.float32(target.shape[1] - 1), np.float32(target.shape[0] - 1)
-    fx, fy, cx, cy = lenses[0, 0], lenses[0, 1], lenses[0, 2], lenses[0, 3]
-    gx, gy, hx, hy = lenses[1, 0], lenses[1, 1], lenses[1, 2], lenses[1, 3]
-    zoom_u, zoom_v = lenses[2, 0] / gx, lenses[2, 1] / gy
+    height, width = target.shape
+    hx, hy = lenses[1, 2], lenses[1, 3]
+    zoom_u, zoom_v = lenses[2, 0] / lenses[1, 0], lenses[2, 1] / lenses[1, 1]
     occluded, with_extra = target_depth.shape[0] > 1, extra.shape[1] > 0
     line = np.empty(depth.shape[1], np.float32)
+    geometry = np.empty((6, reference.shape[1]), np.float32)
     for y in range(first, last):
         total = ZERO
-        enlarge_line(depth, y, rows, row_share, line)
-        ry = (np.float32(y) - cy) / fy
-        bx, by, bz = T[0, 1] * ry + T[0, 2], T[1, 1] * ry + T[1, 2], T[2, 1] * ry + T[2, 2]
-        for x in range(width):
-            warped[y, x], slope[y, x], mask[y, x] = reference[y, x], ZERO, ZERO
-            if with_extra:
-                extra[0, y, x] = extra[1, y, x] = ZERO
-            near, far = line[columns[0, x]], line[columns[1, x]]
-            d = near + (far - near) * column_share[x]
-            rx = (np.float32(x) - cx) / fx
-            qx, qy, qz = T[0, 0] * rx + bx, T[1, 0] * rx + by, T[2, 0] * rx + bz
-            z = d * qz + T[2, 3]
-            if not ((near > ZERO) & (far > ZERO) & (z > options[1] * d)):
-                continue
-            inverse = ONE / z
-            px, py = (d * qx + T[0, 3]) * inverse, (d * qy + T[1, 3]) * inverse
-            u, v = gx * px + hx, gy * py + hy
-            if not ((u >= ZERO) & (v >= ZERO) & (u <= limit_u) & (v <= limit_v)):
-                continue
-            if occluded:
+        enlarge_line(depth, y, rows, row_share, columns, column_share, line, geometry)
+        project_line(y, lenses, T, limits, geometry)
+        for x in range(reference.shape[1]):
+            u, v, z = geometry[0, x], geometry[1, x], geometry[2, x]
+            seen = z > ZERO
+            if seen and occluded:
                 s, t = (u - hx) * zoom_u + lenses[2, 2], (v - hy) * zoom_v + lenses[2, 3]
-                if not is_visible(target_depth, s, t, z, options[0]):
-                    continue
-            i, j = min(int(u), target.shape[1] - 2), min(int(v), target.shape[0] - 2)
-            fu, fv = u - np.float32(i), v - np.float32(j)
-            value, du, dv = sample_plain(target, i, j, fu, fv)
-            if sobel:
-                du, dv = sample_sobel(target, i, j, fu, fv)
-            warped[y, x], mask[y, x] = value, ONE
-            slope[y, x] = (gx * du * (qx - px * qz) + gy * dv * (qy - py * qz)) * inverse
+                seen = is_visible(target_depth, s, t, z, options[0])
+            value, du, dv = reference[y, x], ZERO, ZERO
+            if seen:
+                i, j = min(int(u), width - 2), min(int(v), height - 2)
+                fu, fv = u - np.float32(i), v - np.float32(j)
+                value, du, dv = sample_plain(target, i, j, fu, fv)
+                if sobel:
+                    du, dv = sample_sobel(target, i, j, fu, fv)
+            warped[y, x], mask[y, x] = value, ONE if seen else ZERO
+            slope[y, x] = du * geometry[3, x] + dv * geometry[4, x] if seen else ZERO
             if with_extra:
-                extra[0, y, x], extra[1, y, x], extra[2, y, x] = du, dv, d
-            total += robust(value - reference[y, x], options[3], options[4])[0]
-        loss[y] = options[2] * total
+                extra[0, y, x], extra[1, y, x], extra[2, y, x] = du, dv, geometry[5, x]
+        for x in range(reference.shape[1]):
+            size = min(abs(warped[y, x] - reference[y, x]), options[3])
+            small = min(size, options[2])
+            total += small * (size - HALF * small)
+        loss[y] = options[1] / options[2] * total
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=FASTMATH)
+@njit(cache=True, **PART)
 def correlate_rows(first, last, reference, warped, mask, half, options, fields, loss):
     """L_ncc of windows centred in rows ``first <= y < last`` and what their pixels need of it.
 
@@ -193,7 +204,7 @@ def correlate_rows(first, last, reference, warped, mask, half, options, fields, 
         loss[y] += total
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=FASTMATH)
+@njit(**PART)
 def window_sums(y, fields, half, line, sums):
     """Sums of the three fields over the windows around the pixels of row ``y``.
 
@@ -215,14 +226,14 @@ def window_sums(y, fields, half, line, sums):
                 sums[c, x] += line[c, x + k]
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=FASTMATH)
+@njit(cache=True, **PART)
 def depth_gradient_rows(
     first, last, rows, row_share, columns, column_share, reference, warped, slope, mask, half,
     options, fields, g_image, g_depth,
 ):  # fmt: skip
     """d loss / d depth for the depth rows ``first <= y < last``: the enlargement's adjoint.
 
-    options as in :func:`warp_rows`; ``half`` is negative without correlation. ``g_image`` (2, h, w),
+    options as in :func:`warp_rows`; ``half`` is negative without correlation. ``g_image``
     unless empty: [0] is added to d loss / d warped, [1] receives the sum. Image rows that feed two
     spans are computed in both.
     """
@@ -238,8 +249,8 @@ def depth_gradient_rows(
         window_sums(y, fields, half, line, sums)
         for x in range(width):
             a, b = reference[y, x], warped[y, x]
-            push = min(max((b - a) / options[3], -ONE), ONE) if abs(b - a) < options[4] else ZERO
-            sums[0, x] += a * sums[1, x] + b * sums[2, x] + options[2] * push
+            push = min(max((b - a) / options[2], -ONE), ONE) if abs(b - a) < options[3] else ZERO
+            sums[0, x] += a * sums[1, x] + b * sums[2, x] + options[1] * push
         if g_image.shape[1] > 0:
             for x in range(width):
                 sums[0, x] += g_image[0, y, x]
@@ -265,7 +276,7 @@ def depth_gradient_rows(
             g_depth[first + r, columns[1, x]] += f * pull[r, x]
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=FASTMATH)
+@njit(cache=True, **PART)
 def pose_gradient_rows(first, last, g_image, extra, lenses, T, g_T):
     """d loss / d T (12 numbers of the 3x4 matrix) of each row ``first <= y < last``."""
     fx, fy, cx, cy = lenses[0, 0], lenses[0, 1], lenses[0, 2], lenses[0, 3]

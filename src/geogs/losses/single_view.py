@@ -230,4 +230,5 @@ def single_view_loss(
         eta, both = config.smoothness_eta, config.smoothness_rewards_edges
         loss = depth_smoothness(depth, view.image_gradient, eta, both)
         terms.append((config.smoothness_weight, loss))
-    return sum(weight * loss.sum() for weight, (loss, _) in terms) / depth.numel()
+    total = torch.stack([weight * loss.sum() for weight, (loss, _) in terms]).sum()
+    return total / depth.numel()

@@ -9,11 +9,15 @@ compile. NaN must compare as NaN, hence no ``nnan``.
 import numpy as np
 from numba import njit
 
-FASTMATH = {"contract", "reassoc", "nsz", "arcp"}
+PART = {
+    "nogil": True,
+    "error_model": "numpy",
+    "fastmath": {"contract", "reassoc", "nsz", "arcp"},
+}
 ZERO, ONE, HUGE = np.float32(0), np.float32(1), np.float32(1e30)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=FASTMATH)
+@njit(**PART)
 def known_depth(depth, alpha, y, min_alpha, clean, r):
     """Row ``y`` of the depth where it is visible, else 0, into row ``r``."""
     for x in range(depth.shape[1]):
@@ -21,7 +25,7 @@ def known_depth(depth, alpha, y, min_alpha, clean, r):
         clean[r, x] = d if (d > ZERO) & (d < HUGE) & (alpha[y, x] > min_alpha) else ZERO
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=FASTMATH)
+@njit(**PART)
 def pixel_terms(
     clean, r, alpha, spread, prior, confidence, y, weights, relative, pull, g_alpha, g_spread
 ):
@@ -43,7 +47,7 @@ def pixel_terms(
     return total
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=FASTMATH)
+@njit(**PART)
 def normal_terms(clean, r, normal, prior, y, weight, epsilon, g_normal):
     """``weight`` times the sum of L_n over row ``y``; adds to the normal's gradient."""
     total = ZERO
@@ -64,7 +68,7 @@ def normal_terms(clean, r, normal, prior, y, weight, epsilon, g_normal):
     return total
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=FASTMATH)
+@njit(**PART)
 def consistency_terms(clean, r, normal, edge, y, lens, weight, epsilon, push, g, g_y):
     """``weight`` times the sum of L_nc over the centres of row ``y``.
 
@@ -116,7 +120,7 @@ def consistency_terms(clean, r, normal, edge, y, lens, weight, epsilon, push, g,
     return total
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=FASTMATH)
+@njit(**PART)
 def add_consistency(pull, r, push):
     """Adds what each centre of row ``r`` pushed to its four neighbours."""
     for i in range(pull.shape[1] - 2):
@@ -127,7 +131,7 @@ def add_consistency(pull, r, push):
         pull[r, i + 2] += push[1, i + 1]
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=FASTMATH)
+@njit(**PART)
 def smoothness_terms(clean, r, gradient, y, scale, eta, both, weight, pull):
     """``weight`` times the sum of L_ds over row ``y``; ``scale`` is 1 over the median depth."""
     total = ZERO
@@ -146,7 +150,7 @@ def smoothness_terms(clean, r, gradient, y, scale, eta, both, weight, pull):
     return total
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=FASTMATH)
+@njit(cache=True, **PART)
 def single_view_rows(
     first, last, depth, normal, alpha, spread, edge, gradient, prior, confidence, prior_normal,
     lens, weights, options, scratch, loss, g_depth, g_normal, g_alpha, g_spread,

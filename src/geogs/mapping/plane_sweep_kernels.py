@@ -66,10 +66,6 @@ def _window_sums(column, radius, out):
     for i in range(radius):
         column[i] = column[radius]
         column[radius + w + i] = column[radius + w - 1]
-    if radius == 2:
-        for x in range(w):
-            out[x] = (column[x] + column[x + 1]) + (column[x + 2] + column[x + 3]) + column[x + 4]
-        return
     for x in range(w):
         out[x] = column[x] + column[x + 1] + column[x + 2]
     for i in range(3, 2 * radius + 1):

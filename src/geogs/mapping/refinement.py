@@ -10,7 +10,15 @@ from jaxtyping import Float32
 from geogs.config import DepthConfig
 from geogs.geometry.camera import Camera
 from geogs.mapping import refinement_kernels as kernels
+from geogs.mapping.depth_evidence import DepthEvidence
 from geogs.mapping.depth_view import DepthView
+
+_PATCH_REACH = 2
+"""Patches of 5 x 5 samples, one render pixel apart."""
+_FLOOR_DEVIATION = 0.002
+"""Relative deviation that no number of matches gets below (pose, calibration, resampling)."""
+_FULL_SUPPORT = 5.0
+"""Support from which a local plane counts fully."""
 
 
 @dataclass(slots=True)
@@ -22,12 +30,20 @@ class SlantedDepth:
     """Change of inverse depth per pixel to the right."""
     slope_y: Float32[np.ndarray, "h w"]
     """Change of inverse depth per pixel down."""
-    likeness: Float32[np.ndarray, "h w"]
-    """Mean NCC with the neighbours that match."""
-    precision: Float32[np.ndarray, "h w"]
-    """Curvature of the sum of 1 - NCC by inverse depth."""
     support: Float32[np.ndarray, "h w"]
-    """Sum of weights of the last plane fit."""
+    """Sum of weights of the last plane fit: sure pixels of like colour on the same plane."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Patches:
+    """What the photometric steps compare: reference patches, their weights, and the neighbours."""
+
+    samples: Float32[np.ndarray, "s h w"]
+    offsets: Float32[np.ndarray, "s 2"]
+    weights: Float32[np.ndarray, "s h w"]
+    images: Float32[np.ndarray, "n fh fw"]
+    a: np.ndarray
+    b: np.ndarray
 
 
 def refine_depth(
@@ -35,79 +51,118 @@ def refine_depth(
     neighbours: Sequence[DepthView],
     render: Camera,
     working: Camera,
-    inverse_depth: Float32[np.ndarray, "h w"],
-    confidence: Float32[np.ndarray, "h w"],
+    start: DepthEvidence,
+    tracker: DepthEvidence,
     config: DepthConfig,
 ) -> SlantedDepth:
-    """Alternate photometric Gauss-Newton steps per pixel with bilateral plane fits."""
+    """Alternate photometric Gauss-Newton steps per pixel with bilateral plane fits.
+
+    ``start.weight`` (0 to 1) says which pixels make the first planes. After each step a pixel's
+    inverse depth is the precision-weighted mean of the photometric optimum, the tracker's value
+    (``tracker.weight`` = relative precision, robust) and the local plane.
+    """
+    patches = _gather_patches(reference, neighbours, render, working, config)
     guide = _colour_guide(reference, render)
-    patches, offsets = _reference_patches(reference, render, working)
-    centre = patches[len(patches) // 2]
-    weights = 1.0 / (1.0 + np.float32(config.support_contrast) * (patches - centre) ** 2)
-    images = np.stack([v.fine for v in neighbours]) - np.float32(0.5)
-    k, k_inverse = working.matrix().numpy(), np.linalg.inv(render.matrix().numpy())
-    relative = [v.T_cw @ np.linalg.inv(reference.T_cw) for v in neighbours]
-    a = np.stack([k @ m[:3, :3] @ k_inverse for m in relative])
-    b = np.stack([k @ m[:3, 3] for m in relative])
-    state = SlantedDepth(inverse_depth.copy(), *(np.zeros_like(inverse_depth) for _ in range(5)))
-    sure = (confidence + np.float32(0.02)).astype(np.float32)
-    _fit(state, sure, guide, 2, 1, 0.05, 0.0, config)
-    _fit(state, sure, guide, config.fit_radius, 1, 0.03, 0.0, config)
-    state.inverse_depth = inverse_depth.copy()
-    floor = np.float32(config.variance_floor * 0.5)
-    step = np.empty_like(inverse_depth)
-    for i in range(config.refine_steps):
-        kernels.photometric_step(
-            patches, offsets, weights, images, a, b, state.inverse_depth, state.slope_x,
-            state.slope_y, floor, step, state.likeness, state.precision,
-        )
-        limit = np.float32(config.step_limit) * state.inverse_depth
-        data = state.inverse_depth + np.clip(step, -limit, limit)
-        noise = (1.0 - state.likeness + 0.02) / (25.0 * state.precision + 1e-9)
-        variance = noise / data**2
-        sure = 1.0 / (1.0 + variance / np.float32(config.fit_deviation) ** 2)
+    rho = start.inverse_depth
+    state = SlantedDepth(rho, *(np.zeros_like(rho) for _ in range(3)))
+    sure = start.weight + np.float32(0.02)
+    for radius, tolerance in ((2, 0.05), (config.fit_radius, 0.03)):
+        _fit_planes(state, sure, guide, radius, tolerance, 0.0, config)
+    state.inverse_depth = rho.copy()
+    for _ in range(config.refine_steps):
+        photo_precision = _photometric_step(state, patches, config)
+        rho = state.inverse_depth
+        misfit = (tracker.inverse_depth / rho - 1.0) ** 2 * tracker.weight
+        tracker_precision = tracker.weight / (1.0 + misfit / 4.0)
+        precision = photo_precision + tracker_precision
+        data = (photo_precision * rho + tracker_precision * tracker.inverse_depth) / precision
         state.inverse_depth = data
-        _fit(state, sure + np.float32(1e-3), guide, config.fit_radius, 1, config.fit_tolerance, config.fit_stiffness, config)
-        fitted = state.inverse_depth
-        if i + 1 < config.refine_steps or True:
-            own = 1.0 / variance
-            prior = np.float32(1.0 / config.plane_deviation**2)
-            state.inverse_depth = ((own * data + prior * fitted) / (own + prior)).astype(np.float32)
+        sure = 1.0 / (1.0 + 1.0 / (precision * np.float32(config.fit_deviation**2)))
+        sure += np.float32(1e-3)
+        tolerance, stiffness = config.fit_tolerance, config.fit_stiffness
+        _fit_planes(state, sure, guide, config.fit_radius, tolerance, stiffness, config)
+        plane = np.minimum(state.support / np.float32(_FULL_SUPPORT), np.float32(1.0))
+        plane *= np.float32(1.0 / config.plane_deviation**2)
+        state.inverse_depth = (precision * data + plane * state.inverse_depth) / (precision + plane)
     return state
 
 
-def _fit(state, sure, guide, radius, stride, tolerance, stiffness, config):
-    rho, sx, sy = (np.empty_like(state.inverse_depth) for _ in range(3))
+def _photometric_step(
+    state: SlantedDepth, patches: _Patches, config: DepthConfig
+) -> Float32[np.ndarray, "h w"]:
+    """Move ``state`` one bounded step; returns the relative precision of the optimum.
+
+    The deviation of a single optimum is measured to be ``config.photo_deviation`` over the square
+    root of the curvature (by relative inverse depth), whatever the likeness of the patches.
+    """
+    rho = state.inverse_depth
+    step, curvature = np.empty_like(rho), np.empty_like(rho)
+    kernels.photometric_step(
+        patches.samples, patches.offsets, patches.weights, patches.images, patches.a, patches.b,
+        rho, state.slope_x, state.slope_y, np.float32(0.5 * config.variance_floor), step, curvature,
+    )  # fmt: skip
+    limit = np.float32(config.step_limit) * rho
+    state.inverse_depth = rho = rho + np.clip(step, -limit, limit)
+    variance = np.float32(config.photo_deviation**2) / (curvature * rho**2 + np.float32(1e-6))
+    return 1.0 / (variance + np.float32(_FLOOR_DEVIATION**2))
+
+
+def _fit_planes(
+    state: SlantedDepth,
+    sure: Float32[np.ndarray, "h w"],
+    guide: Float32[np.ndarray, "3 h w"],
+    radius: int,
+    tolerance: float,
+    stiffness: float,
+    config: DepthConfig,
+) -> None:
+    """Replace ``state`` by the local planes."""
+    rho, slope_x, slope_y = (np.empty_like(state.inverse_depth) for _ in range(3))
     kernels.fit_planes(
-        state.inverse_depth, state.slope_x, state.slope_y, sure, guide, radius, stride,
-        np.float32(config.guide_contrast), np.float32(tolerance), np.float32(stiffness), rho, sx,
-        sy, state.support,
-    )
-    state.inverse_depth, state.slope_x, state.slope_y = rho, sx, sy
+        state.inverse_depth, state.slope_x, state.slope_y, sure, guide, radius,
+        np.float32(config.guide_contrast), np.float32(tolerance), np.float32(stiffness),
+        rho, slope_x, slope_y, state.support,
+    )  # fmt: skip
+    positive = rho > np.float32(0.2) * state.inverse_depth
+    state.inverse_depth = np.where(positive, rho, state.inverse_depth)
+    state.slope_x, state.slope_y = slope_x, slope_y
 
 
 def _colour_guide(reference: DepthView, render: Camera) -> Float32[np.ndarray, "3 h w"]:
     """The colour image at the render size in [0, 1], channels first."""
     size = (render.width, render.height)
     small = cv2.resize(reference.image, size, interpolation=cv2.INTER_AREA)
-    return np.ascontiguousarray(small.transpose(2, 0, 1).astype(np.float32) / np.float32(255))
+    return np.ascontiguousarray(small.transpose(2, 0, 1)).astype(np.float32) / np.float32(255)
 
 
-def _reference_patches(
-    reference: DepthView, render: Camera, working: Camera
-) -> tuple[Float32[np.ndarray, "s h w"], Float32[np.ndarray, "s 2"]]:
-    """The fine reference image around every render pixel, and the offsets in render pixels."""
-    reach = np.arange(-2, 3, dtype=np.float32)
+def _gather_patches(
+    reference: DepthView,
+    neighbours: Sequence[DepthView],
+    render: Camera,
+    working: Camera,
+    config: DepthConfig,
+) -> _Patches:
+    """The fine reference image around every render pixel; likeness to the centre as weight."""
+    reach = np.arange(-_PATCH_REACH, _PATCH_REACH + 1, dtype=np.float32)
     offsets = np.stack(np.meshgrid(reach, reach), -1).reshape(-1, 2)
-    zoom_x, zoom_y = working.fx / render.fx, working.fy / render.fy
-    columns = np.arange(render.width, dtype=np.float32)
-    rows = np.arange(render.height, dtype=np.float32)
-    patches = np.empty((len(offsets), render.height, render.width), np.float32)
-    for patch, (ox, oy) in zip(patches, offsets, strict=True):
-        x = (columns + ox - render.cx) * zoom_x + working.cx
-        y = (rows + oy - render.cy) * zoom_y + working.cy
+    columns = np.arange(render.width) - render.cx
+    rows = np.arange(render.height) - render.cy
+    samples = np.empty((len(offsets), render.height, render.width), np.float32)
+    for sample, (ox, oy) in zip(samples, offsets, strict=True):
+        x = (columns + ox) * (working.fx / render.fx) + working.cx
+        y = (rows + oy) * (working.fy / render.fy) + working.cy
         x, y = np.meshgrid(x.astype(np.float32), y.astype(np.float32))
-        patch[:] = cv2.remap(
-            reference.fine, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-        )
-    return patches - np.float32(0.5), offsets
+        fine = cv2.remap(reference.fine, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        sample[:] = fine - np.float32(0.5)
+    contrast = (samples - samples[len(samples) // 2]) ** 2
+    weights = 1.0 / (1.0 + np.float32(config.patch_contrast) * contrast)
+    k, k_inverse = working.matrix().numpy(), np.linalg.inv(render.matrix().numpy())
+    relative = [v.T_cw @ np.linalg.inv(reference.T_cw) for v in neighbours]
+    return _Patches(
+        samples=samples,
+        offsets=offsets,
+        weights=weights,
+        images=np.stack([v.fine for v in neighbours]) - np.float32(0.5),
+        a=np.stack([k @ m[:3, :3] @ k_inverse for m in relative]),
+        b=np.stack([k @ m[:3, 3] for m in relative]),
+    )

@@ -61,26 +61,23 @@ def _sample_row(image, a, b, y, ox, oy, rho, slope_x, slope_y, index, fu, fv, va
 
 @njit(**_FAST)
 def photometric_step(
-    patches, offsets, weights, images, a, b, rho, slope_x, slope_y, floor, step, likeness, precision
+    patches, offsets, weights, images, a, b, rho, slope_x, slope_y, floor, step, curvature
 ):
     """One Gauss-Newton step per pixel on the zero-mean normalised patches of all neighbours.
 
     patches (s, h, w): the reference at each patch sample; offsets (s, 2): (x, y) in render pixels;
-    weights (s, h, w): support weights. Writes the step of inverse depth, the mean NCC of the
-    neighbours that match, and the curvature of their sum of (1 - NCC) by inverse depth.
+    weights (s, h, w): support weights. Writes the step of inverse depth and the curvature of the
+    sum of (1 - NCC) by inverse depth; neighbours that do not match (NCC below 0.4, or partly out
+    of view) count for nothing, better ones for more.
     """
     count, h, w = patches.shape
     n = images.shape[0]
     index = np.empty(w, np.uint32)
-    fu, fv, value, slope = (
-        np.empty(w, np.float32),
-        np.empty(w, np.float32),
-        np.empty(w, np.float32),
-        np.empty(w, np.float32),
-    )
+    fu, fv = np.empty(w, np.float32), np.empty(w, np.float32)
+    value, slope = np.empty(w, np.float32), np.empty(w, np.float32)
     inside = np.empty(w, np.float32)
     sums = np.empty((10, w), np.float32)
-    total = np.empty((4, w), np.float32)
+    total = np.empty((2, w), np.float32)
     for y in range(h):
         total[:] = ZERO
         for j in range(n):
@@ -94,10 +91,8 @@ def photometric_step(
                 _accumulate(patches[s, y], weights[s, y], value, slope, sums)
             _add_neighbour(sums, inside, floor, total)
         for x in range(w):
-            weight = total[0, x] + np.float32(1e-6)
-            likeness[y, x] = total[1, x] / weight
-            precision[y, x] = total[3, x]
-            step[y, x] = total[2, x] / (total[3, x] + np.float32(1e-6))
+            curvature[y, x] = total[1, x]
+            step[y, x] = total[0, x] / (total[1, x] + np.float32(1e-6))
 
 
 @njit(**_FAST)
@@ -138,47 +133,41 @@ def _add_neighbour(sums, inside, floor, total):
         curve = max(vg / vb - (bg / vb) * (bg / vb), ZERO)
         good = max(ncc - np.float32(0.4), ZERO)
         weight = inside[x] * good * good
-        total[0, x] += weight
-        total[1, x] += weight * ncc
-        total[2, x] += weight * climb
-        total[3, x] += weight * curve
+        total[0, x] += weight * climb
+        total[1, x] += weight * curve
 
 
 @njit(**_FAST)
 def fit_planes(
-    rho, slope_x, slope_y, confidence, guide, radius, stride, contrast, tolerance, stiffness,
+    rho, slope_x, slope_y, confidence, guide, radius, contrast, tolerance, stiffness,
     new_rho, new_x, new_y, support,
 ):
     """Weighted least-squares plane of inverse depth around each pixel (bilateral, robust).
 
-    Samples every ``stride`` pixels within ``radius`` samples. A sample counts by its confidence, its
-    likeness in colour 1 / (1 + contrast |dI|^2) over the channels of ``guide`` (c, h, w), and how
-    near it lies to the present plane: 1 / (1 + (d rho / (tolerance rho))^2). ``stiffness`` holds
+    A pixel within ``radius`` counts by its confidence, its likeness in colour
+    1 / (1 + contrast |dI|^2) over ``guide`` (3, h, w), and how near it lies to the present plane,
+    1 / (1 + (d rho / (tolerance rho))^2). ``stiffness`` holds
     the slopes at their present values. ``support`` is the sum of weights.
     """
     h, w = rho.shape
-    channels = guide.shape[0]
     sums = np.empty((9, w), np.float32)
     for y in range(h):
         sums[:] = ZERO
         for j in range(-radius, radius + 1):
-            yy = y + j * stride
+            yy = y + j
             if yy < 0 or yy >= h:
                 continue
             for i in range(-radius, radius + 1):
-                dx = i * stride
-                first, last = max(0, -dx), min(w, w - dx)
+                first, last = max(0, -i), min(w, w - i)
                 _add_samples(
-                    rho, slope_x, slope_y, confidence, guide, channels, y, yy, dx, first, last,
-                    contrast, tolerance, sums,
-                )
+                    rho, slope_x, slope_y, confidence, guide, y, yy, i, first, last, contrast,
+                    tolerance, sums,
+                )  # fmt: skip
         for x in range(w):
             s0, sx, sy = sums[0, x] + np.float32(1e-9), sums[1, x], sums[2, x]
-            reach = np.float32(stride * stride)
-            hold = stiffness * reach
-            xx = sums[3, x] - sx * sx / s0 + hold
+            xx = sums[3, x] - sx * sx / s0 + stiffness
             xy = sums[4, x] - sx * sy / s0
-            yy_ = sums[5, x] - sy * sy / s0 + hold
+            yy_ = sums[5, x] - sy * sy / s0 + stiffness
             rx = sums[7, x] - sx * sums[6, x] / s0
             ry = sums[8, x] - sy * sums[6, x] / s0
             det = xx * yy_ - xy * xy + np.float32(1e-12)
@@ -192,8 +181,7 @@ def fit_planes(
 
 @njit(**_FAST)
 def _add_samples(
-    rho, slope_x, slope_y, confidence, guide, channels, y, yy, dx, first, last, contrast,
-    tolerance, sums,
+    rho, slope_x, slope_y, confidence, guide, y, yy, dx, first, last, contrast, tolerance, sums
 ):
     """Moments of the residuals to the present planes of row y at samples (dx, yy - y) away."""
     here, there = rho[y], rho[yy]
@@ -207,9 +195,8 @@ def _add_samples(
         r = there[x + dx] - here[x] - fx * gx[x] - fy * gy[x]
         c0, c1, c2 = g0[x] - k0[x + dx], g1[x] - k1[x + dx], g2[x] - k2[x + dx]
         far = r / (tolerance * here[x])
-        m = sure[x + dx] / (
-            (ONE + contrast * (c0 * c0 + c1 * c1 + c2 * c2)) * (ONE + far * far)
-        )
+        like = ONE + contrast * (c0 * c0 + c1 * c1 + c2 * c2)
+        m = sure[x + dx] / (like * (ONE + far * far))
         t0[x] += m
         t1[x] += m * fx
         t2[x] += m * fy

@@ -63,5 +63,5 @@ def _components(mesh: Mesh) -> tuple[Int[np.ndarray, "m"], Int[np.ndarray, "c"]]
     links = coo_matrix((np.ones(len(a), np.int8), (a, b)), shape=(n, n))
     _, of_vertex = connected_components(links, directed=False)
     of_face = of_vertex[mesh.faces[:, 0]]
-    names, label, count = np.unique(of_face, return_inverse=True, return_counts=True)
+    _, label, count = np.unique(of_face, return_inverse=True, return_counts=True)
     return label.reshape(-1), count

@@ -7,11 +7,13 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Int32
+from jaxtyping import Float32
 from plyfile import PlyData, PlyElement
 
 from geogs.errors import InputError, OutputError
 from geogs.geometry.camera import Camera
+from geogs.io.writers.atomic import atomic_file, prepare_output_folder, write_text
+from geogs.io.writers.ply import write_mesh
 from geogs.synth.raycast import Raycaster, View
 from geogs.synth.room import make_room
 from geogs.synth.tessellation import SeenSurface, scene_mesh
@@ -56,31 +58,28 @@ def write_sequence(
     camera = default_camera(width, height)
     scene = make_room(seed)
     trajectory = handheld_trajectory(scene, frames, seed)
-    folder = Path(folder)
-    results = folder / "results"
-    try:
-        results.mkdir(parents=True, exist_ok=True)
-        _write_camera(folder / "cam_params.json", camera, seed)
-        np.savetxt(folder / "traj.txt", trajectory.reshape(-1, 16), fmt="%.9f")
-        _write_ply(folder / "mesh.ply", *scene_mesh(scene))
-        raycaster = Raycaster(scene, threads)
+    folder = prepare_output_folder(folder)
+    results = prepare_output_folder(folder / "results")
+    _write_camera(folder / "cam_params.json", camera, seed)
+    with atomic_file(folder / "traj.txt") as stream:
+        np.savetxt(stream, trajectory.reshape(-1, 16), fmt="%.9f")
+    write_mesh(folder / "mesh.ply", *scene_mesh(scene))
+    raycaster = Raycaster(scene, threads)
 
-        def render(index: int) -> View:
-            view = raycaster.render(camera, trajectory[index])
-            _write_view(results, index, view, image_format, depth)
-            return view
+    def render(index: int) -> View:
+        view = raycaster.render(camera, trajectory[index])
+        _write_view(results, index, view, image_format, depth)
+        return view
 
-        seen = SeenSurface(scene)
-        with ThreadPoolExecutor(threads) as pool:
-            views = pool.map(render, range(frames))
-            if video:
-                views = _encode(folder / "video.mp4", camera, views)
-            for index, view in enumerate(views):
-                seen.add(view.depth, camera, trajectory[index])
-                on_frame(index)
-        _write_ply(folder / "points_seen_1cm.ply", seen.points)
-    except OSError as error:
-        raise OutputError(f"cannot write the sequence to {folder}: {error}") from error
+    seen = SeenSurface(scene, camera)
+    with ThreadPoolExecutor(threads) as pool:
+        views = pool.map(render, range(frames))
+        if video:
+            views = _encode(folder / "video.mp4", camera, views)
+        for index, view in enumerate(views):
+            seen.add(view.depth, trajectory[index])
+            on_frame(index)
+    _write_points(folder / "points_seen_1cm.ply", seen.points)
 
 
 def _write_view(results: Path, index: int, view: View, image_format: str, depth: bool) -> None:
@@ -95,8 +94,11 @@ def _write_view(results: Path, index: int, view: View, image_format: str, depth:
 
 
 def _write_image(path: Path, image: np.ndarray, options: list[int]) -> None:
-    encoded = cv2.imencode(path.suffix, image, options)[1]
-    path.write_bytes(encoded.tobytes())
+    try:
+        path.write_bytes(cv2.imencode(path.suffix, image, options)[1].tobytes())
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise OutputError(f"{path} cannot be written ({reason}); free some space.") from error
 
 
 def _write_camera(path: Path, camera: Camera, seed: int) -> None:
@@ -113,22 +115,13 @@ def _write_camera(path: Path, camera: Camera, seed: int) -> None:
         "convention": "OpenCV axes, pixel centres at integer coordinates, depth = z",
         "scene": f"procedural room, seed {seed}",
     }
-    path.write_text(json.dumps(parameters, indent=1) + "\n")
+    write_text(path, json.dumps(parameters, indent=1) + "\n")
 
 
-def _write_ply(
-    path: Path,
-    vertices: Float[np.ndarray, "v 3"],
-    triangles: Int32[np.ndarray, "f 3"] | None = None,
-) -> None:
-    axes = [("x", "f4"), ("y", "f4"), ("z", "f4")]
-    rows = np.ascontiguousarray(vertices, np.float32).view(axes)[:, 0]
-    elements = [PlyElement.describe(rows, "vertex")]
-    if triangles is not None:
-        faces = np.empty(len(triangles), [("vertex_indices", "i4", (3,))])
-        faces["vertex_indices"] = triangles
-        elements.append(PlyElement.describe(faces, "face"))
-    PlyData(elements).write(str(path))
+def _write_points(path: Path, points: Float32[np.ndarray, "n 3"]) -> None:
+    rows = np.ascontiguousarray(points).view([("x", "f4"), ("y", "f4"), ("z", "f4")])[:, 0]
+    with atomic_file(path) as stream:
+        PlyData([PlyElement.describe(rows, "vertex")]).write(stream)
 
 
 def _encode(path: Path, camera: Camera, views: Iterator[View]) -> Iterator[View]:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from geogs.synth import artwork, texture
-from geogs.synth.scene import SceneBuilder, yaw_rotation
+from geogs.synth.scene import Pair, SceneBuilder, yaw_rotation
 
 
 @dataclass(frozen=True)
@@ -190,7 +190,7 @@ def desk(build: SceneBuilder, rng: np.random.Generator, materials: Materials, wi
     top.box((0, 0.02, 0.31), (0.56, 0.03, 0.35), materials.metal, front=picture)
     _row_of_books(build.at(x - 0.15, 0.3, height), rng, materials, 0.3, 0.28)
     _trinket(build.at(-side * (width / 2 - 0.16), 0.36, height), rng, materials)
-    chair(build.at(-side * 0.1, 0.5, yaw=rng.uniform(-0.5, 0.5)), rng, materials)
+    chair(build.at(-side * 0.1, 0.34, yaw=rng.uniform(-0.5, 0.5)), rng, materials)
 
 
 def chair(build: SceneBuilder, rng: np.random.Generator, materials: Materials) -> None:
@@ -259,7 +259,7 @@ def _roll_about_y(angle: float) -> np.ndarray:
 
 def round_table(build: SceneBuilder, rng: np.random.Generator, materials: Materials) -> None:
     """A low round table on one foot, with objects."""
-    radius, height = rng.uniform(0.38, 0.48), rng.uniform(0.42, 0.5)
+    radius, height = rng.uniform(0.38, 0.48), rng.uniform(0.4, 0.45)
     build.frustum((0, 0, 0), (0.24, 0.2), 0.03, materials.oak)
     build.frustum((0, 0, 0.03), (0.06, 0.04), height - 0.06, materials.oak)
     build.frustum((0, 0, height - 0.03), (radius, radius), 0.03, materials.walnut)
@@ -282,7 +282,7 @@ def pouf(build: SceneBuilder, rng: np.random.Generator, materials: Materials) ->
 
 
 def picture(
-    build: SceneBuilder, centre: tuple[float, float], size: tuple[float, float],
+    build: SceneBuilder, centre: Pair, size: Pair,
     canvas: int, frame: int,
 ) -> None:  # fmt: skip
     """A framed picture on the wall, its centre at (x, z); it stands off the wall by 1.5 cm."""

@@ -51,7 +51,7 @@ def visibility_slices(
                 px, py, pz = (x + 0.5) * voxel, (y + 0.5) * voxel, (z + 0.5) * voxel
                 free = 0
                 for s in range(samples):
-                    dx, dy, dz = sphere[s]
+                    dx, dy, dz = sphere[s, 0], sphere[s, 1], sphere[s, 2]
                     free += not _blocked(
                         kind, half, rotation, centre, radius, px, py, pz, dx, dy, dz, ambient_reach
                     )

@@ -79,7 +79,7 @@ class Raycaster:
 
     def _in_bands(self, rows: int, work: Callable[[int, int], None]) -> None:
         """Runs ``work(first, last)`` over bands of rows, several per thread to even the load."""
-        edges = np.linspace(0, rows, 4 * self._threads + 1).astype(int)
+        edges = np.linspace(0, rows, 4 * self._threads + 1).astype(int).tolist()
         list(self._pool.map(work, edges[:-1], edges[1:]))
 
     def _solids_from(self, T_wc: Float64[np.ndarray, "4 4"]) -> Solids:
@@ -143,7 +143,7 @@ def _pixel_bounds(
     limit = np.array([camera.width, camera.height, camera.width, camera.height])
     box = np.stack([u.min(1), v.min(1), u.max(1) + 1, v.max(1) + 1], 1)
     box = np.clip(np.concatenate([np.ceil(box[:, :2]), np.floor(box[:, 2:])], 1), 0, limit)
-    # A solid that crosses the camera's plane may be anywhere, unless a side of the view excludes it.
+    # A solid that crosses the camera's plane may be anywhere that no side of the view excludes.
     box[near.any(1)] = [0, 0, camera.width, camera.height]
     left, right = -(camera.cx + 1) / camera.fx, (camera.width - camera.cx) / camera.fx
     top, bottom = -(camera.cy + 1) / camera.fy, (camera.height - camera.cy) / camera.fy

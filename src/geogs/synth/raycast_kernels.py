@@ -242,7 +242,8 @@ def _texture_colour(solids, textures, i, face, point, footprint, out):
     level = min(max(math.log2(footprint / texel), 0.0), len(start) - 1.0)
     low = int(level)
     part = level - low
-    out[:] = 0.0
+    for k in range(3):
+        out[k] = 0.0
     _add_bilinear(textures.texels, start[low], width[low], height[low], u, v, wrap, 1 - part, out)
     if part > 0.0:
         k = low + 1
@@ -264,7 +265,8 @@ def _light(lighting, point, normal, out):
     x, y, z = int(gx), int(gy), int(gz)
     fx, fy, fz = gx - x, gy - y, gz - z
     sky = 0.5 + 0.5 * normal[2]
-    out[:] = 0.0
+    for k in range(3):
+        out[k] = 0.0
     for channel in range(channels):
         near = (1 - fy) * (
             (1 - fx) * volume[z, y, x, channel] + fx * volume[z, y, x + 1, channel]
@@ -327,7 +329,8 @@ def _around(solid, face, row, column, found):
 def _gain(solids, lighting, i, world, normal, out):
     """What the texture of solid i is multiplied with."""
     if solids.emission[i] > 0.0:
-        out[:] = solids.emission[i]
+        for k in range(3):
+            out[k] = solids.emission[i]
     else:
         _light(lighting, world, normal, out)
 
@@ -377,7 +380,8 @@ def shade_rows(
                 _surface(solids, camera, js, fs, ts, x + dx, y + dy, local, world, normal)
                 _texture_colour(solids, textures, js, fs, local, 0.5 * footprint, colour)
                 if js == i and fs == f:
-                    edge_gain[:] = gain
+                    for k in range(3):
+                        edge_gain[k] = gain[k]
                 else:
                     _gain(solids, lighting, js, world, normal, edge_gain)
                 for k in range(3):

@@ -161,7 +161,7 @@ def _furnish_middle(
     rug = build.texture(texture.rug(rng, (512, 720)))
     middle.box((0, 0, 0.006), (2.3, 1.65, 0.012), rug)
     table = rng.uniform(-0.2, 0.2, 2)
-    furniture.round_table(middle.at(*table, 0.012), rng, materials)
+    furniture.round_table(middle.at(table[0], table[1], 0.012), rng, materials)
     for _ in range(3):
         r, angle = rng.uniform(0.06, 0.14), rng.uniform(0, 2 * math.pi)
         x, y = table + rng.uniform(0.62, 0.8) * np.array([math.cos(angle), math.sin(angle)])

@@ -19,6 +19,10 @@ from jaxtyping import Float64, Int64, UInt8
 
 BOX, FRUSTUM, ELLIPSOID = 0, 1, 2
 
+Number = float | int
+Triple = Sequence[Number] | Float64[np.ndarray, "3"]
+Pair = tuple[Number, Number]
+
 
 @dataclass(frozen=True)
 class Texture:
@@ -82,7 +86,7 @@ class Scene:
         return nearest
 
 
-def yaw_rotation(yaw: float) -> Float64[np.ndarray, "3 3"]:
+def yaw_rotation(yaw: Number) -> Float64[np.ndarray, "3 3"]:
     """Rotation by ``yaw`` radians about z."""
     c, s = np.cos(yaw), np.sin(yaw)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
@@ -115,7 +119,7 @@ class SceneBuilder:
         self._rotation = np.eye(3)
         self._origin = np.zeros(3)
 
-    def at(self, x: float, y: float, z: float = 0.0, yaw: float = 0.0) -> "SceneBuilder":
+    def at(self, x: Number, y: Number, z: Number = 0.0, yaw: Number = 0.0) -> "SceneBuilder":
         """A builder for a frame placed in this one; what it adds lands in the same scene."""
         child = SceneBuilder(self._rng)
         child._parts = self._parts
@@ -128,22 +132,20 @@ class SceneBuilder:
         self._parts.textures.append(Texture(image, metres_per_texel))
         return len(self._parts.textures) - 1
 
-    def light(
-        self, position: Sequence[float], colour: tuple[float, float, float], radius: float
-    ) -> None:
+    def light(self, position: Triple, colour: tuple[float, float, float], radius: float) -> None:
         """Adds a light at a position of this frame."""
         x, y, z = self._origin + self._rotation @ np.asarray(position, float)
         self._parts.lights.append(Light((float(x), float(y), float(z)), colour, radius))
 
     def box(
         self,
-        centre: Sequence[float],
-        size: Sequence[float],
+        centre: Triple,
+        size: Triple,
         texture: int,
         *,
         rotation: np.ndarray | None = None,
         front: int | None = None,
-        emission: float = 0.0,
+        emission: Number = 0.0,
     ) -> None:
         """A box of full extents ``size``; ``front`` is the texture of its +y face if another."""
         faces = [texture] * 6
@@ -151,21 +153,19 @@ class SceneBuilder:
             faces[3] = front
         self._add(BOX, centre, np.asarray(size, float) / 2, faces, rotation, emission)
 
-    def rectangle(
-        self, centre: Sequence[float], size: tuple[float, float], texture: int, rotation: np.ndarray
-    ) -> None:
+    def rectangle(self, centre: Triple, size: Pair, texture: int, rotation: np.ndarray) -> None:
         """A rectangle whose local x, y span it and whose local z faces the viewer."""
         half = np.array([size[0] / 2, size[1] / 2, 0.0])
         self._add(BOX, centre, half, [texture] * 6, rotation, 0.0)
 
     def frustum(
         self,
-        base: Sequence[float],
-        radii: tuple[float, float],
-        height: float,
+        base: Triple,
+        radii: Pair,
+        height: Number,
         texture: int,
         *,
-        emission: float = 0.0,
+        emission: Number = 0.0,
     ) -> None:
         """An upright cone frustum on ``base``, the centre of its lower disc; radii below, above."""
         half = np.array([radii[0], radii[1], height / 2])
@@ -174,17 +174,17 @@ class SceneBuilder:
 
     def ellipsoid(
         self,
-        centre: Sequence[float],
-        radii: Sequence[float],
+        centre: Triple,
+        radii: Triple,
         texture: int,
         *,
         rotation: np.ndarray | None = None,
-        emission: float = 0.0,
+        emission: Number = 0.0,
     ) -> None:
         """An ellipsoid with the given radii along its local axes."""
         self._add(ELLIPSOID, centre, np.asarray(radii, float), [texture] * 6, rotation, emission)
 
-    def build(self, size: Sequence[float]) -> Scene:
+    def build(self, size: Triple) -> Scene:
         """The scene so far, in a room filling [0, size]."""
         p = self._parts
         return Scene(
@@ -203,11 +203,11 @@ class SceneBuilder:
     def _add(
         self,
         kind: int,
-        centre: Sequence[float] | np.ndarray,
+        centre: Triple,
         half: np.ndarray,
         faces: list[int],
         rotation: np.ndarray | None,
-        emission: float,
+        emission: Number,
     ) -> None:
         p = self._parts
         p.kind.append(kind)

@@ -83,26 +83,21 @@ def _ellipsoid(half: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 class SeenSurface:
-    """The surface points that depth maps have shown, one to a voxel."""
+    """The surface points that depth maps of one camera have shown, one to a voxel."""
 
-    def __init__(self, scene: Scene, voxel: float = 0.01) -> None:
+    def __init__(self, scene: Scene, camera: Camera, voxel: float = 0.01) -> None:
+        self._rays = camera.rays(torch.float64).numpy()
         self._voxel = voxel
-        # One cell of margin, since walls lie exactly on the border.
+        # A cell of margin, since walls lie exactly on the border.
         self._shape = np.ceil(scene.size / voxel).astype(np.int64) + 2
         self._filled = np.zeros(int(self._shape.prod()), bool)
         self._points: list[Float32[np.ndarray, "k 3"]] = []
 
-    def add(
-        self,
-        depth: Float32[np.ndarray, "h w"],
-        camera: Camera,
-        T_wc: Float64[np.ndarray, "4 4"],
-    ) -> None:
-        """Adds the back-projected pixels of a depth map that fall into empty voxels."""
-        rays = camera.rays(torch.float64).numpy()
+    def add(self, depth: Float32[np.ndarray, "h w"], T_wc: Float64[np.ndarray, "4 4"]) -> None:
+        """Adds the back-projected pixels that fall into voxels empty so far."""
         seen = depth > 0
-        points = (depth[seen, None] * rays[seen]) @ T_wc[:3, :3].T + T_wc[:3, 3]
-        x, y, z = (np.floor(points / self._voxel).astype(np.int64) + 1).T
+        points = (depth[..., None] * self._rays)[seen] @ T_wc[:3, :3].T + T_wc[:3, 3]
+        x, y, z = ((points / self._voxel).astype(np.int32) + 1).T
         key = (z * self._shape[1] + y) * self._shape[0] + x
         fresh = np.flatnonzero(~self._filled[key])
         key, first = np.unique(key[fresh], return_index=True)

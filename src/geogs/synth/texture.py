@@ -10,9 +10,9 @@ from itertools import pairwise
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float, Float32, UInt8
 
-Colour = tuple[float, float, float]
+Colour = tuple[float | int, float | int, float | int]
 """RGB in 0..255."""
 
 
@@ -27,7 +27,7 @@ def random_colour(
 def fractal_noise(
     rng: np.random.Generator,
     shape: tuple[int, int],
-    cells: tuple[float, float],
+    cells: tuple[float | int, float | int],
     octaves: int = 6,
     gain: float = 0.6,
 ) -> Float32[np.ndarray, "h w"]:
@@ -69,7 +69,7 @@ def _tint(
     return np.asarray(colour, np.float32) * (1 + contrast * value[..., None])
 
 
-def _finish(image: Float32[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
+def _finish(image: Float[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
     return np.clip(image, 4, 250).astype(np.uint8)
 
 
@@ -110,8 +110,9 @@ def brick(
     width = 3.1 * height
     shifted = x / width + 0.5 * (row % 2)
     column = np.floor(shifted).astype(int)
-    tone = rng.normal(1.0, 0.16, (rows + 3, int(shape[1] / width) + 4, 1))
-    hue = rng.normal(0.0, 9.0, (*tone.shape[:2], 3))
+    table = (rows + 3, int(shape[1] / width) + 4)
+    tone = rng.normal(1.0, 0.16, (*table, 1)).astype(np.float32)
+    hue = rng.normal(0.0, 9.0, (*table, 3)).astype(np.float32)
     fx, fy = (shifted - column) * width, y - row * height
     edge = np.minimum(np.minimum(fx, width - fx), np.minimum(fy, height - fy))
     mask = np.clip((edge - 0.07 * height) / (0.05 * height), 0, 1)[..., None]
@@ -173,7 +174,7 @@ def planks(
     rng: np.random.Generator, shape: tuple[int, int], rows: int, colour: Colour
 ) -> UInt8[np.ndarray, "h w 3"]:
     """A board floor: boards along x, each with its own tone, grain and length."""
-    edges = np.linspace(0, shape[0], rows + 1).astype(int)
+    edges = np.linspace(0, shape[0], rows + 1).astype(int).tolist()
     image = np.empty((*shape, 3), np.float32)
     for top, bottom in pairwise(edges):
         strip = (bottom - top, shape[1])
@@ -195,7 +196,7 @@ def tiles(
     size = shape[0] / rows
     y, x = np.mgrid[: shape[0], : shape[1]].astype(np.float32)
     row, column = (y / size).astype(int), (x / size).astype(int)
-    tone = rng.normal(1.0, 0.1, (rows + 1, int(shape[1] / size) + 2, 1))
+    tone = rng.normal(1.0, 0.1, (rows + 1, int(shape[1] / size) + 2, 1)).astype(np.float32)
     ground = np.asarray(colours, np.float32)[(row + column) % 2] * tone[row, column]
     veins = np.abs(fractal_noise(rng, shape, (rows, rows), 6, 0.6))
     dark = np.clip(1 - 6 * veins, 0, 1)
@@ -204,7 +205,7 @@ def tiles(
     fx, fy = x - column * size, y - row * size
     edge = np.minimum(np.minimum(fx, size - fx), np.minimum(fy, size - fy))
     joint = np.clip(1.5 - edge / (0.012 * size), 0, 1)[..., None]
-    return _finish(image * (1 - joint) + joint * np.array([168, 162, 150]))
+    return _finish(image * (1 - joint) + joint * np.array([168, 162, 150], np.float32))
 
 
 def fabric(

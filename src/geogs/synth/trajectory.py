@@ -2,7 +2,7 @@
 
 import numpy as np
 from jaxtyping import Float64
-from scipy.interpolate import CubicSpline
+from scipy.interpolate import BSpline, CubicSpline
 from scipy.spatial.transform import Rotation
 
 from geogs.errors import InputError
@@ -14,8 +14,8 @@ FRAMES_PER_LAP = 280
 _KNOTS_PER_LAP = 9
 _MIN_CLEARANCE = 0.6
 _SHAKE_PERIOD = 7
-_SHAKE_METRES = 0.003
-_SHAKE_RADIANS = np.radians(0.2)
+_SHAKE_METRES = 0.004
+_SHAKE_RADIANS = np.radians(0.3)
 
 
 def handheld_trajectory(
@@ -35,7 +35,7 @@ def handheld_trajectory(
     for shrink in np.geomspace(1.0, 0.25, 16):
         position, target = _splines(scene, np.random.default_rng([seed, 0x7A1]), shrink)
         # The path of the whole lap decides, so that longer sequences begin with shorter ones.
-        if scene.clearance(position(whole)).min() > _MIN_CLEARANCE + 4 * _SHAKE_METRES:
+        if scene.clearance(position(whole)).min() > _MIN_CLEARANCE + 5 * _SHAKE_METRES:
             break
     else:
         raise InputError(f"no camera path keeps {_MIN_CLEARANCE} m from the furniture of this room")
@@ -52,7 +52,7 @@ def _splines(
     turn = rng.choice((-1.0, 1.0)) * 2 * np.pi
     angle = rng.uniform(0, 2 * np.pi) + turn * np.arange(_KNOTS_PER_LAP) / _KNOTS_PER_LAP
     radius = rng.uniform(0.8, 1.1, _KNOTS_PER_LAP)
-    height = rng.uniform(1.3, 1.6, _KNOTS_PER_LAP)
+    height = rng.uniform(1.42, 1.62, _KNOTS_PER_LAP)
     outward = np.stack([np.cos(angle), np.sin(angle)], 1)
     position = np.column_stack([middle + radius[:, None] * outward * reach, height])
     across = middle - outward * rng.uniform(0.5, 0.9, (_KNOTS_PER_LAP, 1))
@@ -82,12 +82,11 @@ def _look_at(
 def _shake(
     T_wc: Float64[np.ndarray, "n 4 4"], rng: np.random.Generator
 ) -> Float64[np.ndarray, "n 4 4"]:
-    """Adds a smooth tremor: a spline through random offsets a few frames apart."""
-    frames = np.arange(len(T_wc))
-    knots = len(T_wc) // _SHAKE_PERIOD + 3
-    offsets = np.clip(rng.standard_normal((knots, 6)), -2.5, 2.5)
-    # A natural start would let later knots reach back; clamped ends keep prefixes almost alike.
-    tremor = CubicSpline(np.arange(knots) * _SHAKE_PERIOD, offsets)(frames)
+    """Adds a smooth tremor: a cubic B-spline whose random coefficients act only locally."""
+    count = len(T_wc) // _SHAKE_PERIOD + 4
+    coefficients = np.clip(rng.standard_normal((count, 6)), -2.5, 2.5)
+    knots = _SHAKE_PERIOD * np.arange(-3, count + 1)
+    tremor = BSpline(knots, coefficients, 3)(np.arange(len(T_wc)))
     shaken = T_wc.copy()
     shaken[:, :3, 3] += _SHAKE_METRES * tremor[:, :3]
     turn = Rotation.from_rotvec(_SHAKE_RADIANS * tremor[:, 3:]).as_matrix()

@@ -19,7 +19,7 @@ from geogs.tracking.flow.base import FlowMatch
 from geogs.tracking.graph import FrameGraph
 from geogs.tracking.grid import SampleGrid
 from geogs.tracking.keyframes import KeyframeStore
-from geogs.tracking.motion import pnp, transfer_depth
+from geogs.tracking.motion import filled_positions, pnp, transfer_depth
 
 
 
@@ -67,15 +67,9 @@ def chained_flows(graph: FrameGraph) -> list[FlowMatch]:
             [encoded[0]], [encoded[k]], there[None], back[None], fine=True
         )
         flows.append(match)
-        there = _filled(grid, match)
-        back = _filled(grid, reverse)
+        there = filled_positions(grid, match)
+        back = filled_positions(grid, reverse)
     return flows
-
-
-def _filled(grid: SampleGrid, match: FlowMatch) -> Float[Tensor, "p 2"]:
-    """Positions with the unmatched cells filled in from their surroundings."""
-    flow, weight = match.pixels[0] - grid.pixels, match.weight[0, :, 0]
-    return grid.pixels + torch.stack([grid.fill(flow[:, k], weight) for k in (0, 1)], -1)
 
 
 def _best_two_view(

@@ -105,6 +105,52 @@ class FrameLocator:
         return FrameMotion(keyframe.id, T[0], match, flow, agree, median)
 
 
+@dataclass(frozen=True)
+class ChainedMatch:
+    """The motion of a frame since the last keyframe while no depth is known."""
+
+    there: FlowMatch
+    """One edge, keyframe -> frame."""
+    flow: float
+    """Median motion of the matched cells in pixels."""
+    matched: float
+    """Fraction of the cells that are matched."""
+
+
+class FlowChain:
+    """Follows the flow from a keyframe through the frames after it, each starting from the last."""
+
+    def __init__(self, grid: SampleGrid, operator: FlowOperator) -> None:
+        self.grid = grid
+        self.operator = operator
+        self._there: Tensor | None = None
+        self._back: Tensor | None = None
+
+    def reset(self) -> None:
+        """Begin again at a new keyframe."""
+        self._there = self._back = None
+
+    def follow(self, keyframe: Any, encoded: Any) -> ChainedMatch:
+        """Match the keyframe with the next frame."""
+        there, back = self.operator.measure(
+            [keyframe], [encoded], self._there, self._back, fine=False
+        )
+        used = there.weight[0, :, 0] > 0
+        matched = float(used.float().mean())
+        flow = (there.pixels[0] - self.grid.pixels).norm(dim=-1)
+        median = float(flow[used].median()) if matched else 0.0
+        if matched > 0:
+            self._there = filled_positions(self.grid, there)[None]
+            self._back = filled_positions(self.grid, back)[None]
+        return ChainedMatch(there, median, matched)
+
+
+def filled_positions(grid: SampleGrid, match: FlowMatch) -> Float[Tensor, "p 2"]:
+    """Positions of a single edge, unmatched cells filled in from the flow around them."""
+    flow, weight = match.pixels[0] - grid.pixels, match.weight[0, :, 0]
+    return grid.pixels + torch.stack([grid.fill(flow[:, k], weight) for k in (0, 1)], -1)
+
+
 def both_reprojections(
     grid: SampleGrid, keyframe: KeyframeState, T_cw: Float[Tensor, "4 4"]
 ) -> tuple[Float[Tensor, "p 2"], Float[Tensor, "p 2"]]:

@@ -1,7 +1,7 @@
 """The front end: frames in, keyframes with poses and inverse depth out."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Any
 
@@ -22,11 +22,13 @@ from geogs.tracking.graph import FrameGraph, frame_distances, proximity_pairs
 from geogs.tracking.grid import SampleGrid
 from geogs.tracking.initialise import initialise
 from geogs.tracking.keyframes import KeyframeStore
-from geogs.tracking.motion import FrameLocator, FrameMotion, transfer_depth
+from geogs.tracking.motion import FlowChain, FrameLocator, FrameMotion, transfer_depth
 from geogs.tracking.trajectory import TrajectoryRecorder
 from geogs.types import Frame, Keyframe, PoseCorrection, Trajectory
 
 MIN_KEYFRAMES = 4
+MAX_MISSES = 5
+"""Frames without a match after which a start that has not succeeded begins anew."""
 
 
 class TrackState(Enum):
@@ -80,7 +82,8 @@ class Tracker:
         self._finalized: list[int] = []
         self._last: Tensor | None = None
         self._velocity: Tensor | None = None
-        self._moved = False
+        self._chain = FlowChain(self.grid, self.operator)
+        self._misses = 0
 
     # --- reading ---------------------------------------------------------------------------
 
@@ -177,20 +180,23 @@ class Tracker:
     # --- before the map is started ---------------------------------------------------------
 
     def _start(self, frame: Frame, encoded: Any) -> TrackResult:
-        eye = torch.eye(4, dtype=torch.float64, device=self.grid.device)
         if len(self.store):
             last = list(self.store)[-1]
-            there, _ = self.operator.measure([last.encoded], [encoded], fine=False)
-            used = there.weight[0, :, 0] > 0
-            flow = (there.pixels[0] - self.grid.pixels).norm(dim=-1)
-            matched = float(used.float().mean())
-            moved = float(flow[used].median()) if matched else 0.0
-            if matched < self.config.min_matched:
-                return self._restart(frame)
-            if moved < self.config.keyframe_flow * self._long_edge:
-                self.recorder.add(frame.index, frame.timestamp, encoded, last.id, eye, there)
+            match = self._chain.follow(last.encoded, encoded)
+            if match.matched < self.config.min_matched:
+                return self._restart(frame, encoded)
+            self._misses = 0
+            if match.flow < self.config.keyframe_flow * self._long_edge:
+                eye = torch.eye(4, dtype=torch.float64, device=self.grid.device)
+                self.recorder.add(frame.index, frame.timestamp, encoded, last.id, eye, match.there)
                 return TrackResult(self.state)
+        return self._gather(frame, encoded)
+
+    def _gather(self, frame: Frame, encoded: Any) -> TrackResult:
+        """Add a keyframe to those the map will be started from, and start it with enough."""
+        eye = torch.eye(4, dtype=torch.float64, device=self.grid.device)
         state = self.store.add(frame.index, frame.timestamp, frame.image, encoded, eye)
+        self._chain.reset()
         self.recorder.add_keyframe(state.id)
         if len(self.store) < max(self.config.init_keyframes, MIN_KEYFRAMES):
             return TrackResult(self.state)
@@ -198,6 +204,19 @@ class Tracker:
             return TrackResult(self.state, removed=self._forget(len(self.store) // 2))
         fresh = self._finalise(self.store.ids[:-1])
         return TrackResult(self.state, state.id, fresh, self.active)
+
+    def _restart(self, frame: Frame, encoded: Any) -> TrackResult:
+        """The view changed at once: wait for it to come back, start with what there is, or anew."""
+        self._misses += 1
+        if self._misses < MAX_MISSES:
+            self.recorder.add_untracked(frame.index, frame.timestamp)
+            return TrackResult(self.state)
+        self._misses = 0
+        if len(self.store) >= MIN_KEYFRAMES and self._initialise():
+            self.recorder.add_untracked(frame.index, frame.timestamp)
+            return TrackResult(self.state, None, self._finalise(self.store.ids[:-1]), self.active)
+        removed = self._forget(len(self.store))
+        return replace(self._gather(frame, encoded), removed=removed)
 
     def _initialise(self) -> bool:
         ok = initialise(self.graph, self.config.min_parallax * self._long_edge, self.config.radius)
@@ -214,11 +233,6 @@ class Tracker:
             self.graph.remove_keyframe(id)
             self.store.remove(id)
         return gone
-
-    def _restart(self, frame: Frame) -> TrackResult:
-        """The view changed at once before the map was started: try what there is, or begin anew."""
-        self.recorder.add_untracked(frame.index, frame.timestamp)
-        return TrackResult(self.state)
 
     # --- with a map ------------------------------------------------------------------------
 

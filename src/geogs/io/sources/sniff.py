@@ -9,7 +9,6 @@ from geogs.io.sources.images import SUFFIXES, open_image_folder
 from geogs.io.sources.replica import is_replica, open_replica
 from geogs.io.sources.seven_scenes import is_seven_scenes, open_seven_scenes
 from geogs.io.sources.tum import is_tum, open_tum
-from geogs.io.sources.video import VideoFile
 
 
 def open_source(path: str | Path, config: InputConfig | None = None) -> Source:
@@ -39,6 +38,8 @@ def _reader(path: Path) -> Reader:
             raise InputError(f"{path} is empty; is the copy or download complete?")
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror}.") from error
+    from geogs.io.sources.video import VideoFile  # loads FFmpeg
+
     return VideoFile(path)
 
 

@@ -5,102 +5,122 @@ import math
 import numba
 import numpy as np
 
-from geogs.splat.cpu.layout import PER_DISK, ROWS_PER_RUN, TILE_HEIGHT, TILE_WIDTH, WC
+from geogs.splat.cpu.layout import (
+    BLUR,
+    CENTER_X,
+    CENTER_Y,
+    HALF_X,
+    MIDDLE_X,
+    MIDDLE_Y,
+    PER_DISK,
+    ROWS_PER_RUN,
+    SIDE,
+    SLOPE,
+    TILE_HEIGHT,
+    TILE_WIDTH,
+    TOP,
+)
 
-_DIGIT_BITS = 11
-_DIGITS = 1 << _DIGIT_BITS
-
-
-@numba.njit(**PER_DISK)
-def sort_by_depth(records, pairs):
-    """Indices of the disks that touch a tile, nearest centre first; equal depths keep their order.
-
-    A radix sort of the depths' bit patterns, which order like the positive floats they encode.
-    """
-    n = np.count_nonzero(pairs)
-    keys, order = np.empty(n, np.uint32), np.empty(n, np.int32)
-    count = 0
-    for i in range(pairs.shape[0]):
-        if pairs[i] > 0:
-            depth = np.float32(1) / records[i, WC]
-            keys[count] = np.float32(depth).view(np.uint32)
-            order[count] = i
-            count += 1
-    other_keys, other_order = np.empty(n, np.uint32), np.empty(n, np.int32)
-    for shift in range(0, 32, _DIGIT_BITS):
-        starts = np.zeros(_DIGITS + 1, np.int64)
-        for k in range(n):
-            starts[((keys[k] >> np.uint32(shift)) & np.uint32(_DIGITS - 1)) + 1] += 1
-        for d in range(_DIGITS):
-            starts[d + 1] += starts[d]
-        for k in range(n):
-            d = (keys[k] >> np.uint32(shift)) & np.uint32(_DIGITS - 1)
-            other_keys[starts[d]] = keys[k]
-            other_order[starts[d]] = order[k]
-            starts[d] += 1
-        keys, other_keys = other_keys, keys
-        order, other_order = other_order, order
-    return order
+DIGIT_BITS = 11
+DIGITS = 1 << DIGIT_BITS
+_DIGIT = np.uint32(DIGITS - 1)
+# Pixels by which outlines are widened against rounding.
+_MARGIN = 0.01
 
 
 @numba.njit(**PER_DISK)
-def count_pairs(pairs, boxes, columns, slots, offsets):
-    """First slot of every disk's pairs, and first list entry of every tile."""
-    slots[0] = 0
-    offsets[:] = 0
-    for i in range(pairs.shape[0]):
-        slots[i + 1] = slots[i] + pairs[i]
-        if pairs[i] > 0:
-            for row in range(boxes[i, 2] // TILE_HEIGHT, (boxes[i, 3] - 1) // TILE_HEIGHT + 1):
-                for col in range(boxes[i, 0] // TILE_WIDTH, (boxes[i, 1] - 1) // TILE_WIDTH + 1):
-                    offsets[row * columns + col + 1] += 1
-    for t in range(offsets.shape[0] - 1):
-        offsets[t + 1] += offsets[t]
+def sort_by_digit(keys, order, shift, starts, sorted_keys, sorted_order):
+    """One pass of a stable radix sort: by the bits of the keys from ``shift`` on."""
+    for d in range(DIGITS + 1):
+        starts[d] = 0
+    for k in range(keys.shape[0]):
+        starts[((keys[k] >> shift) & _DIGIT) + 1] += 1
+    for d in range(DIGITS):
+        starts[d + 1] += starts[d]
+    for k in range(keys.shape[0]):
+        d = (keys[k] >> shift) & _DIGIT
+        sorted_keys[starts[d]] = keys[k]
+        sorted_order[starts[d]] = order[k]
+        starts[d] += 1
 
 
 @numba.njit(**{**PER_DISK, "cache": False})
 def rows_within(outline, left, right):
-    """Rows (lowest, highest, as numbers) of an outline's part with left <= x <= right."""
+    """Lowest and highest y of an outline's part with left <= x <= right."""
     lowest, highest = np.inf, -np.inf
-    mx, my, blur, ox, oy, hx = outline[0], outline[1], outline[2], outline[3], outline[4], outline[5]
-    low, high = max(left - ox, -hx), min(right - ox, hx)
+    middle_x, half_x = outline[MIDDLE_X], outline[HALF_X]
+    low, high = max(left - middle_x, -half_x), min(right - middle_x, half_x)
     if low <= high:
-        slope, side, top = outline[6], outline[7], outline[8]
-        x = min(max(top, low), high)
-        highest = oy + slope * x + side * math.sqrt(max(1 - x * x / (hx * hx), 0.0))
-        x = min(max(-top, low), high)
-        lowest = oy + slope * x - side * math.sqrt(max(1 - x * x / (hx * hx), 0.0))
-    aside = max(left - mx, mx - right, 0.0)
-    if aside < blur:
-        half = math.sqrt(blur * blur - aside * aside)
-        lowest, highest = min(lowest, my - half), max(highest, my + half)
-    return lowest, highest
+        x = min(max(outline[TOP], low), high)
+        side = outline[SIDE] * math.sqrt(max(1 - x * x / (half_x * half_x), 0.0))
+        highest = outline[MIDDLE_Y] + outline[SLOPE] * x + side
+        x = min(max(-outline[TOP], low), high)
+        side = outline[SIDE] * math.sqrt(max(1 - x * x / (half_x * half_x), 0.0))
+        lowest = outline[MIDDLE_Y] + outline[SLOPE] * x - side
+    aside = max(left - outline[CENTER_X], outline[CENTER_X] - right, 0.0)
+    if aside < outline[BLUR]:
+        half = math.sqrt(outline[BLUR] * outline[BLUR] - aside * aside)
+        lowest = min(lowest, outline[CENTER_Y] - half)
+        highest = max(highest, outline[CENTER_Y] + half)
+    return lowest - _MARGIN, highest + _MARGIN
 
 
 @numba.njit(**PER_DISK)
-def list_disks(order, boxes, outlines, columns, offsets, first_row, last_row, lists, runs):
-    """Fill the lists of the tiles in rows first_row..last_row, nearest disk first.
+def cut_disks(boxes, outlines, slots, columns, start, stop, pair_runs, counts):
+    """Cut the disks start..stop along the tiles.
 
-    An entry is a disk and the runs of the tile's pixels (first, last) that it may reach.
+    ``pair_runs`` receives for every pair the runs (first, last) of the tile's pixels that the disk
+    may reach, (0, 0) if it misses the tile; ``counts`` the number of disks in each tile. Disk i's
+    pairs start at ``slots[i]`` and go through its box row by row.
     """
-    cursor = offsets[first_row * columns : last_row * columns].copy()
-    for k in range(order.shape[0]):
-        i = order[k]
-        y0, y1 = boxes[i, 2], boxes[i, 3]
-        first, last = max(y0 // TILE_HEIGHT, first_row), min((y1 - 1) // TILE_HEIGHT + 1, last_row)
-        if first >= last:
+    for i in range(start, stop):
+        if slots[i] == slots[i + 1]:
             continue
-        for col in range(boxes[i, 0] // TILE_WIDTH, (boxes[i, 1] - 1) // TILE_WIDTH + 1):
+        y0, y1 = boxes[i, 2], boxes[i, 3]
+        first_row, last_row = y0 // TILE_HEIGHT, (y1 - 1) // TILE_HEIGHT + 1
+        first_column, last_column = boxes[i, 0] // TILE_WIDTH, (boxes[i, 1] - 1) // TILE_WIDTH + 1
+        for col in range(first_column, last_column):
             left = col * TILE_WIDTH
             lowest, highest = rows_within(outlines[i], left, left + TILE_WIDTH - 1)
-            low = int(math.ceil(max(lowest - 0.01, y0)))
-            high = int(math.floor(min(highest + 0.01, y1 - 1))) + 1
-            for row in range(first, last):
-                t = (row - first_row) * columns + col
-                top = row * TILE_HEIGHT
-                lists[cursor[t]] = i
-                runs[cursor[t], 0] = max(low - top, 0) // ROWS_PER_RUN
-                runs[cursor[t], 1] = (
-                    max(min(high - top, TILE_HEIGHT), 0) + ROWS_PER_RUN - 1
-                ) // ROWS_PER_RUN
-                cursor[t] += 1
+            low = int(math.ceil(max(lowest, y0)))
+            high = int(math.floor(min(highest, y1 - 1))) + 1
+            slot = slots[i] + col - first_column
+            for row in range(first_row, last_row):
+                first = max(low - row * TILE_HEIGHT, 0)
+                last = min(high - row * TILE_HEIGHT, TILE_HEIGHT)
+                if first < last:
+                    pair_runs[slot, 0] = first // ROWS_PER_RUN
+                    pair_runs[slot, 1] = (last + ROWS_PER_RUN - 1) // ROWS_PER_RUN
+                    counts[row * columns + col] += 1
+                else:
+                    pair_runs[slot, 0] = 0
+                    pair_runs[slot, 1] = 0
+                slot += last_column - first_column
+
+
+@numba.njit(**PER_DISK)
+def list_disks(
+    order, boxes, slots, pair_runs, columns, first_row, last_row, cursor, lists, runs, entries
+):
+    """Fill the lists of the tiles in rows first_row..last_row, nearest disk first.
+
+    ``cursor`` holds where each tile's next entry goes: its disk to ``lists``, its runs to ``runs``.
+    ``entries`` tells for every pair which entry it became: one past the last where there is none.
+    """
+    none = lists.shape[0]
+    for k in range(order.shape[0]):
+        i = order[k]
+        top, bottom = boxes[i, 2] // TILE_HEIGHT, (boxes[i, 3] - 1) // TILE_HEIGHT + 1
+        first_column, last_column = boxes[i, 0] // TILE_WIDTH, (boxes[i, 1] - 1) // TILE_WIDTH + 1
+        for row in range(max(top, first_row), min(bottom, last_row)):
+            slot = slots[i] + (row - top) * (last_column - first_column)
+            for t in range(row * columns + first_column, row * columns + last_column):
+                entry = none
+                if pair_runs[slot, 1] > 0:
+                    entry = cursor[t]
+                    cursor[t] += 1
+                    lists[entry] = i
+                    runs[entry, 0] = pair_runs[slot, 0]
+                    runs[entry, 1] = pair_runs[slot, 1]
+                entries[slot] = entry
+                slot += 1

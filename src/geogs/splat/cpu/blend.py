@@ -43,7 +43,7 @@ _INLINE = {**PER_PIXEL, "cache": False}
 (
     _X, _Y, _LIGHT, _MOMENT, _NORMAL_X, _NORMAL_Y, _NORMAL_Z, _DISTORTION, _MEDIAN, _LAST,
 ) = (np.uint64(k * TILE_PIXELS) for k in range(10))  # fmt: skip
-_PLANES = 10
+BLEND_PLANES = 10
 _RUN = np.uint64(LANES)
 _RUNS = TILE_PIXELS // LANES
 _CHECK_EVERY = 16
@@ -149,8 +149,8 @@ def write_maps(state, left, top, z_reference, depth, normal, alpha, distortion, 
 
 @numba.njit(**PER_PIXEL)
 def blend_tiles(
-    first_tile, stride, records, offsets, lists, runs, inverse_near,
-    depth, normal, alpha, distortion, median_depth, visible, saved,
+    first_tile, last_tile, records, offsets, lists, runs, inverse_near,
+    depth, normal, alpha, distortion, median_depth, visible, saved, state,
 ):  # fmt: skip
     """Render every ``stride``-th tile from ``first_tile`` on.
 
@@ -159,8 +159,7 @@ def blend_tiles(
     """
     height, width = depth.shape
     columns = (width + TILE_WIDTH - 1) // TILE_WIDTH
-    state = np.empty(_PLANES * TILE_PIXELS, np.float32)
-    for tile in range(first_tile, offsets.shape[0] - 1, stride):
+    for tile in range(first_tile, last_tile):
         left, top = tile % columns * TILE_WIDTH, tile // columns * TILE_HEIGHT
         clear_state(state, left, top, width, height)
         first, last = offsets[tile], offsets[tile + 1]

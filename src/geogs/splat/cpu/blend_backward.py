@@ -59,7 +59,7 @@ _INLINE = {**PER_PIXEL, "cache": False}
     _X, _Y, _LIGHT, _MOMENT, _LAST, _BEHIND, _SIGNS, _SIGNED_Z,
     _D_CONSTANT, _D_Z, _D_NORMAL_X, _D_NORMAL_Y, _D_NORMAL_Z, _D_DISTORTION,
 ) = (np.uint64(k * TILE_PIXELS) for k in range(14))  # fmt: skip
-_PLANES = 14
+UNBLEND_PLANES = 14
 _RUN = np.uint64(LANES)
 _RUNS = TILE_PIXELS // LANES
 
@@ -192,26 +192,16 @@ def last_of_runs(state, last_of):
     return int(most)
 
 
-@numba.njit(**_INLINE)
-def slot_of(boxes, slots, i, tile, columns):
-    """Where disk i's pair with a tile keeps its gradients."""
-    first_column = boxes[i, 0] // TILE_WIDTH
-    count = (boxes[i, 1] - 1) // TILE_WIDTH - first_column + 1
-    row = tile // columns - boxes[i, 2] // TILE_HEIGHT
-    return slots[i] + row * count + tile % columns - first_column
-
-
 @numba.njit(**PER_PIXEL)
 def unblend_tiles(
-    first_tile, stride, records, boxes, slots, offsets, lists, runs, inverse_near, saved,
-    d_depth, d_normal, d_alpha, d_distortion, pair_gradients,
+    first_tile, last_tile, records, offsets, lists, runs, inverse_near, saved,
+    d_depth, d_normal, d_alpha, d_distortion, gradients, state,
 ):  # fmt: skip
     """Gradients of every pair of every ``stride``-th tile from ``first_tile`` on."""
     width = d_depth.shape[1]
     columns = (width + TILE_WIDTH - 1) // TILE_WIDTH
-    state = np.empty(_PLANES * TILE_PIXELS, np.float32)
     last_of = np.empty(_RUNS, np.float32)
-    for tile in range(first_tile, offsets.shape[0] - 1, stride):
+    for tile in range(first_tile, last_tile):
         left, top = tile % columns * TILE_WIDTH, tile // columns * TILE_HEIGHT
         first, last = offsets[tile], offsets[tile + 1]
         if first == last:
@@ -222,7 +212,7 @@ def unblend_tiles(
         )
         used = last_of_runs(state, last_of)
         for k in range(first + used, last):
-            pair_gradients[slot_of(boxes, slots, lists[k], tile, columns), :] = ZERO
+            gradients[k, :] = ZERO
         first_run, last_run = _RUNS, 0
         for k in range(first + used - 1, first - 1, -1):
             i = lists[k]
@@ -231,7 +221,7 @@ def unblend_tiles(
                 if last_of[run] == rank:
                     first_run, last_run = min(first_run, run), max(last_run, run + 1)
             start, stop = common_runs(runs, k, first_run, last_run)
-            g = pair_gradients[slot_of(boxes, slots, i, tile, columns)]
+            g = gradients[k]
             if start == stop:
                 g[:] = ZERO
                 continue

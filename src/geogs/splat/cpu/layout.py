@@ -15,20 +15,28 @@ import numba
 import numpy as np
 
 TILE_WIDTH = 8
-TILE_HEIGHT = 32
+TILE_HEIGHT = 64
 TILE_PIXELS = TILE_WIDTH * TILE_HEIGHT
 LANES = 16
 """Pixels per run."""
 ROWS_PER_RUN = LANES // TILE_WIDTH
 
 OUTLINE = 10
+"""Numbers (float64) that bound the pixels of a disk: an ellipse about MIDDLE and a circle of radius
+BLUR about the projected CENTER. At x from MIDDLE the ellipse spans
+SLOPE x +- SIDE sqrt(1 - (x / HALF_X)^2); its highest point, y = HALF_Y, is at x = TOP."""
+(
+    CENTER_X, CENTER_Y, BLUR, MIDDLE_X, MIDDLE_Y, HALF_X, HALF_Y, SLOPE, SIDE, TOP,
+) = range(10)  # fmt: skip
 
 RECORD = 16
 """Floats per record: one cache line."""
-MX, MY, UX, UY, VX, VY, WX, WY, WC, OPACITY, NX, NY, NZ, Z_NEAREST, Z_FURTHEST = range(15)
+(
+    MX, MY, UX, UY, VX, VY, WX, WY, WC, OPACITY, NX, NY, NZ, Z_NEAREST, Z_FURTHEST,
+) = range(15)  # fmt: skip
 
 GRADIENT = 16
-"""Floats per pair that the backward pass sums over pixels."""
+"""Floats per list entry that the backward pass sums over pixels, in the order below."""
 (
     G_U, G_UX, G_UY, G_V, G_VX, G_VY, G_W, G_WX, G_WY,
     G_CLAMPED, G_MX, G_MY, G_OPACITY, G_NX, G_NY, G_NZ,

@@ -10,7 +10,14 @@ import numba
 import numpy as np
 
 from geogs.splat.cpu.layout import (
+    BLUR,
+    CENTER_X,
+    CENTER_Y,
+    HALF_X,
+    HALF_Y,
     MAX_REACH_RATIO,
+    MIDDLE_X,
+    MIDDLE_Y,
     MIN_ALPHA,
     MIN_FACING,
     MX,
@@ -20,8 +27,11 @@ from geogs.splat.cpu.layout import (
     NZ,
     OPACITY,
     PER_DISK,
+    SIDE,
+    SLOPE,
     TILE_HEIGHT,
     TILE_WIDTH,
+    TOP,
     UX,
     UY,
     VX,
@@ -124,21 +134,22 @@ def outline_of(mx, my, c, u, v, opacity, intrinsics, outline):
     xx = max(ox * ox - k * (ux * ux + vx * vx), 1e-6)
     yy = max(oy * oy - k * (uy * uy + vy * vy), 1e-6)
     xy = ox * oy - k * (ux * uy + vx * vy)
-    outline[0], outline[1], outline[2] = mx, my, math.sqrt(radius2 / 2)
-    outline[3], outline[4], outline[5] = mx + ox, my + oy, math.sqrt(xx)
-    outline[6], outline[7] = xy / xx, math.sqrt(max(yy - xy * xy / xx, 0.0))
-    outline[8] = xy / math.sqrt(yy)
-    outline[9] = math.sqrt(yy)
+    outline[CENTER_X], outline[CENTER_Y], outline[BLUR] = mx, my, math.sqrt(radius2 / 2)
+    outline[MIDDLE_X], outline[MIDDLE_Y] = mx + ox, my + oy
+    outline[HALF_X], outline[HALF_Y] = math.sqrt(xx), math.sqrt(yy)
+    outline[SLOPE], outline[SIDE] = xy / xx, math.sqrt(max(yy - xy * xy / xx, 0.0))
+    outline[TOP] = xy / outline[HALF_Y]
     return True
 
 
 @numba.njit(**_INLINE)
 def box_of(outline, width, height):
     """Pixels (x0, x1, y0, y1) within an outline."""
-    mx, my, blur = outline[0], outline[1], outline[2] 
-    ox, oy, hx, hy = outline[3], outline[4], outline[5], outline[9]
-    x0, x1 = pixel_range(min(mx - blur, ox - hx), max(mx + blur, ox + hx), width)
-    y0, y1 = pixel_range(min(my - blur, oy - hy), max(my + blur, oy + hy), height)
+    x, y, blur = outline[CENTER_X], outline[CENTER_Y], outline[BLUR]
+    left, right = outline[MIDDLE_X] - outline[HALF_X], outline[MIDDLE_X] + outline[HALF_X]
+    top, bottom = outline[MIDDLE_Y] - outline[HALF_Y], outline[MIDDLE_Y] + outline[HALF_Y]
+    x0, x1 = pixel_range(min(left, x - blur), max(right, x + blur), width)
+    y0, y1 = pixel_range(min(top, y - blur), max(bottom, y + blur), height)
     return x0, x1, y0, y1
 
 
@@ -185,8 +196,7 @@ def project_disks(
         if outline_of(mx, my, c, u, v, opacity, intrinsics, outlines[i]):
             x0, x1, y0, y1 = box_of(outlines[i], width, height)
         else:
-            outlines[i, 2] = np.inf
-            outlines[i, 5] = -1
+            outlines[i, BLUR], outlines[i, HALF_X] = np.inf, -1
         if x0 >= x1 or y0 >= y1:
             continue
         boxes[i, 0], boxes[i, 1], boxes[i, 2], boxes[i, 3] = x0, x1, y0, y1

@@ -75,16 +75,6 @@ def quaternion_gradient(q, inverse_norm, a, b, n):
 
 
 @numba.njit(**_INLINE)
-def sum_pairs(pair_gradients, first, last, total):
-    """Sum of rows first..last, always in this order."""
-    for k in range(GRADIENT):
-        total[k] = 0
-    for s in range(first, last):
-        for k in range(GRADIENT):
-            total[k] += pair_gradients[s, k]
-
-
-@numba.njit(**_INLINE)
 def record_backward(record, g, axes, c, ku, kv, intrinsics):
     """Gradients of the camera-frame tangents, normal and centre from the pixels' sums ``g``.
 
@@ -127,15 +117,25 @@ def record_backward(record, g, axes, c, ku, kv, intrinsics):
 
 
 @numba.njit(**PER_DISK)
+def sum_pairs(slots, entries, gradients, start, stop, sums):
+    """Sum the gradients of the pairs of each of the disks start..stop, always in the same order."""
+    # Of a width known only at run time a loop is vectorised; of a constant one, unrolled instead.
+    width = sums.shape[1]
+    for i in range(start, stop):
+        for k in range(width):
+            sums[i, k] = 0
+        for s in range(slots[i], slots[i + 1]):
+            e = entries[s]
+            for k in range(width):
+                sums[i, k] += gradients[e, k]
+
+
+@numba.njit(**PER_DISK)
 def project_disks_backward(
-    position, quaternion, log_scale, T, intrinsics, records, slots, pair_gradients, start, stop,
+    position, quaternion, log_scale, T, intrinsics, records, slots, sums, start, stop,
     d_position, d_quaternion, d_log_scale, d_opacity_logit, d_T,
 ):  # fmt: skip
-    """Gradients of disks start..stop, and this range's share of the (3, 4) pose gradient.
-
-    Disk i's pairs hold the slots ``slots[i]``..``slots[i + 1]``; they are summed in that order.
-    """
-    g = np.empty(GRADIENT)
+    """Gradients of disks start..stop, and this range's share of the (3, 4) pose gradient."""
     for i in range(start, stop):
         if slots[i] == slots[i + 1]:
             d_position[i, :] = 0
@@ -143,8 +143,7 @@ def project_disks_backward(
             d_log_scale[i, :] = 0
             d_opacity_logit[i] = 0
             continue
-        sum_pairs(pair_gradients, slots[i], slots[i + 1], g)
-        r = records[i]
+        r, g = records[i], sums[i]
         p, c = place(position, i, T)
         q, inverse_norm = unit_quaternion(quaternion, i)
         tu, tv, tn = axes_of(*q)

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from geogs.geometry.camera import Camera
-from geogs.splat.cpu.binning import count_pairs, list_disks, sort_by_depth
-from geogs.splat.cpu.blend import blend_tiles
-from geogs.splat.cpu.blend_backward import unblend_tiles
+from geogs.splat.cpu.binning import DIGIT_BITS, DIGITS, cut_disks, list_disks, sort_by_digit
+from geogs.splat.cpu.blend import BLEND_PLANES, blend_tiles
+from geogs.splat.cpu.blend_backward import UNBLEND_PLANES, unblend_tiles
 from geogs.splat.cpu.layout import (
     GRADIENT,
     OUTLINE,
@@ -16,14 +16,20 @@ from geogs.splat.cpu.layout import (
     TILE_HEIGHT,
     TILE_PIXELS,
     TILE_WIDTH,
+    WC,
 )
 from geogs.splat.cpu.pool import run_chunks
 from geogs.splat.cpu.project import project_disks
-from geogs.splat.cpu.project_backward import project_disks_backward
+from geogs.splat.cpu.project_backward import project_disks_backward, sum_pairs
 
-_CHUNKS_PER_THREAD = 8
-# Disk chunks do not depend on the number of threads: the pose gradient sums them in their order.
+# More chunks than threads, so that threads finish together; neighbouring tiles share a chunk, and
+# with it the disks in the cache.
+_TILE_CHUNKS_PER_THREAD = 16
+# The pose gradient is summed per chunk, then over chunks: their number must not depend on threads.
 _DISK_CHUNKS = 8
+
+Arrays = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+"""position (n, 3), quaternion (n, 4), log_scale (n, 2), opacity_logit (n): float32, contiguous."""
 
 
 @dataclass(slots=True)
@@ -39,19 +45,32 @@ class Maps:
 
 
 @dataclass(slots=True)
-class Trace:
-    """What a forward pass leaves for its backward pass; belongs to that pass alone."""
+class TileLists:
+    """The disks of each tile, nearest first."""
 
-    parameters: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+    offsets: np.ndarray
+    """(tiles + 1,) where each tile's entries start."""
+    disks: np.ndarray
+    """(entries,) index of the disk."""
+    runs: np.ndarray
+    """(entries, 2) runs of the tile's pixels that the disk may reach."""
+    slots: np.ndarray
+    """(n + 1,) where each disk's pairs start."""
+    entries: np.ndarray
+    """(pairs,) the entry that a pair became; the number of entries where the disk misses the
+    tile."""
+
+
+@dataclass(slots=True)
+class Trace:
+    """What a forward pass leaves for its backward pass; no other pass writes to it."""
+
+    parameters: Arrays
     T_cw: np.ndarray
     intrinsics: tuple[float, float, float, float]
     inverse_near: np.float32
     records: np.ndarray
-    boxes: np.ndarray
-    slots: np.ndarray
-    offsets: np.ndarray
-    lists: np.ndarray
-    runs: np.ndarray
+    lists: TileLists
     saved: np.ndarray
 
 
@@ -67,61 +86,51 @@ class Gradients:
 
 
 def rasterize_forward(
-    parameters: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
+    parameters: Arrays,
     camera: Camera,
     T_cw: np.ndarray,
     near: float,
     threads: int,
     with_trace: bool = True,
 ) -> tuple[Maps, Trace]:
-    """Render; arrays are contiguous float32 (T_cw: (3, 4) float64) as in ``DiskParameters``.
+    """Render the disks; ``T_cw`` is (3, 4) float64.
 
-    Results do not depend on the number of threads. Without trace there is no way back, and less
-    memory is touched.
+    The result is the same, bit by bit, for any number of threads. Without trace a backward pass is
+    not possible.
     """
     n, width, height = len(parameters[0]), camera.width, camera.height
     intrinsics = (float(camera.fx), float(camera.fy), float(camera.cx), float(camera.cy))
-    records, boxes = np.empty((n, RECORD), np.float32), np.empty((n, 4), np.int32)
-    outlines, pairs = np.empty((n, OUTLINE)), np.empty(n, np.int32)
+    records, outlines = np.empty((n, RECORD), np.float32), np.empty((n, OUTLINE))
+    boxes, pairs = np.empty((n, 4), np.int32), np.empty(n, np.int32)
     run_chunks(
         lambda c: project_disks(
-            *parameters, T_cw, intrinsics, near, width, height,
-            *_span(n, c, _DISK_CHUNKS), records, outlines, boxes, pairs,
+            *parameters, T_cw, intrinsics, near, width, height, *_span(n, c, _DISK_CHUNKS),
+            records, outlines, boxes, pairs,
         ),
         _DISK_CHUNKS, threads,
     )  # fmt: skip
-    columns, rows = -(-width // TILE_WIDTH), -(-height // TILE_HEIGHT)
-    slots, offsets = np.empty(n + 1, np.int64), np.empty(columns * rows + 1, np.int64)
-    count_pairs(pairs, boxes, columns, slots, offsets)
-    order = sort_by_depth(records, pairs)
-    lists, runs = np.empty(offsets[-1], np.int32), np.empty((offsets[-1], 2), np.uint8)
-    run_chunks(
-        lambda c: list_disks(
-            order, boxes, outlines, columns, offsets, *_span(rows, c, threads), lists, runs
-        ),
-        threads, threads,
-    )  # fmt: skip
+    lists = list_tiles(records, outlines, boxes, pairs, width, height, threads)
+    shape, tiles = (height, width), len(lists.offsets) - 1
     maps = Maps(
-        depth=np.empty((height, width), np.float32),
-        normal=np.empty((height, width, 3), np.float32),
-        alpha=np.empty((height, width), np.float32),
-        distortion=np.empty((height, width), np.float32),
-        median_depth=np.empty((height, width), np.float32),
+        depth=np.empty(shape, np.float32),
+        normal=np.empty((*shape, 3), np.float32),
+        alpha=np.empty(shape, np.float32),
+        distortion=np.empty(shape, np.float32),
+        median_depth=np.empty(shape, np.float32),
         visible=np.zeros(n, np.bool_),
     )
-    saved = np.empty((columns * rows if with_trace else 0, SAVED, TILE_PIXELS), np.float32)
+    saved = np.empty((tiles if with_trace else 0, SAVED, TILE_PIXELS), np.float32)
     inverse_near = np.float32(1 / near)
-    chunks = threads * _CHUNKS_PER_THREAD
+    chunks = threads * _TILE_CHUNKS_PER_THREAD
     run_chunks(
         lambda c: blend_tiles(
-            c, chunks, records, offsets, lists, runs, inverse_near, maps.depth, maps.normal,
-            maps.alpha, maps.distortion, maps.median_depth, maps.visible, saved,
+            *_span(tiles, c, chunks), records, lists.offsets, lists.disks, lists.runs, inverse_near,
+            maps.depth, maps.normal, maps.alpha, maps.distortion, maps.median_depth, maps.visible,
+            saved, _cache_aligned(BLEND_PLANES * TILE_PIXELS),
         ),
         chunks, threads,
     )  # fmt: skip
-    return maps, Trace(
-        parameters, T_cw, intrinsics, inverse_near, records, boxes, slots, offsets, lists, runs, saved
-    )
+    return maps, Trace(parameters, T_cw, intrinsics, inverse_near, records, lists, saved)
 
 
 def rasterize_backward(
@@ -133,28 +142,91 @@ def rasterize_backward(
     threads: int,
 ) -> Gradients:
     """Gradients of a loss, given its contiguous float32 gradients with respect to the maps."""
-    position, quaternion, log_scale, opacity_logit = trace.parameters
-    pair_gradients = np.empty((len(trace.lists), GRADIENT), np.float32)
-    chunks = threads * _CHUNKS_PER_THREAD
+    lists, n, tiles = trace.lists, len(trace.parameters[0]), len(trace.lists.offsets) - 1
+    gradients = np.empty((len(lists.disks) + 1, GRADIENT), np.float32)
+    gradients[-1] = 0
+    chunks = threads * _TILE_CHUNKS_PER_THREAD
     run_chunks(
         lambda c: unblend_tiles(
-            c, chunks, trace.records, trace.boxes, trace.slots, trace.offsets, trace.lists, trace.runs,
-            trace.inverse_near, trace.saved, d_depth, d_normal, d_alpha, d_distortion,
-            pair_gradients,
+            *_span(tiles, c, chunks), trace.records, lists.offsets, lists.disks, lists.runs,
+            trace.inverse_near, trace.saved, d_depth, d_normal, d_alpha, d_distortion, gradients,
+            _cache_aligned(UNBLEND_PLANES * TILE_PIXELS),
         ),
         chunks, threads,
     )  # fmt: skip
     out = tuple(np.empty_like(p) for p in trace.parameters)
-    d_T = np.zeros((_DISK_CHUNKS, 3, 4))
-    run_chunks(
-        lambda c: project_disks_backward(
+    sums, d_T = np.empty((n, GRADIENT), np.float32), np.zeros((_DISK_CHUNKS, 3, 4))
+
+    def finish(chunk: int) -> None:
+        span = _span(n, chunk, _DISK_CHUNKS)
+        sum_pairs(lists.slots, lists.entries, gradients, *span, sums)
+        position, quaternion, log_scale, _ = trace.parameters
+        project_disks_backward(
             position, quaternion, log_scale, trace.T_cw, trace.intrinsics, trace.records,
-            trace.slots, pair_gradients, *_span(len(position), c, _DISK_CHUNKS), *out, d_T[c],
+            lists.slots, sums, *span, *out, d_T[chunk],
+        )  # fmt: skip
+
+    run_chunks(finish, _DISK_CHUNKS, threads)
+    return Gradients(*out, d_T.sum(0))
+
+
+def list_tiles(
+    records: np.ndarray,
+    outlines: np.ndarray,
+    boxes: np.ndarray,
+    pairs: np.ndarray,
+    width: int,
+    height: int,
+    threads: int,
+) -> TileLists:
+    """Sort the projected disks by depth and assign them to tiles."""
+    n, columns, rows = len(pairs), -(-width // TILE_WIDTH), -(-height // TILE_HEIGHT)
+    slots = np.zeros(n + 1, np.int64)
+    np.cumsum(pairs, out=slots[1:])
+    counts = np.zeros((_DISK_CHUNKS, columns * rows), np.int64)
+    pair_runs = np.empty((slots[-1], 2), np.uint8)
+    run_chunks(
+        lambda c: cut_disks(
+            boxes, outlines, slots, columns, *_span(n, c, _DISK_CHUNKS), pair_runs, counts[c]
         ),
         _DISK_CHUNKS, threads,
     )  # fmt: skip
-    return Gradients(*out, d_T.sum(0))
+    offsets = np.zeros(columns * rows + 1, np.int64)
+    np.cumsum(counts.sum(0), out=offsets[1:])
+    order, cursor = sort_by_depth(records, pairs), offsets[:-1].copy()
+    disks, runs = np.empty(offsets[-1], np.int32), np.empty((offsets[-1], 2), np.uint8)
+    entries = np.empty(slots[-1], np.int32)
+    run_chunks(
+        lambda c: list_disks(
+            order, boxes, slots, pair_runs, columns, *_span(rows, c, threads), cursor, disks, runs,
+            entries,
+        ),
+        threads, threads,
+    )  # fmt: skip
+    return TileLists(offsets, disks, runs, slots, entries)
+
+
+def sort_by_depth(records: np.ndarray, pairs: np.ndarray) -> np.ndarray:
+    """Disks that touch a tile, nearest centre first; equal depths keep their order.
+
+    Radix sort of the depths' bit patterns, which order like the positive floats they encode.
+    """
+    order = np.flatnonzero(pairs).astype(np.int32)
+    keys = (1 / records[order, WC]).view(np.uint32)
+    other_keys, other_order = np.empty_like(keys), np.empty_like(order)
+    starts = np.empty(DIGITS + 1, np.int64)
+    for shift in range(0, 32, DIGIT_BITS):
+        sort_by_digit(keys, order, np.uint32(shift), starts, other_keys, other_order)
+        keys, other_keys, order, other_order = other_keys, keys, other_order, order
+    return order
 
 
 def _span(count: int, chunk: int, chunks: int) -> tuple[int, int]:
     return count * chunk // chunks, count * (chunk + 1) // chunks
+
+
+def _cache_aligned(count: int) -> np.ndarray:
+    """Uninitialised float32 array that starts on a cache line."""
+    raw = np.empty(4 * count + 64, np.uint8)
+    start = -raw.ctypes.data % 64
+    return raw[start : start + 4 * count].view(np.float32)

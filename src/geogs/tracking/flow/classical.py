@@ -76,13 +76,21 @@ class ClassicalFlow:
         weight = torch.from_numpy(np.stack([m[1] for m in matches])).to(self.grid.device)
         return FlowMatch(pixels[:n], weight[:n]), FlowMatch(pixels[n:], weight[n:])
 
-    def _dis(self, scale: int) -> cv2.DISOpticalFlow:
+    def _dis(self, scale: int, cold: bool = False) -> cv2.DISOpticalFlow:
         """This thread's flow object whose finest level is ``scale`` halvings down."""
-        found = getattr(self._local, f"dis{scale}", None)
+        name = f"dis{scale}{'cold' if cold else ''}"
+        found = getattr(self._local, name, None)
         if found is None:
             found = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
             found.setFinestScale(scale)
-            setattr(self._local, f"dis{scale}", found)
+            if not cold:
+                # Measured: as precise as the preset on warped pairs, at half its time.
+                found.setGradientDescentIterations(6)
+                found.setPatchStride(5)
+            # Smoother, and gradients rather than brightness: less noise, less light.
+            found.setVariationalRefinementAlpha(40.0)
+            found.setVariationalRefinementDelta(1.0)
+            setattr(self._local, name, found)
         return found
 
     def _dense(
@@ -91,7 +99,7 @@ class ClassicalFlow:
         """Flow from a to b on every pixel."""
         scale = 0 if fine else 1
         if start is None:
-            return self._dis(scale).calc(a.grey, b.grey, None)
+            return self._dis(scale, cold=True).calc(a.grey, b.grey, None)
         shape = (self.grid.height, self.grid.width, 2)
         warp = np.clip(start - self._pixels, -1e4, 1e4).reshape(shape).astype(np.float32)
         warp = cv2.remap(

@@ -1,0 +1,206 @@
+"""Pictures of a result, drawn by matplotlib without a display and written as PNG."""
+
+from collections.abc import Sequence
+from io import BytesIO
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+
+from geogs.evaluation.shading import Viewpoint, level_axes, shade
+from geogs.evaluation.trajectory import TrajectoryErrors
+from geogs.io.writers.atomic import atomic_file
+from geogs.types import Trajectory
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_TRUTH, _ESTIMATE, _LOST = "0.45", "#0072b2", "#d55e00"
+_ERROR_MAP = "YlOrRd"
+
+
+def plot_path(path: Path, trajectory: Trajectory) -> None:
+    """The camera path from above and from the side, in map units; lost stretches are marked."""
+    figure = _figure(10.0, 4.2)
+    axes = level_axes(trajectory.T_wc)
+    points = (trajectory.T_wc[:, :3, 3] - trajectory.T_wc[0, :3, 3]) @ axes.T
+    for column, (name, vertical) in enumerate((("from above", 1), ("from the side", 2))):
+        plot = figure.add_subplot(1, 2, column + 1)
+        plot.plot(points[:, 0], points[:, vertical], color=_ESTIMATE, lw=1.2, label="camera")
+        plot.plot(points[0, 0], points[0, vertical], "o", color=_ESTIMATE, ms=5, label="start")
+        lost = points[~trajectory.tracked]
+        if len(lost):
+            plot.plot(lost[:, 0], lost[:, vertical], ".", color=_LOST, ms=3, label="lost")
+        _finish_map(plot, name, "map units")
+    _save(figure, path)
+
+
+def plot_trajectory(path: Path, errors: TrajectoryErrors) -> None:
+    """Aligned estimate over the truth, from above and from the side, coloured by its error."""
+    figure = _figure(11.0, 4.6)
+    axes = level_axes(errors.truth)
+    origin = errors.truth[:, :3, 3].mean(0)
+    truth = (errors.truth[:, :3, 3] - origin) @ axes.T
+    estimate = (errors.aligned[:, :3, 3] - origin) @ axes.T
+    plots = []
+    for column, (name, vertical) in enumerate((("from above", 1), ("from the side", 2))):
+        plot = figure.add_subplot(1, 2, column + 1)
+        plot.plot(truth[:, 0], truth[:, vertical], color=_TRUTH, lw=2.5, label="truth")
+        x, y, colour = estimate[:, 0], estimate[:, vertical], 100 * errors.position_error
+        dots = plot.scatter(x, y, 7, colour, cmap="plasma", label="estimate", zorder=3)
+        _finish_map(plot, name, "m")
+        plots.append(plot)
+    figure.colorbar(dots, ax=plots, label="position error (cm)", shrink=0.8)
+    _save(figure, path)
+
+
+def plot_error_over_time(path: Path, errors: TrajectoryErrors) -> None:
+    """Position error in cm and rotation error in degrees against time."""
+    figure = _figure(10.0, 4.2)
+    order = np.argsort(errors.timestamps)
+    time = errors.timestamps[order] - errors.timestamps[order[0]]
+    rows = (
+        ("position error (cm)", 100 * errors.position_error, errors.ate_rmse_cm),
+        ("rotation error (deg)", errors.rotation_error, errors.rotation_rmse_deg),
+    )
+    for row, (label, values, rmse) in enumerate(rows):
+        plot = figure.add_subplot(2, 1, row + 1)
+        plot.plot(time, values[order], color=_ESTIMATE, lw=1)
+        plot.axhline(rmse, color=_TRUTH, ls="--", lw=1, label=f"RMSE {rmse:.3g}")
+        plot.set_ylabel(label)
+        plot.set_ylim(0, 1.15 * max(float(values.max()), 1e-9))
+        plot.margins(x=0.01)
+        plot.legend(loc="upper right")
+        plot.grid(alpha=0.3)
+    plot.set_xlabel("time (s)")
+    _save(figure, path)
+
+
+def plot_keyframes(
+    path: Path,
+    images: Sequence[UInt8[np.ndarray, "ih iw 3"]],
+    depths: Sequence[Float[np.ndarray, "h w"]],
+    normals: Sequence[Float[np.ndarray, "h w 3"]],
+    names: Sequence[str],
+) -> None:
+    """One row a keyframe: image, rendered depth (one colour scale for all) and normals.
+
+    Depth is white where it is 0 or not finite; normals (camera frame) show x, y, z as red, green,
+    blue, from -1 dark to 1 bright, towards the camera being bright blue.
+    """
+    known = [d[np.isfinite(d) & (d > 0)] for d in depths]
+    values = np.concatenate(known) if known else np.zeros(0)
+    low, high = np.quantile(values, [0.01, 0.99]) if len(values) else (0.0, 1.0)
+    height, width = images[0].shape[:2]
+    figure = _figure(12.0, 0.4 + len(images) * 3.7 * height / width)
+    plots = []
+    rows = zip(images, depths, normals, names, strict=True)
+    for row, (image, depth, normal, name) in enumerate(rows):
+        hidden = np.ma.masked_where(~(np.isfinite(depth) & (depth > 0)), depth)
+        missing = ~(np.linalg.norm(normal, axis=-1) > 0.5)
+        flipped = np.where(missing[..., None], 1.0, 0.5 + 0.5 * normal * [1, -1, -1])
+        for column, (title, picture) in enumerate(
+            (("image", image), ("depth", hidden), ("normals", flipped.clip(0, 1)))
+        ):
+            plot = figure.add_subplot(len(images), 3, 3 * row + column + 1)
+            plot.imshow(picture, cmap="turbo", vmin=low, vmax=high)
+            plot.set(xticks=[], yticks=[])
+            if row == 0:
+                plot.set_title(title)
+            if column == 0:
+                plot.set_ylabel(name)
+            plots.append(plot)
+    _colour_bar(figure, plots, "turbo", (float(low), float(high)), "depth (map units)")
+    _save(figure, path)
+
+
+def plot_meshes(
+    path: Path,
+    rows: Sequence[
+        tuple[
+            str,
+            Float[np.ndarray, "n 3"],
+            Int[np.ndarray, "m 3"],
+            UInt8[np.ndarray, "n 3"] | None,
+        ]
+    ],
+    views: Sequence[Viewpoint],
+    error_limit_cm: float | None = None,
+) -> None:
+    """Shaded meshes, one row each (name, vertices, faces, vertex colours), one column a view.
+
+    With ``error_limit_cm`` a colour bar says what the colours of :func:`error_colours` mean.
+    """
+    camera = views[0].camera
+    figure = _figure(4.2 * len(views), 0.5 + 4.2 * camera.height / camera.width * len(rows))
+    plots = []
+    for row, (name, vertices, faces, colours) in enumerate(rows):
+        for column, view in enumerate(views):
+            plot = figure.add_subplot(len(rows), len(views), row * len(views) + column + 1)
+            plot.imshow(shade(vertices, faces, view, colours))
+            plot.set(xticks=[], yticks=[])
+            if row == 0:
+                plot.set_title(view.name)
+            if column == 0:
+                plot.set_ylabel(name)
+            plots.append(plot)
+    if error_limit_cm is not None:
+        _colour_bar(figure, plots, _ERROR_MAP, (0.0, error_limit_cm), "distance to the truth (cm)")
+    _save(figure, path)
+
+
+def error_colours(
+    vertices: Float[np.ndarray, "n 3"],
+    samples: Float[np.ndarray, "k 3"],
+    errors: Float[np.ndarray, "k"],
+    limit: float,
+) -> UInt8[np.ndarray, "n 3"]:
+    """Colour of each vertex by the mean error of the three samples nearest to it.
+
+    Pale is 0, dark red ``limit`` (in the unit of the errors) and more.
+    """
+    from matplotlib import colormaps
+    from scipy.spatial import cKDTree
+
+    k = min(3, len(samples))
+    nearest = cKDTree(samples).query(vertices, k=k, workers=-1)[1].reshape(len(vertices), k)
+    share = (errors[nearest].mean(1) / limit).clip(0, 1)
+    return (255 * colormaps[_ERROR_MAP](share)[:, :3]).round().astype(np.uint8)
+
+
+def _figure(width: float, height: float) -> "Figure":
+    """A figure of its own (inches), outside of pyplot and its global state."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, height), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def _colour_bar(
+    figure: "Figure", plots: list["Axes"], colours: str, span: tuple[float, float], label: str
+) -> None:
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
+
+    scale = ScalarMappable(Normalize(*span), colours)
+    figure.colorbar(scale, ax=plots, label=label, shrink=0.6, pad=0.01)
+
+
+def _finish_map(plot: "Axes", name: str, unit: str) -> None:
+    plot.set_aspect("equal", adjustable="datalim")
+    plot.set_title(name)
+    plot.set_xlabel(f"right ({unit})")
+    plot.set_ylabel(f"{'forward' if 'above' in name else 'up'} ({unit})")
+    plot.grid(alpha=0.3)
+    plot.legend(loc="best")
+
+
+def _save(figure: "Figure", path: Path) -> None:
+    buffer = BytesIO()
+    figure.savefig(buffer, format="png", dpi=110)
+    with atomic_file(path) as stream:
+        stream.write(buffer.getvalue())

@@ -1,0 +1,177 @@
+"""The pictures, the page, and the command as a user runs it."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from geogs.cli.eval import EvalOptions, evaluate, find_surface, main
+from geogs.errors import InputError
+from geogs.evaluation import plots
+from geogs.evaluation.shading import Viewpoint, level_axes, shade, viewpoints
+from geogs.geometry.camera import Camera
+from geogs.geometry.lie import so3_exp
+from geogs.io.writers.intrinsics import write_intrinsics
+from geogs.io.writers.ply import write_mesh
+from geogs.io.writers.tum import write_tum_trajectory
+from geogs.types import Trajectory
+
+CAMERA = Camera(fx=80.0, fy=80.0, cx=63.5, cy=47.5, width=128, height=96)
+
+
+def box(half: tuple[float, float, float]) -> tuple[np.ndarray, np.ndarray]:
+    """A closed box around the origin, faces turned inwards."""
+    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
+    quads = [(0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5)]
+    faces = [f for a, b, c, d in quads for f in ((a, c, b), (a, d, c))]
+    return corners * half, np.array(faces)
+
+
+def circle(n: int = 60) -> np.ndarray:
+    """Camera to world on a circle of 0.5 m, level (world z is up), looking outwards."""
+    T = np.tile(np.eye(4), (n, 1, 1))
+    for k, angle in enumerate(np.linspace(0, 2 * np.pi, n, endpoint=False)):
+        forward = np.array([np.cos(angle), np.sin(angle), 0.0])
+        down = np.array([0.0, 0.0, -1.0])
+        T[k, :3, :3] = np.stack([np.cross(down, forward), down, forward], -1)
+        T[k, :3, 3] = 0.5 * forward + [0, 0, 0.1 * np.sin(3 * angle)]
+    return T
+
+
+@pytest.fixture
+def result(tmp_path):
+    """A result folder in its own frame and unit (1 = 4 m), and the truth in Replica layout."""
+    T = circle()
+    vertices, faces = box((3.0, 2.0, 1.2))
+    truth, out = tmp_path / "room", tmp_path / "out"
+    truth.mkdir()
+    np.savetxt(truth / "traj.txt", T.reshape(-1, 16))
+    write_mesh(truth / "mesh.ply", vertices, faces)
+    write_mesh(truth / "points_seen_1cm.ply", vertices, faces[:0])
+    R = so3_exp(torch.tensor([0.3, -0.8, 0.5], dtype=torch.float64)).numpy()
+    moved = T.copy()
+    moved[:, :3, :3] = R @ T[:, :3, :3]
+    moved[:, :3, 3] = (T[:, :3, 3] @ R.T + [1.0, 2.0, 3.0]) / 4
+    time = np.arange(60) / 30
+    write_tum_trajectory(out / "trajectory.tum", Trajectory(time, moved, np.ones(60, bool)))
+    some = Trajectory(time[::6], moved[::6], np.ones(10, bool))
+    write_tum_trajectory(out / "keyframes.tum", some)
+    grown = vertices * [3.02 / 3, 2.02 / 2, 1.22 / 1.2]  # every wall 2 cm too far
+    write_mesh(out / "mesh.ply", (grown @ R.T + [1.0, 2.0, 3.0]) / 4, faces)
+    write_intrinsics(out / "intrinsics.json", CAMERA)
+    return truth, out
+
+
+def test_eval_command_writes_everything(result, capsys):
+    truth, out = result
+    mesh = str(truth / "mesh.ply")
+    assert main([str(out), "--gt", str(truth), "--gt-mesh", mesh, "--samples", "20000"]) == 0
+    printed = capsys.readouterr().out
+    assert "ATE RMSE, all frames, Sim(3) aligned (cm)" in printed
+    numbers = json.loads((out / "eval.json").read_text())
+    assert numbers["trajectory"]["ate_rmse_cm"] < 1e-6
+    assert numbers["trajectory"]["scale"] == pytest.approx(4.0)
+    assert numbers["trajectory"]["pairs"] == 60
+    assert numbers["keyframes"]["pairs"] == 10
+    surface = numbers["reconstruction"]
+    assert surface["accuracy_cm"] == pytest.approx(2.0, abs=0.1)  # a little more at the edges
+    assert surface["completeness_cm"] == pytest.approx(2.0, abs=0.01)
+    assert surface["completeness_ratio"] == 100.0
+    page = (out / "report" / "index.html").read_text()
+    for name in ("trajectory_truth.png", "trajectory_error.png", "mesh_truth.png"):
+        assert name in page
+        assert (out / "report" / name).read_bytes().startswith(b"\x89PNG")
+
+
+def test_culling_and_icp_run_from_the_command(result):
+    truth, out = result
+    options = EvalOptions(
+        output=out, gt=truth, gt_mesh=truth / "mesh.ply", cull=True, icp=True, samples=5000,
+        plots=False,
+    )  # fmt: skip
+    evaluation = evaluate(options)
+    assert evaluation.reconstruction.accuracy_cm < 2.1
+    assert evaluation.reconstruction.completeness_ratio == 100.0
+    assert not (out / "report" / "mesh_truth.png").exists()
+
+
+def test_truth_is_found_beside_the_poses_or_above(result):
+    truth, out = result
+    mesh, points = find_surface(EvalOptions(output=out, gt=truth))
+    assert (mesh.name, points.name) == ("mesh.ply", "points_seen_1cm.ply")
+    (truth / "poses").mkdir()
+    (truth / "traj.txt").rename(truth / "poses" / "traj.txt")
+    assert find_surface(EvalOptions(output=out, gt=truth / "poses"))[0] == mesh
+    given = EvalOptions(output=out, gt=truth, gt_mesh=out / "mesh.ply")
+    assert find_surface(given) == (out / "mesh.ply", None)
+    (truth / "mesh.ply").rename(truth / "other.ply")
+    assert find_surface(EvalOptions(output=out, gt=truth))[0] == points
+    with pytest.raises(InputError, match="does not exist"):
+        find_surface(EvalOptions(output=out, gt=truth, gt_mesh=truth / "none.ply"))
+
+
+def test_eval_without_a_surface_or_a_result(result):
+    truth, out = result
+    (out / "mesh.ply").unlink()
+    (out / "keyframes.tum").unlink()
+    evaluation = evaluate(EvalOptions(output=out, gt=truth / "traj.txt", plots=False))
+    assert evaluation.reconstruction is None
+    assert evaluation.keyframes is None
+    with pytest.raises(InputError, match=r"no trajectory\.tum"):
+        evaluate(EvalOptions(output=truth, gt=truth))
+    with pytest.raises(InputError, match=r"does not exist|not a folder"):
+        evaluate(EvalOptions(output=out, gt=truth / "nothing"))
+
+
+def test_level_axes_stand_upright():
+    axes = level_axes(circle())
+    assert np.allclose(axes @ axes.T, np.eye(3))
+    assert np.linalg.det(axes) == pytest.approx(1)
+    assert np.allclose(axes[2], [0, 0, 1])
+    assert np.allclose(level_axes(np.eye(4)[None])[2], [0, -1, 0])  # one pose: still a frame
+
+
+def test_shading_is_the_cosine_and_the_ceiling_is_cut():
+    half = (3.0, 2.0, 1.2)
+    vertices, faces = box(half)
+    view = Viewpoint("x", CAMERA, np.linalg.inv(circle()[0]))
+    picture = shade(vertices, faces, view)
+    middle = picture[47:49, 63:65].astype(float)
+    assert np.abs(middle - 190).max() <= 1  # a wall seen at right angles, at full brightness
+    assert picture.max() <= 190  # no background: the box is closed
+    ray = np.array([(20 - 63.5) / 80, 0, 1])
+    expected = 190 * (0.25 + 0.75 / np.linalg.norm(ray))
+    assert abs(float(picture[47:49, 20].mean()) - expected) < 1.5
+    red = np.tile(np.array([[200, 10, 20]], np.uint8), (8, 1))
+    assert np.abs(shade(vertices, faces, view, red)[48, 64].astype(int) - [200, 10, 20]).max() <= 1
+    above = viewpoints(vertices, circle(), CAMERA)[-1]
+    assert above.name == "from above"
+    size = above.camera
+    centre = shade(vertices, faces, above)[size.height // 2, size.width // 2]
+    depth_of_floor = np.abs(centre.astype(int) - 190).max()
+    assert depth_of_floor <= 1
+    assert (shade(vertices, faces, above)[0] == 255).all()
+
+
+def test_keyframe_and_path_pictures_are_written(tmp_path):
+    depth = np.full((48, 64), 2.0)
+    depth[:5] = 0
+    normal = np.zeros((48, 64, 3))
+    normal[10:, :, 2] = -1
+    image = np.full((96, 128, 3), 90, np.uint8)
+    plots.plot_keyframes(tmp_path / "k.png", [image] * 2, [depth] * 2, [normal] * 2, ["a", "b"])
+    tracked = np.ones(60, bool)
+    tracked[20:25] = False
+    plots.plot_path(tmp_path / "p.png", Trajectory(np.arange(60) / 30, circle(), tracked))
+    for name in ("k.png", "p.png"):
+        assert (tmp_path / name).stat().st_size > 5000
+
+
+def test_error_colours_go_from_pale_to_red():
+    samples = np.array([[0.0, 0, 0], [10, 0, 0]])
+    errors = np.array([0, 0, 0, 9, 9, 9.0])
+    colours = plots.error_colours(samples, samples.repeat(3, 0), errors, 9.0)
+    assert colours[0].sum() > 600
+    assert colours[1][0] > 100
+    assert colours[1][1] < 30

@@ -1,0 +1,159 @@
+"""Warping through a depth: an exact textured plane, masks, and gradients to depth and poses."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from geogs.config import LossConfig
+from geogs.errors import InputError
+from geogs.geometry.camera import Camera
+from geogs.geometry.lie import retract, se3_exp, se3_inverse
+from geogs.losses.multi_view import (
+    PhotoView,
+    enlarge_depth,
+    multi_view_loss,
+    occlusion_mask,
+    sample_image,
+    warp,
+)
+
+CAMERA = Camera(50.0, 52.0, 23.3, 19.1, 48, 40)
+NORMAL, DISTANCE = torch.tensor([0.2, -0.1, -1.0]).double(), 2.0
+REFERENCE = se3_exp(torch.tensor([0.05, 0.02, 0.1, 0.02, -0.03, 0.01]).double())
+TARGET = se3_exp(torch.tensor([-0.1, 0.05, 0.02, -0.02, 0.03, 0.04]).double())
+
+
+def plane_view(T_cw: torch.Tensor, camera: Camera = CAMERA) -> tuple[torch.Tensor, torch.Tensor]:
+    """Exact depth and smooth grey image of the plane n.X + distance = 0 of the world."""
+    T_wc = se3_inverse(T_cw)
+    rays = camera.rays(torch.float64) @ T_wc[:3, :3].T
+    depth = -(DISTANCE + T_wc[:3, 3] @ NORMAL) / (rays @ NORMAL)
+    points = T_wc[:3, 3] + depth[..., None] * rays
+    x, y = 9 * points[..., 0], 9 * points[..., 1]
+    grey = 0.5 + 0.2 * torch.sin(x + 0.3 * y) + 0.2 * torch.cos(0.4 * x - y)
+    return depth, grey
+
+
+def views(camera: Camera = CAMERA) -> tuple[torch.Tensor, PhotoView, PhotoView, torch.Tensor]:
+    """Reference depth, both views, target depth."""
+    depth, a = plane_view(REFERENCE, camera)
+    seen, b = plane_view(TARGET, camera)
+    return depth, PhotoView(a, camera, REFERENCE), PhotoView(b, camera, TARGET), seen
+
+
+def test_the_true_depth_warps_the_target_onto_the_reference() -> None:
+    depth, reference, target, seen = views()
+    warped = warp(target.grey, depth, CAMERA, CAMERA, REFERENCE, TARGET)
+    assert 0.7 < warped.in_view.double().mean() < 1
+    error = (warped.image - reference.grey)[warped.in_view].abs()
+    assert error.max() < 0.01  # what bilinear interpolation leaves
+    assert (warped.image[~warped.in_view] == 0).all()
+    assert occlusion_mask(warped, seen, CAMERA).sum() >= 0.99 * warped.in_view.sum()
+
+    loss = multi_view_loss(depth, reference, target, seen, LossConfig())
+    for wrong in (0.97, 1.03):
+        worse = multi_view_loss(wrong * depth, reference, target, seen, LossConfig())
+        assert worse > 3 * loss
+
+
+def test_hidden_and_outside_pixels_are_masked() -> None:
+    depth, _, target, seen = views()
+    depth[3, 4] = 0
+    depth[5, 6] = -1
+    warped = warp(target.grey, depth, CAMERA, CAMERA, REFERENCE, TARGET)
+    assert not warped.in_view[3, 4]
+    assert not warped.in_view[5, 6]
+    inside = (warped.pixels >= 0).all(-1) & (warped.pixels <= torch.tensor([47, 39])).all(-1)
+    assert (warped.in_view == inside & (depth > 0)).all()
+    for factor, expected in ((0.96, True), (1.04, True), (0.94, False), (1.06, False)):
+        mask = occlusion_mask(warped, factor * seen, CAMERA, 0.05)
+        assert bool(mask.any()) == expected
+    unknown = seen.clone()
+    unknown[:, 20:] = 0
+    mask = occlusion_mask(warped, unknown, CAMERA)
+    assert mask.any()
+    assert (warped.pixels[mask][:, 0] <= 19).all()
+    behind = REFERENCE.clone()
+    behind[2, 3] -= 10
+    assert not warp(target.grey, depth, CAMERA, CAMERA, REFERENCE, behind).in_view.any()
+
+
+def test_occlusion_accepts_a_depth_of_another_size() -> None:
+    big = CAMERA.resized(96, 80)
+    depth, _, target, _ = views(big)
+    small, _ = plane_view(TARGET, CAMERA)
+    warped = warp(target.grey, depth, big, big, REFERENCE, TARGET)
+    assert occlusion_mask(warped, small, big, 0.005).sum() >= 0.99 * warped.in_view.sum()
+
+
+def test_enlarged_depth_is_exact_where_linear_and_keeps_holes() -> None:
+    rows, columns = torch.meshgrid(torch.arange(10), torch.arange(12), indexing="ij")
+    depth = (2 + 0.1 * columns - 0.05 * rows).double()
+    depth[4, 5] = float("nan")
+    big = enlarge_depth(depth, 20, 24)
+    at_x = (torch.arange(24) + 0.5) / 2 - 0.5
+    at_y = (torch.arange(20) + 0.5) / 2 - 0.5
+    expected = 2 + 0.1 * at_x[None] - 0.05 * at_y[:, None]
+    known = big > 0
+    assert int((~known).sum()) == 16  # the 4x4 pixels that draw on the hole
+    assert not known[7:11, 9:13].any()
+    inner = torch.zeros_like(known)
+    inner[1:-1, 1:-1] = True
+    torch.testing.assert_close(big[known & inner], expected.double()[known & inner])
+
+
+def test_sobel_gives_the_value_of_the_interpolation_and_the_slope_of_the_filter() -> None:
+    rng = np.random.default_rng(0)
+    image = torch.from_numpy(rng.random((9, 10)))
+    pixels = torch.tensor([[3.0, 4.0], [5.25, 2.5]]).double().requires_grad_()
+    values = sample_image(image, pixels, "sobel")
+    torch.testing.assert_close(values, sample_image(image, pixels, "exact"))
+    (slope,) = torch.autograd.grad(values[0], pixels)
+    patch = image[3:6, 2:5]
+    across = (patch[:, 2] - patch[:, 0]) @ torch.tensor([1.0, 2.0, 1.0]).double() / 8
+    down = (patch[2] - patch[0]) @ torch.tensor([1.0, 2.0, 1.0]).double() / 8
+    torch.testing.assert_close(slope[0], torch.stack([across, down]))
+
+
+def test_gradients_match_finite_differences() -> None:
+    depth, _ = plane_view(REFERENCE, CAMERA.resized(12, 10))
+    _, reference, target, seen = views()
+    noise = np.random.default_rng(1).random((10, 12))
+    depth = (depth * torch.from_numpy(1 + 0.01 * noise)).requires_grad_()
+    config = replace(LossConfig(), ssim_weight=0.3)
+
+    def loss(d: torch.Tensor, xi_r: torch.Tensor, xi_t: torch.Tensor) -> torch.Tensor:
+        moved = reference.at(retract(xi_r, REFERENCE)), target.at(retract(xi_t, TARGET))
+        # Without the depth test: its mask may flip within the step of the difference.
+        return multi_view_loss(d, *moved, None, config)
+
+    still = torch.zeros(6, dtype=torch.float64, requires_grad=True)
+    inputs = (depth, still, still.detach().clone().requires_grad_())
+    assert torch.autograd.gradcheck(loss, inputs, eps=1e-8, atol=1e-6, rtol=1e-3, fast_mode=True)
+    value = multi_view_loss(depth, reference, target, seen, config)
+    (gradient,) = torch.autograd.grad(value, depth)
+    assert gradient.abs().max() > 0
+
+
+@pytest.mark.parametrize("value", [0.0, float("nan"), -1.0])
+def test_a_view_without_depth_gives_no_loss_and_no_gradient(value: float) -> None:
+    _, reference, target, seen = views()
+    depth = torch.full((20, 24), value, dtype=torch.float64, requires_grad=True)
+    loss = multi_view_loss(depth, reference, target, seen, LossConfig())
+    loss.backward()
+    assert float(loss.detach()) == 0
+    assert (depth.grad == 0).all()
+
+
+def test_photo_view_is_grey_smoothed_and_of_the_camera_size() -> None:
+    image = np.zeros((80, 96, 3), np.uint8)
+    image[:, 48:] = (255, 0, 0)
+    sharp = PhotoView.prepare(image, CAMERA, REFERENCE, blur=0.0)
+    assert sharp.grey.shape == (40, 48)
+    assert float(sharp.grey.max()) == pytest.approx(0.299, abs=2e-3)
+    soft = PhotoView.prepare(image, CAMERA, REFERENCE)
+    assert 0 < soft.grey[5, 23] < soft.grey[5, 24] < sharp.grey.max()
+    with pytest.raises(InputError, match="16"):
+        PhotoView.prepare(image, CAMERA.resized(12, 40), REFERENCE)

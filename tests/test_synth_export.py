@@ -1,0 +1,121 @@
+"""The written sequence: layout, exact round trip, the command, bad input."""
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from plyfile import PlyData
+
+from geogs.cli.synth import main
+from geogs.errors import InputError, OutputError
+from geogs.synth.export import default_camera, write_sequence
+from geogs.synth.raycast import Raycaster
+from geogs.synth.room import make_room
+from geogs.synth.trajectory import handheld_trajectory
+
+FRAMES, WIDTH, HEIGHT, SEED = 4, 96, 72, 2
+
+
+@pytest.fixture(scope="module")
+def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("synth") / "room"
+    size = ["--width", str(WIDTH), "--height", str(HEIGHT), "--image-format", "png"]
+    assert main([str(folder), "--frames", str(FRAMES), "--seed", str(SEED), "--video", *size]) == 0
+    return folder
+
+
+def _vertices(path: Path) -> np.ndarray:
+    vertex = PlyData.read(str(path))["vertex"]
+    return np.stack([vertex[axis] for axis in "xyz"], 1).astype(float)
+
+
+def test_layout(sequence: Path) -> None:
+    names = {str(path.relative_to(sequence)) for path in sequence.rglob("*") if path.is_file()}
+    expected = {"cam_params.json", "traj.txt", "mesh.ply", "points_seen_1cm.ply", "video.mp4"}
+    for i in range(FRAMES):
+        expected |= {f"results/frame{i:06d}.png", f"results/depth{i:06d}.png"}
+    assert names == expected
+
+
+def test_round_trip(sequence: Path) -> None:
+    """What is read back is what the raycaster gives for the poses and intrinsics read back."""
+    parameters = json.loads((sequence / "cam_params.json").read_text())["camera"]
+    camera = default_camera(WIDTH, HEIGHT)
+    for name, value in (("w", WIDTH), ("h", HEIGHT), ("fx", camera.fx), ("cy", camera.cy)):
+        assert parameters[name] == value
+    poses = np.loadtxt(sequence / "traj.txt").reshape(-1, 4, 4)
+    scene = make_room(SEED)
+    np.testing.assert_allclose(poses, handheld_trajectory(scene, FRAMES, SEED), atol=1e-9)
+    view = Raycaster(scene).render(camera, poses[3])
+    image = cv2.imread(str(sequence / "results/frame000003.png"))[..., ::-1]
+    assert np.abs(image.astype(int) - view.image).mean() < 0.01
+    depth = cv2.imread(str(sequence / "results/depth000003.png"), cv2.IMREAD_UNCHANGED)
+    assert depth.dtype == np.uint16
+    assert np.abs(depth / parameters["scale"] - view.depth).max() < 0.6 / parameters["scale"]
+
+
+def test_points_are_what_was_seen(sequence: Path) -> None:
+    """They project onto themselves in some frame, and lie inside the room."""
+    points = _vertices(sequence / "points_seen_1cm.ply")
+    scene = make_room(SEED)
+    assert len(points) > 5000
+    assert (points > -1e-4).all()
+    assert (points < scene.size + 1e-4).all()
+    assert np.quantile(scene.clearance(points), 0.7) < 1e-4
+    poses = handheld_trajectory(scene, FRAMES, SEED)
+    camera, raycaster = default_camera(WIDTH, HEIGHT), Raycaster(scene)
+    best = np.full(len(points), np.inf)
+    for T_wc in poses:
+        depth = raycaster.render(camera, T_wc).depth
+        x, y, z = ((points - T_wc[:3, 3]) @ T_wc[:3, :3]).T
+        u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+        column, row = np.rint(u).astype(int), np.rint(v).astype(int)
+        ok = (z > 0) & (column >= 0) & (column < WIDTH) & (row >= 0) & (row < HEIGHT)
+        ok &= (np.abs(u - column) < 1e-2) & (np.abs(v - row) < 1e-2)
+        best[ok] = np.minimum(best[ok], np.abs(depth[row[ok], column[ok]] - z[ok]))
+    assert (best < 1e-4).all()
+
+
+def test_mesh_fills_the_room(sequence: Path) -> None:
+    points = _vertices(sequence / "mesh.ply")
+    size = make_room(SEED).size
+    np.testing.assert_allclose(points.min(0), 0, atol=1e-5)
+    np.testing.assert_allclose(points.max(0), size, atol=1e-5)
+    faces = np.stack(PlyData.read(str(sequence / "mesh.ply"))["face"]["vertex_indices"])
+    assert faces.min() == 0
+    assert faces.max() == len(points) - 1
+
+
+def test_video_plays(sequence: Path) -> None:
+    capture = cv2.VideoCapture(str(sequence / "video.mp4"))
+    frames = []
+    while (frame := capture.read())[0]:
+        frames.append(frame[1])
+    assert len(frames) == FRAMES
+    image = cv2.imread(str(sequence / "results/frame000002.png"))
+    assert np.abs(frames[2].astype(float) - image).mean() < 8
+
+
+def test_jpeg_without_depth(tmp_path: Path) -> None:
+    seen: list[int] = []
+    write_sequence(tmp_path, 2, 32, 24, 1, depth=False, on_frame=seen.append)
+    assert sorted(p.name for p in (tmp_path / "results").iterdir()) == [
+        "frame000000.jpg",
+        "frame000001.jpg",
+    ]
+    assert seen == [0, 1]
+
+
+def test_bad_input(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="at least 1 frame"):
+        write_sequence(tmp_path, 0)
+    with pytest.raises(InputError, match="16 to"):
+        write_sequence(tmp_path, 1, 4, 4)
+    with pytest.raises(InputError, match="jpg or png"):
+        write_sequence(tmp_path, 1, image_format="bmp")
+    assert not list(tmp_path.iterdir())
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(OutputError):
+        write_sequence(tmp_path / "file", 1, 32, 24)
