@@ -13,6 +13,7 @@ from geogs.errors import InputError, OutputError
 from geogs.synth.export import default_camera, write_sequence
 from geogs.synth.raycast import Raycaster
 from geogs.synth.room import make_room
+from geogs.synth.scene import Scene
 from geogs.synth.trajectory import handheld_trajectory
 
 FRAMES, WIDTH, HEIGHT, SEED = 4, 96, 72, 2
@@ -24,6 +25,16 @@ def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
     size = ["--width", str(WIDTH), "--height", str(HEIGHT), "--image-format", "png"]
     assert main([str(folder), "--frames", str(FRAMES), "--seed", str(SEED), "--video", *size]) == 0
     return folder
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return make_room(SEED)
+
+
+@pytest.fixture(scope="module")
+def raycaster(scene: Scene) -> Raycaster:
+    return Raycaster(scene)
 
 
 def _vertices(path: Path) -> np.ndarray:
@@ -39,16 +50,15 @@ def test_layout(sequence: Path) -> None:
     assert names == expected
 
 
-def test_round_trip(sequence: Path) -> None:
+def test_round_trip(sequence: Path, scene: Scene, raycaster: Raycaster) -> None:
     """What is read back is what the raycaster gives for the poses and intrinsics read back."""
     parameters = json.loads((sequence / "cam_params.json").read_text())["camera"]
     camera = default_camera(WIDTH, HEIGHT)
     for name, value in (("w", WIDTH), ("h", HEIGHT), ("fx", camera.fx), ("cy", camera.cy)):
         assert parameters[name] == value
     poses = np.loadtxt(sequence / "traj.txt").reshape(-1, 4, 4)
-    scene = make_room(SEED)
     np.testing.assert_allclose(poses, handheld_trajectory(scene, FRAMES, SEED), atol=1e-9)
-    view = Raycaster(scene).render(camera, poses[3])
+    view = raycaster.render(camera, poses[3])
     image = cv2.imread(str(sequence / "results/frame000003.png"))[..., ::-1]
     assert np.abs(image.astype(int) - view.image).mean() < 0.01
     depth = cv2.imread(str(sequence / "results/depth000003.png"), cv2.IMREAD_UNCHANGED)
@@ -56,16 +66,15 @@ def test_round_trip(sequence: Path) -> None:
     assert np.abs(depth / parameters["scale"] - view.depth).max() < 0.6 / parameters["scale"]
 
 
-def test_points_are_what_was_seen(sequence: Path) -> None:
+def test_points_are_what_was_seen(sequence: Path, scene: Scene, raycaster: Raycaster) -> None:
     """They project onto themselves in some frame, and lie inside the room."""
     points = _vertices(sequence / "points_seen_1cm.ply")
-    scene = make_room(SEED)
     assert len(points) > 5000
     assert (points > -1e-4).all()
     assert (points < scene.size + 1e-4).all()
     assert np.quantile(scene.clearance(points), 0.7) < 1e-4
     poses = handheld_trajectory(scene, FRAMES, SEED)
-    camera, raycaster = default_camera(WIDTH, HEIGHT), Raycaster(scene)
+    camera = default_camera(WIDTH, HEIGHT)
     best = np.full(len(points), np.inf)
     for T_wc in poses:
         depth = raycaster.render(camera, T_wc).depth
@@ -78,11 +87,10 @@ def test_points_are_what_was_seen(sequence: Path) -> None:
     assert (best < 1e-4).all()
 
 
-def test_mesh_fills_the_room(sequence: Path) -> None:
+def test_mesh_fills_the_room(sequence: Path, scene: Scene) -> None:
     points = _vertices(sequence / "mesh.ply")
-    size = make_room(SEED).size
     np.testing.assert_allclose(points.min(0), 0, atol=1e-5)
-    np.testing.assert_allclose(points.max(0), size, atol=1e-5)
+    np.testing.assert_allclose(points.max(0), scene.size, atol=1e-5)
     faces = np.stack(PlyData.read(str(sequence / "mesh.ply"))["face"]["vertex_indices"])
     assert faces.min() == 0
     assert faces.max() == len(points) - 1

@@ -214,7 +214,7 @@ class LossConfig:
     photo_blur: float = 0.7
     """Standard deviation in pixels by which the photometric images are smoothed; at least 0."""
     photo_gradient: Literal["exact", "sobel"] = "exact"
-    """Image derivative of the warp: of the bilinear interpolation, or the smoother 3x3 Sobel."""
+    """Image derivative of the warp: of the bilinear interpolation, or of a 3x3 Sobel filter."""
 
 
 @dataclass(frozen=True)

@@ -121,10 +121,10 @@ def sample_image(
 ) -> Float[Tensor, "..."]:
     """Bilinear interpolation B: paper Eq. bilinear_interpolation.
 
-    ``exact`` differentiates the interpolation, whose slope is piecewise constant along a row.
-    ``sobel`` gives the same values, but the slope of a 3x3 Sobel filter: it looks a pixel further
-    and is continuous, so it points to the minimum from farther away; it is not the derivative of
-    the value.
+    ``exact`` differentiates the interpolation, whose slope jumps where it crosses a pixel.
+    ``sobel`` gives the same values with the slope of a 3x3 Sobel filter, which looks a pixel
+    further and does not jump, but is not the derivative of the value: descent then settles beside
+    the minimum of the loss (on a rendered room at 1.1 times the depth error, from any start).
     """
     if gradient == "exact":
         return bilinear(image, pixels)

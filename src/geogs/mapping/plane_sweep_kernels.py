@@ -9,6 +9,8 @@ from numba import njit
 
 BLOCK = 16
 """Planes matched before their costs are transposed into the volume: one cache line of float32."""
+STRIP = 16
+"""Rows matched at a time, so that all buffers stay in the first cache levels."""
 FAR = np.float32(1e9)
 OUTSIDE = np.float32(1.2)
 """Cost of a sample outside the neighbour, a little more than that of no likeness (1)."""
@@ -17,8 +19,8 @@ _FAST = {"cache": True, "nogil": True, "fastmath": True, "error_model": "numpy"}
 
 
 @njit(**_FAST)
-def _warp_plane(image, a, b, rho, warped, lowest):
-    """Sample ``image`` where the fronto-parallel plane of inverse depth ``rho`` projects.
+def _warp_row(image, a, b, rho, y, warped, lowest, index, fraction_u, fraction_v):
+    """Sample ``image`` where row ``y`` of the plane of inverse depth ``rho`` projects.
 
     Homogeneous pixel q = a p + rho b. ``lowest``, the least cost a pixel may get, is OUTSIDE where
     the sample leaves the image and 0 elsewhere. The loop over x is split so that all but the
@@ -29,34 +31,48 @@ def _warp_plane(image, a, b, rho, warped, lowest):
     right, down = np.uint32(1), np.uint32(w)
     last_u, last_v = np.float32(w - 1.001), np.float32(h - 1.001)
     s0, s1, s2 = np.float32(a[0, 0]), np.float32(a[1, 0]), np.float32(a[2, 0])
-    n = warped.shape[1]
-    index = np.empty(n, np.uint32)
-    fraction_u, fraction_v = np.empty(n, np.float32), np.empty(n, np.float32)
-    for y in range(warped.shape[0]):
-        c0 = np.float32(a[0, 1] * y + a[0, 2] + rho * b[0])
-        c1 = np.float32(a[1, 1] * y + a[1, 2] + rho * b[1])
-        c2 = np.float32(a[2, 1] * y + a[2, 2] + rho * b[2])
-        low, out = lowest[y], warped[y]
-        for x in range(n):
-            column = np.float32(np.int32(x))
-            q2 = c2 + s2 * column
-            inverse = np.float32(1.0) / max(q2, np.float32(1e-3))
-            u = (c0 + s0 * column) * inverse
-            v = (c1 + s1 * column) * inverse
-            cu = min(max(u, np.float32(0.0)), last_u)
-            cv = min(max(v, np.float32(0.0)), last_v)
-            gone = abs(cu - u) + abs(cv - v) + max(np.float32(1e-3) - q2, np.float32(0.0))
-            low[x] = OUTSIDE if gone > np.float32(0.0) else np.float32(0.0)
-            whole_u, whole_v = np.floor(cu), np.floor(cv)
-            fraction_u[x] = cu - whole_u
-            fraction_v[x] = cv - whole_v
-            index[x] = np.uint32(np.int32(whole_v * np.float32(w) + whole_u))
-        for x in range(n):
-            k = index[x]
-            top = flat[k] + fraction_u[x] * (flat[k + right] - flat[k])
-            k += down
-            bottom = flat[k] + fraction_u[x] * (flat[k + right] - flat[k])
-            out[x] = top + fraction_v[x] * (bottom - top)
+    c0 = np.float32(a[0, 1] * y + a[0, 2] + rho * b[0])
+    c1 = np.float32(a[1, 1] * y + a[1, 2] + rho * b[1])
+    c2 = np.float32(a[2, 1] * y + a[2, 2] + rho * b[2])
+    for x in range(warped.shape[0]):
+        column = np.float32(np.int32(x))
+        q2 = c2 + s2 * column
+        inverse = np.float32(1.0) / max(q2, np.float32(1e-3))
+        u = (c0 + s0 * column) * inverse
+        v = (c1 + s1 * column) * inverse
+        cu = min(max(u, np.float32(0.0)), last_u)
+        cv = min(max(v, np.float32(0.0)), last_v)
+        gone = abs(cu - u) + abs(cv - v) + max(np.float32(1e-3) - q2, np.float32(0.0))
+        lowest[x] = OUTSIDE if gone > np.float32(0.0) else np.float32(0.0)
+        whole_u, whole_v = np.floor(cu), np.floor(cv)
+        fraction_u[x] = cu - whole_u
+        fraction_v[x] = cv - whole_v
+        index[x] = np.uint32(np.int32(whole_v * np.float32(w) + whole_u))
+    for x in range(warped.shape[0]):
+        k = index[x]
+        top = flat[k] + fraction_u[x] * (flat[k + right] - flat[k])
+        k += down
+        bottom = flat[k] + fraction_u[x] * (flat[k + right] - flat[k])
+        warped[x] = top + fraction_v[x] * (bottom - top)
+
+
+@njit(**_FAST)
+def _column_sums(reference, warped, first, radius, ones, squares, products):
+    """Sums of b, b^2 and a b down 2 radius + 1 rows; ``reference`` starts ``first`` rows away."""
+    h, w = reference.shape
+    # Views, because an index that could be negative would keep the loops from vectorising.
+    one, square, product = ones[radius:], squares[radius:], products[radius:]
+    for x in range(w):
+        one[x] = np.float32(0.0)
+        square[x] = np.float32(0.0)
+        product[x] = np.float32(0.0)
+    for i in range(2 * radius + 1):
+        row, other = warped[i], reference[min(max(first + i, 0), h - 1)]
+        for x in range(w):
+            b = row[x]
+            one[x] += b
+            square[x] += b * b
+            product[x] += b * other[x]
 
 
 @njit(**_FAST)
@@ -74,59 +90,42 @@ def _window_sums(column, radius, out):
 
 
 @njit(**_FAST)
-def _add_row(reference, warped, sign, radius, ones, squares, products):
-    """Add (sign 1) or take away (sign -1) one image row from the running column sums."""
-    for x in range(warped.shape[0]):
-        s = warped[x]
-        ones[radius + x] += sign * s
-        squares[radius + x] += sign * s * s
-        products[radius + x] += sign * s * reference[x]
+def _ncc_row(sum_b, sum_bb, sum_ab, mean, scale, lowest, norm, floor, best):
+    """1 - NCC from the window sums, inserted into the sorted smallest costs ``best`` (keep, w).
 
-
-@njit(**_FAST)
-def _ncc_cost(reference, mean, scale, warped, lowest, radius, floor, out):
-    """out = 1 - NCC over (2 radius + 1)^2 windows, softened where variances are near ``floor``.
-
-    ``scale`` is 1 / sqrt(variance + floor) of the reference windows. Running column sums: the
-    images should be centred about zero so that little is lost to cancellation.
+    ``scale`` is 1 / sqrt(variance + floor) of the reference windows, which softens the likeness of
+    windows without texture to nothing.
     """
-    h, w = reference.shape
-    norm = np.float32(1.0 / (2 * radius + 1) ** 2)
-    one = np.float32(1.0)
-    ones = np.zeros(w + 2 * radius, np.float32)
-    squares, products = np.zeros_like(ones), np.zeros_like(ones)
-    sum_b = np.empty(w, np.float32)
-    sum_bb, sum_ab = np.empty_like(sum_b), np.empty_like(sum_b)
-    for dy in range(-radius, radius):
-        y = min(max(dy, 0), h - 1)
-        _add_row(reference[y], warped[y], one, radius, ones, squares, products)
-    for y in range(h):
-        y1 = min(y + radius, h - 1)
-        _add_row(reference[y1], warped[y1], one, radius, ones, squares, products)
-        _window_sums(ones, radius, sum_b)
-        _window_sums(squares, radius, sum_bb)
-        _window_sums(products, radius, sum_ab)
-        ma, sa, low, row = mean[y], scale[y], lowest[y], out[y]
-        for x in range(w):
-            m = sum_b[x] * norm
-            spread = max(sum_bb[x] * norm - m * m, np.float32(0.0)) + floor
-            cost = one - (sum_ab[x] * norm - ma[x] * m) * sa[x] / np.sqrt(spread)
-            row[x] = max(min(cost, OUTSIDE), low[x])
-        y0 = max(y - radius, 0)
-        _add_row(reference[y0], warped[y0], -one, radius, ones, squares, products)
+    keep = best.shape[0]
+    for x in range(sum_b.shape[0]):
+        m = sum_b[x] * norm
+        spread = max(sum_bb[x] * norm - m * m, np.float32(0.0)) + floor
+        ncc = (sum_ab[x] * norm - mean[x] * m) * scale[x] / np.sqrt(spread)
+        sum_b[x] = max(min(np.float32(1.0) - ncc, OUTSIDE), lowest[x])
+    for k in range(keep):
+        row = best[k]
+        for x in range(sum_b.shape[0]):
+            b, c = row[x], sum_b[x]
+            row[x] = min(b, c)
+            sum_b[x] = max(b, c)
 
 
 @njit(**_FAST)
-def _keep_best(cost, best):
-    """Insert ``cost`` into the sorted smallest costs ``best`` (keep, h, w)."""
-    keep = best.shape[0]
-    for y in range(cost.shape[0]):
-        for x in range(cost.shape[1]):
-            c = cost[y, x]
-            for k in range(keep):
-                b = best[k, y, x]
-                best[k, y, x] = min(b, c)
-                c = max(b, c)
+def _mean_rows(rows, share, out):
+    """out = share times the sum of the rows."""
+    for x in range(out.shape[0]):
+        out[x] = rows[0, x] * share
+    for k in range(1, rows.shape[0]):
+        for x in range(out.shape[0]):
+            out[x] += rows[k, x] * share
+
+
+@njit(**_FAST)
+def _transpose(block, count, volume, start):
+    """volume[x, start + k] = block[k, x] for k below ``count``."""
+    for x in range(volume.shape[0]):
+        for k in range(count):
+            volume[x, start + k] = block[k, x]
 
 
 @njit(**_FAST)
@@ -134,32 +133,48 @@ def match_planes(reference, mean, scale, images, a, b, planes, radius, floor, ke
     """volume[y, x, k] = mean of the ``keep`` smallest 1 - NCC over the neighbours, at plane k.
 
     ``a`` (n, 3, 3), ``b`` (n, 3): homographies a + rho b e_3^T of the neighbours (float64).
+    Windows have (2 radius + 1)^2 pixels; image borders repeat. Images should be centred about zero,
+    so that little is lost to cancellation in the variances.
     """
     h, w = reference.shape
-    n = images.shape[0]
-    warped, lowest = np.empty((h, w), np.float32), np.empty((h, w), np.float32)
-    cost = np.empty((h, w), np.float32)
-    best = np.empty((keep, h, w), np.float32)
-    block = np.empty((h, BLOCK, w), np.float32)
-    share = np.float32(1.0 / keep)
-    for start in range(0, planes.shape[0], BLOCK):
-        count = min(BLOCK, planes.shape[0] - start)
-        for k in range(count):
-            best[:] = FAR
-            for j in range(n):
-                _warp_plane(images[j], a[j], b[j], planes[start + k], warped, lowest)
-                _ncc_cost(reference, mean, scale, warped, lowest, radius, floor, cost)
-                _keep_best(cost, best)
-            for y in range(h):
-                for x in range(w):
-                    block[y, k, x] = best[0, y, x] * share
-                for i in range(1, keep):
-                    for x in range(w):
-                        block[y, k, x] += best[i, y, x] * share
-        for y in range(h):
-            for x in range(w):
-                for k in range(count):
-                    volume[y, x, start + k] = block[y, k, x]
+    warped = np.empty((STRIP + 2 * radius, w), np.float32)
+    lowest = np.empty_like(warped)
+    index = np.empty(w, np.uint32)
+    fraction_u, fraction_v = np.empty(w, np.float32), np.empty(w, np.float32)
+    columns = np.empty((3, w + 2 * radius), np.float32)
+    sums = np.empty((3, w), np.float32)
+    best = np.empty((STRIP, keep, w), np.float32)
+    block = np.empty((STRIP, BLOCK, w), np.float32)
+    norm, share = np.float32(1.0 / (2 * radius + 1) ** 2), np.float32(1.0 / keep)
+    for y0 in range(0, h, STRIP):
+        rows = min(STRIP, h - y0)
+        for start in range(0, planes.shape[0], BLOCK):
+            count = min(BLOCK, planes.shape[0] - start)
+            for k in range(count):
+                best[:] = FAR
+                for j in range(images.shape[0]):
+                    for i in range(rows + 2 * radius):
+                        y = min(max(y0 + i - radius, 0), h - 1)
+                        _warp_row(
+                            images[j], a[j], b[j], planes[start + k], y, warped[i], lowest[i],
+                            index, fraction_u, fraction_v,
+                        )  # fmt: skip
+                    for i in range(rows):
+                        y = y0 + i
+                        _column_sums(
+                            reference, warped[i:], y - radius, radius, columns[0], columns[1],
+                            columns[2],
+                        )  # fmt: skip
+                        for s in range(3):
+                            _window_sums(columns[s], radius, sums[s])
+                        _ncc_row(
+                            sums[0], sums[1], sums[2], mean[y], scale[y], lowest[i + radius],
+                            norm, floor, best[i],
+                        )  # fmt: skip
+                for i in range(rows):
+                    _mean_rows(best[i], share, block[i, k])
+            for i in range(rows):
+                _transpose(block[i], count, volume[y0 + i], start)
 
 
 @njit(**_FAST)
@@ -242,10 +257,7 @@ def aggregate_paths(volume, image, small, large, edge, forward, total):
             for direction in range(4):
                 dx = s * (direction - 1) if direction < 3 else s
                 dy = s if direction < 3 else 0
-                if direction < 3:
-                    current = rows[i % 2, direction, x]
-                else:
-                    current = side[j % 2]
+                current = rows[i % 2, direction, x] if direction < 3 else side[j % 2]
                 px, py = x - dx, y - dy
                 if px < 0 or px >= w or py < 0 or py >= h:
                     for k in range(planes):

@@ -184,19 +184,23 @@ def _add_samples(
     rho, slope_x, slope_y, confidence, guide, y, yy, dx, first, last, contrast, tolerance, sums
 ):
     """Moments of the residuals to the present planes of row y at samples (dx, yy - y) away."""
-    here, there = rho[y], rho[yy]
-    gx, gy, sure = slope_x[y], slope_y[y], confidence[yy]
+    # Views, because an index that could be negative would keep the loop from vectorising.
+    here, there = rho[y, first:last], rho[yy, first + dx : last + dx]
+    gx, gy = slope_x[y, first:last], slope_y[y, first:last]
+    sure = confidence[yy, first + dx : last + dx]
     fx, fy = np.float32(dx), np.float32(yy - y)
-    t0, t1, t2, t3, t4 = sums[0], sums[1], sums[2], sums[3], sums[4]
-    t5, t6, t7, t8 = sums[5], sums[6], sums[7], sums[8]
-    g0, g1, g2 = guide[0, y], guide[1, y], guide[2, y]
-    k0, k1, k2 = guide[0, yy], guide[1, yy], guide[2, yy]
-    for x in range(first, last):
-        r = there[x + dx] - here[x] - fx * gx[x] - fy * gy[x]
-        c0, c1, c2 = g0[x] - k0[x + dx], g1[x] - k1[x + dx], g2[x] - k2[x + dx]
+    row = sums[:, first:last]
+    t0, t1, t2, t3, t4 = row[0], row[1], row[2], row[3], row[4]
+    t5, t6, t7, t8 = row[5], row[6], row[7], row[8]
+    own, other = guide[:, y, first:last], guide[:, yy, first + dx : last + dx]
+    g0, g1, g2 = own[0], own[1], own[2]
+    k0, k1, k2 = other[0], other[1], other[2]
+    for x in range(last - first):
+        r = there[x] - here[x] - fx * gx[x] - fy * gy[x]
+        c0, c1, c2 = g0[x] - k0[x], g1[x] - k1[x], g2[x] - k2[x]
         far = r / (tolerance * here[x])
         like = ONE + contrast * (c0 * c0 + c1 * c1 + c2 * c2)
-        m = sure[x + dx] / (like * (ONE + far * far))
+        m = sure[x] / (like * (ONE + far * far))
         t0[x] += m
         t1[x] += m * fx
         t2[x] += m * fy

@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Float64
 
 from geogs.config import DepthConfig
-from geogs.mapping.completion import GRID_OFFSET, GRID_STRIDE
 from geogs.geometry.camera import Camera
+from geogs.mapping.completion import GRID_OFFSET, GRID_STRIDE
 from geogs.mapping.depth_view import DepthView
 
 

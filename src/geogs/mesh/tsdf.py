@@ -113,8 +113,8 @@ class SparseTsdf:
         Each pixel is a small plane: its inverse depth with its slopes, which is exact on flat
         surfaces at any slant and does not mix the two sides of a depth step. Every voxel of every
         block in view is updated up to one truncation behind the surface, so free space seen later
-        clears what an earlier view put there. Distances are along the optical axis. Beyond one
-        voxel behind the surface the weight falls to zero (Bylow et al. 2013), since what is
+        clears what an earlier view put there. Distances are along the optical axis. Beyond half
+        of that the weight falls to zero (Bylow et al. 2013), since what is
         behind one view's silhouette is often in front of another's surface.
         """
         depth = depth.to(self.device, torch.float32)
@@ -192,7 +192,7 @@ class SparseTsdf:
         sample = table[pixel.flatten()].unflatten(0, z.shape)
         surface = sample[..., 0] + sample[..., 1] * (u - column) + sample[..., 2] * (v - row)
         ahead = (1.0 / surface - z) / (self.truncation * self.voxel)
-        fade = ((1.0 + ahead) / (1.0 - 1.0 / self.truncation)).clamp(max=1.0)
+        fade = (2.0 + 2.0 * ahead).clamp(max=1.0)
         gain = torch.where(inside & (ahead > -1.0), sample[..., 3] * fade, 0.0)
         old = self._weight[slots]
         new = old + gain

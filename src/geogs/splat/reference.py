@@ -24,6 +24,8 @@ MIN_FACING = 1e-4
 """Lower bound of |cos| between a disk's normal and the line to its centre."""
 MAX_HIT_RATIO = 1e4
 """A hit further away than this multiple of the centre's depth does not count."""
+MAX_LOG_SCALE = 40.0
+"""Larger or smaller disks are ignored."""
 MAX_REACH_RATIO = 1e3
 """Upper bound of a disk's depth extent, as a multiple of its centre's depth."""
 
@@ -105,18 +107,18 @@ def render_reference(
     )
 
 
-def project_disks(
-    disks: DiskParameters, T_cw: Float[Tensor, "4 4"], near: float
-) -> ProjectedDisks:
+def project_disks(disks: DiskParameters, T_cw: Float[Tensor, "4 4"], near: float) -> ProjectedDisks:
     """Disks into the camera frame, without those that no pixel can blend, sorted by centre depth.
 
     Left out are disks whose centre is not beyond ``near``, whose opacity is below ``MIN_ALPHA``,
-    whose quaternion is zero or that hold a number that is not finite.
+    whose quaternion is zero, whose log-scale exceeds ``MAX_LOG_SCALE`` or that hold a number that
+    is not finite.
     """
     R, t = T_cw[:3, :3], T_cw[:3, 3]
     with torch.no_grad():
         finite = torch.cat([disks.position, disks.quaternion, disks.log_scale], 1).isfinite()
         ok = finite.all(1) & disks.opacity_logit.isfinite() & (disks.quaternion != 0).any(1)
+        ok &= (disks.log_scale.abs() < MAX_LOG_SCALE).all(1)
         center_z = (disks.position @ R.mT + t)[:, 2]
         ok &= (center_z > near) & (disks.opacity_logit.sigmoid() >= MIN_ALPHA)
         order = torch.argsort(torch.where(ok, center_z, torch.inf), stable=True)
@@ -198,9 +200,7 @@ def blend(
     )
 
 
-def distortion(
-    weight: Float[Tensor, "p n"], z: Float[Tensor, "p n"]
-) -> Float[Tensor, "p"]:
+def distortion(weight: Float[Tensor, "p n"], z: Float[Tensor, "p n"]) -> Float[Tensor, "p"]:
     """Spread of the hits along each ray: 2 sum_i w_i |z_i A_i - Z_i|.
 
     A_i and Z_i are the sums of w_j and w_j z_j over j < i. Equal to the paper's

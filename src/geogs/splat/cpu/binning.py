@@ -82,8 +82,8 @@ def cut_disks(boxes, outlines, slots, columns, start, stop, pair_runs, counts):
         for col in range(first_column, last_column):
             left = col * TILE_WIDTH
             lowest, highest = rows_within(outlines[i], left, left + TILE_WIDTH - 1)
-            low = int(math.ceil(max(lowest, y0)))
-            high = int(math.floor(min(highest, y1 - 1))) + 1
+            low = math.ceil(max(lowest, y0))
+            high = math.floor(min(highest, y1 - 1)) + 1
             slot = slots[i] + col - first_column
             for row in range(first_row, last_row):
                 first = max(low - row * TILE_HEIGHT, 0)

@@ -21,7 +21,6 @@ from geogs.splat.cpu.layout import (
     G_W,
     G_WX,
     G_WY,
-    GRADIENT,
     LANES,
     MAX_ALPHA,
     MIN_ALPHA,
@@ -93,7 +92,8 @@ def unblend_disk(state, first, last, r, rank, z_reference, inverse_near, g):
         z_kept = min(max(z, nearest), furthest)
         free = on_plane | (z_kept == z)
         z_hit = z if on_plane else z_kept
-        gauss = exp_minus(rho3 if on_plane else rho2)
+        rho = rho3 if on_plane else rho2
+        gauss = exp_minus(rho)
         a = opacity * gauss
         blended = (a >= MIN_ALPHA) & (state[_LAST + j] >= rank)
         is_free_alpha = blended & (a < MAX_ALPHA)
@@ -125,7 +125,7 @@ def unblend_disk(state, first, last, r, rank, z_reference, inverse_near, g):
         g_rho3 = TWO * g_rho if on_plane else ZERO
         g_rho2 = TWO * g_rho - g_rho3
         g_u, g_v = g_rho3 * u * z, g_rho3 * v * z
-        g_w = -z * (z * g_z + g_rho3 * rho3)
+        g_w = -z * (z * g_z + g_rho3 * rho)
         g_w = g_w if free else ZERO
         s_u += g_u
         s_ux += g_u * dx
@@ -150,9 +150,7 @@ def unblend_disk(state, first, last, r, rank, z_reference, inverse_near, g):
 
 
 @numba.njit(**_INLINE)
-def load_state(
-    state, saved, left, top, z_reference, d_depth, d_normal, d_alpha, d_distortion
-):
+def load_state(state, saved, left, top, z_reference, d_depth, d_normal, d_alpha, d_distortion):
     """A tile's final state and the losses' gradients of its maps.
 
     Depth is Z / A, so dL/dw_i collects d_depth / A (z_i - depth); the part without z_i and d_alpha

@@ -52,6 +52,7 @@ MIN_TRANSMITTANCE = np.float32(1e-4)
 MIN_FACING = 1e-4
 MIN_HIT_RATIO = np.float32(1e-4)
 MAX_REACH_RATIO = 1e3
+MAX_LOG_SCALE = 40.0
 
 ZERO = np.float32(0)
 HALF = np.float32(0.5)

@@ -15,6 +15,7 @@ from geogs.splat.cpu.layout import (
     CENTER_Y,
     HALF_X,
     HALF_Y,
+    MAX_LOG_SCALE,
     MAX_REACH_RATIO,
     MIDDLE_X,
     MIDDLE_Y,
@@ -109,7 +110,7 @@ def pixel_range(low, high, count):
     """Pixels first..last of a line of ``count`` whose centres lie between low and high."""
     low = min(max(low - 0.01, -1.0), float(count))
     high = min(max(high + 0.01, -1.0), float(count))
-    return max(int(math.ceil(low)), 0), min(int(math.floor(high)) + 1, count)
+    return max(math.ceil(low), 0), min(math.floor(high) + 1, count)
 
 
 @numba.njit(**_INLINE)
@@ -161,12 +162,12 @@ def sigmoid(x):
 
 @numba.njit(**_INLINE)
 def is_usable(position, quaternion, log_scale, opacity_logit, i):
-    """Whether disk i's numbers are finite, its quaternion not zero and its scale representable."""
+    """Whether disk i's numbers are finite, its quaternion not zero and its scales sensible."""
     total = position[i, 0] + position[i, 1] + position[i, 2] + opacity_logit[i]
     q = abs(quaternion[i, 0]) + abs(quaternion[i, 1]) + abs(quaternion[i, 2])
     q += abs(quaternion[i, 3])
     s = max(abs(log_scale[i, 0]), abs(log_scale[i, 1])) + 0 * (log_scale[i, 0] + log_scale[i, 1])
-    return abs(total) < np.inf and 0 < q < np.inf and s < 80
+    return abs(total) < np.inf and 0 < q < np.inf and s < MAX_LOG_SCALE
 
 
 @numba.njit(**PER_DISK)

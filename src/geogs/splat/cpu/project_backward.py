@@ -22,7 +22,6 @@ from geogs.splat.cpu.layout import (
     G_W,
     G_WX,
     G_WY,
-    GRADIENT,
     OPACITY,
     PER_DISK,
     UX,
