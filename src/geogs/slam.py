@@ -66,7 +66,7 @@ class Slam:
         if not correct:
             return
         with self.stopwatch("global bundle adjustment"):
-            correction = global_bundle(self.tracker, lambda f: progress("bundle adjustment", f))
+            correction = global_bundle(self.tracker, lambda f, _: progress("bundle adjustment", f))
         with self.stopwatch("map update"):
             self.mapper.correct(correction, self._keyframes(self.mapper.keyframe_ids))
         with self.stopwatch("final mapping"):

@@ -12,6 +12,8 @@ import geogs
 from geogs.cli.progress import RunProgress, peak_memory
 from geogs.config import Config
 from geogs.errors import InputError
+from geogs.evaluation import plots
+from geogs.evaluation.shading import viewpoints
 from geogs.io.sources.base import Source
 from geogs.io.writers.atomic import write_text
 from geogs.io.writers.intrinsics import write_intrinsics
@@ -143,3 +145,21 @@ def write_report(
     folder: Path, trajectory: Trajectory, renders: list[RenderedKeyframe], mesh: Mesh | None
 ) -> None:
     """Plots that need no ground truth: the path, renders beside images, the shaded mesh."""
+    folder.mkdir(exist_ok=True)
+    plots.plot_path(folder / "trajectory.png", trajectory)
+    if renders:
+        shown = [renders[i] for i in np.linspace(0, len(renders) - 1, min(5, len(renders))).round()
+                 .astype(int)]  # fmt: skip
+        plots.plot_keyframes(
+            folder / "keyframes.png",
+            [r.image for r in shown],
+            [r.depth.numpy() for r in shown],
+            [r.normal.numpy() for r in shown],
+        )
+    if mesh is not None:
+        views = viewpoints(mesh.vertices, trajectory.T_wc[trajectory.tracked], renders[0].camera)
+        surface = [("mesh", mesh.vertices, mesh.faces, None)]
+        coloured = [("colours", mesh.vertices, mesh.faces, mesh.colours)]
+        plots.plot_meshes(
+            folder / "mesh.png", surface + (coloured if mesh.colours is not None else []), views
+        )

@@ -83,7 +83,7 @@ def plot_keyframes(
     images: Sequence[UInt8[np.ndarray, "ih iw 3"]],
     depths: Sequence[Float[np.ndarray, "h w"]],
     normals: Sequence[Float[np.ndarray, "h w 3"]],
-    names: Sequence[str],
+    names: Sequence[str] | None = None,
 ) -> None:
     """One row a keyframe: image, rendered depth (one colour scale for all) and normals.
 
@@ -96,7 +96,7 @@ def plot_keyframes(
     height, width = images[0].shape[:2]
     figure = _figure(12.0, 0.4 + len(images) * 3.7 * height / width)
     plots = []
-    rows = zip(images, depths, normals, names, strict=True)
+    rows = zip(images, depths, normals, names or [""] * len(images), strict=True)
     for row, (image, depth, normal, name) in enumerate(rows):
         hidden = np.ma.masked_where(~(np.isfinite(depth) & (depth > 0)), depth)
         missing = ~(np.linalg.norm(normal, axis=-1) > 0.5)

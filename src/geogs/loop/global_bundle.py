@@ -6,7 +6,8 @@ from geogs.tracking.bundle import BundleOptions
 from geogs.tracking.graph import proximity_pairs
 from geogs.tracking.tracker import Tracker
 from geogs.types import PoseCorrection
-SUPP = 2
+SUPP = 3
+HUBER = 1.0
 
 
 def global_bundle(
@@ -34,7 +35,7 @@ def global_bundle(
     graph.edges = {}
     for n in range(config.global_rounds):
         graph.measure(graph.stale(pairs, 0.25), fine=True)
-        graph.adjust(list(graph.edges), ids[1:], ids, BundleOptions(iterations=4))
+        graph.adjust(list(graph.edges), ids[1:], ids, BundleOptions(iterations=4, huber=HUBER))
         if progress is not None:
             progress((n + 1) / config.global_rounds, "global bundle adjustment")
     after = {k: store[k].T_cw.clone() for k in ids}

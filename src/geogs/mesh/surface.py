@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from geogs.mesh.tsdf import BLOCK, SparseTsdf
+from geogs.mesh.tsdf import BLOCK, LIMIT, SparseTsdf
 from geogs.mesh.types import Mesh
 
 _CHUNK_BLOCKS = 16
@@ -108,5 +108,6 @@ def _edge_keys(position: Float[np.ndarray, "n 3"]) -> np.ndarray:
     base = np.floor(position + 0.2 * _SMALLEST)
     inner = position - base > 0.4 * _SMALLEST
     axis = np.where(inner.sum(1) > 1, 3, inner.argmax(1))
-    x, y, z = (base.astype(np.int64) + 2**19).T
-    return (((x << 20) + y << 20) + z << 2) + axis
+    x, y, z = (base.astype(np.int64) + LIMIT).T
+    width = 2 * LIMIT
+    return ((x * width + y) * width + z) * 4 + axis

@@ -15,10 +15,12 @@ from geogs.geometry.camera import Camera
 
 BLOCK = 8
 """Voxels along a side of a block."""
+LIMIT = 2**19
+"""Voxels have coordinates in [-LIMIT, LIMIT) along each axis; what lies farther is left out."""
 BYTES_PER_BLOCK = BLOCK**3 * 2 * 4
 _HALF = BLOCK // 2
 _BITS = 20
-_CHUNK = {"cpu": 128, "cuda": 32768}
+_CHUNK = {"cpu": 256, "cuda": 8192}
 
 
 def pack(coordinates: Int[Tensor, "n 3"]) -> Int[Tensor, "n"]:
@@ -40,12 +42,13 @@ def band_blocks(
     """Coordinates of every block that comes within the truncation of a point.
 
     Points are first gathered into half blocks, whose neighbours in reach of the truncation cover
-    the band around all of their points. ``truncation`` is in voxels.
+    the band around all of their points. ``truncation`` is in voxels. Points at :data:`LIMIT`
+    voxels from the origin or farther are left out.
     """
     cell = torch.floor(points / (voxel * _HALF)).long()
-    cell = cell[(cell.abs() < 2**_BITS - 2 * _HALF).all(-1)]
-    cell = unpack(torch.unique(pack(cell)))
     reach = math.ceil(truncation / _HALF)
+    cell = cell[(cell.abs() < LIMIT // _HALF - reach - 2).all(-1)]
+    cell = unpack(torch.unique(pack(cell)))
     low, high = (cell - reach) >> 1, (cell + reach) >> 1
     steps = torch.arange(reach + 1, device=points.device)
     offsets = torch.cartesian_prod(steps, steps, steps)
@@ -113,9 +116,9 @@ class SparseTsdf:
         Each pixel is a small plane: its inverse depth with its slopes, which is exact on flat
         surfaces at any slant and does not mix the two sides of a depth step. Every voxel of every
         block in view is updated up to one truncation behind the surface, so free space seen later
-        clears what an earlier view put there. Distances are along the optical axis. Beyond half
-        of that the weight falls to zero (Bylow et al. 2013), since what is
-        behind one view's silhouette is often in front of another's surface.
+        clears what an earlier view put there. In the farther half of that the weight falls to
+        zero (Bylow et al. 2013), since what is behind one view's silhouette is often in front of
+        another's surface. Distances are along the optical axis.
         """
         depth = depth.to(self.device, torch.float32)
         weight = weight.to(self.device, torch.float32)
@@ -189,7 +192,7 @@ class SparseTsdf:
         inside = (z > 1e-6) & (column >= 0) & (row >= 0)
         inside &= (column < camera.width) & (row < camera.height)
         pixel = torch.where(inside, row * camera.width + column, 0.0).long()
-        sample = table[pixel.flatten()].unflatten(0, z.shape)
+        sample = table.index_select(0, pixel.flatten()).unflatten(0, z.shape)
         surface = sample[..., 0] + sample[..., 1] * (u - column) + sample[..., 2] * (v - row)
         ahead = (1.0 / surface - z) / (self.truncation * self.voxel)
         fade = (2.0 + 2.0 * ahead).clamp(max=1.0)

@@ -77,7 +77,7 @@ _C3, _C4, _C5 = np.float32(-0.1664003761), np.float32(0.0406455346), np.float32(
 
 @numba.njit(inline="always", error_model="numpy", fastmath=PER_PIXEL["fastmath"])
 def exp_minus(x):
-    """exp(-x) of a float32 x >= 0 to six digits, and exp(-8) < MIN_ALPHA beyond 8.
+    """exp(-x) of a float32 x >= 0 to 3e-6 of itself, and exp(-8) < MIN_ALPHA beyond 8.
 
     (exp(-x / 16))^16 by a polynomial; a library's exp is a call and would keep loops scalar.
     """

@@ -120,12 +120,15 @@ def outline_of(mx, my, c, u, v, opacity, intrinsics, outline):
     ``u`` and ``v`` are the scaled tangents in the camera. The radius in deviations follows from the
     opacity. On the disk's plane it is an ellipse in the image: the dual conic of the circle, about
     the projected centre, M diag(r^2, r^2, -1) M^T with M = K [u v c]. Around the projected centre
-    it is the circle of the low-pass Gaussian. A disk that reaches behind the camera has no bounds.
+    it is the circle of the low-pass Gaussian. A disk that reaches behind the camera has no bounds:
+    an endless circle stands for it.
     """
     fx, fy = intrinsics[0], intrinsics[1]
     radius2 = 2 * math.log(opacity / MIN_ALPHA)
+    outline[CENTER_X], outline[CENTER_Y], outline[BLUR] = mx, my, math.sqrt(radius2 / 2)
     d = radius2 * (u[2] * u[2] + v[2] * v[2]) - c[2] * c[2]
     if d > -1e-6 * c[2] * c[2]:
+        outline[BLUR], outline[MIDDLE_X], outline[HALF_X] = np.inf, mx, -1
         return False
     x, y = c[0] / c[2], c[1] / c[2]
     ux, vx = fx * (u[0] - x * u[2]), fx * (v[0] - x * v[2])
@@ -135,7 +138,6 @@ def outline_of(mx, my, c, u, v, opacity, intrinsics, outline):
     xx = max(ox * ox - k * (ux * ux + vx * vx), 1e-6)
     yy = max(oy * oy - k * (uy * uy + vy * vy), 1e-6)
     xy = ox * oy - k * (ux * uy + vx * vy)
-    outline[CENTER_X], outline[CENTER_Y], outline[BLUR] = mx, my, math.sqrt(radius2 / 2)
     outline[MIDDLE_X], outline[MIDDLE_Y] = mx + ox, my + oy
     outline[HALF_X], outline[HALF_Y] = math.sqrt(xx), math.sqrt(yy)
     outline[SLOPE], outline[SIDE] = xy / xx, math.sqrt(max(yy - xy * xy / xx, 0.0))
@@ -196,8 +198,6 @@ def project_disks(
         x0, x1, y0, y1 = 0, width, 0, height
         if outline_of(mx, my, c, u, v, opacity, intrinsics, outlines[i]):
             x0, x1, y0, y1 = box_of(outlines[i], width, height)
-        else:
-            outlines[i, BLUR], outlines[i, HALF_X] = np.inf, -1
         if x0 >= x1 or y0 >= y1:
             continue
         boxes[i, 0], boxes[i, 1], boxes[i, 2], boxes[i, 3] = x0, x1, y0, y1
