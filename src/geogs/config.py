@@ -152,6 +152,12 @@ class DepthConfig:
     """Check: relative distance within which another keyframe's depth supports a pixel."""
     violation_distance: float = 0.05
     """Check: relative distance in front of another keyframe's depth that speaks against it."""
+    repair_below: float = 0.4
+    """Check: confidence below which a pixel takes the depth that others agree on."""
+    repair_votes: float = 1.0
+    """Check: sum of the others' confidences needed for that."""
+    repair_confidence: float = 0.3
+    """Check: confidence of such a pixel before the others' votes are counted."""
     vote_confidence: float = 0.5
     """Least confidence of a pixel that votes on points."""
     vote_support: float = 0.04

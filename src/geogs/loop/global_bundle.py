@@ -7,7 +7,7 @@ from geogs.tracking.graph import proximity_pairs
 from geogs.tracking.tracker import Tracker
 from geogs.types import PoseCorrection
 SUPP = 3
-HUBER = 1.0
+HUBER = 3.0
 
 
 def global_bundle(

@@ -11,9 +11,7 @@ from geogs.mapping.completion import GRID_OFFSET, GRID_STRIDE
 from geogs.mapping.depth_view import DepthView
 
 
-def parallax_degrees(
-    reference: DepthView, other: DepthView, depth: float
-) -> tuple[float, float]:
+def parallax_degrees(reference: DepthView, other: DepthView, depth: float) -> tuple[float, float]:
     """Angle between the two rays to the point ``depth`` ahead, and between the two directions."""
     ray = depth * reference.forward
     back = reference.center + ray - other.center
@@ -67,29 +65,37 @@ def depth_range(
 ) -> tuple[float, float]:
     """Nearest and farthest depth to search in the reference view.
 
-    From what the tracker is fairly sure of in this and the other views, seen from the reference,
-    widened by ``config.range_margin`` on both sides.
+    From the surest half of what the tracker knows in this and the other views (and all whose
+    relative deviation is below ``config.range_deviation``), seen from the reference and widened by
+    ``config.range_margin`` on both sides. (0.1, 10) if the tracker knows next to nothing.
     """
-    inverse = [np.empty(0)]
-    for view in [reference, *others]:
-        grid = view.inverse_depth
-        with np.errstate(divide="ignore", invalid="ignore"):
-            deviation = 1.0 / (grid * np.sqrt(view.information))
-        rows, columns = np.nonzero(
-            np.isfinite(deviation) & (deviation < config.range_deviation) & (grid > 0)
-        )
-        z = 1.0 / grid[rows, columns].astype(np.float64)
-        x = (GRID_OFFSET + GRID_STRIDE * columns - working.cx) / working.fx * z
-        y = (GRID_OFFSET + GRID_STRIDE * rows - working.cy) / working.fy * z
-        relative = reference.T_cw @ np.linalg.inv(view.T_cw)
-        point = relative[:3, :3] @ np.stack([x, y, z]) + relative[:3, 3:]
-        u = point[0] / np.maximum(point[2], 1e-6) * working.fx + working.cx
-        v = point[1] / np.maximum(point[2], 1e-6) * working.fy + working.cy
-        seen = (point[2] > 1e-6) & (abs(2 * u / working.width - 1) < 1)
-        seen &= abs(2 * v / working.height - 1) < 1
-        inverse.append(1.0 / point[2][seen])
-    sure = np.concatenate(inverse)
-    if len(sure) < 8:
+    inverse = np.concatenate(
+        [_seen_inverse_depth(reference, v, working, config) for v in (reference, *others)]
+    )
+    if len(inverse) < 8:
         return 0.1, 10.0
-    low, high = np.percentile(sure, [0.5, 99.5])
+    low, high = np.percentile(inverse, [0.5, 99.5])
     return float(1.0 / high / config.range_margin), float(1.0 / low * config.range_margin)
+
+
+def _seen_inverse_depth(
+    reference: DepthView, view: DepthView, working: Camera, config: DepthConfig
+) -> Float64[np.ndarray, "n"]:
+    """Inverse depths, in the reference view, of the sure cells of ``view`` that it can see."""
+    grid = view.inverse_depth.astype(np.float64)
+    known = np.isfinite(grid) & (grid > 0) & (view.information > 0)
+    rows, columns = np.nonzero(known)
+    z = 1.0 / grid[known]
+    deviation = z / np.sqrt(view.information[known])
+    if len(deviation) == 0:
+        return deviation
+    sure = deviation <= max(config.range_deviation, float(np.median(deviation)))
+    x = (GRID_OFFSET + GRID_STRIDE * columns - working.cx) / working.fx * z
+    y = (GRID_OFFSET + GRID_STRIDE * rows - working.cy) / working.fy * z
+    relative = reference.T_cw @ np.linalg.inv(view.T_cw)
+    point = relative[:3, :3] @ np.stack([x, y, z])[:, sure] + relative[:3, 3:]
+    point = point[:, point[2] > 1e-6]
+    u = point[0] / point[2] * working.fx + working.cx
+    v = point[1] / point[2] * working.fy + working.cy
+    seen = (np.abs(2 * u / working.width - 1) < 1) & (np.abs(2 * v / working.height - 1) < 1)
+    return 1.0 / point[2, seen]

@@ -60,8 +60,8 @@ class BundleOptions:
     """How a problem is solved."""
 
     iterations: int = 2
-    huber: float = 1.0
-    """Pixels beyond which a residual counts linearly."""
+    huber: float = 3.0
+    """Standard deviations beyond which a residual counts linearly."""
     damping: float = 1e-4
     """Levenberg damping relative to the diagonal of the reduced system."""
     depth_damping: float = 1e-3
@@ -119,8 +119,8 @@ def project(
 def robust_weight(
     residual: Float[Tensor, "*b 2"], weight: Float[Tensor, "*b 2"], huber: float
 ) -> Float[Tensor, "*b 2"]:
-    """Weights times Huber's factor ``min(1, huber / |residual|)``."""
-    norm = residual.norm(dim=-1, keepdim=True)
+    """Weights times Huber's factor ``min(1, huber / |W^(1/2) residual|)``."""
+    norm = (weight * residual.square()).sum(-1, keepdim=True).sqrt()
     return weight * (huber / norm.clamp(min=huber))
 
 
@@ -338,7 +338,7 @@ def solve_poses(
     pixels: Float[Tensor, "e p 2"],
     weight: Float[Tensor, "e p 2"],
     iterations: int = 4,
-    huber: float = 1.0,
+    huber: float = 3.0,
 ) -> tuple[Float[Tensor, "n 4 4"], Float[Tensor, "e p 2"]]:
     """Motion-only adjustment of independent frames, each seen from keyframes that stay fixed.
 

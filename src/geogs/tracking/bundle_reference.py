@@ -47,7 +47,9 @@ def gauss_newton_step(
     xi = torch.zeros(n, 6, dtype=torch.float64)
     delta = torch.zeros(n, p, dtype=torch.float64)
     r = residuals(problem, camera, rays, xi, delta)
-    w = problem.weight.double() * (options.huber / r.norm(dim=-1).clamp(min=options.huber))[..., None]
+    w = problem.weight.double()
+    norm = (w * r * r).sum(-1, keepdim=True).sqrt()
+    w = w * (options.huber / norm.clamp(min=options.huber))
     Jx, Jd = torch.autograd.functional.jacobian(
         lambda a, b: residuals(problem, camera, rays, a, b).reshape(-1), (xi, delta)
     )

@@ -149,7 +149,7 @@ def _polish(graph: FrameGraph, radius: int, rounds: int = 6) -> bool:
     ]
     for n in range(rounds):
         graph.measure(graph.stale(near, 0.25), fine=n >= 2)
-        options = BundleOptions(iterations=4, huber=(5.0, 2.0, 1.0)[min(n, 2)])
+        options = BundleOptions(iterations=4, huber=(30.0, 10.0, 3.0)[min(n, 2)])
         if graph.adjust(list(graph.edges), ids[1:], ids, options) is None:
             return False
         normalise(store)

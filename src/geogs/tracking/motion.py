@@ -94,7 +94,7 @@ class FrameLocator:
             match.pixels,
             weight,
             iterations=6,
-            huber=2.0,
+            huber=5.0,
         )
         error = residual[0].norm(dim=-1)
         agree = float((used & (error < 2 * self.max_residual)).float().mean())

@@ -10,6 +10,7 @@ from geogs.splat.cpu.layout import (
     CENTER_X,
     CENTER_Y,
     HALF_X,
+    MARGIN,
     MIDDLE_X,
     MIDDLE_Y,
     PER_DISK,
@@ -24,8 +25,6 @@ from geogs.splat.cpu.layout import (
 DIGIT_BITS = 11
 DIGITS = 1 << DIGIT_BITS
 _DIGIT = np.uint32(DIGITS - 1)
-# Pixels by which outlines are widened against rounding.
-_MARGIN = 0.01
 
 
 @numba.njit(**PER_DISK)
@@ -62,7 +61,7 @@ def rows_within(outline, left, right):
         half = math.sqrt(outline[BLUR] * outline[BLUR] - aside * aside)
         lowest = min(lowest, outline[CENTER_Y] - half)
         highest = max(highest, outline[CENTER_Y] + half)
-    return lowest - _MARGIN, highest + _MARGIN
+    return lowest - MARGIN, highest + MARGIN
 
 
 @numba.njit(**PER_DISK)

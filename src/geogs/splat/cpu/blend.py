@@ -46,7 +46,8 @@ _INLINE = {**PER_PIXEL, "cache": False}
 BLEND_PLANES = 10
 _RUN = np.uint64(LANES)
 _RUNS = TILE_PIXELS // LANES
-_CHECK_EVERY = 16
+CHECK_EVERY = 16
+"""List entries after which the runs worth visiting are looked up again."""
 
 
 @numba.njit(**_INLINE)
@@ -152,7 +153,7 @@ def blend_tiles(
     first_tile, last_tile, records, offsets, lists, runs, inverse_near,
     depth, normal, alpha, distortion, median_depth, visible, saved, state,
 ):  # fmt: skip
-    """Render every ``stride``-th tile from ``first_tile`` on.
+    """Render the tiles first_tile..last_tile; ``state`` is scratch of BLEND_PLANES planes.
 
     ``saved`` (tiles, SAVED, TILE_PIXELS) receives what the backward pass starts from; give it no
     tiles if there will be none. ``visible`` is only ever set.
@@ -172,7 +173,7 @@ def blend_tiles(
             shown = blend_disk(state, start, stop, records[i], rank, z_reference, inverse_near)
             if shown > ZERO:
                 visible[i] = True
-            if (k - first) % _CHECK_EVERY == _CHECK_EVERY - 1:
+            if (k - first) % CHECK_EVERY == CHECK_EVERY - 1:
                 first_run, last_run = live_runs(state)
                 if first_run >= last_run:
                     break

@@ -3,7 +3,7 @@
 import numba
 import numpy as np
 
-from geogs.splat.cpu.blend import common_runs, reference_depth
+from geogs.splat.cpu.blend import CHECK_EVERY, common_runs, reference_depth
 from geogs.splat.cpu.layout import (
     G_CLAMPED,
     G_MX,
@@ -150,7 +150,7 @@ def unblend_disk(state, first, last, r, rank, z_reference, inverse_near, g):
 
 
 @numba.njit(**_INLINE)
-def load_state(state, saved, left, top, z_reference, d_depth, d_normal, d_alpha, d_distortion):
+def load_state(state, saved, left, top, d_depth, d_normal, d_alpha, d_distortion):
     """A tile's final state and the losses' gradients of its maps.
 
     Depth is Z / A, so dL/dw_i collects d_depth / A (z_i - depth); the part without z_i and d_alpha
@@ -190,12 +190,25 @@ def last_of_runs(state, last_of):
     return int(most)
 
 
+@numba.njit(**_INLINE)
+def blended_runs(last_of, rank):
+    """First and last (exclusive) run that blends some disk of at least this rank."""
+    first, last = _RUNS, 0
+    for run in range(_RUNS):
+        if last_of[run] >= rank:
+            first, last = min(first, run), run + 1
+    return first, last
+
+
 @numba.njit(**PER_PIXEL)
 def unblend_tiles(
     first_tile, last_tile, records, offsets, lists, runs, inverse_near, saved,
     d_depth, d_normal, d_alpha, d_distortion, gradients, state,
 ):  # fmt: skip
-    """Gradients of every pair of every ``stride``-th tile from ``first_tile`` on."""
+    """Gradients of every list entry of the tiles first_tile..last_tile.
+
+    ``state`` is scratch of UNBLEND_PLANES planes.
+    """
     width = d_depth.shape[1]
     columns = (width + TILE_WIDTH - 1) // TILE_WIDTH
     last_of = np.empty(_RUNS, np.float32)
@@ -205,22 +218,18 @@ def unblend_tiles(
         if first == last:
             continue
         z_reference = reference_depth(records, lists, first, last)
-        load_state(
-            state, saved[tile], left, top, z_reference, d_depth, d_normal, d_alpha, d_distortion
-        )
+        load_state(state, saved[tile], left, top, d_depth, d_normal, d_alpha, d_distortion)
         used = last_of_runs(state, last_of)
         for k in range(first + used, last):
             gradients[k, :] = ZERO
-        first_run, last_run = _RUNS, 0
+        first_run, last_run = 0, _RUNS
         for k in range(first + used - 1, first - 1, -1):
-            i = lists[k]
             rank = np.float32(k - first + 1)
-            for run in range(_RUNS):
-                if last_of[run] == rank:
-                    first_run, last_run = min(first_run, run), max(last_run, run + 1)
+            if (k - first) % CHECK_EVERY == CHECK_EVERY - 1:
+                first_run, last_run = blended_runs(last_of, k - first + 2 - CHECK_EVERY)
             start, stop = common_runs(runs, k, first_run, last_run)
             g = gradients[k]
             if start == stop:
                 g[:] = ZERO
                 continue
-            unblend_disk(state, start, stop, records[i], rank, z_reference, inverse_near, g)
+            unblend_disk(state, start, stop, records[lists[k]], rank, z_reference, inverse_near, g)

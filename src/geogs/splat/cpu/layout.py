@@ -11,6 +11,8 @@ the compiler turns it into vector instructions of 16 lanes (AVX-512) or 8 (AVX2)
 a time. A *pair* is a disk and a tile that its box touches.
 """
 
+from typing import Any
+
 import numba
 import numpy as np
 
@@ -28,6 +30,9 @@ SLOPE x +- SIDE sqrt(1 - (x / HALF_X)^2); its highest point, y = HALF_Y, is at x
 (
     CENTER_X, CENTER_Y, BLUR, MIDDLE_X, MIDDLE_Y, HALF_X, HALF_Y, SLOPE, SIDE, TOP,
 ) = range(10)  # fmt: skip
+
+MARGIN = 0.01
+"""Pixels by which outlines are widened against rounding."""
 
 RECORD = 16
 """Floats per record: one cache line."""
@@ -59,8 +64,13 @@ HALF = np.float32(0.5)
 ONE = np.float32(1)
 TWO = np.float32(2)
 
-PER_DISK = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": {"contract"}}
-PER_PIXEL = {
+PER_DISK: dict[str, Any] = {
+    "cache": True,
+    "nogil": True,
+    "error_model": "numpy",
+    "fastmath": {"contract"},
+}
+PER_PIXEL: dict[str, Any] = {
     "cache": True,
     "nogil": True,
     "error_model": "numpy",

@@ -15,6 +15,7 @@ from geogs.splat.cpu.layout import (
     CENTER_Y,
     HALF_X,
     HALF_Y,
+    MARGIN,
     MAX_LOG_SCALE,
     MAX_REACH_RATIO,
     MIDDLE_X,
@@ -108,8 +109,8 @@ def bounded_facing(normal, center):
 @numba.njit(**_INLINE)
 def pixel_range(low, high, count):
     """Pixels first..last of a line of ``count`` whose centres lie between low and high."""
-    low = min(max(low - 0.01, -1.0), float(count))
-    high = min(max(high + 0.01, -1.0), float(count))
+    low = min(max(low - MARGIN, -1.0), float(count))
+    high = min(max(high + MARGIN, -1.0), float(count))
     return max(math.ceil(low), 0), min(math.floor(high) + 1, count)
 
 

@@ -154,7 +154,7 @@ def rasterize_backward(
         ),
         chunks, threads,
     )  # fmt: skip
-    out = tuple(np.empty_like(p) for p in trace.parameters)
+    out = Gradients(*map(np.empty_like, trace.parameters), np.zeros((3, 4)))
     sums, d_T = np.empty((n, GRADIENT), np.float32), np.zeros((_DISK_CHUNKS, 3, 4))
 
     def finish(chunk: int) -> None:
@@ -163,11 +163,13 @@ def rasterize_backward(
         position, quaternion, log_scale, _ = trace.parameters
         project_disks_backward(
             position, quaternion, log_scale, trace.T_cw, trace.intrinsics, trace.records,
-            lists.slots, sums, *span, *out, d_T[chunk],
+            lists.slots, sums, *span, out.position, out.quaternion, out.log_scale,
+            out.opacity_logit, d_T[chunk],
         )  # fmt: skip
 
     run_chunks(finish, _DISK_CHUNKS, threads)
-    return Gradients(*out, d_T.sum(0))
+    d_T.sum(0, out=out.T_cw)
+    return out
 
 
 def list_tiles(

@@ -1,9 +1,9 @@
 """Flow without a network: dense inverse search on what the present reprojection leaves over.
 
-The second image is warped into the first by the reprojection, OpenCV's DIS flow is computed on the
-pair and the warp is added back, so wide baselines are matched as well as narrow ones. Both
-directions are computed; their disagreement, the photometric difference and the image structure give
-the variance of a match.
+The second image is warped into the first by the reprojection and brought to its local brightness,
+OpenCV's DIS flow is computed on the pair and the warp is added back, so wide baselines are matched
+as well as narrow ones. Both directions are computed; their disagreement and the roughness of the
+flow that was left over give the variance of a match.
 """
 
 import threading
@@ -22,6 +22,10 @@ from geogs.tracking.grid import OFFSET, STRIDE, SampleGrid
 
 FAR = 1e3
 """Stands for a position outside the image, in pixels."""
+MAX_DISAGREEMENT = 1.0
+"""Forward and backward flow that differ by more pixels are no match."""
+MIN_STRUCTURE = 0.5
+"""Smaller eigenvalue of the structure tensor that counts as texture, grey levels^2 / pixel^2."""
 
 
 @dataclass(frozen=True)
@@ -29,9 +33,17 @@ class ClassicalImage:
     """An image as the classical operator keeps it."""
 
     grey: UInt8[np.ndarray, "h w"]
-    """Brightness divided by its local mean, 100 where they are equal."""
-    structure: Float[np.ndarray, "p"]
-    """Smaller eigenvalue of the structure tensor on the grid, grey levels^2 / pixel^2."""
+    texture: float
+    """Fraction of the grid with structure."""
+
+
+@dataclass(frozen=True)
+class _DenseFlow:
+    """Flow on every pixel, and what is needed to judge it."""
+
+    flow: np.ndarray
+    roughness: np.ndarray
+    """Mean gradient of the flow without the warp, around each grid cell."""
 
 
 class ClassicalFlow:
@@ -49,11 +61,12 @@ class ClassicalFlow:
         self._pixels = grid.pixels.cpu().numpy()
 
     def encode(self, image: UInt8[np.ndarray, "h w 3"]) -> ClassicalImage:
-        grey = _flatten_illumination(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
-        return ClassicalImage(grey, self._on_grid(_smaller_eigenvalue(grey)))
+        grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+        structure = self._on_grid(_smaller_eigenvalue(grey))
+        return ClassicalImage(grey, float((structure > MIN_STRUCTURE).mean()))
 
     def texture(self, encoded: ClassicalImage) -> float:
-        return float((encoded.structure > 2.0).mean())
+        return encoded.texture
 
     def measure(
         self,
@@ -71,7 +84,7 @@ class ClassicalFlow:
             start = list(torch.cat([forward, backward]).cpu().numpy())
         flows = list(self._pool.map(lambda x, y, s: self._dense(x, y, s, fine), a, b, start))
         reverse = [*flows[n:], *flows[:n]]
-        matches = list(self._pool.map(self._match, a, b, flows, reverse))
+        matches = list(self._pool.map(self._match, flows, reverse))
         pixels = torch.from_numpy(np.stack([m[0] for m in matches])).to(self.grid.device)
         weight = torch.from_numpy(np.stack([m[1] for m in matches])).to(self.grid.device)
         return FlowMatch(pixels[:n], weight[:n]), FlowMatch(pixels[n:], weight[n:])
@@ -95,32 +108,32 @@ class ClassicalFlow:
 
     def _dense(
         self, a: ClassicalImage, b: ClassicalImage, start: np.ndarray | None, fine: bool
-    ) -> np.ndarray:
-        """Flow from a to b on every pixel."""
+    ) -> _DenseFlow:
+        """Flow from a to b."""
         scale = 0 if fine else 1
         if start is None:
-            return self._dis(scale, cold=True).calc(a.grey, b.grey, None)
+            moved = _match_brightness(b.grey, a.grey)
+            flow = self._dis(scale, cold=True).calc(a.grey, moved, None)
+            return _DenseFlow(flow, self._on_grid(_roughness(flow)))
         shape = (self.grid.height, self.grid.width, 2)
         warp = np.clip(start - self._pixels, -1e4, 1e4).reshape(shape).astype(np.float32)
         warp = cv2.remap(
             warp, self._up_u, self._up_v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
         )
-        moved = self._warp(b.grey, warp, cv2.INTER_CUBIC)
+        moved = _match_brightness(self._warp(b.grey, warp, cv2.INTER_CUBIC), a.grey)
         rest = self._dis(scale).calc(a.grey, moved, None)
-        return rest + self._warp(warp, rest, cv2.INTER_LINEAR)
+        flow = rest + self._warp(warp, rest, cv2.INTER_LINEAR)
+        return _DenseFlow(flow, self._on_grid(_roughness(rest)))
 
-    def _match(
-        self, a: ClassicalImage, b: ClassicalImage, flow: np.ndarray, reverse: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def _match(self, there: _DenseFlow, back: _DenseFlow) -> tuple[np.ndarray, np.ndarray]:
         """Positions on the grid and their weights."""
-        f = self._on_grid(flow)
+        f = self._on_grid(there.flow)
         q = self._pixels + f
-        back = self._sample(reverse, q, FAR)
-        disagreement = np.linalg.norm(f + back, axis=-1)
+        disagreement = np.linalg.norm(f + self._sample(back.flow, q, FAR), axis=-1)
         camera = self.grid.camera
         inside = (q > 1).all(-1) & (q < [camera.width - 2, camera.height - 2]).all(-1)
-        ok = inside & (disagreement < 1.0)
-        weight = ok * match_weight(disagreement, a.structure)
+        ok = inside & (disagreement < MAX_DISAGREEMENT)
+        weight = ok / match_deviation(disagreement, there.roughness) ** 2
         q = np.where(np.isfinite(q), q, FAR).astype(np.float32)
         return q, np.repeat(weight[:, None], 2, 1).astype(np.float32)
 
@@ -144,26 +157,43 @@ class ClassicalFlow:
         )
 
 
-def match_weight(
-    disagreement: Float[np.ndarray, "p"], structure: Float[np.ndarray, "p"]
+def match_deviation(
+    disagreement: Float[np.ndarray, "p"], roughness: Float[np.ndarray, "p"]
 ) -> Float[np.ndarray, "p"]:
-    """Inverse variance of a match, 1 / pixel^2."""
-    return np.minimum(1.0, structure / 4 + 0.02) / (25 * (0.1 + disagreement) ** 2)
+    """Standard deviation of a match along any direction, pixels.
+
+    Fitted to true flow of rendered rooms: 1.48 times the median error given the forward-backward
+    disagreement in pixels and the mean gradient of the flow left after warping, which is large at
+    occlusions and where texture is missing. Image structure and photometric difference add nothing.
+    """
+    return 0.02 + 0.55 * disagreement + 2.4 * roughness
 
 
-def _flatten_illumination(grey: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]:
-    """Brightness relative to its local mean, so that gain and slow changes of light drop out."""
-    image = grey.astype(np.float32) + 10.0
-    # The mean is smooth, so an eighth of the resolution is enough.
-    size = (max(grey.shape[1] // 8, 1), max(grey.shape[0] // 8, 1))
-    small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-    mean = cv2.GaussianBlur(small, (0, 0), max(small.shape) / 16)
-    mean = cv2.resize(mean, grey.shape[::-1], interpolation=cv2.INTER_LINEAR)
-    return np.clip(100.0 * image / mean, 0, 255).astype(np.uint8)
+def _match_brightness(
+    image: UInt8[np.ndarray, "h w"], reference: UInt8[np.ndarray, "h w"]
+) -> UInt8[np.ndarray, "h w"]:
+    """The image with the slowly varying brightness of the reference; light and gain drop out."""
+    gain = (_local_mean(reference) + 4.0) / (_local_mean(image) + 4.0)
+    gain = cv2.resize(np.clip(gain, 0.2, 5.0), image.shape[::-1], interpolation=cv2.INTER_LINEAR)
+    return np.clip((image + np.float32(4.0)) * gain - 4.0, 0, 255).astype(np.uint8)
+
+
+def _local_mean(image: UInt8[np.ndarray, "h w"]) -> Float[np.ndarray, "r c"]:
+    """Over about an eighth of the long edge, at an eighth of the resolution."""
+    size = (max(image.shape[1] // 8, 1), max(image.shape[0] // 8, 1))
+    small = cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float32)
+    return cv2.GaussianBlur(small, (0, 0), max(size) / 16)
+
+
+def _roughness(flow: Float[np.ndarray, "h w 2"]) -> Float[np.ndarray, "h w"]:
+    """Norm of the flow's gradient, averaged over 9 x 9 pixels."""
+    gx = cv2.Sobel(flow, cv2.CV_32F, 1, 0, scale=1 / 8)
+    gy = cv2.Sobel(flow, cv2.CV_32F, 0, 1, scale=1 / 8)
+    return cv2.blur(np.sqrt((gx * gx + gy * gy).sum(-1)), (9, 9))
 
 
 def _smaller_eigenvalue(grey: UInt8[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
-    """Of the structure tensor averaged over 9 x 9 pixels."""
+    """Of the structure tensor averaged over 9 x 9 pixels, grey levels^2 / pixel^2."""
     gx = cv2.Sobel(grey, cv2.CV_32F, 1, 0, scale=1 / 8)
     gy = cv2.Sobel(grey, cv2.CV_32F, 0, 1, scale=1 / 8)
     xx, yy, xy = (cv2.boxFilter(p, -1, (9, 9)) for p in (gx * gx, gy * gy, gx * gy))
