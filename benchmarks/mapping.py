@@ -236,9 +236,7 @@ def main() -> None:
         keyframes = with_true_poses(keyframes, truth, sim)
     start = time.perf_counter()
     mapper = build(camera, keyframes, config)
-    scorer = Scorer(
-        arguments.sequence, config, sim, keyframes, truth, mapper.cameras.render
-    )
+    scorer = Scorer(arguments.sequence, config, sim, keyframes, truth, mapper.cameras.render)
     if arguments.baselines:
         baselines(mapper, scorer, camera)
     report_map("map, online", mapper, scorer)

@@ -33,7 +33,9 @@ def test_a_rigid_correction_is_followed_exactly_by_both_strategies():
         update = plan_update(x, anchor, correction, strategy)
         assert (apply_each(update.transform, x) - expected).abs().max() < 1e-9
         assert update.residual < 1e-9
-    assert update.correction == pytest.approx(float((expected - x).norm(dim=1).square().mean().sqrt()))
+    assert update.correction == pytest.approx(
+        float((expected - x).norm(dim=1).square().mean().sqrt())
+    )
 
 
 def test_scale_acts_about_the_new_camera_centre_not_the_world_origin():

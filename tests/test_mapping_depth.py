@@ -180,4 +180,4 @@ def test_unsure_pixels_take_what_the_others_agree_on(scene, depths):
     assert (checked.confidence[8:-8, 12:-12] > 0.5).mean() > 0.9
     sure = KeyframeDepth(hidden.depth, np.full_like(confidence, 0.9))
     kept = check_depth(sure, poses[0], others, poses[1:], RENDER, CONFIG)
-    assert np.array_equal(kept.depth, hidden.depth)
+    assert np.abs(kept.depth / hidden.depth - 1.0).max() < 0.02

@@ -373,6 +373,7 @@ class Config:
     mapping: MappingConfig = field(default_factory=MappingConfig)
     mesh: MeshConfig = field(default_factory=MeshConfig)
 
+
 Preset = Literal["fast", "default", "accurate"]
 
 

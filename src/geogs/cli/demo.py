@@ -32,8 +32,8 @@ def main(argv: Sequence[str]) -> int:
 
 def demo(options: DemoOptions) -> int:
     """The three commands one after the other."""
-    from geogs.cli import eval as evaluation
     from geogs.cli import run, synth
+    from geogs.cli.eval import main as evaluate
 
     room, result = str(options.output / "room"), str(options.output / "result")
     steps = [
@@ -42,7 +42,7 @@ def demo(options: DemoOptions) -> int:
             "--height", str(options.height), "--seed", str(options.seed),
         ]),
         ("run", run.main, [room, "-o", result]),
-        ("eval", evaluation.main, [result, "--gt", room]),
+        ("eval", evaluate, [result, "--gt", room]),
     ]  # fmt: skip
     for name, command, arguments in steps:
         print(f"$ geogs {name} {' '.join(arguments)}", flush=True)

@@ -50,7 +50,9 @@ def write_results(
     with slam.stopwatch("mesh"):
         try:
             mesh = extract_mesh(
-                views, config.mesh, lambda name, done, of: progress.stage(f"mesh: {name}", done / of)
+                views,
+                config.mesh,
+                lambda name, done, of: progress.stage(f"mesh: {name}", done / of),
             )
             write_mesh(output / "mesh.ply", mesh.vertices, mesh.faces, mesh.colours, mesh.normals)
         except InputError as error:

@@ -25,9 +25,7 @@ def look_up(
     lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32)
     rotation = np.ascontiguousarray(T_view[:3, :3], np.float32)
     translation = np.ascontiguousarray(T_view[:3, 3], np.float32)
-    relative_depths(
-        points, rotation, translation, lens, depth.depth, depth.confidence, ratio, sure
-    )
+    relative_depths(points, rotation, translation, lens, depth.depth, depth.confidence, ratio, sure)
     return ratio, sure
 
 

@@ -113,6 +113,9 @@ def upsample_grid(
     rows = ((v - GRID_OFFSET) / GRID_STRIDE).astype(np.float32)
     x, y = np.meshgrid(columns, rows)
     return cv2.remap(
-        np.ascontiguousarray(grid, np.float32), x, y, cv2.INTER_LINEAR,
+        np.ascontiguousarray(grid, np.float32),
+        x,
+        y,
+        cv2.INTER_LINEAR,
         borderMode=cv2.BORDER_REPLICATE,
     )

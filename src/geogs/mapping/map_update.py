@@ -50,9 +50,7 @@ def anchor_transforms(correction: PoseCorrection) -> tuple[Tensor, Tensor]:
     return torch.tensor(ids), se3_inverse(after) @ shrink @ before
 
 
-def apply_each(
-    S: Float[Tensor, "n 4 4"], points: Float[Tensor, "n 3"]
-) -> Float[Tensor, "n 3"]:
+def apply_each(S: Float[Tensor, "n 4 4"], points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
     """Every point by its own similarity."""
     return (S[:, :3, :3] @ points[:, :, None])[:, :, 0] + S[:, :3, 3]
 
@@ -121,9 +119,7 @@ def similarity_field(
     return sim3_exp(tangent) @ S
 
 
-def _fit_similarity(
-    source: Tensor, target: Tensor, weights: Tensor | None = None
-) -> Tensor | None:
+def _fit_similarity(source: Tensor, target: Tensor, weights: Tensor | None = None) -> Tensor | None:
     """Umeyama as a 4x4 matrix; None where the points do not determine one."""
     try:
         scale, R, t = umeyama(source, target, weights=weights)

@@ -138,7 +138,7 @@ class Mapper:
 
     def _training(self) -> Trainer:
         if self._trainer is None:
-            depth = self.views[self.mapped[0]].depth
+            depth = self.views[self.mapped[0]].dense
             sure = depth.depth[depth.confidence >= np.median(depth.confidence)]
             self._trainer = Trainer(self.map, self.cameras, self.config, float(np.median(sure)))
         return self._trainer
@@ -169,9 +169,9 @@ class Mapper:
         others = self._near(view)
         if others:
             poses = [o.depth_view.T_cw for o in others]
-            depths = [o.depth for o in others]
+            depths = [o.dense for o in others]
             checked = check_depth(
-                view.depth, view.depth_view.T_cw, depths, poses, self.cameras.render,
+                view.dense, view.depth_view.T_cw, depths, poses, self.cameras.render,
                 self.config.depth,
             )  # fmt: skip
             view.set_depth(checked, self.cameras)
@@ -180,21 +180,19 @@ class Mapper:
         """The keyframes with a depth that see a view's surface best from elsewhere."""
         known = [v for v in self.views.values() if v.depth is not None and v.id != view.id]
         views = [v.depth_view for v in known]
-        depth = float(np.median(view.depth.depth))
+        depth = view.typical_depth
         chosen = select_sweep_neighbours(view.depth_view, views, depth, self.config.depth)
         return [known[i] for i in chosen[:_CHECKING_VIEWS]]
 
     def _choose_partners(self, view: MapView) -> None:
         """Photometric partners of a view; it becomes a candidate for those before it."""
         photo = self.config.photo
-        depth = float(np.median(view.depth.depth))
         mapped = [self.views[i] for i in self.mapped]
-        view.partners = choose_partners(view, mapped, depth, photo)
+        view.partners = choose_partners(view, mapped, view.typical_depth, photo)
         for i in view.partners:
             other = self.views[i]
             pool = [self.views[j] for j in {*other.partners, view.id} if j in self.views]
-            depth = float(np.median(other.depth.depth))
-            other.partners = choose_partners(other, pool, depth, photo)
+            other.partners = choose_partners(other, pool, other.typical_depth, photo)
 
     def _batch(self, ids: list[int]) -> list[tuple[MapView, list[MapView]]]:
         views = [self.views[i] for i in ids]
@@ -208,15 +206,15 @@ class Mapper:
     def _vote(self, points: np.ndarray, views: list[MapView]) -> np.ndarray:
         views = [v for v in views if v.depth is not None]
         poses = [v.depth_view.T_cw for v in views]
-        depths = [v.depth for v in views]
+        depths = [v.dense for v in views]
         return vote(points, poses, depths, self.cameras.render, self.config.depth)
 
     @torch.no_grad()
     def _insert(self, view: MapView, min_confidence: float) -> None:
         """Disks where the map does not explain a view's depth, by local planes."""
         disk, camera = self.config.disk, self.cameras.render
-        depth = torch.from_numpy(view.depth.depth)
-        confidence = torch.from_numpy(view.depth.confidence)
+        depth = torch.from_numpy(view.dense.depth)
+        confidence = torch.from_numpy(view.dense.confidence)
         output = render(self.map, camera, view.T_cw)
         needed = unexplained(output, depth, confidence, disk) & (confidence >= min_confidence)
         v, u = candidate_pixels(camera.height, camera.width, disk.stride, self._torch_random)

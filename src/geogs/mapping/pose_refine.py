@@ -40,6 +40,7 @@ def refine_poses(
         if step < config.pose_iterations:
             optimizer.zero_grad()
             loss.backward()
+            assert tangent.grad is not None
             tangent.grad.nan_to_num_(nan=0.0, posinf=0.0, neginf=0.0)
             optimizer.step()
     return {view.id: T for view, T in zip(active[1:], best[1:], strict=True)}
@@ -63,7 +64,7 @@ def _pose_loss(
         output = render(disks, cameras.render, T_cw)
         total = total + fused_single_view(
             output.depth, output.normal, output.alpha.detach(), output.distortion.detach(),
-            view.constants, loss_config, unit,
+            view.known, loss_config, unit,
         )  # fmt: skip
         depth = torch.where(output.alpha.detach() > loss_config.min_alpha, output.depth, 0.0)
         for i in view.partners[:1]:

@@ -85,8 +85,21 @@ def photometric_step(
             inside[:] = ONE
             for s in range(count):
                 _sample_row(
-                    images[j], a[j], b[j], np.float32(y), offsets[s, 0], offsets[s, 1],
-                    rho[y], slope_x[y], slope_y[y], index, fu, fv, value, slope, inside,
+                    images[j],
+                    a[j],
+                    b[j],
+                    np.float32(y),
+                    offsets[s, 0],
+                    offsets[s, 1],
+                    rho[y],
+                    slope_x[y],
+                    slope_y[y],
+                    index,
+                    fu,
+                    fv,
+                    value,
+                    slope,
+                    inside,
                 )
                 _accumulate(patches[s, y], weights[s, y], value, slope, sums)
             _add_neighbour(sums, inside, floor, total)
@@ -139,8 +152,19 @@ def _add_neighbour(sums, inside, floor, total):
 
 @njit(**_FAST)
 def fit_planes(
-    rho, slope_x, slope_y, confidence, guide, radius, contrast, tolerance, stiffness,
-    new_rho, new_x, new_y, support,
+    rho,
+    slope_x,
+    slope_y,
+    confidence,
+    guide,
+    radius,
+    contrast,
+    tolerance,
+    stiffness,
+    new_rho,
+    new_x,
+    new_y,
+    support,
 ):
     """Weighted least-squares plane of inverse depth around each pixel (bilateral, robust).
 

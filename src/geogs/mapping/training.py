@@ -39,7 +39,7 @@ def view_loss(
     """
     loss = fused_single_view(
         output.depth, output.normal, output.alpha, output.distortion,
-        view.constants, config.loss, unit,
+        view.known, config.loss, unit,
     )  # fmt: skip
     if partners:
         depth = torch.where(output.alpha.detach() > config.loss.min_alpha, output.depth, 0.0)

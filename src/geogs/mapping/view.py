@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field, replace
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -55,6 +56,23 @@ class MapView:
     def id(self) -> int:
         """The keyframe's id."""
         return self.keyframe.id
+
+    @property
+    def dense(self) -> KeyframeDepth:
+        """The dense depth, where there must be one."""
+        assert self.depth is not None, f"keyframe {self.id} has no depth yet"
+        return self.depth
+
+    @property
+    def known(self) -> ViewConstants:
+        """The losses' constants, where there must be a depth."""
+        assert self.constants is not None, f"keyframe {self.id} has no depth yet"
+        return self.constants
+
+    @property
+    def typical_depth(self) -> float:
+        """Median of the dense depth, map units."""
+        return float(np.median(self.dense.depth))
 
     @property
     def T_cw(self) -> Float[Tensor, "4 4"]:
