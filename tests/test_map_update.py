@@ -80,7 +80,7 @@ def test_the_coherent_update_follows_a_bend_without_tearing():
     whole = plan_update(x, anchor, correction, "coherent")
     moved = apply_each(whole.transform, x)
     assert tearing(x, moved) < 0.1 * tearing(x, apply_each(torn.transform, x))
-    # Targets averaged over the keyframes that made the neighbourhood: what a smooth field can reach.
+    # What a smooth field can reach: the correction by position, without the scatter of anchors.
     smooth = plan_update(x, (x[:, 0] / 6 * 20).round().long(), correction, "per_keyframe")
     error = (moved - apply_each(smooth.transform, x)).norm(dim=1)
     assert error.mean() < 0.3 * smooth.correction

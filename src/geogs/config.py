@@ -52,6 +52,8 @@ class TrackingConfig:
     """Most such neighbours per keyframe."""
     local_rounds: int = 2
     """Rounds of flow and adjustment per keyframe."""
+    local_iterations: int = 3
+    """Gauss-Newton steps per round."""
     remeasure: float = 0.5
     """A pair is matched again when its reprojection has moved by this many pixels."""
     min_texture: float = 0.05
@@ -62,12 +64,20 @@ class TrackingConfig:
     """The camera is lost when the median reprojection error exceeds this, of the long edge."""
     relocalise: int = 5
     """Recent keyframes tried when the camera is lost."""
-    global_rounds: int = 5
-    """Rounds of flow and adjustment over all keyframes at the end."""
-    global_distance: float = 0.2
+    huber: float = 2.0
+    """Standard deviations of the flow beyond which a match counts linearly."""
+    global_rounds: int = 4
+    """Most rounds of flow and adjustment over all keyframes at the end."""
+    global_iterations: int = 10
+    """Gauss-Newton steps per round."""
+    global_remeasure: float = 0.25
+    """As remeasure, in the global adjustment, pixels."""
+    global_distance: float = 0.35
     """Largest frame distance of a pair in the global adjustment, of the long edge."""
-    global_pairs: int = 8
-    """Pairs per keyframe in the global adjustment."""
+    global_suppression: int = 3
+    """Pairs within this many keyframes of a chosen one are left out."""
+    global_pairs: int = 10
+    """Most pairs per keyframe in the global adjustment."""
 
 
 @dataclass(frozen=True)
@@ -98,9 +108,9 @@ class DepthConfig:
     """Factor by which the searched depths go beyond what the tracker saw, at least 1."""
     range_deviation: float = 0.1
     """Relative deviation below which the tracker's depth counts for the range."""
-    plane_step: float = 0.6
+    plane_step: float = 0.8
     """Pixels that the median neighbour moves from plane to plane."""
-    min_planes: int = 96
+    min_planes: int = 72
     """Fewest planes, at least 2."""
     max_planes: int = 144
     """Most planes."""
@@ -134,7 +144,7 @@ class DepthConfig:
     """Refinement: deviation of a photometric optimum times the root of its curvature."""
     tracker_scale: float = 0.2
     """Refinement: real over expected relative deviation of the tracker's depth."""
-    fit_radius: int = 3
+    fit_radius: int = 4
     """Local planes: pixels around the centre that make the fit."""
     fit_deviation: float = 0.01
     """Local planes: relative deviation at which a pixel counts half."""
@@ -144,7 +154,7 @@ class DepthConfig:
     """Local planes: weight of the previous slopes, in sure pixels at distance 1."""
     guide_contrast: float = 200.0
     """Local planes: how fast a pixel's weight falls with its colour difference, squared."""
-    plane_deviation: float = 0.005
+    plane_deviation: float = 0.003
     """Local planes: usual relative distance of a surface from them."""
     average_reach: float = 0.01
     """Check: relative distance within which depths of several keyframes are averaged."""
@@ -237,7 +247,7 @@ class DiskConfig:
     insert_behind: float = 0.05
     """... or where the map lies this fraction of the depth behind a sure depth."""
     insert_confidence: float = 0.1
-    """Least confidence of a depth that makes a disk at once; the rest waits for the window's end."""
+    """Least confidence of a depth that makes a disk at once; the rest follows later."""
     neighbours: int = 12
     """Points of the local plane fit, at least 4."""
     scale_factor: float = 0.6

@@ -3,11 +3,12 @@
 from collections.abc import Callable
 
 from geogs.tracking.bundle import BundleOptions
-from geogs.tracking.graph import proximity_pairs
+from geogs.tracking.graph import Pair, proximity_pairs
 from geogs.tracking.tracker import Tracker
 from geogs.types import PoseCorrection
-SUPP = 3
-HUBER = 3.0
+
+SETTLED = 0.02
+"""The rounds end when the reprojection of no more than this fraction of the pairs still moves."""
 
 
 def global_bundle(
@@ -17,26 +18,41 @@ def global_bundle(
 
     Each round measures the pairs whose reprojection has moved and adjusts everything; every round
     sharpens the next. Poses, inverse depth and information of the tracker are updated; the first
-    pose stays. Returns the poses before and after; scales are 1.
+    pose stays. ``progress`` is called with the fraction done and a message. Returns the poses
+    before and after; scales are 1. A tracker without a map is left alone.
     """
     config, store, graph = tracker.config, tracker.store, tracker.graph
-    ids = store.ids
+    ids = tracker.keyframe_ids
     before = {k: store[k].T_cw.clone() for k in ids}
-    pairs = proximity_pairs(
-        store,
+    pairs = global_pairs(tracker)
+    graph.edges = {}
+    options = BundleOptions(iterations=config.global_iterations, huber=config.huber)
+    for n in range(config.global_rounds if pairs else 0):
+        stale = graph.stale(pairs, config.global_remeasure)
+        if len(stale) <= SETTLED * len(pairs):
+            break
+        for start in range(0, len(stale), 16):
+            graph.measure(stale[start : start + 16], fine=True)
+            if progress is not None:
+                share = (n + start / len(stale)) / config.global_rounds
+                progress(share, "matching all keyframes")
+        graph.adjust(list(graph.edges), ids[1:], ids, options)
+    if progress is not None:
+        progress(1.0, "all keyframes adjusted")
+    after = {k: store[k].T_cw.clone() for k in ids}
+    return PoseCorrection(before, after, dict.fromkeys(ids, 1.0))
+
+
+def global_pairs(tracker: Tracker) -> list[Pair]:
+    """Neighbours in time and all places seen again, thinned evenly."""
+    config, ids = tracker.config, tracker.keyframe_ids
+    return proximity_pairs(
+        tracker.store,
         ids,
         ids,
         [],
         config.radius,
-        SUPP,
+        config.global_suppression,
         config.global_distance * max(tracker.camera.width, tracker.camera.height),
         config.global_pairs * len(ids),
     )
-    graph.edges = {}
-    for n in range(config.global_rounds):
-        graph.measure(graph.stale(pairs, 0.25), fine=True)
-        graph.adjust(list(graph.edges), ids[1:], ids, BundleOptions(iterations=4, huber=HUBER))
-        if progress is not None:
-            progress((n + 1) / config.global_rounds, "global bundle adjustment")
-    after = {k: store[k].T_cw.clone() for k in ids}
-    return PoseCorrection(before, after, dict.fromkeys(ids, 1.0))

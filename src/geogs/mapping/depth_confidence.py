@@ -9,12 +9,12 @@ from geogs.mapping.refinement import SlantedDepth
 
 # Weights of a logistic regression of "relative depth error below 2 %" on the evidence below,
 # fitted to two rendered rooms at once; fitted to one room they predict the other as well.
-_BIAS = -0.31
-_MARGIN = 0.34
-_TRACKER_AGREES = 0.79
-_TRACKER_DIFFERS = -0.87
-_JUMP = -0.46
-_SUPPORT = 0.66
+_BIAS = -0.55
+_MARGIN = 0.41
+_TRACKER_AGREES = 0.75
+_TRACKER_DIFFERS = -0.75
+_JUMP = -0.43
+_SUPPORT = 0.48
 
 _TOLERANCE = 0.02
 """Relative depth error that still counts as right."""

@@ -49,7 +49,8 @@ class MapOptimizer:
         self.first = [torch.zeros_like(p) for p in disks.parameters]
         self.second = [torch.zeros_like(p) for p in disks.parameters]
         device = disks.device
-        self._corrections = tuple(_bias_corrections(beta).to(device) for beta in betas)
+        first, second = (_bias_corrections(beta).to(device) for beta in betas)
+        self._corrections = (first, second)
 
     def zero_grad(self) -> None:
         """Forget the gradients."""

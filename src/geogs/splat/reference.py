@@ -40,7 +40,8 @@ class ProjectedDisks(NamedTuple):
     Camera frame; every field has one row per disk.
     """
 
-    index: Tensor
+    rows: Tensor
+    """Their indices among all disks."""
     center: Tensor
     tangents: tuple[Tensor, Tensor]
     normal: Tensor
@@ -85,7 +86,7 @@ def render_reference(
         torch.arange(h).to(disks.position), torch.arange(w).to(disks.position), indexing="ij"
     )
     pixels = torch.stack([x.flatten(), y.flatten()], -1)
-    step = max(1, _CHUNK_ELEMENTS // max(1, len(projected.index)))
+    step = max(1, _CHUNK_ELEMENTS // max(1, len(projected.rows)))
     if step >= len(pixels):
         values = blend(projected, pixels, camera, near)
     else:
@@ -94,9 +95,9 @@ def render_reference(
             for p in pixels.split(step)
         ]
         *maps, seen = zip(*pieces, strict=True)
-        values = PixelValues(*(torch.cat(m) for m in maps), torch.stack(seen).any(0))
+        values = PixelValues._make([*map(torch.cat, maps), torch.stack(seen).any(0)])
     visible = torch.zeros(len(disks.position), dtype=torch.bool, device=x.device)
-    visible[projected.index] = values.visible
+    visible[projected.rows] = values.visible
     return (
         values.depth.view(h, w),
         values.normal.view(h, w, 3),
@@ -135,7 +136,7 @@ def project_disks(disks: DiskParameters, T_cw: Float[Tensor, "4 4"], near: float
         reach = 3 * (scale * torch.stack([tangent_u[:, 2], tangent_v[:, 2]], -1)).norm(dim=-1)
         in_front, behind = torch.minimum(reach, z - near), torch.minimum(reach, MAX_REACH_RATIO * z)
     return ProjectedDisks(
-        index=index,
+        rows=index,
         center=center,
         tangents=(tangent_u, tangent_v),
         normal=torch.where(away[:, None], -normal, normal),
@@ -166,7 +167,7 @@ def intersect(
     w = 1 / z_c + slope
     hits = (w > 1 / (MAX_HIT_RATIO * z_c)) & (w < 1 / near)
     z = 1 / torch.where(hits, w, 1 / z_c)
-    rho3 = 0
+    rho3 = torch.zeros_like(w)
     for tangent, scale in zip(disks.tangents, disks.scale.unbind(-1), strict=True):
         along = (delta * tangent[:, :2]).sum(-1) - slope * (tangent * c).sum(-1)
         rho3 = rho3 + (z * along / scale) ** 2

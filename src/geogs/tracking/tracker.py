@@ -310,7 +310,9 @@ class Tracker:
             if n:
                 pairs = [e for e in edges if e[0] < e[1] and moving & set(e)]
                 self.graph.measure(self.graph.stale(pairs, c.remeasure), fine=False)
-            self.graph.adjust(edges, poses, depths, BundleOptions(iterations=2))
+            self.graph.adjust(
+                edges, poses, depths, BundleOptions(iterations=c.local_iterations, huber=c.huber)
+            )
 
     def _cull(self) -> tuple[int, ...]:
         """Remove the keyframe before the last if it adds little (DROID-SLAM's keyframe test)."""

@@ -21,9 +21,9 @@ def adam_rows(
     """As :func:`geogs.splat.optimizer.adam_reference`, for float32 tensors on the CPU."""
     n = len(p)
     width = p[0].numel() if n else 1
-    flat = (t.detach().reshape(n, width).numpy() for t in (p, grad, first, second))
+    x, g, m, v = (t.detach().reshape(n, width).numpy() for t in (p, grad, first, second))
     c1, c2 = (c.numpy() for c in corrections)
-    _adam(*flat, visible.numpy(), steps.numpy(), c1, c2, rate, betas[0], betas[1], eps)
+    _adam(x, g, m, v, visible.numpy(), steps.numpy(), c1, c2, rate, betas[0], betas[1], eps)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

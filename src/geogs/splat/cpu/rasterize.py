@@ -154,7 +154,8 @@ def rasterize_backward(
         ),
         chunks, threads,
     )  # fmt: skip
-    out = Gradients(*map(np.empty_like, trace.parameters), np.zeros((3, 4)))
+    p, q, s, o = (np.empty_like(array) for array in trace.parameters)
+    out = Gradients(p, q, s, o, T_cw=np.zeros((3, 4)))
     sums, d_T = np.empty((n, GRADIENT), np.float32), np.zeros((_DISK_CHUNKS, 3, 4))
 
     def finish(chunk: int) -> None:

@@ -33,8 +33,8 @@ class ClassicalImage:
     """An image as the classical operator keeps it."""
 
     grey: UInt8[np.ndarray, "h w"]
-    texture: float
-    """Fraction of the grid with structure."""
+    structure: Float[np.ndarray, "p"]
+    """Smaller eigenvalue of the structure tensor on the grid, grey levels^2 / pixel^2."""
 
 
 @dataclass(frozen=True)
@@ -62,11 +62,10 @@ class ClassicalFlow:
 
     def encode(self, image: UInt8[np.ndarray, "h w 3"]) -> ClassicalImage:
         grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-        structure = self._on_grid(_smaller_eigenvalue(grey))
-        return ClassicalImage(grey, float((structure > MIN_STRUCTURE).mean()))
+        return ClassicalImage(grey, self._on_grid(_smaller_eigenvalue(grey)))
 
     def texture(self, encoded: ClassicalImage) -> float:
-        return encoded.texture
+        return float((encoded.structure > MIN_STRUCTURE).mean())
 
     def measure(
         self,
@@ -84,7 +83,7 @@ class ClassicalFlow:
             start = list(torch.cat([forward, backward]).cpu().numpy())
         flows = list(self._pool.map(lambda x, y, s: self._dense(x, y, s, fine), a, b, start))
         reverse = [*flows[n:], *flows[:n]]
-        matches = list(self._pool.map(self._match, flows, reverse))
+        matches = list(self._pool.map(self._match, a, flows, reverse))
         pixels = torch.from_numpy(np.stack([m[0] for m in matches])).to(self.grid.device)
         weight = torch.from_numpy(np.stack([m[1] for m in matches])).to(self.grid.device)
         return FlowMatch(pixels[:n], weight[:n]), FlowMatch(pixels[n:], weight[n:])
@@ -125,7 +124,9 @@ class ClassicalFlow:
         flow = rest + self._warp(warp, rest, cv2.INTER_LINEAR)
         return _DenseFlow(flow, self._on_grid(_roughness(rest)))
 
-    def _match(self, there: _DenseFlow, back: _DenseFlow) -> tuple[np.ndarray, np.ndarray]:
+    def _match(
+        self, image: ClassicalImage, there: _DenseFlow, back: _DenseFlow
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Positions on the grid and their weights."""
         f = self._on_grid(there.flow)
         q = self._pixels + f
@@ -134,6 +135,8 @@ class ClassicalFlow:
         inside = (q > 1).all(-1) & (q < [camera.width - 2, camera.height - 2]).all(-1)
         ok = inside & (disagreement < MAX_DISAGREEMENT)
         weight = ok / match_deviation(disagreement, there.roughness) ** 2
+        # Without texture the flow stays where it started, smooth and consistent but uninformed.
+        weight = weight * np.minimum(1.0, image.structure / 2 + 0.01)
         q = np.where(np.isfinite(q), q, FAR).astype(np.float32)
         return q, np.repeat(weight[:, None], 2, 1).astype(np.float32)
 
@@ -166,7 +169,7 @@ def match_deviation(
     disagreement in pixels and the mean gradient of the flow left after warping, which is large at
     occlusions and where texture is missing. Image structure and photometric difference add nothing.
     """
-    return 0.02 + 0.55 * disagreement + 2.4 * roughness
+    return 0.04 + 0.55 * disagreement + 2.4 * roughness
 
 
 def _match_brightness(

@@ -1,0 +1,172 @@
+"""The whole system through the command line, on rendered frames with known truth."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from geogs.io.poses import read_tum_trajectory
+from geogs.io.writers.native import load_map
+
+GEOGS = [sys.executable, "-m", "geogs.cli.main"]
+FRAMES = 44
+# Small enough for a test, all stages on.
+QUICK = [
+    "--mapping.render-long-edge", "160", "--mapping.iterations", "6",
+    "--mapping.pose-iterations", "1", "--mapping.final-iterations", "60",
+]  # fmt: skip
+
+
+def geogs(*arguments: object, timeout: float = 400) -> subprocess.CompletedProcess[str]:
+    command = [*GEOGS, *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=timeout)
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory) -> Path:
+    """The start of a synthetic room sequence, 256 x 192."""
+    folder = tmp_path_factory.mktemp("room") / "room"
+    done = geogs("synth", folder, "--frames", FRAMES, "--width", 256, "--height", 192)
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
+@pytest.fixture(scope="module")
+def result(room, tmp_path_factory) -> Path:
+    """What ``geogs run`` leaves of it."""
+    folder = tmp_path_factory.mktemp("result") / "out"
+    done = geogs("run", room, "-o", folder, *QUICK)
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
+def test_a_run_reaches_its_accuracy(room, result):
+    done = geogs("eval", result, "--gt", room, "--no-plots")
+    assert done.returncode == 0, done.stderr
+    scores = json.loads((result / "eval.json").read_text())
+    assert scores["trajectory"]["ate_rmse_cm"] < 0.5
+    assert scores["trajectory"]["pairs"] == FRAMES
+    surface = scores["reconstruction"]
+    assert surface["accuracy_cm"] < 4.0
+    assert surface["completeness_ratio"] > 70.0
+
+
+def test_a_run_leaves_every_file(result):
+    names = [
+        "trajectory.tum", "keyframes.tum", "intrinsics.json", "mesh.ply", "splats.ply",
+        "map.safetensors", "config.yaml", "summary.json", "report/trajectory.png",
+        "report/keyframes.png", "report/mesh.png",
+    ]  # fmt: skip
+    assert [n for n in names if not (result / n).is_file()] == []
+    trajectory = read_tum_trajectory(result / "trajectory.tum")
+    assert np.allclose(np.diff(trajectory.timestamps), 1 / 30, atol=1e-6)
+    disks = load_map(result / "map.safetensors")
+    summary = json.loads((result / "summary.json").read_text())
+    assert disks.is_finite()
+    assert 1000 < len(disks) < 30_000
+    assert summary["disks"] == len(disks)
+    assert summary["frames"] == FRAMES
+    assert summary["lost_spans"] == []
+    assert summary["peak_memory_bytes"] < 2e9
+
+
+def test_ground_truth_is_never_read(room, result, tmp_path):
+    """Without the truth beside the images the poses come out the same, bit for bit."""
+    bare = tmp_path / "bare"
+    (bare / "results").mkdir(parents=True)
+    (bare / "cam_params.json").write_bytes((room / "cam_params.json").read_bytes())
+    for image in (room / "results").glob("frame*"):
+        (bare / "results" / image.name).write_bytes(image.read_bytes())
+    done = geogs("run", bare, "-o", tmp_path / "out", *QUICK)
+    assert done.returncode == 0, done.stderr
+    again = (tmp_path / "out" / "trajectory.tum").read_bytes()
+    assert again == (result / "trajectory.tum").read_bytes()
+    disks, twin = (
+        load_map(tmp_path / "out" / "map.safetensors"),
+        load_map(result / "map.safetensors"),
+    )
+    assert (disks.position == twin.position).all()
+
+
+def test_interrupting_keeps_what_there_is(room, tmp_path):
+    out = tmp_path / "out"
+    process = subprocess.Popen(
+        [*GEOGS, "run", str(room), "-o", str(out), *QUICK],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    log = ""
+    # The progress line shows keyframes once the map has been started.
+    deadline = time.monotonic() + 240
+    os.set_blocking(process.stderr.fileno(), False)
+    while time.monotonic() < deadline and process.poll() is None:
+        log += process.stderr.read() or ""
+        if "keyframes" in log and " 0 keyframes" not in log[-200:]:
+            break
+        time.sleep(0.2)
+    time.sleep(4)
+    process.send_signal(signal.SIGINT)
+    _, rest = process.communicate(timeout=240)
+    assert process.returncode == 0, log + rest
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["interrupted"] is True
+    assert 0 < summary["frames"] <= FRAMES
+    assert (out / "trajectory.tum").stat().st_size > 0
+
+
+def images(folder: Path, frames: list[np.ndarray]) -> Path:
+    folder.mkdir()
+    for i, frame in enumerate(frames):
+        cv2.imwrite(str(folder / f"{i:04d}.png"), frame)
+    return folder
+
+
+def noise(seed: int = 0) -> np.ndarray:
+    coarse = np.random.default_rng(seed).integers(0, 255, (24, 32, 3), dtype=np.uint8)
+    return cv2.resize(coarse, (256, 192), interpolation=cv2.INTER_CUBIC)
+
+
+CASES = {
+    "one frame": [noise()],
+    "static video": [noise()] * 30,
+    "black frames": [np.zeros((192, 256, 3), np.uint8)] * 20,
+    "pure rotation": [np.roll(noise(), 3 * i, axis=1) for i in range(40)],
+    "unrelated frames": [noise(i) for i in range(20)],
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_hopeless_input_gets_one_sentence(name, tmp_path):
+    folder = images(tmp_path / "images", CASES[name])
+    done = geogs(
+        "run", folder, "-o", tmp_path / "out", "--intrinsics", "200,200,127.5,95.5", *QUICK
+    )
+    assert done.returncode == 2, done.stderr
+    errors = [line for line in done.stderr.splitlines() if line.startswith("error:")]
+    assert len(errors) == 1, done.stderr
+    assert "Traceback" not in done.stderr
+    assert len(errors[0]) > 30
+
+
+def test_a_gap_of_black_frames_is_survived_and_reported(room, tmp_path):
+    """Frames that show nothing are marked as lost; the camera is found again after them."""
+    files = sorted((room / "results").glob("frame*"))
+    frames = [cv2.imread(str(f)) for f in files]
+    for i in range(26, 30):
+        frames[i] = np.zeros_like(frames[i])
+    folder = images(tmp_path / "images", frames)
+    camera = json.loads((room / "cam_params.json").read_text())["camera"]
+    intrinsics = ",".join(str(camera[k]) for k in ("fx", "fy", "cx", "cy"))
+    done = geogs("run", folder, "-o", tmp_path / "out", "--intrinsics", intrinsics, *QUICK)
+    assert done.returncode == 0, done.stderr
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert [[round(30 * t) for t in span] for span in summary["lost_spans"]] == [[26, 29]]
+    done = geogs("eval", tmp_path / "out", "--gt", room, "--no-plots")
+    scores = json.loads((tmp_path / "out" / "eval.json").read_text())
+    assert scores["keyframes"]["ate_rmse_cm"] < 0.6
