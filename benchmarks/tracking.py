@@ -88,7 +88,11 @@ def true_depth(path: Path, camera: Camera, T_wc: np.ndarray) -> Iterator[np.ndar
     """Depth of a mesh on the tracker's grid from each pose, by ray casting; inf where nothing is."""
     ply = PlyData.read(str(path))
     v = np.stack([ply["vertex"][a] for a in "xyz"], -1).astype(np.float64)
-    f = np.vstack(ply["face"].data["vertex_indices" if "vertex_indices" in ply["face"].data.dtype.names else "vertex_index"])
+    f = np.vstack(
+        ply["face"].data[
+            "vertex_indices" if "vertex_indices" in ply["face"].data.dtype.names else "vertex_index"
+        ]
+    )
     x, y = np.arange(4, camera.width - 3, 8), np.arange(4, camera.height - 3, 8)
     for T in T_wc:
         p = (v - T[:3, 3]) @ T[:3, :3]
@@ -102,11 +106,15 @@ def _raster(p, faces, camera, xs, ys):
     w = camera.fy * p[:, 1] / np.maximum(z, 0.01) + camera.cy
     keep = (z[faces] > 0.01).all(1)
     tu, tv = u[faces], w[faces]
-    keep &= (tu.max(1) >= xs[0]) & (tu.min(1) <= xs[-1]) & (tv.max(1) >= ys[0]) & (tv.min(1) <= ys[-1])
+    keep &= (
+        (tu.max(1) >= xs[0]) & (tu.min(1) <= xs[-1]) & (tv.max(1) >= ys[0]) & (tv.min(1) <= ys[-1])
+    )
     f, tu, tv = faces[keep], tu[keep], tv[keep]
     iz = 1 / z[f]
     depth = np.full((len(ys), len(xs)), np.inf)
-    area = (tu[:, 1] - tu[:, 0]) * (tv[:, 2] - tv[:, 0]) - (tu[:, 2] - tu[:, 0]) * (tv[:, 1] - tv[:, 0])
+    area = (tu[:, 1] - tu[:, 0]) * (tv[:, 2] - tv[:, 0]) - (tu[:, 2] - tu[:, 0]) * (
+        tv[:, 1] - tv[:, 0]
+    )
     lo_c = np.clip(np.ceil((tu.min(1) - 4) / 8), 0, len(xs)).astype(int)
     hi_c = np.clip(np.floor((tu.max(1) - 4) / 8) + 1, 0, len(xs)).astype(int)
     lo_r = np.clip(np.ceil((tv.min(1) - 4) / 8), 0, len(ys)).astype(int)
@@ -141,7 +149,9 @@ def depth_report(tracker: Tracker, sequence: Sequence, scale: float, every: int)
         metres.append(z[ok])
     error, sigma, metres = np.concatenate(error), np.concatenate(sigma), np.concatenate(metres)
     order = np.array_split(np.argsort(sigma), 8)
-    print(f"depth on the grid: {len(error) / len(ids) / tracker.grid.size:.0%} of the cells measured")
+    print(
+        f"depth on the grid: {len(error) / len(ids) / tracker.grid.size:.0%} of the cells measured"
+    )
     print("  sigma     |error|   |error|/sigma   median |error| cm   > 5 %")
     for part in order:
         e = np.abs(error[part])
@@ -150,9 +160,11 @@ def depth_report(tracker: Tracker, sequence: Sequence, scale: float, every: int)
             f"        {100 * np.median(e * metres[part]):9.2f}          {(e > 0.05).mean():6.1%}"
         )
     ratio = np.abs(error) / sigma
-    print(f"  all: |error|/sigma median {np.median(ratio):.2f} (normal: 0.67), "
-          f"68 % {np.quantile(ratio, 0.683):.2f} (1.00), 95 % {np.quantile(ratio, 0.954):.2f} (2.00), "
-          f"median |error| {100 * np.median(np.abs(error) * metres):.2f} cm")
+    print(
+        f"  all: |error|/sigma median {np.median(ratio):.2f} (normal: 0.67), "
+        f"68 % {np.quantile(ratio, 0.683):.2f} (1.00), 95 % {np.quantile(ratio, 0.954):.2f} (2.00), "
+        f"median |error| {100 * np.median(np.abs(error) * metres):.2f} cm"
+    )
 
 
 def save(path: Path, tracker: Tracker) -> None:
@@ -176,7 +188,9 @@ def main() -> None:
     parser.add_argument("--long-edge", type=int, default=512)
     parser.add_argument("--frames", type=int)
     parser.add_argument("--no-global", action="store_true")
-    parser.add_argument("--depth-every", type=int, default=0, help="check every n-th keyframe's depth")
+    parser.add_argument(
+        "--depth-every", type=int, default=0, help="check every n-th keyframe's depth"
+    )
     parser.add_argument("--out", type=Path)
     parser.add_argument("--set", nargs="*", default=[], help="name=value of TrackingConfig")
     args = parser.parse_args()
@@ -193,34 +207,45 @@ def main() -> None:
         spent += time.perf_counter() - tick
         lost += result.state.value == "lost"
         if result.new_keyframe is not None and len(tracker.store) % 10 == 0:
-            print(f"  frame {frame.index}: {len(tracker.store)} keyframes, "
-                  f"ATE {keyframe_error(tracker, sequence)[0]:.3f} cm, {spent:.1f} s", flush=True)
+            print(
+                f"  frame {frame.index}: {len(tracker.store)} keyframes, "
+                f"ATE {keyframe_error(tracker, sequence)[0]:.3f} cm, {spent:.1f} s",
+                flush=True,
+            )
     tick = time.perf_counter()
     tracker.finish()
     spent += time.perf_counter() - tick
     online, scale = keyframe_error(tracker, sequence)
     rate = len(sequence.files) / spent
     centres = tracker.trajectory().T_wc[:, :3, 3]
-    print(f"online: {len(tracker.store)} keyframes, keyframe ATE {online:.3f} cm, all frames "
-          f"{align(centres, sequence.T_wc[:, :3, 3])[0]:.3f} cm, lost {lost}, {rate:.1f} frames/s "
-          f"({spent:.1f} s tracking, {time.perf_counter() - start:.1f} s with reading, "
-          f"{time.process_time() - cpu:.1f} s CPU)", flush=True)
+    print(
+        f"online: {len(tracker.store)} keyframes, keyframe ATE {online:.3f} cm, all frames "
+        f"{align(centres, sequence.T_wc[:, :3, 3])[0]:.3f} cm, lost {lost}, {rate:.1f} frames/s "
+        f"({spent:.1f} s tracking, {time.perf_counter() - start:.1f} s with reading, "
+        f"{time.process_time() - cpu:.1f} s CPU)",
+        flush=True,
+    )
     if args.depth_every and sequence.mesh:
         depth_report(tracker, sequence, scale, args.depth_every)
     if not args.no_global:
         tick, cpu = time.perf_counter(), time.process_time()
         global_bundle(tracker)
         final, scale = keyframe_error(tracker, sequence)
-        print(f"global: keyframe ATE {final:.3f} cm, {len(tracker.graph.pairs)} pairs, "
-              f"{time.perf_counter() - tick:.1f} s, {time.process_time() - cpu:.1f} s CPU", flush=True)
+        print(
+            f"global: keyframe ATE {final:.3f} cm, {len(tracker.graph.pairs)} pairs, "
+            f"{time.perf_counter() - tick:.1f} s, {time.process_time() - cpu:.1f} s CPU",
+            flush=True,
+        )
         if args.depth_every and sequence.mesh:
             depth_report(tracker, sequence, scale, args.depth_every)
     tick = time.perf_counter()
     trajectory = tracker.trajectory()
     full, _ = align(trajectory.T_wc[:, :3, 3], sequence.T_wc[:, :3, 3])
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    print(f"all frames: ATE {full:.3f} cm ({time.perf_counter() - tick:.1f} s to solve), "
-          f"{(~trajectory.tracked).sum()} untracked, peak memory {peak:.0f} MiB")
+    print(
+        f"all frames: ATE {full:.3f} cm ({time.perf_counter() - tick:.1f} s to solve), "
+        f"{(~trajectory.tracked).sum()} untracked, peak memory {peak:.0f} MiB"
+    )
     if args.out:
         save(args.out, tracker)
 

@@ -64,7 +64,7 @@ class TrackingConfig:
     """The camera is lost when the median reprojection error exceeds this, of the long edge."""
     relocalise: int = 5
     """Recent keyframes tried when the camera is lost."""
-    huber: float = 2.0
+    huber: float = 1.5
     """Standard deviations of the flow beyond which a match counts linearly."""
     global_rounds: int = 4
     """Most rounds of flow and adjustment over all keyframes at the end."""

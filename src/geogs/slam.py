@@ -9,6 +9,7 @@ from geogs.geometry.camera import Camera
 from geogs.loop.global_bundle import global_bundle
 from geogs.mapping.mapper import Mapper
 from geogs.stopwatch import Stopwatch
+from geogs.threads import one_torch_thread
 from geogs.tracking.tracker import Tracker, TrackResult, TrackState
 from geogs.types import Frame, MapSnapshot, RenderedKeyframe, Trajectory
 
@@ -69,7 +70,7 @@ class Slam:
             correction = global_bundle(self.tracker, lambda f, _: progress("bundle adjustment", f))
         with self.stopwatch("map update"):
             self.mapper.correct(correction, self._keyframes(self.mapper.keyframe_ids))
-        with self.stopwatch("final mapping"):
+        with self.stopwatch("final mapping"), one_torch_thread():
             self.mapper.refine(lambda f: progress("map refinement", f))
 
     def trajectory(self) -> Trajectory:
@@ -83,13 +84,13 @@ class Slam:
 
     def renders(self) -> list[RenderedKeyframe]:
         """Depth, normal and reliability of the map seen from every mapped keyframe."""
-        with self.stopwatch("rendering"):
+        with self.stopwatch("rendering"), one_torch_thread():
             return self.mapper.renders()
 
     def _map(self, result: TrackResult, lag: int) -> None:
         """Hand settled keyframes to the mapper; train those whose successors are known."""
         self._waiting.extend(result.finalized)
-        with self.stopwatch("mapping"):
+        with self.stopwatch("mapping"), one_torch_thread():
             for keyframe in self._keyframes(list(result.finalized)):
                 self.mapper.observe(keyframe)
             self.mapper.follow(self._keyframes(list(result.active)))
@@ -98,7 +99,7 @@ class Slam:
                 self.mapper.map_keyframe(self._waiting.popleft())
                 trained = True
         if trained and self.config.mapping.pose_iterations:
-            with self.stopwatch("pose refinement"):
+            with self.stopwatch("pose refinement"), one_torch_thread():
                 self.tracker.write_back(self.mapper.refine_poses(list(result.active)))
 
     def _keyframes(self, ids: list[int]) -> list:

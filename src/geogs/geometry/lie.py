@@ -30,9 +30,7 @@ def _angle_series(t2: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     safe = torch.where(small, torch.ones_like(t2), t2)
     t = safe.sqrt()
     a = torch.where(small, 1 - t2 / 6 * (1 - t2 / 20 * (1 - t2 / 42)), t.sin() / t)
-    b = torch.where(
-        small, 0.5 - t2 / 24 * (1 - t2 / 30 * (1 - t2 / 56)), (1 - t.cos()) / safe
-    )
+    b = torch.where(small, 0.5 - t2 / 24 * (1 - t2 / 30 * (1 - t2 / 56)), (1 - t.cos()) / safe)
     c = torch.where(
         small, 1 / 6 - t2 / 120 * (1 - t2 / 42 * (1 - t2 / 72)), (t - t.sin()) / (safe * t)
     )
@@ -154,7 +152,9 @@ def sim3_adjoint(S: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 7 7"]:
     column = torch.zeros_like(t)[..., None]
     top = torch.cat([S[..., :3, :3], so3_hat(t) @ R, -t[..., None]], -1)
     middle = torch.cat([zero, R, column], -1)
-    bottom = torch.cat([zero[..., :1, :], zero[..., :1, :], torch.ones_like(column[..., :1, :])], -1)
+    bottom = torch.cat(
+        [zero[..., :1, :], zero[..., :1, :], torch.ones_like(column[..., :1, :])], -1
+    )
     return torch.cat([top, middle, bottom], -2)
 
 

@@ -24,6 +24,7 @@ from geogs.losses.multi_view import MIN_DEPTH_RATIO, PhotoView
 from geogs.losses.photometric import NCC_VARIANCE_FLOOR, ssim
 from geogs.losses.single_view import NORMAL_EPSILON, ViewConstants, visible
 from geogs.losses.single_view_kernels import single_view_rows
+from geogs.threads import worker_count
 
 
 @functools.cache
@@ -32,8 +33,8 @@ def _pool(workers: int) -> ThreadPoolExecutor:
 
 
 def _over_rows(kernel: Callable[[int, int], None], height: int) -> None:
-    """Runs ``kernel(first, last)`` on equal spans of rows, one per PyTorch thread."""
-    count = max(1, min(torch.get_num_threads(), height // 16))
+    """Runs ``kernel(first, last)`` on equal spans of rows, one per worker."""
+    count = max(1, min(worker_count(), height // 16))
     bounds = [height * k // count for k in range(count + 1)]
     spans = list(itertools.pairwise(bounds))
     waiting = [_pool(count - 1).submit(kernel, *span) for span in spans[1:]]

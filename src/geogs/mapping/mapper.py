@@ -1,7 +1,6 @@
 """The back end: keyframe depths in, a trained disk map and refined poses out."""
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import torch
@@ -24,6 +23,7 @@ from geogs.splat.density import candidate_pixels, unexplained, worth_keeping
 from geogs.splat.init import initialise_disks
 from geogs.splat.map import GaussianMap
 from geogs.splat.render import render
+from geogs.threads import thread_map
 from geogs.types import Keyframe, PoseCorrection, RenderedKeyframe
 
 # Keyframes whose depth checks a new keyframe's depth and whose free space carves around it.
@@ -67,7 +67,7 @@ class Mapper:
         """Give a keyframe its depth, carve and grow the map with it, train the window."""
         view = self.views[keyframe_id]
         self._estimate_ahead(keyframe_id)
-        self._check(view)
+        self._check([view])
         self.mapped.append(keyframe_id)
         self._choose_partners(view)
         trainer = self._training()
@@ -111,8 +111,7 @@ class Mapper:
         views = [self.views[i] for i in self.mapped]
         if self.config.final_depth:
             self._estimate(views)
-            for view in views:
-                self._check(view)
+            self._check(views)
         for view in views:
             self._choose_partners(view)
         self.prune()
@@ -160,21 +159,22 @@ class Mapper:
                 reference, neighbours, self.cameras.render, self.cameras.working, self.config.depth
             )
 
-        with ThreadPoolExecutor(torch.get_num_threads()) as pool:
-            for view, depth in zip(views, pool.map(estimate, views), strict=True):
-                view.set_depth(depth, self.cameras)
+        for view, depth in zip(views, thread_map(estimate, views), strict=True):
+            view.set_depth(depth, self.cameras)
 
-    def _check(self, view: MapView) -> None:
-        """Let the neighbours' depths revise the confidence of a view's depth."""
+    def _check(self, views: list[MapView]) -> None:
+        """Let the neighbours' depths, as they were estimated, revise those of the views."""
+        for view, depth in zip(views, thread_map(self._checked, views), strict=True):
+            view.set_depth(depth, self.cameras)
+
+    def _checked(self, view: MapView) -> KeyframeDepth:
         others = self._near(view)
-        if others:
-            poses = [o.depth_view.T_cw for o in others]
-            depths = [o.dense for o in others]
-            checked = check_depth(
-                view.dense, view.depth_view.T_cw, depths, poses, self.cameras.render,
-                self.config.depth,
-            )  # fmt: skip
-            view.set_depth(checked, self.cameras)
+        if not others:
+            return view.dense
+        poses = [o.depth_view.T_cw for o in others]
+        depths = [o.dense for o in others]
+        camera, config = self.cameras.render, self.config.depth
+        return check_depth(view.dense, view.depth_view.T_cw, depths, poses, camera, config)
 
     def _near(self, view: MapView) -> list[MapView]:
         """The keyframes with a depth that see a view's surface best from elsewhere."""

@@ -8,10 +8,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from geogs.geometry.camera import Camera
-from geogs.splat.cpu.pool import default_threads
 from geogs.splat.cpu.rasterize import rasterize_backward, rasterize_forward
 from geogs.splat.map import DiskParameters, GaussianMap
 from geogs.splat.reference import render_reference
+from geogs.threads import worker_count
 
 Backend = Literal["auto", "reference", "cpu"]
 
@@ -68,7 +68,7 @@ def render(
         return RenderOutput(*render_reference(parameters, camera, T_cw, near))
     if any(p.dtype != torch.float32 or p.device.type != "cpu" for p in parameters):
         raise ValueError("The cpu backend renders float32 disks on the CPU.")
-    return RenderOutput(*_Rasterize.apply(*parameters, T_cw, camera, near, default_threads()))
+    return RenderOutput(*_Rasterize.apply(*parameters, T_cw, camera, near, worker_count()))
 
 
 class _Rasterize(torch.autograd.Function):

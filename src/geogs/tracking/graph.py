@@ -59,7 +59,9 @@ class FrameGraph:
         index = torch.arange(len(directed), device=source.device)
         T = relative_motion(torch.cat([source, target]), index, index + len(directed))
         grid = store.grid
-        return project(grid.camera, grid.rays, T, store.inverse_depths([e[0] for e in directed])).pixels
+        return project(
+            grid.camera, grid.rays, T, store.inverse_depths([e[0] for e in directed])
+        ).pixels
 
     def measure(self, pairs: Iterable[Pair], cold: bool = False, fine: bool = True) -> None:
         """Measure the flow of pairs in both directions, starting from the reprojection."""
@@ -137,9 +139,7 @@ class FrameGraph:
                 state.T_cw = result.T_cw[n]
             if k in depths:
                 information = result.information[n]
-                state.inverse_depth = self.keyframes.grid.fill(
-                    result.inverse_depth[n], information
-                )
+                state.inverse_depth = self.keyframes.grid.fill(result.inverse_depth[n], information)
                 state.information = information
         return result
 

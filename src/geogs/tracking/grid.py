@@ -50,9 +50,7 @@ class SampleGrid:
         """Number of cells."""
         return self.width * self.height
 
-    def inside(
-        self, points: Float[Tensor, "*b 2"], margin: float = 1.0
-    ) -> Bool[Tensor, "*b"]:
+    def inside(self, points: Float[Tensor, "*b 2"], margin: float = 1.0) -> Bool[Tensor, "*b"]:
         """Whether pixel positions lie in the image, ``margin`` pixels from its border."""
         x, y = points.unbind(-1)
         right, bottom = self.camera.width - 1 - margin, self.camera.height - 1 - margin
@@ -80,9 +78,7 @@ class SampleGrid:
         full = self.sample_field(values, torch.stack([u, v], -1).reshape(-1, 2))
         return full.reshape(self.camera.height, self.camera.width, -1)
 
-    def cells_of(
-        self, points: Float[Tensor, "*b 2"]
-    ) -> tuple[Tensor, Bool[Tensor, "*b"]]:
+    def cells_of(self, points: Float[Tensor, "*b 2"]) -> tuple[Tensor, Bool[Tensor, "*b"]]:
         """Index of the cell nearest to each pixel position, and whether there is one."""
         cell = torch.round((points.nan_to_num(-1e4).clamp(-1e4, 1e5) - OFFSET) / STRIDE).long()
         c, r = cell.unbind(-1)

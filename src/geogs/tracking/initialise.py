@@ -22,7 +22,6 @@ from geogs.tracking.keyframes import KeyframeStore
 from geogs.tracking.motion import filled_positions, pnp, transfer_depth
 
 
-
 @dataclass(frozen=True)
 class TwoView:
     """The relative pose of a pair of views and the depth that it gives, up to scale."""
@@ -144,9 +143,7 @@ def _place_all(store: KeyframeStore, flows: list[FlowMatch], best: tuple[int, Tw
 def _polish(graph: FrameGraph, radius: int, rounds: int = 6) -> bool:
     """Rounds of flow and adjustment, from forgiving to strict."""
     store, ids = graph.keyframes, graph.keyframes.ids
-    near = [
-        (a, b) for n, a in enumerate(ids) for b in ids[n + 1 : n + 1 + radius]
-    ]
+    near = [(a, b) for n, a in enumerate(ids) for b in ids[n + 1 : n + 1 + radius]]
     for n in range(rounds):
         graph.measure(graph.stale(near, 0.25), fine=n >= 2)
         options = BundleOptions(iterations=4, huber=(30.0, 10.0, 3.0)[min(n, 2)])

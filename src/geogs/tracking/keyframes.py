@@ -12,6 +12,9 @@ from torch import Tensor
 from geogs.tracking.grid import SampleGrid
 from geogs.types import Keyframe
 
+RELATIVE_FLOOR = 0.004
+"""Relative depth deviation that no amount of matches removes."""
+
 
 @dataclass
 class KeyframeState:
@@ -98,6 +101,9 @@ class KeyframeStore:
         """The keyframe as the rest of the system sees it; tensors are copies."""
         s = self._states[id]
         shape = (self.grid.height, self.grid.width)
+        # What matches agree on is still wrong by a common error of poses and scale.
+        floor = (RELATIVE_FLOOR * s.inverse_depth).square()
+        information = s.information / (1 + s.information * floor)
         return Keyframe(
             id=s.id,
             frame_index=s.frame_index,
@@ -105,7 +111,7 @@ class KeyframeStore:
             image=s.image,
             T_cw=s.T_cw.clone(),
             inverse_depth=s.inverse_depth.reshape(shape).clone(),
-            information=s.information.reshape(shape).clone(),
+            information=information.reshape(shape),
         )
 
 

@@ -201,7 +201,9 @@ class Tracker:
         if len(self.store) < max(self.config.init_keyframes, MIN_KEYFRAMES):
             return TrackResult(self.state)
         if not self._initialise():
-            return TrackResult(self.state, removed=self._forget(len(self.store) // 2))
+            # More keyframes may bring parallax; with twice as many the first are given up.
+            full = len(self.store) >= 2 * self.config.init_keyframes
+            return TrackResult(self.state, removed=self._forget(len(self.store) // 2 * full))
         fresh = self._finalise(self.store.ids[:-1])
         return TrackResult(self.state, state.id, fresh, self.active)
 
@@ -264,9 +266,7 @@ class Tracker:
         anchor = self.store[motion.keyframe]
         if motion.flow < self.config.keyframe_flow * self._long_edge:
             T_rel = motion.T_cw @ se3_inverse(anchor.T_cw)
-            self.recorder.add(
-                frame.index, frame.timestamp, encoded, anchor.id, T_rel, motion.match
-            )
+            self.recorder.add(frame.index, frame.timestamp, encoded, anchor.id, T_rel, motion.match)
             return TrackResult(self.state, active=self.active)
         return self._insert(frame, encoded, motion)
 

@@ -52,9 +52,7 @@ class TrajectoryRecorder:
     is measured and every second cell of it is kept.
     """
 
-    def __init__(
-        self, store: KeyframeStore, operator: FlowOperator, max_pending: int = 64
-    ) -> None:
+    def __init__(self, store: KeyframeStore, operator: FlowOperator, max_pending: int = 64) -> None:
         self.store, self.operator, self.max_pending = store, operator, max_pending
         self.records: list[FrameRecord] = []
         self._pending: list[_Pending] = []

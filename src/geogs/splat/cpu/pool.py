@@ -6,13 +6,6 @@ import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
-import torch
-
-
-def default_threads() -> int:
-    """As many threads as PyTorch uses."""
-    return torch.get_num_threads()
-
 
 def run_chunks(function: Callable[[int], object], chunks: int, threads: int) -> None:
     """Call ``function(chunk)`` for every chunk; threads take the next one as they become free.

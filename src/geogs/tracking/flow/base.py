@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -20,6 +20,7 @@ class FlowMatch:
     """Inverse variance of x and y in 1 / pixel^2; zero where there is no match."""
 
 
+@runtime_checkable
 class FlowOperator(Protocol):
     """Measures image motion between pairs of images, in both directions at once."""
 

@@ -24,6 +24,8 @@ FAR = 1e3
 """Stands for a position outside the image, in pixels."""
 MAX_DISAGREEMENT = 1.0
 """Forward and backward flow that differ by more pixels are no match."""
+COARSE_DEVIATION = 1.7
+"""Deviation of a match at half resolution relative to full resolution."""
 MIN_STRUCTURE = 0.5
 """Smaller eigenvalue of the structure tensor that counts as texture, grey levels^2 / pixel^2."""
 
@@ -83,7 +85,10 @@ class ClassicalFlow:
             start = list(torch.cat([forward, backward]).cpu().numpy())
         flows = list(self._pool.map(lambda x, y, s: self._dense(x, y, s, fine), a, b, start))
         reverse = [*flows[n:], *flows[:n]]
-        matches = list(self._pool.map(self._match, a, flows, reverse))
+        scale = 1.0 if fine else COARSE_DEVIATION
+        matches = list(
+            self._pool.map(lambda x, f, r: self._match(x, f, r, scale), a, flows, reverse)
+        )
         pixels = torch.from_numpy(np.stack([m[0] for m in matches])).to(self.grid.device)
         weight = torch.from_numpy(np.stack([m[1] for m in matches])).to(self.grid.device)
         return FlowMatch(pixels[:n], weight[:n]), FlowMatch(pixels[n:], weight[n:])
@@ -125,7 +130,7 @@ class ClassicalFlow:
         return _DenseFlow(flow, self._on_grid(_roughness(rest)))
 
     def _match(
-        self, image: ClassicalImage, there: _DenseFlow, back: _DenseFlow
+        self, image: ClassicalImage, there: _DenseFlow, back: _DenseFlow, scale: float
     ) -> tuple[np.ndarray, np.ndarray]:
         """Positions on the grid and their weights."""
         f = self._on_grid(there.flow)
@@ -134,7 +139,7 @@ class ClassicalFlow:
         camera = self.grid.camera
         inside = (q > 1).all(-1) & (q < [camera.width - 2, camera.height - 2]).all(-1)
         ok = inside & (disagreement < MAX_DISAGREEMENT)
-        weight = ok / match_deviation(disagreement, there.roughness) ** 2
+        weight = ok / (scale * match_deviation(disagreement, there.roughness)) ** 2
         # Without texture the flow stays where it started, smooth and consistent but uninformed.
         weight = weight * np.minimum(1.0, image.structure / 2 + 0.01)
         q = np.where(np.isfinite(q), q, FAR).astype(np.float32)
@@ -165,11 +170,13 @@ def match_deviation(
 ) -> Float[np.ndarray, "p"]:
     """Standard deviation of a match along any direction, pixels.
 
-    Fitted to true flow of rendered rooms: 1.48 times the median error given the forward-backward
-    disagreement in pixels and the mean gradient of the flow left after warping, which is large at
-    occlusions and where texture is missing. Image structure and photometric difference add nothing.
+    Fitted to true flow of rendered rooms, given the forward-backward disagreement in pixels and the
+    mean gradient of the flow left after warping, which is large at occlusions and where texture is
+    missing; image structure and photometric difference add little. It is 1.4 times the deviation
+    of a single match, because the errors of a cell are alike in all its edges and the bundle
+    adjustment takes them for independent.
     """
-    return 0.04 + 0.55 * disagreement + 2.4 * roughness
+    return 0.06 + 0.8 * disagreement + 3.4 * roughness
 
 
 def _match_brightness(

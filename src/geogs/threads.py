@@ -1,0 +1,46 @@
+"""Threads of the compiled kernels, apart from PyTorch's own.
+
+PyTorch's OpenMP threads spin for a while after each operation. On a machine with few cores they
+take the cores that our kernels' threads need next, and a training step becomes several times
+slower. So kernels count their threads here, and PyTorch is held to one while they work.
+"""
+
+import functools
+import os
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from typing import TypeVar
+
+import torch
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+
+@functools.cache
+def worker_count() -> int:
+    """CPUs that this process may use, at most OMP_NUM_THREADS where that is set, at most 16."""
+    try:
+        available = len(os.sched_getaffinity(0))
+    except AttributeError:  # not on macOS and Windows
+        available = os.cpu_count() or 1
+    wanted = os.environ.get("OMP_NUM_THREADS", "")
+    return max(1, min(available, int(wanted) if wanted.isdigit() else 16, 16))
+
+
+def thread_map(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
+    """``list(map(function, items))`` over the workers; results in the order of the items."""
+    with ThreadPoolExecutor(worker_count()) as pool:
+        return list(pool.map(function, items))
+
+
+@contextmanager
+def one_torch_thread() -> Iterator[None]:
+    """PyTorch on one thread inside the block."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
