@@ -60,13 +60,13 @@ def test_jacobians_match_autograd_and_finite_differences():
     zero = torch.zeros(6, dtype=torch.float64), torch.zeros(grid.size, dtype=torch.float64)
     Jx, Jd = torch.autograd.functional.jacobian(moved, zero)
     Jd = torch.stack([Jd[k, :, k] for k in range(grid.size)])
-    torch.testing.assert_close(fast.pose_jacobian[0], Jx, rtol=1e-9, atol=1e-8)
+    torch.testing.assert_close(fast.pose_jacobian[0].permute(2, 1, 0), Jx, rtol=1e-9, atol=1e-8)
     torch.testing.assert_close(fast.depth_jacobian[0], Jd, rtol=1e-9, atol=1e-8)
     for k in range(6):
         step = torch.zeros(6, dtype=torch.float64)
         step[k] = 1e-6
         numeric = (moved(step, zero[1]) - moved(-step, zero[1])) / 2e-6
-        torch.testing.assert_close(fast.pose_jacobian[0, ..., k], numeric, rtol=1e-6, atol=1e-5)
+        torch.testing.assert_close(fast.pose_jacobian[0, k].mT, numeric, rtol=1e-6, atol=1e-5)
     numeric = (moved(zero[0], zero[1] + 1e-6) - moved(zero[0], zero[1] - 1e-6)) / 2e-6
     torch.testing.assert_close(fast.depth_jacobian[0], numeric, rtol=1e-6, atol=1e-5)
 

@@ -6,7 +6,6 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from tracking_scenes import CAMERA, frames, pose, render, sideways
 
 from geogs.config import TrackingConfig
 from geogs.errors import GeogsError, InputError, TrackingLost
@@ -15,6 +14,7 @@ from geogs.geometry.umeyama import umeyama
 from geogs.loop.global_bundle import global_bundle
 from geogs.tracking.tracker import Tracker, TrackState
 from geogs.types import Frame, PoseCorrection
+from tracking_scenes import CAMERA, frames, pose, render, sideways
 
 CONFIG = TrackingConfig(init_keyframes=5)
 PATH = sideways(40)

@@ -63,7 +63,7 @@ class TrackingConfig:
     max_residual: float = 0.008
     """The camera is lost when the median reprojection error exceeds this, of the long edge."""
     relocalise: int = 5
-    """Recent keyframes tried when the camera is lost."""
+    """Recent keyframes, and as many older ones in turn, tried when the camera is lost."""
     huber: float = 1.5
     """Standard deviations of the flow beyond which a match counts linearly."""
     global_rounds: int = 4

@@ -1,9 +1,9 @@
 """Dense bundle adjustment over poses and inverse depths.
 
-One Gauss-Newton step on ``sum_e sum_p rho(|W^(1/2) (target - project(T_j T_i^-1, d_i))|)`` (DROID-SLAM's
-dense BA layer). Each edge is linearised in the motion of its target relative to its source, so only
-one Jacobian is formed; the chain to both poses, ``xi_rel = xi_j - Ad(T_ij) xi_i``, is applied to the
-small reduced blocks. Residuals are float32, the reduced camera system is float64.
+Gauss-Newton on ``sum_e sum_p rho(|W^(1/2) (target - project(T_j T_i^-1, d_i))|)``, DROID-SLAM's
+dense BA layer. Each edge is linearised in the motion of its target relative to its source, so only
+one Jacobian is formed; the chain to both poses, ``xi_rel = xi_j - Ad(T_ji) xi_i``, is applied to
+the small reduced blocks. Residuals are float32, the reduced camera system is float64.
 """
 
 from dataclasses import dataclass
@@ -32,8 +32,8 @@ class Projection:
 
     pixels: Float[Tensor, "e p 2"]
     valid: Bool[Tensor, "e p"]
-    pose_jacobian: Float[Tensor, "e p 2 6"] | None
-    """d pixel / d xi of the target pose (left perturbation)."""
+    pose_jacobian: Float[Tensor, "e 6 2 p"] | None
+    """d pixel / d xi of the target pose (left perturbation), laid out for the products below."""
     depth_jacobian: Float[Tensor, "e p 2"] | None
     """d pixel / d inverse depth of the source."""
 
@@ -66,7 +66,7 @@ class BundleOptions:
     """Levenberg damping relative to the diagonal of the reduced system."""
     depth_damping: float = 1e-3
     """Damping of inverse depth relative to the mean curvature of its frame."""
-    chunk: int = 96
+    chunk: int = 24
     """Edges linearised at a time; bounds memory."""
     min_inverse_depth: float = 1e-3
     max_inverse_depth: float = 1e2
@@ -109,11 +109,11 @@ def project(
         return Projection(pixels, valid, None, None)
     dq = inverse_depth * q
     o = torch.zeros_like(q)
-    row_x = torch.stack([dq, o, -x * dq, -x * v, 1 + x * x, -v], -1) * camera.fx
-    row_y = torch.stack([o, dq, -v * dq, -1 - v * v, x * v, x], -1) * camera.fy
+    row_x = torch.stack([dq, o, -x * dq, -x * v, 1 + x * x, -v], 1) * camera.fx
+    row_y = torch.stack([o, dq, -v * dq, -1 - v * v, x * v, x], 1) * camera.fy
     tx, ty, tz = t[:, None].unbind(-1)
     depth = torch.stack([camera.fx * (tx - tz * x) * q, camera.fy * (ty - tz * v) * q], -1)
-    return Projection(pixels, valid, torch.stack([row_x, row_y], -2), depth)
+    return Projection(pixels, valid, torch.stack([row_x, row_y], 2), depth)
 
 
 def robust_weight(
@@ -211,9 +211,10 @@ class DenseBundle:
 
 def _normal_equations(wJ: Tensor, J: Tensor, residual: Tensor) -> tuple[Tensor, Tensor]:
     """J^T W J and J^T W r of every edge, summed over its cells."""
-    left = wJ.flatten(1, 2).mT
-    H = left @ J.flatten(1, 2)
-    return H.double(), (left @ residual.flatten(1, 2)[..., None])[..., 0].double()
+    left = wJ.flatten(2)
+    right = torch.cat([J.flatten(2), residual.mT.flatten(1)[:, None]], 1)
+    both = (left @ right.mT).double()
+    return both[..., :6], both[..., 6]
 
 
 def _edge_residual(residual: Tensor, weight: Tensor) -> Tensor:
@@ -261,9 +262,9 @@ class _Reduced:
     ) -> None:
         """Add whole stars (all edges of each of their sources)."""
         J, Jd = p.pose_jacobian, p.depth_jacobian
-        wJ = J * weight[..., None]
+        wJ = J * weight.mT[:, None]
         H, v = _normal_equations(wJ, J, residual)
-        coupling = (wJ * Jd[..., None]).sum(2).mT
+        coupling = (wJ * Jd.mT[:, None]).sum(2)
         depth_gradient = (weight * Jd * residual).sum(-1)
         adjoint = se3_adjoint(T_ji)
         frames, counts = torch.unique_consecutive(source, return_counts=True)
@@ -351,7 +352,7 @@ def solve_poses(
         p = project(camera, rays, T[frame] @ inverse, inverse_depth, jacobians=True)
         r = pixels - p.pixels
         w = robust_weight(r, weight * p.valid[..., None], huber)
-        wJ = p.pose_jacobian * w[..., None]
+        wJ = p.pose_jacobian * w.mT[:, None]
         H = torch.zeros(len(T), 6, 6, dtype=torch.float64, device=T.device)
         g = torch.zeros(len(T), 6, dtype=torch.float64, device=T.device)
         edge_H, edge_g = _normal_equations(wJ, p.pose_jacobian, r)

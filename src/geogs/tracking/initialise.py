@@ -50,7 +50,7 @@ def initialise(graph: FrameGraph, min_parallax: float, radius: int = 3) -> bool:
 
 
 def chained_flows(graph: FrameGraph) -> list[FlowMatch]:
-    """Flow from the first keyframe to each later one: chained from step to step, then re-measured."""
+    """Flow from the first keyframe to each later one, chained from step to step and re-measured."""
     states = list(graph.keyframes)
     grid, operator = graph.keyframes.grid, graph.operator
     encoded = [s.encoded for s in states]

@@ -6,7 +6,6 @@ from enum import Enum
 from typing import Any
 
 import cv2
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -21,7 +20,7 @@ from geogs.tracking.flow.classical import ClassicalFlow
 from geogs.tracking.graph import FrameGraph, frame_distances, proximity_pairs
 from geogs.tracking.grid import SampleGrid
 from geogs.tracking.initialise import initialise
-from geogs.tracking.keyframes import KeyframeStore
+from geogs.tracking.keyframes import KeyframeState, KeyframeStore
 from geogs.tracking.motion import FlowChain, FrameLocator, FrameMotion, transfer_depth
 from geogs.tracking.trajectory import TrajectoryRecorder
 from geogs.types import Frame, Keyframe, PoseCorrection, Trajectory
@@ -97,8 +96,14 @@ class Tracker:
         return self.store.export(id)
 
     def trajectory(self) -> Trajectory:
-        """Poses of all frames seen so far, solved on the present keyframes."""
-        return self.recorder.solve()
+        """Poses of all frames seen so far, solved on the present keyframes.
+
+        Before the map is started nothing counts as tracked.
+        """
+        trajectory = self.recorder.solve()
+        if self.state is TrackState.INITIALIZING:
+            return replace(trajectory, tracked=np.zeros_like(trajectory.tracked))
+        return trajectory
 
     @property
     def active(self) -> tuple[int, ...]:
@@ -248,21 +253,28 @@ class Tracker:
             if motion is None and self._velocity is not None:
                 motion = self._locator.locate(last, encoded, self._last)
         if motion is None:
-            recent = states[: -self.config.relocalise - 1 : -1]
-            motion = self._locator.relocate_any(recent, encoded)
+            motion = self._locator.relocate_any(self._places(), encoded)
         return motion
+
+    def _places(self) -> list[KeyframeState]:
+        """Where to look for a lost camera: recent keyframes, and older ones in turn."""
+        count, states = self.config.relocalise, list(self.store)
+        recent, older = states[: -count - 1 : -1], states[:-count]
+        turn = (self._misses * count) % max(len(older), 1)
+        return recent + (older[turn:] + older[:turn])[:count]
 
     def _lose(self, frame: Frame) -> TrackResult:
         if self.state is not TrackState.INITIALIZING:
             self.state = TrackState.LOST
             self._velocity = None
+            self._misses += 1
         self.recorder.add_untracked(frame.index, frame.timestamp)
         return TrackResult(self.state, active=self.active)
 
     def _follow(self, frame: Frame, encoded: Any, motion: FrameMotion) -> TrackResult:
         steady = self.state is TrackState.TRACKING and self._last is not None
         self._velocity = motion.T_cw @ se3_inverse(self._last) if steady else None
-        self.state, self._last = TrackState.TRACKING, motion.T_cw
+        self.state, self._last, self._misses = TrackState.TRACKING, motion.T_cw, 0
         anchor = self.store[motion.keyframe]
         if motion.flow < self.config.keyframe_flow * self._long_edge:
             T_rel = motion.T_cw @ se3_inverse(anchor.T_cw)

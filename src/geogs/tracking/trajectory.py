@@ -121,7 +121,7 @@ class TrajectoryRecorder:
             (p, k)
             for p in ready
             for k in (before, after)
-            if k is not None and all(o.keyframe != k for o in p.record.observations)
+            if k is not None and p.record.anchor in self.store and all(o.keyframe != k for o in p.record.observations)
         ]
         for start in range(0, len(jobs), 8):
             self._measure(jobs[start : start + 8])
@@ -156,10 +156,7 @@ class TrajectoryRecorder:
         """
         records = sorted(self.records, key=lambda r: r.index)
         keyframes = {s.frame_index: s.id for s in self.store}
-        for record in records:
-            if record.anchor is not None and record.anchor not in self.store:
-                record.anchor = None
-        tracked = [r for r in records if r.anchor is not None]
+        tracked = [r for r in records if r.anchor is not None and r.anchor in self.store]
         free = [r for r in tracked if r.index not in keyframes and r.observations]
         solved: dict[int, Tensor] = {r.index: self._pose(r) for r in tracked}
         for start in range(0, len(free), chunk):
@@ -167,7 +164,7 @@ class TrajectoryRecorder:
             poses = self._solve_chunk(part)
             solved.update({r.index: T for r, T in zip(part, poses, strict=True)})
         timestamps = np.array([r.timestamp for r in records], dtype=np.float64)
-        known = np.array([r.anchor is not None for r in records], dtype=bool)
+        known = np.array([r.index in solved for r in records], dtype=bool)
         T_cw = [solved.get(r.index) for r in records]
         return Trajectory(timestamps, interpolate(timestamps, T_cw), known)
 

@@ -26,6 +26,8 @@ MAX_DISAGREEMENT = 1.0
 """Forward and backward flow that differ by more pixels are no match."""
 COARSE_DEVIATION = 1.7
 """Deviation of a match at half resolution relative to full resolution."""
+SMALL_IMAGE = 400
+"""Long edge in pixels up to which every measurement is at full resolution."""
 MIN_STRUCTURE = 0.5
 """Smaller eigenvalue of the structure tensor that counts as texture, grey levels^2 / pixel^2."""
 
@@ -77,6 +79,8 @@ class ClassicalFlow:
         backward: Float[Tensor, "e p 2"] | None = None,
         fine: bool = True,
     ) -> tuple[FlowMatch, FlowMatch]:
+        # Half of a small image is too little to match.
+        fine = fine or max(self.grid.camera.width, self.grid.camera.height) <= SMALL_IMAGE
         a = [*first, *second]
         b = [*second, *first]
         n = len(first)
