@@ -14,7 +14,7 @@ demo: $(STAMP)
 	$(BIN)/geogs demo -o out/demo
 
 test: $(STAMP) lint
-	$(BIN)/python -m pytest -n 2
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2
 
 lint: $(STAMP)
 	$(BIN)/ruff check .

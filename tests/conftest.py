@@ -4,6 +4,7 @@ from pathlib import Path
 
 import jaxtyping
 import pytest
+import torch
 
 SOURCE = Path(__file__).parents[1] / "src"
 
@@ -18,6 +19,7 @@ def _typed_modules() -> list[str]:
     return sorted(names)
 
 
+torch.set_num_threads(1)  # as the system works; more only wait for each other
 jaxtyping.install_import_hook(_typed_modules(), "beartype.beartype")
 
 

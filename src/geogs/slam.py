@@ -9,7 +9,7 @@ from geogs.geometry.camera import Camera
 from geogs.loop.global_bundle import global_bundle
 from geogs.mapping.mapper import Mapper
 from geogs.stopwatch import Stopwatch
-from geogs.threads import one_torch_thread
+from geogs.threads import on_one_torch_thread
 from geogs.tracking.tracker import Tracker, TrackResult, TrackState
 from geogs.types import Frame, MapSnapshot, RenderedKeyframe, Trajectory
 
@@ -46,6 +46,7 @@ class Slam:
         self.frames = 0
         self._waiting: deque[int] = deque()
 
+    @on_one_torch_thread
     def process(self, frame: Frame) -> SlamStatus:
         """Track one frame and, where it completes a keyframe, train the map."""
         with self.stopwatch("tracking"):
@@ -56,6 +57,7 @@ class Slam:
             result.state, self.frames, len(self.tracker.keyframe_ids), len(self.mapper.map)
         )
 
+    @on_one_torch_thread
     def finish(self, progress: Progress = _silent, correct: bool = True) -> None:
         """End of the stream: map what waits, bundle-adjust all keyframes, move and refine the map.
 
@@ -70,9 +72,10 @@ class Slam:
             correction = global_bundle(self.tracker, lambda f, _: progress("bundle adjustment", f))
         with self.stopwatch("map update"):
             self.mapper.correct(correction, self._keyframes(self.mapper.keyframe_ids))
-        with self.stopwatch("final mapping"), one_torch_thread():
+        with self.stopwatch("final mapping"):
             self.mapper.refine(lambda f: progress("map refinement", f))
 
+    @on_one_torch_thread
     def trajectory(self) -> Trajectory:
         """Poses of all frames so far."""
         with self.stopwatch("trajectory"):
@@ -82,15 +85,16 @@ class Slam:
         """The disks as they are now."""
         return self.mapper.map.snapshot()
 
+    @on_one_torch_thread
     def renders(self) -> list[RenderedKeyframe]:
         """Depth, normal and reliability of the map seen from every mapped keyframe."""
-        with self.stopwatch("rendering"), one_torch_thread():
+        with self.stopwatch("rendering"):
             return self.mapper.renders()
 
     def _map(self, result: TrackResult, lag: int) -> None:
         """Hand settled keyframes to the mapper; train those whose successors are known."""
         self._waiting.extend(result.finalized)
-        with self.stopwatch("mapping"), one_torch_thread():
+        with self.stopwatch("mapping"):
             for keyframe in self._keyframes(list(result.finalized)):
                 self.mapper.observe(keyframe)
             self.mapper.follow(self._keyframes(list(result.active)))
@@ -99,7 +103,7 @@ class Slam:
                 self.mapper.map_keyframe(self._waiting.popleft())
                 trained = True
         if trained and self.config.mapping.pose_iterations:
-            with self.stopwatch("pose refinement"), one_torch_thread():
+            with self.stopwatch("pose refinement"):
                 self.tracker.write_back(self.mapper.refine_poses(list(result.active)))
 
     def _keyframes(self, ids: list[int]) -> list:

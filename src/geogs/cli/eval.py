@@ -69,12 +69,14 @@ def main(argv: Sequence[str]) -> int:
 
 def evaluate(options: EvalOptions) -> "Evaluation":
     """Compare, write eval.json and report/, print the table."""
+    import torch
     from rich.console import Console
 
     from geogs.evaluation.report import Evaluation, table, write_report
     from geogs.evaluation.trajectory import evaluate_trajectory
     from geogs.io.poses import read_poses, read_tum_trajectory
 
+    torch.set_num_threads(1)  # the kernels have threads of their own; see geogs.threads
     if options.cull_every < 1 or options.samples < 1 or not options.threshold > 0:
         raise InputError("cull-every, samples and threshold must be positive.")
     if not (options.output / "trajectory.tum").is_file():

@@ -53,12 +53,15 @@ def main(argv: Sequence[str]) -> int:
 
 def run(options: RunOptions) -> Path:
     """Reconstruct, write the results, say where they are; returns their folder."""
+    import torch
+
     from geogs.cli.results import write_results
     from geogs.errors import InputError
     from geogs.io.sources.sniff import open_source
     from geogs.io.writers.atomic import prepare_output_folder
     from geogs.slam import Slam
 
+    torch.set_num_threads(1)  # the kernels have threads of their own; see geogs.threads
     if options.device != "cpu":
         raise InputError(f"There is no backend for {options.device} yet; use --device cpu.")
     source = open_source(options.source, options.input)

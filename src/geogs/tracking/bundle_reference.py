@@ -50,9 +50,9 @@ def gauss_newton_step(
     w = problem.weight.double()
     norm = (w * r * r).sum(-1, keepdim=True).sqrt()
     w = w * (options.huber / norm.clamp(min=options.huber))
-    Jx, Jd = torch.autograd.functional.jacobian(
-        lambda a, b: residuals(problem, camera, rays, a, b).reshape(-1), (xi, delta)
-    )
+    Jx, Jd = torch.func.jacrev(
+        lambda a, b: residuals(problem, camera, rays, a, b).reshape(-1), (0, 1)
+    )(xi, delta)
     Jx, Jd, w, r = -Jx.reshape(-1, 6 * n), -Jd.reshape(-1, n * p), w.reshape(-1), r.reshape(-1)
     pose = problem.free_pose.repeat_interleave(6)
     depth = problem.free_depth.repeat_interleave(p)

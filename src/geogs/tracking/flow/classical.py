@@ -37,17 +37,57 @@ class ClassicalImage:
     """An image as the classical operator keeps it."""
 
     grey: UInt8[np.ndarray, "h w"]
+    half: UInt8[np.ndarray, "h2 w2"]
+    """The same at half resolution; its pixel x is 2 x + 1/2 of the image."""
     structure: Float[np.ndarray, "p"]
     """Smaller eigenvalue of the structure tensor on the grid, grey levels^2 / pixel^2."""
 
 
+class _Level:
+    """Coordinates of an image pyramid's level of 1 or 1/2 resolution."""
+
+    def __init__(self, grid: SampleGrid, step: int) -> None:
+        self.step = step
+        width, height = -(-grid.camera.width // step), -(-grid.camera.height // step)
+        v, u = np.mgrid[:height, :width].astype(np.float32)
+        self.u, self.v = u, v
+        # The same pixels in cells of the grid.
+        self.cell_u, self.cell_v = ((self.to_image(x) - OFFSET) / STRIDE for x in (u, v))
+
+    def to_image(self, x: np.ndarray) -> np.ndarray:
+        """Coordinates of this level in the full image."""
+        return self.step * x + np.float32((self.step - 1) / 2)
+
+    def from_image(self, x: np.ndarray) -> np.ndarray:
+        """Coordinates of the full image on this level."""
+        return (x - np.float32((self.step - 1) / 2)) / self.step
+
+
 @dataclass(frozen=True)
 class _DenseFlow:
-    """Flow on every pixel, and what is needed to judge it."""
+    """A known warp, the dense flow that was left over, and how rough that is."""
 
-    flow: np.ndarray
-    roughness: np.ndarray
-    """Mean gradient of the flow without the warp, around each grid cell."""
+    level: _Level
+    warp: np.ndarray | None
+    """(gh, gw, 2) on the grid, image pixels."""
+    rest: np.ndarray
+    """On the level's pixels, level pixels."""
+
+    def at(self, points: Float[np.ndarray, "p 2"], outside: float) -> Float[np.ndarray, "p 2"]:
+        """Flow of image points; ``outside`` where they are not in the image."""
+        moved = self.level.step * _sample(self.rest, self.level.from_image(points), outside)
+        if self.warp is None:
+            return moved
+        cells = (points + moved - OFFSET) / STRIDE
+        return moved + _sample(self.warp, cells, None)
+
+    def roughness(self, points: Float[np.ndarray, "p 2"]) -> Float[np.ndarray, "p"]:
+        """Norm of the gradient of the rest around image points."""
+        gx = cv2.Sobel(self.rest, cv2.CV_32F, 1, 0, scale=1 / 8)
+        gy = cv2.Sobel(self.rest, cv2.CV_32F, 0, 1, scale=1 / 8)
+        norm = cv2.sqrt(cv2.transform(gx * gx + gy * gy, np.ones((1, 2), np.float32)))
+        window = 8 // self.level.step + 1
+        return _sample(cv2.blur(norm, (window, window)), self.level.from_image(points), None)
 
 
 class ClassicalFlow:
@@ -58,15 +98,15 @@ class ClassicalFlow:
         self.grid = grid
         self._pool = ThreadPoolExecutor(threads)
         self._local = threading.local()
-        width, height = grid.camera.width, grid.camera.height
-        v, u = np.mgrid[:height, :width].astype(np.float32)
-        self._u, self._v = u, v
-        self._up_u, self._up_v = (u - OFFSET) / STRIDE, (v - OFFSET) / STRIDE
+        self._full, self._half = _Level(grid, 1), _Level(grid, 2)
         self._pixels = grid.pixels.cpu().numpy()
 
     def encode(self, image: UInt8[np.ndarray, "h w 3"]) -> ClassicalImage:
         grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-        return ClassicalImage(grey, self._on_grid(_smaller_eigenvalue(grey)))
+        structure = _smaller_eigenvalue(grey)[OFFSET:-3:STRIDE, OFFSET:-3:STRIDE].reshape(-1)
+        even = np.pad(grey, [(0, n % 2) for n in grey.shape], mode="edge")
+        half = cv2.resize(even, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+        return ClassicalImage(grey, half, structure)
 
     def texture(self, encoded: ClassicalImage) -> float:
         return float((encoded.structure > MIN_STRUCTURE).mean())
@@ -81,29 +121,25 @@ class ClassicalFlow:
     ) -> tuple[FlowMatch, FlowMatch]:
         # Half of a small image is too little to match.
         fine = fine or max(self.grid.camera.width, self.grid.camera.height) <= SMALL_IMAGE
-        a = [*first, *second]
-        b = [*second, *first]
+        a, b = [*first, *second], [*second, *first]
         n = len(first)
         start = [None] * (2 * n)
         if forward is not None and backward is not None:
             start = list(torch.cat([forward, backward]).cpu().numpy())
         flows = list(self._pool.map(lambda x, y, s: self._dense(x, y, s, fine), a, b, start))
         reverse = [*flows[n:], *flows[:n]]
-        scale = 1.0 if fine else COARSE_DEVIATION
-        matches = list(
-            self._pool.map(lambda x, f, r: self._match(x, f, r, scale), a, flows, reverse)
-        )
+        matches = list(self._pool.map(self._match, a, flows, reverse))
         pixels = torch.from_numpy(np.stack([m[0] for m in matches])).to(self.grid.device)
         weight = torch.from_numpy(np.stack([m[1] for m in matches])).to(self.grid.device)
         return FlowMatch(pixels[:n], weight[:n]), FlowMatch(pixels[n:], weight[n:])
 
-    def _dis(self, scale: int, cold: bool = False) -> cv2.DISOpticalFlow:
-        """This thread's flow object whose finest level is ``scale`` halvings down."""
-        name = f"dis{scale}{'cold' if cold else ''}"
+    def _dis(self, cold: bool) -> cv2.DISOpticalFlow:
+        """This thread's flow object, for unwarped or warped pairs."""
+        name = "cold" if cold else "warm"
         found = getattr(self._local, name, None)
         if found is None:
             found = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-            found.setFinestScale(scale)
+            found.setFinestScale(0)
             if not cold:
                 # Measured: as precise as the preset on warped pairs, at half its time.
                 found.setGradientDescentIterations(6)
@@ -117,56 +153,51 @@ class ClassicalFlow:
     def _dense(
         self, a: ClassicalImage, b: ClassicalImage, start: np.ndarray | None, fine: bool
     ) -> _DenseFlow:
-        """Flow from a to b."""
-        scale = 0 if fine else 1
-        if start is None:
-            moved = _match_brightness(b.grey, a.grey)
-            flow = self._dis(scale, cold=True).calc(a.grey, moved, None)
-            return _DenseFlow(flow, self._on_grid(_roughness(flow)))
-        shape = (self.grid.height, self.grid.width, 2)
-        warp = np.clip(start - self._pixels, -1e4, 1e4).reshape(shape).astype(np.float32)
-        warp = cv2.remap(
-            warp, self._up_u, self._up_v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-        )
-        moved = _match_brightness(self._warp(b.grey, warp, cv2.INTER_CUBIC), a.grey)
-        rest = self._dis(scale).calc(a.grey, moved, None)
-        flow = rest + self._warp(warp, rest, cv2.INTER_LINEAR)
-        return _DenseFlow(flow, self._on_grid(_roughness(rest)))
+        """Flow from a to b, whose positions in b are about ``start``."""
+        level = self._full if fine else self._half
+        source, target = (x.grey if fine else x.half for x in (a, b))
+        warp = None
+        if start is not None:
+            shape = (self.grid.height, self.grid.width, 2)
+            warp = np.clip(start - self._pixels, -1e4, 1e4).reshape(shape).astype(np.float32)
+            dense = _bilinear(warp, level.cell_u, level.cell_v) / level.step
+            u, v = level.u + dense[..., 0], level.v + dense[..., 1]
+            target = cv2.remap(target, u, v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+        target = _match_brightness(target, source)
+        return _DenseFlow(level, warp, self._dis(start is None).calc(source, target, None))
 
     def _match(
-        self, image: ClassicalImage, there: _DenseFlow, back: _DenseFlow, scale: float
+        self, image: ClassicalImage, there: _DenseFlow, back: _DenseFlow
     ) -> tuple[np.ndarray, np.ndarray]:
         """Positions on the grid and their weights."""
-        f = self._on_grid(there.flow)
-        q = self._pixels + f
-        disagreement = np.linalg.norm(f + self._sample(back.flow, q, FAR), axis=-1)
+        flow = there.at(self._pixels, 0.0)
+        q = self._pixels + flow
+        disagreement = np.linalg.norm(flow + back.at(q, FAR), axis=-1)
         camera = self.grid.camera
         inside = (q > 1).all(-1) & (q < [camera.width - 2, camera.height - 2]).all(-1)
         ok = inside & (disagreement < MAX_DISAGREEMENT)
-        weight = ok / (scale * match_deviation(disagreement, there.roughness)) ** 2
+        deviation = match_deviation(disagreement, there.roughness(self._pixels))
+        if there.level.step > 1:
+            deviation = deviation * COARSE_DEVIATION
         # Without texture the flow stays where it started, smooth and consistent but uninformed.
-        weight = weight * np.minimum(1.0, image.structure / 2 + 0.01)
+        weight = ok / deviation**2 * np.minimum(1.0, image.structure / 2 + 0.01)
         q = np.where(np.isfinite(q), q, FAR).astype(np.float32)
         return q, np.repeat(weight[:, None], 2, 1).astype(np.float32)
 
-    def _on_grid(self, image: np.ndarray) -> np.ndarray:
-        return image[OFFSET:-3:STRIDE, OFFSET:-3:STRIDE].reshape(self.grid.size, *image.shape[2:])
 
-    def _sample(self, image: np.ndarray, points: np.ndarray, outside: float) -> np.ndarray:
-        u, v = (points[None, :, k].astype(np.float32) for k in (0, 1))
-        out = cv2.remap(
-            image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=[outside] * 4
-        )
-        return out[0]
+def _bilinear(image: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    return cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
-    def _warp(self, image: np.ndarray, flow: np.ndarray, interpolation: int) -> np.ndarray:
-        return cv2.remap(
-            image,
-            self._u + flow[..., 0],
-            self._v + flow[..., 1],
-            interpolation,
-            borderMode=cv2.BORDER_REPLICATE,
-        )
+
+def _sample(
+    image: np.ndarray, points: Float[np.ndarray, "p 2"], outside: float | None
+) -> np.ndarray:
+    """Bilinear values at points; ``outside`` beyond the border, None replicates it."""
+    u, v = (points[None, :, k].astype(np.float32) for k in (0, 1))
+    if outside is None:
+        return _bilinear(image, u, v)[0]
+    border = {"borderMode": cv2.BORDER_CONSTANT, "borderValue": [outside] * 4}
+    return cv2.remap(image, u, v, cv2.INTER_LINEAR, **border)[0]
 
 
 def match_deviation(
@@ -197,13 +228,6 @@ def _local_mean(image: UInt8[np.ndarray, "h w"]) -> Float[np.ndarray, "r c"]:
     size = (max(image.shape[1] // 8, 1), max(image.shape[0] // 8, 1))
     small = cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float32)
     return cv2.GaussianBlur(small, (0, 0), max(size) / 16)
-
-
-def _roughness(flow: Float[np.ndarray, "h w 2"]) -> Float[np.ndarray, "h w"]:
-    """Norm of the flow's gradient, averaged over 9 x 9 pixels."""
-    gx = cv2.Sobel(flow, cv2.CV_32F, 1, 0, scale=1 / 8)
-    gy = cv2.Sobel(flow, cv2.CV_32F, 0, 1, scale=1 / 8)
-    return cv2.blur(np.sqrt((gx * gx + gy * gy).sum(-1)), (9, 9))
 
 
 def _smaller_eigenvalue(grey: UInt8[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
