@@ -194,6 +194,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path)
     parser.add_argument("--set", nargs="*", default=[], help="name=value of TrackingConfig")
     args = parser.parse_args()
+    torch.set_num_threads(1)  # as the system works; our own threads use the cores
     changes = {k: json.loads(v) for k, v in (item.split("=") for item in args.set)}
     config = dataclasses.replace(TrackingConfig(), **changes)
     sequence = load(args.source, args.long_edge, args.frames)

@@ -64,7 +64,7 @@ class TrackingConfig:
     """The camera is lost when the median reprojection error exceeds this, of the long edge."""
     relocalise: int = 5
     """Recent keyframes, and as many older ones in turn, tried when the camera is lost."""
-    huber: float = 1.5
+    huber: float = 0.5
     """Standard deviations of the flow beyond which a match counts linearly."""
     global_rounds: int = 4
     """Most rounds of flow and adjustment over all keyframes at the end."""
@@ -219,7 +219,7 @@ class LossConfig:
     """Windows with 1 - NCC of this or more are taken for occluded or changed; in (0, 2]."""
     ncc_min_variance: float = 1e-4
     """Windows of the reference with less grey variance have no texture to correlate; above 0."""
-    ncc_texture: float = 1e-3
+    ncc_texture: float = 1e-4
     """A window of grey variance v weighs v / (v + this); 0 weighs all windows alike."""
     ncc_min_coverage: float = 0.7
     """Windows with a smaller valid share are left out; in (0, 1]."""
@@ -227,7 +227,7 @@ class LossConfig:
     """L_ssim, 1 - structural similarity; unitless, at least 0; slow on a CPU."""
     occlusion: float = 0.05
     """Relative depth difference to the neighbour's depth from which a pixel is hidden; above 0."""
-    photo_blur: float = 0.7
+    photo_blur: float = 0.3
     """Standard deviation in pixels by which the photometric images are smoothed; at least 0."""
     photo_gradient: Literal["exact", "sobel"] = "exact"
     """Image derivative of the warp: of the bilinear interpolation, or of a 3x3 Sobel filter."""
@@ -246,7 +246,7 @@ class DiskConfig:
     """A pixel gets a disk where the map's alpha is below this, in (0, 1)."""
     insert_behind: float = 0.05
     """... or where the map lies this fraction of the depth behind a sure depth."""
-    insert_confidence: float = 0.1
+    insert_confidence: float = 0.3
     """Least confidence of a depth that makes a disk at once; the rest follows later."""
     neighbours: int = 12
     """Points of the local plane fit, at least 4."""
@@ -300,11 +300,11 @@ class MappingConfig:
     """Recent keyframes that are trained together."""
     history: int = 2
     """Older keyframes drawn at random into each window."""
-    iterations: int = 15
+    iterations: int = 8
     """Steps per keyframe."""
     views_per_step: int = 2
     """Views of the window in each step; 0 sums the loss over the whole window as the paper does."""
-    final_iterations: int = 400
+    final_iterations: int = 600
     """Single-view steps over all keyframes after the final bundle adjustment; 0 stops online."""
     final_depth: bool = True
     """Search all keyframe depths once more with the final poses."""
@@ -318,14 +318,14 @@ class MappingConfig:
     """Adam step of opacity logits."""
     lr_final: float = 0.1
     """Factor that the learning rates fall to over the final iterations."""
-    pose_iterations: int = 5
+    pose_iterations: int = 2
     """Pose-only steps per mapped keyframe; 0 leaves the poses to the tracker."""
     pose_lr: float = 4e-4
     """Adam step of the pose tangents: radians, and u for translations."""
     map_update: Literal["coherent", "per_keyframe"] = "coherent"
     """How the map follows a correction of the poses."""
-    max_spread: float = 0.03
-    """A rendered depth makes surface only where its spread along the ray is below this share."""
+    max_spread: float = 0.01
+    """Rendered depth makes surface where mean and median along the ray differ by less, relative."""
     disk: DiskConfig = field(default_factory=DiskConfig)
     photo: PhotoConfig = field(default_factory=PhotoConfig)
     depth: DepthConfig = field(default_factory=DepthConfig)
@@ -349,7 +349,7 @@ class MeshConfig:
 
     voxel: float | None = None
     """Voxel size in map units; chosen from depth, budget and memory limit if none is given."""
-    voxel_per_pixel: float = 1.0
+    voxel_per_pixel: float = 1.25
     """Chosen voxel size in footprints of a depth map's pixel at the median depth, above 0."""
     truncation: float = 4.0
     """Voxels in front of and behind a surface in which distances are averaged, at least 2."""
@@ -395,10 +395,10 @@ def preset(name: Preset) -> Config:
     base = Config()
     if name == "fast":
         mapping = replace(
-            base.mapping, iterations=10, pose_iterations=0, final_iterations=100, final_depth=False
+            base.mapping, iterations=5, pose_iterations=0, final_iterations=100, final_depth=False
         )
         return replace(base, mapping=mapping)
     if name == "accurate":
-        mapping = replace(base.mapping, render_long_edge=400, iterations=20, final_iterations=1500)
+        mapping = replace(base.mapping, render_long_edge=400, iterations=15, final_iterations=1500)
         return replace(base, input=replace(base.input, long_edge=640), mapping=mapping)
     return base

@@ -7,7 +7,6 @@ from geogs.tracking.graph import Pair, proximity_pairs
 from geogs.tracking.tracker import Tracker
 from geogs.types import PoseCorrection
 
-COARSE = 0
 SETTLED = 0.02
 """The rounds end when the reprojection of no more than this fraction of the pairs still moves."""
 
@@ -28,15 +27,12 @@ def global_bundle(
     pairs = global_pairs(tracker)
     graph.edges = {}
     options = BundleOptions(iterations=config.global_iterations, huber=config.huber)
-    coarse = COARSE
     for n in range(config.global_rounds if pairs else 0):
-        if n == coarse:
-            graph.edges = {}
         stale = graph.stale(pairs, config.global_remeasure)
         if len(stale) <= SETTLED * len(pairs):
-            continue
+            break
         for start in range(0, len(stale), 16):
-            graph.measure(stale[start : start + 16], fine=n >= coarse)
+            graph.measure(stale[start : start + 16], fine=True)
             if progress is not None:
                 share = (n + start / len(stale)) / config.global_rounds
                 progress(share, "matching all keyframes")

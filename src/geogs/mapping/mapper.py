@@ -257,10 +257,9 @@ class Mapper:
     def _rendered(self, view: MapView) -> RenderedKeyframe:
         output = render(self.map, self.cameras.render, view.T_cw)
         depth = shown_depth(output, self.config.loss.min_alpha)
-        # Of a normal distribution the mean absolute difference is 2 / sqrt(pi) deviations.
-        share = output.alpha.square().clamp(min=1e-6) * depth.clamp(min=1e-6)
-        spread = output.distortion / share * (np.pi**0.5 / 2)
-        weight = ((depth > 0) & (spread < self.config.max_spread)).float()
+        # Where disks lie at several depths along the ray, its mean depth is on none of them.
+        spread = (output.median_depth - depth).abs()
+        weight = ((depth > 0) & (spread < self.config.max_spread * depth)).float()
         length = output.normal.norm(dim=-1, keepdim=True).clamp(min=1e-6)
         return RenderedKeyframe(
             keyframe_id=view.id,

@@ -20,6 +20,7 @@ from geogs.geometry.lie import (
     se3_adjoint,
     se3_inverse,
 )
+from geogs.threads import thread_map
 from geogs.tracking.grid import SampleGrid
 
 MIN_Z = 0.05
@@ -82,8 +83,6 @@ class BundleResult:
     """Sum over a frame's edges of w |dp/dd|^2 before the last step."""
     residual: Float[Tensor, "e"]
     """Root of the robustly weighted mean squared residual of each edge in pixels."""
-    step: float
-    """Largest change of a pixel position by the last pose update, estimated."""
     finite: bool
 
 
@@ -143,17 +142,21 @@ def relative_motion(
 
 @dataclass(frozen=True)
 class _Star:
-    """A source frame with its edges, linearised and reduced to relative motions."""
+    """A source frame with all its edges, linearised, its inverse depths eliminated if free."""
 
     frame: int
     targets: Tensor
     adjoint: Tensor
-    coupling: Tensor
-    """(6k, p): weighted product of pose and depth Jacobians."""
-    curvature: Tensor
-    """(p,), damped."""
+    hessian: Tensor
+    """(6k, 6k) float64 over the relative motions of its k edges."""
     gradient: Tensor
-    """(p,)."""
+    """(6k,) float64."""
+    information: Tensor
+    """(p,): sum of w |dp/dd|^2."""
+    residual: Tensor
+    """(k,)."""
+    depth: tuple[Tensor, Tensor, Tensor] | None
+    """Coupling (6k, p), damped curvature (p,) and gradient (p,) of free inverse depths."""
 
 
 class DenseBundle:
@@ -171,42 +174,63 @@ class DenseBundle:
         T, d = problem.T_cw, problem.inverse_depth
         information = torch.zeros_like(d)
         residual = d.new_zeros(len(problem.source))
-        step, finite = 0.0, True
+        finite = True
         for _ in range(options.iterations):
-            reduced = _Reduced(problem, T.device)
-            information, residual = self._linearise(problem, T, d, options, reduced)
-            xi = reduced.solve(options.damping)
-            delta = reduced.depth_step(xi, d)
+            stars = self._linearise(problem, T, d, options)
+            for star in stars:
+                information[star.frame] = star.information
+            residual = torch.cat([star.residual for star in stars]) if stars else residual
+            xi = _pose_step(problem, stars, options.damping)
+            delta = _depth_step(stars, xi, d)
             if not bool(torch.isfinite(xi).all() and torch.isfinite(delta).all()):
                 finite = False
                 break
             T = torch.where(problem.free_pose[:, None, None], move(xi, T), T)
             d = (d + delta).clamp(options.min_inverse_depth, options.max_inverse_depth)
             d = torch.where(problem.free_depth[:, None], d, problem.inverse_depth)
-            step = float(xi.abs().max()) * self.grid.camera.fx if xi.numel() else 0.0
-        return BundleResult(T, d, information, residual, step, finite)
+        return BundleResult(T, d, information, residual, finite)
 
     def _linearise(
-        self,
-        problem: BundleProblem,
-        T: Tensor,
-        d: Tensor,
-        options: BundleOptions,
-        reduced: "_Reduced",
-    ) -> tuple[Tensor, Tensor]:
-        information = torch.zeros_like(d)
-        residuals = []
-        for chunk in _source_chunks(problem.source, options.chunk):
-            i, j = problem.source[chunk], problem.target[chunk]
-            T_ji = relative_motion(T, i, j)
-            p = project(self.grid.camera, self.grid.rays, T_ji, d[i], jacobians=True)
-            r = problem.pixels[chunk] - p.pixels
-            w = robust_weight(r, problem.weight[chunk] * p.valid[..., None], options.huber)
-            residuals.append(_edge_residual(r, w))
-            curvature = (w * p.depth_jacobian.square()).sum(-1)
-            information.index_add_(0, i, curvature)
-            reduced.add(i, j, T_ji, p, r, w, curvature, options.depth_damping)
-        return information, torch.cat(residuals) if residuals else d.new_zeros(0)
+        self, problem: BundleProblem, T: Tensor, d: Tensor, options: BundleOptions
+    ) -> list[_Star]:
+        """All stars; chunks of them side by side on the CPU, always in the same order."""
+        chunks = _source_chunks(problem.source, options.chunk)
+
+        def work(chunk: slice) -> list[_Star]:
+            return self._linearise_chunk(problem, T, d, options, chunk)
+
+        parts = thread_map(work, chunks) if d.device.type == "cpu" else map(work, chunks)
+        return [star for part in parts for star in part]
+
+    def _linearise_chunk(
+        self, problem: BundleProblem, T: Tensor, d: Tensor, options: BundleOptions, chunk: slice
+    ) -> list[_Star]:
+        i, j = problem.source[chunk], problem.target[chunk]
+        T_ji = relative_motion(T, i, j)
+        p = project(self.grid.camera, self.grid.rays, T_ji, d[i], jacobians=True)
+        r = problem.pixels[chunk] - p.pixels
+        w = robust_weight(r, problem.weight[chunk] * p.valid[..., None], options.huber)
+        wJ = p.pose_jacobian * w.mT[:, None]
+        H, v = _normal_equations(wJ, p.pose_jacobian, r)
+        coupling = (wJ * p.depth_jacobian.mT[:, None]).sum(2)
+        curvature = (w * p.depth_jacobian.square()).sum(-1)
+        depth_gradient = (w * p.depth_jacobian * r).sum(-1)
+        adjoint, residual = se3_adjoint(T_ji), _edge_residual(r, w)
+        frames, counts = torch.unique_consecutive(i, return_counts=True)
+        stars, start = [], 0
+        for frame, count in zip(frames.tolist(), counts.tolist(), strict=True):
+            e = slice(start, start + count)
+            start += count
+            block, g, c = torch.block_diag(*H[e]), v[e].reshape(-1), curvature[e].sum(0)
+            depth = None
+            if bool(problem.free_depth[frame]):
+                damped = c + options.depth_damping * c.mean() + 1e-8
+                E, b = coupling[e].reshape(6 * count, -1), depth_gradient[e].sum(0)
+                depth = (E, damped, b)
+                block = block - ((E / damped) @ E.mT).double()
+                g = g - (E @ (b / damped)).double()
+            stars.append(_Star(frame, j[e], adjoint[e], block, g, c, residual[e], depth))
+        return stars
 
 
 def _normal_equations(wJ: Tensor, J: Tensor, residual: Tensor) -> tuple[Tensor, Tensor]:
@@ -236,97 +260,54 @@ def _source_chunks(source: Tensor, size: int) -> list[slice]:
     return [*chunks, slice(start, last)]
 
 
-class _Reduced:
-    """The camera system left after the inverse depths are eliminated."""
-
-    def __init__(self, problem: BundleProblem, device: torch.device) -> None:
-        self.free_depth = problem.free_depth
-        count = int(problem.free_pose.sum())
-        slot = torch.full((len(problem.T_cw),), -1, dtype=torch.long, device=device)
-        slot[problem.free_pose] = torch.arange(count, device=device)
-        self.slot, self.frames = slot, len(problem.T_cw)
-        self.hessian = torch.zeros(count, count, 6, 6, dtype=torch.float64, device=device)
-        self.gradient = torch.zeros(count, 6, dtype=torch.float64, device=device)
-        self.stars: list[_Star] = []
-
-    def add(
-        self,
-        source: Tensor,
-        target: Tensor,
-        T_ji: Tensor,
-        p: Projection,
-        residual: Tensor,
-        weight: Tensor,
-        curvature: Tensor,
-        depth_damping: float,
-    ) -> None:
-        """Add whole stars (all edges of each of their sources)."""
-        J, Jd = p.pose_jacobian, p.depth_jacobian
-        wJ = J * weight.mT[:, None]
-        H, v = _normal_equations(wJ, J, residual)
-        coupling = (wJ * Jd.mT[:, None]).sum(2)
-        depth_gradient = (weight * Jd * residual).sum(-1)
-        adjoint = se3_adjoint(T_ji)
-        frames, counts = torch.unique_consecutive(source, return_counts=True)
-        start = 0
-        for frame, count in zip(frames.tolist(), counts.tolist(), strict=True):
-            edges = slice(start, start + count)
-            start += count
-            block, g = torch.block_diag(*H[edges]), v[edges].reshape(-1)
-            if bool(self.free_depth[frame]):
-                c = curvature[edges].sum(0)
-                c = c + depth_damping * c.mean() + 1e-8
-                b = depth_gradient[edges].sum(0)
-                e = coupling[edges].reshape(6 * count, -1)
-                self.stars.append(_Star(frame, target[edges], adjoint[edges], e, c, b))
-                block = block - ((e / c) @ e.mT).double()
-                g = g - (e @ (b / c)).double()
-            self._scatter(frame, target[edges], adjoint[edges], block, g)
-
-    def _scatter(
-        self, frame: int, targets: Tensor, adjoint: Tensor, block: Tensor, gradient: Tensor
-    ) -> None:
-        """Chain a star's relative system to its poses and add it to the blocks of the free ones."""
-        k = len(targets)
-        poses = torch.cat([targets, targets.new_tensor([frame])])
-        chain = torch.zeros(6 * k, 6 * (k + 1), dtype=torch.float64, device=block.device)
-        chain[:, : 6 * k] = torch.eye(6 * k, dtype=torch.float64, device=block.device)
-        chain[:, 6 * k :] = -adjoint.reshape(6 * k, 6)
-        H = (chain.mT @ block @ chain).reshape(k + 1, 6, k + 1, 6).transpose(1, 2)
-        g = (chain.mT @ gradient).reshape(k + 1, 6)
-        slot = self.slot[poses]
-        keep = slot >= 0
-        slot, H, g = slot[keep], H[keep][:, keep], g[keep]
-        self.gradient.index_add_(0, slot, g)
-        self.hessian.index_put_(
-            (slot[:, None].expand(-1, len(slot)), slot[None].expand(len(slot), -1)),
-            H,
-            accumulate=True,
-        )
-
-    def solve(self, damping: float) -> Float[Tensor, "n 6"]:
-        """Pose steps of all frames, zero for the fixed ones; NaN if the system cannot be solved."""
-        xi = torch.zeros(self.frames, 6, dtype=torch.float64, device=self.gradient.device)
-        n = len(self.gradient)
-        if not n:
-            return xi
-        H = self.hessian.transpose(1, 2).reshape(6 * n, 6 * n)
-        H = H + torch.diag(damping * H.diagonal().abs() + 1e-2)
-        factor, info = torch.linalg.cholesky_ex(H)
-        solution = torch.cholesky_solve(self.gradient.reshape(-1, 1), factor)[:, 0]
-        if int(info):
-            solution = torch.full_like(solution, torch.nan)
-        xi[self.slot >= 0] = solution.reshape(n, 6)[self.slot[self.slot >= 0]]
+def _pose_step(problem: BundleProblem, stars: list[_Star], damping: float) -> Float[Tensor, "n 6"]:
+    """Solve the camera system; steps of all frames, zero for the fixed, NaN where it cannot be."""
+    free = problem.free_pose
+    n = int(free.sum())
+    xi = torch.zeros(len(free), 6, dtype=torch.float64, device=free.device)
+    if not n:
         return xi
+    slot = torch.full((len(free),), -1, dtype=torch.long, device=free.device)
+    slot[free] = torch.arange(n, device=free.device)
+    H, g = xi.new_zeros(n, n, 6, 6), xi.new_zeros(n, 6)
+    for star in stars:
+        poses, block, gradient = _chain(star)
+        at = slot[poses]
+        keep = at >= 0
+        at = at[keep]
+        g.index_add_(0, at, gradient[keep])
+        rows, columns = at[:, None].expand(-1, len(at)), at[None].expand(len(at), -1)
+        H.index_put_((rows, columns), block[keep][:, keep], accumulate=True)
+    H = H.transpose(1, 2).reshape(6 * n, 6 * n)
+    H = H + torch.diag(damping * H.diagonal().abs() + 1e-2)
+    factor, info = torch.linalg.cholesky_ex(H)
+    solution = torch.cholesky_solve(g.reshape(-1, 1), factor)
+    xi[free] = solution.reshape(n, 6) if not int(info) else torch.nan
+    return xi
 
-    def depth_step(self, xi: Float[Tensor, "n 6"], inverse_depth: Tensor) -> Tensor:
-        """Back-substitution: (b - E^T xi_rel) / C for every star."""
-        delta = torch.zeros_like(inverse_depth)
-        for star in self.stars:
-            relative = xi[star.targets] - (star.adjoint @ xi[star.frame])
-            moved = star.coupling.mT @ relative.reshape(-1).to(inverse_depth)
-            delta[star.frame] = (star.gradient - moved) / star.curvature
-        return delta
+
+def _chain(star: _Star) -> tuple[Tensor, Tensor, Tensor]:
+    """From relative motions to poses: xi_rel = xi_target - Ad xi_source. Poses, blocks, gradient."""
+    k = len(star.targets)
+    poses = torch.cat([star.targets, star.targets.new_tensor([star.frame])])
+    eye = torch.eye(6 * k, dtype=torch.float64, device=star.hessian.device)
+    chain = torch.cat([eye, -star.adjoint.reshape(6 * k, 6)], 1)
+    block = (chain.mT @ star.hessian @ chain).reshape(k + 1, 6, k + 1, 6).transpose(1, 2)
+    return poses, block, (chain.mT @ star.gradient).reshape(k + 1, 6)
+
+
+def _depth_step(
+    stars: list[_Star], xi: Float[Tensor, "n 6"], inverse_depth: Float[Tensor, "n p"]
+) -> Float[Tensor, "n p"]:
+    """Back-substitution: (b - E^T xi_rel) / C for every star."""
+    delta = torch.zeros_like(inverse_depth)
+    for star in stars:
+        if star.depth is not None:
+            coupling, curvature, gradient = star.depth
+            relative = xi[star.targets] - star.adjoint @ xi[star.frame]
+            moved = coupling.mT @ relative.reshape(-1).to(inverse_depth)
+            delta[star.frame] = (gradient - moved) / curvature
+    return delta
 
 
 def solve_poses(

@@ -79,7 +79,8 @@ class Tracker:
             self.grid, self.operator, self.config.min_matched, self.config.max_residual * edge
         )
         self._finalized: list[int] = []
-        self._last: Tensor | None = None
+        self._last: tuple[int, Tensor] | None = None
+        """Pose of the last frame: a keyframe and the motion from it, so that corrections carry."""
         self._velocity: Tensor | None = None
         self._chain = FlowChain(self.grid, self.operator)
         self._misses = 0
@@ -131,7 +132,6 @@ class Tracker:
             state.T_cw = T.to(state.T_cw)
             state.inverse_depth = state.inverse_depth * scale
             state.information = state.information / scale**2
-        self._last = self._velocity = None
 
     # --- the stream ------------------------------------------------------------------------
 
@@ -229,7 +229,7 @@ class Tracker:
         ok = initialise(self.graph, self.config.min_parallax * self._long_edge, self.config.radius)
         if ok:
             self.state = TrackState.TRACKING
-            self._last = list(self.store)[-1].T_cw
+            self._last = (self.store.ids[-1], torch.eye(4).to(list(self.store)[-1].T_cw))
             self.recorder.anchor_to_keyframes()
         return ok
 
@@ -247,14 +247,18 @@ class Tracker:
         states = list(self.store)
         last = states[-1]
         motion = None
-        if self._last is not None and self.state is TrackState.TRACKING:
-            guess = self._last if self._velocity is None else self._velocity @ self._last
+        before = self._last_pose()
+        if before is not None and self.state is TrackState.TRACKING:
+            guess = before if self._velocity is None else self._velocity @ before
             motion = self._locator.locate(last, encoded, guess)
             if motion is None and self._velocity is not None:
-                motion = self._locator.locate(last, encoded, self._last)
+                motion = self._locator.locate(last, encoded, before)
         if motion is None:
             motion = self._locator.relocate_any(self._places(), encoded)
         return motion
+
+    def _last_pose(self) -> Float[Tensor, "4 4"] | None:
+        return None if self._last is None else self._last[1] @ self.store[self._last[0]].T_cw
 
     def _places(self) -> list[KeyframeState]:
         """Where to look for a lost camera: recent keyframes, and older ones in turn."""
@@ -272,12 +276,13 @@ class Tracker:
         return TrackResult(self.state, active=self.active)
 
     def _follow(self, frame: Frame, encoded: Any, motion: FrameMotion) -> TrackResult:
-        steady = self.state is TrackState.TRACKING and self._last is not None
-        self._velocity = motion.T_cw @ se3_inverse(self._last) if steady else None
-        self.state, self._last, self._misses = TrackState.TRACKING, motion.T_cw, 0
+        before = self._last_pose() if self.state is TrackState.TRACKING else None
+        self._velocity = None if before is None else motion.T_cw @ se3_inverse(before)
+        self.state, self._misses = TrackState.TRACKING, 0
         anchor = self.store[motion.keyframe]
+        T_rel = motion.T_cw @ se3_inverse(anchor.T_cw)
+        self._last = (anchor.id, T_rel)
         if motion.flow < self.config.keyframe_flow * self._long_edge:
-            T_rel = motion.T_cw @ se3_inverse(anchor.T_cw)
             self.recorder.add(frame.index, frame.timestamp, encoded, anchor.id, T_rel, motion.match)
             return TrackResult(self.state, active=self.active)
         return self._insert(frame, encoded, motion)
@@ -293,7 +298,7 @@ class Tracker:
         self._connect(state.id)
         self._adjust_locally()
         removed = self._cull()
-        self._last = state.T_cw
+        self._last = (state.id, torch.eye(4).to(state.T_cw))
         fresh = self._finalise(self.store.ids[:-1])
         return TrackResult(self.state, state.id, fresh, self.active, removed)
 

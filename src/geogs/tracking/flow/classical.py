@@ -17,6 +17,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from geogs.threads import worker_count
 from geogs.tracking.flow.base import FlowMatch
 from geogs.tracking.grid import OFFSET, STRIDE, SampleGrid
 
@@ -91,12 +92,12 @@ class _DenseFlow:
 
 
 class ClassicalFlow:
-    """The DIS operator on one grid; images are matched in a small thread pool."""
+    """The DIS operator on one grid; directions and images are matched side by side in threads."""
 
-    def __init__(self, grid: SampleGrid, threads: int = 2) -> None:
+    def __init__(self, grid: SampleGrid) -> None:
         cv2.setNumThreads(1)
         self.grid = grid
-        self._pool = ThreadPoolExecutor(threads)
+        self._pool = ThreadPoolExecutor(worker_count())
         self._local = threading.local()
         self._full, self._half = _Level(grid, 1), _Level(grid, 2)
         self._pixels = grid.pixels.cpu().numpy()
