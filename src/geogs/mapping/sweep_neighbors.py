@@ -23,6 +23,11 @@ def _angle(a: Float64[np.ndarray, "3"], b: Float64[np.ndarray, "3"]) -> float:
     return float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
 
 
+def misfit(parallax: float, turn: float, best: float) -> float:
+    """How far a pair is from ``best`` degrees of parallax (log scale) and from looking alike."""
+    return abs(float(np.log(max(parallax, 0.05) / best))) + (turn / 20.0) ** 2
+
+
 def select_sweep_neighbours(
     reference: DepthView, candidates: Sequence[DepthView], depth: float, config: DepthConfig
 ) -> list[int]:
@@ -38,9 +43,8 @@ def select_sweep_neighbours(
         if other.id == reference.id:
             continue
         parallax, turn = parallax_degrees(reference, other, depth)
-        misfit = abs(np.log(max(parallax, 0.05) / config.parallax)) + (turn / 20.0) ** 2
         usable = config.min_parallax < parallax < config.max_parallax and turn < config.max_turn
-        scored.append((not usable, misfit, i))
+        scored.append((not usable, misfit(parallax, turn, config.parallax), i))
     scored.sort()
     usable_ids = [i for bad, _, i in scored if not bad]
     if not usable_ids:

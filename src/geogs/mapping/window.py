@@ -3,7 +3,7 @@
 import numpy as np
 
 from geogs.config import MappingConfig, PhotoConfig
-from geogs.mapping.covisibility import pair_score
+from geogs.mapping.sweep_neighbors import misfit, parallax_degrees
 from geogs.mapping.view import MapView
 
 
@@ -31,15 +31,11 @@ def choose_partners(
     view: MapView, others: list[MapView], depth: float, config: PhotoConfig
 ) -> list[int]:
     """Ids of the keyframes best placed to check a view's depth by photo-consistency, best first."""
-    T_wc = view.T_wc.numpy()
     scored = []
     for other in others:
-        if other.id != view.id:
-            score = pair_score(
-                T_wc, other.T_wc.numpy(), depth, best=config.parallax,
-                smallest=config.min_parallax, largest=config.max_parallax,
-                looking_within=config.looking_within,
-            )  # fmt: skip
-            if np.isfinite(score):
-                scored.append((score, other.id))
+        if other.id == view.id:
+            continue
+        parallax, turn = parallax_degrees(view.depth_view, other.depth_view, depth)
+        if config.min_parallax < parallax < config.max_parallax and turn < config.looking_within:
+            scored.append((misfit(parallax, turn, config.parallax), other.id))
     return [i for _, i in sorted(scored)[: config.candidates]]

@@ -1,0 +1,170 @@
+"""The mapper on rendered keyframes with known depth and poses."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from geogs.config import Config, MappingConfig
+from geogs.geometry.lie import retract, se3_exp, se3_inverse
+from geogs.mapping.mapper import Mapper
+from geogs.mapping.window import draw_views
+from geogs.synth.export import default_camera
+from geogs.synth.raycast import Raycaster
+from geogs.synth.room import make_room
+from geogs.synth.trajectory import handheld_trajectory
+from geogs.types import Keyframe, PoseCorrection
+
+CAMERA = default_camera(224, 168)
+MAPPING = replace(
+    Config().mapping,
+    render_long_edge=112,
+    iterations=8,
+    lag=2,
+    final_iterations=40,
+    disk=replace(Config().mapping.disk, stride=2),
+)
+
+
+@pytest.fixture(scope="module")
+def sequence() -> tuple[list[Keyframe], list[np.ndarray]]:
+    """Nine keyframes with noisy grid depth, a fifth of it wrong, and their true depth maps."""
+    scene = make_room(3)
+    caster = Raycaster(scene)
+    poses = handheld_trajectory(scene, 64)
+    random = np.random.default_rng(0)
+    keyframes, truth = [], []
+    for n, index in enumerate(range(0, 63, 7)):
+        view = caster.render(CAMERA, poses[index])
+        z = view.depth[4 : CAMERA.height - 3 : 8, 4 : CAMERA.width - 3 : 8].astype(np.float64)
+        deviation = np.where(random.random(z.shape) < 0.2, 0.4, 0.02)
+        noisy = z * np.exp(deviation * random.standard_normal(z.shape))
+        keyframes.append(
+            Keyframe(
+                n, index, index / 30, view.image, se3_inverse(torch.from_numpy(poses[index])),
+                torch.from_numpy(1 / noisy).float(),
+                torch.from_numpy((noisy / deviation) ** 2).float(),
+            )
+        )  # fmt: skip
+        small = caster.render(CAMERA.with_long_edge(112), poses[index])
+        truth.append(small.depth)
+    return keyframes, truth
+
+
+def build(keyframes: list[Keyframe], config: MappingConfig = MAPPING) -> Mapper:
+    mapper = Mapper(CAMERA, config)
+    for n, keyframe in enumerate(keyframes):
+        mapper.observe(keyframe)
+        if n >= config.lag:
+            mapper.map_keyframe(keyframes[n - config.lag].id)
+    for keyframe in keyframes[-config.lag :]:
+        mapper.map_keyframe(keyframe.id)
+    return mapper
+
+
+@pytest.fixture(scope="module")
+def mapper(sequence) -> Mapper:
+    """A map of the whole sequence, not yet refined."""
+    return build(sequence[0])
+
+
+def depth_error(mapper: Mapper, truth: list[np.ndarray]) -> float:
+    """Median error in cm of the rendered depth over all keyframes."""
+    renders = mapper.renders()
+    errors = [
+        100 * np.abs(r.depth.numpy() - d)[(r.depth.numpy() > 0) & (d > 0)]
+        for r, d in zip(renders, truth, strict=True)
+    ]
+    return float(np.median(np.concatenate(errors)))
+
+
+def test_the_map_renders_the_true_depth(mapper, sequence):
+    assert depth_error(mapper, sequence[1]) < 3.0
+    covered = np.mean([(r.depth > 0).float().mean() for r in mapper.renders()])
+    assert covered > 0.95
+    assert 500 < len(mapper.map) < 12_000
+
+
+def test_training_and_refining_make_it_better(sequence):
+    keyframes, truth = sequence
+    untrained = build(keyframes, replace(MAPPING, iterations=0))
+    before = depth_error(untrained, truth)
+    trained = build(keyframes)
+    online = depth_error(trained, truth)
+    trained.refine()
+    final = depth_error(trained, truth)
+    assert online < before
+    assert final < 0.97 * online
+
+
+def test_same_seed_same_map(sequence):
+    first, second = (build(sequence[0][:6]) for _ in range(2))
+    assert (first.map.position == second.map.position).all()
+    assert (first.map.opacity_logit == second.map.opacity_logit).all()
+
+
+def test_disturbed_poses_are_drawn_back_by_the_map(mapper, sequence):
+    """A centimetre and a third of a degree of error shrink; the earliest pose is not touched."""
+    true = {k.id: k.T_cw for k in sequence[0]}
+    active = [3, 4, 5, 6]
+    g = torch.Generator().manual_seed(1)
+    for i in active[1:]:
+        xi = torch.randn(6, dtype=torch.float64, generator=g)
+        xi[:3] *= 0.008
+        xi[3:] *= 0.004
+        mapper.views[i].move(retract(xi, true[i]))
+    start = {i: mapper.views[i].T_cw for i in active}
+    config, mapper.config = mapper.config, replace(MAPPING, pose_iterations=40, pose_lr=6e-4)
+    poses = mapper.refine_poses(active)
+    mapper.config = config
+
+    def error(T: dict[int, torch.Tensor]) -> float:
+        centres = [torch.linalg.inv(T[i])[:3, 3] - torch.linalg.inv(true[i])[:3, 3] for i in poses]
+        return 100 * float(torch.stack(centres).norm(dim=1).mean())
+
+    assert sorted(poses) == active[1:]
+    assert error(poses) < 0.6 * error(start)
+    for i in active:
+        mapper.views[i].move(true[i])
+
+
+def test_a_rigid_correction_moves_map_and_views_together(sequence):
+    keyframes, truth = sequence
+    mapper = build(keyframes[:6])
+    before = depth_error(mapper, truth[:6])
+    G = se3_exp(torch.tensor([0.5, -0.3, 0.2, 0.3, 0.5, -0.2], dtype=torch.float64))
+    old = {k.id: k.T_cw for k in keyframes[:6]}
+    new = {i: T @ se3_inverse(G) for i, T in old.items()}
+    moved = [replace(k, T_cw=new[k.id]) for k in keyframes[:6]]
+    update = mapper.correct(PoseCorrection(old, new, dict.fromkeys(old, 1.0)), moved)
+    assert update.residual < 1e-4
+    assert depth_error(mapper, truth[:6]) == pytest.approx(before, abs=0.02)
+
+
+def test_a_floater_is_carved_and_the_surface_stays(sequence):
+    mapper = build(sequence[0][:6])
+    count = len(mapper.map)
+    view = mapper.views[2]
+    T_wc = view.T_wc.float()
+    floater = (torch.tensor([[0.0, 0.0, 0.6]]) @ T_wc[:3, :3].T + T_wc[:3, 3]).expand(5, 3)
+    parts = mapper.map.parameters
+    new = type(parts)(floater, *(p.detach()[:5] for p in parts[1:]))
+    mapper._training().optimizer.append(new, view.id)
+    mapper.prune()
+    left = mapper.map.position.detach()
+    assert not ((left - floater[0]).norm(dim=1) < 1e-3).any()
+    assert len(mapper.map) > 0.97 * count
+
+
+def test_windows_hold_the_newest_and_draw_older_ones():
+    random = np.random.default_rng(0)
+    config = replace(MAPPING, window=4, history=2, views_per_step=3)
+    drawn = [draw_views(list(range(20)), step, config, random) for step in range(60)]
+    assert all(19 in views for views in drawn[::3])
+    assert all(len(views) <= 3 for views in drawn)
+    older = {i for views in drawn for i in views if i < 16}
+    assert len(older) > 8
+    whole = draw_views(list(range(20)), 0, replace(config, views_per_step=0), random)
+    assert len(whole) == 6
+    assert set(range(16, 20)) <= set(whole)
