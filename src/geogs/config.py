@@ -72,7 +72,7 @@ class TrackingConfig:
     """Gauss-Newton steps per round."""
     global_remeasure: float = 0.25
     """As remeasure, in the global adjustment, pixels."""
-    global_distance: float = 0.35
+    global_distance: float = 0.5
     """Largest frame distance of a pair in the global adjustment, of the long edge."""
     global_suppression: int = 3
     """Pairs within this many keyframes of a chosen one are left out."""

@@ -8,7 +8,7 @@ here, and PyTorch is held to one while they work.
 
 import functools
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import ParamSpec, TypeVar
 
@@ -30,10 +30,18 @@ def worker_count() -> int:
     return max(1, min(available, int(wanted) if wanted.isdigit() else 16, 16))
 
 
-def thread_map(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
+def thread_map(
+    function: Callable[[T], R],
+    items: Sequence[T],
+    progress: Callable[[float], None] = lambda fraction: None,
+) -> list[R]:
     """``list(map(function, items))`` over the workers; results in the order of the items."""
+    results = []
     with ThreadPoolExecutor(worker_count()) as pool:
-        return list(pool.map(function, items))
+        for result in pool.map(function, items):
+            results.append(result)
+            progress(len(results) / len(items))
+    return results
 
 
 def on_one_torch_thread(function: Callable[P, R]) -> Callable[P, R]:

@@ -26,6 +26,14 @@ from geogs.splat.render import render
 from geogs.threads import thread_map
 from geogs.types import Keyframe, PoseCorrection, RenderedKeyframe
 
+Progress = Callable[[float], None]
+"""Called with the finished fraction of a long stage."""
+
+
+def _silent(fraction: float) -> None:
+    """Progress that nobody watches."""
+
+
 # Keyframes whose depth checks a new keyframe's depth and whose free space carves around it.
 _CHECKING_VIEWS = 8
 
@@ -104,20 +112,21 @@ class Mapper:
         self.follow(keyframes)
         return update
 
-    def refine(self, progress: Callable[[float], None] = lambda fraction: None) -> None:
+    def refine(self, progress: Progress = _silent) -> None:
         """Train over all keyframes with the final poses, after searching their depths again."""
         if not self.mapped or self.config.final_iterations <= 0:
             return
         views = [self.views[i] for i in self.mapped]
         if self.config.final_depth:
-            self._estimate(views)
+            self._estimate(views, lambda fraction: progress(0.4 * fraction))
             self._check(views)
         for view in views:
             self._choose_partners(view)
         self.prune()
         for view in views:
             self._insert(view, self.config.disk.insert_confidence)
-        self._train_all(views, progress)
+        start = 0.4 if self.config.final_depth else 0.0
+        self._train_all(views, lambda fraction: progress(start + (1 - start) * fraction))
         self.prune()
 
     def prune(self) -> None:
@@ -147,7 +156,7 @@ class Mapper:
         later = [i for i in self.views if i >= keyframe_id][: 1 + self.config.lag // 2]
         self._estimate([self.views[i] for i in later if self.views[i].depth is None])
 
-    def _estimate(self, views: list[MapView]) -> None:
+    def _estimate(self, views: list[MapView], progress: Progress = _silent) -> None:
         candidates = [v.depth_view for v in self.views.values()]
 
         def estimate(view: MapView) -> KeyframeDepth:
@@ -159,7 +168,7 @@ class Mapper:
                 reference, neighbours, self.cameras.render, self.cameras.working, self.config.depth
             )
 
-        for view, depth in zip(views, thread_map(estimate, views), strict=True):
+        for view, depth in zip(views, thread_map(estimate, views, progress), strict=True):
             view.set_depth(depth, self.cameras)
 
     def _check(self, views: list[MapView]) -> None:
@@ -236,7 +245,7 @@ class Mapper:
         )  # fmt: skip
         self._training().optimizer.append(new, view.id)
 
-    def _train_all(self, views: list[MapView], progress: Callable[[float], None]) -> None:
+    def _train_all(self, views: list[MapView], progress: Progress) -> None:
         """Single-view steps over all keyframes in random order, with falling learning rates."""
         trainer, total = self._training(), self.config.final_iterations
         fills, prunes = {total // 3, 2 * total // 3}, max(total // 4, 1)

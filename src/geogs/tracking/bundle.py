@@ -287,7 +287,7 @@ def _pose_step(problem: BundleProblem, stars: list[_Star], damping: float) -> Fl
 
 
 def _chain(star: _Star) -> tuple[Tensor, Tensor, Tensor]:
-    """From relative motions to poses: xi_rel = xi_target - Ad xi_source. Poses, blocks, gradient."""
+    """A star over its poses, by xi_rel = xi_target - Ad xi_source: poses, blocks, gradient."""
     k = len(star.targets)
     poses = torch.cat([star.targets, star.targets.new_tensor([star.frame])])
     eye = torch.eye(6 * k, dtype=torch.float64, device=star.hessian.device)

@@ -38,6 +38,10 @@ class FrameRecord:
     """Anchor keyframe to this frame."""
     observations: list[Observation] = field(default_factory=list)
 
+    def sees(self, keyframe: int) -> bool:
+        """Whether the flow from that keyframe has been measured."""
+        return any(o.keyframe == keyframe for o in self.observations)
+
 
 @dataclass
 class _Pending:
@@ -121,7 +125,7 @@ class TrajectoryRecorder:
             (p, k)
             for p in ready
             for k in (before, after)
-            if k is not None and p.record.anchor in self.store and all(o.keyframe != k for o in p.record.observations)
+            if k is not None and p.record.anchor in self.store and not p.record.sees(k)
         ]
         for start in range(0, len(jobs), 8):
             self._measure(jobs[start : start + 8])
