@@ -83,7 +83,7 @@ def load_state(path: Path, sequence: Path, config: Config) -> tuple[Camera, list
 
 
 def alignment(keyframes: list[Keyframe], truth: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-    """Similarity from the tracker's world to the true one, and the keyframes' ATE in cm on the way."""
+    """Similarity from the tracker's world to the true one, and their ATE in cm."""
     centres = torch.stack([torch.linalg.inv(k.T_cw)[:3, 3] for k in keyframes])
     true = torch.from_numpy(truth[[k.frame_index for k in keyframes], :3, 3])
     scale, R, t = umeyama(centres, true)

@@ -85,7 +85,7 @@ def keyframe_error(tracker: Tracker, sequence: Sequence) -> tuple[float, float]:
 
 
 def true_depth(path: Path, camera: Camera, T_wc: np.ndarray) -> Iterator[np.ndarray]:
-    """Depth of a mesh on the tracker's grid from each pose, by ray casting; inf where nothing is."""
+    """Depth of a mesh on the tracker's grid from each pose, by ray casting; inf where empty."""
     ply = PlyData.read(str(path))
     v = np.stack([ply["vertex"][a] for a in "xyz"], -1).astype(np.float64)
     f = np.vstack(
@@ -156,13 +156,15 @@ def depth_report(tracker: Tracker, sequence: Sequence, scale: float, every: int)
     for part in order:
         e = np.abs(error[part])
         print(
-            f"  {np.median(sigma[part]):7.4f}  {np.median(e):7.4f}   {np.median(e / sigma[part]):7.2f}"
+            f"  {np.median(sigma[part]):7.4f}  {np.median(e):7.4f}"
+            f"   {np.median(e / sigma[part]):7.2f}"
             f"        {100 * np.median(e * metres[part]):9.2f}          {(e > 0.05).mean():6.1%}"
         )
     ratio = np.abs(error) / sigma
     print(
         f"  all: |error|/sigma median {np.median(ratio):.2f} (normal: 0.67), "
-        f"68 % {np.quantile(ratio, 0.683):.2f} (1.00), 95 % {np.quantile(ratio, 0.954):.2f} (2.00), "
+        f"68 % {np.quantile(ratio, 0.683):.2f} (1.00), "
+        f"95 % {np.quantile(ratio, 0.954):.2f} (2.00), "
         f"median |error| {100 * np.median(np.abs(error) * metres):.2f} cm"
     )
 

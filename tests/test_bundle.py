@@ -11,6 +11,7 @@ from geogs.tracking.bundle import (
     BundleOptions,
     BundleProblem,
     DenseBundle,
+    linearise,
     project,
     relative_motion,
     solve_poses,
@@ -52,7 +53,7 @@ def test_jacobians_match_autograd_and_finite_differences():
     grid, p = scene()
     T = relative_motion(p.T_cw, p.source, p.target)[:1]
     rays, d = grid.rays.double(), p.inverse_depth[:1].double()
-    fast = project(CAMERA, rays, T, d, jacobians=True)
+    fast = linearise(CAMERA, rays, T, d)
 
     def moved(xi, delta):
         return reproject(CAMERA, rays, retract(xi, T[0]), d[0] + delta)[0]
@@ -75,7 +76,7 @@ def test_points_behind_the_target_are_invalid_and_finite():
     grid, p = scene()
     T = torch.eye(4, dtype=torch.float64)[None].clone()
     T[0, 2, 3] = -10.0
-    out = project(CAMERA, grid.rays, T, p.inverse_depth[:1], jacobians=True)
+    out = linearise(CAMERA, grid.rays, T, p.inverse_depth[:1])
     assert not out.valid.any()
     assert torch.isfinite(out.pixels).all()
     assert torch.isfinite(out.pose_jacobian).all()
@@ -127,7 +128,7 @@ def test_information_is_the_sum_of_squared_weighted_slopes():
     grid, problem = scene()
     result = DenseBundle(grid).solve(problem, BundleOptions(iterations=1))
     T = relative_motion(problem.T_cw, problem.source, problem.target)
-    p = project(CAMERA, grid.rays, T, problem.inverse_depth[problem.source], jacobians=True)
+    p = linearise(CAMERA, grid.rays, T, problem.inverse_depth[problem.source])
     per_edge = (problem.weight * p.valid[..., None] * p.depth_jacobian.square()).sum(-1)
     for frame in range(4):
         expected = per_edge[problem.source == frame].sum(0)

@@ -248,6 +248,8 @@ class DiskConfig:
     """... or where the map lies this fraction of the depth behind a sure depth."""
     insert_confidence: float = 0.3
     """Least confidence of a depth that makes a disk at once; the rest follows later."""
+    fill_confidence: float = 0.1
+    """Least confidence of a depth that makes a disk where nothing better has come since."""
     neighbours: int = 12
     """Points of the local plane fit, at least 4."""
     scale_factor: float = 0.6
@@ -324,7 +326,7 @@ class MappingConfig:
     """Adam step of the pose tangents: radians, and u for translations."""
     map_update: Literal["coherent", "per_keyframe"] = "coherent"
     """How the map follows a correction of the poses."""
-    max_spread: float = 0.01
+    max_spread: float = 0.02
     """Rendered depth makes surface where mean and median along the ray differ by less, relative."""
     disk: DiskConfig = field(default_factory=DiskConfig)
     photo: PhotoConfig = field(default_factory=PhotoConfig)
@@ -349,7 +351,7 @@ class MeshConfig:
 
     voxel: float | None = None
     """Voxel size in map units; chosen from depth, budget and memory limit if none is given."""
-    voxel_per_pixel: float = 1.25
+    voxel_per_pixel: float = 1.0
     """Chosen voxel size in footprints of a depth map's pixel at the median depth, above 0."""
     truncation: float = 4.0
     """Voxels in front of and behind a surface in which distances are averaged, at least 2."""

@@ -69,8 +69,8 @@ def _edge_weights(
     image: UInt8[np.ndarray, "h w 3"], shape: tuple[int, int], config: DepthConfig
 ) -> Float32[np.ndarray, "gh gw"]:
     """exp(-sharpness |gradient of the Lab image|), the strongest within three pixels of a cell."""
-    lab = cv2.cvtColor(image, cv2.COLOR_RGB2LAB).astype(np.float32) * np.float32(1 / 255)
-    lab = cv2.GaussianBlur(lab, (0, 0), 1.5)
+    sharp = cv2.cvtColor(image, cv2.COLOR_RGB2LAB).astype(np.float32) * np.float32(1 / 255)
+    lab = cv2.GaussianBlur(sharp, (0, 0), 1.5)
     across = np.abs(cv2.Sobel(lab, -1, 1, 0, scale=1 / 8)).max(-1)
     down = np.abs(cv2.Sobel(lab, -1, 0, 1, scale=1 / 8)).max(-1)
     edge = cv2.dilate(np.maximum(across, down), np.ones((7, 7), np.uint8))
@@ -93,8 +93,10 @@ def _smoothness_bands(
     bend, stretch = 1.0 / (config.bending * typical), 1.0 / (config.membrane * typical)
     for axis, step in ((0, gh), (1, 1)):
         v = np.moveaxis(w, axis, 0)
-        terms = [((1.0, -2.0, 1.0), (bend * v[1:-1]) ** 2)]
-        terms.append(((1.0, -1.0), (stretch * np.minimum(v[:-1], v[1:])) ** 2))
+        terms: list[tuple[tuple[float, ...], np.ndarray]] = [
+            ((1.0, -2.0, 1.0), (bend * v[1:-1]) ** 2),
+            ((1.0, -1.0), (stretch * np.minimum(v[:-1], v[1:])) ** 2),
+        ]
         for coefficients, square in terms:
             for i, left in enumerate(coefficients):
                 for j in range(i, len(coefficients)):

@@ -82,7 +82,8 @@ class Mapper:
         self._carve([view, *self._near(view)])
         self._insert(view, self.config.disk.insert_confidence)
         if len(self.mapped) > self.config.window:
-            self._insert(self.views[self.mapped[-1 - self.config.window]], 0.0)
+            left = self.views[self.mapped[-1 - self.config.window]]
+            self._insert(left, self.config.disk.fill_confidence)
         for step in range(self.config.iterations):
             ids = draw_views(self.mapped, step, self.config, self._random)
             trainer.step(self._batch(ids))
@@ -259,22 +260,22 @@ class Mapper:
                 self.prune()
             if step in fills:
                 for view in views:
-                    self._insert(view, 0.0)
+                    self._insert(view, self.config.disk.fill_confidence)
             progress(step / total)
         trainer.set_rate(1.0)
 
     def _rendered(self, view: MapView) -> RenderedKeyframe:
         output = render(self.map, self.cameras.render, view.T_cw)
         depth = shown_depth(output, self.config.loss.min_alpha)
-        # Where disks lie at several depths along the ray, its mean depth is on none of them.
-        spread = (output.median_depth - depth).abs()
-        weight = ((depth > 0) & (spread < self.config.max_spread * depth)).float()
+        # The median lies on a surface; where the mean is far from it, there is more than one.
+        median = torch.where(depth > 0, output.median_depth, 0.0)
+        weight = ((median - depth).abs() < self.config.max_spread * depth).float()
         length = output.normal.norm(dim=-1, keepdim=True).clamp(min=1e-6)
         return RenderedKeyframe(
             keyframe_id=view.id,
             camera=self.cameras.render,
             T_cw=view.T_cw,
-            depth=depth,
+            depth=median,
             normal=torch.where(depth[..., None] > 0, output.normal / length, 0.0),
             weight=weight,
             image=view.keyframe.image,

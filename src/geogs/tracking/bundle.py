@@ -33,9 +33,17 @@ class Projection:
 
     pixels: Float[Tensor, "e p 2"]
     valid: Bool[Tensor, "e p"]
-    pose_jacobian: Float[Tensor, "e 6 2 p"] | None
+    z: Float[Tensor, "e p"]
+    """Depth in the target over depth in the source, at least ``MIN_Z``."""
+
+
+@dataclass(frozen=True)
+class LinearProjection(Projection):
+    """A projection with its first derivatives."""
+
+    pose_jacobian: Float[Tensor, "e 6 2 p"]
     """d pixel / d xi of the target pose (left perturbation), laid out for the products below."""
-    depth_jacobian: Float[Tensor, "e p 2"] | None
+    depth_jacobian: Float[Tensor, "e p 2"]
     """d pixel / d inverse depth of the source."""
 
 
@@ -91,28 +99,42 @@ def project(
     rays: Float[Tensor, "p 3"],
     T_ji: Float[Tensor, "e 4 4"],
     inverse_depth: Float[Tensor, "e p"],
-    jacobians: bool = False,
 ) -> Projection:
     """Project the cells of source frames with inverse depth d: p = pi(K (R ray + d t)).
 
-    Points with R ray + d t closer than ``MIN_Z`` are flagged and held at that depth. Jacobians are
-    with respect to a left perturbation of T_ji and to d (DROID-SLAM, reprojection layer).
+    Points with R ray + d t closer than ``MIN_Z`` are flagged and held at that depth.
     """
     R, t = T_ji[:, :3, :3].to(inverse_depth), T_ji[:, :3, 3].to(inverse_depth)
     y = rays @ R.mT + inverse_depth[..., None] * t[:, None]
     valid = y[..., 2] > MIN_Z
-    q = 1 / y[..., 2].clamp(min=MIN_Z)
-    x, v = y[..., 0] * q, y[..., 1] * q
-    pixels = torch.stack([camera.fx * x + camera.cx, camera.fy * v + camera.cy], -1)
-    if not jacobians:
-        return Projection(pixels, valid, None, None)
+    z = y[..., 2].clamp(min=MIN_Z)
+    pixels = torch.stack(
+        [camera.fx * y[..., 0] / z + camera.cx, camera.fy * y[..., 1] / z + camera.cy], -1
+    )
+    return Projection(pixels, valid, z)
+
+
+def linearise(
+    camera: Camera,
+    rays: Float[Tensor, "p 3"],
+    T_ji: Float[Tensor, "e 4 4"],
+    inverse_depth: Float[Tensor, "e p"],
+) -> LinearProjection:
+    """:func:`project` with the Jacobians in a left perturbation of T_ji and in d.
+
+    Source: DROID-SLAM's reprojection layer.
+    """
+    p = project(camera, rays, T_ji, inverse_depth)
+    t, q = T_ji[:, :3, 3].to(inverse_depth), 1 / p.z
+    x = (p.pixels[..., 0] - camera.cx) / camera.fx
+    v = (p.pixels[..., 1] - camera.cy) / camera.fy
     dq = inverse_depth * q
     o = torch.zeros_like(q)
     row_x = torch.stack([dq, o, -x * dq, -x * v, 1 + x * x, -v], 1) * camera.fx
     row_y = torch.stack([o, dq, -v * dq, -1 - v * v, x * v, x], 1) * camera.fy
     tx, ty, tz = t[:, None].unbind(-1)
     depth = torch.stack([camera.fx * (tx - tz * x) * q, camera.fy * (ty - tz * v) * q], -1)
-    return Projection(pixels, valid, torch.stack([row_x, row_y], 2), depth)
+    return LinearProjection(p.pixels, p.valid, p.z, torch.stack([row_x, row_y], 2), depth)
 
 
 def robust_weight(
@@ -207,7 +229,7 @@ class DenseBundle:
     ) -> list[_Star]:
         i, j = problem.source[chunk], problem.target[chunk]
         T_ji = relative_motion(T, i, j)
-        p = project(self.grid.camera, self.grid.rays, T_ji, d[i], jacobians=True)
+        p = linearise(self.grid.camera, self.grid.rays, T_ji, d[i])
         r = problem.pixels[chunk] - p.pixels
         w = robust_weight(r, problem.weight[chunk] * p.valid[..., None], options.huber)
         wJ = p.pose_jacobian * w.mT[:, None]
@@ -330,7 +352,7 @@ def solve_poses(
     T = T_cw
     inverse = se3_inverse(T_source)
     for _ in range(iterations):
-        p = project(camera, rays, T[frame] @ inverse, inverse_depth, jacobians=True)
+        p = linearise(camera, rays, T[frame] @ inverse, inverse_depth)
         r = pixels - p.pixels
         w = robust_weight(r, weight * p.valid[..., None], huber)
         wJ = p.pose_jacobian * w.mT[:, None]

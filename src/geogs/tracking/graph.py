@@ -166,7 +166,7 @@ def frame_distances(
     d = store.inverse_depths([e[0] for e in directed])[:, keep]
     shift = T.clone()
     shift[:, :3, :3] = torch.eye(3, dtype=T.dtype, device=T.device)
-    total = valid = inside = 0
+    total = valid = inside = torch.zeros(len(directed), device=T.device)
     for motion, share in ((T, rotation_weight), (shift, 1 - rotation_weight)):
         p = project(grid.camera, rays, motion, d)
         flow = (p.pixels - pixels).norm(dim=-1)
@@ -212,9 +212,8 @@ def proximity_pairs(
         if b - a > radius and (a, b) not in blocked
     ]
     directed = [(ids[a], ids[b]) for a, b in candidates]
-    there = frame_distances(store, directed)
-    back = frame_distances(store, [(j, i) for i, j in directed])
-    distance = (there + back) / 2
+    reverse = [(j, i) for i, j in directed]
+    distance = (frame_distances(store, directed) + frame_distances(store, reverse)) / 2
     for n in torch.argsort(distance, stable=True).tolist():
         if float(distance[n]) > max_distance or len(found) >= max_pairs:
             break

@@ -114,9 +114,9 @@ def two_view(grid: SampleGrid, match: FlowMatch) -> TwoView | None:
     T[:3, 3] /= median
     device = grid.device
     depth = torch.from_numpy(np.where(good, median / np.where(good, z, 1), 1.0)).float().to(device)
-    mask = torch.from_numpy(good).to(device)
+    known = torch.from_numpy(np.asarray(good, bool)).to(device)
     return TwoView(
-        torch.from_numpy(T).to(device), grid.fill(depth, mask.float()), mask, float(parallax)
+        torch.from_numpy(T).to(device), grid.fill(depth, known.float()), known, float(parallax)
     )
 
 

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from geogs.geometry.lie import retract, se3_inverse, se3_log
-from geogs.tracking.bundle import project, solve_poses
+from geogs.tracking.bundle import linearise, solve_poses
 from geogs.tracking.flow.base import FlowMatch, FlowOperator
 from geogs.tracking.grid import SampleGrid
 from geogs.tracking.keyframes import KeyframeState, KeyframeStore
@@ -125,7 +125,10 @@ class TrajectoryRecorder:
             (p, k)
             for p in ready
             for k in (before, after)
-            if k is not None and p.record.anchor in self.store and not p.record.sees(k)
+            if k is not None
+            and p.record.anchor is not None
+            and p.record.anchor in self.store
+            and not p.record.sees(k)
         ]
         for start in range(0, len(jobs), 8):
             self._measure(jobs[start : start + 8])
@@ -151,6 +154,7 @@ class TrajectoryRecorder:
             record.observations.append(Observation(keyframe, pixels.clone(), weight.clone()))
 
     def _pose(self, record: FrameRecord) -> Float[Tensor, "4 4"]:
+        assert record.anchor is not None, "a frame that was not tracked has no pose"
         return record.T_rel @ self.store[record.anchor].T_cw
 
     def solve(self, chunk: int = 64) -> Trajectory:
@@ -189,9 +193,7 @@ class TrajectoryRecorder:
         information = self.store.informations(ids)[:, cells]
         source = self.store.poses(ids)
         weight = torch.stack([o.weight for _, o in pairs])
-        p = project(
-            grid.camera, grid.rays[cells], start[frame] @ se3_inverse(source), depth, jacobians=True
-        )
+        p = linearise(grid.camera, grid.rays[cells], start[frame] @ se3_inverse(source), depth)
         weight = depth_aware_weight(weight, p.depth_jacobian, information)
         pixels = torch.stack([o.pixels for _, o in pairs])
         T, _ = solve_poses(
@@ -222,17 +224,16 @@ def interpolate(
     timestamps: Float[np.ndarray, "n"], T_cw: list[Tensor | None]
 ) -> Float[np.ndarray, "n 4 4"]:
     """Camera to world of every frame; gaps are bridged by constant motion, ends are held."""
-    known = [n for n, T in enumerate(T_cw) if T is not None]
+    known = {n: T for n, T in enumerate(T_cw) if T is not None}
     out = np.tile(np.eye(4), (len(T_cw), 1, 1))
     if not known:
         return out
-    for n, T in enumerate(T_cw):
-        if T is None:
-            a = max((k for k in known if k < n), default=known[0])
-            b = min((k for k in known if k > n), default=known[-1])
-            T = T_cw[a]
-            if a != b:
-                share = (timestamps[n] - timestamps[a]) / max(timestamps[b] - timestamps[a], 1e-9)
-                T = retract(share * se3_log(T_cw[b] @ se3_inverse(T)), T)
+    for n in range(len(T_cw)):
+        a = max((k for k in known if k <= n), default=min(known))
+        b = min((k for k in known if k >= n), default=max(known))
+        T = known[a]
+        if a != b:
+            share = (timestamps[n] - timestamps[a]) / max(timestamps[b] - timestamps[a], 1e-9)
+            T = retract(share * se3_log(known[b] @ se3_inverse(T)), T)
         out[n] = se3_inverse(T).cpu().numpy()
     return out
