@@ -326,8 +326,8 @@ class MappingConfig:
     """Adam step of the pose tangents: radians, and u for translations."""
     map_update: Literal["coherent", "per_keyframe"] = "coherent"
     """How the map follows a correction of the poses."""
-    max_spread: float = 0.02
-    """Rendered depth makes surface where mean and median along the ray differ by less, relative."""
+    max_spread: float = 0.01
+    """Surfaces take the mean depth of a ray where the median differs by less, else the median."""
     disk: DiskConfig = field(default_factory=DiskConfig)
     photo: PhotoConfig = field(default_factory=PhotoConfig)
     depth: DepthConfig = field(default_factory=DepthConfig)

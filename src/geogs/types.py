@@ -104,6 +104,6 @@ class RenderedKeyframe:
     normal: Float[Tensor, "h w 3"]
     """Camera frame, facing the camera, zero where there is no depth."""
     weight: Float[Tensor, "h w"]
-    """How far the depth may be trusted, in [0, 1]; 0 where disks spread along the ray."""
+    """How far the depth may be trusted, in [0, 1]; less where disks spread along the ray."""
     image: UInt8[np.ndarray, "h2 w2 3"]
     """RGB at working resolution."""

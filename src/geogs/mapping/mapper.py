@@ -267,15 +267,17 @@ class Mapper:
     def _rendered(self, view: MapView) -> RenderedKeyframe:
         output = render(self.map, self.cameras.render, view.T_cw)
         depth = shown_depth(output, self.config.loss.min_alpha)
-        # The median lies on a surface; where the mean is far from it, there is more than one.
-        median = torch.where(depth > 0, output.median_depth, 0.0)
-        weight = ((median - depth).abs() < self.config.max_spread * depth).float()
+        # The mean is smoother; but where the ray meets several surfaces it lies on none of them,
+        # while the median is on one.
+        single = (output.median_depth - depth).abs() < self.config.max_spread * depth
+        depth = torch.where(single | (depth <= 0), depth, output.median_depth)
+        weight = torch.where(single, 1.0, 0.5) * (depth > 0)
         length = output.normal.norm(dim=-1, keepdim=True).clamp(min=1e-6)
         return RenderedKeyframe(
             keyframe_id=view.id,
             camera=self.cameras.render,
             T_cw=view.T_cw,
-            depth=median,
+            depth=depth,
             normal=torch.where(depth[..., None] > 0, output.normal / length, 0.0),
             weight=weight,
             image=view.keyframe.image,
