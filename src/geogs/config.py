@@ -34,7 +34,7 @@ class TrackingConfig:
     """Median motion since the last keyframe that makes a frame a keyframe, of the long edge."""
     cull_distance: float = 0.012
     """A keyframe nearer than this to the one before it is removed again, of the long edge."""
-    init_keyframes: int = 8
+    init_keyframes: int = 12
     """Keyframes gathered before the map is started, at least 4."""
     min_parallax: float = 0.02
     """Motion that rotation does not explain, needed to start, of the long edge."""
