@@ -58,6 +58,12 @@ def write_results(
         except InputError as error:
             mesh = None
             progress.write(f"No mesh: {error}")
+    lost = int((~trajectory.tracked).sum())
+    if lost > 0.2 * slam.frames:
+        progress.write(
+            f"warning: {lost} of {slam.frames} frames were not tracked; a slower motion, more texture "
+            "or the right --intrinsics may help."
+        )
     summary = summarise(slam, source, trajectory, disks, mesh, config, interrupted)
     write_text(output / "summary.json", json.dumps(summary, indent=2))
     with slam.stopwatch("report"):
