@@ -11,6 +11,10 @@ if TYPE_CHECKING:
     from geogs.slam import SlamStatus
 
 
+_LOG_SECONDS = 2.0
+"""Where no terminal redraws the bars, a line of text comes this often."""
+
+
 def peak_memory() -> int:
     """Largest resident size of this process so far, bytes."""
     import resource
@@ -33,7 +37,7 @@ class RunProgress:
             console=self._console,
         )
         self._frames = frames
-        self._start = time.perf_counter()
+        self._start = self._printed = time.perf_counter()
         self._tasks = {"tracking": self._bar.add_task("tracking", total=frames, info="")}
 
     def __enter__(self) -> "RunProgress":
@@ -58,6 +62,10 @@ class RunProgress:
         if status.state.value != "tracking":
             info += f"  [bold]{status.state.value}[/bold]"
         self._bar.update(self._tasks["tracking"], completed=status.frames, info=info)
+        now = time.perf_counter()
+        if not self._console.is_terminal and now - self._printed > _LOG_SECONDS:
+            self._printed = now
+            self._console.print(f"frame {status.frames}/{self._frames or '?'}: {info}")
 
     def stage(self, name: str, fraction: float) -> None:
         """After each part of a later stage; ``fraction`` in [0, 1]."""

@@ -61,7 +61,7 @@ def write_results(
     lost = int((~trajectory.tracked).sum())
     if lost > 0.2 * slam.frames:
         progress.write(
-            f"warning: {lost} of {slam.frames} frames were not tracked; a slower motion, more texture "
+            f"warning: {lost} of {slam.frames} frames were not tracked; slower motion, texture "
             "or the right --intrinsics may help."
         )
     summary = summarise(slam, source, trajectory, disks, mesh, config, interrupted)

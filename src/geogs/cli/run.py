@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from geogs.cli.interrupt import Interruption
 from geogs.cli.options import parse_options
 from geogs.cli.progress import RunProgress
 from geogs.config import Config, Preset, preset
@@ -67,26 +68,38 @@ def run(options: RunOptions) -> Path:
     source = open_source(options.source, options.input)
     output = prepare_output_folder(options.output or Path("out") / source.name)
     slam = Slam(source.camera, options, options.device)
-    with RunProgress(source.length) as progress:
-        interrupted = _feed(slam, source, progress)
-        progress.write("Stopped early; keeping what there is." if interrupted else "")
-        slam.finish(progress.stage, correct=not interrupted)
+    with Interruption() as stop, RunProgress(source.length) as progress:
+        _feed(slam, source, progress, stop)
+        interrupted = stop.requested
+        if interrupted:
+            progress.write("Stopping early; keeping what there is. Press Ctrl-C again to quit.")
+        interrupted |= not _finish(slam, progress, stop)
         write_results(output, slam, source, options, interrupted, progress)
     print(f"Results are in {output}/")
     return output
 
 
-def _feed(slam: "Slam", source: "Source", progress: RunProgress) -> bool:
-    """All frames through the system; true if Ctrl-C ended it early."""
+def _feed(slam: "Slam", source: "Source", progress: RunProgress, stop: Interruption) -> None:
+    """All frames through the system, until a request to stop."""
+    for frame in source:
+        status = slam.process(frame)
+        progress.frame(status)
+        if stop.requested:
+            return
+
+
+def _finish(slam: "Slam", progress: RunProgress, stop: Interruption) -> bool:
+    """The final stages; false if a request to stop cut them short."""
+
+    def report(stage: str, fraction: float) -> None:
+        progress.stage(stage, fraction)
+        stop.check()
+
     try:
-        for frame in source:
-            status = slam.process(frame)
-            progress.frame(status)
+        slam.finish(report, correct=not stop.requested)
     except KeyboardInterrupt:
-        if slam.frames == 0:
-            raise
-        return True
-    return False
+        return False
+    return True
 
 
 def parse(argv: Sequence[str]) -> RunOptions:
