@@ -129,6 +129,7 @@ class Mapper:
         start = 0.4 if self.config.final_depth else 0.0
         self._train_all(views, lambda fraction: progress(start + (1 - start) * fraction))
         self.prune()
+        self._training().optimizer.keep(self.map.seen > 0)
 
     def prune(self) -> None:
         """Drop transparent and broken disks, and those that the keyframes see in free space."""
