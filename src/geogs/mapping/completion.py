@@ -9,11 +9,7 @@ from scipy.linalg import solveh_banded
 
 from geogs.config import DepthConfig
 from geogs.geometry.camera import Camera
-
-GRID_STRIDE = 8
-"""Pixels of the working image between two cells of the tracker's grid."""
-GRID_OFFSET = 4
-"""Pixel of the working image that the first cell samples."""
+from geogs.tracking.grid import OFFSET, STRIDE
 
 
 @dataclass(frozen=True)
@@ -74,8 +70,8 @@ def _edge_weights(
     across = np.abs(cv2.Sobel(lab, -1, 1, 0, scale=1 / 8)).max(-1)
     down = np.abs(cv2.Sobel(lab, -1, 0, 1, scale=1 / 8)).max(-1)
     edge = cv2.dilate(np.maximum(across, down), np.ones((7, 7), np.uint8))
-    rows = np.minimum(GRID_OFFSET + GRID_STRIDE * np.arange(shape[0]), edge.shape[0] - 1)
-    columns = np.minimum(GRID_OFFSET + GRID_STRIDE * np.arange(shape[1]), edge.shape[1] - 1)
+    rows = np.minimum(OFFSET + STRIDE * np.arange(shape[0]), edge.shape[0] - 1)
+    columns = np.minimum(OFFSET + STRIDE * np.arange(shape[1]), edge.shape[1] - 1)
     return np.exp(-config.edge_sharpness * edge[np.ix_(rows, columns)])
 
 
@@ -111,8 +107,8 @@ def upsample_grid(
     """Bilinear values of a tracker grid at the pixels of the render camera; borders repeat."""
     u = (np.arange(render.width) - render.cx) * (working.fx / render.fx) + working.cx
     v = (np.arange(render.height) - render.cy) * (working.fy / render.fy) + working.cy
-    columns = ((u - GRID_OFFSET) / GRID_STRIDE).astype(np.float32)
-    rows = ((v - GRID_OFFSET) / GRID_STRIDE).astype(np.float32)
+    columns = ((u - OFFSET) / STRIDE).astype(np.float32)
+    rows = ((v - OFFSET) / STRIDE).astype(np.float32)
     x, y = np.meshgrid(columns, rows)
     return cv2.remap(
         np.ascontiguousarray(grid, np.float32),

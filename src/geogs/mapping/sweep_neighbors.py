@@ -7,8 +7,8 @@ from jaxtyping import Float64
 
 from geogs.config import DepthConfig
 from geogs.geometry.camera import Camera
-from geogs.mapping.completion import GRID_OFFSET, GRID_STRIDE
 from geogs.mapping.depth_view import DepthView
+from geogs.tracking.grid import OFFSET, STRIDE
 
 
 def parallax_degrees(reference: DepthView, other: DepthView, depth: float) -> tuple[float, float]:
@@ -94,8 +94,8 @@ def _seen_inverse_depth(
     if len(deviation) == 0:
         return deviation
     sure = deviation <= max(config.range_deviation, float(np.median(deviation)))
-    x = (GRID_OFFSET + GRID_STRIDE * columns - working.cx) / working.fx * z
-    y = (GRID_OFFSET + GRID_STRIDE * rows - working.cy) / working.fy * z
+    x = (OFFSET + STRIDE * columns - working.cx) / working.fx * z
+    y = (OFFSET + STRIDE * rows - working.cy) / working.fy * z
     relative = reference.T_cw @ np.linalg.inv(view.T_cw)
     point = relative[:3, :3] @ np.stack([x, y, z])[:, sure] + relative[:3, 3:]
     point = point[:, point[2] > 1e-6]

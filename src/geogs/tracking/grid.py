@@ -10,7 +10,9 @@ from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 
 STRIDE = 8
+"""Pixels of the working image between two cells of the grid."""
 OFFSET = 4
+"""Pixel of the working image that the first cell samples."""
 
 
 @dataclass(frozen=True)

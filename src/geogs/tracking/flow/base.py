@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
-import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
@@ -47,9 +46,3 @@ class FlowOperator(Protocol):
         ``fine`` False allows a cheaper, less precise measurement.
         """
         ...
-
-
-def select(match: FlowMatch, edges: Sequence[int]) -> FlowMatch:
-    """The given edges of a match."""
-    index = torch.as_tensor(list(edges), device=match.pixels.device)
-    return FlowMatch(match.pixels[index], match.weight[index])
