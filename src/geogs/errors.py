@@ -15,3 +15,7 @@ class TrackingLost(GeogsError):
 
 class OutputError(GeogsError):
     """A result could not be written; what was already on disk is kept."""
+
+
+class DeviceError(GeogsError):
+    """A GPU, its driver or its compiler is missing or unsuitable."""

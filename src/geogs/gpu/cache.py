@@ -1,0 +1,56 @@
+"""Compiled kernels on disk, so that only the first start compiles."""
+
+import hashlib
+import logging
+import os
+import tempfile
+from pathlib import Path
+
+_log = logging.getLogger(__name__)
+
+
+def cache_folder() -> Path:
+    """``$GEOGS_CACHE``, else geogs in the user's cache directory."""
+    if chosen := os.environ.get("GEOGS_CACHE"):
+        return Path(chosen)
+    base = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA")
+    return (Path(base) if base else Path.home() / ".cache") / "geogs"
+
+
+def cache_key(*parts: str) -> str:
+    """Name of a cached file made from everything that its content depends on."""
+    return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:32]
+
+
+def read_cubin(key: str) -> bytes | None:
+    """A cached cubin, None where there is none or it does not carry its own checksum."""
+    try:
+        content = _path(key).read_bytes()
+    except OSError:
+        return None
+    checksum, cubin = content[:32], content[32:]
+    return cubin if hashlib.sha256(cubin).digest() == checksum else None
+
+
+def write_cubin(key: str, cubin: bytes) -> bool:
+    """Keep a cubin; appears at once and whole, whoever else writes it. False if it cannot be."""
+    path = _path(key)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, name = tempfile.mkstemp(dir=path.parent)
+        with os.fdopen(handle, "wb") as file:
+            file.write(hashlib.sha256(cubin).digest() + cubin)
+        os.replace(name, path)
+    except OSError as error:
+        _log.warning(
+            "compiled kernels cannot be kept in %s (%s), so every start compiles them again; "
+            "set GEOGS_CACHE to a folder that can be written",
+            path.parent,
+            error.strerror or error,
+        )
+        return False
+    return True
+
+
+def _path(key: str) -> Path:
+    return cache_folder() / "kernels" / f"{key}.cubin"

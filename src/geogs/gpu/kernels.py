@@ -1,0 +1,74 @@
+"""Kernels of a source file for a device: from the cache, or compiled now."""
+
+import functools
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import torch
+
+from geogs.errors import DeviceError
+from geogs.gpu.cache import cache_key, read_cubin, write_cubin
+from geogs.gpu.source import kernel_signatures, read_source
+
+Kernel = Callable[..., None]
+"""``kernel(grid, block, *arguments, shared=0)``; grid and block are ints or tuples of ints."""
+
+OPTIONS = ("--use_fast_math", "--std=c++17")
+
+
+def kernels_for(source: Path, device: torch.device) -> Mapping[str, Kernel]:
+    """The kernels that a ``.cu`` file defines, by name, ready to be launched on a GPU.
+
+    Raises DeviceError where there is no such GPU or its kernels cannot be compiled or loaded.
+    """
+    if device.type != "cuda":
+        raise DeviceError(f"CUDA kernels do not run on {device}.")
+    index = torch.cuda.current_device() if device.index is None else device.index
+    return _device_kernels(source, index)
+
+
+@functools.cache
+def _device_kernels(source: Path, index: int) -> Mapping[str, Kernel]:
+    from geogs.gpu.driver import load_kernels
+
+    text = read_source(source)
+    signatures = list(kernel_signatures(text).values())
+    major, minor = torch.cuda.get_device_capability(index)
+    cubin, key = find_cubin(text, source.name, f"sm_{major}{minor}")
+    try:
+        return load_kernels(cubin, signatures, index)
+    except DeviceError:
+        if read_cubin(key) is None:
+            raise
+    # The cached file may be what is wrong.
+    return load_kernels(compile_cubin(text, source.name, f"sm_{major}{minor}"), signatures, index)
+
+
+def find_cubin(text: str, name: str, architecture: str) -> tuple[bytes, str]:
+    """Machine code of a source for an architecture such as ``sm_90``, and its key in the cache."""
+    key = cache_key(text, architecture, *OPTIONS, _compiler_version())
+    cubin = read_cubin(key)
+    if cubin is None:
+        cubin = compile_cubin(text, name, architecture)
+        write_cubin(key, cubin)
+    return cubin, key
+
+
+def compile_cubin(text: str, name: str, architecture: str) -> bytes:
+    """Compile a source whatever the cache holds."""
+    from geogs.gpu.nvrtc import load_nvrtc
+
+    options = [f"--gpu-architecture={architecture}", *OPTIONS]
+    return load_nvrtc(_cuda_major()).compile(text, name, options)
+
+
+def _cuda_major() -> str:
+    version = torch.version.cuda
+    if version is None:
+        raise DeviceError("This PyTorch was built without CUDA; install a CUDA build of PyTorch.")
+    return version.split(".")[0]
+
+
+def _compiler_version() -> str:
+    """The toolkit's version, without loading the compiler."""
+    return str(torch.version.cuda)

@@ -1,0 +1,86 @@
+"""The run-time compiler that comes inside PyTorch's CUDA wheels."""
+
+import ctypes
+import functools
+import glob
+import importlib.util
+import os
+import sys
+from pathlib import Path
+
+from geogs.errors import DeviceError
+
+
+class Nvrtc:
+    """CUDA C++ in, machine code (cubin) out."""
+
+    def __init__(self, library: ctypes.CDLL) -> None:
+        self._library = library
+        major, minor = ctypes.c_int(), ctypes.c_int()
+        self._check(library.nvrtcVersion(ctypes.byref(major), ctypes.byref(minor)))
+        self.version = f"{major.value}.{minor.value}"
+
+    def compile(self, source: str, name: str, options: list[str]) -> bytes:
+        """The cubin of a source; raises DeviceError with the compiler's words if it has errors."""
+        rtc, program = self._library, ctypes.c_void_p()
+        self._check(
+            rtc.nvrtcCreateProgram(
+                ctypes.byref(program), source.encode(), name.encode(), 0, None, None
+            )
+        )
+        try:
+            flags = (ctypes.c_char_p * len(options))(*(o.encode() for o in options))
+            if rtc.nvrtcCompileProgram(program, len(options), flags):
+                log = self._text(program, rtc.nvrtcGetProgramLogSize, rtc.nvrtcGetProgramLog)
+                raise DeviceError(f"The CUDA kernels in {name} do not compile: {log.decode()}")
+            return self._text(program, rtc.nvrtcGetCUBINSize, rtc.nvrtcGetCUBIN)
+        finally:
+            rtc.nvrtcDestroyProgram(ctypes.byref(program))
+
+    def _text(self, program: ctypes.c_void_p, size_of, copy) -> bytes:  # type: ignore[no-untyped-def]
+        size = ctypes.c_size_t()
+        self._check(size_of(program, ctypes.byref(size)))
+        buffer = ctypes.create_string_buffer(size.value)
+        self._check(copy(program, buffer))
+        return buffer.raw
+
+    def _check(self, code: int) -> None:
+        if code:
+            self._library.nvrtcGetErrorString.restype = ctypes.c_char_p
+            message = self._library.nvrtcGetErrorString(code).decode()
+            raise DeviceError(f"The CUDA run-time compiler failed: {message}.")
+
+
+@functools.cache
+def load_nvrtc(cuda_major: str) -> Nvrtc:
+    """The compiler of PyTorch's CUDA version; raises DeviceError where there is none."""
+    for path in [*_candidates(cuda_major), f"libnvrtc.so.{cuda_major}", "libnvrtc.so"]:
+        try:
+            _preload_builtins(path)
+            return Nvrtc(ctypes.CDLL(path))
+        except OSError:
+            continue
+    raise DeviceError(
+        f"The CUDA {cuda_major} run-time compiler (libnvrtc) is missing; install "
+        f"nvidia-cuda-nvrtc or a CUDA build of PyTorch."
+    )
+
+
+def _candidates(cuda_major: str) -> list[str]:
+    """Copies in Python packages first, then those of an installed toolkit."""
+    name = f"libnvrtc.so.{cuda_major}" if os.name == "posix" else f"nvrtc64_{cuda_major}0_0.dll"
+    folders = [Path(p) / "nvidia" for p in sys.path if p]
+    spec = importlib.util.find_spec("torch")
+    if spec is not None and spec.origin is not None:
+        folders += [Path(spec.origin).parents[1] / "nvidia", Path(spec.origin).parent / "lib"]
+    found = [str(p) for f in folders if f.is_dir() for p in sorted(f.rglob(name))]
+    return list(dict.fromkeys(found + sorted(glob.glob(f"/usr/local/cuda*/lib64/{name}"))))
+
+
+def _preload_builtins(path: str) -> None:
+    """NVRTC opens its builtins by bare name, which fails outside the loader's path."""
+    for builtins in sorted(Path(path).parent.glob("libnvrtc-builtins.so*")):
+        try:
+            ctypes.CDLL(str(builtins), mode=ctypes.RTLD_GLOBAL)
+        except OSError:
+            continue

@@ -1,0 +1,59 @@
+"""Kernel sources: what they include and which kernels they define."""
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+INCLUDE_FOLDER = Path(__file__).parent
+"""Where ``#include "common.cuh"`` is found."""
+
+_KERNEL = re.compile(
+    r'extern\s+"C"\s+__global__\s+void\s+(?:__launch_bounds__\([^)]*\)\s*)?(\w+)\s*\(([^)]*)\)',
+    re.DOTALL,
+)
+_INCLUDE = re.compile(r'^\s*#include\s+"([^"]+)"', re.MULTILINE)
+
+
+@dataclass(frozen=True)
+class KernelSignature:
+    """A kernel's name and the types of its parameters, as ``float*``, ``int``, ``float``, ..."""
+
+    name: str
+    parameters: tuple[str, ...]
+
+
+def read_source(path: Path) -> str:
+    """The text with its own includes in place, each once: all that the compiled code depends on."""
+    seen: set[str] = set()
+
+    def insert(text: str, folder: Path) -> str:
+        def replace(match: re.Match[str]) -> str:
+            name = match.group(1)
+            if name in seen:
+                return ""
+            seen.add(name)
+            near = folder / name
+            file = near if near.is_file() else INCLUDE_FOLDER / name
+            return insert(file.read_text(), file.parent)
+
+        return _INCLUDE.sub(replace, text)
+
+    return insert(path.read_text(), path.parent)
+
+
+def kernel_signatures(source: str) -> dict[str, KernelSignature]:
+    """The ``extern "C" __global__`` functions of a source."""
+    plain = re.sub(r"//[^\n]*|/\*.*?\*/", "", source, flags=re.DOTALL)
+    found = {}
+    for name, text in _KERNEL.findall(plain):
+        types = tuple(_parameter_type(p) for p in text.split(",") if p.strip())
+        found[name] = KernelSignature(name, types)
+    return found
+
+
+def _parameter_type(declaration: str) -> str:
+    """``const float* __restrict__ x`` -> ``float*``"""
+    text = re.sub(r"\b(const|__restrict__)\b", " ", declaration)
+    stars = text.count("*")
+    words = text.replace("*", " ").split()
+    return " ".join(words[:-1]) + "*" * stars
