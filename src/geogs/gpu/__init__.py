@@ -1,1 +1,1 @@
-"""CUDA kernels from package sources: compiled at first use, cached, launched on PyTorch's stream."""
+"""CUDA kernels from package sources: compiled at first use, cached, launched on the stream."""
