@@ -32,6 +32,9 @@ COMMANDS = {
     "eval": Command("geogs.cli.eval", "compare a result with the ground truth"),
     "synth": Command("geogs.cli.synth", "make a synthetic room sequence with exact ground truth"),
     "demo": Command("geogs.cli.demo", "make a small room, reconstruct it and show the errors"),
+    "doctor": Command(
+        "geogs.cli.doctor", "show what this machine can do, test it, say what to mend"
+    ),
 }
 
 

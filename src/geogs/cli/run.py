@@ -42,7 +42,7 @@ class RunOptions(Config):
     preset: Preset = "default"
     """Group of settings; single ones given beside it win."""
     device: str = "cpu"
-    """Where to compute."""
+    """Where to compute: cpu, cuda or cuda:1; ``geogs doctor`` tells what can be used."""
 
 
 def main(argv: Sequence[str]) -> int:
@@ -57,17 +57,16 @@ def run(options: RunOptions) -> Path:
     import torch
 
     from geogs.cli.results import write_results
-    from geogs.errors import InputError
+    from geogs.gpu.installation import require_device
     from geogs.io.sources.sniff import open_source
     from geogs.io.writers.atomic import prepare_output_folder
     from geogs.slam import Slam
 
     torch.set_num_threads(1)  # the kernels have threads of their own; see geogs.threads
-    if options.device != "cpu":
-        raise InputError(f"There is no backend for {options.device} yet; use --device cpu.")
+    device = require_device(options.device)
     source = open_source(options.source, options.input)
     output = prepare_output_folder(options.output or Path("out") / source.name)
-    slam = Slam(source.camera, options, options.device)
+    slam = Slam(source.camera, options, str(device))
     with Interruption() as stop, RunProgress(source.length) as progress:
         _feed(slam, source, progress, stop)
         interrupted = stop.requested

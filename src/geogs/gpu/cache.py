@@ -4,9 +4,21 @@ import hashlib
 import logging
 import os
 import tempfile
+from dataclasses import dataclass
 from pathlib import Path
 
 _log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class CacheState:
+    """What is kept and whether more can be."""
+
+    kernels: int
+    """Compiled source files."""
+    bytes: int
+    problem: str | None
+    """Why nothing can be written, None if it can."""
 
 
 def cache_folder() -> Path:
@@ -52,5 +64,23 @@ def write_cubin(key: str, cubin: bytes) -> bool:
     return True
 
 
+def cache_state() -> CacheState:
+    """Look into the cache, and try to write there."""
+    folder = _kernel_folder()
+    files = list(folder.glob("*.cubin"))
+    problem = None
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        problem = error.strerror or str(error)
+    return CacheState(len(files), sum(f.stat().st_size for f in files), problem)
+
+
+def _kernel_folder() -> Path:
+    return cache_folder() / "kernels"
+
+
 def _path(key: str) -> Path:
-    return cache_folder() / "kernels" / f"{key}.cubin"
+    return _kernel_folder() / f"{key}.cubin"

@@ -3,12 +3,16 @@
 import functools
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import torch
 
 from geogs.errors import DeviceError
 from geogs.gpu.cache import cache_key, read_cubin, write_cubin
 from geogs.gpu.source import kernel_signatures, read_source
+
+if TYPE_CHECKING:
+    from geogs.gpu.nvrtc import Nvrtc
 
 Kernel = Callable[..., None]
 """``kernel(grid, block, *arguments, shared=0)``; grid and block are ints or tuples of ints."""
@@ -56,10 +60,15 @@ def find_cubin(text: str, name: str, architecture: str) -> tuple[bytes, str]:
 
 def compile_cubin(text: str, name: str, architecture: str) -> bytes:
     """Compile a source whatever the cache holds."""
+    options = [f"--gpu-architecture={architecture}", *OPTIONS]
+    return compiler().compile(text, name, options)
+
+
+def compiler() -> "Nvrtc":
+    """The run-time compiler that belongs to PyTorch; raises DeviceError where there is none."""
     from geogs.gpu.nvrtc import load_nvrtc
 
-    options = [f"--gpu-architecture={architecture}", *OPTIONS]
-    return load_nvrtc(_cuda_major()).compile(text, name, options)
+    return load_nvrtc(_cuda_major())
 
 
 def _cuda_major() -> str:

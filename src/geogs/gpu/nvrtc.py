@@ -14,7 +14,10 @@ from geogs.errors import DeviceError
 class Nvrtc:
     """CUDA C++ in, machine code (cubin) out."""
 
-    def __init__(self, library: ctypes.CDLL) -> None:
+    def __init__(self, path: str) -> None:
+        library = ctypes.CDLL(path)
+        self.path = path
+        """As it was opened; a bare name was found by the system's loader."""
         self._library = library
         major, minor = ctypes.c_int(), ctypes.c_int()
         self._check(library.nvrtcVersion(ctypes.byref(major), ctypes.byref(minor)))
@@ -57,7 +60,7 @@ def load_nvrtc(cuda_major: str) -> Nvrtc:
     for path in [*_candidates(cuda_major), f"libnvrtc.so.{cuda_major}", "libnvrtc.so"]:
         try:
             _preload_builtins(path)
-            return Nvrtc(ctypes.CDLL(path))
+            return Nvrtc(path)
         except OSError:
             continue
     raise DeviceError(
