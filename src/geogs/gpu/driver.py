@@ -80,6 +80,8 @@ class DeviceKernel:
                 slots[i] = 0
             elif self._types[i] == "float":
                 slots[i] = struct.unpack("I", struct.pack("f", value))[0]
+            elif self._types[i] == "double":
+                slots[i] = struct.unpack("Q", struct.pack("d", value))[0]
             else:
                 slots[i] = int(value) & 0xFFFFFFFFFFFFFFFF
         if shared > self._dynamic:

@@ -13,7 +13,7 @@ from geogs.splat.map import DiskParameters, GaussianMap
 from geogs.splat.reference import render_reference
 from geogs.threads import worker_count
 
-Backend = Literal["auto", "reference", "cpu"]
+Backend = Literal["auto", "reference", "cpu", "cuda"]
 
 NEAR = 0.05
 """Depth in map units up to which a disk's centre and hits are ignored."""
@@ -21,23 +21,26 @@ NEAR = 0.05
 
 @dataclass(frozen=True, slots=True)
 class RenderOutput:
-    """Maps of one view. Gradients flow from all but ``median_depth`` and ``visible``."""
+    """Maps of one view, or of several with a leading dimension.
 
-    depth: Float[Tensor, "h w"]
+    Gradients flow from all but ``median_depth`` and ``visible``.
+    """
+
+    depth: Float[Tensor, "*b h w"]
     """Ray-disk intersections blended and divided by alpha, z in map units; 0 where alpha is 0."""
-    normal: Float[Tensor, "h w 3"]
+    normal: Float[Tensor, "*b h w 3"]
     """Sum of weight times unit normal, camera frame, facing the camera; its length is at most
     alpha."""
-    alpha: Float[Tensor, "h w"]
+    alpha: Float[Tensor, "*b h w"]
     """Sum of the blending weights, in [0, 1)."""
-    distortion: Float[Tensor, "h w"]
+    distortion: Float[Tensor, "*b h w"]
     """2 sum_i w_i |z_i A_i - Z_i| with A_i, Z_i the sums of w_j, w_j z_j in front of i: the paper's
     sum_ij w_i w_j |z_i - z_j| where hits are sorted along the ray, never negative elsewhere."""
-    median_depth: Float[Tensor, "h w"]
+    median_depth: Float[Tensor, "*b h w"]
     """z of the last disk blended while more than half of the light is left; 0 where there is
     none. No gradient."""
     visible: Bool[Tensor, "n"]
-    """Disks blended into at least one pixel."""
+    """Disks blended into at least one pixel of any view."""
 
 
 def render(
@@ -57,18 +60,53 @@ def render(
     smaller of the squared distance on the disk (in deviations) and twice the squared pixel distance
     from the projected centre.
 
-    ``reference`` works in the positions' dtype on any device, ``cpu`` in float32 on the CPU.
+    ``reference`` works in the positions' dtype on any device, ``cpu`` in float32 on the CPU and
+    ``cuda`` in float32 on the GPU that holds the disks; ``auto`` takes the fastest that can.
     """
     parameters = disks.parameters if isinstance(disks, GaussianMap) else disks
     if backend == "auto":
         position = parameters.position
-        fits = position.device.type == "cpu" and position.dtype == torch.float32
-        backend = "cpu" if fits else "reference"
+        fits = position.dtype == torch.float32 and position.device.type in ("cpu", "cuda")
+        backend = "reference" if not fits else "cuda" if position.is_cuda else "cpu"
     if backend == "reference":
         return RenderOutput(*render_reference(parameters, camera, T_cw, near))
-    if any(p.dtype != torch.float32 or p.device.type != "cpu" for p in parameters):
-        raise ValueError("The cpu backend renders float32 disks on the CPU.")
+    if any(p.dtype != torch.float32 for p in parameters):
+        raise ValueError(f"The {backend} backend renders float32 disks.")
+    if backend == "cuda":
+        from geogs.splat.cuda.autograd import RasterizeOnGpu
+
+        return RenderOutput(*RasterizeOnGpu.apply(*parameters, T_cw, camera, near))
+    if any(p.device.type != "cpu" for p in parameters):
+        raise ValueError("The cpu backend renders disks on the CPU.")
     return RenderOutput(*_Rasterize.apply(*parameters, T_cw, camera, near, worker_count()))
+
+
+def render_views(
+    disks: GaussianMap | DiskParameters,
+    camera: Camera,
+    T_cw: Float[Tensor, "b 4 4"],
+    backend: Backend = "auto",
+    near: float = NEAR,
+) -> RenderOutput:
+    """:func:`render` for several poses at once; every map has a leading dimension.
+
+    On a GPU all views share each kernel's launch.
+    """
+    parameters = disks.parameters if isinstance(disks, GaussianMap) else disks
+    on_gpu = parameters.position.is_cuda and parameters.position.dtype == torch.float32
+    if backend == "cuda" or (backend == "auto" and on_gpu):
+        from geogs.splat.cuda.autograd import RasterizeOnGpu
+
+        return RenderOutput(*RasterizeOnGpu.apply(*parameters, T_cw, camera, near))
+    views = [render(parameters, camera, T, backend, near) for T in T_cw]
+    return RenderOutput(
+        depth=torch.stack([v.depth for v in views]),
+        normal=torch.stack([v.normal for v in views]),
+        alpha=torch.stack([v.alpha for v in views]),
+        distortion=torch.stack([v.distortion for v in views]),
+        median_depth=torch.stack([v.median_depth for v in views]),
+        visible=torch.stack([v.visible for v in views]).any(0),
+    )
 
 
 class _Rasterize(torch.autograd.Function):
