@@ -37,11 +37,12 @@ class PhotoView:
         camera: Camera,
         T_cw: Float[Tensor, "4 4"],
         blur: float = 0.7,
+        device: torch.device | str = "cpu",
     ) -> "PhotoView":
         """View of an RGB image (any size) by ``camera``, whose size is the photometric size.
 
         ``blur`` is the standard deviation in pixels of a Gaussian that takes out what bilinear
-        interpolation would alias.
+        interpolation would alias. The grey image is put on ``device``.
         """
         if min(camera.width, camera.height) < 16:
             raise InputError(
@@ -53,7 +54,7 @@ class PhotoView:
         grey = grey.astype(np.float32) / 255
         if blur > 0:
             grey = cv2.GaussianBlur(grey, (0, 0), blur)
-        return PhotoView(torch.from_numpy(grey), camera, T_cw.detach().double())
+        return PhotoView(torch.from_numpy(grey).to(device), camera, T_cw.detach().double())
 
     def at(self, T_cw: Float[Tensor, "4 4"]) -> "PhotoView":
         """The same image with another pose."""

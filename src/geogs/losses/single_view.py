@@ -47,11 +47,15 @@ class ViewConstants:
         confidence: Float[Tensor, "h w"] | None = None,
         prior_normal: Float[Tensor, "h w 3"] | None = None,
     ) -> "ViewConstants":
-        """Constants of a keyframe with this RGB image (any size) rendered by ``camera``."""
+        """Constants of a keyframe with this RGB image (any size) rendered by ``camera``.
+
+        On the prior depth's device.
+        """
         size = (camera.width, camera.height)
         small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-        rgb = torch.from_numpy(small).float() / 255
-        unknown = torch.zeros(camera.height, camera.width)
+        device = None if prior_depth is None else prior_depth.device
+        rgb = torch.from_numpy(small).to(device).float() / 255
+        unknown = torch.zeros(camera.height, camera.width, device=device)
         if confidence is None:
             confidence = torch.ones_like(unknown)
         return ViewConstants(

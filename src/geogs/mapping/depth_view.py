@@ -4,7 +4,9 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+import torch
 from jaxtyping import Float32, Float64, UInt8
+from torch import Tensor
 
 from geogs.geometry.camera import Camera
 from geogs.types import Keyframe
@@ -48,6 +50,44 @@ class KeyframeDepth:
     """z in map units; positive everywhere."""
     confidence: Float32[np.ndarray, "h w"]
     """In [0, 1]; about the chance that the depth is right to 2 %."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DenseDepth:
+    """A keyframe's dense depth on the device of the map."""
+
+    depth: Float32[Tensor, "h w"]
+    """z in map units; positive everywhere."""
+    confidence: Float32[Tensor, "h w"]
+    """In [0, 1]; about the chance that the depth is right to 2 %."""
+    typical: float
+    """Median depth, map units."""
+
+    @staticmethod
+    def of(depth: KeyframeDepth) -> "DenseDepth":
+        """The same memory as CPU tensors."""
+        typical = float(np.median(depth.depth))
+        return DenseDepth(
+            torch.from_numpy(depth.depth), torch.from_numpy(depth.confidence), typical
+        )
+
+    def arrays(self) -> KeyframeDepth:
+        """As arrays: the same memory where the tensors are on the CPU."""
+        return KeyframeDepth(self.depth.cpu().numpy(), self.confidence.cpu().numpy())
+
+    def scaled(self, factor: float) -> "DenseDepth":
+        """The depth multiplied by a factor."""
+        depth = self.depth * factor
+        return DenseDepth(depth, self.confidence, float(np.median(depth.cpu().numpy())))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PosedDepth:
+    """A dense depth and where it was taken."""
+
+    T_cw: Float64[np.ndarray, "4 4"]
+    """World to camera."""
+    depth: DenseDepth
 
 
 def depth_view(keyframe: Keyframe, render: Camera) -> DepthView:

@@ -4,15 +4,12 @@ from collections.abc import Callable
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from geogs.config import MappingConfig
 from geogs.geometry.camera import Camera
-from geogs.mapping.carve import vote
-from geogs.mapping.depth_fusion import check_depth
-from geogs.mapping.depth_view import KeyframeDepth
-from geogs.mapping.keyframe_depth import estimate_depth
+from geogs.mapping.depth_engine import depth_engine
 from geogs.mapping.map_update import MapUpdate, plan_update
 from geogs.mapping.pose_refine import refine_poses
 from geogs.mapping.sweep_neighbors import select_sweep_neighbours
@@ -23,7 +20,6 @@ from geogs.splat.density import candidate_pixels, unexplained, worth_keeping
 from geogs.splat.init import initialise_disks
 from geogs.splat.map import GaussianMap
 from geogs.splat.render import render
-from geogs.threads import thread_map
 from geogs.types import Keyframe, PoseCorrection, RenderedKeyframe
 
 Progress = Callable[[float], None]
@@ -50,6 +46,9 @@ class Mapper:
         self.config = config
         self.cameras = _cameras(camera, config)
         self.map = GaussianMap.empty(device)
+        self._depths = depth_engine(
+            self.map.device, self.cameras.render, self.cameras.working, config.depth
+        )
         self.views: dict[int, MapView] = {}
         self.mapped: list[int] = []
         self._trainer: Trainer | None = None
@@ -63,7 +62,9 @@ class Mapper:
 
     def observe(self, keyframe: Keyframe) -> None:
         """A settled keyframe, from now on available for matching."""
-        self.views[keyframe.id] = MapView.of(keyframe, self.cameras, self.config.loss)
+        view = MapView.of(keyframe, self.cameras, self.config.loss, self.map.device)
+        self.views[keyframe.id] = view
+        self._depths.observe(view.depth_view)
 
     def follow(self, keyframes: list[Keyframe]) -> None:
         """Take over the tracker's present poses and grid depths of known keyframes."""
@@ -148,7 +149,7 @@ class Mapper:
 
     def _training(self) -> Trainer:
         if self._trainer is None:
-            depth = self.views[self.mapped[0]].dense
+            depth = self.views[self.mapped[0]].dense.arrays()
             sure = depth.depth[depth.confidence >= np.median(depth.confidence)]
             self._trainer = Trainer(self.map, self.cameras, self.config, float(np.median(sure)))
         return self._trainer
@@ -160,32 +161,21 @@ class Mapper:
 
     def _estimate(self, views: list[MapView], progress: Progress = _silent) -> None:
         candidates = [v.depth_view for v in self.views.values()]
-
-        def estimate(view: MapView) -> KeyframeDepth:
-            reference = view.depth_view
+        references, neighbours = [v.depth_view for v in views], []
+        for view in views:
             depth = _typical_depth(view)
-            chosen = select_sweep_neighbours(reference, candidates, depth, self.config.depth)
-            neighbours = [candidates[i] for i in chosen]
-            return estimate_depth(
-                reference, neighbours, self.cameras.render, self.cameras.working, self.config.depth
-            )
-
-        for view, depth in zip(views, thread_map(estimate, views, progress), strict=True):
-            view.set_depth(depth, self.cameras)
+            chosen = select_sweep_neighbours(view.depth_view, candidates, depth, self.config.depth)
+            neighbours.append([candidates[i] for i in chosen])
+        depths = self._depths.estimate(references, neighbours, progress)
+        for view, dense in zip(views, depths, strict=True):
+            view.set_depth(dense, self.cameras)
 
     def _check(self, views: list[MapView]) -> None:
         """Let the neighbours' depths, as they were estimated, revise those of the views."""
-        for view, depth in zip(views, thread_map(self._checked, views), strict=True):
+        others = [[o.posed for o in self._near(view)] for view in views]
+        depths = self._depths.check([view.posed for view in views], others)
+        for view, depth in zip(views, depths, strict=True):
             view.set_depth(depth, self.cameras)
-
-    def _checked(self, view: MapView) -> KeyframeDepth:
-        others = self._near(view)
-        if not others:
-            return view.dense
-        poses = [o.depth_view.T_cw for o in others]
-        depths = [o.dense for o in others]
-        camera, config = self.cameras.render, self.config.depth
-        return check_depth(view.dense, view.depth_view.T_cw, depths, poses, camera, config)
 
     def _near(self, view: MapView) -> list[MapView]:
         """The keyframes with a depth that see a view's surface best from elsewhere."""
@@ -211,31 +201,28 @@ class Mapper:
 
     def _carve(self, views: list[MapView]) -> None:
         if len(self.map):
-            points = self.map.position.detach().numpy()
-            self._training().optimizer.keep(torch.from_numpy(self._vote(points, views)))
+            self._training().optimizer.keep(self._vote(self.map.position.detach(), views))
 
-    def _vote(self, points: np.ndarray, views: list[MapView]) -> np.ndarray:
-        views = [v for v in views if v.depth is not None]
-        poses = [v.depth_view.T_cw for v in views]
-        depths = [v.dense for v in views]
-        return vote(points, poses, depths, self.cameras.render, self.config.depth)
+    def _vote(self, points: Float[Tensor, "n 3"], views: list[MapView]) -> Bool[Tensor, "n"]:
+        return self._depths.keep(points, [v.posed for v in views if v.depth is not None])
 
     @torch.no_grad()
     def _insert(self, view: MapView, min_confidence: float) -> None:
         """Disks where the map does not explain a view's depth, by local planes."""
         disk, camera = self.config.disk, self.cameras.render
-        depth = torch.from_numpy(view.dense.depth)
-        confidence = torch.from_numpy(view.dense.confidence)
+        depth, confidence = view.dense.depth, view.dense.confidence
         output = render(self.map, camera, view.T_cw)
         needed = unexplained(output, depth, confidence, disk) & (confidence >= min_confidence)
         v, u = candidate_pixels(camera.height, camera.width, disk.stride, self._torch_random)
+        v, u = v.to(depth.device), u.to(depth.device)
         chosen = needed[v, u]
         v, u = v[chosen], u[chosen]
         z = depth[v, u]
-        T_wc = view.T_wc.float()
-        points = (camera.rays()[v, u] * z[:, None]) @ T_wc[:3, :3].T + T_wc[:3, 3]
+        T_wc = view.T_wc.float().to(depth.device)
+        rays = camera.rays(device=depth.device)[v, u]
+        points = (rays * z[:, None]) @ T_wc[:3, :3].T + T_wc[:3, 3]
         others = [self.views[i] for i in self.mapped if i != view.id]
-        kept = torch.from_numpy(self._vote(points.numpy(), others))
+        kept = self._vote(points, others)
         points, z = points[kept], z[kept]
         if len(points) + len(self.map) < disk.neighbours or len(points) == 0:
             return

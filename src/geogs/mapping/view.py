@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass, field, replace
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -12,7 +11,7 @@ from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_inverse
 from geogs.losses.multi_view import PhotoView
 from geogs.losses.single_view import ViewConstants
-from geogs.mapping.depth_view import DepthView, KeyframeDepth, depth_view
+from geogs.mapping.depth_view import DenseDepth, DepthView, PosedDepth, depth_view
 from geogs.types import Keyframe
 
 
@@ -35,7 +34,7 @@ class MapView:
     keyframe: Keyframe
     depth_view: DepthView
     photo: PhotoView
-    depth: KeyframeDepth | None = None
+    depth: DenseDepth | None = None
     constants: ViewConstants | None = None
     """None until the keyframe has a depth."""
     rendered_depth: Float[Tensor, "h w"] | None = None
@@ -44,12 +43,18 @@ class MapView:
     """Ids of the keyframes whose images check this one's depth, best first."""
 
     @staticmethod
-    def of(keyframe: Keyframe, cameras: MapCameras, loss: LossConfig) -> "MapView":
-        """The view of a keyframe that the tracker settled."""
+    def of(
+        keyframe: Keyframe,
+        cameras: MapCameras,
+        loss: LossConfig,
+        device: torch.device | str = "cpu",
+    ) -> "MapView":
+        """The view of a keyframe that the tracker settled, for a map on ``device``."""
+        image, T_cw = keyframe.image, keyframe.T_cw
         return MapView(
             keyframe,
             depth_view(keyframe, cameras.render),
-            PhotoView.prepare(keyframe.image, cameras.photo, keyframe.T_cw, loss.photo_blur),
+            PhotoView.prepare(image, cameras.photo, T_cw, loss.photo_blur, device),
         )
 
     @property
@@ -58,7 +63,7 @@ class MapView:
         return self.keyframe.id
 
     @property
-    def dense(self) -> KeyframeDepth:
+    def dense(self) -> DenseDepth:
         """The dense depth, where there must be one."""
         assert self.depth is not None, f"keyframe {self.id} has no depth yet"
         return self.depth
@@ -72,7 +77,12 @@ class MapView:
     @property
     def typical_depth(self) -> float:
         """Median of the dense depth, map units."""
-        return float(np.median(self.dense.depth))
+        return self.dense.typical
+
+    @property
+    def posed(self) -> PosedDepth:
+        """The dense depth with the view's pose, where there must be one."""
+        return PosedDepth(self.depth_view.T_cw, self.dense)
 
     @property
     def T_cw(self) -> Float[Tensor, "4 4"]:
@@ -89,7 +99,7 @@ class MapView:
         self.keyframe = keyframe
         self.depth_view = replace(
             self.depth_view,
-            T_cw=keyframe.T_cw.numpy(),
+            T_cw=keyframe.T_cw.cpu().numpy(),
             inverse_depth=keyframe.inverse_depth.cpu().numpy(),
             information=keyframe.information.cpu().numpy(),
         )
@@ -99,18 +109,19 @@ class MapView:
         """Take over a new pose alone."""
         self.follow(replace(self.keyframe, T_cw=T_cw))
 
-    def set_depth(self, depth: KeyframeDepth, cameras: MapCameras) -> None:
-        """Take over a dense depth and what the losses derive from it."""
+    def set_depth(self, depth: DenseDepth, cameras: MapCameras) -> None:
+        """Take over a dense depth, on which the losses' constants then live."""
         self.depth = depth
-        self.constants = ViewConstants.prepare(
-            self.keyframe.image,
-            cameras.render,
-            torch.from_numpy(depth.depth),
-            torch.from_numpy(depth.confidence),
-        )
+        if self.constants is None:
+            self.constants = ViewConstants.prepare(
+                self.keyframe.image, cameras.render, depth.depth, depth.confidence
+            )
+        else:
+            self.constants = replace(
+                self.constants, prior_depth=depth.depth, confidence=depth.confidence
+            )
 
     def rescale(self, factor: float, cameras: MapCameras) -> None:
         """Multiply the dense depth, after the map's unit changed around this keyframe."""
         if self.depth is not None and factor != 1.0:
-            scaled = replace(self.depth, depth=self.depth.depth * factor)
-            self.set_depth(scaled, cameras)
+            self.set_depth(self.depth.scaled(factor), cameras)

@@ -1,0 +1,109 @@
+"""Where keyframe depths are computed: on the CPU, or on the GPU that holds the map."""
+
+from collections.abc import Callable, Sequence
+from typing import Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from geogs.config import DepthConfig
+from geogs.geometry.camera import Camera
+from geogs.mapping.carve import vote
+from geogs.mapping.depth_fusion import check_depth
+from geogs.mapping.depth_view import DenseDepth, DepthView, PosedDepth
+from geogs.mapping.keyframe_depth import estimate_depth
+from geogs.threads import thread_map
+
+Progress = Callable[[float], None]
+"""Called with the finished fraction."""
+
+
+def _silent(fraction: float) -> None:
+    """Progress that nobody watches."""
+
+
+@runtime_checkable
+class DepthEngine(Protocol):
+    """The keyframe depth's heavy parts; tensors live on the engine's device."""
+
+    def observe(self, view: DepthView) -> None:
+        """A view that others will be matched with: prepare what depends on its image alone."""
+        ...
+
+    def estimate(
+        self,
+        references: Sequence[DepthView],
+        neighbours: Sequence[Sequence[DepthView]],
+        progress: Progress = _silent,
+    ) -> list[DenseDepth]:
+        """Dense depth of every reference, matched with its neighbours (``estimate_depth``)."""
+        ...
+
+    def check(
+        self, depths: Sequence[PosedDepth], others: Sequence[Sequence[PosedDepth]]
+    ) -> list[DenseDepth]:
+        """Every depth repaired, averaged and judged by its others (``check_depth``)."""
+        ...
+
+    def keep(self, points: Float[Tensor, "n 3"], depths: Sequence[PosedDepth]) -> Bool[Tensor, "n"]:
+        """World points that do not stand in the free space of the depths (``vote``)."""
+        ...
+
+
+class CpuDepthEngine:
+    """The compiled CPU loops, one keyframe per thread."""
+
+    def __init__(self, render: Camera, working: Camera, config: DepthConfig) -> None:
+        self.render = render
+        self.working = working
+        self.config = config
+
+    def observe(self, view: DepthView) -> None:
+        """As in the protocol; here nothing is kept."""
+
+    def estimate(
+        self,
+        references: Sequence[DepthView],
+        neighbours: Sequence[Sequence[DepthView]],
+        progress: Progress = _silent,
+    ) -> list[DenseDepth]:
+        """As in the protocol."""
+
+        def one(pair: tuple[DepthView, Sequence[DepthView]]) -> DenseDepth:
+            depth = estimate_depth(*pair, self.render, self.working, self.config)
+            return DenseDepth.of(depth)
+
+        return thread_map(one, list(zip(references, neighbours, strict=True)), progress)
+
+    def check(
+        self, depths: Sequence[PosedDepth], others: Sequence[Sequence[PosedDepth]]
+    ) -> list[DenseDepth]:
+        """As in the protocol."""
+
+        def one(pair: tuple[PosedDepth, Sequence[PosedDepth]]) -> DenseDepth:
+            own, rest = pair
+            if not rest:
+                return own.depth
+            arrays, poses = [o.depth.arrays() for o in rest], [o.T_cw for o in rest]
+            return DenseDepth.of(
+                check_depth(own.depth.arrays(), own.T_cw, arrays, poses, self.render, self.config)
+            )
+
+        return thread_map(one, list(zip(depths, others, strict=True)))
+
+    def keep(self, points: Float[Tensor, "n 3"], depths: Sequence[PosedDepth]) -> Bool[Tensor, "n"]:
+        """As in the protocol."""
+        arrays, poses = [d.depth.arrays() for d in depths], [d.T_cw for d in depths]
+        return torch.from_numpy(
+            vote(points.detach().numpy(), poses, arrays, self.render, self.config)
+        )
+
+
+def depth_engine(
+    device: torch.device | str, render: Camera, working: Camera, config: DepthConfig
+) -> DepthEngine:
+    """The engine for a map on ``device``: depths at the size of ``render``, refined at that of
+    ``working``, the size of the keyframes' images.
+    """
+    return CpuDepthEngine(render, working, config)
