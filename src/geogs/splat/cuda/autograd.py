@@ -3,8 +3,7 @@
 import torch
 from torch import Tensor
 
-from geogs.geometry.camera import Camera
-from geogs.splat.cuda.rasterize import Trace, rasterize_backward, rasterize_forward
+from geogs.splat.cuda.rasterize import MapGradients, Trace, rasterize_backward, rasterize_forward
 from geogs.splat.map import DiskParameters
 
 
@@ -25,7 +24,7 @@ class RasterizeOnGpu(torch.autograd.Function):
         outputs.append(maps.median_depth)
         if T_cw.dim() == 2:
             outputs = [o.squeeze(0) for o in outputs]
-        if trace is not None:
+        if with_trace:
             # Saved, so that PyTorch notices if they are changed before the backward pass.
             ctx.save_for_backward(*disks, T_cw)
             ctx.trace = trace
@@ -38,10 +37,8 @@ class RasterizeOnGpu(torch.autograd.Function):
     def backward(ctx, *gradients):  # type: ignore[no-untyped-def]
         *_, T_cw = ctx.saved_tensors
         trace: Trace = ctx.trace
-        d_depth, d_normal, d_alpha, d_distortion = _map_gradients(gradients[:4], trace.camera)
-        result = rasterize_backward(
-            trace, d_depth, d_normal, d_alpha, d_distortion, ctx.needs_input_grad[4]
-        )
+        maps = _map_gradients(gradients[:4], trace.rasterizer.maps.depth.shape)
+        result = rasterize_backward(trace, maps, ctx.needs_input_grad[4])
         d_T = None
         if result.poses is not None:
             d_T = torch.zeros(len(result.poses), 4, 4, dtype=T_cw.dtype, device=T_cw.device)
@@ -56,18 +53,22 @@ def _poses(T_cw: Tensor, device: torch.device) -> Tensor:
     return upper.reshape(-1, 3, 4).contiguous()
 
 
-def _map_gradients(gradients: tuple[Tensor | None, ...], camera: Camera) -> list[Tensor]:
-    """Contiguous float32 gradients with a leading dimension; zeros for those that are missing."""
+def _map_gradients(gradients: tuple[Tensor | None, ...], shape: torch.Size) -> MapGradients:
+    """Contiguous float32 gradients of (b, h, w) maps; zeros for those that are missing."""
     known = next(g for g in gradients if g is not None)
-    area = camera.height * camera.width
-    b = max(known.numel() // (area * (3 if known.shape[-1:] == (3,) and known.dim() > 2 else 1)), 1)
-    out = []
-    for k, g in enumerate(gradients):
-        shape = (b, camera.height, camera.width, 3)[: 4 if k == 1 else 3]
-        if g is None:
-            out.append(torch.zeros(shape, dtype=torch.float32, device=known.device))
-            continue
-        g = g.to(torch.float32).reshape(shape)
-        planar = k == 1 and g.permute(0, 3, 1, 2).is_contiguous()
-        out.append(g if planar else g.contiguous())
-    return out
+    zeros = None
+    if any(g is None for g in gradients):
+        zeros = known.new_zeros((3, *shape), dtype=torch.float32)
+    depth, alpha, distortion = (
+        zeros[0] if g is None else g.to(torch.float32).reshape(shape).contiguous()  # type: ignore[index]
+        for g in (gradients[0], gradients[2], gradients[3])
+    )
+    normal = zeros if gradients[1] is None else gradients[1].to(torch.float32)
+    assert normal is not None
+    if gradients[1] is None:
+        normal = normal.view(shape[0], 3, *shape[1:])
+    else:
+        normal = normal.reshape(*shape, 3)
+        planar = normal.permute(0, 3, 1, 2)
+        normal = planar if planar.is_contiguous() else normal.contiguous()
+    return MapGradients(depth, normal, alpha, distortion)
