@@ -1,0 +1,262 @@
+"""Flow without a network on a GPU: dense inverse search with variational refinement.
+
+The same idea as the operator on the CPU: the second image is warped to the first by the present
+reprojection and brought to its local brightness, the flow that is left over is found by dense
+inverse search (Kroeger et al., "Fast Optical Flow using Dense Inverse Search", ECCV 2016) from
+coarse to fine, and the warp is added back. All directed pairs of a call go through each kernel
+together, and nothing is read back.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int, UInt8
+from torch import Tensor
+
+from geogs.gpu.kernels import Kernel, kernels_for
+from geogs.tracking.flow.base import FlowMatch
+from geogs.tracking.flow.classical import (
+    COARSE_DEVIATION,
+    MAX_DISAGREEMENT,
+    MIN_STRUCTURE,
+    SMALL_IMAGE,
+)
+from geogs.tracking.grid import SampleGrid
+
+SOURCES = Path(__file__).parents[1] / "cuda"
+TILE = 32
+"""Pixels along the edge of the tile that a block of the pyramid kernels makes."""
+PATCH = 8
+"""Pixels along the edge of a patch."""
+PATCH_STRIDE = 4
+"""Pixels between patches."""
+REFINE_INNER = 24
+"""Pixels along the edge of what a block of the refinement keeps."""
+MEAN_LEVEL = 3
+"""Pyramid level on which local brightness is compared."""
+LEVELS = 6
+"""Levels of a pyramid, the image itself included."""
+PAIRS_AT_ONCE = 48
+"""Pairs whose images and flows are in memory together."""
+DEVIATION = (0.06, 0.8, 3.4)
+"""Standard deviation of a match: constant (pixels), by disagreement, by roughness.
+
+As :func:`geogs.tracking.flow.classical.match_deviation`, fitted to this operator.
+"""
+
+
+@dataclass(frozen=True)
+class SearchOptions:
+    """How the dense flow is found."""
+
+    warm_levels: int = 4
+    """Pyramid levels searched where the start is right to a few pixels."""
+    iterations: int = 6
+    """Gauss-Newton steps of a patch."""
+    refinements: int = 3
+    """Linearisations of the variational refinement at each level."""
+    sweeps: int = 5
+    """Relaxation sweeps of each."""
+    smoothness: float = 40.0
+    """Weight alpha of the smoothness term."""
+    gradients: float = 10.0
+    """Weight gamma of gradient constancy."""
+    brightness: float = 1.0
+    """Weight delta of brightness constancy."""
+    zeta: float = 0.1
+    """Added to the norms that divide the data terms, grey levels / pixel."""
+    epsilon: float = 0.001
+    """Where the penalty turns from quadratic to linear."""
+    relaxation: float = 1.6
+    """Over-relaxation of the sweeps."""
+
+
+@dataclass(frozen=True)
+class CudaImage:
+    """An image as the operator keeps it, on the device."""
+
+    data: Float[Tensor, "n"]
+    """Grey pyramid, local means of the brightness, structure of the cells, one after the other."""
+    textured: Int[Tensor, "1"]
+    """Number of cells with structure, int32."""
+
+
+class _Layout:
+    """Sizes of the levels and of the parts of an image's buffer."""
+
+    def __init__(self, grid: SampleGrid) -> None:
+        self.width, self.height = grid.camera.width, grid.camera.height
+        self.sizes = [(self.width, self.height)]
+        for _ in range(LEVELS - 1):
+            w, h = self.sizes[-1]
+            self.sizes.append(((w + 1) // 2, (h + 1) // 2))
+        self.pyramid = sum(w * h for w, h in self.sizes)
+        w, h = self.sizes[MEAN_LEVEL]
+        self.means = w * h
+        self.structure = self.pyramid + self.means
+        self.total = self.structure + grid.size
+        self.coarsest = max(k for k, size in enumerate(self.sizes) if min(size) >= PATCH or k == 0)
+
+    def patches(self, level: int) -> int:
+        """Number of patches of a level."""
+        across, down = (-(-(n - PATCH) // PATCH_STRIDE) + 1 for n in self.sizes[level])
+        return across * down
+
+
+class CudaClassicalFlow:
+    """The dense-inverse-search operator on one grid, on the grid's device."""
+
+    def __init__(self, grid: SampleGrid, options: SearchOptions | None = None) -> None:
+        self.grid = grid
+        self.options = options or SearchOptions()
+        self.device = torch.device(grid.device)
+        self._layout = _Layout(grid)
+        self._kernels: dict[str, Kernel] = {}
+        for name in ("image", "search", "refine", "match"):
+            loaded: Mapping[str, Kernel] = kernels_for(SOURCES / f"flow_{name}.cu", self.device)
+            self._kernels.update(loaded)
+
+    def encode(self, image: UInt8[np.ndarray, "h w 3"]) -> CudaImage:
+        layout, grid = self._layout, self.grid
+        rgb = self._upload(torch.from_numpy(np.ascontiguousarray(image)))
+        data = torch.empty(layout.total, device=self.device)
+        textured = torch.empty(1, dtype=torch.int32, device=self.device)
+        w, h = layout.width, layout.height
+        self._kernels["flow_grey"](_tiles(w, h), (TILE, 8), rgb, data, textured, w, h, LEVELS)
+        self._kernels["flow_structure"](
+            -(-(grid.size + layout.means) // 8), (32, 8), data, textured, w, h,
+            grid.width, grid.height, layout.pyramid, layout.structure, MIN_STRUCTURE,
+        )  # fmt: skip
+        return CudaImage(data, textured)
+
+    def texture(self, encoded: CudaImage) -> float:
+        return float(encoded.textured.item()) / self.grid.size
+
+    def structure(self, encoded: CudaImage) -> Float[Tensor, "p"]:
+        """Smaller eigenvalue of the structure tensor on the grid, grey levels^2 / pixel^2."""
+        return encoded.data[self._layout.structure :]
+
+    def measure(
+        self,
+        first: Sequence[CudaImage],
+        second: Sequence[CudaImage],
+        forward: Float[Tensor, "e p 2"] | None = None,
+        backward: Float[Tensor, "e p 2"] | None = None,
+        fine: bool = True,
+    ) -> tuple[FlowMatch, FlowMatch]:
+        cells = self.grid.size
+        if forward is None or backward is None:
+            start = None
+        else:
+            start = (forward.float().contiguous(), backward.float().contiguous())
+        fine = fine or max(self._layout.width, self._layout.height) <= SMALL_IMAGE
+        n = len(first)
+        # The two directions are apart, so that each part is whole when pairs go in several turns.
+        pixels = torch.empty(2, n, cells, 2, device=self.device)
+        weight = torch.empty(2, n, cells, 2, device=self.device)
+        for at in range(0, n, PAIRS_AT_ONCE):
+            part = slice(at, at + PAIRS_AT_ONCE)
+            images = [*first[part], *second[part]]
+            begin = None if start is None else (start[0][part], start[1][part])
+            found = self._measure(images, begin, 0 if fine else 1)
+            if len(images) == 2 * n:
+                pixels, weight = found
+            else:
+                pixels[:, part], weight[:, part] = found
+        return FlowMatch(pixels[0], weight[0]), FlowMatch(pixels[1], weight[1])
+
+    def _measure(
+        self, images: Sequence[CudaImage], start: tuple[Tensor, Tensor] | None, finest: int
+    ) -> tuple[Float[Tensor, "2 e p 2"], Float[Tensor, "2 e p 2"]]:
+        layout, grid, pairs = self._layout, self.grid, len(images) // 2
+        w, h = layout.width, layout.height
+        table = self._upload(torch.tensor([i.data.data_ptr() for i in images]))
+        forward, backward = (None, None) if start is None else start
+        warped = self._warped(table, forward, backward)
+        flow = self._coarse_to_fine(table, warped, start is None, finest)
+        pixels = torch.empty(2, pairs, grid.size, 2, device=self.device)
+        weight = torch.empty_like(pixels)
+        scale = COARSE_DEVIATION if finest else 1.0
+        self._kernels["flow_match"](
+            (-(-grid.size // 8), 2 * pairs), (32, 8), table, flow, forward, backward, pixels,
+            weight, pairs, w, h, grid.width, grid.height, finest, layout.structure,
+            MAX_DISAGREEMENT, *(scale * d for d in DEVIATION),
+        )  # fmt: skip
+        return pixels, weight
+
+    def _warped(
+        self,
+        table: Int[Tensor, "d"],
+        forward: Float[Tensor, "e p 2"] | None,
+        backward: Float[Tensor, "e p 2"] | None,
+    ) -> Float[Tensor, "d n"]:
+        """Pyramids of the second images, warped and with the first images' brightness."""
+        layout, grid, directed = self._layout, self.grid, len(table)
+        w, h, stride = layout.width, layout.height, layout.pyramid
+        warped = torch.empty(directed, stride, device=self.device)
+        gain = torch.empty(directed, layout.means, device=self.device)
+        self._kernels["flow_warp"](
+            (*_tiles(w, h), directed), (TILE, 8), table, forward, backward, warped,
+            directed // 2, stride, w, h, grid.width, grid.height, LEVELS,
+        )  # fmt: skip
+        self._kernels["flow_gain"](
+            (-(-layout.means // 8), directed), (32, 8), table, warped, gain, stride, w, h,
+            layout.pyramid,
+        )  # fmt: skip
+        self._kernels["flow_brighten"](
+            (-(-stride // 256), directed), 256, warped, gain, stride, w, h, LEVELS
+        )
+        return warped
+
+    def _coarse_to_fine(
+        self, table: Int[Tensor, "d"], warped: Float[Tensor, "d n"], cold: bool, finest: int
+    ) -> Float[Tensor, "d q 2"]:
+        """Dense flow of the finest level that is asked for, row by row, in its pixels."""
+        layout, options, directed = self._layout, self.options, len(table)
+        w, h, stride = layout.width, layout.height, layout.pyramid
+        coarsest = layout.coarsest if cold else min(options.warm_levels - 1, layout.coarsest)
+        flow: Tensor | None = None
+        for level in range(coarsest, finest - 1, -1):
+            width, height = layout.sizes[level]
+            count = layout.patches(level)
+            patches = torch.empty(directed, count, 2, device=self.device)
+            self._kernels["flow_search"](
+                (-(-count * PATCH // 256), directed), 256, table, warped, flow, patches, stride,
+                w, h, level, options.iterations,
+            )  # fmt: skip
+            flow = torch.empty(directed, width * height, 2, device=self.device)
+            other = torch.empty_like(flow)
+            self._kernels["flow_densify"](
+                (-(-width // 32), -(-height // 8), directed), (32, 8), table, warped, patches,
+                flow, stride, w, h, level,
+            )  # fmt: skip
+            for _ in range(options.refinements):
+                self._refine(table, warped, flow, other, level)
+                flow, other = other, flow
+        assert flow is not None
+        return flow
+
+    def _refine(
+        self, table: Tensor, warped: Tensor, flow: Tensor, refined: Tensor, level: int
+    ) -> None:
+        layout, o = self._layout, self.options
+        width, height = layout.sizes[level]
+        blocks = (-(-width // REFINE_INNER), -(-height // REFINE_INNER), len(table))
+        self._kernels["flow_refine"](
+            blocks, (32, 8), table, warped, flow, refined, layout.pyramid, layout.width,
+            layout.height, level, o.sweeps, o.smoothness, o.gradients, o.brightness,
+            o.zeta**2, o.epsilon**2, o.relaxation,
+        )  # fmt: skip
+
+    def _upload(self, tensor: Tensor) -> Tensor:
+        """To the device without waiting for it."""
+        if self.device.type == "cuda":
+            tensor = tensor.pin_memory()
+        return tensor.to(self.device, non_blocking=True)
+
+
+def _tiles(width: int, height: int) -> tuple[int, int]:
+    return -(-width // TILE), -(-height // TILE)
