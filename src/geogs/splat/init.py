@@ -7,7 +7,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from geogs.geometry.lie import matrix_to_quaternion
-from geogs.geometry.neighbors import nearest_neighbors
+from geogs.geometry.neighbors import all_pairs_neighbors, nearest_neighbors
+from geogs.splat.cuda.local_planes import principal_planes
 from geogs.splat.map import DiskParameters
 
 
@@ -32,6 +33,8 @@ def fit_local_planes(
 
     Source: Eq. planarity of the paper; the spacing is 3DGS's rule for initial scales.
     """
+    if points.device.type == "cuda":
+        return fit_local_planes_on_gpu(points, context, k)
     union = torch.cat([points, context]).double()
     distances, indices = nearest_neighbors(points.double(), union, k + 1)
     neighbours = union[indices]
@@ -45,6 +48,15 @@ def fit_local_planes(
         planarity=((middle - low) / high.clamp(min=1e-30)).to(points.dtype),
         spacing=spacing.to(points.dtype),
     )
+
+
+def fit_local_planes_on_gpu(
+    points: Float[Tensor, "n 3"], context: Float[Tensor, "m 3"], k: int
+) -> LocalPlane:
+    """The same without waiting for the device, neighbours by float32 distances; k <= 31."""
+    union = torch.cat([points, context]).detach().float().contiguous()
+    neighbours = all_pairs_neighbors(union[: len(points)], union, min(k + 1, len(union)))
+    return LocalPlane(*(x.to(points.dtype) for x in principal_planes(union, neighbours)))
 
 
 def face_camera(
