@@ -1,0 +1,131 @@
+"""What the losses know of the keyframes, kept on a GPU by slot."""
+
+from collections.abc import Sequence
+from enum import IntEnum
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from geogs.geometry.camera import Camera
+from geogs.losses.multi_view import PhotoView
+from geogs.losses.single_view import ViewConstants
+
+
+class ViewField(IntEnum):
+    """Columns of the pointer table; the order of ``view_maps.cuh``."""
+
+    EDGE = 0
+    IMAGE_GRADIENT = 1
+    PRIOR_DEPTH = 2
+    CONFIDENCE = 3
+    PRIOR_NORMAL = 4
+    GREY = 5
+    RENDERED_DEPTH = 6
+
+
+class ViewTable:
+    """Maps and poses of keyframes on a device, one slot each, in any number.
+
+    The kernels find them through ``pointers`` and ``poses``, so a captured graph follows whatever
+    slots its input names. Adding slots beyond the capacity replaces these two and ``rendered`` by
+    larger ones and raises ``generation``: graphs captured before must be captured again.
+    """
+
+    def __init__(
+        self, render: Camera, photo: Camera, device: torch.device, capacity: int = 64
+    ) -> None:
+        self.render = render
+        self.photo = photo
+        self.device = device
+        self.generation = 0
+        """Rises whenever ``pointers``, ``poses`` and ``rendered`` are other tensors than before."""
+        self.pointers: Int[Tensor, "slots fields"] = torch.zeros(
+            capacity, len(ViewField), dtype=torch.int64, device=device
+        )
+        """Addresses of each slot's maps, 0 where it has none."""
+        self.poses: Float[Tensor, "slots 12"] = torch.zeros(
+            capacity, 12, dtype=torch.float64, device=device
+        )
+        """T_cw, rows of the 3x4 matrix."""
+        self.rendered: Int[Tensor, "slots"] = torch.zeros(
+            capacity, dtype=torch.int32, device=device
+        )
+        """1 where the slot's rendered depth is known."""
+        self._maps: list[Float[Tensor, "fields h w"]] = []
+        self._normals: list[Float[Tensor, "3 h w"] | None] = []
+        self._greys: list[Float[Tensor, "ph pw"]] = []
+
+    def __len__(self) -> int:
+        return len(self._maps)
+
+    def add(self, view: ViewConstants | None, photo: PhotoView) -> int:
+        """Take up a keyframe and return its slot; constants may follow later."""
+        slot = len(self)
+        if slot == len(self.pointers):
+            self._grow()
+        size = (self.render.height, self.render.width)
+        maps = torch.zeros(5, *size, device=self.device)
+        grey = self._upload(photo.grey)
+        if grey.shape != (self.photo.height, self.photo.width):
+            raise ValueError(f"the grey image has size {tuple(grey.shape)}, not the photo camera's")
+        self._maps.append(maps)
+        self._normals.append(None)
+        self._greys.append(grey)
+        self._point(slot)
+        if view is not None:
+            self.set_constants(slot, view)
+        self.set_poses([slot], photo.T_cw[None])
+        return slot
+
+    def set_constants(self, slot: int, view: ViewConstants) -> None:
+        """Replace a keyframe's prior depth, confidence, prior normals and edges."""
+        maps = [view.edge, view.image_gradient, view.prior_depth, view.confidence]
+        self._maps[slot][:4].copy_(torch.stack([m.float() for m in maps]), non_blocking=True)
+        before = self._normals[slot]
+        if view.prior_normal is None:
+            self._normals[slot] = None
+        elif before is None:
+            self._normals[slot] = self._upload(view.prior_normal.permute(2, 0, 1))
+        else:
+            before.copy_(view.prior_normal.permute(2, 0, 1), non_blocking=True)
+        if (before is None) != (self._normals[slot] is None):
+            self._point(slot)
+
+    def set_poses(self, slots: Sequence[int], T_cw: Float[Tensor, "k 4 4"]) -> None:
+        """Replace the world-to-camera poses of some slots, from a CPU or the device."""
+        rows = T_cw.detach()[:, :3].reshape(-1, 12).double()
+        index = torch.tensor(slots, dtype=torch.int64).to(self.device, non_blocking=True)
+        self.poses.index_copy_(0, index, rows.to(self.device, non_blocking=True))
+
+    def rendered_depth(self, slot: int) -> Float[Tensor, "h w"]:
+        """The slot's rendered depth for occlusion tests; valid where ``rendered`` is 1."""
+        return self._maps[slot][4]
+
+    def forget_rendered(self) -> None:
+        """No rendered depth counts any more, as after the map has moved."""
+        self.rendered.zero_()
+
+    def _upload(self, tensor: Tensor) -> Tensor:
+        return tensor.float().contiguous().to(self.device, non_blocking=True)
+
+    def _point(self, slot: int) -> None:
+        """Write the addresses of a slot's maps."""
+        maps, normal = self._maps[slot], self._normals[slot]
+        address = dict.fromkeys(ViewField, 0)
+        for row, field in enumerate((ViewField.EDGE, ViewField.IMAGE_GRADIENT,
+                                     ViewField.PRIOR_DEPTH, ViewField.CONFIDENCE,
+                                     ViewField.RENDERED_DEPTH)):  # fmt: skip
+            address[field] = maps[row].data_ptr()
+        address[ViewField.PRIOR_NORMAL] = 0 if normal is None else normal.data_ptr()
+        address[ViewField.GREY] = self._greys[slot].data_ptr()
+        line = torch.tensor([address[field] for field in ViewField], dtype=torch.int64)
+        self.pointers[slot].copy_(line, non_blocking=True)
+
+    def _grow(self) -> None:
+        """Double the capacity; the keyframes' maps stay where they are."""
+        more = torch.zeros_like
+        self.pointers = torch.cat([self.pointers, more(self.pointers)])
+        self.poses = torch.cat([self.poses, more(self.poses)])
+        self.rendered = torch.cat([self.rendered, more(self.rendered)])
+        self.generation += 1

@@ -1,0 +1,166 @@
+// The target image through the reference's depth (paper Eqs. back_project, bilinear, valid_mask)
+// and L_1 of what comes out.
+#pragma once
+#include "enlargement.cuh"
+
+// A row of a 3x4 motion from the reference's to the target's frame.
+struct MotionRow { float x, y, z, t; };
+struct Motion { MotionRow u, v, w; };
+
+__device__ __forceinline__ float turned(MotionRow m, float rx, float ry) { return m.x * rx + m.y * ry + m.z; }
+
+// Where a pixel with depth falls in the target.
+struct Landing {
+  float x, y;          // the target frame's X / Z and Y / Z
+  float u, v, z;       // pixel and depth there; z is 0 where out of view
+  float du, dv;        // d pixel / d depth
+};
+
+__device__ __forceinline__ Landing land(
+    const Motion& m, float rx, float ry, float d, int height, int width, const PhotoSettings& c) {
+  const float qx = turned(m.u, rx, ry), qy = turned(m.v, rx, ry), qz = turned(m.w, rx, ry);
+  const float z = d * qz + m.w.t;
+  const bool front = d > 0.f && z > c.min_depth_ratio * d;
+  const float inverse = 1.f / (front ? z : 1.f);
+  const float x = (d * qx + m.u.t) * inverse, y = (d * qy + m.v.t) * inverse;
+  const float u = c.fx * x + c.cx, v = c.fy * y + c.cy;
+  const bool inside = front && u >= 0.f && v >= 0.f && u <= (float)(width - 1) && v <= (float)(height - 1);
+  return {x, y, u, v, inside ? z : 0.f, c.fx * (qx - x * qz) * inverse, c.fy * (qy - y * qz) * inverse};
+}
+
+struct Sample { float value, dx, dy; };
+
+__device__ __forceinline__ Sample sample_plain(const float* image, int width, int i, int j, float fx, float fy) {
+  const float* at = image + (size_t)j * width + i;
+  const float p = at[0], q = at[1], r = at[width], s = at[width + 1];
+  const float upper = p + (q - p) * fx, lower = r + (s - r) * fx;
+  return {upper + (lower - upper) * fy, (q - p) * (1.f - fy) + (s - r) * fy, lower - upper};
+}
+
+// The bilinear samples of the two 3x3 Sobel derivatives: one separable 4x4 filter each.
+__device__ __forceinline__ void sobel_slopes(
+    const float* image, int height, int width, int i, int j, float fx, float fy, Sample& s) {
+  const int left = max(i - 1, 0), right = min(i + 2, width - 1);
+  const float smooth_weight[4] = {1.f - fy, 2.f - fy, 1.f + fy, fy};
+  const float slope_weight[4] = {fy - 1.f, -fy, 1.f - fy, fy};
+  s.dx = s.dy = 0.f;
+#pragma unroll
+  for (int k = 0; k < 4; k++) {
+    const float* line = image + (size_t)min(max(j + k - 1, 0), height - 1) * width;
+    const float a = line[left], b = line[i], c = line[i + 1], d = line[right];
+    s.dx += smooth_weight[k] * ((c - a) * (1.f - fx) + (d - b) * fx) * 0.125f;
+    s.dy += slope_weight[k] * ((a + 2.f * b + c) * (1.f - fx) + (b + 2.f * c + d) * fx) * 0.125f;
+  }
+}
+
+__device__ __forceinline__ Sample sample_image(
+    const float* image, int height, int width, float u, float v, bool sobel) {
+  const int i = min((int)u, width - 2), j = min((int)v, height - 2);
+  Sample s = sample_plain(image, width, i, j, u - (float)i, v - (float)j);
+  if (sobel) sobel_slopes(image, height, width, i, j, u - (float)i, v - (float)j, s);
+  return s;
+}
+
+// Whether the target's rendered depth (0 unknown) at pixel (u, v) of the big image agrees with z.
+__device__ __forceinline__ bool is_visible(
+    const float* depth, int height, int width, int big_height, int big_width, float u, float v,
+    float z, float tolerance) {
+  const float x = fmaf(u + 0.5f, (float)width / big_width, -0.5f);
+  const float y = fmaf(v + 0.5f, (float)height / big_height, -0.5f);
+  const float s = fminf(fmaxf(x, 0.f), (float)(width - 1)), t = fminf(fmaxf(y, 0.f), (float)(height - 1));
+  const int i = min((int)s, width - 2), j = min((int)t, height - 2);
+  const float* at = depth + (size_t)j * width + i;
+  const float p = at[0], q = at[1], r = at[width], w = at[width + 1], fx = s - (float)i, fy = t - (float)j;
+  const float upper = p + (q - p) * fx, lower = r + (w - r) * fx;
+  const bool known = p > 0.f && q > 0.f && r > 0.f && w > 0.f;
+  return known && fabsf(z - upper - (lower - upper) * fy) < tolerance * z;
+}
+
+// Derivative of the weighted L_1 in the warped image, and the loss.
+__device__ __forceinline__ float l1_push(float a, float b, const PhotoSettings& c) {
+  const float e = b - a;
+  return fabsf(e) < c.cut ? c.l1 * fminf(fmaxf(e / c.huber, -1.f), 1.f) : 0.f;
+}
+__device__ __forceinline__ float l1_loss(float a, float b, const PhotoSettings& c) {
+  const float size = fminf(fabsf(b - a), c.cut), small = fminf(size, c.huber);
+  return c.l1 * (small / c.huber) * (size - 0.5f * small);
+}
+
+// A warped image holds its mask in the sign: filled from the reference, negative where not seen.
+__device__ __forceinline__ float packed(float value, bool seen) {
+  return __uint_as_float((__float_as_uint(value) & 0x7fffffffu) | (seen ? 0u : 0x80000000u));
+}
+__device__ __forceinline__ bool is_seen(float warped) { return (__float_as_uint(warped) >> 31) == 0; }
+
+// Relative motions (pairs, 12) and target slots of the pairs, -1 where there is none; clears the
+// loss and, unless null, d loss / d motion (pairs, 12).
+extern "C" __global__ void __launch_bounds__(128) begin_window(
+    const int* batch, const int* pairs, const double* poses, int* targets, float* motions,
+    float* loss, double* d_motion, int views, int partners) {
+  const int i = blockIdx.x * 128 + threadIdx.x;
+  if (i < views) loss[i] = 0.f;
+  if (i >= views * partners) return;
+  const int reference = batch[i / partners], target = reference < 0 ? -1 : pairs[i];
+  targets[i] = target;
+  if (d_motion)
+    for (int k = 0; k < 12; k++) d_motion[12 * i + k] = 0.0;
+  if (target < 0) return;
+  const double *r = poses + 12 * reference, *t = poses + 12 * target;
+  for (int j = 0; j < 3; j++) {
+    double shift = t[4 * j + 3];
+    for (int k = 0; k < 3; k++) {
+      // T_target T_reference^-1: R_t R_r^T, and its translation takes off that of the reference.
+      double turn = 0.0;
+      for (int n = 0; n < 3; n++) turn += t[4 * j + n] * r[4 * k + n];
+      motions[12 * i + 4 * j + k] = (float)turn;
+      shift -= turn * r[4 * k + 3];
+    }
+    motions[12 * i + 4 * j + 3] = (float)shift;
+  }
+}
+
+#define WARP_ROWS 32
+
+// depth (B, h, w), 0 unknown -> per pair (H, W): the packed warped image and ``slope``, its
+// derivative in the enlarged depth. Adds L_1 to the loss (B). With ``last`` no other term follows:
+// ``slope`` becomes d loss / d enlarged depth, and ``push`` (unless null) d loss / d warped.
+extern "C" __global__ void __launch_bounds__(256) warp_pairs(
+    const int* batch, const int* targets, const float* motions, const long long* maps,
+    const int* rendered, const float* settings, const float* depth, float* warped, float* slope,
+    float* push, float* loss, int height, int width, int big_height, int big_width, int partners,
+    int sobel, int last) {
+  const int pair = blockIdx.z, b = pair / partners, target = targets[pair];
+  if (target < 0) return;
+  const PhotoSettings c = *(const PhotoSettings*)settings;
+  const Motion motion = *(const Motion*)(motions + 12 * pair);
+  const float* image = view_map(maps, target, GREY);
+  const float* hidden = rendered[target] ? view_map(maps, target, RENDERED_DEPTH) : 0;
+  const float* grey = view_map(maps, batch[b], GREY);
+  const int x = blockIdx.x * 32 + threadIdx.x, end = min((int)(blockIdx.y + 1) * WARP_ROWS, big_height);
+  depth += (size_t)b * height * width;
+  const Source column = source_pixels(x, width, (float)width / big_width);
+  const float ratio = (float)height / big_height, rx = ((float)x - c.cx) / c.fx;
+  float total = 0.f;
+  for (int y = blockIdx.y * WARP_ROWS + threadIdx.y; y < end && x < big_width; y += 8) {
+    const float d = enlarged_depth(depth, width, source_pixels(y, height, ratio), column);
+    const Landing p = land(motion, rx, ((float)y - c.cy) / c.fy, d, big_height, big_width, c);
+    bool seen = p.z > 0.f;
+    if (seen && hidden)
+      seen = is_visible(hidden, height, width, big_height, big_width, p.u, p.v, p.z, c.occlusion);
+    const size_t pixel = (size_t)y * big_width + x, at = (size_t)pair * big_height * big_width + pixel;
+    const float a = grey[pixel];
+    Sample s = {a, 0.f, 0.f};
+    if (seen) s = sample_image(image, big_height, big_width, p.u, p.v, sobel);
+    const float rate = seen ? s.dx * p.du + s.dy * p.dv : 0.f;
+    if (seen && c.l1 > 0.f) total += l1_loss(a, s.value, c);
+    warped[at] = packed(s.value, seen);
+    if (!last) {
+      slope[at] = rate;
+      continue;
+    }
+    const float g = seen && c.l1 > 0.f ? l1_push(a, s.value, c) : 0.f;
+    slope[at] = g * rate;
+    if (push) push[at] = g;
+  }
+  add_block_sum(total, loss + b);
+}

@@ -1,0 +1,225 @@
+"""The losses of a window of views and their gradients, in a few kernel launches.
+
+Same definitions as :func:`geogs.losses.single_view.single_view_loss` and
+:func:`geogs.losses.multi_view.multi_view_loss`, in float32, for all views and pairs at once. The
+gradient is made with the value. A launch allocates nothing and never waits for the device, so it
+can be part of a captured graph; the views and pairs may change between replays.
+"""
+
+from enum import IntFlag
+from pathlib import Path
+
+import torch
+from jaxtyping import Float32, Float64, Int32
+from torch import Tensor
+
+from geogs.config import LossConfig
+from geogs.gpu.kernels import kernels_for
+from geogs.losses.cuda.view_table import ViewTable
+from geogs.losses.multi_view import MIN_DEPTH_RATIO
+from geogs.losses.photometric import NCC_VARIANCE_FLOOR
+from geogs.losses.single_view import NORMAL_EPSILON
+
+_SOURCE = Path(__file__).with_name("losses.cu")
+# As in the sources: columns a block walks down, rows of a block of other kernels.
+_STRIP, _WARP_ROWS, _MOTION_ROWS = 128, 32, 64
+# Rows that a strip is cut into: more share the windows' first rows, fewer fill the device better.
+_STRIP_ROWS = 64
+_SSIM_HALF = 5
+
+
+class _Flags(IntFlag):
+    """What there is around a windowed measure; the bits of ``windows.cuh``."""
+
+    ADD_EARLIER = 1
+    FINISH = 2
+    KEEP_GRADIENT = 4
+
+
+class WindowLosses:
+    """L_geo of up to ``views`` views with up to ``partners`` partners each.
+
+    The loss of a view is its single-view loss plus ``pair_share`` times the multi-view loss of each
+    of its pairs (so one over the number of partners that a view should have). ``unit`` is a length
+    in map units that makes the distortion term unitless. ``with_pose`` also gives the gradient in
+    the pairs' relative motions.
+    """
+
+    def __init__(
+        self,
+        table: ViewTable,
+        config: LossConfig,
+        unit: float,
+        views: int,
+        partners: int,
+        pair_share: float,
+        with_pose: bool = False,
+    ) -> None:
+        self.table = table
+        self.config = config
+        self.views = views
+        self.partners = partners
+        self._with_pose = with_pose
+        self._kernels = kernels_for(_SOURCE, table.device)
+        weights = (config.l1_weight, config.ssim_weight, config.ncc_weight)
+        self._photo = partners > 0 and max(weights) > 0
+        self._view_settings = self._single_view_settings(unit)
+        self._photo_settings = self._multi_view_settings(pair_share)
+        self._allocate()
+
+    def _single_view_settings(self, unit: float) -> Float32[Tensor, "k"]:
+        """``SingleViewSettings`` of ``view_maps.cuh``."""
+        c, camera = self.config, self.table.render
+        weights = [
+            c.depth_weight, c.normal_weight, c.normal_consistency_weight,
+            c.distortion_weight / unit, c.opacity_weight, c.smoothness_weight,
+        ]  # fmt: skip
+        pixels = camera.width * camera.height
+        values = [camera.fx, camera.fy, camera.cx, camera.cy, *(w / pixels for w in weights)]
+        values += [c.min_alpha, c.depth_relative, NORMAL_EPSILON, c.smoothness_eta]
+        values += [c.smoothness_rewards_edges]
+        return torch.tensor(values, dtype=torch.float32, device=self.table.device)
+
+    def _multi_view_settings(self, pair_share: float) -> Float32[Tensor, "k"]:
+        """``PhotoSettings`` of ``view_maps.cuh``."""
+        c, camera = self.config, self.table.photo
+        scale = pair_share / (camera.width * camera.height)
+        values = [camera.fx, camera.fy, camera.cx, camera.cy, MIN_DEPTH_RATIO, c.occlusion]
+        values += [scale * c.l1_weight, max(c.l1_huber, 1e-12), c.l1_cut]
+        values += [scale * c.ncc_weight, c.ncc_reject, c.ncc_min_variance, c.ncc_texture]
+        values += [c.ncc_min_coverage, NCC_VARIANCE_FLOOR, scale * c.ssim_weight]
+        return torch.tensor(values, dtype=torch.float32, device=self.table.device)
+
+    def _allocate(self) -> None:
+        device, render, photo = self.table.device, self.table.render, self.table.photo
+        pairs, c = self.views * self.partners, self.config
+
+        def maps(*shape: int) -> Float32[Tensor, "..."]:
+            return torch.zeros(shape, dtype=torch.float32, device=device)
+
+        self._clean = maps(self.views, render.height, render.width)
+        self._inverse_median = maps(self.views)
+        self._motions = maps(pairs, 12)
+        self._targets = torch.full((pairs,), -1, dtype=torch.int32, device=device)
+        size = (pairs if self._photo else 0, photo.height, photo.width)
+        self._warped, self._pull = maps(*size), maps(*size)
+        two_measures = c.ssim_weight > 0 and c.ncc_weight > 0
+        held = self._photo and (self._with_pose or two_measures)
+        self._image_gradient = maps(*size) if held else None
+
+    def launch(
+        self,
+        batch: Int32[Tensor, "b"],
+        pairs: Int32[Tensor, "b p"],
+        depth: Float32[Tensor, "b h w"],
+        normal: Float32[Tensor, "b 3 h w"],
+        alpha: Float32[Tensor, "b h w"],
+        distortion: Float32[Tensor, "b h w"],
+        d_depth: Float32[Tensor, "b h w"],
+        d_normal: Float32[Tensor, "b 3 h w"],
+        d_alpha: Float32[Tensor, "b h w"],
+        d_distortion: Float32[Tensor, "b h w"],
+        loss: Float32[Tensor, "b"],
+        relative_gradient: Float64[Tensor, "b p 12"] | None = None,
+    ) -> None:
+        """Losses (map units as the views') and gradients of the views in the slots ``batch``.
+
+        ``pairs`` holds the partners' slots; -1 stands for no view and no partner. ``depth`` and the
+        other rendered maps are as in ``single_view_loss``, with normals in planes. All outputs are
+        overwritten, the four gradients everywhere. ``relative_gradient`` (needs ``with_pose``) is
+        d loss / d T of the rows of T = T_partner T_view^-1. All tensors lie on the device,
+        contiguous.
+        """
+        assert (relative_gradient is not None) == self._with_pose
+        t, kernels, c = self.table, self._kernels, self.config
+        height, width = t.render.height, t.render.width
+        views, partners = self.views, self.partners
+        kernels["begin_window"](
+            _blocks(max(views * partners, views), 128), 128, batch, pairs, t.poses, self._targets,
+            self._motions, loss, relative_gradient, views, partners,
+        )  # fmt: skip
+        if c.smoothness_weight > 0:
+            kernels["inverse_median"](
+                views, 1024, batch, depth, alpha, self._inverse_median, height * width, c.min_alpha
+            )
+        kernels["single_view"](
+            (_blocks(width, 32), _blocks(height, 16), views), 256, batch, t.pointers,
+            self._view_settings, depth, normal, alpha, distortion, self._inverse_median,
+            self._clean, d_depth, d_normal, d_alpha, d_distortion, loss, height, width,
+        )  # fmt: skip
+        if self._photo:
+            self._launch_pairs(batch, d_depth, loss, relative_gradient)
+
+    def _launch_pairs(
+        self,
+        batch: Int32[Tensor, "b"],
+        d_depth: Float32[Tensor, "b h w"],
+        loss: Float32[Tensor, "b"],
+        relative_gradient: Float64[Tensor, "b p 12"] | None,
+    ) -> None:
+        """Adds the multi-view terms, given the visible depth and the pairs' motions."""
+        t, kernels, c = self.table, self._kernels, self.config
+        pairs = self.views * self.partners
+        height, width = t.photo.height, t.photo.width
+        sizes = (t.render.height, t.render.width, height, width, self.partners)
+        sobel = c.photo_gradient == "sobel"
+        windowed = c.ssim_weight > 0 or c.ncc_weight > 0
+        columns = _blocks(width, 32)
+        kernels["warp_pairs"](
+            (columns, _blocks(height, _WARP_ROWS), pairs), (32, 8), batch, self._targets,
+            self._motions, t.pointers, t.rendered, self._photo_settings, self._clean, self._warped,
+            self._pull, self._image_gradient, loss, *sizes, sobel, not windowed,
+        )  # fmt: skip
+        keep = _Flags.KEEP_GRADIENT if self._with_pose else _Flags(0)
+        if c.ssim_weight > 0:
+            flags = _Flags(0) if c.ncc_weight > 0 else _Flags.FINISH | keep
+            self._compare("compare_structure", _SSIM_HALF, batch, loss, flags)
+        if c.ncc_weight > 0:
+            earlier = _Flags.ADD_EARLIER if c.ssim_weight > 0 else _Flags(0)
+            flags = earlier | _Flags.FINISH | keep
+            self._compare(f"correlate_{c.ncc_patch}", c.ncc_patch // 2, batch, loss, flags)
+        if relative_gradient is not None:
+            kernels["motion_gradient"](
+                (columns, _blocks(height, _MOTION_ROWS), pairs), (32, 8), self._targets,
+                self._motions, t.pointers, self._photo_settings, self._clean, self._warped,
+                self._image_gradient, relative_gradient, *sizes, sobel,
+            )  # fmt: skip
+        grid = (_blocks(t.render.width, 32), _blocks(t.render.height, 8), self.views)
+        kernels["gather_depth_gradient"](grid, (32, 8), self._targets, self._pull, d_depth, *sizes)
+
+    def _compare(
+        self,
+        kernel: str,
+        half: int,
+        batch: Int32[Tensor, "b"],
+        loss: Float32[Tensor, "b"],
+        flags: _Flags,
+    ) -> None:
+        photo = self.table.photo
+        strips = _blocks(photo.width, _STRIP - 4 * half)
+        grid = (strips, _blocks(photo.height, _STRIP_ROWS), self.views * self.partners)
+        self._kernels[kernel](
+            grid, _STRIP, batch, self._targets, self.table.pointers, self._photo_settings,
+            self._warped, self._pull, self._image_gradient, loss, photo.height, photo.width,
+            self.partners, _STRIP_ROWS, int(flags),
+        )  # fmt: skip
+
+    def store_rendered(
+        self,
+        batch: Int32[Tensor, "b"],
+        depth: Float32[Tensor, "b h w"],
+        alpha: Float32[Tensor, "b h w"],
+    ) -> None:
+        """Keep the visible depth of views for other views' occlusion tests; slots -1 are skipped.
+
+        Of the same slot twice one is kept.
+        """
+        pixels = depth.shape[1] * depth.shape[2]
+        self._kernels["store_rendered"](
+            (_blocks(pixels, 256), len(batch)), 256, batch, self.table.pointers,
+            self.table.rendered, depth, alpha, pixels, self.config.min_alpha,
+        )  # fmt: skip
+
+
+def _blocks(size: int, block: int) -> int:
+    return -(-size // block)
