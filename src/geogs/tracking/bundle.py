@@ -7,6 +7,7 @@ the small reduced blocks. Residuals are float32, the reduced camera system is fl
 """
 
 from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -49,7 +50,10 @@ class LinearProjection(Projection):
 
 @dataclass(frozen=True)
 class BundleProblem:
-    """Frames and edges of one adjustment; edges are sorted by source."""
+    """Frames and edges of one adjustment; edges are sorted by source.
+
+    On a GPU only inverse depths, pixels and weights need to be there; all else is best on the CPU.
+    """
 
     T_cw: Float[Tensor, "n 4 4"]
     """float64."""
@@ -181,8 +185,26 @@ class _Star:
     """Coupling (6k, p), damped curvature (p,) and gradient (p,) of free inverse depths."""
 
 
+@runtime_checkable
+class BundleSolver(Protocol):
+    """What adjusts a problem."""
+
+    def solve(self, problem: BundleProblem, options: BundleOptions | None = None) -> BundleResult:
+        """Take ``options.iterations`` steps; one that is not finite is not taken."""
+        ...
+
+
+def bundle_solver(grid: SampleGrid) -> BundleSolver:
+    """The solver for the device of a grid."""
+    if grid.on_gpu:
+        from geogs.tracking.cuda.bundle import CudaDenseBundle
+
+        return CudaDenseBundle(grid)
+    return DenseBundle(grid)
+
+
 class DenseBundle:
-    """Solver for one grid; holds no state between calls."""
+    """Solver for one grid on the CPU; holds no state between calls."""
 
     def __init__(self, grid: SampleGrid) -> None:
         self.grid = grid
@@ -349,6 +371,12 @@ def solve_poses(
     Edge e observes frame ``frame[e]`` from a keyframe at ``T_source[e]`` with the given inverse
     depth. Returns the poses and the residuals of the observations at those poses.
     """
+    if inverse_depth.is_cuda:
+        from geogs.tracking.cuda import motion
+
+        return motion.solve_poses(
+            camera, rays, T_cw, inverse_depth, T_source, frame, pixels, weight, iterations, huber
+        )
     T = T_cw
     inverse = se3_inverse(T_source)
     for _ in range(iterations):

@@ -11,7 +11,7 @@ from geogs.tracking.bundle import (
     BundleOptions,
     BundleProblem,
     BundleResult,
-    DenseBundle,
+    bundle_solver,
     project,
     relative_motion,
 )
@@ -39,7 +39,7 @@ class FrameGraph:
         self.keyframes = keyframes
         self.operator = operator
         self.edges: dict[Pair, Edge] = {}
-        self.bundle = DenseBundle(keyframes.grid)
+        self.bundle = bundle_solver(keyframes.grid)
 
     @property
     def pairs(self) -> list[Pair]:
@@ -55,6 +55,10 @@ class FrameGraph:
         if not directed:
             return self.keyframes.grid.pixels.new_zeros(0, self.keyframes.grid.size, 2)
         store = self.keyframes
+        if store.grid.on_gpu:
+            from geogs.tracking.cuda.graph import DirectedPairs
+
+            return DirectedPairs.of(store, directed).project()
         source, target = (store.poses([e[k] for e in directed]) for k in (0, 1))
         index = torch.arange(len(directed), device=source.device)
         T = relative_motion(torch.cat([source, target]), index, index + len(directed))
@@ -89,12 +93,20 @@ class FrameGraph:
         if not known:
             return new
         directed = known + [(j, i) for i, j in known]
-        before = torch.stack([self.edges[e].reprojection for e in directed])
-        matched = torch.stack([self.edges[e].weight[:, 0] > 0 for e in directed])
-        moved = (self.reprojections(directed) - before).norm(dim=-1)
-        moved = moved.masked_fill(~matched, torch.nan).nanmedian(dim=1).values.nan_to_num(torch.inf)
+        moved = self._moved(directed).cpu().nan_to_num(torch.inf)
         worst = torch.maximum(*moved.split(len(known)))
         return new + [p for p, m in zip(known, worst.tolist(), strict=True) if m > tolerance]
+
+    def _moved(self, directed: Sequence[Pair]) -> Float[Tensor, "e"]:
+        """Median motion in pixels of the matched cells since they were measured."""
+        before = torch.stack([self.edges[e].reprojection for e in directed])
+        weight = torch.stack([self.edges[e].weight for e in directed])
+        if self.keyframes.grid.on_gpu:
+            from geogs.tracking.cuda.graph import DirectedPairs
+
+            return DirectedPairs.of(self.keyframes, directed).moved(before, weight)
+        moved = (self.reprojections(directed) - before).norm(dim=-1)
+        return moved.masked_fill(~(weight[..., 0] > 0), torch.nan).nanmedian(dim=1).values
 
     def problem(
         self, directed: Sequence[Pair], free_pose: Iterable[int], free_depth: Iterable[int]
@@ -104,17 +116,16 @@ class FrameGraph:
         poses, depths = set(free_pose), set(free_depth)
         ids = sorted({k for e in directed for k in e} | poses | depths)
         slot = {k: n for n, k in enumerate(ids)}
-        device = self.keyframes.grid.device
         edges = [self.edges[e] for e in directed]
         problem = BundleProblem(
             T_cw=self.keyframes.poses(ids),
             inverse_depth=self.keyframes.inverse_depths(ids),
-            source=torch.tensor([slot[i] for i, _ in directed], device=device),
-            target=torch.tensor([slot[j] for _, j in directed], device=device),
+            source=torch.tensor([slot[i] for i, _ in directed]),
+            target=torch.tensor([slot[j] for _, j in directed]),
             pixels=torch.stack([e.pixels for e in edges]),
             weight=torch.stack([e.weight for e in edges]),
-            free_pose=torch.tensor([k in poses for k in ids], device=device),
-            free_depth=torch.tensor([k in depths for k in ids], device=device),
+            free_pose=torch.tensor([k in poses for k in ids]),
+            free_depth=torch.tensor([k in depths for k in ids]),
         )
         return problem, ids
 
@@ -134,13 +145,16 @@ class FrameGraph:
             return None
         depths, poses = set(free_depth), set(free_pose)
         for n, k in enumerate(ids):
-            state = self.keyframes[k]
             if k in poses:
-                state.T_cw = result.T_cw[n]
-            if k in depths:
-                information = result.information[n]
-                state.inverse_depth = self.keyframes.grid.fill(result.inverse_depth[n], information)
-                state.information = information
+                self.keyframes[k].T_cw = result.T_cw[n]
+        rows = [n for n, k in enumerate(ids) if k in depths]
+        if rows:
+            depth = torch.stack([result.inverse_depth[n] for n in rows])
+            information = torch.stack([result.information[n] for n in rows])
+            filled = self.keyframes.grid.fill_all(depth, information)
+            for m, n in enumerate(rows):
+                state = self.keyframes[ids[n]]
+                state.inverse_depth, state.information = filled[m], information[m]
         return result
 
 
@@ -156,6 +170,10 @@ def frame_distances(
     grid = store.grid
     if not directed:
         return grid.pixels.new_zeros(0)
+    if grid.on_gpu:
+        from geogs.tracking.cuda.graph import DirectedPairs
+
+        return DirectedPairs.of(store, directed).distances(rotation_weight, step)
     keep = torch.zeros(grid.height, grid.width, dtype=torch.bool, device=grid.device)
     keep[::step, ::step] = True
     keep = keep.reshape(-1)
@@ -212,8 +230,8 @@ def proximity_pairs(
         if b - a > radius and (a, b) not in blocked
     ]
     directed = [(ids[a], ids[b]) for a, b in candidates]
-    reverse = [(j, i) for i, j in directed]
-    distance = (frame_distances(store, directed) + frame_distances(store, reverse)) / 2
+    both = frame_distances(store, directed + [(j, i) for i, j in directed]).cpu()
+    distance = (both[: len(directed)] + both[len(directed) :]) / 2
     for n in torch.argsort(distance, stable=True).tolist():
         if float(distance[n]) > max_distance or len(found) >= max_pairs:
             break

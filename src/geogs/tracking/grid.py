@@ -48,6 +48,11 @@ class SampleGrid:
         object.__setattr__(self, "rays", rays.reshape(-1, 3).float().to(self.device))
 
     @property
+    def on_gpu(self) -> bool:
+        """Whether fields on the grid are kept and worked on by a GPU."""
+        return torch.device(self.device).type == "cuda"
+
+    @property
     def size(self) -> int:
         """Number of cells."""
         return self.width * self.height
@@ -95,6 +100,21 @@ class SampleGrid:
         Push and pull: confidence-weighted means over growing blocks, taken from the finest level
         that has any confidence near. Without any confidence the plain mean is returned.
         """
+        return self.fill_all(values[None], confidence[None])[0]
+
+    def fill_all(
+        self, values: Float[Tensor, "n p"], confidence: Float[Tensor, "n p"]
+    ) -> Float[Tensor, "n p"]:
+        """:meth:`fill` of several fields at once."""
+        if self.on_gpu:
+            from geogs.tracking.cuda.fields import fill_fields
+
+            return fill_fields(self, values, confidence)
+        return torch.stack([self._fill(*pair) for pair in zip(values, confidence, strict=True)])
+
+    def _fill(
+        self, values: Float[Tensor, "p"], confidence: Float[Tensor, "p"]
+    ) -> Float[Tensor, "p"]:
         if not bool((confidence > 0).any()):
             return torch.full_like(values, float(values.mean()))
         shape = (1, 1, self.height, self.width)

@@ -115,9 +115,7 @@ def two_view(grid: SampleGrid, match: FlowMatch) -> TwoView | None:
     device = grid.device
     depth = torch.from_numpy(np.where(good, median / np.where(good, z, 1), 1.0)).float().to(device)
     known = torch.from_numpy(np.asarray(good, bool)).to(device)
-    return TwoView(
-        torch.from_numpy(T).to(device), grid.fill(depth, known.float()), known, float(parallax)
-    )
+    return TwoView(torch.from_numpy(T), grid.fill(depth, known.float()), known, float(parallax))
 
 
 def _place_all(store: KeyframeStore, flows: list[FlowMatch], best: tuple[int, TwoView]) -> None:
@@ -125,7 +123,7 @@ def _place_all(store: KeyframeStore, flows: list[FlowMatch], best: tuple[int, Tw
     chosen, view = best
     states = list(store)
     first = states[0]
-    eye = torch.eye(4, dtype=torch.float64, device=store.grid.device)
+    eye = torch.eye(4, dtype=torch.float64)
     first.T_cw, first.inverse_depth = eye, view.inverse_depth
     first.information = view.good.float()
     for n, (state, match) in enumerate(zip(states[1:], flows, strict=True)):

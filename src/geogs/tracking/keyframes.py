@@ -27,7 +27,7 @@ class KeyframeState:
     encoded: Any
     """The flow operator's form of the image."""
     T_cw: Float[Tensor, "4 4"]
-    """float64."""
+    """float64, on the CPU whatever the device of the grid."""
     inverse_depth: Float[Tensor, "p"]
     information: Float[Tensor, "p"]
 
@@ -79,7 +79,7 @@ class KeyframeStore:
         return self._states.pop(id)
 
     def poses(self, ids: Sequence[int]) -> Float[Tensor, "n 4 4"]:
-        """World to camera, float64."""
+        """World to camera, float64, on the CPU."""
         return torch.stack([self._states[i].T_cw for i in ids])
 
     def inverse_depths(self, ids: Sequence[int]) -> Float[Tensor, "n p"]:
@@ -98,7 +98,10 @@ class KeyframeStore:
             state.information = state.information * factor**2
 
     def export(self, id: int) -> Keyframe:
-        """The keyframe as the rest of the system sees it; tensors are copies."""
+        """The keyframe as the rest of the system sees it; tensors are copies.
+
+        The pose is on the CPU, inverse depth and information are on the grid's device.
+        """
         s = self._states[id]
         shape = (self.grid.height, self.grid.width)
         # What matches agree on is still wrong by a common error of poses and scale.

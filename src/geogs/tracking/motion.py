@@ -16,6 +16,11 @@ from geogs.tracking.flow.base import FlowMatch, FlowOperator
 from geogs.tracking.grid import SampleGrid
 from geogs.tracking.keyframes import KeyframeState
 
+FIT_ITERATIONS = 6
+"""Steps of the motion-only adjustment of a frame."""
+FIT_HUBER = 5.0
+"""Standard deviations of the flow beyond which a match counts linearly in it."""
+
 
 @dataclass(frozen=True)
 class FrameMotion:
@@ -53,9 +58,9 @@ class FrameLocator:
         self, keyframe: KeyframeState, encoded: Any, T_guess: Float[Tensor, "4 4"]
     ) -> FrameMotion | None:
         """Pose of a frame that is near ``T_guess``; None if too little agrees with any pose."""
-        forward, backward = both_reprojections(self.grid, keyframe, T_guess)
+        forward, backward = all_reprojections(self.grid, [keyframe], [T_guess])
         there, _ = self.operator.measure(
-            [keyframe.encoded], [encoded], forward[None], backward[None], fine=False
+            [keyframe.encoded], [encoded], forward, backward, fine=False
         )
         return self._solve(keyframe, there, T_guess)
 
@@ -79,6 +84,36 @@ class FrameLocator:
     def _solve(
         self, keyframe: KeyframeState, match: FlowMatch, T_guess: Float[Tensor, "4 4"]
     ) -> FrameMotion | None:
+        fit = self._fit_on_gpu if self.grid.on_gpu else self._fit
+        motion = fit(keyframe, match, T_guess)
+        if motion is None or motion.matched < self.min_matched:
+            return None
+        return motion if motion.residual < self.max_residual else None
+
+    def _fit_on_gpu(
+        self, keyframe: KeyframeState, match: FlowMatch, T_guess: Float[Tensor, "4 4"]
+    ) -> FrameMotion | None:
+        from geogs.tracking.cuda.motion import fit_frame
+
+        T, (used, agree, residual, flow) = fit_frame(
+            self.grid,
+            T_guess,
+            keyframe.T_cw,
+            keyframe.inverse_depth,
+            keyframe.information,
+            match.pixels[0],
+            match.weight[0],
+            iterations=FIT_ITERATIONS,
+            huber=FIT_HUBER,
+            limit=2 * self.max_residual,
+        )
+        if used < self.min_matched:
+            return None
+        return FrameMotion(keyframe.id, T, match, flow, agree, residual)
+
+    def _fit(
+        self, keyframe: KeyframeState, match: FlowMatch, T_guess: Float[Tensor, "4 4"]
+    ) -> FrameMotion | None:
         weight = match.weight * (keyframe.information > 0)[:, None]
         used = weight[0, :, 0] > 0
         if float(used.float().mean()) < self.min_matched:
@@ -93,14 +128,12 @@ class FrameLocator:
             frame,
             match.pixels,
             weight,
-            iterations=6,
-            huber=5.0,
+            iterations=FIT_ITERATIONS,
+            huber=FIT_HUBER,
         )
         error = residual[0].norm(dim=-1)
         agree = float((used & (error < 2 * self.max_residual)).float().mean())
         median = float(error[used].median())
-        if agree < self.min_matched or not median < self.max_residual:
-            return None
         flow = float((match.pixels[0] - self.grid.pixels).norm(dim=-1)[used].median())
         return FrameMotion(keyframe.id, T[0], match, flow, agree, median)
 
@@ -148,7 +181,30 @@ class FlowChain:
 def filled_positions(grid: SampleGrid, match: FlowMatch) -> Float[Tensor, "p 2"]:
     """Positions of a single edge, unmatched cells filled in from the flow around them."""
     flow, weight = match.pixels[0] - grid.pixels, match.weight[0, :, 0]
-    return grid.pixels + torch.stack([grid.fill(flow[:, k], weight) for k in (0, 1)], -1)
+    return grid.pixels + grid.fill_all(flow.mT, weight.expand(2, -1)).mT
+
+
+def all_reprojections(
+    grid: SampleGrid, keyframes: Sequence[KeyframeState], T_cw: Sequence[Float[Tensor, "4 4"]]
+) -> tuple[Float[Tensor, "e p 2"], Float[Tensor, "e p 2"]]:
+    """:func:`both_reprojections` of several pairs of a keyframe and a frame."""
+    if not grid.on_gpu:
+        views = [both_reprojections(grid, k, T) for k, T in zip(keyframes, T_cw, strict=True)]
+        return torch.stack([v[0] for v in views]), torch.stack([v[1] for v in views])
+    from geogs.tracking.cuda.fields import carry_depth
+
+    rows = {k.id: k for k in keyframes}
+    slot = {id: n for n, id in enumerate(rows)}
+    there, back = carry_depth(
+        grid,
+        torch.stack(list(T_cw)),
+        torch.stack([k.T_cw for k in rows.values()]),
+        torch.tensor([slot[k.id] for k in keyframes]),
+        torch.stack([k.inverse_depth for k in rows.values()]),
+        torch.stack([k.information for k in rows.values()]),
+        reproject=True,
+    )
+    return there, back
 
 
 def both_reprojections(
@@ -175,6 +231,19 @@ def transfer_depth(
 
     Cells that nothing falls on are filled from their surroundings and have no information.
     """
+    if grid.on_gpu:
+        from geogs.tracking.cuda.fields import carry_depth
+
+        depth, carried = carry_depth(
+            grid,
+            T_ji[None],
+            torch.eye(4).to(T_ji)[None],
+            torch.zeros(1, dtype=torch.long),
+            inverse_depth[None],
+            information[None],
+            reproject=False,
+        )
+        return depth[0], carried[0]
     R, t = T_ji[:3, :3].to(inverse_depth), T_ji[:3, 3].to(inverse_depth)
     z = (grid.rays @ R.mT + inverse_depth[:, None] * t)[:, 2]
     p = project(grid.camera, grid.rays, T_ji[None], inverse_depth[None])
@@ -215,4 +284,4 @@ def pnp(
         return None
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = cv2.Rodrigues(rotation)[0], translation[:, 0]
-    return torch.from_numpy(T).to(grid.device) if np.isfinite(T).all() else None
+    return torch.from_numpy(T) if np.isfinite(T).all() else None

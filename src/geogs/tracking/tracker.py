@@ -53,6 +53,15 @@ class TrackResult:
     """Ids that were culled."""
 
 
+def classical_flow(grid: SampleGrid) -> FlowOperator:
+    """The flow operator without a network for the device of a grid."""
+    if grid.on_gpu:
+        from geogs.tracking.flow.classical_cuda import CudaClassicalFlow
+
+        return CudaClassicalFlow(grid)
+    return ClassicalFlow(grid)
+
+
 class Tracker:
     """Monocular tracking after DROID-SLAM: motion filter, frame graph, dense bundle adjustment."""
 
@@ -68,7 +77,7 @@ class Tracker:
         self.camera = camera
         self.config = config or TrackingConfig()
         self.grid = SampleGrid(camera, device)
-        self.operator = operator or ClassicalFlow(self.grid)
+        self.operator = operator or classical_flow(self.grid)
         self.store = KeyframeStore(self.grid)
         self.graph = FrameGraph(self.store, self.operator)
         self.recorder = TrajectoryRecorder(self.store, self.operator)
@@ -192,14 +201,14 @@ class Tracker:
                 return self._restart(frame, encoded)
             self._misses = 0
             if match.flow < self.config.keyframe_flow * self._long_edge:
-                eye = torch.eye(4, dtype=torch.float64, device=self.grid.device)
+                eye = torch.eye(4, dtype=torch.float64)
                 self.recorder.add(frame.index, frame.timestamp, encoded, last.id, eye, match.there)
                 return TrackResult(self.state)
         return self._gather(frame, encoded)
 
     def _gather(self, frame: Frame, encoded: Any) -> TrackResult:
         """Add a keyframe to those the map will be started from, and start it with enough."""
-        eye = torch.eye(4, dtype=torch.float64, device=self.grid.device)
+        eye = torch.eye(4, dtype=torch.float64)
         state = self.store.add(frame.index, frame.timestamp, frame.image, encoded, eye)
         self._chain.reset()
         self.recorder.add_keyframe(state.id)

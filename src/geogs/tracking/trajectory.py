@@ -13,7 +13,7 @@ from geogs.tracking.bundle import linearise, solve_poses
 from geogs.tracking.flow.base import FlowMatch, FlowOperator
 from geogs.tracking.grid import SampleGrid
 from geogs.tracking.keyframes import KeyframeState, KeyframeStore
-from geogs.tracking.motion import both_reprojections
+from geogs.tracking.motion import all_reprojections
 from geogs.types import Trajectory
 
 
@@ -60,11 +60,11 @@ class TrajectoryRecorder:
         self.store, self.operator, self.max_pending = store, operator, max_pending
         self.records: list[FrameRecord] = []
         self._pending: list[_Pending] = []
-        self._subset = sparse_cells(store.grid)
+        self._subset = torch.nonzero(sparse_cells(store.grid))[:, 0]
 
     def add_untracked(self, index: int, timestamp: float) -> None:
         """A frame that could not be located."""
-        eye = torch.eye(4, dtype=torch.float64, device=self.store.grid.device)
+        eye = torch.eye(4, dtype=torch.float64)
         self.records.append(FrameRecord(index, timestamp, None, eye))
 
     def add(
@@ -79,7 +79,7 @@ class TrajectoryRecorder:
         """A frame at ``T_rel`` from the anchor keyframe, with the flow that located it."""
         record = FrameRecord(index, timestamp, anchor, T_rel)
         if match is not None:
-            self._observe(record, anchor, match, 0)
+            self._observe([(record, anchor)], match)
         self.records.append(record)
         self._pending.append(_Pending(record, encoded))
         if len(self._pending) > self.max_pending:
@@ -88,7 +88,7 @@ class TrajectoryRecorder:
     def add_keyframe(self, id: int) -> None:
         """A frame that is a keyframe."""
         state = self.store[id]
-        eye = torch.eye(4, dtype=torch.float64, device=self.store.grid.device)
+        eye = torch.eye(4, dtype=torch.float64)
         self.records.append(FrameRecord(state.frame_index, state.timestamp, id, eye))
 
     def keyframe_removed(self, removed: KeyframeState, substitute: int) -> None:
@@ -134,24 +134,25 @@ class TrajectoryRecorder:
             self._measure(jobs[start : start + 8])
 
     def _measure(self, jobs: list[tuple[_Pending, int]]) -> None:
-        views = [
-            both_reprojections(self.store.grid, self.store[k], self._pose(p.record))
-            for p, k in jobs
-        ]
+        keyframes = [self.store[k] for _, k in jobs]
+        poses = [self._pose(p.record) for p, _ in jobs]
+        forward, backward = all_reprojections(self.store.grid, keyframes, poses)
         there, _ = self.operator.measure(
-            [self.store[k].encoded for _, k in jobs],
+            [k.encoded for k in keyframes],
             [p.encoded for p, _ in jobs],
-            torch.stack([v[0] for v in views]),
-            torch.stack([v[1] for v in views]),
+            forward,
+            backward,
             fine=False,
         )
-        for n, (p, k) in enumerate(jobs):
-            self._observe(p.record, k, there, n)
+        self._observe([(p.record, k) for p, k in jobs], there)
 
-    def _observe(self, record: FrameRecord, keyframe: int, match: FlowMatch, edge: int) -> None:
-        pixels, weight = match.pixels[edge, self._subset], match.weight[edge, self._subset]
-        if bool((weight > 0).any()):
-            record.observations.append(Observation(keyframe, pixels.clone(), weight.clone()))
+    def _observe(self, jobs: list[tuple[FrameRecord, int]], match: FlowMatch) -> None:
+        """Keep the matches of records with keyframes."""
+        pixels, weight = match.pixels[:, self._subset], match.weight[:, self._subset]
+        for n, (record, keyframe) in enumerate(jobs):
+            # Asking would wait for the GPU; an observation without weight does no harm.
+            if self.store.grid.on_gpu or bool((weight[n] > 0).any()):
+                record.observations.append(Observation(keyframe, pixels[n], weight[n]))
 
     def _pose(self, record: FrameRecord) -> Float[Tensor, "4 4"]:
         assert record.anchor is not None, "a frame that was not tracked has no pose"
@@ -188,7 +189,7 @@ class TrajectoryRecorder:
         if not pairs:
             return start
         ids = [o.keyframe for _, o in pairs]
-        frame = torch.tensor([n for n, _ in pairs], device=grid.device)
+        frame = torch.tensor([n for n, _ in pairs])
         depth = self.store.inverse_depths(ids)[:, cells]
         information = self.store.informations(ids)[:, cells]
         source = self.store.poses(ids)
