@@ -24,7 +24,7 @@ class DepthScene:
     truth: list[np.ndarray]
 
 
-def make_scene(seed: int = 0) -> DepthScene:
+def make_scene(seed: int = 0, working: Camera = WORKING, render: Camera = RENDER) -> DepthScene:
     """Five views; the tracker is right to 3 % on most cells and knows nothing of every fourth."""
     rng = np.random.default_rng(seed)
     views, truth = [], []
@@ -32,7 +32,7 @@ def make_scene(seed: int = 0) -> DepthScene:
         T_wc = np.eye(4)
         T_wc[:3, :3] = _turn(0.04 * np.array([centre[1], -centre[0], 0]))
         T_wc[:3, 3] = centre
-        depth, points = trace(WORKING, T_wc)
+        depth, points = trace(working, T_wc)
         image = _texture(points)
         grid = 1.0 / depth[4:-3:8, 4:-3:8]
         lost = rng.random(grid.shape) < 0.25
@@ -48,8 +48,8 @@ def make_scene(seed: int = 0) -> DepthScene:
             inverse_depth=torch.from_numpy(inverse.astype(np.float32)),
             information=torch.from_numpy(information.astype(np.float32)),
         )
-        views.append(depth_view(keyframe, RENDER))
-        truth.append(trace(RENDER, T_wc)[0].astype(np.float32))
+        views.append(depth_view(keyframe, render))
+        truth.append(trace(render, T_wc)[0].astype(np.float32))
     return DepthScene(views, truth)
 
 

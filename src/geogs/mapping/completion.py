@@ -37,6 +37,17 @@ def complete_inverse_depth(
     of inverse depth, ``config.sigma_scale`` / sqrt(information), plus 0.2 % of d. Cells without a
     finite positive value or with no information get theirs from around them.
     """
+    smooth = edge_weights(image, inverse_depth.shape, config)
+    return complete_grid(inverse_depth, information, smooth, config)
+
+
+def complete_grid(
+    inverse_depth: Float32[np.ndarray, "gh gw"],
+    information: Float32[np.ndarray, "gh gw"],
+    smooth: Float32[np.ndarray, "gh gw"],
+    config: DepthConfig,
+) -> CompletedDepth:
+    """``complete_inverse_depth`` with the weights of smoothness as ``edge_weights`` has them."""
     known = np.isfinite(inverse_depth) & (inverse_depth > 1e-6)
     known &= np.isfinite(information) & (information > 0)
     if not known.any():
@@ -47,7 +58,7 @@ def complete_inverse_depth(
     amount = np.where(known, information, 0.0).astype(np.float64)
     deviation = 1.0 / (data * np.sqrt(amount) + 1e-3)
     scale = config.sigma_scale / np.sqrt(amount + 1e-9) + 0.002 * data
-    smoothness = _smoothness_bands(_edge_weights(image, data.shape, config), typical, config)
+    smoothness = _smoothness_bands(smooth, typical, config)
     weight = np.ones_like(data)
     for _ in range(4):
         precision = weight / scale**2
@@ -61,8 +72,8 @@ def complete_inverse_depth(
     return CompletedDepth(fitted.astype(np.float32), deviation.astype(np.float32), inlier)
 
 
-def _edge_weights(
-    image: UInt8[np.ndarray, "h w 3"], shape: tuple[int, int], config: DepthConfig
+def edge_weights(
+    image: UInt8[np.ndarray, "h w 3"], shape: tuple[int, ...], config: DepthConfig
 ) -> Float32[np.ndarray, "gh gw"]:
     """exp(-sharpness |gradient of the Lab image|), the strongest within three pixels of a cell."""
     sharp = cv2.cvtColor(image, cv2.COLOR_RGB2LAB).astype(np.float32) * np.float32(1 / 255)

@@ -19,6 +19,9 @@ _SUPPORT = 0.48
 _TOLERANCE = 0.02
 """Relative depth error that still counts as right."""
 
+WEIGHTS = (_BIAS, _MARGIN, _TRACKER_AGREES, _TRACKER_DIFFERS, _JUMP, _SUPPORT, _TOLERANCE)
+"""All of them, for the CUDA kernel."""
+
 
 def depth_confidence(
     refined: SlantedDepth,

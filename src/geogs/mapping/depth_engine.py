@@ -19,7 +19,7 @@ Progress = Callable[[float], None]
 """Called with the finished fraction."""
 
 
-def _silent(fraction: float) -> None:
+def silent(fraction: float) -> None:
     """Progress that nobody watches."""
 
 
@@ -35,7 +35,7 @@ class DepthEngine(Protocol):
         self,
         references: Sequence[DepthView],
         neighbours: Sequence[Sequence[DepthView]],
-        progress: Progress = _silent,
+        progress: Progress = silent,
     ) -> list[DenseDepth]:
         """Dense depth of every reference, matched with its neighbours (``estimate_depth``)."""
         ...
@@ -66,7 +66,7 @@ class CpuDepthEngine:
         self,
         references: Sequence[DepthView],
         neighbours: Sequence[Sequence[DepthView]],
-        progress: Progress = _silent,
+        progress: Progress = silent,
     ) -> list[DenseDepth]:
         """As in the protocol."""
 
@@ -106,4 +106,8 @@ def depth_engine(
     """The engine for a map on ``device``: depths at the size of ``render``, refined at that of
     ``working``, the size of the keyframes' images.
     """
+    if torch.device(device).type == "cuda":
+        from geogs.mapping.cuda.engine import CudaDepthEngine
+
+        return CudaDepthEngine(torch.device(device), render, working, config)
     return CpuDepthEngine(render, working, config)

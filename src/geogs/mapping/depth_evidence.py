@@ -28,19 +28,33 @@ class DepthEvidence:
 def tracker_prior(
     completed: CompletedDepth, working: Camera, render: Camera, config: DepthConfig
 ) -> DepthEvidence:
-    """The completed depth, for the sweep; weight 1 / (1 + (deviation / sure_deviation)^2)."""
-    weight = 1.0 / (1.0 + (completed.deviation / np.float32(config.sure_deviation)) ** 2)
-    weight = np.where(completed.inlier, weight, np.float32(0.0))
+    """The completed depth, for the sweep, with ``prior_weight``."""
     return DepthEvidence(
         upsample_grid(completed.inverse_depth, working, render),
-        upsample_grid(weight, working, render),
+        upsample_grid(prior_weight(completed, config), working, render),
     )
+
+
+def prior_weight(completed: CompletedDepth, config: DepthConfig) -> Float32[np.ndarray, "gh gw"]:
+    """1 / (1 + (deviation / sure_deviation)^2) on the grid, 0 where the tracker was rejected."""
+    weight = 1.0 / (1.0 + (completed.deviation / np.float32(config.sure_deviation)) ** 2)
+    return np.where(completed.inlier, weight, np.float32(0.0))
 
 
 def tracker_evidence(
     completed: CompletedDepth, working: Camera, render: Camera, config: DepthConfig
 ) -> DepthEvidence:
-    """The completed depth with its relative precision 1 / sigma^2 as weight.
+    """The completed depth with its ``relative_precision`` as weight."""
+    return DepthEvidence(
+        upsample_grid(completed.inverse_depth, working, render),
+        upsample_grid(relative_precision(completed, config), working, render),
+    )
+
+
+def relative_precision(
+    completed: CompletedDepth, config: DepthConfig
+) -> Float32[np.ndarray, "gh gw"]:
+    """1 / sigma^2 on the grid.
 
     sigma is ``config.tracker_scale`` times the deviation the tracker expects. Where inverse depth
     bends sharply between cells, interpolating makes a curtain from foreground to background: the
@@ -48,11 +62,7 @@ def tracker_evidence(
     """
     deviation = np.where(completed.inlier, completed.deviation, np.float32(_UNKNOWN_DEVIATION))
     sigma = np.maximum(np.float32(config.tracker_scale) * deviation, np.float32(_BEST_DEVIATION))
-    precision = _flatness(completed.inverse_depth) ** 2 / sigma**2
-    return DepthEvidence(
-        upsample_grid(completed.inverse_depth, working, render),
-        upsample_grid(precision, working, render),
-    )
+    return _flatness(completed.inverse_depth) ** 2 / sigma**2
 
 
 def choose_start(prior: DepthEvidence, sweep: SweepResult) -> DepthEvidence:

@@ -18,7 +18,12 @@ _OWN = 0.66
 _SUPPORT = 0.72
 _VIOLATION = -0.92
 
-_OCCLUSION_PENALTY = 0.7
+WEIGHTS = (_BIAS, _OWN, _SUPPORT, _VIOLATION)
+"""All of them, for the CUDA kernel."""
+SPLAT_CONFIDENCE = 0.5
+"""Confidence from which pixels of other keyframes repair this one."""
+
+OCCLUSION_PENALTY = 0.7
 """Weight of a transferred depth that hides a candidate, against one that agrees with it."""
 
 
@@ -78,11 +83,12 @@ def _repair(
         points = other.depth.reshape(-1, 1) * rays
         splat_depth(
             points, other.confidence.ravel(), np.ascontiguousarray(relative[:3, :3]),
-            np.ascontiguousarray(relative[:3, 3]), lens, np.float32(0.5), seen[j], weight[j],
+            np.ascontiguousarray(relative[:3, 3]), lens, np.float32(SPLAT_CONFIDENCE), seen[j],
+            weight[j],
         )  # fmt: skip
     best, score = np.empty_like(depth.depth), np.empty_like(depth.depth)
     reach, clearance = np.float32(config.agreement_reach), np.float32(config.violation_distance)
-    agree_on_depth(seen, weight, reach, clearance, np.float32(_OCCLUSION_PENALTY), best, score)
+    agree_on_depth(seen, weight, reach, clearance, np.float32(OCCLUSION_PENALTY), best, score)
     unsure = depth.confidence < config.repair_below
     taken = unsure & (score > config.repair_votes)
     confidence = np.where(taken, np.float32(config.repair_confidence), depth.confidence)

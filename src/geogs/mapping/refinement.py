@@ -13,11 +13,11 @@ from geogs.mapping import refinement_kernels as kernels
 from geogs.mapping.depth_evidence import DepthEvidence
 from geogs.mapping.depth_view import DepthView
 
-_PATCH_REACH = 2
+PATCH_REACH = 2
 """Patches of 5 x 5 samples, one render pixel apart."""
-_FLOOR_DEVIATION = 0.002
+FLOOR_DEVIATION = 0.002
 """Relative deviation that no number of matches gets below (pose, calibration, resampling)."""
-_FULL_SUPPORT = 5.0
+FULL_SUPPORT = 5.0
 """Support from which a local plane counts fully."""
 
 
@@ -81,7 +81,7 @@ def refine_depth(
         sure += np.float32(1e-3)
         tolerance, stiffness = config.fit_tolerance, config.fit_stiffness
         _fit_planes(state, sure, guide, config.fit_radius, tolerance, stiffness, config)
-        plane = np.minimum(state.support / np.float32(_FULL_SUPPORT), np.float32(1.0))
+        plane = np.minimum(state.support / np.float32(FULL_SUPPORT), np.float32(1.0))
         plane *= np.float32(1.0 / config.plane_deviation**2)
         state.inverse_depth = (precision * data + plane * state.inverse_depth) / (precision + plane)
     return state
@@ -104,7 +104,7 @@ def _photometric_step(
     limit = np.float32(config.step_limit) * rho
     state.inverse_depth = rho = rho + np.clip(step, -limit, limit)
     variance = np.float32(config.photo_deviation**2) / (curvature * rho**2 + np.float32(1e-6))
-    return 1.0 / (variance + np.float32(_FLOOR_DEVIATION**2))
+    return 1.0 / (variance + np.float32(FLOOR_DEVIATION**2))
 
 
 def _fit_planes(
@@ -143,7 +143,7 @@ def _gather_patches(
     config: DepthConfig,
 ) -> _Patches:
     """The fine reference image around every render pixel; likeness to the centre as weight."""
-    reach = np.arange(-_PATCH_REACH, _PATCH_REACH + 1, dtype=np.float32)
+    reach = np.arange(-PATCH_REACH, PATCH_REACH + 1, dtype=np.float32)
     offsets = np.stack(np.meshgrid(reach, reach), -1).reshape(-1, 2)
     columns = np.arange(render.width) - render.cx
     rows = np.arange(render.height) - render.cy

@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Int
 
-from geogs.mesh.types import Mesh
+from geogs.mesh.types import Mesh, cross
 
 
 def remove_degenerate_faces(mesh: Mesh, tolerance: float = 1e-12) -> Mesh:
@@ -12,7 +12,7 @@ def remove_degenerate_faces(mesh: Mesh, tolerance: float = 1e-12) -> Mesh:
     corners = mesh.vertices.astype(np.float64)[mesh.faces]
     edges = corners - np.roll(corners, 1, axis=1)
     squared = (edges**2).sum(-1)
-    area = (np.cross(edges[:, 0], edges[:, 1]) ** 2).sum(-1)
+    area = (cross(edges[:, 0], edges[:, 1]) ** 2).sum(-1)
     distinct = (mesh.faces != np.roll(mesh.faces, 1, axis=1)).all(1)
     scale = squared.mean() if len(squared) else 0.0
     return keep_faces(mesh, distinct & (area > tolerance * scale**2))

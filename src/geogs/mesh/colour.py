@@ -3,12 +3,12 @@
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from geogs.geometry.lie import transform
+from geogs.geometry.neighbors import nearest_neighbors
 from geogs.mesh.types import DepthMapView, Mesh
 
 _GREY = 128
@@ -25,12 +25,14 @@ def colour_mesh(
     A view sees a vertex that projects into the image onto its depth map within ``tolerance``
     (map units, plus 2 % of the depth) and turns its front to the camera. Views count by
     (cosine of the viewing angle / depth)^2: near and frontal ones decide. A vertex that no view
-    sees takes the colour of the nearest one that is seen, grey if there is none.
+    sees takes the colour of the nearest one that is seen, grey if there is none. Computed on the
+    device of the first depth map.
     """
-    vertices = torch.from_numpy(mesh.vertices)
-    normals = torch.from_numpy(mesh.normals)
+    device = views[0].depth.device if len(views) else torch.device("cpu")
+    vertices = torch.from_numpy(mesh.vertices).to(device)
+    normals = torch.from_numpy(mesh.normals).to(device)
     total = torch.zeros_like(vertices)
-    weight = torch.zeros(len(vertices))
+    weight = torch.zeros(len(vertices), device=device)
     for number, view in enumerate(views):
         if view.image is not None:
             index, w, colour = _observe(vertices, normals, view, tolerance)
@@ -40,8 +42,8 @@ def colour_mesh(
             progress(number + 1, len(views))
     seen = weight > 0
     mean = total / torch.where(seen, weight, 1.0)[:, None]
-    colours = (mean + 0.5).clamp(0, 255).to(torch.uint8).numpy()
-    return replace(mesh, colours=_fill(mesh.vertices, colours, seen.numpy()))
+    colours = (mean + 0.5).clamp(0, 255).to(torch.uint8)
+    return replace(mesh, colours=_fill(vertices, colours, seen).cpu().numpy())
 
 
 def _observe(
@@ -51,7 +53,7 @@ def _observe(
     tolerance: float,
 ) -> tuple[Tensor, Float[Tensor, "k"], Float[Tensor, "k 3"]]:
     """Indices, weights and colours (0 to 255) of the vertices that a view sees."""
-    T_cw = view.T_cw.cpu().float()
+    T_cw = view.T_cw.to(vertices)
     points = transform(T_cw, vertices)
     pixels, z = view.camera.project(points)
     column, row = pixels.round().long().unbind(-1)
@@ -59,7 +61,7 @@ def _observe(
     inside = (z > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
     index = inside.nonzero()[:, 0]
     place = row[index], column[index]
-    depth = torch.where(view.valid(), view.depth, torch.inf).cpu()
+    depth = torch.where(view.valid(), view.depth, torch.inf).to(vertices.device)
     on_surface = (depth[place] - z[index]).abs() < tolerance + 0.02 * z[index]
     index = index[on_surface]
     ray = torch.nn.functional.normalize(points[index], dim=-1)
@@ -71,7 +73,7 @@ def _observe(
 
 def _sample(view: DepthMapView, pixels: Float[Tensor, "k 2"]) -> Float[Tensor, "k 3"]:
     """Bilinear samples of the view's image at pixels of its depth map."""
-    image = torch.from_numpy(view.image).permute(2, 0, 1).float()
+    image = torch.from_numpy(view.image).to(pixels.device).permute(2, 0, 1).float()
     height, width = image.shape[1:]
     scale = pixels.new_tensor([width / view.camera.width, height / view.camera.height])
     pixels = (pixels + 0.5) * scale - 0.5
@@ -83,15 +85,13 @@ def _sample(view: DepthMapView, pixels: Float[Tensor, "k 2"]) -> Float[Tensor, "
 
 
 def _fill(
-    vertices: Float[np.ndarray, "n 3"], colours: np.ndarray, seen: Bool[np.ndarray, "n"]
-) -> np.ndarray:
-    if seen.all():
+    vertices: Float[Tensor, "n 3"], colours: UInt8[Tensor, "n 3"], seen: Bool[Tensor, "n"]
+) -> UInt8[Tensor, "n 3"]:
+    """Unseen vertices in the colour of the nearest seen one."""
+    if bool(seen.all()):
         return colours
-    if not seen.any():
-        return np.full_like(colours, _GREY)
-    from scipy.spatial import cKDTree
-
-    nearest = cKDTree(vertices[seen]).query(vertices[~seen])[1]
-    colours = colours.copy()
-    colours[~seen] = colours[seen][nearest]
+    if not bool(seen.any()):
+        return torch.full_like(colours, _GREY)
+    _, nearest = nearest_neighbors(vertices[~seen], vertices[seen], 1)
+    colours[~seen] = colours[seen][nearest[:, 0]]
     return colours

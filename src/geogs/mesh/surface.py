@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from geogs.mesh.tsdf import BLOCK, LIMIT, SparseTsdf
@@ -25,8 +25,8 @@ def extract_surface(tsdf: SparseTsdf, min_weight: float = 1.5) -> Mesh:
     Method: marching cubes (Lorensen and Cline 1987) with Lewiner's topology (2003), scikit-image.
     """
     keys, positions, faces, offset = [], [], [], 0
-    for origin, distance, seen in _chunks(tsdf, min_weight):
-        vertices, triangles = _march(distance, seen)
+    for origin, distance, cell in _chunks(tsdf, min_weight):
+        vertices, triangles = _march(distance, cell)
         if not len(triangles):
             continue
         position = vertices.astype(np.float64) + origin
@@ -46,7 +46,11 @@ def extract_surface(tsdf: SparseTsdf, min_weight: float = 1.5) -> Mesh:
 def _chunks(
     tsdf: SparseTsdf, min_weight: float
 ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """First voxel, distances and seen flags of dense boxes that overlap by one voxel layer."""
+    """First voxel, distances and cells of dense boxes that overlap by one voxel layer.
+
+    A cell is true at its upper corner if all its eight voxels were seen. Boxes without a cell or
+    without a zero are left out.
+    """
     blocks = tsdf.coordinates
     chunk_of = torch.div(blocks, _CHUNK_BLOCKS, rounding_mode="floor")
     # A cell reaches one voxel up, so a chunk also needs the first layer of the next blocks.
@@ -57,10 +61,30 @@ def _chunks(
         extent = blocks[member].amax(0) - first + 1
         last = low + _CHUNK_BLOCKS
         crop = torch.minimum(extent * BLOCK, (last - first) * BLOCK + 1).tolist()
+        if min(crop) < 2:
+            continue
         place = blocks[member] - first
-        distance = _dense(tsdf.distance[member], place, extent, 1.0, crop)
+        distance = _off_zero(_dense(tsdf.distance[member], place, extent, 1.0, crop))
         weight = _dense(tsdf.weight[member], place, extent, 0.0, crop)
-        yield first.cpu().numpy() * BLOCK, distance, weight >= max(min_weight, 1e-6)
+        cell = _seen_cells(weight >= max(min_weight, 1e-6))
+        if bool(cell.any() & (distance.amin() < 0) & (distance.amax() > 0)):
+            yield first.cpu().numpy() * BLOCK, distance.cpu().numpy(), cell.cpu().numpy()
+
+
+def _off_zero(distance: Float[Tensor, "x y z"]) -> Float[Tensor, "x y z"]:
+    """No value quite zero, so that a vertex lies strictly inside its edge."""
+    away = distance.abs().clamp(min=_SMALLEST)
+    return torch.where(distance < 0, -away, away)
+
+
+def _seen_cells(seen: Bool[Tensor, "x y z"]) -> Bool[Tensor, "x y z"]:
+    """Cells whose eight corners were seen, at their upper corners, as scikit-image's mask has it."""
+    cell = seen
+    for axis in range(3):
+        length = cell.shape[axis]
+        both = cell.narrow(axis, 1, length - 1) & cell.narrow(axis, 0, length - 1)
+        cell = torch.cat([torch.zeros_like(cell.narrow(axis, 0, 1)), both], axis)
+    return cell
 
 
 def _dense(
@@ -69,37 +93,23 @@ def _dense(
     extent: Int[Tensor, "3"],
     fill: float,
     crop: list[int],
-) -> Float[np.ndarray, "x y z"]:
+) -> Float[Tensor, "x y z"]:
     nx, ny, nz = (int(n) for n in extent)
     grid = values.new_full((nx, ny, nz, BLOCK, BLOCK, BLOCK), fill)
     grid[place[:, 0], place[:, 1], place[:, 2]] = values
     dense = grid.permute(0, 3, 1, 4, 2, 5).reshape(nx * BLOCK, ny * BLOCK, nz * BLOCK)
-    return dense[: crop[0], : crop[1], : crop[2]].cpu().numpy()
+    return dense[: crop[0], : crop[1], : crop[2]].contiguous()
 
 
-def _march(distance: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _march(distance: np.ndarray, cell: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     from skimage.measure import marching_cubes
 
-    nothing = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32)
-    if min(distance.shape) < 2:
-        return nothing
-    cell = seen.copy()
-    for axis in range(3):
-        upper = np.roll(cell, 1, axis)
-        np.moveaxis(upper, axis, 0)[0] = False
-        cell &= upper
-    # scikit-image's mask speaks of the cell whose upper corner it is, which is how `cell` is laid
-    # out. No value is quite zero: a vertex then lies strictly inside its edge.
-    distance = np.where(distance < 0, np.minimum(distance, -_SMALLEST), distance)
-    distance = np.where(distance >= 0, np.maximum(distance, _SMALLEST), distance)
-    if not cell.any() or distance.min() > 0 or distance.max() < 0:
-        return nothing
     try:
         vertices, faces, _, _ = marching_cubes(
             distance, 0.0, mask=cell, gradient_direction="descent", allow_degenerate=True
         )
     except RuntimeError:  # how scikit-image says that no masked cell has a zero
-        return nothing
+        return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32)
     return vertices, faces
 
 

@@ -1,17 +1,19 @@
 """Truncated signed distances of depth maps in sparse blocks of 8 x 8 x 8 voxels.
 
 Curless and Levoy 1996, in blocks allocated where surface was seen (voxel hashing, Niessner 2013).
-Blocks are found by binary search in their sorted keys, so everything is plain batched torch and
-runs on any device.
+Blocks are found by binary search in their sorted keys, in plain batched torch on any device; on a GPU
+the voxels are updated by a kernel.
 """
 
 import math
+from pathlib import Path
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from geogs.geometry.camera import Camera
+from geogs.gpu.kernels import kernels_for
 
 BLOCK = 8
 """Voxels along a side of a block."""
@@ -20,7 +22,8 @@ LIMIT = 2**19
 BYTES_PER_BLOCK = BLOCK**3 * 2 * 4
 _HALF = BLOCK // 2
 _BITS = 20
-_CHUNK = {"cpu": 256, "cuda": 8192}
+_CHUNK = 256
+_SOURCE = Path(__file__).parent / "cuda" / "tsdf.cu"
 
 
 def pack(coordinates: Int[Tensor, "n 3"]) -> Int[Tensor, "n"]:
@@ -130,11 +133,33 @@ class SparseTsdf:
         points = (points - T_cw[:3, 3]) @ T_cw[:3, :3]
         self._allocate(band_blocks(points, self.voxel, self.truncation))
         table = _plane_table(depth, torch.where(valid, weight, 0.0), valid)
+        if self.device.type == "cuda":
+            self.update_by_kernel(table, camera, T_cw, torch.where(valid, depth, 0.0).amax())
+            return
         far = float(depth[valid].max()) + self.truncation * self.voxel
-        projection = camera.matrix().to(self.device) @ T_cw[:3]
+        projection = camera.matrix() @ T_cw[:3]
         visible = self._in_view(camera, T_cw, far)
-        for slots in visible.split(_CHUNK.get(self.device.type, _CHUNK["cuda"])):
+        for slots in visible.split(_CHUNK):
             self._update(slots, projection, table, camera)
+
+    def update_by_kernel(
+        self,
+        table: Float[Tensor, "p 4"],
+        camera: Camera,
+        T_cw: Float[Tensor, "4 4"],
+        farthest: Float[Tensor, ""],
+    ) -> None:
+        """What a GPU does in place of :meth:`_update`: all blocks in view at once.
+
+        ``farthest`` is the largest depth of the map; it stays on the device.
+        """
+        c = camera
+        far = farthest + self.truncation * self.voxel
+        kernels_for(_SOURCE, self.device)["integrate"](
+            len(self), BLOCK**3, self._coordinates, self._distance, self._weight, table,
+            T_cw.contiguous(), far, c.width, c.height, c.fx, c.fy, c.cx, c.cy,
+            self.voxel, self.truncation,
+        )  # fmt: skip
 
     def _allocate(self, blocks: Int[Tensor, "k 3"]) -> None:
         keys = pack(blocks)

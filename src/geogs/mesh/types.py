@@ -59,10 +59,17 @@ def vertex_normals(
 ) -> Float[np.ndarray, "n 3"]:
     """Unit normals, the mean of a vertex's faces weighted by area; zero where it has none."""
     corners = vertices.astype(np.float64)[faces]
-    doubled_area = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    doubled_area = cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     index = faces.T.ravel()
     total = np.stack(
         [np.bincount(index, np.tile(axis, 3), len(vertices)) for axis in doubled_area.T], -1
     )
     length = np.linalg.norm(total, axis=1, keepdims=True)
     return (total / np.where(length > 0, length, 1)).astype(np.float32)
+
+
+def cross(a: Float[np.ndarray, "n 3"], b: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    """Cross products of the rows, several times faster than NumPy's for long arrays."""
+    x, y, z = a.T
+    u, v, w = b.T
+    return np.stack([y * w - z * v, z * u - x * w, x * v - y * u], -1)

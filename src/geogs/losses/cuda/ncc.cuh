@@ -39,14 +39,14 @@ extern "C" __global__ void __launch_bounds__(128) correlate_3(
   compare_windows<Correlation<1>>(batch, targets, maps, settings, warped, pull, gradient, loss,
                                    height, width, partners, rows, flags);
 }
-extern "C" __global__ void __launch_bounds__(128) correlate_5(
+extern "C" __global__ void __launch_bounds__(128, 6) correlate_5(
     const int* batch, const int* targets, const long long* maps, const float* settings,
     const float* warped, float* pull, float* gradient, float* loss, int height, int width,
     int partners, int rows, int flags) {
   compare_windows<Correlation<2>>(batch, targets, maps, settings, warped, pull, gradient, loss,
                                    height, width, partners, rows, flags);
 }
-extern "C" __global__ void __launch_bounds__(128) correlate_7(
+extern "C" __global__ void __launch_bounds__(128, 5) correlate_7(
     const int* batch, const int* targets, const long long* maps, const float* settings,
     const float* warped, float* pull, float* gradient, float* loss, int height, int width,
     int partners, int rows, int flags) {

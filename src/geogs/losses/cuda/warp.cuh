@@ -124,7 +124,7 @@ extern "C" __global__ void __launch_bounds__(128) begin_window(
 // depth (B, h, w), 0 unknown -> per pair (H, W): the packed warped image and ``slope``, its
 // derivative in the enlarged depth. Adds L_1 to the loss (B). With ``last`` no other term follows:
 // ``slope`` becomes d loss / d enlarged depth, and ``push`` (unless null) d loss / d warped.
-extern "C" __global__ void __launch_bounds__(256) warp_pairs(
+extern "C" __global__ void __launch_bounds__(256, 4) warp_pairs(
     const int* batch, const int* targets, const float* motions, const long long* maps,
     const int* rendered, const float* settings, const float* depth, float* warped, float* slope,
     float* push, float* loss, int height, int width, int big_height, int big_width, int partners,
@@ -141,6 +141,7 @@ extern "C" __global__ void __launch_bounds__(256) warp_pairs(
   const Source column = source_pixels(x, width, (float)width / big_width);
   const float ratio = (float)height / big_height, rx = ((float)x - c.cx) / c.fx;
   float total = 0.f;
+#pragma unroll 1
   for (int y = blockIdx.y * WARP_ROWS + threadIdx.y; y < end && x < big_width; y += 8) {
     const float d = enlarged_depth(depth, width, source_pixels(y, height, ratio), column);
     const Landing p = land(motion, rx, ((float)y - c.cy) / c.fy, d, big_height, big_width, c);

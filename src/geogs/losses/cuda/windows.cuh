@@ -71,7 +71,9 @@ __device__ __forceinline__ void compare_windows(
   __shared__ u32 seen[2][STRIP / 32 + 1];
   const int pair = blockIdx.z, b = pair / partners;
   if (targets[pair] < 0) return;
-  const PhotoSettings c = *(const PhotoSettings*)settings;
+  // In shared memory, because registers are short here.
+  __shared__ PhotoSettings c;
+  if (threadIdx.x == 0) c = *(const PhotoSettings*)settings;
   const size_t plane = (size_t)height * width;
   const PairImages source = {view_map(maps, batch[b], GREY), warped + pair * plane, height, width};
   const int t = threadIdx.x, x = blockIdx.x * (STRIP - 4 * HALF) - 2 * HALF + t;

@@ -55,7 +55,7 @@ extern "C" __global__ void __launch_bounds__(256) list_disks(
   float mx = 0.f, my = 0.f, wc = 0.f;
   if (i < disk_count(count, capacity)) {
     q = outlines[2 * at + 1];
-    if (q.z != 0.f) {
+    if (has_box(q)) {
       p = outlines[2 * at];
       const float4 r = records[4 * at];
       mx = r.x;
@@ -66,7 +66,7 @@ extern "C" __global__ void __launch_bounds__(256) list_disks(
   const int columns = (width + TILE - 1) / TILE, rows = (height + TILE - 1) / TILE;
   int* own = cursor + (size_t)b * columns * rows;
   const u64 key = ((u64)~__float_as_uint(wc) << 32) | (u32)i;
-  visit_tiles(q.z != 0.f, p, q, mx, my, key, [&](int x, int y, u64 k) {
+  visit_tiles(has_box(q), p, q, mx, my, key, [&](int x, int y, u64 k) {
     const int slot = atomicAdd(own + y * columns + x, 1);
     if (slot < room) keys[slot] = k;
   });

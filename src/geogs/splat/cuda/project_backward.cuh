@@ -75,7 +75,7 @@ extern "C" __global__ void __launch_bounds__(256) project_backward(
     const double* T = pose_of(poses, batch, b);
     const size_t at = (size_t)b * capacity + i;
     float m[SUMS] = {};
-    if (T && exists && outlines[2 * at + 1].z != 0.f) {
+    if (T && exists && has_box(outlines[2 * at + 1])) {
       if (!is_loaded) {
         p = vec(position[3 * i], position[3 * i + 1], position[3 * i + 2]);
         q = unit_quaternion(quaternion + 4 * i);

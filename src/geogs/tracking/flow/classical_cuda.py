@@ -56,9 +56,11 @@ class SearchOptions:
     """Pyramid levels searched where the start is right to a few pixels."""
     iterations: int = 6
     """Gauss-Newton steps of a patch."""
-    refinements: int = 3
-    """Linearisations of the variational refinement at each level."""
-    sweeps: int = 5
+    refinements: int = 5
+    """Linearisations of the variational refinement at the finest level."""
+    coarse_refinements: int = 5
+    """The same at the other levels."""
+    sweeps: int = 10
     """Relaxation sweeps of each."""
     smoothness: float = 40.0
     """Weight alpha of the smoothness term."""
@@ -233,7 +235,7 @@ class CudaClassicalFlow:
                 (-(-width // 32), -(-height // 8), directed), (32, 8), table, warped, patches,
                 flow, stride, w, h, level,
             )  # fmt: skip
-            for _ in range(options.refinements):
+            for _ in range(options.refinements if level == finest else options.coarse_refinements):
                 self._refine(table, warped, flow, other, level)
                 flow, other = other, flow
         assert flow is not None
