@@ -1,0 +1,1 @@
+"""Keyframe depths on a GPU."""

@@ -1,0 +1,156 @@
+"""Keyframe depths on the GPU that holds the map."""
+
+from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float32
+from torch import Tensor
+
+from geogs.config import DepthConfig
+from geogs.geometry.camera import Camera
+from geogs.mapping.completion import complete_grid, edge_weights
+from geogs.mapping.cuda.check import check, vote
+from geogs.mapping.cuda.images import KeyframeImages, homographies, upload
+from geogs.mapping.cuda.refine import PixelPlaces, TrackerMaps, choose_start, judge, refine
+from geogs.mapping.cuda.sweep import MAX_NEIGHBOURS, MAX_PLANES, PlaneSlots, sweep
+from geogs.mapping.depth_engine import Progress, silent
+from geogs.mapping.depth_evidence import prior_weight, relative_precision
+from geogs.mapping.depth_view import DenseDepth, DepthView, PosedDepth
+from geogs.mapping.plane_sweep import sweep_planes
+from geogs.mapping.sweep_neighbors import depth_range
+from geogs.threads import worker_count
+
+
+@dataclass(frozen=True, eq=False)
+class SearchPlan:
+    """What the CPU works out before a keyframe's depth is searched."""
+
+    grids: Float32[np.ndarray, "3 gh gw"]
+    """The tracker's completed inverse depth, its prior weight and its relative precision."""
+    near: float
+    far: float
+    planes: Float32[np.ndarray, "p"]
+    """Inverse depths to sweep; none without neighbours."""
+
+
+class CudaDepthEngine:
+    """The kernels of this package, keyframe by keyframe; small parts run in threads on the CPU.
+
+    The host waits for the GPU only at the end of ``estimate`` and ``check``, for median depths.
+    Images of observed keyframes stay on the GPU.
+    """
+
+    def __init__(
+        self, device: torch.device, render: Camera, working: Camera, config: DepthConfig
+    ) -> None:
+        self.device = device
+        self.render = render
+        self.working = working
+        self.config = config
+        self._places = PixelPlaces.of(render, working, device)
+        self._images: dict[int, KeyframeImages] = {}
+        self._edges: dict[int, Future[Float32[np.ndarray, "gh gw"]]] = {}
+        self._threads = ThreadPoolExecutor(worker_count())
+
+    def observe(self, view: DepthView) -> None:
+        """As in the protocol: its images go to the GPU."""
+        self._images[view.id] = KeyframeImages.prepare(view, self.device)
+        shape = view.inverse_depth.shape
+        self._edges[view.id] = self._threads.submit(edge_weights, view.image, shape, self.config)
+
+    def estimate(
+        self,
+        references: Sequence[DepthView],
+        neighbours: Sequence[Sequence[DepthView]],
+        progress: Progress = silent,
+    ) -> list[DenseDepth]:
+        """As in the protocol; at most 16 neighbours and 256 planes are used."""
+        usable = [list(n[:MAX_NEIGHBOURS]) for n in neighbours]
+        for view in (*references, *(v for group in usable for v in group)):
+            if view.id not in self._images:
+                self.observe(view)
+        plans = list(self._threads.map(self._plan, references, usable))
+        maps = []
+        for reference, others, plan in zip(references, usable, plans, strict=True):
+            maps.append(self._search(reference, others, plan))
+            progress(len(maps) / len(references))
+        return _with_medians(maps)
+
+    def check(
+        self, depths: Sequence[PosedDepth], others: Sequence[Sequence[PosedDepth]]
+    ) -> list[DenseDepth]:
+        """As in the protocol."""
+        checked = []
+        for own, rest in zip(depths, others, strict=True):
+            depth, confidence = own.depth.depth, own.depth.confidence
+            if rest:
+                poses = [o.T_cw for o in rest]
+                depth, confidence = check(
+                    depth, confidence, own.T_cw, *_stack(rest), poses, self.render, self.config
+                )
+            checked.append((depth, confidence))
+        return _with_medians(checked)
+
+    def keep(self, points: Float[Tensor, "n 3"], depths: Sequence[PosedDepth]) -> Bool[Tensor, "n"]:
+        """As in the protocol."""
+        points = points.detach().float().contiguous()
+        if not depths:
+            return torch.isfinite(points).all(1)
+        poses = [d.T_cw for d in depths]
+        return vote(points, poses, *_stack(depths), self.render, self.config)
+
+    def _plan(self, reference: DepthView, neighbours: list[DepthView]) -> SearchPlan:
+        smooth = self._edges[reference.id].result()
+        completed = complete_grid(
+            reference.inverse_depth, reference.information, smooth, self.config
+        )
+        weight = prior_weight(completed, self.config)
+        precision = relative_precision(completed, self.config)
+        grids = np.stack([completed.inverse_depth, weight, precision]).astype(np.float32)
+        if not neighbours:
+            return SearchPlan(grids, 0.0, 0.0, np.empty(0, np.float32))
+        near, far = depth_range(reference, neighbours, self.working, self.config)
+        planes = sweep_planes(reference, neighbours, self.render, near, far, self.config)
+        if len(planes) > MAX_PLANES:
+            planes = np.linspace(planes[0], planes[-1], MAX_PLANES, dtype=np.float32)
+        return SearchPlan(grids, near, far, planes)
+
+    def _search(
+        self, reference: DepthView, neighbours: list[DepthView], plan: SearchPlan
+    ) -> tuple[Tensor, Tensor]:
+        """Depth and confidence of one keyframe."""
+        config, device, own = self.config, self.device, self._images[reference.id]
+        tracker = TrackerMaps.of(upload(plan.grids, device), self._places)
+        if not neighbours:
+            return 1.0 / tracker.inverse_depth, 0.5 * tracker.prior_weight
+        others = [self._images[v.id] for v in neighbours]
+        across = homographies(reference, neighbours, self.render, self.render)
+        finely = homographies(reference, neighbours, self.render, self.working)
+        swept = sweep(
+            own, torch.stack([o.grey for o in others]), upload(across, device),
+            PlaneSlots.of(plan.planes, device), tracker.inverse_depth, tracker.prior_weight, config,
+        )  # fmt: skip
+        refined = refine(
+            own, torch.stack([o.fine for o in others]), upload(finely, device), self._places,
+            *choose_start(tracker, swept), tracker, config,
+        )  # fmt: skip
+        return judge(refined, swept.margin, tracker, plan.near, plan.far)
+
+
+def _stack(depths: Sequence[PosedDepth]) -> tuple[Tensor, Tensor]:
+    """Depths and confidences of several keyframes."""
+    return (
+        torch.stack([d.depth.depth for d in depths]),
+        torch.stack([d.depth.confidence for d in depths]),
+    )
+
+
+def _with_medians(maps: Sequence[tuple[Tensor, Tensor]]) -> list[DenseDepth]:
+    """The depths with their medians, fetched at once."""
+    if not maps:
+        return []
+    medians = torch.stack([depth.flatten().median() for depth, _ in maps]).tolist()
+    return [DenseDepth(*m, typical) for m, typical in zip(maps, medians, strict=True)]
