@@ -78,7 +78,7 @@ def _off_zero(distance: Float[Tensor, "x y z"]) -> Float[Tensor, "x y z"]:
 
 
 def _seen_cells(seen: Bool[Tensor, "x y z"]) -> Bool[Tensor, "x y z"]:
-    """Cells whose eight corners were seen, at their upper corners, as scikit-image's mask has it."""
+    """Cells whose eight corners were seen, at their upper corners as in scikit-image's mask."""
     cell = seen
     for axis in range(3):
         length = cell.shape[axis]

@@ -1,8 +1,8 @@
 """Truncated signed distances of depth maps in sparse blocks of 8 x 8 x 8 voxels.
 
 Curless and Levoy 1996, in blocks allocated where surface was seen (voxel hashing, Niessner 2013).
-Blocks are found by binary search in their sorted keys, in plain batched torch on any device; on a GPU
-the voxels are updated by a kernel.
+Blocks are found by binary search in their sorted keys, in plain batched torch on any device; on a
+GPU the voxels are updated by a kernel.
 """
 
 import math
