@@ -49,11 +49,12 @@ class DeviceKernel:
         self.name = signature.name
         self._function = function
         self._index = index
-        self._types = signature.parameters
-        count = len(self._types)
-        self._slots = (ctypes.c_uint64 * count)()
-        start = ctypes.addressof(self._slots)
-        self._pointers = (ctypes.c_void_p * count)(*(start + 8 * i for i in range(count)))
+        # Every argument has eight bytes of a buffer, which the driver reads through pointers.
+        self._packer = struct.Struct("<" + "".join(_format(p) for p in signature.parameters))
+        self._buffer = ctypes.create_string_buffer(self._packer.size)
+        start = ctypes.addressof(self._buffer)
+        places = range(start, start + self._packer.size, 8)
+        self._pointers = (ctypes.c_void_p * len(places))(*places)
         self._dynamic = _MAX_STATIC_SHARED
         launch = _driver()[1].cuLaunchKernel
         launch.argtypes = [ctypes.c_void_p, *[ctypes.c_uint] * 7, *[ctypes.c_void_p] * 3]
@@ -70,35 +71,20 @@ class DeviceKernel:
         gx, gy, gz = _three(grid)
         if gx == 0 or gy == 0 or gz == 0:
             return
-        if len(arguments) != len(self._types):
-            raise TypeError(f"{self.name} takes {len(self._types)} arguments, not {len(arguments)}")
-        slots = self._slots
-        for i, value in enumerate(arguments):
-            if isinstance(value, torch.Tensor):
-                slots[i] = value.data_ptr()
-            elif value is None:
-                slots[i] = 0
-            elif self._types[i] == "float":
-                slots[i] = struct.unpack("I", struct.pack("f", value))[0]
-            elif self._types[i] == "double":
-                slots[i] = struct.unpack("Q", struct.pack("d", value))[0]
-            else:
-                slots[i] = int(value) & 0xFFFFFFFFFFFFFFFF
         if shared > self._dynamic:
             self._allow_shared(shared)
-        if torch.cuda.current_device() != self._index:
-            with torch.cuda.device(self._index):
-                code = self._start(gx, gy, gz, block, shared)
+        index = self._index
+        values = [a.data_ptr() if isinstance(a, torch.Tensor) else a or 0 for a in arguments]
+        self._packer.pack_into(self._buffer, 0, *values)
+        stream = torch.cuda.current_stream(index).cuda_stream
+        sizes = (gx, gy, gz, *_three(block), shared)
+        if torch.cuda.current_device() == index:
+            code = self._launch(self._function, *sizes, stream, self._pointers, None)
         else:
-            code = self._start(gx, gy, gz, block, shared)
+            with torch.cuda.device(index):
+                code = self._launch(self._function, *sizes, stream, self._pointers, None)
         if code:
             raise DeviceError(f"The kernel {self.name} could not start ({driver_error(code)}).")
-
-    def _start(self, gx: int, gy: int, gz: int, block: Dimensions, shared: int) -> int:
-        stream = torch.cuda.current_stream(self._index).cuda_stream
-        return self._launch(
-            self._function, gx, gy, gz, *_three(block), shared, stream, self._pointers, None
-        )
 
     def _allow_shared(self, size: int) -> None:
         code = _driver()[0].cuFuncSetAttribute(self._function, _MAX_DYNAMIC_SHARED, size)
@@ -108,6 +94,15 @@ class DeviceKernel:
                 f"has ({driver_error(code)})."
             )
         self._dynamic = size
+
+
+def _format(parameter: str) -> str:
+    """How ``struct`` packs a parameter into eight bytes."""
+    if parameter.endswith("*"):
+        return "Q"
+    return {"int": "i4x", "unsigned": "I4x", "float": "f4x", "double": "d", "long long": "q"}[
+        parameter
+    ]
 
 
 def load_kernels(

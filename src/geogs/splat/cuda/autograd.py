@@ -1,74 +1,82 @@
 """The GPU renderer as a differentiable function."""
 
+import functools
+
 import torch
 from torch import Tensor
 
-from geogs.splat.cuda.rasterize import MapGradients, Trace, rasterize_backward, rasterize_forward
+from geogs.splat.cuda.pool import RasterizerPool
+from geogs.splat.cuda.rasterize import MapGradients, Maps, Views
 from geogs.splat.map import DiskParameters
+
+
+@functools.cache
+def _pool() -> RasterizerPool:
+    """The process's rasterizers."""
+    return RasterizerPool()
 
 
 class RasterizeOnGpu(torch.autograd.Function):
     """Maps of one pose (4, 4), or of several (b, 4, 4) with a leading dimension.
 
-    Depth, normal, alpha, distortion, median depth, visibility.
+    Depth, normal, alpha, distortion, median depth, visibility. The number of list entries is read
+    back once, which waits for the projection but not for the compositing.
     """
 
     @staticmethod
     def forward(ctx, position, quaternion, log_scale, opacity_logit, T_cw, camera, near):  # type: ignore[no-untyped-def]
-        disks = DiskParameters(position, quaternion, log_scale, opacity_logit)
-        plain = DiskParameters(*(p.detach().contiguous() for p in disks))
-        poses = _poses(T_cw, position.device)
+        device, n = position.device, len(position)
+        given = (position, quaternion, log_scale, opacity_logit)
+        disks = DiskParameters(*(p.contiguous() for p in given))
+        poses = T_cw.to(device, torch.float64).contiguous().view(-1, 4, 4)
+        views = Views(poses)
+        loan = _pool().lend(n, len(poses), camera, near, device)
+        rasterizer, maps = loan.rasterizer, Maps.empty(camera, T_cw.shape[:-2], n, device)
         with_trace = any(ctx.needs_input_grad)
-        maps, trace = rasterize_forward(plain, camera, poses, near, with_trace)
-        outputs = [maps.depth, maps.normal.permute(0, 2, 3, 1), maps.alpha, maps.distortion]
-        outputs.append(maps.median_depth)
-        if T_cw.dim() == 2:
-            outputs = [o.squeeze(0) for o in outputs]
+        rasterizer.project(disks, views)
+        rasterizer.reserve(rasterizer.entries())
+        rasterizer.blend(views, maps, with_trace)
         if with_trace:
             # Saved, so that PyTorch notices if they are changed before the backward pass.
-            ctx.save_for_backward(*disks, T_cw)
-            ctx.trace = trace
+            ctx.save_for_backward(*given, T_cw)
+            ctx.disks, ctx.views, ctx.loan = disks, views, loan
             ctx.set_materialize_grads(False)
-        ctx.mark_non_differentiable(outputs[4], maps.visible)
-        return *outputs, maps.visible
+        ctx.mark_non_differentiable(maps.median_depth, maps.visible)
+        normal = maps.normal.movedim(-3, -1)
+        return maps.depth, normal, maps.alpha, maps.distortion, maps.median_depth, maps.visible
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, *gradients):  # type: ignore[no-untyped-def]
         *_, T_cw = ctx.saved_tensors
-        trace: Trace = ctx.trace
-        maps = _map_gradients(gradients[:4], trace.rasterizer.maps.depth.shape)
-        result = rasterize_backward(trace, maps, ctx.needs_input_grad[4])
+        rasterizer, disks = ctx.loan.rasterizer, ctx.disks
+        d_disks = DiskParameters(*(torch.empty_like(p) for p in disks))
         d_T = None
-        if result.poses is not None:
-            d_T = torch.zeros(len(result.poses), 4, 4, dtype=T_cw.dtype, device=T_cw.device)
-            d_T[:, :3] = result.poses
-            d_T = d_T.reshape(T_cw.shape)
-        return *result.parameters, d_T, None, None
+        if ctx.needs_input_grad[4]:
+            d_T = torch.empty_like(ctx.views.poses)
+        shape = (rasterizer.camera.height, rasterizer.camera.width)
+        maps = _map_gradients(gradients[:4], (*T_cw.shape[:-2], *shape))
+        rasterizer.backward(disks, ctx.views, maps, d_disks, d_T)
+        if d_T is not None:
+            d_T = d_T.view(T_cw.shape).to(T_cw)
+        return *d_disks, d_T, None, None
 
 
-def _poses(T_cw: Tensor, device: torch.device) -> Tensor:
-    """(b, 3, 4) float64 on the device."""
-    upper = T_cw.detach()[..., :3, :].to(device, torch.float64)
-    return upper.reshape(-1, 3, 4).contiguous()
-
-
-def _map_gradients(gradients: tuple[Tensor | None, ...], shape: torch.Size) -> MapGradients:
-    """Contiguous float32 gradients of (b, h, w) maps; zeros for those that are missing."""
+def _map_gradients(gradients: tuple[Tensor | None, ...], shape: tuple[int, ...]) -> MapGradients:
+    """Contiguous float32 gradients; zeros for those that are missing."""
     known = next(g for g in gradients if g is not None)
-    zeros = None
-    if any(g is None for g in gradients):
-        zeros = known.new_zeros((3, *shape), dtype=torch.float32)
-    depth, alpha, distortion = (
-        zeros[0] if g is None else g.to(torch.float32).reshape(shape).contiguous()  # type: ignore[index]
-        for g in (gradients[0], gradients[2], gradients[3])
-    )
-    normal = zeros if gradients[1] is None else gradients[1].to(torch.float32)
-    assert normal is not None
-    if gradients[1] is None:
-        normal = normal.view(shape[0], 3, *shape[1:])
+    depth, normal, alpha, distortion = gradients
+    if normal is None:
+        normal, planar = known.new_zeros((3, *shape), dtype=torch.float32), True
     else:
-        normal = normal.reshape(*shape, 3)
-        planar = normal.permute(0, 3, 1, 2)
-        normal = planar if planar.is_contiguous() else normal.contiguous()
-    return MapGradients(depth, normal, alpha, distortion)
+        normal = normal.to(torch.float32)
+        planar = normal.movedim(-1, -3).is_contiguous()
+        normal = normal.movedim(-1, -3) if planar else normal.contiguous()
+    plain = (
+        known.new_zeros(shape, dtype=torch.float32)
+        if g is None
+        else g.to(torch.float32).contiguous()
+        for g in (depth, alpha, distortion)
+    )
+    d_depth, d_alpha, d_distortion = plain
+    return MapGradients(d_depth, normal, d_alpha, d_distortion, planar)

@@ -88,8 +88,9 @@ __device__ __forceinline__ int disk_count(const int* count, int capacity) {
   return count ? min(*count, capacity) : capacity;
 }
 
-// The pose of view b, or none where its slot is negative.
-__device__ __forceinline__ const double* pose_of(const double* poses, const int* batch, int b) {
+// The pose of view b, or none where its slot is negative; ``size`` numbers (12 or 16) are a pose.
+__device__ __forceinline__ const double* pose_of(const double* poses, int size, const int* batch,
+                                                 int b) {
   const int slot = batch ? batch[b] : b;
-  return slot < 0 ? nullptr : poses + 12 * (size_t)slot;
+  return slot < 0 ? nullptr : poses + size * (size_t)slot;
 }

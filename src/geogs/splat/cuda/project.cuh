@@ -114,11 +114,11 @@ __device__ __forceinline__ void visit_tiles(bool active, float4 p, float4 q, flo
 // and counts the disks of every tile in ``counts`` (views, tile rows, tile columns), zero on entry.
 extern "C" __global__ void __launch_bounds__(256) project_disks(
     int capacity, const int* count, const float* position, const float* quaternion,
-    const float* log_scale, const float* opacity_logit, const double* poses, const int* batch,
-    double fx, double fy, double cx, double cy, double near, int width, int height,
-    float4* records, float4* outlines, int* counts) {
+    const float* log_scale, const float* opacity_logit, const double* poses, int pose_size,
+    const int* batch, double fx, double fy, double cx, double cy, double near, int width,
+    int height, float4* records, float4* outlines, int* counts) {
   const int i = blockIdx.x * blockDim.x + threadIdx.x, b = blockIdx.y;
-  const double* T = pose_of(poses, batch, b);
+  const double* T = pose_of(poses, pose_size, batch, b);
   float4 p = make_float4(0.f, 0.f, 0.f, 0.f), q = p;
   float mx = 0.f, my = 0.f;
   if (T && i < disk_count(count, capacity)) {

@@ -55,12 +55,13 @@ __device__ __forceinline__ void outer(const Vec a, const Vec b, float* m) {
 
 #define POSE_COPIES 32
 
-// Grid: disks / 256. Sums the views of each disk; writes every disk below ``capacity``. ``d_poses``
-// (POSE_COPIES, views, 16), unless null, is added to: many copies, so that blocks seldom meet.
+// Grid: disks / 256. Sums the views of each disk and writes every disk below ``capacity``, unless
+// ``d_position`` is null; clears ``sums``. ``d_poses`` (POSE_COPIES, views, 12), unless null, is
+// added to: many copies, so that blocks seldom meet.
 extern "C" __global__ void __launch_bounds__(256) project_backward(
     int capacity, const int* count, int views, const float* position, const float* quaternion,
-    const float* log_scale, const float* opacity_logit, const double* poses, const int* batch,
-    double fx, double fy, const float4* outlines, const float* sums, float* d_position,
+    const float* log_scale, const float* opacity_logit, const double* poses, int pose_size,
+    const int* batch, double fx, double fy, const float4* outlines, float4* sums, float* d_position,
     float* d_quaternion, float* d_log_scale, float* d_opacity_logit, double* d_poses) {
   __shared__ double shared[8][12];
   const int i = blockIdx.x * blockDim.x + threadIdx.x, lane = threadIdx.x & 31;
@@ -72,7 +73,7 @@ extern "C" __global__ void __launch_bounds__(256) project_backward(
   double ku = 0, kv = 0, su = 0, sv = 0, g_o = 0;
   bool is_loaded = false;
   for (int b = 0; b < views; b++) {
-    const double* T = pose_of(poses, batch, b);
+    const double* T = pose_of(poses, pose_size, batch, b);
     const size_t at = (size_t)b * capacity + i;
     float m[SUMS] = {};
     if (T && exists && has_box(outlines[2 * at + 1])) {
@@ -84,7 +85,13 @@ extern "C" __global__ void __launch_bounds__(256) project_backward(
         kv = SQRT_HALF * exp(-(double)log_scale[2 * i + 1]);
         is_loaded = true;
       }
-      const float* g = sums + SUMS * at;
+      float g[SUMS];
+      #pragma unroll
+      for (int k = 0; k < SUMS / 4; k++) {
+        const float4 four = sums[SUMS / 4 * at + k];
+        g[4 * k] = four.x; g[4 * k + 1] = four.y; g[4 * k + 2] = four.z; g[4 * k + 3] = four.w;
+        sums[SUMS / 4 * at + k] = make_float4(0.f, 0.f, 0.f, 0.f);
+      }
       const Vec c = place(position + 3 * i, T);
       const Axes w = rotate_axes(T, axes);
       const FrameGradient d = record_backward(g, w, c, ku, kv, fx, fy);
@@ -116,7 +123,7 @@ extern "C" __global__ void __launch_bounds__(256) project_backward(
         double total = 0;
         for (int k = 0; k < 8; k++) total += shared[k][threadIdx.x];
         const int copy = blockIdx.x % POSE_COPIES;
-        if (total != 0) atomicAdd(d_poses + 16 * ((size_t)copy * views + b) + threadIdx.x, total);
+        if (total != 0) atomicAdd(d_poses + 12 * ((size_t)copy * views + b) + threadIdx.x, total);
       }
       __syncthreads();
     }
@@ -130,4 +137,17 @@ extern "C" __global__ void __launch_bounds__(256) project_backward(
   d_log_scale[2 * i + 1] = (float)sv;
   const double o = exists ? sigmoid(opacity_logit[i]) : 0;
   d_opacity_logit[i] = is_loaded ? (float)(g_o * o * (1 - o)) : 0.f;
+}
+
+// One block per view. Sums and clears the copies; writes the (4, 4) gradient of each pose.
+extern "C" __global__ void sum_poses(int views, double* copies, double* d_poses) {
+  const int k = threadIdx.x, b = blockIdx.x;
+  double total = 0;
+  if (k < 12)
+    for (int copy = 0; copy < POSE_COPIES; copy++) {
+      double* own = copies + 12 * ((size_t)copy * views + b) + k;
+      total += *own;
+      *own = 0;
+    }
+  if (k < 16) d_poses[16 * b + k] = total;
 }
