@@ -14,6 +14,9 @@ if TYPE_CHECKING:
 _LOG_SECONDS = 2.0
 """Where no terminal redraws the bars, a line of text comes this often."""
 
+_REDRAWS = 4
+"""A second; drawing the bars holds the interpreter's lock for milliseconds."""
+
 
 def peak_memory() -> int:
     """Largest resident size of this process so far, bytes."""
@@ -35,6 +38,7 @@ class RunProgress:
             TextColumn("{task.fields[info]}"),
             TimeRemainingColumn(compact=True),
             console=self._console,
+            refresh_per_second=_REDRAWS,
         )
         self._frames = frames
         self._start = self._printed = time.perf_counter()

@@ -73,7 +73,7 @@ def write_results(
 def keyframe_trajectory(slam: Slam) -> Trajectory:
     """Poses of the keyframes alone."""
     keyframes = [slam.tracker.keyframe(i) for i in slam.tracker.keyframe_ids]
-    T_wc = np.array([torch.linalg.inv(k.T_cw).numpy() for k in keyframes]).reshape(-1, 4, 4)
+    T_wc = np.array([torch.linalg.inv(k.T_cw.cpu()).numpy() for k in keyframes]).reshape(-1, 4, 4)
     times = np.array([k.timestamp for k in keyframes], dtype=np.float64)
     return Trajectory(times, T_wc, np.ones(len(keyframes), dtype=bool))
 
@@ -129,6 +129,7 @@ def summarise(
             "with_final_stages": round(slam.frames / max(total, 1e-9), 3),
         },
         "peak_memory_bytes": peak_memory(),
+        **device_summary(disks.position.device),
         "interrupted": interrupted,
         "intrinsics": source.intrinsics_origin,
         "scale": "arbitrary (monocular)",
@@ -139,6 +140,14 @@ def summarise(
             "python": platform.python_version(),
         },
     }
+
+
+def device_summary(device: torch.device) -> dict[str, object]:
+    """What the map was trained on, and a GPU's memory at its fullest (PyTorch's tensors)."""
+    if device.type != "cuda":
+        return {"device": "cpu"}
+    name = torch.cuda.get_device_name(device)
+    return {"device": name, "peak_gpu_memory_bytes": torch.cuda.max_memory_allocated(device)}
 
 
 def lost_spans(trajectory: Trajectory) -> list[list[float]]:
@@ -161,8 +170,8 @@ def write_report(
         plots.plot_keyframes(
             folder / "keyframes.png",
             [r.image for r in shown],
-            [r.depth.numpy() for r in shown],
-            [r.normal.numpy() for r in shown],
+            [r.depth.cpu().numpy() for r in shown],
+            [r.normal.cpu().numpy() for r in shown],
         )
     if mesh is not None:
         views = viewpoints(mesh.vertices, trajectory.T_wc[trajectory.tracked], renders[0].camera)

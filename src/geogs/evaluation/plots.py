@@ -1,6 +1,7 @@
 """Pictures of a result, drawn by matplotlib without a display and written as PNG."""
 
 from collections.abc import Sequence
+from functools import partial
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -8,9 +9,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from geogs.evaluation.shading import Viewpoint, level_axes, shade
+from geogs.evaluation.shading import Sight, Viewpoint, level_axes, look
 from geogs.evaluation.trajectory import TrajectoryErrors
 from geogs.io.writers.atomic import atomic_file
+from geogs.threads import thread_map
 from geogs.types import Trajectory
 
 if TYPE_CHECKING:
@@ -136,10 +138,13 @@ def plot_meshes(
     camera = views[0].camera
     figure = _figure(4.2 * len(views), 0.5 + 4.2 * camera.height / camera.width * len(rows))
     plots = []
+    sights: list[Sight] = []
     for row, (name, vertices, faces, colours) in enumerate(rows):
+        if row == 0 or vertices is not rows[row - 1][1] or faces is not rows[row - 1][2]:
+            sights = thread_map(partial(look, vertices, faces), views)
         for column, view in enumerate(views):
             plot = figure.add_subplot(len(rows), len(views), row * len(views) + column + 1)
-            plot.imshow(shade(vertices, faces, view, colours))
+            plot.imshow(sights[column].paint(colours))
             plot.set(xticks=[], yticks=[])
             if row == 0:
                 plot.set_title(view.name)
@@ -201,6 +206,6 @@ def _finish_map(plot: "Axes", name: str, unit: str) -> None:
 
 def _save(figure: "Figure", path: Path) -> None:
     buffer = BytesIO()
-    figure.savefig(buffer, format="png", dpi=110)
+    figure.savefig(buffer, format="png", dpi=110, pil_kwargs={"compress_level": 3})
     with atomic_file(path) as stream:
         stream.write(buffer.getvalue())

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 
 from geogs.evaluation.raster import render_mesh
 from geogs.geometry.camera import Camera
@@ -25,16 +25,33 @@ class Viewpoint:
     up: Float[np.ndarray, "3"] | None = None
 
 
-def shade(
-    vertices: Float[np.ndarray, "n 3"],
-    faces: Int[np.ndarray, "m 3"],
-    view: Viewpoint,
-    colours: UInt8[np.ndarray, "n 3"] | None = None,
-) -> UInt8[np.ndarray, "h w 3"]:
-    """A picture (RGB) with a lamp at the camera: brightness is the cosine to the face's normal.
+@dataclass(frozen=True)
+class Sight:
+    """What the rays of a view meet: 2 x 2 rays a pixel."""
 
-    Faces are flat, grey or in the mean colour of their vertices; 2 x 2 rays a pixel. Both sides
-    of a face are seen, as meshes of truth often have no orientation.
+    hit: Bool[np.ndarray, "fine_h fine_w"]
+    corners: Int[np.ndarray, "k 3"]
+    """Vertices of the face that each of the hitting rays meets."""
+    light: Float[np.ndarray, "k 1"]
+    """Brightness there, in [0, 1]."""
+
+    def paint(self, colours: UInt8[np.ndarray, "n 3"] | None = None) -> UInt8[np.ndarray, "h w 3"]:
+        """The picture (RGB): faces flat, grey or in the mean colour of their vertices."""
+        picture = np.full((*self.hit.shape, 3), _BACKGROUND)
+        colour = np.full((1, 3), _GREY)
+        if colours is not None:
+            colour = colours[self.corners].astype(np.float64).mean(1)
+        picture[self.hit] = self.light * colour
+        height, width = self.hit.shape[0] // 2, self.hit.shape[1] // 2
+        return picture.reshape(height, 2, width, 2, 3).mean((1, 3)).round().astype(np.uint8)
+
+
+def look(
+    vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "m 3"], view: Viewpoint
+) -> Sight:
+    """A mesh with a lamp at the camera: brightness is the cosine to the face's normal.
+
+    Both sides of a face are seen, as meshes of truth often have no orientation.
     """
     vertices = vertices.astype(np.float64)
     if view.ceiling is not None and view.up is not None and len(faces):
@@ -42,22 +59,29 @@ def shade(
         faces = faces[height < view.ceiling]
     camera = view.camera
     fine = camera.resized(2 * camera.width, 2 * camera.height)
-    picture = np.full((fine.height, fine.width, 3), _BACKGROUND)
-    if len(faces):
-        _, face = render_mesh(vertices, faces, fine, view.T_cw)
-        hit = face >= 0
-        a, b, c = (vertices[faces[face[hit], i]] for i in range(3))
-        normal = np.cross(b - a, c - a) @ view.T_cw[:3, :3].T
-        normal /= np.linalg.norm(normal, axis=1, keepdims=True) + 1e-300
-        ray = fine.rays().numpy()[hit].astype(np.float64)
-        ray /= np.linalg.norm(ray, axis=1, keepdims=True)
-        light = _AMBIENT + (1 - _AMBIENT) * np.abs((normal * ray).sum(1, keepdims=True))
-        paint = np.full((1, 3), _GREY)
-        if colours is not None:
-            paint = colours[faces[face[hit]]].astype(np.float64).mean(1)
-        picture[hit] = light * paint
-    height, width = camera.height, camera.width
-    return picture.reshape(height, 2, width, 2, 3).mean((1, 3)).round().astype(np.uint8)
+    if not len(faces):
+        hit = np.zeros((fine.height, fine.width), bool)
+        return Sight(hit, np.zeros((0, 3), np.int64), np.zeros((0, 1)))
+    _, face = render_mesh(vertices, faces, fine, view.T_cw)
+    hit = face >= 0
+    corners = faces[face[hit]]
+    a, b, c = (vertices[corners[:, i]] for i in range(3))
+    normal = np.cross(b - a, c - a) @ view.T_cw[:3, :3].T
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True) + 1e-300
+    ray = fine.rays().numpy()[hit].astype(np.float64)
+    ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+    light = _AMBIENT + (1 - _AMBIENT) * np.abs((normal * ray).sum(1, keepdims=True))
+    return Sight(hit, corners, light)
+
+
+def shade(
+    vertices: Float[np.ndarray, "n 3"],
+    faces: Int[np.ndarray, "m 3"],
+    view: Viewpoint,
+    colours: UInt8[np.ndarray, "n 3"] | None = None,
+) -> UInt8[np.ndarray, "h w 3"]:
+    """A picture (RGB) of a mesh in one go; see :func:`look`."""
+    return look(vertices, faces, view).paint(colours)
 
 
 def level_axes(T_wc: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "3 3"]:

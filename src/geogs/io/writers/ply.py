@@ -1,10 +1,10 @@
 """PLY files: the coloured mesh, and the disks as splats for 3D Gaussian splatting viewers."""
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
-from plyfile import PlyData, PlyElement
 
 from geogs.io.writers.atomic import atomic_file
 from geogs.types import MapSnapshot
@@ -12,7 +12,17 @@ from geogs.types import MapSnapshot
 SPLAT_THICKNESS = 0.01
 """Third standard deviation of an exported splat relative to its smaller one: flat, not zero."""
 
+_TYPES = {"<f4": "float", "|u1": "uchar"}
 _SH_DEGREE_0 = 0.28209479177387814  # 1 / (2 sqrt(pi)), the constant spherical harmonic
+
+
+@dataclass(frozen=True)
+class Element:
+    """A table of a PLY file: packed little-endian rows, and how the header describes a row."""
+
+    name: str
+    table: np.ndarray
+    properties: list[str]
 
 
 def write_mesh(
@@ -28,9 +38,15 @@ def write_mesh(
         columns |= {f"n{axis}": normals[:, i].astype("<f4") for i, axis in enumerate("xyz")}
     if colors is not None:
         columns |= {name: colors[:, i] for i, name in enumerate(("red", "green", "blue"))}
-    triangles = np.empty(len(faces), dtype=[("vertex_indices", "<i4", (3,))])
-    triangles["vertex_indices"] = faces
-    _write(path, [_element("vertex", columns), PlyElement.describe(triangles, "face")])
+    triangles = np.empty(len(faces), dtype=[("count", "u1"), ("corners", "<i4", (3,))])
+    triangles["count"], triangles["corners"] = 3, faces
+    _write(
+        path,
+        [
+            _element("vertex", columns),
+            Element("face", triangles, ["list uchar int vertex_indices"]),
+        ],
+    )
 
 
 def write_splats(path: str | Path, disks: MapSnapshot, colors: Float[np.ndarray, "n 3"]) -> None:
@@ -64,14 +80,21 @@ def _columns(values: Float[np.ndarray, "n k"], names: tuple[str, ...]) -> dict[s
     return {name: values[:, i].astype("<f4") for i, name in enumerate(names)}
 
 
-def _element(name: str, columns: dict[str, np.ndarray]) -> PlyElement:
+def _element(name: str, columns: dict[str, np.ndarray]) -> Element:
     dtype = [(column, values.dtype.str) for column, values in columns.items()]
     table = np.empty(len(next(iter(columns.values()))), dtype=dtype)
     for column, values in columns.items():
         table[column] = values
-    return PlyElement.describe(table, name)
+    return Element(name, table, [f"{_TYPES[dtype]} {column}" for column, dtype in dtype])
 
 
-def _write(path: str | Path, elements: list[PlyElement]) -> None:
+def _write(path: str | Path, elements: list[Element]) -> None:
+    """Header and tables in one go; a general library walks over the faces one by one."""
+    header = ["ply", "format binary_little_endian 1.0"]
+    for element in elements:
+        header.append(f"element {element.name} {len(element.table)}")
+        header += [f"property {text}" for text in element.properties]
     with atomic_file(path) as stream:
-        PlyData(elements, text=False, byte_order="<").write(stream)
+        stream.write("\n".join([*header, "end_header\n"]).encode())
+        for element in elements:
+            stream.write(element.table.tobytes())
