@@ -14,8 +14,9 @@ from geogs.geometry.camera import Camera
 from geogs.mapping import plane_sweep_kernels as sweep_loops
 from geogs.mapping import refinement as cpu_refinement
 from geogs.mapping.carve import vote
-from geogs.mapping.completion import complete_inverse_depth, upsample_grid
+from geogs.mapping.completion import complete_grid, complete_inverse_depth, upsample_grid
 from geogs.mapping.cuda import check as check_module
+from geogs.mapping.cuda import completion as completion_module
 from geogs.mapping.cuda import refine as refine_module
 from geogs.mapping.cuda import sweep as sweep_module
 from geogs.mapping.cuda.engine import CudaDepthEngine
@@ -24,7 +25,13 @@ from geogs.mapping.cuda.refine import PixelPlaces, SlantedMaps, TrackerMaps
 from geogs.mapping.cuda.sweep import PlaneSlots, SweptDepth
 from geogs.mapping.depth_confidence import depth_confidence
 from geogs.mapping.depth_engine import CpuDepthEngine
-from geogs.mapping.depth_evidence import choose_start, tracker_evidence, tracker_prior
+from geogs.mapping.depth_evidence import (
+    choose_start,
+    prior_weight,
+    relative_precision,
+    tracker_evidence,
+    tracker_prior,
+)
 from geogs.mapping.depth_view import DenseDepth, KeyframeDepth, PosedDepth
 from geogs.mapping.plane_sweep import SweepResult, matching_costs, plane_sweep
 
@@ -64,7 +71,7 @@ def setting(
 ) -> Setting:
     """A few pixels in the emulator; the real size on a GPU."""
     if request.param == "emulated":
-        use_emulator(monkeypatch, sweep_module, refine_module, check_module)
+        use_emulator(monkeypatch, completion_module, sweep_module, refine_module, check_module)
         config = DepthConfig(min_planes=24, max_planes=29, support_radius=2)
         size, device = (WORKING.resized(37, 30), 1.6), "cpu"
     elif torch.cuda.is_available():
@@ -205,6 +212,46 @@ def test_grids_are_upsampled_and_patches_gathered_as_opencv_does(setting):
     _close(refine_module.gather_patches(images.fine, places), patches.samples, rounding)
     guide = cpu_refinement._colour_guide(view, setting.render)
     _close(images.colours, guide, 1e-6)
+
+
+@pytest.mark.parametrize("shape", [(6, 11), (9, 5), (3, 4)])
+def test_completed_grids(setting, shape):
+    config = setting.config
+    shape = shape if setting.device.type == "cpu" else tuple(7 * n for n in shape)
+    v, u = np.mgrid[: shape[0], : shape[1]]
+    grids, typical, expected = [], [], []
+    for seed in range(2):
+        grid = (0.4 + 0.02 * u - 0.01 * v + 0.03 * _random(*shape, seed=seed)).astype(F)
+        information = F(2e3) * _random(*shape, seed=2 + seed) ** 2
+        grid[1, 2], grid[0, 1], information[-2:, -3:] = 1.9, np.nan, 0.0
+        smooth = np.exp(-2 * _random(*shape, seed=4 + seed))
+        known = np.isfinite(grid) & (information > 0)
+        done = complete_grid(grid, information, smooth, config)
+        assert not done.inlier[1, 2]
+        evidence = (
+            done.inverse_depth,
+            prior_weight(done, config),
+            relative_precision(done, config),
+        )
+        grids.append(np.stack([grid, information, smooth]))
+        typical.append(float(np.median(grid[known])))
+        expected.append(np.stack(evidence))
+    assert completion_module.can_complete(shape, setting.device)
+    out = completion_module.complete(_to(setting, np.stack(grids)), typical, config).cpu()
+    for got, want in zip(out, expected, strict=True):
+        assert np.abs(got[0] / want[0] - 1).max() < 1e-5
+        _close(got[1], want[1], 1e-5)
+        assert np.abs(got[2] / (want[2] + 1e-6) - 1).max() < 2e-3
+
+
+def test_grids_too_large_for_the_gpu_or_without_knowledge_are_completed_on_the_cpu(setting):
+    assert not completion_module.can_complete((120, 100), setting.device)
+    views = setting.scene.views[:3]
+    lost = [replace(v, information=0 * v.information) for v in views]
+    cpu, cuda = _engines(setting)
+    (expected,), (depth,) = (e.estimate(lost[:1], [lost[1:]]) for e in (cpu, cuda))
+    off = (depth.depth.cpu() / expected.depth - 1).abs()
+    assert float((off < 1e-3).float().mean()) > 0.95
 
 
 def test_start_is_the_surer_of_sweep_and_tracker(setting):

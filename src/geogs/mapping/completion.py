@@ -48,8 +48,7 @@ def complete_grid(
     config: DepthConfig,
 ) -> CompletedDepth:
     """``complete_inverse_depth`` with the weights of smoothness as ``edge_weights`` has them."""
-    known = np.isfinite(inverse_depth) & (inverse_depth > 1e-6)
-    known &= np.isfinite(information) & (information > 0)
+    known = known_cells(inverse_depth, information)
     if not known.any():
         one = np.ones_like(inverse_depth)
         return CompletedDepth(one, np.full_like(one, 1e3), np.zeros(one.shape, bool))
@@ -70,6 +69,14 @@ def complete_grid(
     fitted = np.clip(fitted, 0.12 * typical, 7.0 * typical)
     inlier = known & (weight > 0.3)
     return CompletedDepth(fitted.astype(np.float32), deviation.astype(np.float32), inlier)
+
+
+def known_cells(
+    inverse_depth: Float32[np.ndarray, "gh gw"], information: Float32[np.ndarray, "gh gw"]
+) -> Bool[np.ndarray, "gh gw"]:
+    """Cells of which the tracker knows something."""
+    known = np.isfinite(inverse_depth) & (inverse_depth > 1e-6)
+    return known & np.isfinite(information) & (information > 0)
 
 
 def edge_weights(

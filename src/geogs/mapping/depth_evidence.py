@@ -10,10 +10,10 @@ from geogs.geometry.camera import Camera
 from geogs.mapping.completion import CompletedDepth, upsample_grid
 from geogs.mapping.plane_sweep import SweepResult
 
-_UNKNOWN_DEVIATION = 10.0
-_BEST_DEVIATION = 0.002
+UNKNOWN_DEVIATION = 10.0
+BEST_DEVIATION = 0.002
 """Relative deviation below which the tracker is not believed."""
-_KINK = 0.06
+KINK = 0.06
 """Relative second difference of inverse depth between cells that marks a depth edge."""
 
 
@@ -60,8 +60,8 @@ def relative_precision(
     bends sharply between cells, interpolating makes a curtain from foreground to background: the
     weight falls to nothing there, as it does where the robust completion rejected the tracker.
     """
-    deviation = np.where(completed.inlier, completed.deviation, np.float32(_UNKNOWN_DEVIATION))
-    sigma = np.maximum(np.float32(config.tracker_scale) * deviation, np.float32(_BEST_DEVIATION))
+    deviation = np.where(completed.inlier, completed.deviation, np.float32(UNKNOWN_DEVIATION))
+    sigma = np.maximum(np.float32(config.tracker_scale) * deviation, np.float32(BEST_DEVIATION))
     return _flatness(completed.inverse_depth) ** 2 / sigma**2
 
 
@@ -84,4 +84,4 @@ def _flatness(inverse_depth: Float32[np.ndarray, "gh gw"]) -> Float32[np.ndarray
     q, bend = inverse_depth, np.zeros_like(inverse_depth)
     bend[:, 1:-1] = np.abs(q[:, 2:] + q[:, :-2] - 2.0 * q[:, 1:-1])
     bend[1:-1] = np.maximum(bend[1:-1], np.abs(q[2:] + q[:-2] - 2.0 * q[1:-1]))
-    return np.exp(-((bend / (np.float32(_KINK) * q)) ** 2))
+    return np.exp(-((bend / (np.float32(KINK) * q)) ** 2))

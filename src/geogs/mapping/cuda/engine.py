@@ -11,8 +11,9 @@ from torch import Tensor
 
 from geogs.config import DepthConfig
 from geogs.geometry.camera import Camera
-from geogs.mapping.completion import complete_grid, edge_weights
+from geogs.mapping.completion import complete_grid, edge_weights, known_cells
 from geogs.mapping.cuda.check import check, vote
+from geogs.mapping.cuda.completion import can_complete, complete
 from geogs.mapping.cuda.images import KeyframeImages, homographies, upload
 from geogs.mapping.cuda.refine import PixelPlaces, TrackerMaps, choose_start, judge, refine
 from geogs.mapping.cuda.sweep import MAX_NEIGHBOURS, MAX_PLANES, PlaneSlots, sweep
@@ -23,13 +24,18 @@ from geogs.mapping.plane_sweep import sweep_planes
 from geogs.mapping.sweep_neighbors import depth_range
 from geogs.threads import worker_count
 
+# Keyframes whose grids are completed at once.
+_BATCH = 32
+
 
 @dataclass(frozen=True, eq=False)
 class SearchPlan:
     """What the CPU works out before a keyframe's depth is searched."""
 
     grids: Float32[np.ndarray, "3 gh gw"]
-    """The tracker's completed inverse depth, its prior weight and its relative precision."""
+    """The tracker's inverse depth, its information, and the weights of smoothness."""
+    typical: float
+    """Median known inverse depth; 0 where none is known."""
     near: float
     far: float
     planes: Float32[np.ndarray, "p"]
@@ -73,10 +79,13 @@ class CudaDepthEngine:
             if view.id not in self._images:
                 self.observe(view)
         plans = list(self._threads.map(self._plan, references, usable))
-        maps = []
-        for reference, others, plan in zip(references, usable, plans, strict=True):
-            maps.append(self._search(reference, others, plan))
-            progress(len(maps) / len(references))
+        maps: list[tuple[Tensor, Tensor]] = []
+        for start in range(0, len(plans), _BATCH):
+            batch = slice(start, start + _BATCH)
+            evidence = self._complete(plans[batch])
+            for i, grids in enumerate(evidence, start):
+                maps.append(self._search(references[i], usable[i], plans[i], grids))
+                progress(len(maps) / len(references))
         return _with_medians(maps)
 
     def check(
@@ -103,27 +112,41 @@ class CudaDepthEngine:
         return vote(points, poses, *_stack(depths), self.render, self.config)
 
     def _plan(self, reference: DepthView, neighbours: list[DepthView]) -> SearchPlan:
-        smooth = self._edges[reference.id].result()
-        completed = complete_grid(
-            reference.inverse_depth, reference.information, smooth, self.config
-        )
-        weight = prior_weight(completed, self.config)
-        precision = relative_precision(completed, self.config)
-        grids = np.stack([completed.inverse_depth, weight, precision]).astype(np.float32)
+        grid, information = reference.inverse_depth, reference.information
+        known = known_cells(grid, information)
+        typical = float(np.median(grid[known])) if known.any() else 0.0
+        grids = np.stack([grid, information, self._edges[reference.id].result()])
+        grids = grids.astype(np.float32)
         if not neighbours:
-            return SearchPlan(grids, 0.0, 0.0, np.empty(0, np.float32))
+            return SearchPlan(grids, typical, 0.0, 0.0, np.empty(0, np.float32))
         near, far = depth_range(reference, neighbours, self.working, self.config)
         planes = sweep_planes(reference, neighbours, self.render, near, far, self.config)
         if len(planes) > MAX_PLANES:
             planes = np.linspace(planes[0], planes[-1], MAX_PLANES, dtype=np.float32)
-        return SearchPlan(grids, near, far, planes)
+        return SearchPlan(grids, typical, near, far, planes)
+
+    def _complete(self, plans: list[SearchPlan]) -> Float32[Tensor, "k 3 gh gw"]:
+        """The tracker's completed inverse depth, its prior weight and its relative precision."""
+        grids, typical = np.stack([p.grids for p in plans]), [p.typical for p in plans]
+        if min(typical) > 0 and can_complete(grids.shape[2:], self.device):
+            return complete(upload(grids, self.device), typical, self.config)
+        completed = [complete_grid(g[0], g[1], g[2], self.config) for g in grids]
+        evidence = [
+            (c.inverse_depth, prior_weight(c, self.config), relative_precision(c, self.config))
+            for c in completed
+        ]
+        return upload(np.array(evidence, np.float32), self.device)
 
     def _search(
-        self, reference: DepthView, neighbours: list[DepthView], plan: SearchPlan
+        self,
+        reference: DepthView,
+        neighbours: list[DepthView],
+        plan: SearchPlan,
+        grids: Float32[Tensor, "3 gh gw"],
     ) -> tuple[Tensor, Tensor]:
         """Depth and confidence of one keyframe."""
         config, device, own = self.config, self.device, self._images[reference.id]
-        tracker = TrackerMaps.of(upload(plan.grids, device), self._places)
+        tracker = TrackerMaps.of(grids, self._places)
         if not neighbours:
             return 1.0 / tracker.inverse_depth, 0.5 * tracker.prior_weight
         others = [self._images[v.id] for v in neighbours]
