@@ -1,7 +1,7 @@
 """What is removed from an extracted mesh."""
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
 
 from geogs.mesh.types import Mesh, cross
 
@@ -9,11 +9,11 @@ from geogs.mesh.types import Mesh, cross
 def remove_degenerate_faces(mesh: Mesh, tolerance: float = 1e-12) -> Mesh:
     """Without faces that repeat a vertex or whose squared area is below ``tolerance`` of the
     squared mean edge length squared, and without the vertices this leaves unused."""
-    corners = mesh.vertices.astype(np.float64)[mesh.faces]
-    edges = corners - np.roll(corners, 1, axis=1)
-    squared = (edges**2).sum(-1)
-    area = (cross(edges[:, 0], edges[:, 1]) ** 2).sum(-1)
-    distinct = (mesh.faces != np.roll(mesh.faces, 1, axis=1)).all(1)
+    vertices, (a, b, c) = mesh.vertices.astype(np.float64), mesh.faces.T
+    edges = [vertices[i] - vertices[j] for i, j in ((a, c), (b, a), (c, b))]
+    squared = np.stack([_squared_norm(e) for e in edges], -1)
+    area = _squared_norm(cross(edges[0], edges[1]))
+    distinct = (a != b) & (b != c) & (c != a)
     scale = squared.mean() if len(squared) else 0.0
     return keep_faces(mesh, distinct & (area > tolerance * scale**2))
 
@@ -53,8 +53,16 @@ def keep_faces(mesh: Mesh, keep: np.ndarray) -> Mesh:
     )
 
 
+def _squared_norm(rows: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, "m"]:
+    x, y, z = rows.T
+    return x * x + y * y + z * z
+
+
 def _components(mesh: Mesh) -> tuple[Int[np.ndarray, "m"], Int[np.ndarray, "c"]]:
-    """Label of each face and number of faces of each label; faces connect by a shared vertex."""
+    """Label of each face and number of faces of each label; faces connect by a shared vertex.
+
+    A vertex without a face has a label of its own, which no face has.
+    """
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
@@ -62,6 +70,5 @@ def _components(mesh: Mesh) -> tuple[Int[np.ndarray, "m"], Int[np.ndarray, "c"]]
     n = len(mesh.vertices)
     links = coo_matrix((np.ones(len(a), np.int8), (a, b)), shape=(n, n))
     _, of_vertex = connected_components(links, directed=False)
-    of_face = of_vertex[mesh.faces[:, 0]]
-    _, label, count = np.unique(of_face, return_inverse=True, return_counts=True)
-    return label.reshape(-1), count
+    label = of_vertex[mesh.faces[:, 0]]
+    return label, np.bincount(label, minlength=of_vertex.max() + 1)

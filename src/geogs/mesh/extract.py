@@ -132,15 +132,15 @@ def fuse(
 def _sample_points(
     views: Sequence[DepthMapView],
 ) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"], Float[Tensor, "n 3"]]:
-    """Depths, pixel footprints and world points of a regular part of all pixels, on the CPU."""
+    """Depths, pixel footprints and world points of a regular part of all pixels."""
     depths, footprints, points = [], [], []
     pixels = sum(view.depth.numel() for view in views)
     step = max(1, round((pixels / _SAMPLED_POINTS) ** 0.5))
     for view in views:
         valid = view.valid()[::step, ::step]
-        depth = view.depth[::step, ::step][valid].cpu().double()
-        rays = view.camera.rays(torch.float64)[::step, ::step][valid.cpu()]
-        T_cw = view.T_cw.cpu().double()
+        depth = view.depth[::step, ::step][valid].double()
+        rays = view.camera.rays(torch.float64, depth.device)[::step, ::step][valid]
+        T_cw = view.T_cw.to(depth)
         depths.append(depth)
         footprints.append(depth / (0.5 * (view.camera.fx + view.camera.fy)))
         points.append((rays * depth[:, None] - T_cw[:3, 3]) @ T_cw[:3, :3])
