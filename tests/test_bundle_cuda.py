@@ -114,6 +114,13 @@ def test_solve_matches_the_cpu(device, iterations):
     assert torch.equal(fast.inverse_depth[1].cpu(), problem.inverse_depth[1])
 
 
+def test_solve_with_more_cells_than_threads(device):
+    camera = Camera(fx=150.0, fy=152.0, cx=95.5, cy=61.5, width=192, height=124)
+    problem = scene(camera, frames=3, reach=1)
+    assert problem.inverse_depth.shape[1] > 256
+    assert_same(*solve_both(camera, problem, BundleOptions(1, huber=0.5), device))
+
+
 def test_many_poses_go_through_the_library_solver(device):
     camera = camera_for(device)
     problem = scene(camera, frames=19, reach=1)

@@ -73,8 +73,8 @@ class FrameGraph:
         if not pairs:
             return
         first, second = ([self.keyframes[p[k]].encoded for p in pairs] for k in (0, 1))
-        forward = self.reprojections(pairs)
-        backward = self.reprojections([(j, i) for i, j in pairs])
+        both = self.reprojections(pairs + [(j, i) for i, j in pairs])
+        forward, backward = both[: len(pairs)], both[len(pairs) :]
         if cold:
             there, back = self.operator.measure(first, second, fine=fine)
         else:
@@ -214,7 +214,13 @@ def proximity_pairs(
     """
     position = {k: n for n, k in enumerate(store.ids)}
     ids = store.ids
-    taken = {(position[i], position[j]) for i, j in existing if i in position and j in position}
+    # Pairs that end well before the later keyframes suppress none of theirs.
+    reach = min((position[k] for k in later), default=0) - suppression
+    taken = {
+        (position[i], position[j])
+        for i, j in existing
+        if i in position and j in position and position[j] >= reach
+    }
     found: list[Pair] = []
     for k in later:
         for back in range(1, radius + 1):
@@ -230,10 +236,10 @@ def proximity_pairs(
         if b - a > radius and (a, b) not in blocked
     ]
     directed = [(ids[a], ids[b]) for a, b in candidates]
-    both = frame_distances(store, directed + [(j, i) for i, j in directed]).cpu()
-    distance = (both[: len(directed)] + both[len(directed) :]) / 2
-    for n in torch.argsort(distance, stable=True).tolist():
-        if float(distance[n]) > max_distance or len(found) >= max_pairs:
+    there, back = frame_distances(store, directed + [(j, i) for i, j in directed]).chunk(2)
+    distance, order = torch.sort(((there + back) / 2).cpu(), stable=True)
+    for n, d in zip(order.tolist(), distance.tolist(), strict=True):
+        if d > max_distance or len(found) >= max_pairs:
             break
         if candidates[n] not in blocked:
             found.append(candidates[n])

@@ -330,11 +330,11 @@ class Tracker:
         c, ids = self.config, self.store.ids
         poses = [k for k in ids[-c.window :] if k != ids[0]]
         depths = ids[-max(c.window, c.depth_window) :]
-        moving = set(poses)
+        moving, deep = set(poses), set(depths)
         for n in range(c.local_rounds):
-            edges = [e for e in self.graph.edges if e[0] in depths or moving & set(e)]
+            edges = [e for e in self.graph.edges if e[0] in deep or not moving.isdisjoint(e)]
             if n:
-                pairs = [e for e in edges if e[0] < e[1] and moving & set(e)]
+                pairs = [e for e in edges if e[0] < e[1] and not moving.isdisjoint(e)]
                 self.graph.measure(self.graph.stale(pairs, c.remeasure), fine=False)
             self.graph.adjust(
                 edges, poses, depths, BundleOptions(iterations=c.local_iterations, huber=c.huber)

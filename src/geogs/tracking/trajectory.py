@@ -1,5 +1,6 @@
 """The pose of every frame, solved at the end from sparse flow kept along the way."""
 
+from bisect import bisect_left
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -229,9 +230,11 @@ def interpolate(
     out = np.tile(np.eye(4), (len(T_cw), 1, 1))
     if not known:
         return out
+    indices = list(known)
     for n in range(len(T_cw)):
-        a = max((k for k in known if k <= n), default=min(known))
-        b = min((k for k in known if k >= n), default=max(known))
+        next = bisect_left(indices, n)
+        b = indices[min(next, len(indices) - 1)]
+        a = n if b == n else indices[max(next - 1, 0)]
         T = known[a]
         if a != b:
             share = (timestamps[n] - timestamps[a]) / max(timestamps[b] - timestamps[a], 1e-9)
