@@ -44,14 +44,15 @@ class Window:
         rng = np.random.default_rng(0)
         noise = cv2.GaussianBlur(rng.random((PHOTO.height, PHOTO.width, 3)), (0, 0), 3.0)
         texture = np.clip(127 + 2500 * (noise - 0.5), 0, 255)
-        y, x = torch.meshgrid(torch.arange(344), torch.arange(616), indexing="ij")
+        height, width = RENDER.height, RENDER.width
+        y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
         depth = 2 + 0.2 * torch.sin(x / 60) + 0.15 * torch.cos(y / 55)
         table = ViewTable(RENDER, PHOTO, device)
         views, photos = [], []
         for k in range(VIEWS):
             image = (texture + 2 * rng.normal(size=texture.shape)).clip(0, 255).astype(np.uint8)
             move = torch.tensor([0.01 * k, 0.005 * k, 0.0, 0.0, 0.001 * k, 0.0]).double()
-            confidence = torch.from_numpy(rng.random((344, 616))).float()
+            confidence = torch.from_numpy(rng.random((height, width))).float()
             view = ViewConstants.prepare(image, RENDER, 1.01 * depth, confidence)
             photo = PhotoView.prepare(image, PHOTO, se3_exp(move), blur=0.3)
             table.add(view, photo)
@@ -59,7 +60,7 @@ class Window:
             views.append(replace(view, **moved))
             photos.append(replace(photo, grey=photo.grey.to(device), T_cw=photo.T_cw.to(device)))
         batch = depth.expand(VIEWS, -1, -1)
-        normal = torch.tensor([0.1, -0.1, -0.9])[:, None, None].expand(VIEWS, 3, 344, 616)
+        normal = torch.tensor([0.1, -0.1, -0.9])[:, None, None].expand(VIEWS, 3, height, width)
         maps = [batch, normal, torch.full_like(batch, 0.95), torch.full_like(batch, 0.01)]
         maps = [m.to(device).contiguous() for m in maps]
         partners = [[(k + 1) % VIEWS, (k + 2) % VIEWS] for k in range(VIEWS)]

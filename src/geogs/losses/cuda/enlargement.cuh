@@ -27,10 +27,9 @@ __device__ __forceinline__ float enlarged_depth(const float* depth, int width, S
 
 // The enlarged pixels along one axis that look at source pixel ``i``: first and last.
 struct Span { int first, last; };
-__device__ __forceinline__ Span reading_pixels(int i, int size, int big_size, float inverse_ratio) {
+__device__ __forceinline__ Span reading_pixels(int i, int big_size, float inverse_ratio) {
   const float low = ((float)i - 0.5f) * inverse_ratio - 0.5f, high = ((float)i + 1.5f) * inverse_ratio - 0.5f;
-  return {i == 0 ? 0 : max((int)ceilf(low - 1e-3f), 0),
-          i == size - 1 ? big_size - 1 : min((int)floorf(high + 1e-3f), big_size - 1)};
+  return {max((int)ceilf(low - 1e-3f), 0), min((int)floorf(high + 1e-3f), big_size - 1)};
 }
 __device__ __forceinline__ float weight_of(int i, Source s) {
   return (s.near_ == i ? 1.f - s.share : 0.f) + (s.far_ == i ? s.share : 0.f);
@@ -43,8 +42,8 @@ extern "C" __global__ void __launch_bounds__(256) gather_depth_gradient(
   const int x = blockIdx.x * 32 + threadIdx.x, y = blockIdx.y * 8 + threadIdx.y, b = blockIdx.z;
   if (x >= width || y >= height) return;
   const float ratio_x = (float)width / big_width, ratio_y = (float)height / big_height;
-  const Span rows = reading_pixels(y, height, big_height, (float)big_height / height);
-  const Span columns = reading_pixels(x, width, big_width, (float)big_width / width);
+  const Span rows = reading_pixels(y, big_height, (float)big_height / height);
+  const Span columns = reading_pixels(x, big_width, (float)big_width / width);
   const size_t plane = (size_t)big_height * big_width;
   float sum = 0.f;
   for (int p = 0; p < partners; p++) {

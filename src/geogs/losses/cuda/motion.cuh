@@ -14,7 +14,7 @@ extern "C" __global__ void __launch_bounds__(256) motion_gradient(
   const int pair = blockIdx.z, b = pair / partners, target = targets[pair];
   if (target < 0) return;
   const PhotoSettings c = *(const PhotoSettings*)settings;
-  const Motion motion = *(const Motion*)(motions + 12 * pair);
+  const PixelMotion motion = *(const PixelMotion*)(motions + 12 * pair);
   const float* image = view_map(maps, target, GREY);
   const int x = blockIdx.x * 32 + threadIdx.x, end = min((int)(blockIdx.y + 1) * MOTION_ROWS, big_height);
   depth += (size_t)b * height * width;
@@ -28,11 +28,11 @@ extern "C" __global__ void __launch_bounds__(256) motion_gradient(
     if (g == 0.f || !is_seen(warped[at])) continue;
     const float ry = ((float)y - c.cy) / c.fy;
     const float d = enlarged_depth(depth, width, source_pixels(y, height, ratio), column);
-    const Landing p = land(motion, rx, ry, d, big_height, big_width, c);
+    const Landing p = land(motion, (float)x, (float)y, d, big_height, big_width, c);
     if (!(p.z > 0.f)) continue;
     const Sample s = sample_image(image, big_height, big_width, p.u, p.v, sobel);
     const float gx = g * c.fx * s.dx / p.z, gy = g * c.fy * s.dy / p.z;
-    const float rows[3] = {gx, gy, -gx * p.x - gy * p.y};
+    const float rows[3] = {gx, gy, -gx * (p.u - c.cx) / c.fx - gy * (p.v - c.cy) / c.fy};
 #pragma unroll
     for (int k = 0; k < 3; k++) {
       sums[4 * k] += rows[k] * d * rx;

@@ -3,29 +3,32 @@
 #pragma once
 #include "enlargement.cuh"
 
-// A row of a 3x4 motion from the reference's to the target's frame.
+// From a pixel (x, y, 1) of the reference times depth to the target: diag(fx, fy, 1) [R K^-1 | t],
+// so that X / Z and Y / Z of the result are pixels but for the principal point.
 struct MotionRow { float x, y, z, t; };
-struct Motion { MotionRow u, v, w; };
+struct PixelMotion { MotionRow u, v, w; };
 
-__device__ __forceinline__ float turned(MotionRow m, float rx, float ry) { return m.x * rx + m.y * ry + m.z; }
+__device__ __forceinline__ float along_row(MotionRow m, float x, float y) {
+  return fmaf(m.y, y, fmaf(m.x, x, m.z));
+}
 
 // Where a pixel with depth falls in the target.
 struct Landing {
-  float x, y;          // the target frame's X / Z and Y / Z
-  float u, v, z;       // pixel and depth there; z is 0 where out of view
-  float du, dv;        // d pixel / d depth
+  float u, v, z;  // pixel and depth there; z is 0 where out of view
+  float du, dv;   // d pixel / d depth
 };
 
 __device__ __forceinline__ Landing land(
-    const Motion& m, float rx, float ry, float d, int height, int width, const PhotoSettings& c) {
-  const float qx = turned(m.u, rx, ry), qy = turned(m.v, rx, ry), qz = turned(m.w, rx, ry);
-  const float z = d * qz + m.w.t;
+    const PixelMotion& m, float x, float y, float d, int height, int width, const PhotoSettings& c) {
+  const float qx = along_row(m.u, x, y), qy = along_row(m.v, x, y), qz = along_row(m.w, x, y);
+  const float z = fmaf(d, qz, m.w.t);
   const bool front = d > 0.f && z > c.min_depth_ratio * d;
   const float inverse = 1.f / (front ? z : 1.f);
-  const float x = (d * qx + m.u.t) * inverse, y = (d * qy + m.v.t) * inverse;
-  const float u = c.fx * x + c.cx, v = c.fy * y + c.cy;
+  const float u = fmaf(fmaf(d, qx, m.u.t), inverse, c.cx), v = fmaf(fmaf(d, qy, m.v.t), inverse, c.cy);
   const bool inside = front && u >= 0.f && v >= 0.f && u <= (float)(width - 1) && v <= (float)(height - 1);
-  return {x, y, u, v, inside ? z : 0.f, c.fx * (qx - x * qz) * inverse, c.fy * (qy - y * qz) * inverse};
+  // (qx - qz X / Z) / Z without its cancellation.
+  const float rate = inverse * inverse;
+  return {u, v, inside ? z : 0.f, rate * (qx * m.w.t - m.u.t * qz), rate * (qy * m.w.t - m.v.t * qz)};
 }
 
 struct Sample { float value, dx, dy; };
@@ -92,11 +95,21 @@ __device__ __forceinline__ float packed(float value, bool seen) {
 }
 __device__ __forceinline__ bool is_seen(float warped) { return (__float_as_uint(warped) >> 31) == 0; }
 
-// Relative motions (pairs, 12) and target slots of the pairs, -1 where there is none; clears the
-// loss and, unless null, d loss / d motion (pairs, 12).
+// A row of R_t R_r^T and of the translation that belongs to it: T_target T_reference^-1, 3x4 rows.
+__device__ __forceinline__ void relative_row(const double* target, const double* reference, int row, double* out) {
+  out[3] = target[4 * row + 3];
+  for (int k = 0; k < 3; k++) {
+    out[k] = 0.0;
+    for (int n = 0; n < 3; n++) out[k] += target[4 * row + n] * reference[4 * k + n];
+    out[3] -= out[k] * reference[4 * k + 3];
+  }
+}
+
+// Motions of the pairs (pairs, 12), see PixelMotion, and their target slots, -1 where there is
+// none; clears the loss and, unless null, d loss / d motion (pairs, 12).
 extern "C" __global__ void __launch_bounds__(128) begin_window(
-    const int* batch, const int* pairs, const double* poses, int* targets, float* motions,
-    float* loss, double* d_motion, int views, int partners) {
+    const int* batch, const int* pairs, const double* poses, const float* settings, int* targets,
+    float* motions, float* loss, double* d_motion, int views, int partners) {
   const int i = blockIdx.x * 128 + threadIdx.x;
   if (i < views) loss[i] = 0.f;
   if (i >= views * partners) return;
@@ -105,17 +118,16 @@ extern "C" __global__ void __launch_bounds__(128) begin_window(
   if (d_motion)
     for (int k = 0; k < 12; k++) d_motion[12 * i + k] = 0.0;
   if (target < 0) return;
-  const double *r = poses + 12 * reference, *t = poses + 12 * target;
+  const PhotoSettings& c = *(const PhotoSettings*)settings;
   for (int j = 0; j < 3; j++) {
-    double shift = t[4 * j + 3];
-    for (int k = 0; k < 3; k++) {
-      // T_target T_reference^-1: R_t R_r^T, and its translation takes off that of the reference.
-      double turn = 0.0;
-      for (int n = 0; n < 3; n++) turn += t[4 * j + n] * r[4 * k + n];
-      motions[12 * i + 4 * j + k] = (float)turn;
-      shift -= turn * r[4 * k + 3];
-    }
-    motions[12 * i + 4 * j + 3] = (float)shift;
+    double row[4];
+    relative_row(poses + 12 * target, poses + 12 * reference, j, row);
+    const double zoom = j == 0 ? c.fx : j == 1 ? c.fy : 1.f, x = row[0] / c.fx, y = row[1] / c.fy;
+    float* out = motions + 12 * i + 4 * j;
+    out[0] = (float)(zoom * x);
+    out[1] = (float)(zoom * y);
+    out[2] = (float)(zoom * (row[2] - x * c.cx - y * c.cy));
+    out[3] = (float)(zoom * row[3]);
   }
 }
 
@@ -132,19 +144,18 @@ extern "C" __global__ void __launch_bounds__(256, 4) warp_pairs(
   const int pair = blockIdx.z, b = pair / partners, target = targets[pair];
   if (target < 0) return;
   const PhotoSettings c = *(const PhotoSettings*)settings;
-  const Motion motion = *(const Motion*)(motions + 12 * pair);
+  const PixelMotion motion = *(const PixelMotion*)(motions + 12 * pair);
   const float* image = view_map(maps, target, GREY);
   const float* hidden = rendered[target] ? view_map(maps, target, RENDERED_DEPTH) : 0;
   const float* grey = view_map(maps, batch[b], GREY);
   const int x = blockIdx.x * 32 + threadIdx.x, end = min((int)(blockIdx.y + 1) * WARP_ROWS, big_height);
   depth += (size_t)b * height * width;
   const Source column = source_pixels(x, width, (float)width / big_width);
-  const float ratio = (float)height / big_height, rx = ((float)x - c.cx) / c.fx;
+  const float ratio = (float)height / big_height;
   float total = 0.f;
-#pragma unroll 1
   for (int y = blockIdx.y * WARP_ROWS + threadIdx.y; y < end && x < big_width; y += 8) {
     const float d = enlarged_depth(depth, width, source_pixels(y, height, ratio), column);
-    const Landing p = land(motion, rx, ((float)y - c.cy) / c.fy, d, big_height, big_width, c);
+    const Landing p = land(motion, (float)x, (float)y, d, big_height, big_width, c);
     bool seen = p.z > 0.f;
     if (seen && hidden)
       seen = is_visible(hidden, height, width, big_height, big_width, p.u, p.v, p.z, c.occlusion);

@@ -135,8 +135,8 @@ class WindowLosses:
         height, width = t.render.height, t.render.width
         views, partners = self.views, self.partners
         kernels["begin_window"](
-            _blocks(max(views * partners, views), 128), 128, batch, pairs, t.poses, self._targets,
-            self._motions, loss, relative_gradient, views, partners,
+            _blocks(max(views * partners, views), 128), 128, batch, pairs, t.poses, self._photo_settings,
+            self._targets, self._motions, loss, relative_gradient, views, partners,
         )  # fmt: skip
         if c.smoothness_weight > 0:
             kernels["inverse_median"](
