@@ -114,6 +114,14 @@ def test_solve_matches_the_cpu(device, iterations):
     assert torch.equal(fast.inverse_depth[1].cpu(), problem.inverse_depth[1])
 
 
+def test_same_input_same_result(device):
+    camera = camera_for(device)
+    problem = scene(camera)
+    a, b = (solve_both(camera, problem, BundleOptions(2), device)[0] for _ in range(2))
+    assert torch.equal(a.T_cw, b.T_cw)
+    assert torch.equal(a.inverse_depth, b.inverse_depth)
+
+
 def test_solve_with_more_cells_than_threads(device):
     camera = Camera(fx=150.0, fy=152.0, cx=95.5, cy=61.5, width=192, height=124)
     problem = scene(camera, frames=3, reach=1)

@@ -7,6 +7,8 @@ from geogs.tracking.graph import Pair, proximity_pairs
 from geogs.tracking.tracker import Tracker
 from geogs.types import PoseCorrection
 
+MATCHED_TOGETHER = 16, 48
+"""Pairs that are matched in one go, on the CPU and on a GPU."""
 SETTLED = 0.02
 """The rounds end when the reprojection of no more than this fraction of the pairs still moves."""
 
@@ -26,13 +28,14 @@ def global_bundle(
     before = {k: store[k].T_cw.clone() for k in ids}
     pairs = global_pairs(tracker)
     graph.edges = {}
+    batch = MATCHED_TOGETHER[store.grid.on_gpu]
     options = BundleOptions(iterations=config.global_iterations, huber=config.huber)
     for n in range(config.global_rounds if pairs else 0):
         stale = graph.stale(pairs, config.global_remeasure)
         if len(stale) <= SETTLED * len(pairs):
             break
-        for start in range(0, len(stale), 16):
-            graph.measure(stale[start : start + 16], fine=True)
+        for start in range(0, len(stale), batch):
+            graph.measure(stale[start : start + batch], fine=True)
             if progress is not None:
                 share = (n + start / len(stale)) / config.global_rounds
                 progress(share, "matching all keyframes")

@@ -236,10 +236,10 @@ def proximity_pairs(
         if b - a > radius and (a, b) not in blocked
     ]
     directed = [(ids[a], ids[b]) for a, b in candidates]
-    there, back = frame_distances(store, directed + [(j, i) for i, j in directed]).chunk(2)
-    distance, order = torch.sort(((there + back) / 2).cpu(), stable=True)
-    for n, d in zip(order.tolist(), distance.tolist(), strict=True):
-        if d > max_distance or len(found) >= max_pairs:
+    forward, backward = frame_distances(store, directed + [(j, i) for i, j in directed]).chunk(2)
+    distance, order = torch.sort(((forward + backward) / 2).cpu(), stable=True)
+    for n, far in zip(order.tolist(), distance.tolist(), strict=True):
+        if far > max_distance or len(found) >= max_pairs:
             break
         if candidates[n] not in blocked:
             found.append(candidates[n])

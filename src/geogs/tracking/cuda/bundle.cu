@@ -8,8 +8,8 @@
 extern "C" __global__ void __launch_bounds__(256) linearise_edges(
     const double* T, const float* inverse_depth, const int* source, const int* target,
     const float2* pixels, const float2* weight, const float* rays, int cells, float fx, float fy,
-    float cx, float cy, float huber, double* system, int system_size, double* motion,
-    double* normal, float* coupling, float* curvature, float* gradient, float* residual) {
+    float cx, float cy, float huber, double* motion, double* normal, float* coupling,
+    float* curvature, float* gradient, float* residual) {
   __shared__ Motion T_ji;
   __shared__ double sums[32];
   size_t e = blockIdx.x;
@@ -22,9 +22,6 @@ extern "C" __global__ void __launch_bounds__(256) linearise_edges(
       T_ji.m[k] = (float)relative[k];
     }
   }
-  // The reduced camera system is summed up later in the same step.
-  for (int k = blockIdx.x * blockDim.x + threadIdx.x; k < system_size; k += gridDim.x * blockDim.x)
-    system[k] = 0.0;
   __syncthreads();
   Motion pose = T_ji;
   Camera camera = {fx, fy, cx, cy};
@@ -71,20 +68,6 @@ extern "C" __global__ void __launch_bounds__(256) sum_sources(
     inverse_curvature[at + p] = 1.f / (information[at + p] + damping);
 }
 
-// Adds a 6 x 6 block (and its transpose at the mirrored place) to the lower triangle of the system.
-__device__ __forceinline__ void add_block(
-    double* H, int size, int p, int q, const double* block, bool mirrored) {
-  if (p < 0 || q < 0 || threadIdx.x >= 36) return;
-  int r = threadIdx.x / 6, c = threadIdx.x % 6;
-  double value = block[6 * r + c], other = block[6 * c + r];
-  if (p == q)
-    atomicAdd(&H[(size_t)(6 * p + r) * size + 6 * q + c], mirrored ? value + other : value);
-  else if (p > q)
-    atomicAdd(&H[(size_t)(6 * p + r) * size + 6 * q + c], value);
-  else
-    atomicAdd(&H[(size_t)(6 * q + r) * size + 6 * p + c], other);
-}
-
 // out = sign a b, or sign a^T b, by 36 threads; all threads of the block call it.
 __device__ __forceinline__ void multiply_blocks(
     const double* a, bool transposed, const double* b, double sign, double* out) {
@@ -97,7 +80,7 @@ __device__ __forceinline__ void multiply_blocks(
   __syncthreads();
 }
 
-// Products E_a C^-1 E_b^T and E_a C^-1 b over the cells of a source, left out where it is fixed.
+// Products E_a C^-1 E_b^T and, for the same edge, E_a C^-1 b over the cells of a source.
 __device__ __forceinline__ void eliminate_cells(
     const float* coupling_a, const float* coupling_b, const float* inverse_curvature,
     const float* gradient, int cells, bool same, double* sums) {
@@ -127,53 +110,70 @@ __device__ __forceinline__ void eliminate_cells(
   block_sums(w, sums + 32);
 }
 
-// Eliminates the inverse depths between two edges a <= b of one source and adds what is left to the
-// camera system, by xi_rel = xi_target - Ad xi_source. One block per pair of edges.
+// Eliminates the inverse depths between two edges a <= b of one source and carries what is left to
+// the poses by xi_rel = xi_target - Ad xi_source. One block per pair of edges. Per pair: blocks
+// holds S at (target_a, target_b), -S Ad_b at (target_a, source), -Ad_a^T S at (source, target_b)
+// and Ad_a^T S Ad_b at (source, source); vectors holds v at target_a and -Ad_a^T v at source.
 extern "C" __global__ void __launch_bounds__(256) eliminate_depths(
-    const int* pair_a, const int* pair_b, const int* source, const int* target, const int* slot,
-    const int* free_depth, const float* coupling, const float* inverse_curvature,
-    const float* depth_gradient, const double* motion, const double* normal, int cells, int size,
-    double* H, double* g) {
-  __shared__ double sums[64], S[36], left[36], right[36], M[36], N[36], v[6];
+    const int* pair_a, const int* pair_b, const int* source, const int* free_depth,
+    const float* coupling, const float* inverse_curvature, const float* depth_gradient,
+    const double* motion, const double* normal, int cells, double* blocks, double* vectors) {
+  __shared__ double sums[64], parts[4][36], left[36], right[36], v[6];
   size_t a = pair_a[blockIdx.x], b = pair_b[blockIdx.x];
-  int i = source[a];
+  int i = source[a], t = threadIdx.x;
   bool same = a == b;
   if (free_depth[i]) {
     size_t at = (size_t)i * cells;
     eliminate_cells(coupling + 6 * a * cells, coupling + 6 * b * cells, inverse_curvature + at,
                     depth_gradient + at, cells, same, sums);
   } else {
-    if (threadIdx.x < 64) sums[threadIdx.x] = 0.0;
-    if (threadIdx.x < 32) sums[32 + threadIdx.x] = 0.0;
+    if (t < 64) sums[t] = 0.0;
     __syncthreads();
   }
-  if (threadIdx.x < 36) {
-    int r = threadIdx.x / 6, c = threadIdx.x % 6;
+  if (t < 36) {
+    int r = t / 6, c = t % 6;
     double direct = same ? normal[NORMAL_STRIDE * a + upper_entry(r, c)] : 0.0;
-    S[threadIdx.x] = direct - sums[threadIdx.x];
-    left[threadIdx.x] = adjoint_entry(motion + 12 * a, r, c);
-    right[threadIdx.x] = adjoint_entry(motion + 12 * b, r, c);
+    parts[0][t] = direct - sums[t];
+    left[t] = adjoint_entry(motion + 12 * a, r, c);
+    right[t] = adjoint_entry(motion + 12 * b, r, c);
   }
-  if (threadIdx.x < 6) v[threadIdx.x] = normal[NORMAL_STRIDE * a + 21 + threadIdx.x] - sums[36 + threadIdx.x];
+  if (t < 6) v[t] = normal[NORMAL_STRIDE * a + 21 + t] - sums[36 + t];
   __syncthreads();
-  int from = slot[i], to_a = slot[target[a]], to_b = slot[target[b]];
-  add_block(H, size, to_a, to_b, S, !same);
-  multiply_blocks(S, false, right, -1.0, M);
-  add_block(H, size, to_a, from, M, false);
-  multiply_blocks(left, true, M, -1.0, N);
-  add_block(H, size, from, from, N, !same);
-  if (same) {
-    if (threadIdx.x < 6) {
-      double s = 0.0;
-      for (int k = 0; k < 6; k++) s -= left[6 * k + threadIdx.x] * v[k];
-      if (from >= 0) atomicAdd(&g[6 * from + threadIdx.x], s);
-      if (to_a >= 0) atomicAdd(&g[6 * to_a + threadIdx.x], v[threadIdx.x]);
-    }
-  } else {
-    __syncthreads();
-    multiply_blocks(left, true, S, -1.0, N);
-    add_block(H, size, from, to_b, N, false);
+  multiply_blocks(parts[0], false, right, -1.0, parts[1]);
+  multiply_blocks(left, true, parts[0], -1.0, parts[2]);
+  multiply_blocks(left, true, parts[1], -1.0, parts[3]);
+  for (int k = t; k < 144; k += blockDim.x) blocks[144 * (size_t)blockIdx.x + k] = parts[k / 36][k % 36];
+  if (same && t < 6) {
+    double s = 0.0;
+    for (int k = 0; k < 6; k++) s -= left[6 * k + t] * v[k];
+    vectors[12 * (size_t)blockIdx.x + t] = v[t];
+    vectors[12 * (size_t)blockIdx.x + 6 + t] = s;
   }
+}
+
+// Sums up the lower triangle of the camera system, always in the same order. One block of 256 per
+// place p (poses + 1) + q: the 6 x 6 block (p, q), or the right-hand side of pose p for q = poses.
+// Parts first[n] to first[n + 1] of place n are vectors, or twice a block, plus one if transposed.
+extern "C" __global__ void __launch_bounds__(256) assemble_system(
+    const int* places, const int* first, const int* parts, const double* blocks,
+    const double* vectors, int poses, double* H, double* g) {
+  __shared__ double partial[7][36];
+  int place = places[blockIdx.x], p = place / (poses + 1), q = place % (poses + 1);
+  int group = threadIdx.x / 36, t = threadIdx.x % 36, end = first[blockIdx.x + 1];
+  bool right_hand_side = q == poses;
+  double sum = 0.0;
+  if (group < 7 && (t < 6 || !right_hand_side))
+    for (int n = first[blockIdx.x] + group; n < end; n += 7) {
+      size_t part = parts[n];
+      if (right_hand_side) sum += vectors[6 * part + t];
+      else sum += blocks[36 * (part >> 1) + (part & 1 ? t % 6 * 6 + t / 6 : t)];
+    }
+  if (group < 7) partial[group][t] = sum;
+  __syncthreads();
+  if (group || (right_hand_side && t >= 6)) return;
+  for (int n = 1; n < 7; n++) sum += partial[n][t];
+  if (right_hand_side) g[6 * p + t] = sum;
+  else H[(size_t)(6 * p + t / 6) * (6 * poses) + 6 * q + t % 6] = sum;
 }
 
 // Back-substitution (b - E^T xi_rel) / C; a step that is not finite sets `failed` for good.

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from jaxtyping import Bool, Int
 from torch import Tensor
 
 from geogs.gpu.kernels import kernels_for
@@ -23,7 +24,7 @@ def block_size(cells: int) -> int:
 
 @dataclass(frozen=True)
 class _Structure:
-    """Which frames and edges there are, as index arrays on the device."""
+    """Which frames and edges there are and how they meet, as index arrays on the device."""
 
     source: Tensor
     target: Tensor
@@ -37,6 +38,10 @@ class _Structure:
     pair_b: Tensor
     free: Tensor
     """Frames with free poses."""
+    places: Tensor
+    """Blocks of the camera system, see ``assemble_system``."""
+    first_part: Tensor
+    parts: Tensor
 
     @property
     def frames(self) -> int:
@@ -58,15 +63,56 @@ def _structure(problem: BundleProblem, device: torch.device) -> _Structure:
         for x in (problem.source, problem.target, problem.free_pose, problem.free_depth)
     )
     first = np.searchsorted(source, np.arange(len(free_pose) + 1))
-    pairs = [
-        begin + (np.stack(np.tril_indices(end - begin)) if joined else np.arange(end - begin))
-        for begin, end, joined in zip(first[:-1], first[1:], free_depth, strict=True)
-    ]
-    b, a = np.concatenate([np.broadcast_to(p, (2, p.shape[-1])) for p in pairs], 1)
+    a, b = _joined_edges(first, free_depth)
     slot = np.where(free_pose, np.cumsum(free_pose) - 1, -1)
-    parts = [source, target, first, slot, free_depth, a, b, np.flatnonzero(free_pose)]
+    free = np.flatnonzero(free_pose)
+    system = _system_parts(slot[source[a]], slot[target[a]], slot[target[b]], a == b, len(free))
+    parts = [source, target, first, slot, free_depth, a, b, free, *system]
     sent = torch.from_numpy(np.concatenate(parts).astype(np.int32)).to(device, non_blocking=True)
     return _Structure(*sent.split([len(p) for p in parts]))
+
+
+def _joined_edges(
+    first: Int[np.ndarray, "m"], free_depth: Bool[np.ndarray, "n"]
+) -> tuple[Int[np.ndarray, "k"], Int[np.ndarray, "k"]]:
+    """Pairs a <= b of edges of one source; only a = b where its depth is fixed."""
+    pairs = [np.zeros((2, 0), dtype=np.int64)]
+    for begin, end, joined in zip(first[:-1], first[1:], free_depth, strict=True):
+        count = end - begin
+        low = np.tril_indices(count) if joined else (np.arange(count), np.arange(count))
+        pairs.append(begin + np.stack(low))
+    b, a = np.concatenate(pairs, 1)
+    return a, b
+
+
+def _system_parts(
+    source: Int[np.ndarray, "k"],
+    target_a: Int[np.ndarray, "k"],
+    target_b: Int[np.ndarray, "k"],
+    same: Bool[np.ndarray, "k"],
+    poses: int,
+) -> tuple[Int[np.ndarray, "m"], Int[np.ndarray, "m1"], Int[np.ndarray, "l"]]:
+    """What each block of the camera system is the sum of: places, first parts, parts.
+
+    Given are the slots of the frames of every pair of edges. A pair of two edges stands for its
+    mirror image as well.
+    """
+    row = np.concatenate([target_a, target_a, source, source])
+    column = np.concatenate([target_b, source, target_b, source])
+    pair = np.arange(len(same))
+    block = np.concatenate([4 * pair + k for k in range(4)])
+    both = np.tile(~same, 4)
+    row, column = np.concatenate([row, column[both]]), np.concatenate([column, row[both]])
+    part = np.concatenate([2 * block, 2 * block[both] + 1])
+    lower = (row >= column) & (column >= 0)
+    right = np.concatenate([target_a[same], source[same]])
+    vector = np.concatenate([2 * pair[same], 2 * pair[same] + 1])[right >= 0]
+    right = right[right >= 0]
+    place = np.concatenate([row[lower] * (poses + 1) + column[lower], right * (poses + 1) + poses])
+    part = np.concatenate([part[lower], vector])
+    order = np.argsort(place, kind="stable")
+    places, first = np.unique(place[order], return_index=True)
+    return places, np.append(first, len(order)), part[order]
 
 
 class _Workspace:
@@ -83,13 +129,13 @@ class _Workspace:
         self.T = self.state[: 16 * s.frames]
         self.failed = self.state[16 * s.frames :].view(torch.int32)
         self.inverse_depth = d.clone()
-        self.system = torch.zeros(
-            (6 * s.poses) ** 2 + 6 * s.poses, dtype=torch.float64, device=device
-        )
-        self.H, self.g = self.system.split([(6 * s.poses) ** 2, 6 * s.poses])
-        self.xi = self.system.new_zeros(6 * s.frames)
-        self.motion = self.system.new_empty(12 * edges)
-        self.normal = self.system.new_empty(32 * edges)
+        self.H = self.state.new_zeros(6 * s.poses, 6 * s.poses)
+        self.g = self.state.new_zeros(6 * s.poses)
+        self.xi = self.state.new_zeros(6 * s.frames)
+        self.blocks = self.state.new_empty(144 * len(s.pair_a))
+        self.vectors = self.state.new_empty(12 * len(s.pair_a))
+        self.motion = self.state.new_empty(12 * edges)
+        self.normal = self.state.new_empty(32 * edges)
         self.coupling = d.new_empty(6 * edges * cells)
         self.curvature, self.gradient = d.new_empty(2, edges * cells).unbind()
         self.information = torch.zeros_like(d)
@@ -138,8 +184,8 @@ class CudaDenseBundle:
         s, c, block = w.structure, self.grid.camera, block_size(w.cells)
         self._step["linearise_edges"](
             s.edges, block, w.T, w.inverse_depth, s.source, s.target, pixels, weight,
-            self.grid.rays, w.cells, c.fx, c.fy, c.cx, c.cy, options.huber, w.system,
-            len(w.system), w.motion, w.normal, w.coupling, w.curvature, w.gradient, w.residual,
+            self.grid.rays, w.cells, c.fx, c.fy, c.cx, c.cy, options.huber, w.motion, w.normal,
+            w.coupling, w.curvature, w.gradient, w.residual,
         )  # fmt: skip
         self._step["sum_sources"](
             s.frames, block, s.first, w.curvature, w.gradient, w.cells, options.depth_damping,
@@ -151,9 +197,13 @@ class CudaDenseBundle:
         if not s.poses:
             return
         self._step["eliminate_depths"](
-            len(s.pair_a), block_size(w.cells), s.pair_a, s.pair_b, s.source, s.target, s.slot,
-            s.free_depth, w.coupling, w.inverse_curvature, w.depth_gradient, w.motion, w.normal,
-            w.cells, 6 * s.poses, w.H, w.g,
+            len(s.pair_a), block_size(w.cells), s.pair_a, s.pair_b, s.source, s.free_depth,
+            w.coupling, w.inverse_curvature, w.depth_gradient, w.motion, w.normal, w.cells,
+            w.blocks, w.vectors,
+        )  # fmt: skip
+        self._step["assemble_system"](
+            len(s.places), 256, s.places, s.first_part, s.parts, w.blocks, w.vectors, s.poses, w.H,
+            w.g,
         )  # fmt: skip
         if s.poses <= MAX_SMALL:
             threads = min(256, 32 * s.poses)
@@ -161,10 +211,9 @@ class CudaDenseBundle:
                 1, threads, w.H, w.g, s.slot, s.poses, s.frames, options.damping, w.xi
             )
             return
-        H = w.H.reshape(6 * s.poses, 6 * s.poses)
-        diagonal = H.diagonal()
+        diagonal = w.H.diagonal()
         diagonal.add_(options.damping * diagonal.abs() + 1e-2)
-        factor, info = torch.linalg.cholesky_ex(H)
+        factor, info = torch.linalg.cholesky_ex(w.H)  # reads the lower triangle only
         steps = torch.cholesky_solve(w.g[:, None], factor).reshape(-1, 6)
         w.xi.view(-1, 6)[w.free] = torch.where(info == 0, steps, torch.nan)
 
