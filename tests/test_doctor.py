@@ -7,7 +7,7 @@ import torch
 
 from geogs.cli import doctor, self_test
 from geogs.errors import DeviceError
-from geogs.gpu import cache, installation
+from geogs.gpu import cache, installation, kernels
 
 NEEDS_GPU = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 
@@ -128,6 +128,19 @@ def test_cache_state(monkeypatch, tmp_path):
     problem = doctor._cache(is_needed=True).problem
     assert problem is not None
     assert "every start compiles them again; set GEOGS_CACHE" in problem
+
+
+def test_all_kernels_are_prepared(monkeypatch, tmp_path):
+    (tmp_path / "a" / "cuda").mkdir(parents=True)
+    for name in ("a/cuda/one.cu", "a/two.cu", "a/common.cuh"):
+        (tmp_path / name).touch()
+    asked = []
+    monkeypatch.setattr(torch.cuda, "init", lambda: None)
+    monkeypatch.setattr(
+        kernels, "kernels_for", lambda s, d: asked.append(s.name) or {"x": 1, "y": 2}
+    )
+    assert kernels.prepare_kernels(tmp_path, torch.device("cuda")) == 4
+    assert sorted(asked) == ["one.cu", "two.cu"]
 
 
 @pytest.mark.gpu

@@ -147,18 +147,16 @@ def _kernels(device: "torch.device") -> Finding:
     import geogs
     from geogs.errors import DeviceError
     from geogs.gpu.cache import cache_state
-    from geogs.gpu.kernels import kernels_for
-    from geogs.threads import thread_map
+    from geogs.gpu.kernels import prepare_kernels
 
-    sources = sorted(Path(geogs.__file__).parent.rglob("*.cu"))
     before, start = cache_state().kernels, time.perf_counter()
     try:
-        kernels = sum(map(len, thread_map(lambda source: kernels_for(source, device), sources)))
+        kernels = prepare_kernels(Path(geogs.__file__).parent, device)
     except DeviceError as error:
         return Finding("kernels", "BAD", str(error), is_fatal=True)
     seconds, new = time.perf_counter() - start, cache_state().kernels - before
-    how = f"{new} compiled now" if new else "all from the cache"
-    return Finding("kernels", f"{kernels} in {len(sources)} files, {how}, {seconds:.1f} s")
+    how = f"{new} files compiled now" if new else "none to compile"
+    return Finding("kernels", f"{kernels}, {how}, {seconds:.1f} s")
 
 
 def _self_test(device: "torch.device") -> Iterator[Finding]:

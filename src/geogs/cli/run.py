@@ -56,8 +56,10 @@ def run(options: RunOptions) -> Path:
     """Reconstruct, write the results, say where they are; returns their folder."""
     import torch
 
+    import geogs
     from geogs.cli.results import write_results
     from geogs.gpu.installation import require_device
+    from geogs.gpu.kernels import prepare_kernels
     from geogs.io.sources.sniff import open_source
     from geogs.io.writers.atomic import prepare_output_folder
     from geogs.slam import Slam
@@ -66,6 +68,8 @@ def run(options: RunOptions) -> Path:
     device = require_device(options.device)
     source = open_source(options.source, options.input)
     output = prepare_output_folder(options.output or Path("out") / source.name)
+    if device.type == "cuda":
+        prepare_kernels(Path(geogs.__file__).parent, device)
     slam = Slam(source.camera, options, str(device))
     with Interruption() as stop, RunProgress(source.length) as progress:
         _feed(slam, source, progress, stop)

@@ -1,7 +1,9 @@
 """Kernels of a source file for a device: from the cache, or compiled now."""
 
 import functools
+import os
 from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -29,6 +31,17 @@ def kernels_for(source: Path, device: torch.device) -> Mapping[str, Kernel]:
         raise DeviceError(f"CUDA kernels do not run on {device}.")
     index = torch.cuda.current_device() if device.index is None else device.index
     return _device_kernels(source, index)
+
+
+def prepare_kernels(folder: Path, device: torch.device) -> int:
+    """Compile or load every source below ``folder`` now, many at once; the number of kernels.
+
+    Otherwise each would be compiled when it is first used. Raises as :func:`kernels_for` does.
+    """
+    sources = sorted(folder.rglob("*.cu"))
+    torch.cuda.init()
+    with ThreadPoolExecutor(min(16, os.cpu_count() or 1)) as pool:
+        return sum(pool.map(lambda source: len(kernels_for(source, device)), sources))
 
 
 @functools.cache
