@@ -243,7 +243,7 @@ def test_each_multi_view_term_matches_the_plain_loss(name: str, device: torch.de
     check(Scene.make(device), replace(NOTHING, **PAIRS[name]), True)
 
 
-@pytest.mark.parametrize("zoom", [1.0, 1.5, 2.0])
+@pytest.mark.parametrize("zoom", [0.8, 1.0, 1.5, 2.0])
 @pytest.mark.parametrize("config", [LossConfig(), EVERYTHING], ids=["default", "everything"])
 def test_all_terms_together_match_the_plain_loss(
     zoom: float, config: LossConfig, device: torch.device

@@ -5,14 +5,21 @@
 // The two source pixels of a pixel along one axis, and the share of the far one.
 struct Source { int near_, far_; float share; };
 
-// A source pixel without share is not looked at, so that its missing depth does not matter.
-// ``ratio`` is the source's size over the enlarged one; pixel centres at integers.
+// A source pixel with less share is not looked at, so that its missing depth does not matter.
+#define LEAST_SHARE 1e-3f
+
+// Where a pixel of the enlarged image lies in the source; pixel centres at integers. ``ratio`` is
+// the source's size over the enlarged one.
+__device__ __forceinline__ float source_position(int i, int size, float ratio) {
+  return fminf(fmaxf(fmaf((float)i + 0.5f, ratio, -0.5f), 0.f), (float)(size - 1));
+}
+
 __device__ __forceinline__ Source source_pixels(int i, int size, float ratio) {
-  const float at = fminf(fmaxf(fmaf((float)i + 0.5f, ratio, -0.5f), 0.f), (float)(size - 1));
+  const float at = source_position(i, size, ratio);
   const int left = (int)at;
   const float share = at - (float)left;
-  const int right = share > 1e-3f ? left + 1 : left;
-  return {share < 1.f - 1e-3f ? left : right, right, share};
+  const int right = share > LEAST_SHARE ? left + 1 : left;
+  return {share < 1.f - LEAST_SHARE ? left : right, right, share};
 }
 
 // Depth between its source pixels, 0 where one of them is unknown (0).
@@ -31,8 +38,11 @@ __device__ __forceinline__ Span reading_pixels(int i, int big_size, float invers
   const float low = ((float)i - 0.5f) * inverse_ratio - 0.5f, high = ((float)i + 1.5f) * inverse_ratio - 0.5f;
   return {max((int)ceilf(low - 1e-3f), 0), min((int)floorf(high + 1e-3f), big_size - 1)};
 }
-__device__ __forceinline__ float weight_of(int i, Source s) {
-  return (s.near_ == i ? 1.f - s.share : 0.f) + (s.far_ == i ? s.share : 0.f);
+
+// The share that source pixel ``i`` has in the enlarged pixel ``reader``.
+__device__ __forceinline__ float share_in(int i, int reader, int size, float ratio) {
+  const float share = 1.f - fabsf(source_position(reader, size, ratio) - (float)i);
+  return share > LEAST_SHARE ? (share < 1.f - LEAST_SHARE ? share : 1.f) : 0.f;
 }
 
 // Adds d loss / d enlarged depth of every pair (B, P, H, W) to d loss / d depth (B, h, w).
@@ -53,8 +63,8 @@ extern "C" __global__ void __launch_bounds__(256) gather_depth_gradient(
       const float* line = pull + pair * plane + (size_t)v * big_width;
       float along = 0.f;
       for (int u = columns.first; u <= columns.last; u++)
-        along += weight_of(x, source_pixels(u, width, ratio_x)) * line[u];
-      sum += weight_of(y, source_pixels(v, height, ratio_y)) * along;
+        along += share_in(x, u, width, ratio_x) * line[u];
+      sum += share_in(y, v, height, ratio_y) * along;
     }
   }
   if (sum != 0.f) d_depth[((size_t)b * height + y) * width + x] += sum;

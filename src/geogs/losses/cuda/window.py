@@ -55,6 +55,8 @@ class WindowLosses:
         pair_share: float,
         with_pose: bool = False,
     ) -> None:
+        if not 0 < pair_share <= 1:
+            raise ValueError(f"a pair's share of the loss is in (0, 1], not {pair_share}")
         self.table = table
         self.config = config
         self.views = views
@@ -135,8 +137,9 @@ class WindowLosses:
         height, width = t.render.height, t.render.width
         views, partners = self.views, self.partners
         kernels["begin_window"](
-            _blocks(max(views * partners, views), 128), 128, batch, pairs, t.poses, self._photo_settings,
-            self._targets, self._motions, loss, relative_gradient, views, partners,
+            _blocks(max(views * partners, views), 128), 128, batch, pairs, t.poses,
+            self._photo_settings, self._targets, self._motions, loss, relative_gradient,
+            views, partners,
         )  # fmt: skip
         if c.smoothness_weight > 0:
             kernels["inverse_median"](
