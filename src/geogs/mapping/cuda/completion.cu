@@ -17,10 +17,10 @@ struct Grid {
   int cells, padded;
 };
 
-// Bands of the smoothness term and what belongs to each unknown, in global memory, `padded` each.
+// What belongs to each unknown, in global memory, `padded` numbers each. `rows` are six such arrays:
+// the normal matrix's diagonal, its bands 1, 2, minors and 2 minors below, and the right side.
 struct Unknowns {
-  double *diagonal, *next_minor, *second_minor, *next_major, *second_major;
-  double *data, *scale, *weight, *solution;
+  double *rows, *smoothness, *data, *scale, *weight, *solution;
 };
 
 __device__ __forceinline__ int cell_of(const Grid& g, int i) {
@@ -69,30 +69,38 @@ __device__ void prepare_unknowns(
       scale = sigma_scale / sqrt((known ? information[c] : 0.) + 1e-9) + 0.002 * data;
       diagonal += 1e-6 / (typical * typical);
     }
-    u.diagonal[i] = diagonal;
-    u.next_minor[i] = next[0];
-    u.second_minor[i] = second[0];
-    u.next_major[i] = next[1];
-    u.second_major[i] = second[1];
+    u.smoothness[i] = diagonal;
+    u.rows[g.padded + i] = next[0];
+    u.rows[2 * g.padded + i] = second[0];
+    u.rows[3 * g.padded + i] = next[1];
+    u.rows[4 * g.padded + i] = second[1];
     u.data[i] = data;
     u.scale[i] = scale;
-    u.weight[i] = 1.;
+    u.solution[i] = data;
   }
 }
 
-// Entry (i, j) of the normal matrix, j <= i; the unit matrix beyond the last unknown.
-__device__ __forceinline__ double entry(const Grid& g, const Unknowns& u, int i, int j) {
-  if (j < 0 || i >= g.padded) return i == j ? 1. : 0.;
-  const int k = i - j;
-  if (k == 0) return u.diagonal[i] + u.weight[i] / (u.scale[i] * u.scale[i]);
-  if (k == 1) return u.next_minor[j];
-  if (k == 2) return u.second_minor[j];
-  if (k == g.minors) return u.next_major[j];
-  return k == 2 * g.minors ? u.second_major[j] : 0.;
+// Cauchy weights about the last solution, and with them the diagonal and the right side.
+__device__ void weigh_data(const Grid& g, const Unknowns& u) {
+  for (int i = threadIdx.x; i < g.padded; i += blockDim.x) {
+    const double away = (u.solution[i] - u.data[i]) / (2. * u.scale[i]);
+    const double weight = 1. / (1. + away * away), precision = weight / (u.scale[i] * u.scale[i]);
+    u.weight[i] = weight;
+    u.rows[i] = u.smoothness[i] + precision;
+    u.rows[5 * g.padded + i] = precision * u.data[i];
+  }
 }
 
-__device__ __forceinline__ double right_side(const Grid& g, const Unknowns& u, int i) {
-  return i < g.cells ? u.weight[i] / (u.scale[i] * u.scale[i]) * u.data[i] : 0.;
+// Columns that array number `lane` of the rows lies below the diagonal.
+__device__ __forceinline__ int band_offset(const Grid& g, int lane) {
+  return lane == 1 || lane == 2 ? lane : (lane == 3 || lane == 4 ? (lane - 2) * g.minors : 0);
+}
+
+// Number `lane` of row i; beyond the last unknown follows the unit matrix.
+__device__ __forceinline__ double row_entry(const Grid& g, const Unknowns& u, int i, int lane) {
+  const int j = i - band_offset(g, lane);
+  if (lane > 5 || j < 0) return 0.;
+  return i < g.padded ? u.rows[lane * g.padded + j] : (lane == 0 ? 1. : 0.);
 }
 
 // The window and what the threads exchange, in shared memory.
@@ -101,8 +109,7 @@ struct Window {
   double* matrix;   // (size, size + 1), circular
   double* right;    // (size), circular: right side, then the solution
   double* panel;    // (PANEL, size): factored columns by offset from the panel's first row
-  double* diagonal; // (PANEL, PANEL): factored diagonal block
-  double* inverse;  // (PANEL): 1 / its diagonal
+  double* diagonal; // (PANEL, PANEL): diagonal block of the back substitution
   double* solved;   // (PANEL): the panel's part of the solved right side
 };
 
@@ -111,50 +118,46 @@ __device__ __forceinline__ int place(const Window& w, int start, int offset) {
   return p < w.size ? p : p - w.size;
 }
 
-// Factor the panel's diagonal block: lane r of the first warp holds row r.
-__device__ void factor_diagonal(const Window& w, int start) {
-  const int lane = threadIdx.x, row = lane & (PANEL - 1);
-  double a[PANEL];
+// Cholesky factor of the panel's diagonal block, with the inverse of its diagonal. Every thread
+// makes its own: quicker than to wait for one that shares it.
+__device__ __forceinline__ void factor_diagonal(
+    const Window& w, int start, double (&l)[PANEL][PANEL], double (&inverse)[PANEL]) {
 #pragma unroll
-  for (int k = 0; k < PANEL; k++)
-    a[k] = k <= row ? w.matrix[(start + row) * (w.size + 1) + start + k] : 0.;
+  for (int i = 0; i < PANEL; i++)
+#pragma unroll
+    for (int j = 0; j <= i; j++) l[i][j] = w.matrix[(start + i) * (w.size + 1) + start + j];
 #pragma unroll
   for (int k = 0; k < PANEL; k++) {
-    const double inverse = rsqrt(__shfl_sync(ALL_LANES, a[k], k));
-    a[k] *= inverse;
-    if (lane == k) w.inverse[k] = inverse;
+    inverse[k] = rsqrt(l[k][k]);
 #pragma unroll
-    for (int j = k + 1; j < PANEL; j++) a[j] -= a[k] * __shfl_sync(ALL_LANES, a[k], j);
+    for (int i = k; i < PANEL; i++) l[i][k] *= inverse[k];
+#pragma unroll
+    for (int i = k + 1; i < PANEL; i++)
+#pragma unroll
+      for (int j = k + 1; j <= i; j++) l[i][j] -= l[i][k] * l[j][k];
   }
-  if (lane < PANEL)
-    for (int k = 0; k < PANEL; k++) w.diagonal[row * PANEL + k] = k <= row ? a[k] : 0.;
 }
 
 // Rows below the diagonal block, and the right side as one more row, times its inverse transpose.
+// The stored factor has the inverse of its diagonal in the diagonal's place.
 __device__ void solve_panel(const Window& w, int start, int first, double* factor, double* solved) {
+  double l[PANEL][PANEL], inverse[PANEL];
+  factor_diagonal(w, start, l, inverse);
   for (int o = threadIdx.x; o <= w.size; o += blockDim.x) {
-    double l[PANEL];
-    if (o < PANEL) {
-#pragma unroll
-      for (int k = 0; k < PANEL; k++) l[k] = w.diagonal[o * PANEL + k];
-    } else {
-      const double* row = o < w.size ? w.matrix + place(w, start, o) * (w.size + 1) : w.right;
-#pragma unroll
-      for (int k = 0; k < PANEL; k++) {
-        double s = row[start + k];
-#pragma unroll
-        for (int m = 0; m < k; m++) s -= l[m] * w.diagonal[k * PANEL + m];
-        l[k] = s * w.inverse[k];
-      }
-    }
+    const double* row = o < w.size ? w.matrix + place(w, start, o) * (w.size + 1) : w.right;
+    double x[PANEL];
 #pragma unroll
     for (int k = 0; k < PANEL; k++) {
+      double s = row[start + k];
+#pragma unroll
+      for (int m = 0; m < k; m++) s -= x[m] * l[k][m];
+      x[k] = o == k ? inverse[k] : s * inverse[k];
       if (o < w.size) {
-        w.panel[k * w.size + o] = l[k];
-        factor[k * w.size + o] = l[k];
+        w.panel[k * w.size + o] = x[k];
+        factor[k * w.size + o] = x[k];
       } else {
-        w.solved[k] = l[k];
-        solved[first + k] = l[k];
+        w.solved[k] = x[k];
+        solved[first + k] = x[k];
       }
     }
   }
@@ -192,37 +195,30 @@ __device__ void update_window(const Window& w, int start) {
   }
 }
 
-// Rows first + size ... + PANEL - 1 take the place of the panel's.
-__device__ void enter_rows(const Grid& g, const Unknowns& u, const Window& w, int start, int first) {
-  for (int e = threadIdx.x; e < PANEL * (w.size + 1); e += blockDim.x) {
-    const int a = e / (w.size + 1), o = e % (w.size + 1), i = first + w.size + a;
-    if (o == w.size) {
-      w.right[start + a] = right_side(g, u, i);
-    } else {
-      const int j = first + PANEL + o;
-      w.matrix[(start + a) * (w.size + 1) + place(w, start, (PANEL + o) % w.size)] =
-          j <= i ? entry(g, u, i, j) : 0.;
-    }
-  }
+// Row i takes its place in the window: one warp.
+__device__ __forceinline__ void enter_row(
+    const Grid& g, const Window& w, int position, double value) {
+  const int lane = threadIdx.x & 31, column = position - band_offset(g, lane);
+  for (int p = lane; p < w.size; p += 32) w.matrix[position * (w.size + 1) + p] = 0.;
+  __syncwarp();
+  if (lane < 5) w.matrix[position * (w.size + 1) + (column < 0 ? column + w.size : column)] = value;
+  if (lane == 5) w.right[position] = value;
 }
 
 // factor (padded / PANEL, PANEL, size) and the solved right side.
 __device__ void factorise(
     const Grid& g, const Unknowns& u, const Window& w, double* factor, double* solved) {
-  for (int e = threadIdx.x; e < w.size * w.size; e += blockDim.x) {
-    const int i = e / w.size, j = e % w.size;
-    w.matrix[i * (w.size + 1) + j] = j <= i ? entry(g, u, i, j) : 0.;
-    if (j == 0) w.right[i] = right_side(g, u, i);
-  }
+  const int lane = threadIdx.x & 31, warp = threadIdx.x >> 5;
+  for (int i = warp; i < w.size; i += WARPS) enter_row(g, w, i, row_entry(g, u, i, lane));
   __syncthreads();
   int start = 0;
   for (int first = 0; first < g.padded; first += PANEL) {
-    if (threadIdx.x < 32) factor_diagonal(w, start);
-    __syncthreads();
     solve_panel(w, start, first, factor + (long long)first * w.size, solved);
     __syncthreads();
+    // The next rows are fetched while the window is updated; they take the panel's place.
+    const double value = row_entry(g, u, first + w.size + warp, lane);
     update_window(w, start);
-    enter_rows(g, u, w, start, first);
+    enter_row(g, w, start + warp, value);
     start = place(w, start, PANEL);
     __syncthreads();
   }
@@ -266,7 +262,7 @@ __device__ void substitute(
     if (threadIdx.x < 32) {
       const int c = lane & (PANEL - 1);
       double x = w.solved[c];
-      const double inverse = 1. / w.diagonal[c * PANEL + c];
+      const double inverse = w.diagonal[c * PANEL + c];
 #pragma unroll
       for (int o = PANEL - 1; o >= 0; o--) {
         const double above = __shfl_sync(ALL_LANES, x * inverse, o);
@@ -278,13 +274,6 @@ __device__ void substitute(
       }
     }
     __syncthreads();
-  }
-}
-
-__device__ void reweight(const Grid& g, const Unknowns& u) {
-  for (int i = threadIdx.x; i < g.padded; i += blockDim.x) {
-    const double away = (u.solution[i] - u.data[i]) / (2. * u.scale[i]);
-    u.weight[i] = 1. / (1. + away * away);
   }
 }
 
@@ -324,8 +313,8 @@ __device__ void write_evidence(
 
 // grids (keyframes, 3, cells): the tracker's inverse depth, its information, smoothness weights;
 // typical (keyframes): median inverse depth. out (keyframes, 3, cells): completed inverse depth,
-// prior weight, relative precision. scratch (keyframes, 10 padded + padded (band + PANEL)).
-// Block of 32 x PANEL threads; shared: (window^2 + window (PANEL + 2) + PANEL (PANEL + 2)) doubles
+// prior weight, relative precision. scratch (keyframes, padded (12 + window)).
+// Block of 32 x PANEL threads; shared: (window^2 + window (PANEL + 2) + PANEL (PANEL + 1)) doubles
 // with window = band + PANEL.
 extern "C" __global__ void complete_grids(
     const float* grids, const float* typical, const float* settings, int minors, int majors,
@@ -338,12 +327,11 @@ extern "C" __global__ void complete_grids(
   w.right = w.matrix + w.size * (w.size + 1);
   w.panel = w.right + w.size;
   w.diagonal = w.panel + PANEL * w.size;
-  w.inverse = w.diagonal + PANEL * PANEL;
-  w.solved = w.inverse + PANEL;
-  double* own = scratch + (long long)blockIdx.x * padded * (10 + w.size);
-  const Unknowns u = {own, own + padded, own + 2 * padded, own + 3 * padded, own + 4 * padded,
-                      own + 5 * padded, own + 6 * padded, own + 7 * padded, own + 8 * padded};
-  double *solved = own + 9 * padded, *factor = own + 10 * padded;
+  w.solved = w.diagonal + PANEL * PANEL;
+  double* own = scratch + (long long)blockIdx.x * padded * (12 + w.size);
+  const Unknowns u = {own, own + 6 * padded, own + 7 * padded, own + 8 * padded, own + 9 * padded,
+                      own + 10 * padded};
+  double *solved = own + 11 * padded, *factor = own + 12 * padded;
   const Settings s = {settings[0], settings[1], settings[2], settings[3],
                       settings[4], settings[5], settings[6], settings[7]};
   grids += (long long)blockIdx.x * 3 * g.cells;
@@ -352,10 +340,12 @@ extern "C" __global__ void complete_grids(
                    s.sigma_scale, u);
   __syncthreads();
   for (int round = 0; round < ROUNDS; round++) {
+    weigh_data(g, u);
+    __syncthreads();
     factorise(g, u, w, factor, solved);
     substitute(g, u, w, factor, solved);
-    reweight(g, u);
-    __syncthreads();
   }
+  weigh_data(g, u);
+  __syncthreads();
   write_evidence(grids, g, u, typical[blockIdx.x], s, out + (long long)blockIdx.x * 3 * g.cells);
 }

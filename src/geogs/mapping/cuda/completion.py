@@ -24,7 +24,7 @@ def _window(minors: int) -> int:
 
 def _shared_bytes(minors: int) -> int:
     window = _window(minors)
-    return 8 * (window**2 + window * (_PANEL + 2) + _PANEL * (_PANEL + 2))
+    return 8 * (window**2 + window * (_PANEL + 2) + _PANEL * (_PANEL + 1))
 
 
 def can_complete(shape: tuple[int, ...], device: torch.device) -> bool:
@@ -51,7 +51,7 @@ def complete(
     minors, majors = (gh, gw) if by_columns else (gw, gh)
     strides = (gw, 1) if by_columns else (1, gw)
     window, padded = _window(minors), -(-gh * gw // _PANEL) * _PANEL
-    scratch = grids.new_empty(count * padded * (10 + window), dtype=torch.float64)
+    scratch = grids.new_empty(count * padded * (12 + window), dtype=torch.float64)
     out = torch.empty_like(grids)
     kernels_for(SOURCE, grids.device)["complete_grids"](
         count, 32 * _PANEL, grids, upload(np.array(typical, np.float32), grids.device),

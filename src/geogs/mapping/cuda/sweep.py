@@ -12,7 +12,8 @@ from geogs.config import DepthConfig
 from geogs.gpu.kernels import kernels_for
 from geogs.mapping.cuda.images import KeyframeImages, upload
 
-SOURCE = Path(__file__).with_name("plane_sweep.cu")
+MATCHING = Path(__file__).with_name("matching.cu")
+AGGREGATION = Path(__file__).with_name("aggregation.cu")
 
 MAX_PLANES = 256
 """More than that do not fit the registers of a warp."""
@@ -73,9 +74,9 @@ def match_planes(
     threads = min(1024, max(-(-size // 32) * 32, _TILE_W * _TILE_H))
     grid = (-(-w // _TILE_W), -(-h // _TILE_H), len(planes.rho) // _SLOT_GROUP)
     volume = grey.new_empty(h, w, len(planes.rho))
-    kernels_for(SOURCE, grey.device)["match_planes"](
+    kernels_for(MATCHING, grey.device)["match_planes"](
         grid, threads, grey, images, homographies, planes.rho, len(planes.rho), n, h, w, radius,
-        keep, config.variance_floor, volume, shared=3 * 4 * size,
+        keep, config.variance_floor, volume, shared=4 * (3 * size + 12 * n),
     )  # fmt: skip
     return volume
 
@@ -91,7 +92,7 @@ def average_support(
     """Costs averaged over pixels of like colour, and pulled to the prior inverse depth."""
     h, w = volume.shape[:2]
     radius, out = config.support_radius, torch.empty_like(volume)
-    kernels_for(SOURCE, volume.device)["average_support"](
+    kernels_for(MATCHING, volume.device)["average_support"](
         (-(-w // 8), -(-h // 4)), (32, 8, 4), volume, colours, planes.rho, prior, prior_weight,
         planes.per, h, w, radius, config.support_sharpness, config.prior_pull,
         config.prior_tolerance, out, shared=32 * 4 * (2 * radius + 1) ** 2,
@@ -108,7 +109,7 @@ def follow_paths(
     """Semi-global path costs in each of the eight directions."""
     h, w = smooth.shape
     paths = volume.new_empty(8, *volume.shape)
-    kernels_for(SOURCE, volume.device)["follow_paths"](
+    kernels_for(AGGREGATION, volume.device)["follow_paths"](
         (-(-(w + h - 1) // 4), 8), (32, 4), volume, smooth, planes.per, h, w, config.small_jump,
         config.large_jump, config.jump_contrast, paths,
     )  # fmt: skip
@@ -121,7 +122,7 @@ def pick_planes(
     """The winners of the summed path costs."""
     h, w = volume.shape[:2]
     out = [volume.new_empty(h, w) for _ in range(3)]
-    kernels_for(SOURCE, volume.device)["pick_planes"](
+    kernels_for(AGGREGATION, volume.device)["pick_planes"](
         -(-h * w // 4), (32, 4), paths, volume, planes.per, h * w, planes.count, planes.first,
         planes.spacing, *out,
     )  # fmt: skip
