@@ -56,7 +56,7 @@ class Scene:
     @staticmethod
     def make(device: torch.device, zoom: float = 2.0, normals: bool = True) -> "Scene":
         """Four keyframes, three in the batch of four (one place is empty), up to two partners."""
-        scale = 1 if device.type == "cpu" else 12
+        scale = 1 if device.type == "cpu" else 8
         width, height = 61 * scale + 1, 37 * scale
         camera = Camera(50.0 * scale, 51.0 * scale, 30.3 * scale, 18.2 * scale, width, height)
         photo = camera.resized(round(zoom * width), round(zoom * height))
