@@ -1,6 +1,7 @@
 """``geogs doctor``: findings, what is to be mended, exit codes."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -128,6 +129,37 @@ def test_cache_state(monkeypatch, tmp_path):
     problem = doctor._cache(is_needed=True).problem
     assert problem is not None
     assert "every start compiles them again; set GEOGS_CACHE" in problem
+
+
+def test_gpus_and_driver_are_named(machine, monkeypatch):
+    machine((13, 1), "13.0", available=True)
+    gpu = SimpleNamespace(name="Test GPU", total_memory=24 * 2**30, major=9, minor=0)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    monkeypatch.setattr(torch.cuda, "get_device_properties", lambda index: gpu)
+    monkeypatch.setattr(installation, "driver_release", lambda: "580.65.06")
+    found = list(doctor._gpus())
+    assert [f.name for f in found] == ["GPU 0", "GPU 1", "driver"]
+    assert found[1].text == "Test GPU, 24.0 GiB, capability 9.0"
+    assert found[2].text == "580.65.06, supports CUDA 13.1"
+    assert not any(f.problem for f in found)
+
+
+def test_kernels_that_do_not_compile(monkeypatch):
+    def broken(folder, device):
+        raise DeviceError("The CUDA kernels in x.cu do not compile: line 3")
+
+    monkeypatch.setattr(kernels, "prepare_kernels", broken)
+    finding = doctor._kernels(torch.device("cuda"))
+    assert finding.is_fatal
+    assert finding.problem == "The CUDA kernels in x.cu do not compile: line 3"
+
+
+def test_missing_compiler(monkeypatch):
+    def missing():
+        raise DeviceError("The CUDA 13 run-time compiler (libnvrtc) is missing; install it.")
+
+    monkeypatch.setattr(kernels, "compiler", missing)
+    assert "libnvrtc" in (doctor._compiler().problem or "")
 
 
 def test_all_kernels_are_prepared(monkeypatch, tmp_path):
