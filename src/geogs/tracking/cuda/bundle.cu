@@ -151,12 +151,13 @@ extern "C" __global__ void __launch_bounds__(256) eliminate_depths(
   }
 }
 
-// Sums up the lower triangle of the camera system, always in the same order. One block of 256 per
-// place p (poses + 1) + q: the 6 x 6 block (p, q), or the right-hand side of pose p for q = poses.
-// Parts first[n] to first[n + 1] of place n are vectors, or twice a block, plus one if transposed.
+// Sums up the lower triangle of the camera system, always in the same order, and damps it; below it
+// the right-hand side is one more row. One block of 256 threads per place p (poses + 1) + q: the
+// 6 x 6 block (p, q), or the right-hand side of pose p for q = poses. Parts first[n] to
+// first[n + 1] of place n are vectors, or twice a block, plus one if transposed.
 extern "C" __global__ void __launch_bounds__(256) assemble_system(
     const int* places, const int* first, const int* parts, const double* blocks,
-    const double* vectors, int poses, double* H, double* g) {
+    const double* vectors, int poses, double damping, double* system) {
   __shared__ double partial[7][36];
   int place = places[blockIdx.x], p = place / (poses + 1), q = place % (poses + 1);
   int group = threadIdx.x / 36, t = threadIdx.x % 36, end = first[blockIdx.x + 1];
@@ -172,8 +173,9 @@ extern "C" __global__ void __launch_bounds__(256) assemble_system(
   __syncthreads();
   if (group || (right_hand_side && t >= 6)) return;
   for (int n = 1; n < 7; n++) sum += partial[n][t];
-  if (right_hand_side) g[6 * p + t] = sum;
-  else H[(size_t)(6 * p + t / 6) * (6 * poses) + 6 * q + t % 6] = sum;
+  if (!right_hand_side && p == q && t % 7 == 0) sum += damping * fabs(sum) + 1e-2;
+  size_t size = 6 * poses, row = right_hand_side ? size : 6 * p + t / 6;
+  system[row * size + (right_hand_side ? 6 * p + t : 6 * q + t % 6)] = sum;
 }
 
 // Back-substitution (b - E^T xi_rel) / C; a step that is not finite sets `failed` for good.

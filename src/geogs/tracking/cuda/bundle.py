@@ -1,7 +1,6 @@
 """Dense bundle adjustment on the GPU: a handful of launches per step, one wait per solve."""
 
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +12,12 @@ from geogs.gpu.kernels import kernels_for
 from geogs.tracking.bundle import BundleOptions, BundleProblem, BundleResult
 from geogs.tracking.grid import SampleGrid
 
-MAX_SMALL = 16
+MAX_FEW = 16
 """Free poses up to which one block solves the camera system; ``MAX_POSES`` of the source."""
+PANEL = 48
+"""Columns of a larger system that are factored at a time; ``PANEL`` of the source."""
+TILE = 32
+"""Rows and columns of the tiles of a larger system; ``TILE`` of the source."""
 
 
 def block_size(cells: int) -> int:
@@ -26,6 +29,8 @@ def block_size(cells: int) -> int:
 class _Structure:
     """Which frames and edges there are and how they meet, as index arrays on the device."""
 
+    poses: int
+    """Number of free poses."""
     source: Tensor
     target: Tensor
     first: Tensor
@@ -36,8 +41,6 @@ class _Structure:
     pair_a: Tensor
     """Pairs a <= b of edges of one source that the elimination joins."""
     pair_b: Tensor
-    free: Tensor
-    """Frames with free poses."""
     places: Tensor
     """Blocks of the camera system, see ``assemble_system``."""
     first_part: Tensor
@@ -51,10 +54,6 @@ class _Structure:
     def edges(self) -> int:
         return len(self.source)
 
-    @property
-    def poses(self) -> int:
-        return len(self.free)
-
 
 def _structure(problem: BundleProblem, device: torch.device) -> _Structure:
     """The index arrays, sent to the device in one piece."""
@@ -65,11 +64,11 @@ def _structure(problem: BundleProblem, device: torch.device) -> _Structure:
     first = np.searchsorted(source, np.arange(len(free_pose) + 1))
     a, b = _joined_edges(first, free_depth)
     slot = np.where(free_pose, np.cumsum(free_pose) - 1, -1)
-    free = np.flatnonzero(free_pose)
-    system = _system_parts(slot[source[a]], slot[target[a]], slot[target[b]], a == b, len(free))
-    parts = [source, target, first, slot, free_depth, a, b, free, *system]
+    poses = int(free_pose.sum())
+    system = _system_parts(slot[source[a]], slot[target[a]], slot[target[b]], a == b, poses)
+    parts = [source, target, first, slot, free_depth, a, b, *system]
     sent = torch.from_numpy(np.concatenate(parts).astype(np.int32)).to(device, non_blocking=True)
-    return _Structure(*sent.split([len(p) for p in parts]))
+    return _Structure(poses, *sent.split([len(p) for p in parts]))
 
 
 def _joined_edges(
@@ -108,11 +107,15 @@ def _system_parts(
     right = np.concatenate([target_a[same], source[same]])
     vector = np.concatenate([2 * pair[same], 2 * pair[same] + 1])[right >= 0]
     right = right[right >= 0]
-    place = np.concatenate([row[lower] * (poses + 1) + column[lower], right * (poses + 1) + poses])
+    found = np.concatenate([row[lower] * (poses + 1) + column[lower], right * (poses + 1) + poses])
     part = np.concatenate([part[lower], vector])
-    order = np.argsort(place, kind="stable")
-    places, first = np.unique(place[order], return_index=True)
-    return places, np.append(first, len(order)), part[order]
+    order = np.argsort(found, kind="stable")
+    # Every place is listed, so that those without parts are set to zero.
+    p, q = np.tril_indices(poses)
+    places = np.concatenate([p * (poses + 1) + q, np.arange(poses) * (poses + 1) + poses])
+    places.sort()
+    first = np.searchsorted(found[order], np.append(places, (poses + 1) ** 2))
+    return places, first, part[order]
 
 
 class _Workspace:
@@ -129,8 +132,11 @@ class _Workspace:
         self.T = self.state[: 16 * s.frames]
         self.failed = self.state[16 * s.frames :].view(torch.int32)
         self.inverse_depth = d.clone()
-        self.H = self.state.new_zeros(6 * s.poses, 6 * s.poses)
-        self.g = self.state.new_zeros(6 * s.poses)
+        size = 6 * s.poses
+        self.system = self.state.new_empty((size + 1) * size)
+        self.panels = -(-size // PANEL)
+        self.inverses = self.state.new_empty(self.panels * PANEL * PANEL)
+        self.good = torch.empty(1, dtype=torch.int32, device=device)
         self.xi = self.state.new_zeros(6 * s.frames)
         self.blocks = self.state.new_empty(144 * len(s.pair_a))
         self.vectors = self.state.new_empty(12 * len(s.pair_a))
@@ -141,10 +147,6 @@ class _Workspace:
         self.information = torch.zeros_like(d)
         self.inverse_curvature, self.depth_gradient, self.delta = d.new_empty(3, d.numel()).unbind()
         self.residual = d.new_zeros(edges)
-
-    @cached_property
-    def free(self) -> Tensor:
-        return self.structure.free.long()
 
 
 class CudaDenseBundle:
@@ -202,20 +204,29 @@ class CudaDenseBundle:
             w.blocks, w.vectors,
         )  # fmt: skip
         self._step["assemble_system"](
-            len(s.places), 256, s.places, s.first_part, s.parts, w.blocks, w.vectors, s.poses, w.H,
-            w.g,
+            len(s.places), 256, s.places, s.first_part, s.parts, w.blocks, w.vectors, s.poses,
+            options.damping, w.system,
         )  # fmt: skip
-        if s.poses <= MAX_SMALL:
+        if s.poses <= MAX_FEW:
             threads = min(256, 32 * s.poses)
-            self._solve["solve_camera_system"](
-                1, threads, w.H, w.g, s.slot, s.poses, s.frames, options.damping, w.xi
-            )
-            return
-        diagonal = w.H.diagonal()
-        diagonal.add_(options.damping * diagonal.abs() + 1e-2)
-        factor, info = torch.linalg.cholesky_ex(w.H)  # reads the lower triangle only
-        steps = torch.cholesky_solve(w.g[:, None], factor).reshape(-1, 6)
-        w.xi.view(-1, 6)[w.free] = torch.where(info == 0, steps, torch.nan)
+            self._solve["solve_few_poses"](1, threads, w.system, s.slot, s.poses, s.frames, w.xi)
+        else:
+            self._solve_many_poses(w)
+
+    def _solve_many_poses(self, w: _Workspace) -> None:
+        """Cholesky's method panel by panel."""
+        s, size = w.structure, 6 * w.structure.poses
+        for k in range(0, size, PANEL):
+            self._solve["factor_panel"](1, 256, w.system, size, k, w.inverses, w.good)
+            # The right-hand side is a row below every panel.
+            tiles = -(-(size + 1 - min(k + PANEL, size)) // TILE)
+            self._solve["substitute_panel"](tiles, 256, w.system, size, k, w.inverses)
+            if k + PANEL < size:
+                self._solve["update_rest"]((tiles, tiles), 256, w.system, size, k)
+        threads = min(1024, 32 * s.poses)
+        self._solve["substitute_back"](
+            1, threads, w.system, size, w.inverses, w.good, s.slot, s.frames, w.xi
+        )
 
     def _move(self, w: _Workspace, options: BundleOptions) -> None:
         s, block = w.structure, block_size(w.cells)
