@@ -11,21 +11,29 @@ from geogs.mapping.depth_view import DepthView
 from geogs.tracking.grid import OFFSET, STRIDE
 
 
-def parallax_degrees(reference: DepthView, other: DepthView, depth: float) -> tuple[float, float]:
-    """Angle between the two rays to the point ``depth`` ahead, and between the two directions."""
+def parallax_degrees(
+    reference: DepthView, others: Sequence[DepthView], depth: float
+) -> tuple[Float64[np.ndarray, "n"], Float64[np.ndarray, "n"]]:
+    """Angles between the two rays to the point ``depth`` ahead, and between the two directions."""
+    poses = np.stack([v.T_cw for v in others])
+    centers = -(np.swapaxes(poses[:, :3, :3], 1, 2) @ poses[:, :3, 3:])[:, :, 0]
     ray = depth * reference.forward
-    back = reference.center + ray - other.center
-    return _angle(ray, back), _angle(reference.forward, other.forward)
+    return (
+        _angles(ray, reference.center + ray - centers),
+        _angles(reference.forward, poses[:, 2, :3]),
+    )
 
 
-def _angle(a: Float64[np.ndarray, "3"], b: Float64[np.ndarray, "3"]) -> float:
-    cosine = a @ b / (np.linalg.norm(a) * np.linalg.norm(b) + 1e-12)
-    return float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
+def _angles(a: Float64[np.ndarray, "3"], b: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n"]:
+    cosine = b @ a / (np.linalg.norm(a) * np.linalg.norm(b, axis=1) + 1e-12)
+    return np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
 
 
-def misfit(parallax: float, turn: float, best: float) -> float:
-    """How far a pair is from ``best`` degrees of parallax (log scale) and from looking alike."""
-    return abs(float(np.log(max(parallax, 0.05) / best))) + (turn / 20.0) ** 2
+def misfit(
+    parallax: Float64[np.ndarray, "n"], turn: Float64[np.ndarray, "n"], best: float
+) -> Float64[np.ndarray, "n"]:
+    """How far pairs are from ``best`` degrees of parallax (log scale) and from looking alike."""
+    return np.abs(np.log(np.maximum(parallax, 0.05) / best)) + (turn / 20.0) ** 2
 
 
 def select_sweep_neighbours(
@@ -38,17 +46,18 @@ def select_sweep_neighbours(
     orientation can be matched. Too small or too large a parallax, or looking more than 35 degrees
     aside, excludes; if nobody is left, the two nearest to good are taken.
     """
-    scored = []
-    for i, other in enumerate(candidates):
-        if other.id == reference.id:
-            continue
-        parallax, turn = parallax_degrees(reference, other, depth)
-        usable = config.min_parallax < parallax < config.max_parallax and turn < config.max_turn
-        scored.append((not usable, misfit(parallax, turn, config.parallax), i))
-    scored.sort()
-    usable_ids = [i for bad, _, i in scored if not bad]
-    if not usable_ids:
-        return [i for _, _, i in scored[:2]]
+    others = np.array([i for i, v in enumerate(candidates) if v.id != reference.id], int)
+    if len(others) == 0:
+        return []
+    parallax, turn = parallax_degrees(reference, [candidates[i] for i in others], depth)
+    usable = (config.min_parallax < parallax) & (parallax < config.max_parallax)
+    usable &= turn < config.max_turn
+    order = np.lexsort((misfit(parallax, turn, config.parallax), ~usable))
+    ranked: list[int] = others[order].tolist()
+    count = int(usable.sum())
+    if count == 0:
+        return ranked[:2]
+    usable_ids = ranked[:count]
     pool = usable_ids[: 3 * config.neighbours]
     chosen: list[int] = []
     directions: list[np.ndarray] = []
@@ -73,9 +82,7 @@ def depth_range(
     relative deviation is below ``config.range_deviation``), seen from the reference and widened by
     ``config.range_margin`` on both sides. (0.1, 10) if the tracker knows next to nothing.
     """
-    inverse = np.concatenate(
-        [_seen_inverse_depth(reference, v, working, config) for v in (reference, *others)]
-    )
+    inverse = _seen_inverse_depth(reference, (reference, *others), working, config)
     if len(inverse) < 8:
         return 0.1, 10.0
     low, high = np.percentile(inverse, [0.5, 99.5])
@@ -83,21 +90,23 @@ def depth_range(
 
 
 def _seen_inverse_depth(
-    reference: DepthView, view: DepthView, working: Camera, config: DepthConfig
+    reference: DepthView, views: Sequence[DepthView], working: Camera, config: DepthConfig
 ) -> Float64[np.ndarray, "n"]:
-    """Inverse depths, in the reference view, of the sure cells of ``view`` that it can see."""
-    grid = view.inverse_depth.astype(np.float64)
-    known = np.isfinite(grid) & (grid > 0) & (view.information > 0)
-    rows, columns = np.nonzero(known)
-    z = 1.0 / grid[known]
-    deviation = z / np.sqrt(view.information[known])
-    if len(deviation) == 0:
-        return deviation
-    sure = deviation <= max(config.range_deviation, float(np.median(deviation)))
-    x = (OFFSET + STRIDE * columns - working.cx) / working.fx * z
-    y = (OFFSET + STRIDE * rows - working.cy) / working.fy * z
-    relative = reference.T_cw @ np.linalg.inv(view.T_cw)
-    point = relative[:3, :3] @ np.stack([x, y, z])[:, sure] + relative[:3, 3:]
+    """Inverse depths, in the reference view, of the views' sure cells that it can see."""
+    grid = np.stack([v.inverse_depth for v in views]).astype(np.float64)
+    information = np.stack([v.information for v in views])
+    known = np.isfinite(grid) & (grid > 0) & (information > 0)
+    z = 1.0 / np.where(known, grid, 1.0)
+    deviation = z / np.sqrt(np.where(known, information, np.float32(1.0)))
+    medians = [np.median(d[k]) if k.any() else 0.0 for d, k in zip(deviation, known, strict=True)]
+    limits = np.maximum(config.range_deviation, medians)
+    sure = known & (deviation <= limits[:, None, None])
+    x = (OFFSET + STRIDE * np.arange(grid.shape[2]) - working.cx) / working.fx * z
+    y = (OFFSET + STRIDE * np.arange(grid.shape[1])[:, None] - working.cy) / working.fy * z
+    relative = reference.T_cw @ np.linalg.inv(np.stack([v.T_cw for v in views]))
+    camera = np.stack([x, y, z], 1).reshape(len(views), 3, -1)
+    point = relative[:, :3, :3] @ camera + relative[:, :3, 3:]
+    point = point.transpose(1, 0, 2)[:, sure.reshape(len(views), -1)]
     point = point[:, point[2] > 1e-6]
     u = point[0] / point[2] * working.fx + working.cx
     v = point[1] / point[2] * working.fy + working.cy

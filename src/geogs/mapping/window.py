@@ -31,11 +31,13 @@ def choose_partners(
     view: MapView, others: list[MapView], depth: float, config: PhotoConfig
 ) -> list[int]:
     """Ids of the keyframes best placed to check a view's depth by photo-consistency, best first."""
-    scored = []
-    for other in others:
-        if other.id == view.id:
-            continue
-        parallax, turn = parallax_degrees(view.depth_view, other.depth_view, depth)
-        if config.min_parallax < parallax < config.max_parallax and turn < config.looking_within:
-            scored.append((misfit(parallax, turn, config.parallax), other.id))
-    return [i for _, i in sorted(scored)[: config.candidates]]
+    others = [o for o in others if o.id != view.id]
+    if not others:
+        return []
+    views = [o.depth_view for o in others]
+    parallax, turn = parallax_degrees(view.depth_view, views, depth)
+    usable = (config.min_parallax < parallax) & (parallax < config.max_parallax)
+    usable &= turn < config.looking_within
+    scores = misfit(parallax, turn, config.parallax)
+    scored = sorted((scores[i], o.id) for i, o in enumerate(others) if usable[i])
+    return [i for _, i in scored[: config.candidates]]
