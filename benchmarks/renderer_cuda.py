@@ -3,10 +3,11 @@
     python benchmarks/renderer_cuda.py [--rounds 60] [--json FILE]
 
 Needs a GPU. Where gsplat (1.5) can be imported, both render the same room in turns, so that what
-else the machine does hits both alike; its times are for its public autograd function as it stands,
-whose depth is that of the disks' centres and not of the hits. Each time is the median over the
-rounds of one forward and backward pass: between CUDA events around a burst of passes, on the host's
-clock without waiting, and summed over the kernels alone.
+else the machine does hits both alike. Its times are for its public autograd function as it stands,
+which blends the depths of the disks' centres, not of the hits, and waits for the GPU at the end of
+its backward pass (the sums over the kernels leave that out). Each time is the median over the
+rounds of one forward and backward pass: between CUDA events around a burst of passes, on the
+host's clock until the calls return, and summed over the kernels alone.
 """
 
 import argparse

@@ -2,6 +2,7 @@
 
 import ctypes
 import functools
+import warnings
 from pathlib import Path
 
 import torch
@@ -42,7 +43,10 @@ def driver_release() -> str | None:
 
 def gpu_problem() -> str | None:
     """One sentence on why PyTorch cannot use an NVIDIA GPU here and what to do, None if it can."""
-    if torch.version.cuda is not None and torch.cuda.is_available():
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # PyTorch's own words on an old driver; ours follow
+        available = torch.version.cuda is not None and torch.cuda.is_available()
+    if available:
         return None
     supported, built = driver_cuda(), torch.version.cuda
     has_driver = supported is not None or _KERNEL_MODULE.exists()
