@@ -94,13 +94,8 @@ class CudaDepthEngine:
         """As in the protocol."""
         checked = []
         for own, rest in zip(depths, others, strict=True):
-            depth, confidence = own.depth.depth, own.depth.confidence
-            if rest:
-                poses = [o.T_cw for o in rest]
-                depth, confidence = check(
-                    depth, confidence, own.T_cw, *_stack(rest), poses, self.render, self.config
-                )
-            checked.append((depth, confidence))
+            unchanged = own.depth.depth, own.depth.confidence
+            checked.append(check(own, rest, self.render, self.config) if rest else unchanged)
         return _with_medians(checked)
 
     def keep(self, points: Float[Tensor, "n 3"], depths: Sequence[PosedDepth]) -> Bool[Tensor, "n"]:
@@ -108,8 +103,7 @@ class CudaDepthEngine:
         points = points.detach().float().contiguous()
         if not depths:
             return torch.isfinite(points).all(1)
-        poses = [d.T_cw for d in depths]
-        return vote(points, poses, *_stack(depths), self.render, self.config)
+        return vote(points, depths, self.render, self.config)
 
     def _plan(self, reference: DepthView, neighbours: list[DepthView]) -> SearchPlan:
         grid, information = reference.inverse_depth, reference.information
@@ -161,14 +155,6 @@ class CudaDepthEngine:
             *choose_start(tracker, swept), tracker, config,
         )  # fmt: skip
         return judge(refined, swept.margin, tracker, plan.near, plan.far)
-
-
-def _stack(depths: Sequence[PosedDepth]) -> tuple[Tensor, Tensor]:
-    """Depths and confidences of several keyframes."""
-    return (
-        torch.stack([d.depth.depth for d in depths]),
-        torch.stack([d.depth.confidence for d in depths]),
-    )
 
 
 def _with_medians(maps: Sequence[tuple[Tensor, Tensor]]) -> list[DenseDepth]:

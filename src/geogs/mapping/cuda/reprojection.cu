@@ -1,9 +1,18 @@
 // Depth maps seen from elsewhere: transfer, mutual check, votes on points.
 //
 // `transforms` (n, 12): rotation (3 x 3, row by row) and translation of each view.
+// `maps` (n, 2): addresses of each view's depth and confidence (h, w).
 #include "common.cuh"
 
 #define NOTHING 0xffffffffffffffffull
+
+__device__ __forceinline__ const float* depth_map(const long long* maps, int view) {
+  return (const float*)maps[2 * view];
+}
+
+__device__ __forceinline__ const float* confidence_map(const long long* maps, int view) {
+  return (const float*)maps[2 * view + 1];
+}
 
 struct Lens { float fx, fy, cx, cy; };
 struct Point { float x, y, z; };
@@ -35,14 +44,14 @@ __device__ __forceinline__ Seen look_up(
 // Nearest points of other views per pixel of this one, each covering 2 x 2 pixels: the bits of z
 // above those of the confidence, which order as the numbers do. `seen` (n, h, w) starts as NOTHING.
 extern "C" __global__ void splat_depths(
-    const float* depths, const float* confidences, const float* transforms, int h, int w, float fx,
-    float fy, float cx, float cy, float least, unsigned long long* seen) {
+    const long long* maps, const float* transforms, int h, int w, float fx, float fy, float cx,
+    float cy, float least, unsigned long long* seen) {
   const int pixel = blockIdx.x * blockDim.x + threadIdx.x, pixels = h * w, j = blockIdx.y;
   if (pixel >= pixels) return;
-  const float sure = confidences[j * pixels + pixel];
+  const float sure = confidence_map(maps, j)[pixel];
   if (!(sure >= least)) return;
   const Lens lens = {fx, fy, cx, cy};
-  const float depth = depths[j * pixels + pixel];
+  const float depth = depth_map(maps, j)[pixel];
   const Point p = transform(transforms + 12 * j, back_project(lens, pixel % w, pixel / w, depth));
   if (!(p.z > 1e-4f)) return;
   const float left = floorf(fx * p.x / p.z + cx), top = floorf(fy * p.y / p.z + cy);
@@ -84,9 +93,9 @@ __device__ __forceinline__ Agreed agree_on_depth(
 // distance, repair below, repair votes, repair confidence, occlusion penalty, then bias and weights
 // of the logistic regression (own, support, violation).
 extern "C" __global__ void check_depth(
-    const float* depth, const float* confidence, const float* depths, const float* confidences,
-    const float* transforms, const unsigned long long* seen, const float* settings, int others,
-    int h, int w, float fx, float fy, float cx, float cy, float* new_depth, float* new_confidence) {
+    const float* depth, const float* confidence, const long long* maps, const float* transforms,
+    const unsigned long long* seen, const float* settings, int others, int h, int w, float fx,
+    float fy, float cx, float cy, float* new_depth, float* new_confidence) {
   const int pixel = blockIdx.x * blockDim.x + threadIdx.x, pixels = h * w;
   if (pixel >= pixels) return;
   const Lens lens = {fx, fy, cx, cy};
@@ -103,8 +112,8 @@ extern "C" __global__ void check_depth(
   const Point point = back_project(lens, pixel % w, pixel / w, z);
   float shift = 0.f, votes = 0.f, support = 0.f, violation = 0.f;
   for (int j = 0; j < others; j++) {
-    const Seen s = look_up(lens, transform(transforms + 12 * j, point), depths + j * pixels,
-                           confidences + j * pixels, h, w);
+    const Seen s = look_up(lens, transform(transforms + 12 * j, point), depth_map(maps, j),
+                           confidence_map(maps, j), h, w);
     const float error = s.ratio - 1.f;
     const float close = error / average_reach, agreeing = error / reach;
     const float near = s.sure * __expf(-0.5f * close * close);
@@ -123,18 +132,17 @@ extern "C" __global__ void check_depth(
 // Which world points to keep: those that are finite and that fewer than `free_views` views, or no
 // more than see them on their surface, see in free space. transforms: world to view.
 extern "C" __global__ void vote_on_points(
-    const float* points, const float* depths, const float* confidences, const float* transforms,
-    int count, int views, int h, int w, float fx, float fy, float cx, float cy,
-    float vote_confidence, float vote_support, float vote_violation, int free_views, bool* keep) {
+    const float* points, const long long* maps, const float* transforms, int count, int views, int h,
+    int w, float fx, float fy, float cx, float cy, float vote_confidence, float vote_support,
+    float vote_violation, int free_views, bool* keep) {
   const int i = blockIdx.x * blockDim.x + threadIdx.x;
   if (i >= count) return;
   const Lens lens = {fx, fy, cx, cy};
   const Point point = {points[3 * i], points[3 * i + 1], points[3 * i + 2]};
   int surface = 0, open = 0;
   for (int j = 0; j < views; j++) {
-    const long long start = (long long)j * h * w;
-    const Seen s =
-        look_up(lens, transform(transforms + 12 * j, point), depths + start, confidences + start, h, w);
+    const Seen s = look_up(lens, transform(transforms + 12 * j, point), depth_map(maps, j),
+                           confidence_map(maps, j), h, w);
     if (!(s.sure > vote_confidence)) continue;
     surface += fabsf(s.ratio - 1.f) < vote_support;
     open += s.ratio < 1.f - vote_violation;
