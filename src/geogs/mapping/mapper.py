@@ -11,9 +11,8 @@ from geogs.config import MappingConfig
 from geogs.geometry.camera import Camera
 from geogs.mapping.depth_engine import depth_engine
 from geogs.mapping.map_update import MapUpdate, plan_update
-from geogs.mapping.pose_refine import refine_poses
 from geogs.mapping.sweep_neighbors import select_sweep_neighbours
-from geogs.mapping.training import Trainer, draw_partners, shown_depth
+from geogs.mapping.training import Batch, MapTrainer, draw_partners, map_trainer, shown_depth
 from geogs.mapping.view import MapCameras, MapView
 from geogs.mapping.window import choose_partners, draw_views
 from geogs.splat.density import candidate_pixels, unexplained, worth_keeping
@@ -32,6 +31,8 @@ def _silent(fraction: float) -> None:
 
 # Keyframes whose depth checks a new keyframe's depth and whose free space carves around it.
 _CHECKING_VIEWS = 8
+# Steps of the final training between two reports of progress, at least.
+_REPORTED_STEPS = 20
 
 
 class Mapper:
@@ -51,7 +52,7 @@ class Mapper:
         )
         self.views: dict[int, MapView] = {}
         self.mapped: list[int] = []
-        self._trainer: Trainer | None = None
+        self._trainer: MapTrainer | None = None
         self._random = np.random.default_rng(seed)
         self._torch_random = torch.Generator().manual_seed(seed)
 
@@ -85,9 +86,10 @@ class Mapper:
         if len(self.mapped) > self.config.window:
             left = self.views[self.mapped[-1 - self.config.window]]
             self._insert(left, self.config.disk.fill_confidence)
-        for step in range(self.config.iterations):
-            ids = draw_views(self.mapped, step, self.config, self._random)
-            trainer.step(self._batch(ids))
+        steps = range(self.config.iterations)
+        trainer.train([
+            self._batch(draw_views(self.mapped, step, self.config, self._random)) for step in steps
+        ])  # fmt: skip
         if len(self.mapped) % self.config.disk.carve_every == 0:
             self.prune()
 
@@ -96,7 +98,7 @@ class Mapper:
         views = [self.views[i] for i in active if i in self.views and self.views[i].constants]
         if len(views) < 2 or len(self.map) == 0:
             return {}
-        poses = refine_poses(self.map, views, self.views, self.cameras, self.config, self.unit)
+        poses = self._training().refine_poses(views, self.views, self.config)
         for i, T_cw in poses.items():
             self.views[i].move(T_cw)
         return poses
@@ -147,11 +149,12 @@ class Mapper:
         """Median depth of the first keyframe, map units."""
         return self._training().unit
 
-    def _training(self) -> Trainer:
+    def _training(self) -> MapTrainer:
         if self._trainer is None:
             depth = self.views[self.mapped[0]].dense.arrays()
             sure = depth.depth[depth.confidence >= np.median(depth.confidence)]
-            self._trainer = Trainer(self.map, self.cameras, self.config, float(np.median(sure)))
+            unit = float(np.median(sure))
+            self._trainer = map_trainer(self.map, self.cameras, self.config, unit)
         return self._trainer
 
     def _estimate_ahead(self, keyframe_id: int) -> None:
@@ -195,7 +198,7 @@ class Mapper:
             pool = [self.views[j] for j in {*other.partners, view.id} if j in self.views]
             other.partners = choose_partners(other, pool, other.typical_depth, photo)
 
-    def _batch(self, ids: list[int]) -> list[tuple[MapView, list[MapView]]]:
+    def _batch(self, ids: list[int]) -> Batch:
         views = [self.views[i] for i in ids]
         return [(v, draw_partners(v, self.views, self.config, self._random)) for v in views]
 
@@ -238,19 +241,25 @@ class Mapper:
         """Single-view steps over all keyframes in random order, with falling learning rates."""
         trainer, total = self._training(), self.config.final_iterations
         fills, prunes = {total // 3, 2 * total // 3}, max(total // 4, 1)
+        events = fills | set(range(prunes, total, prunes))
+        stops = sorted(events | set(range(_REPORTED_STEPS, total, _REPORTED_STEPS)) | {total})
         order: list[int] = []
-        for step in range(1, total + 1):
-            if not order:
-                order = list(self._random.permutation(len(views)))
-            trainer.set_rate(self.config.lr_final ** (step / total))
-            trainer.step(self._batch([views[order.pop()].id]))
-            if step % prunes == 0 and step < total:
+        done = 0
+        for stop in stops:
+            batches = []
+            for _ in range(done, stop):
+                if not order:
+                    order = list(self._random.permutation(len(views)))
+                batches.append(self._batch([views[order.pop()].id]))
+            rates = [self.config.lr_final ** (step / total) for step in range(done + 1, stop + 1)]
+            trainer.train(batches, rates)
+            done = stop
+            if done % prunes == 0 and done < total:
                 self.prune()
-            if step in fills:
+            if done in fills:
                 for view in views:
                     self._insert(view, self.config.disk.fill_confidence)
-            progress(step / total)
-        trainer.set_rate(1.0)
+            progress(done / total)
 
     def _rendered(self, view: MapView) -> RenderedKeyframe:
         output = render(self.map, self.cameras.render, view.T_cw)

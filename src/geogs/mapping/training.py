@@ -1,4 +1,7 @@
-"""One step of training: losses of some views, gradients, Adam."""
+"""Training the map: losses of some views, gradients, Adam."""
+
+from collections.abc import Sequence
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -7,13 +10,17 @@ from torch import Tensor
 
 from geogs.config import MappingConfig
 from geogs.losses import fused_multi_view, fused_single_view
+from geogs.mapping.pose_refine import refine_poses
 from geogs.mapping.view import MapCameras, MapView
 from geogs.splat.map import DiskParameters, GaussianMap
 from geogs.splat.optimizer import LearningRates, MapOptimizer
 from geogs.splat.render import RenderOutput, render
 
-# A disk whose gradient exceeds this has met a numerical accident (a nearly edge-on pixel).
-_GRADIENT_LIMIT = 1e3
+Batch = list[tuple[MapView, list[MapView]]]
+"""The views of one step, each with the partners that check it by their images."""
+
+GRADIENT_LIMIT = 1e3
+"""A disk whose gradient exceeds this has met a numerical accident (a nearly edge-on pixel)."""
 
 
 def learning_rates(config: MappingConfig, unit: float, factor: float = 1.0) -> LearningRates:
@@ -59,8 +66,41 @@ def draw_partners(
     return [views[ids[i]] for i in random.choice(len(ids), count, replace=False)] if count else []
 
 
+@runtime_checkable
+class MapTrainer(Protocol):
+    """Trains a map in place, and poses on it."""
+
+    optimizer: MapOptimizer
+    unit: float
+    """Length in map units by which settings that are lengths are scaled."""
+
+    def train(self, batches: Sequence[Batch], factors: Sequence[float] | None = None) -> None:
+        """One Adam step per batch on its summed losses; ``factors`` scale all learning rates."""
+        ...
+
+    def refine_poses(
+        self, active: list[MapView], views: dict[int, MapView], config: MappingConfig
+    ) -> dict[int, Float[Tensor, "4 4"]]:
+        """Poses of the active keyframes that agree better with the map; the earliest stays."""
+        ...
+
+
+def map_trainer(
+    disks: GaussianMap, cameras: MapCameras, config: MappingConfig, unit: float
+) -> MapTrainer:
+    """The trainer of the device that holds the map.
+
+    A GPU trains in fused kernels, a CPU in compiled ones.
+    """
+    if disks.device.type == "cuda":
+        from geogs.mapping.cuda.trainer import CudaTrainer
+
+        return CudaTrainer(disks, cameras, config, unit)
+    return Trainer(disks, cameras, config, unit)
+
+
 class Trainer:
-    """Adam on a map, view by view."""
+    """Adam on a map, view by view, on a CPU."""
 
     def __init__(self, disks: GaussianMap, cameras: MapCameras, config: MappingConfig, unit: float):
         self.disks = disks
@@ -69,11 +109,21 @@ class Trainer:
         self.unit = unit
         self.optimizer = MapOptimizer(disks, learning_rates(config, unit))
 
-    def set_rate(self, factor: float) -> None:
-        """Scale all learning rates."""
-        self.optimizer.learning_rates = learning_rates(self.config, self.unit, factor)
+    def train(self, batches: Sequence[Batch], factors: Sequence[float] | None = None) -> None:
+        """One Adam step per batch on its summed losses; ``factors`` scale all learning rates."""
+        for n, batch in enumerate(batches):
+            factor = 1.0 if factors is None else factors[n]
+            self.optimizer.learning_rates = learning_rates(self.config, self.unit, factor)
+            self.step(batch)
+        self.optimizer.learning_rates = learning_rates(self.config, self.unit)
 
-    def step(self, batch: list[tuple[MapView, list[MapView]]]) -> float:
+    def refine_poses(
+        self, active: list[MapView], views: dict[int, MapView], config: MappingConfig
+    ) -> dict[int, Float[Tensor, "4 4"]]:
+        """Poses of the active keyframes that agree better with the map; the earliest stays."""
+        return refine_poses(self.disks, active, views, self.cameras, config, self.unit)
+
+    def step(self, batch: Batch) -> float:
         """One Adam step on the summed losses of views with their partners; returns the loss."""
         if len(self.disks) == 0:
             return 0.0
@@ -111,5 +161,5 @@ def _sane_gradients(parameters: DiskParameters) -> Bool[Tensor, "n"]:
     for p in parameters:
         if p.grad is not None:
             size = p.grad.abs().reshape(len(p), -1).amax(1)
-            sane &= size < _GRADIENT_LIMIT  # NaN compares false
+            sane &= size < GRADIENT_LIMIT  # NaN compares false
     return sane

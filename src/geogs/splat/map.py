@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from geogs.geometry.lie import matrix_to_quaternion, quaternion_multiply, sim3_scale
+from geogs.splat.rows import GrowingRows
 from geogs.types import MapSnapshot
 
 
@@ -31,6 +32,9 @@ class GaussianMap:
     ``seen`` the times it was marked as seen; all int64. While a :class:`MapOptimizer` trains the
     map, change the number or the frame of the disks through the optimiser, so that its moments
     follow.
+
+    All tensors are the first rows of larger ones (``room``), which stay where they are until more
+    disks come than there is room for.
     """
 
     def __init__(
@@ -40,10 +44,11 @@ class GaussianMap:
         steps: Int[Tensor, "n"] | None = None,
         seen: Int[Tensor, "n"] | None = None,
     ) -> None:
-        self.keyframe_id = keyframe_id
-        self.steps = torch.zeros_like(keyframe_id) if steps is None else steps
-        self.seen = torch.zeros_like(keyframe_id) if seen is None else seen
-        self._set_parameters(parameters)
+        steps = torch.zeros_like(keyframe_id) if steps is None else steps
+        seen = torch.zeros_like(keyframe_id) if seen is None else seen
+        self._trained = [GrowingRows(p) for p in parameters]
+        self._counts = [GrowingRows(c) for c in (keyframe_id, steps, seen)]
+        self._expose()
 
     @classmethod
     def empty(cls, device: torch.device | str = "cpu") -> "GaussianMap":
@@ -78,29 +83,41 @@ class GaussianMap:
         """In (0, 1), detached."""
         return self.opacity_logit.detach().sigmoid()
 
+    @property
+    def capacity(self) -> int:
+        """Disks there is room for; it changes whenever the tensors have moved."""
+        return len(self._trained[0].room)
+
+    @property
+    def room(self) -> DiskParameters:
+        """The trained tensors with all their room; rows beyond the disks mean nothing."""
+        return DiskParameters(*(rows.room for rows in self._trained))
+
+    @property
+    def counters_room(self) -> tuple[Int[Tensor, "c"], Int[Tensor, "c"]]:
+        """``steps`` and ``seen`` with all their room."""
+        return self._counts[1].room, self._counts[2].room
+
     def append(self, parameters: DiskParameters, keyframe_id: int | Int[Tensor, "m"]) -> None:
         """Add disks behind the present ones; gradients of the old tensors are dropped."""
         n = len(parameters.position)
         ids = torch.as_tensor(keyframe_id, dtype=torch.int64, device=self.device).expand(n)
         new = torch.zeros_like(ids)
-        self.keyframe_id = torch.cat([self.keyframe_id, ids])
-        self.steps = torch.cat([self.steps, new])
-        self.seen = torch.cat([self.seen, new])
-        self._set_parameters(
-            DiskParameters(
-                *(
-                    torch.cat([old.detach(), p.detach().to(old)])
-                    for old, p in zip(self.parameters, parameters, strict=True)
-                )
-            )
-        )
+        for rows, p in zip(self._trained, parameters, strict=True):
+            rows.append(p.to(rows.room))
+        for rows, c in zip(self._counts, (ids, new, new), strict=True):
+            rows.append(c)
+        self._expose()
 
     def keep(self, mask: Bool[Tensor, "n"]) -> None:
         """Drop the disks where ``mask`` is false; gradients are dropped."""
-        self.keyframe_id = self.keyframe_id[mask]
-        self.steps = self.steps[mask]
-        self.seen = self.seen[mask]
-        self._set_parameters(DiskParameters(*(p.detach()[mask] for p in self.parameters)))
+        self.take(mask.nonzero()[:, 0])
+
+    def take(self, index: Int[Tensor, "m"]) -> None:
+        """Keep the disks of the index; gradients are dropped."""
+        for rows in (*self._trained, *self._counts):
+            rows.take(index)
+        self._expose()
 
     def mark_seen(self, visible: Bool[Tensor, "n"]) -> None:
         """Count the disks that a rendering showed."""
@@ -135,6 +152,8 @@ class GaussianMap:
             opacity=self.opacity,
         )
 
-    def _set_parameters(self, parameters: DiskParameters) -> None:
-        fresh = (p.detach().clone().requires_grad_() for p in parameters)
+    def _expose(self) -> None:
+        """Fresh leaf tensors over the present rows, without gradients."""
+        fresh = (rows.rows.detach().requires_grad_() for rows in self._trained)
         self.position, self.quaternion, self.log_scale, self.opacity_logit = fresh
+        self.keyframe_id, self.steps, self.seen = (rows.rows for rows in self._counts)

@@ -10,6 +10,7 @@ from torch import Tensor
 from geogs.geometry.lie import matrix_to_quaternion, sim3_scale
 from geogs.splat.cpu.adam import adam_rows
 from geogs.splat.map import DiskParameters, GaussianMap
+from geogs.splat.rows import GrowingRows
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,11 +47,29 @@ class MapOptimizer:
         self.learning_rates = learning_rates
         self.betas = betas
         self.eps = eps
-        self.first = [torch.zeros_like(p) for p in disks.parameters]
-        self.second = [torch.zeros_like(p) for p in disks.parameters]
+        self._moments = tuple(
+            [GrowingRows(torch.zeros_like(p)) for p in disks.parameters] for _ in betas
+        )
         device = disks.device
         first, second = (_bias_corrections(beta).to(device) for beta in betas)
         self._corrections = (first, second)
+
+    @property
+    def first(self) -> list[Tensor]:
+        """Running means of the gradients, one tensor per group."""
+        return [m.rows for m in self._moments[0]]
+
+    @property
+    def second(self) -> list[Tensor]:
+        """Running means of the squared gradients."""
+        return [m.rows for m in self._moments[1]]
+
+    def moments_room(self) -> list[Tensor]:
+        """First, then second moments of the four groups with all their room (as the map's)."""
+        for moments in self._moments:
+            for m, p in zip(moments, self.disks.room, strict=True):
+                m.reserve(len(p))
+        return [m.room for moments in self._moments for m in moments]
 
     def zero_grad(self) -> None:
         """Forget the gradients."""
@@ -85,15 +104,20 @@ class MapOptimizer:
     def append(self, parameters: DiskParameters, keyframe_id: int | Tensor) -> None:
         """Add disks to the map, with empty moments."""
         n = len(parameters.position)
-        for moments in (self.first, self.second):
-            moments[:] = [torch.cat([m, m.new_zeros(n, *m.shape[1:])]) for m in moments]
+        for moments in self._moments:
+            for m in moments:
+                m.append(m.room.new_zeros(n, *m.room.shape[1:]))
         self.disks.append(parameters, keyframe_id)
 
     def keep(self, mask: Bool[Tensor, "n"]) -> None:
         """Drop disks from the map, and their moments."""
-        for moments in (self.first, self.second):
-            moments[:] = [m[mask] for m in moments]
-        self.disks.keep(mask)
+        index = mask.nonzero()[:, 0]
+        if len(index) == len(mask) == len(self.disks):
+            return
+        for moments in self._moments:
+            for m in moments:
+                m.take(index)
+        self.disks.take(index)
 
     @torch.no_grad()
     def transform(self, S: Float[Tensor, "*n 4 4"]) -> None:
@@ -107,9 +131,10 @@ class MapOptimizer:
         R = S[..., :3, :3] / scale
         by = {0: R / scale, 1: _left_product(matrix_to_quaternion(R))}
         for group, linear in by.items():
-            matrix = linear.to(self.first[group])
-            self.first[group] = (matrix @ self.first[group][..., None])[..., 0]
-            self.second[group] = (matrix.square() @ self.second[group][..., None])[..., 0]
+            first, second = self.first[group], self.second[group]
+            matrix = linear.to(first)
+            first.copy_((matrix @ first[..., None])[..., 0])
+            second.copy_((matrix.square() @ second[..., None])[..., 0])
         self.disks.transform(S)
 
     def _is_fused(self) -> bool:

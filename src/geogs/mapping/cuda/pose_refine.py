@@ -1,0 +1,93 @@
+"""Pose-only refinement on a GPU: all active keyframes in one pass."""
+
+from typing import TYPE_CHECKING
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from geogs.config import MappingConfig
+from geogs.geometry.lie import retract, se3_inverse
+from geogs.mapping.cuda.window_pass import WindowPass
+from geogs.mapping.view import MapView
+from geogs.splat.map import GaussianMap
+
+if TYPE_CHECKING:
+    from geogs.mapping.cuda.trainer import KnownViews
+
+
+def refine_poses(
+    disks: GaussianMap,
+    active: list[MapView],
+    views: dict[int, MapView],
+    known: "KnownViews",
+    window: WindowPass,
+    config: MappingConfig,
+    unit: float,
+) -> dict[int, Float[Tensor, "4 4"]]:
+    """As :func:`geogs.mapping.pose_refine.refine_poses`, from the same loss in float32.
+
+    ``window`` has as many views as there are active keyframes, one partner each. Each step waits
+    once, for the gradients of the poses, which are few and go on on the CPU.
+    """
+    partners = [views[i] for view in active for i in view.partners[:1]]
+    slot = dict(zip((v.id for v in (*active, *partners)), known.slots([*active, *partners]),
+                    strict=True))  # fmt: skip
+    rows = [slot[v.id] for v in active]
+    rows += [slot[v.partners[0]] if v.partners else -1 for v in active]
+    window.slots.copy_(torch.tensor(rows, dtype=torch.int32))
+    count = torch.tensor([len(disks)], dtype=torch.int32).to(disks.device)
+    start = torch.stack([view.T_cw for view in active])
+    tangent = torch.zeros(len(active) - 1, 6, dtype=torch.float64, requires_grad=True)
+    units = torch.tensor([unit] * 3 + [1.0] * 3, dtype=torch.float64)
+    optimizer = torch.optim.Adam([tangent], lr=config.pose_lr)
+    best_loss, best = float("inf"), start
+    for step in range(config.pose_iterations + 1):
+        poses = torch.cat([start[:1], retract(tangent * units, start[1:])])
+        known.set_poses([v.id for v in active], poses.detach())
+        loss, d_poses, d_motions = _evaluate(window, disks, count)
+        if loss < best_loss:
+            best_loss, best = loss, poses.detach()
+        if step < config.pose_iterations:
+            optimizer.zero_grad()
+            _chain(active, views, poses, d_poses, d_motions).backward()
+            assert tangent.grad is not None
+            tangent.grad.nan_to_num_(nan=0.0, posinf=0.0, neginf=0.0)
+            optimizer.step()
+    return {view.id: T for view, T in zip(active[1:], best[1:], strict=True)}
+
+
+def _evaluate(
+    window: WindowPass, disks: GaussianMap, count: Int[Tensor, "1"]
+) -> tuple[float, Float[Tensor, "b 4 4"], Float[Tensor, "b 3 4"]]:
+    """Summed loss and gradients of poses and motions, fetched in one transfer."""
+    d_poses, d_motions, n = window.d_poses, window.d_motions, window.views
+    assert d_poses is not None
+    assert d_motions is not None
+    status = window.rasterizer.status
+    window.launch(disks.room, count)
+    parts = (window.loss.double(), d_poses.reshape(-1), d_motions.reshape(-1), status.double())
+    flat = torch.cat(parts).cpu()
+    if flat[-1]:  # the lists had no room
+        status.zero_()
+        window.rasterizer.reserve(int(flat[-2]))
+        return _evaluate(window, disks, count)
+    motions = flat[17 * n : 29 * n].view(n, 3, 4)
+    return float(flat[:n].sum()), flat[n : 17 * n].view(n, 4, 4), motions
+
+
+def _chain(
+    active: list[MapView],
+    views: dict[int, MapView],
+    poses: Float[Tensor, "b 4 4"],
+    d_poses: Float[Tensor, "b 4 4"],
+    d_motions: Float[Tensor, "b 3 4"],
+) -> Float[Tensor, ""]:
+    """A scalar whose gradient in the poses is the loss's."""
+    pose_of = {view.id: T for view, T in zip(active, poses, strict=True)}
+    total = (poses * d_poses).sum()
+    for k, view in enumerate(active):
+        for i in view.partners[:1]:
+            target = pose_of.get(i, views[i].T_cw)
+            total = total + ((target @ se3_inverse(poses[k]))[:3] * d_motions[k]).sum()
+    return total

@@ -1,0 +1,84 @@
+"""One pass over a window of views on a GPU: rendering, losses, gradients."""
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from geogs.config import LossConfig
+from geogs.geometry.camera import Camera
+from geogs.losses.cuda.view_table import ViewTable
+from geogs.losses.cuda.window import WindowLosses
+from geogs.splat.cuda.rasterize import MapGradients, Maps, Rasterizer, Views
+from geogs.splat.map import DiskParameters, GaussianMap
+from geogs.splat.render import NEAR
+
+_ENTRIES_PER_DISK = 4
+"""Tiles that a disk reaches in a view, usually fewer; what the lists have room for at first."""
+
+
+class WindowPass:
+    """Buffers and launches for a fixed number of views, partners and disks.
+
+    ``batch`` (views) and ``pairs`` (views, partners) hold slots of the table, -1 for none, on the
+    device. Nothing waits for the GPU, so passes can be captured in a CUDA graph.
+    """
+
+    def __init__(
+        self,
+        table: ViewTable,
+        camera: Camera,
+        config: LossConfig,
+        unit: float,
+        views: int,
+        partners: int,
+        pair_share: float,
+        capacity: int,
+        for_poses: bool = False,
+    ) -> None:
+        device = table.device
+        self.table, self.views, self.partners, self.capacity = table, views, partners, capacity
+        self._generation = table.generation
+        self.rasterizer = Rasterizer(capacity, views, camera, NEAR, device)
+        self.rasterizer.reserve(_ENTRIES_PER_DISK * views * capacity)
+        self.losses = WindowLosses(table, config, unit, views, partners, pair_share, for_poses)
+        self.maps = Maps.empty(camera, (views,), capacity, device)
+        m = self.maps
+        self._gradients = MapGradients(
+            torch.zeros_like(m.depth), torch.zeros_like(m.normal), torch.zeros_like(m.alpha),
+            torch.zeros_like(m.distortion),
+        )  # fmt: skip
+        slots = torch.full((views * (1 + partners),), -1, dtype=torch.int32, device=device)
+        self.slots: Int[Tensor, "s"] = slots
+        """Batch, then pairs, in one piece."""
+        self.batch, self.pairs = slots[:views], slots[views:].view(views, partners)
+        self.loss: Float[Tensor, "b"] = torch.zeros(views, device=device)
+        sizes = ((3,), (4,), (2,), ())
+        self.d_disks: DiskParameters | None = None
+        self.d_poses: Float[Tensor, "b 4 4"] | None = None
+        self.d_motions: Float[Tensor, "b p 12"] | None = None
+        """Of the loss, for the motion from a view to its partner, rows of the 3x4 matrix."""
+        if for_poses:
+            self.d_poses = torch.zeros(views, 4, 4, dtype=torch.float64, device=device)
+            self.d_motions = torch.zeros(views, partners, 12, dtype=torch.float64, device=device)
+        else:
+            self.d_disks = DiskParameters(
+                *(torch.zeros(capacity, *size, device=device) for size in sizes)
+            )
+
+    def is_outdated(self, disks: GaussianMap) -> bool:
+        """Whether the map or the table have moved in memory since."""
+        return self.table.generation != self._generation or disks.capacity != self.capacity
+
+    def launch(self, disks: DiskParameters, count: Int[Tensor, "1"]) -> None:
+        """Maps, losses and gradients of the views in ``batch``; ``disks`` have all their room."""
+        views = Views(self.table.poses, self.batch, count)
+        m, d = self.maps, self._gradients
+        self.rasterizer.project(disks, views)
+        self.rasterizer.blend(views, m)
+        self.losses.launch(
+            self.batch, self.pairs, m.depth, m.normal, m.alpha, m.distortion,
+            d.depth, d.normal, d.alpha, d.distortion, self.loss, self.d_motions,
+        )  # fmt: skip
+        if self.d_disks is not None:
+            self.losses.store_rendered(self.batch, m.depth, m.alpha)
+        self.rasterizer.backward(disks, views, d, self.d_disks, self.d_poses)

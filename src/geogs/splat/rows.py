@@ -1,0 +1,45 @@
+"""Tensors that grow and shrink by rows without moving."""
+
+from jaxtyping import Int, Shaped
+from torch import Tensor
+
+_LEAST = 4096
+
+
+class GrowingRows:
+    """Rows in a larger tensor, so that adding some seldom allocates and keeps addresses.
+
+    ``room`` is all of it, ``rows`` the part in use; both share memory.
+    """
+
+    def __init__(self, rows: Shaped[Tensor, "n *k"]) -> None:
+        self.room = rows.detach().clone()
+        self._count = len(rows)
+
+    def __len__(self) -> int:
+        return self._count
+
+    @property
+    def rows(self) -> Shaped[Tensor, "n *k"]:
+        """The rows in use."""
+        return self.room[: self._count]
+
+    def append(self, rows: Shaped[Tensor, "m *k"]) -> None:
+        """Add rows behind the present ones; the room doubles where it is too small."""
+        count = self._count + len(rows)
+        if count > len(self.room):
+            self.reserve(max(count, 2 * len(self.room), _LEAST))
+        self.room[self._count : count] = rows.detach()
+        self._count = count
+
+    def reserve(self, size: int) -> None:
+        """Make room for so many rows in all; new room is zero."""
+        if size > len(self.room):
+            room = self.room.new_zeros(size, *self.room.shape[1:])
+            room[: self._count] = self.rows
+            self.room = room
+
+    def take(self, index: Int[Tensor, "m"]) -> None:
+        """Keep the rows of the index, in its order."""
+        self.room[: len(index)] = self.room[index]
+        self._count = len(index)
