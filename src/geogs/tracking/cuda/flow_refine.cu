@@ -51,7 +51,8 @@ __device__ __forceinline__ DataTerm data_term(const float (*mean)[IMAGE + 1], co
 
 extern "C" __global__ void __launch_bounds__(256) flow_refine(const long long* images, const float* warped, const float2* before, float2* after, int stride, int width, int height, int level, int sweeps, float alpha, float gamma, float delta, float zeta2, float eps2, float relaxation) {
   __shared__ float mean[IMAGE][IMAGE + 1], diff[IMAGE][IMAGE + 1];
-  __shared__ float U[FIELD][FIELD + 1], V[FIELD][FIELD + 1], smooth[FIELD][FIELD + 1];
+  // Rows of even length: lanes of a warp that work on alternating rows then meet no bank twice.
+  __shared__ float U[FIELD][FIELD], V[FIELD][FIELD], smooth[FIELD][FIELD];
   Level size = pyramid_level(width, height, level);
   int d = blockIdx.z, thread = threadIdx.y * TILE + threadIdx.x;
   int left = blockIdx.x * INNER - OVERLAP, top = blockIdx.y * INNER - OVERLAP;
@@ -90,23 +91,24 @@ extern "C" __global__ void __launch_bounds__(256) flow_refine(const long long* i
 
   int x = left + (int)threadIdx.x, i = threadIdx.x + 1;
   for (int half = 0; half < 2 * sweeps; half++) {
+    // Of two rows the one of this colour, so that no lane idles.
+    int odd = (threadIdx.x + half) & 1;
 #pragma unroll
-    for (int k = 0; k < EACH; k++) {
-      int j = threadIdx.y * EACH + k + 1, y = top + j - 1;
-      bool inside = x >= 0 && y >= 0 && x < size.width && y < size.height;
-      if (inside && ((threadIdx.x + k + half) & 1)) {
-        float west = x > 0 ? smooth[j][i - 1] : 0.f, north = y > 0 ? smooth[j - 1][i] : 0.f;
-        float east = x < size.width - 1 ? smooth[j][i] : 0.f, south = y < size.height - 1 ? smooth[j][i] : 0.f;
-        float sum = west + north + east + south;
-        float su = west * U[j][i - 1] + east * U[j][i + 1] + north * U[j - 1][i] + south * U[j + 1][i];
-        float sv = west * V[j][i - 1] + east * V[j][i + 1] + north * V[j - 1][i] + south * V[j + 1][i];
-        DataTerm t = term[k];
-        // Both components at once: a 2 x 2 system.
-        float a = t.xx + sum, c = t.yy + sum, bu = t.cx + su, bv = t.cy + sv;
-        float inverse = 1.f / (a * c - t.xy * t.xy);
-        U[j][i] += relaxation * (inverse * (c * bu - t.xy * bv) - U[j][i]);
-        V[j][i] += relaxation * (inverse * (a * bv - t.xy * bu) - V[j][i]);
-      }
+    for (int k = 0; k < EACH; k += 2) {
+      int j = threadIdx.y * EACH + k + odd + 1, y = top + j - 1;
+      if (x < 0 || y < 0 || x >= size.width || y >= size.height) continue;
+      DataTerm t = odd ? term[k + 1] : term[k];
+      float here = smooth[j][i];
+      float west = x > 0 ? smooth[j][i - 1] : 0.f, north = y > 0 ? smooth[j - 1][i] : 0.f;
+      float east = x < size.width - 1 ? here : 0.f, south = y < size.height - 1 ? here : 0.f;
+      float sum = west + north + east + south;
+      float su = west * U[j][i - 1] + east * U[j][i + 1] + north * U[j - 1][i] + south * U[j + 1][i];
+      float sv = west * V[j][i - 1] + east * V[j][i + 1] + north * V[j - 1][i] + south * V[j + 1][i];
+      // Both components at once: a 2 x 2 system.
+      float a = t.xx + sum, c = t.yy + sum, bu = t.cx + su, bv = t.cy + sv;
+      float inverse = 1.f / (a * c - t.xy * t.xy);
+      U[j][i] += relaxation * (inverse * (c * bu - t.xy * bv) - U[j][i]);
+      V[j][i] += relaxation * (inverse * (a * bv - t.xy * bu) - V[j][i]);
     }
     __syncthreads();
   }

@@ -69,9 +69,11 @@ __device__ __forceinline__ Fit evaluate(const Column& c, const float* target, Le
   return {patch_sum(ss) - s * s * each, patch_sum(bx) - sum_gx * s * each, patch_sum(by) - sum_gy * s * each};
 }
 
-// Motion of each patch by inverse-compositional Gauss-Newton steps (eq. 2-4 of the paper) from the
-// coarser level's flow; the best of all steps is kept. Eight lanes a patch.
-extern "C" __global__ void __launch_bounds__(256) flow_search(const long long* images, const float* warped, const float2* coarse, float2* patches, int stride, int width, int height, int level, int iterations) {
+// Motion of each patch by inverse-compositional Gauss-Newton steps (eq. 2-4 of the paper); the best
+// of all steps is kept. The start is the coarser level's flow or, where there are results of an
+// earlier pass, the best of the patch's own and those of its neighbours `reach` patches away.
+// Eight lanes a patch.
+extern "C" __global__ void __launch_bounds__(256) flow_search(const long long* images, const float* warped, const float2* coarse, const float2* earlier, float2* patches, int stride, int width, int height, int level, int reach, int iterations) {
   Level size = pyramid_level(width, height, level);
   int across = patches_along(size.width), count = across * patches_along(size.height);
   int index = (blockIdx.x * blockDim.x + threadIdx.x) / PATCH, lane = threadIdx.x % PATCH, d = blockIdx.y;
@@ -105,6 +107,20 @@ extern "C" __global__ void __launch_bounds__(256) flow_search(const long long* i
     // The centre of the patch in pixels of the coarser level.
     start = sample(coarse + (long long)d * w * h, w, h, 0.5f * (x0 + 0.5f * (PATCH - 1)) - 0.25f, 0.5f * (y + 0.5f * (PATCH - 1)) - 0.25f);
     start = make_float2(2.f * start.x, 2.f * start.y);
+  }
+  if (earlier) {
+    int i = patch % across, j = patch / across, down = count / across;
+    float least = 3.4e38f;
+    for (int k = 0; k < 5; k++) {
+      int column = clampi(i + (k == 1 ? -reach : k == 2 ? reach : 0), 0, across - 1);
+      int row = clampi(j + (k == 3 ? -reach : k == 4 ? reach : 0), 0, down - 1);
+      float2 f = earlier[(long long)d * count + row * across + column];
+      float cost = evaluate(c, target, size, x, y, f.x, f.y, sx, sy).cost;
+      if (cost < least) {
+        least = cost;
+        start = f;
+      }
+    }
   }
   float u = start.x, v = start.y, least = 3.4e38f;
   float2 best = start;

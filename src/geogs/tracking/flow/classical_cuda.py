@@ -56,13 +56,17 @@ class SearchOptions:
     """Pyramid levels searched where the start is right to a few pixels."""
     iterations: int = 6
     """Gauss-Newton steps of a patch."""
+    cold_reaches: tuple[int, ...] = (4, 2, 1)
+    """Passes in which a patch tries its neighbours' motions, so many patches away; cold starts."""
     refinements: int = 5
     """Linearisations of the variational refinement at the finest level."""
-    coarse_refinements: int = 5
+    coarse_refinements: int = 3
     """The same at the other levels."""
     sweeps: int = 10
     """Relaxation sweeps of each."""
-    smoothness: float = 40.0
+    coarse_sweeps: int = 20
+    """The same at the other levels."""
+    smoothness: float = 25.0
     """Weight alpha of the smoothness term."""
     gradients: float = 10.0
     """Weight gamma of gradient constancy."""
@@ -224,32 +228,37 @@ class CudaClassicalFlow:
         for level in range(coarsest, finest - 1, -1):
             width, height = layout.sizes[level]
             count = layout.patches(level)
-            patches = torch.empty(directed, count, 2, device=self.device)
-            self._kernels["flow_search"](
-                (-(-count * PATCH // 256), directed), 256, table, warped, flow, patches, stride,
-                w, h, level, options.iterations,
-            )  # fmt: skip
+            patches: Tensor | None = None
+            for reach in (0, *(options.cold_reaches if cold else ())):
+                found = torch.empty(directed, count, 2, device=self.device)
+                self._kernels["flow_search"](
+                    (-(-count * PATCH // 256), directed), 256, table, warped, flow, patches, found,
+                    stride, w, h, level, reach, options.iterations,
+                )  # fmt: skip
+                patches = found
             flow = torch.empty(directed, width * height, 2, device=self.device)
             other = torch.empty_like(flow)
             self._kernels["flow_densify"](
                 (-(-width // 32), -(-height // 8), directed), (32, 8), table, warped, patches,
                 flow, stride, w, h, level,
             )  # fmt: skip
-            for _ in range(options.refinements if level == finest else options.coarse_refinements):
-                self._refine(table, warped, flow, other, level)
+            last = level == finest
+            sweeps = options.sweeps if last else options.coarse_sweeps
+            for _ in range(options.refinements if last else options.coarse_refinements):
+                self._refine(table, warped, flow, other, level, sweeps)
                 flow, other = other, flow
         assert flow is not None
         return flow
 
     def _refine(
-        self, table: Tensor, warped: Tensor, flow: Tensor, refined: Tensor, level: int
+        self, table: Tensor, warped: Tensor, flow: Tensor, refined: Tensor, level: int, sweeps: int
     ) -> None:
         layout, o = self._layout, self.options
         width, height = layout.sizes[level]
         blocks = (-(-width // REFINE_INNER), -(-height // REFINE_INNER), len(table))
         self._kernels["flow_refine"](
             blocks, (32, 8), table, warped, flow, refined, layout.pyramid, layout.width,
-            layout.height, level, o.sweeps, o.smoothness, o.gradients, o.brightness,
+            layout.height, level, sweeps, o.smoothness, o.gradients, o.brightness,
             o.zeta**2, o.epsilon**2, o.relaxation,
         )  # fmt: skip
 
