@@ -13,7 +13,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_inverse
+from geogs.threads import thread_map
 from geogs.tracking.bundle import BundleOptions
 from geogs.tracking.flow.base import FlowMatch
 from geogs.tracking.graph import FrameGraph
@@ -24,11 +26,11 @@ from geogs.tracking.motion import filled_positions, pnp, transfer_depth
 
 @dataclass(frozen=True)
 class TwoView:
-    """The relative pose of a pair of views and the depth that it gives, up to scale."""
+    """The relative pose of a pair of views and the depth that it gives, up to scale; on the CPU."""
 
     T_ji: Float[Tensor, "4 4"]
     inverse_depth: Float[Tensor, "p"]
-    """Of the first view, median 1."""
+    """Of the first view, median 1; 1 where it is not good."""
     good: Bool[Tensor, "p"]
     parallax: float
     """Median motion in pixels that rotation does not explain."""
@@ -75,8 +77,8 @@ def _best_two_view(
     grid: SampleGrid, flows: list[FlowMatch], min_parallax: float
 ) -> tuple[int, TwoView] | None:
     best, best_score = None, 0.0
-    for n, match in enumerate(flows):
-        view = two_view(grid, match)
+    flows = [FlowMatch(f.pixels.cpu(), f.weight.cpu()) for f in flows]
+    for n, view in enumerate(thread_map(lambda match: two_view(grid.camera, match), flows)):
         if view is None or view.parallax < min_parallax:
             continue
         # Parallax helps until the views no longer overlap.
@@ -86,14 +88,13 @@ def _best_two_view(
     return best
 
 
-def two_view(grid: SampleGrid, match: FlowMatch) -> TwoView | None:
-    """Relative pose by the essential matrix (MAGSAC) and depth by triangulation."""
-    weight = match.weight[0, :, 0]
-    used = (weight > 0).cpu().numpy()
+def two_view(camera: Camera, match: FlowMatch) -> TwoView | None:
+    """Relative pose by the essential matrix (MAGSAC) and depth by triangulation, on the CPU."""
+    used = (match.weight[0, :, 0] > 0).numpy()
     if used.sum() < 0.1 * len(used):
         return None
-    p, q = grid.pixels.double().cpu().numpy(), match.pixels[0].double().cpu().numpy()
-    K = grid.camera.matrix().numpy()
+    p, q = SampleGrid(camera).pixels.double().numpy(), match.pixels[0].double().numpy()
+    K = camera.matrix().numpy()
     E, mask = cv2.findEssentialMat(p[used], q[used], K, cv2.USAC_MAGSAC, 0.9999, 0.7)
     if E is None or E.shape != (3, 3):
         return None
@@ -112,10 +113,9 @@ def two_view(grid: SampleGrid, match: FlowMatch) -> TwoView | None:
     rotated = (np.c_[(p - K[:2, 2]) / K[[0, 1], [0, 1]], np.ones(len(p))]) @ (K @ R).T
     parallax = np.median(np.linalg.norm(q - rotated[:, :2] / rotated[:, 2:], axis=1)[good])
     T[:3, 3] /= median
-    device = grid.device
-    depth = torch.from_numpy(np.where(good, median / np.where(good, z, 1), 1.0)).float().to(device)
-    known = torch.from_numpy(np.asarray(good, bool)).to(device)
-    return TwoView(torch.from_numpy(T), grid.fill(depth, known.float()), known, float(parallax))
+    depth = torch.from_numpy(np.where(good, median / np.where(good, z, 1), 1.0)).float()
+    known = torch.from_numpy(np.asarray(good, bool))
+    return TwoView(torch.from_numpy(T), depth, known, float(parallax))
 
 
 def _place_all(store: KeyframeStore, flows: list[FlowMatch], best: tuple[int, TwoView]) -> None:
@@ -124,14 +124,15 @@ def _place_all(store: KeyframeStore, flows: list[FlowMatch], best: tuple[int, Tw
     states = list(store)
     first = states[0]
     eye = torch.eye(4, dtype=torch.float64)
-    first.T_cw, first.inverse_depth = eye, view.inverse_depth
-    first.information = view.good.float()
+    known = view.good.to(store.grid.device)
+    first.T_cw, first.information = eye, known.float()
+    first.inverse_depth = store.grid.fill(view.inverse_depth.to(known.device), first.information)
     for n, (state, match) in enumerate(zip(states[1:], flows, strict=True)):
         if n == chosen:
             state.T_cw = view.T_ji
         else:
-            good = view.good & (match.weight[0, :, 0] > 0)
-            T = pnp(store.grid, view.inverse_depth, match.pixels[0], good)
+            good = known & (match.weight[0, :, 0] > 0)
+            T = pnp(store.grid, first.inverse_depth, match.pixels[0], good)
             state.T_cw = states[n].T_cw if T is None else T
         state.inverse_depth, state.information = transfer_depth(
             store.grid, state.T_cw, first.inverse_depth, first.information
