@@ -7,14 +7,20 @@ import pytest
 import torch
 
 from cuda_emulator import use_emulator
+from geogs.cli import results
+from geogs.config import MeshConfig
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp
+from geogs.io.writers.native import save_map
+from geogs.io.writers.ply import write_splats
 from geogs.mesh import DepthMapView, extract_mesh, tsdf
 from geogs.mesh.colour import colour_mesh
 from geogs.mesh.tsdf import SparseTsdf, _plane_table, band_blocks
+from geogs.types import MapSnapshot, RenderedKeyframe, Trajectory
 
 HAS_GPU = torch.cuda.is_available()
 NEEDS_GPU = pytest.mark.skipif(not HAS_GPU, reason="needs a GPU")
+GPU = pytest.param("cuda", marks=[pytest.mark.gpu, NEEDS_GPU])
 
 
 def views(camera: Camera, count: int, seed: int = 0) -> list[DepthMapView]:
@@ -106,3 +112,41 @@ def test_mesh_and_colours_on_a_gpu():
     again = colour_mesh(expected, on_gpu, 0.05).colours
     same = colour_mesh(expected, on_cpu, 0.05).colours
     assert (np.abs(again.astype(int) - same.astype(int)).max(1) <= 1).mean() > 0.999
+
+
+@pytest.mark.parametrize(
+    "device", ["cpu", pytest.param("cuda", marks=[pytest.mark.gpu, NEEDS_GPU])]
+)
+def test_results_are_written_from_any_device(device, tmp_path):
+    camera = Camera(40.0, 41.0, 23.2, 19.7, 48, 40)
+    renders = [
+        RenderedKeyframe(
+            keyframe_id=i,
+            camera=camera,
+            T_cw=v.T_cw.to(device),
+            depth=v.depth.to(device),
+            normal=torch.tensor([0.0, 0.0, -1.0]).expand(40, 48, 3).to(device),
+            weight=v.weight.to(device),
+            image=v.image,
+        )
+        for i, v in enumerate(views(camera, 6))
+    ]
+    depth_maps = results.fusion_views(renders)
+    mesh = extract_mesh(depth_maps, MeshConfig(min_component_faces=10))
+    points = torch.from_numpy(mesh.vertices[::20]).to(device)
+    n = len(points)
+    quaternion = torch.tensor([0, 1.0, 0, 0], device=device).expand(n, 4)
+    scale, opacity = torch.full((n, 2), 0.05, device=device), torch.full((n,), 0.8, device=device)
+    disks = MapSnapshot(points, quaternion, scale, opacity)
+    colours = results.splat_colours(disks, depth_maps)
+    assert colours.shape == (n, 3)
+    assert colours.std() > 0.02
+    write_splats(tmp_path / "splats.ply", disks, colours)
+    save_map(tmp_path / "map.safetensors", disks)
+    T_wc = np.stack([torch.linalg.inv(r.T_cw.cpu()).numpy() for r in renders])
+    trajectory = Trajectory(np.arange(6.0), T_wc, np.ones(6, bool))
+    results.write_report(tmp_path / "report", trajectory, renders, mesh)
+    for name in ("trajectory", "keyframes", "mesh"):
+        assert (tmp_path / "report" / f"{name}.png").stat().st_size > 5000
+    summary = results.device_summary(disks.position.device)
+    assert (summary["device"] == "cpu") == (device == "cpu")
