@@ -1,6 +1,8 @@
 """The GPU's bundle adjustment, graph and motion kernels against their PyTorch counterparts."""
 
+import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,6 +17,7 @@ from geogs.geometry.camera import Camera
 from geogs.geometry.lie import retract, se3_exp
 from geogs.loop.global_bundle import global_bundle
 from geogs.tracking.bundle import (
+    MIN_Z,
     BundleOptions,
     BundleProblem,
     BundleResult,
@@ -101,6 +104,18 @@ def assert_same(fast: BundleResult, slow: BundleResult) -> None:
     torch.testing.assert_close(fast.inverse_depth.cpu(), slow.inverse_depth, rtol=3e-4, atol=3e-5)
     torch.testing.assert_close(fast.information.cpu(), slow.information, rtol=3e-4, atol=1e-2)
     torch.testing.assert_close(fast.residual.cpu(), slow.residual, rtol=1e-4, atol=1e-5)
+
+
+def test_sources_and_python_agree_on_sizes():
+    folder = Path(cuda_bundle.__file__).parent
+    text = "".join(
+        (folder / name).read_text() for name in ("bundle_solve.cu", "bundle_projection.cuh")
+    )
+    found = {k: float(v) for k, v in re.findall(r"#define (\w+) ([\d.]+)", text)}
+    assert found["MAX_POSES"] == cuda_bundle.MAX_FEW
+    assert found["PANEL"] == cuda_bundle.PANEL
+    assert found["TILE"] == cuda_bundle.TILE
+    assert found["MIN_Z"] == MIN_Z
 
 
 @pytest.mark.parametrize("iterations", [1, 3])

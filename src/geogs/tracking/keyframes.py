@@ -38,6 +38,8 @@ class KeyframeStore:
     def __init__(self, grid: SampleGrid) -> None:
         self.grid = grid
         self._states: dict[int, KeyframeState] = {}
+        self._reported: dict[int, tuple[Tensor, Tensor, Tensor]] = {}
+        """Inverse depth and information of each keyframe as last exported, and its limit."""
         self._next_id = 0
 
     def __len__(self) -> int:
@@ -76,6 +78,7 @@ class KeyframeStore:
 
     def remove(self, id: int) -> KeyframeState:
         """Take a keyframe out and return it."""
+        self._reported.pop(id, None)
         return self._states.pop(id)
 
     def poses(self, ids: Sequence[int]) -> Float[Tensor, "n 4 4"]:
@@ -104,9 +107,6 @@ class KeyframeStore:
         """
         s = self._states[id]
         shape = (self.grid.height, self.grid.width)
-        # What matches agree on is still wrong by a common error of poses and scale.
-        floor = (RELATIVE_FLOOR * s.inverse_depth).square()
-        information = s.information / (1 + s.information * floor)
         return Keyframe(
             id=s.id,
             frame_index=s.frame_index,
@@ -114,8 +114,18 @@ class KeyframeStore:
             image=s.image,
             T_cw=s.T_cw.clone(),
             inverse_depth=s.inverse_depth.reshape(shape).clone(),
-            information=information.reshape(shape),
+            information=self._limited(s).reshape(shape).clone(),
         )
+
+    def _limited(self, s: KeyframeState) -> Float[Tensor, "p"]:
+        """Information less the error that no match removes; computed again after a change only."""
+        depth, information, limited = self._reported.get(s.id, (None, None, s.information))
+        if depth is not s.inverse_depth or information is not s.information:
+            # What matches agree on is still wrong by a common error of poses and scale.
+            floor = (RELATIVE_FLOOR * s.inverse_depth).square()
+            limited = s.information / (1 + s.information * floor)
+            self._reported[s.id] = (s.inverse_depth, s.information, limited)
+        return limited
 
 
 def scaled(T: Float[Tensor, "*b 4 4"], factor: float) -> Float[Tensor, "*b 4 4"]:

@@ -157,7 +157,7 @@ extern "C" __global__ void __launch_bounds__(256) eliminate_depths(
 // first[n + 1] of place n are vectors, or twice a block, plus one if transposed.
 extern "C" __global__ void __launch_bounds__(256) assemble_system(
     const int* places, const int* first, const int* parts, const double* blocks,
-    const double* vectors, int poses, double damping, double* system) {
+    const double* vectors, int poses, float damping, double* system) {
   __shared__ double partial[7][36];
   int place = places[blockIdx.x], p = place / (poses + 1), q = place % (poses + 1);
   int group = threadIdx.x / 36, t = threadIdx.x % 36, end = first[blockIdx.x + 1];
