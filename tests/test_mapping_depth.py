@@ -5,13 +5,20 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from depth_scene import RENDER, WORKING, DepthScene, make_scene
 from geogs.config import DepthConfig
+from geogs.mapping.carve import vote
+from geogs.mapping.depth_engine import depth_engine
 from geogs.mapping.depth_fusion import check_depth
-from geogs.mapping.depth_view import KeyframeDepth
+from geogs.mapping.depth_view import DenseDepth, KeyframeDepth, PosedDepth
 from geogs.mapping.keyframe_depth import estimate_depth
-from geogs.mapping.sweep_neighbors import depth_range, select_sweep_neighbours
+from geogs.mapping.sweep_neighbors import (
+    depth_range,
+    parallax_degrees,
+    select_sweep_neighbours,
+)
 
 CONFIG = DepthConfig()
 
@@ -131,6 +138,42 @@ def test_check_lowers_the_confidence_of_a_floater_and_averages_noise(scene, dept
     assert (checked.confidence[inner] > 0.8).mean() > 0.85
     before = np.abs(wrong / truth[0] - 1.0)[inner].mean()
     assert np.abs(checked.depth / truth[0] - 1.0)[inner].mean() < 0.7 * before
+
+
+def test_the_cpu_engine_is_the_functions(scene, depths):
+    engine = depth_engine("cpu", RENDER, WORKING, CONFIG)
+    views = scene.views
+    dense = engine.estimate(views[:2], [[v for v in views if v.id != i] for i in range(2)])
+    posed = [PosedDepth(v.T_cw, DenseDepth.of(d)) for v, d in zip(views, depths, strict=True)]
+    for got, expected in zip(dense, depths, strict=False):
+        assert np.array_equal(got.depth.numpy(), expected.depth)
+        assert np.array_equal(got.confidence.numpy(), expected.confidence)
+        assert got.typical == np.median(expected.depth)
+    checked, alone = engine.check(posed[:2], [posed[1:], []])
+    poses = [v.T_cw for v in views]
+    expected = check_depth(depths[0], poses[0], depths[1:], poses[1:], RENDER, CONFIG)
+    assert np.array_equal(checked.arrays().depth, expected.depth)
+    assert np.array_equal(checked.arrays().confidence, expected.confidence)
+    assert alone is posed[1].depth
+    doubled = alone.scaled(2.0)
+    assert doubled.typical == pytest.approx(2 * alone.typical)
+    assert torch.equal(doubled.depth, 2 * alone.depth)
+    points = torch.rand(200, 3) * 3
+    kept = engine.keep(points, posed)
+    assert np.array_equal(kept.numpy(), vote(points.numpy(), poses, depths, RENDER, CONFIG))
+    assert 0 < int(kept.sum()) < 200
+
+
+def test_parallax_is_the_angle_at_the_point_ahead(scene):
+    view = scene.views[0]
+    aside, turned = np.eye(4), np.eye(4)
+    aside[0, 3] = -2.0
+    turned[:3, :3] = [[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]]
+    reference = replace(view, T_cw=np.eye(4))
+    others = [replace(view, T_cw=aside), replace(view, T_cw=turned)]
+    parallax, turn = parallax_degrees(reference, others, 2.0)
+    assert np.allclose(parallax, [45.0, 0.0], atol=1e-3)
+    assert np.allclose(turn, [0.0, 90.0], atol=1e-3)
 
 
 def test_check_without_others_changes_nothing(scene, depths):

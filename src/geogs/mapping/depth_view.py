@@ -60,16 +60,26 @@ class DenseDepth:
     """z in map units; positive everywhere."""
     confidence: Float32[Tensor, "h w"]
     """In [0, 1]; about the chance that the depth is right to 2 %."""
-    typical: float
-    """Median depth, map units."""
+    median: Float32[Tensor, ""]
+    """About the median depth, in memory of the host; to be read as ``typical``."""
+    written: torch.cuda.Event | None = None
+    """After which a GPU has written the median."""
 
     @staticmethod
     def of(depth: KeyframeDepth) -> "DenseDepth":
         """The same memory as CPU tensors."""
-        typical = float(np.median(depth.depth))
         return DenseDepth(
-            torch.from_numpy(depth.depth), torch.from_numpy(depth.confidence), typical
+            torch.from_numpy(depth.depth),
+            torch.from_numpy(depth.confidence),
+            torch.tensor(np.median(depth.depth)),
         )
+
+    @property
+    def typical(self) -> float:
+        """About the median depth, map units."""
+        if self.written is not None:
+            self.written.synchronize()
+        return float(self.median)
 
     def arrays(self) -> KeyframeDepth:
         """As arrays: the same memory where the tensors are on the CPU."""
@@ -78,7 +88,7 @@ class DenseDepth:
     def scaled(self, factor: float) -> "DenseDepth":
         """The depth multiplied by a factor."""
         depth = self.depth * factor
-        return DenseDepth(depth, self.confidence, float(np.median(depth.cpu().numpy())))
+        return DenseDepth(depth, self.confidence, torch.tensor(np.median(depth.cpu().numpy())))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -316,7 +316,7 @@ __device__ void write_evidence(
 // prior weight, relative precision. scratch (keyframes, padded (12 + window)).
 // Block of 32 x PANEL threads; shared: (window^2 + window (PANEL + 2) + PANEL (PANEL + 1)) doubles
 // with window = band + PANEL.
-extern "C" __global__ void complete_grids(
+extern "C" __global__ void __launch_bounds__(256) complete_grids(
     const float* grids, const float* typical, const float* settings, int minors, int majors,
     int minor_stride, int major_stride, int padded, int band, double* scratch, float* out) {
   SHARED_MEMORY(double, shared);

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -45,8 +45,7 @@ class SearchPlan:
 class CudaDepthEngine:
     """The kernels of this package, keyframe by keyframe; small parts run in threads on the CPU.
 
-    The host waits for the GPU only at the end of ``estimate`` and ``check``, for median depths.
-    Images of observed keyframes stay on the GPU.
+    The host does not wait for the GPU. Images of observed keyframes stay there.
     """
 
     def __init__(
@@ -91,12 +90,15 @@ class CudaDepthEngine:
     def check(
         self, depths: Sequence[PosedDepth], others: Sequence[Sequence[PosedDepth]]
     ) -> list[DenseDepth]:
-        """As in the protocol."""
+        """As in the protocol; the median stays that of the estimate."""
         checked = []
         for own, rest in zip(depths, others, strict=True):
-            unchanged = own.depth.depth, own.depth.confidence
-            checked.append(check(own, rest, self.render, self.config) if rest else unchanged)
-        return _with_medians(checked)
+            result = own.depth
+            if rest:
+                depth, confidence = check(own, rest, self.render, self.config)
+                result = replace(result, depth=depth, confidence=confidence)
+            checked.append(result)
+        return checked
 
     def keep(self, points: Float[Tensor, "n 3"], depths: Sequence[PosedDepth]) -> Bool[Tensor, "n"]:
         """As in the protocol."""
@@ -158,8 +160,14 @@ class CudaDepthEngine:
 
 
 def _with_medians(maps: Sequence[tuple[Tensor, Tensor]]) -> list[DenseDepth]:
-    """The depths with their medians, fetched at once."""
+    """The depths with their medians, which follow from the GPU without being waited for."""
     if not maps:
         return []
-    medians = torch.stack([depth.flatten().median() for depth, _ in maps]).tolist()
-    return [DenseDepth(*m, typical) for m, typical in zip(maps, medians, strict=True)]
+    medians = torch.stack([depth.flatten().median() for depth, _ in maps])
+    written = None
+    if medians.is_cuda:
+        on_host = torch.empty(len(maps), pin_memory=True)
+        medians = on_host.copy_(medians, non_blocking=True)
+        written = torch.cuda.Event()
+        written.record(torch.cuda.current_stream(maps[0][0].device))
+    return [DenseDepth(*m, median, written) for m, median in zip(maps, medians, strict=True)]

@@ -188,7 +188,7 @@ __device__ void average_pixel(
 // Mean cost over (2 radius + 1)^2 pixels, weighted by 1 / (1 + contrast |dI|^2)^2 over the colours
 // (3, h, w), plus the pull to the prior: weight min(|rho / prior - 1| / tolerance, 1).
 // One warp per pixel; block (32, 8, 4), shared: blockDim warps x (2 radius + 1)^2 floats.
-extern "C" __global__ void average_support(
+extern "C" __global__ void __launch_bounds__(1024) average_support(
     const float* volume, const float* colours, const float* slot_rho, const float* prior,
     const float* prior_weight, int per, int h, int w, int radius, float contrast, float strength,
     float tolerance, float* out) {
