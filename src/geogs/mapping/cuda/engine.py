@@ -14,7 +14,7 @@ from geogs.geometry.camera import Camera
 from geogs.mapping.completion import complete_grid, edge_weights, known_cells
 from geogs.mapping.cuda.check import check, vote
 from geogs.mapping.cuda.completion import can_complete, complete
-from geogs.mapping.cuda.images import KeyframeImages, homographies, upload
+from geogs.mapping.cuda.images import KeyframeImages, homographies, image_pixels, upload
 from geogs.mapping.cuda.refine import PixelPlaces, TrackerMaps, choose_start, judge, refine
 from geogs.mapping.cuda.sweep import MAX_NEIGHBOURS, MAX_PLANES, PlaneSlots, sweep
 from geogs.mapping.depth_engine import Progress, silent
@@ -57,13 +57,14 @@ class CudaDepthEngine:
         self.config = config
         self._places = PixelPlaces.of(render, working, device)
         self._images: dict[int, KeyframeImages] = {}
+        self._pixels: dict[int, Future[Float32[np.ndarray, "n"]]] = {}
         self._edges: dict[int, Future[Float32[np.ndarray, "gh gw"]]] = {}
         self._threads = ThreadPoolExecutor(worker_count())
 
     def observe(self, view: DepthView) -> None:
-        """As in the protocol: its images go to the GPU."""
-        self._images[view.id] = KeyframeImages.prepare(view, self.device)
+        """As in the protocol: threads prepare its images."""
         shape = view.inverse_depth.shape
+        self._pixels[view.id] = self._threads.submit(image_pixels, view)
         self._edges[view.id] = self._threads.submit(edge_weights, view.image, shape, self.config)
 
     def estimate(
@@ -75,7 +76,7 @@ class CudaDepthEngine:
         """As in the protocol; at most 16 neighbours and 256 planes are used."""
         usable = [list(n[:MAX_NEIGHBOURS]) for n in neighbours]
         for view in (*references, *(v for group in usable for v in group)):
-            if view.id not in self._images:
+            if view.id not in self._edges:
                 self.observe(view)
         plans = list(self._threads.map(self._plan, references, usable))
         maps: list[tuple[Tensor, Tensor]] = []
@@ -106,6 +107,13 @@ class CudaDepthEngine:
         if not depths:
             return torch.isfinite(points).all(1)
         return vote(points, depths, self.render, self.config)
+
+    def _images_of(self, view: DepthView) -> KeyframeImages:
+        """The images on the GPU, brought there at their first use."""
+        if view.id not in self._images:
+            pixels = self._pixels.pop(view.id).result()
+            self._images[view.id] = KeyframeImages.of(view, self.device, pixels)
+        return self._images[view.id]
 
     def _plan(self, reference: DepthView, neighbours: list[DepthView]) -> SearchPlan:
         grid, information = reference.inverse_depth, reference.information
@@ -141,11 +149,11 @@ class CudaDepthEngine:
         grids: Float32[Tensor, "3 gh gw"],
     ) -> tuple[Tensor, Tensor]:
         """Depth and confidence of one keyframe."""
-        config, device, own = self.config, self.device, self._images[reference.id]
+        config, device, own = self.config, self.device, self._images_of(reference)
         tracker = TrackerMaps.of(grids, self._places)
         if not neighbours:
             return 1.0 / tracker.inverse_depth, 0.5 * tracker.prior_weight
-        others = [self._images[v.id] for v in neighbours]
+        others = [self._images_of(v) for v in neighbours]
         across = homographies(reference, neighbours, self.render, self.render)
         finely = homographies(reference, neighbours, self.render, self.working)
         swept = sweep(

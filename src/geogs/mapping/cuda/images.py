@@ -27,18 +27,26 @@ class KeyframeImages:
     """At the working size, where depth is refined."""
 
     @staticmethod
-    def prepare(view: DepthView, device: torch.device) -> "KeyframeImages":
-        """The images of a view, in one transfer."""
+    def of(
+        view: DepthView, device: torch.device, pixels: Float32[np.ndarray, "n"] | None = None
+    ) -> "KeyframeImages":
+        """The images of a view, in one transfer; ``pixels`` are its ``image_pixels``."""
         h, w = view.grey.shape
-        small = cv2.resize(view.image, (w, h), interpolation=cv2.INTER_AREA)
-        colours = small.transpose(2, 0, 1).astype(np.float32) * np.float32(1 / 255)
-        smooth = cv2.GaussianBlur(view.grey, (0, 0), 0.7)
-        flat = np.concatenate([x.ravel() for x in (view.grey, smooth, view.fine)]) - np.float32(0.5)
-        moved = upload(np.concatenate([flat, colours.ravel()]), device)
-        grey, smoothed, fine, rgb = moved.split([h * w, h * w, view.fine.size, 3 * h * w])
+        moved = upload(image_pixels(view) if pixels is None else pixels, device)
+        grey, smooth, fine, colours = moved.split([h * w, h * w, view.fine.size, 3 * h * w])
         return KeyframeImages(
-            grey.view(h, w), smoothed.view(h, w), rgb.view(3, h, w), fine.view(view.fine.shape)
+            grey.view(h, w), smooth.view(h, w), colours.view(3, h, w), fine.view(view.fine.shape)
         )
+
+
+def image_pixels(view: DepthView) -> Float32[np.ndarray, "n"]:
+    """Everything that ``KeyframeImages`` holds, in a row."""
+    h, w = view.grey.shape
+    small = cv2.resize(view.image, (w, h), interpolation=cv2.INTER_AREA)
+    colours = small.transpose(2, 0, 1).astype(np.float32) * np.float32(1 / 255)
+    smooth = cv2.GaussianBlur(view.grey, (0, 0), 0.7)
+    grey = np.concatenate([x.ravel() for x in (view.grey, smooth, view.fine)]) - np.float32(0.5)
+    return np.concatenate([grey, colours.ravel()])
 
 
 def upload(array: np.ndarray, device: torch.device) -> Tensor:
