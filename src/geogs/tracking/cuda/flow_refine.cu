@@ -49,6 +49,17 @@ __device__ __forceinline__ DataTerm data_term(const float (*mean)[IMAGE + 1], co
   return t;
 }
 
+// One relaxation step of a pixel: f += c + M (weighted sum of the neighbours) - relaxation f.
+struct Stencil {
+  float xx, xy, yy, cx, cy;  // M = relaxation (A + sum of weights)^-1, and M c
+  float west, east, north, south;
+};
+
+// Row in U and V of pixel k of this thread.
+__device__ __forceinline__ int row_of(int k) {
+  return threadIdx.y * EACH + (k & ~1) + ((threadIdx.x + k) & 1) + 1;
+}
+
 extern "C" __global__ void __launch_bounds__(256) flow_refine(const long long* images, const float* warped, const float2* before, float2* after, int stride, int width, int height, int level, int sweeps, float alpha, float gamma, float delta, float zeta2, float eps2, float relaxation) {
   __shared__ float mean[IMAGE][IMAGE + 1], diff[IMAGE][IMAGE + 1];
   // Rows of even length: lanes of a warp that work on alternating rows then meet no bank twice.
@@ -81,36 +92,43 @@ extern "C" __global__ void __launch_bounds__(256) flow_refine(const long long* i
     float vx = V[j][i + 1] - V[j][i], vy = V[j + 1][i] - V[j][i];
     smooth[j][i] = alpha * rsqrtf(ux * ux + uy * uy + vx * vx + vy * vy + eps2);
   }
-  DataTerm term[EACH];
+  __syncthreads();
+  // Pixel k of a thread has colour k % 2, so that all lanes work on both colours.
+  int x = left + (int)threadIdx.x, i = threadIdx.x + 1;
+  Stencil stencil[EACH];
 #pragma unroll
   for (int k = 0; k < EACH; k++) {
-    int i = threadIdx.x + 1, j = threadIdx.y * EACH + k + 1;
-    term[k] = data_term(mean, diff, i + 1, j + 1, U[j][i], V[j][i], gamma, delta, zeta2, eps2);
+    int j = row_of(k), y = top + j - 1;
+    DataTerm t = data_term(mean, diff, i + 1, j + 1, U[j][i], V[j][i], gamma, delta, zeta2, eps2);
+    Stencil m;
+    m.west = x > 0 ? smooth[j][i - 1] : 0.f;
+    m.east = x < size.width - 1 ? smooth[j][i] : 0.f;
+    m.north = y > 0 ? smooth[j - 1][i] : 0.f;
+    m.south = y < size.height - 1 ? smooth[j][i] : 0.f;
+    float sum = m.west + m.east + m.north + m.south, a = t.xx + sum, c = t.yy + sum;
+    float scale = relaxation / (a * c - t.xy * t.xy);
+    m.xx = scale * c;
+    m.xy = -scale * t.xy;
+    m.yy = scale * a;
+    m.cx = m.xx * t.cx + m.xy * t.cy;
+    m.cy = m.xy * t.cx + m.yy * t.cy;
+    stencil[k] = m;
   }
-  __syncthreads();
-
-  int x = left + (int)threadIdx.x, i = threadIdx.x + 1;
-  for (int half = 0; half < 2 * sweeps; half++) {
-    // Of two rows the one of this colour, so that no lane idles.
-    int odd = (threadIdx.x + half) & 1;
+  // Pixels outside the image are relaxed like the others; nothing inside depends on them.
+  for (int sweep = 0; sweep < sweeps; sweep++) {
 #pragma unroll
-    for (int k = 0; k < EACH; k += 2) {
-      int j = threadIdx.y * EACH + k + odd + 1, y = top + j - 1;
-      if (x < 0 || y < 0 || x >= size.width || y >= size.height) continue;
-      DataTerm t = odd ? term[k + 1] : term[k];
-      float here = smooth[j][i];
-      float west = x > 0 ? smooth[j][i - 1] : 0.f, north = y > 0 ? smooth[j - 1][i] : 0.f;
-      float east = x < size.width - 1 ? here : 0.f, south = y < size.height - 1 ? here : 0.f;
-      float sum = west + north + east + south;
-      float su = west * U[j][i - 1] + east * U[j][i + 1] + north * U[j - 1][i] + south * U[j + 1][i];
-      float sv = west * V[j][i - 1] + east * V[j][i + 1] + north * V[j - 1][i] + south * V[j + 1][i];
-      // Both components at once: a 2 x 2 system.
-      float a = t.xx + sum, c = t.yy + sum, bu = t.cx + su, bv = t.cy + sv;
-      float inverse = 1.f / (a * c - t.xy * t.xy);
-      U[j][i] += relaxation * (inverse * (c * bu - t.xy * bv) - U[j][i]);
-      V[j][i] += relaxation * (inverse * (a * bv - t.xy * bu) - V[j][i]);
+    for (int colour = 0; colour < 2; colour++) {
+#pragma unroll
+      for (int k = colour; k < EACH; k += 2) {
+        const Stencil& m = stencil[k];
+        int j = row_of(k);
+        float su = m.west * U[j][i - 1] + m.east * U[j][i + 1] + m.north * U[j - 1][i] + m.south * U[j + 1][i];
+        float sv = m.west * V[j][i - 1] + m.east * V[j][i + 1] + m.north * V[j - 1][i] + m.south * V[j + 1][i];
+        U[j][i] += m.cx + m.xx * su + m.xy * sv - relaxation * U[j][i];
+        V[j][i] += m.cy + m.xy * su + m.yy * sv - relaxation * V[j][i];
+      }
+      __syncthreads();
     }
-    __syncthreads();
   }
   if (threadIdx.x < OVERLAP || threadIdx.x >= TILE - OVERLAP || x >= size.width) return;
   for (int k = 0; k < EACH; k++) {
