@@ -394,6 +394,25 @@ def test_without_neighbours_the_completed_tracker_remains(setting):
     assert cuda.estimate([], []) == []
 
 
+@pytest.mark.parametrize("how", ["bad values", "nothing known, black images"])
+def test_hopeless_input_gives_finite_depth(setting, how):
+    views = setting.scene.views[:3]
+    if how == "bad values":
+        inverse = views[0].inverse_depth.copy()
+        inverse.ravel()[:4] = [np.nan, 0.0, -1.0, np.inf]
+        views = [replace(views[0], inverse_depth=inverse), *views[1:]]
+    else:
+        v = views[0]
+        black = {"grey": 0 * v.grey, "fine": 0 * v.fine, "image": 0 * v.image}
+        views = [replace(v, information=0 * v.information, **black) for v in views]
+    _, cuda = _engines(setting)
+    (depth,) = cuda.estimate(views[:1], [views[1:]])
+    assert bool(torch.isfinite(depth.depth).all() & (depth.depth > 0).all())
+    assert bool(torch.isfinite(depth.confidence).all())
+    if how != "bad values":
+        assert float(depth.confidence.max()) < 0.5
+
+
 def _disturbed(setting: Setting) -> list[KeyframeDepth]:
     """True depths with noise, patches that are wrong, and confidences all over."""
     random = np.random.default_rng(3)

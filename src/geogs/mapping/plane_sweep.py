@@ -37,13 +37,14 @@ def sweep_planes(
     pixels = pixels * [camera.width, camera.height] - [camera.cx, camera.cy]
     rays = np.concatenate([pixels / [camera.fx, camera.fy], np.ones((len(pixels), 1))], 1)
     shifts = [0.0]
-    for view in neighbours:
-        relative = view.T_cw @ np.linalg.inv(reference.T_cw)
-        ends = [rays @ relative[:3, :3].T + relative[:3, 3] / z for z in (near, far)]
-        seen = (ends[0][:, 2] > 0.1) & (ends[1][:, 2] > 0.1)
-        if seen.any():
-            p, q = (e[seen, :2] / e[seen, 2:] * [camera.fx, camera.fy] for e in ends)
-            shifts.append(float(np.median(np.linalg.norm(p - q, axis=1))))
+    if neighbours:
+        relative = np.stack([v.T_cw for v in neighbours]) @ np.linalg.inv(reference.T_cw)
+        turned = rays @ np.swapaxes(relative[:, :3, :3], 1, 2)
+        ends = [turned + relative[:, None, :3, 3] / z for z in (near, far)]
+        seen = np.minimum(ends[0], ends[1])[..., 2] > 0.1
+        p, q = (e[..., :2] / np.where(seen, e[..., 2], 1.0)[..., None] for e in ends)
+        moved = np.linalg.norm((p - q) * [camera.fx, camera.fy], axis=2)
+        shifts += [float(np.median(m[s])) for m, s in zip(moved, seen, strict=True) if s.any()]
     steps = np.median(shifts[1:] or shifts) / config.plane_step
     count = int(np.clip(np.ceil(steps), config.min_planes, config.max_planes))
     return np.linspace(1.0 / far, 1.0 / near, count, dtype=np.float32)

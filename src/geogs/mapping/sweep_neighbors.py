@@ -106,8 +106,8 @@ def _seen_inverse_depth(
     relative = reference.T_cw @ np.linalg.inv(np.stack([v.T_cw for v in views]))
     camera = np.stack([x, y, z], 1).reshape(len(views), 3, -1)
     point = relative[:, :3, :3] @ camera + relative[:, :3, 3:]
-    point = point.transpose(1, 0, 2)[:, sure.reshape(len(views), -1)]
-    point = point[:, point[2] > 1e-6]
+    point = point.transpose(1, 0, 2).reshape(3, -1).take(np.flatnonzero(sure), 1)
+    point = point.take(np.flatnonzero(point[2] > 1e-6), 1)
     u = point[0] / point[2] * working.fx + working.cx
     v = point[1] / point[2] * working.fy + working.cy
     seen = (np.abs(2 * u / working.width - 1) < 1) & (np.abs(2 * v / working.height - 1) < 1)
