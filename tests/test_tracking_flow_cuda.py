@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from cuda_emulator import use_emulator
+from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.tracking.flow import classical_cuda
 from geogs.tracking.flow.base import FlowOperator
@@ -171,6 +172,11 @@ def test_starts_that_are_no_positions_have_no_weight(device: str) -> None:
         assert match.weight.isfinite().all()
     assert float(there.weight[0, :10].max()) == 0
     assert float((there.weight[..., 0] > 0).float().mean()) > 0.6
+
+
+def test_an_image_of_another_size_is_refused(device: str) -> None:
+    with pytest.raises(InputError, match="does not fit"):
+        operator_on(device).encode(np.zeros((40, 40, 3), np.uint8))
 
 
 def true_positions(grid: SampleGrid, a: np.ndarray, b: np.ndarray) -> torch.Tensor:

@@ -16,6 +16,7 @@ import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
+from geogs.errors import InputError
 from geogs.gpu.kernels import Kernel, kernels_for
 from geogs.tracking.flow.base import FlowMatch
 from geogs.tracking.flow.classical import (
@@ -127,7 +128,14 @@ class CudaClassicalFlow:
 
     def encode(self, image: UInt8[np.ndarray, "h w 3"]) -> CudaImage:
         layout, grid = self._layout, self.grid
-        rgb = self._upload(torch.from_numpy(np.ascontiguousarray(image)))
+        if image.shape != (layout.height, layout.width, 3):
+            raise InputError(
+                f"An image of shape {image.shape} does not fit a camera of "
+                f"{layout.width} x {layout.height} pixels."
+            )
+        staged = torch.empty(image.shape, dtype=torch.uint8, pin_memory=self.device.type == "cuda")
+        staged.numpy()[...] = image
+        rgb = staged.to(self.device, non_blocking=True)
         data = torch.empty(layout.total, device=self.device)
         textured = torch.empty(1, dtype=torch.int32, device=self.device)
         w, h = layout.width, layout.height
@@ -153,25 +161,19 @@ class CudaClassicalFlow:
         backward: Float[Tensor, "e p 2"] | None = None,
         fine: bool = True,
     ) -> tuple[FlowMatch, FlowMatch]:
-        cells = self.grid.size
         if forward is None or backward is None:
             start = None
         else:
             start = (forward.float().contiguous(), backward.float().contiguous())
         fine = fine or max(self._layout.width, self._layout.height) <= SMALL_IMAGE
-        n = len(first)
-        # The two directions are apart, so that each part is whole when pairs go in several turns.
-        pixels = torch.empty(2, n, cells, 2, device=self.device)
-        weight = torch.empty(2, n, cells, 2, device=self.device)
-        for at in range(0, n, PAIRS_AT_ONCE):
+        parts = []
+        for at in range(0, len(first), PAIRS_AT_ONCE):
             part = slice(at, at + PAIRS_AT_ONCE)
-            images = [*first[part], *second[part]]
             begin = None if start is None else (start[0][part], start[1][part])
-            found = self._measure(images, begin, 0 if fine else 1)
-            if len(images) == 2 * n:
-                pixels, weight = found
-            else:
-                pixels[:, part], weight[:, part] = found
+            parts.append(self._measure([*first[part], *second[part]], begin, 0 if fine else 1))
+        pixels, weight = (
+            p[0] if len(p) == 1 else torch.cat(p, 1) for p in zip(*parts, strict=True)
+        )
         return FlowMatch(pixels[0], weight[0]), FlowMatch(pixels[1], weight[1])
 
     def _measure(
@@ -179,7 +181,10 @@ class CudaClassicalFlow:
     ) -> tuple[Float[Tensor, "2 e p 2"], Float[Tensor, "2 e p 2"]]:
         layout, grid, pairs = self._layout, self.grid, len(images) // 2
         w, h = layout.width, layout.height
-        table = self._upload(torch.tensor([i.data.data_ptr() for i in images]))
+        pointers = torch.tensor([image.data.data_ptr() for image in images])
+        if self.device.type == "cuda":
+            pointers = pointers.pin_memory()
+        table = pointers.to(self.device, non_blocking=True)
         forward, backward = (None, None) if start is None else start
         warped = self._warped(table, forward, backward)
         flow = self._coarse_to_fine(table, warped, start is None, finest)
@@ -261,12 +266,6 @@ class CudaClassicalFlow:
             layout.height, level, sweeps, o.smoothness, o.gradients, o.brightness,
             o.zeta**2, o.epsilon**2, o.relaxation,
         )  # fmt: skip
-
-    def _upload(self, tensor: Tensor) -> Tensor:
-        """To the device without waiting for it."""
-        if self.device.type == "cuda":
-            tensor = tensor.pin_memory()
-        return tensor.to(self.device, non_blocking=True)
 
 
 def _tiles(width: int, height: int) -> tuple[int, int]:
