@@ -63,7 +63,7 @@ def make_views(rendered, device: torch.device) -> list[MapView]:
         view = MapView.of(keyframe, CAMERAS, CONFIG.loss, device)
         dense = torch.from_numpy(depth).float().to(device)
         confidence = torch.full_like(dense, 0.8)
-        view.set_depth(DenseDepth(dense, confidence, float(dense.median())), CAMERAS)
+        view.set_depth(DenseDepth(dense, confidence, dense.median().cpu()), CAMERAS)
         view.partners = [i for i in range(len(rendered)) if i != view.id][:2]
         views.append(view)
     return views

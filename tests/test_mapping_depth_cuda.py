@@ -222,7 +222,7 @@ def test_grids_are_upsampled_and_patches_gathered_as_opencv_does(setting):
 @pytest.mark.parametrize("shape", [(6, 11), (9, 5), (3, 4)])
 def test_completed_grids(setting, shape):
     config = setting.config
-    shape = shape if setting.device.type == "cpu" else tuple(7 * n for n in shape)
+    shape = tuple(7 * n for n in shape)
     v, u = np.mgrid[: shape[0], : shape[1]]
     grids, typical, expected = [], [], []
     for seed in range(2):
@@ -442,7 +442,7 @@ def test_check(setting):
     expected = cpu.check(here[:2], [here[1:], []])
     checked = cuda.check(there[:2], [there[1:], []])
     repaired = expected[0].depth.numpy() / depths[0].depth
-    assert (np.abs(repaired - 1) > 0.1).mean() > 0.01
+    assert (np.abs(repaired - 1) > 0.1).mean() > 0.005
     # A point may fall on the next pixel, for a rounding.
     _close(checked[0].depth, expected[0].depth.numpy(), 1e-3, 0.99)
     _close(checked[0].confidence, expected[0].confidence.numpy(), 2e-3, 0.99)

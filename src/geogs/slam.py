@@ -97,7 +97,8 @@ class Slam:
         with self.stopwatch("mapping"):
             for keyframe in self._keyframes(list(result.finalized)):
                 self.mapper.observe(keyframe)
-            self.mapper.follow(self._keyframes(list(result.active)))
+            if result.new_keyframe is not None or result.removed or result.finalized:
+                self.mapper.follow(self._keyframes(list(result.active)))
             trained = False
             while len(self._waiting) > lag:
                 self.mapper.map_keyframe(self._waiting.popleft())

@@ -55,12 +55,11 @@ def examine(device_name: str = "auto") -> Iterator[Finding]:
 
     Raises DeviceError if a device is asked for by name that cannot be used.
     """
-    from geogs.gpu.installation import gpu_problem, require_device
+    from geogs.gpu.installation import require_device
 
     yield from _versions()
-    asked = None if device_name == "auto" else require_device(device_name)
+    device = require_device(device_name)
     yield from _gpus()
-    device = asked or require_device("cpu" if gpu_problem() else "cuda")
     yield _cache(device.type == "cuda")
     if device.type == "cuda":
         yield _compiler()
@@ -74,7 +73,6 @@ def examine(device_name: str = "auto") -> Iterator[Finding]:
 def _versions() -> Iterator[Finding]:
     import platform
 
-    import av
     import cv2
     import numba
     import torch
@@ -91,7 +89,12 @@ def _versions() -> Iterator[Finding]:
     )
     yield Finding("OpenCV", cv2.__version__)
     yield Finding("numba", numba.__version__)
-    yield Finding("video", f"PyAV {av.__version__}, FFmpeg {av.ffmpeg_version_info}")
+    try:
+        import av
+    except ImportError as error:
+        yield Finding("video", f"PyAV does not load ({error})", "Install av to read videos.")
+    else:
+        yield Finding("video", f"PyAV {av.__version__}, FFmpeg {av.ffmpeg_version_info}")
 
 
 def _gpus() -> Iterator[Finding]:

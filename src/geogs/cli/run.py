@@ -41,8 +41,8 @@ class RunOptions(Config):
     """Folder for the results (also -o); out/NAME if none is given."""
     preset: Preset = "default"
     """Group of settings; single ones given beside it win."""
-    device: str = "cpu"
-    """Where to compute: cpu, cuda or cuda:1; ``geogs doctor`` tells what can be used."""
+    device: str = "auto"
+    """Where to compute: auto (a GPU where there is one), cpu, cuda or cuda:1; see geogs doctor."""
 
 
 def main(argv: Sequence[str]) -> int:

@@ -18,6 +18,7 @@ Argument = torch.Tensor | int | float | None
 
 _MAX_STATIC_SHARED = 48 * 1024
 _MAX_DYNAMIC_SHARED = 8  # CU_FUNC_ATTRIBUTE_MAX_DYNAMIC_SHARED_SIZE_BYTES
+_INVALID_CONTEXT = 201
 
 
 @functools.cache
@@ -83,6 +84,10 @@ class DeviceKernel:
         else:
             with torch.cuda.device(index):
                 code = self._launch(self._function, *sizes, stream, self._pointers, None)
+        if code == _INVALID_CONTEXT:  # the first use of the GPU by this thread
+            with torch.cuda.device(index):
+                _use_primary_context(index)
+                code = self._launch(self._function, *sizes, stream, self._pointers, None)
         if code:
             raise DeviceError(f"The kernel {self.name} could not start ({driver_error(code)}).")
 
@@ -94,6 +99,25 @@ class DeviceKernel:
                 f"has ({driver_error(code)})."
             )
         self._dynamic = size
+
+
+@functools.cache
+def _primary_context(index: int) -> ctypes.c_void_p:
+    """The context that PyTorch uses on a GPU."""
+    cuda, _ = _driver()
+    device, context = ctypes.c_int(), ctypes.c_void_p()
+    code = cuda.cuDeviceGet(ctypes.byref(device), index)
+    code = code or cuda.cuDevicePrimaryCtxRetain(ctypes.byref(context), device)
+    if code:
+        raise DeviceError(f"GPU {index} cannot be used ({driver_error(code)}).")
+    return context
+
+
+def _use_primary_context(index: int) -> None:
+    """Make PyTorch's context the calling thread's."""
+    code = _driver()[0].cuCtxSetCurrent(_primary_context(index))
+    if code:
+        raise DeviceError(f"GPU {index} cannot be used ({driver_error(code)}).")
 
 
 def _format(parameter: str) -> str:
@@ -111,7 +135,7 @@ def load_kernels(
     """The kernels of a cubin on the GPU ``index``; raises DeviceError if the driver refuses it."""
     cuda, _ = _driver()
     with torch.cuda.device(index):
-        torch.cuda.current_stream(index).synchronize()  # makes PyTorch's context current
+        _use_primary_context(index)
         module = ctypes.c_void_p()
         code = cuda.cuModuleLoadData(ctypes.byref(module), cubin)
         if code:

@@ -71,7 +71,12 @@ def gpu_problem() -> str | None:
 
 
 def require_device(name: str) -> torch.device:
-    """The device named ``cpu``, ``cuda`` or ``cuda:1``; raises DeviceError if it cannot be used."""
+    """The device named ``cpu``, ``cuda`` or ``cuda:1``; ``auto`` is a GPU where one can be used.
+
+    Raises DeviceError if the device cannot be used.
+    """
+    if name == "auto":
+        name = "cpu" if gpu_problem() else "cuda"
     try:
         device = torch.device(name)
     except RuntimeError:

@@ -96,6 +96,8 @@ class MapView:
 
     def follow(self, keyframe: Keyframe) -> None:
         """Take over the tracker's new pose and grid depth."""
+        if keyframe is self.keyframe:
+            return
         self.keyframe = keyframe
         self.depth_view = replace(
             self.depth_view,

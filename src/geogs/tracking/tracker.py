@@ -6,6 +6,7 @@ from enum import Enum
 from typing import Any
 
 import cv2
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor

@@ -8,6 +8,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from geogs.geometry.camera import Camera
+from geogs.gpu.transfer import to_device
 from geogs.losses.multi_view import PhotoView
 from geogs.losses.single_view import ViewConstants
 
@@ -81,22 +82,22 @@ class ViewTable:
     def set_constants(self, slot: int, view: ViewConstants) -> None:
         """Replace a keyframe's prior depth, confidence, prior normals and edges."""
         maps = [view.edge, view.image_gradient, view.prior_depth, view.confidence]
-        self._maps[slot][:4].copy_(torch.stack([m.float() for m in maps]), non_blocking=True)
+        self._maps[slot][:4].copy_(self._upload(torch.stack([m.float() for m in maps])))
         before = self._normals[slot]
         if view.prior_normal is None:
             self._normals[slot] = None
         elif before is None:
             self._normals[slot] = self._upload(view.prior_normal.permute(2, 0, 1))
         else:
-            before.copy_(view.prior_normal.permute(2, 0, 1), non_blocking=True)
+            before.copy_(self._upload(view.prior_normal.permute(2, 0, 1)))
         if (before is None) != (self._normals[slot] is None):
             self._point(slot)
 
     def set_poses(self, slots: Sequence[int], T_cw: Float[Tensor, "k 4 4"]) -> None:
         """Replace the world-to-camera poses of some slots, from a CPU or the device."""
         rows = T_cw.detach()[:, :3].reshape(-1, 12).double()
-        index = torch.tensor(slots, dtype=torch.int64).to(self.device, non_blocking=True)
-        self.poses.index_copy_(0, index, rows.to(self.device, non_blocking=True))
+        index = to_device(torch.tensor(slots, dtype=torch.int64), self.device)
+        self.poses.index_copy_(0, index, to_device(rows, self.device))
 
     def rendered_depth(self, slot: int) -> Float[Tensor, "h w"]:
         """The slot's rendered depth for occlusion tests; valid where ``rendered`` is 1."""
@@ -107,7 +108,7 @@ class ViewTable:
         self.rendered.zero_()
 
     def _upload(self, tensor: Tensor) -> Tensor:
-        return tensor.float().contiguous().to(self.device, non_blocking=True)
+        return to_device(tensor.float().contiguous(), self.device)
 
     def _point(self, slot: int) -> None:
         """Write the addresses of a slot's maps."""
@@ -120,7 +121,7 @@ class ViewTable:
         address[ViewField.PRIOR_NORMAL] = 0 if normal is None else normal.data_ptr()
         address[ViewField.GREY] = self._greys[slot].data_ptr()
         line = torch.tensor([address[field] for field in ViewField], dtype=torch.int64)
-        self.pointers[slot].copy_(line, non_blocking=True)
+        self.pointers[slot].copy_(to_device(line, self.device))
 
     def _grow(self) -> None:
         """Double the capacity; the keyframes' maps stay where they are."""

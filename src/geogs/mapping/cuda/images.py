@@ -10,6 +10,7 @@ from jaxtyping import Float32, Float64
 from torch import Tensor
 
 from geogs.geometry.camera import Camera
+from geogs.gpu.transfer import to_device
 from geogs.mapping.depth_view import DepthView
 
 
@@ -50,11 +51,8 @@ def image_pixels(view: DepthView) -> Float32[np.ndarray, "n"]:
 
 
 def upload(array: np.ndarray, device: torch.device) -> Tensor:
-    """The array on the device, without waiting for what runs there.
-
-    The driver copies pageable memory aside before it returns, so the array may change afterwards.
-    """
-    return torch.from_numpy(np.ascontiguousarray(array)).to(device, non_blocking=True)
+    """The array on the device, without waiting for what runs there."""
+    return to_device(torch.from_numpy(np.ascontiguousarray(array)), device)
 
 
 def homographies(

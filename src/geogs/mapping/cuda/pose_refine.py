@@ -8,6 +8,7 @@ from torch import Tensor
 
 from geogs.config import MappingConfig
 from geogs.geometry.lie import retract, se3_inverse
+from geogs.gpu.transfer import to_device
 from geogs.mapping.cuda.window_pass import WindowPass
 from geogs.mapping.view import MapView
 from geogs.splat.map import GaussianMap
@@ -35,8 +36,8 @@ def refine_poses(
                     strict=True))  # fmt: skip
     rows = [slot[v.id] for v in active]
     rows += [slot[v.partners[0]] if v.partners else -1 for v in active]
-    window.slots.copy_(torch.tensor(rows, dtype=torch.int32))
-    count = torch.tensor([len(disks)], dtype=torch.int32).to(disks.device)
+    window.slots.copy_(to_device(torch.tensor(rows, dtype=torch.int32), disks.device))
+    count = to_device(torch.tensor([len(disks)], dtype=torch.int32), disks.device)
     start = torch.stack([view.T_cw for view in active])
     tangent = torch.zeros(len(active) - 1, 6, dtype=torch.float64, requires_grad=True)
     units = torch.tensor([unit] * 3 + [1.0] * 3, dtype=torch.float64)

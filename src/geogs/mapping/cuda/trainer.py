@@ -10,6 +10,7 @@ from torch import Tensor
 
 from geogs.config import MappingConfig
 from geogs.gpu.kernels import kernels_for
+from geogs.gpu.transfer import to_device
 from geogs.losses.cuda.view_table import ViewTable
 from geogs.mapping.cuda.pose_refine import refine_poses
 from geogs.mapping.cuda.window_pass import WindowPass
@@ -144,9 +145,11 @@ class _TrainingStep:
             self._schedule = torch.zeros(rows.shape, dtype=torch.int32, device=self._device)
             self._factors = torch.zeros(len(rows), device=self._device)
             self._graph = None
-        self._schedule[: len(rows)] = torch.from_numpy(rows)
-        self._factors[: len(rows)] = torch.as_tensor(factors, dtype=torch.float32)
-        self._base.copy_(torch.tensor(list(self._trainer.optimizer.learning_rates)))
+        self._schedule[: len(rows)] = to_device(torch.from_numpy(rows), self._device)
+        scale = torch.as_tensor(np.asarray(factors, np.float32))
+        self._factors[: len(rows)] = to_device(scale, self._device)
+        rates = torch.tensor(list(self._trainer.optimizer.learning_rates))
+        self._base.copy_(to_device(rates, self._device))
         self._count.fill_(len(self._trainer.disks))
         self._completed.zero_()
 

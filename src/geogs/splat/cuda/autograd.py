@@ -5,6 +5,7 @@ import functools
 import torch
 from torch import Tensor
 
+from geogs.gpu.transfer import to_device
 from geogs.splat.cuda.pool import RasterizerPool
 from geogs.splat.cuda.rasterize import MapGradients, Maps, Views
 from geogs.splat.map import DiskParameters
@@ -28,7 +29,7 @@ class RasterizeOnGpu(torch.autograd.Function):
         device, n = position.device, len(position)
         given = (position, quaternion, log_scale, opacity_logit)
         disks = DiskParameters(*(p.contiguous() for p in given))
-        poses = T_cw.to(device, torch.float64).contiguous().view(-1, 4, 4)
+        poses = to_device(T_cw, device, torch.float64).contiguous().view(-1, 4, 4)
         views = Views(poses)
         loan = _pool().lend(n, len(poses), camera, near, device)
         rasterizer, maps = loan.rasterizer, Maps.empty(camera, T_cw.shape[:-2], n, device)

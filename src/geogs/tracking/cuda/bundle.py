@@ -9,6 +9,7 @@ from jaxtyping import Bool, Int
 from torch import Tensor
 
 from geogs.gpu.kernels import kernels_for
+from geogs.gpu.transfer import to_device
 from geogs.tracking.bundle import BundleOptions, BundleProblem, BundleResult
 from geogs.tracking.grid import SampleGrid
 
@@ -67,7 +68,7 @@ def _structure(problem: BundleProblem, device: torch.device) -> _Structure:
     poses = int(free_pose.sum())
     system = _system_parts(slot[source[a]], slot[target[a]], slot[target[b]], a == b, poses)
     parts = [source, target, first, slot, free_depth, a, b, *system]
-    sent = torch.from_numpy(np.concatenate(parts).astype(np.int32)).to(device, non_blocking=True)
+    sent = to_device(torch.from_numpy(np.concatenate(parts).astype(np.int32)), device)
     return _Structure(poses, *sent.split([len(p) for p in parts]))
 
 
@@ -128,7 +129,7 @@ class _Workspace:
         self.cells = cells
         # Poses and the sign of failure travel back together.
         self.state = torch.zeros(16 * s.frames + 1, dtype=torch.float64, device=device)
-        self.state[: 16 * s.frames].copy_(problem.T_cw.reshape(-1), non_blocking=True)
+        self.state[: 16 * s.frames].copy_(to_device(problem.T_cw.reshape(-1), device))
         self.T = self.state[: 16 * s.frames]
         self.failed = self.state[16 * s.frames :].view(torch.int32)
         self.inverse_depth = d.clone()

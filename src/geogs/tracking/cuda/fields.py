@@ -7,6 +7,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from geogs.gpu.kernels import kernels_for
+from geogs.gpu.transfer import to_device
 from geogs.tracking.grid import OFFSET, STRIDE, SampleGrid
 
 SOURCE = Path(__file__).with_name("bundle_grid.cu")
@@ -54,8 +55,8 @@ def carry_depth(
     pixels (n, p, 2) of the sources' cells in the views and of the views' cells in the sources.
     """
     device, camera, n = inverse_depth.device, grid.camera, len(T)
-    poses = torch.cat([T, T_source]).to(device, non_blocking=True)
-    rows = source.to(device, torch.int32, non_blocking=True)
+    poses = to_device(torch.cat([T, T_source]), device)
+    rows = to_device(source, device, torch.int32)
     size = 2 * grid.size + _pyramid_size(grid)
     memory = inverse_depth.new_empty(n * (size + grid.size))
     scratch, depth = memory[: n * size], memory[n * size :]

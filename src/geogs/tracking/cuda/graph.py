@@ -9,6 +9,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from geogs.gpu.kernels import Kernel, kernels_for
+from geogs.gpu.transfer import to_device
 from geogs.tracking.cuda.bundle import block_size
 from geogs.tracking.grid import SampleGrid
 from geogs.tracking.keyframes import KeyframeStore
@@ -34,8 +35,8 @@ class DirectedPairs:
         rows = torch.tensor([[slot[i], slot[j]] for i, j in directed], dtype=torch.int32).mT
         inverse_depth = store.inverse_depths(ids)
         device = inverse_depth.device
-        rows = rows.contiguous().to(device, non_blocking=True)
-        T = store.poses(ids).to(device, non_blocking=True)
+        rows = to_device(rows.contiguous(), device)
+        T = to_device(store.poses(ids), device)
         return cls(store.grid, T, inverse_depth, rows[0], rows[1])
 
     def __len__(self) -> int:

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from geogs.geometry.camera import Camera
 from geogs.gpu.kernels import kernels_for
+from geogs.gpu.transfer import to_device
 from geogs.tracking.grid import SampleGrid
 
 SOURCE = Path(__file__).with_name("bundle_motion.cu")
@@ -36,8 +37,8 @@ def solve_poses(
     n, device, frame = len(T_cw), inverse_depth.device, frame.cpu()
     order = torch.argsort(frame, stable=True)
     first = torch.searchsorted(frame[order], torch.arange(n + 1))
-    rows = torch.cat([first, order]).int().to(device, non_blocking=True)
-    poses = torch.cat([T_cw, T_source]).to(device, non_blocking=True)
+    rows = to_device(torch.cat([first, order]).int(), device)
+    poses = to_device(torch.cat([T_cw, T_source]), device)
     residual = torch.empty_like(pixels, memory_format=torch.contiguous_format)
     cells = inverse_depth.shape[1]
     kernels_for(SOURCE, device)["solve_poses"](
@@ -68,7 +69,7 @@ def fit_frame(
     """
     device, c, threads = inverse_depth.device, grid.camera, _threads(grid.size)
     state = torch.cat([T_guess.reshape(-1), T_guess.new_zeros(4), T_keyframe.reshape(-1)])
-    state = state.to(device, non_blocking=True)
+    state = to_device(state, device)
     rows = torch.arange(2, dtype=torch.int32, device=device)
     residual, pixels, weight = (
         torch.empty_like(grid.pixels),

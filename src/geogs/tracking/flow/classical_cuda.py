@@ -18,6 +18,7 @@ from torch import Tensor
 
 from geogs.errors import InputError
 from geogs.gpu.kernels import Kernel, kernels_for
+from geogs.gpu.transfer import to_device
 from geogs.tracking.flow.base import FlowMatch
 from geogs.tracking.flow.classical import (
     COARSE_DEVIATION,
@@ -182,9 +183,7 @@ class CudaClassicalFlow:
         layout, grid, pairs = self._layout, self.grid, len(images) // 2
         w, h = layout.width, layout.height
         pointers = torch.tensor([image.data.data_ptr() for image in images])
-        if self.device.type == "cuda":
-            pointers = pointers.pin_memory()
-        table = pointers.to(self.device, non_blocking=True)
+        table = to_device(pointers, self.device)
         forward, backward = (None, None) if start is None else start
         warped = self._warped(table, forward, backward)
         flow = self._coarse_to_fine(table, warped, start is None, finest)
