@@ -184,3 +184,15 @@ def test_streams_and_devices() -> None:
     for index in range(1, torch.cuda.device_count()):
         there = DiskParameters(*(p.to(f"cuda:{index}") for p in disks))
         assert torch.equal(render(there, CAMERA, pose()).depth.cpu(), expected.depth.cpu())
+
+
+def test_more_entries_than_room_are_rendered_again(device: torch.device) -> None:
+    # Every disk covers the whole image: many more entries than were expected.
+    camera = Camera(fx=60.0, fy=60.0, cx=48.0, cy=40.0, width=96, height=80)
+    wide = disks_at(40, 2, 1.5)._replace(opacity_logit=torch.full((40,), -1.0))
+    disks = DiskParameters(*(p.to(device) for p in wide))
+    expected = render(wide, camera, pose(), backend="cpu")
+    for _ in range(2):
+        out = render(disks, camera, pose(), backend="cuda")
+        for name in MAPS:
+            assert relative(getattr(out, name).cpu(), getattr(expected, name).double()) < 1e-4, name

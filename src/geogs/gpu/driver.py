@@ -77,7 +77,7 @@ class DeviceKernel:
         index = self._index
         values = [a.data_ptr() if isinstance(a, torch.Tensor) else a or 0 for a in arguments]
         self._packer.pack_into(self._buffer, 0, *values)
-        stream = torch.cuda.current_stream(index).cuda_stream
+        stream = _current_stream(index)
         sizes = (gx, gy, gz, *_three(block), shared)
         if torch.cuda.current_device() == index:
             code = self._launch(self._function, *sizes, stream, self._pointers, None)
@@ -99,6 +99,12 @@ class DeviceKernel:
                 f"has ({driver_error(code)})."
             )
         self._dynamic = size
+
+
+def _current_stream(index: int) -> int:
+    """Handle of PyTorch's current stream; a tenth of the time of making a Stream object."""
+    raw = getattr(torch._C, "_cuda_getCurrentRawStream", None)
+    return torch.cuda.current_stream(index).cuda_stream if raw is None else raw(index)
 
 
 @functools.cache

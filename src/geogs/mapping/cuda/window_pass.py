@@ -12,9 +12,6 @@ from geogs.splat.cuda.rasterize import MapGradients, Maps, Rasterizer, Views
 from geogs.splat.map import DiskParameters, GaussianMap
 from geogs.splat.render import NEAR
 
-_ENTRIES_PER_DISK = 4
-"""Tiles that a disk reaches in a view, usually fewer; what the lists have room for at first."""
-
 
 class WindowPass:
     """Buffers and launches for a fixed number of views, partners and disks.
@@ -39,7 +36,6 @@ class WindowPass:
         self.table, self.views, self.partners, self.capacity = table, views, partners, capacity
         self._generation = table.generation
         self.rasterizer = Rasterizer(capacity, views, camera, NEAR, device)
-        self.rasterizer.reserve(_ENTRIES_PER_DISK * views * capacity)
         self.losses = WindowLosses(table, config, unit, views, partners, pair_share, for_poses)
         self.maps = Maps.empty(camera, (views,), capacity, device)
         m = self.maps
@@ -73,7 +69,7 @@ class WindowPass:
         """Maps, losses and gradients of the views in ``batch``; ``disks`` have all their room."""
         views = Views(self.table.poses, self.batch, count)
         m, d = self.maps, self._gradients
-        self.rasterizer.project(disks, views)
+        self.rasterizer.project(disks, views, m)
         self.rasterizer.blend(views, m)
         self.losses.launch(
             self.batch, self.pairs, m.depth, m.normal, m.alpha, m.distortion,

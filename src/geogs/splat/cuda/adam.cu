@@ -35,7 +35,7 @@ __device__ __forceinline__ void step_rows(float* p, const float* g, float* first
 }
 
 // Grid: disks / 256. Steps the visible disks whose gradients are finite and below a limit, with the
-// bias correction of their own step count; counts and clears their visibility; bounds all scales.
+// bias correction of their own step count; counts their visibility; bounds all scales.
 // If ``status[1]`` says that the lists had no room, nothing is stepped or counted as completed.
 extern "C" __global__ void __launch_bounds__(256) adam_step(
     int capacity, const int* count, const int* status, int* completed, float* position,
@@ -43,16 +43,14 @@ extern "C" __global__ void __launch_bounds__(256) adam_step(
     const float* d_quaternion, const float* d_log_scale, const float* d_opacity_logit,
     float* first_position, float* first_quaternion, float* first_log_scale, float* first_opacity,
     float* second_position, float* second_quaternion, float* second_log_scale,
-    float* second_opacity, long long* steps, long long* seen, unsigned char* visible,
+    float* second_opacity, long long* steps, long long* seen, const unsigned char* visible,
     const float* rates, float beta1, float beta2, float eps, float gradient_limit,
     float least_log_scale, float largest_log_scale) {
   const int i = blockIdx.x * blockDim.x + threadIdx.x;
   const bool failed = status[1] != 0;
   if (i == 0 && !failed) *completed += 1;
-  if (i >= min(*count, capacity)) return;
+  if (failed || i >= min(*count, capacity)) return;
   const bool shown = visible[i] != 0;
-  visible[i] = 0;
-  if (failed) return;
   const AdamSettings s = {beta1, beta2, eps, gradient_limit, least_log_scale, largest_log_scale};
   if (shown) {
     seen[i] += 1;

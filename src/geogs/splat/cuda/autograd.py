@@ -20,8 +20,9 @@ def _pool() -> RasterizerPool:
 class RasterizeOnGpu(torch.autograd.Function):
     """Maps of one pose (4, 4), or of several (b, 4, 4) with a leading dimension.
 
-    Depth, normal, alpha, distortion, median depth, visibility. The number of list entries is read
-    back once, which waits for the projection but not for the compositing.
+    Depth, normal, alpha, distortion, median depth, visibility. The compositing is launched on the
+    guess that the list entries fit where the last ones did, and once more if they do not: that is
+    known as soon as the projection is done, while the GPU goes on.
     """
 
     @staticmethod
@@ -34,9 +35,12 @@ class RasterizeOnGpu(torch.autograd.Function):
         loan = _pool().lend(n, len(poses), camera, near, device)
         rasterizer, maps = loan.rasterizer, Maps.empty(camera, T_cw.shape[:-2], n, device)
         with_trace = any(ctx.needs_input_grad)
-        rasterizer.project(disks, views)
-        rasterizer.reserve(rasterizer.entries())
+        rasterizer.project(disks, views, maps)
+        rasterizer.note_projection()
         rasterizer.blend(views, maps, with_trace)
+        if not rasterizer.has_room():
+            rasterizer.project(disks, views, maps)
+            rasterizer.blend(views, maps, with_trace)
         if with_trace:
             # Saved, so that PyTorch notices if they are changed before the backward pass.
             ctx.save_for_backward(*given, T_cw)

@@ -5,10 +5,11 @@
 #define SHARED_KEYS 2048
 
 // One block of 1024. Exclusive sums of ``counts``, which are cleared; ``status``: the largest number
-// of entries seen, and whether it ever exceeded what the lists hold.
+// of entries seen, and whether it ever exceeded what the lists hold. ``entries``, unless null, is
+// memory of the host and receives the number of entries.
 extern "C" __global__ void __launch_bounds__(1024) scan_tiles(int tiles, int room, int* counts,
                                                               int* offsets, int* cursor,
-                                                              int* status) {
+                                                              int* status, int* entries) {
   __shared__ int warp_sums[32];
   const int t = threadIdx.x, lane = t & 31, warp = t >> 5, each = (tiles + 1023) / 1024;
   const int first = min(t * each, tiles), last = min(first + each, tiles);
@@ -41,6 +42,7 @@ extern "C" __global__ void __launch_bounds__(1024) scan_tiles(int tiles, int roo
     offsets[tiles] = at;
     status[0] = max(status[0], at);
     if (at > room) status[1] = 1;
+    if (entries) *entries = at;
   }
 }
 

@@ -112,11 +112,12 @@ __device__ __forceinline__ void visit_tiles(bool active, float4 p, float4 q, flo
 
 // Grid: disks / 256, views. Writes records and outlines (no box where no pixel can blend the disk)
 // and counts the disks of every tile in ``counts`` (views, tile rows, tile columns), zero on entry.
+// Clears ``visible`` (disks).
 extern "C" __global__ void __launch_bounds__(256) project_disks(
     int capacity, const int* count, const float* position, const float* quaternion,
     const float* log_scale, const float* opacity_logit, const double* poses, int pose_size,
     const int* batch, double fx, double fy, double cx, double cy, double near, int width,
-    int height, float4* records, float4* outlines, int* counts) {
+    int height, float4* records, float4* outlines, int* counts, unsigned char* visible) {
   const int i = blockIdx.x * blockDim.x + threadIdx.x, b = blockIdx.y;
   const double* T = pose_of(poses, pose_size, batch, b);
   float4 p = make_float4(0.f, 0.f, 0.f, 0.f), q = p;
@@ -169,6 +170,7 @@ extern "C" __global__ void __launch_bounds__(256) project_disks(
     }
   }
   if (i < capacity) {
+    if (b == 0) visible[i] = 0;
     outlines[2 * ((size_t)b * capacity + i)] = p;
     outlines[2 * ((size_t)b * capacity + i) + 1] = q;
   }

@@ -16,6 +16,8 @@ TILE = 16
 THREADS = 256
 RECORD, OUTLINE, SUMS, POSE_COPIES = 16, 8, 16, 32
 """Floats per disk of the record, of the outline and of the pixels' sums; see the sources."""
+_ENTRIES_PER_DISK = 4
+"""Tiles that a disk reaches in a view, usually fewer; what the lists have room for at first."""
 _SLACK = 1.25
 
 
@@ -46,11 +48,11 @@ class Maps:
     distortion: Float[Tensor, "*b h w"]
     median_depth: Float[Tensor, "*b h w"]
     visible: Bool[Tensor, "n"]
-    """Of any view; only ever set by the renderer."""
+    """Of any view."""
 
     @staticmethod
     def empty(camera: Camera, views: tuple[int, ...], disks: int, device: torch.device) -> "Maps":
-        """Uninitialised maps; no disk visible."""
+        """Uninitialised maps."""
         shape = (*views, camera.height, camera.width)
         return Maps(
             depth=torch.empty(shape, device=device),
@@ -58,7 +60,7 @@ class Maps:
             alpha=torch.empty(shape, device=device),
             distortion=torch.empty(shape, device=device),
             median_depth=torch.empty(shape, device=device),
-            visible=torch.zeros(disks, dtype=torch.bool, device=device),
+            visible=torch.empty(disks, dtype=torch.bool, device=device),
         )
 
 
@@ -78,8 +80,8 @@ class Rasterizer:
     """Buffers for a number of views and disks, and the launches that fill them.
 
     Nothing waits for the GPU and nothing is allocated after ``reserve``, so that the passes can be
-    captured in a CUDA graph; only :meth:`entries` reads something back. Every buffer that must be
-    clear before a pass is cleared by the pass that reads it.
+    captured in a CUDA graph; only :meth:`has_room` waits. Every buffer that must be clear before a
+    pass is cleared by the pass that reads it.
     """
 
     def __init__(
@@ -102,8 +104,13 @@ class Rasterizer:
         self._ranks = torch.empty(pixels, dtype=torch.int32, device=device)
         self._sums = torch.zeros(views, capacity, SUMS, device=device)
         self._pose_copies = torch.zeros(POSE_COPIES, views, 12, dtype=torch.float64, device=device)
+        # Written by the GPU into the host's memory, so that it can be read without a copy.
+        on_gpu = device.type == "cuda"
+        self._entries = torch.zeros(1, dtype=torch.int32, pin_memory=on_gpu)
+        self._counted = torch.cuda.Event() if on_gpu else None
         self._keys = torch.empty(0, dtype=torch.int64, device=device)
         self._disks = torch.empty(0, dtype=torch.int32, device=device)
+        self.reserve(_ENTRIES_PER_DISK * views * capacity + 1)
 
     @property
     def room(self) -> int:
@@ -117,22 +124,32 @@ class Rasterizer:
             self._keys = torch.empty(room, dtype=torch.int64, device=self.device)
             self._disks = torch.empty(room, dtype=torch.int32, device=self.device)
 
-    def project(self, disks: DiskParameters, views: Views) -> None:
-        """Records, outlines and the number of entries of each tile."""
+    def project(self, disks: DiskParameters, views: Views, maps: Maps) -> None:
+        """Records, outlines and the number of entries of each tile; clears what is visible."""
         c = self.camera
         self._kernels["project_disks"](
             (self._blocks, self.views), THREADS, self.capacity, views.count, *disks, views.poses,
             views.pose_size, views.batch, c.fx, c.fy, c.cx, c.cy, self.near, c.width, c.height,
-            self._records, self._outlines, self._counts,
+            self._records, self._outlines, self._counts, maps.visible,
         )  # fmt: skip
         self._kernels["scan_tiles"](
             1, 1024, self.views * self._tiles, self.room, self._counts, self._offsets,
-            self._cursor, self.status,
+            self._cursor, self.status, self._entries,
         )  # fmt: skip
 
-    def entries(self) -> int:
-        """How many entries the last projection made; waits for it."""
-        return int(self._offsets[-1])
+    def note_projection(self) -> None:
+        """Let :meth:`has_room` wait for what was launched so far and no longer."""
+        if self._counted is not None:
+            self._counted.record(torch.cuda.current_stream(self.device))
+
+    def has_room(self) -> bool:
+        """Whether the last projection's entries fit; waits for it, and makes room if not."""
+        if self._counted is not None:
+            self._counted.synchronize()
+        entries = int(self._entries)
+        fits = entries <= self.room
+        self.reserve(entries)
+        return fits
 
     def blend(self, views: Views, maps: Maps, with_trace: bool = True) -> None:
         """List and sort the entries, composite the maps; the backward pass needs the trace."""
