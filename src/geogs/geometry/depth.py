@@ -19,9 +19,10 @@ def normals_from_depth(
     p = camera.back_project(depth)
     horizontal = p[1:-1, 2:] - p[1:-1, :-2]
     vertical = p[:-2, 1:-1] - p[2:, 1:-1]
-    n = torch.linalg.cross(horizontal, vertical)
-    n = n * (n.square().sum(-1, keepdim=True) + 1e-30).rsqrt()
     d = depth > 0
     inner = d[1:-1, 1:-1] & d[1:-1, 2:] & d[1:-1, :-2] & d[2:, 1:-1] & d[:-2, 1:-1]
+    # In holes the product may be zero, where normalising it has no finite slope.
+    n = torch.where(inner[..., None], torch.linalg.cross(horizontal, vertical), 1.0)
+    n = n * (n.square().sum(-1, keepdim=True) + 1e-30).rsqrt()
     normals = torch.nn.functional.pad(n * inner[..., None], (0, 0, 1, 1, 1, 1))
     return normals, torch.nn.functional.pad(inner, (1, 1, 1, 1))

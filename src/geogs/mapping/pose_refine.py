@@ -7,6 +7,7 @@ from torch import Tensor
 from geogs.config import MappingConfig
 from geogs.geometry.lie import retract
 from geogs.losses import fused_multi_view, fused_single_view
+from geogs.mapping.tangent_adam import TangentAdam
 from geogs.mapping.view import MapCameras, MapView
 from geogs.splat.map import DiskParameters, GaussianMap
 from geogs.splat.render import render
@@ -30,7 +31,7 @@ def refine_poses(
     start = torch.stack([view.T_cw for view in active])
     tangent = torch.zeros(len(active) - 1, 6, dtype=torch.float64, requires_grad=True)
     units = torch.tensor([unit] * 3 + [1.0] * 3, dtype=torch.float64)
-    optimizer = torch.optim.Adam([tangent], lr=config.pose_lr)
+    optimizer = TangentAdam(tangent, config.pose_lr)
     best_loss, best = float("inf"), start
     for step in range(config.pose_iterations + 1):
         poses = torch.cat([start[:1], retract(tangent * units, start[1:])])
@@ -38,11 +39,7 @@ def refine_poses(
         if float(loss.detach()) < best_loss:
             best_loss, best = float(loss.detach()), poses.detach()
         if step < config.pose_iterations:
-            optimizer.zero_grad()
-            loss.backward()
-            assert tangent.grad is not None
-            tangent.grad.nan_to_num_(nan=0.0, posinf=0.0, neginf=0.0)
-            optimizer.step()
+            optimizer.step(torch.autograd.grad(loss, tangent)[0])
     return {view.id: T for view, T in zip(active[1:], best[1:], strict=True)}
 
 

@@ -10,6 +10,7 @@ from geogs.config import MappingConfig
 from geogs.geometry.lie import retract, se3_inverse
 from geogs.gpu.transfer import to_device
 from geogs.mapping.cuda.window_pass import WindowPass
+from geogs.mapping.tangent_adam import TangentAdam
 from geogs.mapping.view import MapView
 from geogs.splat.map import GaussianMap
 
@@ -41,7 +42,7 @@ def refine_poses(
     start = torch.stack([view.T_cw for view in active])
     tangent = torch.zeros(len(active) - 1, 6, dtype=torch.float64, requires_grad=True)
     units = torch.tensor([unit] * 3 + [1.0] * 3, dtype=torch.float64)
-    optimizer = torch.optim.Adam([tangent], lr=config.pose_lr)
+    optimizer = TangentAdam(tangent, config.pose_lr)
     best_loss, best = float("inf"), start
     for step in range(config.pose_iterations + 1):
         poses = torch.cat([start[:1], retract(tangent * units, start[1:])])
@@ -50,11 +51,8 @@ def refine_poses(
         if loss < best_loss:
             best_loss, best = loss, poses.detach()
         if step < config.pose_iterations:
-            optimizer.zero_grad()
-            _chain(active, views, poses, d_poses, d_motions).backward()
-            assert tangent.grad is not None
-            tangent.grad.nan_to_num_(nan=0.0, posinf=0.0, neginf=0.0)
-            optimizer.step()
+            chain = _chain(active, views, poses, d_poses, d_motions)
+            optimizer.step(torch.autograd.grad(chain, tangent)[0])
     return {view.id: T for view, T in zip(active[1:], best[1:], strict=True)}
 
 
