@@ -64,6 +64,18 @@ def test_normals_are_invalid_beside_a_hole():
     assert int((~valid).sum()) == 2 * (320 + 238) + 5
 
 
+def test_normals_from_depth_have_finite_gradients_beside_holes() -> None:
+    depth = torch.full((CAMERA.height, CAMERA.width), 2.0)
+    depth[:, 5:9] = 0.0
+    depth.requires_grad_()
+    normals, valid = normals_from_depth(depth, CAMERA)
+    assert 0 < int(valid.sum()) < valid.numel()
+    normals[..., 0].sum().backward()
+    assert depth.grad is not None
+    assert torch.isfinite(depth.grad).all()
+    assert float(depth.grad.abs().max()) > 0
+
+
 @pytest.mark.parametrize("with_scale", [True, False])
 def test_umeyama_recovers_a_similarity(with_scale):
     g = torch.Generator().manual_seed(1)
