@@ -1,5 +1,6 @@
 """The CPU renderer against its specification, forward and backward."""
 
+import math
 import re
 from collections.abc import Callable
 
@@ -270,6 +271,28 @@ def test_near_is_a_bound_of_depth() -> None:
     assert relative(out.depth, expected.depth) < 1e-4
     assert out.depth[out.alpha > 0].min() >= 2.5
     assert not torch.equal(out.visible, render(disks, CAMERA, pose()).visible)
+
+
+def held_at_the_near_plane(backend: str, dtype: torch.dtype, device: str) -> list[torch.Tensor]:
+    """Gradients of a tilted disk that reaches the near plane, so that hits are held there."""
+    half = 1.55 / 2
+    parameters = (
+        [[0.02, 0.01, 0.6]], [[math.cos(half), math.sin(half), 0.05, 0.0]], [[-0.5, -0.7]], [1.0],
+    )  # fmt: skip
+    leaves = [torch.tensor(p).to(device, dtype).requires_grad_() for p in parameters]
+    camera = Camera(fx=40.0, fy=40.0, cx=20.0, cy=15.0, width=41, height=31)
+    eye = torch.eye(4, dtype=torch.float64)
+    out = render(DiskParameters(*leaves), camera, eye, backend=backend, near=0.5)
+    g = torch.Generator().manual_seed(0)
+    weight = torch.randn(31, 41, generator=g, dtype=torch.float64).to(out.depth)
+    found = torch.autograd.grad((out.depth * weight).sum(), leaves[:2])
+    return [x.cpu() for x in found]
+
+
+def test_hits_held_at_the_near_plane_move_with_the_centre() -> None:
+    expected = held_at_the_near_plane("reference", torch.float64, "cpu")
+    for a, b in zip(held_at_the_near_plane("cpu", torch.float32, "cpu"), expected, strict=True):
+        assert relative(a, b) < 1e-3
 
 
 def test_wrong_dtype_is_refused() -> None:

@@ -11,7 +11,18 @@ from geogs.geometry.lie import se3_exp
 from geogs.splat.cuda import rasterize
 from geogs.splat.map import DiskParameters, GaussianMap
 from geogs.splat.render import RenderOutput, render, render_views
-from test_splat_cpu import CAMERA, MAPS, SCENES, disks_at, edge_on, ordinary, pose, relative, tiny
+from test_splat_cpu import (
+    CAMERA,
+    MAPS,
+    SCENES,
+    disks_at,
+    edge_on,
+    held_at_the_near_plane,
+    ordinary,
+    pose,
+    relative,
+    tiny,
+)
 
 
 @pytest.fixture(params=["emulated", pytest.param("gpu", marks=pytest.mark.gpu)])
@@ -196,3 +207,10 @@ def test_more_entries_than_room_are_rendered_again(device: torch.device) -> None
         out = render(disks, camera, pose(), backend="cuda")
         for name in MAPS:
             assert relative(getattr(out, name).cpu(), getattr(expected, name).double()) < 1e-4, name
+
+
+def test_hits_held_at_the_near_plane_move_with_the_centre(device: torch.device) -> None:
+    expected = held_at_the_near_plane("reference", torch.float64, "cpu")
+    found = held_at_the_near_plane("cuda", torch.float32, str(device))
+    for a, b in zip(found, expected, strict=True):
+        assert relative(a, b) < 1e-3

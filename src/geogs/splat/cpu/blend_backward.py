@@ -90,7 +90,7 @@ def unblend_disk(state, first, last, r, rank, z_reference, inverse_near, g):
         rho3, rho2 = u * u + v * v, dx * dx + dy * dy
         on_plane = (bounded == w) & (rho3 <= rho2)
         z_kept = min(max(z, nearest), furthest)
-        free = on_plane | (z_kept == z)
+        free = on_plane | ((z_kept == z) & (bounded == w))
         z_hit = z if on_plane else z_kept
         rho = rho3 if on_plane else rho2
         gauss = exp_minus(rho)

@@ -38,7 +38,7 @@ __device__ __forceinline__ Hit hit_of(float4 r0, float4 r1, float4 r2, float4 r3
   const float rho3 = h.u * h.u + h.v * h.v, rho2 = h.dx * h.dx + h.dy * h.dy;
   h.on_plane = bounded == w && rho3 <= rho2;
   const float kept = fminf(fmaxf(z, r3.y), r3.z);
-  h.is_free = h.on_plane || kept == z;
+  h.is_free = h.on_plane || (kept == z && bounded == w);
   h.z = h.on_plane ? z : kept;
   h.rho = h.on_plane ? rho3 : rho2;
   h.gauss = __expf(-h.rho);
