@@ -15,6 +15,7 @@ import statistics
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -29,6 +30,7 @@ from geogs.mapping.cuda.trainer import CudaTrainer
 from geogs.mapping.depth_view import DenseDepth
 from geogs.mapping.training import Batch
 from geogs.mapping.view import MapCameras, MapView
+from geogs.splat.cuda import autograd
 from geogs.splat.init import initialise_disks
 from geogs.splat.map import DiskParameters, GaussianMap
 from geogs.splat.render import render_views
@@ -201,6 +203,9 @@ class Plain:
         return float(self.loss.detach()), self.disks.position.grad
 
 
+Contestant = TypeVar("Contestant", Fused, Plain)
+
+
 def agreement(fused: Fused, plain: Plain) -> tuple[float, float]:
     """Relative difference of the losses and cosine of the gradients.
 
@@ -252,25 +257,23 @@ def parts_of(kernels: dict[str, float]) -> dict[str, float]:
     return parts
 
 
-def peak_mib(work: Callable[[], None]) -> float:
-    """Largest memory of tensors during some work, beyond what is there before, in MiB."""
+def started(make: Callable[[], Contestant]) -> tuple[Contestant, float]:
+    """A contestant after two steps and the most memory of its tensors meanwhile, in MiB."""
+    autograd._pool.cache_clear()  # no buffers of earlier renderings
     before = torch.cuda.memory_allocated()
     torch.cuda.reset_peak_memory_stats()
-    work()
+    contestant = make()
+    contestant.train(2)
     torch.cuda.synchronize()
-    return (torch.cuda.max_memory_allocated() - before) / 2**20
+    return contestant, (torch.cuda.max_memory_allocated() - before) / 2**20
 
 
 def measure(name: str, window: Window, steps: int, rounds: int) -> dict:
     """One row: agreement, times and memory of both for one set of losses."""
-    config, made = CONFIGS[name], []
-
-    def start(kind: type[Fused] | type[Plain]) -> None:
-        made.append(kind(window, config))
-        made[-1].train(2)
-
-    memory = {"fused": peak_mib(lambda: start(Fused)), "plain": peak_mib(lambda: start(Plain))}
-    fused, plain = made
+    config = CONFIGS[name]
+    fused, fused_memory = started(lambda: Fused(window, config))
+    plain, plain_memory = started(lambda: Plain(window, config))
+    memory = {"fused": fused_memory, "plain": plain_memory}
     difference, cosine = agreement(fused, plain)
     a, b = time_in_turns(fused, plain, steps, rounds)
     kernels = {"fused": kernel_times(fused.train, 10), "plain": kernel_times(plain.train, 3)}
@@ -324,7 +327,7 @@ def main() -> None:
     if not torch.cuda.is_available():
         raise SystemExit("This benchmark needs a GPU.")
     # The profiler sees the kernels of graphs that were captured after its first start.
-    kernel_times(lambda _: torch.zeros(1, device="cuda").add_(1), 1)
+    kernel_times(lambda _: torch.cuda.synchronize(), 1)
     window = Window.make(args.views, args.disks, args.width, args.height, torch.device("cuda"))
     rows = [measure(name, window, args.steps, args.rounds) for name in CONFIGS]
     print(
