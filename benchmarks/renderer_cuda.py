@@ -1,6 +1,6 @@
 """Speed of the CUDA renderer beside gsplat's 2-D renderer, forward and backward.
 
-    python benchmarks/renderer_cuda.py [--rounds 60] [--json FILE]
+    python benchmarks/renderer_cuda.py [--rounds 30] [--json FILE]
 
 Needs a GPU. Where gsplat (1.5) can be imported, both render the same room in turns, so that what
 else the machine does hits both alike. Its times are for its public autograd function as it stands,
@@ -38,7 +38,7 @@ FURNITURE = [
 """Centre and size of boxes, metres."""
 OVERLAP = 0.75
 """Deviation of a disk over the mean distance to the next."""
-BURST = 4
+BURST = 20
 """Passes in a turn, so that the host may run ahead as it does in training."""
 
 
@@ -282,7 +282,7 @@ def _number(value: float | None, digits: int = 3) -> str:
 def main() -> None:
     """Run all cases."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--rounds", type=int, default=60)
+    parser.add_argument("--rounds", type=int, default=30)
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
     if not torch.cuda.is_available():

@@ -68,8 +68,8 @@ class SearchOptions:
     """Relaxation sweeps of each."""
     coarse_sweeps: int = 20
     """The same at the other levels."""
-    smoothness: float = 25.0
-    """Weight alpha of the smoothness term."""
+    smoothness: float = 10.0
+    """Weight alpha of the smoothness term; less lets more noise in, more bends depth steps."""
     gradients: float = 10.0
     """Weight gamma of gradient constancy."""
     brightness: float = 1.0
