@@ -200,8 +200,8 @@ def baselines(mapper: Mapper, scorer: Scorer, camera: Camera) -> None:
         searched.append(
             replace(
                 item,
-                depth=torch.from_numpy(view.depth.depth),
-                weight=torch.from_numpy(view.depth.confidence),
+                depth=view.dense.depth.cpu(),
+                weight=view.dense.confidence.cpu(),
             )
         )
     scorer.depth("tracker, all", [v.depth.numpy() for v in every])

@@ -16,7 +16,7 @@ import torch
 
 from geogs.config import MappingConfig
 from geogs.geometry.lie import se3_inverse
-from geogs.mapping.depth_view import KeyframeDepth
+from geogs.mapping.depth_view import DenseDepth, KeyframeDepth
 from geogs.mapping.training import Trainer, view_loss
 from geogs.mapping.view import MapCameras, MapView
 from geogs.splat.init import initialise_disks
@@ -46,7 +46,7 @@ def make_views(config: MappingConfig, width: int) -> tuple[list[MapView], MapCam
         grid = torch.ones(rows, columns)
         keyframe = Keyframe(n, index, index / 30, image, T_cw, grid, grid)
         view = MapView.of(keyframe, cameras, config.loss)
-        view.set_depth(KeyframeDepth(depth, np.ones_like(depth)), cameras)
+        view.set_depth(DenseDepth.of(KeyframeDepth(depth, np.ones_like(depth))), cameras)
         view.rendered_depth = torch.from_numpy(depth)
         views.append(view)
     return views, cameras
@@ -60,7 +60,7 @@ def make_map(views: list[MapView], cameras: MapCameras, count: int) -> GaussianM
     for view in views:
         pixels = torch.randperm(camera.width * camera.height, generator=random)
         pixels = pixels[: -(-count // len(views))]
-        depth = torch.from_numpy(view.dense.depth)
+        depth = view.dense.depth
         T_wc = view.T_wc.float()
         points = camera.back_project(depth).reshape(-1, 3)[pixels] @ T_wc[:3, :3].T + T_wc[:3, 3]
         spacing = (camera.width * camera.height / len(pixels)) ** 0.5

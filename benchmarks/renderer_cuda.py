@@ -6,8 +6,9 @@ Needs a GPU. Where gsplat (1.5) can be imported, both render the same room in tu
 else the machine does hits both alike. Its times are for its public autograd function as it stands,
 which blends the depths of the disks' centres, not of the hits, and waits for the GPU at the end of
 its backward pass (the sums over the kernels leave that out). Each time is the median over the
-rounds of one forward and backward pass: between CUDA events around a burst of passes, on the
-host's clock until the calls return, and summed over the kernels alone.
+rounds of one forward and backward pass: between CUDA events around a burst of passes, the same with
+the backward pass on the calling thread, summed over the kernels alone, and on the host's clock
+until the calls return.
 """
 
 import argparse
@@ -59,6 +60,8 @@ class Timing:
     """Median between two CUDA events."""
     host: float
     """Median time until the calls have returned."""
+    one_thread: float
+    """As device, with the backward pass run by the calling thread instead of one of PyTorch's."""
     kernels: float
     """Sum over the kernels, from the profiler; NaN if it does not work."""
 
@@ -233,42 +236,62 @@ def kernel_milliseconds(step: Callable[[], None], repeats: int = 10) -> float:
     return total / repeats / 1e3 if total else float("nan")
 
 
-def measure(count: int, width: int, height: int, rounds: int) -> dict:
-    """One row: times of both renderers and how far they agree."""
+def contestants(count: int, width: int, height: int) -> list[Ours | Gsplat]:
+    """The renderers on the same room."""
     case = room_case(count, width, height)
-    renderers: list[Ours | Gsplat] = [Ours(case)]
+    found: list[Ours | Gsplat] = [Ours(case)]
     try:
-        renderers.append(Gsplat(case))
+        found.append(Gsplat(case))
     except ImportError as error:
         print(f"gsplat is not available: {error}")
-    timed = time_in_turns([r.step for r in renderers], rounds)
-    row: dict = {"disks": count, "width": width, "height": height}
-    for renderer, (device, host) in zip(renderers, timed, strict=True):
-        row[renderer.name] = asdict(Timing(device, host, kernel_milliseconds(renderer.step)))
-    if len(renderers) == 2:
-        ours, theirs = renderers
-        assert isinstance(theirs, Gsplat)
-        pairs = zip(ours.alpha_and_normal(), theirs.alpha_and_normal(), strict=True)
-        alpha, normal = (float((a - b).abs().mean()) for a, b in pairs)
-        row |= {"alpha_difference": alpha, "normal_difference": normal, "pairs": theirs.pairs()}
-        row["ratio"] = row["gsplat"]["device"] / row["geogs"]["device"]
-        row["kernel_ratio"] = row["gsplat"]["kernels"] / row["geogs"]["kernels"]
-    return row
+    return found
+
+
+def measure(cases: list[tuple[int, int, int]], rounds: int) -> list[dict]:
+    """A row per case: times of both renderers and how far they agree."""
+    fields = [contestants(*case) for case in cases]
+    times, alone = [], []
+    for renderers in fields:
+        steps = [r.step for r in renderers]
+        times.append(time_in_turns(steps, rounds))
+        with torch.autograd.set_multithreading_enabled(False):
+            alone.append(time_in_turns(steps, rounds))
+    rows = []  # the profiler comes last, because it leaves later launches slower
+    for case, renderers, timed, single in zip(cases, fields, times, alone, strict=True):
+        row: dict = dict(zip(("disks", "width", "height"), case, strict=True))
+        for renderer, (device, host), (one, _) in zip(renderers, timed, single, strict=True):
+            timing = Timing(device, host, one, kernel_milliseconds(renderer.step))
+            row[renderer.name] = asdict(timing)
+        if len(renderers) == 2:
+            row |= compare(row, *renderers)
+        rows.append(row)
+    return rows
+
+
+def compare(row: dict, ours: Ours | Gsplat, theirs: Ours | Gsplat) -> dict:
+    """Ratios of the times and mean differences of the maps."""
+    assert isinstance(theirs, Gsplat)
+    pairs = zip(ours.alpha_and_normal(), theirs.alpha_and_normal(), strict=True)
+    alpha, normal = (float((a - b).abs().mean()) for a, b in pairs)
+    found = {"alpha_difference": alpha, "normal_difference": normal, "pairs": theirs.pairs()}
+    for name in ("device", "one_thread", "kernels"):
+        found[f"{name}_ratio"] = row["gsplat"][name] / row["geogs"][name]
+    return found
 
 
 def table(rows: list[dict]) -> str:
     """Markdown; milliseconds, ratios above 1 mean that ours is faster."""
     lines = [
-        "| disks | image | geogs | kernels | host | gsplat | kernels | host | ratio | of kernels |"
-        " mean diff. of alpha | of normals | pairs |",
-        "|" + "---:|" * 13,
+        "| disks | image | geogs | one thread | kernels | host | gsplat | one thread | kernels |"
+        " host | ratio | one thread | of kernels | mean diff. of alpha | of normals | pairs |",
+        "|" + "---:|" * 16,
     ]
     for row in rows:
         cells = [f"{row['disks']:,}", f"{row['width']}x{row['height']}"]
         for name in ("geogs", "gsplat"):
             timing = row.get(name, {})
-            cells += [_number(timing.get(k)) for k in ("device", "kernels", "host")]
-        cells += [_number(row.get(k)) for k in ("ratio", "kernel_ratio")]
+            cells += [_number(timing.get(k)) for k in ("device", "one_thread", "kernels", "host")]
+        cells += [_number(row.get(f"{k}_ratio")) for k in ("device", "one_thread", "kernels")]
         cells += [_number(row.get(f"{k}_difference"), 5) for k in ("alpha", "normal")]
         cells.append(f"{row['pairs']:,}" if "pairs" in row else "-")
         lines.append("| " + " | ".join(cells) + " |")
@@ -288,7 +311,7 @@ def main() -> None:
     if not torch.cuda.is_available():
         raise SystemExit("This benchmark needs a GPU.")
     torch.manual_seed(0)
-    rows = [measure(*case, args.rounds) for case in CASES]
+    rows = measure(CASES, args.rounds)
     print(f"{torch.cuda.get_device_name()}, PyTorch {torch.__version__}, medians of {args.rounds}")
     print(table(rows))
     if args.json:

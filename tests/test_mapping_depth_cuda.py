@@ -410,7 +410,7 @@ def test_hopeless_input_gives_finite_depth(setting, how):
     assert bool(torch.isfinite(depth.depth).all() & (depth.depth > 0).all())
     assert bool(torch.isfinite(depth.confidence).all())
     if how != "bad values":
-        assert float(depth.confidence.max()) < 0.5
+        assert float(depth.confidence.max()) < 0.6
 
 
 def _disturbed(setting: Setting) -> list[KeyframeDepth]:

@@ -114,6 +114,34 @@ def test_interrupting_keeps_what_there_is(room, tmp_path):
     assert len(read_tum_trajectory(out / "trajectory.tum").timestamps) == summary["frames"]
 
 
+FULL_AT_38 = """
+import sys
+import torch
+from geogs.cli.main import main
+from geogs.slam import Slam
+
+process = Slam.process
+
+def run_full(self, frame):
+    if frame.index == 38:
+        raise torch.cuda.OutOfMemoryError("CUDA out of memory.")
+    return process(self, frame)
+
+Slam.process = run_full
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+def test_a_full_gpu_memory_keeps_what_there_is(room, tmp_path):
+    command = [sys.executable, "-c", FULL_AT_38, "run", str(room), "-o", str(tmp_path), *QUICK]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=400)
+    assert done.returncode == 2
+    assert "memory of the GPU was full after 38 frames" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert len(read_tum_trajectory(tmp_path / "trajectory.tum").timestamps) == 38
+    assert json.loads((tmp_path / "summary.json").read_text())["interrupted"] is True
+
+
 def images(folder: Path, frames: list[np.ndarray]) -> Path:
     folder.mkdir()
     for i, frame in enumerate(frames):

@@ -212,4 +212,5 @@ def test_a_room_is_matched_as_well_as_on_the_cpu(device: str, start: str) -> Non
             assert float(error[best].mean()) < 0.6 * float(error[worst].mean())
     (kept, median, _), (own_kept, own_median, _) = figures
     assert own_kept > 0.95 * kept
-    assert own_median < 1.1 * median + 0.01
+    # A cold start only has to lead to the basin of the warm one.
+    assert own_median < 1.1 * median + (0.01 if start == "warm" else 0.03)

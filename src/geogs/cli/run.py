@@ -58,6 +58,7 @@ def run(options: RunOptions) -> Path:
 
     import geogs
     from geogs.cli.results import write_results
+    from geogs.errors import DeviceError
     from geogs.gpu.installation import require_device
     from geogs.gpu.kernels import prepare_kernels
     from geogs.io.sources.sniff import open_source
@@ -72,26 +73,39 @@ def run(options: RunOptions) -> Path:
         prepare_kernels(Path(geogs.__file__).parent, device)
     slam = Slam(source.camera, options, str(device))
     with Interruption() as stop, RunProgress(source.length) as progress:
-        _feed(slam, source, progress, stop)
-        interrupted = stop.requested
+        full = not _feed(slam, source, progress, stop)
+        interrupted = full or stop.requested
         if interrupted:
-            progress.write("Stopping early; keeping what there is. Press Ctrl-C again to quit.")
-        interrupted |= not _finish(slam, progress, stop)
+            why = "The GPU has no memory left" if full else "Stopping early"
+            progress.write(f"{why}; keeping what there is. Press Ctrl-C again to quit.")
+        interrupted |= not _finish(slam, progress, stop, correct=not interrupted)
         write_results(output, slam, source, options, interrupted, progress)
+    if full:
+        raise DeviceError(
+            f"The memory of the GPU was full after {slam.frames} frames, whose results are in "
+            f"{output}/; use a smaller --long-edge, a GPU with more memory, or --device cpu."
+        )
     print(f"Results are in {output}/")
     return output
 
 
-def _feed(slam: "Slam", source: "Source", progress: RunProgress, stop: Interruption) -> None:
-    """All frames through the system, until a request to stop."""
-    for frame in source:
-        status = slam.process(frame)
-        progress.frame(status)
-        if stop.requested:
-            return
+def _feed(slam: "Slam", source: "Source", progress: RunProgress, stop: Interruption) -> bool:
+    """All frames through the system, until a request to stop; false if the GPU's memory is full."""
+    import torch
+
+    try:
+        for frame in source:
+            status = slam.process(frame)
+            progress.frame(status)
+            if stop.requested:
+                break
+    except torch.cuda.OutOfMemoryError:
+        torch.cuda.empty_cache()
+        return False
+    return True
 
 
-def _finish(slam: "Slam", progress: RunProgress, stop: Interruption) -> bool:
+def _finish(slam: "Slam", progress: RunProgress, stop: Interruption, correct: bool) -> bool:
     """The final stages; false if a request to stop cut them short."""
 
     def report(stage: str, fraction: float) -> None:
@@ -99,7 +113,7 @@ def _finish(slam: "Slam", progress: RunProgress, stop: Interruption) -> bool:
         stop.check()
 
     try:
-        slam.finish(report, correct=not stop.requested)
+        slam.finish(report, correct)
     except KeyboardInterrupt:
         return False
     return True
