@@ -50,8 +50,8 @@ class Counts:
     """At least; a tile whose parts end at different ranks may need one more in each part."""
     backward_hits: int
     alpha_error: float
-    """Largest difference of the map of alpha and the one made of what is counted here; a disk at the
-    threshold of 1/255 that only one of them blends makes up to that."""
+    """Largest difference of the map of alpha and the one made of what is counted here: up to 1/255
+    where only one of them blends a disk at that threshold."""
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,7 @@
 """Pose-only refinement: the map stands still, the cameras move to agree with it (Eq. pose_loss)."""
 
+from collections.abc import Callable
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -12,6 +14,31 @@ from geogs.mapping.view import MapCameras, MapView
 from geogs.splat.map import DiskParameters, GaussianMap
 from geogs.splat.render import render
 
+Evaluate = Callable[[Float[Tensor, "k 4 4"]], tuple[float, Float[Tensor, ""]]]
+"""Of the poses: the loss, and something differentiable whose gradient is the loss's."""
+
+
+def descend(
+    start: Float[Tensor, "k 4 4"], config: MappingConfig, unit: float, evaluate: Evaluate
+) -> Float[Tensor, "k 4 4"]:
+    """Poses of less loss near ``start``, the first of them fixed.
+
+    Adam on left perturbations [tau, phi], tau in units of the map's depth. The step with the least
+    loss is returned; where no step lowered the loss the poses come back as they were.
+    """
+    tangent = torch.zeros(len(start) - 1, 6, dtype=torch.float64, requires_grad=True)
+    units = torch.tensor([unit] * 3 + [1.0] * 3, dtype=torch.float64)
+    optimizer = TangentAdam(tangent, config.pose_lr)
+    best_loss, best = float("inf"), start
+    for step in range(config.pose_iterations + 1):
+        poses = torch.cat([start[:1], retract(tangent * units, start[1:])])
+        loss, differentiable = evaluate(poses)
+        if loss < best_loss:
+            best_loss, best = loss, poses.detach()
+        if step < config.pose_iterations:
+            optimizer.step(torch.autograd.grad(differentiable, tangent)[0])
+    return best
+
 
 def refine_poses(
     disks: GaussianMap,
@@ -23,23 +50,15 @@ def refine_poses(
 ) -> dict[int, Float[Tensor, "4 4"]]:
     """Refined world-to-camera poses of the active keyframes, the earliest of them fixed.
 
-    Adam on left perturbations [tau, phi], tau in units of the map's depth, of L_d + L_n + L_mv
-    with the mapping weights. The steps with the least loss are returned; where no step lowered the
-    loss the poses come back as they were.
+    By :func:`descend` on L_d + L_n + L_mv with the mapping weights.
     """
     frozen = DiskParameters(*(p.detach() for p in disks.parameters))
-    start = torch.stack([view.T_cw for view in active])
-    tangent = torch.zeros(len(active) - 1, 6, dtype=torch.float64, requires_grad=True)
-    units = torch.tensor([unit] * 3 + [1.0] * 3, dtype=torch.float64)
-    optimizer = TangentAdam(tangent, config.pose_lr)
-    best_loss, best = float("inf"), start
-    for step in range(config.pose_iterations + 1):
-        poses = torch.cat([start[:1], retract(tangent * units, start[1:])])
+
+    def evaluate(poses: Float[Tensor, "k 4 4"]) -> tuple[float, Float[Tensor, ""]]:
         loss = _pose_loss(frozen, active, views, poses, cameras, config, unit)
-        if float(loss.detach()) < best_loss:
-            best_loss, best = float(loss.detach()), poses.detach()
-        if step < config.pose_iterations:
-            optimizer.step(torch.autograd.grad(loss, tangent)[0])
+        return float(loss.detach()), loss
+
+    best = descend(torch.stack([view.T_cw for view in active]), config, unit, evaluate)
     return {view.id: T for view, T in zip(active[1:], best[1:], strict=True)}
 
 

@@ -7,10 +7,10 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from geogs.config import MappingConfig
-from geogs.geometry.lie import retract, se3_inverse
+from geogs.geometry.lie import se3_inverse
 from geogs.gpu.transfer import to_device
 from geogs.mapping.cuda.window_pass import WindowPass
-from geogs.mapping.tangent_adam import TangentAdam
+from geogs.mapping.pose_refine import descend
 from geogs.mapping.view import MapView
 from geogs.splat.map import GaussianMap
 
@@ -39,20 +39,13 @@ def refine_poses(
     rows += [slot[v.partners[0]] if v.partners else -1 for v in active]
     window.slots.copy_(to_device(torch.tensor(rows, dtype=torch.int32), disks.device))
     count = to_device(torch.tensor([len(disks)], dtype=torch.int32), disks.device)
-    start = torch.stack([view.T_cw for view in active])
-    tangent = torch.zeros(len(active) - 1, 6, dtype=torch.float64, requires_grad=True)
-    units = torch.tensor([unit] * 3 + [1.0] * 3, dtype=torch.float64)
-    optimizer = TangentAdam(tangent, config.pose_lr)
-    best_loss, best = float("inf"), start
-    for step in range(config.pose_iterations + 1):
-        poses = torch.cat([start[:1], retract(tangent * units, start[1:])])
+
+    def evaluate(poses: Float[Tensor, "b 4 4"]) -> tuple[float, Float[Tensor, ""]]:
         known.set_poses([v.id for v in active], poses.detach())
         loss, d_poses, d_motions = _evaluate(window, disks, count)
-        if loss < best_loss:
-            best_loss, best = loss, poses.detach()
-        if step < config.pose_iterations:
-            chain = _chain(active, views, poses, d_poses, d_motions)
-            optimizer.step(torch.autograd.grad(chain, tangent)[0])
+        return loss, _chain(active, views, poses, d_poses, d_motions)
+
+    best = descend(torch.stack([view.T_cw for view in active]), config, unit, evaluate)
     return {view.id: T for view, T in zip(active[1:], best[1:], strict=True)}
 
 
