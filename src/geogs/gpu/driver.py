@@ -6,6 +6,7 @@ A few calls of the driver's C interface, so that nothing needs to be installed o
 import ctypes
 import functools
 import struct
+import threading
 from collections.abc import Sequence
 
 import torch
@@ -23,10 +24,9 @@ _INVALID_CONTEXT = 201
 
 @functools.cache
 def _driver() -> tuple[ctypes.CDLL, ctypes.PyDLL]:
-    """The driver for calls that may take long, and once more for those that must not be torn.
+    """The driver for calls that may take long, and once more for launches.
 
-    A PyDLL keeps the interpreter lock, so that a kernel's argument buffer is not refilled by
-    another thread while it is read.
+    A PyDLL keeps the interpreter lock: giving it away takes longer than a launch.
     """
     try:
         return ctypes.CDLL("libcuda.so.1"), ctypes.PyDLL("libcuda.so.1")
@@ -56,6 +56,7 @@ class DeviceKernel:
         start = ctypes.addressof(self._buffer)
         places = range(start, start + self._packer.size, 8)
         self._pointers = (ctypes.c_void_p * len(places))(*places)
+        self._lock = threading.Lock()
         self._dynamic = _MAX_STATIC_SHARED
         launch = _driver()[1].cuLaunchKernel
         launch.argtypes = [ctypes.c_void_p, *[ctypes.c_uint] * 7, *[ctypes.c_void_p] * 3]
@@ -74,11 +75,17 @@ class DeviceKernel:
             return
         if shared > self._dynamic:
             self._allow_shared(shared)
-        index = self._index
         values = [a.data_ptr() if isinstance(a, torch.Tensor) else a or 0 for a in arguments]
-        self._packer.pack_into(self._buffer, 0, *values)
-        stream = _current_stream(index)
         sizes = (gx, gy, gz, *_three(block), shared)
+        with self._lock:  # another thread may launch the same kernel
+            self._packer.pack_into(self._buffer, 0, *values)
+            code = self._start(sizes)
+        if code:
+            raise DeviceError(f"The kernel {self.name} could not start ({driver_error(code)}).")
+
+    def _start(self, sizes: tuple[int, ...]) -> int:
+        index = self._index
+        stream = _current_stream(index)
         if torch.cuda.current_device() == index:
             code = self._launch(self._function, *sizes, stream, self._pointers, None)
         else:
@@ -88,8 +95,7 @@ class DeviceKernel:
             with torch.cuda.device(index):
                 _use_primary_context(index)
                 code = self._launch(self._function, *sizes, stream, self._pointers, None)
-        if code:
-            raise DeviceError(f"The kernel {self.name} could not start ({driver_error(code)}).")
+        return code
 
     def _allow_shared(self, size: int) -> None:
         code = _driver()[0].cuFuncSetAttribute(self._function, _MAX_DYNAMIC_SHARED, size)
