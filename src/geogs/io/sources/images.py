@@ -44,7 +44,7 @@ class ImageList:
         self.calibration = calibration
         self.length: int | None = len(files)
         self.fps = _median_rate([file.timestamp for file in files])
-        self._files = files
+        self.files = files
         first = next(
             (image for file in files if (image := read_image(file.path)) is not None), None
         )
@@ -54,7 +54,7 @@ class ImageList:
 
     def read(self, start: int, stop: int | None, stride: int) -> Iterator[RawFrame]:
         """Read images ``start, start + stride, ...`` before ``stop``."""
-        for file in self._files[start:stop:stride]:
+        for file in self.files[start:stop:stride]:
             yield RawFrame(str(file.path), file.timestamp, read_image(file.path))
 
 

@@ -1,0 +1,136 @@
+"""What one format says about its images before any is read: files, poses, cameras, points."""
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int64
+
+from geogs.errors import InputError
+from geogs.io.sources.calibration import Calibration
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class PosedFile:
+    """An image on disk with its pose and, where known, its camera and mask."""
+
+    path: Path
+    T_cw: Float64[np.ndarray, "4 4"]
+    """World to camera, OpenCV axes."""
+    calibration: Calibration | None = None
+    """The camera that took it; none where the format does not say."""
+    mask: Path | None = None
+    """Image whose bright pixels are to be used; may be ``path`` itself, then its alpha."""
+    timestamp: float = 0.0
+    """Seconds."""
+
+
+@dataclass(frozen=True, slots=True)
+class SparsePoints:
+    """Triangulated points and which images see them."""
+
+    positions: Float64[np.ndarray, "n 3"]
+    """In the world."""
+    seen_point: Int64[np.ndarray, "m"]
+    """Point of observation k."""
+    seen_image: Int64[np.ndarray, "m"]
+    """Image of observation k: its index in the source."""
+
+    def seen_by(self, image: int) -> Float64[np.ndarray, "k 3"]:
+        """Positions of the points that image ``image`` sees."""
+        return self.positions[np.unique(self.seen_point[self.seen_image == image])]
+
+    def for_images(self, kept: Sequence[int]) -> "SparsePoints":
+        """The points that the images ``kept`` see, these being numbered 0, 1, ... now."""
+        number = {old: new for new, old in enumerate(kept)}
+        new_image = np.array([number.get(int(image), -1) for image in self.seen_image], np.int64)
+        stays = new_image >= 0
+        points, seen_point = np.unique(self.seen_point[stays], return_inverse=True)
+        return SparsePoints(self.positions[points], seen_point.astype(np.int64), new_image[stays])
+
+
+@dataclass(frozen=True, slots=True)
+class Sphere:
+    """A ball in the world."""
+
+    centre: Float64[np.ndarray, "3"]
+    radius: float
+
+
+@dataclass(frozen=True, slots=True)
+class PosedSet:
+    """An image set as its format describes it."""
+
+    kind: str
+    """Name of the format."""
+    name: str
+    """Name of the scene."""
+    files: tuple[PosedFile, ...]
+    scene_scale: str = "arbitrary"
+    """What one unit of the world is: metres, millimetres or arbitrary."""
+    points: SparsePoints | None = None
+    region: Sphere | None = None
+    """Where the object lies, if the data set says so."""
+
+    def only(self, kept: Sequence[int]) -> "PosedSet":
+        """The set reduced to the images ``kept``, in this order."""
+        points = None if self.points is None else self.points.for_images(kept)
+        return replace(self, files=tuple(self.files[i] for i in kept), points=points)
+
+
+def without_invalid_poses(posed: PosedSet) -> PosedSet:
+    """Drop images whose pose is NaN, inf or no rigid motion; the others become exactly rigid.
+
+    Raises:
+        InputError: no pose is left, or they are mirrored or scaled altogether.
+    """
+    T = np.stack([file.T_cw for file in posed.files])
+    finite = np.isfinite(T).all(axis=(1, 2))
+    rotation = np.where(finite[:, None, None], T[:, :3, :3], 0.0)
+    has_pose = finite & (np.abs(rotation).sum(axis=(1, 2)) > 0)
+    valid = has_pose & _is_rotation(rotation)
+    if valid.sum() < 0.5 * has_pose.sum():
+        _refuse(posed, rotation[has_pose])
+    if not valid.any():
+        raise InputError(f"{posed.name} holds no valid pose: all {len(T)} are NaN, inf or zero.")
+    if not valid.all():
+        _log.warning(
+            "%s: left out %d of %d images, whose poses are invalid (NaN, inf or no rotation).",
+            posed.name, int((~valid).sum()), len(valid),
+        )  # fmt: skip
+    posed = posed.only(np.flatnonzero(valid).tolist())
+    return replace(
+        posed, files=tuple(replace(file, T_cw=_rigid(file.T_cw)) for file in posed.files)
+    )
+
+
+def _is_rotation(rotation: Float64[np.ndarray, "n 3 3"]) -> Bool[np.ndarray, "n"]:
+    error = np.abs(rotation @ rotation.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+    return (error < 1e-2) & (np.linalg.det(rotation) > 0)
+
+
+def _refuse(posed: PosedSet, rotation: Float64[np.ndarray, "n 3 3"]) -> None:
+    if np.median(np.linalg.det(rotation)) < 0:
+        raise InputError(
+            f"{posed.name}: the poses mirror the scene (determinant -1), as when two axes are "
+            f"swapped without turning a sign; negate one of the swapped axes."
+        )
+    raise InputError(
+        f"{posed.name}: the upper left 3x3 of the poses is no rotation; scale the translations "
+        f"only, and give each matrix row by row."
+    )
+
+
+def _rigid(T: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "4 4"]:
+    """The pose with the nearest rotation; itself where its rotation is exact to 1e-9 already."""
+    rotation = T[:3, :3]
+    if np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-9:
+        return T
+    u, _, vt = np.linalg.svd(rotation)
+    rigid = T.copy()
+    rigid[:3, :3] = u @ vt
+    return rigid

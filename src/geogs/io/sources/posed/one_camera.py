@@ -1,0 +1,161 @@
+"""All images of a set as one pinhole camera sees them, though several cameras took them."""
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float64, UInt8
+
+from geogs.config import InputConfig
+from geogs.errors import InputError
+from geogs.geometry.camera import Camera
+from geogs.io.sources.calibration import Calibration
+from geogs.io.sources.intrinsics import resolve_intrinsics
+from geogs.io.sources.posed.files import PosedFile
+from geogs.io.sources.posed.pictures import stored_size
+from geogs.io.sources.undistort import Rectifier
+
+SAME_CAMERA = 0.02
+"""Pixels of the working image by which two cameras may differ and still count as one."""
+MAX_ZOOM = 1.5
+"""Largest enlargement of an image that has fewer pixels per degree than the common camera."""
+MIN_SHARED = 0.6
+"""Least part that the fields of view of two cameras must share of the larger one."""
+
+
+class OneCamera:
+    """The common camera, that of the first image, and the way of each image into it."""
+
+    def __init__(self, files: Sequence[PosedFile], config: InputConfig) -> None:
+        self._sizes = [_size(file) for file in files]
+        keys = [(file.calibration, size) for file, size in zip(files, self._sizes, strict=True)]
+        cameras = {key: _resolved(config, *key) for key in dict.fromkeys(keys)}
+        first = cameras[keys[0]]
+        rectifier = Rectifier(first, config.long_edge)
+        self.camera: Camera = rectifier.camera
+        """The pinhole camera of every image."""
+        self.origin = first.origin
+        """Where its intrinsics come from."""
+        ways = {
+            key: rectifier if camera == first else _way(camera, self.camera, rectifier.zoom)
+            for key, camera in cameras.items()
+        }
+        self._ways = [ways[key] for key in keys]
+        for file, way in zip(files, self._ways, strict=True):
+            if isinstance(way, Resampler):
+                way.check(file, files[0])
+
+    def stored_shape(self, index: int) -> tuple[int, int]:
+        """Width and height of image ``index`` on disk."""
+        return self._sizes[index]
+
+    def view(
+        self, index: int, picture: UInt8[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"] | None
+    ) -> tuple[UInt8[np.ndarray, "h2 w2 3"], Bool[np.ndarray, "h2 w2"] | None]:
+        """Image ``index`` and its mask as the common camera sees them."""
+        way = self._ways[index]
+        image = way(picture)
+        if mask is not None:
+            grey = np.where(mask, np.uint8(255), np.uint8(0))
+            mask = way(np.ascontiguousarray(np.repeat(grey[..., None], 3, axis=2)))[..., 0] > 127
+        covered = way.covered if isinstance(way, Resampler) else None
+        if covered is not None:
+            mask = covered if mask is None else mask & covered
+        return image, mask
+
+
+class Resampler:
+    """Makes the image of ``target`` from that of another camera at the same place.
+
+    Both look along the same axes, so that pixels map by K_source D(K_target^-1 u) with the
+    source's distortion D, whatever the scene.
+    """
+
+    def __init__(self, source: Calibration, target: Camera, zoom: float) -> None:
+        camera = source.camera()
+        self._source = camera
+        # The source comes to about the target's scale first, so that no detail is skipped.
+        scale = min(1.0, target.fx / zoom / camera.fx)
+        size = (round(camera.width * scale), round(camera.height * scale))
+        resized = camera.resized(max(size[0], 1), max(size[1], 1))
+        self._size = (resized.width, resized.height)
+        self._target = target
+        self._maps = cv2.initUndistortRectifyMap(
+            resized.matrix().numpy(),
+            np.array(source.distortion or (0.0,) * 4, dtype=np.float64),
+            None,
+            target.matrix().numpy(),
+            (target.width, target.height),
+            cv2.CV_32FC1,
+        )
+        self.covered: Bool[np.ndarray, "h w"] | None = self._covered()
+        """Pixels of the target that the source sees; none where it sees all."""
+
+    def __call__(self, image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h2 w2 3"]:
+        """The image of the target."""
+        if (image.shape[1], image.shape[0]) != self._size:
+            image = cv2.resize(image, self._size, interpolation=cv2.INTER_AREA)
+        return cv2.remap(image, *self._maps, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+
+    def check(self, file: PosedFile, first: PosedFile) -> None:
+        """Raise InputError where the cameras differ too much for one to stand for the other."""
+        enlarged = self._target.fx / self._source.fx
+        if enlarged > MAX_ZOOM or _shared_view(self._source, self._target) < MIN_SHARED:
+            raise InputError(
+                f"{file.path} ({_described(self._source)}) was taken with quite another camera "
+                f"than {first.path} ({_described(self._target)} at working size); give the images "
+                f"of one camera, or undistort and crop them to one."
+            )
+
+    def _covered(self) -> Bool[np.ndarray, "h w"] | None:
+        x, y = self._maps
+        width, height = self._size
+        covered = (x >= -1) & (x <= width) & (y >= -1) & (y <= height)
+        return None if covered.all() else covered
+
+
+def _way(camera: Calibration, target: Camera, zoom: float) -> Resampler | Rectifier:
+    """The way of a camera into the target; without resampling where they are the same anyway."""
+    rectifier = Rectifier(camera, max(target.width, target.height))
+    own = rectifier.camera
+    is_same_size = (own.width, own.height) == (target.width, target.height)
+    if is_same_size and np.abs(_corners(own, target)).max() < SAME_CAMERA:
+        return rectifier
+    return Resampler(camera, target, zoom)
+
+
+def _corners(camera: Camera, target: Camera) -> Float64[np.ndarray, "2 2"]:
+    """How far two corners of the image move from one camera to the other, in pixels."""
+    corners = np.array([[0.0, 0.0], [target.width - 1.0, target.height - 1.0]])
+    rays = (corners - (target.cx, target.cy)) / (target.fx, target.fy)
+    return rays * (camera.fx, camera.fy) + (camera.cx, camera.cy) - corners
+
+
+def _shared_view(one: Camera, other: Camera) -> float:
+    """Area that two images share on the plane z = 1, as part of the larger image."""
+    (low, high), (other_low, other_high) = _view(one), _view(other)
+    shared = np.minimum(high, other_high) - np.maximum(low, other_low)
+    area = max(np.prod(high - low), np.prod(other_high - other_low))
+    return float(np.prod(shared.clip(0)) / area)
+
+
+def _view(camera: Camera) -> tuple[Float64[np.ndarray, "2"], Float64[np.ndarray, "2"]]:
+    """The corners of the image on the plane z = 1."""
+    corners = np.array([[-0.5, -0.5], [camera.width - 0.5, camera.height - 0.5]])
+    low, high = (corners - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
+    return low, high
+
+
+def _resolved(config: InputConfig, known: Calibration | None, size: tuple[int, int]) -> Calibration:
+    return resolve_intrinsics(config.intrinsics, known, *size)
+
+
+def _size(file: PosedFile) -> tuple[int, int]:
+    size = stored_size(file.path)
+    if size is None:
+        raise InputError(f"{file.path} is damaged; copy it again, or leave it out.")
+    return size
+
+
+def _described(camera: Camera) -> str:
+    return f"{camera.width}x{camera.height}, focal length {camera.fx:.0f}"
