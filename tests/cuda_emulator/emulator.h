@@ -1,6 +1,7 @@
 // A small CUDA machine for tests on computers without a GPU: blocks run one after another, the
 // threads of a block are fibers of one operating-system thread that switch at every barrier.
 #pragma once
+#include <sys/mman.h>
 #include <ucontext.h>
 
 #include <algorithm>
@@ -82,7 +83,7 @@ struct Barrier { int arrived, generation; };
 struct Fiber { ucontext_t context; bool done; Index3 index; };
 static ucontext_t emu_main;
 static std::vector<Fiber> emu_fibers;
-static std::vector<char> emu_stacks, emu_dynamic;
+static std::vector<char> emu_dynamic;
 static int emu_current, emu_count, emu_live, emu_live_in_warp[64], emu_predicates[1024];
 static Barrier emu_block, emu_warp[64];
 static uint64_t emu_lane[64][32];
@@ -154,14 +155,20 @@ static void emu_enter() {
   swapcontext(&emu_fibers[me].context, &emu_main);
 }
 
+// Stacks of all threads of a block; memory is only taken where it is used.
+static const size_t EMU_STACK = 256 * 1024;
+static char* emu_stacks() {
+  static char* stacks = (char*)mmap(nullptr, EMU_STACK * 1024, PROT_READ | PROT_WRITE,
+                                    MAP_PRIVATE | MAP_ANONYMOUS | MAP_NORESERVE, -1, 0);
+  return stacks;
+}
+
 static void emu_run(const unsigned* grid, const unsigned* block, size_t shared, std::function<void()> body) {
-  const size_t stack = 256 * 1024;
   emu_body = body;
   blockDim = {block[0], block[1], block[2]};
   gridDim = {grid[0], grid[1], grid[2]};
   emu_count = block[0] * block[1] * block[2];
   if (emu_count > 1024) abort();
-  emu_stacks.resize(stack * emu_count);
   emu_fibers.resize(emu_count);
   emu_dynamic.assign(shared + 16, 0x7f);
   for (unsigned z = 0; z < grid[2]; z++) for (unsigned y = 0; y < grid[1]; y++) for (unsigned x = 0; x < grid[0]; x++) {
@@ -172,8 +179,8 @@ static void emu_run(const unsigned* grid, const unsigned* block, size_t shared, 
     for (int t = 0; t < emu_count; t++) {
       Fiber& f = emu_fibers[t];
       getcontext(&f.context);
-      f.context.uc_stack.ss_sp = emu_stacks.data() + stack * t;
-      f.context.uc_stack.ss_size = stack;
+      f.context.uc_stack.ss_sp = emu_stacks() + EMU_STACK * t;
+      f.context.uc_stack.ss_size = EMU_STACK;
       f.context.uc_link = &emu_main;
       f.done = false;
       f.index = {t % block[0], t / block[0] % block[1], t / (block[0] * block[1])};
