@@ -80,7 +80,7 @@ def _from_json(document: dict[str, Any], path: Path) -> Calibration:
     # "source" is the camera of the images as they came, in the intrinsics.json of a result.
     entry = document.get("source") or document.get("camera") or document
     if "fl_x" in entry:
-        return _from_nerfstudio(entry, path)
+        return calibration_from_nerfstudio(entry, path)
     return Calibration(
         float(entry["fx"]),
         float(entry["fy"]),
@@ -94,7 +94,8 @@ def _from_json(document: dict[str, Any], path: Path) -> Calibration:
     )
 
 
-def _from_nerfstudio(entry: dict[str, Any], path: Path) -> Calibration:
+def calibration_from_nerfstudio(entry: dict[str, Any], path: Path) -> Calibration:
+    """Translate the keys of ``transforms.json``; raises KeyError, TypeError or ValueError."""
     _refuse_fisheye(str(entry.get("camera_model", "OPENCV")), path)
     distortion = tuple(float(entry.get(key, 0.0)) for key in ("k1", "k2", "p1", "p2", "k3"))
     return Calibration(
@@ -115,14 +116,30 @@ def _from_colmap(text: str, path: Path) -> Calibration:
     if len(cameras) != 1:
         raise InputError(f"{path} holds {len(cameras)} different cameras; give a file with one.")
     model, width, height, *words = next(iter(cameras))
-    _refuse_fisheye(model, path)
     parameters = [float(word) for word in words]
+    return calibration_from_colmap(model, int(width), int(height), parameters, str(path))
+
+
+def calibration_from_colmap(
+    model: str, width: int, height: int, parameters: Numbers, origin: str
+) -> Calibration:
+    """Translate a camera of COLMAP (https://colmap.github.io/cameras.html).
+
+    Raises:
+        InputError: the camera model is unknown here, or a fisheye.
+    """
+    _refuse_fisheye(model, origin)
+    if model not in _COLMAP_MODELS:
+        raise InputError(
+            f"{origin} describes a {model} camera, which is not supported; undistort the images "
+            f"with COLMAP's image_undistorter first."
+        )
     fx, fy, cx, cy, *distortion = (
-        0.0 if index is None else parameters[index] for index in _COLMAP_MODELS[model]
+        0.0 if index is None else float(parameters[index]) for index in _COLMAP_MODELS[model]
     )
     return Calibration(
         fx, fy, cx - 0.5, cy - 0.5,
-        distortion=tuple(distortion), width=int(width), height=int(height), origin=str(path),
+        distortion=tuple(distortion), width=width, height=height, origin=origin,
     )  # fmt: skip
 
 
@@ -160,7 +177,7 @@ def _from_numbers(text: str, path: Path) -> Calibration:
     return calibration_from_numbers([number for row in numbers for number in row], str(path))
 
 
-def _refuse_fisheye(model: str, path: Path) -> None:
+def _refuse_fisheye(model: str, path: Path | str) -> None:
     if any(word in model.upper() for word in ("FISHEYE", "FOV", "EQUIDISTANT", "EQUIRECT")):
         raise InputError(
             f"{path} describes a {model} camera, which is not supported; undistort the images "

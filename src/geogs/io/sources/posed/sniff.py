@@ -1,12 +1,30 @@
 """Open whatever image set with poses the user points at."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 from geogs.config import InputConfig
 from geogs.errors import InputError
 from geogs.io.sources.posed.base import PosedSource
+from geogs.io.sources.posed.colmap import find_model, open_colmap
+from geogs.io.sources.posed.dtu import is_dtu, open_dtu
 from geogs.io.sources.posed.files import PosedSet
+from geogs.io.sources.posed.nerfstudio import find_transforms, open_nerfstudio
 from geogs.io.sources.posed.replica import is_posed_replica, open_posed_replica
+from geogs.io.sources.posed.scannet import is_scannet, open_scannet
+from geogs.io.sources.posed.seven_scenes import is_posed_seven_scenes, open_posed_seven_scenes
+from geogs.io.sources.posed.tum import is_posed_tum, open_posed_tum
+
+# Earlier ones win: data sets with an own description often carry a COLMAP model besides.
+_FORMATS: tuple[tuple[Callable[[Path], object], Callable[[Path], PosedSet]], ...] = (
+    (is_dtu, open_dtu),
+    (find_transforms, open_nerfstudio),
+    (find_model, open_colmap),
+    (is_posed_tum, open_posed_tum),
+    (is_posed_seven_scenes, open_posed_seven_scenes),
+    (is_posed_replica, open_posed_replica),
+    (is_scannet, open_scannet),
+)
 
 
 def open_posed_source(path: str | Path, config: InputConfig | None = None) -> PosedSource:
@@ -32,8 +50,13 @@ def open_posed_source(path: str | Path, config: InputConfig | None = None) -> Po
 def _posed_set(path: Path) -> PosedSet:
     if not path.exists():
         raise InputError(f"{path} does not exist; give a folder of images with poses.")
-    if path.is_dir() and is_posed_replica(path):
-        return open_posed_replica(path)
+    if path.is_file():
+        if find_transforms(path):
+            return open_nerfstudio(path)
+        path = path.parent if path.suffix in (".npz", ".bin", ".txt") else path
+    for is_format, open_format in _FORMATS:
+        if path.is_dir() and is_format(path):
+            return open_format(path)
     raise InputError(
         f"{path} holds no images with known poses (COLMAP model, nerfstudio transforms.json, DTU "
         f"cameras.npz, Replica, TUM RGB-D, 7-Scenes or ScanNet); use geogs run for images alone."

@@ -1,0 +1,48 @@
+"""ScanNet as exported: ``color/<i>.jpg``, ``pose/<i>.txt`` and ``intrinsic/``."""
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64
+
+from geogs.errors import InputError
+from geogs.io.poses import FRAMES_PER_SECOND
+from geogs.io.sources.calibration_files import read_calibration
+from geogs.io.sources.images import SUFFIXES
+from geogs.io.sources.posed.files import PosedFile, PosedSet
+
+
+def is_scannet(folder: Path) -> bool:
+    """Whether ``folder`` is a scene with its poses."""
+    return (folder / "pose").is_dir() and (folder / "color").is_dir()
+
+
+def open_scannet(folder: Path) -> PosedSet:
+    """Read a scene; names count as numbers, padded with zeros or not."""
+    intrinsic = folder / "intrinsic" / "intrinsic_color.txt"
+    calibration = read_calibration(intrinsic) if intrinsic.is_file() else None
+    poses = {
+        int(path.stem): path for path in (folder / "pose").glob("*.txt") if path.stem.isdecimal()
+    }
+    images = sorted(
+        (int(path.stem), path)
+        for path in (folder / "color").iterdir()
+        if path.stem.isdecimal() and path.suffix.lower() in SUFFIXES
+    )
+    files = tuple(
+        PosedFile(path, _read_pose(poses[k]), calibration, None, k / FRAMES_PER_SECOND)
+        for k, path in images
+        if k in poses
+    )
+    return PosedSet("scannet", folder.resolve().name, files, scene_scale="metres")
+
+
+def _read_pose(path: Path) -> Float64[np.ndarray, "4 4"]:
+    """World to camera; NaN where tracking was lost (the file then holds -inf)."""
+    try:
+        T_wc = np.array(path.read_text().split(), dtype=np.float64).reshape(4, 4)
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path} should hold a 4x4 matrix ({error}); copy it again.") from error
+    if not np.isfinite(T_wc).all() or abs(np.linalg.det(T_wc)) < 1e-9:
+        return np.full((4, 4), np.nan)
+    return np.linalg.inv(T_wc)
