@@ -319,3 +319,23 @@ def test_mirrored_poses_are_refused(room, tmp_path):
     (tmp_path / "transforms.json").write_text(json.dumps(document))
     with pytest.raises(InputError, match="mirror the scene"):
         open_posed_source(tmp_path)
+
+
+def test_dtu_scan_projects_like_its_matrices(shared_data):
+    folder = shared_data / "dtu" / "scan24"
+    if not folder.is_dir():
+        pytest.skip("dtu/scan24 is not on this machine")
+    source = open_posed_source(folder, NATIVE)
+    assert (len(source), source.scene_scale) == (49, "millimetres")
+    corners = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
+    points = source.region.centre + 0.5 * source.region.radius * corners
+    K = source.camera.matrix().numpy()
+    matrices = np.load(folder / "cameras.npz")
+    for i, T in enumerate(source.T_cw):
+        seen = (points @ T[:3, :3].T + T[:3, 3]) @ K.T
+        true = np.c_[points, np.ones(8)] @ matrices[f"world_mat_{i}"][:3].T
+        assert (seen[:, 2] > 0).all()
+        # The file holds single precision.
+        np.testing.assert_allclose(
+            seen[:, :2] / seen[:, 2:] + 0.5, true[:, :2] / true[:, 2:], atol=0.01
+        )

@@ -1,5 +1,6 @@
 """All images of a set as one pinhole camera sees them, though several cameras took them."""
 
+import logging
 from collections.abc import Sequence
 
 import cv2
@@ -15,12 +16,16 @@ from geogs.io.sources.posed.files import PosedFile
 from geogs.io.sources.posed.pictures import stored_size
 from geogs.io.sources.undistort import Rectifier
 
+_log = logging.getLogger(__name__)
+
 SAME_CAMERA = 0.02
 """Pixels of the working image by which two cameras may differ and still count as one."""
 MAX_ZOOM = 1.5
 """Largest enlargement of an image that has fewer pixels per degree than the common camera."""
 MIN_SHARED = 0.6
 """Least part that the fields of view of two cameras must share of the larger one."""
+MAX_KEPT_MAPS = 8
+"""Most different cameras whose resampling is remembered; with more it is worked out each time."""
 
 
 class OneCamera:
@@ -40,10 +45,12 @@ class OneCamera:
             key: rectifier if camera == first else _way(camera, self.camera, rectifier.zoom)
             for key, camera in cameras.items()
         }
+        if len(ways) <= MAX_KEPT_MAPS:
+            for way in ways.values():
+                if isinstance(way, Resampler):
+                    way.keep_maps()
         self._ways = [ways[key] for key in keys]
-        for file, way in zip(files, self._ways, strict=True):
-            if isinstance(way, Resampler):
-                way.check(file, files[0])
+        _check_shared(files, self._ways)
 
     def stored_shape(self, index: int) -> tuple[int, int]:
         """Width and height of image ``index`` on disk."""
@@ -58,7 +65,7 @@ class OneCamera:
         if mask is not None:
             grey = np.where(mask, np.uint8(255), np.uint8(0))
             mask = way(np.ascontiguousarray(np.repeat(grey[..., None], 3, axis=2)))[..., 0] > 127
-        covered = way.covered if isinstance(way, Resampler) else None
+        covered = way.covered() if isinstance(way, Resampler) else None
         if covered is not None:
             mask = covered if mask is None else mask & covered
         return image, mask
@@ -73,54 +80,80 @@ class Resampler:
 
     def __init__(self, source: Calibration, target: Camera, zoom: float) -> None:
         camera = source.camera()
-        self._source = camera
+        self.shared = _shared_view(camera, target)
+        """Part of the larger field of view that both have."""
+        self.enlargement = target.fx / camera.fx
+        self.description = f"{camera.width}x{camera.height}, focal length {camera.fx:.0f}"
         # The source comes to about the target's scale first, so that no detail is skipped.
         scale = min(1.0, target.fx / zoom / camera.fx)
         size = (round(camera.width * scale), round(camera.height * scale))
         resized = camera.resized(max(size[0], 1), max(size[1], 1))
         self._size = (resized.width, resized.height)
+        self._resized = resized
+        self._distortion = np.array(source.distortion or (0.0,) * 4, dtype=np.float64)
         self._target = target
-        self._maps = cv2.initUndistortRectifyMap(
-            resized.matrix().numpy(),
-            np.array(source.distortion or (0.0,) * 4, dtype=np.float64),
-            None,
-            target.matrix().numpy(),
-            (target.width, target.height),
-            cv2.CV_32FC1,
-        )
-        self.covered: Bool[np.ndarray, "h w"] | None = self._covered()
-        """Pixels of the target that the source sees; none where it sees all."""
+        self._kept: tuple[np.ndarray, np.ndarray] | None = None
+
+    def keep_maps(self) -> None:
+        """Compute where each pixel comes from once for all; takes 8 bytes a pixel."""
+        self._kept = self._maps()
 
     def __call__(self, image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h2 w2 3"]:
         """The image of the target."""
         if (image.shape[1], image.shape[0]) != self._size:
             image = cv2.resize(image, self._size, interpolation=cv2.INTER_AREA)
-        return cv2.remap(image, *self._maps, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+        return cv2.remap(image, *self._maps(), cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
 
-    def check(self, file: PosedFile, first: PosedFile) -> None:
-        """Raise InputError where the cameras differ too much for one to stand for the other."""
-        enlarged = self._target.fx / self._source.fx
-        if enlarged > MAX_ZOOM or _shared_view(self._source, self._target) < MIN_SHARED:
-            raise InputError(
-                f"{file.path} ({_described(self._source)}) was taken with quite another camera "
-                f"than {first.path} ({_described(self._target)} at working size); give the images "
-                f"of one camera, or undistort and crop them to one."
-            )
-
-    def _covered(self) -> Bool[np.ndarray, "h w"] | None:
-        x, y = self._maps
+    def covered(self) -> Bool[np.ndarray, "h w"] | None:
+        """Pixels of the target that the source sees; none where it sees all."""
+        x, y = self._maps()
         width, height = self._size
         covered = (x >= -1) & (x <= width) & (y >= -1) & (y <= height)
         return None if covered.all() else covered
 
+    def _maps(self) -> tuple[np.ndarray, np.ndarray]:
+        """Column and row in the resized source of each pixel of the target."""
+        if self._kept is not None:
+            return self._kept
+        x, y = cv2.initUndistortRectifyMap(
+            self._resized.matrix().numpy(),
+            self._distortion,
+            None,
+            self._target.matrix().numpy(),
+            (self._target.width, self._target.height),
+            cv2.CV_32FC1,
+        )
+        return x, y
+
+
+def _check_shared(files: Sequence[PosedFile], ways: Sequence[Resampler | Rectifier]) -> None:
+    """Raise InputError where cameras differ too much for one to stand for the other."""
+    cropped = 0
+    for file, way in zip(files, ways, strict=True):
+        if isinstance(way, Rectifier):
+            continue
+        if way.enlargement > MAX_ZOOM or way.shared < MIN_SHARED:
+            raise InputError(
+                f"{file.path} ({way.description}) was taken with quite another camera than "
+                f"{files[0].path}; give images of one camera, or undistort and crop them to one."
+            )
+        cropped += way.shared < 0.9
+    if cropped:
+        _log.warning(
+            "%d of %d images are from other cameras than the first one; what only they see at "
+            "their edges is not used.",
+            cropped, len(files),
+        )  # fmt: skip
+
 
 def _way(camera: Calibration, target: Camera, zoom: float) -> Resampler | Rectifier:
     """The way of a camera into the target; without resampling where they are the same anyway."""
-    rectifier = Rectifier(camera, max(target.width, target.height))
-    own = rectifier.camera
-    is_same_size = (own.width, own.height) == (target.width, target.height)
-    if is_same_size and np.abs(_corners(own, target)).max() < SAME_CAMERA:
-        return rectifier
+    if not camera.is_distorted:
+        rectifier = Rectifier(camera, max(target.width, target.height))
+        own = rectifier.camera
+        is_same_size = (own.width, own.height) == (target.width, target.height)
+        if is_same_size and np.abs(_corners(own, target)).max() < SAME_CAMERA:
+            return rectifier
     return Resampler(camera, target, zoom)
 
 
@@ -155,7 +188,3 @@ def _size(file: PosedFile) -> tuple[int, int]:
     if size is None:
         raise InputError(f"{file.path} is damaged; copy it again, or leave it out.")
     return size
-
-
-def _described(camera: Camera) -> str:
-    return f"{camera.width}x{camera.height}, focal length {camera.fx:.0f}"
