@@ -11,6 +11,7 @@ from geogs.config import InputConfig
 from geogs.errors import InputError
 from geogs.io.sources.posed.colmap_model import read_model
 from geogs.io.sources.posed.dtu import decompose
+from geogs.io.sources.posed.files import renumbered
 from geogs.io.sources.posed.sniff import open_posed_source
 from io_samples import write_image
 from posed_layouts import (
@@ -242,6 +243,11 @@ def test_bad_transforms(change, message, room, tmp_path):
     (tmp_path / "transforms.json").write_text(json.dumps(document))
     with pytest.raises(InputError, match=message):
         open_posed_source(tmp_path)
+
+
+def test_renumbered():
+    numbers = np.array([7, 3, 100, 0, 9, 3], dtype=np.int64)
+    assert renumbered(numbers, [9, 3, 7]).tolist() == [2, 1, -1, -1, 0, 1]
 
 
 def test_dtu_masks_and_region(room, tmp_path):

@@ -12,7 +12,7 @@ from geogs.io.poses import FRAMES_PER_SECOND
 from geogs.io.sources.calibration_files import calibration_from_colmap
 from geogs.io.sources.images import natural_key
 from geogs.io.sources.posed.colmap_model import Model, ModelImage, is_model, read_model
-from geogs.io.sources.posed.files import PosedFile, PosedSet, SparsePoints
+from geogs.io.sources.posed.files import PosedFile, PosedSet, SparsePoints, renumbered
 
 _MODEL_FOLDERS = ("", "0", "sparse/0", "sparse", "colmap/sparse/0", "colmap", "iphone/colmap")
 _IMAGE_FOLDERS = ("images", "image", "rgb", "color", "frames", "input", "")
@@ -116,7 +116,6 @@ def _points(model: Model, numbers: list[int]) -> SparsePoints | None:
     points = model.points
     if points is None or len(points.positions) == 0:
         return None
-    index_of = {number: index for index, number in enumerate(numbers)}
-    images = np.array([index_of.get(int(number), -1) for number in points.seen_image], np.int64)
+    images = renumbered(points.seen_image, numbers)
     known = images >= 0
     return SparsePoints(points.positions, points.seen_point[known], images[known])

@@ -46,11 +46,18 @@ class SparsePoints:
 
     def for_images(self, kept: Sequence[int]) -> "SparsePoints":
         """The points that the images ``kept`` see, these being numbered 0, 1, ... now."""
-        number = {old: new for new, old in enumerate(kept)}
-        new_image = np.array([number.get(int(image), -1) for image in self.seen_image], np.int64)
+        new_image = renumbered(self.seen_image, kept)
         stays = new_image >= 0
         points, seen_point = np.unique(self.seen_point[stays], return_inverse=True)
         return SparsePoints(self.positions[points], seen_point.astype(np.int64), new_image[stays])
+
+
+def renumbered(numbers: Int64[np.ndarray, "m"], kept: Sequence[int]) -> Int64[np.ndarray, "m"]:
+    """The place of each number in ``kept``, whose entries are different; -1 where it is not."""
+    order = np.argsort(kept, kind="stable")
+    ascending = np.asarray(kept, dtype=np.int64)[order]
+    place = np.searchsorted(ascending, numbers).clip(max=len(ascending) - 1)
+    return np.where(ascending[place] == numbers, order[place], -1).astype(np.int64)
 
 
 @dataclass(frozen=True, slots=True)
