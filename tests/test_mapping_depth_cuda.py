@@ -386,6 +386,14 @@ def test_whole_estimate(setting):
     assert depth.typical == pytest.approx(expected.typical, rel=5e-3)
 
 
+def test_estimate_between_given_limits(setting):
+    cpu, cuda = _engines(setting)
+    views, limits = setting.scene.views, [(2.6, 5.0)]
+    (expected,), (depth,) = (e.estimate(views[:1], [views[1:]], limits=limits) for e in (cpu, cuda))
+    off = (depth.depth.cpu() / expected.depth - 1).abs()
+    assert float((off < 1e-3).float().mean()) > 0.98
+
+
 def test_without_neighbours_the_completed_tracker_remains(setting):
     cpu, cuda = _engines(setting)
     (expected,), (depth,) = (e.estimate(setting.scene.views[:1], [[]]) for e in (cpu, cuda))

@@ -386,6 +386,40 @@ class Config:
     mesh: MeshConfig = field(default_factory=MeshConfig)
 
 
+@dataclass(frozen=True)
+class SearchConfig:
+    """How much is done for a map from known poses, and where depth is looked for."""
+
+    steps_per_view: int = 30
+    """Training steps for every image where no time is given, at least 1."""
+    least_steps: int = 300
+    """Fewest training steps where no time is given."""
+    most_steps_per_view: int = 200
+    """Most training steps for every image, whatever the time."""
+    output_share: float = 0.2
+    """Part of a given time that is kept for the mesh and the report, in [0, 1)."""
+    first_edge: int = 128
+    """First look at the scene: longer side of its images, pixels."""
+    first_views: int = 8
+    """First look: images whose depth is searched."""
+    margin: float = 1.3
+    """Factor by which searched depths go beyond those that are known, at least 1."""
+    repeat: bool = True
+    """Search all depths a second time, between the limits that the first time has shown."""
+
+
+@dataclass(frozen=True)
+class ReconstructConfig:
+    """All settings of a reconstruction from known poses."""
+
+    seed: int = 0
+    """Random seed; same seed, same machine and no time limit, same result on the CPU."""
+    input: InputConfig = field(default_factory=InputConfig)
+    search: SearchConfig = field(default_factory=SearchConfig)
+    mapping: MappingConfig = field(default_factory=MappingConfig)
+    mesh: MeshConfig = field(default_factory=MeshConfig)
+
+
 Preset = Literal["fast", "default", "accurate"]
 
 

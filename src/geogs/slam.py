@@ -4,6 +4,9 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import numpy as np
+import torch
+
 from geogs.config import Config
 from geogs.geometry.camera import Camera
 from geogs.loop.global_bundle import global_bundle
@@ -80,6 +83,13 @@ class Slam:
         """Poses of all frames so far."""
         with self.stopwatch("trajectory"):
             return self.tracker.trajectory()
+
+    def keyframe_trajectory(self) -> Trajectory:
+        """Poses of the keyframes alone."""
+        keyframes = self._keyframes(self.tracker.keyframe_ids)
+        T_wc = [torch.linalg.inv(k.T_cw.cpu()).numpy() for k in keyframes]
+        times = np.array([k.timestamp for k in keyframes], dtype=np.float64)
+        return Trajectory(times, np.array(T_wc).reshape(-1, 4, 4), np.ones(len(times), dtype=bool))
 
     def snapshot(self) -> MapSnapshot:
         """The disks as they are now."""

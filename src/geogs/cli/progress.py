@@ -6,7 +6,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    Progress,
+    TaskID,
+    TaskProgressColumn,
+    TextColumn,
+    TimeRemainingColumn,
+)
 
 if TYPE_CHECKING:
     from geogs.slam import SlamStatus
@@ -35,7 +42,8 @@ def peak_memory() -> int:
 class RunProgress:
     """Shows how far a run is; a context manager, on the standard error."""
 
-    def __init__(self, frames: int | None):
+    def __init__(self, frames: int | None, tracks: bool = True):
+        """Of a source of so many frames, if known; without ``tracks`` there are only stages."""
         self._console = Console(stderr=True)
         self._bar = Progress(
             TextColumn("{task.description:<18}"),
@@ -48,7 +56,9 @@ class RunProgress:
         )
         self._frames = frames
         self._start = self._printed = time.perf_counter()
-        self._tasks = {"tracking": self._bar.add_task("tracking", total=frames, info="")}
+        self._tasks: dict[str, TaskID] = {}
+        if tracks:
+            self._tasks["tracking"] = self._bar.add_task("tracking", total=frames, info="")
 
     def __enter__(self) -> "RunProgress":
         self._bar.start()

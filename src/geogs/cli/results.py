@@ -2,19 +2,22 @@
 
 import json
 import platform
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
 
 import geogs
 from geogs.cli.progress import RunProgress, peak_memory
-from geogs.config import Config
+from geogs.config import Config, ReconstructConfig
 from geogs.errors import InputError
 from geogs.evaluation import plots
 from geogs.evaluation.shading import viewpoints
+from geogs.geometry.camera import Camera
 from geogs.io.sources.base import Source
+from geogs.io.sources.calibration import Calibration
 from geogs.io.writers.atomic import write_text
 from geogs.io.writers.intrinsics import write_intrinsics
 from geogs.io.writers.native import save_map
@@ -23,22 +26,74 @@ from geogs.io.writers.tum import write_tum_trajectory
 from geogs.mesh.colour import colour_mesh
 from geogs.mesh.extract import extract_mesh
 from geogs.mesh.types import DepthMapView, Mesh
-from geogs.slam import Slam
+from geogs.stopwatch import Stopwatch
 from geogs.types import MapSnapshot, RenderedKeyframe, Trajectory
+
+
+@runtime_checkable
+class MappedScene(Protocol):
+    """What has a trajectory, disks and depth maps to write."""
+
+    stopwatch: Stopwatch
+
+    @property
+    def frames(self) -> int:
+        """Images so far."""
+        ...
+
+    def trajectory(self) -> Trajectory:
+        """Poses of all frames."""
+        ...
+
+    def keyframe_trajectory(self) -> Trajectory:
+        """Poses of the keyframes alone."""
+        ...
+
+    def snapshot(self) -> MapSnapshot:
+        """The disks."""
+        ...
+
+    def renders(self) -> list[RenderedKeyframe]:
+        """The map seen from every keyframe."""
+        ...
+
+
+@dataclass(frozen=True)
+class SourceFacts:
+    """What the results say of the source."""
+
+    name: str
+    kind: str
+    camera: Camera
+    intrinsics_origin: str
+    calibration: Calibration | None = None
+    """Of the images as they came; none where each may have its own."""
+    skipped: int = 0
+    scale: str = "arbitrary (monocular)"
+    """What a unit of the map is."""
+
+    @staticmethod
+    def of(source: Source) -> "SourceFacts":
+        """Of a source that was read to its end."""
+        return SourceFacts(
+            source.name, source.kind, source.camera, source.intrinsics_origin,
+            source.calibration, source.skipped,
+        )  # fmt: skip
 
 
 def write_results(
     output: Path,
-    slam: Slam,
-    source: Source,
-    config: Config,
+    slam: MappedScene,
+    source: SourceFacts,
+    config: Config | ReconstructConfig,
     interrupted: bool,
     progress: RunProgress,
 ) -> None:
     """Write poses first, then the map, the mesh, and the report on them."""
     trajectory = slam.trajectory()
     write_tum_trajectory(output / "trajectory.tum", trajectory)
-    write_tum_trajectory(output / "keyframes.tum", keyframe_trajectory(slam))
+    keyframes = slam.keyframe_trajectory()
+    write_tum_trajectory(output / "keyframes.tum", keyframes)
     write_intrinsics(output / "intrinsics.json", source.camera, source.calibration)
     write_config(output / "config.yaml", config)
     disks = slam.snapshot()
@@ -64,21 +119,13 @@ def write_results(
             f"warning: {lost} of {slam.frames} frames were not tracked; slower motion, texture "
             "or the right --intrinsics may help."
         )
-    summary = summarise(slam, source, trajectory, disks, mesh, config, interrupted)
+    summary = summarise(slam, source, trajectory, keyframes, disks, mesh, config, interrupted)
     write_text(output / "summary.json", json.dumps(summary, indent=2))
     with slam.stopwatch("report"):
         write_report(output / "report", trajectory, renders, mesh)
 
 
-def keyframe_trajectory(slam: Slam) -> Trajectory:
-    """Poses of the keyframes alone."""
-    keyframes = [slam.tracker.keyframe(i) for i in slam.tracker.keyframe_ids]
-    T_wc = np.array([torch.linalg.inv(k.T_cw.cpu()).numpy() for k in keyframes]).reshape(-1, 4, 4)
-    times = np.array([k.timestamp for k in keyframes], dtype=np.float64)
-    return Trajectory(times, T_wc, np.ones(len(keyframes), dtype=bool))
-
-
-def write_config(path: Path, config: Config) -> None:
+def write_config(path: Path, config: Config | ReconstructConfig) -> None:
     """All settings as YAML."""
     import yaml
 
@@ -102,37 +149,38 @@ def splat_colours(disks: MapSnapshot, views: list[DepthMapView]) -> np.ndarray:
 
 
 def summarise(
-    slam: Slam,
-    source: Source,
+    slam: MappedScene,
+    source: SourceFacts,
     trajectory: Trajectory,
+    keyframes: Trajectory,
     disks: MapSnapshot,
     mesh: Mesh | None,
-    config: Config,
+    config: Config | ReconstructConfig,
     interrupted: bool,
 ) -> dict[str, object]:
     """What happened, in numbers."""
     seconds = {name: round(s, 3) for name, s in slam.stopwatch.seconds.items()}
     total = sum(seconds.values())
     online = sum(seconds.get(k, 0.0) for k in ("tracking", "mapping", "pose refinement"))
+    rates = {"with_final_stages": round(slam.frames / max(total, 1e-9), 3)}
+    if online:
+        rates = {"online": round(slam.frames / online, 3), **rates}
     return {
         "source": source.name,
         "kind": source.kind,
         "frames": slam.frames,
         "skipped_images": source.skipped,
-        "keyframes": len(slam.tracker.keyframe_ids),
+        "keyframes": len(keyframes.timestamps),
         "lost_spans": lost_spans(trajectory),
         "disks": len(disks),
         "mesh_faces": 0 if mesh is None else len(mesh.faces),
         "seconds": {**seconds, "total": round(total, 3)},
-        "frames_per_second": {
-            "online": round(slam.frames / max(online, 1e-9), 3),
-            "with_final_stages": round(slam.frames / max(total, 1e-9), 3),
-        },
+        "frames_per_second": rates,
         "peak_memory_bytes": peak_memory(),
         **device_summary(disks.position.device),
         "interrupted": interrupted,
         "intrinsics": source.intrinsics_origin,
-        "scale": "arbitrary (monocular)",
+        "scale": source.scale,
         "seed": config.seed,
         "versions": {
             "geogs": geogs.__version__,

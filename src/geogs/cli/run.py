@@ -57,7 +57,7 @@ def run(options: RunOptions) -> Path:
     import torch
 
     import geogs
-    from geogs.cli.results import write_results
+    from geogs.cli.results import SourceFacts, write_results
     from geogs.errors import DeviceError
     from geogs.gpu.installation import require_device
     from geogs.gpu.kernels import prepare_kernels
@@ -79,7 +79,8 @@ def run(options: RunOptions) -> Path:
             why = "The GPU has no memory left" if full else "Stopping early"
             progress.write(f"{why}; keeping what there is. Press Ctrl-C again to quit.")
         interrupted |= not _finish(slam, progress, stop, correct=not interrupted)
-        write_results(output, slam, source, options, interrupted, progress)
+        facts = SourceFacts.of(source)
+        write_results(output, slam, facts, options, interrupted, progress)
     if full:
         raise DeviceError(
             f"The memory of the GPU was full after {slam.frames} frames, whose results are in "

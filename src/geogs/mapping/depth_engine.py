@@ -17,6 +17,8 @@ from geogs.threads import thread_map
 
 Progress = Callable[[float], None]
 """Called with the finished fraction."""
+Limits = tuple[float, float]
+"""Nearest and farthest depth to search, map units."""
 
 
 def silent(fraction: float) -> None:
@@ -36,8 +38,12 @@ class DepthEngine(Protocol):
         references: Sequence[DepthView],
         neighbours: Sequence[Sequence[DepthView]],
         progress: Progress = silent,
+        limits: Sequence[Limits | None] | None = None,
     ) -> list[DenseDepth]:
-        """Dense depth of every reference, matched with its neighbours (``estimate_depth``)."""
+        """Dense depth of every reference, matched with its neighbours (``estimate_depth``).
+
+        ``limits`` are the nearest and farthest depth to search; none leaves them to the tracker.
+        """
         ...
 
     def check(
@@ -67,14 +73,18 @@ class CpuDepthEngine:
         references: Sequence[DepthView],
         neighbours: Sequence[Sequence[DepthView]],
         progress: Progress = silent,
+        limits: Sequence[Limits | None] | None = None,
     ) -> list[DenseDepth]:
         """As in the protocol."""
 
-        def one(pair: tuple[DepthView, Sequence[DepthView]]) -> DenseDepth:
-            depth = estimate_depth(*pair, self.render, self.working, self.config)
-            return DenseDepth.of(depth)
+        def one(task: tuple[DepthView, Sequence[DepthView], Limits | None]) -> DenseDepth:
+            reference, others, searched = task
+            cameras = self.render, self.working
+            return DenseDepth.of(estimate_depth(reference, others, *cameras, self.config, searched))
 
-        return thread_map(one, list(zip(references, neighbours, strict=True)), progress)
+        searched = limits or [None] * len(references)
+        tasks = list(zip(references, neighbours, searched, strict=True))
+        return thread_map(one, tasks, progress)
 
     def check(
         self, depths: Sequence[PosedDepth], others: Sequence[Sequence[PosedDepth]]

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float32, Float64, UInt8
+from jaxtyping import Bool, Float32, Float64, UInt8
 from torch import Tensor
 
 from geogs.geometry.camera import Camera
@@ -40,6 +40,16 @@ class DepthView:
     def forward(self) -> Float64[np.ndarray, "3"]:
         """Viewing direction in the world."""
         return self.T_cw[2, :3]
+
+
+@dataclass(frozen=True, slots=True)
+class DepthSearch:
+    """Where to look for a view's depth, where no tracker says. Map units."""
+
+    near: float
+    typical: float
+    """Median: neighbours are chosen for their parallax there."""
+    far: float
 
 
 @dataclass(slots=True)
@@ -84,6 +94,13 @@ class DenseDepth:
     def arrays(self) -> KeyframeDepth:
         """As arrays: the same memory where the tensors are on the CPU."""
         return KeyframeDepth(self.depth.cpu().numpy(), self.confidence.cpu().numpy())
+
+    def within(self, mask: Bool[Tensor, "h w"]) -> "DenseDepth":
+        """Nothing known outside the mask; the median is that of the inside."""
+        inside = self.depth[mask]
+        median = inside.median().cpu() if len(inside) else self.median
+        confidence = torch.where(mask, self.confidence, 0.0)
+        return DenseDepth(self.depth, confidence, median, None if len(inside) else self.written)
 
     def scaled(self, factor: float) -> "DenseDepth":
         """The depth multiplied by a factor."""

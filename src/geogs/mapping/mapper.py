@@ -1,7 +1,9 @@
 """The back end: keyframe depths in, a trained disk map and refined poses out."""
 
+import time
 from collections.abc import Callable
 
+import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
@@ -33,6 +35,10 @@ def _silent(fraction: float) -> None:
 _CHECKING_VIEWS = 8
 # Steps of the final training between two reports of progress, at least.
 _REPORTED_STEPS = 20
+# Keyframes whose depths are searched in one go.
+_SEARCHED_AT_ONCE = 16
+# Steps from which the time of one is judged.
+_REHEARSED_STEPS = 16
 
 
 class Mapper:
@@ -61,9 +67,14 @@ class Mapper:
         """Keyframes observed so far, in order."""
         return list(self.views)
 
-    def observe(self, keyframe: Keyframe) -> None:
-        """A settled keyframe, from now on available for matching."""
+    def observe(self, keyframe: Keyframe, mask: Bool[np.ndarray, "h w"] | None = None) -> None:
+        """A settled keyframe, from now on available for matching.
+
+        Outside a mask, of the size of its image, it has no depth.
+        """
         view = MapView.of(keyframe, self.cameras, self.config.loss, self.map.device)
+        if mask is not None:
+            view.mask = _render_mask(mask, self.cameras.render).to(self.map.device)
         self.views[keyframe.id] = view
         self._depths.observe(view.depth_view)
 
@@ -124,15 +135,57 @@ class Mapper:
         if self.config.final_depth:
             self._estimate(views, lambda fraction: progress(0.4 * fraction))
             self._check(views)
+        self.grow()
+        start = 0.4 if self.config.final_depth else 0.0
+        steps = self.config.final_iterations
+        self.train(steps, lambda fraction: progress(start + (1 - start) * fraction))
+
+    def move(self, poses: list[Float[Tensor, "4 4"]]) -> None:
+        """World-to-camera poses of all keyframes, before there is a map."""
+        for view, T_cw in zip(self.views.values(), poses, strict=True):
+            view.move(T_cw)
+
+    def search_depths(self, keyframe_ids: list[int], progress: Progress = _silent) -> None:
+        """Depths of some keyframes from their images; those that get one are mapped.
+
+        In groups, between which an exception raised by ``progress`` loses nothing.
+        """
+        for start in range(0, len(keyframe_ids), _SEARCHED_AT_ONCE):
+            group = keyframe_ids[start : start + _SEARCHED_AT_ONCE]
+            self._estimate([self.views[i] for i in group])
+            self.mapped += [i for i in group if i not in self.mapped]
+            progress(min(1.0, (start + len(group)) / len(keyframe_ids)))
+
+    def check_depths(self) -> None:
+        """Let the depths of all mapped keyframes revise each other, once per search."""
+        self._check([self.views[i] for i in self.mapped])
+
+    def grow(self) -> None:
+        """Carve the map with all mapped keyframes, and add what their depths show beyond it."""
+        views = [self.views[i] for i in self.mapped]
         for view in views:
             self._choose_partners(view)
         self.prune()
         for view in views:
             self._insert(view, self.config.disk.insert_confidence)
-        start = 0.4 if self.config.final_depth else 0.0
-        self._train_all(views, lambda fraction: progress(start + (1 - start) * fraction))
+
+    def train(self, steps: int, progress: Progress = _silent, until: float | None = None) -> None:
+        """Single-view steps over all mapped keyframes; disks that none has seen go.
+
+        Fewer steps where they would last beyond ``until``, a time of ``time.perf_counter``.
+        """
+        self._train_all([self.views[i] for i in self.mapped], steps, progress, until)
         self.prune()
         self._training().optimizer.keep(self.map.seen > 0)
+
+    def seconds_per_step(self) -> float:
+        """What a training step takes, from a few of them at full rate."""
+        for steps in (2, _REHEARSED_STEPS):  # the first ones make ready what is needed but once
+            start = time.perf_counter()
+            drawn = self._random.choice(self.mapped, steps)
+            self._training().train([self._batch([int(i)]) for i in drawn])
+            float(self.map.position.detach().sum())  # waits for a GPU
+        return (time.perf_counter() - start) / _REHEARSED_STEPS
 
     def prune(self) -> None:
         """Drop transparent and broken disks, and those that the keyframes see in free space."""
@@ -151,9 +204,11 @@ class Mapper:
 
     def _training(self) -> MapTrainer:
         if self._trainer is None:
-            depth = self.views[self.mapped[0]].dense.arrays()
-            sure = depth.depth[depth.confidence >= np.median(depth.confidence)]
-            unit = float(np.median(sure))
+            first = self.views[self.mapped[0]]
+            depth = first.dense.arrays()
+            known = depth.confidence > 0
+            sure = depth.depth[known & (depth.confidence >= np.median(depth.confidence))]
+            unit = float(np.median(sure)) if known.any() else first.typical_depth
             self._trainer = map_trainer(self.map, self.cameras, self.config, unit)
         return self._trainer
 
@@ -165,11 +220,12 @@ class Mapper:
     def _estimate(self, views: list[MapView], progress: Progress = _silent) -> None:
         candidates = [v.depth_view for v in self.views.values()]
         references, neighbours = [v.depth_view for v in views], []
+        limits = [None if v.search is None else (v.search.near, v.search.far) for v in views]
         for view in views:
-            depth = _typical_depth(view)
+            depth = _typical_depth(view) if view.search is None else view.search.typical
             chosen = select_sweep_neighbours(view.depth_view, candidates, depth, self.config.depth)
             neighbours.append([candidates[i] for i in chosen])
-        depths = self._depths.estimate(references, neighbours, progress)
+        depths = self._depths.estimate(references, neighbours, progress, limits)
         for view, dense in zip(views, depths, strict=True):
             view.set_depth(dense, self.cameras)
 
@@ -237,21 +293,33 @@ class Mapper:
         )  # fmt: skip
         self._training().optimizer.append(new, view.id)
 
-    def _train_all(self, views: list[MapView], progress: Progress) -> None:
-        """Single-view steps over all keyframes in random order, with falling learning rates."""
-        trainer, total = self._training(), self.config.final_iterations
+    def _train_all(
+        self, views: list[MapView], total: int, progress: Progress, until: float | None
+    ) -> None:
+        """Single-view steps over all keyframes in random order, with falling learning rates.
+
+        The rates fall with the steps or with the time, whichever is nearer to its end.
+        """
+        start = time.perf_counter()
+        trainer = self._training()
         fills, prunes = {total // 3, 2 * total // 3}, max(total // 4, 1)
         events = fills | set(range(prunes, total, prunes))
         stops = sorted(events | set(range(_REPORTED_STEPS, total, _REPORTED_STEPS)) | {total})
         order: list[int] = []
         done = 0
         for stop in stops:
+            late = 0.0
+            if until is not None:
+                late = (time.perf_counter() - start) / max(until - start, 1e-9)
+            if late >= 1.0:
+                break
             batches = []
             for _ in range(done, stop):
                 if not order:
                     order = list(self._random.permutation(len(views)))
                 batches.append(self._batch([views[order.pop()].id]))
-            rates = [self.config.lr_final ** (step / total) for step in range(done + 1, stop + 1)]
+            shares = [max(step / total, late) for step in range(done + 1, stop + 1)]
+            rates = [self.config.lr_final**share for share in shares]
             trainer.train(batches, rates)
             done = stop
             if done % prunes == 0 and done < total:
@@ -269,6 +337,9 @@ class Mapper:
         single = (output.median_depth - depth).abs() < self.config.max_spread * depth
         depth = torch.where(single | (depth <= 0), depth, output.median_depth)
         weight = torch.where(single, 1.0, 0.5) * (depth > 0)
+        if view.mask is not None:
+            depth = torch.where(view.mask, depth, 0.0)
+            weight = torch.where(view.mask, weight, 0.0)
         length = output.normal.norm(dim=-1, keepdim=True).clamp(min=1e-6)
         return RenderedKeyframe(
             keyframe_id=view.id,
@@ -286,6 +357,13 @@ def _cameras(camera: Camera, config: MappingConfig) -> MapCameras:
     long_edge = min(config.render_long_edge, working)
     photo = min(round(config.photo_scale * long_edge), working)
     return MapCameras(camera, camera.with_long_edge(long_edge), camera.with_long_edge(photo))
+
+
+def _render_mask(mask: Bool[np.ndarray, "h w"], render: Camera) -> Bool[Tensor, "rh rw"]:
+    """The pixels of the render size that lie mostly within the mask."""
+    size = (render.width, render.height)
+    share = cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+    return torch.from_numpy(share > 0.5)
 
 
 def _typical_depth(view: MapView) -> float:

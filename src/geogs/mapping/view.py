@@ -2,8 +2,9 @@
 
 from dataclasses import dataclass, field, replace
 
+import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from geogs.config import LossConfig
@@ -11,8 +12,11 @@ from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_inverse
 from geogs.losses.multi_view import PhotoView
 from geogs.losses.single_view import ViewConstants
-from geogs.mapping.depth_view import DenseDepth, DepthView, PosedDepth, depth_view
+from geogs.mapping.depth_view import DenseDepth, DepthSearch, DepthView, PosedDepth, depth_view
 from geogs.types import Keyframe
+
+UNSURE = 1e3
+"""Relative deviation of a depth that is nobody's measurement: it outweighs nothing."""
 
 
 @dataclass(frozen=True)
@@ -41,6 +45,10 @@ class MapView:
     """The map's last rendering from here, for occlusion tests by others."""
     partners: list[int] = field(default_factory=list)
     """Ids of the keyframes whose images check this one's depth, best first."""
+    mask: Bool[Tensor, "h w"] | None = None
+    """Pixels of the render size that belong to the scene; none takes all. On the map's device."""
+    search: DepthSearch | None = None
+    """Where its depth is searched; none leaves that to the tracker's depth."""
 
     @staticmethod
     def of(
@@ -111,8 +119,17 @@ class MapView:
         """Take over a new pose alone."""
         self.follow(replace(self.keyframe, T_cw=T_cw))
 
+    def expect(self, search: DepthSearch) -> None:
+        """Search the depth there; the grid says only what is usual, and next to nothing of that."""
+        self.search = search
+        grid = np.full_like(self.depth_view.inverse_depth, 1.0 / search.typical)
+        information = np.full_like(grid, (search.typical / UNSURE) ** 2)
+        self.depth_view = replace(self.depth_view, inverse_depth=grid, information=information)
+
     def set_depth(self, depth: DenseDepth, cameras: MapCameras) -> None:
         """Take over a dense depth, on which the losses' constants then live."""
+        if self.mask is not None:
+            depth = depth.within(self.mask)
         self.depth = depth
         if self.constants is None:
             self.constants = ViewConstants.prepare(

@@ -17,7 +17,7 @@ from geogs.mapping.cuda.completion import can_complete, complete
 from geogs.mapping.cuda.images import KeyframeImages, homographies, image_pixels, upload
 from geogs.mapping.cuda.refine import PixelPlaces, TrackerMaps, choose_start, judge, refine
 from geogs.mapping.cuda.sweep import MAX_NEIGHBOURS, MAX_PLANES, PlaneSlots, sweep
-from geogs.mapping.depth_engine import Progress, silent
+from geogs.mapping.depth_engine import Limits, Progress, silent
 from geogs.mapping.depth_evidence import prior_weight, relative_precision
 from geogs.mapping.depth_view import DenseDepth, DepthView, PosedDepth
 from geogs.mapping.plane_sweep import sweep_planes
@@ -72,13 +72,15 @@ class CudaDepthEngine:
         references: Sequence[DepthView],
         neighbours: Sequence[Sequence[DepthView]],
         progress: Progress = silent,
+        limits: Sequence[Limits | None] | None = None,
     ) -> list[DenseDepth]:
         """As in the protocol; at most 16 neighbours and 256 planes are used."""
         usable = [list(n[:MAX_NEIGHBOURS]) for n in neighbours]
         for view in (*references, *(v for group in usable for v in group)):
             if view.id not in self._edges:
                 self.observe(view)
-        plans = list(self._threads.map(self._plan, references, usable))
+        searched = limits or [None] * len(references)
+        plans = list(self._threads.map(self._plan, references, usable, searched))
         maps: list[tuple[Tensor, Tensor]] = []
         for start in range(0, len(plans), _BATCH):
             batch = slice(start, start + _BATCH)
@@ -115,7 +117,9 @@ class CudaDepthEngine:
             self._images[view.id] = KeyframeImages.of(view, self.device, pixels)
         return self._images[view.id]
 
-    def _plan(self, reference: DepthView, neighbours: list[DepthView]) -> SearchPlan:
+    def _plan(
+        self, reference: DepthView, neighbours: list[DepthView], limits: Limits | None = None
+    ) -> SearchPlan:
         grid, information = reference.inverse_depth, reference.information
         known = known_cells(grid, information)
         typical = float(np.median(grid[known])) if known.any() else 0.0
@@ -123,7 +127,7 @@ class CudaDepthEngine:
         grids = grids.astype(np.float32)
         if not neighbours:
             return SearchPlan(grids, typical, 0.0, 0.0, np.empty(0, np.float32))
-        near, far = depth_range(reference, neighbours, self.working, self.config)
+        near, far = limits or depth_range(reference, neighbours, self.working, self.config)
         planes = sweep_planes(reference, neighbours, self.render, near, far, self.config)
         if len(planes) > MAX_PLANES:
             planes = np.linspace(planes[0], planes[-1], MAX_PLANES, dtype=np.float32)

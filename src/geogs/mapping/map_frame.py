@@ -1,0 +1,62 @@
+"""The frame and unit that a map is made in, where the world's are somebody else's."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float64
+from torch import Tensor
+
+from geogs.types import MapSnapshot, RenderedKeyframe
+
+# Cameras whose distances make the unit, at most.
+_SAMPLED_CAMERAS = 8
+
+
+@dataclass(frozen=True)
+class MapFrame:
+    """Map coordinates are (world - origin) / unit; axes are the same.
+
+    So disks keep their float32 digits, and the renderer its fixed near plane, whatever the poses
+    are measured in and from where.
+    """
+
+    origin: Float64[np.ndarray, "3"]
+    """World coordinates of the map's origin."""
+    unit: float
+    """Length of a map unit in the world."""
+
+    @staticmethod
+    def around(
+        points: Float64[np.ndarray, "n 3"], poses: Sequence[Float[Tensor, "4 4"]]
+    ) -> "MapFrame":
+        """About points of the scene; their median distance from the cameras becomes 1."""
+        origin = np.median(points, axis=0)
+        some = poses[:: 1 + len(poses) // _SAMPLED_CAMERAS]
+        centres = np.stack([-(T[:3, :3].T @ T[:3, 3]).numpy() for T in some])
+        distance = np.linalg.norm(points[:, None] - centres, axis=2)
+        return MapFrame(origin, float(np.median(distance)))
+
+    def pose(self, T_cw: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:
+        """Map to camera, both in map units."""
+        moved = T_cw.clone()
+        origin = torch.from_numpy(self.origin).to(T_cw)
+        moved[:3, 3] = (T_cw[:3, 3] + T_cw[:3, :3] @ origin) / self.unit
+        return moved
+
+    def points(self, world: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
+        """World points in map coordinates."""
+        return (world - self.origin) / self.unit
+
+    def world_snapshot(self, disks: MapSnapshot) -> MapSnapshot:
+        """Disks of the map in world coordinates and units."""
+        origin = torch.from_numpy(self.origin).to(disks.position)
+        position = disks.position * self.unit + origin
+        return replace(disks, position=position, scale=disks.scale * self.unit)
+
+    def world_render(
+        self, render: RenderedKeyframe, T_cw: Float[Tensor, "4 4"]
+    ) -> RenderedKeyframe:
+        """A rendering of the map with its depth in world units; ``T_cw`` is its pose there."""
+        return replace(render, depth=render.depth * self.unit, T_cw=T_cw)

@@ -1,0 +1,148 @@
+"""The disk map from images with known poses: find the scene, search depths, grow, train."""
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float64, UInt8
+from torch import Tensor
+
+from geogs.config import ReconstructConfig
+from geogs.errors import InputError
+from geogs.geometry.camera import Camera
+from geogs.mapping import known_poses as known
+from geogs.mapping.map_frame import MapFrame
+from geogs.mapping.mapper import Mapper
+from geogs.stopwatch import Stopwatch
+from geogs.threads import on_one_torch_thread
+from geogs.types import MapSnapshot, RenderedKeyframe, Trajectory
+
+Progress = Callable[[str, float], None]
+"""Called with the name of a stage and its finished fraction in [0, 1]."""
+
+
+def _silent(stage: str, fraction: float) -> None:
+    """Progress that nobody watches."""
+
+
+class Reconstruction:
+    """Dense reconstruction without tracking: add posed images, finish, read the map.
+
+    Poses and the map are in the unit of the given poses. With a ``budget`` in seconds, counted from
+    now on, training takes the time that the depths leave of it.
+    """
+
+    def __init__(
+        self,
+        camera: Camera,
+        config: ReconstructConfig | None = None,
+        device: str = "cpu",
+        budget: float | None = None,
+    ):
+        self.config = config or ReconstructConfig()
+        self.camera = camera
+        self.mapper = Mapper(camera, self.config.mapping, device, self.config.seed)
+        self.stopwatch = Stopwatch()
+        self._frame = MapFrame(np.zeros(3), 1.0)
+        self._poses: list[Float[Tensor, "4 4"]] = []
+        self._random = np.random.default_rng(self.config.seed)
+        kept = 1.0 - self.config.search.output_share
+        self._end = None if budget is None else time.perf_counter() + kept * budget
+
+    @property
+    def frames(self) -> int:
+        """Images added so far."""
+        return len(self._poses)
+
+    @on_one_torch_thread
+    def add(
+        self,
+        image: UInt8[np.ndarray, "h w 3"],
+        T_cw: Float64[np.ndarray, "4 4"],
+        mask: Bool[np.ndarray, "h w"] | None = None,
+        timestamp: float | None = None,
+    ) -> None:
+        """An RGB image, its world-to-camera pose, which pixels count, seconds (or its number)."""
+        seconds = float(self.frames) if timestamp is None else timestamp
+        with self.stopwatch("preparing"):
+            keyframe = known.posed_keyframe(self.frames, seconds, image, T_cw)
+            self.mapper.observe(keyframe, mask)
+            self._poses.append(keyframe.T_cw)
+
+    @on_one_torch_thread
+    def finish(
+        self, points: Float64[np.ndarray, "n 3"] | None = None, progress: Progress = _silent
+    ) -> None:
+        """Depths of all images, the map from them, training; ``points`` of the scene help.
+
+        An exception raised by ``progress`` ends it early; the depths found by then make the map.
+
+        Raises:
+            InputError: too few images, or no two of them show the same thing from two places.
+        """
+        if self.frames < 2:
+            raise InputError(f"There is only {self.frames} image; depth needs at least two.")
+        if points is None or len(points) < known.FEWEST_POINTS:
+            with self.stopwatch("first look"):
+                points = self._first_points(lambda f: progress("first look", f))
+        self._frame = MapFrame.around(points, self._poses)
+        self.mapper.move([self._frame.pose(T_cw) for T_cw in self._poses])
+        try:
+            with self.stopwatch("depth"):
+                self._search(self._frame.points(points), lambda f: progress("depth", f))
+        finally:
+            if self.mapper.mapped:
+                with self.stopwatch("growing"):
+                    self.mapper.check_depths()
+                    self.mapper.grow()
+        with self.stopwatch("training"):
+            self.mapper.train(self._steps(), lambda f: progress("training", f), self._end)
+
+    def trajectory(self) -> Trajectory:
+        """The given poses."""
+        times = [v.keyframe.timestamp for v in self.mapper.views.values()]
+        T_wc = torch.linalg.inv(torch.stack(self._poses)).numpy()
+        return Trajectory(np.array(times, np.float64), T_wc, np.ones(len(times), dtype=bool))
+
+    keyframe_trajectory = trajectory
+    """The same: every image counts."""
+
+    def snapshot(self) -> MapSnapshot:
+        """The disks as they are now."""
+        return self._frame.world_snapshot(self.mapper.map.snapshot())
+
+    @on_one_torch_thread
+    def renders(self) -> list[RenderedKeyframe]:
+        """Depth, normal and reliability of the map seen from every image, inside its mask."""
+        with self.stopwatch("rendering"):
+            renders, frame = self.mapper.renders(), self._frame
+            return [frame.world_render(r, self._poses[r.keyframe_id]) for r in renders]
+
+    def _first_points(self, progress: Callable[[float], None]) -> np.ndarray:
+        views, depth = list(self.mapper.views.values()), self.config.mapping.depth
+        return known.first_points(views, self.camera, depth, self.config.search, progress)
+
+    def _search(self, points: np.ndarray, progress: Callable[[float], None]) -> None:
+        """Depths of all images; twice if time allows, the second time where the first found it."""
+        start, search, mapper = time.perf_counter(), self.config.search, self.mapper
+        views, ids = list(mapper.views.values()), mapper.keyframe_ids
+        known.expect_depths(views, points, self.camera, search.margin)
+        share = 0.5 if search.repeat else 1.0
+        mapper.search_depths(ids, lambda f: progress(share * f))
+        now = time.perf_counter()
+        if search.repeat and (self._end is None or 3 * (now - start) < self._end - now):
+            mapper.check_depths()
+            sure = known.dense_points(views, mapper.cameras.render, self._random)
+            if len(sure) >= known.FEWEST_POINTS:
+                known.expect_depths(views, sure, self.camera, search.margin)
+            mapper.search_depths(ids, lambda f: progress(share + share * f))
+
+    def _steps(self) -> int:
+        """As many training steps as the time allows, or the usual number where none is given."""
+        search, count = self.config.search, len(self.mapper.mapped)
+        if self._end is None:
+            return max(search.least_steps, search.steps_per_view * count)
+        seconds = self.mapper.seconds_per_step()
+        left = max(self._end - time.perf_counter(), 0.0)
+        return int(np.clip(left / seconds, 1, search.most_steps_per_view * count))
