@@ -1,6 +1,7 @@
 """Reconstruction from known poses: through the command line, and its parts."""
 
 import json
+import shutil
 import subprocess
 import sys
 import time
@@ -103,6 +104,18 @@ def test_wrong_input_is_one_sentence(room, tmp_path):
         assert done.returncode == 2, done.stderr
         assert words in done.stderr.splitlines()[-1]
         assert "Traceback" not in done.stderr
+
+
+def test_poses_in_another_convention_are_noticed(room, tmp_path):
+    """World to camera where camera to world is expected."""
+    turned = tmp_path / "room"
+    shutil.copytree(room, turned)
+    poses = np.loadtxt(turned / "traj.txt").reshape(-1, 4, 4)
+    np.savetxt(turned / "traj.txt", np.linalg.inv(poses).reshape(-1, 16))
+    done = geogs("reconstruct", turned, "-o", tmp_path / "out", *QUICK)
+    assert done.returncode == 2, done.stderr
+    assert "world" in done.stderr.splitlines()[-1]
+    assert "Traceback" not in done.stderr
 
 
 def ball_and_wall(

@@ -43,6 +43,8 @@ class ReconstructOptions(ReconstructConfig):
     """Folder for the results (also -o); out/NAME if none is given."""
     budget: str | None = None
     """About how long it may take in all, such as 90s, 10m or 1h; none trains until it is good."""
+    check_poses: bool = True
+    """Whether to see by matching images that the poses follow the expected convention."""
     device: str = "auto"
     """Where to compute: auto (a GPU where there is one), cpu, cuda or cuda:1; see geogs doctor."""
 
@@ -63,6 +65,7 @@ def reconstruct(options: ReconstructOptions) -> Path:
     from geogs.cli.results import SourceFacts, write_results
     from geogs.gpu.installation import require_device
     from geogs.gpu.kernels import prepare_kernels
+    from geogs.io.sources.posed.check import check_poses
     from geogs.io.sources.posed.sniff import open_posed_source
     from geogs.io.writers.atomic import prepare_output_folder
     from geogs.reconstruct import Reconstruction
@@ -73,8 +76,10 @@ def reconstruct(options: ReconstructOptions) -> Path:
     output = prepare_output_folder(options.output or Path("out") / source.name)
     if device.type == "cuda":
         prepare_kernels(Path(geogs.__file__).parent, device)
+    warning = check_poses(source).warning if options.check_poses else None
     scene = Reconstruction(source.camera, options, str(device), budget)
     with Interruption() as stop, RunProgress(source.length, tracks=False) as progress:
+        progress.write(f"warning: {warning}" if warning else "")
         finished = _reconstruct(scene, source, progress, stop)
         facts = SourceFacts(
             source.name, source.kind, source.camera, source.intrinsics_origin,
