@@ -1,9 +1,18 @@
 """Command-line options from a dataclass, for every sub-command alike."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TypeVar
 
 Options = TypeVar("Options")
+
+# Options so common that they may be given without the name of their group.
+SHORT: Mapping[str, str] = {
+    "--long-edge": "--input.long-edge",
+    "--start": "--input.start",
+    "--stop": "--input.stop",
+    "--stride": "--input.stride",
+    "-o": "--output",
+}
 
 
 def parse_options(
@@ -12,6 +21,7 @@ def parse_options(
     command: str,
     description: str | None = None,
     default: Options | None = None,
+    short: Mapping[str, str] | None = None,
 ) -> Options:
     """Make ``options`` from arguments; its fields' docstrings are the help.
 
@@ -24,6 +34,7 @@ def parse_options(
         command: the name of the sub-command.
         description: first lines of its help; the docstring of ``options`` if none.
         default: values other than the fields' defaults.
+        short: other names of options.
 
     Raises:
         SystemExit: with 0 after ``--help``, with 2 after an option that is wrong or missing.
@@ -32,8 +43,13 @@ def parse_options(
 
     return tyro.cli(  # type: ignore[return-value]  # a default of none is no default
         options,
-        args=list(argv),
+        args=[_expand(argument, short or {}) for argument in argv],
         prog=f"geogs {command}",
         description=description,
         default=default,
     )
+
+
+def _expand(argument: str, short: Mapping[str, str]) -> str:
+    name, equals, value = argument.partition("=")
+    return short.get(name, name) + equals + value

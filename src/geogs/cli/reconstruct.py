@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from geogs.cli.interrupt import Interruption
-from geogs.cli.options import parse_options
+from geogs.cli.options import SHORT, parse_options
 from geogs.cli.progress import RunProgress
 from geogs.config import ReconstructConfig
 from geogs.errors import InputError
@@ -19,14 +19,6 @@ if TYPE_CHECKING:
     from geogs.io.sources.posed.base import PosedSource
     from geogs.reconstruct import Reconstruction
 
-# Options so common that they may be given without the name of their group.
-SHORT = {
-    "--long-edge": "--input.long-edge",
-    "--start": "--input.start",
-    "--stop": "--input.stop",
-    "--stride": "--input.stride",
-    "-o": "--output",
-}
 _SECONDS = {"": 1.0, "s": 1.0, "m": 60.0, "min": 60.0, "h": 3600.0}
 
 
@@ -137,15 +129,11 @@ def parse(argv: Sequence[str]) -> ReconstructOptions:
     """Options, some of which have short names."""
     return parse_options(
         ReconstructOptions,
-        [_expand(a) for a in argv],
+        argv,
         "reconstruct",
         default=ReconstructOptions(source=tyro.MISSING),
+        short=SHORT,
     )
-
-
-def _expand(argument: str) -> str:
-    name, equals, value = argument.partition("=")
-    return SHORT.get(name, name) + equals + value
 
 
 if __name__ == "__main__":

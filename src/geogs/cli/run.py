@@ -9,23 +9,13 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from geogs.cli.interrupt import Interruption
-from geogs.cli.options import parse_options
+from geogs.cli.options import SHORT, parse_options
 from geogs.cli.progress import RunProgress
 from geogs.config import Config, Preset, preset
 
 if TYPE_CHECKING:
     from geogs.io.sources.base import Source
     from geogs.slam import Slam
-
-# Options so common that they may be given without the name of their group.
-SHORT = {
-    "--intrinsics": "--input.intrinsics",
-    "--long-edge": "--input.long-edge",
-    "--start": "--input.start",
-    "--stop": "--input.stop",
-    "--stride": "--input.stride",
-    "-o": "--output",
-}
 
 
 @dataclass(frozen=True)
@@ -122,19 +112,14 @@ def _finish(slam: "Slam", progress: RunProgress, stop: Interruption, correct: bo
 
 def parse(argv: Sequence[str]) -> RunOptions:
     """Options with the preset as defaults, over which single settings win."""
-    arguments = [_expand(a) for a in argv]
-    name = _preset_name(arguments)
+    name = _preset_name(argv)
     base = preset(name)
     default = RunOptions(
         seed=base.seed, input=base.input, tracking=base.tracking, mapping=base.mapping,
         mesh=base.mesh, source=tyro.MISSING, preset=name,
     )  # fmt: skip
-    return parse_options(RunOptions, arguments, "run", default=default)
-
-
-def _expand(argument: str) -> str:
-    name, equals, value = argument.partition("=")
-    return SHORT.get(name, name) + equals + value
+    short = {**SHORT, "--intrinsics": "--input.intrinsics"}
+    return parse_options(RunOptions, argv, "run", default=default, short=short)
 
 
 def _preset_name(arguments: Sequence[str]) -> Preset:

@@ -11,7 +11,8 @@ typedef unsigned long long u64;
 #define ALL_LANES 0xffffffffu
 
 // Sum over the lanes of a warp, in every lane.
-__device__ __forceinline__ float warp_sum(float x) {
+template <class T>
+__device__ __forceinline__ T warp_sum(T x) {
   for (int s = 16; s; s >>= 1) x += __shfl_xor_sync(ALL_LANES, x, s);
   return x;
 }

@@ -251,7 +251,7 @@ __device__ void substitute(
       const int o = 32 * n + lane;
       if (o >= PANEL && o < w.size) sum += held[n] * w.right[place(w, start, o)];
     }
-    for (int s = 16; s; s >>= 1) sum += __shfl_xor_sync(ALL_LANES, sum, s);
+    sum = warp_sum(sum);
     if (lane < PANEL) w.diagonal[lane * PANEL + k] = held[0];
     if (lane == 0) w.solved[k] = right - sum;
     if (first > 0) {
