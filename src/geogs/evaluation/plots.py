@@ -36,7 +36,7 @@ def plot_path(path: Path, trajectory: Trajectory) -> None:
         if len(lost):
             plot.plot(lost[:, 0], lost[:, vertical], ".", color=_LOST, ms=3, label="lost")
         _finish_map(plot, name, "map units")
-    _save(figure, path)
+    _save_maps(figure, path)
 
 
 def plot_trajectory(path: Path, errors: TrajectoryErrors) -> None:
@@ -55,7 +55,7 @@ def plot_trajectory(path: Path, errors: TrajectoryErrors) -> None:
         _finish_map(plot, name, "m")
         plots.append(plot)
     figure.colorbar(dots, ax=plots, label="position error (cm)", shrink=0.8)
-    _save(figure, path)
+    _save_maps(figure, path)
 
 
 def plot_error_over_time(path: Path, errors: TrajectoryErrors) -> None:
@@ -202,6 +202,12 @@ def _finish_map(plot: "Axes", name: str, unit: str) -> None:
     plot.set_ylabel(f"{'forward' if 'above' in name else 'up'} ({unit})")
     plot.grid(alpha=0.3)
     plot.legend(loc="best")
+
+
+def _save_maps(figure: "Figure", path: Path) -> None:
+    """Save plots of equal scale: drawing settles their limits, whose tick labels then need room."""
+    figure.draw_without_rendering()
+    _save(figure, path)
 
 
 def _save(figure: "Figure", path: Path) -> None:
