@@ -1,0 +1,68 @@
+"""Report pages as a browser would read them."""
+
+from html.parser import HTMLParser
+
+from geogs.evaluation.page import PictureSection, TableSection, TextSection, write_page
+
+
+class Elements(HTMLParser):
+    """Open tags in order, every attribute, and the text of each kind of element."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.stack: list[str] = []
+        self.texts: list[tuple[str, str]] = []
+        self.attributes: list[tuple[str, str | None]] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs) -> None:
+        self.attributes += attrs
+        if tag not in ("meta", "img"):
+            self.stack.append(tag)
+
+    def handle_endtag(self, tag) -> None:
+        assert self.stack.pop() == tag
+
+    def handle_data(self, data) -> None:
+        if data.strip():
+            self.texts.append((self.stack[-1], data))
+
+
+def test_page_holds_everything_escaped_and_in_order(tmp_path):
+    (tmp_path / "a b.png").write_bytes(b"png")
+    (tmp_path / "runs").mkdir()
+    page = tmp_path / "runs" / "index.html"
+    write_page(
+        page,
+        "results of <room> & @body",
+        [
+            TableSection(
+                "errors", ("scene", "Acc (cm)"), [("a<b", "1.25"), ("  c", "x")], "a note"
+            ),
+            PictureSection("mesh", tmp_path / "a b.png", 'from "above"'),
+            PictureSection("gone", tmp_path / "gone.png"),
+            TextSection("settings", '{\n  "seed": 0\n}'),
+        ],
+        "one line",
+    )
+    text = page.read_text(encoding="utf-8")
+    found = Elements(text)
+    assert found.stack == []
+    assert [t for tag, t in found.texts if tag == "h2"] == ["errors", "mesh", "settings"]
+    assert [t for tag, t in found.texts if tag == "td"] == ["a<b", "1.25", "  c", "x"]
+    assert [t for tag, t in found.texts if tag == "th"] == ["scene", "Acc (cm)"]
+    assert ("h1", "results of <room> & @body") in found.texts
+    assert ("pre", '{\n  "seed": 0\n}') in found.texts
+    assert ("p", "a note") in found.texts
+    assert ("src", "../a%20b.png") in found.attributes
+    assert ("alt", 'from "above"') in found.attributes
+    assert "gone" not in text
+    assert "<script" not in text
+    assert "http" not in text
+
+
+def test_table_without_titles_has_no_head(tmp_path):
+    write_page(tmp_path / "p.html", "t", [TableSection("", (), [("a", "1")])])
+    text = (tmp_path / "p.html").read_text()
+    assert "<thead>" not in text
+    assert "<h2>" not in text
