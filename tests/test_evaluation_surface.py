@@ -16,29 +16,9 @@ from geogs.evaluation.surface import (
     sample_surface,
 )
 from geogs.evaluation.visibility import Visibility
-from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp
 from geogs.io.writers.ply import write_mesh
-
-CAMERA = Camera(fx=100.0, fy=100.0, cx=79.5, cy=59.5, width=160, height=120)
-NO_FACES = np.zeros((0, 3), np.int64)
-
-
-def plane(z: float, half: float = 1.0, cells: int = 4) -> Surface:
-    """A square at depth z."""
-    g = np.linspace(-half, half, cells + 1)
-    x, y = np.meshgrid(g, g, indexing="ij")
-    vertices = np.stack([x.ravel(), y.ravel(), np.full(x.size, z)], -1)
-    i = (np.arange(cells)[:, None] * (cells + 1) + np.arange(cells)).ravel()
-    a, b, c, d = i, i + 1, i + cells + 1, i + cells + 2
-    faces = np.concatenate([np.stack([a, b, c], -1), np.stack([b, d, c], -1)])
-    return Surface(vertices, faces)
-
-
-def joined(*parts: Surface) -> Surface:
-    offsets = np.cumsum([0] + [len(p.vertices) for p in parts[:-1]])
-    faces = np.concatenate([p.faces + o for p, o in zip(parts, offsets, strict=True)])
-    return Surface(np.concatenate([p.vertices for p in parts]), faces)
+from surface_shapes import CAMERA, NO_FACES, joined, plane
 
 
 @pytest.mark.parametrize("cells", [1, 37])

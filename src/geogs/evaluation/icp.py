@@ -55,6 +55,39 @@ def icp(
     return IcpResult(T, fitness, rmse, iterations)
 
 
+def icp_points(
+    source: Float[np.ndarray, "n 3"],
+    target: Float[np.ndarray, "m 3"],
+    max_distance: float = 0.1,
+    iterations: int = 30,
+    tolerance: float = 1e-6,
+) -> IcpResult:
+    """Rigid motion of points onto points from the identity, with Open3D's rules.
+
+    Partners are the nearest target points nearer than ``max_distance``; the squared distances
+    between them are minimised (Besl and McKay 1992). Stops when fitness and RMSE both change by
+    less than ``tolerance``; the change of the RMSE counts in the unit of the points, although
+    Open3D (``registration_icp``, whose defaults these are) calls it relative. With fewer than
+    three partners the motion so far is returned.
+    """
+    from scipy.spatial import cKDTree
+
+    tree = cKDTree(target)
+    T, moved, previous = np.eye(4), source, (np.inf, np.inf)
+    for step in range(iterations + 1):
+        distance, index = tree.query(moved, distance_upper_bound=max_distance, workers=-1)
+        near = np.isfinite(distance)
+        fitness = float(near.mean())
+        rmse = float(np.sqrt((distance[near] ** 2).mean())) if near.any() else 0.0
+        settled = max(abs(fitness - previous[0]), abs(rmse - previous[1])) < tolerance
+        if settled or near.sum() < 3 or step == iterations:
+            break
+        previous = fitness, rmse
+        T = _step(moved[near], target[index[near]], None) @ T
+        moved = source @ T[:3, :3].T + T[:3, 3]
+    return IcpResult(T, fitness, rmse, step)
+
+
 def _step(
     source: Float[np.ndarray, "k 3"],
     target: Float[np.ndarray, "k 3"],

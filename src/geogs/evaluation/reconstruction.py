@@ -38,6 +38,8 @@ class ReconstructionScores:
     completeness_samples: int
     icp_shift_cm: float
     """Mean motion of the samples by ICP; 0 where it was not used."""
+    protocol: str = "area-weighted (NICE-SLAM), distances to the surface"
+    """How the errors are defined."""
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON."""
@@ -68,11 +70,12 @@ def evaluate_reconstruction(
 ) -> SurfaceErrors:
     """Compare a reconstruction with the truth, both in metres and in the truth's frame.
 
-    The NICE-SLAM / iMAP measure: ``samples`` points uniform by area on each side, unsquared
-    nearest distances, means and the share below ``threshold`` (metres). Two details differ from
-    the usual scripts and make the result independent of sampling density: distances go to the
-    surface itself, exactly (see :class:`SurfaceDistance`), not to samples of it; and culling acts
-    on samples, not on whole triangles.
+    The area-weighted measure of NICE-SLAM and iMAP: ``samples`` points uniform by area on each
+    side, unsquared nearest distances, means and the share below ``threshold`` (metres). Two
+    details differ from the usual scripts and make the result independent of sampling density:
+    distances go to the surface itself, exactly (see :class:`SurfaceDistance`), not to samples of
+    it; and culling acts on samples, not on whole triangles. :mod:`geogs.evaluation.toolbox` has
+    the scripts' own ways.
 
     ``truth`` answers accuracy; ``truth_points``, where given (say, only what the camera saw),
     completeness. With ``visibility`` the samples of the truth are limited to what the camera saw
@@ -96,7 +99,7 @@ def evaluate_reconstruction(
     reference = _reference_samples(truth_points or truth, visibility, samples, rng)
     accuracy = to_truth(points)
     completeness = SurfaceDistance(reconstruction, seed=seed)(reference)
-    scores = _scores(accuracy, completeness, threshold, shift)
+    scores = surface_scores(accuracy, completeness, threshold, shift)
     return SurfaceErrors(scores, points, accuracy, reference, completeness)
 
 
@@ -120,12 +123,13 @@ def _cull(
     return points[seen]
 
 
-def _scores(
+def surface_scores(
     accuracy: Float[np.ndarray, "n"],
     completeness: Float[np.ndarray, "m"],
     threshold: float,
-    shift: float,
+    icp_shift: float = 0.0,
 ) -> ReconstructionScores:
+    """Means, medians and ratios of distances in metres, as cm and %."""
     acc, comp = 100 * float(accuracy.mean()), 100 * float(completeness.mean())
     precision = 100 * float((accuracy < threshold).mean())
     recall = 100 * float((completeness < threshold).mean())
@@ -141,5 +145,5 @@ def _scores(
         threshold_cm=100 * threshold,
         accuracy_samples=len(accuracy),
         completeness_samples=len(completeness),
-        icp_shift_cm=100 * shift,
+        icp_shift_cm=100 * icp_shift,
     )

@@ -45,6 +45,12 @@ class Surface:
         """The surface moved by a rigid motion or similarity."""
         return Surface(self.vertices @ T[:3, :3].T + T[:3, 3], self.faces)
 
+    def part(self, kept: Bool[np.ndarray, "m"]) -> "Surface":
+        """The triangles ``kept`` alone, with the vertices they use."""
+        faces = self.faces[kept]
+        used, number = np.unique(faces, return_inverse=True)
+        return Surface(self.vertices[used], number.reshape(faces.shape))
+
     def _corners(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         a, b, c = (self.vertices[self.faces[:, i]] for i in range(3))
         return a, b, c
@@ -105,12 +111,13 @@ def _finite_part(vertices: np.ndarray, faces: np.ndarray) -> Surface:
 
 
 def sample_surface(
-    surface: Surface, n: int, rng: np.random.Generator
+    surface: Surface, n: int, rng: np.random.Generator, stratified: bool = True
 ) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "n"]]:
     """``n`` points uniform by area and the triangle of each.
 
-    Points are stratified: each has its own n-th part of the area to fall in. A point set gives a
-    random choice of its points (all if there are fewer), with triangle -1.
+    Stratified, each point has its own n-th part of the area to fall in; otherwise all are
+    independent and in no order. A point set gives a random choice of its points (all if there are
+    fewer), with triangle -1.
     """
     if not surface.is_mesh:
         m = len(surface.vertices)
@@ -119,7 +126,8 @@ def sample_surface(
     cumulative = np.cumsum(surface.areas)
     if not cumulative[-1] > 0:
         raise InputError("The mesh has no area, so it cannot be sampled.")
-    at = (np.arange(n) + rng.random(n)) / n * cumulative[-1]
+    at = (np.arange(n) + rng.random(n)) / n if stratified else rng.random(n)
+    at = at * cumulative[-1]
     face = np.minimum(np.searchsorted(cumulative, at, side="right"), len(cumulative) - 1)
     u, v = rng.random((2, n))
     fold = u + v > 1
