@@ -25,3 +25,8 @@ def joined(*parts: Surface) -> Surface:
     offsets = np.cumsum([0] + [len(p.vertices) for p in parts[:-1]])
     faces = np.concatenate([p.faces + o for p, o in zip(parts, offsets, strict=True)])
     return Surface(np.concatenate([p.vertices for p in parts]), faces)
+
+
+def moved(surface: Surface, x: float, y: float, z: float) -> Surface:
+    """Shifted."""
+    return Surface(surface.vertices + np.array([x, y, z]), surface.faces)

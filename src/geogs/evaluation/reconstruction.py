@@ -45,6 +45,24 @@ class ReconstructionScores:
         """For JSON."""
         return asdict(self)
 
+    @property
+    def colour_limit_cm(self) -> float:
+        """Distance that pictures show as the worst."""
+        return 2 * self.threshold_cm
+
+    def rows(self) -> list[tuple[str, str]]:
+        """For a table."""
+        return [
+            ("Acc (cm)", f"{self.accuracy_cm:.3f}"),
+            ("Comp (cm)", f"{self.completeness_cm:.3f}"),
+            (f"Comp.Rat (% < {self.threshold_cm:g} cm)", f"{self.completeness_ratio:.2f}"),
+            (f"Prec (% < {self.threshold_cm:g} cm)", f"{self.precision_ratio:.2f}"),
+            ("F-score (%)", f"{self.f_score:.2f}"),
+            ("CD (cm)", f"{self.chamfer_cm:.3f}"),
+            ("  medians of Acc / Comp (cm)",
+             f"{self.accuracy_median_cm:.3f} / {self.completeness_median_cm:.3f}"),
+        ]  # fmt: skip
+
 
 @dataclass(frozen=True)
 class SurfaceErrors:
