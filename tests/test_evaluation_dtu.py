@@ -57,7 +57,9 @@ def test_a_missing_half_counts_up_to_two_centimetres(folder):
     assert s.s2d_mm == pytest.approx((0.1 + 2.1) / 2, abs=0.03)
     high = plane(25.0, half=HALF, cells=2)
     both = evaluate_dtu(joined(right, high), reference).scores
-    assert both.s2d_mm == pytest.approx(s.s2d_mm, abs=0.02)  # 25 mm above the scan, outside the observed voxels
+    assert both.s2d_mm == pytest.approx(
+        s.s2d_mm, abs=0.02
+    )  # 25 mm above the scan, outside the observed voxels
     assert both.d2s_mm == pytest.approx(s.d2s_mm, abs=1e-3)
     with pytest.raises(InputError, match="where the DTU scanner could see"):
         evaluate_dtu(high, reference)

@@ -9,9 +9,11 @@ import torch
 from geogs.cli.eval import EvalOptions, evaluate, find_surface, main
 from geogs.errors import InputError
 from geogs.evaluation import plots
+from geogs.evaluation.run_report import write_run_page
 from geogs.evaluation.shading import Viewpoint, level_axes, shade, viewpoints
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import so3_exp
+from geogs.io.poses import read_poses
 from geogs.io.writers.intrinsics import write_intrinsics
 from geogs.io.writers.ply import write_mesh
 from geogs.io.writers.tum import write_tum_trajectory
@@ -96,6 +98,74 @@ def test_culling_and_icp_run_from_the_command(result):
     assert not (out / "report" / "mesh_truth.png").exists()
 
 
+@pytest.mark.parametrize("protocol", ["samples", "vertex"])
+def test_toolbox_protocols_run_from_the_command(result, protocol):
+    truth, out = result
+    options = EvalOptions(
+        output=out, gt=truth, gt_mesh=truth / "mesh.ply", protocol=protocol, cull=True,
+        samples=5000, plots=False,
+    )  # fmt: skip
+    evaluation = evaluate(options)
+    numbers = json.loads((out / "eval.json").read_text())
+    assert numbers["reconstruction"]["protocol"] == evaluation.settings["protocol"]
+    page = (out / "report" / "index.html").read_text()
+    if protocol == "vertex":  # eight corners, each 2 cm farther out along three axes
+        assert "vertex-weighted (Splat-SLAM toolbox)" in page
+        assert evaluation.reconstruction.accuracy_cm == pytest.approx(2 * 3**0.5, abs=0.01)
+        assert evaluation.reconstruction.completeness_samples == 8
+    else:  # 5000 samples are about 9 cm from each other, on a surface of 48 square metres
+        assert "distances to samples" in page
+        assert 4 < evaluation.reconstruction.accuracy_cm < 8
+
+
+def test_object_protocol_measures_in_the_silhouettes_of_the_truth(result):
+    truth, out = result
+    write_mesh(truth / "near.ply", *box((3.015, 2.015, 1.215)))  # the result is 5 mm beyond
+    options = EvalOptions(
+        output=out, gt=truth / "traj.txt", gt_mesh=truth / "near.ply", protocol="object",
+        samples=20_000, threshold=0.006,
+    )  # fmt: skip
+    scores = evaluate(options).reconstruction
+    assert scores.accuracy_mm == pytest.approx(5, abs=0.05)
+    assert scores.completeness_mm == pytest.approx(5, abs=0.01)
+    assert scores.f_score > 99
+    assert "Acc (mm)" in (out / "report" / "index.html").read_text()
+
+
+def test_results_of_known_poses_are_not_aligned(result):
+    truth, out = result
+    reference = read_poses(truth)
+    shifted = reference.T_wc + np.array([[0, 0, 0, 0.1]] + [[0] * 4] * 3)
+    moved = Trajectory(reference.timestamps, shifted, reference.tracked)
+    write_tum_trajectory(out / "trajectory.tum", moved)
+    (out / "mesh.ply").unlink()
+    options = EvalOptions(output=out, gt=truth, plots=False)
+    assert evaluate(options).trajectory.ate_rmse_cm < 1e-6
+    (out / "summary.json").write_text('{"scale": "of the poses (metres)", "frames": 60}')
+    evaluation = evaluate(options)
+    assert evaluation.trajectory.ate_rmse_cm == pytest.approx(10)
+    assert evaluation.trajectory.alignment == "none"
+    assert "<td>60</td>" in (out / "report" / "index.html").read_text()
+    again = evaluate(EvalOptions(output=out, gt=truth, plots=False, alignment="se3"))
+    assert again.trajectory.ate_rmse_cm < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("changed", "match"),
+    [
+        ({"threshold": -1.0}, "must be positive"),
+        ({"samples": 0}, "must be positive"),
+        ({"photo_every": 0}, "must be positive"),
+        ({"protocol": "dtu"}, "needs --dtu-data"),
+        ({"photo": True}, "no images with known poses|no pictures|holds no"),
+    ],
+)
+def test_wrong_options_are_input_errors(result, changed, match):
+    truth, out = result
+    with pytest.raises(InputError, match=match):
+        evaluate(EvalOptions(output=out, gt=truth, plots=False, **changed))
+
+
 def test_truth_is_found_beside_the_poses_or_above(result):
     truth, out = result
     mesh, points = find_surface(EvalOptions(output=out, gt=truth))
@@ -166,6 +236,29 @@ def test_keyframe_and_path_pictures_are_written(tmp_path):
     plots.plot_path(tmp_path / "p.png", Trajectory(np.arange(60) / 30, circle(), tracked))
     for name in ("k.png", "p.png"):
         assert (tmp_path / name).stat().st_size > 5000
+
+
+def test_page_of_a_run_holds_its_numbers_and_pictures(tmp_path):
+    (tmp_path / "mesh.png").write_bytes(b"png")
+    summary = {
+        "source": "room", "frames": 1234, "skipped_images": 0, "device": "cpu",
+        "lost_spans": [[1.0, 2.5]], "seconds": {"tracking": 1.25, "total": 3.0},
+        "frames_per_second": {"online": 4.5}, "peak_memory_bytes": 2**30, "interrupted": False,
+    }  # fmt: skip
+    write_run_page(tmp_path, summary)
+    page = (tmp_path / "index.html").read_text()
+    for text in ("1 234", "1.0 to 2.5", "4.50 online", "1024 MiB", "<td>tracking</td>", "mesh.png"):
+        assert text in page
+    for text in ("skipped", "stopped early", "keyframes.png"):
+        assert text not in page
+
+
+def test_uncompared_vertices_stay_grey():
+    samples = np.array([[0.0, 0, 0], [0, 0, 0.1], [0, 0, 0.2]])
+    vertices = np.array([[0.0, 0, 0.05], [5.0, 0, 0]])
+    colours = plots.error_colours(vertices, samples, np.full(3, 9.0), 9.0, 1.0)
+    assert colours[1].tolist() == [190, 190, 190]
+    assert colours[0][1] < 30
 
 
 def test_error_colours_go_from_pale_to_red():

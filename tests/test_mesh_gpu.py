@@ -145,7 +145,7 @@ def test_results_are_written_from_any_device(device, tmp_path):
     save_map(tmp_path / "map.safetensors", disks)
     T_wc = np.stack([torch.linalg.inv(r.T_cw.cpu()).numpy() for r in renders])
     trajectory = Trajectory(np.arange(6.0), T_wc, np.ones(6, bool))
-    results.write_report(tmp_path / "report", trajectory, renders, mesh)
+    results.write_report(tmp_path / "report", trajectory, renders, mesh, {"source": "room"})
     for name in ("trajectory", "keyframes", "mesh"):
         assert (tmp_path / "report" / f"{name}.png").stat().st_size > 5000
     summary = results.device_summary(disks.position.device)

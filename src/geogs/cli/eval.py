@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -14,12 +14,11 @@ from geogs.errors import InputError
 if TYPE_CHECKING:
     import numpy as np
 
-    from geogs.evaluation.reconstruction import SurfaceErrors
+    from geogs.cli.eval_surface import SurfaceComparison
+    from geogs.evaluation.page import Section
     from geogs.evaluation.report import Evaluation
-    from geogs.evaluation.surface import Surface
-    from geogs.evaluation.trajectory import TrajectoryErrors
-    from geogs.geometry.camera import Camera
-    from geogs.types import Trajectory
+    from geogs.evaluation.trajectory import Alignment, TrajectoryErrors
+    from geogs.evaluation.truth import TrueScene
 
 
 @dataclass(frozen=True)
@@ -33,7 +32,12 @@ class EvalOptions:
     """Folder of a result, as ``geogs run`` writes it."""
     gt: Path
     """True poses: a TUM file, a traj.txt of 4x4 rows (row k is at k / 30 s), or the folder of a
-    Replica, TUM, 7-Scenes or synthetic sequence, whose surface is then found too."""
+    Replica, TUM, 7-Scenes or synthetic sequence, or of images with known poses (COLMAP, DTU...);
+    the true surface is then found, too."""
+    protocol: Literal["area", "samples", "vertex", "object", "dtu"] = "area"
+    """How surfaces are compared: by area with exact distances, area-weighted from samples to
+    samples (NICE-SLAM), vertex-weighted (Splat-SLAM, HI-SLAM2), a single object inside its masks
+    in mm, or DTU's in mm."""
     gt_mesh: Path | None = None
     """True surface as PLY in metres, in the frame of the true poses."""
     gt_points: Path | None = None
@@ -43,18 +47,30 @@ class EvalOptions:
     """Compare the surface too."""
     cull: bool = False
     """Count only what the true cameras saw of the surfaces (frustum and occlusion)."""
+    cull_rule: Literal["frustum", "occlusion"] = "frustum"
+    """How the samples and vertex protocols cull meshes: NICE-SLAM's rule or Neural RGB-D's."""
     cull_every: int = 10
     """Use every so many true poses for culling, at least 1."""
     icp: bool = False
-    """Refine the alignment of the surface by ICP (0.1 m), as Replica's usual scripts do."""
+    """Refine the alignment of the surface by ICP (0.1 m), as Replica's usual scripts do; the
+    samples and vertex protocols always do."""
     max_diff: float = 0.02
     """Largest time between poses that are compared, seconds."""
-    alignment: Literal["sim3", "se3", "none"] = "sim3"
-    """Sim(3) for monocular results, whose scale is arbitrary."""
-    threshold: float = 0.05
-    """Distance that counts as reached, metres."""
-    samples: int = 200_000
-    """Points on each surface."""
+    alignment: Literal["auto", "sim3", "se3", "none"] = "auto"
+    """Auto takes Sim(3), as the scale of monocular results is arbitrary, but leaves what was made
+    with known poses as it is."""
+    threshold: float | None = None
+    """Distance that counts as reached, metres; 0.05, for objects 0.001."""
+    samples: int | None = None
+    """Points on each surface; 200 000, for objects 4 000 000."""
+    dtu_data: Path | None = None
+    """Folder of the official DTU evaluation, with ObsMask and Points/stl."""
+    dtu_scan: int | None = None
+    """Number of the scan; by the name of the folder of the poses if none is given."""
+    photo: bool = False
+    """Measure how well the images beside the true poses agree on the surface (no truth needed)."""
+    photo_every: int = 8
+    """In every so many images, which the result should not have used."""
     seed: int = 0
     """Of the sampling."""
     plots: bool = True
@@ -72,50 +88,98 @@ def evaluate(options: EvalOptions) -> "Evaluation":
     import torch
     from rich.console import Console
 
+    from geogs.cli.eval_surface import compare_surface, photoconsistency
     from geogs.evaluation.report import Evaluation, table, write_report
-    from geogs.evaluation.trajectory import evaluate_trajectory
-    from geogs.io.poses import read_poses, read_tum_trajectory
+    from geogs.evaluation.surface import read_surface
+    from geogs.evaluation.truth import read_true_scene
 
     torch.set_num_threads(1)  # the kernels have threads of their own; see geogs.threads
-    if options.cull_every < 1 or options.samples < 1 or not options.threshold > 0:
-        raise InputError("cull-every, samples and threshold must be positive.")
-    if not (options.output / "trajectory.tum").is_file():
-        raise InputError(f"{options.output} holds no trajectory.tum; give the folder of a result.")
-    reference = read_poses(options.gt)
-
-    def errors_of(name: str) -> "TrajectoryErrors":
-        estimate = read_tum_trajectory(options.output / name)
-        return evaluate_trajectory(estimate, reference, options.max_diff, options.alignment)
-
-    trajectory = errors_of("trajectory.tum")
+    _check(options)
+    scene = read_true_scene(options.gt)
+    summary = _summary(options.output)
+    alignment = _alignment(options, summary)
+    trajectory = _trajectory_errors(options, "trajectory.tum", scene, alignment)
     keyframes = None
     if (options.output / "keyframes.tum").is_file():
         try:
-            keyframes = errors_of("keyframes.tum")
+            keyframes = _trajectory_errors(options, "keyframes.tum", scene, alignment)
         except InputError:  # too few of them to align
             keyframes = None
     mesh_file, points_file = find_surface(options) if options.surface else (None, None)
-    surface, drawing = None, None
-    if mesh_file is not None and (options.output / "mesh.ply").is_file():
-        surface, drawing = _evaluate_surface(options, trajectory, reference, mesh_file, points_file)
+    surface, photo = None, None
+    if (options.output / "mesh.ply").is_file() and (options.surface or options.photo):
+        mesh = read_surface(options.output / "mesh.ply").transformed(trajectory.T_ref_est)
+        if options.surface:
+            surface = compare_surface(options, scene, mesh, mesh_file, points_file)
+        photo = photoconsistency(options, scene, mesh) if options.photo else None
+    icp = options.icp if options.protocol == "area" else options.protocol in ("samples", "vertex")
     settings = {
         "true_poses": str(options.gt),
         "true_surface": mesh_file and str(mesh_file),
         "seen_points": points_file and str(points_file),
-        "surface_aligned_by": f"{options.alignment} of all frames" + (" + ICP" * options.icp),
+        "protocol": options.protocol if surface is None else surface.scores.protocol,
+        "surface_aligned_by": f"{alignment} of all frames" + (" + ICP" * icp),
         "max_time_difference_s": options.max_diff,
         "cull": options.cull,
         "seed": options.seed,
     }
     result = Evaluation(
-        trajectory, keyframes, surface.scores if surface is not None else None, settings
+        trajectory, keyframes, None if surface is None else surface.scores, settings, photo
     )
-    pictures = _draw(options, trajectory, surface, drawing) if options.plots else []
-    write_report(
-        result, options.output / "eval.json", options.output / "report" / "index.html", pictures
-    )
+    pictures = _draw(options, trajectory, surface) if options.plots else []
+    page = options.output / "report" / "index.html"
+    write_report(result, options.output / "eval.json", page, pictures, _run_sections(summary))
     Console().print(table(result))
     return result
+
+
+def _check(options: EvalOptions) -> None:
+    counts = (options.cull_every, options.photo_every, options.samples)
+    if any(n is not None and n < 1 for n in counts) or (
+        options.threshold is not None and not options.threshold > 0
+    ):
+        raise InputError("cull-every, photo-every, samples and threshold must be positive.")
+    if not (options.output / "trajectory.tum").is_file():
+        raise InputError(f"{options.output} holds no trajectory.tum; give the folder of a result.")
+
+
+def _summary(output: Path) -> dict[str, object]:
+    """What the run said of itself; nothing if it left no summary that can be read."""
+    try:
+        content = json.loads((output / "summary.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return content if isinstance(content, dict) else {}
+
+
+def _alignment(options: EvalOptions, summary: dict[str, object]) -> "Alignment":
+    """The alignment to use: a result in the frame of known poses is compared as it is."""
+    if options.alignment != "auto":
+        return options.alignment
+    return "none" if str(summary.get("scale", "")).startswith("of the poses") else "sim3"
+
+
+def _trajectory_errors(
+    options: EvalOptions, name: str, scene: "TrueScene", alignment: "Alignment"
+) -> "TrajectoryErrors":
+    """Errors of one of the trajectories in metres; its transform takes the map's unit to them."""
+    import numpy as np
+
+    from geogs.evaluation.trajectory import evaluate_trajectory
+    from geogs.evaluation.truth import scaled
+    from geogs.io.poses import read_tum_trajectory
+
+    # A map in the frame of the true poses has their unit; for others the factor is free.
+    estimate = scaled(read_tum_trajectory(options.output / name), scene.metres)
+    errors = evaluate_trajectory(estimate, scene.trajectory, options.max_diff, alignment)
+    T = errors.T_ref_est @ np.diag([scene.metres] * 3 + [1.0])
+    return replace(errors, T_ref_est=T, scale=errors.scale * scene.metres)
+
+
+def _run_sections(summary: dict[str, object]) -> "list[Section]":
+    from geogs.evaluation.run_report import run_sections
+
+    return run_sections(summary) if summary else []
 
 
 def find_surface(options: EvalOptions) -> tuple[Path | None, Path | None]:
@@ -134,64 +198,13 @@ def find_surface(options: EvalOptions) -> tuple[Path | None, Path | None]:
     return mesh or points, points
 
 
-def read_camera(path: Path) -> "Camera":
-    """The working camera in intrinsics.json."""
-    from geogs.geometry.camera import Camera
-
-    try:
-        k = json.loads(path.read_text(encoding="utf-8"))
-        fx, fy, cx, cy = (float(k[name]) for name in ("fx", "fy", "cx", "cy"))
-        return Camera(fx, fy, cx, cy, int(k["width"]), int(k["height"]))
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{path} holds no camera ({error}); was it changed?") from None
-
-
-def _evaluate_surface(
-    options: EvalOptions,
-    trajectory: "TrajectoryErrors",
-    reference: "Trajectory",
-    mesh_file: Path,
-    points_file: Path | None,
-) -> tuple["SurfaceErrors", "tuple[Surface, Surface]"]:
-    """Scores, and the aligned reconstruction with the truth."""
-    import numpy as np
-
-    from geogs.evaluation.reconstruction import evaluate_reconstruction
-    from geogs.evaluation.surface import read_surface
-    from geogs.evaluation.visibility import Visibility
-
-    mesh = read_surface(options.output / "mesh.ply").transformed(trajectory.T_ref_est)
-    truth = read_surface(mesh_file)
-    points = None if points_file is None else read_surface(points_file)
-    visibility = None
-    if options.cull:
-        if not truth.is_mesh:
-            raise InputError(f"{mesh_file} has no triangles to hide anything; leave out --cull.")
-        camera = read_camera(options.output / "intrinsics.json")
-        T_cw = np.linalg.inv(reference.T_wc[:: options.cull_every])
-        visibility = Visibility(truth, camera, T_cw)
-    errors = evaluate_reconstruction(
-        mesh,
-        truth,
-        points,
-        visibility,
-        cull_reconstruction=options.cull,
-        use_icp=options.icp,
-        threshold=options.threshold,
-        samples=options.samples,
-        seed=options.seed,
-    )
-    return errors, (mesh, truth)
-
-
 def _draw(
-    options: EvalOptions,
-    trajectory: "TrajectoryErrors",
-    surface: "SurfaceErrors | None",
-    meshes: "tuple[Surface, Surface] | None",
+    options: EvalOptions, trajectory: "TrajectoryErrors", surface: "SurfaceComparison | None"
 ) -> list[tuple[str, Path]]:
     """Pictures of this command, then those that the run left; titles and files."""
+    from geogs.cli.eval_surface import read_camera
     from geogs.evaluation import plots
+    from geogs.evaluation.run_report import PICTURES
     from geogs.evaluation.shading import viewpoints
 
     folder = options.output / "report"
@@ -201,12 +214,11 @@ def _draw(
         "trajectory_truth.png": "Trajectory over the truth",
         "trajectory_error.png": "Error over time",
     }
-    if surface is not None and meshes is not None:
-        mesh, truth = meshes
+    if surface is not None:
+        mesh, truth, limit = surface.mesh, surface.truth, surface.scores.colour_limit_cm
         camera = read_camera(options.output / "intrinsics.json")
-        limit = 2 * surface.scores.threshold_cm
         colours = plots.error_colours(
-            mesh.vertices, surface.reconstruction_points, 100 * surface.accuracy, limit
+            mesh.vertices, surface.points, 100 * surface.distance, limit, surface.reach
         )
         rows: list[tuple[str, np.ndarray, np.ndarray, np.ndarray | None]] = [
             ("reconstruction", mesh.vertices, mesh.faces, None),
@@ -216,6 +228,6 @@ def _draw(
             rows.insert(1, ("truth", truth.vertices, truth.faces, None))
         views = viewpoints(mesh.vertices, trajectory.aligned, camera)
         plots.plot_meshes(folder / "mesh_truth.png", rows, views, limit)
-        titles["mesh_truth.png"] = "Surface beside the truth"
-    titles |= {"keyframes.png": "Rendered keyframes", "mesh.png": "Mesh"}
+        titles = {"mesh_truth.png": "Surface beside the truth", **titles}
+    titles |= {name: title for name, title in PICTURES.items() if name != "trajectory.png"}
     return [(title, folder / name) for name, title in titles.items()]

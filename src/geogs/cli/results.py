@@ -14,6 +14,7 @@ from geogs.cli.progress import RunProgress, peak_memory
 from geogs.config import Config, ReconstructConfig
 from geogs.errors import InputError
 from geogs.evaluation import plots
+from geogs.evaluation.run_report import write_run_page
 from geogs.evaluation.shading import viewpoints
 from geogs.geometry.camera import Camera
 from geogs.io.sources.base import Source
@@ -122,7 +123,7 @@ def write_results(
     summary = summarise(slam, source, trajectory, keyframes, disks, mesh, config, interrupted)
     write_text(output / "summary.json", json.dumps(summary, indent=2))
     with slam.stopwatch("report"):
-        write_report(output / "report", trajectory, renders, mesh)
+        write_report(output / "report", trajectory, renders, mesh, summary)
 
 
 def write_config(path: Path, config: Config | ReconstructConfig) -> None:
@@ -207,9 +208,13 @@ def lost_spans(trajectory: Trajectory) -> list[list[float]]:
 
 
 def write_report(
-    folder: Path, trajectory: Trajectory, renders: list[RenderedKeyframe], mesh: Mesh | None
+    folder: Path,
+    trajectory: Trajectory,
+    renders: list[RenderedKeyframe],
+    mesh: Mesh | None,
+    summary: dict[str, object],
 ) -> None:
-    """Plots that need no ground truth: the path, renders beside images, the shaded mesh."""
+    """A page with what needs no ground truth: path, renders beside images, shaded mesh, numbers."""
     folder.mkdir(exist_ok=True)
     plots.plot_path(folder / "trajectory.png", trajectory)
     if renders:
@@ -228,3 +233,4 @@ def write_report(
         plots.plot_meshes(
             folder / "mesh.png", surface + (coloured if mesh.colours is not None else []), views
         )
+    write_run_page(folder, summary)

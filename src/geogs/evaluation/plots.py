@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 _TRUTH, _ESTIMATE, _LOST = "0.45", "#0072b2", "#d55e00"
 _ERROR_MAP = "YlOrRd"
+_UNKNOWN = 190
 
 
 def plot_path(path: Path, trajectory: Trajectory) -> None:
@@ -161,18 +162,24 @@ def error_colours(
     samples: Float[np.ndarray, "k 3"],
     errors: Float[np.ndarray, "k"],
     limit: float,
+    reach: float = np.inf,
 ) -> UInt8[np.ndarray, "n 3"]:
     """Colour of each vertex by the mean error of the three samples nearest to it.
 
-    Pale is 0, dark red ``limit`` (in the unit of the errors) and more.
+    Pale is 0, dark red ``limit`` (in the unit of the errors) and more; grey are vertices without a
+    sample within ``reach``, which were not compared.
     """
     from matplotlib import colormaps
     from scipy.spatial import cKDTree
 
     k = min(3, len(samples))
-    nearest = cKDTree(samples).query(vertices, k=k, workers=-1)[1].reshape(len(vertices), k)
+    distance, nearest = (
+        found.reshape(len(vertices), k)
+        for found in cKDTree(samples).query(vertices, k=k, workers=-1)
+    )
     share = (errors[nearest].mean(1) / limit).clip(0, 1)
-    return (255 * colormaps[_ERROR_MAP](share)[:, :3]).round().astype(np.uint8)
+    colours = (255 * colormaps[_ERROR_MAP](share)[:, :3]).round().astype(np.uint8)
+    return np.where(distance[:, :1] <= reach, colours, np.uint8(_UNKNOWN))
 
 
 def _figure(width: float, height: float) -> "Figure":

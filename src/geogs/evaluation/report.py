@@ -1,12 +1,14 @@
 """The errors as a table, as JSON, and as a page with the pictures."""
 
-import html
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from geogs.evaluation.reconstruction import ReconstructionScores
+from geogs.evaluation.page import PictureSection, Section, TableSection, TextSection, write_page
+from geogs.evaluation.photoconsistency import PhotoScores
+from geogs.evaluation.scores import SurfaceScores
 from geogs.evaluation.trajectory import TrajectoryErrors
 from geogs.io.writers.atomic import write_text
 
@@ -22,20 +24,22 @@ class Evaluation:
     """Of every frame."""
     keyframes: TrajectoryErrors | None
     """Of the keyframes alone, with an alignment of their own."""
-    reconstruction: ReconstructionScores | None
+    reconstruction: SurfaceScores | None
     settings: dict[str, Any]
     """What was compared and how."""
+    photo: PhotoScores | None = None
+    """How well the images agree on the surface."""
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON."""
-        return {
-            "trajectory": None if self.trajectory is None else self.trajectory.as_dict(),
-            "keyframes": None if self.keyframes is None else self.keyframes.as_dict(),
-            "reconstruction": None
-            if self.reconstruction is None
-            else self.reconstruction.as_dict(),
-            "settings": self.settings,
+        parts = {
+            "trajectory": self.trajectory,
+            "keyframes": self.keyframes,
+            "reconstruction": self.reconstruction,
+            "photoconsistency": self.photo,
         }
+        scores = {name: None if part is None else part.as_dict() for name, part in parts.items()}
+        return scores | {"settings": self.settings}
 
 
 def rows(evaluation: Evaluation) -> list[tuple[str, str]]:
@@ -46,7 +50,10 @@ def rows(evaluation: Evaluation) -> list[tuple[str, str]]:
         if errors is not None:
             result += _trajectory_rows(name, errors)
     if evaluation.reconstruction is not None:
-        result += _surface_rows(evaluation.reconstruction)
+        result.append((f"surface: {evaluation.reconstruction.protocol}", ""))
+        result += evaluation.reconstruction.rows()
+    if evaluation.photo is not None:
+        result += evaluation.photo.rows()
     return result
 
 
@@ -62,24 +69,23 @@ def table(evaluation: Evaluation) -> "Table":
 
 
 def write_report(
-    evaluation: Evaluation, json_file: Path, page: Path, pictures: list[tuple[str, Path]]
+    evaluation: Evaluation,
+    json_file: Path,
+    page: Path,
+    pictures: list[tuple[str, Path]],
+    run: Sequence[Section] = (),
 ) -> None:
-    """Write ``eval.json`` and an HTML page with the table and the pictures (title, file).
+    """Write ``eval.json`` and a page with the errors, the pictures and the run's own tables.
 
-    Pictures are linked by their names, so they must lie beside the page.
+    Pictures (title, file) are linked, so they should lie beside the page.
     """
     write_text(json_file, json.dumps(evaluation.as_dict(), indent=2, default=str) + "\n")
-    cells = "\n".join(
-        f"<tr><td>{html.escape(name)}</td><td class=n>{html.escape(value)}</td></tr>"
-        for name, value in rows(evaluation)
-    )
-    figures = "\n".join(
-        f'<h2>{html.escape(title)}</h2><img src="{html.escape(file.name)}">'
-        for title, file in pictures
-        if file.is_file()
-    )
-    settings = html.escape(json.dumps(evaluation.settings, indent=2, default=str))
-    write_text(page, _PAGE.format(cells=cells, figures=figures, settings=settings))
+    sections: list[Section] = [TableSection("Errors", ("measure", "value"), rows(evaluation))]
+    sections += [PictureSection(title, file) for title, file in pictures]
+    sections += run
+    settings = json.dumps(evaluation.settings, indent=2, default=str)
+    sections.append(TextSection("Settings of the comparison", settings))
+    write_page(page, "geogs report", sections)
 
 
 def _trajectory_rows(name: str, errors: TrajectoryErrors) -> list[tuple[str, str]]:
@@ -94,32 +100,3 @@ def _trajectory_rows(name: str, errors: TrajectoryErrors) -> list[tuple[str, str
          f"{errors.reference}"),
         ("  path length (m)", f"{errors.path_length_m:.2f}"),
     ]  # fmt: skip
-
-
-def _surface_rows(s: ReconstructionScores) -> list[tuple[str, str]]:
-    return [
-        ("Acc (cm)", f"{s.accuracy_cm:.3f}"),
-        ("Comp (cm)", f"{s.completeness_cm:.3f}"),
-        (f"Comp.Rat (% < {s.threshold_cm:g} cm)", f"{s.completeness_ratio:.2f}"),
-        (f"Prec (% < {s.threshold_cm:g} cm)", f"{s.precision_ratio:.2f}"),
-        ("F-score (%)", f"{s.f_score:.2f}"),
-        ("CD (cm)", f"{s.chamfer_cm:.3f}"),
-        ("  medians of Acc / Comp (cm)", f"{s.accuracy_median_cm:.3f} / "
-         f"{s.completeness_median_cm:.3f}"),
-    ]  # fmt: skip
-
-
-_PAGE = """<!doctype html>
-<html lang="en"><head><meta charset="utf-8"><title>geogs report</title><style>
-body {{ font: 15px/1.5 system-ui, sans-serif; margin: 2em auto; max-width: 1100px; }}
-td {{ padding: 0.1em 1em; border-bottom: 1px solid #ddd; white-space: pre; }}
-td.n {{ text-align: right; font-variant-numeric: tabular-nums; }}
-img {{ max-width: 100%; }} pre {{ color: #555; }}
-</style></head><body><h1>geogs report</h1>
-<table>
-{cells}
-</table>
-{figures}
-<h2>Settings</h2><pre>{settings}</pre>
-</body></html>
-"""

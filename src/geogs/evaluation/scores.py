@@ -1,8 +1,9 @@
 """What the scores of every protocol have in common."""
 
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 
+@runtime_checkable
 class SurfaceScores(Protocol):
     """Errors of a surface by one protocol."""
 
