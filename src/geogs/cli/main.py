@@ -31,6 +31,7 @@ COMMANDS = {
     "run": Command("geogs.cli.run", "reconstruct a video, a folder of images or a data set"),
     "reconstruct": Command("geogs.cli.reconstruct", "reconstruct images whose poses are known"),
     "eval": Command("geogs.cli.eval", "compare a result with the ground truth"),
+    "bench": Command("geogs.cli.bench", "run a benchmark and write its tables"),
     "synth": Command("geogs.cli.synth", "make a synthetic room sequence with exact ground truth"),
     "demo": Command("geogs.cli.demo", "make a small room, reconstruct it and show the errors"),
     "doctor": Command(

@@ -1,0 +1,1 @@
+"""Benchmarks: scenes of known data sets, run and scored in one go, beside the published figures."""

@@ -1,0 +1,40 @@
+"""Error over time, as curves."""
+
+from collections.abc import Sequence
+from io import BytesIO
+from pathlib import Path
+
+from geogs.bench.record import Record
+from geogs.io.writers.atomic import atomic_file
+
+
+def plot_curves(path: Path, records: Sequence[Record]) -> bool:
+    """Chamfer distance over seconds, a panel for each scene; false if no record has a curve."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    scenes = list(dict.fromkeys(record.scene for record in records if record.curve))
+    if not scenes:
+        return False
+    figure = Figure(figsize=(5.5 * len(scenes), 4.2), layout="constrained")
+    FigureCanvasAgg(figure)
+    for column, scene in enumerate(scenes):
+        plot = figure.add_subplot(1, len(scenes), column + 1)
+        for record in (r for r in records if r.scene == scene and r.curve):
+            seconds = [point.seconds for point in record.curve]
+            errors = [point.surface.chamfer for point in record.curve]
+            plot.plot(seconds, errors, "o-", ms=4, label=_label(record))
+        unit = next(r.curve[0].surface.unit for r in records if r.scene == scene and r.curve)
+        plot.set(title=scene, xlabel="seconds", ylabel=f"chamfer distance ({unit})")
+        plot.set_yscale("log")
+        plot.grid(alpha=0.3, which="both")
+        plot.legend()
+    buffer = BytesIO()
+    figure.savefig(buffer, format="png", dpi=110)
+    with atomic_file(path) as stream:
+        stream.write(buffer.getvalue())
+    return True
+
+
+def _label(record: Record) -> str:
+    return " ".join(part for part in (record.provenance.command, record.variant) if part)

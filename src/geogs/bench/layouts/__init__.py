@@ -1,0 +1,1 @@
+"""How data sets lie on disk: one file each, which finds the scenes below a folder."""

@@ -1,0 +1,65 @@
+"""What is measured on: the machine, and the state of the program."""
+
+import ctypes
+import gc
+import os
+import platform
+import subprocess
+from contextlib import suppress
+from pathlib import Path
+
+import geogs
+
+
+def machine_name() -> str:
+    """Processor and the number of cores that may be used."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return f"{_processor()}, {cores} cores"
+
+
+def program_version() -> str:
+    """The commit of the checkout that runs, ``+`` if changed since; else the version."""
+    package = Path(geogs.__file__).resolve()
+    if _git(package.parent, "ls-files", "--error-unmatch", package.name) is None:
+        return geogs.__version__  # installed, perhaps inside a repository of something else
+    commit = _git(package.parent, "rev-parse", "--short=12", "HEAD")
+    changed = _git(package.parent, "status", "--porcelain", "--untracked-files=no", "--", ".")
+    return f"{commit}{'+' if changed else ''}" if commit else geogs.__version__
+
+
+def forget_peak_memory() -> None:
+    """Start counting the largest memory use anew, so that each run reports its own.
+
+    On systems that cannot do so, the figure is that of all runs of this process so far; and what
+    earlier runs left in memory counts everywhere.
+    """
+    gc.collect()
+    with suppress(OSError, AttributeError):  # the C library of Linux keeps freed memory otherwise
+        ctypes.CDLL(None).malloc_trim(0)
+    with suppress(OSError):  # Linux alone has it; see proc(5)
+        Path("/proc/self/clear_refs").write_text("5")
+    import torch
+
+    if torch.cuda.is_available():
+        torch.cuda.empty_cache()
+        torch.cuda.reset_peak_memory_stats()
+
+
+def _processor() -> str:
+    with suppress(OSError):
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()
+
+
+def _git(folder: Path, *arguments: str) -> str | None:
+    """What git says, or none where it fails or is missing."""
+    try:
+        done = subprocess.run(
+            ["git", "-C", str(folder), *arguments],
+            capture_output=True, text=True, check=True, timeout=20,
+        )  # fmt: skip
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return done.stdout.strip()

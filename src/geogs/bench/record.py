@@ -1,0 +1,175 @@
+"""What is kept of one run: how it was made, what it cost, how far it is from the truth."""
+
+import json
+from dataclasses import asdict, dataclass, field, fields, is_dataclass
+from pathlib import Path
+from types import UnionType
+from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+
+from geogs.errors import InputError
+from geogs.io.writers.atomic import write_text
+
+T = TypeVar("T")
+
+Weighting = Literal["area", "vertices", "points"]
+"""Means over the area of the surfaces (NICE-SLAM), over the vertices of the meshes (the toolbox of
+Splat-SLAM), or over thinned points (DTU)."""
+StageName = Literal["online", "depth fusion", "final"]
+"""Before the final stages; the keyframes' depths fused without the disks; the result."""
+
+
+@dataclass(frozen=True)
+class SurfaceScore:
+    """Distances between a surface and the true one, in ``unit``; ratios in percent."""
+
+    weighting: Weighting
+    unit: Literal["cm", "mm"]
+    accuracy: float
+    completeness: float
+    chamfer: float
+    ratio: float | None = None
+    """Part of the truth nearer than ``threshold``."""
+    precision: float | None = None
+    """Part of the result nearer than ``threshold``."""
+    f_score: float | None = None
+    threshold: float | None = None
+    accuracy_median: float | None = None
+    completeness_median: float | None = None
+
+
+@dataclass(frozen=True)
+class TrajectoryScore:
+    """Absolute trajectory error after Sim(3) alignment, cm."""
+
+    ate: float
+    """RMSE over all frames."""
+    pairs: int
+    """Poses compared."""
+    scale: float
+    keyframes_ate: float | None = None
+    """RMSE over the keyframes alone, with an alignment of their own."""
+
+
+@dataclass(frozen=True)
+class PhotoScore:
+    """How well held-out images agree across the surface; without any surface truth."""
+
+    score: float
+    """Mean correlation over all textured pixels, 0 where the mesh has a hole, percent."""
+    ncc: float
+    """Mean over the pixels that could be compared, -1 to 1."""
+    ncc_median: float
+    coverage: float
+    """Part of the masks that could be compared, percent."""
+    views: int
+    """Held-out views."""
+    window: int
+    """Side of the correlation window, pixels."""
+
+
+@dataclass(frozen=True)
+class StageScore:
+    """A result as it stood at a stage."""
+
+    stage: StageName
+    trajectory: TrajectoryScore | None = None
+    surfaces: tuple[SurfaceScore, ...] = ()
+
+    def surface(self, weighting: Weighting) -> SurfaceScore | None:
+        """The score of a weighting."""
+        return next((s for s in self.surfaces if s.weighting == weighting), None)
+
+
+@dataclass(frozen=True)
+class CurvePoint:
+    """The map after so many seconds."""
+
+    seconds: float
+    disks: int | None
+    surface: SurfaceScore
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """How a result came about."""
+
+    command: str
+    commit: str
+    """Of the program, with ``+`` where files were changed; its version where it has no history."""
+    machine: str
+    device: str
+    seed: int
+    config_hash: str
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What a run took."""
+
+    seconds: float
+    """Wall clock of the whole command, reading and writing included."""
+    frames: int | None = None
+    frames_per_second: float | None = None
+    """Online, for SLAM; over everything else."""
+    peak_memory_bytes: int | None = None
+    peak_gpu_memory_bytes: int | None = None
+    disks: int | None = None
+    map_bytes: int | None = None
+    stages: dict[str, float] = field(default_factory=dict)
+    """Seconds by name of the part."""
+
+
+@dataclass(frozen=True)
+class Record:
+    """One row: a scene of a benchmark in one variant."""
+
+    benchmark: str
+    scene: str
+    variant: str
+    folder: str
+    """Of the result, relative to that of the benchmark."""
+    provenance: Provenance
+    cost: Cost | None = None
+    stages: tuple[StageScore, ...] = ()
+    photo: PhotoScore | None = None
+    curve: tuple[CurvePoint, ...] = ()
+    error: str | None = None
+    """Why there are no numbers."""
+
+    def stage(self, name: StageName) -> StageScore | None:
+        """The scores of a stage."""
+        return next((s for s in self.stages if s.stage == name), None)
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write a record (or a list of them) as JSON."""
+    plain = [asdict(v) for v in value] if isinstance(value, list) else asdict(value)
+    write_text(path, json.dumps(plain, indent=2) + "\n")
+
+
+def read_record(path: Path) -> Record | None:
+    """Read what :func:`write_json` wrote; none where there is nothing or it is damaged."""
+    try:
+        return read_dataclass(Record, json.loads(path.read_text(encoding="utf-8")))
+    except (OSError, ValueError, TypeError, KeyError, InputError):
+        return None
+
+
+def read_dataclass(kind: type[T], values: dict[str, Any]) -> T:
+    """A dataclass from its dict; unknown names are an error, so that old files are not misread."""
+    hints = get_type_hints(kind)
+    names = {f.name for f in fields(kind)}  # type: ignore[arg-type]  # always a dataclass
+    if unknown := set(values) - names:
+        raise InputError(f"{kind.__name__} has no {', '.join(sorted(unknown))}.")
+    return kind(**{name: _read(hints[name], value) for name, value in values.items()})
+
+
+def _read(hint: Any, value: Any) -> Any:
+    """A value of a field: dataclasses and tuples of them are made again."""
+    if value is None:
+        return None
+    if get_origin(hint) in (Union, UnionType):
+        hint = next(kind for kind in get_args(hint) if kind is not type(None))
+    if get_origin(hint) is tuple:
+        return tuple(_read(get_args(hint)[0], v) for v in value)
+    return read_dataclass(hint, value) if is_dataclass(hint) else value  # type: ignore[arg-type]
