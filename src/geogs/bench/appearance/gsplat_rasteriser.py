@@ -85,7 +85,7 @@ class GsplatRasteriser:
             raise InputError(f"{len(disks)} disks are too many to tell apart; use fewer points.")
         device = disks.means.device
         numbers = torch.arange(1, len(disks) + 1, device=device, dtype=torch.float32)
-        result = self._call(disks, camera, T_cw, colors=numbers[:, None], render_mode="RGB")
+        result = self._call(disks, camera, T_cw, colors=numbers[None, :, None], render_mode="RGB")
         alpha, median = result[1][0, ..., 0], result[5][0, ..., 0]
         index = median.round().long() - 1
         return MedianDisks(torch.where(alpha > 0, index, -1), alpha)
@@ -97,7 +97,7 @@ class GsplatRasteriser:
         scales = torch.nn.functional.pad(disks.scales, (0, 1), value=1.0)
         return self._rasterize(
             means=disks.means,
-            quats=torch.nn.functional.normalize(disks.quaternions, dim=-1),
+            quats=disks.quaternions,
             scales=scales,
             opacities=disks.opacities,
             viewmats=T_cw[None],
