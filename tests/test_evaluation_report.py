@@ -1,16 +1,19 @@
 """The pictures, the page, and the command as a user runs it."""
 
 import json
+from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 import torch
+from scipy.io import savemat
 
 from geogs.cli.eval import EvalOptions, evaluate, find_surface, main
 from geogs.errors import InputError
 from geogs.evaluation import plots
 from geogs.evaluation.run_report import write_run_page
-from geogs.evaluation.shading import Viewpoint, level_axes, shade, viewpoints
+from geogs.evaluation.shading import Viewpoint, level_axes, look_at_one_place, shade, viewpoints
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import so3_exp
 from geogs.io.poses import read_poses
@@ -81,9 +84,9 @@ def test_eval_command_writes_everything(result, capsys):
     assert surface["completeness_cm"] == pytest.approx(2.0, abs=0.01)
     assert surface["completeness_ratio"] == 100.0
     page = (out / "report" / "index.html").read_text()
-    for name in ("trajectory_truth.png", "trajectory_error.png", "mesh_truth.png"):
-        assert name in page
-        assert (out / "report" / name).read_bytes().startswith(b"\x89PNG")
+    assert "mesh_truth.png" in page
+    assert (out / "report" / "mesh_truth.png").read_bytes().startswith(b"\x89PNG")
+    assert "trajectory_truth.png" not in page  # the poses are the true ones
 
 
 def test_culling_and_icp_run_from_the_command(result):
@@ -142,8 +145,11 @@ def test_results_of_known_poses_are_not_aligned(result):
     options = EvalOptions(output=out, gt=truth, plots=False)
     assert evaluate(options).trajectory.ate_rmse_cm < 1e-6
     (out / "summary.json").write_text('{"scale": "of the poses (metres)", "frames": 60}')
-    evaluation = evaluate(options)
+    evaluation = evaluate(replace(options, plots=True))
     assert evaluation.trajectory.ate_rmse_cm == pytest.approx(10)
+    for name in ("trajectory_truth.png", "trajectory_error.png"):
+        assert name in (out / "report" / "index.html").read_text()
+        assert (out / "report" / name).read_bytes().startswith(b"\x89PNG")
     assert evaluation.trajectory.alignment == "none"
     assert "<td>60</td>" in (out / "report" / "index.html").read_text()
     again = evaluate(EvalOptions(output=out, gt=truth, plots=False, alignment="se3"))
@@ -236,6 +242,69 @@ def test_keyframe_and_path_pictures_are_written(tmp_path):
     plots.plot_path(tmp_path / "p.png", Trajectory(np.arange(60) / 30, circle(), tracked))
     for name in ("k.png", "p.png"):
         assert (tmp_path / name).stat().st_size > 5000
+
+
+def test_objects_are_seen_from_three_cameras_and_rooms_from_above():
+    inwards = circle()
+    inwards[:, 2, 3] = 0
+    inwards[:, :3, [0, 2]] *= -1  # half a turn about the image's vertical axis
+    vertices = box((0.1, 0.1, 0.1))[0]
+    assert np.allclose(np.linalg.det(inwards[:, :3, :3]), 1)
+    assert look_at_one_place(inwards)
+    views = viewpoints(vertices, inwards, CAMERA)
+    assert [view.name for view in views] == ["first frame", "middle frame", "another side"]
+    turn = views[2].T_cw[2, :3] @ np.stack([view.T_cw[2, :3] for view in views[:2]], -1)
+    assert np.abs(turn).max() < 0.1  # at right angles to the first two, which are opposite
+    assert not look_at_one_place(circle())
+    forward = np.tile(np.eye(4), (20, 1, 1))
+    forward[:, 2, 3] = np.linspace(0, 5, 20)
+    assert not look_at_one_place(forward)
+
+
+def test_dtu_runs_from_the_command(tmp_path):
+    """A wall of 40 mm seen by three cameras, the result 0.4 mm behind it, all in millimetres."""
+    scan, out, data = tmp_path / "scan9", tmp_path / "out", tmp_path / "data"
+    K = np.array([[80.0, 0, 64, 0], [0, 80, 48, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    T_cw = np.tile(np.eye(4), (3, 1, 1))
+    T_cw[:, :2, 3] = [[0, 0], [-5, 0], [0, -5]]
+    scale = np.diag([60.0, 60, 60, 1])
+    matrices = {f"world_mat_{i}": K @ T for i, T in enumerate(T_cw)}
+    scan.mkdir()
+    np.savez(scan / "cameras.npz", scale_mat_0=scale, **matrices)
+    for i in range(3):
+        for folder, value in (("image", 90), ("mask", 255)):
+            (scan / folder).mkdir(exist_ok=True)
+            picture = np.full((96, 128, 3), value, np.uint8)
+            picture[:, : 20 if folder == "mask" else 0] = 0  # 44 pixels left of the middle
+            cv2.imwrite(str(scan / folder / f"{i:03d}.png"), picture)
+    (data / "ObsMask").mkdir(parents=True)
+    box_mm = np.array([[-50.0, -50, 50], [50, 50, 150]])
+    observed = {"ObsMask": np.ones((21, 21, 21), np.uint8), "BB": box_mm, "Res": 5.0}
+    savemat(data / "ObsMask" / "ObsMask9_10.mat", observed)
+    savemat(data / "ObsMask" / "Plane9.mat", {"P": np.array([0.0, 0, 1, 0])})
+    g = np.arange(-20, 20.01, 0.2)
+    x, y = (a.ravel() for a in np.meshgrid(g, g))
+    wall = np.stack([x, y, np.full(x.size, 100.0)], -1)
+    write_mesh(data / "Points" / "stl" / "stl009_total.ply", wall, np.zeros((0, 3), int))
+    corners = np.array([[-20, -20, 100.4], [20, -20, 100.4], [20, 20, 100.4], [-20, 20, 100.4]])
+    # A second wall at the left, off the masks, would be 40 mm from the scan and within the box.
+    corners = np.concatenate([corners, corners - [45.0, 0, 0]])
+    faces = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]])
+    write_mesh(out / "mesh.ply", corners, faces)
+    T_wc = np.linalg.inv(T_cw)
+    poses = Trajectory(np.arange(3) / 30, T_wc, np.ones(3, bool))
+    write_tum_trajectory(out / "trajectory.tum", poses)
+    write_intrinsics(out / "intrinsics.json", CAMERA)
+    (out / "summary.json").write_text('{"scale": "of the poses (millimetres)"}')
+    assert main([str(out), "--gt", str(scan), "--protocol", "dtu", "--dtu-data", str(data)]) == 0
+    numbers = json.loads((out / "eval.json").read_text())
+    assert numbers["trajectory"]["ate_max_cm"] < 1e-6
+    assert numbers["trajectory"]["path_length_m"] == pytest.approx(0.005 + 0.005 * 2**0.5)
+    surface = numbers["reconstruction"]
+    assert surface["d2s_mm"] == pytest.approx(0.41, abs=0.01)  # up to 0.14 mm aside of a point
+    assert surface["s2d_mm"] == pytest.approx(0.415, abs=0.015)
+    assert surface["d2s_left_out"] == 0.0
+    assert "overall (mm)" in (out / "report" / "index.html").read_text()
 
 
 def test_page_of_a_run_holds_its_numbers_and_pictures(tmp_path):

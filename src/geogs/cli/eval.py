@@ -21,6 +21,10 @@ if TYPE_CHECKING:
     from geogs.evaluation.truth import TrueScene
 
 
+_SAME_POSES_CM = 1e-4
+"""Errors up to which poses are those that were given, and make no picture."""
+
+
 @dataclass(frozen=True)
 class EvalOptions:
     """Compare a result with the truth: trajectory, and surface where a true one is found.
@@ -128,7 +132,9 @@ def evaluate(options: EvalOptions) -> "Evaluation":
     )
     pictures = _draw(options, trajectory, surface) if options.plots else []
     page = options.output / "report" / "index.html"
-    write_report(result, options.output / "eval.json", page, pictures, _run_sections(summary))
+    title = str(summary.get("source", options.output.resolve().name))
+    run = _run_sections(summary)
+    write_report(result, options.output / "eval.json", page, pictures, run, title)
     Console().print(table(result))
     return result
 
@@ -208,12 +214,12 @@ def _draw(
     from geogs.evaluation.shading import viewpoints
 
     folder = options.output / "report"
-    plots.plot_trajectory(folder / "trajectory_truth.png", trajectory)
-    plots.plot_error_over_time(folder / "trajectory_error.png", trajectory)
-    titles = {
-        "trajectory_truth.png": "Trajectory over the truth",
-        "trajectory_error.png": "Error over time",
-    }
+    titles: dict[str, str] = {}
+    if trajectory.ate_max_cm > _SAME_POSES_CM:
+        plots.plot_trajectory(folder / "trajectory_truth.png", trajectory)
+        plots.plot_error_over_time(folder / "trajectory_error.png", trajectory)
+        titles["trajectory_truth.png"] = "Trajectory over the truth"
+        titles["trajectory_error.png"] = "Error over time"
     if surface is not None:
         mesh, truth, limit = surface.mesh, surface.truth, surface.scores.colour_limit_cm
         camera = read_camera(options.output / "intrinsics.json")

@@ -42,19 +42,20 @@ class Evaluation:
         return scores | {"settings": self.settings}
 
 
-def rows(evaluation: Evaluation) -> list[tuple[str, str]]:
-    """Name with unit, and value, of everything that is shown."""
+def groups(evaluation: Evaluation) -> list[tuple[str, list[tuple[str, str]]]]:
+    """Everything that is shown: headings with names (and units) and values."""
     result = []
+    if evaluation.reconstruction is not None:
+        scores = evaluation.reconstruction
+        result.append((f"Surface, {scores.protocol}", scores.rows()))
+    if evaluation.photo is not None:
+        result.append(("Photoconsistency", evaluation.photo.rows()))
+    trajectory = []
     named = {"all frames": evaluation.trajectory, "keyframes": evaluation.keyframes}
     for name, errors in named.items():
         if errors is not None:
-            result += _trajectory_rows(name, errors)
-    if evaluation.reconstruction is not None:
-        result.append((f"surface: {evaluation.reconstruction.protocol}", ""))
-        result += evaluation.reconstruction.rows()
-    if evaluation.photo is not None:
-        result += evaluation.photo.rows()
-    return result
+            trajectory += _trajectory_rows(name, errors)
+    return [*result, ("Trajectory", trajectory)] if trajectory else result
 
 
 def table(evaluation: Evaluation) -> "Table":
@@ -63,8 +64,11 @@ def table(evaluation: Evaluation) -> "Table":
 
     result = Table("measure", "value", title="errors")
     result.columns[1].justify = "right"
-    for name, value in rows(evaluation):
-        result.add_row(name, value)
+    for heading, rows in groups(evaluation):
+        result.add_section()
+        result.add_row(heading, "", style="bold")
+        for name, value in rows:
+            result.add_row(name, value)
     return result
 
 
@@ -74,18 +78,27 @@ def write_report(
     page: Path,
     pictures: list[tuple[str, Path]],
     run: Sequence[Section] = (),
+    title: str = "report",
 ) -> None:
     """Write ``eval.json`` and a page with the errors, the pictures and the run's own tables.
 
-    Pictures (title, file) are linked, so they should lie beside the page.
+    Args:
+        evaluation: the errors.
+        json_file: for programs.
+        page: for people.
+        pictures: titles and files, which are linked and should lie beside the page.
+        run: what the run said of itself.
+        title: what was reconstructed.
     """
     write_text(json_file, json.dumps(evaluation.as_dict(), indent=2, default=str) + "\n")
-    sections: list[Section] = [TableSection("Errors", ("measure", "value"), rows(evaluation))]
+    sections: list[Section] = [
+        TableSection(heading, (), rows) for heading, rows in groups(evaluation)
+    ]
     sections += [PictureSection(title, file) for title, file in pictures]
     sections += run
     settings = json.dumps(evaluation.settings, indent=2, default=str)
     sections.append(TextSection("Settings of the comparison", settings))
-    write_page(page, "geogs report", sections)
+    write_page(page, f"geogs: {title}", sections, "compared with the truth")
 
 
 def _trajectory_rows(name: str, errors: TrajectoryErrors) -> list[tuple[str, str]]:

@@ -109,11 +109,37 @@ def viewpoints(
     camera: Camera,
     width: int = 480,
 ) -> list[Viewpoint]:
-    """The first camera, the one in the middle, and the whole from above without the ceiling."""
+    """The first camera, the one in the middle, and the whole from above without the ceiling.
+
+    Where all cameras look at one place, as at an object, the third is the camera that is turned
+    most from the other two.
+    """
     inside = camera.with_long_edge(width)
     chosen = {"first frame": T_wc[0], "middle frame": T_wc[len(T_wc) // 2]}
+    around = look_at_one_place(T_wc)
+    if around:
+        cosine = T_wc[:, :3, 2] @ T_wc[[0, len(T_wc) // 2], :3, 2].T
+        chosen["another side"] = T_wc[cosine.max(1).argmin()]
     views = [Viewpoint(name, inside, np.linalg.inv(T)) for name, T in chosen.items()]
-    return [*views, _from_above(vertices, T_wc, width, inside.height)]
+    return views if around else [*views, _from_above(vertices, T_wc, width, inside.height)]
+
+
+def look_at_one_place(T_wc: Float[np.ndarray, "k 4 4"]) -> bool:
+    """Whether the optical axes of all cameras pass near one point in front of them.
+
+    The point nearest to all axes must be in front of every camera and, on average, at most a
+    tenth of its distance beside the axis; and the cameras must be apart by at least a tenth of it.
+    """
+    axes, centres = T_wc[:, :3, 2], T_wc[:, :3, 3]
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    offset = (across @ centres[..., None])[..., 0].sum(0)
+    focus = np.linalg.lstsq(across.sum(0), offset, rcond=None)[0]
+    along = ((focus - centres) * axes).sum(1)
+    if not (along > 0).all():
+        return False
+    beside = np.linalg.norm(focus - centres - along[:, None] * axes, axis=1)
+    apart = np.linalg.norm(centres - centres.mean(0), axis=1).max()
+    return bool(beside.mean() < 0.1 * along.mean() and apart > 0.1 * along.mean())
 
 
 def _from_above(
