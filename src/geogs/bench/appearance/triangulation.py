@@ -89,6 +89,7 @@ def triangulate(
         miss = np.linalg.norm(np.einsum("mij,mj->mi", across, offset), axis=1)
         pixels = projections.intrinsics[seen.view, 0] * miss / depth
         weight = 1 / (depth * (1 + (pixels / max_error) ** 2)) ** 2
+        weight = np.where(np.isfinite(weight), weight, 0.0)
     return points
 
 
