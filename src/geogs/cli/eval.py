@@ -21,10 +21,6 @@ if TYPE_CHECKING:
     from geogs.evaluation.truth import TrueScene
 
 
-_SAME_POSES_CM = 1e-4
-"""Errors up to which poses are those that were given, and make no picture."""
-
-
 @dataclass(frozen=True)
 class EvalOptions:
     """Compare a result with the truth: trajectory, and surface where a true one is found.
@@ -130,7 +126,7 @@ def evaluate(options: EvalOptions) -> "Evaluation":
     result = Evaluation(
         trajectory, keyframes, None if surface is None else surface.scores, settings, photo
     )
-    pictures = _draw(options, trajectory, surface) if options.plots else []
+    pictures = _draw(options, trajectory, surface) if options.plots else _run_pictures(options)
     page = options.output / "report" / "index.html"
     title = str(summary.get("source", options.output.resolve().name))
     run = _run_sections(summary)
@@ -210,12 +206,12 @@ def _draw(
     """Pictures of this command, then those that the run left; titles and files."""
     from geogs.cli.eval_surface import read_camera
     from geogs.evaluation import plots
-    from geogs.evaluation.run_report import PICTURES
+    from geogs.evaluation.report import SAME_POSES_CM
     from geogs.evaluation.shading import viewpoints
 
     folder = options.output / "report"
     titles: dict[str, str] = {}
-    if trajectory.ate_max_cm > _SAME_POSES_CM:
+    if trajectory.ate_max_cm > SAME_POSES_CM:
         plots.plot_trajectory(folder / "trajectory_truth.png", trajectory)
         plots.plot_error_over_time(folder / "trajectory_error.png", trajectory)
         titles["trajectory_truth.png"] = "Trajectory over the truth"
@@ -235,5 +231,12 @@ def _draw(
         views = viewpoints(mesh.vertices, trajectory.aligned, camera)
         plots.plot_meshes(folder / "mesh_truth.png", rows, views, limit)
         titles = {"mesh_truth.png": "Surface beside the truth", **titles}
-    titles |= {name: title for name, title in PICTURES.items() if name != "trajectory.png"}
-    return [(title, folder / name) for name, title in titles.items()]
+    own = [(title, folder / name) for name, title in titles.items()]
+    return own + _run_pictures(options)
+
+
+def _run_pictures(options: EvalOptions) -> list[tuple[str, Path]]:
+    """What the run drew without knowing the truth; titles and files."""
+    from geogs.evaluation.run_report import PICTURES
+
+    return [(title, options.output / "report" / name) for name, title in PICTURES.items()]

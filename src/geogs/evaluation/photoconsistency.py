@@ -60,7 +60,7 @@ class PhotoScores:
     def rows(self) -> list[tuple[str, str]]:
         """For a table."""
         return [
-            ("photoconsistency, holes count 0 (%)", f"{self.score:.2f}"),
+            ("score, holes count 0 (%)", f"{self.score:.2f}"),
             (f"  NCC {self.window}x{self.window}, mean / median",
              f"{self.ncc_mean:.4f} / {self.ncc_median:.4f}"),
             ("  coverage of the masks (%)", f"{self.coverage:.2f}"),
