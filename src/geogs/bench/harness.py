@@ -147,7 +147,7 @@ def cost_of(result: ResultFolder, seconds: float) -> Cost:
         peak_memory_bytes=summary.get("peak_memory_bytes"),
         peak_gpu_memory_bytes=summary.get("peak_gpu_memory_bytes"),
         disks=summary.get("disks"),
-        map_bytes=result.map_bytes,
+        map_bytes=summary.get("map_bytes", result.map_bytes),
         stages=dict(summary.get("seconds", {})),
     )
 

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import Literal, Protocol, runtime_checkable
 
 from geogs.bench.scene import Option
 
@@ -24,6 +24,7 @@ class Task:
         return next((o.value for o in reversed(self.options) if o.name == name), None)
 
 
+@runtime_checkable
 class Runner(Protocol):
     """Runs tasks into their folders."""
 

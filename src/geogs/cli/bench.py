@@ -137,11 +137,10 @@ class CommandRunner:
 
 def runners() -> "dict[Command, Runner]":
     """Who runs which command."""
-    from geogs.bench.runner import Command as Name
+    from geogs.bench.baseline import BaselineRunner
 
     command = CommandRunner()
-    names: tuple[Name, ...] = ("run", "reconstruct")
-    return dict.fromkeys(names, command)
+    return {"run": command, "reconstruct": command, "colour-2dgs": BaselineRunner()}
 
 
 def _parsed(task: "Task") -> "RunOptions | ReconstructOptions":
