@@ -6,6 +6,7 @@ from pathlib import Path
 from geogs.bench.benchmark import Benchmark
 from geogs.bench.curves import plot_curves
 from geogs.bench.pictures import PICTURES
+from geogs.bench.published import PAPER
 from geogs.bench.record import Record, write_json
 from geogs.bench.tables import Table, published_tables, result_tables
 from geogs.evaluation.page import PictureSection, Section, TableSection, TextSection, write_page
@@ -28,6 +29,8 @@ def write_report(output: Path, benchmark: Benchmark, records: Sequence[Record]) 
 def markdown(benchmark: Benchmark, records: Sequence[Record]) -> str:
     """All tables, ours first, the paper's figures last, and how ours came about."""
     parts = [f"# {benchmark.title}", *_provenance(records)]
+    if benchmark.published:
+        parts.append(f"Columns marked (paper) hold the published figures of {PAPER}.")
     parts += [table.markdown() for table in result_tables(benchmark, records)]
     parts += [f"- {note}" for note in benchmark.notes]
     parts += [table.markdown() for table in published_tables(benchmark)]
@@ -42,9 +45,8 @@ def _provenance(records: Sequence[Record]) -> list[str]:
         if (p := r.provenance) and r.cost is not None
     )
     mixed = len({r.provenance.commit for r in records if r.cost is not None}) > 1
-    labels = ["Columns marked (paper) hold the published figures of GeoGS-SLAM."]
     warning = ["The rows were made by different commits of the program."] if mixed else []
-    return [*made, *warning, *(labels if made else [])]
+    return [*made, *warning]
 
 
 def _write_page(

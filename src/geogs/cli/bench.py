@@ -50,6 +50,8 @@ class BenchOptions:
     """From known poses: seconds given to each reconstruction, several with commas between."""
     baseline: bool = False
     """From known poses: 2D Gaussian splatting with colour beside it, in the same time (gsplat)."""
+    depth_fusion: bool = False
+    """Score the keyframes' depths fused without the disks, too: what the disks add to them."""
     device: str = "auto"
     """As in geogs run."""
     seed: int = 0
@@ -168,12 +170,17 @@ def _wishes(options: BenchOptions, benchmark: "Benchmark") -> "Wishes":
     from geogs.bench.plan import Wishes
     from geogs.bench.scene import Option
     from geogs.cli.reconstruct import seconds
+    from geogs.cli.run import RunOptions
 
     common = [Option("device", options.device), Option("seed", str(options.seed))]
     if options.preset:
         if benchmark.command != "run":
             raise InputError(f"--preset is for SLAM; {benchmark.name} starts from known poses.")
         common.append(Option("preset", options.preset))
+    if options.depth_fusion:
+        common.append(Option("depth-mesh"))
+    if benchmark.command == "run" and hasattr(RunOptions, "online_results"):
+        common.append(Option("online-results"))
     return Wishes(
         _names(options.scenes),
         _names(options.variants),

@@ -8,23 +8,24 @@ _MOST_FACES = 4_000_000
 
 
 def with_short_edges(mesh: Surface, longest: float) -> Surface:
-    """The same surface, triangles with a longer edge than ``longest`` cut into four, repeatedly.
+    """The same surface, triangles halved across their longest edge until none is too long.
 
-    New corners are not shared between triangles.
+    Halving keeps thin triangles few. Neighbours that are halved across their common edge share
+    the new corner; a neighbour that is not keeps that edge whole.
     """
-    vertices, faces = mesh.vertices, mesh.faces
+    vertices, faces = mesh.vertices, mesh.faces.astype(np.int64)
     while True:
-        a, b, c = (vertices[faces[:, i]] for i in range(3))
-        edges = np.stack([b - a, c - b, a - c])
-        long = np.linalg.norm(edges, axis=-1).max(0) > longest
-        if not long.any() or len(faces) + 3 * int(long.sum()) > _MOST_FACES:
+        corners = vertices[faces]
+        lengths = np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=-1)
+        long = np.flatnonzero(lengths.max(1) > longest)
+        if not len(long) or len(faces) + len(long) > _MOST_FACES:
             return Surface(vertices, faces)
-        a, b, c = a[long], b[long], c[long]
-        ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
-        quarters = np.concatenate([
-            np.stack(corners, 1)
-            for corners in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))
-        ])  # fmt: skip
-        added = np.arange(3 * len(quarters)).reshape(-1, 3) + len(vertices)
-        vertices = np.concatenate([vertices, quarters.reshape(-1, 3)])
-        faces = np.concatenate([faces[~long], added])
+        # Turn each triangle so that its longest edge is the one from a to b.
+        turn = lengths[long].argmax(1)[:, None] + np.arange(3)
+        a, b, c = np.take_along_axis(faces[long], turn % 3, axis=1).T
+        key = np.minimum(a, b) * len(vertices) + np.maximum(a, b)
+        _, first, middle = np.unique(key, return_index=True, return_inverse=True)
+        middle = middle.reshape(-1) + len(vertices)
+        vertices = np.concatenate([vertices, (vertices[a[first]] + vertices[b[first]]) / 2])
+        faces[long] = np.stack([a, middle, c], 1)
+        faces = np.concatenate([faces, np.stack([middle, b, c], 1)])
