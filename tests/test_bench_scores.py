@@ -185,3 +185,57 @@ def test_published_tables_are_complete_and_their_means_are_those_printed():
     assert paper.DTU.value("scan55", "CD") == 0.34
     assert paper.DTU.mean(["scan24", "scan37"], "CD") == pytest.approx(0.71)
     assert paper.DTU.mean(["other"], "CD") is None
+
+
+def test_without_a_true_surface_held_out_images_judge_the_mesh(tmp_path):
+    from geogs.bench.scene import Scene, Truth
+    from geogs.synth.room import make_room
+    from geogs.synth.tessellation import scene_mesh
+    from posed_layouts import render_room, write_dtu
+
+    room = render_room(6, 12, 160, 120)
+    scene = Scene("scan7", write_dtu(room, tmp_path / "scan7"), Truth(), kind="scan")
+    write_result(tmp_path / "out", 0.0, None, posed=True)
+    write_mesh(tmp_path / "out" / "mesh.ply", *scene_mesh(make_room(3)))
+    with pytest.raises(InputError, match="held no image out"):
+        score(scene, "reconstruct", ResultFolder(tmp_path / "out"), 0)
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    scores = []
+    for held_out in ([1, 4], ["000001.png", "000004.png"]):
+        (tmp_path / "out" / "summary.json").write_text(json.dumps(summary | {"held_out": held_out}))
+        found = score(scene, "reconstruct", ResultFolder(tmp_path / "out"), 0)
+        assert found.stages == ()
+        scores.append(found.photo)
+    assert scores[0] == scores[1]
+    assert scores[0].views == 2
+    assert scores[0].ncc_median > 0.8
+    record = Record("dtu", "scan7", "120s", "scan7/120s", FROM, Cost(9.0), photo=scores[0])
+    assert "held-out views |" in markdown(DTU, [record])
+
+
+def test_a_dtu_scan_is_scored_by_its_own_protocol_in_millimetres(tmp_path):
+    import shutil
+
+    from scipy.io import savemat
+
+    from geogs.bench.layouts.dtu import find_dtu
+    from test_bench_layouts import flat_room, write_dtu
+
+    shutil.rmtree(write_dtu(flat_room(), tmp_path / "scan7") / "mask")
+    official = tmp_path / "SampleSet" / "MVS Data"
+    (official / "ObsMask").mkdir(parents=True)
+    (official / "Points" / "stl").mkdir(parents=True)
+    vertices, faces = wall(n=121)
+    box = np.array([[-12.0, -12, 0], [12, 12, 48]])
+    mask = {"ObsMask": np.ones((25, 25, 49), np.uint8), "BB": box, "Res": 1.0}
+    savemat(official / "ObsMask" / "ObsMask7_10.mat", mask)
+    savemat(official / "ObsMask" / "Plane7.mat", {"P": np.array([[0.0], [0], [1], [0]])})
+    write_mesh(official / "Points" / "stl" / "stl007_total.ply", 10 * vertices, faces)
+    (scene,) = find_dtu(tmp_path)
+    write_result(tmp_path / "out", 0.0, None, posed=True)
+    write_mesh(tmp_path / "out" / "mesh.ply", 10 * vertices + [0, 0, 0.5], faces)
+    (final,) = score(scene, "reconstruct", ResultFolder(tmp_path / "out"), 0).stages
+    (measured,) = final.surfaces
+    assert (measured.weighting, measured.unit) == ("points", "mm")
+    # Half a millimetre away, a little less along the normals.
+    assert measured.chamfer == pytest.approx(0.47, abs=0.04)

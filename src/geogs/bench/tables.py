@@ -166,7 +166,7 @@ def _name(record: Record) -> str:
     return f"{record.scene}, {record.variant}" if record.variant else record.scene
 
 
-def _cell(value: float | None, digits: int) -> str:
+def _cell(value: float | int | None, digits: int) -> str:
     return MISSING if value is None else f"{value:.{digits}f}"
 
 
