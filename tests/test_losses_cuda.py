@@ -99,7 +99,9 @@ class Scene:
         alpha[:, : h // 8] = 0.2
         places = torch.tensor([-1, 0, -1, 3], dtype=torch.int32, device=depth.device)
         losses.store_rendered(places, depth, alpha)
-        shown = torch.where(alpha > losses.config.min_alpha, depth, 0.0)
+        opaque = alpha > losses.config.min_alpha
+        inside = torch.stack([v.prior_depth >= 0 for v in self.views])[[1, 0, 2, 3]]
+        shown = torch.where(opaque & inside, depth, 0.0)
         self.rendered = [shown[1], None, None, shown[3]]
 
     def launch(self, losses: WindowLosses) -> list[Tensor]:
@@ -124,7 +126,9 @@ class Scene:
             loss = depth.new_zeros(())
             if slot >= 0:
                 loss = single_view_loss(*(m[i] for m in leaves), self.views[slot], config, UNIT)
-                shown = torch.where(alpha[i].detach() > config.min_alpha, depth[i], 0.0)
+                opaque = alpha[i].detach() > config.min_alpha
+                inside = self.views[slot].prior_depth >= 0
+                shown = torch.where(opaque & inside, depth[i], 0.0)
                 for j, other in enumerate(self.pairs[i].tolist()):
                     if other < 0:
                         continue
@@ -233,7 +237,8 @@ def test_smoothness_divides_by_the_lower_median(device: torch.device) -> None:
         scene.launch(losses)
         for i in (0, 1, 3):
             depth, alpha = scene.maps[0][i].float(), scene.maps[2][i]
-            known = depth[(alpha > 0.5) & (depth > 0) & torch.isfinite(depth)]
+            inside = scene.views[int(scene.batch[i])].prior_depth >= 0
+            known = depth[inside & (alpha > 0.5) & (depth > 0) & torch.isfinite(depth)]
             assert float(losses._inverse_median[i]) == pytest.approx(
                 1 / float(known.median()), rel=1e-6
             )
@@ -269,7 +274,7 @@ def test_views_without_depth_give_no_loss_and_no_gradient(
 ) -> None:
     scene = Scene.make(device)
     scene.maps = [torch.full_like(m, value) for m in scene.maps]
-    config = replace(EVERYTHING, opacity_weight=0.0)
+    config = replace(EVERYTHING, opacity_weight=0.0, silhouette_weight=0.0)
     losses = WindowLosses(scene.table, config, UNIT, 4, 2, SHARE, with_pose=True)
     assert all((each == 0).all() for each in scene.launch(losses))
 
@@ -282,7 +287,8 @@ def test_only_visible_depth_is_stored(device: torch.device) -> None:
     known = (depth > 0) & torch.isfinite(depth) & (alpha > 0.5)
     for i, slot in enumerate([2, 0, -1, 3]):
         if slot >= 0:
-            expected = torch.where(known[i], depth[i], 0.0)
+            inside = scene.views[slot].prior_depth >= 0
+            expected = torch.where(known[i] & inside, depth[i], 0.0)
             assert torch.equal(scene.table.rendered_depth(slot), expected)
     assert scene.table.rendered[:4].tolist() == [1, 0, 1, 1]
     scene.table.forget_rendered()

@@ -148,7 +148,7 @@ def test_results_do_not_depend_on_the_number_of_threads() -> None:
 @pytest.mark.parametrize("value", [0.0, float("nan"), float("inf")])
 def test_views_without_depth_give_no_loss_and_no_gradient(value: float) -> None:
     maps, view = random_view(13, SMALL)
-    config = replace(ALL_TERMS, opacity_weight=0.0)
+    config = replace(ALL_TERMS, opacity_weight=0.0, silhouette_weight=0.0)
     inputs = leaves(*(torch.full_like(m, value).float() for m in maps))
     _, reference, target, hidden = photo_case(8)
     loss = fused_single_view(*inputs, view, config, 1.0)

@@ -9,6 +9,7 @@ import torch
 from geogs.config import LossConfig
 from geogs.geometry.camera import Camera
 from geogs.losses.single_view import (
+    OUTSIDE,
     ViewConstants,
     depth_l1,
     depth_smoothness,
@@ -18,6 +19,7 @@ from geogs.losses.single_view import (
     normal_consistency,
     normal_l1,
     opacity,
+    silhouette,
     single_view_loss,
 )
 
@@ -30,7 +32,7 @@ def plane_depth(normal: torch.Tensor, distance: float, camera: Camera) -> torch.
 
 
 def random_view(seed: int, camera: Camera = CAMERA) -> tuple[list[torch.Tensor], ViewConstants]:
-    """Smooth random maps in float64 and a keyframe with random priors, some unknown."""
+    """Smooth random maps in float64 and a keyframe with random priors, some unknown, and a mask."""
     rng = np.random.default_rng(seed)
     h, w = camera.height, camera.width
 
@@ -43,6 +45,7 @@ def random_view(seed: int, camera: Camera = CAMERA) -> tuple[list[torch.Tensor],
     maps = [depth.double(), normal.double(), 0.3 + 0.7 * uniform(h, w), 0.1 * uniform(h, w)]
     prior = maps[0] * (1 + 0.1 * (uniform(h, w) - 0.5))
     prior[uniform(h, w) < 0.1] = 0
+    prior[: h // 3, w // 2 :] = OUTSIDE
     towards = torch.nn.functional.normalize(normal + 0.2 * uniform(h, w, 3), dim=-1)
     towards[uniform(h, w) < 0.1] = 0
     image = (255 * rng.random((h, w, 3))).astype(np.uint8)
@@ -128,9 +131,26 @@ def test_depth_and_normal_l1_and_opacity_by_hand() -> None:
     assert distortion(torch.tensor([[0.5, 7.0]]), seen, 2.0)[0].tolist() == [[0.25, 0.0]]
 
 
+def test_outside_a_mask_only_the_silhouette_counts() -> None:
+    maps, view = random_view(5)
+    outside = view.prior_depth < 0
+    assert 0 < int(outside.sum()) < outside.numel()
+    leaves = [m.clone().requires_grad_() for m in maps]
+    single_view_loss(*leaves, view, ALL_TERMS, 1.7).backward()
+    depth, normal, alpha, spread = (m.grad for m in leaves)
+    assert (depth[outside] == 0).all()
+    assert (normal[outside] == 0).all()
+    assert (spread[outside] == 0).all()
+    pixels = outside.numel()
+    expected = torch.where(outside, ALL_TERMS.silhouette_weight, -ALL_TERMS.opacity_weight) / pixels
+    torch.testing.assert_close(alpha, expected.double(), rtol=1e-6, atol=0)
+    seen = torch.tensor([[0.25, 0.5, float("nan")]])
+    assert silhouette(seen, torch.tensor([[True, False, True]]))[0].tolist() == [[0.25, 0.0, 0.0]]
+
+
 def test_gradients_match_finite_differences() -> None:
     maps, view = random_view(2)
-    seen = maps[0][maps[2] > ALL_TERMS.min_alpha]
+    seen = maps[0][(maps[2] > ALL_TERMS.min_alpha) & (view.prior_depth >= 0)]
     median = maps[0] == seen.median()  # constant in the loss, so it must not be moved
     fixed = maps[0].clone()
     maps = [m.requires_grad_() for m in maps]
@@ -146,7 +166,8 @@ def test_gradients_match_finite_differences() -> None:
 def test_the_loss_does_not_depend_on_the_scale_of_the_map() -> None:
     maps, view = random_view(3)
     scaled = ViewConstants(
-        CAMERA, view.edge, view.image_gradient, 5 * view.prior_depth, view.confidence,
+        CAMERA, view.edge, view.image_gradient, 5 * view.prior_depth.clamp(min=0)
+        + view.prior_depth.clamp(max=0), view.confidence,
         view.prior_normal,
     )  # fmt: skip
     one = single_view_loss(*maps, view, ALL_TERMS, 1.7)
@@ -160,7 +181,11 @@ def test_views_without_depth_give_no_loss_and_no_gradient(bad: str) -> None:
     value = 0.0 if bad == "nothing" else math.nan
     maps = [torch.full_like(m, value).requires_grad_() for m in maps]
     config = LossConfig(
-        normal_weight=0.1, smoothness_weight=0.05, smoothness_rewards_edges=True, opacity_weight=0.0
+        normal_weight=0.1,
+        smoothness_weight=0.05,
+        smoothness_rewards_edges=True,
+        opacity_weight=0.0,
+        silhouette_weight=0.0,
     )
     loss = single_view_loss(*maps, view, config, 1.0)
     loss.backward()

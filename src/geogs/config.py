@@ -197,6 +197,8 @@ class LossConfig:
     """L_dist, spread of the depths along a ray over the map's length unit; at least 0."""
     opacity_weight: float = 0.02
     """1 - alpha, closes holes; unitless, at least 0."""
+    silhouette_weight: float = 0.1
+    """alpha outside the masks, where there are masks; unitless, at least 0."""
     smoothness_weight: float = 0.0
     """L_ds, edge-aware smoothness of depth over its median; unitless, at least 0."""
     smoothness_eta: float = 10.0
@@ -341,6 +343,7 @@ class MappingConfig:
             normal_consistency_weight=0.0,
             distortion_weight=0.0,
             opacity_weight=0.0,
+            silhouette_weight=0.0,
             smoothness_weight=0.0,
         )
 

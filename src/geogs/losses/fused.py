@@ -57,7 +57,8 @@ class _SingleView(torch.autograd.Function):
         height, width = depth.shape
         scale = 1.0
         if config.smoothness_weight > 0:
-            known = depth[visible(depth, alpha, config.min_alpha)]
+            shown = visible(depth, alpha, config.min_alpha) & (view.prior_depth >= 0)
+            known = depth[shown]
             scale = 1 / float(known.median()) if len(known) else 0.0
         weights = np.array(
             [
@@ -67,6 +68,7 @@ class _SingleView(torch.autograd.Function):
                 config.distortion_weight / unit,
                 config.opacity_weight,
                 config.smoothness_weight,
+                config.silhouette_weight,
             ]
         )
         weights = (weights / depth.numel()).astype(np.float32)

@@ -20,6 +20,8 @@ from geogs.geometry.depth import normals_from_depth
 
 # Added to the squared length of a blended normal (about 1): bounds the slope of normalising it.
 NORMAL_EPSILON = 1e-6
+OUTSIDE = -1.0
+"""Prior depth where a mask says that nothing of the scene is."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +35,7 @@ class ViewConstants:
     image_gradient: Float[Tensor, "h w"]
     """Image gradient in grey values per pixel, see :func:`gradient_norm`."""
     prior_depth: Float[Tensor, "h w"]
-    """The keyframe's own depth D_f in map units; 0 where unknown."""
+    """The keyframe's own depth D_f in map units; 0 where unknown, ``OUTSIDE`` beyond a mask."""
     confidence: Float[Tensor, "h w"]
     """Weight of the prior depth, in [0, 1]."""
     prior_normal: Float[Tensor, "h w 3"] | None = None
@@ -192,6 +194,13 @@ def opacity(
     return _masked(1 - alpha, finite if mask is None else finite & mask)
 
 
+def silhouette(
+    alpha: Float[Tensor, "h w"], outside: Bool[Tensor, "h w"]
+) -> tuple[Float[Tensor, "h w"], Bool[Tensor, "h w"]]:
+    """``alpha`` where a mask says that nothing is; not in the paper, which has no masks."""
+    return _masked(alpha, torch.isfinite(alpha) & outside)
+
+
 def visible(
     depth: Float[Tensor, "h w"], alpha: Float[Tensor, "h w"], min_alpha: float = 0.5
 ) -> Bool[Tensor, "h w"]:
@@ -212,14 +221,17 @@ def single_view_loss(
 
     Each term is summed over the pixels where it counts and divided by the number of all pixels, so
     that a small valid region does not get large gradients. ``unit`` as in :func:`distortion`.
+    Where the view's prior depth is ``OUTSIDE`` only the silhouette counts.
     Any dtype and device; :func:`geogs.losses.fused_single_view` is the same on a CPU, faster.
     """
-    mask = visible(depth, alpha, config.min_alpha)
+    inside = view.prior_depth >= 0
+    mask = visible(depth, alpha, config.min_alpha) & inside
     zero = torch.zeros_like(depth)
     depth = torch.where(mask, depth, zero)
     normal = torch.where(mask[..., None] & torch.isfinite(normal), normal, zero[..., None])
     spread = torch.where(torch.isfinite(distortion_map), distortion_map, zero)
-    terms = [(config.opacity_weight, opacity(alpha))]
+    terms = [(config.opacity_weight, opacity(alpha, inside))]
+    terms.append((config.silhouette_weight, silhouette(alpha, ~inside)))
     if config.depth_weight > 0:
         loss = depth_l1(depth, view.prior_depth, view.confidence, config.depth_relative)
         terms.append((config.depth_weight, loss))

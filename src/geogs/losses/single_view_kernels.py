@@ -18,24 +18,29 @@ ZERO, ONE, HUGE = np.float32(0), np.float32(1), np.float32(1e30)
 
 
 @njit(**PART)
-def known_depth(depth, alpha, y, min_alpha, clean, r):
-    """Row ``y`` of the depth where it is visible, else 0, into row ``r``."""
+def known_depth(depth, alpha, prior, y, min_alpha, clean, r):
+    """Row ``y`` of the depth where it is visible and no mask excludes it, else 0, to row ``r``."""
     for x in range(depth.shape[1]):
         d = depth[y, x]
-        clean[r, x] = d if (d > ZERO) & (d < HUGE) & (alpha[y, x] > min_alpha) else ZERO
+        shown = (d > ZERO) & (d < HUGE) & (alpha[y, x] > min_alpha) & (prior[y, x] >= ZERO)
+        clean[r, x] = d if shown else ZERO
 
 
 @njit(**PART)
 def pixel_terms(
     clean, r, alpha, spread, prior, confidence, y, weights, relative, pull, g_alpha, g_spread
 ):
-    """Weighted sum of L_d, L_dist and 1 - alpha over row ``y``, and its gradients."""
+    """Weighted sum of L_d, L_dist and the opacity terms over row ``y``, and its gradients."""
     total = ZERO
     for x in range(clean.shape[1]):
         a, s, d, f = alpha[y, x], spread[y, x], clean[r, x], prior[y, x]
-        opaque = weights[4] if abs(a) < HUGE else ZERO
-        total += opaque * (ONE - a) if opaque > ZERO else ZERO
-        g_alpha[y, x] = -opaque
+        solid = abs(a) < HUGE
+        empty, filled = solid & (f < ZERO), solid & (f >= ZERO)
+        opaque = weights[4] if filled else ZERO
+        hollow = weights[6] if empty else ZERO
+        total += opaque * (ONE - a) if filled else ZERO
+        total += hollow * a if empty else ZERO
+        g_alpha[y, x] = hollow - opaque
         thick = weights[3] if (d > ZERO) & (abs(s) < HUGE) else ZERO
         total += thick * s if thick > ZERO else ZERO
         g_spread[y, x] = thick
@@ -158,16 +163,16 @@ def single_view_rows(
     """Rows ``first <= y < last`` of the single-view loss and of its gradients.
 
     lens: fx, fy, cx, cy; weights, already divided by the number of pixels: depth, normal,
-    consistency, distortion over the length unit, opacity, smoothness; options: minimum alpha,
-    relative depth (0, 1), epsilon of the normal's length, eta, second smoothness term (0, 1),
-    1 over the median depth. ``prior_normal`` has no rows without a prior. ``scratch`` (3, rows, w)
+    consistency, distortion over the length unit, opacity, smoothness, silhouette; options: minimum
+    alpha, relative depth (0, 1), epsilon of the normal's length, eta, second smoothness term (0,
+    1), 1 over the median depth. ``prior`` is negative outside a mask. ``prior_normal`` has no rows without a prior. ``scratch`` (3, rows, w)
     has at least 5 and last - first + 4 rows. ``loss[y]`` is the row's sum; ``scratch`` and
     ``g_normal`` are 0 on entry.
     """
     clean, pull, push = scratch[0], scratch[1], scratch[2]
     low, high = max(first - 2, 0), min(last + 2, depth.shape[0])
     for y in range(low, high):
-        known_depth(depth, alpha, y, options[0], clean, y - low)
+        known_depth(depth, alpha, prior, y, options[0], clean, y - low)
     unused = np.zeros((1, depth.shape[1], 3), np.float32)
     for y in range(low, high):
         r, own, total = y - low, first <= y < last, ZERO

@@ -49,7 +49,7 @@ def view_loss(
         view.known, config.loss, unit,
     )  # fmt: skip
     if partners:
-        depth = torch.where(output.alpha.detach() > config.loss.min_alpha, output.depth, 0.0)
+        depth = _within(view, shown_depth(output, config.loss.min_alpha))
         for other in partners:
             loss = loss + fused_multi_view(
                 depth, view.photo, other.photo, other.rendered_depth, config.loss
@@ -133,7 +133,9 @@ class Trainer:
             output = render(self.disks, self.cameras.render, view.T_cw)
             loss = view_loss(view, partners, output, self.config, self.unit)
             loss.backward()
-            view.rendered_depth = shown_depth(output, self.config.loss.min_alpha)
+            with torch.no_grad():
+                shown = shown_depth(output, self.config.loss.min_alpha)
+                view.rendered_depth = _within(view, shown)
             visible |= output.visible
             total += float(loss.detach())
         self.disks.mark_seen(visible)
@@ -149,10 +151,14 @@ class Trainer:
         self.disks.log_scale.clamp_(float(np.log(low)), float(np.log(high)))
 
 
-@torch.no_grad()
 def shown_depth(output: RenderOutput, min_alpha: float) -> Float[Tensor, "h w"]:
     """Rendered depth where the map is opaque enough to hide what lies behind, else 0."""
-    return torch.where(output.alpha > min_alpha, output.depth, 0.0)
+    return torch.where(output.alpha.detach() > min_alpha, output.depth, 0.0)
+
+
+def _within(view: MapView, depth: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
+    """The depth where the view has no mask that excludes it, else 0."""
+    return depth if view.mask is None else torch.where(view.mask, depth, 0.0)
 
 
 def _sane_gradients(parameters: DiskParameters) -> Bool[Tensor, "n"]:

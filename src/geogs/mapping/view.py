@@ -11,7 +11,7 @@ from geogs.config import LossConfig
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_inverse
 from geogs.losses.multi_view import PhotoView
-from geogs.losses.single_view import ViewConstants
+from geogs.losses.single_view import OUTSIDE, ViewConstants
 from geogs.mapping.depth_view import DenseDepth, DepthSearch, DepthView, PosedDepth, depth_view
 from geogs.types import Keyframe
 
@@ -131,14 +131,15 @@ class MapView:
         if self.mask is not None:
             depth = depth.within(self.mask)
         self.depth = depth
+        prior = depth.depth
+        if self.mask is not None:
+            prior = torch.where(self.mask, prior, OUTSIDE)
         if self.constants is None:
             self.constants = ViewConstants.prepare(
-                self.keyframe.image, cameras.render, depth.depth, depth.confidence
+                self.keyframe.image, cameras.render, prior, depth.confidence
             )
         else:
-            self.constants = replace(
-                self.constants, prior_depth=depth.depth, confidence=depth.confidence
-            )
+            self.constants = replace(self.constants, prior_depth=prior, confidence=depth.confidence)
 
     def rescale(self, factor: float, cameras: MapCameras) -> None:
         """Multiply the dense depth, after the map's unit changed around this keyframe."""

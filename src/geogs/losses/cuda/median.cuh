@@ -6,12 +6,13 @@
 // its digits: four histograms of 8 bits, from the highest. The lower median, as torch's.
 // depth, alpha (B, pixels) -> inverse_median (B), 0 without any visible depth.
 extern "C" __global__ void __launch_bounds__(1024) inverse_median(
-    const int* batch, const float* depth, const float* alpha, float* inverse_median, int pixels,
+    const int* batch, const long long* maps, const float* depth, const float* alpha, float* inverse_median, int pixels,
     float min_alpha) {
   __shared__ u32 histogram[256];
   __shared__ u32 prefix, rank;
   const int b = blockIdx.x, t = threadIdx.x;
   if (batch[b] < 0) return;
+  const float* prior = view_map(maps, batch[b], PRIOR_DEPTH);
   depth += (size_t)b * pixels;
   alpha += (size_t)b * pixels;
   u32 found = 0, below = 0;
@@ -19,7 +20,7 @@ extern "C" __global__ void __launch_bounds__(1024) inverse_median(
     if (t < 256) histogram[t] = 0;
     __syncthreads();
     for (int i = t; i < pixels; i += blockDim.x) {
-      const u32 bits = __float_as_uint(shown(depth[i], alpha[i], min_alpha));
+      const u32 bits = __float_as_uint(shown(depth[i], alpha[i], prior[i], min_alpha));
       const bool same = shift == 24 || (bits >> (shift + 8)) == found;
       if (bits != 0 && same) atomicAdd(&histogram[(bits >> shift) & 255], 1u);
     }

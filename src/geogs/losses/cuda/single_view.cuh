@@ -96,11 +96,12 @@ extern "C" __global__ void __launch_bounds__(256) single_view(
   const int b = blockIdx.z, x0 = blockIdx.x * TILE_W, y0 = blockIdx.y * TILE_H;
   const int slot = batch[b];
   const size_t plane = (size_t)height * width, start = b * plane;
+  const float* prior = slot >= 0 ? view_map(maps, slot, PRIOR_DEPTH) : 0;
   for (int i = threadIdx.x; i < DEPTH_H * DEPTH_W && slot >= 0; i += TILE_THREADS) {
     const int r = i / DEPTH_W, k = i % DEPTH_W, y = y0 + r - 2, x = x0 + k - 2;
     const bool inside = y >= 0 && y < height && x >= 0 && x < width;
-    const size_t at = start + (size_t)y * width + x;
-    tile.depth[r][k] = inside ? shown(depth[at], alpha[at], c.min_alpha) : 0.f;
+    const size_t pixel = (size_t)y * width + x, at = start + pixel;
+    tile.depth[r][k] = inside ? shown(depth[at], alpha[at], prior[pixel], c.min_alpha) : 0.f;
   }
   __syncthreads();
   float total = 0.f;
@@ -127,16 +128,17 @@ extern "C" __global__ void __launch_bounds__(256) single_view(
     }
     const float d = tile.depth[r + 2][k + 2], a = alpha[at], s = distortion[at];
     float pull = d > 0.f ? gathered_push(tile, r, k) : 0.f;
-    total += depth_term(d, view_map(maps, slot, PRIOR_DEPTH)[pixel],
-                        view_map(maps, slot, CONFIDENCE)[pixel], c, pull);
+    total += depth_term(d, prior[pixel], view_map(maps, slot, CONFIDENCE)[pixel], c, pull);
     if (c.smoothness > 0.f)
       total += smoothness_terms(tile, r, k, view_map(maps, slot, IMAGE_GRADIENT), y, x, width,
                                 inverse_median[b], c, pull);
     const bool solid = fabsf(a) < HUGE_VALUE, thick = d > 0.f && fabsf(s) < HUGE_VALUE;
-    total += (solid ? c.opacity * (1.f - a) : 0.f) + (thick ? c.distortion * s : 0.f);
+    const bool filled = prior[pixel] >= 0.f;
+    total += solid ? (filled ? c.opacity * (1.f - a) : c.silhouette * a) : 0.f;
+    total += thick ? c.distortion * s : 0.f;
     clean[at] = d;
     d_depth[at] = pull;
-    d_alpha[at] = solid ? -c.opacity : 0.f;
+    d_alpha[at] = solid ? (filled ? -c.opacity : c.silhouette) : 0.f;
     d_distortion[at] = thick ? c.distortion : 0.f;
   }
   add_block_sum(total, loss + b);
@@ -149,6 +151,7 @@ extern "C" __global__ void __launch_bounds__(256) store_rendered(
   const int slot = batch[blockIdx.y], i = blockIdx.x * 256 + threadIdx.x;
   if (slot < 0 || i >= pixels) return;
   const size_t at = (size_t)blockIdx.y * pixels + i;
-  view_map(maps, slot, RENDERED_DEPTH)[i] = shown(depth[at], alpha[at], min_alpha);
+  const float prior = view_map(maps, slot, PRIOR_DEPTH)[i];
+  view_map(maps, slot, RENDERED_DEPTH)[i] = shown(depth[at], alpha[at], prior, min_alpha);
   if (i == 0) rendered[slot] = 1;
 }

@@ -14,7 +14,7 @@ __device__ __forceinline__ float* view_map(const long long* maps, int slot, View
 // Weights are divided by the number of pixels, the distortion's also by the length unit.
 struct SingleViewSettings {
   float fx, fy, cx, cy;
-  float depth, normal, consistency, distortion, opacity, smoothness;
+  float depth, normal, consistency, distortion, opacity, smoothness, silhouette;
   float min_alpha, relative, normal_epsilon, eta, rewards_edges;
 };
 
@@ -30,9 +30,10 @@ struct PhotoSettings {
 __device__ __forceinline__ float sign(float x) { return (float)((x > 0.f) - (x < 0.f)); }
 __device__ __forceinline__ float finite_or_zero(float x) { return fabsf(x) < HUGE_VALUE ? x : 0.f; }
 
-// The depth where it is visible, else 0; NaN compares false.
-__device__ __forceinline__ float shown(float depth, float alpha, float min_alpha) {
-  return depth > 0.f && depth < HUGE_VALUE && alpha > min_alpha ? depth : 0.f;
+// The depth where it is visible and no mask excludes it (which makes the prior depth negative), else
+// 0; NaN compares false.
+__device__ __forceinline__ float shown(float depth, float alpha, float prior, float min_alpha) {
+  return depth > 0.f && depth < HUGE_VALUE && alpha > min_alpha && prior >= 0.f ? depth : 0.f;
 }
 
 // Adds the sum of ``x`` over the block to ``*total``. All threads of the block take part.

@@ -75,6 +75,7 @@ class WindowLosses:
         weights = [
             c.depth_weight, c.normal_weight, c.normal_consistency_weight,
             c.distortion_weight / unit, c.opacity_weight, c.smoothness_weight,
+            c.silhouette_weight,
         ]  # fmt: skip
         pixels = camera.width * camera.height
         values = [camera.fx, camera.fy, camera.cx, camera.cy, *(w / pixels for w in weights)]
@@ -143,7 +144,15 @@ class WindowLosses:
         )  # fmt: skip
         if c.smoothness_weight > 0:
             kernels["inverse_median"](
-                views, 1024, batch, depth, alpha, self._inverse_median, height * width, c.min_alpha
+                views,
+                1024,
+                batch,
+                self.table.pointers,
+                depth,
+                alpha,
+                self._inverse_median,
+                height * width,
+                c.min_alpha,
             )
         kernels["single_view"](
             (_blocks(width, 32), _blocks(height, 16), views), 256, batch, t.pointers,
