@@ -268,6 +268,13 @@ class DiskConfig:
     """Smallest standard deviation, in u."""
     prune_opacity: float = 0.05
     """Disks below this opacity are removed."""
+    split_share: float = 0.0
+    """Part of the disks that is split in two, where the losses pull hardest, each time that the
+    training over all keyframes reaches a split; in [0, 1)."""
+    split_times: tuple[float, ...] = (0.2, 0.35, 0.5)
+    """When that is, in parts of that training."""
+    split_pixels: float = 1.0
+    """Disks with no standard deviation above this many pixels at u are not split."""
     carve_every: int = 10
     """Keyframes between votes of all keyframes against disks in free space."""
 

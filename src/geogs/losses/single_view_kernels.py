@@ -165,9 +165,9 @@ def single_view_rows(
     lens: fx, fy, cx, cy; weights, already divided by the number of pixels: depth, normal,
     consistency, distortion over the length unit, opacity, smoothness, silhouette; options: minimum
     alpha, relative depth (0, 1), epsilon of the normal's length, eta, second smoothness term (0,
-    1), 1 over the median depth. ``prior`` is negative outside a mask. ``prior_normal`` has no rows without a prior. ``scratch`` (3, rows, w)
-    has at least 5 and last - first + 4 rows. ``loss[y]`` is the row's sum; ``scratch`` and
-    ``g_normal`` are 0 on entry.
+    1), 1 over the median depth. ``prior`` is negative outside a mask. ``prior_normal`` has no rows
+    without a prior. ``scratch`` (3, rows, w) has at least 5 and last - first + 4 rows. ``loss[y]``
+    is the row's sum; ``scratch`` and ``g_normal`` are 0 on entry.
     """
     clean, pull, push = scratch[0], scratch[1], scratch[2]
     low, high = max(first - 2, 0), min(last + 2, depth.shape[0])

@@ -17,7 +17,13 @@ from geogs.mapping.sweep_neighbors import select_sweep_neighbours
 from geogs.mapping.training import Batch, MapTrainer, draw_partners, map_trainer, shown_depth
 from geogs.mapping.view import MapCameras, MapView
 from geogs.mapping.window import choose_partners, draw_views
-from geogs.splat.density import candidate_pixels, unexplained, worth_keeping
+from geogs.splat.density import (
+    candidate_pixels,
+    split,
+    unexplained,
+    worth_keeping,
+    worth_splitting,
+)
 from geogs.splat.init import initialise_disks
 from geogs.splat.map import GaussianMap
 from geogs.splat.render import render
@@ -303,7 +309,8 @@ class Mapper:
         start = time.perf_counter()
         trainer = self._training()
         fills, prunes = {total // 3, 2 * total // 3}, max(total // 4, 1)
-        events = fills | set(range(prunes, total, prunes))
+        splits = {int(total * part) for part in self.config.disk.split_times}
+        events = fills | splits | set(range(prunes, total, prunes))
         stops = sorted(events | set(range(_REPORTED_STEPS, total, _REPORTED_STEPS)) | {total})
         order: list[int] = []
         done = 0
@@ -324,10 +331,22 @@ class Mapper:
             done = stop
             if done % prunes == 0 and done < total:
                 self.prune()
+            if done in splits:
+                self._split()
             if done in fills:
                 for view in views:
                     self._insert(view, self.config.disk.fill_confidence)
             progress(done / total)
+
+    def _split(self) -> None:
+        """Split the disks that are pulled hardest; those below a pixel are small enough."""
+        disk, optimizer = self.config.disk, self._training().optimizer
+        pixel = self.unit / self.cameras.render.fx
+        chosen = worth_splitting(
+            self.map, optimizer.position_gradient, disk.split_share, disk.split_pixels * pixel
+        )
+        ids = self.map.keyframe_id[chosen]
+        optimizer.replace(chosen, split(self.map, chosen), torch.cat([ids, ids]))
 
     def _rendered(self, view: MapView) -> RenderedKeyframe:
         output = render(self.map, self.cameras.render, view.T_cw)

@@ -119,6 +119,19 @@ class MapOptimizer:
                 m.take(index)
         self.disks.take(index)
 
+    @property
+    def position_gradient(self) -> Float[Tensor, "n"]:
+        """Root mean square of each position's gradient over the last steps that saw the disk."""
+        last = self.disks.steps.clamp(max=len(self._corrections[1]) - 1)
+        correction = self._corrections[1][last].clamp(min=1e-6)
+        return (self.second[0].sum(1) / correction.to(self.second[0])).sqrt()
+
+    @torch.no_grad()
+    def replace(self, gone: Bool[Tensor, "n"], new: DiskParameters, keyframe_id: Tensor) -> None:
+        """Drop some disks from the map and add others."""
+        self.keep(~gone)
+        self.append(new, keyframe_id)
+
     @torch.no_grad()
     def transform(self, S: Float[Tensor, "*n 4 4"]) -> None:
         """Move the map by a similarity (one, or one per disk) and its moments with it.
