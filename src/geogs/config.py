@@ -227,8 +227,9 @@ class LossConfig:
     """Windows with a smaller valid share are left out; in (0, 1]."""
     ssim_weight: float = 0.0
     """L_ssim, 1 - structural similarity; unitless, at least 0; slow on a CPU."""
-    occlusion: float = 0.05
-    """Relative depth difference to the neighbour's depth from which a pixel is hidden; above 0."""
+    occlusion: float = 2.25
+    """Depth difference to the neighbour's depth from which a pixel is hidden, in pixels of the
+    photometric image that it is worth at 10 degrees of parallax; above 0."""
     photo_blur: float = 0.3
     """Standard deviation in pixels by which the photometric images are smoothed; at least 0."""
     photo_gradient: Literal["exact", "sobel"] = "exact"

@@ -14,6 +14,7 @@ from geogs.geometry.camera import Camera
 from geogs.mapping import known_poses as known
 from geogs.mapping.map_frame import MapFrame
 from geogs.mapping.mapper import Mapper
+from geogs.splat.map import DiskParameters
 from geogs.stopwatch import Stopwatch
 from geogs.threads import on_one_torch_thread
 from geogs.types import MapSnapshot, RenderedKeyframe, Trajectory
@@ -113,11 +114,24 @@ class Reconstruction:
         return self._frame.world_snapshot(self.mapper.map.snapshot())
 
     @on_one_torch_thread
-    def renders(self) -> list[RenderedKeyframe]:
-        """Depth, normal and reliability of the map seen from every image, inside its mask."""
+    def renders(self, disks: MapSnapshot | None = None) -> list[RenderedKeyframe]:
+        """Depth, normal and reliability of the map seen from every image, inside its mask.
+
+        Of an earlier snapshot's disks where they are given.
+        """
         with self.stopwatch("rendering"):
-            renders, frame = self.mapper.renders(), self._frame
-            return [frame.world_render(r, self._poses[r.keyframe_id]) for r in renders]
+            if disks is None:
+                return self._in_world(self.mapper.renders())
+            earlier = DiskParameters.of(self._frame.map_snapshot(disks))
+            return self._in_world(self.mapper.renders(earlier))
+
+    @on_one_torch_thread
+    def depth_maps(self) -> list[RenderedKeyframe]:
+        """Depth and confidence of every image as searched, without the disks."""
+        return self._in_world(self.mapper.depth_maps())
+
+    def _in_world(self, renders: list[RenderedKeyframe]) -> list[RenderedKeyframe]:
+        return [self._frame.world_render(r, self._poses[r.keyframe_id]) for r in renders]
 
     def _first_points(self, progress: Callable[[float], None]) -> np.ndarray:
         views, depth = list(self.mapper.views.values()), self.config.mapping.depth

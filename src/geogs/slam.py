@@ -48,6 +48,7 @@ class Slam:
         self.stopwatch = Stopwatch()
         self.frames = 0
         self._waiting: deque[int] = deque()
+        self._is_ended = False
 
     @on_one_torch_thread
     def process(self, frame: Frame) -> SlamStatus:
@@ -61,14 +62,21 @@ class Slam:
         )
 
     @on_one_torch_thread
-    def finish(self, progress: Progress = _silent, correct: bool = True) -> None:
-        """End of the stream: map what waits, bundle-adjust all keyframes, move and refine the map.
-
-        ``correct=False`` (after an interruption) keeps the online result as it stands.
-        """
+    def end_stream(self) -> None:
+        """After the last frame: map what waits. What there is then is the online result."""
         with self.stopwatch("tracking"):
             result = self.tracker.finish()
         self._map(result, lag=0)
+        self._is_ended = True
+
+    @on_one_torch_thread
+    def finish(self, progress: Progress = _silent, correct: bool = True) -> None:
+        """End the stream if need be, bundle-adjust all keyframes, move and refine the map.
+
+        ``correct=False`` (after an interruption) keeps the online result as it stands.
+        """
+        if not self._is_ended:
+            self.end_stream()
         if not correct:
             return
         with self.stopwatch("global bundle adjustment"):
@@ -100,6 +108,11 @@ class Slam:
         """Depth, normal and reliability of the map seen from every mapped keyframe."""
         with self.stopwatch("rendering"):
             return self.mapper.renders()
+
+    @on_one_torch_thread
+    def depth_maps(self) -> list[RenderedKeyframe]:
+        """Depth and confidence of every mapped keyframe as searched, without the disks."""
+        return self.mapper.depth_maps()
 
     def _map(self, result: TrackResult, lag: int) -> None:
         """Hand settled keyframes to the mapper; train those whose successors are known."""

@@ -2,6 +2,7 @@
 
 import json
 import platform
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Protocol, runtime_checkable
@@ -11,8 +12,8 @@ import torch
 
 import geogs
 from geogs.cli.progress import RunProgress, peak_memory
+from geogs.cli.surfaces import fusion_views, write_surface
 from geogs.config import Config, ReconstructConfig
-from geogs.errors import InputError
 from geogs.evaluation import plots
 from geogs.evaluation.run_report import write_run_page
 from geogs.evaluation.shading import viewpoints
@@ -22,10 +23,9 @@ from geogs.io.sources.calibration import Calibration
 from geogs.io.writers.atomic import write_text
 from geogs.io.writers.intrinsics import write_intrinsics
 from geogs.io.writers.native import save_map
-from geogs.io.writers.ply import write_mesh, write_splats
+from geogs.io.writers.ply import write_splats
 from geogs.io.writers.tum import write_tum_trajectory
 from geogs.mesh.colour import colour_mesh
-from geogs.mesh.extract import extract_mesh
 from geogs.mesh.types import DepthMapView, Mesh
 from geogs.stopwatch import Stopwatch
 from geogs.types import MapSnapshot, RenderedKeyframe, Trajectory
@@ -58,6 +58,10 @@ class MappedScene(Protocol):
         """The map seen from every keyframe."""
         ...
 
+    def depth_maps(self) -> list[RenderedKeyframe]:
+        """The keyframes' depths as searched."""
+        ...
+
 
 @dataclass(frozen=True)
 class SourceFacts:
@@ -72,6 +76,8 @@ class SourceFacts:
     skipped: int = 0
     scale: str = "arbitrary (monocular)"
     """What a unit of the map is."""
+    held_out: tuple[int, ...] = ()
+    """Images that were not used: their places in the source without start and stride."""
 
     @staticmethod
     def of(source: Source) -> "SourceFacts":
@@ -89,8 +95,12 @@ def write_results(
     config: Config | ReconstructConfig,
     interrupted: bool,
     progress: RunProgress,
+    more: Sequence[Callable[[], None]] = (),
 ) -> None:
-    """Write poses first, then the map, the mesh, and the report on them."""
+    """Write poses first, then the map, the mesh, what else was asked for, and the report on them.
+
+    ``more`` writes the rest, which the summary then counts.
+    """
     trajectory = slam.trajectory()
     write_tum_trajectory(output / "trajectory.tum", trajectory)
     keyframes = slam.keyframe_trajectory()
@@ -100,20 +110,12 @@ def write_results(
     disks = slam.snapshot()
     save_map(output / "map.safetensors", disks, {"source": source.name, "seed": config.seed})
     renders = slam.renders()
-    views = fusion_views(renders)
     if len(disks):
-        write_splats(output / "splats.ply", disks, splat_colours(disks, views))
+        write_splats(output / "splats.ply", disks, splat_colours(disks, fusion_views(renders)))
     with slam.stopwatch("mesh"):
-        try:
-            mesh = extract_mesh(
-                views,
-                config.mesh,
-                lambda name, done, of: progress.stage(f"mesh: {name}", done / of),
-            )
-            write_mesh(output / "mesh.ply", mesh.vertices, mesh.faces, mesh.colours, mesh.normals)
-        except InputError as error:
-            mesh = None
-            progress.write(f"No mesh: {error}")
+        mesh = write_surface(output / "mesh.ply", renders, config.mesh, progress)
+    for write in more:
+        write()
     lost = int((~trajectory.tracked).sum())
     if lost > 0.2 * slam.frames:
         progress.write(
@@ -132,11 +134,6 @@ def write_config(path: Path, config: Config | ReconstructConfig) -> None:
 
     plain = json.loads(json.dumps(asdict(config), default=str))
     write_text(path, yaml.safe_dump(plain, sort_keys=False))
-
-
-def fusion_views(renders: list[RenderedKeyframe]) -> list[DepthMapView]:
-    """The renderings as what mesh extraction takes."""
-    return [DepthMapView(r.depth, r.weight, r.camera, r.T_cw, r.image) for r in renders]
 
 
 def splat_colours(disks: MapSnapshot, views: list[DepthMapView]) -> np.ndarray:
@@ -171,6 +168,7 @@ def summarise(
         "kind": source.kind,
         "frames": slam.frames,
         "skipped_images": source.skipped,
+        **({"held_out": list(source.held_out)} if source.held_out else {}),
         "keyframes": len(keyframes.timestamps),
         "lost_spans": lost_spans(trajectory),
         "disks": len(disks),

@@ -20,7 +20,7 @@ from geogs.config import LossConfig
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_inverse
 from geogs.losses import multi_view_kernels as multi
-from geogs.losses.multi_view import MIN_DEPTH_RATIO, PhotoView
+from geogs.losses.multi_view import MIN_DEPTH_RATIO, PhotoView, depth_tolerance
 from geogs.losses.photometric import NCC_VARIANCE_FLOOR, ssim
 from geogs.losses.single_view import NORMAL_EPSILON, ViewConstants, visible
 from geogs.losses.single_view_kernels import single_view_rows
@@ -154,7 +154,8 @@ class _MultiView(torch.autograd.Function):
         lenses = np.array(lenses, np.float32)
         n, huber = grey.size, max(config.l1_huber, 1e-12)
         limits = np.array([MIN_DEPTH_RATIO, image.shape[1] - 1, image.shape[0] - 1], np.float32)
-        options = [config.occlusion, config.l1_weight / n, huber, config.l1_cut]
+        tolerance = depth_tolerance(config.occlusion, target.camera)
+        options = [tolerance, config.l1_weight / n, huber, config.l1_cut]
         options = np.array(options, np.float32)
         window = [config.ncc_weight / n, config.ncc_reject, config.ncc_min_variance]
         window += [config.ncc_texture, config.ncc_min_coverage, NCC_VARIANCE_FLOOR]

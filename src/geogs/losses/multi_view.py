@@ -1,5 +1,6 @@
 """Losses between two views: the target image seen through the reference's rendered depth."""
 
+import math
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -18,6 +19,8 @@ from geogs.losses.photometric import ncc, robust_l1, ssim
 
 # A point must keep this share of its depth in the target's frame; nearer ones project wildly.
 MIN_DEPTH_RATIO = 0.05
+# Degrees between the rays of two views at which the occlusion test is told in pixels.
+_PARALLAX = 10.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,6 +195,14 @@ def occlusion_mask(
     return warped.in_view & (share > 0.999) & ((z - seen).abs() < tolerance * z)
 
 
+def depth_tolerance(pixels: float, camera: Camera) -> float:
+    """Relative depth difference that moves a point by ``pixels`` between views 10 degrees apart.
+
+    So the occlusion test is as sharp as depths can be: a camera with a long lens sees finer steps.
+    """
+    return pixels / (camera.fx * math.tan(math.radians(_PARALLAX)))
+
+
 def multi_view_loss(
     depth: Float[Tensor, "h w"],
     reference: PhotoView,
@@ -220,7 +231,9 @@ def multi_view_loss(
     )
     mask = warped.in_view
     if target_depth is not None:
-        mask = occlusion_mask(warped, target_depth, target.camera, config.occlusion)
+        mask = occlusion_mask(
+            warped, target_depth, target.camera, depth_tolerance(config.occlusion, target.camera)
+        )
     return photometric_loss(grey, warped.image, mask, config)
 
 

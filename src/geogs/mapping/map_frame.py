@@ -55,6 +55,12 @@ class MapFrame:
         position = disks.position * self.unit + origin
         return replace(disks, position=position, scale=disks.scale * self.unit)
 
+    def map_snapshot(self, disks: MapSnapshot) -> MapSnapshot:
+        """Disks in world coordinates and units in those of the map."""
+        origin = torch.from_numpy(self.origin).to(disks.position)
+        position = (disks.position - origin) / self.unit
+        return replace(disks, position=position, scale=disks.scale / self.unit)
+
     def world_render(
         self, render: RenderedKeyframe, T_cw: Float[Tensor, "4 4"]
     ) -> RenderedKeyframe:

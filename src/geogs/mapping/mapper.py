@@ -13,8 +13,9 @@ from geogs.config import MappingConfig
 from geogs.geometry.camera import Camera
 from geogs.mapping.depth_engine import depth_engine
 from geogs.mapping.map_update import MapUpdate, plan_update
+from geogs.mapping.rendered import rendered_keyframe, searched_keyframe
 from geogs.mapping.sweep_neighbors import select_sweep_neighbours
-from geogs.mapping.training import Batch, MapTrainer, draw_partners, map_trainer, shown_depth
+from geogs.mapping.training import Batch, MapTrainer, draw_partners, map_trainer
 from geogs.mapping.view import MapCameras, MapView
 from geogs.mapping.window import choose_partners, draw_views
 from geogs.splat.density import (
@@ -25,7 +26,7 @@ from geogs.splat.density import (
     worth_splitting,
 )
 from geogs.splat.init import initialise_disks
-from geogs.splat.map import GaussianMap
+from geogs.splat.map import DiskParameters, GaussianMap
 from geogs.splat.render import render
 from geogs.types import Keyframe, PoseCorrection, RenderedKeyframe
 
@@ -199,9 +200,15 @@ class Mapper:
         self._carve([self.views[i] for i in self.mapped])
 
     @torch.no_grad()
-    def renders(self) -> list[RenderedKeyframe]:
-        """The map seen from every mapped keyframe, with the weight of each depth for fusion."""
-        return [self._rendered(self.views[i]) for i in self.mapped]
+    def renders(self, disks: DiskParameters | None = None) -> list[RenderedKeyframe]:
+        """The map, or other disks in its frame, seen from every mapped keyframe."""
+        disks = self.map.parameters if disks is None else disks
+        views, camera = [self.views[i] for i in self.mapped], self.cameras.render
+        return [rendered_keyframe(view, disks, camera, self.config) for view in views]
+
+    def depth_maps(self) -> list[RenderedKeyframe]:
+        """The dense depths of the mapped keyframes, weighted by confidence: no disk is in them."""
+        return [searched_keyframe(self.views[i], self.cameras.render) for i in self.mapped]
 
     @property
     def unit(self) -> float:
@@ -347,28 +354,6 @@ class Mapper:
         )
         ids = self.map.keyframe_id[chosen]
         optimizer.replace(chosen, split(self.map, chosen), torch.cat([ids, ids]))
-
-    def _rendered(self, view: MapView) -> RenderedKeyframe:
-        output = render(self.map, self.cameras.render, view.T_cw)
-        depth = shown_depth(output, self.config.loss.min_alpha)
-        # The mean is smoother; but where the ray meets several surfaces it lies on none of them,
-        # while the median is on one.
-        single = (output.median_depth - depth).abs() < self.config.max_spread * depth
-        depth = torch.where(single | (depth <= 0), depth, output.median_depth)
-        weight = torch.where(single, 1.0, 0.5) * (depth > 0)
-        if view.mask is not None:
-            depth = torch.where(view.mask, depth, 0.0)
-            weight = torch.where(view.mask, weight, 0.0)
-        length = output.normal.norm(dim=-1, keepdim=True).clamp(min=1e-6)
-        return RenderedKeyframe(
-            keyframe_id=view.id,
-            camera=self.cameras.render,
-            T_cw=view.T_cw,
-            depth=depth,
-            normal=torch.where(depth[..., None] > 0, output.normal / length, 0.0),
-            weight=weight,
-            image=view.keyframe.image,
-        )
 
 
 def _cameras(camera: Camera, config: MappingConfig) -> MapCameras:

@@ -24,6 +24,12 @@ class DiskParameters(NamedTuple):
     opacity_logit: Float[Tensor, "n"]
     """The opacity is its sigmoid."""
 
+    @staticmethod
+    def of(disks: MapSnapshot) -> "DiskParameters":
+        """The disks of a snapshot before activation."""
+        opacity_logit = disks.opacity.clamp(1e-6, 1 - 1e-6).logit()
+        return DiskParameters(disks.position, disks.quaternion, disks.scale.log(), opacity_logit)
+
 
 class GaussianMap:
     """Disks with trainable parameters (leaf tensors that require gradients) and bookkeeping.

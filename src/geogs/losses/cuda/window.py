@@ -16,7 +16,7 @@ from torch import Tensor
 from geogs.config import LossConfig
 from geogs.gpu.kernels import kernels_for
 from geogs.losses.cuda.view_table import ViewTable
-from geogs.losses.multi_view import MIN_DEPTH_RATIO
+from geogs.losses.multi_view import MIN_DEPTH_RATIO, depth_tolerance
 from geogs.losses.photometric import NCC_VARIANCE_FLOOR
 from geogs.losses.single_view import NORMAL_EPSILON
 
@@ -87,7 +87,8 @@ class WindowLosses:
         """``PhotoSettings`` of ``view_maps.cuh``."""
         c, camera = self.config, self.table.photo
         scale = pair_share / (camera.width * camera.height)
-        values = [camera.fx, camera.fy, camera.cx, camera.cy, MIN_DEPTH_RATIO, c.occlusion]
+        tolerance = depth_tolerance(c.occlusion, camera)
+        values = [camera.fx, camera.fy, camera.cx, camera.cy, MIN_DEPTH_RATIO, tolerance]
         values += [scale * c.l1_weight, max(c.l1_huber, 1e-12), c.l1_cut]
         values += [scale * c.ncc_weight, c.ncc_reject, c.ncc_min_variance, c.ncc_texture]
         values += [c.ncc_min_coverage, NCC_VARIANCE_FLOOR, scale * c.ssim_weight]

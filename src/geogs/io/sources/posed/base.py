@@ -42,8 +42,16 @@ class PosedSource:
     ``len(source)``, ``source[i]`` and iteration (which reads ahead) give :class:`PosedImage`.
     """
 
-    def __init__(self, posed: PosedSet, config: InputConfig) -> None:
+    def __init__(
+        self, posed: PosedSet, config: InputConfig, hold_out: int | None = None
+    ) -> None:
+        """Of the selected images every ``hold_out``-th is left out as if it were not there."""
         posed = _selected(without_invalid_poses(_present(posed)), config)
+        left_out = held_out_places(len(posed.files), hold_out)
+        self.held_out: list[int] = [config.start + config.stride * i for i in left_out]
+        """Images left out: their places in the source with neither start nor stride, from 0."""
+        if left_out:
+            posed = posed.only(sorted(set(range(len(posed.files))) - set(left_out)))
         self._files = posed.files
         self.kind = posed.kind
         """The format: colmap, nerfstudio, dtu, replica, tum, 7scenes or scannet."""
@@ -104,6 +112,25 @@ class PosedSource:
     def __iter__(self) -> Iterator[PosedImage]:
         """Yield all images; the next one is read while the present one is used."""
         return read_ahead(self[index] for index in range(self.length))
+
+
+def held_out_places(count: int, every: int | None) -> range:
+    """Which of ``count`` images are left out where every ``every``-th is; none where that is none.
+
+    Raises:
+        InputError: fewer than two images would be left, or ``every`` leaves none.
+    """
+    if every is None:
+        return range(0)
+    if every < 2:
+        raise InputError(f"hold-out is {every}; it must be at least 2, or every image would go.")
+    places = range(every // 2, count, every)
+    if count - len(places) < 2:
+        raise InputError(
+            f"Of {count} images only {count - len(places)} would be left to reconstruct from; "
+            "give more images or a larger --hold-out."
+        )
+    return places
 
 
 def _present(posed: PosedSet) -> PosedSet:

@@ -27,7 +27,9 @@ _FORMATS: tuple[tuple[Callable[[Path], object], Callable[[Path], PosedSet]], ...
 )
 
 
-def open_posed_source(path: str | Path, config: InputConfig | None = None) -> PosedSource:
+def open_posed_source(
+    path: str | Path, config: InputConfig | None = None, hold_out: int | None = None
+) -> PosedSource:
     """Open an image set together with its known poses.
 
     The format follows from the content: a COLMAP model, nerfstudio's ``transforms.json``, DTU's
@@ -36,13 +38,14 @@ def open_posed_source(path: str | Path, config: InputConfig | None = None) -> Po
     Args:
         path: the folder, or the file with the poses.
         config: selection of images, intrinsics and working resolution; the defaults if none.
+        hold_out: every so many-th of the selected images is left out; none leaves out none.
 
     Raises:
         InputError: no images with poses are there, or they cannot be used.
     """
     path = Path(path).expanduser()
     try:
-        return PosedSource(_posed_set(path), config or InputConfig())
+        return PosedSource(_posed_set(path), config or InputConfig(), hold_out)
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror}.") from error
 
