@@ -17,9 +17,10 @@ from scipy.spatial import cKDTree
 
 from depth_scene import WORKING, make_scene, trace
 from geogs.cli.reconstruct import seconds
-from geogs.config import ReconstructConfig
+from geogs.config import InputConfig, ReconstructConfig
 from geogs.errors import InputError
 from geogs.io.poses import read_tum_trajectory
+from geogs.io.sources.posed.sniff import open_posed_source
 from geogs.io.writers.native import load_map
 from geogs.mapping.depth_engine import CpuDepthEngine
 from geogs.mapping.depth_view import depth_view
@@ -94,6 +95,87 @@ def test_it_leaves_every_file_and_the_given_poses(room, result):
     assert summary["interrupted"] is False
     assert set(summary["frames_per_second"]) == {"with_final_stages"}
     assert summary["disks"] == len(load_map(result / "map.safetensors")) > 1000
+
+
+def test_images_are_held_out_and_earlier_maps_and_the_depths_alone_are_written(room, tmp_path):
+    done = geogs(
+        "reconstruct", room, "-o", tmp_path, "--stride", 5, "--hold-out", 4, "--snapshots",
+        "0.01,5s,0.2m,1h", "--depth-mesh", "--search.no-repeat", "--search.least-steps", 600,
+        "--mapping.render-long-edge", 160, "--device", "cpu",
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["held_out"] == [10, 30, 50]
+    assert summary["frames"] == 9
+    given = np.loadtxt(room / "traj.txt").reshape(-1, 4, 4)[[0, 5, 15, 20, 25, 35, 40, 45, 55]]
+    assert np.abs(read_tum_trajectory(tmp_path / "trajectory.tum").T_wc - given).max() < 1e-5
+    assert "No snapshot after 0.01 s" in done.stderr
+    names = sorted(p.name for p in (tmp_path / "snapshots").iterdir())
+    assert set(names) <= {"5", "12"}
+    folders = [tmp_path, tmp_path / "depth_fusion", *(tmp_path / "snapshots").iterdir()]
+    seen = vertices(room / "points_seen_1cm.ply")
+    for folder in folders:
+        accuracy = cKDTree(seen).query(vertices(folder / "mesh.ply")[::7])[0]
+        assert np.median(accuracy) < 0.02
+    for name in names:
+        assert len(load_map(tmp_path / "snapshots" / name / "map.safetensors")) > 1000
+    seconds = summary["seconds"]
+    assert seconds["total"] == pytest.approx(sum(seconds.values()) - seconds["total"], abs=0.1)
+
+
+def test_an_earlier_snapshot_can_be_rendered():
+    scene, kept = ball_and_wall(far=1e3), []
+
+    def keep(name: str, fraction: float) -> None:
+        if name == "growing":
+            kept.append(scene.snapshot())
+
+    assert scene.elapsed == 0
+    scene.finish(progress=keep)
+    assert scene.elapsed > 0
+    now, same = scene.renders(), scene.renders(scene.snapshot())
+    earlier = scene.renders(kept[0])
+    for a, b, c in zip(now, same, earlier, strict=True):
+        shown = (a.depth > 0) & (b.depth > 0)
+        assert ((a.depth - b.depth).abs()[shown] / a.depth[shown]).quantile(0.95) < 2e-3
+        assert not torch.equal(a.depth, c.depth)
+        assert torch.equal(a.T_cw, c.T_cw)
+
+
+def test_depth_maps_are_those_that_were_searched():
+    scene = ball_and_wall()
+    scene.finish()
+    for view, found in zip(make_scene().views, scene.depth_maps(), strict=True):
+        truth = trace(scene.mapper.cameras.render, np.linalg.inv(view.T_cw))[0]
+        sure = found.weight.numpy() > 0.5
+        assert sure.mean() > 0.1
+        assert np.median(np.abs(found.depth.numpy() / truth - 1)[sure]) < 0.005
+        assert ((found.normal * found.camera.rays()).sum(-1) <= 1e-6).all()
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--hold-out", 1], "at least 2"),
+        (["--hold-out", 0], "at least 2"),
+        (["--stop", 2, "--hold-out", 2], "Of 2 images only 1"),
+        (["--snapshots", "5,soon"], "soon"),
+    ],
+)
+def test_options_that_leave_nothing_to_do(room, tmp_path, options, words):
+    done = geogs("reconstruct", room, "-o", tmp_path / "out", *options)
+    assert done.returncode == 2
+    assert words in done.stderr.splitlines()[-1]
+    assert "Traceback" not in done.stderr
+
+
+def test_held_out_images_are_named_by_their_place_in_the_whole_source(room):
+    config = InputConfig(start=10, stop=30, stride=3)
+    source = open_posed_source(room, config, 3)
+    assert source.held_out == [13, 22]
+    assert [source.label(i)[-8:-4] for i in range(len(source))] == [
+        "0010", "0016", "0019", "0025", "0028"
+    ]  # fmt: skip
 
 
 def test_wrong_input_is_one_sentence(room, tmp_path):

@@ -11,6 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from plyfile import PlyData
 
 from geogs.io.poses import read_tum_trajectory
 from geogs.io.writers.native import load_map
@@ -40,9 +41,9 @@ def room(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def result(room, tmp_path_factory) -> Path:
-    """What ``geogs run`` leaves of it."""
+    """What ``geogs run`` leaves of it, with all that can be asked for."""
     folder = tmp_path_factory.mktemp("result") / "out"
-    done = geogs("run", room, "-o", folder, *QUICK)
+    done = geogs("run", room, "-o", folder, "--online-results", "--depth-mesh", *QUICK)
     assert done.returncode == 0, done.stderr
     return folder
 
@@ -77,8 +78,27 @@ def test_a_run_leaves_every_file(result):
     assert summary["peak_memory_bytes"] < 2e9
 
 
+def test_the_online_result_and_the_depths_alone_are_written_too(room, result):
+    online = read_tum_trajectory(result / "online" / "trajectory.tum")
+    final = read_tum_trajectory(result / "trajectory.tum")
+    assert len(online.timestamps) == len(final.timestamps) == FRAMES
+    assert 0 < np.abs(online.T_wc - final.T_wc).max() < 0.1
+    seconds = json.loads((result / "summary.json").read_text())["seconds"]
+    assert seconds["online results"] > 0
+    assert seconds["depth fusion"] > 0
+    assert seconds["total"] == pytest.approx(sum(seconds.values()) - seconds["total"], abs=0.1)
+    keyframes = read_tum_trajectory(result / "online" / "keyframes.tum")
+    assert 4 < len(keyframes.timestamps) < FRAMES
+    meshes = [PlyData.read(result / n / "mesh.ply") for n in ("online", "depth_fusion", ".")]
+    assert all(len(mesh["face"].data) > 1000 for mesh in meshes)
+    assert len({len(mesh["face"].data) for mesh in meshes}) == 3
+
+
 def test_ground_truth_is_never_read(room, result, tmp_path):
-    """Without the truth beside the images the poses come out the same, bit for bit."""
+    """Without the truth beside the images the poses come out the same, bit for bit.
+
+    Nor do the results that were asked for besides change anything.
+    """
     bare = tmp_path / "bare"
     (bare / "results").mkdir(parents=True)
     (bare / "cam_params.json").write_bytes((room / "cam_params.json").read_bytes())

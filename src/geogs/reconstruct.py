@@ -48,6 +48,7 @@ class Reconstruction:
         self._frame = MapFrame(np.zeros(3), 1.0)
         self._poses: list[Float[Tensor, "4 4"]] = []
         self._random = np.random.default_rng(self.config.seed)
+        self._begin: float | None = None
         kept = 1.0 - self.config.search.output_share
         self._end = None if budget is None else time.perf_counter() + kept * budget
 
@@ -55,6 +56,11 @@ class Reconstruction:
     def frames(self) -> int:
         """Images added so far."""
         return len(self._poses)
+
+    @property
+    def elapsed(self) -> float:
+        """Seconds since all images were there: since ``finish`` was called."""
+        return 0.0 if self._begin is None else time.perf_counter() - self._begin
 
     @on_one_torch_thread
     def add(
@@ -84,6 +90,7 @@ class Reconstruction:
         """
         if self.frames < 2:
             raise InputError(f"There is only {self.frames} image; depth needs at least two.")
+        self._begin = time.perf_counter()
         if points is None or len(points) < known.FEWEST_POINTS:
             with self.stopwatch("first look"):
                 points = self._first_points(lambda f: progress("first look", f))
@@ -97,6 +104,7 @@ class Reconstruction:
                 with self.stopwatch("growing"):
                     self.mapper.check_depths()
                     self.mapper.grow()
+        progress("growing", 1.0)
         with self.stopwatch("training"):
             self.mapper.train(self._steps(), lambda f: progress("training", f), self._end)
 

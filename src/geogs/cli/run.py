@@ -33,6 +33,10 @@ class RunOptions(Config):
     """Group of settings; single ones given beside it win."""
     device: str = "auto"
     """Where to compute: auto (a GPU where there is one), cpu, cuda or cuda:1; see geogs doctor."""
+    online_results: bool = False
+    """Also write trajectory and mesh as they are before the final stages, to online/."""
+    depth_mesh: bool = False
+    """Also fuse the keyframes' depths without the disks, to depth_fusion/mesh.ply."""
 
 
 def main(argv: Sequence[str]) -> int:
@@ -48,6 +52,7 @@ def run(options: RunOptions) -> Path:
 
     import geogs
     from geogs.cli.results import SourceFacts, write_results
+    from geogs.cli.surfaces import write_depth_mesh, write_online_results
     from geogs.errors import DeviceError
     from geogs.gpu.installation import require_device
     from geogs.gpu.kernels import prepare_kernels
@@ -68,9 +73,15 @@ def run(options: RunOptions) -> Path:
         if interrupted:
             why = "The GPU has no memory left" if full else "Stopping early"
             progress.write(f"{why}; keeping what there is. Press Ctrl-C again to quit.")
+        slam.end_stream()
+        if options.online_results:
+            write_online_results(output, slam, options.mesh, progress)
         interrupted |= not _finish(slam, progress, stop, correct=not interrupted)
-        facts = SourceFacts.of(source)
-        write_results(output, slam, facts, options, interrupted, progress)
+        more = [lambda: write_depth_mesh(output, slam, options.mesh, progress)]
+        write_results(
+            output, slam, SourceFacts.of(source), options, interrupted, progress,
+            more if options.depth_mesh else (),
+        )  # fmt: skip
     if full:
         raise DeviceError(
             f"The memory of the GPU was full after {slam.frames} frames, whose results are in "

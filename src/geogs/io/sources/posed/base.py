@@ -42,9 +42,7 @@ class PosedSource:
     ``len(source)``, ``source[i]`` and iteration (which reads ahead) give :class:`PosedImage`.
     """
 
-    def __init__(
-        self, posed: PosedSet, config: InputConfig, hold_out: int | None = None
-    ) -> None:
+    def __init__(self, posed: PosedSet, config: InputConfig, hold_out: int | None = None) -> None:
         """Of the selected images every ``hold_out``-th is left out as if it were not there."""
         posed = _selected(without_invalid_poses(_present(posed)), config)
         left_out = held_out_places(len(posed.files), hold_out)
