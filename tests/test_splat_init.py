@@ -2,8 +2,9 @@
 
 import torch
 
+from geogs.config import DiskConfig
 from geogs.geometry.lie import quaternion_to_matrix
-from geogs.splat.init import face_camera, fit_local_planes, initialise_disks
+from geogs.splat.init import face_camera, fit_local_planes, initialise_disks, new_disks
 
 SETTINGS = {
     "neighbours": 12,
@@ -88,3 +89,41 @@ def test_edge_on_normals_are_leaned_towards_the_camera():
 def test_no_points_no_disks():
     none = torch.zeros(0, 3)
     assert len(initialise_disks(none, torch.zeros(3), none[:, 0], none, **SETTINGS).position) == 0
+
+
+def started(points: torch.Tensor, seed: int = 0, **settings):
+    footprint = torch.full((len(points),), 0.04)
+    random = torch.Generator().manual_seed(seed)
+    config = DiskConfig(**settings)
+    return new_disks(points, torch.zeros(3), footprint, points[:0], config, random)
+
+
+def test_random_disks_are_round_and_turned_anyhow_with_3dgs_scales():
+    points = plane(60, 0.04)
+    disks = started(points, initialisation="random", opacity=0.6)
+    assert torch.equal(disks.position, points)
+    assert torch.equal(disks.log_scale[:, 0], disks.log_scale[:, 1])
+    # The three nearest of a grid with spacings 0.04 and 0.04 * sqrt(1.25): 0.04 twice, 0.0447.
+    inner = (points[:, :2].abs() < 1.0).all(1)
+    expected = torch.tensor((2 * 0.04**2 + 1.25 * 0.04**2) / 3).sqrt()
+    assert torch.allclose(disks.log_scale[inner].exp(), expected, rtol=1e-3)
+    assert torch.allclose(disks.opacity_logit.sigmoid(), torch.tensor(0.6))
+    assert torch.allclose(disks.quaternion.norm(dim=1), torch.tensor(1.0))
+    normal = quaternion_to_matrix(disks.quaternion)[..., 2]
+    assert normal.mean(0).norm() < 0.05
+    # Each coordinate of a uniform direction is uniform in [-1, 1].
+    assert torch.allclose(normal.square().mean(0), torch.tensor(1 / 3), atol=0.03)
+
+
+def test_random_disks_follow_their_seed_and_planes_do_not():
+    points = plane(12, 0.04)
+    first, same, other = (started(points, s, initialisation="random") for s in (1, 1, 2))
+    assert torch.equal(first.quaternion, same.quaternion)
+    assert not torch.allclose(first.quaternion, other.quaternion)
+    default = started(points)
+    wanted = initialise_disks(
+        points, torch.zeros(3), torch.full((len(points),), 0.04), points[:0],
+        **SETTINGS | {"planarity_shrink": 0.5},
+    )  # fmt: skip
+    assert all(torch.equal(a, b) for a, b in zip(default, wanted, strict=True))
+    assert len(started(points[:0], initialisation="random").position) == 0

@@ -253,6 +253,9 @@ class DiskConfig:
     """Least confidence of a depth that makes a disk at once; the rest follows later."""
     fill_confidence: float = 0.1
     """Least confidence of a depth that makes a disk where nothing better has come since."""
+    initialisation: Literal["local_plane", "random"] = "local_plane"
+    """Disks start in the plane of the points around them, or round, turned at random and as large
+    as those points are apart (3DGS's start, to compare with)."""
     neighbours: int = 12
     """Points of the local plane fit, at least 4."""
     scale_factor: float = 0.6

@@ -25,7 +25,7 @@ from geogs.splat.density import (
     worth_keeping,
     worth_splitting,
 )
-from geogs.splat.init import initialise_disks
+from geogs.splat.init import new_disks
 from geogs.splat.map import DiskParameters, GaussianMap
 from geogs.splat.render import render
 from geogs.types import Keyframe, PoseCorrection, RenderedKeyframe
@@ -298,12 +298,10 @@ class Mapper:
         points, z = points[kept], z[kept]
         if len(points) + len(self.map) < disk.neighbours or len(points) == 0:
             return
-        new = initialise_disks(
-            points, T_wc[:3, 3], disk.stride * z / camera.fx, self.map.position.detach(),
-            neighbours=disk.neighbours, scale_factor=disk.scale_factor,
-            planarity_threshold=disk.planarity_threshold,
-            planarity_shrink=disk.planarity_shrink, opacity=disk.opacity,
-        )  # fmt: skip
+        footprint = disk.stride * z / camera.fx
+        new = new_disks(
+            points, T_wc[:3, 3], footprint, self.map.position.detach(), disk, self._torch_random
+        )
         self._training().optimizer.append(new, view.id)
 
     def _train_all(

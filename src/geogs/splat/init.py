@@ -1,4 +1,4 @@
-"""Local-plane driven initialisation of disks (paper, Sec. "Local-plane driven initialization")."""
+"""How disks start: in local planes (paper, Sec. "Local-plane driven initialization"), or anyhow."""
 
 from dataclasses import dataclass
 
@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from geogs.config import DiskConfig
 from geogs.geometry.lie import matrix_to_quaternion
 from geogs.geometry.neighbors import all_pairs_neighbors, nearest_neighbors
 from geogs.splat.cuda.local_planes import principal_planes
@@ -73,6 +74,53 @@ def face_camera(
     lean = (min_cosine - cosine).clamp(min=0)
     normal = normal + lean * to_camera
     return normal / normal.norm(dim=-1, keepdim=True)
+
+
+def new_disks(
+    points: Float[Tensor, "n 3"],
+    camera_centre: Float[Tensor, "3"],
+    footprint: Float[Tensor, "n"],
+    existing: Float[Tensor, "m 3"],
+    config: DiskConfig,
+    random: torch.Generator,
+) -> DiskParameters:
+    """Disks at ``points`` (world frame) as the settings want them to start.
+
+    The arguments are those of :func:`initialise_disks`; ``random`` is a generator on the CPU.
+    """
+    if config.initialisation == "random":
+        return random_disks(points, existing, config.neighbours, config.opacity, random)
+    return initialise_disks(
+        points, camera_centre, footprint, existing,
+        neighbours=config.neighbours, scale_factor=config.scale_factor,
+        planarity_threshold=config.planarity_threshold,
+        planarity_shrink=config.planarity_shrink, opacity=config.opacity,
+    )  # fmt: skip
+
+
+def random_disks(
+    points: Float[Tensor, "n 3"],
+    existing: Float[Tensor, "m 3"],
+    neighbours: int,
+    opacity: float,
+    random: torch.Generator,
+) -> DiskParameters:
+    """Round disks at ``points`` whose orientation is uniform over all rotations.
+
+    Their standard deviation is the distance to the three nearest points, as in 3DGS: its root mean
+    square, among ``neighbours`` of the points and those that are there already.
+    """
+    count = len(points)
+    # A normalised Gaussian sample in four dimensions is uniform on the unit quaternions.
+    quaternion = torch.randn(count, 4, generator=random).to(points)
+    quaternion = quaternion / quaternion.norm(dim=-1, keepdim=True)
+    spacing = points.new_ones(0)
+    if count:
+        spacing = fit_local_planes(points, existing, neighbours).spacing.clamp(min=1e-7)
+    log_scale = spacing.log()[:, None].expand(-1, 2).clone()
+    return DiskParameters(
+        points, quaternion, log_scale, torch.logit(points.new_full((count,), opacity))
+    )
 
 
 def initialise_disks(
