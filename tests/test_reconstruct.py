@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -16,6 +17,7 @@ from plyfile import PlyData
 from scipy.spatial import cKDTree
 
 from depth_scene import WORKING, make_scene, trace
+from geogs.cli.checkpoint import fingerprint, read_checkpoint, write_checkpoint
 from geogs.cli.reconstruct import seconds
 from geogs.config import InputConfig, ReconstructConfig
 from geogs.errors import InputError
@@ -23,9 +25,11 @@ from geogs.io.poses import read_tum_trajectory
 from geogs.io.sources.posed.sniff import open_posed_source
 from geogs.io.writers.native import load_map
 from geogs.mapping.depth_engine import CpuDepthEngine
+from geogs.mapping.depth_schedule import spread_order
 from geogs.mapping.depth_view import depth_view
 from geogs.mapping.keyframe_depth import estimate_depth
 from geogs.mapping.known_poses import depth_search, distances_to_try, posed_keyframe
+from geogs.mapping.state import restore_mapper
 from geogs.reconstruct import Reconstruction
 
 GEOGS = [sys.executable, "-m", "geogs.cli.main"]
@@ -348,3 +352,136 @@ def test_durations():
     for wrong in ("", "soon", "-3s", "0", "10 days"):
         with pytest.raises(InputError, match="duration"):
             seconds(wrong)
+
+
+def test_depths_are_searched_for_as_many_images_as_time_allows():
+    assert spread_order([3, 4, 5, 6, 7]) == [3, 7, 5, 4, 6]
+    assert sorted(spread_order(range(49))) == list(range(49))
+    fewer = spread_order(range(48))[:12]
+    assert max(np.diff(sorted(fewer))) <= 5
+    slow = replace(SMALL, search=replace(SMALL.search, depth_share=1e-6))
+    scene = Reconstruction(WORKING, slow, budget=6.0)
+    for view in make_scene().views:
+        scene.add(view.image, view.T_cw)
+    scene.finish()
+    assert scene.frames == 5
+    assert scene.with_depth == 4
+    assert [r.keyframe_id for r in scene.renders()] == [0, 1, 2, 4]
+    assert len(scene.snapshot()) > 500
+
+
+def interrupted(scene: Reconstruction, fraction: float) -> None:
+    """Finish a reconstruction up to a part of its training."""
+
+    def interrupt(name: str, done: float) -> None:
+        if name == "training" and done >= fraction:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        scene.finish(progress=interrupt)
+
+
+@pytest.mark.parametrize("fraction", [0.0, 0.6])
+def test_work_that_was_cut_off_is_gone_on_with(tmp_path, fraction):
+    first, path = ball_and_wall(far=10.0), tmp_path / "checkpoint"
+    interrupted(first, fraction)
+    write_checkpoint(path, first.state(), "these")
+    state = read_checkpoint(path, "these")
+    assert state.seconds > 0
+    second, stages = ball_and_wall(far=10.0), []
+    second.resume(state, lambda stage, _: stages.append(stage))
+    assert set(stages) == {"training"}
+    assert second.elapsed > state.seconds
+    whole = ball_and_wall(far=10.0)
+    whole.finish()
+    assert second.mapper.trained.steps == whole.mapper.trained.steps
+    counts = len(second.snapshot()), len(whole.snapshot())
+    assert abs(counts[0] - counts[1]) < 0.05 * counts[1]
+    errors, wanted = depth_errors(second), depth_errors(whole)
+    print(f"medians {np.median(errors):.5f} and {np.median(wanted):.5f}")
+    assert np.median(errors) < 1.15 * np.median(wanted)
+
+
+def test_a_restored_mapper_is_the_same(tmp_path):
+    first = ball_and_wall()
+    interrupted(first, 0.5)
+    write_checkpoint(tmp_path / "c", first.state(), "these")
+    second = ball_and_wall()
+    state = read_checkpoint(tmp_path / "c", "these")
+    second.mapper.move([v.T_cw for v in first.mapper.views.values()])
+    restore_mapper(second.mapper, state.mapper)
+    assert second.mapper.trained == first.mapper.trained
+    assert second.mapper.unit == first.mapper.unit
+    for a, b in zip(first.mapper.views.values(), second.mapper.views.values(), strict=True):
+        assert a.partners == b.partners
+        assert a.search == b.search
+        assert torch.equal(a.known.prior_depth, b.known.prior_depth)
+    for a, b in zip(first.mapper.map.parameters, second.mapper.map.parameters, strict=True):
+        assert torch.equal(a, b)
+    assert torch.equal(first.mapper.map.steps, second.mapper.map.steps)
+    for name in ("first", "second"):
+        rows = zip(
+            getattr(first.mapper.optimizer, name),
+            getattr(second.mapper.optimizer, name),
+            strict=True,
+        )
+        assert all(torch.equal(a, b) for a, b in rows)
+
+
+def test_a_wrong_checkpoint_is_one_sentence(tmp_path):
+    path = tmp_path / "checkpoint.safetensors"
+    with pytest.raises(InputError, match="nothing to resume"):
+        read_checkpoint(path, "these")
+    path.write_bytes(b"rubbish")
+    with pytest.raises(InputError, match="damaged"):
+        read_checkpoint(path, "these")
+    scene = ball_and_wall()
+    interrupted(scene, 0.0)
+    write_checkpoint(path, scene.state(), "these")
+    with pytest.raises(InputError, match="other settings or images"):
+        read_checkpoint(path, "those")
+
+
+def test_fingerprints_change_with_settings_and_images():
+    names = ["a.png", "b.png"]
+    own = fingerprint(DEFAULT, None, names)
+    assert own == fingerprint(ReconstructConfig(), None, names)
+    assert own != fingerprint(SMALL, None, names)
+    assert own != fingerprint(DEFAULT, 8, names)
+    assert own != fingerprint(DEFAULT, None, names[:1])
+
+
+def test_an_interrupted_command_resumes(room, tmp_path):
+    """Ctrl-C in the training leaves a result and a checkpoint; the rest is done later."""
+    call = [
+        "reconstruct", room, "-o", tmp_path, "--stride", 5, "--mapping.render-long-edge", 160,
+        "--search.least-steps", 1500, "--search.no-repeat", "--device", "cpu",
+    ]  # fmt: skip
+    checkpoint = tmp_path / "checkpoint.safetensors"
+    process = subprocess.Popen([*GEOGS, *map(str, call)], stderr=subprocess.PIPE, text=True)
+    deadline = time.monotonic() + 200
+    while not checkpoint.is_file() and process.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.05)
+    process.send_signal(signal.SIGINT)
+    _, said = process.communicate(timeout=200)
+    assert process.returncode == 0, said
+    assert "--resume goes on" in said
+    assert json.loads((tmp_path / "summary.json").read_text())["interrupted"] is True
+    assert checkpoint.is_file()
+    other = geogs(*call, "--resume", "--mapping.disk.opacity", 0.6)
+    assert other.returncode == 2
+    assert "other settings" in other.stderr.splitlines()[-1]
+    assert "Traceback" not in other.stderr
+    done = geogs(*call, "--resume")
+    assert done.returncode == 0, done.stderr
+    assert "Going on after" in done.stderr
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["interrupted"] is False
+    assert "depth" not in summary["seconds"]
+    assert not checkpoint.exists()
+    again = geogs(*call, "--resume")
+    assert again.returncode == 2
+    assert "nothing to resume" in again.stderr.splitlines()[-1]
+    seen = vertices(room / "points_seen_1cm.ply")
+    accuracy = cKDTree(seen).query(vertices(tmp_path / "mesh.ply")[::7])[0]
+    assert np.median(accuracy) < 0.01

@@ -410,6 +410,9 @@ class SearchConfig:
     """Fewest training steps where no time is given."""
     most_steps_per_view: int = 200
     """Most training steps for every image, whatever the time."""
+    depth_share: float = 0.6
+    """Most of the time up to then that the depths may take, in (0, 1]; images for which it does not
+    last get none and only serve to find those of the others."""
     output_share: float = 0.2
     """Part of a given time that is kept for the mesh and the report, in [0, 1)."""
     first_edge: int = 128

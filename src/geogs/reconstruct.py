@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -12,8 +13,11 @@ from geogs.config import ReconstructConfig
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.mapping import known_poses as known
+from geogs.mapping.depth_schedule import search_depths
 from geogs.mapping.map_frame import MapFrame
 from geogs.mapping.mapper import Mapper
+from geogs.mapping.state import MapperState, mapper_state, restore_mapper
+from geogs.mapping.training import TrainingPlace
 from geogs.splat.map import DiskParameters
 from geogs.stopwatch import Stopwatch
 from geogs.threads import on_one_torch_thread
@@ -25,6 +29,23 @@ Progress = Callable[[str, float], None]
 
 def _silent(stage: str, fraction: float) -> None:
     """Progress that nobody watches."""
+
+
+# Steps after which their time tells that of the next ones.
+_TELLING_STEPS = 100
+
+
+@dataclass(frozen=True, eq=False)
+class ReconstructionState:
+    """The work of a reconstruction after its depths, to go on from later."""
+
+    mapper: MapperState
+    origin: Float64[np.ndarray, "3"]
+    """World coordinates of the map's origin."""
+    unit: float
+    """Length of a map unit in the world."""
+    seconds: float
+    """Spent since the images had been read."""
 
 
 class Reconstruction:
@@ -56,6 +77,11 @@ class Reconstruction:
     def frames(self) -> int:
         """Images added so far."""
         return len(self._poses)
+
+    @property
+    def with_depth(self) -> int:
+        """Images whose depth has been searched: those that make the map."""
+        return len(self.mapper.mapped)
 
     @property
     def elapsed(self) -> float:
@@ -105,8 +131,26 @@ class Reconstruction:
                     self.mapper.check_depths()
                     self.mapper.grow()
         progress("growing", 1.0)
-        with self.stopwatch("training"):
-            self.mapper.train(self._steps(), lambda f: progress("training", f), self._end)
+        self._train(TrainingPlace(), progress)
+
+    def state(self) -> ReconstructionState:
+        """The work so far, to ``resume`` from; there is some once "growing" was reported."""
+        return ReconstructionState(
+            mapper_state(self.mapper), self._frame.origin, self._frame.unit, self.elapsed
+        )
+
+    @on_one_torch_thread
+    def resume(self, state: ReconstructionState, progress: Progress = _silent) -> None:
+        """Instead of ``finish``, with the same images and settings: go on from the work of another.
+
+        The time that it took counts.
+        """
+        self._begin = time.perf_counter() - state.seconds
+        self._end = None if self._end is None else self._end - state.seconds
+        self._frame = MapFrame(state.origin, state.unit)
+        self.mapper.move([self._frame.pose(T_cw) for T_cw in self._poses])
+        restore_mapper(self.mapper, state.mapper)
+        self._train(state.mapper.trained, progress)
 
     def trajectory(self) -> Trajectory:
         """The given poses."""
@@ -146,25 +190,38 @@ class Reconstruction:
         return known.first_points(views, self.camera, depth, self.config.search, progress)
 
     def _search(self, points: np.ndarray, progress: Callable[[float], None]) -> None:
-        """Depths of all images; twice if time allows, the second time where the first found it."""
+        """Depths of the images; twice if time allows, the second time where the first found it.
+
+        Of fewer images where time is short, evenly spread.
+        """
         start, search, mapper = time.perf_counter(), self.config.search, self.mapper
+        until = None if self._end is None else start + search.depth_share * (self._end - start)
         views, ids = list(mapper.views.values()), mapper.keyframe_ids
         known.expect_depths(views, points, self.camera, search.margin)
         share = 0.5 if search.repeat else 1.0
-        mapper.search_depths(ids, lambda f: progress(share * f))
+        search_depths(mapper, ids, lambda f: progress(share * f), until)
         now = time.perf_counter()
-        if search.repeat and (self._end is None or 3 * (now - start) < self._end - now):
+        affordable = self._end is None or 3 * (now - start) < self._end - now
+        if search.repeat and affordable and len(mapper.mapped) == len(ids):
             mapper.check_depths()
             sure = known.dense_points(views, mapper.cameras.render, self._random)
             if len(sure) >= known.FEWEST_POINTS:
                 known.expect_depths(views, sure, self.camera, search.margin)
-            mapper.search_depths(ids, lambda f: progress(share + share * f))
+            search_depths(mapper, ids, lambda f: progress(share + share * f))
+        progress(1.0)
 
-    def _steps(self) -> int:
+    def _train(self, start: TrainingPlace, progress: Progress) -> None:
+        with self.stopwatch("training"):
+            steps = self._steps(start)
+            self.mapper.train(steps, lambda f: progress("training", f), self._end, start)
+
+    def _steps(self, start: TrainingPlace) -> int:
         """As many training steps as the time allows, or the usual number where none is given."""
         search, count = self.config.search, len(self.mapper.mapped)
         if self._end is None:
             return max(search.least_steps, search.steps_per_view * count)
-        seconds = self.mapper.seconds_per_step()
+        known = start.steps > _TELLING_STEPS
+        seconds = start.seconds / start.steps if known else self.mapper.seconds_per_step()
         left = max(self._end - time.perf_counter(), 0.0)
-        return int(np.clip(left / seconds, 1, search.most_steps_per_view * count))
+        most = search.most_steps_per_view * count
+        return int(np.clip(start.steps + left / seconds, 1, most))

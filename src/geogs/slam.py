@@ -64,10 +64,10 @@ class Slam:
     @on_one_torch_thread
     def end_stream(self) -> None:
         """After the last frame: map what waits. What there is then is the online result."""
+        self._is_ended = True
         with self.stopwatch("tracking"):
             result = self.tracker.finish()
         self._map(result, lag=0)
-        self._is_ended = True
 
     @on_one_torch_thread
     def finish(self, progress: Progress = _silent, correct: bool = True) -> None:

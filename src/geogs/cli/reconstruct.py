@@ -2,6 +2,7 @@
 
 import re
 import sys
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,11 +17,14 @@ from geogs.config import ReconstructConfig
 from geogs.errors import InputError
 
 if TYPE_CHECKING:
+    from geogs.cli.checkpoint import Checkpoint
     from geogs.cli.snapshots import Snapshots
     from geogs.io.sources.posed.base import PosedSource
-    from geogs.reconstruct import Reconstruction
+    from geogs.reconstruct import Reconstruction, ReconstructionState
 
 _SECONDS = {"": 1.0, "s": 1.0, "m": 60.0, "min": 60.0, "h": 3600.0}
+# What is left of a budget at least, when reading and checking have used it up.
+_LEAST_SECONDS = 1.0
 
 
 @dataclass(frozen=True)
@@ -45,6 +49,11 @@ class ReconstructOptions(ReconstructConfig):
     from when the images have been read."""
     depth_mesh: bool = False
     """Also fuse the searched depths without the disks, to depth_fusion/mesh.ply."""
+    resume: bool = False
+    """Go on from the checkpoint that an earlier call left in the output folder."""
+    checkpoint_every: float = 30.0
+    """Seconds of training between two checkpoints (there is one after the depths, too); 0 makes
+    none."""
     device: str = "auto"
     """Where to compute: auto (a GPU where there is one), cpu, cuda or cuda:1; see geogs doctor."""
 
@@ -57,15 +66,16 @@ def main(argv: Sequence[str]) -> int:
 
 def reconstruct(options: ReconstructOptions) -> Path:
     """Reconstruct, write the results, say where they are; returns their folder."""
+    begin = time.perf_counter()
     budget = None if options.budget is None else seconds(options.budget)
     due = [seconds(text, "time") for text in options.snapshots.split(",") if text.strip()]
 
     import torch
 
     import geogs
-    from geogs.cli.results import SourceFacts, write_results
+    from geogs.cli.checkpoint import Checkpoint, fingerprint
+    from geogs.cli.gpu_memory import full_memory_in_a_sentence
     from geogs.cli.snapshots import Snapshots
-    from geogs.cli.surfaces import write_depth_mesh
     from geogs.gpu.installation import require_device
     from geogs.gpu.kernels import prepare_kernels
     from geogs.io.sources.posed.check import check_poses
@@ -78,58 +88,103 @@ def reconstruct(options: ReconstructOptions) -> Path:
     source = open_posed_source(options.source, options.input, options.hold_out)
     output = prepare_output_folder(options.output or Path("out") / source.name)
     if device.type == "cuda":
+        before = time.perf_counter()
         prepare_kernels(Path(geogs.__file__).parent, device)
-    warning = check_poses(source).warning if options.check_poses else None
-    scene = Reconstruction(source.camera, options, str(device), budget)
-    snapshots = Snapshots(due)
-    with Interruption() as stop, RunProgress(source.length, tracks=False) as progress:
-        progress.write(f"warning: {warning}" if warning else "")
-        finished = _reconstruct(scene, source, snapshots, progress, stop)
-        facts = SourceFacts(
-            source.name, source.kind, source.camera, source.intrinsics_origin,
-            scale=f"of the poses ({source.scene_scale})", held_out=tuple(source.held_out),
-        )  # fmt: skip
-        more = [lambda: snapshots.write(output, scene, options, progress)]
-        if options.depth_mesh:
-            more.append(lambda: write_depth_mesh(output, scene, options.mesh, progress))
-        write_results(output, scene, facts, options, not finished, progress, more)
+        begin += time.perf_counter() - before  # compiling, once per machine, is in no budget
+    progress = RunProgress(source.length, tracks=False)
+    names = [Path(source.label(i)).name for i in range(len(source))]
+    made_from = fingerprint(options, options.hold_out, names)
+    checkpoint = Checkpoint(output, made_from, options.checkpoint_every, progress)
+    with full_memory_in_a_sentence(), Interruption() as stop, progress:
+        resumed = checkpoint.read() if options.resume else None
+        if options.check_poses and resumed is None:
+            warning = check_poses(source).warning
+            progress.write(f"warning: {warning}" if warning else "")
+        if budget is not None:
+            budget = max(budget - (time.perf_counter() - begin), _LEAST_SECONDS)
+        scene = Reconstruction(source.camera, options, str(device), budget)
+        attendance = _Attendance(scene, progress, Snapshots(due), checkpoint, stop)
+        finished = _reconstruct(scene, source, resumed, attendance)
+        _write(output, scene, source, options, attendance, not finished)
+    if finished:
+        checkpoint.remove()
     print(f"Results are in {output}/")
     return output
+
+
+@dataclass(frozen=True)
+class _Attendance:
+    """Everything that happens at a report of progress."""
+
+    scene: "Reconstruction"
+    progress: RunProgress
+    snapshots: "Snapshots"
+    checkpoint: "Checkpoint"
+    stop: Interruption
+
+    def report(self, stage: str, fraction: float) -> None:
+        """Show it, keep what is due, and stop if that was asked for."""
+        self.progress.stage(stage, fraction)
+        scene = self.scene
+        if stage == "growing" and scene.with_depth < scene.frames:
+            self.progress.write(
+                f"There is time for the depths of {scene.with_depth} of {scene.frames} images; the "
+                "others only help to find them. A longer --budget or a smaller "
+                "--mapping.render-long-edge takes them all."
+            )
+        self.snapshots.take(scene)
+        self.checkpoint.report(stage, scene)
+        self.stop.check()
 
 
 def _reconstruct(
     scene: "Reconstruction",
     source: "PosedSource",
-    snapshots: "Snapshots",
-    progress: RunProgress,
-    stop: Interruption,
+    resumed: "ReconstructionState | None",
+    attendance: _Attendance,
 ) -> bool:
     """Everything up to the trained map; false if a request to stop cut it short."""
-    import torch
-
-    from geogs.errors import DeviceError
-
-    def report(stage: str, fraction: float) -> None:
-        progress.stage(stage, fraction)
-        snapshots.take(scene)
-        stop.check()
-
     try:
         for image in source:
             scene.add(image.image, image.T_cw, image.mask, image.timestamp)
-            report("reading", scene.frames / source.length)
-        scene.finish(None if source.points is None else source.points.positions, report)
+            attendance.report("reading", scene.frames / source.length)
+        if resumed is not None:
+            scene.resume(resumed, attendance.report)
+        else:
+            points = None if source.points is None else source.points.positions
+            scene.finish(points, attendance.report)
     except KeyboardInterrupt:
         if not len(scene.snapshot()):
             raise
-        progress.write("Stopping early; keeping what there is. Press Ctrl-C again to quit.")
+        keeping = "Stopping early; keeping what there is. Press Ctrl-C again to quit."
+        attendance.progress.write(keeping)
+        if attendance.checkpoint.write(scene):
+            attendance.progress.write("The same command with --resume goes on from here.")
         return False
-    except torch.cuda.OutOfMemoryError as error:
-        raise DeviceError(
-            "The memory of the GPU is full; use fewer images (--stride), a smaller --long-edge, a "
-            "GPU with more memory, or --device cpu."
-        ) from error
     return True
+
+
+def _write(
+    output: Path,
+    scene: "Reconstruction",
+    source: "PosedSource",
+    options: ReconstructOptions,
+    attendance: _Attendance,
+    interrupted: bool,
+) -> None:
+    """All files of the result."""
+    from geogs.cli.results import SourceFacts, write_results
+    from geogs.cli.surfaces import write_depth_mesh
+
+    progress = attendance.progress
+    facts = SourceFacts(
+        source.name, source.kind, source.camera, source.intrinsics_origin,
+        scale=f"of the poses ({source.scene_scale})", held_out=tuple(source.held_out),
+    )  # fmt: skip
+    more = [lambda: attendance.snapshots.write(output, scene, options, progress)]
+    if options.depth_mesh:
+        more.append(lambda: write_depth_mesh(output, scene, options.mesh, progress))
+    write_results(output, scene, facts, options, interrupted, progress, more)
 
 
 def seconds(text: str, what: str = "budget") -> float:

@@ -51,6 +51,7 @@ def run(options: RunOptions) -> Path:
     import torch
 
     import geogs
+    from geogs.cli.gpu_memory import REMEDY, full_memory_in_a_sentence
     from geogs.cli.results import SourceFacts, write_results
     from geogs.cli.surfaces import write_depth_mesh, write_online_results
     from geogs.errors import DeviceError
@@ -67,7 +68,8 @@ def run(options: RunOptions) -> Path:
     if device.type == "cuda":
         prepare_kernels(Path(geogs.__file__).parent, device)
     slam = Slam(source.camera, options, str(device))
-    with Interruption() as stop, RunProgress(source.length) as progress:
+    progress = RunProgress(source.length)
+    with full_memory_in_a_sentence(), Interruption() as stop, progress:
         full = not _feed(slam, source, progress, stop)
         interrupted = full or stop.requested
         if interrupted:
@@ -85,7 +87,7 @@ def run(options: RunOptions) -> Path:
     if full:
         raise DeviceError(
             f"The memory of the GPU was full after {slam.frames} frames, whose results are in "
-            f"{output}/; use a smaller --long-edge, a GPU with more memory, or --device cpu."
+            f"{output}/; {REMEDY}."
         )
     print(f"Results are in {output}/")
     return output
@@ -108,7 +110,8 @@ def _feed(slam: "Slam", source: "Source", progress: RunProgress, stop: Interrupt
 
 
 def _finish(slam: "Slam", progress: RunProgress, stop: Interruption, correct: bool) -> bool:
-    """The final stages; false if a request to stop cut them short."""
+    """The final stages; false if a request to stop or a full GPU cut them short."""
+    import torch
 
     def report(stage: str, fraction: float) -> None:
         progress.stage(stage, fraction)
@@ -117,6 +120,10 @@ def _finish(slam: "Slam", progress: RunProgress, stop: Interruption, correct: bo
     try:
         slam.finish(report, correct)
     except KeyboardInterrupt:
+        return False
+    except torch.cuda.OutOfMemoryError:
+        torch.cuda.empty_cache()
+        progress.write("The GPU has no memory left for the final stages; keeping what there is.")
         return False
     return True
 

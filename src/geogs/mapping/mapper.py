@@ -15,7 +15,13 @@ from geogs.mapping.depth_engine import depth_engine
 from geogs.mapping.map_update import MapUpdate, plan_update
 from geogs.mapping.rendered import rendered_keyframe, searched_keyframe
 from geogs.mapping.sweep_neighbors import select_sweep_neighbours
-from geogs.mapping.training import Batch, MapTrainer, draw_partners, map_trainer
+from geogs.mapping.training import (
+    Batch,
+    MapTrainer,
+    TrainingPlace,
+    draw_partners,
+    map_trainer,
+)
 from geogs.mapping.view import MapCameras, MapView
 from geogs.mapping.window import choose_partners, draw_views
 from geogs.splat.density import (
@@ -27,6 +33,7 @@ from geogs.splat.density import (
 )
 from geogs.splat.init import new_disks
 from geogs.splat.map import DiskParameters, GaussianMap
+from geogs.splat.optimizer import MapOptimizer
 from geogs.splat.render import render
 from geogs.types import Keyframe, PoseCorrection, RenderedKeyframe
 
@@ -42,8 +49,6 @@ def _silent(fraction: float) -> None:
 _CHECKING_VIEWS = 8
 # Steps of the final training between two reports of progress, at least.
 _REPORTED_STEPS = 20
-# Keyframes whose depths are searched in one go.
-_SEARCHED_AT_ONCE = 16
 # Steps from which the time of one is judged.
 _REHEARSED_STEPS = 16
 
@@ -65,6 +70,8 @@ class Mapper:
         )
         self.views: dict[int, MapView] = {}
         self.mapped: list[int] = []
+        self.trained = TrainingPlace()
+        """How far the training over all keyframes is, at each report of its progress."""
         self._trainer: MapTrainer | None = None
         self._random = np.random.default_rng(seed)
         self._torch_random = torch.Generator().manual_seed(seed)
@@ -152,16 +159,10 @@ class Mapper:
         for view, T_cw in zip(self.views.values(), poses, strict=True):
             view.move(T_cw)
 
-    def search_depths(self, keyframe_ids: list[int], progress: Progress = _silent) -> None:
-        """Depths of some keyframes from their images; those that get one are mapped.
-
-        In groups, between which an exception raised by ``progress`` loses nothing.
-        """
-        for start in range(0, len(keyframe_ids), _SEARCHED_AT_ONCE):
-            group = keyframe_ids[start : start + _SEARCHED_AT_ONCE]
-            self._estimate([self.views[i] for i in group])
-            self.mapped += [i for i in group if i not in self.mapped]
-            progress(min(1.0, (start + len(group)) / len(keyframe_ids)))
+    def search_depths(self, keyframe_ids: list[int]) -> None:
+        """Depths of some keyframes from their images; they are mapped then."""
+        self._estimate([self.views[i] for i in keyframe_ids])
+        self.mapped = sorted({*self.mapped, *keyframe_ids})
 
     def check_depths(self) -> None:
         """Let the depths of all mapped keyframes revise each other, once per search."""
@@ -169,18 +170,29 @@ class Mapper:
 
     def grow(self) -> None:
         """Carve the map with all mapped keyframes, and add what their depths show beyond it."""
-        views = [self.views[i] for i in self.mapped]
-        for view in views:
-            self._choose_partners(view)
+        self.choose_partners()
         self.prune()
-        for view in views:
-            self._insert(view, self.config.disk.insert_confidence)
+        for i in self.mapped:
+            self._insert(self.views[i], self.config.disk.insert_confidence)
 
-    def train(self, steps: int, progress: Progress = _silent, until: float | None = None) -> None:
+    def choose_partners(self) -> None:
+        """Photometric partners of all mapped keyframes."""
+        for i in self.mapped:
+            self._choose_partners(self.views[i])
+
+    def train(
+        self,
+        steps: int,
+        progress: Progress = _silent,
+        until: float | None = None,
+        start: TrainingPlace | None = None,
+    ) -> None:
         """Single-view steps over all mapped keyframes; disks that none has seen go.
 
-        Fewer steps where they would last beyond ``until``, a time of ``time.perf_counter``.
+        Fewer steps where they would last beyond ``until``, a time of ``time.perf_counter``. A
+        training that was cut off goes on from ``start``.
         """
+        self.trained = start or TrainingPlace()
         self._train_all([self.views[i] for i in self.mapped], steps, progress, until)
         self.prune()
         self._training().optimizer.keep(self.map.seen > 0)
@@ -209,6 +221,11 @@ class Mapper:
     def depth_maps(self) -> list[RenderedKeyframe]:
         """The dense depths of the mapped keyframes, weighted by confidence: no disk is in them."""
         return [searched_keyframe(self.views[i], self.cameras.render) for i in self.mapped]
+
+    @property
+    def optimizer(self) -> MapOptimizer:
+        """What changes the map, once a keyframe is mapped."""
+        return self._training().optimizer
 
     @property
     def unit(self) -> float:
@@ -311,15 +328,15 @@ class Mapper:
 
         The rates fall with the steps or with the time, whichever is nearer to its end.
         """
-        start = time.perf_counter()
+        start = time.perf_counter() - self.trained.seconds
         trainer = self._training()
         fills, prunes = {total // 3, 2 * total // 3}, max(total // 4, 1)
         splits = {int(total * part) for part in self.config.disk.split_times}
         events = fills | splits | set(range(prunes, total, prunes))
         stops = sorted(events | set(range(_REPORTED_STEPS, total, _REPORTED_STEPS)) | {total})
         order: list[int] = []
-        done = 0
-        for stop in stops:
+        done = self.trained.steps
+        for stop in (stop for stop in stops if stop > done):
             late = 0.0
             if until is not None:
                 late = (time.perf_counter() - start) / max(until - start, 1e-9)
@@ -341,6 +358,7 @@ class Mapper:
             if done in fills:
                 for view in views:
                     self._insert(view, self.config.disk.fill_confidence)
+            self.trained = TrainingPlace(done, total, time.perf_counter() - start)
             progress(done / total)
 
     def _split(self) -> None:

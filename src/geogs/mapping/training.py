@@ -1,6 +1,7 @@
 """Training the map: losses of some views, gradients, Adam."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -21,6 +22,18 @@ Batch = list[tuple[MapView, list[MapView]]]
 
 GRADIENT_LIMIT = 1e3
 """A disk whose gradient exceeds this has met a numerical accident (a nearly edge-on pixel)."""
+
+
+@dataclass(frozen=True, slots=True)
+class TrainingPlace:
+    """How far a long training is."""
+
+    steps: int = 0
+    """Done."""
+    total: int = 0
+    """To be done in all."""
+    seconds: float = 0.0
+    """Spent."""
 
 
 def learning_rates(config: MappingConfig, unit: float, factor: float = 1.0) -> LearningRates:

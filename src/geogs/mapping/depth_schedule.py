@@ -1,0 +1,56 @@
+"""The depths of many keyframes in an order and in groups that suit the time there is for them."""
+
+import time
+from collections.abc import Callable, Sequence
+
+from geogs.mapping.mapper import Mapper
+from geogs.threads import worker_count
+
+# Keyframes whose depths are searched in one go, at most; and at least, where time is short.
+_AT_ONCE, _AT_LEAST = 16, 4
+
+
+def spread_order(items: Sequence[int]) -> list[int]:
+    """The items so that those of every beginning are spread evenly over all of them.
+
+    The first, then the middle one, then those at the quarters: by the reversed bits of their place.
+    """
+    bits = max(len(items) - 1, 1).bit_length()
+    places = sorted(range(len(items)), key=lambda i: int(f"{i:0{bits}b}"[::-1], 2))
+    return [items[i] for i in places]
+
+
+def search_depths(
+    mapper: Mapper,
+    keyframe_ids: Sequence[int],
+    progress: Callable[[float], None],
+    until: float | None = None,
+) -> None:
+    """Search the depths of keyframes in groups; those that get one are mapped.
+
+    An exception raised by ``progress`` loses nothing of the groups before. With ``until``, a time
+    of ``time.perf_counter``, evenly spread keyframes come first, in small groups; as soon as the
+    next group would last longer the rest is left without depth; the first group is always done.
+    """
+    ids = list(keyframe_ids) if until is None else spread_order(keyframe_ids)
+    begin, done = time.perf_counter(), 0
+    while done < len(ids):
+        size = _AT_ONCE if until is None else _affordable(begin, done, until)
+        if size == 0:
+            break
+        group = ids[done : done + size]
+        mapper.search_depths(group)
+        done += len(group)
+        if until is not None:  # a GPU works behind; reading something from it waits
+            float(mapper.views[group[-1]].typical_depth)
+        progress(done / len(ids))
+
+
+def _affordable(begin: float, done: int, until: float) -> int:
+    """How many keyframes to search next, at the pace so far; none if time allows too few."""
+    least = max(_AT_LEAST, worker_count())
+    if done == 0:
+        return least
+    now = time.perf_counter()
+    count = int((until - now) * done / max(now - begin, 1e-9))
+    return 0 if count < least else min(count, max(_AT_ONCE, least))
