@@ -425,6 +425,36 @@ class SearchConfig:
     """Search all depths a second time, between the limits that the first time has shown."""
 
 
+def known_pose_mapping() -> MappingConfig:
+    """Mapping where poses are exact: the images say more about the surface than the first depths.
+
+    So photo-consistency weighs more than in a run, down to faint texture, and the occlusion test is
+    sharper; disks move in smaller steps.
+    """
+    loss = LossConfig(
+        depth_weight=0.5,
+        normal_consistency_weight=0.05,
+        distortion_weight=0.2,
+        opacity_weight=0.1,
+        silhouette_weight=0.3,
+        l1_weight=4.0,
+        l1_huber=0.005,
+        l1_cut=0.1,
+        ncc_patch=5,
+        ncc_reject=0.5,
+        ncc_min_variance=1e-8,
+        ncc_texture=1e-6,
+        occlusion=1.0,
+    )
+    return MappingConfig(
+        lr_position=3e-4,
+        lr_final=0.03,
+        max_spread=0.003,
+        photo=PhotoConfig(per_step=4),
+        loss=loss,
+    )
+
+
 @dataclass(frozen=True)
 class ReconstructConfig:
     """All settings of a reconstruction from known poses."""
@@ -433,7 +463,7 @@ class ReconstructConfig:
     """Random seed; same seed, same machine and no time limit, same result on the CPU."""
     input: InputConfig = field(default_factory=InputConfig)
     search: SearchConfig = field(default_factory=SearchConfig)
-    mapping: MappingConfig = field(default_factory=MappingConfig)
+    mapping: MappingConfig = field(default_factory=known_pose_mapping)
     mesh: MeshConfig = field(default_factory=MeshConfig)
 
 
@@ -454,4 +484,29 @@ def preset(name: Preset) -> Config:
     if name == "accurate":
         mapping = replace(base.mapping, render_long_edge=400, iterations=15, final_iterations=1500)
         return replace(base, input=replace(base.input, long_edge=640), mapping=mapping)
+    return base
+
+
+def reconstruct_preset(name: Preset) -> ReconstructConfig:
+    """The settings of a preset for known poses.
+
+    ``fast`` works on small images and searches depths once; ``accurate``, for a GPU, renders at the
+    size of the images.
+    """
+    base = ReconstructConfig()
+    if name == "fast":
+        return replace(
+            base,
+            input=replace(base.input, long_edge=400),
+            search=replace(base.search, repeat=False, steps_per_view=15),
+            mapping=replace(base.mapping, render_long_edge=256),
+        )
+    if name == "accurate":
+        disk = replace(base.mapping.disk, stride=5)
+        return replace(
+            base,
+            input=replace(base.input, long_edge=800),
+            search=replace(base.search, steps_per_view=200, most_steps_per_view=1000),
+            mapping=replace(base.mapping, render_long_edge=800, photo_scale=1.0, disk=disk),
+        )
     return base

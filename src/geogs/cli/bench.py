@@ -174,8 +174,6 @@ def _wishes(options: BenchOptions, benchmark: "Benchmark") -> "Wishes":
 
     common = [Option("device", options.device), Option("seed", str(options.seed))]
     if options.preset:
-        if benchmark.command != "run":
-            raise InputError(f"--preset is for SLAM; {benchmark.name} starts from known poses.")
         common.append(Option("preset", options.preset))
     if options.depth_fusion:
         common.append(Option("depth-mesh"))

@@ -50,6 +50,18 @@ def parse_options(
     )
 
 
+def given(argv: Sequence[str], name: str) -> str | None:
+    """The value that arguments give an option, by which others' defaults are chosen; none if none.
+
+    ``name`` is without hyphens; ``--name value`` and ``--name=value`` are the same.
+    """
+    for argument, following in zip(argv, [*argv[1:], ""], strict=True):
+        option, equals, value = argument.partition("=")
+        if option == f"--{name}":
+            return value if equals else following
+    return None
+
+
 def _expand(argument: str, short: Mapping[str, str]) -> str:
     name, equals, value = argument.partition("=")
     return short.get(name, name) + equals + value

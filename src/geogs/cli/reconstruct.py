@@ -6,14 +6,14 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, get_args
 
 import tyro
 
 from geogs.cli.interrupt import Interruption
-from geogs.cli.options import SHORT, parse_options
+from geogs.cli.options import SHORT, given, parse_options
 from geogs.cli.progress import RunProgress
-from geogs.config import ReconstructConfig
+from geogs.config import Preset, ReconstructConfig, reconstruct_preset
 from geogs.errors import InputError
 
 if TYPE_CHECKING:
@@ -38,6 +38,9 @@ class ReconstructOptions(ReconstructConfig):
     """Folder of images with poses, or the file with the poses."""
     output: Path | None = None
     """Folder for the results (also -o); out/NAME if none is given."""
+    preset: Preset = "default"
+    """Group of settings; single ones given beside it win. Without it, accurate on a GPU and default
+    on a CPU."""
     budget: str | None = None
     """About how long it may take in all, such as 90s, 10m or 1h; none trains until it is good."""
     check_poses: bool = True
@@ -201,14 +204,30 @@ def seconds(text: str, what: str = "budget") -> float:
 
 
 def parse(argv: Sequence[str]) -> ReconstructOptions:
-    """Options, some of which have short names."""
-    return parse_options(
-        ReconstructOptions,
-        argv,
-        "reconstruct",
-        default=ReconstructOptions(source=tyro.MISSING),
-        short=SHORT,
-    )
+    """Options with the preset as defaults, over which single settings win."""
+    name = _preset_name(argv)
+    base = reconstruct_preset(name)
+    default = ReconstructOptions(
+        seed=base.seed, input=base.input, search=base.search, mapping=base.mapping, mesh=base.mesh,
+        source=tyro.MISSING, preset=name,
+    )  # fmt: skip
+    return parse_options(ReconstructOptions, argv, "reconstruct", default=default, short=SHORT)
+
+
+def _preset_name(argv: Sequence[str]) -> Preset:
+    """The preset asked for, else the one that suits the device.
+
+    A wrong one is left for the option parser to complain about.
+    """
+    asked = given(argv, "preset")
+    if asked is not None or "--help" in argv or "-h" in argv:
+        return next((name for name in get_args(Preset) if name == asked), "default")
+    device = given(argv, "device") or "auto"
+    if device == "auto":
+        from geogs.gpu.installation import gpu_problem
+
+        device = "cpu" if gpu_problem() else "cuda"
+    return "accurate" if device.startswith("cuda") else "default"
 
 
 if __name__ == "__main__":

@@ -4,12 +4,12 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, get_args
 
 import tyro
 
 from geogs.cli.interrupt import Interruption
-from geogs.cli.options import SHORT, parse_options
+from geogs.cli.options import SHORT, given, parse_options
 from geogs.cli.progress import RunProgress
 from geogs.config import Config, Preset, preset
 
@@ -142,11 +142,8 @@ def parse(argv: Sequence[str]) -> RunOptions:
 
 def _preset_name(arguments: Sequence[str]) -> Preset:
     """The preset asked for; a wrong one is left for the option parser to complain about."""
-    for i, argument in enumerate(arguments):
-        value = argument.partition("=")[2] or next(iter(arguments[i + 1 : i + 2]), "")
-        if argument.startswith("--preset") and value in ("fast", "default", "accurate"):
-            return value  # type: ignore[return-value]  # just tested
-    return "default"
+    asked = given(arguments, "preset")
+    return next((name for name in get_args(Preset) if name == asked), "default")
 
 
 if __name__ == "__main__":
