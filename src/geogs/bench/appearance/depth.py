@@ -1,16 +1,23 @@
 """Depth of coloured disks: where each pixel's ray crosses its median disk."""
 
+import math
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from geogs.bench.appearance.disks import AppearanceDisks
 from geogs.bench.appearance.rasteriser import MedianDisks
-from geogs.bench.appearance.reference import PIXEL_SHARPNESS
+from geogs.bench.appearance.reference import MIN_ALPHA, PIXEL_SHARPNESS
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import quaternion_to_matrix
 
-_MIN_FACING = 1e-6
+_MIN_FACING = 0.1
+"""Smallest cosine between a ray and the normal of a disk whose plane it is crossed with."""
+_DEVIATIONS = 3.0
+"""A crossing lies within so many of the disk's larger standard deviations, and besides ..."""
+_PIXELS = math.sqrt(-2 * math.log(MIN_ALPHA) / PIXEL_SHARPNESS)
+"""... within so many pixels of the centre: as far as the smallest disk can be seen."""
 
 
 @torch.no_grad()
@@ -21,11 +28,12 @@ def crossing_depth(
     T_cw: Float[Tensor, "4 4"],
     min_alpha: float,
 ) -> Float[Tensor, "h w"]:
-    """z of the ray's crossing with the median disk; 0 where alpha is below ``min_alpha``.
+    """z of the ray's crossing with the plane of the median disk; 0 below ``min_alpha``.
 
-    Where the pixel sees a disk only because none shrinks below a pixel (seen from the side, or
-    far away), the crossing may be anywhere, and the depth of the centre is taken (Huang et al.
-    2024, Sec. 4.2).
+    The plane counts also where the pixel sees the disk only because none shrinks below a pixel:
+    for disks of a pixel that is most of the image, and the centre's depth would make it a
+    staircase. The centre's depth is taken where ray and plane are nearly parallel and where the
+    crossing is farther from the centre than the disk can be seen.
     """
     has_depth = (median.index >= 0) & (median.alpha >= min_alpha)
     rows = median.index[has_depth]
@@ -43,14 +51,13 @@ def _crossing(
     camera: Camera,
     T_cw: Float[Tensor, "4 4"],
 ) -> Float[Tensor, "m"]:
-    R = (T_cw[:3, :3] @ quaternion_to_matrix(disks.quaternions))[rows]
+    normal = quaternion_to_matrix(disks.quaternions)[..., 2] @ T_cw[:3, :3].T
+    normal = normal[rows]
     centre = (disks.means @ T_cw[:3, :3].T + T_cw[:3, 3])[rows]
-    facing = (rays * R[..., 2]).sum(-1)
-    is_seen_flat = facing.abs() > _MIN_FACING
-    z = (centre * R[..., 2]).sum(-1) / torch.where(is_seen_flat, facing, 1.0)
-    hit = z[:, None] * rays - centre
-    local = torch.einsum("mij,mi->mj", R[..., :2], hit) / disks.scales[rows]
-    focal = rays.new_tensor([camera.fx, camera.fy])
-    pixels = (rays[:, :2] - centre[:, :2] / centre[:, 2:]) * focal
-    by_disk = local.square().sum(-1) <= PIXEL_SHARPNESS * pixels.square().sum(-1)
-    return torch.where(is_seen_flat & by_disk & (z > 0), z, centre[:, 2])
+    facing = (rays * normal).sum(-1)
+    is_seen_flat = facing.abs() > _MIN_FACING * rays.norm(dim=-1)
+    z = (centre * normal).sum(-1) / torch.where(is_seen_flat, facing, 1.0)
+    distance = (z[:, None] * rays - centre).norm(dim=-1)
+    pixel = centre[:, 2] / min(camera.fx, camera.fy)
+    reach = _DEVIATIONS * disks.scales.amax(1)[rows] + _PIXELS * pixel
+    return torch.where(is_seen_flat & (distance <= reach) & (z > 0), z, centre[:, 2])

@@ -1,15 +1,24 @@
 """Coloured disks through the CUDA operators of gsplat (Apache-2.0)."""
 
+from dataclasses import dataclass
 from types import ModuleType
 
 import torch
-from jaxtyping import Float
+import torch.nn.functional as F
+from jaxtyping import Float, Int32
 from torch import Tensor
 
 from geogs.bench.appearance.disks import AppearanceDisks
-from geogs.bench.appearance.rasteriser import MedianDisks, Rendering, shifted_matrix
+from geogs.bench.appearance.rasteriser import (
+    MedianDisks,
+    Rendering,
+    normals_of_depth,
+    shifted_matrix,
+)
 from geogs.errors import DeviceError, InputError
 from geogs.geometry.camera import Camera
+
+_TILE = 16
 
 
 def import_gsplat() -> ModuleType:
@@ -27,8 +36,25 @@ def import_gsplat() -> ModuleType:
     return gsplat
 
 
+@dataclass(frozen=True)
+class _Projection:
+    """Disks in one image, as gsplat's operators pass them on; the first axis is the image."""
+
+    radii: Int32[Tensor, "1 n 2"]
+    """Half sizes in pixels of the boxes around the disks; 0 for those that are not shown."""
+    means: Float[Tensor, "1 n 2"]
+    depths: Float[Tensor, "1 n"]
+    transforms: Float[Tensor, "1 n 3 3"]
+    normals: Float[Tensor, "1 n 3"]
+    screen: Float[Tensor, "1 n 2"]
+    """Zero; gets the gradient that densification looks at."""
+
+
 class GsplatRasteriser:
-    """gsplat's ``rasterization_2dgs``; needs an NVIDIA GPU.
+    """The image of gsplat's ``rasterization_2dgs``; needs an NVIDIA GPU.
+
+    The operators are called one by one, since the function as a whole inverts the camera's pose
+    up to three times an image, and each time the host waits for the GPU.
 
     Raises:
         InputError: gsplat is not installed.
@@ -36,9 +62,10 @@ class GsplatRasteriser:
     """
 
     def __init__(self, near: float) -> None:
-        self._rasterize = import_gsplat().rasterization_2dgs
+        self._gsplat = import_gsplat()
         self._near = near
         self._matrices: dict[Camera, Tensor] = {}
+        self._rays: dict[Camera, Tensor] = {}
         if not torch.cuda.is_available():
             raise DeviceError("The appearance baseline needs an NVIDIA GPU; there is none here.")
 
@@ -52,24 +79,29 @@ class GsplatRasteriser:
         with_normals: bool,
     ) -> Rendering:
         """As :class:`geogs.bench.appearance.rasteriser.Rasteriser` says."""
-        colour, alpha, normal, depth_normal, _, _, meta = self._call(
-            disks,
-            camera,
-            T_cw,
-            colors=disks.coefficients,
-            sh_degree=sh_degree,
-            backgrounds=None if background is None else background[None],
-            render_mode="RGB+ED" if with_normals else "RGB",
+        projection = self._project(disks, camera, T_cw)
+        visible = (projection.radii > 0).all(-1)
+        directions = disks.means + T_cw[:3, 3] @ T_cw[:3, :3]
+        colours = self._gsplat.spherical_harmonics(
+            sh_degree, directions[None], disks.coefficients[None], masks=visible
         )
-        height, width = camera.height, camera.width
-        screen = meta["gradient_2dgs"]
+        channels = (colours + 0.5).clamp(min=0)
+        if with_normals:
+            channels = torch.cat([channels, projection.depths[..., None]], -1)
+        if background is not None:
+            background = F.pad(background, (0, channels.shape[-1] - 3))[None]
+        image, alpha, normal, _, _ = self._blend(disks, camera, projection, channels, background)
+        depth_normal = None
+        if with_normals:
+            depth = image[0, ..., 3] / alpha[0, ..., 0].clamp(min=1e-10)
+            depth_normal = normals_of_depth(depth, self._directions(camera, T_cw.device))
         return Rendering(
-            colour[0, ..., :3],
+            image[0, ..., :3],
             alpha[0, ..., 0],
             normal[0] if with_normals else None,
-            depth_normal.reshape(height, width, 3) if with_normals else None,
-            screen,
-            (meta["radii"][0] > 0).all(-1),
+            depth_normal,
+            projection.screen,
+            visible[0],
         )
 
     @torch.no_grad()
@@ -85,28 +117,58 @@ class GsplatRasteriser:
             raise InputError(f"{len(disks)} disks are too many to tell apart; use fewer points.")
         device = disks.means.device
         numbers = torch.arange(1, len(disks) + 1, device=device, dtype=torch.float32)
-        result = self._call(disks, camera, T_cw, colors=numbers[None, :, None], render_mode="RGB")
-        alpha, median = result[1][0, ..., 0], result[5][0, ..., 0]
+        projection = self._project(disks, camera, T_cw)
+        result = self._blend(disks, camera, projection, numbers[None, :, None], None)
+        alpha, median = result[1][0, ..., 0], result[4][0, ..., 0]
         index = median.round().long() - 1
         return MedianDisks(torch.where(alpha > 0, index, -1), alpha)
 
-    def _call(
-        self, disks: AppearanceDisks, camera: Camera, T_cw: Tensor, **options: object
-    ) -> tuple:
+    def _project(self, disks: AppearanceDisks, camera: Camera, T_cw: Tensor) -> _Projection:
         # The third scale is not used by the operators, but its column must be there.
-        scales = torch.nn.functional.pad(disks.scales, (0, 1), value=1.0)
-        return self._rasterize(
-            means=disks.means,
-            quats=disks.quaternions,
-            scales=scales,
-            opacities=disks.opacities,
-            viewmats=T_cw[None],
-            Ks=self._matrix(camera, T_cw.device)[None],
-            width=camera.width,
-            height=camera.height,
+        radii, means, depths, transforms, normals = self._gsplat.fully_fused_projection_2dgs(
+            disks.means,
+            disks.quaternions,
+            F.pad(disks.scales, (0, 1), value=1.0),
+            T_cw[None],
+            self._matrix(camera, T_cw.device)[None],
+            camera.width,
+            camera.height,
             near_plane=self._near,
-            packed=False,
-            **options,
+        )
+        screen = torch.zeros_like(means, requires_grad=torch.is_grad_enabled())
+        return _Projection(radii, means, depths, transforms, normals, screen)
+
+    def _blend(
+        self,
+        disks: AppearanceDisks,
+        camera: Camera,
+        projection: _Projection,
+        channels: Float[Tensor, "1 n c"],
+        background: Float[Tensor, "1 c"] | None,
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """Image, opacity, normals, distortion and median; (1, h, w, ...) each."""
+        tiles = -(-camera.width // _TILE), -(-camera.height // _TILE)
+        _, keys, rows = self._gsplat.isect_tiles(
+            projection.means.detach(),
+            projection.radii,
+            projection.depths.detach(),
+            _TILE,
+            *tiles,
+        )
+        starts = self._gsplat.isect_offset_encode(keys, 1, *tiles)
+        return self._gsplat.rasterize_to_pixels_2dgs(
+            projection.means,
+            projection.transforms,
+            channels,
+            disks.opacities[None],
+            projection.normals,
+            projection.screen,
+            camera.width,
+            camera.height,
+            _TILE,
+            starts,
+            rows,
+            backgrounds=background,
         )
 
     def _matrix(self, camera: Camera, device: torch.device) -> Float[Tensor, "3 3"]:
@@ -114,3 +176,9 @@ class GsplatRasteriser:
         if camera not in self._matrices:
             self._matrices[camera] = shifted_matrix(camera, device)
         return self._matrices[camera]
+
+    def _directions(self, camera: Camera, device: torch.device) -> Float[Tensor, "h w 3"]:
+        """Rays of the pixels on the device, kept."""
+        if camera not in self._rays:
+            self._rays[camera] = camera.rays(torch.float32, device)
+        return self._rays[camera]

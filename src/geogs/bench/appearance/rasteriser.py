@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
@@ -19,9 +20,9 @@ class Rendering:
     """RGB over the background, not clamped above."""
     alpha: Float[Tensor, "h w"]
     normal: Float[Tensor, "h w 3"] | None
-    """Blended normals of the disks, world frame, facing the camera; none if not asked for."""
+    """Blended normals of the disks, camera frame, facing the camera; none if not asked for."""
     depth_normal: Float[Tensor, "h w 3"] | None
-    """Normals of the expected depth, world frame; zero at the border; none if not asked for."""
+    """Normals of the expected depth, camera frame; zero at the border; none if not asked for."""
     screen: Float[Tensor, "*b n 2"]
     """Gets the gradient of each disk's place in the image, per pixel, in the backward pass."""
     visible: Bool[Tensor, "n"]
@@ -66,3 +67,14 @@ def shifted_matrix(camera: Camera, device: torch.device) -> Float[Tensor, "3 3"]
     K = camera.matrix()
     K[:2, 2] += 0.5
     return K.float().to(device)
+
+
+def normals_of_depth(
+    depth: Float[Tensor, "h w"], rays: Float[Tensor, "h w 3"]
+) -> Float[Tensor, "h w 3"]:
+    """Camera-frame normals by central differences, facing the camera, zero at the border."""
+    points = depth[..., None] * rays
+    down = points[2:, 1:-1] - points[:-2, 1:-1]
+    right = points[1:-1, 2:] - points[1:-1, :-2]
+    normals = F.normalize(torch.linalg.cross(down, right), dim=-1)
+    return F.pad(normals, (0, 0, 1, 1, 1, 1))

@@ -6,12 +6,11 @@ The same image as :mod:`geogs.bench.appearance.gsplat_rasteriser`, whose thresho
 from dataclasses import dataclass
 
 import torch
-import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
 from geogs.bench.appearance.disks import AppearanceDisks
-from geogs.bench.appearance.rasteriser import MedianDisks, Rendering
+from geogs.bench.appearance.rasteriser import MedianDisks, Rendering, normals_of_depth
 from geogs.bench.appearance.spherical_harmonics import view_colours
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import quaternion_to_matrix
@@ -66,7 +65,7 @@ class ReferenceRasteriser:
             normal = (blend.weight @ _facing_normals(disks, T_cw)[blend.rows]).reshape(*shape, 3)
             z = (disks.means @ T_cw[2, :3] + T_cw[2, 3])[blend.rows]
             expected = (blend.weight @ z) / blend.alpha.clamp(min=1e-10)
-            depth_normal = normals_of_depth(expected.reshape(shape), camera, T_cw)
+            depth_normal = normals_of_depth(expected.reshape(shape), camera.rays())
         visible = torch.zeros(len(disks), dtype=torch.bool, device=disks.means.device)
         visible[blend.rows] = blend.weight.detach().amax(0) > 0
         alpha = blend.alpha.reshape(shape)
@@ -101,17 +100,6 @@ class ReferenceRasteriser:
         return _Blend(rows, weight, before, screen)
 
 
-def normals_of_depth(
-    depth: Float[Tensor, "h w"], camera: Camera, T_cw: Float[Tensor, "4 4"]
-) -> Float[Tensor, "h w 3"]:
-    """World normals by central differences, facing the camera, zero at the border."""
-    points = camera.back_project(depth)
-    down = points[2:, 1:-1] - points[:-2, 1:-1]
-    right = points[1:-1, 2:] - points[1:-1, :-2]
-    normals = F.normalize(torch.linalg.cross(down, right), dim=-1)
-    return F.pad(normals @ T_cw[:3, :3], (0, 0, 1, 1, 1, 1))
-
-
 def _exponent(
     disks: AppearanceDisks,
     rows: Tensor,
@@ -137,7 +125,7 @@ def _exponent(
 def _facing_normals(disks: AppearanceDisks, T_cw: Tensor) -> Float[Tensor, "n 3"]:
     normals = quaternion_to_matrix(disks.quaternions)[..., 2]
     towards = ((disks.means - _centre(T_cw)) * normals).sum(-1, keepdim=True)
-    return torch.where(towards > 0, -normals, normals)
+    return torch.where(towards > 0, -normals, normals) @ T_cw[:3, :3].T
 
 
 def _centre(T_cw: Tensor) -> Float[Tensor, "3"]:

@@ -43,21 +43,21 @@ def camera_centres(views: list[TrainingView]) -> Float64[np.ndarray, "n 3"]:
 
 
 class DeviceView:
-    """A view whose image lies on the training device as bytes."""
+    """A view on the training device, with what does not change from one iteration to the next."""
 
     def __init__(self, view: TrainingView, device: torch.device) -> None:
         self.camera = view.camera
         self.T_cw: Float[Tensor, "4 4"] = torch.from_numpy(view.T_cw).float().to(device)
         """World to camera, float32."""
-        self._image = torch.from_numpy(view.image).to(device)
+        self.image: Float[Tensor, "h w 3"] = torch.from_numpy(view.image).to(device).float() / 255
+        """RGB in [0, 1]."""
         self.mask: Bool[Tensor, "h w 1"] | None = None
         """Pixels that count; none where all do."""
         if view.mask is not None:
             self.mask = torch.from_numpy(view.mask).to(device)[..., None]
 
     def target(self, background: Float[Tensor, "3"] | None) -> Float[Tensor, "h w 3"]:
-        """The image in [0, 1], with the background outside the mask."""
-        image = self._image.float() / 255
+        """The image with the background outside the mask."""
         if self.mask is None or background is None:
-            return image
-        return torch.where(self.mask, image, background)
+            return self.image
+        return torch.where(self.mask, self.image, background)
