@@ -16,6 +16,12 @@ _OFFICIAL = (
 )  # fmt: skip
 
 _HELD_OUT = 8
+# What every method gets: half the size of the images, and the same surface from its depths (mm).
+_SAME = (
+    Option("input.long-edge", "800"),
+    Option("mesh.voxel", "1"),
+    Option("mesh.truncation", "5"),
+)
 """Every so many-th image."""
 
 
@@ -42,5 +48,5 @@ def _scene(folder: Path) -> Scene:
     dtu = official_truth(int(number[1]), *place.parents[:2]) if number else None
     name = f"scan{number[1]}" if number else place.name
     # Without a true surface some images are kept back, to see whether they agree across it.
-    options = () if dtu else (Option("hold-out", str(_HELD_OUT)),)
+    options = _SAME if dtu else (*_SAME, Option("hold-out", str(_HELD_OUT)))
     return Scene(name, folder, Truth(dtu=dtu), options, kind="scan")

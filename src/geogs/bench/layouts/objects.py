@@ -4,7 +4,14 @@ from dataclasses import replace
 from pathlib import Path
 
 from geogs.bench.layouts.replica import find_rooms
-from geogs.bench.scene import Scene
+from geogs.bench.scene import Option, Scene
+
+# What every method gets: images of the same size, and the same surface from its depths (metres).
+_SAME = (
+    Option("input.long-edge", "800"),
+    Option("mesh.voxel", "0.001"),
+    Option("mesh.truncation", "5"),
+)
 
 
 def find_objects(root: Path) -> list[Scene]:
@@ -17,4 +24,4 @@ def _masked(folder: Path) -> list[Scene]:
     if not folder.is_dir():
         return []
     scenes = [s for s in find_rooms(folder) if any((s.source / "results").glob("mask*.png"))]
-    return [replace(scene, kind="object") for scene in scenes]
+    return [replace(s, kind="object", options=(*s.options, *_SAME)) for s in scenes]

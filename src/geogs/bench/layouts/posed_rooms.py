@@ -10,6 +10,12 @@ from geogs.bench.scene import Option, Scene
 from geogs.io.sources.replica import open_replica
 
 _IMAGES = 100
+# What every method gets: images of the same size, and the same surface from its depths (metres).
+_SAME = (
+    Option("input.long-edge", "600"),
+    Option("mesh.voxel", "0.01"),
+    Option("mesh.truncation", "5"),
+)
 
 
 def find_posed_rooms(root: Path) -> list[Scene]:
@@ -30,4 +36,4 @@ def _has_masks(scene: Scene) -> bool:
 def _thinned(scene: Scene) -> Scene:
     count = open_replica(scene.source).length or 1
     stride = Option("input.stride", str(max(1, round(count / _IMAGES))))
-    return replace(scene, options=(*scene.options, stride))
+    return replace(scene, options=(*scene.options, *_SAME, stride))
