@@ -192,6 +192,28 @@ def test_wrong_input_is_one_sentence(room, tmp_path):
         assert "Traceback" not in done.stderr
 
 
+FULL = """
+import sys
+import torch
+from geogs.cli.main import main
+from geogs.reconstruct import Reconstruction
+
+def full(*arguments):
+    raise torch.cuda.OutOfMemoryError("CUDA out of memory.")
+
+Reconstruction.finish = full
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+def test_a_full_gpu_memory_is_one_sentence(room, tmp_path):
+    command = [sys.executable, "-c", FULL, "reconstruct", str(room), "-o", str(tmp_path), *QUICK]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=200)
+    assert done.returncode == 2
+    assert "The memory of the GPU is full; use fewer images" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
 def test_poses_in_another_convention_are_noticed(room, tmp_path):
     """World to camera where camera to world is expected."""
     turned = tmp_path / "room"

@@ -162,6 +162,29 @@ def test_a_full_gpu_memory_keeps_what_there_is(room, tmp_path):
     assert json.loads((tmp_path / "summary.json").read_text())["interrupted"] is True
 
 
+FULL_AT_THE_END = """
+import sys
+import torch
+import geogs.slam
+from geogs.cli.main import main
+
+def full(*arguments):
+    raise torch.cuda.OutOfMemoryError("CUDA out of memory.")
+
+geogs.slam.global_bundle = full
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+def test_a_gpu_that_is_full_in_the_final_stages_keeps_the_online_result(room, tmp_path):
+    command = [sys.executable, "-c", FULL_AT_THE_END, "run", str(room), "-o", str(tmp_path), *QUICK]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=400)
+    assert done.returncode == 0, done.stderr
+    assert "no memory left for the final stages" in done.stderr
+    assert len(read_tum_trajectory(tmp_path / "trajectory.tum").timestamps) == FRAMES
+    assert json.loads((tmp_path / "summary.json").read_text())["interrupted"] is True
+
+
 def images(folder: Path, frames: list[np.ndarray]) -> Path:
     folder.mkdir()
     for i, frame in enumerate(frames):

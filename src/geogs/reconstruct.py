@@ -217,11 +217,11 @@ class Reconstruction:
 
     def _steps(self, start: TrainingPlace) -> int:
         """As many training steps as the time allows, or the usual number where none is given."""
-        search, count = self.config.search, len(self.mapper.mapped)
+        search = self.config.search
         if self._end is None:
-            return max(search.least_steps, search.steps_per_view * count)
+            return max(search.least_steps, search.steps_per_view * self.with_depth)
         known = start.steps > _TELLING_STEPS
         seconds = start.seconds / start.steps if known else self.mapper.seconds_per_step()
         left = max(self._end - time.perf_counter(), 0.0)
-        most = search.most_steps_per_view * count
+        most = search.most_steps_per_view * self.frames
         return int(np.clip(start.steps + left / seconds, 1, most))

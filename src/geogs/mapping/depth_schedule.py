@@ -6,8 +6,8 @@ from collections.abc import Callable, Sequence
 from geogs.mapping.mapper import Mapper
 from geogs.threads import worker_count
 
-# Keyframes whose depths are searched in one go, at most; and at least, where time is short.
-_AT_ONCE, _AT_LEAST = 16, 4
+# Keyframes whose depths are searched in one go, at most; and those that every map has at least.
+_AT_ONCE, _FIRST = 16, 4
 
 
 def spread_order(items: Sequence[int]) -> list[int]:
@@ -33,24 +33,22 @@ def search_depths(
     next group would last longer the rest is left without depth; the first group is always done.
     """
     ids = list(keyframe_ids) if until is None else spread_order(keyframe_ids)
-    begin, done = time.perf_counter(), 0
-    while done < len(ids):
-        size = _AT_ONCE if until is None else _affordable(begin, done, until)
-        if size == 0:
-            break
-        group = ids[done : done + size]
+    done, size = 0, _AT_ONCE if until is None else max(_FIRST, worker_count())
+    while done < len(ids) and size > 0:
+        start, group = time.perf_counter(), ids[done : done + size]
         mapper.search_depths(group)
         done += len(group)
-        if until is not None:  # a GPU works behind; reading something from it waits
-            float(mapper.views[group[-1]].typical_depth)
+        if until is not None:
+            float(mapper.views[group[-1]].typical_depth)  # waits for a GPU
+            size = _affordable(start, len(group), until)
         progress(done / len(ids))
 
 
-def _affordable(begin: float, done: int, until: float) -> int:
-    """How many keyframes to search next, at the pace so far; none if time allows too few."""
-    least = max(_AT_LEAST, worker_count())
-    if done == 0:
-        return least
-    now = time.perf_counter()
-    count = int((until - now) * done / max(now - begin, 1e-9))
-    return 0 if count < least else min(count, max(_AT_ONCE, least))
+def _affordable(start: float, searched: int, until: float) -> int:
+    """How many keyframes to search next, at the pace of those since ``start``; 0 if too few.
+
+    Half of those that time allows, as the pace may change.
+    """
+    now, least = time.perf_counter(), worker_count()
+    count = int((until - now) * searched / max(now - start, 1e-9))
+    return 0 if count < least else max(least, min(count // 2, _AT_ONCE))
