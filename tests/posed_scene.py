@@ -1,0 +1,67 @@
+"""What the tests of reconstruction from known poses share: a small scene, a room, the command."""
+
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from plyfile import PlyData
+
+from depth_scene import WORKING, make_scene, trace
+from geogs.config import ReconstructConfig
+from geogs.reconstruct import Reconstruction
+
+GEOGS = [sys.executable, "-m", "geogs.cli.main"]
+DEFAULT = ReconstructConfig()
+SMALL = replace(
+    DEFAULT,
+    search=replace(DEFAULT.search, least_steps=60, steps_per_view=1),
+    mapping=replace(
+        DEFAULT.mapping, render_long_edge=96, disk=replace(DEFAULT.mapping.disk, stride=2)
+    ),
+)
+
+
+def geogs(*arguments: object) -> subprocess.CompletedProcess[str]:
+    command = [*GEOGS, *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=300)
+
+
+def make_room(folder: Path) -> Path:
+    """Sixty frames of a synthetic room with exact poses, 256 x 192."""
+    done = geogs("synth", folder, "--frames", 60, "--width", 256, "--height", 192)
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
+def vertices(path: Path) -> np.ndarray:
+    """Vertex positions of a PLY file."""
+    vertex = PlyData.read(path)["vertex"]
+    return np.stack([vertex[k] for k in "xyz"], 1)
+
+
+def ball_and_wall(
+    scale: float = 1.0, config: ReconstructConfig = SMALL, far: float = 0.0
+) -> Reconstruction:
+    """The views of the depth tests, without what a tracker knew.
+
+    Lengths times ``scale``, then moved by ``far`` along each axis.
+    """
+    scene = Reconstruction(WORKING, config)
+    for view in make_scene().views:
+        T_wc = np.linalg.inv(view.T_cw)
+        T_wc[:3, 3] = scale * T_wc[:3, 3] + far
+        T_cw = np.linalg.inv(T_wc)
+        scene.add(view.image, T_cw)
+    return scene
+
+
+def depth_errors(scene: Reconstruction, scale: float = 1.0) -> np.ndarray:
+    """Relative errors of all rendered depths."""
+    camera, errors = scene.mapper.cameras.render, []
+    for view, render in zip(make_scene().views, scene.renders(), strict=True):
+        truth = trace(camera, np.linalg.inv(view.T_cw))[0] * scale
+        depth = render.depth.numpy()
+        errors.append(np.abs(depth / truth - 1)[depth > 0])
+    return np.concatenate(errors)
