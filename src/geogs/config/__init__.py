@@ -1,0 +1,36 @@
+"""Every setting, as a tree of frozen dataclasses; it is saved with each result.
+
+The string under a field is its help text: meaning, unit, range.
+"""
+
+from geogs.config.depth import DepthConfig
+from geogs.config.input import InputConfig
+from geogs.config.known_poses import (
+    ReconstructConfig,
+    SearchConfig,
+    known_pose_mapping,
+    reconstruct_preset,
+)
+from geogs.config.losses import LossConfig
+from geogs.config.mapping import DiskConfig, MappingConfig, PhotoConfig
+from geogs.config.mesh import MeshConfig
+from geogs.config.slam import Config, Preset, preset
+from geogs.config.tracking import TrackingConfig
+
+__all__ = [
+    "Config",
+    "DepthConfig",
+    "DiskConfig",
+    "InputConfig",
+    "LossConfig",
+    "MappingConfig",
+    "MeshConfig",
+    "PhotoConfig",
+    "Preset",
+    "ReconstructConfig",
+    "SearchConfig",
+    "TrackingConfig",
+    "known_pose_mapping",
+    "preset",
+    "reconstruct_preset",
+]

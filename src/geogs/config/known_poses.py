@@ -1,0 +1,101 @@
+"""All settings of a reconstruction from known poses, and their presets."""
+
+from dataclasses import dataclass, field, replace
+
+from geogs.config.input import InputConfig
+from geogs.config.losses import LossConfig
+from geogs.config.mapping import MappingConfig, PhotoConfig
+from geogs.config.mesh import MeshConfig
+from geogs.config.slam import Preset
+
+
+@dataclass(frozen=True)
+class SearchConfig:
+    """How much is done for a map from known poses, and where depth is looked for."""
+
+    steps_per_view: int = 30
+    """Training steps for every image where no time is given, at least 1."""
+    least_steps: int = 300
+    """Fewest training steps where no time is given."""
+    most_steps_per_view: int = 200
+    """Most training steps for every image, whatever the time."""
+    depth_share: float = 0.6
+    """Most of the time up to then that the depths may take, in (0, 1]; images for which it does not
+    last get none and only serve to find those of the others."""
+    output_share: float = 0.2
+    """Part of a given time that is kept for the mesh and the report, in [0, 1)."""
+    first_edge: int = 128
+    """First look at the scene: longer side of its images, pixels."""
+    first_views: int = 8
+    """First look: images whose depth is searched."""
+    margin: float = 1.3
+    """Factor by which searched depths go beyond those that are known, at least 1."""
+    repeat: bool = True
+    """Search all depths a second time, between the limits that the first time has shown."""
+
+
+def known_pose_mapping() -> MappingConfig:
+    """Mapping where poses are exact: the images say more about the surface than the first depths.
+
+    So photo-consistency weighs more than in a run, down to faint texture, and the occlusion test is
+    sharper; disks move in smaller steps.
+    """
+    loss = LossConfig(
+        depth_weight=0.5,
+        normal_consistency_weight=0.05,
+        distortion_weight=0.2,
+        opacity_weight=0.1,
+        silhouette_weight=0.3,
+        l1_weight=4.0,
+        l1_huber=0.005,
+        l1_cut=0.1,
+        ncc_patch=5,
+        ncc_reject=0.5,
+        ncc_min_variance=1e-8,
+        ncc_texture=1e-6,
+        occlusion=1.0,
+    )
+    return MappingConfig(
+        lr_position=3e-4,
+        lr_final=0.03,
+        max_spread=0.003,
+        photo=PhotoConfig(per_step=4),
+        loss=loss,
+    )
+
+
+@dataclass(frozen=True)
+class ReconstructConfig:
+    """All settings of a reconstruction from known poses."""
+
+    seed: int = 0
+    """Random seed; same seed, same machine and no time limit, same result on the CPU."""
+    input: InputConfig = field(default_factory=InputConfig)
+    search: SearchConfig = field(default_factory=SearchConfig)
+    mapping: MappingConfig = field(default_factory=known_pose_mapping)
+    mesh: MeshConfig = field(default_factory=MeshConfig)
+
+
+def reconstruct_preset(name: Preset) -> ReconstructConfig:
+    """The settings of a preset for known poses.
+
+    ``fast`` works on small images and searches depths once; ``accurate``, for a GPU, renders at the
+    size of the images.
+    """
+    base = ReconstructConfig()
+    if name == "fast":
+        return replace(
+            base,
+            input=replace(base.input, long_edge=400),
+            search=replace(base.search, repeat=False, steps_per_view=15),
+            mapping=replace(base.mapping, render_long_edge=256),
+        )
+    if name == "accurate":
+        disk = replace(base.mapping.disk, stride=5)
+        return replace(
+            base,
+            input=replace(base.input, long_edge=800),
+            search=replace(base.search, steps_per_view=200, most_steps_per_view=1000),
+            mapping=replace(base.mapping, render_long_edge=800, photo_scale=1.0, disk=disk),
+        )
+    return base

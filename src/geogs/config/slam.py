@@ -1,0 +1,40 @@
+"""All settings of a run, and their presets."""
+
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+from geogs.config.input import InputConfig
+from geogs.config.mapping import MappingConfig
+from geogs.config.mesh import MeshConfig
+from geogs.config.tracking import TrackingConfig
+
+Preset = Literal["fast", "default", "accurate"]
+
+
+@dataclass(frozen=True)
+class Config:
+    """All settings of a run."""
+
+    seed: int = 0
+    """Random seed; same seed, same machine, same result on the CPU."""
+    input: InputConfig = field(default_factory=InputConfig)
+    tracking: TrackingConfig = field(default_factory=TrackingConfig)
+    mapping: MappingConfig = field(default_factory=MappingConfig)
+    mesh: MeshConfig = field(default_factory=MeshConfig)
+
+
+def preset(name: Preset) -> Config:
+    """The settings of a preset.
+
+    ``fast`` stops after the online map; ``accurate`` works on larger images and trains longer.
+    """
+    base = Config()
+    if name == "fast":
+        mapping = replace(
+            base.mapping, iterations=5, pose_iterations=0, final_iterations=100, final_depth=False
+        )
+        return replace(base, mapping=mapping)
+    if name == "accurate":
+        mapping = replace(base.mapping, render_long_edge=400, iterations=15, final_iterations=1500)
+        return replace(base, input=replace(base.input, long_edge=640), mapping=mapping)
+    return base
