@@ -31,17 +31,12 @@ class BaselineSettings:
     """Seconds of training; start points and mesh come on top."""
     seed: int = 0
     device: str = "auto"
-    hold_out: int = 0
-    """Every so many-th image is not used; 0 uses all."""
+    hold_out: int | None = None
+    """Every so many-th image is not used; none uses all."""
     snapshots: tuple[float, ...] = ()
     """Seconds after which the mesh is written as it is then."""
     input: InputConfig = field(default_factory=InputConfig)
     mesh: MeshConfig = field(default_factory=MeshConfig)
-
-
-def held_out_places(count: int, every: int) -> list[int]:
-    """Which of ``count`` images are not used where every ``every``-th is held out; 0 is none."""
-    return list(range(every // 2, count, every)) if every else []
 
 
 class BaselineRunner:
@@ -71,10 +66,8 @@ class BaselineRunner:
         device = require_device(settings.device)
         if device.type != "cuda":
             raise DeviceError("the baseline with colour needs an NVIDIA GPU.")
-        source = open_posed_source(task.source, settings.input)
-        held_out = held_out_places(len(source), settings.hold_out)
-        every = training_views(source)
-        views = [view for i, view in enumerate(every) if i not in set(held_out)]
+        source = open_posed_source(task.source, settings.input, settings.hold_out)
+        views = training_views(source)
         start = time.perf_counter()
         points = find_start_points(views)
         seconds = {"start points": time.perf_counter() - start}
@@ -85,7 +78,7 @@ class BaselineRunner:
             "source": source.name,
             "kind": source.kind,
             "frames": len(views),
-            "held_out": held_out,
+            "held_out": list(source.held_out),
             "start_points": len(points),
             "disks": len(result.disks),
             "map_bytes": result.disks.bytes,
@@ -107,7 +100,7 @@ def settings_of(task: Task) -> BaselineSettings:
             float((task.option("budget") or "120").removesuffix("s")),
             int(task.option("seed") or 0),
             task.option("device") or "auto",
-            int(task.option("hold-out") or 0),
+            int(every) if (every := task.option("hold-out")) else None,
             tuple(float(s) for s in (task.option("snapshots") or "").split(",") if s),
             InputConfig(
                 intrinsics=task.option("input.intrinsics") or "auto",
