@@ -13,8 +13,9 @@ import tyro
 
 from geogs import __version__
 from geogs.cli import main as cli
-from geogs.cli.options import parse_options
-from geogs.config import InputConfig
+from geogs.cli import reconstruct
+from geogs.cli.options import given, parse_options
+from geogs.config import Config, InputConfig, reconstruct_preset
 from geogs.errors import InputError, OutputError, TrackingLost
 
 
@@ -185,3 +186,25 @@ def test_output_cut_off_by_its_reader_is_no_traceback():
     shell = f"{sys.executable} -m geogs.cli.main --help | head -n 1"
     result = subprocess.run(["sh", "-c", shell], capture_output=True, text=True, env=os.environ)
     assert "Traceback" not in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("argv", "value"),
+    [
+        (["x", "--preset", "fast"], "fast"),
+        (["x", "--preset=accurate"], "accurate"),
+        (["x", "--presets", "fast"], None),
+        (["x", "--preset"], ""),
+    ],
+)
+def test_an_option_is_found_in_either_form(argv: list[str], value: str | None) -> None:
+    assert given(argv, "preset") == value
+
+
+def test_known_poses_take_the_preset_of_the_device_unless_one_is_given() -> None:
+    assert reconstruct._preset_name(["x", "--device", "cpu"]) == "default"
+    assert reconstruct._preset_name(["x", "--device=cuda:0"]) == "accurate"
+    assert reconstruct._preset_name(["x", "--device", "cuda", "--preset", "fast"]) == "fast"
+    small, large = (reconstruct_preset(name) for name in ("default", "accurate"))
+    assert small.mapping.render_long_edge < large.mapping.render_long_edge == 800
+    assert small.mapping.loss == large.mapping.loss != Config().mapping.loss

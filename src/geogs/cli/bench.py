@@ -57,7 +57,7 @@ class BenchOptions:
     seed: int = 0
     """As in geogs run."""
     preset: str = ""
-    """As in geogs run: fast, default or accurate."""
+    """As in geogs run and geogs reconstruct: fast, default or accurate; their own choice if none."""
     settings: Annotated[
         tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(name="set", metavar="KEY=VALUE")
     ] = ()
@@ -170,14 +170,13 @@ def _wishes(options: BenchOptions, benchmark: "Benchmark") -> "Wishes":
     from geogs.bench.plan import Wishes
     from geogs.bench.scene import Option
     from geogs.cli.reconstruct import seconds
-    from geogs.cli.run import RunOptions
 
     common = [Option("device", options.device), Option("seed", str(options.seed))]
     if options.preset:
         common.append(Option("preset", options.preset))
     if options.depth_fusion:
         common.append(Option("depth-mesh"))
-    if benchmark.command == "run" and hasattr(RunOptions, "online_results"):
+    if benchmark.command == "run":
         common.append(Option("online-results"))
     return Wishes(
         _names(options.scenes),
