@@ -57,7 +57,7 @@ class BenchOptions:
     seed: int = 0
     """As in geogs run."""
     preset: str = ""
-    """As in geogs run and geogs reconstruct: fast, default or accurate; their own choice if none."""
+    """As in geogs run and geogs reconstruct; without one, what they choose."""
     settings: Annotated[
         tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(name="set", metavar="KEY=VALUE")
     ] = ()
