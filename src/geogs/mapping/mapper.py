@@ -364,6 +364,8 @@ class Mapper:
     def _split(self) -> None:
         """Split the disks that are pulled hardest; those below a pixel are small enough."""
         disk, optimizer = self.config.disk, self._training().optimizer
+        if disk.split_share == 0:
+            return
         pixel = self.unit / self.cameras.render.fx
         chosen = worth_splitting(
             self.map, optimizer.position_gradient, disk.split_share, disk.split_pixels * pixel
