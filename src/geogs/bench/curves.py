@@ -1,23 +1,18 @@
 """Error over time, as curves."""
 
 from collections.abc import Sequence
-from io import BytesIO
 from pathlib import Path
 
 from geogs.bench.record import Record
-from geogs.io.writers.atomic import atomic_file
+from geogs.evaluation.plots import new_figure, save_figure
 
 
 def plot_curves(path: Path, records: Sequence[Record]) -> bool:
     """Chamfer distance over seconds, a panel for each scene; false if no record has a curve."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     scenes = list(dict.fromkeys(record.scene for record in records if record.curve))
     if not scenes:
         return False
-    figure = Figure(figsize=(5.5 * len(scenes), 4.2), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(5.5 * len(scenes), 4.2)
     for column, scene in enumerate(scenes):
         plot = figure.add_subplot(1, len(scenes), column + 1)
         for record in (r for r in records if r.scene == scene and r.curve):
@@ -29,10 +24,7 @@ def plot_curves(path: Path, records: Sequence[Record]) -> bool:
         plot.set_yscale("log")
         plot.grid(alpha=0.3, which="both")
         plot.legend()
-    buffer = BytesIO()
-    figure.savefig(buffer, format="png", dpi=110)
-    with atomic_file(path) as stream:
-        stream.write(buffer.getvalue())
+    save_figure(figure, path)
     return True
 
 

@@ -37,10 +37,5 @@ def _draw_surface(
 ) -> None:
     mesh, truth, limit = found.mesh, found.truth, found.limit_cm
     colours = plots.error_colours(mesh.vertices, found.points, found.errors_cm, limit)
-    rows: list[tuple[str, np.ndarray, np.ndarray, np.ndarray | None]] = [
-        ("reconstruction", mesh.vertices, mesh.faces, None),
-        ("its error", mesh.vertices, mesh.faces, colours),
-    ]
-    if truth is not None:
-        rows.insert(1, ("truth", truth.vertices, truth.faces, None))
-    plots.plot_meshes(path, rows, viewpoints(mesh.vertices, T_wc, result.camera), limit)
+    views = viewpoints(mesh.vertices, T_wc, result.camera)
+    plots.plot_beside_truth(path, mesh, truth, colours, views, limit)

@@ -11,6 +11,7 @@ from geogs.errors import InputError
 from geogs.evaluation.surface import Surface, read_surface
 from geogs.geometry.camera import Camera
 from geogs.io.poses import read_tum_trajectory
+from geogs.io.writers.intrinsics import read_camera
 from geogs.types import Trajectory
 
 _STAGE_FOLDERS: dict[StageName, str] = {
@@ -36,13 +37,7 @@ class ResultFolder:
     @cached_property
     def camera(self) -> Camera:
         """The working camera. Raises InputError if ``intrinsics.json`` holds none."""
-        file = self.path / "intrinsics.json"
-        try:
-            k = json.loads(file.read_text(encoding="utf-8"))
-            fx, fy, cx, cy = (float(k[name]) for name in ("fx", "fy", "cx", "cy"))
-            return Camera(fx, fy, cx, cy, int(k["width"]), int(k["height"]))
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            raise InputError(f"{file} holds no camera ({error}).") from error
+        return read_camera(self.path / "intrinsics.json")
 
     @property
     def map_bytes(self) -> int | None:

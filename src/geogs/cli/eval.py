@@ -12,8 +12,6 @@ from geogs.cli.options import parse_options
 from geogs.errors import InputError
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from geogs.cli.eval_surface import SurfaceComparison
     from geogs.evaluation.page import Section
     from geogs.evaluation.report import Evaluation
@@ -204,10 +202,10 @@ def _draw(
     options: EvalOptions, trajectory: "TrajectoryErrors", surface: "SurfaceComparison | None"
 ) -> list[tuple[str, Path]]:
     """Pictures of this command, then those that the run left; titles and files."""
-    from geogs.cli.eval_surface import read_camera
     from geogs.evaluation import plots
     from geogs.evaluation.report import SAME_POSES_CM
     from geogs.evaluation.shading import viewpoints
+    from geogs.io.writers.intrinsics import read_camera
 
     folder = options.output / "report"
     titles: dict[str, str] = {}
@@ -222,14 +220,8 @@ def _draw(
         colours = plots.error_colours(
             mesh.vertices, surface.points, 100 * surface.distance, limit, surface.reach
         )
-        rows: list[tuple[str, np.ndarray, np.ndarray, np.ndarray | None]] = [
-            ("reconstruction", mesh.vertices, mesh.faces, None),
-            ("its error", mesh.vertices, mesh.faces, colours),
-        ]
-        if truth.is_mesh:
-            rows.insert(1, ("truth", truth.vertices, truth.faces, None))
         views = viewpoints(mesh.vertices, trajectory.aligned, camera)
-        plots.plot_meshes(folder / "mesh_truth.png", rows, views, limit)
+        plots.plot_beside_truth(folder / "mesh_truth.png", mesh, truth, colours, views, limit)
         titles = {"mesh_truth.png": "Surface beside the truth", **titles}
     own = [(title, folder / name) for name, title in titles.items()]
     return own + _run_pictures(options)

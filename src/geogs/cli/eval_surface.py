@@ -1,6 +1,5 @@
 """The part of ``geogs eval`` that compares surfaces, by the protocol that was asked for."""
 
-import json
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +17,7 @@ from geogs.evaluation.surface import Surface, read_surface
 from geogs.evaluation.truth import TrueScene, photographs, silhouettes
 from geogs.evaluation.visibility import Visibility
 from geogs.geometry.camera import Camera
+from geogs.io.writers.intrinsics import read_camera
 
 if TYPE_CHECKING:
     from geogs.cli.eval import EvalOptions
@@ -73,16 +73,6 @@ def photoconsistency(options: "EvalOptions", scene: TrueScene, mesh: Surface) ->
     held_out = range(options.photo_every // 2, len(views), options.photo_every)
     there = Surface(mesh.vertices / scene.metres, mesh.faces)
     return evaluate_photoconsistency(there, source.camera, views, held_out or range(len(views)))
-
-
-def read_camera(path: Path) -> Camera:
-    """The working camera in intrinsics.json."""
-    try:
-        k = json.loads(path.read_text(encoding="utf-8"))
-        fx, fy, cx, cy = (float(k[name]) for name in ("fx", "fy", "cx", "cy"))
-        return Camera(fx, fy, cx, cy, int(k["width"]), int(k["height"]))
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{path} holds no camera ({error}); was it changed?") from None
 
 
 def _area(

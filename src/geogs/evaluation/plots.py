@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from geogs.evaluation.shading import Sight, Viewpoint, level_axes, look
+from geogs.evaluation.surface import Surface
 from geogs.evaluation.trajectory import TrajectoryErrors
 from geogs.io.writers.atomic import atomic_file
 from geogs.threads import thread_map
@@ -26,7 +27,7 @@ _UNKNOWN = 190
 
 def plot_path(path: Path, trajectory: Trajectory) -> None:
     """The camera path from above and from the side, in map units; lost stretches are marked."""
-    figure = _figure(10.0, 4.2)
+    figure = new_figure(10.0, 4.2)
     axes = level_axes(trajectory.T_wc)
     points = (trajectory.T_wc[:, :3, 3] - trajectory.T_wc[0, :3, 3]) @ axes.T
     for column, (name, vertical) in enumerate((("from above", 1), ("from the side", 2))):
@@ -42,7 +43,7 @@ def plot_path(path: Path, trajectory: Trajectory) -> None:
 
 def plot_trajectory(path: Path, errors: TrajectoryErrors) -> None:
     """Aligned estimate over the truth, from above and from the side, coloured by its error."""
-    figure = _figure(11.0, 4.6)
+    figure = new_figure(11.0, 4.6)
     axes = level_axes(errors.truth)
     origin = errors.truth[:, :3, 3].mean(0)
     truth = (errors.truth[:, :3, 3] - origin) @ axes.T
@@ -61,7 +62,7 @@ def plot_trajectory(path: Path, errors: TrajectoryErrors) -> None:
 
 def plot_error_over_time(path: Path, errors: TrajectoryErrors) -> None:
     """Position error in cm and rotation error in degrees against time."""
-    figure = _figure(10.0, 4.2)
+    figure = new_figure(10.0, 4.2)
     order = np.argsort(errors.timestamps)
     time = errors.timestamps[order] - errors.timestamps[order[0]]
     rows = (
@@ -78,7 +79,7 @@ def plot_error_over_time(path: Path, errors: TrajectoryErrors) -> None:
         plot.legend(loc="upper right")
         plot.grid(alpha=0.3)
     plot.set_xlabel("time (s)")
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def plot_keyframes(
@@ -97,7 +98,7 @@ def plot_keyframes(
     values = np.concatenate(known) if known else np.zeros(0)
     low, high = np.quantile(values, [0.01, 0.99]) if len(values) else (0.0, 1.0)
     height, width = images[0].shape[:2]
-    figure = _figure(12.0, 0.4 + len(images) * 3.7 * height / width)
+    figure = new_figure(12.0, 0.4 + len(images) * 3.7 * height / width)
     plots = []
     rows = zip(images, depths, normals, names or [""] * len(images), strict=True)
     for row, (image, depth, normal, name) in enumerate(rows):
@@ -116,7 +117,7 @@ def plot_keyframes(
                 plot.set_ylabel(name)
             plots.append(plot)
     _colour_bar(figure, plots, "turbo", (float(low), float(high)), "depth (map units)")
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def plot_meshes(
@@ -137,7 +138,7 @@ def plot_meshes(
     With ``error_limit_cm`` a colour bar says what the colours of :func:`error_colours` mean.
     """
     camera = views[0].camera
-    figure = _figure(4.2 * len(views), 0.5 + 4.2 * camera.height / camera.width * len(rows))
+    figure = new_figure(4.2 * len(views), 0.5 + 4.2 * camera.height / camera.width * len(rows))
     plots = []
     sights: list[Sight] = []
     for row, (name, vertices, faces, colours) in enumerate(rows):
@@ -154,7 +155,25 @@ def plot_meshes(
             plots.append(plot)
     if error_limit_cm is not None:
         _colour_bar(figure, plots, _ERROR_MAP, (0.0, error_limit_cm), "distance to the truth (cm)")
-    _save(figure, path)
+    save_figure(figure, path)
+
+
+def plot_beside_truth(
+    path: Path,
+    mesh: Surface,
+    truth: Surface | None,
+    colours: UInt8[np.ndarray, "n 3"],
+    views: Sequence[Viewpoint],
+    limit_cm: float,
+) -> None:
+    """A mesh, the truth if that is one, and the mesh in the colours of its error."""
+    rows: list[tuple[str, np.ndarray, np.ndarray, np.ndarray | None]] = [
+        ("reconstruction", mesh.vertices, mesh.faces, None),
+        ("its error", mesh.vertices, mesh.faces, colours),
+    ]
+    if truth is not None and truth.is_mesh:
+        rows.insert(1, ("truth", truth.vertices, truth.faces, None))
+    plot_meshes(path, rows, views, limit_cm)
 
 
 def error_colours(
@@ -182,7 +201,7 @@ def error_colours(
     return np.where(distance[:, :1] <= reach, colours, np.uint8(_UNKNOWN))
 
 
-def _figure(width: float, height: float) -> "Figure":
+def new_figure(width: float, height: float) -> "Figure":
     """A figure of its own (inches), outside of pyplot and its global state."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -214,10 +233,11 @@ def _finish_map(plot: "Axes", name: str, unit: str) -> None:
 def _save_maps(figure: "Figure", path: Path) -> None:
     """Save plots of equal scale: drawing settles their limits, whose tick labels then need room."""
     figure.draw_without_rendering()
-    _save(figure, path)
+    save_figure(figure, path)
 
 
-def _save(figure: "Figure", path: Path) -> None:
+def save_figure(figure: "Figure", path: Path) -> None:
+    """Write a figure as PNG, completely or not at all."""
     buffer = BytesIO()
     figure.savefig(buffer, format="png", dpi=110, pil_kwargs={"compress_level": 3})
     with atomic_file(path) as stream:

@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 
+from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.io.sources.calibration import Calibration
 from geogs.io.writers.atomic import write_text
@@ -39,3 +40,13 @@ def write_intrinsics(
             "is_guess": calibration.is_guess,
         }
     write_text(path, json.dumps(document, indent=2) + "\n")
+
+
+def read_camera(path: str | Path) -> Camera:
+    """The pinhole of the frames. Raises InputError if the file is missing or holds none."""
+    try:
+        k = json.loads(Path(path).read_text(encoding="utf-8"))
+        fx, fy, cx, cy = (float(k[name]) for name in ("fx", "fy", "cx", "cy"))
+        return Camera(fx, fy, cx, cy, int(k["width"]), int(k["height"]))
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{path} holds no camera ({error}); was it changed?") from None
