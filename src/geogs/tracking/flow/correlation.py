@@ -1,0 +1,174 @@
+"""Correlation of two feature maps around given positions, as RAFT and DROID-SLAM look it up.
+
+All-pairs products of the features, averaged over 2 x 2, 4 x 4, ... pixels of the second map, are
+read in a square window around a position (Teed & Deng, "RAFT: Recurrent All-Pairs Field Transforms
+for Optical Flow", ECCV 2020, section 3.2). Averaging products is averaging the second features, so
+the window can as well be computed without the volume: slower, but in little memory.
+
+Conventions, which are those of the published networks:
+
+- positions are in pixels of the feature maps, x before y, pixel centres at integers;
+- on level l of the pyramid they are divided by 2^l, no more (the half pixel by which the centres of
+  averaged pixels move is left to the network);
+- beyond the border the correlation is zero;
+- the channels are ordered by level, then x offset, then y offset: channel
+  ``(l (2 r + 1) + i) (2 r + 1) + j`` is at (x + i - r, y + j - r).
+"""
+
+from collections.abc import Callable
+from typing import Protocol
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+CHUNK_ELEMENTS = 1 << 24
+"""Most numbers that :func:`local_correlation` gathers at once."""
+
+
+class CorrelationLookup(Protocol):
+    """What a recurrent network asks of the correlation of a batch of pairs."""
+
+    def __call__(self, coords: Float[Tensor, "b h w 2"]) -> Float[Tensor, "b c h w"]:
+        """Correlation of each pixel of the first maps with a window around ``coords``, float32."""
+        ...
+
+
+class CorrelationVolume:
+    """All-pairs correlation, computed once and read many times: 16 h^2 w^2 / 3 bytes a pair."""
+
+    def __init__(
+        self,
+        first: Float[Tensor, "b d h w"],
+        second: Float[Tensor, "b d h w"],
+        levels: int = 4,
+        radius: int = 4,
+        scale: float | None = None,
+    ) -> None:
+        """Multiply all pairs of features.
+
+        Args:
+            first: features of the pixels that are looked up.
+            second: features of the images they are looked for in.
+            levels: levels of the pyramid.
+            radius: window radius, pixels of a level.
+            scale: factor on the products; 1 / sqrt(d) if None, as RAFT has it (DROID-SLAM: 1/16).
+        """
+        self.radius = radius
+        root = _scale(first, scale) ** 0.5
+        # Half of the factor to each side: products of half-precision features stay in range.
+        a, b = (first * root).flatten(2), (second * root).flatten(2)
+        volume = (a.mT @ b).reshape(-1, 1, *second.shape[-2:])
+        self._levels = _pyramid(volume, levels)
+
+    def __call__(self, coords: Float[Tensor, "b h w 2"]) -> Float[Tensor, "b c h w"]:
+        def read(level: Tensor) -> Callable[[Tensor], Tensor]:
+            flat = level.flatten(1)
+            return lambda index: flat.gather(1, index.reshape(len(flat), -1)).reshape(index.shape)
+
+        windows = [
+            _window(read(level), level.shape[-2:], coords / 2**k, self.radius)
+            for k, level in enumerate(self._levels)
+        ]
+        return torch.cat(windows, 1)
+
+
+class LocalCorrelation:
+    """The same numbers without the volume: for large images, or many pairs at once."""
+
+    def __init__(
+        self,
+        first: Float[Tensor, "b d h w"],
+        second: Float[Tensor, "b d h w"],
+        levels: int = 4,
+        radius: int = 4,
+        scale: float | None = None,
+    ) -> None:
+        """Keep the features; arguments as :class:`CorrelationVolume`."""
+        self.radius = radius
+        root = _scale(first, scale) ** 0.5
+        self._first = first * root
+        self._levels = _pyramid(second * root, levels)
+
+    def __call__(self, coords: Float[Tensor, "b h w 2"]) -> Float[Tensor, "b c h w"]:
+        windows = [
+            local_correlation(self._first, level, coords / 2**k, self.radius)
+            for k, level in enumerate(self._levels)
+        ]
+        return torch.cat(windows, 1)
+
+
+def local_correlation(
+    first: Float[Tensor, "b d h w"],
+    second: Float[Tensor, "b d h2 w2"],
+    coords: Float[Tensor, "b h w 2"],
+    radius: int,
+) -> Float[Tensor, "b c h w"]:
+    """Products of each pixel of ``first`` with ``second`` in a window around ``coords``, float32.
+
+    One level, in pixels of ``second``, without a factor. Rows of the first image are taken so many
+    at a time that the gathered features stay small.
+    """
+    taps = (2 * radius + 2) ** 2
+    batch, channels, height, width = first.shape
+    rows = max(1, CHUNK_ELEMENTS // (batch * channels * width * taps))
+    of_second = second.flatten(2).mT
+    of_first = first.permute(0, 2, 3, 1)
+    parts = []
+    for top in range(0, height, rows):
+        part = of_first[:, top : top + rows]
+
+        def products(index: Int[Tensor, "b h w k k"], part: Tensor = part) -> Tensor:
+            flat = index.reshape(batch, -1, 1).expand(-1, -1, channels)
+            near = of_second.gather(1, flat).reshape(-1, taps, channels)
+            return (near @ part.reshape(-1, channels, 1)).reshape(index.shape)
+
+        here = coords[:, top : top + rows]
+        parts.append(_window(products, second.shape[-2:], here, radius))
+    return torch.cat(parts, 2)
+
+
+def _scale(features: Float[Tensor, "b d h w"], scale: float | None) -> float:
+    return features.shape[1] ** -0.5 if scale is None else scale
+
+
+def _pyramid(image: Float[Tensor, "n c h w"], levels: int) -> list[Tensor]:
+    """Means over 2^l x 2^l pixels; a level that has no pixel left is of size zero."""
+    found = [image]
+    for _ in range(levels - 1):
+        height, width = found[-1].shape[-2:]
+        if min(height, width) < 2:
+            found.append(image.new_zeros(*image.shape[:2], height // 2, width // 2))
+        else:
+            found.append(torch.nn.functional.avg_pool2d(found[-1], 2))
+    return found
+
+
+def _window(
+    read: Callable[[Int[Tensor, "b h w k k"]], Tensor],
+    size: torch.Size,
+    coords: Float[Tensor, "b h w 2"],
+    radius: int,
+) -> Float[Tensor, "b c h w"]:
+    """Bilinear window, zero outside, of what ``read`` gives at row-major pixel indices.
+
+    All positions of a window have the same fraction, so the values at (2 r + 2)^2 whole pixels are
+    enough.
+    """
+    height, width = size
+    side = 2 * radius + 1
+    if not height or not width:
+        return coords.new_zeros(len(coords), side * side, *coords.shape[1:3], dtype=torch.float32)
+    # Far away (or not a number) is as good as just outside.
+    limit = coords.new_tensor([width, height]) + radius + 1
+    near = coords.float().nan_to_num(-1e6).clamp(min=-radius - 2.0).minimum(limit.float())
+    corner = near.floor()
+    fx, fy = ((near - corner)[..., None, None, k] for k in (0, 1))
+    steps = torch.arange(-radius, radius + 2, device=coords.device)
+    x, y = (corner[..., None, k].long() + steps for k in (0, 1))
+    inside = ((x >= 0) & (x < width))[..., :, None] & ((y >= 0) & (y < height))[..., None, :]
+    index = y.clamp(0, height - 1)[..., None, :] * width + x.clamp(0, width - 1)[..., :, None]
+    values = torch.where(inside, read(index).float(), 0.0)
+    values = values[..., :-1, :] * (1 - fx) + values[..., 1:, :] * fx
+    values = values[..., :-1] * (1 - fy) + values[..., 1:] * fy
+    return values.flatten(3).permute(0, 3, 1, 2)
