@@ -1,0 +1,312 @@
+"""The network of DROID-SLAM: encoders, recurrent update of an edge, aggregation over a frame.
+
+Teed and Deng, "DROID-SLAM: Deep Visual SLAM for Monocular, Stereo, and RGB-D Cameras", NeurIPS
+2021. Names of parameters and channels are those of the public weights, so that these load without
+translation. All positions are in cells of 1/8 of the image, x before y.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from geogs.errors import InputError
+
+LEVELS = 4
+"""Levels of the correlation pyramid."""
+RADIUS = 3
+"""Cells around a position that are looked up on each level."""
+LOOKUP = LEVELS * (2 * RADIUS + 1) ** 2
+"""Channels of a lookup."""
+CORRELATION_SCALE = 1 / 16
+"""Factor on the products of features."""
+MOTION_LIMIT = 64.0
+"""Cells at which the motion that is shown to the network is cut off."""
+DAMPING_SCALE = 0.01
+"""Factor on the softplus that gives the damping."""
+UPSAMPLING = 8
+"""Edge of a cell in pixels."""
+MEAN, DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+"""Of the red, green and blue of the images that the public encoders were trained on, in [0, 1]."""
+TRIMMED = tuple(
+    f"update.{head}.2.{kind}" for head in ("weight", "delta") for kind in ("weight", "bias")
+)
+"""Parameters of which the public weights hold more outputs than the first two that are used."""
+
+
+@dataclass(frozen=True)
+class DroidSize:
+    """Width of the network; the default is that of the public weights."""
+
+    base: int = 32
+    """Channels of the encoders at half resolution."""
+
+    @property
+    def features(self) -> int:
+        """Channels of matching features, of the hidden state and of the static context."""
+        return 4 * self.base
+
+    @property
+    def motion(self) -> int:
+        """Channels of the encoded motion."""
+        return 2 * self.base
+
+
+def normalised(images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n 3 h w"]:
+    """RGB in [0, 1] as the encoders want it."""
+    mean, deviation = (images.new_tensor(c)[:, None, None] for c in (MEAN, DEVIATION))
+    return (images - mean) / deviation
+
+
+class ResidualBlock(nn.Module):
+    """Two 3 x 3 convolutions beside a shortcut, which is a convolution where the size changes."""
+
+    def __init__(self, inputs: int, outputs: int, stride: int, norm: bool) -> None:
+        super().__init__()
+        self.conv1 = nn.Conv2d(inputs, outputs, 3, stride, 1)
+        self.conv2 = nn.Conv2d(outputs, outputs, 3, 1, 1)
+        self.norm = nn.InstanceNorm2d(outputs) if norm else nn.Identity()
+        shortcut = nn.Conv2d(inputs, outputs, 1, stride)
+        self.downsample = nn.Sequential(shortcut, self.norm) if stride > 1 else nn.Identity()
+
+    def forward(self, x: Float[Tensor, "n c h w"]) -> Float[Tensor, "n c2 h2 w2"]:
+        y = F.relu(self.norm(self.conv1(x)))
+        y = F.relu(self.norm(self.conv2(y)))
+        return F.relu(self.downsample(x) + y)
+
+
+class Encoder(nn.Module):
+    """Features of an image at an eighth of its resolution.
+
+    Cell (r, c) of the output is centred on pixel (8 r, 8 c). The instance norm of the matching
+    features has no parameters; the context has no norm.
+    """
+
+    def __init__(self, base: int, outputs: int, norm: bool) -> None:
+        super().__init__()
+        self.conv1 = nn.Conv2d(3, base, 7, 2, 3)
+        self.norm = nn.InstanceNorm2d(base) if norm else nn.Identity()
+        self.layer1 = self._layer(base, base, 1, norm)
+        self.layer2 = self._layer(base, 2 * base, 2, norm)
+        self.layer3 = self._layer(2 * base, 4 * base, 2, norm)
+        self.conv2 = nn.Conv2d(4 * base, outputs, 1)
+
+    @staticmethod
+    def _layer(inputs: int, outputs: int, stride: int, norm: bool) -> nn.Sequential:
+        first = ResidualBlock(inputs, outputs, stride, norm)
+        return nn.Sequential(first, ResidualBlock(outputs, outputs, 1, norm))
+
+    def forward(self, images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n c h8 w8"]:
+        x = F.relu(self.norm(self.conv1(images)))
+        return self.conv2(self.layer3(self.layer2(self.layer1(x))))
+
+
+class _Clip(torch.autograd.Function):
+    """The identity, whose gradient drops entries that are large or not a number."""
+
+    @staticmethod
+    def forward(ctx, x: Tensor, limit: float) -> Tensor:  # type: ignore[no-untyped-def]
+        ctx.limit = limit
+        return x.view_as(x)
+
+    @staticmethod
+    def backward(ctx, gradient: Tensor) -> tuple[Tensor, None]:  # type: ignore[no-untyped-def, override]
+        # NaN compares false.
+        kept = gradient.abs() <= ctx.limit
+        return torch.where(kept, gradient, torch.zeros_like(gradient)), None
+
+
+class GradientClip(nn.Module):
+    """Keeps gradients of the bundle adjustment that blow up from the weights of the heads."""
+
+    def __init__(self, limit: float = 0.01) -> None:
+        super().__init__()
+        self.limit = limit
+
+    def forward(self, x: Tensor) -> Tensor:
+        return _Clip.apply(x, self.limit)
+
+
+class ConvGru(nn.Module):
+    """A convolutional gated recurrent unit whose gates also see a mean over the whole image."""
+
+    def __init__(self, hidden: int, inputs: int) -> None:
+        super().__init__()
+        self.convz = nn.Conv2d(hidden + inputs, hidden, 3, 1, 1)
+        self.convr = nn.Conv2d(hidden + inputs, hidden, 3, 1, 1)
+        self.convq = nn.Conv2d(hidden + inputs, hidden, 3, 1, 1)
+        self.w = nn.Conv2d(hidden, hidden, 1)
+        self.convz_glo = nn.Conv2d(hidden, hidden, 1)
+        self.convr_glo = nn.Conv2d(hidden, hidden, 1)
+        self.convq_glo = nn.Conv2d(hidden, hidden, 1)
+
+    def forward(
+        self, hidden: Float[Tensor, "e c h w"], inputs: Float[Tensor, "e c2 h w"]
+    ) -> Float[Tensor, "e c h w"]:
+        both = torch.cat([hidden, inputs], 1)
+        whole = (self.w(hidden).sigmoid() * hidden).mean((2, 3), keepdim=True)
+        z = (self.convz(both) + self.convz_glo(whole)).sigmoid()
+        r = (self.convr(both) + self.convr_glo(whole)).sigmoid()
+        proposed = self.convq(torch.cat([r * hidden, inputs], 1)) + self.convq_glo(whole)
+        return (1 - z) * hidden + z * proposed.tanh()
+
+
+@dataclass(frozen=True)
+class FrameOutput:
+    """What the edges that leave a frame say about it together."""
+
+    frames: Int[Tensor, "n"]
+    """Which frames, ascending."""
+    damping: Float[Tensor, "n h w"]
+    """Damping of inverse depth, in the units of the network's own weights and cells."""
+    upsampling: Float[Tensor, "n 576 h w"]
+    """Logits for :func:`upsample_convex`."""
+
+
+class GraphAggregation(nn.Module):
+    """Mean over the edges of a source frame, read out as damping and upsampling of its depth."""
+
+    def __init__(self, hidden: int, clip: float) -> None:
+        super().__init__()
+        self.conv1 = nn.Conv2d(hidden, hidden, 3, 1, 1)
+        self.conv2 = nn.Conv2d(hidden, hidden, 3, 1, 1)
+        self.eta = nn.Sequential(nn.Conv2d(hidden, 1, 3, 1, 1), GradientClip(clip), nn.Softplus())
+        self.upmask = nn.Sequential(nn.Conv2d(hidden, 9 * UPSAMPLING**2, 1))
+
+    def forward(self, hidden: Float[Tensor, "e c h w"], source: Int[Tensor, "e"]) -> FrameOutput:
+        frames, place, count = source.unique(return_inverse=True, return_counts=True)
+        edges = F.relu(self.conv1(hidden))
+        # Half precision would lose digits in the sums.
+        total = torch.zeros(len(frames), *edges.shape[1:], device=edges.device)
+        total = total.index_add(0, place, edges.float())
+        mean = (total / count[:, None, None, None]).to(edges)
+        joined = F.relu(self.conv2(mean))
+        return FrameOutput(frames, DAMPING_SCALE * self.eta(joined)[:, 0], self.upmask(joined))
+
+
+@dataclass(frozen=True)
+class EdgeOutput:
+    """One update of the edges."""
+
+    hidden: Float[Tensor, "e c h w"]
+    delta: Float[Tensor, "e 2 h w"]
+    """What is to be added to the position that was looked up, in cells."""
+    weight: Float[Tensor, "e 2 h w"]
+    """Confidence of x and y in (0, 1)."""
+
+
+class UpdateOperator(nn.Module):
+    """The recurrent part: revises the flow of an edge from what lies around its present target."""
+
+    def __init__(self, size: DroidSize, clip: float) -> None:
+        super().__init__()
+        hidden, motion = size.features, size.motion
+        self.corr_encoder = nn.Sequential(
+            nn.Conv2d(LOOKUP, hidden, 1), nn.ReLU(), nn.Conv2d(hidden, hidden, 3, 1, 1), nn.ReLU()
+        )
+        self.flow_encoder = nn.Sequential(
+            nn.Conv2d(4, hidden, 7, 1, 3), nn.ReLU(), nn.Conv2d(hidden, motion, 3, 1, 1), nn.ReLU()
+        )
+        self.gru = ConvGru(hidden, 2 * hidden + motion)
+        self.delta = nn.Sequential(*self._head(hidden, clip))
+        self.weight = nn.Sequential(*self._head(hidden, clip), nn.Sigmoid())
+        self.agg = GraphAggregation(hidden, clip)
+
+    @staticmethod
+    def _head(hidden: int, clip: float) -> list[nn.Module]:
+        first, second = nn.Conv2d(hidden, hidden, 3, 1, 1), nn.Conv2d(hidden, 2, 3, 1, 1)
+        return [first, nn.ReLU(), second, GradientClip(clip)]
+
+    def forward(
+        self,
+        hidden: Float[Tensor, "e c h w"],
+        static: Float[Tensor, "e c h w"],
+        correlation: Float[Tensor, "e 196 h w"],
+        motion: Float[Tensor, "e 4 h w"],
+    ) -> EdgeOutput:
+        """``correlation`` at the present positions, ``motion`` of :func:`motion_features`."""
+        seen = [static, self.corr_encoder(correlation), self.flow_encoder(motion)]
+        hidden = self.gru(hidden, torch.cat(seen, 1))
+        return EdgeOutput(hidden, self.delta(hidden), self.weight(hidden))
+
+
+class DroidNetwork(nn.Module):
+    """All parts, with the parameters of the public weights."""
+
+    def __init__(self, size: DroidSize | None = None, clip: float = 0.01) -> None:
+        """``clip`` is the size of a head's gradient from which on it is dropped."""
+        super().__init__()
+        self.size = size or DroidSize()
+        features = self.size.features
+        self.fnet = Encoder(self.size.base, features, norm=True)
+        self.cnet = Encoder(self.size.base, 2 * features, norm=False)
+        self.update = UpdateOperator(self.size, clip)
+
+    def features(self, images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n c h8 w8"]:
+        """What images are matched by; RGB in [0, 1], sides divisible by 8."""
+        return self.fnet(normalised(images))
+
+    def context(
+        self, images: Float[Tensor, "n 3 h w"]
+    ) -> tuple[Float[Tensor, "n c h8 w8"], Float[Tensor, "n c h8 w8"]]:
+        """Hidden state that an edge from the image starts with, and its static context."""
+        hidden, static = self.cnet(normalised(images)).chunk(2, 1)
+        return hidden.tanh(), F.relu(static)
+
+
+def cell_positions(
+    height: int, width: int, device: torch.device | str = "cpu"
+) -> Float[Tensor, "h w 2"]:
+    """x, y of every cell."""
+    y, x = torch.meshgrid(
+        torch.arange(height, dtype=torch.float32, device=device),
+        torch.arange(width, dtype=torch.float32, device=device),
+        indexing="ij",
+    )
+    return torch.stack([x, y], -1)
+
+
+def motion_features(
+    position: Float[Tensor, "e h w 2"], target: Float[Tensor, "e h w 2"]
+) -> Float[Tensor, "e 4 h w"]:
+    """Flow at the present position, and how far that is from the last target; in cells."""
+    height, width = position.shape[1:3]
+    flow = position - cell_positions(height, width, position.device)
+    both = torch.cat([flow, target - position], -1)
+    return both.clamp(-MOTION_LIMIT, MOTION_LIMIT).permute(0, 3, 1, 2)
+
+
+def upsample_convex(
+    values: Float[Tensor, "n h w"], logits: Float[Tensor, "n 576 h w"]
+) -> Float[Tensor, "n h8 w8"]:
+    """Eightfold resolution: every pixel a convex mean of the 3 x 3 cells around it.
+
+    Pixel (8 y + r, 8 x + c) takes channel 64 k + 8 r + c for neighbour k, row by row. Neighbours
+    outside the image take no part, as in HI-SLAM2.
+    """
+    n, h, w = values.shape
+    around = F.unfold(values[:, None], 3, padding=1).view(n, 9, 1, 1, h, w)
+    inside = F.unfold(torch.ones_like(values[:1, None]), 3, padding=1).view(1, 9, 1, 1, h, w)
+    share = logits.to(values).view(n, 9, UPSAMPLING, UPSAMPLING, h, w)
+    share = share.masked_fill(inside == 0, -torch.inf).softmax(1)
+    fine = (share * around).sum(1)
+    return fine.permute(0, 3, 1, 4, 2).reshape(n, h * UPSAMPLING, w * UPSAMPLING)
+
+
+def load_droid(state: Mapping[str, Tensor]) -> DroidNetwork:
+    """The network with the public weights ``droid.pth``, ready to measure.
+
+    The names there begin with ``module.``, and the two heads have outputs that nothing uses.
+    """
+    plain = {name.removeprefix("module."): value for name, value in state.items()}
+    plain.update({name: plain[name][:2] for name in TRIMMED if name in plain})
+    network = DroidNetwork()
+    try:
+        network.load_state_dict(plain)
+    except RuntimeError as error:
+        reason = str(error).splitlines()[1].strip() if "\n" in str(error) else str(error)
+        raise InputError(f"These are not the weights of DROID-SLAM: {reason}") from error
+    return network.eval().requires_grad_(False)
