@@ -100,6 +100,25 @@ def test_one_step_matches_dense_normal_equations(huber, chunk):
     torch.testing.assert_close(result.inverse_depth.double(), expected, rtol=0, atol=5e-5)
 
 
+def test_damping_resists_the_depth_it_is_given_for():
+    grid, problem = scene()
+    problem = disturbed(problem, 0.02, 0.05)
+    damping = torch.zeros_like(problem.inverse_depth)
+    damping[1] = 3e3 * torch.rand(grid.size, generator=torch.Generator().manual_seed(2))
+    damping[2, 7] = 1e9
+    options = BundleOptions(iterations=1, huber=50.0)
+    damped = replace(problem, damping=damping)
+    xi, delta = gauss_newton_step(damped, CAMERA, grid.rays, options)
+    result = DenseBundle(grid).solve(damped, options)
+    torch.testing.assert_close(result.T_cw, retract(xi, problem.T_cw), rtol=0, atol=2e-5)
+    expected = problem.inverse_depth.double() + delta
+    torch.testing.assert_close(result.inverse_depth.double(), expected, rtol=0, atol=5e-5)
+    plain = DenseBundle(grid).solve(problem, options)
+    moved, freely = ((r.inverse_depth - problem.inverse_depth).abs() for r in (result, plain))
+    assert float(moved[2, 7]) < 1e-5 < 1e-3 < float(freely[2, 7])
+    assert float(moved[1].mean()) < 0.8 * float(freely[1].mean())
+
+
 def test_recovers_a_disturbed_scene():
     grid, truth = scene()
     start = disturbed(truth, 0.03, 0.1)

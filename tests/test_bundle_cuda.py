@@ -129,6 +129,22 @@ def test_solve_matches_the_cpu(device, iterations):
     assert torch.equal(fast.inverse_depth[1].cpu(), problem.inverse_depth[1])
 
 
+def test_damped_depths_match_the_cpu(device):
+    camera = camera_for(device)
+    problem = scene(camera)
+    g = torch.Generator().manual_seed(5)
+    damping = 2e3 * torch.rand(problem.inverse_depth.shape, generator=g)
+    damping[2] = 0
+    options = BundleOptions(2, huber=0.5)
+    damped = replace(problem, damping=damping)
+    slow = DenseBundle(SampleGrid(camera)).solve(damped, options)
+    sent = replace(on(problem, device), damping=damping.to(device))
+    fast = cuda_bundle.CudaDenseBundle(SampleGrid(camera, device)).solve(sent, options)
+    assert_same(fast, slow)
+    plain = DenseBundle(SampleGrid(camera)).solve(problem, options)
+    assert float((plain.inverse_depth - slow.inverse_depth).abs().max()) > 0.01
+
+
 def test_same_input_same_result(device):
     camera = camera_for(device)
     problem = scene(camera)

@@ -66,6 +66,8 @@ class BundleProblem:
     """Inverse variance of x and y, 1 / pixel^2."""
     free_pose: Bool[Tensor, "n"]
     free_depth: Bool[Tensor, "n"]
+    damping: Float[Tensor, "n p"] | None = None
+    """Added to the curvature sum_e w |dp/dd|^2 of each inverse depth (DROID-SLAM's eta)."""
 
 
 @dataclass(frozen=True)
@@ -269,6 +271,8 @@ class DenseBundle:
             depth = None
             if bool(problem.free_depth[frame]):
                 damped = c + options.depth_damping * c.mean() + 1e-8
+                if problem.damping is not None:
+                    damped = damped + problem.damping[frame]
                 E, b = coupling[e].reshape(6 * count, -1), depth_gradient[e].sum(0)
                 depth = (E, damped, b)
                 block = block - ((E / damped) @ E.mT).double()

@@ -59,7 +59,10 @@ def gauss_newton_step(
     Jx, Jd = Jx[:, pose], Jd[:, depth]
     C = (Jd.mT @ (w[:, None] * Jd)).diagonal()
     mean = C.reshape(-1, p).mean(1).repeat_interleave(p)
-    C = torch.diag(C + options.depth_damping * mean + 1e-8)
+    C = C + options.depth_damping * mean + 1e-8
+    if problem.damping is not None:
+        C = C + problem.damping.double().reshape(-1)[depth]
+    C = torch.diag(C)
     H, E = Jx.mT @ (w[:, None] * Jx), Jx.mT @ (w[:, None] * Jd)
     v, b = Jx.mT @ (w * r), Jd.mT @ (w * r)
     S = H - E @ torch.linalg.inv(C) @ E.mT

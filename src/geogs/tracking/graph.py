@@ -1,7 +1,8 @@
 """The frame graph: which keyframes see each other, and the flow measured between them."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -15,7 +16,7 @@ from geogs.tracking.bundle import (
     project,
     relative_motion,
 )
-from geogs.tracking.flow.base import FlowOperator
+from geogs.tracking.flow.base import FlowMatch, FlowOperator
 from geogs.tracking.keyframes import KeyframeStore
 
 Pair = tuple[int, int]
@@ -30,6 +31,17 @@ class Edge:
     weight: Float[Tensor, "p 2"]
     reprojection: Float[Tensor, "p 2"]
     """Where the cells fell when the flow was measured."""
+    damping: Float[Tensor, "p"] | None = None
+    """Of the source's inverse depth, if the operator gives one."""
+    memory: Any = None
+    """What the operator keeps of this edge."""
+
+    @staticmethod
+    def of(match: FlowMatch, n: int, reprojection: Float[Tensor, "p 2"]) -> "Edge":
+        """The n-th edge of a measurement."""
+        damping = None if match.damping is None else match.damping[n]
+        memory = None if match.memory is None else match.memory[n]
+        return Edge(match.pixels[n], match.weight[n], reprojection, damping, memory)
 
 
 class FrameGraph:
@@ -78,10 +90,23 @@ class FrameGraph:
         if cold:
             there, back = self.operator.measure(first, second, fine=fine)
         else:
-            there, back = self.operator.measure(first, second, forward, backward, fine=fine)
+            memory = [(self._memory((i, j)), self._memory((j, i))) for i, j in pairs]
+            there, back = self.operator.measure(
+                first, second, forward, backward, fine=fine, memory=memory
+            )
         for n, (i, j) in enumerate(pairs):
-            self.edges[i, j] = Edge(there.pixels[n], there.weight[n], forward[n])
-            self.edges[j, i] = Edge(back.pixels[n], back.weight[n], backward[n])
+            self.edges[i, j] = Edge.of(there, n, forward[n])
+            self.edges[j, i] = Edge.of(back, n, backward[n])
+
+    def _memory(self, directed: Pair) -> Any:
+        edge = self.edges.get(directed)
+        return None if edge is None else edge.memory
+
+    def release(self, moving: Collection[int]) -> None:
+        """Let go of what the operator keeps of edges that do not join a moving keyframe."""
+        for directed, edge in self.edges.items():
+            if directed[0] not in moving and directed[1] not in moving:
+                edge.memory = None
 
     def stale(self, pairs: Sequence[Pair], tolerance: float) -> list[Pair]:
         """Pairs that are new or whose reprojection has moved more than ``tolerance`` pixels.
@@ -126,6 +151,7 @@ class FrameGraph:
             weight=torch.stack([e.weight for e in edges]),
             free_pose=torch.tensor([k in poses for k in ids]),
             free_depth=torch.tensor([k in depths for k in ids]),
+            damping=_frame_damping(edges, [slot[i] for i, _ in directed], len(ids)),
         )
         return problem, ids
 
@@ -156,6 +182,20 @@ class FrameGraph:
                 state = self.keyframes[ids[n]]
                 state.inverse_depth, state.information = filled[m], information[m]
         return result
+
+
+def _frame_damping(
+    edges: Sequence[Edge], source: Sequence[int], frames: int
+) -> Float[Tensor, "n p"] | None:
+    """Damping of each frame: the mean over the edges that leave it; None where there is none."""
+    given = [(e.damping, n) for e, n in zip(edges, source, strict=True) if e.damping is not None]
+    if not given:
+        return None
+    place = torch.tensor([n for _, n in given])
+    share = torch.nn.functional.one_hot(place, frames).float()
+    share = share / share.sum(0).clamp(min=1)
+    damping = torch.stack([d for d, _ in given])
+    return share.mT.to(damping) @ damping
 
 
 def frame_distances(

@@ -340,6 +340,7 @@ class Tracker:
             self.graph.adjust(
                 edges, poses, depths, BundleOptions(iterations=c.local_iterations, huber=c.huber)
             )
+        self.graph.release(moving)
 
     def _cull(self) -> tuple[int, ...]:
         """Remove the keyframe before the last if it adds little (DROID-SLAM's keyframe test)."""

@@ -47,9 +47,10 @@ extern "C" __global__ void __launch_bounds__(256) linearise_edges(
 }
 
 // Curvature and gradient of the inverse depths of a frame over all of its edges. One block each.
+// added: further damping of every cell, or null.
 extern "C" __global__ void __launch_bounds__(256) sum_sources(
     const int* first, const float* curvature, const float* gradient, int cells,
-    float depth_damping, float* information, float* inverse_curvature, float* depth_gradient) {
+    float depth_damping, const float* added, float* information, float* inverse_curvature, float* depth_gradient) {
   size_t at = (size_t)blockIdx.x * cells;
   int begin = first[blockIdx.x], end = first[blockIdx.x + 1];
   float total = 0.f;
@@ -65,7 +66,8 @@ extern "C" __global__ void __launch_bounds__(256) sum_sources(
   }
   float damping = depth_damping * block_sum(total) / cells + 1e-8f;
   for (int p = threadIdx.x; p < cells; p += blockDim.x)
-    inverse_curvature[at + p] = 1.f / (information[at + p] + damping);
+    inverse_curvature[at + p] =
+        1.f / (information[at + p] + damping + (added ? added[at + p] : 0.f));
 }
 
 // out = sign a b, or sign a^T b, by 36 threads; all threads of the block call it.

@@ -148,6 +148,7 @@ class _Workspace:
         self.information = torch.zeros_like(d)
         self.inverse_curvature, self.depth_gradient, self.delta = d.new_empty(3, d.numel()).unbind()
         self.residual = d.new_zeros(edges)
+        self.damping = None if problem.damping is None else problem.damping.contiguous()
 
 
 class CudaDenseBundle:
@@ -192,7 +193,7 @@ class CudaDenseBundle:
         )  # fmt: skip
         self._step["sum_sources"](
             s.frames, block, s.first, w.curvature, w.gradient, w.cells, options.depth_damping,
-            w.information, w.inverse_curvature, w.depth_gradient,
+            w.damping, w.information, w.inverse_curvature, w.depth_gradient,
         )  # fmt: skip
 
     def _solve_cameras(self, w: _Workspace, options: BundleOptions) -> None:

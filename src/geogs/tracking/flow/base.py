@@ -17,6 +17,15 @@ class FlowMatch:
     """Position in the second image of each grid cell of the first."""
     weight: Float[Tensor, "e p 2"]
     """Inverse variance of x and y in 1 / pixel^2; zero where there is no match."""
+    damping: Float[Tensor, "e p"] | None = None
+    """What resists a change of the first image's inverse depth, in the units of its inverse
+    variance; equal for all edges of a call that share the first image. None for nothing."""
+    memory: tuple[Any, ...] | None = None
+    """Of each edge, what the operator wants to be given when it measures that edge again."""
+
+
+Memories = Sequence[tuple[Any, Any]]
+"""Of each pair, what the operator returned as memory of the two directions; None for nothing."""
 
 
 @runtime_checkable
@@ -38,11 +47,13 @@ class FlowOperator(Protocol):
         forward: Float[Tensor, "e p 2"] | None = None,
         backward: Float[Tensor, "e p 2"] | None = None,
         fine: bool = True,
+        memory: Memories | None = None,
     ) -> tuple[FlowMatch, FlowMatch]:
         """Match ``first[e]`` with ``second[e]``; returns first -> second and second -> first.
 
         ``forward`` and ``backward`` are the present estimates of the matched positions in pixels
         (the reprojection, right to a few pixels); None means nothing is known (a cold start).
-        ``fine`` False allows a cheaper, less precise measurement.
+        ``fine`` False allows a cheaper, less precise measurement. ``memory`` is what earlier
+        measurements of these pairs returned; operators without a memory ignore it.
         """
         ...

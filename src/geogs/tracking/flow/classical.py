@@ -18,7 +18,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from geogs.threads import worker_count
-from geogs.tracking.flow.base import FlowMatch
+from geogs.tracking.flow.base import FlowMatch, Memories
 from geogs.tracking.grid import OFFSET, STRIDE, SampleGrid
 
 FAR = 1e3
@@ -119,6 +119,7 @@ class ClassicalFlow:
         forward: Float[Tensor, "e p 2"] | None = None,
         backward: Float[Tensor, "e p 2"] | None = None,
         fine: bool = True,
+        memory: Memories | None = None,
     ) -> tuple[FlowMatch, FlowMatch]:
         # Half of a small image is too little to match.
         fine = fine or max(self.grid.camera.width, self.grid.camera.height) <= SMALL_IMAGE

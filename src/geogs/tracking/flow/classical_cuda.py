@@ -19,7 +19,7 @@ from torch import Tensor
 from geogs.errors import InputError
 from geogs.gpu.kernels import Kernel, kernels_for
 from geogs.gpu.transfer import to_device
-from geogs.tracking.flow.base import FlowMatch
+from geogs.tracking.flow.base import FlowMatch, Memories
 from geogs.tracking.flow.classical import (
     COARSE_DEVIATION,
     MAX_DISAGREEMENT,
@@ -161,6 +161,7 @@ class CudaClassicalFlow:
         forward: Float[Tensor, "e p 2"] | None = None,
         backward: Float[Tensor, "e p 2"] | None = None,
         fine: bool = True,
+        memory: Memories | None = None,
     ) -> tuple[FlowMatch, FlowMatch]:
         if forward is None or backward is None:
             start = None
