@@ -16,7 +16,7 @@ Conventions, which are those of the published networks:
 """
 
 from collections.abc import Callable
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float, Int
@@ -26,6 +26,7 @@ CHUNK_ELEMENTS = 1 << 24
 """Most numbers that :func:`local_correlation` gathers at once."""
 
 
+@runtime_checkable
 class CorrelationLookup(Protocol):
     """What a recurrent network asks of the correlation of a batch of pairs."""
 
