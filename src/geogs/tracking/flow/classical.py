@@ -19,6 +19,7 @@ from torch import Tensor
 
 from geogs.threads import worker_count
 from geogs.tracking.flow.base import FlowMatch, Memories
+from geogs.tracking.flow.texture import MIN_STRUCTURE, cell_structure
 from geogs.tracking.grid import OFFSET, STRIDE, SampleGrid
 
 FAR = 1e3
@@ -29,8 +30,6 @@ COARSE_DEVIATION = 1.7
 """Deviation of a match at half resolution relative to full resolution."""
 SMALL_IMAGE = 400
 """Long edge in pixels up to which every measurement is at full resolution."""
-MIN_STRUCTURE = 0.5
-"""Smaller eigenvalue of the structure tensor that counts as texture, grey levels^2 / pixel^2."""
 
 
 @dataclass(frozen=True)
@@ -104,7 +103,7 @@ class ClassicalFlow:
 
     def encode(self, image: UInt8[np.ndarray, "h w 3"]) -> ClassicalImage:
         grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-        structure = _smaller_eigenvalue(grey)[OFFSET:-3:STRIDE, OFFSET:-3:STRIDE].reshape(-1)
+        structure = cell_structure(grey)
         even = np.pad(grey, [(0, n % 2) for n in grey.shape], mode="edge")
         half = cv2.resize(even, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
         return ClassicalImage(grey, half, structure)
@@ -235,11 +234,3 @@ def _local_mean(image: UInt8[np.ndarray, "h w"]) -> Float[np.ndarray, "r c"]:
     size = (max(image.shape[1] // 8, 1), max(image.shape[0] // 8, 1))
     small = cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float32)
     return cv2.GaussianBlur(small, (0, 0), max(size) / 16)
-
-
-def _smaller_eigenvalue(grey: UInt8[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
-    """Of the structure tensor averaged over 9 x 9 pixels, grey levels^2 / pixel^2."""
-    gx = cv2.Sobel(grey, cv2.CV_32F, 1, 0, scale=1 / 8)
-    gy = cv2.Sobel(grey, cv2.CV_32F, 0, 1, scale=1 / 8)
-    xx, yy, xy = (cv2.boxFilter(p, -1, (9, 9)) for p in (gx * gx, gy * gy, gx * gy))
-    return (xx + yy) / 2 - np.sqrt(((xx - yy) / 2) ** 2 + xy * xy)
