@@ -23,9 +23,9 @@ from geogs.tracking.flow.base import FlowMatch, Memories
 from geogs.tracking.flow.classical import (
     COARSE_DEVIATION,
     MAX_DISAGREEMENT,
-    MIN_STRUCTURE,
     SMALL_IMAGE,
 )
+from geogs.tracking.flow.texture import MIN_STRUCTURE
 from geogs.tracking.grid import SampleGrid
 
 SOURCES = Path(__file__).parents[1] / "cuda"

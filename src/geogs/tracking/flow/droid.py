@@ -1,0 +1,249 @@
+"""The flow operator of DROID-SLAM: recurrent, with a hidden state for every directed edge.
+
+What the network speaks is translated here.
+
+- Its cells are centred on the pixels (8 c, 8 r) of what it is shown, those of the sample grid on
+  (4 + 8 c, 4 + 8 r) of the working image. It is shown the image without its first four rows and
+  columns (and continued by up to four at the other end), so cell c is cell c, exactly, and a
+  position of x cells is at pixel 4 + 8 x.
+- A weight w in (0, 1) enters DROID-SLAM's adjustment as 0.001 w with residuals in cells. Only the
+  ratio of that to the damping was ever learned, so a scale is free here: a weight of 1 is read as a
+  match of deviation ``DroidOptions.deviation`` pixels. Residuals are 8 times as many pixels as
+  cells, hence all curvatures are ``64 / (0.001 deviation^2)`` times those of DROID-SLAM, and so
+  must be its damping, ``0.2 eta + 1e-7``.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from geogs.errors import InputError
+from geogs.gpu.transfer import to_device
+from geogs.tracking.flow.base import FlowMatch, Memories
+from geogs.tracking.flow.correlation import CorrelationLookup, CorrelationVolume, LocalCorrelation
+from geogs.tracking.flow.droid_network import (
+    CORRELATION_SCALE,
+    LEVELS,
+    RADIUS,
+    DroidNetwork,
+    load_droid,
+    motion_features,
+)
+from geogs.tracking.flow.texture import textured_fraction
+from geogs.tracking.grid import OFFSET, STRIDE, SampleGrid
+
+FAR = 1e4
+"""Cells beyond which a position is as good as lost."""
+WEIGHT_SCALE = 0.001
+"""DROID-SLAM's factor on the weights."""
+DAMPING_SHARE, DAMPING_FLOOR = 0.2, 1e-7
+"""DROID-SLAM's factor on the damping, and what it adds."""
+
+
+@dataclass(frozen=True)
+class DroidOptions:
+    """How often the network is run, and how its output is read."""
+
+    updates: int = 2
+    """Updates of a measurement that starts from a reprojection; nothing is adjusted in between."""
+    fine_updates: int = 4
+    """The same where a precise measurement is asked for."""
+    cold_updates: int = 8
+    """Updates of a measurement that starts from nothing."""
+    deviation: float = 0.3
+    """Standard deviation of a match of weight 1, pixels."""
+    min_confidence: float = 0.05
+    """Matches whose mean weight is smaller are none."""
+    edges_at_once: int = 32
+    """Directed edges that go through the network together; bounds memory."""
+    without_volume: bool = False
+    """Correlate around the flow instead of everywhere: slower, in little memory."""
+
+
+@dataclass(frozen=True)
+class DroidImage:
+    """An image as the operator keeps it, on the device; half precision on a GPU."""
+
+    features: Float[Tensor, "c h w"]
+    """What it is matched by."""
+    hidden: Float[Tensor, "c h w"]
+    """What an edge from this image starts with."""
+    static: Float[Tensor, "c h w"]
+    """What its updates see of the image."""
+    texture: float
+    """Fraction of the cells with structure."""
+
+
+@dataclass(frozen=True)
+class DroidMemory:
+    """What is kept of a directed edge."""
+
+    hidden: Float[Tensor, "c h w"]
+    target: Float[Tensor, "h w 2"]
+    """Where the network last thought its cells to be, in cells."""
+
+
+@dataclass(frozen=True)
+class _Revised:
+    """Directed edges after their updates."""
+
+    hidden: Float[Tensor, "d c h w"]
+    target: Float[Tensor, "d h w 2"]
+    weight: Float[Tensor, "d h w 2"]
+
+
+class DroidFlow:
+    """DROID-SLAM's network on one grid, on the grid's device."""
+
+    def __init__(
+        self, grid: SampleGrid, weights: Path | DroidNetwork, options: DroidOptions | None = None
+    ) -> None:
+        """``weights`` is the file of public weights, ``droid.pth``, or a network."""
+        self.grid = grid
+        self.options = options or DroidOptions()
+        self.device = torch.device(grid.device)
+        network = weights if isinstance(weights, DroidNetwork) else load_droid(_read(weights))
+        self.network = network.to(self.device).eval()
+
+    @torch.no_grad()
+    def encode(self, image: UInt8[np.ndarray, "h w 3"]) -> DroidImage:
+        with self._precision():
+            shown = self._shown(image)
+            features = self.network.features(shown)
+            hidden, static = self.network.context(shown)
+        return DroidImage(features[0], hidden[0], static[0], textured_fraction(image))
+
+    def texture(self, encoded: DroidImage) -> float:
+        return encoded.texture
+
+    @torch.no_grad()
+    def measure(
+        self,
+        first: Sequence[DroidImage],
+        second: Sequence[DroidImage],
+        forward: Float[Tensor, "e p 2"] | None = None,
+        backward: Float[Tensor, "e p 2"] | None = None,
+        fine: bool = True,
+        memory: Memories | None = None,
+    ) -> tuple[FlowMatch, FlowMatch]:
+        source, target = [*first, *second], [*second, *first]
+        before: list[DroidMemory | None] = [None] * len(source)
+        if memory is not None:
+            before = [pair[way] for way in (0, 1) for pair in memory]
+        updates = self.options.fine_updates if fine else self.options.updates
+        if forward is None or backward is None:
+            updates = self.options.cold_updates
+            start = self.grid.pixels.expand(len(source), -1, -1)
+        else:
+            start = torch.cat([forward, backward])
+        parts = []
+        for begin in range(0, len(source), self.options.edges_at_once):
+            c = slice(begin, begin + self.options.edges_at_once)
+            parts.append(self._revise(source[c], target[c], start[c], before[c], updates))
+        edges = _Revised(
+            torch.cat([p.hidden for p in parts]),
+            torch.cat([p.target for p in parts]),
+            torch.cat([p.weight for p in parts]),
+        )
+        match = self._match(edges, self._damping(source, edges.hidden))
+        return _some(match, slice(None, len(first))), _some(match, slice(len(first), None))
+
+    def _precision(self) -> torch.autocast:
+        return torch.autocast(self.device.type, torch.float16, enabled=self.grid.on_gpu)
+
+    def _shown(self, image: UInt8[np.ndarray, "h w 3"]) -> Float[Tensor, "1 3 h8 w8"]:
+        """The part of the image whose every eighth pixel is a cell."""
+        camera, height, width = self.grid.camera, 8 * self.grid.height, 8 * self.grid.width
+        if image.shape != (camera.height, camera.width, 3):
+            raise InputError(
+                f"An image of shape {image.shape} does not fit a camera of "
+                f"{camera.width} x {camera.height} pixels."
+            )
+        part = np.ascontiguousarray(image[OFFSET : OFFSET + height, OFFSET : OFFSET + width])
+        rgb = to_device(torch.from_numpy(part), self.device).permute(2, 0, 1)[None].float() / 255
+        beyond = (0, width - rgb.shape[3], 0, height - rgb.shape[2])
+        return torch.nn.functional.pad(rgb, beyond, mode="replicate")
+
+    def _revise(
+        self,
+        source: Sequence[DroidImage],
+        target: Sequence[DroidImage],
+        start: Float[Tensor, "d p 2"],
+        before: Sequence[DroidMemory | None],
+        updates: int,
+    ) -> _Revised:
+        """Run the updates of some directed edges from the positions ``start``, in pixels."""
+        shape = (len(source), self.grid.height, self.grid.width, 2)
+        position = (start.reshape(shape) - OFFSET) / STRIDE
+        # Points close to or behind the second camera can be anywhere.
+        position = position.nan_to_num(FAR).clamp(-FAR, FAR)
+        hidden = torch.stack(
+            [s.hidden if m is None else m.hidden for s, m in zip(source, before, strict=True)]
+        )
+        last = torch.stack(
+            [p if m is None else m.target for p, m in zip(position, before, strict=True)]
+        )
+        static = torch.stack([s.static for s in source])
+        weight = torch.zeros_like(position)
+        with self._precision():
+            lookup = self._lookup(source, target)
+            for _ in range(updates):
+                out = self.network.update(
+                    hidden, static, lookup(position), motion_features(position, last)
+                )
+                hidden, weight = out.hidden, out.weight.permute(0, 2, 3, 1).float()
+                # The best guess of where the adjustment would move the reprojection to.
+                position = last = position + out.delta.permute(0, 2, 3, 1).float()
+        return _Revised(hidden, position, weight)
+
+    def _lookup(
+        self, source: Sequence[DroidImage], target: Sequence[DroidImage]
+    ) -> CorrelationLookup:
+        first, second = (torch.stack([image.features for image in x]) for x in (source, target))
+        if self.options.without_volume:
+            return LocalCorrelation(first, second, LEVELS, RADIUS, CORRELATION_SCALE)
+        return CorrelationVolume(first, second, LEVELS, RADIUS, CORRELATION_SCALE)
+
+    def _damping(
+        self, source: Sequence[DroidImage], hidden: Float[Tensor, "d c h w"]
+    ) -> Float[Tensor, "d p"]:
+        """Damping of the inverse depth of each edge's source, from all edges that leave it."""
+        number: dict[int, int] = {}
+        place = [number.setdefault(id(image), len(number)) for image in source]
+        index = to_device(torch.tensor(place), self.device)
+        with self._precision():
+            eta = self.network.update.agg(hidden, index).damping.float()
+        factor = STRIDE**2 / (WEIGHT_SCALE * self.options.deviation**2)
+        return factor * (DAMPING_SHARE * eta.flatten(1) + DAMPING_FLOOR)[index]
+
+    def _match(self, edges: _Revised, damping: Float[Tensor, "d p"]) -> FlowMatch:
+        pixels = (OFFSET + STRIDE * edges.target).flatten(1, 2)
+        confidence = edges.weight.flatten(1, 2)
+        found = (confidence.mean(-1) > self.options.min_confidence) & self.grid.inside(pixels, 0.0)
+        weight = confidence * found[..., None] / self.options.deviation**2
+        # Copies, so that one edge that is kept does not keep all.
+        memory = tuple(
+            DroidMemory(h.clone(), t.clone())
+            for h, t in zip(edges.hidden, edges.target, strict=True)
+        )
+        return FlowMatch(pixels, weight, damping, memory)
+
+
+def _some(match: FlowMatch, edges: slice) -> FlowMatch:
+    assert match.damping is not None
+    assert match.memory is not None
+    return FlowMatch(
+        match.pixels[edges], match.weight[edges], match.damping[edges], match.memory[edges]
+    )
+
+
+def _read(path: Path) -> dict[str, Tensor]:
+    try:
+        return torch.load(path, map_location="cpu", weights_only=True)
+    except (OSError, RuntimeError, ValueError) as error:
+        raise InputError(f"The weights {path} cannot be read.") from error
