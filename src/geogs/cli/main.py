@@ -32,8 +32,10 @@ COMMANDS = {
     "reconstruct": Command("geogs.cli.reconstruct", "reconstruct images whose poses are known"),
     "eval": Command("geogs.cli.eval", "compare a result with the ground truth"),
     "bench": Command("geogs.cli.bench", "run a benchmark and write its tables"),
+    "train": Command("geogs.cli.train", "train the flow network that is shipped"),
     "synth": Command("geogs.cli.synth", "make a synthetic room sequence with exact ground truth"),
     "demo": Command("geogs.cli.demo", "make a small room, reconstruct it and show the errors"),
+    "weights": Command("geogs.cli.weights", "list the networks' weights, or verify a file"),
     "doctor": Command(
         "geogs.cli.doctor", "show what this machine can do, test it, say what to mend"
     ),

@@ -1,0 +1,168 @@
+"""The flow operator that is trained for this system (``geogs train flow``)."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from safetensors import safe_open
+from torch import Tensor
+
+from geogs.errors import InputError
+from geogs.tracking.flow.base import FlowMatch, Memories
+from geogs.tracking.flow.lookup import DescriptorPyramid, Edges
+from geogs.tracking.flow.own_network import (
+    FlowEstimate,
+    FlowNetwork,
+    ImageFeatures,
+    NetworkOptions,
+)
+from geogs.tracking.flow.texture import textured_fraction
+from geogs.tracking.grid import SampleGrid
+
+SHIPPED = Path(__file__).parents[2] / "data" / "weights" / "flow.safetensors"
+"""The weights that come with the package."""
+
+
+@dataclass(frozen=True)
+class OwnFlowOptions:
+    """How the network is run."""
+
+    warm_iterations: int = 4
+    """From a start that is right to a few pixels."""
+    coarse_iterations: int = 3
+    """The same where a cheaper measurement will do."""
+    cold_iterations: int = 12
+    """From nothing."""
+    min_share: float = 0.5
+    """A cell that is matched with less probability has no weight."""
+    max_deviation: float = 2.0
+    """Nor has one whose flow may be off by more pixels."""
+    inflation: float = 1.4
+    """Deviation in the adjustment over that of a single match: errors of a cell are alike in all
+    its edges, and the adjustment takes them for independent."""
+    floor: float = 0.04
+    """Deviation in pixels that no match goes below."""
+    edges_at_once: int = 64
+    """Directed pairs that are in memory together."""
+
+
+@dataclass(frozen=True)
+class OwnImage:
+    """An image as the network keeps it, on the device of the grid."""
+
+    features: ImageFeatures
+    """Of one image."""
+    texture: float
+
+
+class OwnFlow:
+    """The network on one grid; bfloat16 inside, positions float32."""
+
+    def __init__(
+        self, grid: SampleGrid, weights: Path | None = None, options: OwnFlowOptions | None = None
+    ) -> None:
+        cv2.setNumThreads(1)
+        self.grid = grid
+        self.options = options or OwnFlowOptions()
+        self.device = torch.device(grid.device)
+        network = load_network(SHIPPED if weights is None else weights)
+        network.to(self.device)
+        # PyTorch's stubs do not know the memory format.
+        self.network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+
+    @torch.inference_mode()
+    def encode(self, image: UInt8[np.ndarray, "h w 3"]) -> OwnImage:
+        height, width = self.grid.camera.height, self.grid.camera.width
+        if image.shape != (height, width, 3):
+            raise InputError(
+                f"An image of shape {image.shape} does not fit a camera of {width} x {height} "
+                "pixels."
+            )
+        pixels = torch.from_numpy(np.ascontiguousarray(image)).to(self.device)
+        with self._autocast():
+            features = self.network.encode(pixels.permute(2, 0, 1)[None].float() / 255)
+        return OwnImage(features, textured_fraction(image))
+
+    def texture(self, encoded: OwnImage) -> float:
+        return encoded.texture
+
+    @torch.inference_mode()
+    def measure(
+        self,
+        first: Sequence[OwnImage],
+        second: Sequence[OwnImage],
+        forward: Float[Tensor, "e p 2"] | None = None,
+        backward: Float[Tensor, "e p 2"] | None = None,
+        fine: bool = True,
+        memory: Memories | None = None,
+    ) -> tuple[FlowMatch, FlowMatch]:
+        options, pairs = self.options, len(first)
+        images = list({id(i): i for i in (*first, *second)}.values())
+        slot = {id(image): n for n, image in enumerate(images)}
+        a, b = ([slot[id(i)] for i in side] for side in (first, second))
+        if forward is None or backward is None:
+            start = self.grid.pixels.expand(2 * pairs, -1, -1)
+            iterations = options.cold_iterations
+        else:
+            start = torch.cat([forward, backward]).float()
+            iterations = options.warm_iterations if fine else options.coarse_iterations
+        features = _stack([i.features for i in images])
+        source, target = torch.tensor([*a, *b]), torch.tensor([*b, *a])
+        parts = []
+        for at in range(0, 2 * pairs, options.edges_at_once):
+            part = slice(at, at + options.edges_at_once)
+            edges = Edges(*(x[part].int().to(self.device) for x in (source, target)))
+            with self._autocast():
+                *_, last = self.network.iterate(features, edges, start[part], iterations)
+            parts.append((last.pixels, self._weight(last)))
+        pixels, weight = (torch.cat(p).clone() for p in zip(*parts, strict=True))
+        return FlowMatch(pixels[:pairs], weight[:pairs]), FlowMatch(pixels[pairs:], weight[pairs:])
+
+    def _weight(self, estimate: FlowEstimate) -> Float[Tensor, "e p 2"]:
+        """Inverse variance of matched cells; none where a match is unlikely or leaves the image."""
+        options, error = self.options, estimate.error
+        share = error.share.sigmoid()
+        deviation = 2**0.5 * error.log_scale.exp()
+        good = (share[..., 0] > options.min_share) & (deviation.amax(-1) < options.max_deviation)
+        good &= self.grid.inside(estimate.pixels)
+        deviation = options.inflation * (deviation.square() + options.floor**2).sqrt()
+        return torch.where(good[..., None], share / deviation.square(), 0.0)
+
+    def _autocast(self) -> torch.autocast:
+        return torch.autocast(self.device.type, torch.bfloat16)
+
+
+def load_network(path: Path) -> FlowNetwork:
+    """The network of a weights file; raises InputError where it is missing or another's."""
+    if not path.is_file():
+        raise InputError(
+            f"There are no weights at {path}; train some with geogs train flow, or take "
+            "--tracking.operator classical."
+        )
+    try:
+        with safe_open(path, "pt") as file:
+            values = json.loads((file.metadata() or {})["options"])
+            tensors = {key: file.get_tensor(key).float() for key in file.keys()}  # noqa: SIM118
+        network = FlowNetwork(NetworkOptions(**{**values, "levels": tuple(values["levels"])}))
+        network.load_state_dict(tensors)
+    except Exception as error:
+        raise InputError(f"{path} does not hold weights of our flow network ({error}).") from error
+    return network.eval().requires_grad_(False)
+
+
+def _stack(parts: Sequence[ImageFeatures]) -> ImageFeatures:
+    """Features of several images as one."""
+    if len(parts) == 1:
+        return parts[0]
+    descriptors = torch.cat([p.pyramid.descriptors for p in parts])
+    return ImageFeatures(
+        torch.cat([p.source for p in parts]),
+        DescriptorPyramid(descriptors, parts[0].pyramid.levels),
+        torch.cat([p.hidden for p in parts]),
+        torch.cat([p.context for p in parts]),
+    )

@@ -1,0 +1,339 @@
+"""Our recurrent flow network for static scenes and dense bundle adjustment.
+
+It starts from the flow that poses and depths predict, looks the cells' descriptors up around where
+they are believed to lie, and iterates (after RAFT and DROID-SLAM). Every iteration says how far its
+flow may be off: each axis has a mixture of two Laplace distributions (after SEA-RAFT), one for
+cells that are matched and one for cells that are not.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional
+
+from geogs.tracking.flow.lookup import (
+    CHANNELS,
+    WINDOW,
+    DescriptorPyramid,
+    Edges,
+    PyramidLevel,
+    correlation_windows,
+)
+from geogs.tracking.grid import OFFSET, STRIDE
+
+FLOW_UNIT = 16.0
+"""Pixels of flow that are one to the network."""
+MIN_LOG_SCALE, MAX_LOG_SCALE = -4.5, 3.0
+"""Bounds of the logarithm of a matched cell's Laplace scale in pixels."""
+
+
+@dataclass(frozen=True)
+class NetworkOptions:
+    """Sizes of the network."""
+
+    levels: tuple[int, ...] = (2, 4, 8, 16, 32)
+    """Pixels between the descriptors of each level of the pyramid, each twice the one before."""
+    stem: int = 32
+    """Channels at 1/2 of the resolution."""
+    middle: int = 64
+    """Channels at 1/4."""
+    deep: int = 96
+    """Channels at 1/8."""
+    hidden: int = 96
+    """Channels of the recurrent state."""
+    context: int = 64
+    """Channels of what an image gives to every iteration."""
+    motion: int = 80
+    """Channels that the correlation windows are reduced to."""
+
+
+@dataclass(frozen=True)
+class ImageFeatures:
+    """What the network keeps of images; cells are those of the sample grid."""
+
+    source: Float[Tensor, "n p c"]
+    """Descriptors of the cells."""
+    pyramid: DescriptorPyramid
+    hidden: Float[Tensor, "n ch gh gw"]
+    """State that the iterations begin with."""
+    context: Float[Tensor, "n cx gh gw"]
+
+
+@dataclass(frozen=True)
+class LaplaceMixture:
+    """Error of a flow along each axis: matched with probability ``share``, else not."""
+
+    share: Float[Tensor, "e p 1"]
+    """Logit of the probability that a cell is matched."""
+    log_scale: Float[Tensor, "e p 2"]
+    """Logarithm of the Laplace scale in pixels of a matched cell."""
+    log_outlier: Float[Tensor, "e p 2"]
+    """The same of a cell that is not matched; larger."""
+
+    def variance(self) -> Float[Tensor, "e p 2"]:
+        """Of the whole mixture, pixels^2 (a Laplace distribution of scale b has 2 b^2)."""
+        p = self.share.sigmoid()
+        return 2 * (p * (2 * self.log_scale).exp() + (1 - p) * (2 * self.log_outlier).exp())
+
+    def negative_log_likelihood(self, error: Float[Tensor, "e p 2"]) -> Float[Tensor, "e p"]:
+        """Of errors in pixels, mean over both axes."""
+        parts = []
+        for logit, log_scale in ((self.share, self.log_scale), (-self.share, self.log_outlier)):
+            density = -error.abs() * (-log_scale).exp() - log_scale - 0.693147
+            parts.append(functional.logsigmoid(logit) + density)
+        return -torch.logaddexp(*parts).mean(-1)
+
+
+@dataclass(frozen=True)
+class FlowEstimate:
+    """What an iteration says."""
+
+    pixels: Float[Tensor, "e p 2"]
+    """Positions of the cells in the second image."""
+    error: LaplaceMixture
+    state: Float[Tensor, "e ch gh gw"]
+
+
+class FlowNetwork(nn.Module):
+    """Encoder, recurrent update, heads and convex upsampling."""
+
+    def __init__(self, options: NetworkOptions | None = None) -> None:
+        super().__init__()
+        self.options = options or NetworkOptions()
+        self.encoder = Encoder(self.options)
+        self.update = Update(self.options)
+        self.upsampling = nn.Sequential(
+            nn.Conv2d(self.options.hidden, 80, 3, padding=1),
+            nn.ReLU(),
+            nn.Conv2d(80, 9 * STRIDE * STRIDE, 1),
+        )
+
+    def encode(self, images: Float[Tensor, "n 3 h w"]) -> ImageFeatures:
+        """Features of RGB images in [0, 1], on the cells of :class:`SampleGrid`."""
+        return self.encoder(images)
+
+    def iterate(
+        self,
+        features: ImageFeatures,
+        edges: Edges,
+        start: Float[Tensor, "e p 2"],
+        iterations: int,
+        hidden: Float[Tensor, "e ch gh gw"] | None = None,
+    ) -> Iterator[FlowEstimate]:
+        """Estimates of where the cells of each edge's first image lie in its second, in pixels.
+
+        ``start`` is what is known before; ``hidden`` a state to go on with instead of a new one.
+        Positions are detached between iterations.
+        """
+        first = edges.first.long()
+        state = features.hidden[first] if hidden is None else hidden
+        context = features.context[first]
+        height, width = state.shape[-2:]
+        cells = cell_pixels(height, width, start)
+        pixels = start
+        confidence = torch.zeros_like(start)
+        for _ in range(iterations):
+            pixels = pixels.detach()
+            windows = correlation_windows(features.source, features.pyramid, edges, pixels)
+            flow = torch.cat([pixels - cells, pixels - start, FLOW_UNIT * confidence], -1)
+            state, raw = self.update(
+                state, context, _image(windows, height), _image(flow / FLOW_UNIT, height)
+            )
+            values = raw.float().flatten(2).mT
+            pixels = pixels + values[..., :2]
+            error = _mixture(values)
+            confidence = (error.log_scale / 4).detach()
+            yield FlowEstimate(pixels, error, state)
+
+    def upsample(self, estimate: FlowEstimate, height: int, width: int) -> Float[Tensor, "e h w 2"]:
+        """Flow of every pixel as a convex combination of the flows of the nine cells around it."""
+        state = estimate.state
+        gh, gw = state.shape[-2:]
+        flow = estimate.pixels - cell_pixels(gh, gw, estimate.pixels)
+        flow = functional.pad(_image(flow, gh), (1, 1, 1, 1), mode="replicate")
+        near = functional.unfold(flow, 3).reshape(len(flow), 2, 9, 1, 1, gh, gw)
+        logits = 0.25 * self.upsampling(state).float()
+        weight = logits.reshape(len(flow), 1, 9, STRIDE, STRIDE, gh, gw).softmax(2)
+        full = (weight * near).sum(2).permute(0, 4, 2, 5, 3, 1)
+        full = full.reshape(len(flow), gh * STRIDE, gw * STRIDE, 2)
+        if full.shape[1] < height or full.shape[2] < width:
+            pad = (0, 0, 0, max(0, width - full.shape[2]), 0, max(0, height - full.shape[1]))
+            full = _replicated(full, pad)
+        return full[:, :height, :width]
+
+
+class Encoder(nn.Module):
+    """One trunk for descriptors and context, so that an image is read once.
+
+    Pixel of a position i: 2 i at 1/2, 4 i at 1/4, 4 + 8 i at 1/8, where the cells are.
+    """
+
+    def __init__(self, options: NetworkOptions) -> None:
+        super().__init__()
+        o = options
+        self.levels = o.levels
+        self.stem = nn.Sequential(
+            nn.Conv2d(3, o.stem, 7, stride=2, padding=3), _norm(o.stem), nn.ReLU()
+        )
+        self.at_half = Residual(o.stem, o.stem)
+        self.at_quarter = nn.Sequential(Residual(o.stem, o.middle, 1), Residual(o.middle, o.middle))
+        self.at_eighth = nn.Sequential(
+            Residual(o.middle, o.deep, 0), Residual(o.deep, o.deep), Residual(o.deep, o.deep)
+        )
+        self.describe_cells = nn.Conv2d(o.deep, CHANNELS, 1)
+        self.deep_to_quarter = nn.ConvTranspose2d(o.deep, o.middle, 3, stride=2)
+        self.describe_quarter = nn.Sequential(
+            nn.ReLU(), nn.Conv2d(o.middle, o.middle, 3, padding=1), nn.ReLU(),
+            nn.Conv2d(o.middle, CHANNELS, 1),
+        )  # fmt: skip
+        if 2 in o.levels:
+            self.quarter_to_half = nn.ConvTranspose2d(
+                o.middle, o.stem, 3, stride=2, padding=1, output_padding=1
+            )
+            self.describe_half = nn.Sequential(
+                nn.ReLU(), nn.Conv2d(o.stem, o.stem, 3, padding=1), nn.ReLU(),
+                nn.Conv2d(o.stem, CHANNELS, 1),
+            )  # fmt: skip
+        self.state = nn.Sequential(
+            nn.Conv2d(o.deep, 128, 3, padding=1), nn.ReLU(),
+            nn.Conv2d(128, o.hidden + o.context, 1),
+        )  # fmt: skip
+        self.hidden = o.hidden
+
+    def forward(self, images: Float[Tensor, "n 3 h w"]) -> ImageFeatures:
+        height, width = images.shape[-2:]
+        gh, gw = -(-(height - 7) // STRIDE), -(-(width - 7) // STRIDE)
+        images = _replicated(images, (0, -width % STRIDE, 0, -height % STRIDE))
+        half = self.at_half(self.stem(4 * images - 2))
+        quarter = self.at_quarter(half)
+        eighth = self.at_eighth(quarter)
+        joined = quarter + self.deep_to_quarter(eighth)[..., :-1, :-1]
+        fields = {4: self.describe_quarter(joined)}
+        if 2 in self.levels:
+            fields[2] = self.describe_half(half + self.quarter_to_half(joined))
+        for step in range(3, 8):
+            fields[2**step] = functional.avg_pool2d(fields[2 ** (step - 1)], 2, ceil_mode=True)
+        state = self.state(eighth)[..., :gh, :gw]
+        hidden, context = state.split([self.hidden, state.shape[1] - self.hidden], 1)
+        return ImageFeatures(
+            self.describe_cells(eighth)[..., :gh, :gw].flatten(2).mT.contiguous(),
+            _pyramid({stride: fields[stride] for stride in self.levels}),
+            hidden.tanh(),
+            context.relu(),
+        )
+
+
+class Residual(nn.Module):
+    """Two convolutions beside a shortcut; ``shift`` halves the resolution.
+
+    Output i of a halving block is at input 2 i + 1 - shift.
+    """
+
+    def __init__(self, inputs: int, outputs: int, shift: int | None = None) -> None:
+        super().__init__()
+        self.shift = shift
+        stride = 1 if shift is None else 2
+        self.first = nn.Conv2d(inputs, outputs, 3, stride=stride, padding=1 if stride == 1 else 0)
+        self.second = nn.Conv2d(outputs, outputs, 3, padding=1)
+        self.norm_first, self.norm_second = _norm(outputs), _norm(outputs)
+        self.shortcut = nn.Conv2d(inputs, outputs, 1) if stride == 2 else nn.Identity()
+
+    def forward(self, x: Tensor) -> Tensor:
+        beside = x
+        if self.shift is not None:
+            beside = x[..., 1 - self.shift :: 2, 1 - self.shift :: 2]
+            x = functional.pad(x, (self.shift, 1 - self.shift, self.shift, 1 - self.shift))
+        y = self.norm_first(self.first(x)).relu()
+        return (self.norm_second(self.second(y)) + self.shortcut(beside)).relu()
+
+
+class Update(nn.Module):
+    """One iteration: windows and flow in, a convolutional GRU, step and uncertainty out."""
+
+    def __init__(self, options: NetworkOptions) -> None:
+        super().__init__()
+        o = options
+        self.windows = nn.Sequential(
+            nn.Conv2d(len(o.levels) * WINDOW, 128, 1), nn.ReLU(),
+            nn.Conv2d(128, o.motion, 3, padding=1), nn.ReLU(),
+        )  # fmt: skip
+        self.flow = nn.Sequential(
+            nn.Conv2d(6, 48, 5, padding=2), nn.ReLU(), nn.Conv2d(48, 32, 3, padding=1), nn.ReLU()
+        )
+        inputs = o.hidden + o.context + o.motion + 32
+        self.gates = nn.Conv2d(inputs, 2 * o.hidden, 3, padding=1)
+        self.candidate = nn.Conv2d(inputs, o.hidden, 3, padding=1)
+        self.view = nn.Conv2d(o.hidden, o.hidden, 1)
+        self.view_to_gates = nn.Linear(o.hidden, 3 * o.hidden)
+        self.head = nn.Sequential(
+            nn.Conv2d(o.hidden, 112, 3, padding=1), nn.ReLU(), nn.Conv2d(112, 7, 1)
+        )
+
+    def forward(
+        self, state: Tensor, context: Tensor, windows: Tensor, flow: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        x = torch.cat([context, self.windows(windows), self.flow(flow)], 1)
+        # What the whole view says, as in DROID-SLAM: a weighted mean of the state.
+        mean = (self.view(state).sigmoid() * state).mean((2, 3))
+        gate_bias, candidate_bias = self.view_to_gates(mean)[..., None, None].split(
+            [2 * state.shape[1], state.shape[1]], 1
+        )
+        gates = (self.gates(torch.cat([state, x], 1)) + gate_bias).sigmoid()
+        keep, reset = gates.chunk(2, 1)
+        candidate = self.candidate(torch.cat([reset * state, x], 1)) + candidate_bias
+        state = (1 - keep) * state + keep * candidate.tanh()
+        return state, self.head(state)
+
+
+def cell_pixels(height: int, width: int, like: Tensor) -> Float[Tensor, "p 2"]:
+    """Pixels of the sample grid's cells, row by row."""
+    x = OFFSET + STRIDE * torch.arange(width, dtype=like.dtype, device=like.device)
+    y = OFFSET + STRIDE * torch.arange(height, dtype=like.dtype, device=like.device)
+    yy, xx = torch.meshgrid(y, x, indexing="ij")
+    return torch.stack([xx, yy], -1).reshape(-1, 2)
+
+
+def _mixture(values: Float[Tensor, "e p k"]) -> LaplaceMixture:
+    scale = values[..., 2:4].clamp(MIN_LOG_SCALE, MAX_LOG_SCALE)
+    outlier = scale + 1.0 + functional.softplus(values[..., 4:6])
+    return LaplaceMixture(values[..., 6:7] + 2.0, scale, outlier.clamp(max=5.0))
+
+
+def _pyramid(fields: dict[int, Tensor]) -> DescriptorPyramid:
+    """Levels by the pixels between their descriptors; those above 1/4 are means of 2 x 2."""
+    levels = []
+    for stride, field in fields.items():
+        # A mean of k x k descriptors at 4 i lies (k - 1) / 2 of them further on.
+        shift = 0.0 if stride <= 4 else (4 / stride - 1) / 2
+        levels.append(PyramidLevel(field.shape[-1], field.shape[-2], 1 / stride, shift))
+    flat = torch.cat([field.flatten(2).mT for field in fields.values()], 1)
+    return DescriptorPyramid(flat, tuple(levels))
+
+
+def _image(values: Float[Tensor, "e p k"], height: int) -> Float[Tensor, "e k h w"]:
+    """Values of cells as an image; the channels stay innermost in memory."""
+    return values.unflatten(1, (height, -1)).permute(0, 3, 1, 2)
+
+
+def _replicated(x: Tensor, pad: tuple[int, ...]) -> Tensor:
+    """Padding that repeats the last value, also of integers and of channels-last fields."""
+    for axis, (before, after) in enumerate(zip(pad[::2], pad[1::2], strict=True)):
+        dim = x.dim() - 1 - axis
+        parts = [x.narrow(dim, 0, 1).expand(*_times(x, dim, before))] if before else []
+        parts.append(x)
+        if after:
+            parts.append(x.narrow(dim, x.shape[dim] - 1, 1).expand(*_times(x, dim, after)))
+        x = torch.cat(parts, dim) if len(parts) > 1 else x
+    return x
+
+
+def _times(x: Tensor, dim: int, count: int) -> list[int]:
+    return [count if d == dim else -1 for d in range(x.dim())]
+
+
+def _norm(channels: int) -> nn.Module:
+    """Free of the batch, and of gain and offset of the image's light."""
+    return nn.InstanceNorm2d(channels, affine=True)

@@ -1,0 +1,1 @@
+"""How the shipped flow network is made: random rooms on the GPU, loss and loop."""

@@ -1,0 +1,81 @@
+"""A training run on disk: a few safetensors files and a page of numbers, no pickles."""
+
+import json
+import shutil
+from dataclasses import asdict
+from pathlib import Path
+
+from safetensors.torch import load_file, save_file
+
+from geogs.errors import InputError
+from geogs.tracking.flow.own_network import NetworkOptions
+from geogs.train.options import FlowTraining
+from geogs.train.trainer import FlowTrainer
+
+FOLDER = "checkpoint"
+_PARTS = ("network", "mean", "first_moment", "second_moment")
+
+
+def save_checkpoint(trainer: FlowTrainer, out: Path) -> None:
+    """Write all that the run needs to go on; the one before stays until the new one is whole."""
+    fresh, final = out / f".{FOLDER}", out / FOLDER
+    shutil.rmtree(fresh, ignore_errors=True)
+    fresh.mkdir(parents=True)
+    names = [name for name, _ in trainer.network.named_parameters()]
+    moments = trainer.optimizer.state_dict()["state"]
+    parts = {
+        "network": trainer.network.state_dict(),
+        "mean": trainer.mean.state_dict(),
+        "first_moment": {names[k]: v["exp_avg"] for k, v in moments.items()},
+        "second_moment": {names[k]: v["exp_avg_sq"] for k, v in moments.items()},
+    }
+    for name in _PARTS:
+        tensors = {k: v.detach().cpu().contiguous() for k, v in parts[name].items()}
+        save_file(tensors, fresh / f"{name}.safetensors")
+    state = {"step": trainer.step, "options": asdict(trainer.options)}
+    (fresh / "state.json").write_text(json.dumps(state, indent=1))
+    shutil.rmtree(final, ignore_errors=True)
+    fresh.rename(final)
+
+
+def read_options(out: Path) -> FlowTraining:
+    """The settings of the run in a folder; raises InputError where there is none."""
+    values = _read_state(out)["options"]
+    network = values.pop("network")
+    network["levels"] = tuple(network["levels"])
+    return FlowTraining(**values, network=NetworkOptions(**network))
+
+
+def load_checkpoint(trainer: FlowTrainer, out: Path) -> None:
+    """Go on from a checkpoint; raises InputError where there is none or it is damaged."""
+    step = int(_read_state(out)["step"])
+    try:
+        parts = {name: load_file(out / FOLDER / f"{name}.safetensors") for name in _PARTS}
+    except Exception as error:
+        raise InputError(f"The checkpoint in {out} is damaged ({error}).") from error
+    state = trainer.state()
+    names = [name for name, _ in trainer.network.named_parameters()]
+    optimizer = state["optimizer"]
+    if parts["first_moment"]:
+        optimizer["state"] = {
+            k: {
+                "step": _count(step),
+                "exp_avg": parts["first_moment"][name],
+                "exp_avg_sq": parts["second_moment"][name],
+            }
+            for k, name in enumerate(names)
+        }
+    trainer.load({**state, **{n: parts[n] for n in ("network", "mean")}, "step": step})
+
+
+def _count(step: int):  # type: ignore[no-untyped-def]
+    import torch
+
+    return torch.tensor(float(step))
+
+
+def _read_state(out: Path) -> dict:
+    path = out / FOLDER / "state.json"
+    if not path.is_file():
+        raise InputError(f"There is no checkpoint in {out}; start without --resume.")
+    return json.loads(path.read_text())

@@ -1,0 +1,44 @@
+"""Settings of the training of the flow network."""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from geogs.tracking.flow.own_network import NetworkOptions
+
+
+@dataclass(frozen=True)
+class FlowTraining:
+    """What a training run does; saved with every checkpoint."""
+
+    steps: int = 20_000
+    """Steps of the whole run; the learning rate ends at zero with the last."""
+    batch: int = 16
+    """Clips per step and device."""
+    width: int = 416
+    """Of the images in pixels."""
+    height: int = 288
+    views: int = 2
+    """Views of a clip; every ordered pair of neighbours is an edge."""
+    iterations: int = 8
+    """Of the network per edge."""
+    learning_rate: float = 8e-4
+    """Peak, reached after the warm-up."""
+    warmup: int = 300
+    """Steps in which the learning rate grows from zero."""
+    weight_decay: float = 1e-4
+    clip: float = 1.0
+    """Largest norm of a gradient."""
+    ema: float = 0.999
+    """Decay of the running mean of the weights, which is what is validated and shipped."""
+    decay: float = 0.8
+    """Weight of an iteration's loss relative to the next."""
+    likelihood: Literal["joint", "separate"] = "joint"
+    """Whether the likelihood of the error trains the flow, too, or an absolute error does."""
+    absolute: float = 0.1
+    """Weight of the absolute error (pixels) beside a joint likelihood."""
+    dense: float = 0.5
+    """Weight of the absolute error of the upsampled flow after the last iteration."""
+    occluded: float = 0.3
+    """Weight of cells that the other view does not see, relative to those that it sees."""
+    seed: int = 0
+    network: NetworkOptions = field(default_factory=NetworkOptions)

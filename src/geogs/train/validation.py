@@ -1,0 +1,66 @@
+"""The fixed validation set: rooms and textures that training never shows."""
+
+import torch
+
+from geogs.tracking.flow.own_network import FlowNetwork, cell_pixels
+from geogs.tracking.grid import OFFSET, STRIDE
+from geogs.train.options import FlowTraining
+from geogs.train.pairs import FlowBatch, flow_batch
+from geogs.train.rooms.options import RoomOptions
+from geogs.train.rooms.sampler import RoomSampler
+from geogs.train.scores import CellErrors, FlowScores, has_texture, summarise
+from geogs.train.starts import StartOptions
+from geogs.train.trainer import run_network
+
+SEED = 2718
+
+
+class Validation:
+    """Batches of unseen rooms, made again whenever they are needed."""
+
+    def __init__(
+        self, options: FlowTraining, device: torch.device, batches: int = 8, batch: int = 16
+    ) -> None:
+        rooms = RoomOptions(width=options.width, height=options.height, validation=True)
+        self._rooms = RoomSampler(rooms, device, SEED)
+        self.batches, self._batch, self._device = batches, batch, device
+
+    def batch(self, number: int) -> FlowBatch:
+        """The directed pairs of a batch."""
+        generator = torch.Generator(self._device)
+        generator.manual_seed(SEED + number)
+        return flow_batch(self._rooms.sample(number, self._batch), StartOptions(), generator)
+
+    @torch.no_grad()
+    def score(self, network: FlowNetwork, iterations: int) -> FlowScores:
+        """Scores of a network."""
+        parts = []
+        for number in range(self.batches):
+            batch = self.batch(number)
+            estimates, dense = run_network(network, batch, iterations)
+            deviation = estimates[-1].error.variance().sqrt()
+            parts.append(cell_errors(batch, estimates[-1].pixels, deviation, dense))
+        return summarise(parts)
+
+
+def cell_errors(
+    batch: FlowBatch, pixels: torch.Tensor, deviation: torch.Tensor, dense: torch.Tensor
+) -> CellErrors:
+    """Errors on the visible cells (and pixels) of a batch, given positions and dense flow."""
+    truth, visible = batch.at_cells(batch.truth), batch.at_cells(batch.visible)
+    height, width = batch.truth.shape[1:3]
+    rows = torch.arange(height, device=dense.device, dtype=dense.dtype)
+    columns = torch.arange(width, device=dense.device, dtype=dense.dtype)
+    v, u = torch.meshgrid(rows, columns, indexing="ij")
+    flow = batch.truth - torch.stack([u, v], -1)
+    missed = (flow - dense).norm(dim=-1)
+    textured = has_texture(batch.images)[:, OFFSET:-3:STRIDE, OFFSET:-3:STRIDE].flatten(1)
+    cells = cell_pixels(len(range(OFFSET, height - 3, STRIDE)),
+                        len(range(OFFSET, width - 3, STRIDE)), truth)  # fmt: skip
+    return CellErrors(
+        error=(truth - pixels)[visible],
+        deviation=deviation[visible],
+        motion=(truth - cells).norm(dim=-1)[visible],
+        textured=textured[batch.edges.first.long()][visible],
+        dense=missed[batch.visible],
+    )
