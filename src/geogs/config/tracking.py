@@ -1,6 +1,7 @@
 """Settings of the front end."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 
 @dataclass(frozen=True)
@@ -10,6 +11,10 @@ class TrackingConfig:
     Distances in the image are fractions of its longer side, so that they hold at any resolution.
     """
 
+    operator: Literal["auto", "classical", "own", "raft", "droid"] = "auto"
+    """What measures image motion; auto takes classical, which needs no weights."""
+    weights: str = ""
+    """File with the operator's weights; empty looks for one (geogs weights says where)."""
     keyframe_flow: float = 0.025
     """Median motion since the last keyframe that makes a frame a keyframe, of the long edge."""
     cull_distance: float = 0.012

@@ -17,7 +17,7 @@ from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_inverse
 from geogs.tracking.bundle import BundleOptions
 from geogs.tracking.flow.base import FlowOperator
-from geogs.tracking.flow.classical import ClassicalFlow
+from geogs.tracking.flow.select import build_operator
 from geogs.tracking.graph import FrameGraph, frame_distances, proximity_pairs
 from geogs.tracking.grid import SampleGrid
 from geogs.tracking.initialise import initialise
@@ -54,15 +54,6 @@ class TrackResult:
     """Ids that were culled."""
 
 
-def classical_flow(grid: SampleGrid) -> FlowOperator:
-    """The flow operator without a network for the device of a grid."""
-    if grid.on_gpu:
-        from geogs.tracking.flow.classical_cuda import CudaClassicalFlow
-
-        return CudaClassicalFlow(grid)
-    return ClassicalFlow(grid)
-
-
 class Tracker:
     """Monocular tracking after DROID-SLAM: motion filter, frame graph, dense bundle adjustment."""
 
@@ -78,7 +69,7 @@ class Tracker:
         self.camera = camera
         self.config = config or TrackingConfig()
         self.grid = SampleGrid(camera, device)
-        self.operator = operator or classical_flow(self.grid)
+        self.operator = operator or build_operator(self.config, self.grid)
         self.store = KeyframeStore(self.grid)
         self.graph = FrameGraph(self.store, self.operator)
         self.recorder = TrajectoryRecorder(self.store, self.operator)
