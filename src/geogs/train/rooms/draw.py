@@ -1,0 +1,76 @@
+"""Random numbers on a device, of given shapes, without waiting for the device."""
+
+import hashlib
+import math
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+
+class Draw:
+    """A stream of random tensors that depends on the given numbers only."""
+
+    def __init__(self, device: torch.device, *key: int) -> None:
+        digest = hashlib.blake2b(repr(key).encode(), digest_size=8).digest()
+        self.device = device
+        self._generator = torch.Generator(device).manual_seed(int.from_bytes(digest) >> 1)
+
+    def uniform(self, low: float | int, high: float | int, *shape: int) -> Float[Tensor, "..."]:
+        """Even in [low, high)."""
+        values = torch.rand(shape, generator=self._generator, device=self.device)
+        return low + (high - low) * values
+
+    def log_uniform(self, low: float | int, high: float | int, *shape: int) -> Float[Tensor, "..."]:
+        """Positive, its logarithm even."""
+        return self.uniform(math.log(low), math.log(high), *shape).exp()
+
+    def normal(self, deviation: float | int, *shape: int) -> Float[Tensor, "..."]:
+        """Gaussian around zero."""
+        return deviation * torch.randn(shape, generator=self._generator, device=self.device)
+
+    def chance(self, share: float, *shape: int) -> Bool[Tensor, "..."]:
+        """True with the given probability."""
+        return self.uniform(0.0, 1.0, *shape) < share
+
+    def integers(self, end: int, *shape: int) -> Int[Tensor, "..."]:
+        """Even in 0..end-1."""
+        return torch.randint(end, shape, generator=self._generator, device=self.device)
+
+    def choose(self, shares: Sequence[float | int], *shape: int) -> Int[Tensor, "..."]:
+        """Index of a share, drawn in proportion to them."""
+        value = self.uniform(0.0, sum(shares), *shape)
+        bound = 0.0
+        chosen = torch.zeros(shape, dtype=torch.int64, device=self.device)
+        for index in range(1, len(shares)):
+            bound += shares[index - 1]
+            chosen = torch.where(value >= bound, index, chosen)
+        return chosen
+
+    def rotation(self, *shape: int) -> Float[Tensor, "... 3 3"]:
+        """Rotations of any kind, evenly spread."""
+        q = torch.nn.functional.normalize(self.normal(1.0, *shape, 4), dim=-1)
+        w, x, y, z = q.unbind(-1)
+        rows = [
+            1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+            2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+            2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+        ]  # fmt: skip
+        return torch.stack(rows, -1).unflatten(-1, (3, 3))
+
+
+def about_z(angle: Float[Tensor, "..."]) -> Float[Tensor, "... 3 3"]:
+    """Rotations about z by angles in radians."""
+    c, s, o, i = angle.cos(), angle.sin(), torch.zeros_like(angle), torch.ones_like(angle)
+    return torch.stack([c, -s, o, s, c, o, o, o, i], -1).unflatten(-1, (3, 3))
+
+
+def from_vector(vector: Float[Tensor, "... 3"]) -> Float[Tensor, "... 3 3"]:
+    """Rotations by rotation vectors (axis times angle in radians)."""
+    angle = vector.norm(dim=-1, keepdim=True)[..., None]
+    x, y, z = (vector / angle[..., 0].clamp_min(1e-9)).unbind(-1)
+    o = torch.zeros_like(x)
+    K = torch.stack([o, -z, y, z, o, -x, -y, x, o], -1).unflatten(-1, (3, 3))
+    eye = torch.eye(3, dtype=vector.dtype, device=vector.device)
+    return eye + angle.sin() * K + (1 - angle.cos()) * (K @ K)

@@ -1,0 +1,85 @@
+// Views of random rooms, and where their points are in other views.
+#include "shading.cuh"
+
+#define CAMERA_FLOATS 16
+
+// A view: camera to world by rows (rotation, centre), then fx fy cx cy.
+__device__ __forceinline__ V3 world_ray(const float* c, float x, float y) {
+  V3 d = v3((x - c[14]) / c[12], (y - c[15]) / c[13], 1.f);
+  return v3(c[0] * d.x + c[1] * d.y + c[2] * d.z, c[4] * d.x + c[5] * d.y + c[6] * d.z, c[8] * d.x + c[9] * d.y + c[10] * d.z);
+}
+__device__ __forceinline__ V3 centre_of(const float* c) { return v3(c[3], c[7], c[11]); }
+
+// The solids that pixels left..right, top..bottom may see; all threads of the block.
+__device__ void select_visible(const Stock& stock, u32* mask, const float* camera, int count, float left, float top, float right, float bottom, int thread) {
+  V3 axis = unit(world_ray(camera, 0.5f * (left + right), 0.5f * (top + bottom)));
+  float cosine = fminf(fminf(dot(axis, unit(world_ray(camera, left, top))), dot(axis, unit(world_ray(camera, right, top)))), fminf(dot(axis, unit(world_ray(camera, left, bottom))), dot(axis, unit(world_ray(camera, right, bottom)))));
+  float opening = acosf(fminf(cosine, 1.f));
+  if (thread < MOST_SOLIDS / 32) mask[thread] = 0;
+  __syncthreads();
+  if (thread < count && stock.present[thread >> 5] >> (thread & 31) & 1) {
+    const Solid& s = stock.solid[thread];
+    V3 offset = load3(s.centre) - centre_of(camera);
+    float distance = norm(offset), radius = s.radius + 1e-3f;
+    bool seen = distance <= radius;
+    if (!seen) seen = acosf(clampf(dot(offset, axis) / distance, -1.f, 1.f)) <= opening + asinf(radius / distance) + 2e-3f;
+    if (seen) atomicOr(&mask[thread >> 5], 1u << (thread & 31));
+  }
+  __syncthreads();
+}
+
+__device__ __forceinline__ Point point_at(const Stock& stock, V3 size, Hit hit, V3 origin, V3 direction) {
+  V3 position = origin + hit.t * direction;
+  return hit.solid < 0 ? room_point(size, position) : solid_point(stock.solid[hit.solid], hit.solid, position);
+}
+
+// Linear colour as the mean of four samples, and depth by the ray through the centre; a thread per
+// pixel, at least MOST_SOLIDS threads per block, a view per blockIdx.z.
+extern "C" __global__ void render_rooms(const float* sizes, const float* solids, const float* surfaces, const float* lights, const float* cameras, const unsigned* texels, float* colour, float* depth, int views, int count, int light_count, int texture_size, int texture_levels, long long texture_stride, int width, int height) {
+  __shared__ Stock stock;
+  __shared__ u32 mask[MOST_SOLIDS / 32];
+  int view = blockIdx.z, room_index = view / views, thread = threadIdx.y * blockDim.x + threadIdx.x;
+  const float *camera = cameras + view * CAMERA_FLOATS, *light = lights + view * (8 + LIGHT_FLOATS * light_count);
+  load_stock(stock, solids + room_index * count * SOLID_FLOATS, count, thread, blockDim.x * blockDim.y);
+  int left = blockIdx.x * blockDim.x, top = blockIdx.y * blockDim.y, x = left + threadIdx.x, y = top + threadIdx.y;
+  select_visible(stock, mask, camera, count, left - 0.5f, top - 0.5f, left + blockDim.x - 0.5f, top + blockDim.y - 0.5f, thread);
+  if (x >= width || y >= height) return;
+
+  Room room = {load3(sizes + room_index * 3), surfaces + (long long)room_index * (6 + 2 * count) * SURFACE_FLOATS, light, light + 8, light_count, {texels, texture_size, texture_levels, texture_stride}};
+  V3 origin = centre_of(camera), direction = world_ray(camera, x, y);
+  Hit hit = closest_hit(stock, mask, room.size, origin, direction);
+  float access = ambient_access(stock, room.size, point_at(stock, room.size, hit, origin, direction));
+  float focal = sqrtf(camera[12] * camera[13]);
+  long long area = (long long)width * height, pixel = (long long)y * width + x;
+  depth[view * area + pixel] = hit.t;
+  V3 sum = v3(0.f, 0.f, 0.f);
+  for (int k = 0; k < 4; k++) {
+    V3 ray = world_ray(camera, x + (k % 2 ? 0.25f : -0.25f), y + (k / 2 ? 0.25f : -0.25f));
+    Hit seen = closest_hit(stock, mask, room.size, origin, ray);
+    Point point = point_at(stock, room.size, seen, origin, ray);
+    sum = sum + shade(room, stock, point, k, ray, 0.5f * seen.t * norm(ray) / focal, access);
+  }
+  float* out = colour + view * 3 * area + pixel;
+  out[0] = 0.25f * sum.x;
+  out[area] = 0.25f * sum.y;
+  out[2 * area] = 0.25f * sum.z;
+}
+
+// Where the points of the first views are in the second ones, and whether nothing hides them.
+// A thread per pixel, a room per blockIdx.z.
+extern "C" __global__ void flow_rooms(const float* solids, const float* first, const float* second, const float* depth, float2* pixels, bool* visible, bool* valid, int count, int width, int height, float margin) {
+  __shared__ Stock stock;
+  int room = blockIdx.z, x = blockIdx.x * blockDim.x + threadIdx.x, y = blockIdx.y * blockDim.y + threadIdx.y;
+  load_stock(stock, solids + room * count * SOLID_FLOATS, count, threadIdx.y * blockDim.x + threadIdx.x, blockDim.x * blockDim.y);
+  if (x >= width || y >= height) return;
+  const float *a = first + room * CAMERA_FLOATS, *b = second + room * CAMERA_FLOATS;
+  long long pixel = ((long long)room * height + y) * width + x;
+  V3 centre = centre_of(b), ray = centre_of(a) + depth[pixel] * world_ray(a, x, y) - centre;
+  V3 p = v3(b[0] * ray.x + b[4] * ray.y + b[8] * ray.z, b[1] * ray.x + b[5] * ray.y + b[9] * ray.z, b[2] * ray.x + b[6] * ray.y + b[10] * ray.z);
+  bool before = p.z > 0.01f;
+  float z = fmaxf(p.z, 0.01f), u = b[12] * p.x / z + b[14], v = b[13] * p.y / z + b[15];
+  pixels[pixel] = make_float2(u, v);
+  valid[pixel] = before;
+  bool inside = before && u >= 0.f && v >= 0.f && u <= width - 1 && v <= height - 1;
+  visible[pixel] = inside && !occluded(stock, centre, ray, 1.f - margin / norm(ray));
+}
