@@ -11,6 +11,7 @@ from geogs.config import Config
 from geogs.geometry.camera import Camera
 from geogs.loop.global_bundle import global_bundle
 from geogs.mapping.mapper import Mapper
+from geogs.priors.base import MonocularPrior
 from geogs.stopwatch import Stopwatch
 from geogs.threads import on_one_torch_thread
 from geogs.tracking.tracker import Tracker, TrackResult, TrackState
@@ -37,13 +38,23 @@ class SlamStatus:
 class Slam:
     """Dense monocular SLAM: feed frames, finish, read the trajectory, the map and its depth maps.
 
-    Poses are world to camera in units of the sequence's own scale; nothing here is metric.
+    Poses are world to camera in units of the sequence's own scale; nothing here is metric. A
+    monocular prior, where one is given, sees every keyframe.
     """
 
-    def __init__(self, camera: Camera, config: Config | None = None, device: str = "cpu"):
+    def __init__(
+        self,
+        camera: Camera,
+        config: Config | None = None,
+        device: str = "cpu",
+        prior: MonocularPrior | None = None,
+    ):
         self.config = config or Config()
         self.camera = camera
-        self.tracker = Tracker(camera, self.config.tracking, device, self.config.seed)
+        c = self.config
+        self.tracker = Tracker(
+            camera, c.tracking, device, c.seed, prior=prior, prior_config=c.prior
+        )
         self.mapper = Mapper(camera, self.config.mapping, device, self.config.seed)
         self.stopwatch = Stopwatch()
         self.frames = 0

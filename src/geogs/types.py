@@ -38,6 +38,9 @@ class Keyframe:
     """On the tracker's grid: cell (r, c) is pixel (4 + 8 c, 4 + 8 r)."""
     information: Float[Tensor, "gh gw"]
     """Sum over edges of w |dp/dd|^2; the relative depth deviation is z / sqrt(information)."""
+    normal: Float[Tensor, "h w 3"] | None = None
+    """Unit normals of a monocular prior at working resolution, in the camera frame and facing the
+    camera; zero where unknown."""
 
 
 @dataclass(frozen=True, slots=True)

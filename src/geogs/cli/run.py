@@ -133,8 +133,8 @@ def parse(argv: Sequence[str]) -> RunOptions:
     name = _preset_name(argv)
     base = preset(name)
     default = RunOptions(
-        seed=base.seed, input=base.input, tracking=base.tracking, mapping=base.mapping,
-        mesh=base.mesh, source=tyro.MISSING, preset=name,
+        seed=base.seed, input=base.input, tracking=base.tracking, prior=base.prior,
+        mapping=base.mapping, mesh=base.mesh, source=tyro.MISSING, preset=name,
     )  # fmt: skip
     short = {**SHORT, "--intrinsics": "--input.intrinsics"}
     return parse_options(RunOptions, argv, "run", default=default, short=short)

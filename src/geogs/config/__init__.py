@@ -14,6 +14,7 @@ from geogs.config.known_poses import (
 from geogs.config.losses import LossConfig
 from geogs.config.mapping import DiskConfig, MappingConfig, PhotoConfig
 from geogs.config.mesh import MeshConfig
+from geogs.config.prior import PriorConfig
 from geogs.config.slam import Config, Preset, preset
 from geogs.config.tracking import TrackingConfig
 
@@ -27,6 +28,7 @@ __all__ = [
     "MeshConfig",
     "PhotoConfig",
     "Preset",
+    "PriorConfig",
     "ReconstructConfig",
     "SearchConfig",
     "TrackingConfig",

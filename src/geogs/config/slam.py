@@ -6,6 +6,7 @@ from typing import Literal
 from geogs.config.input import InputConfig
 from geogs.config.mapping import MappingConfig
 from geogs.config.mesh import MeshConfig
+from geogs.config.prior import PriorConfig
 from geogs.config.tracking import TrackingConfig
 
 Preset = Literal["fast", "default", "accurate"]
@@ -19,6 +20,7 @@ class Config:
     """Random seed; same seed, same machine, same result on the CPU."""
     input: InputConfig = field(default_factory=InputConfig)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
+    prior: PriorConfig = field(default_factory=PriorConfig)
     mapping: MappingConfig = field(default_factory=MappingConfig)
     mesh: MeshConfig = field(default_factory=MeshConfig)
 

@@ -40,6 +40,7 @@ def global_bundle(
                 share = (n + start / len(stale)) / config.global_rounds
                 progress(share, "matching all keyframes")
         graph.adjust(list(graph.edges), ids[1:], ids, options)
+    tracker.priors.adjust(ids, config.huber)  # which moves no pose
     if progress is not None:
         progress(1.0, "all keyframes adjusted")
     after = {k: store[k].T_cw.clone() for k in ids}

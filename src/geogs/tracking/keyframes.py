@@ -9,11 +9,33 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from geogs.priors.base import DepthKind
 from geogs.tracking.grid import SampleGrid
 from geogs.types import Keyframe
 
 RELATIVE_FLOOR = 0.004
 """Relative depth deviation that no amount of matches removes."""
+
+
+@dataclass
+class KeyframePrior:
+    """What a monocular prior said of a keyframe's depth, and how it is scaled; mutable."""
+
+    kind: DepthKind
+    values: Float[Tensor, "p"]
+    """As the prior gave them, on the grid."""
+    inverse_depth: Float[Tensor, "p"]
+    """Aligned to the tracker's; 0 where unknown, and everywhere before the first alignment."""
+    scale: Float[Tensor, "4"]
+    """Factors of the aligned inverse depth at the corners of the grid."""
+    information: Float[Tensor, "p"]
+    """What it adds to the inverse variance of the keyframe's inverse depth."""
+    is_aligned: bool = False
+
+    def rescale(self, factor: float) -> None:
+        """Multiply every length by ``factor``."""
+        self.scale = self.scale / factor
+        self.information = self.information * factor**2
 
 
 @dataclass
@@ -30,6 +52,10 @@ class KeyframeState:
     """float64, on the CPU whatever the device of the grid."""
     inverse_depth: Float[Tensor, "p"]
     information: Float[Tensor, "p"]
+    """Of the matches alone."""
+    prior: KeyframePrior | None = None
+    normal: Float[Tensor, "h w 3"] | None = None
+    """A monocular prior's unit normals in the camera frame, facing the camera."""
 
 
 class KeyframeStore:
@@ -99,9 +125,11 @@ class KeyframeStore:
             state.T_cw = scaled(state.T_cw, factor)
             state.inverse_depth = state.inverse_depth / factor
             state.information = state.information * factor**2
+            if state.prior is not None:
+                state.prior.rescale(factor)
 
     def export(self, id: int) -> Keyframe:
-        """The keyframe as the rest of the system sees it; tensors are copies.
+        """The keyframe as the rest of the system sees it; tensors are copies, but for the normals.
 
         The pose is on the CPU, inverse depth and information are on the grid's device.
         """
@@ -115,15 +143,20 @@ class KeyframeStore:
             T_cw=s.T_cw.clone(),
             inverse_depth=s.inverse_depth.reshape(shape).clone(),
             information=self._limited(s).reshape(shape).clone(),
+            normal=s.normal,
         )
 
     def _limited(self, s: KeyframeState) -> Float[Tensor, "p"]:
-        """Information less the error that no match removes; computed again after a change only."""
+        """Information less the error that no match removes; computed again after a change only.
+
+        What a prior adds is only told of where depth has been adjusted with it.
+        """
         depth, information, limited = self._reported.get(s.id, (None, None, s.information))
         if depth is not s.inverse_depth or information is not s.information:
             # What matches agree on is still wrong by a common error of poses and scale.
             floor = (RELATIVE_FLOOR * s.inverse_depth).square()
-            limited = s.information / (1 + s.information * floor)
+            known = s.information if s.prior is None else s.information + s.prior.information
+            limited = known / (1 + known * floor)
             self._reported[s.id] = (s.inverse_depth, s.information, limited)
         return limited
 

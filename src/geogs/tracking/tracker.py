@@ -11,16 +11,18 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from geogs.config import TrackingConfig
+from geogs.config import PriorConfig, TrackingConfig
 from geogs.errors import GeogsError, InputError, TrackingLost
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_inverse
+from geogs.priors.base import MonocularPrior
 from geogs.tracking.bundle import BundleOptions
 from geogs.tracking.flow.base import FlowOperator
 from geogs.tracking.flow.select import build_operator
 from geogs.tracking.graph import FrameGraph, frame_distances, proximity_pairs
 from geogs.tracking.grid import SampleGrid
 from geogs.tracking.initialise import initialise
+from geogs.tracking.keyframe_priors import KeyframePriors
 from geogs.tracking.keyframes import KeyframeState, KeyframeStore
 from geogs.tracking.motion import FlowChain, FrameLocator, FrameMotion, transfer_depth
 from geogs.tracking.trajectory import TrajectoryRecorder
@@ -64,6 +66,8 @@ class Tracker:
         device: torch.device | str = "cpu",
         seed: int = 0,
         operator: FlowOperator | None = None,
+        prior: MonocularPrior | None = None,
+        prior_config: PriorConfig | None = None,
     ) -> None:
         cv2.setRNGSeed(seed)
         self.camera = camera
@@ -72,6 +76,7 @@ class Tracker:
         self.operator = operator or build_operator(self.config, self.grid)
         self.store = KeyframeStore(self.grid)
         self.graph = FrameGraph(self.store, self.operator)
+        self.priors = KeyframePriors(self.graph, prior, prior_config or PriorConfig())
         self.recorder = TrajectoryRecorder(self.store, self.operator)
         self.state = TrackState.INITIALIZING
         edge = max(camera.width, camera.height)
@@ -133,6 +138,8 @@ class Tracker:
             state.T_cw = T.to(state.T_cw)
             state.inverse_depth = state.inverse_depth * scale
             state.information = state.information / scale**2
+            if state.prior is not None:
+                state.prior.rescale(1 / scale)
 
     # --- the stream ------------------------------------------------------------------------
 
@@ -202,6 +209,7 @@ class Tracker:
         """Add a keyframe to those the map will be started from, and start it with enough."""
         eye = torch.eye(4, dtype=torch.float64)
         state = self.store.add(frame.index, frame.timestamp, frame.image, encoded, eye)
+        self.priors.ask(state)
         self._chain.reset()
         self.recorder.add_keyframe(state.id)
         if len(self.store) < max(self.config.init_keyframes, MIN_KEYFRAMES):
@@ -229,6 +237,7 @@ class Tracker:
     def _initialise(self) -> bool:
         ok = initialise(self.graph, self.config.min_parallax * self._long_edge, self.config.radius)
         if ok:
+            self.priors.adjust(self.store.ids, self.config.huber)
             self.state = TrackState.TRACKING
             self._last = (self.store.ids[-1], torch.eye(4).to(list(self.store)[-1].T_cw))
             self.recorder.anchor_to_keyframes()
@@ -291,6 +300,7 @@ class Tracker:
     def _insert(self, frame: Frame, encoded: Any, motion: FrameMotion) -> TrackResult:
         anchor = self.store[motion.keyframe]
         state = self.store.add(frame.index, frame.timestamp, frame.image, encoded, motion.T_cw)
+        self.priors.ask(state)
         T = motion.T_cw @ se3_inverse(anchor.T_cw)
         state.inverse_depth, state.information = transfer_depth(
             self.grid, T, anchor.inverse_depth, anchor.information
@@ -331,6 +341,8 @@ class Tracker:
             self.graph.adjust(
                 edges, poses, depths, BundleOptions(iterations=c.local_iterations, huber=c.huber)
             )
+            if n >= c.local_rounds - self.priors.config.rounds:
+                self.priors.adjust(depths, c.huber)
         self.graph.release(moving)
 
     def _cull(self) -> tuple[int, ...]:

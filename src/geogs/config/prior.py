@@ -1,0 +1,33 @@
+"""Settings of the monocular priors."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class PriorConfig:
+    """Depth and normals that a network guesses from single keyframes; without a model, none.
+
+    How far depth counts follows from the deviations below: beside a match whose inverse depth has
+    the variance 1 / sum w |dp/dd|^2, the prior has that of its own deviation.
+    """
+
+    model: str = ""
+    """Network for depth (or depth and normals): a file; none does without."""
+    card: str = ""
+    """What it wants and gives: the name of a card that comes with geogs, or a YAML file."""
+    normal_model: str = ""
+    """Another network for normals, where the first has none: a file."""
+    normal_card: str = ""
+    """What that one wants and gives."""
+    depth: bool = True
+    """Adjust the tracker's depth with the prior's; normals count by mapping.loss.normal_weight."""
+    rounds: int = 1
+    """Last rounds of the local adjustment that are followed by it, at least 1."""
+    deviation: float = 0.05
+    """Relative deviation of a good prior after its scale has been adjusted, above 0."""
+    reach: float = 0.06
+    """Matched depth judges the prior around it within about this fraction of the grid's width."""
+    max_deviation: float = 0.25
+    """Cells where the prior seems to be worse than this go without it, above deviation."""
+    reject: float = 0.3
+    """A prior whose ratio to the matched depth deviates by more than this is not used at all."""

@@ -1,0 +1,127 @@
+"""From any kind of prior to a positive inverse depth in the tracker's unit."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from geogs.priors.base import DepthKind
+
+MIN_CELLS = 32
+"""Cells that must be known to both for an alignment."""
+FARTHEST = 0.05
+"""Aligned inverse depth below this fraction of its median counts as unknown (sky, a bad shift)."""
+_BINS = 12
+"""Parts of the cells, by their value, of whose medians lines are tried."""
+_ROUNDS = 8
+_CUT = 2.0
+"""Deviations at which a cell counts a quarter (Geman and McClure's weight)."""
+
+
+@dataclass(frozen=True)
+class AlignedPrior:
+    """A prior as inverse depth in the tracker's unit."""
+
+    inverse_depth: Float[Tensor, "p"]
+    """0 where unknown."""
+    deviation: float
+    """Robust deviation of its ratio to the tracker's inverse depth where both are known."""
+
+
+def align_inverse_depth(
+    values: Float[Tensor, "p"],
+    kind: DepthKind,
+    inverse_depth: Float[Tensor, "p"],
+    weight: Float[Tensor, "p"],
+) -> AlignedPrior | None:
+    """The prior with that scale (and shift, where its kind has one) that fits the tracker best.
+
+    A scale alone is the weighted median ratio. Scale and shift minimise the weighted relative
+    error by reweighted least squares (Geman and McClure), begun at the best line through the
+    medians of two parts of the cells, so that wrong cells do not matter while they are fewer.
+    ``inverse_depth`` is the tracker's, ``weight`` how much each cell counts (0: not known).
+    None where too few cells are known, or where the prior says that near is far.
+    """
+    finite = torch.isfinite(values)
+    known = finite & (weight > 0) & (inverse_depth > 0)
+    if not kind.has_shift:
+        finite = finite & (values > 0)
+        known = known & finite
+    if int(known.sum()) < MIN_CELLS:
+        return None
+    x, d, w = (v[known].double() for v in (values, inverse_depth, weight))
+    if not kind.has_shift:
+        inverse = 1 / values.double()
+        scale = _weighted_median(d * x, w)
+        aligned = torch.where(finite, scale * inverse, 0.0)
+    else:
+        # Both are fits of y = a x + b whose error is measured in parts of y.
+        y = d if kind is DepthKind.AFFINE_INVERSE else 1 / d
+        fitted = _robust_line(x, y, w)
+        if fitted is None:
+            return None
+        line = fitted[0] * values.double() + fitted[1]
+        if kind is DepthKind.AFFINE_DEPTH:
+            line = torch.where(line > 0, 1 / line, 0.0)
+        aligned = torch.where(finite, line, 0.0)
+    aligned = _without_far(aligned)
+    both = known & (aligned > 0)
+    if int(both.sum()) < MIN_CELLS:
+        return None
+    ratio = inverse_depth[both].double() / aligned[both]
+    spread = 1.4826 * _weighted_median((ratio - 1).abs(), weight[both].double())
+    return AlignedPrior(aligned.to(inverse_depth), float(spread))
+
+
+def _robust_line(
+    x: Float[Tensor, "n"], y: Float[Tensor, "n"], w: Float[Tensor, "n"]
+) -> tuple[float, float] | None:
+    """Slope and offset of y = a x + b with the error relative to y; None if a is not positive."""
+    line = _best_of_medians(x, y, w)
+    if line is None:
+        return None
+    rows = torch.stack([x, torch.ones_like(x)], -1) / y[:, None]
+    for _ in range(_ROUNDS):
+        error = rows @ line - 1
+        width = _CUT * 1.4826 * _weighted_median(error.abs(), w) + 1e-6
+        v = w / (1 + (error / width).square()).square()
+        weighted = rows * v[:, None]
+        normal = rows.mT @ weighted
+        damping = 1e-9 * normal.diagonal()
+        line = torch.linalg.solve(normal + torch.diag(damping), weighted.sum(0))
+    a, b = line.tolist()
+    return (a, b) if a > 0 and bool(torch.isfinite(line).all()) else None
+
+
+def _best_of_medians(
+    x: Float[Tensor, "n"], y: Float[Tensor, "n"], w: Float[Tensor, "n"]
+) -> Float[Tensor, "2"] | None:
+    """Of all rising lines through the medians of two parts, that with the least median error."""
+    parts = torch.argsort(x).tensor_split(_BINS)
+    u, v = (torch.stack([_weighted_median(q[p], w[p]) for p in parts]) for q in (x, y))
+    i, j = torch.triu_indices(_BINS, _BINS, 1, device=x.device)
+    slope = (v[j] - v[i]) / (u[j] - u[i]).clamp(min=1e-12)
+    rising = (slope > 0) & (u[j] - u[i] > 1e-6 * x.abs().max())
+    if not bool(rising.any()):
+        return None
+    lines = torch.stack([slope, v[i] - slope * u[i]], -1)[rising]
+    errors = (x * lines[:, :1] + lines[:, 1:]).div(y).sub(1).abs()
+    medians = torch.stack([_weighted_median(e, w) for e in errors])
+    return lines[int(medians.argmin())]
+
+
+def _without_far(inverse_depth: Float[Tensor, "p"]) -> Float[Tensor, "p"]:
+    """Zero where inverse depth is not positive or next to nothing beside its median."""
+    positive: Bool[Tensor, "p"] = inverse_depth > 0
+    if not bool(positive.any()):
+        return torch.zeros_like(inverse_depth)
+    least = FARTHEST * inverse_depth[positive].median()
+    return torch.where(inverse_depth > least, inverse_depth, 0.0)
+
+
+def _weighted_median(values: Float[Tensor, "n"], weight: Float[Tensor, "n"]) -> Float[Tensor, ""]:
+    """The value below which half of the weight lies."""
+    order = torch.argsort(values)
+    total = weight[order].cumsum(0)
+    return values[order][int(torch.searchsorted(total, total[-1] / 2).clamp(max=len(values) - 1))]

@@ -1,0 +1,231 @@
+"""Joint adjustment of inverse depth and of the scale of a monocular prior (HI-SLAM2's JDSA).
+
+Poses are fixed. Every keyframe has one multiplicative scale at each corner of its grid, bilinear in
+between: s(u) = B(u) . s. Inverse depths d and scales minimise
+
+    sum_e w |target - project(d)|^2  +  sum_u alpha(u) (d(u) - s(u) d_prior(u))^2 .
+
+HI-SLAM2 gives alpha as a number that belongs to its network's weights. Here weights of flow are
+inverse variances, so alpha is one, too: 1 / (deviation * d)^2.
+"""
+
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor
+
+from geogs.config import PriorConfig
+from geogs.tracking.bundle import BundleProblem, linearise, relative_motion, robust_weight
+from geogs.tracking.grid import SampleGrid
+
+CORNERS = 4
+"""Scales of a keyframe: top left, top right, bottom left, bottom right."""
+SCALE_DAMPING = 1e-4
+"""Of the scales, relative to the curvature of the prior's term."""
+DEPTH_DAMPING = 1e-3
+"""Of inverse depth where there is no prior, relative to the mean curvature of its frame."""
+REWEIGHTINGS = 3
+"""Times that the prior is judged and fitted anew in one adjustment."""
+_CAUCHY = 2.0
+"""Deviations at which a cell of the prior counts half in the fit of the scales."""
+_EVIDENCE = ((1.0, 8.0), (3.0, 2.0), (9.0, 0.5))
+"""Windows in multiples of the reach, and how many cells a window full of evidence counts as."""
+_BELIEF = 0.5
+"""Cells that the deviation of a good prior counts as before there is evidence."""
+
+
+@dataclass(frozen=True)
+class FlowEvidence:
+    """What the edges of a problem say of the inverse depth of its frames, linearised."""
+
+    curvature: Float[Tensor, "n p"]
+    """C = sum w |dp/dd|^2."""
+    gradient: Float[Tensor, "n p"]
+    """b = sum w r . dp/dd; the matches alone want the step b / C."""
+
+
+@dataclass(frozen=True)
+class ScaledPrior:
+    """Priors of several frames with their present scales."""
+
+    inverse_depth: Float[Tensor, "n p"]
+    """d_prior; 0 where unknown."""
+    scale: Float[Tensor, "n 4"]
+    """One at each corner of the grid."""
+    weight: Float[Tensor, "n p"]
+    """alpha, 1 / inverse depth^2; 0 where unknown."""
+
+
+@dataclass(frozen=True)
+class DepthScaleStep:
+    """A step of inverse depths and scales."""
+
+    depth: Float[Tensor, "n p"]
+    scale: Float[Tensor, "n 4"]
+
+
+def corner_weights(grid: SampleGrid) -> Float[Tensor, "p 4"]:
+    """Share B of each corner's scale in each cell; rows sum to one."""
+    y = torch.linspace(0, 1, grid.height, device=grid.device)[:, None, None]
+    x = torch.linspace(0, 1, grid.width, device=grid.device)[None, :, None]
+    corners = [(1 - y) * (1 - x), (1 - y) * x, y * (1 - x), y * x]
+    return torch.cat([c.expand(grid.height, grid.width, 1) for c in corners], -1).reshape(-1, 4)
+
+
+def flow_evidence(
+    grid: SampleGrid, problem: BundleProblem, huber: float, chunk: int = 24
+) -> FlowEvidence:
+    """Curvature and gradient of the matches' term in the inverse depth of every frame."""
+    d = problem.inverse_depth
+    curvature, gradient = torch.zeros_like(d), torch.zeros_like(d)
+    motion = relative_motion(problem.T_cw, problem.source, problem.target)
+    for first in range(0, len(problem.source), chunk):
+        part = slice(first, first + chunk)
+        source = problem.source[part].to(d.device)
+        p = linearise(grid.camera, grid.rays, motion[part], d[source])
+        r = problem.pixels[part] - p.pixels
+        w = robust_weight(r, problem.weight[part] * p.valid[..., None], huber)
+        curvature.index_add_(0, source, (w * p.depth_jacobian.square()).sum(-1))
+        gradient.index_add_(0, source, (w * p.depth_jacobian * r).sum(-1))
+    return FlowEvidence(curvature, gradient)
+
+
+def depth_scale_step(
+    flow: FlowEvidence,
+    inverse_depth: Float[Tensor, "n p"],
+    prior: ScaledPrior,
+    basis: Float[Tensor, "p 4"],
+) -> DepthScaleStep:
+    """The Gauss-Newton step of inverse depths and scales; frames are independent.
+
+    Inverse depths are eliminated (Schur). What is left of the prior's term is a fit of the scales
+    to the depth that the matches want, d + b / C, with the weight alpha C / (alpha + C) of the
+    difference of two measurements; it is formed as such, since H - E C'^-1 E^T would cancel.
+    """
+    C, b, alpha = flow.curvature, flow.gradient, prior.weight
+    known = alpha > 0
+    J = prior.inverse_depth[..., None] * basis
+    residual = inverse_depth - (J @ prior.scale[..., None])[..., 0]
+    free = alpha / (alpha + C).clamp(min=1e-30)
+    J64, fit = J.double(), (free * C).double()
+    S = J64.mT @ (fit[..., None] * J64)
+    curvature = (alpha.double()[..., None] * J64.square()).sum(1)
+    S = S + torch.diag_embed(SCALE_DAMPING * curvature + 1e-12)
+    g = (J64 * (free * (C * residual + b)).double()[..., None]).sum(1)
+    scale = torch.linalg.solve(S, g)
+    damping = DEPTH_DAMPING * C.mean(1, keepdim=True) + 1e-8
+    curved = C + torch.where(known, alpha, damping)
+    wanted = residual - (J64 @ scale[..., None])[..., 0].to(residual)
+    depth = (b - alpha * wanted) / curved
+    return DepthScaleStep(depth, scale.to(inverse_depth))
+
+
+@dataclass(frozen=True)
+class AdjustedDepth:
+    """Frames after the adjustment."""
+
+    inverse_depth: Float[Tensor, "n p"]
+    scale: Float[Tensor, "n 4"]
+    information: Float[Tensor, "n p"]
+    """alpha: what the prior adds to the inverse variance of inverse depth; 0 where it is unused."""
+    deviation: Float[Tensor, "n"]
+    """Median relative deviation of the scaled prior from what the matches want."""
+
+
+def adjust_depth(
+    grid: SampleGrid,
+    flow: FlowEvidence,
+    inverse_depth: Float[Tensor, "n p"],
+    prior: Float[Tensor, "n p"],
+    scale: Float[Tensor, "n 4"],
+    config: PriorConfig,
+    limits: tuple[float, float] = (1e-3, 1e2),
+) -> AdjustedDepth:
+    """One JDSA step with weights that follow how well each prior agrees with the matches.
+
+    The scales are fitted, the prior is judged by the depth that matches want (:func:`local
+    deviation <local_deviation>`), and that is repeated with the new weights. Cells where the prior
+    seems bad, and frames where it is bad on the whole, keep what the matches say.
+    """
+    basis = corner_weights(grid).to(inverse_depth)
+    C = flow.curvature
+    wanted = inverse_depth + torch.where(C > 0, flow.gradient / C.clamp(min=1e-30), 0.0)
+    start = scale
+    deviation = torch.full_like(prior, config.deviation)
+    trust = torch.ones_like(prior)
+    for _ in range(REWEIGHTINGS):
+        alpha = _prior_weight(prior, start, basis, deviation)
+        step = depth_scale_step(
+            flow, inverse_depth, ScaledPrior(prior, start, alpha * trust), basis
+        )
+        fitted = prior * ((start + step.scale) @ basis.mT)
+        known = (prior > 0) & (fitted > 0)
+        error = torch.where(known, wanted / fitted.clamp(min=1e-12) - 1, 0.0)
+        own = (deviation * fitted).square() + 1 / C.clamp(min=1e-12)
+        trust = 1 / (1 + (error * fitted).square() / (_CAUCHY**2 * own))
+        sure = known * C / (C + _prior_weight(prior, start, basis, deviation).clamp(min=1e-12))
+        deviation = local_deviation(grid, error, sure, config)
+    overall = _weighted_median(error.abs(), sure)
+    used = (deviation < config.max_deviation) & (overall < config.reject)[:, None]
+    used &= (start + step.scale > 0).all(1, keepdim=True)
+    alpha = torch.where(used, trust * _prior_weight(prior, start, basis, deviation), 0.0)
+    step = depth_scale_step(flow, inverse_depth, ScaledPrior(prior, start, alpha), basis)
+    good = (torch.isfinite(step.depth).all(1) & torch.isfinite(step.scale).all(1))[:, None]
+    good &= (start + step.scale > 0).all(1, keepdim=True)
+    return AdjustedDepth(
+        torch.where(good, (inverse_depth + step.depth).clamp(*limits), inverse_depth),
+        torch.where(good, start + step.scale, start),
+        torch.where(good, alpha, 0.0),
+        overall,
+    )
+
+
+def local_deviation(
+    grid: SampleGrid,
+    error: Float[Tensor, "n p"],
+    sure: Float[Tensor, "n p"],
+    config: PriorConfig,
+) -> Float[Tensor, "n p"]:
+    """Relative deviation of the prior in every cell, by its errors in sure cells around it.
+
+    The root of a weighted mean of squared errors in windows of three sizes, the smaller the more
+    it counts, and of that of a good prior, which stands alone where nothing is sure. ``sure`` in
+    [0, 1] says how well the matches know a cell, beside the prior.
+    """
+    shape = (-1, 1, grid.height, grid.width)
+    square = (sure * error.square().clamp(max=1.0)).reshape(shape)
+    amount = sure.reshape(shape)
+    total = torch.full_like(amount, _BELIEF * config.deviation**2)
+    count = torch.full_like(amount, _BELIEF)
+    for multiple, cells in _EVIDENCE:
+        total = total + cells * _mean_around(square, multiple * config.reach * grid.width)
+        count = count + cells * _mean_around(amount, multiple * config.reach * grid.width)
+    return (total / count).sqrt().reshape(error.shape)
+
+
+def _mean_around(field: Float[Tensor, "n 1 h w"], radius: float) -> Float[Tensor, "n 1 h w"]:
+    """Mean over a square window, cut at the border."""
+    k = max(1, round(radius))
+    return F.avg_pool2d(field, 2 * k + 1, 1, k, count_include_pad=False)
+
+
+def _prior_weight(
+    prior: Float[Tensor, "n p"],
+    scale: Float[Tensor, "n 4"],
+    basis: Float[Tensor, "p 4"],
+    deviation: Float[Tensor, "n p"],
+) -> Float[Tensor, "n p"]:
+    """alpha = 1 / (deviation s d_prior)^2, 0 where there is no prior."""
+    scaled = prior * (scale @ basis.mT)
+    known = scaled > 0
+    return torch.where(known, 1 / (deviation * scaled).square().clamp(min=1e-30), 0.0)
+
+
+def _weighted_median(values: Float[Tensor, "n p"], weight: Float[Tensor, "n p"]) -> Tensor:
+    """Of every row, the value below which half of its weight lies; NaN without weight."""
+    ordered, order = values.sort(dim=1)
+    total = weight.gather(1, order).cumsum(1)
+    middle = torch.searchsorted(total, total[:, -1:] / 2).clamp(max=values.shape[1] - 1)
+    return torch.where(total[:, -1] > 0, ordered.gather(1, middle)[:, 0], torch.nan)

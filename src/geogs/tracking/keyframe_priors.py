@@ -1,0 +1,96 @@
+"""Monocular priors in the tracker: asked for at every keyframe, then adjusted with its depth."""
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from geogs.config import PriorConfig
+from geogs.priors.alignment import align_inverse_depth
+from geogs.priors.base import MonocularPrior
+from geogs.tracking.depth_prior import CORNERS, FlowEvidence, adjust_depth, flow_evidence
+from geogs.tracking.graph import FrameGraph
+from geogs.tracking.grid import OFFSET, STRIDE, SampleGrid
+from geogs.tracking.keyframes import KeyframePrior, KeyframeState
+
+
+class KeyframePriors:
+    """Gives keyframes their priors and lets these fill in what matches say little about.
+
+    Without a prior nothing is ever done.
+    """
+
+    def __init__(
+        self, graph: FrameGraph, prior: MonocularPrior | None, config: PriorConfig
+    ) -> None:
+        self.graph = graph
+        self.prior = prior
+        self.config = config
+
+    def ask(self, state: KeyframeState) -> None:
+        """Let the prior look at a new keyframe."""
+        if self.prior is None:
+            return
+        maps, grid = self.prior.predict(state.image), self.graph.keyframes.grid
+        state.normal = maps.normal
+        if maps.depth is not None and self.config.depth:
+            values = on_cells(grid, maps.depth.to(grid.device))
+            zero = torch.zeros_like(values)
+            state.prior = KeyframePrior(maps.kind, values, zero, values.new_ones(CORNERS), zero)
+
+    def adjust(self, ids: Sequence[int], huber: float) -> None:
+        """Joint depth and scale adjustment of those keyframes that have a prior, poses fixed."""
+        store, deep = self.graph.keyframes, set(ids)
+        edges = [e for e in self.graph.edges if e[0] in deep and store[e[0]].prior is not None]
+        if not edges:
+            return
+        problem, frames = self.graph.problem(edges, [], {i for i, _ in edges})
+        flow = flow_evidence(store.grid, problem, huber)
+        rows, states, priors = [], [], []
+        for n, id in enumerate(frames):
+            state, prior = store[id], store[id].prior
+            if id in deep and prior is not None:
+                self._align(prior, state.inverse_depth, flow.curvature[n])
+                if prior.is_aligned:
+                    rows.append(n)
+                    states.append(state)
+                    priors.append(prior)
+        if not rows:
+            return
+        adjusted = adjust_depth(
+            store.grid,
+            FlowEvidence(flow.curvature[rows], flow.gradient[rows]),
+            torch.stack([s.inverse_depth for s in states]),
+            torch.stack([p.inverse_depth for p in priors]),
+            torch.stack([p.scale for p in priors]),
+            self.config,
+        )
+        for n, (state, prior) in enumerate(zip(states, priors, strict=True)):
+            state.inverse_depth = adjusted.inverse_depth[n]
+            prior.scale, prior.information = adjusted.scale[n], adjusted.information[n]
+
+    def _align(
+        self,
+        prior: KeyframePrior,
+        inverse_depth: Float[Tensor, "p"],
+        curvature: Float[Tensor, "p"],
+    ) -> None:
+        """Bring a prior to the tracker's unit: once, and a shift again whenever depth is better.
+
+        The scales stand for a scale alone, so one that has them needs no second alignment.
+        """
+        if prior.is_aligned and not prior.kind.has_shift:
+            return
+        relative = curvature * inverse_depth.square()
+        weight = relative / (relative + self.config.deviation**-2)
+        aligned = align_inverse_depth(prior.values, prior.kind, inverse_depth, weight)
+        if aligned is not None:
+            prior.inverse_depth = aligned.inverse_depth
+            prior.scale, prior.is_aligned = torch.ones_like(prior.scale), True
+
+
+def on_cells(grid: SampleGrid, values: Float[Tensor, "h w"]) -> Float[Tensor, "p"]:
+    """Values of an image-sized map at the pixels of the cells."""
+    rows = values[OFFSET : OFFSET + STRIDE * grid.height : STRIDE]
+    return rows[:, OFFSET : OFFSET + STRIDE * grid.width : STRIDE].reshape(-1).float()
