@@ -33,8 +33,10 @@ from geogs.tracking.flow.droid_network import (
     DroidNetwork,
     load_droid,
     motion_features,
+    on_cells,
 )
 from geogs.tracking.flow.texture import textured_fraction
+from geogs.tracking.flow.weights import read_tensors
 from geogs.tracking.grid import OFFSET, STRIDE, SampleGrid
 
 FAR = 1e4
@@ -107,7 +109,9 @@ class DroidFlow:
         self.grid = grid
         self.options = options or DroidOptions()
         self.device = torch.device(grid.device)
-        network = weights if isinstance(weights, DroidNetwork) else load_droid(_read(weights))
+        network = (
+            weights if isinstance(weights, DroidNetwork) else load_droid(read_tensors(weights))
+        )
         self.network = network.to(self.device).eval()
 
     @torch.no_grad()
@@ -157,17 +161,14 @@ class DroidFlow:
         return torch.autocast(self.device.type, torch.float16, enabled=self.grid.on_gpu)
 
     def _shown(self, image: UInt8[np.ndarray, "h w 3"]) -> Float[Tensor, "1 3 h8 w8"]:
-        """The part of the image whose every eighth pixel is a cell."""
-        camera, height, width = self.grid.camera, 8 * self.grid.height, 8 * self.grid.width
+        camera = self.grid.camera
         if image.shape != (camera.height, camera.width, 3):
             raise InputError(
                 f"An image of shape {image.shape} does not fit a camera of "
                 f"{camera.width} x {camera.height} pixels."
             )
-        part = np.ascontiguousarray(image[OFFSET : OFFSET + height, OFFSET : OFFSET + width])
-        rgb = to_device(torch.from_numpy(part), self.device).permute(2, 0, 1)[None].float() / 255
-        beyond = (0, width - rgb.shape[3], 0, height - rgb.shape[2])
-        return torch.nn.functional.pad(rgb, beyond, mode="replicate")
+        rgb = to_device(torch.from_numpy(image), self.device).permute(2, 0, 1)[None]
+        return on_cells(rgb.float() / 255)
 
     def _revise(
         self,
@@ -240,10 +241,3 @@ def _some(match: FlowMatch, edges: slice) -> FlowMatch:
     return FlowMatch(
         match.pixels[edges], match.weight[edges], match.damping[edges], match.memory[edges]
     )
-
-
-def _read(path: Path) -> dict[str, Tensor]:
-    try:
-        return torch.load(path, map_location="cpu", weights_only=True)
-    except (OSError, RuntimeError, ValueError) as error:
-        raise InputError(f"The weights {path} cannot be read.") from error

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from geogs.errors import InputError
+from geogs.tracking.grid import OFFSET, STRIDE
 
 LEVELS = 4
 """Levels of the correlation pyramid."""
@@ -53,6 +54,19 @@ class DroidSize:
     def motion(self) -> int:
         """Channels of the encoded motion."""
         return 2 * self.base
+
+
+def on_cells(images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n 3 h8 w8"]:
+    """The part of images whose every eighth pixel is a cell of the sample grid.
+
+    Without their first four rows and columns; where the last cell has no eight pixels left, the
+    border goes on.
+    """
+    # The last cell has at least three pixels after its own.
+    rows, columns = (n // STRIDE * STRIDE for n in images.shape[2:])
+    part = images[:, :, OFFSET : OFFSET + rows, OFFSET : OFFSET + columns]
+    beyond = (0, columns - part.shape[3], 0, rows - part.shape[2])
+    return F.pad(part, beyond, mode="replicate")
 
 
 def normalised(images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n 3 h w"]:
