@@ -2,9 +2,9 @@
 
 import torch
 
-from geogs.train.rooms.render import Views
 from geogs.train.rooms.scene import NONE, Lights, Rooms, Solids, Surfaces
 from geogs.train.rooms.textures import TextureBank
+from geogs.train.rooms.views import Views
 
 
 def solids_of(*rows: tuple[int, list[float], list[float], torch.Tensor | None]) -> Solids:
@@ -38,6 +38,7 @@ def room_of(solids: Solids, views: int = 2) -> Rooms:
         gloss=torch.full(n, 0.2, **f),
         shininess=torch.full(n, 20.0, **f),
         glow=torch.full(n, 0.1, **f),
+        mirror=torch.full(n, 0.3, **f),
     )
     lights = Lights(
         position=torch.tensor([2.0, 2.5, 2.8], **f).expand(1, views, 1, 3),
@@ -61,4 +62,6 @@ def looking_along_y(*centres: list[float], width: int = 33, height: int = 25) ->
 
 def small_bank() -> TextureBank:
     g = torch.Generator().manual_seed(0)
-    return TextureBank.pack(torch.randint(0, 255, (2, 16, 16, 3), generator=g, dtype=torch.uint8))
+    return TextureBank.pack(
+        torch.randint(0, 255, (2, 16, 16, 3), generator=g, dtype=torch.uint8), 1
+    )

@@ -13,12 +13,12 @@ from geogs.train.rooms.clips import ClipBatch, flow_between
 from geogs.train.rooms.draw import Draw
 from geogs.train.rooms.options import RoomOptions
 from geogs.train.rooms.raycast import signed_distance, wall_distance
-from geogs.train.rooms.render import flow_by_torch, render_by_torch
+from geogs.train.rooms.reference import flow_by_torch, render_by_torch
 from geogs.train.rooms.sampler import RoomSampler
 from geogs.train.rooms.scene import BOX, ELLIPSOID, FRUSTUM
 from random_rooms import looking_along_y, nothing, room_of, small_bank, solids_of
 
-OPTIONS = RoomOptions(width=64, height=48, textures=8, texture_size=32)
+OPTIONS = RoomOptions(width=64, height=48, textures=8, texture_size=32, candidates=12)
 
 
 @pytest.fixture(scope="module")
@@ -134,7 +134,9 @@ def test_same_numbers_give_the_same_clips(sampler):
 
 
 def test_validation_has_other_rooms_and_textures(sampler):
-    options = RoomOptions(width=64, height=48, textures=8, texture_size=32, validation=True)
+    options = RoomOptions(
+        width=64, height=48, textures=8, texture_size=32, candidates=12, validation=True
+    )
     other = RoomSampler(options, "cpu")
     assert (other.bank.texels != sampler.bank.texels).float().mean() > 0.5
     assert (other.sample(3, 2).T_cw != sampler.sample(3, 2).T_cw).any()
@@ -147,7 +149,7 @@ def test_statistics_of_the_clips(clips):
     assert share.median() < 0.97
     y, x = torch.meshgrid(torch.arange(48.0), torch.arange(64.0), indexing="ij")
     motion = (truth.pixels - torch.stack([x, y], -1)).norm(dim=-1)[truth.visible] * 512 / 64
-    assert motion.quantile(0.1) < 15
+    assert motion.quantile(0.1) < 25
     assert motion.quantile(0.95) > 60
     assert clips.images.min() >= 0
     assert clips.images.max() <= 1
@@ -162,7 +164,7 @@ def test_cameras_are_in_free_space(clips):
 
 
 def test_paths_of_many_views(sampler):
-    options = RoomOptions(width=64, height=48, textures=8, texture_size=32, views=5)
+    options = RoomOptions(width=64, height=48, textures=8, texture_size=32, candidates=12, views=5)
     five = RoomSampler(options, "cpu").sample(1, 4)
     assert five.images.shape == (4, 5, 3, 48, 64)
     for k in range(4):

@@ -1,26 +1,24 @@
 """The GPU's room kernels against their PyTorch counterparts."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
 import geogs.train.rooms.render as render_module
 from cuda_emulator import use_emulator
-from geogs.train.rooms.cameras import draw_cameras, too_near
+from geogs.train.rooms.cameras import choose_cameras, too_near
 from geogs.train.rooms.draw import Draw
 from geogs.train.rooms.layout import draw_layout
-from geogs.train.rooms.materials import draw_lights, draw_surfaces
+from geogs.train.rooms.lights import draw_lights
+from geogs.train.rooms.materials import draw_surfaces
 from geogs.train.rooms.options import RoomOptions
-from geogs.train.rooms.render import (
-    MOST_SOLIDS,
-    SOURCE,
-    Views,
-    flow_by_kernel,
-    flow_by_torch,
-    render_by_kernel,
-    render_by_torch,
-)
+from geogs.train.rooms.paths import draw_paths
+from geogs.train.rooms.reference import flow_by_torch, render_by_torch
+from geogs.train.rooms.render import MOST_SOLIDS, SOURCE, flow_by_kernel, render_by_kernel
 from geogs.train.rooms.sampler import RoomSampler
-from geogs.train.rooms.scene import Rooms
+from geogs.train.rooms.scene import Rooms, moved
+from geogs.train.rooms.views import Views
 from random_rooms import small_bank
 
 
@@ -40,14 +38,14 @@ def furnished(device: torch.device) -> tuple[Rooms, Views]:
     large = device.type == "cuda"
     width, height = (512, 384) if large else (45, 30)
     options = RoomOptions(width=width, height=height, density=(0.7, 0.9), candidates=8)
-    draw = Draw(device, 3)
+    draw = Draw(torch.device("cpu"), 3)
     size = draw.uniform(3.0, 6.0, 2 if large else 1, 3)
     layout = draw_layout(draw, size, options.density)
-    surfaces = draw_surfaces(draw, layout, 2)
+    surfaces = draw_surfaces(draw, layout, 2, 1)
     lights = draw_lights(draw, size, 2, 1.0)
-    views = draw_cameras(draw, options, size, layout.solids)
+    views = choose_cameras(draw_paths(draw, options, size), size, layout.solids, width, height)
     solids = layout.solids.without(too_near(layout.solids, views))
-    return Rooms(size, solids, surfaces, lights), views
+    return moved(Rooms(size, solids, surfaces, lights), device), moved(views, device)
 
 
 def test_sources_and_python_agree_on_sizes():
@@ -58,7 +56,7 @@ def test_sources_and_python_agree_on_sizes():
 def test_renders_like_the_reference(device):
     rooms, views = furnished(device)
     bank = small_bank()
-    bank = type(bank)(bank.texels.to(device), bank.size)
+    bank = replace(bank, texels=bank.texels.to(device))
     fast, slow = render_by_kernel(rooms, bank, views), render_by_torch(rooms, bank, views)
     # Rays that graze an edge, or whose texture level is between two, may fall on either side.
     wrong = (fast.depth - slow.depth).abs() > 1e-4 * slow.depth

@@ -23,6 +23,8 @@ TRAINING_PHOTOGRAPHS = (
     "grass.png", "ihc.png", "camera.png", "page.png",
 )  # fmt: skip
 VALIDATION_PHOTOGRAPHS = ("chelsea.png", "gravel.png", "moon.png", "text.png", "retina.jpg")
+_MATERIALS = 0.6
+"""Share of the bank that is materials rather than images."""
 _LEAST_DRAWN = 192
 """Texels; the drawn textures need some room and are reduced where less is asked for."""
 
@@ -33,14 +35,17 @@ def make_bank(
     """``count`` textures of ``size`` x ``size``, all periodic; drawn on all processor cores."""
     if size & (size - 1):
         raise ValueError(f"The side of a texture must be a power of two, not {size}.")
+    materials = max(1, round(_MATERIALS * count))
 
     def make(index: int) -> UInt8[np.ndarray, "s s 3"]:
         rng = np.random.default_rng([seed, int(validation), index])
-        return _periodic(_recipe(rng, index, validation), rng, size)
+        material = index < materials
+        recipe = _material(rng) if material else _image(rng, index - materials, validation)
+        return _periodic(recipe, rng, size)
 
     with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
         images = list(pool.map(make, range(count)))
-    return TextureBank.pack(torch.from_numpy(np.stack(images)).to(device))
+    return TextureBank.pack(torch.from_numpy(np.stack(images)).to(device), materials)
 
 
 def _periodic(recipe: Recipe, rng: np.random.Generator, size: int) -> UInt8[np.ndarray, "s s 3"]:
@@ -56,16 +61,11 @@ def _periodic(recipe: Recipe, rng: np.random.Generator, size: int) -> UInt8[np.n
     return np.clip(reduced + 0.5, 0, 255).astype(np.uint8)
 
 
-def _recipe(rng: np.random.Generator, index: int, validation: bool) -> Recipe:
-    """Every sixth a photograph, every third noise, the others drawn."""
-    if index % 6 == 0:
-        names = VALIDATION_PHOTOGRAPHS if validation else TRAINING_PHOTOGRAPHS
-        name = names[index // 6 % len(names)]
-        if _photograph(name) is not None:
-            return lambda rng, s: _crop(rng, name, s)
-    if index % 3 == 1:
-        return _noise
-    drawn: tuple[Recipe, ...] = (
+def _material(rng: np.random.Generator) -> Recipe:
+    recipes: tuple[Recipe, ...] = (
+        _noise,
+        _noise,
+        _noise,
         lambda rng, s: texture.plaster(rng, (s, s), _paint(rng)),
         lambda rng, s: texture.brick(rng, (s, s), int(rng.integers(4, 14)), _paint(rng)),
         lambda rng, s: texture.wallpaper(rng, (s, s), _paint(rng), int(rng.integers(3, 9))),
@@ -74,6 +74,18 @@ def _recipe(rng: np.random.Generator, index: int, validation: bool) -> Recipe:
         lambda rng, s: texture.planks(rng, (s, s), int(rng.integers(3, 9)), _timber(rng)),
         lambda rng, s: texture.tiles(rng, (s, s), int(rng.integers(2, 9)), _pair(rng)),
         lambda rng, s: texture.fabric(rng, (s, s), *_pair(rng)),
+    )
+    return recipes[rng.integers(len(recipes))]
+
+
+def _image(rng: np.random.Generator, index: int, validation: bool) -> Recipe:
+    """Every second a photograph, the others drawn."""
+    if index % 2 == 0:
+        names = VALIDATION_PHOTOGRAPHS if validation else TRAINING_PHOTOGRAPHS
+        name = names[index // 2 % len(names)]
+        if _photograph(name) is not None:
+            return lambda rng, s: _crop(rng, name, s)
+    recipes: tuple[Recipe, ...] = (
         lambda rng, s: texture.rug(rng, (s, s)),
         lambda rng, s: texture.ceramic(rng, (s, s), _paint(rng)),
         lambda rng, s: artwork.poster(rng, (s, s)),
@@ -85,11 +97,11 @@ def _recipe(rng: np.random.Generator, index: int, validation: bool) -> Recipe:
         _books,
         lambda rng, s: artwork.page_edges(rng, (s, s)),
     )
-    return drawn[rng.integers(len(drawn))]
+    return recipes[rng.integers(len(recipes))]
 
 
 def _paint(rng: np.random.Generator) -> Colour:
-    return texture.random_colour(rng, (0.02, 0.7), (0.3, 0.95))
+    return texture.random_colour(rng, (0.0, 0.75 * float(rng.random()) ** 1.5), (0.3, 0.95))
 
 
 def _pair(rng: np.random.Generator) -> tuple[Colour, Colour]:

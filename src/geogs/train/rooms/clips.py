@@ -5,8 +5,10 @@ from dataclasses import dataclass
 from jaxtyping import Float
 from torch import Tensor
 
-from geogs.train.rooms.render import FlowTruth, Views, flow
+from geogs.train.rooms.reference import FlowTruth
+from geogs.train.rooms.render import flow
 from geogs.train.rooms.scene import Solids
+from geogs.train.rooms.views import Views
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Random numbers on a device, of given shapes, without waiting for the device."""
+"""Random tensors of given shapes that depend on a few numbers only."""
 
 import hashlib
 import math

@@ -6,9 +6,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+Matrix = tuple[tuple[float, float, float], ...]
+
 _SIDE = 8
-_TO_YCC = ((0.299, 0.587, 0.114), (-0.1687, -0.3313, 0.5), (0.5, -0.4187, -0.0813))
-_TO_RGB = ((1.0, 0.0, 1.402), (1.0, -0.3441, -0.7141), (1.0, 1.772, 0.0))
+_TO_YCC: Matrix = ((0.299, 0.587, 0.114), (-0.1687, -0.3313, 0.5), (0.5, -0.4187, -0.0813))
+_TO_RGB: Matrix = ((1.0, 0.0, 1.402), (1.0, -0.3441, -0.7141), (1.0, 1.772, 0.0))
 
 
 def compress(
@@ -22,18 +24,23 @@ def compress(
     n, _, h, w = images.shape
     padded = torch.nn.functional.pad(images, (0, -w % _SIDE, 0, -h % _SIDE), mode="replicate")
     rows, columns = padded.shape[2] // _SIDE, padded.shape[3] // _SIDE
-    to_ycc, to_rgb = (torch.tensor(m, device=images.device) for m in (_TO_YCC, _TO_RGB))
-    ycc = torch.einsum("ij,njhw->nihw", to_ycc, padded) * 255
+    ycc = 255 * _mix(_TO_YCC, padded)
     blocks = ycc.reshape(n, 3, rows, _SIDE, columns, _SIDE).transpose(3, 4)
     basis = _cosines(images.device)
     frequency = torch.arange(_SIDE, device=images.device)
     growth = 1 + 0.75 * (frequency[:, None] + frequency)
-    channel = torch.tensor([1.0, 1.8, 1.8], device=images.device)
+    channel = 1 + 0.8 * (torch.arange(3, device=images.device) > 0)
     table = step[:, None, None, None] * channel[:, None, None] * growth
     table = table[:, :, None, None]
     coefficients = (basis @ blocks @ basis.T / table).round() * table
     ycc = (basis.T @ coefficients @ basis).transpose(3, 4).reshape(padded.shape)
-    return torch.einsum("ij,njhw->nihw", to_rgb, ycc / 255)[:, :, :h, :w]
+    return _mix(_TO_RGB, ycc / 255)[:, :, :h, :w]
+
+
+def _mix(matrix: Matrix, image: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n 3 h w"]:
+    """Other colours; the numbers stay in the program, a tensor would have to be sent."""
+    a, b, c = image.unbind(1)
+    return torch.stack([r[0] * a + r[1] * b + r[2] * c for r in matrix], 1)
 
 
 def _cosines(device: torch.device) -> Float[Tensor, "8 8"]:

@@ -1,6 +1,6 @@
-"""What the surfaces of random rooms look like, and the light on them."""
+"""What the surfaces of random rooms look like."""
 
-from dataclasses import dataclass
+from dataclasses import fields, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -8,20 +8,36 @@ from torch import Tensor
 
 from geogs.train.rooms.draw import Draw
 from geogs.train.rooms.layout import Layout
-from geogs.train.rooms.scene import Lights, Surfaces
+from geogs.train.rooms.scene import Surfaces
 
-_PLAIN_WALL, _PLAIN_FLOOR, _PLAIN_CEILING, _PLAIN_SOLID = 0.5, 0.2, 0.8, 0.3
-"""Shares of the surfaces that have next to no texture."""
-_LIGHTS = 3
+_PLAIN = (0.5, 0.5, 0.5, 0.5, 0.2, 0.8)
+"""Share of the walls, the floor and the ceiling that have next to no texture."""
+_PLAIN_SOLID = 0.35
+_SHOWS_IMAGE = (0.12, 0.12, 0.12, 0.12, 0.12, 0.04)
+"""Share of them that show images rather than materials."""
+_SOLID_SHOWS_IMAGE = 0.35
 
 
-def draw_surfaces(draw: Draw, layout: Layout, textures: int) -> Surfaces:
-    """Materials for the room's six faces and two surfaces of each solid."""
+def draw_surfaces(draw: Draw, layout: Layout, textures: int, materials: int) -> Surfaces:
+    """Looks of the room's six faces and of two surfaces of each solid.
+
+    Of the ``textures`` in the bank the first ``materials`` are materials, the others images.
+    """
     b, n = layout.solids.kind.shape
-    walls = _draw(draw, textures, _plain_faces(draw, b), (0.4, 8.0))
-    solids = _draw(draw, textures, draw.chance(_PLAIN_SOLID, b, 2 * n), (0.08, 5.0))
-    solids = _show_pictures(draw, solids, layout)
-    wall = torch.arange(6, device=draw.device).repeat(b, 1)
+    plain = draw.uniform(0, 1, b, 6) < torch.tensor(_PLAIN)
+    image = draw.uniform(0, 1, b, 6) < torch.tensor(_SHOWS_IMAGE)
+    walls = _draw(draw, plain, _texture(draw, image, textures, materials), textures, (0.4, 8.0))
+    polished = (draw.chance(0.15, b) * draw.log_uniform(0.03, 0.5, b))[:, None]
+    walls = replace(walls, mirror=torch.tensor([0.0] * 4 + [1.0, 0.0]) * polished)
+
+    plain = draw.chance(_PLAIN_SOLID, b, 2 * n)
+    image = draw.chance(_SOLID_SHOWS_IMAGE, b, 2 * n)
+    texture = _texture(draw, image, textures, materials)
+    solids = _draw(draw, plain, texture, textures, (0.08, 5.0))
+    pictures = _texture(draw, torch.ones_like(image), textures, materials)
+    solids = _show_pictures(draw, solids, layout, pictures)
+
+    wall = torch.arange(6).repeat(b, 1)
     wall[:, :4] = torch.where(draw.chance(0.6, b)[:, None], 0, wall[:, :4])
     owner = torch.stack([2 * layout.material, 2 * layout.material + 1], -1).flatten().repeat(b, 1)
     # The ends of most solids look like their sides.
@@ -29,117 +45,83 @@ def draw_surfaces(draw: Draw, layout: Layout, textures: int) -> Surfaces:
     return _join(_pick(walls, wall), _pick(solids, owner))
 
 
-def _plain_faces(draw: Draw, rooms: int) -> Bool[Tensor, "b 6"]:
-    shares = [_PLAIN_WALL] * 4 + [_PLAIN_FLOOR, _PLAIN_CEILING]
-    return draw.uniform(0, 1, rooms, 6) < torch.tensor(shares, device=draw.device)
+def _texture(
+    draw: Draw, image: Bool[Tensor, "b s"], textures: int, materials: int
+) -> Int[Tensor, "b s"]:
+    images = materials + draw.integers(textures - materials, *image.shape)
+    return torch.where(image, images, draw.integers(materials, *image.shape))
 
 
 def _draw(
-    draw: Draw, textures: int, plain: Bool[Tensor, "b s"], period: tuple[float, float]
+    draw: Draw,
+    plain: Bool[Tensor, "b s"],
+    texture: Int[Tensor, "b s"],
+    textures: int,
+    period: tuple[float, float],
 ) -> Surfaces:
     """Random surfaces; ``period`` is the range of a texture's width in metres."""
     n = plain.shape
-    angle = torch.where(draw.chance(0.6, *n), 0.0, draw.uniform(-3.15, 3.15, *n))
-    angle = angle + draw.integers(4, *n) * (torch.pi / 2)
+    quarter = torch.where(draw.chance(0.7, *n), 0, draw.integers(4, *n)) * (torch.pi / 2)
+    angle = quarter + torch.where(draw.chance(0.7, *n), 0.0, draw.uniform(-3.15, 3.15, *n))
     scale = 1 / draw.log_uniform(*period, *n)
-    c, s = scale * angle.cos(), scale * angle.sin()
-    lightness = torch.where(plain, draw.uniform(0.35, 1.9, *n), draw.uniform(0.6, 1.6, *n))
-    hue = 1 + draw.uniform(0, 0.25, *n)[..., None] * draw.uniform(-1, 1, *n, 3)
+    lightness = torch.where(plain, draw.uniform(0.4, 1.9, *n), draw.uniform(0.7, 1.6, *n))
+    # Most surfaces are nearly grey, a few are colourful.
+    chroma = 0.4 * draw.uniform(0, 1, *n).pow(2.5)
+    hue = 1 + chroma[..., None] * draw.uniform(-1, 1, *n, 3)
+    warmth = draw.uniform(-0.02, 0.12, *n)[..., None] * torch.tensor([1.0, 0.2, -1.0])
     faint = draw.chance(0.5, *n) * draw.log_uniform(0.005, 0.06, *n)
-    detail = torch.where(draw.chance(0.5, *n), draw.log_uniform(0.03, 0.5, *n), 0.0)
-    glossy = draw.chance(0.3, *n)
+    stain = draw.chance(0.5, *n) * draw.log_uniform(0.002, 0.03, *n)
+    detail = draw.chance(0.5, *n) * draw.log_uniform(0.03, 0.5, *n)
     return Surfaces(
-        texture=draw.integers(textures, *n),
-        matrix=torch.stack([c, -s, s, c], -1).unflatten(-1, (2, 2)),
+        texture=texture,
+        matrix=_matrix(scale, angle),
         offset=draw.uniform(0, 1, *n, 2),
-        contrast=torch.where(plain, faint, draw.log_uniform(0.25, 1.3, *n)),
-        tint=lightness[..., None] * hue,
+        contrast=torch.where(plain, faint, draw.log_uniform(0.25, 1.2, *n)),
+        tint=lightness[..., None] * hue * (1 + warmth),
         noise=draw.integers(textures, *n),
         noise_scale=1 / draw.log_uniform(0.05, 1.5, *n),
-        detail=torch.where(plain, draw.chance(0.5, *n) * draw.log_uniform(0.002, 0.03, *n), detail),
-        gloss=torch.where(glossy, draw.log_uniform(0.02, 0.6, *n), 0.0),
+        detail=torch.where(plain, stain, detail),
+        gloss=draw.chance(0.3, *n) * draw.log_uniform(0.02, 0.6, *n),
         shininess=draw.log_uniform(4.0, 200.0, *n),
-        glow=torch.zeros(n, device=draw.device),
+        glow=torch.zeros(n),
+        mirror=draw.chance(0.06, *n) * draw.log_uniform(0.03, 0.5, *n),
     )
 
 
-def _show_pictures(draw: Draw, surfaces: Surfaces, layout: Layout) -> Surfaces:
-    """What hangs on a wall shows about one texture; some of it is a bright window or screen."""
-    picture = (layout.picture == 1).repeat_interleave(2)
+def _matrix(scale: Float[Tensor, "b s"], angle: Float[Tensor, "b s"]) -> Float[Tensor, "b s 2 2"]:
+    """Turned and scaled; upside down, because rows of an image go down."""
+    c, s = scale * angle.cos(), scale * angle.sin()
+    return torch.stack([c, s, s, -c], -1).unflatten(-1, (2, 2))
+
+
+def _show_pictures(
+    draw: Draw, surfaces: Surfaces, layout: Layout, images: Int[Tensor, "b s"]
+) -> Surfaces:
+    """What hangs on a wall shows about one image; some of it is a bright window or screen."""
+    picture = layout.picture.repeat_interleave(2)
     half = layout.solids.half.repeat_interleave(2, 1)
-    n = picture.shape[0]
-    b = len(half)
-    width = 2 * torch.maximum(half[..., 0], half[..., 2]) * draw.uniform(1.0, 2.0, b, n)
-    scale = (1 / width)[..., None, None] * torch.eye(2, device=draw.device)
+    b, n = half.shape[:2]
+    width = 2 * torch.maximum(half[..., 0], half[..., 2]) * draw.uniform(1.0, 1.8, b, n)
+    matrix = _matrix(1 / width, torch.zeros_like(width))
     bright = draw.chance(0.2, b, n) * draw.log_uniform(0.5, 4.0, b, n)
     plain = draw.chance(0.25, b, n)
-    return Surfaces(
-        texture=surfaces.texture,
-        matrix=torch.where(picture[:, None, None], scale, surfaces.matrix),
-        offset=surfaces.offset,
+    glass = draw.chance(0.25, b, n) * draw.log_uniform(0.1, 0.9, b, n)
+    return replace(
+        surfaces,
+        texture=torch.where(picture, images, surfaces.texture),
+        matrix=torch.where(picture[:, None, None], matrix, surfaces.matrix),
         contrast=torch.where(picture & ~plain, 1.0, surfaces.contrast),
-        tint=surfaces.tint,
-        noise=surfaces.noise,
-        noise_scale=surfaces.noise_scale,
         detail=torch.where(picture, 0.0, surfaces.detail),
-        gloss=surfaces.gloss,
-        shininess=surfaces.shininess,
         glow=torch.where(picture, bright, surfaces.glow),
+        mirror=torch.where(picture, glass, surfaces.mirror),
     )
 
 
 def _pick(surfaces: Surfaces, index: Int[Tensor, "b s"]) -> Surfaces:
-    rows = torch.arange(len(index), device=index.device)[:, None]
-    return Surfaces(*(value[rows, index] for value in vars(surfaces).values()))
+    rows = torch.arange(len(index))[:, None]
+    return Surfaces(*(getattr(surfaces, f.name)[rows, index] for f in fields(Surfaces)))
 
 
 def _join(first: Surfaces, second: Surfaces) -> Surfaces:
-    pairs = zip(vars(first).values(), vars(second).values(), strict=True)
-    return Surfaces(*(torch.cat(pair, 1) for pair in pairs))
-
-
-@dataclass(frozen=True)
-class _Light:
-    """One state of the light in b rooms."""
-
-    position: Float[Tensor, "b l 3"]
-    colour: Float[Tensor, "b l 3"]
-    radius: Float[Tensor, "b l"]
-    above: Float[Tensor, "b 3"]
-    below: Float[Tensor, "b 3"]
-
-
-def draw_lights(draw: Draw, size: Float[Tensor, "b 3"], views: int, change: float) -> Lights:
-    """One to three lights under the ceiling; in a share of the rooms they change between views."""
-    b = len(size)
-    first, second = _light(draw, size), _light(draw, size)
-    moment = draw.integers(max(views - 1, 1), b) + 1
-    later = torch.arange(views, device=draw.device) >= moment[:, None]
-    changed = draw.chance(change, b)[:, None] & later
-
-    def per_view(a: Tensor, z: Tensor) -> Tensor:
-        pick = changed.reshape(b, views, *[1] * (a.ndim - 1))
-        return torch.where(pick, z[:, None], a[:, None])
-
-    pairs = zip(vars(first).values(), vars(second).values(), strict=True)
-    return Lights(*(per_view(*pair) for pair in pairs))
-
-
-def _light(draw: Draw, size: Float[Tensor, "b 3"]) -> _Light:
-    b = len(size)
-    n = (b, _LIGHTS)
-    position = draw.uniform(0.05, 0.95, *n, 3)
-    position[..., 2] = 1 - 0.5 * position[..., 2].square()
-    there = torch.arange(_LIGHTS, device=draw.device) <= draw.integers(_LIGHTS, b)[:, None]
-    warmth = draw.uniform(-0.35, 0.35, *n)[..., None]
-    white = 1 + warmth * torch.tensor([1.0, 0.1, -1.0], device=draw.device)
-    power = there * draw.log_uniform(0.7, 6.0, *n)
-    ambient = draw.log_uniform(0.12, 1.0, b)[:, None]
-    cast = 1 + draw.uniform(-0.15, 0.15, b, 3)
-    return _Light(
-        position=position * size[:, None],
-        colour=power[..., None] * white,
-        radius=draw.log_uniform(0.02, 0.3, *n),
-        above=ambient * cast,
-        below=ambient * draw.uniform(0.4, 0.9, b)[:, None] * (1 + draw.uniform(-0.15, 0.15, b, 3)),
-    )
+    names = [f.name for f in fields(Surfaces)]
+    return Surfaces(*(torch.cat([getattr(s, n) for s in (first, second)], 1) for n in names))

@@ -29,8 +29,8 @@ class RoomOptions:
     """Of the images, pixels."""
     views: int = 2
     """Per clip; 2 makes pairs, more make short smooth paths."""
-    density: tuple[float, float] = (0.2, 0.6)
-    """Least and largest share of the 84 places for solids that a room fills (about 17 to 50)."""
+    density: tuple[float, float] = (0.15, 0.55)
+    """Least and largest share of the places for solids that a room fills (there are about 125)."""
     motions: MotionShares = MotionShares()
     """Kinds of camera motion."""
     candidates: int = 24

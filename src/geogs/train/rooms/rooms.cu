@@ -28,11 +28,6 @@ __device__ void select_visible(const Stock& stock, u32* mask, const float* camer
   __syncthreads();
 }
 
-__device__ __forceinline__ Point point_at(const Stock& stock, V3 size, Hit hit, V3 origin, V3 direction) {
-  V3 position = origin + hit.t * direction;
-  return hit.solid < 0 ? room_point(size, position) : solid_point(stock.solid[hit.solid], hit.solid, position);
-}
-
 // Linear colour as the mean of four samples, and depth by the ray through the centre; a thread per
 // pixel, at least MOST_SOLIDS threads per block, a view per blockIdx.z.
 extern "C" __global__ void render_rooms(const float* sizes, const float* solids, const float* surfaces, const float* lights, const float* cameras, const unsigned* texels, float* colour, float* depth, int views, int count, int light_count, int texture_size, int texture_levels, long long texture_stride, int width, int height) {

@@ -1,17 +1,36 @@
 """Clips of random rooms: a room, its light, a camera path, pictures of an imperfect camera."""
 
+from dataclasses import dataclass
+
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from geogs.train.rooms.bank import make_bank
-from geogs.train.rooms.cameras import draw_cameras, too_near
+from geogs.train.rooms.cameras import choose_cameras, too_near
 from geogs.train.rooms.clips import ClipBatch
-from geogs.train.rooms.disturb import develop
+from geogs.train.rooms.develop import develop
 from geogs.train.rooms.draw import Draw
+from geogs.train.rooms.flaws import Flaws, draw_flaws
 from geogs.train.rooms.layout import draw_layout
-from geogs.train.rooms.materials import draw_lights, draw_surfaces
+from geogs.train.rooms.lights import draw_lights
+from geogs.train.rooms.materials import draw_surfaces
 from geogs.train.rooms.options import RoomOptions
+from geogs.train.rooms.paths import Paths, draw_paths
 from geogs.train.rooms.render import render
-from geogs.train.rooms.scene import Rooms
+from geogs.train.rooms.scene import Rooms, moved
+
+_LEAST, _MOST = (2.5, 2.5, 2.2), (8.0, 8.0, 3.5)
+"""Sizes of rooms, metres."""
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """Everything random about a batch but the noise of its pixels."""
+
+    rooms: Rooms
+    paths: Paths
+    flaws: Flaws
 
 
 class RoomSampler:
@@ -29,17 +48,32 @@ class RoomSampler:
     def sample(self, step: int, batch: int, rank: int = 0) -> ClipBatch:
         """``batch`` clips for a training step of a process; the same whenever it is asked for.
 
-        Nothing waits for the device.
+        The rooms are the same on every device, only the noise differs. Nothing waits for the
+        device.
         """
         options = self.options
-        draw = Draw(self.device, self._seed, int(options.validation), step, rank)
-        size = draw.uniform(0, 1, batch, 3) * torch.tensor([5.5, 5.5, 1.3], device=self.device)
-        size = size + torch.tensor([2.5, 2.5, 2.2], device=self.device)
-        layout = draw_layout(draw, size, options.density)
-        surfaces = draw_surfaces(draw, layout, options.textures)
-        lights = draw_lights(draw, size, options.views, options.light_change)
-        views = draw_cameras(draw, options, size, layout.solids)
-        solids = layout.solids.without(too_near(layout.solids, views))
-        rendering = render(Rooms(size, solids, surfaces, lights), self.bank, views)
-        images = develop(draw, options, rendering.colour)
+        key = (self._seed, int(options.validation), step, rank)
+        plan = moved(self._plan(Draw(torch.device("cpu"), *key), batch), self.device)
+        size, solids = plan.rooms.size, plan.rooms.solids
+        views = choose_cameras(plan.paths, size, solids, options.width, options.height)
+        solids = solids.without(too_near(solids, views))
+        rooms = Rooms(size, solids, plan.rooms.surfaces, plan.rooms.lights)
+        rendering = render(rooms, self.bank, views)
+        images = develop(Draw(self.device, *key), plan.flaws, rendering.colour)
         return ClipBatch(images, rendering.depth, views.T_cw, views.intrinsics, solids)
+
+    def _plan(self, draw: Draw, batch: int) -> _Plan:
+        """Drawn on the host: thousands of tiny steps, which a GPU would not do faster."""
+        options = self.options
+        size = _draw_sizes(draw, batch)
+        layout = draw_layout(draw, size, options.density)
+        surfaces = draw_surfaces(draw, layout, options.textures, self.bank.materials)
+        lights = draw_lights(draw, size, options.views, options.light_change)
+        paths = draw_paths(draw, options, size)
+        flaws = draw_flaws(draw, options, batch)
+        return _Plan(Rooms(size, layout.solids, surfaces, lights), paths, flaws)
+
+
+def _draw_sizes(draw: Draw, rooms: int) -> Float[Tensor, "b 3"]:
+    least, most = torch.tensor(_LEAST), torch.tensor(_MOST)
+    return least + (most - least) * draw.uniform(0, 1, rooms, 3)

@@ -8,17 +8,19 @@ Surfaces: 0..5 are the room's faces -x, +x, -y, +y, -z (floor), +z (ceiling); so
 6 + 2 i around it and 7 + 2 i on its two faces along the local z axis (an ellipsoid only the first).
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import TypeVar
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from geogs.gpu.transfer import to_device
+
 NONE, BOX, FRUSTUM, ELLIPSOID = -1, 0, 1, 2
 
-Part = TypeVar("Part", "Solids", "Surfaces", "Lights")
+Part = TypeVar("Part")
 
 
 @dataclass(frozen=True)
@@ -64,7 +66,7 @@ class Surfaces:
     texture: Int[Tensor, "b s"]
     """Index into the bank."""
     matrix: Float[Tensor, "b s 2 2"]
-    """Repeats of the texture per metre, turned; a scaled rotation."""
+    """Repeats of the texture per metre; turned or mirrored, but scaled evenly."""
     offset: Float[Tensor, "b s 2"]
     """Repeats."""
     contrast: Float[Tensor, "b s"]
@@ -83,16 +85,18 @@ class Surfaces:
     """Exponent of the highlights."""
     glow: Float[Tensor, "b s"]
     """Light of its own, times the albedo."""
+    mirror: Float[Tensor, "b s"]
+    """Reflects the room: 0 for most, near 1 for a mirror; more at grazing angles."""
 
     def packed(self) -> Float[Tensor, "b s 20"]:
         """What the kernels read, in their order."""
-        rows = [
+        columns = [
             self.texture[..., None], self.matrix.flatten(-2), self.offset, self.contrast[..., None],
-            self.tint, self.noise[..., None], self.noise_scale[..., None], self.detail[..., None],
-            self.gloss[..., None], self.shininess[..., None], self.glow[..., None],
-            torch.zeros_like(self.offset), torch.zeros_like(self.glow[..., None]),
+            self.tint, torch.stack([self.noise.float(), self.noise_scale, self.detail, self.gloss,
+                                    self.shininess, self.glow, self.mirror], -1),
+            torch.zeros_like(self.offset),
         ]  # fmt: skip
-        return torch.cat([r.float() for r in rows], -1).contiguous()
+        return torch.cat([c.float() for c in columns], -1).contiguous()
 
 
 @dataclass(frozen=True)
@@ -139,14 +143,20 @@ def packed_solids(solids: Solids) -> Float[Tensor, "b n 16"]:
 
 def convert(rooms: Rooms, dtype: torch.dtype) -> Rooms:
     """The same rooms with floating-point numbers of another precision."""
-    return Rooms(
-        rooms.size.to(dtype),
-        _cast(rooms.solids, dtype),
-        _cast(rooms.surfaces, dtype),
-        _cast(rooms.lights, dtype),
+    return _each(rooms, lambda t: t.to(dtype) if t.is_floating_point() else t)
+
+
+def moved(part: Part, device: torch.device) -> Part:
+    """Rooms, or a part of them, on a device, without waiting for it."""
+    return _each(part, lambda t: to_device(t, device))
+
+
+def _each(part: Part, change: Callable[[Tensor], Tensor]) -> Part:
+    """A dataclass of tensors, or of such dataclasses, with every tensor changed."""
+    values = [getattr(part, f.name) for f in fields(part)]  # type: ignore[arg-type]
+    return type(part)(
+        *(
+            change(v) if isinstance(v, Tensor) else _each(v, change) if is_dataclass(v) else v
+            for v in values
+        )
     )
-
-
-def _cast(part: Part, dtype: torch.dtype) -> Part:
-    values = {f.name: getattr(part, f.name) for f in fields(part)}
-    return type(part)(**{k: v.to(dtype) if v.is_floating_point() else v for k, v in values.items()})

@@ -105,26 +105,60 @@ __device__ float ambient_access(const Stock& stock, V3 size, const Point& point)
   return share;
 }
 
+__device__ __forceinline__ V3 ambient_at(const Room& room, V3 normal, float access) {
+  float share = (0.5f + 0.5f * normal.z) * access;
+  return share * load3(room.ambient) + (access - share) * load3(room.ambient + 3);
+}
+
+// Irradiance of a surface from a light, if nothing is in the way; the direction to the light.
+__device__ __forceinline__ V3 lamp_at(V3 ray, V3 normal, V3 colour, V3& to_light) {
+  float squared = dot(ray, ray);
+  to_light = rsqrtf(squared) * ray;
+  return (fmaxf(dot(to_light, normal), 0.f) / (squared + SOFTENING)) * colour;
+}
+
+__device__ __forceinline__ V3 corner_of(int sample_) {
+  return v3(sample_ < 2 ? 1.f : -1.f, sample_ % 2 ? -1.f : 1.f, sample_ == 0 || sample_ == 3 ? 1.f : -1.f);
+}
+
+__device__ __forceinline__ Point point_at(const Stock& stock, V3 size, Hit hit, V3 origin, V3 direction) {
+  V3 position = origin + hit.t * direction;
+  return hit.solid < 0 ? room_point(size, position) : solid_point(stock.solid[hit.solid], hit.solid, position);
+}
+
+// What a mirroring point reflects towards a direction; light there is without shadows.
+__device__ V3 reflected(const Room& room, const Stock& stock, V3 start, V3 direction, int sample_, float footprint) {
+  Hit hit = closest_hit(stock, stock.present, room.size, start, direction);
+  Point point = point_at(stock, room.size, hit, start, direction);
+  const float* s = room.surfaces + point.surface * SURFACE_FLOATS;
+  float cosine = clampf(-dot(point.normal, direction), 0.05f, 1.f);
+  V3 albedo = albedo_of(s, room.textures, point.u, point.v, (2.f * footprint + 0.004f * hit.t) * rsqrtf(cosine), sample_);
+  V3 light = ambient_at(room, point.normal, 1.f) + v3(s[16], s[16], s[16]), to_light;
+  for (int k = 0; k < room.light_count; k++) {
+    const float* lamp = room.lights + k * LIGHT_FLOATS;
+    light = light + lamp_at(load3(lamp) - point.position, point.normal, load3(lamp + 3), to_light);
+  }
+  return albedo * light;
+}
+
 // Linear colour that one of the four samples of a pixel sees.
 __device__ V3 shade(const Room& room, const Stock& stock, const Point& point, int sample_, V3 direction, float footprint, float access) {
   const float* s = room.surfaces + point.surface * SURFACE_FLOATS;
   V3 towards = -1.f * unit(direction), n = point.normal;
   float cosine = clampf(dot(n, towards), 0.05f, 1.f);
   V3 albedo = albedo_of(s, room.textures, point.u, point.v, footprint * rsqrtf(cosine), sample_);
-  float share = (0.5f + 0.5f * n.z) * access;
-  V3 diffuse = share * load3(room.ambient) + (access - share) * load3(room.ambient + 3), highlight = v3(0.f, 0.f, 0.f);
+  V3 diffuse = ambient_at(room, n, access), highlight = v3(0.f, 0.f, 0.f), to_light;
   V3 start = point.position + LIFT * n;
-  V3 corner = v3(sample_ < 2 ? 1.f : -1.f, sample_ % 2 ? -1.f : 1.f, sample_ == 0 || sample_ == 3 ? 1.f : -1.f);
   for (int k = 0; k < room.light_count; k++) {
-    const float* light = room.lights + k * LIGHT_FLOATS;
-    V3 ray = load3(light) + light[6] * corner - start, colour = load3(light + 3);
-    float squared = dot(ray, ray);
-    V3 to_light = rsqrtf(squared) * ray;
-    float facing = dot(to_light, n);
-    if (facing <= 0.f || colour.x + colour.y + colour.z <= 0.f || occluded(stock, start, ray, 1.f)) continue;
-    V3 power = (facing / (squared + SOFTENING)) * colour;
+    const float* lamp = room.lights + k * LIGHT_FLOATS;
+    V3 ray = load3(lamp) + lamp[6] * corner_of(sample_) - start, power = lamp_at(ray, n, load3(lamp + 3), to_light);
+    if (power.x + power.y + power.z <= 0.f || occluded(stock, start, ray, 1.f)) continue;
     diffuse = diffuse + power;
     if (s[14] > 0.f) highlight = highlight + powf(fmaxf(dot(unit(to_light + towards), n), 1e-4f), s[15]) * power;
   }
-  return albedo * (diffuse + v3(s[16], s[16], s[16])) + s[14] * highlight;
+  V3 colour = albedo * (diffuse + v3(s[16], s[16], s[16])) + s[14] * highlight;
+  if (s[17] <= 0.f) return colour;
+  float grazing = 1.f - cosine, weight = s[17] * (0.3f + 0.7f * grazing * grazing * grazing);
+  V3 mirrored = 2.f * dot(towards, n) * n - towards;
+  return (1.f - weight) * colour + weight * reflected(room, stock, start, mirrored, sample_, footprint);
 }

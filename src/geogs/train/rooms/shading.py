@@ -6,8 +6,15 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from geogs.train.rooms.raycast import SurfacePoint, occluded, signed_distance, wall_distance
-from geogs.train.rooms.scene import Rooms, Surfaces
+from geogs.train.rooms.raycast import (
+    SurfacePoint,
+    closest_hit,
+    occluded,
+    signed_distance,
+    surface_point,
+    wall_distance,
+)
+from geogs.train.rooms.scene import Lights, Rooms, Surfaces
 from geogs.train.rooms.textures import TextureBank
 
 CORNERS = ((1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1))
@@ -50,28 +57,73 @@ def shade(
     towards = -torch.nn.functional.normalize(direction, dim=-1)
     cosine = (point.normal * towards).sum(-1).clamp(0.05, 1)
     albedo = _albedo(surface, bank, point.coordinates, footprint / cosine.sqrt(), sample)
-    light = rooms.lights
-    above, below = light.above[:, view, None], light.below[:, view, None]
-    share = (0.5 + 0.5 * point.normal[..., 2:]) * access[..., None]
-    diffuse = share * above + (access[..., None] - share) * below
+    diffuse = _ambient(rooms.lights, point, view, access)
     highlight = torch.zeros_like(diffuse)
     start = point.position + LIFT * point.normal
     corner = torch.tensor(CORNERS[sample], dtype=start.dtype, device=start.device)
+    light = rooms.lights
     for k in range(light.position.shape[2]):
         ball = light.position[:, view, k] + light.radius[:, view, k, None] * corner
         ray = ball[:, None] - start
-        squared = (ray * ray).sum(-1)
-        unit = ray / squared.sqrt()[..., None]
-        facing = (unit * point.normal).sum(-1).clamp_min(0)
-        ones = torch.ones_like(facing)
-        lit = (facing > 0) & ~occluded(rooms.solids, start, ray, ones)
-        power = light.colour[:, view, k, None] * (lit * facing / (squared + SOFTENING))[..., None]
+        power = _lamp(ray, point, light.colour[:, view, k])
+        shadow = occluded(rooms.solids, start, ray, torch.ones_like(access))
+        power = torch.where(shadow[..., None], 0.0, power)
         diffuse = diffuse + power
-        middle = torch.nn.functional.normalize(unit + towards, dim=-1)
+        middle = torch.nn.functional.normalize(ray, dim=-1) + towards
+        middle = torch.nn.functional.normalize(middle, dim=-1)
         peak = (middle * point.normal).sum(-1).clamp_min(1e-4) ** surface.shininess
         highlight = highlight + power * peak[..., None]
     glow = surface.glow[..., None]
-    return albedo * (diffuse + glow) + surface.gloss[..., None] * highlight
+    colour = albedo * (diffuse + glow) + surface.gloss[..., None] * highlight
+    if not surface.mirror.any():
+        return colour
+    weight = (surface.mirror * (0.3 + 0.7 * (1 - cosine) ** 3))[..., None]
+    mirrored = 2 * (towards * point.normal).sum(-1, keepdim=True) * point.normal - towards
+    return (1 - weight) * colour + weight * _reflected(
+        rooms, bank, start, mirrored, view, sample, footprint
+    )
+
+
+def _reflected(
+    rooms: Rooms,
+    bank: TextureBank,
+    start: Float[Tensor, "b m 3"],
+    direction: Float[Tensor, "b m 3"],
+    view: int,
+    sample: int,
+    footprint: Float[Tensor, "b m"],
+) -> Float[Tensor, "b m 3"]:
+    """What mirroring points reflect towards unit directions; light there is without shadows."""
+    hit = closest_hit(rooms, start, direction)
+    point = surface_point(rooms, hit, start, direction)
+    surface = _gather(rooms.surfaces, point.surface)
+    cosine = -(point.normal * direction).sum(-1).clamp(-1.0, -0.05)
+    # A polished surface is not as sharp as a mirror.
+    footprint = (2 * footprint + 0.004 * hit.t) / cosine.sqrt()
+    albedo = _albedo(surface, bank, point.coordinates, footprint, sample)
+    light = _ambient(rooms.lights, point, view, torch.ones_like(cosine))
+    light = light + surface.glow[..., None]
+    for k in range(rooms.lights.position.shape[2]):
+        ray = rooms.lights.position[:, view, k, None] - point.position
+        light = light + _lamp(ray, point, rooms.lights.colour[:, view, k])
+    return albedo * light
+
+
+def _ambient(
+    lights: Lights, point: SurfacePoint, view: int, access: Float[Tensor, "b m"]
+) -> Float[Tensor, "b m 3"]:
+    share = (0.5 + 0.5 * point.normal[..., 2:]) * access[..., None]
+    above, below = lights.above[:, view, None], lights.below[:, view, None]
+    return share * above + (access[..., None] - share) * below
+
+
+def _lamp(
+    ray: Float[Tensor, "b m 3"], point: SurfacePoint, colour: Float[Tensor, "b 3"]
+) -> Float[Tensor, "b m 3"]:
+    """Irradiance from a light at the end of the rays, if nothing is in the way."""
+    squared = (ray * ray).sum(-1)
+    facing = ((ray * point.normal).sum(-1) / squared.sqrt()).clamp_min(0)
+    return colour[:, None] * (facing / (squared + SOFTENING))[..., None]
 
 
 def _albedo(

@@ -1,7 +1,7 @@
 // Rays against the solids of a room; the arithmetic of raycast.py.
 #include "common.cuh"
 
-#define MOST_SOLIDS 96
+#define MOST_SOLIDS 128
 #define SOLID_FLOATS 16
 #define NEAREST 1e-4f
 #define TINY 1e-9f

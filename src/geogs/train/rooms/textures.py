@@ -15,6 +15,8 @@ class TextureBank:
     """32 bits each: red, green, blue from the lowest byte up."""
     size: int
     """Side of the finest level."""
+    materials: int
+    """The first so many are materials (wood, plaster, noise), the others images."""
 
     @property
     def levels(self) -> int:
@@ -22,7 +24,7 @@ class TextureBank:
         return self.size.bit_length()
 
     @staticmethod
-    def pack(images: UInt8[Tensor, "t s s 3"]) -> "TextureBank":
+    def pack(images: UInt8[Tensor, "t s s 3"], materials: int) -> "TextureBank":
         """A bank of these images, with area averages for the smaller levels."""
         level = images.movedim(-1, 1).float()
         pieces = []
@@ -32,7 +34,7 @@ class TextureBank:
                 break
             level = torch.nn.functional.avg_pool2d(level, 2)
         red, green, blue = torch.cat(pieces, -1).to(torch.int32).unbind(1)
-        return TextureBank((red | green << 8 | blue << 16).contiguous(), images.shape[1])
+        return TextureBank((red | green << 8 | blue << 16).contiguous(), images.shape[1], materials)
 
     def sample(
         self,
