@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from geogs.config import TrackingConfig
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.tracking.flow.base import FlowOperator
@@ -19,8 +20,13 @@ from geogs.tracking.flow.raft import (
     sample_flow,
     start_in_cells,
 )
+from geogs.tracking.flow.raft_network import SMALL, RaftEstimate, RaftFeatures
 from geogs.tracking.grid import SampleGrid
+from geogs.tracking.tracker import Tracker
 from test_tracking_flow_raft_network import original, published
+from test_tracking_tracker import error_cm
+from tracking_scenes import CAMERA as ROOM_CAMERA
+from tracking_scenes import frames, render, sideways
 
 # Neither side is a multiple of 8: 17 x 20 cells of the network, 16 x 19 of the grid.
 CAMERA = Camera(fx=150.0, fy=150.0, cx=78.0, cy=66.0, width=157, height=133)
@@ -231,3 +237,52 @@ def test_other_weights_are_told_in_one_sentence(tmp_path):
 def test_another_image_size_is_told(operator):
     with pytest.raises(InputError, match="does not fit a camera of 157 x 133"):
         operator.encode(np.zeros((64, 64, 3), np.uint8))
+
+
+class KnowingNetwork:
+    """Gives the true flow of a rendered path instead of estimating it."""
+
+    shape = SMALL
+
+    def __init__(self, path: list[np.ndarray]) -> None:
+        self.path = path
+        views = [render(T) for T in path]
+        self.depth = [depth for _, depth in views]
+        shown = [padded(torch.from_numpy(image)).numpy().tobytes() for image, _ in views]
+        self.frame = {content: k for k, content in enumerate(shown)}
+
+    def encode(self, image: torch.Tensor) -> RaftFeatures:
+        # One feature, the number of the frame plus one: products tell both frames of a pair.
+        number = torch.full((1, 1, 18, 24), self.frame[image.numpy().tobytes()] + 1.0)
+        return RaftFeatures(number, number, number)
+
+    def estimate(self, first, correlation, start, iterations) -> RaftEstimate:
+        at = torch.full((len(first.hidden), 18, 24, 2), 8.0)
+        products = correlation(at)[:, 24, 0, 0]
+        numbers = first.hidden[:, 0, 0, 0]
+        pairs = zip(numbers.tolist(), (products / numbers).tolist(), strict=True)
+        flow = torch.stack([self.flow(round(a) - 1, round(b) - 1) for a, b in pairs])
+        return RaftEstimate(flow[..., ::8, ::8] / 8, flow)
+
+    def flow(self, a: int, b: int) -> torch.Tensor:
+        rays = ROOM_CAMERA.rays(torch.float64).numpy()
+        T = np.linalg.inv(self.path[b]) @ self.path[a]
+        points = (rays * self.depth[a][..., None]) @ T[:3, :3].T + T[:3, 3]
+        u = ROOM_CAMERA.fx * points[..., 0] / points[..., 2] + ROOM_CAMERA.cx
+        v = ROOM_CAMERA.fy * points[..., 1] / points[..., 2] + ROOM_CAMERA.cy
+        y, x = np.mgrid[: ROOM_CAMERA.height, : ROOM_CAMERA.width]
+        return torch.from_numpy(np.stack([u - x, v - y])).float()
+
+
+def test_the_tracker_follows_a_network_that_is_right(weights):
+    """All between network and tracker: cells, directions, starts, confidence."""
+    path = sideways(25)
+    operator = RaftFlow(SampleGrid(ROOM_CAMERA), weights)
+    operator.network = KnowingNetwork(path)
+    tracker = Tracker(ROOM_CAMERA, TrackingConfig(init_keyframes=5), operator=operator)
+    for frame in frames(path):
+        tracker.track(frame)
+    tracker.finish()
+    trajectory = tracker.trajectory()
+    assert trajectory.tracked.all()
+    assert error_cm(trajectory.T_wc[:, :3, 3], np.stack(path)[:, :3, 3]) < 0.001
