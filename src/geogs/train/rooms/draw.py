@@ -19,16 +19,15 @@ class Draw:
 
     def uniform(self, low: float | int, high: float | int, *shape: int) -> Float[Tensor, "..."]:
         """Even in [low, high)."""
-        values = torch.rand(shape, generator=self._generator, device=self.device)
-        return low + (high - low) * values
+        return self._empty(*shape).uniform_(low, high, generator=self._generator)
 
-    def log_uniform(self, low: float | int, high: float | int, *shape: int) -> Float[Tensor, "..."]:
+    def log_uniform(self, low: float, high: float, *shape: int) -> Float[Tensor, "..."]:
         """Positive, its logarithm even."""
-        return self.uniform(math.log(low), math.log(high), *shape).exp()
+        return self.uniform(math.log(low), math.log(high), *shape).exp_()
 
     def normal(self, deviation: float | int, *shape: int) -> Float[Tensor, "..."]:
         """Gaussian around zero."""
-        return deviation * torch.randn(shape, generator=self._generator, device=self.device)
+        return self._empty(*shape).normal_(0.0, deviation, generator=self._generator)
 
     def chance(self, share: float, *shape: int) -> Bool[Tensor, "..."]:
         """True with the given probability."""
@@ -47,6 +46,9 @@ class Draw:
             bound += shares[index - 1]
             chosen = torch.where(value >= bound, index, chosen)
         return chosen
+
+    def _empty(self, *shape: int) -> Float[Tensor, "..."]:
+        return torch.empty(shape, device=self.device)
 
     def rotation(self, *shape: int) -> Float[Tensor, "... 3 3"]:
         """Rotations of any kind, evenly spread."""

@@ -29,7 +29,7 @@ class RoomOptions:
     """Of the images, pixels."""
     views: int = 2
     """Per clip; 2 makes pairs, more make short smooth paths."""
-    density: tuple[float, float] = (0.15, 0.55)
+    density: tuple[float, float] = (0.12, 0.5)
     """Least and largest share of the places for solids that a room fills (there are about 125)."""
     motions: MotionShares = MotionShares()
     """Kinds of camera motion."""

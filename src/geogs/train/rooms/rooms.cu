@@ -28,32 +28,59 @@ __device__ void select_visible(const Stock& stock, u32* mask, const float* camer
   __syncthreads();
 }
 
+// Finds what can shade the points in the ball; all threads of the block.
+__device__ void find_nearby(const Room& room, const Stock& stock, const Ball& ball, Nearby& nearby, int thread) {
+  V3 middle = middle_of(ball);
+  float radius = radius_of(ball);
+  for (int k = 0; k < room.light_count; k++) {
+    const float* lamp = room.lights + k * LIGHT_FLOATS;
+    mark_between(stock, nearby.before_light[k], load3(lamp), middle, fmaxf(radius, 1.74f * lamp[6]), thread);
+  }
+  mark_between(stock, nearby.around, middle, middle, radius + 2.f * FURTHEST_CREASE, thread);
+  __syncthreads();
+}
+
 // Linear colour as the mean of four samples, and depth by the ray through the centre; a thread per
-// pixel, at least MOST_SOLIDS threads per block, a view per blockIdx.z.
-extern "C" __global__ void render_rooms(const float* sizes, const float* solids, const float* surfaces, const float* lights, const float* cameras, const unsigned* texels, float* colour, float* depth, int views, int count, int light_count, int texture_size, int texture_levels, long long texture_stride, int width, int height) {
+// pixel, MOST_SOLIDS threads per block, a view per blockIdx.z.
+extern "C" __global__ void __launch_bounds__(128) render_rooms(const float* sizes, const float* solids, const float* surfaces, const float* lights, const float* cameras, const unsigned* texels, float* colour, float* depth, int views, int count, int light_count, int texture_size, int texture_levels, long long texture_stride, int width, int height) {
   __shared__ Stock stock;
   __shared__ u32 mask[MOST_SOLIDS / 32];
-  int view = blockIdx.z, room_index = view / views, thread = threadIdx.y * blockDim.x + threadIdx.x;
+  __shared__ Nearby nearby;
+  __shared__ Ball ball;
+  int view = blockIdx.z, room_index = view / views, thread = threadIdx.y * blockDim.x + threadIdx.x, threads = blockDim.x * blockDim.y;
   const float *camera = cameras + view * CAMERA_FLOATS, *light = lights + view * (8 + LIGHT_FLOATS * light_count);
-  load_stock(stock, solids + room_index * count * SOLID_FLOATS, count, thread, blockDim.x * blockDim.y);
+  for (int k = thread; k < (int)(sizeof(Nearby) / sizeof(u32)); k += threads) ((u32*)&nearby)[k] = 0;
+  load_stock(stock, solids + room_index * count * SOLID_FLOATS, count, thread, threads);
   int left = blockIdx.x * blockDim.x, top = blockIdx.y * blockDim.y, x = left + threadIdx.x, y = top + threadIdx.y;
   select_visible(stock, mask, camera, count, left - 0.5f, top - 0.5f, left + blockDim.x - 0.5f, top + blockDim.y - 0.5f, thread);
-  if (x >= width || y >= height) return;
 
   Room room = {load3(sizes + room_index * 3), surfaces + (long long)room_index * (6 + 2 * count) * SURFACE_FLOATS, light, light + 8, light_count, {texels, texture_size, texture_levels, texture_stride}};
   V3 origin = centre_of(camera), direction = world_ray(camera, x, y);
-  Hit hit = closest_hit(stock, mask, room.size, origin, direction);
-  float access = ambient_access(stock, room.size, point_at(stock, room.size, hit, origin, direction));
-  float focal = sqrtf(camera[12] * camera[13]);
-  long long area = (long long)width * height, pixel = (long long)y * width + x;
-  depth[view * area + pixel] = hit.t;
-  V3 sum = v3(0.f, 0.f, 0.f);
+  Hit hit = closest_hit(stock, mask, room.size, origin, direction), seen[4];
+  V3 position = origin + hit.t * direction;
+  begin_ball(ball, position, thread == threads / 2 + (int)blockDim.x / 2);
+  float furthest = norm(position - middle_of(ball));
+#pragma unroll
   for (int k = 0; k < 4; k++) {
     V3 ray = world_ray(camera, x + (k % 2 ? 0.25f : -0.25f), y + (k / 2 ? 0.25f : -0.25f));
-    Hit seen = closest_hit(stock, mask, room.size, origin, ray);
-    Point point = point_at(stock, room.size, seen, origin, ray);
-    sum = sum + shade(room, stock, point, k, ray, 0.5f * seen.t * norm(ray) / focal, access);
+    seen[k] = closest_hit(stock, mask, room.size, origin, ray);
+    furthest = fmaxf(furthest, norm(origin + seen[k].t * ray - middle_of(ball)));
   }
+  end_ball(ball, furthest, thread);
+  find_nearby(room, stock, ball, nearby, thread);
+  if (x >= width || y >= height) return;
+
+  float access = ambient_access(stock, nearby.around, room.size, point_at(stock, room.size, hit, origin, direction));
+  float focal = sqrtf(camera[12] * camera[13]);
+  V3 sum = v3(0.f, 0.f, 0.f);
+#pragma unroll
+  for (int k = 0; k < 4; k++) {
+    V3 ray = world_ray(camera, x + (k % 2 ? 0.25f : -0.25f), y + (k / 2 ? 0.25f : -0.25f));
+    Point point = point_at(stock, room.size, seen[k], origin, ray);
+    sum = sum + shade(room, stock, nearby, point, k, ray, 0.5f * seen[k].t * norm(ray) / focal, access);
+  }
+  long long area = (long long)width * height, pixel = (long long)y * width + x;
+  depth[view * area + pixel] = hit.t;
   float* out = colour + view * 3 * area + pixel;
   out[0] = 0.25f * sum.x;
   out[area] = 0.25f * sum.y;
@@ -61,20 +88,30 @@ extern "C" __global__ void render_rooms(const float* sizes, const float* solids,
 }
 
 // Where the points of the first views are in the second ones, and whether nothing hides them.
-// A thread per pixel, a room per blockIdx.z.
-extern "C" __global__ void flow_rooms(const float* solids, const float* first, const float* second, const float* depth, float2* pixels, bool* visible, bool* valid, int count, int width, int height, float margin) {
+// A thread per pixel, MOST_SOLIDS threads per block, a room per blockIdx.z.
+extern "C" __global__ void __launch_bounds__(128) flow_rooms(const float* solids, const float* first, const float* second, const float* depth, float2* pixels, bool* visible, bool* valid, int count, int width, int height, float margin) {
   __shared__ Stock stock;
+  __shared__ u32 between[MOST_SOLIDS / 32];
+  __shared__ Ball ball;
   int room = blockIdx.z, x = blockIdx.x * blockDim.x + threadIdx.x, y = blockIdx.y * blockDim.y + threadIdx.y;
-  load_stock(stock, solids + room * count * SOLID_FLOATS, count, threadIdx.y * blockDim.x + threadIdx.x, blockDim.x * blockDim.y);
-  if (x >= width || y >= height) return;
+  int thread = threadIdx.y * blockDim.x + threadIdx.x, threads = blockDim.x * blockDim.y;
+  if (thread < MOST_SOLIDS / 32) between[thread] = 0;
+  load_stock(stock, solids + room * count * SOLID_FLOATS, count, thread, threads);
   const float *a = first + room * CAMERA_FLOATS, *b = second + room * CAMERA_FLOATS;
-  long long pixel = ((long long)room * height + y) * width + x;
-  V3 centre = centre_of(b), ray = centre_of(a) + depth[pixel] * world_ray(a, x, y) - centre;
+  long long pixel = ((long long)room * height + min(y, height - 1)) * width + min(x, width - 1);
+  V3 centre = centre_of(b), point = centre_of(a) + depth[pixel] * world_ray(a, min(x, width - 1), min(y, height - 1));
+  begin_ball(ball, point, thread == threads / 2 + (int)blockDim.x / 2);
+  end_ball(ball, norm(point - middle_of(ball)), thread);
+  mark_between(stock, between, centre, middle_of(ball), radius_of(ball), thread);
+  __syncthreads();
+  if (x >= width || y >= height) return;
+
+  V3 ray = point - centre;
   V3 p = v3(b[0] * ray.x + b[4] * ray.y + b[8] * ray.z, b[1] * ray.x + b[5] * ray.y + b[9] * ray.z, b[2] * ray.x + b[6] * ray.y + b[10] * ray.z);
   bool before = p.z > 0.01f;
   float z = fmaxf(p.z, 0.01f), u = b[12] * p.x / z + b[14], v = b[13] * p.y / z + b[15];
   pixels[pixel] = make_float2(u, v);
   valid[pixel] = before;
   bool inside = before && u >= 0.f && v >= 0.f && u <= width - 1 && v <= height - 1;
-  visible[pixel] = inside && !occluded(stock, centre, ray, 1.f - margin / norm(ray));
+  visible[pixel] = inside && !occluded(stock, between, centre, ray, 1.f - margin / norm(ray));
 }

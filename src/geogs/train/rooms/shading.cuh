@@ -3,6 +3,7 @@
 
 #define SURFACE_FLOATS 20
 #define LIGHT_FLOATS 8
+#define FURTHEST_CREASE 0.35f
 #define LIFT 1e-3f
 #define SOFTENING 0.3f
 
@@ -10,6 +11,11 @@
 struct Point { V3 position, normal; float u, v; int surface; };
 
 struct Textures { const u32* texels; int size, levels; long long stride; };
+
+#define MOST_LIGHTS 4
+
+// The solids that can matter to the points of a block: between them and each light, or near them.
+struct Nearby { u32 before_light[MOST_LIGHTS][MOST_SOLIDS / 32], around[MOST_SOLIDS / 32]; };
 
 // What a view sees by: the room and its light.
 struct Room {
@@ -87,14 +93,14 @@ __device__ V3 albedo_of(const float* s, const Textures& bank, float u, float v, 
 }
 
 // Share of the ambient light that reaches a point: less in corners and next to things.
-__device__ float ambient_access(const Stock& stock, V3 size, const Point& point) {
-  const float height[2] = {0.08f, 0.35f}, strength[2] = {0.35f, 0.45f};
+__device__ float ambient_access(const Stock& stock, const u32* around, V3 size, const Point& point) {
+  const float height[2] = {0.08f, FURTHEST_CREASE}, strength[2] = {0.35f, 0.45f};
   float share = 1.f;
   for (int k = 0; k < 2; k++) {
     V3 p = point.position + height[k] * point.normal, q = size - p;
     float free = fminf(fminf(fminf(p.x, p.y), fminf(p.z, q.x)), fminf(q.y, q.z));
     for (int word = 0; word < MOST_SOLIDS / 32; word++)
-      for (u32 left = stock.present[word]; left; left &= left - 1) {
+      for (u32 left = around[word]; left; left &= left - 1) {
         const Solid& s = stock.solid[32 * word + __ffs(left) - 1];
         V3 gap = p - load3(s.centre);
         float reach = s.radius + height[k];
@@ -142,7 +148,7 @@ __device__ V3 reflected(const Room& room, const Stock& stock, V3 start, V3 direc
 }
 
 // Linear colour that one of the four samples of a pixel sees.
-__device__ V3 shade(const Room& room, const Stock& stock, const Point& point, int sample_, V3 direction, float footprint, float access) {
+__device__ V3 shade(const Room& room, const Stock& stock, const Nearby& nearby, const Point& point, int sample_, V3 direction, float footprint, float access) {
   const float* s = room.surfaces + point.surface * SURFACE_FLOATS;
   V3 towards = -1.f * unit(direction), n = point.normal;
   float cosine = clampf(dot(n, towards), 0.05f, 1.f);
@@ -152,7 +158,7 @@ __device__ V3 shade(const Room& room, const Stock& stock, const Point& point, in
   for (int k = 0; k < room.light_count; k++) {
     const float* lamp = room.lights + k * LIGHT_FLOATS;
     V3 ray = load3(lamp) + lamp[6] * corner_of(sample_) - start, power = lamp_at(ray, n, load3(lamp + 3), to_light);
-    if (power.x + power.y + power.z <= 0.f || occluded(stock, start, ray, 1.f)) continue;
+    if (power.x + power.y + power.z <= 0.f || occluded(stock, nearby.before_light[k], start, ray, 1.f)) continue;
     diffuse = diffuse + power;
     if (s[14] > 0.f) highlight = highlight + powf(fmaxf(dot(unit(to_light + towards), n), 1e-4f), s[15]) * power;
   }

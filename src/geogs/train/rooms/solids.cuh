@@ -109,10 +109,10 @@ __device__ __forceinline__ float enter(const Solid& s, V3 origin, V3 direction) 
   return t > NEAREST ? t : NO_HIT;
 }
 
-// Whether one of the solids is met before t = end.
-__device__ bool occluded(const Stock& stock, V3 origin, V3 direction, float end) {
+// Whether one of the solids in the mask is met before t = end.
+__device__ bool occluded(const Stock& stock, const u32* mask, V3 origin, V3 direction, float end) {
   for (int word = 0; word < MOST_SOLIDS / 32; word++)
-    for (u32 left = stock.present[word]; left; left &= left - 1)
+    for (u32 left = mask[word]; left; left &= left - 1)
       if (enter(stock.solid[32 * word + __ffs(left) - 1], origin, direction) < end) return true;
   return false;
 }
@@ -120,6 +120,35 @@ __device__ bool occluded(const Stock& stock, V3 origin, V3 direction, float end)
 __device__ __forceinline__ float room_exit(V3 size, V3 o, V3 d) {
   d = v3(away(d.x), away(d.y), away(d.z));
   return fminf(fminf((d.x > 0.f ? size.x - o.x : -o.x) / d.x, (d.y > 0.f ? size.y - o.y : -o.y) / d.y), (d.z > 0.f ? size.z - o.z : -o.z) / d.z);
+}
+
+// A ball around all points that the threads of a block look at, so that most solids can be left out.
+struct Ball { float x, y, z; int radius_bits; };
+
+// Prepares a ball; to be called by all threads, each with a point of its own.
+__device__ void begin_ball(Ball& ball, V3 point, bool middle) {
+  if (middle) { ball.x = point.x; ball.y = point.y; ball.z = point.z; ball.radius_bits = 0; }
+  __syncthreads();
+}
+// Widens it by what each thread measured from its middle; the bits of floats >= 0 sort like integers.
+__device__ void end_ball(Ball& ball, float distance, int thread) {
+  int widest = warp_max(__float_as_int(distance));
+  if ((thread & 31) == 0) atomicMax(&ball.radius_bits, widest);
+  __syncthreads();
+}
+__device__ __forceinline__ V3 middle_of(const Ball& ball) { return v3(ball.x, ball.y, ball.z); }
+__device__ __forceinline__ float radius_of(const Ball& ball) { return __int_as_float(ball.radius_bits) * 1.001f + 2e-3f; }
+
+// Marks the solids nearer than a reach to a segment: no other can be between its two ends, each
+// widened by as much. A solid per thread; the mask must be zero.
+__device__ void mark_between(const Stock& stock, u32* mask, V3 from, V3 to, float reach, int thread) {
+  if (thread >= MOST_SOLIDS || !(stock.present[thread >> 5] >> (thread & 31) & 1)) return;
+  const Solid& s = stock.solid[thread];
+  V3 along = to - from, offset = load3(s.centre) - from;
+  float share = clampf(dot(offset, along) / fmaxf(dot(along, along), 1e-12f), 0.f, 1.f);
+  V3 gap = offset - share * along;
+  float most = s.radius * 1.001f + reach;
+  if (dot(gap, gap) <= most * most) atomicOr(&mask[thread >> 5], 1u << (thread & 31));
 }
 
 struct Hit { float t; int solid; };
