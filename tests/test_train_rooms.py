@@ -1,6 +1,7 @@
 """Random rooms for training: exact geometry, fair statistics, the same again from the same seed."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -10,7 +11,10 @@ import geogs.train.rooms.render as render_module
 import geogs.train.rooms.sampler as sampler_module
 from cuda_emulator import use_emulator
 from geogs.train.rooms.clips import ClipBatch, flow_between
+from geogs.train.rooms.develop import develop
 from geogs.train.rooms.draw import Draw
+from geogs.train.rooms.flaws import draw_flaws
+from geogs.train.rooms.jpeg import compress
 from geogs.train.rooms.options import RoomOptions
 from geogs.train.rooms.raycast import signed_distance, wall_distance
 from geogs.train.rooms.reference import flow_by_torch, render_by_torch
@@ -134,9 +138,7 @@ def test_same_numbers_give_the_same_clips(sampler):
 
 
 def test_validation_has_other_rooms_and_textures(sampler):
-    options = RoomOptions(
-        width=64, height=48, textures=8, texture_size=32, candidates=12, validation=True
-    )
+    options = replace(OPTIONS, validation=True)
     other = RoomSampler(options, "cpu")
     assert (other.bank.texels != sampler.bank.texels).float().mean() > 0.5
     assert (other.sample(3, 2).T_cw != sampler.sample(3, 2).T_cw).any()
@@ -158,13 +160,22 @@ def test_statistics_of_the_clips(clips):
     assert clips.depth.min() > 0.05
 
 
+def test_much_of_the_area_has_next_to_no_texture(sampler):
+    options = replace(OPTIONS, disturbance=0.0)
+    images = 255 * RoomSampler(options, "cpu").sample(2, 12).images
+    across = (images[..., 1:, 1:] - images[..., 1:, :-1]).abs().amax(2)
+    down = (images[..., 1:, 1:] - images[..., :-1, 1:]).abs().amax(2)
+    plain = (torch.maximum(across, down) < 3).float().mean()
+    assert 0.2 < plain < 0.7
+
+
 def test_cameras_are_in_free_space(clips):
     free = signed_distance(clips.solids, clips.views.centre).amin(-1)
     assert free.min() > 0.1
 
 
 def test_paths_of_many_views(sampler):
-    options = RoomOptions(width=64, height=48, textures=8, texture_size=32, candidates=12, views=5)
+    options = replace(OPTIONS, views=5)
     five = RoomSampler(options, "cpu").sample(1, 4)
     assert five.images.shape == (4, 5, 3, 48, 64)
     for k in range(4):
@@ -177,6 +188,26 @@ def test_draws_follow_their_shares():
     torch.testing.assert_close(counts, torch.tensor([0.25, 0.5, 0.25]), rtol=0, atol=0.04)
     R = draw.rotation(10)
     torch.testing.assert_close(R @ R.transpose(-1, -2), torch.eye(3).expand(10, 3, 3))
+
+
+def test_compression_keeps_what_it_does_not_round():
+    image = torch.rand(2, 3, 20, 27, generator=torch.Generator().manual_seed(0))
+    fine = compress(image, torch.full((2,), 1e-3))
+    torch.testing.assert_close(fine, image, rtol=0, atol=1e-3)
+    coarse = compress(image, torch.tensor([2.0, 30.0]))
+    error = (coarse - image).abs().mean((1, 2, 3))
+    assert 0.005 < error[0] < error[1]
+
+
+def test_pictures_without_flaws_are_those_of_the_light():
+    draw, options = Draw(torch.device("cpu"), 0), RoomOptions(disturbance=0.0)
+    flaws = draw_flaws(draw, options, 2)
+    light = torch.rand(2, 2, 3, 24, 32, generator=torch.Generator().manual_seed(1))
+    image = develop(draw, flaws, light)
+    assert ((image * 255) % 1).abs().max() < 1e-3
+    # Brighter light makes brighter pixels, and nothing else does.
+    order = light[0, 0, 0].flatten().argsort()
+    assert (image[0, 0, 0].flatten()[order].diff() >= 0).all()
 
 
 def test_wall_distance():

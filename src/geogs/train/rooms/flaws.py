@@ -97,5 +97,5 @@ def _blur(draw: Draw, some: _Clips) -> Float[Tensor, "n t 2"]:
 
 
 def _steps(draw: Draw, some: _Clips) -> Float[Tensor, "n"]:
-    steps = some.amount(draw, 0.7, 3.0, 25.0)
+    steps = some.amount(draw, 0.7, 2.0, 18.0)
     return torch.where(steps < 0.5, 0.0, steps)

@@ -21,19 +21,22 @@ def compress(
     ``step`` is that of the lowest brightness frequency, in 8-bit levels: 2 is hardly seen, 30 is
     coarse. Steps grow with frequency, and are larger for colour, roughly as in JPEG's tables.
     """
-    n, _, h, w = images.shape
+    h, w = images.shape[-2:]
     padded = torch.nn.functional.pad(images, (0, -w % _SIDE, 0, -h % _SIDE), mode="replicate")
     rows, columns = padded.shape[2] // _SIDE, padded.shape[3] // _SIDE
     ycc = 255 * _mix(_TO_YCC, padded)
-    blocks = ycc.reshape(n, 3, rows, _SIDE, columns, _SIDE).transpose(3, 4)
     basis = _cosines(images.device)
     frequency = torch.arange(_SIDE, device=images.device)
-    growth = 1 + 0.75 * (frequency[:, None] + frequency)
-    channel = 1 + 0.8 * (torch.arange(3, device=images.device) > 0)
-    table = step[:, None, None, None] * channel[:, None, None] * growth
-    table = table[:, :, None, None]
-    coefficients = (basis @ blocks @ basis.T / table).round() * table
-    ycc = (basis.T @ coefficients @ basis).transpose(3, 4).reshape(padded.shape)
+    growth = 1 + 0.75 * (frequency[:, None] + frequency).repeat(1, columns)
+    colour = 1 + 0.8 * (torch.arange(3, device=images.device) > 0)
+    table = step[:, None, None, None, None] * colour[:, None, None, None] * growth
+
+    # Blocks stay in their rows of the image; a matrix for each of many tiny blocks would be slow.
+    across = (ycc.unflatten(3, (columns, _SIDE)) @ basis.T).flatten(3)
+    coefficients = basis @ across.unflatten(2, (rows, _SIDE))
+    coefficients = (coefficients / table).round() * table
+    down = (basis.T @ coefficients).flatten(2, 3)
+    ycc = (down.unflatten(3, (columns, _SIDE)) @ basis).flatten(3)
     return _mix(_TO_RGB, ycc / 255)[:, :, :h, :w]
 
 

@@ -41,22 +41,30 @@ def draw_layout(draw: Draw, size: Float[Tensor, "b 3"], density: tuple[float, fl
     cupboards = pieces.cupboards(draw, size, 8)
     tables = pieces.tables(draw, size, 3)
     shelves = pieces.shelves(draw, size, 2)
-    boards = [pieces.tops(shelves, k) for k in range(BOARDS)]
-    furniture = torch.cat([pieces.tops(cupboards, 0), pieces.tops(tables, 0), *boards], 1)
-    anywhere = torch.cat([loose.floor(size).expand(-1, 6, -1), furniture], 1)
+    standing = [
+        draw.uniform(0, 1, *placed[1].yaw.shape) < share for placed in (cupboards, tables, shelves)
+    ]
+    floor = loose.floor(size)
+    supports = [(cupboards, standing[0], 0), (tables, standing[1], 0)]
+    supports += [(shelves, standing[2], k) for k in range(BOARDS)]
+    # What would stand on a piece that is not there stands on the floor.
+    furniture = torch.cat(
+        [torch.where(there[..., None], pieces.tops(p, k), floor) for p, there, k in supports], 1
+    )
+    anywhere = torch.cat([floor.expand(-1, 6, -1), furniture], 1)
 
-    def some(placed: Placed, factor: float = 1.0) -> Solids:
-        return _put(placed, draw.uniform(0, 1, *placed[1].yaw.shape) < factor * share)
+    def some(placed: Placed) -> Solids:
+        return _put(placed, draw.uniform(0, 1, *placed[1].yaw.shape) < share)
 
     def scattered(solids: Solids, factor: float = 1.0) -> Solids:
         return solids.without(draw.uniform(0, 1, *solids.kind.shape) > factor * share)
 
     return _join(
-        _Group(some(cupboards), 1),
-        _Group(some(tables), 5),
+        _Group(_put(cupboards, standing[0]), 1),
+        _Group(_put(tables, standing[1]), 5),
         _Group(some(pieces.chairs(draw, size, 2)), 6),
         _Group(some(pieces.sofas(draw, size, 1)), 4),
-        _Group(some(shelves), BOARDS + 2),
+        _Group(_put(shelves, standing[2]), BOARDS + 2),
         _Group(some(pieces.pictures(draw, size, 7)), 1, picture=2),
         _Group(_put(pieces.skirting(draw, size), draw.chance(0.6, b, 1)), 4),
         _Group(some(pieces.lamps(draw, size, 2)), 1),

@@ -14,6 +14,8 @@ from geogs.train.rooms.views import Views, pixel_grid, project, rays
 
 MARGIN = 1.5e-3
 """Metres before a point within which nothing hides it, since it lies on a solid itself."""
+SAMPLES = ((-0.125, -0.375), (0.375, -0.125), (-0.375, 0.125), (0.125, 0.375))
+"""Where in a pixel its four samples are: no two in a row or column."""
 _CHUNK = 512
 """Pixels at a time; what the rays need then stays in the processor's cache."""
 
@@ -87,7 +89,7 @@ def _look(
     focal = (views.intrinsics[:, :1] * views.intrinsics[:, 1:2]).sqrt()
     total = torch.zeros_like(direction)
     for k in range(4):
-        origin, ray = rays(views, view, x + (k % 2 - 0.5) / 2, y + (k // 2 - 0.5) / 2)
+        origin, ray = rays(views, view, x + SAMPLES[k][0], y + SAMPLES[k][1])
         seen = closest_hit(rooms, origin, ray)
         point = surface_point(rooms, seen, origin, ray)
         footprint = 0.5 * seen.t * ray.norm(dim=-1) / focal

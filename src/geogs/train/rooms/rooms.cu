@@ -10,6 +10,11 @@ __device__ __forceinline__ V3 world_ray(const float* c, float x, float y) {
 }
 __device__ __forceinline__ V3 centre_of(const float* c) { return v3(c[3], c[7], c[11]); }
 
+// Through the samples of a pixel: no two in a row or column.
+__device__ __forceinline__ V3 sample_ray(const float* c, int x, int y, int k) {
+  return world_ray(c, x + (k == 0 ? -0.125f : k == 1 ? 0.375f : k == 2 ? -0.375f : 0.125f), y + (0.25f * k - 0.375f));
+}
+
 // The solids that pixels left..right, top..bottom may see; all threads of the block.
 __device__ void select_visible(const Stock& stock, u32* mask, const float* camera, int count, float left, float top, float right, float bottom, int thread) {
   V3 axis = unit(world_ray(camera, 0.5f * (left + right), 0.5f * (top + bottom)));
@@ -62,7 +67,7 @@ extern "C" __global__ void __launch_bounds__(128) render_rooms(const float* size
   float furthest = norm(position - middle_of(ball));
 #pragma unroll
   for (int k = 0; k < 4; k++) {
-    V3 ray = world_ray(camera, x + (k % 2 ? 0.25f : -0.25f), y + (k / 2 ? 0.25f : -0.25f));
+    V3 ray = sample_ray(camera, x, y, k);
     seen[k] = closest_hit(stock, mask, room.size, origin, ray);
     furthest = fmaxf(furthest, norm(origin + seen[k].t * ray - middle_of(ball)));
   }
@@ -75,7 +80,7 @@ extern "C" __global__ void __launch_bounds__(128) render_rooms(const float* size
   V3 sum = v3(0.f, 0.f, 0.f);
 #pragma unroll
   for (int k = 0; k < 4; k++) {
-    V3 ray = world_ray(camera, x + (k % 2 ? 0.25f : -0.25f), y + (k / 2 ? 0.25f : -0.25f));
+    V3 ray = sample_ray(camera, x, y, k);
     Point point = point_at(stock, room.size, seen[k], origin, ray);
     sum = sum + shade(room, stock, nearby, point, k, ray, 0.5f * seen[k].t * norm(ray) / focal, access);
   }

@@ -148,7 +148,7 @@ def convert(rooms: Rooms, dtype: torch.dtype) -> Rooms:
 
 def moved(part: Part, device: torch.device) -> Part:
     """Rooms, or a part of them, on a device, without waiting for it."""
-    return _each(part, lambda t: to_device(t, device))
+    return _each(part, lambda t: to_device(t.contiguous(), device))
 
 
 def _each(part: Part, change: Callable[[Tensor], Tensor]) -> Part:

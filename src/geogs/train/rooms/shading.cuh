@@ -98,15 +98,17 @@ __device__ float ambient_access(const Stock& stock, const u32* around, V3 size, 
   float share = 1.f;
   for (int k = 0; k < 2; k++) {
     V3 p = point.position + height[k] * point.normal, q = size - p;
-    float free = fminf(fminf(fminf(p.x, p.y), fminf(p.z, q.x)), fminf(q.y, q.z));
+    float wall = fminf(fminf(fminf(p.x, p.y), fminf(p.z, q.x)), fminf(q.y, q.z));
+    float closed = 1.f - clampf(wall / height[k], 0.f, 1.f);
     for (int word = 0; word < MOST_SOLIDS / 32; word++)
       for (u32 left = around[word]; left; left &= left - 1) {
         const Solid& s = stock.solid[32 * word + __ffs(left) - 1];
         V3 gap = p - load3(s.centre);
         float reach = s.radius + height[k];
-        if (dot(gap, gap) < reach * reach) free = fminf(free, signed_distance(s, p));
+        // A wire lets nearly all light pass.
+        if (dot(gap, gap) < reach * reach) closed = fmaxf(closed, fminf(s.bulk / height[k], 1.f) * (1.f - clampf(signed_distance(s, p) / height[k], 0.f, 1.f)));
       }
-    share -= strength[k] * (1.f - clampf(free / height[k], 0.f, 1.f));
+    share -= strength[k] * closed;
   }
   return share;
 }

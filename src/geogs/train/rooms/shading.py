@@ -30,11 +30,14 @@ SOFTENING = 0.3
 def ambient_access(rooms: Rooms, point: SurfacePoint) -> Float[Tensor, "b m"]:
     """Share of the ambient light that reaches points: less in corners and next to things."""
     share = torch.ones_like(point.position[..., 0])
+    bulk = 2 * rooms.solids.bounding_half.median(-1).values[:, None]
     for height, strength in CREASES:
         above = point.position + height * point.normal
-        free = signed_distance(rooms.solids, above).amin(-1)
-        free = torch.minimum(free, wall_distance(rooms.size, above))
-        share = share - strength * (1 - (free / height).clamp(0, 1))
+        closed = 1 - (signed_distance(rooms.solids, above) / height).clamp(0, 1)
+        # A wire lets nearly all light pass.
+        closed = (closed * (bulk / height).clamp_max(1)).amax(-1)
+        wall = 1 - (wall_distance(rooms.size, above) / height).clamp(0, 1)
+        share = share - strength * torch.maximum(closed, wall)
     return share
 
 

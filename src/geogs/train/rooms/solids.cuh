@@ -22,9 +22,9 @@ __device__ __forceinline__ V3 load3(const float* p) { return v3(p[0], p[1], p[2]
 __device__ __forceinline__ float clampf(float x, float low, float high) { return fminf(fmaxf(x, low), high); }
 __device__ __forceinline__ float away(float d) { return fabsf(d) < TINY ? (d < 0.f ? -TINY : TINY) : d; }
 
-// A solid as packed_solids() stores it, and the radius of the ball around it.
+// A solid as packed_solids() stores it, the radius of the ball around it, the second of its widths.
 struct Solid {
-  float to_local[9], centre[3], half[3], kind, radius;
+  float to_local[9], centre[3], half[3], kind, radius, bulk;
 };
 
 // Those of a room, in shared memory; a bit for each place that is not empty.
@@ -54,6 +54,8 @@ __device__ void load_stock(Stock& stock, const float* packed, int count, int thr
     s.kind = p[15];
     float wide = fmaxf(s.half[0], s.half[1]), other = s.kind == FRUSTUM ? 0.f : fminf(s.half[0], s.half[1]);
     s.radius = s.kind == 2.f ? fmaxf(wide, s.half[2]) : sqrtf(wide * wide + other * other + s.half[2] * s.half[2]);
+    float other_wide = s.kind == FRUSTUM ? wide : fminf(s.half[0], s.half[1]);
+    s.bulk = 2.f * fmaxf(other_wide, fminf(wide, s.half[2]));
     if (s.kind >= 0.f) atomicOr(&stock.present[i >> 5], 1u << (i & 31));
   }
   __syncthreads();
