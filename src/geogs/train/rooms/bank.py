@@ -11,6 +11,7 @@ import numpy as np
 import skimage
 import torch
 from jaxtyping import UInt8
+from PIL import Image
 
 from geogs.synth import artwork, texture
 from geogs.synth.texture import Colour
@@ -158,5 +159,4 @@ def _crop(rng: np.random.Generator, name: str, size: int) -> UInt8[np.ndarray, "
 def _photograph(name: str) -> UInt8[np.ndarray, "h w 3"] | None:
     """One of the pictures that come with scikit-image; None where it was left out."""
     path = Path(skimage.__file__).parent / "data" / name
-    image = cv2.imread(str(path)) if path.is_file() else None
-    return None if image is None else np.ascontiguousarray(image[..., ::-1])
+    return np.asarray(Image.open(path).convert("RGB")) if path.is_file() else None
