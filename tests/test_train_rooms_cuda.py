@@ -14,8 +14,15 @@ from geogs.train.rooms.lights import draw_lights
 from geogs.train.rooms.materials import draw_surfaces
 from geogs.train.rooms.options import RoomOptions
 from geogs.train.rooms.paths import draw_paths
+from geogs.train.rooms.raycast import closest_hit
 from geogs.train.rooms.reference import flow_by_torch, render_by_torch
-from geogs.train.rooms.render import MOST_SOLIDS, SOURCE, flow_by_kernel, render_by_kernel
+from geogs.train.rooms.render import (
+    MOST_SOLIDS,
+    SOURCE,
+    first_hit_by_kernel,
+    flow_by_kernel,
+    render_by_kernel,
+)
 from geogs.train.rooms.sampler import RoomSampler
 from geogs.train.rooms.scene import Rooms, moved
 from geogs.train.rooms.views import Views
@@ -64,6 +71,19 @@ def test_renders_like_the_reference(device):
     difference = (fast.colour - slow.colour).abs().amax(2)
     assert difference.quantile(0.98) < 2e-3 if difference.numel() < 1e6 else True
     assert (difference > 5e-3).float().mean() < 0.01
+
+
+def test_hits_like_the_reference(device):
+    rooms, _ = furnished(device)
+    g = torch.Generator().manual_seed(2)
+    b = len(rooms.size)
+    direction = torch.randn(b, 500, 3, generator=g).to(device)
+    origin = (0.5 * rooms.size[:, None]).expand_as(direction)
+    fast = first_hit_by_kernel(rooms.size, rooms.solids, origin, direction)
+    slow = closest_hit(rooms.size, rooms.solids, origin, direction)
+    assert (fast.solid != slow.solid).float().mean() < 5e-3
+    same = fast.solid == slow.solid
+    torch.testing.assert_close(fast.t[same], slow.t[same], rtol=1e-4, atol=1e-5)
 
 
 def test_flows_like_the_reference(device):

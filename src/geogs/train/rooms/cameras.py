@@ -7,7 +7,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from geogs.train.rooms.paths import Paths
-from geogs.train.rooms.raycast import entry, signed_distance, wall_distance
+from geogs.train.rooms.raycast import signed_distance, wall_distance
+from geogs.train.rooms.render import first_hit
 from geogs.train.rooms.scene import Solids
 from geogs.train.rooms.views import Views
 
@@ -73,11 +74,10 @@ def _look(
     directions = _fan(paths.intrinsics, width, height)[:, None, None]
     ray = (paths.R_wc[..., None, :, :] @ directions[..., None])[..., 0]
     origin = paths.centre[..., None, :].expand_as(ray)
-    t = entry(solids, origin.flatten(1, 3), ray.flatten(1, 3)).amin(-1).reshape(ray.shape[:-1])
-    room = torch.where(ray > 0, size[:, None, None, None] - origin, -origin) / ray
-    wall = room.amin(-1)
-    depth = torch.minimum(t, wall)
-    return _Sight(depth, origin + depth[..., None] * ray, (t < wall)[:, :, 0].float().mean(-1))
+    hit = first_hit(size, solids, origin.flatten(1, 3), ray.flatten(1, 3))
+    depth, solid = (x.reshape(ray.shape[:-1]) for x in (hit.t, hit.solid))
+    crowd = (solid[:, :, 0] >= 0).float().mean(-1)
+    return _Sight(depth, origin + depth[..., None] * ray, crowd)
 
 
 def _fan(intrinsics: Float[Tensor, "b 4"], width: int, height: int) -> Float[Tensor, "b r 3"]:

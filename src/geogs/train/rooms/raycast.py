@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from geogs.train.rooms.scene import BOX, ELLIPSOID, FRUSTUM, NONE, Rooms, Solids
+from geogs.train.rooms.scene import BOX, ELLIPSOID, FRUSTUM, Rooms, Solids
 
 NEAREST = 1e-4
 """Hits at a smaller t do not count."""
@@ -43,11 +43,12 @@ class SurfacePoint:
 
 
 def closest_hit(
-    rooms: Rooms, origin: Float[Tensor, "b m 3"], direction: Float[Tensor, "b m 3"]
-) -> Hit:
+    size: Float[Tensor, "b 3"], solids: Solids, origin: Float[Tensor, "b m 3"],
+    direction: Float[Tensor, "b m 3"],
+) -> Hit:  # fmt: skip
     """The first thing that each ray from inside a room meets."""
-    t_room = _room_exit(rooms.size, origin, direction)
-    t, solid = entry(rooms.solids, origin, direction).min(-1)
+    t_room = _room_exit(size, origin, direction)
+    t, solid = entry(solids, origin, direction).min(-1)
     inside = t < t_room
     return Hit(torch.where(inside, t, t_room), torch.where(inside, solid, -1))
 
@@ -64,19 +65,22 @@ def entry(
     solids: Solids, origin: Float[Tensor, "b m 3"], direction: Float[Tensor, "b m 3"]
 ) -> Float[Tensor, "b m n"]:
     """t at which each ray enters each solid; infinite where it does not."""
-    o = torch.einsum(
-        "bnij,bmni->bmnj", solids.rotation, origin[:, :, None] - solids.centre[:, None]
-    )
-    d = torch.einsum("bnij,bmi->bmnj", solids.rotation, direction)
-    # From the point nearest to the solid's centre the equations lose no digits to distance.
-    t0 = -(o * d).sum(-1) / (d * d).sum(-1)
-    o = o + t0[..., None] * d
-    half = solids.half[:, None]
-    kind = solids.kind[:, None]
-    t = torch.where(kind == BOX, _enter_box(o, d, half), math.inf)
-    t = torch.where(kind == FRUSTUM, _enter_frustum(o, d, half, NEAREST - t0), t)
-    t = torch.where(kind == ELLIPSOID, _enter_ellipsoid(o, d, half), t) + t0
-    return torch.where((kind != NONE) & (t > NEAREST), t, math.inf)
+    t = origin.new_full((*origin.shape[:2], solids.kind.shape[1]), math.inf)
+    for kind, enter in (
+        (BOX, _enter_box),
+        (FRUSTUM, _enter_frustum),
+        (ELLIPSOID, _enter_ellipsoid),
+    ):
+        places = _places(solids, kind)
+        part = solids.at(places)
+        o = _to_local(part, origin)
+        d = torch.einsum("bnij,bmi->bmnj", part.rotation, direction)
+        # From the point nearest to the solid's centre the equations lose no digits to distance.
+        t0 = -(o * d).sum(-1) / (d * d).sum(-1)
+        there = enter(o + t0[..., None] * d, d, part.half[:, None], NEAREST - t0) + t0
+        meets = (part.kind[:, None] == kind) & (there > NEAREST)
+        t[..., places] = torch.where(meets, there, t[..., places])
+    return t
 
 
 def surface_point(
@@ -107,21 +111,15 @@ def signed_distance(solids: Solids, points: Float[Tensor, "b m 3"]) -> Float[Ten
 
     Exact outside boxes, close to it near the others.
     """
-    offset = points[:, :, None] - solids.centre[:, None]
-    p = torch.einsum("bnij,bmni->bmnj", solids.rotation, offset)
-    half, kind = solids.half[:, None], solids.kind[:, None]
-    q = p.abs() - half
-    box = q.clamp_min(0).norm(dim=-1) + q.amax(-1).clamp_max(0)
-    slope = (half[..., 1] - half[..., 0]) / (2 * half[..., 2])
-    side = p[..., :2].norm(dim=-1) - 0.5 * (half[..., 0] + half[..., 1]) - slope * p[..., 2]
-    side = side / (1 + slope * slope).sqrt()
-    cap = q[..., 2]
-    outside = (side.clamp_min(0).square() + cap.clamp_min(0).square()).sqrt()
-    frustum = outside + torch.maximum(side, cap).clamp_max(0)
-    k0, k1 = (p / half).norm(dim=-1), (p / half.square()).norm(dim=-1)
-    ellipsoid = k0 * (k0 - 1) / k1.clamp_min(1e-6)
-    distance = torch.where(kind == FRUSTUM, frustum, torch.where(kind == BOX, box, ellipsoid))
-    return torch.where(kind == NONE, math.inf, distance)
+    distance = points.new_full((*points.shape[:2], solids.kind.shape[1]), math.inf)
+    kinds = ((BOX, _box_distance), (FRUSTUM, _frustum_distance), (ELLIPSOID, _ellipsoid_distance))
+    for kind, measure in kinds:
+        places = _places(solids, kind)
+        part = solids.at(places)
+        there = measure(_to_local(part, points), part.half[:, None])
+        one = part.kind[:, None] == kind
+        distance[..., places] = torch.where(one, there, distance[..., places])
+    return distance
 
 
 def wall_distance(
@@ -129,6 +127,40 @@ def wall_distance(
 ) -> Float[Tensor, "b m"]:
     """Distance in metres from points inside a room to its nearest face."""
     return torch.minimum(points, size[:, None] - points).amin(-1)
+
+
+def _places(solids: Solids, kind: int) -> Int[Tensor, "k"]:
+    """The places where some room has a solid of a kind; all of them on a GPU."""
+    n, device = solids.kind.shape[1], solids.kind.device
+    if device.type != "cpu":  # to know how many there are, the host would have to wait
+        return torch.arange(n, device=device)
+    return (solids.kind == kind).any(0).nonzero()[:, 0]
+
+
+def _to_local(solids: Solids, points: Float[Tensor, "b m 3"]) -> Float[Tensor, "b m n 3"]:
+    """Points in the frame of each solid."""
+    return torch.einsum(
+        "bnij,bmni->bmnj", solids.rotation, points[:, :, None] - solids.centre[:, None]
+    )
+
+
+def _box_distance(p: Tensor, half: Tensor) -> Tensor:
+    q = p.abs() - half
+    return q.clamp_min(0).norm(dim=-1) + q.amax(-1).clamp_max(0)
+
+
+def _frustum_distance(p: Tensor, half: Tensor) -> Tensor:
+    slope = (half[..., 1] - half[..., 0]) / (2 * half[..., 2])
+    side = p[..., :2].norm(dim=-1) - 0.5 * (half[..., 0] + half[..., 1]) - slope * p[..., 2]
+    side = side / (1 + slope * slope).sqrt()
+    cap = p[..., 2].abs() - half[..., 2]
+    outside = (side.clamp_min(0).square() + cap.clamp_min(0).square()).sqrt()
+    return outside + torch.maximum(side, cap).clamp_max(0)
+
+
+def _ellipsoid_distance(p: Tensor, half: Tensor) -> Tensor:
+    k0, k1 = (p / half).norm(dim=-1), (p / half.square()).norm(dim=-1)
+    return k0 * (k0 - 1) / k1.clamp_min(1e-6)
 
 
 def _room_exit(
@@ -192,14 +224,14 @@ def _away_from_zero(d: Tensor) -> Tensor:
     return torch.where(d.abs() < _TINY, torch.where(d < 0, -_TINY, _TINY).to(d.dtype), d)
 
 
-def _enter_box(o: Tensor, d: Tensor, half: Tensor) -> Tensor:
+def _enter_box(o: Tensor, d: Tensor, half: Tensor, least: Tensor) -> Tensor:
     d = _away_from_zero(d)
     middle, reach = -o / d, half / d.abs()
     near, far = (middle - reach).amax(-1), (middle + reach).amin(-1)
     return torch.where(near <= far, near, math.inf)
 
 
-def _enter_ellipsoid(o: Tensor, d: Tensor, half: Tensor) -> Tensor:
+def _enter_ellipsoid(o: Tensor, d: Tensor, half: Tensor, least: Tensor) -> Tensor:
     o, d = o / half, d / half
     a, b = (d * d).sum(-1), (o * d).sum(-1)
     nearest = o - (b / a)[..., None] * d

@@ -7,6 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from geogs.gpu.kernels import kernels_for
+from geogs.train.rooms.raycast import Hit, closest_hit
 from geogs.train.rooms.reference import (
     MARGIN,
     FlowTruth,
@@ -39,6 +40,16 @@ def flow(
     return flow_by_torch(solids, views, depth, first, second)
 
 
+def first_hit(
+    size: Float[Tensor, "b 3"], solids: Solids, origin: Float[Tensor, "b m 3"],
+    direction: Float[Tensor, "b m 3"],
+) -> Hit:  # fmt: skip
+    """The first thing that each ray from inside a room meets."""
+    if origin.device.type == "cuda":
+        return first_hit_by_kernel(size, solids, origin, direction)
+    return closest_hit(size, solids, origin, direction)
+
+
 def render_by_kernel(rooms: Rooms, bank: TextureBank, views: Views) -> Rendering:
     """:func:`render` by the CUDA kernel."""
     b, v = views.T_cw.shape[:2]
@@ -69,6 +80,21 @@ def flow_by_kernel(
         _count(solids), views.width, views.height, MARGIN,
     )  # fmt: skip
     return FlowTruth(pixels, visible, valid)
+
+
+def first_hit_by_kernel(
+    size: Float[Tensor, "b 3"], solids: Solids, origin: Float[Tensor, "b m 3"],
+    direction: Float[Tensor, "b m 3"],
+) -> Hit:  # fmt: skip
+    """:func:`first_hit` by the CUDA kernel."""
+    b, rays = origin.shape[:2]
+    t = torch.empty(b, rays, device=origin.device)
+    solid = torch.empty(b, rays, dtype=torch.int32, device=origin.device)
+    kernels_for(SOURCE, origin.device)["first_hits"](
+        (-(-rays // 128), b), 128, size.contiguous(), packed_solids(solids), origin.contiguous(),
+        direction.contiguous(), t, solid, rays, _count(solids),
+    )  # fmt: skip
+    return Hit(t, solid.long())
 
 
 def _count(solids: Solids) -> int:

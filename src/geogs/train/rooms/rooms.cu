@@ -92,6 +92,18 @@ extern "C" __global__ void __launch_bounds__(128) render_rooms(const float* size
   out[2 * area] = 0.25f * sum.z;
 }
 
+// The first thing that each ray meets; a thread per ray, a room per blockIdx.y.
+extern "C" __global__ void first_hits(const float* sizes, const float* solids, const float* origins, const float* directions, float* t, int* solid, int rays, int count) {
+  __shared__ Stock stock;
+  int room = blockIdx.y, index = blockIdx.x * blockDim.x + threadIdx.x;
+  load_stock(stock, solids + room * count * SOLID_FLOATS, count, threadIdx.x, blockDim.x);
+  if (index >= rays) return;
+  long long ray = (long long)room * rays + index;
+  Hit hit = closest_hit(stock, stock.present, load3(sizes + 3 * room), load3(origins + 3 * ray), load3(directions + 3 * ray));
+  t[ray] = hit.t;
+  solid[ray] = hit.solid;
+}
+
 // Where the points of the first views are in the second ones, and whether nothing hides them.
 // A thread per pixel, MOST_SOLIDS threads per block, a room per blockIdx.z.
 extern "C" __global__ void __launch_bounds__(128) flow_rooms(const float* solids, const float* first, const float* second, const float* depth, float2* pixels, bool* visible, bool* valid, int count, int width, int height, float margin) {

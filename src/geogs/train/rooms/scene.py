@@ -43,6 +43,10 @@ class Solids:
         frustum = torch.stack([radius, radius, self.half[..., 2]], -1)
         return torch.where((self.kind == FRUSTUM)[..., None], frustum, self.half)
 
+    def at(self, places: Int[Tensor, "k"]) -> "Solids":
+        """Some of the places of every room."""
+        return Solids(*(getattr(self, f.name)[:, places] for f in fields(Solids)))
+
     def without(self, gone: Bool[Tensor, "b n"]) -> "Solids":
         """The same places, some emptied."""
         return replace(self, kind=torch.where(gone, NONE, self.kind))
@@ -149,6 +153,11 @@ def convert(rooms: Rooms, dtype: torch.dtype) -> Rooms:
 def moved(part: Part, device: torch.device) -> Part:
     """Rooms, or a part of them, on a device, without waiting for it."""
     return _each(part, lambda t: to_device(t.contiguous(), device))
+
+
+def only(part: Part, room: int) -> Part:
+    """One room, or a part of it, as a batch of its own."""
+    return _each(part, lambda t: t[room : room + 1])
 
 
 def _each(part: Part, change: Callable[[Tensor], Tensor]) -> Part:

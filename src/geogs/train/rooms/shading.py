@@ -97,7 +97,7 @@ def _reflected(
     footprint: Float[Tensor, "b m"],
 ) -> Float[Tensor, "b m 3"]:
     """What mirroring points reflect towards unit directions; light there is without shadows."""
-    hit = closest_hit(rooms, start, direction)
+    hit = closest_hit(rooms.size, rooms.solids, start, direction)
     point = surface_point(rooms, hit, start, direction)
     surface = _gather(rooms.surfaces, point.surface)
     cosine = -(point.normal * direction).sum(-1).clamp(-1.0, -0.05)
