@@ -22,7 +22,12 @@ from tracking_scenes import pose, render
 
 CAMERA = ROOM.resized(64, 48)
 INTRINSICS = torch.tensor([[CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy]])
-POSES = [pose(0.0), pose(0.12, 0.02), pose(0.22, -0.03, 0.05, 0.03), pose(0.33, 0.03, 0.06, 0.05)]
+POSES = [
+    pose(0.0),
+    pose(0.25, 0.04),
+    pose(0.45, -0.06, 0.1, -0.08),
+    pose(0.65, 0.05, 0.12, -0.12),
+]
 EDGES = neighbour_edges(len(POSES), 2)
 
 
@@ -132,13 +137,16 @@ def test_every_part_learns_from_poses_and_depths_alone(clip):
 
 
 def test_training_through_the_adjustment_lowers_the_loss(clip):
-    """To less than half, for poses that are a guess and depths that are all one."""
+    """To less than 0.4, for poses that are a guess and depths that are all one.
+
+    Five seeds ended between 0.19 and 0.26 of the loss at the start.
+    """
     images, truth = clip
     start, network = blind_start(truth), narrow()
     cameras, _, _ = cell_cameras(INTRINSICS, 48, 64)
-    steps, options = 30, UnrollOptions(updates=3)
+    steps, options = 36, UnrollOptions(updates=2)
     optimizer = torch.optim.Adam(network.parameters(), 2e-3)
-    losses, flows = [], []
+    losses, shifts = [], []
     for step in range(steps):
         for group in optimizer.param_groups:
             group["lr"] = 2e-3 * min((step + 1) / 5, (1 + np.cos(np.pi * step / steps)) / 2)
@@ -146,9 +154,9 @@ def test_training_through_the_adjustment_lowers_the_loss(clip):
         loss, errors = pose_loss(cameras, estimates, truth, EDGES)
         optimizer.zero_grad()
         loss.backward()
-        torch.nn.utils.clip_grad_norm_(network.parameters(), 2.5)
+        torch.nn.utils.clip_grad_norm_(network.parameters(), 0.5)
         optimizer.step()
         losses.append(float(loss.detach()))
-        flows.append(float(errors[-1].flow.detach()))
-    assert np.mean(losses[-3:]) < 0.45 * losses[0]
-    assert np.mean(flows[-3:]) < 0.45 * flows[0]
+        shifts.append(float(errors[-1].pose.detach()))
+    assert np.median(losses[-8:]) < 0.4 * losses[0]
+    assert np.median(shifts[-8:]) < 0.5 * shifts[0]

@@ -23,8 +23,8 @@ class PoseLossOptions:
     decay: float = 0.9
     """Weight of an update relative to the one after it."""
     pose: float = 10.0
-    flow: float = 0.05
-    """Per cell of 1/8 of the image, or whatever unit positions are in."""
+    flow: float = 0.4
+    """Where positions are in cells of 8 pixels; DROID-SLAM's 0.05 is for pixels."""
     residual: float = 0.01
     align_scale: bool = False
     """Whether only the shape of the path counts; not needed where two poses are fixed at the
