@@ -167,7 +167,8 @@ class DroidFlow:
                 f"An image of shape {image.shape} does not fit a camera of "
                 f"{camera.width} x {camera.height} pixels."
             )
-        rgb = to_device(torch.from_numpy(image), self.device).permute(2, 0, 1)[None]
+        sent = to_device(torch.from_numpy(np.ascontiguousarray(image)), self.device)
+        rgb = sent.permute(2, 0, 1)[None]
         return on_cells(rgb.float() / 255)
 
     def _revise(

@@ -193,10 +193,9 @@ class GraphAggregation(nn.Module):
     def forward(self, hidden: Float[Tensor, "e c h w"], source: Int[Tensor, "e"]) -> FrameOutput:
         frames, place, count = source.unique(return_inverse=True, return_counts=True)
         edges = F.relu(self.conv1(hidden))
-        # Half precision would lose digits in the sums.
-        total = torch.zeros(len(frames), *edges.shape[1:], device=edges.device)
-        total = total.index_add(0, place, edges.float())
-        mean = (total / count[:, None, None, None]).to(edges)
+        # A product, not scattered sums: always in the same order, summed in single precision.
+        share = F.one_hot(place, len(frames)).mT / count[:, None]
+        mean = (share.to(edges) @ edges.flatten(1)).unflatten(1, edges.shape[1:])
         joined = F.relu(self.conv2(mean))
         return FrameOutput(frames, DAMPING_SCALE * self.eta(joined)[:, 0], self.upmask(joined))
 
