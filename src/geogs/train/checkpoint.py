@@ -2,17 +2,19 @@
 
 import json
 import shutil
-from dataclasses import asdict
+from dataclasses import asdict, is_dataclass
 from pathlib import Path
+from typing import Any, TypeVar
 
+import torch
 from safetensors.torch import load_file, save_file
 
 from geogs.errors import InputError
-from geogs.tracking.flow.own_network import NetworkOptions
 from geogs.train.options import FlowTraining
 from geogs.train.trainer import FlowTrainer
 
 FOLDER = "checkpoint"
+T = TypeVar("T")
 _PARTS = ("network", "mean", "first_moment", "second_moment")
 
 
@@ -40,10 +42,7 @@ def save_checkpoint(trainer: FlowTrainer, out: Path) -> None:
 
 def read_options(out: Path) -> FlowTraining:
     """The settings of the run in a folder; raises InputError where there is none."""
-    values = _read_state(out)["options"]
-    network = values.pop("network")
-    network["levels"] = tuple(network["levels"])
-    return FlowTraining(**values, network=NetworkOptions(**network))
+    return _revived(FlowTraining, _read_state(out)["options"])
 
 
 def load_checkpoint(trainer: FlowTrainer, out: Path) -> None:
@@ -68,9 +67,20 @@ def load_checkpoint(trainer: FlowTrainer, out: Path) -> None:
     trainer.load({**state, **{n: parts[n] for n in ("network", "mean")}, "step": step})
 
 
-def _count(step: int):  # type: ignore[no-untyped-def]
-    import torch
+def _revived(kind: type[T], values: dict[str, Any]) -> T:
+    """A dataclass from what ``asdict`` made of it and JSON kept."""
+    default: Any = kind()
+    found: dict[str, Any] = {}
+    for name, value in values.items():
+        before = getattr(default, name)
+        if is_dataclass(before):
+            found[name] = _revived(type(before), value)
+        else:
+            found[name] = tuple(value) if isinstance(before, tuple) else value
+    return kind(**found)
 
+
+def _count(step: int) -> torch.Tensor:
     return torch.tensor(float(step))
 
 

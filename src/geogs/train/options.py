@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from geogs.tracking.flow.own_network import NetworkOptions
+from geogs.train.rooms.options import RoomOptions
 
 
 @dataclass(frozen=True)
@@ -14,12 +15,9 @@ class FlowTraining:
     """Steps of the whole run; the learning rate ends at zero with the last."""
     batch: int = 16
     """Clips per step and device."""
-    width: int = 416
-    """Of the images in pixels."""
-    height: int = 288
-    views: int = 2
-    """Views of a clip; every ordered pair of neighbours is an edge."""
-    iterations: int = 8
+    rooms: RoomOptions = field(default_factory=lambda: RoomOptions(width=416, height=288))
+    """What the clips show; every ordered pair of neighbouring views is an edge."""
+    iterations: int = 6
     """Of the network per edge."""
     learning_rate: float = 8e-4
     """Peak, reached after the warm-up."""
@@ -34,10 +32,12 @@ class FlowTraining:
     """Weight of an iteration's loss relative to the next."""
     likelihood: Literal["joint", "separate"] = "joint"
     """Whether the likelihood of the error trains the flow, too, or an absolute error does."""
-    absolute: float = 0.1
-    """Weight of the absolute error (pixels) beside a joint likelihood."""
+    absolute: float = 0.3
+    """Weight of log(1 + absolute error in pixels) beside a joint likelihood."""
     dense: float = 0.5
-    """Weight of the absolute error of the upsampled flow after the last iteration."""
+    """Weight of the same of the upsampled flow after the last iteration."""
+    descriptors: float = 0.3
+    """Weight of the cross-entropy between correlation windows and where the truth lies in them."""
     occluded: float = 0.3
     """Weight of cells that the other view does not see, relative to those that it sees."""
     seed: int = 0

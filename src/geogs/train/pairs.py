@@ -1,5 +1,6 @@
 """Clips of rooms as what the flow network learns from: images, edges, truth, starts."""
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -15,6 +16,8 @@ from geogs.train.starts import StartOptions, disturbed_starts
 
 MARGIN = 48
 """Cells that lie further outside the second image, in pixels, teach nothing."""
+PROBE = 1.0, 100.0
+"""Least and largest distance of a probe from the truth, pixels."""
 
 
 @dataclass(frozen=True)
@@ -29,10 +32,12 @@ class FlowBatch:
     known: Bool[Tensor, "e h w"]
     """Whether the pixel lies before the second camera and near enough to its image."""
     start: Float[Tensor, "e p 2"]
+    probe: Float[Tensor, "e p 2"]
+    """Positions near the truth, where descriptors are asked to point to it."""
 
     def at_cells(self, field: Tensor) -> Tensor:
         """A field (e, h, w, ...) on the cells, row by row."""
-        return field[:, OFFSET:-3:STRIDE, OFFSET:-3:STRIDE].flatten(1, 2)
+        return _at_cells(field).flatten(1, 2)
 
 
 def flow_batch(clips: ClipBatch, options: StartOptions, generator: torch.Generator) -> FlowBatch:
@@ -51,9 +56,22 @@ def flow_batch(clips: ClipBatch, options: StartOptions, generator: torch.Generat
         _starts(clips, pair, flow.pixels, options, generator)
         for pair, flow in zip(pairs, flows, strict=True)
     ]
-    return FlowBatch(
-        clips.images.flatten(0, 1), edges, truth, visible, known, torch.cat(starts).flatten(1, 2)
-    )
+    start = torch.cat(starts).flatten(1, 2)
+    probe = _at_cells(truth).flatten(1, 2) + _offsets(start, generator)
+    images = clips.images.flatten(0, 1)
+    return FlowBatch(images, edges, truth, visible, known, start, probe)
+
+
+def _offsets(like: Float[Tensor, "e p 2"], generator: torch.Generator) -> Float[Tensor, "e p 2"]:
+    """Of any direction, their lengths spread evenly over the scales of the windows."""
+    u = torch.rand(*like.shape, generator=generator, device=like.device)
+    low, high = math.log(PROBE[0]), math.log(PROBE[1])
+    length, angle = (low + (high - low) * u[..., 0]).exp(), 2 * math.pi * u[..., 1]
+    return length[..., None] * torch.stack([angle.cos(), angle.sin()], -1)
+
+
+def _at_cells(field: Tensor) -> Tensor:
+    return field[:, OFFSET:-3:STRIDE, OFFSET:-3:STRIDE]
 
 
 def _starts(
@@ -63,8 +81,7 @@ def _starts(
     options: StartOptions,
     generator: torch.Generator,
 ) -> Tensor:
-    at = (slice(None), slice(OFFSET, -3, STRIDE), slice(OFFSET, -3, STRIDE))
-    depth, truth = clips.depth[:, pair[0]][at], truth[at]
+    depth, truth = _at_cells(clips.depth[:, pair[0]]), _at_cells(truth)
     cells = cell_pixels(depth.shape[1], depth.shape[2], depth).reshape(*depth.shape[1:], 2)
     intrinsics = clips.intrinsics.float()
     f, c = intrinsics[:, None, None, :2], intrinsics[:, None, None, 2:]

@@ -27,7 +27,7 @@ class RunOptions:
     """How a run is watched and when it pauses."""
 
     validate_every: int = 1000
-    """Steps between validations."""
+    """Steps between validations, each with a checkpoint."""
     validation_batches: int = 8
     minutes: float = float("inf")
     """The run stops with a checkpoint after so many minutes; it goes on with ``resume``."""
@@ -49,7 +49,7 @@ def train_flow(
     mean of the weights in half precision) to ``out``. Ctrl-C ends it as the last minute does.
 
     Raises:
-        GeogsError: the loss is no longer finite.
+        GeogsError: the weights are no longer finite.
     """
     begin = time.monotonic()
     trainer = FlowTrainer(options, worker, run.fuse)
@@ -64,8 +64,8 @@ def train_flow(
             loss = trainer.advance()
             if trainer.step % REPORT_EVERY == 0:
                 value, now = float(loss), time.monotonic()
-                if value != value:
-                    raise GeogsError(f"The loss is not a number at step {trainer.step}.")
+                if not trainer.is_finite():
+                    raise GeogsError(f"The weights are no longer finite at step {trainer.step}.")
                 rate = (trainer.step - at) / (now - since)
                 since, at = now, trainer.step
                 if first:
@@ -77,9 +77,12 @@ def train_flow(
                     break
             if trainer.step % run.validate_every == 0 and validation is not None:
                 scores = _validate(trainer, validation, out, progress)
+                save_checkpoint(trainer, out)
                 since, at = time.monotonic(), trainer.step
     except KeyboardInterrupt:
         progress("interrupted; writing what there is")
+    finally:
+        trainer.close()
     if validation is not None:
         scores = _validate(trainer, validation, out, progress)
         save_checkpoint(trainer, out)

@@ -8,13 +8,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, distributed, nn
 
-from geogs.tracking.flow.own_network import FlowEstimate, FlowNetwork
+from geogs.tracking.flow.own_network import FlowEstimate, FlowNetwork, ImageFeatures
+from geogs.train.ahead import PlansAhead
 from geogs.train.flow_loss import flow_loss
 from geogs.train.options import FlowTraining
 from geogs.train.pairs import FlowBatch, flow_batch
-from geogs.train.rooms.options import RoomOptions
-from geogs.train.rooms.sampler import RoomSampler
+from geogs.train.rooms.sampler import Plan, RoomSampler
 from geogs.train.starts import StartOptions
+from geogs.train.step_graph import StepGraph
 
 
 @dataclass(frozen=True)
@@ -37,8 +38,8 @@ class FlowTrainer:
     def __init__(self, options: FlowTraining, worker: Worker, fuse: bool = False) -> None:
         self.options, self.worker = options, worker
         torch.manual_seed(options.seed)
-        self.network = FlowNetwork(options.network).to(worker.device)
-        self.mean = FlowNetwork(options.network).to(worker.device).requires_grad_(False)
+        self.network = _on_device(FlowNetwork(options.network), worker.device)
+        self.mean = _on_device(FlowNetwork(options.network), worker.device).requires_grad_(False)
         self.mean.load_state_dict(self.network.state_dict())
         self._parameters = list(self.network.parameters())
         self._gradient = _flat_gradient(self._parameters)
@@ -49,11 +50,9 @@ class FlowTrainer:
             fused=worker.device.type == "cuda",
         )
         self.step = 0
-        self.rooms = RoomSampler(
-            RoomOptions(width=options.width, height=options.height, views=options.views),
-            worker.device,
-            options.seed,
-        )
+        self._graph: StepGraph | None = None
+        self._plans: PlansAhead | None = None
+        self.rooms = RoomSampler(options.rooms, worker.device, options.seed)
         if fuse:
             self.network.encoder.compile(dynamic=False)
             self.network.update.compile(dynamic=False)
@@ -61,10 +60,7 @@ class FlowTrainer:
     def advance(self) -> Float[Tensor, ""]:
         """Take a step; returns its loss, which stays on the device."""
         options = self.options
-        batch = self.batch(self.step)
-        self._gradient.zero_()
-        loss = self._loss(batch)
-        loss.backward()
+        loss = self._gradients(self.batch(self.step))
         if self.worker.count > 1:
             distributed.all_reduce(self._gradient)
             self._gradient /= self.worker.count
@@ -79,15 +75,34 @@ class FlowTrainer:
         with torch.no_grad():
             means: list[Tensor] = [*self.mean.parameters()]
             torch._foreach_lerp_(means, [*self._parameters], 1 - decay)
-        return loss.detach()
+        return loss
 
     def batch(self, step: int) -> FlowBatch:
         """What step ``step`` learns from."""
-        clips = self.rooms.sample(step, self.options.batch, self.worker.rank)
+        clips = self.rooms.film(self._plan(step))
         generator = torch.Generator(self.worker.device)
         generator.manual_seed(hash((self.options.seed, step, self.worker.rank)) % 2**62)
         with torch.no_grad():
             return flow_batch(clips, StartOptions(), generator)
+
+    def is_finite(self) -> bool:
+        """Whether all weights are."""
+        return bool(torch.stack([p.detach().isfinite().all() for p in self._parameters]).all())
+
+    def close(self) -> None:
+        """End the processes that draw rooms."""
+        if self._plans is not None:
+            self._plans.close()
+
+    def _plan(self, step: int) -> Plan:
+        options, rank = self.options, self.worker.rank
+        if self.worker.device.type != "cuda":
+            return self.rooms.plan(step, options.batch, rank)
+        if self._plans is None:
+            self._plans = PlansAhead(
+                options.rooms, self.rooms.bank.materials, options.seed, options.batch, rank
+            )
+        return self._plans.plan(step)
 
     def state(self) -> dict[str, Any]:
         """All that a run needs to go on; plain tensors and numbers."""
@@ -106,15 +121,25 @@ class FlowTrainer:
         self.optimizer.load_state_dict(state["optimizer"])
         self.step = int(state["step"])
 
-    def _loss(self, batch: FlowBatch) -> Float[Tensor, ""]:
-        estimates, dense = run_network(self.network, batch, self.options.iterations)
-        return flow_loss(estimates, dense, batch, self.options)
+    def _gradients(self, batch: FlowBatch) -> Float[Tensor, ""]:
+        if self.worker.device.type != "cuda":
+            return self._compute(batch)
+        if self._graph is None:
+            self._graph = StepGraph(self._compute, batch)
+        return self._graph(batch).clone()
+
+    def _compute(self, batch: FlowBatch) -> Float[Tensor, ""]:
+        self._gradient.zero_()
+        features, estimates, dense = run_network(self.network, batch, self.options.iterations)
+        loss = flow_loss(features, estimates, dense, batch, self.options)
+        loss.backward()
+        return loss.detach()
 
 
 def run_network(
     network: FlowNetwork, batch: FlowBatch, iterations: int
-) -> tuple[list[FlowEstimate], Float[Tensor, "e h w 2"]]:
-    """Estimates of every iteration, and the upsampled flow of the last; bfloat16 on a GPU."""
+) -> tuple[ImageFeatures, list[FlowEstimate], Float[Tensor, "e h w 2"]]:
+    """Features, estimates of every iteration, upsampled flow of the last; bfloat16 on a GPU."""
     device = batch.images.device
     with torch.autocast(device.type, torch.bfloat16, enabled=device.type == "cuda"):
         images = batch.images
@@ -123,7 +148,7 @@ def run_network(
         features = network.encode(images)
         estimates = list(network.iterate(features, batch.edges, batch.start, iterations))
         dense = network.upsample(estimates[-1], *batch.truth.shape[1:3])
-    return estimates, dense
+    return features, estimates, dense
 
 
 def schedule(step: int, options: FlowTraining) -> float:
@@ -134,11 +159,16 @@ def schedule(step: int, options: FlowTraining) -> float:
     return 0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * min(done, 1.0)))
 
 
+def _on_device(network: FlowNetwork, device: torch.device) -> FlowNetwork:
+    """With the layout that convolutions are fast in (which PyTorch's stubs do not know)."""
+    return network.to(device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+
+
 def _flat_gradient(parameters: list[nn.Parameter]) -> Float[Tensor, "n"]:
     """One buffer for all gradients, so that they are summed over the devices at once."""
     flat = torch.zeros(sum(p.numel() for p in parameters), device=parameters[0].device)
     at = 0
     for p in parameters:
-        p.grad = flat[at : at + p.numel()].view_as(p)
+        p.grad = flat.as_strided(p.shape, p.stride(), at)
         at += p.numel()
     return flat

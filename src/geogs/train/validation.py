@@ -1,12 +1,13 @@
 """The fixed validation set: rooms and textures that training never shows."""
 
+from dataclasses import replace
+
 import torch
 
 from geogs.tracking.flow.own_network import FlowNetwork, cell_pixels
 from geogs.tracking.grid import OFFSET, STRIDE
 from geogs.train.options import FlowTraining
 from geogs.train.pairs import FlowBatch, flow_batch
-from geogs.train.rooms.options import RoomOptions
 from geogs.train.rooms.sampler import RoomSampler
 from geogs.train.scores import CellErrors, FlowScores, has_texture, summarise
 from geogs.train.starts import StartOptions
@@ -18,12 +19,10 @@ SEED = 2718
 class Validation:
     """Batches of unseen rooms, made again whenever they are needed."""
 
-    def __init__(
-        self, options: FlowTraining, device: torch.device, batches: int = 8, batch: int = 16
-    ) -> None:
-        rooms = RoomOptions(width=options.width, height=options.height, validation=True)
+    def __init__(self, options: FlowTraining, device: torch.device, batches: int = 8) -> None:
+        rooms = replace(options.rooms, views=2, validation=True)
         self._rooms = RoomSampler(rooms, device, SEED)
-        self.batches, self._batch, self._device = batches, batch, device
+        self.batches, self._batch, self._device = batches, options.batch, device
 
     def batch(self, number: int) -> FlowBatch:
         """The directed pairs of a batch."""
@@ -37,7 +36,7 @@ class Validation:
         parts = []
         for number in range(self.batches):
             batch = self.batch(number)
-            estimates, dense = run_network(network, batch, iterations)
+            _, estimates, dense = run_network(network, batch, iterations)
             deviation = estimates[-1].error.variance().sqrt()
             parts.append(cell_errors(batch, estimates[-1].pixels, deviation, dense))
         return summarise(parts)

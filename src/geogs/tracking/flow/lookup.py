@@ -5,6 +5,7 @@ grids, finer ones than the cells' included, so that a position can be read to a 
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -48,15 +49,12 @@ class DescriptorPyramid:
     @property
     def table(self) -> Int[np.ndarray, "l 3"]:
         """Offset, width and height of each level, int32."""
-        sizes = [level.width * level.height for level in self.levels]
-        offsets = np.concatenate([[0], np.cumsum(sizes)[:-1]])
-        rows = [(o, v.width, v.height) for o, v in zip(offsets, self.levels, strict=True)]
-        return np.array(rows, np.int32)
+        return _table(self.levels)
 
     @property
     def scales(self) -> Float[np.ndarray, "l 2"]:
         """Factor and shift of each level, float32."""
-        return np.array([(level.scale, level.shift) for level in self.levels], np.float32)
+        return _scales(self.levels)
 
 
 @dataclass(frozen=True)
@@ -140,8 +138,7 @@ class _CudaWindows(torch.autograd.Function):
     ) -> Tensor:
         mine, theirs = (_pairs(x) for x in (source, descriptors))
         device = centres.device
-        table = torch.from_numpy(pyramid.table).to(device, non_blocking=True)
-        scales = torch.from_numpy(pyramid.scales).to(device, non_blocking=True)
+        table, scales = _tables(pyramid.levels, device)
         points = centres.float().contiguous()
         count, cells = points.shape[:2]
         levels = len(pyramid.levels)
@@ -165,6 +162,25 @@ class _CudaWindows(torch.autograd.Function):
         )
         own, other = (g.to(t) for g, t in zip(grads, ctx.types, strict=True))
         return own, other, None, None, None
+
+
+def _table(levels: tuple[PyramidLevel, ...]) -> Int[np.ndarray, "l 3"]:
+    sizes = [level.width * level.height for level in levels]
+    offsets = np.concatenate([[0], np.cumsum(sizes)[:-1]])
+    rows = [(o, v.width, v.height) for o, v in zip(offsets, levels, strict=True)]
+    return np.array(rows, np.int32)
+
+
+def _scales(levels: tuple[PyramidLevel, ...]) -> Float[np.ndarray, "l 2"]:
+    return np.array([(level.scale, level.shift) for level in levels], np.float32)
+
+
+@lru_cache(maxsize=8)
+def _tables(levels: tuple[PyramidLevel, ...], device: torch.device) -> tuple[Tensor, Tensor]:
+    """Table and scales of a pyramid on a device, copied there once."""
+    parts = (torch.from_numpy(part).to(device) for part in (_table(levels), _scales(levels)))
+    table, scales = parts
+    return table, scales
 
 
 def _pairs(descriptors: Float[Tensor, "n q c"]) -> Int[Tensor, "n q c2"]:

@@ -34,8 +34,8 @@ MIN_LOG_SCALE, MAX_LOG_SCALE = -4.5, 3.0
 class NetworkOptions:
     """Sizes of the network."""
 
-    levels: tuple[int, ...] = (2, 4, 8, 16, 32)
-    """Pixels between the descriptors of each level of the pyramid, each twice the one before."""
+    levels: tuple[int, ...] = (2, 8, 32)
+    """Pixels between the descriptors of each level of the pyramid, powers of two."""
     stem: int = 32
     """Channels at 1/2 of the resolution."""
     middle: int = 64
@@ -211,15 +211,15 @@ class Encoder(nn.Module):
         quarter = self.at_quarter(half)
         eighth = self.at_eighth(quarter)
         joined = quarter + self.deep_to_quarter(eighth)[..., :-1, :-1]
-        fields = {4: self.describe_quarter(joined)}
+        fields = {4: _descriptors(self.describe_quarter(joined))}
         if 2 in self.levels:
-            fields[2] = self.describe_half(half + self.quarter_to_half(joined))
+            fields[2] = _descriptors(self.describe_half(half + self.quarter_to_half(joined)))
         for step in range(3, 8):
             fields[2**step] = functional.avg_pool2d(fields[2 ** (step - 1)], 2, ceil_mode=True)
         state = self.state(eighth)[..., :gh, :gw]
         hidden, context = state.split([self.hidden, state.shape[1] - self.hidden], 1)
         return ImageFeatures(
-            self.describe_cells(eighth)[..., :gh, :gw].flatten(2).mT.contiguous(),
+            _descriptors(self.describe_cells(eighth)[..., :gh, :gw]).flatten(2).mT.contiguous(),
             _pyramid({stride: fields[stride] for stride in self.levels}),
             hidden.tanh(),
             context.relu(),
@@ -300,6 +300,11 @@ def _mixture(values: Float[Tensor, "e p k"]) -> LaplaceMixture:
     scale = values[..., 2:4].clamp(MIN_LOG_SCALE, MAX_LOG_SCALE)
     outlier = scale + 1.0 + functional.softplus(values[..., 4:6])
     return LaplaceMixture(values[..., 6:7] + 2.0, scale, outlier.clamp(max=5.0))
+
+
+def _descriptors(x: Float[Tensor, "n c h w"]) -> Float[Tensor, "n c h w"]:
+    """Of one length, so that a perfect match has the correlation sqrt(c) and a random one 0."""
+    return CHANNELS**0.5 * functional.normalize(x.float(), dim=1)
 
 
 def _pyramid(fields: dict[int, Tensor]) -> DescriptorPyramid:

@@ -25,8 +25,11 @@ _LEAST, _MOST = (2.5, 2.5, 2.2), (8.0, 8.0, 3.5)
 
 
 @dataclass(frozen=True)
-class _Plan:
-    """Everything random about a batch but the noise of its pixels."""
+class Plan:
+    """Everything random about a batch but the noise of its pixels; on the host."""
+
+    key: tuple[int, ...]
+    """What the random numbers depend on."""
 
     rooms: Rooms
     paths: Paths
@@ -44,16 +47,23 @@ class RoomSampler:
             options.textures, options.texture_size, seed, self.device, options.validation
         )
 
-    @torch.no_grad()
     def sample(self, step: int, batch: int, rank: int = 0) -> ClipBatch:
         """``batch`` clips for a training step of a process; the same whenever it is asked for.
 
         The rooms are the same on every device, only the noise differs. Nothing waits for the
         device.
         """
-        options = self.options
-        key = (self._seed, int(options.validation), step, rank)
-        plan = moved(self._plan(Draw(torch.device("cpu"), *key), batch), self.device)
+        return self.film(self.plan(step, batch, rank))
+
+    def plan(self, step: int, batch: int, rank: int = 0) -> Plan:
+        """What :meth:`sample` draws on the host."""
+        return draw_plan(self.options, self.bank.materials, self._seed, step, batch, rank)
+
+    @torch.no_grad()
+    def film(self, plan: Plan) -> ClipBatch:
+        """The clips of a plan."""
+        options, key = self.options, plan.key
+        plan = moved(plan, self.device)
         size, solids = plan.rooms.size, plan.rooms.solids
         views = choose_cameras(plan.paths, size, solids, options.width, options.height)
         solids = solids.without(too_near(solids, views))
@@ -62,16 +72,24 @@ class RoomSampler:
         images = develop(Draw(self.device, *key), plan.flaws, rendering.colour)
         return ClipBatch(images, rendering.depth, views.T_cw, views.intrinsics, solids)
 
-    def _plan(self, draw: Draw, batch: int) -> _Plan:
-        """Drawn on the host: thousands of tiny steps, which a GPU would not do faster."""
-        options = self.options
-        size = _draw_sizes(draw, batch)
-        layout = draw_layout(draw, size, options.density)
-        surfaces = draw_surfaces(draw, layout, options.textures, self.bank.materials)
-        lights = draw_lights(draw, size, options.views, options.light_change)
-        paths = draw_paths(draw, options, size)
-        flaws = draw_flaws(draw, options, batch)
-        return _Plan(Rooms(size, layout.solids, surfaces, lights), paths, flaws)
+
+@torch.no_grad()
+def draw_plan(
+    options: RoomOptions, materials: int, seed: int, step: int, batch: int, rank: int
+) -> Plan:
+    """A batch of rooms, lights, paths and flaws, given how many materials the bank has.
+
+    Drawn on the host: thousands of tiny steps, which a GPU would not do faster.
+    """
+    key = (seed, int(options.validation), step, rank)
+    draw = Draw(torch.device("cpu"), *key)
+    size = _draw_sizes(draw, batch)
+    layout = draw_layout(draw, size, options.density)
+    surfaces = draw_surfaces(draw, layout, options.textures, materials)
+    lights = draw_lights(draw, size, options.views, options.light_change)
+    paths = draw_paths(draw, options, size)
+    flaws = draw_flaws(draw, options, batch)
+    return Plan(key, Rooms(size, layout.solids, surfaces, lights), paths, flaws)
 
 
 def _draw_sizes(draw: Draw, rooms: int) -> Float[Tensor, "b 3"]:
