@@ -15,16 +15,19 @@ from geogs.tracking.depth_prior import (
     FlowEvidence,
     ScaledPrior,
     adjust_depth,
-    corner_weights,
     depth_scale_step,
     flow_evidence,
     local_deviation,
+    node_differences,
+    node_weights,
 )
 from geogs.tracking.depth_prior_reference import joint_step, residuals, scale_field
 from geogs.tracking.grid import SampleGrid
 
 CAMERA = Camera(fx=70.0, fy=72.0, cx=39.0, cy=29.0, width=80, height=60)
 HUBER = 0.5
+TWO = PriorConfig(scale_rows=2, scale_columns=2, scale_step=1e3)
+"""HI-SLAM2's scales."""
 
 
 def scene(seed: int = 0) -> tuple[SampleGrid, BundleProblem]:
@@ -52,35 +55,45 @@ def disturbed(problem: BundleProblem, amount: float, seed: int = 1) -> BundlePro
 
 def prior_of(grid: SampleGrid, d: torch.Tensor, scale: list[float]) -> torch.Tensor:
     """The prior that is right with these scales at the corners."""
-    return d / scale_field(grid, torch.tensor(scale))
+    return d / scale_field(grid, torch.tensor(scale).reshape(2, 2))
 
 
-def test_step_equals_the_dense_normal_equations():
+@pytest.mark.parametrize(("rows", "columns", "step"), [(2, 2, None), (3, 4, 0.1)])
+def test_step_equals_the_dense_normal_equations(rows: int, columns: int, step: float | None):
     grid, exact = scene()
     p = disturbed(exact, 0.03)
     prior = torch.stack([prior_of(grid, d, [1.2, 0.9, 1.1, 1.0]) for d in exact.inverse_depth])
     prior = prior * (1 + 0.05 * torch.sin(grid.pixels[:, 0] * 0.3))
     prior[:, ::7] = 0
-    scale = torch.tensor([[1.0, 1.1, 0.95, 1.0]]).expand(3, -1)
+    g = torch.Generator().manual_seed(5)
+    scale = 2 + 0.2 * torch.rand(3, rows * columns, generator=g)
     alpha = torch.where(prior > 0, 1 / (0.05 * prior) ** 2, 0.0)
-    flow = flow_evidence(grid, p, HUBER)
-    step = depth_scale_step(
-        flow, p.inverse_depth, ScaledPrior(prior, scale, alpha), corner_weights(grid)
-    )
+    stiffness = None if step is None else node_differences(rows, columns).double() / step**2
+    moved = depth_scale_step(
+        flow_evidence(grid, p, HUBER), p.inverse_depth, ScaledPrior(prior, scale, alpha),
+        node_weights(grid, rows, columns), stiffness,
+    )  # fmt: skip
     for n in range(3):
-        depth, scales = joint_step(grid, p, n, prior[n], scale[n], alpha[n], HUBER)
-        torch.testing.assert_close(step.scale[n].double(), scales, rtol=1e-3, atol=1e-5)
-        torch.testing.assert_close(step.depth[n].double(), depth, rtol=1e-3, atol=2e-5)
+        nodes = scale[n].reshape(rows, columns)
+        depth, scales = joint_step(grid, p, n, prior[n], nodes, alpha[n], HUBER, step or torch.inf)
+        torch.testing.assert_close(
+            moved.scale[n].double(), scales.reshape(-1), rtol=2e-3, atol=1e-4
+        )
+        torch.testing.assert_close(moved.depth[n].double(), depth, rtol=2e-3, atol=5e-5)
         assert float(depth.abs().max()) > 0.02
+        assert float(scales.abs().max()) > 0.5
 
 
-def test_corners_are_bilinear():
+def test_the_scale_is_bilinear_between_nodes():
     grid = SampleGrid(CAMERA)
-    scale = torch.tensor([1.0, 2.0, 3.0, 5.0])
-    field = corner_weights(grid) @ scale
+    scale = torch.tensor([[1.0, 2.0, 4.0], [3.0, 5.0, 9.0]])
+    field = node_weights(grid, 2, 3) @ scale.reshape(-1)
     torch.testing.assert_close(field, scale_field(grid, scale))
     shaped = field.reshape(grid.height, grid.width)
-    assert shaped[[0, 0, -1, -1], [0, -1, 0, -1]].tolist() == [1, 2, 3, 5]
+    assert shaped[[0, 0, -1, -1], [0, -1, 0, -1]].tolist() == [1, 4, 3, 9]
+    assert float(scale.reshape(-1) @ node_differences(2, 3) @ scale.reshape(-1)) == pytest.approx(
+        1 + 4 + 4 + 16 + 4 + 9 + 25
+    )
 
 
 def test_repeated_steps_end_where_the_cost_is_least():
@@ -94,7 +107,7 @@ def test_repeated_steps_end_where_the_cost_is_least():
         p, source=p.source[:2], target=p.target[:2], pixels=p.pixels[:2], weight=p.weight[:2],
     )  # fmt: skip
     scale = torch.ones(1, 4)
-    basis, huge = corner_weights(grid), 1e6
+    basis, huge = node_weights(grid, 2, 2), 1e6
     for _ in range(6):
         flow = flow_evidence(grid, problem, huge)
         flow = FlowEvidence(flow.curvature[:1], flow.gradient[:1])
@@ -106,7 +119,7 @@ def test_repeated_steps_end_where_the_cost_is_least():
         problem = replace(problem, inverse_depth=moved)
 
     def cost(depth: torch.Tensor, s: torch.Tensor) -> float:
-        flow, rest = residuals(grid, problem, 0, prior.double(), depth, s)
+        flow, rest = residuals(grid, problem, 0, prior.double(), depth, s.reshape(2, 2))
         weighted = (problem.weight[:2].double() * flow**2).sum() + (alpha.double() * rest**2).sum()
         return float(weighted)
 
@@ -131,7 +144,7 @@ def test_bare_cells_take_the_priors_shape_and_the_matches_scale():
     p = replace(exact, inverse_depth=torch.stack([flat, truth[1], truth[2]]))
     prior = torch.stack([prior_of(grid, d, [1.3, 0.8, 1.1, 1.0]) for d in truth])
     adjusted = adjust_depth(
-        grid, flow_evidence(grid, p, HUBER), p.inverse_depth, prior, torch.ones(3, 4), PriorConfig()
+        grid, flow_evidence(grid, p, HUBER), p.inverse_depth, prior, torch.ones(3, 4), TWO
     )
     bare = exact.weight[0, :, 0] == 0
     before = (flat / truth[0] - 1).abs()[bare].mean()
@@ -149,9 +162,7 @@ def test_a_prior_that_contradicts_the_matches_changes_nothing():
     g = torch.Generator().manual_seed(3)
     nonsense = exact.inverse_depth * torch.exp(0.8 * torch.randn(3, grid.size, generator=g))
     flow = flow_evidence(grid, exact, HUBER)
-    adjusted = adjust_depth(
-        grid, flow, exact.inverse_depth, nonsense, torch.ones(3, 4), PriorConfig()
-    )
+    adjusted = adjust_depth(grid, flow, exact.inverse_depth, nonsense, torch.ones(3, 4), TWO)
     assert float(adjusted.deviation.min()) > 0.3
     assert float(adjusted.information.max()) == 0
     torch.testing.assert_close(adjusted.inverse_depth, exact.inverse_depth, rtol=1e-4, atol=0)
@@ -163,12 +174,11 @@ def test_a_prior_that_is_wrong_in_places_is_not_used_there():
     wrong = grid.pixels[:, 0] > 60
     prior[:, wrong] *= 2.5
     flow = flow_evidence(grid, exact, HUBER)
-    config = PriorConfig()
-    adjusted = adjust_depth(grid, flow, exact.inverse_depth, prior, torch.ones(3, 4), config)
+    adjusted = adjust_depth(grid, flow, exact.inverse_depth, prior, torch.ones(3, 4), TWO)
     error = (adjusted.inverse_depth / exact.inverse_depth - 1).abs()
     assert float(error.max()) < 0.05
     right = grid.pixels[:, 0] < 30
-    usual = 1 / (config.deviation * exact.inverse_depth) ** 2
+    usual = 1 / (TWO.deviation * exact.inverse_depth) ** 2
     assert float((adjusted.information / usual)[:, wrong].max()) < 0.05
     assert float((adjusted.information / usual)[:, right].mean()) > 0.3
 

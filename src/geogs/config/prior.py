@@ -25,9 +25,15 @@ class PriorConfig:
     """Last rounds of the local adjustment that are followed by it, at least 1."""
     deviation: float = 0.05
     """Relative deviation of a good prior after its scale has been adjusted, above 0."""
+    scale_rows: int = 8
+    """Nodes of the scale field from top to bottom, at least 2."""
+    scale_columns: int = 10
+    """Nodes from left to right. HI-SLAM2 has 2 by 2, with no bound on their difference."""
+    scale_step: float = 0.1
+    """Relative difference that is usual between neighbouring nodes, above 0."""
     reach: float = 0.06
     """Matched depth judges the prior around it within about this fraction of the grid's width."""
-    max_deviation: float = 0.25
+    max_deviation: float = 0.15
     """Cells where the prior seems to be worse than this go without it, above deviation."""
     reject: float = 0.3
     """A prior whose ratio to the matched depth deviates by more than this is not used at all."""

@@ -1,12 +1,15 @@
 """Joint adjustment of inverse depth and of the scale of a monocular prior (HI-SLAM2's JDSA).
 
-Poses are fixed. Every keyframe has one multiplicative scale at each corner of its grid, bilinear in
-between: s(u) = B(u) . s. Inverse depths d and scales minimise
+Poses are fixed. Every keyframe has a multiplicative scale at each node of a coarse grid, bilinear
+in between: s(u) = B(u) . s. Inverse depths d and scales minimise
 
-    sum_e w |target - project(d)|^2  +  sum_u alpha(u) (d(u) - s(u) d_prior(u))^2 .
+    sum_e w |target - project(d)|^2  +  sum_u alpha(u) (d(u) - s(u) d_prior(u))^2
+        +  sum_nodes (s_i - s_j)^2 / step^2 ,
 
-HI-SLAM2 gives alpha as a number that belongs to its network's weights. Here weights of flow are
-inverse variances, so alpha is one, too: 1 / (deviation * d)^2.
+the last sum over neighbouring nodes. HI-SLAM2 has 2 x 2 nodes without that last term, and gives
+alpha as a number that belongs to its network's weights. Here weights of flow are inverse variances,
+so alpha is one, too: 1 / (deviation * d)^2; and with more nodes, held together by their usual
+differences, the prior lends its shape and the matches around a bare wall lend their scale.
 """
 
 from dataclasses import dataclass
@@ -20,8 +23,6 @@ from geogs.config import PriorConfig
 from geogs.tracking.bundle import BundleProblem, linearise, relative_motion, robust_weight
 from geogs.tracking.grid import SampleGrid
 
-CORNERS = 4
-"""Scales of a keyframe: top left, top right, bottom left, bottom right."""
 SCALE_DAMPING = 1e-4
 """Of the scales, relative to the curvature of the prior's term."""
 DEPTH_DAMPING = 1e-3
@@ -34,6 +35,8 @@ _EVIDENCE = ((1.0, 8.0), (3.0, 2.0), (9.0, 0.5))
 """Windows in multiples of the reach, and how many cells a window full of evidence counts as."""
 _BELIEF = 0.5
 """Cells that the deviation of a good prior counts as before there is evidence."""
+_ROUGHNESS = 3.0
+"""Deviation of a cell for the deviation of the scale around it."""
 
 
 @dataclass(frozen=True)
@@ -52,8 +55,8 @@ class ScaledPrior:
 
     inverse_depth: Float[Tensor, "n p"]
     """d_prior; 0 where unknown."""
-    scale: Float[Tensor, "n 4"]
-    """One at each corner of the grid."""
+    scale: Float[Tensor, "n k"]
+    """One at each node."""
     weight: Float[Tensor, "n p"]
     """alpha, 1 / inverse depth^2; 0 where unknown."""
 
@@ -63,15 +66,30 @@ class DepthScaleStep:
     """A step of inverse depths and scales."""
 
     depth: Float[Tensor, "n p"]
-    scale: Float[Tensor, "n 4"]
+    scale: Float[Tensor, "n k"]
 
 
-def corner_weights(grid: SampleGrid) -> Float[Tensor, "p 4"]:
-    """Share B of each corner's scale in each cell; rows sum to one."""
-    y = torch.linspace(0, 1, grid.height, device=grid.device)[:, None, None]
-    x = torch.linspace(0, 1, grid.width, device=grid.device)[None, :, None]
-    corners = [(1 - y) * (1 - x), (1 - y) * x, y * (1 - x), y * x]
-    return torch.cat([c.expand(grid.height, grid.width, 1) for c in corners], -1).reshape(-1, 4)
+def node_weights(grid: SampleGrid, rows: int, columns: int) -> Float[Tensor, "p k"]:
+    """Share B of each node's scale in each cell; rows sum to one."""
+    y, x = (_hats(n, k, grid) for n, k in ((grid.height, rows), (grid.width, columns)))
+    return torch.einsum("hr,wc->hwrc", y, x).reshape(grid.size, rows * columns)
+
+
+def _hats(cells: int, nodes: int, grid: SampleGrid) -> Float[Tensor, "n k"]:
+    """Linear interpolation between nodes along one side of the grid."""
+    at = torch.linspace(0, nodes - 1, cells, device=grid.device)[:, None]
+    return (1 - (at - torch.arange(nodes, device=grid.device)).abs()).clamp(min=0)
+
+
+def node_differences(rows: int, columns: int) -> Float[Tensor, "k k"]:
+    """The matrix L of sum over neighbouring nodes of (s_i - s_j)^2 = s . L s."""
+    node = torch.arange(rows * columns).reshape(rows, columns)
+    i = torch.cat([node[:, 1:].reshape(-1), node[1:].reshape(-1)])
+    j = torch.cat([node[:, :-1].reshape(-1), node[:-1].reshape(-1)])
+    D = torch.zeros(len(i), rows * columns)
+    edge = torch.arange(len(i))
+    D[edge, i], D[edge, j] = 1.0, -1.0
+    return D.mT @ D
 
 
 def flow_evidence(
@@ -96,30 +114,40 @@ def depth_scale_step(
     flow: FlowEvidence,
     inverse_depth: Float[Tensor, "n p"],
     prior: ScaledPrior,
-    basis: Float[Tensor, "p 4"],
+    basis: Float[Tensor, "p k"],
+    stiffness: Float[Tensor, "k k"] | None = None,
 ) -> DepthScaleStep:
     """The Gauss-Newton step of inverse depths and scales; frames are independent.
 
     Inverse depths are eliminated (Schur). What is left of the prior's term is a fit of the scales
     to the depth that the matches want, d + b / C, with the weight alpha C / (alpha + C) of the
     difference of two measurements; it is formed as such, since H - E C'^-1 E^T would cancel.
+    ``stiffness`` is the matrix of the nodes' term for scales about one.
     """
     C, b, alpha = flow.curvature, flow.gradient, prior.weight
     known = alpha > 0
-    J = prior.inverse_depth[..., None] * basis
-    residual = inverse_depth - (J @ prior.scale[..., None])[..., 0]
-    free = alpha / (alpha + C).clamp(min=1e-30)
-    J64, fit = J.double(), (free * C).double()
-    S = J64.mT @ (fit[..., None] * J64)
-    curvature = (alpha.double()[..., None] * J64.square()).sum(1)
-    S = S + torch.diag_embed(SCALE_DAMPING * curvature + 1e-12)
-    g = (J64 * (free * (C * residual + b)).double()[..., None]).sum(1)
-    scale = torch.linalg.solve(S, g)
+    residual = inverse_depth - prior.inverse_depth * (prior.scale @ basis.mT)
+    fit = alpha / (alpha + C).clamp(min=1e-30) * prior.inverse_depth
+    S = _node_products(fit * C * prior.inverse_depth, basis)
+    g = (fit * (C * residual + b)) @ basis
+    S, g = S.double(), g.double()
+    curvature = (alpha * prior.inverse_depth.square()) @ basis.square()
+    S = S + torch.diag_embed(SCALE_DAMPING * curvature.double() + 1e-12)
+    if stiffness is not None:
+        # Scales differ by parts of their mean, so that the unit of depth does not matter.
+        relative = stiffness / prior.scale.double().mean(1).square()[:, None, None]
+        S = S + relative
+        g = g - (relative @ prior.scale.double()[..., None])[..., 0]
+    scale = torch.linalg.solve(S, g).to(inverse_depth)
     damping = DEPTH_DAMPING * C.mean(1, keepdim=True) + 1e-8
     curved = C + torch.where(known, alpha, damping)
-    wanted = residual - (J64 @ scale[..., None])[..., 0].to(residual)
-    depth = (b - alpha * wanted) / curved
-    return DepthScaleStep(depth, scale.to(inverse_depth))
+    rest = residual - prior.inverse_depth * (scale @ basis.mT)
+    return DepthScaleStep((b - alpha * rest) / curved, scale)
+
+
+def _node_products(weight: Float[Tensor, "n p"], basis: Float[Tensor, "p k"]) -> Tensor:
+    """sum_u weight(u) B(u) B(u)^T of every frame, (n, k, k)."""
+    return torch.stack([basis.mT @ (w[:, None] * basis) for w in weight])
 
 
 @dataclass(frozen=True)
@@ -127,7 +155,7 @@ class AdjustedDepth:
     """Frames after the adjustment."""
 
     inverse_depth: Float[Tensor, "n p"]
-    scale: Float[Tensor, "n 4"]
+    scale: Float[Tensor, "n k"]
     information: Float[Tensor, "n p"]
     """alpha: what the prior adds to the inverse variance of inverse depth; 0 where it is unused."""
     deviation: Float[Tensor, "n"]
@@ -139,7 +167,7 @@ def adjust_depth(
     flow: FlowEvidence,
     inverse_depth: Float[Tensor, "n p"],
     prior: Float[Tensor, "n p"],
-    scale: Float[Tensor, "n 4"],
+    scale: Float[Tensor, "n k"],
     config: PriorConfig,
     limits: tuple[float, float] = (1e-3, 1e2),
 ) -> AdjustedDepth:
@@ -149,7 +177,9 @@ def adjust_depth(
     deviation <local_deviation>`), and that is repeated with the new weights. Cells where the prior
     seems bad, and frames where it is bad on the whole, keep what the matches say.
     """
-    basis = corner_weights(grid).to(inverse_depth)
+    basis = node_weights(grid, config.scale_rows, config.scale_columns)
+    stiffness = node_differences(config.scale_rows, config.scale_columns).to(basis).double()
+    stiffness = stiffness / config.scale_step**2
     C = flow.curvature
     wanted = inverse_depth + torch.where(C > 0, flow.gradient / C.clamp(min=1e-30), 0.0)
     start = scale
@@ -158,7 +188,7 @@ def adjust_depth(
     for _ in range(REWEIGHTINGS):
         alpha = _prior_weight(prior, start, basis, deviation)
         step = depth_scale_step(
-            flow, inverse_depth, ScaledPrior(prior, start, alpha * trust), basis
+            flow, inverse_depth, ScaledPrior(prior, start, alpha * trust), basis, stiffness
         )
         fitted = prior * ((start + step.scale) @ basis.mT)
         known = (prior > 0) & (fitted > 0)
@@ -167,11 +197,13 @@ def adjust_depth(
         trust = 1 / (1 + (error * fitted).square() / (_CAUCHY**2 * own))
         sure = known * C / (C + _prior_weight(prior, start, basis, deviation).clamp(min=1e-12))
         deviation = local_deviation(grid, error, sure, config)
+        bent = _ROUGHNESS * roughness(grid, (start + step.scale) @ basis.mT, config)
+        deviation = torch.hypot(deviation, bent)
     overall = _weighted_median(error.abs(), sure)
     used = (deviation < config.max_deviation) & (overall < config.reject)[:, None]
     used &= (start + step.scale > 0).all(1, keepdim=True)
     alpha = torch.where(used, trust * _prior_weight(prior, start, basis, deviation), 0.0)
-    step = depth_scale_step(flow, inverse_depth, ScaledPrior(prior, start, alpha), basis)
+    step = depth_scale_step(flow, inverse_depth, ScaledPrior(prior, start, alpha), basis, stiffness)
     good = (torch.isfinite(step.depth).all(1) & torch.isfinite(step.scale).all(1))[:, None]
     good &= (start + step.scale > 0).all(1, keepdim=True)
     return AdjustedDepth(
@@ -205,6 +237,20 @@ def local_deviation(
     return (total / count).sqrt().reshape(error.shape)
 
 
+def roughness(
+    grid: SampleGrid, factor: Float[Tensor, "n p"], config: PriorConfig
+) -> Float[Tensor, "n p"]:
+    """Relative deviation of the scale within reach of a cell.
+
+    A scale that has to change fast to follow the matches says little between them.
+    """
+    radius = config.reach * grid.width
+    field = factor.reshape(-1, 1, grid.height, grid.width)
+    mean = _mean_around(field, radius)
+    variance = (_mean_around(field.square(), radius) - mean.square()).clamp(min=0)
+    return (variance.sqrt() / mean.abs().clamp(min=1e-12)).reshape(factor.shape)
+
+
 def _mean_around(field: Float[Tensor, "n 1 h w"], radius: float) -> Float[Tensor, "n 1 h w"]:
     """Mean over a square window, cut at the border."""
     k = max(1, round(radius))
@@ -213,8 +259,8 @@ def _mean_around(field: Float[Tensor, "n 1 h w"], radius: float) -> Float[Tensor
 
 def _prior_weight(
     prior: Float[Tensor, "n p"],
-    scale: Float[Tensor, "n 4"],
-    basis: Float[Tensor, "p 4"],
+    scale: Float[Tensor, "n k"],
+    basis: Float[Tensor, "p k"],
     deviation: Float[Tensor, "n p"],
 ) -> Float[Tensor, "n p"]:
     """alpha = 1 / (deviation s d_prior)^2, 0 where there is no prior."""

@@ -12,11 +12,10 @@ from geogs.tracking.depth_prior import DEPTH_DAMPING, SCALE_DAMPING
 from geogs.tracking.grid import SampleGrid
 
 
-def scale_field(grid: SampleGrid, scale: Float[Tensor, "4"]) -> Float[Tensor, "p"]:
-    """The corners' scales, bilinear in between."""
+def scale_field(grid: SampleGrid, scale: Float[Tensor, "r c"]) -> Float[Tensor, "p"]:
+    """The nodes' scales, bilinear in between."""
     size = (grid.height, grid.width)
-    corners = scale.reshape(1, 1, 2, 2)
-    return F.interpolate(corners, size, mode="bilinear", align_corners=True).reshape(-1)
+    return F.interpolate(scale[None, None], size, mode="bilinear", align_corners=True).reshape(-1)
 
 
 def residuals(
@@ -25,7 +24,7 @@ def residuals(
     frame: int,
     prior: Float[Tensor, "p"],
     depth: Float[Tensor, "p"],
-    scale: Float[Tensor, "4"],
+    scale: Float[Tensor, "r c"],
 ) -> tuple[Float[Tensor, "e p 2"], Float[Tensor, "p"]]:
     """Of the matches of a frame's edges in pixels, and of its prior in inverse depth."""
     rows = []
@@ -41,10 +40,11 @@ def joint_step(
     problem: BundleProblem,
     frame: int,
     prior: Float[Tensor, "p"],
-    scale: Float[Tensor, "4"],
+    scale: Float[Tensor, "r c"],
     alpha: Float[Tensor, "p"],
     huber: float,
-) -> tuple[Float[Tensor, "p"], Float[Tensor, "4"]]:
+    scale_step: float = torch.inf,
+) -> tuple[Float[Tensor, "p"], Float[Tensor, "r c"]]:
     """Steps of one frame's inverse depths and scales from the full normal equations."""
     p = len(prior)
     edges = problem.source == frame
@@ -55,14 +55,18 @@ def joint_step(
     root = (weight * (huber / norm.clamp(min=huber))).sqrt()
 
     def weighted(x: Float[Tensor, "q"]) -> Float[Tensor, "m"]:
-        a, b = residuals(grid, problem, frame, prior, x[:p], x[p:])
-        return torch.cat([(root * a).reshape(-1), alpha.sqrt() * b])
+        nodes = x[p:].reshape(scale.shape)
+        a, b = residuals(grid, problem, frame, prior, x[:p], nodes)
+        across, down = nodes.diff(dim=1), nodes.diff(dim=0)
+        steps = torch.cat([across.reshape(-1), down.reshape(-1)]) / (scale_step * s.mean())
+        return torch.cat([(root * a).reshape(-1), alpha.sqrt() * b, steps])
 
-    x = torch.cat([d, s])
+    x = torch.cat([d, s.reshape(-1)])
     J, r = torch.func.jacrev(weighted)(x), weighted(x)
     H = J.mT @ J
     curvature = (J[: flow.numel(), :p].square()).sum(0)
     damping = torch.where(alpha > 0, 0.0, DEPTH_DAMPING * curvature.mean() + 1e-8)
-    scales = SCALE_DAMPING * H.diagonal()[p:] + 1e-12
+    own = J[flow.numel() : flow.numel() + p, p:].square().sum(0)
+    scales = SCALE_DAMPING * own + 1e-12
     step = torch.linalg.solve(H + torch.diag(torch.cat([damping, scales])), -J.mT @ r)
-    return step[:p], step[p:]
+    return step[:p], step[p:].reshape(scale.shape)

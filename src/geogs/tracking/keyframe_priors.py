@@ -9,7 +9,7 @@ from torch import Tensor
 from geogs.config import PriorConfig
 from geogs.priors.alignment import align_inverse_depth
 from geogs.priors.base import MonocularPrior
-from geogs.tracking.depth_prior import CORNERS, FlowEvidence, adjust_depth, flow_evidence
+from geogs.tracking.depth_prior import FlowEvidence, adjust_depth, flow_evidence
 from geogs.tracking.graph import FrameGraph
 from geogs.tracking.grid import OFFSET, STRIDE, SampleGrid
 from geogs.tracking.keyframes import KeyframePrior, KeyframeState
@@ -37,7 +37,8 @@ class KeyframePriors:
         if maps.depth is not None and self.config.depth:
             values = on_cells(grid, maps.depth.to(grid.device))
             zero = torch.zeros_like(values)
-            state.prior = KeyframePrior(maps.kind, values, zero, values.new_ones(CORNERS), zero)
+            one = values.new_ones(self.config.scale_rows * self.config.scale_columns)
+            state.prior = KeyframePrior(maps.kind, values, zero, one, zero)
 
     def adjust(self, ids: Sequence[int], huber: float) -> None:
         """Joint depth and scale adjustment of those keyframes that have a prior, poses fixed."""

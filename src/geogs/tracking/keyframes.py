@@ -26,8 +26,8 @@ class KeyframePrior:
     """As the prior gave them, on the grid."""
     inverse_depth: Float[Tensor, "p"]
     """Aligned to the tracker's; 0 where unknown, and everywhere before the first alignment."""
-    scale: Float[Tensor, "4"]
-    """Factors of the aligned inverse depth at the corners of the grid."""
+    scale: Float[Tensor, "k"]
+    """Factors of the aligned inverse depth at the nodes of a coarse grid, row by row."""
     information: Float[Tensor, "p"]
     """What it adds to the inverse variance of the keyframe's inverse depth."""
     is_aligned: bool = False

@@ -1,0 +1,104 @@
+"""Monocular priors that err as networks do, made from true depth: for tests and measurements."""
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float32, UInt8
+
+from geogs.priors.base import DepthKind, PriorMaps
+from geogs.synth.raycast import View
+from geogs.synth.texture import fractal_noise
+
+
+@dataclass(frozen=True)
+class PriorErrors:
+    """How far a made-up prior is from the truth. Every image has its own random errors."""
+
+    scale: float = 0.3
+    """Deviation of the logarithm of the factor common to an image."""
+    shift: float = 0.1
+    """Deviation of its shift, in parts of the median, where the kind has one."""
+    warp: float = 0.08
+    """Deviation of the logarithm of a smooth factor that varies over the image."""
+    warp_cells: int = 2
+    """Waves of that factor across the image, about."""
+    noise: float = 0.02
+    """Relative deviation of what varies from pixel to pixel."""
+    blur: float = 0.008
+    """Deviation of the blur at depth edges, of the long edge."""
+    wrong_share: float = 0.0
+    """Part of the image, in random places, whose depth is wrong."""
+    wrong_factor: float = 2.5
+    """Largest factor there, up or down; the least is two."""
+    turn: float = 0.05
+    """Deviation of the normals' direction, radians, smooth over the image."""
+
+
+PLAUSIBLE = PriorErrors()
+"""About as good as public networks are indoors: 5 % after the best scale."""
+BAD = PriorErrors(warp=0.2, noise=0.05, wrong_share=0.35)
+"""Wrong by a factor of two and more in a third of the image, elsewhere in every image."""
+
+
+class DegradedPrior:
+    """A prior that knows the true views of some images and spoils them."""
+
+    def __init__(
+        self,
+        views: Iterable[View],
+        errors: PriorErrors = PLAUSIBLE,
+        kind: DepthKind = DepthKind.SCALE_FREE,
+        seed: int = 0,
+    ) -> None:
+        self._views = {v.image.tobytes(): (n, v) for n, v in enumerate(views)}
+        self._errors, self._kind, self._seed = errors, kind, seed
+
+    def predict(self, image: UInt8[np.ndarray, "h w 3"]) -> PriorMaps:
+        """Spoiled depth and normals of an image that is among the known ones."""
+        number, view = self._views[image.tobytes()]
+        rng = np.random.default_rng([self._seed, number, 0x9E1])
+        depth = torch.from_numpy(self._depth(view.depth, rng))
+        return PriorMaps(self._kind, depth, torch.from_numpy(self._normal(view.normal, rng)))
+
+    def _depth(
+        self, true: Float32[np.ndarray, "h w"], rng: np.random.Generator
+    ) -> Float32[np.ndarray, "h w"]:
+        e, shape = self._errors, true.shape
+        sigma = e.blur * max(shape)
+        depth = np.where(true > 0, true, np.float32(np.median(true)))
+        depth = cv2.GaussianBlur(depth, (0, 0), sigma) if sigma > 0 else depth
+        logarithm = np.log(depth) + e.scale * rng.standard_normal()
+        logarithm += e.warp * fractal_noise(rng, shape, (e.warp_cells, e.warp_cells), 2)
+        logarithm += e.noise * cv2.GaussianBlur(rng.standard_normal(shape, np.float32), (0, 0), 1.0)
+        logarithm += self._wrong(shape, rng)
+        spoiled = np.exp(logarithm)
+        if self._kind is DepthKind.AFFINE_INVERSE:
+            spoiled = 1 / spoiled
+        if self._kind.has_shift:
+            spoiled = spoiled + e.shift * rng.standard_normal() * np.median(spoiled)
+        return spoiled.astype(np.float32)
+
+    def _wrong(
+        self, shape: tuple[int, int], rng: np.random.Generator
+    ) -> Float32[np.ndarray, "h w"]:
+        """Logarithm of the factor of the wrong places, 0 elsewhere."""
+        if self._errors.wrong_share <= 0:
+            return np.zeros(shape, np.float32)
+        place = fractal_noise(rng, shape, (3, 4), 2)
+        level = np.quantile(place, 1 - self._errors.wrong_share)
+        size = rng.uniform(math.log(2.0), math.log(self._errors.wrong_factor), shape[:1])[0]
+        up = np.where(fractal_noise(rng, shape, (1, 2), 1) > 0, 1.0, -1.0)
+        return (size * up * (place > level)).astype(np.float32)
+
+    def _normal(
+        self, true: Float32[np.ndarray, "h w 3"], rng: np.random.Generator
+    ) -> Float32[np.ndarray, "h w 3"]:
+        shape = true.shape[:2]
+        turns = [fractal_noise(rng, shape, (2, 2), 2) for _ in range(3)]
+        normal = true + self._errors.turn * np.cross(np.stack(turns, -1), true)
+        length = np.linalg.norm(normal, axis=-1, keepdims=True)
+        return (normal / np.maximum(length, 1e-6)).astype(np.float32)

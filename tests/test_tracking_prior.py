@@ -1,0 +1,159 @@
+"""The tracker with monocular priors on a room whose walls have no texture."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from geogs.config import PriorConfig, TrackingConfig
+from geogs.geometry.camera import Camera
+from geogs.geometry.umeyama import umeyama
+from geogs.loop.global_bundle import global_bundle
+from geogs.priors.base import DepthKind, PriorMaps
+from geogs.synth.prior import BAD, PLAUSIBLE, DegradedPrior, PriorErrors
+from geogs.synth.raycast import Raycaster, View
+from geogs.synth.room import make_room, with_bare_walls
+from geogs.synth.trajectory import handheld_trajectory
+from geogs.tracking.flow.texture import MIN_STRUCTURE, cell_structure
+from geogs.tracking.tracker import Tracker
+from geogs.types import Frame, PoseCorrection
+
+CAMERA = Camera(218.0, 218.0, 127.5, 95.5, 256, 192)
+CONFIG = TrackingConfig(init_keyframes=6)
+FRAMES = 45
+
+
+@dataclass(frozen=True)
+class Score:
+    """Keyframes' RMSE in cm; mean relative depth error of all cells, of those without texture."""
+
+    ate: float
+    depth: float
+    bare: float
+
+
+@pytest.fixture(scope="module")
+def walk() -> tuple[list[View], np.ndarray]:
+    scene = with_bare_walls(make_room(0))
+    T_wc = handheld_trajectory(scene, FRAMES)
+    caster = Raycaster(scene)
+    return [caster.render(CAMERA, T) for T in T_wc], T_wc
+
+
+def track(views: list[View], prior, config: PriorConfig | None = None) -> Tracker:
+    tracker = Tracker(CAMERA, CONFIG, prior=prior, prior_config=config)
+    for n, view in enumerate(views):
+        tracker.track(Frame(n, n / 30, view.image))
+    tracker.finish()
+    return tracker
+
+
+def score(tracker: Tracker, walk: tuple[list[View], np.ndarray]) -> Score:
+    views, T_wc = walk
+    keyframes = [tracker.keyframe(k) for k in tracker.keyframe_ids]
+    x = torch.stack([torch.linalg.inv(k.T_cw)[:3, 3] for k in keyframes])
+    y = torch.from_numpy(T_wc[[k.frame_index for k in keyframes], :3, 3])
+    scale, R, t = umeyama(x, y)
+    ate = 100 * float((scale * x @ R.T + t - y).square().sum(1).mean().sqrt())
+    errors, bare = [], []
+    for k in keyframes[1:-1]:
+        true = views[k.frame_index].depth[4:-3:8, 4:-3:8]
+        errors.append(np.abs(float(scale) / k.inverse_depth.numpy() / true - 1).ravel())
+        bare.append(cell_structure(cv2.cvtColor(k.image, cv2.COLOR_RGB2GRAY)) < MIN_STRUCTURE)
+    error, where = np.concatenate(errors), np.concatenate(bare)
+    assert 0.2 < where.mean() < 0.6
+    return Score(ate, float(error.mean()), float(error[where].mean()))
+
+
+@pytest.fixture(scope="module")
+def alone(walk) -> Score:
+    return score(track(walk[0], None), walk)
+
+
+@pytest.fixture(scope="module")
+def helped(walk) -> Tracker:
+    return track(walk[0], DegradedPrior(walk[0], PLAUSIBLE))
+
+
+def test_a_good_prior_gives_bare_walls_their_depth(walk, alone: Score, helped: Tracker):
+    good = score(helped, walk)
+    assert good.bare < 0.8 * alone.bare
+    assert good.depth < 0.9 * alone.depth
+    assert good.ate < 1.1 * alone.ate
+
+
+def test_a_prior_known_up_to_a_shift_helps_as_well(walk, alone: Score):
+    prior = DegradedPrior(walk[0], PLAUSIBLE, DepthKind.AFFINE_INVERSE)
+    assert score(track(walk[0], prior), walk).bare < 0.8 * alone.bare
+
+
+def test_a_bad_prior_costs_little(walk, alone: Score):
+    bad = score(track(walk[0], DegradedPrior(walk[0], BAD)), walk)
+    assert bad.ate < 1.2 * alone.ate
+    assert bad.bare < 1.2 * alone.bare
+    partly = PriorErrors(wrong_share=0.12)
+    patchy = score(track(walk[0], DegradedPrior(walk[0], partly)), walk)
+    assert patchy.ate < 1.2 * alone.ate
+    assert patchy.depth < 1.1 * alone.depth
+
+
+def test_the_prior_adds_little_information_and_only_where_it_is_needed(walk, helped: Tracker):
+    views, _ = walk
+    told, alone, bare = [], [], []
+    for id in helped.keyframe_ids[1:-1]:
+        state, k = helped.store[id], helped.keyframe(id)
+        d = state.inverse_depth
+        told.append(1 / (d * k.information.reshape(-1).clamp(min=1e-9).sqrt()))
+        alone.append(1 / (d * state.information.clamp(min=1e-9).sqrt()))
+        grey = cv2.cvtColor(views[k.frame_index].image, cv2.COLOR_RGB2GRAY)
+        bare.append(torch.from_numpy(cell_structure(grey) < 0.05))
+    told, alone, bare = (torch.cat(v) for v in (told, alone, bare))
+    assert float(alone[bare].median()) > 0.15
+    assert 0.02 < float(told[bare].median()) < 0.3
+    sure = alone < 0.01
+    assert float((told / alone)[sure].min()) > 0.9
+
+
+def test_scales_follow_the_unit(walk, helped: Tracker):
+    """After a correction that halves lengths, prior and depth still say the same."""
+    id = helped.keyframe_ids[-2]
+    state = helped.store[id]
+    before = state.inverse_depth.clone(), state.prior.scale.clone(), state.prior.information.clone()
+    poses = {id: state.T_cw.clone()}
+    helped.correct(PoseCorrection(poses, poses, {id: 2.0}))
+    torch.testing.assert_close(state.inverse_depth, 2 * before[0])
+    torch.testing.assert_close(state.prior.scale, 2 * before[1])
+    torch.testing.assert_close(state.prior.information, before[2] / 4)
+    helped.correct(PoseCorrection(poses, poses, {id: 0.5}))
+    torch.testing.assert_close(state.prior.scale, before[1])
+
+
+def test_global_adjustment_keeps_what_the_prior_gave(walk, alone: Score, helped: Tracker):
+    global_bundle(helped)
+    assert score(helped, walk).bare < 0.8 * alone.bare
+
+
+class _Normals:
+    """Says nothing of depth."""
+
+    def predict(self, image):
+        normal = torch.zeros(*image.shape[:2], 3)
+        normal[..., 2] = -1
+        return PriorMaps(normal=normal)
+
+
+def test_normals_reach_the_keyframes_and_depth_can_be_left_alone(walk):
+    views = walk[0][:20]
+    without, normals = track(views, None), track(views, _Normals())
+    off = track(views, DegradedPrior(views), PriorConfig(depth=False))
+    assert len(without.keyframe_ids) >= 6
+    assert without.keyframe_ids == normals.keyframe_ids == off.keyframe_ids
+    for id in without.keyframe_ids:
+        a, b, c = without.keyframe(id), normals.keyframe(id), off.keyframe(id)
+        for other in (b, c):
+            assert torch.equal(a.inverse_depth, other.inverse_depth)
+            assert torch.equal(a.T_cw, other.T_cw)
+        assert a.normal is None
+        assert b.normal.shape == c.normal.shape == (192, 256, 3)
