@@ -49,8 +49,8 @@ def plane_pair(count: int = 64) -> dict:
     T = se3_exp(torch.tensor([0.1, 0.0, 0.05, 0.0, 0.02, 0.0])).float().repeat(count, 1, 1)
     y = (T[0, :3, :3] @ (2.0 * rays)[..., None])[..., 0] + T[0, :3, 3]
     truth = (y[..., :2] / y[..., 2:] * 60 + intrinsics[0, 2:]).repeat(count, 1, 1, 1)
-    return dict(truth=truth, depth=depth, rays=rays.repeat(count, 1, 1, 1), T_ji=T,
-                intrinsics=intrinsics, cells=cells)  # fmt: skip
+    return {"truth": truth, "depth": depth, "rays": rays.repeat(count, 1, 1, 1), "T_ji": T,
+            "intrinsics": intrinsics, "cells": cells}  # fmt: skip
 
 
 def test_starts_are_off_by_what_is_asked_for():

@@ -24,11 +24,13 @@ class Validation:
         self._rooms = RoomSampler(rooms, device, SEED)
         self.batches, self._batch, self._device = batches, options.batch, device
 
-    def batch(self, number: int) -> FlowBatch:
-        """The directed pairs of a batch."""
+    def batch(self, number: int, starts: StartOptions | None = None) -> FlowBatch:
+        """The directed pairs of a batch, with the starts of the training if no others."""
         generator = torch.Generator(self._device)
         generator.manual_seed(SEED + number)
-        return flow_batch(self._rooms.sample(number, self._batch), StartOptions(), generator)
+        return flow_batch(
+            self._rooms.sample(number, self._batch), starts or StartOptions(), generator
+        )
 
     @torch.no_grad()
     def score(self, network: FlowNetwork, iterations: int) -> FlowScores:

@@ -1,0 +1,148 @@
+"""Our flow network against the classical operator on the same pairs of images.
+
+    python benchmarks/flow.py [--weights FILE] [--batches 4]       unseen synthetic rooms (a GPU)
+    python benchmarks/flow.py --data ROOM_DIR [--gaps 5,15,40]     rendered rooms with depth images
+
+ROOM_DIR is in Replica layout with some depth images: every frame that has one is matched with the
+frames before and after it; occlusions are not known there, so medians and shares tell more than
+means. Both operators start from the same disturbed flow ("warm") or from nothing ("cold").
+"""
+
+import argparse
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+
+from geogs.config import InputConfig
+from geogs.geometry.camera import Camera
+from geogs.geometry.lie import se3_inverse
+from geogs.io.poses import read_replica_trajectory
+from geogs.io.sources.sniff import open_source
+from geogs.tracking.flow.classical import ClassicalFlow
+from geogs.tracking.flow.lookup import Edges
+from geogs.tracking.flow.own import SHIPPED, load_network
+from geogs.tracking.flow.own_network import FlowNetwork, cell_pixels
+from geogs.tracking.grid import SampleGrid
+from geogs.train.options import FlowTraining
+from geogs.train.pairs import FlowBatch
+from geogs.train.scores import CellErrors, summarise
+from geogs.train.starts import StartOptions, disturbed_starts
+from geogs.train.trainer import run_network
+from geogs.train.validation import Validation, cell_errors
+
+WARM, COLD = StartOptions(cold=0.0), StartOptions(cold=1.0)
+DEPTH_UNIT = 6553.5
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--weights", type=Path, default=SHIPPED)
+    parser.add_argument("--batches", type=int, default=4)
+    parser.add_argument("--data", type=Path)
+    parser.add_argument("--gaps", default="5,15,40")
+    parser.add_argument("--iterations", type=int, nargs=2, default=(4, 12), help="warm and cold")
+    options = parser.parse_args()
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    network = load_network(options.weights).to(device)
+    for name, starts, count in zip(("warm", "cold"), (WARM, COLD), options.iterations, strict=True):
+        found: dict[str, list[CellErrors]] = {"own": [], "classical": []}
+        if options.data is None:
+            validation = Validation(FlowTraining(), device, options.batches)
+            batches = (validation.batch(n, starts) for n in range(options.batches))
+        else:
+            gaps = [int(g) for g in options.gaps.split(",")]
+            batches = (b.to(device) for b in data_batches(options.data, gaps, starts))
+        for batch in batches:
+            found["own"].append(own_errors(network, batch, count))
+            found["classical"].append(classical_errors(batch, name == "cold"))
+        for operator, parts in found.items():
+            print(f"{name:5} {operator:9} {summarise(parts).line()}", flush=True)
+
+
+@torch.no_grad()
+def own_errors(network: FlowNetwork, batch: FlowBatch, iterations: int) -> CellErrors:
+    """Of the network, on the device of the batch."""
+    _, estimates, dense = run_network(network, batch, iterations)
+    last = estimates[-1]
+    parts = cell_errors(batch, last.pixels, last.error.variance().sqrt(), dense)
+    return CellErrors(**{k: v.cpu() for k, v in vars(parts).items()})
+
+
+def classical_errors(batch: FlowBatch, cold: bool) -> CellErrors:
+    """Of the operator without a network, on the CPU; edges come as pairs of both directions."""
+    batch = batch.to(torch.device("cpu"))
+    height, width = batch.images.shape[-2:]
+    grid = SampleGrid(Camera(fx=1.0, fy=1.0, cx=0.0, cy=0.0, width=width, height=height))
+    operator = ClassicalFlow(grid)
+    images = (batch.images.permute(0, 2, 3, 1).numpy() * 255).round().astype(np.uint8)
+    encoded = [operator.encode(np.ascontiguousarray(i)) for i in images]
+    n = len(batch.start) // 2
+    first, second = ([encoded[k] for k in e[:n].tolist()] for e in vars(batch.edges).values())
+    start = (None, None) if cold else (batch.start[:n], batch.start[n:])
+    matches = operator.measure(first, second, *start)
+    pixels, weight = (torch.cat([getattr(m, k) for m in matches]) for k in ("pixels", "weight"))
+    deviation = torch.where(weight > 0, weight.rsqrt(), torch.inf)
+    dense = [
+        operator.dense(a, b, None if cold else s.numpy())
+        for a, b, s in zip([*first, *second], [*second, *first], batch.start, strict=True)
+    ]
+    return cell_errors(batch, pixels, deviation, torch.from_numpy(np.stack(dense)))
+
+
+def data_batches(folder: Path, gaps: list[int], starts: StartOptions) -> Iterator[FlowBatch]:
+    """Frames that have depth with frames before and after them; half of the truth each way."""
+    source = open_source(folder, InputConfig())
+    camera, poses = source.camera, read_replica_trajectory(folder / "traj.txt").T_wc
+    depths = {int(p.stem[5:]): p for p in (folder / "results").glob("depth*.png")}
+    frames = {f.index: f.image for f in source}
+    generator = torch.Generator().manual_seed(0)
+    for index, path in sorted(depths.items()):
+        depth = working_depth(cv2.imread(str(path), cv2.IMREAD_UNCHANGED) / DEPTH_UNIT, camera)
+        others = [k for g in gaps for k in (index - g, index + g) if k in frames]
+        yield pairs_with(index, others, depth, frames, poses, camera, starts, generator)
+
+
+def working_depth(depth: np.ndarray, camera: Camera) -> torch.Tensor:
+    """The nearest depth to every pixel's centre."""
+    v, u = np.mgrid[: camera.height, : camera.width]
+    rows = ((v + 0.5) * depth.shape[0] / camera.height - 0.5).round().astype(int)
+    columns = ((u + 0.5) * depth.shape[1] / camera.width - 0.5).round().astype(int)
+    return torch.from_numpy(depth[rows, columns]).float()
+
+
+def pairs_with(index, others, depth, frames, poses, camera, starts, generator) -> FlowBatch:  # type: ignore[no-untyped-def]
+    """Edges from one frame to others, then back; the way back has no truth and is not scored."""
+    n, (height, width) = len(others), depth.shape
+    images = torch.from_numpy(np.stack([frames[index], *(frames[k] for k in others)]))
+    T_cw = se3_inverse(torch.from_numpy(poses[[index, *others]])).float()
+    T = T_cw[1:] @ se3_inverse(T_cw[:1])
+    K = torch.tensor([camera.fx, camera.fy, camera.cx, camera.cy]).repeat(n, 1).float()
+    v, u = torch.meshgrid(torch.arange(height) * 1.0, torch.arange(width) * 1.0, indexing="ij")
+    rays = torch.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, 0 * u + 1], -1)
+    y = (T[:, None, None, :3, :3] @ (rays * depth[..., None])[..., None])[..., 0]
+    y = y + T[:, None, None, :3, 3]
+    truth = y[..., :2] / y[..., 2:].clamp(min=1e-3) * K[0, :2] + K[0, 2:]
+    size = torch.tensor([width - 1, height - 1])
+    seen = ((truth >= 0) & (truth <= size)).all(-1) & (y[..., 2] > 0.05) & (depth > 0)
+    at = (slice(None), slice(4, -3, 8), slice(4, -3, 8))
+    shape = truth[at].shape[1:3]
+    cells = cell_pixels(*shape, truth).reshape(*shape, 2)
+    start = disturbed_starts(
+        truth[at], depth[None][at].expand(n, -1, -1), rays[None][at].expand(n, -1, -1, -1), T, K,
+        cells, starts, generator,
+    )  # fmt: skip
+    back = 2 * cells - start  # about right, and good enough for what is only a check
+    zero, k = torch.zeros(n, dtype=torch.int32), torch.arange(1, n + 1, dtype=torch.int32)
+    both = [torch.cat([x, torch.zeros_like(x)]) for x in (truth, seen)]
+    return FlowBatch(
+        images.permute(0, 3, 1, 2).float() / 255, Edges(torch.cat([zero, k]), torch.cat([k, zero])),
+        both[0], both[1], both[1], torch.cat([start, back]).flatten(1, 2),
+        torch.cat([start, back]).flatten(1, 2),
+    )  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()
