@@ -26,11 +26,11 @@ from geogs.tracking.flow.lookup import Edges
 from geogs.tracking.flow.own import SHIPPED, load_network
 from geogs.tracking.flow.own_network import FlowNetwork, cell_pixels
 from geogs.tracking.grid import SampleGrid
+from geogs.train.objective import run_network
 from geogs.train.options import FlowTraining
 from geogs.train.pairs import FlowBatch
 from geogs.train.scores import CellErrors, summarise
 from geogs.train.starts import StartOptions, disturbed_starts
-from geogs.train.trainer import run_network
 from geogs.train.validation import Validation, cell_errors
 
 WARM, COLD = StartOptions(cold=0.0), StartOptions(cold=1.0)

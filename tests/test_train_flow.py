@@ -19,9 +19,10 @@ from geogs.tracking.flow.own_network import (
     NetworkOptions,
     cell_pixels,
 )
+from geogs.train.bundle import reproject
 from geogs.train.checkpoint import load_checkpoint, read_options, save_checkpoint
 from geogs.train.flow_loss import descriptor_loss, flow_loss
-from geogs.train.options import FlowTraining
+from geogs.train.options import BundleTraining, FlowTraining
 from geogs.train.pairs import FlowBatch
 from geogs.train.rooms.options import RoomOptions
 from geogs.train.scores import CellErrors, has_texture, summarise
@@ -234,3 +235,37 @@ def test_the_command_trains_resumes_and_writes_weights(tmp_path):
 def test_resuming_nothing_is_one_sentence(tmp_path, capsys):
     assert main(["train", "flow", str(tmp_path / "no"), "--run.resume", "--device", "cpu"]) == 2
     assert "There is no checkpoint" in capsys.readouterr().err
+
+
+def test_the_second_stage_begins_near_the_truth_and_learns_from_what_is_adjusted():
+    options = replace(
+        TINY, stage="bundle", rooms=replace(ROOMS, views=4), bundle=BundleTraining(rounds=2)
+    )
+    trainer = FlowTrainer(options, CPU)
+    batch = trainer.batch(0)
+    assert torch.equal(batch.start.T_cw[:, :2], batch.truth.T_cw[:, :2])
+    assert not torch.equal(batch.start.T_cw[:, 2:], batch.truth.T_cw[:, 2:])
+    scale = batch.truth.inverse_depth.median()
+    assert float(scale) == pytest.approx(1.0)
+    # Truth reprojects to the exact flow of the clip.
+    clips = trainer.rooms.sample(0, 1)
+    exact = clips.flow(0, 1).pixels[:, 4::8, 4::8].flatten(1, 2)
+    edge = next(
+        n
+        for n, pair in enumerate(zip(batch.edges.source, batch.edges.target, strict=True))
+        if pair == (0, 1)
+    )
+    found = reproject(batch.cameras, batch.truth, batch.edges).pixels[:, edge]
+    torch.testing.assert_close(found.float(), exact, atol=2e-2, rtol=1e-3)
+    loss = trainer.objective.loss(trainer.network, batch)
+    loss.backward()
+    head = trainer.network.update.head[-1].bias.grad
+    assert head.isfinite().all()
+    assert (head[[0, 1, 2, 3, 6]].abs() > 0).all()  # flow, deviations and share all learn
+
+
+def test_the_weight_in_the_adjustment_is_that_of_a_matched_cell():
+    like = torch.full((1, 2, 2), -2.0)
+    mixture = LaplaceMixture(torch.full((1, 2, 1), 1.0), like, like + 2)
+    expected = 1 / (1 + math.exp(-1)) / (2 * math.exp(-4.0) + 0.04**2)
+    assert mixture.weight(0.04).flatten().tolist() == pytest.approx([expected] * 4)

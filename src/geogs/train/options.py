@@ -8,9 +8,27 @@ from geogs.train.rooms.options import RoomOptions
 
 
 @dataclass(frozen=True)
+class BundleTraining:
+    """The second stage, through the dense bundle adjustment."""
+
+    rounds: int = 3
+    """Of flow and adjustment."""
+    reach: int = 2
+    """Views of a clip at most so far apart are matched."""
+    pose: float = 10.0
+    """Weight of the error of relative poses, median depths plus radians."""
+    flow: float = 0.05
+    """Weight of the error of the flow that poses and depths induce, pixels."""
+    likelihood: float = 0.3
+    """Weight of the likelihood of the network's own flow."""
+
+
+@dataclass(frozen=True)
 class FlowTraining:
     """What a training run does; saved with every checkpoint."""
 
+    stage: Literal["flow", "bundle"] = "flow"
+    """Pairs of views with exact flow, or clips through the dense bundle adjustment."""
     steps: int = 20_000
     """Steps of the whole run; the learning rate ends at zero with the last."""
     batch: int = 16
@@ -41,4 +59,5 @@ class FlowTraining:
     occluded: float = 0.3
     """Weight of cells that the other view does not see, relative to those that it sees."""
     seed: int = 0
+    bundle: BundleTraining = field(default_factory=BundleTraining)
     network: NetworkOptions = field(default_factory=NetworkOptions)

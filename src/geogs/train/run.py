@@ -10,6 +10,7 @@ import torch
 from torch import distributed
 
 from geogs.errors import GeogsError
+from geogs.tracking.flow.own import load_network
 from geogs.train.checkpoint import load_checkpoint, save_checkpoint
 from geogs.train.export import export_weights
 from geogs.train.options import FlowTraining
@@ -32,6 +33,9 @@ class RunOptions:
     minutes: float = float("inf")
     """The run stops with a checkpoint after so many minutes; it goes on with ``resume``."""
     resume: bool = False
+    """Go on from the checkpoint in the output folder, with its settings."""
+    begin_with: str = ""
+    """Weights file to begin with; "" for random ones."""
     fuse: bool = False
     """Whether the network is compiled; worth its minute on a GPU."""
 
@@ -53,6 +57,8 @@ def train_flow(
     """
     begin = time.monotonic()
     trainer = FlowTrainer(options, worker, run.fuse)
+    if run.begin_with:
+        trainer.begin_with(load_network(Path(run.begin_with)))
     if run.resume:
         load_checkpoint(trainer, out)
     first = worker.rank == 0

@@ -8,13 +8,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, distributed, nn
 
-from geogs.tracking.flow.own_network import FlowEstimate, FlowNetwork, ImageFeatures
+from geogs.tracking.flow.own_network import FlowNetwork
 from geogs.train.ahead import PlansAhead
-from geogs.train.flow_loss import flow_loss
+from geogs.train.objective import objective
 from geogs.train.options import FlowTraining
-from geogs.train.pairs import FlowBatch, flow_batch
 from geogs.train.rooms.sampler import Plan, RoomSampler
-from geogs.train.starts import StartOptions
 from geogs.train.step_graph import StepGraph
 
 
@@ -49,6 +47,7 @@ class FlowTrainer:
             weight_decay=options.weight_decay,
             fused=worker.device.type == "cuda",
         )
+        self.objective = objective(options)
         self.step = 0
         self._graph: StepGraph | None = None
         self._plans: PlansAhead | None = None
@@ -77,13 +76,18 @@ class FlowTrainer:
             torch._foreach_lerp_(means, [*self._parameters], 1 - decay)
         return loss
 
-    def batch(self, step: int) -> FlowBatch:
+    def batch(self, step: int) -> Any:
         """What step ``step`` learns from."""
         clips = self.rooms.film(self._plan(step))
         generator = torch.Generator(self.worker.device)
         generator.manual_seed(hash((self.options.seed, step, self.worker.rank)) % 2**62)
         with torch.no_grad():
-            return flow_batch(clips, StartOptions(), generator)
+            return self.objective.prepare(clips, generator)
+
+    def begin_with(self, network: FlowNetwork) -> None:
+        """Take over the weights of a network of the same sizes."""
+        for mine in (self.network, self.mean):
+            mine.load_state_dict(network.state_dict())
 
     def is_finite(self) -> bool:
         """Whether all weights are."""
@@ -121,34 +125,18 @@ class FlowTrainer:
         self.optimizer.load_state_dict(state["optimizer"])
         self.step = int(state["step"])
 
-    def _gradients(self, batch: FlowBatch) -> Float[Tensor, ""]:
-        if self.worker.device.type != "cuda":
+    def _gradients(self, batch: Any) -> Float[Tensor, ""]:
+        if self.worker.device.type != "cuda" or not self.objective.recordable:
             return self._compute(batch)
         if self._graph is None:
             self._graph = StepGraph(self._compute, batch)
         return self._graph(batch).clone()
 
-    def _compute(self, batch: FlowBatch) -> Float[Tensor, ""]:
+    def _compute(self, batch: Any) -> Float[Tensor, ""]:
         self._gradient.zero_()
-        features, estimates, dense = run_network(self.network, batch, self.options.iterations)
-        loss = flow_loss(features, estimates, dense, batch, self.options)
+        loss = self.objective.loss(self.network, batch)
         loss.backward()
         return loss.detach()
-
-
-def run_network(
-    network: FlowNetwork, batch: FlowBatch, iterations: int
-) -> tuple[ImageFeatures, list[FlowEstimate], Float[Tensor, "e h w 2"]]:
-    """Features, estimates of every iteration, upsampled flow of the last; bfloat16 on a GPU."""
-    device = batch.images.device
-    with torch.autocast(device.type, torch.bfloat16, enabled=device.type == "cuda"):
-        images = batch.images
-        if device.type == "cuda":
-            images = images.contiguous(memory_format=torch.channels_last)
-        features = network.encode(images)
-        estimates = list(network.iterate(features, batch.edges, batch.start, iterations))
-        dense = network.upsample(estimates[-1], *batch.truth.shape[1:3])
-    return features, estimates, dense
 
 
 def schedule(step: int, options: FlowTraining) -> float:

@@ -6,12 +6,12 @@ import torch
 
 from geogs.tracking.flow.own_network import FlowNetwork, cell_pixels
 from geogs.tracking.grid import OFFSET, STRIDE
+from geogs.train.objective import run_network
 from geogs.train.options import FlowTraining
 from geogs.train.pairs import FlowBatch, flow_batch
 from geogs.train.rooms.sampler import RoomSampler
 from geogs.train.scores import CellErrors, FlowScores, has_texture, summarise
 from geogs.train.starts import StartOptions
-from geogs.train.trainer import run_network
 
 SEED = 2718
 

@@ -126,12 +126,13 @@ class OwnFlow:
     def _weight(self, estimate: FlowEstimate) -> Float[Tensor, "e p 2"]:
         """Inverse variance of matched cells; none where a match is unlikely or leaves the image."""
         options, error = self.options, estimate.error
-        share = error.share.sigmoid()
-        deviation = 2**0.5 * error.log_scale.exp()
-        good = (share[..., 0] > options.min_share) & (deviation.amax(-1) < options.max_deviation)
-        good &= self.grid.inside(estimate.pixels)
-        deviation = options.inflation * (deviation.square() + options.floor**2).sqrt()
-        return torch.where(good[..., None], share / deviation.square(), 0.0)
+        deviation = 2**0.5 * error.log_scale.exp().amax(-1)
+        good = (error.share[..., 0].sigmoid() > options.min_share) & self.grid.inside(
+            estimate.pixels
+        )
+        good &= deviation < options.max_deviation
+        weight = error.weight(options.floor) / options.inflation**2
+        return torch.where(good[..., None], weight, 0.0)
 
     def _autocast(self) -> torch.autocast:
         return torch.autocast(self.device.type, torch.bfloat16)

@@ -78,6 +78,11 @@ class LaplaceMixture:
         p = self.share.sigmoid()
         return 2 * (p * (2 * self.log_scale).exp() + (1 - p) * (2 * self.log_outlier).exp())
 
+    def weight(self, floor: float) -> Float[Tensor, "e p 2"]:
+        """What a flow counts in an adjustment, 1 / pixel^2: the probability that the cell is
+        matched, over the variance that it then has; ``floor`` is a deviation in pixels."""
+        return self.share.sigmoid() / (2 * (2 * self.log_scale).exp() + floor**2)
+
     def negative_log_likelihood(self, error: Float[Tensor, "e p 2"]) -> Float[Tensor, "e p"]:
         """Of errors in pixels, mean over both axes."""
         parts = []
