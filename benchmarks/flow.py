@@ -23,8 +23,9 @@ from geogs.io.poses import read_replica_trajectory
 from geogs.io.sources.sniff import open_source
 from geogs.tracking.flow.classical import ClassicalFlow
 from geogs.tracking.flow.lookup import Edges
-from geogs.tracking.flow.own import SHIPPED, load_network
+from geogs.tracking.flow.own import load_network
 from geogs.tracking.flow.own_network import FlowNetwork, cell_pixels
+from geogs.tracking.flow.weights_files import PACKAGED
 from geogs.tracking.grid import SampleGrid
 from geogs.train.objective import run_network
 from geogs.train.options import FlowTraining
@@ -39,7 +40,7 @@ DEPTH_UNIT = 6553.5
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--weights", type=Path, default=SHIPPED)
+    parser.add_argument("--weights", type=Path, default=PACKAGED / "flow.safetensors")
     parser.add_argument("--batches", type=int, default=4)
     parser.add_argument("--data", type=Path)
     parser.add_argument("--gaps", default="5,15,40")

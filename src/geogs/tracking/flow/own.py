@@ -24,9 +24,6 @@ from geogs.tracking.flow.own_network import (
 from geogs.tracking.flow.texture import textured_fraction
 from geogs.tracking.grid import SampleGrid
 
-SHIPPED = Path(__file__).parents[2] / "data" / "weights" / "flow.safetensors"
-"""The weights that come with the package."""
-
 
 @dataclass(frozen=True)
 class OwnFlowOptions:
@@ -64,13 +61,13 @@ class OwnFlow:
     """The network on one grid; bfloat16 inside, positions float32."""
 
     def __init__(
-        self, grid: SampleGrid, weights: Path | None = None, options: OwnFlowOptions | None = None
+        self, grid: SampleGrid, weights: Path, options: OwnFlowOptions | None = None
     ) -> None:
         cv2.setNumThreads(1)
         self.grid = grid
         self.options = options or OwnFlowOptions()
         self.device = torch.device(grid.device)
-        network = load_network(SHIPPED if weights is None else weights)
+        network = load_network(weights)
         network.to(self.device)
         # PyTorch's stubs do not know the memory format.
         self.network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
