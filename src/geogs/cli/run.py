@@ -10,6 +10,7 @@ import tyro
 
 from geogs.cli.interrupt import Interruption
 from geogs.cli.options import SHORT, given, parse_options
+from geogs.cli.priors import open_prior
 from geogs.cli.progress import RunProgress
 from geogs.config import Config, Preset, preset
 
@@ -67,7 +68,8 @@ def run(options: RunOptions) -> Path:
     output = prepare_output_folder(options.output or Path("out") / source.name)
     if device.type == "cuda":
         prepare_kernels(Path(geogs.__file__).parent, device)
-    slam = Slam(source.camera, options, str(device))
+    prior = open_prior(options.prior, source.camera, device)
+    slam = Slam(source.camera, options, str(device), prior)
     progress = RunProgress(source.length)
     with full_memory_in_a_sentence(), Interruption() as stop, progress:
         full = not _feed(slam, source, progress, stop)

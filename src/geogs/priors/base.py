@@ -49,3 +49,16 @@ class MonocularPrior(Protocol):
     def predict(self, image: UInt8[np.ndarray, "h w 3"]) -> PriorMaps:
         """Maps of an RGB image, at its size; tensors may be on any device."""
         ...
+
+
+@dataclass(frozen=True, eq=False)
+class CombinedPrior:
+    """Depth from one prior, normals from another."""
+
+    depth: MonocularPrior
+    normal: MonocularPrior
+
+    def predict(self, image: UInt8[np.ndarray, "h w 3"]) -> PriorMaps:
+        """The depth of the first with the normals of the second."""
+        maps = self.depth.predict(image)
+        return PriorMaps(maps.kind, maps.depth, self.normal.predict(image).normal)

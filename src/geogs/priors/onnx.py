@@ -1,0 +1,98 @@
+"""A prior from an ONNX file and a card that says what the network wants and gives."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import UInt8
+
+from geogs.errors import InputError
+from geogs.geometry.camera import Camera
+from geogs.priors.base import DepthKind, PriorMaps
+from geogs.priors.card import PriorCard
+from geogs.priors.fitting import fit_image
+from geogs.priors.outputs import depth_map, normal_map
+from geogs.threads import worker_count
+
+MISSING = "Monocular networks in ONNX files need onnxruntime: pip install 'geogs[priors]'."
+
+
+class OnnxPrior:
+    """Runs an ONNX network on single images; on a GPU where onnxruntime has been built for it."""
+
+    def __init__(
+        self, model: Path, card: PriorCard, camera: Camera, device: torch.device | str = "cpu"
+    ) -> None:
+        """``camera`` is that of the images.
+
+        Raises InputError if onnxruntime is missing or the file does not fit the card.
+        """
+        self.card = card
+        self.camera = camera
+        self._session = _open(model, torch.device(device))
+        inputs = [i.name for i in self._session.get_inputs()]
+        named = [n for n in (card.image_input, card.camera_input) if n]
+        free = [n for n in inputs if n not in named]
+        self._image = card.image_input or _only(free, "image_input", model)
+        outputs = [o.name for o in self._session.get_outputs()]
+        named = [n for n in (card.depth_output, card.normal_output) if n]
+        free = [n for n in outputs if n not in named]
+        self._depth = card.depth_kind and (card.depth_output or _only(free, "depth_output", model))
+        self._normal = card.axes and (card.normal_output or _only(free, "normal_output", model))
+        _require(inputs, [self._image, card.camera_input], "input", model)
+        _require(outputs, [self._depth, self._normal], "output", model)
+
+    def predict(self, image: UInt8[np.ndarray, "h w 3"]) -> PriorMaps:
+        """Depth and normals, as far as the card has them, at the size of the image; on the CPU."""
+        fitted = fit_image(image, self.card)
+        feed = {self._image: fitted.pixels}
+        if self.card.camera_input:
+            feed[self.card.camera_input] = fitted.camera(self.camera)
+        names = [n for n in (self._depth, self._normal) if n]
+        try:
+            found = dict(zip(names, self._session.run(names, feed), strict=True))
+        except Exception as error:  # onnxruntime raises classes of its own
+            first = str(error).splitlines()[0]
+            raise InputError(f"The monocular network {self.card.name} fails: {first}") from error
+        depth = normal = None
+        if self._depth:
+            depth = torch.from_numpy(depth_map(found[self._depth], fitted, self.card))
+        if self._normal:
+            normal = torch.from_numpy(normal_map(found[self._normal], fitted, self.card))
+        return PriorMaps(self.card.depth_kind or DepthKind.SCALE_FREE, depth, normal)
+
+
+def _open(model: Path, device: torch.device) -> Any:
+    try:
+        import onnxruntime
+    except ImportError as error:
+        raise InputError(MISSING) from error
+    if not model.is_file():
+        raise InputError(f"There is no file {model} with a monocular network.")
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = worker_count()
+    options.log_severity_level = 3
+    wanted = ["CUDAExecutionProvider"] * (device.type == "cuda") + ["CPUExecutionProvider"]
+    providers = [p for p in wanted if p in onnxruntime.get_available_providers()]
+    try:
+        return onnxruntime.InferenceSession(str(model), options, providers=providers)
+    except Exception as error:  # onnxruntime raises classes of its own
+        first = str(error).splitlines()[0]
+        raise InputError(f"{model} cannot be read as an ONNX network: {first}") from error
+
+
+def _only(names: Sequence[str], setting: str, model: Path) -> str:
+    if len(names) == 1:
+        return names[0]
+    listed = ", ".join(names) or "none"
+    raise InputError(f"{model} leaves open which is the {setting} of its card: {listed}.")
+
+
+def _require(there: Sequence[str], names: Sequence[str | None], what: str, model: Path) -> None:
+    missing = [n for n in names if n and n not in there]
+    if missing:
+        raise InputError(
+            f"{model} has no {what} {missing[0]}, which its card names; it has {', '.join(there)}."
+        )
