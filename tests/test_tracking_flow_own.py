@@ -6,6 +6,7 @@ import torch
 
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
+from geogs.tracking.flow.classical import ClassicalFlow
 from geogs.tracking.flow.lookup import Edges
 from geogs.tracking.flow.own import OwnFlow, OwnFlowOptions, load_network
 from geogs.tracking.flow.own_network import (
@@ -33,7 +34,8 @@ def network() -> FlowNetwork:
 def operator(network, tmp_path) -> OwnFlow:
     path = tmp_path / "w.safetensors"
     export_weights(network, path, 3, FlowScores(*[0.5] * 10))
-    return OwnFlow(SampleGrid(CAMERA), path)
+    grid = SampleGrid(CAMERA)
+    return OwnFlow(grid, path, ClassicalFlow(grid))
 
 
 def images(count: int, seed: int = 0) -> list[np.ndarray]:

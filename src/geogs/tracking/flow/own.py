@@ -4,6 +4,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -13,7 +14,7 @@ from safetensors import safe_open
 from torch import Tensor
 
 from geogs.errors import InputError
-from geogs.tracking.flow.base import FlowMatch, Memories
+from geogs.tracking.flow.base import FlowMatch, FlowOperator, Memories
 from geogs.tracking.flow.lookup import DescriptorPyramid, Edges
 from geogs.tracking.flow.own_network import (
     FlowEstimate,
@@ -23,6 +24,7 @@ from geogs.tracking.flow.own_network import (
 )
 from geogs.tracking.flow.texture import textured_fraction
 from geogs.tracking.grid import SampleGrid
+from geogs.tracking.motion import filled_positions
 
 
 @dataclass(frozen=True)
@@ -33,17 +35,22 @@ class OwnFlowOptions:
     """From a start that is right to a few pixels."""
     coarse_iterations: int = 3
     """The same where a cheaper measurement will do."""
-    cold_iterations: int = 12
-    """From nothing."""
+    cold_iterations: int = 8
+    """From what the classical operator finds where nothing is known."""
     min_share: float = 0.5
     """A cell that is matched with less probability has no weight."""
     max_deviation: float = 2.0
     """Nor has one whose flow may be off by more pixels."""
-    inflation: float = 1.4
-    """Deviation in the adjustment over that of a single match: errors of a cell are alike in all
-    its edges, and the adjustment takes them for independent."""
+    inflation: float = 6.0
+    """Deviation in the adjustment over that of a single match: the errors of a cell are alike in
+    all its edges and those of neighbouring cells are alike, too; the adjustment takes them for
+    independent. Measured: less trust keeps the polished cells in charge."""
     floor: float = 0.04
     """Deviation in pixels that no match goes below."""
+    polish: bool = True
+    """Whether the classical operator refines the network's flow."""
+    agreement: float = 3.0
+    """Standard deviations by which both may differ to be joined; else the network is believed."""
     edges_at_once: int = 64
     """Directed pairs that are in memory together."""
 
@@ -55,16 +62,29 @@ class OwnImage:
     features: ImageFeatures
     """Of one image."""
     texture: float
+    classical: Any
+    """What the classical operator keeps of it."""
 
 
 class OwnFlow:
-    """The network on one grid; bfloat16 inside, positions float32."""
+    """The network on one grid; bfloat16 inside, positions float32.
+
+    The classical operator helps twice. Where nothing is known of a motion it makes the start: on
+    patterns that repeat its coarse levels find the right one of many places that look alike, where
+    windows of correlation see the nearest. And it polishes: begun at the network's flow it is more
+    precise where there is texture, so both are joined by their variances where they agree.
+    """
 
     def __init__(
-        self, grid: SampleGrid, weights: Path, options: OwnFlowOptions | None = None
+        self,
+        grid: SampleGrid,
+        weights: Path,
+        classical: FlowOperator,
+        options: OwnFlowOptions | None = None,
     ) -> None:
         cv2.setNumThreads(1)
         self.grid = grid
+        self.classical = classical
         self.options = options or OwnFlowOptions()
         self.device = torch.device(grid.device)
         network = load_network(weights)
@@ -83,7 +103,7 @@ class OwnFlow:
         pixels = torch.from_numpy(np.ascontiguousarray(image)).to(self.device)
         with self._autocast():
             features = self.network.encode(pixels.permute(2, 0, 1)[None].float() / 255)
-        return OwnImage(features, textured_fraction(image))
+        return OwnImage(features, textured_fraction(image), self.classical.encode(image))
 
     def texture(self, encoded: OwnImage) -> float:
         return encoded.texture
@@ -103,7 +123,7 @@ class OwnFlow:
         slot = {id(image): n for n, image in enumerate(images)}
         a, b = ([slot[id(i)] for i in side] for side in (first, second))
         if forward is None or backward is None:
-            start = self.grid.pixels.expand(2 * pairs, -1, -1)
+            start = self._cold_start(first, second)
             iterations = options.cold_iterations
         else:
             start = torch.cat([forward, backward]).float()
@@ -118,7 +138,45 @@ class OwnFlow:
                 *_, last = self.network.iterate(features, edges, start[part], iterations)
             parts.append((last.pixels, self._weight(last)))
         pixels, weight = (torch.cat(p).clone() for p in zip(*parts, strict=True))
+        if options.polish:
+            pixels, weight = self._polished(first, second, pixels, weight, fine)
         return FlowMatch(pixels[:pairs], weight[:pairs]), FlowMatch(pixels[pairs:], weight[pairs:])
+
+    def _cold_start(
+        self, first: Sequence[OwnImage], second: Sequence[OwnImage]
+    ) -> Float[Tensor, "d p 2"]:
+        """The classical flow of both directions, its gaps filled; no motion where it has none."""
+        sides = [[i.classical for i in side] for side in (first, second)]
+        matches = self.classical.measure(*sides, fine=False)
+        starts = []
+        for match in matches:
+            for pixels, weight in zip(match.pixels, match.weight, strict=True):
+                found = FlowMatch(pixels[None], weight[None])
+                known = bool((weight > 0).any())
+                starts.append(filled_positions(self.grid, found) if known else self.grid.pixels)
+        return torch.stack(starts)
+
+    def _polished(
+        self,
+        first: Sequence[OwnImage],
+        second: Sequence[OwnImage],
+        pixels: Float[Tensor, "d p 2"],
+        weight: Float[Tensor, "d p 2"],
+        fine: bool,
+    ) -> tuple[Float[Tensor, "d p 2"], Float[Tensor, "d p 2"]]:
+        """The network's flow joined with the classical flow that begins there."""
+        sides = [[i.classical for i in side] for side in (first, second)]
+        matches = self.classical.measure(*sides, *pixels.split(len(first)), fine=fine)
+        theirs, certain = (
+            torch.cat([getattr(m, k) for m in matches]) for k in ("pixels", "weight")
+        )
+        both = (weight > 0).all(-1, keepdim=True) & (certain > 0).all(-1, keepdim=True)
+        variance = 1 / weight.clamp(min=1e-9) + 1 / certain.clamp(min=1e-9)
+        apart = ((theirs - pixels).square() / variance).amax(-1, keepdim=True)
+        join = both & (apart < self.options.agreement**2)
+        total = weight + certain
+        mean = (weight * pixels + certain * theirs) / total.clamp(min=1e-9)
+        return torch.where(join, mean, pixels), torch.where(join, total, weight)
 
     def _weight(self, estimate: FlowEstimate) -> Float[Tensor, "e p 2"]:
         """Inverse variance of matched cells; none where a match is unlikely or leaves the image."""

@@ -16,7 +16,7 @@ def build_operator(config: TrackingConfig, grid: SampleGrid) -> FlowOperator:
     if config.operator == "own":
         from geogs.tracking.flow.own import OwnFlow
 
-        return OwnFlow(grid, find_weights("own", config.weights))
+        return OwnFlow(grid, find_weights("own", config.weights), _classical(grid))
     if config.operator == "raft":
         from geogs.tracking.flow.raft import RaftFlow
 
