@@ -1,11 +1,13 @@
-"""What a monocular prior brings to tracking, and what a bad one costs.
+"""What a monocular prior brings to tracking and to the map, and what a bad one costs.
 
     python benchmarks/priors.py [--frames 80] [--long-edge 320] [--rooms 2] [--kind scale_free]
+    python benchmarks/priors.py --map [--frames 60] [--rooms 1]
 
 Rooms whose walls are painted in one colour are tracked without a prior, with one that errs as
 networks do, and with one that is wrong by a factor of two and more in a third of each image (see
 ``geogs.synth.prior``). Depth errors are relative, over the tracker's grid of all keyframes but the
-first and last, after the similarity that aligns the trajectory.
+first and last, after the similarity that aligns the trajectory. With ``--map`` the whole system
+runs, and the errors are those of the depth and normals of the map seen from all keyframes.
 """
 
 import argparse
@@ -18,16 +20,17 @@ import cv2
 import numpy as np
 import torch
 
-from geogs.config import PriorConfig
+from geogs.config import Config, MappingConfig, PriorConfig
 from geogs.geometry.camera import Camera
 from geogs.geometry.umeyama import umeyama
 from geogs.loop.global_bundle import global_bundle
 from geogs.priors.base import DepthKind, MonocularPrior
+from geogs.slam import Slam
 from geogs.synth.prior import BAD, PLAUSIBLE, DegradedPrior
 from geogs.synth.raycast import Raycaster, View
 from geogs.synth.room import make_room, with_bare_walls
 from geogs.synth.trajectory import handheld_trajectory
-from geogs.tracking.flow.texture import MIN_STRUCTURE, cell_structure
+from geogs.tracking.flow.texture import MIN_STRUCTURE, cell_structure, smaller_eigenvalue
 from geogs.tracking.grid import OFFSET, STRIDE
 from geogs.tracking.tracker import Tracker
 from geogs.types import Frame
@@ -97,6 +100,82 @@ def score(tracker: Tracker, walk: Walk) -> Score:
     )  # fmt: skip
 
 
+@dataclass(frozen=True)
+class MapScore:
+    """How far the map seen from the keyframes is from the truth."""
+
+    mean: float
+    """Relative depth error."""
+    bare_mean: float
+    bare_wrong: float
+    """Part of the pixels without texture that is off by more than 5 %."""
+    normal: float
+    """Mean angle in degrees."""
+    bare_normal: float
+    disks: int
+
+
+def map_score(slam: Slam, walk: Walk) -> MapScore:
+    """Errors of a finished map."""
+    states = [slam.tracker.store[k] for k in slam.tracker.keyframe_ids]
+    x = torch.stack([torch.linalg.inv(s.T_cw)[:3, 3] for s in states])
+    y = torch.from_numpy(walk.T_wc[[s.frame_index for s in states], :3, 3])
+    scale = float(umeyama(x, y)[0])
+    errors, angles, bare = [], [], []
+    for seen in slam.renders():
+        view = walk.views[slam.tracker.store[seen.keyframe_id].frame_index]
+        size = seen.depth.shape[::-1]
+        nearest = cv2.INTER_NEAREST
+        depth, normal = (
+            cv2.resize(m, size, interpolation=nearest) for m in (view.depth, view.normal)
+        )
+        grey = cv2.cvtColor(view.image, cv2.COLOR_RGB2GRAY)
+        plain = (smaller_eigenvalue(grey) < MIN_STRUCTURE).astype(np.uint8)
+        known = seen.depth.numpy() > 0
+        errors.append(np.abs(scale * seen.depth.numpy() / depth - 1)[known])
+        cosine = (normal * seen.normal.numpy()).sum(-1).clip(-1, 1)
+        angles.append(np.degrees(np.arccos(cosine))[known])
+        bare.append(cv2.resize(plain, size, interpolation=nearest)[known] > 0)
+    error, angle, where = (np.concatenate(v) for v in (errors, angles, bare))
+    return MapScore(
+        float(error.mean()), float(error[where].mean()), float((error[where] > 0.05).mean()),
+        float(angle.mean()), float(angle[where].mean()), len(slam.mapper.map),
+    )  # fmt: skip
+
+
+def compare_maps(walk: Walk, kind: DepthKind, config: PriorConfig) -> None:
+    """A table of maps, with and without the normals of the prior."""
+    print_row("prior", "its normals", "depth", "bare", "bare > 5 %", "angle", "bare", "disks", "s")
+    print("|---" * 9 + "|")
+    cases = (
+        ("none", None, False),
+        ("good", PLAUSIBLE, False), ("good", PLAUSIBLE, True),
+        ("bad", BAD, False), ("bad", BAD, True),
+    )  # fmt: skip
+    for name, errors, with_normals in cases:
+        mapping = MappingConfig()
+        if not with_normals:
+            loss = dataclasses.replace(mapping.loss, normal_weight=0.0)
+            mapping = dataclasses.replace(mapping, loss=loss)
+        prior = None if errors is None else DegradedPrior(walk.views, errors, kind)
+        start = time.perf_counter()
+        slam = Slam(walk.camera, Config(prior=config, mapping=mapping), prior=prior)
+        for n, view in enumerate(walk.views):
+            slam.process(Frame(n, n / 30, view.image))
+        slam.finish()
+        seconds, s = time.perf_counter() - start, map_score(slam, walk)
+        print_row(
+            name, "yes" if with_normals else "no", f"{s.mean:.2%}", f"{s.bare_mean:.2%}",
+            f"{s.bare_wrong:.1%}", f"{s.normal:.1f}°", f"{s.bare_normal:.1f}°", s.disks,
+            f"{seconds:.0f}",
+        )  # fmt: skip
+
+
+def print_row(*cells: object) -> None:
+    """One line of a table."""
+    print("| " + " | ".join(map(str, cells)) + " |", flush=True)
+
+
 def main() -> None:
     """Run the benchmark."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -104,6 +183,7 @@ def main() -> None:
     parser.add_argument("--long-edge", type=int, default=320)
     parser.add_argument("--rooms", type=int, default=2)
     parser.add_argument("--textured", action="store_true", help="leave the walls as they are")
+    parser.add_argument("--map", action="store_true", help="the whole system instead")
     parser.add_argument("--global", action="store_true", dest="all", help="adjust all at the end")
     parser.add_argument("--kind", choices=[k.value for k in DepthKind], default="scale_free")
     parser.add_argument("--set", nargs="*", default=[], help="name=value of PriorConfig")
@@ -111,19 +191,13 @@ def main() -> None:
     torch.set_num_threads(1)  # as the system works; our own threads use the cores
     changes = {k: json.loads(v) for k, v in (item.split("=") for item in args.set)}
     config = dataclasses.replace(PriorConfig(), **changes)
-    columns = (
-        "room",
-        "prior",
-        "ATE cm",
-        "depth median",
-        "mean",
-        "bare median",
-        "mean",
-        "textured",
-        "s",
-    )
-    print("| " + " | ".join(columns) + " |")
-    print("|---" * len(columns) + "|")
+    for seed in range(args.rooms if args.map else 0):
+        seen = walk(seed, args.frames, args.long_edge, not args.textured)
+        compare_maps(seen, DepthKind(args.kind), config)
+    if args.map:
+        return
+    print_row("room", "prior", "ATE cm", "depth", "mean", "bare depth", "mean", "textured", "s")
+    print("|---" * 9 + "|")
     for seed in range(args.rooms):
         seen = walk(seed, args.frames, args.long_edge, not args.textured)
         for name, errors in (("none", None), ("good", PLAUSIBLE), ("bad", BAD)):
@@ -134,12 +208,11 @@ def main() -> None:
             if args.all:
                 global_bundle(tracker)
             seconds, s = time.perf_counter() - start, score(tracker, seen)
-            print(
-                f"| {seed} ({s.bare_share:.0%} bare) | {name} | {s.ate_cm:.3f} | {s.median:.2%} "
-                f"| {s.mean:.2%} | {s.bare_median:.2%} | {s.bare_mean:.2%} | {s.textured_mean:.2%} "
-                f"| {seconds:.1f} |",
-                flush=True,
-            )
+            print_row(
+                f"{seed} ({s.bare_share:.0%} bare)", name, f"{s.ate_cm:.3f}", f"{s.median:.2%}",
+                f"{s.mean:.2%}", f"{s.bare_median:.2%}", f"{s.bare_mean:.2%}",
+                f"{s.textured_mean:.2%}", f"{seconds:.1f}",
+            )  # fmt: skip
 
 
 if __name__ == "__main__":

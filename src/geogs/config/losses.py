@@ -15,8 +15,8 @@ class LossConfig:
     """L_d, rendered depth against the keyframe's depth; unitless, at least 0."""
     depth_relative: bool = True
     """Relative depth error times confidence; off for the plain difference in map units."""
-    normal_weight: float = 0.0
-    """L_n, rendered normal against a monocular normal prior; unitless, at least 0."""
+    normal_weight: float = 0.05
+    """L_n, rendered normal against a monocular prior's where there is one; unitless, at least 0."""
     normal_consistency_weight: float = 0.02
     """L_nc, rendered normal against the normal of the rendered depth; unitless, at least 0."""
     distortion_weight: float = 0.1

@@ -35,5 +35,8 @@ class PriorConfig:
     """Matched depth judges the prior around it within about this fraction of the grid's width."""
     max_deviation: float = 0.15
     """Cells where the prior seems to be worse than this go without it, above deviation."""
+    caution: float = 4.0
+    """Factor on the deviation that mapping is told of, since it takes a tracker's deviations for
+    larger than they are (mapping.depth.sigma_scale, tracker_scale)."""
     reject: float = 0.3
     """A prior whose ratio to the matched depth deviates by more than this is not used at all."""

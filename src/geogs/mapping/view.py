@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field, replace
 
+import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
@@ -49,6 +50,9 @@ class MapView:
     """Pixels of the render size that belong to the scene; none takes all. On the map's device."""
     search: DepthSearch | None = None
     """Where its depth is searched; none leaves that to the tracker's depth."""
+    normal: Float[Tensor, "h w 3"] | None = None
+    """A monocular prior's normals N_f at the render size, where there are any and the losses count
+    them; on the map's device."""
 
     @staticmethod
     def of(
@@ -63,6 +67,7 @@ class MapView:
             keyframe,
             depth_view(keyframe, cameras.render),
             PhotoView.prepare(image, cameras.photo, T_cw, loss.photo_blur, device),
+            normal=_shrunk_normal(keyframe, cameras.render, device) if loss.normal_weight else None,
         )
 
     @property
@@ -136,7 +141,7 @@ class MapView:
             prior = torch.where(self.mask, prior, OUTSIDE)
         if self.constants is None:
             self.constants = ViewConstants.prepare(
-                self.keyframe.image, cameras.render, prior, depth.confidence
+                self.keyframe.image, cameras.render, prior, depth.confidence, self.normal
             )
         else:
             self.constants = replace(self.constants, prior_depth=prior, confidence=depth.confidence)
@@ -145,3 +150,20 @@ class MapView:
         """Multiply the dense depth, after the map's unit changed around this keyframe."""
         if self.depth is not None and factor != 1.0:
             self.set_depth(self.depth.scaled(factor), cameras)
+
+
+def _shrunk_normal(
+    keyframe: Keyframe, render: Camera, device: torch.device | str
+) -> Float[Tensor, "h w 3"] | None:
+    """A keyframe's prior normals, averaged over the pixels of the render; zero where they differ.
+
+    An average shorter than a half comes from an edge or from pixels that are not known.
+    """
+    if keyframe.normal is None:
+        return None
+    size = (render.width, render.height)
+    full = keyframe.normal.detach().cpu().float().numpy()
+    mean = cv2.resize(full, size, interpolation=cv2.INTER_AREA)
+    length = np.linalg.norm(mean, axis=-1, keepdims=True)
+    unit = np.where(length > 0.5, mean / np.maximum(length, 1e-6), 0.0)
+    return torch.from_numpy(unit.astype(np.float32)).to(device)

@@ -34,7 +34,7 @@ class PriorErrors:
     """Part of the image, in random places, whose depth is wrong."""
     wrong_factor: float = 2.5
     """Largest factor there, up or down; the least is two."""
-    turn: float = 0.05
+    turn: float = 0.12
     """Deviation of the normals' direction, radians, smooth over the image."""
 
 

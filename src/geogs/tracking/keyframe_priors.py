@@ -1,5 +1,6 @@
 """Monocular priors in the tracker: asked for at every keyframe, then adjusted with its depth."""
 
+import logging
 from collections.abc import Sequence
 
 import torch
@@ -14,6 +15,8 @@ from geogs.tracking.graph import FrameGraph
 from geogs.tracking.grid import OFFSET, STRIDE, SampleGrid
 from geogs.tracking.keyframes import KeyframePrior, KeyframeState
 
+_log = logging.getLogger(__name__)
+
 
 class KeyframePriors:
     """Gives keyframes their priors and lets these fill in what matches say little about.
@@ -27,18 +30,29 @@ class KeyframePriors:
         self.graph = graph
         self.prior = prior
         self.config = config
+        self._warned = False
 
     def ask(self, state: KeyframeState) -> None:
         """Let the prior look at a new keyframe."""
         if self.prior is None:
             return
         maps, grid = self.prior.predict(state.image), self.graph.keyframes.grid
-        state.normal = maps.normal
+        if maps.normal is not None:
+            state.normal = self._facing(maps.normal.cpu())
         if maps.depth is not None and self.config.depth:
             values = on_cells(grid, maps.depth.to(grid.device))
             zero = torch.zeros_like(values)
             one = values.new_ones(self.config.scale_rows * self.config.scale_columns)
             state.prior = KeyframePrior(maps.kind, values, zero, one, zero)
+
+    def _facing(self, normal: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
+        """Normals that face the camera, in half precision; zero instead of those that cannot be."""
+        away = (normal * self.graph.keyframes.grid.camera.rays()).sum(-1, keepdim=True) >= 0
+        known = normal.square().sum(-1, keepdim=True) > 0
+        if not self._warned and int((away & known).sum()) > 0.5 * int(known.sum()):
+            self._warned = True
+            _log.warning("Most prior normals face away from the camera; check their normal_axes.")
+        return torch.where(away, 0.0, normal).half()
 
     def adjust(self, ids: Sequence[int], huber: float) -> None:
         """Joint depth and scale adjustment of those keyframes that have a prior, poses fixed."""
@@ -69,7 +83,8 @@ class KeyframePriors:
         )
         for n, (state, prior) in enumerate(zip(states, priors, strict=True)):
             state.inverse_depth = adjusted.inverse_depth[n]
-            prior.scale, prior.information = adjusted.scale[n], adjusted.information[n]
+            prior.scale = adjusted.scale[n]
+            prior.information = adjusted.information[n] / self.config.caution**2
 
     def _align(
         self,
