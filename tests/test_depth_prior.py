@@ -18,6 +18,7 @@ from geogs.tracking.depth_prior import (
     depth_scale_step,
     flow_evidence,
     local_deviation,
+    mean_around,
     node_differences,
     node_weights,
 )
@@ -231,3 +232,13 @@ def test_alignment_refuses_what_cannot_be_aligned():
     assert aligned is not None
     assert bool((aligned.inverse_depth[depth < 2] == 0).all())
     torch.testing.assert_close(aligned.inverse_depth[depth >= 2], (2 / depth)[depth >= 2])
+
+
+def test_means_are_those_of_windows_cut_at_the_border():
+    g = torch.Generator().manual_seed(0)
+    field = torch.rand(2, 9, 7, generator=g)
+    pooled = torch.nn.functional.avg_pool2d(field[:, None], 5, 1, 2, count_include_pad=False)
+    torch.testing.assert_close(mean_around(field, 2.2).float(), pooled[:, 0])
+    torch.testing.assert_close(
+        mean_around(field, 40.0), field.double().mean((1, 2), keepdim=True).expand(2, 9, 7)
+    )

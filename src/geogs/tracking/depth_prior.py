@@ -226,15 +226,15 @@ def local_deviation(
     it counts, and of that of a good prior, which stands alone where nothing is sure. ``sure`` in
     [0, 1] says how well the matches know a cell, beside the prior.
     """
-    shape = (-1, 1, grid.height, grid.width)
+    shape = (-1, grid.height, grid.width)
     square = (sure * error.square().clamp(max=1.0)).reshape(shape)
-    amount = sure.reshape(shape)
-    total = torch.full_like(amount, _BELIEF * config.deviation**2)
-    count = torch.full_like(amount, _BELIEF)
+    both = torch.cat([square, sure.reshape(shape)])
+    around = torch.full_like(both, _BELIEF, dtype=torch.float64)
+    around[: len(square)] *= config.deviation**2
     for multiple, cells in _EVIDENCE:
-        total = total + cells * _mean_around(square, multiple * config.reach * grid.width)
-        count = count + cells * _mean_around(amount, multiple * config.reach * grid.width)
-    return (total / count).sqrt().reshape(error.shape)
+        around += cells * mean_around(both, multiple * config.reach * grid.width)
+    total, count = around.chunk(2)
+    return (total / count).sqrt().reshape(error.shape).to(error)
 
 
 def roughness(
@@ -245,16 +245,25 @@ def roughness(
     A scale that has to change fast to follow the matches says little between them.
     """
     radius = config.reach * grid.width
-    field = factor.reshape(-1, 1, grid.height, grid.width)
-    mean = _mean_around(field, radius)
-    variance = (_mean_around(field.square(), radius) - mean.square()).clamp(min=0)
-    return (variance.sqrt() / mean.abs().clamp(min=1e-12)).reshape(factor.shape)
+    field = factor.double().reshape(-1, grid.height, grid.width)
+    mean, square = mean_around(torch.cat([field, field.square()]), radius).chunk(2)
+    variance = (square - mean.square()).clamp(min=0)
+    return (variance.sqrt() / mean.abs().clamp(min=1e-12)).reshape(factor.shape).to(factor)
 
 
-def _mean_around(field: Float[Tensor, "n 1 h w"], radius: float) -> Float[Tensor, "n 1 h w"]:
-    """Mean over a square window, cut at the border."""
+def mean_around(field: Float[Tensor, "n h w"], radius: float) -> Float[Tensor, "n h w"]:
+    """Mean over a square window, cut at the border; float64."""
     k = max(1, round(radius))
-    return F.avg_pool2d(field, 2 * k + 1, 1, k, count_include_pad=False)
+    return _means_along(_means_along(field.double(), k).mT, k).mT
+
+
+def _means_along(field: Float[Tensor, "n h w"], k: int) -> Float[Tensor, "n h w"]:
+    """Means along rows over the k cells on either side, from a running sum."""
+    width = field.shape[-1]
+    running = F.pad(field.cumsum(-1), (1, 0))
+    at = torch.arange(width, device=field.device)
+    first, end = (at - k).clamp(min=0), (at + k + 1).clamp(max=width)
+    return (running[..., end] - running[..., first]) / (end - first)
 
 
 def _prior_weight(
