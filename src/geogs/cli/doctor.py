@@ -61,6 +61,7 @@ def examine(device_name: str = "auto") -> Iterator[Finding]:
     device = require_device(device_name)
     yield from _gpus()
     yield _cache(device.type == "cuda")
+    yield _weights()
     if device.type == "cuda":
         yield _compiler()
         kernels = _kernels(device)
@@ -132,6 +133,18 @@ def _cache(is_needed: bool) -> Finding:
         f"Compiled kernels cannot be kept in {cache_folder()} ({state.problem}), so every start "
         "compiles them again; set GEOGS_CACHE to a folder that can be written.",
     )
+
+
+def _weights() -> Finding:
+    """The weights files that are there."""
+    from geogs.tracking.flow.weights_catalogue import CATALOGUE
+    from geogs.tracking.flow.weights_files import checksum, locate
+
+    found = {known: checksum(path) for known in CATALOGUE if (path := locate(known))}
+    text = ", ".join(f"{k.name} ({k.purpose}: {c.verdict})" for k, c in found.items())
+    wrong = [k.name for k, c in found.items() if c.is_wrong]
+    problem = f"Get {', '.join(wrong)} again; geogs weights says where." if wrong else None
+    return Finding("weights", text or "none", problem)
 
 
 def _compiler() -> Finding:

@@ -90,7 +90,7 @@ def _best_two_view(
 
 def two_view(camera: Camera, match: FlowMatch) -> TwoView | None:
     """Relative pose by the essential matrix (MAGSAC) and depth by triangulation, on the CPU."""
-    used = (match.weight[0, :, 0] > 0).numpy()
+    used = match.sure()[0].numpy()
     if used.sum() < 0.1 * len(used):
         return None
     p, q = SampleGrid(camera).pixels.double().numpy(), match.pixels[0].double().numpy()
@@ -131,7 +131,7 @@ def _place_all(store: KeyframeStore, flows: list[FlowMatch], best: tuple[int, Tw
         if n == chosen:
             state.T_cw = view.T_ji
         else:
-            good = known & (match.weight[0, :, 0] > 0)
+            good = known & match.sure()[0]
             T = pnp(store.grid, first.inverse_depth, match.pixels[0], good)
             state.T_cw = states[n].T_cw if T is None else T
         state.inverse_depth, state.information = transfer_depth(

@@ -67,7 +67,7 @@ class FrameLocator:
     def relocate(self, keyframe: KeyframeState, encoded: Any) -> FrameMotion | None:
         """Pose of a frame about which nothing is known, by flow from a cold start and PnP."""
         there, _ = self.operator.measure([keyframe.encoded], [encoded], fine=False)
-        good = (there.weight[0, :, 0] > 0) & (keyframe.information > 0)
+        good = there.sure()[0] & (keyframe.information > 0)
         T_rel = pnp(self.grid, keyframe.inverse_depth, there.pixels[0], good)
         if T_rel is None:
             return None

@@ -5,7 +5,8 @@ from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float, UInt8
+import torch
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 
@@ -22,6 +23,13 @@ class FlowMatch:
     variance; equal for all edges of a call that share the first image. None for nothing."""
     memory: tuple[Any, ...] | None = None
     """Of each edge, what the operator wants to be given when it measures that edge again."""
+
+    def sure(self) -> Bool[Tensor, "e p"]:
+        """Cells that a geometry may be guessed from: matched with no less than a hundredth of the
+        weight of the edge's best, where a mere guess would count like a good match."""
+        weight = self.weight[..., 0]
+        best = torch.quantile(weight.float(), 0.98, dim=-1, keepdim=True)
+        return (weight > 0) & (weight > 0.01 * best)
 
 
 Memories = Sequence[tuple[Any, Any]]

@@ -41,7 +41,7 @@ class OwnFlowOptions:
     """A cell that is matched with less probability has no weight."""
     max_deviation: float = 2.0
     """Nor has one whose flow may be off by more pixels."""
-    inflation: float = 6.0
+    inflation: float = 100.0
     """Deviation in the adjustment over that of a single match: the errors of a cell are alike in
     all its edges and those of neighbouring cells are alike, too; the adjustment takes them for
     independent. Measured: less trust keeps the polished cells in charge."""
@@ -147,7 +147,7 @@ class OwnFlow:
     ) -> Float[Tensor, "d p 2"]:
         """The classical flow of both directions, its gaps filled; no motion where it has none."""
         sides = [[i.classical for i in side] for side in (first, second)]
-        matches = self.classical.measure(*sides, fine=False)
+        matches = self.classical.measure(sides[0], sides[1], fine=False)
         starts = []
         for match in matches:
             for pixels, weight in zip(match.pixels, match.weight, strict=True):
@@ -166,11 +166,11 @@ class OwnFlow:
     ) -> tuple[Float[Tensor, "d p 2"], Float[Tensor, "d p 2"]]:
         """The network's flow joined with the classical flow that begins there."""
         sides = [[i.classical for i in side] for side in (first, second)]
-        matches = self.classical.measure(*sides, *pixels.split(len(first)), fine=fine)
-        theirs, certain = (
-            torch.cat([getattr(m, k) for m in matches]) for k in ("pixels", "weight")
-        )
-        both = (weight > 0).all(-1, keepdim=True) & (certain > 0).all(-1, keepdim=True)
+        n = len(first)
+        matches = self.classical.measure(sides[0], sides[1], pixels[:n], pixels[n:], fine)
+        theirs = torch.cat([m.pixels for m in matches])
+        certain = torch.cat([m.weight for m in matches])
+        both = ((weight > 0) & (certain > 0)).all(-1, keepdim=True)
         variance = 1 / weight.clamp(min=1e-9) + 1 / certain.clamp(min=1e-9)
         apart = ((theirs - pixels).square() / variance).amax(-1, keepdim=True)
         join = both & (apart < self.options.agreement**2)
