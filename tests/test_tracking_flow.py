@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from geogs.tracking.bundle import project
-from geogs.tracking.flow.base import FlowOperator
+from geogs.tracking.flow.base import FlowMatch, FlowOperator
 from geogs.tracking.flow.classical import ClassicalFlow, match_deviation
 from geogs.tracking.grid import SampleGrid
 from tracking_scenes import CAMERA, pose, render
@@ -135,3 +135,12 @@ def test_deviation_grows_with_both_signs_of_trouble():
     assert 0.02 < base < 0.1
     assert match_deviation(zero + 0.5, zero)[0] > base + 0.3
     assert match_deviation(zero, zero + 0.2)[0] > base + 0.3
+
+
+def test_a_geometry_is_guessed_from_cells_that_count():
+    weight = torch.tensor([[100.0, 90.0, 0.5, 0.0, 60.0], [0.02, 0.03, 0.01, 0.0, 0.0]])
+    match = FlowMatch(torch.zeros(2, 5, 2), weight[..., None].expand(-1, -1, 2))
+    assert match.sure().tolist() == [
+        [True, True, False, False, True],
+        [True, True, True, False, False],
+    ]

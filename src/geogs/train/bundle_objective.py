@@ -63,7 +63,7 @@ class BundleObjective:
         pairs = [(i, j) for i in range(views) for j in range(views) if 0 < abs(i - j) <= reach]
         source, target = to_device(torch.tensor(pairs), device).unbind(1)
         inverse = 1 / clips.depth[..., OFFSET:-3:STRIDE, OFFSET:-3:STRIDE].clamp(min=1e-2)
-        cells = cell_pixels(*inverse.shape[-2:], inverse)
+        cells = cell_pixels(inverse.shape[-2], inverse.shape[-1], inverse)
         inverse = inverse.flatten(2)
         scale = inverse.flatten(1).median(1).values[:, None, None]
         T = clips.T_cw.double()
