@@ -158,6 +158,29 @@ def sim3_adjoint(S: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 7 7"]:
     return torch.cat([top, middle, bottom], -2)
 
 
+def sim3_small_adjoint(xi: Float[Tensor, "*b 7"]) -> Float[Tensor, "*b 7 7"]:
+    """``ad`` with ``Exp(ad(xi)) = Ad(Exp(xi))``: the bracket of Sim(3) as a matrix."""
+    tau, phi, sigma = xi[..., :3], xi[..., 3:6], xi[..., 6, None, None]
+    turn = so3_hat(phi)
+    eye = torch.eye(3, dtype=xi.dtype, device=xi.device)
+    column = torch.zeros_like(tau)[..., None]
+    top = torch.cat([sigma * eye + turn, so3_hat(tau), -tau[..., None]], -1)
+    middle = torch.cat([torch.zeros_like(turn), turn, column], -1)
+    return torch.cat([top, middle, torch.zeros_like(top[..., :1, :])], -2)
+
+
+def sim3_left_jacobian(xi: Float[Tensor, "*b 7"]) -> Float[Tensor, "*b 7 7"]:
+    """``J`` with ``Exp(xi + d) = Exp(J d) Exp(xi)`` to first order; of ``-xi`` it is the right one.
+
+    J is the integral of exp(s ad(xi)) over s in [0, 1], which stands beside exp(ad(xi)) in the
+    exponential of the block matrix [[ad(xi), I], [0, 0]].
+    """
+    ad = sim3_small_adjoint(xi)
+    eye = torch.eye(7, dtype=xi.dtype, device=xi.device).expand_as(ad)
+    top = torch.cat([ad, eye], -1)
+    return torch.linalg.matrix_exp(torch.cat([top, torch.zeros_like(top)], -2))[..., :7, 7:]
+
+
 def retract(xi: Float[Tensor, "*b k"], T: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 4 4"]:
     """Left retraction ``Exp(xi) T``; six numbers move an SE(3), seven a Sim(3)."""
     return (se3_exp(xi) if xi.shape[-1] == 6 else sim3_exp(xi)) @ T

@@ -1,0 +1,346 @@
+"""Sim(3) pose-graph adjustment: relative poses and dense matches over drifting keyframes.
+
+A monocular tracker drifts in scale, so every keyframe carries a similarity ``S`` from the world to
+its camera *in the keyframe's own unit of length*, lifted from its pose with scale 1. A relative
+pose G from keyframe i to j says S_j S_i^-1 = G, and errs by ``e = log(G S_i S_j^-1)`` in tangent
+order [tau, phi, sigma], in the frame of j. Loops are robust: Geman-McClure, approached from the
+convex side (graduated non-convexity, Yang et al. 2020), so that a false loop loses its weight
+instead of bending the map. Steps are Levenberg-Marquardt on left retractions, each solved sparsely;
+memory is linear in edges. Source: the Sim(3) pose graph of HI-SLAM2, with exact Jacobians.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from scipy.sparse import coo_matrix
+from scipy.sparse.linalg import splu
+from torch import Tensor
+
+from geogs.geometry.lie import (
+    retract,
+    sim3_adjoint,
+    sim3_inverse,
+    sim3_left_jacobian,
+    sim3_log,
+    sim3_scale,
+)
+from geogs.loop.matched_edges import (
+    BlockEquations,
+    LinearMatches,
+    MatchedEdges,
+    MatchOptions,
+    depth_step,
+    linearise_matches,
+    match_cost,
+)
+from geogs.types import PoseCorrection
+
+
+@dataclass(frozen=True)
+class RelativePoses:
+    """Measured similarities between pairs of keyframes."""
+
+    source: Int[Tensor, "e"]
+    """Index of keyframe i."""
+    target: Int[Tensor, "e"]
+    """Index of keyframe j."""
+    G: Float[Tensor, "e 4 4"]
+    """Camera i, in the unit of keyframe i, to camera j in the unit of keyframe j; float64."""
+    information: Float[Tensor, "e 7"]
+    """Inverse variances of the error [tau, phi, sigma] in the frame of j: 1 / unit^2, 1 / rad^2
+    and of the logarithm of scale; float64. Zero where nothing is known."""
+    is_loop: Bool[Tensor, "e"]
+    """Edges that may be wrong altogether; the others are trusted."""
+
+    def __len__(self) -> int:
+        return len(self.source)
+
+    def select(self, keep: Bool[Tensor, "e"]) -> "RelativePoses":
+        """The edges that are marked."""
+        parts = (self.source, self.target, self.G, self.information, self.is_loop)
+        return RelativePoses(*(p[keep] for p in parts))
+
+    def rescaled(self, scale: Float[Tensor, "n"]) -> "RelativePoses":
+        """The same measurements after the unit of each keyframe was divided by ``scale``.
+
+        To be applied to edges kept beyond a correction, with :attr:`PoseGraphResult.scale`.
+        """
+        here, there = scale[self.source], scale[self.target]
+        G = self.G.clone()
+        G[:, :3, :3] *= (here / there)[:, None, None]
+        G[:, :3, 3] /= there[:, None]
+        information = self.information.clone()
+        information[:, :3] *= there[:, None] ** 2
+        return RelativePoses(self.source, self.target, G, information, self.is_loop)
+
+
+@dataclass(frozen=True)
+class PoseGraph:
+    """What is adjusted."""
+
+    T_cw: Float[Tensor, "n 4 4"]
+    """World to camera of each keyframe, float64."""
+    relative: RelativePoses
+    fixed: Bool[Tensor, "n"]
+    """Keyframes whose similarity stays; at least one, or the world is undetermined."""
+    matches: MatchedEdges | None = None
+
+
+@dataclass(frozen=True)
+class PoseGraphOptions:
+    """How a graph is adjusted."""
+
+    loop_threshold: float = 18.5
+    """Squared error, in squared standard deviations, at which a loop's influence fades; the 99th
+    percentile of chi^2 with seven degrees of freedom."""
+    convexity_step: float = 2.0
+    """Factor by which the kernel is sharpened from stage to stage."""
+    stage_iterations: int = 2
+    """Steps of every stage but the last."""
+    iterations: int = 20
+    """Steps of the last stage at most."""
+    tolerance: float = 1e-9
+    """The last stage ends when a step lowers the cost by no more than this fraction of it."""
+    damping: float = 1e-8
+    """Levenberg damping at the start, relative to the diagonal."""
+    max_damping: float = 1e4
+    """A stage ends when even this damping brings no decrease."""
+    matches: MatchOptions = field(default_factory=MatchOptions)
+
+
+@dataclass(frozen=True)
+class PoseGraphResult:
+    """The adjusted graph."""
+
+    S: Float[Tensor, "n 4 4"]
+    """World to camera in the keyframe's unit of before, float64."""
+    inverse_depth: Float[Tensor, "n p"] | None
+    """In the keyframe's unit of before; None without matches."""
+    loop_weight: Float[Tensor, "e"]
+    """Share of each relative pose that the kernel left in force, in [0, 1]; 1 for trusted ones."""
+    cost_before: float
+    """With the kernel of the last stage."""
+    cost_after: float
+    steps: int
+    """Steps taken."""
+
+    @property
+    def scale(self) -> Float[Tensor, "n"]:
+        """Unit of length of the world over the keyframe's unit of before."""
+        return sim3_scale(self.S)
+
+
+@dataclass(frozen=True)
+class _State:
+    S: Float[Tensor, "n 4 4"]
+    inverse_depth: Tensor
+
+
+def relative_errors(S: Float[Tensor, "n 4 4"], relative: RelativePoses) -> Float[Tensor, "e 7"]:
+    """``log(G S_i S_j^-1)`` of every relative pose."""
+    return sim3_log(relative.G @ S[relative.source] @ sim3_inverse(S[relative.target]))
+
+
+def relative_jacobians(
+    relative: RelativePoses, error: Float[Tensor, "e 7"]
+) -> tuple[Float[Tensor, "e 7 7"], Float[Tensor, "e 7 7"]]:
+    """d error / d xi of source and target (left perturbations), exact.
+
+    A motion of the source reaches the error's left through Ad(G), one of the target its right:
+    Jl(e)^-1 Ad(G) and -Jl(-e)^-1.
+    """
+    left = torch.linalg.solve(sim3_left_jacobian(error), sim3_adjoint(relative.G))
+    return left, -torch.linalg.inv(sim3_left_jacobian(-error))
+
+
+def solve(graph: PoseGraph, options: PoseGraphOptions | None = None) -> PoseGraphResult:
+    """Adjust all similarities; inverse depths of matched edges with them.
+
+    The kernel starts so wide that it is convex over the errors of all loops at the given poses.
+    Every step lowers the cost at its stage; the result is deterministic.
+    """
+    options = options or PoseGraphOptions()
+    none = torch.zeros(len(graph.T_cw), 0)
+    depth = none if graph.matches is None else graph.matches.inverse_depth
+    start = _State(graph.T_cw.double(), depth)
+    problem = _Problem(graph, options)
+    state, steps = start, 0
+    for width in problem.widths(start):
+        last = width == 1.0
+        state, taken = problem.descend(
+            state, width, options.iterations if last else options.stage_iterations
+        )
+        steps += taken
+    valid = problem.linearise(state, 0.0).valid
+    return PoseGraphResult(
+        state.S,
+        None if graph.matches is None else state.inverse_depth,
+        problem.weights(relative_errors(state.S, graph.relative), 1.0),
+        problem.cost(start, 1.0, valid),
+        problem.cost(state, 1.0, valid),
+        steps,
+    )
+
+
+def pose_correction(
+    ids: Sequence[int], T_cw: Float[Tensor, "n 4 4"], S: Float[Tensor, "n 4 4"]
+) -> PoseCorrection:
+    """What the rest of the system needs to know: T' = (R, t / s) and s of each keyframe.
+
+    Lengths around a keyframe are divided by s, so inverse depth is multiplied by it, as
+    ``Tracker.correct`` does; the map follows by T'^-1 (1 / s) T = S^-1 T.
+    """
+    scale = sim3_scale(S)
+    after = S / scale[:, None, None]
+    after[:, 3] = S[:, 3]
+    return PoseCorrection(
+        {k: T_cw[n].clone() for n, k in enumerate(ids)},
+        {k: after[n].clone() for n, k in enumerate(ids)},
+        {k: float(scale[n]) for n, k in enumerate(ids)},
+    )
+
+
+class _Problem:
+    """Cost, weights and steps of one graph."""
+
+    def __init__(self, graph: PoseGraph, options: PoseGraphOptions) -> None:
+        self.graph, self.options = graph, options
+
+    def widths(self, state: _State) -> list[float]:
+        """Widening of the kernel's threshold from stage to stage; the last is 1."""
+        relative, widths = self.graph.relative, [1.0]
+        square = self._squares(relative_errors(state.S, relative))[relative.is_loop]
+        # Geman-McClure is convex up to a third of its squared threshold.
+        widest = 3 * float(square.max()) / self.options.loop_threshold if len(square) else 0.0
+        while widths[0] < widest:
+            widths.insert(0, widths[0] * self.options.convexity_step)
+        return widths
+
+    def weights(self, error: Float[Tensor, "e 7"], width: float) -> Float[Tensor, "e"]:
+        """Geman-McClure's factor (c^2 / (c^2 + |e|^2))^2 of loops, 1 of other edges."""
+        limit = width * self.options.loop_threshold
+        weight = (limit / (limit + self._squares(error))).square()
+        return torch.where(self.graph.relative.is_loop, weight, torch.ones_like(weight))
+
+    def cost(self, state: _State, width: float, valid: Bool[Tensor, "e p"]) -> float:
+        """Sum of |e|^2 of trusted edges, c^2 |e|^2 / (c^2 + |e|^2) of loops, Huber of matches."""
+        relative, limit = self.graph.relative, width * self.options.loop_threshold
+        square = self._squares(relative_errors(state.S, relative))
+        robust = torch.where(relative.is_loop, limit * square / (limit + square), square)
+        total = float(robust.sum())
+        if self.graph.matches is None:
+            return total
+        return total + match_cost(
+            self.graph.matches, state.S, state.inverse_depth, valid, self.options.matches
+        )
+
+    def descend(self, state: _State, width: float, iterations: int) -> tuple[_State, int]:
+        """Levenberg-Marquardt with one kernel; the new state and how many steps it took."""
+        damping, steps = self.options.damping, 0
+        linear = self.linearise(state, damping)
+        cost = self.cost(state, width, linear.valid)
+        while steps < iterations and damping <= self.options.max_damping:
+            candidate = self._step(state, width, linear, damping)
+            lowered = torch.inf if candidate is None else self.cost(candidate, width, linear.valid)
+            if candidate is None or not lowered < cost:
+                if candidate is not None and lowered - cost <= 1e-12 * cost:
+                    break
+                damping *= 10
+                linear = self.linearise(state, damping)
+                continue
+            gain = cost - lowered
+            state, steps = candidate, steps + 1
+            damping = max(damping / 10, self.options.damping)
+            linear = self.linearise(state, damping)
+            cost = self.cost(state, width, linear.valid)
+            if gain <= self.options.tolerance * cost:
+                break
+        return state, steps
+
+    def linearise(self, state: _State, damping: float) -> LinearMatches:
+        """The matched edges at a state, their depths eliminated; nothing without any."""
+        if self.graph.matches is None:
+            index = torch.zeros(0, dtype=torch.long)
+            gradient = torch.zeros(len(state.S), 7, dtype=torch.float64)
+            none = BlockEquations(index, index, gradient.new_zeros(0, 7, 7), gradient)
+            return LinearMatches(none, (), torch.zeros(0, 0, dtype=torch.bool))
+        return linearise_matches(
+            self.graph.matches, state.S, state.inverse_depth, damping, self.options.matches
+        )
+
+    def _squares(self, error: Float[Tensor, "e 7"]) -> Float[Tensor, "e"]:
+        return (self.graph.relative.information * error.square()).sum(-1)
+
+    def _step(
+        self, state: _State, width: float, linear: LinearMatches, damping: float
+    ) -> _State | None:
+        """The state one damped step on; None where the system cannot be solved."""
+        xi = _solve_blocks(
+            [self._relative_equations(state, width), linear.equations], self.graph.fixed, damping
+        )
+        if xi is None:
+            return None
+        S = torch.where(self.graph.fixed[:, None, None], state.S, retract(xi, state.S))
+        matches, limits = self.graph.matches, self.options.matches
+        if matches is None:
+            return _State(S, state.inverse_depth)
+        d = state.inverse_depth + depth_step(linear, xi, state.inverse_depth)
+        return _State(S, d.clamp(limits.min_inverse_depth, limits.max_inverse_depth))
+
+    def _relative_equations(self, state: _State, width: float) -> BlockEquations:
+        relative = self.graph.relative
+        e = relative_errors(state.S, relative)
+        J_i, J_j = relative_jacobians(relative, e)
+        W = relative.information * self.weights(e, width)[:, None]
+        i, j = relative.source, relative.target
+        WJ_i, WJ_j, r = W[..., None] * J_i, W[..., None] * J_j, (W * e)[..., None]
+        cross = J_i.mT @ WJ_j
+        gradient = torch.zeros(len(state.S), 7, dtype=torch.float64)
+        gradient.index_add_(0, i, -(J_i.mT @ r)[..., 0])
+        gradient.index_add_(0, j, -(J_j.mT @ r)[..., 0])
+        blocks = torch.cat([J_i.mT @ WJ_i, J_j.mT @ WJ_j, cross, cross.mT])
+        return BlockEquations(torch.cat([i, j, i, j]), torch.cat([i, j, j, i]), blocks, gradient)
+
+
+def _solve_blocks(
+    parts: Sequence[BlockEquations], fixed: Bool[Tensor, "n"], damping: float
+) -> Float[Tensor, "n 7"] | None:
+    """Solve the damped sparse system over the free keyframes; None if it is singular."""
+    free = ~fixed
+    n = int(free.sum())
+    xi = torch.zeros(len(fixed), 7, dtype=torch.float64)
+    if not n:
+        return xi
+    slot = torch.full((len(fixed),), -1, dtype=torch.long)
+    slot[free] = torch.arange(n)
+    row, column = (slot[torch.cat([getattr(p, k) for p in parts])] for k in ("row", "column"))
+    block = torch.cat([p.block for p in parts])
+    keep = (row >= 0) & (column >= 0)
+    row, column, block = row[keep], column[keep], block[keep]
+    within = torch.arange(7)
+    rows = (7 * row[:, None, None] + within[:, None]).expand(-1, 7, 7)
+    columns = (7 * column[:, None, None] + within).expand(-1, 7, 7)
+    H = coo_matrix(
+        (block.numpy().ravel(), (rows.numpy().ravel(), columns.numpy().ravel())),
+        shape=(7 * n, 7 * n),
+    ).tocsc()
+    diagonal = H.diagonal()
+    # A keyframe that nothing ties down stays where it is.
+    floor = 1e-12 * max(float(diagonal.max(initial=0.0)), 1e-300)
+    H.setdiag(diagonal * (1 + damping) + floor)
+    gradient = sum((p.gradient for p in parts), torch.zeros_like(xi))[free]
+    try:
+        # Symmetric and positive definite: pivots stay on the diagonal, and fill-in small.
+        factor = splu(
+            H, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
+        )
+    except RuntimeError:
+        return None
+    solution = factor.solve(gradient.reshape(-1).numpy())
+    if not np.isfinite(solution).all():
+        return None
+    xi[free] = torch.from_numpy(solution).reshape(n, 7)
+    return xi
