@@ -10,6 +10,7 @@ from geogs.tracking.flow.classical import ClassicalFlow
 from geogs.tracking.flow.lookup import Edges
 from geogs.tracking.flow.own import OwnFlow, OwnFlowOptions, load_network
 from geogs.tracking.flow.own_network import (
+    FlowEstimate,
     FlowNetwork,
     LaplaceMixture,
     NetworkOptions,
@@ -156,3 +157,19 @@ def test_weights_of_something_else_are_refused_in_one_sentence(tmp_path):
     (tmp_path / "bad.safetensors").write_bytes(b"0" * 64)
     with pytest.raises(InputError, match="does not hold weights"):
         load_network(tmp_path / "bad.safetensors")
+
+
+def test_cells_that_jump_from_a_warm_start_have_no_weight(operator):
+    operator.options = OwnFlowOptions(min_share=0.0, max_deviation=1e6, polish=False)
+    cells = operator.grid.pixels
+    inner = operator.grid.inside(cells, margin=20.0)
+    jumped = cells.clone()
+    far = torch.nonzero(inner)[:3, 0]
+    jumped[far] += 8.0
+    zero = torch.zeros(1, len(cells), 2)
+    mixture = LaplaceMixture(zero[..., :1], zero, zero + 1)
+    estimate = FlowEstimate(jumped[None] + 2.0, mixture, torch.zeros(1, 1, 1, 1))
+    warm = operator._weight(estimate, cells[None])[0, :, 0] > 0
+    assert not warm[far].any()
+    assert warm[inner].sum() == inner.sum() - 3  # a shift of all is no jump
+    assert (operator._weight(estimate, None)[0, far, 0] > 0).all()

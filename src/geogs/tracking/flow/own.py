@@ -41,6 +41,9 @@ class OwnFlowOptions:
     """A cell that is matched with less probability has no weight."""
     max_deviation: float = 2.0
     """Nor has one whose flow may be off by more pixels."""
+    max_correction: float = 6.0
+    """Pixels by which a cell may move away from a warm start more than the median cell does; a
+    jump of one period of a pattern that repeats is larger."""
     inflation: float = 100.0
     """Deviation in the adjustment over that of a single match: the errors of a cell are alike in
     all its edges and those of neighbouring cells are alike, too; the adjustment takes them for
@@ -122,6 +125,7 @@ class OwnFlow:
         images = list({id(i): i for i in (*first, *second)}.values())
         slot = {id(image): n for n, image in enumerate(images)}
         a, b = ([slot[id(i)] for i in side] for side in (first, second))
+        cold = forward is None or backward is None
         if forward is None or backward is None:
             start = self._cold_start(first, second)
             iterations = options.cold_iterations
@@ -136,7 +140,7 @@ class OwnFlow:
             edges = Edges(*(x[part].int().to(self.device) for x in (source, target)))
             with self._autocast():
                 *_, last = self.network.iterate(features, edges, start[part], iterations)
-            parts.append((last.pixels, self._weight(last)))
+            parts.append((last.pixels, self._weight(last, None if cold else start[part])))
         pixels, weight = (torch.cat(p).clone() for p in zip(*parts, strict=True))
         if options.polish:
             pixels, weight = self._polished(first, second, pixels, weight, fine)
@@ -178,14 +182,21 @@ class OwnFlow:
         mean = (weight * pixels + certain * theirs) / total.clamp(min=1e-9)
         return torch.where(join, mean, pixels), torch.where(join, total, weight)
 
-    def _weight(self, estimate: FlowEstimate) -> Float[Tensor, "e p 2"]:
-        """Inverse variance of matched cells; none where a match is unlikely or leaves the image."""
+    def _weight(
+        self, estimate: FlowEstimate, start: Float[Tensor, "e p 2"] | None
+    ) -> Float[Tensor, "e p 2"]:
+        """Inverse variance of matched cells; none where a match is unlikely or leaves the image,
+        or goes elsewhere than the others from a warm start."""
         options, error = self.options, estimate.error
         deviation = 2**0.5 * error.log_scale.exp().amax(-1)
         good = (error.share[..., 0].sigmoid() > options.min_share) & self.grid.inside(
             estimate.pixels
         )
         good &= deviation < options.max_deviation
+        if start is not None:
+            moved = (estimate.pixels - start).masked_fill(~good[..., None], torch.nan)
+            apart = (moved - moved.nanmedian(1, keepdim=True).values).norm(dim=-1)
+            good &= apart < options.max_correction
         weight = error.weight(options.floor) / options.inflation**2
         return torch.where(good[..., None], weight, 0.0)
 
