@@ -1,0 +1,99 @@
+"""The last word on a loop: dense flow, started from the pose that the features gave."""
+
+import math
+from dataclasses import dataclass
+
+from jaxtyping import Float
+from torch import Tensor
+
+from geogs.geometry.lie import se3_inverse, so3_log
+from geogs.loop.options import VerificationOptions
+from geogs.tracking.flow.base import FlowOperator
+from geogs.tracking.grid import SampleGrid
+from geogs.tracking.keyframes import KeyframeState, scaled
+from geogs.tracking.motion import FrameLocator, FrameMotion
+
+
+@dataclass(frozen=True)
+class DenseCheck:
+    """What the flow between two keyframes says of a supposed loop."""
+
+    accepted: bool
+    reason: str
+    """Why not; empty if accepted."""
+    T_ji: Float[Tensor, "4 4"] | None = None
+    """First camera to second in the first's lengths, float64, by the flow."""
+    scale: float = 1.0
+    """Lengths of the second's depth per length of the first's."""
+    matched: float = 0.0
+    """Share of the cells whose flow agrees with the pose, in the poorer direction."""
+    residual: float = math.inf
+    """Median error of the reprojection in pixels, in the poorer direction."""
+
+
+def dense_check(
+    grid: SampleGrid,
+    operator: FlowOperator,
+    first: KeyframeState,
+    second: KeyframeState,
+    T_ji: Float[Tensor, "4 4"],
+    scale: float = 1.0,
+    options: VerificationOptions | None = None,
+) -> DenseCheck:
+    """Measure the flow between two keyframes from their supposed relative pose, and judge it.
+
+    Both directions are located on their own, each on the depth of its source; their poses must
+    turn alike and both views' depth must agree up to one scale. ``T_ji`` is in the first's
+    lengths, ``scale`` as in :class:`DenseCheck`.
+    """
+    o = options or VerificationOptions()
+    limit = o.max_residual * max(grid.camera.width, grid.camera.height)
+    locator = FrameLocator(grid, operator, 0.0, limit)
+    T_ji = T_ji.to(first.T_cw)
+    there = locator.locate(first, second.encoded, T_ji @ first.T_cw)
+    back = locator.locate(second, first.encoded, se3_inverse(scaled(T_ji, scale)) @ second.T_cw)
+    if there is None or back is None:
+        return DenseCheck(False, "the flow agrees with no pose")
+    matched, residual = min(there.matched, back.matched), max(there.residual, back.residual)
+    T_there = there.T_cw @ se3_inverse(first.T_cw)
+    T_back = back.T_cw @ se3_inverse(second.T_cw)
+    ratios = _depth_ratios(grid, first, second, there, T_there)
+    scale_dense, agreeing = _consensus(ratios, o.depth_tolerance)
+    turn = math.degrees(float(so3_log((T_back @ T_there)[:3, :3]).norm()))
+    if matched < o.min_matched:
+        reason = f"the flow agrees on only {matched:.0%} of the image"
+    elif turn > o.max_turn:
+        reason = f"the two directions differ by {turn:.1f} degrees"
+    elif agreeing < o.min_consistent:
+        reason = f"the depths agree at only {agreeing:.0%} of the matches"
+    elif abs(math.log(scale_dense)) > math.log(o.max_scale):
+        reason = f"the depths differ by a factor of {scale_dense:.2f}"
+    else:
+        reason = ""
+    return DenseCheck(not reason, reason, T_there, scale_dense, matched, residual)
+
+
+def _depth_ratios(
+    grid: SampleGrid,
+    first: KeyframeState,
+    second: KeyframeState,
+    there: FrameMotion,
+    T_ji: Float[Tensor, "4 4"],
+) -> Float[Tensor, "m"]:
+    """Logarithm of the second's depth over the first's as seen from it, at the sure matches."""
+    T = T_ji.to(grid.rays)
+    pixels = there.match.pixels[0]
+    forward = (grid.rays @ T[:3, :3].mT + first.inverse_depth[:, None] * T[:3, 3])[:, 2]
+    own = grid.sample_field(second.inverse_depth[:, None], pixels)[:, 0]
+    cell, inside = grid.cells_of(pixels)
+    good = there.match.sure()[0] & (first.information > 0) & (second.information[cell] > 0)
+    good = good & inside & (forward > 1e-6) & (own > 1e-9) & (first.inverse_depth > 1e-9)
+    return (first.inverse_depth / (forward * own).clamp(min=1e-12))[good].log()
+
+
+def _consensus(ratios: Float[Tensor, "m"], tolerance: float) -> tuple[float, float]:
+    """Median ratio, and the share of the ratios that keep to it."""
+    if not len(ratios):
+        return 1.0, 0.0
+    middle = ratios.median()
+    return float(middle.exp()), float(((ratios - middle).abs() < tolerance).float().mean())

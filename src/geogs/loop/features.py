@@ -1,0 +1,68 @@
+"""ORB features spread evenly over an image."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Float32, UInt8
+
+from geogs.loop.options import RetrievalOptions
+
+ROWS, COLUMNS = 6, 8
+"""Cells of the image that share the features evenly."""
+SURPLUS = 1.5
+"""Features detected for each that is kept, so that poor cells find theirs."""
+
+
+@dataclass(frozen=True)
+class Features:
+    """What is kept of an image to recognise it; the strongest of every cell come first."""
+
+    pixels: Float32[np.ndarray, "n 2"]
+    """x, y."""
+    descriptors: UInt8[np.ndarray, "n 32"]
+    """256 bits each."""
+
+    def __len__(self) -> int:
+        return len(self.pixels)
+
+
+class FeatureExtractor:
+    """Finds oriented FAST corners at eight scales and describes them by ORB."""
+
+    def __init__(self, options: RetrievalOptions) -> None:
+        self.count = options.features
+        self._orb = cv2.ORB_create(
+            nfeatures=round(SURPLUS * options.features), fastThreshold=options.fast_threshold
+        )
+
+    def __call__(self, image: UInt8[np.ndarray, "h w 3"]) -> Features:
+        """Features of an RGB image; none where nothing stands out."""
+        grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+        points = self._orb.detect(grey, None)
+        if not points:
+            return Features(np.zeros((0, 2), np.float32), np.zeros((0, 32), np.uint8))
+        pixels = np.array([p.pt for p in points], np.float32)
+        strength = np.array([p.response for p in points])
+        order = _spread(pixels, strength, grey.shape)[: self.count]
+        # Descriptors come back in another order: OpenCV sorts by scale.
+        kept = []
+        for n in order:
+            points[n].class_id = len(kept)
+            kept.append(points[n])
+        kept, descriptors = self._orb.compute(grey, kept)
+        if descriptors is None:
+            return Features(np.zeros((0, 2), np.float32), np.zeros((0, 32), np.uint8))
+        back = np.argsort([p.class_id for p in kept], kind="stable")
+        pixels = np.array([p.pt for p in kept], np.float32)
+        return Features(pixels[back], descriptors[back])
+
+
+def _spread(pixels: np.ndarray, strength: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Order in which every cell gives its strongest, then every cell its second, and so on."""
+    row = (pixels[:, 1] * ROWS / shape[0]).astype(int)
+    cell = row * COLUMNS + (pixels[:, 0] * COLUMNS / shape[1]).astype(int)
+    by_cell = np.lexsort((-strength, cell))
+    sorted_cell = cell[by_cell]
+    rank = np.arange(len(cell)) - np.searchsorted(sorted_cell, sorted_cell)
+    return by_cell[np.lexsort((-strength[by_cell], rank))]

@@ -1,0 +1,80 @@
+"""Settings of loop detection."""
+
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True)
+class RetrievalOptions:
+    """Appearance features and the vocabulary that grows from them."""
+
+    features: int = 800
+    """Most ORB features per keyframe, strongest of each image cell first."""
+    indexed: int = 300
+    """How many of them the index looks up and stores; the rest serve verification."""
+    fast_threshold: int = 7
+    """Least grey-level step of a corner: low, so that dark exposures still give features."""
+    word_radius: int = 50
+    """Bits (of 256) within which a descriptor belongs to an existing word."""
+    words: int = 6144
+    """Size at which the vocabulary stops growing; bounds the cost of a keyframe."""
+
+
+@dataclass(frozen=True)
+class VerificationOptions:
+    """When two views count as views of one place."""
+
+    ratio: float = 0.8
+    """A match must be this much nearer than the second nearest descriptor."""
+    reprojection: float = 0.006
+    """Largest error of an inlier of the pose, of the long edge."""
+    epipolar: float = 0.002
+    """Largest distance of an inlier from its epipolar line, of the long edge."""
+    min_inliers: int = 25
+    """Fewest matches that agree with the pose."""
+    min_share: float = 0.3
+    """Least share of all matches that do."""
+    min_spread: float = 0.25
+    """Least share of the cells of a 4 x 4 raster that hold inliers, in the poorer image: one
+    picture that hangs in two rooms is no loop."""
+    depth_tolerance: float = 0.15
+    """Relative deviation within which an inlier's depths in both views agree, up to one scale."""
+    min_consistent: float = 0.6
+    """Least share of the inliers with depth in both views for which they do."""
+    max_scale: float = 3.0
+    """Largest factor between the scales of both views' depths, either way."""
+    min_matched: float = 0.12
+    """Dense check: least share of the cells whose flow agrees with the pose, in each direction."""
+    max_residual: float = 0.006
+    """Dense check: largest median reprojection error of the flow, of the long edge."""
+    max_turn: float = 3.0
+    """Dense check: largest rotation in degrees between the poses found in the two directions."""
+
+
+@dataclass(frozen=True)
+class LoopConfig:
+    """Where loops are looked for and how many are kept.
+
+    Distances in the image are fractions of its longer side, so that they hold at any resolution.
+    """
+
+    min_gap: int = 15
+    """Keyframes that lie at least between the two views of a loop."""
+    max_distance: float = 0.29
+    """Flow distance below which the present poses make a pair a candidate, of the long edge (22
+    cells of 8 pixels at 616 pixels, as HI-SLAM2 has it)."""
+    rotation_weight: float = 0.3
+    """Weight of the flow with the rotation in that distance, the rest is without."""
+    max_angle: float = 120.0
+    """Largest angle in degrees between the orientations of such a pair."""
+    appearance: int = 5
+    """Candidates taken from the index per keyframe."""
+    min_score: float = 0.05
+    """Least similarity of such a candidate, of that of a keyframe with itself."""
+    verified: int = 4
+    """Most candidates of a keyframe that are verified: bounds the cost."""
+    suppression: int = 3
+    """A loop rules out others whose ends together lie within this many keyframes of its own."""
+    max_loops: int = 2
+    """Most loops per keyframe."""
+    retrieval: RetrievalOptions = field(default_factory=RetrievalOptions)
+    verification: VerificationOptions = field(default_factory=VerificationOptions)

@@ -1,0 +1,128 @@
+"""Which earlier keyframes look like an image: an inverted index over binary words."""
+
+from collections.abc import Collection
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Float64, Int64, UInt8
+
+from geogs.loop.features import FeatureExtractor, Features
+from geogs.loop.options import RetrievalOptions
+
+LOOSE = 15
+"""Bits by which the radius of the words grows once the vocabulary is full."""
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """An earlier keyframe that looks alike."""
+
+    keyframe: int
+    score: float
+    """Shared tf-idf mass, of the query's own: 0 nothing in common, 1 the same image."""
+
+
+class AppearanceIndex:
+    """Keyframes by the words they contain.
+
+    The vocabulary needs no training data: a descriptor farther than ``word_radius`` bits from
+    every word becomes a word itself (as in iBoW-LCD, Garcia-Fidalgo & Ortiz 2018, without its
+    merging of words). Words that many keyframes share count little (inverse document frequency).
+    """
+
+    def __init__(self, options: RetrievalOptions | None = None) -> None:
+        self.options = options or RetrievalOptions()
+        self._extract = FeatureExtractor(self.options)
+        self._matcher = cv2.BFMatcher(cv2.NORM_HAMMING)
+        self._words = np.zeros((0, 32), np.uint8)
+        self._postings: list[list[tuple[int, int]]] = []
+        """Of each word, the keyframes that hold it with their row and how often."""
+        self._keyframes: list[int] = []
+        """Keyframe of each row."""
+        self._recent: tuple[Features, np.ndarray, np.ndarray] | None = None
+        """Features last looked up with their words: a keyframe is queried, then added."""
+
+    def __len__(self) -> int:
+        return len(self._keyframes)
+
+    def describe(self, image: UInt8[np.ndarray, "h w 3"]) -> Features:
+        """Features of an image, to be given to :meth:`add` and :meth:`query` in its stead."""
+        return self._extract(image)
+
+    def add(self, keyframe: int, image: UInt8[np.ndarray, "h w 3"] | Features) -> None:
+        """Enter a keyframe; what is new in it becomes words."""
+        features = self._features(image)
+        descriptors = features.descriptors[: self.options.indexed]
+        words, distance = self._nearest(features)
+        room = max(self.options.words - len(self._words), 0)
+        fresh = np.flatnonzero(distance > self._radius)[:room]
+        words = words.copy()
+        words[fresh] = len(self._words) + np.arange(len(fresh))
+        known = distance <= self._radius
+        known[fresh] = True
+        self._words = np.concatenate([self._words, descriptors[fresh]])
+        self._recent = None
+        self._postings.extend([] for _ in fresh)
+        row = len(self._keyframes)
+        self._keyframes.append(keyframe)
+        for word, count in _counts(words[known]):
+            self._postings[word].append((row, count))
+
+    def query(
+        self,
+        image: UInt8[np.ndarray, "h w 3"] | Features,
+        exclude: Collection[int] = (),
+        count: int = 5,
+    ) -> list[Candidate]:
+        """The ``count`` most similar keyframes that are not excluded, best first."""
+        score = self._scores(self._features(image))
+        for row, keyframe in enumerate(self._keyframes):
+            if keyframe in exclude:
+                score[row] = 0.0
+        best = np.argsort(-score, kind="stable")[:count]
+        return [Candidate(self._keyframes[r], float(score[r])) for r in best if score[r] > 0]
+
+    def _scores(self, features: Features) -> Float64[np.ndarray, "rows"]:
+        """Similarity of every row to an image."""
+        rows = len(self._keyframes)
+        score = np.zeros(rows)
+        words, distance = self._nearest(features)
+        known = distance <= self._radius
+        # A word that no keyframe has yet still belongs to what the image is.
+        own = float((~known).sum()) * np.log((rows + 1) / 0.5)
+        for word, count in _counts(words[known]):
+            posting = self._postings[word]
+            weight = max(np.log((rows + 1) / (len(posting) + 0.5)), 0.0)
+            own += weight * count
+            for row, other in posting:
+                score[row] += weight * min(count, other)
+        return score / max(own, 1e-9)
+
+    @property
+    def _radius(self) -> int:
+        full = len(self._words) >= self.options.words
+        return self.options.word_radius + LOOSE * full
+
+    def _features(self, image: UInt8[np.ndarray, "h w 3"] | Features) -> Features:
+        return image if isinstance(image, Features) else self.describe(image)
+
+    def _nearest(self, features: Features) -> tuple[Int64[np.ndarray, "n"], Int64[np.ndarray, "n"]]:
+        """Nearest word of each indexed descriptor and its distance in bits; 256 without a word."""
+        if self._recent is not None and self._recent[0] is features:
+            return self._recent[1:]
+        descriptors = features.descriptors[: self.options.indexed]
+        words = np.zeros(len(descriptors), np.int64)
+        distance = np.full(len(descriptors), 256, np.int64)
+        if len(descriptors) and len(self._words):
+            for match in self._matcher.match(descriptors, self._words):
+                words[match.queryIdx] = match.trainIdx
+                distance[match.queryIdx] = int(match.distance)
+        self._recent = features, words, distance
+        return words, distance
+
+
+def _counts(words: Int64[np.ndarray, "n"]) -> list[tuple[int, int]]:
+    """Each word with how often it occurs, by word."""
+    values, counts = np.unique(words, return_counts=True)
+    return list(zip(values.tolist(), counts.tolist(), strict=True))

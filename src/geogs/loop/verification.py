@@ -1,0 +1,213 @@
+"""Whether two keyframes show one place, and how the cameras stood to each other."""
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float32, Float64, Int64
+from torch import Tensor
+
+from geogs.geometry.camera import Camera
+from geogs.loop.features import Features
+from geogs.loop.options import VerificationOptions
+from geogs.tracking.grid import SampleGrid
+from geogs.tracking.keyframes import KeyframeState
+
+RASTER = 4
+"""Cells per side in which the spread of the inliers is counted."""
+ITERATIONS = 300
+"""Samples drawn for a pose."""
+
+
+@dataclass(frozen=True)
+class TwoView:
+    """What the features of two views say of each other."""
+
+    accepted: bool
+    reason: str
+    """Why not; empty if accepted."""
+    T_ji: Float[Tensor, "4 4"] | None = None
+    """First camera to second, float64. In the first's lengths if metric, else with a translation
+    of length one, which means nothing where the views have no parallax. None without a pose."""
+    is_metric: bool = False
+    scale: float | None = None
+    """Lengths of the second's depth per length of the first's; None unless both have depth."""
+    matches: int = 0
+    inliers: int = 0
+    spread: float = 0.0
+    """Share of the raster's cells that hold inliers, in the poorer image."""
+
+    @property
+    def share(self) -> float:
+        """Inliers of all matches."""
+        return self.inliers / max(self.matches, 1)
+
+
+@dataclass(frozen=True)
+class DepthView:
+    """A view's features and what is known of their depth."""
+
+    features: Features
+    depth: Float32[np.ndarray, "n"] | None = None
+    """z of each feature; 0 where unknown. None if nothing is known."""
+
+    @staticmethod
+    def of(grid: SampleGrid, keyframe: KeyframeState, features: Features) -> "DepthView":
+        """Depth of the features from a keyframe's; known where its nearest cell has information."""
+        points = torch.from_numpy(features.pixels).to(grid.device)
+        inverse = grid.sample_field(keyframe.inverse_depth[:, None], points)[:, 0]
+        cell, inside = grid.cells_of(points)
+        known = inside & (keyframe.information[cell] > 0) & (inverse > 1e-6)
+        depth = torch.where(known, 1 / inverse.clamp(min=1e-6), torch.zeros_like(inverse))
+        return DepthView(features, depth.float().cpu().numpy())
+
+
+class TwoViewVerifier:
+    """Matches features and accepts pairs whose matches agree on one pose."""
+
+    def __init__(self, camera: Camera, options: VerificationOptions | None = None) -> None:
+        self.camera = camera
+        self.options = options or VerificationOptions()
+        self._K = camera.matrix().numpy()
+        self._edge = max(camera.width, camera.height)
+        self._matcher = cv2.BFMatcher(cv2.NORM_HAMMING)
+
+    def verify(self, first: DepthView, second: DepthView) -> TwoView:
+        """Pose of the second view from matches with the first.
+
+        With depth in the first view by PnP, metric; otherwise by the essential matrix. Depth in
+        both must agree at the inliers up to one scale, which is returned.
+        """
+        pairs = self._match(first.features, second.features)
+        if len(pairs) < self.options.min_inliers:
+            return TwoView(False, f"only {len(pairs)} features match", matches=len(pairs))
+        a, b = first.features.pixels[pairs[:, 0]], second.features.pixels[pairs[:, 1]]
+        depth = None if first.depth is None else first.depth[pairs[:, 0]]
+        if depth is not None and int((depth > 0).sum()) >= self.options.min_inliers:
+            a, b, pairs, depth = (x[depth > 0] for x in (a, b, pairs, depth))
+            found = self._resect(a, b, depth)
+        else:
+            depth, found = None, self._epipolar(a, b)
+        if found is None:
+            return TwoView(False, "the matches agree on no pose", matches=len(pairs))
+        T, inlier = found
+        view = TwoView(
+            True,
+            "",
+            torch.from_numpy(T),
+            depth is not None,
+            matches=len(pairs),
+            inliers=int(inlier.sum()),
+            spread=min(self._spread(a[inlier]), self._spread(b[inlier])),
+        )
+        reason = self._weakness(view)
+        if not reason and depth is not None and second.depth is not None:
+            predicted = self._points(a, depth) @ T[2, :3] + T[2, 3]
+            own = second.depth[pairs[:, 1]]
+            scale, reason = self._scale(own[inlier], predicted[inlier])
+            view = replace(view, scale=scale)
+        return replace(view, accepted=not reason, reason=reason)
+
+    def _match(self, first: Features, second: Features) -> Int64[np.ndarray, "m 2"]:
+        """Mutual nearest descriptors that are clearly nearer than the second nearest."""
+        if len(first) < 2 or len(second) < 2:
+            return np.zeros((0, 2), np.int64)
+        there = self._distinct(first, second)
+        back = {(i, j) for j, i in self._distinct(second, first)}
+        return np.array(sorted(set(there) & back), np.int64).reshape(-1, 2)
+
+    def _distinct(self, source: Features, target: Features) -> list[tuple[int, int]]:
+        nearest = self._matcher.knnMatch(source.descriptors, target.descriptors, k=2)
+        ratio = self.options.ratio
+        return [(m.queryIdx, m.trainIdx) for m, n in nearest if m.distance < ratio * n.distance]
+
+    def _points(
+        self, pixels: Float32[np.ndarray, "m 2"], depth: Float32[np.ndarray, "m"]
+    ) -> Float64[np.ndarray, "m 3"]:
+        """Points of the camera frame."""
+        c, z = self.camera, depth.astype(np.float64)
+        x, y = (pixels[:, 0] - c.cx) / c.fx, (pixels[:, 1] - c.cy) / c.fy
+        return np.stack([x * z, y * z, z], -1)
+
+    def _resect(
+        self,
+        a: Float32[np.ndarray, "m 2"],
+        b: Float32[np.ndarray, "m 2"],
+        depth: Float32[np.ndarray, "m"],
+    ) -> tuple[Float64[np.ndarray, "4 4"], Bool[np.ndarray, "m"]] | None:
+        """Pose by RANSAC over SQPnP, refined on its inliers."""
+        points, image = self._points(a, depth), b.astype(np.float64)
+        limit = self.options.reprojection * self._edge
+        ok, r, t, chosen = cv2.solvePnPRansac(
+            points,
+            image,
+            self._K,
+            None,
+            iterationsCount=ITERATIONS,
+            reprojectionError=limit,
+            flags=cv2.SOLVEPNP_SQPNP,
+        )
+        if not ok or chosen is None or len(chosen) < 6:
+            return None
+        chosen = chosen[:, 0]
+        r, t = cv2.solvePnPRefineLM(points[chosen], image[chosen], self._K, None, r, t)
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = cv2.Rodrigues(r)[0], t[:, 0]
+        moved = points @ T[:3, :3].T + T[:3, 3]
+        shown = cv2.projectPoints(points, r, t, self._K, None)[0][:, 0]
+        inlier = (moved[:, 2] > 0) & (np.linalg.norm(shown - image, axis=1) < limit)
+        return (T, inlier) if np.isfinite(T).all() else None
+
+    def _epipolar(
+        self, a: Float32[np.ndarray, "m 2"], b: Float32[np.ndarray, "m 2"]
+    ) -> tuple[Float64[np.ndarray, "4 4"], Bool[np.ndarray, "m"]] | None:
+        """Pose by MAGSAC over essential matrices; the translation has length one."""
+        E, mask = cv2.findEssentialMat(
+            a.astype(np.float64),
+            b.astype(np.float64),
+            self._K,
+            method=cv2.USAC_MAGSAC,
+            prob=0.999,
+            threshold=self.options.epipolar * self._edge,
+        )
+        if E is None or E.shape != (3, 3):
+            return None
+        # Points at any distance count: a revisit may have no parallax at all.
+        _, R, t, ahead, _ = cv2.recoverPose(
+            E, a.astype(np.float64), b.astype(np.float64), self._K, distanceThresh=1e6, mask=mask
+        )
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = R, t[:, 0]
+        return T, ahead[:, 0] > 0
+
+    def _spread(self, pixels: Float32[np.ndarray, "m 2"]) -> float:
+        size = np.array([self.camera.width, self.camera.height])
+        cell = np.clip((pixels + 0.5) * RASTER / size, 0, RASTER - 1).astype(int)
+        return len(np.unique(cell @ [1, RASTER])) / RASTER**2
+
+    def _weakness(self, view: TwoView) -> str:
+        o = self.options
+        if view.inliers < o.min_inliers:
+            return f"only {view.inliers} matches agree with the pose"
+        if view.share < o.min_share:
+            return f"only {view.share:.0%} of the matches agree with the pose"
+        if view.spread < o.min_spread:
+            return f"the matches fill only {view.spread:.0%} of the image"
+        return ""
+
+    def _scale(
+        self, own: Float32[np.ndarray, "m"], predicted: Float64[np.ndarray, "m"]
+    ) -> tuple[float | None, str]:
+        """Median ratio of the second's depth to the first's, and a refusal if few keep to it."""
+        known = own > 0
+        if int(known.sum()) < self.options.min_inliers // 2:
+            return None, ""
+        ratio = np.log(own[known] / predicted[known])
+        middle = float(np.median(ratio))
+        if abs(middle) > np.log(self.options.max_scale):
+            return None, f"the depths differ by a factor of {np.exp(abs(middle)):.1f}"
+        share = float((np.abs(ratio - middle) < self.options.depth_tolerance).mean())
+        if share < self.options.min_consistent:
+            return None, f"the depths agree at only {share:.0%} of the matches"
+        return float(np.exp(middle)), ""
