@@ -22,6 +22,7 @@ from torch import Tensor
 from geogs.geometry.lie import (
     retract,
     sim3_adjoint,
+    sim3_exp,
     sim3_inverse,
     sim3_left_jacobian,
     sim3_log,
@@ -93,9 +94,13 @@ class PoseGraph:
 class PoseGraphOptions:
     """How a graph is adjusted."""
 
-    loop_threshold: float = 18.5
-    """Squared error, in squared standard deviations, at which a loop's influence fades; the 99th
-    percentile of chi^2 with seven degrees of freedom."""
+    loop_threshold: float = 37.0
+    """Squared error, in squared standard deviations, at which a loop's influence fades: twice the
+    99th percentile of chi^2 with seven degrees of freedom, so that most true loops keep most."""
+    drift: float = 9.0
+    """Factor of the covariance of trusted edges when there are loops. Odometry errs alike from step
+    to step, and what a whole chain errs is more than its steps tell; a true loop would lose to
+    it."""
     convexity_step: float = 2.0
     """Factor by which the kernel is sharpened from stage to stage."""
     stage_iterations: int = 2
@@ -149,11 +154,12 @@ def relative_jacobians(
 ) -> tuple[Float[Tensor, "e 7 7"], Float[Tensor, "e 7 7"]]:
     """d error / d xi of source and target (left perturbations), exact.
 
-    A motion of the source reaches the error's left through Ad(G), one of the target its right:
-    Jl(e)^-1 Ad(G) and -Jl(-e)^-1.
+    A motion of the source reaches the error's left through Ad(G), one of the target through
+    Ad(Exp(e)): Jl(e)^-1 Ad(G) and -Jl(e)^-1 Ad(Exp(e)) = -Jr(e)^-1.
     """
-    left = torch.linalg.solve(sim3_left_jacobian(error), sim3_adjoint(relative.G))
-    return left, -torch.linalg.inv(sim3_left_jacobian(-error))
+    reach = torch.cat([sim3_adjoint(relative.G), -sim3_adjoint(sim3_exp(error))], -1)
+    both = torch.linalg.solve(sim3_left_jacobian(error), reach)
+    return both[..., :7], both[..., 7:]
 
 
 def solve(graph: PoseGraph, options: PoseGraphOptions | None = None) -> PoseGraphResult:
@@ -208,6 +214,11 @@ class _Problem:
 
     def __init__(self, graph: PoseGraph, options: PoseGraphOptions) -> None:
         self.graph, self.options = graph, options
+        relative = graph.relative
+        trust = 1 / options.drift if bool(relative.is_loop.any()) else 1.0
+        self._information = torch.where(
+            relative.is_loop[:, None], relative.information, trust * relative.information
+        )
 
     def widths(self, state: _State) -> list[float]:
         """Widening of the kernel's threshold from stage to stage; the last is 1."""
@@ -272,7 +283,7 @@ class _Problem:
         )
 
     def _squares(self, error: Float[Tensor, "e 7"]) -> Float[Tensor, "e"]:
-        return (self.graph.relative.information * error.square()).sum(-1)
+        return (self._information * error.square()).sum(-1)
 
     def _step(
         self, state: _State, width: float, linear: LinearMatches, damping: float
@@ -294,7 +305,7 @@ class _Problem:
         relative = self.graph.relative
         e = relative_errors(state.S, relative)
         J_i, J_j = relative_jacobians(relative, e)
-        W = relative.information * self.weights(e, width)[:, None]
+        W = self._information * self.weights(e, width)[:, None]
         i, j = relative.source, relative.target
         WJ_i, WJ_j, r = W[..., None] * J_i, W[..., None] * J_j, (W * e)[..., None]
         cross = J_i.mT @ WJ_j
