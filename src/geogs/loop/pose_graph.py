@@ -82,8 +82,8 @@ class RelativePoses:
 class PoseGraph:
     """What is adjusted."""
 
-    T_cw: Float[Tensor, "n 4 4"]
-    """World to camera of each keyframe, float64."""
+    start: Float[Tensor, "n 4 4"]
+    """World to camera of each keyframe in its own unit, float64; at first simply its pose."""
     relative: RelativePoses
     fixed: Bool[Tensor, "n"]
     """Keyframes whose similarity stays; at least one, or the world is undetermined."""
@@ -104,11 +104,12 @@ class PoseGraphOptions:
     convexity_step: float = 2.0
     """Factor by which the kernel is sharpened from stage to stage."""
     stage_iterations: int = 2
-    """Steps of every stage but the last."""
+    """Most steps of every other stage."""
     iterations: int = 20
-    """Steps of the last stage at most."""
+    """Most steps of the last stage."""
     tolerance: float = 1e-9
-    """The last stage ends when a step lowers the cost by no more than this fraction of it."""
+    """A stage ends when a step lowers the cost by no more than this fraction of it, or when less
+    than this is left, in squared standard deviations."""
     damping: float = 1e-8
     """Levenberg damping at the start, relative to the diagonal."""
     max_damping: float = 1e4
@@ -169,9 +170,9 @@ def solve(graph: PoseGraph, options: PoseGraphOptions | None = None) -> PoseGrap
     Every step lowers the cost at its stage; the result is deterministic.
     """
     options = options or PoseGraphOptions()
-    none = torch.zeros(len(graph.T_cw), 0)
+    none = torch.zeros(len(graph.start), 0)
     depth = none if graph.matches is None else graph.matches.inverse_depth
-    start = _State(graph.T_cw.double(), depth)
+    start = _State(graph.start.double(), depth)
     problem = _Problem(graph, options)
     state, steps = start, 0
     for width in problem.widths(start):
@@ -267,7 +268,7 @@ class _Problem:
             damping = max(damping / 10, self.options.damping)
             linear = self.linearise(state, damping)
             cost = self.cost(state, width, linear.valid)
-            if gain <= self.options.tolerance * cost:
+            if gain <= self.options.tolerance * cost or cost < self.options.tolerance:
                 break
         return state, steps
 

@@ -47,7 +47,7 @@ def gauss_newton_step(
     diagonal of the system without depths. The matches' weights are Huber's at the given state.
     """
     assert graph.matches is not None
-    m, S = graph.matches, graph.T_cw
+    m, S = graph.matches, graph.start
     n, p = m.inverse_depth.shape
     zero = torch.zeros(n, 7, dtype=torch.float64), torch.zeros(n, p, dtype=torch.float64)
     Je = torch.func.jacrev(lambda x: relative_residuals(graph.relative, S, x).reshape(-1))(zero[0])
