@@ -351,7 +351,7 @@ def test_false_loops_are_outvoted(name):
 def test_odometry_alone_could_not_tell_the_next_bay():
     d = drive()
     relative = joined(d.odometry, loops(d, 20), next_bay(d, 12))
-    pairs, alone = cycle_errors(d.T_cw, relative, ConsistencyOptions().drift)
+    pairs, alone = cycle_errors(d.T_cw, relative, ConsistencyOptions())
     limit = ConsistencyOptions().threshold
     assert alone.max() < limit
     assert pairs[20:, 20:].max() < limit  # they support each other
@@ -367,6 +367,15 @@ def test_the_kernel_alone_resists_random_loops():
     assert weight[:20].min() > 0.3
     assert weight[20:].max() < 0.01
     assert ate(d, result.S) <= 1.2 * ate(d, clean.S)
+
+
+def test_the_vote_forgives_odometry_that_is_too_sure_of_itself():
+    d = drive()
+    relative = joined(d.odometry, loops(d, 20), random_loops(10), next_bay(d, 12))
+    sure = torch.where(relative.is_loop[:, None], 1.0, 10.0) * relative.information
+    keep = consistent_loops(d.T_cw, replace(relative, information=sure))[relative.is_loop]
+    assert keep[:20].all()
+    assert not keep[20:].any()
 
 
 def test_a_lone_loop_needs_support_if_asked_for():

@@ -11,7 +11,7 @@ more often. Source: pairwise consistency maximisation (Mangelson et al. 2018), g
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from geogs.errors import GeogsError
@@ -23,52 +23,69 @@ from geogs.loop.pose_graph import RelativePoses
 class ConsistencyOptions:
     """When loops agree."""
 
-    threshold: float = 24.3
-    """Squared error, in squared standard deviations, up to which two loops agree; the 99.9th
-    percentile of chi^2 with seven degrees of freedom."""
+    threshold: float = 35.3
+    """Squared error, in squared standard deviations, up to which two loops agree; exceeded once in
+    100 000 times by chi^2 with seven degrees of freedom, as many loops have very many pairs."""
     drift: float = 9.0
-    """Factor of the odometry's covariance: errors repeat from step to step, which no information
-    of a single step tells."""
+    """Factor of the odometry's covariance, as in the adjustment."""
+    bias: float = 0.5
+    """Part of a step's deviation that may be the same at every step of the camera, as a drift in
+    scale is; it adds up along a chain, where the rest partly cancels."""
     support: int = 1
     """Pairs of keyframes that have to agree before any loop is believed."""
 
 
-def drift_covariance(
-    T_cw: Float[Tensor, "n 4 4"], relative: RelativePoses
-) -> Float[Tensor, "n 7 7"]:
-    """Covariance of the drift from the first keyframe to each, in the frame of the world.
+@dataclass(frozen=True)
+class Drift:
+    """What odometry may have drifted from the first keyframe to each, in the frame of the world."""
 
-    Steps between consecutive keyframes count, the surest edge of each; a step that none covers is
-    as unsure as the worst that is covered. The drift between keyframes a < b has the difference.
-    Raises GeogsError if no edge joins consecutive keyframes.
+    covariance: Float[Tensor, "n 7 7"]
+    """Of what is new at every step, summed up."""
+    bias: Float[Tensor, "n 7 7"]
+    """One column for each number of the tangent, were it wrong by the same amount at every step."""
+
+    def between(self, a: Int[Tensor, "l"], b: Int[Tensor, "l"]) -> Float[Tensor, "l 7 7"]:
+        """Covariance of the drift between keyframes, in either order."""
+        first, last = torch.minimum(a, b), torch.maximum(a, b)
+        constant = self.bias[last] - self.bias[first]
+        return self.covariance[last] - self.covariance[first] + constant @ constant.mT
+
+
+def odometry_drift(
+    T_cw: Float[Tensor, "n 4 4"], relative: RelativePoses, options: ConsistencyOptions
+) -> Drift:
+    """Drift along the steps between consecutive keyframes, each by its surest trusted edge.
+
+    A step that no edge covers is as unsure as the worst that is covered. Raises GeogsError if no
+    edge joins consecutive keyframes.
     """
-    n = len(T_cw)
     trusted = ~relative.is_loop & ((relative.target - relative.source).abs() == 1)
     edges = relative.select(trusted & (relative.information > 0).all(1))
     if not len(edges):
         raise GeogsError("No relative pose joins consecutive keyframes, so drift is unknown.")
-    carry = sim3_adjoint(se3_inverse(T_cw[edges.target]))
-    covariance = (carry / edges.information[:, None]) @ carry.mT
-    # An edge's translation is as sure as its frame's, wherever the world's origin lies.
-    unsure = (1 / edges.information).sum(1)
+    variance = 1 / edges.information
+    order = torch.argsort(variance.sum(1), descending=True, stable=True)
     step = torch.minimum(edges.source, edges.target)
-    order = torch.argsort(unsure, descending=True, stable=True)
-    steps = covariance[order[0]].repeat(max(n - 1, 0), 1, 1)
+    chosen = variance[order[0]].repeat(len(T_cw) - 1, 1)
     for e in order.tolist():  # the surest comes last and stays
-        steps[step[e]] = covariance[e]
-    return torch.cat([steps.new_zeros(1, 7, 7), steps.cumsum(0)])
+        chosen[step[e]] = variance[e]
+    carry = sim3_adjoint(se3_inverse(T_cw[1:]))
+    steps = options.drift * (carry * chosen[:, None]) @ carry.mT
+    bias = options.bias * carry * chosen.sqrt()[:, None]
+    none = steps.new_zeros(1, 7, 7)
+    return Drift(torch.cat([none, steps.cumsum(0)]), torch.cat([none, bias.cumsum(0)]))
 
 
 def cycle_errors(
-    T_cw: Float[Tensor, "n 4 4"], relative: RelativePoses, drift: float
+    T_cw: Float[Tensor, "n 4 4"], relative: RelativePoses, options: ConsistencyOptions
 ) -> tuple[Float[Tensor, "l l"], Float[Tensor, "l"]]:
     """Squared errors, in squared standard deviations, of the loops of a graph among themselves.
 
     Of each cycle of two loops with the odometry between them, and of each loop with the odometry
-    between its ends; ``drift`` multiplies the odometry's covariance.
+    between its ends.
     """
     loops = relative.select(relative.is_loop)
-    total = drift * drift_covariance(T_cw, relative)
+    drift = odometry_drift(T_cw, relative, options)
     back = se3_inverse(T_cw[loops.target])
     D = back @ loops.G @ T_cw[loops.source]
     carry = sim3_adjoint(back)
@@ -78,10 +95,11 @@ def cycle_errors(
     # All claims run from the earlier keyframe to the later.
     turned = (loops.source > loops.target)[:, None, None]
     D = torch.where(turned, sim3_inverse(D), D)
-    alone = _squares(sim3_log(D), own + total[second] - total[first])
+    alone = _squares(sim3_log(D), own + drift.between(first, second))
     rows = []
     for a in range(len(loops)):
-        between = _gap(total, first, first[a]) + _gap(total, second, second[a])
+        here, there = first[a].expand_as(first), second[a].expand_as(second)
+        between = drift.between(first, here) + drift.between(second, there)
         rows.append(_squares(sim3_log(D @ sim3_inverse(D[a])), own + own[a] + between))
     pairs = torch.stack(rows) if rows else alone.new_zeros(0, 0)
     return torch.maximum(pairs, pairs.mT), alone
@@ -102,7 +120,7 @@ def consistent_loops(
     keep = ~relative.is_loop
     if not bool(relative.is_loop.any()):
         return keep
-    pairs, alone = cycle_errors(T_cw, relative, options.drift)
+    pairs, alone = cycle_errors(T_cw, relative, options)
     plausible = alone <= options.threshold
     agree = (pairs <= options.threshold) & plausible & plausible[:, None]
     loops = relative.select(relative.is_loop)
@@ -132,11 +150,6 @@ def _grow(agree: Bool[Tensor, "l l"], seed: int) -> list[int]:
         open_to &= agree[taken]
         open_to[taken] = False
     return sorted(party)
-
-
-def _gap(total: Float[Tensor, "n 7 7"], a: Tensor, b: Tensor) -> Float[Tensor, "l 7 7"]:
-    """Covariance of the drift between keyframes, in either order."""
-    return total[torch.maximum(a, b)] - total[torch.minimum(a, b)]
 
 
 def _squares(error: Float[Tensor, "l 7"], covariance: Float[Tensor, "l 7 7"]) -> Float[Tensor, "l"]:
