@@ -3,11 +3,13 @@
 import math
 from dataclasses import dataclass
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from geogs.geometry.lie import se3_inverse, so3_log
 from geogs.loop.options import VerificationOptions
+from geogs.tracking.bundle import project
 from geogs.tracking.flow.base import FlowOperator
 from geogs.tracking.grid import SampleGrid
 from geogs.tracking.keyframes import KeyframeState, scaled
@@ -29,6 +31,8 @@ class DenseCheck:
     """Share of the cells whose flow agrees with the pose, in the poorer direction."""
     residual: float = math.inf
     """Median error of the reprojection in pixels, in the poorer direction."""
+    contradiction: float = 1.0
+    """Share of one view's surface through which the other sees, in the poorer direction."""
 
 
 def dense_check(
@@ -43,7 +47,8 @@ def dense_check(
     """Measure the flow between two keyframes from their supposed relative pose, and judge it.
 
     Both directions are located on their own, each on the depth of its source; their poses must
-    turn alike and both views' depth must agree up to one scale. ``T_ji`` is in the first's
+    turn alike, both views' depth must agree up to one scale where they match, and where they do
+    not match neither may see through what the other shows. ``T_ji`` is in the first's
     lengths, ``scale`` as in :class:`DenseCheck`.
     """
     o = options or VerificationOptions()
@@ -59,6 +64,11 @@ def dense_check(
     T_back = back.T_cw @ se3_inverse(second.T_cw)
     ratios = _depth_ratios(grid, first, second, there, T_there)
     scale_dense, agreeing = _consensus(ratios, o.depth_tolerance)
+    T_far = se3_inverse(scaled(T_there, scale_dense))
+    contradiction = max(
+        _seen_through(grid, first, second, T_there, scale_dense, o.depth_tolerance),
+        _seen_through(grid, second, first, T_far, 1 / scale_dense, o.depth_tolerance),
+    )
     turn = math.degrees(float(so3_log((T_back @ T_there)[:3, :3]).norm()))
     if matched < o.min_matched:
         reason = f"the flow agrees on only {matched:.0%} of the image"
@@ -68,9 +78,11 @@ def dense_check(
         reason = f"the depths agree at only {agreeing:.0%} of the matches"
     elif abs(math.log(scale_dense)) > math.log(o.max_scale):
         reason = f"the depths differ by a factor of {scale_dense:.2f}"
+    elif contradiction > o.max_contradiction:
+        reason = f"one sees through {contradiction:.0%} of what the other shows"
     else:
         reason = ""
-    return DenseCheck(not reason, reason, T_there, scale_dense, matched, residual)
+    return DenseCheck(not reason, reason, T_there, scale_dense, matched, residual, contradiction)
 
 
 def _depth_ratios(
@@ -97,3 +109,36 @@ def _consensus(ratios: Float[Tensor, "m"], tolerance: float) -> tuple[float, flo
         return 1.0, 0.0
     middle = ratios.median()
     return float(middle.exp()), float(((ratios - middle).abs() < tolerance).float().mean())
+
+
+def _seen_through(
+    grid: SampleGrid,
+    source: KeyframeState,
+    target: KeyframeState,
+    T_ts: Float[Tensor, "4 4"],
+    scale: float,
+    tolerance: float,
+) -> float:
+    """Share of the source's surface in the target's view behind which the target has its own.
+
+    Surface that the target has before it is occluded and does not count; 1 where nothing is left.
+    """
+    T = T_ts.to(grid.rays)
+    shown = project(grid.camera, grid.rays, T_ts[None], source.inverse_depth[None])
+    pixels = shown.pixels[0]
+    forward = (grid.rays @ T[:3, :3].mT + source.inverse_depth[:, None] * T[:3, 3])[:, 2]
+    cell, inside = grid.cells_of(pixels)
+    known = inside & shown.valid[0] & (forward > 1e-6) & (source.inverse_depth > 1e-9)
+    known = known & (source.information > 0) & (target.information[cell] > 0)
+    # The nearest of the cells around, so that no edge of a surface passes for a gap in it.
+    image = target.inverse_depth.reshape(1, 1, grid.height, grid.width)
+    nearest = torch.nn.functional.max_pool2d(image, 3, 1, 1).reshape(-1)[cell]
+    expected = (source.inverse_depth / (scale * forward.clamp(min=1e-6))).clamp(min=1e-9)
+    ratio = (nearest.clamp(min=1e-9) / expected).log()[known]
+    farthest = -torch.nn.functional.max_pool2d(-image, 3, 1, 1).reshape(-1)[cell]
+    behind = (ratio < -tolerance).sum()
+    same = (
+        (ratio >= -tolerance) & ((farthest.clamp(min=1e-9) / expected)[known].log() <= tolerance)
+    ).sum()
+    total = int(behind + same)
+    return float(behind) / total if total else 1.0

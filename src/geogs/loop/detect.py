@@ -19,7 +19,7 @@ from geogs.tracking.graph import frame_distances
 from geogs.tracking.keyframes import KeyframeStore
 
 Source = Literal["geometry", "appearance"]
-"""What proposed a pair: the present poses, or the looks."""
+"""What proposed a pair: the present poses, or nothing but the looks."""
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,11 @@ class LoopDetector:
         by_pose, by_looks = self._by_pose(id, old), self._by_looks(id, set(old))
         turns: list[Proposal] = []
         for n in range(max(len(by_pose), len(by_looks))):
-            turns += [Proposal(k, id, "appearance") for k in by_looks[n : n + 1]]
+            # Where the poses agree with the looks, the flow may start from them if features fail.
+            turns += [
+                Proposal(k, id, "geometry" if k in by_pose else "appearance")
+                for k in by_looks[n : n + 1]
+            ]
             turns += [Proposal(k, id, "geometry") for k in by_pose[n : n + 1]]
         kept: list[Proposal] = []
         for p in turns:

@@ -32,7 +32,7 @@ class FeatureExtractor:
 
     def __init__(self, options: RetrievalOptions) -> None:
         self.count = options.features
-        self._orb = cv2.ORB_create(
+        self._orb = cv2.ORB.create(
             nfeatures=round(SURPLUS * options.features), fastThreshold=options.fast_threshold
         )
 
@@ -46,15 +46,15 @@ class FeatureExtractor:
         strength = np.array([p.response for p in points])
         order = _spread(pixels, strength, grey.shape)[: self.count]
         # Descriptors come back in another order: OpenCV sorts by scale.
-        kept = []
+        kept: list[cv2.KeyPoint] = []
         for n in order:
             points[n].class_id = len(kept)
             kept.append(points[n])
-        kept, descriptors = self._orb.compute(grey, kept)
+        described, descriptors = self._orb.compute(grey, kept)
         if descriptors is None:
             return Features(np.zeros((0, 2), np.float32), np.zeros((0, 32), np.uint8))
-        back = np.argsort([p.class_id for p in kept], kind="stable")
-        pixels = np.array([p.pt for p in kept], np.float32)
+        back = np.argsort([p.class_id for p in described], kind="stable")
+        pixels = np.array([p.pt for p in described], np.float32)
         return Features(pixels[back], descriptors[back])
 
 

@@ -23,14 +23,16 @@ class RetrievalOptions:
 class VerificationOptions:
     """When two views count as views of one place."""
 
-    ratio: float = 0.8
+    ratio: float = 0.87
     """A match must be this much nearer than the second nearest descriptor."""
     reprojection: float = 0.006
     """Largest error of an inlier of the pose, of the long edge."""
     epipolar: float = 0.002
     """Largest distance of an inlier from its epipolar line, of the long edge."""
-    min_inliers: int = 25
+    min_inliers: int = 15
     """Fewest matches that agree with the pose."""
+    min_epipolar: int = 25
+    """The same where no depth is known and a match binds only half as much."""
     min_share: float = 0.3
     """Least share of all matches that do."""
     min_spread: float = 0.25
@@ -42,10 +44,13 @@ class VerificationOptions:
     """Least share of the inliers with depth in both views for which they do."""
     max_scale: float = 3.0
     """Largest factor between the scales of both views' depths, either way."""
-    min_matched: float = 0.12
+    min_matched: float = 0.15
     """Dense check: least share of the cells whose flow agrees with the pose, in each direction."""
-    max_residual: float = 0.006
+    max_residual: float = 0.0033
     """Dense check: largest median reprojection error of the flow, of the long edge."""
+    max_contradiction: float = 0.25
+    """Dense check: largest share of the surface of one view, where the other looks at it, through
+    which the other sees; what tells rooms apart that share their pictures but not their shape."""
     max_turn: float = 3.0
     """Dense check: largest rotation in degrees between the poses found in the two directions."""
 

@@ -188,7 +188,7 @@ class TwoViewVerifier:
 
     def _weakness(self, view: TwoView) -> str:
         o = self.options
-        if view.inliers < o.min_inliers:
+        if view.inliers < (o.min_inliers if view.is_metric else o.min_epipolar):
             return f"only {view.inliers} matches agree with the pose"
         if view.share < o.min_share:
             return f"only {view.share:.0%} of the matches agree with the pose"

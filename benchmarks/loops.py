@@ -1,0 +1,270 @@
+"""Find loops in folders with known poses and print precision, recall and cost.
+
+    python benchmarks/loops.py FOLDER[:POINTS.ply] ... [--every 5] [--long-edge 512] [--drift 1]
+
+Each FOLDER is one that benchmarks/tracking.py reads. POINTS.ply holds points of the visible
+surface; without it, points_seen_1cm.ply or tsdf_pseudo_gt.ply of the folder is taken. No tracker
+runs: keyframes are every n-th frame with depth from the points (3 % smooth error) and true poses
+with a drift (a random walk of 0.3 degrees, 4 mm and 1 % scale per keyframe, times --drift). Ground
+truth says which pairs show the same surface (at least 30 % of both images) and whether a relative
+pose is right (3 degrees, 5 % of the median depth).
+"""
+
+import argparse
+import time
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from plyfile import PlyData
+
+from geogs.geometry.lie import se3_exp, se3_inverse, so3_log
+from geogs.loop.dense import dense_check
+from geogs.loop.detect import LoopDetector
+from geogs.loop.options import LoopConfig
+from geogs.loop.retrieval import AppearanceIndex
+from geogs.loop.verification import DepthView, TwoViewVerifier
+from geogs.tracking.flow.classical import ClassicalFlow
+from geogs.tracking.grid import SampleGrid
+from geogs.tracking.keyframes import KeyframeStore
+from tracking import Sequence, load
+
+OVERLAP, DEGREES, SHARE_OF_DEPTH = 0.3, 3.0, 0.05
+SIMILAR = 30.0
+"""Degrees within which two directions count as similar."""
+
+
+@dataclass
+class Clock:
+    """CPU time per named step in milliseconds."""
+
+    spent: dict[str, list[float]] = field(default_factory=dict)
+
+    def __call__(self, name: str, work: Callable[[], Any]) -> Any:
+        """Do the work and remember how long it took."""
+        start = time.process_time()
+        out = work()
+        self.spent.setdefault(name, []).append(1e3 * (time.process_time() - start))
+        return out
+
+    def report(self) -> str:
+        """Mean per call."""
+        return ", ".join(f"{k} {np.mean(v):.1f}" for k, v in self.spent.items())
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What really is."""
+
+    T_cw: torch.Tensor
+    depth: torch.Tensor
+    """(n, p) on the grid, metres; inf where empty."""
+    overlap: np.ndarray
+    """(n, n) share of the cells of both images that show the same surface."""
+    scale: np.ndarray
+    """Drifted lengths per metre of each keyframe."""
+
+    def turn(self, first: int, second: int) -> float:
+        """Degrees between two orientations."""
+        R = self.T_cw[second][:3, :3] @ self.T_cw[first][:3, :3].mT
+        return float(torch.rad2deg(so3_log(R).norm()))
+
+    def right(self, first: int, second: int, T_ji: torch.Tensor) -> bool:
+        """Whether a relative pose, in the drifted lengths of the first, is right."""
+        true = self.T_cw[second] @ se3_inverse(self.T_cw[first])
+        turn = float(torch.rad2deg(so3_log(T_ji[:3, :3] @ true[:3, :3].mT).norm()))
+        shift = float((T_ji[:3, 3] / self.scale[first] - true[:3, 3]).norm())
+        middle = float(self.depth[first][self.depth[first].isfinite()].median())
+        return turn < DEGREES and shift < SHARE_OF_DEPTH * middle
+
+
+def depths(points: np.ndarray, T_wc: np.ndarray, grid: SampleGrid) -> np.ndarray:
+    """Nearest point in every cell from each pose."""
+    out = np.full((len(T_wc), grid.size), np.inf)
+    cam = grid.camera
+    for T, depth in zip(T_wc, out, strict=True):
+        p = (points - T[:3, 3]) @ T[:3, :3]
+        p = p[p[:, 2] > 0.05]
+        pixels = [cam.fx, cam.fy] * p[:, :2] / p[:, 2:] + [cam.cx, cam.cy]
+        cell, inside = grid.cells_of(torch.from_numpy(pixels))
+        np.minimum.at(depth, cell[inside].numpy(), p[inside.numpy(), 2])
+    return out
+
+
+def overlaps(depth: np.ndarray, T_wc: np.ndarray, grid: SampleGrid) -> np.ndarray:
+    """Share of the cells of both images that show the same surface, for all pairs."""
+    n, cam, rays = len(depth), grid.camera, grid.rays.double().numpy()
+    seen = np.zeros((n, n))
+    for i in range(n):
+        good = np.isfinite(depth[i])
+        world = (rays[good] * depth[i][good, None]) @ T_wc[i, :3, :3].T + T_wc[i, :3, 3]
+        for j in range(n):
+            p = (world - T_wc[j, :3, 3]) @ T_wc[j, :3, :3]
+            z = np.maximum(p[:, 2], 1e-6)
+            pixels = [cam.fx, cam.fy] * p[:, :2] / z[:, None] + [cam.cx, cam.cy]
+            cell, inside = grid.cells_of(torch.from_numpy(pixels))
+            same = np.abs(depth[j][cell.numpy()] - p[:, 2]) < 0.06 * p[:, 2] + 0.03
+            seen[i, j] = (inside.numpy() & (p[:, 2] > 0.05) & same).sum() / grid.size
+    return np.minimum(seen, seen.T)
+
+
+def prepare(
+    folder: Path, points: Path, every: int, long_edge: int, drift: float
+) -> tuple[KeyframeStore, ClassicalFlow, Truth]:
+    """Keyframes as a drifting tracker would have left them, and the truth about them."""
+    whole = load(folder, long_edge, None)
+    sequence = Sequence(whole.files[::every], whole.camera, whole.T_wc[::every], None)
+    grid = SampleGrid(sequence.camera)
+    vertex = PlyData.read(str(points))["vertex"]
+    cloud = np.stack([vertex[a] for a in "xyz"], -1).astype(np.float64)
+    depth = depths(cloud, sequence.T_wc, grid)
+    T_cw = se3_inverse(torch.from_numpy(sequence.T_wc))
+    rng = np.random.default_rng(0)
+    scale = np.exp(np.cumsum(drift * 0.01 * rng.standard_normal(len(depth))))
+    store, operator = KeyframeStore(grid), ClassicalFlow(grid)
+    T = T_cw[0]
+    for n, frame in enumerate(sequence.frames()):
+        if n:
+            step = T_cw[n] @ se3_inverse(T_cw[n - 1])
+            step[:3, 3] *= scale[n]
+            noise = rng.standard_normal(6) * ([0.004] * 3 + [np.radians(0.3)] * 3)
+            T = se3_exp(torch.from_numpy(drift * noise)) @ step @ T
+        state = store.add(n * every, n / 30, frame.image, operator.encode(frame.image), T)
+        coarse = rng.standard_normal((5, 8)).astype(np.float32)
+        smooth = cv2.resize(coarse, (grid.width, grid.height), interpolation=cv2.INTER_CUBIC)
+        z = torch.from_numpy(depth[n] * scale[n] * np.exp(0.03 * smooth.reshape(-1))).float()
+        state.information = z.isfinite().float()
+        state.inverse_depth = grid.fill(torch.where(z.isfinite(), 1 / z, 0.0), state.information)
+    overlap = overlaps(depth, sequence.T_wc, grid)
+    return store, operator, Truth(T_cw, torch.from_numpy(depth), overlap, scale)
+
+
+def separate(store: KeyframeStore, operator: ClassicalFlow, truth: Truth, gap: int) -> None:
+    """Retrieval, then verification of all that it returned, with and without depth."""
+    clock, index = Clock(), AppearanceIndex()
+    verifier, features = TwoViewVerifier(store.grid.camera), {}
+    precision, recall, best = [], [], []
+    judged: list[tuple[float, ...]] = []
+    counts = {name: np.zeros(4, int) for name in ("essential", "pnp", "pnp + flow")}
+    scale_error: list[float] = []
+    reasons: Counter[str] = Counter()
+    queries = alike = 0
+    for k in store.ids:
+        features[k] = clock("extract", lambda k=k: index.describe(store[k].image))
+        old = [i for i in store.ids if i < k - gap]
+        exclude = set(store.ids) - set(old)
+        found = clock("query", lambda k=k, e=exclude: index.query(features[k], e))
+        clock("add", lambda k=k: index.add(k, features[k]))
+        wanted = [i for i in old if truth.overlap[i, k] > OVERLAP]
+        if wanted:
+            queries += 1
+            similar = any(truth.turn(i, k) < SIMILAR for i in wanted)
+            alike += similar
+            hits = [c.keyframe in wanted for c in found]
+            precision.append(np.mean(hits) if hits else 0.0)
+            recall.append(any(hits))
+            best.append(bool(hits) and hits[0])
+        closed = dict.fromkeys(counts, False)
+        for c in found:
+            i = c.keyframe
+            views = [DepthView.of(store.grid, store[n], features[n]) for n in (i, k)]
+            bare = [DepthView(v.features) for v in views]
+            plain = clock("essential", lambda v=bare: verifier.verify(*v))
+            if plain.accepted:
+                true = truth.T_cw[k] @ se3_inverse(truth.T_cw[i])
+                turn = torch.rad2deg(so3_log(plain.T_ji[:3, :3] @ true[:3, :3].mT).norm())
+                counts["essential"][:2] += [1, turn < DEGREES]
+                closed["essential"] |= bool(turn < DEGREES)
+            view = clock("pnp", lambda v=views: verifier.verify(*v))
+            if not view.accepted:
+                reasons[" ".join(w for w in view.reason.split() if not w[0].isdigit())] += 1
+                continue
+            ok = truth.right(i, k, view.T_ji)
+            counts["pnp"][:2] += [1, ok]
+            closed["pnp"] |= ok
+            if ok and view.scale:
+                scale_error.append(abs(np.log(view.scale * truth.scale[i] / truth.scale[k])))
+            check = clock(
+                "flow",
+                lambda i=i, k=k, v=view: dense_check(
+                    store.grid, operator, store[i], store[k], v.T_ji, v.scale or 1.0
+                ),
+            )
+            if check.T_ji is not None:
+                ok = truth.right(i, k, check.T_ji)
+                judged.append((ok, check.matched, check.residual, check.contradiction))
+            if check.accepted:
+                ok = truth.right(i, k, check.T_ji)
+                counts["pnp + flow"][:2] += [1, ok]
+                closed["pnp + flow"] |= ok
+        for name in counts:
+            counts[name][2] += closed[name] and bool(wanted)
+            counts[name][3] += closed[name] and bool(wanted) and similar
+    print(
+        f"  retrieval: {queries} keyframes see an old place; precision@5 {np.mean(precision):.2f}, "
+        f"recall@5 {np.mean(recall):.2f}, first right {np.mean(best):.2f}"
+    )
+    for name, (accepted, right, closed_at, of_alike) in counts.items():
+        print(
+            f"  {name}: {accepted} accepted, precision {right / max(accepted, 1):.3f}, "
+            f"recall {closed_at / max(queries, 1):.2f} of these keyframes, "
+            f"{of_alike / max(alike, 1):.2f} of the {alike} that see it from a similar direction"
+        )
+    print(f"  refused: {dict(reasons.most_common())}")
+    for ok in (1, 0):
+        rows = np.array([j[1:] for j in judged if j[0] == ok])
+        if len(rows):
+            low, middle, high = np.percentile(rows, [5, 50, 95], axis=0).round(2).tolist()
+            print(
+                f"  flow (matched, residual, contradiction) {'right' if ok else 'wrong'}: "
+                f"{len(rows)}, 5 % {low}, 50 % {middle}, 95 % {high}"
+            )
+    print(f"  scale by features: median error {100 * np.median(scale_error):.1f} %")
+    print(f"  CPU ms: {clock.report()}")
+
+
+def together(store: KeyframeStore, operator: ClassicalFlow, truth: Truth, gap: int) -> None:
+    """The detector as a system would run it."""
+    detector, clock = LoopDetector(store, operator, LoopConfig(min_gap=gap)), Clock()
+    for k in store.ids:
+        clock("update", lambda k=k: detector.update([k]))
+    right = [truth.right(o.first, o.second, o.T_ji) for o in detector.loops]
+    closed = {o.second for o, ok in zip(detector.loops, right, strict=True) if ok}
+    can = {k for k in store.ids for i in store.ids if i < k - gap and truth.overlap[i, k] > OVERLAP}
+    looks = sum(o.source == "appearance" for o in detector.loops)
+    print(
+        f"  detector: {len(right)} loops ({looks} by looks), precision "
+        f"{np.mean(right) if right else 1.0:.3f}, {len(closed & can)} of {len(can)} keyframes that "
+        f"could close one did; CPU ms per keyframe {clock.report()}, "
+        f"worst {max(clock.spent['update']):.0f}"
+    )
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("folders", nargs="+", metavar="FOLDER[:POINTS.ply]")
+    parser.add_argument("--every", type=int, default=5)
+    parser.add_argument("--long-edge", type=int, default=512)
+    parser.add_argument("--gap", type=int, default=15, help="keyframes between the two views")
+    parser.add_argument("--drift", type=float, default=1.0)
+    args = parser.parse_args()
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+    for argument in args.folders:
+        folder, _, points = argument.partition(":")
+        usual = [Path(folder) / n for n in ("points_seen_1cm.ply", "tsdf_pseudo_gt.ply")]
+        cloud = Path(points) if points else next(p for p in usual if p.exists())
+        keyframes = prepare(Path(folder), cloud, args.every, args.long_edge, args.drift)
+        print(f"{Path(folder).name}: {len(keyframes[0])} keyframes", flush=True)
+        separate(*keyframes, args.gap)
+        together(*keyframes, args.gap)
+
+
+if __name__ == "__main__":
+    main()

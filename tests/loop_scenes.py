@@ -1,0 +1,89 @@
+"""Keyframes of synthetic rooms with exact depth and poses, for tests of loop detection."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import torch
+
+from geogs.geometry.camera import Camera
+from geogs.geometry.lie import se3_inverse
+from geogs.synth.raycast import Raycaster, View
+from geogs.synth.room import make_room
+from geogs.synth.scene import Scene
+from geogs.tracking.flow.classical import ClassicalFlow
+from geogs.tracking.grid import SampleGrid
+from geogs.tracking.keyframes import KeyframeStore
+
+CAMERA = Camera(fx=260.0, fy=260.0, cx=191.5, cy=143.5, width=384, height=288)
+
+
+def orbit(scene: Scene, count: int, turn: float = 0.0) -> list[np.ndarray]:
+    """Camera-to-world poses on a circle of half a metre that look outwards, once around.
+
+    ``turn`` in radians is added to every direction.
+    """
+    poses = []
+    for angle in turn + np.linspace(0, 2 * np.pi, count, endpoint=False):
+        forward = np.array([np.cos(angle), np.sin(angle), -0.15])
+        forward /= np.linalg.norm(forward)
+        right = np.cross(forward, [0.0, 0.0, 1.0])
+        right /= np.linalg.norm(right)
+        T = np.eye(4)
+        T[:3, :3] = np.stack([right, np.cross(forward, right), forward], 1)
+        T[:3, 3] = scene.size * [0.5, 0.5, 0.55] - 0.5 * forward * [1, 1, 0]
+        poses.append(T)
+    return poses
+
+
+def views(scene: Scene, poses: Sequence[np.ndarray]) -> list[View]:
+    """Rendered with one thread."""
+    return _rendered(Raycaster(scene, threads=1), poses)
+
+
+@cache
+def room(seed: int = 0) -> Raycaster:
+    """A furnished room, lit once for all tests."""
+    return Raycaster(make_room(seed), threads=1)
+
+
+def room_views(seed: int, poses: Sequence[np.ndarray]) -> list[View]:
+    """What cameras see of :func:`room`."""
+    return _rendered(room(seed), poses)
+
+
+def _rendered(caster: Raycaster, poses: Sequence[np.ndarray]) -> list[View]:
+    return [caster.render(CAMERA, T) for T in poses]
+
+
+def stretched(scene: Scene, factor: float) -> Scene:
+    """The same room with everything longer along y: its pictures show the same things."""
+    f = np.array([1.0, factor, 1.0])
+    along = np.abs(np.einsum("nij,i->nj", scene.rotation, np.array([0.0, 1.0, 0.0])))
+    half = scene.half * (1 + (factor - 1) * along**2)
+    return replace(scene, size=scene.size * f, centre=scene.centre * f, half=half)
+
+
+def rearranged(scene: Scene, seed: int = 0, reach: float = 0.35) -> Scene:
+    """The same things, but for the room itself, each moved by up to ``reach`` metres level."""
+    rng = np.random.default_rng(seed)
+    shift = rng.uniform(-reach, reach, (len(scene), 3)) * [1, 1, 0]
+    large = scene.bounding_half.max(1) > 1.6
+    return replace(scene, centre=np.where(large[:, None], scene.centre, scene.centre + shift))
+
+
+def keyframes(
+    seen: Sequence[View], poses: Sequence[np.ndarray]
+) -> tuple[KeyframeStore, ClassicalFlow]:
+    """A store of the views with their true depth, and the operator that encoded them."""
+    grid = SampleGrid(CAMERA)
+    store, operator = KeyframeStore(grid), ClassicalFlow(grid)
+    for n, (view, T_wc) in enumerate(zip(seen, poses, strict=True)):
+        T_cw = se3_inverse(torch.from_numpy(T_wc))
+        state = store.add(n, n / 30, view.image, operator.encode(view.image), T_cw)
+        x, y = grid.pixels.long().unbind(-1)
+        depth = torch.from_numpy(view.depth)[y, x]
+        state.information = (depth > 0).float()
+        state.inverse_depth = torch.where(depth > 0, 1 / depth.clamp(min=1e-6), 1.0)
+    return store, operator

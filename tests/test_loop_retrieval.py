@@ -1,0 +1,103 @@
+"""Appearance retrieval: places seen again are found, without training data and at any exposure."""
+
+import numpy as np
+import pytest
+
+from geogs.loop.features import FeatureExtractor
+from geogs.loop.options import RetrievalOptions
+from geogs.loop.retrieval import AppearanceIndex
+from loop_scenes import orbit, room, room_views
+
+LAP = 18
+
+
+@pytest.fixture(scope="module")
+def lap() -> list[np.ndarray]:
+    """Images once around a room, 20 degrees apart."""
+    return [v.image for v in room_views(3, orbit(room(3).scene, LAP))]
+
+
+@pytest.fixture(scope="module")
+def again() -> list[np.ndarray]:
+    """Four of the places, seen from 5 degrees aside."""
+    return [v.image for v in room_views(3, orbit(room(3).scene, LAP, np.radians(5))[::5])]
+
+
+@pytest.fixture(scope="module")
+def index(lap: list[np.ndarray]) -> AppearanceIndex:
+    """All of the lap."""
+    index = AppearanceIndex()
+    for n, image in enumerate(lap):
+        index.add(100 + n, image)
+    return index
+
+
+def test_features_are_spread_and_strongest_first(lap):
+    extract = FeatureExtractor(RetrievalOptions(features=240))
+    features = extract(lap[0])
+    assert len(features) == len(features.descriptors) <= 240
+    cells = (features.pixels // [48, 48]).astype(int) @ [1, 8]
+    # The first of every cell come before the second of any.
+    assert len(np.unique(cells[:30])) > 20
+
+
+def test_finds_the_place_that_is_seen_again(index, again):
+    for n, image in enumerate(again):
+        found = index.query(image, count=3)
+        assert found[0].keyframe == 100 + 5 * n
+
+
+def test_excluded_keyframes_are_never_returned(index, again):
+    found = index.query(again[0], exclude={100, 101}, count=50)
+    assert found
+    assert not {100, 101} & {c.keyframe for c in found}
+
+
+def test_an_image_is_most_like_itself(index, lap):
+    best = index.query(lap[7], count=1)[0]
+    assert best.keyframe == 107
+    assert best.score > 0.9
+
+
+@pytest.mark.parametrize("gain", [0.45, 0.7, 1.5])
+def test_exposure_does_not_matter(index, again, gain):
+    for n, image in enumerate(again):
+        exposed = np.clip(gain * image.astype(float), 0, 255).astype(np.uint8)
+        best = {c.keyframe for c in index.query(exposed, count=2)}
+        assert 100 + 5 * n in best
+
+
+def test_other_rooms_score_far_less(index, again):
+    here = min(index.query(image, count=1)[0].score for image in again)
+    for view in room_views(5, orbit(room(5).scene, 4)):
+        there = index.query(view.image, count=1)
+        assert not there or there[0].score < 0.3 * here
+
+
+def test_same_order_gives_same_scores(lap, again):
+    def run() -> list[tuple[int, float]]:
+        index = AppearanceIndex()
+        for n, image in enumerate(lap):
+            index.add(n, image)
+        return [(c.keyframe, c.score) for image in again for c in index.query(image)]
+
+    assert run() == run()
+
+
+def test_featureless_images_find_nothing(lap):
+    index = AppearanceIndex()
+    grey = np.full_like(lap[0], 90)
+    assert index.query(grey) == []
+    index.add(0, grey)
+    index.add(1, lap[0])
+    assert index.query(grey) == []
+    assert index.query(lap[1], exclude={1}) == []
+    assert len(index) == 2
+
+
+def test_a_full_vocabulary_still_finds_places(lap, again):
+    index = AppearanceIndex(RetrievalOptions(words=2500))
+    for n, image in enumerate(lap):
+        index.add(n, image)
+    hits = [index.query(image, count=3) for image in again]
+    assert all(5 * n in {c.keyframe for c in found} for n, found in enumerate(hits))
