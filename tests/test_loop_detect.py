@@ -147,6 +147,20 @@ def test_poses_close_a_loop_without_features(walk):
         assert _turn(loop.T_ji, true) < 0.2
 
 
+def test_a_loop_as_a_similarity_takes_depth_to_depth(walk):
+    store, operator = walk
+    _scale_depth(store, LAP, 1.2)
+    detector = LoopDetector(store, operator, LoopConfig(min_gap=10))
+    detector.update(store.ids[: LAP + 1])
+    loop = next(x for x in detector.loops if x.second == LAP)
+    assert loop.scale == pytest.approx(1.2, rel=0.02)
+    # The points before the first camera lie at 1.2 times their depth before the second.
+    there = loop.S_ji[:3, :3] @ torch.tensor([0.0, 0, 2], dtype=torch.float64) + loop.S_ji[:3, 3]
+    true = _relative(store, loop.first, LAP)
+    exact = true[:3, :3] @ torch.tensor([0.0, 0, 2], dtype=torch.float64) + true[:3, 3]
+    assert torch.allclose(there, 1.2 * exact, atol=0.06)
+
+
 def test_close_pairs_suppress_each_other(walk):
     store, operator = walk
     detector = LoopDetector(store, operator, LoopConfig(min_gap=10, suppression=3))

@@ -49,6 +49,13 @@ class Loop:
     matched: float
     """Share of the cells whose flow does."""
 
+    @property
+    def S_ji(self) -> Float[Tensor, "4 4"]:
+        """Sim(3) that takes points of the first camera, in its lengths, to the second in its."""
+        S = self.scale * self.T_ji
+        S[3, 3] = 1.0
+        return S
+
 
 @dataclass(frozen=True)
 class Refusal:
@@ -172,6 +179,9 @@ class LoopDetector:
         else:
             return Refusal(p, view.reason or "too little depth is known")
         check = dense_check(grid, self.operator, first, second, T, scale, self.config.verification)
+        if not inliers and check.matched < self.config.verification.min_matched_alone:
+            share = f"{check.matched:.0%}"
+            return Refusal(p, check.reason or f"without features, {share} matched is too little")
         if not check.accepted or check.T_ji is None:
             return Refusal(p, check.reason)
         return Loop(p.first, p.second, p.source, check.T_ji, check.scale, inliers, check.matched)

@@ -46,11 +46,13 @@ class VerificationOptions:
     """Largest factor between the scales of both views' depths, either way."""
     min_matched: float = 0.15
     """Dense check: least share of the cells whose flow agrees with the pose, in each direction."""
+    min_matched_alone: float = 0.3
+    """The same where only the present poses, and no features, speak for the loop."""
     max_residual: float = 0.0033
     """Dense check: largest median reprojection error of the flow, of the long edge."""
-    max_contradiction: float = 0.25
+    max_contradiction: float = 0.1
     """Dense check: largest share of the surface of one view, where the other looks at it, through
-    which the other sees; what tells rooms apart that share their pictures but not their shape."""
+    which the other sees. Tells look-alikes apart where their shapes differ within the view."""
     max_turn: float = 3.0
     """Dense check: largest rotation in degrees between the poses found in the two directions."""
 
