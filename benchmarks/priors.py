@@ -26,7 +26,7 @@ from geogs.geometry.umeyama import umeyama
 from geogs.loop.global_bundle import global_bundle
 from geogs.priors.base import DepthKind, MonocularPrior
 from geogs.slam import Slam
-from geogs.synth.prior import BAD, PLAUSIBLE, DegradedPrior
+from geogs.synth.prior import BAD, PATCHY, PLAUSIBLE, DegradedPrior
 from geogs.synth.raycast import Raycaster, View
 from geogs.synth.room import make_room, with_bare_walls
 from geogs.synth.trajectory import handheld_trajectory
@@ -34,6 +34,8 @@ from geogs.tracking.flow.texture import MIN_STRUCTURE, cell_structure, smaller_e
 from geogs.tracking.grid import OFFSET, STRIDE
 from geogs.tracking.tracker import Tracker
 from geogs.types import Frame
+
+PRIORS = {"none": None, "good": PLAUSIBLE, "patchy": PATCHY, "bad": BAD}
 
 
 @dataclass(frozen=True)
@@ -150,7 +152,7 @@ def compare_maps(walk: Walk, kind: DepthKind, config: PriorConfig) -> None:
     cases = (
         ("none", None, False),
         ("good", PLAUSIBLE, False), ("good", PLAUSIBLE, True),
-        ("bad", BAD, False), ("bad", BAD, True),
+        ("patchy", PATCHY, True), ("bad", BAD, True),
     )  # fmt: skip
     for name, errors, with_normals in cases:
         mapping = MappingConfig()
@@ -200,7 +202,7 @@ def main() -> None:
     print("|---" * 9 + "|")
     for seed in range(args.rooms):
         seen = walk(seed, args.frames, args.long_edge, not args.textured)
-        for name, errors in (("none", None), ("good", PLAUSIBLE), ("bad", BAD)):
+        for name, errors in PRIORS.items():
             kind = DepthKind(args.kind)
             prior = None if errors is None else DegradedPrior(seen.views, errors, kind)
             start = time.perf_counter()

@@ -164,15 +164,15 @@ def test_a_prior_that_contradicts_the_matches_changes_nothing():
     nonsense = exact.inverse_depth * torch.exp(0.8 * torch.randn(3, grid.size, generator=g))
     flow = flow_evidence(grid, exact, HUBER)
     adjusted = adjust_depth(grid, flow, exact.inverse_depth, nonsense, torch.ones(3, 4), TWO)
-    assert float(adjusted.deviation.min()) > 0.3
+    assert float(adjusted.deviation.min()) > 0.5
     assert float(adjusted.information.max()) == 0
-    torch.testing.assert_close(adjusted.inverse_depth, exact.inverse_depth, rtol=1e-4, atol=0)
+    assert torch.equal(adjusted.inverse_depth, exact.inverse_depth)
 
 
 def test_a_prior_that_is_wrong_in_places_is_not_used_there():
     grid, exact = scene()
     prior = exact.inverse_depth.clone()
-    wrong = grid.pixels[:, 0] > 60
+    wrong = grid.pixels[:, 0] > 70
     prior[:, wrong] *= 2.5
     flow = flow_evidence(grid, exact, HUBER)
     adjusted = adjust_depth(grid, flow, exact.inverse_depth, prior, torch.ones(3, 4), TWO)

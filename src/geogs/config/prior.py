@@ -38,5 +38,5 @@ class PriorConfig:
     caution: float = 4.0
     """Factor on the deviation that mapping is told of, since it takes a tracker's deviations for
     larger than they are (mapping.depth.sigma_scale, tracker_scale)."""
-    reject: float = 0.3
-    """A prior whose ratio to the matched depth deviates by more than this is not used at all."""
+    reject: float = 0.2
+    """A prior that is off by more than this in a fifth of the matched cells is not used at all."""

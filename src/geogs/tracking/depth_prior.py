@@ -35,6 +35,8 @@ _EVIDENCE = ((1.0, 8.0), (3.0, 2.0), (9.0, 0.5))
 """Windows in multiples of the reach, and how many cells a window full of evidence counts as."""
 _BELIEF = 0.5
 """Cells that the deviation of a good prior counts as before there is evidence."""
+_AGREEING = 0.8
+"""Part of the matched cells whose agreement decides on a prior; a bad one fits half of them."""
 _ROUGHNESS = 3.0
 """Deviation of a cell for the deviation of the scale around it."""
 
@@ -159,7 +161,7 @@ class AdjustedDepth:
     information: Float[Tensor, "n p"]
     """alpha: what the prior adds to the inverse variance of inverse depth; 0 where it is unused."""
     deviation: Float[Tensor, "n"]
-    """Median relative deviation of the scaled prior from what the matches want."""
+    """Relative error of the scaled prior that four fifths of the matched cells keep below."""
 
 
 def adjust_depth(
@@ -199,15 +201,16 @@ def adjust_depth(
         deviation = local_deviation(grid, error, sure, config)
         bent = _ROUGHNESS * roughness(grid, (start + step.scale) @ basis.mT, config)
         deviation = torch.hypot(deviation, bent)
-    overall = _weighted_median(error.abs(), sure)
+    overall = _weighted_quantile(error.abs(), sure, _AGREEING)
     used = (deviation < config.max_deviation) & (overall < config.reject)[:, None]
     used &= (start + step.scale > 0).all(1, keepdim=True)
     alpha = torch.where(used, trust * _prior_weight(prior, start, basis, deviation), 0.0)
     step = depth_scale_step(flow, inverse_depth, ScaledPrior(prior, start, alpha), basis, stiffness)
     good = (torch.isfinite(step.depth).all(1) & torch.isfinite(step.scale).all(1))[:, None]
     good &= (start + step.scale > 0).all(1, keepdim=True)
+    taken = good & (alpha > 0)  # what goes without the prior has just been adjusted to the matches
     return AdjustedDepth(
-        torch.where(good, (inverse_depth + step.depth).clamp(*limits), inverse_depth),
+        torch.where(taken, (inverse_depth + step.depth).clamp(*limits), inverse_depth),
         torch.where(good, start + step.scale, start),
         torch.where(good, alpha, 0.0),
         overall,
@@ -278,9 +281,11 @@ def _prior_weight(
     return torch.where(known, 1 / (deviation * scaled).square().clamp(min=1e-30), 0.0)
 
 
-def _weighted_median(values: Float[Tensor, "n p"], weight: Float[Tensor, "n p"]) -> Tensor:
-    """Of every row, the value below which half of its weight lies; NaN without weight."""
+def _weighted_quantile(
+    values: Float[Tensor, "n p"], weight: Float[Tensor, "n p"], share: float
+) -> Float[Tensor, "n"]:
+    """Of every row, the value below which that share of its weight lies; NaN without weight."""
     ordered, order = values.sort(dim=1)
     total = weight.gather(1, order).cumsum(1)
-    middle = torch.searchsorted(total, total[:, -1:] / 2).clamp(max=values.shape[1] - 1)
-    return torch.where(total[:, -1] > 0, ordered.gather(1, middle)[:, 0], torch.nan)
+    place = torch.searchsorted(total, share * total[:, -1:]).clamp(max=values.shape[1] - 1)
+    return torch.where(total[:, -1] > 0, ordered.gather(1, place)[:, 0], torch.nan)
