@@ -125,12 +125,12 @@ class OwnFlow:
         images = list({id(i): i for i in (*first, *second)}.values())
         slot = {id(image): n for n, image in enumerate(images)}
         a, b = ([slot[id(i)] for i in side] for side in (first, second))
-        cold = forward is None or backward is None
+        warm: Tensor | None = None
         if forward is None or backward is None:
             start = self._cold_start(first, second)
             iterations = options.cold_iterations
         else:
-            start = torch.cat([forward, backward]).float()
+            start = warm = torch.cat([forward, backward]).float()
             iterations = options.warm_iterations if fine else options.coarse_iterations
         features = _stack([i.features for i in images])
         source, target = torch.tensor([*a, *b]), torch.tensor([*b, *a])
@@ -140,7 +140,7 @@ class OwnFlow:
             edges = Edges(*(x[part].int().to(self.device) for x in (source, target)))
             with self._autocast():
                 *_, last = self.network.iterate(features, edges, start[part], iterations)
-            parts.append((last.pixels, self._weight(last, None if cold else start[part])))
+            parts.append((last.pixels, self._weight(last, None if warm is None else warm[part])))
         pixels, weight = (torch.cat(p).clone() for p in zip(*parts, strict=True))
         if options.polish:
             pixels, weight = self._polished(first, second, pixels, weight, fine)
@@ -189,10 +189,8 @@ class OwnFlow:
         or goes elsewhere than the others from a warm start."""
         options, error = self.options, estimate.error
         deviation = 2**0.5 * error.log_scale.exp().amax(-1)
-        good = (error.share[..., 0].sigmoid() > options.min_share) & self.grid.inside(
-            estimate.pixels
-        )
-        good &= deviation < options.max_deviation
+        good = (deviation < options.max_deviation) & self.grid.inside(estimate.pixels)
+        good &= error.share[..., 0].sigmoid() > options.min_share
         if start is not None:
             moved = (estimate.pixels - start).masked_fill(~good[..., None], torch.nan)
             apart = (moved - moved.nanmedian(1, keepdim=True).values).norm(dim=-1)
