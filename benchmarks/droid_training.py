@@ -21,12 +21,10 @@ from geogs.synth.room import make_room
 from geogs.synth.trajectory import handheld_trajectory
 from geogs.tracking.flow.droid_network import DroidNetwork, DroidSize
 from geogs.train.bundle import ClipState
+from geogs.train.clip_state import blind_start, neighbour_edges, true_state
 from geogs.train.droid_unroll import (
     UnrollOptions,
-    blind_start,
     cell_cameras,
-    neighbour_edges,
-    true_state,
     unroll,
 )
 from geogs.train.pose_loss import Estimate, PoseLossOptions, pose_errors, pose_loss

@@ -8,12 +8,10 @@ from geogs.tracking.flow.droid import DroidFlow, DroidOptions
 from geogs.tracking.flow.droid_network import DroidNetwork, DroidSize
 from geogs.tracking.grid import SampleGrid
 from geogs.train.bundle import ClipEdges, ClipMatches, ClipState, adjust, reproject
+from geogs.train.clip_state import blind_start, neighbour_edges, true_state
 from geogs.train.droid_unroll import (
     UnrollOptions,
-    blind_start,
     cell_cameras,
-    neighbour_edges,
-    true_state,
     unroll,
 )
 from geogs.train.pose_loss import PoseLossOptions, pose_loss

@@ -10,7 +10,7 @@ import geogs.train.rooms.clips as clips_module
 import geogs.train.rooms.render as render_module
 import geogs.train.rooms.sampler as sampler_module
 from cuda_emulator import use_emulator
-from geogs.train.rooms.clips import ClipBatch, flow_between
+from geogs.train.rooms.clips import ClipBatch
 from geogs.train.rooms.develop import develop
 from geogs.train.rooms.draw import Draw
 from geogs.train.rooms.flaws import draw_flaws
@@ -117,8 +117,8 @@ def test_flow_is_the_reprojection_of_depth(clips):
 
 def test_flow_there_and_back(clips):
     """Where a visible point lands, the second view's depth leads back to it."""
-    truth = flow_between(clips, 0, 1)
-    back = flow_between(clips, 1, 0)
+    truth = clips.flow(0, 1)
+    back = clips.flow(1, 0)
     scale = torch.tensor([2 / 63, 2 / 47])
     grid = torch.nn.functional.grid_sample(
         back.pixels.movedim(-1, 1), truth.pixels * scale - 1, align_corners=True

@@ -7,8 +7,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from geogs.geometry.lie import retract
-from geogs.gpu.transfer import to_device
 from geogs.tracking.flow.lookup import Edges
+from geogs.tracking.flow.own import OwnFlowOptions
 from geogs.tracking.flow.own_network import FlowNetwork, cell_pixels
 from geogs.tracking.grid import OFFSET, STRIDE
 from geogs.train.bundle import (
@@ -20,16 +20,16 @@ from geogs.train.bundle import (
     adjust,
     reproject,
 )
+from geogs.train.clip_state import neighbour_edges, true_state
 from geogs.train.options import FlowTraining
+from geogs.train.pairs import MARGIN
 from geogs.train.pose_loss import Estimate, PoseLossOptions, pose_loss
 from geogs.train.rooms.clips import ClipBatch
 
-FLOOR = 0.04
+FLOOR = OwnFlowOptions().floor
 """Deviation in pixels that no weight goes beyond, as in the operator."""
 SOLVER = ClipBundleOptions(iterations=2, damping_floor=1e-2, depth_damping=1e-3)
 """As the tracker's, in pixels."""
-MARGIN = 48.0
-"""Pixels outside an image beyond which a cell's flow teaches nothing."""
 
 
 @dataclass(frozen=True)
@@ -59,17 +59,11 @@ class BundleObjective:
     def prepare(self, clips: ClipBatch, generator: torch.Generator) -> BundleBatch:
         """Disturb poses and depths; the first two poses, which set the scale, stay."""
         views, device = clips.images.shape[1], clips.images.device
-        reach = self.options.bundle.reach
-        pairs = [(i, j) for i in range(views) for j in range(views) if 0 < abs(i - j) <= reach]
-        source, target = to_device(torch.tensor(pairs), device).unbind(1)
-        inverse = 1 / clips.depth[..., OFFSET:-3:STRIDE, OFFSET:-3:STRIDE].clamp(min=1e-2)
-        cells = cell_pixels(inverse.shape[-2], inverse.shape[-1], inverse)
-        inverse = inverse.flatten(2)
-        scale = inverse.flatten(1).median(1).values[:, None, None]
-        T = clips.T_cw.double()
-        T = torch.cat([torch.cat([T[..., :3, :3], T[..., :3, 3:] * scale[..., None]], -1),
-                       T[..., 3:, :]], -2)  # fmt: skip
-        truth = ClipState(T, inverse / scale)
+        edges = neighbour_edges(views, self.options.bundle.reach, device)
+        truth = true_state(clips.T_cw.double(), clips.depth.clamp(min=1e-2))
+        rows, columns = clips.depth[0, 0, OFFSET:-3:STRIDE, OFFSET:-3:STRIDE].shape
+        cells = cell_pixels(rows, columns, clips.depth)
+        T = truth.T_cw
 
         def normal(*shape: int) -> Tensor:
             return torch.randn(*shape, generator=generator, device=device)
@@ -78,11 +72,9 @@ class BundleObjective:
         xi = amount * normal(*T.shape[:2], 6)
         xi = torch.cat([torch.zeros_like(xi[:, :2]), xi[:, 2:]], 1)
         wrong = truth.inverse_depth * (3 * amount * normal(*truth.inverse_depth.shape)).exp()
-        start = ClipState(retract(xi.double(), truth.T_cw), wrong)
+        start = ClipState(retract(xi.double(), T), wrong)
         cameras = ClipCameras(clips.intrinsics.float(), cells)
-        return BundleBatch(
-            clips.images.flatten(0, 1), cameras, ClipEdges(source, target), truth, start
-        )
+        return BundleBatch(clips.images.flatten(0, 1), cameras, edges, truth, start)
 
     def loss(self, network: FlowNetwork, batch: BundleBatch) -> Float[Tensor, ""]:
         """Of all rounds, the last counting most."""

@@ -52,19 +52,21 @@ def load_checkpoint(trainer: FlowTrainer, out: Path) -> None:
         parts = {name: load_file(out / FOLDER / f"{name}.safetensors") for name in _PARTS}
     except Exception as error:
         raise InputError(f"The checkpoint in {out} is damaged ({error}).") from error
-    state = trainer.state()
+    trainer.network.load_state_dict(parts["network"])
+    trainer.mean.load_state_dict(parts["mean"])
     names = [name for name, _ in trainer.network.named_parameters()]
-    optimizer = state["optimizer"]
+    optimizer = trainer.optimizer.state_dict()
     if parts["first_moment"]:
         optimizer["state"] = {
             k: {
-                "step": _count(step),
+                "step": torch.tensor(float(step)),
                 "exp_avg": parts["first_moment"][name],
                 "exp_avg_sq": parts["second_moment"][name],
             }
             for k, name in enumerate(names)
         }
-    trainer.load({**state, **{n: parts[n] for n in ("network", "mean")}, "step": step})
+    trainer.optimizer.load_state_dict(optimizer)
+    trainer.step = step
 
 
 def _revived(kind: type[T], values: dict[str, Any]) -> T:
@@ -80,12 +82,8 @@ def _revived(kind: type[T], values: dict[str, Any]) -> T:
     return kind(**found)
 
 
-def _count(step: int) -> torch.Tensor:
-    return torch.tensor(float(step))
-
-
 def _read_state(out: Path) -> dict:
     path = out / FOLDER / "state.json"
     if not path.is_file():
-        raise InputError(f"There is no checkpoint in {out}; start without --resume.")
+        raise InputError(f"There is no checkpoint in {out}; start without --run.resume.")
     return json.loads(path.read_text())

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from geogs.tracking.flow.lookup import RADIUS, WINDOW, correlation_windows
-from geogs.tracking.flow.own_network import FlowEstimate, ImageFeatures, LaplaceMixture
+from geogs.tracking.flow.own_network import FlowEstimate, ImageFeatures
 from geogs.train.options import FlowTraining
 from geogs.train.pairs import FlowBatch
 
@@ -33,15 +33,14 @@ def flow_loss(
     total = truth.new_zeros(())
     for n, estimate in enumerate(estimates):
         error = (truth - estimate.pixels).clamp(-MAX_ERROR, MAX_ERROR)
-        absolute = error.abs().mean(-1)
         if options.likelihood == "joint":
-            value = _likelihood(estimate.error, error)
+            value = estimate.error.negative_log_likelihood(error)
             value = value + options.absolute * error.abs().log1p().mean(-1)
         else:
-            value = absolute + 0.2 * _likelihood(estimate.error, error.detach())
+            value = 0.2 * estimate.error.negative_log_likelihood(error.detach())
+            value = error.abs().mean(-1) + value
         total = total + options.decay ** (len(estimates) - 1 - n) * _mean(value, at_cells)
-    grid = torch.stack(_pixel_grid(dense), -1)
-    missed = (batch.truth - grid - dense).clamp(-MAX_ERROR, MAX_ERROR).abs()
+    missed = (batch.flow - dense).clamp(-MAX_ERROR, MAX_ERROR).abs()
     total = total + options.dense * _mean(missed.log1p().mean(-1), weight)
     return total + options.descriptors * descriptor_loss(features, batch)
 
@@ -73,17 +72,6 @@ def _weights(batch: FlowBatch, options: FlowTraining) -> Float[Tensor, "e h w"]:
     return torch.where(batch.visible, 1.0, options.occluded) * batch.known
 
 
-def _likelihood(mixture: LaplaceMixture, error: Tensor) -> Float[Tensor, "e p"]:
-    return mixture.negative_log_likelihood(error)
-
-
 def _mean(values: Tensor, weight: Tensor) -> Float[Tensor, ""]:
     values = torch.where(weight > 0, values, 0.0)
     return (values * weight).sum() / weight.sum().clamp(min=1.0)
-
-
-def _pixel_grid(dense: Float[Tensor, "e h w 2"]) -> tuple[Tensor, Tensor]:
-    rows = torch.arange(dense.shape[1], dtype=dense.dtype, device=dense.device)
-    columns = torch.arange(dense.shape[2], dtype=dense.dtype, device=dense.device)
-    v, u = torch.meshgrid(rows, columns, indexing="ij")
-    return u, v

@@ -42,6 +42,16 @@ class FlowBatch:
         moved = {k: v.to(device) for k, v in values.items() if isinstance(v, Tensor)}
         return FlowBatch(edges=edges, **moved)
 
+    @property
+    def flow(self) -> Float[Tensor, "e h w 2"]:
+        """True motion of every pixel."""
+        rows, columns = (
+            torch.arange(n, dtype=self.truth.dtype, device=self.truth.device)
+            for n in self.truth.shape[1:3]
+        )
+        v, u = torch.meshgrid(rows, columns, indexing="ij")
+        return self.truth - torch.stack([u, v], -1)
+
     def at_cells(self, field: Tensor) -> Tensor:
         """A field (e, h, w, ...) on the cells, row by row."""
         return _at_cells(field).flatten(1, 2)

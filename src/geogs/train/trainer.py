@@ -1,7 +1,7 @@
 """One training run of the flow network: steps, running mean of the weights, exact resume."""
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -107,23 +107,6 @@ class FlowTrainer:
                 options.rooms, self.rooms.bank.materials, options.seed, options.batch, rank
             )
         return self._plans.plan(step)
-
-    def state(self) -> dict[str, Any]:
-        """All that a run needs to go on; plain tensors and numbers."""
-        return {
-            "options": asdict(self.options),
-            "step": self.step,
-            "network": self.network.state_dict(),
-            "mean": self.mean.state_dict(),
-            "optimizer": self.optimizer.state_dict(),
-        }
-
-    def load(self, state: dict[str, Any]) -> None:
-        """Go on from :meth:`state`."""
-        self.network.load_state_dict(state["network"])
-        self.mean.load_state_dict(state["mean"])
-        self.optimizer.load_state_dict(state["optimizer"])
-        self.step = int(state["step"])
 
     def _gradients(self, batch: Any) -> Float[Tensor, ""]:
         if self.worker.device.type != "cuda" or not self.objective.recordable:

@@ -4,8 +4,7 @@ from dataclasses import replace
 
 import torch
 
-from geogs.tracking.flow.own_network import FlowNetwork, cell_pixels
-from geogs.tracking.grid import OFFSET, STRIDE
+from geogs.tracking.flow.own_network import FlowNetwork
 from geogs.train.objective import run_network
 from geogs.train.options import FlowTraining
 from geogs.train.pairs import FlowBatch, flow_batch
@@ -49,19 +48,12 @@ def cell_errors(
 ) -> CellErrors:
     """Errors on the visible cells (and pixels) of a batch, given positions and dense flow."""
     truth, visible = batch.at_cells(batch.truth), batch.at_cells(batch.visible)
-    height, width = batch.truth.shape[1:3]
-    rows = torch.arange(height, device=dense.device, dtype=dense.dtype)
-    columns = torch.arange(width, device=dense.device, dtype=dense.dtype)
-    v, u = torch.meshgrid(rows, columns, indexing="ij")
-    flow = batch.truth - torch.stack([u, v], -1)
-    missed = (flow - dense).norm(dim=-1)
-    textured = has_texture(batch.images)[:, OFFSET:-3:STRIDE, OFFSET:-3:STRIDE].flatten(1)
-    cells = cell_pixels(len(range(OFFSET, height - 3, STRIDE)),
-                        len(range(OFFSET, width - 3, STRIDE)), truth)  # fmt: skip
+    flow = batch.flow
+    textured = batch.at_cells(has_texture(batch.images))[batch.edges.first.long()]
     return CellErrors(
         error=(truth - pixels)[visible],
         deviation=deviation[visible],
-        motion=(truth - cells).norm(dim=-1)[visible],
-        textured=textured[batch.edges.first.long()][visible],
-        dense=missed[batch.visible],
+        motion=batch.at_cells(flow).norm(dim=-1)[visible],
+        textured=textured[visible],
+        dense=(flow - dense).norm(dim=-1)[batch.visible],
     )

@@ -22,7 +22,6 @@ from geogs.tracking.flow.own_network import (
     ImageFeatures,
     NetworkOptions,
 )
-from geogs.tracking.flow.texture import textured_fraction
 from geogs.tracking.grid import SampleGrid
 from geogs.tracking.motion import filled_positions
 
@@ -64,7 +63,6 @@ class OwnImage:
 
     features: ImageFeatures
     """Of one image."""
-    texture: float
     classical: Any
     """What the classical operator keeps of it."""
 
@@ -106,10 +104,10 @@ class OwnFlow:
         pixels = torch.from_numpy(np.ascontiguousarray(image)).to(self.device)
         with self._autocast():
             features = self.network.encode(pixels.permute(2, 0, 1)[None].float() / 255)
-        return OwnImage(features, textured_fraction(image), self.classical.encode(image))
+        return OwnImage(features, self.classical.encode(image))
 
     def texture(self, encoded: OwnImage) -> float:
-        return encoded.texture
+        return self.classical.texture(encoded.classical)
 
     @torch.inference_mode()
     def measure(

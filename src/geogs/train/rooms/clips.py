@@ -35,8 +35,3 @@ class ClipBatch:
     def flow(self, first: int, second: int) -> FlowTruth:
         """Where the points that the view ``first`` sees are in the view ``second``."""
         return flow(self.solids, self.views, self.depth, first, second)
-
-
-def flow_between(clips: ClipBatch, first: int, second: int) -> FlowTruth:
-    """Where the points that the view ``first`` sees are in the view ``second``."""
-    return clips.flow(first, second)
