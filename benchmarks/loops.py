@@ -27,7 +27,7 @@ from plyfile import PlyData
 from geogs.geometry.lie import se3_exp, se3_inverse, so3_log
 from geogs.loop.dense import dense_check
 from geogs.loop.detect import LoopDetector
-from geogs.loop.options import LoopConfig
+from geogs.config import LoopConfig
 from geogs.loop.retrieval import AppearanceIndex
 from geogs.loop.verification import DepthView, TwoViewVerifier
 from geogs.tracking.flow.classical import ClassicalFlow

@@ -10,7 +10,7 @@ from geogs.geometry.lie import se3_exp, se3_inverse, so3_log
 from geogs.loop.dense import dense_check
 from geogs.loop.detect import LoopDetector
 from geogs.loop.features import FeatureExtractor
-from geogs.loop.options import LoopConfig, RetrievalOptions
+from geogs.config import LoopConfig, RetrievalOptions
 from geogs.loop.verification import DepthView, TwoViewVerifier
 from geogs.synth.raycast import View
 from geogs.tracking.keyframes import KeyframeStore

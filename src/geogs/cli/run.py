@@ -2,7 +2,7 @@
 
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, get_args
 
@@ -134,10 +134,8 @@ def parse(argv: Sequence[str]) -> RunOptions:
     """Options with the preset as defaults, over which single settings win."""
     name = _preset_name(argv)
     base = preset(name)
-    default = RunOptions(
-        seed=base.seed, input=base.input, tracking=base.tracking, prior=base.prior,
-        mapping=base.mapping, mesh=base.mesh, source=tyro.MISSING, preset=name,
-    )  # fmt: skip
+    settings = {f.name: getattr(base, f.name) for f in fields(base)}
+    default = RunOptions(**settings, source=tyro.MISSING, preset=name)
     short = {**SHORT, "--intrinsics": "--input.intrinsics"}
     return parse_options(RunOptions, argv, "run", default=default, short=short)
 

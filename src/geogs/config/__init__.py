@@ -11,6 +11,7 @@ from geogs.config.known_poses import (
     known_pose_mapping,
     reconstruct_preset,
 )
+from geogs.config.loop import LoopConfig, RetrievalOptions, VerificationOptions
 from geogs.config.losses import LossConfig
 from geogs.config.mapping import DiskConfig, MappingConfig, PhotoConfig
 from geogs.config.mesh import MeshConfig
@@ -23,6 +24,7 @@ __all__ = [
     "DepthConfig",
     "DiskConfig",
     "InputConfig",
+    "LoopConfig",
     "LossConfig",
     "MappingConfig",
     "MeshConfig",
@@ -30,8 +32,10 @@ __all__ = [
     "Preset",
     "PriorConfig",
     "ReconstructConfig",
+    "RetrievalOptions",
     "SearchConfig",
     "TrackingConfig",
+    "VerificationOptions",
     "known_pose_mapping",
     "preset",
     "reconstruct_preset",

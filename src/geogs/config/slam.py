@@ -4,6 +4,7 @@ from dataclasses import dataclass, field, replace
 from typing import Literal
 
 from geogs.config.input import InputConfig
+from geogs.config.loop import LoopConfig
 from geogs.config.mapping import MappingConfig
 from geogs.config.mesh import MeshConfig
 from geogs.config.prior import PriorConfig
@@ -21,6 +22,7 @@ class Config:
     input: InputConfig = field(default_factory=InputConfig)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
     prior: PriorConfig = field(default_factory=PriorConfig)
+    loop: LoopConfig = field(default_factory=LoopConfig)
     mapping: MappingConfig = field(default_factory=MappingConfig)
     mesh: MeshConfig = field(default_factory=MeshConfig)
 

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from geogs.geometry.lie import se3_inverse, so3_log
-from geogs.loop.options import VerificationOptions
+from geogs.config import VerificationOptions
 from geogs.tracking.bundle import project
 from geogs.tracking.flow.base import FlowOperator
 from geogs.tracking.grid import SampleGrid

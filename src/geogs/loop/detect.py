@@ -11,7 +11,7 @@ from torch import Tensor
 from geogs.geometry.lie import se3_inverse, so3_log
 from geogs.loop.dense import dense_check
 from geogs.loop.features import Features
-from geogs.loop.options import LoopConfig
+from geogs.config import LoopConfig
 from geogs.loop.retrieval import AppearanceIndex
 from geogs.loop.verification import DepthView, TwoViewVerifier
 from geogs.tracking.flow.base import FlowOperator

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from geogs.loop.options import RetrievalOptions
+from geogs.config import RetrievalOptions
 
 ROWS, COLUMNS = 6, 8
 """Cells of the image that share the features evenly."""

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from geogs.geometry.camera import Camera
 from geogs.loop.features import Features
-from geogs.loop.options import VerificationOptions
+from geogs.config import VerificationOptions
 from geogs.tracking.grid import SampleGrid
 from geogs.tracking.keyframes import KeyframeState
 

@@ -1,4 +1,4 @@
-"""Settings of loop detection."""
+"""Settings of loops: how they are found, closed, and corrected globally."""
 
 from dataclasses import dataclass, field
 
