@@ -24,10 +24,10 @@ import numpy as np
 import torch
 from plyfile import PlyData
 
+from geogs.config import LoopConfig
 from geogs.geometry.lie import se3_exp, se3_inverse, so3_log
 from geogs.loop.dense import dense_check
 from geogs.loop.detect import LoopDetector
-from geogs.config import LoopConfig
 from geogs.loop.retrieval import AppearanceIndex
 from geogs.loop.verification import DepthView, TwoViewVerifier
 from geogs.tracking.flow.classical import ClassicalFlow
@@ -231,7 +231,10 @@ def separate(store: KeyframeStore, operator: ClassicalFlow, truth: Truth, gap: i
 
 def together(store: KeyframeStore, operator: ClassicalFlow, truth: Truth, gap: int) -> None:
     """The detector as a system would run it."""
-    detector, clock = LoopDetector(store, operator, LoopConfig(min_gap=gap)), Clock()
+    detector, clock = (
+        LoopDetector(store.grid, operator, lambda _: store, LoopConfig(min_gap=gap)),
+        Clock(),
+    )
     for k in store.ids:
         clock("update", lambda k=k: detector.update([k]))
     right = [truth.right(o.first, o.second, o.T_ji) for o in detector.loops]

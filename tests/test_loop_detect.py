@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import torch
 
+from geogs.config import LoopConfig, RetrievalOptions
 from geogs.geometry.lie import se3_exp, se3_inverse, so3_log
 from geogs.loop.dense import dense_check
 from geogs.loop.detect import LoopDetector
 from geogs.loop.features import FeatureExtractor
-from geogs.config import LoopConfig, RetrievalOptions
 from geogs.loop.verification import DepthView, TwoViewVerifier
 from geogs.synth.raycast import View
 from geogs.tracking.keyframes import KeyframeStore
@@ -125,7 +125,9 @@ def test_looks_close_a_loop_that_drift_hides(walk):
     store, operator = walk
     true = {k: _relative(store, k - LAP, k) for k in store.ids[LAP:]}
     _drift(store, range(LAP, LAP + AGAIN))
-    detector = LoopDetector(store, operator, LoopConfig(min_gap=10, suppression=1))
+    detector = LoopDetector(
+        store.grid, operator, lambda _: store, LoopConfig(min_gap=10, suppression=1)
+    )
     loops = [loop for k in store.ids for loop in detector.update([k]) if k >= LAP]
     assert {(0, LAP), (1, LAP + 1)} <= {(loop.first, loop.second) for loop in loops}
     for loop in loops:
@@ -138,7 +140,7 @@ def test_looks_close_a_loop_that_drift_hides(walk):
 def test_poses_close_a_loop_without_features(walk):
     store, operator = walk
     config = LoopConfig(min_gap=10, retrieval=RetrievalOptions(features=8, indexed=8))
-    detector = LoopDetector(store, operator, config)
+    detector = LoopDetector(store.grid, operator, lambda _: store, config)
     loops = detector.update(store.ids)
     assert loops
     assert all(loop.source == "geometry" and loop.inliers == 0 for loop in loops)
@@ -150,7 +152,7 @@ def test_poses_close_a_loop_without_features(walk):
 def test_a_loop_as_a_similarity_takes_depth_to_depth(walk):
     store, operator = walk
     _scale_depth(store, LAP, 1.2)
-    detector = LoopDetector(store, operator, LoopConfig(min_gap=10))
+    detector = LoopDetector(store.grid, operator, lambda _: store, LoopConfig(min_gap=10))
     detector.update(store.ids[: LAP + 1])
     loop = next(x for x in detector.loops if x.second == LAP)
     assert loop.scale == pytest.approx(1.2, rel=0.02)
@@ -163,7 +165,9 @@ def test_a_loop_as_a_similarity_takes_depth_to_depth(walk):
 
 def test_close_pairs_suppress_each_other(walk):
     store, operator = walk
-    detector = LoopDetector(store, operator, LoopConfig(min_gap=10, suppression=3))
+    detector = LoopDetector(
+        store.grid, operator, lambda _: store, LoopConfig(min_gap=10, suppression=3)
+    )
     detector.update(store.ids)
     pairs = [(loop.first, loop.second) for loop in detector.loops]
     assert pairs
@@ -175,7 +179,9 @@ def test_close_pairs_suppress_each_other(walk):
 def test_update_is_deterministic(path):
     def run() -> list[tuple[int, int, float]]:
         store, operator = keyframes(*path)
-        loops = LoopDetector(store, operator, LoopConfig(min_gap=10)).update(store.ids)
+        loops = LoopDetector(store.grid, operator, lambda _: store, LoopConfig(min_gap=10)).update(
+            store.ids
+        )
         return [(x.first, x.second, float(x.T_ji.sum())) for x in loops]
 
     assert run() == run()
@@ -187,7 +193,7 @@ def test_a_room_of_another_shape_with_the_same_pictures_closes_no_loop(path):
     twins = orbit(other, LAP, np.radians(4))[:AGAIN]
     store, operator = keyframes(seen[:LAP] + views(other, twins), poses[:LAP] + twins)
     _drift(store, range(LAP, LAP + AGAIN))
-    detector = LoopDetector(store, operator, LoopConfig(min_gap=10))
+    detector = LoopDetector(store.grid, operator, lambda _: store, LoopConfig(min_gap=10))
     # The lap itself closes where its end meets its beginning.
     assert [loop for loop in detector.update(store.ids) if loop.second >= LAP] == []
 
@@ -199,4 +205,9 @@ def test_blank_keyframes_close_nothing(path):
         store[id].image = np.full_like(store[id].image, 120)
         store[id].encoded = operator.encode(store[id].image)
         store[id].information = torch.zeros_like(store[id].information)
-    assert LoopDetector(store, operator, LoopConfig(min_gap=5)).update([0, 12, 13]) == ()
+    assert (
+        LoopDetector(store.grid, operator, lambda _: store, LoopConfig(min_gap=5)).update(
+            [0, 12, 13]
+        )
+        == ()
+    )

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from geogs.loop.features import FeatureExtractor
 from geogs.config import RetrievalOptions
+from geogs.loop.features import FeatureExtractor
 from geogs.loop.retrieval import AppearanceIndex
 from loop_scenes import orbit, room, room_views
 

@@ -73,6 +73,10 @@ class LoopConfig:
     """Weight of the flow with the rotation in that distance, the rest is without."""
     max_angle: float = 120.0
     """Largest angle in degrees between the orientations of such a pair."""
+    max_baseline: float = 1.5
+    """Largest distance between their centres, of the keyframe's median depth."""
+    measured: int = 48
+    """Most such pairs, nearest first, whose flow distance is computed: bounds the cost."""
     appearance: int = 5
     """Candidates taken from the index per keyframe."""
     min_score: float = 0.05

@@ -7,10 +7,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from geogs.geometry.lie import se3_inverse, so3_log
 from geogs.config import VerificationOptions
+from geogs.geometry.lie import se3_inverse, so3_log
 from geogs.tracking.bundle import project
-from geogs.tracking.flow.base import FlowOperator
+from geogs.tracking.flow.base import FlowMatch, FlowOperator
 from geogs.tracking.grid import SampleGrid
 from geogs.tracking.keyframes import KeyframeState, scaled
 from geogs.tracking.motion import FrameLocator, FrameMotion
@@ -33,6 +33,9 @@ class DenseCheck:
     """Median error of the reprojection in pixels, in the poorer direction."""
     contradiction: float = 1.0
     """Share of one view's surface through which the other sees, in the poorer direction."""
+    there: FlowMatch | None = None
+    """The flow from the first to the second, one edge."""
+    back: FlowMatch | None = None
 
 
 def dense_check(
@@ -82,7 +85,10 @@ def dense_check(
         reason = f"one sees through {contradiction:.0%} of what the other shows"
     else:
         reason = ""
-    return DenseCheck(not reason, reason, T_there, scale_dense, matched, residual, contradiction)
+    return DenseCheck(
+        not reason, reason, T_there, scale_dense, matched, residual, contradiction,
+        there.match, back.match,
+    )  # fmt: skip
 
 
 def _depth_ratios(

@@ -1,22 +1,25 @@
 """Loops: pairs of keyframes far apart in time that show one place."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from geogs.config import LoopConfig
 from geogs.geometry.lie import se3_inverse, so3_log
 from geogs.loop.dense import dense_check
 from geogs.loop.features import Features
-from geogs.config import LoopConfig
 from geogs.loop.retrieval import AppearanceIndex
 from geogs.loop.verification import DepthView, TwoViewVerifier
-from geogs.tracking.flow.base import FlowOperator
+from geogs.tracking.flow.base import FlowMatch, FlowOperator
 from geogs.tracking.graph import frame_distances
-from geogs.tracking.keyframes import KeyframeStore
+from geogs.tracking.grid import SampleGrid
+from geogs.tracking.keyframes import KeyframeState, KeyframeStore
+from geogs.tracking.motion import Recognition
 
 Source = Literal["geometry", "appearance"]
 """What proposed a pair: the present poses, or nothing but the looks."""
@@ -48,6 +51,9 @@ class Loop:
     """Features that agree with the pose; 0 where the flow alone found it."""
     matched: float
     """Share of the cells whose flow does."""
+    there: FlowMatch
+    """The flow from the first to the second, one edge."""
+    back: FlowMatch
 
     @property
     def S_ji(self) -> Float[Tensor, "4 4"]:
@@ -66,18 +72,28 @@ class Refusal:
 
 
 class LoopDetector:
-    """Proposes loops by present poses and by looks, and keeps those that two checks accept."""
+    """Proposes loops by present poses and by looks, and keeps those that two checks accept.
+
+    Keyframes may lie in several stores, whose poses then have nothing to do with each other:
+    between them, only looks propose.
+    """
 
     def __init__(
-        self, store: KeyframeStore, operator: FlowOperator, config: LoopConfig | None = None
+        self,
+        grid: SampleGrid,
+        operator: FlowOperator,
+        store_of: Callable[[int], KeyframeStore],
+        config: LoopConfig | None = None,
     ) -> None:
-        self.store = store
+        """``store_of`` says where a keyframe is at present."""
+        self.grid = grid
         self.operator = operator
+        self.store_of = store_of
         self.config = config or LoopConfig()
         self.index = AppearanceIndex(self.config.retrieval)
         self.refusals: list[Refusal] = []
         """Of the last update."""
-        self._verifier = TwoViewVerifier(store.grid.camera, self.config.verification)
+        self._verifier = TwoViewVerifier(grid.camera, self.config.verification)
         self._features: dict[int, Features] = {}
         self._order: dict[int, int] = {}
         """Place in time of each keyframe taken so far."""
@@ -94,15 +110,32 @@ class LoopDetector:
         found: list[Loop] = []
         for id in ids:
             self._order[id] = len(self._order)
-            self._features[id] = self.index.describe(self.store[id].image)
+            self._features[id] = self.index.describe(self._state(id).image)
             found += self._close(id)
             self.index.add(id, self._features[id])
         return tuple(found)
 
+    def recognise(self, image: UInt8[np.ndarray, "h w 3"]) -> list[Recognition]:
+        """Keyframes that show what an image shows, with its pose; most alike first."""
+        features = self.index.describe(image)
+        found: list[Recognition] = []
+        for candidate in self.index.query(features, (), self.config.appearance):
+            if candidate.score < self.config.min_score:
+                continue
+            id = candidate.keyframe
+            known = DepthView.of(self.grid, self._state(id), self._features[id])
+            view = self._verifier.verify(known, DepthView(features))
+            if view.accepted and view.is_metric and view.T_ji is not None:
+                found.append(Recognition(id, view.T_ji))
+        return found
+
     def propose(self, id: int) -> list[Proposal]:
         """Pairs of a taken keyframe with earlier ones, thinned: geometry and looks take turns."""
-        old = [k for k in self._order if self._order[k] < self._order[id] - self.config.min_gap]
-        by_pose, by_looks = self._by_pose(id, old), self._by_looks(id, set(old))
+        store, gap = self.store_of(id), self._order[id] - self.config.min_gap
+        here = [k for k in self._order if k != id and self.store_of(k) is store]
+        near = {k for k in here if self._order[k] >= gap}
+        by_pose = self._by_pose(id, [k for k in here if k not in near])
+        by_looks = self._by_looks(id, near | {id})
         turns: list[Proposal] = []
         for n in range(max(len(by_pose), len(by_looks))):
             # Where the poses agree with the looks, the flow may start from them if features fail.
@@ -117,26 +150,35 @@ class LoopDetector:
                 kept.append(p)
         return kept[: self.config.verified]
 
+    def _state(self, id: int) -> KeyframeState:
+        return self.store_of(id)[id]
+
     def _by_pose(self, id: int, old: Sequence[int]) -> list[int]:
         """Keyframes that the present poses say are seen again, nearest first."""
         if not old:
             return []
-        R = self.store.poses(old)[:, :3, :3]
-        angle = torch.rad2deg(so3_log(self.store[id].T_cw[:3, :3] @ R.mT).norm(dim=-1))
-        near = [k for k, a in zip(old, angle.tolist(), strict=True) if a < self.config.max_angle]
+        near = self._facing(id, old)
         directed = [(k, id) for k in near] + [(id, k) for k in near]
-        there, back = frame_distances(self.store, directed, self.config.rotation_weight).chunk(2)
-        camera = self.store.grid.camera
-        limit = self.config.max_distance * max(camera.width, camera.height)
+        store = self.store_of(id)
+        there, back = frame_distances(store, directed, self.config.rotation_weight).chunk(2)
+        limit = self.config.max_distance * max(self.grid.camera.width, self.grid.camera.height)
         distance, order = torch.sort(((there + back) / 2).cpu(), stable=True)
         return [near[n] for n in order[distance < limit].tolist()]
 
-    def _by_looks(self, id: int, old: set[int]) -> list[int]:
+    def _facing(self, id: int, old: Sequence[int]) -> list[int]:
+        """The keyframes nearest by that look roughly the same way; there are never many."""
+        store = self.store_of(id)
+        state, T = store[id], store.poses(old)
+        angle = torch.rad2deg(so3_log(state.T_cw[:3, :3] @ T[:, :3, :3].mT).norm(dim=-1))
+        away = (se3_inverse(T)[:, :3, 3] - se3_inverse(state.T_cw)[:3, 3]).norm(dim=-1)
+        depth = 1 / float(state.inverse_depth.median())
+        facing = (angle < self.config.max_angle) & (away < self.config.max_baseline * depth)
+        order = torch.argsort(away, stable=True)
+        return [old[n] for n in order.tolist() if facing[n]][: self.config.measured]
+
+    def _by_looks(self, id: int, excluded: set[int]) -> list[int]:
         """Keyframes that look alike, most alike first."""
-        if not old:
-            return []
-        recent = [k for k in self._order if k not in old]
-        found = self.index.query(self._features[id], recent, self.config.appearance)
+        found = self.index.query(self._features[id], excluded, self.config.appearance)
         return [c.keyframe for c in found if c.score >= self.config.min_score]
 
     def _suppressed(self, p: Proposal, others: Sequence[Proposal | Loop]) -> bool:
@@ -166,8 +208,7 @@ class LoopDetector:
 
         Plain surfaces have few corners, but when the drift is small the flow needs none.
         """
-        first, second = self.store[p.first], self.store[p.second]
-        grid = self.store.grid
+        first, second, grid = self._state(p.first), self._state(p.second), self.grid
         view = self._verifier.verify(
             DepthView.of(grid, first, self._features[p.first]),
             DepthView.of(grid, second, self._features[p.second]),
@@ -182,6 +223,9 @@ class LoopDetector:
         if not inliers and check.matched < self.config.verification.min_matched_alone:
             share = f"{check.matched:.0%}"
             return Refusal(p, check.reason or f"without features, {share} matched is too little")
-        if not check.accepted or check.T_ji is None:
+        if not check.accepted or check.T_ji is None or check.there is None or check.back is None:
             return Refusal(p, check.reason)
-        return Loop(p.first, p.second, p.source, check.T_ji, check.scale, inliers, check.matched)
+        return Loop(
+            p.first, p.second, p.source, check.T_ji, check.scale, inliers, check.matched,
+            check.there, check.back,
+        )  # fmt: skip

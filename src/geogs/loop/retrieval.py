@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float64, Int64, UInt8
 
-from geogs.loop.features import FeatureExtractor, Features
 from geogs.config import RetrievalOptions
+from geogs.loop.features import FeatureExtractor, Features
 
 LOOSE = 15
 """Bits by which the radius of the words grows once the vocabulary is full."""

@@ -8,9 +8,9 @@ import torch
 from jaxtyping import Bool, Float, Float32, Float64, Int64
 from torch import Tensor
 
+from geogs.config import VerificationOptions
 from geogs.geometry.camera import Camera
 from geogs.loop.features import Features
-from geogs.config import VerificationOptions
 from geogs.tracking.grid import SampleGrid
 from geogs.tracking.keyframes import KeyframeState
 

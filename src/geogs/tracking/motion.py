@@ -39,6 +39,15 @@ class FrameMotion:
     """Median distance in pixels between matches and reprojection."""
 
 
+@dataclass(frozen=True)
+class Recognition:
+    """A keyframe that shows what an image shows."""
+
+    keyframe: int
+    T_rel: Float[Tensor, "4 4"]
+    """Keyframe's camera to the image's, float64."""
+
+
 class FrameLocator:
     """Finds the pose of a frame from flow against keyframes, by motion-only adjustment."""
 

@@ -1,6 +1,7 @@
 """The pose of every frame, solved at the end from sparse flow kept along the way."""
 
 from bisect import bisect_left
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -102,6 +103,23 @@ class TrajectoryRecorder:
                 if record.index == removed.frame_index:
                     self._pending.append(_Pending(record, removed.encoded))
         self._pending.sort(key=lambda p: p.record.index)
+
+    def rescale(self, scale: Mapping[int, float]) -> None:
+        """Divide the lengths around keyframes by the given factors."""
+        for record in self.records:
+            if record.anchor in scale and scale[record.anchor] != 1.0:
+                record.T_rel = record.T_rel.clone()
+                record.T_rel[:3, 3] /= scale[record.anchor]
+
+    def absorb(self, other: "TrajectoryRecorder") -> None:
+        """Take over the frames of another recorder, whose keyframes are now in this one's store."""
+        self.records = sorted([*self.records, *other.records], key=lambda r: r.index)
+        self._pending = sorted([*self._pending, *other._pending], key=lambda p: p.record.index)
+
+    def give_up(self, other: "TrajectoryRecorder") -> None:
+        """Take over the frames of another recorder as frames that were not tracked."""
+        for record in other.records:
+            self.add_untracked(record.index, record.timestamp)
 
     def anchor_to_keyframes(self) -> None:
         """Give the frames seen before the map was started a pose between their keyframes."""
