@@ -51,7 +51,7 @@ def load_views(
             id=i,
             frame_index=int(k),
             timestamp=0.0,
-            image=image,
+            stored_image=image,
             T_cw=torch.from_numpy(np.linalg.inv(poses[i])),
             inverse_depth=torch.from_numpy((data["d"][i] / scale).astype(np.float32)),
             information=torch.from_numpy((data["info"][i] * scale**2).astype(np.float32)),

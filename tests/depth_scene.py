@@ -43,7 +43,7 @@ def make_scene(seed: int = 0, working: Camera = WORKING, render: Camera = RENDER
             id=i,
             frame_index=i,
             timestamp=0.1 * i,
-            image=image,
+            stored_image=image,
             T_cw=torch.from_numpy(np.linalg.inv(T_wc)),
             inverse_depth=torch.from_numpy(inverse.astype(np.float32)),
             information=torch.from_numpy(information.astype(np.float32)),

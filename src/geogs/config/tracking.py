@@ -49,6 +49,9 @@ class TrackingConfig:
     """The camera is lost when the median reprojection error exceeds this, of the long edge."""
     relocalise: int = 5
     """Recent keyframes, and as many older ones in turn, tried when the camera is lost."""
+    resident_keyframes: int = 64
+    """Keyframes whose images stay in memory, those used last; others wait in a temporary file, at
+    least 1."""
     huber: float = 0.5
     """Standard deviations of the flow beyond which a match counts linearly."""
     global_rounds: int = 4

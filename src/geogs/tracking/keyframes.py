@@ -1,6 +1,6 @@
 """The keyframes a tracker holds, by stable id."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,6 +11,7 @@ from torch import Tensor
 
 from geogs.priors.base import DepthKind
 from geogs.tracking.grid import SampleGrid
+from geogs.tracking.pictures import Picture, PictureArchive
 from geogs.types import Keyframe
 
 RELATIVE_FLOOR = 0.004
@@ -45,24 +46,58 @@ class KeyframeState:
     id: int
     frame_index: int
     timestamp: float
-    image: UInt8[np.ndarray, "h w 3"]
-    encoded: Any
-    """The flow operator's form of the image."""
+    picture: Picture
+    """Image and normals, in memory or not."""
     T_cw: Float[Tensor, "4 4"]
     """float64, on the CPU whatever the device of the grid."""
     inverse_depth: Float[Tensor, "p"]
     information: Float[Tensor, "p"]
     """Of the matches alone."""
     prior: KeyframePrior | None = None
-    normal: Float[Tensor, "h w 3"] | None = None
-    """A monocular prior's unit normals in the camera frame, facing the camera."""
+
+    @property
+    def image(self) -> UInt8[np.ndarray, "h w 3"]:
+        """RGB; not to be changed in place."""
+        return self.picture.image
+
+    @image.setter
+    def image(self, image: UInt8[np.ndarray, "h w 3"]) -> None:
+        self.picture.image = image
+
+    @property
+    def encoded(self) -> Any:
+        """The flow operator's form of the image."""
+        return self.picture.encoded
+
+    @encoded.setter
+    def encoded(self, encoded: Any) -> None:
+        self.picture.encoded = encoded
+
+    @property
+    def normal(self) -> Float[Tensor, "h w 3"] | None:
+        """A monocular prior's unit normals in the camera frame, facing the camera."""
+        return self.picture.normal
+
+    @normal.setter
+    def normal(self, normal: Float[Tensor, "h w 3"] | None) -> None:
+        self.picture.normal = normal
 
 
 class KeyframeStore:
-    """Keyframes in order of time; ids grow and are never used twice."""
+    """Keyframes in order of time; ids grow and are never used twice.
 
-    def __init__(self, grid: SampleGrid) -> None:
+    Where ``encode``, the flow operator's, is given, only the ``resident`` keyframes used last have
+    their images in memory; those of others are read from a file and encoded again when needed.
+    """
+
+    def __init__(
+        self,
+        grid: SampleGrid,
+        encode: Callable[[UInt8[np.ndarray, "h w 3"]], Any] | None = None,
+        resident: int = 64,
+    ) -> None:
         self.grid = grid
+        self._pictures = None if encode is None else PictureArchive(encode, resident)
         self._states: dict[int, KeyframeState] = {}
         self._reported: dict[int, tuple[Tensor, Tensor, Tensor]] = {}
         """Inverse depth and information of each keyframe as last exported, and its limit."""
@@ -95,9 +130,8 @@ class KeyframeStore:
     ) -> KeyframeState:
         """Append a keyframe with unit inverse depth and no information."""
         ones = torch.ones(self.grid.size, device=self.grid.device)
-        state = KeyframeState(
-            self._next_id, frame_index, timestamp, image, encoded, T_cw, ones, 0 * ones
-        )
+        picture = Picture(image, encoded, self._pictures)
+        state = KeyframeState(self._next_id, frame_index, timestamp, picture, T_cw, ones, 0 * ones)
         self._states[state.id] = state
         self._next_id += 1
         return state
@@ -129,9 +163,10 @@ class KeyframeStore:
                 state.prior.rescale(factor)
 
     def export(self, id: int) -> Keyframe:
-        """The keyframe as the rest of the system sees it; tensors are copies, but for the normals.
+        """The keyframe as the rest of the system sees it; tensors are copies.
 
-        The pose is on the CPU, inverse depth and information are on the grid's device.
+        Image and normals are references to the archive, where there is one. The pose is on the CPU,
+        inverse depth and information are on the grid's device.
         """
         s = self._states[id]
         shape = (self.grid.height, self.grid.width)
@@ -139,11 +174,11 @@ class KeyframeStore:
             id=s.id,
             frame_index=s.frame_index,
             timestamp=s.timestamp,
-            image=s.image,
+            stored_image=s.picture.stored_image,
             T_cw=s.T_cw.clone(),
             inverse_depth=s.inverse_depth.reshape(shape).clone(),
             information=self._limited(s).reshape(shape).clone(),
-            normal=s.normal,
+            stored_normal=s.picture.stored_normal,
         )
 
     def _limited(self, s: KeyframeState) -> Float[Tensor, "p"]:
