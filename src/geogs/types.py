@@ -21,6 +21,8 @@ class Frame:
     """Seconds."""
     image: UInt8[np.ndarray, "h w 3"]
     """RGB."""
+    follows_cut: bool = False
+    """Whether it begins another video, so that no motion links it to the frame before."""
 
 
 @dataclass(frozen=True, slots=True)

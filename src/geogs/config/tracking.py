@@ -49,6 +49,10 @@ class TrackingConfig:
     """The camera is lost when the median reprojection error exceeds this, of the long edge."""
     relocalise: int = 5
     """Recent keyframes, and as many older ones in turn, tried when the camera is lost."""
+    recognised: float = 0.25
+    """A keyframe that an image was recognised as counts if this fraction of it finds a match."""
+    patience: int = 15
+    """Frames with texture in which the camera stays lost before another segment is begun."""
     resident_keyframes: int = 64
     """Keyframes whose images stay in memory, those used last; others wait in a temporary file, at
     least 1."""

@@ -55,6 +55,13 @@ class KeyframeState:
     """Of the matches alone."""
     prior: KeyframePrior | None = None
 
+    def rescale(self, factor: float) -> None:
+        """Multiply every length that the camera sees by ``factor``; the pose stays."""
+        self.inverse_depth = self.inverse_depth / factor
+        self.information = self.information * factor**2
+        if self.prior is not None:
+            self.prior.rescale(factor)
+
     @property
     def image(self) -> UInt8[np.ndarray, "h w 3"]:
         """RGB; not to be changed in place."""
@@ -83,8 +90,20 @@ class KeyframeState:
         self.picture.normal = normal
 
 
+@dataclass
+class KeyframeIds:
+    """Gives out ids, which grow and are never used twice; several stores may share it."""
+
+    next: int = 0
+
+    def take(self) -> int:
+        """A new id."""
+        self.next += 1
+        return self.next - 1
+
+
 class KeyframeStore:
-    """Keyframes in order of time; ids grow and are never used twice.
+    """Keyframes in order of time, by id.
 
     Where ``encode``, the flow operator's, is given, only the ``resident`` keyframes used last have
     their images in memory; those of others are read from a file and encoded again when needed.
@@ -95,13 +114,14 @@ class KeyframeStore:
         grid: SampleGrid,
         encode: Callable[[UInt8[np.ndarray, "h w 3"]], Any] | None = None,
         resident: int = 64,
+        ids: KeyframeIds | None = None,
     ) -> None:
         self.grid = grid
+        self._numbers = ids or KeyframeIds()
         self._pictures = None if encode is None else PictureArchive(encode, resident)
         self._states: dict[int, KeyframeState] = {}
         self._reported: dict[int, tuple[Tensor, Tensor, Tensor]] = {}
         """Inverse depth and information of each keyframe as last exported, and its limit."""
-        self._next_id = 0
 
     def __len__(self) -> int:
         return len(self._states)
@@ -120,6 +140,11 @@ class KeyframeStore:
         """All ids, earliest first."""
         return list(self._states)
 
+    @property
+    def next_id(self) -> int:
+        """The id that the next keyframe gets."""
+        return self._numbers.next
+
     def add(
         self,
         frame_index: int,
@@ -131,10 +156,14 @@ class KeyframeStore:
         """Append a keyframe with unit inverse depth and no information."""
         ones = torch.ones(self.grid.size, device=self.grid.device)
         picture = Picture(image, encoded, self._pictures)
-        state = KeyframeState(self._next_id, frame_index, timestamp, picture, T_cw, ones, 0 * ones)
-        self._states[state.id] = state
-        self._next_id += 1
-        return state
+        id = self._numbers.take()
+        self._states[id] = KeyframeState(id, frame_index, timestamp, picture, T_cw, ones, 0 * ones)
+        return self._states[id]
+
+    def absorb(self, other: "KeyframeStore") -> None:
+        """Take over the keyframes of another store, whose ids are others."""
+        self._states = dict(sorted({**self._states, **other._states}.items()))
+        self._reported.update(other._reported)
 
     def remove(self, id: int) -> KeyframeState:
         """Take a keyframe out and return it."""
@@ -157,10 +186,7 @@ class KeyframeStore:
         """Multiply every length by ``factor``."""
         for state in self:
             state.T_cw = scaled(state.T_cw, factor)
-            state.inverse_depth = state.inverse_depth / factor
-            state.information = state.information * factor**2
-            if state.prior is not None:
-                state.prior.rescale(factor)
+            state.rescale(factor)
 
     def export(self, id: int) -> Keyframe:
         """The keyframe as the rest of the system sees it; tensors are copies.

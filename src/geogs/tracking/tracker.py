@@ -1,6 +1,6 @@
 """The front end: frames in, keyframes with poses and inverse depth out."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Any
@@ -21,16 +21,17 @@ from geogs.tracking.flow.base import FlowOperator
 from geogs.tracking.flow.select import build_operator
 from geogs.tracking.graph import FrameGraph, frame_distances, proximity_pairs
 from geogs.tracking.grid import SampleGrid
-from geogs.tracking.initialise import initialise
 from geogs.tracking.keyframe_priors import KeyframePriors
-from geogs.tracking.keyframes import KeyframeState, KeyframeStore
-from geogs.tracking.motion import FlowChain, FrameLocator, FrameMotion, transfer_depth
-from geogs.tracking.trajectory import TrajectoryRecorder
+from geogs.tracking.keyframes import KeyframeIds, KeyframeState, KeyframeStore, scaled
+from geogs.tracking.motion import (
+    FrameLocator,
+    FrameMotion,
+    Recognition,
+    transfer_depth,
+)
+from geogs.tracking.start_up import MIN_KEYFRAMES, StartUp
+from geogs.tracking.trajectory import FrameRecord, TrajectoryRecorder
 from geogs.types import Frame, Keyframe, PoseCorrection, Trajectory
-
-MIN_KEYFRAMES = 4
-MAX_MISSES = 5
-"""Frames without a match after which a start that has not succeeded begins anew."""
 
 
 class TrackState(Enum):
@@ -54,6 +55,10 @@ class TrackResult:
     """Ids whose poses the local adjustment still moves, earliest first."""
     removed: tuple[int, ...] = ()
     """Ids that were culled."""
+    apart: tuple[int, ...] = ()
+    """Ids that became final in a segment which is not part of the world."""
+    is_new_world: bool = False
+    """Whether another segment became the world; what is final is all of it."""
 
 
 class Tracker:
@@ -68,6 +73,7 @@ class Tracker:
         operator: FlowOperator | None = None,
         prior: MonocularPrior | None = None,
         prior_config: PriorConfig | None = None,
+        ids: KeyframeIds | None = None,
     ) -> None:
         cv2.setRNGSeed(seed)
         self.camera = camera
@@ -84,12 +90,16 @@ class Tracker:
         self._locator = FrameLocator(
             self.grid, self.operator, self.config.min_matched, self.config.max_residual * edge
         )
-        self._finalized: list[int] = []
+        self._finalized: dict[int, None] = {}
+        self._breaks: list[int] = []
+        """Keyframes that no motion links to the one before them."""
         self._last: tuple[int, Tensor] | None = None
         """Pose of the last frame: a keyframe and the motion from it, so that corrections carry."""
         self._velocity: Tensor | None = None
-        self._chain = FlowChain(self.grid, self.operator)
+        self._start_up = StartUp(self.graph, self.recorder, self.priors, self.config)
         self._misses = 0
+        self.frames_lost = 0
+        """Frames with texture since the camera was last located, once the map has been started."""
 
     # --- reading ---------------------------------------------------------------------------
 
@@ -102,12 +112,17 @@ class Tracker:
         """Present state of a keyframe."""
         return self.store.export(id)
 
-    def trajectory(self) -> Trajectory:
+    @property
+    def finalized(self) -> tuple[int, ...]:
+        """Ids that are never removed any more, earliest first."""
+        return tuple(self._finalized)
+
+    def trajectory(self, apart: Sequence[FrameRecord] = ()) -> Trajectory:
         """Poses of all frames seen so far, solved on the present keyframes.
 
-        Before the map is started nothing counts as tracked.
+        Before the map is started nothing counts as tracked, and frames ``apart`` never do.
         """
-        trajectory = self.recorder.solve()
+        trajectory = self.recorder.solve(apart)
         if self.state is TrackState.INITIALIZING:
             return replace(trajectory, tracked=np.zeros_like(trajectory.tracked))
         return trajectory
@@ -132,14 +147,37 @@ class Tracker:
             self.store[id].T_cw = T.to(self.store[id].T_cw)
 
     def correct(self, correction: PoseCorrection) -> None:
-        """Take over poses and scales of a loop closure or another global correction."""
+        """Take over poses and scales of a loop closure or another global correction.
+
+        What is known relative to a keyframe, such as where the last frame was, moves along.
+        """
         for id, T in correction.after.items():
-            state, scale = self.store[id], correction.scale.get(id, 1.0)
-            state.T_cw = T.to(state.T_cw)
-            state.inverse_depth = state.inverse_depth * scale
-            state.information = state.information / scale**2
-            if state.prior is not None:
-                state.prior.rescale(1 / scale)
+            self.store[id].T_cw = T.to(self.store[id].T_cw)
+            self.store[id].rescale(1 / correction.scale.get(id, 1.0))
+        self.recorder.rescale(correction.scale)
+        if self._last is not None:
+            scale = 1 / correction.scale.get(self._last[0], 1.0)
+            self._last = (self._last[0], scaled(self._last[1], scale))
+            if self._velocity is not None:
+                self._velocity = scaled(self._velocity, scale)
+
+    def absorb(self, other: "Tracker") -> None:
+        """Take over the keyframes and frames of another tracker, already in this one's world.
+
+        The camera is where the later of the two saw it last. The other is of no more use.
+        """
+        if other.store.ids[0] > self.store.ids[0]:
+            self._breaks.append(other.store.ids[0])
+        after = [k for k in self.store.ids if k > other.store.ids[-1]]
+        self._breaks = sorted({*self._breaks, *other._breaks, *after[:1]})
+        if other.store.ids[-1] > self.store.ids[-1]:
+            self.state, self._misses = other.state, other._misses
+            self._last, self._velocity = other._last, other._velocity
+            self.frames_lost = other.frames_lost
+        self._finalized = dict.fromkeys(sorted([*self._finalized, *other._finalized]))
+        self.store.absorb(other.store)
+        self.graph.edges = dict(sorted({**self.graph.edges, **other.graph.edges}.items()))
+        self.recorder.absorb(other.recorder)
 
     # --- the stream ------------------------------------------------------------------------
 
@@ -161,104 +199,65 @@ class Tracker:
             return self._start(frame, encoded)
         motion = self._locate(encoded)
         if motion is None:
+            self.frames_lost += 1
             return self._lose(frame)
         return self._follow(frame, encoded, motion)
+
+    def rejoin(self, frame: Frame, places: Sequence[Recognition]) -> TrackResult | None:
+        """Take the next frame, which was recognised at one of some keyframes; None if it was not.
+
+        A place is believed where the dense flow agrees with it over ``recognised`` of the cells.
+        """
+        encoded = self.operator.encode(frame.image)
+        for place in places:
+            if place.keyframe not in self.store:
+                continue
+            keyframe = self.store[place.keyframe]
+            guess = place.T_rel.to(keyframe.T_cw) @ keyframe.T_cw
+            motion = self._locator.locate(keyframe, encoded, guess)
+            if motion is not None and motion.matched >= self.config.recognised:
+                self.cut()
+                return self._follow(frame, encoded, motion)
+        return None
+
+    def cut(self) -> None:
+        """No motion links the next frame to those before it; the camera has to be found anew."""
+        if self.state is not TrackState.INITIALIZING:
+            self.state, self._velocity = TrackState.LOST, None
 
     def finish(self) -> TrackResult:
         """End of the stream: every keyframe becomes final.
 
         Raises TrackingLost if the map could never be started.
         """
-        if self.state is TrackState.INITIALIZING and not (
-            len(self.store) >= MIN_KEYFRAMES and self._initialise()
-        ):
-            raise TrackingLost(self._why_not_started())
+        if self.state is TrackState.INITIALIZING:
+            if not self._start_up.finish():
+                raise TrackingLost(self._start_up.why_not())
+            self._begin()
         fresh = self._finalise(self.store.ids)
         self.recorder.finalise(self.store.ids[-1], None)
         return TrackResult(self.state, None, fresh, ())
 
-    def _why_not_started(self) -> str:
-        if not len(self.store):
-            return "No frame has enough texture to be tracked; check exposure and focus."
-        if len(self.store) < MIN_KEYFRAMES:
-            return (
-                "The camera hardly moves (no parallax), so nothing can be reconstructed; "
-                "record a longer video in which the camera changes its place."
-            )
-        return (
-            "The images show no parallax (the camera only turns, or the scene is too far away); "
-            "move the camera sideways while recording."
-        )
-
-    # --- before the map is started ---------------------------------------------------------
-
     def _start(self, frame: Frame, encoded: Any) -> TrackResult:
-        if len(self.store):
-            last = list(self.store)[-1]
-            match = self._chain.follow(last.encoded, encoded)
-            if match.matched < self.config.min_matched:
-                return self._restart(frame, encoded)
-            self._misses = 0
-            if match.flow < self.config.keyframe_flow * self._long_edge:
-                eye = torch.eye(4, dtype=torch.float64)
-                self.recorder.add(frame.index, frame.timestamp, encoded, last.id, eye, match.there)
-                return TrackResult(self.state)
-        return self._gather(frame, encoded)
-
-    def _gather(self, frame: Frame, encoded: Any) -> TrackResult:
-        """Add a keyframe to those the map will be started from, and start it with enough."""
-        eye = torch.eye(4, dtype=torch.float64)
-        state = self.store.add(frame.index, frame.timestamp, frame.image, encoded, eye)
-        self.priors.ask(state)
-        self._chain.reset()
-        self.recorder.add_keyframe(state.id)
-        if len(self.store) < max(self.config.init_keyframes, MIN_KEYFRAMES):
-            return TrackResult(self.state)
-        if not self._initialise():
-            # More keyframes may bring parallax; with twice as many the first are given up.
-            full = len(self.store) >= 2 * self.config.init_keyframes
-            return TrackResult(self.state, removed=self._forget(len(self.store) // 2 * full))
+        step = self._start_up.take(frame, encoded)
+        if not step.has_started:
+            return TrackResult(self.state, removed=step.removed)
+        self._begin()
+        newest = self.store.ids[-1] if step.is_keyframe else None
         fresh = self._finalise(self.store.ids[:-1])
-        return TrackResult(self.state, state.id, fresh, self.active)
+        return TrackResult(self.state, newest, fresh, self.active, step.removed)
 
-    def _restart(self, frame: Frame, encoded: Any) -> TrackResult:
-        """The view changed at once: wait for it to come back, start with what there is, or anew."""
-        self._misses += 1
-        if self._misses < MAX_MISSES:
-            self.recorder.add_untracked(frame.index, frame.timestamp)
-            return TrackResult(self.state)
-        self._misses = 0
-        if len(self.store) >= MIN_KEYFRAMES and self._initialise():
-            self.recorder.add_untracked(frame.index, frame.timestamp)
-            return TrackResult(self.state, None, self._finalise(self.store.ids[:-1]), self.active)
-        removed = self._forget(len(self.store))
-        return replace(self._gather(frame, encoded), removed=removed)
-
-    def _initialise(self) -> bool:
-        ok = initialise(self.graph, self.config.min_parallax * self._long_edge, self.config.radius)
-        if ok:
-            self.priors.adjust(self.store.ids, self.config.huber)
-            self.state = TrackState.TRACKING
-            self._last = (self.store.ids[-1], torch.eye(4).to(list(self.store)[-1].T_cw))
-            self.recorder.anchor_to_keyframes()
-        return ok
-
-    def _forget(self, count: int) -> tuple[int, ...]:
-        """Drop the earliest keyframes of a start that failed."""
-        gone = tuple(self.store.ids[:count])
-        for id in gone:
-            self.graph.remove_keyframe(id)
-            self.store.remove(id)
-        return gone
+    def _begin(self) -> None:
+        self.state = TrackState.TRACKING
+        self._last = (self.store.ids[-1], torch.eye(4, dtype=torch.float64))
 
     # --- with a map ------------------------------------------------------------------------
 
     def _locate(self, encoded: Any) -> FrameMotion | None:
-        states = list(self.store)
-        last = states[-1]
         motion = None
         before = self._last_pose()
-        if before is not None and self.state is TrackState.TRACKING:
+        if self._last is not None and before is not None and self.state is TrackState.TRACKING:
+            last = self.store[self._last[0]]
             guess = before if self._velocity is None else self._velocity @ before
             motion = self._locator.locate(last, encoded, guess)
             if motion is None and self._velocity is not None:
@@ -288,7 +287,9 @@ class Tracker:
     def _follow(self, frame: Frame, encoded: Any, motion: FrameMotion) -> TrackResult:
         before = self._last_pose() if self.state is TrackState.TRACKING else None
         self._velocity = None if before is None else motion.T_cw @ se3_inverse(before)
-        self.state, self._misses = TrackState.TRACKING, 0
+        if self.state is TrackState.LOST:
+            self._breaks.append(self.store.next_id)
+        self.state, self._misses, self.frames_lost = TrackState.TRACKING, 0, 0
         anchor = self.store[motion.keyframe]
         T_rel = motion.T_cw @ se3_inverse(anchor.T_cw)
         self._last = (anchor.id, T_rel)
@@ -306,15 +307,15 @@ class Tracker:
             self.grid, T, anchor.inverse_depth, anchor.information
         )
         self.recorder.add_keyframe(state.id)
-        self._connect(state.id)
+        self._connect(state.id, anchor.id)
         self._adjust_locally()
         removed = self._cull()
         self._last = (state.id, torch.eye(4).to(state.T_cw))
         fresh = self._finalise(self.store.ids[:-1])
         return TrackResult(self.state, state.id, fresh, self.active, removed)
 
-    def _connect(self, id: int) -> None:
-        """Measure a new keyframe against its neighbours."""
+    def _connect(self, id: int, anchor: int) -> None:
+        """Measure a new keyframe against the one it was located at, and its neighbours."""
         c, ids = self.config, self.store.ids
         pairs = proximity_pairs(
             self.store,
@@ -326,7 +327,12 @@ class Tracker:
             c.proximity_distance * self._long_edge,
             c.radius + c.proximity_pairs,
         )
-        self.graph.measure(pairs, fine=False)
+        # Neighbours in time are none where the camera was lost in between.
+        broken = [p for p in pairs if any(p[0] < b <= p[1] for b in self._breaks)]
+        there, back = frame_distances(self.store, broken + [p[::-1] for p in broken]).chunk(2)
+        apart = {p for p, d in zip(broken, (there + back).tolist(), strict=True) if d == torch.inf}
+        pairs = [p for p in pairs if p not in apart]
+        self.graph.measure({*pairs, (anchor, id)}, fine=False)
 
     def _adjust_locally(self) -> None:
         c, ids = self.config, self.store.ids
@@ -362,6 +368,6 @@ class Tracker:
         fresh = [k for k in ids if k not in self._finalized]
         for id in fresh:
             if self._finalized:
-                self.recorder.finalise(self._finalized[-1], id)
-            self._finalized.append(id)
+                self.recorder.finalise(next(reversed(self._finalized)), id)
+            self._finalized[id] = None
         return tuple(fresh)

@@ -1,7 +1,7 @@
 """The pose of every frame, solved at the end from sparse flow kept along the way."""
 
 from bisect import bisect_left
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -14,7 +14,7 @@ from geogs.geometry.lie import retract, se3_inverse, se3_log
 from geogs.tracking.bundle import linearise, solve_poses
 from geogs.tracking.flow.base import FlowMatch, FlowOperator
 from geogs.tracking.grid import SampleGrid
-from geogs.tracking.keyframes import KeyframeState, KeyframeStore
+from geogs.tracking.keyframes import KeyframeState, KeyframeStore, scaled
 from geogs.tracking.motion import all_reprojections
 from geogs.types import Trajectory
 
@@ -107,9 +107,9 @@ class TrajectoryRecorder:
     def rescale(self, scale: Mapping[int, float]) -> None:
         """Divide the lengths around keyframes by the given factors."""
         for record in self.records:
-            if record.anchor in scale and scale[record.anchor] != 1.0:
-                record.T_rel = record.T_rel.clone()
-                record.T_rel[:3, 3] /= scale[record.anchor]
+            factor = 1.0 if record.anchor is None else scale.get(record.anchor, 1.0)
+            if factor != 1.0:
+                record.T_rel = scaled(record.T_rel, 1 / factor)
 
     def absorb(self, other: "TrajectoryRecorder") -> None:
         """Take over the frames of another recorder, whose keyframes are now in this one's store."""
@@ -177,12 +177,13 @@ class TrajectoryRecorder:
         assert record.anchor is not None, "a frame that was not tracked has no pose"
         return record.T_rel @ self.store[record.anchor].T_cw
 
-    def solve(self, chunk: int = 64) -> Trajectory:
+    def solve(self, apart: Sequence[FrameRecord] = (), chunk: int = 64) -> Trajectory:
         """Poses of all frames seen so far on the present keyframes, real timestamps.
 
-        Untracked frames are interpolated between their neighbours.
+        Untracked frames, and those ``apart`` on other keyframes, are interpolated between their
+        neighbours.
         """
-        records = sorted(self.records, key=lambda r: r.index)
+        records = sorted([*self.records, *apart], key=lambda r: r.index)
         keyframes = {s.frame_index: s.id for s in self.store}
         tracked = [r for r in records if r.anchor is not None and r.anchor in self.store]
         free = [r for r in tracked if r.index not in keyframes and r.observations]

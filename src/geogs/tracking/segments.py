@@ -1,0 +1,198 @@
+"""Stretches of video that no motion links: each tracked on its own until one place joins them."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from geogs.errors import TrackingLost
+from geogs.geometry.lie import sim3_scale
+from geogs.tracking.keyframes import KeyframeStore
+from geogs.tracking.motion import Recognition
+from geogs.tracking.tracker import Tracker, TrackResult, TrackState
+from geogs.types import Frame, Keyframe, PoseCorrection, Trajectory
+
+Recall = Callable[[UInt8[np.ndarray, "h w 3"]], Sequence[Recognition]]
+"""Recognises keyframes of any segment in an image; most alike first."""
+
+
+@dataclass(frozen=True)
+class Segment:
+    """What became of one stretch of video."""
+
+    first_time: float
+    """Seconds."""
+    last_time: float
+    keyframes: int
+    """It had when it was joined, or at the end."""
+    fate: Literal["world", "joined", "apart"]
+    """The first of the map, joined to it, or never: then its frames count as not tracked."""
+
+
+class Segments:
+    """Trackers of stretches of video, one of which is the world that the map shows.
+
+    A camera that stays lost although there is something to see starts a new segment, with a frame
+    and unit of its own. Meanwhile every image is compared with the keyframes of all segments: where
+    one is recognised, tracking goes on there, and a segment that has not been started is dropped.
+    One that has been waits until a loop says where it lies, and then becomes part of the world.
+    Source: the atlas of ORB-SLAM3 (Campos et al. 2021), with one map.
+    """
+
+    def __init__(self, start: Callable[[], Tracker], recall: Recall, patience: int) -> None:
+        """``start`` makes a tracker whose keyframe ids follow all others'; a segment begins after
+        ``patience`` frames with texture in which nothing was recognised."""
+        self._start, self._recall, self._patience = start, recall, patience
+        self.world = start()
+        self.current = self.world
+        """Where the camera is."""
+        self.trackers = [self.world]
+        """The world and the segments that are apart, earliest first."""
+        self._joined: list[Segment] = []
+
+    # --- reading ---------------------------------------------------------------------------
+
+    @property
+    def keyframe_ids(self) -> list[int]:
+        """Ids of the world's keyframes, earliest first."""
+        return self.world.keyframe_ids
+
+    @property
+    def active(self) -> tuple[int, ...]:
+        """Ids of the world's keyframes whose poses the local adjustment moves, earliest first."""
+        return self.world.active
+
+    def keyframe(self, id: int) -> Keyframe:
+        """Present state of one of the world's keyframes."""
+        return self.world.keyframe(id)
+
+    def tracker_of(self, id: int) -> Tracker:
+        """The tracker that holds a keyframe. Raises KeyError if none does."""
+        for tracker in self.trackers:
+            if id in tracker.store:
+                return tracker
+        raise KeyError(id)
+
+    def store_of(self, id: int) -> KeyframeStore:
+        """The keyframes among which one is. Raises KeyError if it is nowhere."""
+        return self.tracker_of(id).store
+
+    def trajectory(self) -> Trajectory:
+        """Poses of all frames seen so far; those of segments apart count as not tracked."""
+        apart = [t.recorder for t in self.trackers if t is not self.world]
+        return self.world.trajectory([r for recorder in apart for r in recorder.records])
+
+    def summary(self) -> list[Segment]:
+        """All segments so far that were started, earliest first."""
+        present = [
+            _segment(t, "world" if t is self.world else "apart")
+            for t in self.trackers
+            if t.keyframe_ids
+        ]
+        return sorted([*present, *self._joined], key=lambda s: s.first_time)
+
+    # --- writing ---------------------------------------------------------------------------
+
+    def write_back(self, poses: Mapping[int, Float[Tensor, "4 4"]]) -> None:
+        """Take over poses of active keyframes that were refined elsewhere."""
+        self.world.write_back(poses)
+
+    def join(self, host: Tracker, guest: Tracker, S: Float[Tensor, "4 4"]) -> tuple[int, ...]:
+        """Make a segment part of another, given the Sim(3) from the host's world to the guest's.
+
+        Returns the ids of the guest's keyframes that were final.
+        """
+        self._joined.append(_segment(guest, "joined"))
+        guest.correct(moved(guest.store, S))
+        final = guest.finalized
+        host.absorb(guest)
+        self.trackers.remove(guest)
+        if self.current is guest:
+            self.current = host
+        return final
+
+    # --- the stream ------------------------------------------------------------------------
+
+    def track(self, frame: Frame) -> TrackResult:
+        """Take the next frame. Raises InputError if its size is not the camera's."""
+        if frame.follows_cut:
+            self.current.cut()
+        if self._is_searching:
+            result = self._rejoin(frame)
+            if result is not None:
+                return self._report(result)
+        lost = self.current.state is TrackState.LOST
+        if lost and (frame.follows_cut or self.current.frames_lost >= self._patience):
+            self.current = self._start()
+            self.trackers.append(self.current)
+        return self._report(self.current.track(frame))
+
+    def finish(self) -> TrackResult:
+        """End of the stream: every keyframe becomes final, and the largest segment the world.
+
+        Raises TrackingLost if no segment could be started.
+        """
+        finals: dict[Tracker, TrackResult] = {}
+        for tracker in list(self.trackers):
+            try:
+                finals[tracker] = tracker.finish()
+            except TrackingLost:
+                if len(self.trackers) == 1:
+                    raise
+                self._drop(tracker)
+        largest = max(finals, key=lambda t: len(t.store))
+        if largest is self.world:
+            return finals[largest]
+        self.world = largest
+        return replace(finals[largest], finalized=largest.finalized, is_new_world=True)
+
+    @property
+    def _is_searching(self) -> bool:
+        is_starting = self.current.state is TrackState.INITIALIZING
+        return self.current.state is TrackState.LOST or (is_starting and len(self.trackers) > 1)
+
+    def _rejoin(self, frame: Frame) -> TrackResult | None:
+        """Go on where the frame was recognised, in whatever segment."""
+        places = self._recall(frame.image)
+        for tracker in self.trackers if places else ():
+            if tracker.state is TrackState.INITIALIZING:
+                continue
+            result = tracker.rejoin(frame, places)
+            if result is not None:
+                if self.current.state is TrackState.INITIALIZING:
+                    self._drop(self.current)
+                self.current = tracker
+                return result
+        return None
+
+    def _drop(self, tracker: Tracker) -> None:
+        """Give up a segment that has not been started."""
+        self.trackers.remove(tracker)
+        if tracker is self.world:
+            self.world = self.trackers[0]
+        self.world.recorder.give_up(tracker.recorder)
+
+    def _report(self, result: TrackResult) -> TrackResult:
+        """What the world is told: of segments apart, only what is final."""
+        if self.current is self.world:
+            return result
+        return TrackResult(result.state, apart=result.finalized)
+
+
+def moved(store: KeyframeStore, S: Float[Tensor, "4 4"]) -> PoseCorrection:
+    """The correction that takes keyframes to another world, given the Sim(3) from it to theirs."""
+    scale = float(sim3_scale(S))
+    before = {k: store[k].T_cw.clone() for k in store.ids}
+    after = {}
+    for k, T in before.items():
+        after[k] = T @ S.to(T)
+        after[k][:3] /= scale
+    return PoseCorrection(before, after, dict.fromkeys(before, scale))
+
+
+def _segment(tracker: Tracker, fate: Literal["world", "joined", "apart"]) -> Segment:
+    times = [r.timestamp for r in tracker.recorder.records]
+    return Segment(min(times), max(times), len(tracker.store), fate)

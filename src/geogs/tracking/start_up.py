@@ -1,0 +1,123 @@
+"""Before there is a map: gather keyframes until one can be started from them."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+
+from geogs.config import TrackingConfig
+from geogs.tracking.graph import FrameGraph
+from geogs.tracking.initialise import initialise
+from geogs.tracking.keyframe_priors import KeyframePriors
+from geogs.tracking.motion import FlowChain
+from geogs.tracking.trajectory import TrajectoryRecorder
+from geogs.types import Frame
+
+MIN_KEYFRAMES = 4
+MAX_MISSES = 5
+"""Frames without a match after which a start that has not succeeded begins anew."""
+
+
+@dataclass(frozen=True)
+class StartStep:
+    """What one frame changed."""
+
+    has_started: bool = False
+    """Whether all keyframes now have poses and depths."""
+    is_keyframe: bool = False
+    removed: tuple[int, ...] = ()
+    """Ids of keyframes that were given up."""
+
+
+class StartUp:
+    """Chooses keyframes by the flow since the last, and starts the map once there are enough."""
+
+    def __init__(
+        self,
+        graph: FrameGraph,
+        recorder: TrajectoryRecorder,
+        priors: KeyframePriors,
+        config: TrackingConfig,
+    ) -> None:
+        self.graph, self.recorder, self.priors, self.config = graph, recorder, priors, config
+        self.store = graph.keyframes
+        camera = self.store.grid.camera
+        self._long_edge = max(camera.width, camera.height)
+        self._chain = FlowChain(self.store.grid, graph.operator)
+        self._misses = 0
+
+    def take(self, frame: Frame, encoded: Any) -> StartStep:
+        """Take the next frame."""
+        if len(self.store):
+            last = list(self.store)[-1]
+            match = self._chain.follow(last.encoded, encoded)
+            if match.matched < self.config.min_matched:
+                return self._miss(frame, encoded)
+            self._misses = 0
+            if match.flow < self.config.keyframe_flow * self._long_edge:
+                eye = torch.eye(4, dtype=torch.float64)
+                self.recorder.add(frame.index, frame.timestamp, encoded, last.id, eye, match.there)
+                return StartStep()
+        return self._gather(frame, encoded)
+
+    def finish(self) -> bool:
+        """Start with what there is; False if that cannot be."""
+        if len(self.store) < MIN_KEYFRAMES:
+            return False
+        edge = self._long_edge
+        if not initialise(self.graph, self.config.min_parallax * edge, self.config.radius):
+            return False
+        self.priors.adjust(self.store.ids, self.config.huber)
+        self.recorder.anchor_to_keyframes()
+        return True
+
+    def why_not(self) -> str:
+        """What to tell somebody whose video could not be started with."""
+        if not len(self.store):
+            return "No frame has enough texture to be tracked; check exposure and focus."
+        if len(self.store) < MIN_KEYFRAMES:
+            return (
+                "The camera hardly moves (no parallax), so nothing can be reconstructed; "
+                "record a longer video in which the camera changes its place."
+            )
+        return (
+            "The images show no parallax (the camera only turns, or the scene is too far away); "
+            "move the camera sideways while recording."
+        )
+
+    def _gather(self, frame: Frame, encoded: Any) -> StartStep:
+        """Add a keyframe to those the map will be started from, and start it with enough."""
+        eye = torch.eye(4, dtype=torch.float64)
+        state = self.store.add(frame.index, frame.timestamp, frame.image, encoded, eye)
+        self.priors.ask(state)
+        self._chain.reset()
+        self.recorder.add_keyframe(state.id)
+        if len(self.store) < max(self.config.init_keyframes, MIN_KEYFRAMES):
+            return StartStep(is_keyframe=True)
+        if self.finish():
+            return StartStep(True, True)
+        # More keyframes may bring parallax; with twice as many the first are given up.
+        full = len(self.store) >= 2 * self.config.init_keyframes
+        return StartStep(False, True, self._forget(len(self.store) // 2 * full))
+
+    def _miss(self, frame: Frame, encoded: Any) -> StartStep:
+        """The view changed at once: wait for it to come back, start with what there is, or anew."""
+        self._misses += 1
+        if self._misses < MAX_MISSES:
+            self.recorder.add_untracked(frame.index, frame.timestamp)
+            return StartStep()
+        self._misses = 0
+        if self.finish():
+            self.recorder.add_untracked(frame.index, frame.timestamp)
+            return StartStep(True)
+        removed = self._forget(len(self.store))
+        step = self._gather(frame, encoded)
+        return StartStep(step.has_started, step.is_keyframe, removed)
+
+    def _forget(self, count: int) -> tuple[int, ...]:
+        """Drop the earliest keyframes of a start that failed."""
+        gone = tuple(self.store.ids[:count])
+        for id in gone:
+            self.graph.remove_keyframe(id)
+            self.store.remove(id)
+        return gone
