@@ -70,15 +70,23 @@ def _surfaces(
     materials: Materials,
 ) -> None:
     """Walls, floor, ceiling, beams and skirting."""
-    w, d, h = size
+    h = size[2]
     upright = np.array([[-1.0, 0, 0], [0, 0, 1], [0, 1, 0]])  # local z to y, local y to z
     kinds = rng.permutation(4)
     for wall, kind in zip(walls, kinds, strict=True):
-        image = _wall_image(rng, int(kind), wall.width, h)
+        image = wall_image(rng, int(kind), wall.width, h)
         paper = build.texture(image)
         wall.build.rectangle((0, 0, h / 2), (wall.width, h), paper, upright)
         skirting = (wall.width - 0.04, 0.02, 0.1)
         wall.build.box((0, 0.01, 0.05), skirting, materials.lacquer)
+    add_ceiling_and_floor(build, rng, size, materials)
+
+
+def add_ceiling_and_floor(
+    build: SceneBuilder, rng: np.random.Generator, size: np.ndarray, materials: Materials
+) -> None:
+    """Floor, ceiling and beams of a room that fills [0, size]."""
+    w, d, h = size
     shape = (round(d / _TEXEL), round(w / _TEXEL))
     if rng.random() < 0.6:
         floor = texture.planks(rng, shape, 26, (168, 124, 82))
@@ -91,7 +99,7 @@ def _surfaces(
         build.box((x, d / 2, h - 0.06), (0.12, d, 0.12), materials.walnut)
 
 
-def _wall_image(rng: np.random.Generator, kind: int, width: float, height: float) -> np.ndarray:
+def wall_image(rng: np.random.Generator, kind: int, width: float, height: float) -> np.ndarray:
     """Brick, two plasters or paper, as large as the wall."""
     shape = (round(height / _TEXEL), round(width / _TEXEL))
     match kind:
@@ -121,12 +129,12 @@ def _furnish_walls(
                 furniture.bookshelf(piece, rng, materials, rng.uniform(1.3, 1.8))
                 furniture.plant(corner, rng, materials)
                 beside = math.copysign(wall.width / 2 - 0.6, -aside)
-                _picture(wall, rng, materials, beside, 1.6, 0.5)
+                add_picture(wall.build, rng, materials, beside, 1.6, 0.5)
             case 1:
                 furniture.sofa(piece, rng, materials, rng.uniform(1.8, 2.1))
                 furniture.floor_lamp(corner, materials)
                 for x in (-0.75, 0.0, 0.75):
-                    _picture(wall, rng, materials, x, rng.uniform(1.45, 1.6), 0.52)
+                    add_picture(wall.build, rng, materials, x, rng.uniform(1.45, 1.6), 0.52)
             case 2:
                 furniture.desk(piece, rng, materials, rng.uniform(1.2, 1.5))
                 furniture.pouf(corner, rng, materials)
@@ -134,20 +142,25 @@ def _furnish_walls(
             case _:
                 furniture.sideboard(piece, rng, materials, rng.uniform(1.5, 1.9))
                 for x in (-0.8, 0.1, 0.85):
-                    _picture(wall, rng, materials, x, rng.uniform(1.5, 1.7), 0.6)
+                    add_picture(wall.build, rng, materials, x, rng.uniform(1.5, 1.7), 0.6)
 
 
-def _picture(
-    wall: _Wall, rng: np.random.Generator, materials: Materials, x: float, z: float, extent: float
+def add_picture(
+    wall: SceneBuilder,
+    rng: np.random.Generator,
+    materials: Materials,
+    x: float,
+    z: float,
+    extent: float,
 ) -> None:
     """A poster, landscape or abstract in a frame."""
     draw = (artwork.poster, artwork.landscape, artwork.abstract)[rng.integers(3)]
     tall = draw is artwork.poster or rng.random() < 0.3
     shape = (420, 320) if tall else (300, 420)
     scale = extent * rng.uniform(0.9, 1.15) / 400
-    canvas = wall.build.texture(draw(rng, shape))
+    canvas = wall.texture(draw(rng, shape))
     frame = (materials.oak, materials.walnut, materials.metal)[rng.integers(3)]
-    furniture.picture(wall.build, (x, z), (shape[1] * scale, shape[0] * scale), canvas, frame)
+    furniture.picture(wall, (x, z), (shape[1] * scale, shape[0] * scale), canvas, frame)
 
 
 def _window(wall: _Wall, rng: np.random.Generator, materials: Materials, height: float) -> None:
@@ -168,7 +181,7 @@ def _furnish_middle(
     build: SceneBuilder, rng: np.random.Generator, size: np.ndarray, materials: Materials
 ) -> None:
     """Rug, round table, balls on the floor, the ceiling lamp."""
-    w, d, h = size
+    w, d = size[:2]
     middle = build.at(w / 2, d / 2, yaw=rng.uniform(-0.3, 0.3))
     rug = build.texture(texture.rug(rng, (512, 720)))
     middle.box((0, 0, 0.006), (2.3, 1.65, 0.012), rug)
@@ -179,5 +192,11 @@ def _furnish_middle(
         x, y = table + rng.uniform(0.62, 0.8) * np.array([math.cos(angle), math.sin(angle)])
         ball = materials.ceramic[rng.integers(len(materials.ceramic))]
         middle.ellipsoid((x, y, 0.012 + r), (r, r, r), ball)
+    add_ceiling_lamp(build, size, materials)
+
+
+def add_ceiling_lamp(build: SceneBuilder, size: np.ndarray, materials: Materials) -> None:
+    """A lamp in the middle of the ceiling, and its light."""
+    w, d, h = size
     build.frustum((w / 2, d / 2, h - 0.2), (0.16, 0.22), 0.08, materials.shade, emission=1.0)
     build.light((w / 2, d / 2, h - 0.25), (2.5, 2.35, 2.1), 0.2)

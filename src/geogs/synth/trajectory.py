@@ -39,8 +39,8 @@ def handheld_trajectory(
             break
     else:
         raise InputError(f"no camera path keeps {_MIN_CLEARANCE} m from the furniture of this room")
-    T_wc = _look_at(position(lap % 1.0), target(lap % 1.0))
-    return _shake(T_wc, np.random.default_rng([seed, 0x5A4]))
+    T_wc = look_at(position(lap % 1.0), target(lap % 1.0))
+    return with_shake(T_wc, np.random.default_rng([seed, 0x5A4]))
 
 
 def _splines(
@@ -65,7 +65,7 @@ def _splines(
     return closed(position), closed(target)
 
 
-def _look_at(
+def look_at(
     position: Float64[np.ndarray, "n 3"], target: Float64[np.ndarray, "n 3"]
 ) -> Float64[np.ndarray, "n 4 4"]:
     """Camera to world with z towards the target and x level."""
@@ -79,7 +79,7 @@ def _look_at(
     return T
 
 
-def _shake(
+def with_shake(
     T_wc: Float64[np.ndarray, "n 4 4"], rng: np.random.Generator
 ) -> Float64[np.ndarray, "n 4 4"]:
     """Adds a smooth tremor: a cubic B-spline whose random coefficients act only locally."""

@@ -1,0 +1,169 @@
+"""Time and memory along a long video: a walk through many furnished rooms.
+
+    python benchmarks/long_walk.py [--frames 5000] [--size 512 288] [--device cuda]
+        [--preset fast] [--folder FOLDER] [--online] [--output FILE]
+
+The walk is rendered first, in another process and once for all runs into ``--folder``. Then the
+whole system follows it; reading images does not count. Printed are, for every 500 frames, the
+milliseconds per keyframe of each stage, the memory of the process (and of the GPU), keyframes and
+disks; then the ratio of the last to the first 500 frames and the trajectory errors. ``--walk``
+keeps the rooms of a longer walk of which only the beginning is followed.
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+
+from geogs.config import preset
+from geogs.evaluation.trajectory import evaluate_trajectory
+from geogs.geometry.camera import Camera
+from geogs.slam import Slam
+from geogs.synth.export import default_camera
+from geogs.synth.portals import SuiteRaycaster
+from geogs.synth.suite import Suite
+from geogs.types import Frame, Trajectory
+
+
+@dataclass(frozen=True)
+class Block:
+    """What some frames cost."""
+
+    frames: int
+    """Seen at the end."""
+    keyframes: int
+    disks: int
+    stages: dict[str, float]
+    """Milliseconds per new keyframe."""
+    total: float
+    """Their sum."""
+    resident: float
+    """Gigabytes of the process at the end."""
+    peak: float
+    """Gigabytes, most so far."""
+    gpu: float
+    """Gigabytes allocated at most within the block."""
+    lost: int
+
+
+def main() -> None:
+    options = parse()
+    suite, camera = Suite.for_walk(options.walk or options.frames), default_camera(*options.size)
+    folder = options.folder / f"{suite.rooms}-rooms-{camera.width}x{camera.height}"
+    if options.render_only:
+        render(suite, camera, folder, options.frames)
+        return
+    subprocess.run([sys.executable, __file__, *sys.argv[1:], "--render-only"], check=True)
+    slam = Slam(camera, preset(options.preset), options.device)
+    truth = suite.walk(options.frames)
+    blocks = follow(slam, folder, options.frames, options.every)
+    errors = {}
+    start = time.perf_counter()
+    slam.end_stream()
+    errors["online"] = ate(slam, truth)
+    if not options.online:
+        slam.finish()
+        errors["final"] = ate(slam, truth)
+    used = [b for b in blocks if b.total > 0]
+    result = {
+        "options": {k: str(v) for k, v in vars(options).items()},
+        "blocks": [asdict(b) for b in blocks],
+        "ratio": round(used[-1].total / used[0].total, 3),
+        "peak": memory("VmHWM"),
+        "gpu_peak": torch.cuda.max_memory_allocated() / 1e9 if options.device == "cuda" else 0.0,
+        "end": round(time.perf_counter() - start, 1),
+        "ate_cm": errors,
+        "seconds": {k: round(v, 2) for k, v in slam.stopwatch.seconds.items()},
+    }
+    print(json.dumps({k: v for k, v in result.items() if k != "blocks"}, indent=1))
+    if options.output is not None:
+        options.output.write_text(json.dumps(result, indent=1) + "\n")
+
+
+def parse() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--frames", type=int, default=5000)
+    parser.add_argument("--walk", type=int, help="frames of the whole walk, if only begun")
+    parser.add_argument("--size", type=int, nargs=2, default=(512, 288))
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--preset", default="fast", choices=("fast", "default", "accurate"))
+    parser.add_argument("--every", type=int, default=500, help="frames of a block")
+    parser.add_argument("--online", action="store_true", help="leave out what follows the video")
+    parser.add_argument("--folder", type=Path, default=Path("out/long_walk"))
+    parser.add_argument("--output", type=Path, help="JSON file")
+    parser.add_argument("--render-only", action="store_true")
+    return parser.parse_args()
+
+
+def render(suite: Suite, camera: Camera, folder: Path, frames: int) -> None:
+    """Write the images that are not there yet."""
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = [folder / f"frame{n:06d}.jpg" for n in range(frames)]
+    if all(path.exists() for path in paths):
+        return
+    threads = len(os.sched_getaffinity(0))
+    caster, poses = SuiteRaycaster(suite, threads), suite.walk(frames)
+    with ThreadPoolExecutor(threads) as pool:
+        for path, T_wc in zip(paths, poses, strict=True):
+            if not path.exists():
+                pool.submit(write, path, caster.render(camera, T_wc)[0])
+
+
+def write(path: Path, image: np.ndarray) -> None:
+    part = path.with_suffix(".part")
+    part.write_bytes(cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 95])[1])
+    part.rename(path)
+
+
+def follow(slam: Slam, folder: Path, frames: int, every: int) -> list[Block]:
+    """Feed the frames and take stock of every so many."""
+    blocks: list[Block] = []
+    before, known, lost, status = {}, 0, 0, None
+    for n in range(frames):
+        pixels = cv2.imread(str(folder / f"frame{n:06d}.jpg"))
+        status = slam.process(Frame(n, n / 30, np.ascontiguousarray(pixels[..., ::-1])))
+        lost += status.state.value == "lost"
+        if (n + 1) % every and n + 1 < frames:
+            continue
+        now = dict(slam.stopwatch.seconds)
+        fresh = max(status.keyframes - known, 1)
+        stages = {k: 1e3 * (now[k] - before.get(k, 0.0)) / fresh for k in now}
+        gpu = 0.0
+        if slam.mapper.map.device.type == "cuda":
+            gpu = torch.cuda.max_memory_allocated() / 1e9
+            torch.cuda.reset_peak_memory_stats()
+        blocks.append(Block(
+            n + 1, status.keyframes, status.disks, {k: round(v, 1) for k, v in stages.items()},
+            round(sum(stages.values()), 1), memory("VmRSS"), memory("VmHWM"), round(gpu, 3), lost,
+        ))  # fmt: skip
+        print(json.dumps(asdict(blocks[-1])), flush=True)
+        before, known = now, status.keyframes
+    return blocks
+
+
+def memory(field: str) -> float:
+    """Gigabytes of this process: VmRSS now, VmHWM at most."""
+    for line in Path("/proc/self/status").read_text().splitlines():
+        if line.startswith(field):
+            return round(int(line.split()[1]) * 1024 / 1e9, 3)
+    return 0.0
+
+
+def ate(slam: Slam, truth: np.ndarray) -> float:
+    """Root mean square position error after a similarity, centimetres."""
+    n = len(truth)
+    reference = Trajectory(np.arange(n) / 30, truth, np.ones(n, dtype=bool))
+    return round(evaluate_trajectory(slam.trajectory(), reference).ate_rmse_cm, 2)
+
+
+if __name__ == "__main__":
+    main()
