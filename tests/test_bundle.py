@@ -14,10 +14,10 @@ from geogs.tracking.bundle import (
     linearise,
     project,
     relative_motion,
-    solve_poses,
 )
 from geogs.tracking.bundle_reference import gauss_newton_step, reproject
 from geogs.tracking.grid import SampleGrid
+from geogs.tracking.motion_only import solve_poses
 
 CAMERA = Camera(fx=70.0, fy=72.0, cx=39.0, cy=29.0, width=80, height=60)
 

@@ -25,7 +25,6 @@ from geogs.tracking.bundle import (
     linearise,
     project,
     relative_motion,
-    solve_poses,
 )
 from geogs.tracking.flow.base import FlowMatch
 from geogs.tracking.flow.classical import ClassicalFlow
@@ -33,6 +32,7 @@ from geogs.tracking.graph import Edge, FrameGraph, frame_distances
 from geogs.tracking.grid import SampleGrid
 from geogs.tracking.keyframes import KeyframeStore
 from geogs.tracking.motion import FrameLocator, both_reprojections, transfer_depth
+from geogs.tracking.motion_only import solve_poses
 from geogs.tracking.tracker import Tracker, TrackState
 from test_tracking_tracker import CONFIG, PATH, error_cm
 from tracking_scenes import CAMERA as ROOM

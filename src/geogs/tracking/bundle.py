@@ -85,6 +85,8 @@ class BundleOptions:
     """Edges linearised at a time; bounds memory."""
     min_inverse_depth: float = 1e-3
     max_inverse_depth: float = 1e2
+    tolerance: float = 0.0
+    """On the CPU, a step that moves no pose by this much (units, radians) is the last one."""
 
 
 @dataclass(frozen=True)
@@ -169,7 +171,7 @@ def relative_motion(
 
 
 @dataclass(frozen=True)
-class _Star:
+class Star:
     """A source frame with all its edges, linearised, its inverse depths eliminated if free."""
 
     frame: int
@@ -234,54 +236,78 @@ class DenseBundle:
             T = torch.where(problem.free_pose[:, None, None], move(xi, T), T)
             d = (d + delta).clamp(options.min_inverse_depth, options.max_inverse_depth)
             d = torch.where(problem.free_depth[:, None], d, problem.inverse_depth)
+            if float(xi.abs().max()) < options.tolerance:
+                break
         return BundleResult(T, d, information, residual, finite)
 
     def _linearise(
         self, problem: BundleProblem, T: Tensor, d: Tensor, options: BundleOptions
-    ) -> list[_Star]:
+    ) -> list[Star]:
         """All stars; chunks of them side by side on the CPU, always in the same order."""
-        chunks = _source_chunks(problem.source, options.chunk)
+        chunks = source_chunks(problem.source, options.chunk)
 
-        def work(chunk: slice) -> list[_Star]:
-            return self._linearise_chunk(problem, T, d, options, chunk)
+        def work(chunk: slice) -> list[Star]:
+            return linearise_stars(self.grid, problem, T, d, options, chunk)
 
         parts = thread_map(work, chunks) if d.device.type == "cpu" else map(work, chunks)
         return [star for part in parts for star in part]
 
-    def _linearise_chunk(
-        self, problem: BundleProblem, T: Tensor, d: Tensor, options: BundleOptions, chunk: slice
-    ) -> list[_Star]:
-        i, j = problem.source[chunk], problem.target[chunk]
-        T_ji = relative_motion(T, i, j)
-        p = linearise(self.grid.camera, self.grid.rays, T_ji, d[i])
-        r = problem.pixels[chunk] - p.pixels
-        w = robust_weight(r, problem.weight[chunk] * p.valid[..., None], options.huber)
-        wJ = p.pose_jacobian * w.mT[:, None]
-        H, v = _normal_equations(wJ, p.pose_jacobian, r)
-        coupling = (wJ * p.depth_jacobian.mT[:, None]).sum(2)
-        curvature = (w * p.depth_jacobian.square()).sum(-1)
-        depth_gradient = (w * p.depth_jacobian * r).sum(-1)
-        adjoint, residual = se3_adjoint(T_ji), _edge_residual(r, w)
-        frames, counts = torch.unique_consecutive(i, return_counts=True)
-        stars, start = [], 0
-        for frame, count in zip(frames.tolist(), counts.tolist(), strict=True):
-            e = slice(start, start + count)
-            start += count
-            block, g, c = torch.block_diag(*H[e]), v[e].reshape(-1), curvature[e].sum(0)
-            depth = None
-            if bool(problem.free_depth[frame]):
-                damped = c + options.depth_damping * c.mean() + 1e-8
-                if problem.damping is not None:
-                    damped = damped + problem.damping[frame]
-                E, b = coupling[e].reshape(6 * count, -1), depth_gradient[e].sum(0)
-                depth = (E, damped, b)
-                block = block - ((E / damped) @ E.mT).double()
-                g = g - (E @ (b / damped)).double()
-            stars.append(_Star(frame, j[e], adjoint[e], block, g, c, residual[e], depth))
-        return stars
+
+def linearise_stars(
+    grid: SampleGrid,
+    problem: BundleProblem,
+    T: Float[Tensor, "n 4 4"],
+    d: Float[Tensor, "n p"],
+    options: BundleOptions,
+    chunk: slice,
+) -> list[Star]:
+    """The stars of some edges of a problem at the given poses and inverse depths."""
+    i, j = problem.source[chunk], problem.target[chunk]
+    T_ji = relative_motion(T, i, j)
+    p = linearise(grid.camera, grid.rays, T_ji, d[i])
+    r = problem.pixels[chunk] - p.pixels
+    w = robust_weight(r, problem.weight[chunk] * p.valid[..., None], options.huber)
+    wJ = p.pose_jacobian * w.mT[:, None]
+    H, v = normal_equations(wJ, p.pose_jacobian, r)
+    coupling = (wJ * p.depth_jacobian.mT[:, None]).sum(2)
+    curvature = (w * p.depth_jacobian.square()).sum(-1)
+    depth_gradient = (w * p.depth_jacobian * r).sum(-1)
+    adjoint, residual = se3_adjoint(T_ji), _edge_residual(r, w)
+    stars = []
+    for frame, e in sources_within(i):
+        block, g, c = torch.block_diag(*H[e]), v[e].reshape(-1), curvature[e].sum(0)
+        depth = None
+        if bool(problem.free_depth[frame]):
+            damped = damped_curvature(problem, frame, c, options)
+            E, b = coupling[e].flatten(0, 1), depth_gradient[e].sum(0)
+            depth = (E, damped, b)
+            block = block - ((E / damped) @ E.mT).double()
+            g = g - (E @ (b / damped)).double()
+        stars.append(Star(frame, j[e], adjoint[e], block, g, c, residual[e], depth))
+    return stars
 
 
-def _normal_equations(wJ: Tensor, J: Tensor, residual: Tensor) -> tuple[Tensor, Tensor]:
+def sources_within(source: Int[Tensor, "e"]) -> list[tuple[int, slice]]:
+    """The sources of sorted edges and which edges are theirs."""
+    frames, counts = torch.unique_consecutive(source, return_counts=True)
+    found, start = [], 0
+    for frame, count in zip(frames.tolist(), counts.tolist(), strict=True):
+        found.append((frame, slice(start, start + count)))
+        start += count
+    return found
+
+
+def damped_curvature(
+    problem: BundleProblem, frame: int, curvature: Float[Tensor, "p"], options: BundleOptions
+) -> Float[Tensor, "p"]:
+    """Curvature of a frame's inverse depths with all that resists their change."""
+    damped = curvature + options.depth_damping * curvature.mean() + 1e-8
+    return damped if problem.damping is None else damped + problem.damping[frame]
+
+
+def normal_equations(
+    wJ: Float[Tensor, "e 6 2 p"], J: Float[Tensor, "e 6 2 p"], residual: Float[Tensor, "e p 2"]
+) -> tuple[Float[Tensor, "e 6 6"], Float[Tensor, "e 6"]]:
     """J^T W J and J^T W r of every edge, summed over its cells."""
     left = wJ.flatten(2)
     right = torch.cat([J.flatten(2), residual.mT.flatten(1)[:, None]], 1)
@@ -294,7 +320,7 @@ def _edge_residual(residual: Tensor, weight: Tensor) -> Tensor:
     return ((weight * residual.square()).sum((1, 2)) / total * 2).sqrt()
 
 
-def _source_chunks(source: Tensor, size: int) -> list[slice]:
+def source_chunks(source: Int[Tensor, "e"], size: int) -> list[slice]:
     """Slices of about ``size`` edges that never split the edges of one source."""
     if not len(source):
         return []
@@ -308,7 +334,7 @@ def _source_chunks(source: Tensor, size: int) -> list[slice]:
     return [*chunks, slice(start, last)]
 
 
-def _pose_step(problem: BundleProblem, stars: list[_Star], damping: float) -> Float[Tensor, "n 6"]:
+def _pose_step(problem: BundleProblem, stars: list[Star], damping: float) -> Float[Tensor, "n 6"]:
     """Solve the camera system; steps of all frames, zero for the fixed, NaN where it cannot be."""
     free = problem.free_pose
     n = int(free.sum())
@@ -319,7 +345,7 @@ def _pose_step(problem: BundleProblem, stars: list[_Star], damping: float) -> Fl
     slot[free] = torch.arange(n, device=free.device)
     H, g = xi.new_zeros(n, n, 6, 6), xi.new_zeros(n, 6)
     for star in stars:
-        poses, block, gradient = _chain(star)
+        poses, block, gradient = chain_star(star)
         at = slot[poses]
         keep = at >= 0
         at = at[keep]
@@ -334,7 +360,9 @@ def _pose_step(problem: BundleProblem, stars: list[_Star], damping: float) -> Fl
     return xi
 
 
-def _chain(star: _Star) -> tuple[Tensor, Tensor, Tensor]:
+def chain_star(
+    star: Star,
+) -> tuple[Int[Tensor, "k1"], Float[Tensor, "k1 k1 6 6"], Float[Tensor, "k1 6"]]:
     """A star over its poses, by xi_rel = xi_target - Ad xi_source: poses, blocks, gradient."""
     k = len(star.targets)
     poses = torch.cat([star.targets, star.targets.new_tensor([star.frame])])
@@ -345,7 +373,7 @@ def _chain(star: _Star) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _depth_step(
-    stars: list[_Star], xi: Float[Tensor, "n 6"], inverse_depth: Float[Tensor, "n p"]
+    stars: list[Star], xi: Float[Tensor, "n 6"], inverse_depth: Float[Tensor, "n p"]
 ) -> Float[Tensor, "n p"]:
     """Back-substitution: (b - E^T xi_rel) / C for every star."""
     delta = torch.zeros_like(inverse_depth)
@@ -356,45 +384,3 @@ def _depth_step(
             moved = coupling.mT @ relative.reshape(-1).to(inverse_depth)
             delta[star.frame] = (gradient - moved) / curvature
     return delta
-
-
-def solve_poses(
-    camera: Camera,
-    rays: Float[Tensor, "p 3"],
-    T_cw: Float[Tensor, "n 4 4"],
-    inverse_depth: Float[Tensor, "e p"],
-    T_source: Float[Tensor, "e 4 4"],
-    frame: Int[Tensor, "e"],
-    pixels: Float[Tensor, "e p 2"],
-    weight: Float[Tensor, "e p 2"],
-    iterations: int = 4,
-    huber: float = 3.0,
-) -> tuple[Float[Tensor, "n 4 4"], Float[Tensor, "e p 2"]]:
-    """Motion-only adjustment of independent frames, each seen from keyframes that stay fixed.
-
-    Edge e observes frame ``frame[e]`` from a keyframe at ``T_source[e]`` with the given inverse
-    depth. Returns the poses and the residuals of the observations at those poses.
-    """
-    if inverse_depth.is_cuda:
-        from geogs.tracking.cuda import motion
-
-        return motion.solve_poses(
-            camera, rays, T_cw, inverse_depth, T_source, frame, pixels, weight, iterations, huber
-        )
-    T = T_cw
-    inverse = se3_inverse(T_source)
-    for _ in range(iterations):
-        p = linearise(camera, rays, T[frame] @ inverse, inverse_depth)
-        r = pixels - p.pixels
-        w = robust_weight(r, weight * p.valid[..., None], huber)
-        wJ = p.pose_jacobian * w.mT[:, None]
-        H = torch.zeros(len(T), 6, 6, dtype=torch.float64, device=T.device)
-        g = torch.zeros(len(T), 6, dtype=torch.float64, device=T.device)
-        edge_H, edge_g = _normal_equations(wJ, p.pose_jacobian, r)
-        H.index_add_(0, frame, edge_H)
-        g.index_add_(0, frame, edge_g)
-        damping = 1e-4 * H.diagonal(dim1=-2, dim2=-1) + 1e-6
-        xi = torch.linalg.solve(H + torch.diag_embed(damping), g)
-        T = move(xi.nan_to_num(0.0, 0.0, 0.0), T)
-    final = project(camera, rays, T[frame] @ inverse, inverse_depth)
-    return T, pixels - final.pixels

@@ -11,10 +11,11 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from geogs.geometry.lie import se3_inverse
-from geogs.tracking.bundle import project, solve_poses
+from geogs.tracking.bundle import project
 from geogs.tracking.flow.base import FlowMatch, FlowOperator
 from geogs.tracking.grid import SampleGrid
 from geogs.tracking.keyframes import KeyframeState
+from geogs.tracking.motion_only import solve_poses
 
 FIT_ITERATIONS = 6
 """Steps of the motion-only adjustment of a frame."""

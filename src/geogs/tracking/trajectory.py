@@ -11,11 +11,12 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from geogs.geometry.lie import retract, se3_inverse, se3_log
-from geogs.tracking.bundle import linearise, solve_poses
+from geogs.tracking.bundle import linearise
 from geogs.tracking.flow.base import FlowMatch, FlowOperator
 from geogs.tracking.grid import SampleGrid
 from geogs.tracking.keyframes import KeyframeState, KeyframeStore, scaled
 from geogs.tracking.motion import all_reprojections
+from geogs.tracking.motion_only import solve_poses
 from geogs.types import Trajectory
 
 

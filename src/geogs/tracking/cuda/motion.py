@@ -30,7 +30,7 @@ def solve_poses(
     iterations: int = 4,
     huber: float = 3.0,
 ) -> tuple[Float[Tensor, "n 4 4"], Float[Tensor, "e p 2"]]:
-    """Motion-only adjustment as ``geogs.tracking.bundle.solve_poses``.
+    """Motion-only adjustment as ``geogs.tracking.motion_only.solve_poses``.
 
     Poses and ``frame`` may be on the CPU; poses are returned where they were given.
     """
