@@ -1,0 +1,85 @@
+"""Time and memory of the global adjustment of a long walk, with matches made up.
+
+    python benchmarks/global_ba.py [COUNT ...] [--rounds 1] [--iterations 2] [--drift 0.002]
+
+Each number of keyframes (200, 400, 800 and 1600 if none is given) runs in a process of its own:
+the walk of tests/planted_walk.py on a grid of 64 x 36 cells, whose matches cost next to nothing, so
+that the choice of pairs, the graph and the solver are what is measured. Printed are the pairs, the
+seconds to choose them and to do everything, the peak memory above that of the loaded program and
+the error of the poses in cm, before and after.
+"""
+
+import argparse
+import dataclasses
+import resource
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+
+import torch
+
+from geogs.config import TrackingConfig
+from geogs.geometry.lie import se3_inverse
+from geogs.geometry.umeyama import umeyama
+from geogs.loop.global_bundle import global_bundle, global_pairs
+from geogs.tracking.tracker import Tracker
+from planted_walk import CAMERA, drift, planted_tracker
+
+
+def error_cm(tracker: Tracker, truth: torch.Tensor) -> float:
+    """RMS distance of the camera centres after a similarity."""
+    x = se3_inverse(tracker.store.poses(tracker.store.ids))[:, :3, 3]
+    y = se3_inverse(truth)[:, :3, 3]
+    scale, R, t = umeyama(x, y)
+    return 100 * float((scale * x @ R.T + t - y).square().sum(1).mean().sqrt())
+
+
+def peak() -> float:
+    """Most memory the process has held, MiB."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+def measure(count: int, args: argparse.Namespace) -> None:
+    """One walk in this process."""
+    torch.set_num_threads(1)
+    changes = {"global_rounds": args.rounds, "global_iterations": args.iterations}
+    config = dataclasses.replace(TrackingConfig(), global_pairs=args.pairs, **changes)
+    tracker, truth = planted_tracker(count, CAMERA, config=config)
+    drift(tracker, args.drift, args.yaw)
+    base, before = peak(), error_cm(tracker, truth)
+    tick = time.perf_counter()
+    pairs = global_pairs(tracker)
+    chosen, mid = time.perf_counter() - tick, peak()
+    global_bundle(tracker)
+    total = time.perf_counter() - tick - chosen
+    print(
+        f"{count:5d} keyframes, {len(pairs):6d} pairs: choice {chosen:6.1f} s (+{mid - base:.0f} "
+        f"MiB), all {total:7.1f} s, peak +{peak() - base:.0f} MiB over {base:.0f}, "
+        f"error {before:.2f} -> {error_cm(tracker, truth):.3f} cm",
+        flush=True,
+    )
+
+
+def main() -> None:
+    """Run the benchmark."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("counts", nargs="*", type=int, default=[200, 400, 800, 1600])
+    parser.add_argument("--rounds", type=int, default=1)
+    parser.add_argument("--iterations", type=int, default=2)
+    parser.add_argument("--pairs", type=int, default=13, help="most pairs per keyframe")
+    parser.add_argument("--drift", type=float, default=0.002, help="growth of lengths to the end")
+    parser.add_argument("--yaw", type=float, default=0.0, help="turn to the end, radians")
+    args = parser.parse_args()
+    if len(args.counts) == 1:
+        measure(args.counts[0], args)
+        return
+    options = [f"--{k}={v}" for k, v in vars(args).items() if k != "counts"]
+    for count in args.counts:
+        subprocess.run([sys.executable, __file__, str(count), *options], check=True)
+
+
+if __name__ == "__main__":
+    main()
