@@ -119,13 +119,13 @@ class MapScore:
 
 def map_score(slam: Slam, walk: Walk) -> MapScore:
     """Errors of a finished map."""
-    states = [slam.tracker.store[k] for k in slam.tracker.keyframe_ids]
+    states = [slam.segments.world.store[k] for k in slam.segments.world.keyframe_ids]
     x = torch.stack([torch.linalg.inv(s.T_cw)[:3, 3] for s in states])
     y = torch.from_numpy(walk.T_wc[[s.frame_index for s in states], :3, 3])
     scale = float(umeyama(x, y)[0])
     errors, angles, bare = [], [], []
     for seen in slam.renders():
-        view = walk.views[slam.tracker.store[seen.keyframe_id].frame_index]
+        view = walk.views[slam.segments.world.store[seen.keyframe_id].frame_index]
         size = seen.depth.shape[::-1]
         nearest = cv2.INTER_NEAREST
         depth, normal = (

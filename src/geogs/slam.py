@@ -2,20 +2,25 @@
 
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 
 from geogs.config import Config
 from geogs.geometry.camera import Camera
+from geogs.loop.closer import LoopCloser
 from geogs.loop.global_bundle import global_bundle
 from geogs.mapping.mapper import Mapper
 from geogs.priors.base import MonocularPrior
 from geogs.stopwatch import Stopwatch
 from geogs.threads import on_one_torch_thread
+from geogs.tracking.flow.select import build_operator
+from geogs.tracking.grid import SampleGrid
+from geogs.tracking.keyframes import KeyframeIds
+from geogs.tracking.segments import Segments
 from geogs.tracking.tracker import Tracker, TrackResult, TrackState
-from geogs.types import Frame, MapSnapshot, RenderedKeyframe, Trajectory
+from geogs.types import Frame, MapSnapshot, PoseCorrection, RenderedKeyframe, Trajectory
 
 Progress = Callable[[str, float], None]
 """Called with the name of a stage and its finished fraction in [0, 1]."""
@@ -52,24 +57,32 @@ class Slam:
         self.config = config or Config()
         self.camera = camera
         c = self.config
-        self.tracker = Tracker(
-            camera, c.tracking, device, c.seed, prior=prior, prior_config=c.prior
-        )
-        self.mapper = Mapper(camera, self.config.mapping, device, self.config.seed)
+        ids, operator = KeyframeIds(), build_operator(c.tracking, SampleGrid(camera, device))
+
+        def start() -> Tracker:
+            return Tracker(camera, c.tracking, device, c.seed, operator, prior, c.prior, ids)
+
+        self.segments = Segments(start, c.tracking.patience)
+        self.loops = LoopCloser(self.segments, c.loop)
+        self.device = device
+        self.mapper = Mapper(camera, c.mapping, device, c.seed)
         self.stopwatch = Stopwatch()
         self.frames = 0
         self._waiting: deque[int] = deque()
+        self._adjusted = 0
+        """Keyframes at the last bundle adjustment of all."""
         self._is_ended = False
 
     @on_one_torch_thread
     def process(self, frame: Frame) -> SlamStatus:
         """Track one frame and, where it completes a keyframe, train the map."""
         with self.stopwatch("tracking"):
-            result = self.tracker.track(frame)
+            result = self.segments.track(frame, self.loops.recognise)
         self.frames += 1
-        self._map(result, self.config.mapping.lag)
+        self._map(self._close_loops(result), self.config.mapping.lag)
+        self._adjust_now_and_then()
         return SlamStatus(
-            result.state, self.frames, len(self.tracker.keyframe_ids), len(self.mapper.map)
+            result.state, self.frames, len(self.segments.keyframe_ids), len(self.mapper.map)
         )
 
     @on_one_torch_thread
@@ -77,8 +90,11 @@ class Slam:
         """After the last frame: map what waits. What there is then is the online result."""
         self._is_ended = True
         with self.stopwatch("tracking"):
-            result = self.tracker.finish()
-        self._map(result, lag=0)
+            result = self.segments.finish()
+        if result.is_new_world:
+            self.mapper = Mapper(self.camera, self.config.mapping, self.device, self.config.seed)
+            self._waiting.clear()
+        self._map(self._close_loops(result, is_last=True), lag=0)
 
     @on_one_torch_thread
     def finish(self, progress: Progress = _silent, correct: bool = True) -> None:
@@ -90,10 +106,7 @@ class Slam:
             self.end_stream()
         if not correct:
             return
-        with self.stopwatch("global bundle adjustment"):
-            correction = global_bundle(self.tracker, lambda f, _: progress("bundle adjustment", f))
-        with self.stopwatch("map update"):
-            self.mapper.correct(correction, self._keyframes(self.mapper.keyframe_ids))
+        self._adjust_globally(progress)
         with self.stopwatch("final mapping"):
             self.mapper.refine(lambda f: progress("map refinement", f))
 
@@ -101,11 +114,11 @@ class Slam:
     def trajectory(self) -> Trajectory:
         """Poses of all frames so far."""
         with self.stopwatch("trajectory"):
-            return self.tracker.trajectory()
+            return self.segments.trajectory()
 
     def keyframe_trajectory(self) -> Trajectory:
         """Poses of the keyframes alone."""
-        keyframes = self._keyframes(self.tracker.keyframe_ids)
+        keyframes = self._keyframes(self.segments.keyframe_ids)
         T_wc = [torch.linalg.inv(k.T_cw.cpu()).numpy() for k in keyframes]
         times = np.array([k.timestamp for k in keyframes], dtype=np.float64)
         return Trajectory(times, np.array(T_wc).reshape(-1, 4, 4), np.ones(len(times), dtype=bool))
@@ -125,6 +138,32 @@ class Slam:
         """Depth and confidence of every mapped keyframe as searched, without the disks."""
         return self.mapper.depth_maps()
 
+    def _close_loops(self, result: TrackResult, is_last: bool = False) -> TrackResult:
+        """Act on loops that a frame closed; what is to be mapped then."""
+        with self.stopwatch("loops"):
+            event = self.loops.update(result, is_last)
+        if event.correction is not None:
+            self._move_map(event.correction)
+        return replace(result, finalized=(*result.finalized, *event.joined))
+
+    def _adjust_now_and_then(self) -> None:
+        every, count = self.config.loop.global_ba_every, len(self.segments.keyframe_ids)
+        if every and count - self._adjusted >= every:
+            self._adjust_globally(_silent)
+
+    def _adjust_globally(self, progress: Progress) -> None:
+        """Bundle-adjust all keyframes and let the map follow."""
+        world = self.segments.world
+        with self.stopwatch("global bundle adjustment"):
+            correction = global_bundle(world, lambda f, _: progress("bundle adjustment", f))
+            self.loops.replaced_by_bundle()
+        self._adjusted = len(world.keyframe_ids)
+        self._move_map(correction)
+
+    def _move_map(self, correction: PoseCorrection) -> None:
+        with self.stopwatch("map update"):
+            self.mapper.correct(correction, self._keyframes(self.mapper.keyframe_ids))
+
     def _map(self, result: TrackResult, lag: int) -> None:
         """Hand settled keyframes to the mapper; train those whose successors are known."""
         self._waiting.extend(result.finalized)
@@ -139,8 +178,8 @@ class Slam:
                 trained = True
         if trained and self.config.mapping.pose_iterations:
             with self.stopwatch("pose refinement"):
-                self.tracker.write_back(self.mapper.refine_poses(list(result.active)))
+                self.segments.write_back(self.mapper.refine_poses(list(result.active)))
 
     def _keyframes(self, ids: list[int]) -> list:
-        alive = set(self.tracker.keyframe_ids)
-        return [self.tracker.keyframe(i) for i in ids if i in alive]
+        alive = set(self.segments.keyframe_ids)
+        return [self.segments.keyframe(i) for i in ids if i in alive]

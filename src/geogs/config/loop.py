@@ -64,6 +64,8 @@ class LoopConfig:
     Distances in the image are fractions of its longer side, so that they hold at any resolution.
     """
 
+    enabled: bool = True
+    """Look for loops, close them, and recognise places when the camera is lost."""
     min_gap: int = 15
     """Keyframes that lie at least between the two views of a loop."""
     max_distance: float = 0.29
@@ -87,5 +89,16 @@ class LoopConfig:
     """A loop rules out others whose ends together lie within this many keyframes of its own."""
     max_loops: int = 2
     """Most loops per keyframe."""
+    close_every: int = 5
+    """Keyframes between two corrections, at least."""
+    min_change: float = 0.004
+    """Corrections that move no keyframe by more than this are not worth moving the map for: radians,
+    parts of its median depth, or of its scale."""
+    agreeing: int = 2
+    """Loops that have to agree before a segment is joined to another."""
+    join_tolerance: float = 0.12
+    """Within which they agree: radians, parts of the median depth, or of the scale."""
+    global_ba_every: int = 0
+    """Keyframes between two bundle adjustments of all keyframes; 0 leaves that to the end."""
     retrieval: RetrievalOptions = field(default_factory=RetrievalOptions)
     verification: VerificationOptions = field(default_factory=VerificationOptions)

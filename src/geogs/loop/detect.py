@@ -16,10 +16,10 @@ from geogs.loop.features import Features
 from geogs.loop.retrieval import AppearanceIndex
 from geogs.loop.verification import DepthView, TwoViewVerifier
 from geogs.tracking.flow.base import FlowMatch, FlowOperator
-from geogs.tracking.graph import frame_distances
 from geogs.tracking.grid import SampleGrid
 from geogs.tracking.keyframes import KeyframeState, KeyframeStore
 from geogs.tracking.motion import Recognition
+from geogs.tracking.proximity import frame_distances
 
 Source = Literal["geometry", "appearance"]
 """What proposed a pair: the present poses, or nothing but the looks."""

@@ -1,56 +1,70 @@
 """Bundle adjustment over all keyframes, with flow measured anew from round to round."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from geogs.tracking.bundle import BundleOptions
-from geogs.tracking.graph import Pair, proximity_pairs
+from geogs.tracking.proximity import Pair, proximity_pairs
 from geogs.tracking.tracker import Tracker
 from geogs.types import PoseCorrection
 
 MATCHED_TOGETHER = 16, 48
 """Pairs that are matched in one go, on the CPU and on a GPU."""
+PRIORS_TOGETHER = 32
+"""Keyframes whose depths are adjusted with their priors at a time; bounds memory."""
 SETTLED = 0.02
 """The rounds end when the reprojection of no more than this fraction of the pairs still moves."""
+SMALL_STEP = 1e-5
+"""A round ends with a step that moves no pose by more, in units and radians."""
 
 
 def global_bundle(
-    tracker: Tracker, progress: Callable[[float, str], None] | None = None
+    tracker: Tracker,
+    progress: Callable[[float, str], None] | None = None,
+    keyframes: Sequence[int] | None = None,
 ) -> PoseCorrection:
-    """Refine all keyframes of a tracker on a fresh graph that also joins places seen again.
+    """Refine keyframes of a tracker on a fresh graph that also joins places seen again.
 
+    ``keyframes`` (all where None) are ids, earliest first; the pose of the first of them stays.
     Each round measures the pairs whose reprojection has moved and adjusts everything; every round
-    sharpens the next. Poses, inverse depth and information of the tracker are updated; the first
-    pose stays. ``progress`` is called with the fraction done and a message. Returns the poses
-    before and after; scales are 1. A tracker without a map is left alone.
+    sharpens the next. Poses, inverse depth and information of the tracker are updated, and its
+    graph holds the fresh edges alone: one that goes on tracking needs only those that
+    ``FrameGraph.retire`` leaves of them. ``progress`` is called with the fraction done and a
+    message. Returns the poses before and after; scales are 1. A tracker without a map is left
+    alone.
     """
     config, store, graph = tracker.config, tracker.store, tracker.graph
-    ids = tracker.keyframe_ids
+    ids = tracker.keyframe_ids if keyframes is None else list(keyframes)
     before = {k: store[k].T_cw.clone() for k in ids}
-    pairs = global_pairs(tracker)
+    pairs = global_pairs(tracker, ids)
     graph.edges = {}
     batch = MATCHED_TOGETHER[store.grid.on_gpu]
-    options = BundleOptions(iterations=config.global_iterations, huber=config.huber)
+    options = BundleOptions(
+        iterations=config.global_iterations, huber=config.huber, tolerance=SMALL_STEP
+    )
     for n in range(config.global_rounds if pairs else 0):
-        stale = graph.stale(pairs, config.global_remeasure)
+        # Pairs of the same keyframe one after the other: images of old ones are read from a file.
+        stale = sorted(graph.stale(pairs, config.global_remeasure))
         if len(stale) <= SETTLED * len(pairs):
             break
         for start in range(0, len(stale), batch):
-            graph.measure(stale[start : start + batch], fine=True)
+            graph.measure(stale[start : start + batch], fine=True, packed=True)
             if progress is not None:
                 share = (n + start / len(stale)) / config.global_rounds
                 progress(share, "matching all keyframes")
         graph.adjust(list(graph.edges), ids[1:], ids, options)
-    tracker.priors.adjust(ids, config.huber)  # which moves no pose
+    for start in range(0, len(ids), PRIORS_TOGETHER):
+        tracker.priors.adjust(ids[start : start + PRIORS_TOGETHER], config.huber)  # moves no pose
     if progress is not None:
         progress(1.0, "all keyframes adjusted")
     after = {k: store[k].T_cw.clone() for k in ids}
     return PoseCorrection(before, after, dict.fromkeys(ids, 1.0))
 
 
-def global_pairs(tracker: Tracker) -> list[Pair]:
+def global_pairs(tracker: Tracker, keyframes: Sequence[int] | None = None) -> list[Pair]:
     """Neighbours in time and all places seen again, thinned evenly."""
-    config, ids = tracker.config, tracker.keyframe_ids
-    return proximity_pairs(
+    config = tracker.config
+    ids = tracker.keyframe_ids if keyframes is None else list(keyframes)
+    pairs = proximity_pairs(
         tracker.store,
         ids,
         ids,
@@ -60,3 +74,5 @@ def global_pairs(tracker: Tracker) -> list[Pair]:
         config.global_distance * max(tracker.camera.width, tracker.camera.height),
         config.global_pairs * len(ids),
     )
+    wanted = set(ids)
+    return [p for p in pairs if wanted.issuperset(p)]

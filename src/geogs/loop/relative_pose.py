@@ -51,8 +51,11 @@ def relative_poses(
     T_cw: Float[Tensor, "n 4 4"],
     is_loop: bool,
     options: RelativePoseOptions | None = None,
+    start: Float[Tensor, "e 4 4"] | None = None,
 ) -> RelativePoses:
-    """Solve every edge from the present poses on; those with too few sure cells are left out.
+    """Solve every edge; those with too few sure cells are left out.
+
+    From the present poses on, or from ``start``, the motion of each edge in its source's unit.
 
     Covariance is ``sigma^2 diag(H^-1)`` with ``sigma^2 = sum w r^2`` divided not by the number of
     cells, but by ``options.independent``. A loop's scale is the median ratio of the depths at
@@ -61,9 +64,11 @@ def relative_poses(
     """
     options = options or RelativePoseOptions()
     G, information, kept = [], [], []
-    for start in range(0, len(edges.source), options.chunk):
-        chunk = slice(start, start + options.chunk)
-        solved, known, keep = _solve_edges(grid, edges, chunk, T_cw, is_loop, options)
+    if start is None:
+        start = T_cw[edges.target] @ se3_inverse(T_cw[edges.source])
+    for first in range(0, len(edges.source), options.chunk):
+        chunk = slice(first, first + options.chunk)
+        solved, known, keep = _solve_edges(grid, edges, chunk, start[chunk], is_loop, options)
         G.append(solved)
         information.append(known)
         kept.append(keep)
@@ -81,14 +86,13 @@ def _solve_edges(
     grid: SampleGrid,
     edges: MatchedEdges,
     chunk: slice,
-    T_cw: Float[Tensor, "n 4 4"],
+    T: Float[Tensor, "e 4 4"],
     is_loop: bool,
     options: RelativePoseOptions,
 ) -> tuple[Float[Tensor, "e 4 4"], Float[Tensor, "e 7"], Bool[Tensor, "e"]]:
     """Similarity, information and whether it is worth keeping, of each edge of a chunk."""
     i, j = edges.source[chunk], edges.target[chunk]
     pixels, weight, d = edges.pixels[chunk], edges.weight[chunk], edges.inverse_depth[i]
-    T = T_cw[j] @ se3_inverse(T_cw[i])
     for _ in range(options.iterations):
         p = linearise(edges.camera, edges.rays, T, d)
         H, g, _ = _normal_equations(p, pixels, weight, options)

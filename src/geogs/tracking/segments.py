@@ -42,10 +42,10 @@ class Segments:
     Source: the atlas of ORB-SLAM3 (Campos et al. 2021), with one map.
     """
 
-    def __init__(self, start: Callable[[], Tracker], recall: Recall, patience: int) -> None:
+    def __init__(self, start: Callable[[], Tracker], patience: int) -> None:
         """``start`` makes a tracker whose keyframe ids follow all others'; a segment begins after
         ``patience`` frames with texture in which nothing was recognised."""
-        self._start, self._recall, self._patience = start, recall, patience
+        self._start, self._patience = start, patience
         self.world = start()
         self.current = self.world
         """Where the camera is."""
@@ -116,12 +116,15 @@ class Segments:
 
     # --- the stream ------------------------------------------------------------------------
 
-    def track(self, frame: Frame) -> TrackResult:
-        """Take the next frame. Raises InputError if its size is not the camera's."""
+    def track(self, frame: Frame, recall: Recall) -> TrackResult:
+        """Take the next frame; ``recall`` is asked where it is while the camera is lost.
+
+        Raises InputError if its size is not the camera's.
+        """
         if frame.follows_cut:
             self.current.cut()
         if self._is_searching:
-            result = self._rejoin(frame)
+            result = self._rejoin(frame, recall(frame.image))
             if result is not None:
                 return self._report(result)
         lost = self.current.state is TrackState.LOST
@@ -154,9 +157,8 @@ class Segments:
         is_starting = self.current.state is TrackState.INITIALIZING
         return self.current.state is TrackState.LOST or (is_starting and len(self.trackers) > 1)
 
-    def _rejoin(self, frame: Frame) -> TrackResult | None:
+    def _rejoin(self, frame: Frame, places: Sequence[Recognition]) -> TrackResult | None:
         """Go on where the frame was recognised, in whatever segment."""
-        places = self._recall(frame.image)
         for tracker in self.trackers if places else ():
             if tracker.state is TrackState.INITIALIZING:
                 continue

@@ -1,0 +1,214 @@
+"""Loops along the way: found at keyframes that are final, closed when that changes something."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from geogs.config import LoopConfig
+from geogs.geometry.lie import se3_inverse, sim3_inverse
+from geogs.loop.closure import close_loops
+from geogs.loop.constraints import (
+    between_positions,
+    disagreement,
+    joined,
+    none_known,
+    of_edges,
+    of_loop,
+    rescaled,
+)
+from geogs.loop.detect import Loop, LoopDetector
+from geogs.loop.pose_graph import RelativePoses
+from geogs.tracking.motion import Recognition
+from geogs.tracking.segments import Segments, moved
+from geogs.tracking.tracker import Tracker, TrackResult
+from geogs.types import PoseCorrection
+
+
+@dataclass(frozen=True)
+class LoopEvent:
+    """What loops changed."""
+
+    correction: PoseCorrection | None = None
+    """Of the world's keyframes, already taken over by the tracker."""
+    joined: tuple[int, ...] = ()
+    """Ids of final keyframes that became part of the world."""
+
+
+@dataclass
+class _Known:
+    """Relative poses of the keyframes of one tracker, by id."""
+
+    odometry: RelativePoses = field(default_factory=none_known)
+    """Of edges that the tracker has let go of."""
+    loops: RelativePoses = field(default_factory=none_known)
+    pending: int = 0
+    """Loops found since the last attempt to close."""
+    last_attempt: int = 0
+    """Number of keyframes at it."""
+
+    def rescale(self, correction: PoseCorrection) -> None:
+        """Follow a correction."""
+        self.odometry = rescaled(self.odometry, correction.scale)
+        self.loops = rescaled(self.loops, correction.scale)
+
+
+class LoopCloser:
+    """Watches the segments of a run: closes loops within each, and joins segments that meet."""
+
+    def __init__(self, segments: Segments, config: LoopConfig) -> None:
+        self.segments = segments
+        self.config = config
+        tracker = segments.world
+        self.detector = LoopDetector(tracker.grid, tracker.operator, segments.store_of, config)
+        self.corrections = 0
+        """Loop closures so far."""
+        self._known: dict[Tracker, _Known] = {}
+        self._between: list[Loop] = []
+        """Loops between segments."""
+
+    def recognise(self, image: UInt8[np.ndarray, "h w 3"]) -> Sequence[Recognition]:
+        """Keyframes that show what an image shows."""
+        return self.detector.recognise(image) if self.config.enabled else ()
+
+    def update(self, result: TrackResult, is_last: bool = False) -> LoopEvent:
+        """After a frame: look for loops at the keyframes that became final, and act on them."""
+        if not self.config.enabled:
+            return LoopEvent()
+        fresh = [*result.finalized, *result.apart]
+        if fresh:
+            self._retire(self.segments.tracker_of(fresh[0]))
+        for loop in self.detector.update(fresh):
+            self._take(loop)
+        became_final = self._join()
+        return LoopEvent(self._close(is_last), became_final)
+
+    def replaced_by_bundle(self) -> None:
+        """All of the world was adjusted together: what its edges say now replaces all else."""
+        world = self.segments.world
+        order = {k: n for n, k in enumerate(world.store.ids)}
+        edges = {
+            e: v for e, v in world.graph.edges.items() if order[e[1]] - order[e[0]] not in (2, 3)
+        }
+        self._known[world] = _Known(of_edges(world.store, edges))
+        self._retire(world)
+
+    def _of(self, tracker: Tracker) -> _Known:
+        return self._known.setdefault(tracker, _Known())
+
+    def _retire(self, tracker: Tracker) -> None:
+        """Turn the edges that the local adjustment has left behind into relative poses."""
+        keep = set(tracker.store.ids[-tracker.config.depth_window :])
+        old = {e: v for e, v in tracker.graph.edges.items() if keep.isdisjoint(e)}
+        if old:
+            known = self._of(tracker)
+            known.odometry = joined([known.odometry, of_edges(tracker.store, old)])
+            tracker.graph.edges = {e: v for e, v in tracker.graph.edges.items() if e not in old}
+
+    def _take(self, loop: Loop) -> None:
+        first, second = (self.segments.tracker_of(k) for k in (loop.first, loop.second))
+        if first is not second:
+            self._between.append(loop)
+            return
+        known = self._of(first)
+        known.loops = joined([known.loops, self._constraint(loop)])
+        known.pending += 1
+
+    def _constraint(self, loop: Loop) -> RelativePoses:
+        stores = self.segments.store_of
+        return of_loop(stores(loop.first), stores(loop.second), loop)
+
+    # --- joining segments ------------------------------------------------------------------
+
+    def _join(self) -> tuple[int, ...]:
+        """Join segments between which enough loops agree; ids that thereby reached the world."""
+        final: tuple[int, ...] = ()
+        for loop in list(self._between):
+            host, guest = self._ends(loop)
+            S = self._claim(loop)
+            agreeing = [
+                o for o in self._between if self._ends(o) == (host, guest) and self._agrees(o, S)
+            ]
+            if len(agreeing) < self.config.agreeing:
+                continue
+            for o in agreeing:
+                self._of(host).loops = joined([self._of(host).loops, self._constraint(o)])
+            final += self._merge(host, guest, S)
+            return final + self._join()
+        return final
+
+    def _ends(self, loop: Loop) -> tuple[Tracker, Tracker]:
+        """Host and guest: the world is host, else the earlier segment."""
+        a, b = (self.segments.tracker_of(k) for k in (loop.first, loop.second))
+        if b is self.segments.world or (a is not self.segments.world and b.store.ids < a.store.ids):
+            return b, a
+        return a, b
+
+    def _claim(self, loop: Loop) -> Float[Tensor, "4 4"]:
+        """Sim(3) from the host's world to the guest's as a loop has it."""
+        host, guest = self._ends(loop)
+        S = loop.S_ji.cpu()
+        here, there = loop.first, loop.second
+        if loop.first in guest.store:
+            S, here, there = sim3_inverse(S), loop.second, loop.first
+        return se3_inverse(guest.store[there].T_cw) @ S @ host.store[here].T_cw
+
+    def _agrees(self, loop: Loop, S: Float[Tensor, "4 4"]) -> bool:
+        """Whether a loop lands where a Sim(3) of the segments would."""
+        _, guest = self._ends(loop)
+        state = guest.store[loop.second if loop.second in guest.store else loop.first]
+        depth = 1 / float(state.inverse_depth.median())
+        error = disagreement(state.T_cw @ self._claim(loop), state.T_cw @ S, depth)
+        return error < self.config.join_tolerance
+
+    def _merge(self, host: Tracker, guest: Tracker, S: Float[Tensor, "4 4"]) -> tuple[int, ...]:
+        self._retire(guest)
+        theirs, ours = self._known.pop(guest, _Known()), self._of(host)
+        # The loops between the two were measured in the guest's unit, too.
+        correction = moved(guest.store, S)
+        theirs.rescale(correction)
+        both = correction.scale | dict.fromkeys(host.store.ids, 1.0)
+        ours.loops = joined([rescaled(ours.loops, both), theirs.loops])
+        ours.odometry = joined([ours.odometry, theirs.odometry])
+        ours.pending += 1
+        final = self.segments.join(host, guest, S)
+        self._between = [
+            o for o in self._between
+            if self.segments.tracker_of(o.first) is not self.segments.tracker_of(o.second)
+        ]  # fmt: skip
+        return final if host is self.segments.world else ()
+
+    # --- closing loops ---------------------------------------------------------------------
+
+    def _close(self, is_last: bool) -> PoseCorrection | None:
+        """Correct the world by its loops, if there are new ones and they change something."""
+        world = self.segments.world
+        known, ids = self._of(world), world.store.ids
+        due = is_last or len(ids) - known.last_attempt >= self.config.close_every
+        if not known.pending or not due:
+            return None
+        known.pending, known.last_attempt = 0, len(ids)
+        relative = joined([
+            known.odometry, of_edges(world.store, world.graph.edges), known.loops,
+        ])  # fmt: skip
+        closure = close_loops(ids, world.store.poses(ids), between_positions(relative, ids))
+        if closure is None or self._change(closure.correction) < self.config.min_change:
+            return None
+        world.correct(closure.correction)
+        known.rescale(closure.correction)
+        self.corrections += 1
+        return closure.correction
+
+    def _change(self, correction: PoseCorrection) -> float:
+        """How far a correction moves the keyframe that it moves most."""
+        store = self.segments.world.store
+        changes = []
+        for k, before in correction.before.items():
+            scale = correction.scale[k]
+            S = correction.after[k].clone()
+            S[:3] *= scale
+            depth = 1 / float(store[k].inverse_depth.median())
+            changes.append(disagreement(S, before, depth))
+        return max(changes)

@@ -1,0 +1,108 @@
+"""What is known of the keyframes of one tracker relative to each other, by id."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from geogs.geometry.lie import se3_inverse, sim3_inverse, sim3_log
+from geogs.loop.detect import Loop
+from geogs.loop.matched_edges import MatchedEdges
+from geogs.loop.pose_graph import RelativePoses
+from geogs.loop.relative_pose import RelativePoseOptions, relative_poses
+from geogs.tracking.graph import Edge, Pair
+from geogs.tracking.grid import SampleGrid
+from geogs.tracking.keyframes import KeyframeStore, scaled
+
+SETTLED = RelativePoseOptions(iterations=2)
+"""For edges that a bundle adjustment has already fitted."""
+
+
+def none_known() -> RelativePoses:
+    """No relative pose at all."""
+    empty = torch.zeros(0, dtype=torch.long)
+    numbers = torch.zeros(0, 7, dtype=torch.float64)
+    return RelativePoses(empty, empty, numbers.new_zeros(0, 4, 4), numbers, empty.bool())
+
+
+def joined(parts: Sequence[RelativePoses]) -> RelativePoses:
+    """All of them, in this order."""
+    columns = ("source", "target", "G", "information", "is_loop")
+    return RelativePoses(*(torch.cat([getattr(p, c) for p in parts]) for c in columns))
+
+
+def of_edges(store: KeyframeStore, edges: Mapping[Pair, Edge]) -> RelativePoses:
+    """Relative poses, between ids, that fitted edges of a frame graph amount to.
+
+    Of the two directions of a pair the one from the earlier keyframe is taken.
+    """
+    pairs = sorted(e for e in edges if e[0] < e[1])
+    if not pairs:
+        return none_known()
+    ids = sorted({k for p in pairs for k in p})
+    slot = {k: n for n, k in enumerate(ids)}
+    matched = MatchedEdges(
+        store.grid.camera,
+        store.grid.rays.cpu(),
+        store.inverse_depths(ids).cpu(),
+        torch.tensor([slot[i] for i, _ in pairs]),
+        torch.tensor([slot[j] for _, j in pairs]),
+        torch.stack([edges[p].pixels for p in pairs]).cpu().float(),
+        torch.stack([edges[p].weight for p in pairs]).cpu().float(),
+    )
+    grid = SampleGrid(store.grid.camera)
+    return _named(relative_poses(grid, matched, store.poses(ids), False, SETTLED), ids)
+
+
+def of_loop(first: KeyframeStore, second: KeyframeStore, loop: Loop) -> RelativePoses:
+    """Relative poses, between ids, of a loop: one for each direction of its flow."""
+    one, other = first[loop.first], second[loop.second]
+    there, back = loop.there, loop.back
+    matched = MatchedEdges(
+        first.grid.camera,
+        first.grid.rays.cpu(),
+        torch.stack([one.inverse_depth, other.inverse_depth]).cpu(),
+        torch.tensor([0, 1]),
+        torch.tensor([1, 0]),
+        torch.cat([there.pixels, back.pixels]).cpu(),
+        torch.cat([there.weight, back.weight]).cpu(),
+    )
+    T = loop.T_ji.cpu()
+    start = torch.stack([T, se3_inverse(scaled(T, loop.scale))])
+    grid = SampleGrid(first.grid.camera)
+    poses = torch.stack([one.T_cw, other.T_cw])
+    solved = relative_poses(grid, matched, poses, True, start=start)
+    return _named(solved, [loop.first, loop.second])
+
+
+def between_positions(relative: RelativePoses, ids: Sequence[int]) -> RelativePoses:
+    """Relative poses between ids as those between places in the sorted list ``ids``."""
+    sorted_ids = torch.tensor(ids)
+    return replace(
+        relative,
+        source=torch.searchsorted(sorted_ids, relative.source),
+        target=torch.searchsorted(sorted_ids, relative.target),
+    )
+
+
+def rescaled(relative: RelativePoses, scale: Mapping[int, float]) -> RelativePoses:
+    """Relative poses between ids after the unit of each keyframe was divided by its scale."""
+    if not scale or not len(relative):
+        return relative
+    ids = sorted(scale)
+    factors = torch.tensor([scale[k] for k in ids], dtype=torch.float64)
+    return _named(between_positions(relative, ids).rescaled(factors), ids)
+
+
+def _named(relative: RelativePoses, ids: Sequence[int]) -> RelativePoses:
+    """Relative poses between places in a list of ids as those between the ids."""
+    names = torch.tensor(ids)
+    return replace(relative, source=names[relative.source], target=names[relative.target])
+
+
+def disagreement(S: Float[Tensor, "4 4"], other: Float[Tensor, "4 4"], depth: float) -> float:
+    """Largest of the turn in radians, the shift over a depth, and the change of scale."""
+    error = sim3_log(S @ sim3_inverse(other)).abs()
+    return max(float(error[:3].norm()) / depth, float(error[3:6].norm()), float(error[6]))
