@@ -28,11 +28,12 @@ from geogs.tracking.bundle import (
 )
 from geogs.tracking.flow.base import FlowMatch
 from geogs.tracking.flow.classical import ClassicalFlow
-from geogs.tracking.graph import Edge, FrameGraph, frame_distances
+from geogs.tracking.graph import FrameGraph, MeasuredEdge
 from geogs.tracking.grid import SampleGrid
 from geogs.tracking.keyframes import KeyframeStore
 from geogs.tracking.motion import FrameLocator, both_reprojections, transfer_depth
 from geogs.tracking.motion_only import solve_poses
+from geogs.tracking.proximity import frame_distances
 from geogs.tracking.tracker import Tracker, TrackState
 from test_tracking_tracker import CONFIG, PATH, error_cm
 from tracking_scenes import CAMERA as ROOM
@@ -362,7 +363,7 @@ def test_pairs_of_keyframes_match_the_cpu(device):
     weight = (torch.rand(before.shape, generator=g) > 0.4).float()
     weight[4] = 0
     for n, e in enumerate(directed):
-        graph.edges[e] = Edge(before[n], weight[n], earlier[n])
+        graph.edges[e] = MeasuredEdge(before[n], weight[n], earlier[n])
     expected = graph._moved(directed)
     assert torch.isnan(expected[4])
     moved = pairs.moved(earlier.to(device), weight.to(device)).cpu()

@@ -6,10 +6,11 @@ import torch
 
 from geogs.tracking.bundle import BundleOptions
 from geogs.tracking.flow.classical import ClassicalFlow
-from geogs.tracking.graph import FrameGraph, frame_distances, proximity_pairs
+from geogs.tracking.graph import FrameGraph
 from geogs.tracking.grid import SampleGrid
 from geogs.tracking.keyframes import KeyframeStore
 from geogs.tracking.motion import FrameLocator, pnp, transfer_depth
+from geogs.tracking.proximity import frame_distances, proximity_pairs
 from tracking_scenes import CAMERA, pose, render
 
 POSES = [pose(0.06 * k, yaw=0.01 * k) for k in range(6)]

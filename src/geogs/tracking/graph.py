@@ -1,6 +1,6 @@
 """The frame graph: which keyframes see each other, and the flow measured between them."""
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from geogs.threads import thread_map
 from geogs.tracking.bundle import (
     BundleOptions,
     BundleProblem,
@@ -18,13 +19,16 @@ from geogs.tracking.bundle import (
 )
 from geogs.tracking.flow.base import FlowMatch, FlowOperator
 from geogs.tracking.keyframes import KeyframeStore
+from geogs.tracking.packed_edge import PackedEdge, packed_reprojections
+from geogs.tracking.proximity import PAIRS_TOGETHER, Pair
+from geogs.tracking.streamed_bundle import StreamedBundle, StreamedProblem
 
-Pair = tuple[int, int]
-"""Two keyframe ids, the earlier first; an edge of the graph in both directions."""
+STACKED_EDGES = 1024
+"""Directed edges up to which an adjustment on the CPU has all matches in one piece."""
 
 
 @dataclass
-class Edge:
+class MeasuredEdge:
     """One direction of a measured pair."""
 
     pixels: Float[Tensor, "p 2"]
@@ -37,11 +41,15 @@ class Edge:
     """What the operator keeps of this edge."""
 
     @staticmethod
-    def of(match: FlowMatch, n: int, reprojection: Float[Tensor, "p 2"]) -> "Edge":
+    def of(match: FlowMatch, n: int, reprojection: Float[Tensor, "p 2"]) -> "MeasuredEdge":
         """The n-th edge of a measurement."""
         damping = None if match.damping is None else match.damping[n]
         memory = None if match.memory is None else match.memory[n]
-        return Edge(match.pixels[n], match.weight[n], reprojection, damping, memory)
+        return MeasuredEdge(match.pixels[n], match.weight[n], reprojection, damping, memory)
+
+
+Edge = MeasuredEdge | PackedEdge
+"""One direction of a measured pair, in full or packed."""
 
 
 class FrameGraph:
@@ -62,6 +70,19 @@ class FrameGraph:
         """Forget every edge of a keyframe."""
         self.edges = {e: v for e, v in self.edges.items() if id not in e}
 
+    def retire(self, keep: Collection[int]) -> dict[Pair, Edge]:
+        """Take out the edges that join none of the given keyframes, and return them."""
+        kept = set(keep)
+        old = {e: v for e, v in self.edges.items() if e[0] not in kept and e[1] not in kept}
+        if old:
+            self.edges = {e: v for e, v in self.edges.items() if e not in old}
+        return old
+
+    def retain(self, ids: Collection[int]) -> None:
+        """Forget the edges that join any but the given keyframes."""
+        kept = set(ids)
+        self.edges = {e: v for e, v in self.edges.items() if e[0] in kept and e[1] in kept}
+
     def reprojections(self, directed: Sequence[Pair]) -> Float[Tensor, "e p 2"]:
         """Present positions of the cells of i in j for each directed edge (i, j)."""
         if not directed:
@@ -79,8 +100,17 @@ class FrameGraph:
             grid.camera, grid.rays, T, store.inverse_depths([e[0] for e in directed])
         ).pixels
 
-    def measure(self, pairs: Iterable[Pair], cold: bool = False, fine: bool = True) -> None:
-        """Measure the flow of pairs in both directions, starting from the reprojection."""
+    def measure(
+        self,
+        pairs: Iterable[Pair],
+        cold: bool = False,
+        fine: bool = True,
+        packed: bool = False,
+    ) -> None:
+        """Measure the flow of pairs in both directions, starting from the reprojection.
+
+        ``packed`` edges take a third of the memory.
+        """
         pairs = list(pairs)
         if not pairs:
             return
@@ -94,9 +124,14 @@ class FrameGraph:
             there, back = self.operator.measure(
                 first, second, forward, backward, fine=fine, memory=memory
             )
+        store = self.keyframes
         for n, (i, j) in enumerate(pairs):
-            self.edges[i, j] = Edge.of(there, n, forward[n])
-            self.edges[j, i] = Edge.of(back, n, backward[n])
+            if packed:
+                self.edges[i, j] = PackedEdge.of(there, n, store.grid, store[i], store[j])
+                self.edges[j, i] = PackedEdge.of(back, n, store.grid, store[j], store[i])
+                continue
+            self.edges[i, j] = MeasuredEdge.of(there, n, forward[n])
+            self.edges[j, i] = MeasuredEdge.of(back, n, backward[n])
 
     def _memory(self, directed: Pair) -> Any:
         edge = self.edges.get(directed)
@@ -117,14 +152,16 @@ class FrameGraph:
         new = [p for p in pairs if p not in self.edges]
         if not known:
             return new
-        directed = known + [(j, i) for i, j in known]
-        moved = self._moved(directed).cpu().nan_to_num(torch.inf)
+        moved = self._moved(known + [(j, i) for i, j in known]).cpu().nan_to_num(torch.inf)
         worst = torch.maximum(*moved.split(len(known)))
         return new + [p for p, m in zip(known, worst.tolist(), strict=True) if m > tolerance]
 
     def _moved(self, directed: Sequence[Pair]) -> Float[Tensor, "e"]:
         """Median motion in pixels of the matched cells since they were measured."""
-        before = torch.stack([self.edges[e].reprojection for e in directed])
+        return _in_parts(self._moved_together, directed, self.keyframes.grid.on_gpu)
+
+    def _moved_together(self, directed: Sequence[Pair]) -> Float[Tensor, "e"]:
+        before = _reprojections([self.edges[e] for e in directed])
         weight = torch.stack([self.edges[e].weight for e in directed])
         if self.keyframes.grid.on_gpu:
             from geogs.tracking.cuda.graph import DirectedPairs
@@ -137,18 +174,29 @@ class FrameGraph:
         self, directed: Sequence[Pair], free_pose: Iterable[int], free_depth: Iterable[int]
     ) -> tuple[BundleProblem, list[int]]:
         """The adjustment of the given edges, and the keyframe id of each of its frames."""
+        problem, ids = self.streamed_problem(directed, free_pose, free_depth)
+        return problem.part(slice(None)), ids
+
+    def streamed_problem(
+        self, directed: Sequence[Pair], free_pose: Iterable[int], free_depth: Iterable[int]
+    ) -> tuple[StreamedProblem, list[int]]:
+        """As :meth:`problem`, with the matches left where they are."""
         directed = sorted(directed)
         poses, depths = set(free_pose), set(free_depth)
         ids = sorted({k for e in directed for k in e} | poses | depths)
         slot = {k: n for n, k in enumerate(ids)}
         edges = [self.edges[e] for e in directed]
-        problem = BundleProblem(
+
+        def matches(part: slice) -> tuple[Tensor, Tensor]:
+            wanted = edges[part]
+            return torch.stack([e.pixels for e in wanted]), torch.stack([e.weight for e in wanted])
+
+        problem = StreamedProblem(
             T_cw=self.keyframes.poses(ids),
             inverse_depth=self.keyframes.inverse_depths(ids),
             source=torch.tensor([slot[i] for i, _ in directed]),
             target=torch.tensor([slot[j] for _, j in directed]),
-            pixels=torch.stack([e.pixels for e in edges]),
-            weight=torch.stack([e.weight for e in edges]),
+            matches=matches,
             free_pose=torch.tensor([k in poses for k in ids]),
             free_depth=torch.tensor([k in depths for k in ids]),
             damping=_frame_damping(edges, [slot[i] for i, _ in directed], len(ids)),
@@ -165,8 +213,7 @@ class FrameGraph:
         """Solve for poses and inverse depths and store them; None (nothing stored) on failure."""
         if not directed:
             return None
-        problem, ids = self.problem(directed, free_pose, free_depth)
-        result = self.bundle.solve(problem, options)
+        result, ids = self._solve(directed, free_pose, free_depth, options)
         if not result.finite:
             return None
         depths, poses = set(free_depth), set(free_pose)
@@ -183,6 +230,39 @@ class FrameGraph:
                 state.inverse_depth, state.information = filled[m], information[m]
         return result
 
+    def _solve(
+        self,
+        directed: Sequence[Pair],
+        free_pose: Sequence[int],
+        free_depth: Sequence[int],
+        options: BundleOptions,
+    ) -> tuple[BundleResult, list[int]]:
+        grid = self.keyframes.grid
+        if len(directed) <= STACKED_EDGES or grid.on_gpu:
+            problem, ids = self.problem(directed, free_pose, free_depth)
+            return self.bundle.solve(problem, options), ids
+        streamed, ids = self.streamed_problem(directed, free_pose, free_depth)
+        return StreamedBundle(grid).solve(streamed, options), ids
+
+
+def _reprojections(edges: Sequence[Edge]) -> Float[Tensor, "e p 2"]:
+    """Where the cells fell when the flow of each edge was measured."""
+    packed = [e for e in edges if isinstance(e, PackedEdge)]
+    if len(packed) == len(edges):
+        return packed_reprojections(packed)
+    return torch.stack([e.reprojection for e in edges])
+
+
+def _in_parts(
+    work: Callable[[Sequence[Pair]], Float[Tensor, "k"]], directed: Sequence[Pair], on_gpu: bool
+) -> Float[Tensor, "e"]:
+    """A number for each directed pair; some at a time, side by side on the CPU."""
+    size = PAIRS_TOGETHER[on_gpu]
+    if len(directed) <= size:
+        return work(directed)
+    parts = [directed[k : k + size] for k in range(0, len(directed), size)]
+    return torch.cat([work(p) for p in parts] if on_gpu else thread_map(work, parts))
+
 
 def _frame_damping(
     edges: Sequence[Edge], source: Sequence[int], frames: int
@@ -191,104 +271,12 @@ def _frame_damping(
     given = [(e.damping, n) for e, n in zip(edges, source, strict=True) if e.damping is not None]
     if not given:
         return None
-    place = torch.tensor([n for _, n in given])
-    share = torch.nn.functional.one_hot(place, frames).float()
-    share = share / share.sum(0).clamp(min=1)
-    damping = torch.stack([d for d, _ in given])
-    return share.mT.to(damping) @ damping
-
-
-def frame_distances(
-    store: KeyframeStore, directed: Sequence[Pair], rotation_weight: float = 0.3, step: int = 2
-) -> Float[Tensor, "e"]:
-    """DROID-SLAM's distance of directed keyframe pairs in pixels; infinite at little overlap.
-
-    Mean of the flow (weight ``rotation_weight``) and of the flow without the rotation (the rest)
-    over the cells that stay in front of the target; infinite where less than 3/4 do or where less
-    than a fifth falls into the image.
-    """
-    grid = store.grid
-    if not directed:
-        return grid.pixels.new_zeros(0)
-    if grid.on_gpu:
-        from geogs.tracking.cuda.graph import DirectedPairs
-
-        return DirectedPairs.of(store, directed).distances(rotation_weight, step)
-    keep = torch.zeros(grid.height, grid.width, dtype=torch.bool, device=grid.device)
-    keep[::step, ::step] = True
-    keep = keep.reshape(-1)
-    rays, pixels = grid.rays[keep], grid.pixels[keep]
-    source, target = (store.poses([e[k] for e in directed]) for k in (0, 1))
-    index = torch.arange(len(directed), device=source.device)
-    T = relative_motion(torch.cat([source, target]), index, index + len(directed))
-    d = store.inverse_depths([e[0] for e in directed])[:, keep]
-    shift = T.clone()
-    shift[:, :3, :3] = torch.eye(3, dtype=T.dtype, device=T.device)
-    total = valid = inside = torch.zeros(len(directed), device=T.device)
-    for motion, share in ((T, rotation_weight), (shift, 1 - rotation_weight)):
-        p = project(grid.camera, rays, motion, d)
-        flow = (p.pixels - pixels).norm(dim=-1)
-        total = total + share * (flow * p.valid).sum(1)
-        valid = valid + share * p.valid.float().sum(1)
-        if motion is T:
-            inside = (grid.inside(p.pixels) & p.valid).float().mean(1)
-    seen = (valid > 0.75 * int(keep.sum())) & (inside > 0.2)
-    return torch.where(seen, total / valid.clamp(min=1e-6), torch.inf)
-
-
-def proximity_pairs(
-    store: KeyframeStore,
-    later: Sequence[int],
-    earlier: Sequence[int],
-    existing: Iterable[Pair],
-    radius: int,
-    suppression: int,
-    max_distance: float,
-    max_pairs: int,
-) -> list[Pair]:
-    """Pairs to add between ``later`` and ``earlier`` keyframes (DROID-SLAM's proximity factors).
-
-    Every later keyframe is paired with its ``radius`` predecessors; then pairs are taken by growing
-    distance up to ``max_distance`` pixels, each suppressing those within ``suppression`` keyframes
-    of it, as the existing pairs do, until ``max_pairs`` are found.
-    """
-    position = {k: n for n, k in enumerate(store.ids)}
-    ids = store.ids
-    # Pairs that end well before the later keyframes suppress none of theirs.
-    reach = min((position[k] for k in later), default=0) - suppression
-    taken = {
-        (position[i], position[j])
-        for i, j in existing
-        if i in position and j in position and position[j] >= reach
-    }
-    found: list[Pair] = []
-    for k in later:
-        for back in range(1, radius + 1):
-            pair = (position[k] - back, position[k])
-            if pair[0] >= 0 and pair not in taken:
-                taken.add(pair)
-                found.append(pair)
-    blocked = {cell for pair in taken for cell in _neighbourhood(pair, suppression)}
-    candidates = [
-        (a, b)
-        for a in sorted(position[k] for k in earlier)
-        for b in sorted(position[k] for k in later)
-        if b - a > radius and (a, b) not in blocked
-    ]
-    directed = [(ids[a], ids[b]) for a, b in candidates]
-    forward, backward = frame_distances(store, directed + [(j, i) for i, j in directed]).chunk(2)
-    distance, order = torch.sort(((forward + backward) / 2).cpu(), stable=True)
-    for n, far in zip(order.tolist(), distance.tolist(), strict=True):
-        if far > max_distance or len(found) >= max_pairs:
-            break
-        if candidates[n] not in blocked:
-            found.append(candidates[n])
-            blocked.update(_neighbourhood(candidates[n], suppression))
-    return [(ids[a], ids[b]) for a, b in found]
-
-
-def _neighbourhood(pair: Pair, reach: int) -> list[Pair]:
-    a, b = pair
-    limit = max(min(abs(a - b) - 2, reach), 0)
-    span = range(-limit, limit + 1)
-    return [(a + x, b + y) for x in span for y in span if abs(x) + abs(y) <= limit]
+    count = torch.bincount(torch.tensor([n for _, n in given]), minlength=frames)
+    total = torch.zeros(frames, given[0][0].shape[0], device=given[0][0].device)
+    for start in range(0, len(given), STACKED_EDGES):
+        part = given[start : start + STACKED_EDGES]
+        damping = torch.stack([d for d, _ in part])
+        share = torch.nn.functional.one_hot(torch.tensor([n for _, n in part]), frames).float()
+        share = share / count.clamp(min=1)
+        total = total + share.mT.to(damping) @ damping
+    return total

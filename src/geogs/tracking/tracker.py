@@ -19,7 +19,7 @@ from geogs.priors.base import MonocularPrior
 from geogs.tracking.bundle import BundleOptions
 from geogs.tracking.flow.base import FlowOperator
 from geogs.tracking.flow.select import build_operator
-from geogs.tracking.graph import FrameGraph, frame_distances, proximity_pairs
+from geogs.tracking.graph import FrameGraph
 from geogs.tracking.grid import SampleGrid
 from geogs.tracking.keyframe_priors import KeyframePriors
 from geogs.tracking.keyframes import KeyframeIds, KeyframeState, KeyframeStore, scaled
@@ -29,6 +29,7 @@ from geogs.tracking.motion import (
     Recognition,
     transfer_depth,
 )
+from geogs.tracking.proximity import frame_distances, proximity_pairs
 from geogs.tracking.start_up import MIN_KEYFRAMES, StartUp
 from geogs.tracking.trajectory import FrameRecord, TrajectoryRecorder
 from geogs.types import Frame, Keyframe, PoseCorrection, Trajectory

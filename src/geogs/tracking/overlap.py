@@ -1,0 +1,93 @@
+"""Which keyframes cannot see enough of each other, found without looking at single cells."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from geogs.geometry.camera import Camera
+from geogs.geometry.lie import se3_inverse
+from geogs.tracking.keyframes import KeyframeStore
+
+TILES = 4, 6
+"""Rows and columns of tiles into which the cells of a keyframe are grouped."""
+TARGETS_TOGETHER = 32
+"""Keyframes against which all others are held at a time; bounds memory."""
+
+
+@dataclass(frozen=True)
+class _Spheres:
+    """Around the points that each tile of each keyframe sees, in world coordinates."""
+
+    centre: Float[Tensor, "n t 3"]
+    radius: Float[Tensor, "n t"]
+    share: Float[Tensor, "t"]
+    """Of the cells."""
+
+
+def may_overlap(
+    store: KeyframeStore, source: Sequence[int], target: Sequence[int], least: float, step: int
+) -> Bool[np.ndarray, "n m"]:
+    """False where no more than ``least`` of every ``step``-th cell of a source falls into a target.
+
+    Every tile whose bounding sphere reaches into the target's view is counted as if all its cells
+    did, so True proves nothing and False is certain.
+    """
+    spheres = _spheres(store, source, step)
+    out = np.empty((len(source), len(target)), dtype=bool)
+    for begin in range(0, len(target), TARGETS_TOGETHER):
+        part = target[begin : begin + TARGETS_TOGETHER]
+        normal, offset = _view_planes(store.grid.camera, store.poses(part))
+        distance = torch.einsum("ntd,mkd->nmtk", spheres.centre, normal) + offset[:, None]
+        reached = (distance >= -spheres.radius[:, None, :, None]).all(-1)
+        share = reached.float() @ spheres.share
+        out[:, begin : begin + len(part)] = (share > least - 1e-6).numpy()
+    return out
+
+
+def _spheres(store: KeyframeStore, ids: Sequence[int], step: int) -> _Spheres:
+    grid = store.grid
+    rows, columns = torch.arange(0, grid.height, step), torch.arange(0, grid.width, step)
+    tile = (rows * TILES[0] // grid.height)[:, None] * TILES[1] + columns * TILES[1] // grid.width
+    cells = (rows[:, None] * grid.width + columns).reshape(-1)
+    rays = grid.rays.cpu()[cells]
+    groups = [torch.nonzero(tile.reshape(-1) == t)[:, 0] for t in tile.unique().tolist()]
+    T_wc = se3_inverse(store.poses(ids)).float()
+    centres, radii = [], []
+    for begin in range(0, len(ids), 64):
+        part = slice(begin, begin + 64)
+        depth = 1 / store.inverse_depths(ids[part]).cpu()[:, cells, None]
+        points = (rays * depth) @ T_wc[part, :3, :3].mT + T_wc[part, None, :3, 3]
+        grouped = [points[:, g] for g in groups]
+        middle = [(p.amin(1) + p.amax(1)) / 2 for p in grouped]
+        far = [(p - c[:, None]).norm(dim=-1).amax(1) for p, c in zip(grouped, middle, strict=True)]
+        centres.append(torch.stack(middle, 1))
+        radii.append(torch.stack(far, 1))
+    centre, radius = torch.cat(centres), torch.cat(radii)
+    slack = 1e-5 * (centre.norm(dim=-1) + T_wc[:, :3, 3].norm(dim=-1).max())
+    count = torch.tensor([len(g) for g in groups], dtype=torch.float32)
+    return _Spheres(centre, 1.001 * radius + slack, count / len(cells))
+
+
+def _view_planes(
+    camera: Camera, T_cw: Float[Tensor, "m 4 4"]
+) -> tuple[Float[Tensor, "m 5 3"], Float[Tensor, "m 5"]]:
+    """Inward normals n and offsets o of the planes around each view: n . x + o >= 0 within."""
+    c = camera
+    planes = torch.tensor(
+        [
+            [c.fx, 0, c.cx],
+            [-c.fx, 0, c.width - 1 - c.cx],
+            [0, c.fy, c.cy],
+            [0, -c.fy, c.height - 1 - c.cy],
+            [0, 0, 1],
+        ],
+        dtype=torch.float64,
+    )
+    planes = planes / planes.norm(dim=1, keepdim=True)
+    normal = planes @ T_cw[:, :3, :3]
+    offset = (planes @ T_cw[:, :3, 3:])[..., 0]
+    return normal.float(), offset.float()

@@ -1,0 +1,93 @@
+"""Edges of the frame graph in a third of the memory, for graphs over thousands of keyframes."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from jaxtyping import Float, Float16, Int16
+from torch import Tensor
+
+from geogs.geometry.camera import Camera
+from geogs.geometry.lie import se3_inverse
+from geogs.tracking.bundle import project
+from geogs.tracking.flow.base import FlowMatch
+from geogs.tracking.grid import SampleGrid
+from geogs.tracking.keyframes import KeyframeState
+
+MAX_WEIGHT = 6e4
+"""Largest weight that half precision holds, 1 / pixel^2."""
+
+
+@dataclass
+class PackedEdge:
+    """One direction of a measured pair; reads like a ``MeasuredEdge``.
+
+    Positions are kept in steps of 2^-15 of the long edge (1/64 pixel at 512; matches half an image
+    outside are held at its border) and weights in half precision. Where the cells fell when the
+    flow was measured is computed again from the poses and depths of that time, which many edges
+    share.
+    """
+
+    grid: SampleGrid
+    position: Int16[Tensor, "p 2"]
+    half_weight: Float16[Tensor, "p 2"]
+    T_source: Float[Tensor, "4 4"]
+    """World to camera of the source when the flow was measured."""
+    T_target: Float[Tensor, "4 4"]
+    inverse_depth: Float[Tensor, "p"]
+    """Of the source when the flow was measured."""
+    damping: Float[Tensor, "p"] | None = None
+    memory: Any = None
+
+    @staticmethod
+    def of(
+        match: FlowMatch, n: int, grid: SampleGrid, source: KeyframeState, target: KeyframeState
+    ) -> "PackedEdge":
+        """The n-th edge of a measurement that started from the present state."""
+        weight = match.weight[n]
+        steps = (match.pixels[n] - _centre(grid)) / position_step(grid.camera)
+        position = torch.where(weight > 0, steps.round(), 0.0).clamp(-32768, 32767).short()
+        return PackedEdge(
+            grid,
+            position,
+            weight.clamp(max=MAX_WEIGHT).half(),
+            source.T_cw,
+            target.T_cw,
+            source.inverse_depth,
+            None if match.damping is None else match.damping[n],
+            None if match.memory is None else match.memory[n],
+        )
+
+    @property
+    def pixels(self) -> Float[Tensor, "p 2"]:
+        """Position in the target of each cell of the source; the image's centre where unmatched."""
+        return self.position.float() * position_step(self.grid.camera) + _centre(self.grid)
+
+    @property
+    def weight(self) -> Float[Tensor, "p 2"]:
+        """Inverse variance of x and y in 1 / pixel^2."""
+        return self.half_weight.float()
+
+    @property
+    def reprojection(self) -> Float[Tensor, "p 2"]:
+        """Where the cells fell when the flow was measured."""
+        return packed_reprojections([self])[0]
+
+
+def position_step(camera: Camera) -> float:
+    """Pixels between two positions that can be told apart."""
+    return 2.0**-15 * max(camera.width, camera.height)
+
+
+def packed_reprojections(edges: Sequence[PackedEdge]) -> Float[Tensor, "e p 2"]:
+    """Where the cells fell when the flow of each edge was measured."""
+    grid = edges[0].grid
+    source, target = (torch.stack([getattr(e, k) for e in edges]) for k in ("T_source", "T_target"))
+    depth = torch.stack([e.inverse_depth for e in edges])
+    return project(grid.camera, grid.rays, target @ se3_inverse(source), depth).pixels
+
+
+def _centre(grid: SampleGrid) -> Float[Tensor, "2"]:
+    camera = grid.camera
+    return grid.pixels.new_tensor([camera.width / 2, camera.height / 2])
