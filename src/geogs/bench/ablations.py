@@ -57,7 +57,7 @@ INITIALISATION = Benchmark(
 
 MAP_UPDATE = Benchmark(
     "ablation-update",
-    "Ablation: one similarity for all disks after a correction, or one per keyframe",
+    "Ablation: after a correction, one similarity for all disks, one per keyframe, or a blend",
     "run",
     find_rooms,
     _ROOMS,
@@ -66,6 +66,7 @@ MAP_UPDATE = Benchmark(
     (
         Variant("per-keyframe", (*_set(map_update="per_keyframe"), *_NO_REFINEMENT)),
         Variant("coherent", (*_set(map_update="coherent"), *_NO_REFINEMENT)),
+        Variant("blended", (*_set(map_update="blended"), *_NO_REFINEMENT)),
     ),
     paper.REPLICA_SCENES,
     (paper.ABLATION_UPDATE,),

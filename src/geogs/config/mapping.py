@@ -108,8 +108,9 @@ class MappingConfig:
     """Pose-only steps per mapped keyframe; 0 leaves the poses to the tracker."""
     pose_lr: float = 4e-4
     """Adam step of the pose tangents: radians, and u for translations."""
-    map_update: Literal["coherent", "per_keyframe"] = "coherent"
-    """How the map follows a correction of the poses."""
+    map_update: Literal["blended", "coherent", "per_keyframe"] = "blended"
+    """How the map follows a correction of the poses: each disk with all keyframes that see it in
+    place, all by one similarity (the paper's), or each with the keyframe that made it."""
     max_spread: float = 0.01
     """Surfaces take the mean depth of a ray where the median differs by less, else the median."""
     disk: DiskConfig = field(default_factory=DiskConfig)

@@ -1,11 +1,13 @@
-"""Moving the map after the trajectory was corrected: coherent, or per keyframe (the baseline).
+"""Moving the map after the trajectory was corrected: blended, coherent (the paper's), per keyframe.
 
 Each disk has an anchor, the keyframe it was made from. The correction of its anchor would carry it
 to a target position (Eq. target_position). Moving every disk to its own target tears surfaces that
-several keyframes share; the coherent update fits one Sim(3) to all targets (Eq. global_sim3), and
-where one Sim(3) cannot describe the correction, a smooth field of them.
+several keyframes share. The coherent update fits one Sim(3) to all targets (Eq. global_sim3): it
+tears nothing and cannot follow a drift. The blended one moves every disk with all keyframes that
+see it where it lies (:mod:`geogs.mapping.similarity_field`).
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -14,12 +16,13 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from geogs.errors import GeogsError
-from geogs.geometry.lie import se3_inverse, sim3_exp, sim3_log
-from geogs.geometry.neighbors import nearest_neighbors
+from geogs.geometry.lie import se3_inverse
 from geogs.geometry.umeyama import umeyama
+from geogs.mapping.similarity_field import Witness, blended_similarities
+from geogs.mapping.view import MapCameras, MapView
 from geogs.types import PoseCorrection
 
-Strategy = Literal["coherent", "per_keyframe"]
+Strategy = Literal["blended", "coherent", "per_keyframe"]
 
 
 @dataclass(frozen=True)
@@ -32,6 +35,11 @@ class MapUpdate:
     """Root mean square distance between positions and targets, map units."""
     residual: float
     """Root mean square distance between targets and where the update puts the disks."""
+
+
+def witness(view: MapView, cameras: MapCameras) -> Witness:
+    """What a view with a depth sees, before it takes over a correction."""
+    return Witness(view.id, cameras.render, view.T_cw, view.dense.depth, view.dense.confidence)
 
 
 def anchor_transforms(correction: PoseCorrection) -> tuple[Tensor, Tensor]:
@@ -59,86 +67,53 @@ def plan_update(
     position: Float[Tensor, "n 3"],
     anchor: Int[Tensor, "n"],
     correction: PoseCorrection,
-    strategy: Strategy = "coherent",
-    field_threshold: float = 0.25,
-    nodes: int = 200,
+    strategy: Strategy = "blended",
+    witnesses: Sequence[Witness] = (),
 ) -> MapUpdate:
-    """The similarity of every disk for a pose correction.
+    """The similarity of every disk for a pose correction, computed where the disks live.
 
     Disks whose anchor is not in the correction follow the corrected keyframe nearest in time.
-    ``coherent`` fits one Sim(3) to all targets; if what it leaves is more than ``field_threshold``
-    of the correction, it is followed by a smooth field of Sim(3)s at ``nodes`` control points.
+    ``per_keyframe`` moves each with its anchor, ``coherent`` all by the one Sim(3) that fits the
+    anchors' targets best, ``blended`` each with the ``witnesses`` that see it in place (with its
+    anchor where none does), evened out among neighbours; witnesses that the correction does not
+    know say nothing.
     """
     if len(position) == 0:
         return MapUpdate(torch.zeros(0, 4, 4, dtype=torch.float64), 0.0, 0.0)
     ids, similarities = anchor_transforms(correction)
-    slot = torch.searchsorted(ids, anchor.cpu().to(ids.dtype)).clamp(max=len(ids) - 1)
-    previous = (slot - 1).clamp(min=0)
-    closer = (anchor.cpu() - ids[previous]).abs() < (ids[slot] - anchor.cpu()).abs()
-    own = similarities[torch.where(closer, previous, slot)]
-    x = position.detach().cpu().double()
+    own = similarities[_nearest_in_time(ids, anchor.cpu())].to(position.device)
+    x = position.detach().double()
     target = apply_each(own, x)
-    moved = _rms(target - x)
-    if strategy == "per_keyframe" or len(x) < 4:
-        return MapUpdate(own, moved, 0.0)
-    S = _fit_similarity(x, target)
-    if S is None:
-        return MapUpdate(own, moved, 0.0)
-    left = _rms(target - apply_each(S.expand(len(x), 4, 4), x))
-    if left <= field_threshold * moved or moved < 1e-9:
-        return MapUpdate(S.expand(len(x), 4, 4).clone(), moved, left)
-    field = similarity_field(x, target, S, nodes)
-    return MapUpdate(field, moved, _rms(target - apply_each(field, x)))
+    S = own
+    if strategy != "per_keyframe" and (fit := _fit_similarity(x, target)) is not None:
+        S = fit.expand(len(x), 4, 4).clone()
+        if strategy == "blended":
+            known = {int(i): n for n, i in enumerate(ids)}
+            heard = [w for w in witnesses if w.keyframe_id in known]
+            theirs = similarities[[known[w.keyframe_id] for w in heard]].to(x)
+            S = blended_similarities(x, own, fit, heard, theirs)
+    return MapUpdate(S, _rms(target - x), _rms(target - apply_each(S, x)))
 
 
-def similarity_field(
-    x: Float[Tensor, "n 3"], target: Float[Tensor, "n 3"], S: Float[Tensor, "4 4"], nodes: int
-) -> Float[Tensor, "n 4 4"]:
-    """A similarity for every point that follows the targets locally and varies smoothly.
-
-    Control points are spread by farthest-point sampling. Each fits a Sim(3) to the points around
-    it, weighted by a Gaussian of distance, from the similarity ``S`` onwards; a point takes the
-    weighted mean of its nearest control points' remainders in the Lie algebra, so neighbours on
-    one surface move alike whichever keyframe made them.
-    """
-    warped = apply_each(S.expand(len(x), 4, 4), x)
-    centres = _farthest_points(warped, min(nodes, len(x)))
-    spread, _ = nearest_neighbors(warped[centres], warped[centres], 5)
-    radius = spread[:, 1:].mean(1).clamp(min=1e-9) * 1.5
-    support = min(len(x), max(64, 8 * len(x) // len(centres)))
-    distance, index = nearest_neighbors(warped[centres], warped, support)
-    remainders = []
-    for c in range(len(centres)):
-        weight = torch.exp(-0.5 * (distance[c] / radius[c]) ** 2) + 1e-9
-        local = _fit_similarity(warped[index[c]], target[index[c]], weight)
-        remainders.append(torch.zeros(7).double() if local is None else sim3_log(local))
-    distance, index = nearest_neighbors(warped, warped[centres], 8)
-    weight = torch.exp(-0.5 * (distance / radius[index]) ** 2) + 1e-12
-    weight = weight / weight.sum(1, keepdim=True)
-    tangent = (weight[..., None] * torch.stack(remainders)[index]).sum(1)
-    return sim3_exp(tangent) @ S
+def _nearest_in_time(ids: Int[Tensor, "k"], anchor: Int[Tensor, "n"]) -> Int[Tensor, "n"]:
+    """Index of the keyframe (ids ascending) nearest to each anchor."""
+    slot = torch.searchsorted(ids, anchor.to(ids.dtype)).clamp(max=len(ids) - 1)
+    previous = (slot - 1).clamp(min=0)
+    closer = (anchor - ids[previous]).abs() < (ids[slot] - anchor).abs()
+    return torch.where(closer, previous, slot)
 
 
-def _fit_similarity(source: Tensor, target: Tensor, weights: Tensor | None = None) -> Tensor | None:
+def _fit_similarity(
+    source: Float[Tensor, "n 3"], target: Float[Tensor, "n 3"]
+) -> Float[Tensor, "4 4"] | None:
     """Umeyama as a 4x4 matrix; None where the points do not determine one."""
     try:
-        scale, R, t = umeyama(source, target, weights=weights)
+        scale, R, t = umeyama(source, target)
     except GeogsError:
         return None
-    S = torch.eye(4, dtype=torch.float64)
+    S = torch.eye(4, dtype=source.dtype, device=source.device)
     S[:3, :3], S[:3, 3] = scale * R, t
     return S
-
-
-def _farthest_points(x: Tensor, count: int) -> Tensor:
-    """Indices of ``count`` points, each the farthest from those before it; deterministic."""
-    chosen = torch.zeros(count, dtype=torch.long)
-    chosen[0] = (x - x.mean(0)).square().sum(1).argmax()
-    nearest = (x - x[chosen[0]]).square().sum(1)
-    for i in range(1, count):
-        chosen[i] = nearest.argmax()
-        nearest = torch.minimum(nearest, (x - x[chosen[i]]).square().sum(1))
-    return chosen
 
 
 def _rms(difference: Tensor) -> float:

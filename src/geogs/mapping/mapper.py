@@ -12,7 +12,7 @@ from torch import Tensor
 from geogs.config import MappingConfig
 from geogs.geometry.camera import Camera
 from geogs.mapping.depth_engine import depth_engine
-from geogs.mapping.map_update import MapUpdate, plan_update
+from geogs.mapping.map_update import MapUpdate, plan_update, witness
 from geogs.mapping.rendered import rendered_keyframe, searched_keyframe
 from geogs.mapping.sweep_neighbors import select_sweep_neighbours
 from geogs.mapping.training import (
@@ -63,7 +63,7 @@ class Mapper:
 
     def __init__(self, camera: Camera, config: MappingConfig, device: str = "cpu", seed: int = 0):
         self.config = config
-        self.cameras = _cameras(camera, config)
+        self.cameras = MapCameras.of(camera, config)
         self.map = GaussianMap.empty(device)
         self._depths = depth_engine(
             self.map.device, self.cameras.render, self.cameras.working, config.depth
@@ -129,12 +129,21 @@ class Mapper:
         return poses
 
     def correct(self, correction: PoseCorrection, keyframes: list[Keyframe]) -> MapUpdate:
-        """Move the map with a global correction of the poses, and take over the new keyframes."""
+        """Move the map with a global correction of the poses, and take over the new keyframes.
+
+        To be called before the keyframes' new poses arrive by ``follow``: what they see in place
+        before the correction says how the map moves.
+        """
         update = plan_update(
-            self.map.position, self.map.keyframe_id, correction, self.config.map_update
+            self.map.position,
+            self.map.keyframe_id,
+            correction,
+            self.config.map_update,
+            [witness(v, self.cameras) for v in self.views.values() if v.depth is not None],
         )
         if len(self.map):
             self._training().optimizer.transform(update.transform)
+            self._training().forget_renders(self.views.values())
         for i, scale in correction.scale.items():
             if i in self.views:
                 self.views[i].rescale(1.0 / scale, self.cameras)
@@ -372,13 +381,6 @@ class Mapper:
         )
         ids = self.map.keyframe_id[chosen]
         optimizer.replace(chosen, split(self.map, chosen), torch.cat([ids, ids]))
-
-
-def _cameras(camera: Camera, config: MappingConfig) -> MapCameras:
-    working = max(camera.width, camera.height)
-    long_edge = min(config.render_long_edge, working)
-    photo = min(round(config.photo_scale * long_edge), working)
-    return MapCameras(camera, camera.with_long_edge(long_edge), camera.with_long_edge(photo))
 
 
 def _render_mask(mask: Bool[np.ndarray, "h w"], render: Camera) -> Bool[Tensor, "rh rw"]:

@@ -1,6 +1,6 @@
 """Training the map: losses of some views, gradients, Adam."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -97,6 +97,10 @@ class MapTrainer(Protocol):
         """Poses of the active keyframes that agree better with the map; the earliest stays."""
         ...
 
+    def forget_renders(self, views: Iterable[MapView]) -> None:
+        """What the views showed of the map counts no more: it was moved."""
+        ...
+
 
 def map_trainer(
     disks: GaussianMap, cameras: MapCameras, config: MappingConfig, unit: float
@@ -135,6 +139,11 @@ class Trainer:
     ) -> dict[int, Float[Tensor, "4 4"]]:
         """Poses of the active keyframes that agree better with the map; the earliest stays."""
         return refine_poses(self.disks, active, views, self.cameras, config, self.unit)
+
+    def forget_renders(self, views: Iterable[MapView]) -> None:
+        """What the views showed of the map counts no more: it was moved."""
+        for view in views:
+            view.rendered_depth = None
 
     def step(self, batch: Batch) -> float:
         """One Adam step on the summed losses of views with their partners; returns the loss."""

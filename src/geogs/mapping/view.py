@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from geogs.config import LossConfig
+from geogs.config import LossConfig, MappingConfig
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_inverse
 from geogs.losses.multi_view import PhotoView
@@ -30,6 +30,14 @@ class MapCameras:
     """Of the rendered maps and keyframe depths."""
     photo: Camera
     """Of the images that L_mv compares."""
+
+    @staticmethod
+    def of(camera: Camera, config: MappingConfig) -> "MapCameras":
+        """The sizes that the settings ask for, none above the working image."""
+        working = max(camera.width, camera.height)
+        long_edge = min(config.render_long_edge, working)
+        photo = min(round(config.photo_scale * long_edge), working)
+        return MapCameras(camera, camera.with_long_edge(long_edge), camera.with_long_edge(photo))
 
 
 @dataclass

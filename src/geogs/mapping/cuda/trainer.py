@@ -1,6 +1,6 @@
 """Training the map on a GPU: whole steps captured in CUDA graphs and replayed."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -100,6 +100,10 @@ class CudaTrainer:
             )  # fmt: skip
             self._pose_pass = window
         return refine_poses(self.disks, active, views, self.known, window, config, self.unit)
+
+    def forget_renders(self, views: Iterable[MapView]) -> None:
+        """What the views showed of the map counts no more: it was moved."""
+        self.known.table.forget_rendered()
 
     def _program(self, views: int, partners: int) -> "_TrainingStep":
         key = (views, partners)

@@ -1,0 +1,114 @@
+"""A similarity for every disk, smooth over each surface: the blended map update.
+
+After a correction every keyframe says how what it sees has to move. A disk is moved by all those
+that see it where it lies: its place is the work of the keyframes that trained it, not of the one
+that made it alone. A disk that a drifting loop has put in double is seen in place by the keyframes
+of its own visit only, and goes with these. Then neighbours are evened out unless they have to part.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from geogs.geometry.camera import Camera
+from geogs.geometry.lie import sim3_exp, sim3_inverse, sim3_log
+from geogs.geometry.neighbors import nearest_neighbors
+
+_AGREEMENT = 0.03
+"""Relative deviation from a keyframe's depth at which a disk counts as its surface no more."""
+_OWN = 0.1
+"""Weight of the keyframe that made a disk; another's is at most one."""
+_BORDER = 8.0
+"""Pixels over which a keyframe's say fades towards the border of its image."""
+_NEIGHBOURS = 32
+_ROUNDS = 4
+_SPREAD = 1.5
+"""Width of the smoothing, in distances to the middle one of the neighbours."""
+_PARTING = 0.2
+"""Difference of two neighbours' ways at which they belong to different layers, in that width."""
+
+
+@dataclass(frozen=True, eq=False)
+class Witness:
+    """What a keyframe saw before the correction, on the device of the map."""
+
+    keyframe_id: int
+    camera: Camera
+    """Of the depth."""
+    T_cw: Float[Tensor, "4 4"]
+    """World to camera, before the correction."""
+    depth: Float[Tensor, "h w"]
+    """z in map units, before the correction."""
+    confidence: Float[Tensor, "h w"]
+    """In [0, 1]."""
+
+
+def blended_similarities(
+    x: Float[Tensor, "n 3"],
+    own: Float[Tensor, "n 4 4"],
+    reference: Float[Tensor, "4 4"],
+    witnesses: Sequence[Witness],
+    similarities: Float[Tensor, "k 4 4"],
+) -> Float[Tensor, "n 4 4"]:
+    """World similarities of disks at ``x``, float64.
+
+    ``own`` is the correction of the keyframe that made each, ``similarities`` those of the
+    witnesses. Blends are means in the Lie algebra of Sim(3) of what remains after ``reference``,
+    which should be near all of them; they do not depend on the origin of the world.
+    """
+    back = sim3_inverse(reference)
+    total = _OWN * sim3_log(own @ back)
+    weight = torch.full_like(x[:, 0], _OWN)
+    for witness, xi in zip(witnesses, sim3_log(similarities @ back), strict=True):
+        say = agreement(x, witness)
+        total += say[:, None] * xi
+        weight += say
+    moved = x @ reference[:3, :3].T + reference[:3, 3]
+    return sim3_exp(smoothed(x, moved, total / weight[:, None])) @ reference
+
+
+def agreement(x: Float[Tensor, "n 3"], witness: Witness) -> Float[Tensor, "n"]:
+    """In [0, 1]: how sure the witness is that there is a surface at each point."""
+    camera = witness.camera
+    T = witness.T_cw.to(x)
+    y = x @ T[:3, :3].T + T[:3, 3]
+    z = y[:, 2].clamp(min=1e-9)
+    u, v = camera.fx * y[:, 0] / z + camera.cx, camera.fy * y[:, 1] / z + camera.cy
+    inwards = torch.stack([u, camera.width - 1 - u, v, camera.height - 1 - v]).amin(0)
+    seen = (y[:, 2] > 0) & (inwards > 0)
+    column = torch.where(seen, u, 0.0).round().long()
+    row = torch.where(seen, v, 0.0).round().long()
+    deviation = (z / witness.depth[row, column].to(x) - 1) / _AGREEMENT
+    say = (inwards / _BORDER).clamp(max=1.0) * witness.confidence[row, column].to(x)
+    return torch.where(seen, say * torch.exp(-0.5 * deviation.square()), 0.0)
+
+
+def smoothed(
+    x: Float[Tensor, "n 3"], moved: Float[Tensor, "n 3"], tangent: Float[Tensor, "n 7"]
+) -> Float[Tensor, "n 7"]:
+    """Tangents at points ``x``, each a mean over near points that go about the same way.
+
+    A bilateral filter: its weights fall with the distance, and with the distance between where both
+    tangents take the point ``moved`` (to first order), so layers that have to part do.
+    """
+    distance, index = nearest_neighbors(x, x, _NEIGHBOURS)
+    width = _SPREAD * distance[:, distance.shape[1] // 2].clamp(min=1e-12)
+    near = torch.exp(-0.5 * (distance / width[:, None]).square())
+    for _ in range(_ROUNDS):
+        total, weight = torch.zeros_like(tangent), torch.zeros_like(width)
+        for k in range(index.shape[1]):
+            other = tangent[index[:, k]]
+            way = _displacement(other - tangent, moved).norm(dim=1) / (_PARTING * width)
+            w = near[:, k] * torch.exp(-0.5 * way.square())
+            total += w[:, None] * other
+            weight += w
+        tangent = total / weight[:, None]
+    return tangent
+
+
+def _displacement(xi: Float[Tensor, "n 7"], x: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+    """Of points by small tangents, to first order."""
+    return xi[:, :3] + torch.linalg.cross(xi[:, 3:6], x) + xi[:, 6:] * x
