@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, get_args
 
 import tyro
 
+from geogs.cli.calibrate import self_calibrated
 from geogs.cli.interrupt import Interruption
 from geogs.cli.options import SHORT, given, parse_options
 from geogs.cli.priors import open_prior
@@ -68,6 +69,7 @@ def run(options: RunOptions) -> Path:
     output = prepare_output_folder(options.output or Path("out") / source.name)
     if device.type == "cuda":
         prepare_kernels(Path(geogs.__file__).parent, device)
+    source = self_calibrated(source, options, device)
     prior = open_prior(options.prior, source.camera, device)
     slam = Slam(source.camera, options, str(device), prior)
     progress = RunProgress(source.length)

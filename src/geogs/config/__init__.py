@@ -3,6 +3,7 @@
 The string under a field is its help text: meaning, unit, range.
 """
 
+from geogs.config.calibration import CalibrationConfig
 from geogs.config.depth import DepthConfig
 from geogs.config.input import InputConfig
 from geogs.config.known_poses import (
@@ -20,6 +21,7 @@ from geogs.config.slam import Config, Preset, preset
 from geogs.config.tracking import TrackingConfig
 
 __all__ = [
+    "CalibrationConfig",
     "Config",
     "DepthConfig",
     "DiskConfig",

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
+from geogs.config.calibration import CalibrationConfig
 from geogs.config.input import InputConfig
 from geogs.config.loop import LoopConfig
 from geogs.config.mapping import MappingConfig
@@ -20,6 +21,7 @@ class Config:
     seed: int = 0
     """Random seed; same seed, same machine, same result on the CPU."""
     input: InputConfig = field(default_factory=InputConfig)
+    calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
     prior: PriorConfig = field(default_factory=PriorConfig)
     loop: LoopConfig = field(default_factory=LoopConfig)

@@ -5,7 +5,7 @@ common: the selection of frames, the calibration, the working resolution and rea
 """
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Protocol, TypeVar, runtime_checkable
@@ -65,11 +65,14 @@ class Reader(Protocol):
 class Source:
     """Frames at working resolution, undistorted, in time order; can be iterated repeatedly."""
 
-    def __init__(self, reader: Reader, config: InputConfig) -> None:
+    def __init__(
+        self, reader: Reader, config: InputConfig, calibration: Calibration | None = None
+    ) -> None:
+        """``calibration`` of the upright images, where it is known better than the reader's."""
         _check_selection(config, reader.length)
         self._reader = reader
         self._config = config
-        self.calibration = resolve_intrinsics(
+        self.calibration = calibration or resolve_intrinsics(
             config.intrinsics,
             reader.calibration,
             reader.width,
@@ -97,6 +100,16 @@ class Source:
         return self._rectifier.camera
 
     @property
+    def is_calibration_open(self) -> bool:
+        """Whether the focal length is a guess or nominal, and neither user nor data set gave it."""
+        asked = self._config.intrinsics.strip().lower() == "auto"
+        return asked and (self.calibration.is_guess or self.calibration.is_nominal)
+
+    def with_calibration(self, calibration: Calibration) -> "Source":
+        """The same frames, undistorted by another calibration of the images as they came."""
+        return Source(self._reader, self._config, calibration)
+
+    @property
     def intrinsics_origin(self) -> str:
         """Where the intrinsics come from."""
         return self.calibration.origin
@@ -115,7 +128,7 @@ class Source:
         stop = self._reader.length if stop is None else min(stop, self._reader.length)
         return len(range(self._config.start, stop, self._config.stride))
 
-    def __iter__(self) -> Iterator[Frame]:
+    def __iter__(self) -> Generator[Frame, None, None]:
         """Yield the frames; the next one is read while the present one is used.
 
         Raises:

@@ -8,6 +8,21 @@ from geogs.geometry.camera import Camera
 
 
 @dataclass(frozen=True)
+class Refinement:
+    """What the video itself said of the focal length."""
+
+    deviation: float | None = None
+    """Standard deviation of fx in pixels of the source's images; none where there is a failure."""
+    deviation_k1: float | None = None
+    """Of the radial term; none where it was not asked for."""
+    keyframes: int = 0
+    frames: int = 0
+    """Looked at."""
+    failure: str | None = None
+    """Why the video does not tell it."""
+
+
+@dataclass(frozen=True)
 class Calibration:
     """Intrinsics in pixels (pixel centres at integers) with OpenCV distortion coefficients."""
 
@@ -24,6 +39,10 @@ class Calibration:
     """Where the numbers come from, for the log and ``intrinsics.json``."""
     is_guess: bool = False
     """Whether the focal length is only assumed."""
+    is_nominal: bool = False
+    """Whether the focal length is what the maker says of the lens, to a few percent."""
+    refinement: Refinement | None = None
+    """What the video said of it, where it was asked."""
 
     def __post_init__(self) -> None:
         numbers = (self.fx, self.fy, self.cx, self.cy, *self.distortion)

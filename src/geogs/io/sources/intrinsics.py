@@ -94,7 +94,7 @@ def calibration_from_exif(image: Path) -> Calibration | None:
     focal = equivalent / _FULL_FRAME_DIAGONAL * math.hypot(width, height)
     return Calibration(
         focal, focal, (width - 1) / 2, (height - 1) / 2,
-        origin=f"EXIF of {image.name} ({equivalent:g} mm equivalent)",
+        origin=f"EXIF of {image.name} ({equivalent:g} mm equivalent)", is_nominal=True,
     )  # fmt: skip
 
 

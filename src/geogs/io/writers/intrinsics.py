@@ -38,8 +38,25 @@ def write_intrinsics(
             "distortion": list(calibration.distortion),
             "origin": calibration.origin,
             "is_guess": calibration.is_guess,
+            **_refinement(calibration),
         }
     write_text(path, json.dumps(document, indent=2) + "\n")
+
+
+def _refinement(calibration: Calibration) -> dict[str, object]:
+    """What the video said, if it was asked; deviations in pixels of the source's images."""
+    said = calibration.refinement
+    if said is None:
+        return {}
+    return {
+        "focal_deviation": said.deviation,
+        "k1_deviation": said.deviation_k1,
+        "self_calibration": {
+            "keyframes": said.keyframes,
+            "frames": said.frames,
+            "failure": said.failure,
+        },
+    }
 
 
 def read_camera(path: str | Path) -> Camera:

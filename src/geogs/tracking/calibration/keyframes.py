@@ -1,0 +1,125 @@
+"""Keyframes of a camera about which nothing is known, and the flow between them."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from geogs.geometry.camera import Camera
+from geogs.tracking.flow.base import FlowMatch, FlowOperator
+from geogs.tracking.grid import SampleGrid
+from geogs.tracking.motion import FlowChain
+from geogs.types import Frame
+
+MIN_MATCHED = 0.12
+"""Share of a keyframe's cells that must be found in the next one."""
+MIN_TEXTURE = 0.05
+"""Share of a frame that must have structure."""
+
+
+@dataclass(frozen=True)
+class View:
+    """A keyframe without a pose."""
+
+    frame: Frame
+    encoded: Any
+    step: FlowMatch | None
+    """From the keyframe before it; None for the first."""
+
+
+class ViewGatherer:
+    """Takes keyframes by image motion alone, which needs no focal length."""
+
+    def __init__(
+        self, frames: Iterator[Frame], grid: SampleGrid, operator: FlowOperator, motion: float
+    ) -> None:
+        """``motion``: pixels of median flow that make a keyframe."""
+        self._frames, self._grid, self._operator, self._motion = frames, grid, operator, motion
+        self._chain = FlowChain(grid, operator)
+        self.frames = 0
+        """Frames taken so far."""
+
+    def gather(
+        self, views: list[View], count: int, limit: int, tick: Callable[[], None]
+    ) -> list[View]:
+        """``views`` grown to ``count``, or less where ``limit`` frames are seen or none is left.
+
+        The frames begin anew where the view changes at once, with what comes after.
+        """
+        views = list(views)
+        while len(views) < count and self.frames < limit:
+            frame = next(self._frames, None)
+            if frame is None:
+                break
+            self.frames += 1
+            tick()
+            encoded = self._operator.encode(frame.image)
+            if self._operator.texture(encoded) < MIN_TEXTURE:
+                continue
+            step = None
+            if views:
+                match = self._chain.follow(views[-1].encoded, encoded)
+                if match.matched < MIN_MATCHED:
+                    if len(views) >= count // 2:
+                        break
+                    views = []
+                elif match.flow < self._motion:
+                    continue
+                else:
+                    step = match.there
+            self._chain.reset()
+            views.append(View(frame, encoded, step))
+        return views
+
+
+def with_focal(camera: Camera, focal: float) -> Camera:
+    """The camera with fx = ``focal`` and the same aspect."""
+    return replace(camera, fx=focal, fy=focal * camera.fy / camera.fx)
+
+
+def flows_from_first(
+    grid: SampleGrid, operator: FlowOperator, views: list[View]
+) -> list[FlowMatch]:
+    """Flow from the first view to each later one: chained over the steps and measured again."""
+    there: Float[Tensor, "p 2"] = grid.pixels
+    encoded = [v.encoded for v in views]
+    _, back_steps = operator.measure(encoded[:-1], encoded[1:], fine=False)
+    back = grid.pixels
+    flows = []
+    for k in range(1, len(views)):
+        step = views[k].step
+        assert step is not None
+        flow = _filled(grid, step)
+        there = there + grid.sample_field(flow, there)
+        back_step = grid.pixels + _filled(
+            grid, FlowMatch(back_steps.pixels[k - 1][None], back_steps.weight[k - 1][None])
+        )
+        back = back_step + grid.sample_field(back - grid.pixels, back_step)
+        match, reverse = operator.measure(
+            [encoded[0]], [encoded[k]], there[None], back[None], fine=True
+        )
+        flows.append(match)
+        if float((match.weight[0, :, 0] > 0).float().mean()) < MIN_MATCHED:
+            break
+        there = grid.pixels + _filled(grid, match)
+        back = grid.pixels + _filled(grid, reverse)
+    return flows
+
+
+def _filled(grid: SampleGrid, match: FlowMatch) -> Float[Tensor, "p 2"]:
+    """Flow of a single edge, unmatched cells filled in from around them."""
+    flow, weight = match.pixels[0] - grid.pixels, match.weight[0, :, 0]
+    return grid.fill_all(flow.mT.contiguous(), weight.expand(2, -1)).mT.contiguous()
+
+
+def on_cpu(match: FlowMatch) -> FlowMatch:
+    """Positions and weights, on the CPU."""
+    return FlowMatch(match.pixels.cpu(), match.weight.cpu())
+
+
+def stacked(matches: list[FlowMatch]) -> tuple[Float[Tensor, "e p 2"], Float[Tensor, "e p 2"]]:
+    """Positions and weights of several single edges."""
+    return torch.cat([m.pixels for m in matches]), torch.cat([m.weight for m in matches])

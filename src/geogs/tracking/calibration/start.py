@@ -1,0 +1,111 @@
+"""A first focal length: several fields of view tried on the same flows from one keyframe.
+
+Flow needs no focal length, so it is measured once. Every candidate places the keyframes by the
+essential matrix and PnP and is adjusted, the focal length with the rest; the least cost wins.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from geogs.geometry.camera import Camera
+from geogs.tracking.bundle import BundleProblem
+from geogs.tracking.calibration.bundle import LensBundleOptions, LensBundleResult, solve_lens
+from geogs.tracking.calibration.keyframes import on_cpu, stacked, with_focal
+from geogs.tracking.calibration.lens import Lens
+from geogs.tracking.flow.base import FlowMatch
+from geogs.tracking.grid import SampleGrid
+from geogs.tracking.initialise import TwoView, two_view
+from geogs.tracking.motion import pnp
+
+FIELDS_OF_VIEW = (50.0, 70.0, 95.0)
+"""Degrees along the longer side, besides that of the guess."""
+_HUBERS = (30.0, 10.0, 3.0)
+
+
+@dataclass(frozen=True)
+class Start:
+    """Keyframes placed by one candidate; on the CPU."""
+
+    lens: Lens
+    T_cw: Float[Tensor, "n 4 4"]
+    inverse_depth: Float[Tensor, "p"]
+    """Of the first keyframe."""
+    information: Float[Tensor, "p"]
+    cost: float
+    field_of_view: float
+    """Degrees from which it began."""
+
+
+def candidates(camera: Camera) -> list[Camera]:
+    """The guess and cameras of other fields of view."""
+    edge = max(camera.width, camera.height)
+    focals = [camera.fx, *(edge / 2 / math.tan(math.radians(a / 2)) for a in FIELDS_OF_VIEW)]
+    return [with_focal(camera, f) for f in focals]
+
+
+def try_candidate(camera: Camera, flows: list[FlowMatch], min_parallax: float) -> Start | None:
+    """Place and adjust the keyframes from one focal length; None where it shows no parallax."""
+    flows = [on_cpu(f) for f in flows]
+    grid = SampleGrid(camera)
+    best, view = _best_view(camera, flows, min_parallax)
+    if view is None:
+        return None
+    depth = grid.fill(view.inverse_depth, view.good.float())
+    poses = [torch.eye(4, dtype=torch.float64)]
+    for n, match in enumerate(flows):
+        T = view.T_ji if n == best else pnp(
+            grid, depth, match.pixels[0], view.good & match.sure()[0]
+        )  # fmt: skip
+        poses.append(poses[-1] if T is None else T)
+    pixels, weight = stacked(flows)
+    n = len(flows) + 1
+    free = torch.ones(n, dtype=torch.bool)
+    free[0] = False
+    rows = torch.cat([depth[None], torch.ones(n - 1, grid.size)])
+    problem = BundleProblem(
+        torch.stack(poses), rows, torch.zeros(n - 1, dtype=torch.long), torch.arange(1, n),
+        pixels, weight, free, torch.ones(n, dtype=torch.bool),
+    )  # fmt: skip
+    result = _adjusted(problem, Lens(camera), grid)
+    if result is None:
+        return None
+    edge = max(camera.width, camera.height)
+    return Start(
+        result.lens, result.T_cw, result.inverse_depth[0], result.information[0], result.cost,
+        2 * math.degrees(math.atan(edge / 2 / camera.fx)),
+    )  # fmt: skip
+
+
+def _adjusted(problem: BundleProblem, lens: Lens, grid: SampleGrid) -> LensBundleResult | None:
+    """From forgiving to strict, always with the focal length."""
+    result = None
+    for huber in _HUBERS:
+        result = solve_lens(
+            problem, lens, grid.pixels, LensBundleOptions(iterations=10, huber=huber)
+        )
+        if not result.finite:
+            return None
+        lens = result.lens
+        problem = BundleProblem(
+            result.T_cw, result.inverse_depth, problem.source, problem.target, problem.pixels,
+            problem.weight, problem.free_pose, problem.free_depth,
+        )  # fmt: skip
+    return result
+
+
+def _best_view(
+    camera: Camera, flows: list[FlowMatch], min_parallax: float
+) -> tuple[int, TwoView | None]:
+    best, best_score, place = None, 0.0, -1
+    for n in range(1, len(flows), 2):
+        view = two_view(camera, flows[n])
+        if view is None or view.parallax < min_parallax:
+            continue
+        score = min(view.parallax, 3 * min_parallax) * int(view.good.sum())
+        if score > best_score:
+            best, best_score, place = view, score, n
+    return place, best
