@@ -100,12 +100,10 @@ class LoopCloser:
 
     def _retire(self, tracker: Tracker) -> None:
         """Turn the edges that the local adjustment has left behind into relative poses."""
-        keep = set(tracker.store.ids[-tracker.config.depth_window :])
-        old = {e: v for e, v in tracker.graph.edges.items() if keep.isdisjoint(e)}
+        old = tracker.graph.retire(tracker.store.ids[-tracker.config.depth_window :])
         if old:
             known = self._of(tracker)
             known.odometry = joined([known.odometry, of_edges(tracker.store, old)])
-            tracker.graph.edges = {e: v for e, v in tracker.graph.edges.items() if e not in old}
 
     def _take(self, loop: Loop) -> None:
         first, second = (self.segments.tracker_of(k) for k in (loop.first, loop.second))

@@ -15,6 +15,7 @@ from geogs.loop.relative_pose import RelativePoseOptions, relative_poses
 from geogs.tracking.graph import Edge, Pair
 from geogs.tracking.grid import SampleGrid
 from geogs.tracking.keyframes import KeyframeStore, scaled
+from geogs.tracking.packed_edge import PackedEdge
 
 SETTLED = RelativePoseOptions(iterations=2)
 """For edges that a bundle adjustment has already fitted."""
@@ -33,7 +34,7 @@ def joined(parts: Sequence[RelativePoses]) -> RelativePoses:
     return RelativePoses(*(torch.cat([getattr(p, c) for p in parts]) for c in columns))
 
 
-def of_edges(store: KeyframeStore, edges: Mapping[Pair, Edge]) -> RelativePoses:
+def of_edges(store: KeyframeStore, edges: Mapping[Pair, Edge | PackedEdge]) -> RelativePoses:
     """Relative poses, between ids, that fitted edges of a frame graph amount to.
 
     Of the two directions of a pair the one from the earlier keyframe is taken.

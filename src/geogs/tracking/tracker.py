@@ -81,7 +81,9 @@ class Tracker:
         self.config = config or TrackingConfig()
         self.grid = SampleGrid(camera, device)
         self.operator = operator or build_operator(self.config, self.grid)
-        self.store = KeyframeStore(self.grid, self.operator.encode, self.config.resident_keyframes)
+        self.store = KeyframeStore(
+            self.grid, self.operator.encode, self.config.resident_keyframes, ids
+        )
         self.graph = FrameGraph(self.store, self.operator)
         self.priors = KeyframePriors(self.graph, prior, prior_config or PriorConfig())
         self.recorder = TrajectoryRecorder(self.store, self.operator)
