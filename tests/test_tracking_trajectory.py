@@ -4,7 +4,9 @@ import numpy as np
 import torch
 
 from geogs.geometry.lie import se3_exp, se3_inverse
-from geogs.tracking.trajectory import depth_aware_weight, interpolate
+from geogs.tracking.flow.base import FlowMatch
+from geogs.tracking.trajectory import TrajectoryRecorder, depth_aware_weight, interpolate
+from planted_walk import planted_tracker
 
 
 def test_gaps_are_bridged_by_constant_motion_and_ends_are_held():
@@ -27,3 +29,35 @@ def test_uncertain_depth_lowers_the_weight_along_its_direction_only():
     out = depth_aware_weight(weight, slope, information)
     torch.testing.assert_close(out, torch.tensor([[[1 / (0.04 + 1.0), 25.0]]]))
     assert float(depth_aware_weight(weight, slope, 0 * information).max()) == 0
+
+
+def test_frames_of_a_culled_keyframe_keep_their_place_and_others_are_not_touched():
+    tracker, _ = planted_tracker(6)
+    recorder = TrajectoryRecorder(tracker.store, tracker.operator)
+    step = se3_exp(torch.tensor([0.02, 0, 0, 0, 0.01, 0], dtype=torch.float64))
+    for n in range(5):
+        tracker.store[n].frame_index = 3 * n
+        recorder.add_keyframe(n)
+        for k in (1, 2):
+            recorder.add(3 * n + k, (3 * n + k) / 30, n, n, step)
+    before = [recorder._pose(r).clone() for r in recorder.records]
+    recorder.keyframe_removed(tracker.store.remove(3), 2)
+    assert [r.anchor for r in recorder.records] == [0] * 3 + [1] * 3 + [2] * 6 + [4] * 3
+    for record, T_cw in zip(recorder.records, before, strict=True):
+        torch.testing.assert_close(recorder._pose(record), T_cw)
+    assert 9 in [p.record.index for p in recorder._pending]
+
+
+def test_what_is_kept_of_a_frame_is_small_and_finds_its_pose():
+    tracker, T = planted_tracker(4, sigma=0.0)
+    recorder = TrajectoryRecorder(tracker.store, tracker.operator)
+    match, _ = tracker.operator.measure([0], [2])
+    wrong = se3_exp(torch.tensor([0.02, 0, 0.01, 0, 0.01, 0], dtype=torch.float64))
+    recorder.add(50, 1.0, 2, 0, wrong @ T[2], FlowMatch(match.pixels, match.weight))
+    kept = recorder.records[0].observations[0]
+    cells = len(kept.position)
+    assert kept.position.nbytes + kept.half_weight.nbytes == 8 * cells
+    assert cells <= (tracker.grid.size + 9) // 3
+    found = torch.from_numpy(recorder.solve().T_wc[0])
+    # Positions are known to 1/800 pixel here, of 75 pixels focal length at 3 metres.
+    torch.testing.assert_close(se3_inverse(found), T[2], rtol=0, atol=2e-4)

@@ -45,13 +45,11 @@ class PackedEdge:
         match: FlowMatch, n: int, grid: SampleGrid, source: KeyframeState, target: KeyframeState
     ) -> "PackedEdge":
         """The n-th edge of a measurement that started from the present state."""
-        weight = match.weight[n]
-        steps = (match.pixels[n] - _centre(grid)) / position_step(grid.camera)
-        position = torch.where(weight > 0, steps.round(), 0.0).clamp(-32768, 32767).short()
+        position, half_weight = pack_matches(grid, match.pixels[n], match.weight[n])
         return PackedEdge(
             grid,
             position,
-            weight.clamp(max=MAX_WEIGHT).half(),
+            half_weight,
             source.T_cw,
             target.T_cw,
             source.inverse_depth,
@@ -62,7 +60,7 @@ class PackedEdge:
     @property
     def pixels(self) -> Float[Tensor, "p 2"]:
         """Position in the target of each cell of the source; the image's centre where unmatched."""
-        return self.position.float() * position_step(self.grid.camera) + _centre(self.grid)
+        return unpacked_positions(self.grid, self.position)
 
     @property
     def weight(self) -> Float[Tensor, "p 2"]:
@@ -78,6 +76,20 @@ class PackedEdge:
 def position_step(camera: Camera) -> float:
     """Pixels between two positions that can be told apart."""
     return 2.0**-15 * max(camera.width, camera.height)
+
+
+def pack_matches(
+    grid: SampleGrid, pixels: Float[Tensor, "*b 2"], weight: Float[Tensor, "*b 2"]
+) -> tuple[Int16[Tensor, "*b 2"], Float16[Tensor, "*b 2"]]:
+    """Positions in whole steps from the image's centre, zero where unmatched; half weights."""
+    steps = (pixels - _centre(grid)) / position_step(grid.camera)
+    position = torch.where(weight > 0, steps.round(), 0.0).clamp(-32768, 32767).short()
+    return position, weight.clamp(max=MAX_WEIGHT).half()
+
+
+def unpacked_positions(grid: SampleGrid, position: Int16[Tensor, "*b 2"]) -> Float[Tensor, "*b 2"]:
+    """Pixels of packed positions."""
+    return position.float() * position_step(grid.camera) + _centre(grid)
 
 
 def packed_reprojections(edges: Sequence[PackedEdge]) -> Float[Tensor, "e p 2"]:

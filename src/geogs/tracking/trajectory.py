@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Float16, Int16
 from torch import Tensor
 
 from geogs.geometry.lie import retract, se3_inverse, se3_log
@@ -17,16 +17,17 @@ from geogs.tracking.grid import SampleGrid
 from geogs.tracking.keyframes import KeyframeState, KeyframeStore, scaled
 from geogs.tracking.motion import all_reprojections
 from geogs.tracking.motion_only import solve_poses
+from geogs.tracking.packed_edge import pack_matches, unpacked_positions
 from geogs.types import Trajectory
 
 
 @dataclass
 class Observation:
-    """Flow from a keyframe to a frame on every second cell."""
+    """Flow from a keyframe to a frame on every second cell, packed."""
 
     keyframe: int
-    pixels: Float[Tensor, "s 2"]
-    weight: Float[Tensor, "s 2"]
+    position: Int16[Tensor, "s 2"]
+    half_weight: Float16[Tensor, "s 2"]
 
 
 @dataclass
@@ -97,7 +98,10 @@ class TrajectoryRecorder:
     def keyframe_removed(self, removed: KeyframeState, substitute: int) -> None:
         """Make a culled keyframe an ordinary frame; frames anchored to it move to another one."""
         base = removed.T_cw @ se3_inverse(self.store[substitute].T_cw)
-        for record in self.records:
+        # Frames are located from keyframes before them.
+        for record in reversed(self.records):
+            if record.index < removed.frame_index:
+                break
             if record.anchor == removed.id:
                 record.anchor, record.T_rel = substitute, record.T_rel @ base
                 record.observations = [o for o in record.observations if o.keyframe != removed.id]
@@ -169,10 +173,11 @@ class TrajectoryRecorder:
     def _observe(self, jobs: list[tuple[FrameRecord, int]], match: FlowMatch) -> None:
         """Keep the matches of records with keyframes."""
         pixels, weight = match.pixels[:, self._subset], match.weight[:, self._subset]
+        position, half_weight = pack_matches(self.store.grid, pixels, weight)
         for n, (record, keyframe) in enumerate(jobs):
             # Asking would wait for the GPU; an observation without weight does no harm.
             if self.store.grid.on_gpu or bool((weight[n] > 0).any()):
-                record.observations.append(Observation(keyframe, pixels[n], weight[n]))
+                record.observations.append(Observation(keyframe, position[n], half_weight[n]))
 
     def _pose(self, record: FrameRecord) -> Float[Tensor, "4 4"]:
         assert record.anchor is not None, "a frame that was not tracked has no pose"
@@ -214,10 +219,10 @@ class TrajectoryRecorder:
         depth = self.store.inverse_depths(ids)[:, cells]
         information = self.store.informations(ids)[:, cells]
         source = self.store.poses(ids)
-        weight = torch.stack([o.weight for _, o in pairs])
+        weight = torch.stack([o.half_weight for _, o in pairs]).float()
         p = linearise(grid.camera, grid.rays[cells], start[frame] @ se3_inverse(source), depth)
         weight = depth_aware_weight(weight, p.depth_jacobian, information)
-        pixels = torch.stack([o.pixels for _, o in pairs])
+        pixels = unpacked_positions(grid, torch.stack([o.position for _, o in pairs]))
         T, _ = solve_poses(
             grid.camera, grid.rays[cells], start, depth, source, frame, pixels, weight, iterations=8
         )
