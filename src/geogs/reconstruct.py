@@ -178,6 +178,10 @@ class Reconstruction:
             return self._in_world(self.mapper.renders(earlier))
 
     @on_one_torch_thread
+    def particulars(self) -> dict[str, object]:
+        """Nothing that is not said of every result."""
+        return {}
+
     def depth_maps(self) -> list[RenderedKeyframe]:
         """Depth and confidence of every image as searched, without the disks."""
         return self._in_world(self.mapper.depth_maps())

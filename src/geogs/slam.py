@@ -2,7 +2,7 @@
 
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 import torch
@@ -122,6 +122,14 @@ class Slam:
         T_wc = [torch.linalg.inv(k.T_cw.cpu()).numpy() for k in keyframes]
         times = np.array([k.timestamp for k in keyframes], dtype=np.float64)
         return Trajectory(times, np.array(T_wc).reshape(-1, 4, 4), np.ones(len(times), dtype=bool))
+
+    def particulars(self) -> dict[str, object]:
+        """What a summary says of segments and loops, ready for JSON."""
+        return {
+            "segments": [asdict(segment) for segment in self.segments.summary()],
+            "loops": len(self.loops.detector.loops),
+            "loop_closures": self.loops.closures,
+        }
 
     def snapshot(self) -> MapSnapshot:
         """The disks as they are now."""

@@ -10,14 +10,14 @@ from geogs.config import Config
 if TYPE_CHECKING:
     import torch
 
-    from geogs.io.sources.base import Source
     from geogs.io.sources.calibration import Calibration
+    from geogs.io.sources.sniff import Stream
     from geogs.tracking.calibration.estimate import SelfCalibration
 
 _STAGE = "calibration"
 
 
-def self_calibrated(source: "Source", options: Config, device: "torch.device") -> "Source":
+def self_calibrated(source: "Stream", options: Config, device: "torch.device") -> "Stream":
     """The source with its focal length refined, if that is a guess or nominal and may be refined.
 
     Where the video does not tell, or at Ctrl-C, the guess stays and a warning says so.
@@ -27,7 +27,7 @@ def self_calibrated(source: "Source", options: Config, device: "torch.device") -
     if not (options.calibration.refine and source.is_calibration_open):
         return source
     progress = RunProgress(source.length, tracks=False)
-    frames = iter(source)
+    frames = source.linked_frames()
     with Interruption() as stop, progress:
 
         def report(fraction: float) -> None:

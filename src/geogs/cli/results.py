@@ -2,7 +2,7 @@
 
 import json
 import platform
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Protocol, runtime_checkable
@@ -18,8 +18,9 @@ from geogs.evaluation import plots
 from geogs.evaluation.run_report import write_run_page
 from geogs.evaluation.shading import viewpoints
 from geogs.geometry.camera import Camera
-from geogs.io.sources.base import Source
 from geogs.io.sources.calibration import Calibration
+from geogs.io.sources.several import SeveralSources, SourceSpan
+from geogs.io.sources.sniff import Stream
 from geogs.io.writers.atomic import write_text
 from geogs.io.writers.intrinsics import write_intrinsics
 from geogs.io.writers.native import save_map
@@ -62,6 +63,10 @@ class MappedScene(Protocol):
         """The keyframes' depths as searched."""
         ...
 
+    def particulars(self) -> Mapping[str, object]:
+        """What else the summary says, ready for JSON."""
+        ...
+
 
 @dataclass(frozen=True)
 class SourceFacts:
@@ -78,13 +83,16 @@ class SourceFacts:
     """What a unit of the map is."""
     held_out: tuple[int, ...] = ()
     """Images that were not used: their places in the source without start and stride."""
+    videos: tuple[SourceSpan, ...] = ()
+    """Where each begins, if there are several."""
 
     @staticmethod
-    def of(source: Source) -> "SourceFacts":
+    def of(source: Stream) -> "SourceFacts":
         """Of a source that was read to its end."""
         return SourceFacts(
             source.name, source.kind, source.camera, source.intrinsics_origin,
             source.calibration, source.skipped,
+            videos=tuple(source.spans) if isinstance(source, SeveralSources) else (),
         )  # fmt: skip
 
 
@@ -171,6 +179,8 @@ def summarise(
         **({"held_out": list(source.held_out)} if source.held_out else {}),
         "keyframes": len(keyframes.timestamps),
         "lost_spans": lost_spans(trajectory),
+        **slam.particulars(),
+        **({"videos": [asdict(v) for v in source.videos]} if source.videos else {}),
         "disks": len(disks),
         "mesh_faces": 0 if mesh is None else len(mesh.faces),
         "seconds": {**seconds, "total": round(total, 3)},

@@ -16,7 +16,7 @@ from geogs.cli.progress import RunProgress
 from geogs.config import Config, Preset, preset
 
 if TYPE_CHECKING:
-    from geogs.io.sources.base import Source
+    from geogs.io.sources.sniff import Stream
     from geogs.slam import Slam
 
 
@@ -25,10 +25,11 @@ class RunOptions(Config):
     """Reconstruct a video, a folder of images, or a Replica, TUM RGB-D or 7-Scenes sequence.
 
     Every default works: ``geogs run video.mp4``. Intrinsics: ``--intrinsics fx,fy,cx,cy``.
+    Several videos of one place: ``geogs run a.mp4 b.mp4``.
     """
 
-    source: Annotated[Path, tyro.conf.Positional] = Path()
-    """Video file or folder."""
+    source: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
+    """Video file or folder; several of one place, by one camera, make one map."""
     output: Path | None = None
     """Folder for the results (also -o); out/NAME if none is given."""
     preset: Preset = "default"
@@ -59,13 +60,13 @@ def run(options: RunOptions) -> Path:
     from geogs.errors import DeviceError
     from geogs.gpu.installation import require_device
     from geogs.gpu.kernels import prepare_kernels
-    from geogs.io.sources.sniff import open_source
+    from geogs.io.sources.sniff import open_sources
     from geogs.io.writers.atomic import prepare_output_folder
     from geogs.slam import Slam
 
     torch.set_num_threads(1)  # the kernels have threads of their own; see geogs.threads
     device = require_device(options.device)
-    source = open_source(options.source, options.input)
+    source = open_sources(options.source, options.input)
     output = prepare_output_folder(options.output or Path("out") / source.name)
     if device.type == "cuda":
         prepare_kernels(Path(geogs.__file__).parent, device)
@@ -97,7 +98,7 @@ def run(options: RunOptions) -> Path:
     return output
 
 
-def _feed(slam: "Slam", source: "Source", progress: RunProgress, stop: Interruption) -> bool:
+def _feed(slam: "Slam", source: "Stream", progress: RunProgress, stop: Interruption) -> bool:
     """All frames through the system, until a request to stop; false if the GPU's memory is full."""
     import torch
 
@@ -138,7 +139,11 @@ def parse(argv: Sequence[str]) -> RunOptions:
     base = preset(name)
     settings = {f.name: getattr(base, f.name) for f in fields(base)}
     default = RunOptions(**settings, source=tyro.MISSING, preset=name)
-    short = {**SHORT, "--intrinsics": "--input.intrinsics"}
+    short = {
+        **SHORT,
+        "--intrinsics": "--input.intrinsics",
+        "--global-ba-every": "--loop.global-ba-every",
+    }
     return parse_options(RunOptions, argv, "run", default=default, short=short)
 
 

@@ -92,7 +92,7 @@ class LoopConfig:
     close_every: int = 5
     """Keyframes between two corrections, at least."""
     min_change: float = 0.004
-    """Corrections that move no keyframe by more than this are not worth moving the map for: radians,
+    """Corrections that move no keyframe by more than this are not worth it for the map: radians,
     parts of its median depth, or of its scale."""
     agreeing: int = 2
     """Loops that have to agree before a segment is joined to another."""

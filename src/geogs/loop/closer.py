@@ -63,7 +63,7 @@ class LoopCloser:
         self.config = config
         tracker = segments.world
         self.detector = LoopDetector(tracker.grid, tracker.operator, segments.store_of, config)
-        self.corrections = 0
+        self.closures = 0
         """Loop closures so far."""
         self._known: dict[Tracker, _Known] = {}
         self._between: list[Loop] = []
@@ -196,7 +196,7 @@ class LoopCloser:
             return None
         world.correct(closure.correction)
         known.rescale(closure.correction)
-        self.corrections += 1
+        self.closures += 1
         return closure.correction
 
     def _change(self, correction: PoseCorrection) -> float:

@@ -109,6 +109,10 @@ class Source:
         """The same frames, undistorted by another calibration of the images as they came."""
         return Source(self._reader, self._config, calibration)
 
+    def linked_frames(self) -> Generator[Frame, None, None]:
+        """Frames between which there is no cut."""
+        return iter(self)
+
     @property
     def intrinsics_origin(self) -> str:
         """Where the intrinsics come from."""

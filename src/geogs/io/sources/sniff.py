@@ -1,5 +1,6 @@
 """Open whatever the user points at."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from geogs.config import InputConfig
@@ -8,7 +9,11 @@ from geogs.io.sources.base import Reader, Source
 from geogs.io.sources.images import SUFFIXES, open_image_folder
 from geogs.io.sources.replica import is_replica, open_replica
 from geogs.io.sources.seven_scenes import is_seven_scenes, open_seven_scenes
+from geogs.io.sources.several import SeveralSources
 from geogs.io.sources.tum import is_tum, open_tum
+
+Stream = Source | SeveralSources
+"""What a run reads."""
 
 
 def open_source(path: str | Path, config: InputConfig | None = None) -> Source:
@@ -24,6 +29,18 @@ def open_source(path: str | Path, config: InputConfig | None = None) -> Source:
         InputError: nothing usable is there, or ``config`` does not fit it.
     """
     return Source(_reader(Path(path).expanduser()), config or InputConfig())
+
+
+def open_sources(paths: Sequence[str | Path], config: InputConfig | None = None) -> Stream:
+    """Open one source as :func:`open_source` does, or several as one stream.
+
+    Raises:
+        InputError: as for each, or their cameras differ.
+    """
+    if not paths:
+        raise InputError("Nothing to read; give a video or a folder of images.")
+    sources = [open_source(path, config) for path in paths]
+    return sources[0] if len(sources) == 1 else SeveralSources(sources)
 
 
 def _reader(path: Path) -> Reader:

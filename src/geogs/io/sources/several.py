@@ -1,0 +1,122 @@
+"""Several videos of one place, taken with one camera, as a single stream."""
+
+from collections.abc import Generator, Sequence
+from dataclasses import dataclass, replace
+
+from geogs.errors import InputError
+from geogs.geometry.camera import Camera
+from geogs.io.sources.base import Source
+from geogs.io.sources.calibration import Calibration
+from geogs.types import Frame
+
+PAUSE = 1.0
+"""Seconds between the last frame of a source and the first of the next, in the joint time."""
+SAME = 0.01
+"""Relative difference up to which two focal lengths count as one."""
+
+
+@dataclass(frozen=True, slots=True)
+class SourceSpan:
+    """One source within the joint stream."""
+
+    name: str
+    first_frame: int
+    first_time: float
+    """Seconds, in the joint time."""
+    own_time: float
+    """Of its first frame in its own time."""
+
+
+class SeveralSources:
+    """Frames of several sources one after the other, numbered and timed through.
+
+    No motion links the first frame of a source to the last of the one before.
+    """
+
+    def __init__(self, sources: Sequence[Source]) -> None:
+        """Raises InputError if the cameras differ."""
+        self._sources = list(sources)
+        first = self._sources[0]
+        for other in self._sources[1:]:
+            _check_same(first, other)
+        self.spans: list[SourceSpan] = []
+        """Where each source that was read so far begins, in this iteration."""
+
+    @property
+    def name(self) -> str:
+        """Names of all."""
+        return " + ".join(s.name for s in self._sources)
+
+    @property
+    def kind(self) -> str:
+        """The format of the first."""
+        return self._sources[0].kind
+
+    @property
+    def camera(self) -> Camera:
+        """The pinhole camera of every frame."""
+        return self._sources[0].camera
+
+    @property
+    def calibration(self) -> Calibration:
+        """The camera of the first source's images as they came."""
+        return self._sources[0].calibration
+
+    @property
+    def intrinsics_origin(self) -> str:
+        """Where the intrinsics come from."""
+        return self._sources[0].intrinsics_origin
+
+    @property
+    def is_calibration_open(self) -> bool:
+        """Whether the focal length of any is a guess or nominal, and nobody gave it."""
+        return any(s.is_calibration_open for s in self._sources)
+
+    def with_calibration(self, calibration: Calibration) -> "SeveralSources":
+        """The same frames, undistorted by another calibration of the images as they came."""
+        return SeveralSources([s.with_calibration(calibration) for s in self._sources])
+
+    def linked_frames(self) -> Generator[Frame, None, None]:
+        """The frames of the first source."""
+        return self._sources[0].linked_frames()
+
+    @property
+    def length(self) -> int | None:
+        """Frames to expect; none where it is not known of every source."""
+        lengths = [s.length for s in self._sources]
+        return None if None in lengths else sum(n for n in lengths if n is not None)
+
+    @property
+    def skipped(self) -> int:
+        """Images that could not be read, so far in this iteration."""
+        return sum(s.skipped for s in self._sources)
+
+    def __iter__(self) -> Generator[Frame, None, None]:
+        """Yield the frames of all. Raises InputError as each of them does."""
+        self.spans = []
+        index, end = 0, 0.0
+        for source in self._sources:
+            shift: float | None = None
+            for frame in source:
+                starts = shift is None
+                if shift is None:
+                    shift = end + PAUSE - frame.timestamp if index else 0.0
+                    time = frame.timestamp + shift
+                    self.spans.append(SourceSpan(source.name, index, time, frame.timestamp))
+                end = frame.timestamp + shift
+                yield replace(frame, index=index, timestamp=end, follows_cut=starts and index > 0)
+                index += 1
+
+
+def _check_same(first: Source, other: Source) -> None:
+    a, b = first.camera, other.camera
+    if (a.width, a.height) != (b.width, b.height):
+        raise InputError(
+            f"{first.name} gives images of {a.width} x {a.height} pixels, {other.name} of "
+            f"{b.width} x {b.height}; videos can be joined that were taken with one camera mode."
+        )
+    if abs(a.fx / b.fx - 1) > SAME or abs(a.fy / b.fy - 1) > SAME:
+        raise InputError(
+            f"{first.name} and {other.name} have different focal lengths ({a.fx:.0f} and "
+            f"{b.fx:.0f} pixels); videos can be joined that were taken with one camera."
+        )
