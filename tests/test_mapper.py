@@ -142,6 +142,39 @@ def test_a_rigid_correction_moves_map_and_views_together(sequence):
     assert depth_error(mapper, truth[:6]) == pytest.approx(before, abs=0.02)
 
 
+def test_mapping_goes_on_in_corrected_units(sequence):
+    """Half-way the world turns, moves and shrinks to nine tenths; the map hardly differs after."""
+    keyframes, truth = sequence
+    factor = 0.9
+    G = se3_exp(torch.tensor([0.5, -0.3, 0.2, 0.3, 0.5, -0.2], dtype=torch.float64))
+
+    def corrected(keyframe: Keyframe) -> Keyframe:
+        T = keyframe.T_cw @ se3_inverse(G)
+        T[:3, 3] *= factor
+        return replace(keyframe, T_cw=T, inverse_depth=keyframe.inverse_depth / factor)
+
+    plain, mapper = build(keyframes), build(keyframes[:6])
+    old = {k.id: k.T_cw for k in keyframes[:6]}
+    moved = [corrected(k) for k in keyframes]
+    new = {k.id: k.T_cw for k in moved[:6]}
+    depths = {i: v.dense.depth.clone() for i, v in mapper.views.items()}
+    update = mapper.correct(PoseCorrection(old, new, dict.fromkeys(old, 1 / factor)), moved[:6])
+    assert update.residual < 1e-4
+    for i, view in mapper.views.items():
+        assert (view.dense.depth / depths[i]).numpy() == pytest.approx(factor, rel=1e-5)
+        assert (view.T_cw - new[i]).abs().max() == 0
+        assert view.rendered_depth is None
+    for keyframe in moved[6:]:
+        mapper.observe(keyframe)
+    for keyframe in moved[6:]:
+        mapper.map_keyframe(keyframe.id)
+    renders = [r.depth.numpy() / factor for r in mapper.renders()]
+    errors = [np.abs(r - d)[(r > 0) & (d > 0)] for r, d in zip(renders, truth, strict=True)]
+    median = 100 * float(np.median(np.concatenate(errors)))
+    assert median == pytest.approx(depth_error(plain, truth), rel=0.15)
+    assert len(mapper.map) == pytest.approx(len(plain.map), rel=0.05)
+
+
 def test_a_floater_is_carved_and_the_surface_stays(sequence):
     mapper = build(sequence[0][:6])
     count = len(mapper.map)

@@ -7,7 +7,7 @@ tears nothing and cannot follow a drift. The blended one moves every disk with a
 see it where it lies (:mod:`geogs.mapping.similarity_field`).
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -68,7 +68,7 @@ def plan_update(
     anchor: Int[Tensor, "n"],
     correction: PoseCorrection,
     strategy: Strategy = "blended",
-    witnesses: Sequence[Witness] = (),
+    witnesses: Iterable[Witness] = (),
 ) -> MapUpdate:
     """The similarity of every disk for a pose correction, computed where the disks live.
 
@@ -89,9 +89,10 @@ def plan_update(
         S = fit.expand(len(x), 4, 4).clone()
         if strategy == "blended":
             known = {int(i): n for n, i in enumerate(ids)}
-            heard = [w for w in witnesses if w.keyframe_id in known]
-            theirs = similarities[[known[w.keyframe_id] for w in heard]].to(x)
-            S = blended_similarities(x, own, fit, heard, theirs)
+            heard = (
+                (w, similarities[known[w.keyframe_id]]) for w in witnesses if w.keyframe_id in known
+            )
+            S = blended_similarities(x, own, fit, heard)
     return MapUpdate(S, _rms(target - x), _rms(target - apply_each(S, x)))
 
 

@@ -6,7 +6,7 @@ that made it alone. A disk that a drifting loop has put in double is seen in pla
 of its own visit only, and goes with these. Then neighbours are evened out unless they have to part.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import torch
@@ -50,21 +50,20 @@ def blended_similarities(
     x: Float[Tensor, "n 3"],
     own: Float[Tensor, "n 4 4"],
     reference: Float[Tensor, "4 4"],
-    witnesses: Sequence[Witness],
-    similarities: Float[Tensor, "k 4 4"],
+    witnesses: Iterable[tuple[Witness, Float[Tensor, "4 4"]]],
 ) -> Float[Tensor, "n 4 4"]:
     """World similarities of disks at ``x``, float64.
 
-    ``own`` is the correction of the keyframe that made each, ``similarities`` those of the
-    witnesses. Blends are means in the Lie algebra of Sim(3) of what remains after ``reference``,
+    ``own`` is the correction of the keyframe that made each; every witness comes with its own, one
+    at a time. Blends are means in the Lie algebra of Sim(3) of what remains after ``reference``,
     which should be near all of them; they do not depend on the origin of the world.
     """
     back = sim3_inverse(reference)
     total = _OWN * sim3_log(own @ back)
     weight = torch.full_like(x[:, 0], _OWN)
-    for witness, xi in zip(witnesses, sim3_log(similarities @ back), strict=True):
+    for witness, similarity in witnesses:
         say = agreement(x, witness)
-        total += say[:, None] * xi
+        total += say[:, None] * sim3_log(similarity.to(back) @ back)
         weight += say
     moved = x @ reference[:3, :3].T + reference[:3, 3]
     return sim3_exp(smoothed(x, moved, total / weight[:, None])) @ reference
