@@ -24,17 +24,20 @@ def orbit(scene: Scene, count: int, turn: float = 0.0) -> list[np.ndarray]:
 
     ``turn`` in radians is added to every direction.
     """
-    poses = []
-    for angle in turn + np.linspace(0, 2 * np.pi, count, endpoint=False):
-        forward = np.array([np.cos(angle), np.sin(angle), -0.15])
-        forward /= np.linalg.norm(forward)
-        right = np.cross(forward, [0.0, 0.0, 1.0])
-        right /= np.linalg.norm(right)
-        T = np.eye(4)
-        T[:3, :3] = np.stack([right, np.cross(forward, right), forward], 1)
-        T[:3, 3] = scene.size * [0.5, 0.5, 0.55] - 0.5 * forward * [1, 1, 0]
-        poses.append(T)
-    return poses
+    angles = turn + np.linspace(0, 2 * np.pi, count, endpoint=False)
+    return [at_angle(scene, angle) for angle in angles]
+
+
+def at_angle(scene: Scene, angle: float) -> np.ndarray:
+    """Camera to world half a metre from the middle of a room, looking outwards."""
+    forward = np.array([np.cos(angle), np.sin(angle), -0.15])
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    T = np.eye(4)
+    T[:3, :3] = np.stack([right, np.cross(forward, right), forward], 1)
+    T[:3, 3] = scene.size * [0.5, 0.5, 0.55] - 0.5 * forward * [1, 1, 0]
+    return T
 
 
 def views(scene: Scene, poses: Sequence[np.ndarray]) -> list[View]:

@@ -121,8 +121,27 @@ class Segments:
 
         Raises InputError if its size is not the camera's.
         """
-        if frame.follows_cut:
-            self.current.cut()
+        final = self._cut() if frame.follows_cut else ()
+        result = self._track(frame, recall)
+        return replace(result, finalized=(*final, *result.finalized))
+
+    def _cut(self) -> tuple[int, ...]:
+        """No motion links the next frame to those before it; ids that thereby became final."""
+        current = self.current
+        if current.state is not TrackState.INITIALIZING:
+            current.cut()
+            return ()
+        try:
+            final = current.finish().finalized
+        except TrackingLost:  # too few frames to start with
+            self.current = self._start()
+            self.trackers.append(self.current)
+            self._drop(current)
+            return ()
+        current.cut()
+        return final if current is self.world else ()
+
+    def _track(self, frame: Frame, recall: Recall) -> TrackResult:
         if self._is_searching:
             result = self._rejoin(frame, recall(frame.image))
             if result is not None:
@@ -175,6 +194,8 @@ class Segments:
         self.trackers.remove(tracker)
         if tracker is self.world:
             self.world = self.trackers[0]
+        if tracker is self.current:
+            self.current = self.world
         self.world.recorder.give_up(tracker.recorder)
 
     def _report(self, result: TrackResult) -> TrackResult:
