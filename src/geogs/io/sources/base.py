@@ -107,7 +107,8 @@ class Source:
 
     def with_calibration(self, calibration: Calibration) -> "Source":
         """The same frames, undistorted by another calibration of the images as they came."""
-        return Source(self._reader, self._config, calibration)
+        fitted = calibration.fit(self._reader.width, self._reader.height)
+        return Source(self._reader, self._config, fitted)
 
     def linked_frames(self) -> Generator[Frame, None, None]:
         """Frames between which there is no cut."""
