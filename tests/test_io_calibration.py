@@ -161,6 +161,8 @@ def test_exif_focal_length_is_by_diagonal(tmp_path):
     Image.new("RGB", (4000, 3000)).save(tmp_path / "photo.jpg", exif=exif)
     calibration = calibration_from_exif(tmp_path / "photo.jpg")
     assert calibration.fx == pytest.approx(26 * 5000 / math.hypot(36, 24))
+    assert calibration.is_nominal
+    assert not calibration.is_guess
     Image.new("RGB", (40, 30)).save(tmp_path / "plain.jpg")
     assert calibration_from_exif(tmp_path / "plain.jpg") is None
     (tmp_path / "broken.jpg").write_bytes(b"\xff\xd8\xff\xe1nonsense")
