@@ -75,6 +75,11 @@ def test_a_camera_that_stands_still_is_said_to():
     assert found.frames == 5
 
 
+def test_frames_without_texture_are_said_to_have_none():
+    grey = [replace(f, image=np.full_like(f.image, 90)) for f in frames([pose(0.0)] * 3)]
+    assert self_calibrate(grey, CAMERA, CONFIG).failure == "no frame has enough texture"
+
+
 def test_what_the_report_raises_passes_through():
     def stop(fraction: float) -> None:
         raise KeyboardInterrupt

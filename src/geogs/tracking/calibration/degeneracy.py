@@ -27,6 +27,7 @@ _FIELDS_OF_VIEW = np.geomspace(25, 130, 15)
 class Degeneracy(Enum):
     """Why the flow cannot tell the focal length."""
 
+    BLANK = "no frame has enough texture"
     STILL = "the camera hardly moves"
     TURNING = "the camera only turns (no parallax)"
     PLANAR = "it shows a single plane"

@@ -118,8 +118,10 @@ class _Search:
     def start(self) -> Start | Degeneracy:
         """The first views that show parallax and depth, placed by the best candidate."""
         count = max(self.config.start_keyframes, 2 * LEAST_VIEWS)
-        failure = Degeneracy.STILL
-        while self._gather(count) and len(self._views) >= LEAST_VIEWS:
+        failure = Degeneracy.BLANK
+        while self._gather(count):
+            if len(self._views) < LEAST_VIEWS:
+                return Degeneracy.STILL
             flows = flows_from_first(self.grid, self.operator, self._views)
             found = self._solve_start(flows)
             if isinstance(found, Start):
