@@ -9,7 +9,7 @@ import torch
 from geogs.config import Config, MappingConfig
 from geogs.geometry.lie import retract, se3_exp, se3_inverse
 from geogs.mapping.mapper import Mapper
-from geogs.mapping.window import draw_views
+from geogs.mapping.window import draw_views, views_around
 from geogs.synth.export import default_camera
 from geogs.synth.raycast import Raycaster
 from geogs.synth.room import make_room
@@ -201,3 +201,40 @@ def test_windows_hold_the_newest_and_draw_older_ones():
     whole = draw_views(list(range(20)), 0, replace(config, views_per_step=0), random)
     assert len(whole) == 6
     assert set(range(16, 20)) <= set(whole)
+
+
+def test_parked_views_change_nothing(sequence):
+    """With next to no keyframe in memory the same map comes out, bit by bit."""
+    keyframes, _ = sequence
+    config = replace(MAPPING, iterations=3, final_iterations=6, final_depth=True)
+    maps = []
+    for resident in (128, 2):
+        mapper = build(keyframes[:7], replace(config, resident_views=resident))
+        mapper.refine()
+        maps.append(mapper)
+    held, parked = maps
+    assert sum(v.is_resident for v in held.views.values()) == 7
+    assert sum(v.is_resident for v in parked.views.values()) == 2
+    for a, b in zip(held.map.parameters, parked.map.parameters, strict=True):
+        assert torch.equal(a, b)
+    for i in held.mapped:
+        a, b = held.views[i], parked.views[i]
+        assert torch.equal(a.dense.depth, b.dense.depth)
+        assert torch.equal(a.known.edge, b.known.edge)
+        assert torch.equal(a.known.prior_depth, b.known.prior_depth)
+        assert torch.equal(a.photo.grey, b.photo.grey)
+        assert (a.typical_depth, a.partners) == (b.typical_depth, b.partners)
+        if a.rendered_depth is not None:
+            assert torch.equal(a.rendered_depth, b.rendered_depth)
+    parked.views[0].rescale(2.0, parked.cameras)
+    torch.testing.assert_close(parked.views[0].dense.depth, 2 * held.views[0].dense.depth)
+    assert parked.views[0].typical_depth == pytest.approx(2 * held.views[0].typical_depth)
+
+
+def test_only_the_nearest_keyframes_are_looked_at(sequence):
+    mapper = build(sequence[0][:5], replace(MAPPING, iterations=0))
+    views = list(mapper.views.values())
+    assert views_around(views[2], views, 5) == views
+    apart = [float(np.linalg.norm(v.place.center - views[2].place.center)) for v in views]
+    nearest = sorted(sorted(range(5), key=lambda n: apart[n])[:3])
+    assert views_around(views[2], views, 3) == [views[n] for n in nearest]

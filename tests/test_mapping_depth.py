@@ -160,7 +160,9 @@ def test_the_cpu_engine_is_the_functions(scene, depths):
     assert torch.equal(doubled.depth, 2 * alone.depth)
     points = torch.rand(200, 3) * 3
     kept = engine.keep(points, posed)
-    assert np.array_equal(kept.numpy(), vote(points.numpy(), poses, depths, RENDER, CONFIG))
+    assert np.array_equal(
+        kept.numpy(), vote(points.numpy(), zip(poses, depths, strict=True), RENDER, CONFIG)
+    )
     assert 0 < int(kept.sum()) < 200
 
 

@@ -472,6 +472,8 @@ def test_votes_on_points(setting):
     assert not kept[0]
     assert not kept[3]
     poses, arrays = [v.T_cw for v in setting.scene.views], depths
-    assert np.array_equal(expected.numpy(), vote(points, poses, arrays, setting.render, cpu.config))
+    assert np.array_equal(
+        expected.numpy(), vote(points, zip(poses, arrays, strict=True), setting.render, cpu.config)
+    )
     alone = cuda.keep(_to(setting, points), [])
     assert int(alone.sum()) == len(points) - 2

@@ -1,6 +1,6 @@
 """Votes of the views on points: on a surface, or in free space."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int32
@@ -31,12 +31,13 @@ def look_up(
 
 def count_votes(
     points: Float[np.ndarray, "n 3"],
-    poses: Sequence[Float64[np.ndarray, "4 4"]],
-    depths: Sequence[KeyframeDepth],
+    views: Iterable[tuple[Float64[np.ndarray, "4 4"], KeyframeDepth]],
     camera: Camera,
     config: DepthConfig,
 ) -> tuple[Int32[np.ndarray, "n"], Int32[np.ndarray, "n"]]:
     """How many views see each world point on their surface, and how many in their free space.
+
+    A view is its world-to-camera pose and its depth.
 
     Only pixels with confidence above ``config.vote_confidence`` vote: for the surface within
     ``config.vote_support`` of their depth, for free space if the point is more than
@@ -44,7 +45,7 @@ def count_votes(
     """
     points = np.ascontiguousarray(points, np.float32)
     surface, free = np.zeros(len(points), np.int32), np.zeros(len(points), np.int32)
-    for pose, depth in zip(poses, depths, strict=True):
+    for pose, depth in views:
         ratio, sure = look_up(points, pose, depth, camera)
         votes = sure > config.vote_confidence
         surface += votes & (np.abs(ratio - 1.0) < config.vote_support)
@@ -54,8 +55,7 @@ def count_votes(
 
 def vote(
     points: Float[np.ndarray, "n 3"],
-    poses: Sequence[Float64[np.ndarray, "4 4"]],
-    depths: Sequence[KeyframeDepth],
+    views: Iterable[tuple[Float64[np.ndarray, "4 4"], KeyframeDepth]],
     camera: Camera,
     config: DepthConfig,
 ) -> Bool[np.ndarray, "n"]:
@@ -63,7 +63,7 @@ def vote(
     on their surface, see in free space; nor those that are not finite.
     """
     finite = np.isfinite(points).all(1)
-    surface, free = count_votes(points[finite], poses, depths, camera, config)
+    surface, free = count_votes(points[finite], views, camera, config)
     keep = np.zeros(len(points), bool)
     keep[finite] = (free < config.vote_free_views) | (free <= surface)
     return keep

@@ -104,10 +104,8 @@ class CpuDepthEngine:
 
     def keep(self, points: Float[Tensor, "n 3"], depths: Sequence[PosedDepth]) -> Bool[Tensor, "n"]:
         """As in the protocol."""
-        arrays, poses = [d.depth.arrays() for d in depths], [d.T_cw for d in depths]
-        return torch.from_numpy(
-            vote(points.detach().numpy(), poses, arrays, self.render, self.config)
-        )
+        views = ((d.T_cw, d.depth.arrays()) for d in depths)  # not all in memory at once
+        return torch.from_numpy(vote(points.detach().numpy(), views, self.render, self.config))
 
 
 def depth_engine(

@@ -12,24 +12,14 @@ from geogs.geometry.camera import Camera
 from geogs.types import Keyframe
 
 
-@dataclass(frozen=True, slots=True)
-class DepthView:
-    """One keyframe: images, pose, and the tracker's depth on its grid."""
+@dataclass(frozen=True, slots=True, eq=False)
+class Place:
+    """Where a keyframe was taken."""
 
     id: int
     """The keyframe's id."""
-    grey: Float32[np.ndarray, "h w"]
-    """Grey image in [0, 1] at the render size, where planes are swept."""
-    fine: Float32[np.ndarray, "fh fw"]
-    """Grey image in [0, 1] at the working size, a little blurred, where depth is refined."""
-    image: UInt8[np.ndarray, "wh ww 3"]
-    """RGB at the working size."""
     T_cw: Float64[np.ndarray, "4 4"]
     """World to camera."""
-    inverse_depth: Float32[np.ndarray, "gh gw"]
-    """The tracker's, on its grid; per map unit."""
-    information: Float32[np.ndarray, "gh gw"]
-    """Sum over edges of w |dp/dd|^2; 0 where the tracker knows nothing."""
 
     @property
     def center(self) -> Float64[np.ndarray, "3"]:
@@ -40,6 +30,22 @@ class DepthView:
     def forward(self) -> Float64[np.ndarray, "3"]:
         """Viewing direction in the world."""
         return self.T_cw[2, :3]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DepthView(Place):
+    """One keyframe: images, pose, and the tracker's depth on its grid."""
+
+    grey: Float32[np.ndarray, "h w"]
+    """Grey image in [0, 1] at the render size, where planes are swept."""
+    fine: Float32[np.ndarray, "fh fw"]
+    """Grey image in [0, 1] at the working size, a little blurred, where depth is refined."""
+    image: UInt8[np.ndarray, "wh ww 3"]
+    """RGB at the working size."""
+    inverse_depth: Float32[np.ndarray, "gh gw"]
+    """The tracker's, on its grid; per map unit."""
+    information: Float32[np.ndarray, "gh gw"]
+    """Sum over edges of w |dp/dd|^2; 0 where the tracker knows nothing."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,14 +123,17 @@ class PosedDepth:
     depth: DenseDepth
 
 
-def depth_view(keyframe: Keyframe, render: Camera) -> DepthView:
-    """The view of a keyframe for depths at the size of ``render``."""
-    grey = cv2.cvtColor(keyframe.image, cv2.COLOR_RGB2GRAY).astype(np.float32) * np.float32(1 / 255)
+def depth_view(
+    keyframe: Keyframe, render: Camera, image: UInt8[np.ndarray, "wh ww 3"] | None = None
+) -> DepthView:
+    """The view of a keyframe, whose image may be given, for depths at the size of ``render``."""
+    image = keyframe.image if image is None else image
+    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32) * np.float32(1 / 255)
     return DepthView(
         id=keyframe.id,
         grey=cv2.resize(grey, (render.width, render.height), interpolation=cv2.INTER_AREA),
         fine=cv2.GaussianBlur(grey, (0, 0), 0.7),
-        image=keyframe.image,
+        image=image,
         T_cw=keyframe.T_cw.detach().cpu().numpy().astype(np.float64),
         inverse_depth=keyframe.inverse_depth.detach().cpu().numpy().astype(np.float32),
         information=keyframe.information.detach().cpu().numpy().astype(np.float32),

@@ -2,19 +2,20 @@
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 
-import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from geogs.archive import Archive, Archived
 from geogs.config import MappingConfig
 from geogs.geometry.camera import Camera
 from geogs.mapping.depth_engine import depth_engine
+from geogs.mapping.keyframe_depths import CANDIDATES, KeyframeDepths
 from geogs.mapping.map_update import MapUpdate, plan_update, witness
 from geogs.mapping.rendered import rendered_keyframe, searched_keyframe
-from geogs.mapping.sweep_neighbors import select_sweep_neighbours
 from geogs.mapping.training import (
     Batch,
     MapTrainer,
@@ -22,8 +23,9 @@ from geogs.mapping.training import (
     draw_partners,
     map_trainer,
 )
-from geogs.mapping.view import MapCameras, MapView
-from geogs.mapping.window import choose_partners, draw_views
+from geogs.mapping.view import MapCameras, MapView, PosedDepths
+from geogs.mapping.view_maps import ResidentViews
+from geogs.mapping.window import choose_partners, draw_views, views_around
 from geogs.splat.density import (
     candidate_pixels,
     split,
@@ -45,8 +47,8 @@ def _silent(fraction: float) -> None:
     """Progress that nobody watches."""
 
 
-# Keyframes whose depth checks a new keyframe's depth and whose free space carves around it.
-_CHECKING_VIEWS = 8
+# Nearest keyframes that vote on a keyframe's disks; others are too far away to know better.
+_VOTERS = 96
 # Steps of the final training between two reports of progress, at least.
 _REPORTED_STEPS = 20
 # Steps from which the time of one is judged.
@@ -65,10 +67,13 @@ class Mapper:
         self.config = config
         self.cameras = MapCameras.of(camera, config)
         self.map = GaussianMap.empty(device)
-        self._depths = depth_engine(
+        engine = depth_engine(
             self.map.device, self.cameras.render, self.cameras.working, config.depth
         )
         self.views: dict[int, MapView] = {}
+        self._resident = ResidentViews(config.resident_views)
+        self._depths = KeyframeDepths(engine, self.views, self.cameras, config, self._resident)
+        self._images = Archive(resident=config.resident_views)
         self.mapped: list[int] = []
         self.trained = TrainingPlace()
         """How far the training over all keyframes is, at each report of its progress."""
@@ -86,11 +91,13 @@ class Mapper:
 
         Outside a mask, of the size of its image, it has no depth.
         """
-        view = MapView.of(keyframe, self.cameras, self.config.loss, self.map.device)
+        if not isinstance(keyframe.stored_image, Archived):
+            keyframe = replace(keyframe, stored_image=self._images.put(keyframe.image))
+        view = MapView.of(keyframe, self.cameras, self.config.loss, self.map.device, self._resident)
         if mask is not None:
-            view.mask = _render_mask(mask, self.cameras.render).to(self.map.device)
+            view.keep_within(mask)
         self.views[keyframe.id] = view
-        self._depths.observe(view.depth_view)
+        self._depths.engine.observe(view.depth_view)
 
     def follow(self, keyframes: list[Keyframe]) -> None:
         """Take over the tracker's present poses and grid depths of known keyframes."""
@@ -102,11 +109,11 @@ class Mapper:
         """Give a keyframe its depth, carve and grow the map with it, train the window."""
         view = self.views[keyframe_id]
         self._estimate_ahead(keyframe_id)
-        self._check([view])
+        self._depths.check([view])
         self.mapped.append(keyframe_id)
         self._choose_partners(view)
         trainer = self._training()
-        self._carve([view, *self._near(view)])
+        self._carve([view, *self._depths.near(view)])
         self._insert(view, self.config.disk.insert_confidence)
         if len(self.mapped) > self.config.window:
             left = self.views[self.mapped[-1 - self.config.window]]
@@ -116,11 +123,11 @@ class Mapper:
             self._batch(draw_views(self.mapped, step, self.config, self._random)) for step in steps
         ])  # fmt: skip
         if len(self.mapped) % self.config.disk.carve_every == 0:
-            self.prune()
+            self._prune_around(view)
 
     def refine_poses(self, active: list[int]) -> dict[int, Float[Tensor, "4 4"]]:
         """Poses of the active keyframes that agree better with the map; the earliest stays."""
-        views = [self.views[i] for i in active if i in self.views and self.views[i].constants]
+        views = [self.views[i] for i in active if i in self.views and self.views[i].has_depth]
         if len(views) < 2 or len(self.map) == 0:
             return {}
         poses = self._training().refine_poses(views, self.views, self.config)
@@ -139,7 +146,7 @@ class Mapper:
             self.map.keyframe_id,
             correction,
             self.config.map_update,
-            [witness(v, self.cameras) for v in self.views.values() if v.depth is not None],
+            (witness(v, self.cameras) for v in self.views.values() if v.has_depth),
         )
         if len(self.map):
             self._training().optimizer.transform(update.transform)
@@ -156,8 +163,8 @@ class Mapper:
             return
         views = [self.views[i] for i in self.mapped]
         if self.config.final_depth:
-            self._estimate(views, lambda fraction: progress(0.4 * fraction))
-            self._check(views)
+            self._depths.estimate(views, lambda fraction: progress(0.4 * fraction))
+            self._depths.check(views)
         self.grow()
         start = 0.4 if self.config.final_depth else 0.0
         steps = self.config.final_iterations
@@ -170,12 +177,12 @@ class Mapper:
 
     def search_depths(self, keyframe_ids: list[int]) -> None:
         """Depths of some keyframes from their images; they are mapped then."""
-        self._estimate([self.views[i] for i in keyframe_ids])
+        self._depths.estimate([self.views[i] for i in keyframe_ids])
         self.mapped = sorted({*self.mapped, *keyframe_ids})
 
     def check_depths(self) -> None:
         """Let the depths of all mapped keyframes revise each other, once per search."""
-        self._check([self.views[i] for i in self.mapped])
+        self._depths.check([self.views[i] for i in self.mapped])
 
     def grow(self) -> None:
         """Carve the map with all mapped keyframes, and add what their depths show beyond it."""
@@ -220,6 +227,11 @@ class Mapper:
         self._training().optimizer.keep(worth_keeping(self.map, self.config.disk))
         self._carve([self.views[i] for i in self.mapped])
 
+    def _prune_around(self, view: MapView) -> None:
+        """The same with the keyframes around one only: votes of others do not change."""
+        self._training().optimizer.keep(worth_keeping(self.map, self.config.disk))
+        self._carve(self._mapped_around(view, _VOTERS))
+
     @torch.no_grad()
     def renders(self, disks: DiskParameters | None = None) -> list[RenderedKeyframe]:
         """The map, or other disks in its frame, seen from every mapped keyframe."""
@@ -254,39 +266,15 @@ class Mapper:
     def _estimate_ahead(self, keyframe_id: int) -> None:
         """Depths of the keyframe and of its next ones, which then check each other."""
         later = [i for i in self.views if i >= keyframe_id][: 1 + self.config.lag // 2]
-        self._estimate([self.views[i] for i in later if self.views[i].depth is None])
+        self._depths.estimate([self.views[i] for i in later if not self.views[i].has_depth])
 
-    def _estimate(self, views: list[MapView], progress: Progress = _silent) -> None:
-        candidates = [v.depth_view for v in self.views.values()]
-        references, neighbours = [v.depth_view for v in views], []
-        limits = [None if v.search is None else (v.search.near, v.search.far) for v in views]
-        for view in views:
-            depth = _typical_depth(view) if view.search is None else view.search.typical
-            chosen = select_sweep_neighbours(view.depth_view, candidates, depth, self.config.depth)
-            neighbours.append([candidates[i] for i in chosen])
-        depths = self._depths.estimate(references, neighbours, progress, limits)
-        for view, dense in zip(views, depths, strict=True):
-            view.set_depth(dense, self.cameras)
-
-    def _check(self, views: list[MapView]) -> None:
-        """Let the neighbours' depths, as they were estimated, revise those of the views."""
-        others = [[o.posed for o in self._near(view)] for view in views]
-        depths = self._depths.check([view.posed for view in views], others)
-        for view, depth in zip(views, depths, strict=True):
-            view.set_depth(depth, self.cameras)
-
-    def _near(self, view: MapView) -> list[MapView]:
-        """The keyframes with a depth that see a view's surface best from elsewhere."""
-        known = [v for v in self.views.values() if v.depth is not None and v.id != view.id]
-        views = [v.depth_view for v in known]
-        depth = view.typical_depth
-        chosen = select_sweep_neighbours(view.depth_view, views, depth, self.config.depth)
-        return [known[i] for i in chosen[:_CHECKING_VIEWS]]
+    def _mapped_around(self, view: MapView, count: int) -> list[MapView]:
+        return views_around(view, [self.views[i] for i in self.mapped], count)
 
     def _choose_partners(self, view: MapView) -> None:
         """Photometric partners of a view; it becomes a candidate for those before it."""
         photo = self.config.photo
-        mapped = [self.views[i] for i in self.mapped]
+        mapped = self._mapped_around(view, CANDIDATES)
         view.partners = choose_partners(view, mapped, view.typical_depth, photo)
         for i in view.partners:
             other = self.views[i]
@@ -302,7 +290,7 @@ class Mapper:
             self._training().optimizer.keep(self._vote(self.map.position.detach(), views))
 
     def _vote(self, points: Float[Tensor, "n 3"], views: list[MapView]) -> Bool[Tensor, "n"]:
-        return self._depths.keep(points, [v.posed for v in views if v.depth is not None])
+        return self._depths.engine.keep(points, PosedDepths([v for v in views if v.has_depth]))
 
     @torch.no_grad()
     def _insert(self, view: MapView, min_confidence: float) -> None:
@@ -319,7 +307,7 @@ class Mapper:
         T_wc = view.T_wc.float().to(depth.device)
         rays = camera.rays(device=depth.device)[v, u]
         points = (rays * z[:, None]) @ T_wc[:3, :3].T + T_wc[:3, 3]
-        others = [self.views[i] for i in self.mapped if i != view.id]
+        others = [v for v in self._mapped_around(view, _VOTERS) if v.id != view.id]
         kept = self._vote(points, others)
         points, z = points[kept], z[kept]
         if len(points) + len(self.map) < disk.neighbours or len(points) == 0:
@@ -381,18 +369,3 @@ class Mapper:
         )
         ids = self.map.keyframe_id[chosen]
         optimizer.replace(chosen, split(self.map, chosen), torch.cat([ids, ids]))
-
-
-def _render_mask(mask: Bool[np.ndarray, "h w"], render: Camera) -> Bool[Tensor, "rh rw"]:
-    """The pixels of the render size that lie mostly within the mask."""
-    size = (render.width, render.height)
-    share = cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA)
-    return torch.from_numpy(share > 0.5)
-
-
-def _typical_depth(view: MapView) -> float:
-    """Median depth of the cells that the tracker is fairly sure of, else of all."""
-    inverse, information = view.keyframe.inverse_depth, view.keyframe.information
-    z = 1 / inverse.clamp(min=1e-3)
-    sure = z / information.clamp(min=1e-12).sqrt() < 0.2
-    return float(z[sure].median() if int(sure.sum()) > 8 else z.median())

@@ -7,12 +7,12 @@ from jaxtyping import Float64
 
 from geogs.config import DepthConfig
 from geogs.geometry.camera import Camera
-from geogs.mapping.depth_view import DepthView
+from geogs.mapping.depth_view import DepthView, Place
 from geogs.tracking.grid import OFFSET, STRIDE
 
 
 def parallax_degrees(
-    reference: DepthView, others: Sequence[DepthView], depth: float
+    reference: Place, others: Sequence[Place], depth: float
 ) -> tuple[Float64[np.ndarray, "n"], Float64[np.ndarray, "n"]]:
     """Angles between the two rays to the point ``depth`` ahead, and between the two directions."""
     poses = np.stack([v.T_cw for v in others])
@@ -37,7 +37,7 @@ def misfit(
 
 
 def select_sweep_neighbours(
-    reference: DepthView, candidates: Sequence[DepthView], depth: float, config: DepthConfig
+    reference: Place, candidates: Sequence[Place], depth: float, config: DepthConfig
 ) -> list[int]:
     """Indices of the at most ``config.neighbours`` best candidates, best first.
 

@@ -257,5 +257,6 @@ def _middle(build: SceneBuilder, rng: np.random.Generator, materials: Materials)
     w, d = ROOM[:2]
     middle = build.at(w / 2, d / 2, yaw=rng.uniform(-0.3, 0.3))
     middle.box((0, 0, 0.006), (2.3, 1.65, 0.012), build.texture(texture.rug(rng, (512, 720))))
-    furniture.round_table(middle.at(*rng.uniform(-0.5, 0.5, 2), 0.012), rng, materials)
+    x, y = rng.uniform(-0.5, 0.5, 2)
+    furniture.round_table(middle.at(x, y, 0.012), rng, materials)
     add_ceiling_lamp(build, ROOM, materials)
