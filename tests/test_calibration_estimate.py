@@ -2,14 +2,19 @@
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
+import torch
 
 import tracking_scenes
 from geogs.config import CalibrationConfig
+from geogs.geometry.camera import Camera
 from geogs.tracking.calibration.estimate import LEAST_DEVIATION, self_calibrate
 from geogs.tracking.calibration.keyframes import with_focal
-from tracking_scenes import CAMERA, frames, pose
+from geogs.tracking.calibration.lens import Lens, lens_rays
+from geogs.types import Frame
+from tracking_scenes import CAMERA, frames, pose, render
 
 CONFIG = CalibrationConfig(start_keyframes=8, keyframes=16)
 
@@ -48,6 +53,30 @@ def test_the_radial_term_of_a_pinhole_is_none():
     assert found.deviation_k1 is not None
     assert abs(found.k1) < max(0.02, 2.5 * found.deviation_k1)
     assert abs(found.camera.fx / CAMERA.fx - 1) < 0.03
+
+
+def test_finds_the_radial_term_of_a_distorting_lens():
+    wide = Camera(CAMERA.fx, CAMERA.fy, 143.5, 107.5, 288, 216)
+    rays = lens_rays(Lens(CAMERA, -0.15), torch.from_numpy(pixels_of(CAMERA))).rays.numpy()
+    at = (rays @ wide.matrix().numpy().T.astype(np.float32))[:, :2]
+    at = at.reshape(CAMERA.height, CAMERA.width, 2)
+    video = [
+        Frame(k, k / 30, cv2.remap(render(T, wide)[0], at, None, cv2.INTER_CUBIC))
+        for k, T in enumerate(swinging(22))
+    ]
+    config = replace(CONFIG, radial=True)
+    found = self_calibrate(video, with_focal(CAMERA, 190.0), config)
+    assert found.failure is None
+    assert found.deviation_k1 is not None
+    print(found)
+    assert abs(found.k1 + 0.15) < min(0.03, 2.5 * found.deviation_k1)
+    assert abs(found.camera.fx / CAMERA.fx - 1) < min(0.02, 2.5 * found.deviation)
+
+
+def pixels_of(camera: Camera) -> np.ndarray:
+    """x, y of every pixel, row by row."""
+    v, u = np.mgrid[: camera.height, : camera.width].astype(np.float32)
+    return np.stack([u, v], -1).reshape(-1, 2)
 
 
 def test_a_camera_that_only_turns_is_said_to():

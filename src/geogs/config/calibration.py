@@ -17,7 +17,7 @@ class CalibrationConfig:
     frames: int = 600
     """Frames of the video that are looked at, at most."""
     start_keyframes: int = 12
-    """Keyframes that are solved first, at least 6."""
+    """Keyframes that are solved first, at least 8."""
     keyframes: int = 24
     """Most keyframes that are used; they are added until the focal length is sure enough."""
     keyframe_flow: float = 0.025
