@@ -46,6 +46,8 @@ class Block:
     """Milliseconds per new keyframe."""
     total: float
     """Their sum."""
+    processor: float
+    """Milliseconds of all CPU threads per new keyframe, whatever else the machine did."""
     resident: float
     """Gigabytes of the process at the end."""
     peak: float
@@ -78,6 +80,7 @@ def main() -> None:
         "options": {k: str(v) for k, v in vars(options).items()},
         "blocks": [asdict(b) for b in blocks],
         "ratio": round(used[-1].total / used[0].total, 3),
+        "processor_ratio": round(used[-1].processor / used[0].processor, 3),
         "peak": memory("VmHWM"),
         "gpu_peak": torch.cuda.max_memory_allocated() / 1e9 if options.device == "cuda" else 0.0,
         "end": round(time.perf_counter() - start, 1),
@@ -127,10 +130,12 @@ def write(path: Path, image: np.ndarray) -> None:
 def follow(slam: Slam, folder: Path, frames: int, every: int) -> list[Block]:
     """Feed the frames and take stock of every so many."""
     blocks: list[Block] = []
-    before, known, lost, status = {}, 0, 0, None
+    before, known, lost, status, spent = {}, 0, 0, None, 0.0
     for n in range(frames):
         pixels = cv2.imread(str(folder / f"frame{n:06d}.jpg"))
+        start = time.process_time()
         status = slam.process(Frame(n, n / 30, np.ascontiguousarray(pixels[..., ::-1])))
+        spent += time.process_time() - start
         lost += status.state.value == "lost"
         if (n + 1) % every and n + 1 < frames:
             continue
@@ -143,10 +148,11 @@ def follow(slam: Slam, folder: Path, frames: int, every: int) -> list[Block]:
             torch.cuda.reset_peak_memory_stats()
         blocks.append(Block(
             n + 1, status.keyframes, status.disks, {k: round(v, 1) for k, v in stages.items()},
-            round(sum(stages.values()), 1), memory("VmRSS"), memory("VmHWM"), round(gpu, 3), lost,
+            round(sum(stages.values()), 1), round(1e3 * spent / fresh, 1),
+            memory("VmRSS"), memory("VmHWM"), round(gpu, 3), lost,
         ))  # fmt: skip
         print(json.dumps(asdict(blocks[-1])), flush=True)
-        before, known = now, status.keyframes
+        before, known, spent = now, status.keyframes, 0.0
     return blocks
 
 

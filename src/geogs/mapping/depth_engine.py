@@ -104,7 +104,8 @@ class CpuDepthEngine:
 
     def keep(self, points: Float[Tensor, "n 3"], depths: Sequence[PosedDepth]) -> Bool[Tensor, "n"]:
         """As in the protocol."""
-        views = ((d.T_cw, d.depth.arrays()) for d in depths)  # not all in memory at once
+        # One view after the other, so that not all are in memory at once.
+        views = ((d.T_cw, d.depth.arrays()) for d in depths)
         return torch.from_numpy(vote(points.detach().numpy(), views, self.render, self.config))
 
 

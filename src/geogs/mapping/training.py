@@ -6,13 +6,14 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from geogs.config import MappingConfig
 from geogs.losses import fused_multi_view, fused_single_view
 from geogs.mapping.pose_refine import refine_poses
 from geogs.mapping.view import MapCameras, MapView
+from geogs.splat.cpu.in_view import disks_in_view
 from geogs.splat.map import DiskParameters, GaussianMap
 from geogs.splat.optimizer import LearningRates, MapOptimizer
 from geogs.splat.render import RenderOutput, render
@@ -22,6 +23,12 @@ Batch = list[tuple[MapView, list[MapView]]]
 
 GRADIENT_LIMIT = 1e3
 """A disk whose gradient exceeds this has met a numerical accident (a nearly edge-on pixel)."""
+
+
+# Part of the map up to which an excerpt is trained rather than all of it.
+_LARGE_EXCERPT = 0.7
+# Standard deviations at which a disk of any opacity has faded below what the renderer shows.
+REACH = 3.4
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,12 +134,41 @@ class Trainer:
         self.optimizer = MapOptimizer(disks, learning_rates(config, unit))
 
     def train(self, batches: Sequence[Batch], factors: Sequence[float] | None = None) -> None:
-        """One Adam step per batch on its summed losses; ``factors`` scale all learning rates."""
+        """One Adam step per batch on its summed losses; ``factors`` scale all learning rates.
+
+        On an excerpt of the map where the views can see no more than that, which changes nothing
+        but rounding.
+        """
+        whole, seen = self.optimizer, self._in_view(batches)
+        if not 0 < len(seen) <= _LARGE_EXCERPT * len(self.disks):
+            self._train(batches, factors)
+            return
+        part = whole.excerpt(seen)
+        try:
+            self.optimizer, self.disks = part, part.disks
+            self._train(batches, factors)
+        finally:
+            self.optimizer, self.disks = whole, whole.disks
+            whole.take_back(seen, part)
+
+    def _train(self, batches: Sequence[Batch], factors: Sequence[float] | None) -> None:
         for n, batch in enumerate(batches):
             factor = 1.0 if factors is None else factors[n]
             self.optimizer.learning_rates = learning_rates(self.config, self.unit, factor)
             self.step(batch)
         self.optimizer.learning_rates = learning_rates(self.config, self.unit)
+
+    def _in_view(self, batches: Sequence[Batch]) -> Int[Tensor, "m"]:
+        """Disks that the views of some steps can see, or could after these steps."""
+        views = {view.id: view for batch in batches for view, _ in batch}
+        if not views or not len(self.disks):
+            return torch.zeros(0, dtype=torch.int64)
+        steps = 1.5 * len(batches)  # Adam's moves are about as long as the learning rate
+        growth, way = np.exp(steps * self.config.lr_scale), steps * self.config.lr_position
+        radius = REACH * growth * self.disks.scale.amax(1) + way * self.unit
+        poses = torch.stack([view.T_cw for view in views.values()])
+        camera = self.cameras.render
+        return disks_in_view(self.disks.position, radius, poses, camera).nonzero()[:, 0]
 
     def refine_poses(
         self, active: list[MapView], views: dict[int, MapView], config: MappingConfig

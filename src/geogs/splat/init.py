@@ -12,6 +12,9 @@ from geogs.geometry.neighbors import all_pairs_neighbors, nearest_neighbors
 from geogs.splat.cuda.local_planes import principal_planes
 from geogs.splat.map import DiskParameters
 
+# Part of the extent of some points within which their neighbours are looked for at first.
+_MARGIN = 0.05
+
 
 @dataclass(frozen=True)
 class LocalPlane:
@@ -36,9 +39,7 @@ def fit_local_planes(
     """
     if points.device.type == "cuda":
         return fit_local_planes_on_gpu(points, context, k)
-    union = torch.cat([points, context]).double()
-    distances, indices = nearest_neighbors(points.double(), union, k + 1)
-    neighbours = union[indices]
+    distances, neighbours = _neighbourhoods(points, context, k)
     centred = neighbours - neighbours.mean(1, keepdim=True)
     eigenvalues, vectors = torch.linalg.eigh(centred.mT @ centred)
     low, middle, high = eigenvalues.clamp(min=0).unbind(-1)
@@ -49,6 +50,24 @@ def fit_local_planes(
         planarity=((middle - low) / high.clamp(min=1e-30)).to(points.dtype),
         spacing=spacing.to(points.dtype),
     )
+
+
+def _neighbourhoods(
+    points: Float[Tensor, "n 3"], context: Float[Tensor, "m 3"], k: int
+) -> tuple[Float[Tensor, "n j"], Float[Tensor, "n j 3"]]:
+    """Distances and positions of the k + 1 nearest of points and context, float64.
+
+    Of a large context only what lies around the points is searched, as long as that is enough.
+    """
+    low, high = points.amin(0), points.amax(0)
+    margin = _MARGIN * (high - low).norm()
+    near = ((context > low - margin) & (context < high + margin)).all(1)
+    union = torch.cat([points, context[near]]).double()
+    distances, indices = nearest_neighbors(points.double(), union, k + 1)
+    if not bool(near.all()) and (len(union) <= k or float(distances.max()) > float(margin)):
+        union = torch.cat([points, context]).double()
+        distances, indices = nearest_neighbors(points.double(), union, k + 1)
+    return distances, union[indices]
 
 
 def fit_local_planes_on_gpu(

@@ -119,10 +119,10 @@ class GaussianMap:
         """Drop the disks where ``mask`` is false; gradients are dropped."""
         self.take(mask.nonzero()[:, 0])
 
-    def take(self, index: Int[Tensor, "m"]) -> None:
-        """Keep the disks of the index; gradients are dropped."""
+    def take(self, index: Int[Tensor, "m"], start: int = 0) -> None:
+        """Keep the disks of the index, the first ``start`` in place; gradients are dropped."""
         for rows in (*self._trained, *self._counts):
-            rows.take(index)
+            rows.take(index, start)
         self._expose()
 
     def mark_seen(self, visible: Bool[Tensor, "n"]) -> None:

@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from geogs.geometry.lie import matrix_to_quaternion, sim3_scale
@@ -114,10 +114,39 @@ class MapOptimizer:
         index = mask.nonzero()[:, 0]
         if len(index) == len(mask) == len(self.disks):
             return
+        # Old disks come first and seldom go, so most rows of a large map need not be touched.
+        start = int(mask.to(torch.uint8).argmin())
         for moments in self._moments:
             for m in moments:
-                m.take(index)
-        self.disks.take(index)
+                m.take(index, start)
+        self.disks.take(index, start)
+
+    @torch.no_grad()
+    def excerpt(self, index: Int[Tensor, "m"]) -> "MapOptimizer":
+        """The optimiser of a map of some of the disks: copies that :meth:`take_back` returns."""
+        disks = self.disks
+        part = MapOptimizer(
+            GaussianMap(
+                DiskParameters(*(p.detach()[index] for p in disks.parameters)),
+                disks.keyframe_id[index], disks.steps[index], disks.seen[index],
+            ),
+            self.learning_rates, self.betas, self.eps,
+        )  # fmt: skip
+        for mine, theirs in zip(self._moments, part._moments, strict=True):
+            for m, t in zip(mine, theirs, strict=True):
+                t.rows.copy_(m.rows[index])
+        return part
+
+    @torch.no_grad()
+    def take_back(self, index: Int[Tensor, "m"], part: "MapOptimizer") -> None:
+        """What has become of the disks of an excerpt, none of which came or went."""
+        own, other = self.disks, part.disks
+        pairs = [*zip(own.parameters, other.parameters, strict=True)]
+        pairs += [*zip(self.first, part.first, strict=True)]
+        pairs += [*zip(self.second, part.second, strict=True)]
+        pairs += [(own.steps, other.steps), (own.seen, other.seen)]
+        for mine, theirs in pairs:
+            mine.detach()[index] = theirs.detach()
 
     @property
     def position_gradient(self) -> Float[Tensor, "n"]:

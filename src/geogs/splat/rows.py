@@ -39,7 +39,7 @@ class GrowingRows:
             room[: self._count] = self.rows
             self.room = room
 
-    def take(self, index: Int[Tensor, "m"]) -> None:
-        """Keep the rows of the index, in its order."""
-        self.room[: len(index)] = self.room[index]
+    def take(self, index: Int[Tensor, "m"], start: int = 0) -> None:
+        """Keep the rows of the index, in its order; the first ``start`` of them stay in place."""
+        self.room[start : len(index)] = self.room[index[start:]]
         self._count = len(index)

@@ -79,6 +79,18 @@ class ViewTable:
         self.set_poses([slot], photo.T_cw[None])
         return slot
 
+    def replace(self, slot: int, view: ViewConstants | None, photo: PhotoView) -> None:
+        """Let a slot stand for another keyframe, whose rendering is not known yet.
+
+        All maps stay where they are, so captured graphs remain valid.
+        """
+        self._maps[slot].zero_()
+        self._greys[slot].copy_(self._upload(photo.grey))
+        self.rendered[slot : slot + 1].zero_()
+        if view is not None:
+            self.set_constants(slot, view)
+        self.set_poses([slot], photo.T_cw[None])
+
     def set_constants(self, slot: int, view: ViewConstants) -> None:
         """Replace a keyframe's prior depth, confidence, prior normals and edges."""
         maps = [view.edge, view.image_gradient, view.prior_depth, view.confidence]

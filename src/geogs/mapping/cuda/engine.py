@@ -24,6 +24,8 @@ from geogs.mapping.plane_sweep import sweep_planes
 from geogs.mapping.sweep_neighbors import depth_range
 from geogs.threads import worker_count
 
+# Keyframes whose images stay on the GPU, those used last.
+_RESIDENT = 128
 # Keyframes whose grids are completed at once.
 _BATCH = 32
 
@@ -88,6 +90,7 @@ class CudaDepthEngine:
             for i, grids in enumerate(evidence, start):
                 maps.append(self._search(references[i], usable[i], plans[i], grids))
                 progress(len(maps) / len(references))
+        self._forget()
         return _with_medians(maps)
 
     def check(
@@ -113,10 +116,17 @@ class CudaDepthEngine:
 
     def _images_of(self, view: DepthView) -> KeyframeImages:
         """The images on the GPU, brought there at their first use."""
-        if view.id not in self._images:
+        images = self._images.pop(view.id, None)
+        if images is None:
             pixels = self._pixels.pop(view.id).result()
-            self._images[view.id] = KeyframeImages.of(view, self.device, pixels)
-        return self._images[view.id]
+            images = KeyframeImages.of(view, self.device, pixels)
+        self._images[view.id] = images  # the last used comes last
+        return images
+
+    def _forget(self) -> None:
+        """Let go of the images that were not used for longest; they can be prepared again."""
+        for id in list(self._images)[:-_RESIDENT]:
+            del self._images[id], self._edges[id]
 
     def _plan(
         self, reference: DepthView, neighbours: list[DepthView], limits: Limits | None = None
