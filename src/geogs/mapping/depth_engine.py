@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from typing import Protocol, runtime_checkable
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -13,10 +14,14 @@ from geogs.mapping.carve import vote
 from geogs.mapping.depth_fusion import check_depth
 from geogs.mapping.depth_view import DenseDepth, DepthView, PosedDepth
 from geogs.mapping.keyframe_depth import estimate_depth
+from geogs.splat.cpu.in_view import disks_in_view
 from geogs.threads import thread_map
 
 Progress = Callable[[float], None]
 """Called with the finished fraction."""
+# Views whose depths may be in memory at once.
+_FEW_VIEWS = 128
+
 Limits = tuple[float, float]
 """Nearest and farthest depth to search, map units."""
 
@@ -104,9 +109,20 @@ class CpuDepthEngine:
 
     def keep(self, points: Float[Tensor, "n 3"], depths: Sequence[PosedDepth]) -> Bool[Tensor, "n"]:
         """As in the protocol."""
-        # One view after the other, so that not all are in memory at once.
-        views = ((d.T_cw, d.depth.arrays()) for d in depths)
-        return torch.from_numpy(vote(points.detach().numpy(), views, self.render, self.config))
+        if not 0 < len(depths) <= _FEW_VIEWS:
+            # One view after the other, so that not all are in memory at once.
+            views = ((d.T_cw, d.depth.arrays()) for d in depths)
+            return torch.from_numpy(vote(points.detach().numpy(), views, self.render, self.config))
+        held = list(depths)
+        poses = torch.from_numpy(np.stack([d.T_cw for d in held]))
+        # No view has a say on the others, which may be most of a large map.
+        seen = disks_in_view(points, points.new_zeros(len(points)), poses, self.render)
+        kept = torch.ones_like(seen)
+        if bool(seen.any()):
+            some = points.detach()[seen].numpy()
+            views = ((d.T_cw, d.depth.arrays()) for d in held)
+            kept[seen] = torch.from_numpy(vote(some, views, self.render, self.config))
+        return kept
 
 
 def depth_engine(
