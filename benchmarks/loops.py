@@ -173,7 +173,10 @@ def separate(store: KeyframeStore, operator: ClassicalFlow, truth: Truth, gap: i
         closed = dict.fromkeys(counts, False)
         for c in found:
             i = c.keyframe
-            views = [DepthView.of(store.grid, store[n], features[n]) for n in (i, k)]
+            views = [
+                DepthView.of(store.grid, store[n].inverse_depth, store[n].information, features[n])
+                for n in (i, k)
+            ]
             bare = [DepthView(v.features) for v in views]
             plain = clock("essential", lambda v=bare: verifier.verify(*v))
             if plain.accepted:
@@ -236,11 +239,11 @@ def together(store: KeyframeStore, operator: ClassicalFlow, truth: Truth, gap: i
         Clock(),
     )
     for k in store.ids:
-        clock("update", lambda k=k: detector.update([k]))
+        clock("update", lambda k=k: detector.update([k], is_last=True))
     right = [truth.right(o.first, o.second, o.T_ji) for o in detector.loops]
     closed = {o.second for o, ok in zip(detector.loops, right, strict=True) if ok}
     can = {k for k in store.ids for i in store.ids if i < k - gap and truth.overlap[i, k] > OVERLAP}
-    looks = sum(o.source == "appearance" for o in detector.loops)
+    looks = sum(o.cause == "appearance" for o in detector.loops)
     print(
         f"  detector: {len(right)} loops ({looks} by looks), precision "
         f"{np.mean(right) if right else 1.0:.3f}, {len(closed & can)} of {len(can)} keyframes that "

@@ -10,7 +10,7 @@ from geogs.config import LoopConfig, RetrievalOptions
 from geogs.geometry.lie import se3_exp, se3_inverse, so3_log
 from geogs.loop.dense import dense_check
 from geogs.loop.detect import LoopDetector
-from geogs.loop.features import FeatureExtractor
+from geogs.loop.features import FeatureExtractor, Features
 from geogs.loop.verification import DepthView, TwoViewVerifier
 from geogs.synth.raycast import View
 from geogs.tracking.keyframes import KeyframeStore
@@ -56,7 +56,12 @@ def _scale_depth(store: KeyframeStore, id: int, factor: float) -> None:
 
 def _views_of(store: KeyframeStore, *ids: int) -> list[DepthView]:
     extract = FeatureExtractor(RetrievalOptions())
-    return [DepthView.of(store.grid, store[k], extract(store[k].image)) for k in ids]
+    return [_depth_view(store, k, extract(store[k].image)) for k in ids]
+
+
+def _depth_view(store: KeyframeStore, id: int, features: Features) -> DepthView:
+    state = store[id]
+    return DepthView.of(store.grid, state.inverse_depth, state.information, features)
 
 
 def test_features_give_pose_and_scale(walk):
@@ -128,10 +133,11 @@ def test_looks_close_a_loop_that_drift_hides(walk):
     detector = LoopDetector(
         store.grid, operator, lambda _: store, LoopConfig(min_gap=10, suppression=1)
     )
-    loops = [loop for k in store.ids for loop in detector.update([k]) if k >= LAP]
+    loops = [x for k in store.ids for x in detector.update([k])] + [*detector.update([], True)]
+    loops = [loop for loop in loops if loop.second >= LAP]
     assert {(0, LAP), (1, LAP + 1)} <= {(loop.first, loop.second) for loop in loops}
     for loop in loops:
-        assert loop.source == "appearance"
+        assert loop.cause == "appearance"
         if loop.second - loop.first == LAP:
             assert _turn(loop.T_ji, true[loop.second]) < 0.2
             assert float((loop.T_ji - true[loop.second])[:3, 3].norm()) < 0.01
@@ -141,9 +147,9 @@ def test_poses_close_a_loop_without_features(walk):
     store, operator = walk
     config = LoopConfig(min_gap=10, retrieval=RetrievalOptions(features=8, indexed=8))
     detector = LoopDetector(store.grid, operator, lambda _: store, config)
-    loops = detector.update(store.ids)
+    loops = detector.update(store.ids, is_last=True)
     assert loops
-    assert all(loop.source == "geometry" and loop.inliers == 0 for loop in loops)
+    assert all(loop.cause == "geometry" and loop.inliers == 0 for loop in loops)
     for loop in loops:
         true = _relative(store, loop.first, loop.second)
         assert _turn(loop.T_ji, true) < 0.2
@@ -152,8 +158,9 @@ def test_poses_close_a_loop_without_features(walk):
 def test_a_loop_as_a_similarity_takes_depth_to_depth(walk):
     store, operator = walk
     _scale_depth(store, LAP, 1.2)
-    detector = LoopDetector(store.grid, operator, lambda _: store, LoopConfig(min_gap=10))
-    detector.update(store.ids[: LAP + 1])
+    config = LoopConfig(min_gap=10, suppression=0)
+    detector = LoopDetector(store.grid, operator, lambda _: store, config)
+    detector.update(store.ids[: LAP + 1], is_last=True)
     loop = next(x for x in detector.loops if x.second == LAP)
     assert loop.scale == pytest.approx(1.2, rel=0.02)
     # The points before the first camera lie at 1.2 times their depth before the second.
@@ -168,7 +175,7 @@ def test_close_pairs_suppress_each_other(walk):
     detector = LoopDetector(
         store.grid, operator, lambda _: store, LoopConfig(min_gap=10, suppression=3)
     )
-    detector.update(store.ids)
+    detector.update(store.ids, is_last=True)
     pairs = [(loop.first, loop.second) for loop in detector.loops]
     assert pairs
     for n, (a, b) in enumerate(pairs):
@@ -179,9 +186,8 @@ def test_close_pairs_suppress_each_other(walk):
 def test_update_is_deterministic(path):
     def run() -> list[tuple[int, int, float]]:
         store, operator = keyframes(*path)
-        loops = LoopDetector(store.grid, operator, lambda _: store, LoopConfig(min_gap=10)).update(
-            store.ids
-        )
+        detector = LoopDetector(store.grid, operator, lambda _: store, LoopConfig(min_gap=10))
+        loops = [x for k in store.ids for x in detector.update([k])] + [*detector.update([], True)]
         return [(x.first, x.second, float(x.T_ji.sum())) for x in loops]
 
     assert run() == run()
@@ -195,7 +201,7 @@ def test_a_room_of_another_shape_with_the_same_pictures_closes_no_loop(path):
     _drift(store, range(LAP, LAP + AGAIN))
     detector = LoopDetector(store.grid, operator, lambda _: store, LoopConfig(min_gap=10))
     # The lap itself closes where its end meets its beginning.
-    assert [loop for loop in detector.update(store.ids) if loop.second >= LAP] == []
+    assert [loop for loop in detector.update(store.ids, True) if loop.second >= LAP] == []
 
 
 def test_blank_keyframes_close_nothing(path):
@@ -205,9 +211,5 @@ def test_blank_keyframes_close_nothing(path):
         store[id].image = np.full_like(store[id].image, 120)
         store[id].encoded = operator.encode(store[id].image)
         store[id].information = torch.zeros_like(store[id].information)
-    assert (
-        LoopDetector(store.grid, operator, lambda _: store, LoopConfig(min_gap=5)).update(
-            [0, 12, 13]
-        )
-        == ()
-    )
+    detector = LoopDetector(store.grid, operator, lambda _: store, LoopConfig(min_gap=5))
+    assert detector.update([0, 12, 13], is_last=True) == ()

@@ -89,6 +89,8 @@ class LoopConfig:
     """A loop rules out others whose ends together lie within this many keyframes of its own."""
     max_loops: int = 2
     """Most loops per keyframe."""
+    lag: int = 2
+    """Keyframes for which a search may run beside tracking before it is waited for."""
     close_every: int = 5
     """Keyframes between two corrections, at least."""
     min_change: float = 0.004

@@ -80,7 +80,7 @@ class LoopCloser:
         fresh = [*result.finalized, *result.apart]
         if fresh:
             self._retire(self.segments.tracker_of(fresh[0]))
-        for loop in self.detector.update(fresh):
+        for loop in self.detector.update(fresh, is_last):
             self._take(loop)
         became_final = self._join()
         return LoopEvent(self._close(is_last), became_final)

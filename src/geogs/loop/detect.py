@@ -1,8 +1,9 @@
 """Loops: pairs of keyframes far apart in time that show one place."""
 
+from collections import deque
 from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 import torch
@@ -12,27 +13,12 @@ from torch import Tensor
 from geogs.config import LoopConfig
 from geogs.geometry.lie import se3_inverse, so3_log
 from geogs.loop.dense import dense_check
-from geogs.loop.features import Features
-from geogs.loop.retrieval import AppearanceIndex
-from geogs.loop.verification import DepthView, TwoViewVerifier
+from geogs.loop.search import Cause, Depths, PlaceSearch, Proposal, Query, Sighting
 from geogs.tracking.flow.base import FlowMatch, FlowOperator
 from geogs.tracking.grid import SampleGrid
 from geogs.tracking.keyframes import KeyframeState, KeyframeStore
 from geogs.tracking.motion import Recognition
 from geogs.tracking.proximity import frame_distances
-
-Source = Literal["geometry", "appearance"]
-"""What proposed a pair: the present poses, or nothing but the looks."""
-
-
-@dataclass(frozen=True)
-class Proposal:
-    """A pair that may be a loop."""
-
-    first: int
-    second: int
-    """The later."""
-    source: Source
 
 
 @dataclass(frozen=True)
@@ -42,7 +28,7 @@ class Loop:
     first: int
     second: int
     """The later keyframe."""
-    source: Source
+    cause: Cause
     T_ji: Float[Tensor, "4 4"]
     """First camera to second in the lengths of the first keyframe's depth, float64."""
     scale: float
@@ -72,10 +58,12 @@ class Refusal:
 
 
 class LoopDetector:
-    """Proposes loops by present poses and by looks, and keeps those that two checks accept.
+    """Finds loops at keyframes that are final: looks and features propose, the flow decides.
 
-    Keyframes may lie in several stores, whose poses then have nothing to do with each other:
-    between them, only looks propose.
+    The search by looks and features runs in a thread beside tracking; what it finds is taken up
+    ``lag`` keyframes later, at the same place of the stream however fast the machine is. Keyframes
+    may lie in several stores, whose poses then have nothing to do with each other: between them,
+    only looks propose.
     """
 
     def __init__(
@@ -90,13 +78,13 @@ class LoopDetector:
         self.operator = operator
         self.store_of = store_of
         self.config = config or LoopConfig()
-        self.index = AppearanceIndex(self.config.retrieval)
         self.refusals: list[Refusal] = []
         """Of the last update."""
-        self._verifier = TwoViewVerifier(grid.camera, self.config.verification)
-        self._features: dict[int, Features] = {}
+        self._search = PlaceSearch(grid, self.config)
+        self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="loops")
         self._order: dict[int, int] = {}
         """Place in time of each keyframe taken so far."""
+        self._pending: deque[Future[list[Sighting]]] = deque()
         self._loops: list[Loop] = []
 
     @property
@@ -104,66 +92,58 @@ class LoopDetector:
         """All that were found, earliest first."""
         return tuple(self._loops)
 
-    def update(self, ids: Sequence[int]) -> tuple[Loop, ...]:
-        """Take keyframes that became final, earliest first, and return the loops they close."""
+    def update(self, ids: Sequence[int], is_last: bool = False) -> tuple[Loop, ...]:
+        """Take keyframes that became final, earliest first, and return loops that were found.
+
+        They are those of the keyframes ``lag`` earlier, and at the end of all.
+        """
         self.refusals = []
         found: list[Loop] = []
         for id in ids:
             self._order[id] = len(self._order)
-            self._features[id] = self.index.describe(self._state(id).image)
-            found += self._close(id)
-            self.index.add(id, self._features[id])
+            self._pending.append(self._thread.submit(self._search.find, self._query(id)))
+            if len(self._pending) > self.config.lag:
+                found += self._decide(self._pending.popleft().result())
+        while is_last and self._pending:
+            found += self._decide(self._pending.popleft().result())
         return tuple(found)
 
     def recognise(self, image: UInt8[np.ndarray, "h w 3"]) -> list[Recognition]:
         """Keyframes that show what an image shows, with its pose; most alike first."""
-        features = self.index.describe(image)
-        found: list[Recognition] = []
-        for candidate in self.index.query(features, (), self.config.appearance):
-            if candidate.score < self.config.min_score:
-                continue
-            id = candidate.keyframe
-            known = DepthView.of(self.grid, self._state(id), self._features[id])
-            view = self._verifier.verify(known, DepthView(features))
-            if view.accepted and view.is_metric and view.T_ji is not None:
-                found.append(Recognition(id, view.T_ji))
-        return found
+        return self._thread.submit(self._search.recognise, image, self._depths()).result()
 
-    def propose(self, id: int) -> list[Proposal]:
-        """Pairs of a taken keyframe with earlier ones, thinned: geometry and looks take turns."""
-        store, gap = self.store_of(id), self._order[id] - self.config.min_gap
-        here = [k for k in self._order if k != id and self.store_of(k) is store]
-        near = {k for k in here if self._order[k] >= gap}
-        by_pose = self._by_pose(id, [k for k in here if k not in near])
-        by_looks = self._by_looks(id, near | {id})
-        turns: list[Proposal] = []
-        for n in range(max(len(by_pose), len(by_looks))):
-            # Where the poses agree with the looks, the flow may start from them if features fail.
-            turns += [
-                Proposal(k, id, "geometry" if k in by_pose else "appearance")
-                for k in by_looks[n : n + 1]
-            ]
-            turns += [Proposal(k, id, "geometry") for k in by_pose[n : n + 1]]
-        kept: list[Proposal] = []
-        for p in turns:
-            if not self._suppressed(p, [*kept, *self._loops]):
-                kept.append(p)
-        return kept[: self.config.verified]
-
-    def _state(self, id: int) -> KeyframeState:
-        return self.store_of(id)[id]
-
-    def _by_pose(self, id: int, old: Sequence[int]) -> list[int]:
-        """Keyframes that the present poses say are seen again, nearest first."""
+    def candidates(self, id: int) -> list[int]:
+        """Keyframes that the present poses say a taken one sees again, nearest first."""
+        near = self._near(id)
+        store = self.store_of(id)
+        old = [k for k in self._order if k not in near and self.store_of(k) is store]
         if not old:
             return []
-        near = self._facing(id, old)
-        directed = [(k, id) for k in near] + [(id, k) for k in near]
-        store = self.store_of(id)
+        facing = self._facing(id, old)
+        directed = [(k, id) for k in facing] + [(id, k) for k in facing]
         there, back = frame_distances(store, directed, self.config.rotation_weight).chunk(2)
         limit = self.config.max_distance * max(self.grid.camera.width, self.grid.camera.height)
         distance, order = torch.sort(((there + back) / 2).cpu(), stable=True)
-        return [near[n] for n in order[distance < limit].tolist()]
+        return [facing[n] for n in order[distance < limit].tolist()]
+
+    def _query(self, id: int) -> Query:
+        known = tuple((loop.first, loop.second) for loop in self._loops)
+        near, by_pose = self._near(id), tuple(self.candidates(id))
+        return Query(id, self._state(id).image, near, by_pose, known, self._depths())
+
+    def _near(self, id: int) -> frozenset[int]:
+        """The keyframe itself and those of the same time and store."""
+        gap, store = self._order[id] - self.config.min_gap, self.store_of(id)
+        recent = [k for k, n in self._order.items() if n >= gap]
+        return frozenset(k for k in recent if self.store_of(k) is store)
+
+    def _depths(self) -> Depths:
+        """What is known of the depth of all keyframes now; they are replaced, never changed."""
+        states = {k: self._state(k) for k in self._order}
+        return {k: (s.inverse_depth, s.information) for k, s in states.items()}
+
+    def _state(self, id: int) -> KeyframeState:
+        return self.store_of(id)[id]
 
     def _facing(self, id: int, old: Sequence[int]) -> list[int]:
         """The keyframes nearest by that look roughly the same way; there are never many."""
@@ -176,24 +156,15 @@ class LoopDetector:
         order = torch.argsort(away, stable=True)
         return [old[n] for n in order.tolist() if facing[n]][: self.config.measured]
 
-    def _by_looks(self, id: int, excluded: set[int]) -> list[int]:
-        """Keyframes that look alike, most alike first."""
-        found = self.index.query(self._features[id], excluded, self.config.appearance)
-        return [c.keyframe for c in found if c.score >= self.config.min_score]
-
-    def _suppressed(self, p: Proposal, others: Sequence[Proposal | Loop]) -> bool:
-        """Whether a pair is too near to another to say anything new."""
-        a, b = self._order[p.first], self._order[p.second]
-        return any(
-            abs(a - self._order[o.first]) + abs(b - self._order[o.second])
-            <= self.config.suppression
-            for o in others
-        )
-
-    def _close(self, id: int) -> list[Loop]:
+    def _decide(self, sightings: Sequence[Sighting]) -> list[Loop]:
+        """The loops among what was seen of one keyframe."""
         found: list[Loop] = []
-        for proposal in self.propose(id):
-            loop = self._verify(proposal)
+        for sighting in sightings:
+            pair = sighting.proposal.first, sighting.proposal.second
+            known = [(loop.first, loop.second) for loop in self._loops]
+            if self._search.is_suppressed(pair, known):
+                continue
+            loop = self._verify(sighting)
             if isinstance(loop, Refusal):
                 self.refusals.append(loop)
                 continue
@@ -203,19 +174,16 @@ class LoopDetector:
                 break
         return found
 
-    def _verify(self, p: Proposal) -> Loop | Refusal:
-        """Features find the pose, the flow confirms it; where features fail, present poses may do.
+    def _verify(self, sighting: Sighting) -> Loop | Refusal:
+        """Features found the pose, the flow confirms it; where they failed, present poses may do.
 
         Plain surfaces have few corners, but when the drift is small the flow needs none.
         """
+        p, view = sighting.proposal, sighting.view
         first, second, grid = self._state(p.first), self._state(p.second), self.grid
-        view = self._verifier.verify(
-            DepthView.of(grid, first, self._features[p.first]),
-            DepthView.of(grid, second, self._features[p.second]),
-        )
         if view.accepted and view.is_metric and view.T_ji is not None:
             T, scale, inliers = view.T_ji, view.scale or 1.0, view.inliers
-        elif p.source == "geometry":
+        elif p.cause == "geometry":
             T, scale, inliers = second.T_cw @ se3_inverse(first.T_cw), 1.0, 0
         else:
             return Refusal(p, view.reason or "too little depth is known")
@@ -226,6 +194,6 @@ class LoopDetector:
         if not check.accepted or check.T_ji is None or check.there is None or check.back is None:
             return Refusal(p, check.reason)
         return Loop(
-            p.first, p.second, p.source, check.T_ji, check.scale, inliers, check.matched,
+            p.first, p.second, p.cause, check.T_ji, check.scale, inliers, check.matched,
             check.there, check.back,
         )  # fmt: skip

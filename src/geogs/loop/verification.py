@@ -12,7 +12,6 @@ from geogs.config import VerificationOptions
 from geogs.geometry.camera import Camera
 from geogs.loop.features import Features
 from geogs.tracking.grid import SampleGrid
-from geogs.tracking.keyframes import KeyframeState
 
 RASTER = 4
 """Cells per side in which the spread of the inliers is counted."""
@@ -53,12 +52,17 @@ class DepthView:
     """z of each feature; 0 where unknown. None if nothing is known."""
 
     @staticmethod
-    def of(grid: SampleGrid, keyframe: KeyframeState, features: Features) -> "DepthView":
+    def of(
+        grid: SampleGrid,
+        inverse_depth: Float[Tensor, "p"],
+        information: Float[Tensor, "p"],
+        features: Features,
+    ) -> "DepthView":
         """Depth of the features from a keyframe's; known where its nearest cell has information."""
         points = torch.from_numpy(features.pixels).to(grid.device)
-        inverse = grid.sample_field(keyframe.inverse_depth[:, None], points)[:, 0]
+        inverse = grid.sample_field(inverse_depth[:, None], points)[:, 0]
         cell, inside = grid.cells_of(points)
-        known = inside & (keyframe.information[cell] > 0) & (inverse > 1e-6)
+        known = inside & (information[cell] > 0) & (inverse > 1e-6)
         depth = torch.where(known, 1 / inverse.clamp(min=1e-6), torch.zeros_like(inverse))
         return DepthView(features, depth.float().cpu().numpy())
 

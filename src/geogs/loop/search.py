@@ -1,0 +1,126 @@
+"""The part of loop detection that can run beside tracking: looks and features, no flow."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from geogs.config import LoopConfig
+from geogs.loop.features import Features
+from geogs.loop.retrieval import AppearanceIndex
+from geogs.loop.verification import DepthView, TwoView, TwoViewVerifier
+from geogs.tracking.grid import SampleGrid
+from geogs.tracking.motion import Recognition
+
+Cause = Literal["geometry", "appearance"]
+"""What proposed a pair: the present poses, or nothing but the looks."""
+
+Depths = Mapping[int, tuple[Float[Tensor, "p"], Float[Tensor, "p"]]]
+"""Inverse depth and information on the grid, by keyframe."""
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """A pair that may be a loop."""
+
+    first: int
+    second: int
+    """The later."""
+    cause: Cause
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """A proposal and what the features of its views say of it."""
+
+    proposal: Proposal
+    view: TwoView
+
+
+@dataclass(frozen=True)
+class Query:
+    """A keyframe to search loops for; nothing in it changes any more."""
+
+    id: int
+    image: UInt8[np.ndarray, "h w 3"]
+    near: frozenset[int]
+    """Keyframes that cannot be its loops, for being of the same time."""
+    by_pose: tuple[int, ...]
+    """Keyframes that the poses say are seen again, nearest first."""
+    known: tuple[tuple[int, int], ...]
+    """Loops found so far."""
+    depths: Depths
+
+
+class PlaceSearch:
+    """Remembers keyframes by their features, and finds those that a new one may show again."""
+
+    def __init__(self, grid: SampleGrid, config: LoopConfig) -> None:
+        self.grid = grid
+        self.config = config
+        self.index = AppearanceIndex(config.retrieval)
+        self._verifier = TwoViewVerifier(grid.camera, config.verification)
+        self._features: dict[int, Features] = {}
+        self._order: dict[int, int] = {}
+        """Place in time of each keyframe remembered."""
+
+    def find(self, query: Query) -> list[Sighting]:
+        """Remember a keyframe; the pairs it makes with earlier ones, most promising first."""
+        id = query.id
+        self._order[id] = len(self._order)
+        self._features[id] = self.index.describe(query.image)
+        sightings = [Sighting(p, self._verify(p, query.depths)) for p in self._proposals(query)]
+        self.index.add(id, self._features[id])
+        return sightings
+
+    def recognise(self, image: UInt8[np.ndarray, "h w 3"], depths: Depths) -> list[Recognition]:
+        """Keyframes that show what an image shows, with its pose; most alike first."""
+        features, found = self.index.describe(image), []
+        for id in self._alike(features, frozenset()):
+            known = DepthView.of(self.grid, *depths[id], self._features[id])
+            view = self._verifier.verify(known, DepthView(features))
+            if view.accepted and view.is_metric and view.T_ji is not None:
+                found.append(Recognition(id, view.T_ji))
+        return found
+
+    def is_suppressed(self, pair: tuple[int, int], others: Sequence[tuple[int, int]]) -> bool:
+        """Whether a pair is too near to another to say anything new."""
+        a, b = (self._order[k] for k in pair)
+        return any(
+            abs(a - self._order[first]) + abs(b - self._order[second]) <= self.config.suppression
+            for first, second in others
+        )
+
+    def _proposals(self, query: Query) -> list[Proposal]:
+        """Pairs of a keyframe with earlier ones, thinned: geometry and looks take turns."""
+        id, by_pose = query.id, query.by_pose
+        by_looks = self._alike(self._features[id], query.near)
+        turns: list[Proposal] = []
+        for n in range(max(len(by_pose), len(by_looks))):
+            # Where the poses agree with the looks, the flow may start from them if features fail.
+            turns += [
+                Proposal(k, id, "geometry" if k in by_pose else "appearance")
+                for k in by_looks[n : n + 1]
+            ]
+            turns += [Proposal(k, id, "geometry") for k in by_pose[n : n + 1]]
+        kept: list[tuple[int, int]] = []
+        chosen: list[Proposal] = []
+        for p in turns:
+            if not self.is_suppressed((p.first, p.second), [*kept, *query.known]):
+                kept.append((p.first, p.second))
+                chosen.append(p)
+        return chosen[: self.config.verified]
+
+    def _alike(self, features: Features, excluded: frozenset[int]) -> list[int]:
+        """Keyframes that look alike, most alike first."""
+        found = self.index.query(features, excluded, self.config.appearance)
+        return [c.keyframe for c in found if c.score >= self.config.min_score]
+
+    def _verify(self, p: Proposal, depths: Depths) -> TwoView:
+        first, second = (
+            DepthView.of(self.grid, *depths[k], self._features[k]) for k in (p.first, p.second)
+        )
+        return self._verifier.verify(first, second)
