@@ -1,14 +1,15 @@
 """Self-calibration: error of the focal length, and what it costs the trajectory.
 
     python benchmarks/calibration.py NAME=FOLDER_OR_NPZ... [--frames 300] [--field-of-view 60]
-        [--starts 0,100,200] [--device cpu] [--no-tracking]
+        [--starts 0,100,200] [--device cpu] [--no-tracking] [--offset 0.025]
 
 FOLDER is in Replica or 7-Scenes layout. An NPZ holds the same ready made: JPEG images one after the
 other (data, sizes), camera (fx, fy, cx, cy, width, height) and T_wc. The known focal length and
 poses are read for the printed errors only; the search begins at the field of view given, with the
 principal point in the middle. --starts estimates from those frames on, as if the video began there;
 the trajectories are tracked, and adjusted as a whole, from frame 0 with the known focal length and
-with the one estimated there.
+with the one estimated there. --offset is for poses of another camera: how many metres to the right
+of it the one stands that took the images (7-Scenes: 0.025).
 """
 
 import argparse
@@ -90,6 +91,7 @@ def main() -> None:
     parser.add_argument("--starts", default="0")
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--radial", action="store_true")
+    parser.add_argument("--offset", type=float, default=0.0)
     parser.add_argument("--no-tracking", action="store_true")
     options = parser.parse_args()
     torch.set_num_threads(1)
@@ -102,6 +104,7 @@ def main() -> None:
     for item in options.sequences:
         name, _, path = item.partition("=")
         sequence = load(Path(path), options.frames)
+        sequence.T_wc[:, :3, 3] += options.offset * sequence.T_wc[:, :3, 0]
         first = guess(sequence.camera, options.field_of_view)
         known = sequence.camera.fx
         for start in map(int, options.starts.split(",")):
