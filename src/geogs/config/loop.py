@@ -93,7 +93,7 @@ class LoopConfig:
     """Keyframes for which a search may run beside tracking before it is waited for."""
     close_every: int = 5
     """Keyframes between two corrections, at least."""
-    min_change: float = 0.004
+    min_change: float = 0.002
     """Corrections that move no keyframe by more than this are not worth it for the map: radians,
     parts of its median depth, or of its scale."""
     agreeing: int = 2

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, Float64, Int64
+from jaxtyping import Bool, Float, Float32, Float64, Int64, UInt8
 from torch import Tensor
 
 from geogs.config import VerificationOptions
@@ -117,12 +117,20 @@ class TwoViewVerifier:
         """Mutual nearest descriptors that are clearly nearer than the second nearest."""
         if len(first) < 2 or len(second) < 2:
             return np.zeros((0, 2), np.int64)
-        there = self._distinct(first, second)
-        back = {(i, j) for j, i in self._distinct(second, first)}
-        return np.array(sorted(set(there) & back), np.int64).reshape(-1, 2)
+        there = self._distinct(first.descriptors, second.descriptors)
+        if not there:
+            return np.zeros((0, 2), np.int64)
+        # The way back is only asked of those that were hit.
+        hit = sorted({j for _, j in there})
+        back = self._distinct(second.descriptors[hit], first.descriptors)
+        return np.array(sorted(set(there) & {(i, hit[n]) for n, i in back}), np.int64).reshape(
+            -1, 2
+        )
 
-    def _distinct(self, source: Features, target: Features) -> list[tuple[int, int]]:
-        nearest = self._matcher.knnMatch(source.descriptors, target.descriptors, k=2)
+    def _distinct(
+        self, source: UInt8[np.ndarray, "n 32"], target: UInt8[np.ndarray, "m 32"]
+    ) -> list[tuple[int, int]]:
+        nearest = self._matcher.knnMatch(source, target, k=2)
         ratio = self.options.ratio
         return [(m.queryIdx, m.trainIdx) for m, n in nearest if m.distance < ratio * n.distance]
 
@@ -140,7 +148,7 @@ class TwoViewVerifier:
         b: Float32[np.ndarray, "m 2"],
         depth: Float32[np.ndarray, "m"],
     ) -> tuple[Float64[np.ndarray, "4 4"], Bool[np.ndarray, "m"]] | None:
-        """Pose by RANSAC over SQPnP, refined on its inliers."""
+        """Pose by RANSAC over three points, refined on its inliers."""
         points, image = self._points(a, depth), b.astype(np.float64)
         limit = self.options.reprojection * self._edge
         ok, r, t, chosen = cv2.solvePnPRansac(
@@ -150,7 +158,7 @@ class TwoViewVerifier:
             None,
             iterationsCount=ITERATIONS,
             reprojectionError=limit,
-            flags=cv2.SOLVEPNP_SQPNP,
+            flags=cv2.SOLVEPNP_AP3P,
         )
         if not ok or chosen is None or len(chosen) < 6:
             return None
