@@ -46,6 +46,8 @@ class Block:
     """Milliseconds per new keyframe."""
     total: float
     """Their sum."""
+    per_frame: float
+    """Milliseconds per frame: there are more keyframes where more is seen for the first time."""
     processor: float
     """Milliseconds of all CPU threads per new keyframe, whatever else the machine did."""
     resident: float
@@ -80,6 +82,7 @@ def main() -> None:
         "options": {k: str(v) for k, v in vars(options).items()},
         "blocks": [asdict(b) for b in blocks],
         "ratio": round(used[-1].total / used[0].total, 3),
+        "per_frame_ratio": round(used[-1].per_frame / used[0].per_frame, 3),
         "processor_ratio": round(used[-1].processor / used[0].processor, 3),
         "peak": memory("VmHWM"),
         "gpu_peak": torch.cuda.max_memory_allocated() / 1e9 if options.device == "cuda" else 0.0,
@@ -148,7 +151,8 @@ def follow(slam: Slam, folder: Path, frames: int, every: int) -> list[Block]:
             torch.cuda.reset_peak_memory_stats()
         blocks.append(Block(
             n + 1, status.keyframes, status.disks, {k: round(v, 1) for k, v in stages.items()},
-            round(sum(stages.values()), 1), round(1e3 * spent / fresh, 1),
+            round(sum(stages.values()), 1), round(sum(stages.values()) * fresh / (n % every + 1), 1),
+            round(1e3 * spent / fresh, 1),
             memory("VmRSS"), memory("VmHWM"), round(gpu, 3), lost,
         ))  # fmt: skip
         print(json.dumps(asdict(blocks[-1])), flush=True)
