@@ -145,13 +145,13 @@ def follow(slam: Slam, folder: Path, frames: int, every: int) -> list[Block]:
         now = dict(slam.stopwatch.seconds)
         fresh = max(status.keyframes - known, 1)
         stages = {k: 1e3 * (now[k] - before.get(k, 0.0)) / fresh for k in now}
-        gpu = 0.0
+        gpu, total = 0.0, sum(stages.values())
         if slam.mapper.map.device.type == "cuda":
             gpu = torch.cuda.max_memory_allocated() / 1e9
             torch.cuda.reset_peak_memory_stats()
         blocks.append(Block(
             n + 1, status.keyframes, status.disks, {k: round(v, 1) for k, v in stages.items()},
-            round(sum(stages.values()), 1), round(sum(stages.values()) * fresh / (n % every + 1), 1),
+            round(total, 1), round(total * fresh / (n % every + 1), 1),
             round(1e3 * spent / fresh, 1),
             memory("VmRSS"), memory("VmHWM"), round(gpu, 3), lost,
         ))  # fmt: skip
