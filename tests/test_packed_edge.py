@@ -61,7 +61,7 @@ def peak_mib() -> float:
 
 def test_a_walk_of_a_thousand_keyframes_is_adjusted_in_little_memory():
     tiny = Camera(fx=45.0, fy=45.0, cx=23.5, cy=19.5, width=48, height=40)
-    config = replace(TrackingConfig(), global_rounds=1, global_iterations=2, global_pairs=4)
+    config = replace(TrackingConfig(), global_rounds=1, global_iterations=1, global_pairs=4)
     tracker, truth = planted_tracker(1000, tiny, 0.02, config)
     drift(tracker, scale=0.004)
     before, held = error_cm(tracker, truth), peak_mib()

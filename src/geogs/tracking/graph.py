@@ -40,6 +40,10 @@ class MeasuredEdge:
     memory: Any = None
     """What the operator keeps of this edge."""
 
+    def __getstate__(self) -> dict[str, object]:
+        """What a checkpoint holds: the operator does without its memory."""
+        return {**self.__dict__, "memory": None}
+
     @staticmethod
     def of(match: FlowMatch, n: int, reprojection: Float[Tensor, "p 2"]) -> "MeasuredEdge":
         """The n-th edge of a measurement."""
@@ -124,12 +128,15 @@ class FrameGraph:
             there, back = self.operator.measure(
                 first, second, forward, backward, fine=fine, memory=memory
             )
-        store = self.keyframes
+        if packed:
+            grid, back_pairs = self.keyframes.grid, [(j, i) for i, j in pairs]
+            source, target = ([self.keyframes[p[k]] for p in pairs] for k in (0, 1))
+            forth = PackedEdge.all_of(there, grid, source, target)
+            reverse = PackedEdge.all_of(back, grid, target, source)
+            self.edges.update(zip(pairs, forth, strict=True))
+            self.edges.update(zip(back_pairs, reverse, strict=True))
+            return
         for n, (i, j) in enumerate(pairs):
-            if packed:
-                self.edges[i, j] = PackedEdge.of(there, n, store.grid, store[i], store[j])
-                self.edges[j, i] = PackedEdge.of(back, n, store.grid, store[j], store[i])
-                continue
             self.edges[i, j] = MeasuredEdge.of(there, n, forward[n])
             self.edges[j, i] = MeasuredEdge.of(back, n, backward[n])
 

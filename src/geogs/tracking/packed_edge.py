@@ -40,22 +40,32 @@ class PackedEdge:
     damping: Float[Tensor, "p"] | None = None
     memory: Any = None
 
+    def __getstate__(self) -> dict[str, object]:
+        """What a checkpoint holds: the operator does without its memory."""
+        return {**self.__dict__, "memory": None}
+
     @staticmethod
-    def of(
-        match: FlowMatch, n: int, grid: SampleGrid, source: KeyframeState, target: KeyframeState
-    ) -> "PackedEdge":
-        """The n-th edge of a measurement that started from the present state."""
-        position, half_weight = pack_matches(grid, match.pixels[n], match.weight[n])
-        return PackedEdge(
-            grid,
-            position,
-            half_weight,
-            source.T_cw,
-            target.T_cw,
-            source.inverse_depth,
-            None if match.damping is None else match.damping[n],
-            None if match.memory is None else match.memory[n],
-        )
+    def all_of(
+        match: FlowMatch,
+        grid: SampleGrid,
+        source: Sequence[KeyframeState],
+        target: Sequence[KeyframeState],
+    ) -> list["PackedEdge"]:
+        """The edges of a measurement that started from the present state."""
+        position, half_weight = pack_matches(grid, match.pixels, match.weight)
+        return [
+            PackedEdge(
+                grid,
+                position[n],
+                half_weight[n],
+                i.T_cw,
+                j.T_cw,
+                i.inverse_depth,
+                None if match.damping is None else match.damping[n],
+                None if match.memory is None else match.memory[n],
+            )
+            for n, (i, j) in enumerate(zip(source, target, strict=True))
+        ]
 
     @property
     def pixels(self) -> Float[Tensor, "p 2"]:
