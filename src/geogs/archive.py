@@ -4,20 +4,26 @@ A long video has more keyframes than fit into memory, and seldom are old ones lo
 is read and written at offsets and never mapped, so nothing of it counts as memory of the process.
 """
 
+import math
 import os
 import tempfile
 import threading
+import uuid
 import weakref
 from collections import OrderedDict, deque
 from collections.abc import Callable, Hashable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Generic, TypeVar
 
 import numpy as np
 
-from geogs.errors import OutputError
+from geogs.errors import InputError, OutputError
 
 V = TypeVar("V")
+
+_PIECE = 1 << 24
+"""Bytes copied at once."""
 
 
 class Recent(Generic[V]):
@@ -30,6 +36,13 @@ class Recent(Generic[V]):
 
     def __len__(self) -> int:
         return len(self._values)
+
+    def __getstate__(self) -> int:
+        """What a checkpoint says of it: the values are made again."""
+        return self.count
+
+    def __setstate__(self, count: int) -> None:
+        self.__init__(count)  # type: ignore[misc]
 
     def put(self, key: Hashable, value: V) -> None:
         """Keep a value as the last used; the one not used for longest may go."""
@@ -61,6 +74,9 @@ class Archive:
     It lies in ``folder``, or where the system keeps temporary files (``TMPDIR``), has no name there
     and so vanishes with the process, however that ends. The last ``resident`` arrays written or
     read stay in memory as well. Space of arrays that nobody refers to any more is used again.
+
+    For a checkpoint the file gets a name (``settle``), and what the last checkpoint refers to stays
+    until the next one is complete (``release``).
     """
 
     def __init__(self, folder: Path | str | None = None, resident: int = 0) -> None:
@@ -72,6 +88,12 @@ class Archive:
         """Key, offset and size of what nobody refers to any more; collected without a lock."""
         self._end = self._next_key = 0
         self._lock = threading.Lock()
+        self._path: Path | None = None
+        """Of the named file."""
+        self._withheld: list[tuple[int, int]] = []
+        """Offset and size of what is gone, but not for the last checkpoint."""
+        self._releasing: list[tuple[int, int]] = []
+        """The same of what is gone for the checkpoint that is being written, too."""
         try:
             self._file = tempfile.TemporaryFile(dir=self.folder, buffering=0)  # noqa: SIM115
         except OSError as error:
@@ -81,6 +103,11 @@ class Archive:
     def size(self) -> int:
         """Bytes of the file."""
         return self._end
+
+    @property
+    def settled_name(self) -> str | None:
+        """Name of the file, if it has one."""
+        return None if self._path is None else self._path.name
 
     def put(self, array: np.ndarray) -> "Archived":
         """Write an array; it must not be changed while it is resident.
@@ -94,8 +121,7 @@ class Archive:
             offset = pieces.pop() if pieces else self._end
             self._end = max(self._end, offset + array.nbytes)
             self._next_key += 1
-            archived = Archived(self, self._next_key, offset, array.shape, array.dtype)
-        weakref.finalize(archived, self._gone.append, (archived.key, offset, array.nbytes))
+        archived = self.archived(self._next_key, offset, array.shape, array.dtype)
         self._write(np.ascontiguousarray(array), offset)
         if self._recent.count:
             self._recent.put(archived.key, array)
@@ -106,6 +132,84 @@ class Archive:
         if not self._recent.count:
             return self._read(archived)
         return self._recent.get(archived.key, lambda: self._read(archived))
+
+    # --- checkpoints -----------------------------------------------------------------------
+
+    def settle(self, folder: Path) -> "SettledArchive":
+        """Put all that was written on the disk under a name in ``folder``; what to open it by.
+
+        Raises:
+            OutputError: the disk is full, or cannot be written.
+        """
+        try:
+            if self._path is None or self._path.parent != folder:
+                self._move(folder / f"archive-{uuid.uuid4().hex[:16]}")
+            os.fsync(self._file.fileno())
+        except OSError as error:
+            raise self._unwritable(error) from error
+        assert self._path is not None
+        with self._lock:
+            self._collect()
+        self._releasing, self._withheld = self._releasing + self._withheld, []
+        unused = [(o, size) for size, offsets in self._free.items() for o in offsets]
+        resident, free = self._recent.count, (*unused, *self._releasing)
+        return SettledArchive(self._path.name, resident, self._end, self._next_key, free)
+
+    def release(self) -> None:
+        """The checkpoint that was written since ``settle`` is complete and replaces the last."""
+        for offset, size in self._releasing:
+            self._free.setdefault(size, []).append(offset)
+        self._releasing = []
+
+    @classmethod
+    def reopened(cls, folder: Path, settled: "SettledArchive") -> "Archive":
+        """The archive as it was when it was settled; what was written later is cut off.
+
+        Raises:
+            InputError: the file is missing or too short.
+        """
+        archive = cls(folder, settled.resident)
+        path = folder / settled.name
+        try:
+            with path.open("r+b", buffering=0) as named:
+                if os.fstat(named.fileno()).st_size < settled.end:
+                    raise InputError(f"{path} is cut off.")
+                named.truncate(settled.end)
+                os.dup2(named.fileno(), archive._file.fileno())
+        except OSError as error:
+            raise InputError(f"{path} cannot be opened ({error.strerror or error}).") from error
+        archive._path, archive._end, archive._next_key = path, settled.end, settled.next_key
+        for offset, size in settled.free:
+            archive._free.setdefault(size, []).append(offset)
+        return archive
+
+    def archived(
+        self, key: int, offset: int, shape: tuple[int, ...], dtype: np.dtype
+    ) -> "Archived":
+        """An array that is in the file; its space is used again once nobody refers to it."""
+        archived = Archived(self, key, offset, shape, dtype)
+        size = math.prod(shape) * dtype.itemsize
+        weakref.finalize(archived, self._gone.append, (key, offset, size))
+        return archived
+
+    def _move(self, path: Path) -> None:
+        """Copy the file to another place, where it is from then on."""
+        try:
+            with path.open("x+b", buffering=0) as named:
+                done = 0
+                while done < self._end:
+                    piece = os.pread(self._file.fileno(), min(_PIECE, self._end - done), done)
+                    if not piece:  # something could not be written
+                        break
+                    done += os.pwrite(named.fileno(), piece, done)
+                os.truncate(named.fileno(), self._end)
+                os.dup2(named.fileno(), self._file.fileno())  # other threads notice nothing
+        except OSError:
+            path.unlink(missing_ok=True)
+            raise
+        self.folder, self._path = path.parent, path
+
+    # --- the file --------------------------------------------------------------------------
 
     def _write(self, array: np.ndarray, offset: int) -> None:
         rest = memoryview(array.reshape(-1).view(np.uint8).data)
@@ -131,14 +235,35 @@ class Archive:
         while self._gone:
             key, offset, size = self._gone.popleft()
             self._recent.drop(key)
-            self._free.setdefault(size, []).append(offset)
+            if self._path is None:
+                self._free.setdefault(size, []).append(offset)
+            else:
+                self._withheld.append((offset, size))
 
     def _unwritable(self, error: OSError) -> OutputError:
         reason = error.strerror or str(error)
+        remedy = (
+            "name a folder on a larger disk in TMPDIR" if self._path is None
+            else "give a folder on a larger disk for the results"
+        )  # fmt: skip
         return OutputError(
             f"The keyframes of a long video cannot be kept in {self.folder} ({reason}); free some "
-            "space, or name a folder on a larger disk in TMPDIR."
+            f"space, or {remedy}."
         )
+
+
+@dataclass(frozen=True)
+class SettledArchive:
+    """What a checkpoint says of an archive."""
+
+    name: str
+    """Of its file."""
+    resident: int
+    end: int
+    """Bytes of the file."""
+    next_key: int
+    free: tuple[tuple[int, int], ...]
+    """Offset and size of its unused pieces."""
 
 
 class Archived:

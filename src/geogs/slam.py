@@ -57,14 +57,12 @@ class Slam:
         self.config = config or Config()
         self.camera = camera
         c = self.config
-        ids, operator = KeyframeIds(), build_operator(c.tracking, SampleGrid(camera, device))
-
-        def start() -> Tracker:
-            return Tracker(camera, c.tracking, device, c.seed, operator, prior, c.prior, ids)
-
-        self.segments = Segments(start, c.tracking.patience)
-        self.loops = LoopCloser(self.segments, c.loop)
         self.device = device
+        self.prior = prior
+        self.ids = KeyframeIds()
+        self.operator = build_operator(c.tracking, SampleGrid(camera, device))
+        self.segments = Segments(self.new_tracker, c.tracking.patience)
+        self.loops = LoopCloser(self.segments, c.loop)
         self.mapper = Mapper(camera, c.mapping, device, c.seed)
         self.stopwatch = Stopwatch()
         self.frames = 0
@@ -72,6 +70,19 @@ class Slam:
         self._adjusted = 0
         """Keyframes at the last bundle adjustment of all."""
         self._is_ended = False
+
+    def new_tracker(self) -> Tracker:
+        """A tracker of another segment, whose keyframe ids follow all others'."""
+        c = self.config
+        return Tracker(
+            self.camera, c.tracking, self.device, c.seed, self.operator, self.prior, c.prior,
+            self.ids,
+        )  # fmt: skip
+
+    @property
+    def is_ended(self) -> bool:
+        """Whether the stream has ended."""
+        return self._is_ended
 
     @on_one_torch_thread
     def process(self, frame: Frame) -> SlamStatus:

@@ -4,7 +4,7 @@ import itertools
 import sys
 from collections.abc import Sequence
 from contextlib import redirect_stderr, redirect_stdout
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from io import StringIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -117,13 +117,20 @@ def listing() -> str:
     return "\n".join(lines)
 
 
+_NO_SETTINGS = {
+    "run": ("output", "source", "resume", "checkpoint_every"),
+    "reconstruct": ("output", "source"),
+}
+"""Options of each command that change nothing about its results."""
+
+
 class CommandRunner:
     """Runs tasks by the functions behind ``geogs run`` and ``geogs reconstruct``."""
 
     def settings(self, task: "Task") -> dict[str, object]:
         """Every setting of the command but its output. Raises InputError for a wrong option."""
-        options = _parsed(task)
-        return {k: v for k, v in asdict(options).items() if k not in ("output", "source")}
+        options = asdict(_parsed(task))
+        return {k: v for k, v in options.items() if k not in _NO_SETTINGS[task.command]}
 
     def run(self, task: "Task") -> None:
         """Run the command."""
@@ -132,7 +139,7 @@ class CommandRunner:
 
         options = _parsed(task)
         if isinstance(options, RunOptions):
-            run(options)
+            run(replace(options, checkpoint_every=0.0))
         else:
             reconstruct(options)
 

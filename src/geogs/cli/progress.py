@@ -42,8 +42,11 @@ def peak_memory() -> int:
 class RunProgress:
     """Shows how far a run is; a context manager, on the standard error."""
 
-    def __init__(self, frames: int | None, tracks: bool = True):
-        """Of a source of so many frames, if known; without ``tracks`` there are only stages."""
+    def __init__(self, frames: int | None, tracks: bool = True, begun: int = 0):
+        """Of a source of so many frames, if known; without ``tracks`` there are only stages.
+
+        ``begun`` frames were done by an earlier process.
+        """
         self._console = Console(stderr=True)
         self._bar = Progress(
             TextColumn("{task.description:<18}"),
@@ -54,11 +57,13 @@ class RunProgress:
             console=self._console,
             refresh_per_second=_REDRAWS,
         )
-        self._frames = frames
+        self._frames, self._begun = frames, begun
         self._start = self._printed = time.perf_counter()
         self._tasks: dict[str, TaskID] = {}
         if tracks:
-            self._tasks["tracking"] = self._bar.add_task("tracking", total=frames, info="")
+            self._tasks["tracking"] = self._bar.add_task(
+                "tracking", total=frames, completed=begun, info=""
+            )
 
     def __enter__(self) -> "RunProgress":
         self._bar.start()
@@ -74,7 +79,7 @@ class RunProgress:
 
     def frame(self, status: "SlamStatus") -> None:
         """After each frame."""
-        rate = status.frames / max(time.perf_counter() - self._start, 1e-9)
+        rate = (status.frames - self._begun) / max(time.perf_counter() - self._start, 1e-9)
         info = (
             f"{status.frames} frames  {rate:.1f}/s  {status.keyframes} keyframes  "
             f"{status.disks / 1000:.1f}k disks  {peak_memory() / 2**30:.1f} GB"

@@ -2,7 +2,7 @@
 
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, get_args
 
@@ -16,6 +16,9 @@ from geogs.cli.progress import RunProgress
 from geogs.config import Config, Preset, preset
 
 if TYPE_CHECKING:
+    from geogs.cli.run_checkpoint import RunCheckpoint, RunFacts
+    from geogs.io.sources.base import ReadingPlace
+    from geogs.io.sources.several import JointPlace
     from geogs.io.sources.sniff import Stream
     from geogs.slam import Slam
 
@@ -36,6 +39,11 @@ class RunOptions(Config):
     """Group of settings; single ones given beside it win."""
     device: str = "auto"
     """Where to compute: auto (a GPU where there is one), cpu, cuda or cuda:1; see geogs doctor."""
+    resume: Path | None = None
+    """Go on with the run that was interrupted or killed in this folder, with its source and its
+    settings; only --device and --checkpoint-every may be given beside it."""
+    checkpoint_every: float = 60.0
+    """Seconds between two checkpoints, from which --resume goes on; 0 makes none."""
     online_results: bool = False
     """Also write trajectory and mesh as they are before the final stages, to online/."""
     depth_mesh: bool = False
@@ -56,6 +64,7 @@ def run(options: RunOptions) -> Path:
     import geogs
     from geogs.cli.gpu_memory import REMEDY, full_memory_in_a_sentence
     from geogs.cli.results import SourceFacts, write_results
+    from geogs.cli.run_checkpoint import RunCheckpoint, RunFacts, SavedRun, checkpoint_folder
     from geogs.cli.surfaces import write_depth_mesh, write_online_results
     from geogs.errors import DeviceError
     from geogs.gpu.installation import require_device
@@ -65,22 +74,48 @@ def run(options: RunOptions) -> Path:
     from geogs.slam import Slam
 
     torch.set_num_threads(1)  # the kernels have threads of their own; see geogs.threads
+    saved = None if options.resume is None else SavedRun(options.resume)
+    if saved is not None:
+        options = _resumed(options, saved.facts)
     device = require_device(options.device)
     source = open_sources(options.source, options.input)
     output = prepare_output_folder(options.output or Path("out") / source.name)
     if device.type == "cuda":
         prepare_kernels(Path(geogs.__file__).parent, device)
-    source = self_calibrated(source, options, device)
+    if saved is None:
+        opened, source = source, self_calibrated(source, options, device)
+        found = None if source is opened else source.calibration
+    else:
+        saved.check_source(source)
+        found = saved.facts.calibration
+        source = source if found is None else source.with_calibration(found)
     prior = open_prior(options.prior, source.camera, device)
     slam = Slam(source.camera, options, str(device), prior)
-    progress = RunProgress(source.length)
+    if saved is not None:
+        saved.restore(slam)
+        place = saved.facts.place
+    else:
+        place = source.place
+    progress = RunProgress(source.length, begun=slam.frames)
+    facts = RunFacts(_absolute(options), device.type, source.fingerprint(), found, place)
+    checkpoint = RunCheckpoint(output, facts, options.checkpoint_every, progress)
     with full_memory_in_a_sentence(), Interruption() as stop, progress:
-        full = not _feed(slam, source, progress, stop)
+        if saved is not None:
+            progress.write(f"Going on after {slam.frames} frames.")
+        elif checkpoint_folder(output).is_dir():
+            progress.write(
+                f"Starting anew; geogs run --resume {output} would go on with the unfinished run "
+                "there, until the first checkpoint of this one."
+            )
+        full = not _feed(slam, source, place, checkpoint, progress, stop)
         interrupted = full or stop.requested
         if interrupted:
             why = "The GPU has no memory left" if full else "Stopping early"
             progress.write(f"{why}; keeping what there is. Press Ctrl-C again to quit.")
+            kept = not full and checkpoint.write(slam, source)
         slam.end_stream()
+        if not interrupted:
+            kept = checkpoint.write(slam, source)
         if options.online_results:
             write_online_results(output, slam, options.mesh, progress)
         interrupted |= not _finish(slam, progress, stop, correct=not interrupted)
@@ -94,20 +129,64 @@ def run(options: RunOptions) -> Path:
             f"The memory of the GPU was full after {slam.frames} frames, whose results are in "
             f"{output}/; {REMEDY}."
         )
+    if not interrupted:
+        checkpoint.remove()
+    elif kept:
+        print(f"geogs run --resume {output} goes on from here.")
     print(f"Results are in {output}/")
     return output
 
 
-def _feed(slam: "Slam", source: "Stream", progress: RunProgress, stop: Interruption) -> bool:
-    """All frames through the system, until a request to stop; false if the GPU's memory is full."""
+def _resumed(options: RunOptions, facts: "RunFacts") -> RunOptions:
+    """The options that the run began with. Raises InputError if others are asked for."""
+    from geogs.errors import InputError
+
+    given = replace(options, resume=None, device="auto", checkpoint_every=60.0)
+    if given != replace(_defaults("default"), source=()):
+        raise InputError(
+            "--resume goes on with the source and the settings of the run; leave out everything "
+            "else but --device and --checkpoint-every."
+        )
+    device = facts.options.device
+    if options.device != "auto":
+        device = options.device
+    elif not device.startswith(facts.device):  # what auto was found to be
+        device = facts.device
+    if not device.startswith(facts.device):
+        raise InputError(f"The run was on {facts.device}, and can only go on there.")
+    every = options.checkpoint_every
+    return replace(facts.options, output=options.resume, device=device, checkpoint_every=every)
+
+
+def _absolute(options: RunOptions) -> RunOptions:
+    """With paths that hold wherever the run is resumed from."""
+    sources = tuple(path.expanduser().absolute() for path in options.source)
+    return replace(options, source=sources, output=None, resume=None)
+
+
+def _feed(
+    slam: "Slam",
+    source: "Stream",
+    place: "ReadingPlace | JointPlace",
+    checkpoint: "RunCheckpoint",
+    progress: RunProgress,
+    stop: Interruption,
+) -> bool:
+    """All frames after a place through the system, until a request to stop; false if the GPU's
+    memory is full."""
     import torch
 
+    from geogs.cli.run_checkpoint import frames_after
+
+    if slam.is_ended:
+        return True
     try:
-        for frame in source:
+        for frame in frames_after(source, place):
             status = slam.process(frame)
             progress.frame(status)
             if stop.requested:
                 break
+            checkpoint.after_frame(slam, source)
     except torch.cuda.OutOfMemoryError:
         torch.cuda.empty_cache()
         return False
@@ -135,16 +214,21 @@ def _finish(slam: "Slam", progress: RunProgress, stop: Interruption, correct: bo
 
 def parse(argv: Sequence[str]) -> RunOptions:
     """Options with the preset as defaults, over which single settings win."""
-    name = _preset_name(argv)
-    base = preset(name)
-    settings = {f.name: getattr(base, f.name) for f in fields(base)}
-    default = RunOptions(**settings, source=tyro.MISSING, preset=name)
+    default = _defaults(_preset_name(argv))
+    if given(argv, "resume") is not None:
+        default = replace(default, source=())
     short = {
         **SHORT,
         "--intrinsics": "--input.intrinsics",
         "--global-ba-every": "--loop.global-ba-every",
     }
     return parse_options(RunOptions, argv, "run", default=default, short=short)
+
+
+def _defaults(name: Preset) -> RunOptions:
+    base = preset(name)
+    settings = {f.name: getattr(base, f.name) for f in fields(base)}
+    return RunOptions(**settings, source=tyro.MISSING, preset=name)
 
 
 def _preset_name(arguments: Sequence[str]) -> Preset:

@@ -4,6 +4,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -81,11 +82,23 @@ class LoopDetector:
         self.refusals: list[Refusal] = []
         """Of the last update."""
         self._search = PlaceSearch(grid, self.config)
-        self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="loops")
+        self._thread = _search_thread()
         self._order: dict[int, int] = {}
         """Place in time of each keyframe taken so far."""
         self._pending: deque[Future[list[Sighting]]] = deque()
         self._loops: list[Loop] = []
+
+    def __getstate__(self) -> dict[str, object]:
+        """What a checkpoint holds: searches that are under way are finished first."""
+        found = [future.result() for future in self._pending]
+        state = {**self.__dict__, "_pending": found}
+        del state["_thread"]
+        return state
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._thread = _search_thread()
+        self._pending = deque(map(_done, state["_pending"]))
 
     @property
     def loops(self) -> tuple[Loop, ...]:
@@ -197,3 +210,14 @@ class LoopDetector:
             p.first, p.second, p.cause, check.T_ji, check.scale, inliers, check.matched,
             check.there, check.back,
         )  # fmt: skip
+
+
+def _search_thread() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(max_workers=1, thread_name_prefix="loops")
+
+
+def _done(sightings: list[Sighting]) -> Future[list[Sighting]]:
+    """A search whose result is known."""
+    future: Future[list[Sighting]] = Future()
+    future.set_result(sightings)
+    return future

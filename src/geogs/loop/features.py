@@ -31,10 +31,14 @@ class FeatureExtractor:
     """Finds oriented FAST corners at eight scales and describes them by ORB."""
 
     def __init__(self, options: RetrievalOptions) -> None:
+        self.options = options
         self.count = options.features
         self._orb = cv2.ORB.create(
             nfeatures=round(SURPLUS * options.features), fastThreshold=options.fast_threshold
         )
+
+    def __reduce__(self) -> tuple:
+        return FeatureExtractor, (self.options,)
 
     def __call__(self, image: UInt8[np.ndarray, "h w 3"]) -> Features:
         """Features of an RGB image; none where nothing stands out."""

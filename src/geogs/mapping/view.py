@@ -259,6 +259,19 @@ class MapView:
 
     def park(self, archive: Archive) -> None:
         """Leave the memory; what has changed since the last time is archived."""
+        self._store(archive)
+        self._maps = None
+
+    def keep(self) -> None:
+        """Archive what has changed, as for a checkpoint; the view stays in memory."""
+        assert self._resident is not None, "a view without a pool has no archive"
+        self._store(self._resident.archive)
+
+    def __getstate__(self) -> dict[str, object]:
+        """What a checkpoint holds of a view that is kept; its maps come back when asked for."""
+        return {**self.__dict__, "_maps": None}
+
+    def _store(self, archive: Archive) -> None:
         maps = self._maps
         if maps is None:
             return
@@ -267,7 +280,6 @@ class MapView:
         if not self._is_render_parked and maps.rendered_depth is not None:
             self._parked.rendered_depth = archive.put(maps.rendered_depth.cpu().numpy())
         self._is_depth_parked = self._is_render_parked = True
-        self._maps = None
 
     def _held(self) -> ViewMaps:
         """The maps in memory, which were brought back if need be."""

@@ -109,6 +109,10 @@ class ResidentViews:
     def __len__(self) -> int:
         return len(self._views)
 
+    def __getstate__(self) -> dict[str, object]:
+        """What a checkpoint holds: no view is in memory when it is read."""
+        return {**self.__dict__, "_views": OrderedDict()}
+
     def use(self, view: Parkable) -> None:
         """A view is in memory and in use: the one not used for longest may leave."""
         self._views[view] = None

@@ -4,10 +4,12 @@ A format supplies a :class:`Reader` (how images are stored); :class:`Source` add
 common: the selection of frames, the calibration, the working resolution and reading ahead.
 """
 
+import hashlib
 import logging
-from collections.abc import Generator, Iterator
+from collections.abc import Generator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Protocol, TypeVar, runtime_checkable
 
 import numpy as np
@@ -37,6 +39,16 @@ class RawFrame:
     """RGB; none where it could not be read."""
 
 
+@dataclass(frozen=True, slots=True)
+class ReadingPlace:
+    """How far a source has been read."""
+
+    frames: int = 0
+    """Given."""
+    skipped: int = 0
+    """Images before the last of them that could not be read."""
+
+
 @runtime_checkable
 class Reader(Protocol):
     """How one format stores its images."""
@@ -56,6 +68,11 @@ class Reader(Protocol):
     """Images in the source; none where only reading to the end would tell."""
     calibration: Calibration | None
     """The camera as far as the data set says."""
+
+    @property
+    def paths(self) -> Sequence[Path]:
+        """The files that are read."""
+        ...
 
     def read(self, start: int, stop: int | None, stride: int) -> Iterator[RawFrame]:
         """Read images ``start, start + stride, ...`` before ``stop``."""
@@ -83,6 +100,8 @@ class Source:
         self._rectifier = Rectifier(self.calibration, config.long_edge)
         self.skipped = 0
         """Images that could not be read, so far in this iteration."""
+        self.place = ReadingPlace()
+        """How far the source has been read, at each frame of this iteration."""
 
     @property
     def name(self) -> str:
@@ -133,20 +152,29 @@ class Source:
         stop = self._reader.length if stop is None else min(stop, self._reader.length)
         return len(range(self._config.start, stop, self._config.stride))
 
+    def fingerprint(self) -> str:
+        """Sixteen digits that change with the names and sizes of the files."""
+        sizes = [(p.name, p.stat().st_size if p.is_file() else -1) for p in self._reader.paths]
+        return hashlib.sha256(repr(sizes).encode()).hexdigest()[:16]
+
     def __iter__(self) -> Generator[Frame, None, None]:
         """Yield the frames; the next one is read while the present one is used.
 
         Raises:
             InputError: an image of another size, or no image that can be read.
         """
-        self.skipped = 0
-        index = 0
-        for raw in read_ahead(self._rectified()):
+        return self.frames_after(ReadingPlace())
+
+    def frames_after(self, place: ReadingPlace) -> Generator[Frame, None, None]:
+        """Yield the frames after a place; otherwise as the iteration over all."""
+        self.place, self.skipped, index = place, place.skipped, place.frames
+        for raw in read_ahead(self._rectified(place.frames + place.skipped)):
             if raw.image is None:
                 self.skipped += 1
                 if self.skipped == 1:
                     _log.warning("%s cannot be read; skipped.", raw.label)
                 continue
+            self.place = ReadingPlace(index + 1, self.skipped)
             yield Frame(index, raw.timestamp, raw.image)
             index += 1
         if index == 0:
@@ -154,9 +182,11 @@ class Source:
         if self.skipped > 1:
             _log.warning("%s: skipped %d images that cannot be read.", self.name, self.skipped)
 
-    def _rectified(self) -> Iterator[RawFrame]:
+    def _rectified(self, first: int) -> Iterator[RawFrame]:
+        """The images of the selection from its ``first`` on."""
         config, reader = self._config, self._reader
-        for raw in reader.read(config.start, config.stop, config.stride):
+        start = config.start + first * config.stride
+        for raw in reader.read(start, config.stop, config.stride):
             if raw.image is not None:
                 _check_size(raw, reader)
                 raw = RawFrame(raw.label, raw.timestamp, self._rectifier(raw.image))

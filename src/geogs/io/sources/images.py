@@ -52,6 +52,11 @@ class ImageList:
             raise InputError(f"{name}: none of its {len(files)} images can be read.")
         self.height, self.width = first.shape[:2]
 
+    @property
+    def paths(self) -> list[Path]:
+        """The files that are read."""
+        return [file.path for file in self.files]
+
     def read(self, start: int, stop: int | None, stride: int) -> Iterator[RawFrame]:
         """Read images ``start, start + stride, ...`` before ``stop``."""
         for file in self.files[start:stop:stride]:

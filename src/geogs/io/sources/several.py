@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
-from geogs.io.sources.base import Source
+from geogs.io.sources.base import ReadingPlace, Source
 from geogs.io.sources.calibration import Calibration
 from geogs.types import Frame
 
@@ -27,6 +27,20 @@ class SourceSpan:
     """Of its first frame in its own time."""
 
 
+@dataclass(frozen=True, slots=True)
+class JointPlace:
+    """How far several sources have been read."""
+
+    frames: int = 0
+    """Given, of all together."""
+    time: float = 0.0
+    """Of the last, seconds in the joint time."""
+    spans: tuple[SourceSpan, ...] = ()
+    """Of the sources that were begun."""
+    places: tuple[ReadingPlace, ...] = ()
+    """In each of these."""
+
+
 class SeveralSources:
     """Frames of several sources one after the other, numbered and timed through.
 
@@ -41,6 +55,8 @@ class SeveralSources:
             _check_same(first, other)
         self.spans: list[SourceSpan] = []
         """Where each source that was read so far begins, in this iteration."""
+        self.place = JointPlace()
+        """How far the sources have been read, at each frame of this iteration."""
 
     @property
     def name(self) -> str:
@@ -91,19 +107,34 @@ class SeveralSources:
         """Images that could not be read, so far in this iteration."""
         return sum(s.skipped for s in self._sources)
 
+    def fingerprint(self) -> str:
+        """Changes with the names and sizes of the files of any."""
+        return "-".join(s.fingerprint() for s in self._sources)
+
     def __iter__(self) -> Generator[Frame, None, None]:
         """Yield the frames of all. Raises InputError as each of them does."""
-        self.spans = []
-        index, end = 0, 0.0
-        for source in self._sources:
-            shift: float | None = None
-            for frame in source:
+        return self.frames_after(JointPlace())
+
+    def frames_after(self, place: JointPlace) -> Generator[Frame, None, None]:
+        """Yield the frames after a place; otherwise as the iteration over all."""
+        self.spans = list(place.spans)
+        index, end = place.frames, place.time
+        for n, source in enumerate(self._sources):
+            if n < len(place.places) - 1:
+                source.skipped, source.place = place.places[n].skipped, place.places[n]
+                continue
+            is_begun = n < len(place.places)
+            begin = place.places[n] if is_begun else ReadingPlace()
+            shift = self.spans[n].first_time - self.spans[n].own_time if is_begun else None
+            for frame in source.frames_after(begin):
                 starts = shift is None
                 if shift is None:
                     shift = end + PAUSE - frame.timestamp if index else 0.0
                     time = frame.timestamp + shift
                     self.spans.append(SourceSpan(source.name, index, time, frame.timestamp))
                 end = frame.timestamp + shift
+                places = tuple(s.place for s in self._sources[: n + 1])
+                self.place = JointPlace(index + 1, end, tuple(self.spans), places)
                 yield replace(frame, index=index, timestamp=end, follows_cut=starts and index > 0)
                 index += 1
 

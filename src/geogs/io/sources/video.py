@@ -41,6 +41,11 @@ class VideoFile:
         self.width, self.height = size[::-1] if self.quarter_turns % 2 else size
         self.calibration: Calibration | None = None
 
+    @property
+    def paths(self) -> list[Path]:
+        """The file that is read."""
+        return [self._path]
+
     def read(self, start: int, stop: int | None, stride: int) -> Iterator[RawFrame]:
         """Decode from the beginning and yield frames ``start, start + stride, ...``."""
         last: float | None = None
