@@ -93,6 +93,11 @@ class LoopConfig:
     """Keyframes for which a search may run beside tracking before it is waited for."""
     close_every: int = 5
     """Keyframes between two corrections, at least."""
+    strain: float = 7.0
+    """Squared error of a loop at the present poses, in its own variances, from which it calls for a
+    correction; of seven numbers that are right, the mean is 7."""
+    kept: int = 200
+    """Relative poses of loops from which on older ones are thinned out."""
     min_change: float = 0.002
     """Corrections that move no keyframe by more than this are not worth it for the map: radians,
     parts of its median depth, or of its scale."""

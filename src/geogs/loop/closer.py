@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
@@ -18,6 +19,8 @@ from geogs.loop.constraints import (
     of_edges,
     of_loop,
     rescaled,
+    strains,
+    thinned,
 )
 from geogs.loop.detect import Loop, LoopDetector
 from geogs.loop.pose_graph import RelativePoses
@@ -45,7 +48,7 @@ class _Known:
     """Of edges that the tracker has let go of."""
     loops: RelativePoses = field(default_factory=none_known)
     pending: int = 0
-    """Loops found since the last attempt to close."""
+    """Loops that disagree with the poses, found since the last attempt to close."""
     last_attempt: int = 0
     """Number of keyframes at it."""
 
@@ -110,9 +113,11 @@ class LoopCloser:
         if first is not second:
             self._between.append(loop)
             return
-        known = self._of(first)
-        known.loops = joined([known.loops, self._constraint(loop)])
-        known.pending += 1
+        known, constraint = self._of(first), self._constraint(loop)
+        known.loops = thinned(joined([known.loops, constraint]), self.config.kept)
+        ends = sorted({loop.first, loop.second})
+        strain = strains(first.store.poses(ends), between_positions(constraint, ends))
+        known.pending += bool((strain > self.config.strain).any())
 
     def _constraint(self, loop: Loop) -> RelativePoses:
         stores = self.segments.store_of
@@ -157,9 +162,9 @@ class LoopCloser:
         """Whether a loop lands where a Sim(3) of the segments would."""
         _, guest = self._ends(loop)
         state = guest.store[loop.second if loop.second in guest.store else loop.first]
-        depth = 1 / float(state.inverse_depth.median())
+        depth = 1 / state.inverse_depth.median().cpu().double()
         error = disagreement(state.T_cw @ self._claim(loop), state.T_cw @ S, depth)
-        return error < self.config.join_tolerance
+        return float(error) < self.config.join_tolerance
 
     def _merge(self, host: Tracker, guest: Tracker, S: Float[Tensor, "4 4"]) -> tuple[int, ...]:
         self._retire(guest)
@@ -184,7 +189,9 @@ class LoopCloser:
         """Correct the world by its loops, if there are new ones and they change something."""
         world = self.segments.world
         known, ids = self._of(world), world.store.ids
-        due = is_last or len(ids) - known.last_attempt >= self.config.close_every
+        # A correction costs in proportion to the keyframes, so it comes once in a part of them.
+        pause = max(self.config.close_every, len(ids) // 20)
+        due = is_last or len(ids) - known.last_attempt >= pause
         if not known.pending or not due:
             return None
         known.pending, known.last_attempt = 0, len(ids)
@@ -201,12 +208,10 @@ class LoopCloser:
 
     def _change(self, correction: PoseCorrection) -> float:
         """How far a correction moves the keyframe that it moves most."""
-        store = self.segments.world.store
-        changes = []
-        for k, before in correction.before.items():
-            scale = correction.scale[k]
-            S = correction.after[k].clone()
-            S[:3] *= scale
-            depth = 1 / float(store[k].inverse_depth.median())
-            changes.append(disagreement(S, before, depth))
-        return max(changes)
+        store, ids = self.segments.world.store, sorted(correction.before)
+        scale = torch.tensor([correction.scale[k] for k in ids], dtype=torch.float64)
+        S = torch.stack([correction.after[k] for k in ids])
+        S[:, :3] *= scale[:, None, None]
+        before = torch.stack([correction.before[k] for k in ids])
+        depth = 1 / store.inverse_depths(ids).median(1).values.cpu().double()
+        return float(disagreement(S, before, depth).max())

@@ -17,8 +17,8 @@ from geogs.tracking.grid import SampleGrid
 from geogs.tracking.keyframes import KeyframeStore, scaled
 from geogs.tracking.packed_edge import PackedEdge
 
-SETTLED = RelativePoseOptions(iterations=2)
-"""For edges that a bundle adjustment has already fitted."""
+SETTLED = RelativePoseOptions(iterations=0)
+"""For edges that a bundle adjustment has fitted, with more than they tell alone."""
 
 
 def none_known() -> RelativePoses:
@@ -103,7 +103,26 @@ def _named(relative: RelativePoses, ids: Sequence[int]) -> RelativePoses:
     return replace(relative, source=names[relative.source], target=names[relative.target])
 
 
-def disagreement(S: Float[Tensor, "4 4"], other: Float[Tensor, "4 4"], depth: float) -> float:
+def thinned(relative: RelativePoses, most: int) -> RelativePoses:
+    """At most so many relative poses: of the older half, every second goes when there are more."""
+    n = len(relative)
+    if n <= most:
+        return relative
+    place = torch.arange(n)
+    return relative.select((place >= n // 2) | (place % 2 == 0))
+
+
+def strains(T_cw: Float[Tensor, "n 4 4"], relative: RelativePoses) -> Float[Tensor, "e"]:
+    """Squared errors of relative poses between places at given poses, in their own variances."""
+    now = T_cw[relative.target] @ se3_inverse(T_cw[relative.source])
+    error = sim3_log(relative.G @ sim3_inverse(now))
+    return (relative.information * error.square()).sum(-1)
+
+
+def disagreement(
+    S: Float[Tensor, "*b 4 4"], other: Float[Tensor, "*b 4 4"], depth: Float[Tensor, "*b"]
+) -> Float[Tensor, "*b"]:
     """Largest of the turn in radians, the shift over a depth, and the change of scale."""
     error = sim3_log(S @ sim3_inverse(other)).abs()
-    return max(float(error[:3].norm()) / depth, float(error[3:6].norm()), float(error[6]))
+    shift, turn = error[..., :3].norm(dim=-1) / depth, error[..., 3:6].norm(dim=-1)
+    return torch.stack([shift, turn, error[..., 6]]).amax(0)
