@@ -234,7 +234,9 @@ class FrameGraph:
             filled = self.keyframes.grid.fill_all(depth, information)
             for m, n in enumerate(rows):
                 state = self.keyframes[ids[n]]
-                state.inverse_depth, state.information = filled[m], information[m]
+                # Copies: a row would keep the whole stack in memory.
+                state.inverse_depth = filled[m].clone()
+                state.information = information[m].clone()
         return result
 
     def _solve(
