@@ -14,7 +14,7 @@ from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
 from types import MethodType
-from typing import Any, BinaryIO
+from typing import Any, Protocol, runtime_checkable
 
 import cv2
 import numpy as np
@@ -56,7 +56,29 @@ _FOLDER = object()
 """Stands for the folder of the archives."""
 
 
-def write_slam(stream: BinaryIO, slam: Slam, folder: Path) -> list[Archive]:
+@runtime_checkable
+class ByteSink(Protocol):
+    """What can be written to."""
+
+    def write(self, data: bytes, /) -> int:
+        """As of a binary file."""
+        ...
+
+
+@runtime_checkable
+class ByteSource(Protocol):
+    """What can be read from."""
+
+    def read(self, size: int, /) -> bytes:
+        """As of a binary file."""
+        ...
+
+    def readline(self) -> bytes:
+        """As of a binary file."""
+        ...
+
+
+def write_slam(stream: ByteSink, slam: Slam, folder: Path) -> list[Archive]:
     """Write a system between two frames; its archives lie in ``folder`` from now on.
 
     Returns the archives, to be released once the state is safe. What the flow operator remembers of
@@ -72,7 +94,7 @@ def write_slam(stream: BinaryIO, slam: Slam, folder: Path) -> list[Archive]:
     return writer.archives
 
 
-def read_slam(stream: BinaryIO, slam: Slam, folder: Path) -> None:
+def read_slam(stream: ByteSource, slam: Slam, folder: Path) -> None:
     """Give a new system, made with the same camera and settings, the state that was written.
 
     Raises:
@@ -85,13 +107,13 @@ def read_slam(stream: BinaryIO, slam: Slam, folder: Path) -> None:
     vars(slam).update(state)
 
 
-def write_record(stream: BinaryIO, record: object) -> None:
+def write_record(stream: ByteSink, record: object) -> None:
     """Write a frozen record of plain values."""
     _Writer(stream).dump(record)
 
 
 def read_record(
-    stream: BinaryIO,
+    stream: ByteSource,
     kind: type,
     slam: Slam | None = None,
     folder: Path | None = None,
@@ -117,7 +139,7 @@ class _Writer(pickle.Pickler):
     """Leaves out what belongs to the process."""
 
     def __init__(
-        self, stream: BinaryIO, slam: Slam | None = None, folder: Path | None = None
+        self, stream: ByteSink, slam: Slam | None = None, folder: Path | None = None
     ) -> None:
         super().__init__(stream, PROTOCOL)
         self.folder = folder
@@ -158,7 +180,7 @@ class _Reader(pickle.Unpickler):
 
     def __init__(
         self,
-        stream: BinaryIO,
+        stream: ByteSource,
         slam: Slam | None,
         folder: Path | None,
         more: frozenset[tuple[str, str]],

@@ -9,8 +9,9 @@ import zlib
 from collections.abc import Generator
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from io import BufferedReader
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO
+from typing import TYPE_CHECKING
 
 import geogs
 from geogs.cli.progress import RunProgress
@@ -21,7 +22,7 @@ from geogs.io.sources.several import JointPlace, SeveralSources
 from geogs.io.sources.sniff import Stream
 from geogs.io.writers.atomic import atomic_file
 from geogs.slam import Slam
-from geogs.slam_state import read_record, read_slam, write_record, write_slam
+from geogs.slam_state import ByteSink, read_record, read_slam, write_record, write_slam
 from geogs.types import Frame
 
 if TYPE_CHECKING:
@@ -103,8 +104,8 @@ class RunCheckpoint:
         with atomic_file(self.folder / "state") as stream:
             checked = _CheckedWriter(stream)
             checked.write(_TITLE)
-            write_record(checked, facts)  # type: ignore[arg-type]  # only writes
-            archives = write_slam(checked, slam, self.folder)  # type: ignore[arg-type]
+            write_record(checked, facts)
+            archives = write_slam(checked, slam, self.folder)
             stream.write(checked.sum.to_bytes(_CHECKSUM_BYTES, "big"))
         used = {archive.settled_name for archive in archives}
         for archive in archives:
@@ -151,7 +152,7 @@ class SavedRun:
                 "sizes); put it back, or start anew without --resume."
             )
 
-    def _check(self, stream: BinaryIO) -> None:
+    def _check(self, stream: BufferedReader) -> None:
         """Leave the stream behind the title if title and checksum are right."""
         title = stream.readline(200)
         if title != _TITLE:
@@ -188,7 +189,7 @@ def frames_after(source: Stream, place: ReadingPlace | JointPlace) -> Generator[
 class _CheckedWriter:
     """Passes on what is written, and sums it up."""
 
-    def __init__(self, stream: BinaryIO) -> None:
+    def __init__(self, stream: ByteSink) -> None:
         self._stream = stream
         self.sum = 0
 
