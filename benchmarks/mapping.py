@@ -13,6 +13,7 @@ import argparse
 import json
 import sys
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -152,7 +153,9 @@ class Scorer:
             flush=True,
         )
 
-    def mesh(self, name: str, views: list[DepthMapView], min_weight: float | None = None) -> None:
+    def mesh(
+        self, name: str, views: Sequence[DepthMapView], min_weight: float | None = None
+    ) -> None:
         """Fuse depth maps with the settings of a run and compare."""
         config = self.config.mesh
         if min_weight is not None:

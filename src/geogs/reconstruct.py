@@ -1,7 +1,7 @@
 """The disk map from images with known poses: find the scene, search depths, grow, train."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +18,7 @@ from geogs.mapping.map_frame import MapFrame
 from geogs.mapping.mapper import Mapper
 from geogs.mapping.state import MapperState, mapper_state, restore_mapper
 from geogs.mapping.training import TrainingPlace
+from geogs.on_demand import OnDemand
 from geogs.splat.map import DiskParameters
 from geogs.stopwatch import Stopwatch
 from geogs.threads import on_one_torch_thread
@@ -166,10 +167,11 @@ class Reconstruction:
         return self._frame.world_snapshot(self.mapper.map.snapshot())
 
     @on_one_torch_thread
-    def renders(self, disks: MapSnapshot | None = None) -> list[RenderedKeyframe]:
+    def renders(self, disks: MapSnapshot | None = None) -> Sequence[RenderedKeyframe]:
         """Depth, normal and reliability of the map seen from every image, inside its mask.
 
-        Of an earlier snapshot's disks where they are given.
+        Of an earlier snapshot's disks where they are given. Rendered now; of many images most are
+        read from a temporary file when they are asked for.
         """
         with self.stopwatch("rendering"):
             if disks is None:
@@ -177,17 +179,20 @@ class Reconstruction:
             earlier = DiskParameters.of(self._frame.map_snapshot(disks))
             return self._in_world(self.mapper.renders(earlier))
 
-    @on_one_torch_thread
     def particulars(self) -> dict[str, object]:
         """Nothing that is not said of every result."""
         return {}
 
-    def depth_maps(self) -> list[RenderedKeyframe]:
-        """Depth and confidence of every image as searched, without the disks."""
+    def depth_maps(self) -> Sequence[RenderedKeyframe]:
+        """Depth and confidence of every image as searched, without the disks.
+
+        Each is read when it is asked for, as it is at that time.
+        """
         return self._in_world(self.mapper.depth_maps())
 
-    def _in_world(self, renders: list[RenderedKeyframe]) -> list[RenderedKeyframe]:
-        return [self._frame.world_render(r, self._poses[r.keyframe_id]) for r in renders]
+    def _in_world(self, renders: Sequence[RenderedKeyframe]) -> Sequence[RenderedKeyframe]:
+        frame, poses = self._frame, self._poses
+        return OnDemand(renders, lambda r: frame.world_render(r, poses[r.keyframe_id]))
 
     def _first_points(self, progress: Callable[[float], None]) -> np.ndarray:
         views, depth = list(self.mapper.views.values()), self.config.mapping.depth

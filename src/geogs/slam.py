@@ -1,7 +1,7 @@
 """The system on one page: track, grow and train the map, refine poses, correct globally."""
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
@@ -147,14 +147,19 @@ class Slam:
         return self.mapper.map.snapshot()
 
     @on_one_torch_thread
-    def renders(self) -> list[RenderedKeyframe]:
-        """Depth, normal and reliability of the map seen from every mapped keyframe."""
+    def renders(self) -> Sequence[RenderedKeyframe]:
+        """Depth, normal and reliability of the map as it is now, seen from every mapped keyframe.
+
+        Of a long video most are read from a temporary file when they are asked for.
+        """
         with self.stopwatch("rendering"):
             return self.mapper.renders()
 
-    @on_one_torch_thread
-    def depth_maps(self) -> list[RenderedKeyframe]:
-        """Depth and confidence of every mapped keyframe as searched, without the disks."""
+    def depth_maps(self) -> Sequence[RenderedKeyframe]:
+        """Depth and confidence of every mapped keyframe as searched, without the disks.
+
+        Each is read when it is asked for, as it is at that time.
+        """
         return self.mapper.depth_maps()
 
     def _close_loops(self, result: TrackResult, is_last: bool = False) -> TrackResult:

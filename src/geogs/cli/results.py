@@ -55,11 +55,11 @@ class MappedScene(Protocol):
         """The disks."""
         ...
 
-    def renders(self) -> list[RenderedKeyframe]:
+    def renders(self) -> Sequence[RenderedKeyframe]:
         """The map seen from every keyframe."""
         ...
 
-    def depth_maps(self) -> list[RenderedKeyframe]:
+    def depth_maps(self) -> Sequence[RenderedKeyframe]:
         """The keyframes' depths as searched."""
         ...
 
@@ -144,7 +144,7 @@ def write_config(path: Path, config: Config | ReconstructConfig) -> None:
     write_text(path, yaml.safe_dump(plain, sort_keys=False))
 
 
-def splat_colours(disks: MapSnapshot, views: list[DepthMapView]) -> np.ndarray:
+def splat_colours(disks: MapSnapshot, views: Sequence[DepthMapView]) -> np.ndarray:
     """RGB in [0, 1] of every disk, from the images that see it; the map itself has no colour."""
     points = Mesh(
         disks.position.cpu().numpy(), np.zeros((0, 3), np.int32), disks.normal.cpu().numpy()
@@ -218,7 +218,7 @@ def lost_spans(trajectory: Trajectory) -> list[list[float]]:
 def write_report(
     folder: Path,
     trajectory: Trajectory,
-    renders: list[RenderedKeyframe],
+    renders: Sequence[RenderedKeyframe],
     mesh: Mesh | None,
     summary: dict[str, object],
 ) -> None:

@@ -1,5 +1,6 @@
 """Meshes as files: of the result, of what there was before it, and of depths without disks."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -10,20 +11,21 @@ from geogs.io.writers.ply import write_mesh
 from geogs.io.writers.tum import write_tum_trajectory
 from geogs.mesh.extract import extract_mesh
 from geogs.mesh.types import DepthMapView, Mesh
+from geogs.on_demand import OnDemand
 from geogs.types import RenderedKeyframe
 
 if TYPE_CHECKING:
     from geogs.cli.results import MappedScene
 
 
-def fusion_views(renders: list[RenderedKeyframe]) -> list[DepthMapView]:
-    """The renderings as what mesh extraction takes."""
-    return [DepthMapView(r.depth, r.weight, r.camera, r.T_cw, r.image) for r in renders]
+def fusion_views(renders: Sequence[RenderedKeyframe]) -> Sequence[DepthMapView]:
+    """The renderings as what mesh extraction takes, each when it is asked for."""
+    return OnDemand(renders, lambda r: DepthMapView(r.depth, r.weight, r.camera, r.T_cw, r.image))
 
 
 def write_surface(
     path: Path,
-    renders: list[RenderedKeyframe],
+    renders: Sequence[RenderedKeyframe],
     config: MeshConfig,
     progress: RunProgress,
     name: str = "mesh",

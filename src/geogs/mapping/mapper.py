@@ -1,8 +1,9 @@
 """The back end: keyframe depths in, a trained disk map and refined poses out."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -16,6 +17,7 @@ from geogs.mapping.depth_engine import depth_engine
 from geogs.mapping.keyframe_depths import CANDIDATES, KeyframeDepths
 from geogs.mapping.map_update import MapUpdate, plan_update, witness
 from geogs.mapping.rendered import rendered_keyframe, searched_keyframe
+from geogs.mapping.stored_renders import RenderStore, StoredRender
 from geogs.mapping.training import (
     Batch,
     MapTrainer,
@@ -26,6 +28,7 @@ from geogs.mapping.training import (
 from geogs.mapping.view import MapCameras, MapView, PosedDepths
 from geogs.mapping.view_maps import ResidentViews
 from geogs.mapping.window import choose_partners, draw_views, views_around
+from geogs.on_demand import OnDemand
 from geogs.splat.density import (
     candidate_pixels,
     split,
@@ -233,15 +236,28 @@ class Mapper:
         self._carve(self._mapped_around(view, _VOTERS))
 
     @torch.no_grad()
-    def renders(self, disks: DiskParameters | None = None) -> list[RenderedKeyframe]:
-        """The map, or other disks in its frame, seen from every mapped keyframe."""
-        disks = self.map.parameters if disks is None else disks
-        views, camera = [self.views[i] for i in self.mapped], self.cameras.render
-        return [rendered_keyframe(view, disks, camera, self.config) for view in views]
+    def renders(self, disks: DiskParameters | None = None) -> Sequence[RenderedKeyframe]:
+        """The map, or other disks in its frame, seen from every mapped keyframe.
 
-    def depth_maps(self) -> list[RenderedKeyframe]:
-        """The dense depths of the mapped keyframes, weighted by confidence: no disk is in them."""
-        return [searched_keyframe(self.views[i], self.cameras.render) for i in self.mapped]
+        Rendered now; of a long video most are read from a temporary file when they are asked for.
+
+        Raises:
+            OutputError: the disk is full, or cannot be written.
+        """
+        disks = self.map.parameters if disks is None else disks
+        camera, store, stored = self.cameras.render, RenderStore(), []
+        for view in (self.views[i] for i in self.mapped):
+            render = rendered_keyframe(view, disks, camera, self.config)
+            stored.append(store.put(render, view.keyframe.stored_image))
+        return OnDemand(stored, StoredRender.load)
+
+    def depth_maps(self) -> Sequence[RenderedKeyframe]:
+        """The dense depths of the mapped keyframes, weighted by confidence: no disk is in them.
+
+        Each is read when it is asked for, as it is at that time.
+        """
+        views = [self.views[i] for i in self.mapped]
+        return OnDemand(views, partial(searched_keyframe, camera=self.cameras.render))
 
     @property
     def optimizer(self) -> MapOptimizer:

@@ -54,8 +54,7 @@ def plan_volume(views: Sequence[DepthMapView], config: MeshConfig) -> VolumePlan
     memory limit.
     """
     stride = max(1, len(views) // _SAMPLED_VIEWS)
-    sampled = [views[i] for i in range(0, len(views), stride)]
-    depths, footprints, points = _sample_points(sampled)
+    depths, footprints, points = _sample_points(views[::stride])
     if not len(depths):
         raise InputError("No depth map has a valid pixel, so there is no surface to extract.")
     max_depth = config.max_depth or 2 * float(depths.quantile(0.95))

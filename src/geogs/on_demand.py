@@ -1,0 +1,31 @@
+"""Sequences too large for the memory: an element is there for as long as somebody holds it."""
+
+from collections.abc import Callable, Sequence
+from typing import Generic, SupportsIndex, TypeVar, overload
+
+S = TypeVar("S")
+V = TypeVar("V")
+
+
+class OnDemand(Sequence[V], Generic[S, V]):
+    """Elements that are made, one by one and each time anew, when they are asked for.
+
+    Element ``i`` is ``make(items[i])``. Nothing is kept, so what goes through the sequence in order
+    has one element in memory at a time. A slice makes nothing yet.
+    """
+
+    def __init__(self, items: Sequence[S], make: Callable[[S], V]) -> None:
+        self._items = items
+        self._make = make
+
+    def __len__(self) -> int:
+        return len(self._items)
+
+    @overload
+    def __getitem__(self, index: SupportsIndex) -> V: ...
+    @overload
+    def __getitem__(self, index: slice) -> "OnDemand[S, V]": ...
+    def __getitem__(self, index: SupportsIndex | slice) -> "V | OnDemand[S, V]":
+        if isinstance(index, slice):
+            return OnDemand(self._items[index], self._make)
+        return self._make(self._items[index.__index__()])
