@@ -15,18 +15,23 @@ import numpy as np
 import pytest
 
 from geogs.archive import Archive
-from geogs.cli.run_checkpoint import frames_after
+from geogs.cli.progress import RunProgress
+from geogs.cli.run import RunOptions
+from geogs.cli.run_checkpoint import RunCheckpoint, RunFacts, frames_after
 from geogs.config import InputConfig
 from geogs.errors import InputError
 from geogs.io.sources.sniff import open_sources
 from geogs.io.writers.native import load_map
+from geogs.slam import Slam
 from geogs.synth.export import write_sequence
+from geogs.tracking.segments import Segments
 
 GEOGS = [sys.executable, "-m", "geogs.cli.main"]
 FRAMES = 40
 QUICK = [
     "--mapping.render-long-edge", "128", "--mapping.iterations", "4",
-    "--mapping.pose-iterations", "1", "--mapping.final-iterations", "20", "--mapping.no-final-depth",
+    "--mapping.pose-iterations", "1", "--mapping.final-iterations", "20",
+    "--mapping.no-final-depth",
     "--tracking.resident-keyframes", "4", "--mapping.resident-views", "4",
 ]  # fmt: skip
 OFTEN = ["--checkpoint-every", "0.05"]
@@ -113,9 +118,14 @@ def test_a_killed_run_goes_on_even_after_another_interruption(room, whole, kille
 
 def test_a_run_killed_in_its_final_stages_does_only_those_again(room, whole, tmp_path):
     out = tmp_path / "out"
+    (out / "checkpoint").mkdir(parents=True)
+    for name in ("state", "archive-of-another-run"):
+        (out / "checkpoint" / name).touch()
     # Nothing is due before the end of the stream.
-    stop(["run", str(room), "-o", str(out), *QUICK, "--checkpoint-every", "900"],
-         signal.SIGKILL, out, 1)  # fmt: skip
+    said = stop(["run", str(room), "-o", str(out), *QUICK, "--checkpoint-every", "900"],
+                signal.SIGKILL, out, 1)  # fmt: skip
+    assert f"Starting anew; geogs run --resume {out} would go on" in said
+    assert not (out / "checkpoint" / "archive-of-another-run").exists()
     done = geogs("run", "--resume", out)
     assert done.returncode == 0, done.stderr
     assert f"Going on after {FRAMES} frames." in done.stderr
@@ -191,19 +201,21 @@ def test_a_source_that_is_gone_or_changed_is_one_sentence(room, killed):
         moved.rename(room)
 
 
-def test_a_new_run_in_a_folder_with_a_checkpoint_says_so(room, killed, tmp_path):
-    """And where no checkpoint can be written, that is said once, and the run goes on."""
-    out = tmp_path / "out"
-    shutil.copytree(killed, out)
-    (out / "checkpoint" / "state").unlink()
-    (out / "checkpoint" / "state").mkdir()
-    (out / "checkpoint" / "state" / "x").touch()
-    done = geogs("run", room, "-o", out, *QUICK, *OFTEN, "--stop", 32)
-    assert done.returncode == 0, done.stderr
-    said = " ".join(done.stderr.split())
-    assert "Starting anew; geogs run --resume" in said
-    assert said.count("No more checkpoints: ") == 1
-    assert json.loads((out / "summary.json").read_text())["interrupted"] is False
+def test_where_no_checkpoint_can_be_written_that_is_said_once(room, tmp_path, monkeypatch):
+    monkeypatch.setattr(Segments, "keyframe_ids", [0])
+    said: list[str] = []
+    monkeypatch.setattr(RunProgress, "write", lambda _, text: said.append(text))
+    source = open_sources([room])
+    slam = Slam(source.camera)
+    facts = RunFacts(RunOptions(), "cpu", source.fingerprint(), None, source.place)
+    (tmp_path / "checkpoint").touch()
+    checkpoint = RunCheckpoint(tmp_path, facts, 0.001, RunProgress(None))
+    for _ in range(3):
+        time.sleep(0.002)
+        checkpoint.after_frame(slam, source)
+    assert len(said) == 1
+    assert said[0].startswith("No more checkpoints: ")
+    assert not checkpoint.write(slam, source)
 
 
 def test_reading_goes_on_where_it_was(tmp_path):

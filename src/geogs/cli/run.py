@@ -64,7 +64,7 @@ def run(options: RunOptions) -> Path:
     import geogs
     from geogs.cli.gpu_memory import REMEDY, full_memory_in_a_sentence
     from geogs.cli.results import SourceFacts, write_results
-    from geogs.cli.run_checkpoint import RunCheckpoint, RunFacts, SavedRun, checkpoint_folder
+    from geogs.cli.run_checkpoint import RunCheckpoint, RunFacts, SavedRun, has_checkpoint
     from geogs.cli.surfaces import write_depth_mesh, write_online_results
     from geogs.errors import DeviceError
     from geogs.gpu.installation import require_device
@@ -102,7 +102,7 @@ def run(options: RunOptions) -> Path:
     with full_memory_in_a_sentence(), Interruption() as stop, progress:
         if saved is not None:
             progress.write(f"Going on after {slam.frames} frames.")
-        elif checkpoint_folder(output).is_dir():
+        elif has_checkpoint(output):
             progress.write(
                 f"Starting anew; geogs run --resume {output} would go on with the unfinished run "
                 "there, until the first checkpoint of this one."

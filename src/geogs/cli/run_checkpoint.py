@@ -176,6 +176,11 @@ def checkpoint_folder(output: Path) -> Path:
     return output / "checkpoint"
 
 
+def has_checkpoint(output: Path) -> bool:
+    """Whether a run in a folder could be gone on with."""
+    return (checkpoint_folder(output) / "state").is_file()
+
+
 def frames_after(source: Stream, place: ReadingPlace | JointPlace) -> Generator[Frame, None, None]:
     """The frames of a source after a place in it. Raises InputError if there cannot be one."""
     if isinstance(source, SeveralSources):
