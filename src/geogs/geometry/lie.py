@@ -5,6 +5,8 @@ are ``[tau(3), phi(3)(, sigma(1))]``. Every function is differentiable everywher
 and the logarithms hold up to (not at) a half turn.
 """
 
+import math
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -96,25 +98,30 @@ def se3_adjoint(T: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 6 6"]:
 
 
 def _sim3_v(phi: Tensor, sigma: Tensor) -> Tensor:
-    """V with translation = V tau: the integral of exp(s (sigma I + hat(phi))) over s in [0, 1].
-
-    V is a function of the matrix M = sigma I + hat(phi): V = sum M^k / (k+1)!. For small M the
-    series is summed; otherwise V = (exp(M) - I) M^-1 is solved for, M being invertible unless
-    sigma is near 0, where V equals the SE(3) Jacobian plus its first order in sigma.
-    """
+    """V with translation = V tau: the integral of exp(s (sigma I + hat(phi))) over s in [0, 1]."""
     eye = torch.eye(3, dtype=phi.dtype, device=phi.device)
-    m = sigma[..., None, None] * eye + so3_hat(phi)
-    # Halve M until it is small, sum the series, then double: V(2M) = (I + exp(M)) V(M) / 2.
-    halvings = 6
-    h = m / 2**halvings
-    term, v = eye.expand_as(m), eye.expand_as(m)
-    for k in range(2, 12):
+    return _integral_of_exponential(sigma[..., None, None] * eye + so3_hat(phi))
+
+
+def _integral_of_exponential(M: Tensor) -> Tensor:
+    """V(M) = sum M^k / (k+1)!, the integral of exp(s M) over s in [0, 1].
+
+    M is halved until it is small, then the series is summed, then V is doubled again:
+    V(2 M) = (I + exp(M)) V(M) / 2.
+    """
+    eye = torch.eye(M.shape[-1], dtype=M.dtype, device=M.device)
+    size = float(M.detach().abs().sum(-1).max()) if M.numel() else 0.0
+    halvings = max(0, math.ceil(math.log2(size / 0.5))) if 0.5 < size < math.inf else 0
+    h = M / 2**halvings
+    term, v = eye.expand_as(M), eye.expand_as(M)
+    for k in range(2, 13):
         term = term @ h / k
         v = v + term
-    e = eye + h @ v
-    for _ in range(halvings):
-        v = (eye + e) @ v / 2
-        e = e @ e
+    if halvings:
+        e = eye + h @ v
+        for _ in range(halvings):
+            v = (eye + e) @ v / 2
+            e = e @ e
     return v
 
 
@@ -172,13 +179,9 @@ def sim3_small_adjoint(xi: Float[Tensor, "*b 7"]) -> Float[Tensor, "*b 7 7"]:
 def sim3_left_jacobian(xi: Float[Tensor, "*b 7"]) -> Float[Tensor, "*b 7 7"]:
     """``J`` with ``Exp(xi + d) = Exp(J d) Exp(xi)`` to first order; of ``-xi`` it is the right one.
 
-    J is the integral of exp(s ad(xi)) over s in [0, 1], which stands beside exp(ad(xi)) in the
-    exponential of the block matrix [[ad(xi), I], [0, 0]].
+    J is the integral of exp(s ad(xi)) over s in [0, 1].
     """
-    ad = sim3_small_adjoint(xi)
-    eye = torch.eye(7, dtype=xi.dtype, device=xi.device).expand_as(ad)
-    top = torch.cat([ad, eye], -1)
-    return torch.linalg.matrix_exp(torch.cat([top, torch.zeros_like(top)], -2))[..., :7, 7:]
+    return _integral_of_exponential(sim3_small_adjoint(xi))
 
 
 def retract(xi: Float[Tensor, "*b k"], T: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 4 4"]:

@@ -101,7 +101,7 @@ class PoseGraphOptions:
     """Factor of the covariance of trusted edges when there are loops. Odometry errs alike from step
     to step, and what a whole chain errs is more than its steps tell; a true loop would lose to
     it."""
-    convexity_step: float = 2.0
+    convexity_step: float = 4.0
     """Factor by which the kernel is sharpened from stage to stage."""
     stage_iterations: int = 2
     """Most steps of every other stage."""

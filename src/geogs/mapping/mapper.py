@@ -121,10 +121,8 @@ class Mapper:
         if len(self.mapped) > self.config.window:
             left = self.views[self.mapped[-1 - self.config.window]]
             self._insert(left, self.config.disk.fill_confidence)
-        steps = range(self.config.iterations)
-        trainer.train([
-            self._batch(draw_views(self.mapped, step, self.config, self._random)) for step in steps
-        ])  # fmt: skip
+        drawn = draw_views(self.mapped, self.config.iterations, self.config, self._random)
+        trainer.train([self._batch(ids) for ids in drawn])
         if len(self.mapped) % self.config.disk.carve_every == 0:
             self._prune_around(view)
 

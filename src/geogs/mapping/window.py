@@ -10,23 +10,27 @@ from geogs.mapping.view import MapView
 
 
 def draw_views(
-    mapped: list[int], step: int, config: MappingConfig, random: np.random.Generator
-) -> list[int]:
-    """Ids of the views of one training step: from the recent window plus random older keyframes.
+    mapped: list[int], steps: int, config: MappingConfig, random: np.random.Generator
+) -> list[list[int]]:
+    """Ids of the views of some training steps: from the recent window plus random older keyframes.
 
-    With ``views_per_step`` 0 the whole window and its history, as the paper sums them; otherwise
-    that many of them at random, the newest in every third step.
+    The older ones are drawn once for all steps, as they may have to be read from a file. With
+    ``views_per_step`` 0 every step has the whole window and its history, as the paper sums them;
+    otherwise that many of them at random, the newest in every third step.
     """
     window, older = mapped[-config.window :], mapped[: -config.window]
     drawn = min(config.history, len(older))
     history = [older[i] for i in random.choice(len(older), drawn, replace=False)] if drawn else []
     pool = window + history
     if config.views_per_step <= 0:
-        return pool
-    newest = [mapped[-1]] if step % 3 == 0 else []
-    more = max(0, min(config.views_per_step, len(pool)) - len(newest))
-    rest = [pool[i] for i in random.choice(len(pool), more, replace=False)]
-    return list(dict.fromkeys(newest + rest))
+        return [pool] * steps
+    views = []
+    for step in range(steps):
+        newest = [mapped[-1]] if step % 3 == 0 else []
+        more = max(0, min(config.views_per_step, len(pool)) - len(newest))
+        rest = [pool[i] for i in random.choice(len(pool), more, replace=False)]
+        views.append(list(dict.fromkeys(newest + rest)))
+    return views
 
 
 def choose_partners(
