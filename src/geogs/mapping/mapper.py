@@ -52,6 +52,8 @@ def _silent(fraction: float) -> None:
 
 # Nearest keyframes that vote on a keyframe's disks; others are too far away to know better.
 _VOTERS = 96
+# Keyframes that say how the map moves with a correction, at most: neighbours say the same.
+_WITNESSES = 256
 # Steps of the final training between two reports of progress, at least.
 _REPORTED_STEPS = 20
 # Steps from which the time of one is judged.
@@ -142,12 +144,14 @@ class Mapper:
         To be called before the keyframes' new poses arrive by ``follow``: what they see in place
         before the correction says how the map moves.
         """
+        views = [v for v in self.views.values() if v.has_depth]
+        views = views[:: 1 + len(views) // _WITNESSES]
         update = plan_update(
             self.map.position,
             self.map.keyframe_id,
             correction,
             self.config.map_update,
-            (witness(v, self.cameras) for v in self.views.values() if v.has_depth),
+            (witness(v, self.cameras) for v in views),
         )
         if len(self.map):
             self._training().optimizer.transform(update.transform)
