@@ -3,6 +3,7 @@
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, get_args
 
@@ -78,26 +79,19 @@ def run(options: RunOptions) -> Path:
     if saved is not None:
         options = _resumed(options, saved.facts)
     device = require_device(options.device)
-    source = open_sources(options.source, options.input)
-    output = prepare_output_folder(options.output or Path("out") / source.name)
+    opened = open_sources(options.source, options.input)
+    output = prepare_output_folder(options.output or Path("out") / opened.name)
     if device.type == "cuda":
         prepare_kernels(Path(geogs.__file__).parent, device)
-    if saved is None:
-        opened, source = source, self_calibrated(source, options, device)
-        found = None if source is opened else source.calibration
-    else:
-        saved.check_source(source)
-        found = saved.facts.calibration
-        source = source if found is None else source.with_calibration(found)
+    calibrate = partial(self_calibrated, options=options, device=device)
+    source = (calibrate if saved is None else saved.calibrated)(opened)
+    found = None if source is opened else source.calibration
     prior = open_prior(options.prior, source.camera, device)
     slam = Slam(source.camera, options, str(device), prior)
     if saved is not None:
         saved.restore(slam)
-        place = saved.facts.place
-    else:
-        place = source.place
     progress = RunProgress(source.length, begun=slam.frames)
-    facts = RunFacts(_absolute(options), device.type, source.fingerprint(), found, place)
+    facts = RunFacts(_absolute(options), device.type, source.fingerprint(), found)
     checkpoint = RunCheckpoint(output, facts, options.checkpoint_every, progress)
     with full_memory_in_a_sentence(), Interruption() as stop, progress:
         if saved is not None:
@@ -107,6 +101,7 @@ def run(options: RunOptions) -> Path:
                 f"Starting anew; geogs run --resume {output} would go on with the unfinished run "
                 "there, until the first checkpoint of this one."
             )
+        place = None if saved is None else saved.facts.place
         full = not _feed(slam, source, place, checkpoint, progress, stop)
         interrupted = full or stop.requested
         if interrupted:
@@ -160,14 +155,29 @@ def _resumed(options: RunOptions, facts: "RunFacts") -> RunOptions:
 
 def _absolute(options: RunOptions) -> RunOptions:
     """With paths that hold wherever the run is resumed from."""
-    sources = tuple(path.expanduser().absolute() for path in options.source)
-    return replace(options, source=sources, output=None, resume=None)
+
+    def file(name: str) -> str:
+        return str(Path(name).absolute()) if name and Path(name).is_file() else name
+
+    p = options.prior
+    return replace(
+        options,
+        source=tuple(path.expanduser().absolute() for path in options.source),
+        output=None,
+        resume=None,
+        input=replace(options.input, intrinsics=file(options.input.intrinsics)),
+        tracking=replace(options.tracking, weights=file(options.tracking.weights)),
+        prior=replace(
+            p, model=file(p.model), card=file(p.card), normal_model=file(p.normal_model),
+            normal_card=file(p.normal_card),
+        ),
+    )  # fmt: skip
 
 
 def _feed(
     slam: "Slam",
     source: "Stream",
-    place: "ReadingPlace | JointPlace",
+    place: "ReadingPlace | JointPlace | None",
     checkpoint: "RunCheckpoint",
     progress: RunProgress,
     stop: Interruption,
@@ -178,10 +188,12 @@ def _feed(
 
     from geogs.cli.run_checkpoint import frames_after
 
+    frames = iter(source) if place is None else frames_after(source, place)
     if slam.is_ended:
+        next(frames, None)  # only what the source says of itself at its end
         return True
     try:
-        for frame in frames_after(source, place):
+        for frame in frames:
             status = slam.process(frame)
             progress.frame(status)
             if stop.requested:

@@ -8,7 +8,7 @@ import time
 import zlib
 from collections.abc import Generator
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from io import BufferedReader
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -54,7 +54,7 @@ class RunFacts:
     """Of the source."""
     calibration: Calibration | None
     """Found before the run; none if the source's own was taken."""
-    place: ReadingPlace | JointPlace
+    place: ReadingPlace | JointPlace = field(default_factory=ReadingPlace)
     """How far the source has been read."""
 
 
@@ -144,13 +144,15 @@ class SavedRun:
         except (OSError, InputError) as error:
             raise self._unusable(error) from error
 
-    def check_source(self, source: Stream) -> None:
-        """Raises InputError if the source is not the one that the run began with."""
+    def calibrated(self, source: Stream) -> Stream:
+        """The source as the run read it. Raises InputError if its files are not what they were."""
         if source.fingerprint() != self.facts.fingerprint:
             raise InputError(
                 f"{source.name} is not what it was when the run began (other files, or other "
                 "sizes); put it back, or start anew without --resume."
             )
+        found = self.facts.calibration
+        return source if found is None else source.with_calibration(found)
 
     def _check(self, stream: BufferedReader) -> None:
         """Leave the stream behind the title if title and checksum are right."""
