@@ -18,11 +18,11 @@ class CalibrationConfig:
     """Frames of the video that are looked at, at most."""
     start_keyframes: int = 12
     """Keyframes that are solved first, at least 8."""
-    keyframes: int = 24
+    keyframes: int = 36
     """Most keyframes that are used; they are added until the focal length is sure enough."""
     keyframe_flow: float = 0.025
     """Median motion that makes a frame a keyframe, of the long edge."""
-    enough: float = 0.004
+    enough: float = 0.0021
     """Relative deviation of the focal length that ends the search early."""
     too_much: float = 0.1
     """Relative deviation above which the focal length is not believed and the guess is kept."""

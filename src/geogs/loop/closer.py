@@ -190,7 +190,7 @@ class LoopCloser:
         world = self.segments.world
         known, ids = self._of(world), world.store.ids
         # A correction costs in proportion to the keyframes, so it comes once in a part of them.
-        pause = max(self.config.close_every, len(ids) // 20)
+        pause = max(self.config.close_every, len(ids) // 10)
         due = is_last or len(ids) - known.last_attempt >= pause
         if not known.pending or not due:
             return None

@@ -62,6 +62,13 @@ class ParkedMaps:
     """Median depth, map units."""
     factor: float = 1.0
     """What the archived depth is to be multiplied with."""
+    held: DenseDepth | None = None
+    """The archived depth, where it can also stay: on a GPU it is small beside all else there, and
+    bringing it there again takes longer than using it."""
+
+    def __getstate__(self) -> dict[str, object]:
+        """What a checkpoint holds: the archive has it."""
+        return {**self.__dict__, "held": None}
 
     @staticmethod
     def of(depth: DenseDepth, archive: Archive) -> "ParkedMaps":
@@ -76,9 +83,13 @@ class ParkedMaps:
         arrays = depth.arrays()
         self.depth, self.confidence = archive.put(arrays.depth), archive.put(arrays.confidence)
         self.typical = depth.typical
+        self.held = depth if depth.depth.is_cuda else None
 
     def load_depth(self, device: torch.device | str) -> DenseDepth:
         """The depth, as it was but for the factor."""
+        if self.held is not None:
+            typical = torch.tensor(self.typical)
+            return DenseDepth(self.held.depth * self.factor, self.held.confidence, typical)
         assert self.depth is not None, "no depth was parked"
         assert self.confidence is not None, "no confidence was parked"
         depth = torch.from_numpy(self.depth.load())
