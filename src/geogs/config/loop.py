@@ -83,17 +83,17 @@ class LoopConfig:
     """Candidates taken from the index per keyframe."""
     min_score: float = 0.05
     """Least similarity of such a candidate, of that of a keyframe with itself."""
-    verified: int = 3
+    verified: int = 4
     """Most candidates of a keyframe that are verified: bounds the cost."""
-    suppression: int = 4
+    suppression: int = 3
     """A loop rules out others whose ends together lie within this many keyframes of its own."""
-    max_loops: int = 1
+    max_loops: int = 2
     """Most loops per keyframe."""
     lag: int = 2
     """Keyframes for which a search may run beside tracking before it is waited for."""
     close_every: int = 5
     """Keyframes between two corrections, at least."""
-    strain: float = 3.0
+    strain: float = 5.0
     """Squared error of a loop at the present poses, in its own variances, from which it calls for a
     correction. Variances are cautious: right loops come to 1 or 2, where 7 would be exact."""
     kept: int = 200
