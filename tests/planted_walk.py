@@ -77,9 +77,7 @@ class PlantedFlow:
 
     def _match(self, source: Sequence[int], target: Sequence[int]) -> FlowMatch:
         i, j = list(source), list(target)
-        p = project(
-            self.grid.camera, self.grid.rays, self.T[j] @ se3_inverse(self.T[i]), self.d[i]
-        )
+        p = project(self.grid.camera, self.grid.rays, self.T[j] @ se3_inverse(self.T[i]), self.d[i])
         seed = 7919 * i[0] + j[0]
         g = torch.Generator().manual_seed(seed)
         pixels = p.pixels + self.sigma * torch.randn(p.pixels.shape, generator=g)

@@ -142,4 +142,4 @@ def test_the_options_of_the_ablations_exist_and_make_a_difference(room):
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     rows = [line.split() for line in done.stdout.splitlines()]
-    assert rows == [[names[0], "2", "2"], [names[1], "5", "5"], [names[2], "9", "9"]]
+    assert rows == [[names[0], "3", "3"], [names[1], "5", "5"], [names[2], "9", "9"]]
