@@ -67,7 +67,7 @@ class Slam:
         self.stopwatch = Stopwatch()
         self.frames = 0
         self._waiting: deque[int] = deque()
-        self._adjusted = 0
+        self.adjusted = 0
         """Keyframes at the last bundle adjustment of all."""
         self._is_ended = False
 
@@ -172,7 +172,7 @@ class Slam:
 
     def _adjust_now_and_then(self) -> None:
         every, count = self.config.loop.global_ba_every, len(self.segments.keyframe_ids)
-        if every and count - self._adjusted >= every:
+        if every and count - self.adjusted >= every:
             self._adjust_globally(_silent)
 
     def _adjust_globally(self, progress: Progress) -> None:
@@ -181,7 +181,7 @@ class Slam:
         with self.stopwatch("global bundle adjustment"):
             correction = global_bundle(world, lambda f, _: progress("bundle adjustment", f))
             self.loops.replaced_by_bundle()
-        self._adjusted = len(world.keyframe_ids)
+        self.adjusted = len(world.keyframe_ids)
         self._move_map(correction)
 
     def _move_map(self, correction: PoseCorrection) -> None:
