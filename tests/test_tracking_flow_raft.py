@@ -285,4 +285,5 @@ def test_the_tracker_follows_a_network_that_is_right(weights):
     tracker.finish()
     trajectory = tracker.trajectory()
     assert trajectory.tracked.all()
-    assert error_cm(trajectory.T_wc[:, :3, 3], np.stack(path)[:, :3, 3]) < 0.001
+    # Between keyframes what is kept of the flow is rounded to a fraction of a pixel.
+    assert error_cm(trajectory.T_wc[:, :3, 3], np.stack(path)[:, :3, 3]) < 0.005
