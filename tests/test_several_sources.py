@@ -16,7 +16,7 @@ from geogs.evaluation.trajectory import evaluate_trajectory
 from geogs.io.sources.several import PAUSE
 from geogs.io.sources.sniff import open_sources
 from geogs.slam import Slam
-from geogs.types import Trajectory
+from geogs.types import Frame, Trajectory
 from tracking_scenes import CAMERA, frames, sideways
 
 
@@ -100,3 +100,24 @@ def test_all_keyframes_are_adjusted_on_the_way_where_asked_for():
     adjusted, error = run(6)
     assert adjusted >= 6
     assert error < 0.3
+
+
+def test_the_map_shows_the_largest_of_videos_that_have_nothing_in_common():
+    """The first is short; the second shows a mirrored room."""
+    first, second = frames(sideways(10)), frames(sideways(34))
+    stream = first + [
+        Frame(10 + k, f.timestamp + 2, np.ascontiguousarray(f.image[::-1]), k == 0)
+        for k, f in enumerate(second)
+    ]
+    tracking = TrackingConfig(init_keyframes=5)
+    slam = Slam(CAMERA, Config(tracking=tracking))
+    for frame in stream:
+        slam.process(frame)
+    slam.end_stream()
+    fates = [s["fate"] for s in slam.particulars()["segments"]]
+    assert fates == ["apart", "world"]
+    trajectory = slam.trajectory()
+    assert trajectory.tracked.tolist() == [False] * 10 + [True] * 34
+    assert slam.mapper.keyframe_ids == slam.segments.keyframe_ids
+    assert slam.mapper.mapped == slam.segments.keyframe_ids
+    assert len(slam.snapshot()) > 500
