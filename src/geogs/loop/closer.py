@@ -198,7 +198,11 @@ class LoopCloser:
         relative = joined([
             known.odometry, of_edges(world.store, world.graph.edges), known.loops,
         ])  # fmt: skip
-        closure = close_loops(ids, world.store.poses(ids), between_positions(relative, ids))
+        relative = between_positions(relative, ids)
+        steps = ~relative.is_loop & ((relative.target - relative.source).abs() == 1)
+        if not bool(steps.any()):
+            return None  # hardly anything matches: nothing tells how far the camera has drifted
+        closure = close_loops(ids, world.store.poses(ids), relative)
         if closure is None or self._change(closure.correction) < self.config.min_change:
             return None
         world.correct(closure.correction)
