@@ -85,7 +85,8 @@ class LoopCloser:
             self._retire(self.segments.tracker_of(fresh[0]))
         for loop in self.detector.update(fresh, is_last):
             self._take(loop)
-        became_final = self._join()
+        # Between keyframes nothing changes that could let segments meet.
+        became_final = self._join() if fresh or is_last else ()
         return LoopEvent(self._close(is_last), became_final)
 
     def replaced_by_bundle(self) -> None:

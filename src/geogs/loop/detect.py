@@ -81,10 +81,10 @@ class LoopDetector:
         self.config = config or LoopConfig()
         self.refusals: list[Refusal] = []
         """Of the last update."""
-        self._search = PlaceSearch(grid, self.config)
         self._thread = _search_thread()
         self._order: dict[int, int] = {}
         """Place in time of each keyframe taken so far."""
+        self._search = PlaceSearch(grid, self.config, self._order)
         self._pending: deque[Future[list[Sighting]]] = deque()
         self._loops: list[Loop] = []
 

@@ -58,19 +58,18 @@ class Query:
 class PlaceSearch:
     """Remembers keyframes by their features, and finds those that a new one may show again."""
 
-    def __init__(self, grid: SampleGrid, config: LoopConfig) -> None:
+    def __init__(self, grid: SampleGrid, config: LoopConfig, order: Mapping[int, int]) -> None:
+        """``order`` is the place in time of each keyframe; it may grow meanwhile."""
         self.grid = grid
         self.config = config
         self.index = AppearanceIndex(config.retrieval)
         self._verifier = TwoViewVerifier(grid.camera, config.verification)
         self._features: dict[int, Features] = {}
-        self._order: dict[int, int] = {}
-        """Place in time of each keyframe remembered."""
+        self._order = order
 
     def find(self, query: Query) -> list[Sighting]:
         """Remember a keyframe; the pairs it makes with earlier ones, most promising first."""
         id = query.id
-        self._order[id] = len(self._order)
         self._features[id] = self.index.describe(query.image)
         sightings = [Sighting(p, self._verify(p, query.depths)) for p in self._proposals(query)]
         self.index.add(id, self._features[id])

@@ -1,9 +1,10 @@
 """The back end: keyframe depths in, a trained disk map and refined poses out."""
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
+from operator import attrgetter
 
 import numpy as np
 import torch
@@ -13,7 +14,7 @@ from torch import Tensor
 from geogs.archive import Archive, Archived
 from geogs.config import MappingConfig
 from geogs.geometry.camera import Camera
-from geogs.mapping.depth_engine import depth_engine
+from geogs.mapping.depth_engine import Progress, depth_engine, silent
 from geogs.mapping.keyframe_depths import CANDIDATES, KeyframeDepths
 from geogs.mapping.map_update import MapUpdate, plan_update, witness
 from geogs.mapping.rendered import rendered_keyframe, searched_keyframe
@@ -25,7 +26,7 @@ from geogs.mapping.training import (
     draw_partners,
     map_trainer,
 )
-from geogs.mapping.view import MapCameras, MapView, PosedDepths
+from geogs.mapping.view import MapCameras, MapView
 from geogs.mapping.view_maps import ResidentViews
 from geogs.mapping.window import choose_partners, draw_views, views_around
 from geogs.on_demand import OnDemand
@@ -41,14 +42,6 @@ from geogs.splat.map import DiskParameters, GaussianMap
 from geogs.splat.optimizer import MapOptimizer
 from geogs.splat.render import render
 from geogs.types import Keyframe, PoseCorrection, RenderedKeyframe
-
-Progress = Callable[[float], None]
-"""Called with the finished fraction of a long stage."""
-
-
-def _silent(fraction: float) -> None:
-    """Progress that nobody watches."""
-
 
 # Nearest keyframes that vote on a keyframe's disks; others are too far away to know better.
 _VOTERS = 96
@@ -162,7 +155,7 @@ class Mapper:
         self.follow(keyframes)
         return update
 
-    def refine(self, progress: Progress = _silent) -> None:
+    def refine(self, progress: Progress = silent) -> None:
         """Train over all keyframes with the final poses, after searching their depths again."""
         if not self.mapped or self.config.final_iterations <= 0:
             return
@@ -204,7 +197,7 @@ class Mapper:
     def train(
         self,
         steps: int,
-        progress: Progress = _silent,
+        progress: Progress = silent,
         until: float | None = None,
         start: TrainingPlace | None = None,
     ) -> None:
@@ -308,7 +301,9 @@ class Mapper:
             self._training().optimizer.keep(self._vote(self.map.position.detach(), views))
 
     def _vote(self, points: Float[Tensor, "n 3"], views: list[MapView]) -> Bool[Tensor, "n"]:
-        return self._depths.engine.keep(points, PosedDepths([v for v in views if v.has_depth]))
+        known = [v for v in views if v.has_depth]
+        # Read one after the other where they are not in memory.
+        return self._depths.engine.keep(points, OnDemand(known, attrgetter("posed")))
 
     @torch.no_grad()
     def _insert(self, view: MapView, min_confidence: float) -> None:

@@ -1,8 +1,6 @@
 """What the mapper keeps of a keyframe."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import overload
 
 import cv2
 import numpy as np
@@ -312,22 +310,3 @@ class MapView:
 
     def _prior_depth(self, depth: DenseDepth) -> Float[Tensor, "h w"]:
         return depth.depth if self.mask is None else torch.where(self.mask, depth.depth, OUTSIDE)
-
-
-class PosedDepths(Sequence[PosedDepth]):
-    """The depths of some views, read one after the other where they are not in memory."""
-
-    def __init__(self, views: Sequence[MapView]) -> None:
-        self._views = views
-
-    def __len__(self) -> int:
-        return len(self._views)
-
-    @overload
-    def __getitem__(self, index: int) -> PosedDepth: ...
-    @overload
-    def __getitem__(self, index: slice) -> "PosedDepths": ...
-    def __getitem__(self, index: int | slice) -> "PosedDepth | PosedDepths":
-        if isinstance(index, slice):
-            return PosedDepths(self._views[index])
-        return self._views[index].posed

@@ -5,6 +5,7 @@ first comes from the essential matrix, the others follow by PnP on flows chained
 dense bundle adjustment with re-measured flow polishes the whole.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import cv2
@@ -76,9 +77,18 @@ def chained_flows(graph: FrameGraph) -> list[FlowMatch]:
 def _best_two_view(
     grid: SampleGrid, flows: list[FlowMatch], min_parallax: float
 ) -> tuple[int, TwoView] | None:
-    best, best_score = None, 0.0
     flows = [FlowMatch(f.pixels.cpu(), f.weight.cpu()) for f in flows]
-    for n, view in enumerate(thread_map(lambda match: two_view(grid.camera, match), flows)):
+    return best_two_view(
+        thread_map(lambda match: two_view(grid.camera, match), flows), min_parallax
+    )
+
+
+def best_two_view(
+    views: Iterable[TwoView | None], min_parallax: float
+) -> tuple[int, TwoView] | None:
+    """The pair to start from, with its place; None where none has the parallax (pixels)."""
+    best, best_score = None, 0.0
+    for n, view in enumerate(views):
         if view is None or view.parallax < min_parallax:
             continue
         # Parallax helps until the views no longer overlap.

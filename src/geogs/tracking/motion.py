@@ -190,8 +190,13 @@ class FlowChain:
 
 def filled_positions(grid: SampleGrid, match: FlowMatch) -> Float[Tensor, "p 2"]:
     """Positions of a single edge, unmatched cells filled in from the flow around them."""
+    return grid.pixels + filled_flow(grid, match)
+
+
+def filled_flow(grid: SampleGrid, match: FlowMatch) -> Float[Tensor, "p 2"]:
+    """Flow of a single edge, unmatched cells filled in from around them."""
     flow, weight = match.pixels[0] - grid.pixels, match.weight[0, :, 0]
-    return grid.pixels + grid.fill_all(flow.mT, weight.expand(2, -1)).mT.contiguous()
+    return grid.fill_all(flow.mT, weight.expand(2, -1)).mT.contiguous()
 
 
 def all_reprojections(

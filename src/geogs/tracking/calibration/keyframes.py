@@ -11,7 +11,7 @@ from torch import Tensor
 from geogs.geometry.camera import Camera
 from geogs.tracking.flow.base import FlowMatch, FlowOperator
 from geogs.tracking.grid import SampleGrid
-from geogs.tracking.motion import FlowChain
+from geogs.tracking.motion import FlowChain, filled_flow, filled_positions
 from geogs.types import Frame
 
 MIN_MATCHED = 0.12
@@ -92,9 +92,9 @@ def flows_from_first(
     for k in range(1, len(views)):
         step = views[k].step
         assert step is not None
-        flow = _filled(grid, step)
+        flow = filled_flow(grid, step)
         there = there + grid.sample_field(flow, there)
-        back_step = grid.pixels + _filled(
+        back_step = filled_positions(
             grid, FlowMatch(back_steps.pixels[k - 1][None], back_steps.weight[k - 1][None])
         )
         back = back_step + grid.sample_field(back - grid.pixels, back_step)
@@ -104,15 +104,9 @@ def flows_from_first(
         flows.append(match)
         if float((match.weight[0, :, 0] > 0).float().mean()) < MIN_MATCHED:
             break
-        there = grid.pixels + _filled(grid, match)
-        back = grid.pixels + _filled(grid, reverse)
+        there = filled_positions(grid, match)
+        back = filled_positions(grid, reverse)
     return flows
-
-
-def _filled(grid: SampleGrid, match: FlowMatch) -> Float[Tensor, "p 2"]:
-    """Flow of a single edge, unmatched cells filled in from around them."""
-    flow, weight = match.pixels[0] - grid.pixels, match.weight[0, :, 0]
-    return grid.fill_all(flow.mT.contiguous(), weight.expand(2, -1)).mT.contiguous()
 
 
 def on_cpu(match: FlowMatch) -> FlowMatch:

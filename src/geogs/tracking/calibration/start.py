@@ -18,7 +18,7 @@ from geogs.tracking.calibration.keyframes import on_cpu, stacked, with_focal
 from geogs.tracking.calibration.lens import Lens
 from geogs.tracking.flow.base import FlowMatch
 from geogs.tracking.grid import SampleGrid
-from geogs.tracking.initialise import TwoView, two_view
+from geogs.tracking.initialise import best_two_view, two_view
 from geogs.tracking.motion import pnp
 
 FIELDS_OF_VIEW = (50.0, 70.0, 95.0)
@@ -51,9 +51,10 @@ def try_candidate(camera: Camera, flows: list[FlowMatch], min_parallax: float) -
     """Place and adjust the keyframes from one focal length; None where it shows no parallax."""
     flows = [on_cpu(f) for f in flows]
     grid = SampleGrid(camera)
-    best, view = _best_view(camera, flows, min_parallax)
-    if view is None:
+    found = best_two_view((two_view(camera, match) for match in flows[1::2]), min_parallax)
+    if found is None:
         return None
+    best, view = 1 + 2 * found[0], found[1]
     depth = grid.fill(view.inverse_depth, view.good.float())
     poses = [torch.eye(4, dtype=torch.float64)]
     for n, match in enumerate(flows):
@@ -95,17 +96,3 @@ def _adjusted(problem: BundleProblem, lens: Lens, grid: SampleGrid) -> LensBundl
             problem.weight, problem.free_pose, problem.free_depth,
         )  # fmt: skip
     return result
-
-
-def _best_view(
-    camera: Camera, flows: list[FlowMatch], min_parallax: float
-) -> tuple[int, TwoView | None]:
-    best, best_score, place = None, 0.0, -1
-    for n in range(1, len(flows), 2):
-        view = two_view(camera, flows[n])
-        if view is None or view.parallax < min_parallax:
-            continue
-        score = min(view.parallax, 3 * min_parallax) * int(view.good.sum())
-        if score > best_score:
-            best, best_score, place = view, score, n
-    return place, best
