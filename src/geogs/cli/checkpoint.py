@@ -64,8 +64,7 @@ class Checkpoint:
         except OutputError as error:
             self._progress.write(f"No checkpoint: {error}")
             self._every = 0.0
-        now = time.perf_counter()
-        self._due = now + max(self._every, (now - start) / _WRITING_SHARE)
+        self._due = next_due(start, self._every)
         return self._every > 0
 
     def read(self) -> ReconstructionState:
@@ -83,6 +82,12 @@ class Checkpoint:
     def remove(self) -> None:
         """After success."""
         self.path.unlink(missing_ok=True)
+
+
+def next_due(start: float, every: float) -> float:
+    """When the next checkpoint is due, after one that was begun at ``start``; both seconds."""
+    now = time.perf_counter()
+    return now + max(every, (now - start) / _WRITING_SHARE)
 
 
 def write_checkpoint(path: Path, state: ReconstructionState, made_from: str) -> None:

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import geogs
+from geogs.cli.checkpoint import next_due
 from geogs.cli.progress import RunProgress
 from geogs.errors import InputError, OutputError
 from geogs.io.sources.base import ReadingPlace
@@ -29,8 +30,6 @@ if TYPE_CHECKING:
     from geogs.cli.run import RunOptions
 
 _TITLE = f"geogs run checkpoint 1, geogs {geogs.__version__}\n".encode()
-# Checkpoints may take this part of the time.
-_WRITING_SHARE = 0.05
 _PIECE = 1 << 20
 _CHECKSUM_BYTES = 4
 _OURS = frozenset({
@@ -85,8 +84,7 @@ class RunCheckpoint:
         except OutputError as error:
             self._progress.write(f"No more checkpoints: {error}")
             self._every = 0.0
-        now = time.perf_counter()
-        self._due = now + max(self._every, (now - start) / _WRITING_SHARE)
+        self._due = next_due(start, self._every)
         return self._every > 0
 
     def remove(self) -> None:

@@ -44,16 +44,16 @@ def of_edges(store: KeyframeStore, edges: Mapping[Pair, Edge | PackedEdge]) -> R
         return none_known()
     ids = sorted({k for p in pairs for k in p})
     slot = {k: n for n, k in enumerate(ids)}
+    grid = _on_cpu(store.grid)
     matched = MatchedEdges(
-        store.grid.camera,
-        store.grid.rays.cpu(),
+        grid.camera,
+        grid.rays,
         store.inverse_depths(ids).cpu(),
         torch.tensor([slot[i] for i, _ in pairs]),
         torch.tensor([slot[j] for _, j in pairs]),
         torch.stack([edges[p].pixels for p in pairs]).cpu().float(),
         torch.stack([edges[p].weight for p in pairs]).cpu().float(),
     )
-    grid = SampleGrid(store.grid.camera)
     return _named(relative_poses(grid, matched, store.poses(ids), False, SETTLED), ids)
 
 
@@ -61,9 +61,10 @@ def of_loop(first: KeyframeStore, second: KeyframeStore, loop: Loop) -> Relative
     """Relative poses, between ids, of a loop: one for each direction of its flow."""
     one, other = first[loop.first], second[loop.second]
     there, back = loop.there, loop.back
+    grid = _on_cpu(first.grid)
     matched = MatchedEdges(
-        first.grid.camera,
-        first.grid.rays.cpu(),
+        grid.camera,
+        grid.rays,
         torch.stack([one.inverse_depth, other.inverse_depth]).cpu(),
         torch.tensor([0, 1]),
         torch.tensor([1, 0]),
@@ -72,10 +73,14 @@ def of_loop(first: KeyframeStore, second: KeyframeStore, loop: Loop) -> Relative
     )
     T = loop.T_ji.cpu()
     start = torch.stack([T, se3_inverse(scaled(T, loop.scale))])
-    grid = SampleGrid(first.grid.camera)
     poses = torch.stack([one.T_cw, other.T_cw])
     solved = relative_poses(grid, matched, poses, True, start=start)
     return _named(solved, [loop.first, loop.second])
+
+
+def _on_cpu(grid: SampleGrid) -> SampleGrid:
+    """The grid where relative poses are solved."""
+    return SampleGrid(grid.camera) if grid.on_gpu else grid
 
 
 def between_positions(relative: RelativePoses, ids: Sequence[int]) -> RelativePoses:
