@@ -15,19 +15,19 @@ from pathlib import Path
 
 import torch
 
-from geogs.bench.appearance.baseline import appearance_mesh, train_appearance
-from geogs.bench.appearance.config import AppearanceConfig
-from geogs.bench.appearance.disks import AppearanceDisks
-from geogs.bench.appearance.points_file import read_points, write_points
-from geogs.bench.appearance.start_points import StartPoints, find_start_points
-from geogs.bench.appearance.trainer import AppearanceResult
-from geogs.bench.appearance.views import TrainingView, training_views
 from geogs.config import InputConfig, MeshConfig
 from geogs.errors import GeogsError
 from geogs.io.sources.posed.sniff import open_posed_source
 from geogs.io.writers.atomic import prepare_output_folder, write_text
 from geogs.io.writers.ply import write_mesh
 from geogs.mesh.types import Mesh
+from geogs_bench.appearance.baseline import appearance_mesh, train_appearance
+from geogs_bench.appearance.config import AppearanceConfig
+from geogs_bench.appearance.disks import AppearanceDisks
+from geogs_bench.appearance.points_file import read_points, write_points
+from geogs_bench.appearance.start_points import StartPoints, find_start_points
+from geogs_bench.appearance.trainer import AppearanceResult
+from geogs_bench.appearance.views import TrainingView, training_views
 
 
 def main() -> int:

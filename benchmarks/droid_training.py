@@ -20,14 +20,14 @@ from geogs.synth.raycast import Raycaster
 from geogs.synth.room import make_room
 from geogs.synth.trajectory import handheld_trajectory
 from geogs.tracking.flow.droid_network import DroidNetwork, DroidSize
-from geogs.train.bundle import ClipState
-from geogs.train.clip_state import blind_start, neighbour_edges, true_state
-from geogs.train.droid_unroll import (
+from geogs_train.bundle import ClipState
+from geogs_train.clip_state import blind_start, neighbour_edges, true_state
+from geogs_train.droid_unroll import (
     UnrollOptions,
     cell_cameras,
     unroll,
 )
-from geogs.train.pose_loss import Estimate, PoseLossOptions, pose_errors, pose_loss
+from geogs_train.pose_loss import Estimate, PoseLossOptions, pose_errors, pose_loss
 
 FRAMES = 120
 """Of the path that the clip is a part of."""

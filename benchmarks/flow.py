@@ -21,18 +21,18 @@ from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_inverse
 from geogs.io.poses import read_replica_trajectory
 from geogs.io.sources.sniff import open_source
+from geogs.keyframes.grid import SampleGrid
 from geogs.tracking.flow.classical import ClassicalFlow
 from geogs.tracking.flow.lookup import Edges
 from geogs.tracking.flow.own import load_network
 from geogs.tracking.flow.own_network import FlowNetwork, cell_pixels
 from geogs.tracking.flow.weights_files import PACKAGED
-from geogs.tracking.grid import SampleGrid
-from geogs.train.objective import run_network
-from geogs.train.options import FlowTraining
-from geogs.train.pairs import FlowBatch
-from geogs.train.scores import CellErrors, summarise
-from geogs.train.starts import StartOptions, disturbed_starts
-from geogs.train.validation import Validation, cell_errors
+from geogs_train.objective import run_network
+from geogs_train.options import FlowTraining
+from geogs_train.pairs import FlowBatch
+from geogs_train.scores import CellErrors, summarise
+from geogs_train.starts import StartOptions, disturbed_starts
+from geogs_train.validation import Validation, cell_errors
 
 WARM, COLD = StartOptions(cold=0.0), StartOptions(cold=1.0)
 DEPTH_UNIT = 6553.5

@@ -16,13 +16,13 @@ import numpy as np
 import torch
 
 from geogs.config import DepthConfig
+from geogs.depth.completion import complete_inverse_depth, upsample_grid
+from geogs.depth.estimate import estimate_depth
+from geogs.depth.fusion import check_depth
+from geogs.depth.sweep_neighbors import select_sweep_neighbours
+from geogs.depth.view import DepthView, KeyframeDepth, depth_view
 from geogs.geometry.camera import Camera
 from geogs.geometry.umeyama import umeyama
-from geogs.mapping.completion import complete_inverse_depth, upsample_grid
-from geogs.mapping.depth_fusion import check_depth
-from geogs.mapping.depth_view import DepthView, KeyframeDepth, depth_view
-from geogs.mapping.keyframe_depth import estimate_depth
-from geogs.mapping.sweep_neighbors import select_sweep_neighbours
 from geogs.types import Keyframe
 
 

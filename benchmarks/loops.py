@@ -26,13 +26,13 @@ from plyfile import PlyData
 
 from geogs.config import LoopConfig
 from geogs.geometry.lie import se3_exp, se3_inverse, so3_log
+from geogs.keyframes.grid import SampleGrid
+from geogs.keyframes.store import KeyframeStore
 from geogs.loop.dense import dense_check
 from geogs.loop.detect import LoopDetector
 from geogs.loop.retrieval import AppearanceIndex
 from geogs.loop.verification import DepthView, TwoViewVerifier
 from geogs.tracking.flow.classical import ClassicalFlow
-from geogs.tracking.grid import SampleGrid
-from geogs.tracking.keyframes import KeyframeStore
 from tracking import Sequence, load
 
 OVERLAP, DEGREES, SHARE_OF_DEPTH = 0.3, 5.0, 0.1

@@ -20,10 +20,11 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from geogs.cli.progress import peak_memory
-from geogs.cli.results import fusion_views
+from geogs.application.progress import peak_memory
+from geogs.application.results import fusion_views
 from geogs.cli.run import RunOptions
 from geogs.config import Config
+from geogs.depth.completion import upsample_grid
 from geogs.errors import InputError
 from geogs.evaluation.reconstruction import evaluate_reconstruction
 from geogs.evaluation.surface import Surface, read_surface
@@ -32,7 +33,6 @@ from geogs.geometry.umeyama import umeyama
 from geogs.io.poses import read_matrix_rows
 from geogs.io.sources.sniff import open_source
 from geogs.loop.global_bundle import global_bundle
-from geogs.mapping.completion import upsample_grid
 from geogs.mapping.mapper import Mapper
 from geogs.mesh.extract import extract_mesh
 from geogs.mesh.types import DepthMapView, Mesh

@@ -23,11 +23,11 @@ from torch import Tensor
 from torch.profiler import ProfilerActivity, profile
 
 from geogs.config import LossConfig, MappingConfig
+from geogs.depth.view import DenseDepth
 from geogs.geometry.depth import normals_from_depth
 from geogs.geometry.lie import se3_inverse
 from geogs.losses import multi_view_loss, single_view_loss
 from geogs.mapping.cuda.trainer import CudaTrainer
-from geogs.mapping.depth_view import DenseDepth
 from geogs.mapping.training import Batch
 from geogs.mapping.view import MapCameras, MapView
 from geogs.splat.cuda import autograd

@@ -15,8 +15,8 @@ import numpy as np
 import torch
 
 from geogs.config import MappingConfig
+from geogs.depth.view import DenseDepth, KeyframeDepth
 from geogs.geometry.lie import se3_inverse
-from geogs.mapping.depth_view import DenseDepth, KeyframeDepth
 from geogs.mapping.training import Trainer, view_loss
 from geogs.mapping.view import MapCameras, MapView
 from geogs.splat.init import initialise_disks

@@ -23,6 +23,7 @@ import torch
 from geogs.config import Config, MappingConfig, PriorConfig
 from geogs.geometry.camera import Camera
 from geogs.geometry.umeyama import umeyama
+from geogs.keyframes.grid import OFFSET, STRIDE
 from geogs.loop.global_bundle import global_bundle
 from geogs.priors.base import DepthKind, MonocularPrior
 from geogs.slam import Slam
@@ -31,7 +32,6 @@ from geogs.synth.raycast import Raycaster, View
 from geogs.synth.room import make_room, with_bare_walls
 from geogs.synth.trajectory import handheld_trajectory
 from geogs.tracking.flow.texture import MIN_STRUCTURE, cell_structure, smaller_eigenvalue
-from geogs.tracking.grid import OFFSET, STRIDE
 from geogs.tracking.tracker import Tracker
 from geogs.types import Frame
 

@@ -5,13 +5,13 @@ from pathlib import Path
 
 import numpy as np
 
-from geogs.bench.runner import Task
-from geogs.bench.scene import Scene, TruePoses, Truth
 from geogs.geometry.camera import Camera
 from geogs.io.writers.intrinsics import write_intrinsics
 from geogs.io.writers.ply import write_mesh
 from geogs.io.writers.tum import write_tum_trajectory
 from geogs.types import Trajectory
+from geogs_bench.runner import Task
+from geogs_bench.scene import Scene, TruePoses, Truth
 
 SCALE = 0.25
 """Map units per metre of the results."""

@@ -12,7 +12,7 @@ SOURCE = Path(__file__).parents[1] / "src"
 def _typed_modules() -> list[str]:
     """Every module of ours except compiled kernels, which the type checker must not wrap."""
     names = []
-    for path in (SOURCE / "geogs").rglob("*.py"):
+    for path in SOURCE.glob("geogs*/**/*.py"):
         name = ".".join(path.relative_to(SOURCE).with_suffix("").parts)
         if not name.endswith(("_kernels", "__init__")) and ".splat.cpu." not in name:
             names.append(name)

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from geogs.depth.view import DepthView, depth_view
 from geogs.geometry.camera import Camera
-from geogs.mapping.depth_view import DepthView, depth_view
 from geogs.types import Keyframe
 
 WORKING = Camera(fx=160.0, fy=160.0, cx=95.5, cy=71.5, width=192, height=144)

@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import torch
 
+from geogs.bundle.dense import BundleProblem, relative_motion
+from geogs.bundle.lens import Lens, lens_rays, project_lens
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp
-from geogs.tracking.bundle import BundleProblem, relative_motion
-from geogs.tracking.calibration.lens import Lens, lens_rays, project_lens
-from geogs.tracking.grid import SampleGrid
+from geogs.keyframes.grid import SampleGrid
 
 CAMERA = Camera(fx=70.0, fy=72.0, cx=39.0, cy=29.0, width=80, height=60)
 GRID = SampleGrid(CAMERA)

@@ -7,12 +7,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from geogs.bundle.dense import project
 from geogs.config import TrackingConfig
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp, se3_inverse
-from geogs.tracking.bundle import project
+from geogs.keyframes.grid import SampleGrid
 from geogs.tracking.flow.base import FlowMatch, Memories
-from geogs.tracking.grid import SampleGrid
 from geogs.tracking.tracker import Tracker, TrackState
 
 CAMERA = Camera(fx=480.0, fy=480.0, cx=255.5, cy=143.5, width=512, height=288)

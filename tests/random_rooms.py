@@ -2,9 +2,9 @@
 
 import torch
 
-from geogs.train.rooms.scene import NONE, Lights, Rooms, Solids, Surfaces
-from geogs.train.rooms.textures import TextureBank
-from geogs.train.rooms.views import Views
+from geogs_train.rooms.scene import NONE, Lights, Rooms, Solids, Surfaces
+from geogs_train.rooms.textures import TextureBank
+from geogs_train.rooms.views import Views
 
 
 def solids_of(*rows: tuple[int, list[float], list[float], torch.Tensor | None]) -> Solids:

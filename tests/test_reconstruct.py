@@ -17,14 +17,14 @@ from scipy.spatial import cKDTree
 from depth_scene import WORKING, make_scene, trace
 from geogs.cli.reconstruct import seconds
 from geogs.config import InputConfig
+from geogs.depth.engine import CpuDepthEngine
+from geogs.depth.estimate import estimate_depth
+from geogs.depth.view import depth_view
 from geogs.errors import InputError
 from geogs.io.poses import read_tum_trajectory
 from geogs.io.sources.posed.sniff import open_posed_source
 from geogs.io.writers.native import load_map
-from geogs.mapping.depth_engine import CpuDepthEngine
 from geogs.mapping.depth_schedule import spread_order
-from geogs.mapping.depth_view import depth_view
-from geogs.mapping.keyframe_depth import estimate_depth
 from geogs.mapping.known_poses import depth_search, distances_to_try, posed_keyframe
 from geogs.reconstruct import Reconstruction
 from posed_scene import (

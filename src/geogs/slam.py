@@ -9,6 +9,8 @@ import torch
 
 from geogs.config import Config
 from geogs.geometry.camera import Camera
+from geogs.keyframes.grid import SampleGrid
+from geogs.keyframes.store import KeyframeIds
 from geogs.loop.closer import LoopCloser
 from geogs.loop.global_bundle import global_bundle
 from geogs.mapping.mapper import Mapper
@@ -16,8 +18,6 @@ from geogs.priors.base import MonocularPrior
 from geogs.stopwatch import Stopwatch
 from geogs.threads import on_one_torch_thread
 from geogs.tracking.flow.select import build_operator
-from geogs.tracking.grid import SampleGrid
-from geogs.tracking.keyframes import KeyframeIds
 from geogs.tracking.segments import Segments
 from geogs.tracking.tracker import Tracker, TrackResult, TrackState
 from geogs.types import Frame, MapSnapshot, PoseCorrection, RenderedKeyframe, Trajectory

@@ -21,24 +21,25 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from geogs.archive import Archive, Archived, SettledArchive
+from geogs.bundle.dense import bundle_solver
 from geogs.config import MappingConfig
+from geogs.depth.engine import depth_engine
 from geogs.errors import InputError
-from geogs.mapping.depth_engine import depth_engine
+from geogs.keyframes.archive import Archive, Archived, SettledArchive
+from geogs.keyframes.grid import SampleGrid
 from geogs.mapping.training import MapTrainer, map_trainer
 from geogs.mapping.view import MapCameras
 from geogs.slam import Slam
 from geogs.splat.map import GaussianMap
 from geogs.splat.optimizer import MapOptimizer
-from geogs.tracking.bundle import bundle_solver
-from geogs.tracking.grid import SampleGrid
 from geogs.tracking.segments import Segments
 
 PROTOCOL = 5
 _PROCESS = frozenset({"config", "camera", "device", "prior", "operator", "ids"})
 """Attributes of a Slam that the one who reads has already."""
 _PACKAGES = (
-    "archive", "config", "geometry", "losses", "mapping", "priors.base", "loop", "splat",
+    "keyframes", "bundle", "depth", "config", "geometry", "losses", "mapping", "priors.base",
+    "loop", "splat",
     "stopwatch", "tracking", "types",
 )  # fmt: skip
 """Modules of ours whose classes may be in a state."""

@@ -7,8 +7,8 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
-from geogs.archive import Archived
 from geogs.geometry.camera import Camera
+from geogs.keyframes.archive import Archived
 
 
 @dataclass(frozen=True, slots=True)

@@ -176,7 +176,7 @@ def _kernels(device: "torch.device") -> Finding:
 
 
 def _self_test(device: "torch.device") -> Iterator[Finding]:
-    from geogs.cli.self_test import check_renderer, time_renderer
+    from geogs.application.self_test import check_renderer, time_renderer
 
     name = f"{device.type} renderer against its specification"
     try:

@@ -10,15 +10,15 @@ from typing import TYPE_CHECKING, Annotated, get_args
 
 import tyro
 
-from geogs.cli.interrupt import Interruption
+from geogs.application.interrupt import Interruption
+from geogs.application.progress import RunProgress
 from geogs.cli.options import SHORT, given, parse_options
-from geogs.cli.progress import RunProgress
 from geogs.config import Preset, ReconstructConfig, reconstruct_preset
 from geogs.errors import InputError
 
 if TYPE_CHECKING:
-    from geogs.cli.checkpoint import Checkpoint
-    from geogs.cli.snapshots import Snapshots
+    from geogs.application.checkpoint import Checkpoint
+    from geogs.application.snapshots import Snapshots
     from geogs.io.sources.posed.base import PosedSource
     from geogs.reconstruct import Reconstruction, ReconstructionState
 
@@ -76,9 +76,9 @@ def reconstruct(options: ReconstructOptions) -> Path:
     import torch
 
     import geogs
-    from geogs.cli.checkpoint import Checkpoint, fingerprint
-    from geogs.cli.gpu_memory import full_memory_in_a_sentence
-    from geogs.cli.snapshots import Snapshots
+    from geogs.application.checkpoint import Checkpoint, fingerprint
+    from geogs.application.gpu_memory import full_memory_in_a_sentence
+    from geogs.application.snapshots import Snapshots
     from geogs.gpu.installation import require_device
     from geogs.gpu.kernels import prepare_kernels
     from geogs.io.sources.posed.check import check_poses
@@ -176,8 +176,8 @@ def _write(
     interrupted: bool,
 ) -> None:
     """All files of the result."""
-    from geogs.cli.results import SourceFacts, write_results
-    from geogs.cli.surfaces import write_depth_mesh
+    from geogs.application.results import SourceFacts, write_results
+    from geogs.application.surfaces import write_depth_mesh
 
     progress = attendance.progress
     facts = SourceFacts(

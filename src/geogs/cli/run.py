@@ -9,15 +9,15 @@ from typing import TYPE_CHECKING, Annotated, get_args
 
 import tyro
 
-from geogs.cli.calibrate import self_calibrated
-from geogs.cli.interrupt import Interruption
+from geogs.application.calibrate import self_calibrated
+from geogs.application.interrupt import Interruption
+from geogs.application.priors import open_prior
+from geogs.application.progress import RunProgress
 from geogs.cli.options import SHORT, given, parse_options
-from geogs.cli.priors import open_prior
-from geogs.cli.progress import RunProgress
 from geogs.config import Config, Preset, preset
 
 if TYPE_CHECKING:
-    from geogs.cli.run_checkpoint import RunCheckpoint, RunFacts
+    from geogs.application.run_checkpoint import RunCheckpoint, RunFacts
     from geogs.io.sources.base import ReadingPlace
     from geogs.io.sources.several import JointPlace
     from geogs.io.sources.sniff import Stream
@@ -63,10 +63,10 @@ def run(options: RunOptions) -> Path:
     import torch
 
     import geogs
-    from geogs.cli.gpu_memory import REMEDY, full_memory_in_a_sentence
-    from geogs.cli.results import SourceFacts, write_results
-    from geogs.cli.run_checkpoint import RunCheckpoint, RunFacts, SavedRun, has_checkpoint
-    from geogs.cli.surfaces import write_depth_mesh, write_online_results
+    from geogs.application.gpu_memory import REMEDY, full_memory_in_a_sentence
+    from geogs.application.results import SourceFacts, write_results
+    from geogs.application.run_checkpoint import RunCheckpoint, RunFacts, SavedRun, has_checkpoint
+    from geogs.application.surfaces import write_depth_mesh, write_online_results
     from geogs.errors import DeviceError
     from geogs.gpu.installation import require_device
     from geogs.gpu.kernels import prepare_kernels
@@ -186,7 +186,7 @@ def _feed(
     memory is full."""
     import torch
 
-    from geogs.cli.run_checkpoint import frames_after
+    from geogs.application.run_checkpoint import frames_after
 
     frames = iter(source) if place is None else frames_after(source, place)
     if slam.is_ended:

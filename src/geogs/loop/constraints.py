@@ -8,13 +8,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from geogs.geometry.lie import se3_inverse, sim3_inverse, sim3_log
+from geogs.keyframes.grid import SampleGrid
+from geogs.keyframes.store import KeyframeStore, scaled
 from geogs.loop.detect import Loop
 from geogs.loop.matched_edges import MatchedEdges
 from geogs.loop.pose_graph import RelativePoses
 from geogs.loop.relative_pose import RelativePoseOptions, relative_poses
 from geogs.tracking.graph import Edge, Pair
-from geogs.tracking.grid import SampleGrid
-from geogs.tracking.keyframes import KeyframeStore, scaled
 from geogs.tracking.packed_edge import PackedEdge
 
 SETTLED = RelativePoseOptions(iterations=0)

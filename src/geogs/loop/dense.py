@@ -7,12 +7,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from geogs.bundle.dense import project
 from geogs.config import VerificationOptions
 from geogs.geometry.lie import se3_inverse, so3_log
-from geogs.tracking.bundle import project
+from geogs.keyframes.grid import SampleGrid
+from geogs.keyframes.store import KeyframeState, scaled
 from geogs.tracking.flow.base import FlowMatch, FlowOperator
-from geogs.tracking.grid import SampleGrid
-from geogs.tracking.keyframes import KeyframeState, scaled
 from geogs.tracking.motion import FrameLocator, FrameMotion
 
 

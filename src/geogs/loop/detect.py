@@ -13,11 +13,11 @@ from torch import Tensor
 
 from geogs.config import LoopConfig
 from geogs.geometry.lie import se3_inverse, so3_log
+from geogs.keyframes.grid import SampleGrid
+from geogs.keyframes.store import KeyframeState, KeyframeStore
 from geogs.loop.dense import dense_check
 from geogs.loop.search import Cause, Depths, PlaceSearch, Proposal, Query, Sighting
 from geogs.tracking.flow.base import FlowMatch, FlowOperator
-from geogs.tracking.grid import SampleGrid
-from geogs.tracking.keyframes import KeyframeState, KeyframeStore
 from geogs.tracking.motion import Recognition
 from geogs.tracking.proximity import frame_distances
 

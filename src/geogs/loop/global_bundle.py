@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 
-from geogs.tracking.bundle import BundleOptions
+from geogs.bundle.dense import BundleOptions
 from geogs.tracking.proximity import Pair, proximity_pairs
 from geogs.tracking.tracker import Tracker
 from geogs.types import PoseCorrection

@@ -13,9 +13,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from geogs.bundle.dense import linearise, project, robust_weight
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import sim3_adjoint, sim3_inverse
-from geogs.tracking.bundle import linearise, project, robust_weight
 
 
 @dataclass(frozen=True)

@@ -13,11 +13,11 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from geogs.bundle.dense import LinearProjection, linearise, move, robust_weight
 from geogs.geometry.lie import se3_inverse
+from geogs.keyframes.grid import SampleGrid
 from geogs.loop.matched_edges import MatchedEdges
 from geogs.loop.pose_graph import RelativePoses
-from geogs.tracking.bundle import LinearProjection, linearise, move, robust_weight
-from geogs.tracking.grid import SampleGrid
 
 
 @dataclass(frozen=True)

@@ -9,10 +9,10 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from geogs.config import LoopConfig
+from geogs.keyframes.grid import SampleGrid
 from geogs.loop.features import Features
 from geogs.loop.retrieval import AppearanceIndex
 from geogs.loop.verification import DepthView, TwoView, TwoViewVerifier
-from geogs.tracking.grid import SampleGrid
 from geogs.tracking.motion import Recognition
 
 Cause = Literal["geometry", "appearance"]

@@ -1,8 +1,8 @@
 """The dense depths of a mapper's keyframes: searched, and checked by those around."""
 
 from geogs.config import MappingConfig
-from geogs.mapping.depth_engine import DepthEngine, Progress, silent
-from geogs.mapping.sweep_neighbors import select_sweep_neighbours
+from geogs.depth.engine import DepthEngine, Progress, silent
+from geogs.depth.sweep_neighbors import select_sweep_neighbours
 from geogs.mapping.view import MapCameras, MapView
 from geogs.mapping.view_maps import ParkedMaps, ResidentViews
 from geogs.mapping.window import views_around

@@ -14,14 +14,14 @@ import torch
 from jaxtyping import Bool, Float64, UInt8
 
 from geogs.config import DepthConfig, SearchConfig
+from geogs.depth.plane_sweep import SweepResult, plane_sweep
+from geogs.depth.sweep_neighbors import parallax_degrees, select_sweep_neighbours
+from geogs.depth.view import DepthSearch, DepthView
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
-from geogs.mapping.depth_view import DepthSearch, DepthView
-from geogs.mapping.plane_sweep import SweepResult, plane_sweep
-from geogs.mapping.sweep_neighbors import parallax_degrees, select_sweep_neighbours
+from geogs.keyframes.grid import OFFSET, STRIDE
 from geogs.mapping.view import MapView
 from geogs.threads import thread_map
-from geogs.tracking.grid import OFFSET, STRIDE
 from geogs.types import Keyframe
 
 # A sweep around a distance d goes from d / NEAR to d * FAR; the next distance is RATIO times d.

@@ -11,10 +11,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from geogs.archive import Archive, Archived
 from geogs.config import MappingConfig
+from geogs.depth.engine import Progress, depth_engine, silent
 from geogs.geometry.camera import Camera
-from geogs.mapping.depth_engine import Progress, depth_engine, silent
+from geogs.keyframes.archive import Archive, Archived
 from geogs.mapping.keyframe_depths import CANDIDATES, KeyframeDepths
 from geogs.mapping.map_update import MapUpdate, plan_update, witness
 from geogs.mapping.rendered import rendered_keyframe, searched_keyframe

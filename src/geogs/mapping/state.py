@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float32, Float64, Int64
 from torch import Tensor
 
-from geogs.mapping.depth_view import DenseDepth, DepthSearch
+from geogs.depth.view import DenseDepth, DepthSearch
 from geogs.mapping.mapper import Mapper
 from geogs.mapping.training import TrainingPlace
 from geogs.splat.map import DiskParameters

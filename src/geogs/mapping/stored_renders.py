@@ -7,8 +7,8 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from geogs.archive import Archive, Archived
 from geogs.geometry.camera import Camera
+from geogs.keyframes.archive import Archive, Archived
 from geogs.types import RenderedKeyframe
 
 RESIDENT_BYTES = 1 << 26

@@ -8,13 +8,13 @@ import torch
 from jaxtyping import Bool, Float, Float32
 from torch import Tensor
 
-from geogs.archive import Archive
 from geogs.config import LossConfig, MappingConfig
+from geogs.depth.view import DenseDepth, DepthSearch, DepthView, Place, PosedDepth
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_inverse
+from geogs.keyframes.archive import Archive
 from geogs.losses.multi_view import PhotoView
 from geogs.losses.single_view import OUTSIDE, ViewConstants
-from geogs.mapping.depth_view import DenseDepth, DepthSearch, DepthView, Place, PosedDepth
 from geogs.mapping.view_maps import ParkedMaps, ResidentViews, ViewMaps
 from geogs.types import Keyframe
 

@@ -10,12 +10,12 @@ import torch
 from jaxtyping import Float, Float32, UInt8
 from torch import Tensor
 
-from geogs.archive import Archive, Archived
 from geogs.config import LossConfig
+from geogs.depth.view import DenseDepth, depth_view
 from geogs.geometry.camera import Camera
+from geogs.keyframes.archive import Archive, Archived
 from geogs.losses.multi_view import PhotoView
 from geogs.losses.single_view import ViewConstants
-from geogs.mapping.depth_view import DenseDepth, depth_view
 from geogs.types import Keyframe
 
 

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from geogs.config import MappingConfig, PhotoConfig
-from geogs.mapping.sweep_neighbors import misfit, parallax_degrees
+from geogs.depth.sweep_neighbors import misfit, parallax_degrees
 from geogs.mapping.view import MapView
 
 

@@ -19,9 +19,9 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
+from geogs.bundle.dense import BundleProblem, linearise, relative_motion, robust_weight
 from geogs.config import PriorConfig
-from geogs.tracking.bundle import BundleProblem, linearise, relative_motion, robust_weight
-from geogs.tracking.grid import SampleGrid
+from geogs.keyframes.grid import SampleGrid
 
 SCALE_DAMPING = 1e-4
 """Of the scales, relative to the curvature of the prior's term."""

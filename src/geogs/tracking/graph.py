@@ -8,8 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from geogs.threads import thread_map
-from geogs.tracking.bundle import (
+from geogs.bundle.dense import (
     BundleOptions,
     BundleProblem,
     BundleResult,
@@ -17,11 +16,12 @@ from geogs.tracking.bundle import (
     project,
     relative_motion,
 )
+from geogs.bundle.streamed import StreamedBundle, StreamedProblem
+from geogs.keyframes.store import KeyframeStore
+from geogs.threads import thread_map
 from geogs.tracking.flow.base import FlowMatch, FlowOperator
-from geogs.tracking.keyframes import KeyframeStore
 from geogs.tracking.packed_edge import PackedEdge, packed_reprojections
 from geogs.tracking.proximity import PAIRS_TOGETHER, Pair
-from geogs.tracking.streamed_bundle import StreamedBundle, StreamedProblem
 
 STACKED_EDGES = 1024
 """Directed edges up to which an adjustment on the CPU has all matches in one piece."""
@@ -93,7 +93,7 @@ class FrameGraph:
             return self.keyframes.grid.pixels.new_zeros(0, self.keyframes.grid.size, 2)
         store = self.keyframes
         if store.grid.on_gpu:
-            from geogs.tracking.cuda.graph import DirectedPairs
+            from geogs.bundle.cuda.graph import DirectedPairs
 
             return DirectedPairs.of(store, directed).project()
         source, target = (store.poses([e[k] for e in directed]) for k in (0, 1))
@@ -171,7 +171,7 @@ class FrameGraph:
         before = _reprojections([self.edges[e] for e in directed])
         weight = torch.stack([self.edges[e].weight for e in directed])
         if self.keyframes.grid.on_gpu:
-            from geogs.tracking.cuda.graph import DirectedPairs
+            from geogs.bundle.cuda.graph import DirectedPairs
 
             return DirectedPairs.of(self.keyframes, directed).moved(before, weight)
         moved = (self.reprojections(directed) - before).norm(dim=-1)

@@ -14,14 +14,14 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from geogs.bundle.dense import BundleOptions
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_inverse
+from geogs.keyframes.grid import SampleGrid
+from geogs.keyframes.store import KeyframeStore
 from geogs.threads import thread_map
-from geogs.tracking.bundle import BundleOptions
 from geogs.tracking.flow.base import FlowMatch
 from geogs.tracking.graph import FrameGraph
-from geogs.tracking.grid import SampleGrid
-from geogs.tracking.keyframes import KeyframeStore
 from geogs.tracking.motion import filled_positions, pnp, transfer_depth
 
 

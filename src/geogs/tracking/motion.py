@@ -10,12 +10,12 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from geogs.bundle.dense import project
+from geogs.bundle.motion_only import solve_poses
 from geogs.geometry.lie import se3_inverse
-from geogs.tracking.bundle import project
+from geogs.keyframes.grid import SampleGrid
+from geogs.keyframes.store import KeyframeState
 from geogs.tracking.flow.base import FlowMatch, FlowOperator
-from geogs.tracking.grid import SampleGrid
-from geogs.tracking.keyframes import KeyframeState
-from geogs.tracking.motion_only import solve_poses
 
 FIT_ITERATIONS = 6
 """Steps of the motion-only adjustment of a frame."""
@@ -103,7 +103,7 @@ class FrameLocator:
     def _fit_on_gpu(
         self, keyframe: KeyframeState, match: FlowMatch, T_guess: Float[Tensor, "4 4"]
     ) -> FrameMotion | None:
-        from geogs.tracking.cuda.motion import fit_frame
+        from geogs.bundle.cuda.motion import fit_frame
 
         T, (used, agree, residual, flow) = fit_frame(
             self.grid,
@@ -206,7 +206,7 @@ def all_reprojections(
     if not grid.on_gpu:
         views = [both_reprojections(grid, k, T) for k, T in zip(keyframes, T_cw, strict=True)]
         return torch.stack([v[0] for v in views]), torch.stack([v[1] for v in views])
-    from geogs.tracking.cuda.fields import carry_depth
+    from geogs.bundle.cuda.fields import carry_depth
 
     rows = {k.id: k for k in keyframes}
     slot = {id: n for n, id in enumerate(rows)}
@@ -247,7 +247,7 @@ def transfer_depth(
     Cells that nothing falls on are filled from their surroundings and have no information.
     """
     if grid.on_gpu:
-        from geogs.tracking.cuda.fields import carry_depth
+        from geogs.bundle.cuda.fields import carry_depth
 
         depth, carried = carry_depth(
             grid,

@@ -8,12 +8,12 @@ import torch
 from jaxtyping import Float, Float16, Int16
 from torch import Tensor
 
+from geogs.bundle.dense import project
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_inverse
-from geogs.tracking.bundle import project
+from geogs.keyframes.grid import SampleGrid
+from geogs.keyframes.store import KeyframeState
 from geogs.tracking.flow.base import FlowMatch
-from geogs.tracking.grid import SampleGrid
-from geogs.tracking.keyframes import KeyframeState
 
 MAX_WEIGHT = 6e4
 """Largest weight that half precision holds, 1 / pixel^2."""

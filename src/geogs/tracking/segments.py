@@ -10,7 +10,7 @@ from torch import Tensor
 
 from geogs.errors import TrackingLost
 from geogs.geometry.lie import sim3_scale
-from geogs.tracking.keyframes import KeyframeStore
+from geogs.keyframes.store import KeyframeStore
 from geogs.tracking.motion import Recognition
 from geogs.tracking.tracker import Tracker, TrackResult, TrackState
 from geogs.types import Frame, Keyframe, PoseCorrection, Trajectory

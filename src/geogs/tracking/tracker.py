@@ -11,18 +11,18 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from geogs.bundle.dense import BundleOptions
 from geogs.config import PriorConfig, TrackingConfig
 from geogs.errors import GeogsError, InputError, TrackingLost
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_inverse
+from geogs.keyframes.grid import SampleGrid
+from geogs.keyframes.store import KeyframeIds, KeyframeState, KeyframeStore, scaled
 from geogs.priors.base import MonocularPrior
-from geogs.tracking.bundle import BundleOptions
 from geogs.tracking.flow.base import FlowOperator
 from geogs.tracking.flow.select import build_operator
 from geogs.tracking.graph import FrameGraph
-from geogs.tracking.grid import SampleGrid
 from geogs.tracking.keyframe_priors import KeyframePriors
-from geogs.tracking.keyframes import KeyframeIds, KeyframeState, KeyframeStore, scaled
 from geogs.tracking.motion import (
     FrameLocator,
     FrameMotion,

@@ -10,13 +10,13 @@ import torch
 from jaxtyping import Bool, Float, Float16, Int16
 from torch import Tensor
 
+from geogs.bundle.dense import linearise
+from geogs.bundle.motion_only import solve_poses
 from geogs.geometry.lie import retract, se3_inverse, se3_log
-from geogs.tracking.bundle import linearise
+from geogs.keyframes.grid import SampleGrid
+from geogs.keyframes.store import KeyframeState, KeyframeStore, scaled
 from geogs.tracking.flow.base import FlowMatch, FlowOperator
-from geogs.tracking.grid import SampleGrid
-from geogs.tracking.keyframes import KeyframeState, KeyframeStore, scaled
 from geogs.tracking.motion import all_reprojections
-from geogs.tracking.motion_only import solve_poses
 from geogs.tracking.packed_edge import pack_matches, unpacked_positions
 from geogs.types import Trajectory
 

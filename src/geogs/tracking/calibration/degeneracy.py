@@ -13,9 +13,9 @@ import numpy as np
 from jaxtyping import Float
 
 from geogs.geometry.camera import Camera
+from geogs.keyframes.grid import SampleGrid
 from geogs.tracking.calibration.keyframes import on_cpu, with_focal
 from geogs.tracking.flow.base import FlowMatch
-from geogs.tracking.grid import SampleGrid
 
 PLANAR_SHARE = 0.9
 """Of the matches; where one homography explains so many in every view, the scene is a plane."""

@@ -7,17 +7,17 @@ from dataclasses import dataclass
 import cv2
 import torch
 
+from geogs.bundle.lens_bundle import LensBundleOptions
 from geogs.config import CalibrationConfig, TrackingConfig
 from geogs.geometry.camera import Camera
+from geogs.keyframes.grid import SampleGrid
 from geogs.threads import on_one_torch_thread, thread_map
-from geogs.tracking.calibration.bundle import LensBundleOptions
 from geogs.tracking.calibration.degeneracy import Degeneracy, degeneracy
 from geogs.tracking.calibration.growth import GrowingBundle
 from geogs.tracking.calibration.keyframes import View, ViewGatherer, flows_from_first
 from geogs.tracking.calibration.start import Start, candidates, try_candidate
 from geogs.tracking.flow.base import FlowMatch, FlowOperator
 from geogs.tracking.flow.select import build_operator
-from geogs.tracking.grid import SampleGrid
 from geogs.types import Frame
 
 LEAST_VIEWS = 4

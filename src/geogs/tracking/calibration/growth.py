@@ -6,13 +6,13 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from geogs.tracking.bundle import BundleProblem, relative_motion
-from geogs.tracking.calibration.bundle import LensBundleOptions, LensBundleResult, solve_lens
+from geogs.bundle.dense import BundleProblem, relative_motion
+from geogs.bundle.lens import lens_rays, project_lens
+from geogs.bundle.lens_bundle import LensBundleOptions, LensBundleResult, solve_lens
+from geogs.keyframes.grid import SampleGrid
 from geogs.tracking.calibration.keyframes import View, on_cpu
-from geogs.tracking.calibration.lens import lens_rays, project_lens
 from geogs.tracking.calibration.start import Start
 from geogs.tracking.flow.base import FlowOperator
-from geogs.tracking.grid import SampleGrid
 from geogs.tracking.motion import pnp, transfer_depth
 
 OFFSETS = (1, 3, 6)

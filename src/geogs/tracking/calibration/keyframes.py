@@ -9,8 +9,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from geogs.geometry.camera import Camera
+from geogs.keyframes.grid import SampleGrid
 from geogs.tracking.flow.base import FlowMatch, FlowOperator
-from geogs.tracking.grid import SampleGrid
 from geogs.tracking.motion import FlowChain, filled_flow, filled_positions
 from geogs.types import Frame
 

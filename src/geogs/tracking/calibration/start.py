@@ -11,13 +11,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from geogs.bundle.dense import BundleProblem
+from geogs.bundle.lens import Lens
+from geogs.bundle.lens_bundle import LensBundleOptions, LensBundleResult, solve_lens
 from geogs.geometry.camera import Camera
-from geogs.tracking.bundle import BundleProblem
-from geogs.tracking.calibration.bundle import LensBundleOptions, LensBundleResult, solve_lens
+from geogs.keyframes.grid import SampleGrid
 from geogs.tracking.calibration.keyframes import on_cpu, stacked, with_focal
-from geogs.tracking.calibration.lens import Lens
 from geogs.tracking.flow.base import FlowMatch
-from geogs.tracking.grid import SampleGrid
 from geogs.tracking.initialise import best_two_view, two_view
 from geogs.tracking.motion import pnp
 

@@ -19,6 +19,7 @@ from torch import Tensor
 from geogs.errors import InputError
 from geogs.gpu.kernels import Kernel, kernels_for
 from geogs.gpu.transfer import to_device
+from geogs.keyframes.grid import SampleGrid
 from geogs.tracking.flow.base import FlowMatch, Memories
 from geogs.tracking.flow.classical import (
     COARSE_DEVIATION,
@@ -26,7 +27,6 @@ from geogs.tracking.flow.classical import (
     SMALL_IMAGE,
 )
 from geogs.tracking.flow.texture import MIN_STRUCTURE
-from geogs.tracking.grid import SampleGrid
 
 SOURCES = Path(__file__).parents[1] / "cuda"
 TILE = 32

@@ -14,6 +14,7 @@ from safetensors import safe_open
 from torch import Tensor
 
 from geogs.errors import InputError
+from geogs.keyframes.grid import SampleGrid
 from geogs.tracking.flow.base import FlowMatch, FlowOperator, Memories
 from geogs.tracking.flow.lookup import DescriptorPyramid, Edges
 from geogs.tracking.flow.own_network import (
@@ -22,7 +23,6 @@ from geogs.tracking.flow.own_network import (
     ImageFeatures,
     NetworkOptions,
 )
-from geogs.tracking.grid import SampleGrid
 from geogs.tracking.motion import filled_positions
 
 

@@ -14,6 +14,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
+from geogs.keyframes.grid import OFFSET, STRIDE
 from geogs.tracking.flow.lookup import (
     CHANNELS,
     WINDOW,
@@ -22,7 +23,6 @@ from geogs.tracking.flow.lookup import (
     PyramidLevel,
     correlation_windows,
 )
-from geogs.tracking.grid import OFFSET, STRIDE
 
 FLOW_UNIT = 16.0
 """Pixels of flow that are one to the network."""

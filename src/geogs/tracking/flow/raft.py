@@ -16,13 +16,13 @@ from torch import Tensor
 from torch.nn import functional
 
 from geogs.errors import InputError
+from geogs.keyframes.grid import OFFSET, STRIDE, SampleGrid
 from geogs.tracking.flow.base import FlowMatch, Memories
 from geogs.tracking.flow.correlation import CorrelationVolume, LocalCorrelation
 from geogs.tracking.flow.raft_layout import network_from
 from geogs.tracking.flow.raft_network import CELL, RaftFeatures
 from geogs.tracking.flow.texture import textured_fraction
 from geogs.tracking.flow.weights import read_tensors
-from geogs.tracking.grid import OFFSET, STRIDE, SampleGrid
 
 FAR = 1e3
 """Stands for a position outside the image, in pixels."""

@@ -1,0 +1,1 @@
+"""The program without a command line: run, reconstruct, write results, go on."""

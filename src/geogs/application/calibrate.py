@@ -1,0 +1,91 @@
+"""Before a run: the focal length that nobody gave, from the video itself."""
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from geogs.application.interrupt import Interruption
+from geogs.application.progress import RunProgress
+from geogs.config import Config
+
+if TYPE_CHECKING:
+    import torch
+
+    from geogs.io.sources.calibration import Calibration
+    from geogs.io.sources.sniff import Stream
+    from geogs.tracking.calibration.estimate import SelfCalibration
+
+_STAGE = "calibration"
+
+
+def self_calibrated(source: "Stream", options: Config, device: "torch.device") -> "Stream":
+    """The source with its focal length refined, if that is a guess or nominal and may be refined.
+
+    Where the video does not tell, or at Ctrl-C, the guess stays and a warning says so.
+    """
+    from geogs.tracking.calibration.estimate import self_calibrate
+
+    if not (options.calibration.refine and source.is_calibration_open):
+        return source
+    progress = RunProgress(source.length, tracks=False)
+    frames = source.linked_frames()
+    with Interruption() as stop, progress:
+
+        def report(fraction: float) -> None:
+            progress.stage(_STAGE, fraction)
+            stop.check()
+
+        try:
+            found = self_calibrate(
+                frames, source.camera, options.calibration, device, options.seed, report
+            )
+        except KeyboardInterrupt:
+            progress.write(
+                f"Calibration stopped; going on with {source.intrinsics_origin}. "
+                "Press Ctrl-C again to end."
+            )
+            return source
+        finally:
+            frames.close()
+        calibration = refined(source.calibration, source.camera.fx, found)
+        progress.write(_in_a_sentence(calibration, source.intrinsics_origin))
+    return source.with_calibration(calibration)
+
+
+def refined(
+    calibration: "Calibration", working_focal: float, found: "SelfCalibration"
+) -> "Calibration":
+    """A calibration of the source's images after what was found on its working images.
+
+    ``working_focal`` is fx of the working images by ``calibration``, in their pixels.
+    """
+    from geogs.io.sources.calibration import Refinement
+
+    if found.failure is not None:
+        said = Refinement(keyframes=found.keyframes, frames=found.frames, failure=found.failure)
+        origin = f"{calibration.origin}; the video does not tell: {found.failure}"
+        return replace(calibration, origin=origin, refinement=said)
+    factor = found.camera.fx / working_focal
+    focal = calibration.fx * factor
+    deviation = found.deviation * focal
+    said = Refinement(deviation, found.deviation_k1, found.keyframes, found.frames)
+    was = "was assumed" if calibration.is_guess else f"says {calibration.fx:.1f}"
+    origin = f"refined from the video: {focal:.1f} +- {deviation:.1f} pixels"
+    if found.deviation_k1 is not None:
+        origin += f", k1 {found.k1:.4f} +- {found.deviation_k1:.4f}"
+    return replace(
+        calibration,
+        fx=focal, fy=calibration.fy * factor,
+        distortion=(found.k1, 0.0, 0.0, 0.0) if found.k1 else (),
+        origin=f"{origin} ({calibration.origin} {was})",
+        is_guess=False, is_nominal=False, refinement=said,
+    )  # fmt: skip
+
+
+def _in_a_sentence(calibration: "Calibration", assumed: str) -> str:
+    failure = calibration.refinement.failure if calibration.refinement is not None else None
+    if failure is None:
+        return f"Intrinsics: {calibration.origin}."
+    return (
+        f"warning: the video does not tell its focal length: {failure}; {assumed} stays assumed. "
+        "Move sideways and turn while recording, or give --intrinsics fx,fy,cx,cy."
+    )

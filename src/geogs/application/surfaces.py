@@ -1,0 +1,68 @@
+"""Meshes as files: of the result, of what there was before it, and of depths without disks."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from geogs.application.progress import RunProgress
+from geogs.config import MeshConfig
+from geogs.errors import InputError
+from geogs.io.writers.ply import write_mesh
+from geogs.io.writers.tum import write_tum_trajectory
+from geogs.mesh.extract import extract_mesh
+from geogs.mesh.types import DepthMapView, Mesh
+from geogs.on_demand import OnDemand
+from geogs.types import RenderedKeyframe
+
+if TYPE_CHECKING:
+    from geogs.application.results import MappedScene
+
+
+def fusion_views(renders: Sequence[RenderedKeyframe]) -> Sequence[DepthMapView]:
+    """The renderings as what mesh extraction takes, each when it is asked for."""
+    return OnDemand(renders, lambda r: DepthMapView(r.depth, r.weight, r.camera, r.T_cw, r.image))
+
+
+def write_surface(
+    path: Path,
+    renders: Sequence[RenderedKeyframe],
+    config: MeshConfig,
+    progress: RunProgress,
+    name: str = "mesh",
+) -> Mesh | None:
+    """Fuse depth maps to a mesh and write it; where there is no surface, say so as ``name``.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    try:
+        mesh = extract_mesh(
+            fusion_views(renders),
+            config,
+            lambda part, done, of: progress.stage(f"{name}: {part}", done / of),
+        )
+    except InputError as error:
+        progress.write(f"No {name}: {error}")
+        return None
+    write_mesh(path, mesh.vertices, mesh.faces, mesh.colours, mesh.normals)
+    return mesh
+
+
+def write_depth_mesh(
+    output: Path, scene: "MappedScene", config: MeshConfig, progress: RunProgress
+) -> None:
+    """``depth_fusion/mesh.ply``: the surface of the searched depths, to compare the map with."""
+    with scene.stopwatch("depth fusion"):
+        path = output / "depth_fusion" / "mesh.ply"
+        write_surface(path, scene.depth_maps(), config, progress, "depth mesh")
+
+
+def write_online_results(
+    output: Path, scene: "MappedScene", config: MeshConfig, progress: RunProgress
+) -> None:
+    """``online/``: trajectories and mesh as they stand, before the final stages."""
+    with scene.stopwatch("online results"):
+        folder = output / "online"
+        write_tum_trajectory(folder / "trajectory.tum", scene.trajectory())
+        write_tum_trajectory(folder / "keyframes.tum", scene.keyframe_trajectory())
+        write_surface(folder / "mesh.ply", scene.renders(), config, progress, "online mesh")

@@ -1,0 +1,1 @@
+"""Bundle adjustment over poses, inverse depths and the lens."""

@@ -1,0 +1,133 @@
+"""The reduced camera system of a large adjustment: only the blocks that exist.
+
+Frames are put in reverse Cuthill-McKee order, which leaves a narrow band for a walk, also for one
+that comes back, and the band is factored by Cholesky's method. At worst, when all frames see each
+other, the band is the whole lower triangle.
+"""
+
+from collections.abc import Iterable
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from scipy.linalg import LinAlgError, solveh_banded
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import reverse_cuthill_mckee
+from torch import Tensor
+
+from geogs.bundle.dense import Star, chain_star, sources_within
+
+
+class SparseCameraSystem:
+    """Blocks of the lower triangle over the free poses, and the right-hand side; all float64.
+
+    Stars are added one after the other, so that none has to be kept.
+    """
+
+    def __init__(
+        self,
+        source: Int[Tensor, "e"],
+        target: Int[Tensor, "e"],
+        free_pose: Bool[Tensor, "n"],
+    ) -> None:
+        self._free = free_pose
+        self._count = n = int(free_pose.sum())
+        self._slot = _ordered_slots(source, target, free_pose)
+        keys = [np.arange(n) * (n + 1)]
+        for frame, e in sources_within(source):
+            at = self._slot[torch.cat([target[e], torch.tensor([frame])])]
+            keys.append(np.unique(_lower(at, n)[0].numpy()))
+        # Every diagonal block is listed, so that a frame without edges has one as well.
+        self._keys = torch.from_numpy(np.unique(np.concatenate(keys)))
+        self.clear()
+
+    def clear(self) -> None:
+        """Set everything to zero."""
+        self._blocks = torch.zeros(len(self._keys), 6, 6, dtype=torch.float64)
+        self._gradient = torch.zeros(self._count, 6, dtype=torch.float64)
+
+    @property
+    def stored(self) -> int:
+        """Number of blocks that are kept."""
+        return len(self._keys)
+
+    @property
+    def bandwidth(self) -> int:
+        """Frames by which the two of a block lie apart at most, in the order of the system."""
+        if not self._count:
+            return 0
+        return int((self._keys // self._count - self._keys % self._count).max())
+
+    def add(self, stars: Iterable[Star]) -> None:
+        """Add what the edges of some sources say of the poses."""
+        for star in stars:
+            poses, block, gradient = chain_star(star)
+            at = self._slot[poses]
+            keep = at >= 0
+            self._gradient.index_add_(0, at[keep], gradient[keep])
+            keys, rows, columns = _lower(at, self._count)
+            place = torch.searchsorted(self._keys, keys)
+            self._blocks.index_add_(0, place, block[rows, columns])
+
+    def solve(self, damping: float) -> Float[Tensor, "n 6"]:
+        """Steps of all frames, zero for the fixed, NaN where the system is not definite.
+
+        The diagonal D is raised by ``damping`` |D| + 0.01, as in the dense solver.
+        """
+        xi = torch.zeros(len(self._free), 6, dtype=torch.float64)
+        if not self._count:
+            return xi
+        n, width = 6 * self._count, 6 * (self.bandwidth + 1)
+        band = np.zeros((width, n), order="F")
+        within = np.arange(6)
+        for begin in range(0, len(self._keys), 4096):
+            keys = self._keys[begin : begin + 4096].numpy()
+            row = 6 * (keys // self._count)[:, None, None] + within[:, None]
+            column = 6 * (keys % self._count)[:, None, None] + within
+            row, column = np.broadcast_arrays(row, column)
+            lower = row >= column
+            values = self._blocks[begin : begin + 4096].numpy()
+            band[(row - column)[lower], column[lower]] = values[lower]
+        band[0] += damping * np.abs(band[0]) + 1e-2
+        right = self._gradient.reshape(-1).numpy().copy()
+        if not (np.isfinite(band).all() and np.isfinite(right).all()):
+            return xi.masked_fill(self._free[:, None], torch.nan)
+        try:
+            solution = solveh_banded(
+                band, right, overwrite_ab=True, overwrite_b=True, lower=True, check_finite=False
+            )
+        except LinAlgError:
+            return xi.masked_fill(self._free[:, None], torch.nan)
+        found = torch.from_numpy(solution).reshape(self._count, 6)
+        xi[self._free] = found[self._slot[self._free]]
+        return xi
+
+
+def _ordered_slots(
+    source: Int[Tensor, "e"], target: Int[Tensor, "e"], free_pose: Bool[Tensor, "n"]
+) -> Int[Tensor, "n"]:
+    """Place of each frame in the system, -1 where its pose is fixed."""
+    n = int(free_pose.sum())
+    slot = torch.full((len(free_pose),), -1, dtype=torch.long)
+    slot[free_pose] = torch.arange(n)
+    if not n:
+        return slot
+    # Edges that share a source are joined by the elimination: two steps in the graph of pairs.
+    i, j = slot[source].numpy(), slot[target].numpy()
+    both = (i >= 0) & (j >= 0)
+    graph = coo_matrix((np.ones(int(both.sum())), (i[both], j[both])), shape=(n, n)).tocsr()
+    graph = graph + graph.T
+    order = reverse_cuthill_mckee((graph @ graph + graph).tocsr(), symmetric_mode=True)
+    place = np.empty(n, dtype=np.int64)
+    place[order] = np.arange(n)
+    slot[free_pose] = torch.from_numpy(place)
+    return slot
+
+
+def _lower(
+    at: Int[Tensor, "k"], count: int
+) -> tuple[Int[Tensor, "m"], Int[Tensor, "m"], Int[Tensor, "m"]]:
+    """Keys row * count + column of the blocks that some poses span, and which poses they join."""
+    wanted = (at[:, None] >= at[None]) & (at[None] >= 0)
+    rows, columns = torch.nonzero(wanted, as_tuple=True)
+    return at[rows] * count + at[columns], rows, columns

@@ -1,0 +1,136 @@
+"""The camera with unknowns: one focal length and one radial term, with exact Jacobians.
+
+Both enter twice: in the ray of a source's cell and in its projection into the target. Pixel =
+c + F x (1 + k1 |x|^2), x = (X / Z, Y / Z), which is OpenCV's model with k1 alone.
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from geogs.bundle.dense import MIN_Z
+from geogs.geometry.camera import Camera
+
+UNKNOWNS = 2
+"""Log of the focal length, and k1."""
+_NEWTON_STEPS = 8
+_LEAST_SLOPE = 0.1
+"""Distorted radius per radius, below which the lens folds the image over."""
+
+
+@dataclass(frozen=True)
+class Lens:
+    """A pinhole behind one radial term; the aspect and the principal point are known."""
+
+    camera: Camera
+    k1: float = 0.0
+
+    def moved(self, log_focal: float, k1: float = 0.0) -> "Lens":
+        """With the focal length times ``exp(log_focal)`` and ``k1`` added to the radial term."""
+        c, factor = self.camera, math.exp(log_focal)
+        return Lens(replace(c, fx=c.fx * factor, fy=c.fy * factor), self.k1 + k1)
+
+
+@dataclass(frozen=True)
+class LensRays:
+    """Rays of pixels, with what a change of the lens does to them."""
+
+    rays: Float[Tensor, "p 3"]
+    """z = 1."""
+    slope: Float[Tensor, "2 p"]
+    """d x / d log f and d x / d k1 are these factors times x, and alike for y."""
+
+
+@dataclass(frozen=True)
+class LensProjection:
+    """Where the cells of the sources fall in the targets, with all first derivatives."""
+
+    pixels: Float[Tensor, "e p 2"]
+    valid: Bool[Tensor, "e p"]
+    """In front of the target."""
+    jacobian: Float[Tensor, "e 8 2 p"]
+    """d pixel / d (xi of the target pose, log f, k1)."""
+    depth_jacobian: Float[Tensor, "e 2 p"]
+    """d pixel / d inverse depth of the source."""
+
+
+def lens_rays(lens: Lens, pixels: Float[Tensor, "p 2"]) -> LensRays:
+    """Undistort pixels: Newton's method on the radius, s (1 + k1 s^2) = s_distorted."""
+    c, k1 = lens.camera, lens.k1
+    centre, focal = pixels.new_tensor([c.cx, c.cy]), pixels.new_tensor([c.fx, c.fy])
+    distorted = (pixels - centre) / focal
+    radius = distorted.norm(dim=-1)
+    s = radius
+    for _ in range(_NEWTON_STEPS if k1 else 0):
+        s = s - (s + k1 * s**3 - radius) / (1 + 3 * k1 * s.square()).clamp(min=_LEAST_SLOPE)
+    square = s.square()
+    growth = 1 + k1 * square
+    x = distorted / growth[:, None]
+    steep = (1 + 3 * k1 * square).clamp(min=_LEAST_SLOPE)
+    return LensRays(
+        torch.cat([x, torch.ones_like(x[:, :1])], -1),
+        torch.stack([-growth / steep, -square / steep]),
+    )
+
+
+def project_lens(
+    lens: Lens,
+    rays: Float[Tensor, "p 3"],
+    T_ji: Float[Tensor, "e 4 4"],
+    inverse_depth: Float[Tensor, "e p"],
+) -> tuple[Float[Tensor, "e p 2"], Bool[Tensor, "e p"]]:
+    """Pixels of the cells in the targets, and whether they lie in front of them."""
+    x, valid, _ = _normalised(rays, T_ji, inverse_depth)
+    return _to_pixels(lens, x), valid
+
+
+def linearise_lens(
+    lens: Lens,
+    rays: LensRays,
+    T_ji: Float[Tensor, "e 4 4"],
+    inverse_depth: Float[Tensor, "e p"],
+) -> LensProjection:
+    """:func:`project_lens` with the Jacobians in a left perturbation of T_ji, in d and the lens."""
+    (x, valid, z), c = _normalised(rays.rays, T_ji, inverse_depth), lens.camera
+    u, v, q = x[..., 0], x[..., 1], 1 / z
+    dq, o = inverse_depth * q, torch.zeros_like(q)
+    row_x = [dq, o, -u * dq, -u * v, 1 + u * u, -v]
+    row_y = [o, dq, -v * dq, -1 - v * v, u * v, u]
+    R, t = T_ji[:, :3, :3].to(inverse_depth), T_ji[:, :3, 3].to(inverse_depth)
+    tx, ty, tz = t[:, None].unbind(-1)
+    # A change of the lens moves the ray by a factor of (x, y, 0).
+    ray = (rays.rays[:, :2] @ R[:, :, :2].mT).unbind(-1)
+    along_x, along_y = (ray[0] - ray[2] * u) * q, (ray[1] - ray[2] * v) * q
+    row_x += [along_x * rays.slope[0], along_x * rays.slope[1], (tx - tz * u) * q]
+    row_y += [along_y * rays.slope[0], along_y * rays.slope[1], (ty - tz * v) * q]
+    J = torch.stack([torch.stack(row_x, 1), torch.stack(row_y, 1)], 2)
+    square = u * u + v * v
+    if lens.k1:
+        point = x.mT[:, None]
+        inward = (J * point).sum(2, keepdim=True)
+        J = J * (1 + lens.k1 * square)[:, None, None] + 2 * lens.k1 * point * inward
+    J = J * J.new_tensor([c.fx, c.fy])[:, None]
+    pixels = _to_pixels(lens, x)
+    centred = (pixels - pixels.new_tensor([c.cx, c.cy])).mT
+    bulge = (x * pixels.new_tensor([c.fx, c.fy])).mT * square[:, None]
+    jacobian = torch.cat([J[:, :6], (J[:, 6] + centred)[:, None], (J[:, 7] + bulge)[:, None]], 1)
+    return LensProjection(pixels, valid, jacobian, J[:, 8])
+
+
+def _normalised(
+    rays: Float[Tensor, "p 3"], T_ji: Float[Tensor, "e 4 4"], inverse_depth: Float[Tensor, "e p"]
+) -> tuple[Float[Tensor, "e p 2"], Bool[Tensor, "e p"], Float[Tensor, "e p"]]:
+    """x/z and y/z in the target, whether in front of it, and z, held at ``MIN_Z`` at least."""
+    R, t = T_ji[:, :3, :3].to(inverse_depth), T_ji[:, :3, 3].to(inverse_depth)
+    y = rays @ R.mT + inverse_depth[..., None] * t[:, None]
+    z = y[..., 2].clamp(min=MIN_Z)
+    return y[..., :2] / z[..., None], y[..., 2] > MIN_Z, z
+
+
+def _to_pixels(lens: Lens, x: Float[Tensor, "e p 2"]) -> Float[Tensor, "e p 2"]:
+    c = lens.camera
+    growth = 1 + lens.k1 * x.square().sum(-1, keepdim=True)
+    return x * growth * x.new_tensor([c.fx, c.fy]) + x.new_tensor([c.cx, c.cy])

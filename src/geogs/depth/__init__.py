@@ -1,0 +1,1 @@
+"""A keyframe's dense depth from matching with its neighbours."""

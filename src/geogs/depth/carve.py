@@ -1,0 +1,69 @@
+"""Votes of the views on points: on a surface, or in free space."""
+
+from collections.abc import Iterable
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Float64, Int32
+
+from geogs.config import DepthConfig
+from geogs.depth.reprojection_kernels import relative_depths
+from geogs.depth.view import KeyframeDepth
+from geogs.geometry.camera import Camera
+
+
+def look_up(
+    points: Float32[np.ndarray, "n 3"],
+    T_view: Float64[np.ndarray, "4 4"],
+    depth: KeyframeDepth,
+    camera: Camera,
+) -> tuple[Float32[np.ndarray, "n"], Float32[np.ndarray, "n"]]:
+    """Each point's z over the view's depth there, and the view's confidence; 0, 0 where unseen.
+
+    ``T_view`` takes the frame of the points to the view's camera. Finite input only.
+    """
+    ratio, sure = np.empty(len(points), np.float32), np.empty(len(points), np.float32)
+    lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32)
+    rotation = np.ascontiguousarray(T_view[:3, :3], np.float32)
+    translation = np.ascontiguousarray(T_view[:3, 3], np.float32)
+    relative_depths(points, rotation, translation, lens, depth.depth, depth.confidence, ratio, sure)
+    return ratio, sure
+
+
+def count_votes(
+    points: Float[np.ndarray, "n 3"],
+    views: Iterable[tuple[Float64[np.ndarray, "4 4"], KeyframeDepth]],
+    camera: Camera,
+    config: DepthConfig,
+) -> tuple[Int32[np.ndarray, "n"], Int32[np.ndarray, "n"]]:
+    """How many views see each world point on their surface, and how many in their free space.
+
+    A view is its world-to-camera pose and its depth.
+
+    Only pixels with confidence above ``config.vote_confidence`` vote: for the surface within
+    ``config.vote_support`` of their depth, for free space if the point is more than
+    ``config.vote_violation`` in front of it (both relative).
+    """
+    points = np.ascontiguousarray(points, np.float32)
+    surface, free = np.zeros(len(points), np.int32), np.zeros(len(points), np.int32)
+    for pose, depth in views:
+        ratio, sure = look_up(points, pose, depth, camera)
+        votes = sure > config.vote_confidence
+        surface += votes & (np.abs(ratio - 1.0) < config.vote_support)
+        free += votes & (ratio < 1.0 - config.vote_violation)
+    return surface, free
+
+
+def vote(
+    points: Float[np.ndarray, "n 3"],
+    views: Iterable[tuple[Float64[np.ndarray, "4 4"], KeyframeDepth]],
+    camera: Camera,
+    config: DepthConfig,
+) -> Bool[np.ndarray, "n"]:
+    """Which world points to keep: not those that at least two views, and more views than see them
+    on their surface, see in free space; nor those that are not finite.
+    """
+    finite = np.isfinite(points).all(1)
+    surface, free = count_votes(points[finite], views, camera, config)
+    keep = np.zeros(len(points), bool)
+    keep[finite] = (free < config.vote_free_views) | (free <= surface)
+    return keep

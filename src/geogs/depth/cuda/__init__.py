@@ -1,0 +1,1 @@
+"""Keyframe depth on a GPU."""

@@ -1,0 +1,77 @@
+"""The check of ``fusion.py`` and the votes of ``carve.py`` on a GPU."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float32, Int64
+from torch import Tensor
+
+from geogs.config import DepthConfig
+from geogs.depth import fusion
+from geogs.depth.cuda.images import transforms, upload
+from geogs.depth.view import PosedDepth
+from geogs.geometry.camera import Camera
+from geogs.gpu.kernels import kernels_for
+
+SOURCE = Path(__file__).with_name("reprojection.cu")
+
+
+def check(
+    own: PosedDepth, others: Sequence[PosedDepth], camera: Camera, config: DepthConfig
+) -> tuple[Tensor, Tensor]:
+    """Depth and confidence of a keyframe as revised by those of others (``check_depth``)."""
+    depth, confidence = own.depth.depth, own.depth.confidence
+    (h, w), n, device = depth.shape, len(others), depth.device
+    to_others = np.stack([o.T_cw for o in others]) @ np.linalg.inv(own.T_cw)
+    both = np.stack([transforms(to_others), transforms(np.linalg.inv(to_others))])
+    matrices, maps = upload(both, device), upload(_addresses(others), device)
+    settings = upload(np.array(_settings(config), np.float32), device)
+    lens, kernels = (camera.fx, camera.fy, camera.cx, camera.cy), kernels_for(SOURCE, device)
+    seen = torch.full((n, h, w), -1, dtype=torch.int64, device=device)
+    kernels["splat_depths"](
+        (-(-h * w // 256), n), 256, maps, matrices[1], h, w, *lens, fusion.SPLAT_CONFIDENCE,
+        seen,
+    )  # fmt: skip
+    new_depth, new_confidence = torch.empty_like(depth), torch.empty_like(depth)
+    kernels["check_depth"](
+        -(-h * w // 256), 256, depth, confidence, maps, matrices[0], seen, settings, n, h, w, *lens,
+        new_depth, new_confidence,
+    )  # fmt: skip
+    return new_depth, new_confidence
+
+
+def vote(
+    points: Float32[Tensor, "n 3"],
+    depths: Sequence[PosedDepth],
+    camera: Camera,
+    config: DepthConfig,
+) -> Bool[Tensor, "n"]:
+    """World points that do not stand in the free space of the views (``carve.vote``)."""
+    device = points.device
+    keep = torch.empty(len(points), dtype=torch.bool, device=device)
+    matrices = upload(transforms(np.stack([d.T_cw for d in depths])), device)
+    kernels_for(SOURCE, device)["vote_on_points"](
+        -(-len(points) // 128), 128, points, upload(_addresses(depths), device), matrices,
+        len(points), len(depths), *depths[0].depth.depth.shape, camera.fx, camera.fy, camera.cx,
+        camera.cy, config.vote_confidence, config.vote_support, config.vote_violation,
+        config.vote_free_views, keep,
+    )  # fmt: skip
+    return keep
+
+
+def _addresses(depths: Sequence[PosedDepth]) -> Int64[np.ndarray, "n 2"]:
+    """Where each depth and confidence lies; kernels of this stream may read there from now on."""
+    maps = [(d.depth.depth, d.depth.confidence) for d in depths]
+    assert all(a.is_contiguous() and b.is_contiguous() for a, b in maps)
+    return np.array([(a.data_ptr(), b.data_ptr()) for a, b in maps], np.int64)
+
+
+def _settings(config: DepthConfig) -> tuple[float, ...]:
+    """In the order in which the kernel reads them."""
+    return (
+        config.average_reach, config.agreement_reach, config.violation_distance,
+        config.repair_below, config.repair_votes, config.repair_confidence,
+        fusion.OCCLUSION_PENALTY, *fusion.WEIGHTS,
+    )  # fmt: skip

@@ -1,0 +1,71 @@
+"""The completion of ``completion.py`` and the evidence drawn from it on a GPU."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float32
+from torch import Tensor
+
+from geogs.config import DepthConfig
+from geogs.depth import evidence
+from geogs.depth.cuda.images import upload
+from geogs.gpu.kernels import kernels_for
+
+SOURCE = Path(__file__).with_name("completion.cu")
+_PANEL = 8
+
+
+def _window(minors: int) -> int:
+    """Rows of the band matrix that are in work at a time, for lines of so many cells."""
+    return -(-2 * minors // _PANEL) * _PANEL + _PANEL
+
+
+def _shared_bytes(minors: int) -> int:
+    window = _window(minors)
+    return 8 * (window**2 + window * (_PANEL + 2) + _PANEL * (_PANEL + 1))
+
+
+def can_complete(shape: tuple[int, ...], device: torch.device) -> bool:
+    """Whether the band of a grid of this shape fits into the shared memory of the GPU."""
+    if _window(min(shape)) > 192:
+        return False
+    if device.type != "cuda":
+        return True
+    properties = torch.cuda.get_device_properties(device)
+    limit: int = getattr(properties, "shared_memory_per_block_optin", 48 * 1024)
+    return _shared_bytes(min(shape)) <= limit
+
+
+def complete(
+    grids: Float32[Tensor, "k 3 gh gw"], typical: Sequence[float], config: DepthConfig
+) -> Float32[Tensor, "k 3 gh gw"]:
+    """Completed inverse depth, ``prior_weight`` and ``relative_precision`` of some keyframes.
+
+    From the tracker's inverse depth, its information and the weights of smoothness; ``typical`` is
+    the median of each keyframe's known inverse depths.
+    """
+    count, _, gh, gw = grids.shape
+    by_columns = gh <= gw
+    minors, majors = (gh, gw) if by_columns else (gw, gh)
+    strides = (gw, 1) if by_columns else (1, gw)
+    window, padded = _window(minors), -(-gh * gw // _PANEL) * _PANEL
+    scratch = grids.new_empty(count * padded * (12 + window), dtype=torch.float64)
+    out = torch.empty_like(grids)
+    kernels_for(SOURCE, grids.device)["complete_grids"](
+        count, 32 * _PANEL, grids, upload(np.array(typical, np.float32), grids.device),
+        upload(_settings(config), grids.device), minors, majors, *strides, padded,
+        window - _PANEL, scratch, out, shared=_shared_bytes(minors),
+    )  # fmt: skip
+    return out
+
+
+def _settings(config: DepthConfig) -> Float32[np.ndarray, "8"]:
+    """In the order in which the kernel reads them."""
+    values = (
+        config.sigma_scale, config.bending, config.membrane, config.sure_deviation,
+        config.tracker_scale, evidence.UNKNOWN_DEVIATION, evidence.BEST_DEVIATION,
+        evidence.KINK,
+    )  # fmt: skip
+    return np.array(values, np.float32)

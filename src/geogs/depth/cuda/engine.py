@@ -1,0 +1,196 @@
+"""Keyframe depths on the GPU that holds the map."""
+
+from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float32
+from torch import Tensor
+
+from geogs.config import DepthConfig
+from geogs.depth.completion import complete_grid, edge_weights, known_cells
+from geogs.depth.cuda.check import check, vote
+from geogs.depth.cuda.completion import can_complete, complete
+from geogs.depth.cuda.images import KeyframeImages, homographies, image_pixels, upload
+from geogs.depth.cuda.refine import PixelPlaces, TrackerMaps, choose_start, judge, refine
+from geogs.depth.cuda.sweep import MAX_NEIGHBOURS, MAX_PLANES, PlaneSlots, sweep
+from geogs.depth.engine import Limits, Progress, silent
+from geogs.depth.evidence import prior_weight, relative_precision
+from geogs.depth.plane_sweep import sweep_planes
+from geogs.depth.sweep_neighbors import depth_range
+from geogs.depth.view import DenseDepth, DepthView, PosedDepth
+from geogs.geometry.camera import Camera
+from geogs.threads import worker_count
+
+# Keyframes whose images stay on the GPU, those used last.
+_RESIDENT = 128
+# Keyframes whose grids are completed at once.
+_BATCH = 32
+
+
+@dataclass(frozen=True, eq=False)
+class SearchPlan:
+    """What the CPU works out before a keyframe's depth is searched."""
+
+    grids: Float32[np.ndarray, "3 gh gw"]
+    """The tracker's inverse depth, its information, and the weights of smoothness."""
+    typical: float
+    """Median known inverse depth; 0 where none is known."""
+    near: float
+    far: float
+    planes: Float32[np.ndarray, "p"]
+    """Inverse depths to sweep; none without neighbours."""
+
+
+class CudaDepthEngine:
+    """The kernels of this package, keyframe by keyframe; small parts run in threads on the CPU.
+
+    The host does not wait for the GPU. Images of observed keyframes stay there.
+    """
+
+    def __init__(
+        self, device: torch.device, render: Camera, working: Camera, config: DepthConfig
+    ) -> None:
+        self.device = device
+        self.render = render
+        self.working = working
+        self.config = config
+        self._places = PixelPlaces.of(render, working, device)
+        self._images: dict[int, KeyframeImages] = {}
+        self._pixels: dict[int, Future[Float32[np.ndarray, "n"]]] = {}
+        self._edges: dict[int, Future[Float32[np.ndarray, "gh gw"]]] = {}
+        self._threads = ThreadPoolExecutor(worker_count())
+
+    def observe(self, view: DepthView) -> None:
+        """As in the protocol: threads prepare its images."""
+        shape = view.inverse_depth.shape
+        self._pixels[view.id] = self._threads.submit(image_pixels, view)
+        self._edges[view.id] = self._threads.submit(edge_weights, view.image, shape, self.config)
+
+    def estimate(
+        self,
+        references: Sequence[DepthView],
+        neighbours: Sequence[Sequence[DepthView]],
+        progress: Progress = silent,
+        limits: Sequence[Limits | None] | None = None,
+    ) -> list[DenseDepth]:
+        """As in the protocol; at most 16 neighbours and 256 planes are used."""
+        usable = [list(n[:MAX_NEIGHBOURS]) for n in neighbours]
+        for view in (*references, *(v for group in usable for v in group)):
+            if view.id not in self._edges:
+                self.observe(view)
+        searched = limits or [None] * len(references)
+        plans = list(self._threads.map(self._plan, references, usable, searched))
+        maps: list[tuple[Tensor, Tensor]] = []
+        for start in range(0, len(plans), _BATCH):
+            batch = slice(start, start + _BATCH)
+            evidence = self._complete(plans[batch])
+            for i, grids in enumerate(evidence, start):
+                maps.append(self._search(references[i], usable[i], plans[i], grids))
+                progress(len(maps) / len(references))
+        self._forget()
+        return _with_medians(maps)
+
+    def check(
+        self, depths: Sequence[PosedDepth], others: Sequence[Sequence[PosedDepth]]
+    ) -> list[DenseDepth]:
+        """As in the protocol; the median stays that of the estimate."""
+        checked = []
+        for own, rest in zip(depths, others, strict=True):
+            result = own.depth
+            if rest:
+                depth, confidence = check(own, rest, self.render, self.config)
+                result = replace(result, depth=depth, confidence=confidence)
+            checked.append(result)
+        return checked
+
+    def keep(self, points: Float[Tensor, "n 3"], depths: Sequence[PosedDepth]) -> Bool[Tensor, "n"]:
+        """As in the protocol."""
+        points = points.detach().float().contiguous()
+        if not depths:
+            return torch.isfinite(points).all(1)
+        held = list(depths)  # the kernel reads where they lie
+        return vote(points, held, self.render, self.config)
+
+    def _images_of(self, view: DepthView) -> KeyframeImages:
+        """The images on the GPU, brought there at their first use."""
+        images = self._images.pop(view.id, None)
+        if images is None:
+            pixels = self._pixels.pop(view.id).result()
+            images = KeyframeImages.of(view, self.device, pixels)
+        self._images[view.id] = images  # the last used comes last
+        return images
+
+    def _forget(self) -> None:
+        """Let go of the images that were not used for longest; they can be prepared again."""
+        for id in list(self._images)[:-_RESIDENT]:
+            del self._images[id], self._edges[id]
+
+    def _plan(
+        self, reference: DepthView, neighbours: list[DepthView], limits: Limits | None = None
+    ) -> SearchPlan:
+        grid, information = reference.inverse_depth, reference.information
+        known = known_cells(grid, information)
+        typical = float(np.median(grid[known])) if known.any() else 0.0
+        grids = np.stack([grid, information, self._edges[reference.id].result()])
+        grids = grids.astype(np.float32)
+        if not neighbours:
+            return SearchPlan(grids, typical, 0.0, 0.0, np.empty(0, np.float32))
+        near, far = limits or depth_range(reference, neighbours, self.working, self.config)
+        planes = sweep_planes(reference, neighbours, self.render, near, far, self.config)
+        if len(planes) > MAX_PLANES:
+            planes = np.linspace(planes[0], planes[-1], MAX_PLANES, dtype=np.float32)
+        return SearchPlan(grids, typical, near, far, planes)
+
+    def _complete(self, plans: list[SearchPlan]) -> Float32[Tensor, "k 3 gh gw"]:
+        """The tracker's completed inverse depth, its prior weight and its relative precision."""
+        grids, typical = np.stack([p.grids for p in plans]), [p.typical for p in plans]
+        if min(typical) > 0 and can_complete(grids.shape[2:], self.device):
+            return complete(upload(grids, self.device), typical, self.config)
+        completed = [complete_grid(g[0], g[1], g[2], self.config) for g in grids]
+        evidence = [
+            (c.inverse_depth, prior_weight(c, self.config), relative_precision(c, self.config))
+            for c in completed
+        ]
+        return upload(np.array(evidence, np.float32), self.device)
+
+    def _search(
+        self,
+        reference: DepthView,
+        neighbours: list[DepthView],
+        plan: SearchPlan,
+        grids: Float32[Tensor, "3 gh gw"],
+    ) -> tuple[Tensor, Tensor]:
+        """Depth and confidence of one keyframe."""
+        config, device, own = self.config, self.device, self._images_of(reference)
+        tracker = TrackerMaps.of(grids, self._places)
+        if not neighbours:
+            return 1.0 / tracker.inverse_depth, 0.5 * tracker.prior_weight
+        others = [self._images_of(v) for v in neighbours]
+        across = homographies(reference, neighbours, self.render, self.render)
+        finely = homographies(reference, neighbours, self.render, self.working)
+        swept = sweep(
+            own, torch.stack([o.grey for o in others]), upload(across, device),
+            PlaneSlots.of(plan.planes, device), tracker.inverse_depth, tracker.prior_weight, config,
+        )  # fmt: skip
+        refined = refine(
+            own, torch.stack([o.fine for o in others]), upload(finely, device), self._places,
+            *choose_start(tracker, swept), tracker, config,
+        )  # fmt: skip
+        return judge(refined, swept.margin, tracker, plan.near, plan.far)
+
+
+def _with_medians(maps: Sequence[tuple[Tensor, Tensor]]) -> list[DenseDepth]:
+    """The depths with their medians, which follow from the GPU without being waited for."""
+    if not maps:
+        return []
+    medians = torch.stack([depth.flatten().median() for depth, _ in maps])
+    written = None
+    if medians.is_cuda:
+        on_host = torch.empty(len(maps), pin_memory=True)
+        medians = on_host.copy_(medians, non_blocking=True)
+        written = torch.cuda.Event()
+        written.record(torch.cuda.current_stream(maps[0][0].device))
+    return [DenseDepth(*m, median, written) for m, median in zip(maps, medians, strict=True)]

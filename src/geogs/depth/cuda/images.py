@@ -1,0 +1,72 @@
+"""What the depth kernels read of a keyframe's image."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float32, Float64
+from torch import Tensor
+
+from geogs.depth.view import DepthView
+from geogs.geometry.camera import Camera
+from geogs.gpu.transfer import to_device
+
+
+@dataclass(frozen=True, eq=False)
+class KeyframeImages:
+    """The images of a keyframe on the device; grey values lie in [-1/2, 1/2]."""
+
+    grey: Float32[Tensor, "h w"]
+    """At the render size, where planes are swept."""
+    smooth: Float32[Tensor, "h w"]
+    """The same, blurred: where the sweep's depth may jump."""
+    colours: Float32[Tensor, "3 h w"]
+    """RGB in [0, 1] at the render size."""
+    fine: Float32[Tensor, "fh fw"]
+    """At the working size, where depth is refined."""
+
+    @staticmethod
+    def of(
+        view: DepthView, device: torch.device, pixels: Float32[np.ndarray, "n"] | None = None
+    ) -> "KeyframeImages":
+        """The images of a view, in one transfer; ``pixels`` are its ``image_pixels``."""
+        h, w = view.grey.shape
+        moved = upload(image_pixels(view) if pixels is None else pixels, device)
+        grey, smooth, fine, colours = moved.split([h * w, h * w, view.fine.size, 3 * h * w])
+        return KeyframeImages(
+            grey.view(h, w), smooth.view(h, w), colours.view(3, h, w), fine.view(view.fine.shape)
+        )
+
+
+def image_pixels(view: DepthView) -> Float32[np.ndarray, "n"]:
+    """Everything that ``KeyframeImages`` holds, in a row."""
+    h, w = view.grey.shape
+    small = cv2.resize(view.image, (w, h), interpolation=cv2.INTER_AREA)
+    colours = small.transpose(2, 0, 1).astype(np.float32) * np.float32(1 / 255)
+    smooth = cv2.GaussianBlur(view.grey, (0, 0), 0.7)
+    grey = np.concatenate([x.ravel() for x in (view.grey, smooth, view.fine)]) - np.float32(0.5)
+    return np.concatenate([grey, colours.ravel()])
+
+
+def upload(array: np.ndarray, device: torch.device) -> Tensor:
+    """The array on the device, without waiting for what runs there."""
+    return to_device(torch.from_numpy(np.ascontiguousarray(array)), device)
+
+
+def homographies(
+    reference: DepthView, neighbours: Sequence[DepthView], source: Camera, target: Camera
+) -> Float32[np.ndarray, "n 12"]:
+    """a (3 x 3, row by row) and b: pixel p of the reference's ``source`` camera at inverse depth
+    rho appears at a p + rho b (homogeneous) in the neighbour's ``target`` camera.
+    """
+    k, back = target.matrix().numpy(), np.linalg.inv(source.matrix().numpy())
+    relative = np.stack([v.T_cw for v in neighbours]) @ np.linalg.inv(reference.T_cw)
+    a, b = k @ relative[:, :3, :3] @ back, relative[:, :3, 3] @ k.T
+    return np.concatenate([a.reshape(-1, 9), b], 1).astype(np.float32)
+
+
+def transforms(T: Float64[np.ndarray, "n 4 4"]) -> Float32[np.ndarray, "n 12"]:
+    """Rotation (row by row) and translation of each matrix, as the kernels take them."""
+    return np.concatenate([T[:, :3, :3].reshape(-1, 9), T[:, :3, 3]], 1).astype(np.float32)

@@ -1,0 +1,183 @@
+"""The refinement of ``refinement.py`` and the confidence on a GPU."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float32
+from torch import Tensor
+
+from geogs.config import DepthConfig
+from geogs.depth.confidence import WEIGHTS
+from geogs.depth.cuda.images import KeyframeImages, upload
+from geogs.depth.cuda.sweep import SweptDepth
+from geogs.depth.refinement import FLOOR_DEVIATION, FULL_SUPPORT, PATCH_REACH
+from geogs.geometry.camera import Camera
+from geogs.gpu.kernels import kernels_for
+from geogs.keyframes.grid import OFFSET, STRIDE
+
+SOURCE = Path(__file__).with_name("refinement.cu")
+
+
+@dataclass(frozen=True, eq=False)
+class PixelPlaces:
+    """Where render pixels lie on the tracker's grid, and their patch samples in the fine image."""
+
+    grid_columns: Float32[Tensor, "w"]
+    grid_rows: Float32[Tensor, "h"]
+    fine_columns: Float32[Tensor, "5 w"]
+    fine_rows: Float32[Tensor, "5 h"]
+
+    @staticmethod
+    def of(render: Camera, working: Camera, device: torch.device) -> "PixelPlaces":
+        """Those of two sizes of a camera."""
+        reach = np.arange(-PATCH_REACH, PATCH_REACH + 1, dtype=np.float32)[:, None]
+        u = (np.arange(render.width) - render.cx + reach) * (working.fx / render.fx) + working.cx
+        v = (np.arange(render.height) - render.cy + reach) * (working.fy / render.fy) + working.cy
+        columns, rows = (u[PATCH_REACH] - OFFSET) / STRIDE, (v[PATCH_REACH] - OFFSET) / STRIDE
+        places = (columns, rows, u, v)
+        return PixelPlaces(*(upload(x.astype(np.float32), device) for x in places))
+
+
+@dataclass(frozen=True, eq=False)
+class TrackerMaps:
+    """What the tracker knows, at the render size."""
+
+    inverse_depth: Float32[Tensor, "h w"]
+    prior_weight: Float32[Tensor, "h w"]
+    """How sure it is, in [0, 1], for the sweep."""
+    precision: Float32[Tensor, "h w"]
+    """Relative precision, for the refinement."""
+
+    @staticmethod
+    def of(grids: Float32[Tensor, "3 gh gw"], places: PixelPlaces) -> "TrackerMaps":
+        """Bilinear values of the three grids at the render pixels."""
+        h, w = len(places.grid_rows), len(places.grid_columns)
+        out = grids.new_empty(3, h, w)
+        kernels_for(SOURCE, grids.device)["upsample_grids"](
+            (-(-w // 128), h, 3), 128, grids, places.grid_columns, places.grid_rows,
+            *grids.shape[1:], h, w, out,
+        )  # fmt: skip
+        return TrackerMaps(*out)
+
+
+@dataclass(eq=False)
+class SlantedMaps:
+    """``SlantedDepth`` on the device."""
+
+    inverse_depth: Float32[Tensor, "h w"]
+    slope_x: Float32[Tensor, "h w"]
+    slope_y: Float32[Tensor, "h w"]
+    support: Float32[Tensor, "h w"]
+
+
+def choose_start(tracker: TrackerMaps, swept: SweptDepth) -> tuple[Tensor, Tensor]:
+    """The inverse depth to refine, and how much each pixel counts in the first plane fits."""
+    rho, sure = torch.empty_like(swept.cost), torch.empty_like(swept.cost)
+    kernels_for(SOURCE, rho.device)["choose_start"](
+        -(-rho.numel() // 256), 256, tracker.inverse_depth, tracker.prior_weight,
+        swept.inverse_depth, swept.cost, swept.margin, rho.numel(), rho, sure,
+    )  # fmt: skip
+    return rho, sure
+
+
+def gather_patches(
+    fine: Float32[Tensor, "fh fw"], places: PixelPlaces
+) -> Float32[Tensor, "25 h w"]:
+    """The fine reference image around every render pixel."""
+    h, w = len(places.grid_rows), len(places.grid_columns)
+    samples = fine.new_empty((2 * PATCH_REACH + 1) ** 2, h, w)
+    kernels_for(SOURCE, fine.device)["gather_patches"](
+        (-(-w // 128), h, len(samples)), 128, fine, places.fine_columns, places.fine_rows,
+        *fine.shape, h, w, samples,
+    )  # fmt: skip
+    return samples
+
+
+def photometric_step(
+    state: SlantedMaps,
+    samples: Float32[Tensor, "25 h w"],
+    images: Float32[Tensor, "n fh fw"],
+    homographies: Float32[Tensor, "n 12"],
+    tracker: TrackerMaps,
+    config: DepthConfig,
+) -> tuple[Tensor, Tensor]:
+    """Move ``state`` one step, averaged with the tracker; returns precision and plane weight."""
+    h, w = state.inverse_depth.shape
+    data, precision, sure = (torch.empty_like(state.inverse_depth) for _ in range(3))
+    kernels_for(SOURCE, samples.device)["photometric_step"](
+        (-(-w // 32), h), (32, len(images)), samples, images, homographies, state.inverse_depth,
+        state.slope_x, state.slope_y, tracker.inverse_depth, tracker.precision, h, w,
+        *images.shape[1:], config.patch_contrast, 0.5 * config.variance_floor, config.step_limit,
+        config.photo_deviation**2, FLOOR_DEVIATION**2, config.fit_deviation**2, data, precision,
+        sure,
+    )  # fmt: skip
+    state.inverse_depth = data
+    return precision, sure
+
+
+def fit_planes(
+    state: SlantedMaps,
+    sure: Float32[Tensor, "h w"],
+    colours: Float32[Tensor, "3 h w"],
+    radius: int,
+    tolerance: float,
+    stiffness: float,
+    config: DepthConfig,
+    precision: Float32[Tensor, "h w"] | None = None,
+) -> None:
+    """Replace ``state`` by local planes, averaged with it by ``precision`` if that is given."""
+    h, w = sure.shape
+    out = [torch.empty_like(sure) for _ in range(4)]
+    kernels_for(SOURCE, sure.device)["fit_planes"](
+        (-(-w // 32), -(-h // 4)), (32, 4), state.inverse_depth, state.slope_x, state.slope_y,
+        sure, colours, precision, h, w, radius, config.guide_contrast, tolerance, stiffness,
+        FULL_SUPPORT, 1.0 / config.plane_deviation**2, *out,
+    )  # fmt: skip
+    state.inverse_depth, state.slope_x, state.slope_y, state.support = out
+
+
+def refine(
+    reference: KeyframeImages,
+    images: Float32[Tensor, "n fh fw"],
+    homographies: Float32[Tensor, "n 12"],
+    places: PixelPlaces,
+    rho: Float32[Tensor, "h w"],
+    sure: Float32[Tensor, "h w"],
+    tracker: TrackerMaps,
+    config: DepthConfig,
+) -> SlantedMaps:
+    """``refine_depth`` from the inverse depth ``rho`` with the fine images of the neighbours."""
+    samples = gather_patches(reference.fine, places)
+    zero = torch.zeros_like(rho)
+    state = SlantedMaps(rho, zero, zero, zero)
+    for radius, tolerance in ((2, 0.05), (config.fit_radius, 0.03)):
+        fit_planes(state, sure, reference.colours, radius, tolerance, 0.0, config)
+    state.inverse_depth = rho
+    for _ in range(config.refine_steps):
+        precision, sure = photometric_step(state, samples, images, homographies, tracker, config)
+        fit_planes(
+            state, sure, reference.colours, config.fit_radius, config.fit_tolerance,
+            config.fit_stiffness, config, precision,
+        )  # fmt: skip
+    return state
+
+
+def judge(
+    refined: SlantedMaps,
+    margin: Float32[Tensor, "h w"],
+    tracker: TrackerMaps,
+    near: float,
+    far: float,
+) -> tuple[Tensor, Tensor]:
+    """Depth, held within half of ``near`` and twice ``far``, and its confidence."""
+    h, w = margin.shape
+    depth, confidence = torch.empty_like(margin), torch.empty_like(margin)
+    weights = upload(np.array(WEIGHTS, np.float32), margin.device)
+    kernels_for(SOURCE, margin.device)["judge_depth"](
+        (-(-w // 32), -(-h // 4)), (32, 4), refined.inverse_depth, margin, refined.support,
+        tracker.inverse_depth, tracker.precision, weights, h, w, 0.5 / far, 2.0 / near, depth,
+        confidence,
+    )  # fmt: skip
+    return depth, confidence

@@ -1,0 +1,51 @@
+"""A dense depth, with a confidence, for a keyframe before any disk is made of it."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from geogs.config import DepthConfig
+from geogs.depth.completion import complete_inverse_depth
+from geogs.depth.confidence import depth_confidence
+from geogs.depth.evidence import choose_start, tracker_evidence, tracker_prior
+from geogs.depth.plane_sweep import plane_sweep, sweep_planes
+from geogs.depth.refinement import refine_depth
+from geogs.depth.sweep_neighbors import depth_range
+from geogs.depth.view import DepthView, KeyframeDepth
+from geogs.geometry.camera import Camera
+
+
+def estimate_depth(
+    reference: DepthView,
+    neighbours: Sequence[DepthView],
+    render: Camera,
+    working: Camera,
+    config: DepthConfig,
+    limits: tuple[float, float] | None = None,
+) -> KeyframeDepth:
+    """Dense depth of a keyframe from the tracker's grid and from matching with its neighbours.
+
+    Completion of the grid, plane sweep with semi-global matching around it, refinement of both on
+    slanted patches, and a calibrated confidence. ``neighbours`` are best chosen by
+    ``select_sweep_neighbours``; without any, the completed grid is all there is. ``limits`` are the
+    nearest and farthest depth to search; by default the tracker's, widened. Deterministic;
+    releases the interpreter lock, so that several keyframes can be estimated at once in threads.
+    """
+    completed = complete_inverse_depth(
+        reference.inverse_depth, reference.information, reference.image, config
+    )
+    prior = tracker_prior(completed, working, render, config)
+    if not neighbours:
+        return KeyframeDepth(1.0 / prior.inverse_depth, 0.5 * prior.weight)
+    near, far = limits or depth_range(reference, neighbours, working, config)
+    planes = sweep_planes(reference, neighbours, render, near, far, config)
+    sweep = plane_sweep(
+        reference, neighbours, render, planes, prior.inverse_depth, prior.weight, config
+    )
+    start = choose_start(prior, sweep)
+    tracker = tracker_evidence(completed, working, render, config)
+    refined = refine_depth(reference, neighbours, render, working, start, tracker, config)
+    refined.inverse_depth = np.clip(refined.inverse_depth, 0.5 / far, 2.0 / near)
+    return KeyframeDepth(
+        1.0 / refined.inverse_depth, depth_confidence(refined, sweep.margin, tracker)
+    )

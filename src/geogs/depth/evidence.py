@@ -1,0 +1,87 @@
+"""What the tracker and the sweep know of a keyframe's depth, at the render size."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float32
+
+from geogs.config import DepthConfig
+from geogs.depth.completion import CompletedDepth, upsample_grid
+from geogs.depth.plane_sweep import SweepResult
+from geogs.geometry.camera import Camera
+
+UNKNOWN_DEVIATION = 10.0
+BEST_DEVIATION = 0.002
+"""Relative deviation below which the tracker is not believed."""
+KINK = 0.06
+"""Relative second difference of inverse depth between cells that marks a depth edge."""
+
+
+@dataclass(frozen=True, slots=True)
+class DepthEvidence:
+    """An inverse depth and how much it counts."""
+
+    inverse_depth: Float32[np.ndarray, "h w"]
+    weight: Float32[np.ndarray, "h w"]
+
+
+def tracker_prior(
+    completed: CompletedDepth, working: Camera, render: Camera, config: DepthConfig
+) -> DepthEvidence:
+    """The completed depth, for the sweep, with ``prior_weight``."""
+    return DepthEvidence(
+        upsample_grid(completed.inverse_depth, working, render),
+        upsample_grid(prior_weight(completed, config), working, render),
+    )
+
+
+def prior_weight(completed: CompletedDepth, config: DepthConfig) -> Float32[np.ndarray, "gh gw"]:
+    """1 / (1 + (deviation / sure_deviation)^2) on the grid, 0 where the tracker was rejected."""
+    weight = 1.0 / (1.0 + (completed.deviation / np.float32(config.sure_deviation)) ** 2)
+    return np.where(completed.inlier, weight, np.float32(0.0))
+
+
+def tracker_evidence(
+    completed: CompletedDepth, working: Camera, render: Camera, config: DepthConfig
+) -> DepthEvidence:
+    """The completed depth with its ``relative_precision`` as weight."""
+    return DepthEvidence(
+        upsample_grid(completed.inverse_depth, working, render),
+        upsample_grid(relative_precision(completed, config), working, render),
+    )
+
+
+def relative_precision(
+    completed: CompletedDepth, config: DepthConfig
+) -> Float32[np.ndarray, "gh gw"]:
+    """1 / sigma^2 on the grid.
+
+    sigma is ``config.tracker_scale`` times the deviation the tracker expects. Where inverse depth
+    bends sharply between cells, interpolating makes a curtain from foreground to background: the
+    weight falls to nothing there, as it does where the robust completion rejected the tracker.
+    """
+    deviation = np.where(completed.inlier, completed.deviation, np.float32(UNKNOWN_DEVIATION))
+    sigma = np.maximum(np.float32(config.tracker_scale) * deviation, np.float32(BEST_DEVIATION))
+    return _flatness(completed.inverse_depth) ** 2 / sigma**2
+
+
+def choose_start(prior: DepthEvidence, sweep: SweepResult) -> DepthEvidence:
+    """Per pixel the sweep's depth, or the tracker's where it is sure and the sweep is not better.
+
+    The weight is a rough confidence in [0, 1].
+    """
+    unique = np.clip(0.5 * sweep.margin - 0.25, 0.0, 1.0) * (sweep.cost < 0.8)
+    agree = np.abs(sweep.inverse_depth / prior.inverse_depth - 1.0) < 0.05
+    tracker = (agree & (prior.weight > 0.3)) | ((prior.weight > 0.5) & (unique < 0.3))
+    both = np.where(agree, np.maximum(prior.weight, unique), prior.weight)
+    inverse = np.where(tracker, prior.inverse_depth, sweep.inverse_depth)
+    weight = np.where(tracker, both, 0.7 * unique)
+    return DepthEvidence(inverse.astype(np.float32), weight.astype(np.float32))
+
+
+def _flatness(inverse_depth: Float32[np.ndarray, "gh gw"]) -> Float32[np.ndarray, "gh gw"]:
+    """Near 1 on planes, near 0 where inverse depth bends sharply between cells."""
+    q, bend = inverse_depth, np.zeros_like(inverse_depth)
+    bend[:, 1:-1] = np.abs(q[:, 2:] + q[:, :-2] - 2.0 * q[:, 1:-1])
+    bend[1:-1] = np.maximum(bend[1:-1], np.abs(q[2:] + q[:-2] - 2.0 * q[1:-1]))
+    return np.exp(-((bend / (np.float32(KINK) * q)) ** 2))

@@ -1,0 +1,95 @@
+"""What the depths of other keyframes say to the depth of one."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float64
+
+from geogs.config import DepthConfig
+from geogs.depth.carve import look_up
+from geogs.depth.reprojection_kernels import agree_on_depth, splat_depth
+from geogs.depth.view import KeyframeDepth
+from geogs.geometry.camera import Camera
+
+# Logistic regression of "relative error below 2 %" as in depth_confidence, with the neighbours'
+# votes as evidence.
+_BIAS = -0.10
+_OWN = 0.66
+_SUPPORT = 0.72
+_VIOLATION = -0.92
+
+WEIGHTS = (_BIAS, _OWN, _SUPPORT, _VIOLATION)
+"""All of them, for the CUDA kernel."""
+SPLAT_CONFIDENCE = 0.5
+"""Confidence from which pixels of other keyframes repair this one."""
+
+OCCLUSION_PENALTY = 0.7
+"""Weight of a transferred depth that hides a candidate, against one that agrees with it."""
+
+
+def check_depth(
+    depth: KeyframeDepth,
+    T_cw: Float64[np.ndarray, "4 4"],
+    others: Sequence[KeyframeDepth],
+    other_poses: Sequence[Float64[np.ndarray, "4 4"]],
+    camera: Camera,
+    config: DepthConfig,
+) -> KeyframeDepth:
+    """A keyframe's depth repaired, averaged and judged by those of other keyframes.
+
+    Unsure pixels on whose depth several others agree take it. Then each pixel's point is looked up
+    in the other views: surfaces within ``config.average_reach`` (relative, Gaussian) are averaged
+    by confidence; those near support the pixel; sure ones that are clearly behind the point violate
+    it, since they see free space where it stands. Meant to be called once per estimate: votes
+    counted twice make it surer than it is.
+    """
+    if not others:
+        return depth
+    T_wc = np.linalg.inv(T_cw)
+    depth = _repair(depth, T_wc, others, other_poses, camera, config)
+    points = depth.depth.reshape(-1, 1) * camera.rays().numpy().reshape(-1, 3)
+    shift, votes, support, violation = (np.zeros(len(points), np.float32) for _ in range(4))
+    for other, pose in zip(others, other_poses, strict=True):
+        ratio, sure = look_up(points, pose @ T_wc, other, camera)
+        error = ratio - np.float32(1.0)
+        near = sure * np.exp(-0.5 * (error / np.float32(config.average_reach)) ** 2)
+        shift += near * error
+        votes += near
+        support += sure * np.exp(-0.5 * (error / np.float32(config.agreement_reach)) ** 2)
+        violation += sure * (error < -config.violation_distance)
+    shape = depth.depth.shape
+    averaged = depth.depth / (1.0 + shift / (votes + np.float32(0.5))).reshape(shape)
+    own = np.clip(depth.confidence, 1e-3, 1.0 - 1e-3)
+    score = _BIAS + _OWN * np.log(own / (1.0 - own))
+    score += (_SUPPORT * np.log(support + 0.2) + _VIOLATION * violation).reshape(shape)
+    return KeyframeDepth(averaged, (1.0 / (1.0 + np.exp(-score))).astype(np.float32))
+
+
+def _repair(
+    depth: KeyframeDepth,
+    T_wc: Float64[np.ndarray, "4 4"],
+    others: Sequence[KeyframeDepth],
+    other_poses: Sequence[Float64[np.ndarray, "4 4"]],
+    camera: Camera,
+    config: DepthConfig,
+) -> KeyframeDepth:
+    """Unsure pixels replaced by what the sure pixels of the other views show there."""
+    shape = (len(others), *depth.depth.shape)
+    seen, weight = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+    rays = camera.rays().numpy().reshape(-1, 3)
+    lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32)
+    for j, (other, pose) in enumerate(zip(others, other_poses, strict=True)):
+        relative = np.linalg.inv(pose @ T_wc).astype(np.float32)
+        points = other.depth.reshape(-1, 1) * rays
+        splat_depth(
+            points, other.confidence.ravel(), np.ascontiguousarray(relative[:3, :3]),
+            np.ascontiguousarray(relative[:3, 3]), lens, np.float32(SPLAT_CONFIDENCE), seen[j],
+            weight[j],
+        )  # fmt: skip
+    best, score = np.empty_like(depth.depth), np.empty_like(depth.depth)
+    reach, clearance = np.float32(config.agreement_reach), np.float32(config.violation_distance)
+    agree_on_depth(seen, weight, reach, clearance, np.float32(OCCLUSION_PENALTY), best, score)
+    unsure = depth.confidence < config.repair_below
+    taken = unsure & (score > config.repair_votes)
+    confidence = np.where(taken, np.float32(config.repair_confidence), depth.confidence)
+    return KeyframeDepth(np.where(taken, best, depth.depth), confidence)

@@ -1,0 +1,119 @@
+"""Dense depth by matching a keyframe with its neighbours over planes of equal inverse depth."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Float32, Float64
+
+from geogs.config import DepthConfig
+from geogs.depth import plane_sweep_kernels as kernels
+from geogs.depth.view import DepthView
+from geogs.geometry.camera import Camera
+
+
+@dataclass(frozen=True, slots=True)
+class SweepResult:
+    """The winners of a plane sweep at the render size."""
+
+    inverse_depth: Float32[np.ndarray, "h w"]
+    cost: Float32[np.ndarray, "h w"]
+    """Matching cost 1 - NCC of the winner, 0 (alike) to 1.2."""
+    margin: Float32[np.ndarray, "h w"]
+    """Aggregated cost of the best other plane less the winner's: how unique the match is."""
+
+
+def sweep_planes(
+    reference: DepthView,
+    neighbours: Sequence[DepthView],
+    camera: Camera,
+    near: float,
+    far: float,
+    config: DepthConfig,
+) -> Float32[np.ndarray, "p"]:
+    """Inverse depths, equally spaced: the median neighbour moves ``config.plane_step`` pixels."""
+    pixels = np.array([[x, y] for x in (0.1, 0.5, 0.9) for y in (0.1, 0.5, 0.9)])
+    pixels = pixels * [camera.width, camera.height] - [camera.cx, camera.cy]
+    rays = np.concatenate([pixels / [camera.fx, camera.fy], np.ones((len(pixels), 1))], 1)
+    shifts = [0.0]
+    if neighbours:
+        relative = np.stack([v.T_cw for v in neighbours]) @ np.linalg.inv(reference.T_cw)
+        turned = rays @ np.swapaxes(relative[:, :3, :3], 1, 2)
+        ends = [turned + relative[:, None, :3, 3] / z for z in (near, far)]
+        seen = np.minimum(ends[0], ends[1])[..., 2] > 0.1
+        p, q = (e[..., :2] / np.where(seen, e[..., 2], 1.0)[..., None] for e in ends)
+        moved = np.linalg.norm((p - q) * [camera.fx, camera.fy], axis=2)
+        shifts += [float(np.median(m[s])) for m, s in zip(moved, seen, strict=True) if s.any()]
+    steps = np.median(shifts[1:] or shifts) / config.plane_step
+    count = int(np.clip(np.ceil(steps), config.min_planes, config.max_planes))
+    return np.linspace(1.0 / far, 1.0 / near, count, dtype=np.float32)
+
+
+def plane_sweep(
+    reference: DepthView,
+    neighbours: Sequence[DepthView],
+    camera: Camera,
+    planes: Float32[np.ndarray, "p"],
+    prior: Float32[np.ndarray, "h w"],
+    prior_weight: Float32[np.ndarray, "h w"],
+    config: DepthConfig,
+) -> SweepResult:
+    """Plane sweep with semi-global matching (Hirschmueller 2008) in eight directions.
+
+    The cost of a plane is the mean 1 - NCC of the better half of the neighbours (occlusion), in
+    small windows that are then averaged over pixels of like colour (adaptive support weights, Yoon
+    and Kweon 2006), plus a bounded pull to the ``prior`` inverse depth where ``prior_weight`` (0 to
+    1) is high.
+    """
+    raw = matching_costs(reference, neighbours, camera, planes, config)
+    size = (camera.width, camera.height)
+    colours = cv2.resize(reference.image, size, interpolation=cv2.INTER_AREA)
+    colours = colours.astype(np.float32) * np.float32(1 / 255)
+    volume = np.empty_like(raw)
+    sharpness = np.float32(config.support_sharpness)
+    kernels.average_support(raw, colours, config.support_radius, sharpness, volume)
+    weight = np.float32(config.prior_pull) * prior_weight
+    kernels.pull_to_prior(volume, planes, prior, weight, np.float32(config.prior_tolerance))
+    guide = cv2.GaussianBlur(reference.grey, (0, 0), 0.7)
+    total = np.zeros_like(volume)
+    small, large = np.float32(config.small_jump), np.float32(config.large_jump)
+    for forward in (True, False):
+        contrast = np.float32(config.jump_contrast)
+        kernels.aggregate_paths(volume, guide, small, large, contrast, forward, total)
+    position, cost, margin = (np.empty_like(guide) for _ in range(3))
+    kernels.pick_planes(total, volume, position, cost, margin)
+    spacing = (planes[-1] - planes[0]) / np.float32(len(planes) - 1)
+    return SweepResult(planes[0] + position * spacing, cost, margin)
+
+
+def matching_costs(
+    reference: DepthView,
+    neighbours: Sequence[DepthView],
+    camera: Camera,
+    planes: Float32[np.ndarray, "p"],
+    config: DepthConfig,
+) -> Float32[np.ndarray, "h w p"]:
+    """Mean 1 - NCC of the better half (at least two) of the neighbours, per pixel and plane."""
+    radius, floor = config.window // 2, np.float32(config.variance_floor)
+    grey = reference.grey - np.float32(0.5)
+    images = np.stack([v.grey for v in neighbours]) - np.float32(0.5)
+    size = (config.window, config.window)
+    mean = cv2.blur(grey, size, borderType=cv2.BORDER_REPLICATE)
+    square = cv2.blur(grey * grey, size, borderType=cv2.BORDER_REPLICATE)
+    scale = 1.0 / np.sqrt(np.maximum(square - mean * mean, 0.0) + floor)
+    keep = max(min(2, len(neighbours)), (len(neighbours) + 1) // 2)
+    a, b = _homographies(reference, neighbours, camera)
+    volume = np.empty((*grey.shape, len(planes)), np.float32)
+    kernels.match_planes(grey, mean, scale, images, a, b, planes, radius, floor, keep, volume)
+    return volume
+
+
+def _homographies(
+    reference: DepthView, neighbours: Sequence[DepthView], camera: Camera
+) -> tuple[Float64[np.ndarray, "n 3 3"], Float64[np.ndarray, "n 3"]]:
+    """a and b: pixel p (homogeneous) at inverse depth rho appears at a p + rho b."""
+    k = camera.matrix().numpy()
+    relative = [v.T_cw @ np.linalg.inv(reference.T_cw) for v in neighbours]
+    a = np.stack([k @ m[:3, :3] @ np.linalg.inv(k) for m in relative])
+    return a, np.stack([k @ m[:3, 3] for m in relative])

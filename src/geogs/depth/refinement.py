@@ -1,0 +1,168 @@
+"""Depth beyond the sweep's planes: slanted patches at the working resolution, and local planes."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Float32
+
+from geogs.config import DepthConfig
+from geogs.depth import refinement_kernels as kernels
+from geogs.depth.evidence import DepthEvidence
+from geogs.depth.view import DepthView
+from geogs.geometry.camera import Camera
+
+PATCH_REACH = 2
+"""Patches of 5 x 5 samples, one render pixel apart."""
+FLOOR_DEVIATION = 0.002
+"""Relative deviation that no number of matches gets below (pose, calibration, resampling)."""
+FULL_SUPPORT = 5.0
+"""Support from which a local plane counts fully."""
+
+
+@dataclass(slots=True)
+class SlantedDepth:
+    """Inverse depth and its slopes per pixel of the render size."""
+
+    inverse_depth: Float32[np.ndarray, "h w"]
+    slope_x: Float32[np.ndarray, "h w"]
+    """Change of inverse depth per pixel to the right."""
+    slope_y: Float32[np.ndarray, "h w"]
+    """Change of inverse depth per pixel down."""
+    support: Float32[np.ndarray, "h w"]
+    """Sum of weights of the last plane fit: sure pixels of like colour on the same plane."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Patches:
+    """What the photometric steps compare: reference patches, their weights, and the neighbours."""
+
+    samples: Float32[np.ndarray, "s h w"]
+    offsets: Float32[np.ndarray, "s 2"]
+    weights: Float32[np.ndarray, "s h w"]
+    images: Float32[np.ndarray, "n fh fw"]
+    a: np.ndarray
+    b: np.ndarray
+
+
+def refine_depth(
+    reference: DepthView,
+    neighbours: Sequence[DepthView],
+    render: Camera,
+    working: Camera,
+    start: DepthEvidence,
+    tracker: DepthEvidence,
+    config: DepthConfig,
+) -> SlantedDepth:
+    """Alternate photometric Gauss-Newton steps per pixel with bilateral plane fits.
+
+    ``start.weight`` (0 to 1) says which pixels make the first planes. After each step a pixel's
+    inverse depth is the precision-weighted mean of the photometric optimum, the tracker's value
+    (``tracker.weight`` = relative precision, robust) and the local plane.
+    """
+    patches = _gather_patches(reference, neighbours, render, working, config)
+    guide = _colour_guide(reference, render)
+    rho = start.inverse_depth
+    state = SlantedDepth(rho, *(np.zeros_like(rho) for _ in range(3)))
+    sure = start.weight + np.float32(0.02)
+    for radius, tolerance in ((2, 0.05), (config.fit_radius, 0.03)):
+        _fit_planes(state, sure, guide, radius, tolerance, 0.0, config)
+    state.inverse_depth = rho.copy()
+    for _ in range(config.refine_steps):
+        photo_precision = _photometric_step(state, patches, config)
+        rho = state.inverse_depth
+        misfit = (tracker.inverse_depth / rho - 1.0) ** 2 * tracker.weight
+        tracker_precision = tracker.weight / (1.0 + misfit / 4.0)
+        precision = photo_precision + tracker_precision
+        data = (photo_precision * rho + tracker_precision * tracker.inverse_depth) / precision
+        state.inverse_depth = data
+        sure = 1.0 / (1.0 + 1.0 / (precision * np.float32(config.fit_deviation**2)))
+        sure += np.float32(1e-3)
+        tolerance, stiffness = config.fit_tolerance, config.fit_stiffness
+        _fit_planes(state, sure, guide, config.fit_radius, tolerance, stiffness, config)
+        plane = np.minimum(state.support / np.float32(FULL_SUPPORT), np.float32(1.0))
+        plane *= np.float32(1.0 / config.plane_deviation**2)
+        state.inverse_depth = (precision * data + plane * state.inverse_depth) / (precision + plane)
+    return state
+
+
+def _photometric_step(
+    state: SlantedDepth, patches: _Patches, config: DepthConfig
+) -> Float32[np.ndarray, "h w"]:
+    """Move ``state`` one bounded step; returns the relative precision of the optimum.
+
+    The deviation of a single optimum is measured to be ``config.photo_deviation`` over the square
+    root of the curvature (by relative inverse depth), whatever the likeness of the patches.
+    """
+    rho = state.inverse_depth
+    step, curvature = np.empty_like(rho), np.empty_like(rho)
+    kernels.photometric_step(
+        patches.samples, patches.offsets, patches.weights, patches.images, patches.a, patches.b,
+        rho, state.slope_x, state.slope_y, np.float32(0.5 * config.variance_floor), step, curvature,
+    )  # fmt: skip
+    limit = np.float32(config.step_limit) * rho
+    state.inverse_depth = rho = rho + np.clip(step, -limit, limit)
+    variance = np.float32(config.photo_deviation**2) / (curvature * rho**2 + np.float32(1e-6))
+    return 1.0 / (variance + np.float32(FLOOR_DEVIATION**2))
+
+
+def _fit_planes(
+    state: SlantedDepth,
+    sure: Float32[np.ndarray, "h w"],
+    guide: Float32[np.ndarray, "3 h w"],
+    radius: int,
+    tolerance: float,
+    stiffness: float,
+    config: DepthConfig,
+) -> None:
+    """Replace ``state`` by the local planes."""
+    rho, slope_x, slope_y = (np.empty_like(state.inverse_depth) for _ in range(3))
+    kernels.fit_planes(
+        state.inverse_depth, state.slope_x, state.slope_y, sure, guide, radius,
+        np.float32(config.guide_contrast), np.float32(tolerance), np.float32(stiffness),
+        rho, slope_x, slope_y, state.support,
+    )  # fmt: skip
+    positive = rho > np.float32(0.2) * state.inverse_depth
+    state.inverse_depth = np.where(positive, rho, state.inverse_depth)
+    state.slope_x, state.slope_y = slope_x, slope_y
+
+
+def _colour_guide(reference: DepthView, render: Camera) -> Float32[np.ndarray, "3 h w"]:
+    """The colour image at the render size in [0, 1], channels first."""
+    size = (render.width, render.height)
+    small = cv2.resize(reference.image, size, interpolation=cv2.INTER_AREA)
+    return np.ascontiguousarray(small.transpose(2, 0, 1)).astype(np.float32) / np.float32(255)
+
+
+def _gather_patches(
+    reference: DepthView,
+    neighbours: Sequence[DepthView],
+    render: Camera,
+    working: Camera,
+    config: DepthConfig,
+) -> _Patches:
+    """The fine reference image around every render pixel; likeness to the centre as weight."""
+    reach = np.arange(-PATCH_REACH, PATCH_REACH + 1, dtype=np.float32)
+    offsets = np.stack(np.meshgrid(reach, reach), -1).reshape(-1, 2)
+    columns = np.arange(render.width) - render.cx
+    rows = np.arange(render.height) - render.cy
+    samples = np.empty((len(offsets), render.height, render.width), np.float32)
+    for sample, (ox, oy) in zip(samples, offsets, strict=True):
+        x = (columns + ox) * (working.fx / render.fx) + working.cx
+        y = (rows + oy) * (working.fy / render.fy) + working.cy
+        x, y = np.meshgrid(x.astype(np.float32), y.astype(np.float32))
+        fine = cv2.remap(reference.fine, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        sample[:] = fine - np.float32(0.5)
+    contrast = (samples - samples[len(samples) // 2]) ** 2
+    weights = 1.0 / (1.0 + np.float32(config.patch_contrast) * contrast)
+    k, k_inverse = working.matrix().numpy(), np.linalg.inv(render.matrix().numpy())
+    relative = [v.T_cw @ np.linalg.inv(reference.T_cw) for v in neighbours]
+    return _Patches(
+        samples=samples,
+        offsets=offsets,
+        weights=weights,
+        images=np.stack([v.fine for v in neighbours]) - np.float32(0.5),
+        a=np.stack([k @ m[:3, :3] @ k_inverse for m in relative]),
+        b=np.stack([k @ m[:3, 3] for m in relative]),
+    )

@@ -1,0 +1,114 @@
+"""Which keyframes to match a keyframe with, and over which depths."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float64
+
+from geogs.config import DepthConfig
+from geogs.depth.view import DepthView, Place
+from geogs.geometry.camera import Camera
+from geogs.keyframes.grid import OFFSET, STRIDE
+
+
+def parallax_degrees(
+    reference: Place, others: Sequence[Place], depth: float
+) -> tuple[Float64[np.ndarray, "n"], Float64[np.ndarray, "n"]]:
+    """Angles between the two rays to the point ``depth`` ahead, and between the two directions."""
+    poses = np.stack([v.T_cw for v in others])
+    centers = -(np.swapaxes(poses[:, :3, :3], 1, 2) @ poses[:, :3, 3:])[:, :, 0]
+    ray = depth * reference.forward
+    return (
+        _angles(ray, reference.center + ray - centers),
+        _angles(reference.forward, poses[:, 2, :3]),
+    )
+
+
+def _angles(a: Float64[np.ndarray, "3"], b: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n"]:
+    cosine = b @ a / (np.linalg.norm(a) * np.linalg.norm(b, axis=1) + 1e-12)
+    return np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+
+
+def misfit(
+    parallax: Float64[np.ndarray, "n"], turn: Float64[np.ndarray, "n"], best: float
+) -> Float64[np.ndarray, "n"]:
+    """How far pairs are from ``best`` degrees of parallax (log scale) and from looking alike."""
+    return np.abs(np.log(np.maximum(parallax, 0.05) / best)) + (turn / 20.0) ** 2
+
+
+def select_sweep_neighbours(
+    reference: Place, candidates: Sequence[Place], depth: float, config: DepthConfig
+) -> list[int]:
+    """Indices of the at most ``config.neighbours`` best candidates, best first.
+
+    Good is a parallax near ``config.parallax`` degrees at ``depth`` (on a log scale) and a similar
+    viewing direction. Where there is choice, baselines point different ways, so that edges of any
+    orientation can be matched. Too small or too large a parallax, or looking more than 35 degrees
+    aside, excludes; if nobody is left, the two nearest to good are taken.
+    """
+    others = np.array([i for i, v in enumerate(candidates) if v.id != reference.id], int)
+    if len(others) == 0:
+        return []
+    parallax, turn = parallax_degrees(reference, [candidates[i] for i in others], depth)
+    usable = (config.min_parallax < parallax) & (parallax < config.max_parallax)
+    usable &= turn < config.max_turn
+    order = np.lexsort((misfit(parallax, turn, config.parallax), ~usable))
+    ranked: list[int] = others[order].tolist()
+    count = int(usable.sum())
+    if count == 0:
+        return ranked[:2]
+    usable_ids = ranked[:count]
+    pool = usable_ids[: 3 * config.neighbours]
+    chosen: list[int] = []
+    directions: list[np.ndarray] = []
+    spread = len(pool) >= 2 * config.neighbours
+    for i in pool:
+        baseline = candidates[i].center - reference.center
+        baseline = baseline / np.linalg.norm(baseline)
+        if spread and any(baseline @ d > config.max_baseline_cosine for d in directions):
+            continue
+        chosen.append(i)
+        directions.append(baseline)
+    chosen += [i for i in pool if i not in chosen]
+    return chosen[: config.neighbours]
+
+
+def depth_range(
+    reference: DepthView, others: Sequence[DepthView], working: Camera, config: DepthConfig
+) -> tuple[float, float]:
+    """Nearest and farthest depth to search in the reference view.
+
+    From the surest half of what the tracker knows in this and the other views (and all whose
+    relative deviation is below ``config.range_deviation``), seen from the reference and widened by
+    ``config.range_margin`` on both sides. (0.1, 10) if the tracker knows next to nothing.
+    """
+    inverse = _seen_inverse_depth(reference, (reference, *others), working, config)
+    if len(inverse) < 8:
+        return 0.1, 10.0
+    low, high = np.percentile(inverse, [0.5, 99.5])
+    return float(1.0 / high / config.range_margin), float(1.0 / low * config.range_margin)
+
+
+def _seen_inverse_depth(
+    reference: DepthView, views: Sequence[DepthView], working: Camera, config: DepthConfig
+) -> Float64[np.ndarray, "n"]:
+    """Inverse depths, in the reference view, of the views' sure cells that it can see."""
+    grid = np.stack([v.inverse_depth for v in views]).astype(np.float64)
+    information = np.stack([v.information for v in views])
+    known = np.isfinite(grid) & (grid > 0) & (information > 0)
+    z = 1.0 / np.where(known, grid, 1.0)
+    deviation = z / np.sqrt(np.where(known, information, np.float32(1.0)))
+    medians = [np.median(d[k]) if k.any() else 0.0 for d, k in zip(deviation, known, strict=True)]
+    limits = np.maximum(config.range_deviation, medians)
+    sure = known & (deviation <= limits[:, None, None])
+    x = (OFFSET + STRIDE * np.arange(grid.shape[2]) - working.cx) / working.fx * z
+    y = (OFFSET + STRIDE * np.arange(grid.shape[1])[:, None] - working.cy) / working.fy * z
+    relative = reference.T_cw @ np.linalg.inv(np.stack([v.T_cw for v in views]))
+    camera = np.stack([x, y, z], 1).reshape(len(views), 3, -1)
+    point = relative[:, :3, :3] @ camera + relative[:, :3, 3:]
+    point = point.transpose(1, 0, 2).reshape(3, -1).take(np.flatnonzero(sure), 1)
+    point = point.take(np.flatnonzero(point[2] > 1e-6), 1)
+    u = point[0] / point[2] * working.fx + working.cx
+    v = point[1] / point[2] * working.fy + working.cy
+    seen = (np.abs(2 * u / working.width - 1) < 1) & (np.abs(2 * v / working.height - 1) < 1)
+    return 1.0 / point[2, seen]

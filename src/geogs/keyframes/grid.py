@@ -1,0 +1,136 @@
+"""The sparse sample grid on which the tracker keeps inverse depth and flow."""
+
+from dataclasses import dataclass, field
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from geogs.errors import InputError
+from geogs.geometry.camera import Camera
+
+STRIDE = 8
+"""Pixels of the working image between two cells of the grid."""
+OFFSET = 4
+"""Pixel of the working image that the first cell samples."""
+
+
+@dataclass(frozen=True)
+class SampleGrid:
+    """Cells ``(r, c)`` at pixels ``(4 + 8 c, 4 + 8 r)`` of the working image, row by row."""
+
+    camera: Camera
+    device: torch.device | str = "cpu"
+    width: int = field(init=False)
+    """Cells per row."""
+    height: int = field(init=False)
+    """Rows."""
+    pixels: Float[Tensor, "p 2"] = field(init=False)
+    """x, y of each cell, float32."""
+    rays: Float[Tensor, "p 3"] = field(init=False)
+    """K^-1 (x, y, 1) of each cell, float32."""
+
+    def __post_init__(self) -> None:
+        x = torch.arange(OFFSET, self.camera.width - 3, STRIDE, dtype=torch.float64)
+        y = torch.arange(OFFSET, self.camera.height - 3, STRIDE, dtype=torch.float64)
+        if len(x) < 4 or len(y) < 4:
+            raise InputError(
+                f"The working image is {self.camera.width} x {self.camera.height} pixels; "
+                "tracking needs at least 32 x 32."
+            )
+        yy, xx = torch.meshgrid(y, x, indexing="ij")
+        cam = self.camera
+        rays = torch.stack([(xx - cam.cx) / cam.fx, (yy - cam.cy) / cam.fy, xx * 0 + 1], -1)
+        pixels = torch.stack([xx, yy], -1)
+        object.__setattr__(self, "width", len(x))
+        object.__setattr__(self, "height", len(y))
+        object.__setattr__(self, "pixels", pixels.reshape(-1, 2).float().to(self.device))
+        object.__setattr__(self, "rays", rays.reshape(-1, 3).float().to(self.device))
+
+    @property
+    def on_gpu(self) -> bool:
+        """Whether fields on the grid are kept and worked on by a GPU."""
+        return torch.device(self.device).type == "cuda"
+
+    @property
+    def size(self) -> int:
+        """Number of cells."""
+        return self.width * self.height
+
+    def inside(self, points: Float[Tensor, "*b 2"], margin: float = 1.0) -> Bool[Tensor, "*b"]:
+        """Whether pixel positions lie in the image, ``margin`` pixels from its border."""
+        x, y = points.unbind(-1)
+        right, bottom = self.camera.width - 1 - margin, self.camera.height - 1 - margin
+        return (x >= margin) & (x <= right) & (y >= margin) & (y <= bottom)
+
+    def sample_field(
+        self, values: Float[Tensor, "p c"], points: Float[Tensor, "n 2"]
+    ) -> Float[Tensor, "n c"]:
+        """Bilinear value of a field given on the grid at any pixels; replicated at the border."""
+        size = points.new_tensor([self.width - 1, self.height - 1])
+        normalised = (points - OFFSET) / STRIDE * (2 / size) - 1
+        image = values.mT.reshape(1, -1, self.height, self.width)
+        out = torch.nn.functional.grid_sample(
+            image, normalised[None, None], align_corners=True, padding_mode="border"
+        )
+        return out[0, :, 0].mT
+
+    def upsample(self, values: Float[Tensor, "p c"]) -> Float[Tensor, "h w c"]:
+        """Bilinear field on every pixel of the image."""
+        v, u = torch.meshgrid(
+            torch.arange(self.camera.height, dtype=values.dtype, device=values.device),
+            torch.arange(self.camera.width, dtype=values.dtype, device=values.device),
+            indexing="ij",
+        )
+        full = self.sample_field(values, torch.stack([u, v], -1).reshape(-1, 2))
+        return full.reshape(self.camera.height, self.camera.width, -1)
+
+    def cells_of(self, points: Float[Tensor, "*b 2"]) -> tuple[Tensor, Bool[Tensor, "*b"]]:
+        """Index of the cell nearest to each pixel position, and whether there is one."""
+        cell = torch.round((points.nan_to_num(-1e4).clamp(-1e4, 1e5) - OFFSET) / STRIDE).long()
+        c, r = cell.unbind(-1)
+        valid = (c >= 0) & (c < self.width) & (r >= 0) & (r < self.height)
+        return torch.where(valid, r * self.width + c, torch.zeros_like(c)), valid
+
+    def fill(
+        self, values: Float[Tensor, "p"], confidence: Float[Tensor, "p"]
+    ) -> Float[Tensor, "p"]:
+        """Values where confidence is positive; elsewhere the mean of their surroundings.
+
+        Push and pull: confidence-weighted means over growing blocks, taken from the finest level
+        that has any confidence near. Without any confidence the plain mean is returned.
+        """
+        return self.fill_all(values[None], confidence[None])[0]
+
+    def fill_all(
+        self, values: Float[Tensor, "n p"], confidence: Float[Tensor, "n p"]
+    ) -> Float[Tensor, "n p"]:
+        """:meth:`fill` of several fields at once."""
+        if self.on_gpu:
+            from geogs.bundle.cuda.fields import fill_fields
+
+            return fill_fields(self, values, confidence)
+        return torch.stack([self._fill(*pair) for pair in zip(values, confidence, strict=True)])
+
+    def _fill(
+        self, values: Float[Tensor, "p"], confidence: Float[Tensor, "p"]
+    ) -> Float[Tensor, "p"]:
+        if not bool((confidence > 0).any()):
+            return torch.full_like(values, float(values.mean()))
+        shape = (1, 1, self.height, self.width)
+        value, weight = values.reshape(shape), confidence.reshape(shape).clamp(min=0)
+        return torch.where(
+            confidence > 0, values, _push_pull(value, weight).reshape(-1).to(values.dtype)
+        )
+
+
+def _push_pull(value: Tensor, weight: Tensor) -> Tensor:
+    pool = torch.nn.functional.avg_pool2d
+    if min(value.shape[-2:]) <= 2:
+        return ((value * weight).sum() / weight.sum()).expand_as(value)
+    w = pool(weight, 2, ceil_mode=True)
+    v = pool(value * weight, 2, ceil_mode=True) / w.clamp(min=1e-30)
+    coarse = torch.nn.functional.interpolate(
+        _push_pull(v, w), size=value.shape[-2:], mode="bilinear", align_corners=False
+    )
+    return torch.where(weight > 0, value, coarse)

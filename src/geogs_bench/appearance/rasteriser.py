@@ -1,0 +1,80 @@
+"""What the trainer asks of a rasteriser of coloured disks."""
+
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float, Int64
+from torch import Tensor
+
+from geogs.geometry.camera import Camera
+from geogs_bench.appearance.disks import AppearanceDisks
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """One view, differentiable in the disks."""
+
+    colour: Float[Tensor, "h w 3"]
+    """RGB over the background, not clamped above."""
+    alpha: Float[Tensor, "h w"]
+    normal: Float[Tensor, "h w 3"] | None
+    """Blended normals of the disks, camera frame, facing the camera; none if not asked for."""
+    depth_normal: Float[Tensor, "h w 3"] | None
+    """Normals of the expected depth, camera frame; zero at the border; none if not asked for."""
+    screen: Float[Tensor, "*b n 2"]
+    """Gets the gradient of each disk's place in the image, per pixel, in the backward pass."""
+    visible: Bool[Tensor, "n"]
+    """Disks that touch the image."""
+
+
+@dataclass(frozen=True)
+class MedianDisks:
+    """Which disk each pixel's ray sees at half its transmittance."""
+
+    index: Int64[Tensor, "h w"]
+    """Row of the disk; -1 where there is none."""
+    alpha: Float[Tensor, "h w"]
+    """Opacity along the whole ray."""
+
+
+@runtime_checkable
+class Rasteriser(Protocol):
+    """Renders coloured disks."""
+
+    def render(
+        self,
+        disks: AppearanceDisks,
+        camera: Camera,
+        T_cw: Float[Tensor, "4 4"],
+        sh_degree: int,
+        background: Float[Tensor, "3"] | None,
+        with_normals: bool,
+    ) -> Rendering:
+        """Colours and, if wanted, normals; the background is black if none is given."""
+        ...
+
+    def median_disks(
+        self, disks: AppearanceDisks, camera: Camera, T_cw: Float[Tensor, "4 4"]
+    ) -> MedianDisks:
+        """The last disk of each pixel in front of which more than half the light passes."""
+        ...
+
+
+def shifted_matrix(camera: Camera, device: torch.device) -> Float[Tensor, "3 3"]:
+    """Intrinsics, float32, for renderers that put the centre of the first pixel at (1/2, 1/2)."""
+    K = camera.matrix()
+    K[:2, 2] += 0.5
+    return K.float().to(device)
+
+
+def normals_of_depth(
+    depth: Float[Tensor, "h w"], rays: Float[Tensor, "h w 3"]
+) -> Float[Tensor, "h w 3"]:
+    """Camera-frame normals by central differences, facing the camera, zero at the border."""
+    points = depth[..., None] * rays
+    down = points[2:, 1:-1] - points[:-2, 1:-1]
+    right = points[1:-1, 2:] - points[1:-1, :-2]
+    normals = F.normalize(torch.linalg.cross(down, right), dim=-1)
+    return F.pad(normals, (0, 0, 1, 1, 1, 1))

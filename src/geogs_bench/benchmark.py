@@ -1,0 +1,74 @@
+"""What a benchmark is: scenes, variants of the settings, and the tables of its results."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from geogs_bench.published import PublishedTable
+from geogs_bench.record import Record
+from geogs_bench.runner import Command
+from geogs_bench.scene import Option, Scene
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One row of an ablation: a name, and the options that make it."""
+
+    name: str = ""
+    """Also the folder below the scene's; none for a benchmark of one variant."""
+    options: tuple[Option, ...] = ()
+    command: Command | None = None
+    """Other than the benchmark's."""
+
+
+@dataclass(frozen=True)
+class Published:
+    """The published figures that stand beside a column."""
+
+    table: PublishedTable
+    metric: str
+
+
+@dataclass(frozen=True)
+class Column:
+    """A number of each record."""
+
+    title: str
+    """``{unit}`` stands for that of the surfaces."""
+    value: Callable[[Record], float | None]
+    digits: int = 2
+    published: Published | None = None
+
+
+@dataclass(frozen=True)
+class Layout:
+    """A table of results: which numbers under which heading."""
+
+    title: str
+    columns: tuple[Column, ...]
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class Benchmark:
+    """One ``geogs bench NAME``."""
+
+    name: str
+    title: str
+    command: Command
+    find: Callable[[Path], list[Scene]]
+    needs: str
+    """The folder that the user gives."""
+    source: str
+    """Where the data comes from."""
+    layouts: tuple[Layout, ...]
+    variants: tuple[Variant, ...] = (Variant(),)
+    scenes: tuple[str, ...] = ()
+    """Those of the paper; others are run only if asked for, or if none of these is there."""
+    published: tuple[PublishedTable, ...] = ()
+    notes: tuple[str, ...] = ()
+    """What to know before comparing with the published figures."""
+    budgets: tuple[float, ...] = ()
+    """Seconds given to each reconstruction from known poses; each makes a variant."""
+    synthetic: bool = False
+    """Whether a synthetic room serves where the user gives no data."""

@@ -1,0 +1,149 @@
+"""The columns from which the tables of the benchmarks are made."""
+
+from collections.abc import Callable
+
+from geogs_bench.benchmark import Column, Layout, Published
+from geogs_bench.published import PublishedTable
+from geogs_bench.record import Record, StageName, Weighting
+
+_MEASURES = (
+    ("Acc", "accuracy", "{unit}"),
+    ("Comp", "completeness", "{unit}"),
+    ("Comp.Rat", "ratio", "%"),
+    ("CD", "chamfer", "{unit}"),
+)
+_FURTHER = (
+    ("median Acc", "accuracy_median", "{unit}"),
+    ("median Comp", "completeness_median", "{unit}"),
+    ("F-score", "f_score", "%"),
+)
+
+
+def ate(stage: StageName) -> Callable[[Record], float | None]:
+    """RMSE over all frames."""
+
+    def value(record: Record) -> float | None:
+        scored = record.stage(stage)
+        return scored.trajectory.ate if scored and scored.trajectory else None
+
+    return value
+
+
+def keyframes_ate(stage: StageName) -> Callable[[Record], float | None]:
+    """RMSE over the keyframes."""
+
+    def value(record: Record) -> float | None:
+        scored = record.stage(stage)
+        return scored.trajectory.keyframes_ate if scored and scored.trajectory else None
+
+    return value
+
+
+def surface(
+    stage: StageName, weighting: Weighting, measure: str
+) -> Callable[[Record], float | None]:
+    """A field of a surface score."""
+
+    def value(record: Record) -> float | None:
+        scored = record.stage(stage)
+        found = scored.surface(weighting) if scored else None
+        return None if found is None else getattr(found, measure)
+
+    return value
+
+
+def cost(name: str, factor: float = 1.0) -> Callable[[Record], float | None]:
+    """A field of what the run took, times ``factor``."""
+
+    def value(record: Record) -> float | None:
+        found = None if record.cost is None else getattr(record.cost, name)
+        return None if found is None else factor * found
+
+    return value
+
+
+def trajectory_layout(published: PublishedTable | None = None) -> Layout:
+    """ATE of the online and the final trajectory."""
+    beside = None if published is None else Published(published, "ATE")
+    return Layout(
+        "Trajectory, ATE RMSE after Sim(3) alignment (cm)",
+        (
+            Column("online", ate("online"), 3),
+            Column("final", ate("final"), 3, beside),
+            Column("keyframes online", keyframes_ate("online"), 3),
+            Column("keyframes final", keyframes_ate("final"), 3),
+        ),
+    )
+
+
+def surface_layout(
+    weighting: Weighting,
+    title: str,
+    published: PublishedTable | None = None,
+    stages: tuple[StageName, ...] = ("online", "depth fusion", "final"),
+) -> Layout:
+    """Errors of the surface at each stage; published figures beside those of the result."""
+    columns = []
+    further = () if weighting == "vertices" else _FURTHER
+    for name, measure, unit in (*_MEASURES, *further):
+        for stage in stages if (name, measure, unit) in _MEASURES else ("final",):
+            beside = _beside(published, name) if stage == "final" else None
+            shown = name if stage == "final" else f"{name} {stage}"
+            value = surface(stage, weighting, measure)
+            columns.append(Column(f"{shown} ({unit})", value, 2, beside))
+    return Layout(title, tuple(columns))
+
+
+def _beside(published: PublishedTable | None, metric: str) -> Published | None:
+    if published is None or all(row.metric != metric for row in published.rows):
+        return None
+    return Published(published, metric)
+
+
+def vertex_layout(published: PublishedTable | None = None) -> Layout:
+    """The vertex-weighted measure of the published SLAM tables."""
+    return surface_layout("vertices", "Surface, vertex-weighted (toolbox of Splat-SLAM)", published)
+
+
+def area_layout() -> Layout:
+    """The measure that depends neither on tessellation nor on sampling."""
+    return surface_layout("area", "Surface, area-weighted, exact distances")
+
+
+def dtu_layout(published: PublishedTable | None = None) -> Layout:
+    """DTU's protocol."""
+    return surface_layout("points", "Surface, DTU's protocol", published, ("final",))
+
+
+def photo_layout() -> Layout:
+    """Agreement of held-out images."""
+
+    def field(name: str) -> Callable[[Record], float | None]:
+        return lambda record: None if record.photo is None else getattr(record.photo, name)
+
+    return Layout(
+        "Photo-consistency of held-out views across the mesh",
+        (
+            Column("agreement, holes count 0 (%)", field("score")),
+            Column("mean NCC", field("ncc"), 3),
+            Column("median NCC", field("ncc_median"), 3),
+            Column("coverage (%)", field("coverage")),
+            Column("held-out views", field("views"), 0),
+        ),
+        "Not a distance: no true surface was there.",
+    )
+
+
+COST = Layout(
+    "Cost",
+    (
+        Column("frames", cost("frames"), 0),
+        Column("seconds", cost("seconds"), 1),
+        Column("frames/s", cost("frames_per_second")),
+        Column("peak memory (GB)", cost("peak_memory_bytes", 1e-9)),
+        Column("peak GPU memory (GB)", cost("peak_gpu_memory_bytes", 1e-9)),
+        Column("thousand disks", cost("disks", 1e-3), 1),
+        Column("map (MB)", cost("map_bytes", 1e-6)),
+    ),
+    "Seconds are of the whole command; frames/s of SLAM are those of the online part.",
+)

@@ -1,0 +1,161 @@
+"""Runs the jobs of a benchmark, scores them, and keeps what is done through any failure."""
+
+import time
+import traceback
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+
+from geogs.errors import GeogsError
+from geogs.io.writers.atomic import prepare_output_folder, write_text
+from geogs_bench.benchmark import Benchmark
+from geogs_bench.machine import forget_peak_memory, machine_name, program_version
+from geogs_bench.plan import Job
+from geogs_bench.record import Cost, Provenance, Record, read_record, write_json
+from geogs_bench.report import write_report
+from geogs_bench.result import ResultFolder
+from geogs_bench.runner import Command, Runner
+from geogs_bench.scoring.scores import score
+from geogs_bench.store import (
+    RECORD_FILE,
+    CompletedRun,
+    clear,
+    completed_run,
+    config_hash,
+    records_below,
+    write_completed_run,
+)
+
+_ERROR_FILE = "bench_error.txt"
+
+
+class Harness:
+    """One benchmark into one folder; what was finished before is not run again."""
+
+    def __init__(
+        self,
+        benchmark: Benchmark,
+        output: Path,
+        runners: Mapping[Command, Runner],
+        say: Callable[[str], None] = print,
+        fresh: bool = False,
+        rescore: bool = False,
+    ) -> None:
+        """``fresh`` runs everything anew; ``rescore`` only scores it anew."""
+        self._benchmark = benchmark
+        self._output = output
+        self._runners = runners
+        self._say = say
+        self._fresh = fresh
+        self._rescore = rescore
+        self._commit = program_version()
+        self._machine = machine_name()
+
+    def run(self, jobs: Sequence[Job]) -> list[Record]:
+        """All records of the benchmark, those of earlier calls in the same folder included.
+
+        A job that fails leaves a record that says why, and the others go on. The report is written
+        after each job.
+
+        Raises:
+            InputError: an option does not exist or fit; found before anything is run.
+            OutputError: the folder cannot be written.
+        """
+        settings = [self._runners[job.task.command].settings(job.task) for job in jobs]
+        prepare_output_folder(self._output)
+        records: list[Record] = []
+        for number, (job, values) in enumerate(zip(jobs, settings, strict=True), start=1):
+            name = f"{job.scene.name} {job.variant}".strip()
+            self._say(f"[{number}/{len(jobs)}] {self._benchmark.name}: {name}")
+            self._do(job, values)
+            records = self._ordered(records_below(self._output, self._benchmark.name), jobs)
+            write_report(self._output, self._benchmark, records)
+        return records
+
+    def _ordered(self, records: Sequence[Record], jobs: Sequence[Job]) -> list[Record]:
+        scenes = [*self._benchmark.scenes, *(job.scene.name for job in jobs)]
+        variants = [job.variant for job in jobs]
+
+        def place(record: Record) -> tuple[int, str, int]:
+            return _place(scenes, record.scene), record.scene, _place(variants, record.variant)
+
+        return sorted(records, key=place)
+
+    def _do(self, job: Job, settings: dict[str, object]) -> None:
+        """Run and score a job, as far as needed, and write its record."""
+        folder = job.task.output
+        digest = config_hash(job.task.command, settings)
+        done = None if self._fresh else completed_run(folder, job.task.source, digest)
+        before = read_record(folder / RECORD_FILE)
+        is_scored = before is not None and before.error is None
+        if done is not None and is_scored and not self._rescore:
+            self._say("  done before")
+            return
+        provenance = Provenance(
+            job.task.command, self._commit, self._machine, "", _seed(settings), digest
+        )
+        relative = str(folder.relative_to(self._output))
+        record = Record(self._benchmark.name, job.scene.name, job.variant, relative, provenance)
+        try:
+            done = done or self._run(job, provenance)
+            record = replace(record, provenance=done.provenance, cost=done.cost)
+            record = self._scored(job, record)
+        except GeogsError as error:
+            record = replace(record, error=str(error))
+        except Exception as error:  # whatever it is, the other scenes go on
+            with suppress(GeogsError):
+                write_text(folder / _ERROR_FILE, traceback.format_exc())
+            why = " ".join(f"{type(error).__name__}: {error}".split())
+            record = replace(record, error=f"{why} (see {relative}/{_ERROR_FILE})")
+        if record.error is not None:
+            self._say(f"  failed: {record.error}")
+        write_json(folder / RECORD_FILE, record)
+
+    def _run(self, job: Job, provenance: Provenance) -> CompletedRun:
+        """Run a job; its folder says so only once the run is complete."""
+        folder = clear(job.task.output)
+        forget_peak_memory()
+        start = time.perf_counter()
+        self._runners[job.task.command].run(job.task)
+        seconds = time.perf_counter() - start
+        result = ResultFolder(folder)
+        if result.summary.get("interrupted"):
+            raise KeyboardInterrupt  # the command has kept its part; the benchmark stops, too
+        device = str(result.summary.get("device", "cpu"))
+        provenance = replace(provenance, device=device)
+        source = str(job.task.source.resolve())
+        run = CompletedRun(source, provenance, cost_of(result, seconds))
+        write_completed_run(folder, run)
+        return run
+
+    def _scored(self, job: Job, record: Record) -> Record:
+        self._say("  scoring")
+        result = ResultFolder(job.task.output)
+        scores = score(job.scene, job.task.command, result, record.provenance.seed)
+        return replace(record, stages=scores.stages, photo=scores.photo, curve=scores.curve)
+
+
+def cost_of(result: ResultFolder, seconds: float) -> Cost:
+    """What a run took, by its own summary; ``seconds`` are those of the whole command."""
+    summary = result.summary
+    rates = summary.get("frames_per_second", {})
+    return Cost(
+        seconds=round(seconds, 3),
+        frames=summary.get("frames"),
+        frames_per_second=rates.get("online", rates.get("with_final_stages")),
+        peak_memory_bytes=summary.get("peak_memory_bytes"),
+        peak_gpu_memory_bytes=summary.get("peak_gpu_memory_bytes"),
+        disks=summary.get("disks"),
+        map_bytes=summary.get("map_bytes", result.map_bytes),
+        stages=dict(summary.get("seconds", {})),
+    )
+
+
+def _seed(settings: Mapping[str, object]) -> int:
+    seed = settings.get("seed", 0)
+    return seed if isinstance(seed, int) else 0
+
+
+def _place(order: Sequence[str], name: str) -> int:
+    return order.index(name) if name in order else len(order)

@@ -1,0 +1,31 @@
+"""ScanNet as exported from its ``.sens`` files: ``<scene>/color``, ``pose`` and ``intrinsic``."""
+
+from pathlib import Path
+
+from geogs.io.sources.posed.scannet import is_scannet
+from geogs_bench.layouts.places import first_file, folders_like
+from geogs_bench.scene import Option, Scene, TruePoses, Truth
+
+
+def find_scannet(root: Path) -> list[Scene]:
+    """Exported scenes below ``root`` or its ``scans``; an exporter may add a folder ``frames``."""
+    folders = folders_like(root, _is_scene, ("scans", "scannet"))
+    return [_scene(folder) for folder in folders]
+
+
+def _frames(folder: Path) -> Path:
+    return folder / "frames" if (folder / "frames" / "color").is_dir() else folder
+
+
+def _is_scene(folder: Path) -> bool:
+    return is_scannet(_frames(folder))
+
+
+def _scene(folder: Path) -> Scene:
+    frames = _frames(folder)
+    name = folder.resolve().name
+    calibration = frames / "intrinsic" / "intrinsic_color.txt"
+    options = (Option("input.intrinsics", str(calibration)),) if calibration.is_file() else ()
+    surface = first_file(folder / f"{name}_vh_clean_2.ply", folder / f"{name}_vh_clean.ply")
+    poses = TruePoses(frames, "scannet")
+    return Scene(name, frames / "color", Truth(poses, surface), options)

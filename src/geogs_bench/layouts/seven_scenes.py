@@ -1,0 +1,25 @@
+"""7-Scenes: ``<scene>/seq-01/frame-000000.color.png`` with ``frame-000000.pose.txt``."""
+
+from pathlib import Path
+
+from geogs.io.sources.posed.seven_scenes import is_posed_seven_scenes
+from geogs_bench.layouts.places import first_file, folders_like
+from geogs_bench.scene import Scene, TruePoses, Truth
+
+
+def find_seven_scenes(root: Path) -> list[Scene]:
+    """Every sequence of the scenes below ``root``, which may be a scene or a sequence itself."""
+    folders = folders_like(root, is_posed_seven_scenes)
+    sequences = [path for folder in folders for path in _sequences(folder)]
+    return [_scene(sequence.resolve()) for sequence in sequences]
+
+
+def _sequences(folder: Path) -> list[Path]:
+    below = sorted(path for path in folder.glob("seq-*") if is_posed_seven_scenes(path))
+    return below or [folder]
+
+
+def _scene(sequence: Path) -> Scene:
+    surface = first_file(sequence.parent / "tsdf_pseudo_gt.ply", sequence.parent / "mesh.ply")
+    name = f"{sequence.parent.name}-{sequence.name}"
+    return Scene(name, sequence, Truth(TruePoses(sequence), surface))

@@ -1,0 +1,119 @@
+"""Which tasks a benchmark consists of, given the user's folder and wishes."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from geogs.errors import InputError
+from geogs_bench.benchmark import Benchmark, Variant
+from geogs_bench.runner import Command, Task
+from geogs_bench.scene import Option, Scene
+
+
+@dataclass(frozen=True)
+class Wishes:
+    """What the user chose beside the benchmark and its data."""
+
+    scenes: tuple[str, ...] = ()
+    """Only these, by name; those of the paper if none is named."""
+    variants: tuple[str, ...] = ()
+    """Only these; all if none is named."""
+    options: tuple[Option, ...] = ()
+    """For every task; a variant's own options win over them."""
+    budgets: tuple[float, ...] = ()
+    """Seconds, for benchmarks from known poses; theirs if none is given."""
+    baseline: bool = False
+    """Whether the baseline with colour runs beside, from known poses."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """One row of the results to be."""
+
+    scene: Scene
+    variant: str
+    task: Task
+
+
+def find_scenes(benchmark: Benchmark, folder: Path, names: Sequence[str] = ()) -> list[Scene]:
+    """The scenes to run: those named, else the paper's, else all that are there.
+
+    Raises:
+        InputError: there are none, or one that is named is missing.
+    """
+    if not folder.is_dir():
+        raise InputError(f"{folder} is not a folder; {benchmark.name} needs {benchmark.needs}.")
+    found = {scene.name: scene for scene in benchmark.find(folder)}
+    if not found:
+        raise InputError(
+            f"{folder} holds no scene of {benchmark.name}, which needs {benchmark.needs}."
+        )
+    if missing := [name for name in names if name not in found]:
+        raise InputError(f"{folder} has no scene {missing[0]}, only {', '.join(found)}.")
+    published = [name for name in benchmark.scenes if name in found]
+    return [found[name] for name in names or published or found]
+
+
+def make_jobs(
+    benchmark: Benchmark, scenes: Sequence[Scene], output: Path, wishes: Wishes
+) -> list[Job]:
+    """One job for each scene and variant, scene by scene.
+
+    Raises:
+        InputError: a variant that is named does not exist.
+    """
+    variants = _variants(benchmark, wishes)
+    known = [variant.name for variant in variants]
+    if missing := [name for name in wishes.variants if name not in known]:
+        raise InputError(
+            f"{benchmark.name} has no variant {missing[0]}, only {', '.join(known) or 'one'}."
+        )
+    chosen = [v for v in variants if v.name in wishes.variants or not wishes.variants]
+    return [_job(benchmark, scene, v, output, wishes) for scene in scenes for v in chosen]
+
+
+def _variants(benchmark: Benchmark, wishes: Wishes) -> list[Variant]:
+    """The benchmark's variants, at each budget, and the baseline at each."""
+    variants = list(benchmark.variants)
+    budgets = wishes.budgets or benchmark.budgets
+    if not benchmark.budgets:
+        if wishes.budgets or wishes.baseline:
+            raise InputError(
+                f"{benchmark.name} does not start from known poses; leave out --budgets and "
+                f"--baseline."
+            )
+        return variants
+    if wishes.baseline:
+        command: Command = "colour-2dgs"
+        variants.append(Variant(command, command=command))
+    several = len(budgets) > 1
+    return [
+        replace(
+            variant,
+            name=_timed(variant.name, seconds) if several or not variant.name else variant.name,
+            options=(*variant.options, Option("budget", f"{seconds:g}s")),
+        )
+        for variant in variants
+        for seconds in budgets
+    ]
+
+
+def _timed(name: str, seconds: float) -> str:
+    return f"{name}-{seconds:g}s" if name else f"{seconds:g}s"
+
+
+def _job(benchmark: Benchmark, scene: Scene, variant: Variant, output: Path, wishes: Wishes) -> Job:
+    options = merged(scene.options, wishes.options, variant.options)
+    folder = output / scene.name / variant.name
+    command = variant.command or benchmark.command
+    return Job(scene, variant.name, Task(command, scene.source, folder, options))
+
+
+def merged(*groups: Sequence[Option]) -> tuple[Option, ...]:
+    """All options, each once; later ones win."""
+    by_name = {
+        option.name.replace("_", "-"): replace(option, name=option.name.replace("_", "-"))
+        for group in groups
+        for option in group
+    }
+    return tuple(by_name.values())

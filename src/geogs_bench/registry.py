@@ -1,0 +1,187 @@
+"""Every benchmark of known data sets; the ablations are in their own file."""
+
+from geogs.errors import InputError
+from geogs_bench import published as paper
+from geogs_bench.ablations import ABLATIONS
+from geogs_bench.benchmark import Benchmark
+from geogs_bench.columns import (
+    COST,
+    area_layout,
+    dtu_layout,
+    photo_layout,
+    trajectory_layout,
+    vertex_layout,
+)
+from geogs_bench.layouts.dtu import find_dtu
+from geogs_bench.layouts.objects import find_objects
+from geogs_bench.layouts.posed_rooms import find_posed_rooms
+from geogs_bench.layouts.replica import find_replica, find_rooms
+from geogs_bench.layouts.scannet import find_scannet
+from geogs_bench.layouts.scannetpp import find_scannetpp
+from geogs_bench.layouts.seven_scenes import find_seven_scenes
+from geogs_bench.layouts.tum import find_tum
+
+_ONLINE = (
+    "Published online figures include the paper's final global bundle adjustment and map update; "
+    "our online column does not, our final column has in addition the refinement of the map."
+)
+_PLAIN_DISTANCES = (
+    "The paper prints squared distances in its formulas; its toolbox and its figures are plain "
+    "distances, and so are ours."
+)
+
+REPLICA = Benchmark(
+    "replica",
+    "Replica: tracking and reconstruction",
+    "run",
+    find_replica,
+    "the unpacked Replica.zip of NICE-SLAM: <scene>/results, <scene>/traj.txt, <scene>_mesh.ply, "
+    "best with cull_replica_mesh/ beside them",
+    "https://github.com/cvg/nice-slam (scripts/download_replica.sh, download_cull_replica_mesh.sh)",
+    (
+        trajectory_layout(paper.REPLICA_TRACKING),
+        vertex_layout(paper.REPLICA_SURFACE),
+        area_layout(),
+        COST,
+    ),
+    scenes=paper.REPLICA_SCENES,
+    published=(paper.REPLICA_SURFACE, paper.REPLICA_TRACKING),
+    notes=(_ONLINE, _PLAIN_DISTANCES),
+)
+
+SCANNET = Benchmark(
+    "scannet",
+    "ScanNet: tracking",
+    "run",
+    find_scannet,
+    "scenes exported from their .sens files: <scene>/color, <scene>/pose, <scene>/intrinsic",
+    "http://www.scan-net.org (terms of use), exported with its SensReader",
+    (trajectory_layout(paper.SCANNET), area_layout(), COST),
+    scenes=paper.SCANNET_SCENES,
+    published=(paper.SCANNET,),
+    notes=(
+        _ONLINE,
+        "The published systems cut the black borders of the images off; here they stay.",
+    ),
+)
+
+SCANNETPP = Benchmark(
+    "scannetpp",
+    "ScanNet++ (iPhone): tracking and reconstruction",
+    "run",
+    find_scannetpp,
+    "data/<id>/iphone with rgb.mkv (or the extracted rgb/) and colmap/, and "
+    "data/<id>/scans/mesh_aligned_0.05.ply",
+    "https://kaldir.vc.in.tum.de/scannetpp (terms of use)",
+    (trajectory_layout(paper.SCANNETPP), vertex_layout(paper.SCANNETPP), area_layout(), COST),
+    scenes=paper.SCANNETPP_SCENES,
+    published=(paper.SCANNETPP,),
+    notes=(
+        _ONLINE,
+        "The paper states neither the frames it used, nor its true poses, nor how it cut the "
+        "laser scan; here: every second frame, COLMAP's poses, triangles that the camera saw.",
+    ),
+)
+
+TUM = Benchmark(
+    "tum",
+    "TUM RGB-D: tracking",
+    "run",
+    find_tum,
+    "unpacked sequences: <sequence>/rgb.txt, <sequence>/groundtruth.txt",
+    "https://cvg.cit.tum.de/data/datasets/rgbd-dataset/download",
+    (trajectory_layout(), COST),
+)
+
+SEVEN_SCENES = Benchmark(
+    "7scenes",
+    "7-Scenes: tracking and reconstruction",
+    "run",
+    find_seven_scenes,
+    "<scene>/seq-01/frame-000000.color.png and frame-000000.pose.txt",
+    "https://www.microsoft.com/en-us/research/project/rgb-d-dataset-7-scenes",
+    (trajectory_layout(), area_layout(), COST),
+    notes=(
+        "The true poses come from KinectFusion, a few centimetres off themselves, and are those "
+        "of the depth camera.",
+    ),
+)
+
+DTU = Benchmark(
+    "dtu",
+    "DTU: surfaces from known poses in two minutes",
+    "reconstruct",
+    find_dtu,
+    "scans as prepared for 2DGS or IDR (scan24/images, scan24/cameras.npz), and for distances the "
+    "official SampleSet/MVS Data (ObsMask, Points/stl) beside them",
+    "https://github.com/hbb1/2d-gaussian-splatting (prepared scans); "
+    "https://roboimagedata.compute.dtu.dk (SampleSet.zip, Points.zip)",
+    (dtu_layout(paper.DTU), photo_layout(), COST),
+    scenes=paper.DTU_SCENES,
+    published=(paper.DTU, paper.DTU_EFFICIENCY),
+    notes=(
+        "The paper prints its chamfer distances as cm; the protocol it follows gives mm.",
+        "Our seconds hold everything from reading the images to writing the mesh.",
+    ),
+    budgets=(120.0,),
+)
+
+ROOMS = Benchmark(
+    "rooms",
+    "Rooms with exact surfaces: tracking and reconstruction",
+    "run",
+    find_rooms,
+    "<scene>/results, <scene>/traj.txt, <scene>/mesh.ply and points_seen_*.ply, as geogs synth "
+    "writes them; without a folder a synthetic room is made",
+    "geogs synth, or any rendered room in this layout",
+    (trajectory_layout(), area_layout(), vertex_layout(), COST),
+    synthetic=True,
+)
+
+POSED_ROOMS = Benchmark(
+    "rooms-known-poses",
+    "Rooms with exact surfaces: reconstruction from known poses",
+    "reconstruct",
+    find_posed_rooms,
+    ROOMS.needs,
+    ROOMS.source,
+    (area_layout(), vertex_layout(), COST),
+    notes=("About a hundred images of each sequence are used.",),
+    budgets=(120.0,),
+    synthetic=True,
+)
+
+OBJECTS = Benchmark(
+    "objects",
+    "Objects with masks: surfaces from known poses",
+    "reconstruct",
+    find_objects,
+    "<scene>/results with frame and mask images, <scene>/traj.txt, <scene>/mesh_*.ply and "
+    "points_seen_*.ply",
+    "any rendered or scanned object in this layout",
+    (area_layout(), COST),
+    notes=(
+        "Distances of 20 mm and more, and what lies outside the masks, are left out as in DTU's "
+        "protocol.",
+    ),
+    budgets=(120.0,),
+)
+
+BENCHMARKS: dict[str, Benchmark] = {
+    benchmark.name: benchmark
+    for benchmark in (
+        REPLICA, SCANNET, SCANNETPP, TUM, SEVEN_SCENES, DTU, ROOMS, POSED_ROOMS, OBJECTS,
+        *ABLATIONS,
+    )
+}  # fmt: skip
+
+
+def find_benchmark(name: str) -> Benchmark:
+    """The benchmark of a name. Raises InputError with near names if there is none."""
+    import difflib
+
+    if name in BENCHMARKS:
+        return BENCHMARKS[name]
+    near = difflib.get_close_matches(name, BENCHMARKS, n=1)
+    hint = f"did you mean {near[0]}?" if near else f"choose one of {', '.join(BENCHMARKS)}."
+    raise InputError(f"there is no benchmark {name}; {hint}")

@@ -1,0 +1,113 @@
+"""Judges of meshes that are in the truth's frame already: of a room, an object, a DTU scan."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from geogs.config import InputConfig
+from geogs.errors import InputError
+from geogs.evaluation.dtu import DtuScores, evaluate_dtu, read_dtu_reference
+from geogs.evaluation.masks import Silhouette, cull_by_masks
+from geogs.evaluation.object import MAX_DISTANCE, ObjectScores, evaluate_object
+from geogs.evaluation.surface import Surface, read_surface
+from geogs.evaluation.truth import silhouettes
+from geogs.io.sources.posed.sniff import open_posed_source
+from geogs_bench.comparison import Comparison
+from geogs_bench.record import SurfaceScore
+from geogs_bench.result import ResultFolder
+from geogs_bench.scene import Scene
+from geogs_bench.scoring.surface import read_true_surface, score_surface
+from geogs_bench.truth import read_true_poses
+
+Judge = Callable[[Surface], tuple[tuple[SurfaceScore, ...], Comparison]]
+"""Scores of a mesh (the one to plot last) and where it is wrong."""
+
+_MASK_EDGE = 1600
+"""Pixels; DTU's masks are of this size."""
+
+
+def judge_of(scene: Scene, result: ResultFolder, seed: int) -> Judge | None:
+    """The judge for a scene, its truth read once; none where the scene has no true surface.
+
+    Raises:
+        InputError: the truth cannot be read.
+    """
+    if scene.kind == "scan":
+        return None if scene.truth.dtu is None else _scan_judge(scene, seed)
+    if scene.truth.surface is None:
+        return None
+    if scene.kind == "object":
+        return _object_judge(scene, seed)
+    return _room_judge(scene, result, seed)
+
+
+def _room_judge(scene: Scene, result: ResultFolder, seed: int) -> Judge:
+    poses = read_true_poses(scene)
+    if poses is None:
+        raise InputError(f"{scene.name} has no true poses, which say what its camera saw.")
+    truth = read_true_surface(scene.truth, result.camera, np.linalg.inv(poses.T_wc))
+    assert truth is not None  # the caller has looked
+    return lambda mesh: score_surface(mesh, truth, False, seed)
+
+
+def _object_judge(scene: Scene, seed: int) -> Judge:
+    assert scene.truth.surface is not None  # the caller has looked
+    truth = read_surface(scene.truth.surface)
+    points = None if scene.truth.points is None else read_surface(scene.truth.points)
+    masks = _masks(scene)
+
+    def judge(mesh: Surface) -> tuple[tuple[SurfaceScore, ...], Comparison]:
+        found = evaluate_object(mesh, truth, masks, points, seed=seed)
+        errors = 100 * np.minimum(found.accuracy, MAX_DISTANCE)  # those left out are infinite
+        limit = found.scores.colour_limit_cm
+        comparison = Comparison(mesh, truth, found.reconstruction_points, errors, limit)
+        return (_of_object(found.scores),), comparison
+
+    return judge
+
+
+def _scan_judge(scene: Scene, seed: int) -> Judge:
+    assert scene.truth.dtu is not None  # the caller has looked
+    reference = read_dtu_reference(scene.truth.dtu.folder, scene.truth.dtu.scan)
+    masks = _masks(scene)
+
+    def judge(mesh: Surface) -> tuple[tuple[SurfaceScore, ...], Comparison]:
+        found = evaluate_dtu(cull_by_masks(mesh, masks), reference, seed)
+        limit = found.scores.colour_limit_cm
+        return (_of_scan(found.scores),), Comparison(mesh, None, found.data, found.d2s / 10, limit)
+
+    return judge
+
+
+def _masks(scene: Scene) -> list[Silhouette]:
+    """The masks of all images, widened as DTU's protocol does; empty where images have none."""
+    source = open_posed_source(scene.source, InputConfig(long_edge=_MASK_EDGE))
+    return [mask.dilated() for mask in silhouettes(source) or ()]
+
+
+def _of_object(scores: ObjectScores) -> SurfaceScore:
+    return SurfaceScore(
+        weighting="area",
+        unit="mm",
+        accuracy=scores.accuracy_mm,
+        completeness=scores.completeness_mm,
+        chamfer=scores.chamfer_mm,
+        ratio=scores.recall,
+        precision=scores.precision,
+        f_score=scores.f_score,
+        threshold=scores.threshold_mm,
+        accuracy_median=scores.accuracy_median_mm,
+        completeness_median=scores.completeness_median_mm,
+    )
+
+
+def _of_scan(scores: DtuScores) -> SurfaceScore:
+    return SurfaceScore(
+        weighting="points",
+        unit="mm",
+        accuracy=scores.d2s_mm,
+        completeness=scores.s2d_mm,
+        chamfer=scores.overall_mm,
+        accuracy_median=scores.d2s_median_mm,
+        completeness_median=scores.s2d_median_mm,
+    )

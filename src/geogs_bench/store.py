@@ -1,0 +1,71 @@
+"""What the harness keeps in the folder of each result, so that nothing is done twice."""
+
+import hashlib
+import json
+import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from geogs.errors import InputError
+from geogs.io.writers.atomic import prepare_output_folder
+from geogs_bench.record import Cost, Provenance, Record, read_dataclass, read_record, write_json
+from geogs_bench.runner import Command
+
+RECORD_FILE = "bench.json"
+"""What is known of the result."""
+
+_RUN_FILE = "bench_run.json"
+_LEFT_BY_EARLIER_RUNS = ("online", "depth_fusion", "snapshots")
+
+
+@dataclass(frozen=True)
+class CompletedRun:
+    """That a run came to its end: of what, how, and what it took."""
+
+    source: str
+    provenance: Provenance
+    cost: Cost
+
+
+def config_hash(command: Command, settings: Mapping[str, object]) -> str:
+    """Twelve digits that change with any setting."""
+    text = json.dumps([command, settings], sort_keys=True, default=str)
+    return hashlib.sha256(text.encode()).hexdigest()[:12]
+
+
+def completed_run(folder: Path, source: Path, digest: str) -> CompletedRun | None:
+    """The run that a folder holds, if it is one of this source with these settings."""
+    try:
+        values = json.loads((folder / _RUN_FILE).read_text(encoding="utf-8"))
+        run = read_dataclass(CompletedRun, values)
+    except (OSError, ValueError, TypeError, KeyError, InputError):
+        return None
+    fits = run.source == str(source.resolve()) and run.provenance.config_hash == digest
+    return run if fits else None
+
+
+def write_completed_run(folder: Path, run: CompletedRun) -> None:
+    """Say that the folder's run is complete. Raises OutputError if that fails."""
+    write_json(folder / _RUN_FILE, run)
+
+
+def clear(folder: Path) -> Path:
+    """Make the folder ready for a new run: what an earlier one left must not be scored.
+
+    Raises:
+        OutputError: it cannot be made or written.
+    """
+    prepare_output_folder(folder)
+    for name in (_RUN_FILE, RECORD_FILE, "mesh.ply", "map.safetensors", "summary.json"):
+        (folder / name).unlink(missing_ok=True)
+    for name in _LEFT_BY_EARLIER_RUNS:
+        shutil.rmtree(folder / name, ignore_errors=True)
+    return folder
+
+
+def records_below(output: Path, benchmark: str) -> list[Record]:
+    """The records of a benchmark in the folders of its results."""
+    files = [*output.glob(f"*/{RECORD_FILE}"), *output.glob(f"*/*/{RECORD_FILE}")]
+    records = [record for path in sorted(files) if (record := read_record(path)) is not None]
+    return [record for record in records if record.benchmark == benchmark]

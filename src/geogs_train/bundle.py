@@ -1,0 +1,267 @@
+"""Dense bundle adjustment that gradients pass through, for a batch of clips at once.
+
+The same Gauss-Newton steps as :mod:`geogs.bundle.dense`, without its robust weights: depths are
+eliminated, the small camera systems are solved in float64, poses move by left retraction. All of it
+is plain autograd, so that a network can be taught what measurements, weights and damping make the
+adjusted poses and depths right (Teed and Deng, "DROID-SLAM", NeurIPS 2021, section 3.2).
+
+The edges of all clips are the same. Positions may be in pixels or in cells, if only intrinsics,
+positions and weights agree.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from geogs.bundle.dense import MIN_Z
+from geogs.geometry.lie import retract, se3_adjoint, se3_inverse
+
+
+@dataclass(frozen=True)
+class ClipCameras:
+    """The pinhole camera of each clip, and where in its images inverse depth is kept."""
+
+    intrinsics: Float[Tensor, "b 4"]
+    """fx, fy, cx, cy."""
+    cells: Float[Tensor, "p 2"]
+    """x, y."""
+
+    @property
+    def rays(self) -> Float[Tensor, "b p 3"]:
+        """K^-1 (x, y, 1) of every cell."""
+        focal, centre = self.intrinsics[:, None, :2], self.intrinsics[:, None, 2:]
+        xy = (self.cells - centre) / focal
+        return torch.cat([xy, torch.ones_like(xy[..., :1])], -1)
+
+
+@dataclass(frozen=True)
+class ClipEdges:
+    """Which view of a clip is measured in which other; the same for every clip."""
+
+    source: Int[Tensor, "e"]
+    target: Int[Tensor, "e"]
+
+
+@dataclass(frozen=True)
+class ClipState:
+    """What is adjusted."""
+
+    T_cw: Float[Tensor, "b v 4 4"]
+    """World to camera."""
+    inverse_depth: Float[Tensor, "b v p"]
+
+    def detach(self) -> "ClipState":
+        """The same numbers without a past."""
+        return ClipState(self.T_cw.detach(), self.inverse_depth.detach())
+
+
+@dataclass(frozen=True)
+class ClipMatches:
+    """What was measured."""
+
+    pixels: Float[Tensor, "b e p 2"]
+    """Position in the target of every cell of the source."""
+    weight: Float[Tensor, "b e p 2"]
+    """Inverse variance of x and y."""
+    damping: Float[Tensor, "b v p"] | None = None
+    """Added to the curvature of each inverse depth."""
+
+
+@dataclass(frozen=True)
+class ClipBundleOptions:
+    """How a batch is adjusted; the defaults are DROID-SLAM's, for positions in cells."""
+
+    iterations: int = 2
+    fixed_poses: int = 2
+    """Leading views that stay where they are. Two set the scale."""
+    keep_scale: bool = False
+    """Whether the distance of the first two views is restored after every step, which sets the
+    scale where only one pose is fixed."""
+    damping: float = 1e-4
+    """Levenberg damping relative to the diagonal of the reduced system."""
+    damping_floor: float = 0.1
+    """Added to that diagonal."""
+    depth_damping: float = 0.0
+    """Damping of inverse depth relative to the mean curvature of its view."""
+    depth_floor: float = 1e-7
+    """Added to the curvature of inverse depth."""
+    min_inverse_depth: float = 1e-3
+    max_inverse_depth: float = 1e2
+
+
+@dataclass(frozen=True)
+class ClipProjection:
+    """Where the cells of the sources fall in the targets."""
+
+    pixels: Float[Tensor, "b e p 2"]
+    valid: Bool[Tensor, "b e p"]
+    """Whether a point lies before the target."""
+    z: Float[Tensor, "b e p"]
+    """Depth in the target over depth in the source, at least ``MIN_Z``."""
+
+
+@dataclass(frozen=True)
+class _System:
+    """Normal equations of one step; depths are diagonal."""
+
+    hessian: Float[Tensor, "b n n"]
+    """Of the free poses, float64."""
+    gradient: Float[Tensor, "b n"]
+    coupling: Float[Tensor, "b n q"]
+    """Of free poses and all inverse depths."""
+    curvature: Float[Tensor, "b q"]
+    depth_gradient: Float[Tensor, "b q"]
+
+
+def relative_motions(T_cw: Float[Tensor, "b v 4 4"], edges: ClipEdges) -> Float[Tensor, "b e 4 4"]:
+    """T_ji = T_j T_i^-1 of every edge i -> j."""
+    return T_cw[:, edges.target] @ se3_inverse(T_cw[:, edges.source])
+
+
+def reproject(cameras: ClipCameras, state: ClipState, edges: ClipEdges) -> ClipProjection:
+    """p = pi(K (R ray + d t)) for every cell; points too close are held at ``MIN_Z``."""
+    d = state.inverse_depth[:, edges.source]
+    T = relative_motions(state.T_cw, edges).to(d)
+    y = cameras.rays[:, None] @ T[..., :3, :3].mT + d[..., None] * T[..., None, :3, 3]
+    z = y[..., 2].clamp(min=MIN_Z)
+    focal, centre = (cameras.intrinsics[:, None, None, k] for k in (slice(2), slice(2, 4)))
+    return ClipProjection(focal * y[..., :2] / z[..., None] + centre, y[..., 2] > MIN_Z, z)
+
+
+def adjust(
+    cameras: ClipCameras,
+    state: ClipState,
+    edges: ClipEdges,
+    matches: ClipMatches,
+    options: ClipBundleOptions | None = None,
+) -> ClipState:
+    """Take ``options.iterations`` damped Gauss-Newton steps from a state.
+
+    Differentiable in the state and the matches. A clip whose camera system cannot be solved keeps
+    its poses in that step.
+    """
+    options = options or ClipBundleOptions()
+    for _ in range(options.iterations):
+        system = _normal_equations(cameras, state, edges, matches, options)
+        xi, delta = _solve(system, options)
+        moved = _moved(state, xi, delta, options)
+        state = _rescaled(moved, state) if options.keep_scale else moved
+    return state
+
+
+def _jacobians(
+    cameras: ClipCameras, projection: ClipProjection, state: ClipState, edges: ClipEdges
+) -> tuple[Float[Tensor, "b e 6 2 p"], Float[Tensor, "b e p 2"], Float[Tensor, "b e 6 6"]]:
+    """d pixel / d xi of T_ji (left perturbation), d pixel / d inverse depth; Ad of T_ji."""
+    d = state.inverse_depth[:, edges.source]
+    T = relative_motions(state.T_cw, edges)
+    focal, centre = (cameras.intrinsics[:, None, None, k] for k in (slice(2), slice(2, 4)))
+    x, y = ((projection.pixels - centre) / focal).unbind(-1)
+    q = 1 / projection.z
+    dq, o = d * q, torch.zeros_like(q)
+    rows = torch.stack(
+        [
+            torch.stack([dq, o, -x * dq, -x * y, 1 + x * x, -y], 2),
+            torch.stack([o, dq, -y * dq, -1 - y * y, x * y, x], 2),
+        ],
+        3,
+    )
+    tx, ty, tz = T[..., None, :3, 3].to(d).unbind(-1)
+    depth = focal * torch.stack([(tx - tz * x) * q, (ty - tz * y) * q], -1)
+    return rows * focal[..., 0, :, None][:, :, None], depth, se3_adjoint(T)
+
+
+def _normal_equations(
+    cameras: ClipCameras,
+    state: ClipState,
+    edges: ClipEdges,
+    matches: ClipMatches,
+    options: ClipBundleOptions,
+) -> _System:
+    projection = reproject(cameras, state, edges)
+    J, J_depth, adjoint = _jacobians(cameras, projection, state, edges)
+    residual = matches.pixels - projection.pixels
+    weight = matches.weight * projection.valid[..., None]
+    wJ = J * weight.mT[:, :, None]
+    # An edge is linearised in its relative motion, xi_rel = xi_target - Ad xi_source.
+    block = (wJ.flatten(3) @ J.flatten(3).mT).double()
+    right = (wJ * residual.mT[:, :, None]).sum((3, 4)).double()[..., None]
+    joint = (wJ * J_depth.mT[:, :, None]).sum(3)
+    A = -adjoint.double()
+    views = state.inverse_depth.shape[1]
+    i, j = edges.source, edges.target
+    hessian = _summed(
+        views * views,
+        (views * j + j, block),
+        (views * j + i, block @ A),
+        (views * i + j, A.mT @ block),
+        (views * i + i, A.mT @ block @ A),
+    )
+    gradient = _summed(views, (j, right), (i, A.mT @ right))
+    coupling = _summed(
+        views * views, (views * j + i, joint), (views * i + i, A.mT.to(joint) @ joint)
+    )
+    curvature = _summed(views, (i, (weight * J_depth.square()).sum(-1)))
+    depth_gradient = _summed(views, (i, (weight * J_depth * residual).sum(-1)))
+    mean = curvature.mean(-1, keepdim=True)
+    curvature = curvature + options.depth_damping * mean + options.depth_floor
+    if matches.damping is not None:
+        curvature = curvature + matches.damping
+    free = slice(6 * options.fixed_poses, None)
+    square = hessian.unflatten(1, (views, views)).transpose(2, 3).flatten(3).flatten(1, 2)
+    wide = coupling.unflatten(1, (views, views)).transpose(2, 3).flatten(3).flatten(1, 2)
+    return _System(
+        square[:, free, free],
+        gradient.flatten(1)[:, free],
+        wide[:, free],
+        curvature.flatten(1),
+        depth_gradient.flatten(1),
+    )
+
+
+def _summed(places: int, *parts: tuple[Tensor, Tensor]) -> Tensor:
+    """Parts (b, e, ...) added up at the places (e,) they belong to: (b, places, ...)."""
+    first = parts[0][1]
+    total = first.new_zeros(len(first), places, *first.shape[2:])
+    for place, part in parts:
+        total = total.index_add(1, place, part)
+    return total
+
+
+def _solve(system: _System, options: ClipBundleOptions) -> tuple[Tensor, Tensor]:
+    """Steps of the free poses (b, n), float64, and of all inverse depths (b, q)."""
+    scaled = system.coupling / system.curvature[:, None]
+    S = system.hessian - (scaled @ system.coupling.mT).double()
+    right = system.gradient - (scaled @ system.depth_gradient[..., None])[..., 0].double()
+    diagonal = S.diagonal(dim1=1, dim2=2).abs()
+    S = S + torch.diag_embed(options.damping * diagonal + options.damping_floor)
+    _, info = torch.linalg.cholesky_ex(S.detach())
+    good = (info == 0) & torch.isfinite(S).all((1, 2)) & torch.isfinite(right).all(1)
+    eye = torch.eye(S.shape[1], dtype=S.dtype, device=S.device)
+    S = torch.where(good[:, None, None], S, eye)
+    right = torch.where(good[:, None], right, 0.0)
+    xi = torch.cholesky_solve(right[..., None], torch.linalg.cholesky(S))
+    moved = system.coupling.mT @ xi.to(system.coupling)
+    return xi[..., 0], (system.depth_gradient - moved[..., 0]) / system.curvature
+
+
+def _moved(state: ClipState, xi: Tensor, delta: Tensor, options: ClipBundleOptions) -> ClipState:
+    fixed = options.fixed_poses
+    T, d = state.T_cw, state.inverse_depth
+    free = retract(xi.unflatten(1, (-1, 6)).to(T), T[:, fixed:])
+    d = (d + delta.view_as(d)).clamp(options.min_inverse_depth, options.max_inverse_depth)
+    return ClipState(torch.cat([T[:, :fixed], free], 1), d)
+
+
+def _rescaled(state: ClipState, before: ClipState) -> ClipState:
+    """The state about the first camera at the distance that the first two views had before."""
+    origin = state.T_cw[:, :1]
+    local = state.T_cw @ se3_inverse(origin)
+    start = before.T_cw[:, 1] @ se3_inverse(before.T_cw[:, 0])
+    factor = start[:, :3, 3].norm(dim=-1) / local[:, 1, :3, 3].norm(dim=-1)
+    scale = torch.ones_like(local)
+    scale[..., :3, 3] = factor[:, None, None]
+    depth = state.inverse_depth / factor[:, None, None].to(state.inverse_depth)
+    return ClipState((local * scale) @ origin, depth)

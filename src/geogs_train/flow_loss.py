@@ -1,0 +1,77 @@
+"""What the flow network is trained to do."""
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from geogs.tracking.flow.lookup import RADIUS, WINDOW, correlation_windows
+from geogs.tracking.flow.own_network import FlowEstimate, ImageFeatures
+from geogs_train.options import FlowTraining
+from geogs_train.pairs import FlowBatch
+
+MAX_ERROR = 100.0
+"""Errors beyond so many pixels count as such; nothing is learned from how far lost a cell is."""
+
+
+def flow_loss(
+    features: ImageFeatures,
+    estimates: Sequence[FlowEstimate],
+    dense: Float[Tensor, "e h w 2"],
+    batch: FlowBatch,
+    options: FlowTraining,
+) -> Float[Tensor, ""]:
+    """Loss of all iterations (later ones count more) and of the upsampled flow of the last.
+
+    With the ``joint`` likelihood a cell's flow and its uncertainty are trained by the negative
+    log-likelihood of the error (and by a little of its size, which keeps hopeless cells learning);
+    with the ``separate`` one the flow is trained by the absolute error alone.
+    """
+    truth, weight = batch.at_cells(batch.truth), _weights(batch, options)
+    at_cells = batch.at_cells(weight)
+    total = truth.new_zeros(())
+    for n, estimate in enumerate(estimates):
+        error = (truth - estimate.pixels).clamp(-MAX_ERROR, MAX_ERROR)
+        if options.likelihood == "joint":
+            value = estimate.error.negative_log_likelihood(error)
+            value = value + options.absolute * error.abs().log1p().mean(-1)
+        else:
+            value = 0.2 * estimate.error.negative_log_likelihood(error.detach())
+            value = error.abs().mean(-1) + value
+        total = total + options.decay ** (len(estimates) - 1 - n) * _mean(value, at_cells)
+    missed = (batch.flow - dense).clamp(-MAX_ERROR, MAX_ERROR).abs()
+    total = total + options.dense * _mean(missed.log1p().mean(-1), weight)
+    return total + options.descriptors * descriptor_loss(features, batch)
+
+
+def descriptor_loss(features: ImageFeatures, batch: FlowBatch) -> Float[Tensor, ""]:
+    """Cross-entropy of windows around the probes with the place of the truth in them.
+
+    A window is read as logits over its 49 places; the truth is shared by the four around it.
+    Cells that the second view does not see, and levels whose window misses the truth, do not count.
+    Sum over the levels of the mean over the cells. It makes descriptors tell places apart within
+    the first hundreds of steps, which the flow's error alone takes thousands for.
+    """
+    windows = correlation_windows(features.source, features.pyramid, batch.edges, batch.probe)
+    windows = windows.unflatten(-1, (-1, WINDOW)).log_softmax(-1)
+    away = batch.at_cells(batch.truth) - batch.probe
+    seen = batch.at_cells(batch.visible)
+    places = torch.arange(-RADIUS, RADIUS + 1, dtype=away.dtype, device=away.device)
+    total = away.new_zeros(())
+    for n, level in enumerate(features.pyramid.levels):
+        at = away * level.scale
+        inside = seen & (at.abs() <= RADIUS).all(-1)
+        share = (1 - (at[..., None] - places).abs()).clamp(min=0)  # e p 2 7
+        target = (share[..., 1, :, None] * share[..., 0, None, :]).flatten(-2)
+        total = total + _mean(-(target * windows[..., n, :]).sum(-1), inside.float())
+    return total
+
+
+def _weights(batch: FlowBatch, options: FlowTraining) -> Float[Tensor, "e h w"]:
+    return torch.where(batch.visible, 1.0, options.occluded) * batch.known
+
+
+def _mean(values: Tensor, weight: Tensor) -> Float[Tensor, ""]:
+    values = torch.where(weight > 0, values, 0.0)
+    return (values * weight).sum() / weight.sum().clamp(min=1.0)

@@ -1,0 +1,151 @@
+"""Reconstructions that were cut off and go on: checkpoints, their file, the command."""
+
+import json
+import signal
+import subprocess
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial import cKDTree
+
+from geogs.application.checkpoint import fingerprint, read_checkpoint, write_checkpoint
+from geogs.config import ReconstructConfig
+from geogs.errors import InputError
+from geogs.mapping.state import restore_mapper
+from geogs.reconstruct import Reconstruction
+from posed_scene import (
+    DEFAULT,
+    GEOGS,
+    SMALL,
+    ball_and_wall,
+    depth_errors,
+    geogs,
+    make_room,
+    vertices,
+)
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory) -> Path:
+    """Sixty frames of a synthetic room."""
+    return make_room(tmp_path_factory.mktemp("posed") / "room")
+
+
+def interrupted(scene: Reconstruction, fraction: float) -> None:
+    """Finish a reconstruction up to a part of its training."""
+
+    def interrupt(name: str, done: float) -> None:
+        if name == "training" and done >= fraction:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        scene.finish(progress=interrupt)
+
+
+@pytest.mark.parametrize("fraction", [0.0, 0.6])
+def test_work_that_was_cut_off_is_gone_on_with(tmp_path, fraction):
+    first, path = ball_and_wall(far=10.0), tmp_path / "checkpoint"
+    interrupted(first, fraction)
+    write_checkpoint(path, first.state(), "these")
+    state = read_checkpoint(path, "these")
+    assert state.seconds > 0
+    second, stages = ball_and_wall(far=10.0), []
+    second.resume(state, lambda stage, _: stages.append(stage))
+    assert set(stages) == {"training"}
+    assert second.elapsed > state.seconds
+    whole = ball_and_wall(far=10.0)
+    whole.finish()
+    assert second.mapper.trained.steps == whole.mapper.trained.steps
+    counts = len(second.snapshot()), len(whole.snapshot())
+    assert abs(counts[0] - counts[1]) < 0.05 * counts[1]
+    errors, wanted = depth_errors(second), depth_errors(whole)
+    print(f"medians {np.median(errors):.5f} and {np.median(wanted):.5f}")
+    assert np.median(errors) < 1.15 * np.median(wanted)
+
+
+def test_a_restored_mapper_is_the_same(tmp_path):
+    first = ball_and_wall()
+    interrupted(first, 0.5)
+    write_checkpoint(tmp_path / "c", first.state(), "these")
+    second = ball_and_wall()
+    state = read_checkpoint(tmp_path / "c", "these")
+    second.mapper.move([v.T_cw for v in first.mapper.views.values()])
+    restore_mapper(second.mapper, state.mapper)
+    assert second.mapper.trained == first.mapper.trained
+    assert second.mapper.unit == first.mapper.unit
+    for a, b in zip(first.mapper.views.values(), second.mapper.views.values(), strict=True):
+        assert a.partners == b.partners
+        assert a.search == b.search
+        assert torch.equal(a.known.prior_depth, b.known.prior_depth)
+    for a, b in zip(first.mapper.map.parameters, second.mapper.map.parameters, strict=True):
+        assert torch.equal(a, b)
+    assert torch.equal(first.mapper.map.steps, second.mapper.map.steps)
+    for name in ("first", "second"):
+        rows = zip(
+            getattr(first.mapper.optimizer, name),
+            getattr(second.mapper.optimizer, name),
+            strict=True,
+        )
+        assert all(torch.equal(a, b) for a, b in rows)
+
+
+def test_a_wrong_checkpoint_is_one_sentence(tmp_path):
+    path = tmp_path / "checkpoint.safetensors"
+    with pytest.raises(InputError, match="nothing to resume"):
+        read_checkpoint(path, "these")
+    path.write_bytes(b"rubbish")
+    with pytest.raises(InputError, match="damaged"):
+        read_checkpoint(path, "these")
+    scene = ball_and_wall()
+    interrupted(scene, 0.0)
+    write_checkpoint(path, scene.state(), "these")
+    with pytest.raises(InputError, match="other settings or images"):
+        read_checkpoint(path, "those")
+
+
+def test_fingerprints_change_with_settings_and_images():
+    names = ["a.png", "b.png"]
+    own = fingerprint(DEFAULT, None, names)
+    assert own == fingerprint(ReconstructConfig(), None, names)
+    assert own != fingerprint(SMALL, None, names)
+    assert own != fingerprint(DEFAULT, 8, names)
+    assert own != fingerprint(DEFAULT, None, names[:1])
+
+
+def test_an_interrupted_command_resumes(room, tmp_path):
+    """Ctrl-C in the training leaves a result and a checkpoint; the rest is done later."""
+    call = [
+        "reconstruct", room, "-o", tmp_path, "--stride", 5, "--mapping.render-long-edge", 160,
+        "--search.least-steps", 1500, "--search.no-repeat", "--device", "cpu",
+    ]  # fmt: skip
+    checkpoint = tmp_path / "checkpoint.safetensors"
+    process = subprocess.Popen([*GEOGS, *map(str, call)], stderr=subprocess.PIPE, text=True)
+    deadline = time.monotonic() + 200
+    while not checkpoint.is_file() and process.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.05)
+    process.send_signal(signal.SIGINT)
+    _, said = process.communicate(timeout=200)
+    assert process.returncode == 0, said
+    assert "--resume goes on" in said
+    assert json.loads((tmp_path / "summary.json").read_text())["interrupted"] is True
+    assert checkpoint.is_file()
+    other = geogs(*call, "--resume", "--mapping.disk.opacity", 0.6)
+    assert other.returncode == 2
+    assert "other settings" in other.stderr.splitlines()[-1]
+    assert "Traceback" not in other.stderr
+    done = geogs(*call, "--resume")
+    assert done.returncode == 0, done.stderr
+    assert "Going on after" in done.stderr
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["interrupted"] is False
+    assert "depth" not in summary["seconds"]
+    assert not checkpoint.exists()
+    again = geogs(*call, "--resume")
+    assert again.returncode == 2
+    assert "nothing to resume" in again.stderr.splitlines()[-1]
+    seen = vertices(room / "points_seen_1cm.ply")
+    accuracy = cKDTree(seen).query(vertices(tmp_path / "mesh.ply")[::7])[0]
+    assert np.median(accuracy) < 0.01

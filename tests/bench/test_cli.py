@@ -1,0 +1,145 @@
+"""``geogs bench`` end to end: a generated room at tiny settings, and what can go wrong."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from geogs.cli import main as cli
+from geogs_bench.cli import listing
+
+GEOGS = [sys.executable, "-m", "geogs.cli.main"]
+TINY = [
+    "mapping.render-long-edge=96", "mapping.disk.stride=2", "input.stride=8",
+    "search.least-steps=20", "search.steps-per-view=1", "no-check-poses",
+]  # fmt: skip
+
+
+def geogs(*arguments: object) -> subprocess.CompletedProcess[str]:
+    command = [*GEOGS, *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=300)
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory) -> Path:
+    """The folder above a room of a few small frames."""
+    folder = tmp_path_factory.mktemp("bench") / "rooms"
+    done = geogs("synth", folder / "den", "--frames", 64, "--width", 128, "--height", 96)
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
+def test_a_benchmark_runs_scores_and_resumes(room, tmp_path):
+    output = tmp_path / "out"
+    settings = [word for text in TINY for word in ("--set", text)]
+    call = ["bench", "rooms", room, "--known-poses", "--budgets", "4", "-o", output,
+            "--device", "cpu", *settings]  # fmt: skip
+    done = geogs(*call)
+    assert done.returncode == 0, done.stderr
+    assert "rooms-known-poses: den 4s" in done.stderr
+    assert "Acc (cm)" in done.stdout
+    (record,) = json.loads((output / "results.json").read_text())
+    assert record["variant"] == "4s"
+    assert record["error"] is None
+    assert record["provenance"]["device"] == "cpu"
+    assert record["cost"]["frames"] == 8
+    assert record["cost"]["disks"] > 0
+    assert record["cost"]["map_bytes"] > 0
+    (stage,) = record["stages"]
+    assert {s["weighting"] for s in stage["surfaces"]} == {"vertices", "area"}
+    assert all(0 < s["accuracy"] < 30 for s in stage["surfaces"])
+    assert (output / "den" / "4s" / "report" / "bench_surface.png").is_file()
+    page = (output / "report" / "index.html").read_text()
+    assert "../den/4s/report/bench_surface.png" in page
+    assert "| den, 4s |" in (output / "results.md").read_text()
+    again = geogs(*call)
+    assert again.returncode == 0
+    assert "done before" in again.stderr
+
+
+def test_a_failing_scene_is_exit_code_2_with_its_reason_in_the_tables(room, tmp_path):
+    output = tmp_path / "out"
+    done = geogs("bench", "rooms", room, "-o", output, "--set", "input.stop=1", "--device", "cpu")
+    assert done.returncode == 2
+    assert "Traceback" not in done.stderr
+    (record,) = json.loads((output / "results.json").read_text())
+    assert record["error"]
+    assert record["error"].split()[0] in (output / "results.md").read_text()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["replica"], "replica needs a folder: the unpacked Replica.zip"),
+        (["replicas", "/nowhere"], "did you mean replica"),
+        (["tum", "/nowhere"], "/nowhere is not a folder"),
+        (["tum", "{room}"], "holds no scene of tum"),
+        (["rooms", "{room}", "--scenes", "attic"], "has no scene attic, only den"),
+        (["rooms", "{room}", "--variants", "fast"], "has no variant fast"),
+        (["rooms", "{room}", "--set", "=3"], "is no setting"),
+        (["rooms", "{room}", "--budgets", "20"], "leave out --budgets"),
+        (["tum", "{room}", "--known-poses"], "--known-poses is for rooms"),
+        (["rooms", "{room}", "--known-poses", "--budgets", "soon"], "is no duration"),
+    ],
+)
+def test_wrong_wishes_are_one_sentence(room, tmp_path, capsys, arguments, sentence):
+    argv = [text.format(room=room) for text in arguments]
+    assert cli.main(["bench", *argv, "-o", str(tmp_path / "out")]) == 2
+    error = capsys.readouterr().err
+    assert sentence in error
+    assert "Traceback" not in error
+    assert error.count("\n") == 1
+
+
+def test_the_list_names_every_benchmark_with_its_data(capsys):
+    assert cli.main(["bench", "list"]) == 0
+    text = capsys.readouterr().out
+    assert text.strip() == listing()
+    for name in ("replica", "scannet", "scannetpp", "tum", "7scenes", "dtu", "rooms", "objects",
+                 "ablation-init", "ablation-update", "ablation-pose-lr", "ablation-losses",
+                 "convergence", "light"):  # fmt: skip
+        assert f"{name}\n" in text
+
+
+@pytest.mark.parametrize(
+    ("setting", "sentence"),
+    [
+        ("mapping.foo=3", "error: geogs run: Unrecognized options: --mapping.foo, 3."),
+        ("mapping.iterations=x", "error: geogs run: Error parsing --mapping.iterations: invalid"),
+    ],
+)
+def test_a_wrong_setting_is_found_before_anything_runs(room, tmp_path, setting, sentence):
+    done = geogs("bench", "rooms", room, "-o", tmp_path / "out", "--set", setting)
+    assert done.returncode == 2
+    assert done.stderr.startswith(sentence)
+    assert done.stderr.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+OPTIONS_OF_ABLATIONS = """
+import json, sys
+from pathlib import Path
+from geogs_bench.plan import Wishes, find_scenes, make_jobs
+from geogs_bench.registry import find_benchmark
+from geogs_bench.cli import CommandRunner
+
+for name in sys.argv[2:]:
+    benchmark = find_benchmark(name)
+    scenes = find_scenes(benchmark, Path(sys.argv[1]))
+    jobs = make_jobs(benchmark, scenes, Path("out"), Wishes())
+    settings = [CommandRunner().settings(job.task) for job in jobs]
+    print(name, len(jobs), len({json.dumps(s, default=str) for s in settings}))
+"""
+
+
+def test_the_options_of_the_ablations_exist_and_make_a_difference(room):
+    names = ["ablation-update", "ablation-pose-lr", "ablation-losses"]
+    done = subprocess.run(
+        [sys.executable, "-c", OPTIONS_OF_ABLATIONS, str(room), *names],
+        capture_output=True, text=True,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    rows = [line.split() for line in done.stdout.splitlines()]
+    assert rows == [[names[0], "3", "3"], [names[1], "5", "5"], [names[2], "9", "9"]]

@@ -1,0 +1,242 @@
+"""Scores of results with known errors, and the tables they become."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from bench_results import poses, wall, write_result, write_truth
+from geogs.errors import InputError
+from geogs.evaluation.surface import Surface
+from geogs.io.writers.ply import write_mesh
+from geogs_bench import published as paper
+from geogs_bench.ablations import MAP_UPDATE
+from geogs_bench.record import (
+    Cost,
+    CurvePoint,
+    Provenance,
+    Record,
+    StageScore,
+    SurfaceScore,
+    TrajectoryScore,
+    read_record,
+    write_json,
+)
+from geogs_bench.registry import DTU, REPLICA
+from geogs_bench.report import markdown, write_report
+from geogs_bench.result import ResultFolder
+from geogs_bench.scoring.scores import score
+from geogs_bench.scoring.tessellation import with_short_edges
+
+FROM = Provenance("run", "abc123", "a processor, 2 cores", "cpu", 0, "0123456789ab")
+
+
+def surface(weighting="vertices", value=1.0, unit="cm") -> SurfaceScore:
+    return SurfaceScore(weighting, unit, value, 2 * value, 1.5 * value, 90.0)
+
+
+def record(scene, variant="", ate=0.5, acc=1.0, benchmark="replica") -> Record:
+    stage = StageScore("final", TrajectoryScore(ate, 10, 1.0), (surface(value=acc),))
+    return Record(benchmark, scene, variant, scene, FROM, Cost(10.0), (stage,))
+
+
+def test_slam_stages_are_aligned_each_by_its_own_trajectory(tmp_path):
+    scene = write_truth(tmp_path / "hall")
+    write_result(tmp_path / "out", 0.01, 0.0)
+    write_result(tmp_path / "out" / "online", 0.03, None)
+    scores = score(scene, "run", ResultFolder(tmp_path / "out"), 0)
+    online, final = scores.stages
+    assert (online.stage, final.stage) == ("online", "final")
+    # Half of the poses are a centimetre up, half down.
+    assert final.trajectory.ate == pytest.approx(1.0, rel=0.05)
+    assert online.trajectory.ate == pytest.approx(3.0, rel=0.05)
+    assert final.trajectory.scale == pytest.approx(4.0, rel=0.02)
+    assert final.trajectory.keyframes_ate is not None
+    for weighting in ("vertices", "area"):
+        measured = final.surface(weighting)
+        assert measured.unit == "cm"
+        assert measured.accuracy < 0.3  # ICP takes out what the alignment gets wrong
+    assert final.surface("area").chamfer < 0.3
+    assert final.surface("area").ratio > 99
+    assert (tmp_path / "out" / "report" / "bench_surface.png").is_file()
+    assert (tmp_path / "out" / "report" / "bench_trajectory.png").is_file()
+
+
+def test_known_poses_are_not_aligned_and_make_a_curve(tmp_path):
+    scene = write_truth(tmp_path / "hall")
+    result = tmp_path / "out"
+    write_result(result, 0.0, 0.02, posed=True)
+    write_mesh(result / "snapshots" / "5" / "mesh.ply", *wall(0.05))
+    scores = score(scene, "reconstruct", ResultFolder(result), 0)
+    (final,) = scores.stages
+    assert final.trajectory is None
+    # Two centimetres further away: a little less along the normals.
+    assert final.surface("area").accuracy == pytest.approx(1.85, abs=0.15)
+    assert final.surface("area").chamfer == pytest.approx(1.85, abs=0.15)
+    (point,) = scores.curve
+    assert point.seconds == 5
+    assert point.surface.chamfer > 2 * final.surface("area").chamfer
+
+
+def test_an_object_is_scored_in_millimetres_inside_its_masks(tmp_path):
+    from io_samples import write_image
+
+    scene = replace(write_truth(tmp_path / "jug"), kind="object")
+    (tmp_path / "jug" / "cam_params.json").write_text(json.dumps(
+        {"camera": {"w": 80, "h": 60, "fx": 60, "fy": 60, "cx": 39.5, "cy": 29.5}}
+    ))  # fmt: skip
+    for i in range(len(poses())):
+        write_image(tmp_path / f"jug/results/frame{i:06d}.png", np.zeros((60, 80, 3), np.uint8))
+        write_image(tmp_path / f"jug/results/mask{i:06d}.png", np.full((60, 80, 3), 255, np.uint8))
+    write_result(tmp_path / "out", 0.0, 0.002, posed=True)
+    (final,) = score(scene, "reconstruct", ResultFolder(tmp_path / "out"), 0).stages
+    (measured,) = final.surfaces
+    assert measured.unit == "mm"
+    assert measured.accuracy == pytest.approx(1.85, abs=0.15)
+
+
+def test_no_truth_and_no_mesh_are_sentences(tmp_path):
+    scene = write_truth(tmp_path / "hall")
+    write_result(tmp_path / "out", 0.0, 0.0, posed=True)
+    (tmp_path / "out" / "mesh.ply").unlink()
+    with pytest.raises(InputError, match="no mesh to score"):
+        score(scene, "reconstruct", ResultFolder(tmp_path / "out"), 0)
+    (tmp_path / "out" / "summary.json").write_text("{")
+    with pytest.raises(InputError, match="cannot be read"):
+        _ = ResultFolder(tmp_path / "out").summary
+
+
+def test_coarse_triangles_are_cut_without_changing_the_surface():
+    corners = np.array([[0, 0, 0], [2, 0, 0], [0, 1, 0], [0.01, 0, 1], [0.02, 0, 1], [0, 0, 1.01]])
+    mesh = Surface(corners, np.array([[0, 1, 2], [3, 4, 5]]))
+    fine = with_short_edges(mesh, 0.3)
+    assert fine.areas.sum() == pytest.approx(mesh.areas.sum())
+    a, b, c = (fine.vertices[fine.faces[:, i]] for i in range(3))
+    edges = np.linalg.norm(np.stack([b - a, c - b, a - c]), axis=-1)
+    assert edges.max() <= 0.3
+    assert (fine.areas < 1e-3).sum() == 1  # the small one stays as it is
+
+
+def test_records_survive_json_and_damage(tmp_path):
+    full = replace(
+        record("room0"),
+        curve=(CurvePoint(5.0, None, surface("area")),),
+        error="The disk was full.",
+    )
+    write_json(tmp_path / "bench.json", full)
+    assert read_record(tmp_path / "bench.json") == full
+    text = (tmp_path / "bench.json").read_text()
+    (tmp_path / "bench.json").write_text(text.replace('"benchmark"', '"contest"'))
+    assert read_record(tmp_path / "bench.json") is None
+    (tmp_path / "bench.json").write_text(text[:50])
+    assert read_record(tmp_path / "bench.json") is None
+
+
+def test_markdown_has_our_means_beside_published_ones_of_the_same_scenes():
+    some = [record("room0", acc=1.0), record("room1", acc=2.0)]
+    text = markdown(REPLICA, some)
+    assert "Acc (cm) | Acc (paper)" in text
+    row = [line for line in text.splitlines() if line.startswith("| room1 ")][1]
+    assert "| 2.00 | 1.47 |" in row
+    mean = [line for line in text.splitlines() if line.startswith("| mean ")]
+    assert "| 1.50 | 1.55 |" in mean[1]  # (1.63 + 1.47) / 2: not the paper's mean of eight
+    assert "not measured here (tab:replica_recon)" in text
+    assert "geogs abc123" in text
+    every = [record(scene, ate=0.3) for scene in paper.REPLICA_SCENES]
+    mean = [line for line in markdown(REPLICA, every).splitlines() if line.startswith("| mean ")]
+    assert "| 0.300 | 0.28 |" in mean[0]
+    assert "| 2.09 |" in mean[1]
+
+
+def test_an_ablation_compares_means_over_scenes_that_all_variants_finished(tmp_path):
+    name = MAP_UPDATE.name
+    rows = [
+        record("a", "coherent", acc=1.0, benchmark=name),
+        record("a", "per-keyframe", acc=2.0, benchmark=name),
+        record("b", "coherent", acc=9.0, benchmark=name),
+        replace(record("b", "per-keyframe"), benchmark=name, error="Lost.", cost=None, stages=()),
+    ]
+    text = markdown(MAP_UPDATE, rows)
+    assert "| coherent | 1.00 | 2.09 |" in text
+    assert "| per-keyframe | 2.00 | 2.16 |" in text
+    assert "every variant finished: a." in text
+    assert "| b, per-keyframe | Lost. |" in text
+    write_report(tmp_path, MAP_UPDATE, rows)
+    page = (tmp_path / "report" / "index.html").read_text()
+    assert "Lost." in page
+    assert "2.16" in page
+    assert len(json.loads((tmp_path / "results.json").read_text())) == 4
+
+
+def test_curves_are_drawn(tmp_path):
+    curve = tuple(CurvePoint(s, 10, surface("area", 1 / s)) for s in (1.0, 2.0))
+    write_report(tmp_path, DTU, [replace(record("scan24"), curve=curve)])
+    assert (tmp_path / "report" / "convergence.png").is_file()
+    assert "convergence.png" in (tmp_path / "report" / "index.html").read_text()
+
+
+def test_published_tables_are_complete_and_their_means_are_those_printed():
+    for table in (paper.REPLICA_SURFACE, paper.SCANNETPP, paper.SCANNET, paper.DTU):
+        for row in table.rows:
+            assert len(row.values) == len(table.columns)
+            # The paper rounds some means down, and some to a tenth.
+            assert np.mean(row.values) == pytest.approx(row.mean, abs=0.04)
+    assert paper.DTU.value("scan55", "CD") == 0.34
+    assert paper.DTU.mean(["scan24", "scan37"], "CD") == pytest.approx(0.71)
+    assert paper.DTU.mean(["other"], "CD") is None
+
+
+def test_without_a_true_surface_held_out_images_judge_the_mesh(tmp_path):
+    from geogs.synth.room import make_room
+    from geogs.synth.tessellation import scene_mesh
+    from geogs_bench.scene import Scene, Truth
+    from posed_layouts import render_room, write_dtu
+
+    room = render_room(6, 12, 160, 120)
+    scene = Scene("scan7", write_dtu(room, tmp_path / "scan7"), Truth(), kind="scan")
+    write_result(tmp_path / "out", 0.0, None, posed=True)
+    write_mesh(tmp_path / "out" / "mesh.ply", *scene_mesh(make_room(3)))
+    with pytest.raises(InputError, match="held no image out"):
+        score(scene, "reconstruct", ResultFolder(tmp_path / "out"), 0)
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    scores = []
+    for held_out in ([1, 4], ["000001.png", "000004.png"]):
+        (tmp_path / "out" / "summary.json").write_text(json.dumps(summary | {"held_out": held_out}))
+        found = score(scene, "reconstruct", ResultFolder(tmp_path / "out"), 0)
+        assert found.stages == ()
+        scores.append(found.photo)
+    assert scores[0] == scores[1]
+    assert scores[0].views == 2
+    assert scores[0].ncc_median > 0.8
+    record = Record("dtu", "scan7", "120s", "scan7/120s", FROM, Cost(9.0), photo=scores[0])
+    assert "held-out views |" in markdown(DTU, [record])
+
+
+def test_a_dtu_scan_is_scored_by_its_own_protocol_in_millimetres(tmp_path):
+    import shutil
+
+    from scipy.io import savemat
+
+    from flat_rooms import flat_room
+    from geogs_bench.layouts.dtu import find_dtu
+    from posed_layouts import write_dtu
+
+    shutil.rmtree(write_dtu(flat_room(), tmp_path / "scan7") / "mask")
+    official = tmp_path / "SampleSet" / "MVS Data"
+    (official / "ObsMask").mkdir(parents=True)
+    (official / "Points" / "stl").mkdir(parents=True)
+    vertices, faces = wall(n=121)
+    box = np.array([[-12.0, -12, 0], [12, 12, 48]])
+    mask = {"ObsMask": np.ones((25, 25, 49), np.uint8), "BB": box, "Res": 1.0}
+    savemat(official / "ObsMask" / "ObsMask7_10.mat", mask)
+    savemat(official / "ObsMask" / "Plane7.mat", {"P": np.array([[0.0], [0], [1], [0]])})
+    write_mesh(official / "Points" / "stl" / "stl007_total.ply", 10 * vertices, faces)
+    (scene,) = find_dtu(tmp_path)
+    write_result(tmp_path / "out", 0.0, None, posed=True)
+    write_mesh(tmp_path / "out" / "mesh.ply", 10 * vertices + [0, 0, 0.5], faces)
+    (final,) = score(scene, "reconstruct", ResultFolder(tmp_path / "out"), 0).stages
+    (measured,) = final.surfaces
+    assert (measured.weighting, measured.unit) == ("points", "mm")
+    # Half a millimetre away, a little less along the normals.
+    assert measured.chamfer == pytest.approx(0.47, abs=0.04)

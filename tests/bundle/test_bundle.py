@@ -1,0 +1,170 @@
+"""Dense bundle adjustment against its reference, finite differences and a known scene."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from bundle_scenes import CAMERA, disturbed, scene
+from geogs.bundle.dense import (
+    BundleOptions,
+    DenseBundle,
+    linearise,
+    relative_motion,
+)
+from geogs.bundle.motion_only import solve_poses
+from geogs.geometry.lie import retract, se3_inverse
+from oracles.bundle_reference import gauss_newton_step, reproject
+
+
+def test_jacobians_match_autograd_and_finite_differences():
+    grid, p = scene()
+    T = relative_motion(p.T_cw, p.source, p.target)[:1]
+    rays, d = grid.rays.double(), p.inverse_depth[:1].double()
+    fast = linearise(CAMERA, rays, T, d)
+
+    def moved(xi, delta):
+        return reproject(CAMERA, rays, retract(xi, T[0]), d[0] + delta)[0]
+
+    zero = torch.zeros(6, dtype=torch.float64), torch.zeros(grid.size, dtype=torch.float64)
+    Jx, Jd = torch.autograd.functional.jacobian(moved, zero)
+    Jd = torch.stack([Jd[k, :, k] for k in range(grid.size)])
+    torch.testing.assert_close(fast.pose_jacobian[0].permute(2, 1, 0), Jx, rtol=1e-9, atol=1e-8)
+    torch.testing.assert_close(fast.depth_jacobian[0], Jd, rtol=1e-9, atol=1e-8)
+    for k in range(6):
+        step = torch.zeros(6, dtype=torch.float64)
+        step[k] = 1e-6
+        numeric = (moved(step, zero[1]) - moved(-step, zero[1])) / 2e-6
+        torch.testing.assert_close(fast.pose_jacobian[0, k].mT, numeric, rtol=1e-6, atol=1e-5)
+    numeric = (moved(zero[0], zero[1] + 1e-6) - moved(zero[0], zero[1] - 1e-6)) / 2e-6
+    torch.testing.assert_close(fast.depth_jacobian[0], numeric, rtol=1e-6, atol=1e-5)
+
+
+def test_points_behind_the_target_are_invalid_and_finite():
+    grid, p = scene()
+    T = torch.eye(4, dtype=torch.float64)[None].clone()
+    T[0, 2, 3] = -10.0
+    out = linearise(CAMERA, grid.rays, T, p.inverse_depth[:1])
+    assert not out.valid.any()
+    assert torch.isfinite(out.pixels).all()
+    assert torch.isfinite(out.pose_jacobian).all()
+
+
+@pytest.mark.parametrize("huber", [0.5, 50.0])
+@pytest.mark.parametrize("chunk", [1, 4, 100])
+def test_one_step_matches_dense_normal_equations(huber, chunk):
+    grid, problem = scene()
+    problem = disturbed(problem, 0.02, 0.05)
+    free_depth = problem.free_depth.clone()
+    free_depth[1] = False
+    problem = replace(problem, free_depth=free_depth)
+    options = BundleOptions(iterations=1, huber=huber, chunk=chunk)
+    xi, delta = gauss_newton_step(problem, CAMERA, grid.rays, options)
+    result = DenseBundle(grid).solve(problem, options)
+    assert result.finite
+    assert float(xi.abs().max()) > 0.01
+    torch.testing.assert_close(result.T_cw, retract(xi, problem.T_cw), rtol=0, atol=2e-5)
+    expected = problem.inverse_depth.double() + delta
+    torch.testing.assert_close(result.inverse_depth.double(), expected, rtol=0, atol=5e-5)
+
+
+def test_damping_resists_the_depth_it_is_given_for():
+    grid, problem = scene()
+    problem = disturbed(problem, 0.02, 0.05)
+    damping = torch.zeros_like(problem.inverse_depth)
+    damping[1] = 3e3 * torch.rand(grid.size, generator=torch.Generator().manual_seed(2))
+    damping[2, 7] = 1e9
+    options = BundleOptions(iterations=1, huber=50.0)
+    damped = replace(problem, damping=damping)
+    xi, delta = gauss_newton_step(damped, CAMERA, grid.rays, options)
+    result = DenseBundle(grid).solve(damped, options)
+    torch.testing.assert_close(result.T_cw, retract(xi, problem.T_cw), rtol=0, atol=2e-5)
+    expected = problem.inverse_depth.double() + delta
+    torch.testing.assert_close(result.inverse_depth.double(), expected, rtol=0, atol=5e-5)
+    plain = DenseBundle(grid).solve(problem, options)
+    moved, freely = ((r.inverse_depth - problem.inverse_depth).abs() for r in (result, plain))
+    assert float(moved[2, 7]) < 1e-5 < 1e-3 < float(freely[2, 7])
+    assert float(moved[1].mean()) < 0.8 * float(freely[1].mean())
+
+
+def test_recovers_a_disturbed_scene():
+    grid, truth = scene()
+    start = disturbed(truth, 0.03, 0.1)
+    result = DenseBundle(grid).solve(start, BundleOptions(iterations=12, huber=10.0))
+    centres = se3_inverse(result.T_cw)[:, :3, 3] - se3_inverse(truth.T_cw)[:, :3, 3]
+    assert float(centres.norm(dim=1).max()) < 1e-4  # of a scene about 2 units away
+    assert float((result.inverse_depth / truth.inverse_depth - 1).abs().max()) < 1e-3
+    assert float(result.residual.max()) < 0.01  # pixels
+    torch.testing.assert_close(result.T_cw[:2], truth.T_cw[:2], rtol=0, atol=0)
+
+
+def test_outliers_do_not_pull():
+    grid, truth = scene(frames=5)
+    g = torch.Generator().manual_seed(3)
+    wrong = torch.rand(truth.pixels.shape[:2], generator=g) < 0.1
+    pixels = truth.pixels + 8.0 * torch.randn(truth.pixels.shape, generator=g) * wrong[..., None]
+    start = disturbed(replace(truth, pixels=pixels), 0.01, 0.03)
+    robust = DenseBundle(grid).solve(start, BundleOptions(iterations=30, huber=0.1))
+    plain = DenseBundle(grid).solve(start, BundleOptions(iterations=30, huber=1e3))
+    error = [float((r.T_cw - truth.T_cw).abs().max()) for r in (robust, plain)]
+    assert error[0] < 2e-3
+    assert error[0] < 0.1 * error[1]
+
+
+def test_information_is_the_sum_of_squared_weighted_slopes():
+    grid, problem = scene()
+    result = DenseBundle(grid).solve(problem, BundleOptions(iterations=1))
+    T = relative_motion(problem.T_cw, problem.source, problem.target)
+    p = linearise(CAMERA, grid.rays, T, problem.inverse_depth[problem.source])
+    per_edge = (problem.weight * p.valid[..., None] * p.depth_jacobian.square()).sum(-1)
+    for frame in range(4):
+        expected = per_edge[problem.source == frame].sum(0)
+        torch.testing.assert_close(result.information[frame], expected, rtol=1e-5, atol=1e-5)
+
+
+def test_depth_of_a_cell_without_measurements_stays():
+    grid, problem = scene()
+    weight = problem.weight.clone()
+    weight[problem.source == 2, 5] = 0
+    problem = disturbed(replace(problem, weight=weight), 0.01, 0.05)
+    result = DenseBundle(grid).solve(problem, BundleOptions(iterations=3))
+    assert float(result.information[2, 5]) == 0
+    torch.testing.assert_close(result.inverse_depth[2, 5], problem.inverse_depth[2, 5])
+
+
+def test_not_finite_input_is_refused_and_reported():
+    grid, problem = scene()
+    pixels = problem.pixels.clone()
+    pixels[0, 0] = torch.nan
+    result = DenseBundle(grid).solve(replace(problem, pixels=pixels), BundleOptions(iterations=2))
+    assert not result.finite
+    torch.testing.assert_close(result.T_cw, problem.T_cw)
+    torch.testing.assert_close(result.inverse_depth, problem.inverse_depth)
+
+
+def test_motion_only_recovers_poses():
+    grid, truth = scene()
+    edges = (truth.source < 2) & (truth.target >= 2)
+    source, target = truth.source[edges], truth.target[edges]
+    start = disturbed(truth, 0.03, 0.0)
+    T, residual = solve_poses(
+        CAMERA,
+        grid.rays,
+        start.T_cw[2:],
+        truth.inverse_depth[source],
+        truth.T_cw[source],
+        target - 2,
+        truth.pixels[edges],
+        truth.weight[edges],
+        iterations=10,
+    )
+    torch.testing.assert_close(T, truth.T_cw[2:], rtol=0, atol=1e-5)
+    assert float(residual.norm(dim=-1).max()) < 0.01
+
+
+def test_same_input_same_result():
+    grid, problem = scene()
+    problem = disturbed(problem, 0.02, 0.05)
+    a, b = (DenseBundle(grid).solve(problem, BundleOptions(iterations=3)) for _ in range(2))
+    assert torch.equal(a.T_cw, b.T_cw)
+    assert torch.equal(a.inverse_depth, b.inverse_depth)

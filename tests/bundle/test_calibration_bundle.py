@@ -1,0 +1,123 @@
+"""The camera with unknowns, and its adjustment, against autograd, OpenCV and known lenses."""
+
+import math
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from geogs.bundle import lens_bundle as bundle
+from geogs.bundle.dense import relative_motion
+from geogs.bundle.lens import Lens, lens_rays, linearise_lens, project_lens
+from geogs.bundle.lens_bundle import LensBundleOptions, solve_lens
+from geogs.geometry.lie import retract
+from lens_scene import CAMERA, GRID, disturbed, lens_problem
+from oracles.calibration_reference import gauss_newton_step, reproject
+
+
+@pytest.mark.parametrize("k1", [0.0, 0.15, -0.2])
+def test_jacobians_match_autograd(k1):
+    p = lens_problem(Lens(CAMERA, k1))
+    T = relative_motion(p.T_cw, p.source, p.target)[:1]
+    pixels, d = GRID.pixels.double(), p.inverse_depth[:1].double()
+    lens = Lens(CAMERA, k1)
+    fast = linearise_lens(lens, lens_rays(lens, pixels), T, d)
+
+    def moved(xi, unknowns, delta):
+        return reproject(CAMERA, pixels, unknowns, retract(xi, T[0]), d[0] + delta)
+
+    at = (
+        torch.zeros(6, dtype=torch.float64),
+        torch.tensor([0.0, k1], dtype=torch.float64),
+        torch.zeros(GRID.size, dtype=torch.float64),
+    )
+    torch.testing.assert_close(fast.pixels[0], moved(*at), rtol=1e-9, atol=1e-9)
+    Jx, Jl, Jd = torch.autograd.functional.jacobian(moved, at)
+    Jd = torch.stack([Jd[k, :, k] for k in range(GRID.size)], -1)
+    expected = torch.cat([Jx, Jl], -1).permute(2, 1, 0)
+    torch.testing.assert_close(fast.jacobian[0], expected, rtol=1e-7, atol=1e-7)
+    torch.testing.assert_close(fast.depth_jacobian[0], Jd, rtol=1e-7, atol=1e-7)
+
+
+def test_the_lens_is_that_of_opencv():
+    lens = Lens(CAMERA, -0.12)
+    K, distortion = CAMERA.matrix().numpy(), np.array([-0.12, 0, 0, 0])
+    pixels = GRID.pixels.double()
+    rays = lens_rays(lens, pixels).rays
+    back, _ = cv2.projectPoints(rays.numpy(), np.zeros(3), np.zeros(3), K, distortion)
+    np.testing.assert_allclose(back[:, 0], pixels.numpy(), atol=1e-7)
+    eye = torch.eye(4, dtype=torch.float64)[None]
+    at, valid = project_lens(lens, rays, eye, torch.ones(1, GRID.size, dtype=torch.float64))
+    np.testing.assert_allclose(at[0].numpy(), pixels.numpy(), atol=1e-7)
+    assert valid.all()
+
+
+@pytest.mark.parametrize("huber", [0.5, 50.0])
+def test_one_step_matches_the_dense_equations(huber):
+    lens = Lens(CAMERA, 0.05)
+    problem = disturbed(lens_problem(lens.moved(0.02, 0.01), frames=3), 0.01, 0.03)
+    options = LensBundleOptions(huber=huber, radial=True)
+    xi, unknowns, delta = gauss_newton_step(
+        problem, CAMERA, GRID.pixels, 0.05, huber, options.depth_damping
+    )
+    stars = bundle._stars(problem, lens, GRID.pixels, problem.T_cw, problem.inverse_depth, options)
+    step = bundle._step(problem, stars, problem.T_cw, options, 0.0)
+    assert step is not None
+    depth = bundle._moved_depth(stars, step, problem.inverse_depth, options)
+    assert float(unknowns.abs().min()) > 1e-3
+    torch.testing.assert_close(step[-2:], unknowns, rtol=2e-3, atol=2e-5)
+    # Poses and depths agree up to the scale, which nothing measures.
+    ours, theirs = step[6:-2].reshape(-1, 6), xi[1:]
+    torch.testing.assert_close(ours[:, 3:], theirs[:, 3:], rtol=0, atol=5e-5)
+    away, rest = problem.T_cw[1:, :3, 3].reshape(-1), (ours - theirs)[:, :3].reshape(-1)
+    scale = float(away @ rest / (away @ away))
+    torch.testing.assert_close(rest, scale * away, rtol=0, atol=1e-4)
+    change = depth.double() - problem.inverse_depth - delta
+    torch.testing.assert_close(change, -scale * problem.inverse_depth.double(), rtol=0, atol=2e-3)
+
+
+def test_recovers_focal_length_and_radial_term():
+    truth = Lens(CAMERA, -0.1)
+    start = disturbed(lens_problem(truth), 0.01, 0.05)
+    guess = Lens(CAMERA).moved(math.log(1.25))
+    options = LensBundleOptions(iterations=40, radial=True, huber=100.0, least_decrease=1e-9)
+    result = solve_lens(start, guess, GRID.pixels, options)
+    assert result.finite
+    assert abs(result.lens.camera.fx / CAMERA.fx - 1) < 1e-3
+    assert abs(result.lens.camera.fy / CAMERA.fy - 1) < 1e-3
+    assert abs(result.lens.k1 + 0.1) < 1e-3
+
+
+def test_deviations_are_those_of_repeated_measurements():
+    errors, deviations = [], []
+    for seed in range(16):
+        problem = lens_problem(Lens(CAMERA), frames=8, noise=0.3, seed=seed)
+        result = solve_lens(problem, Lens(CAMERA), GRID.pixels, LensBundleOptions(radial=True))
+        errors.append([math.log(result.lens.camera.fx / CAMERA.fx), result.lens.k1])
+        deviations.append(result.covariance.diagonal().sqrt().tolist())
+    actual = np.sqrt(np.square(errors).mean(0))
+    said = np.sqrt(np.square(deviations).mean(0))
+    assert (actual > 1e-4).all()
+    assert ((actual / said > 0.5) & (actual / said < 2.0)).all(), (actual, said)
+
+
+def test_what_is_no_variable_stays():
+    problem = lens_problem(Lens(CAMERA, 0.05).moved(0.1))
+    lens = Lens(CAMERA, 0.05)
+    fixed = solve_lens(problem, lens, GRID.pixels, LensBundleOptions(focal=False))
+    assert fixed.lens == lens
+    assert not fixed.covariance.any()
+    torch.testing.assert_close(fixed.T_cw[0], problem.T_cw[0])
+    focal = solve_lens(problem, lens, GRID.pixels)
+    assert focal.lens.k1 == 0.05
+    assert float(focal.covariance[1, 1]) == 0
+    assert focal.lens.camera.fx > 1.05 * CAMERA.fx
+
+
+def test_matches_that_are_not_finite_are_reported():
+    problem = lens_problem(Lens(CAMERA))
+    problem.pixels[0, 0] = torch.nan
+    result = solve_lens(problem, Lens(CAMERA), GRID.pixels)
+    assert not result.finite
+    assert result.lens == Lens(CAMERA)

@@ -1,0 +1,60 @@
+"""The sample grid."""
+
+import pytest
+import torch
+
+from geogs.geometry.camera import Camera
+from geogs.keyframes.grid import SampleGrid
+
+CAMERA = Camera(fx=90.0, fy=95.0, cx=50.0, cy=37.5, width=101, height=77)
+
+
+def linear_field(pixels: torch.Tensor) -> torch.Tensor:
+    return torch.stack([0.3 * pixels[:, 0] - 2, 0.1 * pixels[:, 1] + 0.2 * pixels[:, 0]], -1)
+
+
+def test_cells_sit_where_the_convention_says():
+    grid = SampleGrid(CAMERA)
+    assert (grid.width, grid.height) == (len(range(4, 98, 8)), len(range(4, 74, 8)))
+    image = torch.stack(torch.meshgrid(torch.arange(77), torch.arange(101), indexing="ij"), -1)
+    expected = image[4:-3:8, 4:-3:8].reshape(-1, 2).flip(-1).float()
+    torch.testing.assert_close(grid.pixels, expected)
+    pixels, z = CAMERA.project(grid.rays)
+    torch.testing.assert_close(pixels, grid.pixels)
+    assert torch.equal(z, torch.ones_like(z))
+
+
+def test_linear_fields_are_interpolated_exactly():
+    grid = SampleGrid(CAMERA)
+    field = linear_field(grid.pixels)
+    points = torch.tensor([[4.0, 4.0], [10.5, 33.25], [60.0, 59.0], [84.0, 60.0]])
+    torch.testing.assert_close(grid.sample_field(field, points), linear_field(points))
+    full = grid.upsample(field)
+    assert full.shape == (77, 101, 2)
+    at = torch.stack([full[int(y), int(x)] for x, y in points[[0, 2, 3]]])
+    torch.testing.assert_close(at, linear_field(points[[0, 2, 3]]))
+    outside = grid.sample_field(field, torch.tensor([[-50.0, 20.0]]))
+    torch.testing.assert_close(outside, linear_field(torch.tensor([[4.0, 20.0]])))
+
+
+def test_cells_of_rounds_to_the_nearest_and_flags_the_rest():
+    grid = SampleGrid(CAMERA)
+    index, valid = grid.cells_of(grid.pixels + torch.tensor([3.0, -3.0]))
+    assert valid.all()
+    assert torch.equal(index, torch.arange(grid.size))
+    strange = torch.tensor([[-10.0, 5.0], [1e9, 5.0], [float("nan"), 5.0], [50.0, 200.0]])
+    assert not grid.cells_of(strange)[1].any()
+
+
+def test_fill_keeps_known_values_and_bridges_holes():
+    grid = SampleGrid(CAMERA)
+    values = 1 + 0.01 * grid.pixels[:, 0]
+    known = torch.ones(grid.size)
+    known[25:28] = 0
+    filled = grid.fill(torch.where(known > 0, values, torch.tensor(99.0)), known)
+    torch.testing.assert_close(filled[known > 0], values[known > 0])
+    assert float((filled - values).abs().max()) < 0.15
+    assert float(grid.fill(values, 0 * known)[0]) == pytest.approx(float(values.mean()))
+    one = torch.zeros(grid.size)
+    one[40] = 1.0
+    torch.testing.assert_close(grid.fill(values, one), torch.full_like(values, float(values[40])))

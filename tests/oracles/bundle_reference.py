@@ -1,0 +1,75 @@
+"""The specification of one step of dense bundle adjustment: slow, dense, float64, by autograd."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from geogs.bundle.dense import MIN_Z, BundleOptions, BundleProblem
+from geogs.geometry.camera import Camera
+from geogs.geometry.lie import retract, se3_inverse
+
+
+def reproject(
+    camera: Camera,
+    rays: Float[Tensor, "p 3"],
+    T_ji: Float[Tensor, "4 4"],
+    inverse_depth: Float[Tensor, "p"],
+) -> tuple[Float[Tensor, "p 2"], Tensor]:
+    """Pixels in the target of the source's cells, and whether they lie in front of it."""
+    points = rays @ T_ji[:3, :3].mT + inverse_depth[:, None] * T_ji[:3, 3]
+    pixels, z = camera.project(points)
+    return pixels, z > MIN_Z
+
+
+def residuals(
+    problem: BundleProblem, camera: Camera, rays: Tensor, xi: Tensor, delta: Tensor
+) -> Float[Tensor, "e p 2"]:
+    """Measured minus projected pixels after the steps xi of poses and delta of inverse depths."""
+    T = retract(xi, problem.T_cw)
+    d = problem.inverse_depth.double() + delta
+    rows = []
+    for e in range(len(problem.source)):
+        i, j = int(problem.source[e]), int(problem.target[e])
+        pixels, _ = reproject(camera, rays.double(), T[j] @ se3_inverse(T[i]), d[i])
+        rows.append(problem.pixels[e].double() - pixels)
+    return torch.stack(rows)
+
+
+def gauss_newton_step(
+    problem: BundleProblem, camera: Camera, rays: Float[Tensor, "p 3"], options: BundleOptions
+) -> tuple[Float[Tensor, "n 6"], Float[Tensor, "n p"]]:
+    """The step of the free poses and inverse depths from the full normal equations.
+
+    Minimises sum w rho(r) with Huber's weights at the present state. The same damping as the fast
+    solver: of inverse depth in the full system, of poses in the system without depths.
+    """
+    n, p = problem.inverse_depth.shape
+    xi = torch.zeros(n, 6, dtype=torch.float64)
+    delta = torch.zeros(n, p, dtype=torch.float64)
+    r = residuals(problem, camera, rays, xi, delta)
+    w = problem.weight.double()
+    norm = (w * r * r).sum(-1, keepdim=True).sqrt()
+    w = w * (options.huber / norm.clamp(min=options.huber))
+    Jx, Jd = torch.func.jacrev(
+        lambda a, b: residuals(problem, camera, rays, a, b).reshape(-1), (0, 1)
+    )(xi, delta)
+    Jx, Jd, w, r = -Jx.reshape(-1, 6 * n), -Jd.reshape(-1, n * p), w.reshape(-1), r.reshape(-1)
+    pose = problem.free_pose.repeat_interleave(6)
+    depth = problem.free_depth.repeat_interleave(p)
+    Jx, Jd = Jx[:, pose], Jd[:, depth]
+    C = (Jd.mT @ (w[:, None] * Jd)).diagonal()
+    mean = C.reshape(-1, p).mean(1).repeat_interleave(p)
+    C = C + options.depth_damping * mean + 1e-8
+    if problem.damping is not None:
+        C = C + problem.damping.double().reshape(-1)[depth]
+    C = torch.diag(C)
+    H, E = Jx.mT @ (w[:, None] * Jx), Jx.mT @ (w[:, None] * Jd)
+    v, b = Jx.mT @ (w * r), Jd.mT @ (w * r)
+    S = H - E @ torch.linalg.inv(C) @ E.mT
+    H = H + torch.diag(options.damping * S.diagonal().abs() + 1e-2)
+    step = torch.linalg.solve(
+        torch.cat([torch.cat([H, E], 1), torch.cat([E.mT, C], 1)]), torch.cat([v, b])
+    )
+    xi = xi.reshape(-1).masked_scatter(pose, step[: len(v)]).reshape(n, 6)
+    delta = delta.reshape(-1).masked_scatter(depth, step[len(v) :]).reshape(n, p)
+    return xi, delta

@@ -1,0 +1,64 @@
+"""The choice of pairs among many keyframes is that of looking at every pair."""
+
+import numpy as np
+import pytest
+import torch
+
+import geogs.tracking.proximity as proximity
+from geogs.geometry.lie import se3_exp
+from geogs.keyframes.grid import SampleGrid
+from geogs.keyframes.store import KeyframeStore
+from geogs.tracking.overlap import may_overlap
+from geogs.tracking.proximity import frame_distances, proximity_pairs
+from planted_walk import SMALL, planted_tracker
+
+
+def scattered(count: int, seed: int = 0) -> KeyframeStore:
+    """Cameras anywhere, looking anywhere, with depths that vary from cell to cell."""
+    grid, g = SampleGrid(SMALL), torch.Generator().manual_seed(seed)
+    store = KeyframeStore(grid)
+    turn = torch.tensor([2, 2, 2, 0.5, 1.5, 0.5], dtype=torch.float64)
+    T = se3_exp(turn * torch.randn(count, 6, generator=g, dtype=torch.float64))
+    for n in range(count):
+        state = store.add(n, n / 3, np.zeros((4, 4, 3), np.uint8), None, T[n])
+        depth = 1 + 4 * torch.rand(1, generator=g) + torch.rand(grid.size, generator=g)
+        state.inverse_depth = 1 / depth
+    return store
+
+
+def test_no_pair_within_reach_is_left_out():
+    for store in (scattered(60), planted_tracker(80)[0].store):
+        ids = store.ids
+        may = may_overlap(store, ids, ids, 0.2, 2)
+        may &= may.T
+        directed = [(i, j) for i in ids for j in ids]
+        distance = frame_distances(store, directed).reshape(len(ids), len(ids)).numpy()
+        finite = np.isfinite(distance + distance.T)
+        assert not (finite & ~may).any()
+        # It is a help, too: most of what it lets through can be seen.
+        assert finite.sum() > 0.4 * may.sum()
+    short = scattered(60)
+    assert may_overlap(short, short.ids, short.ids, 0.2, 2).mean() < 0.5
+
+
+def test_pairs_of_many_keyframes_are_those_of_looking_at_all(monkeypatch):
+    store = planted_tracker(90)[0].store
+    ids = store.ids
+    arguments = (store, ids, ids, [(0, 9), (20, 60)], 3, 3, 40.0, 700)
+    fast = proximity_pairs(*arguments)
+    monkeypatch.setattr(proximity, "PAIRS_TOGETHER", (10**9, 10**9))
+    assert proximity_pairs(*arguments) == fast
+    far = [(i, j) for i, j in fast if j - i > 60]
+    assert len(far) > 10  # the way back sees the way out
+    position_apart = {abs(i - a) + abs(j - b) for i, j in far for a, b in far if (a, b) != (i, j)}
+    assert min(position_apart) == 4
+
+
+@pytest.mark.parametrize("count", [40, 90])
+def test_the_last_keyframe_finds_its_neighbours(count):
+    store = planted_tracker(count)[0].store
+    ids = store.ids
+    pairs = proximity_pairs(store, [ids[-1]], ids[-25:-1], [], 3, 1, 40.0, 5)
+    assert pairs[:3] == [(ids[-1] - k, ids[-1]) for k in (1, 2, 3)]
+    assert len(pairs) == 5
+    assert all(j == ids[-1] for _, j in pairs)

@@ -1,0 +1,136 @@
+"""A camera that is lost: found again by what it sees, or followed anew until a loop joins it."""
+
+from collections.abc import Sequence
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+
+from geogs.config import LoopConfig, TrackingConfig
+from geogs.geometry.camera import Camera
+from geogs.geometry.lie import sim3_exp
+from geogs.geometry.umeyama import umeyama
+from geogs.keyframes.grid import SampleGrid
+from geogs.keyframes.store import KeyframeIds
+from geogs.loop.closer import LoopCloser
+from geogs.tracking.flow.select import build_operator
+from geogs.tracking.segments import Segments, moved
+from geogs.tracking.tracker import Tracker, TrackState
+from geogs.types import Frame
+from loop_scenes import at_angle, room
+
+CAMERA = Camera(fx=180.0, fy=180.0, cx=127.5, cy=95.5, width=256, height=192)
+CONFIG = TrackingConfig(init_keyframes=5, patience=4)
+LOOPS = LoopConfig(min_gap=100)  # only between segments
+
+
+@cache
+def image(angle: float) -> np.ndarray:
+    return room().render(CAMERA, at_angle(room().scene, np.radians(angle))).image
+
+
+def stream(angles: Sequence[float | None], cuts: Sequence[int] = ()) -> list[Frame]:
+    """Frames looking outwards at angles in degrees; a covered lens where there is none."""
+    black = np.zeros((CAMERA.height, CAMERA.width, 3), np.uint8)
+    return [
+        Frame(k, k / 30, black if a is None else image(a), k in cuts) for k, a in enumerate(angles)
+    ]
+
+
+def run(frames: Sequence[Frame]) -> tuple[Segments, list]:
+    """The whole stream through segments and loops."""
+    ids, operator = KeyframeIds(), build_operator(CONFIG, SampleGrid(CAMERA))
+    segments = Segments(
+        lambda: Tracker(CAMERA, CONFIG, "cpu", 0, operator, None, None, ids), CONFIG.patience
+    )
+    closer, results = LoopCloser(segments, LOOPS), []
+    for frame in frames:
+        results.append(segments.track(frame, closer.recognise))
+        closer.update(results[-1])
+    results.append(segments.finish())
+    closer.update(results[-1], is_last=True)
+    return segments, results
+
+
+def error_cm(segments: Segments, angles: Sequence[float | None]) -> float:
+    """RMSE of the tracked camera centres after one similarity, centimetres."""
+    trajectory = segments.trajectory()
+    known = trajectory.tracked
+    truth = np.stack([
+        at_angle(room().scene, np.radians(a or 0.0))[:3, 3] for a in angles
+    ])[known]  # fmt: skip
+    x, y = torch.from_numpy(trajectory.T_wc[known, :3, 3]), torch.from_numpy(truth)
+    scale, R, t = umeyama(x, y)
+    return 100 * float((scale * x @ R.T + t - y).square().sum(1).mean().sqrt())
+
+
+def test_a_covered_lens_is_survived_where_the_place_was_seen_before():
+    angles = [*np.arange(0, 48, 2.0), *[None] * 8, *np.arange(10, 30, 2.0)]
+    segments, results = run(stream(angles))
+    states = [r.state for r in results[: len(angles)]]
+    assert states[24:32] == [TrackState.LOST] * 8
+    assert states[32:] == [TrackState.TRACKING] * 10
+    assert [s.fate for s in segments.summary()] == ["world"]
+    assert segments.trajectory().tracked.tolist() == [a is not None for a in angles]
+    assert error_cm(segments, angles) < 0.3
+
+
+def test_a_jump_cut_begins_a_segment_that_a_loop_joins():
+    there = np.arange(0, 48, 2.0)
+    back = np.arange(150, 10, -2.5)
+    angles = [*there, *back]
+    segments, results = run(stream(angles))
+    assert results[24].state is TrackState.LOST
+    assert [r.apart for r in results[24:60]] != [()] * 36
+    fates = [s.fate for s in segments.summary()]
+    assert fates == ["world", "joined"]
+    untracked = np.flatnonzero(~segments.trajectory().tracked)
+    assert len(untracked) <= 6
+    assert set(untracked) <= set(range(24, 30))
+    assert error_cm(segments, angles) < 1.0
+    ids = segments.keyframe_ids
+    assert ids == sorted(set(ids))
+
+
+def test_a_segment_that_meets_nothing_stays_apart():
+    angles = [*np.arange(0, 60, 2.0), *np.arange(180, 210, 2.0)]
+    segments, results = run(stream(angles, cuts=[30]))
+    assert [s.fate for s in segments.summary()] == ["world", "apart"]
+    trajectory = segments.trajectory()
+    assert trajectory.tracked.tolist() == [True] * 30 + [False] * 15
+    assert len(trajectory.timestamps) == 45
+    # A declared cut is not waited for.
+    assert results[30].state is TrackState.INITIALIZING
+    world, apart = segments.summary()
+    assert world.last_time < apart.first_time
+    assert apart.keyframes >= 5
+
+
+def test_the_largest_segment_becomes_the_world():
+    angles = [*np.arange(0, 16, 2.0), *np.arange(120, 180, 2.0)]
+    segments, results = run(stream(angles, cuts=[8]))
+    assert results[-1].is_new_world
+    assert results[-1].finalized == tuple(segments.keyframe_ids)
+    assert [s.fate for s in segments.summary()] == ["apart", "world"]
+    assert segments.trajectory().tracked.tolist() == [False] * 8 + [True] * 30
+
+
+@pytest.mark.parametrize("scale", [0.5, 1.0, 3.0])
+def test_moving_keyframes_keeps_what_they_see(scale):
+    ids, operator = KeyframeIds(), build_operator(CONFIG, SampleGrid(CAMERA))
+    tracker = Tracker(CAMERA, CONFIG, "cpu", 0, operator, ids=ids)
+    for frame in stream(np.arange(0, 16, 2.0)):
+        tracker.track(frame)
+    tracker.finish()
+    before = tracker.graph.reprojections([(0, 2), (3, 1)])
+    centres = [torch.linalg.inv(s.T_cw)[:3, 3] for s in tracker.store]
+    xi = torch.tensor([0.3, -0.2, 0.5, 0.1, 0.4, -0.2, np.log(scale)], dtype=torch.float64)
+    S = sim3_exp(xi)
+    tracker.correct(moved(tracker.store, S))
+    after = tracker.graph.reprojections([(0, 2), (3, 1)])
+    assert float((after - before).abs().max()) < 2e-3
+    for centre, state in zip(centres, tracker.store, strict=True):
+        expected = torch.linalg.inv(S) @ torch.cat([centre, torch.ones(1)])
+        assert torch.allclose(torch.linalg.inv(state.T_cw)[:3, 3], expected[:3], atol=1e-9)
+    assert tracker.trajectory().tracked.all()

@@ -1,0 +1,225 @@
+"""The tracker end to end on a rendered room, and what it must survive."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from geogs.config import TrackingConfig
+from geogs.errors import GeogsError, InputError, TrackingLost
+from geogs.geometry.camera import Camera
+from geogs.loop.global_bundle import global_bundle
+from geogs.tracking.tracker import Tracker, TrackState
+from geogs.types import Frame, PoseCorrection
+from tracking_runs import CONFIG, PATH, error_cm
+from tracking_scenes import CAMERA, frames, pose, render, sideways
+
+
+def run(stream: list[Frame], config: TrackingConfig = CONFIG) -> tuple[Tracker, list]:
+    tracker = Tracker(CAMERA, config)
+    results = [tracker.track(f) for f in stream]
+    return tracker, [*results, tracker.finish()]
+
+
+@pytest.fixture(scope="module")
+def tracked() -> tuple[Tracker, list]:
+    return run(frames(PATH))
+
+
+def test_every_frame_is_located_to_millimetres(tracked):
+    tracker, _ = tracked
+    trajectory = tracker.trajectory()
+    assert len(trajectory.timestamps) == len(PATH)
+    assert trajectory.tracked.all()
+    np.testing.assert_allclose(trajectory.timestamps, np.arange(len(PATH)) / 30)
+    truth = np.stack(PATH)[:, :3, 3]
+    assert error_cm(trajectory.T_wc[:, :3, 3], truth) < 0.4  # the path is about 1 m long
+
+
+def test_depth_is_right_where_information_is_high(tracked):
+    tracker, _ = tracked
+    ratios = []
+    for id in tracker.keyframe_ids[1:-1]:
+        k = tracker.keyframe(id)
+        z = render(PATH[k.frame_index])[1][4:-3:8, 4:-3:8]
+        good = k.information > k.information.median()
+        ratios.append((1 / k.inverse_depth.numpy() / z)[good.numpy()])
+    ratios = np.concatenate(ratios)
+    assert np.median(np.abs(ratios / np.median(ratios) - 1)) < 0.02
+
+
+def test_results_tell_what_happened(tracked):
+    tracker, results = tracked
+    finalized = [k for r in results for k in r.finalized]
+    removed = [k for r in results for k in r.removed]
+    assert finalized == tracker.keyframe_ids
+    assert finalized == sorted(set(finalized))
+    assert not set(finalized) & set(removed)
+    last = results[-2]
+    assert last.state is TrackState.TRACKING
+    assert tracker.keyframe_ids[0] not in last.active
+    assert list(last.active) == sorted(last.active)
+    assert results[0].state is TrackState.INITIALIZING
+
+
+def test_median_depth_is_about_one_unit(tracked):
+    tracker, _ = tracked
+    depth = torch.cat(
+        [1 / tracker.keyframe(k).inverse_depth.flatten() for k in tracker.keyframe_ids]
+    )
+    assert 0.7 < float(depth.median()) < 1.5
+
+
+def test_same_seed_same_result(tracked):
+    again, _ = run(frames(PATH))
+    assert np.array_equal(again.trajectory().T_wc, tracked[0].trajectory().T_wc)
+
+
+def test_global_bundle_improves_and_reports_the_correction():
+    tracker, _ = run(frames(PATH))
+    truth = np.stack(PATH)[:, :3, 3]
+    seen = []
+    online = error_cm(tracker.trajectory().T_wc[:, :3, 3], truth)
+    correction = global_bundle(tracker, lambda share, message: seen.append(share))
+    final = error_cm(tracker.trajectory().T_wc[:, :3, 3], truth)
+    assert final < max(online, 0.15)
+    assert final < 0.25
+    assert seen == sorted(seen)
+    assert seen[-1] == 1.0
+    assert list(correction.after) == tracker.keyframe_ids
+    for id, T in correction.after.items():
+        assert torch.equal(T, tracker.keyframe(id).T_cw)
+    assert torch.equal(correction.after[0], correction.before[0])
+
+
+def test_garbage_in_the_middle_is_lost_and_recovered():
+    stream = frames(PATH)
+    rng = np.random.default_rng(0)
+    black = np.zeros_like(stream[0].image)
+    noise = rng.integers(0, 255, black.shape, dtype=np.uint8)
+    blurred = cv2.GaussianBlur(stream[25].image, (0, 0), 30)
+    for k, image in ((24, black), (25, noise), (26, blurred), (27, np.full_like(black, 255))):
+        stream[k] = replace(stream[k], image=image)
+    tracker, results = run(stream)
+    lost = [k for k, r in enumerate(results[:-1]) if r.state is TrackState.LOST]
+    assert lost == [24, 25, 26, 27]
+    trajectory = tracker.trajectory()
+    assert np.flatnonzero(~trajectory.tracked).tolist() == lost
+    good = trajectory.tracked
+    assert np.isfinite(trajectory.T_wc).all()
+    assert error_cm(trajectory.T_wc[good, :3, 3], np.stack(PATH)[good, :3, 3]) < 0.6
+
+
+def test_lost_until_the_end_keeps_what_there_is():
+    stream = frames(PATH)
+    rng = np.random.default_rng(1)
+    shape = stream[0].image.shape
+    for k in range(30, 40):
+        stream[k] = replace(stream[k], image=rng.integers(0, 255, shape, dtype=np.uint8))
+    tracker, results = run(stream)
+    assert results[-1].state is TrackState.LOST
+    assert (~tracker.trajectory().tracked).sum() == 10
+    assert len(tracker.keyframe_ids) >= 5
+
+
+def test_dark_start_is_skipped():
+    stream = frames(PATH[:30])
+    for k in range(3):
+        stream[k] = replace(stream[k], image=np.zeros_like(stream[k].image))
+    tracker, _ = run(stream)
+    assert tracker.keyframe(tracker.keyframe_ids[0]).frame_index == 3
+    assert np.flatnonzero(~tracker.trajectory().tracked).tolist() == [0, 1, 2]
+
+
+def test_light_switched_on_the_way():
+    stream = frames(PATH)
+    for k in range(20, 40):
+        image = stream[k].image.astype(np.float32)
+        ramp = np.linspace(0.5, 0.9, image.shape[1], dtype=np.float32)[None, :, None]
+        stream[k] = replace(stream[k], image=(image * ramp + 10).astype(np.uint8))
+    tracker, results = run(stream)
+    assert all(r.state is not TrackState.LOST for r in results)
+    truth = np.stack(PATH)[:, :3, 3]
+    assert error_cm(tracker.trajectory().T_wc[:, :3, 3], truth) < 0.6
+
+
+def test_static_video_says_so():
+    with pytest.raises(TrackingLost, match="hardly moves"):
+        run(frames([pose(0.0)] * 12))
+
+
+def test_pure_rotation_says_so():
+    with pytest.raises(TrackingLost, match="parallax"):
+        run(frames([pose(0.0, yaw=0.02 * k) for k in range(36)]))
+
+
+def test_black_video_says_so():
+    black = np.zeros((CAMERA.height, CAMERA.width, 3), np.uint8)
+    with pytest.raises(TrackingLost, match="texture"):
+        run([Frame(k, k / 30, black) for k in range(5)])
+
+
+def test_frame_of_another_size_is_refused():
+    tracker = Tracker(CAMERA, CONFIG)
+    with pytest.raises(InputError, match="one size"):
+        tracker.track(Frame(0, 0.0, np.zeros((50, 60, 3), np.uint8)))
+
+
+def test_tiny_image_is_refused():
+    with pytest.raises(InputError, match="32 x 32"):
+        Tracker(Camera(20.0, 20.0, 10.0, 10.0, 24, 20), CONFIG)
+
+
+def test_write_back_moves_active_keyframes_only():
+    tracker, _ = run(frames(PATH[:30]))
+    active = tracker.active
+    T = tracker.keyframe(active[-1]).T_cw
+    T[0, 3] += 0.01
+    tracker.write_back({active[-1]: T})
+    assert torch.equal(tracker.keyframe(active[-1]).T_cw, T)
+    with pytest.raises(GeogsError, match="no longer free"):
+        tracker.write_back({tracker.keyframe_ids[0]: T})
+
+
+def test_correct_scales_depth_with_the_pose():
+    tracker, _ = run(frames(PATH[:30]))
+    id = tracker.keyframe_ids[2]
+    before = tracker.keyframe(id)
+    T = before.T_cw.clone()
+    T[:3, 3] /= 2
+    tracker.correct(PoseCorrection({id: before.T_cw}, {id: T}, {id: 2.0}))
+    after = tracker.keyframe(id)
+    torch.testing.assert_close(after.inverse_depth, 2 * before.inverse_depth)
+    sigma = [1 / (k.inverse_depth * k.information.sqrt()) for k in (before, after)]
+    torch.testing.assert_close(*sigma)
+
+
+def test_slow_motion_makes_few_keyframes_and_culling_removes_more():
+    slow = frames(sideways(40, 0.012))
+    few, _ = run(slow)
+    many, results = run(slow, replace(CONFIG, keyframe_flow=0.012, cull_distance=0.0))
+    culled, results = run(slow, replace(CONFIG, keyframe_flow=0.012, cull_distance=0.02))
+    assert len(few.keyframe_ids) < len(many.keyframe_ids)
+    removed = [k for r in results for k in r.removed]
+    assert removed
+    assert len(culled.keyframe_ids) < len(many.keyframe_ids)
+    assert not set(removed) & set(culled.keyframe_ids)
+    assert culled.trajectory().tracked.all()
+    truth = np.stack(sideways(40, 0.012))[:, :3, 3]
+    assert error_cm(culled.trajectory().T_wc[:, :3, 3], truth) < 0.4
+
+
+def test_forty_frames_of_a_rendered_living_room(shared_data):
+    folder = shared_data / "rooms" / "living-room-2"
+    T_wc = np.loadtxt(folder / "traj.txt").reshape(-1, 4, 4)
+    camera = Camera(600.0, 600.0, 599.5, 339.5, 1200, 680).with_long_edge(320)
+    tracker = Tracker(camera, replace(CONFIG, keyframe_flow=0.02))
+    for k in range(0, 80, 2):
+        image = cv2.imread(str(folder / "results" / f"frame{k:06d}.jpg"))[..., ::-1]
+        size = (camera.width, camera.height)
+        tracker.track(Frame(k, k / 30, cv2.resize(image, size, interpolation=cv2.INTER_AREA)))
+    tracker.finish()
+    centres = tracker.trajectory().T_wc[:, :3, 3]
+    assert error_cm(centres, T_wc[0:80:2, :3, 3]) < 0.3

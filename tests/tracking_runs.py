@@ -1,0 +1,20 @@
+"""A short path to track, and the error of what was tracked."""
+
+import numpy as np
+import torch
+
+from geogs.config import TrackingConfig
+from geogs.geometry.umeyama import umeyama
+from tracking_scenes import sideways
+
+CONFIG = TrackingConfig(init_keyframes=5)
+
+
+PATH = sideways(40)
+
+
+def error_cm(estimate: np.ndarray, truth: np.ndarray) -> float:
+    """RMSE of camera centres after a similarity, centimetres."""
+    x, y = torch.from_numpy(estimate), torch.from_numpy(truth)
+    scale, R, t = umeyama(x, y)
+    return 100 * float((scale * x @ R.T + t - y).square().sum(1).mean().sqrt())

@@ -1,0 +1,108 @@
+"""The GPU's room kernels against their PyTorch counterparts."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+import geogs_train.rooms.render as render_module
+from cuda_emulator import use_emulator
+from geogs_train.rooms.cameras import choose_cameras, too_near
+from geogs_train.rooms.draw import Draw
+from geogs_train.rooms.layout import draw_layout
+from geogs_train.rooms.lights import draw_lights
+from geogs_train.rooms.materials import draw_surfaces
+from geogs_train.rooms.options import RoomOptions
+from geogs_train.rooms.paths import draw_paths
+from geogs_train.rooms.raycast import closest_hit
+from geogs_train.rooms.reference import flow_by_torch, render_by_torch
+from geogs_train.rooms.render import (
+    MOST_SOLIDS,
+    SOURCE,
+    first_hit_by_kernel,
+    flow_by_kernel,
+    render_by_kernel,
+)
+from geogs_train.rooms.sampler import RoomSampler
+from geogs_train.rooms.scene import Rooms, moved
+from geogs_train.rooms.views import Views
+from random_rooms import small_bank
+
+
+@pytest.fixture(params=["emulated", pytest.param("gpu", marks=pytest.mark.gpu)])
+def device(request, monkeypatch) -> torch.device:
+    """Where the kernels run; everything is emulated where there is no GPU."""
+    if request.param == "emulated":
+        use_emulator(monkeypatch, render_module)
+        return torch.device("cpu")
+    if not torch.cuda.is_available():
+        pytest.skip("needs a CUDA GPU")
+    return torch.device("cuda")
+
+
+def furnished(device: torch.device) -> tuple[Rooms, Views]:
+    """Random rooms as they are trained with; on a GPU as large."""
+    large = device.type == "cuda"
+    width, height = (512, 384) if large else (45, 30)
+    options = RoomOptions(width=width, height=height, density=(0.7, 0.9), candidates=8)
+    draw = Draw(torch.device("cpu"), 3)
+    size = draw.uniform(3.0, 6.0, 2 if large else 1, 3)
+    layout = draw_layout(draw, size, options.density)
+    surfaces = draw_surfaces(draw, layout, 2, 1)
+    lights = draw_lights(draw, size, 2, 1.0)
+    views = choose_cameras(draw_paths(draw, options, size), size, layout.solids, width, height)
+    solids = layout.solids.without(too_near(layout.solids, views))
+    return moved(Rooms(size, solids, surfaces, lights), device), moved(views, device)
+
+
+def test_sources_and_python_agree_on_sizes():
+    text = SOURCE.with_name("solids.cuh").read_text()
+    assert f"#define MOST_SOLIDS {MOST_SOLIDS}\n" in text
+
+
+def test_renders_like_the_reference(device):
+    rooms, views = furnished(device)
+    bank = small_bank()
+    bank = replace(bank, texels=bank.texels.to(device))
+    fast, slow = render_by_kernel(rooms, bank, views), render_by_torch(rooms, bank, views)
+    # Rays that graze an edge, or whose texture level is between two, may fall on either side.
+    wrong = (fast.depth - slow.depth).abs() > 1e-4 * slow.depth
+    assert wrong.float().mean() < 2e-3
+    difference = (fast.colour - slow.colour).abs().amax(2)
+    assert difference.quantile(0.98) < 2e-3 if difference.numel() < 1e6 else True
+    assert (difference > 5e-3).float().mean() < 0.01
+
+
+def test_hits_like_the_reference(device):
+    rooms, _ = furnished(device)
+    g = torch.Generator().manual_seed(2)
+    b = len(rooms.size)
+    direction = torch.randn(b, 500, 3, generator=g).to(device)
+    origin = (0.5 * rooms.size[:, None]).expand_as(direction)
+    fast = first_hit_by_kernel(rooms.size, rooms.solids, origin, direction)
+    slow = closest_hit(rooms.size, rooms.solids, origin, direction)
+    assert (fast.solid != slow.solid).float().mean() < 5e-3
+    same = fast.solid == slow.solid
+    torch.testing.assert_close(fast.t[same], slow.t[same], rtol=1e-4, atol=1e-5)
+
+
+def test_flows_like_the_reference(device):
+    rooms, views = furnished(device)
+    b, v = views.T_cw.shape[:2]
+    depth = 1 + torch.rand(b, v, views.height, views.width, device=device)
+    fast = flow_by_kernel(rooms.solids, views, depth, 0, 1)
+    slow = flow_by_torch(rooms.solids, views, depth, 0, 1)
+    torch.testing.assert_close(fast.pixels, slow.pixels, rtol=1e-4, atol=1e-2)
+    assert (fast.valid == slow.valid).all()
+    assert (fast.visible != slow.visible).float().mean() < 2e-3
+    assert 0 < fast.visible.float().mean() < 1
+
+
+@pytest.mark.gpu
+def test_samples_on_a_gpu():
+    if not torch.cuda.is_available():
+        pytest.skip("needs a CUDA GPU")
+    sampler = RoomSampler(RoomOptions(textures=8, texture_size=64), "cuda")
+    clips, again = (sampler.sample(5, 4) for _ in range(2))
+    assert (clips.images == again.images).all()
+    assert clips.flow(0, 1).visible.float().mean() > 0.4
