@@ -27,7 +27,7 @@ from geogs.bundle.motion_only import solve_poses
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import retract, se3_exp
 from geogs.keyframes.grid import SampleGrid
-from geogs.keyframes.store import KeyframeStore
+from geogs.keyframes.store import KeyframeStore, Segment
 from geogs.loop.global_bundle import global_bundle
 from geogs.tracking.flow.base import FlowMatch
 from geogs.tracking.flow.classical import ClassicalFlow
@@ -222,9 +222,9 @@ def test_not_finite_input_is_refused_and_reported(device, which, count):
     )
 
 
-def keyframes(problem: BundleProblem, camera: Camera, device: torch.device) -> KeyframeStore:
+def keyframes(problem: BundleProblem, camera: Camera, device: torch.device) -> Segment:
     """The frames of a problem; a fifth of their cells have no information."""
-    store = KeyframeStore(SampleGrid(camera, device))
+    store = KeyframeStore(SampleGrid(camera, device)).new_segment()
     g = torch.Generator().manual_seed(5)
     image = np.zeros((4, 4, 3), np.uint8)
     for n, (T, d) in enumerate(zip(problem.T_cw, problem.inverse_depth, strict=True)):
@@ -392,7 +392,7 @@ def test_tracker_runs_on_the_gpu_as_on_the_cpu():
     truth = np.stack(PATH)[:, :3, 3]
     assert trajectory.tracked.all()
     assert error_cm(trajectory.T_wc[:, :3, 3], truth) < 0.5
-    keyframe = tracker.keyframe(tracker.keyframe_ids[0])
+    keyframe = tracker.keyframes[tracker.keyframe_ids[0]]
     assert keyframe.T_cw.device.type == "cpu"
     assert keyframe.inverse_depth.device.type == "cuda"
     global_bundle(tracker)

@@ -12,17 +12,19 @@ from geogs.config import Config
 from geogs.depth.view import DenseDepth
 from geogs.geometry.lie import retract, se3_exp, se3_inverse
 from geogs.losses.cuda import window
+from geogs.mapping.cameras import MapCameras
 from geogs.mapping.cuda import trainer as cuda_trainer
 from geogs.mapping.cuda.trainer import CudaTrainer
 from geogs.mapping.training import Batch, Trainer
-from geogs.mapping.view import MapCameras, MapView
+from geogs.mapping.view import MapView
+from geogs.mapping.view_pool import ViewPool
 from geogs.splat.cuda import rasterize
 from geogs.splat.map import DiskParameters, GaussianMap
 from geogs.synth.export import default_camera
 from geogs.synth.raycast import Raycaster
 from geogs.synth.room import make_room
 from geogs.synth.trajectory import handheld_trajectory
-from geogs.types import Keyframe
+from keyframe_samples import Sample, segment_of
 
 WORKING = default_camera(96, 72)
 CAMERAS = MapCameras(WORKING, WORKING.with_long_edge(40), WORKING.with_long_edge(80))
@@ -42,28 +44,30 @@ def device(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> t
 
 
 @pytest.fixture(scope="module")
-def rendered() -> list[tuple[Keyframe, np.ndarray]]:
+def rendered() -> list[tuple[Sample, np.ndarray]]:
     """Four keyframes of a room with their true depth at render size."""
     scene = make_room(3)
     caster = Raycaster(scene)
     poses = handheld_trajectory(scene, 64)
     out = []
-    for n, index in enumerate(range(0, 32, 8)):
+    for index in range(0, 32, 8):
         view = caster.render(WORKING, poses[index])
         grid = torch.from_numpy(1 / view.depth[4:-3:8, 4:-3:8]).float()
         T_cw = se3_inverse(torch.from_numpy(poses[index]))
-        keyframe = Keyframe(n, index, index / 30, view.image, T_cw, grid, torch.ones_like(grid))
+        keyframe = Sample(index, view.image, T_cw, grid, torch.ones_like(grid))
         out.append((keyframe, caster.render(CAMERAS.render, poses[index]).depth))
     return out
 
 
 def make_views(rendered, device: torch.device) -> list[MapView]:
-    views = []
-    for keyframe, depth in rendered:
-        view = MapView.of(keyframe, CAMERAS, CONFIG.loss, device)
+    views, pool = [], ViewPool(CAMERAS, CONFIG.loss, device, 128)
+    segment = segment_of([keyframe for keyframe, _ in rendered], WORKING, device)
+    for keyframe, (_, depth) in zip(segment, rendered, strict=True):
+        pool.add(keyframe)
+        view = MapView(keyframe, pool)
         dense = torch.from_numpy(depth).float().to(device)
         confidence = torch.full_like(dense, 0.8)
-        view.set_depth(DenseDepth(dense, confidence, dense.median().cpu()), CAMERAS)
+        pool.set_depth(view.id, DenseDepth(dense, confidence, dense.median().cpu()))
         view.partners = [i for i in range(len(rendered)) if i != view.id][:2]
         views.append(view)
     return views

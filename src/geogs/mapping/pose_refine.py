@@ -9,8 +9,9 @@ from torch import Tensor
 from geogs.config import MappingConfig
 from geogs.geometry.lie import retract
 from geogs.losses import fused_multi_view, fused_single_view
+from geogs.mapping.cameras import MapCameras
 from geogs.mapping.tangent_adam import TangentAdam
-from geogs.mapping.view import MapCameras, MapView
+from geogs.mapping.view import MapView
 from geogs.splat.map import DiskParameters, GaussianMap
 from geogs.splat.render import render
 

@@ -11,8 +11,9 @@ from torch import Tensor
 
 from geogs.config import MappingConfig
 from geogs.losses import fused_multi_view, fused_single_view
+from geogs.mapping.cameras import MapCameras
 from geogs.mapping.pose_refine import refine_poses
-from geogs.mapping.view import MapCameras, MapView
+from geogs.mapping.view import MapView
 from geogs.splat.cpu.in_view import disks_in_view
 from geogs.splat.map import DiskParameters, GaussianMap
 from geogs.splat.optimizer import LearningRates, MapOptimizer
@@ -110,16 +111,16 @@ class MapTrainer(Protocol):
 
 
 def map_trainer(
-    disks: GaussianMap, cameras: MapCameras, config: MappingConfig, unit: float
+    disks: GaussianMap, cameras: MapCameras, config: MappingConfig, unit: float, resident: int
 ) -> MapTrainer:
-    """The trainer of the device that holds the map.
+    """The trainer of the device that holds the map; a GPU has ``resident`` views at hand.
 
     A GPU trains in fused kernels, a CPU in compiled ones.
     """
     if disks.device.type == "cuda":
         from geogs.mapping.cuda.trainer import CudaTrainer
 
-        return CudaTrainer(disks, cameras, config, unit)
+        return CudaTrainer(disks, cameras, config, unit, resident)
     return Trainer(disks, cameras, config, unit)
 
 

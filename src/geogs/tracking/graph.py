@@ -17,7 +17,7 @@ from geogs.bundle.dense import (
     relative_motion,
 )
 from geogs.bundle.streamed import StreamedBundle, StreamedProblem
-from geogs.keyframes.store import KeyframeStore
+from geogs.keyframes.store import Segment
 from geogs.threads import thread_map
 from geogs.tracking.flow.base import FlowMatch, FlowOperator
 from geogs.tracking.packed_edge import PackedEdge, packed_reprojections
@@ -59,7 +59,7 @@ Edge = MeasuredEdge | PackedEdge
 class FrameGraph:
     """Pairs of keyframes with their flow in both directions."""
 
-    def __init__(self, keyframes: KeyframeStore, operator: FlowOperator) -> None:
+    def __init__(self, keyframes: Segment, operator: FlowOperator) -> None:
         self.keyframes = keyframes
         self.operator = operator
         self.edges: dict[Pair, Edge] = {}

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from geogs.bundle.dense import project, relative_motion
-from geogs.keyframes.store import KeyframeStore
+from geogs.keyframes.store import Segment
 from geogs.threads import thread_map
 from geogs.tracking.overlap import may_overlap
 
@@ -21,7 +21,7 @@ LEAST_OVERLAP = 0.2
 
 
 def frame_distances(
-    store: KeyframeStore, directed: Sequence[Pair], rotation_weight: float = 0.3, step: int = 2
+    store: Segment, directed: Sequence[Pair], rotation_weight: float = 0.3, step: int = 2
 ) -> Float[Tensor, "e"]:
     """DROID-SLAM's distance of directed keyframe pairs in pixels; infinite at little overlap.
 
@@ -59,7 +59,7 @@ def frame_distances(
 
 
 def proximity_pairs(
-    store: KeyframeStore,
+    store: Segment,
     later: Sequence[int],
     earlier: Sequence[int],
     existing: Iterable[Pair],
@@ -105,7 +105,7 @@ def proximity_pairs(
 
 
 def _by_distance(
-    store: KeyframeStore,
+    store: Segment,
     rows: Int[np.ndarray, "r"],
     columns: Int[np.ndarray, "c"],
     wanted: Bool[np.ndarray, "r c"],

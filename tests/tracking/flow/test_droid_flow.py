@@ -217,7 +217,7 @@ def test_half_precision_is_close(operator, start, monkeypatch):
 def test_the_graph_adjusts_what_the_operator_measures():
     """The whole way: memory, weights and damping through the graph into the adjustment."""
     operator = DroidFlow(GRID, narrow(delta=(0.0, 0.0)))
-    store = KeyframeStore(GRID)
+    store = KeyframeStore(GRID).new_segment()
     for k, T in enumerate(POSES):
         image, depth = render(T)
         state = store.add(

@@ -12,7 +12,7 @@ from geogs.bundle.cuda.bundle import block_size
 from geogs.gpu.kernels import Kernel, kernels_for
 from geogs.gpu.transfer import to_device
 from geogs.keyframes.grid import SampleGrid
-from geogs.keyframes.store import KeyframeStore
+from geogs.keyframes.store import Segment
 
 SOURCE = Path(__file__).with_name("bundle_graph.cu")
 
@@ -28,7 +28,7 @@ class DirectedPairs:
     target: Int[Tensor, "e"]
 
     @classmethod
-    def of(cls, store: KeyframeStore, directed: Sequence[tuple[int, int]]) -> "DirectedPairs":
+    def of(cls, store: Segment, directed: Sequence[tuple[int, int]]) -> "DirectedPairs":
         """Pairs (source, target) of keyframe ids."""
         ids = sorted({k for pair in directed for k in pair})
         slot = {k: n for n, k in enumerate(ids)}

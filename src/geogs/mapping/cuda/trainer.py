@@ -1,7 +1,7 @@
 """Training the map on a GPU: whole steps captured in CUDA graphs and replayed."""
 
-from collections import OrderedDict
 from collections.abc import Iterable, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -12,11 +12,13 @@ from torch import Tensor
 from geogs.config import MappingConfig
 from geogs.gpu.kernels import kernels_for
 from geogs.gpu.transfer import to_device
+from geogs.keyframes.swap import Swap
 from geogs.losses.cuda.view_table import ViewTable
+from geogs.mapping.cameras import MapCameras
 from geogs.mapping.cuda.pose_refine import refine_poses
 from geogs.mapping.cuda.window_pass import WindowPass
 from geogs.mapping.training import GRADIENT_LIMIT, Batch, learning_rates
-from geogs.mapping.view import MapCameras, MapView
+from geogs.mapping.view import MapView
 from geogs.splat.cuda import rasterize
 from geogs.splat.map import GaussianMap
 from geogs.splat.optimizer import MapOptimizer
@@ -33,43 +35,46 @@ class KnownViews:
 
     def __init__(self, cameras: MapCameras, device: torch.device, resident: int) -> None:
         self.table = ViewTable(cameras.render, cameras.photo, device)
-        self.resident = resident
-        self._slots: OrderedDict[int, int] = OrderedDict()
+        self._slots: Swap[int, int] = Swap(resident, self._free)
+        self._unused: list[int] = []
+        """Slots whose views had to go."""
         self._constants: dict[int, object] = {}
         self._poses: dict[int, Tensor] = {}
 
     def slots(self, views: Sequence[MapView]) -> list[int]:
         """The table's slots of some views, with their present constants and poses."""
-        moved, wanted = {}, {view.id for view in views}
+        moved, slots, wanted = {}, [], {view.id for view in views}
         for view in views:
-            constants = view.constants
-            if view.id not in self._slots:
-                self._slots[view.id] = self._free_slot(view, wanted)
-            elif constants is not None and self._constants[view.id] is not constants:
-                self.table.set_constants(self._slots[view.id], constants)
-            self._slots.move_to_end(view.id)
+            constants, is_new = view.constants, view.id not in self._slots
+            slot = self._slots.get(view.id, partial(self._new_slot, view), wanted)
+            if not is_new and constants is not None and self._constants[view.id] is not constants:
+                self.table.set_constants(slot, constants)
+            slots.append(slot)
             self._constants[view.id] = constants
             if self._poses.get(view.id) is not view.T_cw:
                 moved[view.id] = view.T_cw
         if moved:
             self.set_poses(list(moved), torch.stack(list(moved.values())))
             self._poses.update(moved)
-        return [self._slots[view.id] for view in views]
+        return slots
 
-    def _free_slot(self, view: MapView, wanted: set[int]) -> int:
+    def _new_slot(self, view: MapView) -> int:
         """A slot that now stands for the view."""
-        gone = next((i for i in self._slots if i not in wanted), None)
-        if len(self._slots) < self.resident or gone is None:
+        if not self._unused:
             return self.table.add(view.constants, view.photo)
-        slot = self._slots.pop(gone)
-        del self._constants[gone]
-        self._poses.pop(gone, None)
+        slot = self._unused.pop()
         self.table.replace(slot, view.constants, view.photo)
         return slot
 
+    def _free(self, id: int, slot: int) -> None:
+        del self._constants[id]
+        self._poses.pop(id, None)
+        self._unused.append(slot)
+
     def set_poses(self, ids: Sequence[int], T_cw: Float[Tensor, "k 4 4"]) -> None:
         """Poses to work with until ``slots`` is asked for again."""
-        self.table.set_poses([self._slots[i] for i in ids], T_cw)
+        slots = [slot for i in ids if (slot := self._slots.peek(i)) is not None]
+        self.table.set_poses(slots, T_cw)
         for i in ids:
             self._poses.pop(i, None)
 
@@ -82,10 +87,17 @@ class CudaTrainer:
     schedule. A step whose list entries find no room changes nothing and is done again with more.
     """
 
-    def __init__(self, disks: GaussianMap, cameras: MapCameras, config: MappingConfig, unit: float):
+    def __init__(
+        self,
+        disks: GaussianMap,
+        cameras: MapCameras,
+        config: MappingConfig,
+        unit: float,
+        resident: int,
+    ) -> None:
         self.disks, self.cameras, self.config, self.unit = disks, cameras, config, unit
         self.optimizer = MapOptimizer(disks, learning_rates(config, unit))
-        self.known = KnownViews(cameras, disks.device, config.resident_views)
+        self.known = KnownViews(cameras, disks.device, resident)
         self._programs: dict[tuple[int, int], _TrainingStep] = {}
         self._pose_pass: WindowPass | None = None
 
