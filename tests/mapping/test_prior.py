@@ -11,7 +11,7 @@ from geogs.depth.view import DenseDepth, KeyframeDepth
 from geogs.geometry.camera import Camera
 from geogs.keyframes.grid import SampleGrid
 from geogs.keyframes.store import KeyframeStore
-from geogs.losses import fused_single_view
+from geogs.losses.cpu import fused_single_view
 from geogs.losses.single_view import single_view_loss
 from geogs.mapping.view import MapCameras, MapView
 from geogs.priors.base import PriorMaps

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from geogs.config import MappingConfig
 from geogs.geometry.lie import retract
-from geogs.losses import fused_multi_view, fused_single_view
+from geogs.losses.cpu import fused_multi_view, fused_single_view
 from geogs.mapping.tangent_adam import TangentAdam
 from geogs.mapping.view import MapCameras, MapView
 from geogs.splat.map import DiskParameters, GaussianMap

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from geogs.config import MappingConfig
-from geogs.losses import fused_multi_view, fused_single_view
+from geogs.losses.cpu import fused_multi_view, fused_single_view
 from geogs.mapping.pose_refine import refine_poses
 from geogs.mapping.view import MapCameras, MapView
 from geogs.splat.cpu.in_view import disks_in_view
