@@ -23,7 +23,7 @@ from torch import Tensor
 
 from geogs.bundle.dense import bundle_solver
 from geogs.config import MappingConfig
-from geogs.depth.engine import depth_engine
+from geogs.depth.select import depth_engine
 from geogs.errors import InputError
 from geogs.keyframes.archive import Archive, Archived, SettledArchive
 from geogs.keyframes.grid import SampleGrid

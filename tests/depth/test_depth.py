@@ -10,9 +10,9 @@ import torch
 from depth_scene import RENDER, WORKING, DepthScene, make_scene
 from geogs.config import DepthConfig
 from geogs.depth.carve import vote
-from geogs.depth.engine import depth_engine
 from geogs.depth.estimate import estimate_depth
 from geogs.depth.fusion import check_depth
+from geogs.depth.select import depth_engine
 from geogs.depth.sweep_neighbors import (
     depth_range,
     parallax_degrees,

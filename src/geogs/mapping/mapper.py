@@ -12,7 +12,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from geogs.config import MappingConfig
-from geogs.depth.engine import Progress, depth_engine, silent
+from geogs.depth.base import Progress, silent
+from geogs.depth.select import depth_engine
 from geogs.geometry.camera import Camera
 from geogs.keyframes.archive import Archive, Archived
 from geogs.mapping.keyframe_depths import CANDIDATES, KeyframeDepths
