@@ -27,8 +27,8 @@ from geogs.depth.view import DenseDepth
 from geogs.geometry.depth import normals_from_depth
 from geogs.geometry.lie import se3_inverse
 from geogs.losses import multi_view_loss, single_view_loss
-from geogs.mapping.cuda.trainer import CudaTrainer
-from geogs.mapping.training import Batch
+from geogs.mapping.training.base import Batch
+from geogs.mapping.training.cuda.trainer import CudaTrainer
 from geogs.mapping.view import MapCameras, MapView
 from geogs.splat.cuda import autograd
 from geogs.splat.init import initialise_disks

@@ -17,7 +17,7 @@ import torch
 from geogs.config import MappingConfig
 from geogs.depth.view import DenseDepth, KeyframeDepth
 from geogs.geometry.lie import se3_inverse
-from geogs.mapping.training import Trainer, view_loss
+from geogs.mapping.training.cpu import Trainer, view_loss
 from geogs.mapping.view import MapCameras, MapView
 from geogs.splat.init import initialise_disks
 from geogs.splat.map import GaussianMap

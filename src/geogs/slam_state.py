@@ -27,7 +27,8 @@ from geogs.depth.select import depth_engine
 from geogs.errors import InputError
 from geogs.keyframes.archive import Archive, Archived, SettledArchive
 from geogs.keyframes.grid import SampleGrid
-from geogs.mapping.training import MapTrainer, map_trainer
+from geogs.mapping.training.base import MapTrainer
+from geogs.mapping.training.select import map_trainer
 from geogs.mapping.view import MapCameras
 from geogs.slam import Slam
 from geogs.splat.map import GaussianMap

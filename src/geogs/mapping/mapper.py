@@ -20,13 +20,8 @@ from geogs.mapping.keyframe_depths import CANDIDATES, KeyframeDepths
 from geogs.mapping.map_update import MapUpdate, plan_update, witness
 from geogs.mapping.rendered import rendered_keyframe, searched_keyframe
 from geogs.mapping.stored_renders import RenderStore, StoredRender
-from geogs.mapping.training import (
-    Batch,
-    MapTrainer,
-    TrainingPlace,
-    draw_partners,
-    map_trainer,
-)
+from geogs.mapping.training.base import Batch, MapTrainer, TrainingPlace, draw_partners
+from geogs.mapping.training.select import map_trainer
 from geogs.mapping.view import MapCameras, MapView
 from geogs.mapping.view_maps import ResidentViews
 from geogs.mapping.window import choose_partners, draw_views, views_around

@@ -12,9 +12,10 @@ from geogs.config import Config
 from geogs.depth.view import DenseDepth
 from geogs.geometry.lie import retract, se3_exp, se3_inverse
 from geogs.losses.cuda import window
-from geogs.mapping.cuda import trainer as cuda_trainer
-from geogs.mapping.cuda.trainer import CudaTrainer
-from geogs.mapping.training import Batch, Trainer
+from geogs.mapping.training.base import Batch
+from geogs.mapping.training.cpu import Trainer
+from geogs.mapping.training.cuda import trainer as cuda_trainer
+from geogs.mapping.training.cuda.trainer import CudaTrainer
 from geogs.mapping.view import MapCameras, MapView
 from geogs.splat.cuda import rasterize
 from geogs.splat.map import DiskParameters, GaussianMap
