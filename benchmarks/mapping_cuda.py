@@ -30,8 +30,8 @@ from geogs.keyframes.grid import SampleGrid
 from geogs.keyframes.store import KeyframeStore, Segment
 from geogs.losses import multi_view_loss, single_view_loss
 from geogs.mapping.cameras import MapCameras
-from geogs.mapping.cuda.trainer import CudaTrainer
-from geogs.mapping.training import Batch
+from geogs.mapping.training.base import Batch
+from geogs.mapping.training.cuda.trainer import CudaTrainer
 from geogs.mapping.view import MapView
 from geogs.mapping.view_pool import ViewPool
 from geogs.splat.cuda import autograd

@@ -20,7 +20,7 @@ from geogs.geometry.lie import se3_inverse
 from geogs.keyframes.grid import SampleGrid
 from geogs.keyframes.store import KeyframeStore
 from geogs.mapping.cameras import MapCameras
-from geogs.mapping.training import Trainer, view_loss
+from geogs.mapping.training.cpu import Trainer, view_loss
 from geogs.mapping.view import MapView
 from geogs.mapping.view_pool import ViewPool
 from geogs.splat.init import initialise_disks

@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 from depth_scene import WORKING, make_scene, trace
 from geogs.cli.reconstruct import seconds
 from geogs.config import InputConfig
-from geogs.depth.engine import CpuDepthEngine
+from geogs.depth.classical import CpuDepthEngine
 from geogs.depth.estimate import estimate_depth
 from geogs.depth.view import depth_view
 from geogs.errors import InputError

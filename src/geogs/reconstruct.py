@@ -19,7 +19,7 @@ from geogs.mapping.depth_schedule import search_depths
 from geogs.mapping.map_frame import MapFrame
 from geogs.mapping.mapper import Mapper
 from geogs.mapping.state import MapperState, mapper_state, restore_mapper
-from geogs.mapping.training import TrainingPlace
+from geogs.mapping.training.base import TrainingPlace
 from geogs.on_demand import OnDemand
 from geogs.splat.map import DiskParameters
 from geogs.stopwatch import Stopwatch

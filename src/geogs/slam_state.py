@@ -23,12 +23,13 @@ from torch import Tensor
 
 from geogs.bundle.dense import bundle_solver
 from geogs.config import MappingConfig
-from geogs.depth.engine import depth_engine
+from geogs.depth.select import depth_engine
 from geogs.errors import InputError
 from geogs.keyframes.archive import Archive, Archived, SettledArchive
 from geogs.keyframes.grid import SampleGrid
 from geogs.mapping.cameras import MapCameras
-from geogs.mapping.training import MapTrainer, map_trainer
+from geogs.mapping.training.base import MapTrainer
+from geogs.mapping.training.select import map_trainer
 from geogs.slam import Slam
 from geogs.splat.map import GaussianMap
 from geogs.splat.optimizer import MapOptimizer

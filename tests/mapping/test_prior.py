@@ -12,7 +12,7 @@ from geogs.geometry.camera import Camera
 from geogs.keyframes.grid import SampleGrid
 from geogs.keyframes.keyframe import Keyframe
 from geogs.keyframes.store import KeyframeStore
-from geogs.losses import fused_single_view
+from geogs.losses.cpu import fused_single_view
 from geogs.losses.single_view import single_view_loss
 from geogs.mapping.cameras import MapCameras
 from geogs.mapping.view import MapView

@@ -9,10 +9,10 @@ from geogs.config import DiskConfig, MappingConfig
 from geogs.depth.view import DenseDepth
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp
-from geogs.mapping import training
 from geogs.mapping.cameras import MapCameras
-from geogs.mapping.cuda.trainer import KnownViews
-from geogs.mapping.training import Trainer
+from geogs.mapping.training import cpu as training
+from geogs.mapping.training.cpu import Trainer
+from geogs.mapping.training.cuda.known_views import KnownViews
 from geogs.mapping.view import MapView
 from geogs.mapping.view_pool import ViewPool
 from geogs.splat import init

@@ -1,7 +1,7 @@
 """The dense depths of a mapper's keyframes: searched, and checked by those around."""
 
 from geogs.config import DepthConfig
-from geogs.depth.engine import DepthEngine, Progress, silent
+from geogs.depth.base import DepthEngine, Progress, silent
 from geogs.depth.sweep_neighbors import select_sweep_neighbours
 from geogs.mapping.view import MapView
 from geogs.mapping.view_pool import StoredDepth, ViewPool

@@ -11,7 +11,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from geogs.config import MappingConfig
-from geogs.depth.engine import Progress, depth_engine, silent
+from geogs.depth.base import Progress, silent
+from geogs.depth.select import depth_engine
 from geogs.keyframes.archive import Archive
 from geogs.keyframes.store import KeyframeStore
 from geogs.mapping.cameras import MapCameras
@@ -19,13 +20,8 @@ from geogs.mapping.keyframe_depths import CANDIDATES, KeyframeDepths
 from geogs.mapping.map_update import MapUpdate, plan_update, witness
 from geogs.mapping.rendered import rendered_keyframe, searched_keyframe
 from geogs.mapping.stored_renders import StoredRender, stored_render
-from geogs.mapping.training import (
-    Batch,
-    MapTrainer,
-    TrainingPlace,
-    draw_partners,
-    map_trainer,
-)
+from geogs.mapping.training.base import Batch, MapTrainer, TrainingPlace, draw_partners
+from geogs.mapping.training.select import map_trainer
 from geogs.mapping.view import MapView
 from geogs.mapping.view_pool import ViewPool
 from geogs.mapping.window import choose_partners, draw_views, views_around
@@ -68,7 +64,11 @@ class Mapper:
         self.cameras = MapCameras.of(keyframes.grid.camera, config)
         self.map = GaussianMap.empty(keyframes.grid.device)
         engine = depth_engine(
-            self.map.device, self.cameras.render, self.cameras.working, config.depth
+            self.map.device,
+            self.cameras.render,
+            self.cameras.working,
+            config.depth,
+            keyframes.resident,
         )
         self.views: dict[int, MapView] = {}
         self.pool = ViewPool(self.cameras, config.loss, self.map.device, keyframes.resident)

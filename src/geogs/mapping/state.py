@@ -8,7 +8,7 @@ from torch import Tensor
 
 from geogs.depth.view import DenseDepth, DepthSearch
 from geogs.mapping.mapper import Mapper
-from geogs.mapping.training import TrainingPlace
+from geogs.mapping.training.base import TrainingPlace
 from geogs.splat.map import DiskParameters
 
 

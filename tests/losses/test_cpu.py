@@ -10,13 +10,8 @@ import torch
 from geogs.config import LossConfig
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp
-from geogs.losses import (
-    PhotoView,
-    fused_multi_view,
-    fused_single_view,
-    multi_view_loss,
-    single_view_loss,
-)
+from geogs.losses import PhotoView, multi_view_loss, single_view_loss
+from geogs.losses.cpu import fused_multi_view, fused_single_view
 from loss_scenes import ALL_TERMS, random_view
 
 SMALL = Camera(70.0, 71.0, 39.3, 30.2, 80, 60)

@@ -13,9 +13,10 @@ from geogs.depth.view import DenseDepth
 from geogs.geometry.lie import retract, se3_exp, se3_inverse
 from geogs.losses.cuda import window
 from geogs.mapping.cameras import MapCameras
-from geogs.mapping.cuda import trainer as cuda_trainer
-from geogs.mapping.cuda.trainer import CudaTrainer
-from geogs.mapping.training import Batch, Trainer
+from geogs.mapping.training.base import Batch
+from geogs.mapping.training.cpu import Trainer
+from geogs.mapping.training.cuda import trainer as cuda_trainer
+from geogs.mapping.training.cuda.trainer import CudaTrainer
 from geogs.mapping.view import MapView
 from geogs.mapping.view_pool import ViewPool
 from geogs.splat.cuda import rasterize

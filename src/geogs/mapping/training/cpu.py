@@ -1,8 +1,6 @@
-"""Training the map: losses of some views, gradients, Adam."""
+"""Training the map on a CPU, view by view."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -10,48 +8,20 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from geogs.config import MappingConfig
-from geogs.losses import fused_multi_view, fused_single_view
+from geogs.losses.cpu import fused_multi_view, fused_single_view
 from geogs.mapping.cameras import MapCameras
-from geogs.mapping.pose_refine import refine_poses
+from geogs.mapping.training.base import GRADIENT_LIMIT, Batch, learning_rates
+from geogs.mapping.training.pose_refine import refine_poses
 from geogs.mapping.view import MapView
 from geogs.splat.cpu.in_view import disks_in_view
 from geogs.splat.map import DiskParameters, GaussianMap
-from geogs.splat.optimizer import LearningRates, MapOptimizer
+from geogs.splat.optimizer import MapOptimizer
 from geogs.splat.render import RenderOutput, render
-
-Batch = list[tuple[MapView, list[MapView]]]
-"""The views of one step, each with the partners that check it by their images."""
-
-GRADIENT_LIMIT = 1e3
-"""A disk whose gradient exceeds this has met a numerical accident (a nearly edge-on pixel)."""
-
 
 # Part of the map up to which an excerpt is trained rather than all of it.
 _LARGE_EXCERPT = 0.7
 # Standard deviations at which a disk of any opacity has faded below what the renderer shows.
 REACH = 3.4
-
-
-@dataclass(frozen=True, slots=True)
-class TrainingPlace:
-    """How far a long training is."""
-
-    steps: int = 0
-    """Done."""
-    total: int = 0
-    """To be done in all."""
-    seconds: float = 0.0
-    """Spent."""
-
-
-def learning_rates(config: MappingConfig, unit: float, factor: float = 1.0) -> LearningRates:
-    """Adam steps in map units; ``unit`` is the map's typical depth."""
-    return LearningRates(
-        position=config.lr_position * unit * factor,
-        quaternion=config.lr_quaternion * factor,
-        log_scale=config.lr_scale * factor,
-        opacity_logit=config.lr_opacity * factor,
-    )
 
 
 def view_loss(
@@ -70,58 +40,12 @@ def view_loss(
         view.known, config.loss, unit,
     )  # fmt: skip
     if partners:
-        depth = _within(view, shown_depth(output, config.loss.min_alpha))
+        depth = _within(view, output.shown_depth(config.loss.min_alpha))
         for other in partners:
             loss = loss + fused_multi_view(
                 depth, view.photo, other.photo, other.rendered_depth, config.loss
             ) / max(len(partners), config.photo.per_step)
     return loss
-
-
-def draw_partners(
-    view: MapView, views: dict[int, MapView], config: MappingConfig, random: np.random.Generator
-) -> list[MapView]:
-    """Some of a view's partners, at random."""
-    ids = [i for i in view.partners if i in views]
-    count = min(config.photo.per_step, len(ids))
-    return [views[ids[i]] for i in random.choice(len(ids), count, replace=False)] if count else []
-
-
-@runtime_checkable
-class MapTrainer(Protocol):
-    """Trains a map in place, and poses on it."""
-
-    optimizer: MapOptimizer
-    unit: float
-    """Length in map units by which settings that are lengths are scaled."""
-
-    def train(self, batches: Sequence[Batch], factors: Sequence[float] | None = None) -> None:
-        """One Adam step per batch on its summed losses; ``factors`` scale all learning rates."""
-        ...
-
-    def refine_poses(
-        self, active: list[MapView], views: dict[int, MapView], config: MappingConfig
-    ) -> dict[int, Float[Tensor, "4 4"]]:
-        """Poses of the active keyframes that agree better with the map; the earliest stays."""
-        ...
-
-    def forget_renders(self, views: Iterable[MapView]) -> None:
-        """What the views showed of the map counts no more: it was moved."""
-        ...
-
-
-def map_trainer(
-    disks: GaussianMap, cameras: MapCameras, config: MappingConfig, unit: float, resident: int
-) -> MapTrainer:
-    """The trainer of the device that holds the map; a GPU has ``resident`` views at hand.
-
-    A GPU trains in fused kernels, a CPU in compiled ones.
-    """
-    if disks.device.type == "cuda":
-        from geogs.mapping.cuda.trainer import CudaTrainer
-
-        return CudaTrainer(disks, cameras, config, unit, resident)
-    return Trainer(disks, cameras, config, unit)
 
 
 class Trainer:
@@ -193,7 +117,7 @@ class Trainer:
             loss = view_loss(view, partners, output, self.config, self.unit)
             loss.backward()
             with torch.no_grad():
-                shown = shown_depth(output, self.config.loss.min_alpha)
+                shown = output.shown_depth(self.config.loss.min_alpha)
                 view.rendered_depth = _within(view, shown)
             visible |= output.visible
             total += float(loss.detach())
@@ -208,11 +132,6 @@ class Trainer:
         disk = self.config.disk
         low, high = disk.min_scale * self.unit, disk.max_scale * self.unit
         self.disks.log_scale.clamp_(float(np.log(low)), float(np.log(high)))
-
-
-def shown_depth(output: RenderOutput, min_alpha: float) -> Float[Tensor, "h w"]:
-    """Rendered depth where the map is opaque enough to hide what lies behind, else 0."""
-    return torch.where(output.alpha.detach() > min_alpha, output.depth, 0.0)
 
 
 def _within(view: MapView, depth: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:

@@ -2,7 +2,7 @@
 
 import torch
 
-from geogs.mapping.tangent_adam import TangentAdam
+from geogs.mapping.training.tangent_adam import TangentAdam
 
 
 def test_equals_torch() -> None:

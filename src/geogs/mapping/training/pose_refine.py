@@ -8,9 +8,9 @@ from torch import Tensor
 
 from geogs.config import MappingConfig
 from geogs.geometry.lie import retract
-from geogs.losses import fused_multi_view, fused_single_view
+from geogs.losses.cpu import fused_multi_view, fused_single_view
 from geogs.mapping.cameras import MapCameras
-from geogs.mapping.tangent_adam import TangentAdam
+from geogs.mapping.training.tangent_adam import TangentAdam
 from geogs.mapping.view import MapView
 from geogs.splat.map import DiskParameters, GaussianMap
 from geogs.splat.render import render
@@ -83,7 +83,7 @@ def _pose_loss(
             output.depth, output.normal, output.alpha.detach(), output.distortion.detach(),
             view.known, loss_config, unit,
         )  # fmt: skip
-        depth = torch.where(output.alpha.detach() > loss_config.min_alpha, output.depth, 0.0)
+        depth = output.shown_depth(loss_config.min_alpha)
         for i in view.partners[:1]:
             other = views[i]
             target = other.photo.at(pose_of.get(i, other.T_cw))

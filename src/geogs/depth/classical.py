@@ -1,7 +1,6 @@
-"""Where keyframe depths are computed: on the CPU, or on the GPU that holds the map."""
+"""Keyframe depths by matching and fusion without a network, on the CPU."""
 
-from collections.abc import Callable, Sequence
-from typing import Protocol, runtime_checkable
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -9,6 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from geogs.config import DepthConfig
+from geogs.depth.base import Limits, Progress, silent
 from geogs.depth.carve import vote
 from geogs.depth.estimate import estimate_depth
 from geogs.depth.fusion import check_depth
@@ -17,49 +17,8 @@ from geogs.geometry.camera import Camera
 from geogs.splat.cpu.in_view import disks_in_view
 from geogs.threads import thread_map
 
-Progress = Callable[[float], None]
-"""Called with the finished fraction."""
 # Views whose depths may be in memory at once.
 _FEW_VIEWS = 128
-
-Limits = tuple[float, float]
-"""Nearest and farthest depth to search, map units."""
-
-
-def silent(fraction: float) -> None:
-    """Progress that nobody watches."""
-
-
-@runtime_checkable
-class DepthEngine(Protocol):
-    """The keyframe depth's heavy parts; tensors live on the engine's device."""
-
-    def observe(self, view: DepthView) -> None:
-        """A view that others will be matched with: prepare what depends on its image alone."""
-        ...
-
-    def estimate(
-        self,
-        references: Sequence[DepthView],
-        neighbours: Sequence[Sequence[DepthView]],
-        progress: Progress = silent,
-        limits: Sequence[Limits | None] | None = None,
-    ) -> list[DenseDepth]:
-        """Dense depth of every reference, matched with its neighbours (``estimate_depth``).
-
-        ``limits`` are the nearest and farthest depth to search; none leaves them to the tracker.
-        """
-        ...
-
-    def check(
-        self, depths: Sequence[PosedDepth], others: Sequence[Sequence[PosedDepth]]
-    ) -> list[DenseDepth]:
-        """Every depth repaired, averaged and judged by its others (``check_depth``)."""
-        ...
-
-    def keep(self, points: Float[Tensor, "n 3"], depths: Sequence[PosedDepth]) -> Bool[Tensor, "n"]:
-        """World points that do not stand in the free space of the depths (``vote``)."""
-        ...
 
 
 class CpuDepthEngine:
@@ -123,16 +82,3 @@ class CpuDepthEngine:
             views = ((d.T_cw, d.depth.arrays()) for d in held)
             kept[seen] = torch.from_numpy(vote(some, views, self.render, self.config))
         return kept
-
-
-def depth_engine(
-    device: torch.device | str, render: Camera, working: Camera, config: DepthConfig
-) -> DepthEngine:
-    """The engine for a map on ``device``: depths at the size of ``render``, refined at that of
-    ``working``, the size of the keyframes' images.
-    """
-    if torch.device(device).type == "cuda":
-        from geogs.depth.cuda.engine import CudaDepthEngine
-
-        return CudaDepthEngine(torch.device(device), render, working, config)
-    return CpuDepthEngine(render, working, config)

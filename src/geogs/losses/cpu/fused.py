@@ -6,9 +6,7 @@ value, so the backward pass only scales it. Results do not depend on the number 
 """
 
 import functools
-import itertools
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import torch
@@ -19,28 +17,19 @@ from torch.autograd.function import once_differentiable
 from geogs.config import LossConfig
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_inverse
-from geogs.losses import multi_view_kernels as multi
+from geogs.losses.cpu import multi_view_kernels as multi
+from geogs.losses.cpu.single_view_kernels import single_view_rows
 from geogs.losses.multi_view import MIN_DEPTH_RATIO, PhotoView, depth_tolerance
 from geogs.losses.photometric import NCC_VARIANCE_FLOOR, ssim
 from geogs.losses.single_view import NORMAL_EPSILON, ViewConstants, visible
-from geogs.losses.single_view_kernels import single_view_rows
-from geogs.threads import worker_count
-
-
-@functools.cache
-def _pool(workers: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(workers, thread_name_prefix="geogs-losses")
+from geogs.threads import run_chunks, worker_count
 
 
 def _over_rows(kernel: Callable[[int, int], None], height: int) -> None:
     """Runs ``kernel(first, last)`` on equal spans of rows, one per worker."""
     count = max(1, min(worker_count(), height // 16))
     bounds = [height * k // count for k in range(count + 1)]
-    spans = list(itertools.pairwise(bounds))
-    waiting = [_pool(count - 1).submit(kernel, *span) for span in spans[1:]]
-    kernel(*spans[0])
-    for future in waiting:
-        future.result()
+    run_chunks(lambda k: kernel(bounds[k], bounds[k + 1]), count, count)
 
 
 def _array(tensor: Tensor) -> np.ndarray:

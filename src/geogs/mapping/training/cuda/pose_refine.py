@@ -1,7 +1,5 @@
 """Pose-only refinement on a GPU: all active keyframes in one pass."""
 
-from typing import TYPE_CHECKING
-
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -9,25 +7,23 @@ from torch import Tensor
 from geogs.config import MappingConfig
 from geogs.geometry.lie import se3_inverse
 from geogs.gpu.transfer import to_device
-from geogs.mapping.cuda.window_pass import WindowPass
-from geogs.mapping.pose_refine import descend
+from geogs.mapping.training.cuda.known_views import KnownViews
+from geogs.mapping.training.cuda.window_pass import WindowPass
+from geogs.mapping.training.pose_refine import descend
 from geogs.mapping.view import MapView
 from geogs.splat.map import GaussianMap
-
-if TYPE_CHECKING:
-    from geogs.mapping.cuda.trainer import KnownViews
 
 
 def refine_poses(
     disks: GaussianMap,
     active: list[MapView],
     views: dict[int, MapView],
-    known: "KnownViews",
+    known: KnownViews,
     window: WindowPass,
     config: MappingConfig,
     unit: float,
 ) -> dict[int, Float[Tensor, "4 4"]]:
-    """As :func:`geogs.mapping.pose_refine.refine_poses`, from the same loss in float32.
+    """As :func:`geogs.mapping.training.pose_refine.refine_poses`, from the same loss in float32.
 
     ``window`` has as many views as there are active keyframes, one partner each. Each step waits
     once, for the gradients of the poses, which are few and go on on the CPU.
