@@ -16,7 +16,7 @@ class Swap(Generic[K, V]):
     to another. For any thread, if ``leave`` is; a value is made without holding others up.
     """
 
-    def __init__(self, limit: int, leave: Callable[[K, V], None] | None = None) -> None:
+    def __init__(self, limit: int, leave: Callable[[K, V], object] | None = None) -> None:
         self.limit = limit
         self._leave = leave
         self._values: OrderedDict[K, V] = OrderedDict()
