@@ -22,7 +22,6 @@ import torch
 
 from geogs.application.progress import peak_memory
 from geogs.application.results import fusion_views
-from geogs.cli.run import RunOptions
 from geogs.config import Config
 from geogs.depth.completion import upsample_grid
 from geogs.errors import InputError
@@ -257,8 +256,7 @@ def parse_config(options: list[str]) -> Config:
     """Settings from the options of geogs run."""
     from geogs.cli.run import parse
 
-    parsed: RunOptions = parse(["none", *options])
-    return parsed
+    return parse(["none", *options]).config
 
 
 if __name__ == "__main__":

@@ -143,7 +143,7 @@ class Fused:
         disks.append(DiskParameters(*(p.clone() for p in window.disks)), 0)
         settings = replace(MappingConfig(), loss=config)
         self.window = window
-        self.trainer = CudaTrainer(disks, window.cameras, settings, window.unit)
+        self.trainer = CudaTrainer(disks, window.cameras, settings, window.unit, len(window.batch))
 
     def train(self, steps: int) -> None:
         """So many whole steps that leave the map as it is."""

@@ -10,7 +10,7 @@ from plyfile import PlyData
 
 from depth_scene import WORKING, make_scene, trace
 from geogs.config import ReconstructConfig
-from geogs.reconstruct import Reconstruction
+from geogs.reconstruction import Reconstruction
 
 GEOGS = [sys.executable, "-m", "geogs.cli.main"]
 DEFAULT = ReconstructConfig()

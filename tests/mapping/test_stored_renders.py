@@ -18,7 +18,7 @@ from geogs.mapping.rendered import rendered_keyframe
 from geogs.mapping.stored_renders import StoredRender, stored_render
 from geogs.mesh import extract_mesh
 from geogs.on_demand import OnDemand
-from geogs.reconstruct import Reconstruction
+from geogs.reconstruction import Reconstruction
 from geogs.types import MapSnapshot, RenderedKeyframe, Trajectory
 from posed_scene import ball_and_wall
 

@@ -109,8 +109,8 @@ def pair(rendered, device: torch.device) -> Callable[[], tuple[CudaTrainer, Trai
 
     def make():
         cpu = torch.device("cpu")
-        fast = CudaTrainer(make_map(rendered, device), CAMERAS, CONFIG, UNIT)
-        slow = Trainer(make_map(rendered, cpu), CAMERAS, CONFIG, UNIT)
+        fast = CudaTrainer(make_map(rendered, device), CAMERAS, CONFIG, UNIT, 128)
+        slow = Trainer(make_map(rendered, cpu), CAMERAS, CONFIG, UNIT, 128)
         return fast, slow, make_views(rendered, device), make_views(rendered, cpu)
 
     return make

@@ -26,7 +26,7 @@ from geogs.io.sources.posed.sniff import open_posed_source
 from geogs.io.writers.native import load_map
 from geogs.mapping.depth_schedule import spread_order
 from geogs.mapping.known_poses import depth_search, distances_to_try
-from geogs.reconstruct import Reconstruction
+from geogs.reconstruction import Reconstruction
 from keyframe_samples import Sample, segment_of
 from posed_scene import (
     DEFAULT,
@@ -179,7 +179,7 @@ FULL = """
 import sys
 import torch
 from geogs.cli.main import main
-from geogs.reconstruct import Reconstruction
+from geogs.reconstruction import Reconstruction
 
 def full(*arguments):
     raise torch.cuda.OutOfMemoryError("CUDA out of memory.")
