@@ -7,8 +7,8 @@ from jaxtyping import Float
 
 from geogs.evaluation import plots
 from geogs.evaluation.shading import viewpoints
-from geogs_bench.comparison import Comparison
 from geogs_bench.result import ResultFolder
+from geogs_bench.scoring.comparison import Comparison
 from geogs_bench.scoring.slam import StageErrors
 
 PICTURES = {
