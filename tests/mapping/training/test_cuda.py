@@ -110,7 +110,7 @@ def pair(rendered, device: torch.device) -> Callable[[], tuple[CudaTrainer, Trai
     def make():
         cpu = torch.device("cpu")
         fast = CudaTrainer(make_map(rendered, device), CAMERAS, CONFIG, UNIT, 128)
-        slow = Trainer(make_map(rendered, cpu), CAMERAS, CONFIG, UNIT, 128)
+        slow = Trainer(make_map(rendered, cpu), CAMERAS, CONFIG, UNIT)
         return fast, slow, make_views(rendered, device), make_views(rendered, cpu)
 
     return make
