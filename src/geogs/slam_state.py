@@ -21,7 +21,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from geogs.bundle.dense import bundle_solver
+from geogs.bundle.select import bundle_solver
 from geogs.config import MappingConfig
 from geogs.depth.select import depth_engine
 from geogs.errors import InputError

@@ -8,22 +8,16 @@ import numpy as np
 import pytest
 import torch
 
-import geogs.bundle.cuda.bundle as cuda_bundle
+import geogs.bundle.cuda.dense as cuda_bundle
 import geogs.bundle.cuda.fields as cuda_fields
-import geogs.bundle.cuda.graph as cuda_graph
 import geogs.bundle.cuda.motion as cuda_motion
+import geogs.bundle.cuda.pairs as cuda_graph
 from cuda_emulator import use_emulator
-from geogs.bundle.dense import (
-    MIN_Z,
-    BundleOptions,
-    BundleProblem,
-    BundleResult,
-    DenseBundle,
-    linearise,
-    project,
-    relative_motion,
-)
-from geogs.bundle.motion_only import solve_poses
+from geogs.bundle.base import BundleOptions, BundleResult
+from geogs.bundle.dense import DenseBundle
+from geogs.bundle.motion import solve_poses
+from geogs.bundle.problem import BundleProblem
+from geogs.bundle.projection import MIN_Z, linearise, project, relative_motion
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import retract, se3_exp
 from geogs.keyframes.grid import SampleGrid
@@ -109,9 +103,7 @@ def assert_same(fast: BundleResult, slow: BundleResult) -> None:
 
 def test_sources_and_python_agree_on_sizes():
     folder = Path(cuda_bundle.__file__).parent
-    text = "".join(
-        (folder / name).read_text() for name in ("bundle_solve.cu", "bundle_projection.cuh")
-    )
+    text = "".join((folder / name).read_text() for name in ("solve.cu", "projection.cuh"))
     found = {k: float(v) for k, v in re.findall(r"#define (\w+) ([\d.]+)", text)}
     assert found["MAX_POSES"] == cuda_bundle.MAX_FEW
     assert found["PANEL"] == cuda_bundle.PANEL

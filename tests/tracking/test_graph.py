@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from geogs.bundle.dense import BundleOptions
+from geogs.bundle.base import BundleOptions
 from geogs.keyframes.grid import SampleGrid
 from geogs.keyframes.store import KeyframeStore, Segment
 from geogs.tracking.flow.classical import ClassicalFlow

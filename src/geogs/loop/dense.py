@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from geogs.bundle.dense import project
+from geogs.bundle.projection import project
 from geogs.config import VerificationOptions
 from geogs.geometry.lie import se3_inverse, so3_log
 from geogs.keyframes.grid import SampleGrid

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 
-from geogs.bundle.dense import BundleOptions
+from geogs.bundle.base import BundleOptions
 from geogs.tracking.proximity import Pair, proximity_pairs
 from geogs.tracking.tracker import Tracker
 from geogs.types import PoseCorrection

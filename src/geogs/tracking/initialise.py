@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from geogs.bundle.dense import BundleOptions
+from geogs.bundle.base import BundleOptions
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_inverse
 from geogs.keyframes.grid import SampleGrid

@@ -10,8 +10,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from geogs.bundle.dense import project
-from geogs.bundle.motion_only import solve_poses
+from geogs.bundle.motion import solve_poses
+from geogs.bundle.projection import project
 from geogs.geometry.lie import se3_inverse
 from geogs.keyframes.grid import SampleGrid
 from geogs.keyframes.keyframe import Keyframe

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float, Float16, Int16
 from torch import Tensor
 
-from geogs.bundle.dense import project
+from geogs.bundle.projection import project
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_inverse
 from geogs.keyframes.grid import SampleGrid

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from geogs.bundle.dense import project, relative_motion
+from geogs.bundle.projection import project, relative_motion
 from geogs.keyframes.store import Segment
 from geogs.threads import thread_map
 from geogs.tracking.overlap import may_overlap
@@ -33,7 +33,7 @@ def frame_distances(
     if not directed:
         return grid.pixels.new_zeros(0)
     if grid.on_gpu:
-        from geogs.bundle.cuda.graph import DirectedPairs
+        from geogs.bundle.cuda.pairs import DirectedPairs
 
         return DirectedPairs.of(store, directed).distances(rotation_weight, step)
     keep = torch.zeros(grid.height, grid.width, dtype=torch.bool, device=grid.device)

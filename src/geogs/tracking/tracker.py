@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from geogs.bundle.dense import BundleOptions
+from geogs.bundle.base import BundleOptions
 from geogs.config import PriorConfig, TrackingConfig
 from geogs.errors import InputError, TrackingLost
 from geogs.geometry.camera import Camera

@@ -10,8 +10,8 @@ import torch
 from jaxtyping import Bool, Float, Float16, Int16
 from torch import Tensor
 
-from geogs.bundle.dense import linearise
-from geogs.bundle.motion_only import solve_poses
+from geogs.bundle.motion import solve_poses
+from geogs.bundle.projection import linearise
 from geogs.geometry.lie import retract, se3_inverse, se3_log
 from geogs.keyframes.grid import SampleGrid
 from geogs.keyframes.keyframe import Keyframe

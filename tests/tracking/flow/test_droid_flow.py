@@ -7,13 +7,10 @@ import pytest
 import torch
 
 from droid_state import public_state
-from geogs.bundle.dense import (
-    BundleOptions,
-    BundleProblem,
-    DenseBundle,
-    linearise,
-    relative_motion,
-)
+from geogs.bundle.base import BundleOptions
+from geogs.bundle.dense import DenseBundle
+from geogs.bundle.problem import BundleProblem
+from geogs.bundle.projection import linearise, relative_motion
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.keyframes.grid import SampleGrid

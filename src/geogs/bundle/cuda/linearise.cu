@@ -1,6 +1,6 @@
 // Dense bundle adjustment: one Gauss-Newton step over poses and inverse depths.
 // Edges are sorted by source; the edges of frame f are first[f] to first[f + 1].
-#include "bundle_projection.cuh"
+#include "projection.cuh"
 
 #define NORMAL_STRIDE 32  // of an edge: 21 of J^T W J, 6 of J^T W r
 

@@ -1,5 +1,5 @@
 // Poses of frames against fixed keyframes: all iterations of a frame in one block.
-#include "bundle_projection.cuh"
+#include "projection.cuh"
 
 // Solves the damped 6 x 6 normal equations by elimination; zero where the step is not finite.
 __device__ void solve_step(const double* sums, double* xi) {

@@ -1,6 +1,6 @@
 // Directed pairs of keyframes: where cells fall, how far that is, how far it has moved. Poses T are
 // 4 x 4 of the frames; source and target are rows. One block per pair.
-#include "bundle_projection.cuh"
+#include "projection.cuh"
 
 __device__ __forceinline__ Motion pair_motion(const double* T, int source, int target) {
   __shared__ Motion motion;

@@ -1,12 +1,13 @@
-"""Motion-only adjustment: poses of frames seen from keyframes that stay fixed."""
+"""Motion-only adjustment on the CPU: poses of frames seen from keyframes that stay fixed."""
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from geogs.bundle.dense import linearise, move, normal_equations, project, robust_weight
+from geogs.bundle.linearise import normal_equations, weighed_residuals
+from geogs.bundle.projection import linearise, project
 from geogs.geometry.camera import Camera
-from geogs.geometry.lie import se3_inverse
+from geogs.geometry.lie import move, se3_inverse
 
 
 def solve_poses(
@@ -36,8 +37,7 @@ def solve_poses(
     inverse = se3_inverse(T_source)
     for _ in range(iterations):
         p = linearise(camera, rays, T[frame] @ inverse, inverse_depth)
-        r = pixels - p.pixels
-        w = robust_weight(r, weight * p.valid[..., None], huber)
+        r, w = weighed_residuals(p, pixels, weight, huber)
         wJ = p.pose_jacobian * w.mT[:, None]
         H = torch.zeros(len(T), 6, 6, dtype=torch.float64, device=T.device)
         g = torch.zeros(len(T), 6, dtype=torch.float64, device=T.device)

@@ -8,13 +8,13 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from geogs.bundle.cuda.bundle import block_size
+from geogs.bundle.cuda.dense import block_size
 from geogs.gpu.kernels import Kernel, kernels_for
 from geogs.gpu.transfer import to_device
 from geogs.keyframes.grid import SampleGrid
 from geogs.keyframes.store import Segment
 
-SOURCE = Path(__file__).with_name("bundle_graph.cu")
+SOURCE = Path(__file__).with_name("pairs.cu")
 
 
 @dataclass(frozen=True)

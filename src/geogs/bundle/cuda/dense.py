@@ -8,7 +8,8 @@ import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
 
-from geogs.bundle.dense import BundleOptions, BundleProblem, BundleResult
+from geogs.bundle.base import BundleOptions, BundleResult
+from geogs.bundle.problem import BundleProblem
 from geogs.gpu.kernels import kernels_for
 from geogs.gpu.transfer import to_device
 from geogs.keyframes.grid import SampleGrid
@@ -161,8 +162,8 @@ class CudaDenseBundle:
     def __init__(self, grid: SampleGrid) -> None:
         self.grid = grid
         device = torch.device(grid.device)
-        self._step = kernels_for(Path(__file__).with_name("bundle.cu"), device)
-        self._solve = kernels_for(Path(__file__).with_name("bundle_solve.cu"), device)
+        self._step = kernels_for(Path(__file__).with_name("linearise.cu"), device)
+        self._solve = kernels_for(Path(__file__).with_name("solve.cu"), device)
 
     def solve(self, problem: BundleProblem, options: BundleOptions | None = None) -> BundleResult:
         """Take ``options.iterations`` damped Gauss-Newton steps.

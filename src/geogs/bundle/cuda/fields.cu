@@ -1,5 +1,5 @@
 // Fields on the sample grid: filling holes, carrying depth from view to view. One block per field.
-#include "bundle_projection.cuh"
+#include "projection.cuh"
 
 // Size of a level of the pyramid, of which each halves the one before, rounded up.
 __device__ __forceinline__ int level_size(int size, int level) { return (size + (1 << level) - 1) >> level; }

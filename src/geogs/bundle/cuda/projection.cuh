@@ -1,7 +1,7 @@
 // Projection of the cells of a source frame with inverse depth d: pi(K (R ray + d t)).
 #pragma once
-#include "bundle_block.cuh"
-#include "bundle_pose.cuh"
+#include "block.cuh"
+#include "pose.cuh"
 
 #define MIN_Z 0.05f
 

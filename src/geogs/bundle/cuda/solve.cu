@@ -1,6 +1,6 @@
 // Solves the damped camera system, (N + 1) x N row by row: the lower triangle, then the right-hand
 // side as one more row, so that the factorisation substitutes forward as well.
-#include "bundle_cholesky.cuh"
+#include "cholesky.cuh"
 
 #define MAX_POSES 16
 #define PANEL 48      // columns factored at a time, a multiple of 6
