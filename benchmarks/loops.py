@@ -22,9 +22,9 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
-from plyfile import PlyData
 
 from geogs.config import LoopConfig
+from geogs.evaluation.surface import read_surface
 from geogs.geometry.lie import se3_exp, se3_inverse, so3_log
 from geogs.keyframes.grid import SampleGrid
 from geogs.keyframes.store import KeyframeStore, Segment
@@ -121,9 +121,7 @@ def prepare(
     whole = load(folder, long_edge, None)
     sequence = Sequence(whole.files[::every], whole.camera, whole.T_wc[::every], None)
     grid = SampleGrid(sequence.camera)
-    vertex = PlyData.read(str(points))["vertex"]
-    cloud = np.stack([vertex[a] for a in "xyz"], -1).astype(np.float64)
-    depth = depths(cloud, sequence.T_wc, grid)
+    depth = depths(read_surface(points).vertices, sequence.T_wc, grid)
     T_cw = se3_inverse(torch.from_numpy(sequence.T_wc))
     rng = np.random.default_rng(0)
     scale = np.exp(np.cumsum(drift * 0.01 * rng.standard_normal(len(depth))))

@@ -19,9 +19,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
-from plyfile import PlyData
 
 from geogs.config import TrackingConfig
+from geogs.evaluation.surface import read_surface
 from geogs.geometry.camera import Camera
 from geogs.geometry.umeyama import umeyama
 from geogs.loop.global_bundle import global_bundle
@@ -86,17 +86,11 @@ def keyframe_error(tracker: Tracker, sequence: Sequence) -> tuple[float, float]:
 
 def true_depth(path: Path, camera: Camera, T_wc: np.ndarray) -> Iterator[np.ndarray]:
     """Depth of a mesh on the tracker's grid from each pose, by ray casting; inf where empty."""
-    ply = PlyData.read(str(path))
-    v = np.stack([ply["vertex"][a] for a in "xyz"], -1).astype(np.float64)
-    f = np.vstack(
-        ply["face"].data[
-            "vertex_indices" if "vertex_indices" in ply["face"].data.dtype.names else "vertex_index"
-        ]
-    )
+    mesh = read_surface(path)
     x, y = np.arange(4, camera.width - 3, 8), np.arange(4, camera.height - 3, 8)
     for T in T_wc:
-        p = (v - T[:3, 3]) @ T[:3, :3]
-        yield _raster(p, f, camera, x, y)
+        p = (mesh.vertices - T[:3, 3]) @ T[:3, :3]
+        yield _raster(p, mesh.faces, camera, x, y)
 
 
 def _raster(p, faces, camera, xs, ys):
