@@ -106,6 +106,7 @@ class Slam:
             self.mapper = Mapper(self.camera, self.config.mapping, self.device, self.config.seed)
             self._waiting.clear()
         self._map(self._close_loops(result, is_last=True), lag=0)
+        self.stopwatch.end_stream()
 
     @on_one_torch_thread
     def finish(self, progress: Progress = _silent, correct: bool = True) -> None:
