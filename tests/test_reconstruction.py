@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 from depth_scene import WORKING, make_scene, trace
 from geogs.cli.durations import seconds
 from geogs.config import InputConfig
-from geogs.depth.engine import CpuDepthEngine
+from geogs.depth.classical import CpuDepthEngine
 from geogs.depth.estimate import estimate_depth
 from geogs.depth.view import depth_view
 from geogs.errors import InputError
@@ -25,8 +25,9 @@ from geogs.io.poses import read_tum_trajectory
 from geogs.io.sources.posed.sniff import open_posed_source
 from geogs.io.writers.native import load_map
 from geogs.mapping.depth_schedule import spread_order
-from geogs.mapping.known_poses import depth_search, distances_to_try, posed_keyframe
+from geogs.mapping.known_poses import depth_search, distances_to_try
 from geogs.reconstruction import Reconstruction
+from keyframe_samples import Sample, segment_of
 from posed_scene import (
     DEFAULT,
     SMALL,
@@ -290,7 +291,8 @@ def test_poses_that_show_nothing_are_refused():
 
 
 def test_where_depth_is_searched_follows_from_the_points():
-    keyframe = posed_keyframe(0, 0.0, np.zeros((144, 192, 3), np.uint8), np.eye(4))
+    sample = Sample(0, np.zeros((144, 192, 3), np.uint8), torch.eye(4, dtype=torch.float64))
+    (keyframe,) = segment_of([sample], WORKING)
     view = depth_view(keyframe, WORKING)
     z = np.linspace(2.0, 4.0, 401)
     seen = np.stack([0 * z, 0 * z, z], 1)

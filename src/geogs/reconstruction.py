@@ -12,12 +12,14 @@ from torch import Tensor
 from geogs.config import ReconstructConfig
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
+from geogs.keyframes.grid import SampleGrid
+from geogs.keyframes.store import KeyframeStore
 from geogs.mapping import known_poses as known
 from geogs.mapping.depth_schedule import search_depths
 from geogs.mapping.map_frame import MapFrame
 from geogs.mapping.mapper import Mapper
 from geogs.mapping.state import MapperState, mapper_state, restore_mapper
-from geogs.mapping.training import TrainingPlace
+from geogs.mapping.training.base import TrainingPlace
 from geogs.on_demand import OnDemand
 from geogs.splat.map import DiskParameters
 from geogs.stopwatch import Stopwatch
@@ -65,7 +67,9 @@ class Reconstruction:
     ):
         self.config = config or ReconstructConfig()
         self.camera = camera
-        self.mapper = Mapper(camera, self.config.mapping, device, self.config.seed)
+        store = KeyframeStore(SampleGrid(camera, device), None, self.config.resident_keyframes)
+        self.mapper = Mapper(store, self.config.mapping, self.config.seed)
+        self._keyframes = store.new_segment()
         self.stopwatch = Stopwatch()
         self._frame = MapFrame(np.zeros(3), 1.0)
         self._poses: list[Float[Tensor, "4 4"]] = []
@@ -100,9 +104,10 @@ class Reconstruction:
         """An RGB image, its world-to-camera pose, which pixels count, seconds (or its number)."""
         seconds = float(self.frames) if timestamp is None else timestamp
         with self.stopwatch("preparing"):
-            keyframe = known.posed_keyframe(self.frames, seconds, image, T_cw)
-            self.mapper.observe(keyframe, mask)
-            self._poses.append(keyframe.T_cw)
+            pose = torch.from_numpy(np.asarray(T_cw, np.float64))
+            keyframe = self._keyframes.add(self.frames, seconds, image, None, pose)
+            self.mapper.observe(keyframe.id, mask)
+            self._poses.append(pose)
 
     @on_one_torch_thread
     def finish(
@@ -122,7 +127,7 @@ class Reconstruction:
             with self.stopwatch("first look"):
                 points = self._first_points(lambda f: progress("first look", f))
         self._frame = MapFrame.around(points, self._poses)
-        self.mapper.move([self._frame.pose(T_cw) for T_cw in self._poses])
+        self._place_keyframes()
         try:
             with self.stopwatch("depth"):
                 self._search(self._frame.points(points), lambda f: progress("depth", f))
@@ -149,13 +154,13 @@ class Reconstruction:
         self._begin = time.perf_counter() - state.seconds
         self._end = None if self._end is None else self._end - state.seconds
         self._frame = MapFrame(state.origin, state.unit)
-        self.mapper.move([self._frame.pose(T_cw) for T_cw in self._poses])
+        self._place_keyframes()
         restore_mapper(self.mapper, state.mapper)
         self._train(state.mapper.trained, progress)
 
     def trajectory(self) -> Trajectory:
         """The given poses."""
-        times = [v.keyframe.timestamp for v in self.mapper.views.values()]
+        times = [keyframe.timestamp for keyframe in self._keyframes]
         T_wc = torch.linalg.inv(torch.stack(self._poses)).numpy()
         return Trajectory(np.array(times, np.float64), T_wc, np.ones(len(times), dtype=bool))
 
@@ -197,6 +202,11 @@ class Reconstruction:
     def _first_points(self, progress: Callable[[float], None]) -> np.ndarray:
         views, depth = list(self.mapper.views.values()), self.config.mapping.depth
         return known.first_points(views, self.camera, depth, self.config.search, progress)
+
+    def _place_keyframes(self) -> None:
+        """Give the keyframes their poses in the map's frame."""
+        for keyframe, T_cw in zip(self._keyframes, self._poses, strict=True):
+            keyframe.T_cw = self._frame.pose(T_cw)
 
     def _search(self, points: np.ndarray, progress: Callable[[float], None]) -> None:
         """Depths of the images; twice if time allows, the second time where the first found it.

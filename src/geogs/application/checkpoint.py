@@ -17,7 +17,7 @@ from geogs.config import ReconstructConfig
 from geogs.errors import InputError, OutputError
 from geogs.io.writers.atomic import atomic_file
 from geogs.mapping.state import DepthState, DiskState, MapperState
-from geogs.mapping.training import TrainingPlace
+from geogs.mapping.training.base import TrainingPlace
 from geogs.reconstruction import Reconstruction, ReconstructionState
 from geogs.splat.map import DiskParameters
 
