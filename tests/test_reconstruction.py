@@ -15,7 +15,7 @@ import torch
 from scipy.spatial import cKDTree
 
 from depth_scene import WORKING, make_scene, trace
-from geogs.cli.reconstruct import seconds
+from geogs.cli.durations import seconds
 from geogs.config import InputConfig
 from geogs.depth.classical import CpuDepthEngine
 from geogs.depth.estimate import estimate_depth

@@ -108,6 +108,7 @@ class Slam:
             self.segments.world.keyframes.take_corrections()
             self._waiting.clear()
         self._map(self._close_loops(result, is_last=True), lag=0)
+        self.stopwatch.end_stream()
 
     @on_one_torch_thread
     def finish(self, progress: Progress = _silent, correct: bool = True) -> None:

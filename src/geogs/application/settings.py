@@ -1,4 +1,4 @@
-"""What a run is made of: plain records, so that a command, a script and a checkpoint say the same.
+"""What a run or a reconstruction is told: the same record for a command, a script, a checkpoint.
 
 Nothing here is imported but the settings, so that a command line can be read at once.
 """
@@ -6,7 +6,7 @@ Nothing here is imported but the settings, so that a command line can be read at
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from geogs.config import Config, MeshConfig
+from geogs.config import Config, MeshConfig, ReconstructConfig
 
 
 @dataclass(frozen=True)
@@ -54,6 +54,36 @@ class RunSettings:
         """
         config = replace(self.absolute().config, mesh=MeshConfig())
         return RunSettings(self.absolute().source, config)
+
+
+@dataclass(frozen=True)
+class ReconstructSettings:
+    """All that a reconstruction from known poses is told."""
+
+    source: Path = Path()
+    """Folder of images with poses, or the file with the poses."""
+    config: ReconstructConfig = field(default_factory=ReconstructConfig)
+    """How to compute."""
+    output: Path | None = None
+    """Folder for the results (also -o); out/NAME if none is given."""
+    budget: float | None = None
+    """About how long it may take in all, such as 90s, 10m or 1h; none trains until it is good."""
+    check_poses: bool = True
+    """Whether to see by matching images that the poses follow the expected convention."""
+    hold_out: int | None = None
+    """Leave out every so many-th image, to judge the result by; at least 2, none uses all."""
+    snapshots: tuple[float, ...] = ()
+    """Also keep the map as it stands after some seconds, such as 5,10,20, in snapshots/; they count
+    from when the images have been read."""
+    depth_mesh: bool = False
+    """Also fuse the searched depths without the disks, to depth_fusion/mesh.ply."""
+    resume: bool = False
+    """Go on from the checkpoint that an earlier call left in the output folder."""
+    checkpoint_every: float = 30.0
+    """Seconds of training between two checkpoints (there is one after the depths, too); 0 makes
+    none."""
+    device: str = "auto"
+    """Where to compute: auto (a GPU where there is one), cpu, cuda or cuda:1; see geogs doctor."""
 
 
 def _file(name: str) -> str:
