@@ -3,6 +3,8 @@
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from geogs.version import __version__
+
 if TYPE_CHECKING:
     from geogs import application
     from geogs.application.reconstruct import reconstruct
@@ -29,8 +31,6 @@ __all__ = [
     "open_source",
     "reconstruct",
 ]
-
-__version__ = "0.1.0"
 
 _HOMES = {
     "Camera": "geogs.geometry.camera",

@@ -4,19 +4,19 @@ import platform
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 
 import cv2
 import numba
 import torch
 
-import geogs
 from geogs.application.self_test import check_renderer, time_renderer
 from geogs.errors import DeviceError
 from geogs.gpu import cache, installation, kernels
+from geogs.gpu.source import PACKAGE
 from geogs.threads import worker_count
 from geogs.tracking.flow.weights_catalogue import CATALOGUE
 from geogs.tracking.flow.weights_files import checksum, locate
+from geogs.version import __version__
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ def examine(device_name: str = "auto") -> Iterator[Finding]:
 
 def _versions() -> Iterator[Finding]:
     system = f"{platform.system()} {platform.machine()}, {worker_count()} threads"
-    yield Finding("geogs", geogs.__version__)
+    yield Finding("geogs", __version__)
     yield Finding("Python", f"{platform.python_version()}, {system}")
     build = f"CUDA {torch.version.cuda}" if torch.version.cuda else "without CUDA"
     yield Finding(
@@ -121,7 +121,7 @@ def _kernels(device: torch.device) -> Finding:
     """Every CUDA source of the package, from the cache or compiled now."""
     before, start = cache.cache_state().kernels, time.perf_counter()
     try:
-        count = kernels.prepare_kernels(Path(geogs.__file__).parent, device)
+        count = kernels.prepare_kernels(PACKAGE, device)
     except DeviceError as error:
         return Finding("kernels", "BAD", str(error), is_fatal=True)
     seconds, new = time.perf_counter() - start, cache.cache_state().kernels - before

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import torch
 
-import geogs
 from geogs.errors import DeviceError
 from geogs.gpu.kernels import prepare_kernels
+from geogs.gpu.source import PACKAGE
 
 REMEDY = (
     "use fewer images (--stride), a smaller --long-edge, a GPU with more memory, or --device cpu"
@@ -22,7 +22,7 @@ def compiled_kernels(device: torch.device) -> float:
     """Have all kernels of a GPU compiled, once per machine; the seconds that took."""
     start = time.perf_counter()
     if device.type == "cuda":
-        prepare_kernels(Path(geogs.__file__).parent, device)
+        prepare_kernels(PACKAGE, device)
     return time.perf_counter() - start
 
 

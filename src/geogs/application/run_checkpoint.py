@@ -12,7 +12,6 @@ from dataclasses import dataclass, field, replace
 from io import BufferedReader
 from pathlib import Path
 
-import geogs
 from geogs.application.checkpoint import next_due
 from geogs.application.progress import RunProgress
 from geogs.application.settings import RunSettings
@@ -25,8 +24,9 @@ from geogs.io.writers.atomic import atomic_file
 from geogs.slam import Slam
 from geogs.slam_state import ByteSink, read_record, read_slam, write_record, write_slam
 from geogs.types import Frame
+from geogs.version import __version__
 
-_TITLE = f"geogs run checkpoint 1, geogs {geogs.__version__}\n".encode()
+_TITLE = f"geogs run checkpoint 1, geogs {__version__}\n".encode()
 _PIECE = 1 << 20
 _CHECKSUM_BYTES = 4
 _OURS = frozenset({

@@ -6,7 +6,6 @@ from dataclasses import asdict
 import numpy as np
 import torch
 
-import geogs
 from geogs.application.machine import device_summary, peak_memory
 from geogs.application.result import Result
 from geogs.io.sources.posed.base import PosedSource
@@ -14,6 +13,7 @@ from geogs.io.sources.several import SeveralSources
 from geogs.io.sources.sniff import Stream
 from geogs.stopwatch import Stopwatch
 from geogs.types import Trajectory
+from geogs.version import __version__
 
 
 def summarise(result: Result) -> dict[str, object]:
@@ -36,7 +36,7 @@ def summarise(result: Result) -> dict[str, object]:
         "intrinsics": source.intrinsics_origin,
         "seed": scene.config.seed,
         "versions": {
-            "geogs": geogs.__version__,
+            "geogs": __version__,
             "torch": torch.__version__,
             "python": platform.python_version(),
         },
