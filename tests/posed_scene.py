@@ -10,7 +10,7 @@ import numpy as np
 from depth_scene import WORKING, make_scene, trace
 from geogs.config import ReconstructConfig
 from geogs.evaluation.surface import read_surface
-from geogs.reconstruct import Reconstruction
+from geogs.reconstruction import Reconstruction
 
 GEOGS = [sys.executable, "-m", "geogs.cli.main"]
 DEFAULT = ReconstructConfig()

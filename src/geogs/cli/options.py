@@ -1,9 +1,14 @@
 """Command-line options from a dataclass, for every sub-command alike."""
 
 from collections.abc import Mapping, Sequence
-from typing import TypeVar
+from dataclasses import fields
+from typing import TYPE_CHECKING, TypeVar
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
 
 Options = TypeVar("Options")
+Record = TypeVar("Record", bound="DataclassInstance")
 
 # Options so common that they may be given without the name of their group.
 SHORT: Mapping[str, str] = {
@@ -48,6 +53,11 @@ def parse_options(
         description=description,
         default=default,
     )
+
+
+def record(kind: type[Record], options: Record) -> Record:
+    """The plain record that options of a command are more than."""
+    return kind(**{f.name: getattr(options, f.name) for f in fields(kind)})
 
 
 def given(argv: Sequence[str], name: str) -> str | None:

@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float
 from geogs.errors import InputError
 from geogs.evaluation.surface import Surface, read_surface
 from geogs.evaluation.thinning import dense_points, thin
+from geogs.threads import on_one_torch_thread
 
 SPACING = 0.2
 """Millimetres between samples."""
@@ -113,6 +114,7 @@ def read_dtu_reference(folder: str | Path, scan: int) -> DtuReference:
     return DtuReference(points, observed, box[0], box[1], resolution, plane)
 
 
+@on_one_torch_thread
 def evaluate_dtu(mesh: Surface, reference: DtuReference, seed: int = 0) -> DtuErrors:
     """Compare a mesh, in millimetres and cut by the masks, with a scan.
 
