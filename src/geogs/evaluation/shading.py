@@ -74,16 +74,6 @@ def look(
     return Sight(hit, corners, light)
 
 
-def shade(
-    vertices: Float[np.ndarray, "n 3"],
-    faces: Int[np.ndarray, "m 3"],
-    view: Viewpoint,
-    colours: UInt8[np.ndarray, "n 3"] | None = None,
-) -> UInt8[np.ndarray, "h w 3"]:
-    """A picture (RGB) of a mesh in one go; see :func:`look`."""
-    return look(vertices, faces, view).paint(colours)
-
-
 def level_axes(T_wc: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "3 3"]:
     """Rows right, forward, up of the world as the camera was held.
 

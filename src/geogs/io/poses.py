@@ -52,17 +52,11 @@ def read_tum_trajectory(path: str | Path, quaternion_order: QuaternionOrder = "a
     return Trajectory(rows[:, 0].copy(), T_wc, np.ones(len(rows), dtype=bool))
 
 
-def read_matrix_rows(path: str | Path) -> Float[np.ndarray, "n 4 4"]:
+def read_replica_trajectory(path: str | Path) -> Trajectory:
     """Read one camera-to-world matrix a row: 16 numbers (Replica) or the upper 12 (KITTI).
 
-    Rows without a pose are left out, so position and frame number may differ afterwards; use
-    :func:`read_replica_trajectory` where they must be matched to frames.
+    Row k is frame k at k / 30 s; rows without a pose are left out.
     """
-    return read_replica_trajectory(path).T_wc
-
-
-def read_replica_trajectory(path: str | Path) -> Trajectory:
-    """Read one matrix a row, row k being frame k at k / 30 s, as a trajectory."""
     path = Path(path)
     rows = _read_table(path, columns=(16, 12), layout="a 4x4 matrix a row")
     T_wc = np.tile(np.eye(4), (len(rows), 1, 1))

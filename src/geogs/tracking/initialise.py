@@ -22,8 +22,9 @@ from geogs.keyframes.grid import SampleGrid
 from geogs.keyframes.store import Segment
 from geogs.threads import thread_map
 from geogs.tracking.flow.base import FlowMatch
+from geogs.tracking.flow.filled import filled_positions
 from geogs.tracking.graph import FrameGraph
-from geogs.tracking.motion import filled_positions, pnp
+from geogs.tracking.motion import pnp
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from geogs.bundle.select import grid_fields
 from geogs.keyframes.grid import SampleGrid
 from geogs.keyframes.keyframe import Keyframe
 from geogs.tracking.flow.base import FlowMatch, FlowOperator
+from geogs.tracking.flow.filled import filled_positions
 
 FIT_ITERATIONS = 6
 """Steps of the motion-only adjustment of a frame."""
@@ -185,17 +186,6 @@ class FlowChain:
             self._there = filled_positions(self.grid, there)[None]
             self._back = filled_positions(self.grid, back)[None]
         return ChainedMatch(there, median, matched)
-
-
-def filled_positions(grid: SampleGrid, match: FlowMatch) -> Float[Tensor, "p 2"]:
-    """Positions of a single edge, unmatched cells filled in from the flow around them."""
-    return grid.pixels + filled_flow(grid, match)
-
-
-def filled_flow(grid: SampleGrid, match: FlowMatch) -> Float[Tensor, "p 2"]:
-    """Flow of a single edge, unmatched cells filled in from around them."""
-    flow, weight = match.pixels[0] - grid.pixels, match.weight[0, :, 0]
-    return grid_fields(grid).fill(flow.mT, weight.expand(2, -1)).mT.contiguous()
 
 
 def pnp(

@@ -11,7 +11,8 @@ from torch import Tensor
 from geogs.geometry.camera import Camera
 from geogs.keyframes.grid import SampleGrid
 from geogs.tracking.flow.base import FlowMatch, FlowOperator
-from geogs.tracking.motion import FlowChain, filled_flow, filled_positions
+from geogs.tracking.flow.filled import filled_flow, filled_positions
+from geogs.tracking.motion import FlowChain
 from geogs.types import Frame
 
 MIN_MATCHED = 0.12
