@@ -33,7 +33,7 @@ import torch
 from torch import Tensor
 
 from geogs.application.results import fusion_views
-from geogs.config import Config, MappingConfig
+from geogs.config import Config, MapAblation, MappingConfig
 from geogs.evaluation.reconstruction import evaluate_reconstruction
 from geogs.evaluation.surface import Surface
 from geogs.evaluation.triangle_tree import TriangleTree
@@ -339,7 +339,7 @@ def compare(scene: str, drift: float, with_mesh: bool) -> None:
     ]
     for name, strategy, c, keyframes in ways:
         moved = copy.deepcopy(mapper)
-        moved.config = replace(MAPPING, map_update=strategy)
+        moved.config = replace(MAPPING, ablation=MapAblation(map_update=strategy))
         seconds = planning_time(moved, c)
         moved.correct(c, keyframes)
         T_cw = torch.stack([k.T_cw for k in keyframes])
@@ -354,7 +354,7 @@ def planning_time(mapper: Mapper, correction: PoseCorrection) -> float:
     def plan() -> MapUpdate:
         seen = [witness(v, mapper.cameras) for v in mapper.views.values() if v.depth is not None]
         disks = mapper.map
-        strategy = mapper.config.map_update
+        strategy = mapper.config.ablation.map_update
         return plan_update(disks.position, disks.keyframe_id, correction, strategy, seen)
 
     times = []

@@ -1,17 +1,14 @@
 """``geogs bench NAME [DATA]``: a benchmark in one command, with its tables as files."""
 
-import itertools
 import sys
 from collections.abc import Sequence
-from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import asdict, dataclass, replace
-from io import StringIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import tyro
-
-from geogs.cli.options import parse_options
+from geogs.cli.options import Positional, parse_options
+from geogs.config import Seed
+from geogs.config.setting import Basic, Settings
 from geogs.errors import InputError
 
 if TYPE_CHECKING:
@@ -23,23 +20,21 @@ if TYPE_CHECKING:
     from geogs_bench.runner import Command, Runner, Task
     from geogs_bench.scene import Option
 
-_SHORT = {"-o": "--output"}
-
 
 @dataclass(frozen=True)
-class BenchOptions:
+class BenchOptions(Settings):
     """Run a benchmark on your copy of its data, score it, write the tables.
 
     ``geogs bench list`` says which there are, what data each needs and where to get it. What was
     finished before in the same folder is not run again.
     """
 
-    name: Annotated[str, tyro.conf.Positional]
+    name: Annotated[str, Positional()]
     """Which benchmark, or list."""
-    data: Annotated[Path | None, tyro.conf.Positional] = None
+    data: Annotated[Path | None, Positional(required=False)] = None
     """Folder of the data set; some benchmarks make a synthetic room without one."""
-    output: Path | None = None
-    """Folder for the results (also -o); out/bench-NAME if none is given."""
+    output: Annotated[Path | None, Basic("-o")] = None
+    """Folder for the results; out/bench-NAME if none is given."""
     scenes: str = ""
     """Only these scenes, by their names with commas between."""
     variants: str = ""
@@ -54,13 +49,11 @@ class BenchOptions:
     """Score the keyframes' depths fused without the disks, too: what the disks add to them."""
     device: str = "auto"
     """As in geogs run."""
-    seed: int = 0
+    seed: Seed = 0
     """As in geogs run."""
     preset: str = ""
     """As in geogs run and geogs reconstruct; without one, what they choose."""
-    settings: Annotated[
-        tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(name="set", metavar="KEY=VALUE")
-    ] = ()
+    set: tuple[str, ...] = ()
     """Any option of geogs run or geogs reconstruct (--set mapping.iterations=12); repeatable."""
     fresh: bool = False
     """Run everything again."""
@@ -70,7 +63,7 @@ class BenchOptions:
 
 def main(argv: Sequence[str]) -> int:
     """Run the command; returns the exit code: 0 if every scene was scored, else 2."""
-    options = parse_options(BenchOptions, argv, "bench", short=_SHORT)
+    options = parse_options(BenchOptions, argv, "bench")
     if options.name == "list":
         print(listing())
         return 0
@@ -158,19 +151,7 @@ def _parsed(task: "Task") -> "RunOptions | ReconstructOptions":
 
     argv = [str(task.source), "-o", str(task.output)]
     argv += [argument for option in task.options for argument in option.arguments()]
-    said = StringIO()
-    try:
-        with redirect_stderr(said), redirect_stdout(said):
-            return run.parse(argv) if task.command == "run" else reconstruct.parse(argv)
-    except SystemExit:
-        raise InputError(_why(task, said.getvalue())) from None
-
-
-def _why(task: "Task", said: str) -> str:
-    """One sentence from the parser's box: what stands between its rulers."""
-    lines = [line.strip("│╭╮╰╯| ") for line in said.splitlines()]
-    told = itertools.takewhile(lambda line: line.strip("─-+"), lines[2:])
-    return f"geogs {task.command}: {' '.join(told).rstrip('.')}."
+    return run.parse(argv) if task.command == "run" else reconstruct.parse(argv)
 
 
 def _wishes(options: BenchOptions, benchmark: "Benchmark") -> "Wishes":
@@ -188,7 +169,7 @@ def _wishes(options: BenchOptions, benchmark: "Benchmark") -> "Wishes":
     return Wishes(
         _names(options.scenes),
         _names(options.variants),
-        (*common, *(_option(text) for text in options.settings)),
+        (*common, *(_option(text) for text in options.set)),
         tuple(seconds(text) for text in _names(options.budgets)),
         options.baseline,
     )

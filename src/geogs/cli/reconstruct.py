@@ -4,20 +4,19 @@ import re
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, get_args
+from typing import TYPE_CHECKING, Annotated, cast
 
-import tyro
-
-from geogs.application.interrupt import Interruption
-from geogs.application.progress import RunProgress
-from geogs.cli.options import SHORT, given, parse_options
+from geogs.cli.options import Given, Positional, parse_options
 from geogs.config import Preset, ReconstructConfig, reconstruct_preset
+from geogs.config.setting import Basic, Range, Weight
 from geogs.errors import InputError
 
 if TYPE_CHECKING:
     from geogs.application.checkpoint import Checkpoint
+    from geogs.application.interrupt import Interruption
+    from geogs.application.progress import RunProgress
     from geogs.application.snapshots import Snapshots
     from geogs.io.sources.posed.base import PosedSource
     from geogs.reconstruct import Reconstruction, ReconstructionState
@@ -34,10 +33,10 @@ class ReconstructOptions(ReconstructConfig):
     Lengths of the result are in the unit of the poses. Every default works.
     """
 
-    source: Annotated[Path, tyro.conf.Positional] = Path()
+    source: Annotated[Path, Positional()] = Path()
     """Folder of images with poses, or the file with the poses."""
-    output: Path | None = None
-    """Folder for the results (also -o); out/NAME if none is given."""
+    output: Annotated[Path | None, Basic("-o")] = None
+    """Folder for the results; out/NAME if none is given."""
     preset: Preset = "default"
     """Group of settings; single ones given beside it win. Without it, accurate on a GPU and default
     on a CPU."""
@@ -45,8 +44,8 @@ class ReconstructOptions(ReconstructConfig):
     """About how long it may take in all, such as 90s, 10m or 1h; none trains until it is good."""
     check_poses: bool = True
     """Whether to see by matching images that the poses follow the expected convention."""
-    hold_out: int | None = None
-    """Leave out every so many-th image, to judge the result by; at least 2, none uses all."""
+    hold_out: Annotated[int | None, Range(2)] = None
+    """Leave out every so many-th image, to judge the result by; none uses all."""
     snapshots: str = ""
     """Also keep the map as it stands after some seconds, such as 5,10,20, in snapshots/; they count
     from when the images have been read."""
@@ -54,7 +53,7 @@ class ReconstructOptions(ReconstructConfig):
     """Also fuse the searched depths without the disks, to depth_fusion/mesh.ply."""
     resume: bool = False
     """Go on from the checkpoint that an earlier call left in the output folder."""
-    checkpoint_every: float = 30.0
+    checkpoint_every: Weight = 30.0
     """Seconds of training between two checkpoints (there is one after the depths, too); 0 makes
     none."""
     device: str = "auto"
@@ -78,6 +77,8 @@ def reconstruct(options: ReconstructOptions) -> Path:
     import geogs
     from geogs.application.checkpoint import Checkpoint, fingerprint
     from geogs.application.gpu_memory import full_memory_in_a_sentence
+    from geogs.application.interrupt import Interruption
+    from geogs.application.progress import RunProgress
     from geogs.application.snapshots import Snapshots
     from geogs.gpu.installation import require_device
     from geogs.gpu.kernels import prepare_kernels
@@ -120,10 +121,10 @@ class _Attendance:
     """Everything that happens at a report of progress."""
 
     scene: "Reconstruction"
-    progress: RunProgress
+    progress: "RunProgress"
     snapshots: "Snapshots"
     checkpoint: "Checkpoint"
-    stop: Interruption
+    stop: "Interruption"
 
     def report(self, stage: str, fraction: float) -> None:
         """Show it, keep what is due, and stop if that was asked for."""
@@ -205,24 +206,20 @@ def seconds(text: str, what: str = "budget") -> float:
 
 def parse(argv: Sequence[str]) -> ReconstructOptions:
     """Options with the preset as defaults, over which single settings win."""
-    name = _preset_name(argv)
+    return parse_options(ReconstructOptions, argv, "reconstruct", _defaults)
+
+
+def _defaults(given: Given) -> ReconstructOptions:
+    name = _preset_name(given)
     base = reconstruct_preset(name)
-    default = ReconstructOptions(
-        seed=base.seed, input=base.input, search=base.search, mapping=base.mapping, mesh=base.mesh,
-        source=tyro.MISSING, preset=name,
-    )  # fmt: skip
-    return parse_options(ReconstructOptions, argv, "reconstruct", default=default, short=SHORT)
+    return ReconstructOptions(**{f.name: getattr(base, f.name) for f in fields(base)}, preset=name)
 
 
-def _preset_name(argv: Sequence[str]) -> Preset:
-    """The preset asked for, else the one that suits the device.
-
-    A wrong one is left for the option parser to complain about.
-    """
-    asked = given(argv, "preset")
-    if asked is not None or "--help" in argv or "-h" in argv:
-        return next((name for name in get_args(Preset) if name == asked), "default")
-    device = given(argv, "device") or "auto"
+def _preset_name(given: Given) -> Preset:
+    """The preset asked for, else the one that suits the device."""
+    if "preset" in given:
+        return cast(Preset, given["preset"])
+    device = given.get("device", "auto")
     if device == "auto":
         from geogs.gpu.installation import gpu_problem
 

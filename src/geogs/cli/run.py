@@ -5,18 +5,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, get_args
+from typing import TYPE_CHECKING, Annotated, cast
 
-import tyro
-
-from geogs.application.calibrate import self_calibrated
-from geogs.application.interrupt import Interruption
-from geogs.application.priors import open_prior
-from geogs.application.progress import RunProgress
-from geogs.cli.options import SHORT, given, parse_options
+from geogs.cli.options import Positional, parse_options
 from geogs.config import Config, Preset, preset
+from geogs.config.setting import Basic, Weight
 
 if TYPE_CHECKING:
+    from geogs.application.interrupt import Interruption
+    from geogs.application.progress import RunProgress
     from geogs.application.run_checkpoint import RunCheckpoint, RunFacts
     from geogs.io.sources.base import ReadingPlace
     from geogs.io.sources.several import JointPlace
@@ -32,10 +29,10 @@ class RunOptions(Config):
     Several videos of one place: ``geogs run a.mp4 b.mp4``.
     """
 
-    source: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
+    source: Annotated[tuple[Path, ...], Positional(unless="resume")] = ()
     """Video file or folder; several of one place, by one camera, make one map."""
-    output: Path | None = None
-    """Folder for the results (also -o); out/NAME if none is given."""
+    output: Annotated[Path | None, Basic("-o")] = None
+    """Folder for the results; out/NAME if none is given."""
     preset: Preset = "default"
     """Group of settings; single ones given beside it win."""
     device: str = "auto"
@@ -43,7 +40,7 @@ class RunOptions(Config):
     resume: Path | None = None
     """Go on with the run that was interrupted or killed in this folder, with its source and its
     settings; only --device and --checkpoint-every may be given beside it."""
-    checkpoint_every: float = 60.0
+    checkpoint_every: Weight = 60.0
     """Seconds between two checkpoints, from which --resume goes on; 0 makes none."""
     online_results: bool = False
     """Also write trajectory and mesh as they are before the final stages, to online/."""
@@ -63,7 +60,11 @@ def run(options: RunOptions) -> Path:
     import torch
 
     import geogs
+    from geogs.application.calibrate import self_calibrated
     from geogs.application.gpu_memory import REMEDY, full_memory_in_a_sentence
+    from geogs.application.interrupt import Interruption
+    from geogs.application.priors import open_prior
+    from geogs.application.progress import RunProgress
     from geogs.application.results import SourceFacts, write_results
     from geogs.application.run_checkpoint import RunCheckpoint, RunFacts, SavedRun, has_checkpoint
     from geogs.application.surfaces import write_depth_mesh, write_online_results
@@ -137,7 +138,7 @@ def _resumed(options: RunOptions, facts: "RunFacts") -> RunOptions:
     from geogs.errors import InputError
 
     given = replace(options, resume=None, device="auto", checkpoint_every=60.0)
-    if given != replace(_defaults("default"), source=()):
+    if given != _defaults("default"):
         raise InputError(
             "--resume goes on with the source and the settings of the run; leave out everything "
             "else but --device and --checkpoint-every."
@@ -179,8 +180,8 @@ def _feed(
     source: "Stream",
     place: "ReadingPlace | JointPlace | None",
     checkpoint: "RunCheckpoint",
-    progress: RunProgress,
-    stop: Interruption,
+    progress: "RunProgress",
+    stop: "Interruption",
 ) -> bool:
     """All frames after a place through the system, until a request to stop; false if the GPU's
     memory is full."""
@@ -205,7 +206,7 @@ def _feed(
     return True
 
 
-def _finish(slam: "Slam", progress: RunProgress, stop: Interruption, correct: bool) -> bool:
+def _finish(slam: "Slam", progress: "RunProgress", stop: "Interruption", correct: bool) -> bool:
     """The final stages; false if a request to stop or a full GPU cut them short."""
     import torch
 
@@ -226,27 +227,14 @@ def _finish(slam: "Slam", progress: RunProgress, stop: Interruption, correct: bo
 
 def parse(argv: Sequence[str]) -> RunOptions:
     """Options with the preset as defaults, over which single settings win."""
-    default = _defaults(_preset_name(argv))
-    if given(argv, "resume") is not None:
-        default = replace(default, source=())
-    short = {
-        **SHORT,
-        "--intrinsics": "--input.intrinsics",
-        "--global-ba-every": "--loop.global-ba-every",
-    }
-    return parse_options(RunOptions, argv, "run", default=default, short=short)
+    return parse_options(
+        RunOptions, argv, "run", lambda given: _defaults(given.get("preset", "default"))
+    )
 
 
-def _defaults(name: Preset) -> RunOptions:
-    base = preset(name)
-    settings = {f.name: getattr(base, f.name) for f in fields(base)}
-    return RunOptions(**settings, source=tyro.MISSING, preset=name)
-
-
-def _preset_name(arguments: Sequence[str]) -> Preset:
-    """The preset asked for; a wrong one is left for the option parser to complain about."""
-    asked = given(arguments, "preset")
-    return next((name for name in get_args(Preset) if name == asked), "default")
+def _defaults(name: str) -> RunOptions:
+    base = preset(cast(Preset, name))
+    return RunOptions(**{f.name: getattr(base, f.name) for f in fields(base)}, preset=name)
 
 
 if __name__ == "__main__":

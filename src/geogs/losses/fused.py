@@ -72,8 +72,9 @@ class _SingleView(torch.autograd.Function):
             ]
         )
         weights = (weights / depth.numel()).astype(np.float32)
-        options = [config.min_alpha, config.depth_relative, NORMAL_EPSILON, config.smoothness_eta]
-        options = np.array([*options, config.smoothness_rewards_edges, scale], np.float32)
+        options = [config.min_alpha, config.ablation.depth_relative, NORMAL_EPSILON]
+        options += [config.smoothness_eta, config.ablation.smoothness_rewards_edges, scale]
+        options = np.array(options, np.float32)
         maps = [_array(m) for m in (depth, normal, alpha, spread)]
         constants = [view.edge, view.image_gradient, view.prior_depth, view.confidence]
         constants = [_array(m) for m in constants]
@@ -167,7 +168,7 @@ class _MultiView(torch.autograd.Function):
         extra = np.empty((3, height, width) if with_pose else (3, 0, 0), np.float32)
         fields = np.empty((3, height, width) if half >= 0 else (3, 0, 0), np.float32)
         loss = np.zeros(height, np.float32)
-        sobel = config.photo_gradient == "sobel"
+        sobel = config.ablation.photo_gradient == "sobel"
         _over_rows(
             lambda a, b: multi.warp_rows(
                 a, b, small, *tables, grey, image, hidden, lenses, T34, limits, options, sobel,

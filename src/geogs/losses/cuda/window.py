@@ -79,8 +79,8 @@ class WindowLosses:
         ]  # fmt: skip
         pixels = camera.width * camera.height
         values = [camera.fx, camera.fy, camera.cx, camera.cy, *(w / pixels for w in weights)]
-        values += [c.min_alpha, c.depth_relative, NORMAL_EPSILON, c.smoothness_eta]
-        values += [c.smoothness_rewards_edges]
+        values += [c.min_alpha, c.ablation.depth_relative, NORMAL_EPSILON, c.smoothness_eta]
+        values += [c.ablation.smoothness_rewards_edges]
         return torch.tensor(values, dtype=torch.float32, device=self.table.device)
 
     def _multi_view_settings(self, pair_share: float) -> Float32[Tensor, "k"]:
@@ -175,7 +175,7 @@ class WindowLosses:
         pairs = self.views * self.partners
         height, width = t.photo.height, t.photo.width
         sizes = (t.render.height, t.render.width, height, width, self.partners)
-        sobel = c.photo_gradient == "sobel"
+        sobel = c.ablation.photo_gradient == "sobel"
         windowed = c.ssim_weight > 0 or c.ncc_weight > 0
         columns = _blocks(width, 32)
         kernels["warp_pairs"](
