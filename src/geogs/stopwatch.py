@@ -13,11 +13,22 @@ class Stopwatch:
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
+        self.until_stream_end: float | None = None
+        """Seconds of all stages up to the end of the stream; none before it."""
         self._is_running = False
 
     def __getstate__(self) -> dict[str, object]:
         """What a checkpoint holds: it is not running when that is read."""
         return {**self.__dict__, "_is_running": False}
+
+    @property
+    def total(self) -> float:
+        """Seconds of all stages so far."""
+        return sum(self.seconds.values())
+
+    def end_stream(self) -> None:
+        """What comes from now on comes after the stream."""
+        self.until_stream_end = self.total
 
     @contextmanager
     def __call__(self, stage: str) -> Iterator[None]:

@@ -6,7 +6,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
-from geogs.cli.options import Positional, parse_options
+from geogs.cli.options import parse_options
+from geogs.config.setting import Positional
 from geogs_train.options import FlowTraining
 from geogs_train.run import RunOptions
 

@@ -15,7 +15,7 @@ from geogs.application.checkpoint import fingerprint, read_checkpoint, write_che
 from geogs.config import ReconstructConfig
 from geogs.errors import InputError
 from geogs.mapping.state import restore_mapper
-from geogs.reconstruct import Reconstruction
+from geogs.reconstruction import Reconstruction
 from posed_scene import (
     DEFAULT,
     GEOGS,

@@ -16,10 +16,10 @@ import pytest
 
 from geogs.application.progress import RunProgress
 from geogs.application.run_checkpoint import RunCheckpoint, RunFacts, frames_after
-from geogs.cli.run import RunOptions
+from geogs.application.settings import RunSettings
 from geogs.config import InputConfig
 from geogs.errors import InputError
-from geogs.io.sources.sniff import open_sources
+from geogs.io.sources.sniff import open_source
 from geogs.io.writers.native import load_map
 from geogs.keyframes.archive import Archive
 from geogs.slam import Slam
@@ -212,11 +212,11 @@ def test_where_no_checkpoint_can_be_written_that_is_said_once(room, tmp_path, mo
     monkeypatch.setattr(Segments, "keyframe_ids", [0])
     said: list[str] = []
     monkeypatch.setattr(RunProgress, "write", lambda _, text: said.append(text))
-    source = open_sources([room])
+    source = open_source([room])
     slam = Slam(source.camera)
-    facts = RunFacts(RunOptions(), "cpu", source.fingerprint(), None, source.place)
+    facts = RunFacts(RunSettings(), "cpu", source.fingerprint(), None, source.place)
     (tmp_path / "checkpoint").touch()
-    checkpoint = RunCheckpoint(tmp_path, facts, 0.001, RunProgress(None))
+    checkpoint = RunCheckpoint(tmp_path, facts, 0.001, RunProgress())
     for _ in range(3):
         time.sleep(0.002)
         checkpoint.after_frame(slam, source)
@@ -239,14 +239,14 @@ def test_reading_goes_on_where_it_was(tmp_path):
     config = InputConfig(intrinsics="60,60,31.5,23.5")
     for paths, count in ((folders[:1], 4), (folders, 7)):
         places = []
-        source = open_sources(paths, config)
+        source = open_source(paths, config)
         frames = []
         for frame in source:
             frames.append(frame)
             places.append(source.place)
         assert len(frames) == count
         for n, place in enumerate(places, 1):
-            other = open_sources(paths, config)
+            other = open_source(paths, config)
             rest = list(frames_after(other, place))
             assert [f.index for f in rest] == list(range(n, count))
             for own, theirs in zip(rest, frames[n:], strict=True):
@@ -258,7 +258,7 @@ def test_reading_goes_on_where_it_was(tmp_path):
             if len(paths) == 2:
                 assert other.spans == source.spans
     with pytest.raises(InputError, match="not what it was"):
-        frames_after(source, open_sources(folders[:1], config).place)
+        frames_after(source, open_source(folders[:1], config).place)
 
 
 def test_archives_keep_what_the_last_checkpoint_refers_to(tmp_path):

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from geogs.cli import main as cli
-from geogs_bench.cli import listing
+from geogs_bench.bench import listing
 
 GEOGS = [sys.executable, "-m", "geogs.cli.main"]
 TINY = [
@@ -126,7 +126,7 @@ import json, sys
 from pathlib import Path
 from geogs_bench.plan import Wishes, find_scenes, make_jobs
 from geogs_bench.registry import find_benchmark
-from geogs_bench.cli import CommandRunner
+from geogs_bench.commands import CommandRunner
 
 for name in sys.argv[2:]:
     benchmark = find_benchmark(name)

@@ -14,8 +14,9 @@ import pytest
 from geogs import __version__
 from geogs.cli import main as cli
 from geogs.cli import reconstruct
-from geogs.cli.options import Positional, parse_options
+from geogs.cli.options import parse_options
 from geogs.config import Config, InputConfig, reconstruct_preset
+from geogs.config.setting import Positional
 from geogs.errors import InputError, OutputError, TrackingLost
 
 

@@ -7,9 +7,9 @@ from typing import Annotated, Literal
 import pytest
 
 from geogs.cli import reconstruct, run
-from geogs.cli.options import Positional, help_text, parse_options
-from geogs.config.leaves import Unnamed, leaves
-from geogs.config.setting import Basic, Only, Range, Settings
+from geogs.cli.options import help_text, parse_options
+from geogs.config.leaves import leaves
+from geogs.config.setting import Basic, Only, Positional, Range, Settings, Unnamed
 from geogs.errors import InputError
 
 

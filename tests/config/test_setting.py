@@ -12,17 +12,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from geogs import config
+from geogs.application.eval_settings import EvalSettings
+from geogs.application.settings import ReconstructSettings, RunSettings
 from geogs.cli.demo import DemoOptions
-from geogs.cli.eval import EvalOptions
-from geogs.cli.reconstruct import ReconstructOptions
-from geogs.cli.run import RunOptions
 from geogs.cli.synth import SynthOptions
-from geogs.config.setting import Kind, Only, Range, Settings, kinds
+from geogs.config.setting import Kind, Only, Range, Settings, Time, kinds
 from geogs.errors import InputError
-from geogs_bench.cli import BenchOptions
+from geogs_bench.settings import BenchSettings
 
-TREES = (config.Config(), config.ReconstructConfig(), RunOptions(), ReconstructOptions())
-COMMANDS = (DemoOptions, EvalOptions, SynthOptions, BenchOptions)
+TREES = (config.Config(), config.ReconstructConfig())
+COMMANDS = (
+    RunSettings, ReconstructSettings, EvalSettings, BenchSettings, DemoOptions, SynthOptions,
+)  # fmt: skip
 
 
 def groups(tree: object, name: str = "") -> Iterator[tuple[str, object]]:
@@ -172,6 +173,11 @@ def test_kinds_come_from_types() -> None:
     kind = Kind.of(Annotated[tuple[Annotated[float, Range(0, 1)], ...] | None, Only("run")])
     assert (kind.base, kind.is_tuple, kind.is_optional) == (float, True, True)
     assert (kind.ranges, kind.marks) == ((Range(0, 1),), (Only("run"),))
+    time = Kind.of(Annotated[float, Time])
+    assert [time.read(text) for text in ("90", "90s", "1.5m", "2min", ".5h")] == [
+        90.0, 90.0, 90.0, 120.0, 1800.0,
+    ]  # fmt: skip
+    assert not time.allows(time.read("soon"))
     assert kind.read("0.5,1") == (0.5, 1.0)
     assert kind.read("None") is None
     assert not kind.allows(kind.read("0.5,x"))

@@ -17,8 +17,8 @@ from geogs.config import ReconstructConfig
 from geogs.errors import InputError, OutputError
 from geogs.io.writers.atomic import atomic_file
 from geogs.mapping.state import DepthState, DiskState, MapperState
-from geogs.mapping.training import TrainingPlace
-from geogs.reconstruct import Reconstruction, ReconstructionState
+from geogs.mapping.training.base import TrainingPlace
+from geogs.reconstruction import Reconstruction, ReconstructionState
 from geogs.splat.map import DiskParameters
 
 FORMAT = "geogs-checkpoint-1"

@@ -12,29 +12,24 @@ import shutil
 import sys
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import MISSING, dataclass, fields, replace
+from dataclasses import MISSING, fields, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from geogs.config.leaves import Leaf, default_of, default_text, leaves
-from geogs.config.setting import Basic, dashed, group_of, refusal
+from geogs.config.setting import Basic, Positional, Time, dashed, group_of, refusal
 from geogs.errors import InputError
 
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
 Options = TypeVar("Options")
+Record = TypeVar("Record", bound="DataclassInstance")
 Given = Mapping[str, str]
 """What the arguments say, by the dotted name of the option; switches say on or off."""
 
 _METAVARS = {int: "N", float: "X", str: "TEXT", Path: "PATH"}
 _COLUMN = 28
-
-
-@dataclass(frozen=True)
-class Positional:
-    """Mark of an option that is given without its name, in the order of the fields."""
-
-    required: bool = True
-    unless: str = ""
-    """Option with which it may be left out all the same."""
 
 
 def parse_options(
@@ -77,6 +72,11 @@ def parse_options(
     texts = {name: some[-1] for name, some in given.items()}
     made: Options = _made(options, default(texts) if default else None, values, ())
     return made
+
+
+def record(kind: type[Record], options: Record) -> Record:
+    """The plain record that options of a command are more than."""
+    return kind(**{f.name: getattr(options, f.name) for f in fields(kind)})
 
 
 def help_text(options: type, command: str, everything: bool) -> str:
@@ -191,6 +191,7 @@ def _head(leaf: Leaf) -> str:
     if kind.base is bool:
         return _off(leaf).replace("no-", "[no-]", 1)
     value = ",".join(kind.choices) if kind.choices else _METAVARS[kind.base]
+    value = "TIME" if Time in kind.marks else value
     return f"{', '.join(reversed(_names(leaf)))} {value}"
 
 

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-from geogs.cli.options import Positional, parse_options
+from geogs.cli.options import parse_options
 from geogs.config import Seed
-from geogs.config.setting import Range, Settings
+from geogs.config.setting import Positional, Range, Settings
 
 
 @dataclass(frozen=True)

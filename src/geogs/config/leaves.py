@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from dataclasses import MISSING, dataclass, fields
 from typing import Any, get_args
 
-from geogs.config.setting import Kind, Only, dashed, group_of, kinds
+from geogs.config.setting import Kind, Only, Unnamed, dashed, group_of, kinds
 
 
 @dataclass(frozen=True)
@@ -35,10 +35,6 @@ class Leaf:
     def mark(self, kind: type) -> Any:
         """What its type says of it, such as :class:`Basic`; none if it does not."""
         return next((mark for mark in self.kind.marks if isinstance(mark, kind)), None)
-
-
-class Unnamed:
-    """Mark of a group whose settings stand at the top of the command line, without its name."""
 
 
 def leaves(tree: object, command: str = "") -> tuple[Leaf, ...]:

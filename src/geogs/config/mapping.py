@@ -107,9 +107,6 @@ class MappingConfig(Settings, group="mapping"):
     """Recent keyframes that are trained together."""
     history: Annotated[CountOrZero, Only("run")] = 2
     """Older keyframes drawn at random into each window."""
-    resident_views: Count = 128
-    """Keyframes whose images and depths stay in memory, those used last; others wait in a temporary
-    file. Best more than the window and its history."""
     iterations: Annotated[CountOrZero, Only("run")] = 8
     """Steps per keyframe."""
     views_per_step: Annotated[CountOrZero, Only("run")] = 2

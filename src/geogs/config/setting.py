@@ -19,6 +19,9 @@ from typing import Annotated, Any, ClassVar, Literal, Union, get_args, get_origi
 
 from geogs.errors import InputError
 
+# Seconds of the units of a time.
+_SECONDS = {"s": 1.0, "min": 60.0, "m": 60.0, "h": 3600.0}
+
 Bound = float | str
 """A number, or the name of another setting of the group, or a sum of such: ``window + history``."""
 
@@ -77,6 +80,23 @@ class Only:
     """A setting that other commands than this one do not heed, and do not offer."""
 
     command: Literal["run", "reconstruct"]
+
+
+@dataclass(frozen=True)
+class Positional:
+    """An option that is given without its name, in the order of the fields."""
+
+    required: bool = True
+    unless: str = ""
+    """Option with which it may be left out all the same."""
+
+
+class Time:
+    """Seconds that an option may give as ``90s``, ``10m`` or ``1.5h``, too."""
+
+
+class Unnamed:
+    """A group whose settings stand at the top of the command line, without its name."""
 
 
 Share = Annotated[float, Range(0, 1)]
@@ -151,6 +171,8 @@ class Kind:
             Path: ("a path", "paths"),
         }[self.base]
         text = many if self.is_tuple else one
+        if Time in self.marks:
+            text += ", as seconds or such as 90s, 10m or 1h,"
         if self.ranges:
             text += " " + " and ".join(map(str, self.ranges))
         if self.choices:
@@ -169,7 +191,10 @@ class Kind:
         return finite and all(r.holds(value, group) for r in self.ranges)  # type: ignore[arg-type]
 
     def _read_one(self, text: str) -> object:
+        units = [unit for unit in _SECONDS if Time in self.marks and text.endswith(unit)]
         try:
+            if units:
+                return _SECONDS[units[0]] * float(text.removesuffix(units[0]))
             return self.base(text)
         except ValueError:
             return text

@@ -9,7 +9,7 @@ from geogs.config.loop import LoopConfig
 from geogs.config.mapping import MappingConfig
 from geogs.config.mesh import MeshConfig
 from geogs.config.prior import PriorConfig
-from geogs.config.setting import Range, Settings
+from geogs.config.setting import Count, Range, Settings
 from geogs.config.tracking import TrackingConfig
 
 Preset = Literal["fast", "default", "accurate"]
@@ -22,6 +22,9 @@ class Config(Settings):
 
     seed: Seed = 0
     """Random seed; same seed, same machine, same result on the CPU."""
+    resident_keyframes: Count = 128
+    """Keyframes whose images, depths and the like stay in memory or on the GPU, those used last;
+    others wait in a temporary file. More than the window that is mapped and its history."""
     input: InputConfig = field(default_factory=InputConfig)
     calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)

@@ -55,8 +55,6 @@ class TrackingConfig(Settings, group="tracking"):
     """A keyframe that an image was recognised as counts if this fraction of it finds a match."""
     patience: Count = 15
     """Frames with texture in which the camera stays lost before another segment is begun."""
-    resident_keyframes: Count = 64
-    """Keyframes whose images stay in memory, those used last; others wait in a temporary file."""
     huber: Positive = 0.5
     """Standard deviations of the flow beyond which a match counts linearly."""
     global_rounds: CountOrZero = 4

@@ -1,0 +1,137 @@
+"""Self-calibration before a run: from a source to its intrinsics.json."""
+
+import json
+import signal
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from geogs.application.calibrate import refined, self_calibrated
+from geogs.application.interrupt import Interruption
+from geogs.application.progress import RunProgress
+from geogs.config import CalibrationConfig, Config, InputConfig
+from geogs.io.sources.calibration import Calibration
+from geogs.io.sources.sniff import open_source
+from geogs.io.writers.intrinsics import write_intrinsics
+from geogs.tracking.calibration import estimate
+from geogs.tracking.calibration.estimate import SelfCalibration
+from tracking_scenes import CAMERA, pose, render
+
+CONFIG = Config(calibration=CalibrationConfig(start_keyframes=8, keyframes=12))
+
+
+class Listener(RunProgress):
+    """Remembers what it was told."""
+
+    def __init__(self) -> None:
+        self.said: list[str] = []
+        self.stages: set[str] = set()
+
+    def write(self, text: str) -> None:
+        self.said.append(text)
+
+    def stage(self, name: str, fraction: float) -> None:
+        self.stages.add(name)
+
+
+def write_images(folder: Path, poses: list[np.ndarray]) -> Path:
+    """A folder of images of the rendered room, about which nothing else is known."""
+    folder.mkdir()
+    for k, T in enumerate(poses):
+        cv2.imwrite(str(folder / f"{k:03d}.png"), render(T)[0][..., ::-1])
+    return folder
+
+
+@pytest.fixture(scope="module")
+def video(tmp_path_factory) -> Path:
+    path = [pose(-0.5 + 0.04 * k, 0.05 * np.sin(0.5 * k), 0.0, 0.35 * np.sin(0.3 * k))
+            for k in range(14)]  # fmt: skip
+    return write_images(tmp_path_factory.mktemp("calibration") / "video", path)
+
+
+def written(source, folder: Path) -> dict:
+    write_intrinsics(folder / "intrinsics.json", source.camera, source.calibration)
+    return json.loads((folder / "intrinsics.json").read_text())
+
+
+def test_intrinsics_json_holds_the_deviation(video, tmp_path, capfd):
+    listener = Listener()
+    source = self_calibrated(open_source(video), CONFIG, progress=listener)
+    document = written(source, tmp_path)
+    of_source = document["source"]
+    deviation = of_source["focal_deviation"]
+    assert abs(of_source["fx"] - CAMERA.fx) < 2.5 * deviation
+    assert 0.002 * CAMERA.fx < deviation < 0.05 * CAMERA.fx
+    assert of_source["is_guess"] is False
+    assert of_source["self_calibration"]["failure"] is None
+    assert of_source["k1_deviation"] is None
+    assert document["fx"] == pytest.approx(of_source["fx"])
+    said = f"refined from the video: {of_source['fx']:.1f} +- {deviation:.1f} pixels"
+    assert of_source["origin"] == f"{said} (a field of view of 60 degrees was assumed)"
+    assert source.intrinsics_origin == of_source["origin"]
+    assert listener.said == [f"Intrinsics: {source.intrinsics_origin}."]
+    assert listener.stages == {"calibration"}
+    assert capfd.readouterr() == ("", "")
+    frames = list(source)
+    assert [f.index for f in frames] == list(range(14))
+
+
+def test_a_camera_that_stands_still_leaves_the_guess(tmp_path):
+    before = open_source(write_images(tmp_path / "still", [pose(0.0)] * 4))
+    listener = Listener()
+    source = self_calibrated(before, CONFIG, progress=listener)
+    of_source = written(source, tmp_path)["source"]
+    assert source.camera == before.camera
+    assert of_source["is_guess"] is True
+    assert of_source["focal_deviation"] is None
+    assert of_source["self_calibration"]["failure"] == "the camera hardly moves"
+    assert "the camera hardly moves" in source.intrinsics_origin
+    (message,) = listener.said
+    assert "warning: the video does not tell its focal length: the camera hardly moves" in message
+    assert "give --intrinsics" in message
+
+
+def test_what_is_given_or_not_wanted_is_left_alone(video, monkeypatch):
+    monkeypatch.setattr(estimate, "self_calibrate", pytest.fail)
+    given = open_source(video, InputConfig(intrinsics="140,140,95.5,71.5"))
+    assert self_calibrated(given, CONFIG) is given
+    guessed = open_source(video)
+    off = replace(CONFIG, calibration=CalibrationConfig(refine=False))
+    assert self_calibrated(guessed, off) is guessed
+
+
+def test_ctrl_c_goes_on_with_the_guess(video, monkeypatch):
+    def interrupted(frames, camera, config, device, seed, report):
+        signal.raise_signal(signal.SIGINT)
+        report(0.1)
+        pytest.fail("the request was not heard")
+
+    monkeypatch.setattr(estimate, "self_calibrate", interrupted)
+    source = open_source(video)
+    listener = Listener()
+    assert self_calibrated(source, CONFIG, progress=listener, stop=Interruption()) is source
+    (said,) = listener.said
+    assert said.startswith("Calibration stopped")
+    with pytest.raises(KeyboardInterrupt):  # of a caller who has no way to stop
+        self_calibrated(source, CONFIG)
+
+
+def test_what_was_found_at_working_size_is_carried_to_the_source():
+    nominal = Calibration(
+        1500.0, 1500.0, 959.5, 539.5, width=1920, height=1080, origin="EXIF", is_nominal=True
+    )
+    working = nominal.camera().with_long_edge(512)
+    camera = replace(working, fx=1.1 * working.fx, fy=1.1 * working.fy)
+    found = SelfCalibration(camera, -0.08, 0.01, 0.004, 12, 80)
+    after = refined(nominal, working.fx, found)
+    assert after.fx == pytest.approx(1650.0)
+    assert after.fy == pytest.approx(1650.0)
+    assert after.distortion == (-0.08, 0.0, 0.0, 0.0)
+    assert after.refinement is not None
+    assert after.refinement.deviation == pytest.approx(16.5)
+    assert after.refinement.deviation_k1 == 0.004
+    assert not after.is_nominal
+    assert "k1 -0.0800 +- 0.0040 (EXIF says 1500.0)" in after.origin
