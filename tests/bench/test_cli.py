@@ -81,7 +81,10 @@ def test_a_failing_scene_is_exit_code_2_with_its_reason_in_the_tables(room, tmp_
         (["rooms", "{room}", "--set", "=3"], "is no setting"),
         (["rooms", "{room}", "--budgets", "20"], "leave out --budgets"),
         (["tum", "{room}", "--known-poses"], "--known-poses is for rooms"),
-        (["rooms", "{room}", "--known-poses", "--budgets", "soon"], "budgets is ('soon',), but must be"),
+        (
+            ["rooms", "{room}", "--known-poses", "--budgets", "soon"],
+            "budgets is ('soon',), but must be",
+        ),
     ],
 )
 def test_wrong_wishes_are_one_sentence(room, tmp_path, capsys, arguments, sentence):

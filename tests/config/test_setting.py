@@ -121,6 +121,8 @@ def test_a_range_holds_what_its_bounds_say(least: int, most: int, x: float, odd:
     closed, opened = Range(least, most), Range(above=least, below=most)
     assert closed.holds(x, None) == (least <= x <= most)
     assert opened.holds(x, None) == (least < x < most)
+    assert Range(least, most, or_zero=True).holds(0, None)
+    assert Range(least, most, or_zero=True).holds(x, None) == (least <= x <= most or x == 0)
     assert Range(least, most, odd=odd).holds(round(x), None) == (
         least <= round(x) <= most and (not odd or round(x) in range(-9, 10, 2))
     )

@@ -12,7 +12,7 @@ class InputConfig(Settings, group="input"):
 
     intrinsics: Annotated[str, Basic("--intrinsics")] = "auto"
     """auto, a file, or fx,fy,cx,cy[,k1,k2,p1,p2[,k3]] in pixels of the source image."""
-    long_edge: Annotated[int, Range(0, 16384), Basic("--long-edge")] = 512
+    long_edge: Annotated[int, Range(32, 16384, or_zero=True), Basic("--long-edge")] = 512
     """Longer side of the working image in pixels; smaller sources are not enlarged, 0 keeps all."""
     start: Annotated[int, Range(0), Basic("--start")] = 0
     """First frame of the source, from 0."""

@@ -38,12 +38,14 @@ class Range:
     above: Bound | None = None
     below: Bound | None = None
     odd: bool = False
+    or_zero: bool = False
+    """0 is allowed, too."""
 
     def holds(self, value: float, group: object) -> bool:
         """Whether a finite number lies in the range, given the other settings of its group."""
         bounds = (self.least, self.most, self.above, self.below)
         least, most, above, below = (_resolved(bound, group) for bound in bounds)
-        return (
+        return (self.or_zero and value == 0) or (
             (least is None or value >= least)
             and (most is None or value <= most)
             and (above is None or value > above)
@@ -64,7 +66,8 @@ class Range:
             words = {"from": self.least, "to": self.most}
         parts = [f"{word} {_shown(bound)}" for word, bound in words.items() if bound is not None]
         text = (" " if "from" in words else " and ").join(parts)
-        return f"{text} and odd" if self.odd else text
+        text = f"{text} and odd" if self.odd else text
+        return f"0 or {text}" if self.or_zero else text
 
 
 @dataclass(frozen=True)
