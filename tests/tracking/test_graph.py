@@ -5,11 +5,12 @@ import pytest
 import torch
 
 from geogs.bundle.base import BundleOptions
+from geogs.bundle.select import grid_fields
 from geogs.keyframes.grid import SampleGrid
 from geogs.keyframes.store import KeyframeStore, Segment
 from geogs.tracking.flow.classical import ClassicalFlow
 from geogs.tracking.graph import FrameGraph
-from geogs.tracking.motion import FrameLocator, pnp, transfer_depth
+from geogs.tracking.motion import FrameLocator, pnp
 from geogs.tracking.proximity import frame_distances, proximity_pairs
 from tracking_scenes import CAMERA, pose, render
 
@@ -138,7 +139,7 @@ def test_a_frame_is_located_from_a_guess_and_from_nothing():
 def test_transferred_depth_matches_the_other_view():
     a, b = room_graph([pose(0.0), pose(0.1, yaw=0.03)]).keyframes
     T = b.T_cw @ torch.linalg.inv(a.T_cw)
-    d, information = transfer_depth(SampleGrid(CAMERA), T, a.inverse_depth, a.information)
+    d, information = grid_fields(SampleGrid(CAMERA)).transfer(T, a.inverse_depth, a.information)
     seen = information > 0
     assert float(seen.float().mean()) > 0.8
     ratio = (d / b.inverse_depth - 1).abs()

@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from geogs.bundle.base import BundleOptions
+from geogs.bundle.select import grid_fields
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_inverse
 from geogs.keyframes.grid import SampleGrid
@@ -23,7 +24,7 @@ from geogs.threads import thread_map
 from geogs.tracking.flow.base import FlowMatch
 from geogs.tracking.flow.filled import filled_positions
 from geogs.tracking.graph import FrameGraph
-from geogs.tracking.motion import pnp, transfer_depth
+from geogs.tracking.motion import pnp
 
 
 @dataclass(frozen=True)
@@ -132,12 +133,12 @@ def two_view(camera: Camera, match: FlowMatch) -> TwoView | None:
 def _place_all(store: Segment, flows: list[FlowMatch], best: tuple[int, TwoView]) -> None:
     """Poses by PnP on the first keyframe's depth, depths by carrying it over."""
     chosen, view = best
-    states = list(store)
+    states, fields = list(store), grid_fields(store.grid)
     first = states[0]
     eye = torch.eye(4, dtype=torch.float64)
     known = view.good.to(store.grid.device)
     first.T_cw, first.information = eye, known.float()
-    first.inverse_depth = store.grid.fill(view.inverse_depth.to(known.device), first.information)
+    first.inverse_depth = fields.fill(view.inverse_depth.to(known.device), first.information)
     for n, (state, match) in enumerate(zip(states[1:], flows, strict=True)):
         if n == chosen:
             state.T_cw = view.T_ji
@@ -145,8 +146,8 @@ def _place_all(store: Segment, flows: list[FlowMatch], best: tuple[int, TwoView]
             good = known & match.sure()[0]
             T = pnp(store.grid, first.inverse_depth, match.pixels[0], good)
             state.T_cw = states[n].T_cw if T is None else T
-        state.inverse_depth, state.information = transfer_depth(
-            store.grid, state.T_cw, first.inverse_depth, first.information
+        state.inverse_depth, state.information = fields.transfer(
+            state.T_cw, first.inverse_depth, first.information
         )
 
 

@@ -11,8 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from geogs.bundle.motion import solve_poses
-from geogs.bundle.projection import project
-from geogs.geometry.lie import se3_inverse
+from geogs.bundle.select import grid_fields
 from geogs.keyframes.grid import SampleGrid
 from geogs.keyframes.keyframe import Keyframe
 from geogs.tracking.flow.base import FlowMatch, FlowOperator
@@ -69,7 +68,7 @@ class FrameLocator:
         self, keyframe: Keyframe, encoded: Any, T_guess: Float[Tensor, "4 4"]
     ) -> FrameMotion | None:
         """Pose of a frame that is near ``T_guess``; None if too little agrees with any pose."""
-        forward, backward = all_reprojections(self.grid, [keyframe], [T_guess])
+        forward, backward = grid_fields(self.grid).reproject([keyframe], [T_guess])
         there, _ = self.operator.measure(
             [keyframe.encoded], [encoded], forward, backward, fine=False
         )
@@ -187,81 +186,6 @@ class FlowChain:
             self._there = filled_positions(self.grid, there)[None]
             self._back = filled_positions(self.grid, back)[None]
         return ChainedMatch(there, median, matched)
-
-
-def all_reprojections(
-    grid: SampleGrid, keyframes: Sequence[Keyframe], T_cw: Sequence[Float[Tensor, "4 4"]]
-) -> tuple[Float[Tensor, "e p 2"], Float[Tensor, "e p 2"]]:
-    """:func:`both_reprojections` of several pairs of a keyframe and a frame."""
-    if not grid.on_gpu:
-        views = [both_reprojections(grid, k, T) for k, T in zip(keyframes, T_cw, strict=True)]
-        return torch.stack([v[0] for v in views]), torch.stack([v[1] for v in views])
-    from geogs.bundle.cuda.fields import carry_depth
-
-    rows = {k.id: k for k in keyframes}
-    slot = {id: n for n, id in enumerate(rows)}
-    there, back = carry_depth(
-        grid,
-        torch.stack(list(T_cw)),
-        torch.stack([k.T_cw for k in rows.values()]),
-        torch.tensor([slot[k.id] for k in keyframes]),
-        torch.stack([k.inverse_depth for k in rows.values()]),
-        torch.stack([k.information for k in rows.values()]),
-        reproject=True,
-    )
-    return there, back
-
-
-def both_reprojections(
-    grid: SampleGrid, keyframe: Keyframe, T_cw: Float[Tensor, "4 4"]
-) -> tuple[Float[Tensor, "p 2"], Float[Tensor, "p 2"]]:
-    """Cells of the keyframe in a frame at ``T_cw``, and cells of that frame in the keyframe.
-
-    The frame has no depth of its own; it borrows the keyframe's.
-    """
-    T = T_cw @ se3_inverse(keyframe.T_cw)
-    depth, _ = transfer_depth(grid, T, keyframe.inverse_depth, keyframe.information)
-    there = project(grid.camera, grid.rays, T[None], keyframe.inverse_depth[None])
-    back = project(grid.camera, grid.rays, se3_inverse(T)[None], depth[None])
-    return there.pixels[0], back.pixels[0]
-
-
-def transfer_depth(
-    grid: SampleGrid,
-    T_ji: Float[Tensor, "4 4"],
-    inverse_depth: Float[Tensor, "p"],
-    information: Float[Tensor, "p"],
-) -> tuple[Float[Tensor, "p"], Float[Tensor, "p"]]:
-    """Inverse depth and information of frame i as seen from frame j; nearest surface wins.
-
-    Cells that nothing falls on are filled from their surroundings and have no information.
-    """
-    if grid.on_gpu:
-        from geogs.bundle.cuda.fields import carry_depth
-
-        depth, carried = carry_depth(
-            grid,
-            T_ji[None],
-            torch.eye(4).to(T_ji)[None],
-            torch.zeros(1, dtype=torch.long),
-            inverse_depth[None],
-            information[None],
-            reproject=False,
-        )
-        return depth[0], carried[0]
-    R, t = T_ji[:3, :3].to(inverse_depth), T_ji[:3, 3].to(inverse_depth)
-    z = (grid.rays @ R.mT + inverse_depth[:, None] * t)[:, 2]
-    p = project(grid.camera, grid.rays, T_ji[None], inverse_depth[None])
-    cell, hit = grid.cells_of(p.pixels[0])
-    hit &= p.valid[0]
-    moved = torch.where(hit, inverse_depth / z.clamp(min=1e-6), torch.zeros_like(z))
-    depth = torch.zeros_like(moved).scatter_reduce(0, cell, moved, "amax")
-    nearest = hit & (moved >= 0.98 * depth[cell])
-    kept = torch.where(nearest, information * z.square(), torch.zeros_like(z))
-    transferred = torch.zeros_like(kept).scatter_reduce(0, cell, kept, "amax")
-    seen = depth > 0
-    # A token confidence lets cells without information still be filled from, if weakly.
-    return grid.fill(depth, torch.where(seen, transferred + 1e-6, 0.0)), transferred * seen
 
 
 def pnp(
