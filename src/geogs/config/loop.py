@@ -55,6 +55,8 @@ class VerificationOptions:
     which the other sees. Tells look-alikes apart where their shapes differ within the view."""
     max_turn: float = 3.0
     """Dense check: largest rotation in degrees between the poses found in the two directions."""
+    min_ncc: float = 0.5
+    """Dense check: least median correlation of the images at those poses, in each direction."""
 
 
 @dataclass(frozen=True)
