@@ -6,7 +6,7 @@ import pytest
 from box_room import CAMERA, box, circle
 from geogs.evaluation import plots
 from geogs.evaluation.run_report import write_run_page
-from geogs.evaluation.shading import Viewpoint, level_axes, look_at_one_place, shade, viewpoints
+from geogs.evaluation.shading import Viewpoint, level_axes, look, look_at_one_place, viewpoints
 from geogs.types import Trajectory
 
 
@@ -22,7 +22,7 @@ def test_shading_is_the_cosine_and_the_ceiling_is_cut():
     half = (3.0, 2.0, 1.2)
     vertices, faces = box(half)
     view = Viewpoint("x", CAMERA, np.linalg.inv(circle()[0]))
-    picture = shade(vertices, faces, view)
+    picture = look(vertices, faces, view).paint()
     middle = picture[47:49, 63:65].astype(float)
     assert np.abs(middle - 190).max() <= 1  # a wall seen at right angles, at full brightness
     assert picture.max() <= 190  # no background: the box is closed
@@ -30,14 +30,15 @@ def test_shading_is_the_cosine_and_the_ceiling_is_cut():
     expected = 190 * (0.25 + 0.75 / np.linalg.norm(ray))
     assert abs(float(picture[47:49, 20].mean()) - expected) < 1.5
     red = np.tile(np.array([[200, 10, 20]], np.uint8), (8, 1))
-    assert np.abs(shade(vertices, faces, view, red)[48, 64].astype(int) - [200, 10, 20]).max() <= 1
+    painted = look(vertices, faces, view).paint(red)[48, 64].astype(int)
+    assert np.abs(painted - [200, 10, 20]).max() <= 1
     above = viewpoints(vertices, circle(), CAMERA)[-1]
     assert above.name == "from above"
     size = above.camera
-    centre = shade(vertices, faces, above)[size.height // 2, size.width // 2]
+    centre = look(vertices, faces, above).paint()[size.height // 2, size.width // 2]
     depth_of_floor = np.abs(centre.astype(int) - 190).max()
     assert depth_of_floor <= 1
-    assert (shade(vertices, faces, above)[0] == 255).all()
+    assert (look(vertices, faces, above).paint()[0] == 255).all()
 
 
 def test_keyframe_and_path_pictures_are_written(tmp_path):
@@ -46,7 +47,7 @@ def test_keyframe_and_path_pictures_are_written(tmp_path):
     normal = np.zeros((48, 64, 3))
     normal[10:, :, 2] = -1
     image = np.full((96, 128, 3), 90, np.uint8)
-    plots.plot_keyframes(tmp_path / "k.png", [image] * 2, [depth] * 2, [normal] * 2, ["a", "b"])
+    plots.plot_keyframes(tmp_path / "k.png", [image] * 2, [depth] * 2, [normal] * 2)
     tracked = np.ones(60, bool)
     tracked[20:25] = False
     plots.plot_path(tmp_path / "p.png", Trajectory(np.arange(60) / 30, circle(), tracked))

@@ -38,8 +38,11 @@ def write_report(
         )
     if mesh is not None:
         views = viewpoints(mesh.vertices, trajectory.T_wc[trajectory.tracked], renders[0].camera)
-        surfaces = [("mesh", mesh.vertices, mesh.faces, None)]
-        if mesh.colours is not None:
-            surfaces.append(("colours", mesh.vertices, mesh.faces, mesh.colours))
+        colourings = {"mesh": None, "colours": mesh.colours}
+        surfaces = [
+            (name, mesh.vertices, mesh.faces, colours)
+            for name, colours in colourings.items()
+            if name == "mesh" or colours is not None
+        ]
         plots.plot_meshes(folder / "mesh.png", surfaces, views)
     write_run_page(folder, summary)
