@@ -68,6 +68,8 @@ class VerificationOptions(Settings, group="loop.verification"):
     which the other sees. Tells look-alikes apart where their shapes differ within the view."""
     max_turn: Angle = 3.0
     """Dense check: largest rotation in degrees between the poses found in the two directions."""
+    min_ncc: Annotated[float, Range(-1, 1)] = 0.5
+    """Dense check: least median correlation of the images at those poses, in each direction."""
 
 
 @dataclass(frozen=True)

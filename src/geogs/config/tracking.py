@@ -49,6 +49,11 @@ class TrackingConfig(Settings, group="tracking"):
     """The camera is lost when less than this fraction of a keyframe finds a match."""
     max_residual: Annotated[float, Range(above=0, most=1)] = 0.008
     """The camera is lost when the median reprojection error exceeds this, of the long edge."""
+    min_ncc: Annotated[float, Range(-1, 1)] = 0.5
+    """A frame counts as located where the images agree: least median correlation (NCC) of windows
+    of 9 x 9 pixels, reprojected by pose and depth. Unlike images come to 0, one place to 0.7 and
+    more. Where too few windows have texture the flow alone decides whether the camera is still
+    where it was followed to; a map is never started, nor a camera found again, without evidence."""
     relocalise: CountOrZero = 5
     """Recent keyframes, and as many older ones in turn, tried when the camera is lost."""
     recognised: Share = 0.25
