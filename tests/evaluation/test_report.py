@@ -47,7 +47,7 @@ def test_keyframe_and_path_pictures_are_written(tmp_path):
     normal = np.zeros((48, 64, 3))
     normal[10:, :, 2] = -1
     image = np.full((96, 128, 3), 90, np.uint8)
-    plots.plot_keyframes(tmp_path / "k.png", [image] * 2, [depth] * 2, [normal] * 2, ["a", "b"])
+    plots.plot_keyframes(tmp_path / "k.png", [image] * 2, [depth] * 2, [normal] * 2)
     tracked = np.ones(60, bool)
     tracked[20:25] = False
     plots.plot_path(tmp_path / "p.png", Trajectory(np.arange(60) / 30, circle(), tracked))

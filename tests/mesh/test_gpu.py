@@ -16,9 +16,11 @@ from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp
 from geogs.io.writers.native import save_map
 from geogs.io.writers.ply import write_splats
-from geogs.mesh import DepthMapView, extract_mesh, tsdf
+from geogs.mesh import tsdf
 from geogs.mesh.colour import colour_mesh
+from geogs.mesh.extract import extract_mesh
 from geogs.mesh.tsdf import SparseTsdf, _plane_table, band_blocks
+from geogs.mesh.types import DepthMapView
 from geogs.types import MapSnapshot, RenderedKeyframe, Trajectory
 
 HAS_GPU = torch.cuda.is_available()
