@@ -10,8 +10,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from geogs.bundle.motion import fit_frame
-from geogs.bundle.select import grid_fields
+from geogs.bundle.select import grid_fields, motion_solver
 from geogs.geometry.lie import se3_inverse
 from geogs.keyframes.grid import SampleGrid
 from geogs.keyframes.keyframe import Keyframe
@@ -117,12 +116,9 @@ class FrameLocator:
         T_guess: Float[Tensor, "4 4"],
         is_expected: bool,
     ) -> FrameMotion | None:
-        T, judged = fit_frame(
-            self.grid,
+        T, judged = motion_solver(self.grid).fit(
             T_guess,
-            keyframe.T_cw,
-            keyframe.inverse_depth,
-            keyframe.information,
+            keyframe,
             match.pixels[0],
             match.weight[0],
             iterations=FIT_ITERATIONS,

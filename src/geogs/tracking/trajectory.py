@@ -10,9 +10,9 @@ import torch
 from jaxtyping import Bool, Float, Float16, Int16
 from torch import Tensor
 
-from geogs.bundle.motion import solve_poses
+from geogs.bundle.problem import MotionProblem
 from geogs.bundle.projection import linearise
-from geogs.bundle.select import grid_fields
+from geogs.bundle.select import grid_fields, motion_solver
 from geogs.geometry.lie import retract, se3_inverse, se3_log
 from geogs.keyframes.grid import SampleGrid
 from geogs.keyframes.keyframe import Keyframe
@@ -222,9 +222,8 @@ class TrajectoryRecorder:
         p = linearise(grid.camera, grid.rays[cells], start[frame] @ se3_inverse(source), depth)
         weight = depth_aware_weight(weight, p.depth_jacobian, information)
         pixels = unpacked_positions(grid, torch.stack([o.position for _, o in pairs]))
-        T, _ = solve_poses(
-            grid.camera, grid.rays[cells], start, depth, source, frame, pixels, weight, iterations=8
-        )
+        problem = MotionProblem(start, depth, source, frame, pixels, weight)
+        T, _ = motion_solver(grid, cells).solve(problem, iterations=8)
         return T
 
 
