@@ -16,7 +16,7 @@ from geogs_train.run import RunOptions
 class TrainOptions:
     """Trains the flow network on random rooms that are made on the fly.
 
-    OUTPUT gets checkpoint/ (to go on with --run.resume), log.jsonl, curves.png and
+    OUTPUT gets checkpoint.safetensors (to go on with --run.resume), log.jsonl, curves.png and
     flow.safetensors. On several GPUs:
     torchrun --nproc-per-node N -m geogs.cli.main train flow OUTPUT
     """

@@ -49,8 +49,9 @@ def train_flow(
 ) -> FlowScores | None:
     """Train until the last step or the last minute; returns the last validation's scores.
 
-    The first worker writes ``checkpoint/``, ``log.jsonl`` and ``flow.safetensors`` (the running
-    mean of the weights in half precision) to ``out``. Ctrl-C ends it as the last minute does.
+    The first worker writes ``checkpoint.safetensors``, ``log.jsonl`` and ``flow.safetensors`` (the
+    running mean of the weights in half precision) to ``out``. Ctrl-C ends it as the last minute
+    does.
 
     Raises:
         GeogsError: the weights are no longer finite.

@@ -206,7 +206,11 @@ def test_a_resumed_run_equals_one_that_was_never_stopped(tmp_path):
     losses = [float(whole.advance()) for _ in range(3)]
     first = FlowTrainer(TINY, CPU)
     first.advance()
+    (tmp_path / "checkpoint").mkdir()
+    (tmp_path / "checkpoint" / "notes.txt").touch()  # of somebody else
     save_checkpoint(first, tmp_path)
+    save_checkpoint(first, tmp_path)
+    assert (tmp_path / "checkpoint" / "notes.txt").is_file()
     assert read_options(tmp_path) == TINY
     second = FlowTrainer(replace(TINY, seed=0), CPU)
     load_checkpoint(second, tmp_path)
@@ -235,6 +239,9 @@ def test_the_command_trains_resumes_and_writes_weights(tmp_path):
 def test_resuming_nothing_is_one_sentence(tmp_path, capsys):
     assert main(["train", "flow", str(tmp_path / "no"), "--run.resume", "--device", "cpu"]) == 2
     assert "There is no checkpoint" in capsys.readouterr().err
+    (tmp_path / "checkpoint.safetensors").write_bytes(b"rubbish")
+    assert main(["train", "flow", str(tmp_path), "--run.resume", "--device", "cpu"]) == 2
+    assert "is damaged" in capsys.readouterr().err
 
 
 def test_the_second_stage_begins_near_the_truth_and_learns_from_what_is_adjusted():

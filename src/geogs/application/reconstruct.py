@@ -22,8 +22,8 @@ from geogs.io.writers.atomic import prepare_output_folder
 from geogs.reconstruction import Reconstruction, ReconstructionState
 from geogs.threads import on_one_torch_thread
 
-_LEAST_SECONDS = 1.0
-"""What is left of a budget at least, when reading and checking have used it up."""
+LEAST_BUDGET = 1.0
+"""Seconds that are left of a budget at least, when reading and checking have used it up."""
 
 Report = Callable[[str, float], None]
 """Called with the name of a stage and its finished fraction in [0, 1]."""
@@ -169,4 +169,4 @@ class _Clock:
 
     def left(self) -> float | None:
         """Seconds; none where there is no limit."""
-        return self._end and max(self._end - time.perf_counter(), _LEAST_SECONDS)
+        return self._end and max(self._end - time.perf_counter(), LEAST_BUDGET)

@@ -81,7 +81,7 @@ def resume(
     """
     progress, stop = progress or RunProgress(), stop or Stop()
     saved = SavedRun(output)
-    settings = _continued(saved.facts, settings or saved.facts.settings, output)
+    settings = continued(saved.facts, settings or saved.facts.settings, output)
     config, device = settings.config, require_device(settings.device)
     source = saved.calibrated(open_source(settings.source, config.input))
     output = prepare_output_folder(output)
@@ -94,8 +94,12 @@ def resume(
     return _Run(slam, source, settings, output, facts, progress, stop).complete(frames)
 
 
-def _continued(facts: RunFacts, settings: RunSettings, output: Path) -> RunSettings:
-    """Settings to go on with, on the kind of device that the run began on."""
+def continued(facts: RunFacts, settings: RunSettings, output: Path) -> RunSettings:
+    """Settings to go on with in a folder, on the kind of device that the run began on.
+
+    Raises:
+        InputError: they would compute something else, or elsewhere.
+    """
     elsewhere = settings.output is not None and settings.output.resolve() != output.resolve()
     if elsewhere or settings.deciding() != facts.settings.deciding():
         raise InputError(
