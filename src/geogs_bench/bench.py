@@ -71,7 +71,7 @@ def _wishes(settings: BenchSettings, benchmark: Benchmark) -> Wishes:
     return Wishes(
         _names(settings.scenes),
         _names(settings.variants),
-        (*common, *(_option(text) for text in settings.settings)),
+        (*common, *(_option(text) for text in settings.set)),
         settings.budgets,
         settings.baseline,
     )

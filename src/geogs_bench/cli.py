@@ -3,12 +3,8 @@
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
-import tyro
-
-from geogs.cli.durations import Durations
 from geogs.cli.options import parse_options
 from geogs_bench.settings import BenchSettings
 
@@ -16,8 +12,6 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from geogs_bench.bench import Benched
-
-_SHORT = {"-o": "--output"}
 
 
 @dataclass(frozen=True)
@@ -28,17 +22,10 @@ class BenchOptions(BenchSettings):
     finished before in the same folder is not run again.
     """
 
-    name: Annotated[str, tyro.conf.Positional]
-    data: Annotated[Path | None, tyro.conf.Positional] = None
-    budgets: Durations = ()
-    settings: Annotated[
-        tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(name="set", metavar="KEY=VALUE")
-    ] = ()
-
 
 def main(argv: Sequence[str]) -> int:
     """Run the command; returns the exit code: 0 if every scene was scored, else 2."""
-    options = parse_options(BenchOptions, argv, "bench", short=_SHORT)
+    options = parse_options(BenchOptions, argv, "bench")
 
     from rich.console import Console
 

@@ -1,9 +1,6 @@
 """Runs tasks as ``geogs run`` and ``geogs reconstruct`` would, by the same options."""
 
-import itertools
-from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import asdict, replace
-from io import StringIO
 
 from geogs.application.interrupt import Interruption
 from geogs.application.settings import ReconstructSettings, RunSettings
@@ -11,7 +8,6 @@ from geogs.application.terminal import TerminalProgress
 from geogs.cli import reconstruct as reconstruct_command
 from geogs.cli import run as run_command
 from geogs.cli.options import record
-from geogs.errors import InputError
 from geogs_bench.runner import Command, Runner, Task
 
 _NO_SETTINGS = ("source", "output", "resume", "checkpoint_every")
@@ -52,18 +48,6 @@ def settings_of(task: Task) -> RunSettings | ReconstructSettings:
     """What a task's options say, by the command's own parser."""
     argv = [str(task.source), "-o", str(task.output)]
     argv += [argument for option in task.options for argument in option.arguments()]
-    said = StringIO()
-    try:
-        with redirect_stderr(said), redirect_stdout(said):
-            if task.command == "run":
-                return record(RunSettings, run_command.parse(argv))
-            return record(ReconstructSettings, reconstruct_command.parse(argv))
-    except SystemExit:
-        raise InputError(_why(task, said.getvalue())) from None
-
-
-def _why(task: Task, said: str) -> str:
-    """One sentence from the parser's box: what stands between its rulers."""
-    lines = [line.strip("│╭╮╰╯| ") for line in said.splitlines()]
-    told = itertools.takewhile(lambda line: line.strip("─-+"), lines[2:])
-    return f"geogs {task.command}: {' '.join(told).rstrip('.')}."
+    if task.command == "run":
+        return record(RunSettings, run_command.parse(argv))
+    return record(ReconstructSettings, reconstruct_command.parse(argv))

@@ -16,7 +16,7 @@ from cuda_emulator import use_emulator
 from geogs.bundle.base import BundleOptions, BundleResult
 from geogs.bundle.dense import DenseBundle
 from geogs.bundle.fields import CpuFields
-from geogs.bundle.motion import solve_poses
+from geogs.bundle.motion import fit_frame, solve_poses
 from geogs.bundle.pairs import CpuPairs
 from geogs.bundle.problem import BundleProblem
 from geogs.bundle.projection import MIN_Z, linearise, project, relative_motion
@@ -25,9 +25,6 @@ from geogs.geometry.lie import retract, se3_exp
 from geogs.keyframes.grid import SampleGrid
 from geogs.keyframes.store import KeyframeStore, Segment
 from geogs.loop.global_bundle import global_bundle
-from geogs.tracking.flow.base import FlowMatch
-from geogs.tracking.flow.classical import ClassicalFlow
-from geogs.tracking.motion import FrameLocator
 from geogs.tracking.tracker import Tracker, TrackState
 from tracking_runs import CONFIG, PATH, error_cm
 from tracking_scenes import CAMERA as ROOM
@@ -307,20 +304,24 @@ def test_fit_of_a_frame_matches_the_cpu(device):
     edge = int(torch.nonzero((problem.source == 0) & (problem.target == 2))[0])
     pixels, weight = problem.pixels[edge], problem.weight[edge]
     pixels[::7] += 30.0
-    locator = FrameLocator(slow.grid, ClassicalFlow(slow.grid), 0.1, 1.5)
-    expected = locator._fit(slow[0], FlowMatch(pixels[None], weight[None]), problem.T_cw[2])
-    assert expected is not None
-    T, (used, matched, residual, flow) = cuda_motion.fit_frame(
-        store.grid, problem.T_cw[2], store[0].T_cw, store[0].inverse_depth, store[0].information,
-        pixels.to(device), weight.to(device), 6, 5.0, 3.0,
+    (expected_T, expected), (T, found) = (
+        fit(
+            kept.grid, problem.T_cw[2], kept[0].T_cw, kept[0].inverse_depth, kept[0].information,
+            pixels.to(where), weight.to(where), 6, 5.0, 3.0,
+        )
+        for fit, kept, where in (
+            (fit_frame, slow, "cpu"), (cuda_motion.fit_frame, store, device)
+        )
     )  # fmt: skip
-    torch.testing.assert_close(T, expected.T_cw, rtol=0, atol=2e-5)
+    torch.testing.assert_close(T.cpu(), expected_T, rtol=0, atol=2e-5)
+    used, matched, residual, flow = found.tolist()
     share = ((weight[:, 0] > 0) & (slow[0].information > 0)).float().mean()
     assert used == pytest.approx(float(share), abs=1e-6)
-    assert matched == pytest.approx(expected.matched, abs=1.5 / len(weight))
+    assert used == pytest.approx(float(expected[0]), abs=1e-6)
+    assert matched == pytest.approx(float(expected[1]), abs=1.5 / len(weight))
     assert matched < used
-    assert residual == pytest.approx(expected.residual, rel=1e-3)
-    assert flow == pytest.approx(expected.flow, rel=1e-5)
+    assert residual == pytest.approx(float(expected[2]), rel=1e-3)
+    assert flow == pytest.approx(float(expected[3]), rel=1e-5)
 
 
 def test_pairs_of_keyframes_match_the_cpu(device):

@@ -2,6 +2,7 @@
 
 import torch
 
+from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.keyframes.grid import SampleGrid
 
@@ -21,6 +22,12 @@ def test_cells_sit_where_the_convention_says():
     pixels, z = CAMERA.project(grid.rays)
     torch.testing.assert_close(pixels, grid.pixels)
     assert torch.equal(z, torch.ones_like(z))
+
+
+@pytest.mark.parametrize(("width", "height"), [(1, 1), (8, 200), (200, 31)])
+def test_an_image_with_too_few_cells_is_refused(width: int, height: int) -> None:
+    with pytest.raises(InputError, match=f"{width} x {height} pixels; tracking needs at least"):
+        SampleGrid(Camera(9.0, 9.0, 0.5, 0.5, width, height))
 
 
 def test_linear_fields_are_interpolated_exactly():

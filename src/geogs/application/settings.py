@@ -5,23 +5,25 @@ Nothing here is imported but the settings, so that a command line can be read at
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Annotated
 
 from geogs.config import Config, MeshConfig, ReconstructConfig
+from geogs.config.setting import Basic, Positional, Positive, Range, Settings, Time, Unnamed, Weight
 
 
 @dataclass(frozen=True)
-class RunSettings:
+class RunSettings(Settings):
     """All that a run is told: what it reads, how it computes, what it writes."""
 
-    source: tuple[Path, ...] = ()
+    source: Annotated[tuple[Path, ...], Positional(unless="resume")] = ()
     """Video file or folder; several of one place, by one camera, make one map."""
-    config: Config = field(default_factory=Config)
+    config: Annotated[Config, Unnamed] = field(default_factory=Config)
     """How to compute."""
-    output: Path | None = None
-    """Folder for the results (also -o); out/NAME if none is given."""
+    output: Annotated[Path | None, Basic("-o")] = None
+    """Folder for the results; out/NAME if none is given."""
     device: str = "auto"
     """Where to compute: auto (a GPU where there is one), cpu, cuda or cuda:1; see geogs doctor."""
-    checkpoint_every: float = 60.0
+    checkpoint_every: Weight = 60.0
     """Seconds between two checkpoints, from which --resume goes on; 0 makes none."""
     online_results: bool = False
     """Also write trajectory and mesh as they are before the final stages, to online/."""
@@ -57,29 +59,29 @@ class RunSettings:
 
 
 @dataclass(frozen=True)
-class ReconstructSettings:
+class ReconstructSettings(Settings):
     """All that a reconstruction from known poses is told."""
 
-    source: Path = Path()
+    source: Annotated[Path, Positional()] = Path()
     """Folder of images with poses, or the file with the poses."""
-    config: ReconstructConfig = field(default_factory=ReconstructConfig)
+    config: Annotated[ReconstructConfig, Unnamed] = field(default_factory=ReconstructConfig)
     """How to compute."""
-    output: Path | None = None
-    """Folder for the results (also -o); out/NAME if none is given."""
-    budget: float | None = None
+    output: Annotated[Path | None, Basic("-o")] = None
+    """Folder for the results; out/NAME if none is given."""
+    budget: Annotated[float | None, Range(above=0), Time] = None
     """About how long it may take in all, such as 90s, 10m or 1h; none trains until it is good."""
     check_poses: bool = True
     """Whether to see by matching images that the poses follow the expected convention."""
-    hold_out: int | None = None
-    """Leave out every so many-th image, to judge the result by; at least 2, none uses all."""
-    snapshots: tuple[float, ...] = ()
+    hold_out: Annotated[int | None, Range(2)] = None
+    """Leave out every so many-th image, to judge the result by; none uses all."""
+    snapshots: Annotated[tuple[Positive, ...], Time] = ()
     """Also keep the map as it stands after some seconds, such as 5,10,20, in snapshots/; they count
     from when the images have been read."""
     depth_mesh: bool = False
     """Also fuse the searched depths without the disks, to depth_fusion/mesh.ply."""
     resume: bool = False
     """Go on from the checkpoint that an earlier call left in the output folder."""
-    checkpoint_every: float = 30.0
+    checkpoint_every: Weight = 30.0
     """Seconds of training between two checkpoints (there is one after the depths, too); 0 makes
     none."""
     device: str = "auto"

@@ -49,7 +49,7 @@ def relative_motion(
 
 
 def seen_from_targets(
-    rays: Float[Tensor, "*b p 3"],
+    rays: Float[Tensor, "*c p 3"],
     T_ji: Float[Tensor, "*b e 4 4"],
     inverse_depth: Float[Tensor, "*b e p"],
 ) -> tuple[Float[Tensor, "*b e p 3"], Bool[Tensor, "*b e p"], Float[Tensor, "*b e p"]]:

@@ -2,10 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated
-
-import tyro
 
 from geogs.application.eval_settings import EvalSettings
 from geogs.cli.options import parse_options
@@ -17,8 +13,6 @@ class EvalOptions(EvalSettings):
 
     Writes eval.json and report/ into the result's folder and prints the table.
     """
-
-    output: Annotated[Path, tyro.conf.Positional]
 
 
 def main(argv: Sequence[str]) -> int:

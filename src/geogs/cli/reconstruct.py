@@ -2,16 +2,12 @@
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from pathlib import Path
-from typing import Annotated, get_args
-
-import tyro
+from dataclasses import dataclass, replace
+from typing import cast
 
 from geogs.application.settings import ReconstructSettings
-from geogs.cli.durations import Duration, Durations
-from geogs.cli.options import SHORT, given, parse_options, record
-from geogs.config import Preset, ReconstructConfig, reconstruct_preset
+from geogs.cli.options import Given, parse_options, record
+from geogs.config import Preset, reconstruct_preset
 
 
 @dataclass(frozen=True)
@@ -21,12 +17,6 @@ class ReconstructOptions(ReconstructSettings):
     Lengths of the result are in the unit of the poses. Every default works.
     """
 
-    source: Annotated[Path, tyro.conf.Positional] = Path()
-    config: Annotated[ReconstructConfig, tyro.conf.arg(name="")] = field(
-        default_factory=ReconstructConfig
-    )
-    budget: Duration = None
-    snapshots: Durations = ()
     preset: Preset = "default"
     """Group of settings; single ones given beside it win. Without it, accurate on a GPU and default
     on a CPU."""
@@ -53,23 +43,22 @@ def parse(argv: Sequence[str]) -> ReconstructOptions:
     """Options with the preset as defaults, over which single settings win.
 
     Raises:
-        SystemExit: after ``--help``, or after an option that is wrong or missing.
-        InputError: a time is none.
+        SystemExit: after ``--help``.
+        InputError: an option is wrong or missing.
     """
-    name = _preset_name(argv)
-    default = ReconstructOptions(source=tyro.MISSING, config=reconstruct_preset(name), preset=name)
-    return parse_options(ReconstructOptions, argv, "reconstruct", default=default, short=SHORT)
+    return parse_options(ReconstructOptions, argv, "reconstruct", _defaults)
 
 
-def _preset_name(argv: Sequence[str]) -> Preset:
-    """The preset asked for, else the one that suits the device.
+def _defaults(given: Given) -> ReconstructOptions:
+    name = _preset_name(given)
+    return ReconstructOptions(config=reconstruct_preset(name), preset=name)
 
-    A wrong one is left for the option parser to complain about.
-    """
-    asked = given(argv, "preset")
-    if asked is not None or "--help" in argv or "-h" in argv:
-        return next((name for name in get_args(Preset) if name == asked), "default")
-    device = given(argv, "device") or "auto"
+
+def _preset_name(given: Given) -> Preset:
+    """The preset asked for, else the one that suits the device."""
+    if "preset" in given:
+        return cast(Preset, given["preset"])
+    device = given.get("device", "auto")
     if device == "auto":
         from geogs.gpu.installation import gpu_problem
 

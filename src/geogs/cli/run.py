@@ -1,23 +1,15 @@
 """``geogs run SOURCE``: a video in; trajectory, mesh and disk map out."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated, get_args
-
-import tyro
+from typing import cast
 
 from geogs.application.settings import RunSettings
-from geogs.cli.options import SHORT, given, parse_options, record
-from geogs.config import Config, Preset, preset
+from geogs.cli.options import Given, parse_options, record
+from geogs.config import Preset, preset
 from geogs.errors import InputError
-
-_SHORT = {
-    **SHORT,
-    "--intrinsics": "--input.intrinsics",
-    "--global-ba-every": "--loop.global-ba-every",
-}
 
 
 @dataclass(frozen=True)
@@ -28,8 +20,6 @@ class RunOptions(RunSettings):
     Several videos of one place: ``geogs run a.mp4 b.mp4``.
     """
 
-    source: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
-    config: Annotated[Config, tyro.conf.arg(name="")] = field(default_factory=Config)
     preset: Preset = "default"
     """Group of settings; single ones given beside it win."""
     resume: Path | None = None
@@ -59,25 +49,22 @@ def parse(argv: Sequence[str]) -> RunOptions:
     """Options over those of a preset, or over those of the run that is gone on with.
 
     Raises:
-        SystemExit: after ``--help``, or after an option that is wrong or missing.
-        InputError: there is nothing to resume, or a preset is asked for beside it.
+        SystemExit: after ``--help``.
+        InputError: an option is wrong or missing; there is nothing to resume, or a preset is asked
+            for beside it.
     """
-    folder = given(argv, "resume")
-    default = _saved(Path(folder), argv) if folder else _of_preset(argv)
-    return parse_options(RunOptions, argv, "run", default=default, short=_SHORT)
+    return parse_options(RunOptions, argv, "run", _defaults)
 
 
-def _of_preset(argv: Sequence[str]) -> RunOptions:
-    """The preset asked for; a wrong one is left for the option parser to complain about."""
-    asked = given(argv, "preset")
-    name: Preset = next((p for p in get_args(Preset) if p == asked), "default")
-    return RunOptions(source=tyro.MISSING, config=preset(name), preset=name)
+def _defaults(given: Given) -> RunOptions:
+    """The preset asked for, or what the run that is gone on with was begun with."""
+    if "resume" not in given:
+        name = cast(Preset, given.get("preset", "default"))
+        return RunOptions(config=preset(name), preset=name)
 
-
-def _saved(folder: Path, argv: Sequence[str]) -> RunOptions:
-    """What the run in a folder was begun with."""
     from geogs.application.run_checkpoint import SavedRun
 
-    if given(argv, "preset") is not None:
+    folder = Path(given["resume"])
+    if "preset" in given:
         raise InputError(f"--resume {folder} goes on with the run's settings; leave out --preset.")
     return RunOptions(**vars(SavedRun(folder).facts.settings), resume=folder)

@@ -5,9 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-import tyro
-
 from geogs.cli.options import parse_options
+from geogs.config.setting import Positional
 from geogs.errors import InputError
 
 
@@ -19,9 +18,9 @@ class WeightsOptions:
     weights/ of the cache directory ($GEOGS_CACHE, else ~/.cache/geogs), and in the package.
     """
 
-    action: Annotated[Literal["list", "verify"], tyro.conf.Positional] = "list"
+    action: Annotated[Literal["list", "verify"], Positional(required=False)] = "list"
     """What to do."""
-    file: Annotated[Path | None, tyro.conf.Positional] = None
+    file: Annotated[Path | None, Positional(required=False)] = None
     """The file to verify."""
 
 

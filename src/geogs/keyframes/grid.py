@@ -31,8 +31,8 @@ class SampleGrid:
     """K^-1 (x, y, 1) of each cell, float32."""
 
     def __post_init__(self) -> None:
-        x = torch.arange(OFFSET, self.camera.width - 3, STRIDE, dtype=torch.float64)
-        y = torch.arange(OFFSET, self.camera.height - 3, STRIDE, dtype=torch.float64)
+        x = torch.arange(OFFSET, max(self.camera.width - 3, OFFSET), STRIDE, dtype=torch.float64)
+        y = torch.arange(OFFSET, max(self.camera.height - 3, OFFSET), STRIDE, dtype=torch.float64)
         if len(x) < 4 or len(y) < 4:
             raise InputError(
                 f"The working image is {self.camera.width} x {self.camera.height} pixels; "

@@ -7,6 +7,7 @@ dense bundle adjustment with re-measured flow polishes the whole.
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -21,6 +22,7 @@ from geogs.geometry.lie import se3_inverse
 from geogs.keyframes.grid import SampleGrid
 from geogs.keyframes.store import Segment
 from geogs.threads import thread_map
+from geogs.tracking.evidence import Evidence, correlation_at
 from geogs.tracking.flow.base import FlowMatch
 from geogs.tracking.flow.filled import filled_positions
 from geogs.tracking.graph import FrameGraph
@@ -39,9 +41,13 @@ class TwoView:
     """Median motion in pixels that rotation does not explain."""
 
 
-def initialise(graph: FrameGraph, min_parallax: float, radius: int = 3) -> bool:
-    """Estimate all keyframes of the graph from nothing; False if they show no parallax.
+def initialise(
+    graph: FrameGraph, min_parallax: float, radius: int = 3, min_ncc: float = 0.5
+) -> bool:
+    """Estimate all keyframes of the graph from nothing.
 
+    False if they show no parallax, or if the images of two that follow each other correlate by less
+    than ``min_ncc`` where poses and depths put them.
     On success poses, depths and information are set, the first pose is the identity and the median
     depth over all keyframes is one unit.
     """
@@ -51,7 +57,7 @@ def initialise(graph: FrameGraph, min_parallax: float, radius: int = 3) -> bool:
     if best is None:
         return False
     _place_all(store, flows, best)
-    return _polish(graph, radius)
+    return _polish(graph, radius) and _is_borne_out(graph, min_ncc)
 
 
 def chained_flows(graph: FrameGraph) -> list[FlowMatch]:
@@ -162,6 +168,24 @@ def _polish(graph: FrameGraph, radius: int, rounds: int = 6) -> bool:
             return False
         normalise(store)
     return True
+
+
+def _is_borne_out(graph: FrameGraph, min_ncc: float) -> bool:
+    """Whether the images of all neighbours in time agree at their poses."""
+    grey, found = graph.operator.grey, []
+    for a, b in pairwise(graph.keyframes):
+        found.append(
+            correlation_at(
+                graph.keyframes.grid,
+                grey(a.encoded),
+                grey(b.encoded),
+                b.T_cw @ se3_inverse(a.T_cw),
+                a.inverse_depth,
+                a.information,
+            )
+        )
+    evidence = map(Evidence.of, torch.stack(found).cpu())
+    return all(e.bears_out(min_ncc, is_expected=False) for e in evidence)
 
 
 def normalise(store: Segment) -> None:

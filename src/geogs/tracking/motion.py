@@ -10,10 +10,12 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from geogs.bundle.motion import solve_poses
+from geogs.bundle.motion import fit_frame
 from geogs.bundle.select import grid_fields
+from geogs.geometry.lie import se3_inverse
 from geogs.keyframes.grid import SampleGrid
 from geogs.keyframes.keyframe import Keyframe
+from geogs.tracking.evidence import Evidence, correlation_at, correlation_matched
 from geogs.tracking.flow.base import FlowMatch, FlowOperator
 from geogs.tracking.flow.filled import filled_positions
 
@@ -38,6 +40,8 @@ class FrameMotion:
     """Fraction of the keyframe's cells with a match that agrees with the pose."""
     residual: float
     """Median distance in pixels between matches and reprojection."""
+    evidence: Evidence
+    """What the images say of it."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +54,10 @@ class Recognition:
 
 
 class FrameLocator:
-    """Finds the pose of a frame from flow against keyframes, by motion-only adjustment."""
+    """Finds the pose of a frame from flow against keyframes, by motion-only adjustment.
+
+    A pose is believed where enough of the flow agrees with it, and the images do.
+    """
 
     def __init__(
         self,
@@ -58,21 +65,31 @@ class FrameLocator:
         operator: FlowOperator,
         min_matched: float,
         max_residual: float,
+        min_ncc: float,
     ) -> None:
         self.grid = grid
         self.operator = operator
         self.min_matched = min_matched
         self.max_residual = max_residual
+        self.min_ncc = min_ncc
 
     def locate(
-        self, keyframe: Keyframe, encoded: Any, T_guess: Float[Tensor, "4 4"]
+        self,
+        keyframe: Keyframe,
+        encoded: Any,
+        T_guess: Float[Tensor, "4 4"],
+        is_expected: bool = True,
     ) -> FrameMotion | None:
-        """Pose of a frame that is near ``T_guess``; None if too little agrees with any pose."""
+        """Pose of a frame that is near ``T_guess``; None if too little agrees with any pose.
+
+        A frame that was not expected there needs the images' evidence; one that was, only where
+        there is texture to have any.
+        """
         forward, backward = grid_fields(self.grid).reproject([keyframe], [T_guess])
         there, _ = self.operator.measure(
             [keyframe.encoded], [encoded], forward, backward, fine=False
         )
-        return self._solve(keyframe, there, T_guess)
+        return self._solve(keyframe, encoded, there, T_guess, is_expected)
 
     def relocate(self, keyframe: Keyframe, encoded: Any) -> FrameMotion | None:
         """Pose of a frame about which nothing is known, by flow from a cold start and PnP."""
@@ -81,7 +98,8 @@ class FrameLocator:
         T_rel = pnp(self.grid, keyframe.inverse_depth, there.pixels[0], good)
         if T_rel is None:
             return None
-        return self.locate(keyframe, encoded, T_rel.to(keyframe.T_cw) @ keyframe.T_cw)
+        T_guess = T_rel.to(keyframe.T_cw) @ keyframe.T_cw
+        return self.locate(keyframe, encoded, T_guess, is_expected=False)
 
     def relocate_any(self, keyframes: Sequence[Keyframe], encoded: Any) -> FrameMotion | None:
         """The first success of :meth:`relocate` over several keyframes."""
@@ -92,20 +110,14 @@ class FrameLocator:
         return None
 
     def _solve(
-        self, keyframe: Keyframe, match: FlowMatch, T_guess: Float[Tensor, "4 4"]
+        self,
+        keyframe: Keyframe,
+        encoded: Any,
+        match: FlowMatch,
+        T_guess: Float[Tensor, "4 4"],
+        is_expected: bool,
     ) -> FrameMotion | None:
-        fit = self._fit_on_gpu if self.grid.on_gpu else self._fit
-        motion = fit(keyframe, match, T_guess)
-        if motion is None or motion.matched < self.min_matched:
-            return None
-        return motion if motion.residual < self.max_residual else None
-
-    def _fit_on_gpu(
-        self, keyframe: Keyframe, match: FlowMatch, T_guess: Float[Tensor, "4 4"]
-    ) -> FrameMotion | None:
-        from geogs.bundle.cuda.motion import fit_frame
-
-        T, (used, agree, residual, flow) = fit_frame(
+        T, judged = fit_frame(
             self.grid,
             T_guess,
             keyframe.T_cw,
@@ -117,35 +129,26 @@ class FrameLocator:
             huber=FIT_HUBER,
             limit=2 * self.max_residual,
         )
-        if used < self.min_matched:
-            return None
-        return FrameMotion(keyframe.id, T, match, flow, agree, residual)
-
-    def _fit(
-        self, keyframe: Keyframe, match: FlowMatch, T_guess: Float[Tensor, "4 4"]
-    ) -> FrameMotion | None:
-        weight = match.weight * (keyframe.information > 0)[:, None]
-        used = weight[0, :, 0] > 0
-        if float(used.float().mean()) < self.min_matched:
-            return None
-        frame = torch.zeros(1, dtype=torch.long, device=weight.device)
-        T, residual = solve_poses(
-            self.grid.camera,
-            self.grid.rays,
-            T_guess[None],
-            keyframe.inverse_depth[None],
-            keyframe.T_cw[None],
-            frame,
-            match.pixels,
-            weight,
-            iterations=FIT_ITERATIONS,
-            huber=FIT_HUBER,
+        T_rel = T @ se3_inverse(keyframe.T_cw).to(T.device)
+        borne_out = correlation_at(
+            self.grid,
+            self.operator.grey(keyframe.encoded),
+            self.operator.grey(encoded),
+            T_rel,
+            keyframe.inverse_depth,
+            keyframe.information,
         )
-        error = residual[0].norm(dim=-1)
-        agree = float((used & (error < 2 * self.max_residual)).float().mean())
-        median = float(error[used].median())
-        flow = float((match.pixels[0] - self.grid.pixels).norm(dim=-1)[used].median())
-        return FrameMotion(keyframe.id, T[0], match, flow, agree, median)
+        # All at once, so that a GPU is waited for once.
+        found = torch.cat([T.reshape(-1), judged.to(T), borne_out.to(T)]).cpu()
+        _, agree, residual, flow = found[16:20].tolist()
+        if agree < self.min_matched or not residual < self.max_residual:
+            return None
+        evidence = Evidence.of(found[20:])
+        if not evidence.bears_out(self.min_ncc, is_expected):
+            return None
+        return FrameMotion(
+            keyframe.id, found[:16].reshape(4, 4), match, flow, agree, residual, evidence
+        )
 
 
 @dataclass(frozen=True)
@@ -157,15 +160,16 @@ class ChainedMatch:
     flow: float
     """Median motion of the matched cells in pixels."""
     matched: float
-    """Fraction of the cells that are matched."""
+    """Fraction of the cells that are matched; 0 where the images do not agree there."""
 
 
 class FlowChain:
     """Follows the flow from a keyframe through the frames after it, each starting from the last."""
 
-    def __init__(self, grid: SampleGrid, operator: FlowOperator) -> None:
+    def __init__(self, grid: SampleGrid, operator: FlowOperator, min_ncc: float) -> None:
         self.grid = grid
         self.operator = operator
+        self.min_ncc = min_ncc
         self._there: Tensor | None = None
         self._back: Tensor | None = None
 
@@ -180,12 +184,20 @@ class FlowChain:
         )
         used = there.weight[0, :, 0] > 0
         matched = float(used.float().mean())
+        if not self._is_borne_out(keyframe, encoded, there):
+            matched = 0.0
         flow = (there.pixels[0] - self.grid.pixels).norm(dim=-1)
         median = float(flow[used].median()) if matched else 0.0
         if matched > 0:
             self._there = filled_positions(self.grid, there)[None]
             self._back = filled_positions(self.grid, back)[None]
         return ChainedMatch(there, median, matched)
+
+    def _is_borne_out(self, keyframe: Any, encoded: Any, match: FlowMatch) -> bool:
+        """Whether the images agree where the flow, for want of a pose, leads."""
+        images = self.operator.grey(keyframe), self.operator.grey(encoded)
+        evidence = Evidence.of(correlation_matched(self.grid, *images, match.pixels[0]))
+        return evidence.bears_out(self.min_ncc, is_expected=True)
 
 
 def pnp(

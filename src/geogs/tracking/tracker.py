@@ -117,7 +117,11 @@ class Tracker:
         edge = max(camera.width, camera.height)
         self._long_edge = edge
         self._locator = FrameLocator(
-            self.grid, self.operator, self.config.min_matched, self.config.max_residual * edge
+            self.grid,
+            self.operator,
+            self.config.min_matched,
+            self.config.max_residual * edge,
+            self.config.min_ncc,
         )
         self._finalized: dict[int, None] = {}
         self._breaks: list[int] = []
@@ -211,7 +215,7 @@ class Tracker:
                 continue
             keyframe = self.keyframes[place.keyframe]
             guess = place.T_rel.to(keyframe.T_cw) @ keyframe.T_cw
-            motion = self._locator.locate(keyframe, encoded, guess)
+            motion = self._locator.locate(keyframe, encoded, guess, is_expected=False)
             if motion is not None and motion.matched >= self.config.recognised:
                 self.cut()
                 return self._follow(frame, encoded, motion)

@@ -109,6 +109,9 @@ class OwnFlow:
     def texture(self, encoded: OwnImage) -> float:
         return self.classical.texture(encoded.classical)
 
+    def grey(self, encoded: OwnImage) -> Float[Tensor, "h w"]:
+        return self.classical.grey(encoded.classical)
+
     @torch.inference_mode()
     def measure(
         self,
