@@ -12,7 +12,6 @@ made again by ``__setstate__`` of its class, or named here.
 import pickle
 from collections.abc import Callable
 from importlib import import_module
-from pathlib import Path
 from types import MethodType
 from typing import Any, Protocol, runtime_checkable
 
@@ -25,7 +24,7 @@ from geogs.bundle.dense import bundle_solver
 from geogs.config import MappingConfig
 from geogs.depth.engine import depth_engine
 from geogs.errors import InputError
-from geogs.keyframes.archive import Archive, Archived, SettledArchive
+from geogs.keyframes.archive import Archive, Archived, NamedFiles, SettledArchive
 from geogs.keyframes.grid import SampleGrid
 from geogs.mapping.training import MapTrainer, map_trainer
 from geogs.mapping.view import MapCameras
@@ -79,7 +78,7 @@ class ByteSource(Protocol):
         ...
 
 
-def write_slam(stream: ByteSink, slam: Slam, folder: Path) -> list[Archive]:
+def write_slam(stream: ByteSink, slam: Slam, folder: NamedFiles) -> list[Archive]:
     """Write a system between two frames; its archives lie in ``folder`` from now on.
 
     Returns the archives, to be released once the state is safe. What the flow operator remembers of
@@ -95,7 +94,7 @@ def write_slam(stream: ByteSink, slam: Slam, folder: Path) -> list[Archive]:
     return writer.archives
 
 
-def read_slam(stream: ByteSource, slam: Slam, folder: Path) -> None:
+def read_slam(stream: ByteSource, slam: Slam, folder: NamedFiles) -> None:
     """Give a new system, made with the same camera and settings, the state that was written.
 
     Raises:
@@ -117,7 +116,7 @@ def read_record(
     stream: ByteSource,
     kind: type,
     slam: Slam | None = None,
-    folder: Path | None = None,
+    folder: NamedFiles | None = None,
     more: frozenset[tuple[str, str]] = frozenset(),
 ) -> Any:
     """Read a record of a kind; ``more`` are modules and names of classes that may be in it.
@@ -140,7 +139,7 @@ class _Writer(pickle.Pickler):
     """Leaves out what belongs to the process."""
 
     def __init__(
-        self, stream: ByteSink, slam: Slam | None = None, folder: Path | None = None
+        self, stream: ByteSink, slam: Slam | None = None, folder: NamedFiles | None = None
     ) -> None:
         super().__init__(stream, PROTOCOL)
         self.folder = folder
@@ -171,7 +170,7 @@ class _Writer(pickle.Pickler):
         if isinstance(obj, Archive):
             assert self.folder is not None, "no folder for archives"
             self.archives.append(obj)
-            return reopened, (_FOLDER, obj.settle(self.folder))
+            return reopened, (_FOLDER, obj.name, obj.settle(self.folder))
         make = _MAKERS.get(type(obj).__name__)
         return NotImplemented if make is None else make(obj)
 
@@ -183,7 +182,7 @@ class _Reader(pickle.Unpickler):
         self,
         stream: ByteSource,
         slam: Slam | None,
-        folder: Path | None,
+        folder: NamedFiles | None,
         more: frozenset[tuple[str, str]],
     ) -> None:
         super().__init__(stream)
@@ -242,16 +241,16 @@ def _parts_of_tensor(x: Tensor) -> tuple[np.ndarray, torch.device, bool, bool]:
     return array, x.device, x.requires_grad, is_brain_float
 
 
-def reopened(folder: Path, settled: SettledArchive) -> Archive:
+def reopened(folder: NamedFiles, name: str, settled: SettledArchive) -> Archive:
     """An archive of a state."""
-    return Archive.reopened(folder, settled)
+    return Archive.reopened(folder, name, settled)
 
 
 def archived_in(
-    archive: Archive, key: int, offset: int, shape: tuple[int, ...], dtype: np.dtype
+    archive: Archive, offset: int, shape: tuple[int, ...], dtype: np.dtype, checksum: int
 ) -> Archived:
     """An array in an archive of a state."""
-    return archive.archived(key, offset, shape, dtype)
+    return archive.piece(offset, shape, dtype, checksum)
 
 
 def torch_generator(state: np.ndarray) -> torch.Generator:
@@ -304,7 +303,7 @@ _MAKERS: dict[str, Callable[[Any], Any]] = {
         if isinstance(g, torch.Generator)
         else (numpy_generator, (g.bit_generator.state,))
     ),
-    "Archived": lambda a: (archived_in, (a.archive, a.key, a.offset, a.shape, a.dtype)),
+    "Archived": lambda a: (archived_in, (a.archive, a.offset, a.shape, a.dtype, a.checksum)),
     "BFMatcher": lambda _: (hamming_matcher, ()),
     "method": _method,
     **dict.fromkeys(

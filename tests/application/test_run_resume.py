@@ -1,6 +1,5 @@
 """``geogs run --resume``: checkpoints of a run that was interrupted or killed, and wrong ones."""
 
-import errno
 import json
 import os
 import shutil
@@ -21,7 +20,6 @@ from geogs.config import InputConfig
 from geogs.errors import InputError
 from geogs.io.sources.sniff import open_sources
 from geogs.io.writers.native import load_map
-from geogs.keyframes.archive import Archive
 from geogs.slam import Slam
 from geogs.synth.export import write_sequence
 from geogs.tracking.segments import Segments
@@ -259,43 +257,3 @@ def test_reading_goes_on_where_it_was(tmp_path):
                 assert other.spans == source.spans
     with pytest.raises(InputError, match="not what it was"):
         frames_after(source, open_sources(folders[:1], config).place)
-
-
-def test_archives_keep_what_the_last_checkpoint_refers_to(tmp_path):
-    archive = Archive(resident=0)
-    first, kept = (archive.put(np.full(100, n)) for n in range(2))
-    settled = archive.settle(tmp_path)
-    archive.release()
-    places = (first.key, first.offset), (kept.key, kept.offset)
-    del first
-    later = [archive.put(np.full(100, 7 + n)) for n in range(3)]
-    again = Archive.reopened(tmp_path, settled)  # as after a kill
-    shape, dtype = (100,), np.dtype(np.int64)
-    for n, (key, offset) in enumerate(places):
-        assert (again.archived(key, offset, shape, dtype).load() == n).all()
-    assert again.size == 2 * 800
-    del again
-    # A complete checkpoint that knows nothing of the first array lets its space go.
-    for _ in range(2):
-        settled = archive.settle(tmp_path)
-        archive.release()
-    size = archive.size
-    later.append(archive.put(np.full(100, 3)))
-    assert archive.size <= size + 800
-    assert len(list(tmp_path.iterdir())) == 1
-
-
-def test_an_archive_that_finds_no_room_stays_where_it_was(tmp_path, monkeypatch):
-    archive = Archive(tmp_path)
-    handle = archive.put(np.arange(1000))
-    write = os.pwrite
-
-    def full(descriptor: int, data: bytes, offset: int) -> int:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    monkeypatch.setattr(os, "pwrite", full)
-    with pytest.raises(Exception, match="No space left"):
-        archive.settle(tmp_path)
-    monkeypatch.setattr(os, "pwrite", write)
-    assert list(tmp_path.iterdir()) == []
-    assert (handle.load() == np.arange(1000)).all()

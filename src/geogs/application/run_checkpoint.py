@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 
 import geogs
 from geogs.application.checkpoint import next_due
+from geogs.application.checkpoint_folder import CheckpointFolder
 from geogs.application.progress import RunProgress
 from geogs.errors import InputError, OutputError
 from geogs.io.sources.base import ReadingPlace
@@ -103,9 +104,9 @@ class RunCheckpoint:
             checked = _CheckedWriter(stream)
             checked.write(_TITLE)
             write_record(checked, facts)
-            archives = write_slam(checked, slam, self.folder)
+            archives = write_slam(checked, slam, CheckpointFolder(self.folder))
             stream.write(checked.sum.to_bytes(_CHECKSUM_BYTES, "big"))
-        used = {archive.settled_name for archive in archives}
+        used = {archive.name for archive in archives}
         for archive in archives:
             archive.release()
         for path in self.folder.glob("archive-*"):
@@ -138,7 +139,7 @@ class SavedRun:
         try:
             with self._path.open("rb") as stream:
                 stream.seek(self._begin)
-                read_slam(stream, slam, self.folder)
+                read_slam(stream, slam, CheckpointFolder(self.folder))
         except (OSError, InputError) as error:
             raise self._unusable(error) from error
 

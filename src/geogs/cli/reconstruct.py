@@ -17,7 +17,7 @@ from geogs.config import Preset, ReconstructConfig, reconstruct_preset
 from geogs.errors import InputError
 
 if TYPE_CHECKING:
-    from geogs.application.checkpoint import Checkpoint
+    from geogs.application.reconstruct_checkpoint import ReconstructCheckpoint
     from geogs.application.snapshots import Snapshots
     from geogs.io.sources.posed.base import PosedSource
     from geogs.reconstruct import Reconstruction, ReconstructionState
@@ -76,8 +76,8 @@ def reconstruct(options: ReconstructOptions) -> Path:
     import torch
 
     import geogs
-    from geogs.application.checkpoint import Checkpoint, fingerprint
     from geogs.application.gpu_memory import full_memory_in_a_sentence
+    from geogs.application.reconstruct_checkpoint import ReconstructCheckpoint, fingerprint
     from geogs.application.snapshots import Snapshots
     from geogs.gpu.installation import require_device
     from geogs.gpu.kernels import prepare_kernels
@@ -97,7 +97,7 @@ def reconstruct(options: ReconstructOptions) -> Path:
     progress = RunProgress(source.length, tracks=False)
     names = [Path(source.label(i)).name for i in range(len(source))]
     made_from = fingerprint(options, options.hold_out, names)
-    checkpoint = Checkpoint(output, made_from, options.checkpoint_every, progress)
+    checkpoint = ReconstructCheckpoint(output, made_from, options.checkpoint_every, progress)
     with full_memory_in_a_sentence(), Interruption() as stop, progress:
         resumed = checkpoint.read() if options.resume else None
         if options.check_poses and resumed is None:
@@ -122,7 +122,7 @@ class _Attendance:
     scene: "Reconstruction"
     progress: RunProgress
     snapshots: "Snapshots"
-    checkpoint: "Checkpoint"
+    checkpoint: "ReconstructCheckpoint"
     stop: Interruption
 
     def report(self, stage: str, fraction: float) -> None:
