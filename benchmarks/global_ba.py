@@ -31,7 +31,7 @@ from planted_walk import CAMERA, drift, planted_tracker
 
 def error_cm(tracker: Tracker, truth: torch.Tensor) -> float:
     """RMS distance of the camera centres after a similarity."""
-    x = se3_inverse(tracker.store.poses(tracker.store.ids))[:, :3, 3]
+    x = se3_inverse(tracker.keyframes.poses(tracker.keyframes.ids))[:, :3, 3]
     y = se3_inverse(truth)[:, :3, 3]
     scale, R, t = umeyama(x, y)
     return 100 * float((scale * x @ R.T + t - y).square().sum(1).mean().sqrt())

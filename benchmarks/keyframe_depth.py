@@ -23,7 +23,8 @@ from geogs.depth.sweep_neighbors import select_sweep_neighbours
 from geogs.depth.view import DepthView, KeyframeDepth, depth_view
 from geogs.geometry.camera import Camera
 from geogs.geometry.umeyama import umeyama
-from geogs.types import Keyframe
+from geogs.keyframes.grid import SampleGrid
+from geogs.keyframes.store import KeyframeStore
 
 
 def load_views(
@@ -43,19 +44,14 @@ def load_views(
     ate = 100 * np.sqrt(((poses[:, :3, 3] - true[:, :3, 3]) ** 2).sum(1).mean())
     print(f"{room.name}: {len(poses)} keyframes, ATE {ate:.2f} cm")
     files = sorted((room / "results").glob("frame*.jpg"))
-    views = []
+    views, segment = [], KeyframeStore(SampleGrid(working)).new_segment()
     for i, k in enumerate(data["k"]):
         image = cv2.cvtColor(cv2.imread(str(files[k])), cv2.COLOR_BGR2RGB)
         image = cv2.resize(image, (working.width, working.height), interpolation=cv2.INTER_AREA)
-        keyframe = Keyframe(
-            id=i,
-            frame_index=int(k),
-            timestamp=0.0,
-            stored_image=image,
-            T_cw=torch.from_numpy(np.linalg.inv(poses[i])),
-            inverse_depth=torch.from_numpy((data["d"][i] / scale).astype(np.float32)),
-            information=torch.from_numpy((data["info"][i] * scale**2).astype(np.float32)),
-        )
+        keyframe = segment.add(int(k), 0.0, image, None, torch.from_numpy(np.linalg.inv(poses[i])))
+        keyframe.inverse_depth = torch.from_numpy((data["d"][i] / scale).astype(np.float32)).ravel()
+        information = (data["info"][i] * scale**2).astype(np.float32)
+        keyframe.information = torch.from_numpy(information).ravel()
         views.append(depth_view(keyframe, render))
     return views, working, render, true
 

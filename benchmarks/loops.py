@@ -22,12 +22,12 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
-from plyfile import PlyData
 
 from geogs.config import LoopConfig
+from geogs.evaluation.surface import read_surface
 from geogs.geometry.lie import se3_exp, se3_inverse, so3_log
 from geogs.keyframes.grid import SampleGrid
-from geogs.keyframes.store import KeyframeStore
+from geogs.keyframes.store import KeyframeStore, Segment
 from geogs.loop.dense import dense_check
 from geogs.loop.detect import LoopDetector
 from geogs.loop.retrieval import AppearanceIndex
@@ -116,18 +116,16 @@ def overlaps(depth: np.ndarray, T_wc: np.ndarray, grid: SampleGrid) -> np.ndarra
 
 def prepare(
     folder: Path, points: Path, every: int, long_edge: int, drift: float
-) -> tuple[KeyframeStore, ClassicalFlow, Truth]:
+) -> tuple[Segment, ClassicalFlow, Truth]:
     """Keyframes as a drifting tracker would have left them, and the truth about them."""
     whole = load(folder, long_edge, None)
     sequence = Sequence(whole.files[::every], whole.camera, whole.T_wc[::every], None)
     grid = SampleGrid(sequence.camera)
-    vertex = PlyData.read(str(points))["vertex"]
-    cloud = np.stack([vertex[a] for a in "xyz"], -1).astype(np.float64)
-    depth = depths(cloud, sequence.T_wc, grid)
+    depth = depths(read_surface(points).vertices, sequence.T_wc, grid)
     T_cw = se3_inverse(torch.from_numpy(sequence.T_wc))
     rng = np.random.default_rng(0)
     scale = np.exp(np.cumsum(drift * 0.01 * rng.standard_normal(len(depth))))
-    store, operator = KeyframeStore(grid), ClassicalFlow(grid)
+    store, operator = KeyframeStore(grid).new_segment(), ClassicalFlow(grid)
     T = T_cw[0]
     for n, frame in enumerate(sequence.frames()):
         if n:
@@ -145,7 +143,7 @@ def prepare(
     return store, operator, Truth(T_cw, torch.from_numpy(depth), overlap, scale)
 
 
-def separate(store: KeyframeStore, operator: ClassicalFlow, truth: Truth, gap: int) -> None:
+def separate(store: Segment, operator: ClassicalFlow, truth: Truth, gap: int) -> None:
     """Retrieval, then verification of all that it returned, with and without depth."""
     clock, index = Clock(), AppearanceIndex()
     verifier, features = TwoViewVerifier(store.grid.camera), {}
@@ -232,10 +230,10 @@ def separate(store: KeyframeStore, operator: ClassicalFlow, truth: Truth, gap: i
     print(f"  CPU ms: {clock.report()}")
 
 
-def together(store: KeyframeStore, operator: ClassicalFlow, truth: Truth, gap: int) -> None:
+def together(store: Segment, operator: ClassicalFlow, truth: Truth, gap: int) -> None:
     """The detector as a system would run it."""
     detector, clock = (
-        LoopDetector(store.grid, operator, lambda _: store, LoopConfig(min_gap=gap)),
+        LoopDetector(store.store, operator, LoopConfig(min_gap=gap)),
         Clock(),
     )
     for k in store.ids:

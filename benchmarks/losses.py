@@ -23,14 +23,8 @@ import torch
 from geogs.config import LossConfig
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp
-from geogs.losses import (
-    PhotoView,
-    ViewConstants,
-    fused_multi_view,
-    fused_single_view,
-    multi_view_loss,
-    single_view_loss,
-)
+from geogs.losses import PhotoView, ViewConstants, multi_view_loss, single_view_loss
+from geogs.losses.cpu import fused_multi_view, fused_single_view
 
 RENDER = Camera(280.0, 280.0, 159.5, 119.5, 320, 240)
 PHOTO = RENDER.resized(640, 480)

@@ -23,7 +23,6 @@ and *blended by true drift* blends these. Columns:
 """
 
 import argparse
-import copy
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -46,6 +45,8 @@ from geogs.geometry.lie import (
 )
 from geogs.geometry.neighbors import nearest_neighbors
 from geogs.geometry.umeyama import umeyama
+from geogs.keyframes.grid import SampleGrid
+from geogs.keyframes.store import KeyframeStore
 from geogs.loop.closure import close_loops
 from geogs.loop.pose_graph import RelativePoses
 from geogs.mapping.map_update import MapUpdate, plan_update, witness
@@ -56,7 +57,7 @@ from geogs.synth.raycast import Raycaster
 from geogs.synth.room import make_room
 from geogs.synth.tessellation import SeenSurface, scene_mesh
 from geogs.synth.trajectory import FRAMES_PER_LAP, handheld_trajectory
-from geogs.types import Keyframe, PoseCorrection
+from geogs.types import PoseCorrection
 
 CAMERA = default_camera(320, 240)
 EVERY = 4
@@ -72,10 +73,20 @@ MAPPING = replace(Config().mapping, render_long_edge=200)
 
 
 @dataclass(frozen=True, eq=False)
+class Observed:
+    """What a tracker knows of a keyframe."""
+
+    image: np.ndarray
+    T_cw: Tensor
+    inverse_depth: Tensor
+    information: Tensor
+
+
+@dataclass(frozen=True, eq=False)
 class Walk:
     """Keyframes of a room as a drifting tracker hands them over, and the truth."""
 
-    keyframes: list[Keyframe]
+    keyframes: list[Observed]
     truth: Tensor
     """(n, 4, 4) world to camera."""
     unit: Tensor
@@ -132,11 +143,8 @@ def walk(scene: str, drift: float, seed: int) -> Walk:
         noisy = float(unit[n]) * z * np.exp(deviation * random.standard_normal(z.shape))
         inverse, information = 1 / noisy, (noisy / deviation) ** 2
         keyframes.append(
-            Keyframe(
-                n, EVERY * n, EVERY * n / 30, view.image, T_cw[n],
-                torch.from_numpy(inverse).float(), torch.from_numpy(information).float(),
-            )
-        )  # fmt: skip
+            Observed(view.image, T_cw[n], torch.from_numpy(inverse), torch.from_numpy(information))
+        )
     vertices, faces = scene_mesh(room)
     none = np.zeros((0, 3), np.int64)
     return Walk(
@@ -162,8 +170,8 @@ def drifted(truth: Tensor, unit: Tensor, drift: float, seed: int) -> Tensor:
     return torch.stack(T)
 
 
-def close(walk: Walk) -> tuple[PoseCorrection, list[Keyframe]]:
-    """The closure of the lap, and the keyframes after it."""
+def close(walk: Walk) -> PoseCorrection:
+    """The closure of the lap."""
     T = walk.T_cw
     n = torch.arange(KEYFRAMES - 1)
     i, j = torch.cat([n, n[:-1]]), torch.cat([n + 1, n[:-1] + 2])
@@ -182,25 +190,24 @@ def close(walk: Walk) -> tuple[PoseCorrection, list[Keyframe]]:
         1 / deviation.square(),
         torch.arange(len(G)) >= len(i),
     )
-    closure = close_loops([k.id for k in walk.keyframes], T, relative)
+    closure = close_loops(list(range(KEYFRAMES)), T, relative)
     assert closure is not None, "no loop was believed"
-    c = closure.correction
-    after = [
-        replace(k, T_cw=c.after[k.id], inverse_depth=k.inverse_depth * c.scale[k.id])
-        for k in walk.keyframes
-    ]
-    return c, after
+    return closure.correction
 
 
-def build(keyframes: Sequence[Keyframe], config: MappingConfig) -> Mapper:
+def build(keyframes: Sequence[Observed], config: MappingConfig) -> Mapper:
     """The map as an online run makes it."""
-    mapper = Mapper(CAMERA, config)
-    for n, keyframe in enumerate(keyframes):
-        mapper.observe(keyframe)
+    segment = KeyframeStore(SampleGrid(CAMERA)).new_segment()
+    mapper = Mapper(segment.store, config)
+    for n, seen in enumerate(keyframes):
+        keyframe = segment.add(EVERY * n, EVERY * n / 30, seen.image, None, seen.T_cw)
+        keyframe.inverse_depth = seen.inverse_depth.float().ravel()
+        keyframe.information = seen.information.float().ravel()
+        mapper.observe(n)
         if n >= config.lag:
-            mapper.map_keyframe(keyframes[n - config.lag].id)
-    for keyframe in keyframes[-config.lag :]:
-        mapper.map_keyframe(keyframe.id)
+            mapper.map_keyframe(n - config.lag)
+    for n in range(len(keyframes) - config.lag, len(keyframes)):
+        mapper.map_keyframe(n)
     return mapper
 
 
@@ -306,7 +313,7 @@ def double(mapper: Mapper, metre: float, apart: int = 20) -> float:
 
 def true_drift(walk: Walk) -> PoseCorrection:
     """What the keyframes really erred by."""
-    ids = [k.id for k in walk.keyframes]
+    ids = range(len(walk.keyframes))
     return PoseCorrection(
         dict(zip(ids, walk.T_cw, strict=True)),
         dict(zip(ids, walk.truth, strict=True)),
@@ -318,9 +325,9 @@ def compare(scene: str, drift: float, with_mesh: bool) -> None:
     """Print the table of one walk."""
     there = walk(scene, drift, ROOM[scene])
     mapper = build(there.keyframes, MAPPING)
-    correction, after = close(there)
+    correction = close(there)
     judge = Judge(there, mapper, with_mesh)
-    corrected = torch.stack([k.T_cw for k in after])
+    corrected = torch.stack([correction.after[k] for k in range(KEYFRAMES)])
     print(
         f"\n{scene}, drift {100 * drift:.0f} %: {KEYFRAMES} keyframes, "
         f"ATE {judge.ate(there.T_cw):.2f} cm, after the closure {judge.ate(corrected):.2f} cm\n"
@@ -329,20 +336,20 @@ def compare(scene: str, drift: float, with_mesh: bool) -> None:
     columns += ["disks", "ms"]
     print("| " + " | ".join(columns) + " |\n|---" + "|---:" * (len(columns) - 1) + "|")
     print(judge.row("before", mapper, there.T_cw, 0.0), flush=True)
-    true = [replace(k, T_cw=T) for k, T in zip(there.keyframes, there.truth, strict=True)]
     ways = [
-        ("true drift", "per_keyframe", true_drift(there), true),
-        ("blended by true drift", "blended", true_drift(there), true),
-        ("per_keyframe", "per_keyframe", correction, after),
-        ("coherent", "coherent", correction, after),
-        ("blended", "blended", correction, after),
+        ("true drift", "per_keyframe", true_drift(there)),
+        ("blended by true drift", "blended", true_drift(there)),
+        ("per_keyframe", "per_keyframe", correction),
+        ("coherent", "coherent", correction),
+        ("blended", "blended", correction),
     ]
-    for name, strategy, c, keyframes in ways:
-        moved = copy.deepcopy(mapper)
+    for name, strategy, c in ways:
+        moved = build(there.keyframes, MAPPING)
         moved.config = replace(MAPPING, map_update=strategy)
+        moved.keyframes.segment_of(0).correct(c)
         seconds = planning_time(moved, c)
-        moved.correct(c, keyframes)
-        T_cw = torch.stack([k.T_cw for k in keyframes])
+        moved.correct(c)
+        T_cw = torch.stack([c.after[k] for k in range(KEYFRAMES)])
         print(judge.row(name, moved, T_cw, seconds), flush=True)
     moved.prune()
     print(judge.row("blended, then pruned", moved, T_cw, seconds), flush=True)
@@ -352,7 +359,7 @@ def planning_time(mapper: Mapper, correction: PoseCorrection) -> float:
     """Seconds of planning alone, the better of two."""
 
     def plan() -> MapUpdate:
-        seen = [witness(v, mapper.cameras) for v in mapper.views.values() if v.depth is not None]
+        seen = [witness(v, correction) for v in mapper.views.values() if v.has_depth]
         disks = mapper.map
         strategy = mapper.config.map_update
         return plan_update(disks.position, disks.keyframe_id, correction, strategy, seen)

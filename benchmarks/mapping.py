@@ -22,7 +22,6 @@ import torch
 
 from geogs.application.progress import peak_memory
 from geogs.application.results import fusion_views
-from geogs.cli.run import RunOptions
 from geogs.config import Config
 from geogs.depth.completion import upsample_grid
 from geogs.errors import InputError
@@ -32,15 +31,16 @@ from geogs.geometry.camera import Camera
 from geogs.geometry.umeyama import umeyama
 from geogs.io.poses import read_matrix_rows
 from geogs.io.sources.sniff import open_source
+from geogs.keyframes.grid import SampleGrid
+from geogs.keyframes.store import KeyframeStore, Segment
 from geogs.loop.global_bundle import global_bundle
 from geogs.mapping.mapper import Mapper
 from geogs.mesh.extract import extract_mesh
 from geogs.mesh.types import DepthMapView, Mesh
 from geogs.tracking.tracker import Tracker
-from geogs.types import Keyframe
 
 
-def track(sequence: Path, config: Config) -> tuple[Camera, list[Keyframe]]:
+def track(sequence: Path, config: Config) -> Segment:
     """Keyframes after tracking and the global bundle adjustment."""
     source = open_source(sequence, config.input)
     tracker = Tracker(source.camera, config.tracking, seed=config.seed)
@@ -48,14 +48,13 @@ def track(sequence: Path, config: Config) -> tuple[Camera, list[Keyframe]]:
         tracker.track(frame)
     tracker.finish()
     global_bundle(tracker)
-    return source.camera, [tracker.keyframe(i) for i in tracker.keyframe_ids]
+    return tracker.keyframes
 
 
-def save_state(path: Path, keyframes: list[Keyframe]) -> None:
+def save_state(path: Path, keyframes: Segment) -> None:
     """Everything but the images."""
     np.savez(
         path,
-        id=[k.id for k in keyframes],
         frame=[k.frame_index for k in keyframes],
         time=[k.timestamp for k in keyframes],
         T=torch.stack([k.T_cw for k in keyframes]).numpy(),
@@ -64,26 +63,23 @@ def save_state(path: Path, keyframes: list[Keyframe]) -> None:
     )
 
 
-def load_state(path: Path, sequence: Path, config: Config) -> tuple[Camera, list[Keyframe]]:
+def load_state(path: Path, sequence: Path, config: Config) -> Segment:
     """The keyframes of :func:`save_state`, images read again."""
     state = np.load(path)
     source = open_source(sequence, config.input)
     wanted = {int(f): n for n, f in enumerate(state["frame"])}
-    keyframes = []
+    keyframes = KeyframeStore(SampleGrid(source.camera)).new_segment()
     for frame in source:
         if frame.index in wanted:
             n = wanted[frame.index]
-            keyframes.append(
-                Keyframe(
-                    int(state["id"][n]), frame.index, float(state["time"][n]), frame.image,
-                    torch.from_numpy(state["T"][n]), torch.from_numpy(state["d"][n]),
-                    torch.from_numpy(state["info"][n]),
-                )
-            )  # fmt: skip
-    return source.camera, keyframes
+            T_cw = torch.from_numpy(state["T"][n])
+            k = keyframes.add(frame.index, float(state["time"][n]), frame.image, None, T_cw)
+            k.inverse_depth = torch.from_numpy(state["d"][n])
+            k.information = torch.from_numpy(state["info"][n])
+    return keyframes
 
 
-def alignment(keyframes: list[Keyframe], truth: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+def alignment(keyframes: Segment, truth: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
     """Similarity from the tracker's world to the true one, and their ATE in cm."""
     centres = torch.stack([torch.linalg.inv(k.T_cw)[:3, 3] for k in keyframes])
     true = torch.from_numpy(truth[[k.frame_index for k in keyframes], :3, 3])
@@ -93,30 +89,28 @@ def alignment(keyframes: list[Keyframe], truth: np.ndarray) -> tuple[float, np.n
     return float(scale), R.numpy(), t.numpy()
 
 
-def with_true_poses(
-    keyframes: list[Keyframe], truth: np.ndarray, sim: tuple[float, np.ndarray, np.ndarray]
-) -> list[Keyframe]:
-    """Keyframes at the true poses, expressed in the tracker's frame and scale."""
+def take_true_poses(
+    keyframes: Segment, truth: np.ndarray, sim: tuple[float, np.ndarray, np.ndarray]
+) -> None:
+    """Give keyframes the true poses, expressed in the tracker's frame and scale."""
     scale, R, t = sim
-    moved = []
     for k in keyframes:
         T_wc = truth[k.frame_index].copy()
         T_wc[:3, 3] = R.T @ (T_wc[:3, 3] - t) / scale
         T_wc[:3, :3] = R.T @ T_wc[:3, :3]
-        moved.append(replace(k, T_cw=torch.from_numpy(np.linalg.inv(T_wc))))
-    return moved
+        k.T_cw = torch.from_numpy(np.linalg.inv(T_wc))
 
 
-def build(camera: Camera, keyframes: list[Keyframe], config: Config) -> Mapper:
+def build(keyframes: Segment, config: Config) -> Mapper:
     """The map, keyframe by keyframe as in a run, then refined."""
-    mapper = Mapper(camera, config.mapping, seed=config.seed)
-    lag, start = config.mapping.lag, time.perf_counter()
-    for n, keyframe in enumerate(keyframes):
-        mapper.observe(keyframe)
+    mapper = Mapper(keyframes.store, config.mapping, seed=config.seed)
+    lag, start, ids = config.mapping.lag, time.perf_counter(), keyframes.ids
+    for n, id in enumerate(ids):
+        mapper.observe(id)
         if n >= lag:
-            mapper.map_keyframe(keyframes[n - lag].id)
-    for keyframe in keyframes[max(0, len(keyframes) - lag) :]:
-        mapper.map_keyframe(keyframe.id)
+            mapper.map_keyframe(ids[n - lag])
+    for id in ids[max(0, len(ids) - lag) :]:
+        mapper.map_keyframe(id)
     print(f"online: {len(mapper.map)} disks, {time.perf_counter() - start:.1f} s", flush=True)
     return mapper
 
@@ -228,27 +222,27 @@ def main() -> None:
     arguments, rest = parser.parse_known_args()
     config = parse_config(rest)
     if arguments.state and arguments.state.exists():
-        camera, keyframes = load_state(arguments.state, arguments.sequence, config)
+        keyframes = load_state(arguments.state, arguments.sequence, config)
     else:
-        camera, keyframes = track(arguments.sequence, config)
+        keyframes = track(arguments.sequence, config)
         if arguments.state:
             save_state(arguments.state, keyframes)
     truth = read_matrix_rows(arguments.sequence / "traj.txt")
     sim = alignment(keyframes, truth)
     if arguments.true_poses:
-        keyframes = with_true_poses(keyframes, truth, sim)
+        take_true_poses(keyframes, truth, sim)
     torch.set_num_threads(1)  # as in a run
-    mapper = build(camera, keyframes, config)
+    mapper = build(keyframes, config)
     scorer = Scorer(arguments.sequence, config, sim, keyframes, truth, mapper.cameras.render)
     if arguments.baselines:
-        baselines(mapper, scorer, camera)
+        baselines(mapper, scorer, keyframes.grid.camera)
     report_map("map, online", mapper, scorer)
     if not arguments.no_refine:
         start = time.perf_counter()
         mapper.refine()
         print(f"refined: {len(mapper.map)} disks, {time.perf_counter() - start:.1f} s")
         if arguments.baselines:
-            baselines(mapper, scorer, camera)
+            baselines(mapper, scorer, keyframes.grid.camera)
         report_map("map, final", mapper, scorer)
     print(f"peak memory {peak_memory() / 2**30:.2f} GiB")
     if arguments.save_mesh:
@@ -262,8 +256,7 @@ def parse_config(options: list[str]) -> Config:
     """Settings from the options of geogs run."""
     from geogs.cli.run import parse
 
-    parsed: RunOptions = parse(["none", *options])
-    return parsed
+    return parse(["none", *options]).config
 
 
 if __name__ == "__main__":

@@ -26,10 +26,14 @@ from geogs.config import LossConfig, MappingConfig
 from geogs.depth.view import DenseDepth
 from geogs.geometry.depth import normals_from_depth
 from geogs.geometry.lie import se3_inverse
+from geogs.keyframes.grid import SampleGrid
+from geogs.keyframes.store import KeyframeStore, Segment
 from geogs.losses import multi_view_loss, single_view_loss
-from geogs.mapping.cuda.trainer import CudaTrainer
-from geogs.mapping.training import Batch
-from geogs.mapping.view import MapCameras, MapView
+from geogs.mapping.cameras import MapCameras
+from geogs.mapping.training.base import Batch
+from geogs.mapping.training.cuda.trainer import CudaTrainer
+from geogs.mapping.view import MapView
+from geogs.mapping.view_pool import ViewPool
 from geogs.splat.cuda import autograd
 from geogs.splat.init import initialise_disks
 from geogs.splat.map import DiskParameters, GaussianMap
@@ -38,7 +42,6 @@ from geogs.synth.export import default_camera
 from geogs.synth.raycast import Raycaster
 from geogs.synth.room import make_room
 from geogs.synth.trajectory import handheld_trajectory
-from geogs.types import Keyframe
 
 FRAMES_APART = 6
 """Frames between two views on the path."""
@@ -76,10 +79,12 @@ class Window:
         scene = make_room(0)
         caster, poses = Raycaster(scene), handheld_trajectory(scene, FRAMES_APART * views)
         own, depths = [], []
-        for n, T_wc in enumerate(poses[::FRAMES_APART]):
+        segment = KeyframeStore(SampleGrid(photo, device)).new_segment()
+        pool = ViewPool(cameras, LossConfig(), device, views)
+        for T_wc in poses[::FRAMES_APART]:
             depths.append(torch.from_numpy(caster.render(cameras.render, T_wc).depth).float())
             image = caster.render(photo, T_wc).image
-            own.append(_view(n, image, T_wc, depths[-1], cameras, device))
+            own.append(_view(segment, pool, image, T_wc, depths[-1]))
         batch = []
         for k, view in enumerate(own):  # partners are the two nearest on the path
             first = min(max(k - 1, 0), views - 3)
@@ -92,16 +97,15 @@ class Window:
 
 
 def _view(
-    n: int, image: np.ndarray, T_wc: np.ndarray, depth: Tensor, cameras: MapCameras,
-    device: torch.device,
-) -> MapView:  # fmt: skip
-    grid = torch.ones(len(range(4, image.shape[0] - 3, 8)), len(range(4, image.shape[1] - 3, 8)))
-    keyframe = Keyframe(n, n, n / 30, image, se3_inverse(torch.from_numpy(T_wc)), grid, grid)
-    view = MapView.of(keyframe, cameras, LossConfig(), device)
-    dense = depth.to(device)
-    view.set_depth(DenseDepth(dense, torch.ones_like(dense), depth.median()), cameras)
-    normal, _ = normals_from_depth(dense, cameras.render)
-    view.constants = replace(view.known, prior_normal=normal)
+    segment: Segment, pool: ViewPool, image: np.ndarray, T_wc: np.ndarray, depth: Tensor
+) -> MapView:
+    n, T_cw = len(segment), se3_inverse(torch.from_numpy(T_wc))
+    view = MapView(segment.add(n, n / 30, image, None, T_cw), pool)
+    pool.add(view.keyframe)
+    dense = depth.to(pool.device)
+    pool.set_depth(view.id, DenseDepth(dense, torch.ones_like(dense), depth.median()))
+    normal, _ = normals_from_depth(dense, pool.cameras.render)
+    pool.maps(view.id).constants = replace(view.known, prior_normal=normal)
     return view
 
 
@@ -139,7 +143,7 @@ class Fused:
         disks.append(DiskParameters(*(p.clone() for p in window.disks)), 0)
         settings = replace(MappingConfig(), loss=config)
         self.window = window
-        self.trainer = CudaTrainer(disks, window.cameras, settings, window.unit)
+        self.trainer = CudaTrainer(disks, window.cameras, settings, window.unit, len(window.batch))
 
     def train(self, steps: int) -> None:
         """So many whole steps that leave the map as it is."""

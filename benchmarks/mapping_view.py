@@ -17,8 +17,12 @@ import torch
 from geogs.config import MappingConfig
 from geogs.depth.view import DenseDepth, KeyframeDepth
 from geogs.geometry.lie import se3_inverse
-from geogs.mapping.training import Trainer, view_loss
-from geogs.mapping.view import MapCameras, MapView
+from geogs.keyframes.grid import SampleGrid
+from geogs.keyframes.store import KeyframeStore
+from geogs.mapping.cameras import MapCameras
+from geogs.mapping.training.cpu import Trainer, view_loss
+from geogs.mapping.view import MapView
+from geogs.mapping.view_pool import ViewPool
 from geogs.splat.init import initialise_disks
 from geogs.splat.map import GaussianMap
 from geogs.splat.render import render
@@ -27,7 +31,6 @@ from geogs.synth.raycast import Raycaster
 from geogs.synth.room import make_room
 from geogs.synth.trajectory import handheld_trajectory
 from geogs.threads import worker_count
-from geogs.types import Keyframe
 
 
 def make_views(config: MappingConfig, width: int) -> tuple[list[MapView], MapCameras]:
@@ -37,16 +40,15 @@ def make_views(config: MappingConfig, width: int) -> tuple[list[MapView], MapCam
     scene = make_room(0)
     caster = Raycaster(scene)
     poses = handheld_trajectory(scene, 60)
-    views = []
-    for n, index in enumerate((0, 12, 24, 36, 48)):
+    views, pool = [], ViewPool(cameras, config.loss, torch.device("cpu"), 128)
+    segment = KeyframeStore(SampleGrid(photo)).new_segment()
+    for index in (0, 12, 24, 36, 48):
         image = caster.render(photo, poses[index]).image
         depth = caster.render(cameras.render, poses[index]).depth
         T_cw = se3_inverse(torch.from_numpy(poses[index]))
-        rows, columns = len(range(4, photo.height - 3, 8)), len(range(4, photo.width - 3, 8))
-        grid = torch.ones(rows, columns)
-        keyframe = Keyframe(n, index, index / 30, image, T_cw, grid, grid)
-        view = MapView.of(keyframe, cameras, config.loss)
-        view.set_depth(DenseDepth.of(KeyframeDepth(depth, np.ones_like(depth))), cameras)
+        view = MapView(segment.add(index, index / 30, image, None, T_cw), pool)
+        pool.add(view.keyframe)
+        pool.set_depth(view.id, DenseDepth.of(KeyframeDepth(depth, np.ones_like(depth))))
         view.rendered_depth = torch.from_numpy(depth)
         views.append(view)
     return views, cameras

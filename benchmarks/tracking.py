@@ -19,9 +19,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
-from plyfile import PlyData
 
 from geogs.config import TrackingConfig
+from geogs.evaluation.surface import read_surface
 from geogs.geometry.camera import Camera
 from geogs.geometry.umeyama import umeyama
 from geogs.loop.global_bundle import global_bundle
@@ -79,24 +79,18 @@ def align(estimate: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
 
 def keyframe_error(tracker: Tracker, sequence: Sequence) -> tuple[float, float]:
     """ATE of the keyframes in cm and the scale to metres."""
-    states = [tracker.keyframe(k) for k in tracker.keyframe_ids]
+    states = [tracker.keyframes[k] for k in tracker.keyframe_ids]
     centres = np.stack([torch.linalg.inv(s.T_cw)[:3, 3].numpy() for s in states])
     return align(centres, sequence.T_wc[[s.frame_index for s in states], :3, 3])
 
 
 def true_depth(path: Path, camera: Camera, T_wc: np.ndarray) -> Iterator[np.ndarray]:
     """Depth of a mesh on the tracker's grid from each pose, by ray casting; inf where empty."""
-    ply = PlyData.read(str(path))
-    v = np.stack([ply["vertex"][a] for a in "xyz"], -1).astype(np.float64)
-    f = np.vstack(
-        ply["face"].data[
-            "vertex_indices" if "vertex_indices" in ply["face"].data.dtype.names else "vertex_index"
-        ]
-    )
+    mesh = read_surface(path)
     x, y = np.arange(4, camera.width - 3, 8), np.arange(4, camera.height - 3, 8)
     for T in T_wc:
-        p = (v - T[:3, 3]) @ T[:3, :3]
-        yield _raster(p, f, camera, x, y)
+        p = (mesh.vertices - T[:3, 3]) @ T[:3, :3]
+        yield _raster(p, mesh.faces, camera, x, y)
 
 
 def _raster(p, faces, camera, xs, ys):
@@ -136,7 +130,7 @@ def _raster(p, faces, camera, xs, ys):
 def depth_report(tracker: Tracker, sequence: Sequence, scale: float, every: int) -> None:
     """Relative depth error of the keyframes by bins of the predicted relative deviation."""
     ids = tracker.keyframe_ids[::every]
-    states = [tracker.keyframe(k) for k in ids]
+    states = [tracker.keyframes[k] for k in ids]
     truth = true_depth(
         sequence.mesh, sequence.camera, sequence.T_wc[[s.frame_index for s in states]]
     )
@@ -171,7 +165,7 @@ def depth_report(tracker: Tracker, sequence: Sequence, scale: float, every: int)
 
 def save(path: Path, tracker: Tracker) -> None:
     """Write the keyframes for work on mapping."""
-    states = [tracker.keyframe(k) for k in tracker.keyframe_ids]
+    states = [tracker.keyframes[k] for k in tracker.keyframe_ids]
     c = tracker.camera
     np.savez(
         path,
@@ -209,9 +203,9 @@ def main() -> None:
         result = tracker.track(frame)
         spent += time.perf_counter() - tick
         lost += result.state.value == "lost"
-        if result.new_keyframe is not None and len(tracker.store) % 10 == 0:
+        if result.new_keyframe is not None and len(tracker.keyframes) % 10 == 0:
             print(
-                f"  frame {frame.index}: {len(tracker.store)} keyframes, "
+                f"  frame {frame.index}: {len(tracker.keyframes)} keyframes, "
                 f"ATE {keyframe_error(tracker, sequence)[0]:.3f} cm, {spent:.1f} s",
                 flush=True,
             )
@@ -222,7 +216,7 @@ def main() -> None:
     rate = len(sequence.files) / spent
     centres = tracker.trajectory().T_wc[:, :3, 3]
     print(
-        f"online: {len(tracker.store)} keyframes, keyframe ATE {online:.3f} cm, all frames "
+        f"online: {len(tracker.keyframes)} keyframes, keyframe ATE {online:.3f} cm, all frames "
         f"{align(centres, sequence.T_wc[:, :3, 3])[0]:.3f} cm, lost {lost}, {rate:.1f} frames/s "
         f"({spent:.1f} s tracking, {time.perf_counter() - start:.1f} s with reading, "
         f"{time.process_time() - cpu:.1f} s CPU)",

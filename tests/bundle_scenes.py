@@ -4,11 +4,8 @@ from dataclasses import replace
 
 import torch
 
-from geogs.bundle.dense import (
-    BundleProblem,
-    project,
-    relative_motion,
-)
+from geogs.bundle.problem import BundleProblem
+from geogs.bundle.projection import project, relative_motion
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import retract, se3_exp
 from geogs.keyframes.grid import SampleGrid

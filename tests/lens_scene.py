@@ -4,8 +4,9 @@ from dataclasses import replace
 
 import torch
 
-from geogs.bundle.dense import BundleProblem, relative_motion
 from geogs.bundle.lens import Lens, lens_rays, project_lens
+from geogs.bundle.problem import BundleProblem
+from geogs.bundle.projection import relative_motion
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp
 from geogs.keyframes.grid import SampleGrid
@@ -26,10 +27,10 @@ def lens_problem(
     pairs = [(i, j) for i in range(frames) for j in range(frames) if i != j]
     source, target = (torch.tensor([p[k] for p in pairs]) for k in (0, 1))
     rays = lens_rays(lens, GRID.pixels).rays
-    pixels, valid = project_lens(lens, rays, relative_motion(T, source, target), d[source])
+    exact = project_lens(lens, rays, relative_motion(T, source, target), d[source])
     g = torch.Generator().manual_seed(seed)
-    pixels = pixels + noise * torch.randn(pixels.shape, generator=g)
-    weight = valid[..., None].expand_as(pixels) / max(noise, 0.1) ** 2
+    pixels = exact.pixels + noise * torch.randn(exact.pixels.shape, generator=g)
+    weight = exact.valid[..., None].expand_as(pixels) / max(noise, 0.1) ** 2
     free = torch.ones(frames, dtype=torch.bool)
     free[0] = False
     return BundleProblem(T, d, source, target, pixels, weight, free, torch.ones_like(free))

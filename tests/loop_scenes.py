@@ -10,7 +10,7 @@ import torch
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_inverse
 from geogs.keyframes.grid import SampleGrid
-from geogs.keyframes.store import KeyframeStore
+from geogs.keyframes.store import KeyframeStore, Segment
 from geogs.synth.raycast import Raycaster, View
 from geogs.synth.room import make_room
 from geogs.synth.scene import Scene
@@ -76,12 +76,10 @@ def rearranged(scene: Scene, seed: int = 0, reach: float = 0.35) -> Scene:
     return replace(scene, centre=np.where(large[:, None], scene.centre, scene.centre + shift))
 
 
-def keyframes(
-    seen: Sequence[View], poses: Sequence[np.ndarray]
-) -> tuple[KeyframeStore, ClassicalFlow]:
+def keyframes(seen: Sequence[View], poses: Sequence[np.ndarray]) -> tuple[Segment, ClassicalFlow]:
     """A store of the views with their true depth, and the operator that encoded them."""
     grid = SampleGrid(CAMERA)
-    store, operator = KeyframeStore(grid), ClassicalFlow(grid)
+    store, operator = KeyframeStore(grid).new_segment(), ClassicalFlow(grid)
     for n, (view, T_wc) in enumerate(zip(seen, poses, strict=True)):
         T_cw = se3_inverse(torch.from_numpy(T_wc))
         state = store.add(n, n / 30, view.image, operator.encode(view.image), T_cw)

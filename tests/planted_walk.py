@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from geogs.bundle.dense import project
+from geogs.bundle.projection import project
 from geogs.config import TrackingConfig
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp, se3_inverse
@@ -97,7 +97,7 @@ def planted_tracker(
     tracker = Tracker(camera, config, operator=PlantedFlow(grid, T, d, sigma))
     for n in range(count):
         image = np.full((4, 4, 3), (n % 256, n // 256, 0), np.uint8)
-        state = tracker.store.add(n, n / 3, image, n, T[n].clone())
+        state = tracker.keyframes.add(n, n / 3, image, n, T[n].clone())
         state.inverse_depth = d[n].clone()
         state.information = torch.full_like(d[n], 1e4)
     tracker.state = TrackState.TRACKING
@@ -109,7 +109,7 @@ def drift(tracker: Tracker, scale: float = 0.0, yaw: float = 0.0) -> None:
 
     Every keyframe stays consistent with its neighbours to first order, as after a long chain.
     """
-    states = list(tracker.store)
+    states = list(tracker.keyframes)
     before = [s.T_cw for s in states]
     T = before[0]
     for n, state in enumerate(states):

@@ -6,11 +6,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from plyfile import PlyData
 
 from depth_scene import WORKING, make_scene, trace
 from geogs.config import ReconstructConfig
-from geogs.reconstruct import Reconstruction
+from geogs.evaluation.surface import read_surface
+from geogs.reconstruction import Reconstruction
 
 GEOGS = [sys.executable, "-m", "geogs.cli.main"]
 DEFAULT = ReconstructConfig()
@@ -37,8 +37,7 @@ def make_room(folder: Path) -> Path:
 
 def vertices(path: Path) -> np.ndarray:
     """Vertex positions of a PLY file."""
-    vertex = PlyData.read(path)["vertex"]
-    return np.stack([vertex[k] for k in "xyz"], 1)
+    return read_surface(path).vertices
 
 
 def ball_and_wall(

@@ -11,8 +11,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from plyfile import PlyData
 
+from geogs.evaluation.surface import read_surface
 from geogs.io.poses import read_tum_trajectory
 from geogs.io.writers.native import load_map
 
@@ -89,9 +89,9 @@ def test_the_online_result_and_the_depths_alone_are_written_too(room, result):
     assert seconds["total"] == pytest.approx(sum(seconds.values()) - seconds["total"], abs=0.1)
     keyframes = read_tum_trajectory(result / "online" / "keyframes.tum")
     assert 4 < len(keyframes.timestamps) < FRAMES
-    meshes = [PlyData.read(result / n / "mesh.ply") for n in ("online", "depth_fusion", ".")]
-    assert all(len(mesh["face"].data) > 1000 for mesh in meshes)
-    assert len({len(mesh["face"].data) for mesh in meshes}) == 3
+    meshes = [read_surface(result / n / "mesh.ply") for n in ("online", "depth_fusion", ".")]
+    assert all(len(mesh.faces) > 1000 for mesh in meshes)
+    assert len({len(mesh.faces) for mesh in meshes}) == 3
 
 
 def test_ground_truth_is_never_read(room, result, tmp_path):

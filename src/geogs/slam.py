@@ -10,7 +10,7 @@ import torch
 from geogs.config import Config
 from geogs.geometry.camera import Camera
 from geogs.keyframes.grid import SampleGrid
-from geogs.keyframes.store import KeyframeIds
+from geogs.keyframes.store import KeyframeStore
 from geogs.loop.closer import LoopCloser
 from geogs.loop.global_bundle import global_bundle
 from geogs.mapping.mapper import Mapper
@@ -20,7 +20,7 @@ from geogs.threads import on_one_torch_thread
 from geogs.tracking.flow.select import build_operator
 from geogs.tracking.segments import Segments
 from geogs.tracking.tracker import Tracker, TrackResult, TrackState
-from geogs.types import Frame, MapSnapshot, PoseCorrection, RenderedKeyframe, Trajectory
+from geogs.types import Frame, MapSnapshot, RenderedKeyframe, Trajectory
 
 Progress = Callable[[str, float], None]
 """Called with the name of a stage and its finished fraction in [0, 1]."""
@@ -59,11 +59,12 @@ class Slam:
         c = self.config
         self.device = device
         self.prior = prior
-        self.ids = KeyframeIds()
-        self.operator = build_operator(c.tracking, SampleGrid(camera, device))
+        grid = SampleGrid(camera, device)
+        self.operator = build_operator(c.tracking, grid)
+        self.keyframes = KeyframeStore(grid, self.operator.encode, c.resident_keyframes)
         self.segments = Segments(self.new_tracker, c.tracking.patience)
         self.loops = LoopCloser(self.segments, c.loop)
-        self.mapper = Mapper(camera, c.mapping, device, c.seed)
+        self.mapper = Mapper(self.keyframes, c.mapping, c.seed)
         self.stopwatch = Stopwatch()
         self.frames = 0
         self._waiting: deque[int] = deque()
@@ -72,11 +73,11 @@ class Slam:
         self._is_ended = False
 
     def new_tracker(self) -> Tracker:
-        """A tracker of another segment, whose keyframe ids follow all others'."""
+        """A tracker of another segment."""
         c = self.config
         return Tracker(
             self.camera, c.tracking, self.device, c.seed, self.operator, self.prior, c.prior,
-            self.ids,
+            self.keyframes,
         )  # fmt: skip
 
     @property
@@ -103,7 +104,8 @@ class Slam:
         with self.stopwatch("tracking"):
             result = self.segments.finish()
         if result.is_new_world:
-            self.mapper = Mapper(self.camera, self.config.mapping, self.device, self.config.seed)
+            self.mapper = Mapper(self.keyframes, self.config.mapping, self.config.seed)
+            self.segments.world.keyframes.take_corrections()
             self._waiting.clear()
         self._map(self._close_loops(result, is_last=True), lag=0)
 
@@ -129,8 +131,8 @@ class Slam:
 
     def keyframe_trajectory(self) -> Trajectory:
         """Poses of the keyframes alone."""
-        keyframes = self._keyframes(self.segments.keyframe_ids)
-        T_wc = [torch.linalg.inv(k.T_cw.cpu()).numpy() for k in keyframes]
+        keyframes = [self.keyframes[i] for i in self.segments.keyframe_ids]
+        T_wc = [torch.linalg.inv(k.T_cw).numpy() for k in keyframes]
         times = np.array([k.timestamp for k in keyframes], dtype=np.float64)
         return Trajectory(times, np.array(T_wc).reshape(-1, 4, 4), np.ones(len(times), dtype=bool))
 
@@ -165,10 +167,9 @@ class Slam:
     def _close_loops(self, result: TrackResult, is_last: bool = False) -> TrackResult:
         """Act on loops that a frame closed; what is to be mapped then."""
         with self.stopwatch("loops"):
-            event = self.loops.update(result, is_last)
-        if event.correction is not None:
-            self._move_map(event.correction)
-        return replace(result, finalized=(*result.finalized, *event.joined))
+            became_final = self.loops.update(result, is_last)
+        self._move_map()
+        return replace(result, finalized=(*result.finalized, *became_final))
 
     def _adjust_now_and_then(self) -> None:
         every, count = self.config.loop.global_ba_every, len(self.segments.keyframe_ids)
@@ -179,31 +180,27 @@ class Slam:
         """Bundle-adjust all keyframes and let the map follow."""
         world = self.segments.world
         with self.stopwatch("global bundle adjustment"):
-            correction = global_bundle(world, lambda f, _: progress("bundle adjustment", f))
+            global_bundle(world, lambda f, _: progress("bundle adjustment", f))
             self.loops.replaced_by_bundle()
         self.adjusted = len(world.keyframe_ids)
-        self._move_map(correction)
+        self._move_map()
 
-    def _move_map(self, correction: PoseCorrection) -> None:
-        with self.stopwatch("map update"):
-            self.mapper.correct(correction, self._keyframes(self.mapper.keyframe_ids))
+    def _move_map(self) -> None:
+        """Let the map follow the corrections of the world's keyframes."""
+        for correction in self.segments.world.keyframes.take_corrections():
+            with self.stopwatch("map update"):
+                self.mapper.correct(correction)
 
     def _map(self, result: TrackResult, lag: int) -> None:
         """Hand settled keyframes to the mapper; train those whose successors are known."""
         self._waiting.extend(result.finalized)
         with self.stopwatch("mapping"):
-            for keyframe in self._keyframes(list(result.finalized)):
-                self.mapper.observe(keyframe)
-            if result.new_keyframe is not None or result.removed or result.finalized:
-                self.mapper.follow(self._keyframes(list(result.active)))
+            for id in result.finalized:
+                self.mapper.observe(id)
             trained = False
             while len(self._waiting) > lag:
                 self.mapper.map_keyframe(self._waiting.popleft())
                 trained = True
         if trained and self.config.mapping.pose_iterations:
             with self.stopwatch("pose refinement"):
-                self.segments.write_back(self.mapper.refine_poses(list(result.active)))
-
-    def _keyframes(self, ids: list[int]) -> list:
-        alive = set(self.segments.keyframe_ids)
-        return [self.segments.keyframe(i) for i in ids if i in alive]
+                self.mapper.refine_poses(result.active)

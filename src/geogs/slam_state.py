@@ -20,14 +20,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from geogs.bundle.dense import bundle_solver
+from geogs.bundle.select import bundle_solver
 from geogs.config import MappingConfig
-from geogs.depth.engine import depth_engine
+from geogs.depth.select import depth_engine
 from geogs.errors import InputError
 from geogs.keyframes.archive import Archive, Archived, NamedFiles, SettledArchive
 from geogs.keyframes.grid import SampleGrid
-from geogs.mapping.training import MapTrainer, map_trainer
-from geogs.mapping.view import MapCameras
+from geogs.mapping.cameras import MapCameras
+from geogs.mapping.training.base import MapTrainer
+from geogs.mapping.training.select import map_trainer
 from geogs.slam import Slam
 from geogs.splat.map import GaussianMap
 from geogs.splat.optimizer import MapOptimizer
@@ -87,8 +88,7 @@ def write_slam(stream: ByteSink, slam: Slam, folder: NamedFiles) -> list[Archive
     Raises:
         OutputError: an archive cannot be written.
     """
-    for view in slam.mapper.views.values():
-        view.keep()
+    slam.mapper.pool.store()
     writer = _Writer(stream, slam, folder)
     writer.dump({name: x for name, x in vars(slam).items() if name not in _PROCESS})
     return writer.archives

@@ -8,7 +8,6 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from geogs.geometry.camera import Camera
-from geogs.keyframes.archive import Archived
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,42 +22,6 @@ class Frame:
     """RGB."""
     follows_cut: bool = False
     """Whether it begins another video, so that no motion links it to the frame before."""
-
-
-@dataclass(frozen=True, slots=True)
-class Keyframe:
-    """The tracker's present state of one keyframe, as handed to the mapper.
-
-    Image and normals may lie in an archive: then they are read whenever they are asked for.
-    """
-
-    id: int
-    """Stable: never reused, increasing in time."""
-    frame_index: int
-    timestamp: float
-    stored_image: UInt8[np.ndarray, "h w 3"] | Archived
-    """What ``image`` is read from."""
-    T_cw: Float[Tensor, "4 4"]
-    """World to camera, float64."""
-    inverse_depth: Float[Tensor, "gh gw"]
-    """On the tracker's grid: cell (r, c) is pixel (4 + 8 c, 4 + 8 r)."""
-    information: Float[Tensor, "gh gw"]
-    """Sum over edges of w |dp/dd|^2; the relative depth deviation is z / sqrt(information)."""
-    stored_normal: Float[Tensor, "h w 3"] | Archived | None = None
-    """What ``normal`` is read from."""
-
-    @property
-    def image(self) -> UInt8[np.ndarray, "h w 3"]:
-        """RGB at working resolution; not to be changed."""
-        stored = self.stored_image
-        return stored.load() if isinstance(stored, Archived) else stored
-
-    @property
-    def normal(self) -> Float[Tensor, "h w 3"] | None:
-        """Unit normals of a monocular prior at working resolution, in the camera frame and facing
-        the camera; zero where unknown, None where nothing was asked."""
-        stored = self.stored_normal
-        return torch.from_numpy(stored.load()) if isinstance(stored, Archived) else stored
 
 
 @dataclass(frozen=True, slots=True)

@@ -130,6 +130,7 @@ class CommandRunner:
     def settings(self, task: "Task") -> dict[str, object]:
         """Every setting of the command but its output. Raises InputError for a wrong option."""
         options = asdict(_parsed(task))
+        options |= options.pop("config", {})
         return {k: v for k, v in options.items() if k not in _NO_SETTINGS[task.command]}
 
     def run(self, task: "Task") -> None:

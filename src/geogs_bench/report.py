@@ -7,9 +7,9 @@ from geogs.evaluation.page import PictureSection, Section, TableSection, TextSec
 from geogs.io.writers.atomic import write_text
 from geogs_bench.benchmark import Benchmark
 from geogs_bench.curves import plot_curves
-from geogs_bench.pictures import PICTURES
 from geogs_bench.published import PAPER
 from geogs_bench.record import Record, write_json
+from geogs_bench.scoring.pictures import PICTURES
 from geogs_bench.tables import Table, published_tables, result_tables
 
 

@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from geogs.bundle.dense import MIN_Z
+from geogs.bundle.projection import MIN_Z
 from geogs.geometry.lie import retract, se3_adjoint, se3_inverse
 
 

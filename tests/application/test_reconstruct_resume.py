@@ -16,7 +16,7 @@ from geogs.application.reconstruct_checkpoint import ReconstructState, fingerpri
 from geogs.config import ReconstructConfig
 from geogs.errors import InputError
 from geogs.mapping.state import restore_mapper
-from geogs.reconstruct import Reconstruction
+from geogs.reconstruction import Reconstruction
 from posed_scene import (
     DEFAULT,
     GEOGS,

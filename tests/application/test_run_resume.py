@@ -15,7 +15,7 @@ import pytest
 
 from geogs.application.progress import RunProgress
 from geogs.application.run_checkpoint import RunCheckpoint, RunFacts, frames_after
-from geogs.cli.run import RunOptions
+from geogs.application.settings import RunSettings
 from geogs.config import InputConfig
 from geogs.errors import InputError
 from geogs.io.sources.sniff import open_sources
@@ -212,7 +212,7 @@ def test_where_no_checkpoint_can_be_written_that_is_said_once(room, tmp_path, mo
     monkeypatch.setattr(RunProgress, "write", lambda _, text: said.append(text))
     source = open_sources([room])
     slam = Slam(source.camera)
-    facts = RunFacts(RunOptions(), "cpu", source.fingerprint(), None, source.place)
+    facts = RunFacts(RunSettings(), "cpu", source.fingerprint(), None, source.place)
     (tmp_path / "checkpoint").touch()
     checkpoint = RunCheckpoint(tmp_path, facts, 0.001, RunProgress(None))
     for _ in range(3):

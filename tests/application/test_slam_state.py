@@ -12,13 +12,13 @@ from types import MethodType
 import numpy as np
 import pytest
 import torch
+from geogs.mapping.view_maps import ViewMaps
 
 from geogs.config import Config
 from geogs.errors import InputError
 from geogs.io.sources.sniff import open_source
 from geogs.keyframes.archive import Archived, Recent
 from geogs.keyframes.grid import SampleGrid
-from geogs.mapping.view_maps import ViewMaps
 from geogs.slam import Slam
 from geogs.slam_state import read_record, read_slam, write_record, write_slam
 from geogs.synth.export import write_sequence

@@ -6,13 +6,10 @@ import pytest
 import torch
 
 from bundle_scenes import CAMERA, disturbed, scene
-from geogs.bundle.dense import (
-    BundleOptions,
-    DenseBundle,
-    linearise,
-    relative_motion,
-)
-from geogs.bundle.motion_only import solve_poses
+from geogs.bundle.base import BundleOptions
+from geogs.bundle.dense import DenseBundle
+from geogs.bundle.motion import solve_poses
+from geogs.bundle.projection import linearise, relative_motion
 from geogs.geometry.lie import retract, se3_inverse
 from oracles.bundle_reference import gauss_newton_step, reproject
 

@@ -8,26 +8,20 @@ import numpy as np
 import pytest
 import torch
 
-import geogs.bundle.cuda.bundle as cuda_bundle
+import geogs.bundle.cuda.dense as cuda_bundle
 import geogs.bundle.cuda.fields as cuda_fields
-import geogs.bundle.cuda.graph as cuda_graph
 import geogs.bundle.cuda.motion as cuda_motion
+import geogs.bundle.cuda.pairs as cuda_graph
 from cuda_emulator import use_emulator
-from geogs.bundle.dense import (
-    MIN_Z,
-    BundleOptions,
-    BundleProblem,
-    BundleResult,
-    DenseBundle,
-    linearise,
-    project,
-    relative_motion,
-)
-from geogs.bundle.motion_only import solve_poses
+from geogs.bundle.base import BundleOptions, BundleResult
+from geogs.bundle.dense import DenseBundle
+from geogs.bundle.motion import solve_poses
+from geogs.bundle.problem import BundleProblem
+from geogs.bundle.projection import MIN_Z, linearise, project, relative_motion
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import retract, se3_exp
 from geogs.keyframes.grid import SampleGrid
-from geogs.keyframes.store import KeyframeStore
+from geogs.keyframes.store import KeyframeStore, Segment
 from geogs.loop.global_bundle import global_bundle
 from geogs.tracking.flow.base import FlowMatch
 from geogs.tracking.flow.classical import ClassicalFlow
@@ -109,9 +103,7 @@ def assert_same(fast: BundleResult, slow: BundleResult) -> None:
 
 def test_sources_and_python_agree_on_sizes():
     folder = Path(cuda_bundle.__file__).parent
-    text = "".join(
-        (folder / name).read_text() for name in ("bundle_solve.cu", "bundle_projection.cuh")
-    )
+    text = "".join((folder / name).read_text() for name in ("solve.cu", "projection.cuh"))
     found = {k: float(v) for k, v in re.findall(r"#define (\w+) ([\d.]+)", text)}
     assert found["MAX_POSES"] == cuda_bundle.MAX_FEW
     assert found["PANEL"] == cuda_bundle.PANEL
@@ -222,9 +214,9 @@ def test_not_finite_input_is_refused_and_reported(device, which, count):
     )
 
 
-def keyframes(problem: BundleProblem, camera: Camera, device: torch.device) -> KeyframeStore:
+def keyframes(problem: BundleProblem, camera: Camera, device: torch.device) -> Segment:
     """The frames of a problem; a fifth of their cells have no information."""
-    store = KeyframeStore(SampleGrid(camera, device))
+    store = KeyframeStore(SampleGrid(camera, device)).new_segment()
     g = torch.Generator().manual_seed(5)
     image = np.zeros((4, 4, 3), np.uint8)
     for n, (T, d) in enumerate(zip(problem.T_cw, problem.inverse_depth, strict=True)):
@@ -392,7 +384,7 @@ def test_tracker_runs_on_the_gpu_as_on_the_cpu():
     truth = np.stack(PATH)[:, :3, 3]
     assert trajectory.tracked.all()
     assert error_cm(trajectory.T_wc[:, :3, 3], truth) < 0.5
-    keyframe = tracker.keyframe(tracker.keyframe_ids[0])
+    keyframe = tracker.keyframes[tracker.keyframe_ids[0]]
     assert keyframe.T_cw.device.type == "cpu"
     assert keyframe.inverse_depth.device.type == "cuda"
     global_bundle(tracker)

@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from geogs.bundle import lens_bundle as bundle
-from geogs.bundle.dense import relative_motion
 from geogs.bundle.lens import Lens, lens_rays, linearise_lens, project_lens
 from geogs.bundle.lens_bundle import LensBundleOptions, solve_lens
+from geogs.bundle.projection import relative_motion
 from geogs.geometry.lie import retract
 from lens_scene import CAMERA, GRID, disturbed, lens_problem
 from oracles.calibration_reference import gauss_newton_step, reproject
@@ -48,9 +48,9 @@ def test_the_lens_is_that_of_opencv():
     back, _ = cv2.projectPoints(rays.numpy(), np.zeros(3), np.zeros(3), K, distortion)
     np.testing.assert_allclose(back[:, 0], pixels.numpy(), atol=1e-7)
     eye = torch.eye(4, dtype=torch.float64)[None]
-    at, valid = project_lens(lens, rays, eye, torch.ones(1, GRID.size, dtype=torch.float64))
-    np.testing.assert_allclose(at[0].numpy(), pixels.numpy(), atol=1e-7)
-    assert valid.all()
+    p = project_lens(lens, rays, eye, torch.ones(1, GRID.size, dtype=torch.float64))
+    np.testing.assert_allclose(p.pixels[0].numpy(), pixels.numpy(), atol=1e-7)
+    assert p.valid.all()
 
 
 @pytest.mark.parametrize("huber", [0.5, 50.0])
@@ -61,10 +61,12 @@ def test_one_step_matches_the_dense_equations(huber):
     xi, unknowns, delta = gauss_newton_step(
         problem, CAMERA, GRID.pixels, 0.05, huber, options.depth_damping
     )
-    stars = bundle._stars(problem, lens, GRID.pixels, problem.T_cw, problem.inverse_depth, options)
-    step = bundle._step(problem, stars, problem.T_cw, options, 0.0)
+    system = bundle._System.of(
+        problem, lens, GRID.pixels, problem.T_cw, problem.inverse_depth, options
+    )
+    step = system.step(0.0)
     assert step is not None
-    depth = bundle._moved_depth(stars, step, problem.inverse_depth, options)
+    depth = system.moved_depth(step, problem.inverse_depth, options)
     assert float(unknowns.abs().min()) > 1e-3
     torch.testing.assert_close(step[-2:], unknowns, rtol=2e-3, atol=2e-5)
     # Poses and depths agree up to the scale, which nothing measures.

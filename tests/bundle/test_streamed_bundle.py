@@ -6,8 +6,10 @@ import pytest
 import torch
 
 from bundle_scenes import disturbed, scene
-from geogs.bundle.dense import BundleOptions, BundleProblem, DenseBundle
-from geogs.bundle.streamed import StreamedBundle, StreamedProblem
+from geogs.bundle.base import BundleOptions
+from geogs.bundle.dense import DenseBundle
+from geogs.bundle.problem import BundleProblem, StreamedProblem
+from geogs.bundle.streamed import StreamedBundle
 
 
 def streamed(p: BundleProblem) -> StreamedProblem:

@@ -13,6 +13,7 @@ from geogs.config import DepthConfig
 from geogs.depth import plane_sweep_kernels as sweep_loops
 from geogs.depth import refinement as cpu_refinement
 from geogs.depth.carve import vote
+from geogs.depth.classical import CpuDepthEngine
 from geogs.depth.completion import (
     complete_grid,
     complete_inverse_depth,
@@ -28,7 +29,6 @@ from geogs.depth.cuda.engine import CudaDepthEngine
 from geogs.depth.cuda.images import KeyframeImages, homographies
 from geogs.depth.cuda.refine import PixelPlaces, SlantedMaps, TrackerMaps
 from geogs.depth.cuda.sweep import PlaneSlots, SweptDepth
-from geogs.depth.engine import CpuDepthEngine
 from geogs.depth.evidence import (
     choose_start,
     prior_weight,
@@ -348,7 +348,7 @@ def _engines(setting: Setting) -> tuple[CpuDepthEngine, CudaDepthEngine]:
     cameras = (setting.render, setting.working)
     return (
         CpuDepthEngine(*cameras, setting.config),
-        CudaDepthEngine(setting.device, *cameras, setting.config),
+        CudaDepthEngine(setting.device, *cameras, setting.config, 128),
     )
 
 

@@ -10,9 +10,9 @@ import torch
 from depth_scene import RENDER, WORKING, DepthScene, make_scene
 from geogs.config import DepthConfig
 from geogs.depth.carve import vote
-from geogs.depth.engine import depth_engine
 from geogs.depth.estimate import estimate_depth
 from geogs.depth.fusion import check_depth
+from geogs.depth.select import depth_engine
 from geogs.depth.sweep_neighbors import (
     depth_range,
     parallax_degrees,
@@ -141,7 +141,7 @@ def test_check_lowers_the_confidence_of_a_floater_and_averages_noise(scene, dept
 
 
 def test_the_cpu_engine_is_the_functions(scene, depths):
-    engine = depth_engine("cpu", RENDER, WORKING, CONFIG)
+    engine = depth_engine("cpu", RENDER, WORKING, CONFIG, 128)
     views = scene.views
     dense = engine.estimate(views[:2], [[v for v in views if v.id != i] for i in range(2)])
     posed = [PosedDepth(v.T_cw, DenseDepth.of(d)) for v, d in zip(views, depths, strict=True)]

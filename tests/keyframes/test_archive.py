@@ -93,39 +93,36 @@ def test_a_missing_folder_is_one_sentence(tmp_path):
 def test_old_keyframes_are_read_and_encoded_again():
     grid = SampleGrid(CAMERA)
     operator, rng = ClassicalFlow(grid), np.random.default_rng(1)
-    store = KeyframeStore(grid, operator.encode, resident=3)
+    store = KeyframeStore(grid, operator.encode, resident=3).new_segment()
     images = [rng.integers(0, 255, (96, 128, 3), dtype=np.uint8) for _ in range(8)]
     encoded = [operator.encode(image) for image in images]
     for n, image in enumerate(images):
         state = store.add(n, n / 30, image, encoded[n], torch.eye(4, dtype=torch.float64))
-        state.normal = torch.full((96, 128, 3), float(n)).half()
-    exported = [store.export(k) for k in store.ids]
+        state.picture.normal = torch.full((96, 128, 3), float(n)).half()
     assert store[7].image is images[7]
     assert store[7].encoded is encoded[7]
     for n, state in enumerate(store):
         np.testing.assert_array_equal(state.image, images[n])
-        np.testing.assert_array_equal(exported[n].image, images[n])
         again = state.encoded
         for name in ("grey", "half", "structure"):
             np.testing.assert_array_equal(getattr(again, name), getattr(encoded[n], name))
-        assert exported[n].normal.dtype == torch.float16
-        assert float(exported[n].normal.min()) == float(exported[n].normal.max()) == n
+        assert state.picture.normal.dtype == torch.float16
+        assert float(state.picture.normal.min()) == float(state.picture.normal.max()) == n
     assert store[0].image is not images[0]
     assert store[7].encoded is store[7].encoded
 
 
-def test_exported_keyframes_do_not_hold_their_images():
+def test_keyframes_do_not_hold_their_images():
     grid = SampleGrid(CAMERA)
-    store = KeyframeStore(grid, lambda image: None, resident=2)
-    exported, image = [], np.zeros((96, 128, 3), np.uint8)
+    store = KeyframeStore(grid, lambda image: None, resident=2).new_segment()
+    image = np.zeros((96, 128, 3), np.uint8)
     before = resident_bytes()
     for n in range(600):  # 21 MiB of images
         store.add(n, n / 30, image + np.uint8(n % 250), None, torch.eye(4, dtype=torch.float64))
         store[n].inverse_depth = store[n].information = torch.zeros(grid.size)
-        exported.append(store.export(n))
-        exported[n].image[0, 0, 0]  # having been looked at changes nothing
+        store[n].image[0, 0, 0]  # having been looked at changes nothing
     assert resident_bytes() - before < 8 << 20
-    assert exported[3].image[5, 5, 1] == 3
+    assert store[3].image[5, 5, 1] == 3
 
 
 def test_archives_keep_what_the_last_checkpoint_refers_to(tmp_path):

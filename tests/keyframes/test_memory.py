@@ -54,7 +54,7 @@ class CountingFlow:
 
 @pytest.fixture
 def graph() -> FrameGraph:
-    store, operator = KeyframeStore(GRID), CountingFlow()
+    store, operator = KeyframeStore(GRID).new_segment(), CountingFlow()
     for k in range(4):
         image = np.full((CAMERA.height, CAMERA.width, 3), k + 1, np.uint8)
         T = torch.from_numpy(np.linalg.inv(pose(0.1 * k)))

@@ -8,7 +8,7 @@ import torch
 
 from geogs.config import LoopConfig, RetrievalOptions
 from geogs.geometry.lie import se3_exp, se3_inverse, so3_log
-from geogs.keyframes.store import KeyframeStore
+from geogs.keyframes.store import Segment
 from geogs.loop.dense import dense_check
 from geogs.loop.detect import LoopDetector
 from geogs.loop.features import FeatureExtractor, Features
@@ -37,7 +37,7 @@ def walk(path):
     return keyframes(*path)
 
 
-def _relative(store: KeyframeStore, first: int, second: int) -> torch.Tensor:
+def _relative(store: Segment, first: int, second: int) -> torch.Tensor:
     return store[second].T_cw @ se3_inverse(store[first].T_cw)
 
 
@@ -45,21 +45,21 @@ def _turn(A: torch.Tensor, B: torch.Tensor) -> float:
     return math.degrees(float(so3_log(A[:3, :3] @ B[:3, :3].mT).norm()))
 
 
-def _drift(store: KeyframeStore, ids: range) -> None:
+def _drift(store: Segment, ids: range) -> None:
     for id in ids:
         store[id].T_cw = se3_exp(DRIFT) @ store[id].T_cw
 
 
-def _scale_depth(store: KeyframeStore, id: int, factor: float) -> None:
+def _scale_depth(store: Segment, id: int, factor: float) -> None:
     store[id].inverse_depth = store[id].inverse_depth / factor
 
 
-def _views_of(store: KeyframeStore, *ids: int) -> list[DepthView]:
+def _views_of(store: Segment, *ids: int) -> list[DepthView]:
     extract = FeatureExtractor(RetrievalOptions())
     return [_depth_view(store, k, extract(store[k].image)) for k in ids]
 
 
-def _depth_view(store: KeyframeStore, id: int, features: Features) -> DepthView:
+def _depth_view(store: Segment, id: int, features: Features) -> DepthView:
     state = store[id]
     return DepthView.of(store.grid, state.inverse_depth, state.information, features)
 
@@ -130,9 +130,7 @@ def test_looks_close_a_loop_that_drift_hides(walk):
     store, operator = walk
     true = {k: _relative(store, k - LAP, k) for k in store.ids[LAP:]}
     _drift(store, range(LAP, LAP + AGAIN))
-    detector = LoopDetector(
-        store.grid, operator, lambda _: store, LoopConfig(min_gap=10, suppression=1)
-    )
+    detector = LoopDetector(store.store, operator, LoopConfig(min_gap=10, suppression=1))
     loops = [x for k in store.ids for x in detector.update([k])] + [*detector.update([], True)]
     loops = [loop for loop in loops if loop.second >= LAP]
     assert {(0, LAP), (1, LAP + 1)} <= {(loop.first, loop.second) for loop in loops}
@@ -146,7 +144,7 @@ def test_looks_close_a_loop_that_drift_hides(walk):
 def test_poses_close_a_loop_without_features(walk):
     store, operator = walk
     config = LoopConfig(min_gap=10, retrieval=RetrievalOptions(features=8, indexed=8))
-    detector = LoopDetector(store.grid, operator, lambda _: store, config)
+    detector = LoopDetector(store.store, operator, config)
     loops = detector.update(store.ids, is_last=True)
     assert loops
     assert all(loop.cause == "geometry" and loop.inliers == 0 for loop in loops)
@@ -159,7 +157,7 @@ def test_a_loop_as_a_similarity_takes_depth_to_depth(walk):
     store, operator = walk
     _scale_depth(store, LAP, 1.2)
     config = LoopConfig(min_gap=10, suppression=0)
-    detector = LoopDetector(store.grid, operator, lambda _: store, config)
+    detector = LoopDetector(store.store, operator, config)
     detector.update(store.ids[: LAP + 1], is_last=True)
     loop = next(x for x in detector.loops if x.second == LAP)
     assert loop.scale == pytest.approx(1.2, rel=0.02)
@@ -172,9 +170,7 @@ def test_a_loop_as_a_similarity_takes_depth_to_depth(walk):
 
 def test_close_pairs_suppress_each_other(walk):
     store, operator = walk
-    detector = LoopDetector(
-        store.grid, operator, lambda _: store, LoopConfig(min_gap=10, suppression=3)
-    )
+    detector = LoopDetector(store.store, operator, LoopConfig(min_gap=10, suppression=3))
     detector.update(store.ids, is_last=True)
     pairs = [(loop.first, loop.second) for loop in detector.loops]
     assert pairs
@@ -186,7 +182,7 @@ def test_close_pairs_suppress_each_other(walk):
 def test_update_is_deterministic(path):
     def run() -> list[tuple[int, int, float]]:
         store, operator = keyframes(*path)
-        detector = LoopDetector(store.grid, operator, lambda _: store, LoopConfig(min_gap=10))
+        detector = LoopDetector(store.store, operator, LoopConfig(min_gap=10))
         loops = [x for k in store.ids for x in detector.update([k])] + [*detector.update([], True)]
         return [(x.first, x.second, float(x.T_ji.sum())) for x in loops]
 
@@ -199,7 +195,7 @@ def test_a_room_of_another_shape_with_the_same_pictures_closes_no_loop(path):
     twins = orbit(other, LAP, np.radians(4))[:AGAIN]
     store, operator = keyframes(seen[:LAP] + views(other, twins), poses[:LAP] + twins)
     _drift(store, range(LAP, LAP + AGAIN))
-    detector = LoopDetector(store.grid, operator, lambda _: store, LoopConfig(min_gap=10))
+    detector = LoopDetector(store.store, operator, LoopConfig(min_gap=10))
     # The lap itself closes where its end meets its beginning.
     assert [loop for loop in detector.update(store.ids, True) if loop.second >= LAP] == []
 
@@ -211,5 +207,5 @@ def test_blank_keyframes_close_nothing(path):
         store[id].image = np.full_like(store[id].image, 120)
         store[id].encoded = operator.encode(store[id].image)
         store[id].information = torch.zeros_like(store[id].information)
-    detector = LoopDetector(store.grid, operator, lambda _: store, LoopConfig(min_gap=5))
+    detector = LoopDetector(store.store, operator, LoopConfig(min_gap=5))
     assert detector.update([0, 12, 13], is_last=True) == ()

@@ -8,13 +8,15 @@ import torch
 
 from geogs.config import Config, MappingConfig
 from geogs.geometry.lie import retract, se3_exp, se3_inverse
+from geogs.mapping.map_update import MapUpdate
 from geogs.mapping.mapper import Mapper
 from geogs.mapping.window import draw_views, views_around
 from geogs.synth.export import default_camera
 from geogs.synth.raycast import Raycaster
 from geogs.synth.room import make_room
 from geogs.synth.trajectory import handheld_trajectory
-from geogs.types import Keyframe, PoseCorrection
+from geogs.types import PoseCorrection
+from keyframe_samples import Sample, add, segment_of
 
 CAMERA = default_camera(224, 168)
 MAPPING = replace(
@@ -28,21 +30,21 @@ MAPPING = replace(
 
 
 @pytest.fixture(scope="module")
-def sequence() -> tuple[list[Keyframe], list[np.ndarray]]:
+def sequence() -> tuple[list[Sample], list[np.ndarray]]:
     """Nine keyframes with noisy grid depth, a fifth of it wrong, and their true depth maps."""
     scene = make_room(3)
     caster = Raycaster(scene)
     poses = handheld_trajectory(scene, 64)
     random = np.random.default_rng(0)
     keyframes, truth = [], []
-    for n, index in enumerate(range(0, 63, 7)):
+    for index in range(0, 63, 7):
         view = caster.render(CAMERA, poses[index])
         z = view.depth[4 : CAMERA.height - 3 : 8, 4 : CAMERA.width - 3 : 8].astype(np.float64)
         deviation = np.where(random.random(z.shape) < 0.2, 0.4, 0.02)
         noisy = z * np.exp(deviation * random.standard_normal(z.shape))
         keyframes.append(
-            Keyframe(
-                n, index, index / 30, view.image, se3_inverse(torch.from_numpy(poses[index])),
+            Sample(
+                index, view.image, se3_inverse(torch.from_numpy(poses[index])),
                 torch.from_numpy(1 / noisy).float(),
                 torch.from_numpy((noisy / deviation) ** 2).float(),
             )
@@ -52,14 +54,14 @@ def sequence() -> tuple[list[Keyframe], list[np.ndarray]]:
     return keyframes, truth
 
 
-def build(keyframes: list[Keyframe], config: MappingConfig = MAPPING) -> Mapper:
-    mapper = Mapper(CAMERA, config)
-    for n, keyframe in enumerate(keyframes):
-        mapper.observe(keyframe)
+def build(samples: list[Sample], config: MappingConfig = MAPPING, resident: int = 128) -> Mapper:
+    mapper = Mapper(segment_of(samples, CAMERA, resident=resident).store, config)
+    for n in range(len(samples)):
+        mapper.observe(n)
         if n >= config.lag:
-            mapper.map_keyframe(keyframes[n - config.lag].id)
-    for keyframe in keyframes[-config.lag :]:
-        mapper.map_keyframe(keyframe.id)
+            mapper.map_keyframe(n - config.lag)
+    for n in range(len(samples) - config.lag, len(samples)):
+        mapper.map_keyframe(n)
     return mapper
 
 
@@ -106,27 +108,38 @@ def test_same_seed_same_map(sequence):
 
 def test_disturbed_poses_are_drawn_back_by_the_map(mapper, sequence):
     """A centimetre and a third of a degree of error shrink; the earliest pose is not touched."""
-    true = {k.id: k.T_cw for k in sequence[0]}
+    true = {n: k.T_cw for n, k in enumerate(sequence[0])}
     active = [3, 4, 5, 6]
     g = torch.Generator().manual_seed(1)
     for i in active[1:]:
         xi = torch.randn(6, dtype=torch.float64, generator=g)
         xi[:3] *= 0.008
         xi[3:] *= 0.004
-        mapper.views[i].move(retract(xi, true[i]))
+        mapper.keyframes[i].T_cw = retract(xi, true[i])
     start = {i: mapper.views[i].T_cw for i in active}
     config, mapper.config = mapper.config, replace(MAPPING, pose_iterations=40, pose_lr=6e-4)
-    poses = mapper.refine_poses(active)
+    mapper.refine_poses(active)
     mapper.config = config
+    poses = {i: mapper.keyframes[i].T_cw for i in active}
 
     def error(T: dict[int, torch.Tensor]) -> float:
-        centres = [torch.linalg.inv(T[i])[:3, 3] - torch.linalg.inv(true[i])[:3, 3] for i in poses]
+        centres = [
+            torch.linalg.inv(T[i])[:3, 3] - torch.linalg.inv(true[i])[:3, 3] for i in active[1:]
+        ]
         return 100 * float(torch.stack(centres).norm(dim=1).mean())
 
-    assert sorted(poses) == active[1:]
+    assert torch.equal(poses[3], true[3])
     assert error(poses) < 0.6 * error(start)
     for i in active:
-        mapper.views[i].move(true[i])
+        mapper.keyframes[i].T_cw = true[i]
+
+
+def correct(mapper: Mapper, correction: PoseCorrection) -> MapUpdate:
+    """Let the keyframes take over a correction, and the map follow."""
+    segment = mapper.keyframes.segment_of(0)
+    segment.correct(correction)
+    (made,) = segment.take_corrections()
+    return mapper.correct(made)
 
 
 def test_a_rigid_correction_moves_map_and_views_together(sequence):
@@ -134,10 +147,9 @@ def test_a_rigid_correction_moves_map_and_views_together(sequence):
     mapper = build(keyframes[:6])
     before = depth_error(mapper, truth[:6])
     G = se3_exp(torch.tensor([0.5, -0.3, 0.2, 0.3, 0.5, -0.2], dtype=torch.float64))
-    old = {k.id: k.T_cw for k in keyframes[:6]}
+    old = {n: k.T_cw for n, k in enumerate(keyframes[:6])}
     new = {i: T @ se3_inverse(G) for i, T in old.items()}
-    moved = [replace(k, T_cw=new[k.id]) for k in keyframes[:6]]
-    update = mapper.correct(PoseCorrection(old, new, dict.fromkeys(old, 1.0)), moved)
+    update = correct(mapper, PoseCorrection(old, new, dict.fromkeys(old, 1.0)))
     assert update.residual < 1e-4
     assert depth_error(mapper, truth[:6]) == pytest.approx(before, abs=0.02)
 
@@ -148,26 +160,28 @@ def test_mapping_goes_on_in_corrected_units(sequence):
     factor = 0.9
     G = se3_exp(torch.tensor([0.5, -0.3, 0.2, 0.3, 0.5, -0.2], dtype=torch.float64))
 
-    def corrected(keyframe: Keyframe) -> Keyframe:
+    def corrected(keyframe: Sample) -> Sample:
         T = keyframe.T_cw @ se3_inverse(G)
         T[:3, 3] *= factor
         return replace(keyframe, T_cw=T, inverse_depth=keyframe.inverse_depth / factor)
 
     plain, mapper = build(keyframes), build(keyframes[:6])
-    old = {k.id: k.T_cw for k in keyframes[:6]}
+    old = {n: k.T_cw for n, k in enumerate(keyframes[:6])}
     moved = [corrected(k) for k in keyframes]
-    new = {k.id: k.T_cw for k in moved[:6]}
+    new = {n: k.T_cw for n, k in enumerate(moved[:6])}
     depths = {i: v.dense.depth.clone() for i, v in mapper.views.items()}
-    update = mapper.correct(PoseCorrection(old, new, dict.fromkeys(old, 1 / factor)), moved[:6])
+    update = correct(mapper, PoseCorrection(old, new, dict.fromkeys(old, 1 / factor)))
     assert update.residual < 1e-4
     for i, view in mapper.views.items():
         assert (view.dense.depth / depths[i]).numpy() == pytest.approx(factor, rel=1e-5)
         assert (view.T_cw - new[i]).abs().max() == 0
         assert view.rendered_depth is None
-    for keyframe in moved[6:]:
-        mapper.observe(keyframe)
-    for keyframe in moved[6:]:
-        mapper.map_keyframe(keyframe.id)
+    segment = mapper.keyframes.segment_of(0)
+    added = [add(segment, sample).id for sample in moved[6:]]
+    for n in added:
+        mapper.observe(n)
+    for n in added:
+        mapper.map_keyframe(n)
     renders = [r.depth.numpy() / factor for r in mapper.renders()]
     errors = [np.abs(r - d)[(r > 0) & (d > 0)] for r, d in zip(renders, truth, strict=True)]
     median = 100 * float(np.median(np.concatenate(errors)))
@@ -211,12 +225,12 @@ def test_parked_views_change_nothing(sequence):
     config = replace(MAPPING, iterations=3, final_iterations=6, final_depth=True)
     maps = []
     for resident in (128, 2):
-        mapper = build(keyframes[:7], replace(config, resident_views=resident))
+        mapper = build(keyframes[:7], config, resident)
         mapper.refine()
         maps.append(mapper)
     held, parked = maps
-    assert sum(v.is_resident for v in held.views.values()) == 7
-    assert sum(v.is_resident for v in parked.views.values()) == 2
+    assert sum(held.pool.is_resident(i) for i in held.views) == 7
+    assert sum(parked.pool.is_resident(i) for i in parked.views) == 2
     for a, b in zip(held.map.parameters, parked.map.parameters, strict=True):
         assert torch.equal(a, b)
     for i in held.mapped:
@@ -228,7 +242,7 @@ def test_parked_views_change_nothing(sequence):
         assert (a.typical_depth, a.partners) == (b.typical_depth, b.partners)
         if a.rendered_depth is not None:
             assert torch.equal(a.rendered_depth, b.rendered_depth)
-    parked.views[0].rescale(2.0, parked.cameras)
+    parked.keyframes[0].rescale(2.0)
     torch.testing.assert_close(parked.views[0].dense.depth, 2 * held.views[0].dense.depth)
     assert parked.views[0].typical_depth == pytest.approx(2 * held.views[0].typical_depth)
 

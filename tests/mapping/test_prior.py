@@ -10,15 +10,18 @@ from geogs.config import LossConfig, PriorConfig
 from geogs.depth.view import DenseDepth, KeyframeDepth
 from geogs.geometry.camera import Camera
 from geogs.keyframes.grid import SampleGrid
+from geogs.keyframes.keyframe import Keyframe
 from geogs.keyframes.store import KeyframeStore
-from geogs.losses import fused_single_view
+from geogs.losses.cpu import fused_single_view
 from geogs.losses.single_view import single_view_loss
-from geogs.mapping.view import MapCameras, MapView
+from geogs.mapping.cameras import MapCameras
+from geogs.mapping.view import MapView
+from geogs.mapping.view_pool import ViewPool
 from geogs.priors.base import PriorMaps
 from geogs.tracking.flow.classical import ClassicalFlow
 from geogs.tracking.graph import FrameGraph
 from geogs.tracking.keyframe_priors import KeyframePriors
-from geogs.types import Keyframe
+from keyframe_samples import Sample, segment_of
 
 WORKING = Camera(80.0, 80.0, 47.5, 35.5, 96, 72)
 CAMERAS = MapCameras(WORKING, WORKING.with_long_edge(48), WORKING)
@@ -26,10 +29,11 @@ OFF = LossConfig(normal_weight=0.0)
 
 
 def keyframe(normal: torch.Tensor | None) -> Keyframe:
-    grid = SampleGrid(WORKING)
-    ones = torch.ones(grid.height, grid.width)
     image = np.random.default_rng(0).integers(0, 255, (72, 96, 3), np.uint8)
-    return Keyframe(0, 0, 0.0, image, torch.eye(4, dtype=torch.float64), ones, ones, normal)
+    (made,) = segment_of([Sample(0, image, torch.eye(4, dtype=torch.float64))], WORKING)
+    if normal is not None:
+        made.picture.normal = normal
+    return made
 
 
 def normals() -> torch.Tensor:
@@ -45,10 +49,12 @@ def normals() -> torch.Tensor:
 
 
 def view(normal: torch.Tensor | None, loss: LossConfig) -> MapView:
-    made = MapView.of(keyframe(normal), CAMERAS, loss)
+    pool = ViewPool(CAMERAS, loss, torch.device("cpu"), 128)
+    made = MapView(keyframe(normal), pool)
+    pool.add(made.keyframe)
     depth = KeyframeDepth(np.full((36, 48), 2.0, np.float32), np.full((36, 48), 0.5, np.float32))
     for _ in range(2):  # a depth that is replaced keeps what does not depend on it
-        made.set_depth(DenseDepth.of(depth), CAMERAS)
+        pool.set_depth(made.id, DenseDepth.of(depth))
     return made
 
 
@@ -90,7 +96,7 @@ def test_normals_that_face_away_are_dropped_with_a_warning(caplog):
             return PriorMaps(normal=normal)
 
     grid = SampleGrid(WORKING)
-    store = KeyframeStore(grid)
+    store = KeyframeStore(grid).new_segment()
     operator = ClassicalFlow(grid)
     priors = KeyframePriors(FrameGraph(store, operator), Backwards(), PriorConfig())
     image = keyframe(None).image
@@ -99,9 +105,9 @@ def test_normals_that_face_away_are_dropped_with_a_warning(caplog):
         with caplog.at_level(logging.WARNING, "geogs"):
             priors.ask(state)
     assert state.prior is None
-    assert state.normal.dtype == torch.float16
-    assert float(state.normal[:, 10:48].abs().max()) == 0
-    torch.testing.assert_close(state.normal[20, 5].tolist(), [0.0, 0.0, -1.0])
+    assert state.picture.normal.dtype == torch.float16
+    assert float(state.picture.normal[:, 10:48].abs().max()) == 0
+    torch.testing.assert_close(state.picture.normal[20, 5].tolist(), [0.0, 0.0, -1.0])
     assert [r.message for r in caplog.records] == [
         "Most prior normals face away from the camera; check their normal_axes."
     ]

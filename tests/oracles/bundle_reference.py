@@ -4,7 +4,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from geogs.bundle.dense import MIN_Z, BundleOptions, BundleProblem
+from geogs.bundle.base import BundleOptions
+from geogs.bundle.problem import BundleProblem
+from geogs.bundle.projection import MIN_Z
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import retract, se3_inverse
 

@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from geogs.bundle.dense import BundleProblem
+from geogs.bundle.problem import BundleProblem
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import retract, se3_inverse
 

@@ -5,7 +5,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from geogs.bundle.dense import BundleProblem
+from geogs.bundle.problem import BundleProblem
 from geogs.geometry.lie import se3_inverse
 from geogs.keyframes.grid import SampleGrid
 from geogs.tracking.depth_prior import DEPTH_DAMPING, SCALE_DAMPING

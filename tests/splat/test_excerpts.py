@@ -9,16 +9,18 @@ from geogs.config import DiskConfig, MappingConfig
 from geogs.depth.view import DenseDepth
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp
-from geogs.mapping import training
-from geogs.mapping.cuda.trainer import KnownViews
-from geogs.mapping.training import Trainer
-from geogs.mapping.view import MapCameras, MapView
+from geogs.mapping.cameras import MapCameras
+from geogs.mapping.training import cpu as training
+from geogs.mapping.training.cpu import Trainer
+from geogs.mapping.training.cuda.known_views import KnownViews
+from geogs.mapping.view import MapView
+from geogs.mapping.view_pool import ViewPool
 from geogs.splat import init
 from geogs.splat.cpu.in_view import disks_in_view
 from geogs.splat.map import DiskParameters, GaussianMap
 from geogs.splat.optimizer import LearningRates, MapOptimizer
 from geogs.splat.render import render
-from geogs.types import Keyframe
+from keyframe_samples import Sample, add, segment_of
 
 CAMERA = Camera(60.0, 60.0, 47.5, 35.5, 96, 72)
 CAMERAS = MapCameras(CAMERA, CAMERA, CAMERA)
@@ -50,14 +52,16 @@ def test_no_disk_that_is_rendered_is_left_out():
 
 def views() -> list[MapView]:
     random = torch.Generator().manual_seed(1)
-    made = []
+    made, segment = [], segment_of([], CAMERA)
+    pool = ViewPool(CAMERAS, LOSS, torch.device("cpu"), 128)
     for n in range(2):
         image = torch.randint(0, 255, (72, 96, 3), dtype=torch.uint8, generator=random).numpy()
-        grid = torch.ones(9, 12)
         T = se3_exp(torch.tensor([0.1 * n, 0, 0, 0, 0.02 * n, 0], dtype=torch.float64))
-        view = MapView.of(Keyframe(n, n, n / 30, image, T, grid, grid), CAMERAS, LOSS)
+        add(segment, Sample(n, image, T))
+        pool.add(segment[n])
+        view = MapView(segment[n], pool)
         depth = 2 + torch.rand(72, 96, generator=random)
-        view.set_depth(DenseDepth(depth, torch.ones_like(depth), depth.median()), CAMERAS)
+        pool.set_depth(n, DenseDepth(depth, torch.ones_like(depth), depth.median()))
         made.append(view)
     return made
 
@@ -120,8 +124,10 @@ def test_few_slots_serve_many_keyframes():
     """Slots on the GPU pass from keyframe to keyframe, and their maps stay where they are."""
     known = KnownViews(CAMERAS, torch.device("cpu"), 2)
     a, b = views()
-    c, _ = views()
-    c.follow(replace(c.keyframe, id=7, T_cw=se3_exp(torch.full((6,), 0.2, dtype=torch.float64))))
+    pose = se3_exp(torch.full((6,), 0.2, dtype=torch.float64))
+    a.pool.add(replace(a.keyframe, id=7, T_cw=pose))
+    c = MapView(replace(a.keyframe, id=7, T_cw=pose), a.pool)
+    a.pool.set_depth(7, a.dense)
     first = known.slots([a, b])
     known.table.rendered.fill_(1)
     addresses = known.table.pointers.clone()

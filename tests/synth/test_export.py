@@ -6,10 +6,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from plyfile import PlyData
 
 from geogs.cli.synth import main
 from geogs.errors import InputError, OutputError
+from geogs.evaluation.surface import read_surface
 from geogs.synth.export import default_camera, write_sequence
 from geogs.synth.raycast import Raycaster
 from geogs.synth.room import make_room
@@ -35,11 +35,6 @@ def scene() -> Scene:
 @pytest.fixture(scope="module")
 def raycaster(scene: Scene) -> Raycaster:
     return Raycaster(scene)
-
-
-def _vertices(path: Path) -> np.ndarray:
-    vertex = PlyData.read(str(path))["vertex"]
-    return np.stack([vertex[axis] for axis in "xyz"], 1).astype(float)
 
 
 def test_layout(sequence: Path) -> None:
@@ -68,7 +63,7 @@ def test_round_trip(sequence: Path, scene: Scene, raycaster: Raycaster) -> None:
 
 def test_points_are_what_was_seen(sequence: Path, scene: Scene, raycaster: Raycaster) -> None:
     """They project onto themselves in some frame, and lie inside the room."""
-    points = _vertices(sequence / "points_seen_1cm.ply")
+    points = read_surface(sequence / "points_seen_1cm.ply").vertices
     assert len(points) > 5000
     assert (points > -1e-4).all()
     assert (points < scene.size + 1e-4).all()
@@ -88,10 +83,10 @@ def test_points_are_what_was_seen(sequence: Path, scene: Scene, raycaster: Rayca
 
 
 def test_mesh_fills_the_room(sequence: Path, scene: Scene) -> None:
-    points = _vertices(sequence / "mesh.ply")
+    mesh = read_surface(sequence / "mesh.ply")
+    points, faces = mesh.vertices, mesh.faces
     np.testing.assert_allclose(points.min(0), 0, atol=1e-5)
     np.testing.assert_allclose(points.max(0), scene.size, atol=1e-5)
-    faces = np.stack(PlyData.read(str(sequence / "mesh.ply"))["face"]["vertex_indices"])
     assert faces.min() == 0
     assert faces.max() == len(points) - 1
 

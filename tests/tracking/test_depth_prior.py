@@ -5,7 +5,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from geogs.bundle.dense import BundleProblem, project, relative_motion
+from geogs.bundle.problem import BundleProblem
+from geogs.bundle.projection import project, relative_motion
 from geogs.config import PriorConfig
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from geogs.bundle.dense import project
+from geogs.bundle.projection import project
 from geogs.config import TrackingConfig
 from geogs.keyframes.grid import SampleGrid
 from geogs.loop.global_bundle import global_bundle

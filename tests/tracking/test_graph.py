@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from geogs.bundle.dense import BundleOptions
+from geogs.bundle.base import BundleOptions
 from geogs.keyframes.grid import SampleGrid
-from geogs.keyframes.store import KeyframeStore
+from geogs.keyframes.store import KeyframeStore, Segment
 from geogs.tracking.flow.classical import ClassicalFlow
 from geogs.tracking.graph import FrameGraph
 from geogs.tracking.motion import FrameLocator, pnp, transfer_depth
@@ -20,7 +20,7 @@ def room_graph(poses: list[np.ndarray] = POSES) -> FrameGraph:
     """A graph whose keyframes have true poses and depths."""
     grid = SampleGrid(CAMERA)
     operator = ClassicalFlow(grid)
-    store = KeyframeStore(grid)
+    store = KeyframeStore(grid).new_segment()
     for k, T in enumerate(poses):
         image, depth = render(T)
         T_cw = torch.from_numpy(np.linalg.inv(T))
@@ -31,10 +31,10 @@ def room_graph(poses: list[np.ndarray] = POSES) -> FrameGraph:
     return FrameGraph(store, operator)
 
 
-def flat_store(centres: list[float]) -> KeyframeStore:
+def flat_store(centres: list[float]) -> Segment:
     """Cameras on a line in front of a wall at depth 2."""
     grid = SampleGrid(CAMERA)
-    store = KeyframeStore(grid)
+    store = KeyframeStore(grid).new_segment()
     for k, x in enumerate(centres):
         T = torch.from_numpy(np.linalg.inv(pose(x)))
         state = store.add(k, k / 30, np.zeros((144, 192, 3), np.uint8), None, T)

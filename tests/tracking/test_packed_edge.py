@@ -48,7 +48,7 @@ def test_edges_of_old_keyframes_can_be_taken_out():
 
 def error_cm(tracker, truth) -> float:
     """RMS distance of the camera centres after a similarity."""
-    x = se3_inverse(tracker.store.poses(tracker.store.ids))[:, :3, 3]
+    x = se3_inverse(tracker.keyframes.poses(tracker.keyframes.ids))[:, :3, 3]
     y = se3_inverse(truth)[:, :3, 3]
     scale, R, t = umeyama(x, y)
     return 100 * float((scale * x @ R.T + t - y).square().sum(1).mean().sqrt())

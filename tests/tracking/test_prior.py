@@ -52,7 +52,7 @@ def track(views: list[View], prior, config: PriorConfig | None = None) -> Tracke
 
 def score(tracker: Tracker, walk: tuple[list[View], np.ndarray]) -> Score:
     views, T_wc = walk
-    keyframes = [tracker.keyframe(k) for k in tracker.keyframe_ids]
+    keyframes = [tracker.keyframes[k] for k in tracker.keyframe_ids]
     x = torch.stack([torch.linalg.inv(k.T_cw)[:3, 3] for k in keyframes])
     y = torch.from_numpy(T_wc[[k.frame_index for k in keyframes], :3, 3])
     scale, R, t = umeyama(x, y)
@@ -60,7 +60,7 @@ def score(tracker: Tracker, walk: tuple[list[View], np.ndarray]) -> Score:
     errors, bare = [], []
     for k in keyframes[1:-1]:
         true = views[k.frame_index].depth[4:-3:8, 4:-3:8]
-        errors.append(np.abs(float(scale) / k.inverse_depth.numpy() / true - 1).ravel())
+        errors.append(np.abs(float(scale) / k.depth_field()[0] / true - 1).ravel())
         bare.append(cell_structure(cv2.cvtColor(k.image, cv2.COLOR_RGB2GRAY)) < MIN_STRUCTURE)
     error, where = np.concatenate(errors), np.concatenate(bare)
     assert 0.2 < where.mean() < 0.6
@@ -121,11 +121,11 @@ def test_scales_follow_the_unit(walk, helped: Tracker):
     state = helped.store[id]
     before = state.inverse_depth.clone(), state.prior.scale.clone(), state.prior.information.clone()
     poses = {id: state.T_cw.clone()}
-    helped.correct(PoseCorrection(poses, poses, {id: 2.0}))
+    helped.keyframes.correct(PoseCorrection(poses, poses, {id: 2.0}))
     torch.testing.assert_close(state.inverse_depth, 2 * before[0])
     torch.testing.assert_close(state.prior.scale, 2 * before[1])
     torch.testing.assert_close(state.prior.information, before[2] / 4)
-    helped.correct(PoseCorrection(poses, poses, {id: 0.5}))
+    helped.keyframes.correct(PoseCorrection(poses, poses, {id: 0.5}))
     torch.testing.assert_close(state.prior.scale, before[1])
 
 

@@ -7,16 +7,16 @@ import torch
 import geogs.tracking.proximity as proximity
 from geogs.geometry.lie import se3_exp
 from geogs.keyframes.grid import SampleGrid
-from geogs.keyframes.store import KeyframeStore
+from geogs.keyframes.store import KeyframeStore, Segment
 from geogs.tracking.overlap import may_overlap
 from geogs.tracking.proximity import frame_distances, proximity_pairs
 from planted_walk import SMALL, planted_tracker
 
 
-def scattered(count: int, seed: int = 0) -> KeyframeStore:
+def scattered(count: int, seed: int = 0) -> Segment:
     """Cameras anywhere, looking anywhere, with depths that vary from cell to cell."""
     grid, g = SampleGrid(SMALL), torch.Generator().manual_seed(seed)
-    store = KeyframeStore(grid)
+    store = KeyframeStore(grid).new_segment()
     turn = torch.tensor([2, 2, 2, 0.5, 1.5, 0.5], dtype=torch.float64)
     T = se3_exp(turn * torch.randn(count, 6, generator=g, dtype=torch.float64))
     for n in range(count):

@@ -12,10 +12,10 @@ from geogs.geometry.camera import Camera
 from geogs.geometry.lie import sim3_exp
 from geogs.geometry.umeyama import umeyama
 from geogs.keyframes.grid import SampleGrid
-from geogs.keyframes.store import KeyframeIds
+from geogs.keyframes.store import KeyframeStore
 from geogs.loop.closer import LoopCloser
 from geogs.tracking.flow.select import build_operator
-from geogs.tracking.segments import Segments, moved
+from geogs.tracking.segments import Segments
 from geogs.tracking.tracker import Tracker, TrackState
 from geogs.types import Frame
 from loop_scenes import at_angle, room
@@ -40,9 +40,11 @@ def stream(angles: Sequence[float | None], cuts: Sequence[int] = ()) -> list[Fra
 
 def run(frames: Sequence[Frame]) -> tuple[Segments, list]:
     """The whole stream through segments and loops."""
-    ids, operator = KeyframeIds(), build_operator(CONFIG, SampleGrid(CAMERA))
+    grid = SampleGrid(CAMERA)
+    operator = build_operator(CONFIG, grid)
+    store = KeyframeStore(grid, operator.encode)
     segments = Segments(
-        lambda: Tracker(CAMERA, CONFIG, "cpu", 0, operator, None, None, ids), CONFIG.patience
+        lambda: Tracker(CAMERA, CONFIG, "cpu", 0, operator, None, None, store), CONFIG.patience
     )
     closer, results = LoopCloser(segments, LOOPS), []
     for frame in frames:
@@ -118,19 +120,18 @@ def test_the_largest_segment_becomes_the_world():
 
 @pytest.mark.parametrize("scale", [0.5, 1.0, 3.0])
 def test_moving_keyframes_keeps_what_they_see(scale):
-    ids, operator = KeyframeIds(), build_operator(CONFIG, SampleGrid(CAMERA))
-    tracker = Tracker(CAMERA, CONFIG, "cpu", 0, operator, ids=ids)
+    tracker = Tracker(CAMERA, CONFIG)
     for frame in stream(np.arange(0, 16, 2.0)):
         tracker.track(frame)
     tracker.finish()
     before = tracker.graph.reprojections([(0, 2), (3, 1)])
-    centres = [torch.linalg.inv(s.T_cw)[:3, 3] for s in tracker.store]
+    centres = [torch.linalg.inv(s.T_cw)[:3, 3] for s in tracker.keyframes]
     xi = torch.tensor([0.3, -0.2, 0.5, 0.1, 0.4, -0.2, np.log(scale)], dtype=torch.float64)
     S = sim3_exp(xi)
-    tracker.correct(moved(tracker.store, S))
+    tracker.keyframes.correct(tracker.keyframes.moved(S))
     after = tracker.graph.reprojections([(0, 2), (3, 1)])
     assert float((after - before).abs().max()) < 2e-3
-    for centre, state in zip(centres, tracker.store, strict=True):
+    for centre, state in zip(centres, tracker.keyframes, strict=True):
         expected = torch.linalg.inv(S) @ torch.cat([centre, torch.ones(1)])
         assert torch.allclose(torch.linalg.inv(state.T_cw)[:3, 3], expected[:3], atol=1e-9)
     assert tracker.trajectory().tracked.all()

@@ -33,15 +33,15 @@ def test_uncertain_depth_lowers_the_weight_along_its_direction_only():
 
 def test_frames_of_a_culled_keyframe_keep_their_place_and_others_are_not_touched():
     tracker, _ = planted_tracker(6)
-    recorder = TrajectoryRecorder(tracker.store, tracker.operator)
+    recorder = TrajectoryRecorder(tracker.keyframes, tracker.operator)
     step = se3_exp(torch.tensor([0.02, 0, 0, 0, 0.01, 0], dtype=torch.float64))
     for n in range(5):
-        tracker.store[n].frame_index = 3 * n
+        tracker.keyframes[n].frame_index = 3 * n
         recorder.add_keyframe(n)
         for k in (1, 2):
             recorder.add(3 * n + k, (3 * n + k) / 30, n, n, step)
     before = [recorder._pose(r).clone() for r in recorder.records]
-    recorder.keyframe_removed(tracker.store.remove(3), 2)
+    recorder.keyframe_removed(tracker.keyframes.remove(3), 2)
     assert [r.anchor for r in recorder.records] == [0] * 3 + [1] * 3 + [2] * 6 + [4] * 3
     for record, T_cw in zip(recorder.records, before, strict=True):
         torch.testing.assert_close(recorder._pose(record), T_cw)
@@ -50,7 +50,7 @@ def test_frames_of_a_culled_keyframe_keep_their_place_and_others_are_not_touched
 
 def test_what_is_kept_of_a_frame_is_small_and_finds_its_pose():
     tracker, T = planted_tracker(4, sigma=0.0)
-    recorder = TrajectoryRecorder(tracker.store, tracker.operator)
+    recorder = TrajectoryRecorder(tracker.keyframes, tracker.operator)
     match, _ = tracker.operator.measure([0], [2])
     wrong = se3_exp(torch.tensor([0.02, 0, 0.01, 0, 0.01, 0], dtype=torch.float64))
     recorder.add(50, 1.0, 2, 0, wrong @ T[2], FlowMatch(match.pixels, match.weight))

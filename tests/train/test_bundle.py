@@ -6,13 +6,10 @@ import pytest
 import torch
 
 from bundle_scenes import CAMERA, disturbed, scene
-from geogs.bundle.dense import (
-    BundleOptions,
-    BundleProblem,
-    DenseBundle,
-    project,
-    relative_motion,
-)
+from geogs.bundle.base import BundleOptions
+from geogs.bundle.dense import DenseBundle
+from geogs.bundle.problem import BundleProblem
+from geogs.bundle.projection import project, relative_motion
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import retract, se3_inverse
 from geogs.keyframes.grid import SampleGrid

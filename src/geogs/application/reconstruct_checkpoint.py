@@ -10,7 +10,7 @@ from geogs.application.checkpoint import Checkpoint, SavedState
 from geogs.application.progress import RunProgress
 from geogs.config import ReconstructConfig
 from geogs.errors import InputError
-from geogs.reconstruct import Reconstruction, ReconstructionState
+from geogs.reconstruction import Reconstruction, ReconstructionState
 
 
 @dataclass(frozen=True)

@@ -11,12 +11,12 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from io import BufferedReader
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import geogs
 from geogs.application.checkpoint import next_due
 from geogs.application.checkpoint_folder import CheckpointFolder
 from geogs.application.progress import RunProgress
+from geogs.application.settings import RunSettings
 from geogs.errors import InputError, OutputError
 from geogs.io.sources.base import ReadingPlace
 from geogs.io.sources.calibration import Calibration
@@ -27,14 +27,11 @@ from geogs.slam import Slam
 from geogs.slam_state import ByteSink, read_record, read_slam, write_record, write_slam
 from geogs.types import Frame
 
-if TYPE_CHECKING:
-    from geogs.cli.run import RunOptions
-
 _TITLE = f"geogs run checkpoint 1, geogs {geogs.__version__}\n".encode()
 _PIECE = 1 << 20
 _CHECKSUM_BYTES = 4
 _OURS = frozenset({
-    ("geogs.cli.run", "RunOptions"), ("geogs.application.run_checkpoint", "RunFacts"),
+    ("geogs.application.settings", "RunSettings"), ("geogs.application.run_checkpoint", "RunFacts"),
     ("geogs.io.sources.base", "ReadingPlace"), ("geogs.io.sources.calibration", "Calibration"),
     ("geogs.io.sources.calibration", "Refinement"), ("geogs.io.sources.several", "JointPlace"),
     ("geogs.io.sources.several", "SourceSpan"),
@@ -46,7 +43,7 @@ _OURS = frozenset({
 class RunFacts:
     """What a run is made of, beside its state."""
 
-    options: "RunOptions"
+    settings: RunSettings
     """With absolute paths."""
     device: str
     """cpu or cuda."""

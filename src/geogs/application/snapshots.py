@@ -7,7 +7,7 @@ from geogs.application.progress import RunProgress
 from geogs.application.surfaces import write_surface
 from geogs.config import ReconstructConfig
 from geogs.io.writers.native import save_map
-from geogs.reconstruct import Reconstruction
+from geogs.reconstruction import Reconstruction
 from geogs.types import MapSnapshot
 
 

@@ -15,7 +15,8 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 from torch import Tensor
 
-from geogs.bundle.dense import Star, chain_star, sources_within
+from geogs.bundle.linearise import Star
+from geogs.bundle.problem import sources_within
 
 
 class SparseCameraSystem:
@@ -47,11 +48,6 @@ class SparseCameraSystem:
         self._gradient = torch.zeros(self._count, 6, dtype=torch.float64)
 
     @property
-    def stored(self) -> int:
-        """Number of blocks that are kept."""
-        return len(self._keys)
-
-    @property
     def bandwidth(self) -> int:
         """Frames by which the two of a block lie apart at most, in the order of the system."""
         if not self._count:
@@ -61,8 +57,8 @@ class SparseCameraSystem:
     def add(self, stars: Iterable[Star]) -> None:
         """Add what the edges of some sources say of the poses."""
         for star in stars:
-            poses, block, gradient = chain_star(star)
-            at = self._slot[poses]
+            block, gradient = star.pose_blocks()
+            at = self._slot[star.poses]
             keep = at >= 0
             self._gradient.index_add_(0, at[keep], gradient[keep])
             keys, rows, columns = _lower(at, self._count)

@@ -8,10 +8,10 @@ import math
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
-from geogs.bundle.dense import MIN_Z
+from geogs.bundle.projection import Projection, motion_rows, seen_from_targets
 from geogs.geometry.camera import Camera
 
 UNKNOWNS = 2
@@ -45,12 +45,9 @@ class LensRays:
 
 
 @dataclass(frozen=True)
-class LensProjection:
-    """Where the cells of the sources fall in the targets, with all first derivatives."""
+class LensProjection(Projection):
+    """A projection with its first derivatives."""
 
-    pixels: Float[Tensor, "e p 2"]
-    valid: Bool[Tensor, "e p"]
-    """In front of the target."""
     jacobian: Float[Tensor, "e 8 2 p"]
     """d pixel / d (xi of the target pose, log f, k1)."""
     depth_jacobian: Float[Tensor, "e 2 p"]
@@ -81,10 +78,10 @@ def project_lens(
     rays: Float[Tensor, "p 3"],
     T_ji: Float[Tensor, "e 4 4"],
     inverse_depth: Float[Tensor, "e p"],
-) -> tuple[Float[Tensor, "e p 2"], Bool[Tensor, "e p"]]:
-    """Pixels of the cells in the targets, and whether they lie in front of them."""
-    x, valid, _ = _normalised(rays, T_ji, inverse_depth)
-    return _to_pixels(lens, x), valid
+) -> Projection:
+    """Pixels of the cells in the targets."""
+    y, valid, z = seen_from_targets(rays, T_ji, inverse_depth)
+    return Projection(_to_pixels(lens, y[..., :2] / z[..., None]), valid, z)
 
 
 def linearise_lens(
@@ -94,19 +91,18 @@ def linearise_lens(
     inverse_depth: Float[Tensor, "e p"],
 ) -> LensProjection:
     """:func:`project_lens` with the Jacobians in a left perturbation of T_ji, in d and the lens."""
-    (x, valid, z), c = _normalised(rays.rays, T_ji, inverse_depth), lens.camera
-    u, v, q = x[..., 0], x[..., 1], 1 / z
-    dq, o = inverse_depth * q, torch.zeros_like(q)
-    row_x = [dq, o, -u * dq, -u * v, 1 + u * u, -v]
-    row_y = [o, dq, -v * dq, -1 - v * v, u * v, u]
+    y, valid, z = seen_from_targets(rays.rays, T_ji, inverse_depth)
+    x, c, q = y[..., :2] / z[..., None], lens.camera, 1 / z
+    u, v = x.unbind(-1)
     R, t = T_ji[:, :3, :3].to(inverse_depth), T_ji[:, :3, 3].to(inverse_depth)
     tx, ty, tz = t[:, None].unbind(-1)
     # A change of the lens moves the ray by a factor of (x, y, 0).
     ray = (rays.rays[:, :2] @ R[:, :, :2].mT).unbind(-1)
     along_x, along_y = (ray[0] - ray[2] * u) * q, (ray[1] - ray[2] * v) * q
-    row_x += [along_x * rays.slope[0], along_x * rays.slope[1], (tx - tz * u) * q]
-    row_y += [along_y * rays.slope[0], along_y * rays.slope[1], (ty - tz * v) * q]
-    J = torch.stack([torch.stack(row_x, 1), torch.stack(row_y, 1)], 2)
+    row_x = [along_x * rays.slope[0], along_x * rays.slope[1], (tx - tz * u) * q]
+    row_y = [along_y * rays.slope[0], along_y * rays.slope[1], (ty - tz * v) * q]
+    others = torch.stack([torch.stack(row_x, 1), torch.stack(row_y, 1)], 2)
+    J = torch.cat([torch.stack(motion_rows(u, v, inverse_depth * q), 2), others], 1)
     square = u * u + v * v
     if lens.k1:
         point = x.mT[:, None]
@@ -117,17 +113,7 @@ def linearise_lens(
     centred = (pixels - pixels.new_tensor([c.cx, c.cy])).mT
     bulge = (x * pixels.new_tensor([c.fx, c.fy])).mT * square[:, None]
     jacobian = torch.cat([J[:, :6], (J[:, 6] + centred)[:, None], (J[:, 7] + bulge)[:, None]], 1)
-    return LensProjection(pixels, valid, jacobian, J[:, 8])
-
-
-def _normalised(
-    rays: Float[Tensor, "p 3"], T_ji: Float[Tensor, "e 4 4"], inverse_depth: Float[Tensor, "e p"]
-) -> tuple[Float[Tensor, "e p 2"], Bool[Tensor, "e p"], Float[Tensor, "e p"]]:
-    """x/z and y/z in the target, whether in front of it, and z, held at ``MIN_Z`` at least."""
-    R, t = T_ji[:, :3, :3].to(inverse_depth), T_ji[:, :3, 3].to(inverse_depth)
-    y = rays @ R.mT + inverse_depth[..., None] * t[:, None]
-    z = y[..., 2].clamp(min=MIN_Z)
-    return y[..., :2] / z[..., None], y[..., 2] > MIN_Z, z
+    return LensProjection(pixels, valid, z, jacobian, J[:, 8])
 
 
 def _to_pixels(lens: Lens, x: Float[Tensor, "e p 2"]) -> Float[Tensor, "e p 2"]:

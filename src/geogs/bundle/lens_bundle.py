@@ -6,21 +6,23 @@ in float64. The first pose is fixed; the scale, which nothing measures, is held 
 it, so that nothing else resists the lens.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
-from geogs.bundle.dense import BundleProblem, move, relative_motion, robust_weight
-from geogs.bundle.lens import (
-    UNKNOWNS,
-    Lens,
-    lens_rays,
-    linearise_lens,
-    project_lens,
+from geogs.bundle.lens import UNKNOWNS, Lens, LensRays, lens_rays, linearise_lens, project_lens
+from geogs.bundle.linearise import (
+    EliminatedDepth,
+    Star,
+    damped_curvature,
+    edge_residual,
+    weighed_residuals,
 )
-from geogs.geometry.lie import se3_adjoint, se3_inverse
+from geogs.bundle.problem import BundleProblem, sources_within
+from geogs.bundle.projection import relative_motion
+from geogs.geometry.lie import move, se3_adjoint, se3_inverse
 
 
 @dataclass(frozen=True)
@@ -66,24 +68,6 @@ class LensBundleResult:
     finite: bool
 
 
-@dataclass(frozen=True)
-class _Star:
-    """A source frame with its edges; its inverse depths eliminated."""
-
-    poses: Tensor
-    """(k + 1,): the targets and the frame itself."""
-    hessian: Tensor
-    """Over (their poses, lens), float64, depths eliminated."""
-    diagonal: Tensor
-    """Of the same with the depths fixed."""
-    gradient: Tensor
-    coupling: Tensor
-    """Rows over (poses, lens), columns over cells."""
-    curvature: Tensor
-    depth_gradient: Tensor
-    information: Tensor
-
-
 def solve_lens(
     problem: BundleProblem,
     lens: Lens,
@@ -101,36 +85,32 @@ def solve_lens(
     T, d = problem.T_cw, problem.inverse_depth
     damping, finite = options.damping, True
     cost = robust_cost(problem, lens, pixels, T, d, options.huber)
-    stars: list[_Star] = []
-    is_fresh = False
+    system = _System.of(problem, lens, pixels, T, d, options)
     for _ in range(options.iterations):
-        if not is_fresh:
-            stars = _stars(problem, lens, pixels, T, d, options)
-        step = _step(problem, stars, T, options, damping)
+        step = system.step(damping)
         if step is None:
             finite = False
             break
         moved_lens = lens.moved(float(step[-2]), float(step[-1]))
         xi = step[:-UNKNOWNS].reshape(-1, 6)
         moved_T = torch.where(problem.free_pose[:, None, None], move(xi, T), T)
-        moved_d = _moved_depth(stars, step, d, options)
+        moved_d = system.moved_depth(step, d, options)
         moved_cost = robust_cost(problem, moved_lens, pixels, moved_T, moved_d, options.huber)
-        is_fresh = not moved_cost < cost
-        if is_fresh:
+        if not moved_cost < cost:
             damping = max(damping, 1e-6) * 10
             if damping > 1e3:
                 break
             continue
         done = cost - moved_cost < options.least_decrease * cost
         lens, T, d, cost = moved_lens, moved_T, moved_d, moved_cost
+        system = _System.of(problem, lens, pixels, T, d, options)
         damping = damping / 10
         if done:
             break
-    stars = _stars(problem, lens, pixels, T, d, options)
     information = torch.zeros_like(d)
-    for star in stars:
-        information[star.poses[-1]] = star.information
-    covariance = _covariance(problem, stars, T, options)
+    for star in system.stars:
+        information[star.frame] = star.information
+    covariance = system.covariance(options.free)
     finite = finite and bool(torch.isfinite(covariance).all())
     return LensBundleResult(lens, T, d, information, cost, covariance, finite)
 
@@ -149,9 +129,9 @@ def robust_cost(
     """
     rays = lens_rays(lens, pixels).rays
     T_ji = relative_motion(T_cw, problem.source, problem.target)
-    at, valid = project_lens(lens, rays, T_ji, inverse_depth[problem.source])
-    norm = (problem.weight * (problem.pixels - at).square()).sum(-1).sqrt()
-    norm = torch.where(valid, norm, torch.full_like(norm, 10 * huber))
+    at = project_lens(lens, rays, T_ji, inverse_depth[problem.source])
+    norm = (problem.weight * (problem.pixels - at.pixels).square()).sum(-1).sqrt()
+    norm = torch.where(at.valid, norm, torch.full_like(norm, 10 * huber))
     cost = torch.where(norm < huber, norm.square(), 2 * huber * norm - huber**2)
     matched = problem.weight[..., 0] > 0
     return (
@@ -161,167 +141,142 @@ def robust_cost(
     )
 
 
-def _stars(
-    problem: BundleProblem,
-    lens: Lens,
-    pixels: Tensor,
-    T: Tensor,
-    d: Tensor,
-    options: LensBundleOptions,
-) -> list[_Star]:
-    rays = lens_rays(lens, pixels)
-    frames, counts = torch.unique_consecutive(problem.source, return_counts=True)
-    ends = counts.cumsum(0).tolist()
-    stars = []
-    for frame, start, end in zip(frames.tolist(), [0, *ends], ends, strict=False):
-        e = slice(start, end)
-        T_ji = relative_motion(T, problem.source[e], problem.target[e])
-        p = linearise_lens(lens, rays, T_ji, d[frame].expand(end - start, -1))
-        r = problem.pixels[e] - p.pixels
-        w = robust_weight(r, problem.weight[e] * p.valid[..., None], options.huber).mT[:, None]
-        stars.append(
-            _star(problem.target[e], frame, T_ji, p.jacobian, p.depth_jacobian, r, w, options)
+@dataclass(frozen=True)
+class _System:
+    """The problem linearised at one state, over all poses, then the lens."""
+
+    stars: list[Star]
+    hessian: Float[Tensor, "v v"]
+    """Depths eliminated, the scale held; float64."""
+    gradient: Float[Tensor, "v"]
+    free: Int[Tensor, "f"]
+    """Which of its rows may move."""
+
+    @staticmethod
+    def of(
+        problem: BundleProblem,
+        lens: Lens,
+        pixels: Float[Tensor, "p 2"],
+        T: Float[Tensor, "n 4 4"],
+        d: Float[Tensor, "n p"],
+        options: LensBundleOptions,
+    ) -> "_System":
+        """Sum the stars of all sources up."""
+        rays, n = lens_rays(lens, pixels), len(T)
+        size = 6 * n + UNKNOWNS
+        H = torch.zeros(size, size, dtype=torch.float64)
+        diagonal, g = H.new_zeros(size), H.new_zeros(size)
+        stars = []
+        for frame, e in sources_within(problem.source):
+            star, curvature = _star(problem, lens, rays, T, d, frame, e, options)
+            rows = _rows(star, n)
+            hessian, gradient = star.chained()
+            H[rows[:, None], rows] += hessian
+            diagonal[rows] += curvature
+            g[rows] += gradient
+            stars.append(star)
+        centre = se3_inverse(T[0])[:3, 3]
+        away = (T[:, :3, :3] @ centre + T[:, :3, 3]).double().cpu()
+        scale = torch.cat([torch.cat([away, 0 * away], 1).reshape(-1), H.new_zeros(UNKNOWNS)])
+        scale = scale / scale.norm().clamp(min=1e-12)
+        H = H + diagonal.mean() * scale[:, None] * scale
+        free = torch.zeros(size, dtype=torch.bool)
+        free[: 6 * n] = problem.free_pose.cpu().repeat_interleave(6)
+        free[[6 * n + u for u in options.free]] = True
+        return _System(stars, H, g, torch.nonzero(free)[:, 0])
+
+    def step(self, damping: float) -> Float[Tensor, "v"] | None:
+        """The damped step of all unknowns; None where it cannot be had."""
+        H, g, free = self.hessian, self.gradient, self.free
+        system = H[free[:, None], free] + torch.diag(damping * H.diagonal()[free].abs() + 1e-6)
+        factor, info = torch.linalg.cholesky_ex(system)
+        step = torch.zeros_like(g)
+        if int(info):
+            return None
+        step[free] = torch.cholesky_solve(g[free, None], factor)[:, 0]
+        step[-UNKNOWNS:] = step[-UNKNOWNS:].clamp(-0.3, 0.3)
+        return step if bool(torch.isfinite(step).all()) else None
+
+    def moved_depth(
+        self, step: Float[Tensor, "v"], d: Float[Tensor, "n p"], options: LensBundleOptions
+    ) -> Float[Tensor, "n p"]:
+        """Inverse depths after a step of everything."""
+        out = d.clone()
+        for star in self.stars:
+            depth = star.depth
+            assert depth is not None
+            coupling = star.chain.mT.to(depth.coupling) @ depth.coupling
+            out[star.frame] += replace(depth, coupling=coupling).step(step[_rows(star, len(d))])
+        return out.clamp(options.min_inverse_depth, options.max_inverse_depth)
+
+    def covariance(self, chosen: list[int]) -> Float[Tensor, "2 2"]:
+        """Of the chosen unknowns of the lens, see :func:`solve_lens`."""
+        H, free = self.hessian, self.free
+        out = H.new_zeros(UNKNOWNS, UNKNOWNS)
+        if not chosen or len(self.stars) < 2:
+            return out
+        system = H[free[:, None], free]
+        unit = H.new_zeros(len(free), len(chosen))
+        unit[-len(chosen) :] = torch.eye(len(chosen), dtype=H.dtype)
+        rows, info = torch.linalg.solve_ex(
+            system + 1e-9 * torch.diag(system.diagonal().abs()), unit
         )
-    return stars
+        if int(info):
+            return out + torch.nan
+        pull = H.new_zeros(len(H), len(chosen))
+        pull[free] = rows
+        n = (len(H) - UNKNOWNS) // 6
+        each = torch.stack([pull[_rows(s, n)].mT @ (s.chain.mT @ s.gradient) for s in self.stars])
+        each = each - each.mean(0)
+        index = torch.tensor(chosen)
+        share = len(self.stars) / (len(self.stars) - 1) * each.mT @ each
+        out[index[:, None], index] = share
+        return out
 
 
 def _star(
-    targets: Tensor,
+    problem: BundleProblem,
+    lens: Lens,
+    rays: LensRays,
+    T: Float[Tensor, "n 4 4"],
+    d: Float[Tensor, "n p"],
     frame: int,
-    T_ji: Tensor,
-    J: Float[Tensor, "k 8 2 p"],
-    Jd: Float[Tensor, "k 2 p"],
-    r: Float[Tensor, "k p 2"],
-    w: Float[Tensor, "k 1 2 p"],
+    e: slice,
     options: LensBundleOptions,
-) -> _Star:
-    k, p = len(targets), J.shape[-1]
+) -> tuple[Star, Float[Tensor, "c"]]:
+    """A source with its edges, and the diagonal of its chained equations with depths fixed."""
+    targets, k = problem.target[e], e.stop - e.start
+    T_ji = relative_motion(T, problem.source[e], targets)
+    p = linearise_lens(lens, rays, T_ji, d[frame].expand(k, -1))
+    r, weight = weighed_residuals(p, problem.pixels[e], problem.weight[e], options.huber)
+    w, J, Jd = weight.mT[:, None], p.jacobian, p.depth_jacobian
     wJ = J * w
     H = (wJ.flatten(2) @ J.flatten(2).mT).double().cpu()
     v = (wJ * r.mT[:, None]).sum((2, 3)).double().cpu()
     E = (wJ * Jd[:, None]).sum(2)
     wd = Jd * w[:, 0]
     information, b = (wd * Jd).sum((0, 1)), (wd * r.mT).sum((0, 1))
-    curvature = information + options.depth_damping * information.mean() + 1e-8
-    # Relative motions of the edges, then the lens that they share; xi_rel = xi_j - Ad xi_i.
-    hessian = torch.zeros(6 * k + UNKNOWNS, 6 * k + UNKNOWNS, dtype=torch.float64)
-    hessian[: 6 * k, : 6 * k] = torch.block_diag(*H[:, :6, :6])
-    hessian[: 6 * k, 6 * k :] = H[:, :6, 6:].reshape(6 * k, UNKNOWNS)
-    hessian[6 * k :, : 6 * k] = hessian[: 6 * k, 6 * k :].mT
-    hessian[6 * k :, 6 * k :] = H[:, 6:, 6:].sum(0)
+    # Relative motions of the edges, then the lens that they share.
+    at = 6 * k
+    hessian = torch.zeros(at + UNKNOWNS, at + UNKNOWNS, dtype=torch.float64)
+    hessian[:at, :at] = torch.block_diag(*H[:, :6, :6])
+    hessian[:at, at:] = H[:, :6, 6:].reshape(at, UNKNOWNS)
+    hessian[at:, :at] = hessian[:at, at:].mT
+    hessian[at:, at:] = H[:, 6:, 6:].sum(0)
     gradient = torch.cat([v[:, :6].reshape(-1), v[:, 6:].sum(0)])
-    coupling = torch.cat([E[:, :6].reshape(6 * k, p), E[:, 6:].sum(0)])
-    chain = _chain(se3_adjoint(T_ji))
-    full = chain.mT @ hessian @ chain
-    reduced = hessian - ((coupling / curvature) @ coupling.mT).double().cpu()
-    gradient = gradient - (coupling @ (b / curvature)).double().cpu()
-    return _Star(
-        torch.cat([targets, targets.new_tensor([frame])]),
-        chain.mT @ reduced @ chain,
-        full.diagonal(),
-        chain.mT @ gradient,
-        chain.mT.to(coupling) @ coupling,
-        curvature,
+    depth = EliminatedDepth(
+        torch.cat([E[:, :6].flatten(0, 1), E[:, 6:].sum(0)]),
+        damped_curvature(information, options.depth_damping),
         b,
-        information,
     )
+    residual, adjoint = edge_residual(r, weight), se3_adjoint(T_ji)
+    star = Star(
+        frame, targets, adjoint, *depth.reduce(hessian, gradient), information, residual, depth
+    )
+    return star, (star.chain.mT @ hessian @ star.chain).diagonal()
 
 
-def _chain(adjoint: Float[Tensor, "k 6 6"]) -> Float[Tensor, "a b"]:
-    """From (poses of the targets, pose of the source, lens) to (relative motions, lens)."""
-    k = len(adjoint)
-    eye = torch.eye(6 * k, dtype=torch.float64)
-    poses = torch.cat([eye, -adjoint.double().cpu().reshape(6 * k, 6)], 1)
-    return torch.block_diag(poses, torch.eye(UNKNOWNS, dtype=torch.float64))
-
-
-def _rows(star: _Star, frames: int) -> Tensor:
-    """Where a star's variables stand among those of all ``frames`` and the lens."""
-    poses = (6 * star.poses[:, None].cpu() + torch.arange(6)).reshape(-1)
+def _rows(star: Star, frames: int) -> Int[Tensor, "c"]:
+    """Where a star's unknowns stand among the poses of all ``frames`` and the lens."""
+    poses = (6 * star.poses[:, None] + torch.arange(6)).reshape(-1)
     return torch.cat([poses, 6 * frames + torch.arange(UNKNOWNS)])
-
-
-def _free(problem: BundleProblem, options: LensBundleOptions) -> Tensor:
-    """Indices of the variables that may move."""
-    lens = torch.zeros(UNKNOWNS, dtype=torch.bool)
-    lens[options.free] = True
-    free = torch.cat([problem.free_pose.cpu().repeat_interleave(6), lens])
-    return torch.nonzero(free)[:, 0]
-
-
-def _system(
-    problem: BundleProblem, stars: list[_Star], T: Tensor
-) -> tuple[Float[Tensor, "v v"], Float[Tensor, "v"], Float[Tensor, "v"]]:
-    """Reduced Hessian with the scale held, its diagonal with fixed depths, and gradient."""
-    n = len(problem.T_cw)
-    size = 6 * n + UNKNOWNS
-    H = torch.zeros(size, size, dtype=torch.float64)
-    diagonal, g = H.new_zeros(size), H.new_zeros(size)
-    for star in stars:
-        rows = _rows(star, n)
-        H[rows[:, None], rows] += star.hessian
-        diagonal[rows] += star.diagonal
-        g[rows] += star.gradient
-    centre = se3_inverse(T[0])[:3, 3]
-    away = (T[:, :3, :3] @ centre + T[:, :3, 3]).double().cpu()
-    scale = torch.cat([torch.cat([away, 0 * away], 1).reshape(-1), H.new_zeros(UNKNOWNS)])
-    scale = scale / scale.norm().clamp(min=1e-12)
-    H = H + diagonal.mean() * scale[:, None] * scale
-    return H, diagonal, g
-
-
-def _step(
-    problem: BundleProblem,
-    stars: list[_Star],
-    T: Tensor,
-    options: LensBundleOptions,
-    damping: float,
-) -> Float[Tensor, "v"] | None:
-    """The damped step of all variables; None where it cannot be had."""
-    H, _, g = _system(problem, stars, T)
-    free = _free(problem, options)
-    system = H[free[:, None], free] + torch.diag(damping * H.diagonal()[free].abs() + 1e-6)
-    factor, info = torch.linalg.cholesky_ex(system)
-    step = torch.zeros_like(g)
-    if int(info):
-        return None
-    step[free] = torch.cholesky_solve(g[free, None], factor)[:, 0]
-    step[-UNKNOWNS:] = step[-UNKNOWNS:].clamp(-0.3, 0.3)
-    return step if bool(torch.isfinite(step).all()) else None
-
-
-def _moved_depth(
-    stars: list[_Star], step: Tensor, d: Tensor, options: LensBundleOptions
-) -> Float[Tensor, "n p"]:
-    """Back-substitution: (b - E^T step) / C of every star."""
-    out = d.clone()
-    n = (len(step) - UNKNOWNS) // 6
-    for star in stars:
-        moved = star.coupling.mT @ step[_rows(star, n)].to(d)
-        out[star.poses[-1]] += (star.depth_gradient - moved) / star.curvature
-    return out.clamp(options.min_inverse_depth, options.max_inverse_depth)
-
-
-def _covariance(
-    problem: BundleProblem, stars: list[_Star], T: Tensor, options: LensBundleOptions
-) -> Float[Tensor, "2 2"]:
-    H, _, _ = _system(problem, stars, T)
-    out = H.new_zeros(UNKNOWNS, UNKNOWNS)
-    free, chosen = _free(problem, options), options.free
-    if not chosen or len(stars) < 2:
-        return out
-    system = H[free[:, None], free]
-    unit = H.new_zeros(len(free), len(chosen))
-    unit[-len(chosen) :] = torch.eye(len(chosen), dtype=H.dtype)
-    rows, info = torch.linalg.solve_ex(system + 1e-9 * torch.diag(system.diagonal().abs()), unit)
-    if int(info):
-        return out + torch.nan
-    pull = H.new_zeros(len(H), len(chosen))
-    pull[free] = rows
-    n = len(problem.T_cw)
-    each = torch.stack([pull[_rows(star, n)].mT @ star.gradient for star in stars])
-    each = each - each.mean(0)
-    share = len(stars) / (len(stars) - 1) * each.mT @ each
-    index = torch.tensor(chosen)
-    out[index[:, None], index] = share
-    return out

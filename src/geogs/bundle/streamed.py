@@ -6,64 +6,24 @@ edges are projected a second time for the steps of the inverse depths.
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TypeVar
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
+from geogs.bundle.base import BundleOptions, BundleResult
 from geogs.bundle.camera_system import SparseCameraSystem
-from geogs.bundle.dense import (
-    BundleOptions,
-    BundleProblem,
-    BundleResult,
-    Star,
-    damped_curvature,
-    linearise,
-    linearise_stars,
-    move,
-    relative_motion,
-    robust_weight,
-    source_chunks,
-    sources_within,
-)
+from geogs.bundle.dense import stepped
+from geogs.bundle.linearise import Star, damped_curvature, linearise_stars, weighed_residuals
+from geogs.bundle.problem import StreamedProblem, source_chunks, sources_within
+from geogs.bundle.projection import linearise, relative_motion
 from geogs.geometry.lie import se3_adjoint
 from geogs.keyframes.grid import SampleGrid
 from geogs.threads import thread_map, worker_count
 
-T = TypeVar("T")
-
-Matches = Callable[[slice], tuple[Float[Tensor, "e p 2"], Float[Tensor, "e p 2"]]]
-"""Measured positions and their inverse variances for a slice of edges; asked from threads."""
-
-
-@dataclass(frozen=True)
-class StreamedProblem:
-    """As ``BundleProblem``, on the CPU, with the matches fetched when they are needed."""
-
-    T_cw: Float[Tensor, "n 4 4"]
-    inverse_depth: Float[Tensor, "n p"]
-    source: Int[Tensor, "e"]
-    target: Int[Tensor, "e"]
-    matches: Matches
-    free_pose: Bool[Tensor, "n"]
-    free_depth: Bool[Tensor, "n"]
-    damping: Float[Tensor, "n p"] | None = None
-
-    def part(self, edges: slice) -> BundleProblem:
-        """The same frames with some of the edges."""
-        pixels, weight = self.matches(edges)
-        return BundleProblem(
-            self.T_cw, self.inverse_depth, self.source[edges], self.target[edges], pixels, weight,
-            self.free_pose, self.free_depth, self.damping,
-        )  # fmt: skip
-
-
-@dataclass(frozen=True)
-class _State:
-    T_cw: Float[Tensor, "n 4 4"]
-    inverse_depth: Float[Tensor, "n p"]
+R = TypeVar("R")
 
 
 class StreamedBundle:
@@ -78,41 +38,39 @@ class StreamedBundle:
         A step that is not finite is not taken and ``finite`` is False in the result.
         """
         options = options or BundleOptions()
-        state = _State(problem.T_cw, problem.inverse_depth)
-        information = torch.zeros_like(problem.inverse_depth)
-        residual = problem.inverse_depth.new_zeros(len(problem.source))
+        T, d = problem.T_cw, problem.inverse_depth
+        information = torch.zeros_like(d)
+        residual = d.new_zeros(len(problem.source))
+        finite = True
         system = SparseCameraSystem(problem.source, problem.target, problem.free_pose)
         chunks = source_chunks(problem.source, options.chunk)
         for _ in range(options.iterations):
             system.clear()
-            for chunk, stars in self._linearised(problem, state, options, chunks):
+            for chunk, stars in self._linearised(problem, T, d, options, chunks):
                 system.add(stars)
                 residual[chunk] = torch.cat([star.residual for star in stars])
                 for star in stars:
                     information[star.frame] = star.information
             xi = system.solve(options.damping)
-            delta = self._depth_steps(problem, state, xi, options, chunks)
+            delta = self._depth_steps(problem, T, d, xi, options, chunks)
             if not bool(torch.isfinite(xi).all() and torch.isfinite(delta).all()):
-                return BundleResult(
-                    state.T_cw, state.inverse_depth, information, residual, finite=False
-                )
-            state = _moved(problem, state, xi, delta, options)
+                finite = False
+                break
+            T, d = stepped(problem, T, d, xi, delta, options)
             if float(xi.abs().max()) < options.tolerance:
                 break
-        return BundleResult(state.T_cw, state.inverse_depth, information, residual, finite=True)
+        return BundleResult(T, d, information, residual, finite)
 
     def _linearised(
         self,
         problem: StreamedProblem,
-        state: _State,
+        T: Float[Tensor, "n 4 4"],
+        d: Float[Tensor, "n p"],
         options: BundleOptions,
         chunks: Sequence[slice],
     ) -> Iterator[tuple[slice, list[Star]]]:
         def work(chunk: slice) -> tuple[slice, list[Star]]:
-            part = problem.part(chunk)
-            stars = linearise_stars(
-                self.grid, part, state.T_cw, state.inverse_depth, options, slice(None)
-            )
+            stars = linearise_stars(self.grid, problem.part(chunk), T, d, options)
             # The coupling with the depths is most of a star; it is not needed again.
             return chunk, [replace(star, depth=None) for star in stars]
 
@@ -121,7 +79,8 @@ class StreamedBundle:
     def _depth_steps(
         self,
         problem: StreamedProblem,
-        state: _State,
+        T: Float[Tensor, "n 4 4"],
+        d: Float[Tensor, "n p"],
         xi: Float[Tensor, "n 6"],
         options: BundleOptions,
         chunks: Sequence[slice],
@@ -131,45 +90,30 @@ class StreamedBundle:
         def work(chunk: slice) -> list[tuple[int, Tensor]]:
             part = problem.part(chunk)
             i, j = part.source, part.target
-            T_ji = relative_motion(state.T_cw, i, j)
-            p = linearise(self.grid.camera, self.grid.rays, T_ji, state.inverse_depth[i])
-            r = part.pixels - p.pixels
-            w = robust_weight(r, part.weight * p.valid[..., None], options.huber)
+            T_ji = relative_motion(T, i, j)
+            p = linearise(self.grid.camera, self.grid.rays, T_ji, d[i])
+            r, w = weighed_residuals(p, part.pixels, part.weight, options.huber)
             relative = (xi[j] - (se3_adjoint(T_ji) @ xi[i][..., None])[..., 0]).to(r)
             moved = (p.pose_jacobian * relative[:, :, None, None]).sum(1).mT
             curvature = (w * p.depth_jacobian.square()).sum(-1)
             gradient = (w * p.depth_jacobian * (r - moved)).sum(-1)
-            return [
-                (
-                    frame,
-                    gradient[e].sum(0)
-                    / damped_curvature(part, frame, curvature[e].sum(0), options),
-                )
-                for frame, e in sources_within(i)
-                if bool(part.free_depth[frame])
-            ]
+            steps = []
+            for frame, e in sources_within(i):
+                if bool(part.free_depth[frame]):
+                    c, extra = curvature[e].sum(0), part.damping_of(frame)
+                    damped = damped_curvature(c, options.depth_damping, extra)
+                    steps.append((frame, gradient[e].sum(0) / damped))
+            return steps
 
-        delta = torch.zeros_like(state.inverse_depth)
+        delta = torch.zeros_like(d)
         for steps in _few_at_a_time(work, chunks):
             for frame, step in steps:
                 delta[frame] = step
         return delta
 
 
-def _few_at_a_time(work: Callable[[slice], T], chunks: Sequence[slice]) -> Iterator[T]:
+def _few_at_a_time(work: Callable[[slice], R], chunks: Sequence[slice]) -> Iterator[R]:
     """Results in order, worked on side by side, a few of them held at a time."""
     group = 8 * worker_count()
     for start in range(0, len(chunks), group):
         yield from thread_map(work, chunks[start : start + group])
-
-
-def _moved(
-    problem: StreamedProblem,
-    state: _State,
-    xi: Float[Tensor, "n 6"],
-    delta: Float[Tensor, "n p"],
-    options: BundleOptions,
-) -> _State:
-    T = torch.where(problem.free_pose[:, None, None], move(xi, state.T_cw), state.T_cw)
-    d = (state.inverse_depth + delta).clamp(options.min_inverse_depth, options.max_inverse_depth)
-    return _State(T, torch.where(problem.free_depth[:, None], d, problem.inverse_depth))

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from geogs.application.reconstruct_checkpoint import ReconstructCheckpoint
     from geogs.application.snapshots import Snapshots
     from geogs.io.sources.posed.base import PosedSource
-    from geogs.reconstruct import Reconstruction, ReconstructionState
+    from geogs.reconstruction import Reconstruction, ReconstructionState
 
 _SECONDS = {"": 1.0, "s": 1.0, "m": 60.0, "min": 60.0, "h": 3600.0}
 # What is left of a budget at least, when reading and checking have used it up.
@@ -84,7 +84,7 @@ def reconstruct(options: ReconstructOptions) -> Path:
     from geogs.io.sources.posed.check import check_poses
     from geogs.io.sources.posed.sniff import open_posed_source
     from geogs.io.writers.atomic import prepare_output_folder
-    from geogs.reconstruct import Reconstruction
+    from geogs.reconstruction import Reconstruction
 
     torch.set_num_threads(1)  # the kernels have threads of their own; see geogs.threads
     device = require_device(options.device)

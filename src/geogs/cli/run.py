@@ -2,7 +2,7 @@
 
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, get_args
@@ -13,6 +13,7 @@ from geogs.application.calibrate import self_calibrated
 from geogs.application.interrupt import Interruption
 from geogs.application.priors import open_prior
 from geogs.application.progress import RunProgress
+from geogs.application.settings import RunSettings
 from geogs.cli.options import SHORT, given, parse_options
 from geogs.config import Config, Preset, preset
 
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class RunOptions(Config):
+class RunOptions(RunSettings):
     """Reconstruct a video, a folder of images, or a Replica, TUM RGB-D or 7-Scenes sequence.
 
     Every default works: ``geogs run video.mp4``. Intrinsics: ``--intrinsics fx,fy,cx,cy``.
@@ -33,22 +34,16 @@ class RunOptions(Config):
     """
 
     source: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
-    """Video file or folder; several of one place, by one camera, make one map."""
-    output: Path | None = None
-    """Folder for the results (also -o); out/NAME if none is given."""
+    config: Annotated[Config, tyro.conf.arg(name="")] = field(default_factory=Config)
     preset: Preset = "default"
     """Group of settings; single ones given beside it win."""
-    device: str = "auto"
-    """Where to compute: auto (a GPU where there is one), cpu, cuda or cuda:1; see geogs doctor."""
     resume: Path | None = None
     """Go on with the run that was interrupted or killed in this folder, with its source and its
     settings; only --device and --checkpoint-every may be given beside it."""
-    checkpoint_every: float = 60.0
-    """Seconds between two checkpoints, from which --resume goes on; 0 makes none."""
-    online_results: bool = False
-    """Also write trajectory and mesh as they are before the final stages, to online/."""
-    depth_mesh: bool = False
-    """Also fuse the keyframes' depths without the disks, to depth_fusion/mesh.ply."""
+
+    def settings(self) -> RunSettings:
+        """The record of the run."""
+        return RunSettings(**{f.name: getattr(self, f.name) for f in fields(RunSettings)})
 
 
 def main(argv: Sequence[str]) -> int:
@@ -79,19 +74,20 @@ def run(options: RunOptions) -> Path:
     if saved is not None:
         options = _resumed(options, saved.facts)
     device = require_device(options.device)
-    opened = open_sources(options.source, options.input)
+    config = options.config
+    opened = open_sources(options.source, config.input)
     output = prepare_output_folder(options.output or Path("out") / opened.name)
     if device.type == "cuda":
         prepare_kernels(Path(geogs.__file__).parent, device)
-    calibrate = partial(self_calibrated, options=options, device=device)
+    calibrate = partial(self_calibrated, options=config, device=device)
     source = (calibrate if saved is None else saved.calibrated)(opened)
     found = None if source is opened else source.calibration
-    prior = open_prior(options.prior, source.camera, device)
-    slam = Slam(source.camera, options, str(device), prior)
+    prior = open_prior(config.prior, source.camera, device)
+    slam = Slam(source.camera, config, str(device), prior)
     if saved is not None:
         saved.restore(slam)
     progress = RunProgress(source.length, begun=slam.frames)
-    facts = RunFacts(_absolute(options), device.type, source.fingerprint(), found)
+    facts = RunFacts(options.settings().absolute(), device.type, source.fingerprint(), found)
     checkpoint = RunCheckpoint(output, facts, options.checkpoint_every, progress)
     with full_memory_in_a_sentence(), Interruption() as stop, progress:
         if saved is not None:
@@ -112,11 +108,11 @@ def run(options: RunOptions) -> Path:
         if not interrupted:
             kept = checkpoint.write(slam, source)
         if options.online_results:
-            write_online_results(output, slam, options.mesh, progress)
+            write_online_results(output, slam, config.mesh, progress)
         interrupted |= not _finish(slam, progress, stop, correct=not interrupted)
-        more = [lambda: write_depth_mesh(output, slam, options.mesh, progress)]
+        more = [lambda: write_depth_mesh(output, slam, config.mesh, progress)]
         write_results(
-            output, slam, SourceFacts.of(source), options, interrupted, progress,
+            output, slam, SourceFacts.of(source), config, interrupted, progress,
             more if options.depth_mesh else (),
         )  # fmt: skip
     if full:
@@ -142,35 +138,17 @@ def _resumed(options: RunOptions, facts: "RunFacts") -> RunOptions:
             "--resume goes on with the source and the settings of the run; leave out everything "
             "else but --device and --checkpoint-every."
         )
-    device = facts.options.device
+    began = facts.settings
+    device = began.device
     if options.device != "auto":
         device = options.device
     elif not device.startswith(facts.device):  # what auto was found to be
         device = facts.device
     if not device.startswith(facts.device):
         raise InputError(f"The run was on {facts.device}, and can only go on there.")
-    every = options.checkpoint_every
-    return replace(facts.options, output=options.resume, device=device, checkpoint_every=every)
-
-
-def _absolute(options: RunOptions) -> RunOptions:
-    """With paths that hold wherever the run is resumed from."""
-
-    def file(name: str) -> str:
-        return str(Path(name).absolute()) if name and Path(name).is_file() else name
-
-    p = options.prior
     return replace(
-        options,
-        source=tuple(path.expanduser().absolute() for path in options.source),
-        output=None,
-        resume=None,
-        input=replace(options.input, intrinsics=file(options.input.intrinsics)),
-        tracking=replace(options.tracking, weights=file(options.tracking.weights)),
-        prior=replace(
-            p, model=file(p.model), card=file(p.card), normal_model=file(p.normal_model),
-            normal_card=file(p.normal_card),
-        ),
+        options, source=began.source, config=began.config, output=options.resume, device=device,
+        online_results=began.online_results, depth_mesh=began.depth_mesh,
     )  # fmt: skip
 
 
@@ -238,9 +216,7 @@ def parse(argv: Sequence[str]) -> RunOptions:
 
 
 def _defaults(name: Preset) -> RunOptions:
-    base = preset(name)
-    settings = {f.name: getattr(base, f.name) for f in fields(base)}
-    return RunOptions(**settings, source=tyro.MISSING, preset=name)
+    return RunOptions(source=tyro.MISSING, config=preset(name), preset=name)
 
 
 def _preset_name(arguments: Sequence[str]) -> Preset:

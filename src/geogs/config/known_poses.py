@@ -70,6 +70,9 @@ class ReconstructConfig:
 
     seed: int = 0
     """Random seed; same seed, same machine and no time limit, same result on the CPU."""
+    resident_keyframes: int = 128
+    """Keyframes whose images, depths and the like stay in memory or on the GPU, those used last;
+    others wait in a temporary file. More than the window that is mapped and its history."""
     input: InputConfig = field(default_factory=InputConfig)
     search: SearchConfig = field(default_factory=SearchConfig)
     mapping: MappingConfig = field(default_factory=known_pose_mapping)

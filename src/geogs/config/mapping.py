@@ -86,9 +86,6 @@ class MappingConfig:
     """Recent keyframes that are trained together."""
     history: int = 2
     """Older keyframes drawn at random into each window."""
-    resident_views: int = 128
-    """Keyframes whose images and depths stay in memory, those used last; others wait in a temporary
-    file. More than the window and its history."""
     iterations: int = 8
     """Steps per keyframe."""
     views_per_step: int = 2

@@ -20,6 +20,9 @@ class Config:
 
     seed: int = 0
     """Random seed; same seed, same machine, same result on the CPU."""
+    resident_keyframes: int = 128
+    """Keyframes whose images, depths and the like stay in memory or on the GPU, those used last;
+    others wait in a temporary file. More than the window that is mapped and its history."""
     input: InputConfig = field(default_factory=InputConfig)
     calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)

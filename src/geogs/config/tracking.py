@@ -53,9 +53,6 @@ class TrackingConfig:
     """A keyframe that an image was recognised as counts if this fraction of it finds a match."""
     patience: int = 15
     """Frames with texture in which the camera stays lost before another segment is begun."""
-    resident_keyframes: int = 64
-    """Keyframes whose images stay in memory, those used last; others wait in a temporary file, at
-    least 1."""
     huber: float = 0.5
     """Standard deviations of the flow beyond which a match counts linearly."""
     global_rounds: int = 4

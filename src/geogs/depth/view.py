@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float32, Float64, UInt8
 from torch import Tensor
 
 from geogs.geometry.camera import Camera
-from geogs.types import Keyframe
+from geogs.keyframes.keyframe import Keyframe
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -123,18 +123,19 @@ class PosedDepth:
     depth: DenseDepth
 
 
-def depth_view(
-    keyframe: Keyframe, render: Camera, image: UInt8[np.ndarray, "wh ww 3"] | None = None
-) -> DepthView:
-    """The view of a keyframe, whose image may be given, for depths at the size of ``render``."""
-    image = keyframe.image if image is None else image
+def depth_images(
+    image: UInt8[np.ndarray, "wh ww 3"], render: Camera
+) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "fh fw"]]:
+    """``grey`` and ``fine`` of a view with that image, for depths at the size of ``render``."""
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32) * np.float32(1 / 255)
+    small = cv2.resize(grey, (render.width, render.height), interpolation=cv2.INTER_AREA)
+    return small, cv2.GaussianBlur(grey, (0, 0), 0.7)
+
+
+def depth_view(keyframe: Keyframe, render: Camera) -> DepthView:
+    """The view of a keyframe for depths at the size of ``render``."""
+    image = keyframe.image
+    T_cw = keyframe.T_cw.numpy()
     return DepthView(
-        id=keyframe.id,
-        grey=cv2.resize(grey, (render.width, render.height), interpolation=cv2.INTER_AREA),
-        fine=cv2.GaussianBlur(grey, (0, 0), 0.7),
-        image=image,
-        T_cw=keyframe.T_cw.detach().cpu().numpy().astype(np.float64),
-        inverse_depth=keyframe.inverse_depth.detach().cpu().numpy().astype(np.float32),
-        information=keyframe.information.detach().cpu().numpy().astype(np.float32),
+        keyframe.id, T_cw, *depth_images(image, render), image, *keyframe.depth_field()
     )

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from geogs.errors import InputError
+from geogs.io.ply import PlyLists, read_ply
 
 _SAMPLES_PER_FACE = 4
 _LEAST_SAMPLES, _MOST_SAMPLES = 100_000, 2_000_000
@@ -62,44 +63,29 @@ def read_surface(path: str | Path) -> Surface:
     Vertices that are not finite are dropped together with their faces. Raises InputError if the
     file is missing, no PLY, cut off, or holds no vertex.
     """
-    from plyfile import PlyData, PlyParseError
-
-    path = Path(path)
-    if not path.is_file():
-        raise InputError(f"{path} does not exist; give a PLY mesh or point cloud.")
-    try:
-        data = PlyData.read(str(path), known_list_len={"face": {_face_list(path): 3}})
-    except PlyParseError:
-        try:
-            data = PlyData.read(str(path))
-        except (PlyParseError, ValueError) as error:
-            raise InputError(f"{path} is no readable PLY file ({error}).") from None
-    if "vertex" not in data or not len(data["vertex"]):
+    elements = read_ply(path)
+    vertex = elements.get("vertex")
+    if (
+        vertex is None
+        or not {"x", "y", "z"} <= vertex.columns.keys()
+        or not len(vertex.columns["x"])
+    ):
         raise InputError(f"{path} holds no vertices.")
-    vertex = data["vertex"]
-    vertices = np.stack([np.asarray(vertex[axis], np.float64) for axis in "xyz"], -1)
-    faces = _triangles(data["face"].data) if "face" in data else np.zeros((0, 3), np.int64)
+    vertices = np.stack([vertex.columns[axis].astype(np.float64) for axis in "xyz"], -1)
+    lists = elements["face"].lists if "face" in elements else {}
+    corners = lists.get("vertex_indices", lists.get("vertex_index"))
+    faces = np.zeros((0, 3), np.int64) if corners is None else _fans(corners)
     if len(faces) and (faces.min() < 0 or faces.max() >= len(vertices)):
         raise InputError(f"{path} has faces that name vertices which are not there.")
     return _finite_part(vertices, faces)
 
 
-def _face_list(path: Path) -> str:
-    """The name of the list of vertex numbers, by the file's header."""
-    with path.open("rb") as file:
-        header = file.read(4096).split(b"end_header")[0]
-    return "vertex_index" if b"vertex_index\n" in header.replace(b"\r", b"") else "vertex_indices"
-
-
-def _triangles(rows: np.ndarray) -> Int[np.ndarray, "m 3"]:
-    if not len(rows):
-        return np.zeros((0, 3), np.int64)
-    name = next(n for n in rows.dtype.names or () if n in ("vertex_index", "vertex_indices"))
-    lists = rows[name]
-    if lists.dtype != object:
-        return np.asarray(lists, np.int64)
-    fans = [[(p[0], p[i], p[i + 1]) for i in range(1, len(p) - 1)] for p in lists]
-    return np.array([t for fan in fans for t in fan], np.int64).reshape(-1, 3)
+def _fans(polygons: PlyLists) -> Int[np.ndarray, "m 3"]:
+    """Triangles from the first corner of each polygon to its sides that do not touch it."""
+    parts = np.maximum(polygons.lengths - 2, 0)
+    first = np.repeat(np.cumsum(polygons.lengths) - polygons.lengths, parts)
+    side = first + 1 + np.arange(len(first)) - np.repeat(np.cumsum(parts) - parts, parts)
+    return polygons.values[np.stack([first, side, side + 1], 1)].astype(np.int64)
 
 
 def _finite_part(vertices: np.ndarray, faces: np.ndarray) -> Surface:

@@ -189,6 +189,16 @@ def retract(xi: Float[Tensor, "*b k"], T: Float[Tensor, "*b 4 4"]) -> Float[Tens
     return (se3_exp(xi) if xi.shape[-1] == 6 else sim3_exp(xi)) @ T
 
 
+def move(xi: Float[Tensor, "*b 6"], T: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 4 4"]:
+    """Left retraction whose rotation is made orthonormal again.
+
+    Inverses are taken by transposition, so rounding errors would otherwise feed on themselves.
+    """
+    T = retract(xi, T)
+    R = quaternion_to_matrix(matrix_to_quaternion(T[..., :3, :3]))
+    return torch.cat([torch.cat([R, T[..., :3, 3:]], -1), T[..., 3:, :]], -2)
+
+
 def transform(
     T: Float[Tensor, "*b 4 4"], points: Float[Tensor, "*b n 3"]
 ) -> Float[Tensor, "*b n 3"]:

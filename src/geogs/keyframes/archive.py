@@ -11,63 +11,19 @@ import threading
 import uuid
 import weakref
 import zlib
-from collections import OrderedDict, deque
-from collections.abc import Callable, Hashable
+from collections import deque
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO, Generic, Protocol, TypeVar
+from typing import BinaryIO, Protocol
 
 import numpy as np
 
 from geogs.errors import InputError, OutputError
-
-V = TypeVar("V")
+from geogs.keyframes.swap import Swap
 
 _PIECE = 1 << 24
 """Bytes copied at once."""
-
-
-class Recent(Generic[V]):
-    """The values used last, up to a number of them; others are made again. For any thread."""
-
-    def __init__(self, count: int) -> None:
-        self.count = count
-        self._values: OrderedDict[Hashable, V] = OrderedDict()
-        self._lock = threading.Lock()
-
-    def __len__(self) -> int:
-        return len(self._values)
-
-    def __getstate__(self) -> int:
-        """What a checkpoint says of it: the values are made again."""
-        return self.count
-
-    def __setstate__(self, count: int) -> None:
-        self.__init__(count)  # type: ignore[misc]
-
-    def put(self, key: Hashable, value: V) -> None:
-        """Keep a value as the last used; the one not used for longest may go."""
-        with self._lock:
-            self._values[key] = value
-            self._values.move_to_end(key)
-            while len(self._values) > self.count:
-                self._values.popitem(last=False)
-
-    def get(self, key: Hashable, make: Callable[[], V]) -> V:
-        """The value of a key, made where it is no longer kept."""
-        with self._lock:
-            if key in self._values:
-                self._values.move_to_end(key)
-                return self._values[key]
-        value = make()
-        self.put(key, value)
-        return value
-
-    def drop(self, key: Hashable) -> None:
-        """Forget a value."""
-        with self._lock:
-            self._values.pop(key, None)
 
 
 class Archive:
@@ -87,7 +43,7 @@ class Archive:
         self.folder = Path(folder or tempfile.gettempdir())
         self.name = f"archive-{uuid.uuid4().hex[:16]}"
         """Of the file, once it is settled."""
-        self._recent: Recent[np.ndarray] = Recent(resident)
+        self._recent: Swap[int, np.ndarray] = Swap(resident)
         self._free: dict[int, list[int]] = {}
         """Offsets of unused pieces, by their size."""
         self._gone: deque[tuple[int, int, int]] = deque()
@@ -123,13 +79,13 @@ class Archive:
         data = np.ascontiguousarray(array)
         archived = self._archived(offset, array.shape, array.dtype, zlib.crc32(_bytes(data)))
         self._write(data, offset)
-        if self._recent.count:
+        if self._recent.limit:
             self._recent.put(archived.key, array)
         return archived
 
     def read(self, archived: "Archived") -> np.ndarray:
         """An array as it was written; one that is resident is not to be changed."""
-        if not self._recent.count:
+        if not self._recent.limit:
             return self._read(archived)
         return self._recent.get(archived.key, lambda: self._read(archived))
 
@@ -151,7 +107,7 @@ class Archive:
             self._collect()
         self._releasing, self._withheld = self._releasing + self._withheld, []
         unused = [(o, size) for size, offsets in self._free.items() for o in offsets]
-        return SettledArchive(self._end, self._recent.count, [*unused, *self._releasing])
+        return SettledArchive(self._end, self._recent.limit, [*unused, *self._releasing])
 
     def release(self) -> None:
         """The checkpoint that was written since ``settle`` is complete and replaces the last."""

@@ -8,72 +8,59 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from geogs.keyframes.archive import Archive, Archived, Recent
+from geogs.keyframes.archive import Archive, Archived
+from geogs.keyframes.swap import Swap
+
+Encode = Callable[[UInt8[np.ndarray, "h w 3"]], Any]
+"""A flow operator's form of an image."""
 
 
-class PictureArchive:
-    """Images in a file, and the encoded forms of the ``resident`` ones used last."""
+class Pictures:
+    """Where the images of keyframes are: the ``resident`` ones used last in memory, all in a file.
 
-    def __init__(self, encode: Callable[[UInt8[np.ndarray, "h w 3"]], Any], resident: int) -> None:
+    Without ``encode`` encoded forms cannot be made again, so all of them stay in memory.
+    """
+
+    def __init__(self, encode: Encode | None, resident: int) -> None:
         self.encode = encode
         self.images = Archive(resident=resident)
         self.normals = Archive()
-        self.encoded: Recent[Any] = Recent(resident)
+        self.encoded: Swap[Picture, Any] = Swap(resident)
 
 
 class Picture:
-    """A keyframe's image, its encoded form and a prior's normals.
-
-    With an archive they are there when asked for, but not kept; without one they are plain values.
-    """
+    """A keyframe's image, its encoded form and a prior's normals, read when they are asked for."""
 
     def __init__(
-        self,
-        image: UInt8[np.ndarray, "h w 3"],
-        encoded: Any,
-        archive: PictureArchive | None = None,
+        self, pictures: Pictures, image: UInt8[np.ndarray, "h w 3"], encoded: Any = None
     ) -> None:
-        self._archive = archive
-        self._encoded = None
-        self.stored_normal: Float[Tensor, "h w 3"] | Archived | None = None
-        self.image = image
-        self.encoded = encoded
+        self._pictures = pictures
+        self._encoded = encoded if pictures.encode is None else None
+        self._normal: Archived | None = None
+        self.archived = pictures.images.put(image)
+        """The image in its archive."""
+        if pictures.encode is not None:
+            pictures.encoded.put(self, encoded)
 
     @property
     def image(self) -> UInt8[np.ndarray, "h w 3"]:
-        """RGB."""
-        stored = self.stored_image
-        return stored.load() if isinstance(stored, Archived) else stored
-
-    @image.setter
-    def image(self, image: UInt8[np.ndarray, "h w 3"]) -> None:
-        archive = self._archive
-        self.stored_image = image if archive is None else archive.images.put(image)
+        """RGB at working resolution; not to be changed in place."""
+        return self.archived.load()
 
     @property
     def encoded(self) -> Any:
         """The flow operator's form of the image, computed again where it is no longer kept."""
-        archive = self._archive
-        if archive is None:
+        encode = self._pictures.encode
+        if encode is None:
             return self._encoded
-        return archive.encoded.get(self, lambda: archive.encode(self.image))
-
-    @encoded.setter
-    def encoded(self, encoded: Any) -> None:
-        if self._archive is None:
-            self._encoded = encoded
-        else:
-            self._archive.encoded.put(self, encoded)
+        return self._pictures.encoded.get(self, lambda: encode(self.image))
 
     @property
     def normal(self) -> Float[Tensor, "h w 3"] | None:
-        """Unit normals in the camera frame, facing the camera."""
-        stored = self.stored_normal
-        return torch.from_numpy(stored.load()) if isinstance(stored, Archived) else stored
+        """A monocular prior's unit normals at working resolution, in the camera frame and facing
+        the camera; zero where unknown, None where nothing was asked."""
+        return None if self._normal is None else torch.from_numpy(self._normal.load())
 
     @normal.setter
-    def normal(self, normal: Float[Tensor, "h w 3"] | None) -> None:
-        if normal is None or self._archive is None:
-            self.stored_normal = normal
-        else:
-            self.stored_normal = self._archive.normals.put(normal.cpu().numpy())
+    def normal(self, normal: Float[Tensor, "h w 3"]) -> None:
+        self._normal = self._pictures.normals.put(normal.cpu().numpy())

@@ -25,19 +25,9 @@ from geogs.loop.constraints import (
 from geogs.loop.detect import Loop, LoopDetector
 from geogs.loop.pose_graph import RelativePoses
 from geogs.tracking.motion import Recognition
-from geogs.tracking.segments import Segments, moved
+from geogs.tracking.segments import Segments
 from geogs.tracking.tracker import Tracker, TrackResult
 from geogs.types import PoseCorrection
-
-
-@dataclass(frozen=True)
-class LoopEvent:
-    """What loops changed."""
-
-    correction: PoseCorrection | None = None
-    """Of the world's keyframes, already taken over by the tracker."""
-    joined: tuple[int, ...] = ()
-    """Ids of final keyframes that became part of the world."""
 
 
 @dataclass
@@ -65,7 +55,7 @@ class LoopCloser:
         self.segments = segments
         self.config = config
         tracker = segments.world
-        self.detector = LoopDetector(tracker.grid, tracker.operator, segments.store_of, config)
+        self.detector = LoopDetector(tracker.keyframes.store, tracker.operator, config)
         self.closures = 0
         """Loop closures so far."""
         self._known: dict[Tracker, _Known] = {}
@@ -76,10 +66,14 @@ class LoopCloser:
         """Keyframes that show what an image shows."""
         return self.detector.recognise(image) if self.config.enabled else ()
 
-    def update(self, result: TrackResult, is_last: bool = False) -> LoopEvent:
-        """After a frame: look for loops at the keyframes that became final, and act on them."""
+    def update(self, result: TrackResult, is_last: bool = False) -> tuple[int, ...]:
+        """After a frame: look for loops at the keyframes that became final, and act on them.
+
+        Returns the ids of final keyframes that became part of the world; whether it was corrected,
+        its segment of the store tells.
+        """
         if not self.config.enabled:
-            return LoopEvent()
+            return ()
         fresh = [*result.finalized, *result.apart]
         if fresh:
             self._retire(self.segments.tracker_of(fresh[0]))
@@ -87,16 +81,17 @@ class LoopCloser:
             self._take(loop)
         # Between keyframes nothing changes that could let segments meet.
         became_final = self._join() if fresh or is_last else ()
-        return LoopEvent(self._close(is_last), became_final)
+        self._close(is_last)
+        return became_final
 
     def replaced_by_bundle(self) -> None:
         """All of the world was adjusted together: what its edges say now replaces all else."""
         world = self.segments.world
-        order = {k: n for n, k in enumerate(world.store.ids)}
+        order = {k: n for n, k in enumerate(world.keyframes.ids)}
         edges = {
             e: v for e, v in world.graph.edges.items() if order[e[1]] - order[e[0]] not in (2, 3)
         }
-        self._known[world] = _Known(of_edges(world.store, edges))
+        self._known[world] = _Known(of_edges(world.keyframes, edges))
         self._retire(world)
 
     def _of(self, tracker: Tracker) -> _Known:
@@ -104,10 +99,10 @@ class LoopCloser:
 
     def _retire(self, tracker: Tracker) -> None:
         """Turn the edges that the local adjustment has left behind into relative poses."""
-        old = tracker.graph.retire(tracker.store.ids[-tracker.config.depth_window :])
+        old = tracker.graph.retire(tracker.keyframes.ids[-tracker.config.depth_window :])
         if old:
             known = self._of(tracker)
-            known.odometry = joined([known.odometry, of_edges(tracker.store, old)])
+            known.odometry = joined([known.odometry, of_edges(tracker.keyframes, old)])
 
     def _take(self, loop: Loop) -> None:
         first, second = (self.segments.tracker_of(k) for k in (loop.first, loop.second))
@@ -117,12 +112,11 @@ class LoopCloser:
         known, constraint = self._of(first), self._constraint(loop)
         known.loops = thinned(joined([known.loops, constraint]), self.config.kept)
         ends = sorted({loop.first, loop.second})
-        strain = strains(first.store.poses(ends), between_positions(constraint, ends))
+        strain = strains(first.keyframes.poses(ends), between_positions(constraint, ends))
         known.pending += bool((strain > self.config.strain).any())
 
     def _constraint(self, loop: Loop) -> RelativePoses:
-        stores = self.segments.store_of
-        return of_loop(stores(loop.first), stores(loop.second), loop)
+        return of_loop(self.segments.world.keyframes.store, loop)
 
     # --- joining segments ------------------------------------------------------------------
 
@@ -146,7 +140,8 @@ class LoopCloser:
     def _ends(self, loop: Loop) -> tuple[Tracker, Tracker]:
         """Host and guest: the world is host, else the earlier segment."""
         a, b = (self.segments.tracker_of(k) for k in (loop.first, loop.second))
-        if b is self.segments.world or (a is not self.segments.world and b.store.ids < a.store.ids):
+        world, is_earlier = self.segments.world, b.keyframes.ids < a.keyframes.ids
+        if b is world or (a is not world and is_earlier):
             return b, a
         return a, b
 
@@ -155,14 +150,14 @@ class LoopCloser:
         host, guest = self._ends(loop)
         S = loop.S_ji.cpu()
         here, there = loop.first, loop.second
-        if loop.first in guest.store:
+        if loop.first in guest.keyframes:
             S, here, there = sim3_inverse(S), loop.second, loop.first
-        return se3_inverse(guest.store[there].T_cw) @ S @ host.store[here].T_cw
+        return se3_inverse(guest.keyframes[there].T_cw) @ S @ host.keyframes[here].T_cw
 
     def _agrees(self, loop: Loop, S: Float[Tensor, "4 4"]) -> bool:
         """Whether a loop lands where a Sim(3) of the segments would."""
         _, guest = self._ends(loop)
-        state = guest.store[loop.second if loop.second in guest.store else loop.first]
+        state = guest.keyframes[loop.second if loop.second in guest.keyframes else loop.first]
         depth = 1 / state.inverse_depth.median().cpu().double()
         error = disagreement(state.T_cw @ self._claim(loop), state.T_cw @ S, depth)
         return float(error) < self.config.join_tolerance
@@ -171,9 +166,9 @@ class LoopCloser:
         self._retire(guest)
         theirs, ours = self._known.pop(guest, _Known()), self._of(host)
         # The loops between the two were measured in the guest's unit, too.
-        correction = moved(guest.store, S)
+        correction = guest.keyframes.moved(S)
         theirs.rescale(correction)
-        both = correction.scale | dict.fromkeys(host.store.ids, 1.0)
+        both = correction.scale | dict.fromkeys(host.keyframes.ids, 1.0)
         ours.loops = joined([rescaled(ours.loops, both), theirs.loops])
         ours.odometry = joined([ours.odometry, theirs.odometry])
         ours.pending += 1
@@ -186,34 +181,33 @@ class LoopCloser:
 
     # --- closing loops ---------------------------------------------------------------------
 
-    def _close(self, is_last: bool) -> PoseCorrection | None:
+    def _close(self, is_last: bool) -> None:
         """Correct the world by its loops, if there are new ones and they change something."""
         world = self.segments.world
-        known, ids = self._of(world), world.store.ids
+        known, ids = self._of(world), world.keyframes.ids
         # A correction costs in proportion to the keyframes, so it comes once in a part of them.
         pause = max(self.config.close_every, len(ids) // 10)
         due = is_last or len(ids) - known.last_attempt >= pause
         if not known.pending or not due:
-            return None
+            return
         known.pending, known.last_attempt = 0, len(ids)
         relative = joined([
-            known.odometry, of_edges(world.store, world.graph.edges), known.loops,
+            known.odometry, of_edges(world.keyframes, world.graph.edges), known.loops,
         ])  # fmt: skip
         relative = between_positions(relative, ids)
         steps = ~relative.is_loop & ((relative.target - relative.source).abs() == 1)
         if not bool(steps.any()):
-            return None  # hardly anything matches: nothing tells how far the camera has drifted
-        closure = close_loops(ids, world.store.poses(ids), relative)
+            return  # hardly anything matches: nothing tells how far the camera has drifted
+        closure = close_loops(ids, world.keyframes.poses(ids), relative)
         if closure is None or self._change(closure.correction) < self.config.min_change:
-            return None
-        world.correct(closure.correction)
+            return
+        world.keyframes.correct(closure.correction)
         known.rescale(closure.correction)
         self.closures += 1
-        return closure.correction
 
     def _change(self, correction: PoseCorrection) -> float:
         """How far a correction moves the keyframe that it moves most."""
-        store, ids = self.segments.world.store, sorted(correction.before)
+        store, ids = self.segments.world.keyframes, sorted(correction.before)
         scale = torch.tensor([correction.scale[k] for k in ids], dtype=torch.float64)
         S = torch.stack([correction.after[k] for k in ids])
         S[:, :3] *= scale[:, None, None]

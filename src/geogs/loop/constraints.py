@@ -9,7 +9,7 @@ from torch import Tensor
 
 from geogs.geometry.lie import se3_inverse, sim3_inverse, sim3_log
 from geogs.keyframes.grid import SampleGrid
-from geogs.keyframes.store import KeyframeStore, scaled
+from geogs.keyframes.store import KeyframeStore, Segment, scaled
 from geogs.loop.detect import Loop
 from geogs.loop.matched_edges import MatchedEdges
 from geogs.loop.pose_graph import RelativePoses
@@ -34,7 +34,7 @@ def joined(parts: Sequence[RelativePoses]) -> RelativePoses:
     return RelativePoses(*(torch.cat([getattr(p, c) for p in parts]) for c in columns))
 
 
-def of_edges(store: KeyframeStore, edges: Mapping[Pair, Edge | PackedEdge]) -> RelativePoses:
+def of_edges(segment: Segment, edges: Mapping[Pair, Edge | PackedEdge]) -> RelativePoses:
     """Relative poses, between ids, that fitted edges of a frame graph amount to.
 
     Of the two directions of a pair the one from the earlier keyframe is taken.
@@ -44,24 +44,24 @@ def of_edges(store: KeyframeStore, edges: Mapping[Pair, Edge | PackedEdge]) -> R
         return none_known()
     ids = sorted({k for p in pairs for k in p})
     slot = {k: n for n, k in enumerate(ids)}
-    grid = _on_cpu(store.grid)
+    grid = _on_cpu(segment.grid)
     matched = MatchedEdges(
         grid.camera,
         grid.rays,
-        store.inverse_depths(ids).cpu(),
+        segment.inverse_depths(ids).cpu(),
         torch.tensor([slot[i] for i, _ in pairs]),
         torch.tensor([slot[j] for _, j in pairs]),
         torch.stack([edges[p].pixels for p in pairs]).cpu().float(),
         torch.stack([edges[p].weight for p in pairs]).cpu().float(),
     )
-    return _named(relative_poses(grid, matched, store.poses(ids), False, SETTLED), ids)
+    return _named(relative_poses(grid, matched, segment.poses(ids), False, SETTLED), ids)
 
 
-def of_loop(first: KeyframeStore, second: KeyframeStore, loop: Loop) -> RelativePoses:
+def of_loop(keyframes: KeyframeStore, loop: Loop) -> RelativePoses:
     """Relative poses, between ids, of a loop: one for each direction of its flow."""
-    one, other = first[loop.first], second[loop.second]
+    one, other = keyframes[loop.first], keyframes[loop.second]
     there, back = loop.there, loop.back
-    grid = _on_cpu(first.grid)
+    grid = _on_cpu(keyframes.grid)
     matched = MatchedEdges(
         grid.camera,
         grid.rays,

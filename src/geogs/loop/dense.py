@@ -7,11 +7,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from geogs.bundle.dense import project
+from geogs.bundle.projection import project
 from geogs.config import VerificationOptions
 from geogs.geometry.lie import se3_inverse, so3_log
 from geogs.keyframes.grid import SampleGrid
-from geogs.keyframes.store import KeyframeState, scaled
+from geogs.keyframes.keyframe import Keyframe
+from geogs.keyframes.store import scaled
 from geogs.tracking.flow.base import FlowMatch, FlowOperator
 from geogs.tracking.motion import FrameLocator, FrameMotion
 
@@ -41,8 +42,8 @@ class DenseCheck:
 def dense_check(
     grid: SampleGrid,
     operator: FlowOperator,
-    first: KeyframeState,
-    second: KeyframeState,
+    first: Keyframe,
+    second: Keyframe,
     T_ji: Float[Tensor, "4 4"],
     scale: float = 1.0,
     options: VerificationOptions | None = None,
@@ -93,8 +94,8 @@ def dense_check(
 
 def _depth_ratios(
     grid: SampleGrid,
-    first: KeyframeState,
-    second: KeyframeState,
+    first: Keyframe,
+    second: Keyframe,
     there: FrameMotion,
     T_ji: Float[Tensor, "4 4"],
 ) -> Float[Tensor, "m"]:
@@ -119,8 +120,8 @@ def _consensus(ratios: Float[Tensor, "m"], tolerance: float) -> tuple[float, flo
 
 def _seen_through(
     grid: SampleGrid,
-    source: KeyframeState,
-    target: KeyframeState,
+    source: Keyframe,
+    target: Keyframe,
     T_ts: Float[Tensor, "4 4"],
     scale: float,
     tolerance: float,

@@ -1,7 +1,7 @@
 """Loops: pairs of keyframes far apart in time that show one place."""
 
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
@@ -13,8 +13,7 @@ from torch import Tensor
 
 from geogs.config import LoopConfig
 from geogs.geometry.lie import se3_inverse, so3_log
-from geogs.keyframes.grid import SampleGrid
-from geogs.keyframes.store import KeyframeState, KeyframeStore
+from geogs.keyframes.store import KeyframeStore
 from geogs.loop.dense import dense_check
 from geogs.loop.search import Cause, Depths, PlaceSearch, Proposal, Query, Sighting
 from geogs.tracking.flow.base import FlowMatch, FlowOperator
@@ -63,28 +62,26 @@ class LoopDetector:
 
     The search by looks and features runs in a thread beside tracking; what it finds is taken up
     ``lag`` keyframes later, at the same place of the stream however fast the machine is. Keyframes
-    may lie in several stores, whose poses then have nothing to do with each other: between them,
-    only looks propose.
+    may lie in several segments, whose poses have nothing to do with each other: between them, only
+    looks propose.
     """
 
     def __init__(
         self,
-        grid: SampleGrid,
+        keyframes: KeyframeStore,
         operator: FlowOperator,
-        store_of: Callable[[int], KeyframeStore],
         config: LoopConfig | None = None,
     ) -> None:
-        """``store_of`` says where a keyframe is at present."""
-        self.grid = grid
+        self.keyframes = keyframes
+        self.grid = keyframes.grid
         self.operator = operator
-        self.store_of = store_of
         self.config = config or LoopConfig()
         self.refusals: list[Refusal] = []
         """Of the last update."""
         self._thread = _search_thread()
         self._order: dict[int, int] = {}
         """Place in time of each keyframe taken so far."""
-        self._search = PlaceSearch(grid, self.config, self._order)
+        self._search = PlaceSearch(self.grid, self.config, self._order)
         self._pending: deque[Future[list[Sighting]]] = deque()
         self._loops: list[Loop] = []
 
@@ -128,8 +125,8 @@ class LoopDetector:
     def candidates(self, id: int) -> list[int]:
         """Keyframes that the present poses say a taken one sees again, nearest first."""
         near = self._near(id)
-        store = self.store_of(id)
-        old = [k for k in self._order if k not in near and self.store_of(k) is store]
+        store = self.keyframes.segment_of(id)
+        old = [k for k in self._order if k not in near and k in store]
         if not old:
             return []
         facing = self._facing(id, old)
@@ -142,25 +139,22 @@ class LoopDetector:
     def _query(self, id: int) -> Query:
         known = tuple((loop.first, loop.second) for loop in self._loops)
         near, by_pose = self._near(id), tuple(self.candidates(id))
-        return Query(id, self._state(id).image, near, by_pose, known, self._depths())
+        return Query(id, self.keyframes[id].image, near, by_pose, known, self._depths())
 
     def _near(self, id: int) -> frozenset[int]:
-        """The keyframe itself and those of the same time and store."""
-        gap, store = self._order[id] - self.config.min_gap, self.store_of(id)
+        """The keyframe itself and those of the same time and segment."""
+        gap, store = self._order[id] - self.config.min_gap, self.keyframes.segment_of(id)
         recent = [k for k, n in self._order.items() if n >= gap]
-        return frozenset(k for k in recent if self.store_of(k) is store)
+        return frozenset(k for k in recent if k in store)
 
     def _depths(self) -> Depths:
         """What is known of the depth of all keyframes now; they are replaced, never changed."""
-        states = {k: self._state(k) for k in self._order}
+        states = {k: self.keyframes[k] for k in self._order}
         return {k: (s.inverse_depth, s.information) for k, s in states.items()}
-
-    def _state(self, id: int) -> KeyframeState:
-        return self.store_of(id)[id]
 
     def _facing(self, id: int, old: Sequence[int]) -> list[int]:
         """The keyframes nearest by that look roughly the same way; there are never many."""
-        store = self.store_of(id)
+        store = self.keyframes.segment_of(id)
         state, T = store[id], store.poses(old)
         angle = torch.rad2deg(so3_log(state.T_cw[:3, :3] @ T[:, :3, :3].mT).norm(dim=-1))
         away = (se3_inverse(T)[:, :3, 3] - se3_inverse(state.T_cw)[:3, 3]).norm(dim=-1)
@@ -193,7 +187,7 @@ class LoopDetector:
         Plain surfaces have few corners, but when the drift is small the flow needs none.
         """
         p, view = sighting.proposal, sighting.view
-        first, second, grid = self._state(p.first), self._state(p.second), self.grid
+        first, second, grid = self.keyframes[p.first], self.keyframes[p.second], self.grid
         if view.accepted and view.is_metric and view.T_ji is not None:
             T, scale, inliers = view.T_ji, view.scale or 1.0, view.inliers
         elif p.cause == "geometry":

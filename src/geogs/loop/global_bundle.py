@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 
-from geogs.bundle.dense import BundleOptions
+from geogs.bundle.base import BundleOptions
 from geogs.tracking.proximity import Pair, proximity_pairs
 from geogs.tracking.tracker import Tracker
 from geogs.types import PoseCorrection
@@ -32,9 +32,9 @@ def global_bundle(
     message. Returns the poses before and after; scales are 1. A tracker without a map is left
     alone.
     """
-    config, store, graph = tracker.config, tracker.store, tracker.graph
+    config, store, graph = tracker.config, tracker.keyframes, tracker.graph
     ids = tracker.keyframe_ids if keyframes is None else list(keyframes)
-    before = {k: store[k].T_cw.clone() for k in ids}
+    before = {k: store[k].T_cw for k in ids}
     pairs = global_pairs(tracker, ids)
     graph.edges = {}
     batch = MATCHED_TOGETHER[store.grid.on_gpu]
@@ -56,8 +56,10 @@ def global_bundle(
         tracker.priors.adjust(ids[start : start + PRIORS_TOGETHER], config.huber)  # moves no pose
     if progress is not None:
         progress(1.0, "all keyframes adjusted")
-    after = {k: store[k].T_cw.clone() for k in ids}
-    return PoseCorrection(before, after, dict.fromkeys(ids, 1.0))
+    after = {k: store[k].T_cw for k in ids}
+    correction = PoseCorrection(before, after, dict.fromkeys(ids, 1.0))
+    store.correct(correction)
+    return correction
 
 
 def global_pairs(tracker: Tracker, keyframes: Sequence[int] | None = None) -> list[Pair]:
@@ -65,7 +67,7 @@ def global_pairs(tracker: Tracker, keyframes: Sequence[int] | None = None) -> li
     config = tracker.config
     ids = tracker.keyframe_ids if keyframes is None else list(keyframes)
     pairs = proximity_pairs(
-        tracker.store,
+        tracker.keyframes,
         ids,
         ids,
         [],

@@ -13,7 +13,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from geogs.bundle.dense import linearise, project, robust_weight
+from geogs.bundle.linearise import robust_weight
+from geogs.bundle.projection import linearise, project
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import sim3_adjoint, sim3_inverse
 

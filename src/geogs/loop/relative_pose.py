@@ -13,8 +13,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from geogs.bundle.dense import LinearProjection, linearise, move, robust_weight
-from geogs.geometry.lie import se3_inverse
+from geogs.bundle.linearise import robust_weight
+from geogs.bundle.projection import LinearProjection, linearise
+from geogs.geometry.lie import move, se3_inverse
 from geogs.keyframes.grid import SampleGrid
 from geogs.loop.matched_edges import MatchedEdges
 from geogs.loop.pose_graph import RelativePoses

@@ -216,7 +216,7 @@ def multi_view_loss(
     photometric size. Without ``target_depth`` (the target's rendered depth, any size, no gradient)
     nothing counts as hidden. Each term is summed over valid pixels and divided by the number of
     all pixels. Differentiable in the depth and in both views' ``T_cw``. Any dtype and device;
-    :func:`geogs.losses.fused_multi_view` is the same on a CPU, faster.
+    :func:`geogs.losses.cpu.fused_multi_view` is the same on a CPU, faster.
     """
     grey = reference.grey.to(depth.dtype)
     big = enlarge_depth(depth, *grey.shape)

@@ -222,7 +222,7 @@ def single_view_loss(
     Each term is summed over the pixels where it counts and divided by the number of all pixels, so
     that a small valid region does not get large gradients. ``unit`` as in :func:`distortion`.
     Where the view's prior depth is ``OUTSIDE`` only the silhouette counts.
-    Any dtype and device; :func:`geogs.losses.fused_single_view` is the same on a CPU, faster.
+    Any dtype and device; :func:`geogs.losses.cpu.fused_single_view` is the same on a CPU, faster.
     """
     inside = view.prior_depth >= 0
     mask = visible(depth, alpha, config.min_alpha) & inside

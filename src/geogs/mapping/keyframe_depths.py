@@ -1,10 +1,10 @@
 """The dense depths of a mapper's keyframes: searched, and checked by those around."""
 
-from geogs.config import MappingConfig
-from geogs.depth.engine import DepthEngine, Progress, silent
+from geogs.config import DepthConfig
+from geogs.depth.base import DepthEngine, Progress, silent
 from geogs.depth.sweep_neighbors import select_sweep_neighbours
-from geogs.mapping.view import MapCameras, MapView
-from geogs.mapping.view_maps import ParkedMaps, ResidentViews
+from geogs.mapping.view import MapView
+from geogs.mapping.view_pool import StoredDepth, ViewPool
 from geogs.mapping.window import views_around
 
 CANDIDATES = 128
@@ -22,15 +22,13 @@ class KeyframeDepths:
         self,
         engine: DepthEngine,
         views: dict[int, MapView],
-        cameras: MapCameras,
-        config: MappingConfig,
-        resident: ResidentViews,
+        config: DepthConfig,
+        pool: ViewPool,
     ) -> None:
         self.engine = engine
         self.views = views
-        self.cameras = cameras
-        self.config = config.depth
-        self.resident = resident
+        self.config = config
+        self.pool = pool
 
     def estimate(self, views: list[MapView], progress: Progress = silent) -> None:
         """Search the depths of some views, not too many at once."""
@@ -53,22 +51,22 @@ class KeyframeDepths:
             neighbours.append([candidates[i].depth_view for i in chosen])
         depths = self.engine.estimate(references, neighbours, progress, limits)
         for view, dense in zip(views, depths, strict=True):
-            view.set_depth(dense, self.cameras)
+            self.pool.set_depth(view.id, dense)
 
     def check(self, views: list[MapView]) -> None:
         """Let the neighbours' depths, as they were estimated, revise those of the views."""
-        checked: list[ParkedMaps] = []
+        checked: list[StoredDepth] = []
         for start in range(0, len(views), SEARCHED_TOGETHER):
             batch = views[start : start + SEARCHED_TOGETHER]
             others = [[o.posed for o in self.near(view)] for view in batch]
             depths = self.engine.check([view.posed for view in batch], others)
             if len(views) == len(batch):
                 for view, depth in zip(views, depths, strict=True):
-                    view.set_depth(depth, self.cameras)
+                    self.pool.set_depth(view.id, depth)
                 return
-            checked += [ParkedMaps.of(depth, self.resident.archive) for depth in depths]
-        for view, parked in zip(views, checked, strict=True):
-            view.set_depth(parked.load_depth(view.device), self.cameras)
+            checked += [StoredDepth.of(depth, 1.0, self.pool.archive) for depth in depths]
+        for view, stored in zip(views, checked, strict=True):
+            self.pool.set_depth(view.id, stored.load(1.0, self.pool.device))
 
     def near(self, view: MapView) -> list[MapView]:
         """The keyframes with a depth that see a view's surface best from elsewhere."""

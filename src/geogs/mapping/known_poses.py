@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float64, UInt8
+from jaxtyping import Bool, Float64
 
 from geogs.config import DepthConfig, SearchConfig
 from geogs.depth.plane_sweep import SweepResult, plane_sweep
@@ -19,10 +19,8 @@ from geogs.depth.sweep_neighbors import parallax_degrees, select_sweep_neighbour
 from geogs.depth.view import DepthSearch, DepthView
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
-from geogs.keyframes.grid import OFFSET, STRIDE
 from geogs.mapping.view import MapView
 from geogs.threads import thread_map
-from geogs.types import Keyframe
 
 # A sweep around a distance d goes from d / NEAR to d * FAR; the next distance is RATIO times d.
 _NEAR, _FAR, _RATIO = 3.0, 6.0, 2.5
@@ -44,21 +42,6 @@ _ENOUGH_POINTS = 50
 _POINTS_PER_VIEW = 2000
 # Least confidence of a pixel that gives a point.
 _SURE = 0.7
-
-
-def posed_keyframe(
-    number: int,
-    timestamp: float,
-    image: UInt8[np.ndarray, "h w 3"],
-    T_cw: Float64[np.ndarray, "4 4"],
-) -> Keyframe:
-    """A keyframe of which only image and pose are known; ``number`` becomes its id."""
-    height, width = image.shape[:2]
-    grid = torch.zeros(
-        len(range(OFFSET, height - 3, STRIDE)), len(range(OFFSET, width - 3, STRIDE))
-    )
-    pose = torch.from_numpy(np.asarray(T_cw, np.float64))
-    return Keyframe(number, number, timestamp, image, pose, torch.ones_like(grid), grid)
 
 
 def distances_to_try(views: Sequence[DepthView]) -> Float64[np.ndarray, "n"]:
@@ -153,7 +136,7 @@ def expect_depths(
 ) -> None:
     """Let every view's depth be searched where these points say; its grid counts for nothing."""
     for view in views:
-        view.expect(depth_search(view.depth_view, points, camera, margin))
+        view.search = depth_search(view.depth_view, points, camera, margin)
 
 
 def dense_points(

@@ -19,7 +19,7 @@ from geogs.errors import GeogsError
 from geogs.geometry.lie import se3_inverse
 from geogs.geometry.umeyama import umeyama
 from geogs.mapping.similarity_field import Witness, blended_similarities
-from geogs.mapping.view import MapCameras, MapView
+from geogs.mapping.view import MapView
 from geogs.types import PoseCorrection
 
 Strategy = Literal["blended", "coherent", "per_keyframe"]
@@ -37,9 +37,14 @@ class MapUpdate:
     """Root mean square distance between targets and where the update puts the disks."""
 
 
-def witness(view: MapView, cameras: MapCameras) -> Witness:
-    """What a view with a depth sees, before it takes over a correction."""
-    return Witness(view.id, cameras.render, view.T_cw, view.dense.depth, view.dense.confidence)
+def witness(view: MapView, correction: PoseCorrection) -> Witness:
+    """What a view with a depth saw, and from where, before a correction that it has taken over."""
+    depth, scale = view.dense.depth, correction.scale.get(view.id, 1.0)
+    T_cw = correction.before.get(view.id, view.T_cw)
+    return Witness(
+        view.id, view.pool.cameras.render, T_cw, depth if scale == 1.0 else depth * scale,
+        view.dense.confidence,
+    )  # fmt: skip
 
 
 def anchor_transforms(correction: PoseCorrection) -> tuple[Tensor, Tensor]:

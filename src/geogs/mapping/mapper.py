@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import partial
 from operator import attrgetter
 
@@ -12,22 +11,19 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from geogs.config import MappingConfig
-from geogs.depth.engine import Progress, depth_engine, silent
-from geogs.geometry.camera import Camera
-from geogs.keyframes.archive import Archive, Archived
+from geogs.depth.base import Progress, silent
+from geogs.depth.select import depth_engine
+from geogs.keyframes.archive import Archive
+from geogs.keyframes.store import KeyframeStore
+from geogs.mapping.cameras import MapCameras
 from geogs.mapping.keyframe_depths import CANDIDATES, KeyframeDepths
 from geogs.mapping.map_update import MapUpdate, plan_update, witness
 from geogs.mapping.rendered import rendered_keyframe, searched_keyframe
-from geogs.mapping.stored_renders import RenderStore, StoredRender
-from geogs.mapping.training import (
-    Batch,
-    MapTrainer,
-    TrainingPlace,
-    draw_partners,
-    map_trainer,
-)
-from geogs.mapping.view import MapCameras, MapView
-from geogs.mapping.view_maps import ResidentViews
+from geogs.mapping.stored_renders import StoredRender, stored_render
+from geogs.mapping.training.base import Batch, MapTrainer, TrainingPlace, draw_partners
+from geogs.mapping.training.select import map_trainer
+from geogs.mapping.view import MapView
+from geogs.mapping.view_pool import ViewPool
 from geogs.mapping.window import choose_partners, draw_views, views_around
 from geogs.on_demand import OnDemand
 from geogs.splat.density import (
@@ -41,7 +37,7 @@ from geogs.splat.init import new_disks
 from geogs.splat.map import DiskParameters, GaussianMap
 from geogs.splat.optimizer import MapOptimizer
 from geogs.splat.render import render
-from geogs.types import Keyframe, PoseCorrection, RenderedKeyframe
+from geogs.types import PoseCorrection, RenderedKeyframe
 
 # Nearest keyframes that vote on a keyframe's disks; others are too far away to know better.
 _VOTERS = 96
@@ -57,21 +53,26 @@ class Mapper:
     """Grows and trains the map keyframe by keyframe.
 
     ``observe`` takes settled keyframes as images to match with; ``map_keyframe`` makes one of them
-    part of the map. Everything is in the tracker's units; ``unit`` is the median depth of the first
-    keyframe, by which settings that are lengths are scaled.
+    part of the map. Poses are those of the store at any time. Everything is in the tracker's units;
+    ``unit`` is the median depth of the first keyframe, by which settings that are lengths are
+    scaled.
     """
 
-    def __init__(self, camera: Camera, config: MappingConfig, device: str = "cpu", seed: int = 0):
+    def __init__(self, keyframes: KeyframeStore, config: MappingConfig, seed: int = 0):
         self.config = config
-        self.cameras = MapCameras.of(camera, config)
-        self.map = GaussianMap.empty(device)
+        self.keyframes = keyframes
+        self.cameras = MapCameras.of(keyframes.grid.camera, config)
+        self.map = GaussianMap.empty(keyframes.grid.device)
         engine = depth_engine(
-            self.map.device, self.cameras.render, self.cameras.working, config.depth
+            self.map.device,
+            self.cameras.render,
+            self.cameras.working,
+            config.depth,
+            keyframes.resident,
         )
         self.views: dict[int, MapView] = {}
-        self._resident = ResidentViews(config.resident_views)
-        self._depths = KeyframeDepths(engine, self.views, self.cameras, config, self._resident)
-        self._images = Archive(resident=config.resident_views)
+        self.pool = ViewPool(self.cameras, config.loss, self.map.device, keyframes.resident)
+        self._depths = KeyframeDepths(engine, self.views, config.depth, self.pool)
         self.mapped: list[int] = []
         self.trained = TrainingPlace()
         """How far the training over all keyframes is, at each report of its progress."""
@@ -84,24 +85,16 @@ class Mapper:
         """Keyframes observed so far, in order."""
         return list(self.views)
 
-    def observe(self, keyframe: Keyframe, mask: Bool[np.ndarray, "h w"] | None = None) -> None:
+    def observe(self, keyframe_id: int, mask: Bool[np.ndarray, "h w"] | None = None) -> None:
         """A settled keyframe, from now on available for matching.
 
         Outside a mask, of the size of its image, it has no depth.
         """
-        if not isinstance(keyframe.stored_image, Archived):
-            keyframe = replace(keyframe, stored_image=self._images.put(keyframe.image))
-        view = MapView.of(keyframe, self.cameras, self.config.loss, self.map.device, self._resident)
-        if mask is not None:
-            view.keep_within(mask)
-        self.views[keyframe.id] = view
+        keyframe = self.keyframes[keyframe_id]
+        self.pool.add(keyframe, mask)
+        view = MapView(keyframe, self.pool)
+        self.views[keyframe_id] = view
         self._depths.engine.observe(view.depth_view)
-
-    def follow(self, keyframes: list[Keyframe]) -> None:
-        """Take over the tracker's present poses and grid depths of known keyframes."""
-        for keyframe in keyframes:
-            if keyframe.id in self.views:
-                self.views[keyframe.id].follow(keyframe)
 
     def map_keyframe(self, keyframe_id: int) -> None:
         """Give a keyframe its depth, carve and grow the map with it, train the window."""
@@ -121,22 +114,17 @@ class Mapper:
         if len(self.mapped) % self.config.disk.carve_every == 0:
             self._prune_around(view)
 
-    def refine_poses(self, active: list[int]) -> dict[int, Float[Tensor, "4 4"]]:
-        """Poses of the active keyframes that agree better with the map; the earliest stays."""
+    def refine_poses(self, active: Sequence[int]) -> None:
+        """Give the active keyframes poses that agree better with the map; the earliest stays."""
         views = [self.views[i] for i in active if i in self.views and self.views[i].has_depth]
         if len(views) < 2 or len(self.map) == 0:
-            return {}
+            return
         poses = self._training().refine_poses(views, self.views, self.config)
         for i, T_cw in poses.items():
-            self.views[i].move(T_cw)
-        return poses
+            self.keyframes[i].T_cw = T_cw
 
-    def correct(self, correction: PoseCorrection, keyframes: list[Keyframe]) -> MapUpdate:
-        """Move the map with a global correction of the poses, and take over the new keyframes.
-
-        To be called before the keyframes' new poses arrive by ``follow``: what they see in place
-        before the correction says how the map moves.
-        """
+    def correct(self, correction: PoseCorrection) -> MapUpdate:
+        """Move the map with a global correction that the keyframes have taken over."""
         views = [v for v in self.views.values() if v.has_depth]
         views = views[:: 1 + len(views) // _WITNESSES]
         update = plan_update(
@@ -144,15 +132,11 @@ class Mapper:
             self.map.keyframe_id,
             correction,
             self.config.map_update,
-            (witness(v, self.cameras) for v in views),
+            (witness(v, correction) for v in views),
         )
         if len(self.map):
             self._training().optimizer.transform(update.transform)
             self._training().forget_renders(self.views.values())
-        for i, scale in correction.scale.items():
-            if i in self.views:
-                self.views[i].rescale(1.0 / scale, self.cameras)
-        self.follow(keyframes)
         return update
 
     def refine(self, progress: Progress = silent) -> None:
@@ -167,11 +151,6 @@ class Mapper:
         start = 0.4 if self.config.final_depth else 0.0
         steps = self.config.final_iterations
         self.train(steps, lambda fraction: progress(start + (1 - start) * fraction))
-
-    def move(self, poses: list[Float[Tensor, "4 4"]]) -> None:
-        """World-to-camera poses of all keyframes, before there is a map."""
-        for view, T_cw in zip(self.views.values(), poses, strict=True):
-            view.move(T_cw)
 
     def search_depths(self, keyframe_ids: list[int]) -> None:
         """Depths of some keyframes from their images; they are mapped then."""
@@ -240,10 +219,10 @@ class Mapper:
             OutputError: the disk is full, or cannot be written.
         """
         disks = self.map.parameters if disks is None else disks
-        camera, store, stored = self.cameras.render, RenderStore(), []
+        camera, archive, stored = self.cameras.render, Archive(), []
         for view in (self.views[i] for i in self.mapped):
             render = rendered_keyframe(view, disks, camera, self.config)
-            stored.append(store.put(render, view.keyframe.stored_image))
+            stored.append(stored_render(render, view.keyframe.picture.archived, archive))
         return OnDemand(stored, StoredRender.load)
 
     def depth_maps(self) -> Sequence[RenderedKeyframe]:
@@ -271,7 +250,8 @@ class Mapper:
             known = depth.confidence > 0
             sure = depth.depth[known & (depth.confidence >= np.median(depth.confidence))]
             unit = float(np.median(sure)) if known.any() else first.typical_depth
-            self._trainer = map_trainer(self.map, self.cameras, self.config, unit)
+            resident = self.keyframes.resident
+            self._trainer = map_trainer(self.map, self.cameras, self.config, unit, resident)
         return self._trainer
 
     def _estimate_ahead(self, keyframe_id: int) -> None:

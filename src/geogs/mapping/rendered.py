@@ -5,7 +5,6 @@ import torch
 from geogs.config import MappingConfig
 from geogs.geometry.camera import Camera
 from geogs.geometry.depth import normals_from_depth
-from geogs.mapping.training import shown_depth
 from geogs.mapping.view import MapView
 from geogs.splat.map import DiskParameters
 from geogs.splat.render import render
@@ -17,7 +16,7 @@ def rendered_keyframe(
 ) -> RenderedKeyframe:
     """Disks seen from a view inside its mask, with the weight of each depth for fusion."""
     output = render(disks, camera, view.T_cw)
-    depth = shown_depth(output, config.loss.min_alpha)
+    depth = output.shown_depth(config.loss.min_alpha)
     # The mean is smoother; but where the ray meets several surfaces it lies on none of them,
     # while the median is on one.
     single = (output.median_depth - depth).abs() < config.max_spread * depth

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from geogs.depth.view import DenseDepth, DepthSearch
 from geogs.mapping.mapper import Mapper
-from geogs.mapping.training import TrainingPlace
+from geogs.mapping.training.base import TrainingPlace
 from geogs.splat.map import DiskParameters
 
 
@@ -76,10 +76,10 @@ def restore_mapper(mapper: Mapper, state: MapperState) -> None:
     mapper.mapped = depths.keyframe_id.tolist()
     for n, i in enumerate(mapper.mapped):
         view = mapper.views[i]
-        view.expect(DepthSearch(*depths.limits[n].tolist()))
+        view.search = DepthSearch(*depths.limits[n].tolist())
         depth, confidence = depths.depth[n].to(device), depths.confidence[n].to(device)
         median = depths.depth[n].median()
-        view.set_depth(DenseDepth(depth, confidence, median), mapper.cameras)
+        mapper.pool.set_depth(i, DenseDepth(depth, confidence, median))
     mapper.choose_partners()
     mapper.trained = state.trained
     optimizer = mapper.optimizer

@@ -42,6 +42,10 @@ class RenderOutput:
     visible: Bool[Tensor, "n"]
     """Disks blended into at least one pixel of any view."""
 
+    def shown_depth(self, min_alpha: float) -> Float[Tensor, "*b h w"]:
+        """Depth where the map is opaque enough to hide what lies behind, else 0."""
+        return torch.where(self.alpha.detach() > min_alpha, self.depth, 0.0)
+
 
 def render(
     disks: GaussianMap | DiskParameters,

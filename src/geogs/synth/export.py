@@ -7,13 +7,11 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Float32
-from plyfile import PlyData, PlyElement
 
 from geogs.errors import InputError, OutputError
 from geogs.geometry.camera import Camera
 from geogs.io.writers.atomic import atomic_file, prepare_output_folder, write_text
-from geogs.io.writers.ply import write_mesh
+from geogs.io.writers.ply import write_mesh, write_points
 from geogs.synth.raycast import Raycaster, View
 from geogs.synth.room import make_room
 from geogs.synth.tessellation import SeenSurface, scene_mesh
@@ -79,7 +77,7 @@ def write_sequence(
         for index, view in enumerate(views):
             seen.add(view.depth, trajectory[index])
             on_frame(index)
-    _write_points(folder / "points_seen_1cm.ply", seen.points)
+    write_points(folder / "points_seen_1cm.ply", seen.points)
 
 
 def _write_view(results: Path, index: int, view: View, image_format: str, depth: bool) -> None:
@@ -116,12 +114,6 @@ def _write_camera(path: Path, camera: Camera, seed: int) -> None:
         "scene": f"procedural room, seed {seed}",
     }
     write_text(path, json.dumps(parameters, indent=1) + "\n")
-
-
-def _write_points(path: Path, points: Float32[np.ndarray, "n 3"]) -> None:
-    rows = np.ascontiguousarray(points).view([("x", "f4"), ("y", "f4"), ("z", "f4")])[:, 0]
-    with atomic_file(path) as stream:
-        PlyData([PlyElement.describe(rows, "vertex")]).write(stream)
 
 
 def _encode(path: Path, camera: Camera, views: Iterator[View]) -> Iterator[View]:

@@ -19,7 +19,9 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from geogs.bundle.dense import BundleProblem, linearise, relative_motion, robust_weight
+from geogs.bundle.linearise import robust_weight
+from geogs.bundle.problem import BundleProblem
+from geogs.bundle.projection import linearise, relative_motion
 from geogs.config import PriorConfig
 from geogs.keyframes.grid import SampleGrid
 

@@ -8,16 +8,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from geogs.bundle.dense import (
-    BundleOptions,
-    BundleProblem,
-    BundleResult,
-    bundle_solver,
-    project,
-    relative_motion,
-)
-from geogs.bundle.streamed import StreamedBundle, StreamedProblem
-from geogs.keyframes.store import KeyframeStore
+from geogs.bundle.base import BundleOptions, BundleResult
+from geogs.bundle.problem import BundleProblem, StreamedProblem
+from geogs.bundle.projection import project, relative_motion
+from geogs.bundle.select import bundle_solver
+from geogs.bundle.streamed import StreamedBundle
+from geogs.keyframes.store import Segment
 from geogs.threads import thread_map
 from geogs.tracking.flow.base import FlowMatch, FlowOperator
 from geogs.tracking.packed_edge import PackedEdge, packed_reprojections
@@ -59,7 +55,7 @@ Edge = MeasuredEdge | PackedEdge
 class FrameGraph:
     """Pairs of keyframes with their flow in both directions."""
 
-    def __init__(self, keyframes: KeyframeStore, operator: FlowOperator) -> None:
+    def __init__(self, keyframes: Segment, operator: FlowOperator) -> None:
         self.keyframes = keyframes
         self.operator = operator
         self.edges: dict[Pair, Edge] = {}
@@ -93,7 +89,7 @@ class FrameGraph:
             return self.keyframes.grid.pixels.new_zeros(0, self.keyframes.grid.size, 2)
         store = self.keyframes
         if store.grid.on_gpu:
-            from geogs.bundle.cuda.graph import DirectedPairs
+            from geogs.bundle.cuda.pairs import DirectedPairs
 
             return DirectedPairs.of(store, directed).project()
         source, target = (store.poses([e[k] for e in directed]) for k in (0, 1))
@@ -171,7 +167,7 @@ class FrameGraph:
         before = _reprojections([self.edges[e] for e in directed])
         weight = torch.stack([self.edges[e].weight for e in directed])
         if self.keyframes.grid.on_gpu:
-            from geogs.bundle.cuda.graph import DirectedPairs
+            from geogs.bundle.cuda.pairs import DirectedPairs
 
             return DirectedPairs.of(self.keyframes, directed).moved(before, weight)
         moved = (self.reprojections(directed) - before).norm(dim=-1)

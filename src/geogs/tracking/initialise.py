@@ -14,11 +14,11 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from geogs.bundle.dense import BundleOptions
+from geogs.bundle.base import BundleOptions
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_inverse
 from geogs.keyframes.grid import SampleGrid
-from geogs.keyframes.store import KeyframeStore
+from geogs.keyframes.store import Segment
 from geogs.threads import thread_map
 from geogs.tracking.flow.base import FlowMatch
 from geogs.tracking.graph import FrameGraph
@@ -128,7 +128,7 @@ def two_view(camera: Camera, match: FlowMatch) -> TwoView | None:
     return TwoView(torch.from_numpy(T), depth, known, float(parallax))
 
 
-def _place_all(store: KeyframeStore, flows: list[FlowMatch], best: tuple[int, TwoView]) -> None:
+def _place_all(store: Segment, flows: list[FlowMatch], best: tuple[int, TwoView]) -> None:
     """Poses by PnP on the first keyframe's depth, depths by carrying it over."""
     chosen, view = best
     states = list(store)
@@ -162,7 +162,7 @@ def _polish(graph: FrameGraph, radius: int, rounds: int = 6) -> bool:
     return True
 
 
-def normalise(store: KeyframeStore) -> None:
+def normalise(store: Segment) -> None:
     """Move the first pose to the identity and scale so that the median depth is one unit."""
     origin = se3_inverse(next(iter(store)).T_cw)
     for state in store:

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from geogs.config import PriorConfig
 from geogs.keyframes.grid import OFFSET, STRIDE, SampleGrid
-from geogs.keyframes.store import KeyframePrior, KeyframeState
+from geogs.keyframes.keyframe import Keyframe, KeyframePrior
 from geogs.priors.alignment import align_inverse_depth
 from geogs.priors.base import MonocularPrior
 from geogs.tracking.depth_prior import FlowEvidence, adjust_depth, flow_evidence
@@ -32,13 +32,13 @@ class KeyframePriors:
         self.config = config
         self._warned = False
 
-    def ask(self, state: KeyframeState) -> None:
+    def ask(self, state: Keyframe) -> None:
         """Let the prior look at a new keyframe."""
         if self.prior is None:
             return
         maps, grid = self.prior.predict(state.image), self.graph.keyframes.grid
         if maps.normal is not None:
-            state.normal = self._facing(maps.normal.cpu())
+            state.picture.normal = self._facing(maps.normal.cpu())
         if maps.depth is not None and self.config.depth:
             values = on_cells(grid, maps.depth.to(grid.device))
             zero = torch.zeros_like(values)

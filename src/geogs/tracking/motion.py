@@ -10,11 +10,11 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from geogs.bundle.dense import project
-from geogs.bundle.motion_only import solve_poses
+from geogs.bundle.motion import solve_poses
+from geogs.bundle.projection import project
 from geogs.geometry.lie import se3_inverse
 from geogs.keyframes.grid import SampleGrid
-from geogs.keyframes.store import KeyframeState
+from geogs.keyframes.keyframe import Keyframe
 from geogs.tracking.flow.base import FlowMatch, FlowOperator
 
 FIT_ITERATIONS = 6
@@ -65,7 +65,7 @@ class FrameLocator:
         self.max_residual = max_residual
 
     def locate(
-        self, keyframe: KeyframeState, encoded: Any, T_guess: Float[Tensor, "4 4"]
+        self, keyframe: Keyframe, encoded: Any, T_guess: Float[Tensor, "4 4"]
     ) -> FrameMotion | None:
         """Pose of a frame that is near ``T_guess``; None if too little agrees with any pose."""
         forward, backward = all_reprojections(self.grid, [keyframe], [T_guess])
@@ -74,7 +74,7 @@ class FrameLocator:
         )
         return self._solve(keyframe, there, T_guess)
 
-    def relocate(self, keyframe: KeyframeState, encoded: Any) -> FrameMotion | None:
+    def relocate(self, keyframe: Keyframe, encoded: Any) -> FrameMotion | None:
         """Pose of a frame about which nothing is known, by flow from a cold start and PnP."""
         there, _ = self.operator.measure([keyframe.encoded], [encoded], fine=False)
         good = there.sure()[0] & (keyframe.information > 0)
@@ -83,7 +83,7 @@ class FrameLocator:
             return None
         return self.locate(keyframe, encoded, T_rel.to(keyframe.T_cw) @ keyframe.T_cw)
 
-    def relocate_any(self, keyframes: Sequence[KeyframeState], encoded: Any) -> FrameMotion | None:
+    def relocate_any(self, keyframes: Sequence[Keyframe], encoded: Any) -> FrameMotion | None:
         """The first success of :meth:`relocate` over several keyframes."""
         for keyframe in keyframes:
             motion = self.relocate(keyframe, encoded)
@@ -92,7 +92,7 @@ class FrameLocator:
         return None
 
     def _solve(
-        self, keyframe: KeyframeState, match: FlowMatch, T_guess: Float[Tensor, "4 4"]
+        self, keyframe: Keyframe, match: FlowMatch, T_guess: Float[Tensor, "4 4"]
     ) -> FrameMotion | None:
         fit = self._fit_on_gpu if self.grid.on_gpu else self._fit
         motion = fit(keyframe, match, T_guess)
@@ -101,7 +101,7 @@ class FrameLocator:
         return motion if motion.residual < self.max_residual else None
 
     def _fit_on_gpu(
-        self, keyframe: KeyframeState, match: FlowMatch, T_guess: Float[Tensor, "4 4"]
+        self, keyframe: Keyframe, match: FlowMatch, T_guess: Float[Tensor, "4 4"]
     ) -> FrameMotion | None:
         from geogs.bundle.cuda.motion import fit_frame
 
@@ -122,7 +122,7 @@ class FrameLocator:
         return FrameMotion(keyframe.id, T, match, flow, agree, residual)
 
     def _fit(
-        self, keyframe: KeyframeState, match: FlowMatch, T_guess: Float[Tensor, "4 4"]
+        self, keyframe: Keyframe, match: FlowMatch, T_guess: Float[Tensor, "4 4"]
     ) -> FrameMotion | None:
         weight = match.weight * (keyframe.information > 0)[:, None]
         used = weight[0, :, 0] > 0
@@ -200,7 +200,7 @@ def filled_flow(grid: SampleGrid, match: FlowMatch) -> Float[Tensor, "p 2"]:
 
 
 def all_reprojections(
-    grid: SampleGrid, keyframes: Sequence[KeyframeState], T_cw: Sequence[Float[Tensor, "4 4"]]
+    grid: SampleGrid, keyframes: Sequence[Keyframe], T_cw: Sequence[Float[Tensor, "4 4"]]
 ) -> tuple[Float[Tensor, "e p 2"], Float[Tensor, "e p 2"]]:
     """:func:`both_reprojections` of several pairs of a keyframe and a frame."""
     if not grid.on_gpu:
@@ -223,7 +223,7 @@ def all_reprojections(
 
 
 def both_reprojections(
-    grid: SampleGrid, keyframe: KeyframeState, T_cw: Float[Tensor, "4 4"]
+    grid: SampleGrid, keyframe: Keyframe, T_cw: Float[Tensor, "4 4"]
 ) -> tuple[Float[Tensor, "p 2"], Float[Tensor, "p 2"]]:
     """Cells of the keyframe in a frame at ``T_cw``, and cells of that frame in the keyframe.
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_inverse
-from geogs.keyframes.store import KeyframeStore
+from geogs.keyframes.store import Segment
 
 TILES = 4, 6
 """Rows and columns of tiles into which the cells of a keyframe are grouped."""
@@ -29,7 +29,7 @@ class _Spheres:
 
 
 def may_overlap(
-    store: KeyframeStore, source: Sequence[int], target: Sequence[int], least: float, step: int
+    store: Segment, source: Sequence[int], target: Sequence[int], least: float, step: int
 ) -> Bool[np.ndarray, "n m"]:
     """False where no more than ``least`` of every ``step``-th cell of a source falls into a target.
 
@@ -48,7 +48,7 @@ def may_overlap(
     return out
 
 
-def _spheres(store: KeyframeStore, ids: Sequence[int], step: int) -> _Spheres:
+def _spheres(store: Segment, ids: Sequence[int], step: int) -> _Spheres:
     grid = store.grid
     rows, columns = torch.arange(0, grid.height, step), torch.arange(0, grid.width, step)
     tile = (rows * TILES[0] // grid.height)[:, None] * TILES[1] + columns * TILES[1] // grid.width

@@ -8,11 +8,11 @@ import torch
 from jaxtyping import Float, Float16, Int16
 from torch import Tensor
 
-from geogs.bundle.dense import project
+from geogs.bundle.projection import project
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_inverse
 from geogs.keyframes.grid import SampleGrid
-from geogs.keyframes.store import KeyframeState
+from geogs.keyframes.keyframe import Keyframe
 from geogs.tracking.flow.base import FlowMatch
 
 MAX_WEIGHT = 6e4
@@ -48,8 +48,8 @@ class PackedEdge:
     def all_of(
         match: FlowMatch,
         grid: SampleGrid,
-        source: Sequence[KeyframeState],
-        target: Sequence[KeyframeState],
+        source: Sequence[Keyframe],
+        target: Sequence[Keyframe],
     ) -> list["PackedEdge"]:
         """The edges of a measurement that started from the present state."""
         position, half_weight = pack_matches(grid, match.pixels, match.weight)

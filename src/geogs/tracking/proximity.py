@@ -7,8 +7,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from geogs.bundle.dense import project, relative_motion
-from geogs.keyframes.store import KeyframeStore
+from geogs.bundle.projection import project, relative_motion
+from geogs.keyframes.store import Segment
 from geogs.threads import thread_map
 from geogs.tracking.overlap import may_overlap
 
@@ -21,7 +21,7 @@ LEAST_OVERLAP = 0.2
 
 
 def frame_distances(
-    store: KeyframeStore, directed: Sequence[Pair], rotation_weight: float = 0.3, step: int = 2
+    store: Segment, directed: Sequence[Pair], rotation_weight: float = 0.3, step: int = 2
 ) -> Float[Tensor, "e"]:
     """DROID-SLAM's distance of directed keyframe pairs in pixels; infinite at little overlap.
 
@@ -33,7 +33,7 @@ def frame_distances(
     if not directed:
         return grid.pixels.new_zeros(0)
     if grid.on_gpu:
-        from geogs.bundle.cuda.graph import DirectedPairs
+        from geogs.bundle.cuda.pairs import DirectedPairs
 
         return DirectedPairs.of(store, directed).distances(rotation_weight, step)
     keep = torch.zeros(grid.height, grid.width, dtype=torch.bool, device=grid.device)
@@ -59,7 +59,7 @@ def frame_distances(
 
 
 def proximity_pairs(
-    store: KeyframeStore,
+    store: Segment,
     later: Sequence[int],
     earlier: Sequence[int],
     existing: Iterable[Pair],
@@ -105,7 +105,7 @@ def proximity_pairs(
 
 
 def _by_distance(
-    store: KeyframeStore,
+    store: Segment,
     rows: Int[np.ndarray, "r"],
     columns: Int[np.ndarray, "c"],
     wanted: Bool[np.ndarray, "r c"],

@@ -1,6 +1,6 @@
 """Stretches of video that no motion links: each tracked on its own until one place joins them."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -9,18 +9,16 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from geogs.errors import TrackingLost
-from geogs.geometry.lie import sim3_scale
-from geogs.keyframes.store import KeyframeStore
 from geogs.tracking.motion import Recognition
 from geogs.tracking.tracker import Tracker, TrackResult, TrackState
-from geogs.types import Frame, Keyframe, PoseCorrection, Trajectory
+from geogs.types import Frame, Trajectory
 
 Recall = Callable[[UInt8[np.ndarray, "h w 3"]], Sequence[Recognition]]
 """Recognises keyframes of any segment in an image; most alike first."""
 
 
 @dataclass(frozen=True)
-class Segment:
+class SegmentFate:
     """What became of one stretch of video."""
 
     first_time: float
@@ -51,7 +49,7 @@ class Segments:
         """Where the camera is."""
         self.trackers = [self.world]
         """The world and the segments that are apart, earliest first."""
-        self._joined: list[Segment] = []
+        self._joined: list[SegmentFate] = []
 
     # --- reading ---------------------------------------------------------------------------
 
@@ -65,27 +63,19 @@ class Segments:
         """Ids of the world's keyframes whose poses the local adjustment moves, earliest first."""
         return self.world.active
 
-    def keyframe(self, id: int) -> Keyframe:
-        """Present state of one of the world's keyframes."""
-        return self.world.keyframe(id)
-
     def tracker_of(self, id: int) -> Tracker:
         """The tracker that holds a keyframe. Raises KeyError if none does."""
         for tracker in self.trackers:
-            if id in tracker.store:
+            if id in tracker.keyframes:
                 return tracker
         raise KeyError(id)
-
-    def store_of(self, id: int) -> KeyframeStore:
-        """The keyframes among which one is. Raises KeyError if it is nowhere."""
-        return self.tracker_of(id).store
 
     def trajectory(self) -> Trajectory:
         """Poses of all frames seen so far; those of segments apart count as not tracked."""
         apart = [t.recorder for t in self.trackers if t is not self.world]
         return self.world.trajectory([r for recorder in apart for r in recorder.records])
 
-    def summary(self) -> list[Segment]:
+    def summary(self) -> list[SegmentFate]:
         """All segments so far that were started, earliest first."""
         present = [
             _segment(t, "world" if t is self.world else "apart")
@@ -96,17 +86,13 @@ class Segments:
 
     # --- writing ---------------------------------------------------------------------------
 
-    def write_back(self, poses: Mapping[int, Float[Tensor, "4 4"]]) -> None:
-        """Take over poses of active keyframes that were refined elsewhere."""
-        self.world.write_back(poses)
-
     def join(self, host: Tracker, guest: Tracker, S: Float[Tensor, "4 4"]) -> tuple[int, ...]:
         """Make a segment part of another, given the Sim(3) from the host's world to the guest's.
 
         Returns the ids of the guest's keyframes that were final.
         """
         self._joined.append(_segment(guest, "joined"))
-        guest.correct(moved(guest.store, S))
+        guest.keyframes.correct(guest.keyframes.moved(S))
         final = guest.finalized
         host.absorb(guest)
         self.trackers.remove(guest)
@@ -165,7 +151,7 @@ class Segments:
                 if len(self.trackers) == 1:
                     raise
                 self._drop(tracker)
-        largest = max(finals, key=lambda t: len(t.store))
+        largest = max(finals, key=lambda t: len(t.keyframes))
         if largest is self.world:
             return finals[largest]
         self.world = largest
@@ -205,17 +191,6 @@ class Segments:
         return TrackResult(result.state, apart=result.finalized)
 
 
-def moved(store: KeyframeStore, S: Float[Tensor, "4 4"]) -> PoseCorrection:
-    """The correction that takes keyframes to another world, given the Sim(3) from it to theirs."""
-    scale = float(sim3_scale(S))
-    before = {k: store[k].T_cw.clone() for k in store.ids}
-    after = {}
-    for k, T in before.items():
-        after[k] = T @ S.to(T)
-        after[k][:3] /= scale
-    return PoseCorrection(before, after, dict.fromkeys(before, scale))
-
-
-def _segment(tracker: Tracker, fate: Literal["world", "joined", "apart"]) -> Segment:
+def _segment(tracker: Tracker, fate: Literal["world", "joined", "apart"]) -> SegmentFate:
     times = [r.timestamp for r in tracker.recorder.records]
-    return Segment(min(times), max(times), len(tracker.store), fate)
+    return SegmentFate(min(times), max(times), len(tracker.keyframes), fate)

@@ -40,16 +40,16 @@ class StartUp:
         config: TrackingConfig,
     ) -> None:
         self.graph, self.recorder, self.priors, self.config = graph, recorder, priors, config
-        self.store = graph.keyframes
-        camera = self.store.grid.camera
+        self.keyframes = graph.keyframes
+        camera = self.keyframes.grid.camera
         self._long_edge = max(camera.width, camera.height)
-        self._chain = FlowChain(self.store.grid, graph.operator)
+        self._chain = FlowChain(self.keyframes.grid, graph.operator)
         self._misses = 0
 
     def take(self, frame: Frame, encoded: Any) -> StartStep:
         """Take the next frame."""
-        if len(self.store):
-            last = list(self.store)[-1]
+        if len(self.keyframes):
+            last = list(self.keyframes)[-1]
             match = self._chain.follow(last.encoded, encoded)
             if match.matched < self.config.min_matched:
                 return self._miss(frame, encoded)
@@ -62,20 +62,20 @@ class StartUp:
 
     def finish(self) -> bool:
         """Start with what there is; False if that cannot be."""
-        if len(self.store) < MIN_KEYFRAMES:
+        if len(self.keyframes) < MIN_KEYFRAMES:
             return False
         edge = self._long_edge
         if not initialise(self.graph, self.config.min_parallax * edge, self.config.radius):
             return False
-        self.priors.adjust(self.store.ids, self.config.huber)
+        self.priors.adjust(self.keyframes.ids, self.config.huber)
         self.recorder.anchor_to_keyframes()
         return True
 
     def why_not(self) -> str:
         """What to tell somebody whose video could not be started with."""
-        if not len(self.store):
+        if not len(self.keyframes):
             return "No frame has enough texture to be tracked; check exposure and focus."
-        if len(self.store) < MIN_KEYFRAMES:
+        if len(self.keyframes) < MIN_KEYFRAMES:
             return (
                 "The camera hardly moves (no parallax), so nothing can be reconstructed; "
                 "record a longer video in which the camera changes its place."
@@ -88,17 +88,17 @@ class StartUp:
     def _gather(self, frame: Frame, encoded: Any) -> StartStep:
         """Add a keyframe to those the map will be started from, and start it with enough."""
         eye = torch.eye(4, dtype=torch.float64)
-        state = self.store.add(frame.index, frame.timestamp, frame.image, encoded, eye)
+        state = self.keyframes.add(frame.index, frame.timestamp, frame.image, encoded, eye)
         self.priors.ask(state)
         self._chain.reset()
         self.recorder.add_keyframe(state.id)
-        if len(self.store) < max(self.config.init_keyframes, MIN_KEYFRAMES):
+        if len(self.keyframes) < max(self.config.init_keyframes, MIN_KEYFRAMES):
             return StartStep(is_keyframe=True)
         if self.finish():
             return StartStep(True, True)
         # More keyframes may bring parallax; with twice as many the first are given up.
-        full = len(self.store) >= 2 * self.config.init_keyframes
-        return StartStep(False, True, self._forget(len(self.store) // 2 * full))
+        full = len(self.keyframes) >= 2 * self.config.init_keyframes
+        return StartStep(False, True, self._forget(len(self.keyframes) // 2 * full))
 
     def _miss(self, frame: Frame, encoded: Any) -> StartStep:
         """The view changed at once: wait for it to come back, start with what there is, or anew."""
@@ -110,14 +110,14 @@ class StartUp:
         if self.finish():
             self.recorder.add_untracked(frame.index, frame.timestamp)
             return StartStep(True)
-        removed = self._forget(len(self.store))
+        removed = self._forget(len(self.keyframes))
         step = self._gather(frame, encoded)
         return StartStep(step.has_started, step.is_keyframe, removed)
 
     def _forget(self, count: int) -> tuple[int, ...]:
         """Drop the earliest keyframes of a start that failed."""
-        gone = tuple(self.store.ids[:count])
+        gone = tuple(self.keyframes.ids[:count])
         for id in gone:
             self.graph.remove_keyframe(id)
-            self.store.remove(id)
+            self.keyframes.remove(id)
         return gone

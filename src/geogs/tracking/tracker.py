@@ -1,6 +1,6 @@
 """The front end: frames in, keyframes with poses and inverse depth out."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Any
@@ -11,13 +11,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from geogs.bundle.dense import BundleOptions
+from geogs.bundle.base import BundleOptions
 from geogs.config import PriorConfig, TrackingConfig
-from geogs.errors import GeogsError, InputError, TrackingLost
+from geogs.errors import InputError, TrackingLost
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_inverse
 from geogs.keyframes.grid import SampleGrid
-from geogs.keyframes.store import KeyframeIds, KeyframeState, KeyframeStore, scaled
+from geogs.keyframes.keyframe import Keyframe
+from geogs.keyframes.store import KeyframeStore, scaled
 from geogs.priors.base import MonocularPrior
 from geogs.tracking.flow.base import FlowOperator
 from geogs.tracking.flow.select import build_operator
@@ -32,7 +33,7 @@ from geogs.tracking.motion import (
 from geogs.tracking.proximity import frame_distances, proximity_pairs
 from geogs.tracking.start_up import MIN_KEYFRAMES, StartUp
 from geogs.tracking.trajectory import FrameRecord, TrajectoryRecorder
-from geogs.types import Frame, Keyframe, PoseCorrection, Trajectory
+from geogs.types import Frame, Trajectory
 
 
 class TrackState(Enum):
@@ -62,6 +63,32 @@ class TrackResult:
     """Whether another segment became the world; what is final is all of it."""
 
 
+@dataclass(frozen=True)
+class LastFrame:
+    """Where the camera was last seen, relative to a keyframe, so that corrections carry it."""
+
+    keyframe: Keyframe
+    T_rel: Float[Tensor, "4 4"]
+    """Keyframe to this frame."""
+    velocity: Float[Tensor, "4 4"] | None
+    """Motion from the frame before; None where the camera had been lost."""
+    scale: float
+    """Of the keyframe when the two were measured."""
+
+    @property
+    def T_cw(self) -> Float[Tensor, "4 4"]:
+        """World to camera by the keyframe's present pose and scale."""
+        return self._present(self.T_rel) @ self.keyframe.T_cw
+
+    def predicted(self) -> Float[Tensor, "4 4"]:
+        """World to camera of the next frame if the motion goes on."""
+        return self.T_cw if self.velocity is None else self._present(self.velocity) @ self.T_cw
+
+    def _present(self, T: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:
+        factor = self.keyframe.scale / self.scale
+        return T if factor == 1.0 else scaled(T, factor)
+
+
 class Tracker:
     """Monocular tracking after DROID-SLAM: motion filter, frame graph, dense bundle adjustment."""
 
@@ -74,19 +101,18 @@ class Tracker:
         operator: FlowOperator | None = None,
         prior: MonocularPrior | None = None,
         prior_config: PriorConfig | None = None,
-        ids: KeyframeIds | None = None,
+        store: KeyframeStore | None = None,
     ) -> None:
+        """``store`` is where the keyframes are kept, in a segment of their own."""
         cv2.setRNGSeed(seed)
         self.camera = camera
         self.config = config or TrackingConfig()
-        self.grid = SampleGrid(camera, device)
+        self.grid = SampleGrid(camera, device) if store is None else store.grid
         self.operator = operator or build_operator(self.config, self.grid)
-        self.store = KeyframeStore(
-            self.grid, self.operator.encode, self.config.resident_keyframes, ids
-        )
-        self.graph = FrameGraph(self.store, self.operator)
+        self.keyframes = (store or KeyframeStore(self.grid, self.operator.encode)).new_segment()
+        self.graph = FrameGraph(self.keyframes, self.operator)
         self.priors = KeyframePriors(self.graph, prior, prior_config or PriorConfig())
-        self.recorder = TrajectoryRecorder(self.store, self.operator)
+        self.recorder = TrajectoryRecorder(self.keyframes, self.operator)
         self.state = TrackState.INITIALIZING
         edge = max(camera.width, camera.height)
         self._long_edge = edge
@@ -96,9 +122,7 @@ class Tracker:
         self._finalized: dict[int, None] = {}
         self._breaks: list[int] = []
         """Keyframes that no motion links to the one before them."""
-        self._last: tuple[int, Tensor] | None = None
-        """Pose of the last frame: a keyframe and the motion from it, so that corrections carry."""
-        self._velocity: Tensor | None = None
+        self._last: LastFrame | None = None
         self._start_up = StartUp(self.graph, self.recorder, self.priors, self.config)
         self._misses = 0
         self.frames_lost = 0
@@ -109,11 +133,7 @@ class Tracker:
     @property
     def keyframe_ids(self) -> list[int]:
         """Ids of all keyframes, earliest first; empty until the map has been started."""
-        return [] if self.state is TrackState.INITIALIZING else self.store.ids
-
-    def keyframe(self, id: int) -> Keyframe:
-        """Present state of a keyframe."""
-        return self.store.export(id)
+        return [] if self.state is TrackState.INITIALIZING else self.keyframes.ids
 
     @property
     def finalized(self) -> tuple[int, ...]:
@@ -138,47 +158,21 @@ class Tracker:
 
     # --- writing ---------------------------------------------------------------------------
 
-    def write_back(self, poses: Mapping[int, Float[Tensor, "4 4"]]) -> None:
-        """Take over poses (world to camera) that were refined elsewhere.
-
-        Raises GeogsError for a keyframe that is not active.
-        """
-        unknown = set(poses) - set(self.active)
-        if unknown:
-            raise GeogsError(f"Poses of keyframes {sorted(unknown)} are no longer free.")
-        for id, T in poses.items():
-            self.store[id].T_cw = T.to(self.store[id].T_cw)
-
-    def correct(self, correction: PoseCorrection) -> None:
-        """Take over poses and scales of a loop closure or another global correction.
-
-        What is known relative to a keyframe, such as where the last frame was, moves along.
-        """
-        for id, T in correction.after.items():
-            self.store[id].T_cw = T.to(self.store[id].T_cw)
-            self.store[id].rescale(1 / correction.scale.get(id, 1.0))
-        self.recorder.rescale(correction.scale)
-        if self._last is not None:
-            scale = 1 / correction.scale.get(self._last[0], 1.0)
-            self._last = (self._last[0], scaled(self._last[1], scale))
-            if self._velocity is not None:
-                self._velocity = scaled(self._velocity, scale)
-
     def absorb(self, other: "Tracker") -> None:
         """Take over the keyframes and frames of another tracker, already in this one's world.
 
         The camera is where the later of the two saw it last. The other is of no more use.
         """
-        if other.store.ids[0] > self.store.ids[0]:
-            self._breaks.append(other.store.ids[0])
-        after = [k for k in self.store.ids if k > other.store.ids[-1]]
+        if other.keyframes.ids[0] > self.keyframes.ids[0]:
+            self._breaks.append(other.keyframes.ids[0])
+        after = [k for k in self.keyframes.ids if k > other.keyframes.ids[-1]]
         self._breaks = sorted({*self._breaks, *other._breaks, *after[:1]})
-        if other.store.ids[-1] > self.store.ids[-1]:
+        if other.keyframes.ids[-1] > self.keyframes.ids[-1]:
             self.state, self._misses = other.state, other._misses
-            self._last, self._velocity = other._last, other._velocity
+            self._last = other._last
             self.frames_lost = other.frames_lost
         self._finalized = dict.fromkeys(sorted([*self._finalized, *other._finalized]))
-        self.store.absorb(other.store)
+        self.keyframes.absorb(other.keyframes)
         self.graph.edges = dict(sorted({**self.graph.edges, **other.graph.edges}.items()))
         self.recorder.absorb(other.recorder)
 
@@ -213,9 +207,9 @@ class Tracker:
         """
         encoded = self.operator.encode(frame.image)
         for place in places:
-            if place.keyframe not in self.store:
+            if place.keyframe not in self.keyframes:
                 continue
-            keyframe = self.store[place.keyframe]
+            keyframe = self.keyframes[place.keyframe]
             guess = place.T_rel.to(keyframe.T_cw) @ keyframe.T_cw
             motion = self._locator.locate(keyframe, encoded, guess)
             if motion is not None and motion.matched >= self.config.recognised:
@@ -226,7 +220,7 @@ class Tracker:
     def cut(self) -> None:
         """No motion links the next frame to those before it; the camera has to be found anew."""
         if self.state is not TrackState.INITIALIZING:
-            self.state, self._velocity = TrackState.LOST, None
+            self._lost()
 
     def finish(self) -> TrackResult:
         """End of the stream: every keyframe becomes final.
@@ -237,8 +231,8 @@ class Tracker:
             if not self._start_up.finish():
                 raise TrackingLost(self._start_up.why_not())
             self._begin()
-        fresh = self._finalise(self.store.ids)
-        self.recorder.finalise(self.store.ids[-1], None)
+        fresh = self._finalise(self.keyframes.ids)
+        self.recorder.finalise(self.keyframes.ids[-1], None)
         return TrackResult(self.state, None, fresh, ())
 
     def _start(self, frame: Frame, encoded: Any) -> TrackResult:
@@ -246,64 +240,79 @@ class Tracker:
         if not step.has_started:
             return TrackResult(self.state, removed=step.removed)
         self._begin()
-        newest = self.store.ids[-1] if step.is_keyframe else None
-        fresh = self._finalise(self.store.ids[:-1])
+        newest = self.keyframes.ids[-1] if step.is_keyframe else None
+        fresh = self._finalise(self.keyframes.ids[:-1])
         return TrackResult(self.state, newest, fresh, self.active, step.removed)
 
     def _begin(self) -> None:
         self.state = TrackState.TRACKING
-        self._last = (self.store.ids[-1], torch.eye(4, dtype=torch.float64))
+        self._seen_at(self.keyframes[self.keyframes.ids[-1]])
 
     # --- with a map ------------------------------------------------------------------------
 
     def _locate(self, encoded: Any) -> FrameMotion | None:
-        motion = None
-        before = self._last_pose()
-        if self._last is not None and before is not None and self.state is TrackState.TRACKING:
-            last = self.store[self._last[0]]
-            guess = before if self._velocity is None else self._velocity @ before
-            motion = self._locator.locate(last, encoded, guess)
-            if motion is None and self._velocity is not None:
-                motion = self._locator.locate(last, encoded, before)
+        motion, last = None, self._last
+        if last is not None and self.state is TrackState.TRACKING:
+            motion = self._locator.locate(last.keyframe, encoded, last.predicted())
+            if motion is None and last.velocity is not None:
+                motion = self._locator.locate(last.keyframe, encoded, last.T_cw)
         if motion is None:
             motion = self._locator.relocate_any(self._places(), encoded)
         return motion
 
-    def _last_pose(self) -> Float[Tensor, "4 4"] | None:
-        return None if self._last is None else self._last[1] @ self.store[self._last[0]].T_cw
+    def _lost(self) -> None:
+        self.state = TrackState.LOST
+        if self._last is not None:
+            self._last = replace(self._last, velocity=None)
 
-    def _places(self) -> list[KeyframeState]:
+    def _seen_at(
+        self,
+        keyframe: Keyframe,
+        T_rel: Float[Tensor, "4 4"] | None = None,
+        velocity: Float[Tensor, "4 4"] | None = None,
+    ) -> None:
+        """Note where the last frame was: relative to a keyframe, or at it."""
+        T_rel = torch.eye(4, dtype=torch.float64) if T_rel is None else T_rel
+        self._last = LastFrame(keyframe, T_rel, velocity, keyframe.scale)
+
+    def _places(self) -> list[Keyframe]:
         """Where to look for a lost camera: recent keyframes, and older ones in turn."""
-        count, states = self.config.relocalise, list(self.store)
+        count, states = self.config.relocalise, list(self.keyframes)
         recent, older = states[: -count - 1 : -1], states[:-count]
         turn = (self._misses * count) % max(len(older), 1)
         return recent + (older[turn:] + older[:turn])[:count]
 
     def _lose(self, frame: Frame) -> TrackResult:
         if self.state is not TrackState.INITIALIZING:
-            self.state = TrackState.LOST
-            self._velocity = None
+            self._lost()
             self._misses += 1
         self.recorder.add_untracked(frame.index, frame.timestamp)
         return TrackResult(self.state, active=self.active)
 
     def _follow(self, frame: Frame, encoded: Any, motion: FrameMotion) -> TrackResult:
-        before = self._last_pose() if self.state is TrackState.TRACKING else None
-        self._velocity = None if before is None else motion.T_cw @ se3_inverse(before)
+        velocity = None
+        if self._last is not None and self.state is TrackState.TRACKING:
+            velocity = motion.T_cw @ se3_inverse(self._last.T_cw)
         if self.state is TrackState.LOST:
-            self._breaks.append(self.store.next_id)
+            self._breaks.append(self.keyframes.store.next_id)
         self.state, self._misses, self.frames_lost = TrackState.TRACKING, 0, 0
-        anchor = self.store[motion.keyframe]
+        anchor = self.keyframes[motion.keyframe]
         T_rel = motion.T_cw @ se3_inverse(anchor.T_cw)
-        self._last = (anchor.id, T_rel)
+        self._seen_at(anchor, T_rel, velocity)
         if motion.flow < self.config.keyframe_flow * self._long_edge:
             self.recorder.add(frame.index, frame.timestamp, encoded, anchor.id, T_rel, motion.match)
             return TrackResult(self.state, active=self.active)
-        return self._insert(frame, encoded, motion)
+        return self._insert(frame, encoded, motion, velocity)
 
-    def _insert(self, frame: Frame, encoded: Any, motion: FrameMotion) -> TrackResult:
-        anchor = self.store[motion.keyframe]
-        state = self.store.add(frame.index, frame.timestamp, frame.image, encoded, motion.T_cw)
+    def _insert(
+        self,
+        frame: Frame,
+        encoded: Any,
+        motion: FrameMotion,
+        velocity: Float[Tensor, "4 4"] | None,
+    ) -> TrackResult:
+        anchor = self.keyframes[motion.keyframe]
+        state = self.keyframes.add(frame.index, frame.timestamp, frame.image, encoded, motion.T_cw)
         self.priors.ask(state)
         T = motion.T_cw @ se3_inverse(anchor.T_cw)
         state.inverse_depth, state.information = transfer_depth(
@@ -313,15 +322,15 @@ class Tracker:
         self._connect(state.id, anchor.id)
         self._adjust_locally()
         removed = self._cull()
-        self._last = (state.id, torch.eye(4).to(state.T_cw))
-        fresh = self._finalise(self.store.ids[:-1])
+        self._seen_at(state, velocity=velocity)
+        fresh = self._finalise(self.keyframes.ids[:-1])
         return TrackResult(self.state, state.id, fresh, self.active, removed)
 
     def _connect(self, id: int, anchor: int) -> None:
         """Measure a new keyframe against the one it was located at, and its neighbours."""
-        c, ids = self.config, self.store.ids
+        c, ids = self.config, self.keyframes.ids
         pairs = proximity_pairs(
-            self.store,
+            self.keyframes,
             [id],
             ids[-c.proximity_window : -1],
             self.graph.pairs,
@@ -332,13 +341,13 @@ class Tracker:
         )
         # Neighbours in time are none where the camera was lost in between.
         broken = [p for p in pairs if any(p[0] < b <= p[1] for b in self._breaks)]
-        there, back = frame_distances(self.store, broken + [p[::-1] for p in broken]).chunk(2)
+        there, back = frame_distances(self.keyframes, broken + [p[::-1] for p in broken]).chunk(2)
         apart = {p for p, d in zip(broken, (there + back).tolist(), strict=True) if d == torch.inf}
         pairs = [p for p in pairs if p not in apart]
         self.graph.measure({*pairs, (anchor, id)}, fine=False)
 
     def _adjust_locally(self) -> None:
-        c, ids = self.config, self.store.ids
+        c, ids = self.config, self.keyframes.ids
         poses = [k for k in ids[-c.window :] if k != ids[0]]
         depths = ids[-max(c.window, c.depth_window) :]
         moving, deep = set(poses), set(depths)
@@ -356,15 +365,15 @@ class Tracker:
 
     def _cull(self) -> tuple[int, ...]:
         """Remove the keyframe before the last if it adds little (DROID-SLAM's keyframe test)."""
-        ids = self.store.ids
+        ids = self.keyframes.ids
         if len(ids) <= MIN_KEYFRAMES or ids[-2] in self._finalized:
             return ()
         before, id = ids[-3], ids[-2]
-        distance = frame_distances(self.store, [(before, id), (id, before)]).mean()
+        distance = frame_distances(self.keyframes, [(before, id), (id, before)]).mean()
         if float(distance) >= self.config.cull_distance * self._long_edge:
             return ()
         self.graph.remove_keyframe(id)
-        self.recorder.keyframe_removed(self.store.remove(id), before)
+        self.recorder.keyframe_removed(self.keyframes.remove(id), before)
         return (id,)
 
     def _finalise(self, ids: list[int]) -> tuple[int, ...]:

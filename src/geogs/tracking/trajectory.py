@@ -1,7 +1,7 @@
 """The pose of every frame, solved at the end from sparse flow kept along the way."""
 
 from bisect import bisect_left
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -10,11 +10,12 @@ import torch
 from jaxtyping import Bool, Float, Float16, Int16
 from torch import Tensor
 
-from geogs.bundle.dense import linearise
-from geogs.bundle.motion_only import solve_poses
+from geogs.bundle.motion import solve_poses
+from geogs.bundle.projection import linearise
 from geogs.geometry.lie import retract, se3_inverse, se3_log
 from geogs.keyframes.grid import SampleGrid
-from geogs.keyframes.store import KeyframeState, KeyframeStore, scaled
+from geogs.keyframes.keyframe import Keyframe
+from geogs.keyframes.store import Segment, scaled
 from geogs.tracking.flow.base import FlowMatch, FlowOperator
 from geogs.tracking.motion import all_reprojections
 from geogs.tracking.packed_edge import pack_matches, unpacked_positions
@@ -40,6 +41,8 @@ class FrameRecord:
     """Keyframe that the pose is relative to; None where the frame was not tracked."""
     T_rel: Float[Tensor, "4 4"]
     """Anchor keyframe to this frame."""
+    scale: float = 1.0
+    """Of the anchor when that was measured."""
     observations: list[Observation] = field(default_factory=list)
 
     def sees(self, keyframe: int) -> bool:
@@ -60,8 +63,8 @@ class TrajectoryRecorder:
     is measured and every second cell of it is kept.
     """
 
-    def __init__(self, store: KeyframeStore, operator: FlowOperator, max_pending: int = 64) -> None:
-        self.store, self.operator, self.max_pending = store, operator, max_pending
+    def __init__(self, store: Segment, operator: FlowOperator, max_pending: int = 64) -> None:
+        self.keyframes, self.operator, self.max_pending = store, operator, max_pending
         self.records: list[FrameRecord] = []
         self._pending: list[_Pending] = []
         self._subset = torch.nonzero(sparse_cells(store.grid))[:, 0]
@@ -81,7 +84,7 @@ class TrajectoryRecorder:
         match: FlowMatch | None = None,
     ) -> None:
         """A frame at ``T_rel`` from the anchor keyframe, with the flow that located it."""
-        record = FrameRecord(index, timestamp, anchor, T_rel)
+        record = FrameRecord(index, timestamp, anchor, T_rel, self.keyframes[anchor].scale)
         if match is not None:
             self._observe([(record, anchor)], match)
         self.records.append(record)
@@ -91,30 +94,25 @@ class TrajectoryRecorder:
 
     def add_keyframe(self, id: int) -> None:
         """A frame that is a keyframe."""
-        state = self.store[id]
+        state = self.keyframes[id]
         eye = torch.eye(4, dtype=torch.float64)
-        self.records.append(FrameRecord(state.frame_index, state.timestamp, id, eye))
+        self.records.append(FrameRecord(state.frame_index, state.timestamp, id, eye, state.scale))
 
-    def keyframe_removed(self, removed: KeyframeState, substitute: int) -> None:
+    def keyframe_removed(self, removed: Keyframe, substitute: int) -> None:
         """Make a culled keyframe an ordinary frame; frames anchored to it move to another one."""
-        base = removed.T_cw @ se3_inverse(self.store[substitute].T_cw)
+        base = removed.T_cw @ se3_inverse(self.keyframes[substitute].T_cw)
         # Frames are located from keyframes before them.
         for record in reversed(self.records):
             if record.index < removed.frame_index:
                 break
             if record.anchor == removed.id:
-                record.anchor, record.T_rel = substitute, record.T_rel @ base
+                T_rel = _at_scale(record, removed) @ base
+                record.anchor, record.T_rel = substitute, T_rel
+                record.scale = self.keyframes[substitute].scale
                 record.observations = [o for o in record.observations if o.keyframe != removed.id]
                 if record.index == removed.frame_index:
                     self._pending.append(_Pending(record, removed.encoded))
         self._pending.sort(key=lambda p: p.record.index)
-
-    def rescale(self, scale: Mapping[int, float]) -> None:
-        """Divide the lengths around keyframes by the given factors."""
-        for record in self.records:
-            factor = 1.0 if record.anchor is None else scale.get(record.anchor, 1.0)
-            if factor != 1.0:
-                record.T_rel = scaled(record.T_rel, 1 / factor)
 
     def absorb(self, other: "TrajectoryRecorder") -> None:
         """Take over the frames of another recorder, whose keyframes are now in this one's store."""
@@ -128,21 +126,21 @@ class TrajectoryRecorder:
 
     def anchor_to_keyframes(self) -> None:
         """Give the frames seen before the map was started a pose between their keyframes."""
-        states = list(self.store)
+        states = list(self.keyframes)
         indices = [s.frame_index for s in states]
         for record in self.records:
-            if record.anchor is None or record.anchor not in self.store:
+            if record.anchor is None or record.anchor not in self.keyframes:
                 continue
-            n = indices.index(self.store[record.anchor].frame_index)
+            n = indices.index(self.keyframes[record.anchor].frame_index)
             a, b = states[n], states[min(n + 1, len(states) - 1)]
             span = max(b.frame_index - a.frame_index, 1)
             share = (record.index - a.frame_index) / span
             xi = se3_log(b.T_cw @ se3_inverse(a.T_cw))
-            record.T_rel = retract(share * xi, torch.eye(4).to(xi))
+            record.T_rel, record.scale = retract(share * xi, torch.eye(4).to(xi)), a.scale
 
     def finalise(self, before: int, after: int | None) -> None:
         """Measure the waiting frames up to keyframe ``after`` against it and the one ``before``."""
-        end = None if after is None else self.store[after].frame_index
+        end = None if after is None else self.keyframes[after].frame_index
         ready = [p for p in self._pending if end is None or p.record.index < end]
         self._pending = [p for p in self._pending if end is not None and p.record.index >= end]
         jobs = [
@@ -151,16 +149,16 @@ class TrajectoryRecorder:
             for k in (before, after)
             if k is not None
             and p.record.anchor is not None
-            and p.record.anchor in self.store
+            and p.record.anchor in self.keyframes
             and not p.record.sees(k)
         ]
         for start in range(0, len(jobs), 8):
             self._measure(jobs[start : start + 8])
 
     def _measure(self, jobs: list[tuple[_Pending, int]]) -> None:
-        keyframes = [self.store[k] for _, k in jobs]
+        keyframes = [self.keyframes[k] for _, k in jobs]
         poses = [self._pose(p.record) for p, _ in jobs]
-        forward, backward = all_reprojections(self.store.grid, keyframes, poses)
+        forward, backward = all_reprojections(self.keyframes.grid, keyframes, poses)
         there, _ = self.operator.measure(
             [k.encoded for k in keyframes],
             [p.encoded for p, _ in jobs],
@@ -173,15 +171,16 @@ class TrajectoryRecorder:
     def _observe(self, jobs: list[tuple[FrameRecord, int]], match: FlowMatch) -> None:
         """Keep the matches of records with keyframes."""
         pixels, weight = match.pixels[:, self._subset], match.weight[:, self._subset]
-        position, half_weight = pack_matches(self.store.grid, pixels, weight)
+        position, half_weight = pack_matches(self.keyframes.grid, pixels, weight)
         for n, (record, keyframe) in enumerate(jobs):
             # Asking would wait for the GPU; an observation without weight does no harm.
-            if self.store.grid.on_gpu or bool((weight[n] > 0).any()):
+            if self.keyframes.grid.on_gpu or bool((weight[n] > 0).any()):
                 record.observations.append(Observation(keyframe, position[n], half_weight[n]))
 
     def _pose(self, record: FrameRecord) -> Float[Tensor, "4 4"]:
         assert record.anchor is not None, "a frame that was not tracked has no pose"
-        return record.T_rel @ self.store[record.anchor].T_cw
+        anchor = self.keyframes[record.anchor]
+        return _at_scale(record, anchor) @ anchor.T_cw
 
     def solve(self, apart: Sequence[FrameRecord] = (), chunk: int = 64) -> Trajectory:
         """Poses of all frames seen so far on the present keyframes, real timestamps.
@@ -190,8 +189,8 @@ class TrajectoryRecorder:
         neighbours.
         """
         records = sorted([*self.records, *apart], key=lambda r: r.index)
-        keyframes = {s.frame_index: s.id for s in self.store}
-        tracked = [r for r in records if r.anchor is not None and r.anchor in self.store]
+        keyframes = {s.frame_index: s.id for s in self.keyframes}
+        tracked = [r for r in records if r.anchor is not None and r.anchor in self.keyframes]
         free = [r for r in tracked if r.index not in keyframes and r.observations]
         solved: dict[int, Tensor] = {r.index: self._pose(r) for r in tracked}
         for start in range(0, len(free), chunk):
@@ -204,21 +203,21 @@ class TrajectoryRecorder:
         return Trajectory(timestamps, interpolate(timestamps, T_cw), known)
 
     def _solve_chunk(self, records: list[FrameRecord]) -> Float[Tensor, "n 4 4"]:
-        grid, cells = self.store.grid, self._subset
+        grid, cells = self.keyframes.grid, self._subset
         pairs = [
             (n, o)
             for n, r in enumerate(records)
             for o in r.observations
-            if o.keyframe in self.store
+            if o.keyframe in self.keyframes
         ]
         start = torch.stack([self._pose(r) for r in records])
         if not pairs:
             return start
         ids = [o.keyframe for _, o in pairs]
         frame = torch.tensor([n for n, _ in pairs])
-        depth = self.store.inverse_depths(ids)[:, cells]
-        information = self.store.informations(ids)[:, cells]
-        source = self.store.poses(ids)
+        depth = self.keyframes.inverse_depths(ids)[:, cells]
+        information = self.keyframes.informations(ids)[:, cells]
+        source = self.keyframes.poses(ids)
         weight = torch.stack([o.half_weight for _, o in pairs]).float()
         p = linearise(grid.camera, grid.rays[cells], start[frame] @ se3_inverse(source), depth)
         weight = depth_aware_weight(weight, p.depth_jacobian, information)
@@ -227,6 +226,12 @@ class TrajectoryRecorder:
             grid.camera, grid.rays[cells], start, depth, source, frame, pixels, weight, iterations=8
         )
         return T
+
+
+def _at_scale(record: FrameRecord, anchor: Keyframe) -> Float[Tensor, "4 4"]:
+    """Motion from the anchor to the frame at the anchor's present scale."""
+    factor = anchor.scale / record.scale
+    return record.T_rel if factor == 1.0 else scaled(record.T_rel, factor)
 
 
 def sparse_cells(grid: SampleGrid) -> Bool[Tensor, "p"]:

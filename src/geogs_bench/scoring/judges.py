@@ -12,10 +12,10 @@ from geogs.evaluation.object import MAX_DISTANCE, ObjectScores, evaluate_object
 from geogs.evaluation.surface import Surface, read_surface
 from geogs.evaluation.truth import silhouettes
 from geogs.io.sources.posed.sniff import open_posed_source
-from geogs_bench.comparison import Comparison
 from geogs_bench.record import SurfaceScore
 from geogs_bench.result import ResultFolder
 from geogs_bench.scene import Scene
+from geogs_bench.scoring.comparison import Comparison
 from geogs_bench.scoring.surface import read_true_surface, score_surface
 from geogs_bench.truth import read_true_poses
 

@@ -4,13 +4,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from geogs_bench.pictures import draw
 from geogs_bench.record import CurvePoint, PhotoScore, StageScore
 from geogs_bench.result import ResultFolder
 from geogs_bench.runner import Command
 from geogs_bench.scene import Scene
 from geogs_bench.scoring.judges import judge_of
 from geogs_bench.scoring.photo import score_photo
+from geogs_bench.scoring.pictures import draw
 from geogs_bench.scoring.posed import score_posed, score_snapshots
 from geogs_bench.scoring.slam import StageErrors, score_slam
 

@@ -7,10 +7,10 @@ import numpy as np
 from geogs.errors import InputError
 from geogs.evaluation.trajectory import TrajectoryErrors, evaluate_trajectory
 from geogs.types import Trajectory
-from geogs_bench.comparison import Comparison
 from geogs_bench.record import StageName, StageScore, SurfaceScore, TrajectoryScore
 from geogs_bench.result import ResultFolder
 from geogs_bench.scene import Scene
+from geogs_bench.scoring.comparison import Comparison
 from geogs_bench.scoring.surface import TrueSurface, read_true_surface, score_surface
 from geogs_bench.truth import read_true_poses
 

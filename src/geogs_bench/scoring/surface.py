@@ -11,9 +11,9 @@ from geogs.evaluation.reconstruction import ReconstructionScores, evaluate_recon
 from geogs.evaluation.surface import Surface, read_surface
 from geogs.evaluation.toolbox import evaluate_vertices
 from geogs.geometry.camera import Camera
-from geogs_bench.comparison import Comparison
 from geogs_bench.record import SurfaceScore
 from geogs_bench.scene import Truth
+from geogs_bench.scoring.comparison import Comparison
 from geogs_bench.scoring.tessellation import with_short_edges
 
 _CULLING_POSES = 200

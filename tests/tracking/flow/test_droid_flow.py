@@ -7,13 +7,10 @@ import pytest
 import torch
 
 from droid_state import public_state
-from geogs.bundle.dense import (
-    BundleOptions,
-    BundleProblem,
-    DenseBundle,
-    linearise,
-    relative_motion,
-)
+from geogs.bundle.base import BundleOptions
+from geogs.bundle.dense import DenseBundle
+from geogs.bundle.problem import BundleProblem
+from geogs.bundle.projection import linearise, relative_motion
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.keyframes.grid import SampleGrid
@@ -217,7 +214,7 @@ def test_half_precision_is_close(operator, start, monkeypatch):
 def test_the_graph_adjusts_what_the_operator_measures():
     """The whole way: memory, weights and damping through the graph into the adjustment."""
     operator = DroidFlow(GRID, narrow(delta=(0.0, 0.0)))
-    store = KeyframeStore(GRID)
+    store = KeyframeStore(GRID).new_segment()
     for k, T in enumerate(POSES):
         image, depth = render(T)
         state = store.add(

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from geogs.bundle.dense import project
+from geogs.bundle.projection import project
 from geogs.keyframes.grid import SampleGrid
 from geogs.tracking.flow.base import FlowMatch, FlowOperator
 from geogs.tracking.flow.classical import ClassicalFlow, match_deviation

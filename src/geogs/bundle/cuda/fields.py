@@ -10,7 +10,7 @@ from geogs.gpu.kernels import kernels_for
 from geogs.gpu.transfer import to_device
 from geogs.keyframes.grid import OFFSET, STRIDE, SampleGrid
 
-SOURCE = Path(__file__).with_name("bundle_grid.cu")
+SOURCE = Path(__file__).with_name("fields.cu")
 
 
 def _threads(grid: SampleGrid) -> int:

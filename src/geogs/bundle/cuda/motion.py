@@ -11,7 +11,7 @@ from geogs.gpu.kernels import kernels_for
 from geogs.gpu.transfer import to_device
 from geogs.keyframes.grid import SampleGrid
 
-SOURCE = Path(__file__).with_name("bundle_motion.cu")
+SOURCE = Path(__file__).with_name("motion.cu")
 
 
 def _threads(cells: int) -> int:
@@ -30,7 +30,7 @@ def solve_poses(
     iterations: int = 4,
     huber: float = 3.0,
 ) -> tuple[Float[Tensor, "n 4 4"], Float[Tensor, "e p 2"]]:
-    """Motion-only adjustment as ``geogs.bundle.motion_only.solve_poses``.
+    """Motion-only adjustment as ``geogs.bundle.motion.solve_poses``.
 
     Poses and ``frame`` may be on the CPU; poses are returned where they were given.
     """

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -10,22 +11,21 @@ from jaxtyping import Bool, Float, Float32
 from torch import Tensor
 
 from geogs.config import DepthConfig
+from geogs.depth.base import Limits, Progress, silent
 from geogs.depth.completion import complete_grid, edge_weights, known_cells
 from geogs.depth.cuda.check import check, vote
 from geogs.depth.cuda.completion import can_complete, complete
 from geogs.depth.cuda.images import KeyframeImages, homographies, image_pixels, upload
 from geogs.depth.cuda.refine import PixelPlaces, TrackerMaps, choose_start, judge, refine
 from geogs.depth.cuda.sweep import MAX_NEIGHBOURS, MAX_PLANES, PlaneSlots, sweep
-from geogs.depth.engine import Limits, Progress, silent
 from geogs.depth.evidence import prior_weight, relative_precision
 from geogs.depth.plane_sweep import sweep_planes
 from geogs.depth.sweep_neighbors import depth_range
 from geogs.depth.view import DenseDepth, DepthView, PosedDepth
 from geogs.geometry.camera import Camera
+from geogs.keyframes.swap import Swap
 from geogs.threads import worker_count
 
-# Keyframes whose images stay on the GPU, those used last.
-_RESIDENT = 128
 # Keyframes whose grids are completed at once.
 _BATCH = 32
 
@@ -47,18 +47,25 @@ class SearchPlan:
 class CudaDepthEngine:
     """The kernels of this package, keyframe by keyframe; small parts run in threads on the CPU.
 
-    The host does not wait for the GPU. Images of observed keyframes stay there.
+    The host does not wait for the GPU. Images of the ``resident`` keyframes used last stay there.
     """
 
     def __init__(
-        self, device: torch.device, render: Camera, working: Camera, config: DepthConfig
+        self,
+        device: torch.device,
+        render: Camera,
+        working: Camera,
+        config: DepthConfig,
+        resident: int,
     ) -> None:
         self.device = device
         self.render = render
         self.working = working
         self.config = config
         self._places = PixelPlaces.of(render, working, device)
-        self._images: dict[int, KeyframeImages] = {}
+        self._images: Swap[int, KeyframeImages] = Swap(
+            resident, lambda id, _: self._edges.pop(id, None)
+        )
         self._pixels: dict[int, Future[Float32[np.ndarray, "n"]]] = {}
         self._edges: dict[int, Future[Float32[np.ndarray, "gh gw"]]] = {}
         self._threads = ThreadPoolExecutor(worker_count())
@@ -90,7 +97,6 @@ class CudaDepthEngine:
             for i, grids in enumerate(evidence, start):
                 maps.append(self._search(references[i], usable[i], plans[i], grids))
                 progress(len(maps) / len(references))
-        self._forget()
         return _with_medians(maps)
 
     def check(
@@ -116,17 +122,12 @@ class CudaDepthEngine:
 
     def _images_of(self, view: DepthView) -> KeyframeImages:
         """The images on the GPU, brought there at their first use."""
-        images = self._images.pop(view.id, None)
-        if images is None:
-            pixels = self._pixels.pop(view.id).result()
-            images = KeyframeImages.of(view, self.device, pixels)
-        self._images[view.id] = images  # the last used comes last
-        return images
+        return self._images.get(view.id, partial(self._bring, view))
 
-    def _forget(self) -> None:
-        """Let go of the images that were not used for longest; they can be prepared again."""
-        for id in list(self._images)[:-_RESIDENT]:
-            del self._images[id], self._edges[id]
+    def _bring(self, view: DepthView) -> KeyframeImages:
+        prepared = self._pixels.pop(view.id, None)
+        pixels = None if prepared is None else prepared.result()
+        return KeyframeImages.of(view, self.device, pixels)
 
     def _plan(
         self, reference: DepthView, neighbours: list[DepthView], limits: Limits | None = None

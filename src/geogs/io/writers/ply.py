@@ -33,20 +33,24 @@ def write_mesh(
     normals: Float[np.ndarray, "n 3"] | None = None,
 ) -> None:
     """Write a triangle mesh as binary PLY, with RGB and normals at the vertices where given."""
-    columns = {axis: vertices[:, i].astype("<f4") for i, axis in enumerate("xyz")}
-    if normals is not None:
-        columns |= {f"n{axis}": normals[:, i].astype("<f4") for i, axis in enumerate("xyz")}
-    if colors is not None:
-        columns |= {name: colors[:, i] for i, name in enumerate(("red", "green", "blue"))}
     triangles = np.empty(len(faces), dtype=[("count", "u1"), ("corners", "<i4", (3,))])
     triangles["count"], triangles["corners"] = 3, faces
     _write(
         path,
         [
-            _element("vertex", columns),
+            _element("vertex", _points(vertices, colors, normals)),
             Element("face", triangles, ["list uchar int vertex_indices"]),
         ],
     )
+
+
+def write_points(
+    path: str | Path,
+    positions: Float[np.ndarray, "n 3"],
+    colors: UInt8[np.ndarray, "n 3"] | None = None,
+) -> None:
+    """Write a point cloud as binary PLY, with RGB where given."""
+    _write(path, [_element("vertex", _points(positions, colors))])
 
 
 def write_splats(path: str | Path, disks: MapSnapshot, colors: Float[np.ndarray, "n 3"]) -> None:
@@ -74,6 +78,19 @@ def write_splats(path: str | Path, disks: MapSnapshot, colors: Float[np.ndarray,
         **_columns(rotation, ("rot_0", "rot_1", "rot_2", "rot_3")),
     }
     _write(path, [_element("vertex", columns)])
+
+
+def _points(
+    positions: Float[np.ndarray, "n 3"],
+    colors: UInt8[np.ndarray, "n 3"] | None,
+    normals: Float[np.ndarray, "n 3"] | None = None,
+) -> dict[str, np.ndarray]:
+    columns = _columns(positions, ("x", "y", "z"))
+    if normals is not None:
+        columns |= _columns(normals, ("nx", "ny", "nz"))
+    if colors is not None:
+        columns |= {name: colors[:, i] for i, name in enumerate(("red", "green", "blue"))}
+    return columns
 
 
 def _columns(values: Float[np.ndarray, "n k"], names: tuple[str, ...]) -> dict[str, np.ndarray]:

@@ -18,9 +18,9 @@ from geogs.splat.cpu.layout import (
     TILE_WIDTH,
     WC,
 )
-from geogs.splat.cpu.pool import run_chunks
 from geogs.splat.cpu.project import project_disks
 from geogs.splat.cpu.project_backward import project_disks_backward, sum_pairs
+from geogs.threads import run_chunks
 
 # More chunks than threads, so that threads finish together; neighbouring tiles share a chunk, and
 # with it the disks in the cache.

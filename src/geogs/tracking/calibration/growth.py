@@ -6,9 +6,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from geogs.bundle.dense import BundleProblem, relative_motion
 from geogs.bundle.lens import lens_rays, project_lens
 from geogs.bundle.lens_bundle import LensBundleOptions, LensBundleResult, solve_lens
+from geogs.bundle.problem import BundleProblem
+from geogs.bundle.projection import relative_motion
 from geogs.keyframes.grid import SampleGrid
 from geogs.tracking.calibration.keyframes import View, on_cpu
 from geogs.tracking.calibration.start import Start
@@ -112,7 +113,7 @@ class GrowingBundle:
         T = relative_motion(torch.stack(self._T), source, target)
         rays = lens_rays(self.lens, self.grid.pixels).rays
         depth = torch.stack([self._depth[i] for i, _ in directed])
-        return project_lens(self.lens, rays, T, depth)[0]
+        return project_lens(self.lens, rays, T, depth).pixels
 
     def problem(self) -> BundleProblem:
         """All edges; every pose but the first is free."""

@@ -11,9 +11,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from geogs.bundle.dense import BundleProblem
 from geogs.bundle.lens import Lens
 from geogs.bundle.lens_bundle import LensBundleOptions, LensBundleResult, solve_lens
+from geogs.bundle.problem import BundleProblem
 from geogs.geometry.camera import Camera
 from geogs.keyframes.grid import SampleGrid
 from geogs.tracking.calibration.keyframes import on_cpu, stacked, with_focal

@@ -1,0 +1,84 @@
+// Projection of the cells of a source frame with inverse depth d: pi(K (R ray + d t)).
+#pragma once
+#include "block.cuh"
+#include "pose.cuh"
+
+#define MIN_Z 0.05f
+
+struct Camera { float fx, fy, cx, cy; };
+
+// The upper three rows R | t of the motion from the source to the target.
+struct Motion { float m[12]; };
+
+struct Projected {
+  float x, y;  // on the plane z = 1
+  float z;     // depth in the target over depth in the source, as it is
+  float q;     // 1 / z, z held at MIN_Z
+  bool valid;
+};
+
+__device__ __forceinline__ Projected project_cell(
+    const Motion& T, const float* rays, int cell, float d) {
+  float a = rays[3 * cell], b = rays[3 * cell + 1], c = rays[3 * cell + 2];
+  float x = T.m[0] * a + T.m[1] * b + T.m[2] * c + d * T.m[3];
+  float y = T.m[4] * a + T.m[5] * b + T.m[6] * c + d * T.m[7];
+  float z = T.m[8] * a + T.m[9] * b + T.m[10] * c + d * T.m[11];
+  float q = 1.f / (z < MIN_Z ? MIN_Z : z);
+  return {x * q, y * q, z, q, z > MIN_Z};
+}
+
+__device__ __forceinline__ float2 pixel_of(const Camera& camera, const Projected& p) {
+  return make_float2(camera.fx * p.x + camera.cx, camera.fy * p.y + camera.cy);
+}
+
+// A measured cell, linearised in a left perturbation of the motion and in its inverse depth.
+struct LinearCell {
+  float jx[6], jy[6];  // d pixel / d xi
+  float dx, dy;        // d pixel / d inverse depth
+  float rx, ry;        // residual, measured minus projected
+  float wx, wy;        // weights with Huber's factor
+};
+
+__device__ __forceinline__ LinearCell linearise_cell(
+    const Camera& camera, const Motion& T, const float* rays, int cell, float d, float2 pixel,
+    float2 weight, float huber) {
+  Projected p = project_cell(T, rays, cell, d);
+  float2 at = pixel_of(camera, p);
+  float x = p.x, y = p.y, dq = d * p.q;
+  LinearCell c;
+  c.jx[0] = camera.fx * dq;  c.jx[1] = 0.f;             c.jx[2] = -camera.fx * x * dq;
+  c.jy[0] = 0.f;             c.jy[1] = camera.fy * dq;  c.jy[2] = -camera.fy * y * dq;
+  c.jx[3] = -camera.fx * x * y;          c.jx[4] = camera.fx * (1.f + x * x);
+  c.jy[3] = -camera.fy * (1.f + y * y);  c.jy[4] = camera.fy * x * y;
+  c.jx[5] = -camera.fx * y;  c.jy[5] = camera.fy * x;
+  c.dx = camera.fx * (T.m[3] - T.m[11] * x) * p.q;
+  c.dy = camera.fy * (T.m[7] - T.m[11] * y) * p.q;
+  c.rx = pixel.x - at.x;
+  c.ry = pixel.y - at.y;
+  float seen = p.valid ? 1.f : 0.f;
+  c.wx = weight.x * seen;
+  c.wy = weight.y * seen;
+  float norm = sqrtf(c.wx * c.rx * c.rx + c.wy * c.ry * c.ry);
+  float factor = norm <= huber ? 1.f : huber / norm;
+  c.wx *= factor;
+  c.wy *= factor;
+  return c;
+}
+
+// Adds J^T W J (21 values of the upper triangle, row by row) and J^T W r (6 values) of a cell.
+__device__ __forceinline__ void add_normal_equations(const LinearCell& c, float* sums) {
+  int n = 0;
+#pragma unroll
+  for (int i = 0; i < 6; i++) {
+    float wx = c.wx * c.jx[i], wy = c.wy * c.jy[i];
+#pragma unroll
+    for (int j = i; j < 6; j++) sums[n++] += wx * c.jx[j] + wy * c.jy[j];
+    sums[21 + i] += wx * c.rx + wy * c.ry;
+  }
+}
+
+// Place of entry (r, c) in the upper triangle of a 6 x 6 matrix, row by row.
+__device__ __forceinline__ int upper_entry(int r, int c) {
+  int i = r < c ? r : c, j = r < c ? c : r;
+  return i * 6 - i * (i - 1) / 2 + j - i;
+}

@@ -1,0 +1,80 @@
+"""What is adjusted: frames, the edges between them, and what was matched along the edges."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+Matches = Callable[[slice], tuple[Float[Tensor, "e p 2"], Float[Tensor, "e p 2"]]]
+"""Measured positions and their inverse variances for a slice of edges; asked from threads."""
+
+
+@dataclass(frozen=True)
+class BundleProblem:
+    """Frames and edges of one adjustment; edges are sorted by source.
+
+    On a GPU only inverse depths, pixels and weights need to be there; all else is best on the CPU.
+    """
+
+    T_cw: Float[Tensor, "n 4 4"]
+    """float64."""
+    inverse_depth: Float[Tensor, "n p"]
+    source: Int[Tensor, "e"]
+    target: Int[Tensor, "e"]
+    pixels: Float[Tensor, "e p 2"]
+    """Measured position in the target of every cell of the source."""
+    weight: Float[Tensor, "e p 2"]
+    """Inverse variance of x and y, 1 / pixel^2."""
+    free_pose: Bool[Tensor, "n"]
+    free_depth: Bool[Tensor, "n"]
+    damping: Float[Tensor, "n p"] | None = None
+    """Added to the curvature sum_e w |dp/dd|^2 of each inverse depth (DROID-SLAM's eta)."""
+
+    def damping_of(self, frame: int) -> Float[Tensor, "p"] | float:
+        """``damping`` of a frame; zero where there is none."""
+        return 0.0 if self.damping is None else self.damping[frame]
+
+
+@dataclass(frozen=True)
+class StreamedProblem:
+    """As ``BundleProblem``, on the CPU, with the matches fetched when they are needed."""
+
+    T_cw: Float[Tensor, "n 4 4"]
+    inverse_depth: Float[Tensor, "n p"]
+    source: Int[Tensor, "e"]
+    target: Int[Tensor, "e"]
+    matches: Matches
+    free_pose: Bool[Tensor, "n"]
+    free_depth: Bool[Tensor, "n"]
+    damping: Float[Tensor, "n p"] | None = None
+
+    def part(self, edges: slice) -> BundleProblem:
+        """The same frames with some of the edges."""
+        pixels, weight = self.matches(edges)
+        return BundleProblem(
+            self.T_cw, self.inverse_depth, self.source[edges], self.target[edges], pixels, weight,
+            self.free_pose, self.free_depth, self.damping,
+        )  # fmt: skip
+
+
+def sources_within(source: Int[Tensor, "e"]) -> list[tuple[int, slice]]:
+    """The sources of sorted edges and which edges are theirs."""
+    frames, counts = torch.unique_consecutive(source, return_counts=True)
+    found, start = [], 0
+    for frame, count in zip(frames.tolist(), counts.tolist(), strict=True):
+        found.append((frame, slice(start, start + count)))
+        start += count
+    return found
+
+
+def source_chunks(source: Int[Tensor, "e"], size: int) -> list[slice]:
+    """Slices of about ``size`` edges that never split the edges of one source."""
+    chunks, start, last = [], 0, 0
+    for _, edges in sources_within(source):
+        if edges.stop - start > size and last > start:
+            chunks.append(slice(start, last))
+            start = last
+        last = edges.stop
+    return [*chunks, slice(start, last)] if last else []

@@ -1,0 +1,122 @@
+"""Where the cells of source frames fall in their targets, and how that changes.
+
+A cell with ray X and inverse depth d lies at y = R X + d t in the target, in units of its depth in
+the source, for T_ji = (R, t). What follows from y alone is here for every camera; of cameras, the
+pinhole without unknowns. Sums of products are in the order in which the results were tested: the
+lens (:mod:`geogs.bundle.lens`) and the training rescale the same derivatives in another one, and
+a common order would change the last bits of what they or the tracker find.
+"""
+
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from geogs.geometry.lie import se3_inverse
+
+MIN_Z = 0.05
+"""Points nearer than this fraction of the source's unit depth behind the target are ignored."""
+
+
+@runtime_checkable
+class Pinhole(Protocol):
+    """Focal lengths and principal point: numbers, or tensors that spread over (e, p)."""
+
+    @property
+    def fx(self) -> float | Tensor: ...
+    @property
+    def fy(self) -> float | Tensor: ...
+    @property
+    def cx(self) -> float | Tensor: ...
+    @property
+    def cy(self) -> float | Tensor: ...
+
+
+@dataclass(frozen=True)
+class Projection:
+    """Where the cells of the sources fall in the targets."""
+
+    pixels: Float[Tensor, "*b e p 2"]
+    valid: Bool[Tensor, "*b e p"]
+    """Whether a cell lies in front of the target."""
+    z: Float[Tensor, "*b e p"]
+    """Depth in the target over depth in the source, at least ``MIN_Z``."""
+
+
+@dataclass(frozen=True)
+class LinearProjection(Projection):
+    """A projection with its first derivatives."""
+
+    pose_jacobian: Float[Tensor, "e 6 2 p"]
+    """d pixel / d xi of the target pose (left perturbation), laid out for the products below."""
+    depth_jacobian: Float[Tensor, "e p 2"]
+    """d pixel / d inverse depth of the source."""
+
+
+def relative_motion(
+    T_cw: Float[Tensor, "*b n 4 4"], source: Int[Tensor, "e"], target: Int[Tensor, "e"]
+) -> Float[Tensor, "*b e 4 4"]:
+    """T_ji = T_j T_i^-1 of every edge i -> j."""
+    return T_cw[..., target, :, :] @ se3_inverse(T_cw[..., source, :, :])
+
+
+def seen_from_targets(
+    rays: Float[Tensor, "*b p 3"],
+    T_ji: Float[Tensor, "*b e 4 4"],
+    inverse_depth: Float[Tensor, "*b e p"],
+) -> tuple[Float[Tensor, "*b e p 3"], Bool[Tensor, "*b e p"], Float[Tensor, "*b e p"]]:
+    """y = R ray + d t of every cell, whether it lies before the target, and its z.
+
+    Points with a z below ``MIN_Z`` are flagged, and their z is held at that.
+    """
+    R, t = T_ji[..., :3, :3].to(inverse_depth), T_ji[..., :3, 3].to(inverse_depth)
+    y = rays @ R.mT + inverse_depth[..., None] * t[..., None, :]
+    return y, y[..., 2] > MIN_Z, y[..., 2].clamp(min=MIN_Z)
+
+
+def motion_rows(
+    x: Float[Tensor, "*b p"], y: Float[Tensor, "*b p"], dq: Float[Tensor, "*b p"]
+) -> tuple[Float[Tensor, "*b 6 p"], Float[Tensor, "*b 6 p"]]:
+    """d x / d xi and d y / d xi of points at (x, y, 1) / q, xi a left perturbation of T_ji.
+
+    ``dq`` is the inverse depth over z. Source: DROID-SLAM's reprojection layer.
+    """
+    o = torch.zeros_like(dq)
+    return (
+        torch.stack([dq, o, -x * dq, -x * y, 1 + x * x, -y], -2),
+        torch.stack([o, dq, -y * dq, -1 - y * y, x * y, x], -2),
+    )
+
+
+def project(
+    camera: Pinhole,
+    rays: Float[Tensor, "*b p 3"],
+    T_ji: Float[Tensor, "*b e 4 4"],
+    inverse_depth: Float[Tensor, "*b e p"],
+) -> Projection:
+    """Project the cells of source frames: p = pi(K y), see :func:`seen_from_targets`."""
+    y, valid, z = seen_from_targets(rays, T_ji, inverse_depth)
+    pixels = torch.stack(
+        [camera.fx * y[..., 0] / z + camera.cx, camera.fy * y[..., 1] / z + camera.cy], -1
+    )
+    return Projection(pixels, valid, z)
+
+
+def linearise(
+    camera: Pinhole,
+    rays: Float[Tensor, "p 3"],
+    T_ji: Float[Tensor, "e 4 4"],
+    inverse_depth: Float[Tensor, "e p"],
+) -> LinearProjection:
+    """:func:`project` with the Jacobians in a left perturbation of T_ji and in d."""
+    p = project(camera, rays, T_ji, inverse_depth)
+    t, q = T_ji[:, :3, 3].to(inverse_depth), 1 / p.z
+    x = (p.pixels[..., 0] - camera.cx) / camera.fx
+    y = (p.pixels[..., 1] - camera.cy) / camera.fy
+    row_x, row_y = motion_rows(x, y, inverse_depth * q)
+    pose = torch.stack([row_x * camera.fx, row_y * camera.fy], -2)
+    tx, ty, tz = t[:, None].unbind(-1)
+    depth = torch.stack([camera.fx * (tx - tz * x) * q, camera.fy * (ty - tz * y) * q], -1)
+    return LinearProjection(p.pixels, p.valid, p.z, pose, depth)

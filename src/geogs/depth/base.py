@@ -1,0 +1,50 @@
+"""What the mapper asks of whatever finds keyframe depths."""
+
+from collections.abc import Callable, Sequence
+from typing import Protocol, runtime_checkable
+
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from geogs.depth.view import DenseDepth, DepthView, PosedDepth
+
+Progress = Callable[[float], None]
+"""Called with the finished fraction."""
+Limits = tuple[float, float]
+"""Nearest and farthest depth to search, map units."""
+
+
+def silent(fraction: float) -> None:
+    """Progress that nobody watches."""
+
+
+@runtime_checkable
+class DepthEngine(Protocol):
+    """The keyframe depth's heavy parts; tensors live on the engine's device."""
+
+    def observe(self, view: DepthView) -> None:
+        """A view that others will be matched with: prepare what depends on its image alone."""
+        ...
+
+    def estimate(
+        self,
+        references: Sequence[DepthView],
+        neighbours: Sequence[Sequence[DepthView]],
+        progress: Progress = silent,
+        limits: Sequence[Limits | None] | None = None,
+    ) -> list[DenseDepth]:
+        """Dense depth of every reference, matched with its neighbours (``estimate_depth``).
+
+        ``limits`` are the nearest and farthest depth to search; none leaves them to the tracker.
+        """
+        ...
+
+    def check(
+        self, depths: Sequence[PosedDepth], others: Sequence[Sequence[PosedDepth]]
+    ) -> list[DenseDepth]:
+        """Every depth repaired, averaged and judged by its others (``check_depth``)."""
+        ...
+
+    def keep(self, points: Float[Tensor, "n 3"], depths: Sequence[PosedDepth]) -> Bool[Tensor, "n"]:
+        """World points that do not stand in the free space of the depths (``vote``)."""
+        ...

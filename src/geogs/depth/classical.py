@@ -1,0 +1,84 @@
+"""Keyframe depths by matching and fusion without a network, on the CPU."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from geogs.config import DepthConfig
+from geogs.depth.base import Limits, Progress, silent
+from geogs.depth.carve import vote
+from geogs.depth.estimate import estimate_depth
+from geogs.depth.fusion import check_depth
+from geogs.depth.view import DenseDepth, DepthView, PosedDepth
+from geogs.geometry.camera import Camera
+from geogs.splat.cpu.in_view import disks_in_view
+from geogs.threads import thread_map
+
+# Views whose depths may be in memory at once.
+_FEW_VIEWS = 128
+
+
+class CpuDepthEngine:
+    """The compiled CPU loops, one keyframe per thread."""
+
+    def __init__(self, render: Camera, working: Camera, config: DepthConfig) -> None:
+        self.render = render
+        self.working = working
+        self.config = config
+
+    def observe(self, view: DepthView) -> None:
+        """As in the protocol; here nothing is kept."""
+
+    def estimate(
+        self,
+        references: Sequence[DepthView],
+        neighbours: Sequence[Sequence[DepthView]],
+        progress: Progress = silent,
+        limits: Sequence[Limits | None] | None = None,
+    ) -> list[DenseDepth]:
+        """As in the protocol."""
+
+        def one(task: tuple[DepthView, Sequence[DepthView], Limits | None]) -> DenseDepth:
+            reference, others, searched = task
+            cameras = self.render, self.working
+            return DenseDepth.of(estimate_depth(reference, others, *cameras, self.config, searched))
+
+        searched = limits or [None] * len(references)
+        tasks = list(zip(references, neighbours, searched, strict=True))
+        return thread_map(one, tasks, progress)
+
+    def check(
+        self, depths: Sequence[PosedDepth], others: Sequence[Sequence[PosedDepth]]
+    ) -> list[DenseDepth]:
+        """As in the protocol."""
+
+        def one(pair: tuple[PosedDepth, Sequence[PosedDepth]]) -> DenseDepth:
+            own, rest = pair
+            if not rest:
+                return own.depth
+            arrays, poses = [o.depth.arrays() for o in rest], [o.T_cw for o in rest]
+            return DenseDepth.of(
+                check_depth(own.depth.arrays(), own.T_cw, arrays, poses, self.render, self.config)
+            )
+
+        return thread_map(one, list(zip(depths, others, strict=True)))
+
+    def keep(self, points: Float[Tensor, "n 3"], depths: Sequence[PosedDepth]) -> Bool[Tensor, "n"]:
+        """As in the protocol."""
+        if not 0 < len(depths) <= _FEW_VIEWS:
+            # One view after the other, so that not all are in memory at once.
+            views = ((d.T_cw, d.depth.arrays()) for d in depths)
+            return torch.from_numpy(vote(points.detach().numpy(), views, self.render, self.config))
+        held = list(depths)
+        poses = torch.from_numpy(np.stack([d.T_cw for d in held]))
+        # No view has a say on the others, which may be most of a large map.
+        seen = disks_in_view(points, points.new_zeros(len(points)), poses, self.render)
+        kept = torch.ones_like(seen)
+        if bool(seen.any()):
+            some = points.detach()[seen].numpy()
+            views = ((d.T_cw, d.depth.arrays()) for d in held)
+            kept[seen] = torch.from_numpy(vote(some, views, self.render, self.config))
+        return kept

@@ -1,0 +1,202 @@
+"""Read PLY files: text or binary of either byte order, any elements and properties.
+
+The format is that of Turk (1994): a header lists elements (tables) and their properties (columns),
+then come the rows. A property is a number, or a list of numbers with its length before it.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Int64, Shaped
+
+from geogs.errors import InputError
+
+_KINDS = {
+    "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4",
+    "float": "f4", "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2",
+    "int32": "i4", "uint32": "u4", "float32": "f4", "float64": "f8",
+}  # fmt: skip
+_ORDERS = {"ascii": None, "binary_little_endian": "<", "binary_big_endian": ">"}
+
+
+@dataclass(frozen=True, slots=True)
+class PlyLists:
+    """A list of numbers for each row."""
+
+    values: Shaped[np.ndarray, "m"]
+    """All lists, one after the other."""
+    lengths: Int64[np.ndarray, "n"]
+
+
+@dataclass(frozen=True, slots=True)
+class PlyElement:
+    """A table: its properties by their names."""
+
+    columns: dict[str, Shaped[np.ndarray, "n"]]
+    """Those of one number a row, in the type that the header says."""
+    lists: dict[str, PlyLists]
+
+
+@dataclass(frozen=True, slots=True)
+class _Property:
+    name: str
+    kind: np.dtype
+    """Type of its numbers."""
+    stored: np.dtype
+    """Type and byte order in which they are stored; text is stored as double precision."""
+    stored_length: np.dtype | None
+    """The same of the length before each list; none for single numbers."""
+
+    @property
+    def prefix(self) -> str:
+        """Name of the field with the length of a list; no property is called so."""
+        return f"length of {self.name}"
+
+    def fields(self, length: int) -> list[tuple]:
+        """Its part of a row, with a list of ``length``, as fields of a NumPy record."""
+        if self.stored_length is None:
+            return [(self.name, self.stored)]
+        return [(self.prefix, self.stored_length), (self.name, self.stored, (length,))]
+
+
+def read_ply(path: str | Path) -> dict[str, PlyElement]:
+    """The elements of a PLY file by name. Lists of one length in all rows are read at once.
+
+    Raises:
+        InputError: the file is missing, cannot be read, is no PLY or is cut off.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{path} does not exist; give a PLY file.")
+    try:
+        data = path.read_bytes()
+        text, layout, start = _header(data)
+        if text:
+            data, start = np.array(data[start:].split(), np.float64).tobytes(), 0
+        elements = {}
+        for name, (count, properties) in layout.items():
+            elements[name], start = _element(data, start, name, count, properties)
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror}.") from error
+    except (ValueError, OverflowError) as error:
+        raise InputError(f"{path} is no readable PLY file ({error}).") from error
+    return elements
+
+
+def _header(data: bytes) -> tuple[bool, dict[str, tuple[int, list[_Property]]], int]:
+    """Whether the rows are text, number of rows and properties by element, and where rows begin."""
+    end = data.find(b"end_header")
+    start = data.find(b"\n", end) + 1
+    lines = data[: max(end, 0)].decode("ascii", "replace").splitlines()
+    if not data.startswith(b"ply") or end < 0 or not start:
+        raise ValueError("it has no header")
+    order: str | None = ""
+    layout: dict[str, tuple[int, list[_Property]]] = {}
+    for words in map(str.split, lines[1:]):
+        match words:
+            case [] | ["comment" | "obj_info", *_]:
+                pass
+            case ["format", name, _] if name in _ORDERS:
+                order = _ORDERS[name]
+            case ["element", name, count] if count.isdecimal() and name not in layout:
+                layout[name] = int(count), []
+            case ["property", *kinds, name] if layout and order != "":
+                properties = next(reversed(layout.values()))[1]
+                if any(name == other.name for other in properties):
+                    raise ValueError(f"the property {name} is there twice")
+                properties.append(_property(name, kinds, order))
+            case _:
+                raise ValueError(f"its header says '{' '.join(words)[:80]}'")
+    if order == "":
+        raise ValueError("its header names no format")
+    return order is None, layout, start
+
+
+def _property(name: str, kinds: list[str], order: str | None) -> _Property:
+    types = [np.dtype(_KINDS[word]) for word in kinds if word in _KINDS]
+    stored = [np.dtype("f8") if order is None else kind.newbyteorder(order) for kind in types]
+    if len(kinds) == len(types) == 1:
+        return _Property(name, types[0], stored[0], None)
+    if kinds[:1] == ["list"] and len(kinds) == 3 and len(types) == 2 and types[0].kind in "iu":
+        return _Property(name, types[1], stored[1], stored[0])
+    raise ValueError(f"the type of the property {name} is '{' '.join(kinds)[:80]}'")
+
+
+def _element(
+    data: bytes, start: int, name: str, count: int, properties: list[_Property]
+) -> tuple[PlyElement, int]:
+    """The rows that begin at ``start``, and where they end."""
+    smallest = sum((p.stored_length or p.stored).itemsize for p in properties)
+    if count * smallest > len(data) - start:
+        raise ValueError(f"it is cut off: {count} rows of {name} are not there")
+    values, lengths, end = _rows(data, start, count, properties)
+    columns, lists = {}, {}
+    for p, stored, length in zip(properties, values, lengths.T, strict=True):
+        if p.stored_length is None:
+            columns[p.name] = _declared(stored, p)
+        else:
+            lists[p.name] = PlyLists(_declared(stored, p), length)
+    return PlyElement(columns, lists), end
+
+
+def _rows(
+    data: bytes, start: int, count: int, properties: list[_Property]
+) -> tuple[list[np.ndarray], np.ndarray, int]:
+    """Numbers of each property as stored, how many a row (n, properties), and where rows end."""
+    if not count or not properties:
+        return [np.zeros(0)] * len(properties), np.zeros((0, len(properties)), np.int64), start
+    _, lengths, _ = _walk(data, start, 1, properties)
+    record = np.dtype(
+        [field for p, n in zip(properties, lengths[0], strict=True) for field in p.fields(int(n))]
+    )
+    if count * record.itemsize <= len(data) - start:
+        rows = np.frombuffer(data, record, count, start)
+        prefixes = [
+            (p.prefix, n) for p, n in zip(properties, lengths[0], strict=True) if p.stored_length
+        ]
+        if all((rows[prefix] == n).all() for prefix, n in prefixes):
+            values = [rows[p.name].reshape(-1) for p in properties]
+            return values, np.repeat(lengths, count, axis=0), start + rows.nbytes
+    starts, lengths, end = _walk(data, start, count, properties)
+    columns = zip(properties, starts.T, lengths.T, strict=True)
+    return [_gathered(data, at, n, p.stored) for p, at, n in columns], lengths, end
+
+
+def _walk(
+    data: bytes, start: int, count: int, properties: list[_Property]
+) -> tuple[np.ndarray, np.ndarray, int]:
+    """Where the numbers of each row and property begin, how many they are, and where rows end."""
+    starts, lengths = np.ones((2, count, len(properties)), np.int64)
+    at = start
+    for row in range(count):
+        for i, p in enumerate(properties):
+            if p.stored_length is not None:
+                (length,) = np.frombuffer(data, p.stored_length, 1, at).tolist()
+                if length < 0 or length != int(length):
+                    raise ValueError(f"a list of {p.name} has length {length}")
+                lengths[row, i] = length
+                at += p.stored_length.itemsize
+            starts[row, i] = at
+            at += p.stored.itemsize * int(lengths[row, i])
+        if at > len(data):
+            raise ValueError("it is cut off")
+    return starts, lengths, at
+
+
+def _gathered(data: bytes, starts: np.ndarray, lengths: np.ndarray, stored: np.dtype) -> np.ndarray:
+    """``lengths`` numbers from each of ``starts``, one after the other."""
+    before = np.cumsum(lengths) - lengths
+    at = np.repeat(starts - stored.itemsize * before, lengths)
+    at += stored.itemsize * np.arange(len(at))
+    table = np.frombuffer(data, np.uint8)[at[:, None] + np.arange(stored.itemsize)]
+    return table.view(stored)[:, 0]
+
+
+def _declared(stored: np.ndarray, p: _Property) -> np.ndarray:
+    """The numbers in the type that the header gives them."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        numbers = stored.astype(p.kind)
+    if p.kind.kind in "iu" and (numbers != stored).any():
+        raise ValueError(f"{p.name} holds what is no {p.kind}")
+    return numbers

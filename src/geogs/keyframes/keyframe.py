@@ -1,0 +1,107 @@
+"""A keyframe: what was seen, from where, and how far it is."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Float32, UInt8
+from torch import Tensor
+
+from geogs.keyframes.grid import SampleGrid
+from geogs.keyframes.pictures import Picture
+from geogs.priors.base import DepthKind
+
+RELATIVE_FLOOR = 0.004
+"""Relative depth deviation that no amount of matches removes."""
+
+
+@dataclass
+class KeyframePrior:
+    """What a monocular prior said of a keyframe's depth, and how it is scaled; mutable."""
+
+    kind: DepthKind
+    values: Float[Tensor, "p"]
+    """As the prior gave them, on the grid."""
+    inverse_depth: Float[Tensor, "p"]
+    """Aligned to the tracker's; 0 where unknown, and everywhere before the first alignment."""
+    scale: Float[Tensor, "k"]
+    """Factors of the aligned inverse depth at the nodes of a coarse grid, row by row."""
+    information: Float[Tensor, "p"]
+    """What it adds to the inverse variance of the keyframe's inverse depth."""
+    is_aligned: bool = False
+
+    def rescale(self, factor: float) -> None:
+        """Multiply every length by ``factor``."""
+        self.scale = self.scale / factor
+        self.information = self.information * factor**2
+
+
+@dataclass(eq=False)
+class Keyframe:
+    """The one record of a keyframe's pose, depth and scale; mutable, and owned by its store.
+
+    A pose or a field is replaced, never changed in place: who keeps a reference sees what it was.
+    """
+
+    id: int
+    """Stable: never reused, increasing in time."""
+    frame_index: int
+    timestamp: float
+    """Seconds."""
+    grid: SampleGrid
+    """Where depth is kept."""
+    picture: Picture
+    """Image, its encoded form and normals, in memory or not."""
+    T_cw: Float[Tensor, "4 4"]
+    """World to camera, float64, on the CPU whatever the device of the grid."""
+    inverse_depth: Float[Tensor, "p"]
+    information: Float[Tensor, "p"]
+    """Of the matches alone: sum over edges of w |dp/dd|^2."""
+    prior: KeyframePrior | None = None
+    scale: float = 1.0
+    """Factor by which corrections have multiplied the lengths around it; what was measured from it
+    at another scale is to be multiplied by the ratio of the two."""
+
+    @property
+    def image(self) -> UInt8[np.ndarray, "h w 3"]:
+        """RGB at working resolution; not to be changed in place."""
+        return self.picture.image
+
+    @property
+    def encoded(self) -> Any:
+        """The flow operator's form of the image."""
+        return self.picture.encoded
+
+    def rescale(self, factor: float) -> None:
+        """Multiply every length that the camera sees by ``factor``; the pose stays."""
+        if factor == 1.0:
+            return
+        self.inverse_depth = self.inverse_depth / factor
+        self.information = self.information * factor**2
+        self.scale = self.scale * factor
+        if self.prior is not None:
+            self.prior.rescale(factor)
+
+    @property
+    def sure_information(self) -> Float[Tensor, "p"]:
+        """Information less the error that no match removes: what others may trust depth by.
+
+        The relative deviation of depth is z / sqrt of this. What a prior adds is only told of where
+        depth has been adjusted with it.
+        """
+        # What matches agree on is still wrong by a common error of poses and scale.
+        floor = (RELATIVE_FLOOR * self.inverse_depth).square()
+        known = self.information
+        if self.prior is not None:
+            known = known + self.prior.information
+        return known / (1 + known * floor)
+
+    def depth_field(
+        self,
+    ) -> tuple[Float32[np.ndarray, "gh gw"], Float32[np.ndarray, "gh gw"]]:
+        """Inverse depth and its ``sure_information`` as images of cells, on the CPU."""
+        shape = (self.grid.height, self.grid.width)
+        return (
+            self.inverse_depth.reshape(shape).cpu().numpy(),
+            self.sure_information.reshape(shape).cpu().numpy(),
+        )

@@ -1,0 +1,72 @@
+"""What is large and many: the values used last stay where they are fast, others leave."""
+
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Collection, Hashable
+from typing import Generic, TypeVar
+
+K = TypeVar("K", bound=Hashable)
+V = TypeVar("V")
+
+
+class Swap(Generic[K, V]):
+    """The values used last, at most ``limit`` of them; others are made again when they are wanted.
+
+    ``leave`` is told of each value that has to go, so that it can be stored or its place be given
+    to another. For any thread, if ``leave`` is; a value is made without holding others up.
+    """
+
+    def __init__(self, limit: int, leave: Callable[[K, V], object] | None = None) -> None:
+        self.limit = limit
+        self._leave = leave
+        self._values: OrderedDict[K, V] = OrderedDict()
+        self._lock = threading.RLock()
+
+    def __len__(self) -> int:
+        return len(self._values)
+
+    def __contains__(self, key: K) -> bool:
+        return key in self._values
+
+    def peek(self, key: K) -> V | None:
+        """The value of a key if it is here; asking is no use."""
+        return self._values.get(key)
+
+    def get(self, key: K, make: Callable[[], V], wanted: Collection[K] = ()) -> V:
+        """The value of a key, made where it is not here; those ``wanted`` as well do not leave.
+
+        There are more than ``limit`` values only if so many are wanted.
+        """
+        with self._lock:
+            if key in self._values:
+                self._values.move_to_end(key)
+                return self._values[key]
+        self._make_room(wanted)
+        value = make()
+        self.put(key, value, wanted)
+        return value
+
+    def put(self, key: K, value: V, wanted: Collection[K] = ()) -> None:
+        """Keep a value as the one used last; those not used for longest leave."""
+        with self._lock:
+            if key not in self._values:
+                self._make_room(wanted)
+            if self.limit > 0 or key in wanted:
+                self._values[key] = value
+                self._values.move_to_end(key)
+
+    def drop(self, key: K) -> None:
+        """Forget a value, of which nobody is told."""
+        with self._lock:
+            self._values.pop(key, None)
+
+    def _make_room(self, wanted: Collection[K]) -> None:
+        with self._lock:
+            going = (k for k in list(self._values) if k not in wanted)
+            while len(self._values) >= max(self.limit, 1):
+                key = next(going, None)
+                if key is None:
+                    return
+                value = self._values.pop(key)
+                if self._leave is not None:
+                    self._leave(key, value)

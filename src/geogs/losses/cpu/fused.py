@@ -1,0 +1,220 @@
+"""The mapper's losses on a CPU: value and gradient in one go, compiled and cut over threads.
+
+Same definitions as :func:`geogs.losses.single_view.single_view_loss` and
+:func:`geogs.losses.multi_view.multi_view_loss`, in float32. The gradient is made together with the
+value, so the backward pass only scales it. Results do not depend on the number of threads.
+"""
+
+import functools
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from geogs.config import LossConfig
+from geogs.geometry.camera import Camera
+from geogs.geometry.lie import se3_inverse
+from geogs.losses.cpu import multi_view_kernels as multi
+from geogs.losses.cpu.single_view_kernels import single_view_rows
+from geogs.losses.multi_view import MIN_DEPTH_RATIO, PhotoView, depth_tolerance
+from geogs.losses.photometric import NCC_VARIANCE_FLOOR, ssim
+from geogs.losses.single_view import NORMAL_EPSILON, ViewConstants, visible
+from geogs.threads import run_chunks, worker_count
+
+
+def _over_rows(kernel: Callable[[int, int], None], height: int) -> None:
+    """Runs ``kernel(first, last)`` on equal spans of rows, one per worker."""
+    count = max(1, min(worker_count(), height // 16))
+    bounds = [height * k // count for k in range(count + 1)]
+    run_chunks(lambda k: kernel(bounds[k], bounds[k + 1]), count, count)
+
+
+def _array(tensor: Tensor) -> np.ndarray:
+    return np.ascontiguousarray(tensor.detach().numpy(), np.float32)
+
+
+def _lens(camera: Camera) -> list[float]:
+    return [camera.fx, camera.fy, camera.cx, camera.cy]
+
+
+class _SingleView(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, depth, normal, alpha, spread, view, config, unit):  # type: ignore[no-untyped-def]
+        height, width = depth.shape
+        scale = 1.0
+        if config.smoothness_weight > 0:
+            shown = visible(depth, alpha, config.min_alpha) & (view.prior_depth >= 0)
+            known = depth[shown]
+            scale = 1 / float(known.median()) if len(known) else 0.0
+        weights = np.array(
+            [
+                config.depth_weight,
+                config.normal_weight,
+                config.normal_consistency_weight,
+                config.distortion_weight / unit,
+                config.opacity_weight,
+                config.smoothness_weight,
+                config.silhouette_weight,
+            ]
+        )
+        weights = (weights / depth.numel()).astype(np.float32)
+        options = [config.min_alpha, config.depth_relative, NORMAL_EPSILON, config.smoothness_eta]
+        options = np.array([*options, config.smoothness_rewards_edges, scale], np.float32)
+        maps = [_array(m) for m in (depth, normal, alpha, spread)]
+        constants = [view.edge, view.image_gradient, view.prior_depth, view.confidence]
+        constants = [_array(m) for m in constants]
+        prior_normal = np.empty((0, 0, 3), np.float32)
+        if view.prior_normal is not None:
+            prior_normal = _array(view.prior_normal)
+        lens = np.array(_lens(view.camera), np.float32)
+        loss = np.zeros(height, np.float32)
+        gradients = [np.zeros_like(m) for m in maps]
+
+        def rows(first: int, last: int) -> None:
+            scratch = np.zeros((3, max(last - first + 4, 5), width), np.float32)
+            arguments = *maps, *constants, prior_normal, lens, weights, options, scratch, loss
+            single_view_rows(first, last, *arguments, *gradients)
+
+        _over_rows(rows, height)
+        ctx.gradients = [torch.from_numpy(g) for g in gradients]
+        return depth.new_tensor(loss.sum(dtype=np.float64))
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, g):  # type: ignore[no-untyped-def]
+        return (*(g * each for each in ctx.gradients), None, None, None)
+
+
+def fused_single_view(
+    depth: Float[Tensor, "h w"],
+    normal: Float[Tensor, "h w 3"],
+    alpha: Float[Tensor, "h w"],
+    distortion_map: Float[Tensor, "h w"],
+    view: ViewConstants,
+    config: LossConfig,
+    unit: float,
+) -> Float[Tensor, ""]:
+    """:func:`geogs.losses.single_view.single_view_loss` for float32 maps on a CPU.
+
+    ``unit`` is a length in map units that makes the distortion term unitless. Differentiable once,
+    in the four maps. NaN and pixels without depth count nowhere.
+    """
+    return _SingleView.apply(depth, normal, alpha, distortion_map, view, config, unit)
+
+
+@functools.lru_cache(maxsize=64)
+def _enlargement(source: int, size: int) -> tuple[np.ndarray, np.ndarray]:
+    """For each of ``size`` pixels its two source pixels (2, size) and the share of the second."""
+    at = ((np.arange(size) + 0.5) * (source / size) - 0.5).clip(0, source - 1)
+    left = np.minimum(at.astype(np.int64), source - 1)
+    share = (at - left).astype(np.float32)
+    # A pixel without share is not looked at, so that its missing depth does not matter.
+    right = np.where(share > 1e-3, left + 1, left)
+    left = np.where(share < 1 - 1e-3, left, right)
+    return np.stack([left, right]), share
+
+
+def _ssim_gradient(
+    reference: np.ndarray, warped: np.ndarray, mask: np.ndarray, config: LossConfig
+) -> tuple[float, np.ndarray]:
+    """Weighted L_ssim and its gradient to the warped image, by PyTorch: off by default, slow."""
+    image = torch.from_numpy(warped).requires_grad_()
+    with torch.enable_grad():
+        inside = torch.from_numpy(mask > 0)
+        loss, _ = ssim(torch.from_numpy(reference), image, inside, config.ncc_min_coverage)
+        total = config.ssim_weight / mask.size * loss.sum()
+        (gradient,) = torch.autograd.grad(total, image)
+    return float(total), gradient.numpy()
+
+
+class _MultiView(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, depth, T, reference, target, target_depth, config):  # type: ignore[no-untyped-def]
+        grey, image = _array(reference.grey), _array(target.grey)
+        height, width = grey.shape
+        small, T34 = _array(depth), np.ascontiguousarray(T.detach().numpy()[:3], np.float32)
+        tables = (*_enlargement(len(small), height), *_enlargement(small.shape[1], width))
+        hidden = np.empty((0, 0), np.float32) if target_depth is None else _array(target_depth)
+        seen = target.camera if target_depth is None else target.camera.resized(*hidden.shape[::-1])
+        lenses = [_lens(c) for c in (reference.camera, target.camera, seen)]
+        lenses = np.array(lenses, np.float32)
+        n, huber = grey.size, max(config.l1_huber, 1e-12)
+        limits = np.array([MIN_DEPTH_RATIO, image.shape[1] - 1, image.shape[0] - 1], np.float32)
+        tolerance = depth_tolerance(config.occlusion, target.camera)
+        options = [tolerance, config.l1_weight / n, huber, config.l1_cut]
+        options = np.array(options, np.float32)
+        window = [config.ncc_weight / n, config.ncc_reject, config.ncc_min_variance]
+        window += [config.ncc_texture, config.ncc_min_coverage, NCC_VARIANCE_FLOOR]
+        window = np.array(window, np.float32)
+        half = config.ncc_patch // 2 if config.ncc_weight > 0 else -1
+        with_depth, with_pose = ctx.needs_input_grad[:2]
+
+        warped, slope, mask = np.empty((3, height, width), np.float32)
+        extra = np.empty((3, height, width) if with_pose else (3, 0, 0), np.float32)
+        fields = np.empty((3, height, width) if half >= 0 else (3, 0, 0), np.float32)
+        loss = np.zeros(height, np.float32)
+        sobel = config.photo_gradient == "sobel"
+        _over_rows(
+            lambda a, b: multi.warp_rows(
+                a, b, small, *tables, grey, image, hidden, lenses, T34, limits, options, sobel,
+                warped, slope, mask, extra, loss,
+            ),
+            height,
+        )  # fmt: skip
+        if half >= 0:
+            _over_rows(
+                lambda a, b: multi.correlate_rows(
+                    a, b, grey, warped, mask, half, window, fields, loss
+                ),
+                height,
+            )
+        total = float(loss.sum(dtype=np.float64))
+        # d loss / d warped: [0] from elsewhere, [1] in all; only held where someone needs it.
+        g_image = np.zeros((2, height, width) if with_pose else (2, 0, 0), np.float32)
+        if config.ssim_weight > 0:
+            g_image = np.zeros((2, height, width), np.float32)
+            value, g_image[0] = _ssim_gradient(grey, warped, mask, config)
+            total += value
+
+        g_depth, g_T = np.zeros_like(small), np.zeros((4, 4))
+        if with_depth or with_pose:
+            _over_rows(
+                lambda a, b: multi.depth_gradient_rows(
+                    a, b, *tables, grey, warped, slope, mask, half, options, fields, g_image,
+                    g_depth,
+                ),
+                len(small),
+            )  # fmt: skip
+        if with_pose:
+            g_rows = np.empty((height, 12))
+            _over_rows(
+                lambda a, b: multi.pose_gradient_rows(a, b, g_image, extra, lenses, T34, g_rows),
+                height,
+            )
+            g_T[:3] = g_rows.sum(0).reshape(3, 4)
+        ctx.g_depth, ctx.g_T = torch.from_numpy(g_depth), torch.from_numpy(g_T).to(T.dtype)
+        return depth.new_tensor(total)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, g):  # type: ignore[no-untyped-def]
+        return g * ctx.g_depth, g * ctx.g_T, None, None, None, None
+
+
+def fused_multi_view(
+    depth: Float[Tensor, "h w"],
+    reference: PhotoView,
+    target: PhotoView,
+    target_depth: Float[Tensor, "dh dw"] | None,
+    config: LossConfig,
+) -> Float[Tensor, ""]:
+    """:func:`geogs.losses.multi_view.multi_view_loss` for a float32 depth on a CPU.
+
+    ``depth`` is the reference's at render size, 0 where alpha is low. Differentiable once, in the
+    depth and, where they require it, in ``reference.T_cw`` and ``target.T_cw``.
+    """
+    T = target.T_cw @ se3_inverse(reference.T_cw)
+    return _MultiView.apply(depth, T, reference, target, target_depth, config)

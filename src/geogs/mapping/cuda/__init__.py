@@ -1,1 +1,0 @@
-"""Keyframe depths on a GPU."""

@@ -1,0 +1,1 @@
+"""Training the map, and poses on it: losses of some views, gradients, Adam."""

@@ -1,0 +1,149 @@
+"""Training the map on a CPU, view by view."""
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from geogs.config import MappingConfig
+from geogs.losses.cpu import fused_multi_view, fused_single_view
+from geogs.mapping.cameras import MapCameras
+from geogs.mapping.training.base import GRADIENT_LIMIT, Batch, learning_rates
+from geogs.mapping.training.pose_refine import refine_poses
+from geogs.mapping.view import MapView
+from geogs.splat.cpu.in_view import disks_in_view
+from geogs.splat.map import DiskParameters, GaussianMap
+from geogs.splat.optimizer import MapOptimizer
+from geogs.splat.render import RenderOutput, render
+
+# Part of the map up to which an excerpt is trained rather than all of it.
+_LARGE_EXCERPT = 0.7
+# Standard deviations at which a disk of any opacity has faded below what the renderer shows.
+REACH = 3.4
+
+
+def view_loss(
+    view: MapView,
+    partners: list[MapView],
+    output: RenderOutput,
+    config: MappingConfig,
+    unit: float,
+) -> Float[Tensor, ""]:
+    """L_geo of one rendered view: single-view terms, and L_mv averaged over its partners.
+
+    Partners without a rendering yet are matched without occlusion test.
+    """
+    loss = fused_single_view(
+        output.depth, output.normal, output.alpha, output.distortion,
+        view.known, config.loss, unit,
+    )  # fmt: skip
+    if partners:
+        depth = _within(view, output.shown_depth(config.loss.min_alpha))
+        for other in partners:
+            loss = loss + fused_multi_view(
+                depth, view.photo, other.photo, other.rendered_depth, config.loss
+            ) / max(len(partners), config.photo.per_step)
+    return loss
+
+
+class Trainer:
+    """Adam on a map, view by view, on a CPU."""
+
+    def __init__(self, disks: GaussianMap, cameras: MapCameras, config: MappingConfig, unit: float):
+        self.disks = disks
+        self.cameras = cameras
+        self.config = config
+        self.unit = unit
+        self.optimizer = MapOptimizer(disks, learning_rates(config, unit))
+
+    def train(self, batches: Sequence[Batch], factors: Sequence[float] | None = None) -> None:
+        """One Adam step per batch on its summed losses; ``factors`` scale all learning rates.
+
+        On an excerpt of the map where the views can see no more than that, which changes nothing
+        but rounding.
+        """
+        whole, seen = self.optimizer, self._in_view(batches)
+        if not 0 < len(seen) <= _LARGE_EXCERPT * len(self.disks):
+            self._train(batches, factors)
+            return
+        part = whole.excerpt(seen)
+        try:
+            self.optimizer, self.disks = part, part.disks
+            self._train(batches, factors)
+        finally:
+            self.optimizer, self.disks = whole, whole.disks
+            whole.take_back(seen, part)
+
+    def _train(self, batches: Sequence[Batch], factors: Sequence[float] | None) -> None:
+        for n, batch in enumerate(batches):
+            factor = 1.0 if factors is None else factors[n]
+            self.optimizer.learning_rates = learning_rates(self.config, self.unit, factor)
+            self.step(batch)
+        self.optimizer.learning_rates = learning_rates(self.config, self.unit)
+
+    def _in_view(self, batches: Sequence[Batch]) -> Int[Tensor, "m"]:
+        """Disks that the views of some steps can see, or could after these steps."""
+        views = {view.id: view for batch in batches for view, _ in batch}
+        if not views or not len(self.disks):
+            return torch.zeros(0, dtype=torch.int64)
+        steps = 1.5 * len(batches)  # Adam's moves are about as long as the learning rate
+        growth, way = np.exp(steps * self.config.lr_scale), steps * self.config.lr_position
+        radius = REACH * growth * self.disks.scale.amax(1) + way * self.unit
+        poses = torch.stack([view.T_cw for view in views.values()])
+        camera = self.cameras.render
+        return disks_in_view(self.disks.position, radius, poses, camera).nonzero()[:, 0]
+
+    def refine_poses(
+        self, active: list[MapView], views: dict[int, MapView], config: MappingConfig
+    ) -> dict[int, Float[Tensor, "4 4"]]:
+        """Poses of the active keyframes that agree better with the map; the earliest stays."""
+        return refine_poses(self.disks, active, views, self.cameras, config, self.unit)
+
+    def forget_renders(self, views: Iterable[MapView]) -> None:
+        """What the views showed of the map counts no more: it was moved."""
+        for view in views:
+            view.rendered_depth = None
+
+    def step(self, batch: Batch) -> float:
+        """One Adam step on the summed losses of views with their partners; returns the loss."""
+        if len(self.disks) == 0:
+            return 0.0
+        visible = torch.zeros(len(self.disks), dtype=torch.bool, device=self.disks.device)
+        total = 0.0
+        for view, partners in batch:
+            output = render(self.disks, self.cameras.render, view.T_cw)
+            loss = view_loss(view, partners, output, self.config, self.unit)
+            loss.backward()
+            with torch.no_grad():
+                shown = output.shown_depth(self.config.loss.min_alpha)
+                view.rendered_depth = _within(view, shown)
+            visible |= output.visible
+            total += float(loss.detach())
+        self.disks.mark_seen(visible)
+        self.optimizer.step(visible & _sane_gradients(self.disks.parameters))
+        self.optimizer.zero_grad()
+        self._bound_scales()
+        return total
+
+    @torch.no_grad()
+    def _bound_scales(self) -> None:
+        disk = self.config.disk
+        low, high = disk.min_scale * self.unit, disk.max_scale * self.unit
+        self.disks.log_scale.clamp_(float(np.log(low)), float(np.log(high)))
+
+
+def _within(view: MapView, depth: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
+    """The depth where the view has no mask that excludes it, else 0."""
+    return depth if view.mask is None else torch.where(view.mask, depth, 0.0)
+
+
+def _sane_gradients(parameters: DiskParameters) -> Bool[Tensor, "n"]:
+    """Disks whose gradient is finite and of reasonable size; the gradient of others is cleared."""
+    sane = torch.ones(len(parameters.position), dtype=torch.bool)
+    for p in parameters:
+        if p.grad is not None:
+            size = p.grad.abs().reshape(len(p), -1).amax(1)
+            sane &= size < GRADIENT_LIMIT  # NaN compares false
+    return sane

@@ -1,0 +1,1 @@
+"""Training the map on a GPU."""

@@ -1,0 +1,66 @@
+"""The keyframes that losses on a GPU know."""
+
+from collections.abc import Sequence
+from functools import partial
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from geogs.keyframes.swap import Swap
+from geogs.losses.cuda.view_table import ViewTable
+from geogs.mapping.cameras import MapCameras
+from geogs.mapping.view import MapView
+
+
+class KnownViews:
+    """The keyframes' images, constants and poses on the GPU, brought up to date on demand.
+
+    At most ``resident`` of them, unless more are asked for at once: the one not used for longest
+    gives its slot away, and has to be rendered again before it hides anything.
+    """
+
+    def __init__(self, cameras: MapCameras, device: torch.device, resident: int) -> None:
+        self.table = ViewTable(cameras.render, cameras.photo, device)
+        self._slots: Swap[int, int] = Swap(resident, self._free)
+        self._unused: list[int] = []
+        """Slots whose views had to go."""
+        self._constants: dict[int, object] = {}
+        self._poses: dict[int, Tensor] = {}
+
+    def slots(self, views: Sequence[MapView]) -> list[int]:
+        """The table's slots of some views, with their present constants and poses."""
+        moved, slots, wanted = {}, [], {view.id for view in views}
+        for view in views:
+            constants, is_new = view.constants, view.id not in self._slots
+            slot = self._slots.get(view.id, partial(self._new_slot, view), wanted)
+            if not is_new and constants is not None and self._constants[view.id] is not constants:
+                self.table.set_constants(slot, constants)
+            slots.append(slot)
+            self._constants[view.id] = constants
+            if self._poses.get(view.id) is not view.T_cw:
+                moved[view.id] = view.T_cw
+        if moved:
+            self.set_poses(list(moved), torch.stack(list(moved.values())))
+            self._poses.update(moved)
+        return slots
+
+    def _new_slot(self, view: MapView) -> int:
+        """A slot that now stands for the view."""
+        if not self._unused:
+            return self.table.add(view.constants, view.photo)
+        slot = self._unused.pop()
+        self.table.replace(slot, view.constants, view.photo)
+        return slot
+
+    def _free(self, id: int, slot: int) -> None:
+        del self._constants[id]
+        self._poses.pop(id, None)
+        self._unused.append(slot)
+
+    def set_poses(self, ids: Sequence[int], T_cw: Float[Tensor, "k 4 4"]) -> None:
+        """Poses to work with until ``slots`` is asked for again."""
+        slots = [slot for i in ids if (slot := self._slots.peek(i)) is not None]
+        self.table.set_poses(slots, T_cw)
+        for i in ids:
+            self._poses.pop(i, None)

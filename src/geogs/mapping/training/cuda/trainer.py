@@ -1,0 +1,171 @@
+"""Training the map on a GPU: whole steps captured in CUDA graphs and replayed."""
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from geogs.config import MappingConfig
+from geogs.gpu.kernels import kernels_for
+from geogs.gpu.transfer import to_device
+from geogs.mapping.cameras import MapCameras
+from geogs.mapping.training.base import GRADIENT_LIMIT, Batch, learning_rates
+from geogs.mapping.training.cuda.known_views import KnownViews
+from geogs.mapping.training.cuda.pose_refine import refine_poses
+from geogs.mapping.training.cuda.window_pass import WindowPass
+from geogs.mapping.view import MapView
+from geogs.splat.cuda import rasterize
+from geogs.splat.map import GaussianMap
+from geogs.splat.optimizer import MapOptimizer
+
+_ADAM = Path(rasterize.__file__).with_name("adam.cu")
+
+
+class CudaTrainer:
+    """As :class:`geogs.mapping.training.cpu.Trainer`; the map never leaves the GPU.
+
+    The views of every step and the factors of the learning rates are uploaded once per call; the
+    steps themselves, from the rendering to Adam, are one CUDA graph that reads its row of that
+    schedule. A step whose list entries find no room changes nothing and is done again with more.
+    """
+
+    def __init__(
+        self,
+        disks: GaussianMap,
+        cameras: MapCameras,
+        config: MappingConfig,
+        unit: float,
+        resident: int,
+    ) -> None:
+        self.disks, self.cameras, self.config, self.unit = disks, cameras, config, unit
+        self.optimizer = MapOptimizer(disks, learning_rates(config, unit))
+        self.known = KnownViews(cameras, disks.device, resident)
+        self._programs: dict[tuple[int, int], _TrainingStep] = {}
+        self._pose_pass: WindowPass | None = None
+
+    def train(self, batches: Sequence[Batch], factors: Sequence[float] | None = None) -> None:
+        """Adam steps on the summed losses of each batch of views with their partners."""
+        if not batches or len(self.disks) == 0:
+            return
+        everyone = {v.id: v for batch in batches for own, others in batch for v in (own, *others)}
+        slots = dict(zip(everyone, self.known.slots(list(everyone.values())), strict=True))
+        views = max(len(batch) for batch in batches)
+        partners = self.config.photo.per_step
+        rows = np.full((len(batches), views * (1 + partners)), -1, np.int32)
+        for row, batch in zip(rows, batches, strict=True):
+            for k, (view, others) in enumerate(batch):
+                row[k] = slots[view.id]
+                first = views + k * partners
+                row[first : first + len(others)] = [slots[o.id] for o in others]
+        program = self._program(views, partners)
+        program.run(rows, np.ones(len(rows), np.float32) if factors is None else factors)
+
+    def refine_poses(
+        self, active: list[MapView], views: dict[int, MapView], config: MappingConfig
+    ) -> dict[int, Float[Tensor, "4 4"]]:
+        """Poses of the active keyframes that agree better with the map; the earliest stays."""
+        window = self._pose_pass
+        if window is None or window.views != len(active) or window.is_outdated(self.disks):
+            table, camera = self.known.table, self.cameras.render
+            window = WindowPass(
+                table, camera, config.pose_loss, self.unit, len(active), 1, 1.0,
+                self.disks.capacity, for_poses=True,
+            )  # fmt: skip
+            self._pose_pass = window
+        return refine_poses(self.disks, active, views, self.known, window, config, self.unit)
+
+    def forget_renders(self, views: Iterable[MapView]) -> None:
+        """What the views showed of the map counts no more: it was moved."""
+        self.known.table.forget_rendered()
+
+    def _program(self, views: int, partners: int) -> "_TrainingStep":
+        key = (views, partners)
+        program = self._programs.get(key)
+        if program is None or program.window.is_outdated(self.disks):
+            program = _TrainingStep(self, views, partners)
+            self._programs[key] = program
+        return program
+
+
+class _TrainingStep:
+    """One training step of a given size, as a CUDA graph where there is a GPU."""
+
+    def __init__(self, trainer: CudaTrainer, views: int, partners: int) -> None:
+        disks, config = trainer.disks, trainer.config
+        self._trainer, self._device = trainer, disks.device
+        self._capacity = disks.capacity
+        self._kernels = kernels_for(_ADAM, disks.device)
+        self.window = WindowPass(
+            trainer.known.table, trainer.cameras.render, config.loss, trainer.unit, views, partners,
+            1 / config.photo.per_step, disks.capacity,
+        )  # fmt: skip
+        integers = torch.zeros(2, dtype=torch.int32, device=disks.device)
+        self._count, self._completed = integers[:1], integers[1:]
+        self._base, self._rates = torch.zeros(2, 4, device=disks.device)
+        self._schedule = torch.zeros(0, len(self.window.slots), dtype=torch.int32)
+        self._factors = torch.zeros(0)
+        self._graph: torch.cuda.CUDAGraph | None = None
+
+    def run(self, rows: np.ndarray, factors: Sequence[float] | np.ndarray) -> None:
+        """Train on the views of each row; waits for the last step."""
+        self._upload(rows, factors)
+        left = len(rows)
+        while left > 0:
+            for _ in range(left):
+                self._step()
+            left = len(rows) - int(self._completed)
+            if left > 0:
+                self._make_room()
+
+    def _upload(self, rows: np.ndarray, factors: Sequence[float] | np.ndarray) -> None:
+        if len(rows) > len(self._schedule):
+            self._schedule = torch.zeros(rows.shape, dtype=torch.int32, device=self._device)
+            self._factors = torch.zeros(len(rows), device=self._device)
+            self._graph = None
+        self._schedule[: len(rows)] = to_device(torch.from_numpy(rows), self._device)
+        scale = torch.as_tensor(np.asarray(factors, np.float32))
+        self._factors[: len(rows)] = to_device(scale, self._device)
+        rates = torch.tensor(list(self._trainer.optimizer.learning_rates))
+        self._base.copy_(to_device(rates, self._device))
+        self._count.fill_(len(self._trainer.disks))
+        self._completed.zero_()
+
+    def _make_room(self) -> None:
+        rasterizer = self.window.rasterizer
+        rasterizer.reserve(int(rasterizer.status[0]))
+        rasterizer.status.zero_()
+        self._graph = None
+
+    def _step(self) -> None:
+        if self._graph is not None:
+            self._graph.replay()
+            return
+        self._launch()  # the first step of its kind also loads what it needs
+        if self._device.type == "cuda":
+            graph = torch.cuda.CUDAGraph()
+            with (
+                torch.cuda.device(self._device),
+                torch.cuda.graph(graph, capture_error_mode="thread_local"),
+            ):
+                self._launch()
+            self._graph = graph
+
+    def _launch(self) -> None:
+        trainer, p, room = self._trainer, self.window, self._trainer.disks.room
+        optimizer, disk = trainer.optimizer, trainer.config.disk
+        assert p.d_disks is not None
+        self._kernels["begin_step"](
+            1, 64, len(p.slots), self._schedule, self._factors, self._completed, self._base,
+            p.slots, self._rates,
+        )  # fmt: skip
+        p.launch(room, self._count)
+        bounds = (np.log(disk.min_scale * trainer.unit), np.log(disk.max_scale * trainer.unit))
+        self._kernels["adam_step"](
+            -(-self._capacity // 256), 256, self._capacity, self._count, p.rasterizer.status,
+            self._completed, *room, *p.d_disks, *optimizer.moments_room(),
+            *trainer.disks.counters_room, p.maps.visible, self._rates, *optimizer.betas,
+            optimizer.eps, GRADIENT_LIMIT, *bounds,
+        )  # fmt: skip

@@ -1,0 +1,93 @@
+"""Pose-only refinement: the map stands still, the cameras move to agree with it (Eq. pose_loss)."""
+
+from collections.abc import Callable
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from geogs.config import MappingConfig
+from geogs.geometry.lie import retract
+from geogs.losses.cpu import fused_multi_view, fused_single_view
+from geogs.mapping.cameras import MapCameras
+from geogs.mapping.training.tangent_adam import TangentAdam
+from geogs.mapping.view import MapView
+from geogs.splat.map import DiskParameters, GaussianMap
+from geogs.splat.render import render
+
+Evaluate = Callable[[Float[Tensor, "k 4 4"]], tuple[float, Float[Tensor, ""]]]
+"""Of the poses: the loss, and something differentiable whose gradient is the loss's."""
+
+
+def descend(
+    start: Float[Tensor, "k 4 4"], config: MappingConfig, unit: float, evaluate: Evaluate
+) -> Float[Tensor, "k 4 4"]:
+    """Poses of less loss near ``start``, the first of them fixed.
+
+    Adam on left perturbations [tau, phi], tau in units of the map's depth. The step with the least
+    loss is returned; where no step lowered the loss the poses come back as they were.
+    """
+    tangent = torch.zeros(len(start) - 1, 6, dtype=torch.float64, requires_grad=True)
+    units = torch.tensor([unit] * 3 + [1.0] * 3, dtype=torch.float64)
+    optimizer = TangentAdam(tangent, config.pose_lr)
+    best_loss, best = float("inf"), start
+    for step in range(config.pose_iterations + 1):
+        poses = torch.cat([start[:1], retract(tangent * units, start[1:])])
+        loss, differentiable = evaluate(poses)
+        if loss < best_loss:
+            best_loss, best = loss, poses.detach()
+        if step < config.pose_iterations:
+            optimizer.step(torch.autograd.grad(differentiable, tangent)[0])
+    return best
+
+
+def refine_poses(
+    disks: GaussianMap,
+    active: list[MapView],
+    views: dict[int, MapView],
+    cameras: MapCameras,
+    config: MappingConfig,
+    unit: float,
+) -> dict[int, Float[Tensor, "4 4"]]:
+    """Refined world-to-camera poses of the active keyframes, the earliest of them fixed.
+
+    By :func:`descend` on L_d + L_n + L_mv with the mapping weights.
+    """
+    frozen = DiskParameters(*(p.detach() for p in disks.parameters))
+
+    def evaluate(poses: Float[Tensor, "k 4 4"]) -> tuple[float, Float[Tensor, ""]]:
+        loss = _pose_loss(frozen, active, views, poses, cameras, config, unit)
+        return float(loss.detach()), loss
+
+    best = descend(torch.stack([view.T_cw for view in active]), config, unit, evaluate)
+    return {view.id: T for view, T in zip(active[1:], best[1:], strict=True)}
+
+
+def _pose_loss(
+    disks: DiskParameters,
+    active: list[MapView],
+    views: dict[int, MapView],
+    poses: Float[Tensor, "k 4 4"],
+    cameras: MapCameras,
+    config: MappingConfig,
+    unit: float,
+) -> Float[Tensor, ""]:
+    """Sum over active views of L_d + L_n and of L_mv with their best partner."""
+    pose_of = {view.id: T for view, T in zip(active, poses, strict=True)}
+    loss_config = config.pose_loss
+    total = poses.new_zeros(())
+    for view in active:
+        T_cw = pose_of[view.id]
+        output = render(disks, cameras.render, T_cw)
+        total = total + fused_single_view(
+            output.depth, output.normal, output.alpha.detach(), output.distortion.detach(),
+            view.known, loss_config, unit,
+        )  # fmt: skip
+        depth = output.shown_depth(loss_config.min_alpha)
+        for i in view.partners[:1]:
+            other = views[i]
+            target = other.photo.at(pose_of.get(i, other.T_cw))
+            total = total + fused_multi_view(
+                depth, view.photo.at(T_cw), target, other.rendered_depth, loss_config
+            )
+    return total

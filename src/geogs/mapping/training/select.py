@@ -1,0 +1,22 @@
+"""Where the map is trained: on the CPU, or on the GPU that holds it."""
+
+from geogs.config import MappingConfig
+from geogs.mapping.cameras import MapCameras
+from geogs.mapping.training.base import MapTrainer
+from geogs.splat.map import GaussianMap
+
+
+def map_trainer(
+    disks: GaussianMap, cameras: MapCameras, config: MappingConfig, unit: float, resident: int
+) -> MapTrainer:
+    """The trainer of the device that holds the map; a GPU has ``resident`` views at hand.
+
+    A GPU trains in fused kernels, a CPU in compiled ones.
+    """
+    if disks.device.type == "cuda":
+        from geogs.mapping.training.cuda.trainer import CudaTrainer
+
+        return CudaTrainer(disks, cameras, config, unit, resident)
+    from geogs.mapping.training.cpu import Trainer
+
+    return Trainer(disks, cameras, config, unit)

@@ -1,0 +1,253 @@
+"""The large parts of the mapper's views: in memory while they are used, else in a file."""
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float32, UInt8
+from torch import Tensor
+
+from geogs.config import LossConfig
+from geogs.depth.view import DenseDepth, depth_images
+from geogs.geometry.camera import Camera
+from geogs.keyframes.archive import Archive, Archived
+from geogs.keyframes.keyframe import Keyframe
+from geogs.keyframes.swap import Swap
+from geogs.losses.multi_view import PhotoView
+from geogs.losses.single_view import OUTSIDE, ViewConstants
+from geogs.mapping.cameras import MapCameras
+
+
+@dataclass(eq=False)
+class ViewMaps:
+    """What is as large as an image: all but the depths follows from the keyframe's image."""
+
+    image: UInt8[np.ndarray, "wh ww 3"]
+    grey: Float32[np.ndarray, "h w"]
+    fine: Float32[np.ndarray, "fh fw"]
+    """Of the :class:`DepthView`."""
+    photo: Float[Tensor, "ph pw"]
+    """Smoothed grey image of the :class:`PhotoView`, on the map's device."""
+    normal: Float[Tensor, "h w 3"] | None
+    """A prior's normals at the render size, on the map's device."""
+    depth: DenseDepth | None = None
+    scale: float = 1.0
+    """Of the keyframe when the depth was as it is here."""
+    constants: ViewConstants | None = None
+    rendered_depth: Float[Tensor, "h w"] | None = None
+    is_depth_stored: bool = True
+    """Whether the archive has the depth."""
+    is_render_stored: bool = True
+
+
+@dataclass(frozen=True, eq=False)
+class StoredDepth:
+    """A dense depth in an archive."""
+
+    depth: Archived
+    confidence: Archived
+    typical: float
+    """Median depth, map units."""
+    scale: float
+    """Of the keyframe when its depth was archived."""
+    held: DenseDepth | None
+    """The depth itself, where it can also stay: on a GPU it is small beside all else there, and
+    bringing it there again takes longer than using it."""
+
+    @staticmethod
+    def of(depth: DenseDepth, scale: float, archive: Archive) -> "StoredDepth":
+        """Archive a depth of a keyframe that has a scale."""
+        arrays = depth.arrays()
+        return StoredDepth(
+            archive.put(arrays.depth), archive.put(arrays.confidence), depth.typical, scale,
+            depth if depth.depth.is_cuda else None,
+        )  # fmt: skip
+
+    def typical_at(self, scale: float) -> float:
+        """Median depth at another scale of the keyframe."""
+        return self.typical * (scale / self.scale)
+
+    def load(self, scale: float, device: torch.device) -> DenseDepth:
+        """The depth at another scale of the keyframe."""
+        factor, typical = scale / self.scale, torch.tensor(self.typical_at(scale))
+        if self.held is not None:
+            return DenseDepth(self.held.depth * factor, self.held.confidence, typical)
+        depth = torch.from_numpy(self.depth.load())
+        if factor != 1.0:
+            depth = depth * factor
+        confidence = torch.from_numpy(self.confidence.load())
+        return DenseDepth(depth.to(device), confidence.to(device), typical)
+
+
+@dataclass(eq=False)
+class StoredMaps:
+    """Of a view that is not in use: its depths in an archive, the rest can be made again."""
+
+    keyframe: Keyframe
+    mask: Bool[Tensor, "h w"] | None
+    """Pixels of the render size that belong to the scene; none takes all. On the map's device."""
+    depth: StoredDepth | None = None
+    rendered_depth: Archived | None = None
+
+
+class ViewPool:
+    """Images, depths and constants of all views, of which those used last are in memory.
+
+    Depths follow the scale of their keyframes.
+    """
+
+    def __init__(
+        self, cameras: MapCameras, loss: LossConfig, device: torch.device, resident: int
+    ) -> None:
+        self.cameras = cameras
+        self.loss = loss
+        self.device = device
+        self.archive = Archive()
+        self._stored: dict[int, StoredMaps] = {}
+        self._maps: Swap[int, ViewMaps] = Swap(resident, self._store)
+
+    def add(self, keyframe: Keyframe, mask: Bool[np.ndarray, "h w"] | None = None) -> None:
+        """Take up a keyframe; it has no depth outside a mask of the size of its image."""
+        inside = None
+        if mask is not None:
+            render = self.cameras.render
+            size = (render.width, render.height)
+            share = cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+            inside = torch.from_numpy(share > 0.5).to(self.device)
+        self._stored[keyframe.id] = StoredMaps(keyframe, inside)
+        self.maps(keyframe.id)
+
+    def mask(self, id: int) -> Bool[Tensor, "h w"] | None:
+        """Pixels of the render size that belong to the scene; none takes all."""
+        return self._stored[id].mask
+
+    def is_resident(self, id: int) -> bool:
+        """Whether its images are in memory."""
+        return id in self._maps
+
+    def maps(self, id: int) -> ViewMaps:
+        """Everything in memory, brought back if need be."""
+        maps = self._maps.get(id, lambda: self._load(self._stored[id]))
+        return self._at_scale(maps, self._stored[id])
+
+    def has_depth(self, id: int) -> bool:
+        """Whether its depth has been estimated."""
+        maps = self._maps.peek(id)
+        return (self._stored[id].depth if maps is None else maps.depth) is not None
+
+    def depth(self, id: int) -> DenseDepth | None:
+        """The dense depth, once estimated; what is not in memory stays where it is."""
+        maps, stored = self._maps.peek(id), self._stored[id]
+        if maps is not None:
+            return self._at_scale(maps, stored).depth
+        if stored.depth is None:
+            return None
+        return stored.depth.load(stored.keyframe.scale, self.device)
+
+    def typical_depth(self, id: int) -> float:
+        """Median of the dense depth, map units."""
+        stored = self._stored[id]
+        if id not in self._maps and stored.depth is not None:
+            return stored.depth.typical_at(stored.keyframe.scale)
+        depth = self.depth(id)
+        assert depth is not None, f"keyframe {id} has no depth yet"
+        return depth.typical
+
+    def set_depth(self, id: int, depth: DenseDepth) -> None:
+        """Take over a dense depth, on which the losses' constants then live."""
+        stored, maps = self._stored[id], self._maps.peek(id)
+        if stored.mask is not None:
+            depth = depth.within(stored.mask)
+        if maps is None:
+            stored.depth = StoredDepth.of(depth, stored.keyframe.scale, self.archive)
+            return
+        maps.depth, maps.scale, maps.is_depth_stored = depth, stored.keyframe.scale, False
+        if maps.constants is not None:
+            maps.constants = replace(
+                maps.constants,
+                prior_depth=self._prior_depth(stored, depth).float(),
+                confidence=depth.confidence.float(),
+            )
+
+    def constants(self, id: int) -> ViewConstants | None:
+        """What the single-view losses need; None until the keyframe has a depth."""
+        maps = self.maps(id)
+        if maps.constants is None and maps.depth is not None:
+            prior = self._prior_depth(self._stored[id], maps.depth)
+            maps.constants = ViewConstants.prepare(
+                maps.image, self.cameras.render, prior, maps.depth.confidence, maps.normal
+            )
+        return maps.constants
+
+    def set_rendered_depth(self, id: int, depth: Float[Tensor, "h w"] | None) -> None:
+        """Take over the map's last rendering from a view, or that there is none any more."""
+        if depth is None:
+            self._stored[id].rendered_depth = None
+        if id in self._maps or depth is not None:
+            maps = self.maps(id)
+            maps.rendered_depth, maps.is_render_stored = depth, False
+
+    def store(self) -> None:
+        """Archive what has changed, as for a checkpoint; it stays in memory."""
+        for id in self._stored:
+            maps = self._maps.peek(id)
+            if maps is not None:
+                self._store(id, maps)
+
+    def _store(self, id: int, maps: ViewMaps) -> None:
+        stored = self._stored[id]
+        if not maps.is_depth_stored and maps.depth is not None:
+            stored.depth = StoredDepth.of(maps.depth, maps.scale, self.archive)
+        if not maps.is_render_stored and maps.rendered_depth is not None:
+            stored.rendered_depth = self.archive.put(maps.rendered_depth.cpu().numpy())
+        maps.is_depth_stored = maps.is_render_stored = True
+
+    def _load(self, stored: StoredMaps) -> ViewMaps:
+        cameras, loss, keyframe = self.cameras, self.loss, stored.keyframe
+        image = keyframe.image
+        grey = PhotoView.prepare(
+            image, cameras.photo, keyframe.T_cw, loss.photo_blur, self.device
+        ).grey
+        normal = None
+        if loss.normal_weight:
+            normal = _shrunk_normal(keyframe, cameras.render, self.device)
+        maps = ViewMaps(image, *depth_images(image, cameras.render), grey, normal)
+        if stored.depth is not None:
+            maps.depth = stored.depth.load(keyframe.scale, self.device)
+            maps.scale = keyframe.scale
+        if stored.rendered_depth is not None:
+            rendered = torch.from_numpy(stored.rendered_depth.load())
+            maps.rendered_depth = rendered.to(self.device)
+        return maps
+
+    def _at_scale(self, maps: ViewMaps, stored: StoredMaps) -> ViewMaps:
+        """The maps, whose depth follows the keyframe's scale."""
+        if maps.depth is not None and maps.scale != stored.keyframe.scale:
+            depth = maps.depth.scaled(stored.keyframe.scale / maps.scale)
+            self.set_depth(stored.keyframe.id, depth)
+        return maps
+
+    @staticmethod
+    def _prior_depth(stored: StoredMaps, depth: DenseDepth) -> Float[Tensor, "h w"]:
+        if stored.mask is None:
+            return depth.depth
+        return torch.where(stored.mask, depth.depth, OUTSIDE)
+
+
+def _shrunk_normal(
+    keyframe: Keyframe, render: Camera, device: torch.device | str
+) -> Float[Tensor, "h w 3"] | None:
+    """A keyframe's prior normals, averaged over the pixels of the render; zero where they differ.
+
+    An average shorter than a half comes from an edge or from pixels that are not known.
+    """
+    normal = keyframe.picture.normal
+    if normal is None:
+        return None
+    size = (render.width, render.height)
+    full = normal.detach().cpu().float().numpy()
+    mean = cv2.resize(full, size, interpolation=cv2.INTER_AREA)
+    length = np.linalg.norm(mean, axis=-1, keepdims=True)
+    unit = np.where(length > 0.5, mean / np.maximum(length, 1e-6), 0.0)
+    return torch.from_numpy(unit.astype(np.float32)).to(device)

@@ -1,0 +1,51 @@
+"""Keyframes as a tracker would leave them in its store."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from geogs.geometry.camera import Camera
+from geogs.keyframes.grid import SampleGrid
+from geogs.keyframes.keyframe import Keyframe
+from geogs.keyframes.store import KeyframeStore, Segment
+
+
+@dataclass(frozen=True, eq=False)
+class Sample:
+    """What a keyframe is made of; without depth it has unit depth."""
+
+    frame_index: int
+    image: UInt8[np.ndarray, "h w 3"]
+    T_cw: Float[Tensor, "4 4"]
+    inverse_depth: Float[Tensor, "gh gw"] | None = None
+    information: Float[Tensor, "gh gw"] | None = None
+
+
+def segment_of(
+    samples: Sequence[Sample],
+    camera: Camera,
+    device: torch.device | str = "cpu",
+    resident: int = 128,
+) -> Segment:
+    """A segment of a new store that holds them, ids from 0."""
+    segment = KeyframeStore(SampleGrid(camera, device), None, resident).new_segment()
+    for sample in samples:
+        add(segment, sample)
+    return segment
+
+
+def add(segment: Segment, sample: Sample) -> Keyframe:
+    """Append a keyframe."""
+    keyframe = segment.add(
+        sample.frame_index, sample.frame_index / 30, sample.image, None, sample.T_cw
+    )
+    device = segment.grid.device
+    if sample.inverse_depth is not None:
+        keyframe.inverse_depth = sample.inverse_depth.reshape(-1).float().to(device)
+    if sample.information is not None:
+        keyframe.information = sample.information.reshape(-1).float().to(device)
+    return keyframe

@@ -1,0 +1,206 @@
+"""Training on the GPU's kernels against training on the CPU's, emulated and on a GPU."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from cuda_emulator import use_emulator
+from geogs.config import Config
+from geogs.depth.view import DenseDepth
+from geogs.geometry.lie import retract, se3_exp, se3_inverse
+from geogs.losses.cuda import window
+from geogs.mapping.cameras import MapCameras
+from geogs.mapping.training.base import Batch
+from geogs.mapping.training.cpu import Trainer
+from geogs.mapping.training.cuda import trainer as cuda_trainer
+from geogs.mapping.training.cuda.trainer import CudaTrainer
+from geogs.mapping.view import MapView
+from geogs.mapping.view_pool import ViewPool
+from geogs.splat.cuda import rasterize
+from geogs.splat.map import DiskParameters, GaussianMap
+from geogs.synth.export import default_camera
+from geogs.synth.raycast import Raycaster
+from geogs.synth.room import make_room
+from geogs.synth.trajectory import handheld_trajectory
+from keyframe_samples import Sample, segment_of
+
+WORKING = default_camera(96, 72)
+CAMERAS = MapCameras(WORKING, WORKING.with_long_edge(40), WORKING.with_long_edge(80))
+CONFIG = Config().mapping
+UNIT = 2.0
+
+
+@pytest.fixture(params=["emulated", pytest.param("gpu", marks=pytest.mark.gpu)])
+def device(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> torch.device:
+    """Where the kernels run."""
+    if request.param == "emulated":
+        use_emulator(monkeypatch, rasterize, window, cuda_trainer)
+        return torch.device("cpu")
+    if not torch.cuda.is_available():
+        pytest.skip("needs an NVIDIA GPU")
+    return torch.device("cuda")
+
+
+@pytest.fixture(scope="module")
+def rendered() -> list[tuple[Sample, np.ndarray]]:
+    """Four keyframes of a room with their true depth at render size."""
+    scene = make_room(3)
+    caster = Raycaster(scene)
+    poses = handheld_trajectory(scene, 64)
+    out = []
+    for index in range(0, 32, 8):
+        view = caster.render(WORKING, poses[index])
+        grid = torch.from_numpy(1 / view.depth[4:-3:8, 4:-3:8]).float()
+        T_cw = se3_inverse(torch.from_numpy(poses[index]))
+        keyframe = Sample(index, view.image, T_cw, grid, torch.ones_like(grid))
+        out.append((keyframe, caster.render(CAMERAS.render, poses[index]).depth))
+    return out
+
+
+def make_views(rendered, device: torch.device) -> list[MapView]:
+    views, pool = [], ViewPool(CAMERAS, CONFIG.loss, device, 128)
+    segment = segment_of([keyframe for keyframe, _ in rendered], WORKING, device)
+    for keyframe, (_, depth) in zip(segment, rendered, strict=True):
+        pool.add(keyframe)
+        view = MapView(keyframe, pool)
+        dense = torch.from_numpy(depth).float().to(device)
+        confidence = torch.full_like(dense, 0.8)
+        pool.set_depth(view.id, DenseDepth(dense, confidence, dense.median().cpu()))
+        view.partners = [i for i in range(len(rendered)) if i != view.id][:2]
+        views.append(view)
+    return views
+
+
+def make_map(rendered, device: torch.device) -> GaussianMap:
+    """Disks a little off the first keyframe's surface."""
+    keyframe, depth = rendered[0]
+    g = torch.Generator().manual_seed(0)
+    rays = CAMERAS.render.rays()[::2, ::2].reshape(-1, 3)
+    z = torch.from_numpy(depth[::2, ::2]).float().reshape(-1, 1)
+    T_wc = se3_inverse(keyframe.T_cw).float()
+    points = (rays * z * (1 + 0.02 * torch.randn(z.shape, generator=g))) @ T_wc[:3, :3].T
+    n = len(points)
+    disks = DiskParameters(
+        points + T_wc[:3, 3],
+        torch.randn(n, 4, generator=g),
+        torch.full((n, 2), -2.6) + 0.2 * torch.randn(n, 2, generator=g),
+        torch.randn(n, generator=g),
+    )
+    map = GaussianMap.empty(device)
+    map.append(disks, 0)
+    return map
+
+
+def make_batches(views: list[MapView]) -> list[Batch]:
+    """Steps of one and of two views; with two partners, one or none."""
+    return [
+        [(views[0], [views[1], views[2]]), (views[1], [views[0]])],
+        [(views[2], [])],
+        [(views[3], [views[0], views[1]]), (views[0], [views[3], views[2]])],
+    ]
+
+
+@pytest.fixture
+def pair(rendered, device: torch.device) -> Callable[[], tuple[CudaTrainer, Trainer, list, list]]:
+    """A CUDA and a CPU trainer of equal maps, each with its views."""
+
+    def make():
+        cpu = torch.device("cpu")
+        fast = CudaTrainer(make_map(rendered, device), CAMERAS, CONFIG, UNIT, 128)
+        slow = Trainer(make_map(rendered, cpu), CAMERAS, CONFIG, UNIT)
+        return fast, slow, make_views(rendered, device), make_views(rendered, cpu)
+
+    return make
+
+
+def moved(before: torch.Tensor, a: torch.Tensor, b: torch.Tensor) -> float:
+    """Distance of two results over the way that the second has gone."""
+    return float((a.cpu() - b).norm() / (b - before).norm().clamp(min=1e-12))
+
+
+def test_steps_equal_those_of_the_cpu(pair, rendered) -> None:
+    fast, slow, fast_views, slow_views = pair()
+    start = [p.detach().clone() for p in make_map(rendered, torch.device("cpu")).parameters]
+    factors = [1.0, 0.5, 0.7]
+    fast.train(make_batches(fast_views), factors)
+    # A step on the CPU stores each view's rendering before the next view's loss; here after all.
+    slow.train(make_batches(slow_views), factors)
+    names = DiskParameters._fields
+    for name, p, a, b in zip(
+        names, start, fast.disks.parameters, slow.disks.parameters, strict=True
+    ):
+        # Adam's first steps are signs of gradients, so single disks with tiny ones may differ.
+        assert moved(p, a.detach(), b.detach()) < 0.08, name
+    same_steps = (fast.disks.steps.cpu() == slow.disks.steps).float().mean()
+    same_seen = (fast.disks.seen.cpu() == slow.disks.seen).float().mean()
+    assert same_steps > 0.99
+    assert same_seen > 0.99
+    assert int(slow.disks.steps.max()) == 3
+
+
+def test_steps_without_room_are_done_again(pair) -> None:
+    fast, _, views, _ = pair()
+    other, _, same_views, _ = pair()
+    batches = [[(views[0], [])]] * 3
+    fast.train(batches[:1])
+    program = fast._programs[1, CONFIG.photo.per_step]
+    rasterizer = program.window.rasterizer
+    needed = int(rasterizer.status[0])
+    rasterizer._keys, rasterizer._disks = rasterizer._keys[:100], rasterizer._disks[:100]
+    program._graph = None
+    fast.train(batches[1:])
+    assert rasterizer.room >= needed > 100
+    other.train([[(same_views[0], [])]] * 3)
+    assert int(fast.disks.steps.max()) == 3
+    assert torch.equal(fast.disks.steps, other.disks.steps)
+    for a, b in zip(fast.disks.parameters, other.disks.parameters, strict=True):
+        assert torch.allclose(a, b, atol=1e-4)
+
+
+def test_growing_and_dropping_between_steps(pair) -> None:
+    fast, _, views, _ = pair()
+    fast.train([[(views[0], [views[1]])]])
+    copies = fast.disks.capacity // len(fast.disks)
+    more = DiskParameters(*(p.detach().clone() for p in fast.disks.parameters))
+    capacity = fast.disks.capacity
+    for _ in range(copies):
+        fast.optimizer.append(more, 1)
+    assert fast.disks.capacity > capacity
+    fast.train([[(views[1], [views[0]])]])
+    n = len(fast.disks)
+    assert len(fast.optimizer.first[0]) == n
+    fast.optimizer.keep(fast.disks.keyframe_id == 1)
+    before = fast.disks.position.detach().clone()
+    fast.train([[(views[0], [])]] * 2)
+    assert len(fast.disks) == n * copies // (copies + 1)
+    assert not torch.equal(fast.disks.position.detach(), before)
+    assert torch.isfinite(fast.disks.position).all()
+
+
+def test_poses_equal_those_of_the_cpu(pair, rendered) -> None:
+    fast, slow, fast_views, slow_views = pair()
+    config = replace(CONFIG, pose_iterations=4, pose_lr=1e-3)
+    results = []
+    for trainer, views in ((fast, fast_views), (slow, slow_views)):
+        trainer.train([[(v, [])] for v in views])
+        g = torch.Generator().manual_seed(1)
+        for view in views[1:]:
+            xi = 0.004 * torch.randn(6, dtype=torch.float64, generator=g)
+            view.move(retract(xi, view.T_cw))
+        start = {v.id: v.T_cw for v in views}
+        poses = trainer.refine_poses(views, {v.id: v for v in views}, config)
+        results.append((start, poses))
+    (_, a), (start, b) = results
+    assert sorted(a) == sorted(b) == [1, 2, 3]
+    for i in b:
+        step = (b[i] - start[i]).norm()
+        assert step > 1e-4
+        assert (a[i] - b[i]).norm() < 0.2 * step
+    # The table has the poses of the last trial; training takes the views' again.
+    slots = fast.known.slots(fast_views)
+    kept = torch.stack([v.T_cw for v in fast_views])[:, :3].reshape(-1, 12)
+    assert torch.allclose(fast.known.table.poses[slots].cpu(), kept)
+    assert torch.allclose(se3_exp(torch.zeros(6)), torch.eye(4))
