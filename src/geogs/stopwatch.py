@@ -15,10 +15,6 @@ class Stopwatch:
         self.seconds: dict[str, float] = {}
         self._is_running = False
 
-    def __getstate__(self) -> dict[str, object]:
-        """What a checkpoint holds: it is not running when that is read."""
-        return {**self.__dict__, "_is_running": False}
-
     @contextmanager
     def __call__(self, stage: str) -> Iterator[None]:
         if self._is_running:

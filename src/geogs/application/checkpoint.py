@@ -8,7 +8,7 @@ prior, kernels, threads) is not stored: whoever reads has it.
 
 import json
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Generic, TypeVar, get_type_hints
@@ -29,7 +29,7 @@ S = TypeVar("S")
 
 _UNUSABLE = (
     OSError, InputError, SafetensorError, ValueError, TypeError, LookupError, ArithmeticError,
-    MemoryError, RecursionError,
+    MemoryError, RuntimeError,
 )  # fmt: skip
 """What reading a file may end with that somebody made up."""
 
@@ -52,17 +52,18 @@ class Checkpoint:
         """Whether its time has come."""
         return self._every > 0 and time.perf_counter() >= self._due
 
-    def write_state(self, state: object) -> bool:
-        """Write a record; whether there is a complete checkpoint of it now."""
+    def write_state(self, state: Callable[[], object]) -> bool:
+        """Write the record that a call gives; whether there is a complete checkpoint of it now."""
         if self._every <= 0:
             return False
         start = time.perf_counter()
         try:
-            write_checkpoint(self._folder, state)
+            write_checkpoint(self._folder, state())
         except OutputError as error:
             self._progress.write(f"No more checkpoints: {error}")
             self._every = 0.0
-        self._due = next_due(start, self._every)
+        now = time.perf_counter()
+        self._due = now + max(self._every, (now - start) / _WRITING_SHARE)
         return self._every > 0
 
     def remove(self) -> None:
@@ -80,14 +81,14 @@ class SavedState(Generic[S]):
         self._arrays: dict[str, Tensor] = {}
         self._archives: dict[str, Archive] = {}
         self._folder = checkpoint_folder(output)
-        with self._in_a_sentence():
+        with self.in_a_sentence():
             manifest = self._folder.manifest()
         if manifest is None or not manifest.state:
             raise InputError(
                 f"There is nothing to resume: no complete checkpoint is in {self._folder.path}; "
                 "start anew without --resume."
             )
-        with self._in_a_sentence():
+        with self.in_a_sentence():
             if (manifest.format, manifest.geogs) != (FORMAT, geogs.__version__):
                 raise InputError(f"geogs {manifest.geogs} wrote it, another version than this")
             if manifest.schema != schema(kind):
@@ -103,22 +104,19 @@ class SavedState(Generic[S]):
         arrays = {k: x for k, x in self._arrays.items() if k.startswith(f"{name}.")}
         self._arrays = {k: x for k, x in self._arrays.items() if k not in arrays}
         kind, values = self._kinds[name], self._values.pop(name, None)
-        with self._in_a_sentence():
+        with self.in_a_sentence():
             return unpack(kind, values, arrays, self._archives, device, name)
 
     @contextmanager
-    def _in_a_sentence(self) -> Iterator[None]:
+    def in_a_sentence(self) -> Iterator[None]:
+        """Whatever using it may end with becomes an InputError that says what to do."""
         try:
             yield
         except _UNUSABLE as error:
-            raise self.unusable(error) from error
-
-    def unusable(self, error: Exception) -> InputError:
-        """The sentence to end with."""
-        reason = str(error) or type(error).__name__
-        return InputError(
-            f"{self._folder.path} cannot be used ({reason}); start anew without --resume."
-        )
+            reason = (str(error) or type(error).__name__).splitlines()[0]
+            raise InputError(
+                f"{self._folder.path} cannot be used ({reason}); start anew without --resume."
+            ) from error
 
     def _read(self, files: Mapping[str, Sum]) -> None:
         """What the files hold; archives are open from then on."""
@@ -141,12 +139,6 @@ def write_checkpoint(folder: CheckpointFolder, state: object) -> None:
         write("safetensors", save(packed.arrays))
     for archive in packed.archives.values():
         archive.release()
-
-
-def next_due(start: float, every: float) -> float:
-    """When the next checkpoint is due, after one that was begun at ``start``; both seconds."""
-    now = time.perf_counter()
-    return now + max(every, (now - start) / _WRITING_SHARE)
 
 
 def checkpoint_folder(output: Path) -> CheckpointFolder:

@@ -51,7 +51,7 @@ class ReconstructCheckpoint(Checkpoint):
         """Write it, if there is something to go on from; whether it has been."""
         if not self._has_work:
             return False
-        return self.write_state(ReconstructState(self._made_from, scene.state()))
+        return self.write_state(lambda: ReconstructState(self._made_from, scene.state()))
 
     def read(self) -> ReconstructionState:
         """The work to go on from; says where that is.
@@ -60,7 +60,7 @@ class ReconstructCheckpoint(Checkpoint):
             InputError: there is none, it is damaged, or made from other settings or images.
         """
         work = read_work(self._output, self._made_from)
-        place = work.mapper.trained
+        place = work.mapper.place
         done = f"step {place.steps} of {place.total}" if place.steps else "the depths"
         self._progress.write(f"Going on after {done}, {work.seconds:.0f} s into the work.")
         return work
@@ -73,8 +73,7 @@ def read_work(output: Path, made_from: str) -> ReconstructionState:
         InputError: there is nothing, it is damaged, or made from other settings or images.
     """
     saved = SavedState(output, ReconstructState)
-    if saved.part("made_from") != made_from:
-        raise saved.unusable(
-            InputError("made with other settings or images; give the same ones to go on from it")
-        )
+    with saved.in_a_sentence():
+        if saved.part("made_from") != made_from:
+            raise InputError("it was made with other settings or images; give the same ones")
     return saved.part("work")

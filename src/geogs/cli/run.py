@@ -58,9 +58,10 @@ def run(options: RunOptions) -> Path:
     import torch
 
     import geogs
+    from geogs.application.checkpoint import has_checkpoint
     from geogs.application.gpu_memory import REMEDY, full_memory_in_a_sentence
     from geogs.application.results import SourceFacts, write_results
-    from geogs.application.run_checkpoint import RunCheckpoint, RunFacts, SavedRun, has_checkpoint
+    from geogs.application.run_checkpoint import RunCheckpoint, RunFacts, SavedRun
     from geogs.application.surfaces import write_depth_mesh, write_online_results
     from geogs.errors import DeviceError
     from geogs.gpu.installation import require_device
