@@ -1,26 +1,36 @@
-# make demo   set up, run the whole system on a small synthetic room, print the error table
-# make test   set up, lint, type-check, test
+# make demo     set up, run the whole system on a small synthetic room, print the error table
+# make quick    set up, lint, type-check, test what does not run the whole system: the inner loop
+# make test     set up, lint, type-check, test everything
+# make format   set up, sort imports, mend what the linter can, format
 PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
 PIP    := $(BIN)/python -m pip install --quiet
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2
 TORCH  := 2.13.0
 TORCH_CPU_INDEX := https://download.pytorch.org/whl/cpu
 
-.PHONY: demo test lint setup clean
+.PHONY: demo quick test lint format setup clean
 
 demo: $(STAMP)
 	$(BIN)/geogs demo -o out/demo
 
-test: $(STAMP) lint
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2
+quick: lint
+	$(PYTEST) -m 'not system and not gpu'
+
+test: lint
+	$(PYTEST)
 
 lint: $(STAMP)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports
 	$(BIN)/mypy
+
+format: $(STAMP)
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
 
 setup: $(STAMP)
 
@@ -34,4 +44,4 @@ $(STAMP): pyproject.toml constraints.txt
 	touch $(STAMP)
 
 clean:
-	rm -rf $(VENV) out .pytest_cache .mypy_cache .ruff_cache
+	rm -rf $(VENV) out .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis

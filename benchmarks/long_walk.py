@@ -29,9 +29,9 @@ from geogs.evaluation.trajectory import evaluate_trajectory
 from geogs.geometry.camera import Camera
 from geogs.slam import Slam
 from geogs.synth.export import default_camera
-from geogs.synth.portals import SuiteRaycaster
-from geogs.synth.suite import Suite
 from geogs.types import Frame, Trajectory
+from portals import SuiteRaycaster
+from suite import Suite
 
 
 @dataclass(frozen=True)

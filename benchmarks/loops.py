@@ -23,6 +23,7 @@ import cv2
 import numpy as np
 import torch
 
+from geogs.bundle.select import grid_fields
 from geogs.config import LoopConfig
 from geogs.evaluation.surface import read_surface
 from geogs.geometry.lie import se3_exp, se3_inverse, so3_log
@@ -126,7 +127,7 @@ def prepare(
     rng = np.random.default_rng(0)
     scale = np.exp(np.cumsum(drift * 0.01 * rng.standard_normal(len(depth))))
     store, operator = KeyframeStore(grid).new_segment(), ClassicalFlow(grid)
-    T = T_cw[0]
+    T, fields = T_cw[0], grid_fields(grid)
     for n, frame in enumerate(sequence.frames()):
         if n:
             step = T_cw[n] @ se3_inverse(T_cw[n - 1])
@@ -138,7 +139,7 @@ def prepare(
         smooth = cv2.resize(coarse, (grid.width, grid.height), interpolation=cv2.INTER_CUBIC)
         z = torch.from_numpy(depth[n] * scale[n] * np.exp(0.03 * smooth.reshape(-1))).float()
         state.information = z.isfinite().float()
-        state.inverse_depth = grid.fill(torch.where(z.isfinite(), 1 / z, 0.0), state.information)
+        state.inverse_depth = fields.fill(torch.where(z.isfinite(), 1 / z, 0.0), state.information)
     overlap = overlaps(depth, sequence.T_wc, grid)
     return store, operator, Truth(T_cw, torch.from_numpy(depth), overlap, scale)
 

@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 import torch
 
-from geogs.config import LossConfig
+from geogs.config import LossAblation, LossConfig
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp
 from geogs.losses import PhotoView, ViewConstants, multi_view_loss, single_view_loss
@@ -81,7 +81,7 @@ def multi_view_cases() -> list[tuple[str, Step, Step]]:
 
         return run
 
-    exact, sobel = (LossConfig(photo_gradient=g) for g in ("exact", "sobel"))
+    exact, sobel = (LossConfig(ablation=LossAblation(photo_gradient=g)) for g in ("exact", "sobel"))
     return [
         (name, step(multi_view_loss, config, pose), step(fused_multi_view, config, pose))
         for name, config, pose in (

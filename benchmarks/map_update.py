@@ -31,8 +31,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from geogs.application.results import fusion_views
-from geogs.config import Config, MappingConfig
+from geogs.application.surfaces import fusion_views
+from geogs.config import Config, MapAblation, MappingConfig
 from geogs.evaluation.reconstruction import evaluate_reconstruction
 from geogs.evaluation.surface import Surface
 from geogs.evaluation.triangle_tree import TriangleTree
@@ -345,7 +345,7 @@ def compare(scene: str, drift: float, with_mesh: bool) -> None:
     ]
     for name, strategy, c in ways:
         moved = build(there.keyframes, MAPPING)
-        moved.config = replace(MAPPING, map_update=strategy)
+        moved.config = replace(MAPPING, ablation=MapAblation(map_update=strategy))
         moved.keyframes.segment_of(0).correct(c)
         seconds = planning_time(moved, c)
         moved.correct(c)
@@ -361,7 +361,7 @@ def planning_time(mapper: Mapper, correction: PoseCorrection) -> float:
     def plan() -> MapUpdate:
         seen = [witness(v, correction) for v in mapper.views.values() if v.has_depth]
         disks = mapper.map
-        strategy = mapper.config.map_update
+        strategy = mapper.config.ablation.map_update
         return plan_update(disks.position, disks.keyframe_id, correction, strategy, seen)
 
     times = []

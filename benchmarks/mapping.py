@@ -20,8 +20,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from geogs.application.progress import peak_memory
-from geogs.application.results import fusion_views
+from geogs.application.machine import peak_memory
+from geogs.application.surfaces import fusion_views
 from geogs.config import Config
 from geogs.depth.completion import upsample_grid
 from geogs.errors import InputError
@@ -29,7 +29,7 @@ from geogs.evaluation.reconstruction import evaluate_reconstruction
 from geogs.evaluation.surface import Surface, read_surface
 from geogs.geometry.camera import Camera
 from geogs.geometry.umeyama import umeyama
-from geogs.io.poses import read_matrix_rows
+from geogs.io.poses import read_replica_trajectory
 from geogs.io.sources.sniff import open_source
 from geogs.keyframes.grid import SampleGrid
 from geogs.keyframes.store import KeyframeStore, Segment
@@ -227,7 +227,7 @@ def main() -> None:
         keyframes = track(arguments.sequence, config)
         if arguments.state:
             save_state(arguments.state, keyframes)
-    truth = read_matrix_rows(arguments.sequence / "traj.txt")
+    truth = read_replica_trajectory(arguments.sequence / "traj.txt").T_wc
     sim = alignment(keyframes, truth)
     if arguments.true_poses:
         take_true_poses(keyframes, truth, sim)

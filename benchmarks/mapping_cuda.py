@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 from torch.profiler import ProfilerActivity, profile
 
-from geogs.config import LossConfig, MappingConfig
+from geogs.config import LossAblation, LossConfig, MappingConfig
 from geogs.depth.view import DenseDepth
 from geogs.geometry.depth import normals_from_depth
 from geogs.geometry.lie import se3_inverse
@@ -52,7 +52,10 @@ SCALE, OPACITY = 1.0, 0.9
 CONFIGS = {
     "of a run": LossConfig(),
     "all of the paper": LossConfig(
-        normal_weight=0.05, smoothness_weight=0.1, smoothness_rewards_edges=True, ssim_weight=0.2
+        normal_weight=0.05,
+        smoothness_weight=0.1,
+        ssim_weight=0.2,
+        ablation=LossAblation(smoothness_rewards_edges=True),
     ),
 }
 PARTS = {

@@ -20,6 +20,7 @@ import cv2
 import numpy as np
 import torch
 
+from degraded_prior import BAD, PATCHY, PLAUSIBLE, DegradedPrior, with_bare_walls
 from geogs.config import Config, MappingConfig, PriorConfig
 from geogs.geometry.camera import Camera
 from geogs.geometry.umeyama import umeyama
@@ -27,9 +28,8 @@ from geogs.keyframes.grid import OFFSET, STRIDE
 from geogs.loop.global_bundle import global_bundle
 from geogs.priors.base import DepthKind, MonocularPrior
 from geogs.slam import Slam
-from geogs.synth.prior import BAD, PATCHY, PLAUSIBLE, DegradedPrior
 from geogs.synth.raycast import Raycaster, View
-from geogs.synth.room import make_room, with_bare_walls
+from geogs.synth.room import make_room
 from geogs.synth.trajectory import handheld_trajectory
 from geogs.tracking.flow.texture import MIN_STRUCTURE, cell_structure, smaller_eigenvalue
 from geogs.tracking.tracker import Tracker

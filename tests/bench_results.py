@@ -64,7 +64,7 @@ def write_result(
         "frames": len(T),
         "disks": 1234,
         "device": "cpu",
-        "frames_per_second": {"online": 5.0},
+        "frames_per_second": {"until_stream_end": 5.0},
         "peak_memory_bytes": 2_000_000_000,
         "seconds": {"total": 4.0},
     }

@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from geogs.config import LossConfig
+from geogs.config import LossAblation, LossConfig
 from geogs.geometry.camera import Camera
 from geogs.losses.single_view import (
     OUTSIDE,
@@ -34,4 +34,8 @@ def random_view(seed: int, camera: Camera = CAMERA) -> tuple[list[torch.Tensor],
     return maps, ViewConstants.prepare(image, camera, prior, uniform(h, w), towards)
 
 
-ALL_TERMS = LossConfig(normal_weight=0.1, smoothness_weight=0.05, smoothness_rewards_edges=True)
+ALL_TERMS = LossConfig(
+    normal_weight=0.1,
+    smoothness_weight=0.05,
+    ablation=LossAblation(smoothness_rewards_edges=True),
+)

@@ -63,6 +63,10 @@ class PlantedFlow:
         """All have enough."""
         return 1.0
 
+    def grey(self, encoded: int) -> Tensor:
+        """None is to be seen."""
+        return torch.zeros(self.grid.camera.height, self.grid.camera.width)
+
     def measure(
         self,
         first: Sequence[int],

@@ -12,10 +12,10 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from geogs.cli.durations import seconds
 from scipy.spatial import cKDTree
 
 from depth_scene import WORKING, make_scene, trace
-from geogs.cli.reconstruct import seconds
 from geogs.config import InputConfig
 from geogs.depth.classical import CpuDepthEngine
 from geogs.depth.estimate import estimate_depth

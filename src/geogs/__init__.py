@@ -3,28 +3,53 @@
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from geogs.version import __version__
+
 if TYPE_CHECKING:
-    from geogs.config import Config
+    from geogs import application
+    from geogs.application.reconstruct import reconstruct
+    from geogs.config import Config, ReconstructConfig
     from geogs.geometry.camera import Camera
+    from geogs.io.sources.posed.sniff import open_posed_source
+    from geogs.io.sources.sniff import open_source
     from geogs.io.writers.native import load_map
     from geogs.slam import Slam
     from geogs.splat.map import GaussianMap
+    from geogs.types import Frame
 
-__all__ = ["Camera", "Config", "GaussianMap", "Slam", "__version__", "load_map"]
-
-__version__ = "0.1.0"
+__all__ = [
+    "Camera",
+    "Config",
+    "Frame",
+    "GaussianMap",
+    "ReconstructConfig",
+    "Slam",
+    "__version__",
+    "application",
+    "load_map",
+    "open_posed_source",
+    "open_source",
+    "reconstruct",
+]
 
 _HOMES = {
     "Camera": "geogs.geometry.camera",
     "Config": "geogs.config",
+    "Frame": "geogs.types",
     "GaussianMap": "geogs.splat.map",
+    "ReconstructConfig": "geogs.config",
     "Slam": "geogs.slam",
     "load_map": "geogs.io.writers.native",
+    "open_posed_source": "geogs.io.sources.posed.sniff",
+    "open_source": "geogs.io.sources.sniff",
+    "reconstruct": "geogs.application.reconstruct",
 }
 
 
 def __getattr__(name: str) -> Any:
     """Import the public names when they are first used, so that the command line starts at once."""
+    if name == "application":
+        return import_module("geogs.application")
     if name not in _HOMES:
         raise AttributeError(f"module geogs has no attribute {name}")
     return getattr(import_module(_HOMES[name]), name)

@@ -17,7 +17,7 @@ from geogs.loop.global_bundle import global_bundle
 from geogs.mapping.mapper import Mapper
 from geogs.mapping.state import MapperState
 from geogs.priors.base import MonocularPrior
-from geogs.stopwatch import Stopwatch
+from geogs.stopwatch import Stopwatch, StopwatchState
 from geogs.threads import on_one_torch_thread
 from geogs.tracking.flow.select import build_operator
 from geogs.tracking.segments import Segments, SegmentsState
@@ -53,7 +53,7 @@ class SlamState:
     segments: SegmentsState
     loops: LoopsState
     mapper: MapperState
-    seconds: dict[str, float]
+    stopwatch: StopwatchState
     frames: int
     waiting: list[int]
     adjusted: int
@@ -104,7 +104,7 @@ class Slam:
         """What a checkpoint holds: to be written before the next frame, as it refers to all."""
         return SlamState(
             self.keyframes.state(), self.segments.state(), self.loops.state(), self.mapper.state(),
-            self.stopwatch.seconds, self.frames, list(self._waiting), self.adjusted, self._is_ended,
+            self.stopwatch.state(), self.frames, list(self._waiting), self.adjusted, self._is_ended,
         )  # fmt: skip
 
     @on_one_torch_thread
@@ -120,7 +120,7 @@ class Slam:
             raise InputError("a keyframe is missing")
         self.loops.load(state.loops)
         self.mapper.load(state.mapper)
-        self.stopwatch.seconds = state.seconds
+        self.stopwatch.load(state.stopwatch)
         self.frames, self._waiting = state.frames, deque(state.waiting)
         self.adjusted, self._is_ended = state.adjusted, state.is_ended
 
@@ -152,6 +152,7 @@ class Slam:
             self.segments.world.keyframes.take_corrections()
             self._waiting.clear()
         self._map(self._close_loops(result, is_last=True), lag=0)
+        self.stopwatch.end_stream()
 
     @on_one_torch_thread
     def finish(self, progress: Progress = _silent, correct: bool = True) -> None:

@@ -3,6 +3,15 @@
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class StopwatchState:
+    """What a checkpoint holds of a stopwatch; the fields are the stopwatch's."""
+
+    seconds: dict[str, float]
+    until_stream_end: float | None
 
 
 class Stopwatch:
@@ -13,7 +22,26 @@ class Stopwatch:
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
+        self.until_stream_end: float | None = None
+        """Seconds of all stages up to the end of the stream; none before it."""
         self._is_running = False
+
+    def state(self) -> StopwatchState:
+        """What a checkpoint holds."""
+        return StopwatchState(dict(self.seconds), self.until_stream_end)
+
+    def load(self, state: StopwatchState) -> None:
+        """Go on from where another was."""
+        self.seconds, self.until_stream_end = state.seconds, state.until_stream_end
+
+    @property
+    def total(self) -> float:
+        """Seconds of all stages so far."""
+        return sum(self.seconds.values())
+
+    def end_stream(self) -> None:
+        """What comes from now on comes after the stream."""
+        self.until_stream_end = self.total
 
     @contextmanager
     def __call__(self, stage: str) -> Iterator[None]:

@@ -42,7 +42,7 @@ INITIALISATION = Benchmark(
         Variant(
             f"{name}-{iterations}",
             (
-                *_set(disk__initialisation=name.replace("-", "_"), iterations=str(iterations)),
+                *_set(ablation__initialisation=name.replace("-", "_"), iterations=str(iterations)),
                 *_NO_REFINEMENT,
             ),
         )
@@ -64,9 +64,9 @@ MAP_UPDATE = Benchmark(
     _WHERE,
     (vertex_layout(paper.ABLATION_UPDATE), area_layout(), COST),
     (
-        Variant("per-keyframe", (*_set(map_update="per_keyframe"), *_NO_REFINEMENT)),
-        Variant("coherent", (*_set(map_update="coherent"), *_NO_REFINEMENT)),
-        Variant("blended", (*_set(map_update="blended"), *_NO_REFINEMENT)),
+        Variant("per-keyframe", (*_set(ablation__map_update="per_keyframe"), *_NO_REFINEMENT)),
+        Variant("coherent", (*_set(ablation__map_update="coherent"), *_NO_REFINEMENT)),
+        Variant("blended", (*_set(ablation__map_update="blended"), *_NO_REFINEMENT)),
     ),
     paper.REPLICA_SCENES,
     (paper.ABLATION_UPDATE,),

@@ -143,7 +143,7 @@ def cost_of(result: ResultFolder, seconds: float) -> Cost:
     return Cost(
         seconds=round(seconds, 3),
         frames=summary.get("frames"),
-        frames_per_second=rates.get("online", rates.get("with_final_stages")),
+        frames_per_second=rates.get("until_stream_end", rates.get("with_final_stages")),
         peak_memory_bytes=summary.get("peak_memory_bytes"),
         peak_gpu_memory_bytes=summary.get("peak_gpu_memory_bytes"),
         disks=summary.get("disks"),

@@ -8,7 +8,8 @@ import subprocess
 from contextlib import suppress
 from pathlib import Path
 
-import geogs
+from geogs.gpu.source import PACKAGE
+from geogs.version import __version__
 
 
 def machine_name() -> str:
@@ -19,12 +20,12 @@ def machine_name() -> str:
 
 def program_version() -> str:
     """The commit of the checkout that runs, ``+`` if changed since; else the version."""
-    package = Path(geogs.__file__).resolve()
+    package = PACKAGE.resolve()
     if _git(package.parent, "ls-files", "--error-unmatch", package.name) is None:
-        return geogs.__version__  # installed, perhaps inside a repository of something else
+        return __version__  # installed, perhaps inside a repository of something else
     commit = _git(package.parent, "rev-parse", "--short=12", "HEAD")
     changed = _git(package.parent, "status", "--porcelain", "--untracked-files=no", "--", ".")
-    return f"{commit}{'+' if changed else ''}" if commit else geogs.__version__
+    return f"{commit}{'+' if changed else ''}" if commit else __version__
 
 
 def forget_peak_memory() -> None:

@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +15,12 @@ RECORD_FILE = "bench.json"
 """What is known of the result."""
 
 _RUN_FILE = "bench_run.json"
-_LEFT_BY_EARLIER_RUNS = ("online", "depth_fusion", "snapshots")
+_LEFT_BY_EARLIER_RUNS = (
+    _RUN_FILE, RECORD_FILE, "mesh.ply", "map.safetensors", "summary.json", "online/trajectory.tum",
+    "online/keyframes.tum", "online/mesh.ply", "depth_fusion/mesh.ply", "snapshots/*/mesh.ply",
+    "snapshots/*/map.safetensors",
+)  # fmt: skip
+"""Files of a result that would be scored, were they still there."""
 
 
 @dataclass(frozen=True)
@@ -53,14 +57,16 @@ def write_completed_run(folder: Path, run: CompletedRun) -> None:
 def clear(folder: Path) -> Path:
     """Make the folder ready for a new run: what an earlier one left must not be scored.
 
+    Nothing else in it is touched, and no link to another folder is followed.
+
     Raises:
         OutputError: it cannot be made or written.
     """
     prepare_output_folder(folder)
-    for name in (_RUN_FILE, RECORD_FILE, "mesh.ply", "map.safetensors", "summary.json"):
-        (folder / name).unlink(missing_ok=True)
-    for name in _LEFT_BY_EARLIER_RUNS:
-        shutil.rmtree(folder / name, ignore_errors=True)
+    for pattern in _LEFT_BY_EARLIER_RUNS:
+        for path in folder.glob(pattern):
+            if path.parent.resolve() == folder.resolve() / path.parent.relative_to(folder):
+                path.unlink()
     return folder
 
 

@@ -6,16 +6,18 @@ is plain autograd, so that a network can be taught what measurements, weights an
 adjusted poses and depths right (Teed and Deng, "DROID-SLAM", NeurIPS 2021, section 3.2).
 
 The edges of all clips are the same. Positions may be in pixels or in cells, if only intrinsics,
-positions and weights agree.
+positions and weights agree. Projection and the derivatives of points are the tracker's. Its stars
+are not used: made one by one they would give autograd a graph each, where here the sources of all
+clips are eliminated at once; nor its robust weights, since the network gives the weights.
 """
 
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
-from geogs.bundle.projection import MIN_Z
+from geogs.bundle.projection import Projection, motion_rows, relative_motion, seen_from_targets
 from geogs.geometry.lie import retract, se3_adjoint, se3_inverse
 
 
@@ -29,10 +31,16 @@ class ClipCameras:
     """x, y."""
 
     @property
+    def focal_and_centre(self) -> tuple[Float[Tensor, "b 1 1 2"], Float[Tensor, "b 1 1 2"]]:
+        """For numbers of each edge and cell."""
+        focal, centre = self.intrinsics[:, None, None].split(2, -1)
+        return focal, centre
+
+    @property
     def rays(self) -> Float[Tensor, "b p 3"]:
         """K^-1 (x, y, 1) of every cell."""
-        focal, centre = self.intrinsics[:, None, :2], self.intrinsics[:, None, 2:]
-        xy = (self.cells - centre) / focal
+        focal, centre = self.focal_and_centre
+        xy = (self.cells - centre[:, 0]) / focal[:, 0]
         return torch.cat([xy, torch.ones_like(xy[..., :1])], -1)
 
 
@@ -92,17 +100,6 @@ class ClipBundleOptions:
 
 
 @dataclass(frozen=True)
-class ClipProjection:
-    """Where the cells of the sources fall in the targets."""
-
-    pixels: Float[Tensor, "b e p 2"]
-    valid: Bool[Tensor, "b e p"]
-    """Whether a point lies before the target."""
-    z: Float[Tensor, "b e p"]
-    """Depth in the target over depth in the source, at least ``MIN_Z``."""
-
-
-@dataclass(frozen=True)
 class _System:
     """Normal equations of one step; depths are diagonal."""
 
@@ -117,17 +114,15 @@ class _System:
 
 def relative_motions(T_cw: Float[Tensor, "b v 4 4"], edges: ClipEdges) -> Float[Tensor, "b e 4 4"]:
     """T_ji = T_j T_i^-1 of every edge i -> j."""
-    return T_cw[:, edges.target] @ se3_inverse(T_cw[:, edges.source])
+    return relative_motion(T_cw, edges.source, edges.target)
 
 
-def reproject(cameras: ClipCameras, state: ClipState, edges: ClipEdges) -> ClipProjection:
-    """p = pi(K (R ray + d t)) for every cell; points too close are held at ``MIN_Z``."""
-    d = state.inverse_depth[:, edges.source]
-    T = relative_motions(state.T_cw, edges).to(d)
-    y = cameras.rays[:, None] @ T[..., :3, :3].mT + d[..., None] * T[..., None, :3, 3]
-    z = y[..., 2].clamp(min=MIN_Z)
-    focal, centre = (cameras.intrinsics[:, None, None, k] for k in (slice(2), slice(2, 4)))
-    return ClipProjection(focal * y[..., :2] / z[..., None] + centre, y[..., 2] > MIN_Z, z)
+def reproject(cameras: ClipCameras, state: ClipState, edges: ClipEdges) -> Projection:
+    """Where the cells of every edge's source fall in its target."""
+    T, d = relative_motions(state.T_cw, edges), state.inverse_depth[:, edges.source]
+    y, valid, z = seen_from_targets(cameras.rays[:, None], T, d)
+    focal, centre = cameras.focal_and_centre
+    return Projection(focal * y[..., :2] / z[..., None] + centre, valid, z)
 
 
 def adjust(
@@ -152,25 +147,18 @@ def adjust(
 
 
 def _jacobians(
-    cameras: ClipCameras, projection: ClipProjection, state: ClipState, edges: ClipEdges
+    cameras: ClipCameras, p: Projection, state: ClipState, edges: ClipEdges
 ) -> tuple[Float[Tensor, "b e 6 2 p"], Float[Tensor, "b e p 2"], Float[Tensor, "b e 6 6"]]:
     """d pixel / d xi of T_ji (left perturbation), d pixel / d inverse depth; Ad of T_ji."""
     d = state.inverse_depth[:, edges.source]
     T = relative_motions(state.T_cw, edges)
-    focal, centre = (cameras.intrinsics[:, None, None, k] for k in (slice(2), slice(2, 4)))
-    x, y = ((projection.pixels - centre) / focal).unbind(-1)
-    q = 1 / projection.z
-    dq, o = d * q, torch.zeros_like(q)
-    rows = torch.stack(
-        [
-            torch.stack([dq, o, -x * dq, -x * y, 1 + x * x, -y], 2),
-            torch.stack([o, dq, -y * dq, -1 - y * y, x * y, x], 2),
-        ],
-        3,
-    )
+    focal, centre = cameras.focal_and_centre
+    x, y = ((p.pixels - centre) / focal).unbind(-1)
+    q = 1 / p.z
+    rows = torch.stack(motion_rows(x, y, d * q), 3)
     tx, ty, tz = T[..., None, :3, 3].to(d).unbind(-1)
     depth = focal * torch.stack([(tx - tz * x) * q, (ty - tz * y) * q], -1)
-    return rows * focal[..., 0, :, None][:, :, None], depth, se3_adjoint(T)
+    return rows * focal[..., None], depth, se3_adjoint(T)
 
 
 def _normal_equations(

@@ -4,11 +4,10 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
-
-from tyro.conf import Positional
+from typing import Annotated, Literal
 
 from geogs.cli.options import parse_options
+from geogs.config.setting import Positional
 from geogs_train.options import FlowTraining
 from geogs_train.run import RunOptions
 
@@ -22,9 +21,9 @@ class TrainOptions:
     torchrun --nproc-per-node N -m geogs.cli.main train flow OUTPUT
     """
 
-    network: Positional[Literal["flow"]]
+    network: Annotated[Literal["flow"], Positional()]
     """What to train."""
-    output: Positional[Path]
+    output: Annotated[Path, Positional()]
     """Folder to write."""
     device: str = "auto"
     """auto, cpu or cuda."""

@@ -60,7 +60,7 @@ def state(steps: int, archive: Archive | None = None, pictures: int = 3) -> Stat
 
 def read(output: Path) -> State:
     saved = SavedState(output, State)
-    return State(saved.part("name"), saved.part("work"))
+    return State(saved.facts("name"), saved.work("work"))
 
 
 def assert_is(made: State, steps: int) -> None:

@@ -53,7 +53,7 @@ def again(slam: Slam, output: Path, copy: Path) -> Slam:
     write_checkpoint(checkpoint_folder(output), Work(slam.state()))
     shutil.copytree(output, copy)
     other = Slam(slam.camera, slam.config)
-    other.load(SavedState(copy, Work).part("slam"))
+    other.load(SavedState(copy, Work).work("slam"))
     return other
 
 

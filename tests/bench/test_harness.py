@@ -13,6 +13,7 @@ from geogs_bench.harness import Harness
 from geogs_bench.machine import machine_name, program_version
 from geogs_bench.plan import Wishes, make_jobs, merged
 from geogs_bench.scene import Option, Scene
+from geogs_bench.store import clear
 
 
 def benchmark(scenes: list[Scene], **changes) -> Benchmark:
@@ -144,3 +145,19 @@ def test_later_options_win_whatever_their_spelling():
     options = merged([Option("a.b_c", "1"), Option("d")], [Option("a.b-c", "2")])
     assert options == (Option("a.b-c", "2"), Option("d"))
     assert [o.arguments() for o in options] == [["--a.b-c", "2"], ["--d"]]
+
+
+def test_only_the_files_of_an_earlier_run_are_cleared_away(tmp_path):
+    folder, elsewhere = tmp_path / "den", tmp_path / "mine"
+    own = ["online/notes.txt", "snapshots/5/photo.png", "video.mp4", "depth_fusion/sub/mesh.ply"]
+    left = ["mesh.ply", "bench.json", "online/mesh.ply", "snapshots/5/map.safetensors"]
+    for name in (*own, *left):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).touch()
+    elsewhere.mkdir()
+    (elsewhere / "mesh.ply").touch()
+    (folder / "snapshots" / "7").symlink_to(elsewhere)
+    assert clear(folder) == folder
+    assert [name for name in own if not (folder / name).is_file()] == []
+    assert [name for name in left if (folder / name).exists()] == []
+    assert (elsewhere / "mesh.ply").is_file()

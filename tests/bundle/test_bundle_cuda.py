@@ -11,11 +11,13 @@ import torch
 import geogs.bundle.cuda.dense as cuda_bundle
 import geogs.bundle.cuda.fields as cuda_fields
 import geogs.bundle.cuda.motion as cuda_motion
-import geogs.bundle.cuda.pairs as cuda_graph
+import geogs.bundle.cuda.pairs as cuda_pairs
 from cuda_emulator import use_emulator
 from geogs.bundle.base import BundleOptions, BundleResult
 from geogs.bundle.dense import DenseBundle
-from geogs.bundle.motion import solve_poses
+from geogs.bundle.fields import CpuFields
+from geogs.bundle.motion import fit_frame, solve_poses
+from geogs.bundle.pairs import CpuPairs
 from geogs.bundle.problem import BundleProblem
 from geogs.bundle.projection import MIN_Z, linearise, project, relative_motion
 from geogs.geometry.camera import Camera
@@ -23,11 +25,6 @@ from geogs.geometry.lie import retract, se3_exp
 from geogs.keyframes.grid import SampleGrid
 from geogs.keyframes.store import KeyframeStore, Segment
 from geogs.loop.global_bundle import global_bundle
-from geogs.tracking.flow.base import FlowMatch
-from geogs.tracking.flow.classical import ClassicalFlow
-from geogs.tracking.graph import FrameGraph, MeasuredEdge
-from geogs.tracking.motion import FrameLocator, both_reprojections, transfer_depth
-from geogs.tracking.proximity import frame_distances
 from geogs.tracking.tracker import Tracker, TrackState
 from tracking_runs import CONFIG, PATH, error_cm
 from tracking_scenes import CAMERA as ROOM
@@ -41,7 +38,7 @@ LARGE = Camera(fx=300.0, fy=302.0, cx=255.5, cy=144.5, width=512, height=290)
 def device(request, monkeypatch) -> torch.device:
     """Where the kernels run; everything is emulated where there is no GPU."""
     if request.param == "emulated":
-        use_emulator(monkeypatch, cuda_bundle, cuda_fields, cuda_graph, cuda_motion)
+        use_emulator(monkeypatch, cuda_bundle, cuda_fields, cuda_pairs, cuda_motion)
         return torch.device("cpu")
     if not torch.cuda.is_available():
         pytest.skip("needs a CUDA GPU")
@@ -243,10 +240,8 @@ def test_filling_matches_the_cpu(device):
         confidence[n] *= torch.rand(grid.size, generator=g) >= share
     confidence[1, 3] = 0.5
     confidence[0, 7] = -1.0
-    filled = cuda_fields.fill_fields(grid, values.to(device), confidence.to(device)).cpu()
-    expected = torch.stack(
-        [SampleGrid(camera).fill(*p) for p in zip(values, confidence, strict=True)]
-    )
+    filled = cuda_fields.CudaFields(grid).fill(values.to(device), confidence.to(device)).cpu()
+    expected = CpuFields(SampleGrid(camera)).fill(values, confidence)
     torch.testing.assert_close(filled, expected, rtol=1e-5, atol=1e-6)
     assert torch.equal(filled[3], values[3])
     assert float((filled[0] - values[0]).abs().max()) > 0.1
@@ -255,27 +250,20 @@ def test_filling_matches_the_cpu(device):
 def test_carried_depth_and_reprojections_match_the_cpu(device):
     camera = camera_for(device)
     problem = smooth(scene(camera, frames=3), camera)
-    store, grid = keyframes(problem, camera, device), SampleGrid(camera)
+    store, cpu = keyframes(problem, camera, device), CpuFields(SampleGrid(camera))
     slow = keyframes(problem, camera, torch.device("cpu"))
     source, target = [0, 2, 2], [1, 1, 0]
-    arguments = (
-        store.grid,
-        store.poses(target),
-        store.poses([0, 1, 2]),
-        torch.tensor(source),
-        store.inverse_depths([0, 1, 2]),
-        store.informations([0, 1, 2]),
-    )
-    depth, information = cuda_fields.carry_depth(*arguments, reproject=False)
-    there, back = cuda_fields.carry_depth(*arguments, reproject=True)
+    fast = cuda_fields.CudaFields(store.grid)
+    there, back = fast.reproject([store[i] for i in source], list(store.poses(target)))
     for n, (i, j) in enumerate(zip(source, target, strict=True)):
         T = relative_motion(slow.poses([i, j]), torch.tensor([0]), torch.tensor([1]))[0]
-        d, info = transfer_depth(grid, T, slow[i].inverse_depth, slow[i].information)
-        forward, backward = both_reprojections(grid, slow[i], slow[j].T_cw)
+        depth, information = fast.transfer(T, store[i].inverse_depth, store[i].information)
+        d, info = cpu.transfer(T, slow[i].inverse_depth, slow[i].information)
+        (forward,), (backward,) = cpu.reproject([slow[i]], [slow[j].T_cw])
         torch.testing.assert_close(there[n].cpu(), forward, rtol=1e-4, atol=1e-2)
         # A cell whose position rounds the other way may fall on a neighbour.
-        same = torch.isclose(depth[n].cpu(), d, rtol=1e-4)
-        same &= torch.isclose(information[n].cpu(), info, rtol=1e-3, atol=1e-3)
+        same = torch.isclose(depth.cpu(), d, rtol=1e-4)
+        same &= torch.isclose(information.cpu(), info, rtol=1e-3, atol=1e-3)
         same &= torch.isclose(back[n].cpu(), backward, rtol=1e-3, atol=1e-1).all(-1)
         assert float(same.float().mean()) > 0.97
         assert 0.2 < float((info > 0).float().mean()) < 1
@@ -316,20 +304,24 @@ def test_fit_of_a_frame_matches_the_cpu(device):
     edge = int(torch.nonzero((problem.source == 0) & (problem.target == 2))[0])
     pixels, weight = problem.pixels[edge], problem.weight[edge]
     pixels[::7] += 30.0
-    locator = FrameLocator(slow.grid, ClassicalFlow(slow.grid), 0.1, 1.5)
-    expected = locator._fit(slow[0], FlowMatch(pixels[None], weight[None]), problem.T_cw[2])
-    assert expected is not None
-    T, (used, matched, residual, flow) = cuda_motion.fit_frame(
-        store.grid, problem.T_cw[2], store[0].T_cw, store[0].inverse_depth, store[0].information,
-        pixels.to(device), weight.to(device), 6, 5.0, 3.0,
+    (expected_T, expected), (T, found) = (
+        fit(
+            kept.grid, problem.T_cw[2], kept[0].T_cw, kept[0].inverse_depth, kept[0].information,
+            pixels.to(where), weight.to(where), 6, 5.0, 3.0,
+        )
+        for fit, kept, where in (
+            (fit_frame, slow, "cpu"), (cuda_motion.fit_frame, store, device)
+        )
     )  # fmt: skip
-    torch.testing.assert_close(T, expected.T_cw, rtol=0, atol=2e-5)
+    torch.testing.assert_close(T.cpu(), expected_T, rtol=0, atol=2e-5)
+    used, matched, residual, flow = found.tolist()
     share = ((weight[:, 0] > 0) & (slow[0].information > 0)).float().mean()
     assert used == pytest.approx(float(share), abs=1e-6)
-    assert matched == pytest.approx(expected.matched, abs=1.5 / len(weight))
+    assert used == pytest.approx(float(expected[0]), abs=1e-6)
+    assert matched == pytest.approx(float(expected[1]), abs=1.5 / len(weight))
     assert matched < used
-    assert residual == pytest.approx(expected.residual, rel=1e-3)
-    assert flow == pytest.approx(expected.flow, rel=1e-5)
+    assert residual == pytest.approx(float(expected[2]), rel=1e-3)
+    assert flow == pytest.approx(float(expected[3]), rel=1e-5)
 
 
 def test_pairs_of_keyframes_match_the_cpu(device):
@@ -341,12 +333,11 @@ def test_pairs_of_keyframes_match_the_cpu(device):
     slow = keyframes(problem, camera, torch.device("cpu"))
     fast = keyframes(problem, camera, device)
     directed = [(i, j) for i in range(4) for j in range(4) if i != j]
-    pairs = cuda_graph.DirectedPairs.of(fast, directed)
-    graph = FrameGraph(slow, ClassicalFlow(slow.grid))
-    before = graph.reprojections(directed)
+    pairs, expected = cuda_pairs.CudaPairs(fast, directed), CpuPairs(slow, directed)
+    before = expected.project()
     torch.testing.assert_close(pairs.project().cpu(), before, rtol=1e-3, atol=1e-2)
 
-    distance = frame_distances(slow, directed)
+    distance = expected.distances(0.3)
     assert 0 < int(torch.isinf(distance).sum()) < len(directed)
     torch.testing.assert_close(pairs.distances(0.3, 2).cpu(), distance, rtol=1e-4, atol=1e-3)
 
@@ -354,12 +345,10 @@ def test_pairs_of_keyframes_match_the_cpu(device):
     earlier = before + 3 * torch.randn(before.shape, generator=g)
     weight = (torch.rand(before.shape, generator=g) > 0.4).float()
     weight[4] = 0
-    for n, e in enumerate(directed):
-        graph.edges[e] = MeasuredEdge(before[n], weight[n], earlier[n])
-    expected = graph._moved(directed)
-    assert torch.isnan(expected[4])
+    motion = expected.moved(earlier, weight)
+    assert torch.isnan(motion[4])
     moved = pairs.moved(earlier.to(device), weight.to(device)).cpu()
-    torch.testing.assert_close(moved, expected, rtol=1e-3, atol=1e-3, equal_nan=True)
+    torch.testing.assert_close(moved, motion, rtol=1e-3, atol=1e-3, equal_nan=True)
 
 
 def test_uncertain_observations_linearise_on_the_device(device):

@@ -6,8 +6,8 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from geogs.application import self_test
-from geogs.cli import doctor
+from geogs.application import doctor, self_test
+from geogs.cli.doctor import main
 from geogs.errors import DeviceError
 from geogs.gpu import cache, installation, kernels
 
@@ -31,7 +31,7 @@ def machine(monkeypatch):
 def test_healthy_cpu_machine(machine, capsys, monkeypatch, tmp_path):
     monkeypatch.setenv("GEOGS_CACHE", str(tmp_path))
     machine(None, None)
-    assert doctor.main([]) == 0
+    assert main([]) == 0
     text = capsys.readouterr().out
     for name in ("Python", "PyTorch", "OpenCV", "numba", "video", "kernel cache", "self-test"):
         assert name in text
@@ -50,7 +50,7 @@ def test_wrong_results_fail(monkeypatch, capsys):
 
     self_test_render = self_test.render
     monkeypatch.setattr(self_test, "render", wrong)
-    assert doctor.main(["--device", "cpu"]) == 2
+    assert main(["--device", "cpu"]) == 2
     text = capsys.readouterr().out
     assert "BAD" in text
     assert "To mend:\n  - The renderer gives wrong results on cpu" in text
@@ -61,7 +61,7 @@ def test_crash_of_the_renderer_is_one_line(monkeypatch, capsys):
         raise RuntimeError("no kernel image is available\nand more")
 
     monkeypatch.setattr(self_test, "render", crash)
-    assert doctor.main(["--device", "cpu"]) == 2
+    assert main(["--device", "cpu"]) == 2
     text = capsys.readouterr().out
     assert "does not run on cpu (RuntimeError: no kernel image is available)." in text
 
@@ -113,7 +113,7 @@ def test_unknown_devices(name):
 
 def test_driver_without_cuda_build_is_to_be_mended(machine, capsys):
     machine((13, 0), None)
-    assert doctor.main([]) == 0  # the CPU works all the same
+    assert main([]) == 0  # the CPU works all the same
     text = capsys.readouterr().out
     assert "To mend:\n  - This machine has an NVIDIA driver, but this PyTorch" in text
 
@@ -179,7 +179,7 @@ def test_all_kernels_are_prepared(monkeypatch, tmp_path):
 @pytest.mark.gpu
 @NEEDS_GPU
 def test_gpu_machine(capsys):
-    assert doctor.main([]) == 0
+    assert main([]) == 0
     text = capsys.readouterr().out
     for name in ("GPU 0", "driver", "NVRTC", "kernels"):
         assert name in text

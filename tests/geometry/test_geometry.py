@@ -94,16 +94,6 @@ def test_umeyama_of_a_mirrored_set_is_still_a_rotation():
     assert float(torch.linalg.det(R)) == pytest.approx(1.0)
 
 
-def test_umeyama_ignores_points_of_weight_zero():
-    source = torch.randn(30, 3, dtype=F64, generator=torch.Generator().manual_seed(2))
-    target = 2 * source
-    target[:5] += 100
-    weights = torch.ones(30, dtype=F64)
-    weights[:5] = 0
-    scale, _, _ = umeyama(source, target, weights=weights)
-    assert float(scale) == pytest.approx(2, abs=1e-12)
-
-
 def test_umeyama_refuses_a_line():
     line = torch.linspace(0, 1, 10, dtype=F64)[:, None] * torch.tensor([1.0, 2, 3], dtype=F64)
     with pytest.raises(GeogsError, match="line"):

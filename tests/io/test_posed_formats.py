@@ -11,7 +11,7 @@ from geogs.config import InputConfig
 from geogs.errors import InputError
 from geogs.io.sources.posed.colmap_model import read_model
 from geogs.io.sources.posed.dtu import decompose
-from geogs.io.sources.posed.files import renumbered
+from geogs.io.sources.posed.files import SparsePoints, renumbered
 from geogs.io.sources.posed.sniff import open_posed_source
 from io_samples import write_image
 from posed_layouts import (
@@ -45,6 +45,11 @@ def write_colmap_project(room, folder, write_model=write_colmap_text, **camera):
 
 def write_colmap_binary_project(room, folder):
     return write_colmap_project(room, folder, write_colmap_binary)
+
+
+def seen_by(points: SparsePoints, image: int) -> np.ndarray:
+    """Positions of the points that an image sees."""
+    return points.positions[np.unique(points.seen_point[points.seen_image == image])]
 
 
 def assert_is_room(source, room, exactly=True):
@@ -101,12 +106,12 @@ def test_colmap_points_follow_the_selection(room, tmp_path):
     write_colmap_project(room, tmp_path)
     source = open_posed_source(tmp_path, NATIVE)
     np.testing.assert_allclose(source.points.positions, room.points)
-    np.testing.assert_allclose(source.points.seen_by(0), room.points[:1])
-    np.testing.assert_allclose(source.points.seen_by(4), room.points[3:5])
+    np.testing.assert_allclose(seen_by(source.points, 0), room.points[:1])
+    np.testing.assert_allclose(seen_by(source.points, 4), room.points[3:5])
     # Images 4, 6, 8: point k is seen by images k and k + 1.
     source = open_posed_source(tmp_path, InputConfig(long_edge=0, start=4, stop=9, stride=2))
     np.testing.assert_allclose(source.points.positions, room.points[3:9])
-    np.testing.assert_allclose(source.points.seen_by(1), room.points[5:7])
+    np.testing.assert_allclose(seen_by(source.points, 1), room.points[5:7])
 
 
 @pytest.mark.parametrize("given", ["sparse/0", "sparse", "sparse/0/images.bin"])
@@ -160,7 +165,7 @@ def test_images_that_are_missing_are_left_out(room, tmp_path, caplog):
         source = open_posed_source(tmp_path, NATIVE)
     assert "left out 2 of 11" in caplog.text
     np.testing.assert_allclose(source.T_cw[[3, 4]], room.T_cw[[4, 6]], atol=1e-9)
-    np.testing.assert_allclose(source.points.seen_by(4), room.points[5:7])
+    np.testing.assert_allclose(seen_by(source.points, 4), room.points[5:7])
 
 
 def test_scannetpp_iphone(room, tmp_path):

@@ -14,7 +14,7 @@ from geogs.config import Config, InputConfig, LoopConfig, TrackingConfig
 from geogs.errors import InputError
 from geogs.evaluation.trajectory import evaluate_trajectory
 from geogs.io.sources.several import PAUSE
-from geogs.io.sources.sniff import open_sources
+from geogs.io.sources.sniff import open_source
 from geogs.slam import Slam
 from geogs.types import Frame, Trajectory
 from tracking_scenes import CAMERA, frames, sideways
@@ -31,7 +31,7 @@ def folder(path: Path, count: int, width: int = 64, name: str = "frame") -> Path
 def test_frames_are_numbered_and_timed_through(tmp_path):
     config = InputConfig(intrinsics="50,50,31.5,23.5")
     paths = [folder(tmp_path / "a", 3), folder(tmp_path / "b", 4)]
-    source = open_sources(paths, config)
+    source = open_source(paths, config)
     for _ in range(2):  # a source can be read again
         read = list(source)
         assert [f.index for f in read] == list(range(7))
@@ -47,9 +47,9 @@ def test_frames_are_numbered_and_timed_through(tmp_path):
 def test_other_cameras_are_refused(tmp_path):
     small, large = folder(tmp_path / "a", 2), folder(tmp_path / "b", 2, width=80)
     with pytest.raises(InputError, match="one camera mode"):
-        open_sources([small, large], InputConfig())
+        open_source([small, large], InputConfig())
     with pytest.raises(InputError, match="Nothing to read"):
-        open_sources([], InputConfig())
+        open_source([], InputConfig())
 
 
 def test_two_videos_of_a_place_make_one_map(tmp_path):

@@ -11,7 +11,7 @@ from geogs.geometry.lie import quaternion_to_matrix, se3_exp
 from geogs.io.ply import read_ply
 from geogs.io.poses import read_tum_trajectory
 from geogs.io.writers.atomic import atomic_file, prepare_output_folder, write_text
-from geogs.io.writers.native import load_map, load_map_metadata, save_map
+from geogs.io.writers.native import load_map, save_map
 from geogs.io.writers.ply import SPLAT_THICKNESS, write_mesh, write_splats
 from geogs.io.writers.tum import write_tum_trajectory
 from geogs.types import MapSnapshot, Trajectory
@@ -129,17 +129,16 @@ def test_empty_map_can_be_written(tmp_path, disks):
 
 def test_map_round_trip_is_exact_and_ten_floats_a_disk(tmp_path, disks):
     path = tmp_path / "map.safetensors"
-    save_map(path, disks, {"scene": "room", "unit": "of the sequence", "views": [1, 2]})
+    metadata = {"scene": "room", "unit": "of the sequence", "views": [1, 2]}
+    save_map(path, disks, metadata)
     read = load_map(path)
     for name in ("position", "quaternion", "scale", "opacity"):
         assert torch.equal(getattr(read, name), getattr(disks, name))
-    assert load_map_metadata(path) == {
-        "scene": "room", "unit": "of the sequence", "views": [1, 2]
-    }  # fmt: skip
     header = int.from_bytes(path.read_bytes()[:8], "little")
     assert path.stat().st_size == 8 + header + 50 * 10 * 4
     declared = json.loads(path.read_bytes()[8 : 8 + header])["__metadata__"]
     assert (declared["format"], declared["version"]) == ("geogs-map", "1")
+    assert json.loads(declared["metadata"]) == metadata
 
 
 def test_maps_that_cannot_be_used(tmp_path, disks):

@@ -1,8 +1,8 @@
 """The sample grid."""
 
-import pytest
 import torch
 
+from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.keyframes.grid import SampleGrid
 
@@ -22,6 +22,12 @@ def test_cells_sit_where_the_convention_says():
     pixels, z = CAMERA.project(grid.rays)
     torch.testing.assert_close(pixels, grid.pixels)
     assert torch.equal(z, torch.ones_like(z))
+
+
+@pytest.mark.parametrize(("width", "height"), [(1, 1), (8, 200), (200, 31)])
+def test_an_image_with_too_few_cells_is_refused(width: int, height: int) -> None:
+    with pytest.raises(InputError, match=f"{width} x {height} pixels; tracking needs at least"):
+        SampleGrid(Camera(9.0, 9.0, 0.5, 0.5, width, height))
 
 
 def test_linear_fields_are_interpolated_exactly():
@@ -44,17 +50,3 @@ def test_cells_of_rounds_to_the_nearest_and_flags_the_rest():
     assert torch.equal(index, torch.arange(grid.size))
     strange = torch.tensor([[-10.0, 5.0], [1e9, 5.0], [float("nan"), 5.0], [50.0, 200.0]])
     assert not grid.cells_of(strange)[1].any()
-
-
-def test_fill_keeps_known_values_and_bridges_holes():
-    grid = SampleGrid(CAMERA)
-    values = 1 + 0.01 * grid.pixels[:, 0]
-    known = torch.ones(grid.size)
-    known[25:28] = 0
-    filled = grid.fill(torch.where(known > 0, values, torch.tensor(99.0)), known)
-    torch.testing.assert_close(filled[known > 0], values[known > 0])
-    assert float((filled - values).abs().max()) < 0.15
-    assert float(grid.fill(values, 0 * known)[0]) == pytest.approx(float(values.mean()))
-    one = torch.zeros(grid.size)
-    one[40] = 1.0
-    torch.testing.assert_close(grid.fill(values, one), torch.full_like(values, float(values[40])))

@@ -24,6 +24,9 @@ class CountingFlow:
     def texture(self, encoded: int) -> float:
         return 1.0
 
+    def grey(self, encoded: int) -> torch.Tensor:
+        return torch.full((CAMERA.height, CAMERA.width), float(encoded))
+
     def measure(
         self,
         first: Sequence[int],

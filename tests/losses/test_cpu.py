@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from geogs.config import LossConfig
+from geogs.config import LossAblation, LossConfig
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp
 from geogs.losses import PhotoView, multi_view_loss, single_view_loss
@@ -29,7 +29,7 @@ def leaves(*tensors: torch.Tensor) -> list[torch.Tensor]:
 SINGLE = {
     "default": LossConfig(),
     "all": ALL_TERMS,
-    "absolute": replace(ALL_TERMS, depth_relative=False, smoothness_rewards_edges=False),
+    "absolute": replace(ALL_TERMS, ablation=LossAblation(depth_relative=False)),
     "depth only": LossConfig(
         normal_consistency_weight=0.0, opacity_weight=0.0, distortion_weight=0.0
     ),
@@ -76,7 +76,7 @@ def photo_case(seed: int) -> tuple[torch.Tensor, PhotoView, PhotoView, torch.Ten
 
 MULTI = {
     "default": LossConfig(),
-    "sobel": LossConfig(photo_gradient="sobel"),
+    "sobel": LossConfig(ablation=LossAblation(photo_gradient="sobel")),
     "ncc 5": LossConfig(l1_weight=0.0, ncc_patch=5, ncc_reject=1.5),
     "l1 plain": LossConfig(ncc_weight=0.0, l1_huber=0.0, l1_cut=1.0),
     "ssim": LossConfig(ssim_weight=0.4),

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from cuda_emulator import use_emulator
-from geogs.config import LossConfig
+from geogs.config import LossAblation, LossConfig
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp
 from geogs.losses import PhotoView, ViewConstants, multi_view_loss, single_view_loss
@@ -200,13 +200,16 @@ def check(scene: Scene, config: LossConfig, with_pose: bool, tolerance: float = 
 
 SINGLE = {
     "depth": {"depth_weight": 2.0},
-    "absolute depth": {"depth_weight": 2.0, "depth_relative": False},
+    "absolute depth": {"depth_weight": 2.0, "ablation": LossAblation(depth_relative=False)},
     "normal": {"normal_weight": 0.1},
     "consistency": {"normal_consistency_weight": 0.02},
     "distortion": {"distortion_weight": 0.1},
     "opacity": {"opacity_weight": 0.02},
     "smoothness": {"smoothness_weight": 0.1},
-    "smoothness both": {"smoothness_weight": 0.1, "smoothness_rewards_edges": True},
+    "smoothness both": {
+        "smoothness_weight": 0.1,
+        "ablation": LossAblation(smoothness_rewards_edges=True),
+    },
 }
 PAIRS = {
     "l1": {"l1_weight": 1.0},
@@ -216,11 +219,15 @@ PAIRS = {
     "ncc 11": {"ncc_weight": 0.5, "ncc_patch": 11, "ncc_reject": 1.5},
     "ssim": {"ssim_weight": 0.3},
     "ssim, l1": {"ssim_weight": 0.3, "l1_weight": 1.0},
-    "sobel": {"l1_weight": 1.0, "ncc_weight": 0.5, "photo_gradient": "sobel"},
+    "sobel": {
+        "l1_weight": 1.0,
+        "ncc_weight": 0.5,
+        "ablation": LossAblation(photo_gradient="sobel"),
+    },
 }
 EVERYTHING = replace(
-    LossConfig(), normal_weight=0.1, smoothness_weight=0.1, smoothness_rewards_edges=True,
-    ssim_weight=0.3,
+    LossConfig(), normal_weight=0.1, smoothness_weight=0.1, ssim_weight=0.3,
+    ablation=LossAblation(smoothness_rewards_edges=True),
 )  # fmt: skip
 
 

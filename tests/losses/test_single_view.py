@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from geogs.config import LossConfig
+from geogs.config import LossAblation, LossConfig
 from geogs.geometry.camera import Camera
 from geogs.losses.single_view import (
     ViewConstants,
@@ -156,7 +156,7 @@ def test_views_without_depth_give_no_loss_and_no_gradient(bad: str) -> None:
     config = LossConfig(
         normal_weight=0.1,
         smoothness_weight=0.05,
-        smoothness_rewards_edges=True,
+        ablation=LossAblation(smoothness_rewards_edges=True),
         opacity_weight=0.0,
         silhouette_weight=0.0,
     )

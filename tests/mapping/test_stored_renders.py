@@ -9,7 +9,8 @@ import torch
 
 from depth_scene import make_scene
 from geogs.application.progress import RunProgress
-from geogs.application.results import splat_colours, write_report
+from geogs.application.report import write_report
+from geogs.application.results import splat_colours
 from geogs.application.surfaces import fusion_views, write_surface
 from geogs.config import MeshConfig
 from geogs.geometry.camera import Camera
@@ -121,7 +122,7 @@ def test_results_hold_few_maps(monkeypatch, tmp_path):
     counts = count_held(monkeypatch)
     kept = stored(renders)
     config = MeshConfig(min_component_faces=10, voxel=0.04)
-    mesh = write_surface(tmp_path / "mesh.ply", kept, config, RunProgress(None, tracks=False))
+    mesh = write_surface(tmp_path / "mesh.ply", kept, config, RunProgress())
     points = torch.rand(50, 3) + torch.tensor([0.0, 0.0, 1.5])
     disks = MapSnapshot(
         points, torch.eye(4)[:1].expand(50, 4), torch.full((50, 2), 0.05), torch.ones(50)

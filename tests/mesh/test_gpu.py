@@ -7,15 +7,20 @@ import pytest
 import torch
 
 from cuda_emulator import use_emulator
-from geogs.application import results
+from geogs.application.machine import device_summary
+from geogs.application.report import write_report
+from geogs.application.results import splat_colours
+from geogs.application.surfaces import fusion_views
 from geogs.config import MeshConfig
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp
 from geogs.io.writers.native import save_map
 from geogs.io.writers.ply import write_splats
-from geogs.mesh import DepthMapView, extract_mesh, tsdf
+from geogs.mesh import tsdf
 from geogs.mesh.colour import colour_mesh
+from geogs.mesh.extract import extract_mesh
 from geogs.mesh.tsdf import SparseTsdf, _plane_table, band_blocks
+from geogs.mesh.types import DepthMapView
 from geogs.types import MapSnapshot, RenderedKeyframe, Trajectory
 
 HAS_GPU = torch.cuda.is_available()
@@ -131,22 +136,22 @@ def test_results_are_written_from_any_device(device, tmp_path):
         )
         for i, v in enumerate(views(camera, 6))
     ]
-    depth_maps = results.fusion_views(renders)
+    depth_maps = fusion_views(renders)
     mesh = extract_mesh(depth_maps, MeshConfig(min_component_faces=10))
     points = torch.from_numpy(mesh.vertices[::20]).to(device)
     n = len(points)
     quaternion = torch.tensor([0, 1.0, 0, 0], device=device).expand(n, 4)
     scale, opacity = torch.full((n, 2), 0.05, device=device), torch.full((n,), 0.8, device=device)
     disks = MapSnapshot(points, quaternion, scale, opacity)
-    colours = results.splat_colours(disks, depth_maps)
+    colours = splat_colours(disks, depth_maps)
     assert colours.shape == (n, 3)
     assert colours.std() > 0.02
     write_splats(tmp_path / "splats.ply", disks, colours)
     save_map(tmp_path / "map.safetensors", disks)
     T_wc = np.stack([torch.linalg.inv(r.T_cw.cpu()).numpy() for r in renders])
     trajectory = Trajectory(np.arange(6.0), T_wc, np.ones(6, bool))
-    results.write_report(tmp_path / "report", trajectory, renders, mesh, {"source": "room"})
+    write_report(tmp_path / "report", trajectory, renders, mesh, {"source": "room"})
     for name in ("trajectory", "keyframes", "mesh"):
         assert (tmp_path / "report" / f"{name}.png").stat().st_size > 5000
-    summary = results.device_summary(disks.position.device)
+    summary = device_summary(disks.position.device)
     assert (summary["device"] == "cpu") == (device == "cpu")

@@ -10,11 +10,12 @@ from geogs.config import MeshConfig
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp
-from geogs.mesh import DepthMapView, extract_mesh, plan_volume, surface
+from geogs.mesh import surface
 from geogs.mesh.clean import keep_components, remove_degenerate_faces
+from geogs.mesh.extract import extract_mesh, plan_volume
 from geogs.mesh.surface import extract_surface
 from geogs.mesh.tsdf import BLOCK, SparseTsdf, band_blocks, pack, unpack
-from geogs.mesh.types import Mesh
+from geogs.mesh.types import DepthMapView, Mesh
 
 CAMERA = Camera(fx=120.0, fy=120.0, cx=79.5, cy=59.5, width=160, height=120)
 RADIUS = 0.4

@@ -91,16 +91,16 @@ def test_no_points_no_disks():
     assert len(initialise_disks(none, torch.zeros(3), none[:, 0], none, **SETTINGS).position) == 0
 
 
-def started(points: torch.Tensor, seed: int = 0, **settings):
+def started(points: torch.Tensor, seed: int = 0, start="local_plane", **settings):
     footprint = torch.full((len(points),), 0.04)
     random = torch.Generator().manual_seed(seed)
     config = DiskConfig(**settings)
-    return new_disks(points, torch.zeros(3), footprint, points[:0], config, random)
+    return new_disks(points, torch.zeros(3), footprint, points[:0], config, random, start)
 
 
 def test_random_disks_are_round_and_turned_anyhow_with_3dgs_scales():
     points = plane(60, 0.04)
-    disks = started(points, initialisation="random", opacity=0.6)
+    disks = started(points, start="random", opacity=0.6)
     assert torch.equal(disks.position, points)
     assert torch.equal(disks.log_scale[:, 0], disks.log_scale[:, 1])
     # The three nearest of a grid with spacings 0.04 and 0.04 * sqrt(1.25): 0.04 twice, 0.0447.
@@ -117,7 +117,7 @@ def test_random_disks_are_round_and_turned_anyhow_with_3dgs_scales():
 
 def test_random_disks_follow_their_seed_and_planes_do_not():
     points = plane(12, 0.04)
-    first, same, other = (started(points, s, initialisation="random") for s in (1, 1, 2))
+    first, same, other = (started(points, s, start="random") for s in (1, 1, 2))
     assert torch.equal(first.quaternion, same.quaternion)
     assert not torch.allclose(first.quaternion, other.quaternion)
     default = started(points)
@@ -126,4 +126,4 @@ def test_random_disks_follow_their_seed_and_planes_do_not():
         **SETTINGS | {"planarity_shrink": 0.5},
     )  # fmt: skip
     assert all(torch.equal(a, b) for a, b in zip(default, wanted, strict=True))
-    assert len(started(points[:0], initialisation="random").position) == 0
+    assert len(started(points[:0], start="random").position) == 0

@@ -5,11 +5,13 @@ import pytest
 import torch
 
 from geogs.bundle.base import BundleOptions
+from geogs.bundle.select import grid_fields
 from geogs.keyframes.grid import SampleGrid
 from geogs.keyframes.store import KeyframeStore, Segment
+from geogs.tracking.evidence import MIN_WINDOWS
 from geogs.tracking.flow.classical import ClassicalFlow
 from geogs.tracking.graph import FrameGraph
-from geogs.tracking.motion import FrameLocator, pnp, transfer_depth
+from geogs.tracking.motion import FrameLocator, pnp
 from geogs.tracking.proximity import frame_distances, proximity_pairs
 from tracking_scenes import CAMERA, pose, render
 
@@ -121,7 +123,7 @@ def test_adjustment_of_real_flow_repairs_poses():
 def test_a_frame_is_located_from_a_guess_and_from_nothing():
     graph = room_graph(POSES[:1])
     state = graph.keyframes[0]
-    locator = FrameLocator(graph.keyframes.grid, graph.operator, 0.12, 2.0)
+    locator = FrameLocator(graph.keyframes.grid, graph.operator, 0.12, 2.0, min_ncc=0.5)
     truth = pose(0.1, 0.02, 0.05, 0.04)
     encoded = graph.operator.encode(render(truth)[0])
     guess = torch.from_numpy(np.linalg.inv(pose(0.08, 0.01, 0.04, 0.03)))
@@ -130,15 +132,42 @@ def test_a_frame_is_located_from_a_guess_and_from_nothing():
         centre = torch.linalg.inv(motion.T_cw)[:3, 3].numpy()
         assert 100 * np.linalg.norm(centre - truth[:3, 3]) < 0.3
         assert motion.matched > 0.5
-    noise = np.random.default_rng(0).integers(0, 255, (144, 192, 3), np.uint8)
-    assert locator.locate(state, graph.operator.encode(noise), guess) is None
-    assert locator.relocate(state, graph.operator.encode(noise)) is None
+        assert motion.evidence.correlation > 0.97
+
+
+def test_noise_is_located_nowhere_however_much_of_it_the_flow_matches():
+    graph = room_graph(POSES[:1])
+    state, grid = graph.keyframes[0], graph.keyframes.grid
+    believing = FrameLocator(grid, graph.operator, 0.0, float("inf"), min_ncc=-1.0)
+    locator = FrameLocator(grid, graph.operator, 0.0, float("inf"), min_ncc=0.5)
+    for seed in range(5):
+        noise = np.random.default_rng(seed).integers(0, 255, (144, 192, 3), np.uint8)
+        encoded = graph.operator.encode(noise)
+        found = believing.locate(state, encoded, state.T_cw)
+        assert found is not None
+        assert found.evidence.windows > 100
+        assert found.evidence.correlation < 0.15
+        assert locator.locate(state, encoded, state.T_cw) is None
+        assert locator.relocate(state, encoded) is None
+
+
+def test_a_frame_without_texture_is_located_only_where_it_was_expected():
+    graph = room_graph(POSES[:1])
+    state = graph.keyframes[0]
+    locator = FrameLocator(graph.keyframes.grid, graph.operator, 0.12, 2.0, min_ncc=0.5)
+    # Two grey levels are enough for the flow, and too little for evidence.
+    flat = [(90 + render(T)[0] / 255 * 5).astype(np.uint8) for T in (POSES[0], pose(0.02))]
+    state.picture.encoded, encoded = map(graph.operator.encode, flat)
+    motion = locator.locate(state, encoded, state.T_cw)
+    assert motion is not None
+    assert motion.evidence.windows < MIN_WINDOWS
+    assert locator.locate(state, encoded, state.T_cw, is_expected=False) is None
 
 
 def test_transferred_depth_matches_the_other_view():
     a, b = room_graph([pose(0.0), pose(0.1, yaw=0.03)]).keyframes
     T = b.T_cw @ torch.linalg.inv(a.T_cw)
-    d, information = transfer_depth(SampleGrid(CAMERA), T, a.inverse_depth, a.information)
+    d, information = grid_fields(SampleGrid(CAMERA)).transfer(T, a.inverse_depth, a.information)
     seen = information > 0
     assert float(seen.float().mean()) > 0.8
     ratio = (d / b.inverse_depth - 1).abs()

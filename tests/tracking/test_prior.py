@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 import torch
 
+from degraded_prior import BAD, PATCHY, PLAUSIBLE, DegradedPrior, with_bare_walls
 from geogs.config import PriorConfig, TrackingConfig
 from geogs.geometry.camera import Camera
 from geogs.geometry.umeyama import umeyama
 from geogs.loop.global_bundle import global_bundle
 from geogs.priors.base import DepthKind, PriorMaps
-from geogs.synth.prior import BAD, PATCHY, PLAUSIBLE, DegradedPrior
 from geogs.synth.raycast import Raycaster, View
-from geogs.synth.room import make_room, with_bare_walls
+from geogs.synth.room import make_room
 from geogs.synth.trajectory import handheld_trajectory
 from geogs.tracking.flow.texture import MIN_STRUCTURE, cell_structure
 from geogs.tracking.tracker import Tracker

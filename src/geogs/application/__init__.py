@@ -1,1 +1,26 @@
-"""The program without a command line: run, reconstruct, write results, go on."""
+"""The program without a command line: run, reconstruct, write results, go on, evaluate."""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from geogs.application.calibrate import self_calibrated
+    from geogs.application.progress import RunProgress
+    from geogs.application.result import Result
+    from geogs.application.results import write_results
+
+__all__ = ["Result", "RunProgress", "self_calibrated", "write_results"]
+
+_HOMES = {
+    "Result": "geogs.application.result",
+    "RunProgress": "geogs.application.progress",
+    "self_calibrated": "geogs.application.calibrate",
+    "write_results": "geogs.application.results",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Import the public names when they are first used, so that the command line starts at once."""
+    if name not in _HOMES:
+        raise AttributeError(f"module geogs.application has no attribute {name}")
+    return getattr(import_module(_HOMES[name]), name)

@@ -3,32 +3,39 @@
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from geogs.application.interrupt import Interruption
+import torch
+
+from geogs.application.interrupt import Stop
 from geogs.application.progress import RunProgress
 from geogs.config import Config
+from geogs.io.sources.calibration import Calibration, Refinement
+from geogs.io.sources.sniff import Stream
 
 if TYPE_CHECKING:
-    import torch
-
-    from geogs.io.sources.calibration import Calibration
-    from geogs.io.sources.sniff import Stream
     from geogs.tracking.calibration.estimate import SelfCalibration
 
 _STAGE = "calibration"
 
 
-def self_calibrated(source: "Stream", options: Config, device: "torch.device") -> "Stream":
+def self_calibrated(
+    source: Stream,
+    config: Config | None = None,
+    device: str | torch.device = "cpu",
+    progress: RunProgress | None = None,
+    stop: Stop | None = None,
+) -> Stream:
     """The source with its focal length refined, if that is a guess or nominal and may be refined.
 
-    Where the video does not tell, or at Ctrl-C, the guess stays and a warning says so.
+    Where the video does not tell, or after a request to stop, the guess stays and ``progress`` is
+    told so.
     """
+    config, progress, stop = config or Config(), progress or RunProgress(), stop or Stop()
+    if not (config.calibration.refine and source.is_calibration_open):
+        return source
     from geogs.tracking.calibration.estimate import self_calibrate
 
-    if not (options.calibration.refine and source.is_calibration_open):
-        return source
-    progress = RunProgress(source.length, tracks=False)
     frames = source.linked_frames()
-    with Interruption() as stop, progress:
+    with stop:
 
         def report(fraction: float) -> None:
             progress.stage(_STAGE, fraction)
@@ -36,9 +43,11 @@ def self_calibrated(source: "Stream", options: Config, device: "torch.device") -
 
         try:
             found = self_calibrate(
-                frames, source.camera, options.calibration, device, options.seed, report
+                frames, source.camera, config.calibration, torch.device(device), config.seed, report
             )
         except KeyboardInterrupt:
+            if not stop.requested:
+                raise
             progress.write(
                 f"Calibration stopped; going on with {source.intrinsics_origin}. "
                 "Press Ctrl-C again to end."
@@ -46,20 +55,18 @@ def self_calibrated(source: "Stream", options: Config, device: "torch.device") -
             return source
         finally:
             frames.close()
-        calibration = refined(source.calibration, source.camera.fx, found)
-        progress.write(_in_a_sentence(calibration, source.intrinsics_origin))
+    calibration = refined(source.calibration, source.camera.fx, found)
+    progress.write(_in_a_sentence(calibration, source.intrinsics_origin))
     return source.with_calibration(calibration)
 
 
 def refined(
-    calibration: "Calibration", working_focal: float, found: "SelfCalibration"
-) -> "Calibration":
+    calibration: Calibration, working_focal: float, found: "SelfCalibration"
+) -> Calibration:
     """A calibration of the source's images after what was found on its working images.
 
     ``working_focal`` is fx of the working images by ``calibration``, in their pixels.
     """
-    from geogs.io.sources.calibration import Refinement
-
     if found.failure is not None:
         said = Refinement(keyframes=found.keyframes, frames=found.frames, failure=found.failure)
         origin = f"{calibration.origin}; the video does not tell: {found.failure}"
@@ -81,7 +88,7 @@ def refined(
     )  # fmt: skip
 
 
-def _in_a_sentence(calibration: "Calibration", assumed: str) -> str:
+def _in_a_sentence(calibration: Calibration, assumed: str) -> str:
     failure = calibration.refinement.failure if calibration.refinement is not None else None
     if failure is None:
         return f"Intrinsics: {calibration.origin}."

@@ -8,7 +8,7 @@ prior, kernels, threads) is not stored: whoever reads has it.
 
 import json
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Generic, TypeVar, get_type_hints
@@ -16,14 +16,13 @@ from typing import Any, Generic, TypeVar, get_type_hints
 import torch
 from safetensors import SafetensorError
 from safetensors.torch import load, save
-from torch import Tensor
 
-import geogs
-from geogs.application.checkpoint_folder import FORMAT, CheckpointFolder, Sum
+from geogs.application.checkpoint_folder import FORMAT, CheckpointFolder
 from geogs.application.progress import RunProgress
 from geogs.application.records import pack, schema, unpack
 from geogs.errors import InputError, OutputError
 from geogs.keyframes.archive import Archive, SettledArchive
+from geogs.version import __version__
 
 S = TypeVar("S")
 
@@ -77,9 +76,6 @@ class SavedState(Generic[S]):
     def __init__(self, output: Path, kind: type[S]) -> None:
         """Raises InputError if there is none, it is damaged, or another version wrote it."""
         self._kinds = get_type_hints(kind)
-        self._values: dict[str, Any] = {}
-        self._arrays: dict[str, Tensor] = {}
-        self._archives: dict[str, Archive] = {}
         self._folder = checkpoint_folder(output)
         with self.in_a_sentence():
             manifest = self._folder.manifest()
@@ -89,23 +85,30 @@ class SavedState(Generic[S]):
                 "start anew without --resume."
             )
         with self.in_a_sentence():
-            if (manifest.format, manifest.geogs) != (FORMAT, geogs.__version__):
+            if (manifest.format, manifest.geogs) != (FORMAT, __version__):
                 raise InputError(f"geogs {manifest.geogs} wrote it, another version than this")
             if manifest.schema != schema(kind):
                 raise InputError("it is of another command, or another version wrote it")
-            self._read(manifest.state)
+            self._files = manifest.state
+            self._values = json.loads(self._read("json"))
 
-    def part(self, name: str, device: torch.device | str = "cpu") -> Any:
-        """A field of the state, each once; tensors that were on a GPU go to ``device``.
+    def facts(self, name: str) -> Any:
+        """A field of the state without any array. Raises InputError if it is damaged."""
+        with self.in_a_sentence():
+            return unpack(self._kinds[name], self._values["state"].get(name), {}, {}, name=name)
+
+    def work(self, name: str, device: torch.device | str = "cpu") -> Any:
+        """A field of the state, once; tensors that were on a GPU go to ``device``.
 
         Raises:
-            InputError: it is not what the kind says, or its arrays in archives have changed.
+            InputError: it is not what the kind says, or an array has changed.
         """
-        arrays = {k: x for k, x in self._arrays.items() if k.startswith(f"{name}.")}
-        self._arrays = {k: x for k, x in self._arrays.items() if k not in arrays}
-        kind, values = self._kinds[name], self._values.pop(name, None)
         with self.in_a_sentence():
-            return unpack(kind, values, arrays, self._archives, device, name)
+            arrays, folder = load(self._read("safetensors")), self._folder
+            settled = unpack(dict[str, SettledArchive], self._values["archives"], {}, {})
+            archives = {n: Archive.reopened(folder, n, s) for n, s in settled.items()}
+            values = self._values["state"].pop(name)
+            return unpack(self._kinds[name], values, arrays, archives, device, name)
 
     @contextmanager
     def in_a_sentence(self) -> Iterator[None]:
@@ -118,14 +121,10 @@ class SavedState(Generic[S]):
                 f"{self._folder.path} cannot be used ({reason}); start anew without --resume."
             ) from error
 
-    def _read(self, files: Mapping[str, Sum]) -> None:
-        """What the files hold; archives are open from then on."""
-        read = {name.rpartition(".")[2]: self._folder.read(name, files[name]) for name in files}
-        values = json.loads(read["json"])
-        self._values = values["state"]
-        self._arrays = load(read["safetensors"])
-        settled = unpack(dict[str, SettledArchive], values["archives"], {}, {})
-        self._archives = {n: Archive.reopened(self._folder, n, s) for n, s in settled.items()}
+    def _read(self, ending: str) -> bytes:
+        """What the file of the state with this ending holds."""
+        (name,) = (name for name in self._files if name.endswith(f".{ending}"))
+        return self._folder.read(name, self._files[name])
 
 
 def write_checkpoint(folder: CheckpointFolder, state: object) -> None:

@@ -17,9 +17,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import BinaryIO, cast
 
-import geogs
 from geogs.application.records import pack, unpack
 from geogs.errors import InputError, OutputError
+from geogs.version import __version__
 
 FORMAT = "geogs checkpoint 2"
 MANIFEST = "manifest.json"
@@ -138,7 +138,7 @@ class CheckpointFolder:
             except BaseException:
                 self._delete(new)
                 raise
-            done = replace(begun, format=FORMAT, geogs=geogs.__version__, schema=schema, state=sums)
+            done = replace(begun, format=FORMAT, geogs=__version__, schema=schema, state=sums)
             self._write_manifest(done)
             self._delete(set(done.files).difference(archives, sums))
         except OSError as error:
@@ -191,7 +191,7 @@ class CheckpointFolder:
             is_our_folder = False
         last = self.manifest()
         if last is None:
-            return Manifest(FORMAT, geogs.__version__, "", is_our_folder, 0, {}, [])
+            return Manifest(FORMAT, __version__, "", is_our_folder, 0, {}, [])
         with self._opened() as folder:
             there = set(os.listdir(folder))
         return replace(last, files=[name for name in last.files if name in there])

@@ -5,13 +5,29 @@ import threading
 from types import FrameType
 
 
-class Interruption:
+class Stop:
+    """A request to stop; nobody makes this one. It may be entered again and again."""
+
+    requested = False
+
+    def __enter__(self) -> "Stop":
+        self.requested = False
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        pass
+
+    def check(self) -> None:
+        """A safe point inside a long stage: raises KeyboardInterrupt after a request."""
+        if self.requested:
+            raise KeyboardInterrupt
+
+
+class Interruption(Stop):
     """While it is entered, the first Ctrl-C only sets ``requested``; the second quits."""
 
-    def __init__(self) -> None:
-        self.requested = False
-
     def __enter__(self) -> "Interruption":
+        super().__enter__()
         # Python takes signals in the main thread alone.
         self._is_listening = threading.current_thread() is threading.main_thread()
         if self._is_listening:
@@ -21,11 +37,6 @@ class Interruption:
     def __exit__(self, *exception: object) -> None:
         if self._is_listening:
             signal.signal(signal.SIGINT, self._before)
-
-    def check(self) -> None:
-        """A safe point inside a long stage: raises KeyboardInterrupt after a request."""
-        if self.requested:
-            raise KeyboardInterrupt
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
         self.check()

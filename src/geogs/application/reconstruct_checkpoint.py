@@ -74,6 +74,6 @@ def read_work(output: Path, made_from: str) -> ReconstructionState:
     """
     saved = SavedState(output, ReconstructState)
     with saved.in_a_sentence():
-        if saved.part("made_from") != made_from:
+        if saved.facts("made_from") != made_from:
             raise InputError("it was made with other settings or images; give the same ones")
-    return saved.part("work")
+    return saved.work("work")

@@ -68,11 +68,11 @@ class SavedRun:
     def __init__(self, output: Path) -> None:
         """Raises InputError if there is none, it is damaged, or another version wrote it."""
         self._saved = SavedState(output, RunState)
-        self.facts: RunFacts = self._saved.part("facts")
+        self.facts: RunFacts = self._saved.facts("facts")
 
     def restore(self, slam: Slam) -> None:
         """Give a new system the state. Raises InputError if that cannot be."""
-        state = self._saved.part("slam", slam.device)
+        state = self._saved.work("slam", slam.device)
         with self._saved.in_a_sentence():
             slam.load(state)
 

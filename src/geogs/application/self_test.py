@@ -11,6 +11,7 @@ from geogs.geometry.camera import Camera
 from geogs.splat.map import DiskParameters
 from geogs.splat.reference import blend, project_disks
 from geogs.splat.render import NEAR, Backend, render
+from geogs.threads import on_one_torch_thread
 
 MAP_TOLERANCE = 1e-3
 """Largest relative error (norms) of depth, normal, alpha and distortion."""
@@ -32,6 +33,7 @@ class Agreement:
         return self.maps < MAP_TOLERANCE and self.gradients < GRADIENT_TOLERANCE
 
 
+@on_one_torch_thread
 def check_renderer(device: torch.device, disks: int = 2000, seed: int = 0) -> Agreement:
     """Compare the backend of ``device`` with the specification, forward and backward.
 
@@ -60,6 +62,7 @@ def check_renderer(device: torch.device, disks: int = 2000, seed: int = 0) -> Ag
     )
 
 
+@on_one_torch_thread
 def time_renderer(device: torch.device, disks: int = 30_000, repeats: int = 20) -> float:
     """Median milliseconds of one forward and backward pass at 616 x 344 pixels."""
     camera = _camera(616, 344)

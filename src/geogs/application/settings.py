@@ -1,27 +1,29 @@
-"""What a run is made of: plain records, so that a command, a script and a checkpoint say the same.
+"""What a run or a reconstruction is told: the same record for a command, a script, a checkpoint.
 
 Nothing here is imported but the settings, so that a command line can be read at once.
 """
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Annotated
 
-from geogs.config import Config, MeshConfig
+from geogs.config import Config, MeshConfig, ReconstructConfig
+from geogs.config.setting import Basic, Positional, Positive, Range, Settings, Time, Unnamed, Weight
 
 
 @dataclass(frozen=True)
-class RunSettings:
+class RunSettings(Settings):
     """All that a run is told: what it reads, how it computes, what it writes."""
 
-    source: tuple[Path, ...] = ()
+    source: Annotated[tuple[Path, ...], Positional(unless="resume")] = ()
     """Video file or folder; several of one place, by one camera, make one map."""
-    config: Config = field(default_factory=Config)
+    config: Annotated[Config, Unnamed] = field(default_factory=Config)
     """How to compute."""
-    output: Path | None = None
-    """Folder for the results (also -o); out/NAME if none is given."""
+    output: Annotated[Path | None, Basic("-o")] = None
+    """Folder for the results; out/NAME if none is given."""
     device: str = "auto"
     """Where to compute: auto (a GPU where there is one), cpu, cuda or cuda:1; see geogs doctor."""
-    checkpoint_every: float = 60.0
+    checkpoint_every: Weight = 60.0
     """Seconds between two checkpoints, from which --resume goes on; 0 makes none."""
     online_results: bool = False
     """Also write trajectory and mesh as they are before the final stages, to online/."""
@@ -54,6 +56,36 @@ class RunSettings:
         """
         config = replace(self.absolute().config, mesh=MeshConfig())
         return RunSettings(self.absolute().source, config)
+
+
+@dataclass(frozen=True)
+class ReconstructSettings(Settings):
+    """All that a reconstruction from known poses is told."""
+
+    source: Annotated[Path, Positional()] = Path()
+    """Folder of images with poses, or the file with the poses."""
+    config: Annotated[ReconstructConfig, Unnamed] = field(default_factory=ReconstructConfig)
+    """How to compute."""
+    output: Annotated[Path | None, Basic("-o")] = None
+    """Folder for the results; out/NAME if none is given."""
+    budget: Annotated[float | None, Range(above=0), Time] = None
+    """About how long it may take in all, such as 90s, 10m or 1h; none trains until it is good."""
+    check_poses: bool = True
+    """Whether to see by matching images that the poses follow the expected convention."""
+    hold_out: Annotated[int | None, Range(2)] = None
+    """Leave out every so many-th image, to judge the result by; none uses all."""
+    snapshots: Annotated[tuple[Positive, ...], Time] = ()
+    """Also keep the map as it stands after some seconds, such as 5,10,20, in snapshots/; they count
+    from when the images have been read."""
+    depth_mesh: bool = False
+    """Also fuse the searched depths without the disks, to depth_fusion/mesh.ply."""
+    resume: bool = False
+    """Go on from the checkpoint that an earlier call left in the output folder."""
+    checkpoint_every: Weight = 30.0
+    """Seconds of training between two checkpoints (there is one after the depths, too); 0 makes
+    none."""
+    device: str = "auto"
+    """Where to compute: auto (a GPU where there is one), cpu, cuda or cuda:1; see geogs doctor."""
 
 
 def _file(name: str) -> str:

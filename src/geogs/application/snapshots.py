@@ -5,7 +5,6 @@ from pathlib import Path
 
 from geogs.application.progress import RunProgress
 from geogs.application.surfaces import write_surface
-from geogs.config import ReconstructConfig
 from geogs.io.writers.native import save_map
 from geogs.reconstruction import Reconstruction
 from geogs.types import MapSnapshot
@@ -31,9 +30,7 @@ class Snapshots:
             else:
                 self._early.append(seconds)
 
-    def write(
-        self, output: Path, scene: Reconstruction, config: ReconstructConfig, progress: RunProgress
-    ) -> None:
+    def write(self, output: Path, scene: Reconstruction, progress: RunProgress) -> None:
         """``snapshots/<seconds>/{map.safetensors, mesh.ply}`` for each copy.
 
         Raises:
@@ -46,6 +43,5 @@ class Snapshots:
             with scene.stopwatch("snapshots"):
                 save_map(folder / "map.safetensors", disks, {"seconds": seconds})
                 name = f"mesh at {seconds:g} s"
-                write_surface(
-                    folder / "mesh.ply", scene.renders(disks), config.mesh, progress, name
-                )
+                renders = scene.renders(disks)
+                write_surface(folder / "mesh.ply", renders, scene.config.mesh, progress, name)

@@ -2,9 +2,9 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from geogs.application.progress import RunProgress
+from geogs.application.scene import MappedScene
 from geogs.config import MeshConfig
 from geogs.errors import InputError
 from geogs.io.writers.ply import write_mesh
@@ -14,13 +14,28 @@ from geogs.mesh.types import DepthMapView, Mesh
 from geogs.on_demand import OnDemand
 from geogs.types import RenderedKeyframe
 
-if TYPE_CHECKING:
-    from geogs.application.results import MappedScene
-
 
 def fusion_views(renders: Sequence[RenderedKeyframe]) -> Sequence[DepthMapView]:
     """The renderings as what mesh extraction takes, each when it is asked for."""
     return OnDemand(renders, lambda r: DepthMapView(r.depth, r.weight, r.camera, r.T_cw, r.image))
+
+
+def surface_of(
+    renders: Sequence[RenderedKeyframe],
+    config: MeshConfig,
+    progress: RunProgress,
+    name: str = "mesh",
+) -> Mesh | None:
+    """Fuse depth maps to a mesh; where there is no surface, say so as ``name``."""
+    try:
+        return extract_mesh(
+            fusion_views(renders),
+            config,
+            lambda part, done, of: progress.stage(f"{name}: {part}", done / of),
+        )
+    except InputError as error:
+        progress.write(f"No {name}: {error}")
+        return None
 
 
 def write_surface(
@@ -30,39 +45,29 @@ def write_surface(
     progress: RunProgress,
     name: str = "mesh",
 ) -> Mesh | None:
-    """Fuse depth maps to a mesh and write it; where there is no surface, say so as ``name``.
+    """Fuse depth maps to a mesh and write that, if there is a surface.
 
     Raises:
         OutputError: the file cannot be written.
     """
-    try:
-        mesh = extract_mesh(
-            fusion_views(renders),
-            config,
-            lambda part, done, of: progress.stage(f"{name}: {part}", done / of),
-        )
-    except InputError as error:
-        progress.write(f"No {name}: {error}")
-        return None
-    write_mesh(path, mesh.vertices, mesh.faces, mesh.colours, mesh.normals)
+    mesh = surface_of(renders, config, progress, name)
+    if mesh is not None:
+        write_mesh(path, mesh.vertices, mesh.faces, mesh.colours, mesh.normals)
     return mesh
 
 
-def write_depth_mesh(
-    output: Path, scene: "MappedScene", config: MeshConfig, progress: RunProgress
-) -> None:
+def write_depth_mesh(output: Path, scene: MappedScene, progress: RunProgress) -> None:
     """``depth_fusion/mesh.ply``: the surface of the searched depths, to compare the map with."""
     with scene.stopwatch("depth fusion"):
         path = output / "depth_fusion" / "mesh.ply"
-        write_surface(path, scene.depth_maps(), config, progress, "depth mesh")
+        write_surface(path, scene.depth_maps(), scene.config.mesh, progress, "depth mesh")
 
 
-def write_online_results(
-    output: Path, scene: "MappedScene", config: MeshConfig, progress: RunProgress
-) -> None:
+def write_online_results(output: Path, scene: MappedScene, progress: RunProgress) -> None:
     """``online/``: trajectories and mesh as they stand, before the final stages."""
     with scene.stopwatch("online results"):
         folder = output / "online"
         write_tum_trajectory(folder / "trajectory.tum", scene.trajectory())
         write_tum_trajectory(folder / "keyframes.tum", scene.keyframe_trajectory())
-        write_surface(folder / "mesh.ply", scene.renders(), config, progress, "online mesh")
+        path = folder / "mesh.ply"
+        write_surface(path, scene.renders(), scene.config.mesh, progress, "online mesh")

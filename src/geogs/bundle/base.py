@@ -1,5 +1,6 @@
-"""What the tracker asks of an adjustment, on whatever device."""
+"""What the tracker asks of whatever adjusts, on either device."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -7,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from geogs.bundle.problem import BundleProblem
+from geogs.keyframes.keyframe import Keyframe
 
 
 @dataclass(frozen=True)
@@ -49,5 +51,65 @@ class BundleSolver(Protocol):
         """Take ``options.iterations`` damped Gauss-Newton steps.
 
         A step that is not finite is not taken, and ``finite`` is False in the result.
+        """
+        ...
+
+
+@runtime_checkable
+class GridFields(Protocol):
+    """What works on fields over the cells of a grid."""
+
+    def fill(
+        self, values: Float[Tensor, "*n p"], confidence: Float[Tensor, "*n p"]
+    ) -> Float[Tensor, "*n p"]:
+        """Values where confidence is positive; elsewhere the mean of their surroundings.
+
+        Push and pull: confidence-weighted means over growing blocks, taken from the finest level
+        that has any confidence near. Without any confidence the plain mean of a field is returned.
+        """
+        ...
+
+    def transfer(
+        self,
+        T_ji: Float[Tensor, "4 4"],
+        inverse_depth: Float[Tensor, "p"],
+        information: Float[Tensor, "p"],
+    ) -> tuple[Float[Tensor, "p"], Float[Tensor, "p"]]:
+        """Inverse depth and information of frame i as seen from frame j; nearest surface wins.
+
+        Cells that nothing falls on are filled from their surroundings and have no information.
+        """
+        ...
+
+    def reproject(
+        self, keyframes: Sequence[Keyframe], T_cw: Sequence[Float[Tensor, "4 4"]]
+    ) -> tuple[Float[Tensor, "e p 2"], Float[Tensor, "e p 2"]]:
+        """Cells of each keyframe in a frame at ``T_cw``, and cells of that frame in the keyframe.
+
+        The frame has no depth of its own; it borrows the keyframe's.
+        """
+        ...
+
+
+@runtime_checkable
+class KeyframePairs(Protocol):
+    """Directed pairs of keyframes, by their present poses and inverse depths."""
+
+    def project(self) -> Float[Tensor, "e p 2"]:
+        """Where the cells of the sources fall in the targets."""
+        ...
+
+    def moved(
+        self, before: Float[Tensor, "e p 2"], weight: Float[Tensor, "e p 2"]
+    ) -> Float[Tensor, "e"]:
+        """Median distance in pixels of the matched cells from where they fell before."""
+        ...
+
+    def distances(self, rotation_weight: float, step: int = 2) -> Float[Tensor, "e"]:
+        """DROID-SLAM's distance in pixels; infinite at little overlap.
+
+        Mean of the flow (weight ``rotation_weight``) and of the flow without the rotation (the
+        rest) over every ``step``-th of the cells that stay in front of the target; infinite where
+        less than 3/4 do or where less than a fifth falls into the image.
         """
         ...

@@ -1,37 +1,23 @@
 """Where the cells of source frames fall in their targets, and how that changes.
 
 A cell with ray X and inverse depth d lies at y = R X + d t in the target, in units of its depth in
-the source, for T_ji = (R, t). What follows from y alone is here for every camera; of cameras, the
-pinhole without unknowns. Sums of products are in the order in which the results were tested: the
-lens (:mod:`geogs.bundle.lens`) and the training rescale the same derivatives in another one, and
-a common order would change the last bits of what they or the tracker find.
+the source, for T_ji = (R, t). What follows from y alone is here for every camera: the tracker's
+pinhole, which is here too, the lens with unknowns (:mod:`geogs.bundle.lens`) and the batch of
+cameras of the training. Each of them multiplies the same derivatives of a point by those of its own
+image, in an order of its own: one order for all would change the last bits of results.
 """
 
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_inverse
 
 MIN_Z = 0.05
 """Points nearer than this fraction of the source's unit depth behind the target are ignored."""
-
-
-@runtime_checkable
-class Pinhole(Protocol):
-    """Focal lengths and principal point: numbers, or tensors that spread over (e, p)."""
-
-    @property
-    def fx(self) -> float | Tensor: ...
-    @property
-    def fy(self) -> float | Tensor: ...
-    @property
-    def cx(self) -> float | Tensor: ...
-    @property
-    def cy(self) -> float | Tensor: ...
 
 
 @dataclass(frozen=True)
@@ -63,7 +49,7 @@ def relative_motion(
 
 
 def seen_from_targets(
-    rays: Float[Tensor, "*b p 3"],
+    rays: Float[Tensor, "*c p 3"],
     T_ji: Float[Tensor, "*b e 4 4"],
     inverse_depth: Float[Tensor, "*b e p"],
 ) -> tuple[Float[Tensor, "*b e p 3"], Bool[Tensor, "*b e p"], Float[Tensor, "*b e p"]]:
@@ -91,10 +77,10 @@ def motion_rows(
 
 
 def project(
-    camera: Pinhole,
-    rays: Float[Tensor, "*b p 3"],
-    T_ji: Float[Tensor, "*b e 4 4"],
-    inverse_depth: Float[Tensor, "*b e p"],
+    camera: Camera,
+    rays: Float[Tensor, "p 3"],
+    T_ji: Float[Tensor, "e 4 4"],
+    inverse_depth: Float[Tensor, "e p"],
 ) -> Projection:
     """Project the cells of source frames: p = pi(K y), see :func:`seen_from_targets`."""
     y, valid, z = seen_from_targets(rays, T_ji, inverse_depth)
@@ -105,7 +91,7 @@ def project(
 
 
 def linearise(
-    camera: Pinhole,
+    camera: Camera,
     rays: Float[Tensor, "p 3"],
     T_ji: Float[Tensor, "e 4 4"],
     inverse_depth: Float[Tensor, "e p"],

@@ -1,7 +1,10 @@
-"""Where poses and inverse depths are adjusted: on the CPU, or on the GPU that holds the depths."""
+"""Where poses and fields are worked on: on the CPU, or on the GPU that holds the depths."""
 
-from geogs.bundle.base import BundleSolver
+from collections.abc import Sequence
+
+from geogs.bundle.base import BundleSolver, GridFields, KeyframePairs
 from geogs.keyframes.grid import SampleGrid
+from geogs.keyframes.store import Segment
 
 
 def bundle_solver(grid: SampleGrid) -> BundleSolver:
@@ -13,3 +16,25 @@ def bundle_solver(grid: SampleGrid) -> BundleSolver:
     from geogs.bundle.dense import DenseBundle
 
     return DenseBundle(grid)
+
+
+def grid_fields(grid: SampleGrid) -> GridFields:
+    """What works on the fields of a grid."""
+    if grid.on_gpu:
+        from geogs.bundle.cuda.fields import CudaFields
+
+        return CudaFields(grid)
+    from geogs.bundle.fields import CpuFields
+
+    return CpuFields(grid)
+
+
+def keyframe_pairs(keyframes: Segment, directed: Sequence[tuple[int, int]]) -> KeyframePairs:
+    """Pairs (source, target) of keyframe ids."""
+    if keyframes.grid.on_gpu:
+        from geogs.bundle.cuda.pairs import CudaPairs
+
+        return CudaPairs(keyframes, directed)
+    from geogs.bundle.pairs import CpuPairs
+
+    return CpuPairs(keyframes, directed)

@@ -3,31 +3,32 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 from geogs.cli.options import parse_options
+from geogs.config import Seed
+from geogs.config.setting import Basic, Range, Settings
 
 
 @dataclass(frozen=True)
-class DemoOptions:
+class DemoOptions(Settings):
     """Make a small synthetic room sequence, run everything on it, print the error table."""
 
-    output: Path = Path("out/demo")
-    """Folder for the sequence (room/) and the result (result/); also -o."""
-    frames: int = 120
-    """Frames of the sequence, at least 20."""
-    width: int = 320
+    output: Annotated[Path, Basic("-o")] = Path("out/demo")
+    """Folder for the sequence (room/) and the result (result/)."""
+    frames: Annotated[int, Range(20, 100_000)] = 120
+    """Frames of the sequence."""
+    width: Annotated[int, Range(64, 8192)] = 320
     """Pixels."""
-    height: int = 240
+    height: Annotated[int, Range(48, 8192)] = 240
     """Pixels."""
-    seed: int = 0
+    seed: Seed = 0
     """Another seed makes another room."""
 
 
 def main(argv: Sequence[str]) -> int:
     """Run the command; returns the exit code."""
-    arguments = ["--output" if a == "-o" else a for a in argv]
-    options = parse_options(DemoOptions, arguments, "demo")
-    return demo(options)
+    return demo(parse_options(DemoOptions, argv, "demo"))
 
 
 def demo(options: DemoOptions) -> int:

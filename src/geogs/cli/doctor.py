@@ -1,16 +1,9 @@
 """``geogs doctor``: what this machine can do, and what to mend."""
 
-import sys
-import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING
 
 from geogs.cli.options import parse_options
-
-if TYPE_CHECKING:
-    import torch
 
 
 @dataclass(frozen=True)
@@ -21,21 +14,12 @@ class DoctorOptions:
     """What to test: cpu, cuda or cuda:1; auto takes a GPU if one can be used."""
 
 
-@dataclass(frozen=True)
-class Finding:
-    """One line of the report."""
-
-    name: str
-    text: str
-    problem: str | None = None
-    """A sentence on what to mend, if anything."""
-    is_fatal: bool = False
-    """Whether nothing works before it is mended."""
-
-
 def main(argv: Sequence[str]) -> int:
     """Run the command; returns 0 if the self-test passes, else 2."""
     options = parse_options(DoctorOptions, argv, "doctor")
+
+    from geogs.application.doctor import examine
+
     findings = []
     for finding in examine(options.device):
         print(f"{finding.name:<13} {finding.text}", flush=True)
@@ -48,159 +32,3 @@ def main(argv: Sequence[str]) -> int:
     else:
         print("everything works")
     return 2 if any(f.is_fatal for f in findings) else 0
-
-
-def examine(device_name: str = "auto") -> Iterator[Finding]:
-    """Every finding as soon as it is made.
-
-    Raises DeviceError if a device is asked for by name that cannot be used.
-    """
-    from geogs.gpu.installation import require_device
-
-    yield from _versions()
-    device = require_device(device_name)
-    yield from _gpus()
-    yield _cache(device.type == "cuda")
-    yield _weights()
-    if device.type == "cuda":
-        yield _compiler()
-        kernels = _kernels(device)
-        yield kernels
-        if kernels.is_fatal:
-            return
-    yield from _self_test(device)
-
-
-def _versions() -> Iterator[Finding]:
-    import platform
-
-    import cv2
-    import numba
-    import torch
-
-    import geogs
-    from geogs.threads import worker_count
-
-    system = f"{platform.system()} {platform.machine()}, {worker_count()} threads"
-    yield Finding("geogs", geogs.__version__)
-    yield Finding("Python", f"{platform.python_version()}, {system}")
-    build = f"CUDA {torch.version.cuda}" if torch.version.cuda else "without CUDA"
-    yield Finding(
-        "PyTorch", f"{torch.__version__}, built {'for ' * bool(torch.version.cuda)}{build}"
-    )
-    yield Finding("OpenCV", cv2.__version__)
-    yield Finding("numba", numba.__version__)
-    try:
-        import av
-    except ImportError as error:
-        yield Finding("video", f"PyAV does not load ({error})", "Install av to read videos.")
-    else:
-        yield Finding("video", f"PyAV {av.__version__}, FFmpeg {av.ffmpeg_version_info}")
-
-
-def _gpus() -> Iterator[Finding]:
-    """Every GPU and the driver; or why there is none.
-
-    A machine without a driver has nothing to mend.
-    """
-    import torch
-
-    from geogs.gpu.installation import driver_cuda, driver_release, gpu_problem
-
-    supported = driver_cuda()
-    if problem := gpu_problem():
-        yield Finding("GPU", f"none. {problem}", problem if supported else None)
-        return
-    for index in range(torch.cuda.device_count()):
-        gpu = torch.cuda.get_device_properties(index)
-        text = f"{gpu.name}, {gpu.total_memory / 2**30:.1f} GiB, capability {gpu.major}.{gpu.minor}"
-        yield Finding(f"GPU {index}", text)
-    newest = ".".join(map(str, supported)) if supported else "?"
-    yield Finding("driver", f"{driver_release() or '?'}, supports CUDA {newest}")
-
-
-def _cache(is_needed: bool) -> Finding:
-    from geogs.gpu.cache import cache_folder, cache_state
-
-    state = cache_state()
-    size = f"{state.kernels} compiled files, {state.bytes / 2**20:.1f} MiB"
-    text = f"{cache_folder()}, {size}, {'read-only' if state.problem else 'writable'}"
-    if not (state.problem and is_needed):
-        return Finding("kernel cache", text)
-    return Finding(
-        "kernel cache",
-        text,
-        f"Compiled kernels cannot be kept in {cache_folder()} ({state.problem}), so every start "
-        "compiles them again; set GEOGS_CACHE to a folder that can be written.",
-    )
-
-
-def _weights() -> Finding:
-    """The weights files that are there."""
-    from geogs.tracking.flow.weights_catalogue import CATALOGUE
-    from geogs.tracking.flow.weights_files import checksum, locate
-
-    found = {known: checksum(path) for known in CATALOGUE if (path := locate(known))}
-    text = ", ".join(f"{k.name} ({k.purpose}: {c.verdict})" for k, c in found.items())
-    wrong = [k.name for k, c in found.items() if c.is_wrong]
-    problem = f"Get {', '.join(wrong)} again; geogs weights says where." if wrong else None
-    return Finding("weights", text or "none", problem)
-
-
-def _compiler() -> Finding:
-    from geogs.errors import DeviceError
-    from geogs.gpu.kernels import compiler
-
-    try:
-        nvrtc = compiler()
-    except DeviceError as error:
-        return Finding("NVRTC", "missing", str(error))
-    return Finding("NVRTC", f"{nvrtc.version}, {nvrtc.path}")
-
-
-def _kernels(device: "torch.device") -> Finding:
-    """Every CUDA source of the package, from the cache or compiled now."""
-    import geogs
-    from geogs.errors import DeviceError
-    from geogs.gpu.cache import cache_state
-    from geogs.gpu.kernels import prepare_kernels
-
-    before, start = cache_state().kernels, time.perf_counter()
-    try:
-        kernels = prepare_kernels(Path(geogs.__file__).parent, device)
-    except DeviceError as error:
-        return Finding("kernels", "BAD", str(error), is_fatal=True)
-    seconds, new = time.perf_counter() - start, cache_state().kernels - before
-    how = f"{new} files compiled now" if new else "none to compile"
-    return Finding("kernels", f"{kernels}, {how}, {seconds:.1f} s")
-
-
-def _self_test(device: "torch.device") -> Iterator[Finding]:
-    from geogs.application.self_test import check_renderer, time_renderer
-
-    name = f"{device.type} renderer against its specification"
-    try:
-        agreement = check_renderer(device)
-        errors = f"maps {agreement.maps:.1e}, gradients {agreement.gradients:.1e}"
-        if not agreement.is_good:
-            problem = f"The renderer gives wrong results on {device} (relative errors: {errors})."
-            yield Finding("self-test", f"{name}: {errors}  BAD", problem, is_fatal=True)
-            return
-        yield Finding("self-test", f"{name}: relative error {errors}  OK")
-        repeats = 20 if device.type == "cuda" else 3
-        milliseconds = time_renderer(device, repeats=repeats)
-    except Exception as error:  # whatever is wrong here is what the user wants to be told
-        problem = f"The renderer does not run on {device} ({_first_line(error)})."
-        yield Finding("self-test", f"{name}: BAD", problem, is_fatal=True)
-        return
-    text = f"30 000 disks, 616 x 344: {milliseconds:.2f} ms forward and backward"
-    yield Finding("speed", text)
-
-
-def _first_line(error: Exception) -> str:
-    lines = str(error).strip().splitlines()
-    return f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))

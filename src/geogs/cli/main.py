@@ -10,8 +10,8 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from geogs import __version__
 from geogs.errors import GeogsError
+from geogs.version import __version__
 
 EXIT_ERROR = 2
 """Exit code after an error that the user can mend."""

@@ -3,26 +3,26 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
-
-from tyro.conf import Positional
+from typing import Annotated, Literal
 
 from geogs.cli.options import parse_options
+from geogs.config import Seed
+from geogs.config.setting import Positional, Range, Settings
 
 
 @dataclass(frozen=True)
-class SynthOptions:
+class SynthOptions(Settings):
     """Renders a furnished room, drawn at random, along a hand-held camera path."""
 
-    output: Positional[Path]
+    output: Annotated[Path, Positional()]
     """Folder to write, in the layout of Replica."""
-    frames: int = 120
-    """Number of frames, at least 1; after 280 the camera is back at its start."""
-    width: int = 320
+    frames: Annotated[int, Range(1, 100_000)] = 120
+    """Number of frames; after 280 the camera is back at its start."""
+    width: Annotated[int, Range(16, 8192)] = 320
     """Pixels."""
-    height: int = 240
+    height: Annotated[int, Range(16, 8192)] = 240
     """Pixels."""
-    seed: int = 0
+    seed: Seed = 0
     """Another seed gives another room and another path."""
     depth: bool = True
     """Write depth images too."""

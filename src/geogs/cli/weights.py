@@ -1,14 +1,12 @@
 """``geogs weights``: which weights files there are, and whether a file is intact."""
 
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-import tyro
-
 from geogs.cli.options import parse_options
+from geogs.config.setting import Positional
 from geogs.errors import InputError
 
 
@@ -20,15 +18,18 @@ class WeightsOptions:
     weights/ of the cache directory ($GEOGS_CACHE, else ~/.cache/geogs), and in the package.
     """
 
-    action: Annotated[Literal["list", "verify"], tyro.conf.Positional] = "list"
+    action: Annotated[Literal["list", "verify"], Positional(required=False)] = "list"
     """What to do."""
-    file: Annotated[Path | None, tyro.conf.Positional] = None
+    file: Annotated[Path | None, Positional(required=False)] = None
     """The file to verify."""
 
 
 def main(argv: Sequence[str]) -> int:
     """Run the command; returns 0, or raises InputError for a file that cannot be used."""
     options = parse_options(WeightsOptions, argv, "weights")
+
+    from geogs.application.weights import listing, verification
+
     if options.action == "list":
         if options.file is not None:
             raise InputError(
@@ -40,65 +41,3 @@ def main(argv: Sequence[str]) -> int:
             raise InputError("geogs weights verify needs a file.")
         print(verification(options.file))
     return 0
-
-
-def listing() -> str:
-    """What is known of every file, and where those are that were found."""
-    from geogs.tracking.flow.weights_catalogue import CATALOGUE, KnownWeights
-    from geogs.tracking.flow.weights_files import checksum, locate, weights_folders
-
-    def entry(known: KnownWeights) -> list[str]:
-        path = locate(known)
-        state = "not here" if path is None else f"{path} ({checksum(path).verdict})"
-        return [
-            f"  {known.name}",
-            f"      {known.what}",
-            f"      file     {state}",
-            f"      from     {known.origin}",
-            f"      licence  {known.licence}",
-        ]
-
-    lines = ["looked for in " + ", ".join(map(str, weights_folders()))]
-    titles = {
-        "own": "--tracking.operator own",
-        "raft": "--tracking.operator raft",
-        "droid": "--tracking.operator droid",
-        "prior": "monocular priors",
-    }
-    for purpose, title in titles.items():
-        lines += ["", title]
-        for known in CATALOGUE:
-            if known.purpose == purpose:
-                lines += entry(known)
-    return "\n".join(lines)
-
-
-def verification(path: Path) -> str:
-    """What a file holds, and whether it is the published one of its name.
-
-    Raises InputError if it is missing, damaged or another.
-    """
-    from geogs.tracking.flow.weights_catalogue import known_as
-    from geogs.tracking.flow.weights_files import require_intact
-
-    found = require_intact(path)
-    known = known_as(path.name)
-    lines = [
-        f"file     {path}, {path.stat().st_size / 2**20:.1f} MiB",
-        f"sha256   {found.actual}",
-        f"known    {f'{known.name}, {known.what}' if known else 'no file of this name is known'}",
-        f"verdict  {found.verdict}",
-    ]
-    if path.suffix != ".onnx":
-        from geogs.tracking.flow.weights import read_tensors
-
-        tensors = read_tensors(path)
-        numbers = sum(t.numel() for t in tensors.values())
-        lines.append(
-            f"content  {len(tensors)} tensors, {numbers:,} numbers, read without running code"
-        )
-    return "\n".join(lines)
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))

@@ -13,11 +13,11 @@ from geogs.config.known_poses import (
     reconstruct_preset,
 )
 from geogs.config.loop import LoopConfig, RetrievalOptions, VerificationOptions
-from geogs.config.losses import LossConfig
-from geogs.config.mapping import DiskConfig, MappingConfig, PhotoConfig
+from geogs.config.losses import LossAblation, LossConfig
+from geogs.config.mapping import DiskConfig, MapAblation, MappingConfig, PhotoConfig
 from geogs.config.mesh import MeshConfig
 from geogs.config.prior import PriorConfig
-from geogs.config.slam import Config, Preset, preset
+from geogs.config.slam import Config, Preset, Seed, preset
 from geogs.config.tracking import TrackingConfig
 
 __all__ = [
@@ -27,7 +27,9 @@ __all__ = [
     "DiskConfig",
     "InputConfig",
     "LoopConfig",
+    "LossAblation",
     "LossConfig",
+    "MapAblation",
     "MappingConfig",
     "MeshConfig",
     "PhotoConfig",
@@ -36,6 +38,7 @@ __all__ = [
     "ReconstructConfig",
     "RetrievalOptions",
     "SearchConfig",
+    "Seed",
     "TrackingConfig",
     "VerificationOptions",
     "known_pose_mapping",

@@ -1,19 +1,22 @@
 """How a source is read."""
 
 from dataclasses import dataclass
+from typing import Annotated
+
+from geogs.config.setting import Basic, Range, Settings
 
 
 @dataclass(frozen=True)
-class InputConfig:
+class InputConfig(Settings, group="input"):
     """How the source is read."""
 
-    intrinsics: str = "auto"
+    intrinsics: Annotated[str, Basic("--intrinsics")] = "auto"
     """auto, a file, or fx,fy,cx,cy[,k1,k2,p1,p2[,k3]] in pixels of the source image."""
-    long_edge: int = 512
+    long_edge: Annotated[int, Range(32, 16384, or_zero=True), Basic("--long-edge")] = 512
     """Longer side of the working image in pixels; smaller sources are not enlarged, 0 keeps all."""
-    start: int = 0
+    start: Annotated[int, Range(0), Basic("--start")] = 0
     """First frame of the source, from 0."""
-    stop: int | None = None
+    stop: Annotated[int | None, Range(above="start"), Basic("--stop")] = None
     """Frame of the source before which to stop; none reads to the end."""
-    stride: int = 1
-    """Use every stride-th frame, at least 1."""
+    stride: Annotated[int, Range(1), Basic("--stride")] = 1
+    """Use every stride-th frame."""

@@ -1,36 +1,38 @@
 """All settings of a reconstruction from known poses, and their presets."""
 
 from dataclasses import dataclass, field, replace
+from typing import Annotated
 
 from geogs.config.input import InputConfig
 from geogs.config.losses import LossConfig
 from geogs.config.mapping import MappingConfig, PhotoConfig
 from geogs.config.mesh import MeshConfig
-from geogs.config.slam import Preset
+from geogs.config.setting import Basic, Count, Range, Settings
+from geogs.config.slam import Preset, Seed
 
 
 @dataclass(frozen=True)
-class SearchConfig:
+class SearchConfig(Settings, group="search"):
     """How much is done for a map from known poses, and where depth is looked for."""
 
-    steps_per_view: int = 30
-    """Training steps for every image where no time is given, at least 1."""
-    least_steps: int = 300
+    steps_per_view: Annotated[Count, Basic()] = 30
+    """Training steps for every image where no time is given."""
+    least_steps: Count = 300
     """Fewest training steps where no time is given."""
-    most_steps_per_view: int = 200
+    most_steps_per_view: Count = 200
     """Most training steps for every image, whatever the time."""
-    depth_share: float = 0.6
-    """Most of the time up to then that the depths may take, in (0, 1]; images for which it does not
+    depth_share: Annotated[float, Range(above=0, most=1)] = 0.6
+    """Most of the time up to then that the depths may take; images for which it does not
     last get none and only serve to find those of the others."""
-    output_share: float = 0.2
-    """Part of a given time that is kept for the mesh and the report, in [0, 1)."""
-    first_edge: int = 128
+    output_share: Annotated[float, Range(0, below=1)] = 0.2
+    """Part of a given time that is kept for the mesh and the report."""
+    first_edge: Annotated[int, Range(16, 4096)] = 128
     """First look at the scene: longer side of its images, pixels."""
-    first_views: int = 8
+    first_views: Annotated[int, Range(1, 1000)] = 8
     """First look: images whose depth is searched."""
-    margin: float = 1.3
-    """Factor by which searched depths go beyond those that are known, at least 1."""
-    repeat: bool = True
+    margin: Annotated[float, Range(1, 1000)] = 1.3
+    """Factor by which searched depths go beyond those that are known."""
+    repeat: Annotated[bool, Basic()] = True
     """Search all depths a second time, between the limits that the first time has shown."""
 
 
@@ -65,12 +67,12 @@ def known_pose_mapping() -> MappingConfig:
 
 
 @dataclass(frozen=True)
-class ReconstructConfig:
+class ReconstructConfig(Settings):
     """All settings of a reconstruction from known poses."""
 
-    seed: int = 0
+    seed: Seed = 0
     """Random seed; same seed, same machine and no time limit, same result on the CPU."""
-    resident_keyframes: int = 128
+    resident_keyframes: Count = 128
     """Keyframes whose images, depths and the like stay in memory or on the GPU, those used last;
     others wait in a temporary file. More than the window that is mapped and its history."""
     input: InputConfig = field(default_factory=InputConfig)

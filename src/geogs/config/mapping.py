@@ -1,122 +1,141 @@
 """Settings of the disk map and its training."""
 
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Annotated, Literal
 
 from geogs.config.depth import DepthConfig
 from geogs.config.losses import LossConfig
+from geogs.config.setting import (
+    Angle,
+    Basic,
+    Count,
+    CountOrZero,
+    Only,
+    Positive,
+    Range,
+    Settings,
+    Share,
+    Weight,
+)
 
 
 @dataclass(frozen=True)
-class DiskConfig:
+class DiskConfig(Settings, group="mapping.disk"):
     """Where disks are made, how they start and when they go. Lengths in units of the map's depth.
 
     The unit u is the median depth of the first keyframe.
     """
 
-    stride: int = 3
-    """A candidate every stride-th pixel of the render, at least 1."""
-    insert_alpha: float = 0.4
-    """A pixel gets a disk where the map's alpha is below this, in (0, 1)."""
-    insert_behind: float = 0.05
+    stride: Annotated[int, Range(1, 100)] = 3
+    """A candidate every stride-th pixel of the render."""
+    insert_alpha: Share = 0.4
+    """A pixel gets a disk where the map's alpha is below this."""
+    insert_behind: Weight = 0.05
     """... or where the map lies this fraction of the depth behind a sure depth."""
-    insert_confidence: float = 0.3
+    insert_confidence: Share = 0.3
     """Least confidence of a depth that makes a disk at once; the rest follows later."""
-    fill_confidence: float = 0.1
+    fill_confidence: Share = 0.1
     """Least confidence of a depth that makes a disk where nothing better has come since."""
-    initialisation: Literal["local_plane", "random"] = "local_plane"
-    """Disks start in the plane of the points around them, or round, turned at random and as large
-    as those points are apart (3DGS's start, to compare with)."""
-    neighbours: int = 12
-    """Points of the local plane fit, at least 4."""
-    scale_factor: float = 0.6
+    neighbours: Annotated[int, Range(4, 31)] = 12
+    """Points of the local plane fit."""
+    scale_factor: Positive = 0.6
     """Initial standard deviation in distances to the nearest points."""
-    planarity_threshold: float = 0.05
-    """Below this planarity the initial scale shrinks, in [0, 1]."""
-    planarity_shrink: float = 0.5
+    planarity_threshold: Share = 0.05
+    """Below this planarity the initial scale shrinks."""
+    planarity_shrink: Positive = 0.5
     """Factor of that shrinking; the paper's is 0.1."""
-    opacity: float = 0.7
-    """Initial opacity, in (0, 1)."""
-    max_scale: float = 0.05
+    opacity: Annotated[float, Range(above=0, below=1)] = 0.7
+    """Initial opacity."""
+    max_scale: Positive = 0.05
     """Largest standard deviation, in u."""
-    min_scale: float = 4e-4
+    min_scale: Annotated[float, Range(above=0, most="max_scale")] = 4e-4
     """Smallest standard deviation, in u."""
-    prune_opacity: float = 0.05
+    prune_opacity: Annotated[float, Range(0, below=1)] = 0.05
     """Disks below this opacity are removed."""
-    split_share: float = 0.0
+    split_share: Annotated[float, Range(0, below=1)] = 0.0
     """Part of the disks that is split in two, where the losses pull hardest, each time that the
-    training over all keyframes reaches a split; in [0, 1)."""
-    split_times: tuple[float, ...] = (0.2, 0.35, 0.5)
+    training over all keyframes reaches a split."""
+    split_times: tuple[Share, ...] = (0.2, 0.35, 0.5)
     """When that is, in parts of that training."""
-    split_pixels: float = 1.0
+    split_pixels: Weight = 1.0
     """Disks with no standard deviation above this many pixels at u are not split."""
-    carve_every: int = 10
+    carve_every: Annotated[Count, Only("run")] = 10
     """Keyframes between votes of all keyframes against disks in free space."""
 
 
 @dataclass(frozen=True)
-class PhotoConfig:
+class PhotoConfig(Settings, group="mapping.photo"):
     """Which keyframes check each other's depth by their images (L_mv)."""
 
-    parallax: float = 8.0
+    parallax: Annotated[float, Range(above=0, most=180)] = 8.0
     """Preferred parallax angle in degrees."""
-    min_parallax: float = 2.0
+    min_parallax: Annotated[float, Range(0, below=180)] = 2.0
     """Degrees."""
-    max_parallax: float = 25.0
+    max_parallax: Annotated[float, Range(above="min_parallax", most=180)] = 25.0
     """Degrees."""
-    looking_within: float = 35.0
+    looking_within: Angle = 35.0
     """Largest angle between the optical axes, degrees."""
-    candidates: int = 6
+    candidates: Annotated[int, Range(1, 1000)] = 6
     """Partners kept per keyframe."""
-    per_step: int = 2
+    per_step: Annotated[int, Range(1, 64)] = 2
     """Partners drawn in each step."""
 
 
 @dataclass(frozen=True)
-class MappingConfig:
-    """The disk map and its training."""
+class MapAblation(Settings, group="mapping.ablation"):
+    """Other ways to start disks and to move them, to compare with."""
 
-    render_long_edge: int = 320
-    """Longer side of the rendered maps in pixels; never above the working image."""
-    photo_scale: float = 2.0
-    """The images of L_mv are this much larger than the render, at most the working image."""
-    lag: int = 4
-    """A keyframe is mapped once this many later ones exist, so that its depth can be searched."""
-    window: int = 8
-    """Recent keyframes that are trained together."""
-    history: int = 2
-    """Older keyframes drawn at random into each window."""
-    iterations: int = 8
-    """Steps per keyframe."""
-    views_per_step: int = 2
-    """Views of the window in each step; 0 sums the loss over the whole window as the paper does."""
-    final_iterations: int = 600
-    """Single-view steps over all keyframes after the final bundle adjustment; 0 stops online."""
-    final_depth: bool = True
-    """Search all keyframe depths once more with the final poses."""
-    lr_position: float = 6e-4
-    """Adam step of positions, in u."""
-    lr_quaternion: float = 4e-3
-    """Adam step of quaternions."""
-    lr_scale: float = 0.02
-    """Adam step of log scales."""
-    lr_opacity: float = 0.05
-    """Adam step of opacity logits."""
-    lr_final: float = 0.1
-    """Factor that the learning rates fall to over the final iterations."""
-    pose_iterations: int = 2
-    """Pose-only steps per mapped keyframe; 0 leaves the poses to the tracker."""
-    pose_lr: float = 4e-4
-    """Adam step of the pose tangents: radians, and u for translations."""
-    map_update: Literal["blended", "coherent", "per_keyframe"] = "blended"
+    initialisation: Literal["local_plane", "random"] = "local_plane"
+    """Disks start in the plane of the points around them, or round, turned at random and as large
+    as those points are apart (3DGS's start)."""
+    map_update: Annotated[Literal["blended", "coherent", "per_keyframe"], Only("run")] = "blended"
     """How the map follows a correction of the poses: each disk with all keyframes that see it in
     place, all by one similarity (the paper's), or each with the keyframe that made it."""
-    max_spread: float = 0.01
+
+
+@dataclass(frozen=True)
+class MappingConfig(Settings, group="mapping"):
+    """The disk map and its training."""
+
+    render_long_edge: Annotated[int, Range(16, 16384), Basic()] = 320
+    """Longer side of the rendered maps in pixels; never above the working image."""
+    photo_scale: Annotated[float, Range(0.1, 16)] = 2.0
+    """The images of L_mv are this much larger than the render, at most the working image."""
+    lag: Annotated[CountOrZero, Only("run")] = 4
+    """A keyframe is mapped once this many later ones exist, so that its depth can be searched."""
+    window: Annotated[Count, Only("run")] = 8
+    """Recent keyframes that are trained together."""
+    history: Annotated[CountOrZero, Only("run")] = 2
+    """Older keyframes drawn at random into each window."""
+    iterations: Annotated[CountOrZero, Only("run")] = 8
+    """Steps per keyframe."""
+    views_per_step: Annotated[CountOrZero, Only("run")] = 2
+    """Views of the window in each step; 0 sums the loss over the whole window as the paper does."""
+    final_iterations: Annotated[CountOrZero, Only("run"), Basic()] = 600
+    """Single-view steps over all keyframes after the final bundle adjustment; 0 stops online."""
+    final_depth: Annotated[bool, Only("run")] = True
+    """Search all keyframe depths once more with the final poses."""
+    lr_position: Weight = 6e-4
+    """Adam step of positions, in u."""
+    lr_quaternion: Weight = 4e-3
+    """Adam step of quaternions."""
+    lr_scale: Weight = 0.02
+    """Adam step of log scales."""
+    lr_opacity: Weight = 0.05
+    """Adam step of opacity logits."""
+    lr_final: Annotated[float, Range(above=0, most=1)] = 0.1
+    """Factor that the learning rates fall to over the final iterations."""
+    pose_iterations: Annotated[CountOrZero, Only("run")] = 2
+    """Pose-only steps per mapped keyframe; 0 leaves the poses to the tracker."""
+    pose_lr: Annotated[Weight, Only("run")] = 4e-4
+    """Adam step of the pose tangents: radians, and u for translations."""
+    max_spread: Weight = 0.01
     """Surfaces take the mean depth of a ray where the median differs by less, else the median."""
     disk: DiskConfig = field(default_factory=DiskConfig)
     photo: PhotoConfig = field(default_factory=PhotoConfig)
     depth: DepthConfig = field(default_factory=DepthConfig)
     loss: LossConfig = field(default_factory=LossConfig)
+    ablation: MapAblation = field(default_factory=MapAblation)
 
     @property
     def pose_loss(self) -> LossConfig:

@@ -1,7 +1,7 @@
 """All settings of a run, and their presets."""
 
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Annotated, Literal
 
 from geogs.config.calibration import CalibrationConfig
 from geogs.config.input import InputConfig
@@ -9,18 +9,20 @@ from geogs.config.loop import LoopConfig
 from geogs.config.mapping import MappingConfig
 from geogs.config.mesh import MeshConfig
 from geogs.config.prior import PriorConfig
+from geogs.config.setting import Count, Range, Settings
 from geogs.config.tracking import TrackingConfig
 
 Preset = Literal["fast", "default", "accurate"]
+Seed = Annotated[int, Range(0, 2**32 - 1)]
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(Settings):
     """All settings of a run."""
 
-    seed: int = 0
+    seed: Seed = 0
     """Random seed; same seed, same machine, same result on the CPU."""
-    resident_keyframes: int = 128
+    resident_keyframes: Count = 128
     """Keyframes whose images, depths and the like stay in memory or on the GPU, those used last;
     others wait in a temporary file. More than the window that is mapped and its history."""
     input: InputConfig = field(default_factory=InputConfig)

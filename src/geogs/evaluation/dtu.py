@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float
 from geogs.errors import InputError
 from geogs.evaluation.surface import Surface, read_surface
 from geogs.evaluation.thinning import dense_points, thin
+from geogs.threads import on_one_torch_thread
 
 SPACING = 0.2
 """Millimetres between samples."""
@@ -113,11 +114,7 @@ def read_dtu_reference(folder: str | Path, scan: int) -> DtuReference:
     return DtuReference(points, observed, box[0], box[1], resolution, plane)
 
 
-def normalised_to_millimetres(mesh: Surface, scale_mat: Float[np.ndarray, "4 4"]) -> Surface:
-    """A mesh in the unit ball of ``cameras.npz`` as one in the world, by its ``scale_mat_0``."""
-    return Surface(mesh.vertices * scale_mat[0, 0] + scale_mat[:3, 3], mesh.faces)
-
-
+@on_one_torch_thread
 def evaluate_dtu(mesh: Surface, reference: DtuReference, seed: int = 0) -> DtuErrors:
     """Compare a mesh, in millimetres and cut by the masks, with a scan.
 

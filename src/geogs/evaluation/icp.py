@@ -10,6 +10,8 @@ from geogs.evaluation.surface import SurfaceDistance
 from geogs.geometry.lie import se3_exp
 from geogs.geometry.umeyama import umeyama
 
+_REACH, _ITERATIONS, _TOLERANCE = 0.1, 30, 1e-6
+
 
 @dataclass(frozen=True)
 class IcpResult:
@@ -27,46 +29,38 @@ class IcpResult:
 def icp(
     points: Float[np.ndarray, "n 3"],
     target: SurfaceDistance,
-    max_distance: float = 0.1,
-    iterations: int = 30,
-    tolerance: float = 1e-6,
+    iterations: int = _ITERATIONS,
 ) -> IcpResult:
     """Rigid motion of ``points`` onto ``target`` from the identity.
 
-    Partners are the nearest surface points within ``max_distance``. Distances along the normals
+    Partners are the nearest surface points within 0.1 m. Distances along the normals
     are minimised for a mesh (point to plane, Chen and Medioni 1992), those between the points for
-    a point set (Besl and McKay 1992). Stops when fitness and RMSE change by less than
-    ``tolerance`` relatively. With fewer than six partners the identity is returned.
+    a point set (Besl and McKay 1992). Stops when fitness and RMSE change by less than 1e-6
+    relatively. With fewer than six partners the identity is returned.
     """
     T, fitness, rmse = np.eye(4), 0.0, 0.0
     for step in range(iterations):
         moved = points @ T[:3, :3].T + T[:3, 3]
         distance, closest, normal = target.nearest(moved)
-        near = distance < max_distance
+        near = distance < _REACH
         if near.sum() < 6:
             return IcpResult(np.eye(4), float(near.mean()), 0.0, step)
         previous = fitness, rmse
         fitness, rmse = float(near.mean()), float(np.sqrt((distance[near] ** 2).mean()))
         change = max(abs(fitness - previous[0]), abs(rmse - previous[1]) / max(rmse, 1e-12))
-        if change < tolerance:
+        if change < _TOLERANCE:
             return IcpResult(T, fitness, rmse, step)
         normals = None if normal is None else normal[near]
         T = _step(moved[near], closest[near], normals) @ T
     return IcpResult(T, fitness, rmse, iterations)
 
 
-def icp_points(
-    source: Float[np.ndarray, "n 3"],
-    target: Float[np.ndarray, "m 3"],
-    max_distance: float = 0.1,
-    iterations: int = 30,
-    tolerance: float = 1e-6,
-) -> IcpResult:
+def icp_points(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "m 3"]) -> IcpResult:
     """Rigid motion of points onto points from the identity, with Open3D's rules.
 
-    Partners are the nearest target points nearer than ``max_distance``; the squared distances
+    Partners are the nearest target points nearer than 0.1 m; the squared distances
     between them are minimised (Besl and McKay 1992). Stops when fitness and RMSE both change by
-    less than ``tolerance``; the change of the RMSE counts in the unit of the points, although
+    less than 1e-6; the change of the RMSE counts in the unit of the points, although
     Open3D (``registration_icp``, whose defaults these are) calls it relative. With fewer than
     three partners the motion so far is returned.
     """
@@ -74,13 +68,13 @@ def icp_points(
 
     tree = cKDTree(target)
     T, moved, previous = np.eye(4), source, (np.inf, np.inf)
-    for step in range(iterations + 1):
-        distance, index = tree.query(moved, distance_upper_bound=max_distance, workers=-1)
+    for step in range(_ITERATIONS + 1):
+        distance, index = tree.query(moved, distance_upper_bound=_REACH, workers=-1)
         near = np.isfinite(distance)
         fitness = float(near.mean())
         rmse = float(np.sqrt((distance[near] ** 2).mean())) if near.any() else 0.0
-        settled = max(abs(fitness - previous[0]), abs(rmse - previous[1])) < tolerance
-        if settled or near.sum() < 3 or step == iterations:
+        settled = max(abs(fitness - previous[0]), abs(rmse - previous[1])) < _TOLERANCE
+        if settled or near.sum() < 3 or step == _ITERATIONS:
             break
         previous = fitness, rmse
         T = _step(moved[near], target[index[near]], None) @ T

@@ -11,6 +11,7 @@ from geogs.errors import InputError
 from geogs.evaluation.masks import Silhouette, inside_masks
 from geogs.evaluation.surface import Surface, sample_surface
 from geogs.evaluation.triangle_tree import TriangleTree
+from geogs.threads import on_one_torch_thread
 
 MAX_DISTANCE = 0.02
 """Metres from which on distances are left out, as in DTU."""
@@ -84,6 +85,7 @@ class ObjectErrors:
     completeness: Float[np.ndarray, "m"]
 
 
+@on_one_torch_thread
 def evaluate_object(
     reconstruction: Surface,
     truth: Surface,

@@ -12,7 +12,7 @@ from geogs.errors import InputError
 from geogs.evaluation.raster import render_mesh
 from geogs.evaluation.surface import Surface
 from geogs.geometry.camera import Camera
-from geogs.threads import thread_map
+from geogs.threads import on_one_torch_thread, thread_map
 
 _LEAST_TURN, _BEST_TURN, _MOST_TURN = 4.0, 12.0, 30.0
 _TEXTURE = 4.0
@@ -80,6 +80,7 @@ class _Agreement:
     pairs: int
 
 
+@on_one_torch_thread
 def evaluate_photoconsistency(
     mesh: Surface,
     camera: Camera,

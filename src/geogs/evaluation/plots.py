@@ -87,7 +87,6 @@ def plot_keyframes(
     images: Sequence[UInt8[np.ndarray, "ih iw 3"]],
     depths: Sequence[Float[np.ndarray, "h w"]],
     normals: Sequence[Float[np.ndarray, "h w 3"]],
-    names: Sequence[str] | None = None,
 ) -> None:
     """One row a keyframe: image, rendered depth (one colour scale for all) and normals.
 
@@ -100,8 +99,7 @@ def plot_keyframes(
     height, width = images[0].shape[:2]
     figure = new_figure(12.0, 0.4 + len(images) * 3.7 * height / width)
     plots = []
-    rows = zip(images, depths, normals, names or [""] * len(images), strict=True)
-    for row, (image, depth, normal, name) in enumerate(rows):
+    for row, (image, depth, normal) in enumerate(zip(images, depths, normals, strict=True)):
         hidden = np.ma.masked_where(~(np.isfinite(depth) & (depth > 0)), depth)
         missing = ~(np.linalg.norm(normal, axis=-1) > 0.5)
         flipped = np.where(missing[..., None], 1.0, 0.5 + 0.5 * normal * [1, -1, -1])
@@ -113,8 +111,6 @@ def plot_keyframes(
             plot.set(xticks=[], yticks=[])
             if row == 0:
                 plot.set_title(title)
-            if column == 0:
-                plot.set_ylabel(name)
             plots.append(plot)
     _colour_bar(figure, plots, "turbo", (float(low), float(high)), "depth (map units)")
     save_figure(figure, path)

@@ -10,6 +10,7 @@ from geogs.errors import InputError
 from geogs.evaluation.icp import icp
 from geogs.evaluation.surface import Surface, SurfaceDistance, sample_surface
 from geogs.evaluation.visibility import Visibility
+from geogs.threads import on_one_torch_thread
 
 _ICP_POINTS = 40_000
 _MARGIN = 0.5
@@ -75,6 +76,7 @@ class SurfaceErrors:
     completeness: Float[np.ndarray, "m"]
 
 
+@on_one_torch_thread
 def evaluate_reconstruction(
     reconstruction: Surface,
     truth: Surface,

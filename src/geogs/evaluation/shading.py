@@ -11,6 +11,8 @@ from geogs.geometry.camera import Camera
 _BACKGROUND = 255.0
 _GREY = 190.0
 _AMBIENT = 0.25
+_WIDTH = 480
+"""Of a picture, pixels."""
 
 
 @dataclass(frozen=True)
@@ -74,16 +76,6 @@ def look(
     return Sight(hit, corners, light)
 
 
-def shade(
-    vertices: Float[np.ndarray, "n 3"],
-    faces: Int[np.ndarray, "m 3"],
-    view: Viewpoint,
-    colours: UInt8[np.ndarray, "n 3"] | None = None,
-) -> UInt8[np.ndarray, "h w 3"]:
-    """A picture (RGB) of a mesh in one go; see :func:`look`."""
-    return look(vertices, faces, view).paint(colours)
-
-
 def level_axes(T_wc: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "3 3"]:
     """Rows right, forward, up of the world as the camera was held.
 
@@ -104,24 +96,21 @@ def level_axes(T_wc: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "3 3"]:
 
 
 def viewpoints(
-    vertices: Float[np.ndarray, "n 3"],
-    T_wc: Float[np.ndarray, "k 4 4"],
-    camera: Camera,
-    width: int = 480,
+    vertices: Float[np.ndarray, "n 3"], T_wc: Float[np.ndarray, "k 4 4"], camera: Camera
 ) -> list[Viewpoint]:
     """The first camera, the one in the middle, and the whole from above without the ceiling.
 
     Where all cameras look at one place, as at an object, the third is the camera that is turned
     most from the other two.
     """
-    inside = camera.with_long_edge(width)
+    inside = camera.with_long_edge(_WIDTH)
     chosen = {"first frame": T_wc[0], "middle frame": T_wc[len(T_wc) // 2]}
     around = look_at_one_place(T_wc)
     if around:
         cosine = T_wc[:, :3, 2] @ T_wc[[0, len(T_wc) // 2], :3, 2].T
         chosen["another side"] = T_wc[cosine.max(1).argmin()]
     views = [Viewpoint(name, inside, np.linalg.inv(T)) for name, T in chosen.items()]
-    return views if around else [*views, _from_above(vertices, T_wc, width, inside.height)]
+    return views if around else [*views, _from_above(vertices, T_wc, _WIDTH, inside.height)]
 
 
 def look_at_one_place(T_wc: Float[np.ndarray, "k 4 4"]) -> bool:

@@ -14,6 +14,7 @@ from geogs.errors import InputError
 from geogs.evaluation.icp import icp_points
 from geogs.evaluation.reconstruction import SurfaceErrors, surface_scores
 from geogs.evaluation.surface import Surface, sample_surface
+from geogs.threads import on_one_torch_thread
 
 VERTEX_WEIGHTED = "vertex-weighted (Splat-SLAM toolbox)"
 AREA_WEIGHTED = "area-weighted (NICE-SLAM), distances to samples"
@@ -21,6 +22,7 @@ AREA_WEIGHTED = "area-weighted (NICE-SLAM), distances to samples"
 _SAME_VERTEX = 1e-8
 
 
+@on_one_torch_thread
 def evaluate_vertices(
     reconstruction: Surface,
     truth: Surface,
@@ -60,6 +62,7 @@ def evaluate_vertices(
     )
 
 
+@on_one_torch_thread
 def evaluate_samples(
     reconstruction: Surface,
     truth: Surface,

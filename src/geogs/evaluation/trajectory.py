@@ -9,6 +9,7 @@ from jaxtyping import Float, Int
 
 from geogs.errors import GeogsError, InputError
 from geogs.geometry.umeyama import umeyama
+from geogs.threads import on_one_torch_thread
 from geogs.types import Trajectory
 
 Alignment = Literal["sim3", "se3", "none"]
@@ -94,6 +95,7 @@ def align(
     return T, float(scale)
 
 
+@on_one_torch_thread
 def evaluate_trajectory(
     estimate: Trajectory,
     reference: Trajectory,

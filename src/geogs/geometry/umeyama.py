@@ -8,20 +8,16 @@ from geogs.errors import GeogsError
 
 
 def umeyama(
-    source: Float[Tensor, "n 3"],
-    target: Float[Tensor, "n 3"],
-    with_scale: bool = True,
-    weights: Float[Tensor, "n"] | None = None,
+    source: Float[Tensor, "n 3"], target: Float[Tensor, "n 3"], with_scale: bool = True
 ) -> tuple[Float[Tensor, ""], Float[Tensor, "3 3"], Float[Tensor, "3"]]:
     """Least-squares ``scale, R, t`` with ``target = scale R source + t`` (Umeyama 1991).
 
-    Weights are non-negative. Raises GeogsError if there are fewer than three points or they lie
-    on one point or line, where the rotation is not determined.
+    Raises GeogsError if there are fewer than three points or they lie on one point or line, where
+    the rotation is not determined.
     """
     if len(source) < 3:
         raise GeogsError(f"A similarity needs three points, {len(source)} were given.")
-    w = torch.ones_like(source[:, 0]) if weights is None else weights
-    w = (w / w.sum())[:, None]
+    w = torch.ones_like(source[:, :1]) / len(source)
     mean_s, mean_t = (w * source).sum(0), (w * target).sum(0)
     s, t = source - mean_s, target - mean_t
     variance = (w * s * s).sum()

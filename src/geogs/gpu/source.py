@@ -4,6 +4,8 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
+PACKAGE = Path(__file__).parents[1]
+"""Below which all kernel sources of ours lie."""
 INCLUDE_FOLDER = Path(__file__).parent
 """Where ``#include "common.cuh"`` is found."""
 

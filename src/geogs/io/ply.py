@@ -6,6 +6,7 @@ then come the rows. A property is a number, or a list of numbers with its length
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Int64, Shaped
@@ -17,7 +18,12 @@ _KINDS = {
     "float": "f4", "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2",
     "int32": "i4", "uint32": "u4", "float32": "f4", "float64": "f8",
 }  # fmt: skip
-_ORDERS = {"ascii": None, "binary_little_endian": "<", "binary_big_endian": ">"}
+_Order = Literal["<", ">"]
+_ORDERS: dict[str, _Order | None] = {
+    "ascii": None,
+    "binary_little_endian": "<",
+    "binary_big_endian": ">",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +97,7 @@ def _header(data: bytes) -> tuple[bool, dict[str, tuple[int, list[_Property]]], 
     lines = data[: max(end, 0)].decode("ascii", "replace").splitlines()
     if not data.startswith(b"ply") or end < 0 or not start:
         raise ValueError("it has no header")
-    order: str | None = ""
+    order: _Order | Literal[""] | None = ""
     layout: dict[str, tuple[int, list[_Property]]] = {}
     for words in map(str.split, lines[1:]):
         match words:
@@ -113,7 +119,7 @@ def _header(data: bytes) -> tuple[bool, dict[str, tuple[int, list[_Property]]], 
     return order is None, layout, start
 
 
-def _property(name: str, kinds: list[str], order: str | None) -> _Property:
+def _property(name: str, kinds: list[str], order: _Order | None) -> _Property:
     types = [np.dtype(_KINDS[word]) for word in kinds if word in _KINDS]
     stored = [np.dtype("f8") if order is None else kind.newbyteorder(order) for kind in types]
     if len(kinds) == len(types) == 1:

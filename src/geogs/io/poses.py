@@ -8,7 +8,6 @@ import logging
 import re
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import torch
@@ -21,18 +20,15 @@ from geogs.types import Trajectory
 FRAMES_PER_SECOND = 30.0
 """Rate given to data sets that carry no time: frame k is at k / 30 s."""
 
-QuaternionOrder = Literal["auto", "xyzw", "wxyz"]
-
 _log = logging.getLogger(__name__)
 _POSE_FILE = re.compile(r"frame-(\d+)\.pose\.txt")
 
 
-def read_tum_trajectory(path: str | Path, quaternion_order: QuaternionOrder = "auto") -> Trajectory:
+def read_tum_trajectory(path: str | Path) -> Trajectory:
     """Read ``t tx ty tz qx qy qz qw`` rows (spaces or commas, ``#`` starts a comment).
 
-    ``auto`` means qx qy qz qw, but refuses a file that begins with the quaternion 1 0 0 0: it is
-    the unit rotation with w first, and hardly ever a half turn about x. Quaternions are made unit;
-    rows are sorted by time.
+    A file that begins with the quaternion 1 0 0 0 is refused: it is the unit rotation with w first,
+    and hardly ever a half turn about x. Quaternions are made unit; rows are sorted by time.
 
     Raises:
         InputError: the file is missing, empty, not of eight columns, or its quaternions are not.
@@ -42,27 +38,21 @@ def read_tum_trajectory(path: str | Path, quaternion_order: QuaternionOrder = "a
     quaternion = rows[:, 4:]
     norm = np.linalg.norm(quaternion, axis=1)
     valid = np.isfinite(rows).all(axis=1) & (np.abs(norm - 1) < 0.1)
-    _check_quaternions(path, rows, valid, quaternion_order)
+    _check_quaternions(path, rows, valid)
     rows = _keep_poses(path, rows, valid)
     rows = rows[np.argsort(rows[:, 0], kind="stable")]
-    wxyz = rows[:, 4:] if quaternion_order == "wxyz" else rows[:, [7, 4, 5, 6]]
+    wxyz = rows[:, [7, 4, 5, 6]]
     T_wc = np.tile(np.eye(4), (len(rows), 1, 1))
-    T_wc[:, :3, :3] = quaternion_to_matrix(torch.from_numpy(wxyz.copy())).numpy()
+    T_wc[:, :3, :3] = quaternion_to_matrix(torch.from_numpy(wxyz)).numpy()
     T_wc[:, :3, 3] = rows[:, 1:4]
     return Trajectory(rows[:, 0].copy(), T_wc, np.ones(len(rows), dtype=bool))
 
 
-def read_matrix_rows(path: str | Path) -> Float[np.ndarray, "n 4 4"]:
+def read_replica_trajectory(path: str | Path) -> Trajectory:
     """Read one camera-to-world matrix a row: 16 numbers (Replica) or the upper 12 (KITTI).
 
-    Rows without a pose are left out, so position and frame number may differ afterwards; use
-    :func:`read_replica_trajectory` where they must be matched to frames.
+    Row k is frame k at k / 30 s; rows without a pose are left out.
     """
-    return read_replica_trajectory(path).T_wc
-
-
-def read_replica_trajectory(path: str | Path) -> Trajectory:
-    """Read one matrix a row, row k being frame k at k / 30 s, as a trajectory."""
     path = Path(path)
     rows = _read_table(path, columns=(16, 12), layout="a 4x4 matrix a row")
     T_wc = np.tile(np.eye(4), (len(rows), 1, 1))
@@ -143,10 +133,7 @@ def _numbers_by_line(path: Path) -> Iterator[tuple[int, list[float]]]:
 
 
 def _check_quaternions(
-    path: Path,
-    rows: Float[np.ndarray, "n 8"],
-    valid: Bool[np.ndarray, "n"],
-    order: QuaternionOrder,
+    path: Path, rows: Float[np.ndarray, "n 8"], valid: Bool[np.ndarray, "n"]
 ) -> None:
     norm = np.linalg.norm(rows[:, 4:], axis=1)
     has_pose = np.isfinite(rows).all(axis=1) & (norm > 0)
@@ -155,7 +142,7 @@ def _check_quaternions(
             f"{path}: columns 5 to 8 are no unit quaternions; expected t tx ty tz qx qy qz qw."
         )
     first = rows[valid][:1, 4:]
-    if order == "auto" and len(first) and abs(first[0, 0]) > 1 - 1e-6:
+    if len(first) and abs(first[0, 0]) > 1 - 1e-6:
         raise InputError(
             f"{path} begins with the quaternion 1 0 0 0, which is w x y z order; "
             f"TUM files hold qx qy qz qw, so move the w column to the end."

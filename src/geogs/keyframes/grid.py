@@ -31,8 +31,8 @@ class SampleGrid:
     """K^-1 (x, y, 1) of each cell, float32."""
 
     def __post_init__(self) -> None:
-        x = torch.arange(OFFSET, self.camera.width - 3, STRIDE, dtype=torch.float64)
-        y = torch.arange(OFFSET, self.camera.height - 3, STRIDE, dtype=torch.float64)
+        x = torch.arange(OFFSET, max(self.camera.width - 3, OFFSET), STRIDE, dtype=torch.float64)
+        y = torch.arange(OFFSET, max(self.camera.height - 3, OFFSET), STRIDE, dtype=torch.float64)
         if len(x) < 4 or len(y) < 4:
             raise InputError(
                 f"The working image is {self.camera.width} x {self.camera.height} pixels; "
@@ -91,46 +91,3 @@ class SampleGrid:
         c, r = cell.unbind(-1)
         valid = (c >= 0) & (c < self.width) & (r >= 0) & (r < self.height)
         return torch.where(valid, r * self.width + c, torch.zeros_like(c)), valid
-
-    def fill(
-        self, values: Float[Tensor, "p"], confidence: Float[Tensor, "p"]
-    ) -> Float[Tensor, "p"]:
-        """Values where confidence is positive; elsewhere the mean of their surroundings.
-
-        Push and pull: confidence-weighted means over growing blocks, taken from the finest level
-        that has any confidence near. Without any confidence the plain mean is returned.
-        """
-        return self.fill_all(values[None], confidence[None])[0]
-
-    def fill_all(
-        self, values: Float[Tensor, "n p"], confidence: Float[Tensor, "n p"]
-    ) -> Float[Tensor, "n p"]:
-        """:meth:`fill` of several fields at once."""
-        if self.on_gpu:
-            from geogs.bundle.cuda.fields import fill_fields
-
-            return fill_fields(self, values, confidence)
-        return torch.stack([self._fill(*pair) for pair in zip(values, confidence, strict=True)])
-
-    def _fill(
-        self, values: Float[Tensor, "p"], confidence: Float[Tensor, "p"]
-    ) -> Float[Tensor, "p"]:
-        if not bool((confidence > 0).any()):
-            return torch.full_like(values, float(values.mean()))
-        shape = (1, 1, self.height, self.width)
-        value, weight = values.reshape(shape), confidence.reshape(shape).clamp(min=0)
-        return torch.where(
-            confidence > 0, values, _push_pull(value, weight).reshape(-1).to(values.dtype)
-        )
-
-
-def _push_pull(value: Tensor, weight: Tensor) -> Tensor:
-    pool = torch.nn.functional.avg_pool2d
-    if min(value.shape[-2:]) <= 2:
-        return ((value * weight).sum() / weight.sum()).expand_as(value)
-    w = pool(weight, 2, ceil_mode=True)
-    v = pool(value * weight, 2, ceil_mode=True) / w.clamp(min=1e-30)
-    coarse = torch.nn.functional.interpolate(
-        _push_pull(v, w), size=value.shape[-2:], mode="bilinear", align_corners=False
-    )
-    return torch.where(weight > 0, value, coarse)

@@ -51,13 +51,13 @@ def dense_check(
     """Measure the flow between two keyframes from their supposed relative pose, and judge it.
 
     Both directions are located on their own, each on the depth of its source; their poses must
-    turn alike, both views' depth must agree up to one scale where they match, and where they do
-    not match neither may see through what the other shows. ``T_ji`` is in the first's
-    lengths, ``scale`` as in :class:`DenseCheck`.
+    turn alike, both views' depth must agree up to one scale where they match, where they do not
+    match neither may see through what the other shows, and the images must agree at the poses.
+    ``T_ji`` is in the first's lengths, ``scale`` as in :class:`DenseCheck`.
     """
     o = options or VerificationOptions()
     limit = o.max_residual * max(grid.camera.width, grid.camera.height)
-    locator = FrameLocator(grid, operator, 0.0, limit)
+    locator = FrameLocator(grid, operator, 0.0, limit, min_ncc=-1.0)
     T_ji = T_ji.to(first.T_cw)
     there = locator.locate(first, second.encoded, T_ji @ first.T_cw)
     back = locator.locate(second, first.encoded, se3_inverse(scaled(T_ji, scale)) @ second.T_cw)
@@ -84,6 +84,9 @@ def dense_check(
         reason = f"the depths differ by a factor of {scale_dense:.2f}"
     elif contradiction > o.max_contradiction:
         reason = f"one sees through {contradiction:.0%} of what the other shows"
+    elif not all(m.evidence.bears_out(o.min_ncc, is_expected=False) for m in (there, back)):
+        correlation = min(there.evidence.correlation, back.evidence.correlation)
+        reason = f"the images correlate by only {correlation:.2f}"
     else:
         reason = ""
     return DenseCheck(

@@ -227,7 +227,7 @@ def multi_view_loss(
         target.camera,
         reference.T_cw,
         target.T_cw,
-        config.photo_gradient,
+        config.ablation.photo_gradient,
     )
     mask = warped.in_view
     if target_depth is not None:

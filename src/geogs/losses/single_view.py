@@ -233,7 +233,7 @@ def single_view_loss(
     terms = [(config.opacity_weight, opacity(alpha, inside))]
     terms.append((config.silhouette_weight, silhouette(alpha, ~inside)))
     if config.depth_weight > 0:
-        loss = depth_l1(depth, view.prior_depth, view.confidence, config.depth_relative)
+        loss = depth_l1(depth, view.prior_depth, view.confidence, config.ablation.depth_relative)
         terms.append((config.depth_weight, loss))
     if config.distortion_weight > 0:
         terms.append((config.distortion_weight, distortion(spread, mask, unit)))
@@ -243,7 +243,7 @@ def single_view_loss(
     if config.normal_weight > 0 and view.prior_normal is not None:
         terms.append((config.normal_weight, normal_l1(normal, view.prior_normal, mask)))
     if config.smoothness_weight > 0:
-        eta, both = config.smoothness_eta, config.smoothness_rewards_edges
+        eta, both = config.smoothness_eta, config.ablation.smoothness_rewards_edges
         loss = depth_smoothness(depth, view.image_gradient, eta, both)
         terms.append((config.smoothness_weight, loss))
     total = torch.stack([weight * loss.sum() for weight, (loss, _) in terms]).sum()

@@ -169,7 +169,7 @@ class Mapper:
             self.map.position,
             self.map.keyframe_id,
             correction,
-            self.config.map_update,
+            self.config.ablation.map_update,
             (witness(v, correction) for v in views),
         )
         if len(self.map):
@@ -348,8 +348,9 @@ class Mapper:
             return
         footprint = disk.stride * z / camera.fx
         new = new_disks(
-            points, T_wc[:3, 3], footprint, self.map.position.detach(), disk, self._torch_random
-        )
+            points, T_wc[:3, 3], footprint, self.map.position.detach(), disk, self._torch_random,
+            self.config.ablation.initialisation,
+        )  # fmt: skip
         self._training().optimizer.append(new, view.id)
 
     def _train_all(

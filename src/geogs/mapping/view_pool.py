@@ -246,7 +246,7 @@ class ViewPool:
         maps.is_depth_stored = maps.is_render_stored = True
 
     def _load(self, stored: StoredMaps, as_archived: bool = False) -> ViewMaps:
-        """The maps of a view; its depth at the scale of its keyframe, or of when it was archived."""
+        """The maps of a view; its depth at the keyframe's scale, or as it was archived."""
         cameras, loss, keyframe = self.cameras, self.loss, stored.keyframe
         image = keyframe.image
         grey = PhotoView.prepare(

@@ -6,8 +6,8 @@ from jaxtyping import Float, Int
 from geogs.mesh.types import Mesh, cross
 
 
-def remove_degenerate_faces(mesh: Mesh, tolerance: float = 1e-12) -> Mesh:
-    """Without faces that repeat a vertex or whose squared area is below ``tolerance`` of the
+def remove_degenerate_faces(mesh: Mesh) -> Mesh:
+    """Without faces that repeat a vertex or whose squared area is below 1e-12 of the
     squared mean edge length squared, and without the vertices this leaves unused."""
     vertices, (a, b, c) = mesh.vertices.astype(np.float64), mesh.faces.T
     edges = [vertices[i] - vertices[j] for i, j in ((a, c), (b, a), (c, b))]
@@ -15,7 +15,7 @@ def remove_degenerate_faces(mesh: Mesh, tolerance: float = 1e-12) -> Mesh:
     area = _squared_norm(cross(edges[0], edges[1]))
     distinct = (a != b) & (b != c) & (c != a)
     scale = squared.mean() if len(squared) else 0.0
-    return keep_faces(mesh, distinct & (area > tolerance * scale**2))
+    return keep_faces(mesh, distinct & (area > 1e-12 * scale**2))
 
 
 def keep_components(

@@ -10,10 +10,12 @@ from torch import Tensor
 from geogs.geometry.lie import transform
 from geogs.geometry.neighbors import nearest_neighbors
 from geogs.mesh.types import DepthMapView, Mesh
+from geogs.threads import on_one_torch_thread
 
 _GREY = 128
 
 
+@on_one_torch_thread
 def colour_mesh(
     mesh: Mesh,
     views: Sequence[DepthMapView],

@@ -16,6 +16,7 @@ from geogs.mesh.colour import colour_mesh
 from geogs.mesh.surface import extract_surface
 from geogs.mesh.tsdf import BLOCK, BYTES_PER_BLOCK, SparseTsdf, band_blocks, pack
 from geogs.mesh.types import DepthMapView, Mesh
+from geogs.threads import on_one_torch_thread
 
 _log = logging.getLogger(__name__)
 _SAMPLED_VIEWS = 40
@@ -43,6 +44,7 @@ class VolumePlan:
         return self.blocks * BYTES_PER_BLOCK
 
 
+@on_one_torch_thread
 def plan_volume(views: Sequence[DepthMapView], config: MeshConfig) -> VolumePlan:
     """Choose voxel size and depth range from the depth maps, before anything is allocated.
 
@@ -76,6 +78,7 @@ def plan_volume(views: Sequence[DepthMapView], config: MeshConfig) -> VolumePlan
     return VolumePlan(voxel, config.truncation, max_depth, n)
 
 
+@on_one_torch_thread
 def extract_mesh(
     views: Sequence[DepthMapView],
     config: MeshConfig | None = None,

@@ -43,15 +43,11 @@ class Mesh:
     """RGB."""
 
     @staticmethod
-    def from_triangles(
-        vertices: Float[np.ndarray, "n 3"],
-        faces: np.ndarray,
-        colours: UInt8[np.ndarray, "n 3"] | None = None,
-    ) -> "Mesh":
+    def from_triangles(vertices: Float[np.ndarray, "n 3"], faces: np.ndarray) -> "Mesh":
         """A mesh whose normals are computed from its faces."""
         vertices = np.asarray(vertices, np.float32)
         faces = np.asarray(faces, np.int32).reshape(-1, 3)
-        return Mesh(vertices, faces, vertex_normals(vertices, faces), colours)
+        return Mesh(vertices, faces, vertex_normals(vertices, faces))
 
 
 def vertex_normals(

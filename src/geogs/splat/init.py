@@ -1,6 +1,7 @@
 """How disks start: in local planes (paper, Sec. "Local-plane driven initialization"), or anyhow."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from jaxtyping import Float
@@ -102,12 +103,13 @@ def new_disks(
     existing: Float[Tensor, "m 3"],
     config: DiskConfig,
     random: torch.Generator,
+    start: Literal["local_plane", "random"] = "local_plane",
 ) -> DiskParameters:
     """Disks at ``points`` (world frame) as the settings want them to start.
 
     The arguments are those of :func:`initialise_disks`; ``random`` is a generator on the CPU.
     """
-    if config.initialisation == "random":
+    if start == "random":
         return random_disks(points, existing, config.neighbours, config.opacity, random)
     return initialise_disks(
         points, camera_centre, footprint, existing,

@@ -1,13 +1,13 @@
 """A furnished room from a seed."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from geogs.synth import artwork, furniture, texture
 from geogs.synth.furniture import Materials
-from geogs.synth.scene import BOX, Scene, SceneBuilder
+from geogs.synth.scene import Scene, SceneBuilder
 
 _TEXEL = 0.003
 """Metres per texel of walls, floor and ceiling."""
@@ -37,18 +37,6 @@ def make_room(seed: int = 0) -> Scene:
     _furnish_walls(rng, walls, size[2], materials)
     _furnish_middle(build, rng, size, materials)
     return build.build(size)
-
-
-def with_bare_walls(scene: Scene) -> Scene:
-    """The same room with its walls painted in one colour each, so that they have no texture."""
-    rectangle = (scene.kind == BOX) & (scene.half[:, 2] == 0)
-    upright = np.abs(scene.rotation[:, 2, 2]) < 0.5
-    textures = list(scene.textures)
-    for k in np.unique(scene.face_texture[rectangle & upright]):
-        image = textures[k].image
-        plain = np.broadcast_to(image.mean((0, 1)).astype(np.uint8), image.shape).copy()
-        textures[k] = replace(textures[k], image=plain)
-    return replace(scene, textures=tuple(textures))
 
 
 def _walls(build: SceneBuilder, size: np.ndarray) -> list[_Wall]:

@@ -10,8 +10,7 @@ from torch import Tensor
 
 from geogs.bundle.base import BundleOptions, BundleResult
 from geogs.bundle.problem import BundleProblem, StreamedProblem
-from geogs.bundle.projection import project, relative_motion
-from geogs.bundle.select import bundle_solver
+from geogs.bundle.select import bundle_solver, grid_fields, keyframe_pairs
 from geogs.bundle.streamed import StreamedBundle
 from geogs.errors import InputError
 from geogs.keyframes.store import Segment
@@ -106,18 +105,7 @@ class FrameGraph:
         """Present positions of the cells of i in j for each directed edge (i, j)."""
         if not directed:
             return self.keyframes.grid.pixels.new_zeros(0, self.keyframes.grid.size, 2)
-        store = self.keyframes
-        if store.grid.on_gpu:
-            from geogs.bundle.cuda.pairs import DirectedPairs
-
-            return DirectedPairs.of(store, directed).project()
-        source, target = (store.poses([e[k] for e in directed]) for k in (0, 1))
-        index = torch.arange(len(directed), device=source.device)
-        T = relative_motion(torch.cat([source, target]), index, index + len(directed))
-        grid = store.grid
-        return project(
-            grid.camera, grid.rays, T, store.inverse_depths([e[0] for e in directed])
-        ).pixels
+        return keyframe_pairs(self.keyframes, directed).project()
 
     def measure(
         self,
@@ -185,12 +173,7 @@ class FrameGraph:
     def _moved_together(self, directed: Sequence[Pair]) -> Float[Tensor, "e"]:
         before = _reprojections([self.edges[e] for e in directed])
         weight = torch.stack([self.edges[e].weight for e in directed])
-        if self.keyframes.grid.on_gpu:
-            from geogs.bundle.cuda.pairs import DirectedPairs
-
-            return DirectedPairs.of(self.keyframes, directed).moved(before, weight)
-        moved = (self.reprojections(directed) - before).norm(dim=-1)
-        return moved.masked_fill(~(weight[..., 0] > 0), torch.nan).nanmedian(dim=1).values
+        return keyframe_pairs(self.keyframes, directed).moved(before, weight)
 
     def problem(
         self, directed: Sequence[Pair], free_pose: Iterable[int], free_depth: Iterable[int]
@@ -246,7 +229,7 @@ class FrameGraph:
         if rows:
             depth = torch.stack([result.inverse_depth[n] for n in rows])
             information = torch.stack([result.information[n] for n in rows])
-            filled = self.keyframes.grid.fill_all(depth, information)
+            filled = grid_fields(self.keyframes.grid).fill(depth, information)
             for m, n in enumerate(rows):
                 state = self.keyframes[ids[n]]
                 # Copies: a row would keep the whole stack in memory.

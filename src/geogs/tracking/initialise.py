@@ -7,6 +7,7 @@ dense bundle adjustment with re-measured flow polishes the whole.
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -15,14 +16,17 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from geogs.bundle.base import BundleOptions
+from geogs.bundle.select import grid_fields
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_inverse
 from geogs.keyframes.grid import SampleGrid
 from geogs.keyframes.store import Segment
 from geogs.threads import thread_map
+from geogs.tracking.evidence import Evidence, correlation_at
 from geogs.tracking.flow.base import FlowMatch
+from geogs.tracking.flow.filled import filled_positions
 from geogs.tracking.graph import FrameGraph
-from geogs.tracking.motion import filled_positions, pnp, transfer_depth
+from geogs.tracking.motion import pnp
 
 
 @dataclass(frozen=True)
@@ -37,9 +41,13 @@ class TwoView:
     """Median motion in pixels that rotation does not explain."""
 
 
-def initialise(graph: FrameGraph, min_parallax: float, radius: int = 3) -> bool:
-    """Estimate all keyframes of the graph from nothing; False if they show no parallax.
+def initialise(
+    graph: FrameGraph, min_parallax: float, radius: int = 3, min_ncc: float = 0.5
+) -> bool:
+    """Estimate all keyframes of the graph from nothing.
 
+    False if they show no parallax, or if the images of two that follow each other correlate by less
+    than ``min_ncc`` where poses and depths put them.
     On success poses, depths and information are set, the first pose is the identity and the median
     depth over all keyframes is one unit.
     """
@@ -49,7 +57,7 @@ def initialise(graph: FrameGraph, min_parallax: float, radius: int = 3) -> bool:
     if best is None:
         return False
     _place_all(store, flows, best)
-    return _polish(graph, radius)
+    return _polish(graph, radius) and _is_borne_out(graph, min_ncc)
 
 
 def chained_flows(graph: FrameGraph) -> list[FlowMatch]:
@@ -131,12 +139,12 @@ def two_view(camera: Camera, match: FlowMatch) -> TwoView | None:
 def _place_all(store: Segment, flows: list[FlowMatch], best: tuple[int, TwoView]) -> None:
     """Poses by PnP on the first keyframe's depth, depths by carrying it over."""
     chosen, view = best
-    states = list(store)
+    states, fields = list(store), grid_fields(store.grid)
     first = states[0]
     eye = torch.eye(4, dtype=torch.float64)
     known = view.good.to(store.grid.device)
     first.T_cw, first.information = eye, known.float()
-    first.inverse_depth = store.grid.fill(view.inverse_depth.to(known.device), first.information)
+    first.inverse_depth = fields.fill(view.inverse_depth.to(known.device), first.information)
     for n, (state, match) in enumerate(zip(states[1:], flows, strict=True)):
         if n == chosen:
             state.T_cw = view.T_ji
@@ -144,8 +152,8 @@ def _place_all(store: Segment, flows: list[FlowMatch], best: tuple[int, TwoView]
             good = known & match.sure()[0]
             T = pnp(store.grid, first.inverse_depth, match.pixels[0], good)
             state.T_cw = states[n].T_cw if T is None else T
-        state.inverse_depth, state.information = transfer_depth(
-            store.grid, state.T_cw, first.inverse_depth, first.information
+        state.inverse_depth, state.information = fields.transfer(
+            state.T_cw, first.inverse_depth, first.information
         )
 
 
@@ -160,6 +168,24 @@ def _polish(graph: FrameGraph, radius: int, rounds: int = 6) -> bool:
             return False
         normalise(store)
     return True
+
+
+def _is_borne_out(graph: FrameGraph, min_ncc: float) -> bool:
+    """Whether the images of all neighbours in time agree at their poses."""
+    grey, found = graph.operator.grey, []
+    for a, b in pairwise(graph.keyframes):
+        found.append(
+            correlation_at(
+                graph.keyframes.grid,
+                grey(a.encoded),
+                grey(b.encoded),
+                b.T_cw @ se3_inverse(a.T_cw),
+                a.inverse_depth,
+                a.information,
+            )
+        )
+    evidence = map(Evidence.of, torch.stack(found).cpu())
+    return all(e.bears_out(min_ncc, is_expected=False) for e in evidence)
 
 
 def normalise(store: Segment) -> None:

@@ -3,11 +3,11 @@
 from collections.abc import Iterable, Sequence
 
 import numpy as np
-import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from geogs.bundle.projection import project, relative_motion
+from geogs.bundle.pairs import LEAST_OVERLAP
+from geogs.bundle.select import keyframe_pairs
 from geogs.keyframes.store import Segment
 from geogs.threads import thread_map
 from geogs.tracking.overlap import may_overlap
@@ -16,46 +16,15 @@ Pair = tuple[int, int]
 """Two keyframe ids, the earlier first; an edge of the graph in both directions."""
 PAIRS_TOGETHER = 512, 8192
 """Directed pairs that are projected at a time, on the CPU and on a GPU; bounds memory."""
-LEAST_OVERLAP = 0.2
-"""A pair of which no more than this fraction of the cells falls into the other image is far."""
 
 
 def frame_distances(
-    store: Segment, directed: Sequence[Pair], rotation_weight: float = 0.3, step: int = 2
+    store: Segment, directed: Sequence[Pair], rotation_weight: float = 0.3
 ) -> Float[Tensor, "e"]:
-    """DROID-SLAM's distance of directed keyframe pairs in pixels; infinite at little overlap.
-
-    Mean of the flow (weight ``rotation_weight``) and of the flow without the rotation (the rest)
-    over the cells that stay in front of the target; infinite where less than 3/4 do or where less
-    than a fifth falls into the image.
-    """
-    grid = store.grid
+    """Distance of directed keyframe pairs in pixels; infinite at little overlap."""
     if not directed:
-        return grid.pixels.new_zeros(0)
-    if grid.on_gpu:
-        from geogs.bundle.cuda.pairs import DirectedPairs
-
-        return DirectedPairs.of(store, directed).distances(rotation_weight, step)
-    keep = torch.zeros(grid.height, grid.width, dtype=torch.bool, device=grid.device)
-    keep[::step, ::step] = True
-    keep = keep.reshape(-1)
-    rays, pixels = grid.rays[keep], grid.pixels[keep]
-    source, target = (store.poses([e[k] for e in directed]) for k in (0, 1))
-    index = torch.arange(len(directed), device=source.device)
-    T = relative_motion(torch.cat([source, target]), index, index + len(directed))
-    d = store.inverse_depths([e[0] for e in directed])[:, keep]
-    shift = T.clone()
-    shift[:, :3, :3] = torch.eye(3, dtype=T.dtype, device=T.device)
-    total = valid = inside = torch.zeros(len(directed), device=T.device)
-    for motion, share in ((T, rotation_weight), (shift, 1 - rotation_weight)):
-        p = project(grid.camera, rays, motion, d)
-        flow = (p.pixels - pixels).norm(dim=-1)
-        total = total + share * (flow * p.valid).sum(1)
-        valid = valid + share * p.valid.float().sum(1)
-        if motion is T:
-            inside = (grid.inside(p.pixels) & p.valid).float().mean(1)
-    seen = (valid > 0.75 * int(keep.sum())) & (inside > LEAST_OVERLAP)
-    return torch.where(seen, total / valid.clamp(min=1e-6), torch.inf)
+        return store.grid.pixels.new_zeros(0)
+    return keyframe_pairs(store, directed).distances(rotation_weight)
 
 
 def proximity_pairs(

@@ -51,7 +51,7 @@ class StartUp:
         self.keyframes = graph.keyframes
         camera = self.keyframes.grid.camera
         self._long_edge = max(camera.width, camera.height)
-        self._chain = FlowChain(self.keyframes.grid, graph.operator)
+        self._chain = FlowChain(self.keyframes.grid, graph.operator, config.min_ncc)
         self._misses = 0
 
     def state(self) -> StartUpState:
@@ -82,7 +82,8 @@ class StartUp:
         if len(self.keyframes) < MIN_KEYFRAMES:
             return False
         edge = self._long_edge
-        if not initialise(self.graph, self.config.min_parallax * edge, self.config.radius):
+        c = self.config
+        if not initialise(self.graph, c.min_parallax * edge, c.radius, c.min_ncc):
             return False
         self.priors.adjust(self.keyframes.ids, self.config.huber)
         self.recorder.anchor_to_keyframes()

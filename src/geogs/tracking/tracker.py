@@ -12,6 +12,7 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from geogs.bundle.base import BundleOptions
+from geogs.bundle.select import grid_fields
 from geogs.config import PriorConfig, TrackingConfig
 from geogs.errors import InputError, TrackingLost
 from geogs.geometry.camera import Camera
@@ -28,7 +29,6 @@ from geogs.tracking.motion import (
     FrameLocator,
     FrameMotion,
     Recognition,
-    transfer_depth,
 )
 from geogs.tracking.proximity import Pair, frame_distances, proximity_pairs
 from geogs.tracking.start_up import MIN_KEYFRAMES, StartUp, StartUpState
@@ -143,7 +143,11 @@ class Tracker:
         edge = max(camera.width, camera.height)
         self._long_edge = edge
         self._locator = FrameLocator(
-            self.grid, self.operator, self.config.min_matched, self.config.max_residual * edge
+            self.grid,
+            self.operator,
+            self.config.min_matched,
+            self.config.max_residual * edge,
+            self.config.min_ncc,
         )
         self._finalized: dict[int, None] = {}
         self._breaks: list[int] = []
@@ -264,7 +268,7 @@ class Tracker:
                 continue
             keyframe = self.keyframes[place.keyframe]
             guess = place.T_rel.to(keyframe.T_cw) @ keyframe.T_cw
-            motion = self._locator.locate(keyframe, encoded, guess)
+            motion = self._locator.locate(keyframe, encoded, guess, is_expected=False)
             if motion is not None and motion.matched >= self.config.recognised:
                 self.cut()
                 return self._follow(frame, encoded, motion)
@@ -368,8 +372,8 @@ class Tracker:
         state = self.keyframes.add(frame.index, frame.timestamp, frame.image, encoded, motion.T_cw)
         self.priors.ask(state)
         T = motion.T_cw @ se3_inverse(anchor.T_cw)
-        state.inverse_depth, state.information = transfer_depth(
-            self.grid, T, anchor.inverse_depth, anchor.information
+        state.inverse_depth, state.information = grid_fields(self.grid).transfer(
+            T, anchor.inverse_depth, anchor.information
         )
         self.recorder.add_keyframe(state.id)
         self._connect(state.id, anchor.id)

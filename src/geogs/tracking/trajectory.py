@@ -12,13 +12,13 @@ from torch import Tensor
 
 from geogs.bundle.motion import solve_poses
 from geogs.bundle.projection import linearise
+from geogs.bundle.select import grid_fields
 from geogs.errors import InputError
 from geogs.geometry.lie import retract, se3_inverse, se3_log
 from geogs.keyframes.grid import SampleGrid
 from geogs.keyframes.keyframe import Keyframe
 from geogs.keyframes.store import Segment, scaled
 from geogs.tracking.flow.base import FlowMatch, FlowOperator
-from geogs.tracking.motion import all_reprojections
 from geogs.tracking.packed_edge import pack_matches, unpacked_positions
 from geogs.types import Frame, Trajectory
 
@@ -193,7 +193,7 @@ class TrajectoryRecorder:
     def _measure(self, jobs: list[tuple[_Pending, int]]) -> None:
         keyframes = [self.keyframes[k] for _, k in jobs]
         poses = [self._pose(p.record) for p, _ in jobs]
-        forward, backward = all_reprojections(self.keyframes.grid, keyframes, poses)
+        forward, backward = grid_fields(self.keyframes.grid).reproject(keyframes, poses)
         there, _ = self.operator.measure(
             [k.encoded for k in keyframes],
             [p.encoded for p, _ in jobs],

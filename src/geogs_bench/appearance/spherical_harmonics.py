@@ -25,11 +25,6 @@ def constant_from_colour(colour: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]
     return (colour - 0.5) / _C0
 
 
-def colour_from_constant(coefficient: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
-    """RGB in [0, 1], without what depends on the direction."""
-    return (coefficient * _C0 + 0.5).clamp(0, 1)
-
-
 def basis(degree: int, directions: Float[Tensor, "n 3"]) -> Float[Tensor, "n k"]:
     """Values of the basis functions in unit directions."""
     x, y, z = directions.unbind(-1)

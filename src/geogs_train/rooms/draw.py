@@ -8,6 +8,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from geogs.geometry.lie import quaternion_to_matrix
+
 
 class Draw:
     """A stream of random tensors that depends on the given numbers only."""
@@ -52,14 +54,7 @@ class Draw:
 
     def rotation(self, *shape: int) -> Float[Tensor, "... 3 3"]:
         """Rotations of any kind, evenly spread."""
-        q = torch.nn.functional.normalize(self.normal(1.0, *shape, 4), dim=-1)
-        w, x, y, z = q.unbind(-1)
-        rows = [
-            1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-            2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-            2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-        ]  # fmt: skip
-        return torch.stack(rows, -1).unflatten(-1, (3, 3))
+        return quaternion_to_matrix(self.normal(1.0, *shape, 4))
 
 
 def about_z(angle: Float[Tensor, "..."]) -> Float[Tensor, "... 3 3"]:

@@ -10,6 +10,8 @@ from geogs_train.rooms.scene import BOX, ELLIPSOID, FRUSTUM, Solids
 
 Tops = Float[Tensor, "b t 6"]
 """Faces to stand on: centre (3), yaw, half extents (2)."""
+_BOOKS = 6
+"""In a row."""
 
 
 def clutter(draw: Draw, supports: Tops, count: int) -> Solids:
@@ -27,13 +29,13 @@ def clutter(draw: Draw, supports: Tops, count: int) -> Solids:
     return Solids(kind, about_z(draw.uniform(-3.15, 3.15, *n)), centre, half)
 
 
-def books(draw: Draw, supports: Tops, rows: int, each: int = 6) -> Placed:
+def books(draw: Draw, supports: Tops, rows: int) -> Placed:
     """Rows of upright books, as high as each other to a degree, side by side."""
     n = (len(supports), rows)
     support = _choose(draw, supports, rows)
-    thick = draw.log_uniform(0.008, 0.03, *n, each)
+    thick = draw.log_uniform(0.008, 0.03, *n, _BOOKS)
     depth, tall = draw.uniform(0.06, 0.1, *n, 1), draw.uniform(0.08, 0.13, *n, 1)
-    tall = tall * draw.uniform(0.75, 1.2, *n, each)
+    tall = tall * draw.uniform(0.75, 1.2, *n, _BOOKS)
     x = 2 * thick.cumsum(-1) - thick
     x = x - x.mean(-1, keepdim=True)
     column = zip(*(t.unbind(-1) for t in (x, tall, thick)), strict=True)

@@ -13,8 +13,8 @@ from torch import Tensor
 from geogs_train.rooms.draw import Draw, about_z
 from geogs_train.rooms.scene import BOX, ELLIPSOID, FRUSTUM
 
-BOARDS = 5
-"""Of a shelf."""
+BOARDS, LEAVES = 5, 7
+"""Of a shelf, of a plant."""
 Numbers = Float[Tensor, "b k"]
 
 
@@ -194,21 +194,21 @@ def skirting(draw: Draw, size: Float[Tensor, "b 3"]) -> Placed:
     return boxes(*rows), Place(position, 0 * x)
 
 
-def plants(draw: Draw, size: Float[Tensor, "b 3"], count: int, leaves: int = 7) -> Placed:
+def plants(draw: Draw, size: Float[Tensor, "b 3"], count: int) -> Placed:
     """Flat ellipsoids turned anyhow above a pot."""
     n = (len(size), count)
     radius, tall = draw.uniform(0.06, 0.18, *n), draw.uniform(0.06, 0.2, *n)
     pot = torch.stack([0.8 * radius, radius, tall], -1)[:, :, None]
-    half = draw.log_uniform(0.05, 0.22, *n, leaves, 3) * torch.tensor([1.0, 0.5, 0.12])
-    spread = draw.normal(1.0, *n, leaves, 3) * torch.tensor([0.12, 0.12, 0.15])
+    half = draw.log_uniform(0.05, 0.22, *n, LEAVES, 3) * torch.tensor([1.0, 0.5, 0.12])
+    spread = draw.normal(1.0, *n, LEAVES, 3) * torch.tensor([0.12, 0.12, 0.15])
     centre = spread + (2 * tall + 0.2)[..., None, None] * torch.tensor([0.0, 0.0, 1.0])
     foot = torch.stack([0 * tall, 0 * tall, tall], -1)[:, :, None]
-    kind = torch.full((*n, leaves + 1), ELLIPSOID)
+    kind = torch.full((*n, LEAVES + 1), ELLIPSOID)
     kind[..., 0] = FRUSTUM
     eye = torch.eye(3).expand(*n, 1, 3, 3)
     piece = Piece(
         kind,
-        torch.cat([eye, draw.rotation(*n, leaves)], 2),
+        torch.cat([eye, draw.rotation(*n, LEAVES)], 2),
         torch.cat([foot, centre], 2),
         torch.cat([pot, half], 2),
     )

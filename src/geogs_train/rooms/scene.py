@@ -145,11 +145,6 @@ def packed_solids(solids: Solids) -> Float[Tensor, "b n 16"]:
     return torch.cat([r.float() for r in rows], -1).contiguous()
 
 
-def convert(rooms: Rooms, dtype: torch.dtype) -> Rooms:
-    """The same rooms with floating-point numbers of another precision."""
-    return _each(rooms, lambda t: t.to(dtype) if t.is_floating_point() else t)
-
-
 def moved(part: Part, device: torch.device) -> Part:
     """Rooms, or a part of them, on a device, without waiting for it."""
     return _each(part, lambda t: to_device(t.contiguous(), device))

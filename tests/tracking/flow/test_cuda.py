@@ -92,6 +92,8 @@ def test_structure_and_texture_are_those_of_the_cpu(device: str) -> None:
     share = operator.texture(found)
     assert 0.3 < share < 0.7
     assert share == pytest.approx(reference.texture(expected), abs=2 / operator.grid.size)
+    grey = operator.grey(found).cpu()
+    torch.testing.assert_close(grey, reference.grey(expected), rtol=0, atol=0.51)
 
 
 def test_the_pyramid_is_made_of_means(device: str) -> None:

@@ -241,5 +241,7 @@ def test_texture_and_size_of_an_image(operator, views):
     assert operator.texture(views[0]) > 0.8
     black = np.zeros((CAMERA.height, CAMERA.width, 3), np.uint8)
     assert operator.texture(operator.encode(black)) == 0
+    grey = cv2.cvtColor(render(POSES[0])[0], cv2.COLOR_RGB2GRAY)
+    np.testing.assert_array_equal(operator.grey(views[0]).numpy(), grey)
     with pytest.raises(InputError, match="does not fit"):
         operator.encode(black[:-8])

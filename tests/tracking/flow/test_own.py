@@ -141,6 +141,12 @@ def test_pairs_measured_together_equal_pairs_measured_alone(operator):
     torch.testing.assert_close(swapped[0].pixels[0], alone[1].pixels[0], atol=0.1, rtol=0)
 
 
+def test_grey_levels_are_the_classical_operators(operator):
+    image = images(1)[0]
+    grey = operator.classical.grey(operator.classical.encode(image))
+    torch.testing.assert_close(operator.grey(operator.encode(image)), grey, rtol=0, atol=0)
+
+
 def test_cells_that_leave_the_image_have_no_weight(operator):
     operator.options = OwnFlowOptions(min_share=0.0, max_deviation=1e6)
     a, b = (operator.encode(i) for i in images(2))

@@ -73,6 +73,8 @@ def test_it_is_a_flow_operator(operator):
 def test_texture_is_the_classical_operators(operator, views):
     classical = ClassicalFlow(GRID)
     assert operator.texture(views[0]) == classical.texture(classical.encode(image(0))) > 0.5
+    grey = classical.grey(classical.encode(image(0)))
+    torch.testing.assert_close(operator.grey(views[0]), grey, rtol=0, atol=0)
     flat = np.full_like(image(0), 90)
     assert operator.texture(operator.encode(flat)) == 0.0
 

@@ -1,5 +1,6 @@
 """Fields on the sample grid on the GPU: filling holes, carrying depth from view to view."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
@@ -9,6 +10,7 @@ from torch import Tensor
 from geogs.gpu.kernels import kernels_for
 from geogs.gpu.transfer import to_device
 from geogs.keyframes.grid import OFFSET, STRIDE, SampleGrid
+from geogs.keyframes.keyframe import Keyframe
 
 SOURCE = Path(__file__).with_name("fields.cu")
 
@@ -26,46 +28,84 @@ def _pyramid_size(grid: SampleGrid) -> int:
     return total
 
 
-def fill_fields(
-    grid: SampleGrid, values: Float[Tensor, "n p"], confidence: Float[Tensor, "n p"]
-) -> Float[Tensor, "n p"]:
-    """``SampleGrid.fill`` of several fields in one launch."""
-    values, confidence = values.contiguous(), confidence.contiguous()
-    out, size = torch.empty_like(values), _pyramid_size(grid)
-    scratch = values.new_empty(len(values) * size)
-    kernel = kernels_for(SOURCE, values.device)["fill_fields"]
-    kernel(
-        len(values), _threads(grid), values, confidence, grid.width, grid.height, size, scratch, out
-    )
-    return out
+class CudaFields:
+    """Works on the fields of one grid."""
 
+    def __init__(self, grid: SampleGrid) -> None:
+        self.grid = grid
 
-def carry_depth(
-    grid: SampleGrid,
-    T: Float[Tensor, "n 4 4"],
-    T_source: Float[Tensor, "m 4 4"],
-    source: Int[Tensor, "n"],
-    inverse_depth: Float[Tensor, "m p"],
-    information: Float[Tensor, "m p"],
-    reproject: bool,
-) -> tuple[Tensor, ...]:
-    """Depth of sources as seen from views at T (world to camera), which have none of their own.
+    def fill(
+        self, values: Float[Tensor, "*n p"], confidence: Float[Tensor, "*n p"]
+    ) -> Float[Tensor, "*n p"]:
+        """As in the protocol, all fields in one launch."""
+        values, confidence = values.contiguous(), confidence.contiguous()
+        out, size = torch.empty_like(values), _pyramid_size(self.grid)
+        count = out.numel() // self.grid.size
+        kernels_for(SOURCE, values.device)["fill_fields"](
+            count, _threads(self.grid), values, confidence, self.grid.width, self.grid.height, size,
+            values.new_empty(count * size), out,
+        )  # fmt: skip
+        return out
 
-    Returns inverse depth (n, p) and information (n, p) in the views, or, with ``reproject``, the
-    pixels (n, p, 2) of the sources' cells in the views and of the views' cells in the sources.
-    """
-    device, camera, n = inverse_depth.device, grid.camera, len(T)
-    poses = to_device(torch.cat([T, T_source]), device)
-    rows = to_device(source, device, torch.int32)
-    size = 2 * grid.size + _pyramid_size(grid)
-    memory = inverse_depth.new_empty(n * (size + grid.size))
-    scratch, depth = memory[: n * size], memory[n * size :]
-    shape = (2, n, grid.size, 2) if reproject else (n, grid.size)
-    out = inverse_depth.new_empty(shape)
-    there, back = out.unbind() if reproject else (None, None)
-    kernels_for(SOURCE, device)["carry_depth"](
-        n, _threads(grid), poses[:n], poses[n:], rows, inverse_depth, information, grid.rays,
-        grid.width, grid.height, OFFSET, STRIDE, camera.fx, camera.fy, camera.cx, camera.cy, size,
-        scratch, depth, None if reproject else out, there, back,
-    )  # fmt: skip
-    return tuple(out.unbind()) if reproject else (depth.reshape(n, -1), out)
+    def transfer(
+        self,
+        T_ji: Float[Tensor, "4 4"],
+        inverse_depth: Float[Tensor, "p"],
+        information: Float[Tensor, "p"],
+    ) -> tuple[Float[Tensor, "p"], Float[Tensor, "p"]]:
+        """As in the protocol."""
+        first = torch.zeros(1, dtype=torch.long)
+        depth, carried = self._carry(
+            T_ji[None], torch.eye(4).to(T_ji)[None], first, inverse_depth[None], information[None],
+            reproject=False,
+        )  # fmt: skip
+        return depth[0], carried[0]
+
+    def reproject(
+        self, keyframes: Sequence[Keyframe], T_cw: Sequence[Float[Tensor, "4 4"]]
+    ) -> tuple[Float[Tensor, "e p 2"], Float[Tensor, "e p 2"]]:
+        """As in the protocol."""
+        rows = {k.id: k for k in keyframes}
+        slot = {id: n for n, id in enumerate(rows)}
+        return self._carry(
+            torch.stack(list(T_cw)),
+            torch.stack([k.T_cw for k in rows.values()]),
+            torch.tensor([slot[k.id] for k in keyframes]),
+            torch.stack([k.inverse_depth for k in rows.values()]),
+            torch.stack([k.information for k in rows.values()]),
+            reproject=True,
+        )
+
+    def _carry(
+        self,
+        T: Float[Tensor, "n 4 4"],
+        T_source: Float[Tensor, "m 4 4"],
+        source: Int[Tensor, "n"],
+        inverse_depth: Float[Tensor, "m p"],
+        information: Float[Tensor, "m p"],
+        reproject: bool,
+    ) -> tuple[Tensor, Tensor]:
+        """Depth of sources as seen from views at T (world to camera), which have none of their own.
+
+        Returns inverse depth (n, p) and information (n, p) in the views, or, with ``reproject``,
+        the pixels (n, p, 2) of the sources' cells in the views and of the views' cells in the
+        sources.
+        """
+        grid, camera, n = self.grid, self.grid.camera, len(T)
+        device = inverse_depth.device
+        poses = to_device(torch.cat([T, T_source]), device)
+        rows = to_device(source, device, torch.int32)
+        size = 2 * grid.size + _pyramid_size(grid)
+        memory = inverse_depth.new_empty(n * (size + grid.size))
+        scratch, depth = memory[: n * size], memory[n * size :]
+        shape = (2, n, grid.size, 2) if reproject else (n, grid.size)
+        out = inverse_depth.new_empty(shape)
+        there, back = out.unbind() if reproject else (None, None)
+        kernels_for(SOURCE, device)["carry_depth"](
+            n, _threads(grid), poses[:n], poses[n:], rows, inverse_depth, information, grid.rays,
+            grid.width, grid.height, OFFSET, STRIDE, camera.fx, camera.fy, camera.cx, camera.cy,
+            size, scratch, depth, None if reproject else out, there, back,
+        )  # fmt: skip
+        if there is None or back is None:
+            return depth.reshape(n, -1), out
+        return there, back

@@ -60,13 +60,8 @@ def fit_frame(
     iterations: int,
     huber: float,
     limit: float,
-) -> tuple[Float[Tensor, "4 4"], list[float]]:
-    """Pose of a frame against one keyframe, and what tells whether it is right; waits once.
-
-    Cells without information do not count. Returns the pose on the CPU; the share of the cells that
-    are matched, the share whose residual is below ``limit`` pixels, and the medians over the
-    matched of the residual and of the motion, in pixels.
-    """
+) -> tuple[Float[Tensor, "4 4"], Float[Tensor, "4"]]:
+    """As :func:`geogs.bundle.motion.fit_frame`; what it returns stays on the device."""
     device, c, threads = inverse_depth.device, grid.camera, _threads(grid.size)
     state = torch.cat([T_guess.reshape(-1), T_guess.new_zeros(4), T_keyframe.reshape(-1)])
     state = to_device(state, device)
@@ -85,5 +80,4 @@ def fit_frame(
         1, threads, pixels, weight, information, residual, grid.pixels, grid.size, limit,
         state[16:], shared=4 * grid.size,
     )  # fmt: skip
-    found = state[:20].cpu()
-    return found[:16].reshape(4, 4), found[16:].tolist()
+    return state[:16].reshape(4, 4), state[16:20]

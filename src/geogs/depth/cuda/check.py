@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -27,7 +28,7 @@ def check(
     to_others = np.stack([o.T_cw for o in others]) @ np.linalg.inv(own.T_cw)
     both = np.stack([transforms(to_others), transforms(np.linalg.inv(to_others))])
     matrices, maps = upload(both, device), upload(_addresses(others), device)
-    settings = upload(np.array(_settings(config), np.float32), device)
+    settings = upload(np.array(CheckSettings.of(config), np.float32), device)
     lens, kernels = (camera.fx, camera.fy, camera.cx, camera.cy), kernels_for(SOURCE, device)
     seen = torch.full((n, h, w), -1, dtype=torch.int64, device=device)
     kernels["splat_depths"](
@@ -68,10 +69,25 @@ def _addresses(depths: Sequence[PosedDepth]) -> Int64[np.ndarray, "n 2"]:
     return np.array([(a.data_ptr(), b.data_ptr()) for a, b in maps], np.int64)
 
 
-def _settings(config: DepthConfig) -> tuple[float, ...]:
-    """In the order in which the kernel reads them."""
-    return (
-        config.average_reach, config.agreement_reach, config.violation_distance,
-        config.repair_below, config.repair_votes, config.repair_confidence,
-        fusion.OCCLUSION_PENALTY, *fusion.WEIGHTS,
-    )  # fmt: skip
+class CheckSettings(NamedTuple):
+    """The struct of this name in ``reprojection.cu``."""
+
+    average_reach: float
+    agreement_reach: float
+    violation_distance: float
+    repair_below: float
+    repair_votes: float
+    repair_confidence: float
+    occlusion_penalty: float
+    bias: float
+    own: float
+    support: float
+    violation: float
+
+    @staticmethod
+    def of(c: DepthConfig) -> "CheckSettings":
+        """Those of the check, and the weights of its logistic regression."""
+        return CheckSettings(
+            c.average_reach, c.agreement_reach, c.violation_distance, c.repair_below,
+            c.repair_votes, c.repair_confidence, fusion.OCCLUSION_PENALTY, *fusion.WEIGHTS,
+        )  # fmt: skip

@@ -278,7 +278,7 @@ __device__ void substitute(
 }
 
 // Constants of the completion, in the order in which completion.py passes them.
-struct Settings {
+struct CompletionSettings {
   float sigma_scale, bending, membrane, sure_deviation, tracker_scale, unknown_deviation,
       best_deviation, kink;
 };
@@ -289,7 +289,7 @@ __device__ __forceinline__ float bend_at(const float* q, int cell, int at, int l
 
 // Inverse depth held within bounds; the prior's weight and the relative precision of each cell.
 __device__ void write_evidence(
-    const float* grids, const Grid& g, const Unknowns& u, float typical, const Settings& s,
+    const float* grids, const Grid& g, const Unknowns& u, float typical, const CompletionSettings& s,
     float* out) {
   for (int i = threadIdx.x; i < g.cells; i += blockDim.x)
     out[cell_of(g, i)] = fminf(fmaxf((float)u.solution[i], 0.12f * typical), 7.f * typical);
@@ -332,8 +332,7 @@ extern "C" __global__ void __launch_bounds__(256) complete_grids(
   const Unknowns u = {own, own + 6 * padded, own + 7 * padded, own + 8 * padded, own + 9 * padded,
                       own + 10 * padded};
   double *solved = own + 11 * padded, *factor = own + 12 * padded;
-  const Settings s = {settings[0], settings[1], settings[2], settings[3],
-                      settings[4], settings[5], settings[6], settings[7]};
+  const CompletionSettings s = *(const CompletionSettings*)settings;
   grids += (long long)blockIdx.x * 3 * g.cells;
   const double usual = typical[blockIdx.x];
   prepare_unknowns(grids, g, usual, 1. / (s.bending * usual), 1. / (s.membrane * usual),

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -53,19 +54,30 @@ def complete(
     window, padded = _window(minors), -(-gh * gw // _PANEL) * _PANEL
     scratch = grids.new_empty(count * padded * (12 + window), dtype=torch.float64)
     out = torch.empty_like(grids)
+    settings = upload(np.array(CompletionSettings.of(config), np.float32), grids.device)
     kernels_for(SOURCE, grids.device)["complete_grids"](
         count, 32 * _PANEL, grids, upload(np.array(typical, np.float32), grids.device),
-        upload(_settings(config), grids.device), minors, majors, *strides, padded,
-        window - _PANEL, scratch, out, shared=_shared_bytes(minors),
+        settings, minors, majors, *strides, padded, window - _PANEL, scratch, out,
+        shared=_shared_bytes(minors),
     )  # fmt: skip
     return out
 
 
-def _settings(config: DepthConfig) -> Float32[np.ndarray, "8"]:
-    """In the order in which the kernel reads them."""
-    values = (
-        config.sigma_scale, config.bending, config.membrane, config.sure_deviation,
-        config.tracker_scale, evidence.UNKNOWN_DEVIATION, evidence.BEST_DEVIATION,
-        evidence.KINK,
-    )  # fmt: skip
-    return np.array(values, np.float32)
+class CompletionSettings(NamedTuple):
+    """The struct of this name in ``completion.cu``."""
+
+    sigma_scale: float
+    bending: float
+    membrane: float
+    sure_deviation: float
+    tracker_scale: float
+    unknown_deviation: float = evidence.UNKNOWN_DEVIATION
+    best_deviation: float = evidence.BEST_DEVIATION
+    kink: float = evidence.KINK
+
+    @staticmethod
+    def of(c: DepthConfig) -> "CompletionSettings":
+        """Those of the completion, and constants of the evidence made from it."""
+        return CompletionSettings(
+            c.sigma_scale, c.bending, c.membrane, c.sure_deviation, c.tracker_scale
+        )

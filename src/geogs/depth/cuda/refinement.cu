@@ -197,8 +197,13 @@ extern "C" __global__ void fit_planes(
   support[p] = total;
 }
 
+// Of a logistic regression, and the relative depth error that still counts as right.
+struct ConfidenceWeights {
+  float bias, margin, tracker_agrees, tracker_differs, jump, support, tolerance;
+};
+
 // Depth 1 / rho, with rho held within [least, most], and the chance that it is right.
-// weights: bias, margin, tracker agrees, tracker differs, jump, support, tolerance.
+// weights: ConfidenceWeights.
 extern "C" __global__ void judge_depth(
     const float* rho, const float* margin, const float* support, const float* tracker,
     const float* tracker_weight, const float* weights, int h, int w, float least, float most,
@@ -214,13 +219,13 @@ extern "C" __global__ void judge_depth(
       near = fmaxf(near, other);
       far = fminf(far, other);
     }
-  const float tolerance = weights[6];
-  const float jump = fminf(__logf(near / far) / tolerance, 5.f);
-  const float known = fminf(tracker_weight[p] * tolerance * tolerance, 1.f);
+  const ConfidenceWeights c = *(const ConfidenceWeights*)weights;
+  const float jump = fminf(__logf(near / far) / c.tolerance, 5.f);
+  const float known = fminf(tracker_weight[p] * c.tolerance * c.tolerance, 1.f);
   const float away = (tracker[p] * z - 1.f) / 0.03f, agrees = __expf(-0.5f * away * away);
-  float score = weights[0] + weights[1] * fminf(fmaxf(margin[p], 0.f), 4.f);
-  score += known * (weights[2] * agrees + weights[3] * (1.f - agrees));
-  score += weights[4] * jump + weights[5] * __logf(support[p] + 0.1f);
+  float score = c.bias + c.margin * fminf(fmaxf(margin[p], 0.f), 4.f);
+  score += known * (c.tracker_agrees * agrees + c.tracker_differs * (1.f - agrees));
+  score += c.jump * jump + c.support * __logf(support[p] + 0.1f);
   depth[p] = z;
   confidence[p] = 1.f / (1.f + __expf(-score));
 }

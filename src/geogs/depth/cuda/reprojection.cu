@@ -88,10 +88,16 @@ __device__ __forceinline__ Agreed agree_on_depth(
   return best;
 }
 
+// The last four are bias and weights of the logistic regression that judges a depth.
+struct CheckSettings {
+  float average_reach, agreement_reach, violation_distance;
+  float repair_below, repair_votes, repair_confidence;
+  float occlusion_penalty;
+  float bias, own, support, violation;
+};
+
 // A depth repaired where it is unsure, averaged with those of the other views, and judged by them.
-// transforms: from this view to the others. settings: average reach, agreement reach, violation
-// distance, repair below, repair votes, repair confidence, occlusion penalty, then bias and weights
-// of the logistic regression (own, support, violation).
+// transforms: from this view to the others. settings: CheckSettings.
 extern "C" __global__ void check_depth(
     const float* depth, const float* confidence, const long long* maps, const float* transforms,
     const unsigned long long* seen, const float* settings, int others, int h, int w, float fx,
@@ -99,14 +105,14 @@ extern "C" __global__ void check_depth(
   const int pixel = blockIdx.x * blockDim.x + threadIdx.x, pixels = h * w;
   if (pixel >= pixels) return;
   const Lens lens = {fx, fy, cx, cy};
-  const float average_reach = settings[0], reach = settings[1], violation_distance = settings[2];
+  const CheckSettings c = *(const CheckSettings*)settings;
   float z = depth[pixel], own = confidence[pixel];
-  if (own < settings[3]) {
-    const Agreed agreed =
-        agree_on_depth(seen + pixel, others, pixels, reach, violation_distance, settings[6]);
-    if (agreed.score > settings[4]) {
+  if (own < c.repair_below) {
+    const Agreed agreed = agree_on_depth(seen + pixel, others, pixels, c.agreement_reach,
+                                         c.violation_distance, c.occlusion_penalty);
+    if (agreed.score > c.repair_votes) {
       z = agreed.depth;
-      own = settings[5];
+      own = c.repair_confidence;
     }
   }
   const Point point = back_project(lens, pixel % w, pixel / w, z);
@@ -115,16 +121,16 @@ extern "C" __global__ void check_depth(
     const Seen s = look_up(lens, transform(transforms + 12 * j, point), depth_map(maps, j),
                            confidence_map(maps, j), h, w);
     const float error = s.ratio - 1.f;
-    const float close = error / average_reach, agreeing = error / reach;
+    const float close = error / c.average_reach, agreeing = error / c.agreement_reach;
     const float near = s.sure * __expf(-0.5f * close * close);
     shift += near * error;
     votes += near;
     support += s.sure * __expf(-0.5f * agreeing * agreeing);
-    violation += error < -violation_distance ? s.sure : 0.f;
+    violation += error < -c.violation_distance ? s.sure : 0.f;
   }
   own = fminf(fmaxf(own, 1e-3f), 1.f - 1e-3f);
-  float score = settings[7] + settings[8] * __logf(own / (1.f - own));
-  score += settings[9] * __logf(support + 0.2f) + settings[10] * violation;
+  float score = c.bias + c.own * __logf(own / (1.f - own));
+  score += c.support * __logf(support + 0.2f) + c.violation * violation;
   new_depth[pixel] = z / (1.f + shift / (votes + 0.5f));
   new_confidence[pixel] = 1.f / (1.f + __expf(-score));
 }

@@ -209,20 +209,10 @@ def read_ahead(items: Iterator[T]) -> Iterator[T]:
 
 
 def _check_selection(config: InputConfig, length: int | None) -> None:
-    if config.stride < 1:
-        raise InputError(f"stride is {config.stride}; it must be at least 1.")
-    if config.start < 0:
-        raise InputError(f"start is {config.start}; it must not be negative.")
-    if config.stop is not None and config.stop <= config.start:
-        raise InputError(
-            f"stop is {config.stop}, which is not after start, {config.start}; no frame is left."
-        )
     if length is not None and config.start >= length:
         raise InputError(
             f"start is {config.start}, but the source has only {length} frames; give a smaller one."
         )
-    if config.long_edge < 0:
-        raise InputError(f"long_edge is {config.long_edge}; it must not be negative.")
 
 
 def _check_size(raw: RawFrame, reader: Reader) -> None:

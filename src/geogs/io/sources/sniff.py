@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import overload
 
 from geogs.config import InputConfig
 from geogs.errors import InputError
@@ -16,30 +17,29 @@ Stream = Source | SeveralSources
 """What a run reads."""
 
 
-def open_source(path: str | Path, config: InputConfig | None = None) -> Source:
+@overload
+def open_source(path: str | Path, config: InputConfig | None = None) -> Source: ...
+@overload
+def open_source(path: Sequence[str | Path], config: InputConfig | None = None) -> Stream: ...
+def open_source(
+    path: str | Path | Sequence[str | Path], config: InputConfig | None = None
+) -> Stream:
     """Open a video, a folder of images, or a Replica, TUM RGB-D or 7-Scenes sequence.
 
     The format follows from the content. Ground truth that lies beside the images is not read.
 
     Args:
-        path: the file or folder.
+        path: the file or folder; several of one place, by one camera, become one stream.
         config: selection of frames, intrinsics and working resolution; the defaults if none.
 
     Raises:
-        InputError: nothing usable is there, or ``config`` does not fit it.
+        InputError: nothing usable is there, ``config`` does not fit it, or the cameras differ.
     """
-    return Source(_reader(Path(path).expanduser()), config or InputConfig())
-
-
-def open_sources(paths: Sequence[str | Path], config: InputConfig | None = None) -> Stream:
-    """Open one source as :func:`open_source` does, or several as one stream.
-
-    Raises:
-        InputError: as for each, or their cameras differ.
-    """
-    if not paths:
+    if isinstance(path, str | Path):
+        return Source(_reader(Path(path).expanduser()), config or InputConfig())
+    if not path:
         raise InputError("Nothing to read; give a video or a folder of images.")
-    sources = [open_source(path, config) for path in paths]
+    sources = [open_source(one, config) for one in path]
     return sources[0] if len(sources) == 1 else SeveralSources(sources)
 
 

@@ -55,12 +55,6 @@ def load_map(path: str | Path, device: torch.device | str = "cpu") -> MapSnapsho
     return disks
 
 
-def load_map_metadata(path: str | Path) -> dict[str, Any]:
-    """Read what was kept beside the disks."""
-    with _open(path) as file:
-        return json.loads(file.metadata()["metadata"])
-
-
 def _open(path: str | Path) -> "safe_open":
     if not Path(path).is_file():
         raise InputError(f"The map {path} does not exist.")

@@ -19,9 +19,10 @@ from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_inverse
 from geogs.losses.cpu import multi_view_kernels as multi
 from geogs.losses.cpu.single_view_kernels import single_view_rows
-from geogs.losses.multi_view import MIN_DEPTH_RATIO, PhotoView, depth_tolerance
-from geogs.losses.photometric import NCC_VARIANCE_FLOOR, ssim
-from geogs.losses.single_view import NORMAL_EPSILON, ViewConstants, visible
+from geogs.losses.multi_view import PhotoView
+from geogs.losses.photometric import ssim
+from geogs.losses.settings import photo_settings, record, single_view_settings
+from geogs.losses.single_view import ViewConstants, visible
 from geogs.threads import run_chunks, worker_count
 
 
@@ -49,33 +50,19 @@ class _SingleView(torch.autograd.Function):
             shown = visible(depth, alpha, config.min_alpha) & (view.prior_depth >= 0)
             known = depth[shown]
             scale = 1 / float(known.median()) if len(known) else 0.0
-        weights = np.array(
-            [
-                config.depth_weight,
-                config.normal_weight,
-                config.normal_consistency_weight,
-                config.distortion_weight / unit,
-                config.opacity_weight,
-                config.smoothness_weight,
-                config.silhouette_weight,
-            ]
-        )
-        weights = (weights / depth.numel()).astype(np.float32)
-        options = [config.min_alpha, config.depth_relative, NORMAL_EPSILON, config.smoothness_eta]
-        options = np.array([*options, config.smoothness_rewards_edges, scale], np.float32)
+        settings = record(single_view_settings(config, view.camera, unit))
         maps = [_array(m) for m in (depth, normal, alpha, spread)]
         constants = [view.edge, view.image_gradient, view.prior_depth, view.confidence]
         constants = [_array(m) for m in constants]
         prior_normal = np.empty((0, 0, 3), np.float32)
         if view.prior_normal is not None:
             prior_normal = _array(view.prior_normal)
-        lens = np.array(_lens(view.camera), np.float32)
         loss = np.zeros(height, np.float32)
         gradients = [np.zeros_like(m) for m in maps]
 
         def rows(first: int, last: int) -> None:
             scratch = np.zeros((3, max(last - first + 4, 5), width), np.float32)
-            arguments = *maps, *constants, prior_normal, lens, weights, options, scratch, loss
+            arguments = *maps, *constants, prior_normal, settings, np.float32(scale), scratch, loss
             single_view_rows(first, last, *arguments, *gradients)
 
         _over_rows(rows, height)
@@ -141,14 +128,7 @@ class _MultiView(torch.autograd.Function):
         seen = target.camera if target_depth is None else target.camera.resized(*hidden.shape[::-1])
         lenses = [_lens(c) for c in (reference.camera, target.camera, seen)]
         lenses = np.array(lenses, np.float32)
-        n, huber = grey.size, max(config.l1_huber, 1e-12)
-        limits = np.array([MIN_DEPTH_RATIO, image.shape[1] - 1, image.shape[0] - 1], np.float32)
-        tolerance = depth_tolerance(config.occlusion, target.camera)
-        options = [tolerance, config.l1_weight / n, huber, config.l1_cut]
-        options = np.array(options, np.float32)
-        window = [config.ncc_weight / n, config.ncc_reject, config.ncc_min_variance]
-        window += [config.ncc_texture, config.ncc_min_coverage, NCC_VARIANCE_FLOOR]
-        window = np.array(window, np.float32)
+        settings = record(photo_settings(config, target.camera))
         half = config.ncc_patch // 2 if config.ncc_weight > 0 else -1
         with_depth, with_pose = ctx.needs_input_grad[:2]
 
@@ -156,10 +136,10 @@ class _MultiView(torch.autograd.Function):
         extra = np.empty((3, height, width) if with_pose else (3, 0, 0), np.float32)
         fields = np.empty((3, height, width) if half >= 0 else (3, 0, 0), np.float32)
         loss = np.zeros(height, np.float32)
-        sobel = config.photo_gradient == "sobel"
+        sobel = config.ablation.photo_gradient == "sobel"
         _over_rows(
             lambda a, b: multi.warp_rows(
-                a, b, small, *tables, grey, image, hidden, lenses, T34, limits, options, sobel,
+                a, b, small, *tables, grey, image, hidden, lenses, T34, settings, sobel,
                 warped, slope, mask, extra, loss,
             ),
             height,
@@ -167,7 +147,7 @@ class _MultiView(torch.autograd.Function):
         if half >= 0:
             _over_rows(
                 lambda a, b: multi.correlate_rows(
-                    a, b, grey, warped, mask, half, window, fields, loss
+                    a, b, grey, warped, mask, half, settings, fields, loss
                 ),
                 height,
             )
@@ -183,7 +163,7 @@ class _MultiView(torch.autograd.Function):
         if with_depth or with_pose:
             _over_rows(
                 lambda a, b: multi.depth_gradient_rows(
-                    a, b, *tables, grey, warped, slope, mask, half, options, fields, g_image,
+                    a, b, *tables, grey, warped, slope, mask, half, settings, fields, g_image,
                     g_depth,
                 ),
                 len(small),

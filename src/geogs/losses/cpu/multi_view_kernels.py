@@ -75,11 +75,11 @@ def enlarge_line(depth, y, rows, row_share, columns, column_share, line, geometr
 
 
 @njit(**PART)
-def project_line(y, lenses, T, limits, geometry):
+def project_line(y, lenses, T, min_depth_ratio, last_u, last_v, geometry):
     """Where the pixels of row ``y`` fall in the target, from their depth in ``geometry[5]``.
 
-    ``limits``: least share of depth kept, largest u and v of the target. ``geometry`` (6, w)
-    receives u, v, z (0 where out of view), du/dd, dv/dd.
+    ``min_depth_ratio``: least share of depth kept; ``last_u``, ``last_v``: largest u and v of the
+    target. ``geometry`` (6, w) receives u, v, z (0 where out of view), du/dd, dv/dd.
     """
     fx, fy, cx, cy = lenses[0, 0], lenses[0, 1], lenses[0, 2], lenses[0, 3]
     gx, gy, hx, hy = lenses[1, 0], lenses[1, 1], lenses[1, 2], lenses[1, 3]
@@ -90,11 +90,11 @@ def project_line(y, lenses, T, limits, geometry):
         rx = (np.float32(x) - cx) / fx
         qx, qy, qz = T[0, 0] * rx + bx, T[1, 0] * rx + by, T[2, 0] * rx + bz
         z = d * qz + T[2, 3]
-        front = (d > ZERO) & (z > limits[0] * d)
+        front = (d > ZERO) & (z > min_depth_ratio * d)
         inverse = ONE / (z if front else ONE)
         px, py = (d * qx + T[0, 3]) * inverse, (d * qy + T[1, 3]) * inverse
         u, v = gx * px + hx, gy * py + hy
-        inside = front & (u >= ZERO) & (v >= ZERO) & (u <= limits[1]) & (v <= limits[2])
+        inside = front & (u >= ZERO) & (v >= ZERO) & (u <= last_u) & (v <= last_v)
         geometry[0, x], geometry[1, x], geometry[2, x] = u, v, z if inside else ZERO
         geometry[3, x] = gx * (qx - px * qz) * inverse
         geometry[4, x] = gy * (qy - py * qz) * inverse
@@ -103,18 +103,19 @@ def project_line(y, lenses, T, limits, geometry):
 @njit(cache=True, **PART)
 def warp_rows(
     first, last, depth, rows, row_share, columns, column_share, reference, target, target_depth,
-    lenses, T, limits, options, sobel, warped, slope, mask, extra, loss,
+    lenses, T, settings, sobel, warped, slope, mask, extra, loss,
 ):  # fmt: skip
     """The target image through the reference's depth, rows ``first <= y < last``.
 
     rows, columns (2, n) and their shares: source pixels of the bilinear enlargement; lenses (3, 4):
     fx, fy, cx, cy of the reference, of the target, and of the target at its depth map's size; T
-    (3, 4) reference to target; limits as in :func:`project_line`; options: occlusion tolerance,
-    L_1 weight, huber, cut. ``warped`` is filled from the reference where ``mask`` is 0; ``slope``
-    is d warped / d depth; ``extra`` (3, h, w), unless empty, receives the derivatives along x and
-    y and the depth. ``loss[y]`` is the row's sum of the weighted L_1.
+    (3, 4) reference to target; settings: a record of ``PhotoSettings``. ``warped`` is filled from
+    the reference where ``mask`` is 0; ``slope`` is d warped / d depth; ``extra`` (3, h, w), unless
+    empty, receives the derivatives along x and y and the depth. ``loss[y]`` is the row's sum of the
+    weighted L_1.
     """
     height, width = target.shape
+    last_u, last_v = np.float32(width - 1), np.float32(height - 1)
     hx, hy = lenses[1, 2], lenses[1, 3]
     zoom_u, zoom_v = lenses[2, 0] / lenses[1, 0], lenses[2, 1] / lenses[1, 1]
     occluded, with_extra = target_depth.shape[0] > 1, extra.shape[1] > 0
@@ -123,13 +124,13 @@ def warp_rows(
     for y in range(first, last):
         total = ZERO
         enlarge_line(depth, y, rows, row_share, columns, column_share, line, geometry)
-        project_line(y, lenses, T, limits, geometry)
+        project_line(y, lenses, T, settings.min_depth_ratio, last_u, last_v, geometry)
         for x in range(reference.shape[1]):
             u, v, z = geometry[0, x], geometry[1, x], geometry[2, x]
             seen = z > ZERO
             if seen and occluded:
                 s, t = (u - hx) * zoom_u + lenses[2, 2], (v - hy) * zoom_v + lenses[2, 3]
-                seen = is_visible(target_depth, s, t, z, options[0])
+                seen = is_visible(target_depth, s, t, z, settings.occlusion)
             value, du, dv = reference[y, x], ZERO, ZERO
             if seen:
                 i, j = min(int(u), width - 2), min(int(v), height - 2)
@@ -142,17 +143,17 @@ def warp_rows(
             if with_extra:
                 extra[0, y, x], extra[1, y, x], extra[2, y, x] = du, dv, geometry[5, x]
         for x in range(reference.shape[1]):
-            size = min(abs(warped[y, x] - reference[y, x]), options[3])
-            small = min(size, options[2])
+            size = min(abs(warped[y, x] - reference[y, x]), settings.cut)
+            small = min(size, settings.huber)
             total += small * (size - HALF * small)
-        loss[y] = options[1] / options[2] * total
+        loss[y] = settings.l1 / settings.huber * total
 
 
 @njit(cache=True, **PART)
-def correlate_rows(first, last, reference, warped, mask, half, options, fields, loss):
+def correlate_rows(first, last, reference, warped, mask, half, settings, fields, loss):
     """L_ncc of windows centred in rows ``first <= y < last`` and what their pixels need of it.
 
-    options: weight, reject, least variance, texture, least coverage, variance floor. The gradient
+    settings as in :func:`warp_rows`. The gradient
     at a pixel q is the sum over the windows p around it of
     ``fields[0, p] + reference[q] fields[1, p] + warped[q] fields[2, p]``. Adds to ``loss[y]``.
     """
@@ -189,12 +190,12 @@ def correlate_rows(first, last, reference, warped, mask, half, options, fields, 
             mean_a, mean_b = share * sums[0, x], share * sums[2, x]
             raw_a = max(share * sums[1, x] - mean_a * mean_a, ZERO)
             raw_b = max(share * sums[3, x] - mean_b * mean_b, ZERO)
-            var_a, var_b = raw_a + options[5], raw_b + options[5]
+            var_a, var_b = raw_a + settings.variance_floor, raw_b + settings.variance_floor
             inverse = ONE / np.sqrt(var_a * var_b)
             ncc = (share * sums[4, x] - mean_a * mean_b) * inverse
-            used = (raw_a > options[2]) & (ONE - ncc < options[1])
-            used = used & (share * sums[5, x] > options[4] - np.float32(1e-4))
-            w = options[0] * raw_a / (raw_a + options[3]) if used else ZERO
+            used = (raw_a > settings.min_variance) & (ONE - ncc < settings.reject)
+            used = used & (share * sums[5, x] > settings.min_coverage - np.float32(1e-4))
+            w = settings.ncc * raw_a / (raw_a + settings.texture) if used else ZERO
             total += w * (ONE - ncc)
             cross = -w * share * inverse
             own = w * share * ncc / var_b if raw_b > ZERO else ZERO
@@ -229,11 +230,11 @@ def window_sums(y, fields, half, line, sums):
 @njit(cache=True, **PART)
 def depth_gradient_rows(
     first, last, rows, row_share, columns, column_share, reference, warped, slope, mask, half,
-    options, fields, g_image, g_depth,
+    settings, fields, g_image, g_depth,
 ):  # fmt: skip
     """d loss / d depth for the depth rows ``first <= y < last``: the enlargement's adjoint.
 
-    options as in :func:`warp_rows`; ``half`` is negative without correlation. ``g_image``
+    settings as in :func:`warp_rows`; ``half`` is negative without correlation. ``g_image``
     unless empty: [0] is added to d loss / d warped, [1] receives the sum. Image rows that feed two
     spans are computed in both.
     """
@@ -249,8 +250,9 @@ def depth_gradient_rows(
         window_sums(y, fields, half, line, sums)
         for x in range(width):
             a, b = reference[y, x], warped[y, x]
-            push = min(max((b - a) / options[2], -ONE), ONE) if abs(b - a) < options[3] else ZERO
-            sums[0, x] += a * sums[1, x] + b * sums[2, x] + options[1] * push
+            near = abs(b - a) < settings.cut
+            push = min(max((b - a) / settings.huber, -ONE), ONE) if near else ZERO
+            sums[0, x] += a * sums[1, x] + b * sums[2, x] + settings.l1 * push
         if g_image.shape[1] > 0:
             for x in range(width):
                 sums[0, x] += g_image[0, y, x]

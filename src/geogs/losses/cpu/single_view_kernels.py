@@ -27,25 +27,23 @@ def known_depth(depth, alpha, prior, y, min_alpha, clean, r):
 
 
 @njit(**PART)
-def pixel_terms(
-    clean, r, alpha, spread, prior, confidence, y, weights, relative, pull, g_alpha, g_spread
-):
+def pixel_terms(clean, r, alpha, spread, prior, confidence, y, settings, pull, g_alpha, g_spread):
     """Weighted sum of L_d, L_dist and the opacity terms over row ``y``, and its gradients."""
-    total = ZERO
+    total, relative = ZERO, settings.relative > ZERO
     for x in range(clean.shape[1]):
         a, s, d, f = alpha[y, x], spread[y, x], clean[r, x], prior[y, x]
         solid = abs(a) < HUGE
         empty, filled = solid & (f < ZERO), solid & (f >= ZERO)
-        opaque = weights[4] if filled else ZERO
-        hollow = weights[6] if empty else ZERO
+        opaque = settings.opacity if filled else ZERO
+        hollow = settings.silhouette if empty else ZERO
         total += opaque * (ONE - a) if filled else ZERO
         total += hollow * a if empty else ZERO
         g_alpha[y, x] = hollow - opaque
-        thick = weights[3] if (d > ZERO) & (abs(s) < HUGE) else ZERO
+        thick = settings.distortion if (d > ZERO) & (abs(s) < HUGE) else ZERO
         total += thick * s if thick > ZERO else ZERO
         g_spread[y, x] = thick
         known = (d > ZERO) & (f > ZERO)
-        w = weights[0] * confidence[y, x] / (f if relative else ONE) if known else ZERO
+        w = settings.depth * confidence[y, x] / (f if relative else ONE) if known else ZERO
         e = d - f if known else ZERO
         total += w * abs(e)
         pull[r, x] += w * np.sign(e)
@@ -53,8 +51,9 @@ def pixel_terms(
 
 
 @njit(**PART)
-def normal_terms(clean, r, normal, prior, y, weight, epsilon, g_normal):
-    """``weight`` times the sum of L_n over row ``y``; adds to the normal's gradient."""
+def normal_terms(clean, r, normal, prior, y, settings, g_normal):
+    """Weighted sum of L_n over row ``y``; adds to the normal's gradient."""
+    weight, epsilon = settings.normal, settings.normal_epsilon
     total = ZERO
     for x in range(clean.shape[1]):
         ax, ay, az = normal[y, x, 0], normal[y, x, 1], normal[y, x, 2]
@@ -74,13 +73,14 @@ def normal_terms(clean, r, normal, prior, y, weight, epsilon, g_normal):
 
 
 @njit(**PART)
-def consistency_terms(clean, r, normal, edge, y, lens, weight, epsilon, push, g, g_y):
-    """``weight`` times the sum of L_nc over the centres of row ``y``.
+def consistency_terms(clean, r, normal, edge, y, settings, push, g, g_y):
+    """Weighted sum of L_nc over the centres of row ``y``.
 
     ``push`` (4, w) receives d/dD at the left, right, upper and lower neighbour of each centre;
     the normal's gradient is added to row ``g_y`` of ``g``. Depths are 0 where unknown.
     """
-    fx, fy, cx, cy = lens[0], lens[1], lens[2], lens[3]
+    fx, fy, cx, cy = settings.fx, settings.fy, settings.cx, settings.cy
+    weight, epsilon = settings.consistency, settings.normal_epsilon
     ry, step_x, step_y = (np.float32(y) - cy) / fy, ONE / fx, ONE / fy
     total = ZERO
     for i in range(clean.shape[1] - 2):
@@ -137,8 +137,9 @@ def add_consistency(pull, r, push):
 
 
 @njit(**PART)
-def smoothness_terms(clean, r, gradient, y, scale, eta, both, weight, pull):
-    """``weight`` times the sum of L_ds over row ``y``; ``scale`` is 1 over the median depth."""
+def smoothness_terms(clean, r, gradient, y, settings, scale, pull):
+    """Weighted sum of L_ds over row ``y``; ``scale`` is 1 over the median depth."""
+    weight, eta, both = settings.smoothness, settings.eta, settings.rewards_edges
     total = ZERO
     for x in range(clean.shape[1] - 1):
         dc, dr, db = clean[r, x], clean[r, x + 1], clean[r + 1, x]
@@ -158,43 +159,35 @@ def smoothness_terms(clean, r, gradient, y, scale, eta, both, weight, pull):
 @njit(cache=True, **PART)
 def single_view_rows(
     first, last, depth, normal, alpha, spread, edge, gradient, prior, confidence, prior_normal,
-    lens, weights, options, scratch, loss, g_depth, g_normal, g_alpha, g_spread,
+    settings, scale, scratch, loss, g_depth, g_normal, g_alpha, g_spread,
 ):  # fmt: skip
     """Rows ``first <= y < last`` of the single-view loss and of its gradients.
 
-    lens: fx, fy, cx, cy; weights, already divided by the number of pixels: depth, normal,
-    consistency, distortion over the length unit, opacity, smoothness, silhouette; options: minimum
-    alpha, relative depth (0, 1), epsilon of the normal's length, eta, second smoothness term (0,
-    1), 1 over the median depth. ``prior`` is negative outside a mask. ``prior_normal`` has no rows
-    without a prior. ``scratch`` (3, rows, w) has at least 5 and last - first + 4 rows. ``loss[y]``
-    is the row's sum; ``scratch`` and ``g_normal`` are 0 on entry.
+    ``settings`` are a record of ``SingleViewSettings``; ``scale`` is 1 over the median depth.
+    ``prior`` is negative outside a mask. ``prior_normal`` has no rows without a prior. ``scratch``
+    (3, rows, w) has at least 5 and last - first + 4 rows. ``loss[y]`` is the row's sum; ``scratch``
+    and ``g_normal`` are 0 on entry.
     """
     clean, pull, push = scratch[0], scratch[1], scratch[2]
     low, high = max(first - 2, 0), min(last + 2, depth.shape[0])
     for y in range(low, high):
-        known_depth(depth, alpha, prior, y, options[0], clean, y - low)
+        known_depth(depth, alpha, prior, y, settings.min_alpha, clean, y - low)
     unused = np.zeros((1, depth.shape[1], 3), np.float32)
     for y in range(low, high):
         r, own, total = y - low, first <= y < last, ZERO
         if own:
             total += pixel_terms(
-                clean, r, alpha, spread, prior, confidence, y, weights, options[1] > ZERO, pull,
-                g_alpha, g_spread,
+                clean, r, alpha, spread, prior, confidence, y, settings, pull, g_alpha,
+                g_spread,
             )  # fmt: skip
-            if weights[1] > ZERO and len(prior_normal) > 0:
-                total += normal_terms(
-                    clean, r, normal, prior_normal, y, weights[1], options[2], g_normal
-                )
-        if weights[2] > ZERO and 0 < r < high - low - 1:
+            if settings.normal > ZERO and len(prior_normal) > 0:
+                total += normal_terms(clean, r, normal, prior_normal, y, settings, g_normal)
+        if settings.consistency > ZERO and 0 < r < high - low - 1:
             g, g_y = (g_normal, y) if own else (unused, 0)
-            total += consistency_terms(
-                clean, r, normal, edge, y, lens, weights[2], options[2], push, g, g_y
-            )
+            total += consistency_terms(clean, r, normal, edge, y, settings, push, g, g_y)
             add_consistency(pull, r, push)
-        if weights[5] > ZERO and r < high - low - 1:
-            total += smoothness_terms(
-                clean, r, gradient, y, options[5], options[3], options[4], weights[5], pull
-            )
+        if settings.smoothness > ZERO and r < high - low - 1:
+            total += smoothness_terms(clean, r, gradient, y, settings, scale, pull)
         if own:
             loss[y] = total
     for y in range(first, last):

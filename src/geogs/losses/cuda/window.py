@@ -16,9 +16,7 @@ from torch import Tensor
 from geogs.config import LossConfig
 from geogs.gpu.kernels import kernels_for
 from geogs.losses.cuda.view_table import ViewTable
-from geogs.losses.multi_view import MIN_DEPTH_RATIO, depth_tolerance
-from geogs.losses.photometric import NCC_VARIANCE_FLOOR
-from geogs.losses.single_view import NORMAL_EPSILON
+from geogs.losses.settings import photo_settings, single_view_settings
 
 _SOURCE = Path(__file__).with_name("losses.cu")
 # As in the sources: columns a block walks down, rows of a block of other kernels.
@@ -65,34 +63,12 @@ class WindowLosses:
         self._kernels = kernels_for(_SOURCE, table.device)
         weights = (config.l1_weight, config.ssim_weight, config.ncc_weight)
         self._photo = partners > 0 and max(weights) > 0
-        self._view_settings = self._single_view_settings(unit)
-        self._photo_settings = self._multi_view_settings(pair_share)
+        self._view_settings = self._uploaded(single_view_settings(config, table.render, unit))
+        self._photo_settings = self._uploaded(photo_settings(config, table.photo, pair_share))
         self._allocate()
 
-    def _single_view_settings(self, unit: float) -> Float32[Tensor, "k"]:
-        """``SingleViewSettings`` of ``view_maps.cuh``."""
-        c, camera = self.config, self.table.render
-        weights = [
-            c.depth_weight, c.normal_weight, c.normal_consistency_weight,
-            c.distortion_weight / unit, c.opacity_weight, c.smoothness_weight,
-            c.silhouette_weight,
-        ]  # fmt: skip
-        pixels = camera.width * camera.height
-        values = [camera.fx, camera.fy, camera.cx, camera.cy, *(w / pixels for w in weights)]
-        values += [c.min_alpha, c.depth_relative, NORMAL_EPSILON, c.smoothness_eta]
-        values += [c.smoothness_rewards_edges]
-        return torch.tensor(values, dtype=torch.float32, device=self.table.device)
-
-    def _multi_view_settings(self, pair_share: float) -> Float32[Tensor, "k"]:
-        """``PhotoSettings`` of ``view_maps.cuh``."""
-        c, camera = self.config, self.table.photo
-        scale = pair_share / (camera.width * camera.height)
-        tolerance = depth_tolerance(c.occlusion, camera)
-        values = [camera.fx, camera.fy, camera.cx, camera.cy, MIN_DEPTH_RATIO, tolerance]
-        values += [scale * c.l1_weight, max(c.l1_huber, 1e-12), c.l1_cut]
-        values += [scale * c.ncc_weight, c.ncc_reject, c.ncc_min_variance, c.ncc_texture]
-        values += [c.ncc_min_coverage, NCC_VARIANCE_FLOOR, scale * c.ssim_weight]
-        return torch.tensor(values, dtype=torch.float32, device=self.table.device)
+    def _uploaded(self, settings: tuple[float, ...]) -> Float32[Tensor, "k"]:
+        return torch.tensor(settings, dtype=torch.float32, device=self.table.device)
 
     def _allocate(self) -> None:
         device, render, photo = self.table.device, self.table.render, self.table.photo
@@ -175,7 +151,7 @@ class WindowLosses:
         pairs = self.views * self.partners
         height, width = t.photo.height, t.photo.width
         sizes = (t.render.height, t.render.width, height, width, self.partners)
-        sobel = c.photo_gradient == "sobel"
+        sobel = c.ablation.photo_gradient == "sobel"
         windowed = c.ssim_weight > 0 or c.ncc_weight > 0
         columns = _blocks(width, 32)
         kernels["warp_pairs"](

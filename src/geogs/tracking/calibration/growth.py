@@ -10,11 +10,12 @@ from geogs.bundle.lens import lens_rays, project_lens
 from geogs.bundle.lens_bundle import LensBundleOptions, LensBundleResult, solve_lens
 from geogs.bundle.problem import BundleProblem
 from geogs.bundle.projection import relative_motion
+from geogs.bundle.select import grid_fields
 from geogs.keyframes.grid import SampleGrid
 from geogs.tracking.calibration.keyframes import View, on_cpu
 from geogs.tracking.calibration.start import Start
 from geogs.tracking.flow.base import FlowOperator
-from geogs.tracking.motion import pnp, transfer_depth
+from geogs.tracking.motion import pnp
 
 OFFSETS = (1, 3, 6)
 """Every keyframe is matched with those so many before it."""
@@ -46,10 +47,10 @@ class GrowingBundle:
         device = grid.device
         depth, known = start.inverse_depth.to(device), start.information.to(device)
         self._T = list(start.T_cw)
-        self._depth = [grid.fill(depth, known)]
+        self._depth = [grid_fields(grid).fill(depth, known)]
         self._information = [known]
         for T in self._T[1:]:
-            d, i = transfer_depth(self._pinhole, T, self._depth[0], known)
+            d, i = grid_fields(self._pinhole).transfer(T, self._depth[0], known)
             self._depth.append(d)
             self._information.append(i)
         self._edges: dict[tuple[int, int], _Edge] = {}
@@ -74,7 +75,7 @@ class GrowingBundle:
             return False
         self._views.append(view)
         self._T.append(T @ self._T[-1])
-        d, i = transfer_depth(grid, T, self._depth[-1], self._information[-1])
+        d, i = grid_fields(grid).transfer(T, self._depth[-1], self._information[-1])
         self._depth.append(d)
         self._information.append(i)
         return True
@@ -140,7 +141,7 @@ class GrowingBundle:
         self.result, self.lens = result, result.lens
         self._T = list(result.T_cw)
         self._information = list(result.information)
-        self._depth = list(self.grid.fill_all(result.inverse_depth, result.information))
+        self._depth = list(grid_fields(self.grid).fill(result.inverse_depth, result.information))
         self._normalise()
         return True
 

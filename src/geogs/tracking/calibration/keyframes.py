@@ -8,10 +8,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from geogs.config import TrackingConfig
 from geogs.geometry.camera import Camera
 from geogs.keyframes.grid import SampleGrid
 from geogs.tracking.flow.base import FlowMatch, FlowOperator
-from geogs.tracking.motion import FlowChain, filled_flow, filled_positions
+from geogs.tracking.flow.filled import filled_flow, filled_positions
+from geogs.tracking.motion import FlowChain
 from geogs.types import Frame
 
 MIN_MATCHED = 0.12
@@ -38,7 +40,7 @@ class ViewGatherer:
     ) -> None:
         """``motion``: pixels of median flow that make a keyframe."""
         self._frames, self._grid, self._operator, self._motion = frames, grid, operator, motion
-        self._chain = FlowChain(grid, operator)
+        self._chain = FlowChain(grid, operator, TrackingConfig().min_ncc)
         self.frames = 0
         """Frames taken so far."""
 

@@ -14,6 +14,7 @@ from torch import Tensor
 from geogs.bundle.lens import Lens
 from geogs.bundle.lens_bundle import LensBundleOptions, LensBundleResult, solve_lens
 from geogs.bundle.problem import BundleProblem
+from geogs.bundle.select import grid_fields
 from geogs.geometry.camera import Camera
 from geogs.keyframes.grid import SampleGrid
 from geogs.tracking.calibration.keyframes import on_cpu, stacked, with_focal
@@ -55,7 +56,7 @@ def try_candidate(camera: Camera, flows: list[FlowMatch], min_parallax: float) -
     if found is None:
         return None
     best, view = 1 + 2 * found[0], found[1]
-    depth = grid.fill(view.inverse_depth, view.good.float())
+    depth = grid_fields(grid).fill(view.inverse_depth, view.good.float())
     poses = [torch.eye(4, dtype=torch.float64)]
     for n, match in enumerate(flows):
         T = view.T_ji if n == best else pnp(

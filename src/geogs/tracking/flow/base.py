@@ -48,6 +48,10 @@ class FlowOperator(Protocol):
         """Fraction of the grid on which the image has enough structure to be matched."""
         ...
 
+    def grey(self, encoded: Any) -> Float[Tensor, "h w"]:
+        """The image in grey levels, 0 to 255, on the device of the grid."""
+        ...
+
     def measure(
         self,
         first: Sequence[Any],

@@ -111,6 +111,9 @@ class ClassicalFlow:
     def texture(self, encoded: ClassicalImage) -> float:
         return float((encoded.structure > MIN_STRUCTURE).mean())
 
+    def grey(self, encoded: ClassicalImage) -> Float[Tensor, "h w"]:
+        return torch.from_numpy(encoded.grey).to(self.grid.device).float()
+
     def measure(
         self,
         first: Sequence[ClassicalImage],

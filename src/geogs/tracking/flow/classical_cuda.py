@@ -150,6 +150,10 @@ class CudaClassicalFlow:
     def texture(self, encoded: CudaImage) -> float:
         return float(encoded.textured.item()) / self.grid.size
 
+    def grey(self, encoded: CudaImage) -> Float[Tensor, "h w"]:
+        width, height = self._layout.sizes[0]
+        return encoded.data[: width * height].reshape(height, width)
+
     def structure(self, encoded: CudaImage) -> Float[Tensor, "p"]:
         """Smaller eigenvalue of the structure tensor on the grid, grey levels^2 / pixel^2."""
         return encoded.data[self._layout.structure :]

@@ -36,7 +36,7 @@ from geogs.tracking.flow.droid_network import (
     motion_features,
     on_cells,
 )
-from geogs.tracking.flow.texture import textured_fraction
+from geogs.tracking.flow.texture import grey_levels, textured_fraction
 from geogs.tracking.flow.weights import read_tensors
 
 FAR = 1e4
@@ -77,6 +77,7 @@ class DroidImage:
     """What an edge from this image starts with."""
     static: Float[Tensor, "c h w"]
     """What its updates see of the image."""
+    grey: UInt8[Tensor, "y x"]
     texture: float
     """Fraction of the cells with structure."""
 
@@ -120,10 +121,15 @@ class DroidFlow:
             shown = self._shown(image)
             features = self.network.features(shown)
             hidden, static = self.network.context(shown)
-        return DroidImage(features[0], hidden[0], static[0], textured_fraction(image))
+        grey = grey_levels(image)
+        kept = to_device(torch.from_numpy(grey), self.device)
+        return DroidImage(features[0], hidden[0], static[0], kept, textured_fraction(grey))
 
     def texture(self, encoded: DroidImage) -> float:
         return encoded.texture
+
+    def grey(self, encoded: DroidImage) -> Float[Tensor, "y x"]:
+        return encoded.grey.float()
 
     @torch.no_grad()
     def measure(

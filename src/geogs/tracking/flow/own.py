@@ -16,6 +16,7 @@ from torch import Tensor
 from geogs.errors import InputError
 from geogs.keyframes.grid import SampleGrid
 from geogs.tracking.flow.base import FlowMatch, FlowOperator, Memories
+from geogs.tracking.flow.filled import filled_positions
 from geogs.tracking.flow.lookup import DescriptorPyramid, Edges
 from geogs.tracking.flow.own_network import (
     FlowEstimate,
@@ -23,7 +24,6 @@ from geogs.tracking.flow.own_network import (
     ImageFeatures,
     NetworkOptions,
 )
-from geogs.tracking.motion import filled_positions
 
 
 @dataclass(frozen=True)
@@ -108,6 +108,9 @@ class OwnFlow:
 
     def texture(self, encoded: OwnImage) -> float:
         return self.classical.texture(encoded.classical)
+
+    def grey(self, encoded: OwnImage) -> Float[Tensor, "h w"]:
+        return self.classical.grey(encoded.classical)
 
     @torch.inference_mode()
     def measure(

@@ -16,12 +16,13 @@ from torch import Tensor
 from torch.nn import functional
 
 from geogs.errors import InputError
+from geogs.gpu.transfer import to_device
 from geogs.keyframes.grid import OFFSET, STRIDE, SampleGrid
 from geogs.tracking.flow.base import FlowMatch, Memories
 from geogs.tracking.flow.correlation import CorrelationVolume, LocalCorrelation
 from geogs.tracking.flow.raft_layout import network_from
 from geogs.tracking.flow.raft_network import CELL, RaftFeatures
-from geogs.tracking.flow.texture import textured_fraction
+from geogs.tracking.flow.texture import grey_levels, textured_fraction
 from geogs.tracking.flow.weights import read_tensors
 
 FAR = 1e3
@@ -56,6 +57,7 @@ class RaftImage:
 
     features: RaftFeatures
     """Of a batch of one."""
+    grey: UInt8[Tensor, "h w"]
     texture: float
     """Fraction of the grid with structure."""
 
@@ -86,10 +88,15 @@ class RaftFlow:
             found = self.network.encode(padded(torch.from_numpy(image).to(self.device)))
         dtype = torch.float16 if self.grid.on_gpu else torch.float32
         kept = (t.to(dtype) for t in (found.features, found.hidden, found.context))
-        return RaftImage(RaftFeatures(*kept), textured_fraction(image))
+        grey = grey_levels(image)
+        shown = to_device(torch.from_numpy(grey), self.device)
+        return RaftImage(RaftFeatures(*kept), shown, textured_fraction(grey))
 
     def texture(self, encoded: RaftImage) -> float:
         return encoded.texture
+
+    def grey(self, encoded: RaftImage) -> Float[Tensor, "h w"]:
+        return encoded.grey.float()
 
     @torch.no_grad()
     def measure(

@@ -15,10 +15,14 @@ def cell_structure(grey: UInt8[np.ndarray, "h w"]) -> Float[np.ndarray, "p"]:
     return smaller_eigenvalue(grey)[OFFSET:-3:STRIDE, OFFSET:-3:STRIDE].reshape(-1)
 
 
-def textured_fraction(image: UInt8[np.ndarray, "h w 3"]) -> float:
-    """Fraction of the sample grid on which an RGB image has texture."""
-    structure = cell_structure(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
-    return float((structure > MIN_STRUCTURE).mean())
+def grey_levels(image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w"]:
+    """An RGB image in grey."""
+    return cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+
+
+def textured_fraction(grey: UInt8[np.ndarray, "h w"]) -> float:
+    """Fraction of the sample grid on which an image has texture."""
+    return float((cell_structure(grey) > MIN_STRUCTURE).mean())
 
 
 def smaller_eigenvalue(grey: UInt8[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:

@@ -151,12 +151,6 @@ def _present(posed: PosedSet) -> PosedSet:
 
 
 def _selected(posed: PosedSet, config: InputConfig) -> PosedSet:
-    if config.stride < 1 or config.start < 0:
-        raise InputError(
-            f"start is {config.start} and stride {config.stride}; they must be at least 0 and 1."
-        )
-    if config.long_edge < 0:
-        raise InputError(f"long_edge is {config.long_edge}; it must not be negative.")
     kept = range(len(posed.files))[config.start : config.stop : config.stride]
     if not kept:
         raise InputError(

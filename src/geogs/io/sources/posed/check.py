@@ -56,7 +56,7 @@ class PoseCheck:
     """What to tell the user; none where the poses fit."""
 
 
-def check_poses(source: PosedSource, pairs: int = PAIRS) -> PoseCheck:
+def check_poses(source: PosedSource) -> PoseCheck:
     """Match features between neighbouring images and see whether the poses explain them.
 
     Neither the scale nor the place of the world matters. Takes about two seconds.
@@ -65,7 +65,7 @@ def check_poses(source: PosedSource, pairs: int = PAIRS) -> PoseCheck:
         InputError: the poses clearly do not fit, but do in another axis convention.
     """
     matcher = Matcher(source)
-    matched = matcher.pairs(pairs)
+    matched = matcher.pairs(PAIRS)
     if not matched:
         text = (
             f"{source.name}: no two neighbouring images have enough features in common, so the "

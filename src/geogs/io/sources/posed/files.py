@@ -40,10 +40,6 @@ class SparsePoints:
     seen_image: Int64[np.ndarray, "m"]
     """Image of observation k: its index in the source."""
 
-    def seen_by(self, image: int) -> Float64[np.ndarray, "k 3"]:
-        """Positions of the points that image ``image`` sees."""
-        return self.positions[np.unique(self.seen_point[self.seen_image == image])]
-
     def for_images(self, kept: Sequence[int]) -> "SparsePoints":
         """The points that the images ``kept`` see, these being numbered 0, 1, ... now."""
         new_image = renumbered(self.seen_image, kept)

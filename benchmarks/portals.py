@@ -8,7 +8,7 @@ from jaxtyping import Float32, Float64, UInt8
 
 from geogs.geometry.camera import Camera
 from geogs.synth.raycast import Raycaster, View
-from geogs.synth.suite import Suite
+from suite import Suite
 
 _ROOMS_IN_MEMORY = 6
 _DEPTH = 2

@@ -1,8 +1,8 @@
-"""Monocular priors that err as networks do, made from true depth: for tests and measurements."""
+"""Monocular priors that err as networks do, made from true depth, and rooms that need them."""
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -11,6 +11,7 @@ from jaxtyping import Float32, UInt8
 
 from geogs.priors.base import DepthKind, PriorMaps
 from geogs.synth.raycast import View
+from geogs.synth.scene import BOX, Scene
 from geogs.synth.texture import fractal_noise
 
 
@@ -104,3 +105,15 @@ class DegradedPrior:
         normal = true + self._errors.turn * np.cross(np.stack(turns, -1), true)
         length = np.linalg.norm(normal, axis=-1, keepdims=True)
         return (normal / np.maximum(length, 1e-6)).astype(np.float32)
+
+
+def with_bare_walls(scene: Scene) -> Scene:
+    """The same room with its walls painted in one colour each, so that they have no texture."""
+    rectangle = (scene.kind == BOX) & (scene.half[:, 2] == 0)
+    upright = np.abs(scene.rotation[:, 2, 2]) < 0.5
+    textures = list(scene.textures)
+    for k in np.unique(scene.face_texture[rectangle & upright]):
+        image = textures[k].image
+        plain = np.broadcast_to(image.mean((0, 1)).astype(np.uint8), image.shape).copy()
+        textures[k] = replace(textures[k], image=plain)
+    return replace(scene, textures=tuple(textures))

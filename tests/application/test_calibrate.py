@@ -1,4 +1,4 @@
-"""Self-calibration as ``geogs run`` does it: from a source to its intrinsics.json."""
+"""Self-calibration before a run: from a source to its intrinsics.json."""
 
 import json
 import signal
@@ -8,9 +8,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-import torch
 
 from geogs.application.calibrate import refined, self_calibrated
+from geogs.application.interrupt import Interruption
+from geogs.application.progress import RunProgress
 from geogs.config import CalibrationConfig, Config, InputConfig
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.sniff import open_source
@@ -20,7 +21,20 @@ from geogs.tracking.calibration.estimate import SelfCalibration
 from tracking_scenes import CAMERA, pose, render
 
 CONFIG = Config(calibration=CalibrationConfig(start_keyframes=8, keyframes=12))
-CPU = torch.device("cpu")
+
+
+class Listener(RunProgress):
+    """Remembers what it was told."""
+
+    def __init__(self) -> None:
+        self.said: list[str] = []
+        self.stages: set[str] = set()
+
+    def write(self, text: str) -> None:
+        self.said.append(text)
+
+    def stage(self, name: str, fraction: float) -> None:
+        self.stages.add(name)
 
 
 def write_images(folder: Path, poses: list[np.ndarray]) -> Path:
@@ -43,8 +57,9 @@ def written(source, folder: Path) -> dict:
     return json.loads((folder / "intrinsics.json").read_text())
 
 
-def test_intrinsics_json_holds_the_deviation(video, tmp_path, capsys):
-    source = self_calibrated(open_source(video), CONFIG, CPU)
+def test_intrinsics_json_holds_the_deviation(video, tmp_path, capfd):
+    listener = Listener()
+    source = self_calibrated(open_source(video), CONFIG, progress=listener)
     document = written(source, tmp_path)
     of_source = document["source"]
     deviation = of_source["focal_deviation"]
@@ -57,21 +72,24 @@ def test_intrinsics_json_holds_the_deviation(video, tmp_path, capsys):
     said = f"refined from the video: {of_source['fx']:.1f} +- {deviation:.1f} pixels"
     assert of_source["origin"] == f"{said} (a field of view of 60 degrees was assumed)"
     assert source.intrinsics_origin == of_source["origin"]
-    assert said in " ".join(capsys.readouterr().err.split())
+    assert listener.said == [f"Intrinsics: {source.intrinsics_origin}."]
+    assert listener.stages == {"calibration"}
+    assert capfd.readouterr() == ("", "")
     frames = list(source)
     assert [f.index for f in frames] == list(range(14))
 
 
-def test_a_camera_that_stands_still_leaves_the_guess(tmp_path, capsys):
+def test_a_camera_that_stands_still_leaves_the_guess(tmp_path):
     before = open_source(write_images(tmp_path / "still", [pose(0.0)] * 4))
-    source = self_calibrated(before, CONFIG, CPU)
+    listener = Listener()
+    source = self_calibrated(before, CONFIG, progress=listener)
     of_source = written(source, tmp_path)["source"]
     assert source.camera == before.camera
     assert of_source["is_guess"] is True
     assert of_source["focal_deviation"] is None
     assert of_source["self_calibration"]["failure"] == "the camera hardly moves"
     assert "the camera hardly moves" in source.intrinsics_origin
-    message = " ".join(capsys.readouterr().err.split())
+    (message,) = listener.said
     assert "warning: the video does not tell its focal length: the camera hardly moves" in message
     assert "give --intrinsics" in message
 
@@ -79,13 +97,13 @@ def test_a_camera_that_stands_still_leaves_the_guess(tmp_path, capsys):
 def test_what_is_given_or_not_wanted_is_left_alone(video, monkeypatch):
     monkeypatch.setattr(estimate, "self_calibrate", pytest.fail)
     given = open_source(video, InputConfig(intrinsics="140,140,95.5,71.5"))
-    assert self_calibrated(given, CONFIG, CPU) is given
+    assert self_calibrated(given, CONFIG) is given
     guessed = open_source(video)
     off = replace(CONFIG, calibration=CalibrationConfig(refine=False))
-    assert self_calibrated(guessed, off, CPU) is guessed
+    assert self_calibrated(guessed, off) is guessed
 
 
-def test_ctrl_c_goes_on_with_the_guess(video, monkeypatch, capsys):
+def test_ctrl_c_goes_on_with_the_guess(video, monkeypatch):
     def interrupted(frames, camera, config, device, seed, report):
         signal.raise_signal(signal.SIGINT)
         report(0.1)
@@ -93,8 +111,12 @@ def test_ctrl_c_goes_on_with_the_guess(video, monkeypatch, capsys):
 
     monkeypatch.setattr(estimate, "self_calibrate", interrupted)
     source = open_source(video)
-    assert self_calibrated(source, CONFIG, CPU) is source
-    assert "Calibration stopped" in capsys.readouterr().err
+    listener = Listener()
+    assert self_calibrated(source, CONFIG, progress=listener, stop=Interruption()) is source
+    (said,) = listener.said
+    assert said.startswith("Calibration stopped")
+    with pytest.raises(KeyboardInterrupt):  # of a caller who has no way to stop
+        self_calibrated(source, CONFIG)
 
 
 def test_what_was_found_at_working_size_is_carried_to_the_source():

@@ -7,8 +7,8 @@ import pytest
 
 from geogs.errors import InputError
 from geogs.synth.export import default_camera
-from geogs.synth.portals import SuiteRaycaster
-from geogs.synth.suite import ROOM, STEP, WALL, Suite
+from portals import SuiteRaycaster
+from suite import ROOM, STEP, WALL, Suite
 
 SUITE = Suite(4, seed=2)
 

@@ -1,0 +1,158 @@
+"""Errors of a result against the truth: trajectory and surface, as numbers, files and pictures."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from geogs.application.eval_settings import EvalSettings
+from geogs.application.evaluate_surface import (
+    SurfaceComparison,
+    compare_surface,
+    photoconsistency,
+)
+from geogs.errors import InputError
+from geogs.evaluation.report import SAME_POSES_CM, Evaluation, write_report
+from geogs.evaluation.run_report import PICTURES, run_sections
+from geogs.evaluation.surface import read_surface
+from geogs.evaluation.trajectory import Alignment, TrajectoryErrors, evaluate_trajectory
+from geogs.evaluation.truth import TrueScene, read_true_scene, scaled
+from geogs.io.poses import read_tum_trajectory
+from geogs.io.writers.intrinsics import read_camera
+from geogs.threads import on_one_torch_thread
+
+_ICP_PROTOCOLS = ("samples", "vertex")
+"""Those whose definition holds an alignment by ICP."""
+
+
+@on_one_torch_thread
+def evaluate(settings: EvalSettings) -> Evaluation:
+    """Compare, and write eval.json and report/ into the folder of the result.
+
+    Raises:
+        InputError: the result or the truth cannot be read, or they have too little in common.
+        OutputError: a file cannot be written.
+    """
+    _check(settings)
+    scene = read_true_scene(settings.gt)
+    summary = _summary(settings.output)
+    alignment = _alignment(settings, summary)
+    trajectory = _trajectory_errors(settings, "trajectory.tum", scene, alignment)
+    keyframes = None
+    if (settings.output / "keyframes.tum").is_file():
+        try:
+            keyframes = _trajectory_errors(settings, "keyframes.tum", scene, alignment)
+        except InputError:  # too few of them to align
+            keyframes = None
+    mesh_file, points_file = find_surface(settings) if settings.surface else (None, None)
+    surface, photo = None, None
+    if (settings.output / "mesh.ply").is_file() and (settings.surface or settings.photo):
+        mesh = read_surface(settings.output / "mesh.ply").transformed(trajectory.T_ref_est)
+        if settings.surface:
+            surface = compare_surface(settings, scene, mesh, mesh_file, points_file)
+        photo = photoconsistency(settings, scene, mesh) if settings.photo else None
+    scores = None if surface is None else surface.scores
+    by_icp = settings.icp if settings.protocol == "area" else settings.protocol in _ICP_PROTOCOLS
+    compared: dict[str, object] = {
+        "true_poses": str(settings.gt),
+        "true_surface": mesh_file and str(mesh_file),
+        "seen_points": points_file and str(points_file),
+        "protocol": settings.protocol if scores is None else scores.protocol,
+        "surface_aligned_by": f"{alignment} of all frames" + (" + ICP" * by_icp),
+        "max_time_difference_s": settings.max_diff,
+        "cull": settings.cull,
+        "seed": settings.seed,
+    }
+    evaluation = Evaluation(trajectory, keyframes, scores, compared, photo)
+    pictures = _draw(settings, trajectory, surface) if settings.plots else _run_pictures(settings)
+    page = settings.output / "report" / "index.html"
+    title = str(summary.get("source", settings.output.resolve().name))
+    run = run_sections(summary) if summary else []
+    write_report(evaluation, settings.output / "eval.json", page, pictures, run, title)
+    return evaluation
+
+
+def _check(settings: EvalSettings) -> None:
+    counts = (settings.cull_every, settings.photo_every, settings.samples)
+    if any(n is not None and n < 1 for n in counts) or (
+        settings.threshold is not None and not settings.threshold > 0
+    ):
+        raise InputError("cull-every, photo-every, samples and threshold must be positive.")
+    if not (settings.output / "trajectory.tum").is_file():
+        raise InputError(f"{settings.output} holds no trajectory.tum; give the folder of a result.")
+
+
+def _summary(output: Path) -> dict[str, object]:
+    """What the run said of itself; nothing if it left no summary that can be read."""
+    try:
+        content = json.loads((output / "summary.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return content if isinstance(content, dict) else {}
+
+
+def _alignment(settings: EvalSettings, summary: dict[str, object]) -> Alignment:
+    """The alignment to use: a result in the frame of known poses is compared as it is."""
+    if settings.alignment != "auto":
+        return settings.alignment
+    return "none" if str(summary.get("scale", "")).startswith("of the poses") else "sim3"
+
+
+def _trajectory_errors(
+    settings: EvalSettings, name: str, scene: TrueScene, alignment: Alignment
+) -> TrajectoryErrors:
+    """Errors of one of the trajectories in metres; its transform takes the map's unit to them."""
+    # A map in the frame of the true poses has their unit; for others the factor is free.
+    estimate = scaled(read_tum_trajectory(settings.output / name), scene.metres)
+    errors = evaluate_trajectory(estimate, scene.trajectory, settings.max_diff, alignment)
+    T = errors.T_ref_est @ np.diag([scene.metres] * 3 + [1.0])
+    return replace(errors, T_ref_est=T, scale=errors.scale * scene.metres)
+
+
+def find_surface(settings: EvalSettings) -> tuple[Path | None, Path | None]:
+    """Files of the true mesh and the seen points: as given, else beside the poses or above."""
+    for path in (settings.gt_mesh, settings.gt_points):
+        if path is not None and not path.is_file():
+            raise InputError(f"{path} does not exist; give a PLY file.")
+    folder = (settings.gt if settings.gt.is_dir() else settings.gt.parent).resolve()
+    mesh, points = settings.gt_mesh, settings.gt_points
+    for place in (folder, folder.parent):
+        names = ["mesh.ply", f"{folder.name}_mesh.ply", "mesh_*.ply", "tsdf_pseudo_gt.ply"]
+        found = [path for name in names for path in sorted(place.glob(name))]
+        mesh = mesh or next(iter(found), None)
+        if settings.gt_mesh is None:
+            points = points or next(iter(sorted(place.glob("points_seen_*.ply"))), None)
+    return mesh or points, points
+
+
+def _draw(
+    settings: EvalSettings, trajectory: TrajectoryErrors, surface: SurfaceComparison | None
+) -> list[tuple[str, Path]]:
+    """Pictures of this command, then those that the run left; titles and files."""
+    from geogs.evaluation import plots
+    from geogs.evaluation.shading import viewpoints
+
+    folder = settings.output / "report"
+    titles: dict[str, str] = {}
+    if trajectory.ate_max_cm > SAME_POSES_CM:
+        plots.plot_trajectory(folder / "trajectory_truth.png", trajectory)
+        plots.plot_error_over_time(folder / "trajectory_error.png", trajectory)
+        titles["trajectory_truth.png"] = "Trajectory over the truth"
+        titles["trajectory_error.png"] = "Error over time"
+    if surface is not None:
+        mesh, truth, limit = surface.mesh, surface.truth, surface.scores.colour_limit_cm
+        camera = read_camera(settings.output / "intrinsics.json")
+        colours = plots.error_colours(
+            mesh.vertices, surface.points, 100 * surface.distance, limit, surface.reach
+        )
+        views = viewpoints(mesh.vertices, trajectory.aligned, camera)
+        plots.plot_beside_truth(folder / "mesh_truth.png", mesh, truth, colours, views, limit)
+        titles = {"mesh_truth.png": "Surface beside the truth", **titles}
+    own = [(title, folder / name) for name, title in titles.items()]
+    return own + _run_pictures(settings)
+
+
+def _run_pictures(settings: EvalSettings) -> list[tuple[str, Path]]:
+    """What the run drew without knowing the truth; titles and files."""
+    return [(title, settings.output / "report" / name) for name, title in PICTURES.items()]

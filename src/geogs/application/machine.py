@@ -1,0 +1,56 @@
+"""What a run computes on: the device made ready, and the memory that is used."""
+
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import torch
+
+from geogs.errors import DeviceError
+from geogs.gpu.kernels import prepare_kernels
+from geogs.gpu.source import PACKAGE
+
+REMEDY = (
+    "use fewer images (--stride), a smaller --long-edge, a GPU with more memory, or --device cpu"
+)
+"""What helps where the memory of a GPU is full."""
+
+
+def compiled_kernels(device: torch.device) -> float:
+    """Have all kernels of a GPU compiled, once per machine; the seconds that took."""
+    start = time.perf_counter()
+    if device.type == "cuda":
+        prepare_kernels(PACKAGE, device)
+    return time.perf_counter() - start
+
+
+@contextmanager
+def full_memory_in_a_sentence() -> Iterator[None]:
+    """Inside, PyTorch's error about a GPU without memory becomes a DeviceError with the remedy."""
+    try:
+        yield
+    except torch.cuda.OutOfMemoryError as error:
+        raise DeviceError(f"The memory of the GPU is full; {REMEDY}.") from error
+
+
+def device_summary(device: torch.device) -> dict[str, object]:
+    """What the map was trained on, and a GPU's memory at its fullest (PyTorch's tensors)."""
+    if device.type != "cuda":
+        return {"device": "cpu"}
+    name = torch.cuda.get_device_name(device)
+    return {"device": name, "peak_gpu_memory_bytes": torch.cuda.max_memory_allocated(device)}
+
+
+def peak_memory() -> int:
+    """Largest resident size of this process so far, bytes."""
+    import resource
+
+    try:  # of this program alone: what the system counts begins with the size of who started it
+        status = Path("/proc/self/status").read_text()
+    except OSError:
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        return peak if sys.platform == "darwin" else peak * 1024
+    (line,) = (line for line in status.splitlines() if line.startswith("VmHWM:"))
+    return int(line.split()[1]) * 1024

@@ -1,0 +1,172 @@
+"""A reconstruction from known poses, from the path of the images to the result."""
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from geogs.application.interrupt import Stop
+from geogs.application.machine import compiled_kernels, full_memory_in_a_sentence
+from geogs.application.progress import RunProgress
+from geogs.application.reconstruct_checkpoint import ReconstructCheckpoint, fingerprint
+from geogs.application.result import Result, Written
+from geogs.application.results import write_results
+from geogs.application.settings import ReconstructSettings
+from geogs.application.snapshots import Snapshots
+from geogs.application.surfaces import write_depth_mesh
+from geogs.config import ReconstructConfig
+from geogs.gpu.installation import require_device
+from geogs.io.sources.posed.base import PosedSource
+from geogs.io.sources.posed.check import check_poses
+from geogs.io.sources.posed.sniff import open_posed_source
+from geogs.io.writers.atomic import prepare_output_folder
+from geogs.reconstruction import Reconstruction, ReconstructionState
+from geogs.threads import on_one_torch_thread
+
+_LEAST_SECONDS = 1.0
+"""What is left of a budget at least, when reading and checking have used it up."""
+
+Report = Callable[[str, float], None]
+"""Called with the name of a stage and its finished fraction in [0, 1]."""
+
+
+@on_one_torch_thread
+def reconstruct(
+    source: str | Path | PosedSource,
+    config: ReconstructConfig | None = None,
+    device: str = "auto",
+    budget: float | None = None,
+    *,
+    check: bool = True,
+    progress: RunProgress | None = None,
+) -> Result:
+    """Map and mesh of images with known poses; nothing is written.
+
+    Args:
+        source: a folder or file as ``open_posed_source`` takes it, or what that opened.
+        config: all settings; the defaults if none.
+        device: auto (a GPU where there is one), cpu, cuda or cuda:1.
+        budget: about how many seconds it may take in all; none trains until it is good.
+        check: whether to see first, by matching images, that the poses fit them.
+        progress: follows the work.
+
+    Raises:
+        InputError: the images or their poses cannot be used.
+        DeviceError: the device cannot be used, or its memory is full.
+    """
+    clock = _Clock(budget)
+    config, progress = config or ReconstructConfig(), progress or RunProgress()
+    used = require_device(device)
+    if not isinstance(source, PosedSource):
+        source = open_posed_source(source, config.input)
+    clock.excuse(compiled_kernels(used))
+    if check:
+        _check(source, progress)
+    with full_memory_in_a_sentence():
+        scene = Reconstruction(source.camera, config, str(used), clock.left())
+        _complete(scene, source, None, progress.stage)
+    return Result(scene, source, progress=progress)
+
+
+@on_one_torch_thread
+def reconstruct_to_folder(
+    settings: ReconstructSettings,
+    progress: RunProgress | None = None,
+    stop: Stop | None = None,
+) -> Written:
+    """Reconstruct, and write the results, with checkpoints and snapshots on the way.
+
+    Raises:
+        InputError: the images, their poses or a setting cannot be used, or there is nothing to
+            resume.
+        OutputError: a file cannot be written.
+        DeviceError: the device cannot be used, or its memory is full.
+    """
+    clock = _Clock(settings.budget)
+    progress, stop = progress or RunProgress(), stop or Stop()
+    config, device = settings.config, require_device(settings.device)
+    source = open_posed_source(settings.source, config.input, settings.hold_out)
+    output = prepare_output_folder(settings.output or Path("out") / source.name)
+    clock.excuse(compiled_kernels(device))
+    names = [Path(source.label(i)).name for i in range(len(source))]
+    made_from = fingerprint(config, settings.hold_out, names)
+    checkpoint = ReconstructCheckpoint(output, made_from, settings.checkpoint_every, progress)
+    snapshots = Snapshots(settings.snapshots)
+    with full_memory_in_a_sentence(), stop:
+        resumed = checkpoint.read() if settings.resume else None
+        if settings.check_poses and resumed is None:
+            _check(source, progress)
+        scene = Reconstruction(source.camera, config, str(device), clock.left())
+
+        def report(stage: str, fraction: float) -> None:
+            progress.stage(stage, fraction)
+            if stage == "growing":
+                progress.write(_too_few_depths(scene))
+            snapshots.take(scene)
+            checkpoint.report(stage, scene)
+            stop.check()
+
+        try:
+            _complete(scene, source, resumed, report)
+            finished, kept = True, False
+        except KeyboardInterrupt:
+            if not (stop.requested and len(scene.snapshot())):
+                raise
+            progress.write("Stopping early; keeping what there is. Press Ctrl-C again to quit.")
+            finished, kept = False, checkpoint.write(scene)
+        result = Result(scene, source, not finished, progress)
+        more = [lambda: snapshots.write(output, scene, progress)]
+        if settings.depth_mesh:
+            more.append(lambda: write_depth_mesh(output, scene, progress))
+        write_results(output, result, more)
+    if finished:
+        checkpoint.remove()
+    return Written(output, result, kept)
+
+
+def _check(source: PosedSource, progress: RunProgress) -> None:
+    """See whether the poses fit the images. Raises InputError if they clearly do not."""
+    warning = check_poses(source).warning
+    progress.write(f"warning: {warning}" if warning else "")
+
+
+def _complete(
+    scene: Reconstruction,
+    source: PosedSource,
+    resumed: ReconstructionState | None,
+    report: Report,
+) -> None:
+    """Everything up to the trained map; what ``report`` raises ends it early."""
+    for image in source:
+        scene.add(image.image, image.T_cw, image.mask, image.timestamp)
+        report("reading", scene.frames / source.length)
+    if resumed is not None:
+        scene.resume(resumed, report)
+    else:
+        scene.finish(None if source.points is None else source.points.positions, report)
+
+
+def _too_few_depths(scene: Reconstruction) -> str:
+    """What to say where the time did not last for the depths of all images; else nothing."""
+    if scene.with_depth == scene.frames:
+        return ""
+    return (
+        f"There is time for the depths of {scene.with_depth} of {scene.frames} images; the others "
+        "only help to find them. A longer --budget or a smaller --mapping.render-long-edge takes "
+        "them all."
+    )
+
+
+class _Clock:
+    """What is left of a time that begins now."""
+
+    def __init__(self, budget: float | None) -> None:
+        self._end = None if budget is None else time.perf_counter() + budget
+
+    def excuse(self, seconds: float) -> None:
+        """Seconds that do not count: compiling, once per machine, is in no budget."""
+        if self._end is not None:
+            self._end += seconds
+
+    def left(self) -> float | None:
+        """Seconds; none where there is no limit."""
+        return self._end and max(self._end - time.perf_counter(), _LEAST_SECONDS)

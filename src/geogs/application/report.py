@@ -1,0 +1,48 @@
+"""``report/``: a page with what needs no ground truth."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from geogs.mesh.types import Mesh
+from geogs.types import RenderedKeyframe, Trajectory
+
+
+def write_report(
+    folder: Path,
+    trajectory: Trajectory,
+    renders: Sequence[RenderedKeyframe],
+    mesh: Mesh | None,
+    summary: Mapping[str, object],
+) -> None:
+    """The path, renders beside images, the shaded mesh, and the numbers of the summary.
+
+    Raises:
+        OutputError: a file cannot be written.
+    """
+    from geogs.evaluation import plots
+    from geogs.evaluation.run_report import write_run_page
+    from geogs.evaluation.shading import viewpoints
+
+    folder.mkdir(exist_ok=True)
+    plots.plot_path(folder / "trajectory.png", trajectory)
+    if renders:
+        numbers = np.linspace(0, len(renders) - 1, min(5, len(renders))).round().astype(int)
+        shown = [renders[i] for i in numbers]
+        plots.plot_keyframes(
+            folder / "keyframes.png",
+            [r.image for r in shown],
+            [r.depth.cpu().numpy() for r in shown],
+            [r.normal.cpu().numpy() for r in shown],
+        )
+    if mesh is not None:
+        views = viewpoints(mesh.vertices, trajectory.T_wc[trajectory.tracked], renders[0].camera)
+        colourings = {"mesh": None, "colours": mesh.colours}
+        surfaces = [
+            (name, mesh.vertices, mesh.faces, colours)
+            for name, colours in colourings.items()
+            if name == "mesh" or colours is not None
+        ]
+        plots.plot_meshes(folder / "mesh.png", surfaces, views)
+    write_run_page(folder, summary)

@@ -1,0 +1,66 @@
+"""What a run or a reconstruction came to."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+
+from geogs.application.progress import RunProgress
+from geogs.application.scene import MappedScene
+from geogs.application.surfaces import surface_of
+from geogs.io.sources.posed.base import PosedSource
+from geogs.io.sources.sniff import Stream
+from geogs.mesh.types import Mesh
+from geogs.types import MapSnapshot, RenderedKeyframe, Trajectory
+
+
+@dataclass(frozen=True)
+class Result:
+    """What there is of a scene; each part is made when it is first asked for, then kept."""
+
+    scene: MappedScene
+    """A ``Slam`` or a ``Reconstruction``, whose work is done."""
+    source: Stream | PosedSource
+    """What it was made from, read to the end."""
+    is_interrupted: bool = False
+    """Whether the final stages were left out, or cut short."""
+    progress: RunProgress = field(default_factory=RunProgress)
+    """Follows the extraction of the mesh."""
+
+    @cached_property
+    def trajectory(self) -> Trajectory:
+        """Poses of all frames."""
+        return self.scene.trajectory()
+
+    @cached_property
+    def keyframes(self) -> Trajectory:
+        """Poses of the keyframes alone."""
+        return self.scene.keyframe_trajectory()
+
+    @cached_property
+    def map(self) -> MapSnapshot:
+        """The disks."""
+        return self.scene.snapshot()
+
+    @cached_property
+    def renders(self) -> Sequence[RenderedKeyframe]:
+        """The map seen from every keyframe."""
+        return self.scene.renders()
+
+    @cached_property
+    def mesh(self) -> Mesh | None:
+        """The surface of the map; none where none was found, of which ``progress`` is told."""
+        renders = self.renders
+        with self.scene.stopwatch("mesh"):
+            return surface_of(renders, self.scene.config.mesh, self.progress)
+
+
+@dataclass(frozen=True)
+class Written:
+    """A result whose files have been written."""
+
+    output: Path
+    """Their folder."""
+    result: Result
+    can_resume: bool
+    """Whether it was interrupted, and a checkpoint holds the work that had been done."""

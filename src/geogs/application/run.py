@@ -1,0 +1,197 @@
+"""A run, from the paths of its videos to the files of its result; or on from a checkpoint."""
+
+from collections.abc import Generator, Iterator
+from contextlib import closing
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+
+from geogs.application.calibrate import self_calibrated
+from geogs.application.checkpoint import has_checkpoint
+from geogs.application.interrupt import Stop
+from geogs.application.machine import REMEDY, compiled_kernels, full_memory_in_a_sentence
+from geogs.application.priors import open_prior
+from geogs.application.progress import RunProgress
+from geogs.application.result import Result, Written
+from geogs.application.results import write_results
+from geogs.application.run_checkpoint import RunCheckpoint, RunFacts, SavedRun, frames_after
+from geogs.application.settings import RunSettings
+from geogs.application.surfaces import write_depth_mesh, write_online_results
+from geogs.errors import DeviceError, InputError
+from geogs.gpu.installation import require_device
+from geogs.io.sources.sniff import Stream, open_source
+from geogs.io.writers.atomic import prepare_output_folder
+from geogs.slam import Slam
+from geogs.stopwatch import Stopwatch
+from geogs.threads import on_one_torch_thread
+from geogs.types import Frame
+
+
+@on_one_torch_thread
+def run(
+    settings: RunSettings, progress: RunProgress | None = None, stop: Stop | None = None
+) -> Written:
+    """Open the sources, calibrate, track and map every frame, write the results.
+
+    Raises:
+        InputError: a source, a setting or a prior cannot be used.
+        TrackingLost: no frame could be tracked.
+        OutputError: a file cannot be written.
+        DeviceError: the device cannot be used, or its memory was full; results so far are written.
+    """
+    progress, stop = progress or RunProgress(), stop or Stop()
+    config, device = settings.config, require_device(settings.device)
+    opened = open_source(settings.source, config.input)
+    output = prepare_output_folder(settings.output or Path("out") / opened.name)
+    compiled_kernels(device)
+    source = self_calibrated(opened, config, device, progress, stop)
+    found = None if source is opened else source.calibration
+    slam = Slam(source.camera, config, str(device), open_prior(config.prior, source.camera, device))
+    facts = RunFacts(settings.absolute(), device.type, source.fingerprint(), found)
+    if has_checkpoint(output):
+        progress.write(
+            f"Starting anew; geogs run --resume {output} would go on with the unfinished run "
+            "there, until the first checkpoint of this one."
+        )
+    return _Run(slam, source, settings, output, facts, progress, stop).complete(iter(source))
+
+
+@on_one_torch_thread
+def resume(
+    output: Path,
+    settings: RunSettings | None = None,
+    progress: RunProgress | None = None,
+    stop: Stop | None = None,
+) -> Written:
+    """Go on with the run whose checkpoint lies in a folder, as if nothing had happened.
+
+    ``settings`` are those it was begun with if none are given. Given ones may differ in what does
+    not decide about poses and map: the mesh, the number of the device, checkpoints, and what is
+    written besides.
+
+    Raises:
+        InputError: there is nothing to resume, or it cannot be used, or with other settings.
+        TrackingLost, OutputError, DeviceError: as of a run.
+    """
+    progress, stop = progress or RunProgress(), stop or Stop()
+    saved = SavedRun(output)
+    settings = _continued(saved.facts, settings or saved.facts.settings, output)
+    config, device = settings.config, require_device(settings.device)
+    source = saved.calibrated(open_source(settings.source, config.input))
+    output = prepare_output_folder(output)
+    compiled_kernels(device)
+    slam = Slam(source.camera, config, str(device), open_prior(config.prior, source.camera, device))
+    saved.restore(slam)
+    progress.write(f"Going on after {slam.frames} frames.")
+    facts = replace(saved.facts, settings=settings.absolute())
+    frames = frames_after(source, saved.facts.place)
+    return _Run(slam, source, settings, output, facts, progress, stop).complete(frames)
+
+
+def _continued(facts: RunFacts, settings: RunSettings, output: Path) -> RunSettings:
+    """Settings to go on with, on the kind of device that the run began on."""
+    elsewhere = settings.output is not None and settings.output.resolve() != output.resolve()
+    if elsewhere or settings.deciding() != facts.settings.deciding():
+        raise InputError(
+            "--resume goes on with the source and the settings of the run; leave out everything "
+            "else but --device, --mesh, --checkpoint-every, --online-results and --depth-mesh."
+        )
+    device = facts.device if settings.device == "auto" else settings.device
+    if not device.startswith(facts.device):
+        raise InputError(f"The run was on {facts.device}, and can only go on there.")
+    return replace(settings, device=device)
+
+
+@dataclass(frozen=True)
+class _Run:
+    """A run that has been made ready."""
+
+    slam: Slam
+    source: Stream
+    settings: RunSettings
+    output: Path
+    facts: RunFacts
+    progress: RunProgress
+    stop: Stop
+
+    def complete(self, frames: Generator[Frame, None, None]) -> Written:
+        """The frames that are left, the final stages, the files."""
+        slam, source, settings, output = self.slam, self.source, self.settings, self.output
+        progress = self.progress
+        checkpoint = RunCheckpoint(output, self.facts, settings.checkpoint_every, progress)
+        progress.expect(source.length, slam.frames)
+        kept = False
+        with full_memory_in_a_sentence(), self.stop:
+            with closing(frames):
+                full = not self._feed(frames, checkpoint)
+            interrupted = full or self.stop.requested
+            if interrupted:
+                why = "The GPU has no memory left" if full else "Stopping early"
+                progress.write(f"{why}; keeping what there is. Press Ctrl-C again to quit.")
+                kept = not full and checkpoint.write(slam, source)
+            slam.end_stream()
+            if not interrupted:
+                kept = checkpoint.write(slam, source)
+            if settings.online_results:
+                write_online_results(output, slam, progress)
+            interrupted |= not self._finish(correct=not interrupted)
+            result = Result(slam, source, interrupted, progress)
+            more = [lambda: write_depth_mesh(output, slam, progress)]
+            write_results(output, result, more if settings.depth_mesh else ())
+        if full:
+            raise DeviceError(
+                f"The memory of the GPU was full after {slam.frames} frames, whose results are in "
+                f"{output}/; {REMEDY}."
+            )
+        if not interrupted:
+            checkpoint.remove()
+        return Written(output, result, interrupted and kept)
+
+    def _feed(self, frames: Iterator[Frame], checkpoint: RunCheckpoint) -> bool:
+        """All frames through the system, until a request to stop; false if the GPU is full."""
+        slam = self.slam
+        if slam.is_ended:
+            next(frames, None)  # only what the source says of itself at its end
+            return True
+        try:
+            for frame in _timed(frames, slam.stopwatch):
+                self.progress.frame(slam.process(frame))
+                if self.stop.requested:
+                    break
+                checkpoint.after_frame(slam, self.source)
+        except torch.cuda.OutOfMemoryError:
+            torch.cuda.empty_cache()
+            return False
+        return True
+
+    def _finish(self, correct: bool) -> bool:
+        """The final stages; false if a request to stop or a full GPU cut them short."""
+
+        def report(stage: str, fraction: float) -> None:
+            self.progress.stage(stage, fraction)
+            self.stop.check()
+
+        try:
+            self.slam.finish(report, correct)
+        except KeyboardInterrupt:
+            if not self.stop.requested:
+                raise
+            return False
+        except torch.cuda.OutOfMemoryError:
+            torch.cuda.empty_cache()
+            self.progress.write(
+                "The GPU has no memory left for the final stages; keeping what there is."
+            )
+            return False
+        return True
+
+
+def _timed(frames: Iterator[Frame], stopwatch: Stopwatch) -> Iterator[Frame]:
+    """The frames; waiting for them is a stage, too."""
+    while True:
+        with stopwatch("reading"):
+            frame = next(frames, None)
+        if frame is None:
+            return
+        yield frame

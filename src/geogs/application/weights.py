@@ -1,0 +1,59 @@
+"""Which weights files there are, and whether a file is intact, in words."""
+
+from pathlib import Path
+
+from geogs.tracking.flow.weights_catalogue import CATALOGUE, KnownWeights, known_as
+from geogs.tracking.flow.weights_files import checksum, locate, require_intact, weights_folders
+
+
+def listing() -> str:
+    """What is known of every file, and where those are that were found."""
+
+    def entry(known: KnownWeights) -> list[str]:
+        path = locate(known)
+        state = "not here" if path is None else f"{path} ({checksum(path).verdict})"
+        return [
+            f"  {known.name}",
+            f"      {known.what}",
+            f"      file     {state}",
+            f"      from     {known.origin}",
+            f"      licence  {known.licence}",
+        ]
+
+    lines = ["looked for in " + ", ".join(map(str, weights_folders()))]
+    titles = {
+        "own": "--tracking.operator own",
+        "raft": "--tracking.operator raft",
+        "droid": "--tracking.operator droid",
+        "prior": "monocular priors",
+    }
+    for purpose, title in titles.items():
+        lines += ["", title]
+        for known in CATALOGUE:
+            if known.purpose == purpose:
+                lines += entry(known)
+    return "\n".join(lines)
+
+
+def verification(path: Path) -> str:
+    """What a file holds, and whether it is the published one of its name.
+
+    Raises InputError if it is missing, damaged or another.
+    """
+    found = require_intact(path)
+    known = known_as(path.name)
+    lines = [
+        f"file     {path}, {path.stat().st_size / 2**20:.1f} MiB",
+        f"sha256   {found.actual}",
+        f"known    {f'{known.name}, {known.what}' if known else 'no file of this name is known'}",
+        f"verdict  {found.verdict}",
+    ]
+    if path.suffix != ".onnx":
+        from geogs.tracking.flow.weights import read_tensors  # loads PyTorch
+
+        tensors = read_tensors(path)
+        numbers = sum(t.numel() for t in tensors.values())
+        lines.append(
+            f"content  {len(tensors)} tensors, {numbers:,} numbers, read without running code"
+        )
+    return "\n".join(lines)

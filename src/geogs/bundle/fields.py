@@ -1,0 +1,91 @@
+"""Fields on the sample grid on the CPU: filling holes, carrying depth from view to view."""
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from geogs.bundle.projection import project
+from geogs.geometry.lie import se3_inverse
+from geogs.keyframes.grid import SampleGrid
+from geogs.keyframes.keyframe import Keyframe
+
+
+class CpuFields:
+    """Works on the fields of one grid."""
+
+    def __init__(self, grid: SampleGrid) -> None:
+        self.grid = grid
+
+    def fill(
+        self, values: Float[Tensor, "*n p"], confidence: Float[Tensor, "*n p"]
+    ) -> Float[Tensor, "*n p"]:
+        """As in the protocol."""
+        rows = (x.reshape(-1, self.grid.size) for x in (values, confidence))
+        filled = [self._fill(*pair) for pair in zip(*rows, strict=True)]
+        return torch.stack(filled).reshape(values.shape)
+
+    def _fill(
+        self, values: Float[Tensor, "p"], confidence: Float[Tensor, "p"]
+    ) -> Float[Tensor, "p"]:
+        if not bool((confidence > 0).any()):
+            return torch.full_like(values, float(values.mean()))
+        shape = (1, 1, self.grid.height, self.grid.width)
+        value, weight = values.reshape(shape), confidence.reshape(shape).clamp(min=0)
+        return torch.where(
+            confidence > 0, values, _push_pull(value, weight).reshape(-1).to(values.dtype)
+        )
+
+    def transfer(
+        self,
+        T_ji: Float[Tensor, "4 4"],
+        inverse_depth: Float[Tensor, "p"],
+        information: Float[Tensor, "p"],
+    ) -> tuple[Float[Tensor, "p"], Float[Tensor, "p"]]:
+        """As in the protocol."""
+        grid = self.grid
+        R, t = T_ji[:3, :3].to(inverse_depth), T_ji[:3, 3].to(inverse_depth)
+        z = (grid.rays @ R.mT + inverse_depth[:, None] * t)[:, 2]
+        p = project(grid.camera, grid.rays, T_ji[None], inverse_depth[None])
+        cell, hit = grid.cells_of(p.pixels[0])
+        hit &= p.valid[0]
+        moved = torch.where(hit, inverse_depth / z.clamp(min=1e-6), torch.zeros_like(z))
+        depth = torch.zeros_like(moved).scatter_reduce(0, cell, moved, "amax")
+        nearest = hit & (moved >= 0.98 * depth[cell])
+        kept = torch.where(nearest, information * z.square(), torch.zeros_like(z))
+        transferred = torch.zeros_like(kept).scatter_reduce(0, cell, kept, "amax")
+        seen = depth > 0
+        # A token confidence lets cells without information still be filled from, if weakly.
+        return self.fill(depth, torch.where(seen, transferred + 1e-6, 0.0)), transferred * seen
+
+    def reproject(
+        self, keyframes: Sequence[Keyframe], T_cw: Sequence[Float[Tensor, "4 4"]]
+    ) -> tuple[Float[Tensor, "e p 2"], Float[Tensor, "e p 2"]]:
+        """As in the protocol."""
+        both = [self._reproject(k, T) for k, T in zip(keyframes, T_cw, strict=True)]
+        return torch.stack([there for there, _ in both]), torch.stack([back for _, back in both])
+
+    def _reproject(
+        self, keyframe: Keyframe, T_cw: Float[Tensor, "4 4"]
+    ) -> tuple[Float[Tensor, "p 2"], Float[Tensor, "p 2"]]:
+        grid, own = self.grid, keyframe.inverse_depth
+        T = T_cw @ se3_inverse(keyframe.T_cw)
+        depth, _ = self.transfer(T, own, keyframe.information)
+        there = project(grid.camera, grid.rays, T[None], own[None])
+        back = project(grid.camera, grid.rays, se3_inverse(T)[None], depth[None])
+        return there.pixels[0], back.pixels[0]
+
+
+def _push_pull(
+    value: Float[Tensor, "1 1 h w"], weight: Float[Tensor, "1 1 h w"]
+) -> Float[Tensor, "1 1 h w"]:
+    pool = torch.nn.functional.avg_pool2d
+    if min(value.shape[-2:]) <= 2:
+        return ((value * weight).sum() / weight.sum()).expand_as(value)
+    w = pool(weight, 2, ceil_mode=True)
+    v = pool(value * weight, 2, ceil_mode=True) / w.clamp(min=1e-30)
+    coarse = torch.nn.functional.interpolate(
+        _push_pull(v, w), size=value.shape[-2:], mode="bilinear", align_corners=False
+    )
+    return torch.where(weight > 0, value, coarse)

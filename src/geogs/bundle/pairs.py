@@ -1,0 +1,56 @@
+"""Directed pairs of keyframes on the CPU: where cells fall, and how far that is."""
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from geogs.bundle.projection import project
+from geogs.geometry.lie import se3_inverse
+from geogs.keyframes.store import Segment
+
+LEAST_OVERLAP = 0.2
+"""A pair of which no more than this fraction of the cells falls into the other image is far."""
+
+
+class CpuPairs:
+    """Pairs (source, target) of keyframe ids."""
+
+    def __init__(self, keyframes: Segment, directed: Sequence[tuple[int, int]]) -> None:
+        self.grid = keyframes.grid
+        source, target = (keyframes.poses([e[k] for e in directed]) for k in (0, 1))
+        self.motion = target @ se3_inverse(source)
+        self.inverse_depth = keyframes.inverse_depths([e[0] for e in directed])
+
+    def project(self) -> Float[Tensor, "e p 2"]:
+        """As in the protocol."""
+        grid = self.grid
+        return project(grid.camera, grid.rays, self.motion, self.inverse_depth).pixels
+
+    def moved(
+        self, before: Float[Tensor, "e p 2"], weight: Float[Tensor, "e p 2"]
+    ) -> Float[Tensor, "e"]:
+        """As in the protocol."""
+        moved = (self.project() - before).norm(dim=-1)
+        return moved.masked_fill(~(weight[..., 0] > 0), torch.nan).nanmedian(dim=1).values
+
+    def distances(self, rotation_weight: float, step: int = 2) -> Float[Tensor, "e"]:
+        """As in the protocol."""
+        grid, T = self.grid, self.motion
+        keep = torch.zeros(grid.height, grid.width, dtype=torch.bool)
+        keep[::step, ::step] = True
+        keep = keep.reshape(-1)
+        rays, pixels, d = grid.rays[keep], grid.pixels[keep], self.inverse_depth[:, keep]
+        shift = T.clone()
+        shift[:, :3, :3] = torch.eye(3, dtype=T.dtype)
+        total = valid = inside = torch.zeros(len(T))
+        for motion, share in ((T, rotation_weight), (shift, 1 - rotation_weight)):
+            p = project(grid.camera, rays, motion, d)
+            flow = (p.pixels - pixels).norm(dim=-1)
+            total = total + share * (flow * p.valid).sum(1)
+            valid = valid + share * p.valid.float().sum(1)
+            if motion is T:
+                inside = (grid.inside(p.pixels) & p.valid).float().mean(1)
+        seen = (valid > 0.75 * int(keep.sum())) & (inside > LEAST_OVERLAP)
+        return torch.where(seen, total / valid.clamp(min=1e-6), torch.inf)

@@ -1,0 +1,102 @@
+"""Writes docs/configuration.md: ``python -m geogs.config.document > docs/configuration.md``."""
+
+import sys
+from collections.abc import Sequence
+from typing import get_args
+
+from geogs.config.known_poses import ReconstructConfig, reconstruct_preset
+from geogs.config.leaves import Leaf, default_text, leaves
+from geogs.config.setting import Basic, Only, Settings
+from geogs.config.slam import Config, Preset, preset
+
+_INTRODUCTION = """\
+# Settings
+
+Made from the classes in `src/geogs/config` by `python -m geogs.config.document`; a test holds this
+page to them.
+
+No setting is needed. On the command line a setting is an option with its dotted name
+(`--mapping.depth.neighbours 6`; a switch is turned off by `--mesh.no-colour`; numbers of a list
+have commas between them), from Python a field of the same name
+(`Config(mapping=MappingConfig(window=6))`). A value outside its range is refused when the settings
+are made. The settings of a result stand in its `config.yaml`.
+
+`geogs run --help` and `geogs reconstruct --help` show the options in **bold**, `--help-all` all of
+them. Settings that only one of the two commands heeds say so, and the other does not offer them.
+Groups named `ablation` are there to be compared with.
+"""
+
+
+def document() -> str:
+    """The page: presets, then a table for every group of settings."""
+    run, known_poses = Config(), ReconstructConfig()
+    both = {leaf.name: leaf for leaf in leaves(run)}
+    other = {leaf.name: leaf for leaf in leaves(known_poses)}
+    groups: dict[str, list[list[str]]] = {}
+    for leaf in (both | other | both).values():
+        row = _row(leaf, both.get(leaf.name), other.get(leaf.name))
+        groups.setdefault(leaf.group, []).append(row)
+    words = {kind.group: kind.__doc__ or "" for kind in _classes(run) + _classes(known_poses)}
+    parts = [_INTRODUCTION, "## Presets\n", _presets("run", run, preset)]
+    parts.append(_presets("reconstruct", known_poses, reconstruct_preset))
+    for group, rows in groups.items():
+        where = [tree for tree in (both, other) if any(x.group == group for x in tree.values())]
+        only = (
+            "" if len(where) == 2 else " (`run` only)" if both in where else " (`reconstruct` only)"
+        )
+        parts.append(f"## {group or 'At the top'}{only}\n")
+        parts += [_paragraphs(words[group])] if group else []
+        parts.append(_table(("setting", "default", "may be", "meaning"), rows))
+    return "\n".join(parts)
+
+
+def _row(leaf: Leaf, run: Leaf | None, known_poses: Leaf | None) -> list[str]:
+    only, default = leaf.mark(Only), _code(default_text(leaf))
+    if only is None and run is not None and known_poses is not None:
+        changed = _code(default_text(known_poses))
+        default += "" if changed == default else f", {changed} in `reconstruct`"
+    beside = f" (`{only.command}` only)" if only else ""
+    name = _code(leaf.name)
+    name = f"**{name}**" if leaf.mark(Basic) or not leaf.group else name
+    return [name, default, str(leaf.kind), leaf.help + beside]
+
+
+def _presets(command: str, usual: Settings, make: object) -> str:
+    """What each preset has that is not usual."""
+    names = [name for name in get_args(Preset) if name != "default"]
+    of = {name: {leaf.name: leaf for leaf in leaves(make(name))} for name in names}  # type: ignore[operator]
+    rows = [
+        [
+            _code(leaf.name),
+            *(_code(default_text(x)) for x in (leaf, *(of[n][leaf.name] for n in names))),
+        ]
+        for leaf in leaves(usual)
+        if any(of[name][leaf.name].default != leaf.default for name in names)
+    ]
+    return _table((f"`geogs {command}`", "default", *names), rows)
+
+
+def _classes(tree: Settings) -> list[type[Settings]]:
+    """The classes of all groups of a tree."""
+    inner = [value for value in vars(tree).values() if isinstance(value, Settings)]
+    return [type(tree), *(kind for group in inner for kind in _classes(group))]
+
+
+def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    lines = [header, ["---"] * len(header), *rows]
+    return "".join(
+        "| " + " | ".join(c.replace("|", "\\|") for c in cells) + " |\n" for cells in lines
+    )
+
+
+def _paragraphs(docstring: str) -> str:
+    lines = [line.strip() for line in docstring.strip().splitlines()]
+    return "\n".join(lines) + "\n"
+
+
+def _code(text: str) -> str:
+    return f"`{text}`" if text else ""
+
+
+if __name__ == "__main__":
+    sys.stdout.write(document())

@@ -1,0 +1,272 @@
+"""What a setting may be: its kind and its range stand in its type and are checked at its making.
+
+    @dataclass(frozen=True)
+    class SweepConfig(Settings, group="mapping.sweep"):
+        planes: Annotated[int, Range(2, 256), Basic()] = 72
+
+The type says all there is to say of a setting; the command line, its help and the documentation
+are made from it.
+"""
+
+import functools
+import math
+import types
+from collections.abc import Iterator
+from dataclasses import dataclass, fields, is_dataclass, replace
+from numbers import Integral, Real
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal, Union, get_args, get_origin
+
+from geogs.errors import InputError
+
+# Seconds of the units of a time.
+_SECONDS = {"s": 1.0, "min": 60.0, "m": 60.0, "h": 3600.0}
+
+Bound = float | str
+"""A number, or the name of another setting of the group, or a sum of such: ``window + history``."""
+
+
+@dataclass(frozen=True)
+class Range:
+    """Numbers from ``least`` to ``most``, or ``above`` and ``below`` what does not belong to them.
+
+    A setting that a bound names is declared before the one that is bounded.
+    """
+
+    least: Bound | None = None
+    most: Bound | None = None
+    above: Bound | None = None
+    below: Bound | None = None
+    odd: bool = False
+    or_zero: bool = False
+    """0 is allowed, too."""
+
+    def holds(self, value: float, group: object) -> bool:
+        """Whether a finite number lies in the range, given the other settings of its group."""
+        bounds = (self.least, self.most, self.above, self.below)
+        least, most, above, below = (_resolved(bound, group) for bound in bounds)
+        return (self.or_zero and value == 0) or (
+            (least is None or value >= least)
+            and (most is None or value <= most)
+            and (above is None or value > above)
+            and (below is None or value < below)
+            and not (self.odd and value % 2 != 1)
+        )
+
+    def partners(self) -> tuple[str, ...]:
+        """Names of the settings that the bounds refer to."""
+        bounds = (self.least, self.most, self.above, self.below)
+        return tuple(name for bound in bounds if isinstance(bound, str) for name in _names(bound))
+
+    def __str__(self) -> str:
+        """Such as ``from 1 to 8``, ``above 0 and at most 1``, ``from 3 to 15 and odd``."""
+        words = {"above": self.above, "at least": self.least, "below": self.below}
+        words |= {"at most": self.most}
+        if self.least is not None and self.most is not None:
+            words = {"from": self.least, "to": self.most}
+        parts = [f"{word} {_shown(bound)}" for word, bound in words.items() if bound is not None]
+        text = (" " if "from" in words else " and ").join(parts)
+        text = f"{text} and odd" if self.odd else text
+        return f"0 or {text}" if self.or_zero else text
+
+
+@dataclass(frozen=True)
+class Basic:
+    """One of the few settings that ``--help`` shows; ``--help-all`` shows every one."""
+
+    name: str = ""
+    """A shorter name on the command line, such as ``--stride`` or ``-o``."""
+
+
+@dataclass(frozen=True)
+class Only:
+    """A setting that other commands than this one do not heed, and do not offer."""
+
+    command: Literal["run", "reconstruct"]
+
+
+@dataclass(frozen=True)
+class Positional:
+    """An option that is given without its name, in the order of the fields."""
+
+    required: bool = True
+    unless: str = ""
+    """Option with which it may be left out all the same."""
+
+
+class Time:
+    """Seconds that an option may give as ``90s``, ``10m`` or ``1.5h``, too."""
+
+
+class Unnamed:
+    """A group whose settings stand at the top of the command line, without its name."""
+
+
+Share = Annotated[float, Range(0, 1)]
+Angle = Annotated[float, Range(0, 180)]
+"""Degrees."""
+Weight = Annotated[float, Range(0, 1e6)]
+Positive = Annotated[float, Range(above=0, most=1e6)]
+Count = Annotated[int, Range(1, 1_000_000)]
+CountOrZero = Annotated[int, Range(0, 1_000_000)]
+"""0 does without."""
+
+
+@dataclass(frozen=True)
+class Kind:
+    """What values a setting takes."""
+
+    base: type
+    """bool, int, float, str or Path."""
+    choices: tuple[str, ...] = ()
+    is_optional: bool = False
+    """Whether it can be none."""
+    is_tuple: bool = False
+    """Whether it is any number of such values."""
+    ranges: tuple[Range, ...] = ()
+    marks: tuple[object, ...] = ()
+    """What else the type says of it, such as :class:`Basic`."""
+
+    @staticmethod
+    def of(annotation: Any, marks: tuple[object, ...] = ()) -> "Kind":
+        """The kind that a type describes. Raises TypeError for one that no setting can have."""
+        origin, inner = get_origin(annotation), get_args(annotation)
+        if origin is Annotated:
+            return Kind.of(inner[0], (*inner[1:], *marks))
+        ranges = tuple(mark for mark in marks if isinstance(mark, Range))
+        marks = tuple(mark for mark in marks if not isinstance(mark, Range))
+        if origin in (Union, types.UnionType) and len(inner) == 2 and inner[1] is type(None):
+            return replace(Kind.of(inner[0], (*ranges, *marks)), is_optional=True)
+        if origin is tuple and len(inner) == 2 and inner[1] is ...:
+            return replace(Kind.of(inner[0], (*ranges, *marks)), is_tuple=True)
+        if origin is Literal:
+            return Kind(str, inner, ranges=ranges, marks=marks)
+        if annotation not in (bool, int, float, str, Path):
+            raise TypeError(f"no setting can be of the type {annotation}")
+        return Kind(annotation, ranges=ranges, marks=marks)
+
+    def allows(self, value: object, group: object = None) -> bool:
+        """Whether a setting of this kind can be ``value``, given the others of its group.
+
+        Without a group, bounds by other settings are not looked at.
+        """
+        if value is None:
+            return self.is_optional
+        if self.is_tuple:
+            return isinstance(value, tuple) and all(self._allows_one(v, group) for v in value)
+        return self._allows_one(value, group)
+
+    def read(self, text: str) -> Any:
+        """The value that a text means; a text that means none comes back as it is."""
+        if self.is_optional and text.lower() == "none":
+            return None
+        if self.is_tuple and self.base is not str:
+            return tuple(self._read_one(part) for part in text.split(",") if part)
+        return self._read_one(text)
+
+    def __str__(self) -> str:
+        """In words: ``none or a number above 0``."""
+        one, many = {
+            bool: ("on or off", "switches"),
+            int: ("a whole number", "whole numbers"),
+            float: ("a number", "numbers"),
+            str: ("a text", "texts"),
+            Path: ("a path", "paths"),
+        }[self.base]
+        text = many if self.is_tuple else one
+        if Time in self.marks:
+            text += ", as seconds or such as 90s, 10m or 1h,"
+        if self.ranges:
+            text += " " + " and ".join(map(str, self.ranges))
+        if self.choices:
+            text = " or ".join(self.choices)
+        return f"none or {text}" if self.is_optional else text
+
+    def _allows_one(self, value: object, group: object) -> bool:
+        if self.choices:
+            return value in self.choices
+        if self.base not in (int, float):
+            return isinstance(value, self.base)
+        number = Integral if self.base is int else Real
+        if isinstance(value, bool) or not isinstance(value, number):
+            return False
+        finite = isinstance(value, Integral) or math.isfinite(value)
+        return finite and all(r.holds(value, group) for r in self.ranges)  # type: ignore[arg-type]
+
+    def _read_one(self, text: str) -> object:
+        units = [unit for unit in _SECONDS if Time in self.marks and text.endswith(unit)]
+        try:
+            if units:
+                return _SECONDS[units[0]] * float(text.removesuffix(units[0]))
+            return self.base(text)
+        except ValueError:
+            return text
+
+
+class Settings:
+    """A frozen dataclass of settings: each is checked when an instance is made.
+
+    ``group`` is the dotted name that its settings have in front of their own.
+    """
+
+    group: ClassVar[str] = ""
+
+    def __init_subclass__(cls, group: str | None = None) -> None:
+        super().__init_subclass__()
+        if group is not None:
+            cls.group = group
+
+    def __post_init__(self) -> None:
+        """Raises InputError for a value that a setting cannot have."""
+        for name, kind in kinds(type(self)):
+            value = getattr(self, name)
+            if not kind.allows(value, self):
+                at = f"{self.group}." if self.group else ""
+                raise InputError(refusal(at + name, value, kind, self))
+
+
+def refusal(name: str, value: object, kind: Kind, group: object = None) -> str:
+    """The sentence for a value that a setting cannot have."""
+    partners = [name for bounds in kind.ranges for name in bounds.partners()]
+    known = []
+    if group is not None:
+        known = [f"{dashed(name)} is {getattr(group, name)}" for name in partners]
+    beside = f" ({', '.join(known)})" if known else ""
+    return f"{dashed(name)} is {value!r}, but must be {kind}{beside}."
+
+
+def dashed(name: str) -> str:
+    """The name of a setting as the command line has it."""
+    return name.replace("_", "-")
+
+
+def group_of(annotation: Any) -> type | None:
+    """The dataclass that the type of a field stands for; none if the field is a setting."""
+    plain = get_args(annotation)[0] if get_origin(annotation) is Annotated else annotation
+    return plain if isinstance(plain, type) and is_dataclass(plain) else None
+
+
+@functools.cache
+def kinds(settings: type) -> tuple[tuple[str, Kind], ...]:
+    """Names and kinds of the settings of a dataclass, without its groups."""
+    return tuple(_kinds(settings))
+
+
+def _kinds(settings: type) -> Iterator[tuple[str, Kind]]:
+    for field in fields(settings):  # type: ignore[arg-type]  # always a dataclass
+        if group_of(field.type) is None:
+            yield field.name, Kind.of(field.type)
+
+
+def _names(bound: str) -> list[str]:
+    return bound.split(" + ")
+
+
+def _resolved(bound: Bound | None, group: object) -> float | None:
+    if not isinstance(bound, str):
+        return bound
+    return None if group is None else sum(getattr(group, name) for name in _names(bound))
+
+
+def _shown(bound: Bound) -> str:
+    return dashed(bound) if isinstance(bound, str) else f"{bound:.15g}"

@@ -1,0 +1,107 @@
+"""What kernels are told of the losses: float32 records, read by the names of their fields.
+
+On a GPU they are the structs of these names in ``cuda/view_maps.cuh``.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from geogs.config import LossConfig
+from geogs.geometry.camera import Camera
+from geogs.losses.multi_view import MIN_DEPTH_RATIO, depth_tolerance
+from geogs.losses.photometric import NCC_VARIANCE_FLOOR
+from geogs.losses.single_view import NORMAL_EPSILON
+
+
+class SingleViewSettings(NamedTuple):
+    """Weights are divided by the number of pixels, the distortion's also by the length unit."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    depth: float
+    normal: float
+    consistency: float
+    distortion: float
+    opacity: float
+    smoothness: float
+    silhouette: float
+    min_alpha: float
+    relative: float
+    """1 for the relative depth error, 0 for the difference."""
+    normal_epsilon: float
+    """Added to the square of a normal's length."""
+    eta: float
+    rewards_edges: float
+    """1 with the second smoothness term."""
+
+
+class PhotoSettings(NamedTuple):
+    """Weights are divided by the number of pixels and scaled by the share of a pair."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    min_depth_ratio: float
+    """Least share of its depth at which a point may lie in front of the other camera."""
+    occlusion: float
+    """Relative depth difference from which a pixel is hidden."""
+    l1: float
+    huber: float
+    cut: float
+    ncc: float
+    reject: float
+    min_variance: float
+    texture: float
+    min_coverage: float
+    variance_floor: float
+    ssim: float
+
+
+def single_view_settings(config: LossConfig, camera: Camera, unit: float) -> SingleViewSettings:
+    """Of views of a camera; ``unit`` is a length in map units that makes distortion unitless."""
+    c, pixels = config, camera.width * camera.height
+    return SingleViewSettings(
+        camera.fx, camera.fy, camera.cx, camera.cy,
+        depth=c.depth_weight / pixels,
+        normal=c.normal_weight / pixels,
+        consistency=c.normal_consistency_weight / pixels,
+        distortion=c.distortion_weight / unit / pixels,
+        opacity=c.opacity_weight / pixels,
+        smoothness=c.smoothness_weight / pixels,
+        silhouette=c.silhouette_weight / pixels,
+        min_alpha=c.min_alpha,
+        relative=c.ablation.depth_relative,
+        normal_epsilon=NORMAL_EPSILON,
+        eta=c.smoothness_eta,
+        rewards_edges=c.ablation.smoothness_rewards_edges,
+    )  # fmt: skip
+
+
+def photo_settings(config: LossConfig, camera: Camera, share: float = 1.0) -> PhotoSettings:
+    """Of pairs of photometric images of a camera, which count ``share`` of their loss each."""
+    c, pixels = config, camera.width * camera.height
+    return PhotoSettings(
+        camera.fx, camera.fy, camera.cx, camera.cy,
+        min_depth_ratio=MIN_DEPTH_RATIO,
+        occlusion=depth_tolerance(c.occlusion, camera),
+        l1=share * c.l1_weight / pixels,
+        huber=max(c.l1_huber, 1e-12),
+        cut=c.l1_cut,
+        ncc=share * c.ncc_weight / pixels,
+        reject=c.ncc_reject,
+        min_variance=c.ncc_min_variance,
+        texture=c.ncc_texture,
+        min_coverage=c.ncc_min_coverage,
+        variance_floor=NCC_VARIANCE_FLOOR,
+        ssim=share * c.ssim_weight / pixels,
+    )  # fmt: skip
+
+
+def record(settings: SingleViewSettings | PhotoSettings) -> np.void:
+    """The settings as compiled code takes them."""
+    kind = np.dtype([(name, np.float32) for name in settings._fields])
+    return np.array([tuple(settings)], kind)[0]

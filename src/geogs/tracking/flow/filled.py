@@ -1,0 +1,19 @@
+"""Flow where there was no match: from the matches around."""
+
+from jaxtyping import Float
+from torch import Tensor
+
+from geogs.bundle.select import grid_fields
+from geogs.keyframes.grid import SampleGrid
+from geogs.tracking.flow.base import FlowMatch
+
+
+def filled_positions(grid: SampleGrid, match: FlowMatch) -> Float[Tensor, "p 2"]:
+    """Positions of a single edge, unmatched cells filled in from the flow around them."""
+    return grid.pixels + filled_flow(grid, match)
+
+
+def filled_flow(grid: SampleGrid, match: FlowMatch) -> Float[Tensor, "p 2"]:
+    """Flow of a single edge, unmatched cells filled in from around them."""
+    flow, weight = match.pixels[0] - grid.pixels, match.weight[0, :, 0]
+    return grid_fields(grid).fill(flow.mT, weight.expand(2, -1)).mT.contiguous()

@@ -1,0 +1,96 @@
+"""A benchmark from a user's wishes to its tables."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from geogs.errors import InputError
+from geogs_bench.benchmark import Benchmark
+from geogs_bench.commands import runners
+from geogs_bench.harness import Harness
+from geogs_bench.plan import Wishes, find_scenes, make_jobs
+from geogs_bench.record import Record
+from geogs_bench.registry import BENCHMARKS, find_benchmark
+from geogs_bench.scene import Option
+from geogs_bench.settings import BenchSettings
+from geogs_bench.synthetic import no_data, synthetic_rooms
+
+
+@dataclass(frozen=True)
+class Benched:
+    """What a benchmark came to."""
+
+    benchmark: Benchmark
+    output: Path
+    """Folder of the results."""
+    records: list[Record]
+    """Those of earlier calls in the same folder included."""
+
+
+def bench(settings: BenchSettings, say: Callable[[str], None]) -> Benched:
+    """Run and score every scene, and write the tables.
+
+    Raises:
+        InputError: the data, a setting or a name is wrong; found before anything is run.
+        OutputError: the folder cannot be written.
+    """
+    name = "rooms-known-poses" if settings.known_poses else settings.name
+    if settings.known_poses and settings.name not in ("rooms", name):
+        raise InputError(f"--known-poses is for rooms; {settings.name} has one way to run.")
+    benchmark = find_benchmark(name)
+    wishes = _wishes(settings, benchmark)
+    output = settings.output or Path("out") / f"bench-{benchmark.name}"
+    data = settings.data or _made_data(benchmark, output, say)
+    scenes = find_scenes(benchmark, data.expanduser(), wishes.scenes)
+    jobs = make_jobs(benchmark, scenes, output, wishes)
+    harness = Harness(
+        benchmark, output, runners(), say, fresh=settings.fresh, rescore=settings.rescore
+    )
+    return Benched(benchmark, output, harness.run(jobs))
+
+
+def listing() -> str:
+    """Which benchmarks there are, what data each needs and where that comes from."""
+    lines = []
+    for benchmark in BENCHMARKS.values():
+        lines += [benchmark.name, f"  {benchmark.title}", f"  needs: {benchmark.needs}"]
+        lines += [f"  from:  {benchmark.source}"]
+        variants = ", ".join(variant.name for variant in benchmark.variants if variant.name)
+        lines += [f"  variants: {variants}"] if variants else []
+    return "\n".join(lines)
+
+
+def _wishes(settings: BenchSettings, benchmark: Benchmark) -> Wishes:
+    common = [Option("device", settings.device), Option("seed", str(settings.seed))]
+    if settings.preset:
+        common.append(Option("preset", settings.preset))
+    if settings.depth_fusion:
+        common.append(Option("depth-mesh"))
+    if benchmark.command == "run":
+        common.append(Option("online-results"))
+    return Wishes(
+        _names(settings.scenes),
+        _names(settings.variants),
+        (*common, *(_option(text) for text in settings.set)),
+        settings.budgets,
+        settings.baseline,
+    )
+
+
+def _option(text: str) -> Option:
+    name, equals, value = text.partition("=")
+    if not name or (equals and not value):
+        raise InputError(f"--set {text} is no setting; give one such as mapping.iterations=12.")
+    return Option(name.strip().removeprefix("--"), value.strip())
+
+
+def _names(text: str) -> tuple[str, ...]:
+    return tuple(name.strip() for name in text.split(",") if name.strip())
+
+
+def _made_data(benchmark: Benchmark, output: Path, say: Callable[[str], None]) -> Path:
+    """A synthetic room where that serves. Raises InputError where it does not."""
+    if not benchmark.synthetic:
+        raise no_data(benchmark.name, benchmark.needs, benchmark.source)
+    say("no data given; rendering a synthetic room")
+    return synthetic_rooms(output / "data", (0,))

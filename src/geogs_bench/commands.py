@@ -1,0 +1,53 @@
+"""Runs tasks as ``geogs run`` and ``geogs reconstruct`` would, by the same options."""
+
+from dataclasses import asdict, replace
+
+from geogs.application.interrupt import Interruption
+from geogs.application.settings import ReconstructSettings, RunSettings
+from geogs.application.terminal import TerminalProgress
+from geogs.cli import reconstruct as reconstruct_command
+from geogs.cli import run as run_command
+from geogs.cli.options import record
+from geogs_bench.runner import Command, Runner, Task
+
+_NO_SETTINGS = ("source", "output", "resume", "checkpoint_every")
+"""What changes nothing about a result."""
+
+
+class CommandRunner:
+    """Runs tasks by what is behind the two commands."""
+
+    def settings(self, task: Task) -> dict[str, object]:
+        """Every setting of the command but its output. Raises InputError for a wrong option."""
+        settings = asdict(settings_of(task))
+        settings |= settings.pop("config")
+        return {name: value for name, value in settings.items() if name not in _NO_SETTINGS}
+
+    def run(self, task: Task) -> None:
+        """Run the command."""
+        from geogs.application.reconstruct import reconstruct_to_folder
+        from geogs.application.run import run
+
+        settings = replace(settings_of(task), checkpoint_every=0.0)
+        with TerminalProgress() as progress:
+            if isinstance(settings, RunSettings):
+                run(settings, progress, Interruption())
+            else:
+                reconstruct_to_folder(settings, progress, Interruption())
+
+
+def runners() -> dict[Command, Runner]:
+    """Who runs which command."""
+    from geogs_bench.baseline import BaselineRunner
+
+    command = CommandRunner()
+    return {"run": command, "reconstruct": command, "colour-2dgs": BaselineRunner()}
+
+
+def settings_of(task: Task) -> RunSettings | ReconstructSettings:
+    """What a task's options say, by the command's own parser."""
+    argv = [str(task.source), "-o", str(task.output)]
+    argv += [argument for option in task.options for argument in option.arguments()]
+    if task.command == "run":
+        return record(RunSettings, run_command.parse(argv))
+    return record(ReconstructSettings, reconstruct_command.parse(argv))

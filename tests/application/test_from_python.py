@@ -1,0 +1,165 @@
+"""Everything a command does can be done from Python, with the same result, and without a word."""
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import geogs
+from geogs.application.interrupt import Interruption
+from geogs.application.run import run
+from geogs.application.settings import RunSettings
+from geogs.cli import main as cli
+from geogs.io.poses import read_tum_trajectory
+from geogs.slam import SlamStatus
+from geogs.synth.export import write_sequence
+from posed_scene import vertices
+
+FRAMES = 34
+RUN = [
+    "--mapping.render-long-edge", "96", "--mapping.iterations", "2",
+    "--mapping.pose-iterations", "0", "--mapping.final-iterations", "10",
+    "--mapping.no-final-depth",
+]  # fmt: skip
+POSED = [
+    "--mapping.render-long-edge", "96", "--mapping.disk.stride", "2", "--search.least-steps", "20",
+    "--search.steps-per-view", "1", "--search.no-repeat", "--stride", "4",
+]  # fmt: skip
+
+
+def run_config() -> geogs.Config:
+    config = geogs.Config()
+    mapping = replace(
+        config.mapping, render_long_edge=96, iterations=2, pose_iterations=0, final_iterations=10,
+        final_depth=False,
+    )  # fmt: skip
+    return replace(config, mapping=mapping)
+
+
+def posed_config() -> geogs.ReconstructConfig:
+    config = geogs.ReconstructConfig()
+    disk = replace(config.mapping.disk, stride=2)
+    return replace(
+        config,
+        input=replace(config.input, stride=4),
+        search=replace(config.search, least_steps=20, steps_per_view=1, repeat=False),
+        mapping=replace(config.mapping, render_long_edge=96, disk=disk),
+    )
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory) -> Path:
+    """The start of a synthetic room sequence."""
+    folder = tmp_path_factory.mktemp("room") / "room"
+    write_sequence(folder, FRAMES, 192, 144)
+    return folder
+
+
+def require_same(folder: Path, other: Path) -> None:
+    """That two results are the same to the last byte."""
+    for name in ("trajectory.tum", "keyframes.tum", "mesh.ply", "splats.ply", "config.yaml"):
+        assert (folder / name).read_bytes() == (other / name).read_bytes(), name
+    disks, twin = (geogs.load_map(f / "map.safetensors") for f in (folder, other))
+    assert (disks.position == twin.position).all()
+
+
+def test_a_run_frame_by_frame_is_that_of_the_command(room, tmp_path, capfd):
+    source = geogs.open_source(room)
+    source = geogs.application.self_calibrated(source)
+    slam = geogs.Slam(source.camera, run_config())
+    for frame in source:
+        slam.process(frame)
+    slam.finish()
+    result = geogs.application.Result(slam, source)
+    assert not list(tmp_path.iterdir())
+    geogs.application.write_results(tmp_path / "own", result)
+    assert capfd.readouterr() == ("", "")
+    assert result.mesh is not None
+    assert len(result.mesh.faces) > 1000
+    argv = [str(room), "-o", str(tmp_path / "out"), *RUN, "--device", "cpu"]
+    assert cli.main(["run", *argv]) == 0
+    said = capfd.readouterr()
+    assert said.out == f"Results are in {tmp_path}/out/\n"
+    assert "tracking" in said.err
+    require_same(tmp_path / "own", tmp_path / "out")
+    seconds = json.loads((tmp_path / "out" / "summary.json").read_text())["seconds"]
+    assert seconds["reading"] > 0
+    rates = json.loads((tmp_path / "own" / "summary.json").read_text())["frames_per_second"]
+    online = slam.stopwatch.until_stream_end
+    assert rates["until_stream_end"] == pytest.approx(FRAMES / online, rel=1e-3)
+    assert slam.stopwatch.seconds["tracking"] < online < slam.stopwatch.total
+
+
+class Impatient(geogs.application.RunProgress):
+    """Remembers what it was told, and stops after some frames."""
+
+    def __init__(self, stop: Interruption, frames: int) -> None:
+        self.stop, self.frames = stop, frames
+        self.said: list[str] = []
+        self.seen = 0
+
+    def expect(self, frames: int | None, begun: int = 0) -> None:
+        assert (frames, begun) == (FRAMES, 0)
+
+    def frame(self, status: SlamStatus) -> None:
+        self.seen = status.frames
+        self.stop.requested = status.frames == self.frames
+
+    def write(self, text: str) -> None:
+        self.said.append(text)
+
+
+def test_a_whole_run_is_one_call_that_can_be_followed_and_stopped(room, tmp_path, capfd):
+    stop = Interruption()
+    progress = Impatient(stop, 30)
+    settings = RunSettings((room,), run_config(), tmp_path / "out", "cpu", checkpoint_every=900.0)
+    written = run(settings, progress, stop)
+    assert progress.seen == 30
+    assert progress.said == ["Stopping early; keeping what there is. Press Ctrl-C again to quit."]
+    assert written.output == tmp_path / "out"
+    assert written.can_resume
+    assert written.result.is_interrupted
+    assert len(written.result.trajectory.timestamps) == 30
+    assert len(read_tum_trajectory(tmp_path / "out" / "trajectory.tum").timestamps) == 30
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_reconstruction_is_that_of_the_command_and_writes_nothing(
+    room, tmp_path, capfd, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    result = geogs.reconstruct(room, posed_config(), device="cpu")
+    assert capfd.readouterr() == ("", "")
+    mesh, disks = result.mesh, result.map
+    assert not list(tmp_path.iterdir())
+    assert mesh is not None
+    given = np.loadtxt(room / "traj.txt").reshape(-1, 4, 4)[::4]
+    assert np.abs(result.trajectory.T_wc - given).max() < 1e-9
+    assert cli.main(["reconstruct", str(room), "-o", "out", *POSED, "--device", "cpu"]) == 0
+    assert np.array_equal(vertices(tmp_path / "out" / "mesh.ply"), mesh.vertices)
+    assert (geogs.load_map("out/map.safetensors").position == disks.position).all()
+    opened = geogs.open_posed_source(room, posed_config().input)
+    assert opened.length == len(given)
+    geogs.application.write_results("own", result)
+    require_same(tmp_path / "own", tmp_path / "out")
+
+
+LIGHT = """
+import sys
+import geogs
+heavy = ("torch", "numpy", "numba", "cv2", "scipy", "matplotlib", "av", "rich", "tyro")
+print([name for name in heavy if name in sys.modules])
+print(all(hasattr(geogs, name) for name in geogs.__all__))
+"""
+
+
+def test_the_package_loads_nothing_before_it_is_used():
+    done = subprocess.run([sys.executable, "-c", LIGHT], capture_output=True, text=True)
+    assert done.stdout == "[]\nTrue\n", done.stderr
+    for module in (geogs, geogs.application):
+        with pytest.raises(AttributeError, match="no attribute nothing"):
+            _ = module.nothing
