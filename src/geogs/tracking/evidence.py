@@ -7,6 +7,7 @@ it.
 """
 
 from dataclasses import dataclass
+from math import gcd
 
 import torch
 from jaxtyping import Bool, Float
@@ -147,9 +148,9 @@ def _median_where(values: Float[Tensor, "n"], counts: Bool[Tensor, "n"]) -> Floa
 
 
 def _spread(grid: SampleGrid) -> slice:
-    """Every k-th cell, row by row: no more than are looked at, and not below each other."""
+    """Every k-th cell, row by row: no more than are looked at, and from all columns."""
     step = -(-grid.size // MAX_WINDOWS)
-    while step > 1 and grid.width % step == 0:
+    while gcd(step, grid.width) > 1:
         step += 1
     return slice(None, None, step)
 
