@@ -13,6 +13,7 @@ from torch import Tensor
 from geogs.bundle.select import grid_fields, motion_solver
 from geogs.errors import InputError
 from geogs.geometry.lie import se3_inverse
+from geogs.gpu.transfer import to_device
 from geogs.keyframes.grid import SampleGrid
 from geogs.keyframes.keyframe import Keyframe
 from geogs.tracking.evidence import Evidence, correlation_at, correlation_matched
@@ -126,17 +127,16 @@ class FrameLocator:
             huber=FIT_HUBER,
             limit=2 * self.max_residual,
         )
-        T_rel = T @ se3_inverse(keyframe.T_cw).to(T.device)
-        borne_out = correlation_at(
+        seen = correlation_at(
             self.grid,
             self.operator.grey(keyframe.encoded),
             self.operator.grey(encoded),
-            T_rel,
+            T @ to_device(se3_inverse(keyframe.T_cw), T.device),
             keyframe.inverse_depth,
             keyframe.information,
         )
         # All at once, so that a GPU is waited for once.
-        found = torch.cat([T.reshape(-1), judged.to(T), borne_out.to(T)]).cpu()
+        found = torch.cat([T.reshape(-1), judged.to(T), seen.to(T)]).cpu()
         _, agree, residual, flow = found[16:20].tolist()
         if agree < self.min_matched or not residual < self.max_residual:
             return None
