@@ -29,7 +29,9 @@ from geogs_train.scores import CellErrors, has_texture, summarise
 from geogs_train.starts import StartOptions, disturbed_starts
 from geogs_train.trainer import FlowTrainer, Worker, schedule
 
-ROOMS = RoomOptions(width=64, height=48, textures=6, texture_size=64, density=(0.02, 0.05))
+ROOMS = RoomOptions(
+    width=64, height=48, textures=6, texture_size=64, least_density=0.02, most_density=0.05
+)
 TINY = FlowTraining(
     steps=4,
     batch=1,
@@ -226,7 +228,8 @@ def test_the_command_trains_resumes_and_writes_weights(tmp_path):
     options = ["--training.batch", "1", "--training.iterations", "2", "--run.validation-batches",
                "1", "--training.rooms.width", "64", "--training.rooms.height", "48",
                "--training.rooms.textures", "6", "--training.rooms.texture-size", "64",
-               "--training.rooms.density", "0.02", "0.05", "--device", "cpu"]  # fmt: skip
+               "--training.rooms.least-density", "0.02",
+               "--training.rooms.most-density", "0.05", "--device", "cpu"]  # fmt: skip
     assert main(["train", "flow", str(out), "--training.steps", "1", *options]) == 0
     network = load_network(out / "flow.safetensors")
     assert sum(p.numel() for p in network.parameters()) > 1e6
