@@ -18,9 +18,15 @@ def test_files_that_a_text_names_exist(text: Path) -> None:
     words = text.read_text()
     code = set(re.findall(r"`([\w./*-]+\.(?:py|cuh?))`", words))
     links = set(re.findall(r"\]\(([\w./-]+\.(?:md|png))", words))
-    missing = {n for n in code if not any(ROOT.glob(f"**/{n}"))}
+    missing = {name for name in code if not _is_there(name)}
     missing |= {link for link in links if not (text.parent / link).is_file()}
     assert missing == set()
+
+
+def _is_there(name: str) -> bool:
+    return any(ROOT.glob(name)) or any(
+        any((ROOT / folder).glob(f"**/{name}")) for folder in ("src", "benchmarks", "tests")
+    )
 
 
 def test_settings_that_the_texts_name_exist() -> None:
