@@ -8,7 +8,8 @@ import torch
 from bundle_scenes import CAMERA, disturbed, scene
 from geogs.bundle.base import BundleOptions
 from geogs.bundle.dense import DenseBundle
-from geogs.bundle.motion import solve_poses
+from geogs.bundle.motion import CpuMotion
+from geogs.bundle.problem import MotionProblem
 from geogs.bundle.projection import linearise, relative_motion
 from geogs.geometry.lie import retract, se3_inverse
 from oracles.bundle_reference import gauss_newton_step, reproject
@@ -144,17 +145,15 @@ def test_motion_only_recovers_poses():
     edges = (truth.source < 2) & (truth.target >= 2)
     source, target = truth.source[edges], truth.target[edges]
     start = disturbed(truth, 0.03, 0.0)
-    T, residual = solve_poses(
-        CAMERA,
-        grid.rays,
+    problem = MotionProblem(
         start.T_cw[2:],
         truth.inverse_depth[source],
         truth.T_cw[source],
         target - 2,
         truth.pixels[edges],
         truth.weight[edges],
-        iterations=10,
     )
+    T, residual = CpuMotion(grid).solve(problem, iterations=10)
     torch.testing.assert_close(T, truth.T_cw[2:], rtol=0, atol=1e-5)
     assert float(residual.norm(dim=-1).max()) < 0.01
 

@@ -16,9 +16,9 @@ from cuda_emulator import use_emulator
 from geogs.bundle.base import BundleOptions, BundleResult
 from geogs.bundle.dense import DenseBundle
 from geogs.bundle.fields import CpuFields
-from geogs.bundle.motion import fit_frame, solve_poses
+from geogs.bundle.motion import CpuMotion
 from geogs.bundle.pairs import CpuPairs
-from geogs.bundle.problem import BundleProblem
+from geogs.bundle.problem import BundleProblem, MotionProblem
 from geogs.bundle.projection import MIN_Z, linearise, project, relative_motion
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import retract, se3_exp
@@ -276,23 +276,18 @@ def test_motion_only_adjustment_matches_the_cpu(device):
     kept = (problem.source < 2) & (problem.target != problem.source)
     order = torch.randperm(int(kept.sum()), generator=torch.Generator().manual_seed(1))
     source, frame = problem.source[kept][order], problem.target[kept][order]
-    dense = problem.inverse_depth[source], problem.pixels[kept][order], problem.weight[kept][order]
-    T_source = problem.T_cw[source]
-    expected, expected_residual = solve_poses(
-        camera, grid.rays, problem.T_cw, dense[0], T_source, frame, *dense[1:], 5, 0.5
-    )
-    d, pixels, weight = (x.to(device) for x in dense)
-    rays = grid.rays.to(device)
-    T, residual = cuda_motion.solve_poses(
-        camera, rays, problem.T_cw, d, T_source, frame, pixels, weight, 5, 0.5
-    )
+    slow = MotionProblem(
+        problem.T_cw, problem.inverse_depth[source], problem.T_cw[source], frame,
+        problem.pixels[kept][order], problem.weight[kept][order],
+    )  # fmt: skip
+    expected, expected_residual = CpuMotion(grid).solve(slow, 5, 0.5)
+    dense = {n: getattr(slow, n).to(device) for n in ("inverse_depth", "pixels", "weight")}
+    solver, sent = cuda_motion.CudaMotion(SampleGrid(camera, device)), replace(slow, **dense)
+    T, residual = solver.solve(sent, 5, 0.5)
     torch.testing.assert_close(T, expected, rtol=0, atol=1e-5)
     torch.testing.assert_close(residual.cpu(), expected_residual, rtol=1e-3, atol=3e-3)
     assert float((T - problem.T_cw).abs().max()) > 0.01
-    weight = torch.zeros_like(weight)
-    T, _ = cuda_motion.solve_poses(
-        camera, rays, problem.T_cw, d, T_source, frame, pixels, weight, 2, 0.5
-    )
+    T, _ = solver.solve(replace(sent, weight=torch.zeros_like(sent.weight)), 2, 0.5)
     torch.testing.assert_close(T, problem.T_cw)
 
 
@@ -305,12 +300,11 @@ def test_fit_of_a_frame_matches_the_cpu(device):
     pixels, weight = problem.pixels[edge], problem.weight[edge]
     pixels[::7] += 30.0
     (expected_T, expected), (T, found) = (
-        fit(
-            kept.grid, problem.T_cw[2], kept[0].T_cw, kept[0].inverse_depth, kept[0].information,
-            pixels.to(where), weight.to(where), 6, 5.0, 3.0,
+        solver(kept.grid).fit(
+            problem.T_cw[2], kept[0], pixels.to(where), weight.to(where), 6, 5.0, 3.0
         )
-        for fit, kept, where in (
-            (fit_frame, slow, "cpu"), (cuda_motion.fit_frame, store, device)
+        for solver, kept, where in (
+            (CpuMotion, slow, "cpu"), (cuda_motion.CudaMotion, store, device)
         )
     )  # fmt: skip
     torch.testing.assert_close(T.cpu(), expected_T, rtol=0, atol=2e-5)

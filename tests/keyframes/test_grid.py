@@ -1,5 +1,6 @@
 """The sample grid."""
 
+import pytest
 import torch
 
 from geogs.errors import InputError

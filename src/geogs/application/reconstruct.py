@@ -4,10 +4,10 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from geogs.application.checkpoint import Checkpoint, fingerprint
 from geogs.application.interrupt import Stop
 from geogs.application.machine import compiled_kernels, full_memory_in_a_sentence
 from geogs.application.progress import RunProgress
+from geogs.application.reconstruct_checkpoint import ReconstructCheckpoint, fingerprint
 from geogs.application.result import Result, Written
 from geogs.application.results import write_results
 from geogs.application.settings import ReconstructSettings
@@ -89,7 +89,7 @@ def reconstruct_to_folder(
     clock.excuse(compiled_kernels(device))
     names = [Path(source.label(i)).name for i in range(len(source))]
     made_from = fingerprint(config, settings.hold_out, names)
-    checkpoint = Checkpoint(output, made_from, settings.checkpoint_every, progress)
+    checkpoint = ReconstructCheckpoint(output, made_from, settings.checkpoint_every, progress)
     snapshots = Snapshots(settings.snapshots)
     with full_memory_in_a_sentence(), stop:
         resumed = checkpoint.read() if settings.resume else None

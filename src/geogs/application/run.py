@@ -8,19 +8,14 @@ from pathlib import Path
 import torch
 
 from geogs.application.calibrate import self_calibrated
+from geogs.application.checkpoint import has_checkpoint
 from geogs.application.interrupt import Stop
 from geogs.application.machine import REMEDY, compiled_kernels, full_memory_in_a_sentence
 from geogs.application.priors import open_prior
 from geogs.application.progress import RunProgress
 from geogs.application.result import Result, Written
 from geogs.application.results import write_results
-from geogs.application.run_checkpoint import (
-    RunCheckpoint,
-    RunFacts,
-    SavedRun,
-    frames_after,
-    has_checkpoint,
-)
+from geogs.application.run_checkpoint import RunCheckpoint, RunFacts, SavedRun, frames_after
 from geogs.application.settings import RunSettings
 from geogs.application.surfaces import write_depth_mesh, write_online_results
 from geogs.errors import DeviceError, InputError

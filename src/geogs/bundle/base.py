@@ -7,7 +7,7 @@ from typing import Protocol, runtime_checkable
 from jaxtyping import Float
 from torch import Tensor
 
-from geogs.bundle.problem import BundleProblem
+from geogs.bundle.problem import BundleProblem, MotionProblem
 from geogs.keyframes.keyframe import Keyframe
 
 
@@ -51,6 +51,36 @@ class BundleSolver(Protocol):
         """Take ``options.iterations`` damped Gauss-Newton steps.
 
         A step that is not finite is not taken, and ``finite`` is False in the result.
+        """
+        ...
+
+
+@runtime_checkable
+class MotionSolver(Protocol):
+    """What finds the poses of frames seen from keyframes that stay as they are."""
+
+    def solve(
+        self, problem: MotionProblem, iterations: int = 4, huber: float = 3.0
+    ) -> tuple[Float[Tensor, "n 4 4"], Float[Tensor, "e p 2"]]:
+        """Poses, each adjusted on its own, and the residuals of the edges at those poses."""
+        ...
+
+    def fit(
+        self,
+        T_guess: Float[Tensor, "4 4"],
+        keyframe: Keyframe,
+        pixels: Float[Tensor, "p 2"],
+        weight: Float[Tensor, "p 2"],
+        iterations: int,
+        huber: float,
+        limit: float,
+    ) -> tuple[Float[Tensor, "4 4"], Float[Tensor, "4"]]:
+        """Pose of a frame against one keyframe, and what tells whether it is right.
+
+        Cells without information do not count. Returns the pose; the share of the cells that are
+        matched, the share whose residual is below ``limit`` pixels, and the medians over the
+        matched of the residual and of the motion, in pixels: not numbers where nothing is matched.
+        On a GPU all stays there, and nothing waits.
         """
         ...
 

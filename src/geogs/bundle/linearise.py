@@ -98,17 +98,13 @@ def weighed_residuals(
     weight: Float[Tensor, "e p 2"],
     huber: float,
 ) -> tuple[Float[Tensor, "e p 2"], Float[Tensor, "e p 2"]]:
-    """Measured less projected position, and its weight: none where a cell is behind the target."""
-    r = pixels - p.pixels
-    return r, robust_weight(r, weight * p.valid[..., None], huber)
+    """Measured less projected positions r, and their weights: none behind the target.
 
-
-def robust_weight(
-    residual: Float[Tensor, "*b 2"], weight: Float[Tensor, "*b 2"], huber: float
-) -> Float[Tensor, "*b 2"]:
-    """Weights times Huber's factor ``min(1, huber / |W^(1/2) residual|)``."""
-    norm = (weight * residual.square()).sum(-1, keepdim=True).sqrt()
-    return weight * (huber / norm.clamp(min=huber))
+    W is multiplied by Huber's factor ``min(1, huber / |W^(1/2) r|)``.
+    """
+    r, w = pixels - p.pixels, weight * p.valid[..., None]
+    norm = (w * r.square()).sum(-1, keepdim=True).sqrt()
+    return r, w * (huber / norm.clamp(min=huber))
 
 
 def normal_equations(

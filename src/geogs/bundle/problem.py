@@ -59,6 +59,22 @@ class StreamedProblem:
         )  # fmt: skip
 
 
+@dataclass(frozen=True)
+class MotionProblem:
+    """Frames seen from keyframes that stay as they are; nothing joins two frames."""
+
+    T_cw: Float[Tensor, "n 4 4"]
+    """float64."""
+    inverse_depth: Float[Tensor, "e p"]
+    """Of the keyframe of each edge."""
+    T_source: Float[Tensor, "e 4 4"]
+    """World to the keyframe of each edge."""
+    frame: Int[Tensor, "e"]
+    """Which of the frames an edge sees."""
+    pixels: Float[Tensor, "e p 2"]
+    weight: Float[Tensor, "e p 2"]
+
+
 def sources_within(source: Int[Tensor, "e"]) -> list[tuple[int, slice]]:
     """The sources of sorted edges and which edges are theirs."""
     frames, counts = torch.unique_consecutive(source, return_counts=True)

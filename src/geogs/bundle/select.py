@@ -2,7 +2,10 @@
 
 from collections.abc import Sequence
 
-from geogs.bundle.base import BundleSolver, GridFields, KeyframePairs
+from jaxtyping import Int
+from torch import Tensor
+
+from geogs.bundle.base import BundleSolver, GridFields, KeyframePairs, MotionSolver
 from geogs.keyframes.grid import SampleGrid
 from geogs.keyframes.store import Segment
 
@@ -16,6 +19,17 @@ def bundle_solver(grid: SampleGrid) -> BundleSolver:
     from geogs.bundle.dense import DenseBundle
 
     return DenseBundle(grid)
+
+
+def motion_solver(grid: SampleGrid, cells: Int[Tensor, "p"] | None = None) -> MotionSolver:
+    """The solver for the device of a grid; matches are those of some cells, or of all."""
+    if grid.on_gpu:
+        from geogs.bundle.cuda.motion import CudaMotion
+
+        return CudaMotion(grid, cells)
+    from geogs.bundle.motion import CpuMotion
+
+    return CpuMotion(grid, cells)
 
 
 def grid_fields(grid: SampleGrid) -> GridFields:

@@ -223,7 +223,7 @@ class Settings:
 
     def __post_init__(self) -> None:
         """Raises InputError for a value that a setting cannot have."""
-        for name, kind in kinds(type(self)):
+        for name, kind in kinds(type(self)):  # type: ignore[arg-type]
             value = getattr(self, name)
             if not kind.allows(value, self):
                 at = f"{self.group}." if self.group else ""

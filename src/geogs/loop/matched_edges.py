@@ -13,7 +13,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from geogs.bundle.linearise import robust_weight
+from geogs.bundle.linearise import EliminatedDepth, weighed_residuals
+from geogs.bundle.problem import source_chunks, sources_within
 from geogs.bundle.projection import linearise, project
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import sim3_adjoint, sim3_inverse
@@ -67,18 +68,15 @@ class BlockEquations:
 
 
 @dataclass(frozen=True)
-class EliminatedDepth:
-    """What brings the inverse depth of one source back after the keyframes have moved."""
+class SimilarityStar:
+    """A source with its edges, linearised in their relative similarities."""
 
     source: int
     targets: Int[Tensor, "k"]
     adjoint: Float[Tensor, "k 6 7"]
     """First six rows of Ad(S_ji)."""
-    coupling: Float[Tensor, "k6 p"]
-    """sum w (d pixel / d xi_rel) (d pixel / d inverse depth)."""
-    curvature: Float[Tensor, "p"]
-    """Damped sum w |d pixel / d inverse depth|^2."""
-    gradient: Float[Tensor, "p"]
+    depth: EliminatedDepth
+    """What brings its inverse depth back after the keyframes have moved."""
 
 
 @dataclass(frozen=True)
@@ -86,7 +84,7 @@ class LinearMatches:
     """All matched edges at one state."""
 
     equations: BlockEquations
-    depths: tuple[EliminatedDepth, ...]
+    stars: tuple[SimilarityStar, ...]
     valid: Bool[Tensor, "e p"]
     """Cells in front of their target; only these count."""
 
@@ -150,17 +148,15 @@ def linearise_matches(
     n = len(S)
     gradient = torch.zeros(n, 7, dtype=torch.float64)
     rows, columns, blocks = [], [], []
-    depths: list[EliminatedDepth] = []
+    stars: list[SimilarityStar] = []
     valid = []
-    for chunk in _by_source(edges.source, options.chunk):
+    for chunk in source_chunks(edges.source, options.chunk):
         i, j = edges.source[chunk], edges.target[chunk]
         S_ji = relative_similarity(S, i, j)
         p = linearise(edges.camera, edges.rays, S_ji, inverse_depth[i])
         valid.append(p.valid)
-        r = edges.pixels[chunk] - p.pixels
-        w = options.share * robust_weight(
-            r, edges.weight[chunk] * p.valid[..., None], options.huber
-        )
+        r, w = weighed_residuals(p, edges.pixels[chunk], edges.weight[chunk], options.huber)
+        w = options.share * w
         J, D = p.pose_jacobian, p.depth_jacobian
         wJ = J * w.mT[:, None]
         H = (wJ.flatten(2) @ J.flatten(2).mT).double()
@@ -168,29 +164,23 @@ def linearise_matches(
         coupling = (wJ * D.mT[:, None]).sum(2)
         curvature, b = (w * D.square()).sum(-1), (w * D * r).sum(-1)
         adjoint = sim3_adjoint(S_ji)[:, :6]
-        for frame in torch.unique_consecutive(i).tolist():
-            e = torch.nonzero(i == frame)[:, 0]
+        for frame, e in sources_within(i):
             c = curvature[e].sum(0)
-            star = EliminatedDepth(
-                frame,
-                j[e],
-                adjoint[e],
-                coupling[e].flatten(0, 1),
-                c * (1 + damping) + options.depth_damping * c.mean() + 1e-12,
-                b[e].sum(0),
-            )
+            damped = c * (1 + damping) + options.depth_damping * c.mean() + 1e-12
+            depth = EliminatedDepth(coupling[e].flatten(0, 1), damped, b[e].sum(0))
+            star = SimilarityStar(frame, j[e], adjoint[e], depth)
             at, block, g = _reduced(star, H[e], v[e])
             gradient.index_add_(0, at, g)
             rows.append(at.repeat_interleave(len(at)))
             columns.append(at.repeat(len(at)))
             blocks.append(block.flatten(0, 1))
-            depths.append(star)
-    if not depths:
+            stars.append(star)
+    if not stars:
         empty = torch.zeros(0, dtype=torch.long)
         none = BlockEquations(empty, empty, gradient.new_zeros(0, 7, 7), gradient)
         return LinearMatches(none, (), torch.zeros(edges.weight.shape[:2], dtype=torch.bool))
     equations = BlockEquations(torch.cat(rows), torch.cat(columns), torch.cat(blocks), gradient)
-    return LinearMatches(equations, tuple(depths), torch.cat(valid))
+    return LinearMatches(equations, tuple(stars), torch.cat(valid))
 
 
 def depth_step(
@@ -198,35 +188,20 @@ def depth_step(
 ) -> Float[Tensor, "n p"]:
     """Step of inverse depth that goes with the step ``xi`` of the keyframes."""
     delta = torch.zeros_like(inverse_depth)
-    for star in linear.depths:
+    for star in linear.stars:
         relative = xi[star.targets, :6] - star.adjoint @ xi[star.source]
-        moved = star.coupling.mT @ relative.reshape(-1).to(star.coupling)
-        delta[star.source] = (star.gradient - moved) / star.curvature
+        delta[star.source] = star.depth.step(relative.reshape(-1))
     return delta
 
 
 def _reduced(
-    star: EliminatedDepth, hessian: Float[Tensor, "k 6 6"], gradient: Float[Tensor, "k 6"]
-) -> tuple[Tensor, Tensor, Tensor]:
-    """A star without its depths over its keyframes: indices, blocks (m, m, 7, 7), gradient."""
-    k, E = len(star.targets), star.coupling
-    block = torch.block_diag(*hessian) - ((E / star.curvature) @ E.mT).double()
-    g = gradient.reshape(-1) - (E @ (star.gradient / star.curvature)).double()
+    star: SimilarityStar, hessian: Float[Tensor, "k 6 6"], gradient: Float[Tensor, "k 6"]
+) -> tuple[Int[Tensor, "m"], Float[Tensor, "m m 7 7"], Float[Tensor, "m 7"]]:
+    """A star without its depths over its keyframes: indices, blocks, gradient."""
+    k = len(star.targets)
+    block, g = star.depth.reduce(torch.block_diag(*hessian), gradient.reshape(-1))
     target = torch.eye(6, 7, dtype=torch.float64)
     chain = torch.cat([torch.block_diag(*[target] * k), -star.adjoint.reshape(6 * k, 7)], 1)
     at = torch.cat([star.targets, star.targets.new_tensor([star.source])])
     full = (chain.mT @ block @ chain).reshape(k + 1, 7, k + 1, 7).transpose(1, 2)
     return at, full, (chain.mT @ g).reshape(k + 1, 7)
-
-
-def _by_source(source: Int[Tensor, "e"], size: int) -> list[slice]:
-    """Slices of about ``size`` edges that never split the edges of one source."""
-    if not len(source):
-        return []
-    ends = [*(torch.nonzero(source[1:] != source[:-1])[:, 0] + 1).tolist(), len(source)]
-    slices, start = [], 0
-    for end, following in zip(ends, [*ends[1:], len(source) + size + 1], strict=True):
-        if following - start > size:
-            slices.append(slice(start, end))
-            start = end
-    return slices

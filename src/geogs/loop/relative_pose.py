@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from geogs.bundle.linearise import robust_weight
+from geogs.bundle.linearise import weighed_residuals
 from geogs.bundle.projection import LinearProjection, linearise
 from geogs.geometry.lie import move, se3_inverse
 from geogs.keyframes.grid import SampleGrid
@@ -129,8 +129,7 @@ def _normal_equations(
     p: LinearProjection, pixels: Tensor, weight: Tensor, options: RelativePoseOptions
 ) -> tuple[Float[Tensor, "e 6 6"], Float[Tensor, "e 6"], Float[Tensor, "e"]]:
     """Damped H, g and the robustly weighted sum of squared residuals; float64."""
-    r = pixels - p.pixels
-    w = robust_weight(r, weight * p.valid[..., None], options.huber)
+    r, w = weighed_residuals(p, pixels, weight, options.huber)
     wJ = (p.pose_jacobian * w.mT[:, None]).flatten(2)
     H = (wJ @ p.pose_jacobian.flatten(2).mT).double()
     g = (wJ @ r.mT.flatten(1)[..., None])[..., 0].double()

@@ -19,7 +19,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from geogs.bundle.linearise import robust_weight
+from geogs.bundle.linearise import weighed_residuals
 from geogs.bundle.problem import BundleProblem
 from geogs.bundle.projection import linearise, relative_motion
 from geogs.config import PriorConfig
@@ -107,8 +107,7 @@ def flow_evidence(
         part = slice(first, first + chunk)
         source = problem.source[part].to(d.device)
         p = linearise(grid.camera, grid.rays, motion[part], d[source])
-        r = problem.pixels[part] - p.pixels
-        w = robust_weight(r, problem.weight[part] * p.valid[..., None], huber)
+        r, w = weighed_residuals(p, problem.pixels[part], problem.weight[part], huber)
         curvature.index_add_(0, source, (w * p.depth_jacobian.square()).sum(-1))
         gradient.index_add_(0, source, (w * p.depth_jacobian * r).sum(-1))
     return FlowEvidence(curvature, gradient)

@@ -6,10 +6,11 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from geogs.geometry.camera import Camera
+from geogs.bundle.problem import MotionProblem
 from geogs.gpu.kernels import kernels_for
 from geogs.gpu.transfer import to_device
 from geogs.keyframes.grid import SampleGrid
+from geogs.keyframes.keyframe import Keyframe
 
 SOURCE = Path(__file__).with_name("motion.cu")
 
@@ -18,66 +19,65 @@ def _threads(cells: int) -> int:
     return max(64, min(-(-cells // 32) * 32, 512))
 
 
-def solve_poses(
-    camera: Camera,
-    rays: Float[Tensor, "p 3"],
-    T_cw: Float[Tensor, "n 4 4"],
-    inverse_depth: Float[Tensor, "e p"],
-    T_source: Float[Tensor, "e 4 4"],
-    frame: Int[Tensor, "e"],
-    pixels: Float[Tensor, "e p 2"],
-    weight: Float[Tensor, "e p 2"],
-    iterations: int = 4,
-    huber: float = 3.0,
-) -> tuple[Float[Tensor, "n 4 4"], Float[Tensor, "e p 2"]]:
-    """Motion-only adjustment as ``geogs.bundle.motion.solve_poses``.
+class CudaMotion:
+    """Solver for some cells of a grid, or for all of them.
 
-    Poses and ``frame`` may be on the CPU; poses are returned where they were given.
+    Poses and ``frame`` of a problem may be on the CPU; poses are returned where they were given.
     """
-    n, device, frame = len(T_cw), inverse_depth.device, frame.cpu()
-    order = torch.argsort(frame, stable=True)
-    first = torch.searchsorted(frame[order], torch.arange(n + 1))
-    rows = to_device(torch.cat([first, order]).int(), device)
-    poses = to_device(torch.cat([T_cw, T_source]), device)
-    residual = torch.empty_like(pixels, memory_format=torch.contiguous_format)
-    cells = inverse_depth.shape[1]
-    kernels_for(SOURCE, device)["solve_poses"](
-        n, _threads(cells), rows[: n + 1], rows[n + 1 :], inverse_depth.contiguous(), poses[n:],
-        pixels.contiguous(), weight.contiguous(), None, rays.contiguous(), cells, camera.fx,
-        camera.fy, camera.cx, camera.cy, iterations, huber, poses, residual,
-    )  # fmt: skip
-    return poses[:n].to(T_cw.device), residual
 
+    def __init__(self, grid: SampleGrid, cells: Int[Tensor, "p"] | None = None) -> None:
+        self.grid = grid
+        self.rays = (grid.rays if cells is None else grid.rays[cells]).contiguous()
 
-def fit_frame(
-    grid: SampleGrid,
-    T_guess: Float[Tensor, "4 4"],
-    T_keyframe: Float[Tensor, "4 4"],
-    inverse_depth: Float[Tensor, "p"],
-    information: Float[Tensor, "p"],
-    pixels: Float[Tensor, "p 2"],
-    weight: Float[Tensor, "p 2"],
-    iterations: int,
-    huber: float,
-    limit: float,
-) -> tuple[Float[Tensor, "4 4"], Float[Tensor, "4"]]:
-    """As :func:`geogs.bundle.motion.fit_frame`; what it returns stays on the device."""
-    device, c, threads = inverse_depth.device, grid.camera, _threads(grid.size)
-    state = torch.cat([T_guess.reshape(-1), T_guess.new_zeros(4), T_keyframe.reshape(-1)])
-    state = to_device(state, device)
-    rows = torch.arange(2, dtype=torch.int32, device=device)
-    residual, pixels, weight = (
-        torch.empty_like(grid.pixels),
-        pixels.contiguous(),
-        weight.contiguous(),
-    )
-    kernels = kernels_for(SOURCE, device)
-    kernels["solve_poses"](
-        1, threads, rows, rows, inverse_depth, state[20:], pixels, weight, information, grid.rays,
-        grid.size, c.fx, c.fy, c.cx, c.cy, iterations, huber, state, residual,
-    )  # fmt: skip
-    kernels["judge_match"](
-        1, threads, pixels, weight, information, residual, grid.pixels, grid.size, limit,
-        state[16:], shared=4 * grid.size,
-    )  # fmt: skip
-    return state[:16].reshape(4, 4), state[16:20]
+    def solve(
+        self, problem: MotionProblem, iterations: int = 4, huber: float = 3.0
+    ) -> tuple[Float[Tensor, "n 4 4"], Float[Tensor, "e p 2"]]:
+        """As in the protocol."""
+        T_cw, d, frame, c = (
+            problem.T_cw,
+            problem.inverse_depth,
+            problem.frame.cpu(),
+            self.grid.camera,
+        )
+        n, device = len(T_cw), d.device
+        order = torch.argsort(frame, stable=True)
+        first = torch.searchsorted(frame[order], torch.arange(n + 1))
+        rows = to_device(torch.cat([first, order]).int(), device)
+        poses = to_device(torch.cat([T_cw, problem.T_source]), device)
+        pixels, weight = problem.pixels.contiguous(), problem.weight.contiguous()
+        residual = torch.empty_like(pixels)
+        kernels_for(SOURCE, device)["solve_poses"](
+            n, _threads(d.shape[1]), rows[: n + 1], rows[n + 1 :], d.contiguous(), poses[n:],
+            pixels, weight, None, self.rays, d.shape[1], c.fx, c.fy, c.cx, c.cy, iterations, huber,
+            poses, residual,
+        )  # fmt: skip
+        return poses[:n].to(T_cw.device), residual
+
+    def fit(
+        self,
+        T_guess: Float[Tensor, "4 4"],
+        keyframe: Keyframe,
+        pixels: Float[Tensor, "p 2"],
+        weight: Float[Tensor, "p 2"],
+        iterations: int,
+        huber: float,
+        limit: float,
+    ) -> tuple[Float[Tensor, "4 4"], Float[Tensor, "4"]]:
+        """As in the protocol."""
+        grid, c, known = self.grid, self.grid.camera, keyframe.information
+        device, threads = known.device, _threads(grid.size)
+        state = torch.cat([T_guess.reshape(-1), T_guess.new_zeros(4), keyframe.T_cw.reshape(-1)])
+        state = to_device(state, device)
+        rows = torch.arange(2, dtype=torch.int32, device=device)
+        pixels, weight = pixels.contiguous(), weight.contiguous()
+        residual = torch.empty_like(pixels)
+        kernels = kernels_for(SOURCE, device)
+        kernels["solve_poses"](
+            1, threads, rows, rows, keyframe.inverse_depth, state[20:], pixels, weight, known,
+            self.rays, grid.size, c.fx, c.fy, c.cx, c.cy, iterations, huber, state, residual,
+        )  # fmt: skip
+        kernels["judge_match"](
+            1, threads, pixels, weight, known, residual, grid.pixels, grid.size, limit,
+            state[16:], shared=4 * grid.size,
+        )  # fmt: skip
+        return state[:16].reshape(4, 4), state[16:20]
