@@ -6,12 +6,12 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from geogs.cli.options import parse_options
-from geogs.config.setting import Positional
+from geogs.config.setting import Positional, Settings
 from geogs_train.options import FlowTraining, RunOptions
 
 
 @dataclass(frozen=True)
-class TrainOptions:
+class TrainOptions(Settings):
     """Trains the flow network on random rooms that are made on the fly.
 
     OUTPUT gets checkpoint.safetensors (to go on with --run.resume), log.jsonl, curves.png and

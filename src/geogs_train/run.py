@@ -63,7 +63,7 @@ def train_flow(
                     _log(out, {"step": trainer.step, "loss": value, "rate": rate})
                     progress(f"step {trainer.step}/{options.steps}  loss {value:.3f}  "
                              f"{rate:.1f} steps/s  {left:.0f} min left")  # fmt: skip
-                if _all(worker, now - begin > 60 * run.minutes):
+                if _all(worker, run.minutes is not None and now - begin > 60 * run.minutes):
                     break
             if trainer.step % run.validate_every == 0 and validation is not None:
                 scores = _validate(trainer, validation, out, progress)

@@ -122,9 +122,7 @@ class Kind:
     is_optional: bool = False
     """Whether it can be none."""
     is_tuple: bool = False
-    """Whether it is several such values."""
-    count: int | None = None
-    """How many; none for any number."""
+    """Whether it is any number of such values."""
     ranges: tuple[Range, ...] = ()
     marks: tuple[object, ...] = ()
     """What else the type says of it, such as :class:`Basic`."""
@@ -139,9 +137,8 @@ class Kind:
         marks = tuple(mark for mark in marks if not isinstance(mark, Range))
         if origin in (Union, types.UnionType) and len(inner) == 2 and inner[1] is type(None):
             return replace(Kind.of(inner[0], (*ranges, *marks)), is_optional=True)
-        if origin is tuple and len(set(inner) - {...}) == 1:
-            count = None if ... in inner else len(inner)
-            return replace(Kind.of(inner[0], (*ranges, *marks)), is_tuple=True, count=count)
+        if origin is tuple and len(inner) == 2 and inner[1] is ...:
+            return replace(Kind.of(inner[0], (*ranges, *marks)), is_tuple=True)
         if origin is Literal:
             return Kind(str, inner, ranges=ranges, marks=marks)
         if annotation not in (bool, int, float, str, Path):
@@ -156,8 +153,7 @@ class Kind:
         if value is None:
             return self.is_optional
         if self.is_tuple:
-            several = isinstance(value, tuple) and self.count in (None, len(value))
-            return several and all(self._allows_one(v, group) for v in value)  # type: ignore[attr-defined]
+            return isinstance(value, tuple) and all(self._allows_one(v, group) for v in value)
         return self._allows_one(value, group)
 
     def read(self, text: str) -> Any:
@@ -178,7 +174,6 @@ class Kind:
             Path: ("a path", "paths"),
         }[self.base]
         text = many if self.is_tuple else one
-        text = f"{self.count} {text}" if self.count else text
         if Time in self.marks:
             text += ", as seconds or such as 90s, 10m or 1h,"
         if self.ranges:
