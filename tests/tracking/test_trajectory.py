@@ -6,6 +6,7 @@ import torch
 from geogs.geometry.lie import se3_exp, se3_inverse
 from geogs.tracking.flow.base import FlowMatch
 from geogs.tracking.trajectory import TrajectoryRecorder, depth_aware_weight, interpolate
+from geogs.types import Frame
 from planted_walk import planted_tracker
 
 
@@ -31,6 +32,11 @@ def test_uncertain_depth_lowers_the_weight_along_its_direction_only():
     assert float(depth_aware_weight(weight, slope, 0 * information).max()) == 0
 
 
+def frame(index: int) -> Frame:
+    """One that nobody looks at."""
+    return Frame(index, index / 30, np.zeros((2, 2, 3), np.uint8))
+
+
 def test_frames_of_a_culled_keyframe_keep_their_place_and_others_are_not_touched():
     tracker, _ = planted_tracker(6)
     recorder = TrajectoryRecorder(tracker.keyframes, tracker.operator)
@@ -39,7 +45,7 @@ def test_frames_of_a_culled_keyframe_keep_their_place_and_others_are_not_touched
         tracker.keyframes[n].frame_index = 3 * n
         recorder.add_keyframe(n)
         for k in (1, 2):
-            recorder.add(3 * n + k, (3 * n + k) / 30, n, n, step)
+            recorder.add(frame(3 * n + k), n, n, step)
     before = [recorder._pose(r).clone() for r in recorder.records]
     recorder.keyframe_removed(tracker.keyframes.remove(3), 2)
     assert [r.anchor for r in recorder.records] == [0] * 3 + [1] * 3 + [2] * 6 + [4] * 3
@@ -53,7 +59,7 @@ def test_what_is_kept_of_a_frame_is_small_and_finds_its_pose():
     recorder = TrajectoryRecorder(tracker.keyframes, tracker.operator)
     match, _ = tracker.operator.measure([0], [2])
     wrong = se3_exp(torch.tensor([0.02, 0, 0.01, 0, 0.01, 0], dtype=torch.float64))
-    recorder.add(50, 1.0, 2, 0, wrong @ T[2], FlowMatch(match.pixels, match.weight))
+    recorder.add(frame(50), 2, 0, wrong @ T[2], FlowMatch(match.pixels, match.weight))
     kept = recorder.records[0].observations[0]
     cells = len(kept.position)
     assert kept.position.nbytes + kept.half_weight.nbytes == 8 * cells

@@ -91,6 +91,8 @@ class CheckpointFolder:
             raise InputError(f"{MANIFEST} is damaged, or none of geogs") from error
         if checksum != Sum.of(_json(pack(Manifest, manifest).values)).sha256:
             raise InputError(f"{MANIFEST} has changed")
+        for name in (*manifest.state, *manifest.files):
+            _check_name(name)
         return manifest
 
     def read(self, name: str, wanted: Sum) -> bytes:
