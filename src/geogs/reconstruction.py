@@ -18,7 +18,7 @@ from geogs.mapping import known_poses as known
 from geogs.mapping.depth_schedule import search_depths
 from geogs.mapping.map_frame import MapFrame
 from geogs.mapping.mapper import Mapper
-from geogs.mapping.state import MapperState, mapper_state, restore_mapper
+from geogs.mapping.state import MapperState
 from geogs.mapping.training.base import TrainingPlace
 from geogs.on_demand import OnDemand
 from geogs.splat.map import DiskParameters
@@ -137,13 +137,12 @@ class Reconstruction:
                     self.mapper.check_depths()
                     self.mapper.grow()
         progress("growing", 1.0)
-        self._train(TrainingPlace(), progress)
+        self._train(progress)
 
     def state(self) -> ReconstructionState:
         """The work so far, to ``resume`` from; there is some once "growing" was reported."""
-        return ReconstructionState(
-            mapper_state(self.mapper), self._frame.origin, self._frame.unit, self.elapsed
-        )
+        frame = self._frame
+        return ReconstructionState(self.mapper.state(), frame.origin, frame.unit, self.elapsed)
 
     @on_one_torch_thread
     def resume(self, state: ReconstructionState, progress: Progress = _silent) -> None:
@@ -155,8 +154,8 @@ class Reconstruction:
         self._end = None if self._end is None else self._end - state.seconds
         self._frame = MapFrame(state.origin, state.unit)
         self._place_keyframes()
-        restore_mapper(self.mapper, state.mapper)
-        self._train(state.mapper.trained, progress)
+        self.mapper.load(state.mapper)
+        self._train(progress, goes_on=True)
 
     def trajectory(self) -> Trajectory:
         """The given poses."""
@@ -229,10 +228,10 @@ class Reconstruction:
             search_depths(mapper, ids, lambda f: progress(share + share * f))
         progress(1.0)
 
-    def _train(self, start: TrainingPlace, progress: Progress) -> None:
+    def _train(self, progress: Progress, goes_on: bool = False) -> None:
         with self.stopwatch("training"):
-            steps = self._steps(start)
-            self.mapper.train(steps, lambda f: progress("training", f), self._end, start)
+            steps = self._steps(self.mapper.trained if goes_on else TrainingPlace())
+            self.mapper.train(steps, lambda f: progress("training", f), self._end, goes_on)
 
     def _steps(self, start: TrainingPlace) -> int:
         """As many training steps as the time allows, or the usual number where none is given."""

@@ -8,17 +8,19 @@ import numpy as np
 import torch
 
 from geogs.config import Config
+from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.keyframes.grid import SampleGrid
-from geogs.keyframes.store import KeyframeStore
-from geogs.loop.closer import LoopCloser
+from geogs.keyframes.store import KeyframeStore, StoreState
+from geogs.loop.closer import LoopCloser, LoopsState
 from geogs.loop.global_bundle import global_bundle
 from geogs.mapping.mapper import Mapper
+from geogs.mapping.state import MapperState
 from geogs.priors.base import MonocularPrior
-from geogs.stopwatch import Stopwatch
+from geogs.stopwatch import Stopwatch, StopwatchState
 from geogs.threads import on_one_torch_thread
 from geogs.tracking.flow.select import build_operator
-from geogs.tracking.segments import Segments
+from geogs.tracking.segments import Segments, SegmentsState
 from geogs.tracking.tracker import Tracker, TrackResult, TrackState
 from geogs.types import Frame, MapSnapshot, RenderedKeyframe, Trajectory
 
@@ -38,6 +40,24 @@ class SlamStatus:
     frames: int
     keyframes: int
     disks: int
+
+
+@dataclass(frozen=True, eq=False)
+class SlamState:
+    """What a checkpoint holds of a system between two frames.
+
+    What a flow operator remembers of edges is left out; the classical has no memory.
+    """
+
+    keyframes: StoreState
+    segments: SegmentsState
+    loops: LoopsState
+    mapper: MapperState
+    stopwatch: StopwatchState
+    frames: int
+    waiting: list[int]
+    adjusted: int
+    is_ended: bool
 
 
 class Slam:
@@ -79,6 +99,30 @@ class Slam:
             self.camera, c.tracking, self.device, c.seed, self.operator, self.prior, c.prior,
             self.keyframes,
         )  # fmt: skip
+
+    def state(self) -> SlamState:
+        """What a checkpoint holds: to be written before the next frame, as it refers to all."""
+        return SlamState(
+            self.keyframes.state(), self.segments.state(), self.loops.state(), self.mapper.state(),
+            self.stopwatch.state(), self.frames, list(self._waiting), self.adjusted, self._is_ended,
+        )  # fmt: skip
+
+    @on_one_torch_thread
+    def load(self, state: SlamState) -> None:
+        """Give a new system, made with the same camera and settings, the state of another.
+
+        Raises:
+            InputError: the state is of another camera, or incomplete.
+        """
+        self.keyframes.load(state.keyframes)
+        self.segments.load(state.segments)
+        if not all(i in self.keyframes for i in (*state.waiting, *state.loops.detector.order)):
+            raise InputError("a keyframe is missing")
+        self.loops.load(state.loops)
+        self.mapper.load(state.mapper)
+        self.stopwatch.load(state.stopwatch)
+        self.frames, self._waiting = state.frames, deque(state.waiting)
+        self.adjusted, self._is_ended = state.adjusted, state.is_ended
 
     @property
     def is_ended(self) -> bool:

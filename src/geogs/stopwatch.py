@@ -3,6 +3,15 @@
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class StopwatchState:
+    """What a checkpoint holds of a stopwatch; the fields are the stopwatch's."""
+
+    seconds: dict[str, float]
+    until_stream_end: float | None
 
 
 class Stopwatch:
@@ -17,9 +26,13 @@ class Stopwatch:
         """Seconds of all stages up to the end of the stream; none before it."""
         self._is_running = False
 
-    def __getstate__(self) -> dict[str, object]:
-        """What a checkpoint holds: it is not running when that is read."""
-        return {**self.__dict__, "_is_running": False}
+    def state(self) -> StopwatchState:
+        """What a checkpoint holds."""
+        return StopwatchState(dict(self.seconds), self.until_stream_end)
+
+    def load(self, state: StopwatchState) -> None:
+        """Go on from where another was."""
+        self.seconds, self.until_stream_end = state.seconds, state.until_stream_end
 
     @property
     def total(self) -> float:

@@ -1,28 +1,31 @@
-"""A training run on disk: a few safetensors files and a page of numbers, no pickles."""
+"""A training run on disk: one safetensors file with its settings in the header, no pickles."""
 
 import json
-import shutil
 from dataclasses import asdict, is_dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
 import torch
-from safetensors.torch import load_file, save_file
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor
 
 from geogs.errors import InputError
+from geogs.io.writers.atomic import atomic_file
 from geogs_train.options import FlowTraining
 from geogs_train.trainer import FlowTrainer
 
-FOLDER = "checkpoint"
+FILE = "checkpoint.safetensors"
 T = TypeVar("T")
 _PARTS = ("network", "mean", "first_moment", "second_moment")
 
 
 def save_checkpoint(trainer: FlowTrainer, out: Path) -> None:
-    """Write all that the run needs to go on; the one before stays until the new one is whole."""
-    fresh, final = out / f".{FOLDER}", out / FOLDER
-    shutil.rmtree(fresh, ignore_errors=True)
-    fresh.mkdir(parents=True)
+    """Write all that the run needs to go on; the one before stays until the new one is whole.
+
+    Raises:
+        OutputError: it cannot be written.
+    """
     names = [name for name, _ in trainer.network.named_parameters()]
     moments = trainer.optimizer.state_dict()["state"]
     parts = {
@@ -31,30 +34,32 @@ def save_checkpoint(trainer: FlowTrainer, out: Path) -> None:
         "first_moment": {names[k]: v["exp_avg"] for k, v in moments.items()},
         "second_moment": {names[k]: v["exp_avg_sq"] for k, v in moments.items()},
     }
-    for name in _PARTS:
-        tensors = {k: v.detach().cpu().contiguous() for k, v in parts[name].items()}
-        save_file(tensors, fresh / f"{name}.safetensors")
-    state = {"step": trainer.step, "options": asdict(trainer.options)}
-    (fresh / "state.json").write_text(json.dumps(state, indent=1))
-    shutil.rmtree(final, ignore_errors=True)
-    fresh.rename(final)
+    tensors = {
+        f"{part}/{name}": x.detach().cpu().contiguous()
+        for part, some in parts.items()
+        for name, x in some.items()
+    }
+    header = {"step": str(trainer.step), "options": json.dumps(asdict(trainer.options))}
+    with atomic_file(out / FILE) as stream:
+        stream.write(save(tensors, metadata=header))
 
 
 def read_options(out: Path) -> FlowTraining:
     """The settings of the run in a folder; raises InputError where there is none."""
-    return _revived(FlowTraining, _read_state(out)["options"])
+    header, _ = _read(out, with_tensors=False)
+    return _revived(FlowTraining, json.loads(header["options"]))
 
 
 def load_checkpoint(trainer: FlowTrainer, out: Path) -> None:
     """Go on from a checkpoint; raises InputError where there is none or it is damaged."""
-    step = int(_read_state(out)["step"])
-    try:
-        parts = {name: load_file(out / FOLDER / f"{name}.safetensors") for name in _PARTS}
-    except Exception as error:
-        raise InputError(f"The checkpoint in {out} is damaged ({error}).") from error
+    header, tensors = _read(out, with_tensors=True)
+    step, names = int(header["step"]), [name for name, _ in trainer.network.named_parameters()]
+    parts = {
+        part: {k.partition("/")[2]: x for k, x in tensors.items() if k.startswith(f"{part}/")}
+        for part in _PARTS
+    }
     trainer.network.load_state_dict(parts["network"])
     trainer.mean.load_state_dict(parts["mean"])
-    names = [name for name, _ in trainer.network.named_parameters()]
     optimizer = trainer.optimizer.state_dict()
     if parts["first_moment"]:
         optimizer["state"] = {
@@ -82,8 +87,17 @@ def _revived(kind: type[T], values: dict[str, Any]) -> T:
     return kind(**found)
 
 
-def _read_state(out: Path) -> dict:
-    path = out / FOLDER / "state.json"
+def _read(out: Path, with_tensors: bool) -> tuple[dict[str, str], dict[str, Tensor]]:
+    """The header of a checkpoint and its tensors by name."""
+    path = out / FILE
     if not path.is_file():
         raise InputError(f"There is no checkpoint in {out}; start without --run.resume.")
-    return json.loads(path.read_text())
+    try:
+        with safe_open(str(path), framework="pt") as file:
+            names = file.keys() if with_tensors else ()
+            header, tensors = file.metadata() or {}, {n: file.get_tensor(n) for n in names}
+    except (SafetensorError, OSError) as error:
+        raise InputError(f"The checkpoint in {out} is damaged ({error}).") from error
+    if not header.keys() >= {"step", "options"}:
+        raise InputError(f"{path} is no checkpoint of a training run.")
+    return header, tensors

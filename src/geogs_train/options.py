@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Literal
 
-from geogs.tracking.flow.own_network import NetworkOptions
+from geogs.tracking.flow.own_options import NetworkOptions
 from geogs_train.rooms.options import RoomOptions
 
 
@@ -61,3 +61,20 @@ class FlowTraining:
     seed: int = 0
     bundle: BundleTraining = field(default_factory=BundleTraining)
     network: NetworkOptions = field(default_factory=NetworkOptions)
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """How a run is watched and when it pauses."""
+
+    validate_every: int = 1000
+    """Steps between validations, each with a checkpoint."""
+    validation_batches: int = 8
+    minutes: float = float("inf")
+    """The run stops with a checkpoint after so many minutes; it goes on with ``resume``."""
+    resume: bool = False
+    """Go on from the checkpoint in the output folder, with its settings."""
+    begin_with: str = ""
+    """Weights file to begin with; "" for random ones."""
+    fuse: bool = False
+    """Whether the network is compiled; worth its minute on a GPU."""

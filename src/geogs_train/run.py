@@ -3,7 +3,7 @@
 import json
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 
 import torch
@@ -13,7 +13,7 @@ from geogs.errors import GeogsError
 from geogs.tracking.flow.own import load_network
 from geogs_train.checkpoint import load_checkpoint, save_checkpoint
 from geogs_train.export import export_weights
-from geogs_train.options import FlowTraining
+from geogs_train.options import FlowTraining, RunOptions
 from geogs_train.scores import FlowScores
 from geogs_train.trainer import FlowTrainer, Worker
 from geogs_train.validation import Validation
@@ -21,23 +21,6 @@ from geogs_train.validation import Validation
 LOG = "log.jsonl"
 REPORT_EVERY = 50
 """Steps between lines of the log."""
-
-
-@dataclass(frozen=True)
-class RunOptions:
-    """How a run is watched and when it pauses."""
-
-    validate_every: int = 1000
-    """Steps between validations, each with a checkpoint."""
-    validation_batches: int = 8
-    minutes: float = float("inf")
-    """The run stops with a checkpoint after so many minutes; it goes on with ``resume``."""
-    resume: bool = False
-    """Go on from the checkpoint in the output folder, with its settings."""
-    begin_with: str = ""
-    """Weights file to begin with; "" for random ones."""
-    fuse: bool = False
-    """Whether the network is compiled; worth its minute on a GPU."""
 
 
 Progress = Callable[[str], None]
@@ -49,8 +32,9 @@ def train_flow(
 ) -> FlowScores | None:
     """Train until the last step or the last minute; returns the last validation's scores.
 
-    The first worker writes ``checkpoint/``, ``log.jsonl`` and ``flow.safetensors`` (the running
-    mean of the weights in half precision) to ``out``. Ctrl-C ends it as the last minute does.
+    The first worker writes ``checkpoint.safetensors``, ``log.jsonl`` and ``flow.safetensors`` (the
+    running mean of the weights in half precision) to ``out``. Ctrl-C ends it as the last minute
+    does.
 
     Raises:
         GeogsError: the weights are no longer finite.

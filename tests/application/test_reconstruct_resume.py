@@ -11,7 +11,8 @@ import pytest
 import torch
 from scipy.spatial import cKDTree
 
-from geogs.application.checkpoint import fingerprint, read_checkpoint, write_checkpoint
+from geogs.application.checkpoint import checkpoint_folder, has_checkpoint, write_checkpoint
+from geogs.application.reconstruct_checkpoint import ReconstructState, fingerprint, read_work
 from geogs.config import ReconstructConfig
 from geogs.errors import InputError
 from geogs.mapping.state import restore_mapper
@@ -45,12 +46,17 @@ def interrupted(scene: Reconstruction, fraction: float) -> None:
         scene.finish(progress=interrupt)
 
 
+def write_work(output: Path, scene: Reconstruction) -> None:
+    """A checkpoint of its work."""
+    write_checkpoint(checkpoint_folder(output), ReconstructState("these", scene.state()))
+
+
 @pytest.mark.parametrize("fraction", [0.0, 0.6])
 def test_work_that_was_cut_off_is_gone_on_with(tmp_path, fraction):
-    first, path = ball_and_wall(far=10.0), tmp_path / "checkpoint"
+    first = ball_and_wall(far=10.0)
     interrupted(first, fraction)
-    write_checkpoint(path, first.state(), "these")
-    state = read_checkpoint(path, "these")
+    write_work(tmp_path, first)
+    state = read_work(tmp_path, "these")
     assert state.seconds > 0
     second, stages = ball_and_wall(far=10.0), []
     second.resume(state, lambda stage, _: stages.append(stage))
@@ -69,9 +75,9 @@ def test_work_that_was_cut_off_is_gone_on_with(tmp_path, fraction):
 def test_a_restored_mapper_is_the_same(tmp_path):
     first = ball_and_wall()
     interrupted(first, 0.5)
-    write_checkpoint(tmp_path / "c", first.state(), "these")
+    write_work(tmp_path, first)
     second = ball_and_wall()
-    state = read_checkpoint(tmp_path / "c", "these")
+    state = read_work(tmp_path, "these")
     second.mapper.move([v.T_cw for v in first.mapper.views.values()])
     restore_mapper(second.mapper, state.mapper)
     assert second.mapper.trained == first.mapper.trained
@@ -93,17 +99,13 @@ def test_a_restored_mapper_is_the_same(tmp_path):
 
 
 def test_a_wrong_checkpoint_is_one_sentence(tmp_path):
-    path = tmp_path / "checkpoint.safetensors"
     with pytest.raises(InputError, match="nothing to resume"):
-        read_checkpoint(path, "these")
-    path.write_bytes(b"rubbish")
-    with pytest.raises(InputError, match="damaged"):
-        read_checkpoint(path, "these")
+        read_work(tmp_path, "these")
     scene = ball_and_wall()
     interrupted(scene, 0.0)
-    write_checkpoint(path, scene.state(), "these")
+    write_work(tmp_path, scene)
     with pytest.raises(InputError, match="other settings or images"):
-        read_checkpoint(path, "those")
+        read_work(tmp_path, "those")
 
 
 def test_fingerprints_change_with_settings_and_images():
@@ -121,10 +123,10 @@ def test_an_interrupted_command_resumes(room, tmp_path):
         "reconstruct", room, "-o", tmp_path, "--stride", 5, "--mapping.render-long-edge", 160,
         "--search.least-steps", 1500, "--search.no-repeat", "--device", "cpu",
     ]  # fmt: skip
-    checkpoint = tmp_path / "checkpoint.safetensors"
+    checkpoint = tmp_path / "checkpoint" / "manifest.json"
     process = subprocess.Popen([*GEOGS, *map(str, call)], stderr=subprocess.PIPE, text=True)
     deadline = time.monotonic() + 200
-    while not checkpoint.is_file() and process.poll() is None and time.monotonic() < deadline:
+    while not has_checkpoint(tmp_path) and process.poll() is None and time.monotonic() < deadline:
         time.sleep(0.05)
     process.send_signal(signal.SIGINT)
     _, said = process.communicate(timeout=200)
@@ -142,7 +144,7 @@ def test_an_interrupted_command_resumes(room, tmp_path):
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert summary["interrupted"] is False
     assert "depth" not in summary["seconds"]
-    assert not checkpoint.exists()
+    assert not checkpoint.parent.exists()
     again = geogs(*call, "--resume")
     assert again.returncode == 2
     assert "nothing to resume" in again.stderr.splitlines()[-1]

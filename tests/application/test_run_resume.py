@@ -1,6 +1,5 @@
 """``geogs run --resume``: checkpoints of a run that was interrupted or killed, and wrong ones."""
 
-import errno
 import json
 import os
 import shutil
@@ -13,18 +12,20 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import torch
+from safetensors.torch import load_file
 
+from geogs.application.checkpoint import checkpoint_folder
 from geogs.application.progress import RunProgress
 from geogs.application.run_checkpoint import RunCheckpoint, RunFacts, frames_after
 from geogs.application.settings import RunSettings
 from geogs.config import InputConfig
 from geogs.errors import InputError
 from geogs.io.sources.sniff import open_source
-from geogs.io.writers.native import load_map
-from geogs.keyframes.archive import Archive
 from geogs.slam import Slam
 from geogs.synth.export import write_sequence
 from geogs.tracking.segments import Segments
+from geogs.version import __version__
 
 GEOGS = [sys.executable, "-m", "geogs.cli.main"]
 FRAMES = 40
@@ -32,7 +33,7 @@ QUICK = [
     "--mapping.render-long-edge", "128", "--mapping.iterations", "4",
     "--mapping.pose-iterations", "1", "--mapping.final-iterations", "20",
     "--mapping.no-final-depth",
-    "--tracking.resident-keyframes", "4", "--mapping.resident-views", "4",
+    "--resident-keyframes", "4",
 ]  # fmt: skip
 OFTEN = ["--checkpoint-every", "0.05"]
 
@@ -76,16 +77,15 @@ def stop(
     arguments: list[str], number: int, out: Path, checkpoints: int, cwd: Path | None = None
 ) -> str:
     """Start the command, signal it after some checkpoints; what it said."""
-    state, seen = out / "checkpoint" / "state", set()
+    seen: set[tuple[str, ...]] = set()
     log = out.parent / f"log{number}"
     with log.open("wb") as stream:
         command = [*GEOGS, *arguments]
         process = subprocess.Popen(command, stdout=stream, stderr=stream, cwd=cwd)
-        before = state.stat().st_mtime_ns if state.exists() else 0
+        before = {complete(out)}
         deadline = time.monotonic() + 200
         while time.monotonic() < deadline and process.poll() is None and len(seen) < checkpoints:
-            if state.exists() and state.stat().st_mtime_ns != before:
-                seen.add(state.stat().st_mtime_ns)
+            seen |= {complete(out)} - before - {()}
             time.sleep(0.02)
         process.send_signal(number)
         code = process.wait(timeout=200)
@@ -93,6 +93,20 @@ def stop(
     assert len(seen) == checkpoints, said
     assert code == (0 if number == signal.SIGINT else -number), said
     return " ".join(said.split())
+
+
+def assert_same_map(out: Path, other: Path) -> None:
+    """Every tensor of two maps, bit for bit."""
+    own, twin = (load_file(folder / "map.safetensors") for folder in (out, other))
+    assert own.keys() == twin.keys()
+    for name in own:
+        assert torch.equal(own[name], twin[name]), name
+
+
+def complete(out: Path) -> tuple[str, ...]:
+    """Names of the files of the complete state."""
+    manifest = checkpoint_folder(out).manifest()
+    return () if manifest is None else tuple(manifest.state)
 
 
 def test_a_killed_run_goes_on_even_after_another_interruption(room, whole, killed, tmp_path):
@@ -111,8 +125,7 @@ def test_a_killed_run_goes_on_even_after_another_interruption(room, whole, kille
     assert not (out / "checkpoint").exists()
     for name in ("trajectory.tum", "keyframes.tum", "mesh.ply"):
         assert (out / name).read_bytes() == (whole / name).read_bytes(), name
-    disks, twin = load_map(out / "map.safetensors"), load_map(whole / "map.safetensors")
-    assert (disks.position == twin.position).all()
+    assert_same_map(out, whole)
     summary = json.loads((out / "summary.json").read_text())
     assert summary["interrupted"] is False
     assert 0 < summary["seconds"]["checkpoints"] < 0.1 * summary["seconds"]["total"]
@@ -123,20 +136,23 @@ def test_a_killed_run_goes_on_even_after_another_interruption(room, whole, kille
     assert "nothing to resume" in again.stderr.splitlines()[-1]
 
 
-def test_a_run_killed_in_its_final_stages_does_only_those_again(room, whole, tmp_path):
+def test_a_run_killed_in_its_final_stages_does_only_those_again(room, whole, killed, tmp_path):
     out = tmp_path / "out"
-    (out / "checkpoint").mkdir(parents=True)
-    for name in ("state", "archive-of-another-run"):
-        (out / "checkpoint" / name).touch()
+    shutil.copytree(killed, out)
+    foreign = out / "checkpoint" / "notes.txt"
+    foreign.write_text("mine")
+    old = list((out / "checkpoint").glob("archive-*"))
     # Nothing is due before the end of the stream.
     said = stop(["run", str(room), "-o", str(out), *QUICK, "--checkpoint-every", "900"],
                 signal.SIGKILL, out, 1)  # fmt: skip
     assert f"Starting anew; geogs run --resume {out} would go on" in said
-    assert not (out / "checkpoint" / "archive-of-another-run").exists()
+    assert not any(path.exists() for path in old)
     done = geogs("run", "--resume", out)
     assert done.returncode == 0, done.stderr
     assert f"Going on after {FRAMES} frames." in done.stderr
     assert (out / "mesh.ply").read_bytes() == (whole / "mesh.ply").read_bytes()
+    assert [path.name for path in (out / "checkpoint").iterdir()] == ["notes.txt"]
+    assert foreign.read_text() == "mine"
 
 
 SEVERAL = """
@@ -165,32 +181,47 @@ def sentences(calls: list[list[object]]) -> list[str]:
 
 
 def test_what_cannot_be_resumed_is_one_sentence(killed, tmp_path):
-    good = (killed / "checkpoint" / "state").read_bytes()
-    cases = {
-        "nothing to resume": None,
-        "is cut off": good[:-100],
-        "has changed": good[:5000] + bytes([good[5000] ^ 1]) + good[5001:],
-        "content has changed": good + b"more",
-        "no checkpoint of geogs": b"rubbish" * 50,
-        "another version": b"geogs run checkpoint 1, geogs 0.0.1\n" + good,
-    }
+    """Checkpoints that were damaged, made up, moved or are of another version."""
+
+    def flip(path: Path) -> None:
+        data = bytearray(path.read_bytes())
+        data[len(data) // 2] ^= 1
+        path.write_bytes(data)
+
+    def link(path: Path) -> None:
+        path.rename(tmp_path / "victim")
+        path.symlink_to(tmp_path / "victim")
+
+    def old(path: Path) -> None:
+        shutil.rmtree(path.parent)
+        path.parent.mkdir()
+        harm = f"cos\nmkdir\n(V{tmp_path / 'harm'}\ntR."  # a pickle, as there once were
+        title = f"geogs run checkpoint 1, geogs {__version__}\n"
+        (path.parent / "state").write_text(title + harm)
+
+    cases = [
+        ("nothing to resume", "manifest.json", lambda p: shutil.rmtree(p.parent)),
+        ("nothing to resume", "manifest.json", old),
+        ("has changed", "manifest.json", flip),
+        ("is a link", "manifest.json", lambda p: link(p.parent)),
+        ("is cut off", "*.json", lambda p: os.truncate(p, 1000)),
+        ("has changed", "*.safetensors", flip),
+        ("is cut off", "archive-*", lambda p: os.truncate(p, 1000)),
+        ("cannot be opened", "archive-*", Path.unlink),
+    ]
     calls: list[list[object]] = []
-    for n, content in enumerate(cases.values()):
+    for n, (_, name, change) in enumerate(cases):
         out = tmp_path / str(n)
-        (out / "checkpoint").mkdir(parents=True)
-        if content is not None:
-            (out / "checkpoint" / "state").write_bytes(content)
-        calls.append(["run", "--resume", out])
-    for n, change in enumerate((lambda p: os.truncate(p, 1000), Path.unlink)):
-        out = tmp_path / f"archive{n}"
         shutil.copytree(killed, out)
-        change(max((out / "checkpoint").glob("archive-*"), key=lambda p: p.stat().st_size))
+        change(max((out / "checkpoint").glob(name), key=lambda p: p.stat().st_size))
         calls.append(["run", "--resume", out])
     calls.append(["run", "--resume", killed, "--stride", 2])
     calls.append(["run", "--resume", killed, "--preset", "fast"])
-    more = ["is cut off", "cannot be opened", *["leave out everything else"] * 2]
-    for wanted, said in zip([*cases, *more], sentences(calls), strict=True):
-        assert wanted in said
+    calls.append(["reconstruct", killed, "-o", killed, "--resume"])
+    wanted = [w for w, *_ in cases] + ["leave out everything else", "leave out --preset"]
+    for text, said in zip([*wanted, ""], sentences(calls), strict=True):
+        assert text in said
+    assert not (tmp_path / "harm").exists()
 
 
 def test_a_source_that_is_gone_or_changed_is_one_sentence(room, killed):
@@ -259,43 +290,3 @@ def test_reading_goes_on_where_it_was(tmp_path):
                 assert other.spans == source.spans
     with pytest.raises(InputError, match="not what it was"):
         frames_after(source, open_source(folders[:1], config).place)
-
-
-def test_archives_keep_what_the_last_checkpoint_refers_to(tmp_path):
-    archive = Archive(resident=0)
-    first, kept = (archive.put(np.full(100, n)) for n in range(2))
-    settled = archive.settle(tmp_path)
-    archive.release()
-    places = (first.key, first.offset), (kept.key, kept.offset)
-    del first
-    later = [archive.put(np.full(100, 7 + n)) for n in range(3)]
-    again = Archive.reopened(tmp_path, settled)  # as after a kill
-    shape, dtype = (100,), np.dtype(np.int64)
-    for n, (key, offset) in enumerate(places):
-        assert (again.archived(key, offset, shape, dtype).load() == n).all()
-    assert again.size == 2 * 800
-    del again
-    # A complete checkpoint that knows nothing of the first array lets its space go.
-    for _ in range(2):
-        settled = archive.settle(tmp_path)
-        archive.release()
-    size = archive.size
-    later.append(archive.put(np.full(100, 3)))
-    assert archive.size <= size + 800
-    assert len(list(tmp_path.iterdir())) == 1
-
-
-def test_an_archive_that_finds_no_room_stays_where_it_was(tmp_path, monkeypatch):
-    archive = Archive(tmp_path)
-    handle = archive.put(np.arange(1000))
-    write = os.pwrite
-
-    def full(descriptor: int, data: bytes, offset: int) -> int:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    monkeypatch.setattr(os, "pwrite", full)
-    with pytest.raises(Exception, match="No space left"):
-        archive.settle(tmp_path)
-    monkeypatch.setattr(os, "pwrite", write)
-    assert list(tmp_path.iterdir()) == []
-    assert (handle.load() == np.arange(1000)).all()

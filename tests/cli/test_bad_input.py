@@ -13,6 +13,7 @@ from geogs.config import InputConfig
 from geogs.errors import GeogsError, InputError, OutputError
 from geogs.io.poses import read_tum_trajectory
 from geogs.io.sources.sniff import open_source
+from geogs.io.writers import atomic
 from geogs.io.writers.atomic import prepare_output_folder, write_text
 from geogs.io.writers.native import save_map
 from geogs.io.writers.ply import write_mesh, write_splats
@@ -259,10 +260,10 @@ def test_read_only_output_folder(tmp_path):
 
 
 def test_read_only_output_folder_for_root_too(tmp_path, monkeypatch):
-    def refuse(self, *args, **kwargs):
-        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(self))
+    def refuse(dir):
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(dir))
 
-    monkeypatch.setattr(Path, "open", refuse)
+    monkeypatch.setattr(atomic, "TemporaryFile", refuse)
     with pytest.raises(OutputError) as error:
         prepare_output_folder(tmp_path)
     assert "Permission denied" in sentence(error)

@@ -6,8 +6,10 @@ from typing import Annotated, Literal
 
 import pytest
 
+from geogs.application.eval_settings import EvalSettings
 from geogs.cli import reconstruct, run
-from geogs.cli.options import help_text, parse_options
+from geogs.cli.help import help_text
+from geogs.cli.options import parse_options
 from geogs.config.leaves import leaves
 from geogs.config.setting import Basic, Only, Positional, Range, Settings, Unnamed
 from geogs.errors import InputError
@@ -125,6 +127,8 @@ def test_what_is_wrong_is_one_sentence(argv: str, sentence: str) -> None:
 def test_a_missing_word_is_named() -> None:
     with pytest.raises(InputError, match=r"geogs run needs SOURCE: what to read\."):
         parse("--kind", "b")
+    with pytest.raises(InputError, match=r"geogs eval needs --gt: true poses\."):
+        parse_options(EvalSettings, ["x"], "eval")
 
 
 def test_no_arguments_show_the_usage(capsys) -> None:

@@ -183,5 +183,8 @@ def test_kinds_come_from_types() -> None:
     assert kind.read("0.5,1") == (0.5, 1.0)
     assert kind.read("None") is None
     assert not kind.allows(kind.read("0.5,x"))
+    pair = Kind.of(tuple[float, float])
+    assert pair.allows(pair.read("1,2"))
+    assert not pair.allows(pair.read("1,2,3"))
     with pytest.raises(TypeError, match="no setting can be of the type"):
         Kind.of(dict[str, int])

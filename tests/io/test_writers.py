@@ -187,6 +187,9 @@ def test_output_folder_is_made_and_probed(tmp_path):
     folder = prepare_output_folder(tmp_path / "new" / "out")
     assert folder.is_dir()
     assert list(folder.iterdir()) == []
+    (folder / ".writable").write_text("of somebody else")
+    assert [path.name for path in prepare_output_folder(folder).iterdir()] == [".writable"]
+    assert (folder / ".writable").read_text() == "of somebody else"
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match="is a file; give another folder"):
         prepare_output_folder(tmp_path / "file")

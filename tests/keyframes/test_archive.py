@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from geogs.application.checkpoint_folder import CheckpointFolder
 from geogs.errors import OutputError
 from geogs.geometry.camera import Camera
 from geogs.keyframes.archive import Archive
@@ -122,3 +123,43 @@ def test_keyframes_do_not_hold_their_images():
         store[n].image[0, 0, 0]  # having been looked at changes nothing
     assert resident_bytes() - before < 8 << 20
     assert store[3].image[5, 5, 1] == 3
+
+
+def test_archives_keep_what_the_last_checkpoint_refers_to(tmp_path):
+    archive = Archive(resident=0)
+    first, kept = (archive.put(np.full(100, n)) for n in range(2))
+    settled = archive.settle(CheckpointFolder(tmp_path))
+    archive.release()
+    places = (first.offset, first.checksum), (kept.offset, kept.checksum)
+    del first
+    later = [archive.put(np.full(100, 7 + n)) for n in range(3)]
+    again = Archive.reopened(CheckpointFolder(tmp_path), archive.name, settled)  # as after a kill
+    shape, dtype = (100,), np.dtype(np.int64)
+    for n, (offset, checksum) in enumerate(places):
+        assert (again.piece(offset, shape, dtype, checksum).load() == n).all()
+    assert again.size == 2 * 800
+    del again
+    # A complete checkpoint that knows nothing of the first array lets its space go.
+    for _ in range(2):
+        settled = archive.settle(CheckpointFolder(tmp_path))
+        archive.release()
+    size = archive.size
+    later.append(archive.put(np.full(100, 3)))
+    assert archive.size <= size + 800
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+def test_an_archive_that_finds_no_room_stays_where_it_was(tmp_path, monkeypatch):
+    archive = Archive(tmp_path)
+    handle = archive.put(np.arange(1000))
+    write = os.pwrite
+
+    def full(descriptor: int, data: bytes, offset: int) -> int:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "pwrite", full)
+    with pytest.raises(Exception, match="No space left"):
+        archive.settle(CheckpointFolder(tmp_path))
+    monkeypatch.setattr(os, "pwrite", write)
+    assert list(tmp_path.iterdir()) == []
+    assert (handle.load() == np.arange(1000)).all()

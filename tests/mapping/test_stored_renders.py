@@ -17,7 +17,7 @@ from geogs.geometry.camera import Camera
 from geogs.keyframes.archive import Archive, Archived
 from geogs.mapping.rendered import rendered_keyframe
 from geogs.mapping.stored_renders import StoredRender, stored_render
-from geogs.mesh import extract_mesh
+from geogs.mesh.extract import extract_mesh
 from geogs.on_demand import OnDemand
 from geogs.reconstruction import Reconstruction
 from geogs.types import MapSnapshot, RenderedKeyframe, Trajectory

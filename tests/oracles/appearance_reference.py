@@ -12,14 +12,17 @@ from torch import Tensor
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import quaternion_to_matrix
 from geogs_bench.appearance.disks import AppearanceDisks
-from geogs_bench.appearance.rasteriser import MedianDisks, Rendering, normals_of_depth
+from geogs_bench.appearance.rasteriser import (
+    MIN_ALPHA,
+    PIXEL_SHARPNESS,
+    MedianDisks,
+    Rendering,
+    normals_of_depth,
+)
 from geogs_bench.appearance.spherical_harmonics import view_colours
 
 MAX_ALPHA = 0.999
-MIN_ALPHA = 1 / 255
 MIN_TRANSMITTANCE = 1e-4
-PIXEL_SHARPNESS = 2.0
-"""Inverse variance in 1/pixel^2 of the Gaussian around a centre below which no disk shrinks."""
 
 
 @dataclass(frozen=True)

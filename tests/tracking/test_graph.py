@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from credulous_flow import CredulousFlow
 from geogs.bundle.base import BundleOptions
 from geogs.bundle.select import grid_fields
 from geogs.keyframes.grid import SampleGrid
@@ -135,31 +136,37 @@ def test_a_frame_is_located_from_a_guess_and_from_nothing():
         assert motion.evidence.correlation > 0.97
 
 
-def test_noise_is_located_nowhere_however_much_of_it_the_flow_matches():
-    graph = room_graph(POSES[:1])
-    state, grid = graph.keyframes[0], graph.keyframes.grid
-    believing = FrameLocator(grid, graph.operator, 0.0, float("inf"), min_ncc=-1.0)
-    locator = FrameLocator(grid, graph.operator, 0.0, float("inf"), min_ncc=0.5)
+def test_noise_is_located_nowhere_even_if_the_flow_believes_in_it():
+    state, grid = room_graph(POSES[:1]).keyframes[0], SampleGrid(CAMERA)
+    operator = CredulousFlow(grid)
+    believing = FrameLocator(grid, operator, 0.12, 2.0, min_ncc=-1.0)
+    locator = FrameLocator(grid, operator, 0.12, 2.0, min_ncc=0.5)
     for seed in range(5):
         noise = np.random.default_rng(seed).integers(0, 255, (144, 192, 3), np.uint8)
-        encoded = graph.operator.encode(noise)
+        encoded = operator.encode(noise)
         found = believing.locate(state, encoded, state.T_cw)
         assert found is not None
-        assert found.evidence.windows > 100
-        assert found.evidence.correlation < 0.15
+        assert found.matched == 1.0
+        assert found.residual < 1e-3
+        assert found.evidence.windows > 300
+        assert found.evidence.correlation < 0.1
+        assert believing.relocate(state, encoded) is not None
         assert locator.locate(state, encoded, state.T_cw) is None
         assert locator.relocate(state, encoded) is None
 
 
 def test_a_frame_without_texture_is_located_only_where_it_was_expected():
     graph = room_graph(POSES[:1])
-    state = graph.keyframes[0]
     locator = FrameLocator(graph.keyframes.grid, graph.operator, 0.12, 2.0, min_ncc=0.5)
-    # Two grey levels are enough for the flow, and too little for evidence.
-    flat = [(90 + render(T)[0] / 255 * 5).astype(np.uint8) for T in (POSES[0], pose(0.02))]
-    state.picture.encoded, encoded = map(graph.operator.encode, flat)
+    # Some grey levels are enough for the flow, and too little for evidence.
+    flat = [(90 + render(T)[0] / 255 * 6).astype(np.uint8) for T in (POSES[0], pose(0.02))]
+    here, encoded = map(graph.operator.encode, flat)
+    first = graph.keyframes[0]
+    state = graph.keyframes.add(1, 0.1, flat[0], here, first.T_cw)
+    state.inverse_depth, state.information = first.inverse_depth, first.information
     motion = locator.locate(state, encoded, state.T_cw)
     assert motion is not None
+    assert motion.matched > 0.3
     assert motion.evidence.windows < MIN_WINDOWS
     assert locator.locate(state, encoded, state.T_cw, is_expected=False) is None
 

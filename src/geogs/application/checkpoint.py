@@ -1,148 +1,154 @@
-"""``checkpoint.safetensors``: a reconstruction's work so far, which survives Ctrl-C and kill."""
+"""Checkpoints: the state of some work in ``checkpoint/`` of its results, to go on from later.
 
-import hashlib
+The state, a record, is taken apart (:mod:`geogs.application.records`) into JSON and a safetensors
+file; large arrays of old keyframes lie in archives beside them, which only grow or are written
+where the last complete state refers to nothing. What belongs to the process (device, flow operator,
+prior, kernels, threads) is not stored: whoever reads has it.
+"""
+
 import json
 import time
-from collections.abc import Sequence
-from dataclasses import asdict
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any, Generic, TypeVar, get_type_hints
 
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
-from torch import Tensor
+from safetensors import SafetensorError
+from safetensors.torch import load, save
 
+from geogs.application.checkpoint_folder import FORMAT, CheckpointFolder
 from geogs.application.progress import RunProgress
-from geogs.config import ReconstructConfig
+from geogs.application.records import pack, schema, unpack
 from geogs.errors import InputError, OutputError
-from geogs.io.writers.atomic import atomic_file
-from geogs.mapping.state import DepthState, DiskState, MapperState
-from geogs.mapping.training.base import TrainingPlace
-from geogs.reconstruction import Reconstruction, ReconstructionState
-from geogs.splat.map import DiskParameters
+from geogs.keyframes.archive import Archive, SettledArchive
+from geogs.version import __version__
 
-FORMAT = "geogs-checkpoint-1"
+S = TypeVar("S")
+
+_UNUSABLE = (
+    OSError, InputError, SafetensorError, ValueError, TypeError, LookupError, ArithmeticError,
+    MemoryError, RuntimeError,
+)  # fmt: skip
+"""What reading a file may end with that somebody made up."""
+
 # Checkpoints may take this part of the time.
 _WRITING_SHARE = 0.05
 
 
-def fingerprint(config: ReconstructConfig, hold_out: int | None, images: Sequence[str]) -> str:
-    """Sixteen digits that change with any setting of the map and with the names of its images."""
-    parts = (config.seed, asdict(config.input), asdict(config.search), asdict(config.mapping))
-    text = json.dumps([*parts, hold_out, list(images)], sort_keys=True, default=str)
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
-
-
 class Checkpoint:
-    """The file in a result's folder, written now and then while the map is trained."""
+    """Writes the state of some work now and then; says once where that fails, and goes on."""
 
-    def __init__(self, output: Path, made_from: str, every: float, progress: RunProgress) -> None:
-        """``made_from`` is the fingerprint; every so many seconds it is written, never if 0."""
-        self.path = output / "checkpoint.safetensors"
-        self._made_from = made_from
+    def __init__(self, output: Path, every: float, progress: RunProgress) -> None:
+        """In a folder of results, every so many seconds, never if 0."""
+        self._folder = checkpoint_folder(output)
         self._every = every
         self._progress = progress
-        self._due: float | None = None
+        self._due = time.perf_counter() + every
 
-    def report(self, stage: str, scene: Reconstruction) -> None:
-        """At a report of progress: write it when the depths are done, then when its time comes."""
-        if self._every <= 0 or stage not in ("growing", "training"):
-            return
-        now = time.perf_counter()
-        if self._due is None:  # resumed work begins with its training
-            self._due = now + (0.0 if stage == "growing" else self._every)
-        if now >= self._due:
-            self.write(scene)
+    @property
+    def is_due(self) -> bool:
+        """Whether its time has come."""
+        return self._every > 0 and time.perf_counter() >= self._due
 
-    def write(self, scene: Reconstruction) -> bool:
-        """Write it, if there is something to go on from; where that fails, say so and go on."""
-        if self._every <= 0 or self._due is None:
+    def write_state(self, state: Callable[[], object]) -> bool:
+        """Write the record that a call gives; whether there is a complete checkpoint of it now."""
+        if self._every <= 0:
             return False
         start = time.perf_counter()
         try:
-            write_checkpoint(self.path, scene.state(), self._made_from)
+            write_checkpoint(self._folder, state())
         except OutputError as error:
-            self._progress.write(f"No checkpoint: {error}")
+            self._progress.write(f"No more checkpoints: {error}")
             self._every = 0.0
-        self._due = next_due(start, self._every)
+        now = time.perf_counter()
+        self._due = now + max(self._every, (now - start) / _WRITING_SHARE)
         return self._every > 0
 
-    def read(self) -> ReconstructionState:
-        """The work to go on from; says where that is.
+    def remove(self) -> None:
+        """After success: all that geogs wrote there."""
+        self._folder.remove()
+
+
+class SavedState(Generic[S]):
+    """A complete checkpoint of work whose state is a record of some kind."""
+
+    def __init__(self, output: Path, kind: type[S]) -> None:
+        """Raises InputError if there is none, it is damaged, or another version wrote it."""
+        self._kinds = get_type_hints(kind)
+        self._folder = checkpoint_folder(output)
+        with self.in_a_sentence():
+            manifest = self._folder.manifest()
+        if manifest is None or not manifest.state:
+            raise InputError(
+                f"There is nothing to resume: no complete checkpoint is in {self._folder.path}; "
+                "start anew without --resume."
+            )
+        with self.in_a_sentence():
+            if (manifest.format, manifest.geogs) != (FORMAT, __version__):
+                raise InputError(f"geogs {manifest.geogs} wrote it, another version than this")
+            if manifest.schema != schema(kind):
+                raise InputError("it is of another command, or another version wrote it")
+            self._files = manifest.state
+            self._values = json.loads(self._read("json"))
+
+    def facts(self, name: str) -> Any:
+        """A field of the state without any array. Raises InputError if it is damaged."""
+        with self.in_a_sentence():
+            return unpack(self._kinds[name], self._values["state"].get(name), {}, {}, name=name)
+
+    def work(self, name: str, device: torch.device | str = "cpu") -> Any:
+        """A field of the state, once; tensors that were on a GPU go to ``device``.
 
         Raises:
-            InputError: there is none, it is damaged, or made from other settings or images.
+            InputError: it is not what the kind says, or an array has changed.
         """
-        state = read_checkpoint(self.path, self._made_from)
-        place = state.mapper.trained
-        done = f"step {place.steps} of {place.total}" if place.steps else "the depths"
-        self._progress.write(f"Going on after {done}, {state.seconds:.0f} s into the work.")
-        return state
+        with self.in_a_sentence():
+            arrays, folder = load(self._read("safetensors")), self._folder
+            settled = unpack(dict[str, SettledArchive], self._values["archives"], {}, {})
+            archives = {n: Archive.reopened(folder, n, s) for n, s in settled.items()}
+            values = self._values["state"].pop(name)
+            return unpack(self._kinds[name], values, arrays, archives, device, name)
 
-    def remove(self) -> None:
-        """After success."""
-        self.path.unlink(missing_ok=True)
+    @contextmanager
+    def in_a_sentence(self) -> Iterator[None]:
+        """Whatever using it may end with becomes an InputError that says what to do."""
+        try:
+            yield
+        except _UNUSABLE as error:
+            reason = (str(error) or type(error).__name__).splitlines()[0]
+            raise InputError(
+                f"{self._folder.path} cannot be used ({reason}); start anew without --resume."
+            ) from error
 
-
-def next_due(start: float, every: float) -> float:
-    """When the next checkpoint is due, after one that was begun at ``start``; both seconds."""
-    now = time.perf_counter()
-    return now + max(every, (now - start) / _WRITING_SHARE)
-
-
-def write_checkpoint(path: Path, state: ReconstructionState, made_from: str) -> None:
-    """Write a state, completely or not at all. Raises OutputError if that fails."""
-    depths, disks, place = state.mapper.depths, state.mapper.disks, state.mapper.trained
-    tensors = {
-        "origin": torch.from_numpy(state.origin),
-        **{f"depths.{name}": x for name, x in vars(depths).items()},
-        **{f"disks.{name}": getattr(disks, name) for name in ("keyframe_id", "steps", "seen")},
-    }
-    for group in ("parameters", "first", "second"):
-        values: DiskParameters = getattr(disks, group)
-        tensors |= {f"{group}.{name}": x for name, x in values._asdict().items()}
-    numbers = {"unit": state.unit, "seconds": state.seconds, "place": asdict(place)}
-    header = {"format": FORMAT, "made_from": made_from, "numbers": json.dumps(numbers)}
-    with atomic_file(path) as stream:
-        stream.write(save({k: x.contiguous() for k, x in tensors.items()}, metadata=header))
+    def _read(self, ending: str) -> bytes:
+        """What the file of the state with this ending holds."""
+        (name,) = (name for name in self._files if name.endswith(f".{ending}"))
+        return self._folder.read(name, self._files[name])
 
 
-def read_checkpoint(path: Path, made_from: str) -> ReconstructionState:
-    """Read what was written with the same fingerprint.
+def write_checkpoint(folder: CheckpointFolder, state: object) -> None:
+    """Write a record in place of the last, completely or not at all. Raises OutputError."""
+    kind = type(state)
+    packed = pack(kind, state)
+    with folder.replaced(schema(kind), packed.archives) as write:
+        settled = {name: archive.settle(folder) for name, archive in packed.archives.items()}
+        archives = pack(dict[str, SettledArchive], settled).values
+        write("json", json.dumps({"archives": archives, "state": packed.values}).encode())
+        write("safetensors", save(packed.arrays))
+    for archive in packed.archives.values():
+        archive.release()
 
-    Raises:
-        InputError: it is missing, damaged, or made from other settings or images.
-    """
-    if not path.is_file():
-        raise InputError(f"There is nothing to resume: {path} does not exist; leave out --resume.")
+
+def checkpoint_folder(output: Path) -> CheckpointFolder:
+    """Where the checkpoint of results lies."""
+    return CheckpointFolder(output / "checkpoint")
+
+
+def has_checkpoint(output: Path) -> bool:
+    """Whether work in a folder could be gone on with."""
     try:
-        with safe_open(str(path), framework="pt") as file:
-            header = file.metadata() or {}
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    except (SafetensorError, OSError) as error:
-        raise InputError(f"{path} is damaged ({error}); leave out --resume.") from error
-    if header.get("format") != FORMAT:
-        raise InputError(f"{path} is no checkpoint of this version; leave out --resume.")
-    if header["made_from"] != made_from:
-        raise InputError(
-            f"{path} was made with other settings or images; give the same ones to go on from it, "
-            "or leave out --resume to start anew."
-        )
-    numbers = json.loads(header["numbers"])
-    depths = DepthState(**_group(tensors, "depths"))
-    parameters, first, second = (
-        DiskParameters(**_group(tensors, k)) for k in ("parameters", "first", "second")
-    )
-    counts = _group(tensors, "disks")
-    disks = DiskState(
-        parameters, first, second, counts["keyframe_id"], counts["steps"], counts["seen"]
-    )
-    mapper = MapperState(depths, disks, TrainingPlace(**numbers["place"]))
-    origin = tensors["origin"].numpy()
-    return ReconstructionState(mapper, origin, numbers["unit"], numbers["seconds"])
-
-
-def _group(tensors: dict[str, Tensor], name: str) -> dict[str, Tensor]:
-    """The tensors of one part, by the names of its fields."""
-    start = f"{name}."
-    return {k.removeprefix(start): x for k, x in tensors.items() if k.startswith(start)}
+        manifest = checkpoint_folder(output).manifest()
+    except (OSError, InputError):
+        return False
+    return manifest is not None and bool(manifest.state)

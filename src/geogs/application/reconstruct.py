@@ -4,10 +4,10 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from geogs.application.checkpoint import Checkpoint, fingerprint
 from geogs.application.interrupt import Stop
 from geogs.application.machine import compiled_kernels, full_memory_in_a_sentence
 from geogs.application.progress import RunProgress
+from geogs.application.reconstruct_checkpoint import ReconstructCheckpoint, fingerprint
 from geogs.application.result import Result, Written
 from geogs.application.results import write_results
 from geogs.application.settings import ReconstructSettings
@@ -22,8 +22,8 @@ from geogs.io.writers.atomic import prepare_output_folder
 from geogs.reconstruction import Reconstruction, ReconstructionState
 from geogs.threads import on_one_torch_thread
 
-_LEAST_SECONDS = 1.0
-"""What is left of a budget at least, when reading and checking have used it up."""
+LEAST_BUDGET = 1.0
+"""Seconds that are left of a budget at least, when reading and checking have used it up."""
 
 Report = Callable[[str, float], None]
 """Called with the name of a stage and its finished fraction in [0, 1]."""
@@ -89,7 +89,7 @@ def reconstruct_to_folder(
     clock.excuse(compiled_kernels(device))
     names = [Path(source.label(i)).name for i in range(len(source))]
     made_from = fingerprint(config, settings.hold_out, names)
-    checkpoint = Checkpoint(output, made_from, settings.checkpoint_every, progress)
+    checkpoint = ReconstructCheckpoint(output, made_from, settings.checkpoint_every, progress)
     snapshots = Snapshots(settings.snapshots)
     with full_memory_in_a_sentence(), stop:
         resumed = checkpoint.read() if settings.resume else None
@@ -169,4 +169,4 @@ class _Clock:
 
     def left(self) -> float | None:
         """Seconds; none where there is no limit."""
-        return self._end and max(self._end - time.perf_counter(), _LEAST_SECONDS)
+        return self._end and max(self._end - time.perf_counter(), LEAST_BUDGET)

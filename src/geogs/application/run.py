@@ -8,19 +8,14 @@ from pathlib import Path
 import torch
 
 from geogs.application.calibrate import self_calibrated
+from geogs.application.checkpoint import has_checkpoint
 from geogs.application.interrupt import Stop
 from geogs.application.machine import REMEDY, compiled_kernels, full_memory_in_a_sentence
 from geogs.application.priors import open_prior
 from geogs.application.progress import RunProgress
 from geogs.application.result import Result, Written
 from geogs.application.results import write_results
-from geogs.application.run_checkpoint import (
-    RunCheckpoint,
-    RunFacts,
-    SavedRun,
-    frames_after,
-    has_checkpoint,
-)
+from geogs.application.run_checkpoint import RunCheckpoint, RunFacts, SavedRun, frames_after
 from geogs.application.settings import RunSettings
 from geogs.application.surfaces import write_depth_mesh, write_online_results
 from geogs.errors import DeviceError, InputError
@@ -81,7 +76,7 @@ def resume(
     """
     progress, stop = progress or RunProgress(), stop or Stop()
     saved = SavedRun(output)
-    settings = _continued(saved.facts, settings or saved.facts.settings, output)
+    settings = continued(saved.facts, settings or saved.facts.settings, output)
     config, device = settings.config, require_device(settings.device)
     source = saved.calibrated(open_source(settings.source, config.input))
     output = prepare_output_folder(output)
@@ -94,8 +89,12 @@ def resume(
     return _Run(slam, source, settings, output, facts, progress, stop).complete(frames)
 
 
-def _continued(facts: RunFacts, settings: RunSettings, output: Path) -> RunSettings:
-    """Settings to go on with, on the kind of device that the run began on."""
+def continued(facts: RunFacts, settings: RunSettings, output: Path) -> RunSettings:
+    """Settings to go on with in a folder, on the kind of device that the run began on.
+
+    Raises:
+        InputError: they would compute something else, or elsewhere.
+    """
     elsewhere = settings.output is not None and settings.output.resolve() != output.resolve()
     if elsewhere or settings.deciding() != facts.settings.deciding():
         raise InputError(

@@ -28,11 +28,12 @@ def main(argv: Sequence[str]) -> int:
     settings = record(ReconstructSettings, parse(argv))
 
     from geogs.application.interrupt import Interruption
-    from geogs.application.reconstruct import reconstruct_to_folder
+    from geogs.application.reconstruct import LEAST_BUDGET, reconstruct_to_folder
     from geogs.application.terminal import TerminalProgress
 
     if settings.budget is not None:  # which counts from the start of the command
-        settings = replace(settings, budget=settings.budget - (time.perf_counter() - begin))
+        left = settings.budget - (time.perf_counter() - begin)
+        settings = replace(settings, budget=max(left, LEAST_BUDGET))
     with TerminalProgress() as progress:
         written = reconstruct_to_folder(settings, progress, Interruption())
     print(f"Results are in {written.output}/")

@@ -9,7 +9,16 @@ from collections.abc import Iterator
 from dataclasses import MISSING, dataclass, fields
 from typing import Any, get_args
 
-from geogs.config.setting import Kind, Only, Unnamed, dashed, group_of, kinds
+from geogs.config.setting import (
+    Basic,
+    Kind,
+    Only,
+    Positional,
+    Unnamed,
+    dashed,
+    group_of,
+    kinds,
+)
 
 
 @dataclass(frozen=True)
@@ -31,6 +40,20 @@ class Leaf:
         """The dotted name, as the command line has it."""
         own = dashed(self.path[-1])
         return f"{self.group}.{own}" if self.group else own
+
+    @property
+    def options(self) -> tuple[str, ...]:
+        """Names on the command line, the full one first; none if it is given without one."""
+        basic = self.mark(Basic)
+        if self.mark(Positional) is not None:
+            return ()
+        return (f"--{self.name}", *([basic.name] if basic is not None and basic.name else []))
+
+    @property
+    def switch_off(self) -> str:
+        """The name that turns a switch off."""
+        group = f"{self.group}." if self.group else ""
+        return f"--{group}no-{dashed(self.path[-1])}"
 
     def mark(self, kind: type) -> Any:
         """What its type says of it, such as :class:`Basic`; none if it does not."""

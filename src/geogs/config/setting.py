@@ -122,7 +122,9 @@ class Kind:
     is_optional: bool = False
     """Whether it can be none."""
     is_tuple: bool = False
-    """Whether it is any number of such values."""
+    """Whether it is several such values."""
+    count: int | None = None
+    """How many; none for any number."""
     ranges: tuple[Range, ...] = ()
     marks: tuple[object, ...] = ()
     """What else the type says of it, such as :class:`Basic`."""
@@ -137,8 +139,9 @@ class Kind:
         marks = tuple(mark for mark in marks if not isinstance(mark, Range))
         if origin in (Union, types.UnionType) and len(inner) == 2 and inner[1] is type(None):
             return replace(Kind.of(inner[0], (*ranges, *marks)), is_optional=True)
-        if origin is tuple and len(inner) == 2 and inner[1] is ...:
-            return replace(Kind.of(inner[0], (*ranges, *marks)), is_tuple=True)
+        if origin is tuple and len(set(inner) - {...}) == 1:
+            count = None if ... in inner else len(inner)
+            return replace(Kind.of(inner[0], (*ranges, *marks)), is_tuple=True, count=count)
         if origin is Literal:
             return Kind(str, inner, ranges=ranges, marks=marks)
         if annotation not in (bool, int, float, str, Path):
@@ -153,7 +156,8 @@ class Kind:
         if value is None:
             return self.is_optional
         if self.is_tuple:
-            return isinstance(value, tuple) and all(self._allows_one(v, group) for v in value)
+            several = isinstance(value, tuple) and self.count in (None, len(value))
+            return several and all(self._allows_one(v, group) for v in value)  # type: ignore[attr-defined]
         return self._allows_one(value, group)
 
     def read(self, text: str) -> Any:
@@ -174,6 +178,7 @@ class Kind:
             Path: ("a path", "paths"),
         }[self.base]
         text = many if self.is_tuple else one
+        text = f"{self.count} {text}" if self.count else text
         if Time in self.marks:
             text += ", as seconds or such as 90s, 10m or 1h,"
         if self.ranges:
@@ -218,7 +223,7 @@ class Settings:
 
     def __post_init__(self) -> None:
         """Raises InputError for a value that a setting cannot have."""
-        for name, kind in kinds(type(self)):
+        for name, kind in kinds(type(self)):  # type: ignore[arg-type]
             value = getattr(self, name)
             if not kind.allows(value, self):
                 at = f"{self.group}." if self.group else ""

@@ -10,9 +10,12 @@ import tempfile
 import threading
 import uuid
 import weakref
+import zlib
 from collections import deque
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO, Protocol
 
 import numpy as np
 
@@ -31,11 +34,15 @@ class Archive:
     read stay in memory as well. Space of arrays that nobody refers to any more is used again.
 
     For a checkpoint the file gets a name (``settle``), and what the last checkpoint refers to stays
-    until the next one is complete (``release``).
+    until the next one is complete (``release``). Every array has a checksum from when it was
+    written, which is compared when a checkpoint is read: so a checkpoint costs what is new in it,
+    and damage is told before any work is done with it.
     """
 
     def __init__(self, folder: Path | str | None = None, resident: int = 0) -> None:
         self.folder = Path(folder or tempfile.gettempdir())
+        self.name = f"archive-{uuid.uuid4().hex[:16]}"
+        """Of the file, once it is settled."""
         self._recent: Swap[int, np.ndarray] = Swap(resident)
         self._free: dict[int, list[int]] = {}
         """Offsets of unused pieces, by their size."""
@@ -43,8 +50,7 @@ class Archive:
         """Key, offset and size of what nobody refers to any more; collected without a lock."""
         self._end = self._next_key = 0
         self._lock = threading.Lock()
-        self._path: Path | None = None
-        """Of the named file."""
+        self._is_settled = False
         self._withheld: list[tuple[int, int]] = []
         """Offset and size of what is gone, but not for the last checkpoint."""
         self._releasing: list[tuple[int, int]] = []
@@ -59,11 +65,6 @@ class Archive:
         """Bytes of the file."""
         return self._end
 
-    @property
-    def settled_name(self) -> str | None:
-        """Name of the file, if it has one."""
-        return None if self._path is None else self._path.name
-
     def put(self, array: np.ndarray) -> "Archived":
         """Write an array; it must not be changed while it is resident.
 
@@ -75,9 +76,9 @@ class Archive:
             pieces = self._free.get(array.nbytes)
             offset = pieces.pop() if pieces else self._end
             self._end = max(self._end, offset + array.nbytes)
-            self._next_key += 1
-        archived = self.archived(self._next_key, offset, array.shape, array.dtype)
-        self._write(np.ascontiguousarray(array), offset)
+        data = np.ascontiguousarray(array)
+        archived = self._archived(offset, array.shape, array.dtype, zlib.crc32(_bytes(data)))
+        self._write(data, offset)
         if self._recent.limit:
             self._recent.put(archived.key, array)
         return archived
@@ -90,25 +91,23 @@ class Archive:
 
     # --- checkpoints -----------------------------------------------------------------------
 
-    def settle(self, folder: Path) -> "SettledArchive":
-        """Put all that was written on the disk under a name in ``folder``; what to open it by.
+    def settle(self, folder: "NamedFiles") -> "SettledArchive":
+        """Put all that was written on the disk under its name in a folder; what to open it by.
 
         Raises:
             OutputError: the disk is full, or cannot be written.
         """
         try:
-            if self._path is None or self._path.parent != folder:
-                self._move(folder / f"archive-{uuid.uuid4().hex[:16]}")
+            if not self._is_settled or self.folder != folder.path:
+                self._move(folder)
             os.fsync(self._file.fileno())
         except OSError as error:
             raise self._unwritable(error) from error
-        assert self._path is not None
         with self._lock:
             self._collect()
         self._releasing, self._withheld = self._releasing + self._withheld, []
         unused = [(o, size) for size, offsets in self._free.items() for o in offsets]
-        resident, free = self._recent.limit, (*unused, *self._releasing)
-        return SettledArchive(self._path.name, resident, self._end, self._next_key, free)
+        return SettledArchive(self._end, self._recent.limit, [*unused, *self._releasing])
 
     def release(self) -> None:
         """The checkpoint that was written since ``settle`` is complete and replaces the last."""
@@ -117,57 +116,70 @@ class Archive:
         self._releasing = []
 
     @classmethod
-    def reopened(cls, folder: Path, settled: "SettledArchive") -> "Archive":
+    def reopened(cls, folder: "NamedFiles", name: str, settled: "SettledArchive") -> "Archive":
         """The archive as it was when it was settled; what was written later is cut off.
 
         Raises:
-            InputError: the file is missing or too short.
+            InputError: the file is missing, too short, or what is said of it cannot be.
         """
-        archive = cls(folder, settled.resident)
-        path = folder / settled.name
-        try:
-            with path.open("r+b", buffering=0) as named:
-                if os.fstat(named.fileno()).st_size < settled.end:
-                    raise InputError(f"{path} is cut off.")
-                named.truncate(settled.end)
-                os.dup2(named.fileno(), archive._file.fileno())
-        except OSError as error:
-            raise InputError(f"{path} cannot be opened ({error.strerror or error}).") from error
-        archive._path, archive._end, archive._next_key = path, settled.end, settled.next_key
+        parts = [(0, settled.end), *settled.free]
+        if settled.resident < 0 or any(min(p) < 0 or sum(p) > settled.end for p in parts):
+            raise InputError(f"what is said of {name} cannot be")
+        archive = cls(folder.path, settled.resident)
+        with folder.change(name) as file:
+            if os.fstat(file.fileno()).st_size < settled.end:
+                raise InputError(f"{name} is cut off")
+            os.truncate(file.fileno(), settled.end)
+            os.dup2(file.fileno(), archive._file.fileno())
+        archive.name, archive._is_settled, archive._end = name, True, settled.end
         for offset, size in settled.free:
             archive._free.setdefault(size, []).append(offset)
         return archive
 
-    def archived(
-        self, key: int, offset: int, shape: tuple[int, ...], dtype: np.dtype
+    def piece(
+        self, offset: int, shape: tuple[int, ...], dtype: np.dtype, checksum: int
     ) -> "Archived":
-        """An array that is in the file; its space is used again once nobody refers to it."""
-        archived = Archived(self, key, offset, shape, dtype)
+        """An array that a checkpoint says is in the file; it is read to be sure.
+
+        Raises:
+            InputError: it is not there, or has changed.
+        """
+        if min(offset, *shape, 0) < 0 or offset + math.prod(shape) * dtype.itemsize > self._end:
+            raise InputError(f"{self.name} does not reach as far as it should")
+        archived = self._archived(offset, shape, dtype, checksum)
+        if zlib.crc32(_bytes(self._read(archived))) != checksum:
+            raise InputError(f"{self.name} has changed")
+        return archived
+
+    def _move(self, folder: "NamedFiles") -> None:
+        """Copy the file to another place, where it is from then on."""
+        with folder.create(self.name) as named:
+            done = 0
+            while done < self._end:
+                piece = os.pread(self._file.fileno(), min(_PIECE, self._end - done), done)
+                if not piece:  # something could not be written
+                    break
+                done += os.pwrite(named.fileno(), piece, done)
+            os.truncate(named.fileno(), self._end)
+            os.dup2(named.fileno(), self._file.fileno())  # other threads notice nothing
+        self.folder, self._is_settled = folder.path, True
+
+    def _archived(
+        self, offset: int, shape: tuple[int, ...], dtype: np.dtype, checksum: int
+    ) -> "Archived":
+        """A reference to an array; its space is used again once nobody has one any more."""
+        with self._lock:
+            self._next_key += 1
+            key = self._next_key
+        archived = Archived(self, key, offset, shape, dtype, checksum)
         size = math.prod(shape) * dtype.itemsize
         weakref.finalize(archived, self._gone.append, (key, offset, size))
         return archived
 
-    def _move(self, path: Path) -> None:
-        """Copy the file to another place, where it is from then on."""
-        try:
-            with path.open("x+b", buffering=0) as named:
-                done = 0
-                while done < self._end:
-                    piece = os.pread(self._file.fileno(), min(_PIECE, self._end - done), done)
-                    if not piece:  # something could not be written
-                        break
-                    done += os.pwrite(named.fileno(), piece, done)
-                os.truncate(named.fileno(), self._end)
-                os.dup2(named.fileno(), self._file.fileno())  # other threads notice nothing
-        except OSError:
-            path.unlink(missing_ok=True)
-            raise
-        self.folder, self._path = path.parent, path
-
     # --- the file --------------------------------------------------------------------------
 
     def _write(self, array: np.ndarray, offset: int) -> None:
-        rest = memoryview(array.reshape(-1).view(np.uint8).data)
+        rest = _bytes(array)
         try:
             while rest:
                 done = os.pwrite(self._file.fileno(), rest, offset)
@@ -177,7 +189,7 @@ class Archive:
 
     def _read(self, archived: "Archived") -> np.ndarray:
         array = np.empty(archived.shape, archived.dtype)
-        rest, offset = memoryview(array.reshape(-1).view(np.uint8).data), archived.offset
+        rest, offset = _bytes(array), archived.offset
         while rest:
             done = os.preadv(self._file.fileno(), [rest], offset)
             if done == 0:
@@ -190,16 +202,16 @@ class Archive:
         while self._gone:
             key, offset, size = self._gone.popleft()
             self._recent.drop(key)
-            if self._path is None:
-                self._free.setdefault(size, []).append(offset)
-            else:
+            if self._is_settled:
                 self._withheld.append((offset, size))
+            else:
+                self._free.setdefault(size, []).append(offset)
 
     def _unwritable(self, error: OSError) -> OutputError:
         reason = error.strerror or str(error)
         remedy = (
-            "name a folder on a larger disk in TMPDIR" if self._path is None
-            else "give a folder on a larger disk for the results"
+            "give a folder on a larger disk for the results" if self._is_settled
+            else "name a folder on a larger disk in TMPDIR"
         )  # fmt: skip
         return OutputError(
             f"The keyframes of a long video cannot be kept in {self.folder} ({reason}); free some "
@@ -211,30 +223,61 @@ class Archive:
 class SettledArchive:
     """What a checkpoint says of an archive."""
 
-    name: str
-    """Of its file."""
-    resident: int
     end: int
     """Bytes of the file."""
-    next_key: int
-    free: tuple[tuple[int, int], ...]
+    resident: int
+    """Arrays that stay in memory."""
+    free: list[tuple[int, int]]
     """Offset and size of its unused pieces."""
+
+
+class NamedFiles(Protocol):
+    """A folder of files by name."""
+
+    @property
+    def path(self) -> Path:
+        """Where it is."""
+        ...
+
+    def create(self, name: str) -> AbstractContextManager[BinaryIO]:
+        """A new file for reading and writing, which is gone again after an error.
+
+        Raises OSError if there is one of that name.
+        """
+        ...
+
+    def change(self, name: str) -> AbstractContextManager[BinaryIO]:
+        """A file for reading and writing. Raises InputError if there is none."""
+        ...
 
 
 class Archived:
     """An array in an archive."""
 
-    __slots__ = ("__weakref__", "archive", "dtype", "key", "offset", "shape")
+    __slots__ = ("__weakref__", "archive", "checksum", "dtype", "key", "offset", "shape")
 
     def __init__(
-        self, archive: Archive, key: int, offset: int, shape: tuple[int, ...], dtype: np.dtype
+        self,
+        archive: Archive,
+        key: int,
+        offset: int,
+        shape: tuple[int, ...],
+        dtype: np.dtype,
+        checksum: int,
     ) -> None:
         self.archive = archive
         self.key = key
         self.offset = offset
         self.shape = shape
         self.dtype = dtype
+        self.checksum = checksum
+        """CRC-32 of its bytes."""
 
     def load(self) -> np.ndarray:
         """The array as it was archived, which is not to be changed."""
         return self.archive.read(self)
+
+
+def _bytes(array: np.ndarray) -> memoryview:
+    """The bytes of an array that lies row by row."""
+    return memoryview(array.reshape(-1).view(np.uint8).data)

@@ -4,9 +4,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Float, Float32, Float64, UInt8
 from torch import Tensor
 
+from geogs.keyframes.archive import Archived
 from geogs.keyframes.grid import SampleGrid
 from geogs.keyframes.pictures import Picture
 from geogs.priors.base import DepthKind
@@ -34,6 +35,22 @@ class KeyframePrior:
         """Multiply every length by ``factor``."""
         self.scale = self.scale / factor
         self.information = self.information * factor**2
+
+
+@dataclass(frozen=True, eq=False)
+class KeyframeState:
+    """What a checkpoint holds of a keyframe; the fields are the keyframe's."""
+
+    id: int
+    frame_index: int
+    timestamp: float
+    image: Archived
+    normal: Archived | None
+    T_cw: Float64[Tensor, "4 4"]
+    inverse_depth: Float32[Tensor, "p"]
+    information: Float32[Tensor, "p"]
+    prior: KeyframePrior | None
+    scale: float
 
 
 @dataclass(eq=False)
@@ -71,6 +88,14 @@ class Keyframe:
     def encoded(self) -> Any:
         """The flow operator's form of the image."""
         return self.picture.encoded
+
+    def state(self) -> KeyframeState:
+        """What a checkpoint holds."""
+        picture = self.picture
+        return KeyframeState(
+            self.id, self.frame_index, self.timestamp, picture.archived, picture.archived_normal,
+            self.T_cw, self.inverse_depth, self.information, self.prior, self.scale,
+        )  # fmt: skip
 
     def rescale(self, factor: float) -> None:
         """Multiply every length that the camera sees by ``factor``; the pose stays."""

@@ -27,20 +27,28 @@ class Pictures:
         self.normals = Archive()
         self.encoded: Swap[Picture, Any] = Swap(resident)
 
+    def add(self, image: UInt8[np.ndarray, "h w 3"], encoded: Any = None) -> "Picture":
+        """Put an image into its archive; ``encoded`` is the flow operator's form of it."""
+        picture = Picture(self, self.images.put(image))
+        if self.encode is None:
+            picture.own_encoded = encoded
+        else:
+            self.encoded.put(picture, encoded)
+        return picture
+
 
 class Picture:
     """A keyframe's image, its encoded form and a prior's normals, read when they are asked for."""
 
     def __init__(
-        self, pictures: Pictures, image: UInt8[np.ndarray, "h w 3"], encoded: Any = None
+        self, pictures: Pictures, archived: Archived, archived_normal: Archived | None = None
     ) -> None:
         self._pictures = pictures
-        self._encoded = encoded if pictures.encode is None else None
-        self._normal: Archived | None = None
-        self.archived = pictures.images.put(image)
+        self.archived = archived
         """The image in its archive."""
-        if pictures.encode is not None:
-            pictures.encoded.put(self, encoded)
+        self.archived_normal = archived_normal
+        self.own_encoded: Any = None
+        """The encoded form, where it cannot be made again."""
 
     @property
     def image(self) -> UInt8[np.ndarray, "h w 3"]:
@@ -52,15 +60,16 @@ class Picture:
         """The flow operator's form of the image, computed again where it is no longer kept."""
         encode = self._pictures.encode
         if encode is None:
-            return self._encoded
+            return self.own_encoded
         return self._pictures.encoded.get(self, lambda: encode(self.image))
 
     @property
     def normal(self) -> Float[Tensor, "h w 3"] | None:
         """A monocular prior's unit normals at working resolution, in the camera frame and facing
         the camera; zero where unknown, None where nothing was asked."""
-        return None if self._normal is None else torch.from_numpy(self._normal.load())
+        normal = self.archived_normal
+        return None if normal is None else torch.from_numpy(normal.load())
 
     @normal.setter
     def normal(self, normal: Float[Tensor, "h w 3"]) -> None:
-        self._normal = self._pictures.normals.put(normal.cpu().numpy())
+        self.archived_normal = self._pictures.normals.put(normal.cpu().numpy())

@@ -1,6 +1,7 @@
 """All keyframes of a run, by stable id: the one owner of their poses, depths and scales."""
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -8,14 +9,25 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from geogs.errors import InputError
 from geogs.geometry.lie import sim3_scale
+from geogs.keyframes.archive import Archive
 from geogs.keyframes.grid import SampleGrid
-from geogs.keyframes.keyframe import Keyframe
+from geogs.keyframes.keyframe import Keyframe, KeyframeState
 from geogs.keyframes.pictures import Encode, Picture, Pictures
 from geogs.types import PoseCorrection
 
 RESIDENT = 128
 """Keyframes whose large arrays stay in memory, where nobody says otherwise."""
+
+
+@dataclass(frozen=True, eq=False)
+class StoreState:
+    """What a checkpoint holds of a store, but for the keyframes: their segments say them."""
+
+    next_id: int
+    images: Archive
+    normals: Archive
 
 
 class KeyframeStore:
@@ -46,6 +58,15 @@ class KeyframeStore:
     def segment_of(self, id: int) -> "Segment":
         """The segment that a keyframe is in at present. Raises KeyError if there is none."""
         return self._segment[id]
+
+    def state(self) -> StoreState:
+        """What a checkpoint holds."""
+        return StoreState(self.next_id, self.pictures.images, self.pictures.normals)
+
+    def load(self, state: StoreState) -> None:
+        """Give a store without keyframes the state of another."""
+        self.next_id = state.next_id
+        self.pictures.images, self.pictures.normals = state.images, state.normals
 
     def new_segment(self) -> "Segment":
         """A segment without keyframes, with a world of its own."""
@@ -102,11 +123,35 @@ class Segment:
     ) -> Keyframe:
         """Append a keyframe with unit inverse depth and no information."""
         grid, id = self.grid, self.store.take_id(self)
-        picture = Picture(self.store.pictures, image, encoded)
+        picture = self.store.pictures.add(image, encoded)
         ones = torch.ones(grid.size, device=grid.device)
         keyframe = Keyframe(id, frame_index, timestamp, grid, picture, T_cw, ones, 0 * ones)
         self._keyframes[id] = keyframe
         return keyframe
+
+    def state(self) -> list[KeyframeState]:
+        """What a checkpoint holds, once the corrections have been taken."""
+        return [keyframe.state() for keyframe in self]
+
+    def load(self, states: list[KeyframeState]) -> None:
+        """Give a segment without keyframes those of another, whose store has been loaded.
+
+        Raises:
+            InputError: they are of another camera, or not in order.
+        """
+        grid, pictures = self.grid, self.store.pictures
+        size = grid.camera.height, grid.camera.width, 3
+        for s in states:
+            if (s.image.shape, s.inverse_depth.shape) != (size, (grid.size,)):
+                raise InputError(f"keyframe {s.id} is of another camera")
+            if s.id in self.store or not max(self._keyframes, default=-1) < s.id:
+                raise InputError(f"keyframe {s.id} is not in its place")
+            picture = Picture(pictures, s.image, s.normal)
+            self._keyframes[s.id] = Keyframe(
+                s.id, s.frame_index, s.timestamp, grid, picture, s.T_cw, s.inverse_depth,
+                s.information, s.prior, s.scale,
+            )  # fmt: skip
+        self.store.assign(self.ids, self)
 
     def absorb(self, other: "Segment") -> None:
         """Take over the keyframes of another segment, which are in this one's world already."""

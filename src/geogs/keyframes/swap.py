@@ -32,6 +32,11 @@ class Swap(Generic[K, V]):
         """The value of a key if it is here; asking is no use."""
         return self._values.get(key)
 
+    def items(self) -> list[tuple[K, V]]:
+        """All that is here, used last at the end."""
+        with self._lock:
+            return list(self._values.items())
+
     def get(self, key: K, make: Callable[[], V], wanted: Collection[K] = ()) -> V:
         """The value of a key, made where it is not here; those ``wanted`` as well do not leave.
 

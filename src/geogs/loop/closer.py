@@ -22,7 +22,7 @@ from geogs.loop.constraints import (
     strains,
     thinned,
 )
-from geogs.loop.detect import Loop, LoopDetector
+from geogs.loop.detect import DetectorState, Loop, LoopDetector
 from geogs.loop.pose_graph import RelativePoses
 from geogs.tracking.motion import Recognition
 from geogs.tracking.segments import Segments
@@ -31,7 +31,7 @@ from geogs.types import PoseCorrection
 
 
 @dataclass
-class _Known:
+class Known:
     """Relative poses of the keyframes of one tracker, by id."""
 
     odometry: RelativePoses = field(default_factory=none_known)
@@ -48,6 +48,17 @@ class _Known:
         self.loops = rescaled(self.loops, correction.scale)
 
 
+@dataclass(frozen=True, eq=False)
+class LoopsState:
+    """What a checkpoint holds of loops."""
+
+    detector: DetectorState
+    closures: int
+    known: dict[int, Known]
+    """By the place of the tracker among all."""
+    between: list[Loop]
+
+
 class LoopCloser:
     """Watches the segments of a run: closes loops within each, and joins segments that meet."""
 
@@ -58,9 +69,21 @@ class LoopCloser:
         self.detector = LoopDetector(tracker.keyframes.store, tracker.operator, config)
         self.closures = 0
         """Loop closures so far."""
-        self._known: dict[Tracker, _Known] = {}
+        self._known: dict[Tracker, Known] = {}
         self._between: list[Loop] = []
         """Loops between segments."""
+
+    def state(self) -> LoopsState:
+        """What a checkpoint holds."""
+        trackers = self.segments.trackers
+        known = {n: self._known[t] for n, t in enumerate(trackers) if t in self._known}
+        return LoopsState(self.detector.state(), self.closures, known, self._between)
+
+    def load(self, state: LoopsState) -> None:
+        """Give loops that know nothing yet the state of others, whose segments are here already."""
+        self.detector.load(state.detector)
+        self.closures, self._between = state.closures, state.between
+        self._known = {self.segments.trackers[n]: known for n, known in state.known.items()}
 
     def recognise(self, image: UInt8[np.ndarray, "h w 3"]) -> Sequence[Recognition]:
         """Keyframes that show what an image shows."""
@@ -91,11 +114,11 @@ class LoopCloser:
         edges = {
             e: v for e, v in world.graph.edges.items() if order[e[1]] - order[e[0]] not in (2, 3)
         }
-        self._known[world] = _Known(of_edges(world.keyframes, edges))
+        self._known[world] = Known(of_edges(world.keyframes, edges))
         self._retire(world)
 
-    def _of(self, tracker: Tracker) -> _Known:
-        return self._known.setdefault(tracker, _Known())
+    def _of(self, tracker: Tracker) -> Known:
+        return self._known.setdefault(tracker, Known())
 
     def _retire(self, tracker: Tracker) -> None:
         """Turn the edges that the local adjustment has left behind into relative poses."""
@@ -164,7 +187,7 @@ class LoopCloser:
 
     def _merge(self, host: Tracker, guest: Tracker, S: Float[Tensor, "4 4"]) -> tuple[int, ...]:
         self._retire(guest)
-        theirs, ours = self._known.pop(guest, _Known()), self._of(host)
+        theirs, ours = self._known.pop(guest, Known()), self._of(host)
         # The loops between the two were measured in the guest's unit, too.
         correction = guest.keyframes.moved(S)
         theirs.rescale(correction)

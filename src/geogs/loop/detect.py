@@ -4,7 +4,6 @@ from collections import deque
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -15,7 +14,15 @@ from geogs.config import LoopConfig
 from geogs.geometry.lie import se3_inverse, so3_log
 from geogs.keyframes.store import KeyframeStore
 from geogs.loop.dense import dense_check
-from geogs.loop.search import Cause, Depths, PlaceSearch, Proposal, Query, Sighting
+from geogs.loop.search import (
+    Cause,
+    Depths,
+    PlaceSearch,
+    Proposal,
+    Query,
+    SearchState,
+    Sighting,
+)
 from geogs.tracking.flow.base import FlowMatch, FlowOperator
 from geogs.tracking.motion import Recognition
 from geogs.tracking.proximity import frame_distances
@@ -57,6 +64,18 @@ class Refusal:
     reason: str
 
 
+@dataclass(frozen=True, eq=False)
+class DetectorState:
+    """What a checkpoint holds of a detector."""
+
+    order: list[int]
+    """Ids of the keyframes taken so far, earliest first."""
+    search: SearchState
+    pending: list[list[Sighting]]
+    """What was found at the last keyframes, to be decided later."""
+    loops: list[Loop]
+
+
 class LoopDetector:
     """Finds loops at keyframes that are final: looks and features propose, the flow decides.
 
@@ -78,24 +97,24 @@ class LoopDetector:
         self.config = config or LoopConfig()
         self.refusals: list[Refusal] = []
         """Of the last update."""
-        self._thread = _search_thread()
+        self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="loops")
         self._order: dict[int, int] = {}
         """Place in time of each keyframe taken so far."""
         self._search = PlaceSearch(self.grid, self.config, self._order)
         self._pending: deque[Future[list[Sighting]]] = deque()
         self._loops: list[Loop] = []
 
-    def __getstate__(self) -> dict[str, object]:
-        """What a checkpoint holds: searches that are under way are finished first."""
+    def state(self) -> DetectorState:
+        """What a checkpoint holds; searches that are under way are finished first."""
         found = [future.result() for future in self._pending]
-        state = {**self.__dict__, "_pending": found}
-        del state["_thread"]
-        return state
+        return DetectorState(list(self._order), self._search.state(), found, self._loops)
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state)
-        self._thread = _search_thread()
-        self._pending = deque(map(_done, state["_pending"]))
+    def load(self, state: DetectorState) -> None:
+        """Give a detector that has seen nothing yet the state of another."""
+        self._order.update((id, n) for n, id in enumerate(state.order))
+        self._search.load(state.search)
+        self._pending = deque(map(_done, state.pending))
+        self._loops = state.loops
 
     @property
     def loops(self) -> tuple[Loop, ...]:
@@ -204,10 +223,6 @@ class LoopDetector:
             p.first, p.second, p.cause, check.T_ji, check.scale, inliers, check.matched,
             check.there, check.back,
         )  # fmt: skip
-
-
-def _search_thread() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(max_workers=1, thread_name_prefix="loops")
 
 
 def _done(sightings: list[Sighting]) -> Future[list[Sighting]]:

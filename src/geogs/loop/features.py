@@ -37,9 +37,6 @@ class FeatureExtractor:
             nfeatures=round(SURPLUS * options.features), fastThreshold=options.fast_threshold
         )
 
-    def __reduce__(self) -> tuple:
-        return FeatureExtractor, (self.options,)
-
     def __call__(self, image: UInt8[np.ndarray, "h w 3"]) -> Features:
         """Features of an RGB image; none where nothing stands out."""
         grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)

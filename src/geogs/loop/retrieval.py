@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float64, Int64, UInt8
 
 from geogs.config import RetrievalOptions
+from geogs.errors import InputError
 from geogs.loop.features import FeatureExtractor, Features
 
 LOOSE = 15
@@ -21,6 +22,17 @@ class Candidate:
     keyframe: int
     score: float
     """Shared tf-idf mass, of the query's own: 0 nothing in common, 1 the same image."""
+
+
+@dataclass(frozen=True, eq=False)
+class IndexState:
+    """What a checkpoint holds of an index."""
+
+    words: UInt8[np.ndarray, "w 32"]
+    postings: Int64[np.ndarray, "m 3"]
+    """Word, row and how often, word by word."""
+    keyframes: Int64[np.ndarray, "r"]
+    """Of each row."""
 
 
 class AppearanceIndex:
@@ -45,6 +57,28 @@ class AppearanceIndex:
 
     def __len__(self) -> int:
         return len(self._keyframes)
+
+    def state(self) -> IndexState:
+        """What a checkpoint holds."""
+        postings = [
+            (word, row, count)
+            for word, posting in enumerate(self._postings)
+            for row, count in posting
+        ]
+        return IndexState(
+            self._words, np.array(postings, np.int64).reshape(-1, 3),
+            np.array(self._keyframes, np.int64),
+        )  # fmt: skip
+
+    def load(self, state: IndexState) -> None:
+        """Give an empty index the state of another. Raises InputError if it is incomplete."""
+        counts = len(state.words), len(state.keyframes)
+        if ((state.postings[:, :2] < 0) | (state.postings[:, :2] >= counts)).any():
+            raise InputError("the index of looks is incomplete")
+        self._words, self._keyframes = state.words, state.keyframes.tolist()
+        self._postings = [[] for _ in state.words]
+        for word, row, count in state.postings.tolist():
+            self._postings[word].append((row, count))
 
     def describe(self, image: UInt8[np.ndarray, "h w 3"]) -> Features:
         """Features of an image, to be given to :meth:`add` and :meth:`query` in its stead."""

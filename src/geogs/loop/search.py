@@ -11,7 +11,7 @@ from torch import Tensor
 from geogs.config import LoopConfig
 from geogs.keyframes.grid import SampleGrid
 from geogs.loop.features import Features
-from geogs.loop.retrieval import AppearanceIndex
+from geogs.loop.retrieval import AppearanceIndex, IndexState
 from geogs.loop.verification import DepthView, TwoView, TwoViewVerifier
 from geogs.tracking.motion import Recognition
 
@@ -55,6 +55,14 @@ class Query:
     depths: Depths
 
 
+@dataclass(frozen=True, eq=False)
+class SearchState:
+    """What a checkpoint holds of a search."""
+
+    index: IndexState
+    features: dict[int, Features]
+
+
 class PlaceSearch:
     """Remembers keyframes by their features, and finds those that a new one may show again."""
 
@@ -66,6 +74,15 @@ class PlaceSearch:
         self._verifier = TwoViewVerifier(grid.camera, config.verification)
         self._features: dict[int, Features] = {}
         self._order = order
+
+    def state(self) -> SearchState:
+        """What a checkpoint holds, while nothing is searched."""
+        return SearchState(self.index.state(), self._features)
+
+    def load(self, state: SearchState) -> None:
+        """Give a search that knows nothing yet the state of another."""
+        self.index.load(state.index)
+        self._features = state.features
 
     def find(self, query: Query) -> list[Sighting]:
         """Remember a keyframe; the pairs it makes with earlier ones, most promising first."""

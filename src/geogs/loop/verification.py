@@ -77,9 +77,6 @@ class TwoViewVerifier:
         self._edge = max(camera.width, camera.height)
         self._matcher = cv2.BFMatcher(cv2.NORM_HAMMING)
 
-    def __reduce__(self) -> tuple:
-        return TwoViewVerifier, (self.camera, self.options)
-
     def verify(self, first: DepthView, second: DepthView) -> TwoView:
         """Pose of the second view from matches with the first.
 

@@ -13,12 +13,14 @@ from torch import Tensor
 from geogs.config import MappingConfig
 from geogs.depth.base import Progress, silent
 from geogs.depth.select import depth_engine
+from geogs.errors import InputError
 from geogs.keyframes.archive import Archive
 from geogs.keyframes.store import KeyframeStore
 from geogs.mapping.cameras import MapCameras
 from geogs.mapping.keyframe_depths import CANDIDATES, KeyframeDepths
 from geogs.mapping.map_update import MapUpdate, plan_update, witness
 from geogs.mapping.rendered import rendered_keyframe, searched_keyframe
+from geogs.mapping.state import MapperState, RandomState, TrainedState, ViewState
 from geogs.mapping.stored_renders import StoredRender, stored_render
 from geogs.mapping.training.base import Batch, MapTrainer, TrainingPlace, draw_partners
 from geogs.mapping.training.select import map_trainer
@@ -76,6 +78,8 @@ class Mapper:
         self.mapped: list[int] = []
         self.trained = TrainingPlace()
         """How far the training over all keyframes is, at each report of its progress."""
+        self._order: list[int] = []
+        """Of the keyframes that it comes to next, by their places among those mapped."""
         self._trainer: MapTrainer | None = None
         self._random = np.random.default_rng(seed)
         self._torch_random = torch.Generator().manual_seed(seed)
@@ -95,6 +99,40 @@ class Mapper:
         view = MapView(keyframe, self.pool)
         self.views[keyframe_id] = view
         self._depths.engine.observe(view.depth_view)
+
+    def state(self) -> MapperState:
+        """What a checkpoint holds."""
+        trainer, training = self._trainer, None
+        if trainer is not None:
+            training = TrainedState(trainer.unit, trainer.optimizer.state())
+        return MapperState(
+            {i: ViewState(view.partners, view.search) for i, view in self.views.items()},
+            self.pool.state(), self.mapped, training, self.trained, self._order,
+            RandomState.of(self._random, self._torch_random),
+        )  # fmt: skip
+
+    def load(self, state: MapperState) -> None:
+        """Give a mapper without a map the state of another, whose keyframes are in the store.
+
+        It may have observed these keyframes already.
+
+        Raises:
+            InputError: the state is incomplete, or of other keyframes.
+        """
+        if not {*state.views, *state.mapped} <= state.pool.maps.keys():
+            raise InputError("a view of the map is missing")
+        if not all(i in self.keyframes for i in state.pool.maps):
+            raise InputError("a keyframe of the map is missing")
+        if not all(0 <= n < len(state.mapped) for n in state.order):
+            raise InputError("the place in the training is none")
+        self.pool.load(state.pool, {i: self.keyframes[i] for i in state.pool.maps})
+        for i, saved in state.views.items():
+            self.views[i] = MapView(self.keyframes[i], self.pool, saved.partners, saved.search)
+        self.mapped, self.trained, self._order = state.mapped, state.place, state.order
+        if state.training is not None:
+            self._trainer = self._new_trainer(state.training.unit)
+            self._trainer.optimizer.load(state.training.disks)
+        state.random.restore(self._random, self._torch_random)
 
     def map_keyframe(self, keyframe_id: int) -> None:
         """Give a keyframe its depth, carve and grow the map with it, train the window."""
@@ -178,14 +216,15 @@ class Mapper:
         steps: int,
         progress: Progress = silent,
         until: float | None = None,
-        start: TrainingPlace | None = None,
+        goes_on: bool = False,
     ) -> None:
         """Single-view steps over all mapped keyframes; disks that none has seen go.
 
         Fewer steps where they would last beyond ``until``, a time of ``time.perf_counter``. A
-        training that was cut off goes on from ``start``.
+        training that was cut off ``goes_on`` from where it was.
         """
-        self.trained = start or TrainingPlace()
+        if not goes_on:
+            self.trained, self._order = TrainingPlace(), []
         self._train_all([self.views[i] for i in self.mapped], steps, progress, until)
         self.prune()
         self._training().optimizer.keep(self.map.seen > 0)
@@ -250,9 +289,11 @@ class Mapper:
             known = depth.confidence > 0
             sure = depth.depth[known & (depth.confidence >= np.median(depth.confidence))]
             unit = float(np.median(sure)) if known.any() else first.typical_depth
-            resident = self.keyframes.resident
-            self._trainer = map_trainer(self.map, self.cameras, self.config, unit, resident)
+            self._trainer = self._new_trainer(unit)
         return self._trainer
+
+    def _new_trainer(self, unit: float) -> MapTrainer:
+        return map_trainer(self.map, self.cameras, self.config, unit, self.keyframes.resident)
 
     def _estimate_ahead(self, keyframe_id: int) -> None:
         """Depths of the keyframe and of its next ones, which then check each other."""
@@ -325,7 +366,6 @@ class Mapper:
         splits = {int(total * part) for part in self.config.disk.split_times}
         events = fills | splits | set(range(prunes, total, prunes))
         stops = sorted(events | set(range(_REPORTED_STEPS, total, _REPORTED_STEPS)) | {total})
-        order: list[int] = []
         done = self.trained.steps
         for stop in (stop for stop in stops if stop > done):
             late = 0.0
@@ -335,9 +375,9 @@ class Mapper:
                 break
             batches = []
             for _ in range(done, stop):
-                if not order:
-                    order = list(self._random.permutation(len(views)))
-                batches.append(self._batch([views[order.pop()].id]))
+                if not self._order:
+                    self._order = self._random.permutation(len(views)).tolist()
+                batches.append(self._batch([views[self._order.pop()].id]))
             shares = [max(step / total, late) for step in range(done + 1, stop + 1)]
             rates = [self.config.lr_final**share for share in shares]
             trainer.train(batches, rates)

@@ -1,96 +1,75 @@
-"""A mapper's work so far as plain tensors, to go on from later, perhaps on another device."""
+"""What a checkpoint holds of a mapper."""
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
-from jaxtyping import Float32, Float64, Int64
+from jaxtyping import UInt8
 from torch import Tensor
 
-from geogs.depth.view import DenseDepth, DepthSearch
-from geogs.mapping.mapper import Mapper
+from geogs.depth.view import DepthSearch
+from geogs.errors import InputError
 from geogs.mapping.training.base import TrainingPlace
-from geogs.splat.map import DiskParameters
+from geogs.mapping.view_pool import PoolState
+from geogs.splat.optimizer import DiskState
 
 
 @dataclass(frozen=True, eq=False)
-class DepthState:
-    """The dense depths of the mapped keyframes, on the CPU."""
+class RandomState:
+    """Where the random numbers are: NumPy's PCG64, and PyTorch's on the CPU."""
 
-    keyframe_id: Int64[Tensor, "v"]
-    depth: Float32[Tensor, "v h w"]
-    """z in map units."""
-    confidence: Float32[Tensor, "v h w"]
-    limits: Float64[Tensor, "v 3"]
-    """Nearest, typical and farthest depth of the search."""
+    state: int
+    increment: int
+    has_half: int
+    half: int
+    """Of 64 bits that were drawn for 32."""
+    torch: UInt8[Tensor, "n"]
+
+    @staticmethod
+    def of(numpy: np.random.Generator, torch: torch.Generator) -> "RandomState":
+        """Of two generators."""
+        s = numpy.bit_generator.state
+        inner, half = s["state"], (s["has_uint32"], s["uinteger"])
+        return RandomState(inner["state"], inner["inc"], *half, torch.get_state())
+
+    def restore(self, numpy: np.random.Generator, torch: torch.Generator) -> None:
+        """Let two generators go on from there. Raises InputError if they cannot."""
+        try:
+            numpy.bit_generator.state = {
+                "bit_generator": "PCG64", "state": {"state": self.state, "inc": self.increment},
+                "has_uint32": self.has_half, "uinteger": self.half,
+            }  # fmt: skip
+            torch.set_state(self.torch)
+        except (ValueError, TypeError, OverflowError, RuntimeError) as error:
+            raise InputError("the random numbers are in no state that there is") from error
 
 
 @dataclass(frozen=True, eq=False)
-class DiskState:
-    """The disks with what their optimiser remembers, on the CPU."""
+class ViewState:
+    """Of a view, beside its keyframe and what the pool has of it; the fields are the view's."""
 
-    parameters: DiskParameters
-    first: DiskParameters
-    """Running means of the gradients."""
-    second: DiskParameters
-    """Running means of their squares."""
-    keyframe_id: Int64[Tensor, "n"]
-    steps: Int64[Tensor, "n"]
-    seen: Int64[Tensor, "n"]
+    partners: list[int]
+    search: DepthSearch | None
+
+
+@dataclass(frozen=True, eq=False)
+class TrainedState:
+    """Of a map that has disks."""
+
+    unit: float
+    disks: DiskState
 
 
 @dataclass(frozen=True, eq=False)
 class MapperState:
     """Depths, disks, and how far their training is."""
 
-    depths: DepthState
-    disks: DiskState
-    trained: TrainingPlace
-
-
-def mapper_state(mapper: Mapper) -> MapperState:
-    """Copies of the work of a mapper whose depths were all searched between given limits."""
-    views = [mapper.views[i] for i in mapper.mapped]
-    searches = [view.search for view in views if view.search is not None]
-    optimizer, disks = mapper.optimizer, mapper.map
-    return MapperState(
-        DepthState(
-            torch.tensor(mapper.mapped),
-            torch.stack([view.dense.depth.cpu() for view in views]),
-            torch.stack([view.dense.confidence.cpu() for view in views]),
-            torch.tensor([[s.near, s.typical, s.far] for s in searches], dtype=torch.float64),
-        ),
-        DiskState(
-            DiskParameters(*map(_copied, disks.parameters)),
-            DiskParameters(*map(_copied, optimizer.first)),
-            DiskParameters(*map(_copied, optimizer.second)),
-            *map(_copied, (disks.keyframe_id, disks.steps, disks.seen)),
-        ),
-        mapper.trained,
-    )
-
-
-@torch.no_grad()
-def restore_mapper(mapper: Mapper, state: MapperState) -> None:
-    """Give a mapper that knows the same keyframes, but has no map yet, the work of another."""
-    depths, disks, device = state.depths, state.disks, mapper.map.device
-    mapper.mapped = depths.keyframe_id.tolist()
-    for n, i in enumerate(mapper.mapped):
-        view = mapper.views[i]
-        view.search = DepthSearch(*depths.limits[n].tolist())
-        depth, confidence = depths.depth[n].to(device), depths.confidence[n].to(device)
-        median = depths.depth[n].median()
-        mapper.pool.set_depth(i, DenseDepth(depth, confidence, median))
-    mapper.choose_partners()
-    mapper.trained = state.trained
-    optimizer = mapper.optimizer
-    optimizer.append(disks.parameters, disks.keyframe_id)
-    mapper.map.steps.copy_(disks.steps)
-    mapper.map.seen.copy_(disks.seen)
-    for rows, saved in zip(optimizer.first, disks.first, strict=True):
-        rows.copy_(saved)
-    for rows, saved in zip(optimizer.second, disks.second, strict=True):
-        rows.copy_(saved)
-
-
-def _copied(x: Tensor) -> Tensor:
-    return x.detach().cpu().clone()
+    views: dict[int, ViewState]
+    pool: PoolState
+    mapped: list[int]
+    training: TrainedState | None
+    place: TrainingPlace
+    """How far the training over all keyframes is."""
+    order: list[int]
+    """Of the keyframes that it comes to next."""
+    random: RandomState

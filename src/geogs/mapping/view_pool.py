@@ -1,6 +1,7 @@
 """The large parts of the mapper's views: in memory while they are used, else in a file."""
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -10,6 +11,7 @@ from torch import Tensor
 
 from geogs.config import LossConfig
 from geogs.depth.view import DenseDepth, depth_images
+from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.keyframes.archive import Archive, Archived
 from geogs.keyframes.keyframe import Keyframe
@@ -51,7 +53,7 @@ class StoredDepth:
     """Median depth, map units."""
     scale: float
     """Of the keyframe when its depth was archived."""
-    held: DenseDepth | None
+    held: DenseDepth | None = field(default=None, metadata={"stored": False})
     """The depth itself, where it can also stay: on a GPU it is small beside all else there, and
     bringing it there again takes longer than using it."""
 
@@ -89,6 +91,25 @@ class StoredMaps:
     """Pixels of the render size that belong to the scene; none takes all. On the map's device."""
     depth: StoredDepth | None = None
     rendered_depth: Archived | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class MapsState:
+    """What a checkpoint holds of the maps of a view."""
+
+    depth: StoredDepth | None
+    rendered_depth: Archived | None
+
+
+@dataclass(frozen=True, eq=False)
+class PoolState:
+    """What a checkpoint holds of a pool."""
+
+    archive: Archive
+    maps: dict[int, MapsState]
+    """By keyframe."""
+    resident: list[int]
+    """Keyframes whose maps are in memory, those used last at the end."""
 
 
 class ViewPool:
@@ -188,12 +209,33 @@ class ViewPool:
             maps = self.maps(id)
             maps.rendered_depth, maps.is_render_stored = depth, False
 
-    def store(self) -> None:
-        """Archive what has changed, as for a checkpoint; it stays in memory."""
-        for id in self._stored:
-            maps = self._maps.peek(id)
-            if maps is not None:
-                self._store(id, maps)
+    def state(self) -> PoolState:
+        """What a checkpoint holds; what has changed is archived, and stays in memory."""
+        held = self._maps.items()
+        for id, maps in held:
+            self._store(id, maps)
+        stored = {id: MapsState(s.depth, s.rendered_depth) for id, s in self._stored.items()}
+        return PoolState(self.archive, stored, [id for id, _ in held])
+
+    def load(self, state: PoolState, keyframes: Mapping[int, Keyframe]) -> None:
+        """Give the views of some keyframes, added or not, the maps of another pool.
+
+        Raises:
+            InputError: they are of another size.
+        """
+        self.archive = state.archive
+        size = self.cameras.render.height, self.cameras.render.width
+        for id, saved in state.maps.items():
+            parts = [saved.rendered_depth]
+            if saved.depth is not None:
+                parts += [saved.depth.depth, saved.depth.confidence]
+            if any(part is not None and part.shape != size for part in parts):
+                raise InputError(f"the depth of keyframe {id} has another size")
+            mask = self._stored[id].mask if id in self._stored else None
+            self._maps.drop(id)
+            self._stored[id] = StoredMaps(keyframes[id], mask, saved.depth, saved.rendered_depth)
+        for id in state.resident:
+            self._maps.put(id, self._load(self._stored[id], as_archived=True))
 
     def _store(self, id: int, maps: ViewMaps) -> None:
         stored = self._stored[id]
@@ -203,7 +245,8 @@ class ViewPool:
             stored.rendered_depth = self.archive.put(maps.rendered_depth.cpu().numpy())
         maps.is_depth_stored = maps.is_render_stored = True
 
-    def _load(self, stored: StoredMaps) -> ViewMaps:
+    def _load(self, stored: StoredMaps, as_archived: bool = False) -> ViewMaps:
+        """The maps of a view; its depth at the keyframe's scale, or as it was archived."""
         cameras, loss, keyframe = self.cameras, self.loss, stored.keyframe
         image = keyframe.image
         grey = PhotoView.prepare(
@@ -214,8 +257,8 @@ class ViewPool:
             normal = _shrunk_normal(keyframe, cameras.render, self.device)
         maps = ViewMaps(image, *depth_images(image, cameras.render), grey, normal)
         if stored.depth is not None:
-            maps.depth = stored.depth.load(keyframe.scale, self.device)
-            maps.scale = keyframe.scale
+            maps.scale = stored.depth.scale if as_archived else keyframe.scale
+            maps.depth = stored.depth.load(maps.scale, self.device)
         if stored.rendered_depth is not None:
             rendered = torch.from_numpy(stored.rendered_depth.load())
             maps.rendered_depth = rendered.to(self.device)

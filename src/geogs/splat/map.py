@@ -66,15 +66,6 @@ class GaussianMap:
         none = torch.zeros(0, dtype=torch.int64, device=device)
         return cls(DiskParameters(shape(0, 3), shape(0, 4), shape(0, 2), shape(0)), none)
 
-    def __getstate__(self) -> dict[str, object]:
-        """What a checkpoint holds; the tensors shown are parts of it."""
-        shown = {*DiskParameters._fields, "keyframe_id", "steps", "seen"}
-        return {name: value for name, value in self.__dict__.items() if name not in shown}
-
-    def __setstate__(self, state: dict[str, object]) -> None:
-        self.__dict__.update(state)
-        self._expose()
-
     def __len__(self) -> int:
         return len(self.position)
 

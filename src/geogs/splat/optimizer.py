@@ -4,9 +4,10 @@ import math
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Int64
 from torch import Tensor
 
+from geogs.errors import InputError
 from geogs.geometry.lie import matrix_to_quaternion, sim3_scale
 from geogs.splat.cpu.adam import adam_rows
 from geogs.splat.map import DiskParameters, GaussianMap
@@ -25,6 +26,20 @@ class LearningRates:
 
     def __iter__(self):
         return iter((self.position, self.quaternion, self.log_scale, self.opacity_logit))
+
+
+@dataclass(frozen=True, eq=False)
+class DiskState:
+    """What a checkpoint holds of a map and its optimiser."""
+
+    parameters: DiskParameters
+    first: DiskParameters
+    """Running means of the gradients."""
+    second: DiskParameters
+    """Running means of their squares."""
+    keyframe_id: Int64[Tensor, "n"]
+    steps: Int64[Tensor, "n"]
+    seen: Int64[Tensor, "n"]
 
 
 class MapOptimizer:
@@ -63,6 +78,31 @@ class MapOptimizer:
     def second(self) -> list[Tensor]:
         """Running means of the squared gradients."""
         return [m.rows for m in self._moments[1]]
+
+    def state(self) -> DiskState:
+        """What a checkpoint holds."""
+        disks = self.disks
+        return DiskState(
+            disks.parameters, DiskParameters(*self.first), DiskParameters(*self.second),
+            disks.keyframe_id, disks.steps, disks.seen,
+        )  # fmt: skip
+
+    @torch.no_grad()
+    def load(self, state: DiskState) -> None:
+        """Give a map without disks those of another, with all that is remembered of them.
+
+        Raises:
+            InputError: there is not one of everything for each disk.
+        """
+        groups = (state.parameters, state.first, state.second)
+        if any(len(g.position) != len(state.steps) for g in groups):
+            raise InputError("the disks are incomplete")
+        self.append(state.parameters, state.keyframe_id)
+        own = (*self.first, *self.second, self.disks.steps, self.disks.seen)
+        for rows, saved in zip(
+            own, (*state.first, *state.second, state.steps, state.seen), strict=True
+        ):
+            rows.copy_(saved)
 
     def moments_room(self) -> list[Tensor]:
         """First, then second moments of the four groups with all their room (as the map's)."""

@@ -16,10 +16,6 @@ class GrowingRows:
         self.room = rows.detach().clone()
         self._count = len(rows)
 
-    def __getstate__(self) -> dict[str, object]:
-        """What a checkpoint holds: room that is not in use means nothing."""
-        return {**self.__dict__, "room": self.rows}
-
     def __len__(self) -> int:
         return self._count
 

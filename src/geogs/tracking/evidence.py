@@ -7,6 +7,7 @@ it.
 """
 
 from dataclasses import dataclass
+from math import gcd
 
 import torch
 from jaxtyping import Bool, Float
@@ -109,8 +110,8 @@ def _median_correlation(
     known: Bool[Tensor, "n"],
 ) -> Float[Tensor, "2"]:
     """Median NCC of the known windows with texture in the first image that the second shows."""
-    size = places.new_tensor([grid.camera.width - 1, grid.camera.height - 1])
-    place = places * (2 / size) - 1
+    sides = (grid.camera.width - 1, grid.camera.height - 1)
+    place = torch.stack([places[..., k] * (2 / sides[k]) - 1 for k in (0, 1)], -1)
     seen = (place.abs() <= 1).flatten(1).all(1)
     place = place.nan_to_num(0.0).clamp(-2, 2)
     there = functional.grid_sample(second[None, None], place[None], align_corners=True)[0, 0]
@@ -147,9 +148,9 @@ def _median_where(values: Float[Tensor, "n"], counts: Bool[Tensor, "n"]) -> Floa
 
 
 def _spread(grid: SampleGrid) -> slice:
-    """Every k-th cell, row by row: no more than are looked at, and not below each other."""
+    """Every k-th cell, row by row: no more than are looked at, and from all columns."""
     step = -(-grid.size // MAX_WINDOWS)
-    while step > 1 and grid.width % step == 0:
+    while gcd(step, grid.width) > 1:
         step += 1
     return slice(None, None, step)
 

@@ -1,7 +1,7 @@
 """The frame graph: which keyframes see each other, and the flow measured between them."""
 
 from collections.abc import Callable, Collection, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
@@ -12,10 +12,11 @@ from geogs.bundle.base import BundleOptions, BundleResult
 from geogs.bundle.problem import BundleProblem, StreamedProblem
 from geogs.bundle.select import bundle_solver, grid_fields, keyframe_pairs
 from geogs.bundle.streamed import StreamedBundle
+from geogs.errors import InputError
 from geogs.keyframes.store import Segment
 from geogs.threads import thread_map
 from geogs.tracking.flow.base import FlowMatch, FlowOperator
-from geogs.tracking.packed_edge import PackedEdge, packed_reprojections
+from geogs.tracking.packed_edge import PackedEdge, PackedFlow, packed_reprojections
 from geogs.tracking.proximity import PAIRS_TOGETHER, Pair
 
 STACKED_EDGES = 1024
@@ -32,12 +33,8 @@ class MeasuredEdge:
     """Where the cells fell when the flow was measured."""
     damping: Float[Tensor, "p"] | None = None
     """Of the source's inverse depth, if the operator gives one."""
-    memory: Any = None
-    """What the operator keeps of this edge."""
-
-    def __getstate__(self) -> dict[str, object]:
-        """What a checkpoint holds: the operator does without its memory."""
-        return {**self.__dict__, "memory": None}
+    memory: Any = field(default=None, metadata={"stored": False})
+    """What the operator keeps of this edge, and can do without."""
 
     @staticmethod
     def of(match: FlowMatch, n: int, reprojection: Float[Tensor, "p 2"]) -> "MeasuredEdge":
@@ -49,6 +46,8 @@ class MeasuredEdge:
 
 Edge = MeasuredEdge | PackedEdge
 """One direction of a measured pair, in full or packed."""
+EdgeState = MeasuredEdge | PackedFlow
+"""What a checkpoint holds of one."""
 
 
 class FrameGraph:
@@ -59,6 +58,26 @@ class FrameGraph:
         self.operator = operator
         self.edges: dict[Pair, Edge] = {}
         self.bundle = bundle_solver(keyframes.grid)
+
+    def state(self) -> dict[Pair, EdgeState]:
+        """What a checkpoint holds: the edges."""
+        return {
+            directed: edge.flow if isinstance(edge, PackedEdge) else edge
+            for directed, edge in self.edges.items()
+        }
+
+    def load(self, state: dict[Pair, EdgeState]) -> None:
+        """Give a graph without edges those of another, whose keyframes are here already.
+
+        Raises:
+            InputError: an edge is of another camera, or joins what is not there.
+        """
+        grid = self.keyframes.grid
+        for (i, j), edge in state.items():
+            cells = edge.position if isinstance(edge, PackedFlow) else edge.pixels
+            if len(cells) != grid.size or i not in self.keyframes or j not in self.keyframes:
+                raise InputError(f"the edge from {i} to {j} has no place")
+            self.edges[i, j] = PackedEdge(grid, edge) if isinstance(edge, PackedFlow) else edge
 
     @property
     def pairs(self) -> list[Pair]:

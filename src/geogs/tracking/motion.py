@@ -7,11 +7,13 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Float32
 from torch import Tensor
 
 from geogs.bundle.select import grid_fields, motion_solver
+from geogs.errors import InputError
 from geogs.geometry.lie import se3_inverse
+from geogs.gpu.transfer import to_device
 from geogs.keyframes.grid import SampleGrid
 from geogs.keyframes.keyframe import Keyframe
 from geogs.tracking.evidence import Evidence, correlation_at, correlation_matched
@@ -125,17 +127,16 @@ class FrameLocator:
             huber=FIT_HUBER,
             limit=2 * self.max_residual,
         )
-        T_rel = T @ se3_inverse(keyframe.T_cw).to(T.device)
-        borne_out = correlation_at(
+        seen = correlation_at(
             self.grid,
             self.operator.grey(keyframe.encoded),
             self.operator.grey(encoded),
-            T_rel,
+            T @ to_device(se3_inverse(keyframe.T_cw), T.device),
             keyframe.inverse_depth,
             keyframe.information,
         )
         # All at once, so that a GPU is waited for once.
-        found = torch.cat([T.reshape(-1), judged.to(T), borne_out.to(T)]).cpu()
+        found = torch.cat([T.reshape(-1), judged.to(T), seen.to(T)]).cpu()
         _, agree, residual, flow = found[16:20].tolist()
         if agree < self.min_matched or not residual < self.max_residual:
             return None
@@ -159,6 +160,14 @@ class ChainedMatch:
     """Fraction of the cells that are matched; 0 where the images do not agree there."""
 
 
+@dataclass(frozen=True, eq=False)
+class ChainState:
+    """What a checkpoint holds of a chain: where the cells are, in both directions."""
+
+    there: Float32[Tensor, "1 p 2"] | None
+    back: Float32[Tensor, "1 p 2"] | None
+
+
 class FlowChain:
     """Follows the flow from a keyframe through the frames after it, each starting from the last."""
 
@@ -168,6 +177,17 @@ class FlowChain:
         self.min_ncc = min_ncc
         self._there: Tensor | None = None
         self._back: Tensor | None = None
+
+    def state(self) -> ChainState:
+        """What a checkpoint holds."""
+        return ChainState(self._there, self._back)
+
+    def load(self, state: ChainState) -> None:
+        """Go on where another was. Raises InputError if that was of another camera."""
+        for positions in (state.there, state.back):
+            if positions is not None and positions.shape[1] != self.grid.size:
+                raise InputError("the flow of the start is of another camera")
+        self._there, self._back = state.there, state.back
 
     def reset(self) -> None:
         """Begin again at a new keyframe."""

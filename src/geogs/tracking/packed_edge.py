@@ -19,9 +19,9 @@ MAX_WEIGHT = 6e4
 """Largest weight that half precision holds, 1 / pixel^2."""
 
 
-@dataclass
-class PackedEdge:
-    """One direction of a measured pair; reads like a ``MeasuredEdge``.
+@dataclass(frozen=True, eq=False)
+class PackedFlow:
+    """What is kept of an edge.
 
     Positions are kept in steps of 2^-15 of the long edge (1/64 pixel at 512; matches half an image
     outside are held at its border) and weights in half precision. Where the cells fell when the
@@ -29,7 +29,6 @@ class PackedEdge:
     share.
     """
 
-    grid: SampleGrid
     position: Int16[Tensor, "p 2"]
     half_weight: Float16[Tensor, "p 2"]
     T_source: Float[Tensor, "4 4"]
@@ -37,12 +36,16 @@ class PackedEdge:
     T_target: Float[Tensor, "4 4"]
     inverse_depth: Float[Tensor, "p"]
     """Of the source when the flow was measured."""
-    damping: Float[Tensor, "p"] | None = None
-    memory: Any = None
+    damping: Float[Tensor, "p"] | None
 
-    def __getstate__(self) -> dict[str, object]:
-        """What a checkpoint holds: the operator does without its memory."""
-        return {**self.__dict__, "memory": None}
+
+@dataclass
+class PackedEdge:
+    """One direction of a measured pair; reads like a ``MeasuredEdge``."""
+
+    grid: SampleGrid
+    flow: PackedFlow
+    memory: Any = None
 
     @staticmethod
     def all_of(
@@ -56,12 +59,14 @@ class PackedEdge:
         return [
             PackedEdge(
                 grid,
-                position[n],
-                half_weight[n],
-                i.T_cw,
-                j.T_cw,
-                i.inverse_depth,
-                None if match.damping is None else match.damping[n],
+                PackedFlow(
+                    position[n],
+                    half_weight[n],
+                    i.T_cw,
+                    j.T_cw,
+                    i.inverse_depth,
+                    None if match.damping is None else match.damping[n],
+                ),
                 None if match.memory is None else match.memory[n],
             )
             for n, (i, j) in enumerate(zip(source, target, strict=True))
@@ -70,12 +75,17 @@ class PackedEdge:
     @property
     def pixels(self) -> Float[Tensor, "p 2"]:
         """Position in the target of each cell of the source; the image's centre where unmatched."""
-        return unpacked_positions(self.grid, self.position)
+        return unpacked_positions(self.grid, self.flow.position)
 
     @property
     def weight(self) -> Float[Tensor, "p 2"]:
         """Inverse variance of x and y in 1 / pixel^2."""
-        return self.half_weight.float()
+        return self.flow.half_weight.float()
+
+    @property
+    def damping(self) -> Float[Tensor, "p"] | None:
+        """Of the source's inverse depth, if the operator gives one."""
+        return self.flow.damping
 
     @property
     def reprojection(self) -> Float[Tensor, "p 2"]:
@@ -104,9 +114,9 @@ def unpacked_positions(grid: SampleGrid, position: Int16[Tensor, "*b 2"]) -> Flo
 
 def packed_reprojections(edges: Sequence[PackedEdge]) -> Float[Tensor, "e p 2"]:
     """Where the cells fell when the flow of each edge was measured."""
-    grid = edges[0].grid
-    source, target = (torch.stack([getattr(e, k) for e in edges]) for k in ("T_source", "T_target"))
-    depth = torch.stack([e.inverse_depth for e in edges])
+    grid, flows = edges[0].grid, [e.flow for e in edges]
+    source, target = (torch.stack([getattr(f, k) for f in flows]) for k in ("T_source", "T_target"))
+    depth = torch.stack([f.inverse_depth for f in flows])
     return project(grid.camera, grid.rays, target @ se3_inverse(source), depth).pixels
 
 

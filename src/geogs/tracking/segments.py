@@ -10,7 +10,7 @@ from torch import Tensor
 
 from geogs.errors import TrackingLost
 from geogs.tracking.motion import Recognition
-from geogs.tracking.tracker import Tracker, TrackResult, TrackState
+from geogs.tracking.tracker import Tracker, TrackerState, TrackResult, TrackState
 from geogs.types import Frame, Trajectory
 
 Recall = Callable[[UInt8[np.ndarray, "h w 3"]], Sequence[Recognition]]
@@ -28,6 +28,17 @@ class SegmentFate:
     """It had when it was joined, or at the end."""
     fate: Literal["world", "joined", "apart"]
     """The first of the map, joined to it, or never: then its frames count as not tracked."""
+
+
+@dataclass(frozen=True, eq=False)
+class SegmentsState:
+    """What a checkpoint holds of segments."""
+
+    trackers: list[TrackerState]
+    world: int
+    """Its place among the trackers."""
+    current: int
+    joined: list[SegmentFate]
 
 
 class Segments:
@@ -83,6 +94,22 @@ class Segments:
             if t.keyframe_ids
         ]
         return sorted([*present, *self._joined], key=lambda s: s.first_time)
+
+    # --- checkpoints -----------------------------------------------------------------------
+
+    def state(self) -> SegmentsState:
+        """What a checkpoint holds."""
+        at = {tracker: n for n, tracker in enumerate(self.trackers)}
+        trackers = [tracker.full_state() for tracker in self.trackers]
+        return SegmentsState(trackers, at[self.world], at[self.current], self._joined)
+
+    def load(self, state: SegmentsState) -> None:
+        """Give segments that have seen nothing yet the state of others."""
+        self.trackers = [self.world, *(self._start() for _ in state.trackers[1:])]
+        for tracker, saved in zip(self.trackers, state.trackers, strict=True):
+            tracker.load(saved)
+        self.world, self.current = self.trackers[state.world], self.trackers[state.current]
+        self._joined = state.joined
 
     # --- writing ---------------------------------------------------------------------------
 

@@ -9,7 +9,7 @@ from geogs.config import TrackingConfig
 from geogs.tracking.graph import FrameGraph
 from geogs.tracking.initialise import initialise
 from geogs.tracking.keyframe_priors import KeyframePriors
-from geogs.tracking.motion import FlowChain
+from geogs.tracking.motion import ChainState, FlowChain
 from geogs.tracking.trajectory import TrajectoryRecorder
 from geogs.types import Frame
 
@@ -29,6 +29,14 @@ class StartStep:
     """Ids of keyframes that were given up."""
 
 
+@dataclass(frozen=True, eq=False)
+class StartUpState:
+    """What a checkpoint holds of a start, beside keyframes and frames."""
+
+    misses: int
+    chain: ChainState
+
+
 class StartUp:
     """Chooses keyframes by the flow since the last, and starts the map once there are enough."""
 
@@ -46,6 +54,15 @@ class StartUp:
         self._chain = FlowChain(self.keyframes.grid, graph.operator, config.min_ncc)
         self._misses = 0
 
+    def state(self) -> StartUpState:
+        """What a checkpoint holds."""
+        return StartUpState(self._misses, self._chain.state())
+
+    def load(self, state: StartUpState) -> None:
+        """Go on where another was."""
+        self._misses = state.misses
+        self._chain.load(state.chain)
+
     def take(self, frame: Frame, encoded: Any) -> StartStep:
         """Take the next frame."""
         if len(self.keyframes):
@@ -56,7 +73,7 @@ class StartUp:
             self._misses = 0
             if match.flow < self.config.keyframe_flow * self._long_edge:
                 eye = torch.eye(4, dtype=torch.float64)
-                self.recorder.add(frame.index, frame.timestamp, encoded, last.id, eye, match.there)
+                self.recorder.add(frame, encoded, last.id, eye, match.there)
                 return StartStep()
         return self._gather(frame, encoded)
 

@@ -8,7 +8,7 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float64
 from torch import Tensor
 
 from geogs.bundle.base import BundleOptions
@@ -18,21 +18,21 @@ from geogs.errors import InputError, TrackingLost
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_inverse
 from geogs.keyframes.grid import SampleGrid
-from geogs.keyframes.keyframe import Keyframe
+from geogs.keyframes.keyframe import Keyframe, KeyframeState
 from geogs.keyframes.store import KeyframeStore, scaled
 from geogs.priors.base import MonocularPrior
 from geogs.tracking.flow.base import FlowOperator
 from geogs.tracking.flow.select import build_operator
-from geogs.tracking.graph import FrameGraph
+from geogs.tracking.graph import EdgeState, FrameGraph
 from geogs.tracking.keyframe_priors import KeyframePriors
 from geogs.tracking.motion import (
     FrameLocator,
     FrameMotion,
     Recognition,
 )
-from geogs.tracking.proximity import frame_distances, proximity_pairs
-from geogs.tracking.start_up import MIN_KEYFRAMES, StartUp
-from geogs.tracking.trajectory import FrameRecord, TrajectoryRecorder
+from geogs.tracking.proximity import Pair, frame_distances, proximity_pairs
+from geogs.tracking.start_up import MIN_KEYFRAMES, StartUp, StartUpState
+from geogs.tracking.trajectory import FrameRecord, RecorderState, TrajectoryRecorder
 from geogs.types import Frame, Trajectory
 
 
@@ -87,6 +87,32 @@ class LastFrame:
     def _present(self, T: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:
         factor = self.keyframe.scale / self.scale
         return T if factor == 1.0 else scaled(T, factor)
+
+
+@dataclass(frozen=True, eq=False)
+class LastFrameState:
+    """What a checkpoint holds of where the camera was last seen; the fields are a last frame's."""
+
+    keyframe: int
+    T_rel: Float64[Tensor, "4 4"]
+    velocity: Float64[Tensor, "4 4"] | None
+    scale: float
+
+
+@dataclass(frozen=True, eq=False)
+class TrackerState:
+    """What a checkpoint holds of a tracker."""
+
+    keyframes: list[KeyframeState]
+    edges: dict[Pair, EdgeState]
+    recorder: RecorderState
+    start_up: StartUpState
+    state: TrackState
+    finalized: list[int]
+    breaks: list[int]
+    last: LastFrameState | None
+    misses: int
+    frames_lost: int
 
 
 class Tracker:
@@ -159,6 +185,33 @@ class Tracker:
         """Ids whose poses the local adjustment moves, earliest first; never the very first."""
         ids = self.keyframe_ids
         return tuple(k for k in ids[-self.config.window :] if k != ids[0])
+
+    # --- checkpoints -----------------------------------------------------------------------
+
+    def full_state(self) -> TrackerState:
+        """What a checkpoint holds; ``state`` is only what the tracker is doing."""
+        seen, last = self._last, None
+        if seen is not None:
+            last = LastFrameState(seen.keyframe.id, seen.T_rel, seen.velocity, seen.scale)
+        return TrackerState(
+            self.keyframes.state(), self.graph.state(), self.recorder.state(),
+            self._start_up.state(), self.state, list(self._finalized), self._breaks, last,
+            self._misses, self.frames_lost,
+        )  # fmt: skip
+
+    def load(self, state: TrackerState) -> None:
+        """Give a tracker that has seen nothing yet the state of another."""
+        self.keyframes.load(state.keyframes)
+        self.graph.load(state.edges)
+        self.recorder.load(state.recorder)
+        self._start_up.load(state.start_up)
+        self.state = state.state
+        self._finalized, self._breaks = dict.fromkeys(state.finalized), state.breaks
+        self._misses, self.frames_lost = state.misses, state.frames_lost
+        if state.last is not None:
+            last = state.last
+            keyframe = self.keyframes[last.keyframe]
+            self._last = LastFrame(keyframe, last.T_rel, last.velocity, last.scale)
 
     # --- writing ---------------------------------------------------------------------------
 
@@ -304,7 +357,7 @@ class Tracker:
         T_rel = motion.T_cw @ se3_inverse(anchor.T_cw)
         self._seen_at(anchor, T_rel, velocity)
         if motion.flow < self.config.keyframe_flow * self._long_edge:
-            self.recorder.add(frame.index, frame.timestamp, encoded, anchor.id, T_rel, motion.match)
+            self.recorder.add(frame, encoded, anchor.id, T_rel, motion.match)
             return TrackResult(self.state, active=self.active)
         return self._insert(frame, encoded, motion, velocity)
 

@@ -7,19 +7,20 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float16, Int16
+from jaxtyping import Bool, Float, Float16, Int16, UInt8
 from torch import Tensor
 
 from geogs.bundle.problem import MotionProblem
 from geogs.bundle.projection import linearise
 from geogs.bundle.select import grid_fields, motion_solver
+from geogs.errors import InputError
 from geogs.geometry.lie import retract, se3_inverse, se3_log
 from geogs.keyframes.grid import SampleGrid
 from geogs.keyframes.keyframe import Keyframe
 from geogs.keyframes.store import Segment, scaled
 from geogs.tracking.flow.base import FlowMatch, FlowOperator
 from geogs.tracking.packed_edge import pack_matches, unpacked_positions
-from geogs.types import Trajectory
+from geogs.types import Frame, Trajectory
 
 
 @dataclass
@@ -53,7 +54,17 @@ class FrameRecord:
 @dataclass
 class _Pending:
     record: FrameRecord
+    image: UInt8[np.ndarray, "h w 3"]
     encoded: Any
+
+
+@dataclass(frozen=True, eq=False)
+class RecorderState:
+    """What a checkpoint holds of a recorder."""
+
+    records: list[FrameRecord]
+    pending: dict[int, UInt8[np.ndarray, "h w 3"]]
+    """Images of the frames that wait, by their indices."""
 
 
 class TrajectoryRecorder:
@@ -69,6 +80,30 @@ class TrajectoryRecorder:
         self._pending: list[_Pending] = []
         self._subset = torch.nonzero(sparse_cells(store.grid))[:, 0]
 
+    def state(self) -> RecorderState:
+        """What a checkpoint holds."""
+        return RecorderState(self.records, {p.record.index: p.image for p in self._pending})
+
+    def load(self, state: RecorderState) -> None:
+        """Give a recorder without frames those of another.
+
+        Raises:
+            InputError: they are of another camera, or one that waits is unknown.
+        """
+        camera, cells = self.keyframes.grid.camera, len(self._subset)
+        by_index = {record.index: record for record in state.records}
+        seen = [len(o.position) for record in state.records for o in record.observations]
+        images = [image.shape[:2] for image in state.pending.values()]
+        if {*seen} - {cells} or {*images} - {(camera.height, camera.width)}:
+            raise InputError("the frames are of another camera")
+        if state.pending.keys() - by_index.keys():
+            raise InputError("a frame that waits is unknown")
+        self.records = state.records
+        self._pending = [
+            _Pending(by_index[n], image, self.operator.encode(image))
+            for n, image in state.pending.items()
+        ]
+
     def add_untracked(self, index: int, timestamp: float) -> None:
         """A frame that could not be located."""
         eye = torch.eye(4, dtype=torch.float64)
@@ -76,19 +111,19 @@ class TrajectoryRecorder:
 
     def add(
         self,
-        index: int,
-        timestamp: float,
+        frame: Frame,
         encoded: Any,
         anchor: int,
         T_rel: Float[Tensor, "4 4"],
         match: FlowMatch | None = None,
     ) -> None:
         """A frame at ``T_rel`` from the anchor keyframe, with the flow that located it."""
-        record = FrameRecord(index, timestamp, anchor, T_rel, self.keyframes[anchor].scale)
+        scale = self.keyframes[anchor].scale
+        record = FrameRecord(frame.index, frame.timestamp, anchor, T_rel, scale)
         if match is not None:
             self._observe([(record, anchor)], match)
         self.records.append(record)
-        self._pending.append(_Pending(record, encoded))
+        self._pending.append(_Pending(record, frame.image, encoded))
         if len(self._pending) > self.max_pending:
             del self._pending[: self.max_pending // 2]
 
@@ -111,7 +146,7 @@ class TrajectoryRecorder:
                 record.scale = self.keyframes[substitute].scale
                 record.observations = [o for o in record.observations if o.keyframe != removed.id]
                 if record.index == removed.frame_index:
-                    self._pending.append(_Pending(record, removed.encoded))
+                    self._pending.append(_Pending(record, removed.image, removed.encoded))
         self._pending.sort(key=lambda p: p.record.index)
 
     def absorb(self, other: "TrajectoryRecorder") -> None:

@@ -9,8 +9,7 @@ from torch import Tensor
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import quaternion_to_matrix
 from geogs_bench.appearance.disks import AppearanceDisks
-from geogs_bench.appearance.rasteriser import MedianDisks
-from geogs_bench.appearance.reference import MIN_ALPHA, PIXEL_SHARPNESS
+from geogs_bench.appearance.rasteriser import MIN_ALPHA, PIXEL_SHARPNESS, MedianDisks
 
 _MIN_FACING = 0.1
 """Smallest cosine between a ray and the normal of a disk whose plane it is crossed with."""

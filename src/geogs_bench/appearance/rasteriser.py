@@ -11,6 +11,11 @@ from torch import Tensor
 from geogs.geometry.camera import Camera
 from geogs_bench.appearance.disks import AppearanceDisks
 
+MIN_ALPHA = 1 / 255
+"""Below this a disk does not hit a pixel."""
+PIXEL_SHARPNESS = 2.0
+"""Inverse variance in 1/pixel^2 of the Gaussian around a centre below which no disk shrinks."""
+
 
 @dataclass(frozen=True)
 class Rendering:

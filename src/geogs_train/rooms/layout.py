@@ -34,10 +34,10 @@ class _Group:
     """Every so many-th place is a picture; 0 for none."""
 
 
-def draw_layout(draw: Draw, size: Float[Tensor, "b 3"], density: tuple[float, float]) -> Layout:
-    """Furnishes rooms of these sizes; ``density`` as in :class:`RoomOptions`."""
+def draw_layout(draw: Draw, size: Float[Tensor, "b 3"], least: float, most: float) -> Layout:
+    """Furnishes rooms of these sizes; the densities are those of :class:`RoomOptions`."""
     b = len(size)
-    share = draw.uniform(*density, b)[:, None]
+    share = draw.uniform(least, most, b)[:, None]
     cupboards = pieces.cupboards(draw, size, 8)
     tables = pieces.tables(draw, size, 3)
     shelves = pieces.shelves(draw, size, 2)

@@ -29,8 +29,10 @@ class RoomOptions:
     """Of the images, pixels."""
     views: int = 2
     """Per clip; 2 makes pairs, more make short smooth paths."""
-    density: tuple[float, float] = (0.12, 0.5)
-    """Least and largest share of the places for solids that a room fills (there are about 125)."""
+    least_density: float = 0.12
+    """Least share of the places for solids that a room fills (there are about 125)."""
+    most_density: float = 0.5
+    """Largest share of them."""
     motions: MotionShares = MotionShares()
     """Kinds of camera motion."""
     candidates: int = 24

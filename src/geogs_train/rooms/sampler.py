@@ -84,7 +84,7 @@ def draw_plan(
     key = (seed, int(options.validation), step, rank)
     draw = Draw(torch.device("cpu"), *key)
     size = _draw_sizes(draw, batch)
-    layout = draw_layout(draw, size, options.density)
+    layout = draw_layout(draw, size, options.least_density, options.most_density)
     surfaces = draw_surfaces(draw, layout, options.textures, materials)
     lights = draw_lights(draw, size, options.views, options.light_change)
     paths = draw_paths(draw, options, size)

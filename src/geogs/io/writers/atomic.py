@@ -4,6 +4,7 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import BinaryIO
 
 from geogs.errors import OutputError
@@ -52,11 +53,12 @@ def prepare_output_folder(path: str | Path) -> Path:
     folder = Path(path).expanduser()
     if folder.exists() and not folder.is_dir():
         raise OutputError(f"{folder} is a file; give another folder for the results.")
-    probe = folder / ".writable"
-    write_text(probe, "")
-    with suppress(OSError):
-        probe.unlink()
-    return folder
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with TemporaryFile(dir=folder):
+            return folder
+    except OSError as error:
+        raise OutputError(_sentence(folder, error)) from error
 
 
 def _sentence(path: Path, error: OSError) -> str:

@@ -1,7 +1,7 @@
 """What the tracker asks of a flow operator."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -21,7 +21,7 @@ class FlowMatch:
     damping: Float[Tensor, "e p"] | None = None
     """What resists a change of the first image's inverse depth, in the units of its inverse
     variance; equal for all edges of a call that share the first image. None for nothing."""
-    memory: tuple[Any, ...] | None = None
+    memory: tuple[Any, ...] | None = field(default=None, metadata={"stored": False})
     """Of each edge, what the operator wants to be given when it measures that edge again."""
 
     def sure(self) -> Bool[Tensor, "e p"]:

@@ -23,31 +23,12 @@ from geogs.tracking.flow.lookup import (
     PyramidLevel,
     correlation_windows,
 )
+from geogs.tracking.flow.own_options import NetworkOptions
 
 FLOW_UNIT = 16.0
 """Pixels of flow that are one to the network."""
 MIN_LOG_SCALE, MAX_LOG_SCALE = -4.5, 3.0
 """Bounds of the logarithm of a matched cell's Laplace scale in pixels."""
-
-
-@dataclass(frozen=True)
-class NetworkOptions:
-    """Sizes of the network."""
-
-    levels: tuple[int, ...] = (2, 8, 32)
-    """Pixels between the descriptors of each level of the pyramid, powers of two."""
-    stem: int = 32
-    """Channels at 1/2 of the resolution."""
-    middle: int = 64
-    """Channels at 1/4."""
-    deep: int = 96
-    """Channels at 1/8."""
-    hidden: int = 96
-    """Channels of the recurrent state."""
-    context: int = 64
-    """Channels of what an image gives to every iteration."""
-    motion: int = 80
-    """Channels that the correlation windows are reduced to."""
 
 
 @dataclass(frozen=True)

@@ -44,10 +44,12 @@ def furnished(device: torch.device) -> tuple[Rooms, Views]:
     """Random rooms as they are trained with; on a GPU as large."""
     large = device.type == "cuda"
     width, height = (512, 384) if large else (45, 30)
-    options = RoomOptions(width=width, height=height, density=(0.7, 0.9), candidates=8)
+    options = RoomOptions(
+        width=width, height=height, least_density=0.7, most_density=0.9, candidates=8
+    )
     draw = Draw(torch.device("cpu"), 3)
     size = draw.uniform(3.0, 6.0, 2 if large else 1, 3)
-    layout = draw_layout(draw, size, options.density)
+    layout = draw_layout(draw, size, options.least_density, options.most_density)
     surfaces = draw_surfaces(draw, layout, 2, 1)
     lights = draw_lights(draw, size, 2, 1.0)
     views = choose_cameras(draw_paths(draw, options, size), size, layout.solids, width, height)

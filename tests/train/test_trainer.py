@@ -29,7 +29,9 @@ from geogs_train.scores import CellErrors, has_texture, summarise
 from geogs_train.starts import StartOptions, disturbed_starts
 from geogs_train.trainer import FlowTrainer, Worker, schedule
 
-ROOMS = RoomOptions(width=64, height=48, textures=6, texture_size=64, density=(0.02, 0.05))
+ROOMS = RoomOptions(
+    width=64, height=48, textures=6, texture_size=64, least_density=0.02, most_density=0.05
+)
 TINY = FlowTraining(
     steps=4,
     batch=1,
@@ -206,7 +208,11 @@ def test_a_resumed_run_equals_one_that_was_never_stopped(tmp_path):
     losses = [float(whole.advance()) for _ in range(3)]
     first = FlowTrainer(TINY, CPU)
     first.advance()
+    (tmp_path / "checkpoint").mkdir()
+    (tmp_path / "checkpoint" / "notes.txt").touch()  # of somebody else
     save_checkpoint(first, tmp_path)
+    save_checkpoint(first, tmp_path)
+    assert (tmp_path / "checkpoint" / "notes.txt").is_file()
     assert read_options(tmp_path) == TINY
     second = FlowTrainer(replace(TINY, seed=0), CPU)
     load_checkpoint(second, tmp_path)
@@ -222,7 +228,8 @@ def test_the_command_trains_resumes_and_writes_weights(tmp_path):
     options = ["--training.batch", "1", "--training.iterations", "2", "--run.validation-batches",
                "1", "--training.rooms.width", "64", "--training.rooms.height", "48",
                "--training.rooms.textures", "6", "--training.rooms.texture-size", "64",
-               "--training.rooms.density", "0.02", "0.05", "--device", "cpu"]  # fmt: skip
+               "--training.rooms.least-density", "0.02",
+               "--training.rooms.most-density", "0.05", "--device", "cpu"]  # fmt: skip
     assert main(["train", "flow", str(out), "--training.steps", "1", *options]) == 0
     network = load_network(out / "flow.safetensors")
     assert sum(p.numel() for p in network.parameters()) > 1e6
@@ -235,6 +242,9 @@ def test_the_command_trains_resumes_and_writes_weights(tmp_path):
 def test_resuming_nothing_is_one_sentence(tmp_path, capsys):
     assert main(["train", "flow", str(tmp_path / "no"), "--run.resume", "--device", "cpu"]) == 2
     assert "There is no checkpoint" in capsys.readouterr().err
+    (tmp_path / "checkpoint.safetensors").write_bytes(b"rubbish")
+    assert main(["train", "flow", str(tmp_path), "--run.resume", "--device", "cpu"]) == 2
+    assert "is damaged" in capsys.readouterr().err
 
 
 def test_the_second_stage_begins_near_the_truth_and_learns_from_what_is_adjusted():

@@ -1,0 +1,259 @@
+"""``checkpoint/`` in a folder of results: complete or not there, and nothing foreign is touched.
+
+A manifest names every file of ours before it is made, and only those are ever deleted. A state's
+files are new ones each time; it is complete once a manifest with their sizes and checksums has
+taken the place of the last. Files are opened by plain names in the folder; links are not followed.
+"""
+
+import errno
+import hashlib
+import json
+import os
+import re
+import stat
+from collections.abc import Callable, Collection, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import BinaryIO, cast
+
+from geogs.application.records import pack, unpack
+from geogs.errors import InputError, OutputError
+from geogs.version import __version__
+
+FORMAT = "geogs checkpoint 2"
+MANIFEST = "manifest.json"
+_UNFINISHED = ".manifest.json.part"
+_PLAIN_NAME = re.compile(r"[a-z0-9.][a-z0-9.-]*[a-z0-9]")
+_LARGEST_MANIFEST = 1 << 24
+"""Bytes; it has about a hundred for every file."""
+_MODES = {os.O_RDONLY: "rb", os.O_WRONLY: "wb", os.O_RDWR: "r+b"}
+
+
+@dataclass(frozen=True)
+class Sum:
+    """What a file should hold."""
+
+    size: int
+    """Bytes."""
+    sha256: str
+
+    @staticmethod
+    def of(data: bytes) -> "Sum":
+        """That of a file with these bytes."""
+        return Sum(len(data), hashlib.sha256(data).hexdigest())
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """What geogs wrote in a folder."""
+
+    format: str
+    geogs: str
+    """The version that wrote it."""
+    schema: str
+    """Of the state, see :func:`geogs.application.records.schema`."""
+    is_our_folder: bool
+    """Whether geogs made it."""
+    number: int
+    """Of the state that was begun last, from 1."""
+    state: dict[str, Sum]
+    """The files of the complete state, but for archives, whose arrays have checksums of their own;
+    none if it was never completed."""
+    files: list[str]
+    """All of ours that may be there, the manifest apart."""
+
+
+class CheckpointFolder:
+    """A folder that geogs makes, fills and removes; files of others there are left alone."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def manifest(self) -> Manifest | None:
+        """What was written there; None if there is no folder, or no manifest in it.
+
+        Raises:
+            InputError: the folder or the manifest is a link, foreign, or damaged.
+        """
+        if not os.path.lexists(self.path):
+            return None
+        with self._opened() as folder:
+            if MANIFEST not in os.listdir(folder):
+                return None
+        with self._open(MANIFEST, os.O_RDONLY) as file:
+            data = file.read(_LARGEST_MANIFEST)
+        try:
+            given = json.loads(data)
+            checksum = given.pop("checksum")
+            manifest = unpack(Manifest, given, {}, {})
+        except (ValueError, LookupError, AttributeError, TypeError, RecursionError) as error:
+            raise InputError(f"{MANIFEST} is damaged, or none of geogs") from error
+        if checksum != Sum.of(_json(pack(Manifest, manifest).values)).sha256:
+            raise InputError(f"{MANIFEST} has changed")
+        return manifest
+
+    def read(self, name: str, wanted: Sum) -> bytes:
+        """What a file holds. Raises InputError if it is not what it should be."""
+        with self._open(name, os.O_RDONLY) as file:
+            size = os.fstat(file.fileno()).st_size
+            if size < wanted.size:
+                raise InputError(f"{name} is cut off")
+            data = file.read(wanted.size)
+        if size > wanted.size or Sum.of(data) != wanted:
+            raise InputError(f"{name} has changed")
+        return data
+
+    @contextmanager
+    def replaced(
+        self, schema: str, archives: Collection[str]
+    ) -> Iterator[Callable[[str, bytes], None]]:
+        """Replace the state, completely or not at all, when the block ends without an error.
+
+        Yields what writes a file of the new state, given the end of its name and its bytes; the
+        ``archives`` that it refers to are made in the block, too. What only the last state
+        consisted of is deleted.
+
+        Raises:
+            OutputError: the disk is full, or the folder cannot be written or is not ours.
+        """
+        try:
+            last = self._last()
+            number, sums = last.number + 1, dict[str, Sum]()
+            new = [f"state-{number}.json", f"state-{number}.safetensors"]
+            begun = replace(last, number=number, files=sorted({*last.files, *archives, *new}))
+            self._write_manifest(begun)
+
+            def write(ending: str, data: bytes) -> None:
+                name = f"state-{number}.{ending}"
+                assert name in new, f"{name} is not in the manifest"
+                with self.create(name) as file:
+                    file.write(data)
+                    file.flush()
+                    os.fsync(file.fileno())
+                sums[name] = Sum.of(data)
+
+            try:
+                yield write
+            except BaseException:
+                self._delete(new)
+                raise
+            done = replace(begun, format=FORMAT, geogs=__version__, schema=schema, state=sums)
+            self._write_manifest(done)
+            self._delete(set(done.files).difference(archives, sums))
+        except OSError as error:
+            reason = error.strerror or error
+            raise OutputError(
+                f"{self.path} cannot be written ({reason}); free some space or give another output "
+                "folder."
+            ) from error
+        except InputError as error:
+            raise OutputError(f"{self.path} is left alone ({error}).") from error
+
+    @contextmanager
+    def create(self, name: str) -> Iterator[BinaryIO]:
+        """A new file for reading and writing, which is gone again after an error.
+
+        Raises OSError if there is one of that name.
+        """
+        try:
+            with self._open(name, os.O_RDWR | os.O_CREAT | os.O_EXCL) as file:
+                yield file
+        except FileExistsError:
+            raise
+        except BaseException:
+            self._delete([name])
+            raise
+
+    @contextmanager
+    def change(self, name: str) -> Iterator[BinaryIO]:
+        """A file for reading and writing. Raises InputError if it cannot be opened."""
+        with self._open(name, os.O_RDWR) as file:
+            yield file
+
+    def remove(self) -> None:
+        """Delete all files of ours, and the folder if we made it and nothing else is in it."""
+        with suppress(OSError, InputError):
+            manifest = self.manifest()
+            if manifest is not None:
+                self._delete([*manifest.files, _UNFINISHED])
+                self._delete([MANIFEST])
+                if manifest.is_our_folder:
+                    self.path.rmdir()
+
+    def _last(self) -> Manifest:
+        """The manifest so far; a new one, in a folder that there is then, if there is none."""
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            self.path.mkdir()
+            is_our_folder = True
+        except FileExistsError:
+            is_our_folder = False
+        last = self.manifest()
+        if last is None:
+            return Manifest(FORMAT, __version__, "", is_our_folder, 0, {}, [])
+        with self._opened() as folder:
+            there = set(os.listdir(folder))
+        return replace(last, files=[name for name in last.files if name in there])
+
+    def _write_manifest(self, manifest: Manifest) -> None:
+        values = pack(Manifest, manifest).values
+        with self._open(_UNFINISHED, os.O_WRONLY | os.O_CREAT | os.O_TRUNC) as file:
+            file.write(_json(values | {"checksum": Sum.of(_json(values)).sha256}))
+            file.flush()
+            os.fsync(file.fileno())
+        with self._opened() as folder:
+            os.replace(_UNFINISHED, MANIFEST, src_dir_fd=folder, dst_dir_fd=folder)
+            os.fsync(folder)
+
+    def _delete(self, names: Collection[str]) -> None:
+        with self._opened() as folder:
+            for name in names:
+                _check_name(name)
+                with suppress(OSError):
+                    if stat.S_ISREG(os.lstat(name, dir_fd=folder).st_mode):
+                        os.unlink(name, dir_fd=folder)
+
+    @contextmanager
+    def _opened(self) -> Iterator[int]:
+        """The folder's descriptor. Raises InputError if it is a link, or no folder."""
+        if self.path.is_symlink():
+            raise InputError("it is a link, and none is followed")
+        try:
+            folder = os.open(self.path, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+        except NotADirectoryError as error:
+            raise InputError("it is no folder") from error
+        try:
+            yield folder
+        finally:
+            os.close(folder)
+
+    @contextmanager
+    def _open(self, name: str, flags: int) -> Iterator[BinaryIO]:
+        """A file of the folder. Raises InputError if it is a link, or cannot be opened."""
+        _check_name(name)
+        with self._opened() as folder:
+            try:  # not to wait for who writes into a pipe
+                number = os.open(name, flags | os.O_NOFOLLOW | os.O_NONBLOCK, 0o666, dir_fd=folder)
+            except OSError as error:
+                if flags & os.O_CREAT and error.errno != errno.ELOOP:
+                    raise
+                is_link = error.errno == errno.ELOOP
+                reason = "is a link, and none is followed" if is_link else "cannot be opened"
+                raise InputError(f"{name} {reason}") from error
+        status = os.fstat(number)
+        if not stat.S_ISREG(status.st_mode) or status.st_nlink != 1:
+            os.close(number)
+            raise InputError(f"{name} is no plain file, or has other names")
+        with os.fdopen(number, _MODES[flags & os.O_ACCMODE]) as file:
+            yield cast(BinaryIO, file)
+
+
+def _check_name(name: str) -> None:
+    """Raises InputError if a name is not one that geogs gives, such as one of another folder."""
+    if not _PLAIN_NAME.fullmatch(name):
+        raise InputError(f"{name!r} is no name of a file of a checkpoint")
+
+
+def _json(values: object) -> bytes:
+    return json.dumps(values).encode()

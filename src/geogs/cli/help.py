@@ -1,0 +1,67 @@
+"""What ``--help`` and ``--help-all`` print, from the types and the words of the options."""
+
+import inspect
+import shutil
+import textwrap
+from pathlib import Path
+
+from geogs.config.leaves import Leaf, default_text, leaves
+from geogs.config.setting import Basic, Positional, Time
+
+_METAVARS = {int: "N", float: "X", str: "TEXT", Path: "PATH"}
+_COLUMN = 28
+
+
+def help_text(options: type, command: str, everything: bool) -> str:
+    """The help of a command: all of its options, or those that most need."""
+    width = min(100, shutil.get_terminal_size().columns)
+    known = leaves(options, command)
+    places = [leaf for leaf in known if leaf.mark(Positional) is not None]
+    usage = [_place(leaf) for leaf in places]
+    groups: dict[str, list[Leaf]] = {"": []}
+    for leaf in known:
+        if leaf not in places and (everything or not leaf.group or leaf.mark(Basic) is not None):
+            groups.setdefault(leaf.group, []).append(leaf)
+    lines = [" ".join(["usage: geogs", command, *usage, "[OPTIONS]"]), ""]
+    lines += [inspect.cleandoc(options.__doc__ or "").replace("``", ""), ""]
+    lines += [line for leaf in places for line in _entry(leaf.name.upper(), leaf.help, width)]
+    for group, some in groups.items():
+        lines += ["", f"{group or 'options'}:"]
+        lines += [line for leaf in some for line in _entry(_head(leaf), _explained(leaf), width)]
+    shown = sum(map(len, groups.values()))
+    if shown + len(places) < len(known):
+        more = f"geogs {command} --help-all shows all {len(known)} options."
+        lines += ["", more]
+    return "\n".join(lines)
+
+
+def _place(leaf: Leaf) -> str:
+    name = leaf.name.upper() + ("..." if leaf.kind.is_tuple else "")
+    return name if leaf.mark(Positional).required else f"[{name}]"
+
+
+def _head(leaf: Leaf) -> str:
+    """Names of an option and what its value is."""
+    kind = leaf.kind
+    if kind.base is bool:
+        return leaf.switch_off.replace("no-", "[no-]", 1)
+    value = ",".join(kind.choices) if kind.choices else _METAVARS[kind.base]
+    value = "TIME" if Time in kind.marks else value
+    return f"{', '.join(reversed(leaf.options))} {value}"
+
+
+def _explained(leaf: Leaf) -> str:
+    """The help of an option with its default and its range."""
+    ranges = " and ".join(map(str, leaf.kind.ranges))
+    beside = "; ".join(text for text in (default_text(leaf), ranges) if text)
+    return leaf.help + (f" ({beside})" if beside else "")
+
+
+def _entry(head: str, text: str, width: int) -> list[str]:
+    """Lines with an option to the left and its help to the right."""
+    lines = textwrap.wrap(text.replace("``", ""), max(width - _COLUMN, 40)) or [""]
+    lines = [" " * _COLUMN + line for line in lines]
+    left = f"  {head}  "
+    if len(left) > _COLUMN:
+        return [left.rstrip(), *lines]
+    return [left.ljust(_COLUMN) + lines[0][_COLUMN:], *lines[1:]]

@@ -1,0 +1,53 @@
+"""A training as one of the processes that torchrun starts, or alone."""
+
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import torch
+from torch import distributed
+
+from geogs.gpu.installation import require_device
+from geogs_train.checkpoint import read_options
+from geogs_train.curves import draw_curves
+from geogs_train.options import FlowTraining, RunOptions
+from geogs_train.run import train_flow
+from geogs_train.trainer import Worker
+
+
+def launch(
+    training: FlowTraining,
+    run: RunOptions,
+    out: Path,
+    device: str,
+    progress: Callable[[str], None],
+) -> None:
+    """Train, and draw the curves; a run that is gone on with keeps its settings.
+
+    Raises:
+        InputError: there is nothing to go on from.
+        DeviceError: the device cannot be used.
+    """
+    with _worker(device) as worker:
+        train_flow(read_options(out) if run.resume else training, run, out, worker, progress)
+    if worker.rank == 0:
+        draw_curves(out)
+
+
+@contextmanager
+def _worker(device: str) -> Iterator[Worker]:
+    """This process among the others, if there are any; each has the GPU of its number."""
+    rank, count = (int(os.environ.get(n, d)) for n, d in (("RANK", "0"), ("WORLD_SIZE", "1")))
+    used = require_device(device)
+    if used.type == "cuda":
+        used = torch.device("cuda", int(os.environ.get("LOCAL_RANK", used.index or 0)))
+    if count == 1:
+        yield Worker(used)
+        return
+    torch.cuda.set_device(used)
+    distributed.init_process_group("nccl", device_id=used)
+    try:
+        yield Worker(used, rank, count)
+    finally:
+        distributed.destroy_process_group()

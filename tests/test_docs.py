@@ -1,0 +1,40 @@
+"""What the texts name is there: files, and settings by their options."""
+
+import re
+from itertools import chain
+from pathlib import Path
+
+import pytest
+
+from geogs.config import Config, ReconstructConfig
+from geogs.config.leaves import leaves
+
+ROOT = Path(__file__).parents[1]
+TEXTS = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), ROOT / "benchmarks" / "README.md"])
+
+
+@pytest.mark.parametrize("text", TEXTS, ids=lambda text: text.stem)
+def test_files_that_a_text_names_exist(text: Path) -> None:
+    words = text.read_text()
+    code = set(re.findall(r"`([\w./*-]+\.(?:py|cuh?))`", words))
+    links = set(re.findall(r"\]\(([\w./-]+\.(?:md|png))", words))
+    missing = {name for name in code if not _is_there(name)}
+    missing |= {link for link in links if not (text.parent / link).is_file()}
+    assert missing == set()
+
+
+def _is_there(name: str) -> bool:
+    return any(ROOT.glob(name)) or any(
+        any((ROOT / folder).glob(f"**/{name}")) for folder in ("src", "benchmarks", "tests")
+    )
+
+
+def test_settings_that_the_texts_name_exist() -> None:
+    known = list(chain(leaves(Config), leaves(ReconstructConfig)))
+    options = {option for leaf in known for option in (*leaf.options, leaf.switch_off)}
+    groups = {option.split(".")[0] for option in options if "." in option}
+    named = set()
+    for text in TEXTS:
+        named |= set(re.findall(r"--[a-z]+(?:\.[a-z0-9-]+)+", text.read_text()))
+    assert {n for n in named if n.split(".")[0] in groups} <= options
+    assert len(named) > 10
