@@ -27,7 +27,7 @@ from geogs_train.droid_unroll import (
     cell_cameras,
     unroll,
 )
-from geogs_train.pose_loss import Estimate, PoseLossOptions, pose_errors, pose_loss
+from geogs_train.pose_loss import Estimate, pose_errors, pose_loss
 
 FRAMES = 120
 """Of the path that the clip is a part of."""
@@ -77,7 +77,7 @@ def main() -> None:
         f"{len(edges.source)} edges, {count} parameters, {args.updates} updates a step"
     )
     nothing = Estimate(start, torch.zeros(1, len(edges.source), rows * columns, 2))
-    before = pose_errors(cameras, nothing, truth, edges, PoseLossOptions())
+    before = pose_errors(cameras, nothing, truth, edges)
     print(f"at the start: pose {float(before.pose):.4f}, flow {float(before.flow):.3f} cells")
     print("step     loss     pose  flow (cells)  residual  gradient  seconds")
 

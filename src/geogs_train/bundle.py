@@ -18,7 +18,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from geogs.bundle.projection import Projection, motion_rows, relative_motion, seen_from_targets
-from geogs.geometry.lie import retract, se3_adjoint, se3_inverse
+from geogs.geometry.lie import retract, se3_adjoint
 
 
 @dataclass(frozen=True)
@@ -84,9 +84,6 @@ class ClipBundleOptions:
     iterations: int = 2
     fixed_poses: int = 2
     """Leading views that stay where they are. Two set the scale."""
-    keep_scale: bool = False
-    """Whether the distance of the first two views is restored after every step, which sets the
-    scale where only one pose is fixed."""
     damping: float = 1e-4
     """Levenberg damping relative to the diagonal of the reduced system."""
     damping_floor: float = 0.1
@@ -141,8 +138,7 @@ def adjust(
     for _ in range(options.iterations):
         system = _normal_equations(cameras, state, edges, matches, options)
         xi, delta = _solve(system, options)
-        moved = _moved(state, xi, delta, options)
-        state = _rescaled(moved, state) if options.keep_scale else moved
+        state = _moved(state, xi, delta, options)
     return state
 
 
@@ -241,15 +237,3 @@ def _moved(state: ClipState, xi: Tensor, delta: Tensor, options: ClipBundleOptio
     free = retract(xi.unflatten(1, (-1, 6)).to(T), T[:, fixed:])
     d = (d + delta.view_as(d)).clamp(options.min_inverse_depth, options.max_inverse_depth)
     return ClipState(torch.cat([T[:, :fixed], free], 1), d)
-
-
-def _rescaled(state: ClipState, before: ClipState) -> ClipState:
-    """The state about the first camera at the distance that the first two views had before."""
-    origin = state.T_cw[:, :1]
-    local = state.T_cw @ se3_inverse(origin)
-    start = before.T_cw[:, 1] @ se3_inverse(before.T_cw[:, 0])
-    factor = start[:, :3, 3].norm(dim=-1) / local[:, 1, :3, 3].norm(dim=-1)
-    scale = torch.ones_like(local)
-    scale[..., :3, 3] = factor[:, None, None]
-    depth = state.inverse_depth / factor[:, None, None].to(state.inverse_depth)
-    return ClipState((local * scale) @ origin, depth)

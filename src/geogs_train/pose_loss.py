@@ -26,9 +26,6 @@ class PoseLossOptions:
     flow: float = 0.4
     """Where positions are in cells of 8 pixels; DROID-SLAM's 0.05 is for pixels."""
     residual: float = 0.01
-    align_scale: bool = False
-    """Whether only the shape of the path counts; not needed where two poses are fixed at the
-    truth."""
 
 
 @dataclass(frozen=True)
@@ -52,26 +49,13 @@ class PoseErrors:
     """Absolute residual of a coordinate."""
 
 
-def relative_scale(
-    found: Float[Tensor, "b e 4 4"], truth: Float[Tensor, "b e 4 4"]
-) -> Float[Tensor, "b"]:
-    """The factor on the translations of ``found`` that brings them nearest to the truth."""
-    a, b = found[..., :3, 3], truth[..., :3, 3]
-    return (a * b).sum((1, 2)) / a.square().sum((1, 2)).clamp(min=1e-12)
-
-
 def geodesic_errors(
     found: Float[Tensor, "b v 4 4"],
     truth: Float[Tensor, "b v 4 4"],
     edges: ClipEdges,
-    align_scale: bool = False,
 ) -> tuple[Float[Tensor, "b e"], Float[Tensor, "b e"]]:
     """Translation and rotation of log(found_ji truth_ji^-1) of every edge, units and radians."""
     a, b = relative_motions(found, edges), relative_motions(truth.to(found), edges)
-    if align_scale:
-        factor = torch.ones_like(a)
-        factor[..., :3, 3] = relative_scale(a, b)[:, None, None]
-        a = a * factor
     xi = se3_log(a @ se3_inverse(b))
     return xi[..., :3].norm(dim=-1), xi[..., 3:].norm(dim=-1)
 
@@ -90,10 +74,9 @@ def pose_errors(
     estimate: Estimate,
     truth: ClipState,
     edges: ClipEdges,
-    options: PoseLossOptions,
 ) -> PoseErrors:
     """The terms of one update, without their weights."""
-    shift, angle = geodesic_errors(estimate.state.T_cw, truth.T_cw, edges, options.align_scale)
+    shift, angle = geodesic_errors(estimate.state.T_cw, truth.T_cw, edges)
     flow, valid = induced_flow_error(cameras, estimate.state, truth, edges)
     return PoseErrors(
         shift.mean() + angle.mean(),
@@ -111,7 +94,7 @@ def pose_loss(
 ) -> tuple[Tensor, list[PoseErrors]]:
     """The loss of all updates, first to last, and the errors of each."""
     options = options or PoseLossOptions()
-    errors = [pose_errors(cameras, e, truth, edges, options) for e in estimates]
+    errors = [pose_errors(cameras, e, truth, edges) for e in estimates]
     terms = [
         options.decay**age
         * (options.pose * e.pose + options.flow * e.flow + options.residual * e.residual)

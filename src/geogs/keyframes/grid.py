@@ -75,16 +75,6 @@ class SampleGrid:
         )
         return out[0, :, 0].mT
 
-    def upsample(self, values: Float[Tensor, "p c"]) -> Float[Tensor, "h w c"]:
-        """Bilinear field on every pixel of the image."""
-        v, u = torch.meshgrid(
-            torch.arange(self.camera.height, dtype=values.dtype, device=values.device),
-            torch.arange(self.camera.width, dtype=values.dtype, device=values.device),
-            indexing="ij",
-        )
-        full = self.sample_field(values, torch.stack([u, v], -1).reshape(-1, 2))
-        return full.reshape(self.camera.height, self.camera.width, -1)
-
     def cells_of(self, points: Float[Tensor, "*b 2"]) -> tuple[Tensor, Bool[Tensor, "*b"]]:
         """Index of the cell nearest to each pixel position, and whether there is one."""
         cell = torch.round((points.nan_to_num(-1e4).clamp(-1e4, 1e5) - OFFSET) / STRIDE).long()

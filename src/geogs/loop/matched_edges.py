@@ -96,24 +96,6 @@ def relative_similarity(
     return S[target] @ sim3_inverse(S[source])
 
 
-def reprojection_jacobians(
-    camera: Camera,
-    rays: Float[Tensor, "p 3"],
-    S_ji: Float[Tensor, "e 4 4"],
-    inverse_depth: Float[Tensor, "e p"],
-) -> tuple[Float[Tensor, "e p 2 7"], Float[Tensor, "e p 2 7"], Float[Tensor, "e p 2"]]:
-    """d pixel / d xi of the source, of the target (left perturbations), and / d inverse depth.
-
-    For a row (a, b, 0) of the target's, the source's is -[s R^T a, R^T (b + a x t), -a . t]: the
-    true adjoint, scale included. The solver never forms these; it chains reduced blocks.
-    """
-    p = linearise(camera, rays, S_ji, inverse_depth)
-    J = p.pose_jacobian.permute(0, 3, 2, 1)
-    J_target = torch.cat([J, torch.zeros_like(J[..., :1])], -1)
-    J_source = -J @ sim3_adjoint(S_ji)[:, None, :6].to(J)
-    return J_source, J_target, p.depth_jacobian
-
-
 def match_cost(
     edges: MatchedEdges,
     S: Float[Tensor, "n 4 4"],
