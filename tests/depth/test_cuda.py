@@ -219,6 +219,7 @@ def test_grids_are_upsampled_and_patches_gathered_as_opencv_does(setting):
     _close(images.colours, guide, 1e-6)
 
 
+@pytest.mark.system
 @pytest.mark.parametrize("shape", [(6, 11), (9, 5), (3, 4)])
 def test_completed_grids(setting, shape):
     config = setting.config
