@@ -38,6 +38,8 @@ from posed_scene import (
     vertices,
 )
 
+pytestmark = pytest.mark.system
+
 QUICK = ["--mapping.render-long-edge", "160", "--search.least-steps", "150", "--device", "cpu"]
 
 

@@ -16,6 +16,8 @@ from geogs.evaluation.surface import read_surface
 from geogs.io.poses import read_tum_trajectory
 from geogs.io.writers.native import load_map
 
+pytestmark = pytest.mark.system
+
 GEOGS = [sys.executable, "-m", "geogs.cli.main"]
 FRAMES = 44
 # Small enough for a test, all stages on.

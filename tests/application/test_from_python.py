@@ -19,6 +19,8 @@ from geogs.slam import SlamStatus
 from geogs.synth.export import write_sequence
 from posed_scene import vertices
 
+pytestmark = pytest.mark.system
+
 FRAMES = 34
 RUN = [
     "--mapping.render-long-edge", "96", "--mapping.iterations", "2",

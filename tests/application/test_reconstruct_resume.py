@@ -28,6 +28,8 @@ from posed_scene import (
     vertices,
 )
 
+pytestmark = pytest.mark.system
+
 
 @pytest.fixture(scope="module")
 def room(tmp_path_factory) -> Path:

@@ -21,6 +21,8 @@ from geogs.slam import Slam, SlamState
 from geogs.splat.rows import GrowingRows
 from geogs.synth.export import write_sequence
 
+pytestmark = pytest.mark.system
+
 FRAMES, AT = 40, 33
 
 

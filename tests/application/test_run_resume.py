@@ -27,6 +27,8 @@ from geogs.synth.export import write_sequence
 from geogs.tracking.segments import Segments
 from geogs.version import __version__
 
+pytestmark = pytest.mark.system
+
 GEOGS = [sys.executable, "-m", "geogs.cli.main"]
 FRAMES = 40
 QUICK = [

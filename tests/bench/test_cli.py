@@ -10,6 +10,8 @@ import pytest
 from geogs.cli import main as cli
 from geogs_bench.bench import listing
 
+pytestmark = pytest.mark.system
+
 GEOGS = [sys.executable, "-m", "geogs.cli.main"]
 TINY = [
     "mapping.render-long-edge=96", "mapping.disk.stride=2", "input.stride=8",

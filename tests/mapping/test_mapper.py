@@ -18,6 +18,8 @@ from geogs.synth.trajectory import handheld_trajectory
 from geogs.types import PoseCorrection
 from keyframe_samples import Sample, add, segment_of
 
+pytestmark = pytest.mark.system
+
 CAMERA = default_camera(224, 168)
 MAPPING = replace(
     Config().mapping,

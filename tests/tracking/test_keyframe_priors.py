@@ -20,6 +20,8 @@ from geogs.tracking.flow.texture import MIN_STRUCTURE, cell_structure
 from geogs.tracking.tracker import Tracker
 from geogs.types import Frame, PoseCorrection
 
+pytestmark = pytest.mark.system
+
 CAMERA = Camera(218.0, 218.0, 127.5, 95.5, 256, 192)
 CONFIG = TrackingConfig(init_keyframes=6)
 FRAMES = 45

@@ -27,6 +27,8 @@ from geogs.synth.room import make_room
 from geogs.synth.trajectory import handheld_trajectory
 from keyframe_samples import Sample, segment_of
 
+pytestmark = pytest.mark.system
+
 WORKING = default_camera(96, 72)
 CAMERAS = MapCameras(WORKING, WORKING.with_long_edge(40), WORKING.with_long_edge(80))
 CONFIG = Config().mapping

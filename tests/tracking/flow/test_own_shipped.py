@@ -15,6 +15,8 @@ from geogs.tracking.flow.classical import ClassicalFlow
 from geogs.tracking.flow.own import OwnFlow, OwnFlowOptions
 from geogs.tracking.flow.weights_files import PACKAGED
 
+pytestmark = pytest.mark.system
+
 WEIGHTS = PACKAGED / "flow.safetensors"
 CAMERA = Camera(fx=260.0, fy=260.0, cx=159.5, cy=119.5, width=320, height=240)
 PAIRS = ((0, 12), (60, 66), (110, 135))
