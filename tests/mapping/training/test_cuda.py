@@ -191,7 +191,7 @@ def test_poses_equal_those_of_the_cpu(pair, rendered) -> None:
         g = torch.Generator().manual_seed(1)
         for view in views[1:]:
             xi = 0.004 * torch.randn(6, dtype=torch.float64, generator=g)
-            view.move(retract(xi, view.T_cw))
+            view.keyframe.T_cw = retract(xi, view.T_cw)
         start = {v.id: v.T_cw for v in views}
         poses = trainer.refine_poses(views, {v.id: v for v in views}, config)
         results.append((start, poses))

@@ -67,7 +67,7 @@ class WindowLosses:
         self._photo_settings = self._uploaded(photo_settings(config, table.photo, pair_share))
         self._allocate()
 
-    def _uploaded(self, settings: tuple[float, ...]) -> Float32[Tensor, "k"]:
+    def _uploaded(self, settings: tuple[float | bool, ...]) -> Float32[Tensor, "k"]:
         return torch.tensor(settings, dtype=torch.float32, device=self.table.device)
 
     def _allocate(self) -> None:
