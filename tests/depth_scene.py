@@ -5,9 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from geogs.depth.view import DepthView, depth_view
+from geogs.depth.view import DepthView, depth_images
 from geogs.geometry.camera import Camera
-from keyframe_samples import Sample, segment_of
 
 WORKING = Camera(fx=160.0, fy=160.0, cx=95.5, cy=71.5, width=192, height=144)
 RENDER = WORKING.resized(96, 72)
@@ -27,7 +26,7 @@ class DepthScene:
 def make_scene(seed: int = 0, working: Camera = WORKING, render: Camera = RENDER) -> DepthScene:
     """Five views; the tracker is right to 3 % on most cells and knows nothing of every fourth."""
     rng = np.random.default_rng(seed)
-    samples, truth = [], []
+    views, truth = [], []
     for i, centre in enumerate(_CENTRES):
         T_wc = np.eye(4)
         T_wc[:3, :3] = _turn(0.04 * np.array([centre[1], -centre[0], 0]))
@@ -39,11 +38,10 @@ def make_scene(seed: int = 0, working: Camera = WORKING, render: Camera = RENDER
         noise = 0.03 * rng.standard_normal(grid.shape)
         inverse = np.where(lost, grid * rng.uniform(0.4, 2.0, grid.shape), grid * (1 + noise))
         information = np.where(lost, 1e-2, (1.0 / (0.15 * grid)) ** 2)
-        T_cw = torch.from_numpy(np.linalg.inv(T_wc))
-        depths = (torch.from_numpy(x.astype(np.float32)) for x in (inverse, information))
-        samples.append(Sample(i, image, T_cw, *depths))
+        grids = inverse.astype(np.float32), information.astype(np.float32)
+        views.append(DepthView(i, np.linalg.inv(T_wc), *depth_images(image, render), image, *grids))
         truth.append(trace(render, T_wc)[0].astype(np.float32))
-    return DepthScene([depth_view(k, render) for k in segment_of(samples, working)], truth)
+    return DepthScene(views, truth)
 
 
 def trace(camera: Camera, T_wc: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -137,9 +137,9 @@ def test_results_of_known_poses_are_not_aligned(result):
 @pytest.mark.parametrize(
     ("changed", "match"),
     [
-        ({"threshold": -1.0}, "must be positive"),
-        ({"samples": 0}, "must be positive"),
-        ({"photo_every": 0}, "must be positive"),
+        ({"threshold": -1.0}, "but must be"),
+        ({"samples": 0}, "but must be"),
+        ({"photo_every": 0}, "but must be"),
         ({"protocol": "dtu"}, "needs --dtu-data"),
         ({"photo": True}, "no images with known poses|no pictures|holds no"),
     ],
