@@ -70,7 +70,7 @@ def parse_options(
     return made
 
 
-def record(kind: type[Record], options: Record) -> Record:
+def record(kind: type[Record], options: object) -> Record:
     """The plain record that options of a command are more than."""
     return kind(**{f.name: getattr(options, f.name) for f in fields(kind)})
 

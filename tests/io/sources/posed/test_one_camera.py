@@ -210,5 +210,5 @@ def test_image_that_is_cut_off(tmp_path):
 
 
 def test_bad_selection(tmp_path):
-    with pytest.raises(InputError, match="images 9 to None of its 3 images are none"):
+    with pytest.raises(InputError, match="images 9 to None of its 3 are none"):
         open_posed_source(write_replica(tmp_path, moves(3)), InputConfig(start=9))
