@@ -11,18 +11,15 @@ import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, fields, replace
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 from geogs.cli.help import help_text
 from geogs.config.leaves import Leaf, default_of, leaves
 from geogs.config.setting import Positional, dashed, group_of, refusal
 from geogs.errors import InputError
 
-if TYPE_CHECKING:
-    from _typeshed import DataclassInstance
-
 Options = TypeVar("Options")
-Record = TypeVar("Record", bound="DataclassInstance")
+Record = TypeVar("Record")
 Given = Mapping[str, str]
 """What the arguments say, by the dotted name of the option; switches say on or off."""
 
@@ -72,7 +69,7 @@ def parse_options(
 
 def record(kind: type[Record], options: object) -> Record:
     """The plain record that options of a command are more than."""
-    return kind(**{f.name: getattr(options, f.name) for f in fields(kind)})
+    return kind(**{f.name: getattr(options, f.name) for f in fields(kind)})  # type: ignore[arg-type]
 
 
 def _named(
