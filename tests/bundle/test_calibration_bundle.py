@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from geogs.bundle import lens_bundle as bundle
-from geogs.bundle.lens import Lens, lens_rays, linearise_lens, project_lens
-from geogs.bundle.lens_bundle import LensBundleOptions, solve_lens
+from geogs.bundle.lens import Lens, LensBlock, lens_rays
+from geogs.bundle.levenberg import LevenbergOptions, LinearSystem, solve_shared
 from geogs.bundle.projection import relative_motion
 from geogs.geometry.lie import retract
 from lens_scene import CAMERA, GRID, disturbed, lens_problem
@@ -21,8 +20,8 @@ def test_jacobians_match_autograd(k1):
     p = lens_problem(Lens(CAMERA, k1))
     T = relative_motion(p.T_cw, p.source, p.target)[:1]
     pixels, d = GRID.pixels.double(), p.inverse_depth[:1].double()
-    lens = Lens(CAMERA, k1)
-    fast = linearise_lens(lens, lens_rays(lens, pixels), T, d)
+    block = LensBlock(Lens(CAMERA, k1), pixels)
+    fast = block.linearise(p.T_cw, p.source[:1], p.target[:1], d)
 
     def moved(xi, unknowns, delta):
         return reproject(CAMERA, pixels, unknowns, retract(xi, T[0]), d[0] + delta)
@@ -47,8 +46,9 @@ def test_the_lens_is_that_of_opencv():
     rays = lens_rays(lens, pixels).rays
     back, _ = cv2.projectPoints(rays.numpy(), np.zeros(3), np.zeros(3), K, distortion)
     np.testing.assert_allclose(back[:, 0], pixels.numpy(), atol=1e-7)
-    eye = torch.eye(4, dtype=torch.float64)[None]
-    p = project_lens(lens, rays, eye, torch.ones(1, GRID.size, dtype=torch.float64))
+    eye, same = torch.eye(4, dtype=torch.float64)[None], torch.zeros(1, dtype=torch.long)
+    depth = torch.ones(1, GRID.size, dtype=torch.float64)
+    p = LensBlock(lens, pixels).project(eye, same, same, depth)
     np.testing.assert_allclose(p.pixels[0].numpy(), pixels.numpy(), atol=1e-7)
     assert p.valid.all()
 
@@ -57,16 +57,12 @@ def test_the_lens_is_that_of_opencv():
 def test_one_step_matches_the_dense_equations(huber):
     lens = Lens(CAMERA, 0.05)
     problem = disturbed(lens_problem(lens.moved(0.02, 0.01), frames=3), 0.01, 0.03)
-    options = LensBundleOptions(huber=huber, radial=True)
-    xi, unknowns, delta = gauss_newton_step(
-        problem, CAMERA, GRID.pixels, 0.05, huber, options.depth_damping
-    )
-    system = bundle._System.of(
-        problem, lens, GRID.pixels, problem.T_cw, problem.inverse_depth, options
-    )
+    xi, unknowns, delta = gauss_newton_step(problem, CAMERA, GRID.pixels, 0.05, huber, 1e-5)
+    block = LensBlock(lens, GRID.pixels, radial=True)
+    system = LinearSystem.of(problem, block, problem.T_cw, problem.inverse_depth, huber, 1e-5)
     step = system.step(0.0)
     assert step is not None
-    depth = system.moved_depth(step, problem.inverse_depth, options)
+    depth = system.moved_depth(step, problem.inverse_depth)
     assert float(unknowns.abs().min()) > 1e-3
     torch.testing.assert_close(step[-2:], unknowns, rtol=2e-3, atol=2e-5)
     # Poses and depths agree up to the scale, which nothing measures.
@@ -83,20 +79,22 @@ def test_recovers_focal_length_and_radial_term():
     truth = Lens(CAMERA, -0.1)
     start = disturbed(lens_problem(truth), 0.01, 0.05)
     guess = Lens(CAMERA).moved(math.log(1.25))
-    options = LensBundleOptions(iterations=40, radial=True, huber=100.0, least_decrease=1e-9)
-    result = solve_lens(start, guess, GRID.pixels, options)
+    options = LevenbergOptions(iterations=40, huber=100.0, least_decrease=1e-9)
+    result = solve_shared(start, LensBlock(guess, GRID.pixels, radial=True), options)
     assert result.finite
-    assert abs(result.lens.camera.fx / CAMERA.fx - 1) < 1e-3
-    assert abs(result.lens.camera.fy / CAMERA.fy - 1) < 1e-3
-    assert abs(result.lens.k1 + 0.1) < 1e-3
+    found = result.block.lens
+    assert abs(found.camera.fx / CAMERA.fx - 1) < 1e-3
+    assert abs(found.camera.fy / CAMERA.fy - 1) < 1e-3
+    assert abs(found.k1 + 0.1) < 1e-3
 
 
 def test_deviations_are_those_of_repeated_measurements():
     errors, deviations = [], []
     for seed in range(16):
         problem = lens_problem(Lens(CAMERA), frames=8, noise=0.3, seed=seed)
-        result = solve_lens(problem, Lens(CAMERA), GRID.pixels, LensBundleOptions(radial=True))
-        errors.append([math.log(result.lens.camera.fx / CAMERA.fx), result.lens.k1])
+        result = solve_shared(problem, LensBlock(Lens(CAMERA), GRID.pixels, radial=True))
+        lens = result.block.lens
+        errors.append([math.log(lens.camera.fx / CAMERA.fx), lens.k1])
         deviations.append(result.covariance.diagonal().sqrt().tolist())
     actual = np.sqrt(np.square(errors).mean(0))
     said = np.sqrt(np.square(deviations).mean(0))
@@ -107,19 +105,19 @@ def test_deviations_are_those_of_repeated_measurements():
 def test_what_is_no_variable_stays():
     problem = lens_problem(Lens(CAMERA, 0.05).moved(0.1))
     lens = Lens(CAMERA, 0.05)
-    fixed = solve_lens(problem, lens, GRID.pixels, LensBundleOptions(focal=False))
-    assert fixed.lens == lens
+    fixed = solve_shared(problem, LensBlock(lens, GRID.pixels, focal=False))
+    assert fixed.block.lens == lens
     assert not fixed.covariance.any()
     torch.testing.assert_close(fixed.T_cw[0], problem.T_cw[0])
-    focal = solve_lens(problem, lens, GRID.pixels)
-    assert focal.lens.k1 == 0.05
+    focal = solve_shared(problem, LensBlock(lens, GRID.pixels))
+    assert focal.block.lens.k1 == 0.05
     assert float(focal.covariance[1, 1]) == 0
-    assert focal.lens.camera.fx > 1.05 * CAMERA.fx
+    assert focal.block.lens.camera.fx > 1.05 * CAMERA.fx
 
 
 def test_matches_that_are_not_finite_are_reported():
     problem = lens_problem(Lens(CAMERA))
     problem.pixels[0, 0] = torch.nan
-    result = solve_lens(problem, Lens(CAMERA), GRID.pixels)
+    result = solve_shared(problem, LensBlock(Lens(CAMERA), GRID.pixels))
     assert not result.finite
-    assert result.lens == Lens(CAMERA)
+    assert result.block.lens == Lens(CAMERA)
