@@ -2,7 +2,7 @@
 
 Each edge is linearised in the motion of its target relative to its source, so only one Jacobian is
 formed; the chain to both poses, ``xi_rel = xi_j - Ad(T_ji) xi_i``, is applied to the small reduced
-blocks. Residuals are float32, what is summed over cells is float64.
+blocks. Residuals and couplings are float32, the equations of poses float64.
 
 A star is a source with its edges. Beside the relative motions it may have unknowns that all edges
 share: they are its last rows and columns, and nothing here depends on what they are
