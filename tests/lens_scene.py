@@ -4,9 +4,8 @@ from dataclasses import replace
 
 import torch
 
-from geogs.bundle.lens import Lens, lens_rays, project_lens
+from geogs.bundle.lens import Lens, LensBlock
 from geogs.bundle.problem import BundleProblem
-from geogs.bundle.projection import relative_motion
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp
 from geogs.keyframes.grid import SampleGrid
@@ -26,8 +25,7 @@ def lens_problem(
     d = 0.4 + 0.3 * torch.rand(frames, GRID.size, generator=g)
     pairs = [(i, j) for i in range(frames) for j in range(frames) if i != j]
     source, target = (torch.tensor([p[k] for p in pairs]) for k in (0, 1))
-    rays = lens_rays(lens, GRID.pixels).rays
-    exact = project_lens(lens, rays, relative_motion(T, source, target), d[source])
+    exact = LensBlock(lens, GRID.pixels).project(T, source, target, d[source])
     g = torch.Generator().manual_seed(seed)
     pixels = exact.pixels + noise * torch.randn(exact.pixels.shape, generator=g)
     weight = exact.valid[..., None].expand_as(pixels) / max(noise, 0.1) ** 2

@@ -6,16 +6,17 @@ c + F x (1 + k1 |x|^2), x = (X / Z, Y / Z), which is OpenCV's model with k1 alon
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import ClassVar
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
-from geogs.bundle.projection import Projection, motion_rows, seen_from_targets
+from geogs.bundle.blocks import SharedProjection
+from geogs.bundle.projection import Projection, motion_rows, relative_motion, seen_from_targets
 from geogs.geometry.camera import Camera
 
-UNKNOWNS = 2
-"""Log of the focal length, and k1."""
 _NEWTON_STEPS = 8
 _LEAST_SLOPE = 0.1
 """Distorted radius per radius, below which the lens folds the image over."""
@@ -35,6 +36,79 @@ class Lens:
 
 
 @dataclass(frozen=True)
+class LensBlock:
+    """A lens as a block of unknowns: log of the focal length, and k1."""
+
+    lens: Lens
+    pixels: Float[Tensor, "p 2"]
+    """Of the cells."""
+    focal: bool = True
+    """Whether the focal length is a variable."""
+    radial: bool = False
+    """Whether k1 is a variable."""
+    largest_step: ClassVar[float] = 0.3
+
+    @property
+    def free(self) -> tuple[bool, bool]:
+        """As in the protocol."""
+        return self.focal, self.radial
+
+    @cached_property
+    def rays(self) -> "LensRays":
+        """Of the cells."""
+        return lens_rays(self.lens, self.pixels)
+
+    def moved(self, step: Float[Tensor, "2"]) -> "LensBlock":
+        """As in the protocol."""
+        return replace(self, lens=self.lens.moved(float(step[0]), float(step[1])))
+
+    def project(
+        self,
+        T_cw: Float[Tensor, "n 4 4"],
+        source: Int[Tensor, "e"],
+        target: Int[Tensor, "e"],
+        inverse_depth: Float[Tensor, "e p"],
+    ) -> Projection:
+        """As in the protocol."""
+        T_ji = relative_motion(T_cw, source, target)
+        y, valid, z = seen_from_targets(self.rays.rays, T_ji, inverse_depth)
+        return Projection(_to_pixels(self.lens, y[..., :2] / z[..., None]), valid, z)
+
+    def linearise(
+        self,
+        T_cw: Float[Tensor, "n 4 4"],
+        source: Int[Tensor, "e"],
+        target: Int[Tensor, "e"],
+        inverse_depth: Float[Tensor, "e p"],
+    ) -> SharedProjection:
+        """As in the protocol."""
+        lens, rays, T_ji = self.lens, self.rays, relative_motion(T_cw, source, target)
+        y, valid, z = seen_from_targets(rays.rays, T_ji, inverse_depth)
+        x, c, q = y[..., :2] / z[..., None], lens.camera, 1 / z
+        u, v = x.unbind(-1)
+        R, t = T_ji[:, :3, :3].to(inverse_depth), T_ji[:, :3, 3].to(inverse_depth)
+        tx, ty, tz = t[:, None].unbind(-1)
+        # A change of the lens moves the ray by a factor of (x, y, 0).
+        ray = (rays.rays[:, :2] @ R[:, :, :2].mT).unbind(-1)
+        along_x, along_y = (ray[0] - ray[2] * u) * q, (ray[1] - ray[2] * v) * q
+        row_x = [along_x * rays.slope[0], along_x * rays.slope[1], (tx - tz * u) * q]
+        row_y = [along_y * rays.slope[0], along_y * rays.slope[1], (ty - tz * v) * q]
+        others = torch.stack([torch.stack(row_x, 1), torch.stack(row_y, 1)], 2)
+        J = torch.cat([torch.stack(motion_rows(u, v, inverse_depth * q), 2), others], 1)
+        square = u * u + v * v
+        if lens.k1:
+            point = x.mT[:, None]
+            inward = (J * point).sum(2, keepdim=True)
+            J = J * (1 + lens.k1 * square)[:, None, None] + 2 * lens.k1 * point * inward
+        J = J * J.new_tensor([c.fx, c.fy])[:, None]
+        pixels = _to_pixels(lens, x)
+        centred = (pixels - pixels.new_tensor([c.cx, c.cy])).mT
+        bulge = (x * pixels.new_tensor([c.fx, c.fy])).mT * square[:, None]
+        own = [(J[:, 6] + centred)[:, None], (J[:, 7] + bulge)[:, None]]
+        return SharedProjection(pixels, valid, z, torch.cat([J[:, :6], *own], 1), J[:, 8])
+
+
+@dataclass(frozen=True)
 class LensRays:
     """Rays of pixels, with what a change of the lens does to them."""
 
@@ -42,16 +116,6 @@ class LensRays:
     """z = 1."""
     slope: Float[Tensor, "2 p"]
     """d x / d log f and d x / d k1 are these factors times x, and alike for y."""
-
-
-@dataclass(frozen=True)
-class LensProjection(Projection):
-    """A projection with its first derivatives."""
-
-    jacobian: Float[Tensor, "e 8 2 p"]
-    """d pixel / d (xi of the target pose, log f, k1)."""
-    depth_jacobian: Float[Tensor, "e 2 p"]
-    """d pixel / d inverse depth of the source."""
 
 
 def lens_rays(lens: Lens, pixels: Float[Tensor, "p 2"]) -> LensRays:
@@ -71,49 +135,6 @@ def lens_rays(lens: Lens, pixels: Float[Tensor, "p 2"]) -> LensRays:
         torch.cat([x, torch.ones_like(x[:, :1])], -1),
         torch.stack([-growth / steep, -square / steep]),
     )
-
-
-def project_lens(
-    lens: Lens,
-    rays: Float[Tensor, "p 3"],
-    T_ji: Float[Tensor, "e 4 4"],
-    inverse_depth: Float[Tensor, "e p"],
-) -> Projection:
-    """Pixels of the cells in the targets."""
-    y, valid, z = seen_from_targets(rays, T_ji, inverse_depth)
-    return Projection(_to_pixels(lens, y[..., :2] / z[..., None]), valid, z)
-
-
-def linearise_lens(
-    lens: Lens,
-    rays: LensRays,
-    T_ji: Float[Tensor, "e 4 4"],
-    inverse_depth: Float[Tensor, "e p"],
-) -> LensProjection:
-    """:func:`project_lens` with the Jacobians in a left perturbation of T_ji, in d and the lens."""
-    y, valid, z = seen_from_targets(rays.rays, T_ji, inverse_depth)
-    x, c, q = y[..., :2] / z[..., None], lens.camera, 1 / z
-    u, v = x.unbind(-1)
-    R, t = T_ji[:, :3, :3].to(inverse_depth), T_ji[:, :3, 3].to(inverse_depth)
-    tx, ty, tz = t[:, None].unbind(-1)
-    # A change of the lens moves the ray by a factor of (x, y, 0).
-    ray = (rays.rays[:, :2] @ R[:, :, :2].mT).unbind(-1)
-    along_x, along_y = (ray[0] - ray[2] * u) * q, (ray[1] - ray[2] * v) * q
-    row_x = [along_x * rays.slope[0], along_x * rays.slope[1], (tx - tz * u) * q]
-    row_y = [along_y * rays.slope[0], along_y * rays.slope[1], (ty - tz * v) * q]
-    others = torch.stack([torch.stack(row_x, 1), torch.stack(row_y, 1)], 2)
-    J = torch.cat([torch.stack(motion_rows(u, v, inverse_depth * q), 2), others], 1)
-    square = u * u + v * v
-    if lens.k1:
-        point = x.mT[:, None]
-        inward = (J * point).sum(2, keepdim=True)
-        J = J * (1 + lens.k1 * square)[:, None, None] + 2 * lens.k1 * point * inward
-    J = J * J.new_tensor([c.fx, c.fy])[:, None]
-    pixels = _to_pixels(lens, x)
-    centred = (pixels - pixels.new_tensor([c.cx, c.cy])).mT
-    bulge = (x * pixels.new_tensor([c.fx, c.fy])).mT * square[:, None]
-    jacobian = torch.cat([J[:, :6], (J[:, 6] + centred)[:, None], (J[:, 7] + bulge)[:, None]], 1)
-    return LensProjection(pixels, valid, z, jacobian, J[:, 8])
 
 
 def _to_pixels(lens: Lens, x: Float[Tensor, "e p 2"]) -> Float[Tensor, "e p 2"]:

@@ -2,12 +2,11 @@
 
 Each edge is linearised in the motion of its target relative to its source, so only one Jacobian is
 formed; the chain to both poses, ``xi_rel = xi_j - Ad(T_ji) xi_i``, is applied to the small reduced
-blocks. Residuals are float32, what is summed over cells is float64.
+blocks. Residuals and couplings are float32, the equations of poses float64.
 
 A star is a source with its edges. Beside the relative motions it may have unknowns that all edges
-share, such as those of a lens: they are its last rows and columns, and nothing here depends on what
-they are. To add some, say how a projection depends on them and how they move (as
-:mod:`geogs.bundle.lens` does) and put their columns after those of the motions.
+share: they are its last rows and columns, and nothing here depends on what they are
+(:mod:`geogs.bundle.blocks`).
 """
 
 from dataclasses import dataclass
@@ -73,11 +72,16 @@ class Star:
         return torch.cat([self.targets, self.targets.new_tensor([self.frame])])
 
     @property
+    def shared(self) -> int:
+        """Number of unknowns that the edges share."""
+        return len(self.gradient) - 6 * len(self.targets)
+
+    @property
     def chain(self) -> Float[Tensor, "m c"]:
         """From steps of ``poses``, then of shared unknowns, to the star's own unknowns."""
         at = 6 * len(self.targets)
         eye = torch.eye(len(self.gradient), dtype=torch.float64, device=self.adjoint.device)
-        source = torch.cat([-self.adjoint.flatten(0, 1), eye.new_zeros(len(eye) - at, 6)])
+        source = torch.cat([-self.adjoint.flatten(0, 1), eye.new_zeros(self.shared, 6)])
         return torch.cat([eye[:, :at], source, eye[:, at:]], 1)
 
     def chained(self) -> tuple[Float[Tensor, "c c"], Float[Tensor, "c"]]:

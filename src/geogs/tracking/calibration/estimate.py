@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import cv2
 import torch
 
-from geogs.bundle.lens_bundle import LensBundleOptions
 from geogs.config import CalibrationConfig, TrackingConfig
 from geogs.geometry.camera import Camera
 from geogs.keyframes.grid import SampleGrid
@@ -103,7 +102,6 @@ class _Search:
         self._done = 0.0
         edge = max(grid.camera.width, grid.camera.height)
         self._min_parallax = config.min_parallax * edge
-        self._options = LensBundleOptions(radial=config.radial)
 
     def _tick(self) -> None:
         """Every frame is a safe point."""
@@ -154,7 +152,7 @@ class _Search:
                     return best
             for fine in (False, True):
                 bundle.measure(fine, self._tick)
-                if not bundle.adjust(self._options):
+                if not bundle.adjust(config.radial):
                     return best
             best = bundle
             self._done = 0.3 + 0.7 * min(1.0, len(bundle) / config.keyframes)
@@ -179,10 +177,11 @@ def _verdict(
     assert result is not None
     deviation = relative_error(bundle)
     if not config.radial:
-        other = bundle.with_radial()
-        shift = math.log(other.lens.camera.fx / result.lens.camera.fx)
+        other = bundle.solve(radial=True)
+        shift = math.log(other.block.lens.camera.fx / result.block.lens.camera.fx)
         deviation = math.hypot(deviation, DISTORTION_SHARE * shift)
-    camera = result.lens.camera
+    lens = result.block.lens
+    camera = lens.camera
     angle = 2 * math.degrees(math.atan(max(camera.width, camera.height) / 2 / camera.fx))
     failure = None
     if not deviation < config.too_much:
@@ -195,4 +194,4 @@ def _verdict(
         return SelfCalibration(guess, keyframes=len(bundle), frames=frames, failure=failure)
     error_k1 = STANDARD_ERRORS * math.sqrt(float(result.covariance[1, 1]))
     deviation_k1 = error_k1 if config.radial else None
-    return SelfCalibration(camera, result.lens.k1, deviation, deviation_k1, len(bundle), frames)
+    return SelfCalibration(camera, lens.k1, deviation, deviation_k1, len(bundle), frames)

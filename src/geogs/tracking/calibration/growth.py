@@ -6,10 +6,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from geogs.bundle.lens import lens_rays, project_lens
-from geogs.bundle.lens_bundle import LensBundleOptions, LensBundleResult, solve_lens
+from geogs.bundle.lens import LensBlock
+from geogs.bundle.levenberg import LevenbergResult, solve_shared
 from geogs.bundle.problem import BundleProblem
-from geogs.bundle.projection import relative_motion
 from geogs.bundle.select import grid_fields
 from geogs.keyframes.grid import SampleGrid
 from geogs.tracking.calibration.keyframes import View, on_cpu
@@ -54,7 +53,7 @@ class GrowingBundle:
             self._depth.append(d)
             self._information.append(i)
         self._edges: dict[tuple[int, int], _Edge] = {}
-        self.result: LensBundleResult | None = None
+        self.result: LevenbergResult[LensBlock] | None = None
 
     def __len__(self) -> int:
         return len(self._views)
@@ -111,10 +110,9 @@ class GrowingBundle:
 
     def _reprojections(self, directed: list[tuple[int, int]]) -> Tensor:
         source, target = (torch.tensor([e[k] for e in directed]) for k in (0, 1))
-        T = relative_motion(torch.stack(self._T), source, target)
-        rays = lens_rays(self.lens, self.grid.pixels).rays
         depth = torch.stack([self._depth[i] for i, _ in directed])
-        return project_lens(self.lens, rays, T, depth).pixels
+        block = LensBlock(self.lens, self.grid.pixels)
+        return block.project(torch.stack(self._T), source, target, depth).pixels
 
     def problem(self) -> BundleProblem:
         """All edges; every pose but the first is free."""
@@ -133,22 +131,22 @@ class GrowingBundle:
             torch.ones_like(free),
         )
 
-    def adjust(self, options: LensBundleOptions) -> bool:
-        """Solve for everything and take it over; False if that fails."""
-        result = solve_lens(self.problem(), self.lens, self.grid.pixels, options)
+    def adjust(self, radial: bool) -> bool:
+        """Solve for everything, k1 if ``radial``, and take it over; False if that fails."""
+        result = self.solve(radial)
         if not result.finite:
             return False
-        self.result, self.lens = result, result.lens
+        self.result, self.lens = result, result.block.lens
         self._T = list(result.T_cw)
         self._information = list(result.information)
         self._depth = list(grid_fields(self.grid).fill(result.inverse_depth, result.information))
         self._normalise()
         return True
 
-    def with_radial(self) -> LensBundleResult:
-        """The solution with k1 as a variable too; nothing is taken over."""
-        options = LensBundleOptions(radial=True)
-        return solve_lens(self.problem(), self.lens, self.grid.pixels, options)
+    def solve(self, radial: bool) -> LevenbergResult[LensBlock]:
+        """The solution, with k1 as a variable too if ``radial``; nothing is taken over."""
+        block = LensBlock(self.lens, self.grid.pixels, radial=radial)
+        return solve_shared(self.problem(), block)
 
     def _normalise(self) -> None:
         """Median depth 1, so that limits and thresholds mean the same everywhere."""

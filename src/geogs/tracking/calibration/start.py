@@ -5,14 +5,14 @@ essential matrix and PnP and is adjusted, the focal length with the rest; the le
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from geogs.bundle.lens import Lens
-from geogs.bundle.lens_bundle import LensBundleOptions, LensBundleResult, solve_lens
+from geogs.bundle.lens import Lens, LensBlock
+from geogs.bundle.levenberg import LevenbergOptions, LevenbergResult, solve_shared
 from geogs.bundle.problem import BundleProblem
 from geogs.bundle.select import grid_fields
 from geogs.geometry.camera import Camera
@@ -72,28 +72,23 @@ def try_candidate(camera: Camera, flows: list[FlowMatch], min_parallax: float) -
         torch.stack(poses), rows, torch.zeros(n - 1, dtype=torch.long), torch.arange(1, n),
         pixels, weight, free, torch.ones(n, dtype=torch.bool),
     )  # fmt: skip
-    result = _adjusted(problem, Lens(camera), grid)
+    result = _adjusted(problem, LensBlock(Lens(camera), grid.pixels))
     if result is None:
         return None
     edge = max(camera.width, camera.height)
     return Start(
-        result.lens, result.T_cw, result.inverse_depth[0], result.information[0], result.cost,
+        result.block.lens, result.T_cw, result.inverse_depth[0], result.information[0], result.cost,
         2 * math.degrees(math.atan(edge / 2 / camera.fx)),
     )  # fmt: skip
 
 
-def _adjusted(problem: BundleProblem, lens: Lens, grid: SampleGrid) -> LensBundleResult | None:
+def _adjusted(problem: BundleProblem, block: LensBlock) -> LevenbergResult[LensBlock] | None:
     """From forgiving to strict, always with the focal length."""
     result = None
     for huber in _HUBERS:
-        result = solve_lens(
-            problem, lens, grid.pixels, LensBundleOptions(iterations=10, huber=huber)
-        )
+        result = solve_shared(problem, block, LevenbergOptions(iterations=10, huber=huber))
         if not result.finite:
             return None
-        lens = result.lens
-        problem = BundleProblem(
-            result.T_cw, result.inverse_depth, problem.source, problem.target, problem.pixels,
-            problem.weight, problem.free_pose, problem.free_depth,
-        )  # fmt: skip
+        block = result.block
+        problem = replace(problem, T_cw=result.T_cw, inverse_depth=result.inverse_depth)
     return result

@@ -1,0 +1,50 @@
+"""The camera with unknowns against autograd and OpenCV."""
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from geogs.bundle.lens import Lens, LensBlock, lens_rays
+from geogs.bundle.projection import relative_motion
+from geogs.geometry.lie import retract
+from lens_scene import CAMERA, GRID, lens_problem
+from oracles.calibration_reference import reproject
+
+
+@pytest.mark.parametrize("k1", [0.0, 0.15, -0.2])
+def test_jacobians_match_autograd(k1):
+    p = lens_problem(Lens(CAMERA, k1))
+    T = relative_motion(p.T_cw, p.source, p.target)[:1]
+    pixels, d = GRID.pixels.double(), p.inverse_depth[:1].double()
+    block = LensBlock(Lens(CAMERA, k1), pixels)
+    fast = block.linearise(p.T_cw, p.source[:1], p.target[:1], d)
+
+    def moved(xi, unknowns, delta):
+        return reproject(CAMERA, pixels, unknowns, retract(xi, T[0]), d[0] + delta)
+
+    at = (
+        torch.zeros(6, dtype=torch.float64),
+        torch.tensor([0.0, k1], dtype=torch.float64),
+        torch.zeros(GRID.size, dtype=torch.float64),
+    )
+    torch.testing.assert_close(fast.pixels[0], moved(*at), rtol=1e-9, atol=1e-9)
+    Jx, Jl, Jd = torch.autograd.functional.jacobian(moved, at)
+    Jd = torch.stack([Jd[k, :, k] for k in range(GRID.size)], -1)
+    expected = torch.cat([Jx, Jl], -1).permute(2, 1, 0)
+    torch.testing.assert_close(fast.jacobian[0], expected, rtol=1e-7, atol=1e-7)
+    torch.testing.assert_close(fast.depth_jacobian[0], Jd, rtol=1e-7, atol=1e-7)
+
+
+def test_the_lens_is_that_of_opencv():
+    lens = Lens(CAMERA, -0.12)
+    K, distortion = CAMERA.matrix().numpy(), np.array([-0.12, 0, 0, 0])
+    pixels = GRID.pixels.double()
+    rays = lens_rays(lens, pixels).rays
+    back, _ = cv2.projectPoints(rays.numpy(), np.zeros(3), np.zeros(3), K, distortion)
+    np.testing.assert_allclose(back[:, 0], pixels.numpy(), atol=1e-7)
+    eye, same = torch.eye(4, dtype=torch.float64)[None], torch.zeros(1, dtype=torch.long)
+    depth = torch.ones(1, GRID.size, dtype=torch.float64)
+    p = LensBlock(lens, pixels).project(eye, same, same, depth)
+    np.testing.assert_allclose(p.pixels[0].numpy(), pixels.numpy(), atol=1e-7)
+    assert p.valid.all()

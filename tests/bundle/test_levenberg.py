@@ -1,0 +1,105 @@
+"""Adjustment with a lens against its reference and known lenses."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from geogs.bundle.base import BundleOptions
+from geogs.bundle.lens import Lens, LensBlock
+from geogs.bundle.levenberg import LevenbergOptions, LinearSystem, solve_shared
+from geogs.bundle.linearise import linearise_stars
+from lens_scene import CAMERA, GRID, disturbed, lens_problem
+from oracles.calibration_reference import gauss_newton_step
+
+
+def test_stars_are_those_of_the_tracker_where_the_lens_is_its_pinhole():
+    lens = Lens(CAMERA)
+    problem = disturbed(lens_problem(lens, frames=4, noise=0.5), 0.01, 0.03)
+    T, d = problem.T_cw, problem.inverse_depth
+    options = BundleOptions(huber=1.0, depth_damping=1e-3)
+    system = LinearSystem.of(problem, LensBlock(lens, GRID.pixels), T, d, 1.0, 1e-3)
+    for own, theirs in zip(
+        system.stars, linearise_stars(GRID, problem, T, d, options), strict=True
+    ):
+        at = len(theirs.gradient)
+        assert (own.frame, own.shared, theirs.shared) == (theirs.frame, 2, 0)
+        scale = theirs.hessian.diagonal().sqrt()
+        error = (own.hessian[:at, :at] - theirs.hessian) / (scale[:, None] * scale)
+        assert float(error.abs().max()) < 1e-5
+        torch.testing.assert_close(
+            own.gradient[:at] / scale, theirs.gradient / scale, rtol=1e-4, atol=1e-2
+        )
+        torch.testing.assert_close(own.information, theirs.information, rtol=1e-4, atol=1e-3)
+        torch.testing.assert_close(own.residual, theirs.residual, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("huber", [0.5, 50.0])
+def test_one_step_matches_the_dense_equations(huber):
+    lens = Lens(CAMERA, 0.05)
+    problem = disturbed(lens_problem(lens.moved(0.02, 0.01), frames=3), 0.01, 0.03)
+    xi, unknowns, delta = gauss_newton_step(problem, CAMERA, GRID.pixels, 0.05, huber, 1e-5)
+    block = LensBlock(lens, GRID.pixels, radial=True)
+    system = LinearSystem.of(problem, block, problem.T_cw, problem.inverse_depth, huber, 1e-5)
+    step = system.step(0.0)
+    assert step is not None
+    depth = system.moved_depth(step, problem.inverse_depth)
+    assert float(unknowns.abs().min()) > 1e-3
+    torch.testing.assert_close(step[-2:], unknowns, rtol=2e-3, atol=2e-5)
+    # Poses and depths agree up to the scale, which nothing measures.
+    ours, theirs = step[6:-2].reshape(-1, 6), xi[1:]
+    torch.testing.assert_close(ours[:, 3:], theirs[:, 3:], rtol=0, atol=5e-5)
+    away, rest = problem.T_cw[1:, :3, 3].reshape(-1), (ours - theirs)[:, :3].reshape(-1)
+    scale = float(away @ rest / (away @ away))
+    torch.testing.assert_close(rest, scale * away, rtol=0, atol=1e-4)
+    change = depth.double() - problem.inverse_depth - delta
+    torch.testing.assert_close(change, -scale * problem.inverse_depth.double(), rtol=0, atol=2e-3)
+
+
+def test_recovers_focal_length_and_radial_term():
+    truth = Lens(CAMERA, -0.1)
+    start = disturbed(lens_problem(truth), 0.01, 0.05)
+    guess = Lens(CAMERA).moved(math.log(1.25))
+    options = LevenbergOptions(iterations=40, huber=100.0, least_decrease=1e-9)
+    result = solve_shared(start, LensBlock(guess, GRID.pixels, radial=True), options)
+    assert result.finite
+    found = result.block.lens
+    assert abs(found.camera.fx / CAMERA.fx - 1) < 1e-3
+    assert abs(found.camera.fy / CAMERA.fy - 1) < 1e-3
+    assert abs(found.k1 + 0.1) < 1e-3
+
+
+def test_deviations_are_those_of_repeated_measurements():
+    errors, deviations = [], []
+    for seed in range(16):
+        problem = lens_problem(Lens(CAMERA), frames=8, noise=0.3, seed=seed)
+        result = solve_shared(problem, LensBlock(Lens(CAMERA), GRID.pixels, radial=True))
+        lens = result.block.lens
+        errors.append([math.log(lens.camera.fx / CAMERA.fx), lens.k1])
+        deviations.append(result.covariance.diagonal().sqrt().tolist())
+    actual = np.sqrt(np.square(errors).mean(0))
+    said = np.sqrt(np.square(deviations).mean(0))
+    assert (actual > 1e-4).all()
+    assert ((actual / said > 0.5) & (actual / said < 2.0)).all(), (actual, said)
+
+
+def test_what_is_no_variable_stays():
+    problem = lens_problem(Lens(CAMERA, 0.05).moved(0.1))
+    lens = Lens(CAMERA, 0.05)
+    fixed = solve_shared(problem, LensBlock(lens, GRID.pixels, focal=False))
+    assert fixed.block.lens == lens
+    assert not fixed.covariance.any()
+    torch.testing.assert_close(fixed.T_cw[0], problem.T_cw[0])
+    focal = solve_shared(problem, LensBlock(lens, GRID.pixels))
+    assert focal.block.lens.k1 == 0.05
+    assert float(focal.covariance[1, 1]) == 0
+    assert focal.block.lens.camera.fx > 1.05 * CAMERA.fx
+
+
+def test_matches_that_are_not_finite_are_reported():
+    problem = lens_problem(Lens(CAMERA))
+    problem.pixels[0, 0] = torch.nan
+    result = solve_shared(problem, LensBlock(Lens(CAMERA), GRID.pixels))
+    assert not result.finite
+    assert result.block.lens == Lens(CAMERA)
