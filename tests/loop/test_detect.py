@@ -204,8 +204,8 @@ def test_blank_keyframes_close_nothing(path):
     seen, poses = path
     store, operator = keyframes(seen[:14], poses[:14])
     for id in (0, 12, 13):
-        store[id].image = np.full_like(store[id].image, 120)
-        store[id].encoded = operator.encode(store[id].image)
+        blank = np.full_like(store[id].image, 120)
+        store[id].picture = store.store.pictures.add(blank, operator.encode(blank))
         store[id].information = torch.zeros_like(store[id].information)
     detector = LoopDetector(store.store, operator, LoopConfig(min_gap=5))
     assert detector.update([0, 12, 13], is_last=True) == ()
