@@ -12,7 +12,6 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from geogs.cli.durations import seconds
 from scipy.spatial import cKDTree
 
 from depth_scene import WORKING, make_scene, trace
@@ -327,13 +326,6 @@ def test_an_engine_searches_between_given_limits():
     (default,) = engine.estimate(views[:1], [views[1:]])
     assert (free.depth == default.depth).all()
     assert not (depth.depth == free.depth).all()
-
-
-def test_durations():
-    assert [seconds(t) for t in ("90", "90s", "10m", "1.5h")] == [90, 90, 600, 5400]
-    for wrong in ("", "soon", "-3s", "0", "10 days"):
-        with pytest.raises(InputError, match="duration"):
-            seconds(wrong)
 
 
 def test_depths_are_searched_for_as_many_images_as_time_allows():

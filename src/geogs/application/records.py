@@ -211,7 +211,7 @@ class _Unpacker:
         self, arrays: Mapping[str, Tensor], archives: Mapping[str, Archive], device: torch.device
     ) -> None:
         self._arrays, self._archives, self._device = arrays, archives, device
-        self._pieces: dict[tuple, Archived] = {}
+        self._pieces: dict[tuple[Any, ...], Archived] = {}
         """One for each place in an archive: its space is free once that one is gone."""
 
     def value(self, kind: Any, value: Values, name: str) -> Any:

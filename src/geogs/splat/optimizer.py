@@ -1,6 +1,7 @@
 """Adam for a map whose disks come, go and move."""
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
@@ -24,7 +25,7 @@ class LearningRates:
     log_scale: float
     opacity_logit: float
 
-    def __iter__(self):
+    def __iter__(self) -> Iterator[float]:
         return iter((self.position, self.quaternion, self.log_scale, self.opacity_logit))
 
 

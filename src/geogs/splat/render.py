@@ -1,7 +1,7 @@
 """Rendering the map: one contract, several backends."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Bool, Float
@@ -117,9 +117,20 @@ class _Rasterize(torch.autograd.Function):
     """The cpu backend."""
 
     @staticmethod
-    def forward(ctx, position, quaternion, log_scale, opacity_logit, T_cw, camera, near, threads):
+    def forward(
+        ctx: Any,
+        position: Tensor,
+        quaternion: Tensor,
+        log_scale: Tensor,
+        opacity_logit: Tensor,
+        T_cw: Tensor,
+        camera: Camera,
+        near: float,
+        threads: int,
+    ) -> tuple[Tensor, ...]:
         disks = (position, quaternion, log_scale, opacity_logit)
-        arrays = tuple(p.detach().contiguous().numpy() for p in disks)
+        x, q, scale, logit = (p.detach().contiguous().numpy() for p in disks)
+        arrays = x, q, scale, logit
         pose = T_cw.detach()[:3].to("cpu", torch.float64).contiguous().numpy()
         with_trace = any(ctx.needs_input_grad)
         maps, trace = rasterize_forward(arrays, camera, pose, near, threads, with_trace)
@@ -134,10 +145,12 @@ class _Rasterize(torch.autograd.Function):
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx, *gradients):
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         *_, T_cw = ctx.saved_tensors
-        maps = (g.to(torch.float32).contiguous().numpy() for g in gradients[:4])
-        result = rasterize_backward(ctx.trace, *maps, ctx.threads)
+        depth, normal, alpha, distortion = (
+            g.to(torch.float32).contiguous().numpy() for g in gradients[:4]
+        )
+        result = rasterize_backward(ctx.trace, depth, normal, alpha, distortion, ctx.threads)
         d_T = torch.zeros(4, 4, dtype=torch.float64)
         d_T[:3] = torch.from_numpy(result.T_cw)
         disks = (result.position, result.quaternion, result.log_scale, result.opacity_logit)
