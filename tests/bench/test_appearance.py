@@ -451,7 +451,7 @@ def test_points_file_keeps_positions_and_colours(tmp_path) -> None:
     np.testing.assert_array_equal(got.positions, points.positions)
     np.testing.assert_array_equal(got.colours, points.colours)
     (tmp_path / "no.ply").write_text("nothing")
-    with pytest.raises(InputError, match="no PLY"):
+    with pytest.raises(InputError, match="no readable PLY"):
         read_points(tmp_path / "no.ply")
     with pytest.raises(InputError, match="does not exist"):
         read_points(tmp_path / "missing.ply")
