@@ -28,7 +28,7 @@ _REDRAWS = 4
 
 
 class TerminalProgress(RunProgress):
-    """Bars on the standard error, while it is entered."""
+    """Bars on the standard error, while it is entered and from the first of them on."""
 
     def __init__(self) -> None:
         self._console = Console(stderr=True)
@@ -47,11 +47,11 @@ class TerminalProgress(RunProgress):
         self._tasks: dict[str, TaskID] = {}
 
     def __enter__(self) -> "TerminalProgress":
-        self._bar.start()
         return self
 
     def __exit__(self, *exception: object) -> None:
-        self._bar.stop()
+        if self._tasks:  # to stop what never began would print an empty line
+            self._bar.stop()
 
     def write(self, text: str) -> None:
         """A line above the bars, if there is something to say."""
@@ -62,6 +62,7 @@ class TerminalProgress(RunProgress):
         """Show the bar of the frames."""
         self._frames, self._begun = frames, begun
         self._start = self._printed = time.perf_counter()
+        self._bar.start()
         self._tasks["tracking"] = self._bar.add_task(
             "tracking", total=frames, completed=begun, info=""
         )
@@ -84,5 +85,6 @@ class TerminalProgress(RunProgress):
     def stage(self, name: str, fraction: float) -> None:
         """Move the bar of a stage, or begin one."""
         if name not in self._tasks:
+            self._bar.start()
             self._tasks[name] = self._bar.add_task(name, total=1.0, info="")
         self._bar.update(self._tasks[name], completed=fraction)
