@@ -104,9 +104,9 @@ def test_the_prior_adds_little_information_and_only_where_it_is_needed(walk, hel
     views, _ = walk
     told, alone, bare = [], [], []
     for id in helped.keyframe_ids[1:-1]:
-        state, k = helped.store[id], helped.keyframe(id)
+        state, k = helped.keyframes[id], helped.keyframes[id]
         d = state.inverse_depth
-        told.append(1 / (d * k.information.reshape(-1).clamp(min=1e-9).sqrt()))
+        told.append(1 / (d * k.sure_information.clamp(min=1e-9).sqrt()))
         alone.append(1 / (d * state.information.clamp(min=1e-9).sqrt()))
         grey = cv2.cvtColor(views[k.frame_index].image, cv2.COLOR_RGB2GRAY)
         bare.append(torch.from_numpy(cell_structure(grey) < 0.05))
@@ -120,7 +120,7 @@ def test_the_prior_adds_little_information_and_only_where_it_is_needed(walk, hel
 def test_scales_follow_the_unit(walk, helped: Tracker):
     """After a correction that halves lengths, prior and depth still say the same."""
     id = helped.keyframe_ids[-2]
-    state = helped.store[id]
+    state = helped.keyframes[id]
     before = state.inverse_depth.clone(), state.prior.scale.clone(), state.prior.information.clone()
     poses = {id: state.T_cw.clone()}
     helped.keyframes.correct(PoseCorrection(poses, poses, {id: 2.0}))
@@ -152,9 +152,9 @@ def test_normals_reach_the_keyframes_and_depth_can_be_left_alone(walk):
     assert len(without.keyframe_ids) >= 6
     assert without.keyframe_ids == normals.keyframe_ids == off.keyframe_ids
     for id in without.keyframe_ids:
-        a, b, c = without.keyframe(id), normals.keyframe(id), off.keyframe(id)
+        a, b, c = without.keyframes[id], normals.keyframes[id], off.keyframes[id]
         for other in (b, c):
             assert torch.equal(a.inverse_depth, other.inverse_depth)
             assert torch.equal(a.T_cw, other.T_cw)
-        assert a.normal is None
-        assert b.normal.shape == c.normal.shape == (192, 256, 3)
+        assert a.picture.normal is None
+        assert b.picture.normal.shape == c.picture.normal.shape == (192, 256, 3)

@@ -27,7 +27,7 @@ def scattered(count: int, seed: int = 0) -> Segment:
 
 
 def test_no_pair_within_reach_is_left_out():
-    for store in (scattered(60), planted_tracker(80)[0].store):
+    for store in (scattered(60), planted_tracker(80)[0].keyframes):
         ids = store.ids
         may = may_overlap(store, ids, ids, 0.2, 2)
         may &= may.T
@@ -42,7 +42,7 @@ def test_no_pair_within_reach_is_left_out():
 
 
 def test_pairs_of_many_keyframes_are_those_of_looking_at_all(monkeypatch):
-    store = planted_tracker(90)[0].store
+    store = planted_tracker(90)[0].keyframes
     ids = store.ids
     arguments = (store, ids, ids, [(0, 9), (20, 60)], 3, 3, 40.0, 700)
     fast = proximity_pairs(*arguments)
@@ -56,7 +56,7 @@ def test_pairs_of_many_keyframes_are_those_of_looking_at_all(monkeypatch):
 
 @pytest.mark.parametrize("count", [40, 90])
 def test_the_last_keyframe_finds_its_neighbours(count):
-    store = planted_tracker(count)[0].store
+    store = planted_tracker(count)[0].keyframes
     ids = store.ids
     pairs = proximity_pairs(store, [ids[-1]], ids[-25:-1], [], 3, 1, 40.0, 5)
     assert pairs[:3] == [(ids[-1] - k, ids[-1]) for k in (1, 2, 3)]
