@@ -90,6 +90,13 @@ def se3_inverse(T: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 4 4"]:
     return _compose(Rt, -(Rt @ T[..., :3, 3:])[..., 0])
 
 
+def scaled(T: Float[Tensor, "*b 4 4"], factor: float) -> Float[Tensor, "*b 4 4"]:
+    """The pose with its translation multiplied by ``factor``."""
+    out = T.clone()
+    out[..., :3, 3] *= factor
+    return out
+
+
 def se3_adjoint(T: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 6 6"]:
     """``Ad`` with ``T Exp(xi) T^-1 = Exp(Ad xi)``."""
     R = T[..., :3, :3]

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Float64, UInt8
 from torch import Tensor
 
+from geogs.geometry.lie import scaled
 from geogs.keyframes.archive import Archived
 from geogs.keyframes.grid import SampleGrid
 from geogs.keyframes.pictures import Picture
@@ -106,6 +107,11 @@ class Keyframe:
         self.scale = self.scale * factor
         if self.prior is not None:
             self.prior.rescale(factor)
+
+    def at_present_scale(self, T: Float[Tensor, "4 4"], scale: float) -> Float[Tensor, "4 4"]:
+        """A motion measured from here when the keyframe had that scale, in its lengths of now."""
+        factor = self.scale / scale
+        return T if factor == 1.0 else scaled(T, factor)
 
     @property
     def sure_information(self) -> Float[Tensor, "p"]:

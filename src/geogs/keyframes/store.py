@@ -10,7 +10,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from geogs.errors import InputError
-from geogs.geometry.lie import sim3_scale
+from geogs.geometry.lie import scaled, sim3_scale
 from geogs.keyframes.archive import Archive
 from geogs.keyframes.grid import SampleGrid
 from geogs.keyframes.keyframe import Keyframe, KeyframeState
@@ -207,10 +207,3 @@ class Segment:
             after[k] = T @ S.to(T)
             after[k][:3] /= scale
         return PoseCorrection(before, after, dict.fromkeys(before, scale))
-
-
-def scaled(T: Float[Tensor, "*b 4 4"], factor: float) -> Float[Tensor, "*b 4 4"]:
-    """The pose with its translation multiplied by ``factor``."""
-    out = T.clone()
-    out[..., :3, 3] *= factor
-    return out

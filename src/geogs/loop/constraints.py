@@ -7,9 +7,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from geogs.geometry.lie import se3_inverse, sim3_inverse, sim3_log
+from geogs.geometry.lie import scaled, se3_inverse, sim3_inverse, sim3_log
 from geogs.keyframes.grid import SampleGrid
-from geogs.keyframes.store import KeyframeStore, Segment, scaled
+from geogs.keyframes.store import KeyframeStore, Segment
 from geogs.loop.detect import Loop
 from geogs.loop.matched_edges import MatchedEdges
 from geogs.loop.pose_graph import RelativePoses

@@ -9,10 +9,9 @@ from torch import Tensor
 
 from geogs.bundle.projection import project
 from geogs.config import VerificationOptions
-from geogs.geometry.lie import se3_inverse, so3_log
+from geogs.geometry.lie import scaled, se3_inverse, so3_log
 from geogs.keyframes.grid import SampleGrid
 from geogs.keyframes.keyframe import Keyframe
-from geogs.keyframes.store import scaled
 from geogs.tracking.flow.base import FlowMatch, FlowOperator
 from geogs.tracking.motion import FrameLocator, FrameMotion
 

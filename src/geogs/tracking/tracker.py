@@ -19,7 +19,7 @@ from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_inverse
 from geogs.keyframes.grid import SampleGrid
 from geogs.keyframes.keyframe import Keyframe, KeyframeState
-from geogs.keyframes.store import KeyframeStore, scaled
+from geogs.keyframes.store import KeyframeStore
 from geogs.priors.base import MonocularPrior
 from geogs.tracking.flow.base import FlowOperator
 from geogs.tracking.flow.select import build_operator
@@ -85,8 +85,7 @@ class LastFrame:
         return self.T_cw if self.velocity is None else self._present(self.velocity) @ self.T_cw
 
     def _present(self, T: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:
-        factor = self.keyframe.scale / self.scale
-        return T if factor == 1.0 else scaled(T, factor)
+        return self.keyframe.at_present_scale(T, self.scale)
 
 
 @dataclass(frozen=True, eq=False)
@@ -406,7 +405,7 @@ class Tracker:
     def _adjust_locally(self) -> None:
         c, ids = self.config, self.keyframes.ids
         poses = [k for k in ids[-c.window :] if k != ids[0]]
-        depths = ids[-max(c.window, c.depth_window) :]
+        depths = ids[-c.depth_window :]
         moving, deep = set(poses), set(depths)
         for n in range(c.local_rounds):
             edges = [e for e in self.graph.edges if e[0] in deep or not moving.isdisjoint(e)]

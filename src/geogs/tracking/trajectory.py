@@ -17,7 +17,7 @@ from geogs.errors import InputError
 from geogs.geometry.lie import retract, se3_inverse, se3_log
 from geogs.keyframes.grid import SampleGrid
 from geogs.keyframes.keyframe import Keyframe
-from geogs.keyframes.store import Segment, scaled
+from geogs.keyframes.store import Segment
 from geogs.tracking.flow.base import FlowMatch, FlowOperator
 from geogs.tracking.packed_edge import pack_matches, unpacked_positions
 from geogs.types import Frame, Trajectory
@@ -141,7 +141,7 @@ class TrajectoryRecorder:
             if record.index < removed.frame_index:
                 break
             if record.anchor == removed.id:
-                T_rel = _at_scale(record, removed) @ base
+                T_rel = removed.at_present_scale(record.T_rel, record.scale) @ base
                 record.anchor, record.T_rel = substitute, T_rel
                 record.scale = self.keyframes[substitute].scale
                 record.observations = [o for o in record.observations if o.keyframe != removed.id]
@@ -215,7 +215,7 @@ class TrajectoryRecorder:
     def _pose(self, record: FrameRecord) -> Float[Tensor, "4 4"]:
         assert record.anchor is not None, "a frame that was not tracked has no pose"
         anchor = self.keyframes[record.anchor]
-        return _at_scale(record, anchor) @ anchor.T_cw
+        return anchor.at_present_scale(record.T_rel, record.scale) @ anchor.T_cw
 
     def solve(self, apart: Sequence[FrameRecord] = (), chunk: int = 64) -> Trajectory:
         """Poses of all frames seen so far on the present keyframes, real timestamps.
@@ -260,12 +260,6 @@ class TrajectoryRecorder:
         problem = MotionProblem(start, depth, source, frame, pixels, weight)
         T, _ = motion_solver(grid, cells).solve(problem, iterations=8)
         return T
-
-
-def _at_scale(record: FrameRecord, anchor: Keyframe) -> Float[Tensor, "4 4"]:
-    """Motion from the anchor to the frame at the anchor's present scale."""
-    factor = anchor.scale / record.scale
-    return record.T_rel if factor == 1.0 else scaled(record.T_rel, factor)
 
 
 def sparse_cells(grid: SampleGrid) -> Bool[Tensor, "p"]:
