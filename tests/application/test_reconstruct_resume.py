@@ -126,14 +126,16 @@ def test_an_interrupted_command_resumes(room, tmp_path):
         "--search.least-steps", 1500, "--search.no-repeat", "--device", "cpu",
     ]  # fmt: skip
     checkpoint = tmp_path / "checkpoint" / "manifest.json"
-    process = subprocess.Popen([*GEOGS, *map(str, call)], stderr=subprocess.PIPE, text=True)
+    process = subprocess.Popen(
+        [*GEOGS, *map(str, call)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
     deadline = time.monotonic() + 200
     while not has_checkpoint(tmp_path) and process.poll() is None and time.monotonic() < deadline:
         time.sleep(0.05)
     process.send_signal(signal.SIGINT)
-    _, said = process.communicate(timeout=200)
+    printed, said = process.communicate(timeout=200)
     assert process.returncode == 0, said
-    assert "--resume goes on" in said
+    assert "--resume goes on" in printed
     assert json.loads((tmp_path / "summary.json").read_text())["interrupted"] is True
     assert checkpoint.is_file()
     other = geogs(*call, "--resume", "--mapping.disk.opacity", 0.6)

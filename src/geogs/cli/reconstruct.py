@@ -36,6 +36,8 @@ def main(argv: Sequence[str]) -> int:
         settings = replace(settings, budget=max(left, LEAST_BUDGET))
     with TerminalProgress() as progress:
         written = reconstruct_to_folder(settings, progress, Interruption())
+    if written.can_resume:
+        print("The same command with --resume goes on from here.")
     print(f"Results are in {written.output}/")
     return 0
 

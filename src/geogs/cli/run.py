@@ -66,5 +66,5 @@ def _defaults(given: Given) -> RunOptions:
 
     folder = Path(given["resume"])
     if "preset" in given:
-        raise InputError("--resume goes on with the run's settings; leave out everything else.")
+        raise InputError("--resume goes on with the run's settings; leave out --preset.")
     return RunOptions(**vars(SavedRun(folder).facts.settings), resume=folder)

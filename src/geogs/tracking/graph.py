@@ -96,11 +96,6 @@ class FrameGraph:
             self.edges = {e: v for e, v in self.edges.items() if e not in old}
         return old
 
-    def retain(self, ids: Collection[int]) -> None:
-        """Forget the edges that join any but the given keyframes."""
-        kept = set(ids)
-        self.edges = {e: v for e, v in self.edges.items() if e[0] in kept and e[1] in kept}
-
     def reprojections(self, directed: Sequence[Pair]) -> Float[Tensor, "e p 2"]:
         """Present positions of the cells of i in j for each directed edge (i, j)."""
         if not directed:
