@@ -1,0 +1,113 @@
+"""Marginal variances against the inverse of the full normal equations, and against samples."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from bundle_scenes import CAMERA, scene
+from geogs.bundle.base import BundleOptions
+from geogs.bundle.dense import DenseBundle
+from geogs.bundle.marginals import marginals
+from geogs.bundle.problem import BundleProblem
+from geogs.bundle.projection import project, relative_motion
+from geogs.geometry.lie import se3_exp, se3_inverse, se3_log
+from geogs.keyframes.grid import SampleGrid
+from oracles.bundle_reference import residuals
+
+EXACT = BundleOptions(huber=50.0, depth_damping=0.0)
+
+
+def full_covariance(problem: BundleProblem, grid: SampleGrid):
+    """Inverse of the normal equations over free poses and all depths, by autograd."""
+    n, p = problem.inverse_depth.shape
+    zero = torch.zeros(n, 6, dtype=torch.float64), torch.zeros(n, p, dtype=torch.float64)
+    Jx, Jd = torch.func.jacrev(
+        lambda a, b: residuals(problem, CAMERA, grid.rays, a, b).reshape(-1), (0, 1)
+    )(*zero)
+    J = torch.cat([Jx.reshape(-1, 6 * n), Jd.reshape(-1, n * p)], 1)
+    free = torch.cat([problem.free_pose.repeat_interleave(6), torch.ones(n * p, dtype=torch.bool)])
+    J = J[:, free] * problem.weight.double().reshape(-1, 1).sqrt()
+    inverse = torch.linalg.inv(J.mT @ J)
+    out = torch.zeros(len(free), dtype=torch.float64)
+    out[free] = inverse.diagonal()
+    return out[: 6 * n].reshape(n, 6), out[6 * n :].reshape(n, p)
+
+
+def test_the_block_inverse_is_that_of_the_whole():
+    grid, problem = scene(frames=3)
+    pose, depth = full_covariance(problem, grid)
+    found = marginals(grid, problem, EXACT, inflation=4.0)
+    got = found.pose.diagonal(dim1=-2, dim2=-1)
+    torch.testing.assert_close(got, 4 * pose, rtol=1e-3, atol=1e-12)
+    torch.testing.assert_close(found.inverse_depth.double(), 4 * depth, rtol=2e-3, atol=1e-12)
+    assert float(found.pose[:2].abs().max()) == 0
+
+
+def turning(sideways: float, seed: int = 0) -> tuple[SampleGrid, BundleProblem]:
+    """Six views that turn by three degrees each and move sideways by so much of the depth."""
+    g = torch.Generator().manual_seed(seed)
+    grid, n = SampleGrid(CAMERA), 6
+    turn = torch.arange(n, dtype=torch.float64) * torch.pi / 60
+    step = torch.arange(n, dtype=torch.float64) * sideways
+    zero = torch.zeros(n, dtype=torch.float64)
+    T = se3_exp(torch.stack([step, zero, zero, zero, turn, zero], 1))
+    d = 0.7 + 0.6 * torch.rand(n, grid.size, generator=g)
+    pairs = [(i, j) for i in range(n) for j in range(n) if i != j]
+    source, target = (torch.tensor([p[k] for p in pairs]) for k in (0, 1))
+    pixels = project(CAMERA, grid.rays, relative_motion(T, source, target), d[source]).pixels
+    weight = torch.full_like(pixels, 4.0)  # half a pixel
+    free = torch.ones(n, dtype=torch.bool)
+    free[0] = False
+    return grid, BundleProblem(T, d, source, target, pixels, weight, free, torch.ones_like(free))
+
+
+def test_depth_is_open_when_the_camera_only_turns():
+    def relative(sideways: float) -> float:
+        grid, problem = turning(sideways)
+        found = marginals(grid, problem, EXACT)
+        assert bool(torch.isfinite(found.inverse_depth).all())
+        ones = torch.ones_like(problem.inverse_depth)
+        return float(found.relative_depth(problem.inverse_depth, ones).median())
+
+    far, near, none = relative(0.05), relative(0.01), relative(1e-6)
+    assert far < 0.1
+    assert 3 < near / far < 7  # five times less parallax
+    assert none > 10
+
+
+@pytest.mark.parametrize("sideways", [0.05, 0.02])
+def test_noise_spreads_poses_and_depths_as_foretold(sideways):
+    grid, truth = turning(sideways)
+    foretold = marginals(grid, truth, EXACT)
+    poses, depths = [], []
+    for seed in range(24):
+        g = torch.Generator().manual_seed(seed)
+        noise = 0.5 * torch.randn(truth.pixels.shape, generator=g)
+        noisy = replace(truth, pixels=truth.pixels + noise)
+        found = DenseBundle(grid).solve(noisy, BundleOptions(iterations=8, huber=50.0))
+        # Lengths relative to that of the path, as the variances are.
+        t, length = found.T_cw[:, :3, 3], truth.T_cw[:, :3, 3].norm()
+        scale = float((t * truth.T_cw[:, :3, 3]).sum() / length**2)
+        T = found.T_cw.clone()
+        T[:, :3, 3] /= scale
+        poses.append(se3_log(T @ se3_inverse(truth.T_cw)))
+        depths.append(found.inverse_depth * scale - truth.inverse_depth)
+    spread = torch.stack(poses).square().mean(0)[1:]
+    expected = foretold.pose.diagonal(dim1=-2, dim2=-1)[1:]
+    ratio = spread.sum(0) / expected.sum(0)
+    assert 0.5 < float(ratio[3:].min())
+    assert float(ratio[3:].max()) < 2.0
+    square = torch.stack(depths).square().mean(0) / foretold.inverse_depth
+    assert 0.6 < float(square.median()) < 1.5
+
+
+def test_what_nothing_measures_is_open():
+    grid, problem = turning(0.05)
+    weight = problem.weight.clone()
+    weight[problem.source == 2, 7] = 0
+    found = marginals(grid, replace(problem, weight=weight), EXACT)
+    assert found.inverse_depth[2, 7] == torch.inf
+    assert bool(torch.isfinite(found.inverse_depth[2, :7]).all())
+    none = torch.zeros_like(problem.inverse_depth)
+    assert bool((found.relative_depth(problem.inverse_depth, none) == torch.inf).all())
