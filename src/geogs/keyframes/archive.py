@@ -59,6 +59,7 @@ class Archive:
             self._file = tempfile.TemporaryFile(dir=self.folder, buffering=0)  # noqa: SIM115
         except OSError as error:
             raise self._unwritable(error) from error
+        weakref.finalize(self, self._file.close)
 
     @property
     def size(self) -> int:
