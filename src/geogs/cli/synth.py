@@ -1,29 +1,42 @@
 """``geogs synth``: a synthetic room sequence with exact ground truth."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, cast
 
-from geogs.cli.options import parse_options
+from geogs.cli.options import Given, parse_options
 from geogs.config import Seed
 from geogs.config.setting import Positional, Range, Settings
+from geogs.synth.flaws import CameraKind, Flaws, camera_flaws
+from geogs.synth.motion_kinds import MotionKind
 
 
 @dataclass(frozen=True)
 class SynthOptions(Settings):
-    """Renders a furnished room, drawn at random, along a hand-held camera path."""
+    """Renders a scene, drawn at random, as a moving camera sees it, with exact truth.
+
+    A furnished room and a perfect camera, if nothing else is said; ``--motion driving`` goes
+    through a street. Flaws of the camera: those of ``--camera``, and single ones beside it,
+    ``--flaws.readout 0.03``.
+    """
 
     output: Annotated[Path, Positional()]
     """Folder to write, in the layout of Replica."""
     frames: Annotated[int, Range(1, 100_000)] = 120
     """Number of frames; after 280 the camera is back at its start."""
-    width: Annotated[int, Range(16, 8192)] = 320
-    """Pixels."""
-    height: Annotated[int, Range(16, 8192)] = 240
-    """Pixels."""
+    width: Annotated[int, Range(16, 8192)] | None = None
+    """Pixels; none is 320, on the street 1241."""
+    height: Annotated[int, Range(16, 8192)] | None = None
+    """Pixels; none is 240, on the street 376."""
     seed: Seed = 0
     """Another seed gives another room and another path."""
+    motion: MotionKind = "handheld"
+    """How the camera is moved."""
+    camera: CameraKind = "clean"
+    """A camera with typical flaws, or none."""
+    flaws: Flaws = field(default_factory=Flaws)
+    """Single flaws, over those of the camera."""
     depth: bool = True
     """Write depth images too."""
     image_format: Literal["jpg", "png"] = "jpg"
@@ -34,7 +47,7 @@ class SynthOptions(Settings):
 
 def main(argv: Sequence[str]) -> int:
     """Runs the command; returns the exit code."""
-    options = parse_options(SynthOptions, argv, "synth")
+    options = parse_options(SynthOptions, argv, "synth", _defaults)
 
     from rich.console import Console
     from rich.progress import Progress
@@ -49,9 +62,17 @@ def main(argv: Sequence[str]) -> int:
             options.width,
             options.height,
             options.seed,
+            motion=options.motion,
+            flaws=options.flaws,
             depth=options.depth,
             image_format=options.image_format,
             video=options.video,
             on_frame=lambda index: progress.update(task, completed=index + 1),
         )
     return 0
+
+
+def _defaults(given: Given) -> SynthOptions:
+    """The flaws of the camera asked for."""
+    camera = cast(CameraKind, given.get("camera", "clean"))
+    return SynthOptions(Path(), camera=camera, flaws=camera_flaws(camera))

@@ -147,11 +147,14 @@ def _hit_pixel(solids, i, x, y):
 
 @njit(**_OPTIONS)
 def cast_rows(solids, bounds, xs, ys, first, last, depth, solid, face):
-    """Nearest solid in rows [first, last); ``bounds`` are (left, top, right, bottom) in pixels."""
+    """Nearest solid in rows [first, last) of the rays (xs, ys, 1), both rows x columns.
+
+    ``bounds`` are (left, top, right, bottom) in pixels, a row for each solid.
+    """
     for i in range(len(solids.kind)):
         for row in range(max(first, bounds[i, 1]), min(last, bounds[i, 3])):
             for column in range(bounds[i, 0], bounds[i, 2]):
-                t, f = _hit_pixel(solids, i, xs[column], ys[row])
+                t, f = _hit_pixel(solids, i, xs[row, column], ys[row, column])
                 if t < depth[row, column]:
                     depth[row, column] = t
                     solid[row, column] = i
@@ -337,9 +340,12 @@ def _gain(solids, lighting, i, world, normal, out):
 
 @njit(**_OPTIONS)
 def shade_rows(
-    solids, textures, lighting, camera, xs, ys, first, last, depth, solid, face, image, normals
-):
+    solids, textures, lighting, camera, pixel, xs, ys, first, last, depth, solid, face,
+    image, normals,
+):  # fmt: skip
     """Colour and camera-frame normal of rows [first, last) from what ``cast_rows`` found.
+
+    ``pixel`` is the width and height of a pixel on the plane z = 1.
 
     Inside a face one sample with the texture low-passed to the pixel is enough. At an edge four
     samples are cast, only against the solids seen in the 3 x 3 pixels around.
@@ -347,11 +353,11 @@ def shade_rows(
     found = np.empty(9, np.int64)
     local, world, normal = np.empty(3), np.empty(3), np.empty(3)
     gain, edge_gain, colour = np.empty(3), np.empty(3), np.empty(3)
-    pixel_x, pixel_y = abs(xs[1] - xs[0]), abs(ys[1] - ys[0])
+    pixel_x, pixel_y = pixel
     for row in range(first, last):
-        for column in range(len(xs)):
+        for column in range(xs.shape[1]):
             i, f, t = solid[row, column], face[row, column], depth[row, column]
-            x, y = xs[column], ys[row]
+            x, y = xs[row, column], ys[row, column]
             if i < 0:
                 continue
             cosine = _surface(solids, camera, i, f, t, x, y, local, world, normal)

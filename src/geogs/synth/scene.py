@@ -1,6 +1,6 @@
-"""What a synthetic room is made of: boxes, cone frustums and ellipsoids with textures and lights.
+"""What a synthetic scene is made of: boxes, cone frustums and ellipsoids with textures and lights.
 
-World frame: z up, metres, the room fills [0, size]. A solid has a local frame (rotation local to
+World frame: z up, metres, the scene fills [0, size]. A solid has a local frame (rotation local to
 world, centre) and three numbers ``half`` whose meaning depends on its kind:
 
 - BOX: half extents; a zero half extent along z makes a rectangle,
@@ -12,7 +12,7 @@ and the whole ellipsoid are face 0.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float64, Int64, UInt8
@@ -46,7 +46,7 @@ class Light:
 
 @dataclass(frozen=True)
 class Scene:
-    """A closed room full of solids, as arrays over its n solids."""
+    """A room or a street full of solids, as arrays over its n solids."""
 
     size: Float64[np.ndarray, "3"]
     kind: Int64[np.ndarray, "n"]
@@ -62,6 +62,8 @@ class Scene:
     """Positive: the surface glows with this gain in any light, and casts no shadow."""
     textures: tuple[Texture, ...]
     lights: tuple[Light, ...]
+    sky: Texture | None = None
+    """Longitude and latitude of what is infinitely far; none in a closed room."""
 
     def __len__(self) -> int:
         return len(self.kind)
@@ -84,6 +86,28 @@ class Scene:
             outside = np.maximum(np.abs((points - centre) @ rotation) - extent, 0.0)
             nearest = np.minimum(nearest, np.linalg.norm(outside, axis=1))
         return nearest
+
+
+def joined(first: Scene, *others: Scene) -> Scene:
+    """The solids of several scenes one after the other; the rest is that of the first."""
+    scenes = (first, *others)
+    ends = np.cumsum([0, *(len(scene.textures) for scene in scenes)])
+
+    def stacked(name: str) -> np.ndarray:
+        return np.concatenate([getattr(scene, name) for scene in scenes])
+
+    faces = [scene.face_texture + end for scene, end in zip(scenes, ends[:-1], strict=True)]
+    return replace(
+        first,
+        kind=stacked("kind"),
+        rotation=stacked("rotation"),
+        centre=stacked("centre"),
+        half=stacked("half"),
+        face_texture=np.concatenate(faces),
+        texture_shift=stacked("texture_shift"),
+        emission=stacked("emission"),
+        textures=tuple(texture for scene in scenes for texture in scene.textures),
+    )
 
 
 def yaw_rotation(yaw: Number) -> Float64[np.ndarray, "3 3"]:
@@ -184,8 +208,8 @@ class SceneBuilder:
         """An ellipsoid with the given radii along its local axes."""
         self._add(ELLIPSOID, centre, np.asarray(radii, float), [texture] * 6, rotation, emission)
 
-    def build(self, size: Triple) -> Scene:
-        """The scene so far, in a room filling [0, size]."""
+    def build(self, size: Triple, sky: Texture | None = None) -> Scene:
+        """The scene so far, which fills [0, size], under a sky or a ceiling."""
         p = self._parts
         return Scene(
             size=np.asarray(size, float),
@@ -198,6 +222,7 @@ class SceneBuilder:
             emission=np.array(p.emission, float),
             textures=tuple(p.textures),
             lights=tuple(p.lights),
+            sky=sky,
         )
 
     def _add(

@@ -3,10 +3,10 @@
 import math
 
 import numpy as np
-import torch
 from jaxtyping import Float32, Float64, Int32
 
 from geogs.geometry.camera import Camera
+from geogs.synth.lens import Lens
 from geogs.synth.scene import BOX, FRUSTUM, Scene
 
 _TOLERANCE = 4e-4
@@ -85,8 +85,9 @@ def _ellipsoid(half: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 class SeenSurface:
     """The surface points that depth maps of one camera have shown, one to a voxel."""
 
-    def __init__(self, scene: Scene, camera: Camera, voxel: float = 0.01) -> None:
-        self._rays = camera.rays(torch.float64).numpy()
+    def __init__(self, scene: Scene, camera: Camera | Lens, voxel: float = 0.01) -> None:
+        x, y = (camera if isinstance(camera, Lens) else Lens(camera)).rays
+        self._rays = np.stack([x, y, np.ones_like(x)], -1)
         self._voxel = voxel
         # A cell of margin, since walls lie exactly on the border.
         self._shape = np.ceil(scene.size / voxel).astype(np.int64) + 2

@@ -1,0 +1,58 @@
+"""Where a sequence is taken: the scene, the camera's shape and the units that suit its size."""
+
+from dataclasses import dataclass
+
+from geogs.errors import InputError
+from geogs.geometry.camera import Camera
+from geogs.synth.motion_kinds import MotionKind
+from geogs.synth.motions import Motion, room_motion
+from geogs.synth.room import make_room
+from geogs.synth.scene import Scene
+
+ROOM_FOCAL = 0.7
+"""Focal length over width of the camera in rooms: 71 degrees across."""
+
+_MAX_SIZE = 8192
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A scene and a way through it."""
+
+    name: str
+    scene: Scene
+    motion: Motion
+    width: int
+    height: int
+    """Pixels of the images, where the user does not say."""
+    focal: float
+    """Focal length over the width of the image."""
+    depth_scale: float
+    """Units of the depth images per metre."""
+    voxel_cm: int
+    """Side of the cells of which each that was seen gives a point, centimetres."""
+
+    def camera(self, width: int | None, height: int | None) -> Camera:
+        """The camera of the size asked for, its principal point in the middle of the image."""
+        return centred_camera(width or self.width, height or self.height, self.focal)
+
+
+def make_stage(kind: MotionKind, seed: int = 0) -> Stage:
+    """The room of the seed, and the motion through it."""
+    scene = make_room(seed)
+    return Stage(
+        f"procedural room, seed {seed}", scene, room_motion(kind, scene, seed),
+        width=320, height=240, focal=ROOM_FOCAL, depth_scale=6553.5, voxel_cm=1,
+    )  # fmt: skip
+
+
+def centred_camera(width: int, height: int, focal: float = ROOM_FOCAL) -> Camera:
+    """A camera with its principal point in the middle; ``focal`` is its length over the width.
+
+    Raises:
+        InputError: the image would be too small or too large.
+    """
+    if not (16 <= width <= _MAX_SIZE and 16 <= height <= _MAX_SIZE):
+        raise InputError(f"images must be 16 to {_MAX_SIZE} pixels a side, not {width}x{height}")
+    f = focal * width
+    return Camera(f, f, (width - 1) / 2, (height - 1) / 2, width, height)
