@@ -36,14 +36,18 @@ TEXTURES = [_texture(k) for k in range(len(PLANES))]
 def render(T_wc: np.ndarray, camera: Camera = CAMERA) -> tuple[np.ndarray, np.ndarray]:
     """Grey RGB image and z-depth from a camera at T_wc inside the box."""
     rays = camera.rays(torch.float64).numpy()
-    directions = rays @ T_wc[:3, :3].T
-    depth = np.full(rays.shape[:2], np.inf)
-    image = np.zeros(rays.shape[:2], np.float32)
+    return seen(T_wc[:3, 3], rays @ T_wc[:3, :3].T)
+
+
+def seen(centre: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Grey RGB image and depth along (h, w, 3) directions from one centre, or from each row's."""
+    depth = np.full(directions.shape[:2], np.inf)
+    image = np.zeros(directions.shape[:2], np.float32)
     for k, (normal, offset) in enumerate(PLANES):
         n = np.array(normal)
         with np.errstate(divide="ignore"):
-            z = (offset - n @ T_wc[:3, 3]) / (directions @ n)
-        points = T_wc[:3, 3] + z[..., None] * directions
+            z = (offset - centre @ n) / (directions @ n)
+        points = centre + z[..., None] * directions
         near = (z > 0) & (z < depth)
         if k == len(PLANES) - 1:
             near &= (np.abs(points[..., 0]) < 0.7) & (np.abs(points[..., 1]) < 0.6)

@@ -128,6 +128,8 @@ def _fits(kind: Any, value: object) -> bool:
     """Whether a value is of a kind, as far as one sees from outside."""
     if kind in (bool, int):
         return type(value) is kind
+    if get_origin(kind) is Literal:
+        return value in get_args(kind)
     return isinstance(value, get_origin(kind) or kind) or (kind is float and type(value) is int)
 
 

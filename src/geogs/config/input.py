@@ -1,9 +1,9 @@
 """How a source is read."""
 
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Literal
 
-from geogs.config.setting import Basic, Range, Settings
+from geogs.config.setting import Basic, Only, Range, Settings
 
 
 @dataclass(frozen=True)
@@ -14,6 +14,9 @@ class InputConfig(Settings, group="input"):
     """auto, a file, or fx,fy,cx,cy[,k1,k2,p1,p2[,k3]] in pixels of the source image."""
     long_edge: Annotated[int, Range(32, 16384, or_zero=True), Basic("--long-edge")] = 512
     """Longer side of the working image in pixels; smaller sources are not enlarged, 0 keeps all."""
+    readout: Annotated[float | Literal["auto"], Range(-0.1, 0.1), Only("run")] = "auto"
+    """Seconds a rolling shutter takes from the first to the last row as the sensor reads them, such
+    as 0.0276; 0 for a global shutter, auto finds it in the video."""
     start: Annotated[int, Range(0), Basic("--start")] = 0
     """First frame of the source, from 0."""
     stop: Annotated[int | None, Range(above="start"), Basic("--stop")] = None

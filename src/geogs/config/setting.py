@@ -121,6 +121,8 @@ class Kind:
     choices: tuple[str, ...] = ()
     is_optional: bool = False
     """Whether it can be none."""
+    word: str = ""
+    """What may stand instead of a number, such as auto."""
     is_tuple: bool = False
     """Whether it is any number of such values."""
     ranges: tuple[Range, ...] = ()
@@ -135,8 +137,12 @@ class Kind:
             return Kind.of(inner[0], (*inner[1:], *marks))
         ranges = tuple(mark for mark in marks if isinstance(mark, Range))
         marks = tuple(mark for mark in marks if not isinstance(mark, Range))
-        if origin in (Union, types.UnionType) and len(inner) == 2 and inner[1] is type(None):
-            return replace(Kind.of(inner[0], (*ranges, *marks)), is_optional=True)
+        if origin in (Union, types.UnionType) and len(inner) == 2:
+            instead = get_args(inner[1]) if get_origin(inner[1]) is Literal else ()
+            if inner[1] is type(None):
+                return replace(Kind.of(inner[0], (*ranges, *marks)), is_optional=True)
+            if len(instead) == 1:
+                return replace(Kind.of(inner[0], (*ranges, *marks)), word=instead[0])
         if origin is tuple and len(inner) == 2 and inner[1] is ...:
             return replace(Kind.of(inner[0], (*ranges, *marks)), is_tuple=True)
         if origin is Literal:
@@ -152,6 +158,8 @@ class Kind:
         """
         if value is None:
             return self.is_optional
+        if self.word and value == self.word:
+            return True
         if self.is_tuple:
             return isinstance(value, tuple) and all(self._allows_one(v, group) for v in value)
         return self._allows_one(value, group)
@@ -160,6 +168,8 @@ class Kind:
         """The value that a text means; a text that means none comes back as it is."""
         if self.is_optional and text.lower() == "none":
             return None
+        if self.word and text.lower() == self.word:
+            return self.word
         if self.is_tuple and self.base is not str:
             return tuple(self._read_one(part) for part in text.split(",") if part)
         return self._read_one(text)
@@ -180,6 +190,7 @@ class Kind:
             text += " " + " and ".join(map(str, self.ranges))
         if self.choices:
             text = " or ".join(self.choices)
+        text = f"{self.word} or {text}" if self.word else text
         return f"none or {text}" if self.is_optional else text
 
     def _allows_one(self, value: object, group: object) -> bool:

@@ -1,7 +1,8 @@
 """A source: working images in order, with their times and the camera that took them.
 
 A format supplies a :class:`Reader` (how images are stored); :class:`Source` adds what all have in
-common: the selection of frames, the calibration, the working resolution and reading ahead.
+common: the selection of frames, the calibration, the shutter, the working resolution and reading
+ahead.
 """
 
 import hashlib
@@ -10,7 +11,7 @@ from collections.abc import Generator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol, TypeVar, runtime_checkable
+from typing import Literal, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 from jaxtyping import UInt8
@@ -21,6 +22,10 @@ from geogs.geometry.camera import Camera
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.intrinsics import resolve_intrinsics
 from geogs.io.sources.undistort import Rectifier
+from geogs.shutter.camera import RollingCamera
+from geogs.shutter.neighbours import with_turning
+from geogs.shutter.rows import RowOffsets
+from geogs.shutter.shutter import Shutter
 from geogs.types import Frame
 
 _log = logging.getLogger(__name__)
@@ -80,12 +85,22 @@ class Reader(Protocol):
 
 
 class Source:
-    """Frames at working resolution, undistorted, in time order; can be iterated repeatedly."""
+    """Frames at working resolution, undistorted, in time order; can be iterated repeatedly.
+
+    The rows of a rolling shutter, where its readout is known, are rectified to the middle one.
+    """
 
     def __init__(
-        self, reader: Reader, config: InputConfig, calibration: Calibration | None = None
+        self,
+        reader: Reader,
+        config: InputConfig,
+        calibration: Calibration | None = None,
+        shutter: Shutter | None = None,
     ) -> None:
-        """``calibration`` of the upright images, where it is known better than the reader's."""
+        """``calibration`` of the upright images, where it is known better than the reader's.
+
+        ``shutter``, where it is known better than the settings'.
+        """
         _check_selection(config, reader.length)
         self._reader = reader
         self._config = config
@@ -97,6 +112,8 @@ class Source:
             reader.quarter_turns,
         )
         """The camera of the images as they came, upright, with its distortion."""
+        self.shutter = shutter or shutter_of(config.readout)
+        """By which rows are rectified."""
         self._rectifier = Rectifier(self.calibration, config.long_edge)
         self.skipped = 0
         """Images that could not be read, so far in this iteration."""
@@ -127,7 +144,34 @@ class Source:
     def with_calibration(self, calibration: Calibration) -> "Source":
         """The same frames, undistorted by another calibration of the images as they came."""
         fitted = calibration.fit(self._reader.width, self._reader.height)
-        return Source(self._reader, self._config, fitted)
+        return Source(self._reader, self._config, fitted, self.shutter)
+
+    @property
+    def is_shutter_open(self) -> bool:
+        """Whether nobody has said yet how long the readout takes."""
+        return self._config.readout == "auto" and self.shutter == Shutter()
+
+    def with_shutter(self, shutter: Shutter) -> "Source":
+        """The same frames, with their rows rectified by another readout."""
+        return Source(self._reader, self._config, self.calibration, shutter)
+
+    @property
+    def rolling_camera(self) -> RollingCamera:
+        """The camera of the images that :meth:`resized_images` gives."""
+        turns = self._reader.quarter_turns
+        lines = self._reader.width if turns % 2 else self._reader.height
+        return self._rectifier.rolling_camera(lines, turns)
+
+    def resized_images(self, start: int, stop: int | None) -> Iterator[RawFrame]:
+        """Neighbouring images at working size as they came, from one place in the source on.
+
+        The stride does not count, nor do the start and the stop of the selection.
+        """
+        for raw in self._reader.read(start, stop, 1):
+            if raw.image is not None:
+                _check_size(raw, self._reader)
+                raw = RawFrame(raw.label, raw.timestamp, self._rectifier.resized(raw.image))
+            yield raw
 
     def linked_frames(self) -> Generator[Frame, None, None]:
         """Frames between which there is no cut."""
@@ -168,7 +212,7 @@ class Source:
     def frames_after(self, place: ReadingPlace) -> Generator[Frame, None, None]:
         """Yield the frames after a place; otherwise as the iteration over all."""
         self.place, self.skipped, index = place, place.skipped, place.frames
-        for raw in read_ahead(self._rectified(place.frames + place.skipped)):
+        for raw in read_ahead(self._working(place.frames + place.skipped)):
             if raw.image is None:
                 self.skipped += 1
                 if self.skipped == 1:
@@ -182,15 +226,42 @@ class Source:
         if self.skipped > 1:
             _log.warning("%s: skipped %d images that cannot be read.", self.name, self.skipped)
 
-    def _rectified(self, first: int) -> Iterator[RawFrame]:
-        """The images of the selection from its ``first`` on."""
+    def _working(self, first: int) -> Iterator[RawFrame]:
+        """The working images of the selection from its ``first`` on."""
         config, reader = self._config, self._reader
         start = config.start + first * config.stride
+        if self.shutter.readout:
+            yield from self._with_rows_rectified(start)
+            return
         for raw in reader.read(start, config.stop, config.stride):
             if raw.image is not None:
                 _check_size(raw, reader)
                 raw = RawFrame(raw.label, raw.timestamp, self._rectifier(raw.image))
             yield raw
+
+    def _with_rows_rectified(self, start: int) -> Iterator[RawFrame]:
+        """The same for a rolling shutter, from a place in the source on.
+
+        The turning is measured between neighbours in the source, whatever the stride, and the
+        image before the first is read, too.
+        """
+        config, rolling, readout = self._config, self.rolling_camera, self.shutter.readout
+        before = min(start, 1)
+        stop = None if config.stop is None else config.stop + 1
+
+        def is_selected(position: int) -> bool:
+            after = position - before
+            inside = config.stop is None or start + after < config.stop
+            return after >= 0 and after % config.stride == 0 and inside
+
+        images = self.resized_images(start - before, stop)
+        offsets = RowOffsets(rolling, self.camera)
+        for raw, turning in with_turning(images, rolling, readout, is_selected):
+            if raw.image is None:
+                yield raw
+                continue
+            moved = None if turning.is_still else offsets(turning, readout)
+            yield RawFrame(raw.label, raw.timestamp, self._rectifier.straightened(raw.image, moved))
 
     def _why_empty(self) -> str:
         if self.skipped:
@@ -206,6 +277,11 @@ def read_ahead(items: Iterator[T]) -> Iterator[T]:
         while (item := pending.result()) is not end:
             pending = thread.submit(next, items, end)
             yield item  # type: ignore[misc]  # not the end mark
+
+
+def shutter_of(readout: float | Literal["auto"]) -> Shutter:
+    """The shutter that the settings ask for; a global one until it is found."""
+    return Shutter() if readout == "auto" else Shutter(readout, "as given")
 
 
 def _check_selection(config: InputConfig, length: int | None) -> None:

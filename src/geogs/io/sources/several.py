@@ -1,12 +1,14 @@
 """Several videos of one place, taken with one camera, as a single stream."""
 
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
-from geogs.io.sources.base import ReadingPlace, Source
+from geogs.io.sources.base import RawFrame, ReadingPlace, Source
 from geogs.io.sources.calibration import Calibration
+from geogs.shutter.camera import RollingCamera
+from geogs.shutter.shutter import Shutter
 from geogs.types import Frame
 
 PAUSE = 1.0
@@ -91,6 +93,29 @@ class SeveralSources:
     def with_calibration(self, calibration: Calibration) -> "SeveralSources":
         """The same frames, undistorted by another calibration of the images as they came."""
         return SeveralSources([s.with_calibration(calibration) for s in self._sources])
+
+    @property
+    def shutter(self) -> Shutter:
+        """By which rows are rectified."""
+        return self._sources[0].shutter
+
+    @property
+    def is_shutter_open(self) -> bool:
+        """Whether nobody has said yet how long the readout takes."""
+        return self._sources[0].is_shutter_open
+
+    def with_shutter(self, shutter: Shutter) -> "SeveralSources":
+        """The same frames, with their rows rectified by another readout."""
+        return SeveralSources([s.with_shutter(shutter) for s in self._sources])
+
+    @property
+    def rolling_camera(self) -> RollingCamera:
+        """The camera of the images that :meth:`resized_images` gives."""
+        return self._sources[0].rolling_camera
+
+    def resized_images(self, start: int, stop: int | None) -> Iterator[RawFrame]:
+        """Neighbouring images of the first source, see there."""
+        return self._sources[0].resized_images(start, stop)
 
     def linked_frames(self) -> Generator[Frame, None, None]:
         """The frames of the first source."""

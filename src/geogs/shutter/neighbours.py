@@ -1,0 +1,77 @@
+"""The turning at each image of a video, from its flow to the images beside it."""
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from typing import Generic, Protocol, TypeVar, runtime_checkable
+
+import numpy as np
+from jaxtyping import UInt8
+
+from geogs.shutter.camera import RollingCamera
+from geogs.shutter.rates import FlowMeter, angular_velocity
+from geogs.shutter.turning import Step, Turning, turning_between
+
+
+@runtime_checkable
+class Image(Protocol):
+    """An image of a video."""
+
+    @property
+    def timestamp(self) -> float:
+        """Seconds."""
+        ...
+
+    @property
+    def image(self) -> UInt8[np.ndarray, "h w 3"] | None:
+        """RGB, of the camera that the turning is asked of; none if it could not be read."""
+        ...
+
+
+Picture = TypeVar("Picture", bound=Image)
+
+
+def with_turning(
+    images: Iterable[Picture], camera: RollingCamera, readout: float, wanted: Callable[[int], bool]
+) -> Iterator[tuple[Picture, Turning]]:
+    """Those images whose position is wanted, each with how the camera turned then.
+
+    One image more than the one that is given has been read by then. What is given depends on an
+    image and its two neighbours alone, so it is the same wherever reading begins.
+
+    Args:
+        images: neighbours in the video.
+        camera: that took them.
+        readout: seconds from the first to the last row.
+        wanted: says of positions 0, 1, 2, ... whether the image is to be given.
+    """
+    meter, position = FlowMeter(camera), -1
+    last: _Seen[Picture] | None = None
+    before: Step | None = None
+    for position, image in enumerate(images):
+        here = _Seen(image, None if image.image is None else meter.small(image.image))
+        after = None
+        if last is not None and (wanted(position - 1) or wanted(position)):
+            after = _step(meter, last, here, readout)
+        if last is not None and wanted(position - 1):
+            yield last.image, turning_between(before, after)
+        before, last = after, here
+    if last is not None and wanted(position):
+        yield last.image, turning_between(before, None)
+
+
+@dataclass(frozen=True)
+class _Seen(Generic[Picture]):
+    """An image, and the small one that flow is measured on."""
+
+    image: Picture
+    small: UInt8[np.ndarray, "h w"] | None
+
+
+def _step(
+    meter: FlowMeter, first: _Seen[Picture], second: _Seen[Picture], readout: float
+) -> Step | None:
+    interval = second.image.timestamp - first.image.timestamp
+    if first.small is None or second.small is None or interval <= 0:
+        return None
+    rate = angular_velocity(meter.measure(first.small, second.small), interval, readout)
+    return None if rate is None else Step(rate, interval)

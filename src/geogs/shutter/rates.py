@@ -1,0 +1,134 @@
+"""The angular velocity of a camera between two images of a video, from their flow."""
+
+import math
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from geogs.shutter.camera import RollingCamera
+from geogs.shutter.turning import rotated
+
+LONG_EDGE = 320
+"""Of the images that flow is measured on, at most, pixels."""
+STEP = 8
+"""Pixels of these between two cells."""
+BORDER = 2
+"""Flow that ends nearer to the border, in pixels, is not used."""
+TOLERANCE = 0.004
+"""Radians by which a cell may differ from rotation before it loses half of its weight."""
+ROUNDS = 10
+AGREEING = 0.2
+"""Share of the cells that have to agree with the rotation within twice the tolerance."""
+
+
+@dataclass(frozen=True)
+class RayFlow:
+    """What the cells of one image see in it and in another, as rays of the two cameras."""
+
+    first: Float[np.ndarray, "n 3"]
+    """Unit vectors in the first camera."""
+    second: Float[np.ndarray, "n 3"]
+    """In the second."""
+    first_time: Float[np.ndarray, "n"]
+    """Readouts from the middle row of the first image to the row of the cell."""
+    second_time: Float[np.ndarray, "n"]
+    """Likewise in the second image."""
+    inside: Bool[np.ndarray, "n"]
+    """Whether the flow ends within the second image."""
+
+
+class FlowMeter:
+    """Measures flow between images of one camera; two threads need two of them."""
+
+    def __init__(self, camera: RollingCamera) -> None:
+        """``camera`` of the images that :meth:`small` is given."""
+        full = camera.camera
+        small = (
+            full if max(full.width, full.height) <= LONG_EDGE else full.with_long_edge(LONG_EDGE)
+        )
+        self._size = (small.width, small.height)
+        self._camera = replace(camera, camera=small)
+        v, u = np.mgrid[STEP // 2 : small.height : STEP, STEP // 2 : small.width : STEP]
+        self._cells = v, u
+        pixels = np.stack([u.ravel(), v.ravel()], axis=1).astype(np.float64)
+        self._pixels = pixels
+        self._rays = self._camera.rays(pixels)
+        self._times = self._camera.line_times(pixels)
+        self._dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+
+    def small(self, image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h2 w2"]:
+        """The grey image that flow is measured on."""
+        grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+        if (grey.shape[1], grey.shape[0]) == self._size:
+            return grey
+        return cv2.resize(grey, self._size, interpolation=cv2.INTER_AREA)
+
+    def measure(self, first: UInt8[np.ndarray, "h w"], second: UInt8[np.ndarray, "h w"]) -> RayFlow:
+        """Flow from one small image to another."""
+        # OpenCV makes the output where None is given, which its stubs do not say.
+        dense = self._dis.calc(first, second, None)  # type: ignore[call-overload]
+        ends = self._pixels + dense[self._cells].reshape(-1, 2)
+        width, height = self._size
+        inside = (ends >= BORDER).all(1) & (ends <= (width - 1 - BORDER, height - 1 - BORDER)).all(
+            1
+        )
+        ends = np.where(inside[:, None], ends, self._pixels)
+        rays, times = self._camera.rays(ends), self._camera.line_times(ends)
+        return RayFlow(self._rays, rays, self._times, times, inside)
+
+
+def angular_velocity(
+    flow: RayFlow, interval: float, readout: float
+) -> Float[np.ndarray, "3"] | None:
+    """Mean radians per second between the middle rows of two images, in axes of the camera.
+
+    The rotation that most cells agree on, by iteratively reweighted least squares (Cauchy's
+    weights, Procrustes' rotation). A point is seen in other rows of the two images, hence after
+    more or less than the interval: its rays are moved to the times of the middle rows by the
+    velocity itself.
+
+    Args:
+        flow: from the first image to the second.
+        interval: seconds between the two.
+        readout: seconds from the first to the last row.
+
+    Returns:
+        the velocity; none where too few cells agree with any.
+    """
+    if interval <= 0:
+        return None
+    rate, weight = np.zeros(3), flow.inside.astype(np.float64)
+    for _ in range(ROUNDS):
+        first, second = flow.first, flow.second
+        if readout:
+            first = rotated(first, -readout * flow.first_time[:, None] * rate)
+            second = rotated(second, -readout * flow.second_time[:, None] * rate)
+        rotation = _procrustes(first, second, weight)
+        rate = _rotation_vector(rotation) / interval
+        error = np.linalg.norm(second - first @ rotation.T, axis=1)
+        weight = flow.inside / (1 + (error / TOLERANCE) ** 2)
+    agreeing = (flow.inside & (error < 2 * TOLERANCE)).mean()
+    return rate if agreeing >= AGREEING else None
+
+
+def _procrustes(
+    first: Float[np.ndarray, "n 3"],
+    second: Float[np.ndarray, "n 3"],
+    weight: Float[np.ndarray, "n"],
+) -> Float[np.ndarray, "3 3"]:
+    """The rotation R that makes ``sum weight |second - R first|^2`` least."""
+    U, _, Vt = np.linalg.svd((second * weight[:, None]).T @ first)
+    turn = np.diag([1.0, 1.0, np.linalg.det(U @ Vt)])
+    rotation: Float[np.ndarray, "3 3"] = U @ turn @ Vt
+    return rotation
+
+
+def _rotation_vector(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3"]:
+    """The logarithm of a rotation, for angles well below a half turn."""
+    skew = 0.5 * (rotation - rotation.T)
+    axis = np.array([skew[2, 1], skew[0, 2], skew[1, 0]])
+    sine, cosine = float(np.linalg.norm(axis)), 0.5 * (float(np.trace(rotation)) - 1)
+    angle = math.atan2(sine, cosine)
+    return axis * (angle / sine if sine > 1e-12 else 1.0)

@@ -1,0 +1,55 @@
+"""Where the pixels of a rectified image lie in the image of a rolling shutter."""
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+
+from geogs.geometry.camera import Camera
+from geogs.shutter.camera import RollingCamera
+from geogs.shutter.turning import Turning, rotated
+
+CELL = 8
+"""Pixels between two nodes; offsets are interpolated between them."""
+ROUNDS = 3
+"""The row decides the time, the time decides the row: an error shrinks some 50 times a round."""
+
+
+class RowOffsets:
+    """By how much each pixel of a rectified image is seen elsewhere because the camera turns.
+
+    The rectified image is what a pinhole with a global shutter would see at the time of the middle
+    row. A distant point at ray r is seen by the rolling camera where ``Exp(angles(t)) r`` projects
+    with its lens, at the time t of the very row that it is projected to.
+    """
+
+    def __init__(self, rolling: RollingCamera, rectified: Camera) -> None:
+        self._rolling, self._size = rolling, (rectified.width, rectified.height)
+        # A cell more on every side, so that all pixels lie between nodes.
+        columns = np.arange(-1, -(-rectified.width // CELL) + 1) * CELL + (CELL - 1) / 2
+        lines = np.arange(-1, -(-rectified.height // CELL) + 1) * CELL + (CELL - 1) / 2
+        self._shape = (len(lines), len(columns))
+        u, v = (x.ravel() for x in np.meshgrid(columns, lines))
+        plane = [(u - rectified.cx) / rectified.fx, (v - rectified.cy) / rectified.fy]
+        self._rays = np.stack([*plane, np.ones_like(u)], axis=1)
+        self._still = rolling.pixels(self._rays)
+
+    def nodes(self, turning: Turning, readout: float) -> Float[np.ndarray, "n 2"]:
+        """Offsets in pixels of the rolling image at the nodes, row by row."""
+        pixels = self._still
+        for _ in range(ROUNDS):
+            times = readout * self._rolling.line_times(pixels)
+            pixels = self._rolling.pixels(rotated(self._rays, turning.angles(times)))
+        return pixels - self._still
+
+    def __call__(self, turning: Turning, readout: float) -> Float[np.ndarray, "h w 2"]:
+        """Offsets in pixels of the rolling image at every pixel of the rectified one.
+
+        Args:
+            turning: of the camera, at this image.
+            readout: seconds from the first to the last row.
+        """
+        width, height = self._size
+        nodes = self.nodes(turning, readout).astype(np.float32).reshape(*self._shape, 2)
+        size = (CELL * self._shape[1], CELL * self._shape[0])
+        dense = cv2.resize(nodes, size, interpolation=cv2.INTER_LINEAR)
+        return dense[CELL : CELL + height, CELL : CELL + width]

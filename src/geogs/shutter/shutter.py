@@ -1,0 +1,25 @@
+"""What is known of a video's shutter."""
+
+import math
+from dataclasses import dataclass
+
+from geogs.errors import InputError
+
+LONGEST = 0.1
+"""Seconds; no camera takes longer to read an image."""
+
+
+@dataclass(frozen=True)
+class Shutter:
+    """How long the sensor takes from its first line to its last."""
+
+    readout: float = 0.0
+    """Seconds; 0 is a global shutter, negative where the last line is read first."""
+    origin: str = "taken for a global shutter"
+    """Where that comes from, for the log and ``intrinsics.json``."""
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.readout) and abs(self.readout) <= LONGEST):
+            raise InputError(
+                f"A readout of {self.readout:g} s cannot be; give seconds, at most {LONGEST:g}."
+            )

@@ -1,0 +1,65 @@
+"""How a camera turns while it reads one image."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float
+
+
+@dataclass(frozen=True)
+class Turning:
+    """Angular velocity around the time of the middle row, in axes of the camera.
+
+    A point that the camera has at X then, it has at ``Exp(rate t + acceleration t^2 / 2) X`` after
+    ``t`` seconds, as far as the camera only turns.
+    """
+
+    rate: Float[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
+    """Radians per second."""
+    acceleration: Float[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
+    """Radians per second squared."""
+
+    def angles(self, times: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n 3"]:
+        """Rotation vectors after seconds from the middle row."""
+        t = times[:, None]
+        return t * self.rate + 0.5 * t * t * self.acceleration
+
+    @property
+    def is_still(self) -> bool:
+        """Whether it does not turn at all."""
+        return not (self.rate.any() or self.acceleration.any())
+
+
+def rotated(
+    vectors: Float[np.ndarray, "n 3"], by: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, "n 3"]:
+    """Each vector turned by its own rotation vector, radians (Rodrigues)."""
+    angle = np.linalg.norm(by, axis=1, keepdims=True)
+    sine = np.sinc(angle / np.pi)
+    cosine = 0.5 * np.sinc(angle / (2 * np.pi)) ** 2
+    once = np.cross(by, vectors)
+    return vectors + sine * once + cosine * np.cross(by, once)
+
+
+@dataclass(frozen=True)
+class Step:
+    """What the camera did between two images of a video."""
+
+    rate: Float[np.ndarray, "3"]
+    """Its mean angular velocity, radians per second."""
+    interval: float
+    """Seconds between the two."""
+
+
+def turning_between(before: Step | None, after: Step | None) -> Turning:
+    """The turning at an image from the steps to it and from it; none where one is not known.
+
+    A mean rate is taken for the rate in the middle of its step; between two it is linear.
+    """
+    if before is None or after is None:
+        known = before or after
+        return Turning() if known is None else Turning(known.rate)
+    apart = (before.interval + after.interval) / 2
+    share = before.interval / (2 * apart)
+    rate = before.rate + share * (after.rate - before.rate)
+    return Turning(rate, (after.rate - before.rate) / apart)

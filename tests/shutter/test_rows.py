@@ -1,0 +1,58 @@
+"""Where pixels lie in a rolling image: against rays followed through time one by one."""
+
+import numpy as np
+import pytest
+import torch
+
+from geogs.geometry.camera import Camera
+from geogs.geometry.lie import so3_exp
+from geogs.shutter.camera import RollingCamera
+from geogs.shutter.rows import RowOffsets
+from geogs.shutter.turning import Turning
+
+CAMERA = Camera(420.0, 415.0, 255.0, 190.0, 512, 384)
+FAST = Turning(np.array([1.2, -1.5, 0.8]), np.array([10.0, -12.0, 8.0]))
+"""115 degrees per second, and shaken."""
+READOUT = 0.033
+
+
+def seen_at(rolling: RollingCamera, ray: np.ndarray, turning: Turning) -> np.ndarray:
+    """The pixel at which a distant point is seen: the row's time and its place have to agree."""
+    early, late = -0.75, 0.75
+    for _ in range(60):  # bisection: a row passes the point once
+        middle = (early + late) / 2
+        angles = turning.angles(np.array([READOUT * middle]))[0]
+        moved = so3_exp(torch.tensor(angles)).numpy() @ ray
+        pixel = rolling.pixels(moved[None])
+        late, early = (middle, early) if rolling.line_times(pixel)[0] < middle else (late, middle)
+    return pixel[0]
+
+
+@pytest.mark.parametrize("distortion", [(), (-0.28, 0.08, 0.001, -0.002)])
+@pytest.mark.parametrize("quarter_turns", [0, 1, 2, 3])
+def test_offsets_at_pixels_are_those_of_single_rays(distortion, quarter_turns):
+    rolling = RollingCamera(CAMERA, distortion, quarter_turns)
+    zoom = 1.15 if distortion else 1.0
+    target = Camera(420.0 * zoom, 415.0 * zoom, 255.0, 190.0, 512, 384)
+    offsets = RowOffsets(rolling, target)(FAST, READOUT)
+    assert np.abs(offsets).max() > 9
+    for u, v in [(0, 0), (511, 383), (0, 383), (511, 0), (256, 190), (37, 290), (400, 101)]:
+        ray = np.array([(u - target.cx) / target.fx, (v - target.cy) / target.fy, 1.0])
+        still = rolling.pixels(ray[None])[0]
+        expected = seen_at(rolling, ray, FAST) - still
+        np.testing.assert_allclose(offsets[v, u], expected, atol=0.02)
+
+
+def test_a_camera_that_stands_or_reads_at_once_has_no_offsets():
+    offsets = RowOffsets(RollingCamera(CAMERA, (-0.2, 0.05, 0.0, 0.0)), CAMERA)
+    assert not offsets(Turning(), READOUT).any()
+    assert not offsets(FAST, 0.0).any()
+
+
+def test_the_middle_row_stays_and_the_edges_go_opposite_ways():
+    """At a steady turn to the side, half a readout moves a row by f w readout / 2."""
+    offsets = RowOffsets(RollingCamera(CAMERA), CAMERA)(Turning(np.array([0.0, 1.0, 0.0])), READOUT)
+    edge = 420 * 1.0 * READOUT / 2
+    assert abs(offsets[191, 255, 0]) < 0.03
+    assert offsets[0, 255, 0] == pytest.approx(-edge, rel=0.01)
+    assert offsets[383, 255, 0] == pytest.approx(edge, rel=0.02)
