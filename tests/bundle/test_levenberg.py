@@ -21,7 +21,7 @@ def test_stars_are_those_of_the_tracker_where_the_lens_is_its_pinhole():
     options = BundleOptions(huber=1.0, depth_damping=1e-3)
     system = LinearSystem.of(problem, LensBlock(lens, GRID.pixels), T, d, 1.0, 1e-3)
     for own, theirs in zip(
-        system.stars, linearise_stars(GRID, problem, T, d, options), strict=True
+        system.stars, linearise_stars(GRID.camera, GRID.rays, problem, T, d, options), strict=True
     ):
         at = len(theirs.gradient)
         assert (own.frame, own.shared, theirs.shared) == (theirs.frame, 2, 0)

@@ -9,7 +9,7 @@ from bundle_scenes import CAMERA, scene
 from geogs.bundle.base import BundleOptions
 from geogs.bundle.dense import DenseBundle
 from geogs.bundle.marginals import marginals
-from geogs.bundle.problem import BundleProblem
+from geogs.bundle.problem import BundleProblem, StreamedProblem
 from geogs.bundle.projection import project, relative_motion
 from geogs.geometry.lie import se3_exp, se3_inverse, se3_log
 from geogs.keyframes.grid import SampleGrid
@@ -37,10 +37,11 @@ def full_covariance(problem: BundleProblem, grid: SampleGrid):
 def test_the_block_inverse_is_that_of_the_whole():
     grid, problem = scene(frames=3)
     pose, depth = full_covariance(problem, grid)
-    found = marginals(grid, problem, EXACT, inflation=4.0)
+    found = marginals(grid, problem, EXACT, alike=4.0)
     got = found.pose.diagonal(dim1=-2, dim2=-1)
     torch.testing.assert_close(got, 4 * pose, rtol=1e-3, atol=1e-12)
-    torch.testing.assert_close(found.inverse_depth.double(), 4 * depth, rtol=2e-3, atol=1e-12)
+    expected = 2 * depth.sqrt() / problem.inverse_depth
+    torch.testing.assert_close(found.relative_depth.double(), expected, rtol=2e-3, atol=1e-12)
     assert float(found.pose[:2].abs().max()) == 0
 
 
@@ -66,9 +67,8 @@ def test_depth_is_open_when_the_camera_only_turns():
     def relative(sideways: float) -> float:
         grid, problem = turning(sideways)
         found = marginals(grid, problem, EXACT)
-        assert bool(torch.isfinite(found.inverse_depth).all())
-        ones = torch.ones_like(problem.inverse_depth)
-        return float(found.relative_depth(problem.inverse_depth, ones).median())
+        assert bool(found.relative_depth.isfinite().all())
+        return float(found.depth_deviation.median())
 
     far, near, none = relative(0.05), relative(0.01), relative(1e-6)
     assert far < 0.1
@@ -79,7 +79,7 @@ def test_depth_is_open_when_the_camera_only_turns():
 @pytest.mark.parametrize("sideways", [0.05, 0.02])
 def test_noise_spreads_poses_and_depths_as_foretold(sideways):
     grid, truth = turning(sideways)
-    foretold = marginals(grid, truth, EXACT)
+    foretold = marginals(grid, truth, EXACT, alike=1.0)
     poses, depths = [], []
     for seed in range(24):
         g = torch.Generator().manual_seed(seed)
@@ -92,13 +92,13 @@ def test_noise_spreads_poses_and_depths_as_foretold(sideways):
         T = found.T_cw.clone()
         T[:, :3, 3] /= scale
         poses.append(se3_log(T @ se3_inverse(truth.T_cw)))
-        depths.append(found.inverse_depth * scale - truth.inverse_depth)
+        depths.append(found.inverse_depth * scale / truth.inverse_depth - 1)
     spread = torch.stack(poses).square().mean(0)[1:]
     expected = foretold.pose.diagonal(dim1=-2, dim2=-1)[1:]
     ratio = spread.sum(0) / expected.sum(0)
     assert float(ratio[3:].min()) > 0.5
     assert float(ratio[3:].max()) < 2.0
-    square = torch.stack(depths).square().mean(0) / foretold.inverse_depth
+    square = torch.stack(depths).square().mean(0) / foretold.relative_depth.square()
     assert 0.6 < float(square.median()) < 1.5
 
 
@@ -107,7 +107,35 @@ def test_what_nothing_measures_is_open():
     weight = problem.weight.clone()
     weight[problem.source == 2, 7] = 0
     found = marginals(grid, replace(problem, weight=weight), EXACT)
-    assert found.inverse_depth[2, 7] == torch.inf
-    assert bool(torch.isfinite(found.inverse_depth[2, :7]).all())
-    none = torch.zeros_like(problem.inverse_depth)
-    assert bool((found.relative_depth(problem.inverse_depth, none) == torch.inf).all())
+    assert found.relative_depth[2, 7] == torch.inf
+    assert bool(found.relative_depth[2, :7].isfinite().all())
+    weight[problem.source == 2] = 0
+    assert marginals(grid, replace(problem, weight=weight), EXACT).depth_deviation[2] == torch.inf
+
+
+def test_some_cells_stand_for_all():
+    grid, problem = turning(0.05)
+    every, some = (marginals(grid, problem, EXACT, cells=n) for n in (grid.size, grid.size // 3))
+    assert some.relative_depth.shape[1] <= grid.size // 3
+    ratio = some.pose[1:].diagonal(dim1=-2, dim2=-1) / every.pose[1:].diagonal(dim1=-2, dim2=-1)
+    assert float((ratio.log().abs()).median()) < 0.3
+    ratio = some.depth_deviation / every.depth_deviation
+    assert float(ratio.log().abs().max()) < 0.2
+
+
+def test_parts_of_a_large_problem_are_fetched():
+    grid, problem = turning(0.05)
+    parts = []
+
+    def matches(edges: slice):
+        parts.append(edges)
+        return problem.pixels[edges], problem.weight[edges]
+
+    streamed = StreamedProblem(
+        problem.T_cw, problem.inverse_depth, problem.source, problem.target, matches,
+        problem.free_pose, problem.free_depth,
+    )  # fmt: skip
+    one, other = (marginals(grid, p, replace(EXACT, chunk=7)) for p in (problem, streamed))
+    assert len(parts) > 4
+    assert torch.equal(one.pose, other.pose)
+    assert torch.equal(one.relative_depth, other.relative_depth)

@@ -51,7 +51,7 @@ class DenseBundle:
         chunks = source_chunks(problem.source, options.chunk)
 
         def work(chunk: slice) -> list[Star]:
-            return linearise_stars(self.grid, problem, T, d, options, chunk)
+            return linearise_stars(self.grid.camera, self.grid.rays, problem, T, d, options, chunk)
 
         parts = thread_map(work, chunks) if d.device.type == "cpu" else map(work, chunks)
         return [star for part in parts for star in part]

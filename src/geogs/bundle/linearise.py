@@ -18,8 +18,8 @@ from torch import Tensor
 from geogs.bundle.base import BundleOptions
 from geogs.bundle.problem import BundleProblem, sources_within
 from geogs.bundle.projection import Projection, linearise, relative_motion
+from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_adjoint
-from geogs.keyframes.grid import SampleGrid
 
 
 @dataclass(frozen=True)
@@ -137,7 +137,8 @@ def damped_curvature(
 
 
 def linearise_stars(
-    grid: SampleGrid,
+    camera: Camera,
+    rays: Float[Tensor, "p 3"],
     problem: BundleProblem,
     T: Float[Tensor, "n 4 4"],
     d: Float[Tensor, "n p"],
@@ -147,7 +148,7 @@ def linearise_stars(
     """The stars of some edges of a problem at the given poses and inverse depths."""
     i, j = problem.source[chunk], problem.target[chunk]
     T_ji = relative_motion(T, i, j)
-    p = linearise(grid.camera, grid.rays, T_ji, d[i])
+    p = linearise(camera, rays, T_ji, d[i])
     r, w = weighed_residuals(p, problem.pixels[chunk], problem.weight[chunk], options.huber)
     wJ = p.pose_jacobian * w.mT[:, None]
     H, v = normal_equations(wJ, p.pose_jacobian, r)

@@ -70,7 +70,9 @@ class StreamedBundle:
         chunks: Sequence[slice],
     ) -> Iterator[tuple[slice, list[Star]]]:
         def work(chunk: slice) -> tuple[slice, list[Star]]:
-            stars = linearise_stars(self.grid, problem.part(chunk), T, d, options)
+            stars = linearise_stars(
+                self.grid.camera, self.grid.rays, problem.part(chunk), T, d, options
+            )
             # The coupling with the depths is most of a star; it is not needed again.
             return chunk, [replace(star, depth=None) for star in stars]
 

@@ -23,8 +23,14 @@ class TrackingConfig(Settings, group="tracking"):
     """A keyframe nearer than this to the one before it is removed again, of the long edge."""
     init_keyframes: Annotated[int, Range(4, 1000)] = 12
     """Keyframes gathered before the map is started."""
-    min_parallax: Share = 0.02
-    """Motion that rotation does not explain, needed to start, of the long edge."""
+    min_parallax: Share = 0.005
+    """Motion that rotation does not explain, needed to try to start, of the long edge."""
+    start_deviation: Positive = 0.1
+    """The map is started when the depths of its first keyframes are known to this, in the median:
+    relative standard deviation by what matches and poses leave open."""
+    start_overlap: Share = 0.3
+    """While it cannot be started: share of the first keyframe that the last has to see still for
+    the first to be kept."""
     window: Annotated[int, Range(1, 1000)] = 8
     """Most recent keyframes whose poses the local adjustment moves."""
     depth_window: Annotated[int, Range("window", 1000)] = 11

@@ -16,7 +16,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from geogs.bundle.base import BundleOptions
+from geogs.bundle.marginals import marginals
 from geogs.bundle.select import grid_fields
+from geogs.config import TrackingConfig
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_inverse
 from geogs.keyframes.grid import SampleGrid
@@ -41,23 +43,28 @@ class TwoView:
     """Median motion in pixels that rotation does not explain."""
 
 
-def initialise(
-    graph: FrameGraph, min_parallax: float, radius: int = 3, min_ncc: float = 0.5
-) -> bool:
+def initialise(graph: FrameGraph, config: TrackingConfig) -> bool:
     """Estimate all keyframes of the graph from nothing.
 
-    False if they show no parallax, or if the images of two that follow each other correlate by less
-    than ``min_ncc`` where poses and depths put them.
+    False if they show no parallax, if matches and poses leave their depths open
+    (``start_deviation``), or if the images of two that follow each other do not correlate where
+    poses and depths put them (``min_ncc``).
     On success poses, depths and information are set, the first pose is the identity and the median
     depth over all keyframes is one unit.
     """
     store = graph.keyframes
     flows = chained_flows(graph)
+    camera = store.grid.camera
+    min_parallax = config.min_parallax * max(camera.width, camera.height)
     best = _best_two_view(store.grid, flows, min_parallax)
     if best is None:
         return False
     _place_all(store, flows, best)
-    return _polish(graph, radius) and _is_borne_out(graph, min_ncc)
+    return (
+        _polish(graph, config.radius)
+        and _depth_deviation(graph, config.huber) <= config.start_deviation
+        and _is_borne_out(graph, config.min_ncc)
+    )
 
 
 def chained_flows(graph: FrameGraph) -> list[FlowMatch]:
@@ -168,6 +175,14 @@ def _polish(graph: FrameGraph, radius: int, rounds: int = 6) -> bool:
             return False
         normalise(store)
     return True
+
+
+def _depth_deviation(graph: FrameGraph, huber: float) -> float:
+    """Relative deviation of the depths, the poses being as open as they are: the median of all."""
+    ids = graph.keyframes.ids
+    problem, _ = graph.problem(list(graph.edges), ids[1:], ids)
+    found = marginals(graph.keyframes.grid, problem, BundleOptions(huber=huber))
+    return float(found.depth_deviation.median())
 
 
 def _is_borne_out(graph: FrameGraph, min_ncc: float) -> bool:

@@ -7,7 +7,7 @@ import torch
 
 from geogs.config import TrackingConfig
 from geogs.tracking.graph import FrameGraph
-from geogs.tracking.initialise import initialise
+from geogs.tracking.initialise import chained_flows, initialise
 from geogs.tracking.keyframe_priors import KeyframePriors
 from geogs.tracking.motion import ChainState, FlowChain
 from geogs.tracking.trajectory import TrajectoryRecorder
@@ -81,9 +81,7 @@ class StartUp:
         """Start with what there is; False if that cannot be."""
         if len(self.keyframes) < MIN_KEYFRAMES:
             return False
-        edge = self._long_edge
-        c = self.config
-        if not initialise(self.graph, c.min_parallax * edge, c.radius, c.min_ncc):
+        if not initialise(self.graph, self.config):
             return False
         self.priors.adjust(self.keyframes.ids, self.config.huber)
         self.recorder.anchor_to_keyframes()
@@ -114,9 +112,14 @@ class StartUp:
             return StartStep(is_keyframe=True)
         if self.finish():
             return StartStep(True, True)
-        # More keyframes may bring parallax; with twice as many the first are given up.
-        full = len(self.keyframes) >= 2 * self.config.init_keyframes
-        return StartStep(False, True, self._forget(len(self.keyframes) // 2 * full))
+        # More keyframes may bring parallax. With twice as many every other one is left out; where
+        # the last no longer sees what the first saw, the first half is given up.
+        if len(self.keyframes) < 2 * self.config.init_keyframes:
+            return StartStep(False, True)
+        overlap = float((chained_flows(self.graph)[-1].weight > 0).float().mean())
+        if overlap >= self.config.start_overlap:
+            return StartStep(False, True, self._thin_out())
+        return StartStep(False, True, self._forget(len(self.keyframes) // 2))
 
     def _miss(self, frame: Frame, encoded: Any) -> StartStep:
         """The view changed at once: wait for it to come back, start with what there is, or anew."""
@@ -131,6 +134,15 @@ class StartUp:
         removed = self._forget(len(self.keyframes))
         step = self._gather(frame, encoded)
         return StartStep(step.has_started, step.is_keyframe, removed)
+
+    def _thin_out(self) -> tuple[int, ...]:
+        """Make every other keyframe an ordinary frame; the first and the last stay."""
+        ids = self.keyframes.ids
+        gone = tuple(ids[1:-1:2])
+        for id in gone:
+            self.graph.remove_keyframe(id)
+            self.recorder.keyframe_removed(self.keyframes.remove(id), ids[ids.index(id) - 1])
+        return gone
 
     def _forget(self, count: int) -> tuple[int, ...]:
         """Drop the earliest keyframes of a start that failed."""
