@@ -70,6 +70,12 @@ def small_room(once: Once) -> Path:
     return once("small-room", lambda folder: write_sequence(folder, 60, 128, 96))
 
 
+@pytest.fixture
+def no_report(monkeypatch) -> None:
+    """Results come without the pictures of the report, which take longer than a small run."""
+    monkeypatch.setattr("geogs.application.results.write_report", lambda *_: None)
+
+
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
     """The folder of development sequences; tests that need it are skipped without it."""
