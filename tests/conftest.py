@@ -1,5 +1,8 @@
-"""Run-time shape checks for the whole suite, and where the shared data is."""
+"""Run-time shape checks for the whole suite, what all tests share, and where the shared data is."""
 
+import fcntl
+import os
+from collections.abc import Callable
 from pathlib import Path
 
 import jaxtyping
@@ -23,6 +26,54 @@ def _typed_modules() -> list[str]:
 
 torch.set_num_threads(1)  # as the system works; more only wait for each other
 jaxtyping.install_import_hook(_typed_modules(), "beartype.beartype")
+
+
+Once = Callable[[str, Callable[[Path], object]], Path]
+"""Of a name and what fills a folder: the folder, filled by whoever asks first."""
+
+
+@pytest.fixture(scope="session")
+def once(tmp_path_factory) -> Once:
+    """Folders that are filled once for all tests, those in other processes of pytest-xdist too.
+
+    Nobody may change what is in them.
+    """
+    top = tmp_path_factory.getbasetemp()
+    top = (top.parent if "PYTEST_XDIST_WORKER" in os.environ else top) / "once"
+
+    def folder(name: str, fill: Callable[[Path], object]) -> Path:
+        place = top / name
+        place.mkdir(parents=True, exist_ok=True)
+        with (place / "lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            if not (place / "done").exists():
+                fill(place / name)
+                (place / "done").touch()
+        return place / name
+
+    return folder
+
+
+@pytest.fixture(scope="session")
+def room(once: Once) -> Path:
+    """Sixty frames of a synthetic room with its truth, 256 x 192: for tests of accuracy."""
+    from geogs.synth.export import write_sequence
+
+    return once("room", lambda folder: write_sequence(folder, 60, 256, 192))
+
+
+@pytest.fixture(scope="session")
+def small_room(once: Once) -> Path:
+    """The same sixty frames at 128 x 96: for tests of how the parts work together."""
+    from geogs.synth.export import write_sequence
+
+    return once("small-room", lambda folder: write_sequence(folder, 60, 128, 96))
+
+
+@pytest.fixture
+def no_report(monkeypatch) -> None:
+    """Results come without the pictures of the report, which take longer than a small run."""
+    monkeypatch.setattr("geogs.application.results.write_report", lambda *_: None)
 
 
 @pytest.fixture(scope="session")

@@ -15,6 +15,7 @@ import torch
 from scipy.spatial import cKDTree
 
 from depth_scene import WORKING, make_scene, trace
+from geogs.cli import main as cli
 from geogs.config import InputConfig
 from geogs.depth.classical import CpuDepthEngine
 from geogs.depth.estimate import estimate_depth
@@ -33,7 +34,6 @@ from posed_scene import (
     ball_and_wall,
     depth_errors,
     geogs,
-    make_room,
     vertices,
 )
 
@@ -42,19 +42,15 @@ pytestmark = pytest.mark.system
 QUICK = ["--mapping.render-long-edge", "160", "--search.least-steps", "150", "--device", "cpu"]
 
 
-@pytest.fixture(scope="module")
-def room(tmp_path_factory) -> Path:
-    """Sixty frames of a synthetic room."""
-    return make_room(tmp_path_factory.mktemp("posed") / "room")
-
-
-@pytest.fixture(scope="module")
-def result(room, tmp_path_factory) -> Path:
+@pytest.fixture(scope="session")
+def result(room, once) -> Path:
     """What ``geogs reconstruct`` makes of every fifth frame."""
-    folder = tmp_path_factory.mktemp("posed-result") / "out"
-    done = geogs("reconstruct", room, "-o", folder, "--stride", 5, *QUICK)
-    assert done.returncode == 0, done.stderr
-    return folder
+
+    def run(folder: Path) -> None:
+        done = geogs("reconstruct", room, "-o", folder, "--stride", 5, *QUICK)
+        assert done.returncode == 0, done.stderr
+
+    return once("reconstruction", run)
 
 
 def test_the_mesh_lies_on_the_room_in_metres_without_alignment(room, result):
@@ -85,26 +81,30 @@ def test_it_leaves_every_file_and_the_given_poses(room, result):
     assert summary["disks"] == len(load_map(result / "map.safetensors")) > 1000
 
 
-def test_images_are_held_out_and_earlier_maps_and_the_depths_alone_are_written(room, tmp_path):
+def test_images_are_held_out_and_earlier_maps_and_the_depths_alone_are_written(
+    small_room, tmp_path
+):
     done = geogs(
-        "reconstruct", room, "-o", tmp_path, "--stride", 5, "--hold-out", 4, "--snapshots",
-        "0.01,5s,0.2m,1h", "--depth-mesh", "--search.no-repeat", "--search.least-steps", 600,
-        "--mapping.render-long-edge", 160, "--device", "cpu",
+        "reconstruct", small_room, "-o", tmp_path, "--stride", 5, "--hold-out", 4, "--snapshots",
+        "0.01,5s,0.2m,1h", "--depth-mesh", "--search.no-repeat", "--search.least-steps", 150,
+        "--mapping.render-long-edge", 128, "--device", "cpu",
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert summary["held_out"] == [10, 30, 50]
     assert summary["frames"] == 9
-    given = np.loadtxt(room / "traj.txt").reshape(-1, 4, 4)[[0, 5, 15, 20, 25, 35, 40, 45, 55]]
+    given = np.loadtxt(small_room / "traj.txt").reshape(-1, 4, 4)[
+        [0, 5, 15, 20, 25, 35, 40, 45, 55]
+    ]
     assert np.abs(read_tum_trajectory(tmp_path / "trajectory.tum").T_wc - given).max() < 1e-5
     assert "No snapshot after 0.01 s" in done.stderr
     names = sorted(p.name for p in (tmp_path / "snapshots").iterdir())
     assert set(names) <= {"5", "12"}
     folders = [tmp_path, tmp_path / "depth_fusion", *(tmp_path / "snapshots").iterdir()]
-    seen = vertices(room / "points_seen_1cm.ply")
+    seen = vertices(small_room / "points_seen_1cm.ply")
     for folder in folders:
         accuracy = cKDTree(seen).query(vertices(folder / "mesh.ply")[::7])[0]
-        assert np.median(accuracy) < 0.02
+        assert np.median(accuracy) < 0.03
     for name in names:
         assert len(load_map(tmp_path / "snapshots" / name / "map.safetensors")) > 1000
     seconds = summary["seconds"]
@@ -150,26 +150,27 @@ def test_depth_maps_are_those_that_were_searched():
         (["--snapshots", "5,soon"], "soon"),
     ],
 )
-def test_options_that_leave_nothing_to_do(room, tmp_path, options, words):
-    done = geogs("reconstruct", room, "-o", tmp_path / "out", *options)
-    assert done.returncode == 2
-    assert words in done.stderr.splitlines()[-1]
-    assert "Traceback" not in done.stderr
+def test_options_that_leave_nothing_to_do(small_room, tmp_path, options, words, capsys):
+    argv = ["reconstruct", small_room, "-o", tmp_path / "out", *options]
+    assert cli.main([str(a) for a in argv]) == 2
+    said = capsys.readouterr().err
+    assert words in said.splitlines()[-1]
+    assert "Traceback" not in said
 
 
-def test_held_out_images_are_named_by_their_place_in_the_whole_source(room):
+def test_held_out_images_are_named_by_their_place_in_the_whole_source(small_room):
     config = InputConfig(start=10, stop=30, stride=3)
-    source = open_posed_source(room, config, 3)
+    source = open_posed_source(small_room, config, 3)
     assert source.held_out == [13, 22]
     assert [source.label(i)[-8:-4] for i in range(len(source))] == [
         "0010", "0016", "0019", "0025", "0028"
     ]  # fmt: skip
 
 
-def test_wrong_input_is_one_sentence(room, tmp_path):
+def test_wrong_input_is_one_sentence(small_room, tmp_path):
     missing = geogs("reconstruct", tmp_path / "none")
-    one = geogs("reconstruct", room, "--stop", 1, "-o", tmp_path / "a", *QUICK)
-    budget = geogs("reconstruct", room, "--budget", "soon")
+    one = geogs("reconstruct", small_room, "--stop", 1, "-o", tmp_path / "a", *QUICK)
+    budget = geogs("reconstruct", small_room, "--budget", "soon")
     for done, words in ((missing, "does not exist"), (one, "at least two"), (budget, "90s")):
         assert done.returncode == 2, done.stderr
         assert words in done.stderr.splitlines()[-1]
@@ -190,18 +191,27 @@ sys.exit(main(sys.argv[1:]))
 """
 
 
-def test_a_full_gpu_memory_is_one_sentence(room, tmp_path):
-    command = [sys.executable, "-c", FULL, "reconstruct", str(room), "-o", str(tmp_path), *QUICK]
+def test_a_full_gpu_memory_is_one_sentence(small_room, tmp_path):
+    command = [
+        sys.executable,
+        "-c",
+        FULL,
+        "reconstruct",
+        str(small_room),
+        "-o",
+        str(tmp_path),
+        *QUICK,
+    ]
     done = subprocess.run(command, capture_output=True, text=True, timeout=200)
     assert done.returncode == 2
     assert "The memory of the GPU is full; use fewer images" in done.stderr
     assert "Traceback" not in done.stderr
 
 
-def test_poses_in_another_convention_are_noticed(room, tmp_path):
+def test_poses_in_another_convention_are_noticed(small_room, tmp_path):
     """World to camera where camera to world is expected."""
     turned = tmp_path / "room"
-    shutil.copytree(room, turned)
+    shutil.copytree(small_room, turned)
     poses = np.loadtxt(turned / "traj.txt").reshape(-1, 4, 4)
     np.savetxt(turned / "traj.txt", np.linalg.inv(poses).reshape(-1, 16))
     done = geogs("reconstruct", turned, "-o", tmp_path / "out", *QUICK)

@@ -16,30 +16,35 @@ from geogs.application.settings import RunSettings
 from geogs.cli import main as cli
 from geogs.io.poses import read_tum_trajectory
 from geogs.slam import SlamStatus
-from geogs.synth.export import write_sequence
 from posed_scene import vertices
 
 pytestmark = pytest.mark.system
 
-FRAMES = 34
+FRAMES = 26
 RUN = [
-    "--mapping.render-long-edge", "96", "--mapping.iterations", "2",
+    "--stop", str(FRAMES), "--tracking.init-keyframes", "6",
+    "--mapping.render-long-edge", "64", "--mapping.iterations", "2",
     "--mapping.pose-iterations", "0", "--mapping.final-iterations", "10",
     "--mapping.no-final-depth",
 ]  # fmt: skip
 POSED = [
     "--mapping.render-long-edge", "96", "--mapping.disk.stride", "2", "--search.least-steps", "20",
-    "--search.steps-per-view", "1", "--search.no-repeat", "--stride", "4",
+    "--search.steps-per-view", "1", "--search.no-repeat", "--stride", "6",
 ]  # fmt: skip
 
 
 def run_config() -> geogs.Config:
     config = geogs.Config()
     mapping = replace(
-        config.mapping, render_long_edge=96, iterations=2, pose_iterations=0, final_iterations=10,
+        config.mapping, render_long_edge=64, iterations=2, pose_iterations=0, final_iterations=10,
         final_depth=False,
     )  # fmt: skip
-    return replace(config, mapping=mapping)
+    return replace(
+        config,
+        input=replace(config.input, stop=FRAMES),
+        tracking=replace(config.tracking, init_keyframes=6),
+        mapping=mapping,
+    )
 
 
 def posed_config() -> geogs.ReconstructConfig:
@@ -47,18 +52,10 @@ def posed_config() -> geogs.ReconstructConfig:
     disk = replace(config.mapping.disk, stride=2)
     return replace(
         config,
-        input=replace(config.input, stride=4),
+        input=replace(config.input, stride=6),
         search=replace(config.search, least_steps=20, steps_per_view=1, repeat=False),
         mapping=replace(config.mapping, render_long_edge=96, disk=disk),
     )
-
-
-@pytest.fixture(scope="module")
-def room(tmp_path_factory) -> Path:
-    """The start of a synthetic room sequence."""
-    folder = tmp_path_factory.mktemp("room") / "room"
-    write_sequence(folder, FRAMES, 192, 144)
-    return folder
 
 
 def require_same(folder: Path, other: Path) -> None:
@@ -69,8 +66,8 @@ def require_same(folder: Path, other: Path) -> None:
     assert (disks.position == twin.position).all()
 
 
-def test_a_run_frame_by_frame_is_that_of_the_command(room, tmp_path, capfd):
-    source = geogs.open_source(room)
+def test_a_run_frame_by_frame_is_that_of_the_command(small_room, tmp_path, capfd):
+    source = geogs.open_source(small_room, run_config().input)
     source = geogs.application.self_calibrated(source)
     slam = geogs.Slam(source.camera, run_config())
     for frame in source:
@@ -81,8 +78,8 @@ def test_a_run_frame_by_frame_is_that_of_the_command(room, tmp_path, capfd):
     geogs.application.write_results(tmp_path / "own", result)
     assert capfd.readouterr() == ("", "")
     assert result.mesh is not None
-    assert len(result.mesh.faces) > 1000
-    argv = [str(room), "-o", str(tmp_path / "out"), *RUN, "--device", "cpu"]
+    assert len(result.mesh.faces) > 300
+    argv = [str(small_room), "-o", str(tmp_path / "out"), *RUN, "--device", "cpu"]
     assert cli.main(["run", *argv]) == 0
     said = capfd.readouterr()
     assert said.out == f"Results are in {tmp_path}/out/\n"
@@ -115,36 +112,38 @@ class Impatient(geogs.application.RunProgress):
         self.said.append(text)
 
 
-def test_a_whole_run_is_one_call_that_can_be_followed_and_stopped(room, tmp_path, capfd):
+def test_a_whole_run_is_one_call_that_can_be_followed_and_stopped(small_room, tmp_path, capfd):
     stop = Interruption()
-    progress = Impatient(stop, 30)
-    settings = RunSettings((room,), run_config(), tmp_path / "out", "cpu", checkpoint_every=900.0)
+    progress = Impatient(stop, 22)
+    settings = RunSettings(
+        (small_room,), run_config(), tmp_path / "out", "cpu", checkpoint_every=900.0
+    )
     written = run(settings, progress, stop)
-    assert progress.seen == 30
+    assert progress.seen == 22
     assert progress.said == ["Stopping early; keeping what there is. Press Ctrl-C again to quit."]
     assert written.output == tmp_path / "out"
     assert written.can_resume
     assert written.result.is_interrupted
-    assert len(written.result.trajectory.timestamps) == 30
-    assert len(read_tum_trajectory(tmp_path / "out" / "trajectory.tum").timestamps) == 30
+    assert len(written.result.trajectory.timestamps) == 22
+    assert len(read_tum_trajectory(tmp_path / "out" / "trajectory.tum").timestamps) == 22
     assert capfd.readouterr() == ("", "")
 
 
 def test_a_reconstruction_is_that_of_the_command_and_writes_nothing(
-    room, tmp_path, capfd, monkeypatch
+    small_room, tmp_path, capfd, monkeypatch
 ):
     monkeypatch.chdir(tmp_path)
-    result = geogs.reconstruct(room, posed_config(), device="cpu")
+    result = geogs.reconstruct(small_room, posed_config(), device="cpu")
     assert capfd.readouterr() == ("", "")
     mesh, disks = result.mesh, result.map
     assert not list(tmp_path.iterdir())
     assert mesh is not None
-    given = np.loadtxt(room / "traj.txt").reshape(-1, 4, 4)[::4]
+    given = np.loadtxt(small_room / "traj.txt").reshape(-1, 4, 4)[::6]
     assert np.abs(result.trajectory.T_wc - given).max() < 1e-9
-    assert cli.main(["reconstruct", str(room), "-o", "out", *POSED, "--device", "cpu"]) == 0
+    assert cli.main(["reconstruct", str(small_room), "-o", "out", *POSED, "--device", "cpu"]) == 0
     assert np.array_equal(vertices(tmp_path / "out" / "mesh.ply"), mesh.vertices)
     assert (geogs.load_map("out/map.safetensors").position == disks.position).all()
-    opened = geogs.open_posed_source(room, posed_config().input)
+    opened = geogs.open_posed_source(small_room, posed_config().input)
     assert opened.length == len(given)
     geogs.application.write_results("own", result)
     require_same(tmp_path / "own", tmp_path / "out")

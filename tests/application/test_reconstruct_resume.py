@@ -23,17 +23,10 @@ from posed_scene import (
     ball_and_wall,
     depth_errors,
     geogs,
-    make_room,
     vertices,
 )
 
 pytestmark = pytest.mark.system
-
-
-@pytest.fixture(scope="module")
-def room(tmp_path_factory) -> Path:
-    """Sixty frames of a synthetic room."""
-    return make_room(tmp_path_factory.mktemp("posed") / "room")
 
 
 def interrupted(scene: Reconstruction, fraction: float) -> None:

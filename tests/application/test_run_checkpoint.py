@@ -12,18 +12,17 @@ import pytest
 import torch
 
 from geogs.application.checkpoint import SavedState, checkpoint_folder, write_checkpoint
-from geogs.config import Config
+from geogs.config import Config, InputConfig
 from geogs.errors import InputError
 from geogs.io.sources.sniff import open_source
 from geogs.keyframes.archive import Archive, Archived
 from geogs.keyframes.grid import SampleGrid
 from geogs.slam import Slam, SlamState
 from geogs.splat.rows import GrowingRows
-from geogs.synth.export import write_sequence
 
 pytestmark = pytest.mark.system
 
-FRAMES, AT = 40, 33
+FRAMES, AT = 30, 24
 
 
 @dataclass
@@ -36,17 +35,17 @@ class Work:
 def quick(resident: int) -> Config:
     c = Config()
     mapping = replace(
-        c.mapping, render_long_edge=128, iterations=4, pose_iterations=1, final_iterations=30
-    )
-    return replace(c, mapping=mapping, resident_keyframes=resident)
+        c.mapping, render_long_edge=64, iterations=2, pose_iterations=1,
+        depth=replace(c.mapping.depth, min_planes=16, max_planes=32),
+    )  # fmt: skip
+    tracking = replace(c.tracking, init_keyframes=6)
+    return replace(c, tracking=tracking, mapping=mapping, resident_keyframes=resident)
 
 
 @pytest.fixture(scope="module")
-def frames(tmp_path_factory):
+def frames(small_room):
     """The camera and the frames of a small room."""
-    folder = tmp_path_factory.mktemp("room")
-    write_sequence(folder, FRAMES, 256, 192, depth=False)
-    source = open_source(folder)
+    source = open_source(small_room, InputConfig(stop=FRAMES))
     return source.camera, list(source)
 
 
@@ -69,7 +68,7 @@ def assert_same(a: Slam, b: Slam) -> None:
         assert torch.equal(own.depth, other.depth)
 
 
-@pytest.mark.parametrize("cut", [None, 24])
+@pytest.mark.parametrize("cut", [None, 17])
 def test_a_system_goes_on_as_if_nothing_had_happened(frames, tmp_path, cut):
     """Bit for bit, with most keyframes in archives; also while a second segment starts."""
     camera, images = frames
@@ -79,7 +78,7 @@ def test_a_system_goes_on_as_if_nothing_had_happened(frames, tmp_path, cut):
         images = [replace(f, follows_cut=f.index == cut) for f in images[:cut] + other_place[cut:]]
     for frame in images[:AT]:
         slam.process(frame)
-    assert len(slam.mapper.map) > 500
+    assert len(slam.mapper.map) > 200
     assert len(slam.segments.trackers) == (1 if cut is None else 2)
     other = again(slam, tmp_path / "own", tmp_path / "copy")
     assert_nothing_is_forgotten(slam, other)
@@ -180,7 +179,7 @@ def test_a_state_of_another_camera_or_without_a_keyframe_is_one_sentence(frames,
         slam.process(frame)
     state = slam.state()
     with pytest.raises(InputError, match="of another camera"):
-        Slam(camera.resized(128, 96), quick(3)).load(state)
+        Slam(camera.resized(64, 48), quick(3)).load(state)
     first, *rest = state.segments.trackers[0].keyframes
     wrong = [
         replace(state, waiting=[99]),

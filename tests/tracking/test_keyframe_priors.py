@@ -22,9 +22,9 @@ from geogs.types import Frame, PoseCorrection
 
 pytestmark = pytest.mark.system
 
-CAMERA = Camera(218.0, 218.0, 127.5, 95.5, 256, 192)
+CAMERA = Camera(163.5, 163.5, 95.5, 71.5, 192, 144)
 CONFIG = TrackingConfig(init_keyframes=6)
-FRAMES = 45
+FRAMES = 36
 
 
 @dataclass(frozen=True)
@@ -157,4 +157,4 @@ def test_normals_reach_the_keyframes_and_depth_can_be_left_alone(walk):
             assert torch.equal(a.inverse_depth, other.inverse_depth)
             assert torch.equal(a.T_cw, other.T_cw)
         assert a.picture.normal is None
-        assert b.picture.normal.shape == c.picture.normal.shape == (192, 256, 3)
+        assert b.picture.normal.shape == c.picture.normal.shape == (144, 192, 3)

@@ -170,7 +170,7 @@ def test_static_video_says_so():
 
 def test_pure_rotation_says_so():
     with pytest.raises(TrackingLost, match="parallax"):
-        run(frames([pose(0.0, yaw=0.02 * k) for k in range(36)]))
+        run(frames([pose(0.0, yaw=0.02 * k) for k in range(24)]))
 
 
 def test_black_video_says_so():
@@ -209,7 +209,7 @@ def test_correct_scales_depth_with_the_pose():
 
 
 def test_slow_motion_makes_few_keyframes_and_culling_removes_more():
-    slow = frames(sideways(40, 0.012))
+    slow = frames(sideways(30, 0.012))
     few, _ = run(slow)
     many, results = run(slow, replace(CONFIG, keyframe_flow=0.012, cull_distance=0.0))
     culled, results = run(slow, replace(CONFIG, keyframe_flow=0.012, cull_distance=0.02))
@@ -219,19 +219,19 @@ def test_slow_motion_makes_few_keyframes_and_culling_removes_more():
     assert len(culled.keyframe_ids) < len(many.keyframe_ids)
     assert not set(removed) & set(culled.keyframe_ids)
     assert culled.trajectory().tracked.all()
-    truth = np.stack(sideways(40, 0.012))[:, :3, 3]
+    truth = np.stack(sideways(30, 0.012))[:, :3, 3]
     assert error_cm(culled.trajectory().T_wc[:, :3, 3], truth) < 0.4
 
 
-def test_forty_frames_of_a_rendered_living_room(shared_data):
+def test_thirty_frames_of_a_rendered_living_room(shared_data):
     folder = shared_data / "rooms" / "living-room-2"
     T_wc = np.loadtxt(folder / "traj.txt").reshape(-1, 4, 4)
     camera = Camera(600.0, 600.0, 599.5, 339.5, 1200, 680).with_long_edge(320)
     tracker = Tracker(camera, replace(CONFIG, keyframe_flow=0.02))
-    for k in range(0, 80, 2):
+    for k in range(0, 60, 2):
         image = cv2.imread(str(folder / "results" / f"frame{k:06d}.jpg"))[..., ::-1]
         size = (camera.width, camera.height)
         tracker.track(Frame(k, k / 30, cv2.resize(image, size, interpolation=cv2.INTER_AREA)))
     tracker.finish()
     centres = tracker.trajectory().T_wc[:, :3, 3]
-    assert error_cm(centres, T_wc[0:80:2, :3, 3]) < 0.3
+    assert error_cm(centres, T_wc[0:60:2, :3, 3]) < 0.3

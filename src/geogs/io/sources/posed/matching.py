@@ -106,7 +106,12 @@ class Matcher:
             return None
         one = one[[good[i].queryIdx for i in index]]
         two = two[[good[i].trainIdx for i in index]]
-        inlier = cv2.findFundamentalMat(one, two, cv2.USAC_MAGSAC, _EPIPOLAR_PIXELS, 0.999, 2000)[1]
+        try:
+            inlier = cv2.findFundamentalMat(
+                one, two, cv2.USAC_MAGSAC, _EPIPOLAR_PIXELS, 0.999, 2000
+            )[1]
+        except cv2.error:  # OpenCV 5 fails an assertion where no sample gives a model
+            return None
         if inlier is None or inlier.sum() < MIN_MATCHES:
             return None
         keep = inlier.ravel().astype(bool)
