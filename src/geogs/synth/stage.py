@@ -4,10 +4,12 @@ from dataclasses import dataclass
 
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
+from geogs.synth.bodies import Body
 from geogs.synth.motion_kinds import MotionKind
 from geogs.synth.motions import Motion, room_motion
 from geogs.synth.room import make_room
 from geogs.synth.scene import Scene
+from geogs.synth.walkers import crossing_walkers
 
 ROOM_FOCAL = 0.7
 """Focal length over width of the camera in rooms: 71 degrees across."""
@@ -19,7 +21,9 @@ _MAX_SIZE = 8192
 class Stage:
     """A scene and a way through it."""
 
+    kind: MotionKind
     name: str
+    seed: int
     scene: Scene
     motion: Motion
     width: int
@@ -36,12 +40,16 @@ class Stage:
         """The camera of the size asked for, its principal point in the middle of the image."""
         return centred_camera(width or self.width, height or self.height, self.focal)
 
+    def bodies(self, camera: Camera, seconds: float, share: float) -> list[Body]:
+        """What crosses the camera's view and covers about this share of it."""
+        return crossing_walkers(self.motion.path, seconds, camera, share, self.seed)
 
-def make_stage(kind: MotionKind, seed: int = 0) -> Stage:
-    """The room of the seed, and the motion through it."""
-    scene = make_room(seed)
+
+def make_stage(kind: MotionKind, seed: int = 0, scene: Scene | None = None) -> Stage:
+    """The room of the seed, and the motion through it; ``scene``, if that room is there already."""
+    scene = scene or make_room(seed)
     return Stage(
-        f"procedural room, seed {seed}", scene, room_motion(kind, scene, seed),
+        kind, f"procedural room, seed {seed}", seed, scene, room_motion(kind, scene, seed),
         width=320, height=240, focal=ROOM_FOCAL, depth_scale=6553.5, voxel_cm=1,
     )  # fmt: skip
 
