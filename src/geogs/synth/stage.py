@@ -59,16 +59,21 @@ def make_stage(kind: MotionKind, seed: int = 0, scene: Scene | None = None) -> S
 
     ``scene``, if it is there already, is not made again.
     """
+    scene = scene or make_scene(kind, seed)
     if kind == "driving":
         return Stage(
-            kind, f"procedural street, seed {seed}", seed, scene or make_street(seed), drive(seed),
+            kind, f"procedural street, seed {seed}", seed, scene, drive(seed),
             width=1241, height=376, focal=STREET_FOCAL, depth_scale=256.0, voxel_cm=10, reach=40.0,
         )  # fmt: skip
-    scene = scene or make_room(seed)
     return Stage(
         kind, f"procedural room, seed {seed}", seed, scene, room_motion(kind, scene, seed),
         width=320, height=240, focal=ROOM_FOCAL, depth_scale=6553.5, voxel_cm=1, reach=math.inf,
     )  # fmt: skip
+
+
+def make_scene(kind: MotionKind, seed: int = 0) -> Scene:
+    """The room or the street of the seed that a motion goes through."""
+    return make_street(seed) if kind == "driving" else make_room(seed)
 
 
 def centred_camera(width: int, height: int, focal: float = ROOM_FOCAL) -> Camera:
