@@ -1,6 +1,7 @@
 """The written sequence: layout, exact round trip, the command, bad input."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -13,7 +14,7 @@ from geogs.evaluation.surface import read_surface
 from geogs.io.poses import read_poses
 from geogs.io.sources.sniff import open_source
 from geogs.synth.export import default_camera, write_sequence
-from geogs.synth.flaws import Flaws
+from geogs.synth.flaws import Flaws, camera_flaws
 from geogs.synth.motions import room_motion
 from geogs.synth.raycast import Raycaster
 from geogs.synth.room import make_room
@@ -128,17 +129,33 @@ def test_bad_input(tmp_path: Path) -> None:
         write_sequence(tmp_path / "file", 1, 32, 24)
 
 
-def test_flawed_sequence_is_read_back(tmp_path: Path) -> None:
-    """Distortion, times and truth, through the command; other sequences say nothing of them."""
-    options = ["--frames", "3", "--width", "48", "--height", "36", "--moving", "0.2"]
-    options += ["--motion", "handheld-5hz", "--camera", "action", "--flaws.readout", "0.03"]
-    assert main([str(tmp_path), *options]) == 0
+def test_the_command_says_motion_and_flaws(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Single flaws win over those of the camera."""
+    asked = {}
+    monkeypatch.setattr(
+        "geogs.synth.export.write_sequence", lambda *args, **options: asked.update(options)
+    )
+    options = ["--motion", "handheld-5hz", "--camera", "action", "--flaws.readout", "0.03"]
+    assert main([str(tmp_path), *options, "--moving", "0.2"]) == 0
+    assert asked["flaws"] == replace(camera_flaws("action"), readout=0.03)
+    assert (asked["motion"], asked["moving"]) == ("handheld-5hz", 0.2)
+    assert main([str(tmp_path)]) == 0
+    assert (asked["flaws"], asked["motion"], asked["moving"]) == (Flaws(), "handheld", 0)
+
+
+def test_flawed_sequence_is_read_back(tmp_path: Path, scene: Scene, raycaster: Raycaster) -> None:
+    """Distortion, times and truth; other sequences say nothing of them."""
+    flaws = replace(camera_flaws("action"), readout=0.03)
+    write_sequence(
+        tmp_path, 3, 48, 36, SEED, motion="handheld-5hz", flaws=flaws, moving=0.2,
+        raycaster=raycaster,
+    )  # fmt: skip
     source = open_source(tmp_path)
     assert source.calibration.distortion == (-0.25, 0.06, 0.0, 0.0)
     assert source.fps == pytest.approx(5)
     assert [frame.timestamp for frame in source] == [0.0, 0.2, 0.4]
     poses = read_poses(tmp_path)
-    path = room_motion("handheld-5hz", make_room(0)).path
+    path = room_motion("handheld-5hz", scene, SEED).path
     np.testing.assert_allclose(poses.T_wc, path(np.array([0.0, 0.2, 0.4])), atol=1e-9)
     np.testing.assert_allclose(poses.timestamps, [0.0, 0.2, 0.4])
     truth = json.loads((tmp_path / "cam_params.json").read_text())
