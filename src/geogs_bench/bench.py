@@ -1,6 +1,6 @@
 """A benchmark from a user's wishes to its tables."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -8,6 +8,7 @@ from geogs.errors import InputError
 from geogs_bench.benchmark import Benchmark
 from geogs_bench.commands import runners
 from geogs_bench.harness import Harness
+from geogs_bench.motion_cells import render_cells
 from geogs_bench.plan import Wishes, find_scenes, make_jobs
 from geogs_bench.record import Record
 from geogs_bench.registry import BENCHMARKS, find_benchmark
@@ -34,19 +35,30 @@ def bench(settings: BenchSettings, say: Callable[[str], None]) -> Benched:
         InputError: the data, a setting or a name is wrong; found before anything is run.
         OutputError: the folder cannot be written.
     """
-    name = "rooms-known-poses" if settings.known_poses else settings.name
-    if settings.known_poses and settings.name not in ("rooms", name):
-        raise InputError(f"--known-poses is for rooms; {settings.name} has one way to run.")
-    benchmark = find_benchmark(name)
+    benchmark = find_benchmark(_name(settings))
     wishes = _wishes(settings, benchmark)
     output = settings.output or Path("out") / f"bench-{benchmark.name}"
-    data = settings.data or _made_data(benchmark, output, say)
+    data = settings.data or _made_data(benchmark, output, wishes.scenes, say)
     scenes = find_scenes(benchmark, data.expanduser(), wishes.scenes)
     jobs = make_jobs(benchmark, scenes, output, wishes)
     harness = Harness(
         benchmark, output, runners(), say, fresh=settings.fresh, rescore=settings.rescore
     )
     return Benched(benchmark, output, harness.run(jobs))
+
+
+def _name(settings: BenchSettings) -> str:
+    """Of the benchmark: some have another for a switch."""
+    name = settings.name
+    if settings.known_poses:
+        if name not in ("rooms", "rooms-known-poses"):
+            raise InputError(f"--known-poses is for rooms; {name} has one way to run.")
+        return "rooms-known-poses"
+    if settings.small:
+        if name not in ("motions", "motions-small"):
+            raise InputError(f"--small is for motions; {name} has one size.")
+        return "motions-small"
+    return name
 
 
 def listing() -> str:
@@ -88,8 +100,12 @@ def _names(text: str) -> tuple[str, ...]:
     return tuple(name.strip() for name in text.split(",") if name.strip())
 
 
-def _made_data(benchmark: Benchmark, output: Path, say: Callable[[str], None]) -> Path:
-    """A synthetic room where that serves. Raises InputError where it does not."""
+def _made_data(
+    benchmark: Benchmark, output: Path, scenes: Sequence[str], say: Callable[[str], None]
+) -> Path:
+    """What can be rendered, where that serves. Raises InputError where it does not."""
+    if benchmark.cells:
+        return render_cells(benchmark.cells, output / "data", scenes, say)
     if not benchmark.synthetic:
         raise no_data(benchmark.name, benchmark.needs, benchmark.source)
     say("no data given; rendering a synthetic room")

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from geogs_bench.motion_cells import Cell
 from geogs_bench.published import PublishedTable
 from geogs_bench.record import Record
 from geogs_bench.runner import Command
@@ -72,3 +73,5 @@ class Benchmark:
     """Seconds given to each reconstruction from known poses; each makes a variant."""
     synthetic: bool = False
     """Whether a synthetic room serves where the user gives no data."""
+    cells: tuple[Cell, ...] = ()
+    """Sequences that are rendered where the user gives no data."""

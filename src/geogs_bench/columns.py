@@ -134,6 +134,26 @@ def photo_layout() -> Layout:
     )
 
 
+def motion_layout() -> Layout:
+    """How every motion was followed."""
+
+    def field(name: str) -> Callable[[Record], float | None]:
+        return lambda record: None if record.motion is None else getattr(record.motion, name)
+
+    return Layout(
+        "Motions",
+        (
+            Column("frames tracked (%)", field("tracked"), 1),
+            Column("ATE over path (%)", field("relative"), 3),
+            Column("ATE (cm)", field("ate"), 2),
+            Column("rotation (degrees)", field("rotation"), 2),
+            Column("within 3 sigma (%)", field("within"), 1),
+        ),
+        "Over the tracked frames; positions after a Sim(3) alignment, orientations after that of "
+        "the world's axes. A camera that hardly moves has no ATE.",
+    )
+
+
 COST = Layout(
     "Cost",
     (

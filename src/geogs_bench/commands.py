@@ -36,18 +36,35 @@ class CommandRunner:
                 reconstruct_to_folder(settings, progress, Interruption())
 
 
+class TrackingRunner(CommandRunner):
+    """What ``geogs run`` does but for the map; the options are the same."""
+
+    def run(self, task: Task) -> None:
+        """Track, and write the trajectory."""
+        from geogs_bench.tracking_only import track_to_folder
+
+        settings = settings_of(task)
+        assert isinstance(settings, RunSettings)
+        track_to_folder(settings, task.output)
+
+
 def runners() -> dict[Command, Runner]:
     """Who runs which command."""
     from geogs_bench.baseline import BaselineRunner
 
     command = CommandRunner()
-    return {"run": command, "reconstruct": command, "colour-2dgs": BaselineRunner()}
+    return {
+        "run": command,
+        "track": TrackingRunner(),
+        "reconstruct": command,
+        "colour-2dgs": BaselineRunner(),
+    }
 
 
 def settings_of(task: Task) -> RunSettings | ReconstructSettings:
     """What a task's options say, by the command's own parser."""
     argv = [str(task.source), "-o", str(task.output)]
     argv += [argument for option in task.options for argument in option.arguments()]
-    if task.command == "run":
+    if task.command in ("run", "track"):
         return record(RunSettings, run_command.parse(argv))
     return record(ReconstructSettings, reconstruct_command.parse(argv))

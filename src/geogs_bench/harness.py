@@ -133,7 +133,13 @@ class Harness:
         self._say("  scoring")
         result = ResultFolder(job.task.output)
         scores = score(job.scene, job.task.command, result, record.provenance.seed)
-        return replace(record, stages=scores.stages, photo=scores.photo, curve=scores.curve)
+        return replace(
+            record,
+            stages=scores.stages,
+            photo=scores.photo,
+            motion=scores.motion,
+            curve=scores.curve,
+        )
 
 
 def cost_of(result: ResultFolder, seconds: float) -> Cost:

@@ -68,6 +68,23 @@ class PhotoScore:
 
 
 @dataclass(frozen=True)
+class MotionScore:
+    """How a camera's motion was followed."""
+
+    tracked: float
+    """Frames that have a pose, percent."""
+    rotation: float | None = None
+    """RMSE of the orientations, degrees; none where nothing was tracked."""
+    ate: float | None = None
+    """RMSE of the positions after Sim(3) alignment, cm; none where the camera hardly moved."""
+    relative: float | None = None
+    """The same over the length of the way, percent."""
+    within: float | None = None
+    """Poses within three of the deviations that the system claims, percent; none where it claims
+    none."""
+
+
+@dataclass(frozen=True)
 class StageScore:
     """A result as it stood at a stage."""
 
@@ -132,6 +149,7 @@ class Record:
     cost: Cost | None = None
     stages: tuple[StageScore, ...] = ()
     photo: PhotoScore | None = None
+    motion: MotionScore | None = None
     curve: tuple[CurvePoint, ...] = ()
     error: str | None = None
     """Why there are no numbers."""

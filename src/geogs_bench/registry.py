@@ -8,11 +8,13 @@ from geogs_bench.columns import (
     COST,
     area_layout,
     dtu_layout,
+    motion_layout,
     photo_layout,
     trajectory_layout,
     vertex_layout,
 )
 from geogs_bench.layouts.dtu import find_dtu
+from geogs_bench.layouts.motions import find_motions
 from geogs_bench.layouts.objects import find_objects
 from geogs_bench.layouts.posed_rooms import find_posed_rooms
 from geogs_bench.layouts.replica import find_replica, find_rooms
@@ -20,6 +22,7 @@ from geogs_bench.layouts.scannet import find_scannet
 from geogs_bench.layouts.scannetpp import find_scannetpp
 from geogs_bench.layouts.seven_scenes import find_seven_scenes
 from geogs_bench.layouts.tum import find_tum
+from geogs_bench.motion_cells import FULL, SMALL
 
 _ONLINE = (
     "Published online figures include the paper's final global bundle adjustment and map update; "
@@ -151,6 +154,29 @@ POSED_ROOMS = Benchmark(
     synthetic=True,
 )
 
+MOTIONS = Benchmark(
+    "motions",
+    "Motions and flaws of the camera, with exact truth",
+    "run",
+    find_motions,
+    "sequences as geogs synth writes them; without a folder a matrix of motions and cameras is "
+    "rendered, with --small a small one that is only tracked",
+    "geogs synth --motion KIND --camera FLAWS",
+    (motion_layout(), COST),
+    cells=FULL,
+)
+
+MOTIONS_SMALL = Benchmark(
+    "motions-small",
+    "Motions and flaws of the camera, small images, tracking alone",
+    "track",
+    find_motions,
+    MOTIONS.needs,
+    MOTIONS.source,
+    (motion_layout(), COST),
+    cells=SMALL,
+)
+
 OBJECTS = Benchmark(
     "objects",
     "Objects with masks: surfaces from known poses",
@@ -170,7 +196,8 @@ OBJECTS = Benchmark(
 BENCHMARKS: dict[str, Benchmark] = {
     benchmark.name: benchmark
     for benchmark in (
-        REPLICA, SCANNET, SCANNETPP, TUM, SEVEN_SCENES, DTU, ROOMS, POSED_ROOMS, OBJECTS,
+        REPLICA, SCANNET, SCANNETPP, TUM, SEVEN_SCENES, DTU, ROOMS, POSED_ROOMS, MOTIONS,
+        MOTIONS_SMALL, OBJECTS,
         *ABLATIONS,
     )
 }  # fmt: skip

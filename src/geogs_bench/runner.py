@@ -6,8 +6,9 @@ from typing import Literal, Protocol, runtime_checkable
 
 from geogs_bench.scene import Option
 
-Command = Literal["run", "reconstruct", "colour-2dgs"]
-"""SLAM, the map from known poses, or the baseline with colour from known poses."""
+Command = Literal["run", "track", "reconstruct", "colour-2dgs"]
+"""SLAM, its tracking alone, the map from known poses, or the baseline with colour from known
+poses."""
 
 
 @dataclass(frozen=True)

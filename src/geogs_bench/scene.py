@@ -71,5 +71,6 @@ class Scene:
     truth: Truth
     options: tuple[Option, ...] = ()
     """That this scene needs, such as its intrinsics."""
-    kind: Literal["room", "object", "scan"] = "room"
-    """How a surface from known poses is scored: as a room in cm, an object in mm, or by DTU."""
+    kind: Literal["room", "object", "scan", "motion"] = "room"
+    """How a surface from known poses is scored: as a room in cm, an object in mm, or by DTU; of a
+    motion the trajectory alone is scored."""

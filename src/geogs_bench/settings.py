@@ -24,6 +24,8 @@ class BenchSettings(Settings):
     """Only these variants of an ablation, with commas between."""
     known_poses: bool = False
     """Of rooms: reconstruct from known poses instead of SLAM."""
+    small: bool = False
+    """Of motions: few short sequences of small images, and tracking alone; for a CPU."""
     budgets: Annotated[tuple[Positive, ...], Time] = ()
     """From known poses: seconds given to each reconstruction, several with commas between."""
     baseline: bool = False

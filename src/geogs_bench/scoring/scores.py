@@ -4,11 +4,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from geogs_bench.record import CurvePoint, PhotoScore, StageScore
+from geogs_bench.record import CurvePoint, MotionScore, PhotoScore, StageScore
 from geogs_bench.result import ResultFolder
 from geogs_bench.runner import Command
 from geogs_bench.scene import Scene
 from geogs_bench.scoring.judges import judge_of
+from geogs_bench.scoring.motion import score_motion
 from geogs_bench.scoring.photo import score_photo
 from geogs_bench.scoring.pictures import draw
 from geogs_bench.scoring.posed import score_posed, score_snapshots
@@ -21,6 +22,7 @@ class Scores:
 
     stages: tuple[StageScore, ...] = ()
     photo: PhotoScore | None = None
+    motion: MotionScore | None = None
     curve: tuple[CurvePoint, ...] = ()
 
 
@@ -31,6 +33,8 @@ def score(scene: Scene, command: Command, result: ResultFolder, seed: int) -> Sc
         InputError: the result or the truth cannot be read, or they do not fit each other.
         OutputError: the pictures cannot be written.
     """
+    if scene.kind == "motion":
+        return Scores(motion=score_motion(scene, result))
     if command == "run":
         stages = score_slam(scene, result, seed)
         _draw_last(stages, result)

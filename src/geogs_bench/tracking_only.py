@@ -1,0 +1,57 @@
+"""The tracker and the loops on a source, without any map: what decides where the camera is."""
+
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from geogs.application.settings import RunSettings
+from geogs.application.summary import lost_spans
+from geogs.errors import TrackingLost
+from geogs.gpu.installation import require_device
+from geogs.io.sources.sniff import open_source
+from geogs.io.writers.atomic import prepare_output_folder, write_text
+from geogs.io.writers.tum import write_tum_trajectory
+from geogs.loop.global_bundle import global_bundle
+from geogs.slam import Slam
+from geogs.threads import on_one_torch_thread
+
+
+@on_one_torch_thread
+def track_to_folder(
+    settings: RunSettings, output: Path, on_frame: Callable[[int], None] = lambda index: None
+) -> None:
+    """Track every frame, close loops, adjust all keyframes; write trajectory and summary.
+
+    A video in which no frame can be tracked leaves a summary that says so, and no trajectory.
+
+    Raises:
+        InputError: the source or a setting cannot be used.
+        DeviceError, OutputError: the device, or the folder.
+    """
+    device = require_device(settings.device)
+    source = open_source(settings.source, settings.config.input)
+    folder = prepare_output_folder(output)
+    slam = Slam(source.camera, settings.config, str(device))
+    start = time.perf_counter()
+    frames = 0
+    for frame in source:
+        slam.loops.update(slam.segments.track(frame, slam.loops.recognise), False)
+        slam.segments.world.keyframes.take_corrections()
+        frames += 1
+        on_frame(frames)
+    seconds = time.perf_counter() - start
+    summary = {
+        "device": device.type,
+        "frames": frames,
+        "frames_per_second": {"until_stream_end": round(frames / max(seconds, 1e-9), 3)},
+    }
+    try:
+        slam.loops.update(slam.segments.finish(), True)
+        global_bundle(slam.segments.world)
+        trajectory = slam.trajectory()
+        write_tum_trajectory(folder / "trajectory.tum", trajectory)
+        summary["lost_spans"] = lost_spans(trajectory)
+    except TrackingLost as error:
+        summary["not_tracked"] = str(error)
+    write_text(folder / "summary.json", json.dumps(summary, indent=2) + "\n")

@@ -1,0 +1,120 @@
+"""The matrix of motions: its cells, what is scored, tracking without a map."""
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from geogs.application.settings import RunSettings
+from geogs.errors import InputError
+from geogs.types import Trajectory
+from geogs_bench.layouts.motions import find_motions
+from geogs_bench.motion_cells import FULL, SMALL, render_cells
+from geogs_bench.result import ResultFolder
+from geogs_bench.scoring.motion import compare_motion, rotation_error, score_motion
+from geogs_bench.tracking_only import track_to_folder
+
+
+def _trajectory(T_wc: np.ndarray) -> Trajectory:
+    return Trajectory(np.arange(len(T_wc)) / 30, T_wc, np.ones(len(T_wc), bool))
+
+
+def _poses(seed: int, count: int = 40) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    T_wc = np.tile(np.eye(4), (count, 1, 1))
+    T_wc[:, :3, :3] = Rotation.random(count, random_state=seed).as_matrix()
+    T_wc[:, :3, 3] = np.cumsum(rng.normal(0, 0.1, (count, 3)), 0)
+    return T_wc
+
+
+def test_cells_have_names_of_their_own() -> None:
+    for cells in (SMALL, FULL):
+        names = [cell.name for cell in cells]
+        assert len(set(names)) == len(names)
+    assert {cell.motion for cell in FULL} == {cell.motion for cell in FULL + SMALL}
+    assert len({cell.motion for cell in FULL}) == 12
+    assert sum(cell.frames * cell.width * cell.height for cell in SMALL) < 1000 * 320 * 240
+
+
+def test_rotation_error_is_what_no_rotation_of_the_world_removes() -> None:
+    """Against a search over rotations of the world."""
+    truth = _poses(0)[:, :3, :3]
+    world = Rotation.from_rotvec([0.3, -0.7, 1.1]).as_matrix()
+    assert rotation_error(world @ truth, truth) < 1e-6
+    noise = Rotation.from_rotvec(np.random.default_rng(1).normal(0, 0.02, (40, 3))).as_matrix()
+    estimate = world @ truth @ noise
+    found = rotation_error(estimate, truth)
+
+    def error(turn: np.ndarray) -> float:
+        aligned = Rotation.from_rotvec(turn).as_matrix() @ world.T @ estimate
+        angles = Rotation.from_matrix(aligned.transpose(0, 2, 1) @ truth).magnitude()
+        return float(np.degrees(np.sqrt((angles**2).mean())))
+
+    turns = np.random.default_rng(2).normal(0, 0.005, (400, 3))
+    assert found == pytest.approx(np.degrees(0.02 * np.sqrt(3)), rel=0.25)
+    assert min(error(turn) for turn in turns) > found * (1 - 1e-6)
+
+
+def test_positions_and_share() -> None:
+    truth = _poses(3)
+    estimate = truth.copy()
+    estimate[:, :3, 3] = 0.2 * (truth[:, :3, 3] + np.random.default_rng(4).normal(0, 0.01, (40, 3)))
+    kept = _trajectory(estimate)
+    kept = Trajectory(kept.timestamps[:30], kept.T_wc[:30], kept.tracked[:30])
+    score = compare_motion(_trajectory(truth), kept)
+    assert score.tracked == 75
+    path = np.linalg.norm(np.diff(truth[:30, :3, 3], axis=0), axis=1).sum()
+    assert score.ate == pytest.approx(1.7, rel=0.3)
+    assert score.relative == pytest.approx(score.ate / path)
+    assert score.rotation == pytest.approx(0, abs=1e-5)
+
+
+def test_a_camera_that_only_turns_has_no_ate() -> None:
+    truth = _poses(5)
+    truth[:, :3, 3] = 1.0
+    score = compare_motion(_trajectory(truth), _trajectory(truth))
+    assert (score.tracked, score.ate, score.relative) == (100, None, None)
+    assert score.rotation == pytest.approx(0, abs=1e-5)
+    moved = _poses(6)
+    stuck = moved.copy()
+    stuck[:, :3, 3] = 0
+    assert compare_motion(_trajectory(moved), _trajectory(stuck)).ate is None
+
+
+def test_names_that_are_no_cell(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="there is no cell flying; choose of handheld-clean, "):
+        render_cells(SMALL, tmp_path, ("flying",), print)
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_was_rendered_is_not_rendered_again(tmp_path: Path) -> None:
+    (tmp_path / "still-kinect").mkdir()
+    (tmp_path / "still-kinect" / "points_seen_1cm.ply").touch()
+    said: list[str] = []
+    assert render_cells(SMALL, tmp_path, ("still-kinect",), said.append) == tmp_path
+    assert said == []
+
+
+def test_a_cell_that_cannot_be_tracked_counts_as_lost(tmp_path: Path) -> None:
+    """A camera that stands still gives no depth, so no start: 0 %, and not a failure."""
+    sequence, output = tmp_path / "still-clean", tmp_path / "result"
+    (sequence / "results").mkdir(parents=True)
+    image = np.random.default_rng(0).integers(0, 255, (72, 96, 3), np.uint8)
+    for k in range(6):
+        cv2.imwrite(str(sequence / f"results/frame{k:06d}.png"), image)
+    np.savetxt(sequence / "traj.txt", np.tile(np.eye(4).ravel(), (6, 1)))
+    camera = {"w": 96, "h": 72, "fx": 70, "fy": 70, "cx": 47.5, "cy": 35.5}
+    (sequence / "cam_params.json").write_text(json.dumps({"camera": camera}))
+    (scene,) = find_motions(tmp_path)
+    assert scene.name == "still-clean"
+    frames: list[int] = []
+    track_to_folder(RunSettings((scene.source,), device="cpu"), output, frames.append)
+    assert frames == [1, 2, 3, 4, 5, 6]
+    summary = json.loads((output / "summary.json").read_text())
+    assert summary["frames"] == 6
+    assert "not_tracked" in summary
+    score = score_motion(scene, ResultFolder(output))
+    assert (score.tracked, score.rotation, score.ate) == (0, None, None)
