@@ -59,6 +59,6 @@ def _evidence(found: "FoundReadout") -> str:
     if found.pairs == 0:
         return "the video does not tell"
     return (
-        f"{100 * found.share:.0f} % of {found.pairs} pairs of views agree better with "
-        f"{1000 * found.best:.1f} ms than with a global shutter, by {100 * found.gain:.1f} %"
+        f"{100 * found.share:.0f} % of {found.pairs} pairs of views agree better than with a "
+        f"global shutter, by {found.evidence:.1f} standard errors"
     )

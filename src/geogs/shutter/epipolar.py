@@ -51,9 +51,9 @@ def refined_costs(
 ) -> Float[np.ndarray, "k"]:
     """The least robust cost of each of k versions of the same matches, near a motion.
 
-    The cost of a match is ``log(1 + (error / tolerance)^2)`` with the error of Sampson, that of a
-    version their mean. Gauss-Newton steps on rotation and direction of translation, of iteratively
-    reweighted matches, with the denominator of the error held.
+    The cost of a match is Geman and McClure's ``e^2 / (1 + e^2)`` of its error by Sampson in units
+    of the tolerance, that of a version their mean. Gauss-Newton steps on rotation and direction of
+    translation, of iteratively reweighted matches, with the denominator of the error held.
     """
     versions = len(first)
     a, b = first / first[..., 2:], second / second[..., 2:]
@@ -64,7 +64,7 @@ def refined_costs(
         turned = a @ R.transpose(0, 2, 1)
         error, scale = _sampson(R, t, b, turned)
         square = (error / tolerance) ** 2
-        best = np.minimum(best, np.log1p(square).mean(1))
+        best = np.minimum(best, (square / (1 + square)).mean(1))
         if turn == ROUNDS:
             break
         # b . (t x Exp(phi) c): derivatives by phi and by t, c being the turned ray.
@@ -72,7 +72,7 @@ def refined_costs(
         basis = _tangents(t)
         by_translation = cross(turned, b) @ basis
         jacobian = np.concatenate([by_rotation, by_translation], 2) * scale[..., None]
-        weighted = jacobian / (1 + square)[..., None]
+        weighted = jacobian / (1 + square)[..., None] ** 2
         normal = weighted.transpose(0, 2, 1) @ jacobian
         damping = 1e-6 * np.trace(normal, axis1=1, axis2=2)[:, None, None] + 1e-12
         right = -(weighted.transpose(0, 2, 1) @ error[..., None])
