@@ -50,7 +50,9 @@ def run(
     found = None if calibrated is opened else calibrated.calibration
     source = with_shutter_found(calibrated, progress, stop)
     slam = Slam(source.camera, config, str(device), open_prior(config.prior, source.camera, device))
-    facts = RunFacts(settings.absolute(), device.type, source.fingerprint(), found, source.shutter)
+    facts = RunFacts(
+        settings.absolute(), device.type, source.fingerprint(), found, shutter=source.shutter
+    )
     if has_checkpoint(output):
         progress.write(
             f"Starting anew; geogs run --resume {output} would go on with the unfinished run "

@@ -29,10 +29,10 @@ class RunFacts:
     """Of the source."""
     calibration: Calibration | None
     """Found before the run; none if the source's own was taken."""
-    shutter: Shutter = field(default_factory=Shutter)
-    """Given, or found before the run."""
     place: ReadingPlace | JointPlace = field(default_factory=ReadingPlace)
     """How far the source has been read."""
+    shutter: Shutter = field(default_factory=Shutter)
+    """Given, or found before the run."""
 
 
 @dataclass(frozen=True)
