@@ -57,6 +57,7 @@ class Tree:
     is_old: bool
     mood: Mood
     kind: Literal["oak", "elm"]
+    girth: float | Literal["unknown"]
     path: Path | None
     leaf: Leaf | None
     several: list[Leaf | Twig]
@@ -74,7 +75,8 @@ def tree() -> Tree:
     leaf = Leaf(np.array([1.0, math.nan]), base[2:4])  # a part of a larger tensor
     pair = Pair(torch.zeros(0, 2), torch.zeros(0, dtype=torch.bool))
     return Tree(
-        "beech", 0.1 + 0.2, 2**127, True, Mood.WILD, "elm", Path("a/b"), leaf, [Twig(3), leaf],
+        "beech", 0.1 + 0.2, 2**127, True, Mood.WILD, "elm", "unknown", Path("a/b"), leaf,
+        [Twig(3), leaf],
         {(1, 2): Twig(5), (0, 9): Twig(6)}, (1, "x"), (math.inf, 2.0), pair,
         torch.tensor(1.5, dtype=torch.bfloat16), None, print,
     )  # fmt: skip
@@ -84,7 +86,18 @@ def test_what_was_taken_apart_is_the_same_again():
     given, packed = tree(), pack(Tree, tree())
     values = json.loads(json.dumps(packed.values))
     made = unpack(Tree, values, packed.arrays, {})
-    for name in ("name", "height", "count", "is_old", "mood", "kind", "path", "span", "ages"):
+    for name in (
+        "name",
+        "height",
+        "count",
+        "is_old",
+        "mood",
+        "kind",
+        "girth",
+        "path",
+        "span",
+        "ages",
+    ):
         assert getattr(made, name) == getattr(given, name), name
     assert list(made.by_pair.items()) == list(given.by_pair.items())  # in their order
     assert made.several[0] == Twig(3)

@@ -184,6 +184,11 @@ def test_kinds_come_from_types() -> None:
         90.0, 90.0, 90.0, 120.0, 1800.0,
     ]  # fmt: skip
     assert not time.allows(time.read("soon"))
+    auto = Kind.of(Annotated[float | Literal["auto"], Range(0, 1)])
+    assert (auto.base, auto.word, str(auto)) == (float, "auto", "auto or a number from 0 to 1")
+    assert [auto.read(text) for text in ("Auto", "0.5")] == ["auto", 0.5]
+    assert all(auto.allows(value) for value in ("auto", 0.5))
+    assert not any(auto.allows(value) for value in ("none", "0.5", 2.0, None))
     assert kind.read("0.5,1") == (0.5, 1.0)
     assert kind.read("None") is None
     assert not kind.allows(kind.read("0.5,x"))

@@ -8,13 +8,15 @@ if TYPE_CHECKING:
     from geogs.application.progress import RunProgress
     from geogs.application.result import Result
     from geogs.application.results import write_results
+    from geogs.application.shutter import with_shutter_found
 
-__all__ = ["Result", "RunProgress", "self_calibrated", "write_results"]
+__all__ = ["Result", "RunProgress", "self_calibrated", "with_shutter_found", "write_results"]
 
 _HOMES = {
     "Result": "geogs.application.result",
     "RunProgress": "geogs.application.progress",
     "self_calibrated": "geogs.application.calibrate",
+    "with_shutter_found": "geogs.application.shutter",
     "write_results": "geogs.application.results",
 }
 

@@ -39,8 +39,8 @@ def write_results(
     scene, source, progress = result.scene, result.source, result.progress
     write_tum_trajectory(output / "trajectory.tum", result.trajectory)
     write_tum_trajectory(output / "keyframes.tum", result.keyframes)
-    calibration = None if isinstance(source, PosedSource) else source.calibration
-    write_intrinsics(output / "intrinsics.json", source.camera, calibration)
+    as_it_came = () if isinstance(source, PosedSource) else (source.calibration, source.shutter)
+    write_intrinsics(output / "intrinsics.json", source.camera, *as_it_came)
     write_config(output / "config.yaml", scene.config)
     disks = result.map
     save_map(output / "map.safetensors", disks, {"source": source.name, "seed": scene.config.seed})

@@ -17,6 +17,7 @@ from geogs.application.result import Result, Written
 from geogs.application.results import write_results
 from geogs.application.run_checkpoint import RunCheckpoint, RunFacts, SavedRun, frames_after
 from geogs.application.settings import RunSettings
+from geogs.application.shutter import with_shutter_found
 from geogs.application.surfaces import write_depth_mesh, write_online_results
 from geogs.errors import DeviceError, InputError
 from geogs.gpu.installation import require_device
@@ -45,10 +46,13 @@ def run(
     opened = open_source(settings.source, config.input)
     output = prepare_output_folder(settings.output or Path("out") / opened.name)
     compiled_kernels(device)
-    source = self_calibrated(opened, config, device, progress, stop)
-    found = None if source is opened else source.calibration
+    calibrated = self_calibrated(opened, config, device, progress, stop)
+    found = None if calibrated is opened else calibrated.calibration
+    source = with_shutter_found(calibrated, progress, stop)
     slam = Slam(source.camera, config, str(device), open_prior(config.prior, source.camera, device))
-    facts = RunFacts(settings.absolute(), device.type, source.fingerprint(), found)
+    facts = RunFacts(
+        settings.absolute(), device.type, source.fingerprint(), found, shutter=source.shutter
+    )
     if has_checkpoint(output):
         progress.write(
             f"Starting anew; geogs run --resume {output} would go on with the unfinished run "

@@ -12,6 +12,7 @@ from geogs.io.sources.base import ReadingPlace
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.several import JointPlace, SeveralSources
 from geogs.io.sources.sniff import Stream
+from geogs.shutter.shutter import Shutter
 from geogs.slam import Slam, SlamState
 from geogs.types import Frame
 
@@ -30,6 +31,8 @@ class RunFacts:
     """Found before the run; none if the source's own was taken."""
     place: ReadingPlace | JointPlace = field(default_factory=ReadingPlace)
     """How far the source has been read."""
+    shutter: Shutter = field(default_factory=Shutter)
+    """Given, or found before the run."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +87,8 @@ class SavedRun:
                 "sizes); put it back, or start anew without --resume."
             )
         found = self.facts.calibration
-        return source if found is None else source.with_calibration(found)
+        calibrated = source if found is None else source.with_calibration(found)
+        return calibrated.with_shutter(self.facts.shutter)
 
 
 def frames_after(source: Stream, place: ReadingPlace | JointPlace) -> Generator[Frame, None, None]:

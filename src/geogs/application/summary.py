@@ -50,7 +50,12 @@ def source_summary(source: Stream | PosedSource) -> dict[str, object]:
         return {"scale": f"of the poses ({source.scene_scale})", "skipped_images": 0, **held_out}
     spans = source.spans if isinstance(source, SeveralSources) else []
     videos = {"videos": [asdict(span) for span in spans]} if spans else {}
-    return {"scale": "arbitrary (monocular)", "skipped_images": source.skipped, **videos}
+    return {
+        "scale": "arbitrary (monocular)",
+        "skipped_images": source.skipped,
+        "shutter": asdict(source.shutter),
+        **videos,
+    }
 
 
 def time_summary(stopwatch: Stopwatch, frames: int) -> dict[str, object]:

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, UInt8
 from geogs.shutter.camera import RollingCamera
 from geogs.shutter.turning import rotated
 
-LONG_EDGE = 320
+LONG_EDGE = 256
 """Of the images that flow is measured on, at most, pixels."""
 STEP = 8
 """Pixels of these between two cells."""

@@ -37,8 +37,16 @@ def rotated(
     angle = np.linalg.norm(by, axis=1, keepdims=True)
     sine = np.sinc(angle / np.pi)
     cosine = 0.5 * np.sinc(angle / (2 * np.pi)) ** 2
-    once = np.cross(by, vectors)
-    return vectors + sine * once + cosine * np.cross(by, once)
+    once = cross(by, vectors)
+    return vectors + sine * once + cosine * cross(by, once)
+
+
+def cross(
+    a: Float[np.ndarray, "*#n 3"], b: Float[np.ndarray, "*#n 3"]
+) -> Float[np.ndarray, "*#n 3"]:
+    """Vector products; NumPy's own is several times slower for some hundred vectors."""
+    (ax, ay, az), (bx, by, bz) = np.moveaxis(a, -1, 0), np.moveaxis(b, -1, 0)
+    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], -1)
 
 
 @dataclass(frozen=True)

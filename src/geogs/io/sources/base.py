@@ -24,6 +24,7 @@ from geogs.io.sources.intrinsics import resolve_intrinsics
 from geogs.io.sources.undistort import Rectifier
 from geogs.shutter.camera import RollingCamera
 from geogs.shutter.neighbours import with_turning
+from geogs.shutter.readout import FRAMES
 from geogs.shutter.rows import RowOffsets
 from geogs.shutter.shutter import Shutter
 from geogs.types import Frame
@@ -157,16 +158,23 @@ class Source:
 
     @property
     def rolling_camera(self) -> RollingCamera:
-        """The camera of the images that :meth:`resized_images` gives."""
+        """The camera of the images that :meth:`first_images` gives."""
         turns = self._reader.quarter_turns
         lines = self._reader.width if turns % 2 else self._reader.height
         return self._rectifier.rolling_camera(lines, turns)
 
-    def resized_images(self, start: int, stop: int | None) -> Iterator[RawFrame]:
-        """Neighbouring images at working size as they came, from one place in the source on.
+    def first_images(self) -> Generator[RawFrame, None, None]:
+        """Neighbouring images at working size as they came, from the start of the selection on.
 
-        The stride does not count, nor do the start and the stop of the selection.
+        They are as many as tell the readout; the stride does not count.
         """
+        config = self._config
+        stop = config.start + FRAMES
+        stop = stop if config.stop is None else min(stop, config.stop)
+        yield from self._resized(config.start, stop)
+
+    def _resized(self, start: int, stop: int | None) -> Iterator[RawFrame]:
+        """Neighbours in the source at working size, lens and rows as they came."""
         for raw in self._reader.read(start, stop, 1):
             if raw.image is not None:
                 _check_size(raw, self._reader)
@@ -254,7 +262,7 @@ class Source:
             inside = config.stop is None or start + after < config.stop
             return after >= 0 and after % config.stride == 0 and inside
 
-        images = self.resized_images(start - before, stop)
+        images = self._resized(start - before, stop)
         offsets = RowOffsets(rolling, self.camera)
         for raw, turning in with_turning(images, rolling, readout, is_selected):
             if raw.image is None:

@@ -1,6 +1,6 @@
 """Several videos of one place, taken with one camera, as a single stream."""
 
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass, replace
 
 from geogs.errors import InputError
@@ -110,12 +110,12 @@ class SeveralSources:
 
     @property
     def rolling_camera(self) -> RollingCamera:
-        """The camera of the images that :meth:`resized_images` gives."""
+        """The camera of the images that :meth:`first_images` gives."""
         return self._sources[0].rolling_camera
 
-    def resized_images(self, start: int, stop: int | None) -> Iterator[RawFrame]:
+    def first_images(self) -> Generator[RawFrame, None, None]:
         """Neighbouring images of the first source, see there."""
-        return self._sources[0].resized_images(start, stop)
+        return self._sources[0].first_images()
 
     def linked_frames(self) -> Generator[Frame, None, None]:
         """The frames of the first source."""

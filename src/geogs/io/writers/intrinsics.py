@@ -1,4 +1,4 @@
-"""``intrinsics.json``: the camera of the working images and that of the source."""
+"""``intrinsics.json``: the camera of the working images, that of the source, and its shutter."""
 
 import json
 from pathlib import Path
@@ -7,13 +7,19 @@ from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.io.sources.calibration import Calibration
 from geogs.io.writers.atomic import write_text
+from geogs.shutter.shutter import Shutter
 
 
 def write_intrinsics(
-    path: str | Path, camera: Camera, calibration: Calibration | None = None
+    path: str | Path,
+    camera: Camera,
+    calibration: Calibration | None = None,
+    shutter: Shutter | None = None,
 ) -> None:
     """Write the pinhole of the frames, and with it the calibration of the images as they came.
 
+    The frames have a global shutter; that of the images as they came is written with its readout in
+    seconds, by which rows were rectified.
     All in pixels with the centre of the first pixel at (0, 0). Given as ``intrinsics``,
     the file stands for the source's calibration where it has one.
     """
@@ -40,6 +46,8 @@ def write_intrinsics(
             "is_guess": calibration.is_guess,
             **_refinement(calibration),
         }
+    if shutter is not None:
+        document["shutter"] = {"readout": shutter.readout, "origin": shutter.origin}
     write_text(path, json.dumps(document, indent=2) + "\n")
 
 
