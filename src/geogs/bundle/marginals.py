@@ -14,7 +14,8 @@ from torch import Tensor
 
 from geogs.bundle.base import BundleOptions
 from geogs.bundle.linearise import Star, linearise_stars
-from geogs.bundle.problem import BundleProblem, StreamedProblem, source_chunks
+from geogs.bundle.problem import BundleProblem, StreamedProblem, source_chunks, sources_within
+from geogs.bundle.projection import project, relative_motion
 from geogs.geometry.lie import se3_inverse
 from geogs.keyframes.grid import SampleGrid
 
@@ -36,6 +37,10 @@ class Marginals:
     """Covariance of the left perturbation of each pose; float64."""
     relative_depth: Float[Tensor, "n c"]
     """Deviation of the inverse depth of some cells of each frame, as a part of it."""
+
+    strain: Float[Tensor, "n"]
+    """Median residual of the matches from each frame, in their own standard deviations (two
+    dimensions): 1.2 where errors are as expected, more where the scene is not as modelled."""
 
     @property
     def depth_deviation(self) -> Float[Tensor, "n"]:
@@ -73,7 +78,7 @@ def marginals(
         if star.depth is not None:
             sigma = _depth_variance(star, covariance, alike).sqrt()
             relative[star.frame] = sigma / part.inverse_depth[star.frame].clamp(min=1e-12)
-    return Marginals(pose, relative)
+    return Marginals(pose, relative, _strain(problem, part, options))
 
 
 class _Thinned:
@@ -91,12 +96,26 @@ class _Thinned:
 
     def stars(self, options: BundleOptions) -> Iterator[Star]:
         """All stars, in order."""
-        T = self._problem.T_cw.cpu()
-        for chunk in source_chunks(self._problem.source.cpu(), options.chunk):
-            part = self._part(chunk)
+        for part in self._parts(options):
             yield from linearise_stars(
-                self._camera, self._rays, part, T, self.inverse_depth, options
+                self._camera, self._rays, part, part.T_cw, self.inverse_depth, options
             )
+
+    def residuals(self, options: BundleOptions) -> Iterator[tuple[int, Float[Tensor, "m"]]]:
+        """Of each source in order: norms of its matches' residuals in standard deviations."""
+        for part in self._parts(options):
+            i, j = part.source, part.target
+            at = project(
+                self._camera, self._rays, relative_motion(part.T_cw, i, j), self.inverse_depth[i]
+            )
+            norm = (part.weight * (part.pixels - at.pixels).square()).sum(-1).sqrt()
+            used = at.valid & (part.weight[..., 0] > 0)
+            for frame, edges in sources_within(i):
+                yield frame, norm[edges][used[edges]]
+
+    def _parts(self, options: BundleOptions) -> Iterator[BundleProblem]:
+        for chunk in source_chunks(self._problem.source.cpu(), options.chunk):
+            yield self._part(chunk)
 
     def _part(self, chunk: slice) -> BundleProblem:
         p, every = self._problem, self._every
@@ -134,6 +153,17 @@ def _pose_covariance(
     inverse = torch.full_like(S, torch.inf) if int(failed) else torch.cholesky_inverse(factor)
     covariance[free[:, None], free] = inverse
     return covariance
+
+
+def _strain(
+    problem: BundleProblem | StreamedProblem, part: _Thinned, options: BundleOptions
+) -> Float[Tensor, "n"]:
+    """Median residual from each frame; infinite without matches."""
+    strain = torch.full((len(problem.T_cw),), torch.inf)
+    for frame, norm in part.residuals(options):
+        if len(norm):
+            strain[frame] = norm.median()
+    return strain
 
 
 def _scaling(T_cw: Float[Tensor, "n 4 4"], origin: int) -> Float[Tensor, "m"]:

@@ -1,0 +1,63 @@
+"""How well a tracker knows its keyframes: by what all its matches leave open of poses and depths."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64
+
+from geogs.bundle.base import BundleOptions
+from geogs.bundle.marginals import Marginals, marginals
+from geogs.tracking.tracker import Tracker
+
+TOGETHER = 300
+"""Keyframes whose poses are looked at jointly; of longer videos the parts follow each other."""
+
+
+@dataclass(frozen=True)
+class Certainty:
+    """Standard deviations of keyframes, earliest first; infinite where nothing is known."""
+
+    keyframes: tuple[int, ...]
+    """Their ids."""
+    position: Float64[np.ndarray, "n"]
+    """Of the camera's centre relative to the first keyframe, map units, all axes together."""
+    rotation: Float64[np.ndarray, "n"]
+    """Likewise of its orientation, radians."""
+    depth: Float64[np.ndarray, "n"]
+    """Of its depths, as a part of them: the median."""
+    strain: Float64[np.ndarray, "n"]
+    """Median residual of its matches in their own deviations."""
+
+
+def certainty(tracker: Tracker) -> Certainty:
+    """Of all keyframes of a tracker that has a map, from the edges that it has at present.
+
+    Lengths are relative to the length of the path: the unit of the map is anyone's. In a long
+    video each part begins where the one before it ended, so that errors add up along the way
+    whatever loops say: what is told of it is rather too much.
+    """
+    ids = tracker.keyframe_ids
+    position, rotation, depth, strain = (np.full(len(ids), np.inf) for _ in range(4))
+    carried = np.zeros(2)
+    for first in range(0, max(len(ids) - 1, 1), TOGETHER):
+        part = slice(first, first + TOGETHER + 1)
+        found = _marginals(tracker, ids[part])
+        if found is None:
+            continue
+        squares = found.pose.diagonal(dim1=-2, dim2=-1).reshape(-1, 2, 3).sum(-1).numpy()
+        squares = squares + carried
+        position[part], rotation[part] = np.sqrt(squares).T
+        depth[part], strain[part] = found.depth_deviation.numpy(), found.strain.numpy()
+        carried = squares[-1]
+    return Certainty(tuple(ids), position, rotation, depth, strain)
+
+
+def _marginals(tracker: Tracker, ids: list[int]) -> Marginals | None:
+    """Of some keyframes, by the edges between them; none where there are none."""
+    among = set(ids)
+    edges = [e for e in tracker.graph.edges if among.issuperset(e)]
+    if not edges:
+        return None
+    problem, _ = tracker.graph.streamed_problem(edges, ids[1:], ids)
+    grid = tracker.keyframes.grid
+    return marginals(grid, problem, BundleOptions(huber=tracker.config.huber), cells=512)
