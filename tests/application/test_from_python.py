@@ -69,6 +69,7 @@ def require_same(folder: Path, other: Path) -> None:
 def test_a_run_frame_by_frame_is_that_of_the_command(small_room, tmp_path, capfd):
     source = geogs.open_source(small_room, run_config().input)
     source = geogs.application.self_calibrated(source)
+    source = geogs.application.with_shutter_found(source)
     slam = geogs.Slam(source.camera, run_config())
     for frame in source:
         slam.process(frame)

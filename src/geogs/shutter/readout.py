@@ -92,7 +92,7 @@ def find_readout(
     features = _Features(views)
     curves: list[Float[np.ndarray, "k"]] = []
     apart: list[float] = []
-    for i, j in _pairs(views):
+    for i, j in _pairs(views, 2 * LEAST_SHIFT / (float(CANDIDATES[-1]) * camera.camera.fy)):
         report(0.5 + 0.5 * len(curves) / PAIRS)
         matches = features.matches(i, j)
         curve = None if matches is None else _curve(camera, (views[i], views[j]), matches)
@@ -159,13 +159,17 @@ def _steps(flow: RayFlow, interval: float) -> tuple[Step, Step] | None:
     return Step(rates[0], interval), Step(rates[1], interval)
 
 
-def _pairs(views: Sequence[View]) -> list[tuple[int, int]]:
-    """Pairs of views across a gap, those first whose angular velocities differ most."""
+def _pairs(views: Sequence[View], least: float) -> list[tuple[int, int]]:
+    """Pairs of views across a gap, those first whose angular velocities differ most.
+
+    They differ by ``least`` radians per second; with less, no readout would show.
+    """
     rates = np.array([view.at_once.rate for view in views]).reshape(-1, 3)
     times = np.array([view.timestamp for view in views])
     gap = times[None] - times[:, None]
-    i, j = np.nonzero((gap >= GAPS[0]) & (gap <= GAPS[1]))
-    order = np.argsort(-np.linalg.norm(rates[i] - rates[j], axis=1), kind="stable")
+    apart = np.linalg.norm(rates[None] - rates[:, None], axis=2)
+    i, j = np.nonzero((gap >= GAPS[0]) & (gap <= GAPS[1]) & (apart >= least))
+    order = np.argsort(-apart[i, j], kind="stable")
     used: Counter[int] = Counter()
     chosen = []
     for one, other in zip(i[order].tolist(), j[order].tolist(), strict=True):
