@@ -166,6 +166,10 @@ class Reconstruction:
     keyframe_trajectory = trajectory
     """The same: every image counts."""
 
+    def uncertainty(self) -> None:
+        """Nothing: the poses were given."""
+        return None
+
     def snapshot(self) -> MapSnapshot:
         """The disks as they are now."""
         return self._frame.world_snapshot(self.mapper.map.snapshot())

@@ -19,10 +19,11 @@ from geogs.mapping.state import MapperState
 from geogs.priors.base import MonocularPrior
 from geogs.stopwatch import Stopwatch, StopwatchState
 from geogs.threads import on_one_torch_thread
+from geogs.tracking.certainty import certainty
 from geogs.tracking.flow.select import build_operator
 from geogs.tracking.segments import Segments, SegmentsState
 from geogs.tracking.tracker import Tracker, TrackResult, TrackState
-from geogs.types import Frame, MapSnapshot, RenderedKeyframe, Trajectory
+from geogs.types import Frame, MapSnapshot, RenderedKeyframe, Trajectory, Uncertainty
 
 Progress = Callable[[str, float], None]
 """Called with the name of a stage and its finished fraction in [0, 1]."""
@@ -180,6 +181,13 @@ class Slam:
         T_wc = [torch.linalg.inv(k.T_cw).numpy() for k in keyframes]
         times = np.array([k.timestamp for k in keyframes], dtype=np.float64)
         return Trajectory(times, np.array(T_wc).reshape(-1, 4, 4), np.ones(len(times), dtype=bool))
+
+    @on_one_torch_thread
+    def uncertainty(self) -> Uncertainty:
+        """How well the keyframes are known, by the matches that there are now."""
+        world = self.segments.world
+        with self.stopwatch("uncertainty"):
+            return certainty(world).calibrated(world)
 
     def particulars(self) -> dict[str, object]:
         """What a summary says of segments and loops, ready for JSON."""

@@ -47,6 +47,21 @@ class Trajectory:
 
 
 @dataclass(frozen=True, slots=True)
+class Uncertainty:
+    """Standard deviations of keyframes, earliest first; infinite where nothing is known."""
+
+    timestamps: Float[np.ndarray, "n"]
+    """Seconds."""
+    position: Float[np.ndarray, "n"]
+    """Of the camera's centre, map units, all axes together; relative to the first keyframe, and to
+    the length of the path."""
+    rotation: Float[np.ndarray, "n"]
+    """Of its orientation, radians."""
+    depth: Float[np.ndarray, "n"]
+    """Of its depths, as a part of them: the median."""
+
+
+@dataclass(frozen=True, slots=True)
 class MapSnapshot:
     """The disks of a map as plain numbers, detached from training."""
 

@@ -8,10 +8,11 @@ from pathlib import Path
 from geogs.application.progress import RunProgress
 from geogs.application.scene import MappedScene
 from geogs.application.surfaces import surface_of
+from geogs.application.verdict import Verdict, verdict
 from geogs.io.sources.posed.base import PosedSource
 from geogs.io.sources.sniff import Stream
 from geogs.mesh.types import Mesh
-from geogs.types import MapSnapshot, RenderedKeyframe, Trajectory
+from geogs.types import MapSnapshot, RenderedKeyframe, Trajectory, Uncertainty
 
 
 @dataclass(frozen=True)
@@ -36,6 +37,18 @@ class Result:
     def keyframes(self) -> Trajectory:
         """Poses of the keyframes alone."""
         return self.scene.keyframe_trajectory()
+
+    @cached_property
+    def uncertainty(self) -> Uncertainty | None:
+        """How well the keyframes are known; none where the poses were given."""
+        return self.scene.uncertainty()
+
+    @cached_property
+    def verdict(self) -> Verdict | None:
+        """Whether trajectory and shape are to be relied on; none where the poses were given."""
+        if self.uncertainty is None:
+            return None
+        return verdict(self.trajectory, self.keyframes, self.uncertainty)
 
     @cached_property
     def map(self) -> MapSnapshot:

@@ -58,6 +58,8 @@ def write_results(
             f"warning: {lost} of {scene.frames} frames were not tracked; slower motion, texture "
             "or the right --intrinsics may help."
         )
+    if result.verdict is not None:
+        progress.write(result.verdict.sentence)
     summary = summarise(result)
     write_text(output / "summary.json", json.dumps(summary, indent=2))
     with scene.stopwatch("report"):

@@ -5,7 +5,7 @@ from typing import Protocol, runtime_checkable
 
 from geogs.config import Config, ReconstructConfig
 from geogs.stopwatch import Stopwatch
-from geogs.types import MapSnapshot, RenderedKeyframe, Trajectory
+from geogs.types import MapSnapshot, RenderedKeyframe, Trajectory, Uncertainty
 
 
 @runtime_checkable
@@ -30,6 +30,10 @@ class MappedScene(Protocol):
 
     def keyframe_trajectory(self) -> Trajectory:
         """Poses of the keyframes alone."""
+        ...
+
+    def uncertainty(self) -> Uncertainty | None:
+        """How well the keyframes are known; none where the poses were given."""
         ...
 
     def snapshot(self) -> MapSnapshot:

@@ -24,6 +24,7 @@ def summarise(result: Result) -> dict[str, object]:
         "kind": source.kind,
         "frames": scene.frames,
         **source_summary(source),
+        "verdict": None if result.verdict is None else _finite(asdict(result.verdict)),
         "keyframes": len(result.keyframes.timestamps),
         "lost_spans": lost_spans(result.trajectory),
         **scene.particulars(),
@@ -41,6 +42,11 @@ def summarise(result: Result) -> dict[str, object]:
             "python": platform.python_version(),
         },
     }
+
+
+def _finite(values: dict[str, object]) -> dict[str, object]:
+    """The values with none instead of infinity, which JSON does not know."""
+    return {k: None if v == float("inf") else v for k, v in values.items()}
 
 
 def source_summary(source: Stream | PosedSource) -> dict[str, object]:

@@ -66,7 +66,7 @@ def marginals(
         cells: most cells of a frame that are looked at, evenly spread; the others' matches are
             taken to be as good.
 
-    Where no more than one pose is fixed, lengths are relative to the distances of the cameras from it.
+    Where at most one pose is fixed, lengths are relative to the distances of the cameras from it.
     """
     options, part = options or BundleOptions(), _Thinned(grid, problem, cells)
     covariance = alike * _pose_covariance(problem, part, options)

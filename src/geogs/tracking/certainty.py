@@ -1,4 +1,4 @@
-"""How well a tracker knows its keyframes: by what all its matches leave open of poses and depths."""
+"""How well a tracker knows its keyframes, by what all its matches leave open."""
 
 from dataclasses import dataclass
 
@@ -8,25 +8,45 @@ from jaxtyping import Float64
 from geogs.bundle.base import BundleOptions
 from geogs.bundle.marginals import Marginals, marginals
 from geogs.tracking.tracker import Tracker
+from geogs.types import Uncertainty
 
 TOGETHER = 300
 """Keyframes whose poses are looked at jointly; of longer videos the parts follow each other."""
+USUAL_STRAIN = 0.23
+"""Median residual, in deviations of a match, where the scene is as modelled."""
+STRAIN_POWER = 4
+"""Errors of poses grow with this power of the strain. Both were read off 15 rendered videos with
+and without rolling shutter, blur, noise and people who cross: the error of the keyframes, in
+foretold deviations, is 0.2 to 0.9 in the median at a strain of 0.21 to 0.26, 1 to 3 at 0.32 to
+0.38 and 3 to 15 above."""
 
 
 @dataclass(frozen=True)
 class Certainty:
-    """Standard deviations of keyframes, earliest first; infinite where nothing is known."""
+    """What matches leave open, and how far they contradict the model; earliest keyframe first."""
 
     keyframes: tuple[int, ...]
-    """Their ids."""
+    """Ids."""
     position: Float64[np.ndarray, "n"]
-    """Of the camera's centre relative to the first keyframe, map units, all axes together."""
+    """Standard deviation of the camera's centre relative to the first keyframe, map units, all axes
+    together; infinite where nothing is known, as the others."""
     rotation: Float64[np.ndarray, "n"]
     """Likewise of its orientation, radians."""
     depth: Float64[np.ndarray, "n"]
     """Of its depths, as a part of them: the median."""
     strain: Float64[np.ndarray, "n"]
-    """Median residual of its matches in their own deviations."""
+    """Median residual of its matches, in their deviations."""
+
+    def calibrated(self, tracker: Tracker) -> Uncertainty:
+        """Deviations that hold where the scene is not as modelled, too: see ``STRAIN_POWER``."""
+        strain = np.where(np.isfinite(self.strain), self.strain / USUAL_STRAIN, 1.0)
+        strain = np.maximum(strain, 1.0)
+        factor = float(np.mean(strain**STRAIN_POWER)) if len(strain) else 1.0
+        times = [tracker.keyframes[k].timestamp for k in self.keyframes]
+        return Uncertainty(
+            np.array(times, np.float64), factor * self.position, factor * self.rotation,
+            strain * self.depth,
+        )  # fmt: skip
 
 
 def certainty(tracker: Tracker) -> Certainty:

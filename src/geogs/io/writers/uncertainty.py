@@ -1,0 +1,27 @@
+"""How well every frame is known, as a table."""
+
+from pathlib import Path
+
+import numpy as np
+
+from geogs.io.writers.atomic import write_text
+from geogs.types import Trajectory, Uncertainty
+
+HEADER = "timestamp,state,sigma_position,sigma_rotation_deg,relative_sigma_depth"
+
+
+def write_uncertainty(path: str | Path, trajectory: Trajectory, known: Uncertainty) -> None:
+    """Write a row per frame: state (tracked or lost), standard deviations as of ``Uncertainty``.
+
+    Between keyframes they are interpolated in time; a lost frame has none.
+    """
+    at, frames = trajectory.timestamps, trajectory.tracked
+    columns = [known.position, np.degrees(known.rotation), known.depth]
+    between = [
+        np.interp(at, known.timestamps, c) if len(c) else np.full(len(at), np.inf) for c in columns
+    ]
+    rows = [HEADER]
+    for n, tracked in enumerate(frames):
+        numbers = [f"{c[n]:.6g}" if tracked else "" for c in between]
+        rows.append(",".join([repr(float(at[n])), "tracked" if tracked else "lost", *numbers]))
+    write_text(path, "\n".join([*rows, ""]))
