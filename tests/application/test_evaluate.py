@@ -21,6 +21,8 @@ from geogs.io.writers.ply import write_mesh
 from geogs.io.writers.tum import write_tum_trajectory
 from geogs.types import Trajectory
 
+pytestmark = pytest.mark.system
+
 
 @pytest.fixture
 def result(tmp_path):

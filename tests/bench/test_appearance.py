@@ -44,6 +44,8 @@ from geogs_bench.appearance.triangulation import (
 from geogs_bench.appearance.views import TrainingView, scene_scale
 from oracles.appearance_reference import ReferenceRasteriser
 
+pytestmark = pytest.mark.system
+
 CAMERA = Camera(40.0, 42.0, 15.3, 11.2, 32, 24)
 CONFIG = AppearanceConfig()
 HASTY = replace(

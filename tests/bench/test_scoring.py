@@ -29,6 +29,8 @@ from geogs_bench.result import ResultFolder
 from geogs_bench.scoring.scores import score
 from geogs_bench.scoring.tessellation import with_short_edges
 
+pytestmark = pytest.mark.system
+
 FROM = Provenance("run", "abc123", "a processor, 2 cores", "cpu", 0, "0123456789ab")
 
 

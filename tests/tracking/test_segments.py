@@ -20,6 +20,8 @@ from geogs.tracking.tracker import Tracker, TrackState
 from geogs.types import Frame
 from loop_scenes import at_angle, room
 
+pytestmark = pytest.mark.system
+
 CAMERA = Camera(fx=135.0, fy=135.0, cx=95.5, cy=71.5, width=192, height=144)
 CONFIG = TrackingConfig(init_keyframes=5, patience=4)
 LOOPS = LoopConfig(min_gap=100)  # only between segments

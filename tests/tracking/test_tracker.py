@@ -18,6 +18,8 @@ from geogs.types import Frame, PoseCorrection
 from tracking_runs import CONFIG, PATH, error_cm
 from tracking_scenes import CAMERA, frames, pose, render, sideways
 
+pytestmark = pytest.mark.system
+
 
 def run(stream: list[Frame], config: TrackingConfig = CONFIG) -> tuple[Tracker, list]:
     tracker = Tracker(CAMERA, config)

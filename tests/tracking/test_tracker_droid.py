@@ -23,6 +23,8 @@ from geogs.tracking.tracker import Tracker
 from tracking_runs import error_cm
 from tracking_scenes import CAMERA, frames, render, sideways
 
+pytestmark = pytest.mark.system
+
 GRID = SampleGrid(CAMERA)
 CONFIG = TrackingConfig(init_keyframes=5, window=4, depth_window=6)
 ROWS, COLUMNS = GRID.height, GRID.width

@@ -29,6 +29,8 @@ from geogs_train.scores import CellErrors, has_texture, summarise
 from geogs_train.starts import StartOptions, disturbed_starts
 from geogs_train.trainer import FlowTrainer, Worker, schedule
 
+pytestmark = pytest.mark.system
+
 ROOMS = RoomOptions(
     width=64, height=48, textures=6, texture_size=64, least_density=0.02, most_density=0.05
 )

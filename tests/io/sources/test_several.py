@@ -19,6 +19,8 @@ from geogs.slam import Slam
 from geogs.types import Frame, Trajectory
 from tracking_scenes import CAMERA, frames, sideways
 
+pytestmark = pytest.mark.system
+
 # A map of the least: its poses and its keyframes are what is asked for.
 QUICK = Config(
     tracking=TrackingConfig(init_keyframes=5),

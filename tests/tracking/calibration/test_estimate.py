@@ -16,6 +16,8 @@ from geogs.tracking.calibration.keyframes import with_focal
 from geogs.types import Frame
 from tracking_scenes import CAMERA, frames, pose, render
 
+pytestmark = pytest.mark.system
+
 CONFIG = CalibrationConfig(start_keyframes=8, keyframes=16)
 
 

@@ -23,6 +23,8 @@ from posed_layouts import (
     write_tum,
 )
 
+pytestmark = pytest.mark.system
+
 NATIVE = InputConfig(long_edge=0)
 # Camera-to-world rotations as others write them: columns are their x, y and z.
 Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # OpenCV axes of those of the camera

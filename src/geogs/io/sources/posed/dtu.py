@@ -84,7 +84,7 @@ def _read_matrices(
 ) -> tuple[dict[int, Float64[np.ndarray, "4 4"]], Float64[np.ndarray, "4 4"] | None]:
     """``world_mat_i`` by i, in order, and the first ``scale_mat_i`` if there is one."""
     try:
-        with np.load(path) as archive:
+        with path.open("rb") as stream, np.load(stream) as archive:
             matrices = {name: archive[name].astype(np.float64) for name in archive.files}
     except Exception as error:  # a damaged archive raises whatever zipfile, zlib or numpy find
         raise InputError(f"{path} is damaged or no NumPy archive; copy it again.") from error
