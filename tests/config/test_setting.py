@@ -18,6 +18,7 @@ from geogs.cli.demo import DemoOptions
 from geogs.cli.synth import SynthOptions
 from geogs.config.setting import Kind, Only, Range, Settings, Time, kinds
 from geogs.errors import InputError
+from geogs.synth.flaws import Flaws
 from geogs_bench.settings import BenchSettings
 from geogs_train.cli import TrainOptions
 
@@ -25,6 +26,7 @@ TREES = (config.Config(), config.ReconstructConfig())
 TRAINING = TrainOptions("flow", Path("x"))
 COMMANDS = (
     RunSettings, ReconstructSettings, EvalSettings, BenchSettings, DemoOptions, SynthOptions,
+    Flaws,
 )  # fmt: skip
 
 

@@ -10,7 +10,11 @@ import pytest
 from geogs.cli.synth import main
 from geogs.errors import InputError, OutputError
 from geogs.evaluation.surface import read_surface
+from geogs.io.poses import read_poses
+from geogs.io.sources.sniff import open_source
 from geogs.synth.export import default_camera, write_sequence
+from geogs.synth.flaws import Flaws
+from geogs.synth.motions import room_motion
 from geogs.synth.raycast import Raycaster
 from geogs.synth.room import make_room
 from geogs.synth.scene import Scene
@@ -122,3 +126,73 @@ def test_bad_input(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(OutputError):
         write_sequence(tmp_path / "file", 1, 32, 24)
+
+
+def test_flawed_sequence_is_read_back(tmp_path: Path) -> None:
+    """Distortion, times and truth, through the command; other sequences say nothing of them."""
+    options = ["--frames", "3", "--width", "48", "--height", "36", "--moving", "0.2"]
+    options += ["--motion", "handheld-5hz", "--camera", "action", "--flaws.readout", "0.03"]
+    assert main([str(tmp_path), *options]) == 0
+    source = open_source(tmp_path)
+    assert source.calibration.distortion == (-0.25, 0.06, 0.0, 0.0)
+    assert source.fps == pytest.approx(5)
+    assert [frame.timestamp for frame in source] == [0.0, 0.2, 0.4]
+    poses = read_poses(tmp_path)
+    path = room_motion("handheld-5hz", make_room(0)).path
+    np.testing.assert_allclose(poses.T_wc, path(np.array([0.0, 0.2, 0.4])), atol=1e-9)
+    np.testing.assert_allclose(poses.timestamps, [0.0, 0.2, 0.4])
+    truth = json.loads((tmp_path / "cam_params.json").read_text())
+    assert truth["readout"] == truth["flaws"]["readout"] == 0.03
+    assert truth["flaws"]["exposure"] == 0.005
+    assert truth["fps"] == 5.0
+    assert truth["motion"] == "handheld-5hz"
+    assert truth["moving"] == 0.2
+    masks = [cv2.imread(str(tmp_path / f"results/moving{k:06d}.png"), 0) for k in range(3)]
+    assert set(np.unique(masks)) <= {0, 255}
+    assert np.mean(masks) > 0
+
+
+def test_points_leave_out_what_moves(tmp_path: Path, scene: Scene, raycaster: Raycaster) -> None:
+    take = {"seed": SEED, "motion": "handheld-5hz", "depth": False, "raycaster": raycaster}
+    write_sequence(tmp_path, 9, 48, 36, moving=0.3, **take)
+    points = read_surface(tmp_path / "points_seen_1cm.ply").vertices
+    assert np.quantile(scene.clearance(points), 0.7) < 1e-4
+    masks = [cv2.imread(str(tmp_path / f"results/moving{k:06d}.png"), 0) for k in range(9)]
+    assert np.mean(masks) > 0.1 * 255
+    seen = len(points)
+    write_sequence(tmp_path, 9, 48, 36, **take)
+    still = read_surface(tmp_path / "points_seen_1cm.ply").vertices
+    assert seen < 0.95 * len(still)
+    known = {tuple(np.rint(p * 1e4).astype(int)) for p in still}
+    assert np.mean([tuple(np.rint(p * 1e4).astype(int)) in known for p in points]) > 0.9
+
+
+def test_times_of_an_earlier_sequence_are_not_believed(
+    tmp_path: Path, raycaster: Raycaster
+) -> None:
+    """A folder that was written at 5 Hz and is written again at 30 Hz is at 30 Hz."""
+    for motion in ("handheld-5hz", "handheld"):
+        write_sequence(tmp_path, 2, 32, 24, SEED, motion=motion, raycaster=raycaster)
+    assert [frame.timestamp for frame in open_source(tmp_path)] == pytest.approx(
+        [0, 1 / 30], abs=1e-6
+    )
+    assert read_poses(tmp_path).timestamps == pytest.approx([0, 1 / 30], abs=1e-6)
+
+
+def test_png_goes_through_jpeg_where_asked(tmp_path: Path, raycaster: Raycaster) -> None:
+    for name, flaws in (("a", Flaws()), ("b", Flaws(jpeg=10))):
+        write_sequence(
+            tmp_path / name, 1, 48, 36, SEED, image_format="png", flaws=flaws, raycaster=raycaster
+        )
+    images = [cv2.imread(str(tmp_path / k / "results/frame000000.png")).astype(int) for k in "ab"]
+    assert 2 < np.abs(images[0] - images[1]).mean() < 30
+
+
+def test_bad_flaws(tmp_path: Path, raycaster: Raycaster) -> None:
+    with pytest.raises(InputError, match=r"flaws\.readout is 0.5, but must be"):
+        main([str(tmp_path), "--flaws.readout", "0.5"])
+    with pytest.raises(InputError, match="fold"):
+        write_sequence(tmp_path, 1, flaws=Flaws(k1=-0.5), raycaster=raycaster)
+    with pytest.raises(InputError, match="motion is 'flying', but must be handheld or"):
+        main([str(tmp_path), "--motion", "flying"])
+    assert not list(tmp_path.iterdir())

@@ -37,6 +37,8 @@ class SynthOptions(Settings):
     """A camera with typical flaws, or none."""
     flaws: Flaws = field(default_factory=Flaws)
     """Single flaws, over those of the camera."""
+    moving: Annotated[float, Range(0, 0.5)] = 0.0
+    """Share of the image that people cover who cross the view; 0 lets nothing move."""
     depth: bool = True
     """Write depth images too."""
     image_format: Literal["jpg", "png"] = "jpg"
@@ -64,6 +66,7 @@ def main(argv: Sequence[str]) -> int:
             options.seed,
             motion=options.motion,
             flaws=options.flaws,
+            moving=options.moving,
             depth=options.depth,
             image_format=options.image_format,
             video=options.video,

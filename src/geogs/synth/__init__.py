@@ -1,6 +1,6 @@
-"""The procedural textured room: exact depth, normals, mesh and poses for demo, tests, training.
+"""Procedural scenes with exact truth: depth, normals, mesh, poses; for demo, tests, training.
 
-``room.make_room(seed)`` gives a ``scene.Scene``; ``raycast.Raycaster(scene)`` renders it;
-``trajectory.handheld_trajectory`` walks a camera through it; ``export.write_sequence`` does it all
+``stage.make_stage`` gives a furnished room or a street and a motion through it; ``raycast.Raycaster``
+renders it from any pose, ``shooting.Shooting`` as a camera with flaws sees it; ``export`` does it all
 and writes a data set.
 """

@@ -1,5 +1,6 @@
 """Writes a synthetic sequence with its ground truth in the layout of Replica."""
 
+import math
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from fractions import Fraction
@@ -22,6 +23,9 @@ from geogs.synth.tessellation import SeenSurface, scene_mesh
 from geogs.synth.truth_files import write_camera, write_trajectory
 
 _JPEG_QUALITY = 95
+_DEPTH_UNITS = 65535
+# Level 1 is four times faster than the default and a few percent larger.
+_FAST_PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1]
 
 
 def default_camera(width: int, height: int) -> Camera:
@@ -38,10 +42,12 @@ def write_sequence(
     *,
     motion: MotionKind = "handheld",
     flaws: Flaws | None = None,
+    moving: float = 0.0,
     depth: bool = True,
     image_format: str = "jpg",
     video: bool = False,
     threads: int = 2,
+    raycaster: Raycaster | None = None,
     on_frame: Callable[[int], None] = lambda index: None,
 ) -> None:
     """Renders a scene and writes images, depths, poses, intrinsics and the true surface.
@@ -51,7 +57,11 @@ def write_sequence(
     ``cam_params.json``, ``mesh.ply`` (the whole scene), ``points_seen_1cm.ply`` (what the camera
     saw), and ``video.mp4`` if asked for. Where the motion has not 30 frames a second, ``rgb.txt``
     and ``groundtruth.txt`` hold the times, in the layout of TUM. Depth and poses are those of the
-    middle row at mid-exposure, whatever the flaws. ``on_frame`` is called after each frame.
+    middle row at mid-exposure, whatever the flaws. With ``moving``, things that cover about this
+    share of the image cross the view: they are in the images and the depths, but in neither the
+    mesh nor the points, and ``results/moving%06d.png`` is white where the depth is theirs.
+    ``raycaster`` of the same scene, where there is one, saves its making. ``on_frame`` is called
+    after each frame.
 
     Raises:
         InputError: what is asked for cannot be rendered.
@@ -62,15 +72,20 @@ def write_sequence(
     if frames < 1:
         raise InputError(f"a sequence needs at least 1 frame, not {frames}")
     flaws = flaws or Flaws()
-    stage = make_stage(motion, seed)
+    stage = make_stage(motion, seed, raycaster.scene if raycaster else None)
+    rate = stage.motion.rate
+    if frames / rate > stage.motion.seconds:
+        most = math.floor(stage.motion.seconds * rate)
+        raise InputError(f"{motion} ends after {most} frames; ask for no more than that")
     lens = Lens(stage.camera(width, height), flaws.k1, flaws.k2)
     folder = prepare_output_folder(folder)
     results = prepare_output_folder(folder / "results")
-    write_camera(folder / "cam_params.json", stage, lens, motion, flaws)
+    write_camera(folder / "cam_params.json", stage, lens, flaws, moving)
     write_trajectory(folder, stage.motion, frames, image_format)
     write_mesh(folder / "mesh.ply", *scene_mesh(stage.scene))
-    rate = stage.motion.rate
-    shooting = Shooting(Raycaster(stage.scene, threads), lens, stage.motion.path, flaws, rate, seed)
+    bodies = stage.bodies(lens.camera, frames / rate, moving) if moving else []
+    raycaster = raycaster or Raycaster(stage.scene, threads)
+    shooting = Shooting(raycaster.with_bodies(bodies), lens, stage.motion.path, flaws, rate, seed)
     quality = _JPEG_QUALITY if flaws.jpeg is None else flaws.jpeg
 
     def shoot(index: int) -> Shot:
@@ -79,10 +94,12 @@ def write_sequence(
         options = [cv2.IMWRITE_JPEG_QUALITY, quality] if image_format == "jpg" else []
         _write_image(name, cv2.cvtColor(shot.image, cv2.COLOR_RGB2BGR), options)
         if depth:
-            units = np.rint(shot.truth.depth * stage.depth_scale).clip(0, 65535).astype(np.uint16)
-            # Level 1 is four times faster than the default and a few percent larger.
-            name = results / f"depth{index:06d}.png"
-            _write_image(name, units, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+            units = np.rint(shot.truth.depth * stage.depth_scale)
+            units = np.where(units > _DEPTH_UNITS, 0, units).astype(np.uint16)
+            _write_image(results / f"depth{index:06d}.png", units, _FAST_PNG)
+        if moving:
+            mask = np.where(shot.moving, 255, 0).astype(np.uint8)
+            _write_image(results / f"moving{index:06d}.png", mask, _FAST_PNG)
         return shot
 
     seen = SeenSurface(stage.scene, lens, stage.voxel_cm / 100)
@@ -91,7 +108,8 @@ def write_sequence(
         if video:
             shots = _encode(folder / "video.mp4", lens.camera, rate, shots)
         for index, shot in enumerate(shots):
-            seen.add(np.where(shot.moving, 0, shot.truth.depth), shot.T_wc)
+            away = shot.moving | (shot.truth.depth > stage.reach)
+            seen.add(np.where(away, 0, shot.truth.depth), shot.T_wc)
             on_frame(index)
     write_points(folder / f"points_seen_{stage.voxel_cm}cm.ply", seen.points)
 

@@ -2,10 +2,14 @@
 
 from typing import Literal, get_args
 
-MotionKind = Literal[
+RoomMotionKind = Literal[
     "handheld", "slow-handheld", "handheld-5hz", "walking", "turning-30", "turning-60",
     "turning-120", "pure-rotation", "rest-start", "jerks", "still",
 ]  # fmt: skip
-"""Names of the motions."""
-ROOM_MOTIONS: tuple[MotionKind, ...] = tuple(kind for kind in get_args(MotionKind))
-"""Those through a room."""
+"""Through a room."""
+ROOM_MOTIONS: tuple[RoomMotionKind, ...] = get_args(RoomMotionKind)
+MotionKind = Literal[
+    "handheld", "slow-handheld", "handheld-5hz", "walking", "turning-30", "turning-60",
+    "turning-120", "pure-rotation", "rest-start", "jerks", "still", "driving",
+]  # fmt: skip
+"""Through a room, or along a street."""

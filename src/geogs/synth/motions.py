@@ -3,6 +3,7 @@
 The first frame is at time 0. All keep clear of the furniture.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,7 +11,7 @@ from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
 from geogs.synth.bodies import Path
-from geogs.synth.motion_kinds import MotionKind
+from geogs.synth.motion_kinds import RoomMotionKind
 from geogs.synth.scene import Scene
 from geogs.synth.trajectory import FRAMES_PER_LAP, HandheldPath, look_at, with_shake
 
@@ -41,9 +42,11 @@ class Motion:
     """Camera to world at times in seconds."""
     rate: float = _FRAMES_PER_SECOND
     """Frames per second."""
+    seconds: float = math.inf
+    """How long it lasts."""
 
 
-def room_motion(kind: MotionKind, scene: Scene, seed: int = 0) -> Motion:
+def room_motion(kind: RoomMotionKind, scene: Scene, seed: int = 0) -> Motion:
     """A motion through a room; the same seed gives the same path.
 
     Raises:
@@ -68,7 +71,6 @@ def room_motion(kind: MotionKind, scene: Scene, seed: int = 0) -> Motion:
             return Motion(_with_jerks(_slow(scene, seed), seed))
         case "still":
             return Motion(_still(scene, seed))
-    raise ValueError(f"{kind} is no motion through a room")
 
 
 def _slow(scene: Scene, seed: int) -> HandheldPath:

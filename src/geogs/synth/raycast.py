@@ -20,7 +20,7 @@ from geogs.synth.scene import Scene, SceneBuilder, Texture, joined
 
 _LEVELS = 8
 _VOXEL = 0.14
-_MAX_CELLS = 120_000
+_MAX_CELLS = 60_000
 """Of the volume that holds the light; larger scenes have larger cells."""
 _AMBIENT_REACH = 0.7
 """Metres over which solids darken the ambient light, in cells of the smallest size."""
@@ -30,7 +30,7 @@ _SHADOW_MIN_HALF = 0.1
 cost as much as large ones."""
 _ROWS_PLACED = 8
 """Rows of a rolling shutter between which solids move straight over the image."""
-_SKY_RADIUS = 5000.0
+_SKY_RADIUS = 1e5
 _SKY_EMISSION = 0.95
 
 

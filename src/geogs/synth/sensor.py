@@ -41,9 +41,10 @@ class Sensor:
 
     def gains(self, time: float) -> Float64[np.ndarray, "3"]:
         """What the light of red, green and blue is multiplied with at ``time`` seconds."""
-        waves = np.sin(2 * np.pi * time / _PERIODS + self._phases).mean(1)
-        balance = self._flaws.colour_drift * waves[1]
-        return 2.0 ** (self._flaws.gain_drift * waves[0]) * np.array([1 + balance, 1, 1 - balance])
+        stops, balance = np.sin(2 * np.pi * time / _PERIODS + self._phases).mean(1)
+        balance *= self._flaws.colour_drift
+        gain = 2.0 ** (self._flaws.gain_drift * stops)
+        return np.array([gain * (1 + balance), gain, gain * (1 - balance)])
 
 
 def _lens_shading(camera: Camera, corner_loss: float) -> Float32[np.ndarray, "h w"]:
@@ -57,4 +58,6 @@ def _lens_shading(camera: Camera, corner_loss: float) -> Float32[np.ndarray, "h 
 def _through_jpeg(image: UInt8[np.ndarray, "h w 3"], quality: int) -> UInt8[np.ndarray, "h w 3"]:
     bgr = cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
     stored = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
-    return cv2.cvtColor(cv2.imdecode(stored, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
+    read = cv2.imdecode(stored, cv2.IMREAD_COLOR)
+    assert read is not None
+    return cv2.cvtColor(read, cv2.COLOR_BGR2RGB).astype(np.uint8)

@@ -1,16 +1,23 @@
 """Where a sequence is taken: the scene, the camera's shape and the units that suit its size."""
 
+import math
 from dataclasses import dataclass
 
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
+from geogs.synth.bodies import Body
 from geogs.synth.motion_kinds import MotionKind
 from geogs.synth.motions import Motion, room_motion
 from geogs.synth.room import make_room
 from geogs.synth.scene import Scene
+from geogs.synth.street import drive, make_street
+from geogs.synth.traffic import street_traffic
+from geogs.synth.walkers import crossing_walkers
 
 ROOM_FOCAL = 0.7
 """Focal length over width of the camera in rooms: 71 degrees across."""
+STREET_FOCAL = 0.58
+"""82 degrees across."""
 
 _MAX_SIZE = 8192
 
@@ -19,7 +26,9 @@ _MAX_SIZE = 8192
 class Stage:
     """A scene and a way through it."""
 
+    kind: MotionKind
     name: str
+    seed: int
     scene: Scene
     motion: Motion
     width: int
@@ -31,18 +40,34 @@ class Stage:
     """Units of the depth images per metre."""
     voxel_cm: int
     """Side of the cells of which each that was seen gives a point, centimetres."""
+    reach: float
+    """Metres of depth beyond which nothing counts as seen."""
 
     def camera(self, width: int | None, height: int | None) -> Camera:
         """The camera of the size asked for, its principal point in the middle of the image."""
         return centred_camera(width or self.width, height or self.height, self.focal)
 
+    def bodies(self, camera: Camera, seconds: float, share: float) -> list[Body]:
+        """What moves in the camera's view and covers about this share of it."""
+        if self.kind == "driving":
+            return street_traffic(camera, share, self.seed)
+        return crossing_walkers(self.motion.path, seconds, camera, share, self.seed)
 
-def make_stage(kind: MotionKind, seed: int = 0) -> Stage:
-    """The room of the seed, and the motion through it."""
-    scene = make_room(seed)
+
+def make_stage(kind: MotionKind, seed: int = 0, scene: Scene | None = None) -> Stage:
+    """The room or the street of the seed, and the motion through it.
+
+    ``scene``, if it is there already, is not made again.
+    """
+    if kind == "driving":
+        return Stage(
+            kind, f"procedural street, seed {seed}", seed, scene or make_street(seed), drive(seed),
+            width=1241, height=376, focal=STREET_FOCAL, depth_scale=256.0, voxel_cm=10, reach=40.0,
+        )  # fmt: skip
+    scene = scene or make_room(seed)
     return Stage(
-        f"procedural room, seed {seed}", scene, room_motion(kind, scene, seed),
-        width=320, height=240, focal=ROOM_FOCAL, depth_scale=6553.5, voxel_cm=1,
+        kind, f"procedural room, seed {seed}", seed, scene, room_motion(kind, scene, seed),
+        width=320, height=240, focal=ROOM_FOCAL, depth_scale=6553.5, voxel_cm=1, reach=math.inf,
     )  # fmt: skip
 
 

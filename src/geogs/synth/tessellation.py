@@ -95,10 +95,14 @@ class SeenSurface:
         self._points: list[Float32[np.ndarray, "k 3"]] = []
 
     def add(self, depth: Float32[np.ndarray, "h w"], T_wc: Float64[np.ndarray, "4 4"]) -> None:
-        """Adds the back-projected pixels that fall into voxels empty so far."""
+        """Adds the back-projected pixels that fall into voxels of the scene empty so far."""
         seen = depth > 0
         points = (depth[..., None] * self._rays)[seen] @ T_wc[:3, :3].T + T_wc[:3, 3]
-        x, y, z = ((points / self._voxel).astype(np.int32) + 1).T
+        cell = (points / self._voxel).astype(np.int32) + 1
+        inside = ((cell >= 0) & (cell < self._shape)).all(1)
+        if not inside.all():
+            points, cell = points[inside], cell[inside]
+        x, y, z = cell.T
         key = (z * self._shape[1] + y) * self._shape[0] + x
         fresh = np.flatnonzero(~self._filled[key])
         key, first = np.unique(key[fresh], return_index=True)

@@ -12,13 +12,12 @@ from geogs.io.writers.atomic import atomic_file, write_text
 from geogs.io.writers.tum import write_tum_trajectory
 from geogs.synth.flaws import Flaws
 from geogs.synth.lens import Lens
-from geogs.synth.motion_kinds import MotionKind
 from geogs.synth.motions import Motion
 from geogs.synth.stage import Stage
 from geogs.types import Trajectory
 
 
-def write_camera(path: Path, stage: Stage, lens: Lens, motion: MotionKind, flaws: Flaws) -> None:
+def write_camera(path: Path, stage: Stage, lens: Lens, flaws: Flaws, moving: float) -> None:
     """Writes the intrinsics, with the distortion, for programs; the rest is for evaluation."""
     camera = lens.camera
     intrinsics: dict[str, Any] = {
@@ -37,11 +36,12 @@ def write_camera(path: Path, stage: Stage, lens: Lens, motion: MotionKind, flaws
         "convention": "OpenCV axes, pixel centres at integer coordinates, depth = z",
         "scene": stage.name,
     }
-    if flaws != Flaws() or motion != "handheld":
-        parameters["motion"] = motion
+    if flaws != Flaws() or moving or stage.kind != "handheld":
+        parameters["motion"] = stage.kind
         parameters["fps"] = stage.motion.rate
         parameters["readout"] = flaws.readout
         parameters["flaws"] = asdict(flaws)
+        parameters["moving"] = moving
     write_text(path, json.dumps(parameters, indent=1) + "\n")
 
 
