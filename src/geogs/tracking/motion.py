@@ -39,6 +39,8 @@ class FrameMotion:
     """Median motion of the matched cells in pixels: what the motion filter looks at."""
     matched: float
     """Fraction of the keyframe's cells with a match that agrees with the pose."""
+    overlap: float
+    """The same of those of its cells whose depth is known."""
     residual: float
     """Median distance in pixels between matches and reprojection."""
     evidence: Evidence
@@ -135,16 +137,24 @@ class FrameLocator:
             keyframe.inverse_depth,
             keyframe.information,
         )
+        known = (keyframe.information > 0).to(T).mean()[None]
         # All at once, so that a GPU is waited for once.
-        found = torch.cat([T.reshape(-1), judged.to(T), seen.to(T)]).cpu()
+        found = torch.cat([T.reshape(-1), judged.to(T), seen.to(T), known.to(T)]).cpu()
         _, agree, residual, flow = found[16:20].tolist()
         if agree < self.min_matched or not residual < self.max_residual:
             return None
-        evidence = Evidence.of(found[20:])
+        evidence = Evidence.of(found[20:22])
         if not evidence.bears_out(self.min_ncc, is_expected):
             return None
         return FrameMotion(
-            keyframe.id, found[:16].reshape(4, 4), match, flow, agree, residual, evidence
+            keyframe.id,
+            found[:16].reshape(4, 4),
+            match,
+            flow,
+            agree,
+            agree / float(found[22]),
+            residual,
+            evidence,
         )
 
 
