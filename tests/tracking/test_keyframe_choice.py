@@ -1,7 +1,7 @@
 from geogs.config import TrackingConfig
 from geogs.tracking.keyframe_choice import calls_for_keyframe
 
-CONFIG = TrackingConfig(keyframe_flow=0.025, keyframe_overlap=0.6)
+CONFIG = TrackingConfig(keyframe_flow=0.025, keyframe_overlap=0.7)
 
 
 def is_chosen(flow: float, overlap: float) -> bool:
@@ -14,8 +14,8 @@ def test_motion_makes_a_keyframe_whatever_overlaps() -> None:
 
 
 def test_lost_overlap_makes_a_keyframe_before_the_median_motion_does() -> None:
-    assert is_chosen(6.0, 0.55)
-    assert not is_chosen(6.0, 0.65)
+    assert is_chosen(6.0, 0.65)
+    assert not is_chosen(6.0, 0.75)
 
 
 def test_a_poor_image_of_a_resting_camera_is_no_keyframe() -> None:
