@@ -6,13 +6,15 @@ import torch
 
 from credulous_flow import CredulousFlow
 from geogs.bundle.base import BundleOptions
+from geogs.bundle.projection import project
 from geogs.bundle.select import grid_fields
 from geogs.keyframes.grid import SampleGrid
 from geogs.keyframes.store import KeyframeStore, Segment
 from geogs.tracking.evidence import MIN_WINDOWS
+from geogs.tracking.features import FeatureMatches
 from geogs.tracking.flow.classical import ClassicalFlow
 from geogs.tracking.graph import FrameGraph
-from geogs.tracking.motion import FrameLocator, pnp
+from geogs.tracking.motion import FrameLocator, pnp, pnp_features
 from geogs.tracking.proximity import frame_distances, proximity_pairs
 from tracking_scenes import CAMERA, pose, render
 
@@ -153,6 +155,44 @@ def test_noise_is_located_nowhere_even_if_the_flow_believes_in_it():
         assert believing.relocate(state, encoded) is not None
         assert locator.locate(state, encoded, state.T_cw) is None
         assert locator.relocate(state, encoded) is None
+
+
+def test_a_camera_that_jumped_is_found_by_features():
+    graph = room_graph(POSES[:1])
+    state = graph.keyframes[0]
+    locator = FrameLocator(graph.keyframes.grid, graph.operator, 0.12, 2.0, min_ncc=0.5)
+    truth = pose(0.2, 0.0, 0.9, 0.05)
+    encoded = graph.operator.encode(render(truth)[0])
+    assert locator.locate(state, encoded, state.T_cw) is None
+    assert locator.relocate(state, encoded) is None
+    motion = locator.relocate_any([state], encoded)
+    assert motion is not None
+    centre = torch.linalg.inv(motion.T_cw)[:3, 3].numpy()
+    assert 100 * np.linalg.norm(centre - truth[:3, 3]) < 1.0
+    assert motion.evidence.correlation > 0.8
+
+
+def test_a_camera_that_sees_something_else_is_not_found_by_features():
+    graph = room_graph(POSES[:1])
+    state = graph.keyframes[0]
+    locator = FrameLocator(graph.keyframes.grid, graph.operator, 0.12, 2.0, min_ncc=0.5)
+    noise = np.random.default_rng(0).integers(0, 255, (144, 192, 3), np.uint8)
+    for image in (noise, render(pose(0.0, yaw=np.pi))[0]):
+        assert locator.relocate_any([state, state], graph.operator.encode(image)) is None
+
+
+def test_pose_from_features_is_that_of_their_true_positions():
+    state, grid = room_graph(POSES[:1]).keyframes[0], SampleGrid(CAMERA)
+    T = torch.from_numpy(np.linalg.inv(pose(0.3, 0.1, 0.6, 0.1)))
+    seen = project(CAMERA, grid.rays, T[None], state.inverse_depth[None]).pixels[0]
+    chosen = torch.arange(0, grid.size, 9)
+    second = seen[chosen].clone()
+    second[::5] += 30.0  # wrong matches
+    found = pnp_features(grid, state, FeatureMatches(grid.pixels[chosen], second))
+    assert found is not None
+    torch.testing.assert_close(found, T, atol=2e-3, rtol=0)
+    state.information = torch.zeros_like(state.information)
+    assert pnp_features(grid, state, FeatureMatches(grid.pixels[chosen], second)) is None
 
 
 def test_a_frame_without_texture_is_located_only_where_it_was_expected():

@@ -19,6 +19,9 @@ class TrackingConfig(Settings, group="tracking"):
     """File with the operator's weights; empty looks for one (geogs weights says where)."""
     keyframe_flow: Share = 0.025
     """Median motion since the last keyframe that makes a frame a keyframe, of the long edge."""
+    keyframe_overlap: Share = 0.7
+    """A frame that has moved a fifth of that becomes one, too, when less than this fraction of the
+    last keyframe finds a match in it."""
     cull_distance: Share = 0.012
     """A keyframe nearer than this to the one before it is removed again, of the long edge."""
     init_keyframes: Annotated[int, Range(4, 1000)] = 12

@@ -25,6 +25,7 @@ from geogs.keyframes.grid import SampleGrid
 from geogs.keyframes.store import Segment
 from geogs.threads import thread_map
 from geogs.tracking.evidence import Evidence, correlation_at
+from geogs.tracking.features import surer_flow
 from geogs.tracking.flow.base import FlowMatch
 from geogs.tracking.flow.filled import filled_positions
 from geogs.tracking.graph import FrameGraph
@@ -72,12 +73,12 @@ def chained_flows(graph: FrameGraph) -> list[FlowMatch]:
     states = list(graph.keyframes)
     grid, operator = graph.keyframes.grid, graph.operator
     encoded = [s.encoded for s in states]
-    steps, back_steps = operator.measure(encoded[:-1], encoded[1:], fine=False)
-    there, back = steps.pixels[0], back_steps.pixels[0]
+    steps = _steps(graph)
+    there, back = steps[0]
     flows = []
     for k in range(1, len(states)):
         if k > 1:
-            step, back_step = steps.pixels[k - 1], back_steps.pixels[k - 1]
+            step, back_step = steps[k - 1]
             there = there + grid.sample_field(step - grid.pixels, there)
             back = back_step + grid.sample_field(back - grid.pixels, back_step)
         match, reverse = operator.measure(
@@ -87,6 +88,20 @@ def chained_flows(graph: FrameGraph) -> list[FlowMatch]:
         there = filled_positions(grid, match)
         back = filled_positions(grid, reverse)
     return flows
+
+
+def _steps(graph: FrameGraph) -> list[tuple[Float[Tensor, "p 2"], Float[Tensor, "p 2"]]]:
+    """Where the cells of each keyframe lie in the next, and those of the next in it."""
+    grid, operator = graph.keyframes.grid, graph.operator
+    encoded = [s.encoded for s in graph.keyframes]
+    pairs = list(pairwise(encoded))
+    matches = operator.measure(encoded[:-1], encoded[1:], fine=False)
+    steps = []
+    for n, (a, b) in enumerate(pairs):
+        one = [FlowMatch(m.pixels[n : n + 1], m.weight[n : n + 1]) for m in matches]
+        there, back = surer_flow(grid, operator, a, b, *one)
+        steps.append((there.pixels[0], back.pixels[0]))
+    return steps
 
 
 def _best_two_view(
@@ -120,7 +135,10 @@ def two_view(camera: Camera, match: FlowMatch) -> TwoView | None:
         return None
     p, q = SampleGrid(camera).pixels.double().numpy(), match.pixels[0].double().numpy()
     K = camera.matrix().numpy()
-    E, mask = cv2.findEssentialMat(p[used], q[used], K, cv2.USAC_MAGSAC, 0.9999, 0.7)
+    try:
+        E, mask = cv2.findEssentialMat(p[used], q[used], K, cv2.USAC_MAGSAC, 0.9999, 0.7)
+    except cv2.error:  # OpenCV 5 fails an assertion where no sample gives a model
+        return None
     if E is None or E.shape != (3, 3):
         return None
     count, R, t, mask = cv2.recoverPose(E, p[used], q[used], K, mask=mask.copy())

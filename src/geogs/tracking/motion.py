@@ -12,11 +12,13 @@ from torch import Tensor
 
 from geogs.bundle.select import grid_fields, motion_solver
 from geogs.errors import InputError
+from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_inverse
 from geogs.gpu.transfer import to_device
 from geogs.keyframes.grid import SampleGrid
 from geogs.keyframes.keyframe import Keyframe
 from geogs.tracking.evidence import Evidence, correlation_at, correlation_matched
+from geogs.tracking.features import FeatureMatches, match_features, surer_flow
 from geogs.tracking.flow.base import FlowMatch, FlowOperator
 from geogs.tracking.flow.filled import filled_positions
 
@@ -24,6 +26,11 @@ FIT_ITERATIONS = 6
 """Steps of the motion-only adjustment of a frame."""
 FIT_HUBER = 5.0
 """Standard deviations of the flow beyond which a match counts linearly in it."""
+
+FEATURE_PLACES = 2
+"""Keyframes with which the features of a frame are compared when the camera is lost."""
+MIN_POINTS = 50, 25
+"""Fewest cells, and fewest features, that a pose is found from."""
 
 
 @dataclass(frozen=True)
@@ -39,6 +46,8 @@ class FrameMotion:
     """Median motion of the matched cells in pixels: what the motion filter looks at."""
     matched: float
     """Fraction of the keyframe's cells with a match that agrees with the pose."""
+    overlap: float
+    """The same of those of its cells whose depth is known."""
     residual: float
     """Median distance in pixels between matches and reprojection."""
     evidence: Evidence
@@ -102,10 +111,29 @@ class FrameLocator:
         T_guess = T_rel.to(keyframe.T_cw) @ keyframe.T_cw
         return self.locate(keyframe, encoded, T_guess, is_expected=False)
 
+    def relocate_by_features(self, keyframe: Keyframe, encoded: Any) -> FrameMotion | None:
+        """As :meth:`relocate`, by sparse features: the motion may be of any size."""
+        grey = self.operator.grey
+        found = match_features(grey(keyframe.encoded), grey(encoded))
+        if found is None:
+            return None
+        T_rel = pnp_features(self.grid, keyframe, found)
+        if T_rel is None:
+            return None
+        T_guess = T_rel.to(keyframe.T_cw) @ keyframe.T_cw
+        return self.locate(keyframe, encoded, T_guess, is_expected=False)
+
     def relocate_any(self, keyframes: Sequence[Keyframe], encoded: Any) -> FrameMotion | None:
-        """The first success of :meth:`relocate` over several keyframes."""
+        """The first success of :meth:`relocate` over several keyframes, the likeliest first.
+
+        Where all fail, features are tried with the first ``FEATURE_PLACES`` of them.
+        """
         for keyframe in keyframes:
             motion = self.relocate(keyframe, encoded)
+            if motion is not None:
+                return motion
+        for keyframe in keyframes[:FEATURE_PLACES]:
+            motion = self.relocate_by_features(keyframe, encoded)
             if motion is not None:
                 return motion
         return None
@@ -135,16 +163,24 @@ class FrameLocator:
             keyframe.inverse_depth,
             keyframe.information,
         )
+        known = (keyframe.information > 0).to(T).mean()[None]
         # All at once, so that a GPU is waited for once.
-        found = torch.cat([T.reshape(-1), judged.to(T), seen.to(T)]).cpu()
+        found = torch.cat([T.reshape(-1), judged.to(T), seen.to(T), known.to(T)]).cpu()
         _, agree, residual, flow = found[16:20].tolist()
         if agree < self.min_matched or not residual < self.max_residual:
             return None
-        evidence = Evidence.of(found[20:])
+        evidence = Evidence.of(found[20:22])
         if not evidence.bears_out(self.min_ncc, is_expected):
             return None
         return FrameMotion(
-            keyframe.id, found[:16].reshape(4, 4), match, flow, agree, residual, evidence
+            keyframe.id,
+            found[:16].reshape(4, 4),
+            match,
+            flow,
+            agree,
+            agree / float(found[22]),
+            residual,
+            evidence,
         )
 
 
@@ -198,6 +234,7 @@ class FlowChain:
         there, back = self.operator.measure(
             [keyframe], [encoded], self._there, self._back, fine=False
         )
+        there, back = surer_flow(self.grid, self.operator, keyframe, encoded, there, back)
         used = there.weight[0, :, 0] > 0
         matched = float(used.float().mean())
         if not self._is_borne_out(keyframe, encoded, there):
@@ -222,19 +259,36 @@ def pnp(
     pixels: Float[Tensor, "p 2"],
     good: Bool[Tensor, "p"],
 ) -> Float[Tensor, "4 4"] | None:
-    """Pose T_ji of a view from cells with depth and their positions in it (RANSAC, SQPnP)."""
-    if int(good.sum()) < 50:
+    """Pose T_ji of a view from cells with depth and their positions in it."""
+    points = grid.rays[good] / inverse_depth[good, None]
+    return _pnp(grid.camera, points, pixels[good], MIN_POINTS[0])
+
+
+def pnp_features(
+    grid: SampleGrid, keyframe: Keyframe, matches: FeatureMatches
+) -> Float[Tensor, "4 4"] | None:
+    """Pose T_ji of a view from features of a keyframe, which have the depth of their cells."""
+    cell, inside = grid.cells_of(matches.first.to(grid.device))
+    known = inside & (keyframe.information[cell] > 0)
+    c, p = grid.camera, matches.first.to(grid.device)
+    rays = torch.stack([(p[:, 0] - c.cx) / c.fx, (p[:, 1] - c.cy) / c.fy, p[:, 0] * 0 + 1], -1)
+    points = (rays / keyframe.inverse_depth[cell, None])[known]
+    return _pnp(c, points, matches.second.to(grid.device)[known], MIN_POINTS[1])
+
+
+def _pnp(
+    camera: Camera, points: Float[Tensor, "n 3"], pixels: Float[Tensor, "n 2"], least: int
+) -> Float[Tensor, "4 4"] | None:
+    """Pose of a view from at least so many points and where it sees them (RANSAC, SQPnP)."""
+    if len(points) < least:
         return None
-    points = (grid.rays[good] / inverse_depth[good, None]).double().cpu().numpy()
-    image = pixels[good].double().cpu().numpy()
-    threshold = max(grid.camera.width, grid.camera.height) / 250
     ok, rotation, translation, inliers = cv2.solvePnPRansac(
-        points,
-        image,
-        grid.camera.matrix().numpy(),
+        points.double().cpu().numpy(),
+        pixels.double().cpu().numpy(),
+        camera.matrix().numpy(),
         None,
         iterationsCount=200,
-        reprojectionError=threshold,
+        reprojectionError=max(camera.width, camera.height) / 250,
         flags=cv2.SOLVEPNP_SQPNP,
     )
     if not ok or inliers is None or len(inliers) < 0.3 * len(points):

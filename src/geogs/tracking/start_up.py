@@ -8,6 +8,7 @@ import torch
 from geogs.config import TrackingConfig
 from geogs.tracking.graph import FrameGraph
 from geogs.tracking.initialise import chained_flows, initialise
+from geogs.tracking.keyframe_choice import calls_for_keyframe
 from geogs.tracking.keyframe_priors import KeyframePriors
 from geogs.tracking.motion import ChainState, FlowChain
 from geogs.tracking.trajectory import TrajectoryRecorder
@@ -71,7 +72,7 @@ class StartUp:
             if match.matched < self.config.min_matched:
                 return self._miss(frame, encoded)
             self._misses = 0
-            if match.flow < self.config.keyframe_flow * self._long_edge:
+            if not calls_for_keyframe(self.config, self._long_edge, match.flow, match.matched):
                 eye = torch.eye(4, dtype=torch.float64)
                 self.recorder.add(frame, encoded, last.id, eye, match.there)
                 return StartStep()

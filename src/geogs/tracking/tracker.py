@@ -24,6 +24,7 @@ from geogs.priors.base import MonocularPrior
 from geogs.tracking.flow.base import FlowOperator
 from geogs.tracking.flow.select import build_operator
 from geogs.tracking.graph import EdgeState, FrameGraph
+from geogs.tracking.keyframe_choice import calls_for_keyframe
 from geogs.tracking.keyframe_priors import KeyframePriors
 from geogs.tracking.motion import (
     FrameLocator,
@@ -355,7 +356,7 @@ class Tracker:
         anchor = self.keyframes[motion.keyframe]
         T_rel = motion.T_cw @ se3_inverse(anchor.T_cw)
         self._seen_at(anchor, T_rel, velocity)
-        if motion.flow < self.config.keyframe_flow * self._long_edge:
+        if not calls_for_keyframe(self.config, self._long_edge, motion.flow, motion.overlap):
             self.recorder.add(frame, encoded, anchor.id, T_rel, motion.match)
             return TrackResult(self.state, active=self.active)
         return self._insert(frame, encoded, motion, velocity)
