@@ -121,7 +121,9 @@ def test_a_whole_run_is_one_call_that_can_be_followed_and_stopped(small_room, tm
     )
     written = run(settings, progress, stop)
     assert progress.seen == 22
-    assert progress.said == ["Stopping early; keeping what there is. Press Ctrl-C again to quit."]
+    stopping, verdict = progress.said
+    assert stopping == "Stopping early; keeping what there is. Press Ctrl-C again to quit."
+    assert verdict == written.result.verdict.sentence
     assert written.output == tmp_path / "out"
     assert written.can_resume
     assert written.result.is_interrupted

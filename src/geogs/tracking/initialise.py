@@ -22,6 +22,7 @@ from geogs.config import TrackingConfig
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_inverse
 from geogs.keyframes.grid import SampleGrid
+from geogs.keyframes.keyframe import Keyframe
 from geogs.keyframes.store import Segment
 from geogs.threads import thread_map
 from geogs.tracking.evidence import Evidence, correlation_at
@@ -30,6 +31,9 @@ from geogs.tracking.flow.base import FlowMatch
 from geogs.tracking.flow.filled import filled_positions
 from geogs.tracking.graph import FrameGraph
 from geogs.tracking.motion import pnp
+
+LEAST_SEEN = 0.4
+"""Share of the first keyframe's depths that a keyframe must see to be placed on them."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +64,7 @@ def initialise(graph: FrameGraph, config: TrackingConfig) -> bool:
     best = _best_two_view(store.grid, flows, min_parallax)
     if best is None:
         return False
-    _place_all(store, flows, best)
+    _place_all(graph, flows, best)
     return (
         _polish(graph, config.radius)
         and _depth_deviation(graph, config.huber) <= config.start_deviation
@@ -161,8 +165,12 @@ def two_view(camera: Camera, match: FlowMatch) -> TwoView | None:
     return TwoView(torch.from_numpy(T), depth, known, float(parallax))
 
 
-def _place_all(store: Segment, flows: list[FlowMatch], best: tuple[int, TwoView]) -> None:
-    """Poses by PnP on the first keyframe's depth, depths by carrying it over."""
+def _place_all(graph: FrameGraph, flows: list[FlowMatch], best: tuple[int, TwoView]) -> None:
+    """Poses by PnP on the first keyframe's depth, depths by carrying it over.
+
+    Keyframes that no longer see it are placed on what the one before them was given.
+    """
+    store = graph.keyframes
     chosen, view = best
     states, fields = list(store), grid_fields(store.grid)
     first = states[0]
@@ -175,11 +183,22 @@ def _place_all(store: Segment, flows: list[FlowMatch], best: tuple[int, TwoView]
             state.T_cw = view.T_ji
         else:
             good = known & match.sure()[0]
-            T = pnp(store.grid, first.inverse_depth, match.pixels[0], good)
-            state.T_cw = states[n].T_cw if T is None else T
+            T = None
+            if float(good.sum()) > LEAST_SEEN * float(known.sum()):
+                T = pnp(store.grid, first.inverse_depth, match.pixels[0], good)
+            state.T_cw = placed_after(graph, states[n], state) if T is None else T
         state.inverse_depth, state.information = fields.transfer(
             state.T_cw, first.inverse_depth, first.information
         )
+
+
+def placed_after(graph: FrameGraph, before: Keyframe, state: Keyframe) -> Float[Tensor, "4 4"]:
+    """Pose of a keyframe by PnP on the depth of the one before it, or that one's pose."""
+    grid, pair = graph.keyframes.grid, (before.encoded, state.encoded)
+    matches = graph.operator.measure(pair[:1], pair[1:], fine=False)
+    match, _ = surer_flow(grid, graph.operator, *pair, *matches)
+    T_rel = pnp(grid, before.inverse_depth, match.pixels[0], match.sure()[0])
+    return before.T_cw if T_rel is None else T_rel.to(before.T_cw) @ before.T_cw
 
 
 def _polish(graph: FrameGraph, radius: int, rounds: int = 6) -> bool:

@@ -1,7 +1,6 @@
 """The check of poses against images passes for the true conventions and names the wrong ones."""
 
 import json
-import time
 
 import numpy as np
 import pytest
@@ -65,13 +64,11 @@ MISTAKES = {
 
 
 def test_true_poses_pass(room, folder):
-    start = time.perf_counter()
     check = check_poses(with_poses(folder, room.T_wc))
     assert check.warning is None
     assert check.pairs == 8
     assert check.given.error < 0.0015  # 0.5 pixels
     assert check.given.in_front > 0.97
-    assert time.perf_counter() - start < 3
 
 
 def test_world_does_not_matter(room, folder):

@@ -1,0 +1,33 @@
+"""Placing the keyframes of a start."""
+
+import numpy as np
+import torch
+
+from geogs.geometry.lie import se3_inverse
+from geogs.keyframes.grid import SampleGrid
+from geogs.keyframes.store import KeyframeStore
+from geogs.tracking.flow.classical import ClassicalFlow
+from geogs.tracking.graph import FrameGraph
+from geogs.tracking.initialise import placed_after
+from tracking_scenes import CAMERA, pose, render
+
+
+def test_a_keyframe_is_placed_on_the_depth_of_the_one_before_it() -> None:
+    before, after = pose(0.1, 0.05, -0.1, 0.02), pose(0.25, 0.0, 0.6, 0.05)
+    grid = SampleGrid(CAMERA)
+    operator = ClassicalFlow(grid)
+    store = KeyframeStore(grid).new_segment()
+    for n, T_wc in enumerate((before, after)):
+        image, depth = render(T_wc)
+        T_cw = torch.from_numpy(np.linalg.inv(before))
+        state = store.add(n, n / 10, image, operator.encode(image), T_cw)
+        d = 1 / depth[4:-3:8, 4:-3:8].reshape(-1)
+        state.inverse_depth = torch.from_numpy(d.copy()).float()
+    found = placed_after(FrameGraph(store, operator), *store)
+    centre = se3_inverse(found)[:3, 3].numpy()
+    assert np.linalg.norm(centre - after[:3, 3]) < 0.02  # the step is 72 cm
+    # Where nothing is matched it stays where the one before it is.
+    noise = np.random.default_rng(0).integers(0, 255, (144, 192, 3), np.uint8)
+    unlike = store.add(2, 0.2, noise, operator.encode(noise), store[1].T_cw)
+    kept = placed_after(FrameGraph(store, operator), store[0], unlike)
+    torch.testing.assert_close(kept, store[0].T_cw)
