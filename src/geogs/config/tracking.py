@@ -28,7 +28,7 @@ class TrackingConfig(Settings, group="tracking"):
     """Keyframes gathered before the map is started."""
     min_parallax: Share = 0.005
     """Motion that rotation does not explain, needed to try to start, of the long edge."""
-    start_deviation: Positive = 0.1
+    start_deviation: Positive = 0.2
     """The map is started when the depths of its first keyframes are known to this, in the median:
     relative standard deviation by what matches and poses leave open."""
     start_overlap: Share = 0.3
