@@ -15,10 +15,8 @@ TOGETHER = 300
 USUAL_STRAIN = 0.23
 """Median residual, in deviations of a match, where the scene is as modelled."""
 STRAIN_POWER = 4
-"""Errors of poses grow with this power of the strain. Both were read off 15 rendered videos with
-and without rolling shutter, blur, noise and people who cross: the error of the keyframes, in
-foretold deviations, is 0.2 to 0.9 in the median at a strain of 0.21 to 0.26, 1 to 3 at 0.32 to
-0.38 and 3 to 15 above."""
+"""Errors of poses grow with this power of the strain. Both were read off rendered videos with and
+without rolling shutter, blur, noise and people who cross (docs/tracking.md has the table)."""
 
 
 @dataclass(frozen=True)
