@@ -79,6 +79,8 @@ class PhotoConfig(Settings, group="mapping.photo"):
     """Partners kept per keyframe."""
     per_step: Annotated[int, Range(1, 64)] = 2
     """Partners drawn in each step."""
+    level: bool = True
+    """Bring all keyframes into the same light (gain and offset of their grey values) for L_1."""
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ from geogs.keyframes.archive import Archive
 from geogs.keyframes.store import KeyframeStore
 from geogs.mapping.cameras import MapCameras
 from geogs.mapping.keyframe_depths import CANDIDATES, KeyframeDepths
+from geogs.mapping.levelling import light_of
 from geogs.mapping.map_update import MapUpdate, plan_update, witness
 from geogs.mapping.rendered import rendered_keyframe, searched_keyframe
 from geogs.mapping.state import MapperState, RandomState, TrainedState, ViewState
@@ -141,6 +142,7 @@ class Mapper:
         self._depths.check([view])
         self.mapped.append(keyframe_id)
         self._choose_partners(view)
+        self._level(view)
         trainer = self._training()
         self._carve([view, *self._depths.near(view)])
         self._insert(view, self.config.disk.insert_confidence)
@@ -207,9 +209,11 @@ class Mapper:
             self._insert(self.views[i], self.config.disk.insert_confidence)
 
     def choose_partners(self) -> None:
-        """Photometric partners of all mapped keyframes."""
+        """Photometric partners of all mapped keyframes, which are brought into the same light."""
         for i in self.mapped:
             self._choose_partners(self.views[i])
+        for i in self.mapped:
+            self._level(self.views[i])
 
     def train(
         self,
@@ -312,6 +316,13 @@ class Mapper:
             other = self.views[i]
             pool = [self.views[j] for j in {*other.partners, view.id} if j in self.views]
             other.partners = choose_partners(other, pool, other.typical_depth, photo)
+
+    def _level(self, view: MapView) -> None:
+        """Give a view's grey values the light of the partners that have it already."""
+        if view.is_levelled or not self.config.photo.level:
+            return
+        known = [self.views[i] for i in view.partners if self.views[i].is_levelled]
+        self.pool.set_light(view.id, light_of(view, known))
 
     def _batch(self, ids: list[int]) -> Batch:
         views = [self.views[i] for i in ids]

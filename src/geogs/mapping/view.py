@@ -9,6 +9,7 @@ from torch import Tensor
 from geogs.depth.view import DenseDepth, DepthSearch, DepthView, Place, PosedDepth
 from geogs.geometry.lie import se3_inverse
 from geogs.keyframes.keyframe import Keyframe
+from geogs.losses.light import same_light
 from geogs.losses.multi_view import PhotoView
 from geogs.losses.single_view import ViewConstants
 from geogs.mapping.view_pool import ViewPool
@@ -68,6 +69,17 @@ class MapView:
     def photo(self) -> PhotoView:
         """What the multi-view losses need."""
         return PhotoView(self.pool.maps(self.id).photo, self.pool.cameras.photo, self.T_cw)
+
+    @property
+    def light(self) -> Float[Tensor, "2"]:
+        """Gain and offset that its photo has had."""
+        light = self.pool.light(self.id)
+        return same_light(self.pool.device) if light is None else light
+
+    @property
+    def is_levelled(self) -> bool:
+        """Whether its photo has been brought into the light of all."""
+        return self.pool.light(self.id) is not None
 
     @property
     def has_depth(self) -> bool:

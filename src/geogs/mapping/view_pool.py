@@ -30,7 +30,7 @@ class ViewMaps:
     fine: Float32[np.ndarray, "fh fw"]
     """Of the :class:`DepthView`."""
     photo: Float[Tensor, "ph pw"]
-    """Smoothed grey image of the :class:`PhotoView`, on the map's device."""
+    """Smoothed grey image of the :class:`PhotoView` in the light of all, on the map's device."""
     normal: Float[Tensor, "h w 3"] | None
     """A prior's normals at the render size, on the map's device."""
     depth: DenseDepth | None = None
@@ -91,6 +91,8 @@ class StoredMaps:
     """Pixels of the render size that belong to the scene; none takes all. On the map's device."""
     depth: StoredDepth | None = None
     rendered_depth: Archived | None = None
+    light: Float[Tensor, "2"] | None = None
+    """Gain and offset that bring its grey values into the light of all; None until known."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,6 +101,7 @@ class MapsState:
 
     depth: StoredDepth | None
     rendered_depth: Archived | None
+    light: Float[Tensor, "2"] | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,6 +204,17 @@ class ViewPool:
             )
         return maps.constants
 
+    def light(self, id: int) -> Float[Tensor, "2"] | None:
+        """Gain and offset of a view's grey values, once known."""
+        return self._stored[id].light
+
+    def set_light(self, id: int, light: Float[Tensor, "2"]) -> None:
+        """Bring a view, whose light was not known, into the light of all."""
+        self._stored[id].light = light
+        maps = self._maps.peek(id)
+        if maps is not None:
+            maps.photo = light[0] * maps.photo + light[1]
+
     def set_rendered_depth(self, id: int, depth: Float[Tensor, "h w"] | None) -> None:
         """Take over the map's last rendering from a view, or that there is none any more."""
         if depth is None:
@@ -214,7 +228,9 @@ class ViewPool:
         held = self._maps.items()
         for id, maps in held:
             self._store(id, maps)
-        stored = {id: MapsState(s.depth, s.rendered_depth) for id, s in self._stored.items()}
+        stored = {
+            id: MapsState(s.depth, s.rendered_depth, s.light) for id, s in self._stored.items()
+        }
         return PoolState(self.archive, stored, [id for id, _ in held])
 
     def load(self, state: PoolState, keyframes: Mapping[int, Keyframe]) -> None:
@@ -233,7 +249,10 @@ class ViewPool:
                 raise InputError(f"the depth of keyframe {id} has another size")
             mask = self._stored[id].mask if id in self._stored else None
             self._maps.drop(id)
-            self._stored[id] = StoredMaps(keyframes[id], mask, saved.depth, saved.rendered_depth)
+            light = None if saved.light is None else saved.light.to(self.device)
+            self._stored[id] = StoredMaps(
+                keyframes[id], mask, saved.depth, saved.rendered_depth, light
+            )
         for id in state.resident:
             self._maps.put(id, self._load(self._stored[id], as_archived=True))
 
@@ -252,6 +271,8 @@ class ViewPool:
         grey = PhotoView.prepare(
             image, cameras.photo, keyframe.T_cw, loss.photo_blur, self.device
         ).grey
+        if stored.light is not None:
+            grey = stored.light[0] * grey + stored.light[1]
         normal = None
         if loss.normal_weight:
             normal = _shrunk_normal(keyframe, cameras.render, self.device)

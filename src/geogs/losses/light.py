@@ -1,0 +1,49 @@
+"""How bright one view is against another: what exposure and white balance did between them."""
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+_ROUNDS = 12
+_SCALE = 0.02
+"""Grey values that a pixel may be off; surfaces that hide each other are off by more."""
+_PLAIN = 0.01
+"""Standard deviation of grey values below which a gain cannot be told from an offset."""
+_FEWEST = 50
+"""Weights of pixels, summed, that tell anything."""
+_LARGEST_GAIN = 8.0
+
+
+def same_light(device: torch.device | str) -> Float[Tensor, "2"]:
+    """Gain 1 and offset 0."""
+    return torch.tensor([1.0, 0.0], device=device)
+
+
+def relative_light(
+    grey: Float[Tensor, "n"], other: Float[Tensor, "n"], usable: Bool[Tensor, "n"]
+) -> Float[Tensor, "2"]:
+    """Gain and offset by which most of some grey values become those of another view.
+
+    The line through both is fitted to either's errors alike (total least squares): a plain
+    regression takes noise for a smaller gain, and along a chain of views these multiply. Pixels
+    that do not agree lose their weight (Cauchy's), and where the values hardly differ the gain
+    stays near 1. Returns gain 1 and offset 0 where too few pixels agree. Nothing waits for a GPU.
+    """
+    weight = usable.to(grey.dtype)
+    for n in range(_ROUNDS):
+        total = weight.sum().clamp(min=1e-12)
+        mean_x, mean_y = (weight * grey).sum() / total, (weight * other).sum() / total
+        x, y = grey - mean_x, other - mean_y
+        # As if as much again of a texture that is equal in both were seen.
+        xx, yy, xy = (
+            (weight * a * b).sum() / total + _PLAIN**2 for a, b in ((x, x), (y, y), (x, y))
+        )
+        apart = yy - xx
+        gain = (apart + (apart.square() + 4 * xy.square()).sqrt()) / (2 * xy.clamp(min=1e-9))
+        gain = gain.clamp(1 / _LARGEST_GAIN, _LARGEST_GAIN)
+        residual = (y - gain * x) / (1 + gain.square()).sqrt()
+        # Wide at first, so that the start, where all count, does not decide.
+        scale = _SCALE * max(1.0, 4.0 * (1 - n / (_ROUNDS / 2)))
+        weight = usable / (1 + (residual / scale).square())
+    found = torch.stack([gain, mean_y - gain * mean_x])
+    return torch.where(weight.sum() > _FEWEST, found, same_light(grey.device).to(grey))

@@ -1,0 +1,51 @@
+"""Gain and offset between the grey values of two views."""
+
+import numpy as np
+import pytest
+import torch
+
+from geogs.losses.light import relative_light
+
+
+def values(random: np.random.Generator, n: int = 2000, spread: float = 0.15) -> torch.Tensor:
+    return torch.from_numpy(0.5 + spread * random.standard_normal(n)).float()
+
+
+def noise(random: np.random.Generator, n: int = 2000) -> torch.Tensor:
+    return torch.from_numpy(0.01 * random.standard_normal(n)).float()
+
+
+@pytest.mark.parametrize(("gain", "offset"), [(1.0, 0.0), (0.6, 0.1), (1.7, -0.2)])
+def test_hidden_surfaces_do_not_count(gain, offset):
+    random = np.random.default_rng(0)
+    grey = values(random)
+    other = gain * grey + offset + noise(random)
+    other[:700] = values(random, 700)  # what hides the surface has grey values of its own
+    found = relative_light(grey + noise(random), other, torch.ones(2000, dtype=torch.bool))
+    assert found.tolist() == pytest.approx([gain, offset], abs=0.02)
+
+
+def test_noise_is_no_gain_along_a_chain():
+    """A plain regression would lose a tenth in 20 steps: the noise is 7 % of the texture."""
+    random = np.random.default_rng(1)
+    true, gain = values(random), 1.0
+    for _ in range(20):
+        here, there = true + noise(random), true + noise(random)
+        gain *= float(relative_light(here, there, torch.ones(2000, dtype=torch.bool))[0])
+    assert gain == pytest.approx(1.0, abs=0.02)
+
+
+def test_a_bare_wall_tells_brightness_only():
+    random = np.random.default_rng(2)
+    wall = torch.full((2000,), 0.7)
+    usable = torch.ones(2000, dtype=torch.bool)
+    found = relative_light(wall + noise(random), wall - 0.1 + noise(random), usable)
+    assert float(found[0]) == pytest.approx(1.0, abs=0.05)
+    assert float(found[0]) * 0.7 + float(found[1]) == pytest.approx(0.6, abs=2e-3)
+
+
+def test_too_few_pixels_say_nothing():
+    grey = values(np.random.default_rng(3))
+    usable = torch.zeros(2000, dtype=torch.bool)
+    usable[:40] = True
+    assert relative_light(grey, 0.5 * grey, usable).tolist() == [1.0, 0.0]

@@ -1,0 +1,73 @@
+"""Keyframes whose exposure changes are brought into one light."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from geogs.config import Config
+from geogs.geometry.lie import se3_inverse
+from geogs.mapping.mapper import Mapper
+from geogs.synth.export import default_camera
+from geogs.synth.raycast import Raycaster
+from geogs.synth.room import make_room
+from geogs.synth.trajectory import handheld_trajectory
+from keyframe_samples import Sample, segment_of
+
+CAMERA = default_camera(160, 120)
+GAINS, OFFSETS = [1.0, 0.8, 0.65, 0.9], [0.0, 0.05, 0.1, -0.05]
+
+
+@pytest.fixture(scope="module")
+def samples() -> list[Sample]:
+    """Four keyframes with the true depth on the grid."""
+    scene = make_room(3)
+    caster, poses, made = Raycaster(scene), handheld_trajectory(scene, 64), []
+    for n, (gain, offset) in enumerate(zip(GAINS, OFFSETS, strict=True)):
+        view = caster.render(CAMERA, poses[6 * n])
+        z = torch.from_numpy(view.depth[4 : CAMERA.height - 3 : 8, 4 : CAMERA.width - 3 : 8])
+        image = np.clip(gain * view.image.astype(np.float64) + 255 * offset, 0, 255)
+        made.append(
+            Sample(
+                n, image.round().astype(np.uint8), se3_inverse(torch.from_numpy(poses[6 * n])),
+                (1 / z).float(), (z / 0.02).square().float(),
+            )
+        )  # fmt: skip
+    return made
+
+
+def mapped(samples: list[Sample], level: bool = True) -> Mapper:
+    config = replace(
+        Config().mapping,
+        render_long_edge=80,
+        lag=0,
+        iterations=0,
+        photo=replace(Config().mapping.photo, level=level, min_parallax=0.5),
+    )
+    mapper = Mapper(segment_of(samples, CAMERA).store, config)
+    for n in range(len(samples)):
+        mapper.observe(n)
+    for n in range(len(samples)):
+        mapper.map_keyframe(n)
+    return mapper
+
+
+def test_gain_and_offset_are_undone(samples):
+    mapper = mapped(samples)
+    for n, (gain, offset) in enumerate(zip(GAINS, OFFSETS, strict=True)):
+        levelled = mapper.views[n].light.tolist()
+        assert levelled == pytest.approx([1 / gain, -offset / gain], abs=0.04)
+        # What was clipped cannot come back, the rest is as it was.
+        grey, middle = 0.5, (0.5 * gain + offset)
+        assert levelled[0] * middle + levelled[1] == pytest.approx(grey, abs=0.015)
+
+
+def test_photos_follow_and_come_back_from_a_checkpoint(samples):
+    mapper = mapped(samples)
+    view, as_taken = mapper.views[2], mapped(samples, level=False).views[2]
+    assert as_taken.light.tolist() == [1.0, 0.0]
+    expected = view.light[0] * as_taken.photo.grey + view.light[1]
+    assert torch.equal(view.photo.grey, expected)
+    mapper.pool.load(mapper.pool.state(), {n: mapper.keyframes[n] for n in range(4)})
+    assert torch.allclose(view.photo.grey, expected, atol=1e-6)
