@@ -22,6 +22,10 @@ class TrackingConfig(Settings, group="tracking"):
     keyframe_overlap: Share = 0.7
     """A frame that has moved a fifth of that becomes one, too, when less than this fraction of the
     last keyframe finds a match in it."""
+    blur_share: Share = 0.7
+    """A frame with less than this fraction of the latest frames' sharpness is blurred ..."""
+    blur_wait: Weight = 0.4
+    """... and becomes a keyframe only when it has moved by this much more; 0 takes it at once."""
     cull_distance: Share = 0.012
     """A keyframe nearer than this to the one before it is removed again, of the long edge."""
     init_keyframes: Annotated[int, Range(4, 1000)] = 12

@@ -1,21 +1,80 @@
 """Which frames become keyframes."""
 
+import math
+from collections import deque
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
 from geogs.config import TrackingConfig
 
 LEAST_FLOW = 0.2
 """Fraction of the motion that makes a keyframe below which a lost overlap is none: the camera has
 hardly moved, so it is the image that is poor."""
+_COMPARED = 12
+"""Latest frames among which one is sharp or blurred."""
+_EDGE = 320
+"""Longer side of the image in which sharpness is measured; below it, noise counts for less."""
 
 
-def calls_for_keyframe(config: TrackingConfig, long_edge: int, flow: float, overlap: float) -> bool:
-    """Whether a frame is far enough from the last keyframe to become one.
+def sharpness(image: UInt8[np.ndarray, "h w 3"]) -> float:
+    """Energy of an image's gradients in the direction that has least, over the image's variance.
 
-    ``flow`` is the median motion of the cells that are matched, in pixels, ``overlap`` the fraction
-    of the keyframe's cells that are. In forward motion the cells that move most leave the image
-    or are not matched any more, so that the median motion of the rest stays small while the
-    overlap goes.
+    Blur by motion takes from the gradients along the motion, hardly from the variance. The number
+    says little by itself, for it follows what is seen; among neighbours in a video it tells
+    which are blurred.
     """
-    enough = config.keyframe_flow * long_edge
-    if overlap < config.keyframe_overlap:
-        enough *= LEAST_FLOW
-    return flow >= enough
+    height, width = image.shape[:2]
+    shrink = min(1.0, _EDGE / max(height, width))
+    size = (max(round(width * shrink), 1), max(round(height * shrink), 1))
+    grey = cv2.cvtColor(cv2.resize(image, size, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2GRAY)
+    grey = grey.astype(np.float32)
+    x, y = cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1)
+    xx, yy, xy = float((x * x).mean()), float((y * y).mean()), float((x * y).mean())
+    least = (xx + yy) / 2 - math.hypot((xx - yy) / 2, xy)  # eigenvalue of the mean outer product
+    return least / float(grey.var() + 1.0)
+
+
+class KeyframeChoice:
+    """Says which frames become keyframes, from their motion, overlap and sharpness."""
+
+    def __init__(self, config: TrackingConfig, long_edge: int) -> None:
+        """``long_edge`` is that of the images, in pixels."""
+        self.config = config
+        self.long_edge = long_edge
+        self._recent: deque[float] = deque(maxlen=_COMPARED)
+
+    def see(self, image: UInt8[np.ndarray, "h w 3"]) -> None:
+        """Take note of the next frame, about which :meth:`calls_for` is asked."""
+        self._recent.append(sharpness(image))
+
+    def state(self) -> list[float]:
+        """What a checkpoint holds: the sharpness of the latest frames."""
+        return list(self._recent)
+
+    def load(self, state: list[float]) -> None:
+        """Go on where another was."""
+        self._recent = deque(state, maxlen=_COMPARED)
+
+    def calls_for(self, flow: float, overlap: float) -> bool:
+        """Whether the frame seen last is far enough from the last keyframe to become one.
+
+        ``flow`` is the median motion of the cells that are matched, in pixels, ``overlap`` the
+        fraction of the keyframe's cells that are. In forward motion the cells that move most leave
+        the image or are not matched any more, so that the median motion of the rest stays small
+        while the overlap goes. A frame that is blurred beside the latest ones waits for a sharper
+        one, though not for long: nothing else sees what comes into view meanwhile.
+        """
+        c, enough, least = self.config, self.config.keyframe_flow, self.config.keyframe_overlap
+        if self._is_blurred():
+            enough *= 1 + c.blur_wait
+            least /= 1 + c.blur_wait
+        if overlap < least:
+            enough *= LEAST_FLOW
+        return flow >= enough * self.long_edge
+
+    def _is_blurred(self) -> bool:
+        if len(self._recent) < 3:
+            return False
+        return self._recent[-1] < self.config.blur_share * float(np.median(self._recent))

@@ -8,7 +8,7 @@ import torch
 from geogs.config import TrackingConfig
 from geogs.tracking.graph import FrameGraph
 from geogs.tracking.initialise import chained_flows, initialise
-from geogs.tracking.keyframe_choice import calls_for_keyframe
+from geogs.tracking.keyframe_choice import KeyframeChoice
 from geogs.tracking.keyframe_priors import KeyframePriors
 from geogs.tracking.motion import ChainState, FlowChain
 from geogs.tracking.trajectory import TrajectoryRecorder
@@ -47,11 +47,11 @@ class StartUp:
         recorder: TrajectoryRecorder,
         priors: KeyframePriors,
         config: TrackingConfig,
+        choice: KeyframeChoice,
     ) -> None:
         self.graph, self.recorder, self.priors, self.config = graph, recorder, priors, config
         self.keyframes = graph.keyframes
-        camera = self.keyframes.grid.camera
-        self._long_edge = max(camera.width, camera.height)
+        self._choice = choice
         self._chain = FlowChain(self.keyframes.grid, graph.operator, config.min_ncc)
         self._misses = 0
 
@@ -72,7 +72,7 @@ class StartUp:
             if match.matched < self.config.min_matched:
                 return self._miss(frame, encoded)
             self._misses = 0
-            if not calls_for_keyframe(self.config, self._long_edge, match.flow, match.matched):
+            if not self._choice.calls_for(match.flow, match.matched):
                 eye = torch.eye(4, dtype=torch.float64)
                 self.recorder.add(frame, encoded, last.id, eye, match.there)
                 return StartStep()

@@ -24,7 +24,7 @@ from geogs.priors.base import MonocularPrior
 from geogs.tracking.flow.base import FlowOperator
 from geogs.tracking.flow.select import build_operator
 from geogs.tracking.graph import EdgeState, FrameGraph
-from geogs.tracking.keyframe_choice import calls_for_keyframe
+from geogs.tracking.keyframe_choice import KeyframeChoice
 from geogs.tracking.keyframe_priors import KeyframePriors
 from geogs.tracking.motion import (
     FrameLocator,
@@ -113,6 +113,8 @@ class TrackerState:
     last: LastFrameState | None
     misses: int
     frames_lost: int
+    sharpness: list[float]
+    """Of the latest frames."""
 
 
 class Tracker:
@@ -142,6 +144,7 @@ class Tracker:
         self.state = TrackState.INITIALIZING
         edge = max(camera.width, camera.height)
         self._long_edge = edge
+        self._choice = KeyframeChoice(self.config, edge)
         self._locator = FrameLocator(
             self.grid,
             self.operator,
@@ -153,7 +156,7 @@ class Tracker:
         self._breaks: list[int] = []
         """Keyframes that no motion links to the one before them."""
         self._last: LastFrame | None = None
-        self._start_up = StartUp(self.graph, self.recorder, self.priors, self.config)
+        self._start_up = StartUp(self.graph, self.recorder, self.priors, self.config, self._choice)
         self._misses = 0
         self.frames_lost = 0
         """Frames with texture since the camera was last located, once the map has been started."""
@@ -196,7 +199,7 @@ class Tracker:
         return TrackerState(
             self.keyframes.state(), self.graph.state(), self.recorder.state(),
             self._start_up.state(), self.state, list(self._finalized), self._breaks, last,
-            self._misses, self.frames_lost,
+            self._misses, self.frames_lost, self._choice.state(),
         )  # fmt: skip
 
     def load(self, state: TrackerState) -> None:
@@ -208,6 +211,7 @@ class Tracker:
         self.state = state.state
         self._finalized, self._breaks = dict.fromkeys(state.finalized), state.breaks
         self._misses, self.frames_lost = state.misses, state.frames_lost
+        self._choice.load(state.sharpness)
         if state.last is not None:
             last = state.last
             keyframe = self.keyframes[last.keyframe]
@@ -247,6 +251,7 @@ class Tracker:
                 f"{self.camera.width} x {self.camera.height}; all frames must have one size."
             )
         encoded = self.operator.encode(frame.image)
+        self._choice.see(frame.image)
         if self.operator.texture(encoded) < self.config.min_texture:
             return self._lose(frame)
         if self.state is TrackState.INITIALIZING:
@@ -356,7 +361,7 @@ class Tracker:
         anchor = self.keyframes[motion.keyframe]
         T_rel = motion.T_cw @ se3_inverse(anchor.T_cw)
         self._seen_at(anchor, T_rel, velocity)
-        if not calls_for_keyframe(self.config, self._long_edge, motion.flow, motion.overlap):
+        if not self._choice.calls_for(motion.flow, motion.overlap):
             self.recorder.add(frame, encoded, anchor.id, T_rel, motion.match)
             return TrackResult(self.state, active=self.active)
         return self._insert(frame, encoded, motion, velocity)
