@@ -144,13 +144,17 @@ def motion_layout() -> Layout:
         "Motions",
         (
             Column("frames tracked (%)", field("tracked"), 1),
+            Column("orientation only (%)", field("turned"), 1),
             Column("ATE over path (%)", field("relative"), 3),
             Column("ATE (cm)", field("ate"), 2),
             Column("rotation (degrees)", field("rotation"), 2),
             Column("within 3 sigma (%)", field("within"), 1),
+            Column("is reliable", field("is_reliable"), 0),
+            Column("is called so", field("is_called_reliable"), 0),
         ),
         "Over the tracked frames; positions after a Sim(3) alignment, orientations after that of "
-        "the world's axes. A camera that hardly moves has no ATE.",
+        "the world's axes. A camera that hardly moves has no ATE. Reliable (1) are an ATE below a "
+        "twentieth of the path's extent and four fifths of the frames tracked.",
     )
 
 

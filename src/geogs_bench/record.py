@@ -73,6 +73,8 @@ class MotionScore:
 
     tracked: float
     """Frames that have a pose, percent."""
+    turned: float = 0.0
+    """Frames of which an orientation is given, but no position, percent."""
     rotation: float | None = None
     """RMSE of the orientations, degrees; none where nothing was tracked."""
     ate: float | None = None
@@ -80,8 +82,13 @@ class MotionScore:
     relative: float | None = None
     """The same over the length of the way, percent."""
     within: float | None = None
-    """Poses within three of the deviations that the system claims, percent; none where it claims
-    none."""
+    """Positions within three of the deviations that the system claims, percent; none where it
+    claims none."""
+    is_called_reliable: bool | None = None
+    """What the system says of the whole; none where it says nothing."""
+    is_reliable: bool | None = None
+    """Whether the ATE is below a twentieth of the true path's extent, and four fifths of the frames
+    are tracked; none where there is no ATE."""
 
 
 @dataclass(frozen=True)

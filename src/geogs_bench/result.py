@@ -1,10 +1,14 @@
 """Reading the folder that ``geogs run`` or ``geogs reconstruct`` leaves."""
 
+import csv
 import json
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float64
 
 from geogs.errors import InputError
 from geogs.evaluation.surface import Surface, read_surface
@@ -17,6 +21,35 @@ from geogs_bench.record import StageName
 _STAGE_FOLDERS: dict[StageName, str] = {
     "online": "online", "depth fusion": "depth_fusion", "final": "",
 }  # fmt: skip
+
+
+TRACKED, ORIENTED = "tracked", "orientation only"
+"""States of a frame that has a pose, and of one that has an orientation."""
+
+
+@dataclass(frozen=True)
+class FrameStates:
+    """What a result says of every frame."""
+
+    timestamps: Float64[np.ndarray, "n"]
+    state: np.ndarray
+    """Strings."""
+    sigma_position: Float64[np.ndarray, "n"]
+    """Map units; infinite where none is given."""
+
+    def tracked_of(self, trajectory: Trajectory) -> Trajectory:
+        """The poses of the frames that were tracked."""
+        return self._of(trajectory, self.state == TRACKED)
+
+    def oriented_of(self, trajectory: Trajectory) -> Trajectory:
+        """The poses of the frames that have an orientation at least."""
+        return self._of(trajectory, np.isin(self.state, (TRACKED, ORIENTED)))
+
+    def _of(self, trajectory: Trajectory, chosen: Bool[np.ndarray, "n"]) -> Trajectory:
+        keep = np.isin(trajectory.timestamps.round(6), self.timestamps[chosen].round(6))
+        return Trajectory(
+            trajectory.timestamps[keep], trajectory.T_wc[keep], trajectory.tracked[keep]
+        )
 
 
 @dataclass(frozen=True)
@@ -62,6 +95,20 @@ class ResultFolder:
         """All poses of a stage, or the keyframes' (``keyframes.tum``); none where not there."""
         file = self.path / _STAGE_FOLDERS[stage] / name
         return read_tum_trajectory(file) if file.is_file() else None
+
+    def uncertainty(self) -> FrameStates | None:
+        """``trajectory_uncertainty.csv``; none where it is not there."""
+        file = self.path / "trajectory_uncertainty.csv"
+        if not file.is_file():
+            return None
+        with file.open(encoding="utf-8", newline="") as lines:
+            rows = list(csv.DictReader(lines))
+        sigma = [float(row["sigma_position"] or "inf") for row in rows]
+        return FrameStates(
+            np.array([float(row["timestamp"]) for row in rows]),
+            np.array([row["state"] for row in rows]),
+            np.array(sigma),
+        )
 
     def snapshots(self) -> list[tuple[float, Path]]:
         """Folders of the map after so many seconds, in order of time."""

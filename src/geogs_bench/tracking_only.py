@@ -7,11 +7,13 @@ from pathlib import Path
 
 from geogs.application.settings import RunSettings
 from geogs.application.summary import lost_spans
+from geogs.application.verdict import verdict
 from geogs.errors import TrackingLost
 from geogs.gpu.installation import require_device
 from geogs.io.sources.sniff import open_source
 from geogs.io.writers.atomic import prepare_output_folder, write_text
 from geogs.io.writers.tum import write_tum_trajectory
+from geogs.io.writers.uncertainty import write_uncertainty
 from geogs.loop.global_bundle import global_bundle
 from geogs.slam import Slam
 from geogs.threads import on_one_torch_thread
@@ -50,8 +52,12 @@ def track_to_folder(
         slam.loops.update(slam.segments.finish(), True)
         global_bundle(slam.segments.world)
         trajectory = slam.trajectory()
+        known = slam.uncertainty()
         write_tum_trajectory(folder / "trajectory.tum", trajectory)
+        write_uncertainty(folder / "trajectory_uncertainty.csv", trajectory, known)
         summary["lost_spans"] = lost_spans(trajectory)
+        said = verdict(trajectory, slam.keyframe_trajectory(), known)
+        summary["verdict"] = {"is_reliable": said.is_reliable, "sentence": said.sentence}
     except TrackingLost as error:
         summary["not_tracked"] = str(error)
     write_text(folder / "summary.json", json.dumps(summary, indent=2) + "\n")

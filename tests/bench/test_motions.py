@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from geogs.application.settings import RunSettings
 from geogs.errors import InputError
+from geogs.io.writers.tum import write_tum_trajectory
 from geogs.types import Trajectory
 from geogs_bench.layouts.motions import find_motions
 from geogs_bench.motion_cells import FULL, SMALL, render_cells
@@ -82,6 +83,32 @@ def test_a_camera_that_only_turns_has_no_ate() -> None:
     stuck = moved.copy()
     stuck[:, :3, 3] = 0
     assert compare_motion(_trajectory(moved), _trajectory(stuck)).ate is None
+
+
+def test_what_a_run_says_of_itself_is_compared_with_the_truth(tmp_path: Path) -> None:
+    """Forty frames of which two are lost, two only oriented, and one is off by 5 deviations."""
+    truth, estimate = _poses(7, 40), _poses(7, 40)
+    estimate[4, :3, 3] += 0.005
+    sequence, output = tmp_path / "walk", tmp_path / "result"
+    sequence.mkdir()
+    output.mkdir()
+    np.savetxt(sequence / "traj.txt", truth.reshape(-1, 16))
+    (sequence / "cam_params.json").write_text("{}")
+    write_tum_trajectory(output / "trajectory.tum", _trajectory(estimate))
+    states = ["lost"] * 2 + ["orientation only"] * 2 + ["tracked"] * 36
+    rows = [
+        f"{k / 30!r},{state},{0.001 if state == 'tracked' else ''},,"
+        for k, state in enumerate(states)
+    ]
+    header = "timestamp,state,sigma_position,sigma_rotation_deg,relative_sigma_depth"
+    (output / "trajectory_uncertainty.csv").write_text("\n".join([header, *rows, ""]))
+    (output / "summary.json").write_text(json.dumps({"verdict": {"is_reliable": True}}))
+    (scene,) = find_motions(tmp_path)
+    score = score_motion(scene, ResultFolder(output))
+    assert (score.tracked, score.turned) == (90, 5)
+    assert score.within == pytest.approx(100 * 35 / 36)
+    assert (score.is_reliable, score.is_called_reliable) == (True, True)
+    assert score.ate == pytest.approx(0.5 * 3**0.5 / 6, rel=0.1)
 
 
 def test_names_that_are_no_cell(tmp_path: Path) -> None:

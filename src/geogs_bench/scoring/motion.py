@@ -1,5 +1,7 @@
 """How well a camera's motion was followed: share of the frames, positions, orientations."""
 
+from dataclasses import replace
+
 import numpy as np
 from jaxtyping import Float
 
@@ -7,7 +9,7 @@ from geogs.errors import InputError
 from geogs.evaluation.trajectory import associate, evaluate_trajectory, finite_poses, rotation_angle
 from geogs.types import Trajectory
 from geogs_bench.record import MotionScore
-from geogs_bench.result import ResultFolder
+from geogs_bench.result import ORIENTED, FrameStates, ResultFolder
 from geogs_bench.scene import Scene
 from geogs_bench.truth import read_true_poses
 
@@ -15,6 +17,11 @@ _LEAST_PATH = 0.05
 """Metres of way below which positions have nothing to be compared with."""
 _SAME_TIME = 0.005
 """Seconds."""
+_MOST_OFF = 0.05
+"""ATE of a reliable run, of the extent of the true path (root of the mean squared distance from its
+middle)."""
+_LEAST_TRACKED = 80.0
+"""Percent of the frames that a reliable run tracks."""
 
 
 def score_motion(scene: Scene, result: ResultFolder) -> MotionScore:
@@ -27,32 +34,66 @@ def score_motion(scene: Scene, result: ResultFolder) -> MotionScore:
     if reference is None:
         raise InputError(f"{scene.name} has no true poses to compare with.")
     estimate = result.trajectory("final")
+    said = result.summary.get("verdict") or {}
     if estimate is None:
-        return MotionScore(tracked=0.0)
-    return compare_motion(reference, _without_lost(estimate, result))
+        return MotionScore(tracked=0.0, is_called_reliable=said.get("is_reliable"))
+    known = result.uncertainty()
+    if known is None:
+        return compare_motion(reference, _without_lost(estimate, result))
+    score = compare_motion(reference, known.tracked_of(estimate), known.oriented_of(estimate))
+    return replace(
+        score,
+        turned=100 * float((known.state == ORIENTED).mean()),
+        within=_within(reference, known.tracked_of(estimate), known),
+        is_called_reliable=said.get("is_reliable"),
+    )
 
 
-def compare_motion(reference: Trajectory, tracked: Trajectory) -> MotionScore:
+def compare_motion(
+    reference: Trajectory, tracked: Trajectory, oriented: Trajectory | None = None
+) -> MotionScore:
     """The poses that were tracked against the true ones, frame by frame.
 
     Positions are aligned by a Sim(3), orientations by the rotation that fits them best, so that a
-    camera that only turns has a rotation error, too.
+    camera that only turns has a rotation error, too. ``oriented`` are the poses whose
+    orientation counts; if they are not given, those that were tracked.
     """
     reference, tracked = finite_poses(reference), finite_poses(tracked)
-    i, j = associate(reference.timestamps, tracked.timestamps, _SAME_TIME)
+    i, _ = associate(reference.timestamps, tracked.timestamps, _SAME_TIME)
     share = 100 * len(i) / len(reference.timestamps)
+    rotation = _rotation(reference, tracked if oriented is None else oriented)
     if len(i) < 3:
-        return MotionScore(share)
-    rotation = rotation_error(tracked.T_wc[j, :3, :3], reference.T_wc[i, :3, :3])
-    steps = np.linalg.norm(np.diff(reference.T_wc[i, :3, 3], axis=0), axis=1)
-    path = float(steps.sum())
+        return MotionScore(share, rotation=rotation)
+    places = reference.T_wc[i, :3, 3]
+    path = float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum())
     if path < _LEAST_PATH:
-        return MotionScore(share, rotation)
+        return MotionScore(share, rotation=rotation)
     try:
         ate = evaluate_trajectory(tracked, reference, _SAME_TIME).ate_rmse_cm
     except InputError:  # all estimated positions are one
-        return MotionScore(share, rotation)
-    return MotionScore(share, rotation, ate, ate / path)
+        return MotionScore(share, rotation=rotation)
+    extent = float(np.sqrt(np.square(places - places.mean(0)).sum(1).mean()))
+    good = share >= _LEAST_TRACKED and ate <= 100 * _MOST_OFF * extent
+    return MotionScore(share, 0.0, rotation, ate, ate / path, is_reliable=good)
+
+
+def _rotation(reference: Trajectory, oriented: Trajectory) -> float | None:
+    """RMSE of the orientations in degrees; none where there are fewer than three."""
+    oriented = finite_poses(oriented)
+    i, j = associate(reference.timestamps, oriented.timestamps, _SAME_TIME)
+    if len(i) < 3:
+        return None
+    return rotation_error(oriented.T_wc[j, :3, :3], reference.T_wc[i, :3, :3])
+
+
+def _within(reference: Trajectory, tracked: Trajectory, known: FrameStates) -> float | None:
+    """Percent of the positions that are off by no more than three deviations, aligned."""
+    try:
+        errors = evaluate_trajectory(tracked, reference, _SAME_TIME)
+    except InputError:
+        return None
+    claimed = errors.scale * np.interp(errors.timestamps, known.timestamps, known.sigma_position)
+    return 100 * float((errors.position_error <= 3 * claimed).mean())
 
 
 def rotation_error(
