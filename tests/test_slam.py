@@ -84,13 +84,25 @@ def test_a_run_reaches_its_accuracy(room, result, tmp_path):
     disks = load_map(result / "map.safetensors")
     assert disks.is_finite()
     assert 1000 < len(disks) < 30_000
-    assert json.loads((result / "summary.json").read_text())["peak_memory_bytes"] < 2e9
+    summary = json.loads((result / "summary.json").read_text())
+    assert summary["peak_memory_bytes"] < 2e9
+    said = summary["verdict"]
+    assert said["is_reliable"]
+    assert said["position"] < 0.02
+    assert said["depth"] < 0.05
+    scale = scores["trajectory"]["scale"]
+    rows = (result / "trajectory_uncertainty.csv").read_text().splitlines()[1:]
+    states = [row.split(",") for row in rows]
+    assert [state for _, state, *_ in states] == ["tracked"] * FRAMES
+    claimed = np.median([float(sigma) for _, _, sigma, *_ in states])
+    assert 100 * scale * claimed > 0.3 * scores["trajectory"]["ate_rmse_cm"]
 
 
 def test_a_run_leaves_every_file(small_result):
     names = [
         "trajectory.tum", "keyframes.tum", "intrinsics.json", "mesh.ply", "splats.ply",
-        "map.safetensors", "config.yaml", "summary.json", "report/trajectory.png",
+        "map.safetensors", "config.yaml", "summary.json", "trajectory_uncertainty.csv",
+        "report/trajectory.png",
         "report/keyframes.png", "report/mesh.png",
     ]  # fmt: skip
     assert [n for n in names if not (small_result / n).is_file()] == []

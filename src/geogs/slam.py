@@ -92,6 +92,7 @@ class Slam:
         self.adjusted = 0
         """Keyframes at the last bundle adjustment of all."""
         self._is_ended = False
+        self._known: Uncertainty | None = None
 
     def new_tracker(self) -> Tracker:
         """A tracker of another segment."""
@@ -182,12 +183,12 @@ class Slam:
         times = np.array([k.timestamp for k in keyframes], dtype=np.float64)
         return Trajectory(times, np.array(T_wc).reshape(-1, 4, 4), np.ones(len(times), dtype=bool))
 
-    @on_one_torch_thread
-    def uncertainty(self) -> Uncertainty:
-        """How well the keyframes are known, by the matches that there are now."""
-        world = self.segments.world
-        with self.stopwatch("uncertainty"):
-            return certainty(world).calibrated(world)
+    def uncertainty(self) -> Uncertainty | None:
+        """How well the keyframes are known, by all matches of the last adjustment.
+
+        None before that: what is left of the matches until then are the latest alone.
+        """
+        return self._known
 
     def particulars(self) -> dict[str, object]:
         """What a summary says of segments and loops, ready for JSON."""
@@ -234,6 +235,10 @@ class Slam:
         world = self.segments.world
         with self.stopwatch("global bundle adjustment"):
             global_bundle(world, lambda f, _: progress("bundle adjustment", f))
+        if self._is_ended:
+            with self.stopwatch("uncertainty"):
+                self._known = certainty(world).calibrated(world)
+        with self.stopwatch("global bundle adjustment"):
             self.loops.replaced_by_bundle()
         self.adjusted = len(world.keyframe_ids)
         self._move_map()

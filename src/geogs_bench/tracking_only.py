@@ -17,6 +17,7 @@ from geogs.io.writers.uncertainty import write_uncertainty
 from geogs.loop.global_bundle import global_bundle
 from geogs.slam import Slam
 from geogs.threads import on_one_torch_thread
+from geogs.tracking.certainty import certainty
 
 
 @on_one_torch_thread
@@ -52,7 +53,7 @@ def track_to_folder(
         slam.loops.update(slam.segments.finish(), True)
         global_bundle(slam.segments.world)
         trajectory = slam.trajectory()
-        known = slam.uncertainty()
+        known = certainty(slam.segments.world).calibrated(slam.segments.world)
         write_tum_trajectory(folder / "trajectory.tum", trajectory)
         write_uncertainty(folder / "trajectory_uncertainty.csv", trajectory, known)
         summary["lost_spans"] = lost_spans(trajectory)
