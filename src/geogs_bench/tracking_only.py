@@ -3,9 +3,11 @@
 import json
 import time
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 
 from geogs.application.settings import RunSettings
+from geogs.application.shutter import with_shutter_found
 from geogs.application.summary import lost_spans
 from geogs.application.verdict import verdict
 from geogs.errors import TrackingLost
@@ -33,7 +35,7 @@ def track_to_folder(
         DeviceError, OutputError: the device, or the folder.
     """
     device = require_device(settings.device)
-    source = open_source(settings.source, settings.config.input)
+    source = with_shutter_found(open_source(settings.source, settings.config.input))
     folder = prepare_output_folder(output)
     slam = Slam(source.camera, settings.config, str(device))
     start = time.perf_counter()
@@ -47,6 +49,7 @@ def track_to_folder(
     summary = {
         "device": device.type,
         "frames": frames,
+        "shutter": asdict(source.shutter),
         "frames_per_second": {"until_stream_end": round(frames / max(seconds, 1e-9), 3)},
     }
     try:
