@@ -59,8 +59,8 @@ def _single_flaws(frames: int, size: tuple[int, int]) -> tuple[Cell, ...]:
     )
 
 
-_VGA, _QVGA = (640, 480), (320, 240)
-_SMALL_STREET, _STREET = (496, 150), (1241, 376)
+_QVGA, _LARGER = (320, 240), (400, 300)
+_SMALL_STREET, _STREET = (496, 150), (800, 242)
 
 SMALL: tuple[Cell, ...] = (
     _cell("handheld", "clean", 75, _QVGA),
@@ -79,16 +79,16 @@ SMALL: tuple[Cell, ...] = (
 """For two CPU cores."""
 
 FULL: tuple[Cell, ...] = (
-    *(_cell(motion, camera, 240 if motion != "handheld-5hz" else 120, _VGA)
+    *(_cell(motion, camera, 120 if motion != "handheld-5hz" else 70, _LARGER)
       for motion in ROOM_MOTIONS for camera in ("clean", "phone", "kinect")),
-    *_single_flaws(240, _VGA),
-    _cell("handheld", "action", 240, _VGA),
-    *(_cell(motion, "clean", 240, _VGA, moving)
+    *_single_flaws(120, _LARGER),
+    _cell("handheld", "action", 120, _LARGER),
+    *(_cell(motion, "clean", 120, _LARGER, moving)
       for motion in ("handheld", "walking") for moving in (0.15, 0.33)),
-    _cell("handheld", "phone", 240, _VGA, 0.33),
-    _cell("driving", "clean", 160, _STREET),
-    _cell("driving", "action", 160, _STREET),
-    _cell("driving", "clean", 160, _STREET, 0.15),
+    _cell("handheld", "phone", 120, _LARGER, 0.33),
+    _cell("driving", "clean", 125, _STREET),
+    _cell("driving", "action", 125, _STREET),
+    _cell("driving", "clean", 125, _STREET, 0.15),
 )  # fmt: skip
 """All motions, all flaws."""
 
