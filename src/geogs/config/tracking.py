@@ -40,6 +40,10 @@ class TrackingConfig(Settings, group="tracking"):
     the first to be kept."""
     window: Annotated[int, Range(1, 1000)] = 8
     """Most recent keyframes whose poses the local adjustment moves."""
+    window_baseline: Weight = 0.0
+    """The window reaches further back until the camera has moved by this much of the depth ..."""
+    window_most: Annotated[int, Range("window", 1000)] = 24
+    """... but never over more keyframes than this."""
     depth_window: Annotated[int, Range("window", 1000)] = 11
     """Most recent keyframes whose inverse depth it moves."""
     radius: Annotated[int, Range(1, 100)] = 3

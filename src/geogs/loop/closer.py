@@ -122,7 +122,7 @@ class LoopCloser:
 
     def _retire(self, tracker: Tracker) -> None:
         """Turn the edges that the local adjustment has left behind into relative poses."""
-        old = tracker.graph.retire(tracker.keyframes.ids[-tracker.config.depth_window :])
+        old = tracker.graph.retire(tracker.deep)
         if old:
             known = self._of(tracker)
             known.odometry = joined([known.odometry, of_edges(tracker.keyframes, old)])

@@ -34,6 +34,7 @@ from geogs.tracking.motion import (
 from geogs.tracking.proximity import Pair, frame_distances, proximity_pairs
 from geogs.tracking.start_up import MIN_KEYFRAMES, StartUp, StartUpState
 from geogs.tracking.trajectory import FrameRecord, RecorderState, TrajectoryRecorder
+from geogs.tracking.window import reach
 from geogs.types import Frame, Trajectory
 
 
@@ -187,7 +188,17 @@ class Tracker:
     def active(self) -> tuple[int, ...]:
         """Ids whose poses the local adjustment moves, earliest first; never the very first."""
         ids = self.keyframe_ids
-        return tuple(k for k in ids[-self.config.window :] if k != ids[0])
+        return tuple(k for k in ids[-self._reach() :] if k != ids[0]) if ids else ()
+
+    @property
+    def deep(self) -> list[int]:
+        """Ids whose inverse depth it moves, earliest first."""
+        c = self.config
+        return self.keyframes.ids[-(self._reach() + c.depth_window - c.window) :]
+
+    def _reach(self) -> int:
+        c = self.config
+        return reach(list(self.keyframes), c.window, c.window_most, c.window_baseline)
 
     # --- checkpoints -----------------------------------------------------------------------
 
@@ -410,8 +421,8 @@ class Tracker:
 
     def _adjust_locally(self) -> None:
         c, ids = self.config, self.keyframes.ids
-        poses = [k for k in ids[-c.window :] if k != ids[0]]
-        depths = ids[-c.depth_window :]
+        poses = [k for k in ids[-self._reach() :] if k != ids[0]]
+        depths = self.deep
         moving, deep = set(poses), set(depths)
         for n in range(c.local_rounds):
             edges = [e for e in self.graph.edges if e[0] in deep or not moving.isdisjoint(e)]
