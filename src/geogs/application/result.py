@@ -48,7 +48,8 @@ class Result:
         """Whether trajectory and shape are to be relied on; none where the poses were given."""
         if self.uncertainty is None:
             return None
-        return verdict(self.trajectory, self.keyframes, self.uncertainty)
+        why_not = self.scene.particulars().get("not_started")
+        return verdict(self.trajectory, self.keyframes, self.uncertainty, str(why_not or ""))
 
     @cached_property
     def map(self) -> MapSnapshot:

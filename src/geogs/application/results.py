@@ -52,7 +52,7 @@ def write_results(
             write_mesh(output / "mesh.ply", mesh.vertices, mesh.faces, mesh.colours, mesh.normals)
     for write in more:
         write()
-    lost = int((~result.trajectory.tracked).sum())
+    lost = result.trajectory.states.count("lost")
     if lost > 0.2 * scene.frames:
         progress.write(
             f"warning: {lost} of {scene.frames} frames were not tracked; slower motion, texture "

@@ -1,7 +1,7 @@
 """The pose of every frame, solved at the end from sparse flow kept along the way."""
 
 from bisect import bisect_left
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -20,6 +20,7 @@ from geogs.keyframes.keyframe import Keyframe
 from geogs.keyframes.store import Segment
 from geogs.tracking.flow.base import FlowMatch, FlowOperator
 from geogs.tracking.packed_edge import pack_matches, unpacked_positions
+from geogs.tracking.turns import Turn, orientations
 from geogs.types import Frame, Trajectory
 
 
@@ -45,6 +46,8 @@ class FrameRecord:
     scale: float = 1.0
     """Of the anchor when that was measured."""
     observations: list[Observation] = field(default_factory=list)
+    turns: list[Turn] = field(default_factory=list)
+    """Against earlier frames: what is left to go by where there is no depth."""
 
     def sees(self, keyframe: int) -> bool:
         """Whether the flow from that keyframe has been measured."""
@@ -104,10 +107,10 @@ class TrajectoryRecorder:
             for n, image in state.pending.items()
         ]
 
-    def add_untracked(self, index: int, timestamp: float) -> None:
-        """A frame that could not be located."""
+    def add_untracked(self, index: int, timestamp: float, turns: Sequence[Turn] = ()) -> None:
+        """A frame that could not be located, though its orientation may be known."""
         eye = torch.eye(4, dtype=torch.float64)
-        self.records.append(FrameRecord(index, timestamp, None, eye))
+        self.records.append(FrameRecord(index, timestamp, None, eye, turns=[*turns]))
 
     def add(
         self,
@@ -116,10 +119,11 @@ class TrajectoryRecorder:
         anchor: int,
         T_rel: Float[Tensor, "4 4"],
         match: FlowMatch | None = None,
+        turns: Sequence[Turn] = (),
     ) -> None:
         """A frame at ``T_rel`` from the anchor keyframe, with the flow that located it."""
         scale = self.keyframes[anchor].scale
-        record = FrameRecord(frame.index, frame.timestamp, anchor, T_rel, scale)
+        record = FrameRecord(frame.index, frame.timestamp, anchor, T_rel, scale, turns=[*turns])
         if match is not None:
             self._observe([(record, anchor)], match)
         self.records.append(record)
@@ -127,11 +131,13 @@ class TrajectoryRecorder:
         if len(self._pending) > self.max_pending:
             del self._pending[: self.max_pending // 2]
 
-    def add_keyframe(self, id: int) -> None:
+    def add_keyframe(self, id: int, turns: Sequence[Turn] = ()) -> None:
         """A frame that is a keyframe."""
         state = self.keyframes[id]
         eye = torch.eye(4, dtype=torch.float64)
-        self.records.append(FrameRecord(state.frame_index, state.timestamp, id, eye, state.scale))
+        self.records.append(
+            FrameRecord(state.frame_index, state.timestamp, id, eye, state.scale, turns=[*turns])
+        )
 
     def keyframe_removed(self, removed: Keyframe, substitute: int) -> None:
         """Make a culled keyframe an ordinary frame; frames anchored to it move to another one."""
@@ -157,7 +163,7 @@ class TrajectoryRecorder:
     def give_up(self, other: "TrajectoryRecorder") -> None:
         """Take over the frames of another recorder as frames that were not tracked."""
         for record in other.records:
-            self.add_untracked(record.index, record.timestamp)
+            self.add_untracked(record.index, record.timestamp, record.turns)
 
     def anchor_to_keyframes(self) -> None:
         """Give the frames seen before the map was started a pose between their keyframes."""
@@ -217,25 +223,26 @@ class TrajectoryRecorder:
         anchor = self.keyframes[record.anchor]
         return anchor.at_present_scale(record.T_rel, record.scale) @ anchor.T_cw
 
-    def solve(self, apart: Sequence[FrameRecord] = (), chunk: int = 64) -> Trajectory:
+    def solve(
+        self, apart: Sequence[FrameRecord] = (), chunk: int = 64, has_map: bool = True
+    ) -> Trajectory:
         """Poses of all frames seen so far on the present keyframes, real timestamps.
 
-        Untracked frames, and those ``apart`` on other keyframes, are interpolated between their
-        neighbours.
+        Of untracked frames, and those ``apart`` on other keyframes, the position is interpolated
+        between their neighbours, and the orientation is what turns say, else interpolated, too.
+        Without a map (``has_map``) nothing but turns is known of any.
         """
         records = sorted([*self.records, *apart], key=lambda r: r.index)
         keyframes = {s.frame_index: s.id for s in self.keyframes}
-        tracked = [r for r in records if r.anchor is not None and r.anchor in self.keyframes]
+        located = records if has_map else []
+        tracked = [r for r in located if r.anchor is not None and r.anchor in self.keyframes]
         free = [r for r in tracked if r.index not in keyframes and r.observations]
         solved: dict[int, Tensor] = {r.index: self._pose(r) for r in tracked}
         for start in range(0, len(free), chunk):
             part = free[start : start + chunk]
             poses = self._solve_chunk(part)
             solved.update({r.index: T for r, T in zip(part, poses, strict=True)})
-        timestamps = np.array([r.timestamp for r in records], dtype=np.float64)
-        known = np.array([r.index in solved for r in records], dtype=bool)
-        T_cw = [solved.get(r.index) for r in records]
-        return Trajectory(timestamps, interpolate(timestamps, T_cw), known)
+        return placed(records, solved)
 
     def _solve_chunk(self, records: list[FrameRecord]) -> Float[Tensor, "n 4 4"]:
         grid, cells = self.keyframes.grid, self._subset
@@ -278,6 +285,39 @@ def depth_aware_weight(
     depth = depth_jacobian.square() / information.clamp(min=1e-12)[..., None]
     variance = 1 / weight.clamp(min=1e-12) + depth
     return (weight > 0) * (information > 0)[..., None] / variance
+
+
+def placed(
+    records: Sequence[FrameRecord], solved: Mapping[int, Float[Tensor, "4 4"]]
+) -> Trajectory:
+    """The trajectory of frames in order of time, of which some have a pose (world to camera)."""
+    timestamps = np.array([r.timestamp for r in records], dtype=np.float64)
+    known = np.array([r.index in solved for r in records], dtype=bool)
+    T_cw = [solved.get(r.index) for r in records]
+    turned = orientations(
+        {r.index: r.turns for r in records}, {n: T[:3, :3] for n, T in solved.items()}
+    )
+    oriented = np.array([r.index in turned for r in records], dtype=bool)
+    if oriented.any():
+        centres = held_centres(timestamps, T_cw)
+        for n in np.flatnonzero(oriented):
+            T = torch.eye(4, dtype=torch.float64)
+            T[:3, :3] = turned[records[n].index]
+            T[:3, 3] = -T[:3, :3] @ centres[n]
+            T_cw[n] = T
+    return Trajectory(timestamps, interpolate(timestamps, T_cw), known, oriented)
+
+
+def held_centres(
+    timestamps: Float[np.ndarray, "n"], T_cw: list[Tensor | None]
+) -> Float[Tensor, "n 3"]:
+    """Centres of cameras that have a pose; on a line between them, and held beyond the ends."""
+    at = [n for n, T in enumerate(T_cw) if T is not None]
+    if not at:
+        return torch.zeros(len(T_cw), 3, dtype=torch.float64)
+    found = np.stack([se3_inverse(T)[:3, 3].cpu().numpy() for T in T_cw if T is not None])
+    axes = [np.interp(timestamps, timestamps[at], found[:, k]) for k in range(3)]
+    return torch.from_numpy(np.stack(axes, 1))
 
 
 def interpolate(
