@@ -156,5 +156,5 @@ class StartUp:
         gone = tuple(self.keyframes.ids[:count])
         for id in gone:
             self.graph.remove_keyframe(id)
-            self.keyframes.remove(id)
+            self.recorder.keyframe_forgotten(self.keyframes.remove(id))
         return gone

@@ -20,6 +20,7 @@ from geogs.keyframes.grid import SampleGrid
 from geogs.keyframes.keyframe import Keyframe, KeyframeState
 from geogs.keyframes.store import KeyframeStore
 from geogs.priors.base import MonocularPrior
+from geogs.tracking.back_fill import back_fill
 from geogs.tracking.flow.base import FlowOperator
 from geogs.tracking.flow.select import build_operator
 from geogs.tracking.graph import EdgeState, FrameGraph
@@ -37,6 +38,10 @@ from geogs.tracking.trajectory import FrameRecord, RecorderState, TrajectoryReco
 from geogs.tracking.turns import Turn
 from geogs.tracking.view_choice import seeing
 from geogs.types import Frame, Trajectory
+
+SELDOM = 5
+"""While a camera only turns, the orientation says what it sees; only so often it is looked for as
+if it could be anywhere."""
 
 
 class TrackState(Enum):
@@ -260,7 +265,7 @@ class Tracker:
         if self.state is TrackState.INITIALIZING:
             return self._start(frame, encoded)
         motion = self._expected(encoded)
-        if motion is not None:
+        if motion is not None and motion.known >= self.config.min_known:
             return self._follow(frame, encoded, motion)
         followed = self.orientation.follow(frame, encoded)
         motion = self._found_again(encoded, followed)
@@ -321,6 +326,7 @@ class Tracker:
 
     def _begin(self) -> None:
         self.state = TrackState.TRACKING
+        back_fill(self.recorder, self._locator, self.config.min_known)
         self._seen_at(self.keyframes[self.keyframes.ids[-1]])
 
     # --- with a map ------------------------------------------------------------------------
@@ -344,9 +350,12 @@ class Tracker:
             guess = turn @ last.T_cw
             for keyframe in seeing(list(self.keyframes), guess):
                 motion = self._locator.locate(keyframe, encoded, guess, is_expected=False)
-                if motion is not None:
+                if motion is not None and motion.known >= self.config.min_known:
                     return motion
-        return self._locator.relocate_any(self._places(), encoded)
+            if followed.is_pure and self._misses % SELDOM:
+                return None
+        motion = self._locator.relocate_any(self._places(), encoded)
+        return None if motion is None or motion.known < self.config.min_known else motion
 
     def _lost(self) -> None:
         self.state = TrackState.LOST

@@ -1,7 +1,6 @@
 """The pose of every frame, solved at the end from sparse flow kept along the way."""
 
-from bisect import bisect_left
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -19,6 +18,7 @@ from geogs.keyframes.grid import SampleGrid
 from geogs.keyframes.keyframe import Keyframe
 from geogs.keyframes.store import Segment
 from geogs.tracking.flow.base import FlowMatch, FlowOperator
+from geogs.tracking.gaps import bridged
 from geogs.tracking.packed_edge import pack_matches, unpacked_positions
 from geogs.tracking.turns import Turn, orientations
 from geogs.types import Frame, Trajectory
@@ -155,6 +155,30 @@ class TrajectoryRecorder:
                     self._pending.append(_Pending(record, removed.image, removed.encoded))
         self._pending.sort(key=lambda p: p.record.index)
 
+    def keyframe_forgotten(self, removed: Keyframe) -> None:
+        """Keep the image of a keyframe that was given up, as that of a frame without a place."""
+        record = next((r for r in self.records if r.index == removed.frame_index), None)
+        if record is not None:
+            self._pending.append(_Pending(record, removed.image, removed.encoded))
+            self._pending.sort(key=lambda p: p.record.index)
+
+    def take_unplaced(self) -> list[tuple[FrameRecord, Any]]:
+        """Frames that wait without a keyframe to be relative to, and their encoded images.
+
+        They wait no longer.
+        """
+        without = [p for p in self._pending if p.record.anchor not in self.keyframes]
+        self._pending = [p for p in self._pending if p.record.anchor in self.keyframes]
+        return [(p.record, p.encoded) for p in without]
+
+    def place(
+        self, record: FrameRecord, anchor: int, T_rel: Float[Tensor, "4 4"], match: FlowMatch
+    ) -> None:
+        """Say where a frame is after all, with the flow that located it."""
+        record.anchor, record.T_rel, record.scale = anchor, T_rel, self.keyframes[anchor].scale
+        record.observations = []
+        self._observe([(record, anchor)], match)
+
     def absorb(self, other: "TrajectoryRecorder") -> None:
         """Take over the frames of another recorder, whose keyframes are now in this one's store."""
         self.records = sorted([*self.records, *other.records], key=lambda r: r.index)
@@ -242,7 +266,15 @@ class TrajectoryRecorder:
             part = free[start : start + chunk]
             poses = self._solve_chunk(part)
             solved.update({r.index: T for r, T in zip(part, poses, strict=True)})
-        return placed(records, solved)
+        turned = orientations(
+            {r.index: r.turns for r in records}, {n: T[:3, :3] for n, T in solved.items()}
+        )
+        timestamps = np.array([r.timestamp for r in records], dtype=np.float64)
+        return bridged(
+            timestamps,
+            [solved.get(r.index) for r in records],
+            [turned.get(r.index) for r in records],
+        )
 
     def _solve_chunk(self, records: list[FrameRecord]) -> Float[Tensor, "n 4 4"]:
         grid, cells = self.keyframes.grid, self._subset
@@ -285,57 +317,3 @@ def depth_aware_weight(
     depth = depth_jacobian.square() / information.clamp(min=1e-12)[..., None]
     variance = 1 / weight.clamp(min=1e-12) + depth
     return (weight > 0) * (information > 0)[..., None] / variance
-
-
-def placed(
-    records: Sequence[FrameRecord], solved: Mapping[int, Float[Tensor, "4 4"]]
-) -> Trajectory:
-    """The trajectory of frames in order of time, of which some have a pose (world to camera)."""
-    timestamps = np.array([r.timestamp for r in records], dtype=np.float64)
-    known = np.array([r.index in solved for r in records], dtype=bool)
-    T_cw = [solved.get(r.index) for r in records]
-    turned = orientations(
-        {r.index: r.turns for r in records}, {n: T[:3, :3] for n, T in solved.items()}
-    )
-    oriented = np.array([r.index in turned for r in records], dtype=bool)
-    if oriented.any():
-        centres = held_centres(timestamps, T_cw)
-        for n in np.flatnonzero(oriented):
-            T = torch.eye(4, dtype=torch.float64)
-            T[:3, :3] = turned[records[n].index]
-            T[:3, 3] = -T[:3, :3] @ centres[n]
-            T_cw[n] = T
-    return Trajectory(timestamps, interpolate(timestamps, T_cw), known, oriented)
-
-
-def held_centres(
-    timestamps: Float[np.ndarray, "n"], T_cw: list[Tensor | None]
-) -> Float[Tensor, "n 3"]:
-    """Centres of cameras that have a pose; on a line between them, and held beyond the ends."""
-    at = [n for n, T in enumerate(T_cw) if T is not None]
-    if not at:
-        return torch.zeros(len(T_cw), 3, dtype=torch.float64)
-    found = np.stack([se3_inverse(T)[:3, 3].cpu().numpy() for T in T_cw if T is not None])
-    axes = [np.interp(timestamps, timestamps[at], found[:, k]) for k in range(3)]
-    return torch.from_numpy(np.stack(axes, 1))
-
-
-def interpolate(
-    timestamps: Float[np.ndarray, "n"], T_cw: list[Tensor | None]
-) -> Float[np.ndarray, "n 4 4"]:
-    """Camera to world of every frame; gaps are bridged by constant motion, ends are held."""
-    known = {n: T for n, T in enumerate(T_cw) if T is not None}
-    out = np.tile(np.eye(4), (len(T_cw), 1, 1))
-    if not known:
-        return out
-    indices = list(known)
-    for n in range(len(T_cw)):
-        next = bisect_left(indices, n)
-        b = indices[min(next, len(indices) - 1)]
-        a = n if b == n else indices[max(next - 1, 0)]
-        T = known[a]
-        if a != b:
-            share = (timestamps[n] - timestamps[a]) / max(timestamps[b] - timestamps[a], 1e-9)
-            T = retract(share * se3_log(known[b] @ se3_inverse(T)), T)
-        out[n] = se3_inverse(T).cpu().numpy()
-    return out

@@ -13,8 +13,8 @@ CONSIDERED = 12
 """Keyframes that look most nearly the same way."""
 MOST = 2
 """Keyframes that are worth a measurement."""
-LEAST_OVERLAP = 0.2
-"""Share of a keyframe's cells of known depth that must fall into the image."""
+LEAST_OVERLAP = 0.15
+"""Share of a keyframe's cells that must have known depth and fall into the image."""
 
 
 def seeing(keyframes: Sequence[Keyframe], T_cw: Float[Tensor, "4 4"]) -> list[Keyframe]:
@@ -25,7 +25,7 @@ def seeing(keyframes: Sequence[Keyframe], T_cw: Float[Tensor, "4 4"]) -> list[Ke
     facing = sorted(keyframes, key=lambda k: -float(k.T_cw[2, :3] @ axis))[:CONSIDERED]
     grid = facing[0].grid
     there, _ = grid_fields(grid).reproject(facing, [T_cw] * len(facing))
-    known = torch.stack([k.information > 0 for k in facing])
+    known = torch.stack([k.has_known_depth for k in facing])
     seen = (grid.inside(there) & known).float().mean(1).tolist()
     ranked = sorted(zip(seen, facing, strict=True), key=lambda pair: -pair[0])
     return [k for share, k in ranked[:MOST] if share >= LEAST_OVERLAP]
