@@ -286,7 +286,9 @@ class Tracker:
             keyframe = self.keyframes[place.keyframe]
             guess = place.T_rel.to(keyframe.T_cw) @ keyframe.T_cw
             motion = self._locator.locate(keyframe, encoded, guess, is_expected=False)
-            if motion is not None and motion.matched >= self.config.recognised:
+            if motion is None or motion.known < self.config.min_known:
+                continue
+            if motion.matched >= self.config.recognised:
                 self.cut()
                 return self._follow(frame, encoded, motion)
         return None
