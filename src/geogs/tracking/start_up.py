@@ -7,8 +7,9 @@ from typing import Any
 import torch
 
 from geogs.config import TrackingConfig
+from geogs.tracking.chained_flows import ChainedFlows
 from geogs.tracking.graph import FrameGraph
-from geogs.tracking.initialise import chained_flows, initialise
+from geogs.tracking.initialise import initialise
 from geogs.tracking.keyframe_choice import calls_for_keyframe
 from geogs.tracking.keyframe_priors import KeyframePriors
 from geogs.tracking.motion import ChainState, FlowChain
@@ -56,6 +57,7 @@ class StartUp:
         camera = self.keyframes.grid.camera
         self._long_edge = max(camera.width, camera.height)
         self._chain = FlowChain(self.keyframes.grid, graph.operator, config.min_ncc)
+        self._flows = ChainedFlows(graph)
         self._misses = 0
 
     def state(self) -> StartUpState:
@@ -88,8 +90,9 @@ class StartUp:
         """Start with what there is; False if that cannot be."""
         if len(self.keyframes) < MIN_KEYFRAMES:
             return False
-        if not initialise(self.graph, self.config):
+        if not initialise(self.graph, self.config, self._flows.measure()):
             return False
+        self._flows.forget()
         self.priors.adjust(self.keyframes.ids, self.config.huber)
         self.recorder.anchor_to_keyframes()
         return True
@@ -123,7 +126,7 @@ class StartUp:
         # the last no longer sees what the first saw, the first half is given up.
         if len(self.keyframes) < 2 * self.config.init_keyframes:
             return StartStep(False, True)
-        overlap = float((chained_flows(self.graph)[-1].weight > 0).float().mean())
+        overlap = float((self._flows.measure()[-1].weight > 0).float().mean())
         if overlap >= self.config.start_overlap:
             return StartStep(False, True, self._thin_out())
         return StartStep(False, True, self._forget(len(self.keyframes) // 2))
