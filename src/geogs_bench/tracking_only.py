@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from geogs.application.settings import RunSettings
-from geogs.application.summary import spans
+from geogs.application.summary import lost_spans
 from geogs.errors import TrackingLost
 from geogs.gpu.installation import require_device
 from geogs.io.sources.sniff import open_source
@@ -48,14 +48,10 @@ def track_to_folder(
     }
     try:
         slam.loops.update(slam.segments.finish(), True)
-        if slam.segments.keyframe_ids:
-            global_bundle(slam.segments.world)
+        global_bundle(slam.segments.world)
         trajectory = slam.trajectory()
         write_tum_trajectory(folder / "trajectory.tum", trajectory)
-        summary["lost_spans"] = spans(trajectory, "lost")
-        summary["orientation_only_spans"] = spans(trajectory, "orientation only")
-        if slam.segments.why_not:
-            summary["not_started"] = slam.segments.why_not
+        summary["lost_spans"] = lost_spans(trajectory)
     except TrackingLost as error:
         summary["not_tracked"] = str(error)
     write_text(folder / "summary.json", json.dumps(summary, indent=2) + "\n")

@@ -18,6 +18,7 @@ from geogs.io.writers.intrinsics import write_intrinsics
 from geogs.io.writers.native import save_map
 from geogs.io.writers.ply import write_mesh, write_splats
 from geogs.io.writers.tum import write_tum_trajectory
+from geogs.io.writers.uncertainty import write_uncertainty
 from geogs.mesh.colour import colour_mesh
 from geogs.mesh.types import DepthMapView, Mesh
 from geogs.threads import on_one_torch_thread
@@ -39,11 +40,16 @@ def write_results(
     scene, source, progress = result.scene, result.source, result.progress
     write_tum_trajectory(output / "trajectory.tum", result.trajectory)
     write_tum_trajectory(output / "keyframes.tum", result.keyframes)
+    if result.uncertainty is not None:
+        table = output / "trajectory_uncertainty.csv"
+        write_uncertainty(table, result.trajectory, result.uncertainty)
     as_it_came = () if isinstance(source, PosedSource) else (source.calibration, source.shutter)
     write_intrinsics(output / "intrinsics.json", source.camera, *as_it_came)
     write_config(output / "config.yaml", scene.config)
     disks = result.map
-    save_map(output / "map.safetensors", disks, {"source": source.name, "seed": scene.config.seed})
+    facts = {"source": source.name, "seed": scene.config.seed}
+    if result.why_no_map is None:
+        save_map(output / "map.safetensors", disks, facts)
     if len(disks):
         colours = splat_colours(disks, fusion_views(result.renders))
         write_splats(output / "splats.ply", disks, colours)

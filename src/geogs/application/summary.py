@@ -26,7 +26,7 @@ def summarise(result: Result) -> dict[str, object]:
         **source_summary(source),
         "verdict": None if result.verdict is None else _finite(asdict(result.verdict)),
         "keyframes": len(result.keyframes.timestamps),
-        "lost_spans": spans(result.trajectory, "lost"),
+        "lost_spans": lost_spans(result.trajectory),
         "orientation_only_spans": spans(result.trajectory, "orientation only"),
         **scene.particulars(),
         "disks": len(result.map),
@@ -79,6 +79,11 @@ def time_summary(stopwatch: Stopwatch, frames: int) -> dict[str, object]:
         rates = {"until_stream_end": online, **rates}
     seconds = {name: round(s, 3) for name, s in stopwatch.seconds.items()}
     return {"seconds": {**seconds, "total": round(total, 3)}, "frames_per_second": rates}
+
+
+def lost_spans(trajectory: Trajectory) -> list[list[float]]:
+    """First and last time of every stretch where the camera was lost."""
+    return spans(trajectory, "lost")
 
 
 def spans(trajectory: Trajectory, state: FrameState) -> list[list[float]]:

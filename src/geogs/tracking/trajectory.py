@@ -13,7 +13,7 @@ from geogs.bundle.problem import MotionProblem
 from geogs.bundle.projection import linearise
 from geogs.bundle.select import grid_fields, motion_solver
 from geogs.errors import InputError
-from geogs.geometry.lie import retract, se3_inverse, se3_log
+from geogs.geometry.lie import retract, se3_inverse, se3_log, so3_log
 from geogs.keyframes.grid import SampleGrid
 from geogs.keyframes.keyframe import Keyframe
 from geogs.keyframes.store import Segment
@@ -22,6 +22,9 @@ from geogs.tracking.gaps import bridged
 from geogs.tracking.packed_edge import pack_matches, unpacked_positions
 from geogs.tracking.turns import Turn, orientations
 from geogs.types import Frame, Trajectory
+
+ASTRAY = 0.05
+"""Radians by which a frame's orientation may differ from one between its keyframes."""
 
 
 @dataclass
@@ -190,9 +193,17 @@ class TrajectoryRecorder:
             self.add_untracked(record.index, record.timestamp, record.turns)
 
     def anchor_to_keyframes(self) -> None:
-        """Give the frames seen before the map was started a pose between their keyframes."""
+        """Give the frames seen before the map was started a pose between their keyframes.
+
+        One whose turns tell another orientation has none: it was seen while the camera looked away
+        from both.
+        """
         states = list(self.keyframes)
         indices = [s.frame_index for s in states]
+        turned = orientations(
+            {r.index: r.turns for r in self.records},
+            {s.frame_index: s.T_cw[:3, :3] for s in states},
+        )
         for record in self.records:
             if record.anchor is None or record.anchor not in self.keyframes:
                 continue
@@ -202,6 +213,9 @@ class TrajectoryRecorder:
             share = (record.index - a.frame_index) / span
             xi = se3_log(b.T_cw @ se3_inverse(a.T_cw))
             record.T_rel, record.scale = retract(share * xi, torch.eye(4).to(xi)), a.scale
+            R = turned.get(record.index)
+            if R is not None and _apart(R, (record.T_rel @ a.T_cw)[:3, :3]) > ASTRAY:
+                record.anchor = None
 
     def finalise(self, before: int, after: int | None) -> None:
         """Measure the waiting frames up to keyframe ``after`` against it and the one ``before``."""
@@ -299,6 +313,11 @@ class TrajectoryRecorder:
         problem = MotionProblem(start, depth, source, frame, pixels, weight)
         T, _ = motion_solver(grid, cells).solve(problem, iterations=8)
         return T
+
+
+def _apart(first: Float[Tensor, "3 3"], second: Float[Tensor, "3 3"]) -> float:
+    """Radians between two rotations."""
+    return float(so3_log(first @ second.mT).norm())
 
 
 def sparse_cells(grid: SampleGrid) -> Bool[Tensor, "p"]:
