@@ -194,6 +194,7 @@ class Slam:
         """What a summary says of segments and loops, ready for JSON."""
         return {
             "segments": [asdict(segment) for segment in self.segments.summary()],
+            "not_started": self.segments.why_not or None,
             "loops": len(self.loops.detector.loops),
             "loop_closures": self.loops.closures,
         }
@@ -233,6 +234,8 @@ class Slam:
     def _adjust_globally(self, progress: Progress) -> None:
         """Bundle-adjust all keyframes and let the map follow."""
         world = self.segments.world
+        if not world.keyframe_ids:
+            return
         with self.stopwatch("global bundle adjustment"):
             global_bundle(world, lambda f, _: progress("bundle adjustment", f))
         if self._is_ended:

@@ -1,6 +1,7 @@
 """What flows between the parts: frozen records, no behaviour."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import torch
@@ -34,6 +35,10 @@ class PoseCorrection:
     """Factor by which lengths around the keyframe were divided; 1 where only the pose moved."""
 
 
+FrameState = Literal["tracked", "orientation only", "lost"]
+"""What is known of a frame: its pose, its orientation alone, or nothing."""
+
+
 @dataclass(frozen=True, slots=True)
 class Trajectory:
     """Camera poses over time."""
@@ -43,7 +48,18 @@ class Trajectory:
     T_wc: Float[np.ndarray, "n 4 4"]
     """Camera to world, float64."""
     tracked: Bool[np.ndarray, "n"]
-    """False where the camera was lost and the pose is only interpolated."""
+    """False where the position is not known, but interpolated or held."""
+    oriented: Bool[np.ndarray, "n"] | None = None
+    """True where no more than the orientation is known; none where there is no such frame."""
+
+    @property
+    def states(self) -> list[FrameState]:
+        """What is known of each frame."""
+        only = np.zeros_like(self.tracked) if self.oriented is None else self.oriented
+        return [
+            "tracked" if t else "orientation only" if o else "lost"
+            for t, o in zip(self.tracked, only, strict=True)
+        ]
 
 
 @dataclass(frozen=True, slots=True)

@@ -50,3 +50,21 @@ def test_a_bad_run_says_why(tracked, position, depth, reason):
 def test_a_run_without_motion_is_not_reliable():
     still = Trajectory(np.arange(5.0), np.tile(np.eye(4), (5, 1, 1)), np.ones(5, bool))
     assert not verdict(still, still, known(0.001, 0.01)).is_reliable
+
+
+def test_a_run_without_a_map_says_why():
+    turned = Trajectory(np.arange(4.0), walk(4, 4).T_wc, np.zeros(4, bool), np.ones(4, bool))
+    none = np.zeros(0)
+    nothing = Uncertainty(none, none, none, none)
+    found = verdict(turned, walk(0, 0), nothing, "The camera only turns.")
+    assert not found.is_reliable
+    assert found.sentence == "Rotation only: no shape. The camera only turns."
+    assert (found.lost, found.orientation_only) == (0, 1)
+
+
+def test_much_turning_is_told():
+    states = np.arange(30) < 10
+    turned = Trajectory(np.arange(30.0), walk(30, 30).T_wc, states, ~states)
+    found = verdict(turned, walk(5, 5), known(0.001, 0.01))
+    assert not found.is_reliable
+    assert "of 67% of the frames only the orientation is known" in found.sentence

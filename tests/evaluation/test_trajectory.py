@@ -104,11 +104,27 @@ def test_what_cannot_be_aligned_is_an_input_error():
     late = Trajectory(reference.timestamps + 100, reference.T_wc, reference.tracked)
     with pytest.raises(InputError, match=r"Only 0 poses match within 0\.02 s"):
         evaluate_trajectory(late, reference)
-    still = Trajectory(
+    straight = Trajectory(
         reference.timestamps, np.tile(np.eye(4), (30, 1, 1)), np.ones(30, dtype=bool)
     )
+    straight.T_wc[:, 0, 3] = np.arange(30)
     with pytest.raises(InputError, match="cannot be aligned"):
-        evaluate_trajectory(still, reference)
+        evaluate_trajectory(straight, reference)
+
+
+def test_orientations_alone_are_aligned_by_themselves():
+    reference = wiggle(40)
+    world = so3_exp(torch.tensor([0.4, -1.0, 0.3], dtype=torch.float64)).numpy()
+    turned = np.tile(np.eye(4), (40, 1, 1))
+    turned[:, :3, :3] = world @ reference.T_wc[:, :3, :3]
+    errors = evaluate_trajectory(
+        Trajectory(reference.timestamps, turned, np.zeros(40, bool)), reference
+    )
+    assert errors.rotation_rmse_deg < 1e-5
+    assert errors.scale == 1
+    places = reference.T_wc[:, :3, 3]
+    spread = np.sqrt(((places - places.mean(0)) ** 2).sum(1).mean())
+    assert errors.ate_rmse_cm == pytest.approx(100 * spread)
 
 
 def test_poses_that_are_not_finite_take_no_part():

@@ -5,7 +5,8 @@ import torch
 
 from geogs.geometry.lie import se3_exp, se3_inverse
 from geogs.tracking.flow.base import FlowMatch
-from geogs.tracking.trajectory import TrajectoryRecorder, depth_aware_weight, interpolate
+from geogs.tracking.gaps import interpolate
+from geogs.tracking.trajectory import TrajectoryRecorder, depth_aware_weight
 from geogs.types import Frame
 from planted_walk import planted_tracker
 

@@ -48,7 +48,14 @@ class Result:
         """Whether trajectory and shape are to be relied on; none where the poses were given."""
         if self.uncertainty is None:
             return None
-        return verdict(self.trajectory, self.keyframes, self.uncertainty)
+        why_not = self.why_no_map or ""
+        return verdict(self.trajectory, self.keyframes, self.uncertainty, why_not)
+
+    @property
+    def why_no_map(self) -> str | None:
+        """Why no map could be started, where only orientations are known; else none."""
+        reason = self.scene.particulars().get("not_started")
+        return None if reason is None else str(reason)
 
     @cached_property
     def map(self) -> MapSnapshot:

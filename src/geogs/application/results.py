@@ -47,7 +47,9 @@ def write_results(
     write_intrinsics(output / "intrinsics.json", source.camera, *as_it_came)
     write_config(output / "config.yaml", scene.config)
     disks = result.map
-    save_map(output / "map.safetensors", disks, {"source": source.name, "seed": scene.config.seed})
+    facts = {"source": source.name, "seed": scene.config.seed}
+    if result.why_no_map is None:
+        save_map(output / "map.safetensors", disks, facts)
     if len(disks):
         colours = splat_colours(disks, fusion_views(result.renders))
         write_splats(output / "splats.ply", disks, colours)
@@ -56,7 +58,7 @@ def write_results(
             write_mesh(output / "mesh.ply", mesh.vertices, mesh.faces, mesh.colours, mesh.normals)
     for write in more:
         write()
-    lost = int((~result.trajectory.tracked).sum())
+    lost = result.trajectory.states.count("lost")
     if lost > 0.2 * scene.frames:
         progress.write(
             f"warning: {lost} of {scene.frames} frames were not tracked; slower motion, texture "

@@ -12,7 +12,7 @@ from geogs.io.sources.posed.base import PosedSource
 from geogs.io.sources.several import SeveralSources
 from geogs.io.sources.sniff import Stream
 from geogs.stopwatch import Stopwatch
-from geogs.types import Trajectory
+from geogs.types import FrameState, Trajectory
 from geogs.version import __version__
 
 
@@ -27,6 +27,7 @@ def summarise(result: Result) -> dict[str, object]:
         "verdict": None if result.verdict is None else _finite(asdict(result.verdict)),
         "keyframes": len(result.keyframes.timestamps),
         "lost_spans": lost_spans(result.trajectory),
+        "orientation_only_spans": spans(result.trajectory, "orientation only"),
         **scene.particulars(),
         "disks": len(result.map),
         "mesh_faces": 0 if mesh is None else len(mesh.faces),
@@ -82,7 +83,12 @@ def time_summary(stopwatch: Stopwatch, frames: int) -> dict[str, object]:
 
 def lost_spans(trajectory: Trajectory) -> list[list[float]]:
     """First and last time of every stretch where the camera was lost."""
-    lost = np.concatenate([[False], ~trajectory.tracked, [False]]).astype(int)
-    first, last = np.flatnonzero(np.diff(lost) == 1), np.flatnonzero(np.diff(lost) == -1) - 1
+    return spans(trajectory, "lost")
+
+
+def spans(trajectory: Trajectory, state: FrameState) -> list[list[float]]:
+    """First and last time of every stretch of frames in a state."""
+    inside = np.array([False, *(s == state for s in trajectory.states), False]).astype(int)
+    first, last = np.flatnonzero(np.diff(inside) == 1), np.flatnonzero(np.diff(inside) == -1) - 1
     times = trajectory.timestamps
     return [[float(times[a]), float(times[b])] for a, b in zip(first, last, strict=True)]

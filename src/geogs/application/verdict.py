@@ -8,6 +8,9 @@ from geogs.types import Trajectory, Uncertainty
 
 MOST_LOST = 0.2
 """Share of the frames without a pose above which nothing is called reliable."""
+MOST_TURNED = 0.5
+"""Likewise of frames of which no more than the orientation is known: what there is of a map is
+right, but it is not what the video is about."""
 MOST_OFF = 0.05
 """Deviation of the camera's place, of the extent of its path."""
 MOST_DEEP = 0.2
@@ -22,7 +25,9 @@ class Verdict:
     sentence: str
     """For the terminal."""
     lost: float
-    """Share of the frames without a pose."""
+    """Share of the frames of which nothing is known."""
+    orientation_only: float
+    """Share of the frames of which no more than the orientation is known."""
     position: float
     """Median deviation of the camera's place, of the extent of its path: the root of the mean
     squared distance from its middle."""
@@ -32,22 +37,32 @@ class Verdict:
     """Median relative deviation of depths."""
 
 
-def verdict(trajectory: Trajectory, keyframes: Trajectory, known: Uncertainty) -> Verdict:
+def verdict(
+    trajectory: Trajectory, keyframes: Trajectory, known: Uncertainty, why_not: str = ""
+) -> Verdict:
     """Whether trajectory and shape are to be relied on.
 
     Args:
         trajectory: of all frames.
         keyframes: of the keyframes alone.
         known: how well these are known.
+        why_not: why no map could be started, if so.
     """
     places = keyframes.T_wc[:, :3, 3]
     extent = float(np.sqrt(np.square(places - places.mean(0)).sum(1).mean())) if len(places) else 0
-    lost = 1 - float(trajectory.tracked.mean()) if len(trajectory.tracked) else 1.0
+    states = trajectory.states
+    lost = states.count("lost") / len(states) if states else 1.0
+    turned = states.count("orientation only") / max(len(states), 1)
+    if why_not:
+        sentence = f"Rotation only: no shape. {why_not}"
+        return Verdict(False, sentence, lost, turned, *3 * [float("inf")])
     position = _median(known.position) / max(extent, 1e-12)
     depth, rotation = _median(known.depth), float(np.degrees(_median(known.rotation)))
     reasons = []
     if lost > MOST_LOST:
         reasons.append(f"the camera was lost in {lost:.0%} of the frames")
+    if turned > MOST_TURNED:
+        reasons.append(f"of {turned:.0%} of the frames only the orientation is known")
     if not position <= MOST_OFF:
         reasons.append(f"its place is known only to {_share(position)} of the extent of its path")
     if not depth <= MOST_DEEP:
@@ -59,7 +74,7 @@ def verdict(trajectory: Trajectory, keyframes: Trajectory, known: Uncertainty) -
             f"Trajectory and shape are reliable: the camera's place is known to {position:.1%} of "
             f"the extent of its path, depths to {depth:.1%}."
         )
-    return Verdict(not reasons, sentence, lost, position, rotation, depth)
+    return Verdict(not reasons, sentence, lost, turned, position, rotation, depth)
 
 
 def _median(values: np.ndarray) -> float:

@@ -64,6 +64,9 @@ class TrackingConfig(Settings, group="tracking"):
     """A frame is skipped when less than this fraction of it has structure."""
     min_matched: Share = 0.12
     """The camera is lost when less than this fraction of a keyframe finds a match."""
+    min_known: Share = 0.1
+    """Where the camera is cannot be told when the depth of less than this fraction of a keyframe is
+    known to 30 % and found in the image: then it is followed as if it only turned."""
     max_residual: Annotated[float, Range(above=0, most=1)] = 0.008
     """The camera is lost when the median reprojection error exceeds this, of the long edge."""
     min_ncc: Annotated[float, Range(-1, 1)] = 0.5

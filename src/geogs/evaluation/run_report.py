@@ -82,6 +82,7 @@ _FACTS = (
     ("keyframes", "keyframes", _count),
     ("skipped images", "skipped_images", _present),
     ("lost (s)", "lost_spans", _spans),
+    ("only the orientation known (s)", "orientation_only_spans", _spans),
     ("disks", "disks", _count),
     ("mesh faces", "mesh_faces", _count),
     ("frames per second", "frames_per_second", _rates),

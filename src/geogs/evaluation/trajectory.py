@@ -95,6 +95,26 @@ def align(
     return T, float(scale)
 
 
+def align_orientations(
+    estimate: Float[np.ndarray, "n 4 4"], reference: Float[np.ndarray, "n 4 4"]
+) -> Float[np.ndarray, "4 4"]:
+    """Rigid motion that fits orientations best (chordal mean) and takes the mean place to the
+    mean place."""
+    T = np.eye(4)
+    T[:3, :3] = best_rotation(estimate[:, :3, :3], reference[:, :3, :3])
+    T[:3, 3] = reference[:, :3, 3].mean(0) - T[:3, :3] @ estimate[:, :3, 3].mean(0)
+    return T
+
+
+def best_rotation(
+    estimate: Float[np.ndarray, "n 3 3"], reference: Float[np.ndarray, "n 3 3"]
+) -> Float[np.ndarray, "3 3"]:
+    """Rotation of the world of some orientations that takes them nearest to others."""
+    u, _, vt = np.linalg.svd((reference @ estimate.transpose(0, 2, 1)).sum(0))
+    R: Float[np.ndarray, "3 3"] = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    return R
+
+
 @on_one_torch_thread
 def evaluate_trajectory(
     estimate: Trajectory,
@@ -106,7 +126,8 @@ def evaluate_trajectory(
 
     Poses are paired by time (:func:`associate`), the estimate is aligned (Sim(3) for monocular
     runs, whose scale is free) and compared. Poses that are not finite are left out. Lost frames
-    (``tracked`` false) take part: their interpolated poses are part of the result.
+    (``tracked`` false) take part: their interpolated poses are part of the result. An estimate
+    that has orientations alone, all at one place, is aligned by these, at scale 1.
 
     Raises InputError if fewer than three poses match in time or the motion does not determine an
     alignment.
@@ -116,10 +137,13 @@ def evaluate_trajectory(
     if len(i) < 3:
         raise InputError(_no_match(reference, estimate, len(i), max_difference))
     truth, guess = reference.T_wc[i], estimate.T_wc[j]
-    try:
-        T, scale = align(guess[:, :3, 3], truth[:, :3, 3], alignment)
-    except GeogsError as reason:
-        raise InputError(f"The trajectories cannot be aligned: {reason}") from None
+    if (guess[:, :3, 3] == guess[0, :3, 3]).all() and alignment != "none":
+        T, scale = align_orientations(guess, truth), 1.0
+    else:
+        try:
+            T, scale = align(guess[:, :3, 3], truth[:, :3, 3], alignment)
+        except GeogsError as reason:
+            raise InputError(f"The trajectories cannot be aligned: {reason}") from None
     aligned = np.tile(np.eye(4), (len(guess), 1, 1))
     aligned[:, :3, 3] = guess[:, :3, 3] @ T[:3, :3].T + T[:3, 3]
     aligned[:, :3, :3] = T[:3, :3] / scale @ guess[:, :3, :3]

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Float32, Float64, UInt8
+from jaxtyping import Bool, Float, Float32, Float64, UInt8
 from torch import Tensor
 
 from geogs.geometry.lie import scaled
@@ -13,6 +13,8 @@ from geogs.keyframes.grid import SampleGrid
 from geogs.keyframes.pictures import Picture
 from geogs.priors.base import DepthKind
 
+KNOWN = 0.3
+"""Relative deviation up to which a depth helps to tell where a camera is."""
 RELATIVE_FLOOR = 0.004
 """Relative depth deviation that no amount of matches removes."""
 
@@ -112,6 +114,11 @@ class Keyframe:
         """A motion measured from here when the keyframe had that scale, in its lengths of now."""
         factor = self.scale / scale
         return T if factor == 1.0 else scaled(T, factor)
+
+    @property
+    def has_known_depth(self) -> Bool[Tensor, "p"]:
+        """Where matches tell the depth to ``KNOWN``, if the poses are right."""
+        return KNOWN**2 * self.inverse_depth.square() * self.information > 1
 
     @property
     def sure_information(self) -> Float[Tensor, "p"]:

@@ -4,12 +4,12 @@ from typing import Literal, get_args
 
 RoomMotionKind = Literal[
     "handheld", "slow-handheld", "handheld-5hz", "walking", "turning-30", "turning-60",
-    "turning-120", "pure-rotation", "rest-start", "jerks", "still",
+    "turning-120", "pure-rotation", "turn-away", "rest-start", "jerks", "still",
 ]  # fmt: skip
 """Through a room."""
 ROOM_MOTIONS: tuple[RoomMotionKind, ...] = get_args(RoomMotionKind)
 MotionKind = Literal[
     "handheld", "slow-handheld", "handheld-5hz", "walking", "turning-30", "turning-60",
-    "turning-120", "pure-rotation", "rest-start", "jerks", "still", "driving",
+    "turning-120", "pure-rotation", "turn-away", "rest-start", "jerks", "still", "driving",
 ]  # fmt: skip
 """Through a room, or along a street."""

@@ -30,6 +30,10 @@ _BOB, _SWAY = 0.025, 0.02
 _GAIT_DEGREES = 0.8
 _REST, _GETTING_GOING = 1.5, 1.0
 """Seconds of standing still at the start, and until full speed."""
+_GOING, _STOPPING = 1.3, 0.4
+"""Seconds of walking before the camera stops to turn, and until it stands, or walks again."""
+_AWAY_DEGREES, _AWAY, _AWAY_HOLD = 120.0, 1.6, 0.2
+"""How far it turns, the seconds either way, and those between."""
 _JERK_PERIOD, _JERK_HALF_LENGTH = 0.9, 0.12
 _TURN_STREAM, _JERK_STREAM = 0x704, 0x3E6
 
@@ -65,6 +69,8 @@ def room_motion(kind: RoomMotionKind, scene: Scene, seed: int = 0) -> Motion:
             return Motion(_turning(scene, seed, float(kind.removeprefix("turning-"))))
         case "pure-rotation":
             return Motion(_pure_rotation(scene, seed))
+        case "turn-away":
+            return Motion(_turn_away(HandheldPath(scene, seed), seed))
         case "rest-start":
             return Motion(_from_rest(HandheldPath(scene, seed)))
         case "jerks":
@@ -137,6 +143,24 @@ def _pure_rotation(scene: Scene, seed: int) -> Path:
         return _turned(T_wc, np.stack([0 * roll, 0 * roll, roll], 1))
 
     return path
+
+
+def _turn_away(path: Path, seed: int) -> Path:
+    """Walks, stops, turns on the spot to what it has not seen yet, back again, and walks on."""
+    sense = np.random.default_rng([seed, _TURN_STREAM]).choice((-1.0, 1.0))
+    standing = 2 * _AWAY + _AWAY_HOLD
+
+    def turned_away(times: np.ndarray) -> np.ndarray:
+        stop = np.clip(times - _GOING, 0, _STOPPING)
+        go = np.clip(times - (_GOING + _STOPPING + standing), 0, None)
+        eased = np.where(go < _STOPPING, 0.5 * go**2 / _STOPPING, go - 0.5 * _STOPPING)
+        walked = np.minimum(times, _GOING) + stop - 0.5 * stop**2 / _STOPPING + eased
+        turn = times - (_GOING + _STOPPING)
+        there, back = (np.clip(t / _AWAY, 0, 1) for t in (turn, turn - _AWAY - _AWAY_HOLD))
+        yaw = np.radians(_AWAY_DEGREES) * 0.5 * (np.cos(np.pi * back) - np.cos(np.pi * there))
+        return _turned(path(walked), np.stack([0 * yaw, sense * yaw, 0 * yaw], 1))
+
+    return turned_away
 
 
 def _from_rest(path: Path) -> Path:

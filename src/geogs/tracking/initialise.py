@@ -5,7 +5,7 @@ first comes from the essential matrix, the others follow by PnP on flows chained
 dense bundle adjustment with re-measured flow polishes the whole.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -28,7 +28,6 @@ from geogs.threads import thread_map
 from geogs.tracking.evidence import Evidence, correlation_at
 from geogs.tracking.features import surer_flow
 from geogs.tracking.flow.base import FlowMatch
-from geogs.tracking.flow.filled import filled_positions
 from geogs.tracking.graph import FrameGraph
 from geogs.tracking.motion import pnp
 
@@ -48,8 +47,8 @@ class TwoView:
     """Median motion in pixels that rotation does not explain."""
 
 
-def initialise(graph: FrameGraph, config: TrackingConfig) -> bool:
-    """Estimate all keyframes of the graph from nothing.
+def initialise(graph: FrameGraph, config: TrackingConfig, flows: Sequence[FlowMatch]) -> bool:
+    """Estimate all keyframes of the graph from nothing but the flows from the first to the others.
 
     False if they show no parallax, if matches and poses leave their depths open
     (``start_deviation``), or if the images of two that follow each other do not correlate where
@@ -58,7 +57,6 @@ def initialise(graph: FrameGraph, config: TrackingConfig) -> bool:
     depth over all keyframes is one unit.
     """
     store = graph.keyframes
-    flows = chained_flows(graph)
     camera = store.grid.camera
     min_parallax = config.min_parallax * max(camera.width, camera.height)
     best = _best_two_view(store.grid, flows, min_parallax)
@@ -72,44 +70,8 @@ def initialise(graph: FrameGraph, config: TrackingConfig) -> bool:
     )
 
 
-def chained_flows(graph: FrameGraph) -> list[FlowMatch]:
-    """Flow from the first keyframe to each later one, chained from step to step and re-measured."""
-    states = list(graph.keyframes)
-    grid, operator = graph.keyframes.grid, graph.operator
-    encoded = [s.encoded for s in states]
-    steps = _steps(graph)
-    there, back = steps[0]
-    flows = []
-    for k in range(1, len(states)):
-        if k > 1:
-            step, back_step = steps[k - 1]
-            there = there + grid.sample_field(step - grid.pixels, there)
-            back = back_step + grid.sample_field(back - grid.pixels, back_step)
-        match, reverse = operator.measure(
-            [encoded[0]], [encoded[k]], there[None], back[None], fine=True
-        )
-        flows.append(match)
-        there = filled_positions(grid, match)
-        back = filled_positions(grid, reverse)
-    return flows
-
-
-def _steps(graph: FrameGraph) -> list[tuple[Float[Tensor, "p 2"], Float[Tensor, "p 2"]]]:
-    """Where the cells of each keyframe lie in the next, and those of the next in it."""
-    grid, operator = graph.keyframes.grid, graph.operator
-    encoded = [s.encoded for s in graph.keyframes]
-    pairs = list(pairwise(encoded))
-    matches = operator.measure(encoded[:-1], encoded[1:], fine=False)
-    steps = []
-    for n, (a, b) in enumerate(pairs):
-        one = [FlowMatch(m.pixels[n : n + 1], m.weight[n : n + 1]) for m in matches]
-        there, back = surer_flow(grid, operator, a, b, *one)
-        steps.append((there.pixels[0], back.pixels[0]))
-    return steps
-
-
 def _best_two_view(
-    grid: SampleGrid, flows: list[FlowMatch], min_parallax: float
+    grid: SampleGrid, flows: Sequence[FlowMatch], min_parallax: float
 ) -> tuple[int, TwoView] | None:
     flows = [FlowMatch(f.pixels.cpu(), f.weight.cpu()) for f in flows]
     return best_two_view(
@@ -165,7 +127,7 @@ def two_view(camera: Camera, match: FlowMatch) -> TwoView | None:
     return TwoView(torch.from_numpy(T), depth, known, float(parallax))
 
 
-def _place_all(graph: FrameGraph, flows: list[FlowMatch], best: tuple[int, TwoView]) -> None:
+def _place_all(graph: FrameGraph, flows: Sequence[FlowMatch], best: tuple[int, TwoView]) -> None:
     """Poses by PnP on the first keyframe's depth, depths by carrying it over.
 
     Keyframes that no longer see it are placed on what the one before them was given.

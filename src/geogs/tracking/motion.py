@@ -48,6 +48,9 @@ class FrameMotion:
     """Fraction of the keyframe's cells with a match that agrees with the pose."""
     overlap: float
     """The same of those of its cells whose depth is known."""
+    known: float
+    """Fraction of the keyframe's cells that are matched and whose depth is known well enough to
+    tell where the camera is."""
     residual: float
     """Median distance in pixels between matches and reprojection."""
     evidence: Evidence
@@ -163,9 +166,10 @@ class FrameLocator:
             keyframe.inverse_depth,
             keyframe.information,
         )
-        known = (keyframe.information > 0).to(T).mean()[None]
+        some = (keyframe.information > 0).to(T).mean()[None]
+        known = (keyframe.has_known_depth & (match.weight[0, :, 0] > 0)).to(T).mean()[None]
         # All at once, so that a GPU is waited for once.
-        found = torch.cat([T.reshape(-1), judged.to(T), seen.to(T), known.to(T)]).cpu()
+        found = torch.cat([T.reshape(-1), judged.to(T), seen.to(T), some, known]).cpu()
         _, agree, residual, flow = found[16:20].tolist()
         if agree < self.min_matched or not residual < self.max_residual:
             return None
@@ -179,6 +183,7 @@ class FrameLocator:
             flow,
             agree,
             agree / float(found[22]),
+            float(found[23]),
             residual,
             evidence,
         )

@@ -39,6 +39,7 @@ class SegmentsState:
     """Its place among the trackers."""
     current: int
     joined: list[SegmentFate]
+    why_not: str
 
 
 class Segments:
@@ -61,6 +62,8 @@ class Segments:
         self.trackers = [self.world]
         """The world and the segments that are apart, earliest first."""
         self._joined: list[SegmentFate] = []
+        self.why_not = ""
+        """Why no segment could be started, once the stream has ended; empty if one could."""
 
     # --- reading ---------------------------------------------------------------------------
 
@@ -101,7 +104,7 @@ class Segments:
         """What a checkpoint holds."""
         at = {tracker: n for n, tracker in enumerate(self.trackers)}
         trackers = [tracker.full_state() for tracker in self.trackers]
-        return SegmentsState(trackers, at[self.world], at[self.current], self._joined)
+        return SegmentsState(trackers, at[self.world], at[self.current], self._joined, self.why_not)
 
     def load(self, state: SegmentsState) -> None:
         """Give segments that have seen nothing yet the state of others."""
@@ -109,7 +112,7 @@ class Segments:
         for tracker, saved in zip(self.trackers, state.trackers, strict=True):
             tracker.load(saved)
         self.world, self.current = self.trackers[state.world], self.trackers[state.current]
-        self._joined = state.joined
+        self._joined, self.why_not = state.joined, state.why_not
 
     # --- writing ---------------------------------------------------------------------------
 
@@ -161,23 +164,31 @@ class Segments:
                 return self._report(result)
         lost = self.current.state is TrackState.LOST
         if lost and (frame.follows_cut or self.current.frames_lost >= self._patience):
-            self.current = self._start()
+            before, self.current = self.current, self._start()
             self.trackers.append(self.current)
+            if not frame.follows_cut:
+                self.current.orientation = before.orientation
         return self._report(self.current.track(frame))
 
     def finish(self) -> TrackResult:
         """End of the stream: every keyframe becomes final, and the largest segment the world.
 
-        Raises TrackingLost if no segment could be started.
+        Where no segment could be started but orientations are known, these are what is left, and
+        ``why_not`` says why. Raises TrackingLost if not even they are.
         """
         finals: dict[Tracker, TrackResult] = {}
         for tracker in list(self.trackers):
             try:
                 finals[tracker] = tracker.finish()
-            except TrackingLost:
-                if len(self.trackers) == 1:
+            except TrackingLost as reason:
+                if len(self.trackers) > 1:
+                    self._drop(tracker)
+                    continue
+                trajectory = tracker.trajectory()
+                if trajectory.oriented is None or not trajectory.oriented.any():
                     raise
-                self._drop(tracker)
+                self.why_not = str(reason)
+                return TrackResult(tracker.state)
         largest = max(finals, key=lambda t: len(t.keyframes))
         if largest is self.world:
             return finals[largest]

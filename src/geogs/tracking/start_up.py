@@ -1,17 +1,21 @@
 """Before there is a map: gather keyframes until one can be started from them."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import torch
 
 from geogs.config import TrackingConfig
+from geogs.tracking.chained_flows import ChainedFlows
 from geogs.tracking.graph import FrameGraph
-from geogs.tracking.initialise import chained_flows, initialise
+from geogs.tracking.initialise import initialise
 from geogs.tracking.keyframe_choice import KeyframeChoice
 from geogs.tracking.keyframe_priors import KeyframePriors
 from geogs.tracking.motion import ChainState, FlowChain
+from geogs.tracking.rotation import relative_rotation
 from geogs.tracking.trajectory import TrajectoryRecorder
+from geogs.tracking.turns import Turn
 from geogs.types import Frame
 
 MIN_KEYFRAMES = 4
@@ -53,6 +57,7 @@ class StartUp:
         self.keyframes = graph.keyframes
         self._choice = choice
         self._chain = FlowChain(self.keyframes.grid, graph.operator, config.min_ncc)
+        self._flows = ChainedFlows(graph)
         self._misses = 0
 
     def state(self) -> StartUpState:
@@ -64,26 +69,30 @@ class StartUp:
         self._misses = state.misses
         self._chain.load(state.chain)
 
-    def take(self, frame: Frame, encoded: Any) -> StartStep:
-        """Take the next frame."""
+    def take(self, frame: Frame, encoded: Any, turns: Sequence[Turn] = ()) -> StartStep:
+        """Take the next frame, of which turns against others may be known already."""
         if len(self.keyframes):
             last = list(self.keyframes)[-1]
             match = self._chain.follow(last.encoded, encoded)
             if match.matched < self.config.min_matched:
-                return self._miss(frame, encoded)
+                return self._miss(frame, encoded, turns)
             self._misses = 0
+            found = relative_rotation(self.keyframes.grid, match.there)
+            if found is not None:
+                turns = (Turn(last.frame_index, found.R, found.deviation), *turns)
             if not self._choice.calls_for(match.flow, match.matched):
                 eye = torch.eye(4, dtype=torch.float64)
-                self.recorder.add(frame, encoded, last.id, eye, match.there)
+                self.recorder.add(frame, encoded, last.id, eye, match.there, turns)
                 return StartStep()
-        return self._gather(frame, encoded)
+        return self._gather(frame, encoded, turns)
 
     def finish(self) -> bool:
         """Start with what there is; False if that cannot be."""
         if len(self.keyframes) < MIN_KEYFRAMES:
             return False
-        if not initialise(self.graph, self.config):
+        if not initialise(self.graph, self.config, self._flows.measure()):
             return False
+        self._flows.forget()
         self.priors.adjust(self.keyframes.ids, self.config.huber)
         self.recorder.anchor_to_keyframes()
         return True
@@ -102,13 +111,13 @@ class StartUp:
             "move the camera sideways while recording."
         )
 
-    def _gather(self, frame: Frame, encoded: Any) -> StartStep:
+    def _gather(self, frame: Frame, encoded: Any, turns: Sequence[Turn]) -> StartStep:
         """Add a keyframe to those the map will be started from, and start it with enough."""
         eye = torch.eye(4, dtype=torch.float64)
         state = self.keyframes.add(frame.index, frame.timestamp, frame.image, encoded, eye)
         self.priors.ask(state)
         self._chain.reset()
-        self.recorder.add_keyframe(state.id)
+        self.recorder.add_keyframe(state.id, turns)
         if len(self.keyframes) < max(self.config.init_keyframes, MIN_KEYFRAMES):
             return StartStep(is_keyframe=True)
         if self.finish():
@@ -117,23 +126,23 @@ class StartUp:
         # the last no longer sees what the first saw, the first half is given up.
         if len(self.keyframes) < 2 * self.config.init_keyframes:
             return StartStep(False, True)
-        overlap = float((chained_flows(self.graph)[-1].weight > 0).float().mean())
+        overlap = float((self._flows.measure()[-1].weight > 0).float().mean())
         if overlap >= self.config.start_overlap:
             return StartStep(False, True, self._thin_out())
         return StartStep(False, True, self._forget(len(self.keyframes) // 2))
 
-    def _miss(self, frame: Frame, encoded: Any) -> StartStep:
+    def _miss(self, frame: Frame, encoded: Any, turns: Sequence[Turn]) -> StartStep:
         """The view changed at once: wait for it to come back, start with what there is, or anew."""
         self._misses += 1
         if self._misses < MAX_MISSES:
-            self.recorder.add_untracked(frame.index, frame.timestamp)
+            self.recorder.add_untracked(frame.index, frame.timestamp, turns)
             return StartStep()
         self._misses = 0
         if self.finish():
-            self.recorder.add_untracked(frame.index, frame.timestamp)
+            self.recorder.add_untracked(frame.index, frame.timestamp, turns)
             return StartStep(True)
         removed = self._forget(len(self.keyframes))
-        step = self._gather(frame, encoded)
+        step = self._gather(frame, encoded, turns)
         return StartStep(step.has_started, step.is_keyframe, removed)
 
     def _thin_out(self) -> tuple[int, ...]:
@@ -150,5 +159,5 @@ class StartUp:
         gone = tuple(self.keyframes.ids[:count])
         for id in gone:
             self.graph.remove_keyframe(id)
-            self.keyframes.remove(id)
+            self.recorder.keyframe_forgotten(self.keyframes.remove(id))
         return gone

@@ -6,7 +6,6 @@ from enum import Enum
 from typing import Any
 
 import cv2
-import numpy as np
 import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
@@ -21,6 +20,7 @@ from geogs.keyframes.grid import SampleGrid
 from geogs.keyframes.keyframe import Keyframe, KeyframeState
 from geogs.keyframes.store import KeyframeStore
 from geogs.priors.base import MonocularPrior
+from geogs.tracking.back_fill import back_fill
 from geogs.tracking.flow.base import FlowOperator
 from geogs.tracking.flow.select import build_operator
 from geogs.tracking.graph import EdgeState, FrameGraph
@@ -31,11 +31,18 @@ from geogs.tracking.motion import (
     FrameMotion,
     Recognition,
 )
+from geogs.tracking.orientation_chain import Followed, OrientationChain, OrientationState
 from geogs.tracking.proximity import Pair, frame_distances, proximity_pairs
 from geogs.tracking.start_up import MIN_KEYFRAMES, StartUp, StartUpState
 from geogs.tracking.trajectory import FrameRecord, RecorderState, TrajectoryRecorder
+from geogs.tracking.turns import Turn
+from geogs.tracking.view_choice import seeing
 from geogs.tracking.window import reach
 from geogs.types import Frame, Trajectory
+
+SELDOM = 5
+"""While a camera only turns, the orientation says what it sees; only so often it is looked for as
+if it could be anywhere."""
 
 
 class TrackState(Enum):
@@ -43,6 +50,8 @@ class TrackState(Enum):
 
     INITIALIZING = "initializing"
     TRACKING = "tracking"
+    TURNING = "orientation only"
+    """There is a map, but too little of it in view: where the camera is cannot be told."""
     LOST = "lost"
 
 
@@ -116,6 +125,7 @@ class TrackerState:
     frames_lost: int
     sharpness: list[float]
     """Of the latest frames."""
+    orientation: OrientationState
 
 
 class Tracker:
@@ -158,9 +168,12 @@ class Tracker:
         """Keyframes that no motion links to the one before them."""
         self._last: LastFrame | None = None
         self._start_up = StartUp(self.graph, self.recorder, self.priors, self.config, self._choice)
+        self.orientation = OrientationChain(self.grid, self.operator, self.config)
+        """How the camera has turned since it was last located."""
         self._misses = 0
         self.frames_lost = 0
-        """Frames with texture since the camera was last located, once the map has been started."""
+        """Frames with texture since the camera was last located, once the map has been started,
+        but for those that only turned."""
 
     # --- reading ---------------------------------------------------------------------------
 
@@ -177,12 +190,11 @@ class Tracker:
     def trajectory(self, apart: Sequence[FrameRecord] = ()) -> Trajectory:
         """Poses of all frames seen so far, solved on the present keyframes.
 
-        Before the map is started nothing counts as tracked, and frames ``apart`` never do.
+        Before the map is started no more than orientations is known, and of frames ``apart`` no
+        more than that ever.
         """
-        trajectory = self.recorder.solve(apart)
-        if self.state is TrackState.INITIALIZING:
-            return replace(trajectory, tracked=np.zeros_like(trajectory.tracked))
-        return trajectory
+        has_map = self.state is not TrackState.INITIALIZING
+        return self.recorder.solve(apart, has_map=has_map)
 
     @property
     def active(self) -> tuple[int, ...]:
@@ -210,7 +222,7 @@ class Tracker:
         return TrackerState(
             self.keyframes.state(), self.graph.state(), self.recorder.state(),
             self._start_up.state(), self.state, list(self._finalized), self._breaks, last,
-            self._misses, self.frames_lost, self._choice.state(),
+            self._misses, self.frames_lost, self._choice.state(), self.orientation.state(),
         )  # fmt: skip
 
     def load(self, state: TrackerState) -> None:
@@ -223,6 +235,7 @@ class Tracker:
         self._finalized, self._breaks = dict.fromkeys(state.finalized), state.breaks
         self._misses, self.frames_lost = state.misses, state.frames_lost
         self._choice.load(state.sharpness)
+        self.orientation.load(state.orientation)
         if state.last is not None:
             last = state.last
             keyframe = self.keyframes[last.keyframe]
@@ -241,7 +254,7 @@ class Tracker:
         self._breaks = sorted({*self._breaks, *other._breaks, *after[:1]})
         if other.keyframes.ids[-1] > self.keyframes.ids[-1]:
             self.state, self._misses = other.state, other._misses
-            self._last = other._last
+            self._last, self.orientation = other._last, other.orientation
             self.frames_lost = other.frames_lost
         self._finalized = dict.fromkeys(sorted([*self._finalized, *other._finalized]))
         self.keyframes.absorb(other.keyframes)
@@ -267,11 +280,15 @@ class Tracker:
             return self._lose(frame)
         if self.state is TrackState.INITIALIZING:
             return self._start(frame, encoded)
-        motion = self._locate(encoded)
-        if motion is None:
-            self.frames_lost += 1
-            return self._lose(frame)
-        return self._follow(frame, encoded, motion)
+        motion = self._expected(encoded)
+        if motion is not None and motion.known >= self.config.min_known:
+            return self._follow(frame, encoded, motion)
+        followed = self.orientation.follow(frame, encoded)
+        motion = self._found_again(encoded, followed)
+        if motion is not None:
+            return self._follow(frame, encoded, motion, followed)
+        self.frames_lost += followed is None or not followed.is_pure
+        return self._lose(frame, followed)
 
     def rejoin(self, frame: Frame, places: Sequence[Recognition]) -> TrackResult | None:
         """Take the next frame, which was recognised at one of some keyframes; None if it was not.
@@ -285,13 +302,16 @@ class Tracker:
             keyframe = self.keyframes[place.keyframe]
             guess = place.T_rel.to(keyframe.T_cw) @ keyframe.T_cw
             motion = self._locator.locate(keyframe, encoded, guess, is_expected=False)
-            if motion is not None and motion.matched >= self.config.recognised:
+            if motion is None or motion.known < self.config.min_known:
+                continue
+            if motion.matched >= self.config.recognised:
                 self.cut()
                 return self._follow(frame, encoded, motion)
         return None
 
     def cut(self) -> None:
         """No motion links the next frame to those before it; the camera has to be found anew."""
+        self.orientation.forget()
         if self.state is not TrackState.INITIALIZING:
             self._lost()
 
@@ -309,29 +329,51 @@ class Tracker:
         return TrackResult(self.state, None, fresh, ())
 
     def _start(self, frame: Frame, encoded: Any) -> TrackResult:
-        step = self._start_up.take(frame, encoded)
+        turns = []
+        if not len(self.keyframes):
+            followed = self.orientation.follow(frame, encoded)
+            turns = [] if followed is None else [followed.turn]
+        step = self._start_up.take(frame, encoded, turns)
         if not step.has_started:
             return TrackResult(self.state, removed=step.removed)
         self._begin()
+        self.orientation.located(frame, encoded)
         newest = self.keyframes.ids[-1] if step.is_keyframe else None
         fresh = self._finalise(self.keyframes.ids[:-1])
         return TrackResult(self.state, newest, fresh, self.active, step.removed)
 
     def _begin(self) -> None:
         self.state = TrackState.TRACKING
+        back_fill(self.recorder, self._locator, self.config.min_known)
         self._seen_at(self.keyframes[self.keyframes.ids[-1]])
 
     # --- with a map ------------------------------------------------------------------------
 
-    def _locate(self, encoded: Any) -> FrameMotion | None:
-        motion, last = None, self._last
-        if last is not None and self.state is TrackState.TRACKING:
-            motion = self._locator.locate(last.keyframe, encoded, last.predicted())
-            if motion is None and last.velocity is not None:
-                motion = self._locator.locate(last.keyframe, encoded, last.T_cw)
-        if motion is None:
-            motion = self._locator.relocate_any(self._places(), encoded)
+    def _expected(self, encoded: Any) -> FrameMotion | None:
+        """The frame near where the last one was; None if the camera is not there, or was lost."""
+        last = self._last
+        if last is None or self.state is not TrackState.TRACKING:
+            return None
+        motion = self._locator.locate(last.keyframe, encoded, last.predicted())
+        if motion is None and last.velocity is not None:
+            motion = self._locator.locate(last.keyframe, encoded, last.T_cw)
         return motion
+
+    def _found_again(self, encoded: Any, followed: Followed | None) -> FrameMotion | None:
+        """The frame anywhere: first where the camera would be if it had only turned."""
+        last = self._last
+        if last is not None and followed is not None and followed.R is not None:
+            turn = torch.eye(4, dtype=torch.float64)
+            turn[:3, :3] = followed.R
+            guess = turn @ last.T_cw
+            for keyframe in seeing(list(self.keyframes), guess):
+                motion = self._locator.locate(keyframe, encoded, guess, is_expected=False)
+                if motion is not None and motion.known >= self.config.min_known:
+                    return motion
+            if followed.is_pure and self._misses % SELDOM:
+                return None
+        motion = self._locator.relocate_any(self._places(), encoded)
+        return None if motion is None or motion.known < self.config.min_known else motion
 
     def _lost(self) -> None:
         self.state = TrackState.LOST
@@ -355,27 +397,35 @@ class Tracker:
         turn = (self._misses * count) % max(len(older), 1)
         return recent + (older[turn:] + older[:turn])[:count]
 
-    def _lose(self, frame: Frame) -> TrackResult:
+    def _lose(self, frame: Frame, followed: Followed | None = None) -> TrackResult:
+        """The frame has no pose; no orientation, either, unless it was ``followed``."""
         if self.state is not TrackState.INITIALIZING:
             self._lost()
             self._misses += 1
-        self.recorder.add_untracked(frame.index, frame.timestamp)
-        return TrackResult(self.state, active=self.active)
+        if followed is None:
+            self.recorder.add_untracked(frame.index, frame.timestamp)
+            return TrackResult(self.state, active=self.active)
+        self.recorder.add_untracked(frame.index, frame.timestamp, [followed.turn])
+        return TrackResult(TrackState.TURNING, active=self.active)
 
-    def _follow(self, frame: Frame, encoded: Any, motion: FrameMotion) -> TrackResult:
+    def _follow(
+        self, frame: Frame, encoded: Any, motion: FrameMotion, followed: Followed | None = None
+    ) -> TrackResult:
         velocity = None
         if self._last is not None and self.state is TrackState.TRACKING:
             velocity = motion.T_cw @ se3_inverse(self._last.T_cw)
         if self.state is TrackState.LOST:
             self._breaks.append(self.keyframes.store.next_id)
         self.state, self._misses, self.frames_lost = TrackState.TRACKING, 0, 0
+        self.orientation.located(frame, encoded)
         anchor = self.keyframes[motion.keyframe]
         T_rel = motion.T_cw @ se3_inverse(anchor.T_cw)
         self._seen_at(anchor, T_rel, velocity)
+        turns = [] if followed is None else [followed.turn]
         if not self._choice.calls_for(motion.flow, motion.overlap):
-            self.recorder.add(frame, encoded, anchor.id, T_rel, motion.match)
+            self.recorder.add(frame, encoded, anchor.id, T_rel, motion.match, turns)
             return TrackResult(self.state, active=self.active)
-        return self._insert(frame, encoded, motion, velocity)
+        return self._insert(frame, encoded, motion, velocity, turns)
 
     def _insert(
         self,
@@ -383,6 +433,7 @@ class Tracker:
         encoded: Any,
         motion: FrameMotion,
         velocity: Float[Tensor, "4 4"] | None,
+        turns: Sequence[Turn],
     ) -> TrackResult:
         anchor = self.keyframes[motion.keyframe]
         state = self.keyframes.add(frame.index, frame.timestamp, frame.image, encoded, motion.T_cw)
@@ -391,7 +442,7 @@ class Tracker:
         state.inverse_depth, state.information = grid_fields(self.grid).transfer(
             T, anchor.inverse_depth, anchor.information
         )
-        self.recorder.add_keyframe(state.id)
+        self.recorder.add_keyframe(state.id, turns)
         self._connect(state.id, anchor.id)
         self._adjust_locally()
         removed = self._cull()

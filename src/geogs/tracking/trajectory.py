@@ -1,6 +1,5 @@
 """The pose of every frame, solved at the end from sparse flow kept along the way."""
 
-from bisect import bisect_left
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -14,13 +13,18 @@ from geogs.bundle.problem import MotionProblem
 from geogs.bundle.projection import linearise
 from geogs.bundle.select import grid_fields, motion_solver
 from geogs.errors import InputError
-from geogs.geometry.lie import retract, se3_inverse, se3_log
+from geogs.geometry.lie import retract, se3_inverse, se3_log, so3_log
 from geogs.keyframes.grid import SampleGrid
 from geogs.keyframes.keyframe import Keyframe
 from geogs.keyframes.store import Segment
 from geogs.tracking.flow.base import FlowMatch, FlowOperator
+from geogs.tracking.gaps import bridged
 from geogs.tracking.packed_edge import pack_matches, unpacked_positions
+from geogs.tracking.turns import Turn, orientations
 from geogs.types import Frame, Trajectory
+
+ASTRAY = 0.05
+"""Radians by which a frame's orientation may differ from one between its keyframes."""
 
 
 @dataclass
@@ -45,6 +49,8 @@ class FrameRecord:
     scale: float = 1.0
     """Of the anchor when that was measured."""
     observations: list[Observation] = field(default_factory=list)
+    turns: list[Turn] = field(default_factory=list)
+    """Against earlier frames: what is left to go by where there is no depth."""
 
     def sees(self, keyframe: int) -> bool:
         """Whether the flow from that keyframe has been measured."""
@@ -104,10 +110,10 @@ class TrajectoryRecorder:
             for n, image in state.pending.items()
         ]
 
-    def add_untracked(self, index: int, timestamp: float) -> None:
-        """A frame that could not be located."""
+    def add_untracked(self, index: int, timestamp: float, turns: Sequence[Turn] = ()) -> None:
+        """A frame that could not be located, though its orientation may be known."""
         eye = torch.eye(4, dtype=torch.float64)
-        self.records.append(FrameRecord(index, timestamp, None, eye))
+        self.records.append(FrameRecord(index, timestamp, None, eye, turns=[*turns]))
 
     def add(
         self,
@@ -116,10 +122,11 @@ class TrajectoryRecorder:
         anchor: int,
         T_rel: Float[Tensor, "4 4"],
         match: FlowMatch | None = None,
+        turns: Sequence[Turn] = (),
     ) -> None:
         """A frame at ``T_rel`` from the anchor keyframe, with the flow that located it."""
         scale = self.keyframes[anchor].scale
-        record = FrameRecord(frame.index, frame.timestamp, anchor, T_rel, scale)
+        record = FrameRecord(frame.index, frame.timestamp, anchor, T_rel, scale, turns=[*turns])
         if match is not None:
             self._observe([(record, anchor)], match)
         self.records.append(record)
@@ -127,11 +134,13 @@ class TrajectoryRecorder:
         if len(self._pending) > self.max_pending:
             del self._pending[: self.max_pending // 2]
 
-    def add_keyframe(self, id: int) -> None:
+    def add_keyframe(self, id: int, turns: Sequence[Turn] = ()) -> None:
         """A frame that is a keyframe."""
         state = self.keyframes[id]
         eye = torch.eye(4, dtype=torch.float64)
-        self.records.append(FrameRecord(state.frame_index, state.timestamp, id, eye, state.scale))
+        self.records.append(
+            FrameRecord(state.frame_index, state.timestamp, id, eye, state.scale, turns=[*turns])
+        )
 
     def keyframe_removed(self, removed: Keyframe, substitute: int) -> None:
         """Make a culled keyframe an ordinary frame; frames anchored to it move to another one."""
@@ -149,6 +158,30 @@ class TrajectoryRecorder:
                     self._pending.append(_Pending(record, removed.image, removed.encoded))
         self._pending.sort(key=lambda p: p.record.index)
 
+    def keyframe_forgotten(self, removed: Keyframe) -> None:
+        """Keep the image of a keyframe that was given up, as that of a frame without a place."""
+        record = next((r for r in self.records if r.index == removed.frame_index), None)
+        if record is not None:
+            self._pending.append(_Pending(record, removed.image, removed.encoded))
+            self._pending.sort(key=lambda p: p.record.index)
+
+    def take_unplaced(self) -> list[tuple[FrameRecord, Any]]:
+        """Frames that wait without a keyframe to be relative to, and their encoded images.
+
+        They wait no longer.
+        """
+        without = [p for p in self._pending if p.record.anchor not in self.keyframes]
+        self._pending = [p for p in self._pending if p.record.anchor in self.keyframes]
+        return [(p.record, p.encoded) for p in without]
+
+    def place(
+        self, record: FrameRecord, anchor: int, T_rel: Float[Tensor, "4 4"], match: FlowMatch
+    ) -> None:
+        """Say where a frame is after all, with the flow that located it."""
+        record.anchor, record.T_rel, record.scale = anchor, T_rel, self.keyframes[anchor].scale
+        record.observations = []
+        self._observe([(record, anchor)], match)
+
     def absorb(self, other: "TrajectoryRecorder") -> None:
         """Take over the frames of another recorder, whose keyframes are now in this one's store."""
         self.records = sorted([*self.records, *other.records], key=lambda r: r.index)
@@ -157,12 +190,20 @@ class TrajectoryRecorder:
     def give_up(self, other: "TrajectoryRecorder") -> None:
         """Take over the frames of another recorder as frames that were not tracked."""
         for record in other.records:
-            self.add_untracked(record.index, record.timestamp)
+            self.add_untracked(record.index, record.timestamp, record.turns)
 
     def anchor_to_keyframes(self) -> None:
-        """Give the frames seen before the map was started a pose between their keyframes."""
+        """Give the frames seen before the map was started a pose between their keyframes.
+
+        One whose turns tell another orientation has none: it was seen while the camera looked away
+        from both.
+        """
         states = list(self.keyframes)
         indices = [s.frame_index for s in states]
+        turned = orientations(
+            {r.index: r.turns for r in self.records},
+            {s.frame_index: s.T_cw[:3, :3] for s in states},
+        )
         for record in self.records:
             if record.anchor is None or record.anchor not in self.keyframes:
                 continue
@@ -172,6 +213,9 @@ class TrajectoryRecorder:
             share = (record.index - a.frame_index) / span
             xi = se3_log(b.T_cw @ se3_inverse(a.T_cw))
             record.T_rel, record.scale = retract(share * xi, torch.eye(4).to(xi)), a.scale
+            R = turned.get(record.index)
+            if R is not None and _apart(R, (record.T_rel @ a.T_cw)[:3, :3]) > ASTRAY:
+                record.anchor = None
 
     def finalise(self, before: int, after: int | None) -> None:
         """Measure the waiting frames up to keyframe ``after`` against it and the one ``before``."""
@@ -217,25 +261,34 @@ class TrajectoryRecorder:
         anchor = self.keyframes[record.anchor]
         return anchor.at_present_scale(record.T_rel, record.scale) @ anchor.T_cw
 
-    def solve(self, apart: Sequence[FrameRecord] = (), chunk: int = 64) -> Trajectory:
+    def solve(
+        self, apart: Sequence[FrameRecord] = (), chunk: int = 64, has_map: bool = True
+    ) -> Trajectory:
         """Poses of all frames seen so far on the present keyframes, real timestamps.
 
-        Untracked frames, and those ``apart`` on other keyframes, are interpolated between their
-        neighbours.
+        Of untracked frames, and those ``apart`` on other keyframes, the position is interpolated
+        between their neighbours, and the orientation is what turns say, else interpolated, too.
+        Without a map (``has_map``) nothing but turns is known of any.
         """
         records = sorted([*self.records, *apart], key=lambda r: r.index)
         keyframes = {s.frame_index: s.id for s in self.keyframes}
-        tracked = [r for r in records if r.anchor is not None and r.anchor in self.keyframes]
+        located = records if has_map else []
+        tracked = [r for r in located if r.anchor is not None and r.anchor in self.keyframes]
         free = [r for r in tracked if r.index not in keyframes and r.observations]
         solved: dict[int, Tensor] = {r.index: self._pose(r) for r in tracked}
         for start in range(0, len(free), chunk):
             part = free[start : start + chunk]
             poses = self._solve_chunk(part)
             solved.update({r.index: T for r, T in zip(part, poses, strict=True)})
+        turned = orientations(
+            {r.index: r.turns for r in records}, {n: T[:3, :3] for n, T in solved.items()}
+        )
         timestamps = np.array([r.timestamp for r in records], dtype=np.float64)
-        known = np.array([r.index in solved for r in records], dtype=bool)
-        T_cw = [solved.get(r.index) for r in records]
-        return Trajectory(timestamps, interpolate(timestamps, T_cw), known)
+        return bridged(
+            timestamps,
+            [solved.get(r.index) for r in records],
+            [turned.get(r.index) for r in records],
+        )
 
     def _solve_chunk(self, records: list[FrameRecord]) -> Float[Tensor, "n 4 4"]:
         grid, cells = self.keyframes.grid, self._subset
@@ -262,6 +315,11 @@ class TrajectoryRecorder:
         return T
 
 
+def _apart(first: Float[Tensor, "3 3"], second: Float[Tensor, "3 3"]) -> float:
+    """Radians between two rotations."""
+    return float(so3_log(first @ second.mT).norm())
+
+
 def sparse_cells(grid: SampleGrid) -> Bool[Tensor, "p"]:
     """Every second cell in both directions."""
     keep = torch.zeros(grid.height, grid.width, dtype=torch.bool, device=grid.device)
@@ -278,24 +336,3 @@ def depth_aware_weight(
     depth = depth_jacobian.square() / information.clamp(min=1e-12)[..., None]
     variance = 1 / weight.clamp(min=1e-12) + depth
     return (weight > 0) * (information > 0)[..., None] / variance
-
-
-def interpolate(
-    timestamps: Float[np.ndarray, "n"], T_cw: list[Tensor | None]
-) -> Float[np.ndarray, "n 4 4"]:
-    """Camera to world of every frame; gaps are bridged by constant motion, ends are held."""
-    known = {n: T for n, T in enumerate(T_cw) if T is not None}
-    out = np.tile(np.eye(4), (len(T_cw), 1, 1))
-    if not known:
-        return out
-    indices = list(known)
-    for n in range(len(T_cw)):
-        next = bisect_left(indices, n)
-        b = indices[min(next, len(indices) - 1)]
-        a = n if b == n else indices[max(next - 1, 0)]
-        T = known[a]
-        if a != b:
-            share = (timestamps[n] - timestamps[a]) / max(timestamps[b] - timestamps[a], 1e-9)
-            T = retract(share * se3_log(known[b] @ se3_inverse(T)), T)
-        out[n] = se3_inverse(T).cpu().numpy()
-    return out

@@ -11,17 +11,18 @@ HEADER = "timestamp,state,sigma_position,sigma_rotation_deg,relative_sigma_depth
 
 
 def write_uncertainty(path: str | Path, trajectory: Trajectory, known: Uncertainty) -> None:
-    """Write a row per frame: state (tracked or lost), standard deviations as of ``Uncertainty``.
+    """Write a row per frame: its state and standard deviations as of ``Uncertainty``.
 
-    Between keyframes they are interpolated in time; a lost frame has none.
+    The state is tracked, orientation only or lost. Between keyframes deviations are interpolated
+    in time; a frame that is not tracked has none.
     """
-    at, frames = trajectory.timestamps, trajectory.tracked
+    at = trajectory.timestamps
     columns = [known.position, np.degrees(known.rotation), known.depth]
     between = [
         np.interp(at, known.timestamps, c) if len(c) else np.full(len(at), np.inf) for c in columns
     ]
     rows = [HEADER]
-    for n, tracked in enumerate(frames):
-        numbers = [f"{c[n]:.6g}" if tracked else "" for c in between]
-        rows.append(",".join([repr(float(at[n])), "tracked" if tracked else "lost", *numbers]))
+    for n, state in enumerate(trajectory.states):
+        numbers = [f"{c[n]:.6g}" if state == "tracked" else "" for c in between]
+        rows.append(",".join([repr(float(at[n])), state, *numbers]))
     write_text(path, "\n".join([*rows, ""]))

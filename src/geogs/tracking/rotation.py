@@ -1,0 +1,168 @@
+"""How the camera turned between two views, and whether it did more than turn.
+
+Two models explain a flow: the camera only turned, or it moved as well. The second always fits
+better, having more freedom; which of them the flow speaks for is decided by Torr's geometric robust
+information criterion (GRIC, 1998), with the operator's own deviations.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float64
+from torch import Tensor
+
+from geogs.keyframes.grid import SampleGrid
+from geogs.tracking.flow.base import FlowMatch
+from geogs.tracking.initialise import two_view
+
+AGREEING = 0.4
+"""Share of the matched cells that must agree with a rotation for it to be believed."""
+SHARPENED = (0.1, 0.03, 0.01, 0.005, 0.005)
+"""Distances in the image, of the long edge, beyond which a cell loses its say, step by step."""
+TOLERANCE = 0.008
+"""Distance within which a cell agrees with a rotation, of the long edge."""
+SUREST = 0.1
+"""Pixels: no cell counts as surer than this."""
+LEAST_DEVIATION = 2e-4
+"""Radians: no rotation is known better, whatever its many cells say; they err alike."""
+
+
+@dataclass(frozen=True)
+class RotationFit:
+    """The rotation that most of a flow agrees with."""
+
+    R: Float64[Tensor, "3 3"]
+    """First camera to second."""
+    agreeing: float
+    """Share of the matched cells within ``TOLERANCE``."""
+    deviation: float
+    """Standard deviation of the angle, radians."""
+    squares: Float64[np.ndarray, "n"]
+    """Squared error of each matched cell in the flow's variances."""
+
+
+@dataclass(frozen=True)
+class RelativeRotation:
+    """How a view is turned against another."""
+
+    R: Float64[Tensor, "3 3"]
+    """First camera to second."""
+    deviation: float
+    """Standard deviation of the angle, radians."""
+    is_pure: bool
+    """Whether nothing speaks for more than a rotation."""
+
+
+def relative_rotation(grid: SampleGrid, match: FlowMatch) -> RelativeRotation | None:
+    """The rotation between two views by the model that their flow (one edge) speaks for.
+
+    None where too few cells agree with either.
+    """
+    turned = fit_rotation(grid, match)
+    if turned is None:
+        return None
+    pair = FlowMatch(match.pixels.cpu(), match.weight.cpu())
+    moved = two_view(grid.camera, pair)
+    if moved is not None:
+        off = epipolar_squares(grid, pair, moved.T_ji)
+        if gric(turned.squares, 2, 3) > gric(off, 3, 5):
+            return RelativeRotation(moved.T_ji[:3, :3].double(), turned.deviation, False)
+    if turned.agreeing < AGREEING:
+        return None
+    return RelativeRotation(turned.R, turned.deviation, True)
+
+
+def gric(squares: Float64[np.ndarray, "n"], dimension: int, parameters: int) -> float:
+    """Torr's criterion of a model of two views; the smaller, the better the model.
+
+    Args:
+        squares: squared errors of the matches in their variances.
+        dimension: of what a match may lie on, in the space of its four coordinates: 2 where the
+            model says where a point is seen, 3 where it says only on which line.
+        parameters: of the model.
+    """
+    n, codimension = len(squares), 4 - dimension
+    robust = float(np.minimum(squares, 2 * codimension).sum())
+    return robust + dimension * n * math.log(4) + parameters * math.log(4 * max(n, 1))
+
+
+def fit_rotation(grid: SampleGrid, match: FlowMatch) -> RotationFit | None:
+    """The rotation that most of a flow (one edge) agrees with.
+
+    Gauss-Newton on the distances in the second image under Geman and McClure's loss, which is
+    sharpened from step to step. None where fewer than eight cells are matched.
+    """
+    camera, used = grid.camera, (match.weight[0, :, 0] > 0).cpu().numpy()
+    if used.sum() < 8:
+        return None
+    rays = grid.rays.double().cpu().numpy()[used]
+    pixels = match.pixels[0].double().cpu().numpy()[used]
+    weight = match.weight[0].double().cpu().numpy()[used]
+    weight = weight / (1 + SUREST**2 * weight)
+    edge = max(camera.width, camera.height)
+    focal, centre = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
+    R = _procrustes(rays, np.c_[(pixels - centre) / focal, np.ones(len(pixels))])
+    for reach in SHARPENED:
+        for _ in range(2):
+            error, J = _linearised(rays @ R.T, pixels, focal, centre)
+            say = weight / (1 + (error**2).sum(1, keepdims=True) / (reach * edge) ** 2) ** 2
+            H = np.einsum("nca,nc,ncb->ab", J, say, J)
+            step = np.linalg.solve(H + 1e-9 * np.eye(3), np.einsum("nca,nc,nc->a", J, say, error))
+            R = _exponential(step) @ R
+    error, _ = _linearised(rays @ R.T, pixels, focal, centre)
+    agreeing = float((np.linalg.norm(error, axis=1) < TOLERANCE * edge).mean())
+    deviation = max(math.sqrt(np.trace(np.linalg.inv(H + 1e-9 * np.eye(3)))), LEAST_DEVIATION)
+    return RotationFit(torch.from_numpy(R), agreeing, deviation, (weight * error**2).sum(1))
+
+
+def epipolar_squares(
+    grid: SampleGrid, match: FlowMatch, T_ji: Float[Tensor, "4 4"]
+) -> Float64[np.ndarray, "n"]:
+    """Squared distances of the matched cells from their epipolar lines, in the flow's variances."""
+    camera, used = grid.camera, match.weight[0, :, 0] > 0
+    t, R = T_ji[:3, 3].double().numpy(), T_ji[:3, :3].double().numpy()
+    turned = grid.rays.cpu().double().numpy()[used.numpy()] @ R.T
+    normal = np.cross(t, turned)  # of the plane of a ray and the baseline
+    line = normal[:, :2] / [camera.fx, camera.fy]
+    pixels = match.pixels[0][used].double().numpy() - [camera.cx, camera.cy]
+    off = (line * pixels).sum(1) + normal[:, 2]
+    weight = match.weight[0][used].double().numpy()
+    variance = (line**2 * (1 / weight + SUREST**2)).sum(1)
+    squares: Float64[np.ndarray, "n"] = off**2 / np.maximum(variance, 1e-30)
+    return squares
+
+
+def _linearised(
+    points: Float64[np.ndarray, "n 3"],
+    pixels: Float64[np.ndarray, "n 2"],
+    focal: Float64[np.ndarray, "2"],
+    centre: Float64[np.ndarray, "2"],
+) -> tuple[Float64[np.ndarray, "n 2"], Float64[np.ndarray, "n 2 3"]]:
+    """What is missing from projections to where points are seen, and how a turn moves them."""
+    z = np.maximum(points[:, 2], 1e-3)
+    x, y = points[:, 0] / z, points[:, 1] / z
+    J = np.stack([
+        np.stack([-x * y, 1 + x * x, -y], -1), np.stack([-1 - y * y, x * y, x], -1),
+    ], 1)  # fmt: skip
+    return pixels - (focal * np.stack([x, y], -1) + centre), J * focal[:, None]
+
+
+def _procrustes(
+    first: Float64[np.ndarray, "n 3"], second: Float64[np.ndarray, "n 3"]
+) -> Float64[np.ndarray, "3 3"]:
+    """The rotation between directions that is best in the mean."""
+    a, b = (x / np.linalg.norm(x, axis=1, keepdims=True) for x in (first, second))
+    U, _, Vt = np.linalg.svd(b.T @ a)
+    R: Float64[np.ndarray, "3 3"] = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    return R
+
+
+def _exponential(phi: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3 3"]:
+    """Rodrigues' formula."""
+    angle = float(np.linalg.norm(phi))
+    K = np.array([[0, -phi[2], phi[1]], [phi[2], 0, -phi[0]], [-phi[1], phi[0], 0]])
+    half = np.sinc(angle / (2 * np.pi))
+    R: Float64[np.ndarray, "3 3"] = np.eye(3) + np.sinc(angle / np.pi) * K + 0.5 * half**2 * K @ K
+    return R

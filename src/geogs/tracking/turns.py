@@ -1,0 +1,116 @@
+"""Orientations of frames from how each is turned against others."""
+
+from collections import defaultdict, deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+from scipy.sparse import coo_matrix
+from scipy.sparse.linalg import spsolve
+from torch import Tensor
+
+from geogs.geometry.lie import so3_exp, so3_log
+
+ROUNDS = 3
+"""Gauss-Newton steps that spread what turns contradict each other by."""
+
+
+@dataclass(frozen=True, eq=False)
+class Turn:
+    """How a frame's camera is turned against that of an earlier frame."""
+
+    frame: int
+    """Index of the earlier."""
+    R: Float64[Tensor, "3 3"]
+    """The earlier camera to this one."""
+    deviation: float
+    """Standard deviation of the angle, radians."""
+
+
+def orientations(
+    turns: Mapping[int, Sequence[Turn]], known: Mapping[int, Float64[Tensor, "3 3"]]
+) -> dict[int, Float64[Tensor, "3 3"]]:
+    """World to camera of all frames that turns link to the known ones, without these.
+
+    Where several ways lead to a frame, what they contradict each other by is spread over them by
+    least squares, each turn as sure as it says (rotation averaging). If nothing is known, the
+    earliest frame of the largest group that turns link is the world.
+
+    Args:
+        turns: of each frame, by its index.
+        known: rotations of frames that stay as they are, by index.
+    """
+    links = [(t.frame, n, t.R, t.deviation) for n, several in turns.items() for t in several]
+    neighbours: dict[int, list[tuple[int, Tensor]]] = defaultdict(list)
+    for a, b, R, _ in links:
+        neighbours[a].append((b, R))
+        neighbours[b].append((a, R.mT))
+    fixed = dict(known) or _earliest_of_largest(neighbours)
+    found = _followed(neighbours, fixed)
+    free = sorted(found.keys() - fixed.keys())
+    moved = set(free)
+    used = [link for link in links if link[0] in found and not moved.isdisjoint(link[:2])]
+    for _ in range(ROUNDS if free else 0):
+        _spread(found, free, used)
+    return {n: R for n, R in found.items() if n not in known}
+
+
+def _earliest_of_largest(neighbours: Mapping[int, list]) -> dict[int, Tensor]:
+    """The identity for the earliest frame of the largest group; nothing without links."""
+    best: list[int] = []
+    left = set(neighbours)
+    while left:
+        group = sorted(_followed(neighbours, {min(left): torch.eye(3, dtype=torch.float64)}))
+        best = max(best, group, key=len)
+        left -= set(group)
+    return {best[0]: torch.eye(3, dtype=torch.float64)} if best else {}
+
+
+def _followed(
+    neighbours: Mapping[int, list[tuple[int, Tensor]]], start: Mapping[int, Tensor]
+) -> dict[int, Tensor]:
+    """The rotations of the start and of all frames linked to them, by the fewest turns."""
+    found, queue = dict(start), deque(start)
+    while queue:
+        a = queue.popleft()
+        for b, R in neighbours.get(a, ()):
+            if b not in found:
+                found[b] = R @ found[a]
+                queue.append(b)
+    return found
+
+
+def _spread(
+    found: dict[int, Tensor], free: list[int], links: list[tuple[int, int, Tensor, float]]
+) -> None:
+    """A Gauss-Newton step over the free rotations, each moved from the left.
+
+    With ``R_b R_a^T`` for the turn R of b against a, the error is ``log(R (R_b R_a^T)^T)``; to
+    first order it falls by ``phi_b - (R_b R_a^T) phi_a``.
+    """
+    column = {n: 3 * k for k, n in enumerate(free)}
+    first, second = (torch.stack([found[link[k]] for link in links]) for k in (0, 1))
+    measured = torch.stack([link[2] for link in links])
+    sure = 1 / torch.tensor([link[3] for link in links], dtype=torch.float64)
+    relative = second @ first.mT
+    error = sure[:, None] * so3_log(measured @ relative.mT)
+    rows: list[np.ndarray] = []
+    columns: list[np.ndarray] = []
+    values: list[np.ndarray] = []
+    at = np.arange(3)
+    for k, (a, b, _, _) in enumerate(links):
+        for n, block in ((b, torch.eye(3, dtype=torch.float64)), (a, -relative[k])):
+            if n in column:
+                rows.append(np.repeat(3 * k + at, 3))
+                columns.append(np.tile(column[n] + at, 3))
+                values.append((sure[k] * block).numpy().ravel())
+    shape = (3 * len(links), 3 * len(free))
+    J = coo_matrix(
+        (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), shape
+    ).tocsc()
+    step = spsolve((J.T @ J).tocsc(), J.T @ error.numpy().ravel())
+    moves = so3_exp(torch.from_numpy(step).reshape(-1, 3))
+    for n, move in zip(free, moves, strict=True):
+        found[n] = move @ found[n]

@@ -1,0 +1,131 @@
+"""Cameras that only turn: before there is a map, where it is out of sight, and for ever."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+
+from geogs.config import TrackingConfig
+from geogs.errors import TrackingLost
+from geogs.evaluation.trajectory import rotation_angle
+from geogs.keyframes.grid import SampleGrid
+from geogs.keyframes.store import KeyframeStore
+from geogs.tracking.flow.select import build_operator
+from geogs.tracking.segments import Segments
+from geogs.tracking.tracker import Tracker, TrackState
+from geogs.types import Frame, Trajectory
+from tracking_runs import CONFIG, error_cm
+from tracking_scenes import CAMERA, frames, pose, sideways
+
+pytestmark = pytest.mark.system
+
+
+def new_segments(config: TrackingConfig = CONFIG) -> Segments:
+    grid = SampleGrid(CAMERA)
+    operator = build_operator(config, grid)
+    store = KeyframeStore(grid, operator.encode)
+    return Segments(
+        lambda: Tracker(CAMERA, config, "cpu", 0, operator, None, None, store), config.patience
+    )
+
+
+def run(stream: Sequence[Frame], config: TrackingConfig = CONFIG) -> tuple[Segments, list]:
+    segments = new_segments(config)
+    results = [segments.track(f, lambda image: ()) for f in stream]
+    return segments, [*results, segments.finish()]
+
+
+def turned(path: Sequence[np.ndarray], trajectory: Trajectory) -> np.ndarray:
+    """Degrees by which orientations are off, relative to the first frame that is not lost."""
+    truth, found = np.stack(path)[:, :3, :3], trajectory.T_wc[:, :3, :3]
+    first = trajectory.states.index("tracked") if trajectory.tracked.any() else 0
+    return rotation_angle(found[first].T @ found, truth[first].T @ truth)
+
+
+def test_a_camera_that_only_turns_has_orientations():
+    path = [pose(0.0, yaw=0.5 * np.sin(0.1 * k)) for k in range(50)]
+    segments, results = run(frames(path))
+    assert segments.why_not.startswith("The images show no parallax")
+    assert results[-1].state is TrackState.INITIALIZING
+    assert segments.keyframe_ids == []
+    trajectory = segments.trajectory()
+    assert trajectory.states == ["orientation only"] * len(path)
+    assert (trajectory.T_wc[:, :3, 3] == 0).all()
+    assert turned(path, trajectory).max() < 0.2
+
+
+def test_nothing_known_is_still_an_error():
+    black = np.zeros((CAMERA.height, CAMERA.width, 3), np.uint8)
+    with pytest.raises(TrackingLost, match="texture"):
+        run([Frame(k, k / 30, black) for k in range(5)])
+
+
+@pytest.fixture(scope="module")
+def turning_away() -> tuple[list[np.ndarray], Segments, list]:
+    walk = sideways(36)
+    end = walk[-1]
+    there = 1.05 * (1 - np.cos(np.linspace(0, np.pi, 36)))
+    yaw = np.concatenate([there, there[::-1]])
+    path = [*walk, *(end @ pose(0.0, yaw=a) for a in yaw), *sideways(50)[36:]]
+    segments, results = run(frames(path))
+    return path, segments, results
+
+
+def test_turning_away_leaves_the_orientation(turning_away):
+    path, segments, _ = turning_away
+    trajectory = segments.trajectory()
+    states = trajectory.states
+    assert "lost" not in states
+    away = [s for s, T in zip(states, path, strict=True) if abs(turn_of(T)) > 1.7]
+    assert set(away) == {"orientation only"}
+    assert turned(path, trajectory).max() < 0.5
+
+
+def test_coming_back_goes_on_in_the_same_world(turning_away):
+    path, segments, _ = turning_away
+    trajectory = segments.trajectory()
+    assert len(segments.trackers) == 1
+    assert trajectory.tracked[-14:].all()
+    known = trajectory.tracked
+    assert 0.5 < known.mean() < 0.9
+    assert error_cm(trajectory.T_wc[known, :3, 3], np.stack(path)[known, :3, 3]) < 0.6
+
+
+def test_no_keyframe_is_made_where_no_depth_is_known(turning_away):
+    path, segments, _ = turning_away
+    for keyframe in segments.world.keyframes:
+        assert abs(turn_of(path[keyframe.frame_index])) < 1.5
+
+
+def test_frames_before_a_start_are_located_by_its_keyframes():
+    looking = [pose(-0.5, yaw=0.55 * (1 - np.cos(0.125 * k))) for k in range(51)]
+    path = [*looking, *sideways(40)[1:]]
+    segments, _ = run(frames(path))
+    trajectory = segments.trajectory()
+    assert "lost" not in trajectory.states
+    assert trajectory.tracked[:10].all()
+    known = trajectory.tracked
+    assert error_cm(trajectory.T_wc[known, :3, 3], np.stack(path)[known, :3, 3]) < 0.8
+    assert turned(path, trajectory).max() < 0.6
+
+
+def test_a_state_goes_on_as_if_nothing_had_happened():
+    path = [pose(0.0, yaw=0.03 * k) for k in range(30)]
+    stream = frames(path)
+    whole, _ = run(stream)
+    first = new_segments()
+    for frame in stream[:14]:
+        first.track(frame, lambda image: ())
+    store, second = first.world.keyframes.store, new_segments()
+    second.world.keyframes.store.load(store.state())
+    second.load(first.state())
+    for frame in stream[14:]:
+        second.track(frame, lambda image: ())
+    second.finish()
+    np.testing.assert_array_equal(second.trajectory().T_wc, whole.trajectory().T_wc)
+    assert second.trajectory().states == whole.trajectory().states
+
+
+def turn_of(T_wc: np.ndarray) -> float:
+    """Radians about the vertical."""
+    return float(np.arctan2(T_wc[0, 2], T_wc[2, 2]))
