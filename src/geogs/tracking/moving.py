@@ -22,14 +22,18 @@ from geogs.tracking.proximity import Pair
 
 LEAST_SCALE = 0.2
 """Deviations of a match below which the usual residual of an edge is not taken to lie."""
+WORSE = 3.0
+"""Times the usual residual of all edges that of one of them is at most taken to be."""
 MOST = 10.0
 """Times the usual residual that a single match can speak for motion."""
 ENOUGH = 0.7
 """Matches per cell of a surrounding from which it can be judged."""
+FILLED = 0.8
+"""Share of a keyframe's cells beyond which it is the keyframe that does not suit the others."""
 REGION = 0.4
 """Share of the cells around one that move, from which it is held for moving itself."""
-EDGES_TOGETHER = 96
-"""Directed edges judged in one go; bounds memory."""
+EDGES_TOGETHER = 128
+"""Directed edges, of some ten keyframes, judged in one go; bounds memory."""
 
 
 class Match(Protocol):
@@ -71,6 +75,12 @@ def carried(
     return moving[cell] & inside & (weight[:, 0] > 0)
 
 
+def moving_share(keyframes: Segment) -> float:
+    """Part of all cells that is held for moving; 0 without keyframes."""
+    held = [k.moving.float().mean().cpu() for k in keyframes if k.moving is not None]
+    return float(torch.stack(held).sum()) / len(keyframes) if held else 0.0
+
+
 def judge(
     keyframes: Segment, edges: Mapping[Pair, Match], judged: Sequence[Pair], threshold: float
 ) -> None:
@@ -86,12 +96,9 @@ def judge(
     ids = sorted({k for e in directed for k in e})
     slot = {k: n for n, k in enumerate(ids)}
     source = torch.tensor([slot[i] for i, _ in directed])
-    chunks = source_chunks(source, EDGES_TOGETHER)
-    parts = [_residuals(keyframes, edges, directed[chunk]) for chunk in chunks]
-    usual = torch.cat([_usual(residual, still) for residual, still in parts])
-    usual = torch.maximum(usual, usual.nanmedian()).nan_to_num(LEAST_SCALE).clamp(min=LEAST_SCALE)
-    for chunk, (residual, _) in zip(chunks, parts, strict=True):
-        ratio = (residual / usual[chunk, None]).clamp(max=MOST)
+    for chunk in source_chunks(source, EDGES_TOGETHER):
+        residual, still = _residuals(keyframes, edges, directed[chunk])
+        ratio = (residual / _usual(residual, still)[:, None]).clamp(max=MOST)
         for frame, e in sources_within(source[chunk]):
             keyframe = keyframes[ids[frame]]
             keyframe.moving = moving_cells(
@@ -109,12 +116,13 @@ def moving_cells(
 ) -> Bool[Tensor, "p"]:
     """Regions whose matches, of which ``count`` add up to ``total``, exceed a threshold.
 
-    Cells around which there are too few matches stay what they were ``before``.
+    Cells around which there are too few matches stay what they were ``before``, and so do all where
+    nearly all contradict: then the pose is wrong, or the image is.
     """
     near, seen = _mean(grid, total, 3), _mean(grid, count.to(total), 3)
-    core = near > threshold * seen
-    unknown = seen < ENOUGH
-    core = torch.where(unknown, torch.zeros_like(core) if before is None else before, core)
+    core, known = near > threshold * seen, seen >= ENOUGH
+    known = known & ((core & known).sum() <= FILLED * known.sum())
+    core = torch.where(known, core, torch.zeros_like(core) if before is None else before)
     return _mean(grid, core.to(total), 5) >= REGION
 
 
@@ -160,5 +168,11 @@ def _residuals(
 
 
 def _usual(residual: Float[Tensor, "e p"], still: Bool[Tensor, "e p"]) -> Float[Tensor, "e"]:
-    """Median residual of each edge over what is held for still."""
-    return torch.where(still, residual, torch.nan).nanmedian(1).values
+    """Median residual of each edge over what is held for still, within what all edges know.
+
+    What moves may fill a keyframe, but not most of those that are judged together.
+    """
+    usual = torch.where(still, residual, torch.nan).nanmedian(1).values
+    common = usual.nanmedian().nan_to_num(LEAST_SCALE).clamp(min=LEAST_SCALE)
+    usual = torch.where(usual.isnan(), common, usual)
+    return torch.minimum(torch.maximum(usual, common), WORSE * common)
