@@ -7,7 +7,7 @@ that end in them, count nowhere.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float
@@ -16,6 +16,7 @@ from torch.nn.functional import avg_pool2d
 
 from geogs.bundle.problem import source_chunks, sources_within
 from geogs.bundle.rigidity import best_residuals
+from geogs.bundle.select import grid_fields
 from geogs.keyframes.grid import SampleGrid
 from geogs.keyframes.store import Segment
 from geogs.tracking.proximity import Pair
@@ -36,6 +37,7 @@ EDGES_TOGETHER = 128
 """Directed edges, of some ten keyframes, judged in one go; bounds memory."""
 
 
+@runtime_checkable
 class Match(Protocol):
     """What is judged of an edge."""
 
@@ -102,7 +104,7 @@ def judge(
         for frame, e in sources_within(source[chunk]):
             keyframe = keyframes[ids[frame]]
             keyframe.moving = moving_cells(
-                keyframe.grid, ratio[e].nan_to_num(0.0).sum(0), (~ratio[e].isnan()).sum(0),
+                keyframe.grid, ratio[e].nan_to_num(0.0).sum(0), (~ratio[e].isnan()).float().sum(0),
                 keyframe.moving, threshold,
             )  # fmt: skip
 
@@ -116,14 +118,16 @@ def moving_cells(
 ) -> Bool[Tensor, "p"]:
     """Regions whose matches, of which ``count`` add up to ``total``, exceed a threshold.
 
-    Cells around which there are too few matches stay what they were ``before``, and so do all where
-    nearly all contradict: then the pose is wrong, or the image is.
+    A cell that cannot be judged goes with its surroundings, and each with the majority of those
+    around it, so that what moves includes its border. All stay what they were ``before`` where none
+    can be judged or nearly all contradict: then the pose is wrong, or the image is.
     """
-    near, seen = _mean(grid, total, 3), _mean(grid, count.to(total), 3)
-    core, known = near > threshold * seen, seen >= ENOUGH
-    known = known & ((core & known).sum() <= FILLED * known.sum())
-    core = torch.where(known, core, torch.zeros_like(core) if before is None else before)
-    return _mean(grid, core.to(total), 5) >= REGION
+    near, seen = _mean(grid, total, 3), _mean(grid, count, 3)
+    known = seen >= ENOUGH
+    core = ((near > threshold * seen) & known).to(total)
+    is_told = known.any() & (core.sum() <= FILLED * known.sum())
+    moves = _mean(grid, grid_fields(grid).fill(core, known.to(total)), 5) >= REGION
+    return torch.where(is_told, moves, torch.zeros_like(moves) if before is None else before)
 
 
 def _mean(grid: SampleGrid, values: Float[Tensor, "p"], size: int) -> Float[Tensor, "p"]:
