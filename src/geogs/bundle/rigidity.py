@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from geogs.bundle.projection import relative_motion, seen_from_targets
+from geogs.bundle.projection import MIN_Z, relative_motion
 from geogs.geometry.camera import Camera
 
 BEHIND = 100.0
@@ -27,7 +27,7 @@ def best_residuals(
     pixels: Float[Tensor, "e p 2"],
     weight: Float[Tensor, "e p 2"],
     huber: float = 0.5,
-    iterations: int = 4,
+    iterations: int = 3,
 ) -> Float[Tensor, "e p"]:
     """Residuals of all matches in their deviations, each cell at the depth that suits it best.
 
@@ -46,22 +46,27 @@ def best_residuals(
     Returns 0 where there is no match.
     """
     T_ji = relative_motion(T_cw, source, target).to(inverse_depth)
-    source, t = source.to(inverse_depth.device), T_ji[:, None, :3, 3]
-    f, c = pixels.new_tensor([camera.fx, camera.fy]), pixels.new_tensor([camera.cx, camera.cy])
+    source = source.to(inverse_depth.device)
+    # Axis by axis, in units of the focal lengths: far faster than pairs of numbers.
+    ax, ay, az = (rays @ T_ji[:, :3, :3].mT).permute(2, 0, 1).contiguous()
+    tx, ty, tz = T_ji[:, :3, 3].T[..., None]
+    wx, wy = weight[..., 0] * camera.fx**2, weight[..., 1] * camera.fy**2
+    ux, uy = (pixels[..., 0] - camera.cx) / camera.fx, (pixels[..., 1] - camera.cy) / camera.fy
     d = inverse_depth
     for n in range(iterations + 1):
-        y, valid, z = seen_from_targets(rays, T_ji, d[source])
-        q = 1 / z[..., None]
-        at = y[..., :2] * q
-        r = pixels - (f * at + c)
-        norm = (weight * r.square()).sum(-1).sqrt()
-        norm = torch.where(valid | (weight[..., 0] == 0), norm, BEHIND)
+        along = d[source]
+        z = az + along * tz
+        valid, q = z > MIN_Z, 1 / z.clamp(min=MIN_Z)
+        x, y = (ax + along * tx) * q, (ay + along * ty) * q
+        rx, ry = ux - x, uy - y
+        norm = (wx * rx * rx + wy * ry * ry).sqrt()
         if n == iterations:
             break
-        J = f * (t[..., :2] - t[..., 2:] * at) * q
-        wJ = weight * J * (valid * huber / norm.clamp(min=huber))[..., None]
-        curvature = torch.zeros_like(d).index_add_(0, source, (wJ * J).sum(-1))
-        gradient = torch.zeros_like(d).index_add_(0, source, (wJ * r).sum(-1))
+        jx, jy = (tx - tz * x) * q, (ty - tz * y) * q
+        share = valid * huber / norm.clamp(min=huber)
+        gx, gy = wx * jx * share, wy * jy * share
+        curvature = torch.zeros_like(d).index_add_(0, source, gx * jx + gy * jy)
+        gradient = torch.zeros_like(d).index_add_(0, source, gx * rx + gy * ry)
         damping = 1e-3 * curvature.mean(1, keepdim=True) + 1e-8
         d = (d + gradient / (curvature + damping)).clamp(*DEPTH_RANGE)
-    return norm
+    return torch.where(valid | (wx == 0), norm, BEHIND)

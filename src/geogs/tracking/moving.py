@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from geogs.bundle.problem import source_chunks, sources_within
+from geogs.bundle.problem import source_chunks
 from geogs.bundle.rigidity import best_residuals
 from geogs.bundle.select import grid_fields
 from geogs.keyframes.grid import SampleGrid
@@ -95,28 +95,31 @@ def judge(
     directed = sorted(judged)
     if not directed:
         return
-    ids = sorted({k for e in directed for k in e})
-    slot = {k: n for n, k in enumerate(ids)}
-    source = torch.tensor([slot[i] for i, _ in directed])
+    source = torch.tensor([i for i, _ in directed])
     for chunk in source_chunks(source, EDGES_TOGETHER):
         residual, still = _residuals(keyframes, edges, directed[chunk])
         ratio = (residual / _usual(residual, still)[:, None]).clamp(max=MOST)
-        for frame, e in sources_within(source[chunk]):
-            keyframe = keyframes[ids[frame]]
-            keyframe.moving = moving_cells(
-                keyframe.grid, ratio[e].nan_to_num(0.0).sum(0), (~ratio[e].isnan()).float().sum(0),
-                keyframe.moving, threshold,
-            )  # fmt: skip
+        ids, row = source[chunk].unique(return_inverse=True)
+        row = row.to(ratio.device)
+        total = ratio.new_zeros(len(ids), ratio.shape[1])
+        count = total.index_add(0, row, (~ratio.isnan()).to(ratio))
+        total = total.index_add(0, row, ratio.nan_to_num(0.0))
+        before = [keyframes[k].moving for k in ids.tolist()]
+        none = torch.zeros_like(still[0])
+        held = torch.stack([none if b is None else b for b in before])
+        held = moving_cells(keyframes.grid, total, count, held, threshold)
+        for n, k in enumerate(ids.tolist()):
+            keyframes[k].moving = held[n].clone()
 
 
 def moving_cells(
     grid: SampleGrid,
-    total: Float[Tensor, "p"],
-    count: Float[Tensor, "p"],
-    before: Bool[Tensor, "p"] | None,
+    total: Float[Tensor, "n p"],
+    count: Float[Tensor, "n p"],
+    before: Bool[Tensor, "n p"],
     threshold: float,
-) -> Bool[Tensor, "p"]:
-    """Regions whose matches, of which ``count`` add up to ``total``, exceed a threshold.
+) -> Bool[Tensor, "n p"]:
+    """Regions of keyframes whose matches, ``count`` that add up to ``total``, exceed a threshold.
 
     A cell that cannot be judged goes with its surroundings, and each with the majority of those
     around it, so that what moves includes its border. All stay what they were ``before`` where none
@@ -124,16 +127,17 @@ def moving_cells(
     """
     near, seen = _mean(grid, total, 3), _mean(grid, count, 3)
     known = seen >= ENOUGH
-    core = ((near > threshold * seen) & known).to(total)
-    is_told = known.any() & (core.sum() <= FILLED * known.sum())
-    moves = _mean(grid, grid_fields(grid).fill(core, known.to(total)), 5) >= REGION
-    return torch.where(is_told, moves, torch.zeros_like(moves) if before is None else before)
+    core = (near > threshold * seen) & known
+    is_told = known.any(1, keepdim=True) & (core.sum(1) <= FILLED * known.sum(1))[:, None]
+    filled = grid_fields(grid).fill(core.to(total), known.to(total))
+    return torch.where(is_told, _mean(grid, filled, 5) >= REGION, before)
 
 
-def _mean(grid: SampleGrid, values: Float[Tensor, "p"], size: int) -> Float[Tensor, "p"]:
+def _mean(grid: SampleGrid, values: Float[Tensor, "n p"], size: int) -> Float[Tensor, "n p"]:
     """Mean over a square of cells around each, as far as it lies on the grid."""
-    image = values.view(1, 1, grid.height, grid.width)
-    return avg_pool2d(image, size, 1, size // 2, count_include_pad=False).view(-1)
+    image = values.view(-1, 1, grid.height, grid.width)
+    pooled = avg_pool2d(image, size, 1, size // 2, count_include_pad=False)
+    return pooled.view(values.shape)
 
 
 def _still(
