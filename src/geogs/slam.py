@@ -21,6 +21,7 @@ from geogs.stopwatch import Stopwatch, StopwatchState
 from geogs.threads import on_one_torch_thread
 from geogs.tracking.certainty import certainty
 from geogs.tracking.flow.select import build_operator
+from geogs.tracking.moving import moving_share
 from geogs.tracking.segments import Segments, SegmentsState
 from geogs.tracking.tracker import Tracker, TrackResult, TrackState
 from geogs.types import Frame, MapSnapshot, RenderedKeyframe, Trajectory, Uncertainty
@@ -191,8 +192,9 @@ class Slam:
         return self._known
 
     def particulars(self) -> dict[str, object]:
-        """What a summary says of segments and loops, ready for JSON."""
+        """What a summary says of segments, loops and things that move, ready for JSON."""
         return {
+            "moving": round(moving_share(self.segments.world.keyframes), 4),
             "segments": [asdict(segment) for segment in self.segments.summary()],
             "not_started": self.segments.why_not or None,
             "loops": len(self.loops.detector.loops),

@@ -47,3 +47,15 @@ def test_cells_of_rounds_to_the_nearest_and_flags_the_rest():
     assert torch.equal(index, torch.arange(grid.size))
     strange = torch.tensor([[-10.0, 5.0], [1e9, 5.0], [float("nan"), 5.0], [50.0, 200.0]])
     assert not grid.cells_of(strange)[1].any()
+
+
+def test_an_enlarged_field_is_that_of_the_nearest_cell():
+    grid = SampleGrid(CAMERA)
+    values = torch.arange(grid.size)
+    image = grid.enlarged(values, 50, 38)
+    assert image.shape == (38, 50)
+    v, u = torch.meshgrid(torch.arange(38), torch.arange(50), indexing="ij")
+    at = torch.stack([(u + 0.5) * 101 / 50 - 0.5, (v + 0.5) * 77 / 38 - 0.5], -1).reshape(-1, 2)
+    distance = torch.cdist(at, grid.pixels)
+    expected = distance.gather(1, image.reshape(-1, 1))[:, 0]
+    torch.testing.assert_close(expected, distance.min(1).values)

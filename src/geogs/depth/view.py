@@ -108,6 +108,11 @@ class DenseDepth:
         confidence = torch.where(mask, self.confidence, 0.0)
         return DenseDepth(self.depth, confidence, median, None if len(inside) else self.written)
 
+    def unsure_where(self, mask: Bool[Tensor, "h w"]) -> "DenseDepth":
+        """Nothing known in the mask; the depth there, and the median, stay what they are."""
+        confidence = torch.where(mask.to(self.confidence.device), 0.0, self.confidence)
+        return DenseDepth(self.depth, confidence, self.median, self.written)
+
     def scaled(self, factor: float) -> "DenseDepth":
         """The depth multiplied by a factor."""
         depth = self.depth * factor

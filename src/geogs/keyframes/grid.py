@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
 from geogs.errors import InputError
@@ -81,3 +81,20 @@ class SampleGrid:
         c, r = cell.unbind(-1)
         valid = (c >= 0) & (c < self.width) & (r >= 0) & (r < self.height)
         return torch.where(valid, r * self.width + c, torch.zeros_like(c)), valid
+
+    def enlarged(self, values: Shaped[Tensor, "p"], width: int, height: int) -> Tensor:
+        """A field as an image of another size of the whole view: that of the nearest cell."""
+        rows, columns = (
+            _nearest(size, whole, cells).to(values.device)
+            for size, whole, cells in (
+                (height, self.camera.height, self.height),
+                (width, self.camera.width, self.width),
+            )
+        )
+        return values.view(self.height, self.width)[rows][:, columns]
+
+
+def _nearest(size: int, whole: int, cells: int) -> Int[Tensor, "n"]:
+    """Index of the cell nearest to each of so many pixels along the whole of an axis."""
+    position = (torch.arange(size) + 0.5) * (whole / size) - 0.5
+    return torch.round((position - OFFSET) / STRIDE).long().clamp(0, cells - 1)

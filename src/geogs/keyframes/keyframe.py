@@ -54,6 +54,7 @@ class KeyframeState:
     information: Float32[Tensor, "p"]
     prior: KeyframePrior | None
     scale: float
+    moving: Bool[Tensor, "p"] | None
 
 
 @dataclass(eq=False)
@@ -81,6 +82,8 @@ class Keyframe:
     scale: float = 1.0
     """Factor by which corrections have multiplied the lengths around it; what was measured from it
     at another scale is to be multiplied by the ratio of the two."""
+    moving: Bool[Tensor, "p"] | None = None
+    """Cells that are held for showing something that moves; none where nobody has judged yet."""
 
     @property
     def image(self) -> UInt8[np.ndarray, "h w 3"]:
@@ -97,7 +100,7 @@ class Keyframe:
         picture = self.picture
         return KeyframeState(
             self.id, self.frame_index, self.timestamp, picture.archived, picture.archived_normal,
-            self.T_cw, self.inverse_depth, self.information, self.prior, self.scale,
+            self.T_cw, self.inverse_depth, self.information, self.prior, self.scale, self.moving,
         )  # fmt: skip
 
     def rescale(self, factor: float) -> None:

@@ -142,14 +142,17 @@ class Segment:
         grid, pictures = self.grid, self.store.pictures
         size = grid.camera.height, grid.camera.width, 3
         for s in states:
-            if (s.image.shape, s.inverse_depth.shape) != (size, (grid.size,)):
+            cells = s.inverse_depth if s.moving is None else s.moving
+            if (s.image.shape, s.inverse_depth.shape, cells.shape) != (
+                size, (grid.size,), (grid.size,)
+            ):  # fmt: skip
                 raise InputError(f"keyframe {s.id} is of another camera")
             if s.id in self.store or not max(self._keyframes, default=-1) < s.id:
                 raise InputError(f"keyframe {s.id} is not in its place")
             picture = Picture(pictures, s.image, s.normal)
             self._keyframes[s.id] = Keyframe(
                 s.id, s.frame_index, s.timestamp, grid, picture, s.T_cw, s.inverse_depth,
-                s.information, s.prior, s.scale,
+                s.information, s.prior, s.scale, s.moving,
             )  # fmt: skip
         self.store.assign(self.ids, self)
 

@@ -15,6 +15,7 @@ from geogs.loop.matched_edges import MatchedEdges
 from geogs.loop.pose_graph import RelativePoses
 from geogs.loop.relative_pose import RelativePoseOptions, relative_poses
 from geogs.tracking.graph import Edge, Pair
+from geogs.tracking.moving import still_weight
 from geogs.tracking.packed_edge import PackedEdge
 
 SETTLED = RelativePoseOptions(iterations=0)
@@ -45,14 +46,16 @@ def of_edges(segment: Segment, edges: Mapping[Pair, Edge | PackedEdge]) -> Relat
     ids = sorted({k for p in pairs for k in p})
     slot = {k: n for n, k in enumerate(ids)}
     grid = _on_cpu(segment.grid)
+    pixels = torch.stack([edges[p].pixels for p in pairs])
+    weight = torch.stack([edges[p].weight for p in pairs])
     matched = MatchedEdges(
         grid.camera,
         grid.rays,
         segment.inverse_depths(ids).cpu(),
         torch.tensor([slot[i] for i, _ in pairs]),
         torch.tensor([slot[j] for _, j in pairs]),
-        torch.stack([edges[p].pixels for p in pairs]).cpu().float(),
-        torch.stack([edges[p].weight for p in pairs]).cpu().float(),
+        pixels.cpu().float(),
+        still_weight(segment, pairs, pixels, weight).cpu().float(),
     )
     return _named(relative_poses(grid, matched, segment.poses(ids), False, SETTLED), ids)
 

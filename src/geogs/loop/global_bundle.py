@@ -52,6 +52,7 @@ def global_bundle(
                 share = (n + start / len(stale)) / config.global_rounds
                 progress(share, "matching all keyframes")
         graph.adjust(list(graph.edges), ids[1:], ids, options)
+        graph.judge_moving(set(ids), config.moving)
     for start in range(0, len(ids), PRIORS_TOGETHER):
         tracker.priors.adjust(ids[start : start + PRIORS_TOGETHER], config.huber)  # moves no pose
     if progress is not None:

@@ -181,6 +181,11 @@ class ViewPool:
     def set_depth(self, id: int, depth: DenseDepth) -> None:
         """Take over a dense depth, on which the losses' constants then live."""
         stored, maps = self._stored[id], self._maps.peek(id)
+        if stored.keyframe.moving is not None:
+            render = self.cameras.render
+            grid = stored.keyframe.grid
+            moving = grid.enlarged(stored.keyframe.moving, render.width, render.height)
+            depth = depth.unsure_where(moving)
         if stored.mask is not None:
             depth = depth.within(stored.mask)
         if maps is None:

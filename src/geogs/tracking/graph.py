@@ -16,6 +16,7 @@ from geogs.errors import InputError
 from geogs.keyframes.store import Segment
 from geogs.threads import thread_map
 from geogs.tracking.flow.base import FlowMatch, FlowOperator
+from geogs.tracking.moving import judge, still_weight
 from geogs.tracking.packed_edge import PackedEdge, PackedFlow, packed_reprojections
 from geogs.tracking.proximity import PAIRS_TOGETHER, Pair
 
@@ -189,7 +190,9 @@ class FrameGraph:
 
         def matches(part: slice) -> tuple[Tensor, Tensor]:
             wanted = edges[part]
-            return torch.stack([e.pixels for e in wanted]), torch.stack([e.weight for e in wanted])
+            pixels = torch.stack([e.pixels for e in wanted])
+            weight = torch.stack([e.weight for e in wanted])
+            return pixels, still_weight(self.keyframes, directed[part], pixels, weight)
 
         problem = StreamedProblem(
             T_cw=self.keyframes.poses(ids),
@@ -202,6 +205,14 @@ class FrameGraph:
             damping=_frame_damping(edges, [slot[i] for i, _ in directed], len(ids)),
         )
         return problem, ids
+
+    def judge_moving(self, ids: Collection[int], threshold: float) -> None:
+        """Say anew which cells of some keyframes move, by all their edges (``moving.judge``).
+
+        A threshold of 0 says nothing.
+        """
+        if threshold > 0:
+            judge(self.keyframes, self.edges, [e for e in self.edges if e[0] in ids], threshold)
 
     def adjust(
         self,

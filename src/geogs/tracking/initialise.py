@@ -64,7 +64,7 @@ def initialise(graph: FrameGraph, config: TrackingConfig, flows: Sequence[FlowMa
         return False
     _place_all(graph, flows, best)
     return (
-        _polish(graph, config.radius)
+        _polish(graph, config.radius, config.moving)
         and _depth_deviation(graph, config.huber) <= config.start_deviation
         and _is_borne_out(graph, config.min_ncc)
     )
@@ -163,8 +163,8 @@ def placed_after(graph: FrameGraph, before: Keyframe, state: Keyframe) -> Float[
     return before.T_cw if T_rel is None else T_rel.to(before.T_cw) @ before.T_cw
 
 
-def _polish(graph: FrameGraph, radius: int, rounds: int = 6) -> bool:
-    """Rounds of flow and adjustment, from forgiving to strict."""
+def _polish(graph: FrameGraph, radius: int, moving: float, rounds: int = 6) -> bool:
+    """Rounds of flow and adjustment, from forgiving to strict; then without what moves."""
     store, ids = graph.keyframes, graph.keyframes.ids
     near = [(a, b) for n, a in enumerate(ids) for b in ids[n + 1 : n + 1 + radius]]
     for n in range(rounds):
@@ -173,6 +173,8 @@ def _polish(graph: FrameGraph, radius: int, rounds: int = 6) -> bool:
         if graph.adjust(list(graph.edges), ids[1:], ids, options) is None:
             return False
         normalise(store)
+        if n >= 2:
+            graph.judge_moving(ids, moving)
     return True
 
 

@@ -31,6 +31,7 @@ from geogs.tracking.motion import (
     FrameMotion,
     Recognition,
 )
+from geogs.tracking.moving import carried
 from geogs.tracking.orientation_chain import Followed, OrientationChain, OrientationState
 from geogs.tracking.proximity import Pair, frame_distances, proximity_pairs
 from geogs.tracking.start_up import MIN_KEYFRAMES, StartUp, StartUpState
@@ -444,6 +445,8 @@ class Tracker:
         )
         self.recorder.add_keyframe(state.id, turns)
         self._connect(state.id, anchor.id)
+        seen = self.graph.edges[state.id, anchor.id]
+        state.moving = carried(self.grid, anchor.moving, seen.pixels, seen.weight)
         self._adjust_locally()
         removed = self._cull()
         self._seen_at(state, velocity=velocity)
@@ -483,6 +486,8 @@ class Tracker:
             self.graph.adjust(
                 edges, poses, depths, BundleOptions(iterations=c.local_iterations, huber=c.huber)
             )
+            if n == 0:
+                self.graph.judge_moving(deep, c.moving)
             if n >= c.local_rounds - self.priors.config.rounds:
                 self.priors.adjust(depths, c.huber)
         self.graph.release(moving)

@@ -1,0 +1,186 @@
+"""Things that move: cells whose matches no depth explains, although the scene's poses are known.
+
+Matches with something that moves agree with each other, not with the scene. Over the pairs of a
+keyframe that were measured, what is left of a cell's matches at the depth that suits them best is
+several times what is left elsewhere. Such regions are *held* for moving: their matches, and those
+that end in them, count nowhere.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn.functional import avg_pool2d
+
+from geogs.bundle.problem import source_chunks
+from geogs.bundle.rigidity import best_residuals
+from geogs.bundle.select import grid_fields
+from geogs.keyframes.grid import SampleGrid
+from geogs.keyframes.store import Segment
+from geogs.tracking.proximity import Pair
+
+LEAST_SCALE = 0.2
+"""Deviations of a match below which the usual residual of an edge is not taken to lie."""
+WORSE = 3.0
+"""Times the usual residual of all edges that of one of them is at most taken to be."""
+MOST = 10.0
+"""Times the usual residual that a single match can speak for motion."""
+ENOUGH = 0.7
+"""Matches per cell of a surrounding from which it can be judged."""
+FILLED = 0.8
+"""Share of a keyframe's cells beyond which it is the keyframe that does not suit the others."""
+REGION = 0.4
+"""Share of the cells around one that move, from which it is held for moving itself."""
+EDGES_TOGETHER = 128
+"""Directed edges, of some ten keyframes, judged in one go; bounds memory."""
+
+
+@runtime_checkable
+class Match(Protocol):
+    """What is judged of an edge."""
+
+    @property
+    def pixels(self) -> Float[Tensor, "p 2"]:
+        """Position in the target of each cell of the source."""
+        ...
+
+    @property
+    def weight(self) -> Float[Tensor, "p 2"]:
+        """Inverse variance, 1 / pixel^2."""
+        ...
+
+
+def still_weight(
+    keyframes: Segment,
+    directed: Sequence[Pair],
+    pixels: Float[Tensor, "e p 2"],
+    weight: Float[Tensor, "e p 2"],
+) -> Float[Tensor, "e p 2"]:
+    """Weights of matches, none of those from or to a cell that is held for moving."""
+    if all(keyframes[k].moving is None for k in {k for e in directed for k in e}):
+        return weight
+    return weight * _still(keyframes, directed, pixels)[..., None]
+
+
+def carried(
+    grid: SampleGrid,
+    moving: Bool[Tensor, "p"] | None,
+    pixels: Float[Tensor, "p 2"],
+    weight: Float[Tensor, "p 2"],
+) -> Bool[Tensor, "p"] | None:
+    """What is held for moving in an image, by the matches of its cells with one that is judged."""
+    if moving is None:
+        return None
+    cell, inside = grid.cells_of(pixels)
+    return moving[cell] & inside & (weight[:, 0] > 0)
+
+
+def moving_share(keyframes: Segment) -> float:
+    """Part of all cells that is held for moving; 0 without keyframes."""
+    held = [k.moving.float().mean().cpu() for k in keyframes if k.moving is not None]
+    return float(torch.stack(held).sum()) / len(keyframes) if held else 0.0
+
+
+def judge(
+    keyframes: Segment, edges: Mapping[Pair, Match], judged: Sequence[Pair], threshold: float
+) -> None:
+    """Say anew of the sources of some directed edges which of their cells move.
+
+    ``judged`` are all edges of these sources that have a say; where they tell too little of a cell,
+    it stays what it was. ``threshold`` is how many times the usual residual of its edges the mean
+    residual around a cell must be.
+    """
+    directed = sorted(judged)
+    if not directed:
+        return
+    source = torch.tensor([i for i, _ in directed])
+    for chunk in source_chunks(source, EDGES_TOGETHER):
+        residual, still = _residuals(keyframes, edges, directed[chunk])
+        ratio = (residual / _usual(residual, still)[:, None]).clamp(max=MOST)
+        ids, row = source[chunk].unique(return_inverse=True)
+        row = row.to(ratio.device)
+        total = ratio.new_zeros(len(ids), ratio.shape[1])
+        count = total.index_add(0, row, (~ratio.isnan()).to(ratio))
+        total = total.index_add(0, row, ratio.nan_to_num(0.0))
+        before = [keyframes[k].moving for k in ids.tolist()]
+        none = torch.zeros_like(still[0])
+        held = torch.stack([none if b is None else b for b in before])
+        held = moving_cells(keyframes.grid, total, count, held, threshold)
+        for n, k in enumerate(ids.tolist()):
+            keyframes[k].moving = held[n].clone()
+
+
+def moving_cells(
+    grid: SampleGrid,
+    total: Float[Tensor, "n p"],
+    count: Float[Tensor, "n p"],
+    before: Bool[Tensor, "n p"],
+    threshold: float,
+) -> Bool[Tensor, "n p"]:
+    """Regions of keyframes whose matches, ``count`` that add up to ``total``, exceed a threshold.
+
+    A cell that cannot be judged goes with its surroundings, and each with the majority of those
+    around it, so that what moves includes its border. All stay what they were ``before`` where none
+    can be judged or nearly all contradict: then the pose is wrong, or the image is.
+    """
+    near, seen = _mean(grid, total, 3), _mean(grid, count, 3)
+    known = seen >= ENOUGH
+    core = (near > threshold * seen) & known
+    is_told = known.any(1, keepdim=True) & (core.sum(1) <= FILLED * known.sum(1))[:, None]
+    filled = grid_fields(grid).fill(core.to(total), known.to(total))
+    return torch.where(is_told, _mean(grid, filled, 5) >= REGION, before)
+
+
+def _mean(grid: SampleGrid, values: Float[Tensor, "n p"], size: int) -> Float[Tensor, "n p"]:
+    """Mean over a square of cells around each, as far as it lies on the grid."""
+    image = values.view(-1, 1, grid.height, grid.width)
+    pooled = avg_pool2d(image, size, 1, size // 2, count_include_pad=False)
+    return pooled.view(values.shape)
+
+
+def _still(
+    keyframes: Segment, directed: Sequence[Pair], pixels: Float[Tensor, "e p 2"]
+) -> Bool[Tensor, "e p"]:
+    """Which matches neither leave nor reach a cell that is held for moving."""
+    grid = keyframes.grid
+    none = torch.zeros(grid.size, dtype=torch.bool, device=grid.device)
+
+    def moving(k: int) -> Bool[Tensor, "p"]:
+        found = keyframes[k].moving
+        return none if found is None else found
+
+    cell, inside = grid.cells_of(pixels)
+    source = torch.stack([moving(i) for i, _ in directed])
+    target = torch.stack([moving(j) for _, j in directed]).gather(1, cell)
+    return ~(source | (target & inside))
+
+
+def _residuals(
+    keyframes: Segment, edges: Mapping[Pair, Match], directed: Sequence[Pair]
+) -> tuple[Float[Tensor, "e p"], Bool[Tensor, "e p"]]:
+    """Best residuals of some edges, not a number without a match; and what is held for still."""
+    grid = keyframes.grid
+    ids = sorted({k for e in directed for k in e})
+    slot = {k: n for n, k in enumerate(ids)}
+    pixels = torch.stack([edges[e].pixels for e in directed])
+    weight = torch.stack([edges[e].weight for e in directed])
+    residual = best_residuals(
+        grid.camera, grid.rays, keyframes.poses(ids), keyframes.inverse_depths(ids),
+        torch.tensor([slot[i] for i, _ in directed]), torch.tensor([slot[j] for _, j in directed]),
+        pixels, weight,
+    )  # fmt: skip
+    residual = torch.where(weight[..., 0] > 0, residual, torch.nan)
+    return residual, _still(keyframes, directed, pixels)
+
+
+def _usual(residual: Float[Tensor, "e p"], still: Bool[Tensor, "e p"]) -> Float[Tensor, "e"]:
+    """Median residual of each edge over what is held for still, within what all edges know.
+
+    What moves may fill a keyframe, but not most of those that are judged together.
+    """
+    usual = torch.where(still, residual, torch.nan).nanmedian(1).values
+    common = usual.nanmedian().nan_to_num(LEAST_SCALE).clamp(min=LEAST_SCALE)
+    usual = torch.where(usual.isnan(), common, usual)
+    return torch.minimum(torch.maximum(usual, common), WORSE * common)
