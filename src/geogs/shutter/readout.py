@@ -43,6 +43,8 @@ less. Measured: what steady motions seem to say of a readout is off by up to 0.1
 LONGEST, SHORTEST = 0.036, 0.002
 """Seconds of a readout that is believed; less is nothing to care about."""
 LEAST_CLIPS = 3
+LEAST_PAIRS = 12
+"""Of views; of more, the half that tells more is used."""
 LEAST_EVIDENCE = 4.0
 """Standard errors by which the readout differs from a global shutter's."""
 LARGEST_ERROR = 0.004
@@ -138,23 +140,36 @@ def _pairs(clip: Sequence[Image], camera: RollingCamera, number: int) -> list[_P
 def _verdict(pairs: Sequence[_Pair], focal: float) -> FoundReadout:
     """The readout that fits all pairs best, and whether it is believed."""
     posed = [(p, pose) for p in pairs if (pose := _start(p, focal)) is not None]
+    readout = 0.0
+    for tolerance in TOLERANCES:
+        parts = [_Equation.of(*pair, readout, tolerance / focal) for pair in posed]
+        if tolerance == TOLERANCES[-1] and len(posed) > LEAST_PAIRS:
+            posed, parts = _telling(posed, parts)
+        if not parts:
+            break
+        step = sum(p.gradient for p in parts) / (sum(p.curvature for p in parts) + 1e-12)
+        step = float(np.clip(step, -LARGEST_STEP, LARGEST_STEP))
+        readout = float(np.clip(readout + step, -1.5 * LONGEST, 1.5 * LONGEST))
+        posed = [
+            (pair, pose.stepped(part.step(step)))
+            for (pair, pose), part in zip(posed, parts, strict=True)
+        ]
     clips = len({pair.clip for pair, _ in posed})
     if clips < LEAST_CLIPS:
         return FoundReadout(clips=clips, pairs=len(posed))
-    readout, poses = 0.0, [pose for _, pose in posed]
-    for tolerance in TOLERANCES:
-        parts = [
-            _Equation.of(pair, pose, readout, tolerance / focal)
-            for (pair, _), pose in zip(posed, poses, strict=True)
-        ]
-        step = sum(p.gradient for p in parts) / (sum(p.curvature for p in parts) + 1e-12)
-        step = float(np.clip(step, -LARGEST_STEP, LARGEST_STEP))
-        poses = [pose.stepped(part.step(step)) for pose, part in zip(poses, parts, strict=True)]
-        readout = float(np.clip(readout + step, -1.5 * LONGEST, 1.5 * LONGEST))
     error = _standard_error([pair.clip for pair, _ in posed], parts)
     sure = error <= LARGEST_ERROR and readout >= LEAST_EVIDENCE * error
     believed = sure and SHORTEST <= readout <= LONGEST
     return FoundReadout(readout if believed else 0.0, readout, error, clips, len(posed))
+
+
+def _telling(
+    posed: list[tuple[_Pair, RelativePose]], parts: list["_Equation"]
+) -> tuple[list[tuple[_Pair, RelativePose]], list["_Equation"]]:
+    """The better half of the pairs, those in which a match says more of the readout."""
+    share = np.array([part.curvature / part.weight for part in parts])
+    keep = np.sort(np.argsort(-share, kind="stable")[: max(LEAST_PAIRS, len(parts) // 2)])
+    return [posed[k] for k in keep], [parts[k] for k in keep]
 
 
 def _start(pair: _Pair, focal: float) -> RelativePose | None:
