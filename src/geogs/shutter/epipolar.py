@@ -28,28 +28,41 @@ class RelativePose:
 
     def errors(
         self, first: Float[np.ndarray, "n 2"], second: Float[np.ndarray, "n 2"]
-    ) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n 5"]]:
-        """Sampson's errors of matches, and their derivatives by :meth:`stepped`'s step.
+    ) -> Float[np.ndarray, "n"]:
+        """Sampson's errors of matches, signed, as a share of the focal length.
 
         Args:
             first: x/z and y/z in the first view.
             second: in the second.
-
-        Returns:
-            signed errors as a share of the focal length; the derivatives, with the denominator of
-            the error held.
         """
+        return self._products(first, second)[0]
+
+    def derivatives(
+        self, first: Float[np.ndarray, "n 2"], second: Float[np.ndarray, "n 2"]
+    ) -> Float[np.ndarray, "n 5"]:
+        """Those of the errors by :meth:`stepped`'s step, the denominator of the error held."""
+        _, scale, b, turned = self._products(first, second)
+        # b . (t x Exp(phi) c): derivatives by phi and by t, c being the turned ray.
+        by_rotation = cross(turned, cross(b, self.t[None]))
+        by_translation = cross(turned, b) @ self._tangents
+        return np.concatenate([by_rotation, by_translation], axis=1) * scale[:, None]
+
+    def _products(
+        self, first: Float[np.ndarray, "n 2"], second: Float[np.ndarray, "n 2"]
+    ) -> tuple[
+        Float[np.ndarray, "n"],
+        Float[np.ndarray, "n"],
+        Float[np.ndarray, "n 3"],
+        Float[np.ndarray, "n 3"],
+    ]:
+        """Errors, what ``b . E a`` was multiplied by for them, the rays b, and R a."""
         a, b = (np.concatenate([p, np.ones((len(p), 1))], axis=1) for p in (first, second))
         turned, t = a @ self.R.T, self.t[None]
         line = cross(t, turned)  # E a
         back = cross(b, t) @ self.R  # E^T b
         squares = (line[:, :2] ** 2).sum(1) + (back[:, :2] ** 2).sum(1)
         scale = 1 / np.sqrt(np.maximum(squares, 1e-12))
-        # b . (t x Exp(phi) c): derivatives by phi and by t, c being the turned ray.
-        by_rotation = cross(turned, cross(b, t))
-        by_translation = cross(turned, b) @ self._tangents
-        jacobian = np.concatenate([by_rotation, by_translation], axis=1) * scale[:, None]
-        return (b * line).sum(1) * scale, jacobian
+        return (b * line).sum(1) * scale, scale, b, turned
 
     @property
     def _tangents(self) -> Float[np.ndarray, "3 2"]:

@@ -29,7 +29,8 @@ class Passage:
         when = self.times[:, None] + readout * self.line_times
         places = np.zeros(self.plane.shape[1:])
         for k, at in enumerate(when):
-            others = np.delete(when, k, axis=0)
-            weight = np.prod(others / (others - at), axis=0)
+            weight = np.ones(len(at))
+            for other in (*when[:k], *when[k + 1 :]):
+                weight *= other / (other - at)
             places += weight[:, None] * self.plane[k]
         return places

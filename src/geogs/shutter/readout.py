@@ -24,8 +24,8 @@ CLIP = 20
 """Neighbouring images that points are followed through."""
 CLIPS = 16
 """That are worth giving, from all over the video."""
-ENOUGH_CLIPS, ENOUGH = 6, 0.001
-"""No more clips are looked at once as many leave a standard error of so many seconds."""
+ENOUGH_CLIPS, ENOUGH = (6, 9, 12), 0.002
+"""No more clips are looked at where so many leave a standard error of so many seconds."""
 VIEWS = (2, 17), (2, 10), (9, 17), (5, 14)
 """Pairs of images of a clip."""
 LONGEST_INTERVAL = 0.12
@@ -86,19 +86,14 @@ def find_readout(
         camera: that took them.
         report: called with the fraction done; what it raises passes through.
     """
-    pairs: list[_Pair] = []
-    found = FoundReadout()
-    for number, clip in enumerate(clips):
-        report(min(1.0, number / CLIPS))
-        pairs += _pairs(clip, camera, number)
-        count = len({pair.clip for pair in pairs})
-        if count >= ENOUGH_CLIPS and count % 2 == 0:
-            found = _verdict(pairs, camera.camera.fx)
-            if found.error <= ENOUGH:
-                report(1.0)
-                return found
+    posed: list[_Posed] = []
+    for number, clip in enumerate(clips, 1):
+        report(min(1.0, (number - 1) / CLIPS))
+        posed += _pairs(clip, camera, number)
+        if number in ENOUGH_CLIPS and _verdict(posed, camera.camera.fx).error <= ENOUGH:
+            break
     report(1.0)
-    return _verdict(pairs, camera.camera.fx)
+    return _verdict(posed, camera.camera.fx)
 
 
 @dataclass(frozen=True)
@@ -109,9 +104,21 @@ class _Pair:
     first: Passage
     second: Passage
 
+    def at_once(self, readout: float) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]]:
+        """The points in both views, each view seen at once."""
+        return self.first.at_once(readout), self.second.at_once(readout)
 
-def _pairs(clip: Sequence[Image], camera: RollingCamera, number: int) -> list[_Pair]:
-    """The pairs of a clip that have enough points."""
+
+@dataclass(frozen=True)
+class _Posed:
+    """A pair and the motion between its views."""
+
+    pair: _Pair
+    pose: RelativePose
+
+
+def _pairs(clip: Sequence[Image], camera: RollingCamera, number: int) -> list[_Posed]:
+    """The pairs of a clip that have enough points, with a motion that explains most of them."""
     times = np.array([image.timestamp for image in clip])
     intervals = np.diff(times)
     if len(clip) < CLIP or (intervals <= 0).any() or (intervals > LONGEST_INTERVAL).any():
@@ -133,17 +140,19 @@ def _pairs(clip: Sequence[Image], camera: RollingCamera, number: int) -> list[_P
                 Passage(plane[near][:, both], line_times[near][:, both], times[near] - times[k])
                 for k, near in zip(views, around, strict=True)
             ]
-            pairs.append(_Pair(number, *passages))
+            pair = _Pair(number, *passages)
+            pose = relative_pose(*pair.at_once(0.0), TOLERANCES[0] / camera.camera.fx)
+            if pose is not None:
+                pairs.append(_Posed(pair, pose))
     return pairs
 
 
-def _verdict(pairs: Sequence[_Pair], focal: float) -> FoundReadout:
+def _verdict(posed: list[_Posed], focal: float) -> FoundReadout:
     """The readout that fits all pairs best, and whether it is believed."""
-    posed = [(p, pose) for p in pairs if (pose := _start(p, focal)) is not None]
-    readout = 0.0
+    readout, parts = 0.0, list[_Equation]()
     for tolerance in TOLERANCES:
-        parts = [_Equation.of(*pair, readout, tolerance / focal) for pair in posed]
-        if tolerance == TOLERANCES[-1] and len(posed) > LEAST_PAIRS:
+        parts = [_Equation.of(p.pair, p.pose, readout, tolerance / focal) for p in posed]
+        if tolerance == TOLERANCES[-1]:
             posed, parts = _telling(posed, parts)
         if not parts:
             break
@@ -151,30 +160,26 @@ def _verdict(pairs: Sequence[_Pair], focal: float) -> FoundReadout:
         step = float(np.clip(step, -LARGEST_STEP, LARGEST_STEP))
         readout = float(np.clip(readout + step, -1.5 * LONGEST, 1.5 * LONGEST))
         posed = [
-            (pair, pose.stepped(part.step(step)))
-            for (pair, pose), part in zip(posed, parts, strict=True)
+            _Posed(p.pair, p.pose.stepped(part.step(step)))
+            for p, part in zip(posed, parts, strict=True)
         ]
-    clips = len({pair.clip for pair, _ in posed})
+    clips = len({p.pair.clip for p in posed})
     if clips < LEAST_CLIPS:
         return FoundReadout(clips=clips, pairs=len(posed))
-    error = _standard_error([pair.clip for pair, _ in posed], parts)
+    error = _standard_error([p.pair.clip for p in posed], parts)
     sure = error <= LARGEST_ERROR and readout >= LEAST_EVIDENCE * error
     believed = sure and SHORTEST <= readout <= LONGEST
     return FoundReadout(readout if believed else 0.0, readout, error, clips, len(posed))
 
 
 def _telling(
-    posed: list[tuple[_Pair, RelativePose]], parts: list["_Equation"]
-) -> tuple[list[tuple[_Pair, RelativePose]], list["_Equation"]]:
+    posed: list[_Posed], parts: list["_Equation"]
+) -> tuple[list[_Posed], list["_Equation"]]:
     """The better half of the pairs, those in which a match says more of the readout."""
     share = np.array([part.curvature / part.weight for part in parts])
-    keep = np.sort(np.argsort(-share, kind="stable")[: max(LEAST_PAIRS, len(parts) // 2)])
+    count = max(LEAST_PAIRS, len(parts) // 2)
+    keep = np.sort(np.argsort(-share, kind="stable")[:count]).tolist()
     return [posed[k] for k in keep], [parts[k] for k in keep]
-
-
-def _start(pair: _Pair, focal: float) -> RelativePose | None:
-    at = pair.first.at_once(0.0), pair.second.at_once(0.0)
-    return relative_pose(*at, TOLERANCES[0] / focal)
 
 
 @dataclass(frozen=True)
@@ -198,12 +203,9 @@ class _Equation:
     def of(pair: _Pair, pose: RelativePose, readout: float, tolerance: float) -> "_Equation":
         """Linearised, its matches weighted by Geman and McClure's loss."""
         small = 5e-4
-
-        def errors(at: float) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n 5"]]:
-            return pose.errors(pair.first.at_once(at), pair.second.at_once(at))
-
-        error, jacobian = errors(readout)
-        slope = (errors(readout + small)[0] - errors(readout - small)[0]) / (2 * small)
+        before, here, after = (pair.at_once(readout + by) for by in (-small, 0.0, small))
+        error, jacobian = pose.errors(*here), pose.derivatives(*here)
+        slope = (pose.errors(*after) - pose.errors(*before)) / (2 * small)
         weight = 1 / (1 + (error / tolerance) ** 2) ** 2 / tolerance**2
         weighted = jacobian * weight[:, None]
         normal = weighted.T @ jacobian

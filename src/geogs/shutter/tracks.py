@@ -5,7 +5,7 @@ from collections.abc import Iterable, Sequence
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Bool, Float, Float32, UInt8
 
 POINTS, QUALITY, APART = 250, 0.005, 8
 """Corners, at most; the least strength of one against the strongest; pixels between two."""
@@ -70,13 +70,10 @@ def _followed(
 
 def _inside(
     pixels: Float[np.ndarray, "n 2"], image: UInt8[np.ndarray, "h w"]
-) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+) -> Bool[np.ndarray, "n"]:
     """Whether the window around a point lies within the image."""
     border, size = WINDOW // 2 + 2, np.array(image.shape[::-1])
-    inside: np.ndarray[tuple[int], np.dtype[np.bool_]] = (
-        (pixels >= border) & (pixels <= size - 1 - border)
-    ).all(1)
-    return inside
+    return np.all((pixels >= border) & (pixels <= size - 1 - border), axis=1)
 
 
 def _amid_gradients(
