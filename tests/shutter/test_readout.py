@@ -1,6 +1,7 @@
 """The readout found from pairs of views: of points seen row by row, and of a rendered video."""
 
 import functools
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -9,109 +10,146 @@ import torch
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import so3_exp
 from geogs.shutter.camera import RollingCamera
-from geogs.shutter.readout import CANDIDATES, View, _curve, _minimum, _pairs, _verdict, find_readout
-from geogs.shutter.turning import Turning, rotated
-from rolling_scenes import hand_held, rolling_frames
+from geogs.shutter.epipolar import relative_pose
+from geogs.shutter.moments import Passage
+from geogs.shutter.readout import CLIP, FoundReadout, _Equation, _Pair, _Posed, _verdict
+from geogs.shutter.readout import find_readout
+from rolling_scenes import RATE, hand_held, rolling_image
 from tracking_scenes import CAMERA
 
 WIDE = RollingCamera(Camera(420.0, 420.0, 255.5, 191.5, 512, 384))
+FOCAL = 420.0
 TRUE = 0.0216
-NO_IMAGE = np.zeros((1, 1), np.uint8)
+Path = Callable[[float], tuple[np.ndarray, np.ndarray]]
+
+
+def shaken(seed: int) -> Path:
+    """Rotation vector and position of the world in a camera that a hand shakes."""
+    phases, sizes = np.random.default_rng(seed).uniform(0.5, 1, (2, 6))
+    waves = 2 * np.pi * np.linspace(1.0, 2.2, 6)
+
+    def at(time: float) -> tuple[np.ndarray, np.ndarray]:
+        wave = sizes * np.sin(waves * time + 6 * phases)
+        return 0.06 * wave[:3], 0.12 * wave[3:]
+
+    return at
+
+
+def steady(seed: int) -> Path:
+    """One that goes by without turning, at a constant speed."""
+    return lambda time: (np.zeros(3), np.array([0.4, 0.01 * seed, 0.0]) * time)
+
+
+def seen(path: Path, points: np.ndarray, time: float, readout: float) -> np.ndarray:
+    """Pixels of the points in the image whose middle row is seen at a time, one by one in turn."""
+    times = np.full(len(points), time)
+    for _ in range(5):
+        moved = []
+        for point, at in zip(points, times, strict=True):
+            turn, move = path(at)
+            moved.append(so3_exp(torch.tensor(turn)).numpy() @ point + move)
+        pixels = WIDE.pixels(np.array(moved))
+        times = time + readout * WIDE.line_times(pixels)
+    return pixels
+
+
+def passage(path: Path, points: np.ndarray, middle: float, readout: float, rng) -> Passage:
+    times = np.arange(-2, 3) / RATE
+    pixels = [seen(path, points, middle + t, readout) for t in times]
+    pixels = [p + rng.normal(0, 0.05, p.shape) for p in pixels]
+    rays = [WIDE.rays(p) for p in pixels]
+    lines = np.array([WIDE.line_times(p) for p in pixels])
+    return Passage(np.array([r[:, :2] / r[:, 2:] for r in rays]), lines, times)
 
 
 @functools.cache
-def curves(readout: float, pairs: int = 12) -> tuple[np.ndarray, np.ndarray]:
-    """Costs over the candidates of pairs of views of random points, and how the views' rates
-    differ; the camera turns at known rates."""
-    rng = np.random.default_rng(3)
-    found, apart = [], []
-    for _ in range(pairs):
-        points = rng.uniform([-2.4, -1.8, 2.5], [2.4, 1.8, 6], (120, 3))
-        rates = rng.normal(0, 0.5, (2, 3))
-        motions = [(np.zeros(3), np.zeros(3)), (rng.normal(0, 0.05, 3), rng.normal(0, 0.2, 3))]
-        pixels = []
-        for (turn, move), rate in zip(motions, rates, strict=True):
-            middle = points @ so3_exp(torch.tensor(turn)).numpy().T + move
-            seen = WIDE.pixels(middle)
-            for _ in range(4):
-                times = readout * WIDE.line_times(seen)
-                seen = WIDE.pixels(rotated(middle, times[:, None] * rate))
-            pixels.append(seen + rng.normal(0, 0.2, seen.shape))
-        views = [View(0.0, NO_IMAGE, Turning(rate), Turning(rate)) for rate in rates]
-        found.append(_curve(WIDE, (views[0], views[1]), (pixels[0], pixels[1])))
-        apart.append(np.linalg.norm(rates[0] - rates[1]))
-    return np.array(found), np.array(apart)
+def pairs(readout: float, motion=shaken) -> list[_Posed]:
+    """A pair of each of six clips."""
+    posed = []
+    for clip in range(6):
+        rng = np.random.default_rng(clip)
+        points = rng.uniform([-2.4, -1.8, 2.5], [2.4, 1.8, 6], (60, 3))
+        path = motion(clip)
+        passages = [passage(path, points, t, readout, rng) for t in (0.0, 0.4)]
+        pair = _Pair(clip, *passages)
+        posed.append(_Posed(pair, relative_pose(*pair.at_once(0.0), 1.2 / FOCAL)))
+    return posed
 
 
 def test_points_seen_row_by_row_tell_the_readout():
-    found = _verdict(*curves(TRUE), WIDE.camera.fy)
+    found = _verdict(pairs(TRUE), FOCAL)
     assert found.is_believed
-    assert found.readout == found.best == pytest.approx(TRUE, rel=0.03)
-    assert found.share > 0.9
-    assert found.evidence > 5
-    assert (found.pairs, found.shift > 1) == (12, True)
+    assert found.readout == found.best == pytest.approx(TRUE, rel=0.05)
+    assert found.error < 0.002
+    assert (found.clips, found.pairs) == (6, 6)
 
 
 def test_points_seen_at_once_tell_a_global_shutter():
-    found = _verdict(*curves(0.0), WIDE.camera.fy)
+    found = _verdict(pairs(0.0), FOCAL)
     assert not found.is_believed
-    assert (found.readout, found.share) == (0.0, 0.0)
-    assert found.best < 0.001
+    assert found.readout == 0.0
+    assert abs(found.best) < 0.001
 
 
-def test_few_pairs_or_little_turning_tell_nothing():
-    costs, apart = curves(TRUE)
-    assert not _verdict(costs[:11], apart[:11], WIDE.camera.fy).is_believed
-    assert _verdict(costs, apart, WIDE.camera.fy).is_believed
-    assert not _verdict(costs, 0.02 * apart, WIDE.camera.fy).is_believed
+def test_a_steady_motion_tells_nothing():
+    """A camera that goes by at a constant speed shears all it sees, in all images alike."""
+    found = _verdict(pairs(TRUE, steady), FOCAL)
+    assert not found.is_believed
+    assert found.error > 0.004
 
 
-def test_pairs_that_disagree_tell_nothing():
-    """Each pair has a minimum somewhere; the mean of all has one, too, that means nothing."""
-    rng = np.random.default_rng(0)
-    costs = 1 + 0.02 * rng.normal(size=(30, len(CANDIDATES)))
-    assert not _verdict(costs, np.full(30, 0.5), WIDE.camera.fy).is_believed
+def test_few_clips_tell_nothing():
+    assert _verdict(pairs(TRUE)[:2], FOCAL) == FoundReadout(clips=2, pairs=2)
+    assert _verdict([], FOCAL) == FoundReadout()
 
 
-def test_the_minimum_of_a_parabola_is_between_the_candidates():
-    for true in (0.0047, 0.0201, 0.0342):
-        assert _minimum((CANDIDATES - true) ** 2) == pytest.approx(true, abs=1e-6)
-    assert _minimum(CANDIDATES) == 0.0
+def test_clips_that_disagree_are_not_believed():
+    """One half has a rolling shutter, the other reads its rows the other way round."""
+    both = pairs(TRUE)[:3] + pairs(-TRUE)[3:]
+    found = _verdict(both, FOCAL)
+    assert not found.is_believed
+    assert found.error > 3 * _verdict(pairs(TRUE), FOCAL).error
 
 
-def test_rates_are_linear_in_the_readout():
-    view = View(0.0, NO_IMAGE, Turning(np.full(3, 1.0)), Turning(np.full(3, 1.2), np.full(3, 2.4)))
-    half = view.turning(float(CANDIDATES[-1]) / 2)
-    np.testing.assert_allclose(half.rate, 1.1)
-    np.testing.assert_allclose(half.acceleration, 1.2)
+def test_the_curvature_is_that_of_the_cost_whose_motion_is_free():
+    """The gradient by the readout, the motion being fitted at each, by differences."""
+    (posed, *_), tolerance = pairs(TRUE), 10.0
+    pair, small = posed.pair, 2e-4
 
+    def fitted(readout: float) -> _Equation:
+        pose = posed.pose
+        for _ in range(6):
+            pose = pose.stepped(_Equation.of(pair, pose, readout, tolerance).step(0.0))
+        return _Equation.of(pair, pose, readout, tolerance)
 
-def test_pairs_are_of_views_across_a_gap_that_turn_apart_and_spread():
-    """Ten views a second; every fifth turns by a radian per second, the others do not."""
-    views = [
-        View(0.1 * k, NO_IMAGE, Turning(np.array([0.0, float(k % 5 == 0), 0.0])), Turning())
-        for k in range(30)
-    ]
-    pairs = _pairs(views, 0.5)
-    assert pairs
-    assert all((i % 5 == 0) != (j % 5 == 0) for i, j in pairs)
-    assert all(1 <= j - i <= 6 for i, j in pairs)
-    assert max(sum(k in pair for pair in pairs) for k in range(30)) <= 4
-    assert _pairs(views, 1.5) == []
-    assert _pairs([], 0.5) == []
+    before, here, after = (fitted(TRUE + by) for by in (-small, 0.0, small))
+    slope = -(after.gradient - before.gradient) / (2 * small)
+    assert here.curvature == pytest.approx(slope, rel=0.05)
+    cost = [part.square / 2 for part in (before, after)]
+    assert (cost[0] - cost[1]) / (2 * small) == pytest.approx(here.gradient, rel=0.05, abs=1e-6)
 
 
 def test_a_video_without_texture_or_images_tells_nothing():
-    empty = find_readout([], RollingCamera(CAMERA))
-    assert (empty.readout, empty.pairs) == (0.0, 0)
+    assert find_readout([], RollingCamera(CAMERA)) == FoundReadout()
+
+
+def clips(readout: float) -> list[list]:
+    from geogs.types import Frame
+
+    return [
+        [
+            Frame(k, k / RATE, rolling_image(hand_held, k / RATE, readout))
+            for k in range(start, start + CLIP)
+        ]
+        for start in range(0, 3 * CLIP, CLIP)
+    ]
 
 
 @pytest.mark.system
 @pytest.mark.parametrize(("readout", "least", "most"), [(0.0, 0.0, 0.0), (0.03, 0.026, 0.034)])
 def test_a_rendered_video_tells_its_readout(readout, least, most):
-    frames = rolling_frames(hand_held, 60, readout)
     done = []
-    found = find_readout(frames, RollingCamera(CAMERA), done.append)
+    found = find_readout(clips(readout), RollingCamera(CAMERA), done.append)
     assert least <= found.readout <= most
     assert done == sorted(done)
     assert done[-1] == 1.0

@@ -1,5 +1,6 @@
 """Before a run: how long the shutter takes, which nobody said, from the video itself."""
 
+import math
 from typing import TYPE_CHECKING
 
 from geogs.application.interrupt import Stop
@@ -26,7 +27,7 @@ def with_shutter_found(
         return source
     from geogs.shutter.readout import find_readout
 
-    images = source.first_images()
+    clips = source.clips()
     with stop:
 
         def report(fraction: float) -> None:
@@ -34,7 +35,7 @@ def with_shutter_found(
             stop.check()
 
         try:
-            found = find_readout(images, source.rolling_camera, report)
+            found = find_readout(clips, source.rolling_camera, report)
         except KeyboardInterrupt:
             if not stop.requested:
                 raise
@@ -44,7 +45,7 @@ def with_shutter_found(
             )
             return source
         finally:
-            images.close()
+            clips.close()
     if not found.is_believed:
         return source.with_shutter(Shutter(origin=_evidence(found)))
     progress.write(
@@ -56,9 +57,7 @@ def with_shutter_found(
 
 def _evidence(found: "FoundReadout") -> str:
     """Why the readout is believed, or why a global shutter is."""
-    if found.pairs == 0:
+    if not math.isfinite(found.error):
         return "the video does not tell"
-    return (
-        f"{100 * found.share:.0f} % of {found.pairs} pairs of views agree better than with a "
-        f"global shutter, by {found.evidence:.1f} standard errors"
-    )
+    best, error = 1000 * found.best, 1000 * found.error
+    return f"{found.pairs} pairs of views say {best:.1f} ms, standard error {error:.1f} ms"

@@ -8,6 +8,7 @@ import pytest
 
 from geogs.config import InputConfig
 from geogs.errors import InputError
+from geogs.io.sources import base
 from geogs.io.sources.base import ReadingPlace, Source
 from geogs.io.sources.sniff import open_source
 from geogs.shutter.shutter import Shutter
@@ -111,6 +112,27 @@ def test_distortion_and_rows_are_undone_at_once(tmp_path):
     true = global_image(hand_held, 1 / RATE, source.camera)
     both, one = list(source)[1].image, list(lens_only)[1].image
     assert difference(both, true) < 0.35 * difference(one, true)
+
+
+def test_clips_spread_over_the_selection(tmp_path, monkeypatch):
+    monkeypatch.setattr(base, "CLIP", 3)
+    monkeypatch.setattr(base, "CLIPS", 3)
+    for k in range(14):
+        write_image(tmp_path / f"{k:03d}.png", np.full((48, 64, 3), k, np.uint8))
+    source = open_source(tmp_path, InputConfig("50,50,31.5,23.5", start=1, stop=13, stride=2))
+    given = [[int(raw.image[0, 0, 0]) for raw in clip] for clip in source.clips()]
+    assert given == [[1, 2, 3], [5, 6, 7], [10, 11, 12]]
+    assert base.clip_starts(0, 2) == []
+    assert base.clip_starts(4, 5) == [4]
+
+
+def test_clips_of_a_video_are_those_of_its_images(tmp_path, monkeypatch):
+    monkeypatch.setattr(base, "CLIP", 3)
+    images = [np.full((48, 64, 3), 12 * k, np.uint8) for k in range(12)]
+    write_video(tmp_path / "video.mp4", images)
+    source = open_source(tmp_path / "video.mp4", InputConfig("50,50,31.5,23.5", start=1))
+    given = [[round(raw.image.mean() / 12) for raw in clip] for clip in source.clips()]
+    assert given == [[1, 2, 3], [5, 6, 7], [9, 10, 11]]
 
 
 def test_who_says_what_the_shutter_is(folder):

@@ -24,13 +24,15 @@ from geogs.io.sources.intrinsics import resolve_intrinsics
 from geogs.io.sources.undistort import Rectifier
 from geogs.shutter.camera import RollingCamera
 from geogs.shutter.neighbours import with_turning
-from geogs.shutter.readout import FRAMES
+from geogs.shutter.readout import CLIP, CLIPS
 from geogs.shutter.rows import RowOffsets
 from geogs.shutter.shutter import Shutter
 from geogs.types import Frame
 
 _log = logging.getLogger(__name__)
 T = TypeVar("T")
+MINUTE = 60.0
+"""Seconds of a video that are looked at for its readout."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,28 +160,45 @@ class Source:
 
     @property
     def rolling_camera(self) -> RollingCamera:
-        """The camera of the images that :meth:`first_images` gives."""
+        """The camera of the images that :meth:`clips` gives."""
         turns = self._reader.quarter_turns
         lines = self._reader.width if turns % 2 else self._reader.height
         return self._rectifier.rolling_camera(lines, turns)
 
-    def first_images(self) -> Generator[RawFrame, None, None]:
-        """Neighbouring images at working size as they came, from the start of the selection on.
+    def clips(self) -> Generator[list[RawFrame], None, None]:
+        """Neighbouring images at working size as they came, from all over the selection.
 
-        They are as many as tell the readout; the stride does not count.
+        They are as many as tell the readout; the stride does not count. A video can only be read
+        from its beginning on, so that they come from its first minute.
         """
-        config = self._config
-        stop = config.start + FRAMES
-        stop = stop if config.stop is None else min(stop, config.stop)
-        yield from self._resized(config.start, stop)
+        config, reader = self._config, self._reader
+        ends = [n for n in (config.stop, reader.length) if n is not None]
+        count = min(ends) - config.start if ends else CLIP * CLIPS
+        if len(reader.paths) > 1:
+            for start in clip_starts(config.start, count):
+                yield list(self._resized(start, start + CLIP))
+            return
+        starts = clip_starts(config.start, min(count, round(MINUTE * reader.fps)))
+        if not starts:
+            return
+        clip: list[RawFrame] = []
+        raws = reader.read(starts[0], starts[-1] + CLIP, 1)
+        for position, raw in enumerate(raws, starts[0]):
+            if any(start <= position < start + CLIP for start in starts):
+                clip.append(self._at_working_size(raw))
+            if len(clip) == CLIP:
+                yield clip
+                clip = []
 
     def _resized(self, start: int, stop: int | None) -> Iterator[RawFrame]:
         """Neighbours in the source at working size, lens and rows as they came."""
-        for raw in self._reader.read(start, stop, 1):
-            if raw.image is not None:
-                _check_size(raw, self._reader)
-                raw = RawFrame(raw.label, raw.timestamp, self._rectifier.resized(raw.image))
-            yield raw
+        return map(self._at_working_size, self._reader.read(start, stop, 1))
+
+    def _at_working_size(self, raw: RawFrame) -> RawFrame:
+        if raw.image is None:
+            return raw
+        _check_size(raw, self._reader)
+        return RawFrame(raw.label, raw.timestamp, self._rectifier.resized(raw.image))
 
     def linked_frames(self) -> Generator[Frame, None, None]:
         """Frames between which there is no cut."""
@@ -285,6 +304,12 @@ def read_ahead(items: Iterator[T]) -> Iterator[T]:
         while (item := pending.result()) is not end:
             pending = thread.submit(next, items, end)
             yield item  # type: ignore[misc]  # not the end mark
+
+
+def clip_starts(first: int, count: int) -> list[int]:
+    """Where clips begin that spread over ``count`` images from ``first`` on, without overlap."""
+    clips = min(CLIPS, count // CLIP)
+    return [first + round(k * (count - CLIP) / max(clips - 1, 1)) for k in range(clips)]
 
 
 def shutter_of(readout: float | Literal["auto"]) -> Shutter:

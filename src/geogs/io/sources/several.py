@@ -110,12 +110,12 @@ class SeveralSources:
 
     @property
     def rolling_camera(self) -> RollingCamera:
-        """The camera of the images that :meth:`first_images` gives."""
+        """The camera of the images that :meth:`clips` gives."""
         return self._sources[0].rolling_camera
 
-    def first_images(self) -> Generator[RawFrame, None, None]:
+    def clips(self) -> Generator[list[RawFrame], None, None]:
         """Neighbouring images of the first source, see there."""
-        return self._sources[0].first_images()
+        return self._sources[0].clips()
 
     def linked_frames(self) -> Generator[Frame, None, None]:
         """The frames of the first source."""

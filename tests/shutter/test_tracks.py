@@ -1,0 +1,56 @@
+"""Points followed through images whose motion is known."""
+
+import cv2
+import numpy as np
+
+from geogs.shutter.tracks import followed_points
+
+SIZE = 160, 120
+STEP = np.array([[1.004, 0.012, 0.8], [-0.002, 1.002, -0.5]])
+"""From one image to the next: moved, grown and sheared."""
+
+
+def after(steps: int) -> np.ndarray:
+    whole, one = np.eye(3), np.vstack([STEP, [0, 0, 1]])
+    for _ in range(abs(steps)):
+        whole = whole @ (one if steps > 0 else np.linalg.inv(one))
+    return whole
+
+
+def images(count: int) -> list[np.ndarray]:
+    """A pattern that is coarser below than above, so that gradients are not in the middle."""
+    rng = np.random.default_rng(1)
+    base = np.zeros(SIZE[::-1])
+    for size in (4, 8, 16):
+        noise = rng.uniform(-1, 1, (SIZE[1] // size + 1, SIZE[0] // size + 1))
+        base += size * cv2.resize(noise, SIZE, interpolation=cv2.INTER_CUBIC)
+    base = np.clip(128 + 5 * base, 0, 255).astype(np.uint8)
+    middle = count // 2
+    return [
+        cv2.warpAffine(base, after(k - middle)[:2], SIZE, flags=cv2.INTER_CUBIC, borderValue=128)
+        for k in range(count)
+    ]
+
+
+def test_points_move_as_the_image_does():
+    seen = followed_points(images(9))
+    assert seen.shape[0] == 9
+    assert np.isfinite(seen).all(axis=(0, 2)).sum() > 40
+    for k, places in enumerate(seen):
+        there = np.isfinite(places[:, 0])
+        true = seen[4][there] @ after(k - 4)[:2, :2].T + after(k - 4)[:2, 2]
+        error = places[there] - true
+        assert np.median(np.abs(error)) < 0.03
+        assert np.abs(error.mean(axis=0)).max() < 0.02
+
+
+def test_what_is_lost_stays_lost():
+    covered = images(9)
+    covered[6] = np.full_like(covered[6], 128)
+    seen = followed_points(covered)
+    assert np.isfinite(seen[5]).any()
+    assert not np.isfinite(seen[6:]).any()
+
+
+def test_an_image_without_texture_has_no_points():
+    assert followed_points([np.full((60, 80), 99, np.uint8)] * 3).shape == (3, 0, 2)
