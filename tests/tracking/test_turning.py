@@ -43,7 +43,7 @@ def turned(path: Sequence[np.ndarray], trajectory: Trajectory) -> np.ndarray:
 
 
 def test_a_camera_that_only_turns_has_orientations():
-    path = [pose(0.0, yaw=0.5 * np.sin(0.1 * k)) for k in range(50)]
+    path = [pose(0.0, yaw=0.5 * np.sin(0.1 * k)) for k in range(32)]
     segments, results = run(frames(path))
     assert segments.why_not.startswith("The images show no parallax")
     assert results[-1].state is TrackState.INITIALIZING
@@ -64,7 +64,7 @@ def test_nothing_known_is_still_an_error():
 def turning_away() -> tuple[list[np.ndarray], Segments, list]:
     walk = sideways(36)
     end = walk[-1]
-    there = 1.05 * (1 - np.cos(np.linspace(0, np.pi, 36)))
+    there = 1.05 * (1 - np.cos(np.linspace(0, np.pi, 30)))
     yaw = np.concatenate([there, there[::-1]])
     path = [*walk, *(end @ pose(0.0, yaw=a) for a in yaw), *sideways(50)[36:]]
     segments, results = run(frames(path))
@@ -110,16 +110,16 @@ def test_frames_before_a_start_are_located_by_its_keyframes():
 
 
 def test_a_state_goes_on_as_if_nothing_had_happened():
-    path = [pose(0.0, yaw=0.03 * k) for k in range(30)]
+    path = [pose(0.0, yaw=0.03 * k) for k in range(20)]
     stream = frames(path)
     whole, _ = run(stream)
     first = new_segments()
-    for frame in stream[:14]:
+    for frame in stream[:11]:
         first.track(frame, lambda image: ())
     store, second = first.world.keyframes.store, new_segments()
     second.world.keyframes.store.load(store.state())
     second.load(first.state())
-    for frame in stream[14:]:
+    for frame in stream[11:]:
         second.track(frame, lambda image: ())
     second.finish()
     np.testing.assert_array_equal(second.trajectory().T_wc, whole.trajectory().T_wc)

@@ -170,8 +170,9 @@ class TrajectoryRecorder:
 
         They wait no longer.
         """
-        without = [p for p in self._pending if p.record.anchor not in self.keyframes]
-        self._pending = [p for p in self._pending if p.record.anchor in self.keyframes]
+        placed = {*self.keyframes.ids}
+        without = [p for p in self._pending if p.record.anchor not in placed]
+        self._pending = [p for p in self._pending if p.record.anchor in placed]
         return [(p.record, p.encoded) for p in without]
 
     def place(
