@@ -12,8 +12,15 @@ from geogs.geometry.lie import so3_exp
 from geogs.shutter.camera import RollingCamera
 from geogs.shutter.epipolar import relative_pose
 from geogs.shutter.moments import Passage
-from geogs.shutter.readout import CLIP, FoundReadout, _Equation, _Pair, _Posed, _verdict
-from geogs.shutter.readout import find_readout
+from geogs.shutter.readout import (
+    CLIP,
+    FoundReadout,
+    _Equation,
+    _Pair,
+    _Posed,
+    _verdict,
+    find_readout,
+)
 from rolling_scenes import RATE, hand_held, rolling_image
 from tracking_scenes import CAMERA
 

@@ -82,7 +82,7 @@ class TrackingConfig(Settings, group="tracking"):
     """Frames with texture in which the camera stays lost before another segment is begun."""
     huber: Positive = 0.5
     """Standard deviations of the flow beyond which a match counts linearly."""
-    moving: Weight = 3.0
+    moving: Annotated[float, Range(0, 1000)] = 3.0
     """A region is held for something that moves, and left out, where its matches contradict a rigid
     scene by this many times what is usual; 0 leaves nothing out."""
     global_rounds: CountOrZero = 4

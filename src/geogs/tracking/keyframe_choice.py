@@ -18,6 +18,22 @@ _EDGE = 320
 """Longer side of the image in which sharpness is measured; below it, noise counts for less."""
 
 
+def calls_for_keyframe(
+    config: TrackingConfig, long_edge: int, flow: float, overlap: float, patience: float = 0.0
+) -> bool:
+    """Whether a frame is far enough from the last keyframe to become one.
+
+    ``flow`` is the median motion of the cells that are matched, in pixels, ``overlap`` the fraction
+    of the keyframe's cells that are. In forward motion the cells that move most leave the image or
+    are not matched any more, so that the median motion of the rest stays small while the overlap
+    goes. With ``patience`` it may come so much further.
+    """
+    enough = config.keyframe_flow * (1 + patience)
+    if overlap < config.keyframe_overlap / (1 + patience):
+        enough *= LEAST_FLOW
+    return flow >= enough * long_edge
+
+
 def sharpness(image: UInt8[np.ndarray, "h w 3"]) -> float:
     """Energy of an image's gradients in the direction that has least, over the image's variance.
 
@@ -58,21 +74,13 @@ class KeyframeChoice:
         self._recent = deque(state, maxlen=_COMPARED)
 
     def calls_for(self, flow: float, overlap: float) -> bool:
-        """Whether the frame seen last is far enough from the last keyframe to become one.
+        """Whether the frame seen last becomes one: see :func:`calls_for_keyframe`.
 
-        ``flow`` is the median motion of the cells that are matched, in pixels, ``overlap`` the
-        fraction of the keyframe's cells that are. In forward motion the cells that move most leave
-        the image or are not matched any more, so that the median motion of the rest stays small
-        while the overlap goes. A frame that is blurred beside the latest ones waits for a sharper
-        one, though not for long: nothing else sees what comes into view meanwhile.
+        A frame that is blurred beside the latest ones waits for a sharper one, though not for
+        long: nothing else sees what comes into view meanwhile.
         """
-        c, enough, least = self.config, self.config.keyframe_flow, self.config.keyframe_overlap
-        if self._is_blurred():
-            enough *= 1 + c.blur_wait
-            least /= 1 + c.blur_wait
-        if overlap < least:
-            enough *= LEAST_FLOW
-        return flow >= enough * self.long_edge
+        patience = self.config.blur_wait if self._is_blurred() else 0.0
+        return calls_for_keyframe(self.config, self.long_edge, flow, overlap, patience)
 
     def _is_blurred(self) -> bool:
         if len(self._recent) < 3:

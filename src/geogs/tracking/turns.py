@@ -91,7 +91,8 @@ def _spread(
     first order it falls by ``phi_b - (R_b R_a^T) phi_a``.
     """
     column = {n: 3 * k for k, n in enumerate(free)}
-    first, second = (torch.stack([found[link[k]] for link in links]) for k in (0, 1))
+    first = torch.stack([found[a] for a, _, _, _ in links])
+    second = torch.stack([found[b] for _, b, _, _ in links])
     measured = torch.stack([link[2] for link in links])
     sure = 1 / torch.tensor([link[3] for link in links], dtype=torch.float64)
     relative = second @ first.mT
