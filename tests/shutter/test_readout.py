@@ -5,15 +5,22 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-import torch
 
 from geogs.geometry.camera import Camera
-from geogs.geometry.lie import so3_exp
 from geogs.shutter.camera import RollingCamera
 from geogs.shutter.epipolar import relative_pose
 from geogs.shutter.moments import Passage
-from geogs.shutter.readout import CLIP, FoundReadout, _Equation, _Pair, _Posed, _verdict
-from geogs.shutter.readout import find_readout
+from geogs.shutter.readout import (
+    CLIP,
+    FoundReadout,
+    _Equation,
+    _Pair,
+    _Posed,
+    _verdict,
+    find_readout,
+)
+from geogs.shutter.turning import rotated
+from geogs.types import Frame
 from rolling_scenes import RATE, hand_held, rolling_image
 from tracking_scenes import CAMERA
 
@@ -44,11 +51,8 @@ def seen(path: Path, points: np.ndarray, time: float, readout: float) -> np.ndar
     """Pixels of the points in the image whose middle row is seen at a time, one by one in turn."""
     times = np.full(len(points), time)
     for _ in range(5):
-        moved = []
-        for point, at in zip(points, times, strict=True):
-            turn, move = path(at)
-            moved.append(so3_exp(torch.tensor(turn)).numpy() @ point + move)
-        pixels = WIDE.pixels(np.array(moved))
+        turns, moves = zip(*map(path, times), strict=True)
+        pixels = WIDE.pixels(rotated(points, np.array(turns)) + np.array(moves))
         times = time + readout * WIDE.line_times(pixels)
     return pixels
 
@@ -134,8 +138,6 @@ def test_a_video_without_texture_or_images_tells_nothing():
 
 
 def clips(readout: float) -> list[list]:
-    from geogs.types import Frame
-
     return [
         [
             Frame(k, k / RATE, rolling_image(hand_held, k / RATE, readout))
