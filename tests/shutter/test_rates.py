@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from geogs.geometry.camera import Camera
 from geogs.shutter.camera import RollingCamera
-from geogs.shutter.rates import FlowMeter, RayFlow, angular_velocity
+from geogs.shutter.rates import FlowMeter, RayFlow, angular_velocity, parallax
 from geogs.shutter.turning import rotated
 from rolling_scenes import RATE, READOUT, global_image, rolling_image, turning
 from tracking_scenes import CAMERA
@@ -51,7 +52,9 @@ def made_flow(outliers: int) -> RayFlow:
     second = rotated(rays, (READOUT * second_time[:, None] + 1 / RATE) * TURN)
     if outliers:
         second[-outliers:] = rotated(second[-outliers:], np.full((outliers, 3), 0.04))
-    return RayFlow(first, second, first_time, second_time, np.ones(400, bool))
+    return RayFlow(
+        first, second, first_time, second_time, np.ones(400, bool), np.zeros((400, 2)), (20, 20)
+    )
 
 
 def test_exact_rays_give_the_exact_rate():
@@ -71,3 +74,24 @@ def test_what_is_no_rotation_has_no_rate():
     assert angular_velocity(replace(flow, second=scattered), 1 / RATE, 0.0) is None
     assert angular_velocity(replace(flow, inside=np.zeros(400, bool)), 1 / RATE, 0.0) is None
     assert angular_velocity(flow, 0.0, 0.0) is None
+
+
+def test_parallax_is_what_cells_move_beside_the_rotation():
+    """A rotation, and beside it a drift that grows downwards as over a floor; some cells fail."""
+    camera = RollingCamera(Camera(200.0, 200.0, 127.5, 95.5, 256, 192))
+    v, u = np.mgrid[4:192:8, 4:256:8]
+    pixels = np.stack([u.ravel(), v.ravel()], axis=1).astype(float)
+    first, interval = camera.rays(pixels), 1 / RATE
+    drift = np.stack([0.3 + 0.5 * pixels[:, 1] / 192, np.full(len(pixels), -0.1)], axis=1)
+    turned = rotated(first, np.repeat(interval * TURN[None], len(first), axis=0))
+    plane = turned[:, :2] / turned[:, 2:] + interval * drift
+    second = np.concatenate([plane, np.ones((len(plane), 1))], axis=1)
+    times = np.zeros(len(first))
+    inside = np.ones(len(first), bool)
+    inside[::17] = False
+    second[::17] += 0.1
+    flow = RayFlow(first, second, times, times, inside, camera.pixels(second), v.shape)
+    here, there = parallax(flow, TURN, interval, READOUT)
+    inner = np.s_[3:-3, 3:-3]
+    np.testing.assert_allclose(here[inner], drift.reshape(*v.shape, 2)[inner], atol=0.03)
+    np.testing.assert_allclose(there[inner].mean((0, 1)), drift.mean(0), atol=0.05)

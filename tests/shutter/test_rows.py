@@ -56,3 +56,22 @@ def test_the_middle_row_stays_and_the_edges_go_opposite_ways():
     assert abs(offsets[191, 255, 0]) < 0.03
     assert offsets[0, 255, 0] == pytest.approx(-edge, rel=0.01)
     assert offsets[383, 255, 0] == pytest.approx(edge, rel=0.02)
+
+
+def test_parallax_moves_rows_by_its_own_velocity():
+    """Beside no turn at all: x/z and y/z per second, at the row's own time."""
+    drift = np.broadcast_to([0.3, 0.0], (12, 16, 2))
+    offsets = RowOffsets(RollingCamera(CAMERA), CAMERA)(Turning(parallax=drift), READOUT)
+    for row in (0, 100, 383):
+        expected = 420 * 0.3 * READOUT * ((row + 0.5) / 384 - 0.5) * 384 / 383
+        np.testing.assert_allclose(offsets[row, :, 0], expected, atol=0.02)
+    np.testing.assert_allclose(offsets[..., 1], 0, atol=1e-6)
+
+
+def test_parallax_counts_little_where_the_rate_changes_fast():
+    drift = np.broadcast_to([0.3, 0.0], (12, 16, 2))
+    shaken = Turning(acceleration=np.array([0.0, 60.0, 0.0]))
+    offsets = RowOffsets(RollingCamera(CAMERA), CAMERA)
+    alone = offsets(shaken, READOUT)
+    both = offsets(Turning(acceleration=shaken.acceleration, parallax=drift), READOUT)
+    assert np.abs(both - alone).max() < 0.05 * 420 * 0.3 * READOUT / 2

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from geogs.shutter.camera import RollingCamera
-from geogs.shutter.rates import FlowMeter, angular_velocity
+from geogs.shutter.rates import FlowMeter, angular_velocity, parallax
 from geogs.shutter.turning import Step, Turning, turning_between
 
 
@@ -73,5 +73,8 @@ def _step(
     interval = second.image.timestamp - first.image.timestamp
     if first.small is None or second.small is None or interval <= 0:
         return None
-    rate = angular_velocity(meter.measure(first.small, second.small), interval, readout)
-    return None if rate is None else Step(rate, interval)
+    flow = meter.measure(first.small, second.small)
+    rate = angular_velocity(flow, interval, readout)
+    if rate is None:
+        return None
+    return Step(rate, interval, parallax(flow, rate, interval, readout))

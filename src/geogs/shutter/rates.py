@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 
 from geogs.shutter.camera import RollingCamera
 from geogs.shutter.turning import rotated
@@ -19,6 +19,8 @@ BORDER = 2
 TOLERANCE = 0.004
 """Radians by which a cell may differ from rotation before it loses half of its weight."""
 ROUNDS = 10
+SMOOTH = 1.0
+"""Cells, standard deviation of the mean that parallax is smoothed by."""
 AGREEING = 0.2
 """Share of the cells that have to agree with the rotation within twice the tolerance."""
 
@@ -37,6 +39,10 @@ class RayFlow:
     """Likewise in the second image."""
     inside: Bool[np.ndarray, "n"]
     """Whether the flow ends within the second image."""
+    ends: Float[np.ndarray, "n 2"]
+    """Pixels of the small second image."""
+    shape: tuple[int, int]
+    """Lines and columns of the cells."""
 
 
 class FlowMeter:
@@ -76,7 +82,7 @@ class FlowMeter:
         )
         ends = np.where(inside[:, None], ends, self._pixels)
         rays, times = self._camera.rays(ends), self._camera.line_times(ends)
-        return RayFlow(self._rays, rays, self._times, times, inside)
+        return RayFlow(self._rays, rays, self._times, times, inside, ends, self._cells[0].shape)
 
 
 def angular_velocity(
@@ -111,6 +117,53 @@ def angular_velocity(
         weight = flow.inside / (1 + (error / TOLERANCE) ** 2)
     agreeing = (flow.inside & (error < 2 * TOLERANCE)).mean()
     return rate if agreeing >= AGREEING else None
+
+
+def parallax(
+    flow: RayFlow, rate: Float[np.ndarray, "3"], interval: float, readout: float
+) -> tuple[Float[np.ndarray, "gh gw 2"], Float[np.ndarray, "gh gw 2"]]:
+    """What cells move beside a rotation, in the first image and carried to the second.
+
+    The translation of the camera, each cell at its own depth, and what moves by itself. It is
+    smoothed over the cells around, by their median and a mean, and where nothing is known it comes
+    from the surroundings.
+
+    Args:
+        flow: from the first image to the second.
+        rate: of the rotation, radians per second.
+        interval: seconds between the two.
+        readout: seconds from the first to the last row.
+
+    Returns:
+        x/z and y/z per second at the cells.
+    """
+    first, second = (
+        rotated(rays, -readout * times[:, None] * rate)
+        for rays, times in ((flow.first, flow.first_time), (flow.second, flow.second_time))
+    )
+    turned = rotated(first, np.repeat(interval * rate[None], len(first), axis=0))
+    known = flow.inside & (turned[:, 2] > 0.1) & (second[:, 2] > 0.1)
+    between = interval + readout * (flow.second_time - flow.first_time)
+    ahead = (rays[:, :2] / np.maximum(rays[:, 2:], 0.1) for rays in (second, turned))
+    velocity = np.subtract(*ahead) / between[:, None]
+    lines, columns = flow.shape
+    field = np.where(known[:, None], velocity, 0).astype(np.float32).reshape(lines, columns, 2)
+    field = np.dstack([cv2.medianBlur(part.copy(), 5) for part in np.moveaxis(field, 2, 0)])
+    ends = np.rint((flow.ends - STEP // 2) / STEP).astype(int)
+    column, row = np.clip(ends, 0, [columns - 1, lines - 1]).T
+    there = row * columns + column
+    return _spread(field, known, np.arange(len(there))), _spread(field, known, there)
+
+
+def _spread(
+    field: Float[np.ndarray, "gh gw 2"], known: Bool[np.ndarray, "n"], cells: Int[np.ndarray, "n"]
+) -> Float[np.ndarray, "gh gw 2"]:
+    """Means of those values that are known around each cell, once each lies at its own cell."""
+    shape, count = field.shape[:2], len(cells)
+    values = (known, *(known * part for part in field.reshape(-1, 2).T))
+    laid = (np.bincount(cells, part, count).reshape(shape) for part in values)
+    weight, *sums = (cv2.GaussianBlur(part, (0, 0), SMOOTH) for part in laid)
+    return np.dstack(sums) / np.maximum(weight, 1e-3)[..., None]
 
 
 def _procrustes(

@@ -36,10 +36,32 @@ class RowOffsets:
     def nodes(self, turning: Turning, readout: float) -> Float[np.ndarray, "n 2"]:
         """Offsets in pixels of the rolling image at the nodes, row by row."""
         pixels = self._still
+        velocity = None
+        if turning.parallax is not None:
+            velocity = self._sampled(turning.parallax)
+            # What the rate's change within a readout leaves of the rotation is not parallax.
+            doubt = abs(readout) * np.linalg.norm(turning.acceleration)
+            square = (velocity**2).sum(1, keepdims=True)
+            velocity *= square / np.maximum(square + doubt**2, 1e-12)
         for _ in range(ROUNDS):
             times = readout * self._rolling.line_times(pixels)
-            pixels = self._rolling.pixels(rotated(self._rays, turning.angles(times)))
+            rays = rotated(self._rays, turning.angles(times))
+            if velocity is not None:
+                rays[:, :2] += times[:, None] * velocity * rays[:, 2:]
+            pixels = self._rolling.pixels(rays)
         return pixels - self._still
+
+    def _sampled(self, field: Float[np.ndarray, "gh gw 2"]) -> Float[np.ndarray, "n 2"]:
+        """A field over the cells of the image, at the nodes."""
+        lines, columns = field.shape[:2]
+        camera = self._rolling.camera
+        size = np.array([camera.width, camera.height]) / [columns, lines]
+        cells = ((self._still + 0.5) / size - 0.5).astype(np.float32)
+        values = cv2.remap(
+            field.astype(np.float32), cells[:, None], None, cv2.INTER_LINEAR,
+            borderMode=cv2.BORDER_REPLICATE,
+        )  # fmt: skip
+        return values[:, 0].astype(np.float64)
 
     def __call__(self, turning: Turning, readout: float) -> Float[np.ndarray, "h w 2"]:
         """Offsets in pixels of the rolling image at every pixel of the rectified one.

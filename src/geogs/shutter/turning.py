@@ -18,6 +18,9 @@ class Turning:
     """Radians per second."""
     acceleration: Float[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
     """Radians per second squared."""
+    parallax: Float[np.ndarray, "gh gw 2"] | None = None
+    """What things move beside that, each at its own depth: x/z and y/z per second at the cells of
+    a grid that covers the image; none where nothing is known."""
 
     def angles(self, times: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n 3"]:
         """Rotation vectors after seconds from the middle row."""
@@ -57,6 +60,8 @@ class Step:
     """Its mean angular velocity, radians per second."""
     interval: float
     """Seconds between the two."""
+    parallax: tuple[Float[np.ndarray, "gh gw 2"], Float[np.ndarray, "gh gw 2"]] | None = None
+    """What things move beside that, x/z and y/z per second, in the first image and the second."""
 
 
 def turning_between(before: Step | None, after: Step | None) -> Turning:
@@ -66,8 +71,23 @@ def turning_between(before: Step | None, after: Step | None) -> Turning:
     """
     if before is None or after is None:
         known = before or after
-        return Turning() if known is None else Turning(known.rate)
+        if known is None:
+            return Turning()
+        return Turning(known.rate, parallax=known.parallax and known.parallax[known is before])
     apart = (before.interval + after.interval) / 2
     share = before.interval / (2 * apart)
     rate = before.rate + share * (after.rate - before.rate)
-    return Turning(rate, (after.rate - before.rate) / apart)
+    parallax = None
+    if before.parallax is not None and after.parallax is not None:
+        parallax = _agreed(before.parallax[1], after.parallax[0], share)
+    return Turning(rate, (after.rate - before.rate) / apart, parallax)
+
+
+def _agreed(
+    before: Float[np.ndarray, "gh gw 2"], after: Float[np.ndarray, "gh gw 2"], share: float
+) -> Float[np.ndarray, "gh gw 2"]:
+    """Between the two, and the less of it the more they differ: flow that fails differs."""
+    mean, change = before + share * (after - before), after - before
+    square, doubt = (mean**2).sum(2, keepdims=True), (change**2).sum(2, keepdims=True)
+    weight: Float[np.ndarray, "gh gw 1"] = square / np.maximum(square + doubt, 1e-12)
+    return weight * mean

@@ -12,7 +12,7 @@ from geogs.io.sources import base
 from geogs.io.sources.base import ReadingPlace, Source
 from geogs.io.sources.sniff import open_source
 from geogs.shutter.shutter import Shutter
-from io_samples import write_image
+from io_samples import write_image, write_video
 from rolling_scenes import RATE, READOUT, global_image, hand_held, rolling_frames, rolling_image
 
 INTRINSICS = "150,150,95.5,71.5"
