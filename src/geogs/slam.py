@@ -187,8 +187,11 @@ class Slam:
     def uncertainty(self) -> Uncertainty | None:
         """How well the keyframes are known, by all matches of the last adjustment.
 
-        None before that: what is left of the matches until then are the latest alone.
+        None before that: what is left of the matches until then are the latest alone. Where no map
+        could be started there is no keyframe, and nothing is known.
         """
+        if self._is_ended and not self.segments.keyframe_ids:
+            return Uncertainty(*(np.zeros(0) for _ in range(4)))
         return self._known
 
     def particulars(self) -> dict[str, object]:

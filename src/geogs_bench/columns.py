@@ -154,7 +154,7 @@ def motion_layout() -> Layout:
         ),
         "Over the tracked frames; positions after a Sim(3) alignment, orientations after that of "
         "the world's axes. A camera that hardly moves has no ATE. Reliable (1) are an ATE below a "
-        "twentieth of the path's extent and four fifths of the frames tracked.",
+        "twentieth of the path's extent and no more than a fifth of the frames lost.",
     )
 
 

@@ -87,8 +87,8 @@ class MotionScore:
     is_called_reliable: bool | None = None
     """What the system says of the whole; none where it says nothing."""
     is_reliable: bool | None = None
-    """Whether the ATE is below a twentieth of the true path's extent, and four fifths of the frames
-    are tracked; none where there is no ATE."""
+    """Whether the ATE is below a twentieth of the true path's extent and at most a fifth of the
+    frames are lost; none where there is no ATE."""
 
 
 @dataclass(frozen=True)

@@ -60,7 +60,7 @@ def track_to_folder(
         write_tum_trajectory(folder / "trajectory.tum", trajectory)
         write_uncertainty(folder / "trajectory_uncertainty.csv", trajectory, known)
         summary["lost_spans"] = lost_spans(trajectory)
-        said = verdict(trajectory, slam.keyframe_trajectory(), known)
+        said = verdict(trajectory, slam.keyframe_trajectory(), known, slam.segments.why_not)
         summary["verdict"] = {"is_reliable": said.is_reliable, "sentence": said.sentence}
     except TrackingLost as error:
         summary["not_tracked"] = str(error)

@@ -68,3 +68,10 @@ def test_much_turning_is_told():
     found = verdict(turned, walk(5, 5), known(0.001, 0.01))
     assert not found.is_reliable
     assert "of 67% of the frames only the orientation is known" in found.sentence
+
+
+def test_depths_that_nobody_knows_are_no_shape():
+    moving = walk(20, 20)
+    assert verdict(moving, moving, known(0.001, 0.1)).has_shape
+    assert not verdict(moving, moving, known(0.001, 0.6)).has_shape
+    assert not verdict(moving, moving, known(0.001, np.inf)).has_shape

@@ -69,7 +69,11 @@ class Result:
 
     @cached_property
     def mesh(self) -> Mesh | None:
-        """The surface of the map; none where none was found, of which ``progress`` is told."""
+        """The surface of the map; none where none was found, or where depths are no evidence of
+        one, of which ``progress`` is told."""
+        if self.verdict is not None and not self.verdict.has_shape:
+            self.progress.write("No mesh: nothing tells the depths of what was seen.")
+            return None
         renders = self.renders
         with self.scene.stopwatch("mesh"):
             return surface_of(renders, self.scene.config.mesh, self.progress)

@@ -15,6 +15,8 @@ MOST_OFF = 0.05
 """Deviation of the camera's place, of the extent of its path."""
 MOST_DEEP = 0.2
 """Relative deviation of depths."""
+NO_SHAPE = 0.5
+"""Relative deviation of depths from which on they are no evidence of a surface."""
 
 
 @dataclass(frozen=True)
@@ -35,6 +37,11 @@ class Verdict:
     """Median deviation of its orientation."""
     depth: float
     """Median relative deviation of depths."""
+
+    @property
+    def has_shape(self) -> bool:
+        """Whether depths are known well enough for any surface."""
+        return self.depth < NO_SHAPE
 
 
 def verdict(

@@ -35,6 +35,8 @@ def global_bundle(
     config, store, graph = tracker.config, tracker.keyframes, tracker.graph
     ids = tracker.keyframe_ids if keyframes is None else list(keyframes)
     before = {k: store[k].T_cw for k in ids}
+    if not ids:
+        return PoseCorrection({}, {}, {})
     pairs = global_pairs(tracker, ids)
     graph.edges = {}
     batch = MATCHED_TOGETHER[store.grid.on_gpu]

@@ -58,7 +58,7 @@ class RowOffsets:
         size = np.array([camera.width, camera.height]) / [columns, lines]
         cells = ((self._still + 0.5) / size - 0.5).astype(np.float32)
         values = cv2.remap(
-            field.astype(np.float32), cells[:, None], None, cv2.INTER_LINEAR,
+            field.astype(np.float32), cells[:, None, :1], cells[:, None, 1:], cv2.INTER_LINEAR,
             borderMode=cv2.BORDER_REPLICATE,
         )  # fmt: skip
         return values[:, 0].astype(np.float64)

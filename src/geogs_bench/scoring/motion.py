@@ -20,8 +20,9 @@ _SAME_TIME = 0.005
 _MOST_OFF = 0.05
 """ATE of a reliable run, of the extent of the true path (root of the mean squared distance from its
 middle)."""
-_LEAST_TRACKED = 80.0
-"""Percent of the frames that a reliable run tracks."""
+_LEAST_FOLLOWED = 80.0
+"""Percent of the frames of which a reliable run knows the pose, or says that it is no more than the
+orientation."""
 
 
 def score_motion(scene: Scene, result: ResultFolder) -> MotionScore:
@@ -41,9 +42,10 @@ def score_motion(scene: Scene, result: ResultFolder) -> MotionScore:
     if known is None:
         return compare_motion(reference, _without_lost(estimate, result))
     score = compare_motion(reference, known.tracked_of(estimate), known.oriented_of(estimate))
+    turned = 100 * float((known.state == ORIENTED).mean())
     return replace(
         score,
-        turned=100 * float((known.state == ORIENTED).mean()),
+        turned=turned,
         within=_within(reference, known.tracked_of(estimate), known),
         is_called_reliable=said.get("is_reliable"),
     )
@@ -59,7 +61,7 @@ def compare_motion(
     orientation counts; if they are not given, those that were tracked.
     """
     reference, tracked = finite_poses(reference), finite_poses(tracked)
-    i, _ = associate(reference.timestamps, tracked.timestamps, _SAME_TIME)
+    i, j = associate(reference.timestamps, tracked.timestamps, _SAME_TIME)
     share = 100 * len(i) / len(reference.timestamps)
     rotation = _rotation(reference, tracked if oriented is None else oriented)
     if len(i) < 3:
@@ -68,12 +70,16 @@ def compare_motion(
     path = float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum())
     if path < _LEAST_PATH:
         return MotionScore(share, rotation=rotation)
+    if np.ptp(tracked.T_wc[j, :3, 3], axis=0).max() == 0:  # all estimated positions are one
+        return MotionScore(share, rotation=rotation)
     try:
         ate = evaluate_trajectory(tracked, reference, _SAME_TIME).ate_rmse_cm
-    except InputError:  # all estimated positions are one
+    except InputError:  # they are on a line
         return MotionScore(share, rotation=rotation)
     extent = float(np.sqrt(np.square(places - places.mean(0)).sum(1).mean()))
-    good = share >= _LEAST_TRACKED and ate <= 100 * _MOST_OFF * extent
+    turned = 0 if oriented is None else len(finite_poses(oriented).timestamps) - len(i)
+    followed = share + 100 * turned / len(reference.timestamps)
+    good = followed >= _LEAST_FOLLOWED and ate <= 100 * _MOST_OFF * extent
     return MotionScore(share, 0.0, rotation, ate, ate / path, is_reliable=good)
 
 
