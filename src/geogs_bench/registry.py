@@ -156,11 +156,11 @@ POSED_ROOMS = Benchmark(
 
 MOTIONS = Benchmark(
     "motions",
-    "Motions and flaws of the camera, with exact truth",
-    "run",
+    "Motions and flaws of the camera, with exact truth: tracking alone",
+    "track",
     find_motions,
     "sequences as geogs synth writes them; without a folder a matrix of motions and cameras is "
-    "rendered, with --small a small one that is only tracked",
+    "rendered, with --small a small one",
     "geogs synth --motion KIND --camera FLAWS",
     (motion_layout(), COST),
     cells=FULL,
@@ -168,7 +168,7 @@ MOTIONS = Benchmark(
 
 MOTIONS_SMALL = Benchmark(
     "motions-small",
-    "Motions and flaws of the camera, small images, tracking alone",
+    "Motions and flaws of the camera, few small sequences",
     "track",
     find_motions,
     MOTIONS.needs,

@@ -25,7 +25,7 @@ class BenchSettings(Settings):
     known_poses: bool = False
     """Of rooms: reconstruct from known poses instead of SLAM."""
     small: bool = False
-    """Of motions: few short sequences of small images, and tracking alone; for a CPU."""
+    """Of motions: few short sequences of small images, for two CPU cores."""
     budgets: Annotated[tuple[Positive, ...], Time] = ()
     """From known poses: seconds given to each reconstruction, several with commas between."""
     baseline: bool = False
