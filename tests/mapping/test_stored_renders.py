@@ -36,7 +36,7 @@ def plane(number: int, distance: float = 2.0) -> RenderedKeyframe:
     T_cw[0, 3] = -0.02 * number
     image = np.full((12, 16, 3), number % 256, np.uint8)
     weight = torch.rand(120, 160, generator=random)
-    return RenderedKeyframe(number, CAMERA, T_cw, depth, normal, weight, image)
+    return RenderedKeyframe(number, CAMERA, T_cw, depth, normal, weight, image, float(number))
 
 
 def stored(renders: Sequence[RenderedKeyframe]) -> Sequence[RenderedKeyframe]:

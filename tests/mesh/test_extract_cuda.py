@@ -133,6 +133,7 @@ def test_results_are_written_from_any_device(device, tmp_path):
             normal=torch.tensor([0.0, 0.0, -1.0]).expand(40, 48, 3).to(device),
             weight=v.weight.to(device),
             image=v.image,
+            timestamp=float(i),
         )
         for i, v in enumerate(views(camera, 6))
     ]
