@@ -22,7 +22,10 @@ class MeshConfig(Settings, group="mesh"):
     """Sum of view weights that a voxel needs to count as seen; just behind a surface a view counts
     less than in front, so 1.5 asks for two sure views."""
     triangle_budget: Annotated[int, Range(100, 1_000_000_000), Basic()] = 1_500_000
-    """Triangles that a chosen voxel size aims at, to about 20 %."""
+    """Triangles that a chosen voxel size aims at, to about 20 %, before those that the surface does
+    not need are merged."""
+    detail: Annotated[float, Range(0, 16), Basic()] = 0.5
+    """How far triangles may be merged: 99 % of the surface moves by less, voxels; 0 merges none."""
     memory_limit: Annotated[float, Range(1e-3, 1e6)] = 2.0
     """Most memory for the volume in GiB."""
     min_component_faces: CountOrZero = 100

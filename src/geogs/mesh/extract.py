@@ -13,6 +13,7 @@ from geogs.config import MeshConfig
 from geogs.errors import InputError
 from geogs.mesh.clean import keep_components, remove_degenerate_faces
 from geogs.mesh.colour import colour_mesh
+from geogs.mesh.decimate import decimate
 from geogs.mesh.surface import extract_surface
 from geogs.mesh.tsdf import BLOCK, BYTES_PER_BLOCK, SparseTsdf, band_blocks, pack
 from geogs.mesh.types import DepthMapView, Mesh
@@ -84,11 +85,11 @@ def extract_mesh(
     config: MeshConfig | None = None,
     progress: Callable[[str, int, int], None] | None = None,
 ) -> Mesh:
-    """Fuse depth maps and return their surface, cleaned and coloured from the views' images.
+    """Fuse depth maps; their surface, cleaned, coloured from the views' images and decimated.
 
     ``views`` is gone through up to three times (plan, fuse, colour) in order, so a lazy sequence
     may render on demand. The work is done on the device of the first depth map. ``progress`` is
-    called with the stage ("fuse", "colour"), the views done and their number.
+    called with the stage ("fuse", "colour", "merge"), what is done of it and all there is to do.
 
     Raises InputError if there are no views, no valid depth or no surface.
     """
@@ -112,6 +113,11 @@ def extract_mesh(
     if config.colour and any(view.image is not None for view in views):
         report = None if progress is None else lambda done, of: progress("colour", done, of)
         mesh = colour_mesh(mesh, views, 2 * plan.voxel, report)
+    if progress:
+        progress("merge", 0, 1)
+    mesh = decimate(mesh, config.detail * plan.voxel)
+    if progress:
+        progress("merge", 1, 1)
     return mesh
 
 
