@@ -9,7 +9,7 @@ import torch
 from cuda_emulator import use_emulator
 from geogs.application.machine import device_summary
 from geogs.application.report import write_report
-from geogs.application.results import splat_colours
+from geogs.application.splat_colours import splat_colours
 from geogs.application.surfaces import fusion_views
 from geogs.config import MeshConfig
 from geogs.geometry.camera import Camera

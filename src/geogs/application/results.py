@@ -5,11 +5,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
-import numpy as np
-
-from geogs.application.report import write_report
 from geogs.application.keyframe_files import write_keyframes
+from geogs.application.report import write_report
 from geogs.application.result import Result
+from geogs.application.splat_colours import splat_colours
 from geogs.application.summary import summarise
 from geogs.application.surfaces import fusion_views
 from geogs.config import Config, ReconstructConfig
@@ -20,10 +19,7 @@ from geogs.io.writers.map_views import save_map_with_views
 from geogs.io.writers.ply import write_mesh, write_splats
 from geogs.io.writers.tum import write_tum_trajectory
 from geogs.io.writers.uncertainty import write_uncertainty
-from geogs.mesh.colour import colour_mesh
-from geogs.mesh.types import DepthMapView, Mesh
 from geogs.threads import on_one_torch_thread
-from geogs.types import MapSnapshot
 
 
 @on_one_torch_thread
@@ -84,13 +80,3 @@ def write_config(path: Path, config: Config | ReconstructConfig) -> None:
 
     plain = json.loads(json.dumps(asdict(config), default=str))
     write_text(path, yaml.safe_dump(plain, sort_keys=False))
-
-
-def splat_colours(disks: MapSnapshot, views: Sequence[DepthMapView]) -> np.ndarray:
-    """RGB in [0, 1] of every disk, from the images that see it; the map itself has no colour."""
-    points = Mesh(
-        disks.position.cpu().numpy(), np.zeros((0, 3), np.int32), disks.normal.cpu().numpy()
-    )
-    tolerance = 4 * float(disks.scale.median())
-    colours = colour_mesh(points, views, tolerance).colours
-    return np.full((len(disks), 3), 0.5) if colours is None else colours / 255.0

@@ -56,9 +56,7 @@ def _simplified(
     return vertices.astype(np.float32), faces.astype(np.int32)
 
 
-def _dressed(
-    mesh: Mesh, vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "m 3"]
-) -> Mesh:
+def _dressed(mesh: Mesh, vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "m 3"]) -> Mesh:
     """The vertices and faces with normals and colours of the mesh that they were made from."""
     from scipy.spatial import cKDTree
 

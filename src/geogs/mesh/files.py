@@ -23,7 +23,9 @@ def read_mesh(path: Path) -> Mesh:
         raise InputError(f"{path} holds no mesh.")
     vertices = _rows(vertex, ("x", "y", "z"), np.float32)
     faces = corners.values.astype(np.int64)
-    if (corners.lengths != 3).any() or (len(faces) and not 0 <= faces.min() <= faces.max() < len(vertices)):
+    if (corners.lengths != 3).any() or (
+        len(faces) and not 0 <= faces.min() <= faces.max() < len(vertices)
+    ):
         raise InputError(f"{path} has faces that are no triangles of its vertices.")
     faces = faces.reshape(-1, 3).astype(np.int32)
     normals, colours = vertex_normals(vertices, faces), None
