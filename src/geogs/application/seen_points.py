@@ -50,7 +50,7 @@ def seen_points(
 
 
 def cloud(
-    keyframes: Sequence[RenderedKeyframe], spacing: float = 2.0
+    keyframes: Sequence[RenderedKeyframe], spacing: float = 1.0
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Positions, normals and colours of the surface that all sure depths show.
 

@@ -257,7 +257,8 @@ class Mapper:
     def renders(self, disks: MapSnapshot | None = None) -> Sequence[RenderedKeyframe]:
         """The map, or other disks in its frame, seen from every mapped keyframe.
 
-        Rendered now, from a snapshot, so that disks that were written show the same; of a long video most are read from a temporary file when they are asked for.
+        Rendered now, from a snapshot, so that disks that were written show the same; of a long
+        video most are read from a temporary file when they are asked for.
 
         Raises:
             OutputError: the disk is full, or cannot be written.

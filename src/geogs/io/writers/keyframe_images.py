@@ -50,9 +50,8 @@ def _write(path: Path, picture: np.ndarray, options: list[int]) -> None:
 
 
 def _read(path: Path, flags: int) -> np.ndarray:
-    picture = None
-    if path.is_file():
-        picture = cv2.imdecode(np.fromfile(path, np.uint8), flags)
+    data = np.fromfile(path, np.uint8) if path.is_file() else np.zeros(0, np.uint8)
+    picture = cv2.imdecode(data, flags) if len(data) else None
     if picture is None:
         raise InputError(f"{path} is missing or damaged; the result needs it.")
     return picture

@@ -81,7 +81,7 @@ def write_obj(
     normals: Float[np.ndarray, "n 3"],
     colours: UInt8[np.ndarray, "n 3"] | None,
 ) -> None:
-    """Write text with normals, y up as in ``write_glb``; sRGB colours from 0 to 1 behind x, y, z."""
+    """Write text with normals, y up as in ``write_glb``; sRGB from 0 to 1 stands behind x, y, z."""
     turn = OPENGL_FROM_OPENCV[:3, :3]
     rows = vertices @ turn
     if colours is not None:
