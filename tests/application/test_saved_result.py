@@ -7,7 +7,7 @@ import torch
 import geogs
 from geogs.errors import InputError
 from geogs.geometry.lie import se3_exp
-from geogs.io.writers.keyframe_images import image_path
+from geogs.io.writers.keyframe_images import image_path, read_image
 from geogs.io.writers.native import save_map
 from saved_results import (
     CAMERA,
@@ -88,9 +88,13 @@ def test_what_cannot_be_used_is_told_in_a_sentence(tmp_path, result):
     save_map(tmp_path / "map.safetensors", disks_of_the_scene(), {"source": "old"})
     with pytest.raises(InputError, match="an older geogs wrote it; run again"):
         geogs.load_result(tmp_path)
-    image_path(make_result(tmp_path / "cut"), IDS[1]).write_bytes(b"")
-    with pytest.raises(InputError, match=r"000002.jpg is missing or damaged"):
-        geogs.load_result(tmp_path / "cut").keyframes[1]
+    cut = image_path(tmp_path, IDS[1])
+    for content in (None, b"", b"no JPEG"):
+        if content is not None:
+            cut.parent.mkdir(exist_ok=True)
+            cut.write_bytes(content)
+        with pytest.raises(InputError, match=r"000002.jpg is missing or damaged"):
+            read_image(cut)
     with pytest.raises(InputError, match=r"summary.json is missing"):
         _ = result.summary
     assert result.mesh is None

@@ -25,7 +25,8 @@ class MeshConfig(Settings, group="mesh"):
     """Triangles that a chosen voxel size aims at, to about 20 %, before those that the surface does
     not need are merged."""
     detail: Annotated[float, Range(0, 16), Basic()] = 0.5
-    """How far triangles may be merged: 99 % of the surface moves by less, voxels; 0 merges none."""
+    """How far triangles may be merged: 99 % of the surface moves by less, and on average by less
+    than 0.15 of it; voxels, 0 merges none."""
     memory_limit: Annotated[float, Range(1e-3, 1e6)] = 2.0
     """Most memory for the volume in GiB."""
     min_component_faces: CountOrZero = 100
