@@ -19,8 +19,8 @@ from geogs.mapping.rendered import SurfaceRules, rendered_keyframe
 from geogs.mapping.stored_renders import StoredRender, stored_render
 from geogs.mesh.extract import extract_mesh
 from geogs.on_demand import OnDemand
-from geogs.splat.map import DiskParameters
 from geogs.reconstruction import Reconstruction
+from geogs.splat.map import DiskParameters
 from geogs.types import MapSnapshot, RenderedKeyframe, Trajectory
 from posed_scene import ball_and_wall
 

@@ -23,8 +23,9 @@ def decimate(mesh: Mesh, tolerance: float) -> Mesh:
     """Collapse edges by quadric error for as long as the surface stays where it was.
 
     99 % of the vertices lie within ``tolerance`` (map units) of the decimated surface, and on
-    average within 15 % of that; borders stay as they are. Colours and normals are the means of those of the vertices that each new one stands
-    for. Of a mesh that this would not make smaller nothing changes.
+    average within 15 % of that; borders stay as they are. Colours and normals are the means of
+    those of the vertices that each new one stands for. Of a mesh that this would not make smaller
+    nothing changes.
 
     Method: Garland and Heckbert (1997), as in fast-simplification. It is told how many triangles to
     leave, so it is asked for half as many, again and again, until that is too few.
