@@ -255,7 +255,7 @@ def test_plan_follows_pixel_budget_and_memory():
     assert plan.voxel == pytest.approx(1.2 / 120, rel=0.15)  # one pixel at about 1.2 m
     assert plan.max_depth == pytest.approx(2 * 1.4, rel=0.1)
     small = plan_volume(views, MeshConfig(triangle_budget=2000))
-    config = MeshConfig(triangle_budget=2000, min_weight=1.0, detail=0)
+    config = MeshConfig(triangle_budget=2000, min_weight=1.0, detail=0, close_holes=0)
     faces = len(extract_mesh(views, config).faces)
     assert small.voxel > 2 * plan.voxel
     assert 1000 < faces < 2400
