@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from geogs.io.writers.native import load_map
     from geogs.slam import Slam
     from geogs.splat.map import GaussianMap
+    from geogs.splat.render import render
     from geogs.types import Frame
 
 __all__ = [
@@ -32,6 +33,7 @@ __all__ = [
     "open_posed_source",
     "open_source",
     "reconstruct",
+    "render",
 ]
 
 _HOMES = {
@@ -46,6 +48,7 @@ _HOMES = {
     "open_posed_source": "geogs.io.sources.posed.sniff",
     "open_source": "geogs.io.sources.sniff",
     "reconstruct": "geogs.application.reconstruct",
+    "render": "geogs.splat.render",
 }
 
 

@@ -66,6 +66,16 @@ def test_disks_are_in_the_world_for_those_who_only_want_them(result):
     np.testing.assert_array_equal(result.disks.scale, disks.scale)
 
 
+def test_loaded_disks_are_rendered_as_they_are(result):
+    disks = geogs.load_map(result.folder / "map.safetensors")
+    T_cw = torch.from_numpy(result.views.T_cw[0])
+    alone = geogs.render(disks, DEPTH_CAMERA, T_cw).median_depth
+    depth = result.keyframes[0].depth
+    shown = (depth > 0) & (alone > 0)
+    assert shown.float().mean() > 0.9
+    assert ((alone - depth).abs() / depth)[shown].median() < 1e-3
+
+
 def test_lost_frames_are_known_from_the_table(tmp_path):
     folder = make_result(tmp_path)
     times = geogs.load_result(folder).trajectory.timestamps

@@ -35,7 +35,7 @@ class MeshConfig(Settings, group="mesh"):
     """Parts with fewer faces than this fraction of the largest part's are removed."""
     max_components: Annotated[int | None, Range(1), Basic()] = None
     """Keep only so many of the largest parts; none keeps all (1 suits a single object)."""
-    close_holes: Annotated[int, Range(0, 1000)] = 16
+    close_holes: Annotated[int, Range(0, 1000)] = 8
     """Holes with so many edges or fewer are closed, unless somebody looked through them; 0 closes
     none."""
     colour: bool = True
