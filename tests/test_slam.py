@@ -124,7 +124,9 @@ def test_a_result_is_used_again(small_result, tmp_path):
     assert len(result.keyframes) == result.summary["keyframes"]
     assert all(k.image.shape[:2] == (result.camera.height, result.camera.width)
                for k in result.keyframes)  # fmt: skip
-    path = remesh(RemeshSettings(small_result, mesh_settings(small_result), tmp_path / "m.ply"))
+    path = remesh(
+        RemeshSettings(small_result, mesh_settings(small_result), tmp_path / "m.ply", "cpu")
+    )
     again = read_mesh(path)
     for name in ("vertices", "faces", "normals"):
         np.testing.assert_array_equal(getattr(result.mesh, name), getattr(again, name))
