@@ -201,6 +201,8 @@ def test_the_command_says_what_it_wrote_and_what_is_missing(tmp_path, capsys):
     assert main(["export", str(folder), "--to", "tum", "--device", "cpu"]) == 0
     assert "export/tum/trajectory.txt" in capsys.readouterr().out
     assert (folder / "export" / "tum" / "trajectory.txt").is_file()
+    assert main(["export", str(folder), "--to", "tum", "-o", str(tmp_path / "a.glb")]) == 2
+    assert "should end in .txt or .tum" in capsys.readouterr().err
     assert main(["export", str(folder), "--to", "glb"]) == 2
     assert "geogs mesh" in capsys.readouterr().err
     assert main(["export", str(folder), "--to", "dwg"]) == 2

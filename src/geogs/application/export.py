@@ -24,6 +24,10 @@ Write = Callable[[SavedResult, ExportSettings, Path], Path]
 """Writes to a place, or to a file of its own name in it if that is a folder; what was written."""
 
 
+_SUFFIXES = frozenset({".csv", ".glb", ".las", ".laz", ".npz", ".obj", ".ply", ".tum", ".txt"})
+"""Of files; a folder is not named so."""
+
+
 @on_one_torch_thread
 def export(settings: ExportSettings) -> Path:
     """Write a result in another format; the folder or file.
@@ -39,8 +43,14 @@ def export(settings: ExportSettings) -> Path:
 
 
 def _file(place: Path, name: str, *suffixes: str) -> Path:
-    """The place if it is named like a file of that kind, else the usual name in it."""
+    """The place if it is named like a file of that kind, else the usual name in it.
+
+    Raises:
+        InputError: it is named like a file of another kind.
+    """
     suffixes = suffixes or (Path(name).suffix,)
+    if place.suffix.lower() in _SUFFIXES - {*suffixes}:
+        raise InputError(f"{place} should end in {' or '.join(suffixes)}, or be a folder.")
     return place if place.suffix.lower() in suffixes else place / name
 
 
