@@ -15,6 +15,7 @@ import torch
 from scipy.spatial import cKDTree
 
 from depth_scene import WORKING, make_scene, trace
+from geogs.application.remesh import RemeshSettings, mesh_settings, remesh
 from geogs.cli import main as cli
 from geogs.config import InputConfig
 from geogs.depth.classical import CpuDepthEngine
@@ -26,6 +27,7 @@ from geogs.io.sources.posed.sniff import open_posed_source
 from geogs.io.writers.native import load_map
 from geogs.mapping.depth_schedule import spread_order
 from geogs.mapping.known_poses import depth_search, distances_to_try
+from geogs.mesh.files import read_mesh
 from geogs.reconstruction import Reconstruction
 from keyframe_samples import Sample, segment_of
 from posed_scene import (
@@ -128,6 +130,14 @@ def test_an_earlier_snapshot_can_be_rendered():
         assert ((a.depth - b.depth).abs()[shown] / a.depth[shown]).quantile(0.95) < 2e-3
         assert not torch.equal(a.depth, c.depth)
         assert torch.equal(a.T_cw, c.T_cw)
+
+
+def test_the_mesh_is_made_again_from_the_folder_as_it_was(result, tmp_path):
+    path = remesh(RemeshSettings(result, mesh_settings(result), tmp_path / "m.ply", "cpu"))
+    made, again = read_mesh(result / "mesh.ply"), read_mesh(path)
+    for name in ("vertices", "faces", "normals"):
+        np.testing.assert_array_equal(getattr(made, name), getattr(again, name))
+    assert np.abs(made.colours.astype(int) - again.colours).mean() < 1.0
 
 
 def test_depth_maps_are_those_that_were_searched():

@@ -13,11 +13,14 @@ import numpy as np
 import pytest
 import torch
 
+from geogs.application.remesh import RemeshSettings, mesh_settings, remesh
+from geogs.application.saved_result import load_result
 from geogs.cli import main as cli
 from geogs.evaluation.surface import read_surface
 from geogs.evaluation.trajectory import evaluate_trajectory
 from geogs.io.poses import read_tum_trajectory
 from geogs.io.writers.native import load_map
+from geogs.mesh.files import read_mesh
 from geogs.slam import Slam
 from geogs.types import Frame, Trajectory
 
@@ -114,6 +117,21 @@ def test_a_run_leaves_every_file(small_result):
     assert summary["disks"] == len(disks) > 300
     assert summary["frames"] == SMALL_FRAMES
     assert summary["lost_spans"] == []
+
+
+def test_a_result_is_used_again(small_result, tmp_path):
+    result = load_result(small_result)
+    assert len(result.keyframes) == result.summary["keyframes"]
+    assert all(k.image.shape[:2] == (result.camera.height, result.camera.width)
+               for k in result.keyframes)  # fmt: skip
+    path = remesh(
+        RemeshSettings(small_result, mesh_settings(small_result), tmp_path / "m.ply", "cpu")
+    )
+    again = read_mesh(path)
+    for name in ("vertices", "faces", "normals"):
+        np.testing.assert_array_equal(getattr(result.mesh, name), getattr(again, name))
+    difference = result.mesh.colours.astype(int) - again.colours
+    assert np.abs(difference).mean() < 2.0
 
 
 def test_the_online_result_and_the_depths_alone_are_written_too(small_result):

@@ -8,6 +8,7 @@ from geogs.version import __version__
 if TYPE_CHECKING:
     from geogs import application
     from geogs.application.reconstruct import reconstruct
+    from geogs.application.saved_result import load_result
     from geogs.config import Config, ReconstructConfig
     from geogs.geometry.camera import Camera
     from geogs.io.sources.posed.sniff import open_posed_source
@@ -15,6 +16,7 @@ if TYPE_CHECKING:
     from geogs.io.writers.native import load_map
     from geogs.slam import Slam
     from geogs.splat.map import GaussianMap
+    from geogs.splat.render import render
     from geogs.types import Frame
 
 __all__ = [
@@ -27,9 +29,11 @@ __all__ = [
     "__version__",
     "application",
     "load_map",
+    "load_result",
     "open_posed_source",
     "open_source",
     "reconstruct",
+    "render",
 ]
 
 _HOMES = {
@@ -40,9 +44,11 @@ _HOMES = {
     "ReconstructConfig": "geogs.config",
     "Slam": "geogs.slam",
     "load_map": "geogs.io.writers.native",
+    "load_result": "geogs.application.saved_result",
     "open_posed_source": "geogs.io.sources.posed.sniff",
     "open_source": "geogs.io.sources.sniff",
     "reconstruct": "geogs.application.reconstruct",
+    "render": "geogs.splat.render",
 }
 
 

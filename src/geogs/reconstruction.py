@@ -18,10 +18,10 @@ from geogs.mapping import known_poses as known
 from geogs.mapping.depth_schedule import search_depths
 from geogs.mapping.map_frame import MapFrame
 from geogs.mapping.mapper import Mapper
+from geogs.mapping.rendered import MapRenderer
 from geogs.mapping.state import MapperState
 from geogs.mapping.training.base import TrainingPlace
 from geogs.on_demand import OnDemand
-from geogs.splat.map import DiskParameters
 from geogs.stopwatch import Stopwatch
 from geogs.threads import on_one_torch_thread
 from geogs.types import MapSnapshot, RenderedKeyframe, Trajectory
@@ -182,10 +182,12 @@ class Reconstruction:
         read from a temporary file when they are asked for.
         """
         with self.stopwatch("rendering"):
-            if disks is None:
-                return self._in_world(self.mapper.renders())
-            earlier = DiskParameters.of(self._frame.map_snapshot(disks))
+            earlier = None if disks is None else self._frame.map_snapshot(disks)
             return self._in_world(self.mapper.renders(earlier))
+
+    def renderer(self) -> MapRenderer:
+        """What shows the map as it is now from anywhere."""
+        return self.mapper.renderer(self._frame)
 
     def particulars(self) -> dict[str, object]:
         """Nothing that is not said of every result."""

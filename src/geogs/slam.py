@@ -15,6 +15,7 @@ from geogs.keyframes.store import KeyframeStore, StoreState
 from geogs.loop.closer import LoopCloser, LoopsState
 from geogs.loop.global_bundle import global_bundle
 from geogs.mapping.mapper import Mapper
+from geogs.mapping.rendered import MapRenderer
 from geogs.mapping.state import MapperState
 from geogs.priors.base import MonocularPrior
 from geogs.stopwatch import Stopwatch, StopwatchState
@@ -216,6 +217,10 @@ class Slam:
         """
         with self.stopwatch("rendering"):
             return self.mapper.renders()
+
+    def renderer(self) -> MapRenderer:
+        """What shows the map as it is now from anywhere."""
+        return self.mapper.renderer()
 
     def depth_maps(self) -> Sequence[RenderedKeyframe]:
         """Depth and confidence of every mapped keyframe as searched, without the disks.

@@ -120,5 +120,9 @@ class RenderedKeyframe:
     """Camera frame, facing the camera, zero where there is no depth."""
     weight: Float[Tensor, "h w"]
     """How far the depth may be trusted, in [0, 1]; less where disks spread along the ray."""
-    image: UInt8[np.ndarray, "h2 w2 3"]
-    """RGB at working resolution."""
+    image: UInt8[np.ndarray, "h2 w2 3"] | None
+    """RGB at working resolution; none in a result that was written without images."""
+    timestamp: float
+    """Seconds."""
+    mask: Bool[Tensor, "h w"] | None = None
+    """Pixels that belong to the scene; none where all do."""

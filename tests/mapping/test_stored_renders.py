@@ -10,16 +10,17 @@ import torch
 from depth_scene import make_scene
 from geogs.application.progress import RunProgress
 from geogs.application.report import write_report
-from geogs.application.results import splat_colours
+from geogs.application.splat_colours import splat_colours
 from geogs.application.surfaces import fusion_views, write_surface
 from geogs.config import MeshConfig
 from geogs.geometry.camera import Camera
 from geogs.keyframes.archive import Archive, Archived
-from geogs.mapping.rendered import rendered_keyframe
+from geogs.mapping.rendered import SurfaceRules, rendered_keyframe
 from geogs.mapping.stored_renders import StoredRender, stored_render
 from geogs.mesh.extract import extract_mesh
 from geogs.on_demand import OnDemand
 from geogs.reconstruction import Reconstruction
+from geogs.splat.map import DiskParameters
 from geogs.types import MapSnapshot, RenderedKeyframe, Trajectory
 from posed_scene import ball_and_wall
 
@@ -36,7 +37,7 @@ def plane(number: int, distance: float = 2.0) -> RenderedKeyframe:
     T_cw[0, 3] = -0.02 * number
     image = np.full((12, 16, 3), number % 256, np.uint8)
     weight = torch.rand(120, 160, generator=random)
-    return RenderedKeyframe(number, CAMERA, T_cw, depth, normal, weight, image)
+    return RenderedKeyframe(number, CAMERA, T_cw, depth, normal, weight, image, float(number))
 
 
 def stored(renders: Sequence[RenderedKeyframe]) -> Sequence[RenderedKeyframe]:
@@ -105,7 +106,7 @@ def count_held(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 def test_the_mesh_is_the_same_to_the_last_bit(monkeypatch):
     """Of views that come from the file, few of which are in memory at a time."""
     renders = [plane(n) for n in range(45)]
-    config = MeshConfig(min_component_faces=10, voxel=0.04)
+    config = MeshConfig(min_component_faces=10, voxel=0.04, detail=0)
     expected = extract_mesh(fusion_views(renders), config)
     counts = count_held(monkeypatch)
     mesh = extract_mesh(fusion_views(stored(renders)), config)
@@ -147,11 +148,9 @@ def test_the_maps_of_a_scene_are_those_of_its_disks(scene):
     mapper = scene.mapper
     renders = scene.renders()
     with torch.no_grad():
-        camera = mapper.cameras.render
-        eager = [
-            rendered_keyframe(mapper.views[i], mapper.map.parameters, camera, mapper.config)
-            for i in mapper.mapped
-        ]
+        camera, rules = mapper.cameras.render, SurfaceRules.of(mapper.config)
+        disks = DiskParameters.of(mapper.map.snapshot())
+        eager = [rendered_keyframe(mapper.views[i], disks, camera, rules) for i in mapper.mapped]
         mapper.map.position.add_(0.1)
     assert len(renders) == len(eager) == len(make_scene().views)
     for now, then in zip(renders, eager, strict=True):

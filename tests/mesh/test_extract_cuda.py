@@ -9,7 +9,7 @@ import torch
 from cuda_emulator import use_emulator
 from geogs.application.machine import device_summary
 from geogs.application.report import write_report
-from geogs.application.results import splat_colours
+from geogs.application.splat_colours import splat_colours
 from geogs.application.surfaces import fusion_views
 from geogs.config import MeshConfig
 from geogs.geometry.camera import Camera
@@ -133,6 +133,7 @@ def test_results_are_written_from_any_device(device, tmp_path):
             normal=torch.tensor([0.0, 0.0, -1.0]).expand(40, 48, 3).to(device),
             weight=v.weight.to(device),
             image=v.image,
+            timestamp=float(i),
         )
         for i, v in enumerate(views(camera, 6))
     ]

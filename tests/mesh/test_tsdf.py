@@ -129,7 +129,7 @@ def test_band_holds_every_voxel_within_truncation(truncation):
 
 def test_sphere_is_accurate_closed_and_faces_outwards():
     views, voxel = sphere_views(), 0.02
-    mesh = extract_mesh(views, MeshConfig(voxel=voxel))
+    mesh = extract_mesh(views, MeshConfig(voxel=voxel, detail=0))
     radius = np.linalg.norm(mesh.vertices.astype(np.float64), axis=1)
     assert np.abs(radius - RADIUS).mean() < voxel / 15
     assert np.abs(radius - RADIUS).max() < voxel / 3
@@ -244,7 +244,7 @@ def test_rigid_motion_of_all_views_moves_the_mesh():
     views = sphere_views(12)
     move = se3_exp(torch.tensor([3.0, -2.0, 5.0, 0.4, 0.3, -0.8], dtype=torch.float64))
     moved = [DepthMapView(v.depth, v.weight, v.camera, v.T_cw @ move.inverse()) for v in views]
-    mesh = extract_mesh(moved, MeshConfig(voxel=0.02))
+    mesh = extract_mesh(moved, MeshConfig(voxel=0.02, detail=0))
     radius = np.linalg.norm(mesh.vertices - move[:3, 3].numpy(), axis=1)
     assert np.abs(radius - RADIUS).mean() < 0.0015
 
@@ -255,7 +255,8 @@ def test_plan_follows_pixel_budget_and_memory():
     assert plan.voxel == pytest.approx(1.2 / 120, rel=0.15)  # one pixel at about 1.2 m
     assert plan.max_depth == pytest.approx(2 * 1.4, rel=0.1)
     small = plan_volume(views, MeshConfig(triangle_budget=2000))
-    faces = len(extract_mesh(views, MeshConfig(triangle_budget=2000, min_weight=1.0)).faces)
+    config = MeshConfig(triangle_budget=2000, min_weight=1.0, detail=0, close_holes=0)
+    faces = len(extract_mesh(views, config).faces)
     assert small.voxel > 2 * plan.voxel
     assert 1000 < faces < 2400
     tight = plan_volume(views, MeshConfig(memory_limit=1e-3))

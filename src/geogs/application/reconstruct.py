@@ -117,7 +117,7 @@ def reconstruct_to_folder(
         more = [lambda: snapshots.write(output, scene, progress)]
         if settings.depth_mesh:
             more.append(lambda: write_depth_mesh(output, scene, progress))
-        write_results(output, result, more)
+        write_results(output, result, more, settings.keyframe_images)
     if finished:
         checkpoint.remove()
     return Written(output, result, kept)

@@ -32,7 +32,7 @@ def write_report(
         shown = [renders[i] for i in numbers]
         plots.plot_keyframes(
             folder / "keyframes.png",
-            [r.image for r in shown],
+            [r.image for r in shown if r.image is not None],
             [r.depth.cpu().numpy() for r in shown],
             [r.normal.cpu().numpy() for r in shown],
         )

@@ -5,33 +5,34 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
-import numpy as np
-
+from geogs.application.keyframe_files import write_keyframes
 from geogs.application.report import write_report
 from geogs.application.result import Result
+from geogs.application.splat_colours import splat_colours
 from geogs.application.summary import summarise
 from geogs.application.surfaces import fusion_views
 from geogs.config import Config, ReconstructConfig
 from geogs.io.sources.posed.base import PosedSource
 from geogs.io.writers.atomic import prepare_output_folder, write_text
 from geogs.io.writers.intrinsics import write_intrinsics
-from geogs.io.writers.native import save_map
+from geogs.io.writers.map_views import save_map_with_views
 from geogs.io.writers.ply import write_mesh, write_splats
 from geogs.io.writers.tum import write_tum_trajectory
 from geogs.io.writers.uncertainty import write_uncertainty
-from geogs.mesh.colour import colour_mesh
-from geogs.mesh.types import DepthMapView, Mesh
 from geogs.threads import on_one_torch_thread
-from geogs.types import MapSnapshot
 
 
 @on_one_torch_thread
 def write_results(
-    output: str | Path, result: Result, more: Sequence[Callable[[], None]] = ()
+    output: str | Path,
+    result: Result,
+    more: Sequence[Callable[[], None]] = (),
+    keyframe_images: bool = True,
 ) -> None:
     """Write poses first, then the map, the mesh, what else was asked for, and the report on them.
 
-    ``more`` writes the rest, which the summary then counts.
+    ``more`` writes the rest, which the summary then counts. ``keyframe_images`` says whether the
+    images of the keyframes are kept, too.
 
     Raises:
         OutputError: a file cannot be written.
@@ -47,9 +48,11 @@ def write_results(
     write_intrinsics(output / "intrinsics.json", source.camera, *as_it_came)
     write_config(output / "config.yaml", scene.config)
     disks = result.map
-    facts = {"source": source.name, "seed": scene.config.seed}
     if result.why_no_map is None:
-        save_map(output / "map.safetensors", disks, facts)
+        with scene.stopwatch("keyframes"):
+            views = write_keyframes(output, scene, source.camera, result.renders, keyframe_images)
+            facts = {"source": source.name, "seed": scene.config.seed}
+            save_map_with_views(output / "map.safetensors", disks, views, facts)
     if len(disks):
         colours = splat_colours(disks, fusion_views(result.renders))
         write_splats(output / "splats.ply", disks, colours)
@@ -78,13 +81,3 @@ def write_config(path: Path, config: Config | ReconstructConfig) -> None:
 
     plain = json.loads(json.dumps(asdict(config), default=str))
     write_text(path, yaml.safe_dump(plain, sort_keys=False))
-
-
-def splat_colours(disks: MapSnapshot, views: Sequence[DepthMapView]) -> np.ndarray:
-    """RGB in [0, 1] of every disk, from the images that see it; the map itself has no colour."""
-    points = Mesh(
-        disks.position.cpu().numpy(), np.zeros((0, 3), np.int32), disks.normal.cpu().numpy()
-    )
-    tolerance = 4 * float(disks.scale.median())
-    colours = colour_mesh(points, views, tolerance).colours
-    return np.full((len(disks), 3), 0.5) if colours is None else colours / 255.0

@@ -103,7 +103,8 @@ def continued(facts: RunFacts, settings: RunSettings, output: Path) -> RunSettin
     if elsewhere or settings.deciding() != facts.settings.deciding():
         raise InputError(
             "--resume goes on with the source and the settings of the run; leave out everything "
-            "else but --device, --mesh, --checkpoint-every, --online-results and --depth-mesh."
+            "else but --device, --mesh, --checkpoint-every, --online-results, --depth-mesh and "
+            "--keyframe-images."
         )
     device = facts.device if settings.device == "auto" else settings.device
     if not device.startswith(facts.device):
@@ -146,7 +147,8 @@ class _Run:
             interrupted |= not self._finish(correct=not interrupted)
             result = Result(slam, source, interrupted, progress)
             more = [lambda: write_depth_mesh(output, slam, progress)]
-            write_results(output, result, more if settings.depth_mesh else ())
+            more = more if settings.depth_mesh else []
+            write_results(output, result, more, settings.keyframe_images)
         if full:
             raise DeviceError(
                 f"The memory of the GPU was full after {slam.frames} frames, whose results are in "

@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import Protocol, runtime_checkable
 
 from geogs.config import Config, ReconstructConfig
+from geogs.mapping.rendered import MapRenderer
 from geogs.stopwatch import Stopwatch
 from geogs.types import MapSnapshot, RenderedKeyframe, Trajectory, Uncertainty
 
@@ -42,6 +43,10 @@ class MappedScene(Protocol):
 
     def renders(self) -> Sequence[RenderedKeyframe]:
         """The map seen from every keyframe."""
+        ...
+
+    def renderer(self) -> MapRenderer:
+        """What shows the map from anywhere."""
         ...
 
     def depth_maps(self) -> Sequence[RenderedKeyframe]:

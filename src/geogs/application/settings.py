@@ -29,6 +29,8 @@ class RunSettings(Settings):
     """Also write trajectory and mesh as they are before the final stages, to online/."""
     depth_mesh: bool = False
     """Also fuse the keyframes' depths without the disks, to depth_fusion/mesh.ply."""
+    keyframe_images: bool = True
+    """Keep the images of the keyframes in keyframes/, which geogs mesh and geogs export use."""
 
     def absolute(self) -> "RunSettings":
         """The same with paths that hold wherever the run is resumed from, and without a folder."""
@@ -79,6 +81,8 @@ class ReconstructSettings(Settings):
     from when the images have been read."""
     depth_mesh: bool = False
     """Also fuse the searched depths without the disks, to depth_fusion/mesh.ply."""
+    keyframe_images: bool = True
+    """Keep the images as they were used in keyframes/, which geogs mesh and geogs export use."""
     resume: bool = False
     """Go on from the checkpoint that an earlier call left in the output folder."""
     checkpoint_every: Weight = 30.0

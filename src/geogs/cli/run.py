@@ -25,7 +25,7 @@ class RunOptions(RunSettings):
     resume: Path | None = None
     """Go on with the run that was interrupted or killed in this folder, with its source and its
     settings; beside it may be given what decides nothing about poses and map: --device, --mesh,
-    --checkpoint-every, --online-results and --depth-mesh."""
+    --checkpoint-every, --online-results, --depth-mesh and --keyframe-images."""
 
 
 def main(argv: Sequence[str]) -> int:

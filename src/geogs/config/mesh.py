@@ -22,7 +22,11 @@ class MeshConfig(Settings, group="mesh"):
     """Sum of view weights that a voxel needs to count as seen; just behind a surface a view counts
     less than in front, so 1.5 asks for two sure views."""
     triangle_budget: Annotated[int, Range(100, 1_000_000_000), Basic()] = 1_500_000
-    """Triangles that a chosen voxel size aims at, to about 20 %."""
+    """Triangles that a chosen voxel size aims at, to about 20 %, before those that the surface does
+    not need are merged."""
+    detail: Annotated[float, Range(0, 16), Basic()] = 0.5
+    """How far triangles may be merged: 99 % of the surface moves by less, and on average by less
+    than 0.15 of it; voxels, 0 merges none."""
     memory_limit: Annotated[float, Range(1e-3, 1e6)] = 2.0
     """Most memory for the volume in GiB."""
     min_component_faces: CountOrZero = 100
@@ -31,5 +35,8 @@ class MeshConfig(Settings, group="mesh"):
     """Parts with fewer faces than this fraction of the largest part's are removed."""
     max_components: Annotated[int | None, Range(1), Basic()] = None
     """Keep only so many of the largest parts; none keeps all (1 suits a single object)."""
+    close_holes: Annotated[int, Range(0, 1000)] = 8
+    """Holes with so many edges or fewer are closed, unless somebody looked through them; 0 closes
+    none."""
     colour: bool = True
     """Colour the vertices from the keyframe images."""

@@ -66,3 +66,7 @@ class MapFrame:
     ) -> RenderedKeyframe:
         """A rendering of the map with its depth in world units; ``T_cw`` is its pose there."""
         return replace(render, depth=render.depth * self.unit, T_cw=T_cw)
+
+
+WORLD = MapFrame(np.zeros(3), 1.0)
+"""The world's own frame and unit."""

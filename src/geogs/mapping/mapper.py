@@ -19,8 +19,9 @@ from geogs.keyframes.store import KeyframeStore
 from geogs.mapping.cameras import MapCameras
 from geogs.mapping.keyframe_depths import CANDIDATES, KeyframeDepths
 from geogs.mapping.levelling import light_of
+from geogs.mapping.map_frame import WORLD, MapFrame
 from geogs.mapping.map_update import MapUpdate, plan_update, witness
-from geogs.mapping.rendered import rendered_keyframe, searched_keyframe
+from geogs.mapping.rendered import MapRenderer, SurfaceRules, rendered_keyframe, searched_keyframe
 from geogs.mapping.state import MapperState, RandomState, TrainedState, ViewState
 from geogs.mapping.stored_renders import StoredRender, stored_render
 from geogs.mapping.training.base import Batch, MapTrainer, TrainingPlace, draw_partners
@@ -40,7 +41,7 @@ from geogs.splat.init import new_disks
 from geogs.splat.map import DiskParameters, GaussianMap
 from geogs.splat.optimizer import MapOptimizer
 from geogs.splat.render import render
-from geogs.types import PoseCorrection, RenderedKeyframe
+from geogs.types import MapSnapshot, PoseCorrection, RenderedKeyframe
 
 # Nearest keyframes that vote on a keyframe's disks; others are too far away to know better.
 _VOTERS = 96
@@ -253,20 +254,27 @@ class Mapper:
         self._carve(self._mapped_around(view, _VOTERS))
 
     @torch.no_grad()
-    def renders(self, disks: DiskParameters | None = None) -> Sequence[RenderedKeyframe]:
+    def renders(self, disks: MapSnapshot | None = None) -> Sequence[RenderedKeyframe]:
         """The map, or other disks in its frame, seen from every mapped keyframe.
 
-        Rendered now; of a long video most are read from a temporary file when they are asked for.
+        Rendered now, from a snapshot, so that disks that were written show the same; of a long
+        video most are read from a temporary file when they are asked for.
 
         Raises:
             OutputError: the disk is full, or cannot be written.
         """
-        disks = self.map.parameters if disks is None else disks
+        parameters = DiskParameters.of(self.map.snapshot() if disks is None else disks)
         camera, archive, stored = self.cameras.render, Archive(), []
+        rules = SurfaceRules.of(self.config)
         for view in (self.views[i] for i in self.mapped):
-            render = rendered_keyframe(view, disks, camera, self.config)
+            render = rendered_keyframe(view, parameters, camera, rules)
             stored.append(stored_render(render, view.keyframe.picture.archived, archive))
         return OnDemand(stored, StoredRender.load)
+
+    def renderer(self, frame: MapFrame = WORLD) -> MapRenderer:
+        """What shows the map as it is now from anywhere, asked in the coordinates of a world."""
+        rules = SurfaceRules.of(self.config)
+        return MapRenderer(self.map.snapshot(), frame, self.cameras.render, rules)
 
     def depth_maps(self) -> Sequence[RenderedKeyframe]:
         """The dense depths of the mapped keyframes, weighted by confidence: no disk is in them.

@@ -1,40 +1,104 @@
 """Depth maps of keyframes for a surface: rendered from disks, or as searched before any disk."""
 
+from dataclasses import dataclass
+from typing import NamedTuple
+
 import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
 
 from geogs.config import MappingConfig
 from geogs.geometry.camera import Camera
 from geogs.geometry.depth import normals_from_depth
+from geogs.mapping.map_frame import MapFrame
 from geogs.mapping.view import MapView
 from geogs.splat.map import DiskParameters
 from geogs.splat.render import render
-from geogs.types import RenderedKeyframe
+from geogs.types import MapSnapshot, RenderedKeyframe
+
+
+class SurfaceMaps(NamedTuple):
+    """A surface seen from one place."""
+
+    depth: Float[Tensor, "h w"]
+    """0 where the map is too thin to say."""
+    normal: Float[Tensor, "h w 3"]
+    """Camera frame, unit and facing the camera; zero where there is no depth."""
+    weight: Float[Tensor, "h w"]
+    """How far the depth may be trusted, in [0, 1]; less where disks spread along the ray."""
+
+
+@dataclass(frozen=True)
+class SurfaceRules:
+    """What counts as surface where disks are blended."""
+
+    min_alpha: float
+    """Opacity above which the map hides what lies behind."""
+    max_spread: float
+    """Relative difference of mean and median depth up to which a ray meets one surface."""
+
+    @staticmethod
+    def of(config: MappingConfig) -> "SurfaceRules":
+        """Those of a run's settings."""
+        return SurfaceRules(config.loss.min_alpha, config.max_spread)
+
+
+@dataclass(frozen=True, eq=False)
+class MapRenderer:
+    """Shows a map from anywhere, as the run showed it from its keyframes.
+
+    Disks are in the map's own frame and unit, what is asked and given in the world's.
+    """
+
+    disks: MapSnapshot
+    frame: MapFrame
+    camera: Camera
+    """Of the depth maps of keyframes."""
+    rules: SurfaceRules
+
+    @torch.no_grad()
+    def surface(
+        self,
+        T_cw: Float[Tensor, "4 4"],
+        camera: Camera | None = None,
+        mask: Bool[Tensor, "h w"] | None = None,
+    ) -> SurfaceMaps:
+        """What a camera sees inside a mask; that of the keyframes' depth maps if none is given."""
+        disks = DiskParameters.of(self.disks)
+        pose = self.frame.pose(T_cw)
+        maps = rendered_surface(disks, camera or self.camera, pose, self.rules, mask)
+        return maps._replace(depth=maps.depth * self.frame.unit)
+
+
+def rendered_surface(
+    disks: DiskParameters,
+    camera: Camera,
+    T_cw: Float[Tensor, "4 4"],
+    rules: SurfaceRules,
+    mask: Bool[Tensor, "h w"] | None = None,
+) -> SurfaceMaps:
+    """Disks seen from a pose inside a mask, with the weight of each depth for fusion."""
+    output = render(disks, camera, T_cw)
+    depth = output.shown_depth(rules.min_alpha)
+    # The mean is smoother; but where the ray meets several surfaces it lies on none of them,
+    # while the median is on one.
+    single = (output.median_depth - depth).abs() < rules.max_spread * depth
+    depth = torch.where(single | (depth <= 0), depth, output.median_depth)
+    weight = torch.where(single, 1.0, 0.5) * (depth > 0)
+    if mask is not None:
+        depth = torch.where(mask, depth, 0.0)
+        weight = torch.where(mask, weight, 0.0)
+    length = output.normal.norm(dim=-1, keepdim=True).clamp(min=1e-6)
+    normal = torch.where(depth[..., None] > 0, output.normal / length, 0.0)
+    return SurfaceMaps(depth, normal, weight)
 
 
 def rendered_keyframe(
-    view: MapView, disks: DiskParameters, camera: Camera, config: MappingConfig
+    view: MapView, disks: DiskParameters, camera: Camera, rules: SurfaceRules
 ) -> RenderedKeyframe:
-    """Disks seen from a view inside its mask, with the weight of each depth for fusion."""
-    output = render(disks, camera, view.T_cw)
-    depth = output.shown_depth(config.loss.min_alpha)
-    # The mean is smoother; but where the ray meets several surfaces it lies on none of them,
-    # while the median is on one.
-    single = (output.median_depth - depth).abs() < config.max_spread * depth
-    depth = torch.where(single | (depth <= 0), depth, output.median_depth)
-    weight = torch.where(single, 1.0, 0.5) * (depth > 0)
-    if view.mask is not None:
-        depth = torch.where(view.mask, depth, 0.0)
-        weight = torch.where(view.mask, weight, 0.0)
-    length = output.normal.norm(dim=-1, keepdim=True).clamp(min=1e-6)
-    return RenderedKeyframe(
-        keyframe_id=view.id,
-        camera=camera,
-        T_cw=view.T_cw,
-        depth=depth,
-        normal=torch.where(depth[..., None] > 0, output.normal / length, 0.0),
-        weight=weight,
-        image=view.keyframe.image,
-    )
+    """Disks seen from a view inside its mask."""
+    maps = rendered_surface(disks, camera, view.T_cw, rules, view.mask)
+    return _keyframe(view, camera, maps)
 
 
 def searched_keyframe(view: MapView, camera: Camera) -> RenderedKeyframe:
@@ -42,4 +106,11 @@ def searched_keyframe(view: MapView, camera: Camera) -> RenderedKeyframe:
     weight = view.dense.confidence
     depth = torch.where(weight > 0, view.dense.depth, 0.0)
     normal, _ = normals_from_depth(depth, camera)
-    return RenderedKeyframe(view.id, camera, view.T_cw, depth, normal, weight, view.keyframe.image)
+    return _keyframe(view, camera, SurfaceMaps(depth, normal, weight))
+
+
+def _keyframe(view: MapView, camera: Camera, maps: SurfaceMaps) -> RenderedKeyframe:
+    frame = view.keyframe
+    return RenderedKeyframe(
+        view.id, camera, view.T_cw, *maps, frame.image, frame.timestamp, view.mask
+    )

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from geogs.geometry.camera import Camera
@@ -23,6 +23,8 @@ class StoredRender:
     """With half the digits; nobody measures with them."""
     weight: Archived
     image: Archived
+    timestamp: float
+    mask: Bool[Tensor, "h w"] | None
     device: torch.device
     """Of the maps that were rendered."""
 
@@ -33,8 +35,9 @@ class StoredRender:
             for maps in (self.depth, self.normal, self.weight)
         )
         return RenderedKeyframe(
-            self.keyframe_id, self.camera, self.T_cw, depth, normal, weight, self.image.load()
-        )
+            self.keyframe_id, self.camera, self.T_cw, depth, normal, weight, self.image.load(),
+            self.timestamp, self.mask,
+        )  # fmt: skip
 
 
 def stored_render(render: RenderedKeyframe, image: Archived, archive: Archive) -> StoredRender:
@@ -49,5 +52,5 @@ def stored_render(render: RenderedKeyframe, image: Archived, archive: Archive) -
     )
     return StoredRender(
         render.keyframe_id, render.camera, render.T_cw, depth, normal, weight, image,
-        render.depth.device,
+        render.timestamp, render.mask, render.depth.device,
     )  # fmt: skip

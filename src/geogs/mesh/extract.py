@@ -4,15 +4,19 @@ import logging
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
+import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from geogs.config import MeshConfig
 from geogs.errors import InputError
 from geogs.mesh.clean import keep_components, remove_degenerate_faces
 from geogs.mesh.colour import colour_mesh
+from geogs.mesh.decimate import decimate
+from geogs.mesh.holes import close_holes
 from geogs.mesh.surface import extract_surface
 from geogs.mesh.tsdf import BLOCK, BYTES_PER_BLOCK, SparseTsdf, band_blocks, pack
 from geogs.mesh.types import DepthMapView, Mesh
@@ -21,6 +25,8 @@ from geogs.threads import on_one_torch_thread
 _log = logging.getLogger(__name__)
 _SAMPLED_VIEWS = 40
 _SAMPLED_POINTS = 400_000
+_FREE = 0.5
+"""Of the truncation; nearer to a surface than that may be its noise."""
 _FACES_PER_SQUARE = 2.4
 """Marching cubes makes about so many triangles per voxel face of surface."""
 
@@ -84,11 +90,11 @@ def extract_mesh(
     config: MeshConfig | None = None,
     progress: Callable[[str, int, int], None] | None = None,
 ) -> Mesh:
-    """Fuse depth maps and return their surface, cleaned and coloured from the views' images.
+    """Fuse depth maps; their surface, cleaned, coloured from the views' images and decimated.
 
     ``views`` is gone through up to three times (plan, fuse, colour) in order, so a lazy sequence
     may render on demand. The work is done on the device of the first depth map. ``progress`` is
-    called with the stage ("fuse", "colour"), the views done and their number.
+    called with the stage ("fuse", "colour", "merge"), what is done of it and all there is to do.
 
     Raises InputError if there are no views, no valid depth or no surface.
     """
@@ -99,11 +105,12 @@ def extract_mesh(
     _log.info("voxel %.4g, about %.0f MiB", plan.voxel, plan.bytes / 2**20)
     tsdf = fuse(views, plan, progress)
     mesh = extract_surface(tsdf, config.min_weight)
-    del tsdf
     mesh = remove_degenerate_faces(mesh)
     mesh = keep_components(
         mesh, config.min_component_faces, config.min_component_fraction, config.max_components
     )
+    mesh = close_holes(mesh, config.close_holes, partial(_is_free, tsdf, config.min_weight))
+    del tsdf
     if not len(mesh.faces):
         raise InputError(
             f"No surface was seen with a total weight of {config.min_weight:g}; lower min-weight "
@@ -112,6 +119,11 @@ def extract_mesh(
     if config.colour and any(view.image is not None for view in views):
         report = None if progress is None else lambda done, of: progress("colour", done, of)
         mesh = colour_mesh(mesh, views, 2 * plan.voxel, report)
+    if progress:
+        progress("merge", 0, 1)
+    mesh = decimate(mesh, config.detail * plan.voxel)
+    if progress:
+        progress("merge", 1, 1)
     return mesh
 
 
@@ -129,6 +141,14 @@ def fuse(
         if progress:
             progress("fuse", number + 1, len(views))
     return tsdf
+
+
+def _is_free(
+    tsdf: SparseTsdf, min_weight: float, points: Float[np.ndarray, "k 3"]
+) -> Bool[np.ndarray, "k"]:
+    """Whether a point was seen to be well before any surface."""
+    distance, weight = tsdf.nearest(torch.from_numpy(points))
+    return ((weight >= min_weight) & (distance > _FREE)).cpu().numpy()
 
 
 def _sample_points(

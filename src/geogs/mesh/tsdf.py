@@ -107,6 +107,24 @@ class SparseTsdf:
         """Sums of observation weights."""
         return self._weight[: len(self)].unflatten(1, (BLOCK, BLOCK, BLOCK))
 
+    def nearest(
+        self, points: Float[Tensor, "n 3"]
+    ) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:
+        """Distance and weight of the voxel nearest to each point; 1 and 0 where there is none."""
+        voxel = torch.round(points.to(self.device) / self.voxel).long()
+        block = torch.div(voxel, BLOCK, rounding_mode="floor")
+        distance, weight = torch.ones(2, len(points), device=self.device)
+        if len(self) and len(points):
+            keys = pack(block.clamp(-LIMIT // BLOCK, LIMIT // BLOCK))
+            place = torch.searchsorted(self._keys, keys).clamp(max=len(self) - 1)
+            known = (self._keys[place] == keys) & (voxel.abs() < LIMIT).all(-1)
+            x, y, z = (voxel - block * BLOCK).unbind(-1)
+            inner, slot = (x * BLOCK + y) * BLOCK + z, self._slots[place]
+            distance = torch.where(known, self._distance[slot, inner], distance)
+            weight = torch.where(known, self._weight[slot, inner], 0.0)
+            return distance, weight
+        return distance, 0 * weight
+
     def integrate(
         self,
         depth: Float[Tensor, "h w"],

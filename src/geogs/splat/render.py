@@ -12,6 +12,7 @@ from geogs.splat.cpu.rasterize import rasterize_backward, rasterize_forward
 from geogs.splat.map import DiskParameters, GaussianMap
 from geogs.splat.reference import render_reference
 from geogs.threads import worker_count
+from geogs.types import MapSnapshot
 
 Backend = Literal["auto", "reference", "cpu", "cuda"]
 
@@ -48,7 +49,7 @@ class RenderOutput:
 
 
 def render(
-    disks: GaussianMap | DiskParameters,
+    disks: GaussianMap | DiskParameters | MapSnapshot,
     camera: Camera,
     T_cw: Float[Tensor, "4 4"],
     backend: Backend = "auto",
@@ -56,7 +57,8 @@ def render(
 ) -> RenderOutput:
     """Render depth, normals, opacity and distortion of the disks as seen from ``T_cw``.
 
-    Differentiable in the ten numbers of every disk and in the entries of ``T_cw``.
+    Differentiable in the ten numbers of every disk and in the entries of ``T_cw``. Disks may be
+    those of a map in training, before activation, or as ``load_map`` gives them.
 
     Blending follows 2-D Gaussian splatting (Huang et al. 2024): front to back in the order of
     centre depths, weight w_i = a_i T_i with a_i = min(o_i exp(-rho_i / 2), 0.99), hits below 1/255
@@ -67,6 +69,8 @@ def render(
     ``reference`` works in the positions' dtype on any device, ``cpu`` in float32 on the CPU and
     ``cuda`` in float32 on the GPU that holds the disks; ``auto`` takes the fastest that can.
     """
+    if isinstance(disks, MapSnapshot):
+        disks = DiskParameters.of(disks)
     parameters = disks.parameters if isinstance(disks, GaussianMap) else disks
     if backend == "auto":
         position = parameters.position

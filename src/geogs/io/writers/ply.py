@@ -13,7 +13,8 @@ SPLAT_THICKNESS = 0.01
 """Third standard deviation of an exported splat relative to its smaller one: flat, not zero."""
 
 _TYPES = {"<f4": "float", "|u1": "uchar"}
-_SH_DEGREE_0 = 0.28209479177387814  # 1 / (2 sqrt(pi)), the constant spherical harmonic
+SH_DEGREE_0 = 0.28209479177387814
+"""1 / (2 sqrt(pi)), the constant spherical harmonic."""
 
 
 @dataclass(frozen=True)
@@ -48,12 +49,26 @@ def write_points(
     path: str | Path,
     positions: Float[np.ndarray, "n 3"],
     colors: UInt8[np.ndarray, "n 3"] | None = None,
+    normals: Float[np.ndarray, "n 3"] | None = None,
 ) -> None:
-    """Write a point cloud as binary PLY, with RGB where given."""
-    _write(path, [_element("vertex", _points(positions, colors))])
+    """Write a point cloud as binary PLY, with RGB and normals where given."""
+    _write(path, [_element("vertex", _points(positions, colors, normals))])
 
 
-def write_splats(path: str | Path, disks: MapSnapshot, colors: Float[np.ndarray, "n 3"]) -> None:
+def splat_scales(disks: MapSnapshot) -> Float[np.ndarray, "n 3"]:
+    """Standard deviations of the disks as splats, along tangents and normal: thin, not flat."""
+    scale = disks.scale.cpu().numpy()
+    thin = SPLAT_THICKNESS * scale.min(axis=1, keepdims=True, initial=np.inf)
+    return np.concatenate([scale, thin], axis=1).clip(1e-12)
+
+
+def write_splats(
+    path: str | Path,
+    disks: MapSnapshot,
+    colors: Float[np.ndarray, "n 3"],
+    is_flat: bool = False,
+    degree: int = 0,
+) -> None:
     """Write disks in the layout of 3D Gaussian splatting (Kerbl et al. 2023), no view dependence.
 
     Scales are logarithms, opacity a logit, rotation w, x, y, z, colour the zeroth coefficient of
@@ -63,18 +78,23 @@ def write_splats(path: str | Path, disks: MapSnapshot, colors: Float[np.ndarray,
         path: the file.
         disks: the map.
         colors: RGB of every disk in [0, 1]; the map itself has none.
+        is_flat: whether there are two scales, as in 2D Gaussian splatting (Huang et al. 2024).
+        degree: of the spherical harmonics, for readers that want more than the constant one; their
+            coefficients are zero.
     """
+    rest = [f"f_rest_{i}" for i in range(3 * ((degree + 1) ** 2 - 1))]
+    scales = ("scale_0", "scale_1") if is_flat else ("scale_0", "scale_1", "scale_2")
     position, normal = disks.position.cpu().numpy(), disks.normal.cpu().numpy()
-    scale, rotation = disks.scale.cpu().numpy(), disks.quaternion.cpu().numpy()
+    rotation = disks.quaternion.cpu().numpy()
     opacity = disks.opacity.cpu().double().numpy().clip(1e-6, 1 - 1e-6)
-    thin = SPLAT_THICKNESS * scale.min(axis=1, keepdims=True, initial=np.inf)
-    log_scale = np.log(np.concatenate([scale, thin], axis=1).clip(1e-12))
+    log_scale = np.log(splat_scales(disks))
     columns = {
         **_columns(position, ("x", "y", "z")),
         **_columns(normal, ("nx", "ny", "nz")),
-        **_columns((colors - 0.5) / _SH_DEGREE_0, ("f_dc_0", "f_dc_1", "f_dc_2")),
+        **_columns((colors - 0.5) / SH_DEGREE_0, ("f_dc_0", "f_dc_1", "f_dc_2")),
+        **_columns(np.zeros((len(position), len(rest))), tuple(rest)),
         "opacity": np.log(opacity / (1 - opacity)).astype("<f4"),
-        **_columns(log_scale, ("scale_0", "scale_1", "scale_2")),
+        **_columns(log_scale, scales),
         **_columns(rotation, ("rot_0", "rot_1", "rot_2", "rot_3")),
     }
     _write(path, [_element("vertex", columns)])

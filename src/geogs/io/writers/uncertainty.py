@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Bool, Float
 
 from geogs.io.writers.atomic import write_text
 from geogs.types import Trajectory, Uncertainty
@@ -26,3 +27,12 @@ def write_uncertainty(path: str | Path, trajectory: Trajectory, known: Uncertain
         numbers = [f"{c[n]:.6g}" if state == "tracked" else "" for c in between]
         rows.append(",".join([repr(float(at[n])), state, *numbers]))
     write_text(path, "\n".join([*rows, ""]))
+
+
+def read_tracked(path: Path, timestamps: Float[np.ndarray, "n"]) -> Bool[np.ndarray, "n"]:
+    """Which frames were tracked, by the table of a run; all of them where there is no table."""
+    if not path.is_file():
+        return np.ones(len(timestamps), dtype=bool)
+    cells = [line.split(",")[:2] for line in path.read_text(encoding="utf-8").splitlines()[1:]]
+    states = {row[0]: row[1] for row in cells if len(row) == 2}
+    return np.array([states.get(repr(float(t))) != "lost" for t in timestamps], dtype=bool)

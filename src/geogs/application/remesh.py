@@ -1,0 +1,77 @@
+"""The mesh of a result, made anew from its folder without running again."""
+
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from geogs.config import MeshConfig
+from geogs.config.setting import Basic, Positional, Settings
+from geogs.errors import InputError
+
+if TYPE_CHECKING:
+    from geogs.application.progress import RunProgress
+
+
+@dataclass(frozen=True)
+class RemeshSettings(Settings):
+    """All that the making of another mesh is told."""
+
+    result: Annotated[Path, Positional()]
+    """Folder of a result, as geogs run and geogs reconstruct write it."""
+    mesh: MeshConfig = field(default_factory=MeshConfig)
+    """How the surface is made; what is not given is as the result was made with."""
+    output: Annotated[Path | None, Basic("-o")] = None
+    """File of the mesh, PLY; mesh.ply in the folder of the result if none is given."""
+    device: str = "auto"
+    """Where to compute: auto (a GPU where there is one), cpu, cuda or cuda:1."""
+
+
+def mesh_settings(folder: Path) -> MeshConfig:
+    """The settings that the mesh of a result was made with; the defaults where nothing is said.
+
+    Raises:
+        InputError: ``config.yaml`` is damaged, or holds a value that a setting cannot have.
+    """
+    import yaml
+
+    path = folder / "config.yaml"
+    if not path.is_file():
+        return MeshConfig()
+    try:
+        said: Any = yaml.safe_load(path.read_text(encoding="utf-8"))["mesh"]
+        known = {name.name: said[name.name] for name in fields(MeshConfig) if name.name in said}
+    except (OSError, KeyError, TypeError, ValueError, yaml.YAMLError) as error:
+        raise InputError(f"{path} is damaged ({type(error).__name__}).") from None
+    return replace(MeshConfig(), **known)
+
+
+def remesh(settings: RemeshSettings, progress: "RunProgress | None" = None) -> Path:
+    """Render the keyframes of a result, fuse their depths and write the mesh; the file's path.
+
+    On the CPU, with the settings of the run, the surface is that of the run to the last byte;
+    colours differ by what JPEG does to the images.
+
+    Raises:
+        InputError: there is no result, it is too old, or its disks show no surface.
+        OutputError: the file cannot be written.
+        DeviceError: the device cannot be used.
+    """
+    from geogs.application.progress import RunProgress
+    from geogs.application.saved_result import load_result
+    from geogs.application.surfaces import fusion_views
+    from geogs.gpu.installation import require_device
+    from geogs.io.writers.ply import write_mesh
+    from geogs.mesh.extract import extract_mesh
+
+    follow = progress or RunProgress()
+    path = settings.output or settings.result / "mesh.ply"
+    if path.suffix.lower() != ".ply":
+        raise InputError(f"{path} should end in .ply; geogs export writes other formats.")
+    result = load_result(settings.result, require_device(settings.device))
+    mesh = extract_mesh(
+        fusion_views(result.keyframes),
+        settings.mesh,
+        lambda part, done, of: follow.stage(f"mesh: {part}", done / of),
+    )
+    write_mesh(path, mesh.vertices, mesh.faces, mesh.colours, mesh.normals)
+    return path

@@ -1,0 +1,125 @@
+"""A result read from its folder: what ``load_result`` gives."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from geogs.errors import InputError
+from geogs.geometry.camera import Camera
+from geogs.io.poses import read_tum_trajectory
+from geogs.io.writers.keyframe_images import image_path, mask_path, read_image, read_mask
+from geogs.io.writers.map_views import MapViews, load_map_views
+from geogs.io.writers.uncertainty import read_tracked
+from geogs.mapping.map_frame import MapFrame
+from geogs.mapping.rendered import MapRenderer, SurfaceMaps, SurfaceRules
+from geogs.mesh.files import read_mesh
+from geogs.mesh.types import Mesh
+from geogs.on_demand import OnDemand
+from geogs.threads import on_one_torch_thread
+from geogs.types import MapSnapshot, RenderedKeyframe, Trajectory
+
+
+@dataclass(frozen=True)
+class SavedResult:
+    """What ``geogs run`` or ``geogs reconstruct`` left in a folder; files are read when asked for.
+
+    Poses are world to camera where they are called ``T_cw``; lengths are in map units.
+    """
+
+    folder: Path
+    disks: MapSnapshot
+    """In the world, on the device asked for."""
+    views: MapViews
+
+    @property
+    def name(self) -> str:
+        """Of the folder."""
+        return self.folder.resolve().name
+
+    @property
+    def camera(self) -> Camera:
+        """Of the keyframes' images."""
+        return self.views.camera
+
+    @property
+    def depth_camera(self) -> Camera:
+        """Of the keyframes' depth maps."""
+        return self.views.render_camera
+
+    @cached_property
+    def trajectory(self) -> Trajectory:
+        """Poses of all frames. Raises InputError if their file is missing or damaged."""
+        trajectory = read_tum_trajectory(self.folder / "trajectory.tum")
+        table = self.folder / "trajectory_uncertainty.csv"
+        tracked = read_tracked(table, trajectory.timestamps)
+        return Trajectory(trajectory.timestamps, trajectory.T_wc, tracked)
+
+    @cached_property
+    def summary(self) -> dict[str, Any]:
+        """What ``summary.json`` holds. Raises InputError if it is missing or damaged."""
+        path = self.folder / "summary.json"
+        try:
+            return dict(json.loads(path.read_text(encoding="utf-8")))
+        except (OSError, ValueError) as error:
+            raise InputError(f"{path} is missing or damaged ({error}).") from None
+
+    @cached_property
+    def mesh(self) -> Mesh | None:
+        """The mesh as it was written; none if there is none. Raises InputError if it is damaged."""
+        path = self.folder / "mesh.ply"
+        return read_mesh(path) if path.is_file() else None
+
+    @cached_property
+    def keyframes(self) -> Sequence[RenderedKeyframe]:
+        """Image, pose, depth, normal and weight of the keyframes, made when they are asked for."""
+        return OnDemand(range(len(self.views.keyframe_id)), self._keyframe)
+
+    @cached_property
+    def renderer(self) -> MapRenderer:
+        """What shows the map from anywhere."""
+        views = self.views
+        frame = MapFrame(views.origin, views.unit)
+        rules = SurfaceRules(views.min_alpha, views.max_spread)
+        return MapRenderer(views.disks, frame, views.render_camera, rules)
+
+    @on_one_torch_thread
+    def render(self, T_cw: Float[Tensor, "4 4"], camera: Camera | None = None) -> SurfaceMaps:
+        """Depth, normal and weight of the map seen from a pose, float64.
+
+        ``camera`` is that of the keyframes' depth maps if none is given.
+        """
+        return self.renderer.surface(T_cw, camera)
+
+    @on_one_torch_thread
+    def _keyframe(self, number: int) -> RenderedKeyframe:
+        views = self.views
+        number = range(len(views.keyframe_id))[number]
+        id, mask, image = int(views.keyframe_id[number]), None, None
+        T_cw = torch.from_numpy(views.T_cw[number])
+        if views.has_mask[number]:
+            mask = torch.from_numpy(read_mask(mask_path(self.folder, id)))
+            mask = mask.to(self.disks.position.device)
+        if views.has_images:
+            image = read_image(image_path(self.folder, id))
+        maps = self.renderer.surface(T_cw, mask=mask)
+        seconds = float(views.timestamp[number])
+        return RenderedKeyframe(id, self.depth_camera, T_cw, *maps, image, seconds, mask)
+
+
+def load_result(folder: str | Path, device: torch.device | str = "cpu") -> SavedResult:
+    """Read a result from its folder; the map goes to ``device``, where it is rendered.
+
+    Raises:
+        InputError: there is no result, it is damaged, or an older geogs wrote it.
+    """
+    folder = Path(folder).expanduser()
+    if not (folder / "map.safetensors").is_file():
+        raise InputError(f"{folder} holds no result of geogs: there is no map.safetensors in it.")
+    return SavedResult(folder, *load_map_views(folder / "map.safetensors", device))

@@ -1,0 +1,37 @@
+"""What is exported, whatever the format: posed images, and points with who sees them."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float32, Float64, Int64, UInt8
+
+OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
+"""Axes x right, y up, z backward from x right, y down, z forward."""
+
+
+@dataclass(frozen=True)
+class PosedImage:
+    """An image that has been written, and where it was taken."""
+
+    name: str
+    """Of the file, with its suffix."""
+    T_cw: Float64[np.ndarray, "4 4"]
+    """World to camera, OpenCV axes."""
+
+
+@dataclass(frozen=True)
+class SeenPoints:
+    """Points of the surface and the images that see them."""
+
+    positions: Float64[np.ndarray, "n 3"]
+    """In the world."""
+    normals: Float32[np.ndarray, "n 3"]
+    """In the world, towards the cameras."""
+    colours: UInt8[np.ndarray, "n 3"]
+    """RGB."""
+    seen_point: Int64[np.ndarray, "m"]
+    """Point of observation k; ascending."""
+    seen_image: Int64[np.ndarray, "m"]
+    """Image of observation k, by its place."""
+    seen_at: Float64[np.ndarray, "m 2"]
+    """Column and row of observation k, the centre of the first pixel at (0, 0)."""

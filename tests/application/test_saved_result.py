@@ -1,0 +1,110 @@
+"""A result that was written can be used again."""
+
+import numpy as np
+import pytest
+import torch
+
+import geogs
+from geogs.errors import InputError
+from geogs.geometry.lie import se3_exp
+from geogs.io.writers.keyframe_images import image_path, read_image
+from geogs.io.writers.native import save_map
+from saved_results import (
+    CAMERA,
+    DEPTH_CAMERA,
+    IDS,
+    MASKED,
+    ORIGIN,
+    UNIT,
+    depth_of_the_scene,
+    disks_of_the_scene,
+    make_result,
+    poses_of_the_scene,
+)
+
+
+@pytest.fixture(scope="module")
+def result(tmp_path_factory):
+    return geogs.load_result(make_result(tmp_path_factory.mktemp("result")))
+
+
+def test_keyframes_come_with_what_the_run_had(result):
+    assert [k.keyframe_id for k in result.keyframes] == IDS
+    assert (result.camera, result.depth_camera) == (CAMERA, DEPTH_CAMERA)
+    own = poses_of_the_scene()
+    for k, T_own in zip(result.keyframes, own, strict=True):
+        truth = UNIT * depth_of_the_scene(T_own, DEPTH_CAMERA)
+        depth, known = k.depth.numpy(), k.depth.numpy() > 0
+        assert known.mean() > (0.45 if k.keyframe_id == IDS[MASKED] else 0.95)
+        assert np.quantile(np.abs(depth / truth - 1)[known], 0.8) < 5e-3
+        assert k.image.shape == (60, 80, 3)
+        np.testing.assert_allclose(k.normal.norm(dim=-1)[k.depth > 0], 1.0, atol=1e-4)
+        assert ((k.normal * DEPTH_CAMERA.rays()).sum(-1)[k.depth > 0] < 0).all()
+    masked = result.keyframes[MASKED]
+    assert (masked.depth[:, 20:] == 0).all()
+    assert (masked.weight[:, 20:] == 0).all()
+    assert result.keyframes[1].timestamp == pytest.approx(2 / 30)
+    np.testing.assert_array_equal(result.trajectory.tracked, True)
+
+
+def test_the_map_can_be_seen_from_anywhere_with_any_camera(result):
+    T_own = se3_exp(torch.tensor([0.3, -0.1, 0.2, 0.05, -0.1, 0.02], dtype=torch.float64))
+    T_cw = T_own.clone()
+    T_cw[:3, 3] = UNIT * T_own[:3, 3] - T_own[:3, :3] @ torch.from_numpy(ORIGIN)
+    camera = geogs.Camera(50.0, 50.0, 31.5, 23.5, 64, 48)
+    maps = result.render(T_cw, camera)
+    truth = UNIT * depth_of_the_scene(T_own.numpy(), camera)
+    known = maps.depth.numpy() > 0
+    assert known.mean() > 0.9
+    assert np.quantile(np.abs(maps.depth.numpy() / truth - 1)[known], 0.8) < 5e-3
+
+
+def test_disks_are_in_the_world_for_those_who_only_want_them(result):
+    disks = geogs.load_map(result.folder / "map.safetensors")
+    expected = disks_of_the_scene().position.double() * UNIT + torch.from_numpy(ORIGIN)
+    np.testing.assert_allclose(disks.position, expected, rtol=1e-6)
+    np.testing.assert_array_equal(result.disks.scale, disks.scale)
+
+
+def test_loaded_disks_are_rendered_as_they_are(result):
+    disks = geogs.load_map(result.folder / "map.safetensors")
+    T_cw = torch.from_numpy(result.views.T_cw[0])
+    alone = geogs.render(disks, DEPTH_CAMERA, T_cw).median_depth
+    depth = result.keyframes[0].depth
+    shown = (depth > 0) & (alone > 0)
+    assert shown.float().mean() > 0.9
+    assert ((alone - depth).abs() / depth)[shown].median() < 1e-3
+
+
+def test_lost_frames_are_known_from_the_table(tmp_path):
+    folder = make_result(tmp_path)
+    times = geogs.load_result(folder).trajectory.timestamps
+    rows = [f"{float(t)!r},{'lost' if i == 1 else 'tracked'},1,1,1" for i, t in enumerate(times)]
+    (folder / "trajectory_uncertainty.csv").write_text("\n".join(["timestamp,state", *rows]))
+    tracked = geogs.load_result(folder).trajectory.tracked
+    assert tracked.tolist() == [True, False, True, True, True]
+
+
+def test_without_images_all_else_is_there(tmp_path):
+    result = geogs.load_result(make_result(tmp_path, with_images=False))
+    keyframe = result.keyframes[0]
+    assert keyframe.image is None
+    assert float((keyframe.depth > 0).float().mean()) > 0.95
+
+
+def test_what_cannot_be_used_is_told_in_a_sentence(tmp_path, result):
+    with pytest.raises(InputError, match=r"holds no result of geogs"):
+        geogs.load_result(tmp_path)
+    save_map(tmp_path / "map.safetensors", disks_of_the_scene(), {"source": "old"})
+    with pytest.raises(InputError, match="an older geogs wrote it; run again"):
+        geogs.load_result(tmp_path)
+    cut = image_path(tmp_path, IDS[1])
+    for content in (None, b"", b"no JPEG"):
+        if content is not None:
+            cut.parent.mkdir(exist_ok=True)
+            cut.write_bytes(content)
+        with pytest.raises(InputError, match=r"000002.jpg is missing or damaged"):
+            read_image(cut)
+    with pytest.raises(InputError, match=r"summary.json is missing"):
+        _ = result.summary
+    assert result.mesh is None

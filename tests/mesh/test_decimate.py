@@ -1,0 +1,117 @@
+"""Fewer triangles, the same surface."""
+
+import numpy as np
+import pytest
+
+from geogs.errors import InputError
+from geogs.io.writers.ply import write_mesh
+from geogs.mesh.decimate import MEAN_SHARE, QUANTILE, decimate
+from geogs.mesh.deviation import deviations, triangle_distance
+from geogs.mesh.files import read_mesh
+from geogs.mesh.types import Mesh
+
+
+def hills(n: int = 60) -> Mesh:
+    """A square with a bump in the middle; sides are straight, half of it is flat."""
+    line = np.linspace(-1, 1, n)
+    y, x = np.meshgrid(line, line, indexing="ij")
+    z = 0.3 * np.exp(-8 * (x**2 + y**2))
+    corner = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).ravel()
+    faces = np.concatenate([
+        np.stack([corner, corner + 1, corner + n], -1),
+        np.stack([corner + 1, corner + n + 1, corner + n], -1),
+    ])  # fmt: skip
+    mesh = Mesh.from_triangles(np.stack([x, y, z], -1).reshape(-1, 3), faces)
+    colours = np.stack([127 * (x + 1), 127 * (y + 1), 0 * x], -1).reshape(-1, 3)
+    return Mesh(mesh.vertices, mesh.faces, mesh.normals, colours.astype(np.uint8))
+
+
+def border(mesh: Mesh) -> set[tuple[float, ...]]:
+    """Vertices at edges that one face has."""
+    edges = np.sort(mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    edges, count = np.unique(edges, axis=0, return_counts=True)
+    return set(map(tuple, mesh.vertices[np.unique(edges[count == 1])].tolist()))
+
+
+def slow_distance(point: np.ndarray, corners: np.ndarray) -> float:
+    """The least of the distances to many points of a triangle."""
+    s, t = np.meshgrid(np.linspace(0, 1, 300), np.linspace(0, 1, 300))
+    inside = s + t <= 1
+    a, b, c = corners
+    points = a + s[inside][:, None] * (b - a) + t[inside][:, None] * (c - a)
+    return float(np.linalg.norm(points - point, axis=1).min())
+
+
+def test_distance_to_a_triangle_is_that_to_the_nearest_of_its_points():
+    random = np.random.default_rng(0)
+    points, a, b, c = random.normal(size=(4, 60, 3))
+    fast = triangle_distance(points, a, b, c)
+    slow = [slow_distance(p, np.stack(t)) for p, *t in zip(points, a, b, c, strict=True)]
+    assert (fast <= np.array(slow) + 1e-9).all()
+    np.testing.assert_allclose(fast, slow, atol=0.02)
+
+
+def test_distance_to_a_triangle_without_area_is_that_to_its_edge():
+    a, b = np.zeros((1, 3)), np.array([[2.0, 0, 0]])
+    for c in (a, b, (a + b) / 2):
+        assert triangle_distance(np.array([[1.0, 3, 4]]), a, b, c)[0] == pytest.approx(5.0)
+
+
+def test_deviation_is_the_distance_to_the_mesh():
+    mesh = hills()
+    moved = mesh.vertices + 0.02 * mesh.normals
+    found = deviations(moved[:500], mesh.vertices, mesh.faces)
+    assert found.max() <= 0.02 + 1e-6
+    assert np.median(found) == pytest.approx(0.02, rel=0.05)
+
+
+@pytest.mark.parametrize("tolerance", [0.002, 0.01])
+def test_the_surface_stays_within_the_tolerance_and_keeps_its_border(tolerance):
+    mesh = hills()
+    few = decimate(mesh, tolerance)
+    assert len(few.faces) < 0.5 * len(mesh.faces)
+    away = deviations(mesh.vertices, few.vertices, few.faces)
+    assert np.quantile(away, QUANTILE) <= tolerance * 1.1
+    assert away.mean() <= 1.1 * MEAN_SHARE * tolerance
+    assert border(few) == border(mesh)
+    assert few.faces.min() == 0
+    assert few.faces.max() == len(few.vertices) - 1
+    facing = Mesh.from_triangles(few.vertices, few.faces).normals[:, 2]
+    assert (facing > 0.3).all()
+
+
+def test_colours_and_normals_are_those_of_the_surface_there():
+    mesh = hills()
+    few = decimate(mesh, 0.01)
+    x, y = few.vertices[:, 0], few.vertices[:, 1]
+    expected = np.stack([127 * (x + 1), 127 * (y + 1)], -1)
+    assert np.abs(few.colours[:, :2] - expected).mean() < 6
+    radius = 0.3 * np.exp(-8 * (x**2 + y**2)) * 16
+    normal = np.stack([radius * x, radius * y, np.ones(len(x))], -1)
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    assert np.median((normal * few.normals).sum(-1)) > 0.99
+    np.testing.assert_allclose(np.linalg.norm(few.normals, axis=1), 1, atol=1e-5)
+
+
+def test_nothing_happens_where_nothing_may_move_and_twice_is_the_same():
+    mesh = hills()
+    assert decimate(mesh, 0.0) is mesh
+    once, twice = decimate(mesh, 0.005), decimate(mesh, 0.005)
+    np.testing.assert_array_equal(once.vertices, twice.vertices)
+    np.testing.assert_array_equal(once.faces, twice.faces)
+
+
+def test_a_mesh_is_read_as_it_was_written(tmp_path):
+    mesh = hills(8)
+    path = tmp_path / "mesh.ply"
+    write_mesh(path, mesh.vertices, mesh.faces, mesh.colours, mesh.normals)
+    read = read_mesh(path)
+    for name in ("vertices", "faces", "normals", "colours"):
+        np.testing.assert_array_equal(getattr(read, name), getattr(mesh, name))
+    write_mesh(path, mesh.vertices, mesh.faces)
+    read = read_mesh(path)
+    assert read.colours is None
+    np.testing.assert_allclose(read.normals, mesh.normals, atol=1e-6)
+    write_mesh(path, mesh.vertices[:5], mesh.faces)
+    with pytest.raises(InputError, match="no triangles of its vertices"):
+        read_mesh(path)

@@ -1,0 +1,108 @@
+"""Small holes are closed; large ones, and those that somebody looked through, are not."""
+
+import numpy as np
+import pytest
+import torch
+
+from geogs.config import MeshConfig
+from geogs.geometry.camera import Camera
+from geogs.mesh.clean import keep_faces
+from geogs.mesh.extract import extract_mesh
+from geogs.mesh.holes import border_loops, close_holes
+from geogs.mesh.tsdf import BLOCK, SparseTsdf
+from geogs.mesh.types import DepthMapView, Mesh
+
+N = 21
+
+
+def never(points: np.ndarray) -> np.ndarray:
+    return np.zeros(len(points), bool)
+
+
+def sheet(*holes: tuple[int, int, int]) -> Mesh:
+    """A slightly curved grid without the cells of squares: row, column, side."""
+    y, x = np.meshgrid(np.arange(N), np.arange(N), indexing="ij")
+    z = 0.01 * (x - 10.0) ** 2
+    cell = (np.arange(N - 1)[:, None] * N + np.arange(N - 1)).ravel()
+    faces = np.stack([cell, cell + 1, cell + N, cell + 1, cell + N + 1, cell + N], -1)
+    keep = np.ones((N - 1, N - 1), bool)
+    for row, column, side in holes:
+        keep[row : row + side, column : column + side] = False
+    mesh = Mesh.from_triangles(np.stack([x, y, z], -1).reshape(-1, 3), faces.reshape(-1, 3))
+    return keep_faces(mesh, np.repeat(keep.ravel(), 2))
+
+
+def open_edges(mesh: Mesh) -> int:
+    edges = np.sort(mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    count = np.unique(edges, axis=0, return_counts=True)[1]
+    assert count.max() <= 2
+    return int((count == 1).sum())
+
+
+def test_loops_go_round_every_border_once():
+    loops = list(border_loops(sheet((3, 3, 1), (8, 8, 3)).faces))
+    assert sorted(map(len, loops)) == [4, 12, 80]
+    assert len({vertex for loop in loops for vertex in loop}) == 96
+
+
+def test_small_holes_are_closed_and_turn_the_same_side_up():
+    mesh = sheet((3, 3, 1), (8, 8, 3))
+    small = close_holes(mesh, 8, never)
+    assert open_edges(small) == 80 + 12
+    both = close_holes(mesh, 16, never)
+    assert open_edges(both) == 80
+    assert len(both.vertices) == len(mesh.vertices) + 2
+    up = Mesh.from_triangles(both.vertices, both.faces).normals
+    assert (up[:, 2] > 0.9).all()
+    np.testing.assert_allclose((both.normals[-2:] * up[-2:]).sum(-1), 1, atol=0.02)
+
+
+def test_holes_that_touch_at_a_vertex_stay_open():
+    mesh = sheet((3, 3, 1), (4, 4, 1))
+    assert open_edges(close_holes(mesh, 16, never)) == 80 + 8
+
+
+def test_what_is_free_and_what_folds_over_stays_open():
+    mesh = sheet((3, 3, 1), (12, 12, 1))
+
+    def high(points: np.ndarray) -> np.ndarray:
+        return points[:, 1] > 10
+
+    assert open_edges(close_holes(mesh, 16, high)) == 80 + 4
+    lone = Mesh.from_triangles(np.eye(3), np.array([[0, 1, 2]]))
+    assert len(close_holes(lone, 16, never).faces) == 1  # its outer border runs the other way
+
+
+def test_the_voxel_nearest_to_a_point_is_looked_up():
+    tsdf = SparseTsdf(0.1, 4.0)
+    camera = Camera(40.0, 40.0, 19.5, 14.5, 40, 30)
+    depth = torch.full((30, 40), 2.0)
+    tsdf.integrate(depth, torch.ones(30, 40), camera, torch.eye(4, dtype=torch.float64))
+    random = np.random.default_rng(0)
+    points = torch.from_numpy(random.uniform([-1, -1, 1.4], [1, 1, 2.5], (200, 3)))
+    distance, weight = tsdf.nearest(points)
+    for point, d, w in zip(points, distance, weight, strict=True):
+        voxel = torch.round(point / 0.1).long()
+        block = torch.div(voxel, BLOCK, rounding_mode="floor")
+        slot = (tsdf.coordinates == block).all(-1).nonzero()[:, 0]
+        place = tuple((voxel - BLOCK * block).tolist())
+        expected = (1.0, 0.0)
+        if len(slot):
+            expected = (float(tsdf.distance[slot[0]][place]), float(tsdf.weight[slot[0]][place]))
+        assert (float(d), float(w)) == expected
+    assert float((weight > 0).float().mean()) > 0.2
+    far = tsdf.nearest(torch.tensor([[1e9, 0.0, 0.0]]))
+    assert (float(far[0]), float(far[1])) == (1.0, 0.0)
+
+
+@pytest.mark.parametrize("looked_through", [False, True])
+def test_a_gap_in_the_depths_is_closed_unless_there_is_more_behind(looked_through):
+    camera = Camera(60.0, 60.0, 31.5, 23.5, 64, 48)
+    depth = torch.full((48, 64), 2.0)
+    depth[20:23, 30:33] = 2.6 if looked_through else 0.0
+    pose = torch.eye(4, dtype=torch.float64)
+    views = [DepthMapView(depth, (depth > 0).float(), camera, pose) for _ in range(3)]
+    few = {"voxel": 0.035, "detail": 0, "min_component_faces": 10, "colour": False}
+    as_it_was = extract_mesh(views, MeshConfig(**few, close_holes=0))
+    closed = extract_mesh(views, MeshConfig(**few, close_holes=24))
+    assert (open_edges(closed) == open_edges(as_it_was)) == looked_through
