@@ -70,7 +70,9 @@ class RoomSampler:
         rooms = Rooms(size, solids, plan.rooms.surfaces, plan.rooms.lights)
         rendering = render(rooms, self.bank, views)
         images = develop(Draw(self.device, *key), plan.flaws, rendering.colour)
-        return ClipBatch(images, rendering.depth, views.T_cw, views.intrinsics, solids)
+        return ClipBatch(
+            images, rendering.depth, rendering.normal, views.T_cw, views.intrinsics, solids
+        )
 
 
 @torch.no_grad()
