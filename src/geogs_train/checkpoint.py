@@ -12,15 +12,14 @@ from torch import Tensor
 
 from geogs.errors import InputError
 from geogs.io.writers.atomic import atomic_file
-from geogs_train.options import FlowTraining
-from geogs_train.trainer import FlowTrainer
+from geogs_train.trainer import Trainer
 
 FILE = "checkpoint.safetensors"
 T = TypeVar("T")
 _PARTS = ("network", "mean", "first_moment", "second_moment")
 
 
-def save_checkpoint(trainer: FlowTrainer, out: Path) -> None:
+def save_checkpoint(trainer: Trainer, out: Path) -> None:
     """Write all that the run needs to go on; the one before stays until the new one is whole.
 
     Raises:
@@ -44,13 +43,16 @@ def save_checkpoint(trainer: FlowTrainer, out: Path) -> None:
         stream.write(save(tensors, metadata=header))
 
 
-def read_options(out: Path) -> FlowTraining:
-    """The settings of the run in a folder; raises InputError where there is none."""
+def read_options(out: Path, kind: type[T]) -> T:
+    """The settings of the run in a folder; raises InputError where there is none of this kind."""
     header, _ = _read(out, with_tensors=False)
-    return _revived(FlowTraining, json.loads(header["options"]))
+    try:
+        return _revived(kind, json.loads(header["options"]))
+    except AttributeError as error:
+        raise InputError(f"The checkpoint in {out} is of another network ({error}).") from error
 
 
-def load_checkpoint(trainer: FlowTrainer, out: Path) -> None:
+def load_checkpoint(trainer: Trainer, out: Path) -> None:
     """Go on from a checkpoint; raises InputError where there is none or it is damaged."""
     header, tensors = _read(out, with_tensors=True)
     step, names = int(header["step"]), [name for name, _ in trainer.network.named_parameters()]

@@ -5,18 +5,16 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import distributed
 
 from geogs.errors import GeogsError
-from geogs.tracking.flow.own import load_network
 from geogs_train.checkpoint import load_checkpoint, save_checkpoint
-from geogs_train.export import export_weights
-from geogs_train.options import FlowTraining, RunOptions
-from geogs_train.scores import FlowScores
-from geogs_train.trainer import FlowTrainer, Worker
-from geogs_train.validation import Validation
+from geogs_train.course import Course, Examination, Scores, Worker
+from geogs_train.options import RunOptions
+from geogs_train.trainer import Trainer
 
 LOG = "log.jsonl"
 REPORT_EVERY = 50
@@ -27,26 +25,25 @@ Progress = Callable[[str], None]
 """Called with a line of text."""
 
 
-def train_flow(
-    options: FlowTraining, run: RunOptions, out: Path, worker: Worker, progress: Progress
-) -> FlowScores | None:
+def train(
+    course: Course, run: RunOptions, out: Path, worker: Worker, progress: Progress
+) -> Scores | None:
     """Train until the last step or the last minute; returns the last validation's scores.
 
-    The first worker writes ``checkpoint.safetensors``, ``log.jsonl`` and ``flow.safetensors`` (the
-    running mean of the weights in half precision) to ``out``. Ctrl-C ends it as the last minute
-    does.
+    The first worker writes ``checkpoint.safetensors``, ``log.jsonl`` and the course's weights
+    (their running mean in half precision) to ``out``. Ctrl-C ends it as the last minute does.
 
     Raises:
         GeogsError: the weights are no longer finite.
     """
     begin = time.monotonic()
-    trainer = FlowTrainer(options, worker, run.fuse)
+    trainer, options = Trainer(course, worker, run.fuse), course.options
     if run.begin_with:
-        trainer.begin_with(load_network(Path(run.begin_with)))
+        trainer.begin_with(course.load(Path(run.begin_with)))
     if run.resume:
         load_checkpoint(trainer, out)
     first = worker.rank == 0
-    validation = Validation(options, worker.device, run.validation_batches) if first else None
+    validation = course.examination(run.validation_batches) if first else None
     out.mkdir(parents=True, exist_ok=True)
     scores, since, at = None, time.monotonic(), trainer.step
     try:
@@ -72,18 +69,16 @@ def train_flow(
     except KeyboardInterrupt:
         progress("interrupted; writing what there is")
     finally:
-        trainer.close()
+        course.close()
     if validation is not None:
         scores = _validate(trainer, validation, out, progress)
         save_checkpoint(trainer, out)
-        export_weights(trainer.mean, out / "flow.safetensors", trainer.step, scores)
+        course.export(trainer.mean, out / course.weights, trainer.step, scores)
     return scores
 
 
-def _validate(
-    trainer: FlowTrainer, validation: Validation, out: Path, progress: Progress
-) -> FlowScores:
-    scores = validation.score(trainer.mean, trainer.options.iterations)
+def _validate(trainer: Trainer, validation: Examination, out: Path, progress: Progress) -> Any:
+    scores = validation.score(trainer.mean)
     _log(out, {"step": trainer.step, "scores": asdict(scores)})
     progress(f"validation at step {trainer.step}: {scores.line()}")
     return scores

@@ -8,12 +8,12 @@ import torch
 
 from geogs.geometry.camera import Camera
 from geogs.keyframes.grid import OFFSET, STRIDE, SampleGrid
+from geogs.networks.weights_files import PACKAGED
 from geogs.synth.raycast import Raycaster
 from geogs.synth.room import make_room
 from geogs.synth.trajectory import handheld_trajectory
 from geogs.tracking.flow.classical import ClassicalFlow
 from geogs.tracking.flow.own import OwnFlow, OwnFlowOptions
-from geogs.tracking.flow.weights_files import PACKAGED
 
 pytestmark = pytest.mark.system
 
