@@ -58,9 +58,9 @@ class DepthCourse:
         return DepthNetwork(self.options.network)
 
     def compile(self, network: DepthNetwork) -> None:
-        """As in the protocol: what sees a fixed number of images."""
-        network.context.compile(dynamic=False)
-        network.body.compile(dynamic=False)
+        """As in the protocol: what sees batches of one size, whatever the number of neighbours."""
+        for part in (network.matching, network.context, network.volume.scorer, network.body):
+            part.compile(dynamic=False)
 
     @torch.no_grad()
     def batch(self, step: int) -> DepthBatch:

@@ -3,7 +3,7 @@
 from dataclasses import asdict, dataclass, field
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, UInt8
 from torch import Tensor
 from torch.nn import functional
 
@@ -25,7 +25,7 @@ class DepthErrors:
     """Predicted probability that the depth is an outlier."""
     angle: Float[Tensor, "n"]
     """Between found and true normals, degrees."""
-    kind: Int[Tensor, "n"]
+    kind: UInt8[Tensor, "n"]
     """Index into ``KINDS``."""
 
     @staticmethod
@@ -102,7 +102,7 @@ def summarise(pixels: DepthErrors) -> DepthScores:
     )
 
 
-def texture_kind(light: Float[Tensor, "n 3 h w"]) -> Int[Tensor, "n h w"]:
+def texture_kind(light: Float[Tensor, "n 3 h w"]) -> UInt8[Tensor, "n h w"]:
     """Of every pixel, from linear light before the camera: 0 textured, 1 faint, 2 bare."""
     level = light.sqrt().mean((1, 2, 3), keepdim=True).square().clamp_min(1e-4)
     grey = (0.2 / level * light).clamp(1e-5, 1).pow(1 / 2.2).mean(1, keepdim=True) * 255
@@ -111,7 +111,7 @@ def texture_kind(light: Float[Tensor, "n 3 h w"]) -> Int[Tensor, "n h w"]:
     down = 0.5 * (padded[..., 2:, 1:-1] - padded[..., :-2, 1:-1])
     energy = across.square() + down.square()
     mean = functional.avg_pool2d(energy, 9, 1, 4, count_include_pad=False)[:, 0]
-    return (mean < TEXTURED**2).long() + (mean < FAINT**2).long()
+    return (mean < TEXTURED**2).to(torch.uint8) + (mean < FAINT**2).to(torch.uint8)
 
 
 def _within(error: Tensor, factor: float) -> float:

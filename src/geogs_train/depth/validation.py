@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from geogs.depth.network.model import DepthNetwork
@@ -29,7 +29,7 @@ class DepthValidation:
         self.options = options
         chance = Chance(torch.Generator(device).manual_seed(seed))
         self.batches: list[DepthBatch] = []
-        self.kinds: list[Int[Tensor, "b h w"]] = []
+        self.kinds: list[UInt8[Tensor, "b h w"]] = []
         tuples = options.tuples
         span = tuples.most_neighbours - tuples.least_neighbours + 1
         for number in range(batches):
@@ -39,7 +39,7 @@ class DepthValidation:
             batch = draw_tuples(stored, options.batch, count, tuples, chance)
             clip, view = batch.place.unbind(1)
             self.batches.append(batch)
-            self.kinds.append(texture_kind(clips.light[clip, view]).to(torch.uint8))
+            self.kinds.append(texture_kind(clips.light[clip, view]))
 
     @torch.no_grad()
     def errors(self, network: DepthNetwork) -> list[DepthErrors]:
@@ -58,7 +58,7 @@ class DepthValidation:
 
 
 def pixel_errors(
-    batch: DepthBatch, found: DepthPrediction, kind: Int[Tensor, "b h w"]
+    batch: DepthBatch, found: DepthPrediction, kind: UInt8[Tensor, "b h w"]
 ) -> DepthErrors:
     """Errors of some of the pixels of a batch."""
     error = (found.depth(batch.views.typical) / batch.depth).log()
