@@ -1,6 +1,6 @@
 """Where the time of the depth network's training goes, on a GPU.
 
-    python benchmarks/depth_training.py [--seconds 20] [--profile]
+    python benchmarks/depth_training.py [--fuse] [--profile]
 
 How fast rooms are drawn and rendered, how long steps with small and large images take for few and
 many neighbours, and how much memory they need.
@@ -25,12 +25,13 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=8)
     parser.add_argument("--batch", type=int, default=12)
     parser.add_argument("--small-batch", type=int, default=24)
+    parser.add_argument("--neighbours", type=int, nargs="*", default=(3, 5, 8))
     parser.add_argument("--device", default="cuda")
     parser.add_argument("--fuse", action="store_true")
     parser.add_argument("--profile", action="store_true")
     options = parser.parse_args()
     device = torch.device(options.device)
-    for neighbours in (3, 5, 8):
+    for neighbours in options.neighbours:
         training = DepthTraining(
             batch=options.batch,
             small_batch=options.small_batch,
@@ -38,13 +39,14 @@ def main() -> None:
         )
         training = replace(
             training,
+            rooms=replace(training.rooms, textures=32, texture_size=256),
             tuples=replace(
                 training.tuples, least_neighbours=neighbours, most_neighbours=neighbours
             ),
         )
         course = DepthCourse(training, Worker(device))
         trainer = Trainer(course, Worker(device), options.fuse)
-        if neighbours == 3:
+        if neighbours == options.neighbours[0]:
             measure_rooms(course, training, device)
         for small in (True, False):
             step = next(n for n in range(20) if course.place(n)[0] == small)
