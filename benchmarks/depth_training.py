@@ -49,8 +49,7 @@ def main() -> None:
         if neighbours == options.neighbours[0]:
             measure_rooms(course, training, device)
         for small in (True, False):
-            step = next(n for n in range(20) if course.place(n)[0] == small)
-            measure_steps(trainer, course, step, small, neighbours, options)
+            measure_steps(trainer, course, small, neighbours, options)
         course.close()
 
 
@@ -68,23 +67,23 @@ def measure_rooms(course: DepthCourse, training: DepthTraining, device: torch.de
 def measure_steps(
     trainer: Trainer,
     course: DepthCourse,
-    step: int,
     small: bool,
     neighbours: int,
     options: argparse.Namespace,
 ) -> None:
     """Steps with one size of images and one number of neighbours."""
     device = trainer.worker.device
+    progress = 0.1 if small else 0.9
     begin = time.perf_counter()
-    course.batch(step)
+    course.batch(0, progress)
     synchronise(device)
     filled = time.perf_counter() - begin
-    drawing = timed(lambda: course.batch(step), options.steps, device)
+    drawing = timed(lambda: course.batch(0, progress), options.steps, device)
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats()
 
     def one() -> None:
-        trainer.step = step
+        trainer.step, trainer.progress = 0, progress
         trainer.advance()
 
     begin = time.perf_counter()

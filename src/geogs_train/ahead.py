@@ -40,6 +40,11 @@ class PlansAhead:
             self._waiting.append((following, self._pool.submit(self._draw, following)))
         return pickle.loads(self._waiting.popleft()[1].result())
 
+    def rest(self) -> None:
+        """Draw nothing until a plan is asked for again."""
+        while self._waiting:
+            self._waiting.popleft()[1].cancel()
+
     def close(self) -> None:
         """End the processes."""
         self._pool.shutdown(wait=False, cancel_futures=True)

@@ -38,7 +38,11 @@ def save_checkpoint(trainer: Trainer, out: Path) -> None:
         for part, some in parts.items()
         for name, x in some.items()
     }
-    header = {"step": str(trainer.step), "options": json.dumps(asdict(trainer.options))}
+    header = {
+        "step": str(trainer.step),
+        "progress": repr(trainer.progress),
+        "options": json.dumps(asdict(trainer.options)),
+    }
     with atomic_file(out / FILE) as stream:
         stream.write(save(tensors, metadata=header))
 
@@ -73,7 +77,7 @@ def load_checkpoint(trainer: Trainer, out: Path) -> None:
             for k, name in enumerate(names)
         }
     trainer.optimizer.load_state_dict(optimizer)
-    trainer.step = step
+    trainer.step, trainer.progress = step, float(header["progress"])
 
 
 def _revived(kind: type[T], values: dict[str, Any]) -> T:
@@ -100,6 +104,6 @@ def _read(out: Path, with_tensors: bool) -> tuple[dict[str, str], dict[str, Tens
             header, tensors = file.metadata() or {}, {n: file.get_tensor(n) for n in names}
     except (SafetensorError, OSError) as error:
         raise InputError(f"The checkpoint in {out} is damaged ({error}).") from error
-    if not header.keys() >= {"step", "options"}:
+    if not header.keys() >= {"step", "progress", "options"}:
         raise InputError(f"{path} is no checkpoint of a training run.")
     return header, tensors

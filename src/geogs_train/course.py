@@ -106,8 +106,9 @@ class Course(Protocol):
         """Compile the parts of a network that are worth it."""
         ...
 
-    def batch(self, step: int) -> Any:
-        """What a step learns from; the same whenever it is asked for."""
+    def batch(self, step: int, progress: float) -> Any:
+        """What a step learns from, when such a share of the run is done; the same whenever it is
+        asked for."""
         ...
 
     def loss(self, network: Any, batch: Any) -> Float[Tensor, ""]:

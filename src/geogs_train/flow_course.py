@@ -44,7 +44,7 @@ class FlowCourse:
         network.encoder.compile(dynamic=False)
         network.update.compile(dynamic=False)
 
-    def batch(self, step: int) -> Any:
+    def batch(self, step: int, progress: float) -> Any:
         """As in the protocol."""
         clips = self.rooms.film(self._plan(step))
         generator = torch.Generator(self.worker.device)

@@ -16,6 +16,7 @@ from geogs_train.depth.course import DepthCourse
 from geogs_train.depth.options import DepthTraining
 from geogs_train.flow_course import FlowCourse
 from geogs_train.options import FlowTraining, RunOptions
+from geogs_train.pace import shared
 from geogs_train.run import train
 
 
@@ -37,6 +38,7 @@ def launch(
             training = read_options(out, type(training))
         course = _course(training, worker)
         train(course, run, out, worker, progress)
+        shared(0.0, worker)  # nobody leaves before the first has written everything
     if worker.rank == 0:
         draw_curves(out, course.curves)
 
@@ -57,8 +59,11 @@ def _worker(device: str) -> Iterator[Worker]:
     if count == 1:
         yield Worker(used)
         return
-    torch.cuda.set_device(used)
-    distributed.init_process_group("nccl", device_id=used)
+    if used.type == "cuda":
+        torch.cuda.set_device(used)
+        distributed.init_process_group("nccl", device_id=used)
+    else:
+        distributed.init_process_group("gloo")
     try:
         yield Worker(used, rank, count)
     finally:

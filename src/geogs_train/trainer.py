@@ -19,7 +19,10 @@ class Trainer:
     bit).
     """
 
-    def __init__(self, course: Course, worker: Worker, fuse: bool = False) -> None:
+    def __init__(
+        self, course: Course, worker: Worker, fuse: bool = False, paced: bool = False
+    ) -> None:
+        """``paced``: ``progress`` is set by who calls, not by the share of the steps."""
         self.course, self.worker = course, worker
         self.options = options = course.options
         torch.manual_seed(options.seed)
@@ -35,6 +38,8 @@ class Trainer:
             fused=worker.device.type == "cuda",
         )
         self.step = 0
+        self.progress, self._paced = 0.0, paced
+        """``progress`` is the share of the run that is done; what is learnt depends on it."""
         self._graph: StepGraph | None = None
         if fuse:
             course.compile(self.network)
@@ -42,7 +47,7 @@ class Trainer:
     def advance(self) -> Float[Tensor, ""]:
         """Take a step; returns its loss, which stays on the device."""
         options = self.options
-        loss = self._gradients(self.course.batch(self.step))
+        loss = self._gradients(self.course.batch(self.step, self.progress))
         if self.worker.count > 1:
             distributed.all_reduce(self._gradient)
             self._gradient /= self.worker.count
@@ -50,9 +55,11 @@ class Trainer:
         # A step from a loss that is not finite would be the last.
         self._gradient.nan_to_num_(0.0, 0.0, 0.0)
         for group in self.optimizer.param_groups:
-            group["lr"] = options.learning_rate * schedule(self.step, options)
+            group["lr"] = options.learning_rate * schedule(self.step, self.progress, options)
         self.optimizer.step()
         self.step += 1
+        if not self._paced:
+            self.progress = self.step / options.steps
         decay = min(options.ema, (1 + self.step) / (10 + self.step))
         with torch.no_grad():
             means: list[Tensor] = [*self.mean.parameters()]
@@ -82,12 +89,10 @@ class Trainer:
         return loss.detach()
 
 
-def schedule(step: int, options: Schedule) -> float:
-    """Learning rate of a step over its peak: a linear warm-up, then half a cosine."""
-    if step < options.warmup:
-        return (step + 1) / options.warmup
-    done = (step - options.warmup) / max(options.steps - options.warmup, 1)
-    return 0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * min(done, 1.0)))
+def schedule(step: int, progress: float, options: Schedule) -> float:
+    """Learning rate of a step over its peak: half a cosine, begun with a linear warm-up."""
+    rate = 0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * min(progress, 1.0)))
+    return rate * min(1.0, (step + 1) / max(options.warmup, 1))
 
 
 def _on_device(network: nn.Module, device: torch.device) -> nn.Module:

@@ -21,12 +21,11 @@ from geogs_train.depth.validation import DepthValidation
 from geogs_train.rooms.draw import Draw
 from geogs_train.rooms.sampler import RoomSampler
 
-_CYCLE = 10
-"""Steps in which small and large images come in their shares."""
+CALIBRATION_BATCHES, CALIBRATION_SEED = 6, 9
 
 
 class DepthCourse:
-    """Steps with small and with large images, each size with a pool of its own."""
+    """Small images first, then large ones, each size with a pool of its own."""
 
     weights = "depth.safetensors"
     curves: Panels = (
@@ -52,6 +51,7 @@ class DepthCourse:
         self._pools = [
             self._pool(rooms, options.seed + n) for n, rooms in enumerate((large, small))
         ]
+        self._held_out: DepthValidation | None = None
 
     def network(self) -> DepthNetwork:
         """As in the protocol."""
@@ -59,16 +59,18 @@ class DepthCourse:
 
     def compile(self, network: DepthNetwork) -> None:
         """As in the protocol: what sees batches of one size, whatever the number of neighbours."""
-        for part in (network.matching, network.context, network.volume.scorer, network.body):
+        for part in (network.context, network.body):
             part.compile(dynamic=False)
 
     @torch.no_grad()
-    def batch(self, step: int) -> DepthBatch:
+    def batch(self, step: int, progress: float) -> DepthBatch:
         """As in the protocol; the size of the images and the number of neighbours are those of all
         workers."""
         options, device = self.options, self.worker.device
-        small, turn = self.place(step)
-        clips = self._pools[small].at(turn // options.pool.refresh)
+        small = progress < options.small
+        if not small:
+            self._pools[True].empty()
+        clips = self._pools[small].at(step // options.pool.refresh)
         shared = Draw(torch.device("cpu"), options.seed, step)
         least, most = options.tuples.least_neighbours, options.tuples.most_neighbours
         count = least + int(shared.integers(most - least + 1, 1))
@@ -76,16 +78,7 @@ class DepthCourse:
         chance = Chance(torch.Generator(device).manual_seed(seed))
         size = options.small_batch if small else options.batch
         batch = draw_tuples(clips, size, count, options.tuples, chance)
-        return replace(batch, progress=step / options.steps)
-
-    def place(self, step: int) -> tuple[bool, int]:
-        """Whether a step has small images, and how many steps of its kind came before it."""
-        often = round(_CYCLE * self.options.small)
-        cycle, at = divmod(step, _CYCLE)
-        # Spread over the cycle, so that neither kind is missing for long.
-        kinds = [(n + 1) * often // _CYCLE > n * often // _CYCLE for n in range(_CYCLE)]
-        small = kinds[at]
-        return small, cycle * kinds.count(small) + kinds[:at].count(small)
+        return replace(batch, progress=progress)
 
     def loss(self, network: DepthNetwork, batch: DepthBatch) -> Float[Tensor, ""]:
         """As in the protocol."""
@@ -93,7 +86,11 @@ class DepthCourse:
 
     def examination(self, batches: int) -> DepthValidation:
         """As in the protocol."""
-        return DepthValidation(self.options, self.worker.device, batches)
+        found = DepthValidation(self.options, self.worker.device, batches)
+        self._held_out = DepthValidation(
+            self.options, self.worker.device, CALIBRATION_BATCHES, CALIBRATION_SEED, found.bank
+        )
+        return found
 
     def load(self, path: Path) -> DepthNetwork:
         """As in the protocol."""
@@ -101,8 +98,8 @@ class DepthCourse:
 
     def export(self, network: DepthNetwork, path: Path, step: int, scores: DepthScores) -> None:
         """As in the protocol; calibrated on rooms that neither training nor validation show."""
-        held_out = DepthValidation(self.options, self.worker.device, 6, seed=9)
-        export_depth_weights(network, path, step, scores, held_out.errors(network))
+        assert self._held_out is not None  # by the examination
+        export_depth_weights(network, path, step, scores, self._held_out.errors(network))
 
     def close(self) -> None:
         """End the processes that draw rooms."""

@@ -86,7 +86,7 @@ class DepthTraining(Settings, group="training"):
     small_batch: Count = 24
     """The same in the steps with small images."""
     small: Share = 0.6
-    """Share of the steps with small images."""
+    """Share of the run, its first, with small images."""
     rooms: RoomOptions = field(
         default_factory=lambda: RoomOptions(
             width=512,

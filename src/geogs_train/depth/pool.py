@@ -88,6 +88,12 @@ class ClipPool:
         assert self._stored is not None
         return self._stored
 
+    def empty(self) -> None:
+        """Free what is stored, and draw nothing ahead until clips are asked for again."""
+        self._stored = None
+        if self._ahead is not None:
+            self._ahead.rest()
+
     def close(self) -> None:
         """End the processes."""
         if self._ahead is not None:

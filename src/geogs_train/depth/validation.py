@@ -13,6 +13,7 @@ from geogs_train.depth.pool import StoredClips
 from geogs_train.depth.scores import DepthErrors, DepthScores, summarise, texture_kind
 from geogs_train.depth.tuples import Chance, DepthBatch, draw_tuples
 from geogs_train.rooms.sampler import RoomSampler
+from geogs_train.rooms.textures import TextureBank
 
 SEED = 3141
 EVERY = 3
@@ -23,10 +24,16 @@ class DepthValidation:
     """Keyframes of one size with neighbours; drawn once, kept on the device."""
 
     def __init__(
-        self, options: DepthTraining, device: torch.device, batches: int, seed: int = SEED
+        self,
+        options: DepthTraining,
+        device: torch.device,
+        batches: int,
+        seed: int = SEED,
+        bank: TextureBank | None = None,
     ) -> None:
-        rooms = RoomSampler(replace(options.rooms, validation=True), device, seed)
-        self.options = options
+        """``bank`` may be that of another set."""
+        rooms = RoomSampler(replace(options.rooms, validation=True), device, seed, bank)
+        self.options, self.bank = options, rooms.bank
         chance = Chance(torch.Generator(device).manual_seed(seed))
         self.batches: list[DepthBatch] = []
         self.kinds: list[UInt8[Tensor, "b h w"]] = []

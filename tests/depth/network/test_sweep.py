@@ -8,7 +8,6 @@ import torch
 
 from geogs.depth.network.sweep import (
     cell_rays,
-    group_correlation,
     log_planes,
     sample_cells,
     see_planes,
@@ -79,17 +78,3 @@ def test_cells_are_sampled_bilinearly_and_are_nothing_outside():
     torch.testing.assert_close(found[:, 0], by_hand)
     torch.testing.assert_close(found[:, 1], field[0, :, 3, 4])
     assert found[:, 2].abs().max() == 0
-
-
-def test_correlations_are_means_over_groups():
-    rng = torch.Generator().manual_seed(3)
-    own, theirs = torch.randn(2, 6, 4, generator=rng), torch.randn(2, 6, 3, 4, generator=rng)
-    found = group_correlation(own, theirs, 2)
-    for b in range(2):
-        for g in range(2):
-            for d in range(3):
-                for p in range(4):
-                    expected = sum(
-                        float(own[b, c, p] * theirs[b, c, d, p]) for c in range(3 * g, 3 * g + 3)
-                    )
-                    assert float(found[b, g, d, p]) == pytest.approx(expected / 3, abs=1e-5)

@@ -30,17 +30,17 @@ def trainer_of(options: DepthTraining) -> Trainer:
 class OneBatch(DepthCourse):
     """The first batch again and again, as late in the run as the step."""
 
-    def batch(self, step):
+    def batch(self, step, progress):
         if not hasattr(self, "kept"):
-            self.kept = super().batch(0)
-        return replace(self.kept, progress=step / self.options.steps)
+            self.kept = super().batch(0, 0.0)
+        return replace(self.kept, progress=progress)
 
 
 def test_one_batch_is_learnt_by_heart():
     options = replace(TRAINING, steps=60, learning_rate=3e-3, warmup=5)
     course = OneBatch(options, CPU)
     trainer = Trainer(course, CPU)
-    batch = course.batch(0)
+    batch = course.batch(0, 0.0)
 
     def error() -> float:
         with torch.no_grad():
@@ -54,14 +54,10 @@ def test_one_batch_is_learnt_by_heart():
     assert error() < 0.15
 
 
-def test_steps_come_in_their_shares_and_the_pools_go_on_in_turn():
+def test_small_images_come_first():
     course = DepthCourse(replace(TRAINING, small=0.6), CPU)
-    places = [course.place(step) for step in range(40)]
-    assert sum(small for small, _ in places) == 24
-    for kind, count in ((True, 24), (False, 16)):
-        assert [turn for small, turn in places if small == kind] == list(range(count))
-    sizes = {course.batch(step).depth.shape[1:] for step in range(3)}
-    assert sizes == {(48, 64), (32, 48)}
+    for progress, size in ((0.0, (32, 48)), (0.59, (32, 48)), (0.61, (48, 64))):
+        assert course.batch(3, progress).depth.shape[1:] == size
 
 
 def test_a_resumed_run_equals_one_that_was_never_stopped(tmp_path):

@@ -39,17 +39,18 @@ class DepthNetwork(nn.Module):
     def forward(self, views: StereoViews) -> DepthPrediction:
         """Depth of the keyframes; networks in bfloat16 on a GPU, geometry in float32."""
         height, width = views.image.shape[-2:]
-        images = [_padded(normalised(i)) for i in (views.image, *views.others.unbind(1))]
+        images = torch.cat([views.image[:, None], views.others], 1)
+        images = _padded(normalised(images.flatten(0, 1)))
         device = views.image.device.type
         with torch.autocast(device, torch.bfloat16, enabled=device == "cuda"):
-            # View by view: what is compiled for a batch suits any number of neighbours.
-            own, *others = [self.matching(image) for image in images]
-            context = self.context(images[0], views.intrinsics)
+            features = self.matching(images).unflatten(0, (len(views.image), -1))
+            images = images.unflatten(0, (len(views.image), -1))
+            context = self.context(images[:, 0], views.intrinsics)
             with torch.autocast(device, enabled=False):
                 planes = log_planes(
                     views.near / views.typical, views.far / views.typical, self.options.planes
                 )
-                volume = self.volume(own, torch.stack(others, 1), views, planes)
+                volume = self.volume(features[:, 0], features[:, 1:], views, planes)
             body = self.body(volume, context[1:])
             found = self.readout(body, context[0], planes, views.intrinsics)
         return _cropped(found, height, width)

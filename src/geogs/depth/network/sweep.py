@@ -99,11 +99,3 @@ def sample_cells(
     size = cells.new_tensor([width, height])
     grid = (2 * cells + 1) / size - 1
     return functional.grid_sample(features, grid.clamp(-4, 4), align_corners=False)
-
-
-def group_correlation(
-    own: Float[Tensor, "b c p"], theirs: Float[Tensor, "b c d p"], groups: int
-) -> Float[Tensor, "b g d p"]:
-    """Mean product of the channels of each group."""
-    product = own.unflatten(1, (groups, -1))[:, :, :, None] * theirs.unflatten(1, (groups, -1))
-    return product.mean(2)

@@ -3,16 +3,10 @@
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
-from torch.utils.checkpoint import checkpoint
 
 from geogs.depth.network.options import DepthNetworkOptions
-from geogs.depth.network.sweep import (
-    PlaneViews,
-    cell_rays,
-    group_correlation,
-    sample_cells,
-    see_planes,
-)
+from geogs.depth.network.rating import rate_planes
+from geogs.depth.network.sweep import PlaneViews, cell_rays, sample_cells, see_planes
 from geogs.depth.network.views import StereoViews
 
 VOXEL, PIXEL, PLANE = 4, 3, 3
@@ -26,13 +20,12 @@ class PlaneScorer(nn.Module):
 
     A small network sees the correlations and what geometry says: whether, how obliquely and how
     near the point is seen and how far it moves from plane to plane (after SimpleRecon's metadata).
-    What is alike for all planes of a cell, or all cells of a plane, is multiplied once.
     """
 
     def __init__(self, options: DepthNetworkOptions) -> None:
         super().__init__()
         width = options.metadata
-        self.groups = options.groups
+        self.groups, self.matching = options.groups, options.matching
         self.voxel = _weight(width, options.groups + VOXEL)
         self.pixel = nn.Linear(PIXEL, width)
         self.plane = nn.Linear(PLANE, width, bias=False)
@@ -44,20 +37,22 @@ class PlaneScorer(nn.Module):
         own: Float[Tensor, "b c p"],
         theirs: Float[Tensor, "b c h w"],
         seen: PlaneViews,
-        pixel: Float[Tensor, "b p 3"],
+        pixel: Float[Tensor, "b 3 p"],
         plane: Float[Tensor, "b d 3"],
     ) -> Float[Tensor, "b 2 d p"]:
         """Score, and logarithm of its weight; float32."""
         found = sample_cells(theirs, seen.cells)
         numbers = torch.stack([seen.seen.float(), seen.log_z, seen.angle, seen.log_step], 1)
-        voxel = torch.cat([group_correlation(own, found, self.groups), numbers], 1)
-        b, _, d, p = voxel.shape
-        with torch.autocast(own.device.type, torch.bfloat16, enabled=own.is_cuda):
-            base = self.pixel(pixel).mT[:, :, None] + self.plane(plane).mT[..., None]
-            x = _apply(self.voxel, voxel.flatten(2), base.flatten(2)).relu_()
-            x = _apply(self.hidden, x, self.hidden_bias).relu_()
-            x = _apply(self.out, x, self.out_bias)
-        return x.float().view(b, 2, d, p)
+        return rate_planes(own, found, numbers, pixel, plane, self._layers())
+
+    def _layers(self) -> list[Tensor]:
+        """Weights and biases of three layers; the first sees products of single channels."""
+        each = self.matching // self.groups
+        products = self.voxel[:, : self.groups].repeat_interleave(each, 1) / each
+        first = (products, self.voxel[:, self.groups :], self.pixel.weight, self.plane.weight)
+        weights = (torch.cat(first, 1), self.hidden, self.out)
+        biases = (self.pixel.bias, self.hidden_bias[:, 0], self.out_bias[:, 0])
+        return [x for layer in zip(weights, biases, strict=True) for x in layer]
 
 
 class PlaneVolume(nn.Module):
@@ -81,7 +76,7 @@ class PlaneVolume(nn.Module):
         height, width = own.shape[-2:]
         rays = cell_rays(views.intrinsics, height, width)
         own, theirs = own.float(), theirs.float()
-        pixel = torch.cat([rays[:, :2], _roughness(own)], 1).mT
+        pixel = torch.cat([rays[:, :2], _roughness(own)], 1)
         scores, weights, masks = [], [], []
         for k in range(theirs.shape[1]):
             T = views.T_nk[:, k].clone()
@@ -90,13 +85,7 @@ class PlaneVolume(nn.Module):
             seen = see_planes(rays, log_planes.exp(), T, lens, height, width)
             pose = _pose_numbers(T)[:, None].expand(-1, log_planes.shape[1], -1)
             plane = torch.cat([log_planes[..., None], pose], -1)
-            arguments = (own.flatten(2), theirs[:, k], seen, pixel, plane)
-            if torch.is_grad_enabled():  # what is warped is too large to be kept
-                rated = checkpoint(
-                    self.scorer, *arguments, use_reentrant=False, preserve_rng_state=False
-                )
-            else:
-                rated = self.scorer(*arguments)
+            rated = self.scorer(own.flatten(2), theirs[:, k], seen, pixel, plane)
             scores.append(rated[:, 0])
             weights.append(rated[:, 1])
             masks.append(seen.seen & views.valid[:, k, None, None])
@@ -136,9 +125,3 @@ def _weight(outputs: int, inputs: int) -> nn.Parameter:
 
 def _bias(outputs: int) -> nn.Parameter:
     return nn.Parameter(torch.zeros(outputs, 1))
-
-
-def _apply(weight: Tensor, x: Float[Tensor, "b i n"], bias: Tensor) -> Float[Tensor, "b o n"]:
-    """A linear layer over the channels, which stay in front: nothing is transposed."""
-    b, _, n = x.shape
-    return torch.baddbmm(bias.expand(b, -1, n), weight.expand(b, -1, -1), x)
