@@ -46,7 +46,11 @@ def depth_loss(
     bent = normals_of(found.log_depth, rays)
     total = total + options.bent * _mean(0.5 * (1 - (bent * batch.normal).sum(1)), smooth)
     total = total + options.agreement * _mean(1 - (found.normal * bent).sum(1), smooth)
-    total = total + options.planes * plane_loss(found, truth, valid)
+    for weight, logits in (
+        (options.planes, found.plane_logits),
+        (options.scores, found.plane_scores),
+    ):
+        total = total + weight * plane_loss(logits, found.log_planes, truth, valid)
 
     late = float(batch.progress >= options.late)
     # The angle's slope is infinite where it is zero.
@@ -82,17 +86,20 @@ def gradient_loss(error: Float[Tensor, "b h w"], valid: Bool[Tensor, "b h w"]) -
 
 
 def plane_loss(
-    found: DepthPrediction, truth: Float[Tensor, "b h w"], valid: Bool[Tensor, "b h w"]
+    logits: Float[Tensor, "b d h4 w4"],
+    log_planes: Float[Tensor, "b d"],
+    truth: Float[Tensor, "b h w"],
+    valid: Bool[Tensor, "b h w"],
 ) -> Float[Tensor, ""]:
     """Cross-entropy of the planes with the two beside the truth, by their nearness."""
     depth, known = coarse_truth(truth, valid, 4)
-    first, planes = found.log_planes[:, :1, None], found.log_planes.shape[1]
-    step = torch.diff(found.log_planes, dim=1).mean(1)[:, None, None]
+    first, planes = log_planes[:, :1, None], log_planes.shape[1]
+    step = torch.diff(log_planes, dim=1).mean(1)[:, None, None]
     place = (depth - first) / step
     known = known & (place >= 0) & (place <= planes - 1)
     below = place.floor().clamp(0, planes - 2)
     share = (place - below).clamp(0, 1)
-    log = found.plane_logits[..., : depth.shape[1], : depth.shape[2]].log_softmax(1)
+    log = logits[..., : depth.shape[1], : depth.shape[2]].log_softmax(1)
     index = below.long()[:, None]
     near = (1 - share) * log.gather(1, index)[:, 0] + share * log.gather(1, index + 1)[:, 0]
     return _mean(-near, known)

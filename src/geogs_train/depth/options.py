@@ -67,6 +67,8 @@ class DepthLossOptions(Settings, group="training.loss"):
     """Of the normals' likelihood, which only their concentration learns from."""
     planes: Weight = 0.2
     """Of the cross-entropy of the planes."""
+    scores: Weight = 0.1
+    """Of the same of the planes' scores before the keyframe's context joins them."""
     likelihood: Weight = 0.1
     """Of the likelihood of depth, which only deviation and outliers learn from."""
     agreement: Weight = 0.1

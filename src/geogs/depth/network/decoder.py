@@ -76,6 +76,7 @@ class Readout(nn.Module):
         context: Float[Tensor, "b x h2 w2"],
         log_planes: Float[Tensor, "b d"],
         intrinsics: Float[Tensor, "b 4"],
+        scores: Float[Tensor, "b d h4 w4"],
     ) -> DepthPrediction:
         device = features.device.type
         logits = self.planes(features).float()
@@ -110,6 +111,7 @@ class Readout(nn.Module):
                 at_half=at_half[:, 0],
                 at_quarter=at_quarter,
                 plane_logits=logits,
+                plane_scores=scores,
                 log_planes=log_planes,
             )
 

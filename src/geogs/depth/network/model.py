@@ -52,7 +52,7 @@ class DepthNetwork(nn.Module):
                 )
                 volume = self.volume(features[:, 0], features[:, 1:], views, planes)
             body = self.body(volume, context[1:])
-            found = self.readout(body, context[0], planes, views.intrinsics)
+            found = self.readout(body, context[0], planes, views.intrinsics, volume[:, :-1])
         return _cropped(found, height, width)
 
 

@@ -58,6 +58,8 @@ class DepthPrediction:
     """``log_depth`` at 1/4 before it was refined."""
     plane_logits: Float[Tensor, "b d h4 w4"]
     """Of the planes at 1/4."""
+    plane_scores: Float[Tensor, "b d h4 w4"]
+    """The same as the neighbours' features alone have it."""
     log_planes: Float[Tensor, "b d"]
     """Logarithms of the planes' depths over ``typical``."""
 
