@@ -75,7 +75,7 @@ class PlaneVolume(nn.Module):
         """
         height, width = own.shape[-2:]
         rays = cell_rays(views.intrinsics, height, width)
-        own, theirs = own.float(), theirs.float()
+        own, theirs = own.float().contiguous(), theirs.float().contiguous()
         pixel = torch.cat([rays[:, :2], _roughness(own)], 1)
         scores, weights, masks = [], [], []
         for k in range(theirs.shape[1]):
