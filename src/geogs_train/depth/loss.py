@@ -30,8 +30,10 @@ def depth_loss(
     found: DepthPrediction, batch: DepthBatch, options: DepthLossOptions
 ) -> Float[Tensor, ""]:
     """The sum of all parts."""
-    truth = (batch.depth / batch.views.typical[:, None, None]).log()
     valid = has_truth(batch)
+    typical = batch.views.typical[:, None, None].expand_as(batch.depth)
+    # A ray may meet nothing: what is not valid must be a number all the same.
+    truth = (torch.where(valid, batch.depth, typical) / typical).log()
     error = found.log_depth - truth
     total = _mean(error.abs(), valid)
     for level, coarse in ((1, found.at_half), (2, found.at_quarter)):
@@ -95,7 +97,7 @@ def plane_loss(
     depth, known = coarse_truth(truth, valid, 4)
     first, planes = log_planes[:, :1, None], log_planes.shape[1]
     step = torch.diff(log_planes, dim=1).mean(1)[:, None, None]
-    place = (depth - first) / step
+    place = ((depth - first) / step).nan_to_num(-1.0)
     known = known & (place >= 0) & (place <= planes - 1)
     below = place.floor().clamp(0, planes - 2)
     share = (place - below).clamp(0, 1)
@@ -124,4 +126,4 @@ def outlier_laplace(error: Tensor, log_scale: Tensor, outlier: Tensor, log_range
 
 def _mean(values: Tensor, chosen: Tensor) -> Float[Tensor, ""]:
     """Over what is chosen; 0 of nothing."""
-    return (values * chosen).sum() / chosen.sum().clamp_min(1)
+    return torch.where(chosen, values, 0.0).sum() / chosen.sum().clamp_min(1)

@@ -172,4 +172,5 @@ def relit(
 def has_truth(batch: DepthBatch) -> Bool[Tensor, "b h w"]:
     """Pixels whose depth lies in what may be searched, or nearly."""
     near, far = (x[:, None, None] for x in (batch.views.near, batch.views.far))
-    return (batch.depth > 0.5 * near) & (batch.depth < 2 * far)
+    known = batch.depth.isfinite() & (batch.views.typical > 0)[:, None, None]
+    return known & (batch.depth > 0.5 * near) & (batch.depth < 2 * far)
