@@ -87,8 +87,8 @@ CATALOGUE = (
     KnownWeights(
         "depth.safetensors",
         "depth",
-        "multi-view depth of still scenes, trained by geogs train depth",
-        "geogs train depth",
+        "multi-view depth of still scenes, trained by geogs",
+        PACKAGED,
         "Apache-2.0",
     ),
     KnownWeights(

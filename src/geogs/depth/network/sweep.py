@@ -77,7 +77,7 @@ def see_planes(
     step = torch.diff(depths.log(), dim=1).mean(1)[:, None, None]
     moved = (focal * slope * (z / safe[:, None])).square().sum(1).sqrt() * step
     cosine = (turned[:, :, None] * point).sum(1) / (
-        rays.norm(dim=1)[:, None] * point.norm(dim=1).clamp_min(1e-6)
+        rays.norm(dim=1)[:, None] * point.square().sum(1).sqrt().clamp_min(1e-6)
     )
     cells = (pixels - (CELL - 1) / 2) / CELL
     limit = cells.new_tensor([width, height])[:, None, None] - 0.5
