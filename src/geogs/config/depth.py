@@ -23,6 +23,8 @@ class DepthConfig(Settings, group="mapping.depth"):
     """Who finds depth: matching without a network, or the network of geogs train depth."""
     weights: str = ""
     """Weights file of the network; "" takes the one that is found."""
+    network_edge: Annotated[int, Range(32, 16384)] = 512
+    """Longest edge of the images that the network sees, pixels; at most that of the input."""
     sigma_scale: Annotated[Positive, Only("run")] = 0.14
     """Completion: real over expected deviation of the tracker's inverse depth."""
     bending: Annotated[Positive, Only("run")] = 0.02

@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from geogs.depth.network.search_range import RATIO
 from geogs.depth.network.views import StereoViews
 from geogs.geometry.lie import se3_exp, se3_inverse
 from geogs_train.depth.options import TupleOptions
@@ -14,8 +15,6 @@ from geogs_train.depth.pool import StoredClips
 
 MOST_TURN = math.radians(40)
 """Angle between viewing directions from which on a view is no good neighbour."""
-_RATIO = (6.0, 60.0)
-"""Bounds of far over near."""
 
 
 @dataclass(frozen=True)
@@ -135,8 +134,8 @@ def known_range(
     n = len(low)
     near = 0.5 * low / chance.log_uniform(options.range_error, n)
     far = 2.0 * high * chance.log_uniform(options.range_error, n)
-    widen = (_RATIO[0] / (far / near)).clamp_min(1).sqrt()
-    narrow = ((far / near) / _RATIO[1]).clamp_min(1)
+    widen = (RATIO[0] / (far / near)).clamp_min(1).sqrt()
+    narrow = ((far / near) / RATIO[1]).clamp_min(1)
     near, far = near / widen * narrow.sqrt(), far * widen / narrow.sqrt()
     return near, far, typical * chance.log_uniform(options.typical_error, n)
 
