@@ -3,8 +3,8 @@
     python benchmarks/depth_engines.py [--rooms 3] [--keyframes 3] [--width 320] [--device cpu]
 
 Rooms are those of ``geogs synth``, which the network's training never shows, with the noise of a
-camera; once as they are, once with most of their materials of one colour. Poses are exact; the tracker's
-depth is simulated, right to 3 % where there is texture and next to nothing elsewhere.
+camera; once as they are, once with most of their materials of one colour. Poses are as wrong as the
+tracker's, whose depth is simulated: right to 3 % where there is texture, elsewhere a guess.
 """
 
 import argparse
@@ -23,6 +23,7 @@ from geogs.depth.sweep_neighbors import select_sweep_neighbours
 from geogs.depth.view import DenseDepth, DepthView, PosedDepth, depth_images
 from geogs.geometry.camera import Camera
 from geogs.geometry.depth import normals_from_depth
+from geogs.geometry.lie import se3_exp
 from geogs.keyframes.grid import OFFSET, STRIDE
 from geogs.synth.raycast import Raycaster
 from geogs.synth.room import make_room
@@ -37,6 +38,8 @@ AROUND = 4
 """Keyframes before and after one from which its neighbours are chosen."""
 NOISE = 1.5
 """Of the images, grey levels."""
+SHIFT, TURN = 0.001, 0.02
+"""Deviation of the positions along each axis, metres, and of the rotations, degrees."""
 FLAT = 0.8
 """Share of the materials that are of one colour in the second set."""
 COLUMNS = (
@@ -104,8 +107,10 @@ def shoot(
         bare, rng.uniform(0.6, 1.6, true.shape), 1 + 0.03 * rng.normal(size=true.shape)
     )
     information = np.where(bare, 1e-2, (1 / (0.15 * true)) ** 2).astype(np.float32)
+    error = torch.from_numpy(rng.normal(0, [SHIFT] * 3 + [np.radians(TURN)] * 3))
+    T_cw = se3_exp(error).numpy() @ np.linalg.inv(T_wc)
     view = DepthView(
-        number, np.linalg.inv(T_wc), *depth_images(image, render), image,
+        number, T_cw, *depth_images(image, render), image,
         (true * wrong).astype(np.float32), information,
     )  # fmt: skip
     return Keyframe(view, coarse.depth, coarse.normal, kinds[1])
