@@ -205,7 +205,7 @@ def main() -> None:
     parser.add_argument("--render", type=int, default=320, help="width of the depths, pixels")
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--checked", action="store_true", help="let neighbours check the depths")
-    parser.add_argument("--engines", default="classical,network")
+    parser.add_argument("--engines", default="classical,network,joint")
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
     working = centred_camera(arguments.width, arguments.width * 3 // 4)

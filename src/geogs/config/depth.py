@@ -19,8 +19,9 @@ from geogs.config.setting import (
 class DepthConfig(Settings, group="mapping.depth"):
     """Dense depth of a keyframe before any disk is made."""
 
-    engine: Literal["classical", "network"] = "classical"
-    """Who finds depth: matching without a network, or the network of geogs train depth."""
+    engine: Literal["classical", "network", "joint"] = "classical"
+    """Who finds depth: matching without a network, the network of geogs train depth, or both, each
+    where it is surer."""
     weights: str = ""
     """Weights file of the network; "" takes the one that is found."""
     network_edge: Annotated[int, Range(32, 16384)] = 512

@@ -27,9 +27,14 @@ def depth_engine(
     from geogs.networks.weights_files import find_weights
 
     trained = load_depth_network(find_weights("depth", config.weights))
-    return NetworkDepthEngine(
+    network = NetworkDepthEngine(
         trained, classical, torch.device(device), render, working, config, resident
     )
+    if config.engine == "network":
+        return network
+    from geogs.depth.network.joint import JointDepthEngine
+
+    return JointDepthEngine(network, classical)
 
 
 def _classical(
