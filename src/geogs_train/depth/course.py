@@ -87,8 +87,9 @@ class DepthCourse:
     def examination(self, batches: int) -> DepthValidation:
         """As in the protocol."""
         found = DepthValidation(self.options, self.worker.device, batches)
+        count = min(batches, CALIBRATION_BATCHES)
         self._held_out = DepthValidation(
-            self.options, self.worker.device, CALIBRATION_BATCHES, CALIBRATION_SEED, found.bank
+            self.options, self.worker.device, count, CALIBRATION_SEED, found.bank
         )
         return found
 
