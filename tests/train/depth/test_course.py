@@ -36,6 +36,7 @@ class OneBatch(DepthCourse):
         return replace(self.kept, progress=progress)
 
 
+@pytest.mark.system
 def test_one_batch_is_learnt_by_heart():
     options = replace(TRAINING, steps=60, learning_rate=3e-3, warmup=5)
     course = OneBatch(options, CPU)
@@ -62,15 +63,14 @@ def test_small_images_come_first():
 
 def test_a_resumed_run_equals_one_that_was_never_stopped(tmp_path):
     whole = trainer_of(TRAINING)
-    losses = [float(whole.advance()) for _ in range(4)]
+    losses = [float(whole.advance()) for _ in range(3)]
     first = trainer_of(TRAINING)
-    first.advance()
     first.advance()
     save_checkpoint(first, tmp_path)
     assert read_options(tmp_path, DepthTraining) == TRAINING
     second = trainer_of(TRAINING)
     load_checkpoint(second, tmp_path)
-    assert [float(second.advance()) for _ in range(2)] == losses[2:]
+    assert [float(second.advance()) for _ in range(2)] == losses[1:]
     for a, b in zip(whole.mean.parameters(), second.mean.parameters(), strict=True):
         assert torch.equal(a, b)
 
@@ -94,7 +94,7 @@ def test_the_command_trains_resumes_and_writes_weights(tmp_path, capsys):
                "48", "--training.small-height", "32", "--training.pool.plans", "1",
                "--training.pool.rooms", "1", "--training.batch", "2", "--training.small-batch",
                "2", "--training.tuples.most-neighbours", "4", "--run.validation-batches", "1",
-               "--training.steps", "2", "--run.validate-every", "1"]  # fmt: skip
+               "--training.steps", "1", "--run.validate-every", "9"]  # fmt: skip
     assert main(["train", "depth", str(out), "--device", "cpu", *options]) == 0
     trained = load_depth_network(out / "depth.safetensors")
     assert trained.network.options == NETWORK
