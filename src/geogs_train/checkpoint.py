@@ -12,15 +12,14 @@ from torch import Tensor
 
 from geogs.errors import InputError
 from geogs.io.writers.atomic import atomic_file
-from geogs_train.options import FlowTraining
-from geogs_train.trainer import FlowTrainer
+from geogs_train.trainer import Trainer
 
 FILE = "checkpoint.safetensors"
 T = TypeVar("T")
 _PARTS = ("network", "mean", "first_moment", "second_moment")
 
 
-def save_checkpoint(trainer: FlowTrainer, out: Path) -> None:
+def save_checkpoint(trainer: Trainer, out: Path) -> None:
     """Write all that the run needs to go on; the one before stays until the new one is whole.
 
     Raises:
@@ -39,18 +38,25 @@ def save_checkpoint(trainer: FlowTrainer, out: Path) -> None:
         for part, some in parts.items()
         for name, x in some.items()
     }
-    header = {"step": str(trainer.step), "options": json.dumps(asdict(trainer.options))}
+    header = {
+        "step": str(trainer.step),
+        "progress": repr(trainer.progress),
+        "options": json.dumps(asdict(trainer.options)),
+    }
     with atomic_file(out / FILE) as stream:
         stream.write(save(tensors, metadata=header))
 
 
-def read_options(out: Path) -> FlowTraining:
-    """The settings of the run in a folder; raises InputError where there is none."""
+def read_options(out: Path, kind: type[T]) -> T:
+    """The settings of the run in a folder; raises InputError where there is none of this kind."""
     header, _ = _read(out, with_tensors=False)
-    return _revived(FlowTraining, json.loads(header["options"]))
+    try:
+        return _revived(kind, json.loads(header["options"]))
+    except AttributeError as error:
+        raise InputError(f"The checkpoint in {out} is of another network ({error}).") from error
 
 
-def load_checkpoint(trainer: FlowTrainer, out: Path) -> None:
+def load_checkpoint(trainer: Trainer, out: Path) -> None:
     """Go on from a checkpoint; raises InputError where there is none or it is damaged."""
     header, tensors = _read(out, with_tensors=True)
     step, names = int(header["step"]), [name for name, _ in trainer.network.named_parameters()]
@@ -71,7 +77,7 @@ def load_checkpoint(trainer: FlowTrainer, out: Path) -> None:
             for k, name in enumerate(names)
         }
     trainer.optimizer.load_state_dict(optimizer)
-    trainer.step = step
+    trainer.step, trainer.progress = step, float(header["progress"])
 
 
 def _revived(kind: type[T], values: dict[str, Any]) -> T:
@@ -98,6 +104,6 @@ def _read(out: Path, with_tensors: bool) -> tuple[dict[str, str], dict[str, Tens
             header, tensors = file.metadata() or {}, {n: file.get_tensor(n) for n in names}
     except (SafetensorError, OSError) as error:
         raise InputError(f"The checkpoint in {out} is damaged ({error}).") from error
-    if not header.keys() >= {"step", "options"}:
+    if not header.keys() >= {"step", "progress", "options"}:
         raise InputError(f"{path} is no checkpoint of a training run.")
     return header, tensors

@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 
 from geogs.cli.options import parse_options
 from geogs.config.setting import Positional, Settings
+from geogs_train.depth.options import DepthTraining
 from geogs_train.options import FlowTraining, RunOptions
 
 
@@ -15,7 +16,8 @@ class TrainOptions(Settings):
     """Trains the flow network on random rooms that are made on the fly.
 
     OUTPUT gets checkpoint.safetensors (to go on with --run.resume), log.jsonl, curves.png and
-    flow.safetensors. On several GPUs:
+    flow.safetensors. geogs train depth OUTPUT trains the depth network (geogs train depth --help).
+    On several GPUs:
     torchrun --nproc-per-node N -m geogs.cli.main train flow OUTPUT
     """
 
@@ -29,9 +31,32 @@ class TrainOptions(Settings):
     training: FlowTraining = field(default_factory=FlowTraining)
 
 
+@dataclass(frozen=True)
+class TrainDepthOptions(Settings):
+    """Trains the multi-view depth network on random rooms that are made on the fly.
+
+    OUTPUT gets checkpoint.safetensors (to go on with --run.resume), log.jsonl, curves.png and
+    depth.safetensors. On several GPUs:
+    torchrun --nproc-per-node N -m geogs.cli.main train depth OUTPUT
+    """
+
+    network: Annotated[Literal["depth"], Positional()]
+    """What to train."""
+    output: Annotated[Path, Positional()]
+    """Folder to write."""
+    device: str = "auto"
+    """auto (a GPU where there is one), cpu, cuda or cuda:1."""
+    run: RunOptions = field(default_factory=RunOptions)
+    training: DepthTraining = field(default_factory=DepthTraining)
+
+
 def main(argv: Sequence[str]) -> int:
     """Runs the command; returns the exit code."""
-    options = parse_options(TrainOptions, argv, "train")
+    options: TrainOptions | TrainDepthOptions
+    if "depth" in argv[:1]:
+        options = parse_options(TrainDepthOptions, argv, "train")
+    else:
+        options = parse_options(TrainOptions, argv, "train")
 
     from geogs_train.launch import launch
 

@@ -10,14 +10,18 @@ from torch import distributed
 
 from geogs.gpu.installation import require_device
 from geogs_train.checkpoint import read_options
+from geogs_train.course import Course, Worker
 from geogs_train.curves import draw_curves
+from geogs_train.depth.course import DepthCourse
+from geogs_train.depth.options import DepthTraining
+from geogs_train.flow_course import FlowCourse
 from geogs_train.options import FlowTraining, RunOptions
-from geogs_train.run import train_flow
-from geogs_train.trainer import Worker
+from geogs_train.pace import shared
+from geogs_train.run import train
 
 
 def launch(
-    training: FlowTraining,
+    training: FlowTraining | DepthTraining,
     run: RunOptions,
     out: Path,
     device: str,
@@ -30,9 +34,19 @@ def launch(
         DeviceError: the device cannot be used.
     """
     with _worker(device) as worker:
-        train_flow(read_options(out) if run.resume else training, run, out, worker, progress)
+        if run.resume:
+            training = read_options(out, type(training))
+        course = _course(training, worker)
+        train(course, run, out, worker, progress)
+        shared(0.0, worker)  # nobody leaves before the first has written everything
     if worker.rank == 0:
-        draw_curves(out)
+        draw_curves(out, course.curves)
+
+
+def _course(training: FlowTraining | DepthTraining, worker: Worker) -> Course:
+    if isinstance(training, DepthTraining):
+        return DepthCourse(training, worker)
+    return FlowCourse(training, worker)
 
 
 @contextmanager
@@ -45,8 +59,11 @@ def _worker(device: str) -> Iterator[Worker]:
     if count == 1:
         yield Worker(used)
         return
-    torch.cuda.set_device(used)
-    distributed.init_process_group("nccl", device_id=used)
+    if used.type == "cuda":
+        torch.cuda.set_device(used)
+        distributed.init_process_group("nccl", device_id=used)
+    else:
+        distributed.init_process_group("gloo")
     try:
         yield Worker(used, rank, count)
     finally:

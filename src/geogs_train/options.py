@@ -74,6 +74,10 @@ class RunOptions(Settings, group="run"):
     validation_batches: Count = 8
     minutes: Annotated[float | None, Range(above=0)] = None
     """The run stops with a checkpoint after so many minutes, if any; it goes on with ``resume``."""
+    paced: bool = False
+    """Whether the run is as long as its minutes instead of its steps: the learning rate ends at
+    zero with the last minute. How many steps that are depends on the machine, and a run that goes
+    on has its minutes again for what was left."""
     resume: bool = False
     """Go on from the checkpoint in the output folder, with its settings."""
     begin_with: str = ""

@@ -5,18 +5,14 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
-import torch
-from torch import distributed
-
-from geogs.errors import GeogsError
-from geogs.tracking.flow.own import load_network
+from geogs.errors import GeogsError, InputError
 from geogs_train.checkpoint import load_checkpoint, save_checkpoint
-from geogs_train.export import export_weights
-from geogs_train.options import FlowTraining, RunOptions
-from geogs_train.scores import FlowScores
-from geogs_train.trainer import FlowTrainer, Worker
-from geogs_train.validation import Validation
+from geogs_train.course import Course, Examination, Scores, Worker
+from geogs_train.options import RunOptions
+from geogs_train.pace import EVERY, Clock, shared
+from geogs_train.trainer import Trainer
 
 LOG = "log.jsonl"
 REPORT_EVERY = 50
@@ -27,30 +23,35 @@ Progress = Callable[[str], None]
 """Called with a line of text."""
 
 
-def train_flow(
-    options: FlowTraining, run: RunOptions, out: Path, worker: Worker, progress: Progress
-) -> FlowScores | None:
+def train(
+    course: Course, run: RunOptions, out: Path, worker: Worker, progress: Progress
+) -> Scores | None:
     """Train until the last step or the last minute; returns the last validation's scores.
 
-    The first worker writes ``checkpoint.safetensors``, ``log.jsonl`` and ``flow.safetensors`` (the
-    running mean of the weights in half precision) to ``out``. Ctrl-C ends it as the last minute
-    does.
+    The first worker writes ``checkpoint.safetensors``, ``log.jsonl`` and the course's weights
+    (their running mean in half precision) to ``out``. Ctrl-C ends it as the last minute does.
 
     Raises:
+        InputError: the run is paced, but has no minutes.
         GeogsError: the weights are no longer finite.
     """
     begin = time.monotonic()
-    trainer = FlowTrainer(options, worker, run.fuse)
+    if run.paced and run.minutes is None:
+        raise InputError("A paced run needs --run.minutes.")
+    trainer = Trainer(course, worker, run.fuse, run.paced)
     if run.begin_with:
-        trainer.begin_with(load_network(Path(run.begin_with)))
+        trainer.begin_with(course.load(Path(run.begin_with)))
     if run.resume:
         load_checkpoint(trainer, out)
     first = worker.rank == 0
-    validation = Validation(options, worker.device, run.validation_batches) if first else None
+    validation = course.examination(run.validation_batches) if first else None
     out.mkdir(parents=True, exist_ok=True)
     scores, since, at = None, time.monotonic(), trainer.step
+    clock = Clock(run.minutes, trainer.progress, worker) if run.paced and run.minutes else None
     try:
-        while trainer.step < options.steps:
+        while trainer.progress < 1:
+            if clock is not None and trainer.step % EVERY == 0:
+                trainer.progress = clock.progress()
             loss = trainer.advance()
             if trainer.step % REPORT_EVERY == 0:
                 value, now = float(loss), time.monotonic()
@@ -59,43 +60,33 @@ def train_flow(
                 rate = (trainer.step - at) / (now - since)
                 since, at = now, trainer.step
                 if first:
-                    left = (options.steps - trainer.step) / rate / 60
-                    _log(out, {"step": trainer.step, "loss": value, "rate": rate})
-                    progress(f"step {trainer.step}/{options.steps}  loss {value:.3f}  "
-                             f"{rate:.1f} steps/s  {left:.0f} min left")  # fmt: skip
-                if _all(worker, run.minutes is not None and now - begin > 60 * run.minutes):
+                    entry = {"step": trainer.step, "loss": value, "rate": rate}
+                    _log(out, {**entry, "minutes": (now - begin) / 60})
+                    progress(f"step {trainer.step}  {100 * trainer.progress:.0f} %  "
+                             f"loss {value:.3f}  {rate:.1f} steps/s")  # fmt: skip
+                late = run.minutes is not None and now - begin > 60 * run.minutes
+                if clock is None and shared(late, worker):
                     break
             if trainer.step % run.validate_every == 0 and validation is not None:
-                scores = _validate(trainer, validation, out, progress)
-                save_checkpoint(trainer, out)
+                scores = _saved(trainer, validation, out, progress)
                 since, at = time.monotonic(), trainer.step
     except KeyboardInterrupt:
         progress("interrupted; writing what there is")
     finally:
-        trainer.close()
+        course.close()
     if validation is not None:
-        scores = _validate(trainer, validation, out, progress)
-        save_checkpoint(trainer, out)
-        export_weights(trainer.mean, out / "flow.safetensors", trainer.step, scores)
+        scores = _saved(trainer, validation, out, progress)
     return scores
 
 
-def _validate(
-    trainer: FlowTrainer, validation: Validation, out: Path, progress: Progress
-) -> FlowScores:
-    scores = validation.score(trainer.mean, trainer.options.iterations)
+def _saved(trainer: Trainer, validation: Examination, out: Path, progress: Progress) -> Any:
+    """Validate, and write the checkpoint and the weights."""
+    scores = validation.score(trainer.mean)
     _log(out, {"step": trainer.step, "scores": asdict(scores)})
     progress(f"validation at step {trainer.step}: {scores.line()}")
+    save_checkpoint(trainer, out)
+    trainer.course.export(trainer.mean, out / trainer.course.weights, trainer.step, scores)
     return scores
-
-
-def _all(worker: Worker, here: bool) -> bool:
-    """Whether the first worker says so; all must stop at the same step."""
-    if worker.count == 1:
-        return here
-    flag = torch.tensor([float(here)], device=worker.device)
-    distributed.broadcast(flag, 0)
-    return bool(flag.item())
 
 
 def _log(out: Path, entry: dict) -> None:

@@ -1,43 +1,33 @@
-"""One training run of the flow network: steps, running mean of the weights, exact resume."""
+"""One training run of a network: steps, running mean of the weights, exact resume."""
 
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, distributed, nn
 
-from geogs.tracking.flow.own_network import FlowNetwork
-from geogs_train.ahead import PlansAhead
-from geogs_train.objective import objective
-from geogs_train.options import FlowTraining
-from geogs_train.rooms.sampler import Plan, RoomSampler
+from geogs_train.course import Course, Schedule, Worker
 from geogs_train.step_graph import StepGraph
 
 
-@dataclass(frozen=True)
-class Worker:
-    """This process among those that train together, one for each device."""
-
-    device: torch.device
-    rank: int = 0
-    count: int = 1
-
-
-class FlowTrainer:
-    """The network, its optimiser and the rooms it learns from.
+class Trainer:
+    """A network, its optimiser and the course that it takes.
 
     Step n of a run depends on nothing but the seed, n, and the state after step n - 1, so that a
     run that goes on from a checkpoint equals one that was never stopped (on the CPU to the last
     bit).
     """
 
-    def __init__(self, options: FlowTraining, worker: Worker, fuse: bool = False) -> None:
-        self.options, self.worker = options, worker
+    def __init__(
+        self, course: Course, worker: Worker, fuse: bool = False, paced: bool = False
+    ) -> None:
+        """``paced``: ``progress`` is set by who calls, not by the share of the steps."""
+        self.course, self.worker = course, worker
+        self.options = options = course.options
         torch.manual_seed(options.seed)
-        self.network = _on_device(FlowNetwork(options.network), worker.device)
-        self.mean = _on_device(FlowNetwork(options.network), worker.device).requires_grad_(False)
+        self.network = _on_device(course.network(), worker.device)
+        self.mean = _on_device(course.network(), worker.device).requires_grad_(False)
         self.mean.load_state_dict(self.network.state_dict())
         self._parameters = list(self.network.parameters())
         self._gradient = _flat_gradient(self._parameters)
@@ -47,19 +37,17 @@ class FlowTrainer:
             weight_decay=options.weight_decay,
             fused=worker.device.type == "cuda",
         )
-        self.objective = objective(options)
         self.step = 0
+        self.progress, self._paced = 0.0, paced
+        """``progress`` is the share of the run that is done; what is learnt depends on it."""
         self._graph: StepGraph | None = None
-        self._plans: PlansAhead | None = None
-        self.rooms = RoomSampler(options.rooms, worker.device, options.seed)
         if fuse:
-            self.network.encoder.compile(dynamic=False)
-            self.network.update.compile(dynamic=False)
+            course.compile(self.network)
 
     def advance(self) -> Float[Tensor, ""]:
         """Take a step; returns its loss, which stays on the device."""
         options = self.options
-        loss = self._gradients(self.batch(self.step))
+        loss = self._gradients(self.course.batch(self.step, self.progress))
         if self.worker.count > 1:
             distributed.all_reduce(self._gradient)
             self._gradient /= self.worker.count
@@ -67,24 +55,18 @@ class FlowTrainer:
         # A step from a loss that is not finite would be the last.
         self._gradient.nan_to_num_(0.0, 0.0, 0.0)
         for group in self.optimizer.param_groups:
-            group["lr"] = options.learning_rate * schedule(self.step, options)
+            group["lr"] = options.learning_rate * schedule(self.step, self.progress, options)
         self.optimizer.step()
         self.step += 1
+        if not self._paced:
+            self.progress = self.step / options.steps
         decay = min(options.ema, (1 + self.step) / (10 + self.step))
         with torch.no_grad():
             means: list[Tensor] = [*self.mean.parameters()]
             torch._foreach_lerp_(means, [*self._parameters], 1 - decay)
         return loss
 
-    def batch(self, step: int) -> Any:
-        """What step ``step`` learns from."""
-        clips = self.rooms.film(self._plan(step))
-        generator = torch.Generator(self.worker.device)
-        generator.manual_seed(hash((self.options.seed, step, self.worker.rank)) % 2**62)
-        with torch.no_grad():
-            return self.objective.prepare(clips, generator)
-
-    def begin_with(self, network: FlowNetwork) -> None:
+    def begin_with(self, network: nn.Module) -> None:
         """Take over the weights of a network of the same sizes."""
         for mine in (self.network, self.mean):
             mine.load_state_dict(network.state_dict())
@@ -93,23 +75,8 @@ class FlowTrainer:
         """Whether all weights are."""
         return bool(torch.stack([p.detach().isfinite().all() for p in self._parameters]).all())
 
-    def close(self) -> None:
-        """End the processes that draw rooms."""
-        if self._plans is not None:
-            self._plans.close()
-
-    def _plan(self, step: int) -> Plan:
-        options, rank = self.options, self.worker.rank
-        if self.worker.device.type != "cuda":
-            return self.rooms.plan(step, options.batch, rank)
-        if self._plans is None:
-            self._plans = PlansAhead(
-                options.rooms, self.rooms.bank.materials, options.seed, options.batch, rank
-            )
-        return self._plans.plan(step)
-
     def _gradients(self, batch: Any) -> Float[Tensor, ""]:
-        if self.worker.device.type != "cuda" or not self.objective.recordable:
+        if self.worker.device.type != "cuda" or not self.course.recordable:
             return self._compute(batch)
         if self._graph is None:
             self._graph = StepGraph(self._compute, batch)
@@ -117,20 +84,18 @@ class FlowTrainer:
 
     def _compute(self, batch: Any) -> Float[Tensor, ""]:
         self._gradient.zero_()
-        loss = self.objective.loss(self.network, batch)
+        loss = self.course.loss(self.network, batch)
         loss.backward()
         return loss.detach()
 
 
-def schedule(step: int, options: FlowTraining) -> float:
-    """Learning rate of a step over its peak: a linear warm-up, then half a cosine."""
-    if step < options.warmup:
-        return (step + 1) / options.warmup
-    done = (step - options.warmup) / max(options.steps - options.warmup, 1)
-    return 0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * min(done, 1.0)))
+def schedule(step: int, progress: float, options: Schedule) -> float:
+    """Learning rate of a step over its peak: half a cosine, begun with a linear warm-up."""
+    rate = 0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * min(progress, 1.0)))
+    return rate * min(1.0, (step + 1) / max(options.warmup, 1))
 
 
-def _on_device(network: FlowNetwork, device: torch.device) -> FlowNetwork:
+def _on_device(network: nn.Module, device: torch.device) -> nn.Module:
     """With the layout that convolutions are fast in (which PyTorch's stubs do not know)."""
     return network.to(device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 

@@ -21,6 +21,7 @@ class Validation:
     def __init__(self, options: FlowTraining, device: torch.device, batches: int = 8) -> None:
         rooms = replace(options.rooms, views=2, validation=True)
         self._rooms = RoomSampler(rooms, device, SEED)
+        self._iterations = options.iterations
         self.batches, self._batch, self._device = batches, options.batch, device
 
     def batch(self, number: int, starts: StartOptions | None = None) -> FlowBatch:
@@ -32,12 +33,12 @@ class Validation:
         )
 
     @torch.no_grad()
-    def score(self, network: FlowNetwork, iterations: int) -> FlowScores:
+    def score(self, network: FlowNetwork) -> FlowScores:
         """Scores of a network."""
         parts = []
         for number in range(self.batches):
             batch = self.batch(number)
-            _, estimates, dense = run_network(network, batch, iterations)
+            _, estimates, dense = run_network(network, batch, self._iterations)
             deviation = estimates[-1].error.variance().sqrt()
             parts.append(cell_errors(batch, estimates[-1].pixels, deviation, dense))
         return summarise(parts)

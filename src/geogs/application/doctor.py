@@ -13,9 +13,9 @@ from geogs.application.self_test import check_renderer, time_renderer
 from geogs.errors import DeviceError
 from geogs.gpu import cache, installation, kernels
 from geogs.gpu.source import PACKAGE
+from geogs.networks.weights_catalogue import CATALOGUE
+from geogs.networks.weights_files import checksum, locate
 from geogs.threads import worker_count
-from geogs.tracking.flow.weights_catalogue import CATALOGUE
-from geogs.tracking.flow.weights_files import checksum, locate
 from geogs.version import __version__
 
 

@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-from geogs.tracking.flow.weights_catalogue import CATALOGUE, KnownWeights, known_as
-from geogs.tracking.flow.weights_files import checksum, locate, require_intact, weights_folders
+from geogs.networks.weights_catalogue import CATALOGUE, KnownWeights, known_as
+from geogs.networks.weights_files import checksum, locate, require_intact, weights_folders
 
 
 def listing() -> str:
@@ -25,6 +25,7 @@ def listing() -> str:
         "own": "--tracking.operator own",
         "raft": "--tracking.operator raft",
         "droid": "--tracking.operator droid",
+        "depth": "--mapping.depth.engine network",
         "prior": "monocular priors",
     }
     for purpose, title in titles.items():
@@ -49,7 +50,7 @@ def verification(path: Path) -> str:
         f"verdict  {found.verdict}",
     ]
     if path.suffix != ".onnx":
-        from geogs.tracking.flow.weights import read_tensors  # loads PyTorch
+        from geogs.networks.weights import read_tensors  # loads PyTorch
 
         tensors = read_tensors(path)
         numbers = sum(t.numel() for t in tensors.values())

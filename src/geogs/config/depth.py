@@ -1,7 +1,7 @@
 """Settings of the keyframes' dense depth."""
 
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Literal
 
 from geogs.config.setting import (
     Angle,
@@ -19,6 +19,13 @@ from geogs.config.setting import (
 class DepthConfig(Settings, group="mapping.depth"):
     """Dense depth of a keyframe before any disk is made."""
 
+    engine: Literal["classical", "network", "joint"] = "classical"
+    """Who finds depth: matching without a network, the network of geogs train depth, or both, each
+    where it is surer."""
+    weights: str = ""
+    """Weights file of the network; "" takes the one that is found."""
+    network_edge: Annotated[int, Range(32, 16384)] = 512
+    """Longest edge of the images that the network sees, pixels; at most that of the input."""
     sigma_scale: Annotated[Positive, Only("run")] = 0.14
     """Completion: real over expected deviation of the tracker's inverse depth."""
     bending: Annotated[Positive, Only("run")] = 0.02

@@ -1,4 +1,4 @@
-"""Where keyframe depths are computed: on the CPU, or on the GPU that holds the map."""
+"""Who computes keyframe depths: on the CPU, or on the GPU that holds the map."""
 
 import torch
 
@@ -14,9 +14,36 @@ def depth_engine(
     config: DepthConfig,
     resident: int,
 ) -> DepthEngine:
-    """The engine for a map on ``device``: depths at the size of ``render``, refined at that of
-    ``working``, the size of the keyframes' images, of which a GPU holds the ``resident`` used last.
+    """The engine that the settings name for a map on ``device``: depths at the size of ``render``,
+    from images at the size of ``working``, of which a GPU holds the ``resident`` used last.
+
+    Raises InputError if the network is asked for and no weights are found or they do not fit.
     """
+    classical = _classical(device, render, working, config, resident)
+    if config.engine == "classical":
+        return classical
+    from geogs.depth.network.engine import NetworkDepthEngine
+    from geogs.depth.network.weights import load_depth_network
+    from geogs.networks.weights_files import find_weights
+
+    trained = load_depth_network(find_weights("depth", config.weights))
+    network = NetworkDepthEngine(
+        trained, classical, torch.device(device), render, working, config, resident
+    )
+    if config.engine == "network":
+        return network
+    from geogs.depth.network.joint import JointDepthEngine
+
+    return JointDepthEngine(network, classical)
+
+
+def _classical(
+    device: torch.device | str,
+    render: Camera,
+    working: Camera,
+    config: DepthConfig,
+    resident: int,
+) -> DepthEngine:
     if torch.device(device).type == "cuda":
         from geogs.depth.cuda.engine import CudaDepthEngine
 

@@ -82,14 +82,14 @@ def depth_range(
     relative deviation is below ``config.range_deviation``), seen from the reference and widened by
     ``config.range_margin`` on both sides. (0.1, 10) if the tracker knows next to nothing.
     """
-    inverse = _seen_inverse_depth(reference, (reference, *others), working, config)
+    inverse = seen_inverse_depth(reference, (reference, *others), working, config)
     if len(inverse) < 8:
         return 0.1, 10.0
     low, high = np.percentile(inverse, [0.5, 99.5])
     return float(1.0 / high / config.range_margin), float(1.0 / low * config.range_margin)
 
 
-def _seen_inverse_depth(
+def seen_inverse_depth(
     reference: DepthView, views: Sequence[DepthView], working: Camera, config: DepthConfig
 ) -> Float64[np.ndarray, "n"]:
     """Inverse depths, in the reference view, of the views' sure cells that it can see."""

@@ -1,6 +1,7 @@
 """What the depth estimation needs to know of one keyframe."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -80,6 +81,8 @@ class DenseDepth:
     """About the median depth, in memory of the host; to be read as ``typical``."""
     written: torch.cuda.Event | None = None
     """After which a GPU has written the median."""
+    normal: Float32[Tensor, "h w 3"] | None = None
+    """Unit, camera frame, facing the camera, where who found the depth knows it; zero elsewhere."""
 
     @staticmethod
     def of(depth: KeyframeDepth) -> "DenseDepth":
@@ -106,7 +109,8 @@ class DenseDepth:
         inside = self.depth[mask]
         median = inside.median().cpu() if len(inside) else self.median
         confidence = torch.where(mask, self.confidence, 0.0)
-        return DenseDepth(self.depth, confidence, median, None if len(inside) else self.written)
+        written = None if len(inside) else self.written
+        return replace(self, confidence=confidence, median=median, written=written)
 
     def unsure_where(self, mask: Bool[Tensor, "h w"]) -> "DenseDepth":
         """Nothing known in the mask; the depth there, and the median, stay what they are."""
@@ -116,7 +120,8 @@ class DenseDepth:
     def scaled(self, factor: float) -> "DenseDepth":
         """The depth multiplied by a factor."""
         depth = self.depth * factor
-        return DenseDepth(depth, self.confidence, torch.tensor(np.median(depth.cpu().numpy())))
+        median = torch.tensor(np.median(depth.cpu().numpy()))
+        return replace(self, depth=depth, median=median, written=None)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -144,3 +149,17 @@ def depth_view(keyframe: Keyframe, render: Camera) -> DepthView:
     return DepthView(
         keyframe.id, T_cw, *depth_images(image, render), image, *keyframe.depth_field()
     )
+
+
+def dense_depths(maps: Sequence[tuple[Tensor, Tensor]]) -> list[DenseDepth]:
+    """Depths with confidences and their medians, for which the host does not wait for a GPU."""
+    if not maps:
+        return []
+    medians = torch.stack([depth.flatten().median() for depth, _ in maps])
+    written = None
+    if medians.is_cuda:
+        on_host = torch.empty(len(maps), pin_memory=True)
+        medians = on_host.copy_(medians, non_blocking=True)
+        written = torch.cuda.Event()
+        written.record(torch.cuda.current_stream(maps[0][0].device))
+    return [DenseDepth(*m, median, written) for m, median in zip(maps, medians, strict=True)]

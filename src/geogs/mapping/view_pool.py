@@ -53,6 +53,8 @@ class StoredDepth:
     """Median depth, map units."""
     scale: float
     """Of the keyframe when its depth was archived."""
+    normal: Archived | None = None
+    """Half precision; none where the depth came without."""
     held: DenseDepth | None = field(default=None, metadata={"stored": False})
     """The depth itself, where it can also stay: on a GPU it is small beside all else there, and
     bringing it there again takes longer than using it."""
@@ -63,6 +65,7 @@ class StoredDepth:
         arrays = depth.arrays()
         return StoredDepth(
             archive.put(arrays.depth), archive.put(arrays.confidence), depth.typical, scale,
+            None if depth.normal is None else archive.put(depth.normal.half().cpu().numpy()),
             depth if depth.depth.is_cuda else None,
         )  # fmt: skip
 
@@ -74,12 +77,16 @@ class StoredDepth:
         """The depth at another scale of the keyframe."""
         factor, typical = scale / self.scale, torch.tensor(self.typical_at(scale))
         if self.held is not None:
-            return DenseDepth(self.held.depth * factor, self.held.confidence, typical)
+            held = self.held
+            return DenseDepth(held.depth * factor, held.confidence, typical, normal=held.normal)
         depth = torch.from_numpy(self.depth.load())
         if factor != 1.0:
             depth = depth * factor
         confidence = torch.from_numpy(self.confidence.load())
-        return DenseDepth(depth.to(device), confidence.to(device), typical)
+        normal = None
+        if self.normal is not None:
+            normal = torch.from_numpy(self.normal.load()).float().to(device)
+        return DenseDepth(depth.to(device), confidence.to(device), typical, normal=normal)
 
 
 @dataclass(eq=False)
@@ -197,6 +204,7 @@ class ViewPool:
                 maps.constants,
                 prior_depth=self._prior_depth(stored, depth).float(),
                 confidence=depth.confidence.float(),
+                prior_normal=self._prior_normal(maps, depth),
             )
 
     def constants(self, id: int) -> ViewConstants | None:
@@ -205,8 +213,9 @@ class ViewPool:
         if maps.constants is None and maps.depth is not None:
             prior = self._prior_depth(self._stored[id], maps.depth)
             maps.constants = ViewConstants.prepare(
-                maps.image, self.cameras.render, prior, maps.depth.confidence, maps.normal
-            )
+                maps.image, self.cameras.render, prior, maps.depth.confidence,
+                self._prior_normal(maps, maps.depth),
+            )  # fmt: skip
         return maps.constants
 
     def light(self, id: int) -> Float[Tensor, "2"] | None:
@@ -296,6 +305,11 @@ class ViewPool:
             depth = maps.depth.scaled(stored.keyframe.scale / maps.scale)
             self.set_depth(stored.keyframe.id, depth)
         return maps
+
+    @staticmethod
+    def _prior_normal(maps: ViewMaps, depth: DenseDepth) -> Float[Tensor, "h w 3"] | None:
+        """A prior's normals, else those that came with the depth."""
+        return depth.normal if maps.normal is None else maps.normal
 
     @staticmethod
     def _prior_depth(stored: StoredMaps, depth: DenseDepth) -> Float[Tensor, "h w"]:

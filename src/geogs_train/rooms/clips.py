@@ -17,8 +17,12 @@ class ClipBatch:
 
     images: Float[Tensor, "b v 3 h w"]
     """RGB in 0..1, in 8-bit steps, as a camera with noise, blur and artefacts takes them."""
+    light: Float[Tensor, "b v 3 h w"]
+    """The same as linear light, before the camera: what there is to see."""
     depth: Float[Tensor, "b v h w"]
     """z along the optical axis in metres, exact at the (integer) pixel centres."""
+    normal: Float[Tensor, "b v 3 h w"]
+    """Unit, camera frame, facing the camera, exact at the pixel centres."""
     T_cw: Float[Tensor, "b v 4 4"]
     """World to camera, OpenCV axes."""
     intrinsics: Float[Tensor, "b 4"]

@@ -38,6 +38,8 @@ class RoomOptions(Settings, group="training.rooms"):
     """Largest share of them."""
     motions: MotionShares = MotionShares()
     """Kinds of camera motion."""
+    sway: Weight = 0.0
+    """Deviation of the views of longer clips from their path, over the way from view to view."""
     candidates: Count = 24
     """Camera paths tried per clip; the first that suits is taken."""
     disturbance: Weight = 1.0

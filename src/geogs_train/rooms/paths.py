@@ -78,6 +78,9 @@ def draw_paths(draw: Draw, options: RoomOptions, size: Float[Tensor, "b 3"]) -> 
     shaken = (v > 2) * (progress[:, None] > 0)
     steps = progress[:, None] + draw.normal(0.12, b, k, v, 1) * shaken
     centre = start[:, :, None] + steps * move.way[:, :, None]
+    if options.sway:
+        aside = draw.normal(options.sway, b, k, v, 3) * shaken
+        centre = centre + aside * move.way.norm(dim=-1)[:, :, None, None]
     seen = start + forward * draw.log_uniform(0.8, 4.0, b, k)[..., None]
     jitter = draw.normal(0.1, b, k, v, 3) * shaken
     R = R0[:, :, None] @ from_vector((steps + jitter) * move.spin[:, :, None])

@@ -28,6 +28,8 @@ class Rendering:
     """Linear, the mean of four samples per pixel."""
     depth: Float[Tensor, "b v h w"]
     """z along the optical axis in metres, of the ray through the pixel's centre."""
+    normal: Float[Tensor, "b v 3 h w"]
+    """Unit, camera frame, facing the camera, of the surface that this ray meets."""
 
 
 @dataclass(frozen=True)
@@ -53,8 +55,11 @@ def render_by_torch(rooms: Rooms, bank: TextureBank, views: Views) -> Rendering:
         for part in _chunks(len(x))
     ]
     shape = (b, v, views.height, views.width)
-    colour, depth = (torch.cat([s[k] for s in seen], 1) for k in (0, 1))
-    return Rendering(colour.reshape(*shape, 3).movedim(-1, 2).contiguous(), depth.reshape(shape))
+    colour, depth, normal = (torch.cat([s[k] for s in seen], 1) for k in range(3))
+    colour, normal = (x.reshape(*shape, 3) for x in (colour, normal))
+    normal = torch.einsum("bvij,bvhwj->bvhwi", views.T_cw[..., :3, :3], normal)
+    colour, normal = (x.movedim(-1, 2).contiguous() for x in (colour, normal))
+    return Rendering(colour, depth.reshape(shape), normal)
 
 
 def flow_by_torch(
@@ -86,11 +91,12 @@ def _chunks(pixels: int) -> list[slice]:
 def _look(
     rooms: Rooms, bank: TextureBank, views: Views, view: int,
     x: Float[Tensor, "m"], y: Float[Tensor, "m"],
-) -> tuple[Float[Tensor, "b m 3"], Float[Tensor, "b m"]]:  # fmt: skip
-    """Colour and depth of some pixels of a view."""
+) -> tuple[Float[Tensor, "b m 3"], Float[Tensor, "b m"], Float[Tensor, "b m 3"]]:  # fmt: skip
+    """Colour, depth and normal (world frame) of some pixels of a view."""
     origin, direction = rays(views, view, x, y)
     hit = closest_hit(rooms.size, rooms.solids, origin, direction)
-    access = ambient_access(rooms, surface_point(rooms, hit, origin, direction))
+    middle = surface_point(rooms, hit, origin, direction)
+    access = ambient_access(rooms, middle)
     focal = (views.intrinsics[:, :1] * views.intrinsics[:, 1:2]).sqrt()
     total = torch.zeros_like(direction)
     for k in range(4):
@@ -99,4 +105,4 @@ def _look(
         point = surface_point(rooms, seen, origin, ray)
         footprint = 0.5 * seen.t * ray.norm(dim=-1) / focal
         total = total + shade(rooms, bank, point, view, k, ray, footprint, access)
-    return total / 4, hit.t
+    return total / 4, hit.t, middle.normal

@@ -55,14 +55,15 @@ def render_by_kernel(rooms: Rooms, bank: TextureBank, views: Views) -> Rendering
     b, v = views.T_cw.shape[:2]
     shape, device = (b, v, views.height, views.width), views.T_cw.device
     depth = torch.empty(shape, device=device)
-    colour = torch.empty(b, v, 3, views.height, views.width, device=device)
+    colour, normal = (torch.empty(b, v, 3, *shape[2:], device=device) for _ in range(2))
     count, lights = _count(rooms.solids), rooms.lights.position.shape[2]
     kernels_for(SOURCE, device)["render_rooms"](
         _grid(views, b * v), _BLOCK, rooms.size.float().contiguous(), packed_solids(rooms.solids),
         rooms.surfaces.packed(), rooms.lights.packed(), views.packed(), bank.texels, colour, depth,
-        v, count, lights, bank.size, bank.levels, bank.texels.shape[1], views.width, views.height,
+        normal, v, count, lights, bank.size, bank.levels, bank.texels.shape[1], views.width,
+        views.height,
     )  # fmt: skip
-    return Rendering(colour, depth)
+    return Rendering(colour, depth, normal)
 
 
 def flow_by_kernel(

@@ -45,9 +45,9 @@ __device__ void find_nearby(const Room& room, const Stock& stock, const Ball& ba
   __syncthreads();
 }
 
-// Linear colour as the mean of four samples, and depth by the ray through the centre; a thread per
-// pixel, MOST_SOLIDS threads per block, a view per blockIdx.z.
-extern "C" __global__ void __launch_bounds__(128) render_rooms(const float* sizes, const float* solids, const float* surfaces, const float* lights, const float* cameras, const unsigned* texels, float* colour, float* depth, int views, int count, int light_count, int texture_size, int texture_levels, long long texture_stride, int width, int height) {
+// Linear colour as the mean of four samples, depth and normal by the ray through the centre; a
+// thread per pixel, MOST_SOLIDS threads per block, a view per blockIdx.z.
+extern "C" __global__ void __launch_bounds__(128) render_rooms(const float* sizes, const float* solids, const float* surfaces, const float* lights, const float* cameras, const unsigned* texels, float* colour, float* depth, float* normal, int views, int count, int light_count, int texture_size, int texture_levels, long long texture_stride, int width, int height) {
   __shared__ Stock stock;
   __shared__ u32 mask[MOST_SOLIDS / 32];
   __shared__ Nearby nearby;
@@ -75,7 +75,8 @@ extern "C" __global__ void __launch_bounds__(128) render_rooms(const float* size
   find_nearby(room, stock, ball, nearby, thread);
   if (x >= width || y >= height) return;
 
-  float access = ambient_access(stock, nearby.around, room.size, point_at(stock, room.size, hit, origin, direction));
+  Point middle = point_at(stock, room.size, hit, origin, direction);
+  float access = ambient_access(stock, nearby.around, room.size, middle);
   float focal = sqrtf(camera[12] * camera[13]);
   V3 sum = v3(0.f, 0.f, 0.f);
 #pragma unroll
@@ -90,6 +91,12 @@ extern "C" __global__ void __launch_bounds__(128) render_rooms(const float* size
   out[0] = 0.25f * sum.x;
   out[area] = 0.25f * sum.y;
   out[2 * area] = 0.25f * sum.z;
+  const float* c = camera;
+  V3 n = middle.normal;
+  float* facing = normal + view * 3 * area + pixel;
+  facing[0] = c[0] * n.x + c[4] * n.y + c[8] * n.z;
+  facing[area] = c[1] * n.x + c[5] * n.y + c[9] * n.z;
+  facing[2 * area] = c[2] * n.x + c[6] * n.y + c[10] * n.z;
 }
 
 // The first thing that each ray meets; a thread per ray, a room per blockIdx.y.

@@ -19,6 +19,7 @@ from geogs_train.rooms.options import RoomOptions
 from geogs_train.rooms.paths import Paths, draw_paths
 from geogs_train.rooms.render import render
 from geogs_train.rooms.scene import Rooms, moved
+from geogs_train.rooms.textures import TextureBank
 
 _LEAST, _MOST = (2.5, 2.5, 2.2), (8.0, 8.0, 3.5)
 """Sizes of rooms, metres."""
@@ -39,11 +40,18 @@ class Plan:
 class RoomSampler:
     """An endless supply of clips; each batch depends only on the seed, the step and the rank."""
 
-    def __init__(self, options: RoomOptions, device: torch.device | str, seed: int = 0) -> None:
+    def __init__(
+        self,
+        options: RoomOptions,
+        device: torch.device | str,
+        seed: int = 0,
+        bank: TextureBank | None = None,
+    ) -> None:
+        """``bank`` may be that of a sampler with the same textures."""
         self.options = options
         self.device = torch.device(device)
         self._seed = seed
-        self.bank = make_bank(
+        self.bank = bank or make_bank(
             options.textures, options.texture_size, seed, self.device, options.validation
         )
 
@@ -70,7 +78,10 @@ class RoomSampler:
         rooms = Rooms(size, solids, plan.rooms.surfaces, plan.rooms.lights)
         rendering = render(rooms, self.bank, views)
         images = develop(Draw(self.device, *key), plan.flaws, rendering.colour)
-        return ClipBatch(images, rendering.depth, views.T_cw, views.intrinsics, solids)
+        return ClipBatch(
+            images, rendering.colour, rendering.depth, rendering.normal, views.T_cw,
+            views.intrinsics, solids,
+        )  # fmt: skip
 
 
 @torch.no_grad()

@@ -213,3 +213,18 @@ def test_pictures_without_flaws_are_those_of_the_light():
 def test_wall_distance():
     size = torch.tensor([[4.0, 5.0, 3.0]])
     assert wall_distance(size, torch.tensor([[[1.0, 1.0, 2.5]]])).item() == pytest.approx(0.5)
+
+
+def test_normals_are_those_of_the_depth_and_face_the_camera(clips):
+    x = (torch.arange(64.0) - clips.intrinsics[:, 2:3]) / clips.intrinsics[:, :1]
+    y = (torch.arange(48.0) - clips.intrinsics[:, 3:]) / clips.intrinsics[:, 1:2]
+    ray = torch.stack(torch.broadcast_tensors(x[:, None], y[:, :, None], torch.ones(1)), 1)
+    assert ((clips.normal * ray[:, None]).sum(2) < 1e-4).float().mean() > 0.999
+    assert torch.allclose(clips.normal.norm(dim=2), torch.ones(()), atol=1e-5)
+    point = clips.depth[:, :, None] * ray[:, None]
+    across = point[..., 1:-1, 2:] - point[..., 1:-1, :-2]
+    down = point[..., :-2, 1:-1] - point[..., 2:, 1:-1]
+    found = torch.nn.functional.normalize(torch.linalg.cross(across, down, dim=2), dim=2)
+    cosine = (found * clips.normal[..., 1:-1, 1:-1]).sum(2)
+    # All but edges: three quarters of the pixels of such small views.
+    assert (cosine > 0.999).float().mean() > 0.6

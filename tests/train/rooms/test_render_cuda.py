@@ -70,6 +70,8 @@ def test_renders_like_the_reference(device):
     # Rays that graze an edge, or whose texture level is between two, may fall on either side.
     wrong = (fast.depth - slow.depth).abs() > 1e-4 * slow.depth
     assert wrong.float().mean() < 2e-3
+    turned = 1 - (fast.normal * slow.normal).sum(2)
+    assert (turned > 1e-4).float().mean() < 4e-3
     difference = (fast.colour - slow.colour).abs().amax(2)
     assert difference.quantile(0.98) < 2e-3 if difference.numel() < 1e6 else True
     assert (difference > 5e-3).float().mean() < 0.01

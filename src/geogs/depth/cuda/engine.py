@@ -21,7 +21,7 @@ from geogs.depth.cuda.sweep import MAX_NEIGHBOURS, MAX_PLANES, PlaneSlots, sweep
 from geogs.depth.evidence import prior_weight, relative_precision
 from geogs.depth.plane_sweep import sweep_planes
 from geogs.depth.sweep_neighbors import depth_range
-from geogs.depth.view import DenseDepth, DepthView, PosedDepth
+from geogs.depth.view import DenseDepth, DepthView, PosedDepth, dense_depths
 from geogs.geometry.camera import Camera
 from geogs.keyframes.swap import Swap
 from geogs.threads import worker_count
@@ -97,7 +97,7 @@ class CudaDepthEngine:
             for i, grids in enumerate(evidence, start):
                 maps.append(self._search(references[i], usable[i], plans[i], grids))
                 progress(len(maps) / len(references))
-        return _with_medians(maps)
+        return dense_depths(maps)
 
     def check(
         self, depths: Sequence[PosedDepth], others: Sequence[Sequence[PosedDepth]]
@@ -181,17 +181,3 @@ class CudaDepthEngine:
             *choose_start(tracker, swept), tracker, config,
         )  # fmt: skip
         return judge(refined, swept.margin, tracker, plan.near, plan.far)
-
-
-def _with_medians(maps: Sequence[tuple[Tensor, Tensor]]) -> list[DenseDepth]:
-    """The depths with their medians, which follow from the GPU without being waited for."""
-    if not maps:
-        return []
-    medians = torch.stack([depth.flatten().median() for depth, _ in maps])
-    written = None
-    if medians.is_cuda:
-        on_host = torch.empty(len(maps), pin_memory=True)
-        medians = on_host.copy_(medians, non_blocking=True)
-        written = torch.cuda.Event()
-        written.record(torch.cuda.current_stream(maps[0][0].device))
-    return [DenseDepth(*m, median, written) for m, median in zip(maps, medians, strict=True)]

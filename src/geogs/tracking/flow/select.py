@@ -2,8 +2,8 @@
 
 from geogs.config import TrackingConfig
 from geogs.keyframes.grid import SampleGrid
+from geogs.networks.weights_files import find_weights
 from geogs.tracking.flow.base import FlowOperator
-from geogs.tracking.flow.weights_files import find_weights
 
 
 def build_operator(config: TrackingConfig, grid: SampleGrid) -> FlowOperator:

@@ -7,9 +7,9 @@ from pathlib import Path
 
 from geogs.errors import InputError
 from geogs.gpu.cache import cache_folder
-from geogs.tracking.flow.weights_catalogue import CATALOGUE, KnownWeights, Purpose, known_as
+from geogs.networks.weights_catalogue import CATALOGUE, KnownWeights, Purpose, known_as
 
-PACKAGED = Path(__file__).parents[2] / "data" / "weights"
+PACKAGED = Path(__file__).parents[1] / "data" / "weights"
 """Weights that come with the package, and their ``SHA256SUMS``."""
 VARIABLE = "GEOGS_WEIGHTS"
 """Environment variable with a weights file, or a folder of them."""
@@ -78,6 +78,11 @@ def find_weights(purpose: Purpose, chosen: str = "") -> Path:
         if known.purpose == purpose and (path := locate(known)):
             return path
     places = ", ".join(map(str, weights_folders()))
+    if purpose == "depth":
+        raise InputError(
+            f"No weights of the depth network were found in {places}; give --mapping.depth.weights "
+            "FILE (geogs train depth makes one), or take --mapping.depth.engine classical."
+        )
     raise InputError(
         f"No weights for the operator {purpose} were found in {places}; give "
         "--tracking.weights FILE (geogs weights says where such files are had)."

@@ -7,8 +7,8 @@ publisher gives one.
 from dataclasses import dataclass
 from typing import Literal
 
-Purpose = Literal["own", "raft", "droid", "prior"]
-"""A flow operator, or a monocular prior."""
+Purpose = Literal["own", "raft", "droid", "depth", "prior"]
+"""A flow operator, the depth network, or a monocular prior."""
 
 PACKAGED = "comes with geogs"
 
@@ -83,6 +83,13 @@ CATALOGUE = (
         "DROID-SLAM, TartanAir",
         "https://github.com/princeton-vl/DROID-SLAM (README, droid.pth)",
         "BSD-3-Clause",
+    ),
+    KnownWeights(
+        "depth.safetensors",
+        "depth",
+        "multi-view depth of still scenes, trained by geogs",
+        PACKAGED,
+        "Apache-2.0",
     ),
     KnownWeights(
         "depth-anything-v2-small.onnx",

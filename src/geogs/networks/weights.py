@@ -10,7 +10,7 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from geogs.errors import InputError
-from geogs.tracking.flow.weights_files import require_intact
+from geogs.networks.weights_files import require_intact
 
 
 def read_tensors(path: Path) -> dict[str, Tensor]:

@@ -12,13 +12,13 @@ from geogs.cli.main import main
 from geogs.config import TrackingConfig
 from geogs.errors import InputError
 from geogs.keyframes.grid import SampleGrid
-from geogs.tracking.flow import weights_files
+from geogs.networks import weights_files
+from geogs.networks.weights import read_tensors
+from geogs.networks.weights_catalogue import CATALOGUE, KnownWeights
+from geogs.networks.weights_files import checksum, find_weights, weights_folders
 from geogs.tracking.flow.classical import ClassicalFlow
 from geogs.tracking.flow.raft import RaftFlow
 from geogs.tracking.flow.select import build_operator
-from geogs.tracking.flow.weights import read_tensors
-from geogs.tracking.flow.weights_catalogue import CATALOGUE, KnownWeights
-from geogs.tracking.flow.weights_files import checksum, find_weights, weights_folders
 from geogs.tracking.tracker import Tracker
 from raft_oracle import published
 from tracking_scenes import CAMERA

@@ -1,0 +1,1 @@
+"""Our multi-view stereo network: keyframe depth where photometry alone fails."""

@@ -1,0 +1,40 @@
+"""What turns the network's own words into deviations and confidences that hold."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+TOLERANCE = 0.02
+"""Relative error of depth up to which it counts as right, as for the classical search."""
+
+
+@dataclass(frozen=True)
+class DepthCalibration:
+    """Numbers that were fitted on rooms that the training did not show."""
+
+    scale: float = 1.0
+    """Factor on Laplace scales."""
+    gain: float = 1.0
+    """Factor on the logit of the chance that a depth is right."""
+    offset: float = 0.0
+    """Added to it."""
+
+    def deviation(self, log_scale: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
+        """Standard deviation of log depth of what is no outlier."""
+        return 2**0.5 * self.scale * log_scale.exp()
+
+    def confidence(
+        self, log_scale: Float[Tensor, "*n"], outlier: Float[Tensor, "*n"]
+    ) -> Float[Tensor, "*n"]:
+        """Chance that depth is right to ``TOLERANCE``."""
+        return (self.gain * right_logit(log_scale, outlier) + self.offset).sigmoid()
+
+
+def right_logit(
+    log_scale: Float[Tensor, "*n"], outlier: Float[Tensor, "*n"]
+) -> Float[Tensor, "*n"]:
+    """Logit of the chance that a depth is right, as the network's distribution says."""
+    inside = 1 - (-TOLERANCE * (-log_scale).exp()).exp()
+    return torch.logit((-outlier).sigmoid() * inside, 1e-4)

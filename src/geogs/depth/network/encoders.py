@@ -1,0 +1,60 @@
+"""What single images say: features to match, and the keyframe's own context."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional
+
+from geogs.depth.network.layers import Block, Residual, doubled
+from geogs.depth.network.options import DepthNetworkOptions
+from geogs.depth.network.sweep import cell_rays
+
+
+class MatchingEncoder(nn.Module):
+    """Features of one length at 1/4, alike in all views."""
+
+    def __init__(self, options: DepthNetworkOptions) -> None:
+        super().__init__()
+        half, quarter, eighth = options.encoder
+        self.at_half = nn.Sequential(Block(3, half, 6), Residual(half))
+        self.at_quarter = nn.Sequential(
+            Block(half, quarter, 4), Residual(quarter), Residual(quarter)
+        )
+        self.at_eighth = nn.Sequential(Block(quarter, eighth, 4), Residual(eighth))
+        self.back = nn.Conv2d(eighth, quarter, 1)
+        self.out = nn.Sequential(Block(quarter, quarter), nn.Conv2d(quarter, options.matching, 1))
+
+    def forward(self, images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n c h4 w4"]:
+        quarter = self.at_quarter(self.at_half(images))
+        found = self.out(quarter + doubled(self.back(self.at_eighth(quarter))))
+        return found.shape[1] ** 0.5 * functional.normalize(found.float(), dim=1)
+
+
+class ContextEncoder(nn.Module):
+    """Features of the keyframe at 1/2, 1/4, ... that see its rays, too."""
+
+    def __init__(self, options: DepthNetworkOptions) -> None:
+        super().__init__()
+        inputs, stages = 5, []
+        for level, channels in enumerate(options.context):
+            down = Block(inputs, channels, 4 if level else 6)
+            stages.append(nn.Sequential(down, Residual(channels)))
+            inputs = channels
+        self.stages = nn.ModuleList(stages)
+
+    def forward(
+        self, images: Float[Tensor, "n 3 h w"], intrinsics: Float[Tensor, "n 4"]
+    ) -> list[Tensor]:
+        height, width = images.shape[-2:]
+        rays = cell_rays(intrinsics, height, width, 1)[:, :2].unflatten(2, (height, width))
+        x, found = torch.cat([images, rays], 1), []
+        for stage in self.stages:
+            x = stage(x)
+            found.append(x)
+        return found
+
+
+def normalised(images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n 3 h w"]:
+    """Each colour of each image without its mean, and all by the image's contrast."""
+    centred = images - images.mean((2, 3), keepdim=True)
+    return centred / (centred.square().mean((1, 2, 3), keepdim=True).sqrt() + 0.02)

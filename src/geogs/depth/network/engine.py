@@ -1,0 +1,170 @@
+"""Keyframe depths by the network, on the CPU or a GPU."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, UInt8
+from torch import Tensor
+from torch.nn import functional
+
+from geogs.config import DepthConfig
+from geogs.depth.base import DepthEngine, Limits, Progress, silent
+from geogs.depth.completion import known_cells
+from geogs.depth.network.search_range import SearchRange, search_range
+from geogs.depth.network.views import DepthPrediction, StereoViews
+from geogs.depth.network.weights import TrainedDepth
+from geogs.depth.sweep_neighbors import seen_inverse_depth
+from geogs.depth.view import DenseDepth, DepthView, PosedDepth, dense_depths
+from geogs.geometry.camera import Camera
+from geogs.gpu.transfer import to_device
+from geogs.keyframes.swap import Swap
+
+MOST_NEIGHBOURS = 8
+"""The training shows no more; they come best first."""
+MOST_ANGLE = math.radians(15)
+"""Expected error of a normal from which on it counts as unknown."""
+_EDGE = 0.02
+"""Relative distance from the nearest pixel's depth from which on an interpolated depth hangs
+between two surfaces."""
+
+
+class NetworkDepthEngine:
+    """The network finds depths, normals and confidence; ``classical`` does everything else.
+
+    That is the check by other keyframes, the votes, and depth where there are no neighbours.
+    Images of the ``resident`` keyframes used last stay on the device.
+    """
+
+    def __init__(
+        self,
+        trained: TrainedDepth,
+        classical: DepthEngine,
+        device: torch.device,
+        render: Camera,
+        working: Camera,
+        config: DepthConfig,
+        resident: int,
+    ) -> None:
+        self.classical = classical
+        self.device = device
+        self.render = render
+        self.working = working
+        self.config = config
+        self.seen = working.with_long_edge(
+            min(config.network_edge, max(working.width, working.height))
+        )
+        self.calibration = trained.calibration
+        self.network = trained.network.to(device)
+        lens = [self.seen.fx, self.seen.fy, self.seen.cx, self.seen.cy]
+        self._intrinsics = torch.tensor([lens], dtype=torch.float32, device=device)
+        self._images: Swap[int, UInt8[Tensor, "h w 3"]] = Swap(resident)
+
+    def observe(self, view: DepthView) -> None:
+        """As in the protocol."""
+        self.classical.observe(view)
+
+    def estimate(
+        self,
+        references: Sequence[DepthView],
+        neighbours: Sequence[Sequence[DepthView]],
+        progress: Progress = silent,
+        limits: Sequence[Limits | None] | None = None,
+    ) -> list[DenseDepth]:
+        """As in the protocol; at most ``MOST_NEIGHBOURS`` are used."""
+        found: list[DenseDepth] = []
+        searched = limits or [None] * len(references)
+        for reference, others, between in zip(references, neighbours, searched, strict=True):
+            if others:
+                found.append(self._search(reference, others[:MOST_NEIGHBOURS], between))
+            else:
+                found += self.classical.estimate([reference], [[]], limits=[between])
+            progress(len(found) / len(references))
+        return found
+
+    def check(
+        self, depths: Sequence[PosedDepth], others: Sequence[Sequence[PosedDepth]]
+    ) -> list[DenseDepth]:
+        """As in the protocol; normals stay."""
+        checked = self.classical.check(depths, others)
+        return [replace(c, normal=d.depth.normal) for c, d in zip(checked, depths, strict=True)]
+
+    def keep(self, points: Float[Tensor, "n 3"], depths: Sequence[PosedDepth]) -> Bool[Tensor, "n"]:
+        """As in the protocol."""
+        return self.classical.keep(points, depths)
+
+    @torch.no_grad()
+    def _search(
+        self, reference: DepthView, others: Sequence[DepthView], limits: Limits | None
+    ) -> DenseDepth:
+        between = self._range(reference, others, limits)
+        prediction = self.network(self._views(reference, others, between))
+        depth, confidence, normal = self._at_render(prediction)
+        (dense,) = dense_depths([(between.typical * depth, confidence)])
+        return replace(dense, normal=normal)
+
+    def _range(
+        self, reference: DepthView, others: Sequence[DepthView], limits: Limits | None
+    ) -> SearchRange:
+        grid = reference.inverse_depth
+        own = grid[known_cells(grid, reference.information)]
+        seen = seen_inverse_depth(reference, (reference, *others), self.working, self.config)
+        return search_range(seen, own, limits)
+
+    def _views(
+        self, reference: DepthView, others: Sequence[DepthView], between: SearchRange
+    ) -> StereoViews:
+        relative = np.stack([v.T_cw for v in others]) @ np.linalg.inv(reference.T_cw)
+        images = torch.stack([self._image(v) for v in (reference, *others)])
+        images = images.permute(0, 3, 1, 2).float() / 255
+        numbers = (between.near, between.far, between.typical)
+        bounds = to_device(torch.tensor(numbers, dtype=torch.float32), self.device)
+        near, far, typical = bounds.split(1)
+        return StereoViews(
+            images[:1],
+            images[None, 1:],
+            self._intrinsics,
+            self._intrinsics[:, None].expand(-1, len(others), -1),
+            to_device(torch.from_numpy(relative)[None], self.device, torch.float32),
+            torch.ones(1, len(others), dtype=torch.bool, device=self.device),
+            near,
+            far,
+            typical,
+        )
+
+    def _image(self, view: DepthView) -> UInt8[Tensor, "h w 3"]:
+        """The keyframe's image at the network's size, brought to the device at its first use."""
+        size = (self.seen.width, self.seen.height)
+
+        def bring() -> Tensor:
+            small = cv2.resize(view.image, size, interpolation=cv2.INTER_AREA)
+            return to_device(torch.from_numpy(small), self.device)
+
+        return self._images.get(view.id, bring)
+
+    def _at_render(self, found: DepthPrediction) -> tuple[Tensor, Tensor, Tensor]:
+        """Depth over the typical depth, confidence, and normals at the size of the render."""
+        confidence = self.calibration.confidence(found.log_scale, found.outlier)
+        sure = 2 / found.concentration < MOST_ANGLE
+        normal = found.normal * sure[:, None]
+        maps = torch.cat([found.log_depth[:, None], confidence[:, None], normal], 1)
+        maps = resampled(maps, (self.render.height, self.render.width))[0]
+        length = maps[2:].norm(dim=0)
+        unit = torch.where(length > 0.5, maps[2:] / length.clamp_min(1e-6), 0.0)
+        return maps[0].exp(), maps[1].contiguous(), unit.movedim(0, -1).contiguous()
+
+
+def resampled(maps: Float[Tensor, "b c h w"], size: tuple[int, int]) -> Float[Tensor, "b c h2 w2"]:
+    """Bilinear values at another size of the same image, the first the logarithm of depth.
+
+    Where two surfaces would be mixed all is that of the nearest pixel.
+    """
+    if tuple(maps.shape[-2:]) == size:
+        return maps
+    smooth = functional.interpolate(maps, size, mode="bilinear", align_corners=False)
+    near = functional.interpolate(maps, size, mode="nearest-exact")
+    apart = (smooth[:, :1] - near[:, :1]).abs() > _EDGE
+    return torch.where(apart, near, smooth)

@@ -1,0 +1,74 @@
+"""Convolutions that the parts of the depth network are made of."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional
+
+
+class Norm(nn.Module):
+    """Normalises groups of eight channels over the image; stays in the precision of its input."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.groups = max(1, channels // 8)
+        while channels % self.groups:
+            self.groups -= 1
+        self.weight = nn.Parameter(torch.ones(channels))
+        self.bias = nn.Parameter(torch.zeros(channels))
+
+    def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
+        b, c, h, w = x.shape
+        weight, bias = self.weight.to(x.dtype), self.bias.to(x.dtype)
+        # Autocast would make a float32 image of every one that is normalised.
+        return torch.native_group_norm(
+            x.contiguous(), weight, bias, b, c, h * w, self.groups, 1e-5
+        )[0]
+
+
+class Block(nn.Sequential):
+    """Convolution, norm, ReLU; a kernel of even size halves the resolution, cell on cell."""
+
+    def __init__(self, inputs: int, outputs: int, kernel: int = 3) -> None:
+        stride = 1 if kernel % 2 else 2
+        padding = kernel // 2 - (stride - 1)
+        super().__init__(
+            nn.Conv2d(inputs, outputs, kernel, stride, padding, bias=False),
+            Norm(outputs),
+            nn.ReLU(inplace=True),
+        )
+
+
+class Residual(nn.Module):
+    """Two convolutions beside a shortcut."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.first = Block(channels, channels)
+        self.second = nn.Conv2d(channels, channels, 3, padding=1, bias=False)
+        self.norm = Norm(channels)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return (x + self.norm(self.second(self.first(x)))).relu_()
+
+
+def doubled(x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h2 w2"]:
+    """Bilinear, cell on cells."""
+    return functional.interpolate(x, scale_factor=2.0, mode="bilinear", align_corners=False)
+
+
+def upsampled(
+    x: Float[Tensor, "b c h w"], logits: Float[Tensor, "b 36 h w"]
+) -> Float[Tensor, "b c h2 w2"]:
+    """Twice the resolution: each fine cell is a convex combination of the nine coarse ones around.
+
+    ``logits`` are those of the nine cells, row by row, for each of the four fine cells of a cell.
+    """
+    b, c, h, w = x.shape
+    weight = logits.float().unflatten(1, (9, 4)).softmax(1)
+    padded = functional.pad(x, (1, 1, 1, 1), mode="replicate")
+    total = x.new_zeros(b, c, 4, h, w)
+    for k in range(9):
+        near = padded[:, :, k // 3 : k // 3 + h, k % 3 : k % 3 + w]
+        total = total + near[:, :, None] * weight[:, k, None]
+    return functional.pixel_shuffle(total.flatten(1, 2), 2)

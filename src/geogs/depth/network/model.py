@@ -1,0 +1,70 @@
+"""The depth network: a keyframe and posed neighbours to depth, deviation, normals, confidence.
+
+A plane sweep with learned features whose scores become the channels of a 2D network (after
+SimpleRecon), with weights for each neighbour's visibility (after CVA-MVSNet), depth as the mean
+over planes with a bounded correction, and a deviation and normals with a concentration trained by
+their likelihoods. It sees lengths relative to the typical depth only.
+"""
+
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional
+
+from geogs.depth.network.decoder import Readout, VolumeNetwork
+from geogs.depth.network.encoders import ContextEncoder, MatchingEncoder, normalised
+from geogs.depth.network.options import DepthNetworkOptions
+from geogs.depth.network.sweep import log_planes
+from geogs.depth.network.views import DepthPrediction, StereoViews
+from geogs.depth.network.volume import PlaneVolume
+
+MULTIPLE = 32
+"""Images are padded to a multiple of so many pixels."""
+
+
+class DepthNetwork(nn.Module):
+    """Encoders, plane sweep, network over the planes, read-out."""
+
+    def __init__(self, options: DepthNetworkOptions | None = None) -> None:
+        super().__init__()
+        self.options = options or DepthNetworkOptions()
+        self.matching = MatchingEncoder(self.options)
+        self.context = ContextEncoder(self.options)
+        self.volume = PlaneVolume(self.options)
+        self.body = VolumeNetwork(self.options)
+        self.readout = Readout(self.options)
+
+    def forward(self, views: StereoViews) -> DepthPrediction:
+        """Depth of the keyframes; networks in bfloat16 on a GPU, geometry in float32."""
+        height, width = views.image.shape[-2:]
+        images = torch.cat([views.image[:, None], views.others], 1)
+        images = _padded(normalised(images.flatten(0, 1)))
+        device = views.image.device.type
+        with torch.autocast(device, torch.bfloat16, enabled=device == "cuda"):
+            features = self.matching(images).unflatten(0, (len(views.image), -1))
+            images = images.unflatten(0, (len(views.image), -1))
+            context = self.context(images[:, 0], views.intrinsics)
+            with torch.autocast(device, enabled=False):
+                planes = log_planes(
+                    views.near / views.typical, views.far / views.typical, self.options.planes
+                )
+                volume = self.volume(features[:, 0], features[:, 1:], views, planes)
+            body = self.body(volume, context[1:])
+            found = self.readout(body, context[0], planes, views.intrinsics, volume[:, :-1])
+        return _cropped(found, height, width)
+
+
+def _padded(images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n 3 h2 w2"]:
+    height, width = images.shape[-2:]
+    pad = (0, -width % MULTIPLE, 0, -height % MULTIPLE)
+    return functional.pad(images, pad, mode="replicate") if any(pad) else images
+
+
+def _cropped(found: DepthPrediction, height: int, width: int) -> DepthPrediction:
+    """The pixels of the image; what is at 1/2 and 1/4 keeps its padding."""
+    if found.log_depth.shape[-2:] == (height, width):
+        return found
+    names = ("log_depth", "log_scale", "outlier", "normal", "concentration")
+    return replace(found, **{n: getattr(found, n)[..., :height, :width] for n in names})

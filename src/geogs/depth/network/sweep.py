@@ -1,0 +1,101 @@
+"""Planes at many depths in the views of neighbours: where they fall and how they look there.
+
+Everything here is float32: a coordinate in bfloat16 is wrong by pixels.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn import functional
+
+CELL = 4
+"""Pixels per cell of the features; cell i covers the pixels 4 i to 4 i + 3."""
+LEAST_Z = 0.02
+"""Depth in a neighbour, over the typical depth, below which nothing is seen."""
+
+
+@dataclass(frozen=True)
+class PlaneViews:
+    """The cells of keyframes, on every plane, as one neighbour each sees them."""
+
+    cells: Float[Tensor, "b d p 2"]
+    """x, y among the neighbour's cells."""
+    seen: Bool[Tensor, "b d p"]
+    """Before the camera and in the image."""
+    log_z: Float[Tensor, "b d p"]
+    """Logarithm of the depth in the neighbour."""
+    angle: Float[Tensor, "b d p"]
+    """Between the two rays, radians."""
+    log_step: Float[Tensor, "b d p"]
+    """Logarithm of the pixels that a cell moves from this plane to the next."""
+
+
+def log_planes(
+    near: Float[Tensor, "b"], far: Float[Tensor, "b"], count: int
+) -> Float[Tensor, "b d"]:
+    """Logarithms of depths from near to far, evenly spaced."""
+    share = torch.linspace(0, 1, count, dtype=near.dtype, device=near.device)
+    return torch.lerp(near.log()[:, None], far.log()[:, None], share)
+
+
+def cell_rays(
+    intrinsics: Float[Tensor, "b 4"], height: int, width: int, cell: int = CELL
+) -> Float[Tensor, "b 3 p"]:
+    """K^-1 (x, y, 1) of the centres of cells of ``cell`` pixels, row by row."""
+    fx, fy, cx, cy = intrinsics[:, :, None].unbind(1)
+    middle = (cell - 1) / 2
+    x = (cell * torch.arange(width, device=fx.device) + middle - cx) / fx
+    y = (cell * torch.arange(height, device=fx.device) + middle - cy) / fy
+    x, y = x[:, None].expand(-1, height, -1), y[:, :, None].expand(-1, -1, width)
+    return torch.stack([x, y, torch.ones_like(x)], 1).flatten(2)
+
+
+def see_planes(
+    rays: Float[Tensor, "b 3 p"],
+    depths: Float[Tensor, "b d"],
+    T: Float[Tensor, "b 4 4"],
+    intrinsics: Float[Tensor, "b 4"],
+    height: int,
+    width: int,
+) -> PlaneViews:
+    """Where cells at these depths are in a neighbour with ``height`` x ``width`` cells.
+
+    ``T`` takes points of the keyframe's camera to the neighbour's; its translation and the depths
+    are over the typical depth.
+    """
+    turned = T[:, :3, :3] @ rays
+    z = depths[:, None, :, None]
+    point = z * turned[:, :, None] + T[:, :3, 3, None, None]
+    focal, centre = (intrinsics[:, k, None, None] for k in (slice(0, 2), slice(2, 4)))
+    depth = point[:, 2]
+    safe = depth.clamp_min(LEAST_Z)
+    pixels = focal * (point[:, :2] / safe[:, None]) + centre
+    # d pixel / d log z is z d pixel / dz.
+    slope = turned[:, :2, None] - point[:, :2] / safe[:, None] * turned[:, 2:, None]
+    step = torch.diff(depths.log(), dim=1).mean(1)[:, None, None]
+    moved = (focal * slope * (z / safe[:, None])).square().sum(1).sqrt() * step
+    cosine = (turned[:, :, None] * point).sum(1) / (
+        rays.norm(dim=1)[:, None] * point.square().sum(1).sqrt().clamp_min(1e-6)
+    )
+    cells = (pixels - (CELL - 1) / 2) / CELL
+    limit = cells.new_tensor([width, height])[:, None, None] - 0.5
+    inside = ((cells > -0.5) & (cells < limit)).all(1)
+    return PlaneViews(
+        cells.movedim(1, -1),
+        inside & (depth > LEAST_Z),
+        safe.log(),
+        cosine.clamp(-1 + 1e-6, 1 - 1e-6).arccos(),
+        (moved + 1e-3).log(),
+    )
+
+
+def sample_cells(
+    features: Float[Tensor, "b c h w"], cells: Float[Tensor, "b d p 2"]
+) -> Float[Tensor, "b c d p"]:
+    """Bilinear features at positions among the cells; zero outside."""
+    height, width = features.shape[-2:]
+    size = cells.new_tensor([width, height])
+    grid = (2 * cells + 1) / size - 1
+    return functional.grid_sample(features, grid.clamp(-4, 4), align_corners=False)

@@ -1,0 +1,73 @@
+"""The joint depth engine against a loop over pixels, and both its engines."""
+
+import math
+from statistics import NormalDist
+
+import numpy as np
+import pytest
+import torch
+
+from depth_scene import RENDER, WORKING, make_scene
+from geogs.config import DepthConfig
+from geogs.depth.network.joint import AGREE, APART, REACH, joined
+from geogs.depth.select import depth_engine
+from geogs.depth.view import DenseDepth
+
+
+def random_depth(seed: int, normal: bool) -> DenseDepth:
+    rng = torch.Generator().manual_seed(seed)
+    depth = 2 + 0.2 * torch.rand(9, 12, generator=rng)
+    confidence = torch.rand(9, 12, generator=rng)
+    return DenseDepth(
+        depth, confidence, depth.median(), normal=torch.ones(9, 12, 3) if normal else None
+    )
+
+
+def logit(c: float) -> float:
+    c = min(max(c, 0.02), 0.98)
+    return math.log(c / (1 - c))
+
+
+def precision(c: float) -> float:
+    """Square of the tolerance over the deviation of a normal error below it with chance c."""
+    return NormalDist().inv_cdf(0.5 + 0.5 * min(max(c, 0.02), 0.98)) ** 2
+
+
+def test_two_depths_are_joined_as_a_loop_does():
+    first, second = random_depth(0, False), random_depth(1, True)
+    found = joined(first, second)
+    agreeing = 0
+    for y in range(9):
+        for x in range(12):
+            z = [float(d.depth[y, x]) for d in (first, second)]
+            c = [float(d.confidence[y, x]) for d in (first, second)]
+            around = (slice(max(y - 3, 0), y + 4), slice(max(x - 3, 0), x + 4))
+            mean = [float(d.confidence[around].sum()) for d in (first, second)]
+            winner = 0 if mean[0] > mean[1] else 1
+            if abs(math.log(z[0] / z[1])) < REACH:
+                agreeing += 1
+                w = [precision(v) ** 2 for v in c]
+                depth = math.exp((w[0] * math.log(z[0]) + w[1] * math.log(z[1])) / sum(w))
+                score = AGREE[0] * logit(max(c)) + AGREE[1] * logit(min(c)) + AGREE[2]
+            else:
+                depth = z[winner]
+                score = APART[0] * logit(c[winner]) + APART[1] * logit(c[1 - winner]) + APART[2]
+            assert float(found.depth[y, x]) == pytest.approx(depth, rel=1e-4)
+            assert float(found.confidence[y, x]) == pytest.approx(
+                1 / (1 + math.exp(-score)), abs=1e-3
+            )
+    assert 10 < agreeing < 100
+    assert found.normal is second.normal
+    assert found.typical == pytest.approx(float(found.depth.median()))
+
+
+@pytest.mark.system
+def test_together_they_are_as_good_as_the_better_one():
+    scene, errors = make_scene(), {}
+    for name in ("classical", "network", "joint"):
+        config = DepthConfig(engine=name, network_edge=96)
+        engine = depth_engine("cpu", RENDER, WORKING, config, 8)
+        found = engine.estimate([scene.views[0]], [scene.views[1:3]])[0]
+        errors[name] = np.abs(found.depth.numpy() / scene.truth[0] - 1)
+    assert np.median(errors["joint"]) < 1.5 * np.median(errors["classical"])
+    assert errors["joint"].mean() < 1.25 * min(errors[n].mean() for n in ("classical", "network"))

@@ -1,0 +1,77 @@
+"""Normals that come with a keyframe's depth: which count, and that they are stored with it."""
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from geogs.config import LossConfig
+from geogs.depth.view import DenseDepth, KeyframeDepth
+from geogs.geometry.camera import Camera
+from geogs.keyframes.keyframe import Keyframe
+from geogs.mapping.cameras import MapCameras
+from geogs.mapping.view_pool import ViewPool
+from keyframe_samples import Sample, segment_of
+
+WORKING = Camera(80.0, 80.0, 47.5, 35.5, 96, 72)
+CAMERAS = MapCameras(WORKING, WORKING.with_long_edge(48), WORKING)
+SIZE = (36, 48)
+
+
+def keyframes() -> list[Keyframe]:
+    image = np.random.default_rng(0).integers(0, 255, (72, 96, 3), np.uint8)
+    pose = torch.eye(4, dtype=torch.float64)
+    return list(segment_of([Sample(i, image, pose) for i in range(3)], WORKING))
+
+
+def depth_with(normal: torch.Tensor | None) -> DenseDepth:
+    plain = DenseDepth.of(
+        KeyframeDepth(np.full(SIZE, 2.0, np.float32), np.full(SIZE, 0.5, np.float32))
+    )
+    return replace(plain, normal=normal)
+
+
+def facing() -> torch.Tensor:
+    return torch.tensor([0.0, 0.0, -1.0]).expand(*SIZE, 3).contiguous()
+
+
+def test_they_reach_the_losses_and_come_back_from_the_archive():
+    made = keyframes()
+    pool = ViewPool(CAMERAS, LossConfig(), torch.device("cpu"), 1)
+    for keyframe in made[:2]:
+        pool.add(keyframe)
+        pool.set_depth(keyframe.id, depth_with(facing()))
+    assert not pool.is_resident(made[0].id)
+    for keyframe in made[:2]:
+        constants = pool.constants(keyframe.id)
+        assert constants is not None
+        assert torch.equal(constants.prior_normal, facing())
+
+
+def test_a_depth_without_normals_takes_them_away():
+    (keyframe, *_) = keyframes()
+    pool = ViewPool(CAMERAS, LossConfig(), torch.device("cpu"), 8)
+    pool.add(keyframe)
+    pool.set_depth(keyframe.id, depth_with(facing()))
+    assert pool.constants(keyframe.id).prior_normal is not None
+    pool.set_depth(keyframe.id, depth_with(None))
+    assert pool.constants(keyframe.id).prior_normal is None
+
+
+def test_those_of_a_prior_come_first():
+    (keyframe, *_) = keyframes()
+    turned = torch.tensor([0.0, -0.6, -0.8])
+    keyframe.picture.normal = turned.expand(72, 96, 3).half()
+    pool = ViewPool(CAMERAS, LossConfig(), torch.device("cpu"), 8)
+    pool.add(keyframe)
+    pool.set_depth(keyframe.id, depth_with(facing()))
+    found = pool.constants(keyframe.id).prior_normal
+    torch.testing.assert_close(found, turned.expand(*SIZE, 3), rtol=0, atol=2e-3)
+
+
+def test_scaling_and_masking_a_depth_leaves_them():
+    depth = depth_with(facing())
+    mask = torch.zeros(SIZE, dtype=torch.bool)
+    mask[:, 5:] = True
+    for changed in (depth.scaled(2.0), depth.within(mask)):
+        assert changed.normal is depth.normal
