@@ -30,6 +30,7 @@ from geogs.synth.room import make_room
 from geogs.synth.scene import Scene
 from geogs.synth.stage import centred_camera
 from geogs.synth.trajectory import handheld_trajectory
+from geogs.threads import worker_count
 from geogs_train.depth.scores import KINDS, texture_kind
 
 STEP = 6
@@ -224,7 +225,7 @@ def main() -> None:
         for seed in range(arguments.first, arguments.first + arguments.rooms):
             scene = make_room(seed)
             path = handheld_trajectory(scene, 280, seed=seed)
-            caster = Raycaster(flattened(scene, seed) if bare else scene, threads=2)
+            caster = Raycaster(flattened(scene, seed) if bare else scene, threads=worker_count())
             for n in range(arguments.keyframes):
                 middle = 30 + n * 220 // arguments.keyframes
                 frames = [middle + STEP * i for i in range(-AROUND, AROUND + 1)]
