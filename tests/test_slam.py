@@ -257,27 +257,49 @@ def turned(degrees: float) -> np.ndarray:
 
 CASES = {
     "one frame": ([noise()], "hardly moves"),
-    "static video": ([noise()] * 20, "hardly moves"),
     "black frames": ([np.zeros((96, 128, 3), np.uint8)] * 12, "enough texture"),
-    "pure rotation": ([turned(1.4 * i - 14) for i in range(20)], "show no parallax"),
     # Matched well enough to try a start.
     "unrelated frames": ([noise(i, (192, 144)) for i in range(7)], "show no parallax"),
+}
+TURNING = {
+    "static video": ([noise()] * 20, "hardly moves"),
+    "pure rotation": ([turned(1.4 * i - 14) for i in range(20)], "show no parallax"),
 }
 
 
 @pytest.mark.parametrize("name", CASES)
 def test_hopeless_input_gets_one_sentence(name, tmp_path, capsys):
     frames, words = CASES[name]
-    folder, out = images(tmp_path / "images", frames), tmp_path / "out"
-    height, width = frames[0].shape[:2]
-    intrinsics = f"{0.8 * width},{0.8 * width},{width / 2 - 0.5},{height / 2 - 0.5}"
-    argv = ["run", str(folder), "-o", str(out), "--intrinsics", intrinsics, *SMALL]
-    assert cli.main(argv) == 2
+    assert cli.main(run_on(frames, tmp_path)) == 2
     said = capsys.readouterr().err
     errors = [line for line in said.splitlines() if line.startswith("error:")]
     assert len(errors) == 1, said
     assert "Traceback" not in said
     assert words in errors[0]
+
+
+def run_on(frames: list[np.ndarray], folder: Path) -> list[str]:
+    """``geogs run`` on pictures of a camera of some focal length, which writes to ``out``."""
+    height, width = frames[0].shape[:2]
+    intrinsics = f"{0.8 * width},{0.8 * width},{width / 2 - 0.5},{height / 2 - 0.5}"
+    source, out = images(folder / "images", frames), folder / "out"
+    return ["run", str(source), "-o", str(out), "--intrinsics", intrinsics, *SMALL]
+
+
+@pytest.mark.usefixtures("no_report")
+@pytest.mark.parametrize("name", TURNING)
+def test_a_camera_that_does_not_move_leaves_orientations(name, tmp_path, capsys):
+    frames, words = TURNING[name]
+    assert cli.main(run_on(frames, tmp_path)) == 0
+    said = " ".join(capsys.readouterr().err.split())
+    assert "Rotation only: no shape." in said
+    assert words in said
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert words in summary["not_started"]
+    assert not summary["verdict"]["is_reliable"]
+    assert not (tmp_path / "out" / "mesh.ply").exists()
+    rows = (tmp_path / "out" / "trajectory_uncertainty.csv").read_text().splitlines()[1:]
+    assert [row.split(",")[1] for row in rows] == ["orientation only"] * len(frames)
 
 
 @pytest.mark.usefixtures("no_report")

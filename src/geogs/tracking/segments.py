@@ -17,6 +17,11 @@ Recall = Callable[[UInt8[np.ndarray, "h w 3"]], Sequence[Recognition]]
 """Recognises keyframes of any segment in an image; most alike first."""
 
 
+LEAST_ORIENTED = 0.5
+"""Share of the frames whose orientation has to be known where nothing else is: fewer are pictures
+of different things rather than a camera that turns."""
+
+
 @dataclass(frozen=True)
 class SegmentFate:
     """What became of one stretch of video."""
@@ -173,8 +178,8 @@ class Segments:
     def finish(self) -> TrackResult:
         """End of the stream: every keyframe becomes final, and the largest segment the world.
 
-        Where no segment could be started but orientations are known, these are what is left, and
-        ``why_not`` says why. Raises TrackingLost if not even they are.
+        Where no segment could be started but the orientations of most frames are known, these are
+        what is left, and ``why_not`` says why. Raises TrackingLost if not even they are.
         """
         finals: dict[Tracker, TrackResult] = {}
         for tracker in list(self.trackers):
@@ -185,7 +190,8 @@ class Segments:
                     self._drop(tracker)
                     continue
                 trajectory = tracker.trajectory()
-                if trajectory.oriented is None or not trajectory.oriented.any():
+                oriented = trajectory.oriented
+                if oriented is None or oriented.mean() < LEAST_ORIENTED:
                     raise
                 self.why_not = str(reason)
                 return TrackResult(tracker.state)
