@@ -9,7 +9,7 @@ import numpy as np
 
 from depth_scene import WORKING, make_scene, trace
 from geogs.config import ReconstructConfig
-from geogs.evaluation.surface import read_surface
+from geogs.evaluation.surface import read_surface, sample_surface
 from geogs.reconstruction import Reconstruction
 
 GEOGS = [sys.executable, "-m", "geogs.cli.main"]
@@ -38,6 +38,11 @@ def make_room(folder: Path) -> Path:
 def vertices(path: Path) -> np.ndarray:
     """Vertex positions of a PLY file."""
     return read_surface(path).vertices
+
+
+def surface_points(path: Path, count: int = 5000) -> np.ndarray:
+    """Points spread evenly over a mesh, however large its triangles are."""
+    return sample_surface(read_surface(path), count, np.random.default_rng(0))[0]
 
 
 def ball_and_wall(

@@ -21,6 +21,12 @@ from geogs.io.writers.tum import write_tum_trajectory
 from geogs.io.writers.uncertainty import write_uncertainty
 from geogs.threads import on_one_torch_thread
 
+NOT_JUDGED = (
+    "How far this is to be relied on was not worked out: the adjustment of all keyframes is "
+    "missing."
+)
+"""Said of a run that was stopped."""
+
 
 @on_one_torch_thread
 def write_results(
@@ -69,6 +75,8 @@ def write_results(
         )
     if result.verdict is not None:
         progress.write(result.verdict.sentence)
+    elif not isinstance(source, PosedSource):
+        progress.write(NOT_JUDGED)
     summary = summarise(result)
     write_text(output / "summary.json", json.dumps(summary, indent=2))
     with scene.stopwatch("report"):
