@@ -5,6 +5,7 @@ from typing import Literal
 
 import cv2
 import numpy as np
+import torch
 from jaxtyping import Bool
 
 from geogs.application.saved_result import SavedResult
@@ -25,7 +26,6 @@ from geogs.io.writers.exports.nerfstudio import DEPTH_UNIT, write_transforms
 from geogs.io.writers.exports.records import PosedImage
 from geogs.io.writers.keyframe_images import image_path, write_mask
 from geogs.io.writers.ply import write_points
-from geogs.types import RenderedKeyframe
 
 
 def write_colmap_set(folder: Path, result: SavedResult, points: int, as_text: bool) -> None:
@@ -36,10 +36,10 @@ def write_colmap_set(folder: Path, result: SavedResult, points: int, as_text: bo
         OutputError: a file cannot be written.
     """
     images = _write_images(folder, result)
-    for image, keyframe in zip(images, result.keyframes, strict=True):
-        if keyframe.mask is not None:
-            mask = _full_size(keyframe.mask.cpu().numpy(), result.camera)
-            write_mask(folder / "masks" / f"{image.name}.png", mask)
+    for number, image in enumerate(images):
+        mask = result.mask(number)
+        if mask is not None:
+            write_mask(folder / "masks" / f"{image.name}.png", _full_size(mask, result.camera))
     seen = seen_points(result.keyframes, result.camera, points)
     write_colmap_model(folder / "sparse" / "0", result.camera, images, seen, as_text)
 
@@ -53,14 +53,13 @@ def write_nerfstudio_set(folder: Path, result: SavedResult, points: int) -> None
     """
     images = _write_images(folder, result)
     unit, masked = _nerfstudio_unit(result), []
-    for image, keyframe in zip(images, result.keyframes, strict=True):
+    for number, image in enumerate(images):
         name = Path(image.name).with_suffix(".png").name
-        mask = keyframe.mask
+        mask = result.mask(number)
         masked.append(mask is not None)
         if mask is not None:
-            full = _full_size(mask.cpu().numpy(), result.camera)
-            write_mask(folder / "masks" / name, full)
-        depth, normal = _maps(keyframe, result, result.camera)
+            write_mask(folder / "masks" / name, _full_size(mask, result.camera))
+        depth, normal = _maps(number, result, result.camera)
         write_depth_png(folder / "depth" / name, depth, unit)
         write_normal_png(folder / "normals" / name, normal)
     seen = seen_points(result.keyframes, result.camera, points)
@@ -76,9 +75,9 @@ def write_map_set(folder: Path, result: SavedResult, kind: Literal["depth", "nor
         OutputError: a file cannot be written.
     """
     unit = depth_unit(_farthest(result))
-    for keyframe in result.keyframes:
-        path = folder / f"{keyframe.keyframe_id:06d}.png"
-        depth, normal = _maps(keyframe, result, result.camera)
+    for number, id in enumerate(result.views.keyframe_id.tolist()):
+        path = folder / f"{id:06d}.png"
+        depth, normal = _maps(number, result, result.camera)
         if kind == "depth":
             write_depth_png(path, depth, unit)
             write_npz(path.with_suffix(".npz"), "depth", depth)
@@ -115,14 +114,15 @@ def _write_images(folder: Path, result: SavedResult) -> list[PosedImage]:
     return images
 
 
-def _maps(
-    keyframe: RenderedKeyframe, result: SavedResult, camera: Camera
-) -> tuple[np.ndarray, np.ndarray]:
+def _maps(number: int, result: SavedResult, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     """Depth and normals of a keyframe inside its mask, rendered for another camera."""
-    maps = result.render(keyframe.T_cw, camera)
+    maps, mask = (
+        result.render(torch.from_numpy(result.views.T_cw[number]), camera),
+        result.mask(number),
+    )
     depth, normal = maps.depth.cpu().numpy(), maps.normal.cpu().numpy()
-    if keyframe.mask is not None:
-        inside = _full_size(keyframe.mask.cpu().numpy(), camera)
+    if mask is not None:
+        inside = _full_size(mask, camera)
         depth, normal = np.where(inside, depth, 0), np.where(inside[..., None], normal, 0)
     return depth.astype(np.float32), normal.astype(np.float32)
 

@@ -7,8 +7,9 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from geogs.errors import InputError
@@ -97,15 +98,23 @@ class SavedResult:
         """
         return self.renderer.surface(T_cw, camera)
 
+    def mask(self, number: int) -> Bool[np.ndarray, "h w"] | None:
+        """The mask of a keyframe, by its place among them; none if it has none.
+
+        Raises InputError if its file is missing or damaged.
+        """
+        if not self.views.has_mask[number]:
+            return None
+        return read_mask(mask_path(self.folder, int(self.views.keyframe_id[number])))
+
     @on_one_torch_thread
     def _keyframe(self, number: int) -> RenderedKeyframe:
         views = self.views
         number = range(len(views.keyframe_id))[number]
         id, mask, image = int(views.keyframe_id[number]), None, None
         T_cw = torch.from_numpy(views.T_cw[number])
-        if views.has_mask[number]:
-            mask = torch.from_numpy(read_mask(mask_path(self.folder, id)))
-            mask = mask.to(self.disks.position.device)
+        if (stored := self.mask(number)) is not None:
+            mask = torch.from_numpy(stored).to(self.disks.position.device)
         if views.has_images:
             image = read_image(image_path(self.folder, id))
         maps = self.renderer.surface(T_cw, mask=mask)

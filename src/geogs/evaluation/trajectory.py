@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float, Int
 
 from geogs.errors import GeogsError, InputError
+from geogs.geometry.nearest_rotation import nearest_rotation
 from geogs.geometry.umeyama import umeyama
 from geogs.threads import on_one_torch_thread
 from geogs.types import Trajectory
@@ -110,9 +111,7 @@ def best_rotation(
     estimate: Float[np.ndarray, "n 3 3"], reference: Float[np.ndarray, "n 3 3"]
 ) -> Float[np.ndarray, "3 3"]:
     """Rotation of the world of some orientations that takes them nearest to others."""
-    u, _, vt = np.linalg.svd((reference @ estimate.transpose(0, 2, 1)).sum(0))
-    R: Float[np.ndarray, "3 3"] = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
-    return R
+    return nearest_rotation((reference @ estimate.transpose(0, 2, 1)).sum(0))
 
 
 @on_one_torch_thread

@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
+from geogs.geometry.nearest_rotation import nearest_rotation
 from geogs.shutter.camera import RollingCamera
 from geogs.shutter.turning import rotated
 
@@ -111,7 +112,7 @@ def angular_velocity(
         if readout:
             first = rotated(first, -readout * flow.first_time[:, None] * rate)
             second = rotated(second, -readout * flow.second_time[:, None] * rate)
-        rotation = _procrustes(first, second, weight)
+        rotation = nearest_rotation((second * weight[:, None]).T @ first)
         rate = _rotation_vector(rotation) / interval
         error = np.linalg.norm(second - first @ rotation.T, axis=1)
         weight = flow.inside / (1 + (error / TOLERANCE) ** 2)
@@ -164,18 +165,6 @@ def _spread(
     laid = (np.bincount(cells, part, count).reshape(shape) for part in values)
     weight, *sums = (cv2.GaussianBlur(part, (0, 0), SMOOTH) for part in laid)
     return np.dstack(sums) / np.maximum(weight, 1e-3)[..., None]
-
-
-def _procrustes(
-    first: Float[np.ndarray, "n 3"],
-    second: Float[np.ndarray, "n 3"],
-    weight: Float[np.ndarray, "n"],
-) -> Float[np.ndarray, "3 3"]:
-    """The rotation R that makes ``sum weight |second - R first|^2`` least."""
-    U, _, Vt = np.linalg.svd((second * weight[:, None]).T @ first)
-    turn = np.diag([1.0, 1.0, np.linalg.det(U @ Vt)])
-    rotation: Float[np.ndarray, "3 3"] = U @ turn @ Vt
-    return rotation
 
 
 def _rotation_vector(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3"]:

@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
+from geogs.geometry.nearest_rotation import nearest_rotation
 from geogs.keyframes.grid import SampleGrid
 from geogs.tracking.flow.base import FlowMatch
 from geogs.tracking.initialise import two_view
@@ -103,7 +104,9 @@ def fit_rotation(grid: SampleGrid, match: FlowMatch) -> RotationFit | None:
     weight = weight / (1 + SUREST**2 * weight)
     edge = max(camera.width, camera.height)
     focal, centre = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
-    R = _procrustes(rays, np.c_[(pixels - centre) / focal, np.ones(len(pixels))])
+    seen = np.c_[(pixels - centre) / focal, np.ones(len(pixels))]
+    first, second = (x / np.linalg.norm(x, axis=1, keepdims=True) for x in (rays, seen))
+    R = nearest_rotation(second.T @ first)
     for reach in SHARPENED:
         for _ in range(2):
             error, J = _linearised(rays @ R.T, pixels, focal, centre)
@@ -147,16 +150,6 @@ def _linearised(
         np.stack([-x * y, 1 + x * x, -y], -1), np.stack([-1 - y * y, x * y, x], -1),
     ], 1)  # fmt: skip
     return pixels - (focal * np.stack([x, y], -1) + centre), J * focal[:, None]
-
-
-def _procrustes(
-    first: Float64[np.ndarray, "n 3"], second: Float64[np.ndarray, "n 3"]
-) -> Float64[np.ndarray, "3 3"]:
-    """The rotation between directions that is best in the mean."""
-    a, b = (x / np.linalg.norm(x, axis=1, keepdims=True) for x in (first, second))
-    U, _, Vt = np.linalg.svd(b.T @ a)
-    R: Float64[np.ndarray, "3 3"] = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
-    return R
 
 
 def _exponential(phi: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3 3"]:

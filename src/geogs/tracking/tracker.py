@@ -474,9 +474,7 @@ class Tracker:
         self.graph.measure({*pairs, (anchor, id)}, fine=False)
 
     def _adjust_locally(self) -> None:
-        c, ids = self.config, self.keyframes.ids
-        poses = [k for k in ids[-self._reach() :] if k != ids[0]]
-        depths = self.deep
+        c, poses, depths = self.config, self.active, self.deep
         moving, deep = set(poses), set(depths)
         for n in range(c.local_rounds):
             edges = [e for e in self.graph.edges if e[0] in deep or not moving.isdisjoint(e)]

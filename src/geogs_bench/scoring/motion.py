@@ -6,7 +6,13 @@ import numpy as np
 from jaxtyping import Float
 
 from geogs.errors import InputError
-from geogs.evaluation.trajectory import associate, evaluate_trajectory, finite_poses, rotation_angle
+from geogs.evaluation.trajectory import (
+    associate,
+    best_rotation,
+    evaluate_trajectory,
+    finite_poses,
+    rotation_angle,
+)
 from geogs.types import Trajectory
 from geogs_bench.record import MotionScore
 from geogs_bench.result import ORIENTED, FrameStates, ResultFolder
@@ -106,8 +112,7 @@ def rotation_error(
     estimate: Float[np.ndarray, "n 3 3"], truth: Float[np.ndarray, "n 3 3"]
 ) -> float:
     """RMS angle in degrees after the rotation of the world that fits best (chordal mean)."""
-    u, _, vt = np.linalg.svd((truth @ estimate.transpose(0, 2, 1)).sum(0))
-    aligned = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt @ estimate
+    aligned = best_rotation(estimate, truth) @ estimate
     return float(np.sqrt((rotation_angle(aligned, truth) ** 2).mean()))
 
 
