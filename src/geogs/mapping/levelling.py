@@ -26,32 +26,30 @@ def light_of(view: MapView, others: Sequence[MapView]) -> Float[Tensor, "2"]:
     The others are levelled already. The dense depth of the view tells where its pixels are in them.
     Gain 1 and offset 0 where there is nothing to compare with.
     """
-    mine, theirs, usable = [], [], []
-    for other in others:
-        grey, seen, good = _common_pixels(view, other)
-        mine.append(grey)
-        theirs.append(seen)
-        usable.append(good)
-    if not mine:
+    if not others:
         return same_light(view.dense.depth.device)
-    return relative_light(torch.cat(mine), torch.cat(theirs), torch.cat(usable))
+    points, sure = _sparse_points(view)
+    mine, inside = _sampled(view.photo.grey, view.photo.camera, points)
+    usable, T_wv = sure & inside & _is_exposed(mine), se3_inverse(view.T_cw)
+    theirs, common = [], []
+    for other in others:
+        T = (other.T_cw @ T_wv).to(points)
+        seen, inside = _sampled(
+            other.photo.grey, other.photo.camera, points @ T[:3, :3].mT + T[:3, 3]
+        )
+        gain, offset = other.light.unbind()
+        theirs.append(seen)
+        common.append(usable & inside & _is_exposed((seen - offset) / gain))
+    return relative_light(mine.repeat(len(others)), torch.cat(theirs), torch.cat(common))
 
 
-def _common_pixels(
-    view: MapView, other: MapView
-) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"], Bool[Tensor, "n"]]:
-    """Grey values of a view's pixels, those of the same points in another, and which are both."""
-    depth, photo, seen = view.dense, view.photo, other.photo
+def _sparse_points(view: MapView) -> tuple[Float[Tensor, "n 3"], Bool[Tensor, "n"]]:
+    """Points of every fourth pixel of a view in its camera, and which are sure."""
+    depth = view.dense
     rays = view.pool.cameras.render.rays(device=depth.depth.device)[::_STRIDE, ::_STRIDE]
-    z = depth.depth[::_STRIDE, ::_STRIDE]
-    points = (rays * z[..., None]).reshape(-1, 3)
-    sure = (depth.confidence[::_STRIDE, ::_STRIDE] > _SURE).reshape(-1)
-    T = (other.T_cw @ se3_inverse(view.T_cw)).to(points)
-    mine, mine_in = _sampled(photo.grey, photo.camera, points)
-    theirs, theirs_in = _sampled(seen.grey, seen.camera, points @ T[:3, :3].mT + T[:3, 3])
-    gain, offset = other.light.unbind()
-    exposed = _is_exposed(mine) & _is_exposed((theirs - offset) / gain)
-    return mine, theirs, sure & mine_in & theirs_in & exposed
+    points = rays * depth.depth[::_STRIDE, ::_STRIDE, None]
+    sure = depth.confidence[::_STRIDE, ::_STRIDE] > _SURE
+    return points.reshape(-1, 3), sure.reshape(-1)
 
 
 def _sampled(

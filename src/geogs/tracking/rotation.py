@@ -24,6 +24,8 @@ SHARPENED = (0.1, 0.03, 0.01, 0.005, 0.005)
 """Distances in the image, of the long edge, beyond which a cell loses its say, step by step."""
 TOLERANCE = 0.008
 """Distance within which a cell agrees with a rotation, of the long edge."""
+MOST_CELLS = 1024
+"""That are fitted; evenly spread ones of more."""
 SUREST = 0.1
 """Pixels: no cell counts as surer than this."""
 LEAST_DEVIATION = 2e-4
@@ -107,15 +109,17 @@ def fit_rotation(grid: SampleGrid, match: FlowMatch) -> RotationFit | None:
     seen = np.c_[(pixels - centre) / focal, np.ones(len(pixels))]
     first, second = (x / np.linalg.norm(x, axis=1, keepdims=True) for x in (rays, seen))
     R = nearest_rotation(second.T @ first)
+    some = slice(None, None, -(-len(pixels) // MOST_CELLS))
     for reach in SHARPENED:
         for _ in range(2):
-            error, J = _linearised(rays @ R.T, pixels, focal, centre)
-            say = weight / (1 + (error**2).sum(1, keepdims=True) / (reach * edge) ** 2) ** 2
+            error, J = _linearised(rays[some] @ R.T, pixels[some], focal, centre)
+            say = weight[some] / (1 + (error**2).sum(1, keepdims=True) / (reach * edge) ** 2) ** 2
             H = np.einsum("nca,nc,ncb->ab", J, say, J)
             step = np.linalg.solve(H + 1e-9 * np.eye(3), np.einsum("nca,nc,nc->a", J, say, error))
             R = _exponential(step) @ R
     error, _ = _linearised(rays @ R.T, pixels, focal, centre)
     agreeing = float((np.linalg.norm(error, axis=1) < TOLERANCE * edge).mean())
+    H *= len(pixels) / len(pixels[some])
     deviation = max(math.sqrt(np.trace(np.linalg.inv(H + 1e-9 * np.eye(3)))), LEAST_DEVIATION)
     return RotationFit(torch.from_numpy(R), agreeing, deviation, (weight * error**2).sum(1))
 

@@ -175,8 +175,8 @@ class Source:
         ends = [n for n in (config.stop, reader.length) if n is not None]
         count = min(ends) - config.start if ends else CLIP * CLIPS
         if len(reader.paths) > 1:
-            for start in clip_starts(config.start, count):
-                yield list(self._resized(start, start + CLIP))
+            starts = clip_starts(config.start, count)
+            yield from read_ahead(list(self._resized(n, n + CLIP)) for n in starts)
             return
         starts = clip_starts(config.start, min(count, round(MINUTE * reader.fps)))
         if not starts:
