@@ -26,3 +26,52 @@ def normals_from_depth(
     n = n * (n.square().sum(-1, keepdim=True) + 1e-30).rsqrt()
     normals = torch.nn.functional.pad(n * inner[..., None], (0, 0, 1, 1, 1, 1))
     return normals, torch.nn.functional.pad(inner, (1, 1, 1, 1))
+
+
+def averaged_over_planes(
+    depth: Float[Tensor, "h w"],
+    normal: Float[Tensor, "h w 3"],
+    camera: Camera,
+    radius: int,
+    reach: float,
+    rounds: int = 2,
+) -> Float[Tensor, "h w"]:
+    """Depth whose noise is averaged over the tangent planes of the pixels around.
+
+    The plane through a pixel q with normal n has the inverse depth ``(n . r_p) / (z_q n . r_q)`` on
+    the ray of any pixel p, which is linear in p. A pixel takes the mean of what those within
+    ``radius`` say, itself included, each weighted by ``(1 - (e / reach)^2)^2`` (Tukey's biweight),
+    where e is its relative distance from what the pixel had before, and not at all beyond
+    ``reach``; so planes stay as they are, however slanted, and steps stay steps. Pixels without
+    depth, and those that are seen at less than six degrees, stay as they are and say nothing.
+    """
+    slope = (normal * camera.rays(depth.dtype, depth.device)).sum(-1)
+    good = (depth > 0) & (slope.abs() > 0.1)
+    inverse = torch.where(good, 1 / depth.clamp(min=1e-9), 0.0)
+    # Of the inverse depth, by its own value and per pixel to the right and down.
+    tilt = [
+        normal[..., k] / slope.where(good, 1.0) / f for k, f in enumerate((camera.fx, camera.fy))
+    ]
+    height, width = depth.shape
+    for _ in range(rounds):
+        right, down = (inverse * t for t in tilt)
+        before = torch.where(good, 1 / inverse.clamp(min=1e-9), 0.0)
+        top, total = torch.zeros_like(depth), torch.zeros_like(depth)
+        for dy in range(-radius, radius + 1):
+            above = inverse - dy * down
+            for dx in range(-radius, radius + 1):
+                here, there = _shifted(height, dy), _shifted(width, dx)
+                p, q = (here[0], there[0]), (here[1], there[1])
+                said = (above - dx * right)[q]
+                # Where either has no depth, e is -1 and the weight nothing.
+                e = (said * before[p]).sub_(1)
+                weight = e.square_().mul_(-1 / reach**2).add_(1).clamp_(min=0).square_()
+                top[p].addcmul_(weight, said)
+                total[p].add_(weight)
+        inverse = torch.where(good, top / total.clamp(min=1e-9), 0.0)
+    return torch.where(good, 1 / inverse.clamp(min=1e-9), depth)
+
+
+def _shifted(size: int, by: int) -> tuple[slice, slice]:
+    """The places that have one so much farther on, and those ones."""
+    return slice(max(0, -by), size - max(0, by)), slice(max(0, by), size - max(0, -by))

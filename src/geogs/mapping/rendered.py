@@ -9,12 +9,15 @@ from torch import Tensor
 
 from geogs.config import MappingConfig
 from geogs.geometry.camera import Camera
-from geogs.geometry.depth import normals_from_depth
+from geogs.geometry.depth import averaged_over_planes, normals_from_depth
 from geogs.mapping.map_frame import MapFrame
 from geogs.mapping.view import MapView
 from geogs.splat.map import DiskParameters
 from geogs.splat.render import render
 from geogs.types import MapSnapshot, RenderedKeyframe
+
+_RADIUS = 3
+"""Pixels around, whose tangent planes a depth is averaged over."""
 
 
 class SurfaceMaps(NamedTuple):
@@ -35,7 +38,8 @@ class SurfaceRules:
     min_alpha: float
     """Opacity above which the map hides what lies behind."""
     max_spread: float
-    """Relative difference of mean and median depth up to which a ray meets one surface."""
+    """Relative difference of mean and median depth up to which a ray meets one surface, and from
+    the planes of the pixels around up to which these are the same surface."""
 
     @staticmethod
     def of(config: MappingConfig) -> "SurfaceRules":
@@ -90,6 +94,8 @@ def rendered_surface(
         weight = torch.where(mask, weight, 0.0)
     length = output.normal.norm(dim=-1, keepdim=True).clamp(min=1e-6)
     normal = torch.where(depth[..., None] > 0, output.normal / length, 0.0)
+    if rules.max_spread > 0:
+        depth = averaged_over_planes(depth, normal, camera, _RADIUS, 2 * rules.max_spread)
     return SurfaceMaps(depth, normal, weight)
 
 

@@ -12,7 +12,8 @@ from geogs.io.sources.intrinsics import find_calibration
 _NAME = re.compile(r"frame-(\d+)\.color\.(png|jpg|jpeg)", re.IGNORECASE)
 # The Kinect's nominal colour camera; the data set publishes no calibration of its own for colour.
 _CAMERA = Calibration(
-    525.0, 525.0, 320.0, 240.0, width=640, height=480, origin="the 7-Scenes colour camera"
+    525.0, 525.0, 320.0, 240.0, width=640, height=480,
+    origin="the 7-Scenes colour camera, nominal", is_nominal=True,
 )  # fmt: skip
 
 
