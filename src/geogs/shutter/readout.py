@@ -117,6 +117,8 @@ def _started(clip: Sequence[Image], camera: RollingCamera) -> _Adjusted | None:
     if start is None:
         return None
     for tolerance in EARLY_TOLERANCES:
+        if not start.is_finite:
+            return None
         start = readout_equation(tracks, start, 0.0, tolerance / focal).stepped(start, 0.0)
     return _Adjusted(tracks, start)
 
@@ -125,12 +127,13 @@ def _verdict(clips: list[_Adjusted], focal: float) -> FoundReadout:
     """The readout that fits all clips best, and whether it is believed."""
     readout, parts = 0.0, list[ReadoutEquation]()
     for tolerance in TOLERANCES:
+        clips = [c for c in clips if c.reconstruction.is_finite]
+        if len(clips) < LEAST_CLIPS:
+            return FoundReadout(clips=len(clips))
         parts = [
             readout_equation(c.tracks, c.reconstruction, readout, tolerance / focal) for c in clips
         ]
         clips, parts = _fitting(clips, parts)
-        if len(clips) < LEAST_CLIPS:
-            return FoundReadout(clips=len(clips))
         step = sum(p.gradient for p in parts) / (sum(p.curvature for p in parts) + 1e-12)
         step = float(np.clip(step, -LARGEST_STEP, LARGEST_STEP))
         step = float(np.clip(readout + step, -1.5 * LONGEST, 1.5 * LONGEST)) - readout
@@ -139,6 +142,8 @@ def _verdict(clips: list[_Adjusted], focal: float) -> FoundReadout:
             _Adjusted(c.tracks, part.stepped(c.reconstruction, step))
             for c, part in zip(clips, parts, strict=True)
         ]
+    if len(parts) < LEAST_CLIPS:
+        return FoundReadout(clips=len(parts))
     error = _standard_error(parts)
     sure = error <= LARGEST_ERROR and readout >= LEAST_EVIDENCE * error
     believed = sure and SHORTEST <= readout <= LONGEST

@@ -21,6 +21,12 @@ class Reconstruction:
     points: Float[np.ndarray, "n 3"]
     """x/z, y/z and the inverse depth d in the middle image."""
 
+    @property
+    def is_finite(self) -> bool:
+        """Whether it has not gone astray."""
+        parts = (self.R, self.t, self.points)
+        return all(bool(np.isfinite(part).all()) for part in parts)
+
     def in_cameras(self) -> Float[np.ndarray, "k n 3"]:
         """Points times their inverse depth in the middle image, in axes of each camera."""
         return self._turned() + self.points[:, 2:] * self.t[:, None]
@@ -53,8 +59,8 @@ class Reconstruction:
 
         The median inverse depth is one again afterwards.
         """
-        R = np.stack([rotated(r.T, np.tile(by, (3, 1))).T for r, by in zip(self.R, poses[:, :3],
-                                                                          strict=True)])  # fmt: skip
+        turns = zip(self.R, poses[:, :3], strict=True)
+        R = np.stack([rotated(old.T, np.tile(by, (3, 1))).T for old, by in turns])
         t, moved = self.t + poses[:, 3:], self.points + points
         scale = max(float(np.median(np.abs(moved[:, 2]))), 1e-9)
         return Reconstruction(R, t * scale, moved / [1, 1, scale])

@@ -39,9 +39,7 @@ class ReadoutEquation:
 
     def stepped(self, reconstruction: Reconstruction, readout: float) -> Reconstruction:
         """Where poses and points go as the readout takes its own step."""
-        poses, points = (
-            a + readout * b for a, b in zip(self.still, self.by_readout, strict=True)
-        )
+        poses, points = (a + readout * b for a, b in zip(self.still, self.by_readout, strict=True))
         return reconstruction.stepped(poses, points)
 
 
