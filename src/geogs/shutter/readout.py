@@ -38,6 +38,8 @@ MISFIT = 1.5
 COMMON = 0.03
 """Share of the error of the matches that they have in common, and that no number of them makes
 less."""
+TREMOR = 0.02
+"""Share of the readout that is added for tremor between the images (jerks: 2 % too much)."""
 
 LONGEST, SHORTEST = 0.036, 0.002
 """Seconds of a readout that is believed; less is nothing to care about."""
@@ -144,7 +146,7 @@ def _verdict(clips: list[_Adjusted], focal: float) -> FoundReadout:
         ]
     if len(parts) < LEAST_CLIPS:
         return FoundReadout(clips=len(parts))
-    error = _standard_error(parts)
+    error = float(np.hypot(_standard_error(parts), TREMOR * readout))
     sure = error <= LARGEST_ERROR and readout >= LEAST_EVIDENCE * error
     believed = sure and SHORTEST <= readout <= LONGEST
     return FoundReadout(readout if believed else 0.0, readout, error, len(clips))

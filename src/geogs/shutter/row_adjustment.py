@@ -15,7 +15,9 @@ from geogs.shutter.clip_tracks import ClipTracks
 from geogs.shutter.reconstruction import Reconstruction
 
 NODES = 5
-"""Images whose poses say where a point is between them."""
+"""Images whose poses say where a point is between them. Fewer make little of quick tremor and the
+readout too long for it: of 27.6 ms, jerks tell 28.2 with five, 27.6 with nine. More make much of
+the poses' own errors, which say that nothing is sheared, where the true motion is steady."""
 DAMPING = 1e-6
 """Share that is added to the curvatures of poses and points."""
 
@@ -71,12 +73,15 @@ def readout_equation(
         by_point += np.swapaxes(part * by_own_point[node], 0, 1)
     # The middle pose stays where it is.
     free = images != tracks.middle
-    by_pose = by_pose[:, :, :, free].reshape(n, 2 * count, -1)
-    by_point = by_point.reshape(n, 2 * count, 3)
     other = np.stack([error, np.einsum("knj,kjna->kna", slope, around)], axis=-1)
     other = np.swapaxes(root[..., None, None] * other, 0, 1).reshape(n, 2 * count, 2)
     return _eliminated(
-        by_pose, by_point, other, free, float(weight.sum()), float((weight * square).sum())
+        by_pose[:, :, :, free].reshape(n, 2 * count, -1),
+        by_point.reshape(n, 2 * count, 3),
+        other,
+        free,
+        float(weight.sum()),
+        float((weight * square).sum()),
     )
 
 
