@@ -21,7 +21,7 @@ from geogs.shutter.shutter import Shutter
 from io_samples import write_images
 
 INTRINSICS = "50,50,31.5,23.5"
-FOUND = FoundReadout(0.0276, 0.0276, 0.0011, 12, 24)
+FOUND = FoundReadout(0.0276, 0.0276, 0.0011, 12)
 
 
 class Listener(RunProgress):
@@ -49,18 +49,18 @@ def test_a_readout_that_is_found_is_said_and_written(folder, tmp_path, monkeypat
     source = with_shutter_found(open_source(folder, InputConfig(INTRINSICS)), listener)
     assert source.shutter.readout == 0.0276
     assert listener.said == [
-        "Rolling shutter: 27.6 ms from the first to the last row (24 pairs of views say 27.6 ms, "
+        "Rolling shutter: 27.6 ms from the first to the last row (12 clips say 27.6 ms, "
         "standard error 1.1 ms); rows are rectified."
     ]
     write_intrinsics(tmp_path / "i.json", source.camera, source.calibration, source.shutter)
     said = json.loads((tmp_path / "i.json").read_text())["shutter"]
     assert said["readout"] == 0.0276
-    assert said["origin"].startswith("found in the video: 24 pairs")
+    assert said["origin"].startswith("found in the video: 12 clips")
     assert source_summary(source)["shutter"] == said
 
 
 def test_what_is_not_believed_leaves_the_shutter_global(folder, monkeypatch):
-    finding(monkeypatch, FoundReadout(0.0, 0.012, 0.009, 8, 16))
+    finding(monkeypatch, FoundReadout(0.0, 0.012, 0.009, 8))
     listener = Listener()
     source = with_shutter_found(open_source(folder, InputConfig(INTRINSICS)), listener)
     assert listener.said == []

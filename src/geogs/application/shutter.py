@@ -60,4 +60,4 @@ def _evidence(found: "FoundReadout") -> str:
     if not math.isfinite(found.error):
         return "the video does not tell"
     best, error = 1000 * found.best, 1000 * found.error
-    return f"{found.pairs} pairs of views say {best:.1f} ms, standard error {error:.1f} ms"
+    return f"{found.clips} clips say {best:.1f} ms, standard error {error:.1f} ms"

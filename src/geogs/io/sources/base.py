@@ -186,9 +186,9 @@ class Source:
         for position, raw in enumerate(raws, starts[0]):
             if any(start <= position < start + CLIP for start in starts):
                 clip.append(self._at_working_size(raw))
-            if len(clip) == CLIP:
-                yield clip
-                clip = []
+            if position - CLIP + 1 in starts:
+                yield clip[-CLIP:]
+            del clip[:-CLIP]
 
     def _resized(self, start: int, stop: int | None) -> Iterator[RawFrame]:
         """Neighbours in the source at working size, lens and rows as they came."""
@@ -307,8 +307,11 @@ def read_ahead(items: Iterator[T]) -> Iterator[T]:
 
 
 def clip_starts(first: int, count: int) -> list[int]:
-    """Where clips begin that spread over ``count`` images from ``first`` on, without overlap."""
-    clips = min(CLIPS, count // CLIP)
+    """Where clips begin that spread over ``count`` images from ``first`` on.
+
+    Those of a short video overlap by half.
+    """
+    clips = min(CLIPS, max(0, count - CLIP // 2) // (CLIP - CLIP // 2))
     return [first + round(k * (count - CLIP) / max(clips - 1, 1)) for k in range(clips)]
 
 

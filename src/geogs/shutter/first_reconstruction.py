@@ -1,0 +1,87 @@
+"""Where the adjustment of a clip begins: two views, then one image after the other."""
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from geogs.shutter.clip_tracks import LEAST_POINTS, ClipTracks
+from geogs.shutter.epipolar import RelativePose, relative_pose
+from geogs.shutter.reconstruction import Reconstruction
+
+ROUNDS = 5
+"""Gauss-Newton steps to the pose of an image."""
+LEAST_SHARE = 0.5
+"""Of the points, which both of the two views have to see."""
+_FEWEST = 8
+"""Points that tell a pose; an image with fewer has that of the image before."""
+
+
+def first_reconstruction(tracks: ClipTracks, tolerance: float) -> Reconstruction | None:
+    """Poses and points from what is seen, all rows taken to be seen at once.
+
+    Args:
+        tracks: of a clip.
+        tolerance: error of an inlier between two views, as a share of the focal length.
+
+    Returns:
+        none where no two views agree on a motion.
+    """
+    count, n = tracks.seen.shape
+    middle = tracks.middle
+    enough = np.flatnonzero(tracks.seen.sum(axis=1) >= max(LEAST_POINTS, LEAST_SHARE * n))
+    best, points = 0.0, None
+    for far in {int(enough.min()), int(enough.max())} - {middle}:
+        both = tracks.seen[far]
+        pose = relative_pose(tracks.plane[middle, both], tracks.plane[far, both], tolerance)
+        if pose is None:
+            continue
+        inverse = inverse_depths(pose, tracks.plane[middle], tracks.plane[far])
+        parallax = float(np.median(np.abs(inverse[both])))
+        if parallax > best:
+            inverse = np.where(both, inverse, np.median(inverse[both])) / parallax
+            inverse = np.clip(inverse, -1, 5)
+            inverse /= np.median(np.abs(inverse))
+            best, points = parallax, np.column_stack([tracks.plane[middle], inverse])
+    if points is None:
+        return None
+    R, t = np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3))
+    for way in (range(middle + 1, count), range(middle - 1, -1, -1)):
+        here = Reconstruction(np.eye(3)[None], np.zeros((1, 3)), points)
+        for k in way:
+            here = _located(here, tracks.plane[k], tracks.seen[k], 3 * tolerance)
+            R[k], t[k] = here.R[0], here.t[0]
+    return Reconstruction(R, t, points)
+
+
+def inverse_depths(
+    pose: RelativePose, first: Float[np.ndarray, "n 2"], second: Float[np.ndarray, "n 2"]
+) -> Float[np.ndarray, "n"]:
+    """In the first view, in units of the inverse length of the translation (least squares).
+
+    A point at inverse depth d is seen in the second view where ``R (x, y, 1) + d t`` projects.
+    """
+    turned = np.column_stack([first, np.ones(len(first))]) @ pose.R.T
+    still = turned[:, :2] - second * turned[:, 2:]
+    moved = pose.t[:2] - second * pose.t[2]
+    inverse: Float[np.ndarray, "n"] = -(still * moved).sum(1) / ((moved**2).sum(1) + 1e-12)
+    return inverse
+
+
+def _located(
+    near: Reconstruction,
+    plane: Float[np.ndarray, "n 2"],
+    seen: Bool[np.ndarray, "n"],
+    tolerance: float,
+) -> Reconstruction:
+    """The pose of one image, from that of a near one; the points stay where they are."""
+    if seen.sum() < _FEWEST:
+        return near
+    for _ in range(ROUNDS):
+        error = plane - near.projected()[0]
+        by_pose = near.derivatives()[0][0]
+        weight = seen / (1 + (error**2).sum(1) / tolerance**2) ** 2
+        normal = np.einsum("nai,n,naj->ij", by_pose, weight, by_pose)
+        right = np.einsum("nai,n,na->i", by_pose, weight, error)
+        step = np.linalg.solve(normal + (1e-6 * np.trace(normal) + 1e-12) * np.eye(6), right)
+        moved = near.stepped(step[None], np.zeros_like(near.points))
+        near = Reconstruction(moved.R, moved.t, moved.points)
+    return near

@@ -1,0 +1,75 @@
+"""Poses of a few images and the points that they see, and how the one follows from the other."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from geogs.shutter.turning import cross, rotated
+
+_NEAREST = 1e-3
+"""Depth, in the unit of the points, below which a point is taken to be there."""
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """A rigid scene and the way of the camera through it, up to scale."""
+
+    R: Float[np.ndarray, "k 3 3"]
+    """A point ``(x, y, 1)/d`` of the middle image is at ``(R (x, y, 1) + d t)/d`` in another."""
+    t: Float[np.ndarray, "k 3"]
+    points: Float[np.ndarray, "n 3"]
+    """x/z, y/z and the inverse depth d in the middle image."""
+
+    @property
+    def is_finite(self) -> bool:
+        """Whether it has not gone astray."""
+        parts = (self.R, self.t, self.points)
+        return all(bool(np.isfinite(part).all()) for part in parts)
+
+    def in_cameras(self) -> Float[np.ndarray, "k n 3"]:
+        """Points times their inverse depth in the middle image, in axes of each camera."""
+        return self._turned() + self.points[:, 2:] * self.t[:, None]
+
+    def projected(self) -> Float[np.ndarray, "k n 2"]:
+        """x/z and y/z of all points in all images."""
+        at = self.in_cameras()
+        return at[..., :2] / _depth(at)
+
+    def derivatives(
+        self,
+    ) -> tuple[Float[np.ndarray, "k n 2 6"], Float[np.ndarray, "k n 2 3"]]:
+        """Those of :meth:`projected` by the steps of an image's own pose and of a point."""
+        at, turned, inverse = self.in_cameras(), self._turned(), self.points[:, 2]
+        depth = _depth(at)
+        by_place = np.zeros((*at.shape[:2], 2, 3))
+        by_place[..., 0, 0] = by_place[..., 1, 1] = 1 / depth[..., 0]
+        by_place[..., 2] = -at[..., :2] / depth**2
+        # Of row g of the above, g . (phi x turned) = phi . (turned x g).
+        by_turn = cross(turned[..., None, :], by_place)
+        by_pose = np.concatenate([by_turn, by_place * inverse[:, None, None]], axis=-1)
+        by_ray = by_place @ self.R[:, None, :, :2]
+        by_inverse = by_place @ self.t[:, None, :, None]
+        return by_pose, np.concatenate([by_ray, by_inverse], axis=-1)
+
+    def stepped(
+        self, poses: Float[np.ndarray, "k 6"], points: Float[np.ndarray, "n 3"]
+    ) -> "Reconstruction":
+        """After rotations on the left and moves of the poses, and moves of the points.
+
+        The median inverse depth is one again afterwards.
+        """
+        turns = zip(self.R, poses[:, :3], strict=True)
+        R = np.stack([rotated(old.T, np.tile(by, (3, 1))).T for old, by in turns])
+        t, moved = self.t + poses[:, 3:], self.points + points
+        scale = max(float(np.median(np.abs(moved[:, 2]))), 1e-9)
+        return Reconstruction(R, t * scale, moved / [1, 1, scale])
+
+    def _turned(self) -> Float[np.ndarray, "k n 3"]:
+        rays = np.concatenate([self.points[:, :2], np.ones((len(self.points), 1))], axis=1)
+        turned: Float[np.ndarray, "k n 3"] = rays @ np.swapaxes(self.R, 1, 2)
+        return turned
+
+
+def _depth(at: Float[np.ndarray, "k n 3"]) -> Float[np.ndarray, "k n 1"]:
+    return np.maximum(at[..., 2:], _NEAREST)

@@ -1,0 +1,150 @@
+"""Bundle adjustment of a clip whose rows are seen in turn, together with the readout.
+
+Points that are followed through all images of a clip tell its poses and their depths. A point is
+seen at the time of its row, and where it is then, the poses around say: the polynomial through
+where they put it at the times of the middle rows. What is measured stays as it is. To move it to
+one time instead would smooth its errors, the more the further, and prefer a readout for that.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from geogs.shutter.clip_tracks import ClipTracks
+from geogs.shutter.reconstruction import Reconstruction
+
+NODES = 5
+"""Images whose poses say where a point is between them. Fewer make little of quick tremor and the
+readout too long for it: of 27.6 ms, jerks tell 28.2 with five, 27.6 with nine. More make much of
+the poses' own errors, which say that nothing is sheared, where the true motion is steady."""
+DAMPING = 1e-6
+"""Share that is added to the curvatures of poses and points."""
+
+
+@dataclass(frozen=True)
+class ReadoutEquation:
+    """What a clip says of the readout, whatever its poses and points."""
+
+    curvature: float
+    """Of the cost in the readout, 1 / s^2, poses and points being what is then best."""
+    gradient: float
+    """Of what falls, 1 / s."""
+    weight: float
+    """Of all that was measured, in the unit of the curvature's error^2."""
+    square: float
+    """Weighted sum of squared errors."""
+    still: tuple[Float[np.ndarray, "k 6"], Float[np.ndarray, "n 3"]]
+    """Steps of poses and points, the readout being held."""
+    by_readout: tuple[Float[np.ndarray, "k 6"], Float[np.ndarray, "n 3"]]
+    """By how much more they step for each second that the readout grows."""
+
+    def stepped(self, reconstruction: Reconstruction, readout: float) -> Reconstruction:
+        """Where poses and points go as the readout takes its own step."""
+        poses, points = (a + readout * b for a, b in zip(self.still, self.by_readout, strict=True))
+        return reconstruction.stepped(poses, points)
+
+
+def readout_equation(
+    tracks: ClipTracks, at: Reconstruction, readout: float, tolerance: float
+) -> ReadoutEquation:
+    """Linearised, what is measured weighted by Geman and McClure's loss.
+
+    Args:
+        tracks: what is seen.
+        at: poses and points.
+        readout: seconds.
+        tolerance: error at which a measurement counts for a quarter, share of the focal length.
+    """
+    count, n = tracks.seen.shape
+    nodes = _nodes(count)
+    share, slope = interpolation(tracks, readout), interpolation_slope(tracks, readout)
+    around = at.projected()[nodes]
+    error = tracks.plane - np.einsum("knj,kjna->kna", share, around)
+    square = (error**2).sum(axis=-1)
+    weight = tracks.seen / (1 + square / tolerance**2) ** 2 / tolerance**2
+    root = np.sqrt(weight)
+    by_own_pose, by_own_point = at.derivatives()
+    by_pose, by_point = np.zeros((n, count, 2, count, 6)), np.zeros((n, count, 2, 3))
+    images = np.arange(count)
+    for j, node in enumerate(nodes.T):
+        part = (root * share[..., j])[..., None, None]
+        by_pose[:, images, :, node, :] = part * by_own_pose[node]
+        by_point += np.swapaxes(part * by_own_point[node], 0, 1)
+    # The middle pose stays where it is.
+    free = images != tracks.middle
+    other = np.stack([error, np.einsum("knj,kjna->kna", slope, around)], axis=-1)
+    other = np.swapaxes(root[..., None, None] * other, 0, 1).reshape(n, 2 * count, 2)
+    return _eliminated(
+        by_pose[:, :, :, free].reshape(n, 2 * count, -1),
+        by_point.reshape(n, 2 * count, 3),
+        other,
+        free,
+        float(weight.sum()),
+        float((weight * square).sum()),
+    )
+
+
+def _eliminated(
+    by_pose: Float[np.ndarray, "n m p"],
+    by_point: Float[np.ndarray, "n m 3"],
+    other: Float[np.ndarray, "n m 2"],
+    free: np.ndarray,
+    weight: float,
+    square: float,
+) -> ReadoutEquation:
+    """The equation that is left without points, which each see only their own, and poses.
+
+    Args:
+        by_pose: derivatives of the predictions by the free poses.
+        by_point: by the point.
+        other: errors, and derivatives of the predictions by the readout.
+        free: of all images, whether their pose is free.
+        weight: of the result.
+        square: of the result.
+    """
+    normal = np.swapaxes(by_point, 1, 2) @ by_point
+    trace = np.trace(normal, axis1=1, axis2=2)[:, None, None]
+    normal += (DAMPING / 3 * trace + 1e-9) * np.eye(3)
+    root = np.linalg.cholesky(np.linalg.inv(normal))
+    joined = np.concatenate([by_pose, other], axis=2)
+    told = np.swapaxes(by_point @ root, 1, 2) @ joined
+    size = joined.shape[2]
+    H = joined.reshape(-1, size).T @ joined.reshape(-1, size)
+    H -= told.reshape(-1, size).T @ told.reshape(-1, size)
+    poses = H[:-2, :-2] + np.diag(DAMPING * H.diagonal()[:-2] + 1e-7 * H.diagonal()[:-2].mean())
+    for_error, for_readout = np.linalg.solve(poses, H[:-2, -2:]).T
+    steps = []
+    for step, column in ((for_error, -2), (for_readout, -1)):
+        points = np.einsum("nij,nj->ni", root, told[..., column] - told[..., :-2] @ step)
+        all_poses = np.zeros((len(free), 6))
+        all_poses[free] = step.reshape(-1, 6)
+        steps.append((all_poses, points))
+    by_readout = (-steps[1][0], -steps[1][1])
+    curvature = float(H[-1, -1] - H[-1, :-2] @ for_readout)
+    gradient = float(H[-2, -1] - H[-2, :-2] @ for_readout)
+    return ReadoutEquation(curvature, gradient, weight, square, steps[0], by_readout)
+
+
+def _nodes(count: int) -> Int[np.ndarray, "k j"]:
+    """The images around each, itself among them."""
+    first = np.clip(np.arange(count) - NODES // 2, 0, count - NODES)
+    return first[:, None] + np.arange(NODES)
+
+
+def interpolation(tracks: ClipTracks, readout: float) -> Float[np.ndarray, "k n j"]:
+    """Shares that the nodes have in the place of a point at the time of its row (Lagrange)."""
+    when = (tracks.times[:, None] + readout * tracks.line_times)[..., None]
+    at = tracks.times[_nodes(len(tracks.times))][:, None]
+    shares = []
+    for j in range(NODES):
+        others = np.delete(at, j, axis=2)
+        shares.append(((when - others) / (at[..., j, None] - others)).prod(axis=2))
+    return np.stack(shares, axis=-1)
+
+
+def interpolation_slope(tracks: ClipTracks, readout: float) -> Float[np.ndarray, "k n j"]:
+    """Derivatives of the shares by the readout, 1 / s."""
+    small = 5e-4
+    after, before = (interpolation(tracks, readout + by) for by in (small, -small))
+    return (after - before) / (2 * small)

@@ -1,0 +1,96 @@
+"""A clip's equation for the readout, against least squares over all unknowns at once."""
+
+import numpy as np
+import pytest
+
+from geogs.shutter import row_adjustment
+from geogs.shutter.first_reconstruction import first_reconstruction
+from geogs.shutter.reconstruction import Reconstruction
+from geogs.shutter.row_adjustment import NODES, interpolation, interpolation_slope, readout_equation
+from row_by_row import FOCAL, clip_of, scattered, shaken
+
+READOUT, TOLERANCE = 0.02, 0.5 / FOCAL
+
+
+@pytest.fixture(scope="module")
+def tracks():
+    return clip_of(shaken(1), scattered(1, 35), READOUT, images=11)
+
+
+@pytest.fixture(scope="module")
+def start(tracks) -> Reconstruction:
+    found = first_reconstruction(tracks, 1.2 / FOCAL)
+    assert found is not None
+    return found
+
+
+def test_interpolation_is_exact_for_polynomials(tracks):
+    def path(t):
+        return 0.3 - t + 4 * t**2 + 20 * t**3 - 70 * t**4
+
+    share, count = interpolation(tracks, READOUT), len(tracks.times)
+    when = tracks.times[:, None] + READOUT * tracks.line_times
+    for k in range(count):
+        first = min(max(k - NODES // 2, 0), count - NODES)
+        value = share[k] @ path(tracks.times[first : first + NODES])
+        np.testing.assert_allclose(value, path(when[k]), atol=1e-12)
+    small = 1e-4
+    ends = [interpolation(tracks, READOUT + by) for by in (small, -small)]
+    slope = (ends[0] - ends[1]) / (2 * small)
+    np.testing.assert_allclose(interpolation_slope(tracks, READOUT), slope, rtol=1e-3, atol=0.02)
+
+
+def errors(tracks, at: Reconstruction, readout: float) -> np.ndarray:
+    """One by one, 0 where nothing is seen."""
+    share, count = interpolation(tracks, readout), len(tracks.times)
+    projected, left = at.projected(), np.zeros_like(tracks.plane)
+    for k, n in np.argwhere(tracks.seen):
+        first = min(max(k - NODES // 2, 0), count - NODES)
+        left[k, n] = tracks.plane[k, n] - share[k, n] @ projected[first : first + NODES, n]
+    return left
+
+
+def test_the_equation_is_that_of_least_squares_over_everything(tracks, start, monkeypatch):
+    monkeypatch.setattr(row_adjustment, "DAMPING", 1e-12)
+    here = errors(tracks, start, READOUT)
+    square = (here**2).sum(axis=-1, keepdims=True)
+    root = np.sqrt(tracks.seen[..., None] / (1 + square / TOLERANCE**2) ** 2) / TOLERANCE
+    (count, n), small = tracks.seen.shape, 1e-6
+    columns = []
+    # Scale is fixed by one coordinate of one pose, as the slight damping leaves it open.
+    poses = [(k, c) for k in range(count) if k != tracks.middle for c in range(6)]
+    for k, c in poses:
+        by = np.zeros((count, 6))
+        by[k, c] = small
+        ends = [errors(tracks, start.stepped(s * by, np.zeros((n, 3))), READOUT) for s in (1, -1)]
+        columns.append((ends[0] - ends[1]) / (2 * small))
+    for p in range(n):
+        for c in range(3):
+            by = np.zeros((n, 3))
+            by[p, c] = small
+            ends = [
+                errors(tracks, start.stepped(np.zeros((count, 6)), s * by), READOUT)
+                for s in (1, -1)
+            ]
+            columns.append((ends[0] - ends[1]) / (2 * small))
+    slope = [errors(tracks, start, READOUT + by) for by in (1e-4, -1e-4)]
+    of_readout = (root * (slope[0] - slope[1]) / 2e-4).ravel()
+    J = np.stack([(root * c).ravel() for c in columns], axis=1)
+    right = (root * here).ravel()
+    free_slope = of_readout - J @ np.linalg.lstsq(J, of_readout, rcond=1e-9)[0]
+    found = readout_equation(tracks, start, READOUT, TOLERANCE)
+    assert found.curvature == pytest.approx(free_slope @ free_slope, rel=0.01)
+    free_right = right - J @ np.linalg.lstsq(J, right, rcond=1e-9)[0]
+    assert found.gradient == pytest.approx(-free_slope @ free_right, rel=0.02)
+    assert found.square == pytest.approx((right**2).sum())
+
+
+def test_steps_lower_the_cost_and_end_where_the_readout_is_right(tracks, start):
+    here, readout, costs = start, 0.0, []
+    for _ in range(12):
+        part = readout_equation(tracks, here, readout, 3 * TOLERANCE)
+        step = float(np.clip(part.gradient / part.curvature, -0.01, 0.01))
+        here, readout = part.stepped(here, step), readout + step
+        costs.append(part.square)
+    assert readout == pytest.approx(READOUT, abs=0.004)
+    assert costs[-1] < 0.5 * costs[0]
