@@ -94,6 +94,7 @@ def _calibrations() -> dict[str, Parser]:
         "calibration-numbers": ("calib.txt", "50 50 31.5 23.5 0.01 0 0 0\n", mutations.text),
         "calibration-matrix": ("k.txt", "50 0 31.5\n0 50 23.5\n0 0 1\n", mutations.text),
     }  # fmt: skip
+
     def use(name: str) -> Callable[[Path], object]:
         return lambda folder: Rectifier(read_calibration(folder / name).fit(64, 48), 32).camera
 
@@ -192,6 +193,7 @@ def _results() -> dict[str, Parser]:
     from geogs.application.remesh import mesh_settings
     from geogs.application.saved_result import load_result
     from geogs.evaluation.surface import read_surface
+    from geogs.io.writers.keyframe_images import image_path, mask_path, read_image, read_mask
     from geogs.io.writers.ply import write_mesh
     from geogs.mesh.files import read_mesh
     from saved_results import make_result
@@ -202,7 +204,7 @@ def _results() -> dict[str, Parser]:
     ascii_ply = (
         "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\n"
         "property float z\nelement face 2\nproperty list uchar int vertex_indices\nend_header\n"
-        "0 0 0\n1 0 0\n1 1 0\n0 1 0\n3 0 1 2\n4 0 1 2 3\n"
+        "0 0 0\n1 0 0\n1 1 0\n0 1 0\n3 0 1 2\n3 0 2 3\n"
     )
 
     def meshes(folder: Path) -> object:
@@ -213,8 +215,8 @@ def _results() -> dict[str, Parser]:
         found = load_result(folder)
         return found.trajectory, found.camera, len(found.keyframes), mesh_settings(folder)
 
-    def one_view(folder: Path) -> object:
-        return load_result(folder).keyframes[2].depth
+    def pictures(folder: Path) -> object:
+        return read_image(image_path(folder, 3)), read_mask(mask_path(folder, 3))
 
     return {
         "ply-binary": Parser(
@@ -229,7 +231,7 @@ def _results() -> dict[str, Parser]:
         ),
         "keyframe-images": Parser(
             make_result, ("keyframes/000003.jpg", "keyframes/000003.mask.png"), mutations.binary,
-            one_view,
+            pictures,
         ),
     }  # fmt: skip
 

@@ -1,6 +1,5 @@
 """A result read from its folder: what ``load_result`` gives."""
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -11,6 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from geogs.documents import read_json
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.io.poses import read_tum_trajectory
@@ -65,10 +65,10 @@ class SavedResult:
     def summary(self) -> dict[str, Any]:
         """What ``summary.json`` holds. Raises InputError if it is missing or damaged."""
         path = self.folder / "summary.json"
-        try:
-            return dict(json.loads(path.read_text(encoding="utf-8")))
-        except (OSError, ValueError) as error:
-            raise InputError(f"{path} is missing or damaged ({error}).") from None
+        summary = read_json(path)
+        if not isinstance(summary, dict):
+            raise InputError(f"{path} is damaged; it holds no summary of a run.")
+        return summary
 
     @cached_property
     def mesh(self) -> Mesh | None:

@@ -60,6 +60,7 @@ def source_summary(source: Stream | PosedSource) -> dict[str, object]:
     return {
         "scale": "arbitrary (monocular)",
         "skipped_images": source.skipped,
+        "damaged_images": source.damaged,
         "shutter": asdict(source.shutter),
         **videos,
     }

@@ -88,7 +88,7 @@ def turn_upright(
 
 def _open(path: Path) -> InputContainer:
     try:
-        container = av.open(str(path))
+        container = av.open(str(path), metadata_errors="replace")
     except (av.error.FFmpegError, OSError) as error:
         raise InputError(
             f"{path} cannot be opened as a video ({error.strerror}); "
