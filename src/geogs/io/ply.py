@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Int64, Shaped
+from jaxtyping import Float64, Int64, Shaped
 
 from geogs.documents import read_bytes
 from geogs.errors import InputError
@@ -88,14 +88,22 @@ def read_ply(path: str | Path) -> dict[str, PlyElement]:
         data = read_bytes(path, LARGEST_PLY)
         text, layout, start = _header(data)
         if text:
-            data, start = np.array(data[start:].split(), np.float64).tobytes(), 0
+            data, start = _numbers(data[start:]).tobytes(), 0
         elements = {}
         for name, (count, properties) in layout.items():
             elements[name], start = _element(data, start, name, count, properties)
     except (ValueError, OverflowError, MemoryError) as error:
-        why = f" ({error})" if isinstance(error, _Wrong) else ""
+        said = "".join(c if c.isprintable() else "?" for c in str(error))[:200]
+        why = f" ({said})" if isinstance(error, _Wrong) else ""
         raise InputError(f"{path} is no readable PLY file{why}.") from None
     return elements
+
+
+def _numbers(text: bytes) -> Float64[np.ndarray, "n"]:
+    try:
+        return np.array(text.split(), np.float64)
+    except ValueError:
+        raise _Wrong("could not convert a word of its rows to a number") from None
 
 
 def _header(data: bytes) -> tuple[bool, dict[str, tuple[int, list[_Property]]], int]:
@@ -118,10 +126,10 @@ def _header(data: bytes) -> tuple[bool, dict[str, tuple[int, list[_Property]]], 
             case ["property", *kinds, name] if layout and order != "":
                 properties = next(reversed(layout.values()))[1]
                 if any(name == other.name for other in properties):
-                    raise _Wrong("a property is there twice")
+                    raise _Wrong(f"the property {name} is there twice")
                 properties.append(_property(name, kinds, order))
             case _:
-                raise _Wrong("its header has a line that none should have")
+                raise _Wrong(f"its header says '{' '.join(words)[:80]}'")
     if order == "":
         raise _Wrong("its header names no format")
     return order is None, layout, start
@@ -134,7 +142,7 @@ def _property(name: str, kinds: list[str], order: _Order | None) -> _Property:
         return _Property(name, types[0], stored[0], None)
     if kinds[:1] == ["list"] and len(kinds) == 3 and len(types) == 2 and types[0].kind in "iu":
         return _Property(name, types[1], stored[1], stored[0])
-    raise _Wrong("a property has a type that there is not")
+    raise _Wrong(f"the type of the property {name} is '{' '.join(kinds)[:80]}'")
 
 
 def _element(
@@ -143,7 +151,7 @@ def _element(
     """The rows that begin at ``start``, and where they end."""
     smallest = sum((p.stored_length or p.stored).itemsize for p in properties)
     if count * smallest > len(data) - start:
-        raise _Wrong("it is cut off")
+        raise _Wrong(f"it is cut off: {count} rows of {name} are not there")
     values, lengths, end = _rows(data, start, count, properties)
     columns, lists = {}, {}
     for p, stored, length in zip(properties, values, lengths.T, strict=True):
@@ -188,7 +196,7 @@ def _walk(
             if p.stored_length is not None:
                 (length,) = np.frombuffer(data, p.stored_length, 1, at).tolist()
                 if length < 0 or length != int(length):
-                    raise _Wrong("a list has a length that none can have")
+                    raise _Wrong(f"a list of {p.name} has length {length}")
                 lengths[row, i] = length
                 at += p.stored_length.itemsize
             starts[row, i] = at
@@ -212,5 +220,5 @@ def _declared(stored: np.ndarray, p: _Property) -> np.ndarray:
     with np.errstate(invalid="ignore", over="ignore"):
         numbers = stored.astype(p.kind)
     if p.kind.kind in "iu" and (numbers != stored).any():
-        raise _Wrong("a property holds numbers that its type has not")
+        raise _Wrong(f"{p.name} holds what is no {p.kind}")
     return numbers

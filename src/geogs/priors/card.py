@@ -164,5 +164,5 @@ def _value(name: str, kind: Any, value: Any) -> Any:
 def _one_of(kind: type[Enum], name: str, value: Any) -> Enum:
     if value not in {member.value for member in kind}:
         known = ", ".join(str(member.value) for member in kind)
-        raise ValueError(f"{name} must be one of {known}")
+        raise ValueError(f"{name} is {str(value)[:40]!r}, not one of {known}")
     return kind(value)

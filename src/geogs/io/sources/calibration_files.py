@@ -181,10 +181,11 @@ def _from_numbers(text: str, path: Path) -> Calibration:
 
 
 def _refuse_fisheye(model: str, path: Path | str) -> None:
-    kinds = [word for word in _OTHER_LENSES if word in model.upper()]
-    if kinds:
+    is_other = any(word in model.upper() for word in _OTHER_LENSES)
+    if is_other:
+        name = f"{model} camera" if re.fullmatch(r"\w{1,40}", model) else "camera of another model"
         raise InputError(
-            f"{path} describes a {kinds[0].lower()} camera, which is not supported; undistort the "
+            f"{path} describes a {name}, which is not supported; undistort the "
             "images first."
         )
 
