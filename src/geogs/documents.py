@@ -105,7 +105,9 @@ def yaml_value(text: str, name: str) -> Any:
     except (yaml.YAMLError, *UNUSABLE) as error:
         mark = getattr(error, "problem_mark", None)
         at = f" at line {mark.line + 1}" if mark is not None else ""
-        raise InputError(f"{name} is damaged or not YAML of plain values{at}; correct it.") from None
+        raise InputError(
+            f"{name} is damaged or not YAML of plain values{at}; correct it."
+        ) from None
 
 
 def whole_number(value: Any) -> int:

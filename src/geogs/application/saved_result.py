@@ -14,6 +14,7 @@ from geogs.documents import read_json
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.io.poses import read_tum_trajectory
+from geogs.io.writers.atomic import expanded
 from geogs.io.writers.keyframe_images import image_path, mask_path, read_image, read_mask
 from geogs.io.writers.map_views import MapViews, load_map_views
 from geogs.io.writers.uncertainty import read_tracked
@@ -119,7 +120,7 @@ def load_result(folder: str | Path, device: torch.device | str = "cpu") -> Saved
     Raises:
         InputError: there is no result, it is damaged, or an older geogs wrote it.
     """
-    folder = Path(folder).expanduser()
+    folder = expanded(folder)
     if not (folder / "map.safetensors").is_file():
         raise InputError(f"{folder} holds no result of geogs: there is no map.safetensors in it.")
     return SavedResult(folder, *load_map_views(folder / "map.safetensors", device))

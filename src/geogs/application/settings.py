@@ -3,6 +3,7 @@
 Nothing here is imported but the settings, so that a command line can be read at once.
 """
 
+import os
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated
@@ -38,7 +39,7 @@ class RunSettings(Settings):
         prior, tracking = config.prior, config.tracking
         return replace(
             self,
-            source=tuple(path.expanduser().absolute() for path in self.source),
+            source=tuple(Path(os.path.expanduser(path)).absolute() for path in self.source),
             output=None,
             config=replace(
                 config,

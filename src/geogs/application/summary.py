@@ -22,6 +22,7 @@ def summarise(result: Result) -> dict[str, object]:
     return {
         "source": source.name,
         "kind": source.kind,
+        "fingerprint": source.fingerprint(),
         "frames": scene.frames,
         **source_summary(source),
         "verdict": None if result.verdict is None else _finite(asdict(result.verdict)),

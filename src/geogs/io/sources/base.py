@@ -241,8 +241,7 @@ class Source:
 
     def fingerprint(self) -> str:
         """Sixteen digits that change with the names and sizes of the files."""
-        sizes = [(p.name, p.stat().st_size if p.is_file() else -1) for p in self._reader.paths]
-        return hashlib.sha256(repr(sizes).encode()).hexdigest()[:16]
+        return fingerprint_of(self._reader.paths)
 
     def __iter__(self) -> Generator[Frame, None, None]:
         """Yield the frames; the next one is read while the present one is used.
@@ -325,6 +324,12 @@ def read_ahead(items: Iterator[T]) -> Iterator[T]:
         while (item := pending.result()) is not end:
             pending = thread.submit(next, items, end)
             yield item  # type: ignore[misc]  # not the end mark
+
+
+def fingerprint_of(paths: Sequence[Path]) -> str:
+    """Sixteen digits that change with the names and sizes of files."""
+    sizes = [(p.name, p.stat().st_size if p.is_file() else -1) for p in paths]
+    return hashlib.sha256(repr(sizes).encode()).hexdigest()[:16]
 
 
 def clip_starts(first: int, count: int) -> list[int]:

@@ -185,8 +185,7 @@ def _refuse_fisheye(model: str, path: Path | str) -> None:
     if is_other:
         name = f"{model} camera" if re.fullmatch(r"\w{1,40}", model) else "camera of another model"
         raise InputError(
-            f"{path} describes a {name}, which is not supported; undistort the "
-            "images first."
+            f"{path} describes a {name}, which is not supported; undistort the images first."
         )
 
 

@@ -12,6 +12,7 @@ from geogs.io.sources.replica import is_replica, open_replica
 from geogs.io.sources.seven_scenes import is_seven_scenes, open_seven_scenes
 from geogs.io.sources.several import SeveralSources
 from geogs.io.sources.tum import is_tum, open_tum
+from geogs.io.writers.atomic import expanded
 
 Stream = Source | SeveralSources
 """What a run reads."""
@@ -36,7 +37,7 @@ def open_source(
         InputError: nothing usable is there, ``config`` does not fit it, or the cameras differ.
     """
     if isinstance(path, str | Path):
-        return Source(_reader(Path(path).expanduser()), config or InputConfig())
+        return Source(_reader(expanded(path)), config or InputConfig())
     if not path:
         raise InputError("Nothing to read; give a video or a folder of images.")
     sources = [open_source(one, config) for one in path]

@@ -14,6 +14,7 @@ from geogs.io.sources.posed.replica import is_posed_replica, open_posed_replica
 from geogs.io.sources.posed.scannet import is_scannet, open_scannet
 from geogs.io.sources.posed.seven_scenes import is_posed_seven_scenes, open_posed_seven_scenes
 from geogs.io.sources.posed.tum import is_posed_tum, open_posed_tum
+from geogs.io.writers.atomic import expanded
 
 # Earlier ones win: data sets with an own description often carry a COLMAP model besides.
 _FORMATS: tuple[tuple[Callable[[Path], object], Callable[[Path], PosedSet]], ...] = (
@@ -43,7 +44,7 @@ def open_posed_source(
     Raises:
         InputError: no images with poses are there, or they cannot be used.
     """
-    path = Path(path).expanduser()
+    path = expanded(path)
     try:
         return PosedSource(_posed_set(path), config or InputConfig(), hold_out)
     except OSError as error:
