@@ -25,6 +25,11 @@ UNUSABLE = (
 """What using the values of a document may end with that somebody made up."""
 
 
+def expanded(path: str | Path) -> Path:
+    """The path with ~ as the folder of the user; as it is where there is no such."""
+    return Path(os.path.expanduser(path))
+
+
 def read_bytes(path: str | Path, largest: int = LARGEST_TEXT) -> bytes:
     """What a plain file holds; a pipe or a device is not waited for.
 
@@ -105,9 +110,8 @@ def yaml_value(text: str, name: str) -> Any:
     except (yaml.YAMLError, *UNUSABLE) as error:
         mark = getattr(error, "problem_mark", None)
         at = f" at line {mark.line + 1}" if mark is not None else ""
-        raise InputError(
-            f"{name} is damaged or not YAML of plain values{at}; correct it."
-        ) from None
+        said = f"{name} is damaged or not YAML of plain values{at}; correct it."
+        raise InputError(said) from None
 
 
 def whole_number(value: Any) -> int:

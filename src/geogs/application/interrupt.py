@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM as a request: the work stops at the next safe point and keeps what there is."""
+"""Ctrl-C and SIGTERM as a request: work stops at the next safe point and keeps what there is."""
 
 import signal
 import threading

@@ -10,11 +10,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from geogs.documents import read_json
+from geogs.documents import expanded, read_json
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.io.poses import read_tum_trajectory
-from geogs.io.writers.atomic import expanded
 from geogs.io.writers.keyframe_images import image_path, mask_path, read_image, read_mask
 from geogs.io.writers.map_views import MapViews, load_map_views
 from geogs.io.writers.uncertainty import read_tracked

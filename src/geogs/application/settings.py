@@ -3,13 +3,13 @@
 Nothing here is imported but the settings, so that a command line can be read at once.
 """
 
-import os
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated
 
 from geogs.config import Config, MeshConfig, ReconstructConfig
 from geogs.config.setting import Basic, Positional, Positive, Range, Settings, Time, Unnamed, Weight
+from geogs.documents import expanded
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class RunSettings(Settings):
         prior, tracking = config.prior, config.tracking
         return replace(
             self,
-            source=tuple(Path(os.path.expanduser(path)).absolute() for path in self.source),
+            source=tuple(expanded(path).absolute() for path in self.source),
             output=None,
             config=replace(
                 config,

@@ -4,8 +4,10 @@ The decoders are C libraries, which print what they find wrong. A JPEG that is d
 gives half a picture and such a line, and no error.
 """
 
+import io
 import os
 import threading
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -33,6 +35,10 @@ _NOISE = (
     "cv::",
 )
 """What lines of the decoders hold, in small letters."""
+_PIXELS_A_BYTE = 10_000
+"""Of a picture of nothing but black, compressed as well as any format can."""
+_HARMLESS = 1 << 24
+"""Pixels that are decoded in no time, whatever the file holds."""
 _PIPE_SIZE = 1 << 20
 _ONE_AT_A_TIME = threading.Lock()
 
@@ -54,6 +60,8 @@ def decoded(path: Path, flags: int) -> Decoded:
     except InputError:
         return Decoded(None)
     if not len(data):
+        return Decoded(None)
+    if _promises_too_much(data):
         return Decoded(None)
     with decoder_noise() as noise:
         try:
@@ -129,6 +137,23 @@ def _sort(pipe: int, noise: list[str]) -> None:
         elif text:
             with suppress(OSError):
                 os.write(2, line)
+
+
+def _promises_too_much(data: np.ndarray) -> bool:
+    """Whether a header tells of more pixels than so few bytes can hold, which would be made up."""
+    from PIL import Image
+
+    try:
+        with (
+            warnings.catch_warnings(action="ignore"),
+            Image.open(io.BytesIO(data.tobytes())) as picture,
+        ):
+            pixels = picture.width * picture.height
+    except Image.DecompressionBombError:
+        pixels = 2 * (Image.MAX_IMAGE_PIXELS or 0)
+    except Exception:  # for the decoder to say
+        return False
+    return pixels > max(_HARMLESS, _PIXELS_A_BYTE * len(data))
 
 
 def _is_cut_off(data: np.ndarray) -> bool:

@@ -28,9 +28,8 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
         raise InputError(f"{path} holds no named tensors.")
     other = [name for name, value in content.items() if not isinstance(value, Tensor)]
     if other:
-        raise InputError(
-            f"{path} holds more than named tensors (such as {ascii(other[0])[1:-1][:40]})."
-        )
+        such = ascii(other[0])[1:-1][:40]
+        raise InputError(f"{path} holds more than named tensors (such as {such}).")
     return dict(content)
 
 

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import overload
 
 from geogs.config import InputConfig
+from geogs.documents import expanded
 from geogs.errors import InputError
 from geogs.io.sources.base import Reader, Source
 from geogs.io.sources.images import SUFFIXES, open_image_folder
@@ -12,7 +13,6 @@ from geogs.io.sources.replica import is_replica, open_replica
 from geogs.io.sources.seven_scenes import is_seven_scenes, open_seven_scenes
 from geogs.io.sources.several import SeveralSources
 from geogs.io.sources.tum import is_tum, open_tum
-from geogs.io.writers.atomic import expanded
 
 Stream = Source | SeveralSources
 """What a run reads."""

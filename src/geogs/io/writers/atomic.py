@@ -8,6 +8,7 @@ from pathlib import Path
 from tempfile import TemporaryFile
 from typing import BinaryIO
 
+from geogs.documents import expanded
 from geogs.errors import OutputError
 
 _FULL = (errno.ENOSPC, errno.EDQUOT)
@@ -62,14 +63,6 @@ def prepare_output_folder(path: str | Path) -> Path:
             return folder
     except OSError as error:
         raise OutputError(_sentence(folder, error)) from error
-
-
-def expanded(path: str | Path) -> Path:
-    """The path with ~ as the folder of the user; as it is where there is no such."""
-    try:
-        return Path(path).expanduser()
-    except RuntimeError:
-        return Path(path)
 
 
 def _sentence(path: Path, error: OSError) -> str:

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from geogs.config import InputConfig
+from geogs.documents import expanded
 from geogs.errors import InputError
 from geogs.io.sources.posed.base import PosedSource
 from geogs.io.sources.posed.colmap import find_model, open_colmap
@@ -14,7 +15,6 @@ from geogs.io.sources.posed.replica import is_posed_replica, open_posed_replica
 from geogs.io.sources.posed.scannet import is_scannet, open_scannet
 from geogs.io.sources.posed.seven_scenes import is_posed_seven_scenes, open_posed_seven_scenes
 from geogs.io.sources.posed.tum import is_posed_tum, open_posed_tum
-from geogs.io.writers.atomic import expanded
 
 # Earlier ones win: data sets with an own description often carry a COLMAP model besides.
 _FORMATS: tuple[tuple[Callable[[Path], object], Callable[[Path], PosedSet]], ...] = (
