@@ -16,8 +16,11 @@ LARGEST_TEXT = 1 << 30
 """Bytes of a table, such as the poses of a long sequence or the points of a COLMAP model."""
 LARGEST_DOCUMENT = 1 << 26
 """Bytes of a JSON document, such as the poses of all images of a scene."""
-LARGEST_SETTINGS = 1 << 20
+LARGEST_SETTINGS = 1 << 17
 """Bytes of a YAML document, whose reader is slow: a calibration, settings, a card."""
+
+_DEEPEST = 50
+"""Groups within groups."""
 
 UNUSABLE = (
     ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RecursionError,
@@ -98,7 +101,15 @@ def yaml_value(text: str, name: str) -> Any:
     import yaml
 
     class Reader(yaml.SafeLoader):
-        """Refuses aliases, by which a few lines can mean billions of values."""
+        """Refuses aliases, by which a few lines can mean billions of values, and deep nesting.
+
+        Time would go with the square of the depth.
+        """
+
+        def fetch_more_tokens(self) -> Any:
+            if self.flow_level + len(self.indents) > _DEEPEST:
+                raise yaml.YAMLError
+            return super().fetch_more_tokens()
 
         def compose_node(self, parent: Any, index: Any) -> Any:
             if self.check_event(yaml.AliasEvent):

@@ -30,9 +30,11 @@ def only_writer(folder: Path) -> Iterator[None]:
             raise OutputError(
                 f"Another run is writing into {folder}; wait for it, or give another folder (-o)."
             )
-        yield
-        with suppress(OSError):
-            path.unlink()
+        try:
+            yield
+        finally:
+            with suppress(OSError):
+                path.unlink()
     finally:
         os.close(file)
 
