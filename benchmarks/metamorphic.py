@@ -5,7 +5,7 @@
 The sequence is reconstructed as it is and as other cameras would have brought it: mirrored, at half
 the frame rate, with intrinsics for images of another size, darker with another gamma, backwards.
 Printed is how far path and disks are from those of the sequence as it is, after the best
-similarity, of the extent of the path; the last column says what is allowed. Ends with 1 where a
+similarity, of the extent of each; beside them what is allowed. Ends with 1 where a
 relation does not hold.
 """
 
@@ -54,7 +54,7 @@ class Relation:
     path: float
     """Distance of the places that is allowed, RMS, of the extent of the path."""
     map: float
-    """Distance of the disks that is allowed, median, likewise."""
+    """Distance of the disks that is allowed, median, of the extent of the map."""
     is_mirrored: bool = False
 
 
@@ -116,7 +116,7 @@ def shape_of(frames: Sequence[Frame], camera: Camera, config: Config) -> Shape:
 
 
 def distances(shape: Shape, as_it_is: Shape) -> tuple[float, float]:
-    """Of the path (RMS) and of the disks (median), after a similarity, of the extent of the path.
+    """Of the path (RMS) and of the disks (median), after a similarity, of the extent of each.
 
     Disks are measured to the nearest of the other map; infinite where there is too little.
     """
@@ -134,7 +134,8 @@ def distances(shape: Shape, as_it_is: Shape) -> tuple[float, float]:
     path = np.sqrt(np.square(scale * turned - goal).sum(1).mean())
     moved = scale * (shape.disks - centre) @ R.T + target
     apart, _ = cKDTree(as_it_is.disks).query(moved)
-    return float(path / extent), float(np.median(apart) / extent)
+    spread = np.sqrt(np.square(as_it_is.disks - as_it_is.disks.mean(0)).sum(1).mean())
+    return float(path / extent), float(np.median(apart) / spread)
 
 
 def held(

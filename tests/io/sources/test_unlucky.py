@@ -1,4 +1,4 @@
-"""What a hostile or unlucky user gives: odd images, odd names, odd numbers; each used or refused."""
+"""What a hostile or unlucky user gives: odd images, names and numbers; each used or refused."""
 
 import os
 
