@@ -94,7 +94,7 @@ def backwards(frames: Sequence[Frame], camera: Camera) -> tuple[list[Frame], Cam
 
 
 RELATIONS = (
-    Relation("mirrored", mirrored, 0.03, 0.03, is_mirrored=True),
+    Relation("mirrored", mirrored, 0.03, 0.05, is_mirrored=True),
     Relation("half the frame rate", half_the_rate, 0.03, 0.04),
     Relation("another clock", slower, 0.001, 0.001),
     Relation("another unit of intrinsics", other_unit, 0.001, 0.001),

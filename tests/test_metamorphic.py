@@ -19,7 +19,7 @@ CONFIG = parse([
 
 @pytest.mark.system
 def test_a_mirrored_video_gives_the_mirrored_map(small_room):
-    source = open_source(small_room, InputConfig(stop=28))
+    source = open_source(small_room, InputConfig(stop=22))
     frames = list(source)
     as_it_is = shape_of(frames, source.camera, CONFIG)
     path, disks, is_held = held(RELATIONS[0], frames, source.camera, CONFIG, as_it_is)
