@@ -1,17 +1,19 @@
 # make demo     set up, run the whole system on a small synthetic room, print the error table
 # make quick    set up, lint, type-check, test what does not run the whole system: the inner loop
 # make test     set up, lint, type-check, test everything
+# make fuzz     set up, damage files and options at random, FUZZ (1000) times each
 # make format   set up, sort imports, mend what the linter can, format
 PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
+FUZZ   ?= 1000
 PIP    := $(BIN)/python -m pip install --quiet
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2
 TORCH  := 2.13.0
 TORCH_CPU_INDEX := https://download.pytorch.org/whl/cpu
 
-.PHONY: demo quick test lint format setup clean
+.PHONY: demo quick test fuzz lint format setup clean
 
 demo: $(STAMP)
 	$(BIN)/geogs demo -o out/demo
@@ -27,6 +29,9 @@ lint: $(STAMP)
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports
 	$(BIN)/mypy
+
+fuzz: $(STAMP)
+	GEOGS_FUZZ=$(FUZZ) $(PYTEST) tests/fuzz tests/cli/test_option_values.py
 
 format: $(STAMP)
 	$(BIN)/ruff check --fix .

@@ -41,6 +41,7 @@ def write_video(
     rotation: int = 0,
     codec: str = "libx264",
     gop: int = 4,
+    title: str = "",
 ) -> Path:
     """Write a video with the given presentation times (33 ms steps if none).
 
@@ -49,6 +50,7 @@ def write_video(
     height, width = images[0].shape[:2]
     times = milliseconds or [33 * i for i in range(len(images))]
     with av.open(str(path), "w") as container:
+        container.metadata["title"] = title
         stream = container.add_stream(codec, rate=30)
         stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
         stream.codec_context.time_base = TIME_BASE

@@ -23,10 +23,12 @@ from geogs.io.writers.native import load_map
 from geogs.mesh.files import read_mesh
 from geogs.slam import Slam
 from geogs.types import Frame, Trajectory
+from json_schema import faults
 
 pytestmark = pytest.mark.system
 
 GEOGS = [sys.executable, "-m", "geogs.cli.main"]
+SCHEMA = Path(__file__).parents[1] / "docs" / "summary.schema.json"
 FRAMES = 44
 # Small enough for a test, all stages on.
 QUICK = [
@@ -113,6 +115,7 @@ def test_a_run_leaves_every_file(small_result):
     assert np.allclose(np.diff(trajectory.timestamps), 1 / 30, atol=1e-6)
     disks = load_map(small_result / "map.safetensors")
     summary = json.loads((small_result / "summary.json").read_text())
+    assert list(faults(summary, json.loads(SCHEMA.read_text()))) == []
     assert disks.is_finite()
     assert summary["disks"] == len(disks) > 300
     assert summary["frames"] == SMALL_FRAMES

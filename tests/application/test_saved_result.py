@@ -105,6 +105,6 @@ def test_what_cannot_be_used_is_told_in_a_sentence(tmp_path, result):
             cut.write_bytes(content)
         with pytest.raises(InputError, match=r"000002.jpg is missing or damaged"):
             read_image(cut)
-    with pytest.raises(InputError, match=r"summary.json is missing"):
+    with pytest.raises(InputError, match=r"summary.json does not exist"):
         _ = result.summary
     assert result.mesh is None

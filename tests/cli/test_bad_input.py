@@ -129,15 +129,15 @@ def test_selected_images_that_are_all_damaged(tmp_path):
     (tmp_path / "b.png").write_bytes(b"damaged")
     with pytest.raises(InputError) as error:
         read_all(tmp_path, InputConfig(intrinsics=GIVEN.intrinsics, start=1))
-    assert "none of its 1 images can be read" in sentence(error)
+    assert "none of its 1 images can be used" in sentence(error)
 
 
-def test_image_of_another_size(tmp_path):
+def test_an_image_of_another_size_is_skipped_and_named(tmp_path, caplog):
     write_images(tmp_path, ["a.png", "b.png"])
     write_image(tmp_path / "c.png", gradient_image(0, 48, 64))
-    with pytest.raises(InputError) as error:
-        read_all(tmp_path)
-    assert "c.png is 48x64 but the first image is 64x48" in sentence(error)
+    with caplog.at_level("WARNING", "geogs"):
+        assert read_all(tmp_path) == 2
+    assert "c.png is 48x64 but the first image is 64x48; skipped." in caplog.text
 
 
 def test_image_list_with_missing_files(tmp_path):

@@ -204,7 +204,7 @@ def test_what_does_not_fit_is_told_in_a_sentence(tmp_path: Path):
         (path, replace(PLAIN, depth_output="z"), "no output z.*depth, normal"),
         (path, replace(PLAIN, depth_output="depth", image_input="rgb"), "no input rgb"),
         (tmp_path / "none.onnx", PLAIN, "no file"),
-        (broken, PLAIN, "cannot be read"),
+        (broken, PLAIN, "no ONNX network"),
     ]
     for file, card, message in wrong:
         with pytest.raises(InputError, match=message):

@@ -1,6 +1,5 @@
 """Errors of a result against the truth: trajectory and surface, as numbers, files and pictures."""
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,6 +11,7 @@ from geogs.application.evaluate_surface import (
     compare_surface,
     photoconsistency,
 )
+from geogs.documents import read_json
 from geogs.errors import InputError
 from geogs.evaluation.report import SAME_POSES_CM, Evaluation, write_report
 from geogs.evaluation.run_report import PICTURES, run_sections
@@ -86,8 +86,8 @@ def _check(settings: EvalSettings) -> None:
 def _summary(output: Path) -> dict[str, object]:
     """What the run said of itself; nothing if it left no summary that can be read."""
     try:
-        content = json.loads((output / "summary.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        content = read_json(output / "summary.json")
+    except InputError:
         return {}
     return content if isinstance(content, dict) else {}
 

@@ -1,8 +1,10 @@
-"""Ctrl-C as a request: the work stops at the next safe point and keeps what there is."""
+"""Ctrl-C and SIGTERM as a request: work stops at the next safe point and keeps what there is."""
 
 import signal
 import threading
 from types import FrameType
+
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 class Stop:
@@ -24,19 +26,23 @@ class Stop:
 
 
 class Interruption(Stop):
-    """While it is entered, the first Ctrl-C only sets ``requested``; the second quits."""
+    """While it is entered, the first Ctrl-C only sets ``requested``; the second quits.
+
+    SIGTERM, by which systems and schedulers end programs, is the same.
+    """
 
     def __enter__(self) -> "Interruption":
         super().__enter__()
         # Python takes signals in the main thread alone.
         self._is_listening = threading.current_thread() is threading.main_thread()
         if self._is_listening:
-            self._before = signal.signal(signal.SIGINT, self._handle)
+            self._before = {n: signal.signal(n, self._handle) for n in _SIGNALS}
         return self
 
     def __exit__(self, *exception: object) -> None:
         if self._is_listening:
-            signal.signal(signal.SIGINT, self._before)
+            for number, before in self._before.items():
+                signal.signal(number, before)
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
         self.check()

@@ -2,7 +2,7 @@
 
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -17,6 +17,8 @@ REMEDY = (
 )
 """What helps where the memory of a GPU is full."""
 
+_GPU_FAILS = ("CUDA error", "CUDA driver error", "cuDNN error", "cuBLAS", "CUBLAS", "NVRTC")
+
 
 def compiled_kernels(device: torch.device) -> float:
     """Have all kernels of a GPU compiled, once per machine; the seconds that took."""
@@ -27,12 +29,23 @@ def compiled_kernels(device: torch.device) -> float:
 
 
 @contextmanager
-def full_memory_in_a_sentence() -> Iterator[None]:
-    """Inside, PyTorch's error about a GPU without memory becomes a DeviceError with the remedy."""
+def full_memory_in_a_sentence(way_on: Callable[[], str] = str) -> Iterator[None]:
+    """Inside, errors of a GPU that fails or is full become a DeviceError with the remedy.
+
+    ``way_on`` gives a sentence on how to go on with the work, behind a space, or nothing; a second
+    Ctrl-C says it, too.
+    """
     try:
         yield
     except torch.cuda.OutOfMemoryError as error:
-        raise DeviceError(f"The memory of the GPU is full; {REMEDY}.") from error
+        raise DeviceError(f"The memory of the GPU is full; {REMEDY}.{way_on()}") from error
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(way_on().strip()) from None
+    except RuntimeError as error:  # of a class of its own in some versions of PyTorch only
+        said = str(error).splitlines() or [""]
+        if not any(word in said[0] for word in _GPU_FAILS):
+            raise
+        raise DeviceError(f"The GPU failed ({said[0][:200].rstrip('.')}).{way_on()}") from error
 
 
 def device_summary(device: torch.device) -> dict[str, object]:

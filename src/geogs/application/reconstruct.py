@@ -4,6 +4,11 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import torch
+
+from geogs.application.checkpoint import has_checkpoint
+from geogs.application.folder_lock import only_writer
+from geogs.application.former import free_folder
 from geogs.application.interrupt import Stop
 from geogs.application.machine import compiled_kernels, full_memory_in_a_sentence
 from geogs.application.progress import RunProgress
@@ -85,13 +90,36 @@ def reconstruct_to_folder(
     progress, stop = progress or RunProgress(), stop or Stop()
     config, device = settings.config, require_device(settings.device)
     source = open_posed_source(settings.source, config.input, settings.hold_out)
-    output = prepare_output_folder(settings.output or Path("out") / source.name)
+    output = Path("out") / source.name
+    if not settings.resume:
+        output = free_folder(output, source.fingerprint())
+    output = prepare_output_folder(settings.output or output)
+    with only_writer(output):
+        return _to_folder(settings, source, output, device, clock, progress, stop)
+
+
+def _to_folder(
+    settings: ReconstructSettings,
+    source: PosedSource,
+    output: Path,
+    device: torch.device,
+    clock: "_Clock",
+    progress: RunProgress,
+    stop: Stop,
+) -> Written:
+    """The same once the source is opened and the folder is ours."""
+    config = settings.config
     clock.excuse(compiled_kernels(device))
     names = [Path(source.label(i)).name for i in range(len(source))]
     made_from = fingerprint(config, settings.hold_out, names)
     checkpoint = ReconstructCheckpoint(output, made_from, settings.checkpoint_every, progress)
     snapshots = Snapshots(settings.snapshots)
-    with full_memory_in_a_sentence(), stop:
+
+    def way_on() -> str:
+        kept = has_checkpoint(output)
+        return " The same command with --resume goes on from the last checkpoint." if kept else ""
+
+    with full_memory_in_a_sentence(way_on), stop:
         resumed = checkpoint.read() if settings.resume else None
         if settings.check_poses and resumed is None:
             _check(source, progress)

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from geogs.config import MeshConfig
 from geogs.config.setting import Basic, Positional, Settings
+from geogs.documents import UNUSABLE, read_yaml
 from geogs.errors import InputError
 
 if TYPE_CHECKING:
@@ -32,16 +33,14 @@ def mesh_settings(folder: Path) -> MeshConfig:
     Raises:
         InputError: ``config.yaml`` is damaged, or holds a value that a setting cannot have.
     """
-    import yaml
-
     path = folder / "config.yaml"
     if not path.is_file():
         return MeshConfig()
     try:
-        said: Any = yaml.safe_load(path.read_text(encoding="utf-8"))["mesh"]
+        said: Any = read_yaml(path)["mesh"]
         known = {name.name: said[name.name] for name in fields(MeshConfig) if name.name in said}
-    except (OSError, KeyError, TypeError, ValueError, yaml.YAMLError) as error:
-        raise InputError(f"{path} is damaged ({type(error).__name__}).") from None
+    except UNUSABLE:
+        raise InputError(f"{path} is damaged; give the settings of the mesh anew.") from None
     return replace(MeshConfig(), **known)
 
 

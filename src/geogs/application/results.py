@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
+from geogs.application.former import remove_former
 from geogs.application.keyframe_files import write_keyframes
 from geogs.application.report import write_report
 from geogs.application.result import Result
@@ -34,16 +35,19 @@ def write_results(
     result: Result,
     more: Sequence[Callable[[], None]] = (),
     keyframe_images: bool = True,
+    is_online_new: bool = False,
 ) -> None:
     """Write poses first, then the map, the mesh, what else was asked for, and the report on them.
 
     ``more`` writes the rest, which the summary then counts. ``keyframe_images`` says whether the
-    images of the keyframes are kept, too.
+    images of the keyframes are kept, too. Files of an earlier result in the folder are deleted;
+    online/ stays where it is said to be of this one.
 
     Raises:
         OutputError: a file cannot be written.
     """
     output = prepare_output_folder(output)
+    remove_former(output, is_online_new)
     scene, source, progress = result.scene, result.source, result.progress
     write_tum_trajectory(output / "trajectory.tum", result.trajectory)
     write_tum_trajectory(output / "keyframes.tum", result.keyframes)

@@ -9,6 +9,8 @@ import torch
 
 from geogs.application.calibrate import self_calibrated
 from geogs.application.checkpoint import has_checkpoint
+from geogs.application.folder_lock import only_writer
+from geogs.application.former import free_folder
 from geogs.application.interrupt import Stop
 from geogs.application.machine import REMEDY, compiled_kernels, full_memory_in_a_sentence
 from geogs.application.priors import open_prior
@@ -44,7 +46,22 @@ def run(
     progress, stop = progress or RunProgress(), stop or Stop()
     config, device = settings.config, require_device(settings.device)
     opened = open_source(settings.source, config.input)
-    output = prepare_output_folder(settings.output or Path("out") / opened.name)
+    wanted = settings.output or free_folder(Path("out") / opened.name, opened.fingerprint())
+    output = prepare_output_folder(wanted)
+    with only_writer(output):
+        return _run(settings, opened, output, device, progress, stop)
+
+
+def _run(
+    settings: RunSettings,
+    opened: Stream,
+    output: Path,
+    device: torch.device,
+    progress: RunProgress,
+    stop: Stop,
+) -> Written:
+    """The same once the source is opened and the folder is ours."""
+    config = settings.config
     compiled_kernels(device)
     calibrated = self_calibrated(opened, config, device, progress, stop)
     found = None if calibrated is opened else calibrated.calibration
@@ -84,17 +101,19 @@ def resume(
     config, device = settings.config, require_device(settings.device)
     source = saved.calibrated(open_source(settings.source, config.input))
     output = prepare_output_folder(output)
-    compiled_kernels(device)
-    slam = Slam(source.camera, config, str(device), open_prior(config.prior, source.camera, device))
-    saved.restore(slam)
-    progress.write(f"Going on after {slam.frames} frames.")
-    facts = replace(saved.facts, settings=settings.absolute())
-    frames = frames_after(source, saved.facts.place)
-    return _Run(slam, source, settings, output, facts, progress, stop).complete(frames)
+    with only_writer(output):
+        compiled_kernels(device)
+        prior = open_prior(config.prior, source.camera, device)
+        slam = Slam(source.camera, config, str(device), prior)
+        saved.restore(slam)
+        progress.write(f"Going on after {slam.frames} frames.")
+        facts = replace(saved.facts, settings=settings.absolute(), device=device.type)
+        frames = frames_after(source, saved.facts.place)
+        return _Run(slam, source, settings, output, facts, progress, stop).complete(frames)
 
 
 def continued(facts: RunFacts, settings: RunSettings, output: Path) -> RunSettings:
-    """Settings to go on with in a folder, on the kind of device that the run began on.
+    """Settings to go on with in a folder, on the kind of device that the run began on or the CPU.
 
     Raises:
         InputError: they would compute something else, or elsewhere.
@@ -107,7 +126,7 @@ def continued(facts: RunFacts, settings: RunSettings, output: Path) -> RunSettin
             "--keyframe-images."
         )
     device = facts.device if settings.device == "auto" else settings.device
-    if not device.startswith(facts.device):
+    if not device.startswith(facts.device) and device != "cpu":
         raise InputError(f"The run was on {facts.device}, and can only go on there.")
     return replace(settings, device=device)
 
@@ -131,7 +150,7 @@ class _Run:
         checkpoint = RunCheckpoint(output, self.facts, settings.checkpoint_every, progress)
         progress.expect(source.length, slam.frames)
         kept = False
-        with full_memory_in_a_sentence(), self.stop:
+        with full_memory_in_a_sentence(self._way_on), self.stop:
             with closing(frames):
                 full = not self._feed(frames, checkpoint)
             interrupted = full or self.stop.requested
@@ -148,15 +167,22 @@ class _Run:
             result = Result(slam, source, interrupted, progress)
             more = [lambda: write_depth_mesh(output, slam, progress)]
             more = more if settings.depth_mesh else []
-            write_results(output, result, more, settings.keyframe_images)
+            write_results(output, result, more, settings.keyframe_images, settings.online_results)
         if full:
             raise DeviceError(
                 f"The memory of the GPU was full after {slam.frames} frames, whose results are in "
-                f"{output}/; {REMEDY}."
+                f"{output}/; {REMEDY}.{self._way_on()}"
             )
         if not interrupted:
             checkpoint.remove()
         return Written(output, result, interrupted and kept)
+
+    def _way_on(self) -> str:
+        """How to go on after a failure, behind another sentence; nothing if there is no way."""
+        if not has_checkpoint(self.output):
+            return ""
+        on_cpu = ", with --device cpu on the CPU" if self.facts.device != "cpu" else ""
+        return f" geogs run --resume {self.output} goes on from the last checkpoint{on_cpu}."
 
     def _feed(self, frames: Iterator[Frame], checkpoint: RunCheckpoint) -> bool:
         """All frames through the system, until a request to stop; false if the GPU is full."""

@@ -1,6 +1,5 @@
 """A result read from its folder: what ``load_result`` gives."""
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -12,6 +11,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from geogs.documents import expanded, read_json
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.io.poses import read_tum_trajectory
@@ -66,10 +66,10 @@ class SavedResult:
     def summary(self) -> dict[str, Any]:
         """What ``summary.json`` holds. Raises InputError if it is missing or damaged."""
         path = self.folder / "summary.json"
-        try:
-            return dict(json.loads(path.read_text(encoding="utf-8")))
-        except (OSError, ValueError) as error:
-            raise InputError(f"{path} is missing or damaged ({error}).") from None
+        summary = read_json(path)
+        if not isinstance(summary, dict):
+            raise InputError(f"{path} is damaged; it holds no summary of a run.")
+        return summary
 
     @cached_property
     def mesh(self) -> Mesh | None:
@@ -128,7 +128,7 @@ def load_result(folder: str | Path, device: torch.device | str = "cpu") -> Saved
     Raises:
         InputError: there is no result, it is damaged, or an older geogs wrote it.
     """
-    folder = Path(folder).expanduser()
+    folder = expanded(folder)
     if not (folder / "map.safetensors").is_file():
         raise InputError(f"{folder} holds no result of geogs: there is no map.safetensors in it.")
     return SavedResult(folder, *load_map_views(folder / "map.safetensors", device))

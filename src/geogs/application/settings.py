@@ -9,6 +9,7 @@ from typing import Annotated
 
 from geogs.config import Config, MeshConfig, ReconstructConfig
 from geogs.config.setting import Basic, Positional, Positive, Range, Settings, Time, Unnamed, Weight
+from geogs.documents import expanded
 
 
 @dataclass(frozen=True)
@@ -38,7 +39,7 @@ class RunSettings(Settings):
         prior, tracking = config.prior, config.tracking
         return replace(
             self,
-            source=tuple(path.expanduser().absolute() for path in self.source),
+            source=tuple(expanded(path).absolute() for path in self.source),
             output=None,
             config=replace(
                 config,

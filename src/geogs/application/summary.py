@@ -1,5 +1,6 @@
 """``summary.json``: what happened, in numbers."""
 
+import math
 import platform
 from dataclasses import asdict
 
@@ -22,6 +23,7 @@ def summarise(result: Result) -> dict[str, object]:
     return {
         "source": source.name,
         "kind": source.kind,
+        "fingerprint": source.fingerprint(),
         "frames": scene.frames,
         **source_summary(source),
         "verdict": None if result.verdict is None else _finite(asdict(result.verdict)),
@@ -46,8 +48,10 @@ def summarise(result: Result) -> dict[str, object]:
 
 
 def _finite(values: dict[str, object]) -> dict[str, object]:
-    """The values with none instead of infinity, which JSON does not know."""
-    return {k: None if v == float("inf") else v for k, v in values.items()}
+    """The values with none instead of infinity and NaN, which JSON does not know."""
+    return {
+        k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in values.items()
+    }
 
 
 def source_summary(source: Stream | PosedSource) -> dict[str, object]:
@@ -60,6 +64,7 @@ def source_summary(source: Stream | PosedSource) -> dict[str, object]:
     return {
         "scale": "arbitrary (monocular)",
         "skipped_images": source.skipped,
+        "damaged_images": source.damaged,
         "shutter": asdict(source.shutter),
         **videos,
     }

@@ -56,7 +56,7 @@ class TerminalProgress(RunProgress):
     def write(self, text: str) -> None:
         """A line above the bars, if there is something to say."""
         if text:
-            self._bar.console.print(text)
+            self._bar.console.print(text, markup=False)  # names may hold brackets
 
     def expect(self, frames: int | None, begun: int = 0) -> None:
         """Show the bar of the frames."""

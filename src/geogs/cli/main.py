@@ -3,13 +3,18 @@
 Nothing heavy is imported before a sub-command is chosen, so that help appears at once.
 """
 
+import errno
 import importlib
 import logging
 import os
+import signal
 import sys
+import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from types import FrameType
 
+from geogs.cli.streams import make_unbreakable
 from geogs.errors import GeogsError
 from geogs.version import __version__
 
@@ -50,6 +55,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     Returns:
         0 on success, 2 after an error of input, output or options, 130 after Ctrl-C.
     """
+    if argv is None:  # the process is ours
+        make_unbreakable()
+        _take_ends_for_interrupts()
     arguments = list(sys.argv[1:] if argv is None else argv)
     return _guarded(lambda: _dispatch(arguments))
 
@@ -88,7 +96,8 @@ def help_text() -> str:
 def print_error(sentence: str) -> None:
     """Print one line to the standard error, in red on a terminal."""
     is_coloured = sys.stderr.isatty() and "NO_COLOR" not in os.environ
-    text = f"error: {sentence}"
+    plain = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in sentence)
+    text = f"error: {plain}"
     print(f"\033[31m{text}\033[0m" if is_coloured else text, file=sys.stderr)
 
 
@@ -103,17 +112,46 @@ def _guarded(run: Callable[[], int]) -> int:
         return code
     except SystemExit as stop:  # help and wrong options end this way
         return stop.code if isinstance(stop.code, int) else 0 if stop.code is None else EXIT_ERROR
-    except KeyboardInterrupt:
-        print_error("interrupted.")
+    except KeyboardInterrupt as interrupt:
+        print_error(" ".join(["interrupted.", *map(str, interrupt.args)]).strip())
         return EXIT_INTERRUPTED
-    except BrokenPipeError:  # such as head, which has enough
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return EXIT_ERROR
     except GeogsError as error:
         if os.environ.get("GEOGS_DEBUG", "0") not in ("", "0"):
             raise
         print_error(str(error))
         return EXIT_ERROR
+    except Exception as error:
+        sentence = _of_the_system(error)
+        if sentence is None or os.environ.get("GEOGS_DEBUG", "0") not in ("", "0"):
+            raise
+        print_error(sentence)
+        return EXIT_ERROR
+
+
+def _of_the_system(error: Exception) -> str | None:
+    """What to say where the system gave too little; nothing for other errors, which are ours."""
+    said = str(error)
+    if isinstance(error, OSError) and error.errno in (errno.EMFILE, errno.ENFILE):
+        return "Too many files are open; raise the limit (ulimit -n)."
+    if isinstance(error, OSError) and error.errno == errno.ENOSPC:
+        return f"A disk is full ({error.filename or 'of temporary files, see TMPDIR'})."
+    lacks = ("allocate memory", "start new thread", "failed to map segment", "Insufficient memory")
+    if isinstance(error, MemoryError) or any(words in said for words in lacks):
+        return (
+            "The memory is full, or may not be used (ulimit -v); use a smaller --long-edge or "
+            "fewer frames, and go on with --resume where there is a checkpoint."
+        )
+    return None
+
+
+def _take_ends_for_interrupts() -> None:
+    """SIGTERM, by which systems and schedulers end programs, is taken as Ctrl-C."""
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        raise KeyboardInterrupt
+
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, interrupt)
 
 
 def _unknown_command(name: str) -> str:

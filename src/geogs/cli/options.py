@@ -121,7 +121,7 @@ def _value(leaf: Leaf, texts: list[str]) -> object:
     if kind.base is bool:
         return texts[-1] == "on"
     several = kind.is_tuple and (kind.base is str or leaf.mark(Positional) is not None)
-    value = tuple(kind.base(text) for text in texts) if several else kind.read(texts[-1])
+    value = kind.read_each(texts) if several else kind.read(texts[-1])
     if not kind.allows(value):
         raise InputError(refusal(leaf.name, value, kind))
     return value

@@ -65,7 +65,7 @@ def leaves(tree: object, command: str = "") -> tuple[Leaf, ...]:
 
     With a command, without those that are :class:`Only` for another.
     """
-    found = tuple(_leaves(tree, (), ""))
+    found = _of_kind(tree) if isinstance(tree, type) else tuple(_leaves(tree, (), ""))
     others = [leaf.mark(Only) for leaf in found]
     return tuple(
         leaf
@@ -87,6 +87,11 @@ def default_text(leaf: Leaf) -> str:
 def default_of(field: Any) -> Any:
     """What a field is if it is not given; ``MISSING`` if it must be."""
     return field.default if field.default_factory is MISSING else field.default_factory()
+
+
+@functools.cache
+def _of_kind(tree: type) -> tuple[Leaf, ...]:
+    return tuple(_leaves(tree, (), ""))
 
 
 def _leaves(tree: Any, path: tuple[str, ...], group: str) -> Iterator[Leaf]:

@@ -10,8 +10,9 @@ are made from it.
 
 import functools
 import math
+import reprlib
 import types
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from numbers import Integral, Real
 from pathlib import Path
@@ -164,6 +165,10 @@ class Kind:
             return isinstance(value, tuple) and all(self._allows_one(v, group) for v in value)
         return self._allows_one(value, group)
 
+    def read_each(self, texts: Sequence[str]) -> tuple[object, ...]:
+        """The values that several texts mean; a text that means none comes back as it is."""
+        return tuple(self._read_one(text) for text in texts)
+
     def read(self, text: str) -> Any:
         """The value that a text means; a text that means none comes back as it is."""
         if self.is_optional and text.lower() == "none":
@@ -206,6 +211,8 @@ class Kind:
 
     def _read_one(self, text: str) -> object:
         units = [unit for unit in _SECONDS if Time in self.marks and text.endswith(unit)]
+        if self.base is Path and not text:  # which Python takes for the working folder
+            return text
         try:
             if units:
                 return _SECONDS[units[0]] * float(text.removesuffix(units[0]))
@@ -243,7 +250,8 @@ def refusal(name: str, value: object, kind: Kind, group: object = None) -> str:
     if group is not None:
         known = [f"{dashed(name)} is {getattr(group, name)}" for name in partners]
     beside = f" ({', '.join(known)})" if known else ""
-    return f"{dashed(name)} is {value!r}, but must be {kind}{beside}."
+    given = reprlib.repr(value) if isinstance(value, str | int) else repr(value)
+    return f"{dashed(name)} is {given}, but must be {kind}{beside}."
 
 
 def dashed(name: str) -> str:

@@ -42,7 +42,8 @@ class Camera:
     def with_long_edge(self, long_edge: int) -> "Camera":
         """The camera of the image scaled so that its longer side has ``long_edge`` pixels."""
         scale = long_edge / max(self.width, self.height)
-        return self.resized(round(self.width * scale), round(self.height * scale))
+        width, height = round(self.width * scale), round(self.height * scale)
+        return self.resized(max(width, 1), max(height, 1))
 
     def rays(
         self, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu"

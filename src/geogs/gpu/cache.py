@@ -26,7 +26,10 @@ def cache_folder() -> Path:
     if chosen := os.environ.get("GEOGS_CACHE"):
         return Path(chosen)
     base = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA")
-    return (Path(base) if base else Path.home() / ".cache") / "geogs"
+    home = os.path.expanduser("~")
+    if not base and not os.path.isabs(home):  # nobody knows this user
+        return Path(tempfile.gettempdir()) / f"geogs-{os.getuid()}"
+    return (Path(base) if base else Path(home) / ".cache") / "geogs"
 
 
 def cache_key(*parts: str) -> str:

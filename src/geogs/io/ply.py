@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Int64, Shaped
+from jaxtyping import Float64, Int64, Shaped
 
+from geogs.documents import read_bytes
 from geogs.errors import InputError
 
 _KINDS = {
@@ -24,6 +25,10 @@ _ORDERS: dict[str, _Order | None] = {
     "binary_little_endian": "<",
     "binary_big_endian": ">",
 }
+
+
+LARGEST_PLY = 1 << 35
+"""Bytes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +71,10 @@ class _Property:
         return [(self.prefix, self.stored_length), (self.name, self.stored, (length,))]
 
 
+class _Wrong(ValueError):
+    """What is wrong, in words of ours."""
+
+
 def read_ply(path: str | Path) -> dict[str, PlyElement]:
     """The elements of a PLY file by name. Lists of one length in all rows are read at once.
 
@@ -76,18 +85,25 @@ def read_ply(path: str | Path) -> dict[str, PlyElement]:
     if not path.is_file():
         raise InputError(f"{path} does not exist; give a PLY file.")
     try:
-        data = path.read_bytes()
+        data = read_bytes(path, LARGEST_PLY)
         text, layout, start = _header(data)
         if text:
-            data, start = np.array(data[start:].split(), np.float64).tobytes(), 0
+            data, start = _numbers(data[start:]).tobytes(), 0
         elements = {}
         for name, (count, properties) in layout.items():
             elements[name], start = _element(data, start, name, count, properties)
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror}.") from error
-    except (ValueError, OverflowError) as error:
-        raise InputError(f"{path} is no readable PLY file ({error}).") from error
+    except (ValueError, OverflowError, MemoryError) as error:
+        said = "".join(c if c.isprintable() else "?" for c in str(error))[:200]
+        why = f" ({said})" if isinstance(error, _Wrong) else ""
+        raise InputError(f"{path} is no readable PLY file{why}.") from None
     return elements
+
+
+def _numbers(text: bytes) -> Float64[np.ndarray, "n"]:
+    try:
+        return np.array(text.split(), np.float64)
+    except ValueError:
+        raise _Wrong("could not convert a word of its rows to a number") from None
 
 
 def _header(data: bytes) -> tuple[bool, dict[str, tuple[int, list[_Property]]], int]:
@@ -96,7 +112,7 @@ def _header(data: bytes) -> tuple[bool, dict[str, tuple[int, list[_Property]]], 
     start = data.find(b"\n", end) + 1
     lines = data[: max(end, 0)].decode("ascii", "replace").splitlines()
     if not data.startswith(b"ply") or end < 0 or not start:
-        raise ValueError("it has no header")
+        raise _Wrong("it has no header")
     order: _Order | Literal[""] | None = ""
     layout: dict[str, tuple[int, list[_Property]]] = {}
     for words in map(str.split, lines[1:]):
@@ -110,12 +126,12 @@ def _header(data: bytes) -> tuple[bool, dict[str, tuple[int, list[_Property]]], 
             case ["property", *kinds, name] if layout and order != "":
                 properties = next(reversed(layout.values()))[1]
                 if any(name == other.name for other in properties):
-                    raise ValueError(f"the property {name} is there twice")
+                    raise _Wrong(f"the property {name} is there twice")
                 properties.append(_property(name, kinds, order))
             case _:
-                raise ValueError(f"its header says '{' '.join(words)[:80]}'")
+                raise _Wrong(f"its header says '{' '.join(words)[:80]}'")
     if order == "":
-        raise ValueError("its header names no format")
+        raise _Wrong("its header names no format")
     return order is None, layout, start
 
 
@@ -126,7 +142,7 @@ def _property(name: str, kinds: list[str], order: _Order | None) -> _Property:
         return _Property(name, types[0], stored[0], None)
     if kinds[:1] == ["list"] and len(kinds) == 3 and len(types) == 2 and types[0].kind in "iu":
         return _Property(name, types[1], stored[1], stored[0])
-    raise ValueError(f"the type of the property {name} is '{' '.join(kinds)[:80]}'")
+    raise _Wrong(f"the type of the property {name} is '{' '.join(kinds)[:80]}'")
 
 
 def _element(
@@ -135,7 +151,7 @@ def _element(
     """The rows that begin at ``start``, and where they end."""
     smallest = sum((p.stored_length or p.stored).itemsize for p in properties)
     if count * smallest > len(data) - start:
-        raise ValueError(f"it is cut off: {count} rows of {name} are not there")
+        raise _Wrong(f"it is cut off: {count} rows of {name} are not there")
     values, lengths, end = _rows(data, start, count, properties)
     columns, lists = {}, {}
     for p, stored, length in zip(properties, values, lengths.T, strict=True):
@@ -180,13 +196,13 @@ def _walk(
             if p.stored_length is not None:
                 (length,) = np.frombuffer(data, p.stored_length, 1, at).tolist()
                 if length < 0 or length != int(length):
-                    raise ValueError(f"a list of {p.name} has length {length}")
+                    raise _Wrong(f"a list of {p.name} has length {length}")
                 lengths[row, i] = length
                 at += p.stored_length.itemsize
             starts[row, i] = at
             at += p.stored.itemsize * int(lengths[row, i])
         if at > len(data):
-            raise ValueError("it is cut off")
+            raise _Wrong("it is cut off")
     return starts, lengths, at
 
 
@@ -204,5 +220,5 @@ def _declared(stored: np.ndarray, p: _Property) -> np.ndarray:
     with np.errstate(invalid="ignore", over="ignore"):
         numbers = stored.astype(p.kind)
     if p.kind.kind in "iu" and (numbers != stored).any():
-        raise ValueError(f"{p.name} holds what is no {p.kind}")
+        raise _Wrong(f"{p.name} holds what is no {p.kind}")
     return numbers

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 
+from geogs.documents import read_text
 from geogs.errors import InputError
 from geogs.geometry.lie import quaternion_to_matrix
 from geogs.types import Trajectory
@@ -114,15 +115,7 @@ def _read_table(path: Path, columns: tuple[int, ...], layout: str) -> Float[np.n
 
 
 def _numbers_by_line(path: Path) -> Iterator[tuple[int, list[float]]]:
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except FileNotFoundError:
-        raise InputError(f"{path} does not exist; give the file with the poses.") from None
-    except UnicodeDecodeError:
-        raise InputError(f"{path} is not a text file; expected poses as numbers.") from None
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror}.") from error
-    for line, content in enumerate(text.splitlines(), start=1):
+    for line, content in enumerate(read_text(path).splitlines(), start=1):
         words = content.split("#", 1)[0].replace(",", " ").split()
         try:
             numbers = [float(word) for word in words]

@@ -28,7 +28,8 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
         raise InputError(f"{path} holds no named tensors.")
     other = [name for name, value in content.items() if not isinstance(value, Tensor)]
     if other:
-        raise InputError(f"{path} holds more than named tensors (such as {other[0]}).")
+        such = ascii(other[0])[1:-1][:40]
+        raise InputError(f"{path} holds more than named tensors (such as {such}).")
     return dict(content)
 
 
@@ -36,7 +37,7 @@ def _safetensors(path: Path) -> object:
     try:
         return load_file(path)
     except (SafetensorError, OSError) as error:
-        raise InputError(f"{path} is damaged, or no safetensors file ({error}).") from error
+        raise InputError(f"{path} is damaged, or no safetensors file.") from error
 
 
 def _checkpoint(path: Path) -> object:

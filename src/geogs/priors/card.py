@@ -6,8 +6,7 @@ from enum import Enum
 from pathlib import Path
 from typing import Any
 
-import yaml
-
+from geogs.documents import LARGEST_SETTINGS, read_text, yaml_value
 from geogs.errors import InputError
 from geogs.priors.base import DepthKind
 
@@ -122,14 +121,11 @@ def load_card(name: str) -> PriorCard:
     if "/" not in name and shipped.is_file():
         text = shipped.read_text("utf-8")
     elif path.is_file():
-        text = path.read_text("utf-8")
+        text = read_text(path, LARGEST_SETTINGS)
     else:
         known = ", ".join(card_names())
         raise InputError(f"There is no card {name}: give a YAML file, or one of {known}.")
-    try:
-        content = yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise InputError(f"The card {name} is not YAML: {str(error).splitlines()[0]}.") from error
+    content = yaml_value(text, f"The card {name}")
     if not isinstance(content, dict):
         raise InputError(f"The card {name} must be a list of settings.")
     return _from_settings(name, content)
@@ -137,27 +133,36 @@ def load_card(name: str) -> PriorCard:
 
 def _from_settings(name: str, content: dict[str, Any]) -> PriorCard:
     known = {f.name for f in fields(PriorCard)}
-    unknown = sorted(set(content) - known)
+    unknown = [str(key)[:40] for key in content if key not in known]
     if unknown:
-        raise InputError(f"The card {name} has settings that do not exist: {', '.join(unknown)}.")
+        raise InputError(f"The card {name} has a setting {unknown[0]!r}, which does not exist.")
     kinds = {f.name: f.type for f in fields(PriorCard)}
     try:
         return PriorCard(**{k: _value(k, kinds[k], v) for k, v in content.items()})
-    except (TypeError, ValueError) as error:
-        raise InputError(f"The card {name} is wrong: {error}.") from error
+    except (TypeError, ValueError, OverflowError) as error:
+        raise InputError(f"The card {name} is wrong: {error}.") from None
 
 
 def _value(name: str, kind: Any, value: Any) -> Any:
     """A setting as its field wants it; raises ValueError for what it cannot be."""
     if kind is Resize:
-        return Resize(value)
+        return _one_of(Resize, name, value)
     if kind == DepthKind | None:
-        return None if value is None else DepthKind(value)
+        return None if value is None else _one_of(DepthKind, name, value)
     if kind is int and type(value) is int:
         return value
     if kind is str and isinstance(value, str):
         return value
     numbers = value if isinstance(value, list) else [value]
     if kind in (int, str) or not all(type(v) in (int, float) for v in numbers):
-        raise ValueError(f"{name} cannot be {value}")
+        raise ValueError(f"{name} cannot be {str(value)[:40]!r}")
+    if not all(abs(v) < 1e30 for v in numbers):  # NaN is not, either
+        raise ValueError(f"{name} must be finite")
     return float(value) if kind is float else tuple(float(v) for v in numbers)
+
+
+def _one_of(kind: type[Enum], name: str, value: Any) -> Enum:
+    if value not in {member.value for member in kind}:
+        known = ", ".join(str(member.value) for member in kind)
+        raise ValueError(f"{name} is {str(value)[:40]!r}, not one of {known}")
+    return kind(value)

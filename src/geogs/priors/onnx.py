@@ -54,8 +54,9 @@ class OnnxPrior:
         try:
             found = dict(zip(names, self._session.run(names, feed), strict=True))
         except Exception as error:  # onnxruntime raises classes of its own
-            first = str(error).splitlines()[0]
-            raise InputError(f"The monocular network {self.card.name} fails: {first}") from error
+            raise InputError(
+                f"The monocular network {self.card.name} fails{_said(error)}."
+            ) from error
         depth = normal = None
         if self._depth:
             depth = torch.from_numpy(depth_map(found[self._depth], fitted, self.card))
@@ -77,10 +78,16 @@ def _open(model: Path, device: torch.device) -> Any:
     wanted = ["CUDAExecutionProvider"] * (device.type == "cuda") + ["CPUExecutionProvider"]
     providers = [p for p in wanted if p in onnxruntime.get_available_providers()]
     try:
-        return onnxruntime.InferenceSession(str(model), options, providers=providers)
+        return onnxruntime.InferenceSession(str(model), options, providers, enable_fallback=0)
     except Exception as error:  # onnxruntime raises classes of its own
-        first = str(error).splitlines()[0]
-        raise InputError(f"{model} cannot be read as an ONNX network: {first}") from error
+        raise InputError(f"{model} is no ONNX network that can be used{_said(error)}.") from error
+
+
+def _said(error: Exception) -> str:
+    """The reason in brackets, in letters that a terminal can show; nothing where there is none."""
+    lines = str(error).encode("ascii", "replace").decode().split("\n")
+    words = "".join(c if c.isprintable() else "?" for c in lines[0])[:200].strip(" .")
+    return f" ({words})" if words else ""
 
 
 def _only(names: Sequence[str], setting: str, model: Path) -> str:

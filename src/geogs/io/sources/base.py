@@ -9,7 +9,7 @@ import hashlib
 import logging
 from collections.abc import Generator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, Protocol, TypeVar, runtime_checkable
 
@@ -31,6 +31,8 @@ from geogs.types import Frame
 
 _log = logging.getLogger(__name__)
 T = TypeVar("T")
+LEAST_EDGE = 16
+"""Pixels of the shorter side of a working image."""
 MINUTE = 60.0
 """Seconds of a video that are looked at for its readout."""
 
@@ -45,6 +47,15 @@ class RawFrame:
     """Seconds."""
     image: UInt8[np.ndarray, "h w 3"] | None
     """RGB; none where it could not be read."""
+    is_damaged: bool = False
+    """Whether its decoder found that a part is wrong."""
+    why_not: str = "cannot be read"
+    """What is wrong where there is no image."""
+
+    @property
+    def fault(self) -> str:
+        """What is wrong, with its name."""
+        return f"{self.label} {self.why_not}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +65,9 @@ class ReadingPlace:
     frames: int = 0
     """Given."""
     skipped: int = 0
-    """Images before the last of them that could not be read."""
+    """Images before the last of them that could not be read, or are of another size."""
+    damaged: int = 0
+    """Images among them of which a part is damaged."""
 
 
 @runtime_checkable
@@ -118,8 +131,11 @@ class Source:
         self.shutter = shutter or shutter_of(config.readout)
         """By which rows are rectified."""
         self._rectifier = Rectifier(self.calibration, config.long_edge)
+        check_large_enough(self._rectifier.camera, reader.name)
         self.skipped = 0
-        """Images that could not be read, so far in this iteration."""
+        """Images that could not be read or are of another size, so far in this iteration."""
+        self.damaged = 0
+        """Images of which a part is damaged, so far in this iteration."""
         self.place = ReadingPlace()
         """How far the source has been read, at each frame of this iteration."""
 
@@ -195,10 +211,10 @@ class Source:
         return map(self._at_working_size, self._reader.read(start, stop, 1))
 
     def _at_working_size(self, raw: RawFrame) -> RawFrame:
+        raw = of_one_size(raw, self._reader)
         if raw.image is None:
             return raw
-        _check_size(raw, self._reader)
-        return RawFrame(raw.label, raw.timestamp, self._rectifier.resized(raw.image))
+        return replace(raw, image=self._rectifier.resized(raw.image))
 
     def linked_frames(self) -> Generator[Frame, None, None]:
         """Frames between which there is no cut."""
@@ -225,33 +241,39 @@ class Source:
 
     def fingerprint(self) -> str:
         """Sixteen digits that change with the names and sizes of the files."""
-        sizes = [(p.name, p.stat().st_size if p.is_file() else -1) for p in self._reader.paths]
-        return hashlib.sha256(repr(sizes).encode()).hexdigest()[:16]
+        return fingerprint_of(self._reader.paths)
 
     def __iter__(self) -> Generator[Frame, None, None]:
         """Yield the frames; the next one is read while the present one is used.
 
         Raises:
-            InputError: an image of another size, or no image that can be read.
+            InputError: there is no image that can be used.
         """
         return self.frames_after(ReadingPlace())
 
     def frames_after(self, place: ReadingPlace) -> Generator[Frame, None, None]:
         """Yield the frames after a place; otherwise as the iteration over all."""
         self.place, self.skipped, index = place, place.skipped, place.frames
+        self.damaged = place.damaged
         for raw in read_ahead(self._working(place.frames + place.skipped)):
             if raw.image is None:
                 self.skipped += 1
                 if self.skipped == 1:
-                    _log.warning("%s cannot be read; skipped.", raw.label)
+                    _log.warning("%s; skipped.", raw.fault)
                 continue
-            self.place = ReadingPlace(index + 1, self.skipped)
+            if raw.is_damaged:
+                self.damaged += 1
+                if self.damaged == 1:
+                    _log.warning("%s is damaged; used as far as it goes.", raw.label)
+            self.place = ReadingPlace(index + 1, self.skipped, self.damaged)
             yield Frame(index, raw.timestamp, raw.image)
             index += 1
         if index == 0:
             raise InputError(self._why_empty())
         if self.skipped > 1:
-            _log.warning("%s: skipped %d images that cannot be read.", self.name, self.skipped)
+            _log.warning("%s: skipped %d images that cannot be used.", self.name, self.skipped)
+        if self.damaged > 1:
+            _log.warning("%s: %d images are damaged.", self.name, self.damaged)
 
     def _working(self, first: int) -> Iterator[RawFrame]:
         """The working images of the selection from its ``first`` on."""
@@ -261,10 +283,8 @@ class Source:
             yield from self._with_rows_rectified(start)
             return
         for raw in reader.read(start, config.stop, config.stride):
-            if raw.image is not None:
-                _check_size(raw, reader)
-                raw = RawFrame(raw.label, raw.timestamp, self._rectifier(raw.image))
-            yield raw
+            raw = of_one_size(raw, reader)
+            yield raw if raw.image is None else replace(raw, image=self._rectifier(raw.image))
 
     def _with_rows_rectified(self, start: int) -> Iterator[RawFrame]:
         """The same for a rolling shutter, from a place in the source on.
@@ -288,11 +308,11 @@ class Source:
                 yield raw
                 continue
             moved = None if turning.is_still else offsets(turning, readout)
-            yield RawFrame(raw.label, raw.timestamp, self._rectifier.straightened(raw.image, moved))
+            yield replace(raw, image=self._rectifier.straightened(raw.image, moved))
 
     def _why_empty(self) -> str:
         if self.skipped:
-            return f"{self.name}: none of its {self.skipped} images can be read."
+            return f"{self.name}: none of its {self.skipped} images can be used."
         return f"{self.name} ends before frame {self._config.start}; give a smaller start."
 
 
@@ -304,6 +324,12 @@ def read_ahead(items: Iterator[T]) -> Iterator[T]:
         while (item := pending.result()) is not end:
             pending = thread.submit(next, items, end)
             yield item  # type: ignore[misc]  # not the end mark
+
+
+def fingerprint_of(paths: Sequence[Path]) -> str:
+    """Sixteen digits that change with the names and sizes of files."""
+    sizes = [(p.name, p.stat().st_size if p.is_file() else -1) for p in paths]
+    return hashlib.sha256(repr(sizes).encode()).hexdigest()[:16]
 
 
 def clip_starts(first: int, count: int) -> list[int]:
@@ -327,11 +353,21 @@ def _check_selection(config: InputConfig, length: int | None) -> None:
         )
 
 
-def _check_size(raw: RawFrame, reader: Reader) -> None:
-    assert raw.image is not None
+def of_one_size(raw: RawFrame, reader: Reader) -> RawFrame:
+    """The image as it is; without its picture if that has another size than the first."""
+    if raw.image is None:
+        return raw
     height, width = raw.image.shape[:2]
-    if (width, height) != (reader.width, reader.height):
+    if (width, height) == (reader.width, reader.height):
+        return raw
+    sizes = f"{width}x{height} but the first image is {reader.width}x{reader.height}"
+    return replace(raw, image=None, why_not=f"is {sizes}")
+
+
+def check_large_enough(camera: Camera, name: str) -> None:
+    """Raises InputError where working images have too few pixels on a side to track anything."""
+    if min(camera.width, camera.height) < LEAST_EDGE:
         raise InputError(
-            f"{raw.label} is {width}x{height} but the first image is "
-            f"{reader.width}x{reader.height}; leave it out or give images of one size."
+            f"{name} gives working images of {camera.width}x{camera.height} pixels; both sides "
+            f"need {LEAST_EDGE} at least, so give larger images or a larger --long-edge."
         )

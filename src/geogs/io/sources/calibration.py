@@ -6,6 +6,12 @@ from dataclasses import dataclass, replace
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 
+_LEAST_FOCAL, _MOST_FOCAL = 0.1, 100.0
+"""Focal lengths by the longer side of the image: fields of view from 157 down to 0.6 degrees."""
+_LARGEST_DISTORTION = 1e5
+_LONGEST_EDGE = 1 << 20
+"""Pixels."""
+
 
 @dataclass(frozen=True)
 class Refinement:
@@ -48,6 +54,21 @@ class Calibration:
         numbers = (self.fx, self.fy, self.cx, self.cy, *self.distortion)
         if not all(math.isfinite(number) for number in numbers):
             raise InputError(f"The intrinsics ({self.origin}) hold NaN or infinity; correct them.")
+        if len(self.distortion) not in (0, 4, 5, 8):
+            raise InputError(
+                f"The intrinsics ({self.origin}) have {len(self.distortion)} distortion numbers; "
+                "give k1, k2, p1, p2[, k3[, k4, k5, k6]]."
+            )
+        if not all(abs(number) <= _LARGEST_DISTORTION for number in self.distortion):
+            raise InputError(
+                f"The intrinsics ({self.origin}) have distortion numbers that no lens has; correct "
+                "them."
+            )
+        if not all(n is None or 1 <= n <= _LONGEST_EDGE for n in (self.width, self.height)):
+            raise InputError(
+                f"The intrinsics ({self.origin}) are for images of {self.width}x{self.height} "
+                "pixels, which there are not; correct them."
+            )
         if self.fx <= 0 or self.fy <= 0:
             raise InputError(
                 f"The focal length ({self.origin}) is {self.fx:g}, {self.fy:g}; "
@@ -103,11 +124,24 @@ class Calibration:
                 f"The principal point ({self.origin}) {self.cx:g}, {self.cy:g} lies outside the "
                 f"{self.width}x{self.height} image; are the intrinsics for another resolution?"
             )
+        self._check_plausible(camera)
         return replace(
             self,
             fx=camera.fx, fy=camera.fy, cx=camera.cx, cy=camera.cy,
             width=width, height=height,
         )  # fmt: skip
+
+    def _check_plausible(self, camera: Camera) -> None:
+        """Raises InputError for a focal length that no camera of such images has."""
+        edge = max(camera.width, camera.height)
+        least, most = _LEAST_FOCAL * edge, _MOST_FOCAL * edge
+        squeeze = max(camera.fx / camera.fy, camera.fy / camera.fx)
+        if not all(least <= focal <= most for focal in (camera.fx, camera.fy)) or squeeze > 4:
+            raise InputError(
+                f"The focal length ({self.origin}) is {camera.fx:g}, {camera.fy:g} pixels for "
+                f"images of {camera.width}x{camera.height}; plausible are {least:g} to {most:g}, "
+                "about the same in both directions."
+            )
 
     def _turned(self, quarter_turns: int) -> "Calibration":
         turned = self

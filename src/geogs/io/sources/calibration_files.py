@@ -4,12 +4,19 @@ COLMAP and nerfstudio put the centre of the first pixel at (1/2, 1/2); their pri
 moved by half a pixel to the convention used here.
 """
 
-import json
 import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from geogs.documents import (
+    LARGEST_SETTINGS,
+    UNUSABLE,
+    read_json,
+    read_text,
+    whole_number,
+    yaml_value,
+)
 from geogs.errors import InputError
 from geogs.io.sources.calibration import Calibration
 
@@ -26,6 +33,9 @@ _COLMAP_MODELS: dict[str, tuple[int | None, ...]] = {
     "FULL_OPENCV": (0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11),
 }
 
+_OTHER_LENSES = ("FISHEYE", "FOV", "EQUIDISTANT", "EQUIRECT")
+"""What names of camera models hold that the images have to be undistorted for."""
+
 
 def read_calibration(path: str | Path) -> Calibration:
     """Read the camera in ``path``; the format follows from the name and the content.
@@ -34,20 +44,23 @@ def read_calibration(path: str | Path) -> Calibration:
         InputError: the file is missing, unreadable, of no known format, or of a fisheye camera.
     """
     path = Path(path)
-    text = _read_text(path)
+    if path.suffix == ".json":
+        document, text = read_json(path), ""
+    else:
+        document, text = None, read_text(path, LARGEST_SETTINGS)
     try:
         if path.suffix == ".json":
-            return _from_json(json.loads(text), path)
+            return _from_json(document, path)
         if path.suffix in (".yaml", ".yml"):
             return _from_yaml(text, path)
         if any(model in text for model in ("PINHOLE", "RADIAL", "OPENCV", "FISHEYE", "FOV")):
             return _from_colmap(text, path)
         return _from_numbers(text, path)
-    except (KeyError, TypeError, ValueError, IndexError) as error:
+    except UNUSABLE as error:
         raise InputError(
-            f"{path} is no calibration that can be understood ({_reason(error)}); "
+            f"{path} is no calibration that can be understood{_reason(error)}; "
             f"give fx fy cx cy [k1 k2 p1 p2 [k3]]."
-        ) from error
+        ) from None
 
 
 def calibration_from_numbers(numbers: Numbers, origin: str) -> Calibration:
@@ -61,22 +74,12 @@ def calibration_from_numbers(numbers: Numbers, origin: str) -> Calibration:
     return Calibration(fx, fy, cx, cy, distortion=tuple(distortion), origin=origin)
 
 
-def _read_text(path: Path) -> str:
-    try:
-        return path.read_text(encoding="utf-8-sig")
-    except FileNotFoundError:
-        raise InputError(f"The calibration file {path} does not exist.") from None
-    except UnicodeDecodeError:
-        raise InputError(f"{path} is not a text file, so it is no calibration.") from None
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror}.") from error
-
-
 def _reason(error: Exception) -> str:
-    return f"no entry {error}" if isinstance(error, KeyError) else str(error)
+    """What is missing, without what the file holds."""
+    return f" (no entry {error})" if isinstance(error, KeyError) else ""
 
 
-def _from_json(document: dict[str, Any], path: Path) -> Calibration:
+def _from_json(document: Any, path: Path) -> Calibration:
     # "source" is the camera of the images as they came, in the intrinsics.json of a result.
     entry = document.get("source") or document.get("camera") or document
     if "fl_x" in entry:
@@ -117,7 +120,9 @@ def _from_colmap(text: str, path: Path) -> Calibration:
         raise InputError(f"{path} holds {len(cameras)} different cameras; give a file with one.")
     model, width, height, *words = next(iter(cameras))
     parameters = [float(word) for word in words]
-    return calibration_from_colmap(model, int(width), int(height), parameters, str(path))
+    return calibration_from_colmap(
+        model, whole_number(width), whole_number(height), parameters, str(path)
+    )
 
 
 def calibration_from_colmap(
@@ -131,7 +136,7 @@ def calibration_from_colmap(
     _refuse_fisheye(model, origin)
     if model not in _COLMAP_MODELS:
         raise InputError(
-            f"{origin} describes a {model} camera, which is not supported; undistort the images "
+            f"{origin} describes a camera of a model that is not supported; undistort the images "
             f"with COLMAP's image_undistorter first."
         )
     fx, fy, cx, cy, *distortion = (
@@ -144,11 +149,9 @@ def calibration_from_colmap(
 
 
 def _from_yaml(text: str, path: Path) -> Calibration:
-    import yaml
-
     # OpenCV writes a directive and a tag that plain YAML readers refuse.
     text = re.sub(r"^%YAML.*$|!!opencv-matrix", "", text, flags=re.MULTILINE)
-    document = yaml.safe_load(text)
+    document = yaml_value(text, str(path))
     if "intrinsics" in document:  # EuRoC and Kalibr
         fx, fy, cx, cy = document["intrinsics"]
         distortion = document.get("distortion_coefficients", [])
@@ -178,12 +181,13 @@ def _from_numbers(text: str, path: Path) -> Calibration:
 
 
 def _refuse_fisheye(model: str, path: Path | str) -> None:
-    if any(word in model.upper() for word in ("FISHEYE", "FOV", "EQUIDISTANT", "EQUIRECT")):
+    is_other = any(word in model.upper() for word in _OTHER_LENSES)
+    if is_other:
+        name = f"{model} camera" if re.fullmatch(r"\w{1,40}", model) else "camera of another model"
         raise InputError(
-            f"{path} describes a {model} camera, which is not supported; undistort the images "
-            f"first."
+            f"{path} describes a {name}, which is not supported; undistort the images first."
         )
 
 
 def _optional_int(number: Any) -> int | None:
-    return None if number is None else int(number)
+    return None if number is None else whole_number(number)

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from geogs.errors import InputError
+from geogs.io.pictures import decoded
 from geogs.io.poses import FRAMES_PER_SECOND
 from geogs.io.sources.base import RawFrame
 from geogs.io.sources.calibration import Calibration
@@ -60,16 +61,15 @@ class ImageList:
     def read(self, start: int, stop: int | None, stride: int) -> Iterator[RawFrame]:
         """Read images ``start, start + stride, ...`` before ``stop``."""
         for file in self.files[start:stop:stride]:
-            yield RawFrame(str(file.path), file.timestamp, read_image(file.path))
+            found = decoded(file.path, cv2.IMREAD_COLOR)
+            image = found.picture
+            image = None if image is None else cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+            yield RawFrame(str(file.path), file.timestamp, image, found.is_damaged)
 
 
 def read_image(path: Path) -> UInt8[np.ndarray, "h w 3"] | None:
     """Read an image as RGB, upright by its EXIF orientation; none if it is damaged or missing."""
-    try:
-        data = np.fromfile(path, dtype=np.uint8)
-        image = cv2.imdecode(data, cv2.IMREAD_COLOR) if len(data) else None
-    except (OSError, cv2.error):
-        return None
+    image = decoded(path, cv2.IMREAD_COLOR).picture
     return None if image is None else cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 

@@ -2,10 +2,12 @@
 
 import logging
 import math
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 
 from geogs.errors import InputError
+from geogs.io.pictures import decoder_noise
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.calibration_files import calibration_from_numbers, read_calibration
 
@@ -80,16 +82,17 @@ def calibration_from_exif(image: Path) -> Calibration | None:
 
     The equivalent compares diagonals (CIPA DCG-001): f / 43.27 mm is focal length by diagonal.
     """
-    from PIL import Image, UnidentifiedImageError
+    from PIL import Image
 
     try:
-        with Image.open(image) as photograph:
+        with decoder_noise(), warnings.catch_warnings(), Image.open(image) as photograph:
+            warnings.simplefilter("ignore")
             exif: Mapping[int, object] = photograph.getexif().get_ifd(_EXIF_IFD)
             width, height = photograph.size
-    except (OSError, UnidentifiedImageError, SyntaxError, ValueError):
+    except Exception:  # whatever damaged EXIF makes its reader stumble over
         return None
     equivalent = exif.get(_FOCAL_LENGTH_35MM)
-    if not isinstance(equivalent, int | float) or equivalent <= 0:
+    if not isinstance(equivalent, int | float) or not 3 <= equivalent <= 3000:  # or a wrong entry
         return None
     focal = equivalent / _FULL_FRAME_DIAGONAL * math.hypot(width, height)
     return Calibration(

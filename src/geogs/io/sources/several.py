@@ -132,6 +132,11 @@ class SeveralSources:
         """Images that could not be read, so far in this iteration."""
         return sum(s.skipped for s in self._sources)
 
+    @property
+    def damaged(self) -> int:
+        """Images of which a part is damaged, so far in this iteration."""
+        return sum(s.damaged for s in self._sources)
+
     def fingerprint(self) -> str:
         """Changes with the names and sizes of the files of any."""
         return "-".join(s.fingerprint() for s in self._sources)
@@ -146,7 +151,8 @@ class SeveralSources:
         index, end = place.frames, place.time
         for n, source in enumerate(self._sources):
             if n < len(place.places) - 1:
-                source.skipped, source.place = place.places[n].skipped, place.places[n]
+                source.skipped, source.damaged = place.places[n].skipped, place.places[n].damaged
+                source.place = place.places[n]
                 continue
             is_begun = n < len(place.places)
             begin = place.places[n] if is_begun else ReadingPlace()

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import overload
 
 from geogs.config import InputConfig
+from geogs.documents import expanded
 from geogs.errors import InputError
 from geogs.io.sources.base import Reader, Source
 from geogs.io.sources.images import SUFFIXES, open_image_folder
@@ -36,7 +37,7 @@ def open_source(
         InputError: nothing usable is there, ``config`` does not fit it, or the cameras differ.
     """
     if isinstance(path, str | Path):
-        return Source(_reader(Path(path).expanduser()), config or InputConfig())
+        return Source(_reader(expanded(path)), config or InputConfig())
     if not path:
         raise InputError("Nothing to read; give a video or a folder of images.")
     sources = [open_source(one, config) for one in path]

@@ -1,7 +1,9 @@
 """TUM RGB-D: ``rgb.txt`` lists the colour images with their times."""
 
+import math
 from pathlib import Path
 
+from geogs.documents import read_text
 from geogs.errors import InputError
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.images import ImageFile, ImageList
@@ -46,19 +48,17 @@ def known_camera(name: str) -> Calibration | None:
 
 def _read_list(folder: Path) -> list[ImageFile]:
     listing = folder / "rgb.txt"
-    try:
-        lines = listing.read_text(encoding="utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{listing} cannot be read: {error}.") from error
-    files = []
+    lines, files = read_text(listing).splitlines(), []
     for number, line in enumerate(lines, start=1):
         words = line.split("#", 1)[0].split()
         if not words:
             continue
         try:
-            time, image = words
-            files.append(ImageFile(folder / image, float(time)))
-        except ValueError:
+            time, image = float(words[0]), words[1]
+            if len(words) != 2 or not math.isfinite(time):
+                raise ValueError
+            files.append(ImageFile(folder / image, time))
+        except (ValueError, IndexError):
             raise InputError(f"{listing}, line {number}: expected a time and a file.") from None
     if not files:
         raise InputError(f"{listing} lists no images.")

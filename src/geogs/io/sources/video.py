@@ -16,6 +16,9 @@ from geogs.io.sources.calibration import Calibration
 # FFmpeg also "plays" text, single pictures and play lists; none of them is a video file.
 _NOT_VIDEO = frozenset({"tty", "image2", "hls", "concat", "concatf", "dash", "sdp", "lrc", "srt"})
 
+_LOCAL = {"protocol_whitelist": "file"}
+"""No container may lead to the network."""
+
 _log = logging.getLogger(__name__)
 
 
@@ -88,7 +91,7 @@ def turn_upright(
 
 def _open(path: Path) -> InputContainer:
     try:
-        container = av.open(str(path))
+        container = av.open(str(path), metadata_errors="replace", options=_LOCAL)
     except (av.error.FFmpegError, OSError) as error:
         raise InputError(
             f"{path} cannot be opened as a video ({error.strerror}); "

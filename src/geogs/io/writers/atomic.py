@@ -1,5 +1,6 @@
 """Files appear complete or not at all: written beside their place, then renamed."""
 
+import errno
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -7,7 +8,10 @@ from pathlib import Path
 from tempfile import TemporaryFile
 from typing import BinaryIO
 
+from geogs.documents import expanded
 from geogs.errors import OutputError
+
+_FULL = (errno.ENOSPC, errno.EDQUOT)
 
 
 @contextmanager
@@ -39,7 +43,7 @@ def atomic_file(path: str | Path) -> Iterator[BinaryIO]:
 def write_text(path: str | Path, text: str) -> None:
     """Write a text file in UTF-8, completely or not at all."""
     with atomic_file(path) as stream:
-        stream.write(text.encode("utf-8"))
+        stream.write(text.encode("utf-8", "backslashreplace"))  # names may be no UTF-8
 
 
 def prepare_output_folder(path: str | Path) -> Path:
@@ -50,7 +54,7 @@ def prepare_output_folder(path: str | Path) -> Path:
     Raises:
         OutputError: it is a file, or cannot be made or written.
     """
-    folder = Path(path).expanduser()
+    folder = expanded(path)
     if folder.exists() and not folder.is_dir():
         raise OutputError(f"{folder} is a file; give another folder for the results.")
     try:
@@ -63,4 +67,17 @@ def prepare_output_folder(path: str | Path) -> Path:
 
 def _sentence(path: Path, error: OSError) -> str:
     reason = error.strerror or str(error)
-    return f"{path} cannot be written ({reason}); free some space or give another output folder."
+    if error.errno in _FULL:
+        return f"{path} cannot be written ({reason}); free some space on {_disk_of(path)}."
+    return f"{path} cannot be written ({reason}); give another output folder."
+
+
+def _disk_of(path: Path) -> str:
+    """Where the disk is mounted that a file lies on, or would."""
+    try:
+        place = next(p for p in (path.absolute(), *path.absolute().parents) if p.exists())
+        while not place.is_mount() and place != place.parent:
+            place = place.parent
+        return f"the disk at {place}"
+    except OSError:
+        return "its disk"

@@ -1,13 +1,18 @@
 """``intrinsics.json``: the camera of the working images, that of the source, and its shutter."""
 
 import json
+import math
 from pathlib import Path
+from typing import Any
 
+from geogs.documents import UNUSABLE, read_json, whole_number
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.io.sources.calibration import Calibration
 from geogs.io.writers.atomic import write_text
 from geogs.shutter.shutter import Shutter
+
+_MOST_PIXELS = 1 << 28
 
 
 def write_intrinsics(
@@ -70,8 +75,21 @@ def _refinement(calibration: Calibration) -> dict[str, object]:
 def read_camera(path: str | Path) -> Camera:
     """The pinhole of the frames. Raises InputError if the file is missing or holds none."""
     try:
-        k = json.loads(Path(path).read_text(encoding="utf-8"))
-        fx, fy, cx, cy = (float(k[name]) for name in ("fx", "fy", "cx", "cy"))
-        return Camera(fx, fy, cx, cy, int(k["width"]), int(k["height"]))
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{path} holds no camera ({error}); was it changed?") from None
+        return camera_of(read_json(path))
+    except UNUSABLE:
+        raise InputError(f"{path} holds no camera; was it changed?") from None
+
+
+def camera_of(entry: Any) -> Camera:
+    """The pinhole that an entry of a document describes, by the names of its fields.
+
+    Raises:
+        ValueError, TypeError, LookupError, ArithmeticError: there is none.
+    """
+    fx, fy, cx, cy = (float(entry[name]) for name in ("fx", "fy", "cx", "cy"))
+    width, height = whole_number(entry["width"]), whole_number(entry["height"])
+    if not (all(map(math.isfinite, (fx, fy, cx, cy))) and min(fx, fy) > 0):
+        raise ValueError("no camera has such numbers")
+    if not (min(width, height) >= 1 and width * height <= _MOST_PIXELS):
+        raise ValueError("no image has such a size")
+    return Camera(fx, fy, cx, cy, width, height)

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Bool, UInt8
 
 from geogs.errors import InputError
+from geogs.io.pictures import decoded
 from geogs.io.writers.atomic import atomic_file
 
 JPEG_QUALITY = 95
@@ -50,8 +51,7 @@ def _write(path: Path, picture: np.ndarray, options: list[int]) -> None:
 
 
 def _read(path: Path, flags: int) -> np.ndarray:
-    data = np.fromfile(path, np.uint8) if path.is_file() else np.zeros(0, np.uint8)
-    picture = cv2.imdecode(data, flags) if len(data) else None
+    picture = decoded(path, flags).picture
     if picture is None:
         raise InputError(f"{path} is missing or damaged; the result needs it.")
     return picture

@@ -10,8 +10,10 @@ import torch
 from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
+from geogs.documents import UNUSABLE
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
+from geogs.io.writers.intrinsics import camera_of
 from geogs.io.writers.native import MapFile, load_map_file, save_map
 from geogs.types import MapSnapshot
 
@@ -89,8 +91,8 @@ def load_map_views(
         )
     try:
         return file.disks, _views(file)
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{path} does not say how the map was seen ({error}).") from error
+    except UNUSABLE as error:
+        raise InputError(f"{path} does not say how the map was seen; was it changed?") from error
 
 
 def _views(file: MapFile) -> MapViews:
@@ -104,8 +106,8 @@ def _views(file: MapFile) -> MapViews:
     if not times.shape == masked.shape == ids.shape or T_cw.shape != (*ids.shape, 4, 4):
         raise ValueError("its keyframes differ in number")
     return MapViews(
-        camera=Camera(**said["camera"]),
-        render_camera=Camera(**said["render_camera"]),
+        camera=camera_of(said["camera"]),
+        render_camera=camera_of(said["render_camera"]),
         min_alpha=float(said["min_alpha"]),
         max_spread=float(said["max_spread"]),
         origin=np.array(said["origin"], np.float64).reshape(3),

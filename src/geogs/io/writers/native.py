@@ -73,7 +73,7 @@ def load_map_file(path: str | Path, device: torch.device | str = "cpu") -> MapFi
     """
     with _open(path) as file:
         tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-        metadata = json.loads((file.metadata() or {}).get("metadata", "{}"))
+        metadata = _metadata(path, (file.metadata() or {}).get("metadata", "{}"))
     count = len(tensors["position"]) if "position" in tensors else 0
     for name, shape in _SHAPES.items():
         if name not in tensors or tensors[name].shape != (count, *shape):
@@ -84,16 +84,29 @@ def load_map_file(path: str | Path, device: torch.device | str = "cpu") -> MapFi
     return MapFile(disks, tensors, metadata)
 
 
+def _metadata(path: str | Path, text: str) -> dict[str, Any]:
+    try:
+        said = json.loads(text)
+    except (ValueError, RecursionError):
+        said = None
+    if not isinstance(said, dict):
+        raise InputError(f"{path} is damaged: what it says of itself cannot be understood.")
+    return said
+
+
 def _open(path: str | Path) -> "safe_open":
     if not Path(path).is_file():
         raise InputError(f"The map {path} does not exist.")
     try:
         file = safe_open(str(path), framework="pt")
     except (SafetensorError, OSError) as error:
-        raise InputError(f"{path} is no map of geogs, or is damaged ({error}).") from error
+        raise InputError(f"{path} is no map of geogs, or is damaged.") from error
     header = file.metadata() or {}
     if header.get("format") != "geogs-map":
         raise InputError(f"{path} is no map of geogs.")
-    if int(header["version"]) > FORMAT_VERSION:
+    version = header.get("version", "")
+    if not (version.isascii() and version.isdigit() and len(version) < 9):
+        raise InputError(f"{path} is damaged: it does not say of which version it is.")
+    if int(version) > FORMAT_VERSION:
         raise InputError(f"{path} was written by a newer geogs; update this one to read it.")
     return file

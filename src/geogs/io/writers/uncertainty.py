@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float
 
+from geogs.documents import read_text
 from geogs.io.writers.atomic import write_text
 from geogs.types import Trajectory, Uncertainty
 
@@ -33,6 +34,6 @@ def read_tracked(path: Path, timestamps: Float[np.ndarray, "n"]) -> Bool[np.ndar
     """Which frames were tracked, by the table of a run; all of them where there is no table."""
     if not path.is_file():
         return np.ones(len(timestamps), dtype=bool)
-    cells = [line.split(",")[:2] for line in path.read_text(encoding="utf-8").splitlines()[1:]]
+    cells = [line.split(",")[:2] for line in read_text(path).splitlines()[1:]]
     states = {row[0]: row[1] for row in cells if len(row) == 2}
     return np.array([states.get(repr(float(t))) != "lost" for t in timestamps], dtype=bool)

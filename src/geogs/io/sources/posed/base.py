@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float64, UInt8
 from geogs.config import InputConfig
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
-from geogs.io.sources.base import read_ahead
+from geogs.io.sources.base import check_large_enough, fingerprint_of, read_ahead
 from geogs.io.sources.posed.files import PosedSet, SparsePoints, Sphere, without_invalid_poses
 from geogs.io.sources.posed.one_camera import OneCamera
 from geogs.io.sources.posed.pictures import read_mask, read_picture, stored_size
@@ -68,6 +68,7 @@ class PosedSource:
         )
         """Seconds."""
         self._one_camera = OneCamera(posed.files, config)
+        check_large_enough(self._one_camera.camera, posed.name)
 
     @property
     def camera(self) -> Camera:
@@ -86,6 +87,10 @@ class PosedSource:
 
     def __len__(self) -> int:
         return self.length
+
+    def fingerprint(self) -> str:
+        """Sixteen digits that change with the names and sizes of the images."""
+        return fingerprint_of([file.path for file in self._files])
 
     def label(self, index: int) -> str:
         """What to call image ``index`` in a message."""

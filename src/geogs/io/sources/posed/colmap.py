@@ -105,6 +105,8 @@ def _or_without_folder(path: Path, root: Path, name: str) -> Path:
 
 def _mask(root: Path, name: str) -> Path | None:
     """COLMAP's own masks are called like the image with .png behind it."""
+    if not Path(name).name:
+        return None
     for folder in ("masks", "mask", "rgb_masks"):
         for file in (f"{name}.png", str(Path(name).with_suffix(".png"))):
             if (root.parent / folder / file).is_file():

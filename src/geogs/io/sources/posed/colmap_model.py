@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64, Int64
 
+from geogs.documents import read_bytes, read_text
 from geogs.errors import InputError
 
 _MODELS = (
@@ -22,6 +23,8 @@ _MODELS = (
 """Name and number of parameters by the number of the model in binary files."""
 
 _TABLES = ("cameras", "images")
+LARGEST_TABLE = 1 << 34
+"""Bytes of a binary file."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,12 +91,12 @@ def read_model(folder: Path) -> Model:
         points = None
         if path.is_file():
             points = _collected(_binary_points(path) if binary else _text_points(path))
-    except (struct.error, ValueError, IndexError, UnicodeDecodeError) as error:
+    except (struct.error, ValueError, IndexError, ArithmeticError) as error:
+        said = str(error)  # by a parser of numbers: it would repeat what the file holds
+        why = f" ({said})" if isinstance(error, _Wrong) else ""
         raise InputError(
-            f"{path} is cut off or no file of a COLMAP model ({error}); copy it again."
-        ) from error
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror}.") from error
+            f"{path} is cut off or no file of a COLMAP model{why}; copy it again."
+        ) from None
     return Model(cameras, images, points)
 
 
@@ -112,10 +115,9 @@ def _collected(points: Iterator[tuple[list[float], list[int]]]) -> ModelPoints:
 
 def _rows(path: Path) -> Iterator[list[str]]:
     """The words of each line without comments; empty lines included, since they mean no points."""
-    with path.open(encoding="utf-8-sig") as stream:
-        for line in stream:
-            if not line.startswith("#"):
-                yield line.split()
+    for line in read_text(path).splitlines():
+        if not line.startswith("#"):
+            yield line.split()
 
 
 def _text_cameras(path: Path) -> Iterator[tuple[int, ModelCamera]]:
@@ -124,19 +126,18 @@ def _text_cameras(path: Path) -> Iterator[tuple[int, ModelCamera]]:
             number, model, width, height, *parameters = words
             values = tuple(float(word) for word in parameters)
             if len(values) != dict(_MODELS).get(model, len(values)):
-                raise ValueError(f"{len(values)} parameters of a {model} camera")
+                raise _Wrong(f"{len(values)} parameters of a {model} camera")
             yield int(number), ModelCamera(model, int(width), int(height), values)
 
 
 def _text_images(path: Path) -> Iterator[tuple[int, ModelImage]]:
-    with path.open(encoding="utf-8-sig") as stream:
-        lines = iter([line.rstrip("\r\n") for line in stream if not line.startswith("#")])
+    lines = iter([line for line in read_text(path).splitlines() if not line.startswith("#")])
     for line in lines:
         words = line.split(maxsplit=9)
         if not words:
             continue
         if len(words) != 10:
-            raise ValueError(f"{len(words)} columns in the row of an image, not 10")
+            raise _Wrong(f"{len(words)} columns in the row of an image, not 10")
         w, x, y, z, *t = (float(word) for word in words[1:8])
         tx, ty, tz = t
         yield int(words[0]), ModelImage(words[9], int(words[8]), (w, x, y, z), (tx, ty, tz))
@@ -149,11 +150,15 @@ def _text_points(path: Path) -> Iterator[tuple[list[float], list[int]]]:
             yield [float(word) for word in words[1:4]], [int(word) for word in words[8::2]]
 
 
+class _Wrong(ValueError):
+    """What is wrong, in words of ours."""
+
+
 class _Bytes:
     """Little-endian values one after the other."""
 
     def __init__(self, path: Path) -> None:
-        self._data = path.read_bytes()
+        self._data = read_bytes(path, LARGEST_TABLE)
         self._at = 0
 
     def take(self, layout: str) -> tuple:
@@ -165,7 +170,7 @@ class _Bytes:
         """A number of records; refuses one that cannot be, before memory is asked for it."""
         (count,) = self.take("Q")
         if count > len(self._data):
-            raise ValueError(f"{count} records")
+            raise _Wrong(f"{count} records")
         return count
 
     def text(self) -> str:
@@ -177,7 +182,7 @@ class _Bytes:
     def skip(self, size: int) -> None:
         self._at += size
         if self._at > len(self._data):
-            raise ValueError("end of file")
+            raise _Wrong("end of file")
 
     def array(self, count: int, columns: int) -> Int64[np.ndarray, "n k"]:
         """``count`` rows of 32-bit numbers."""
@@ -192,7 +197,7 @@ def _binary_cameras(path: Path) -> Iterator[tuple[int, ModelCamera]]:
     for _ in range(data.count()):
         number, model, width, height = data.take("IiQQ")
         if not 0 <= model < len(_MODELS):
-            raise ValueError(f"camera model number {model} is unknown here")
+            raise _Wrong(f"camera model number {model} is unknown here")
         name, parameters = _MODELS[model]
         yield number, ModelCamera(name, width, height, data.take(f"{parameters}d"))
 

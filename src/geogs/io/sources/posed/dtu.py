@@ -90,9 +90,12 @@ def _read_matrices(
         raise InputError(f"{path} is damaged or no NumPy archive; copy it again.") from error
     found = (re.fullmatch(r"world_mat_(\d+)", name) for name in matrices)
     numbers = sorted(int(match[1]) for match in found if match)
-    if not numbers or any(matrices[f"world_mat_{i}"].shape[1:] != (4,) for i in numbers):
+    shapes = {matrices[f"world_mat_{i}"].shape for i in numbers}
+    scale = matrices.get(f"scale_mat_{numbers[0]}") if numbers else None
+    if not numbers or not shapes <= {(3, 4), (4, 4)}:
         raise InputError(f"{path} holds no world_mat_0, world_mat_1, ... of 4x4 numbers.")
-    scale = matrices.get(f"scale_mat_{numbers[0]}")
+    if scale is not None and not (scale.shape == (4, 4) and np.isfinite(scale).all()):
+        raise InputError(f"{path} holds a scale_mat_{numbers[0]} that is not of 4x4 numbers.")
     return {i: matrices[f"world_mat_{i}"] for i in numbers}, scale
 
 

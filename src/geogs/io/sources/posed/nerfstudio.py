@@ -5,7 +5,6 @@ the original world was changed; they are undone, so that results fit what the da
 https://docs.nerf.studio/quickstart/data_conventions.html
 """
 
-import json
 import math
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
+from geogs.documents import UNUSABLE, read_json
 from geogs.errors import InputError
 from geogs.io.poses import FRAMES_PER_SECOND
 from geogs.io.sources.calibration import Calibration
@@ -47,17 +47,14 @@ def open_nerfstudio(path: Path) -> PosedSet:
         frames = sorted(document["frames"], key=lambda frame: natural_key(frame["file_path"]))
         to_world = _undo_applied(document)
         files = tuple(_file(file, document, frame, to_world, k) for k, frame in enumerate(frames))
-    except (KeyError, TypeError, ValueError, AttributeError, np.linalg.LinAlgError) as error:
-        what = f"no entry {error}" if isinstance(error, KeyError) else str(error)
-        raise InputError(f"{file} cannot be understood ({what}); is it complete?") from error
+    except (np.linalg.LinAlgError, *UNUSABLE) as error:
+        what = f" (no entry {error})" if isinstance(error, KeyError) else ""
+        raise InputError(f"{file} cannot be understood{what}; is it complete?") from None
     return PosedSet("nerfstudio", _name(file), files)
 
 
 def _read(file: Path) -> dict[str, Any]:
-    try:
-        document = json.loads(file.read_text(encoding="utf-8-sig"))
-    except (OSError, ValueError) as error:
-        raise InputError(f"{file} is damaged or no JSON ({error}); copy it again.") from error
+    document = read_json(file)
     if not isinstance(document, dict) or "frames" not in document:
         raise InputError(f"{file} has no list of frames, so it is no file of nerfstudio.")
     return document

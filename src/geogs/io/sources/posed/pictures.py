@@ -7,17 +7,13 @@ import numpy as np
 from jaxtyping import Bool, UInt8
 
 from geogs.errors import InputError
+from geogs.io.pictures import decoded, header_of
 
 
 def stored_size(path: Path) -> tuple[int, int] | None:
     """Width and height as stored, from the header alone; none where there is no picture."""
-    from PIL import Image, UnidentifiedImageError
-
-    try:
-        with Image.open(path) as picture:
-            return picture.size
-    except (OSError, UnidentifiedImageError, SyntaxError, ValueError):
-        return None
+    header = header_of(path)
+    return None if header is None else header[0]
 
 
 def read_picture(path: Path, size: tuple[int, int] | None = None) -> UInt8[np.ndarray, "h w 3"]:
@@ -30,7 +26,7 @@ def read_picture(path: Path, size: tuple[int, int] | None = None) -> UInt8[np.nd
     Raises:
         InputError: it is missing or damaged, or of another size.
     """
-    picture = _decode(path, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    picture = decoded(path, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION).picture
     if picture is None or (size is not None and picture.shape[1::-1] != size):
         raise InputError(f"{path} is damaged; copy it again, or leave it out.")
     return cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
@@ -46,10 +42,10 @@ def read_mask(
         shape: height and width of the picture; a mask of another size is scaled to it.
         of_alpha: whether the alpha channel counts; without one all pixels are used.
     """
-    mask = _decode(path, cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
+    mask = decoded(path, cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION).picture
     if mask is None:
         raise InputError(f"The mask {path} is missing or damaged; copy it again.")
-    half = np.iinfo(mask.dtype).max // 2 if mask.dtype != bool else 0
+    half = np.iinfo(mask.dtype).max // 2 if mask.dtype.kind in "iu" else 0
     if of_alpha and (mask.ndim == 2 or mask.shape[2] != 4):
         return np.ones(shape, dtype=bool)
     if mask.ndim == 3:
@@ -63,18 +59,5 @@ def read_mask(
 
 def has_alpha(path: Path) -> bool:
     """Whether a picture has an alpha channel, from the header alone."""
-    from PIL import Image, UnidentifiedImageError
-
-    try:
-        with Image.open(path) as picture:
-            return picture.mode in ("RGBA", "LA", "PA")
-    except (OSError, UnidentifiedImageError, SyntaxError, ValueError):
-        return False
-
-
-def _decode(path: Path, flags: int) -> np.ndarray | None:
-    try:
-        data = np.fromfile(path, dtype=np.uint8)
-        return cv2.imdecode(data, flags) if len(data) else None
-    except (OSError, cv2.error):
-        return None
+    header = header_of(path)
+    return header is not None and header[1] in ("RGBA", "LA", "PA")

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
+from geogs.documents import read_text
 from geogs.errors import InputError
 from geogs.io.poses import FRAMES_PER_SECOND
 from geogs.io.sources.calibration_files import read_calibration
@@ -40,9 +41,9 @@ def open_scannet(folder: Path) -> PosedSet:
 def _read_pose(path: Path) -> Float64[np.ndarray, "4 4"]:
     """World to camera; NaN where tracking was lost (the file then holds -inf)."""
     try:
-        T_wc = np.array(path.read_text().split(), dtype=np.float64).reshape(4, 4)
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path} should hold a 4x4 matrix ({error}); copy it again.") from error
+        T_wc = np.array(read_text(path).split(), dtype=np.float64).reshape(4, 4)
+    except ValueError:
+        raise InputError(f"{path} should hold a 4x4 matrix; copy it again.") from None
     if not np.isfinite(T_wc).all() or abs(np.linalg.det(T_wc)) < 1e-9:
         return np.full((4, 4), np.nan)
     return np.linalg.inv(T_wc)

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from geogs.config import InputConfig
+from geogs.documents import expanded
 from geogs.errors import InputError
 from geogs.io.sources.posed.base import PosedSource
 from geogs.io.sources.posed.colmap import find_model, open_colmap
@@ -43,7 +44,7 @@ def open_posed_source(
     Raises:
         InputError: no images with poses are there, or they cannot be used.
     """
-    path = Path(path).expanduser()
+    path = expanded(path)
     try:
         return PosedSource(_posed_set(path), config or InputConfig(), hold_out)
     except OSError as error:

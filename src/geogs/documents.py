@@ -1,0 +1,137 @@
+"""Text, JSON and YAML files from strangers: plain files of bounded size; nothing expands or runs.
+
+No sentence about such a file repeats what is in it, so that none that was named by mistake or by
+somebody else's list is shown to anybody.
+"""
+
+import json
+import os
+import stat
+from pathlib import Path
+from typing import Any
+
+from geogs.errors import InputError
+
+LARGEST_TEXT = 1 << 30
+"""Bytes of a table, such as the poses of a long sequence or the points of a COLMAP model."""
+LARGEST_DOCUMENT = 1 << 26
+"""Bytes of a JSON document, such as the poses of all images of a scene."""
+LARGEST_SETTINGS = 1 << 17
+"""Bytes of a YAML document, whose reader is slow: a calibration, settings, a card."""
+
+_DEEPEST = 50
+"""Groups within groups."""
+
+UNUSABLE = (
+    ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RecursionError,
+)  # fmt: skip
+"""What using the values of a document may end with that somebody made up."""
+
+
+def expanded(path: str | Path) -> Path:
+    """The path with ~ as the folder of the user; as it is where there is no such."""
+    return Path(os.path.expanduser(path))
+
+
+def read_bytes(path: str | Path, largest: int = LARGEST_TEXT) -> bytes:
+    """What a plain file holds; a pipe or a device is not waited for.
+
+    Raises:
+        InputError: it is missing, no plain file, too large, or cannot be read.
+    """
+    name = str(path)
+    if "\0" in name:
+        raise InputError("A file name with a zero byte in it cannot be that of a file.")
+    try:
+        with open(path, "rb", opener=_without_waiting) as stream:
+            status = os.fstat(stream.fileno())
+            if not stat.S_ISREG(status.st_mode):
+                raise InputError(f"{name} is no plain file; give one.")
+            if status.st_size > largest:
+                raise InputError(
+                    f"{name} has {status.st_size / 2**20:.0f} MiB, more than any such file; is it "
+                    "another one?"
+                )
+            return stream.read(status.st_size)
+    except FileNotFoundError:
+        raise InputError(f"{name} does not exist; give a file that does.") from None
+    except IsADirectoryError:
+        raise InputError(f"{name} is a folder; give a file.") from None
+    except OSError as error:
+        raise InputError(f"{name} cannot be read ({error.strerror or error}).") from error
+
+
+def read_text(path: str | Path, largest: int = LARGEST_TEXT) -> str:
+    """The text of a plain file in UTF-8, with or without a mark at its beginning.
+
+    Raises:
+        InputError: as of ``read_bytes``, or it is no text.
+    """
+    try:
+        return read_bytes(path, largest).decode("utf-8-sig")
+    except UnicodeDecodeError:
+        raise InputError(f"{path} is not a text file in UTF-8; is it another one?") from None
+
+
+def read_json(path: str | Path) -> Any:
+    """The value of a JSON file.
+
+    Raises:
+        InputError: as of ``read_text``, or it is damaged.
+    """
+    text = read_text(path, LARGEST_DOCUMENT)
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:
+        at = f" after line {error.lineno}" if isinstance(error, json.JSONDecodeError) else ""
+        raise InputError(f"{path} is damaged or no JSON{at}; copy it again.") from None
+
+
+def read_yaml(path: str | Path) -> Any:
+    """The value of a YAML file of plain values, without tags of programs and without aliases.
+
+    Raises:
+        InputError: as of ``read_text``, or it is damaged.
+    """
+    return yaml_value(read_text(path, LARGEST_SETTINGS), str(path))
+
+
+def yaml_value(text: str, name: str) -> Any:
+    """The value of a YAML text, as of ``read_yaml``; ``name`` is what to call it in a sentence."""
+    import yaml
+
+    class Reader(yaml.SafeLoader):
+        """Refuses aliases, by which a few lines can mean billions of values, and deep nesting.
+
+        Time would go with the square of the depth.
+        """
+
+        def fetch_more_tokens(self) -> Any:
+            if self.flow_level + len(self.indents) > _DEEPEST:
+                raise yaml.YAMLError
+            return super().fetch_more_tokens()
+
+        def compose_node(self, parent: Any, index: Any) -> Any:
+            if self.check_event(yaml.AliasEvent):
+                raise yaml.YAMLError
+            return super().compose_node(parent, index)
+
+    try:
+        return yaml.load(text, Reader)  # a safe loader
+    except (yaml.YAMLError, *UNUSABLE) as error:
+        mark = getattr(error, "problem_mark", None)
+        at = f" at line {mark.line + 1}" if mark is not None else ""
+        said = f"{name} is damaged or not YAML of plain values{at}; correct it."
+        raise InputError(said) from None
+
+
+def whole_number(value: Any) -> int:
+    """The value of a document as a whole number. Raises ValueError if it is none."""
+    number = float(value)
+    if not (abs(number) < 2**53 and number == int(number)):
+        raise ValueError("no whole number")
+    return int(number)
+
+
+def _without_waiting(path: str, flags: int) -> int:
+    return os.open(path, flags | os.O_NONBLOCK | os.O_CLOEXEC)

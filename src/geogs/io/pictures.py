@@ -1,0 +1,161 @@
+"""Pictures from files: decoded without noise on the standard error, and without waiting for pipes.
+
+The decoders are C libraries, which print what they find wrong. A JPEG that is damaged in its middle
+gives half a picture and such a line, and no error.
+"""
+
+import io
+import os
+import threading
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from geogs.documents import read_bytes
+from geogs.errors import InputError
+
+LARGEST_PICTURE = 1 << 31
+"""Bytes of a file."""
+_NOISE = (
+    "jpeg",
+    "png",
+    "tiff",
+    "webp",
+    "opencv",
+    " warn:",
+    " error:",
+    "bmp",
+    "exif",
+    "iccp",
+    "cv::",
+)
+"""What lines of the decoders hold, in small letters."""
+_PIXELS_A_BYTE = 10_000
+"""Of a picture of nothing but black, compressed as well as any format can."""
+_HARMLESS = 1 << 24
+"""Pixels that are decoded in no time, whatever the file holds."""
+_PIPE_SIZE = 1 << 20
+_ONE_AT_A_TIME = threading.Lock()
+
+
+@dataclass(frozen=True)
+class Decoded:
+    """What came of a file."""
+
+    picture: np.ndarray | None
+    """As OpenCV gives it; none where there is no picture in the file."""
+    is_damaged: bool = False
+    """Whether the decoder complained, or the file is cut off, although there is a picture."""
+
+
+def decoded(path: Path, flags: int) -> Decoded:
+    """Decode a picture with the flags of ``cv2.imdecode``; nothing is raised for a bad file."""
+    try:
+        data = np.frombuffer(read_bytes(path, LARGEST_PICTURE), np.uint8)
+    except InputError:
+        return Decoded(None)
+    if not len(data):
+        return Decoded(None)
+    if _promises_too_much(data):
+        return Decoded(None)
+    with decoder_noise() as noise:
+        try:
+            picture = cv2.imdecode(data, flags)
+        except (cv2.error, MemoryError):
+            picture = None
+    is_damaged = any("corrupt" in line.lower() for line in noise) or _is_cut_off(data)
+    return Decoded(picture, picture is not None and is_damaged)
+
+
+def header_of(path: Path) -> tuple[tuple[int, int], str] | None:
+    """Width and height as stored, and Pillow's mode; none where there is no picture.
+
+    Raises:
+        InputError: it has too many pixels.
+    """
+    from PIL import Image
+
+    if not path.is_file():
+        return None
+    try:
+        with decoder_noise(), Image.open(path) as picture:
+            return picture.size, picture.mode
+    except Image.DecompressionBombError:
+        raise InputError(f"{path} has more than 178 megapixels; make it smaller.") from None
+    except Exception:  # whatever a damaged file makes one of its many readers stumble over
+        return None
+
+
+@contextmanager
+def decoder_noise() -> Iterator[list[str]]:
+    """Inside, lines of decoders on the standard error are caught; afterwards the list has them.
+
+    Lines of others come to the standard error at the end of the block.
+    """
+    lines: list[str] = []
+    with _ONE_AT_A_TIME:
+        try:
+            there, here = os.pipe()
+        except OSError:  # too many files are open
+            yield lines
+            return
+        try:
+            kept = os.dup(2)
+        except OSError:  # there is no standard error
+            os.close(there)
+            os.close(here)
+            yield lines
+            return
+        os.set_blocking(there, False)
+        os.set_blocking(here, False)  # what no longer fits is dropped rather than waited for
+        os.dup2(here, 2)
+        os.close(here)
+        try:
+            yield lines
+        finally:
+            os.dup2(kept, 2)
+            os.close(kept)
+            _sort(there, lines)
+            os.close(there)
+
+
+def _sort(pipe: int, noise: list[str]) -> None:
+    """Lines of decoders in a pipe go to a list, those of others to the standard error."""
+    try:
+        caught = os.read(pipe, _PIPE_SIZE)
+    except BlockingIOError:
+        return
+    for line in caught.splitlines(keepends=True):
+        text = line.decode("utf-8", "replace").strip()
+        if any(word in text.lower() for word in _NOISE):
+            noise.append(text)
+        elif text:
+            with suppress(OSError):
+                os.write(2, line)
+
+
+def _promises_too_much(data: np.ndarray) -> bool:
+    """Whether a header tells of more pixels than so few bytes can hold, which would be made up."""
+    from PIL import Image
+
+    try:
+        with (
+            warnings.catch_warnings(action="ignore"),
+            Image.open(io.BytesIO(data.tobytes())) as picture,
+        ):
+            pixels = picture.width * picture.height
+    except Image.DecompressionBombError:
+        pixels = 2 * (Image.MAX_IMAGE_PIXELS or 0)
+    except Exception:  # for the decoder to say
+        return False
+    return pixels > max(_HARMLESS, _PIXELS_A_BYTE * len(data))
+
+
+def _is_cut_off(data: np.ndarray) -> bool:
+    """Whether a JPEG has no end, as some decoders forgive."""
+    return data[:2].tobytes() == b"\xff\xd8" and b"\xff\xd9" not in data[2:].tobytes()

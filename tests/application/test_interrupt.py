@@ -1,0 +1,67 @@
+"""Ctrl-C and SIGTERM ask to stop once and quit the second time; what fails says how to go on."""
+
+import os
+import signal
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from geogs.application.interrupt import Interruption
+from geogs.application.machine import full_memory_in_a_sentence
+from geogs.application.run import continued
+from geogs.application.run_checkpoint import RunFacts
+from geogs.application.settings import RunSettings
+from geogs.errors import DeviceError, InputError
+
+WAY = " geogs run --resume out goes on."
+
+
+@pytest.mark.parametrize("first", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("second", [signal.SIGINT, signal.SIGTERM])
+def test_the_first_signal_asks_and_the_second_quits(first, second):
+    before = [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)]
+    with Interruption() as stop:
+        os.kill(os.getpid(), first)
+        assert stop.requested
+        with pytest.raises(KeyboardInterrupt):
+            os.kill(os.getpid(), second)
+    assert [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)] == before
+
+
+def test_the_second_signal_names_the_way_on():
+    with pytest.raises(KeyboardInterrupt) as quits, full_memory_in_a_sentence(lambda: WAY):
+        raise KeyboardInterrupt
+    assert str(quits.value) == WAY.strip()
+
+
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (torch.cuda.OutOfMemoryError("tried to allocate"), "The memory of the GPU is full"),
+        (RuntimeError("CUDA error: unspecified launch failure\nmore"), "The GPU failed"),
+        (RuntimeError("CUDA error: device not ready"), "The GPU failed"),
+    ],
+)
+def test_a_gpu_that_fails_is_told_with_the_way_on(error, said):
+    with pytest.raises(DeviceError) as failed, full_memory_in_a_sentence(lambda: WAY):
+        raise error
+    assert str(failed.value).startswith(said)
+    assert str(failed.value).endswith(WAY)
+    assert "\n" not in str(failed.value)
+
+
+def test_errors_of_ours_stay_what_they_are():
+    with pytest.raises(RuntimeError, match="shapes"), full_memory_in_a_sentence(lambda: WAY):
+        raise RuntimeError("shapes do not fit")
+
+
+def test_a_run_that_lost_its_gpu_goes_on_on_the_cpu_where_that_is_asked_for():
+    settings = RunSettings((Path("/videos/v.mp4"),))
+    facts = RunFacts(settings, "cuda", "0", None)
+    on_cpu = replace(settings, device="cpu")
+    assert continued(facts, on_cpu, Path("out")).device == "cpu"
+    assert continued(facts, settings, Path("out")).device == "cuda"
+    with pytest.raises(InputError, match="only go on there"):
+        continued(replace(facts, device="cpu"), replace(settings, device="cuda"), Path("out"))

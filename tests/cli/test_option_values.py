@@ -1,0 +1,103 @@
+"""Every option of every command with values below, at and above its range, and with none at all."""
+
+import math
+import os
+from collections.abc import Callable, Sequence
+
+import pytest
+
+from geogs.cli import demo, doctor, eval, export, mesh, reconstruct, run, synth
+from geogs.cli.options import parse_options
+from geogs.config.leaves import Leaf, leaves
+from geogs.config.setting import Positional, Range
+from geogs.errors import GeogsError, InputError
+
+Parse = Callable[[Sequence[str]], object]
+
+
+def plain(options: type, command: str) -> Parse:
+    return lambda argv: parse_options(options, argv, command)
+
+
+COMMANDS: dict[str, tuple[type, Parse, list[str]]] = {
+    "run": (run.RunOptions, run.parse, ["v.mp4"]),
+    "reconstruct": (
+        reconstruct.ReconstructOptions, reconstruct.parse, ["scene", "--device", "cpu"]
+    ),
+    "eval": (eval.EvalOptions, plain(eval.EvalOptions, "eval"), ["out", "--gt", "truth"]),
+    "export": (export.ExportOptions, plain(export.ExportOptions, "export"),
+               ["out", "--to", "tum"]),
+    "mesh": (mesh.MeshOptions, plain(mesh.MeshOptions, "mesh"), ["out"]),
+    "synth": (synth.SynthOptions, lambda argv: parse_options(
+        synth.SynthOptions, argv, "synth", synth._defaults), ["out"]),
+    "demo": (demo.DemoOptions, plain(demo.DemoOptions, "demo"), []),
+    "doctor": (doctor.DoctorOptions, plain(doctor.DoctorOptions, "doctor"), []),
+}  # fmt: skip
+"""Options, what reads them, and what is needed beside the one that is looked at."""
+
+EVERY = 1 if os.environ.get("GEOGS_FUZZ") else 10
+"""Only every so many-th value of an option is tried, others of the next one; by `make fuzz` all."""
+
+TEXTS = ("nan", "inf", "-1e400", "x", "", "9" * 5000, "0x10", "none")
+
+
+def values(leaf: Leaf) -> set[str]:
+    """Below, at and above the bounds, and what is no number at all."""
+    found = set(TEXTS)
+    for bounds in leaf.kind.ranges:
+        for bound in (bounds.least, bounds.most, bounds.above, bounds.below):
+            if isinstance(bound, int | float):
+                step = 1 if leaf.kind.base is int else max(abs(bound), 1) * 1e-6
+                found |= {f"{bound + k * step:.15g}" for k in (-1, 0, 1)}
+    return found
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_option_takes_what_its_type_says_and_refuses_the_rest_in_a_sentence(command):
+    options, parse, needed = COMMANDS[command]
+    tried = 0
+    for place, leaf in enumerate(leaves(options, command)):
+        if leaf.kind.base is bool or leaf.mark(Positional) is not None or leaf.name == "resume":
+            continue
+        for text in sorted(values(leaf))[place % EVERY :: EVERY]:
+            tried += 1
+            try:
+                parse([*needed, f"{leaf.options[0]}={text}"])
+            except InputError as error:
+                said = str(error)
+                assert said.endswith("."), said
+                assert len(said) < 700, said
+                assert "\n" not in said
+            else:
+                assert leaf.kind.base not in (int, float) or is_meant(leaf, text), (leaf, text)
+    assert tried >= 1
+
+
+def is_meant(leaf: Leaf, text: str) -> bool:
+    """Whether an option of numbers may have been given as this text."""
+    kind = leaf.kind
+    if text == "none":
+        return kind.is_optional
+    if kind.is_tuple:
+        return all(is_meant_number(leaf, part) for part in text.split(",") if part)
+    return text == kind.word or is_meant_number(leaf, text)
+
+
+def is_meant_number(leaf: Leaf, text: str) -> bool:
+    number = float(text)
+    plain = [Range(*(None if isinstance(b, str) else b
+                     for b in (r.least, r.most, r.above, r.below)), r.odd, r.or_zero)
+             for r in leaf.kind.ranges]  # fmt: skip
+    return math.isfinite(number) and all(r.holds(number, None) for r in plain)
+
+
+def test_the_settings_of_the_whole_are_all_looked_at():
+    names = {leaf.name for leaf in leaves(run.RunOptions, "run")}
+    assert len(names) > 150
+    assert {"input.stride", "mapping.window", "tracking.weights", "checkpoint-every"} <= names
+
+
+def test_a_value_that_is_refused_is_shown_in_short():
+    with pytest.raises(GeogsError) as error:
+        run.parse(["v.mp4", "--input.stride=" + "9" * 5000])
+    assert len(str(error.value)) < 300

@@ -1,0 +1,101 @@
+"""Whatever is in a file, its parser gives values or a sentence, and never hangs.
+
+``make fuzz`` tries many more than the few of a normal run.
+"""
+
+import os
+import signal
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import strategies as st
+
+from geogs.errors import GeogsError
+from parsers import Parser, parsers
+
+EXAMPLES = int(os.environ.get("GEOGS_FUZZ", 0)) or 4
+SECONDS = 20
+CORPUS = Path(__file__).parents[1] / "corpus"
+PARSERS = parsers()
+
+
+class Hangs(BaseException):
+    """A parser took too long; no ``except Exception`` takes it for something else."""
+
+
+@contextmanager
+def in_time() -> Iterator[None]:
+    def ring(*_: object) -> None:
+        raise Hangs
+
+    before = signal.signal(signal.SIGALRM, ring)
+    signal.alarm(SECONDS)
+    try:
+        yield
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, before)
+
+
+def read(parser: Parser, folder: Path) -> None:
+    """Read a damaged example; what leaves the parser is a sentence, or nothing does."""
+    with in_time(), warnings.catch_warnings(action="ignore"):
+        try:
+            parser.read(folder)
+        except GeogsError as error:
+            text = str(error)
+            assert text.endswith((".", "?")), text
+            assert text.isprintable(), text
+            assert len(text) < 800, text
+
+
+@pytest.fixture(scope="module")
+def examples(tmp_path_factory) -> dict[str, tuple[Path, dict[str, bytes]]]:
+    """The folder of the good example of each parser, and what its files hold."""
+    found = {}
+    for name, parser in PARSERS.items():
+        folder = tmp_path_factory.mktemp(name)
+        parser.write(folder)
+        found[name] = folder, {file: (folder / file).read_bytes() for file in parser.files}
+    return found
+
+
+@pytest.mark.parametrize("name", PARSERS)
+def test_the_good_example_is_read(name, examples):
+    PARSERS[name].read(examples[name][0])
+
+
+@pytest.mark.parametrize("name", PARSERS)
+def test_damaged_files_are_read_or_refused_in_a_sentence(name, examples):
+    parser, (folder, good) = PARSERS[name], examples[name]
+
+    @settings(
+        max_examples=EXAMPLES, deadline=None, database=None, derandomize=EXAMPLES < 100,
+        phases=[Phase.generate, Phase.shrink], suppress_health_check=list(HealthCheck),
+    )  # fmt: skip
+    @given(st.data())
+    def damage_and_read(data: st.DataObject) -> None:
+        file = data.draw(st.sampled_from(parser.files))
+        (folder / file).write_bytes(data.draw(parser.damage(good[file])))
+        try:
+            read(parser, folder)
+        finally:
+            (folder / file).write_bytes(good[file])
+
+    damage_and_read()
+
+
+@pytest.mark.parametrize("name", sorted(path.name for path in CORPUS.iterdir()))
+def test_files_that_once_led_to_something_else(name, examples):
+    parser, (folder, good) = PARSERS[name], examples[name]
+    for case in sorted((CORPUS / name).iterdir()):
+        file = next(file for file in good if Path(file).suffix == case.suffix)
+        (folder / file).write_bytes(case.read_bytes())
+        try:
+            read(parser, folder)
+        finally:
+            (folder / file).write_bytes(good[file])
