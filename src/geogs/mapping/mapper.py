@@ -308,9 +308,15 @@ class Mapper:
         return map_trainer(self.map, self.cameras, self.config, unit, self.keyframes.resident)
 
     def _estimate_ahead(self, keyframe_id: int) -> None:
-        """Depths of the keyframe and of its next ones, which then check each other."""
+        """Depths of the keyframe and of its next ones, which then check each other.
+
+        The tracker's own depths are taken as they are now, of the window around, too.
+        """
         later = [i for i in self.views if i >= keyframe_id][: 1 + self.config.lag // 2]
-        self._depths.estimate([self.views[i] for i in later if not self.views[i].has_depth])
+        wanted = [i for i in later if not self.views[i].has_depth]
+        if self.config.depth.engine == "tracker":
+            wanted = [*self.mapped[-self.config.window :], *later]
+        self._depths.estimate([self.views[i] for i in wanted])
 
     def _mapped_around(self, view: MapView, count: int) -> list[MapView]:
         return views_around(view, [self.views[i] for i in self.mapped], count)
@@ -337,7 +343,7 @@ class Mapper:
         return [(v, draw_partners(v, self.views, self.config, self._random)) for v in views]
 
     def _carve(self, views: list[MapView]) -> None:
-        if len(self.map):
+        if len(self.map) and self.config.disk.carve:
             self._training().optimizer.keep(self._vote(self.map.position.detach(), views))
 
     def _vote(self, points: Float[Tensor, "n 3"], views: list[MapView]) -> Bool[Tensor, "n"]:
@@ -360,9 +366,10 @@ class Mapper:
         T_wc = view.T_wc.float().to(depth.device)
         rays = camera.rays(device=depth.device)[v, u]
         points = (rays * z[:, None]) @ T_wc[:3, :3].T + T_wc[:3, 3]
-        others = [v for v in self._mapped_around(view, _VOTERS) if v.id != view.id]
-        kept = self._vote(points, others)
-        points, z = points[kept], z[kept]
+        if disk.carve:
+            others = [v for v in self._mapped_around(view, _VOTERS) if v.id != view.id]
+            kept = self._vote(points, others)
+            points, z = points[kept], z[kept]
         if len(points) + len(self.map) < disk.neighbours or len(points) == 0:
             return
         footprint = disk.stride * z / camera.fx

@@ -1,0 +1,62 @@
+"""The matches that close loops: whose they are, in which order, and whose depth they decide."""
+
+import torch
+
+from geogs.geometry.camera import Camera
+from geogs.loop.closing_matches import closing_matches, take_over_depths
+from geogs.loop.detect import Loop
+from geogs.tracking.flow.base import FlowMatch
+from geogs.tracking.graph import MeasuredEdge
+from keyframe_samples import Sample, segment_of
+
+CAMERA = Camera(60.0, 60.0, 31.5, 23.5, 64, 48)
+
+
+def segment():
+    samples = []
+    for n in range(5):
+        image = torch.full((48, 64, 3), 20 * n, dtype=torch.uint8).numpy()
+        d = torch.full((6, 8), 0.5 + 0.1 * n)
+        samples.append(Sample(n, image, torch.eye(4, dtype=torch.float64), d, torch.ones_like(d)))
+    return segment_of(samples, CAMERA)
+
+
+def flow(value: float, cells: int) -> FlowMatch:
+    return FlowMatch(torch.full((1, cells, 2), value), torch.full((1, cells, 2), value + 1))
+
+
+def edge(value: float, cells: int) -> MeasuredEdge:
+    one = flow(value, cells)
+    return MeasuredEdge(one.pixels[0], one.weight[0], one.pixels[0])
+
+
+def test_edges_and_loops_come_by_source_and_the_graph_wins():
+    keyframes = segment()
+    ids, cells = keyframes.ids, keyframes.grid.size
+    pose = torch.eye(4, dtype=torch.float64)
+    known = {"cause": "geometry", "T_ji": pose, "scale": 1.0, "inliers": 0, "matched": 1.0}
+    loops = [
+        Loop(ids[0], ids[4], there=flow(1.0, cells), back=flow(2.0, cells), **known),
+        Loop(ids[2], ids[3], there=flow(3.0, cells), back=flow(4.0, cells), **known),
+        Loop(ids[1], 99, there=flow(5.0, cells), back=flow(6.0, cells), **known),
+    ]
+    edges = {(ids[3], ids[2]): edge(7.0, cells), (ids[2], ids[3]): edge(8.0, cells)}
+    matches = closing_matches(keyframes, edges, loops)
+    assert matches is not None
+    pairs = list(zip(matches.source.tolist(), matches.target.tolist(), strict=True))
+    assert pairs == [(0, 4), (2, 3), (3, 2), (4, 0)]
+    assert matches.pixels[:, 0, 0].tolist() == [1.0, 8.0, 7.0, 2.0]
+    assert torch.equal(matches.weight, matches.pixels + 1)
+    assert torch.equal(matches.inverse_depth, keyframes.inverse_depths(ids))
+    assert closing_matches(keyframes, {}, loops[2:]) is None
+
+
+def test_depths_of_the_frame_graph_alone_are_taken_over():
+    keyframes = segment()
+    ids, cells = keyframes.ids, keyframes.grid.size
+    before = keyframes.inverse_depths(ids).clone()
+    edges = {(ids[3], ids[2]): edge(7.0, cells), (ids[2], ids[3]): edge(8.0, cells)}
+    take_over_depths(keyframes, edges, 2 * before)
+    after = keyframes.inverse_depths(ids)
+    assert torch.equal(after[[2, 3]], 2 * before[[2, 3]])
+    assert torch.equal(after[[0, 1, 4]], before[[0, 1, 4]])
