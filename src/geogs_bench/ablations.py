@@ -98,7 +98,12 @@ LOSSES = Benchmark(
     find_any_posed,
     _POSED,
     _WHERE,
-    (dtu_layout(paper.ABLATION_LOSSES), area_layout(), vertex_layout(), COST),
+    (
+        dtu_layout(paper.ABLATION_LOSSES),
+        area_layout(posed=True),
+        vertex_layout(posed=True),
+        COST,
+    ),
     (
         Variant("no-multi-view", _set(loss__l1_weight="0", loss__ncc_weight="0")),
         Variant("no-normal-consistency", _set(loss__normal_consistency_weight="0")),
@@ -128,7 +133,7 @@ CONVERGENCE = Benchmark(
     find_any_posed,
     _POSED,
     _WHERE,
-    (dtu_layout(), area_layout(), COST),
+    (dtu_layout(), area_layout(posed=True), COST),
     (Variant("", (Option("snapshots", "5,10,20,40,60,90"),)),),
     notes=("The last point of each curve is the result itself.",),
     budgets=(120.0,),

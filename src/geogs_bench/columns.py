@@ -19,6 +19,17 @@ _FURTHER = (
 )
 
 
+_STAGES: dict[StageName, str] = {
+    "online": "after the stream",
+    "adjusted": "after final BA and map update",
+    "depth fusion": "depth fusion",
+    "final": "after refinement",
+}
+"""Of a run. The paper's online results are the second; it has no third."""
+_RUN: tuple[StageName, ...] = ("online", "adjusted", "depth fusion", "final")
+_POSED: tuple[StageName, ...] = ("depth fusion", "final")
+
+
 def ate(stage: StageName) -> Callable[[Record], float | None]:
     """RMSE over all frames."""
 
@@ -63,15 +74,17 @@ def cost(name: str, factor: float = 1.0) -> Callable[[Record], float | None]:
 
 
 def trajectory_layout(published: PublishedTable | None = None) -> Layout:
-    """ATE of the online and the final trajectory."""
+    """ATE of every stage of a run; published figures beside the paper's."""
     beside = None if published is None else Published(published, "ATE")
+    stages = [stage for stage in _RUN if stage != "depth fusion"]
     return Layout(
         "Trajectory, ATE RMSE after Sim(3) alignment (cm)",
         (
-            Column("online", ate("online"), 3),
-            Column("final", ate("final"), 3, beside),
-            Column("keyframes online", keyframes_ate("online"), 3),
-            Column("keyframes final", keyframes_ate("final"), 3),
+            *(
+                Column(_STAGES[stage], ate(stage), 3, beside if stage == "adjusted" else None)
+                for stage in stages
+            ),
+            *(Column(f"keyframes {_STAGES[s]}", keyframes_ate(s), 3) for s in stages),
         ),
     )
 
@@ -80,15 +93,22 @@ def surface_layout(
     weighting: Weighting,
     title: str,
     published: PublishedTable | None = None,
-    stages: tuple[StageName, ...] = ("online", "depth fusion", "final"),
+    posed: bool = False,
 ) -> Layout:
-    """Errors of the surface at each stage; published figures beside those of the result."""
+    """Errors of the surface at each stage; published figures beside those of the paper's stage.
+
+    From known poses (``posed``) there is one stage, the result.
+    """
     columns = []
     further = () if weighting == "vertices" else _FURTHER
+    papers: StageName = "final" if posed else "adjusted"
     for name, measure, unit in (*_MEASURES, *further):
-        for stage in stages if (name, measure, unit) in _MEASURES else ("final",):
-            beside = _beside(published, name) if stage == "final" else None
-            shown = name if stage == "final" else f"{name} {stage}"
+        stages = _POSED if posed else _RUN
+        if (name, measure, unit) in further:
+            stages = tuple(s for s in stages if s in (papers, "final"))
+        for stage in stages:
+            beside = _beside(published, name) if stage == papers else None
+            shown = name if posed and stage == "final" else f"{name}, {_STAGES[stage]}"
             value = surface(stage, weighting, measure)
             columns.append(Column(f"{shown} ({unit})", value, 2, beside))
     return Layout(title, tuple(columns))
@@ -100,19 +120,20 @@ def _beside(published: PublishedTable | None, metric: str) -> Published | None:
     return Published(published, metric)
 
 
-def vertex_layout(published: PublishedTable | None = None) -> Layout:
+def vertex_layout(published: PublishedTable | None = None, posed: bool = False) -> Layout:
     """The vertex-weighted measure of the published SLAM tables."""
-    return surface_layout("vertices", "Surface, vertex-weighted (toolbox of Splat-SLAM)", published)
+    title = "Surface, vertex-weighted (toolbox of Splat-SLAM)"
+    return surface_layout("vertices", title, published, posed)
 
 
-def area_layout() -> Layout:
+def area_layout(posed: bool = False) -> Layout:
     """The measure that depends neither on tessellation nor on sampling."""
-    return surface_layout("area", "Surface, area-weighted, exact distances")
+    return surface_layout("area", "Surface, area-weighted, exact distances", None, posed)
 
 
 def dtu_layout(published: PublishedTable | None = None) -> Layout:
     """DTU's protocol."""
-    return surface_layout("points", "Surface, DTU's protocol", published, ("final",))
+    return surface_layout("points", "Surface, DTU's protocol", published, posed=True)
 
 
 def photo_layout() -> Layout:

@@ -56,5 +56,5 @@ def _draw_last(stages: list[StageErrors], result: ResultFolder) -> None:
     if last.trajectory is not None:
         draw(last, result, last.trajectory.aligned)
         return
-    poses = result.trajectory("final")
+    poses = result.poses()
     draw(last, result, np.eye(4)[None] if poses is None else poses.T_wc)
