@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 from geogs_bench.benchmark import Column, Layout, Published
 from geogs_bench.published import PublishedTable
-from geogs_bench.record import Record, StageName, Weighting
+from geogs_bench.record import Record, StageName, StageScore, Weighting
 
 _MEASURES = (
     ("Acc", "accuracy", "{unit}"),
@@ -176,6 +176,46 @@ def motion_layout() -> Layout:
         "Over the tracked frames; positions after a Sim(3) alignment, orientations after that of "
         "the world's axes. A camera that hardly moves has no ATE. Reliable (1) are an ATE below a "
         "twentieth of the path's extent and no more than a fifth of the frames lost.",
+    )
+
+
+def result_layout() -> Layout:
+    """The last stage of runs and of reconstructions, in one table."""
+
+    def last(record: Record) -> StageScore | None:
+        return record.stages[-1] if record.stages else None
+
+    def field(measure: str, *weightings: Weighting) -> Callable[[Record], float | None]:
+        def value(record: Record) -> float | None:
+            stage = last(record)
+            found = [s for w in weightings if stage and (s := stage.surface(w))]
+            return getattr(found[0], measure) if found else None
+
+        return value
+
+    def last_ate(record: Record) -> float | None:
+        stage = last(record)
+        return stage.trajectory.ate if stage and stage.trajectory else None
+
+    def agreement(record: Record) -> float | None:
+        return None if record.photo is None else record.photo.score
+
+    surfaces: tuple[Weighting, Weighting] = ("area", "points")
+    return Layout(
+        "Results",
+        (
+            Column("ATE after the stream (cm)", ate("online"), 3),
+            Column("ATE of the result (cm)", last_ate, 3),
+            Column("Acc ({unit})", field("accuracy", *surfaces)),
+            Column("Comp ({unit})", field("completeness", *surfaces)),
+            Column("Comp.Rat (%)", field("ratio", "area"), 1),
+            Column("CD ({unit})", field("chamfer", *surfaces)),
+            Column("agreement of held-out images (%)", agreement, 1),
+            Column("thousand disks", cost("disks", 1e-3), 1),
+            Column("seconds", cost("seconds"), 1),
+        ),
+        "Of the result, whichever stage that is: rooms in cm, area-weighted, objects in mm, DTU by "
+        "its protocol where the official files are there.",
     )
 
 

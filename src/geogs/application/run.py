@@ -19,6 +19,7 @@ from geogs.application.run_checkpoint import RunCheckpoint, RunFacts, SavedRun, 
 from geogs.application.settings import RunSettings
 from geogs.application.shutter import with_shutter_found
 from geogs.application.surfaces import write_depth_mesh, write_stage
+from geogs.config.idle import idle_settings
 from geogs.errors import DeviceError, InputError
 from geogs.gpu.installation import require_device
 from geogs.io.sources.sniff import Stream, open_source
@@ -43,6 +44,8 @@ def run(
     """
     progress, stop = progress or RunProgress(), stop or Stop()
     config, device = settings.config, require_device(settings.device)
+    for sentence in idle_settings(config):
+        progress.write(f"note: {sentence}")
     opened = open_source(settings.source, config.input)
     output = prepare_output_folder(settings.output or Path("out") / opened.name)
     compiled_kernels(device)

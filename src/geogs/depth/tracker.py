@@ -70,5 +70,7 @@ class TrackerDepthEngine:
     def _dense(self, depth: KeyframeDepth) -> DenseDepth:
         known = depth.depth[depth.confidence > 0]
         typical = np.median(known if known.size else depth.depth)
-        maps = (torch.from_numpy(m).to(self.device) for m in (depth.depth, depth.confidence))
-        return DenseDepth(*maps, torch.tensor(typical))
+        values, confidence = (
+            torch.from_numpy(m).to(self.device) for m in (depth.depth, depth.confidence)
+        )
+        return DenseDepth(values, confidence, torch.tensor(typical))

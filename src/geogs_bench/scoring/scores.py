@@ -35,7 +35,7 @@ def score(scene: Scene, command: Command, result: ResultFolder, seed: int) -> Sc
     """
     if scene.kind == "motion":
         return Scores(motion=score_motion(scene, result))
-    if command == "run":
+    if command in ("run", "update"):
         stages = score_slam(scene, result, seed)
         _draw_last(stages, result)
         return Scores(tuple(stage.score for stage in stages))
