@@ -278,6 +278,14 @@ def test_coherent_goes_with_the_anchors_where_a_part_moves_in_no_one_way():
     assert update.residual > 0.3
 
 
+def test_after_an_adjustment_of_all_everything_goes_by_one_similarity():
+    x, anchor, correction, _ = part_moved(0.5)
+    together = replace(correction, of_all=True)
+    update = plan_update(x, anchor, together, "coherent")
+    assert (update.transform - update.transform[0]).abs().max() == 0
+    assert update.residual > 0
+
+
 @pytest.mark.parametrize("strategy", STRATEGIES)
 @pytest.mark.parametrize("count", [0, 1, 2, 5])
 def test_few_disks_and_a_single_keyframe(strategy, count):

@@ -139,9 +139,12 @@ def _revisited(
 ) -> Bool[Tensor, "n"]:
     """Disks whose anchors lie where the correction begins, or later: those that were adjusted.
 
+    All of them where all keyframes were.
     ``slot`` is an anchor's place among the corrected keyframes. It begins with the first that has
     moved; where that is the second, with the first of all, which only holds the world in place.
     """
+    if correction.of_all:
+        return torch.ones_like(slot, dtype=torch.bool)
     poses = torch.stack([correction.before[i] for i in sorted(correction.after)]).double()
     centres = se3_inverse(poses)[:, :3, 3].to(x.device)
     way, distance = x.new_zeros(2, len(centres))
