@@ -23,6 +23,7 @@ CASES = {
     "--tracking.weights x.pth": "tracking.weights does nothing",
     "--mapping.no-final-depth --mapping.final-iterations 0": "mapping.no-final-depth does nothing",
     "--mapping.pose-lr 1e-3 --mapping.pose-iterations 0": "mapping.pose-lr does nothing",
+    "--mapping.final-pose-rounds 2 --mapping.pose-iterations 0": "final-pose-rounds does nothing",
     "--loop.matches --loop.no-enabled": "loop.matches does nothing",
     "--mapping.depth.weights x": "mapping.depth.weights does nothing: the engine classical",
     "--mapping.disk.no-carve --mapping.disk.carve-every 3": "mapping.disk.carve-every does",

@@ -124,6 +124,9 @@ class MappingConfig(Settings, group="mapping"):
     """Single-view steps over all keyframes after the final bundle adjustment; 0 stops online."""
     final_depth: Annotated[bool, Only("run")] = True
     """Search all keyframe depths once more with the final poses."""
+    final_pose_rounds: Annotated[CountOrZero, Only("run")] = 0
+    """Times that the final training pauses to refine the poses of all keyframes against the map, in
+    windows that overlap by half; 0 leaves them to the final bundle adjustment."""
     lr_position: Weight = 6e-4
     """Adam step of positions, in u."""
     lr_quaternion: Weight = 4e-3

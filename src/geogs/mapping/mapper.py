@@ -164,6 +164,12 @@ class Mapper:
         for i, T_cw in poses.items():
             self.keyframes[i].T_cw = T_cw
 
+    def refine_all_poses(self) -> None:
+        """The same for all mapped keyframes, in windows that overlap by half, earliest first."""
+        step = max(self.config.window // 2, 1)
+        for start in range(0, max(len(self.mapped) - step, 1), step):
+            self.refine_poses(self.mapped[start : start + 2 * step])
+
     def correct(self, correction: PoseCorrection) -> MapUpdate:
         """Move the map with a global correction that the keyframes have taken over."""
         views = [v for v in self.views.values() if v.has_depth]
@@ -390,7 +396,9 @@ class Mapper:
         trainer = self._training()
         fills, prunes = {total // 3, 2 * total // 3}, max(total // 4, 1)
         splits = {int(total * part) for part in self.config.disk.split_times}
-        events = fills | splits | set(range(prunes, total, prunes))
+        rounds = self.config.final_pose_rounds
+        poses = {total * (n + 1) // (rounds + 1) for n in range(rounds)}
+        events = fills | splits | poses | set(range(prunes, total, prunes))
         stops = sorted(events | set(range(_REPORTED_STEPS, total, _REPORTED_STEPS)) | {total})
         done = self.trained.steps
         for stop in (stop for stop in stops if stop > done):
@@ -412,6 +420,8 @@ class Mapper:
                 self.prune()
             if done in splits:
                 self._split()
+            if done in poses:
+                self.refine_all_poses()
             if done in fills:
                 for view in views:
                     self._insert(view, self.config.disk.fill_confidence)
