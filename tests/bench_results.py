@@ -44,7 +44,11 @@ def write_truth(folder: Path, name: str = "hall") -> Scene:
 
 
 def write_result(
-    folder: Path, pose_noise: float, wall_offset: float | None, posed: bool = False
+    folder: Path,
+    pose_noise: float,
+    wall_offset: float | None,
+    posed: bool = False,
+    refined: bool = True,
 ) -> None:
     """A result with a known error; in map units unless the poses are known. No offset, no mesh."""
     s = 1.0 if posed else SCALE
@@ -62,6 +66,7 @@ def write_result(
     write_intrinsics(folder / "intrinsics.json", Camera(60.0, 60.0, 39.5, 29.5, 80, 60), None)
     summary = {
         "frames": len(T),
+        "refined": refined,
         "disks": 1234,
         "device": "cpu",
         "frames_per_second": {"until_stream_end": 5.0},

@@ -153,6 +153,36 @@ def test_the_online_result_and_the_depths_alone_are_written_too(small_result):
     assert len({len(mesh.faces) for mesh in meshes}) == 3
 
 
+def test_the_papers_stage_lies_between_the_stream_and_the_refinement(small_result):
+    online, adjusted, final = (
+        read_tum_trajectory(small_result / name / "trajectory.tum")
+        for name in ("online", "adjusted", ".")
+    )
+    assert np.abs(adjusted.T_wc - online.T_wc).max() > 0
+    assert np.array_equal(adjusted.T_wc, final.T_wc)  # the refinement moves the map alone
+    meshes = [read_surface(small_result / name / "mesh.ply") for name in ("adjusted", ".")]
+    assert len({len(mesh.faces) for mesh in meshes}) == 2
+    assert json.loads((small_result / "summary.json").read_text())["refined"]
+
+
+def test_the_preset_of_the_paper_runs_and_ends_with_the_adjustment(small_room, tmp_path):
+    out = tmp_path / "paper"
+    done = geogs(
+        "run", small_room, "--preset", "paper", "--stop", SMALL_FRAMES, "-o", out,
+        "--online-results", "--mapping.render-long-edge", "96", "--mapping.iterations", "2",
+        "--mapping.pose-iterations", "1", "--mapping.window", "4", "--mapping.disk.stride", "4",
+        "--tracking.init-keyframes", "6", "--device", "cpu",
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert not json.loads((out / "summary.json").read_text())["refined"]
+    assert (out / "online" / "mesh.ply").is_file()
+    assert not (out / "adjusted").exists()
+    done = geogs("eval", out, "--gt", small_room, "--no-plots")
+    assert done.returncode == 0, done.stderr
+    assert json.loads((out / "eval.json").read_text())["trajectory"]["ate_rmse_cm"] < 2.0
+    assert len(read_surface(out / "mesh.ply").faces) > 300
+
+
 @pytest.mark.usefixtures("no_report")
 def test_ground_truth_is_never_read(small_room, small_result, tmp_path):
     """Without the truth beside the images the poses come out the same, bit for bit.

@@ -66,6 +66,8 @@ class Reconstruction:
         budget: float | None = None,
     ):
         self.config = config or ReconstructConfig()
+        if self.config.mapping.depth.engine == "tracker":
+            raise InputError("mapping.depth.engine tracker needs a tracker: geogs run has one.")
         self.camera = camera
         store = KeyframeStore(SampleGrid(camera, device), None, self.config.resident_keyframes)
         self.mapper = Mapper(store, self.config.mapping, self.config.seed)

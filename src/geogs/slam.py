@@ -93,6 +93,8 @@ class Slam:
         self._waiting: deque[int] = deque()
         self.adjusted = 0
         """Keyframes at the last bundle adjustment of all."""
+        self.is_refined = False
+        """Whether the map was trained over all keyframes at the end."""
         self._is_ended = False
         self._known: Uncertainty | None = None
 
@@ -133,6 +135,11 @@ class Slam:
         """Whether the stream has ended."""
         return self._is_ended
 
+    @property
+    def will_refine(self) -> bool:
+        """Whether a refinement of the map follows the final bundle adjustment."""
+        return self.config.mapping.final_iterations > 0
+
     @on_one_torch_thread
     def process(self, frame: Frame) -> SlamStatus:
         """Track one frame and, where it completes a keyframe, train the map."""
@@ -166,11 +173,21 @@ class Slam:
         """
         if not self._is_ended:
             self.end_stream()
-        if not correct:
-            return
+        if correct:
+            self.adjust(progress)
+            self.refine(progress)
+
+    @on_one_torch_thread
+    def adjust(self, progress: Progress = _silent) -> None:
+        """After the stream: bundle-adjust all keyframes and move the map, as the paper ends."""
         self._adjust_globally(progress)
+
+    @on_one_torch_thread
+    def refine(self, progress: Progress = _silent) -> None:
+        """After that: train the map over all keyframes, if it is to be."""
         with self.stopwatch("final mapping"):
             self.mapper.refine(lambda f: progress("map refinement", f))
+        self.is_refined = self.will_refine
 
     @on_one_torch_thread
     def trajectory(self) -> Trajectory:
@@ -198,6 +215,7 @@ class Slam:
     def particulars(self) -> dict[str, object]:
         """What a summary says of segments, loops and things that move, ready for JSON."""
         return {
+            "refined": self.is_refined,
             "moving": round(moving_share(self.segments.world.keyframes), 4),
             "segments": [asdict(segment) for segment in self.segments.summary()],
             "not_started": self.segments.why_not or None,

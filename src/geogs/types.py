@@ -33,6 +33,9 @@ class PoseCorrection:
     after: dict[int, Float[Tensor, "4 4"]]
     scale: dict[int, float]
     """Factor by which lengths around the keyframe were divided; 1 where only the pose moved."""
+    of_all: bool = False
+    """Whether everything was adjusted together, as a bundle adjustment of all keyframes does; else
+    those before the place where it begins were not."""
 
 
 FrameState = Literal["tracked", "orientation only", "lost"]

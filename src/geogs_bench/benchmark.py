@@ -73,5 +73,7 @@ class Benchmark:
     """Seconds given to each reconstruction from known poses; each makes a variant."""
     synthetic: bool = False
     """Whether a synthetic room serves where the user gives no data."""
+    by_kind: bool = False
+    """Whether objects and scans, whose poses are known, are reconstructed and rooms are run."""
     cells: tuple[Cell, ...] = ()
     """Sequences that are rendered where the user gives no data."""

@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 from geogs_bench.benchmark import Column, Layout, Published
 from geogs_bench.published import PublishedTable
-from geogs_bench.record import Record, StageName, Weighting
+from geogs_bench.record import Record, StageName, StageScore, Weighting
 
 _MEASURES = (
     ("Acc", "accuracy", "{unit}"),
@@ -17,6 +17,17 @@ _FURTHER = (
     ("median Comp", "completeness_median", "{unit}"),
     ("F-score", "f_score", "%"),
 )
+
+
+_STAGES: dict[StageName, str] = {
+    "online": "after the stream",
+    "adjusted": "after final BA and map update",
+    "depth fusion": "depth fusion",
+    "final": "after refinement",
+}
+"""Of a run. The paper's online results are the second; it has no third."""
+_RUN: tuple[StageName, ...] = ("online", "adjusted", "depth fusion", "final")
+_POSED: tuple[StageName, ...] = ("depth fusion", "final")
 
 
 def ate(stage: StageName) -> Callable[[Record], float | None]:
@@ -63,15 +74,17 @@ def cost(name: str, factor: float = 1.0) -> Callable[[Record], float | None]:
 
 
 def trajectory_layout(published: PublishedTable | None = None) -> Layout:
-    """ATE of the online and the final trajectory."""
+    """ATE of every stage of a run; published figures beside the paper's."""
     beside = None if published is None else Published(published, "ATE")
+    stages = [stage for stage in _RUN if stage != "depth fusion"]
     return Layout(
         "Trajectory, ATE RMSE after Sim(3) alignment (cm)",
         (
-            Column("online", ate("online"), 3),
-            Column("final", ate("final"), 3, beside),
-            Column("keyframes online", keyframes_ate("online"), 3),
-            Column("keyframes final", keyframes_ate("final"), 3),
+            *(
+                Column(_STAGES[stage], ate(stage), 3, beside if stage == "adjusted" else None)
+                for stage in stages
+            ),
+            *(Column(f"keyframes {_STAGES[s]}", keyframes_ate(s), 3) for s in stages),
         ),
     )
 
@@ -80,15 +93,22 @@ def surface_layout(
     weighting: Weighting,
     title: str,
     published: PublishedTable | None = None,
-    stages: tuple[StageName, ...] = ("online", "depth fusion", "final"),
+    posed: bool = False,
 ) -> Layout:
-    """Errors of the surface at each stage; published figures beside those of the result."""
+    """Errors of the surface at each stage; published figures beside those of the paper's stage.
+
+    From known poses (``posed``) there is one stage, the result.
+    """
     columns = []
     further = () if weighting == "vertices" else _FURTHER
+    papers: StageName = "final" if posed else "adjusted"
     for name, measure, unit in (*_MEASURES, *further):
-        for stage in stages if (name, measure, unit) in _MEASURES else ("final",):
-            beside = _beside(published, name) if stage == "final" else None
-            shown = name if stage == "final" else f"{name} {stage}"
+        stages = _POSED if posed else _RUN
+        if (name, measure, unit) in further:
+            stages = tuple(s for s in stages if s in (papers, "final"))
+        for stage in stages:
+            beside = _beside(published, name) if stage == papers else None
+            shown = name if posed and stage == "final" else f"{name}, {_STAGES[stage]}"
             value = surface(stage, weighting, measure)
             columns.append(Column(f"{shown} ({unit})", value, 2, beside))
     return Layout(title, tuple(columns))
@@ -100,19 +120,20 @@ def _beside(published: PublishedTable | None, metric: str) -> Published | None:
     return Published(published, metric)
 
 
-def vertex_layout(published: PublishedTable | None = None) -> Layout:
+def vertex_layout(published: PublishedTable | None = None, posed: bool = False) -> Layout:
     """The vertex-weighted measure of the published SLAM tables."""
-    return surface_layout("vertices", "Surface, vertex-weighted (toolbox of Splat-SLAM)", published)
+    title = "Surface, vertex-weighted (toolbox of Splat-SLAM)"
+    return surface_layout("vertices", title, published, posed)
 
 
-def area_layout() -> Layout:
+def area_layout(posed: bool = False) -> Layout:
     """The measure that depends neither on tessellation nor on sampling."""
-    return surface_layout("area", "Surface, area-weighted, exact distances")
+    return surface_layout("area", "Surface, area-weighted, exact distances", None, posed)
 
 
 def dtu_layout(published: PublishedTable | None = None) -> Layout:
     """DTU's protocol."""
-    return surface_layout("points", "Surface, DTU's protocol", published, ("final",))
+    return surface_layout("points", "Surface, DTU's protocol", published, posed=True)
 
 
 def photo_layout() -> Layout:
@@ -155,6 +176,46 @@ def motion_layout() -> Layout:
         "Over the tracked frames; positions after a Sim(3) alignment, orientations after that of "
         "the world's axes. A camera that hardly moves has no ATE. Reliable (1) are an ATE below a "
         "twentieth of the path's extent and no more than a fifth of the frames lost.",
+    )
+
+
+def result_layout() -> Layout:
+    """The last stage of runs and of reconstructions, in one table."""
+
+    def last(record: Record) -> StageScore | None:
+        return record.stages[-1] if record.stages else None
+
+    def field(measure: str, *weightings: Weighting) -> Callable[[Record], float | None]:
+        def value(record: Record) -> float | None:
+            stage = last(record)
+            found = [s for w in weightings if stage and (s := stage.surface(w))]
+            return getattr(found[0], measure) if found else None
+
+        return value
+
+    def last_ate(record: Record) -> float | None:
+        stage = last(record)
+        return stage.trajectory.ate if stage and stage.trajectory else None
+
+    def agreement(record: Record) -> float | None:
+        return None if record.photo is None else record.photo.score
+
+    surfaces: tuple[Weighting, Weighting] = ("area", "points")
+    return Layout(
+        "Results",
+        (
+            Column("ATE after the stream (cm)", ate("online"), 3),
+            Column("ATE of the result (cm)", last_ate, 3),
+            Column("Acc ({unit})", field("accuracy", *surfaces)),
+            Column("Comp ({unit})", field("completeness", *surfaces)),
+            Column("Comp.Rat (%)", field("ratio", "area"), 1),
+            Column("CD ({unit})", field("chamfer", *surfaces)),
+            Column("agreement of held-out images (%)", agreement, 1),
+            Column("thousand disks", cost("disks", 1e-3), 1),
+            Column("seconds", cost("seconds"), 1),
+        ),
+        "Of the result, whichever stage that is: rooms in cm, area-weighted, objects in mm, DTU by "
+        "its protocol where the official files are there.",
     )
 
 

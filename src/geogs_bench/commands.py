@@ -48,6 +48,19 @@ class TrackingRunner(CommandRunner):
         track_to_folder(settings, task.output)
 
 
+class UpdateRunner(CommandRunner):
+    """Moves one map, as the stream has left it, by the rule that the options name."""
+
+    def run(self, task: Task) -> None:
+        """Run the stream unless its map is kept, correct that, and write the result."""
+        from geogs_bench.saved_map import correct_saved_map
+
+        settings = settings_of(task)
+        assert isinstance(settings, RunSettings)
+        with TerminalProgress() as progress:
+            correct_saved_map(settings, task.output, progress)
+
+
 def runners() -> dict[Command, Runner]:
     """Who runs which command."""
     from geogs_bench.baseline import BaselineRunner
@@ -56,6 +69,7 @@ def runners() -> dict[Command, Runner]:
     return {
         "run": command,
         "track": TrackingRunner(),
+        "update": UpdateRunner(),
         "reconstruct": command,
         "colour-2dgs": BaselineRunner(),
     }
@@ -65,6 +79,6 @@ def settings_of(task: Task) -> RunSettings | ReconstructSettings:
     """What a task's options say, by the command's own parser."""
     argv = [str(task.source), "-o", str(task.output)]
     argv += [argument for option in task.options for argument in option.arguments()]
-    if task.command in ("run", "track"):
+    if task.command in ("run", "track", "update"):
         return record(RunSettings, run_command.parse(argv))
     return record(ReconstructSettings, reconstruct_command.parse(argv))

@@ -9,6 +9,9 @@ from geogs_bench.benchmark import Benchmark, Variant
 from geogs_bench.runner import Command, Task
 from geogs_bench.scene import Option, Scene
 
+_BUDGET = 120.0
+"""Seconds of reconstructions beside runs."""
+
 
 @dataclass(frozen=True)
 class Wishes:
@@ -106,6 +109,10 @@ def _job(benchmark: Benchmark, scene: Scene, variant: Variant, output: Path, wis
     options = merged(scene.options, wishes.options, variant.options)
     folder = output / scene.name / variant.name
     command = variant.command or benchmark.command
+    if benchmark.by_kind and scene.kind in ("object", "scan"):
+        command = "reconstruct"
+        budget = (Option("budget", f"{_BUDGET:g}s"),)
+        options = merged(budget, [o for o in options if o.name != "online-results"])
     return Job(scene, variant.name, Task(command, scene.source, folder, options))
 
 

@@ -14,8 +14,10 @@ T = TypeVar("T")
 Weighting = Literal["area", "vertices", "points"]
 """Means over the area of the surfaces (NICE-SLAM), over the vertices of the meshes (the toolbox of
 Splat-SLAM), or over thinned points (DTU)."""
-StageName = Literal["online", "depth fusion", "final"]
-"""Before the final stages; the keyframes' depths fused without the disks; the result."""
+StageName = Literal["online", "adjusted", "depth fusion", "final"]
+"""After the stream; after the final bundle adjustment and the map's update, where the paper ends;
+the keyframes' depths fused without the disks; after the refinement that the paper has not, or from
+known poses the result."""
 
 
 @dataclass(frozen=True)

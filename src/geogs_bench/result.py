@@ -19,7 +19,7 @@ from geogs.types import Trajectory
 from geogs_bench.record import StageName
 
 _STAGE_FOLDERS: dict[StageName, str] = {
-    "online": "online", "depth fusion": "depth_fusion", "final": "",
+    "online": "online", "adjusted": "adjusted", "depth fusion": "depth_fusion", "final": "",
 }  # fmt: skip
 
 
@@ -80,20 +80,39 @@ class ResultFolder:
 
     def stages(self) -> list[StageName]:
         """The stages that left anything, in order of time."""
+        files = ("mesh.ply", "trajectory.tum")
         return [
             stage
-            for stage, name in _STAGE_FOLDERS.items()
-            if any((self.path / name / file).is_file() for file in ("mesh.ply", "trajectory.tum"))
+            for stage, folder in self._folders.items()
+            if any((folder / file).is_file() for file in files)
         ]
+
+    @property
+    def _folders(self) -> dict[StageName, Path]:
+        """Where the stages are; without a refinement the result itself is the adjusted one."""
+        folders = {stage: self.path / name for stage, name in _STAGE_FOLDERS.items()}
+        if self.summary.get("refined", True):
+            return folders
+        return {"online": folders["online"], "depth fusion": folders["depth fusion"],
+                "adjusted": folders["final"]}  # fmt: skip
+
+    def _file(self, stage: StageName, name: str) -> Path | None:
+        folder = self._folders.get(stage)
+        return folder / name if folder is not None and (folder / name).is_file() else None
 
     def mesh(self, stage: StageName) -> Surface | None:
         """The surface of a stage, in map units; none where there is none."""
-        file = self.path / _STAGE_FOLDERS[stage] / "mesh.ply"
-        return read_surface(file) if file.is_file() else None
+        file = self._file(stage, "mesh.ply")
+        return None if file is None else read_surface(file)
 
     def trajectory(self, stage: StageName, name: str = "trajectory.tum") -> Trajectory | None:
         """All poses of a stage, or the keyframes' (``keyframes.tum``); none where not there."""
-        file = self.path / _STAGE_FOLDERS[stage] / name
+        file = self._file(stage, name)
+        return None if file is None else read_tum_trajectory(file)
+
+    def poses(self) -> Trajectory | None:
+        """All poses of the result, whatever its last stage."""
+        file = self.path / "trajectory.tum"
         return read_tum_trajectory(file) if file.is_file() else None
 
     def uncertainty(self) -> FrameStates | None:

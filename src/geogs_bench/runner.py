@@ -6,9 +6,9 @@ from typing import Literal, Protocol, runtime_checkable
 
 from geogs_bench.scene import Option
 
-Command = Literal["run", "track", "reconstruct", "colour-2dgs"]
-"""SLAM, its tracking alone, the map from known poses, or the baseline with colour from known
-poses."""
+Command = Literal["run", "track", "update", "reconstruct", "colour-2dgs"]
+"""SLAM, its tracking alone, one map of it moved by a rule of its update, the map from known poses,
+or the baseline with colour from known poses."""
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,8 @@ RECORD_FILE = "bench.json"
 _RUN_FILE = "bench_run.json"
 _LEFT_BY_EARLIER_RUNS = (
     _RUN_FILE, RECORD_FILE, "mesh.ply", "map.safetensors", "summary.json", "online/trajectory.tum",
-    "online/keyframes.tum", "online/mesh.ply", "depth_fusion/mesh.ply", "snapshots/*/mesh.ply",
+    "online/keyframes.tum", "online/mesh.ply", "adjusted/trajectory.tum",
+    "adjusted/keyframes.tum", "adjusted/mesh.ply", "depth_fusion/mesh.ply", "snapshots/*/mesh.ply",
     "snapshots/*/map.safetensors",
 )  # fmt: skip
 """Files of a result that would be scored, were they still there."""

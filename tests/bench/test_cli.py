@@ -104,7 +104,7 @@ def test_the_list_names_every_benchmark_with_its_data(capsys):
     assert text.strip() == listing()
     for name in ("replica", "scannet", "scannetpp", "tum", "7scenes", "dtu", "rooms", "objects",
                  "ablation-init", "ablation-update", "ablation-pose-lr", "ablation-losses",
-                 "convergence", "light"):  # fmt: skip
+                 "convergence", "light", "paper"):  # fmt: skip
         assert f"{name}\n" in text
 
 
@@ -143,11 +143,14 @@ for name in sys.argv[2:]:
 
 
 def test_the_options_of_the_ablations_exist_and_make_a_difference(room):
-    names = ["ablation-update", "ablation-pose-lr", "ablation-losses"]
+    counts = {
+        "ablation-update": 3, "ablation-pose-lr": 6, "ablation-losses": 10, "ablation-init": 8,
+        "paper": 2,
+    }  # fmt: skip
     done = subprocess.run(
-        [sys.executable, "-c", OPTIONS_OF_ABLATIONS, str(room), *names],
+        [sys.executable, "-c", OPTIONS_OF_ABLATIONS, str(room), *counts],
         capture_output=True, text=True,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     rows = [line.split() for line in done.stdout.splitlines()]
-    assert rows == [[names[0], "3", "3"], [names[1], "5", "5"], [names[2], "9", "9"]]
+    assert rows == [[name, str(n), str(n)] for name, n in counts.items()]

@@ -8,6 +8,7 @@ import pytest
 from flat_rooms import SIZE, flat_room
 from geogs.errors import InputError
 from geogs_bench.layouts.dtu import find_dtu
+from geogs_bench.layouts.mixed import find_mixed
 from geogs_bench.layouts.objects import find_objects
 from geogs_bench.layouts.posed_rooms import find_any_posed, find_posed_rooms
 from geogs_bench.layouts.replica import find_relighted, find_replica, find_rooms
@@ -15,7 +16,7 @@ from geogs_bench.layouts.scannet import find_scannet
 from geogs_bench.layouts.scannetpp import find_scannetpp
 from geogs_bench.layouts.seven_scenes import find_seven_scenes
 from geogs_bench.layouts.tum import find_tum
-from geogs_bench.plan import find_scenes
+from geogs_bench.plan import Wishes, find_scenes, make_jobs
 from geogs_bench.registry import BENCHMARKS, find_benchmark
 from geogs_bench.scene import Option
 from geogs_bench.truth import read_true_poses
@@ -78,6 +79,26 @@ def test_rooms_objects_and_light(tmp_path):
     (scene,) = find_objects(tmp_path)
     assert (scene.name, scene.kind) == ("jug", "object")
     assert [s.name for s in find_any_posed(tmp_path)] == ["jug"]
+
+
+def test_a_mix_of_rooms_and_objects_is_run_and_reconstructed(tmp_path):
+    for name in ("hall", "rooms/den", "objects/vase"):
+        folder = replica_scene(tmp_path / name)
+        touch(folder / "mesh.ply")
+    write_images(tmp_path / "objects" / "vase" / "results", ["mask000000.png"], *SIZE)
+    benchmark = find_benchmark("paper")
+    scenes = find_mixed(tmp_path)
+    assert [(s.name, s.kind) for s in scenes] == [
+        ("den", "room"), ("hall", "room"), ("vase", "object")
+    ]  # fmt: skip
+    wishes = Wishes(options=(Option("online-results"),))
+    jobs = make_jobs(benchmark, scenes, tmp_path / "out", wishes)
+    commands = {(j.scene.name, j.variant): j.task.command for j in jobs}
+    assert commands["den", "paper"] == "run"
+    assert commands["vase", "default"] == commands["vase", "paper"] == "reconstruct"
+    vase = next(j.task for j in jobs if (j.scene.name, j.variant) == ("vase", "paper"))
+    assert vase.option("online-results") is None
+    assert (vase.option("budget"), vase.option("preset")) == ("120s", "paper")
 
 
 def test_known_poses_use_about_a_hundred_images(tmp_path):

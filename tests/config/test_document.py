@@ -22,8 +22,11 @@ def test_every_setting_has_a_row_with_its_default_its_range_and_its_meaning():
         assert f"`{name}`" in text
     assert "| `loop.lag` | `2` | a whole number from 0 to 1000000 | Keyframes for which" in text
     assert "| `mapping.photo.per-step` | `2`, `4` in `reconstruct` | a whole number from 1" in text
-    assert "| `mapping.final-depth` | `on` | `off` | `on` |" in text
-    lag = next(row for row in rows if row.startswith("| `mapping.lag`"))
+    assert "| `mapping.final-depth` | `on` | `off` | `on` | `on` |" in text
+    explained = [row for row in rows if " only) |" in row]
+    lag = next(row for row in explained if row.startswith("| `mapping.lag`"))
     assert lag.endswith("(`run` only) |")
-    silhouette = next(row for row in rows if row.startswith("| `mapping.loss.silhouette-weight`"))
+    silhouette = next(
+        row for row in explained if row.startswith("| `mapping.loss.silhouette-weight`")
+    )
     assert silhouette.endswith("(`reconstruct` only) |")

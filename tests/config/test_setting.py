@@ -118,6 +118,7 @@ def test_presets_are_valid() -> None:
     for name in ("fast", "default", "accurate"):
         assert config.preset(name).mapping.window == 8
         assert config.reconstruct_preset(name).mapping.loss.l1_cut == 0.1
+    assert config.preset("paper").mapping.window == 11
 
 
 @given(least=st.integers(-5, 5), most=st.integers(-5, 5), x=st.floats(-9, 9), odd=st.booleans())

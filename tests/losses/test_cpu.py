@@ -67,8 +67,8 @@ def photo_case(seed: int) -> tuple[torch.Tensor, PhotoView, PhotoView, torch.Ten
     depth[30, 40] = float("nan")
     near = se3_exp(torch.tensor([0.02, -0.01, 0.01, 0.002, 0.003, -0.01]).double())
     images = [x.astype(np.uint8) for x in (texture, other)]
-    reference = PhotoView.prepare(images[0], BIG, torch.eye(4).double())
-    target = PhotoView.prepare(images[1], BIG, near)
+    reference = PhotoView.prepare(images[0], BIG, torch.eye(4).double(), with_colour=True)
+    target = PhotoView.prepare(images[1], BIG, near, with_colour=True)
     hidden = depth.clone().nan_to_num(0.0)
     hidden[40:50, 10:30] *= 0.8
     return depth, reference, target, hidden
@@ -80,6 +80,9 @@ MULTI = {
     "ncc 5": LossConfig(l1_weight=0.0, ncc_patch=5, ncc_reject=1.5),
     "l1 plain": LossConfig(ncc_weight=0.0, l1_huber=0.0, l1_cut=1.0),
     "ssim": LossConfig(ssim_weight=0.4),
+    "colour": LossConfig(
+        ssim_weight=0.4, colour=True, occlusion_share=0.05, l1_huber=0.0, l1_cut=1.0
+    ),
 }
 
 

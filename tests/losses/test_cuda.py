@@ -75,7 +75,8 @@ class Scene:
             move = torch.tensor([0.03, -0.02, 0.06, 0.002, 0.003, -0.01]).double()
             T_cw = se3_exp((k - 1.3) * move)
             scene.views.append(constants_on(view, device))
-            scene.photos.append(PhotoView.prepare(image.astype(np.uint8), photo, T_cw, blur=0.3))
+            pixels = image.astype(np.uint8)
+            scene.photos.append(PhotoView.prepare(pixels, photo, T_cw, 0.3, with_colour=True))
             scene.table.add(view, scene.photos[k])
             rendered.append(maps)
         scene.photos = [photo_on(p, device) for p in scene.photos]
@@ -161,7 +162,13 @@ def constants_on(view: ViewConstants, device: torch.device) -> ViewConstants:
 
 
 def photo_on(photo: PhotoView, device: torch.device) -> PhotoView:
-    return replace(photo, grey=photo.grey.to(device), T_cw=photo.T_cw.to(device))
+    assert photo.colours is not None
+    return replace(
+        photo,
+        grey=photo.grey.to(device),
+        T_cw=photo.T_cw.to(device),
+        colours=photo.colours.to(device),
+    )
 
 
 def spoil(maps: list[Tensor]) -> None:
@@ -218,6 +225,8 @@ PAIRS = {
     "ncc 3": {"ncc_weight": 0.5, "ncc_patch": 3},
     "ncc 11": {"ncc_weight": 0.5, "ncc_patch": 11, "ncc_reject": 1.5},
     "ssim": {"ssim_weight": 0.3},
+    "colour": {"ssim_weight": 0.3, "l1_weight": 1.0, "ncc_weight": 0.5, "colour": True},
+    "tau": {"l1_weight": 1.0, "occlusion_share": 0.05},
     "ssim, l1": {"ssim_weight": 0.3, "l1_weight": 1.0},
     "sobel": {
         "l1_weight": 1.0,

@@ -18,6 +18,7 @@ from geogs.losses.multi_view import (
     sample_image,
     warp,
 )
+from geogs.losses.photometric import ssim
 
 CAMERA = Camera(50.0, 52.0, 23.3, 19.1, 48, 40)
 NORMAL, DISTANCE = torch.tensor([0.2, -0.1, -1.0]).double(), 2.0
@@ -145,6 +146,33 @@ def test_a_view_without_depth_gives_no_loss_and_no_gradient(value: float) -> Non
     loss.backward()
     assert float(loss.detach()) == 0
     assert (depth.grad == 0).all()
+
+
+def test_colour_is_compared_as_printed_and_correlation_in_grey() -> None:
+    """L_1 and L_ssim of images with three channels; NCC of their grey; tau is relative."""
+    depth, reference, target, seen = views()
+    gains = torch.tensor([1.0, 0.7, 0.4]).double()[:, None, None]
+    reference, target = (
+        replace(v, colours=gains * v.grey + 0.05 * gains.flip(0)) for v in (reference, target)
+    )
+    config = LossConfig(
+        l1_weight=0.8, l1_huber=0.0, l1_cut=10.0, ssim_weight=0.2, ncc_weight=0.15, colour=True,
+        occlusion_share=0.05,
+    )  # fmt: skip
+    wrong = 1.02 * depth
+    warped = warp(target.grey, wrong, CAMERA, CAMERA, REFERENCE, TARGET)
+    mask = occlusion_mask(warped, seen, CAMERA, 0.05)
+    assert target.colours is not None
+    assert reference.colours is not None
+    channels = [reference.colours.permute(1, 2, 0), target.colours.permute(1, 2, 0)]
+    other = warp(channels[1], wrong, CAMERA, CAMERA, REFERENCE, TARGET).image
+    l1 = (channels[0] - other).abs().mean(-1)[mask].sum()
+    structure, _ = ssim(channels[0], other, mask, config.ncc_min_coverage)
+    grey = replace(config, l1_weight=0.0, ssim_weight=0.0, colour=False)
+    expected = (0.8 * l1 + 0.2 * structure.sum()) / depth.numel()
+    expected = expected + multi_view_loss(wrong, reference, target, seen, grey)
+    got = multi_view_loss(wrong, reference, target, seen, config)
+    assert float(got) == pytest.approx(float(expected), rel=1e-9)
 
 
 def test_photo_view_is_grey_smoothed_and_of_the_camera_size() -> None:

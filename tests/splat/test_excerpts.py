@@ -138,6 +138,6 @@ def test_few_slots_serve_many_keyframes():
     assert torch.equal(known.table.poses[first[0]], c.T_cw[:3].reshape(-1))
     maps = known.table._maps[first[0]]
     assert torch.equal(maps[2], c.known.prior_depth)
-    assert torch.equal(known.table._greys[first[0]], c.photo.grey)
+    assert torch.equal(known.table._photos[first[0]], c.photo.planes)
     assert len(set(known.slots([a, b, c]))) == 3  # more at once than there should be
     assert torch.equal(known.table.poses[known.slots([a])[0]], a.T_cw[:3].reshape(-1))

@@ -98,15 +98,23 @@ def started(points: torch.Tensor, seed: int = 0, start="local_plane", **settings
     return new_disks(points, torch.zeros(3), footprint, points[:0], config, random, start)
 
 
-def test_random_disks_are_round_and_turned_anyhow_with_3dgs_scales():
-    points = plane(60, 0.04)
-    disks = started(points, start="random", opacity=0.6)
-    assert torch.equal(disks.position, points)
-    assert torch.equal(disks.log_scale[:, 0], disks.log_scale[:, 1])
+def test_unbounded_scales_are_3dgs_s_and_far_points_make_blankets():
+    points = torch.cat([plane(30, 0.04), torch.tensor([[0.0, 0.0, 40.0]])])
+    free = started(points, bound_spacing=False, scale_factor=1.0, planarity_threshold=0.0)
     # The three nearest of a grid with spacings 0.04 and 0.04 * sqrt(1.25): 0.04 twice, 0.0447.
-    inner = (points[:, :2].abs() < 1.0).all(1)
+    inner = (points[:-1, :2].abs() < 0.4).all(1)
     expected = torch.tensor((2 * 0.04**2 + 1.25 * 0.04**2) / 3).sqrt()
-    assert torch.allclose(disks.log_scale[inner].exp(), expected, rtol=1e-3)
+    assert torch.allclose(free.log_scale[:-1][inner].exp(), expected, rtol=1e-3)
+    assert free.log_scale[-1].exp().min() > 35
+    bounded = started(points, scale_factor=1.0)
+    assert bounded.log_scale[-1].exp().max() < 1.51 * 0.04
+
+
+def test_random_disks_differ_from_those_in_planes_by_their_orientation_alone():
+    points = plane(60, 0.04)
+    disks, planes = started(points, start="random", opacity=0.6), started(points, opacity=0.6)
+    assert torch.equal(disks.position, points)
+    assert torch.equal(disks.log_scale, planes.log_scale)
     assert torch.allclose(disks.opacity_logit.sigmoid(), torch.tensor(0.6))
     assert torch.allclose(disks.quaternion.norm(dim=1), torch.tensor(1.0))
     normal = quaternion_to_matrix(disks.quaternion)[..., 2]

@@ -19,6 +19,7 @@ from geogs.application.settings import ReconstructSettings
 from geogs.application.snapshots import Snapshots
 from geogs.application.surfaces import write_depth_mesh
 from geogs.config import ReconstructConfig
+from geogs.config.idle import idle_settings
 from geogs.gpu.installation import require_device
 from geogs.io.sources.posed.base import PosedSource
 from geogs.io.sources.posed.check import check_poses
@@ -89,6 +90,8 @@ def reconstruct_to_folder(
     clock = _Clock(settings.budget)
     progress, stop = progress or RunProgress(), stop or Stop()
     config, device = settings.config, require_device(settings.device)
+    for sentence in idle_settings(config):
+        progress.write(f"note: {sentence}")
     source = open_posed_source(settings.source, config.input, settings.hold_out)
     output = Path("out") / source.name
     if not settings.resume:

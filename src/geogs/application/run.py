@@ -20,12 +20,13 @@ from geogs.application.results import write_results
 from geogs.application.run_checkpoint import RunCheckpoint, RunFacts, SavedRun, frames_after
 from geogs.application.settings import RunSettings
 from geogs.application.shutter import with_shutter_found
-from geogs.application.surfaces import write_depth_mesh, write_online_results
+from geogs.application.surfaces import write_depth_mesh, write_stage
+from geogs.config.idle import idle_settings
 from geogs.errors import DeviceError, InputError
 from geogs.gpu.installation import require_device
 from geogs.io.sources.sniff import Stream, open_source
 from geogs.io.writers.atomic import prepare_output_folder
-from geogs.slam import Slam
+from geogs.slam import Progress, Slam
 from geogs.stopwatch import Stopwatch
 from geogs.threads import on_one_torch_thread
 from geogs.types import Frame
@@ -45,6 +46,8 @@ def run(
     """
     progress, stop = progress or RunProgress(), stop or Stop()
     config, device = settings.config, require_device(settings.device)
+    for sentence in idle_settings(config):
+        progress.write(f"note: {sentence}")
     opened = open_source(settings.source, config.input)
     wanted = settings.output or free_folder(Path("out") / opened.name, opened.fingerprint())
     output = prepare_output_folder(wanted)
@@ -162,7 +165,7 @@ class _Run:
             if not interrupted:
                 kept = checkpoint.write(slam, source)
             if settings.online_results:
-                write_online_results(output, slam, progress)
+                write_stage(output, slam, progress, "online")
             interrupted |= not self._finish(correct=not interrupted)
             result = Result(slam, source, interrupted, progress)
             more = [lambda: write_depth_mesh(output, slam, progress)]
@@ -209,7 +212,8 @@ class _Run:
             self.stop.check()
 
         try:
-            self.slam.finish(report, correct)
+            if correct:
+                self._adjust_and_refine(report)
         except KeyboardInterrupt:
             if not self.stop.requested:
                 raise
@@ -221,6 +225,13 @@ class _Run:
             )
             return False
         return True
+
+    def _adjust_and_refine(self, report: Progress) -> None:
+        slam = self.slam
+        slam.adjust(report)
+        if self.settings.online_results and slam.will_refine:
+            write_stage(self.output, slam, self.progress, "adjusted")
+        slam.refine(report)
 
 
 def _timed(frames: Iterator[Frame], stopwatch: Stopwatch) -> Iterator[Frame]:

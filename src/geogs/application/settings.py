@@ -27,7 +27,8 @@ class RunSettings(Settings):
     checkpoint_every: Weight = 60.0
     """Seconds between two checkpoints, from which --resume goes on; 0 makes none."""
     online_results: bool = False
-    """Also write trajectory and mesh as they are before the final stages, to online/."""
+    """Also write trajectory and mesh as they are after the stream, to online/, and after the final
+    bundle adjustment and the map's update, to adjusted/, where a refinement follows."""
     depth_mesh: bool = False
     """Also fuse the keyframes' depths without the disks, to depth_fusion/mesh.ply."""
     keyframe_images: bool = True

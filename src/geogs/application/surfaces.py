@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Literal
 
 from geogs.application.progress import RunProgress
 from geogs.application.scene import MappedScene
@@ -63,11 +64,17 @@ def write_depth_mesh(output: Path, scene: MappedScene, progress: RunProgress) ->
         write_surface(path, scene.depth_maps(), scene.config.mesh, progress, "depth mesh")
 
 
-def write_online_results(output: Path, scene: MappedScene, progress: RunProgress) -> None:
-    """``online/``: trajectories and mesh as they stand, before the final stages."""
-    with scene.stopwatch("online results"):
-        folder = output / "online"
+def write_stage(
+    output: Path, scene: MappedScene, progress: RunProgress, name: Literal["online", "adjusted"]
+) -> None:
+    """Trajectories and mesh as they stand, to a folder of the stage's name.
+
+    ``online`` is the end of the stream, ``adjusted`` what the final bundle adjustment and the map's
+    update have made of it.
+    """
+    with scene.stopwatch(f"{name} results"):
+        folder = output / name
         write_tum_trajectory(folder / "trajectory.tum", scene.trajectory())
         write_tum_trajectory(folder / "keyframes.tum", scene.keyframe_trajectory())
         path = folder / "mesh.ply"
-        write_surface(path, scene.renders(), scene.config.mesh, progress, "online mesh")
+        write_surface(path, scene.renders(), scene.config.mesh, progress, f"{name} mesh")

@@ -7,6 +7,7 @@ from geogs.config.input import InputConfig
 from geogs.config.losses import LossConfig
 from geogs.config.mapping import MappingConfig, PhotoConfig
 from geogs.config.mesh import MeshConfig
+from geogs.config.paper import paper_known_pose_mapping
 from geogs.config.setting import Basic, Count, Range, Settings
 from geogs.config.slam import Preset, Seed
 
@@ -85,7 +86,7 @@ def reconstruct_preset(name: Preset) -> ReconstructConfig:
     """The settings of a preset for known poses.
 
     ``fast`` works on small images and searches depths once; ``accurate``, for a GPU, renders at the
-    size of the images.
+    size of the images; ``paper`` is the latter with the losses and the start of the paper.
     """
     base = ReconstructConfig()
     if name == "fast":
@@ -95,12 +96,13 @@ def reconstruct_preset(name: Preset) -> ReconstructConfig:
             search=replace(base.search, repeat=False, steps_per_view=15),
             mapping=replace(base.mapping, render_long_edge=256),
         )
-    if name == "accurate":
+    if name in ("accurate", "paper"):
         disk = replace(base.mapping.disk, stride=5)
+        mapping = replace(base.mapping, render_long_edge=800, photo_scale=1.0, disk=disk)
         return replace(
             base,
             input=replace(base.input, long_edge=800),
             search=replace(base.search, steps_per_view=200, most_steps_per_view=1000),
-            mapping=replace(base.mapping, render_long_edge=800, photo_scale=1.0, disk=disk),
+            mapping=mapping if name == "accurate" else paper_known_pose_mapping(mapping),
         )
     return base

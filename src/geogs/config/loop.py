@@ -94,8 +94,8 @@ class LoopConfig(Settings, group="loop"):
     """Largest distance between their centres, of the keyframe's median depth."""
     measured: Count = 48
     """Most such pairs, nearest first, whose flow distance is computed: bounds the cost."""
-    appearance: Count = 5
-    """Candidates taken from the index per keyframe."""
+    appearance: CountOrZero = 5
+    """Candidates taken from the index per keyframe; 0 looks only where the present poses say."""
     min_score: Share = 0.05
     """Least similarity of such a candidate, of that of a keyframe with itself."""
     verified: Count = 4
@@ -111,6 +111,10 @@ class LoopConfig(Settings, group="loop"):
     strain: Weight = 5.0
     """Squared error of a loop at the present poses, in its own variances, from which it calls for a
     correction. Variances are cautious: right loops come to 1 or 2, where 7 would be exact."""
+    matches: bool = False
+    """Adjust the matches of loops and of the frame graph together with the relative poses, depths
+    included, when a loop is closed (the paper's Sim(3) bundle adjustment); off leaves it at the
+    relative poses."""
     kept: Count = 200
     """Relative poses of loops from which on older ones are thinned out."""
     min_change: Weight = 0.002

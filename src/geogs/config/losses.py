@@ -44,7 +44,7 @@ class LossConfig(Settings, group="mapping.loss"):
     min_alpha: Annotated[float, Range(0, below=1)] = 0.5
     """Rendered depth and normals count where alpha exceeds this."""
     l1_weight: Weight = 1.0
-    """L_1, grey difference between a view and its neighbour warped into it."""
+    """L_1, difference between a view and its neighbour warped into it."""
     l1_huber: Share = 0.02
     """Grey difference (of 1) up to which L_1 is quadratic; 0 for the plain absolute value."""
     l1_cut: Annotated[float, Range(above="l1_huber", most=10)] = 0.2
@@ -66,6 +66,11 @@ class LossConfig(Settings, group="mapping.loss"):
     occlusion: Annotated[float, Range(above=0, most=1e6)] = 2.25
     """Depth difference to the neighbour's depth from which a pixel is hidden, in pixels of the
     photometric image that it is worth at 10 degrees of parallax."""
+    occlusion_share: Annotated[float, Range(0, below=1)] = 0.0
+    """The same as a part of the depth whatever the camera, the paper's tau; 0 takes the pixels."""
+    colour: bool = False
+    """L_1 and L_ssim over red, green and blue, as the paper has it, instead of grey; L_ncc is grey
+    always."""
     photo_blur: Annotated[float, Range(0, 100)] = 0.3
     """Standard deviation in pixels by which the photometric images are smoothed."""
     ablation: LossAblation = field(default_factory=LossAblation)

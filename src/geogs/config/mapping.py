@@ -40,6 +40,9 @@ class DiskConfig(Settings, group="mapping.disk"):
     """Points of the local plane fit."""
     scale_factor: Positive = 0.6
     """Initial standard deviation in distances to the nearest points."""
+    bound_spacing: bool = True
+    """Keep that distance within 0.3 to 1.5 of the distance between samples, so that a stray point
+    makes neither a speck nor a blanket; off as in the paper."""
     planarity_threshold: Share = 0.05
     """Below this planarity the initial scale shrinks."""
     planarity_shrink: Positive = 0.5
@@ -59,6 +62,8 @@ class DiskConfig(Settings, group="mapping.disk"):
     """When that is, in parts of that training."""
     split_pixels: Weight = 1.0
     """Disks with no standard deviation above this many pixels at u are not split."""
+    carve: bool = True
+    """Remove disks that stand in the free space of keyframes, and make none there."""
     carve_every: Annotated[Count, Only("run")] = 10
     """Keyframes between votes of all keyframes against disks in free space."""
 
@@ -79,6 +84,9 @@ class PhotoConfig(Settings, group="mapping.photo"):
     """Partners kept per keyframe."""
     per_step: Annotated[int, Range(1, 64)] = 2
     """Partners drawn in each step."""
+    fresh: bool = False
+    """Render the partners anew in every step for the occlusion test, as the paper does; off takes
+    what they showed when they were trained last."""
     level: bool = True
     """Bring all keyframes into the same light (gain and offset of their grey values) for L_1."""
 
@@ -88,8 +96,7 @@ class MapAblation(Settings, group="mapping.ablation"):
     """Other ways to start disks and to move them, to compare with."""
 
     initialisation: Literal["local_plane", "random"] = "local_plane"
-    """Disks start in the plane of the points around them, or round, turned at random and as large
-    as those points are apart (3DGS's start)."""
+    """Disks start in the plane of the points around them, or as large but turned at random."""
     map_update: Annotated[Literal["blended", "coherent", "per_keyframe"], Only("run")] = "blended"
     """How the map follows a correction of the poses: each disk with all keyframes that see it in
     place, all by one similarity (the paper's), or each with the keyframe that made it."""
@@ -117,6 +124,9 @@ class MappingConfig(Settings, group="mapping"):
     """Single-view steps over all keyframes after the final bundle adjustment; 0 stops online."""
     final_depth: Annotated[bool, Only("run")] = True
     """Search all keyframe depths once more with the final poses."""
+    final_pose_rounds: Annotated[CountOrZero, Only("run")] = 0
+    """Times that the final training pauses to refine the poses of all keyframes against the map, in
+    windows that overlap by half; 0 leaves them to the final bundle adjustment."""
     lr_position: Weight = 6e-4
     """Adam step of positions, in u."""
     lr_quaternion: Weight = 4e-3

@@ -8,11 +8,12 @@ from geogs.config.input import InputConfig
 from geogs.config.loop import LoopConfig
 from geogs.config.mapping import MappingConfig
 from geogs.config.mesh import MeshConfig
+from geogs.config.paper import LONG_EDGE, paper_loops, paper_mapping, paper_prior
 from geogs.config.prior import PriorConfig
 from geogs.config.setting import Count, Range, Settings
 from geogs.config.tracking import TrackingConfig
 
-Preset = Literal["fast", "default", "accurate"]
+Preset = Literal["fast", "default", "accurate", "paper"]
 Seed = Annotated[int, Range(0, 2**32 - 1)]
 
 
@@ -37,7 +38,8 @@ class Config(Settings):
 def preset(name: Preset) -> Config:
     """The settings of a preset.
 
-    ``fast`` stops after the online map; ``accurate`` works on larger images and trains longer.
+    ``fast`` stops after the online map; ``accurate`` works on larger images and trains longer;
+    ``paper`` does what the GeoGS-SLAM paper does.
     """
     base = Config()
     if name == "fast":
@@ -48,4 +50,12 @@ def preset(name: Preset) -> Config:
     if name == "accurate":
         mapping = replace(base.mapping, render_long_edge=400, iterations=15, final_iterations=1500)
         return replace(base, input=replace(base.input, long_edge=640), mapping=mapping)
+    if name == "paper":
+        return replace(
+            base,
+            input=replace(base.input, long_edge=LONG_EDGE),
+            prior=paper_prior(),
+            loop=paper_loops(),
+            mapping=paper_mapping(),
+        )
     return base

@@ -22,6 +22,10 @@ def depth_engine(
     classical = _classical(device, render, working, config, resident)
     if config.engine == "classical":
         return classical
+    if config.engine == "tracker":
+        from geogs.depth.tracker import TrackerDepthEngine
+
+        return TrackerDepthEngine(classical, torch.device(device), render, working)
     from geogs.depth.network.engine import NetworkDepthEngine
     from geogs.depth.network.weights import load_depth_network
     from geogs.networks.weights_files import find_weights

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from geogs.config import LoopConfig
 from geogs.geometry.lie import se3_inverse, sim3_inverse
+from geogs.loop.closing_matches import closing_matches, take_over_depths
 from geogs.loop.closure import close_loops
 from geogs.loop.constraints import (
     between_positions,
@@ -221,9 +222,14 @@ class LoopCloser:
         steps = ~relative.is_loop & ((relative.target - relative.source).abs() == 1)
         if not bool(steps.any()):
             return  # hardly anything matches: nothing tells how far the camera has drifted
-        closure = close_loops(ids, world.keyframes.poses(ids), relative)
+        edges, matches = world.graph.edges, None
+        if self.config.matches:
+            matches = closing_matches(world.keyframes, edges, self.detector.loops)
+        closure = close_loops(ids, world.keyframes.poses(ids), relative, matches)
         if closure is None or self._change(closure.correction) < self.config.min_change:
             return
+        if closure.inverse_depth is not None:
+            take_over_depths(world.keyframes, edges, closure.inverse_depth)
         world.keyframes.correct(closure.correction)
         known.rescale(closure.correction)
         self.closures += 1

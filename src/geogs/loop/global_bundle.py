@@ -60,7 +60,7 @@ def global_bundle(
     if progress is not None:
         progress(1.0, "all keyframes adjusted")
     after = {k: store[k].T_cw for k in ids}
-    correction = PoseCorrection(before, after, dict.fromkeys(ids, 1.0))
+    correction = PoseCorrection(before, after, dict.fromkeys(ids, 1.0), of_all=True)
     store.correct(correction)
     return correction
 

@@ -25,7 +25,7 @@ _PARALLAX = 10.0
 
 @dataclass(frozen=True, eq=False)
 class PhotoView:
-    """What the multi-view losses know of a view: its smoothed grey image and where it was taken."""
+    """What the multi-view losses know of a view: its smoothed image and where it was taken."""
 
     grey: Float[Tensor, "h w"]
     """Luma in [0, 1] at photometric size, smoothed; float32."""
@@ -33,6 +33,8 @@ class PhotoView:
     """Intrinsics at photometric size."""
     T_cw: Float[Tensor, "4 4"]
     """World to camera, float64."""
+    colours: Float[Tensor, "3 h w"] | None = None
+    """Red, green and blue in [0, 1], smoothed; where they are compared."""
 
     @staticmethod
     def prepare(
@@ -41,6 +43,7 @@ class PhotoView:
         T_cw: Float[Tensor, "4 4"],
         blur: float = 0.7,
         device: torch.device | str = "cpu",
+        with_colour: bool = False,
     ) -> "PhotoView":
         """View of an RGB image (any size) by ``camera``, whose size is the photometric size.
 
@@ -52,12 +55,36 @@ class PhotoView:
                 f"the photometric image is {camera.width}x{camera.height} pixels: it needs at "
                 "least 16 on each side; choose a larger size"
             )
-        grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-        grey = cv2.resize(grey, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
-        grey = grey.astype(np.float32) / 255
-        if blur > 0:
-            grey = cv2.GaussianBlur(grey, (0, 0), blur)
-        return PhotoView(torch.from_numpy(grey).to(device), camera, T_cw.detach().double())
+        planes = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)]
+        planes += [np.ascontiguousarray(image[..., k]) for k in range(3)] if with_colour else []
+        size = (camera.width, camera.height)
+        smooth = []
+        for plane in planes:
+            small = cv2.resize(plane, size, interpolation=cv2.INTER_AREA).astype(np.float32) / 255
+            smooth.append(cv2.GaussianBlur(small, (0, 0), blur) if blur > 0 else small)
+        return PhotoView.of(torch.from_numpy(np.stack(smooth)).to(device), camera, T_cw)
+
+    @staticmethod
+    def of(
+        planes: Float[Tensor, "k h w"], camera: Camera, T_cw: Float[Tensor, "4 4"]
+    ) -> "PhotoView":
+        """The view of a grey image, followed by red, green and blue or by nothing."""
+        colours = planes[1:] if len(planes) > 1 else None
+        return PhotoView(planes[0], camera, T_cw.detach().double(), colours)
+
+    @property
+    def planes(self) -> Float[Tensor, "k h w"]:
+        """The grey image, then the colours where there are any."""
+        if self.colours is None:
+            return self.grey[None]
+        return torch.cat([self.grey[None], self.colours])
+
+    def plane(self, k: int) -> "PhotoView":
+        """The view with one of its ``planes`` for the grey image."""
+        if k == 0:
+            return self
+        assert self.colours is not None, "the view has no colours"
+        return replace(self, grey=self.colours[k - 1])
 
     def at(self, T_cw: Float[Tensor, "4 4"]) -> "PhotoView":
         """The same image with another pose."""
@@ -203,6 +230,25 @@ def depth_tolerance(pixels: float, camera: Camera) -> float:
     return pixels / (camera.fx * math.tan(math.radians(_PARALLAX)))
 
 
+def compared_planes(config: LossConfig) -> tuple[tuple[int, LossConfig], ...]:
+    """Which of the ``planes`` of two views are compared, each with the weights it has.
+
+    Grey alone, or L_1 and L_ssim as means over red, green and blue and L_ncc over grey.
+    """
+    if not config.colour:
+        return ((0, config),)
+    l1, ssim_weight = config.l1_weight / 3, config.ssim_weight / 3
+    each = replace(config, l1_weight=l1, ssim_weight=ssim_weight, ncc_weight=0.0)
+    grey = replace(config, l1_weight=0.0, ssim_weight=0.0)
+    colours = tuple((k, each) for k in (1, 2, 3)) if max(l1, ssim_weight) > 0 else ()
+    return (*colours, (0, grey)) if config.ncc_weight > 0 else colours
+
+
+def occlusion_tolerance(config: LossConfig, camera: Camera) -> float:
+    """Relative depth difference from which a pixel is hidden: tau, or what pixels come to."""
+    return config.occlusion_share or depth_tolerance(config.occlusion, camera)
+
+
 def multi_view_loss(
     depth: Float[Tensor, "h w"],
     reference: PhotoView,
@@ -218,6 +264,19 @@ def multi_view_loss(
     all pixels. Differentiable in the depth and in both views' ``T_cw``. Any dtype and device;
     :func:`geogs.losses.cpu.fused_multi_view` is the same on a CPU, faster.
     """
+    loss = depth.new_zeros(())
+    for k, weights in compared_planes(config):
+        loss = loss + _plane_loss(depth, reference.plane(k), target.plane(k), target_depth, weights)
+    return loss
+
+
+def _plane_loss(
+    depth: Float[Tensor, "h w"],
+    reference: PhotoView,
+    target: PhotoView,
+    target_depth: Float[Tensor, "dh dw"] | None,
+    config: LossConfig,
+) -> Float[Tensor, ""]:
     grey = reference.grey.to(depth.dtype)
     big = enlarge_depth(depth, *grey.shape)
     warped = warp(
@@ -231,9 +290,8 @@ def multi_view_loss(
     )
     mask = warped.in_view
     if target_depth is not None:
-        mask = occlusion_mask(
-            warped, target_depth, target.camera, depth_tolerance(config.occlusion, target.camera)
-        )
+        tolerance = occlusion_tolerance(config, target.camera)
+        mask = occlusion_mask(warped, target_depth, target.camera, tolerance)
     return photometric_loss(grey, warped.image, mask, config)
 
 

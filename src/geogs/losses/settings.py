@@ -9,7 +9,7 @@ import numpy as np
 
 from geogs.config import LossConfig
 from geogs.geometry.camera import Camera
-from geogs.losses.multi_view import MIN_DEPTH_RATIO, depth_tolerance
+from geogs.losses.multi_view import MIN_DEPTH_RATIO, occlusion_tolerance
 from geogs.losses.photometric import NCC_VARIANCE_FLOOR
 from geogs.losses.single_view import NORMAL_EPSILON
 
@@ -87,7 +87,7 @@ def photo_settings(config: LossConfig, camera: Camera, share: float = 1.0) -> Ph
     return PhotoSettings(
         camera.fx, camera.fy, camera.cx, camera.cy,
         min_depth_ratio=MIN_DEPTH_RATIO,
-        occlusion=depth_tolerance(c.occlusion, camera),
+        occlusion=occlusion_tolerance(c, camera),
         l1=share * c.l1_weight / pixels,
         huber=max(c.l1_huber, 1e-12),
         cut=c.l1_cut,

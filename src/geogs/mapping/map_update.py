@@ -2,9 +2,12 @@
 
 Each disk has an anchor, the keyframe it was made from. The correction of its anchor would carry it
 to a target position (Eq. target_position). Moving every disk to its own target tears surfaces that
-several keyframes share. The coherent update fits one Sim(3) to all targets (Eq. global_sim3): it
-tears nothing and cannot follow a drift. The blended one moves every disk with all keyframes that
-see it where it lies (:mod:`geogs.mapping.similarity_field`).
+several keyframes share. The coherent update fits one Sim(3) to the targets of all disks whose
+anchors move, the paper's revisited ones (Eq. global_sim3): it tears nothing among them and cannot
+follow a drift. Where only part of the map is revisited and one Sim(3) does not describe how it
+moves, it would tear the part from the rest, and each disk goes with its anchor. The blended one
+moves every disk with all keyframes that see it where it lies
+(:mod:`geogs.mapping.similarity_field`).
 """
 
 from collections.abc import Iterable
@@ -12,7 +15,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from geogs.errors import GeogsError
@@ -23,6 +26,11 @@ from geogs.mapping.view import MapView
 from geogs.types import PoseCorrection
 
 Strategy = Literal["blended", "coherent", "per_keyframe"]
+
+STILL = 1e-3
+"""An anchor has moved if its disks do by more than this part of their distance to its camera."""
+DESCRIBED = 0.5
+"""Part of the correction of revisited disks that one Sim(3) may leave where others stay behind."""
 
 
 @dataclass(frozen=True)
@@ -78,27 +86,75 @@ def plan_update(
     """The similarity of every disk for a pose correction, computed where the disks live.
 
     Disks whose anchor is not in the correction follow the corrected keyframe nearest in time.
-    ``per_keyframe`` moves each with its anchor, ``coherent`` all by the one Sim(3) that fits the
-    anchors' targets best, ``blended`` each with the ``witnesses`` that see it in place (with its
-    anchor where none does), evened out among neighbours; witnesses that the correction does not
-    know say nothing.
+    ``per_keyframe`` moves each with its anchor, ``coherent`` those whose anchors move by the one
+    Sim(3) that fits their targets best (:func:`coherent_similarities`), ``blended`` each with the
+    ``witnesses`` that see it in place (with its anchor where none does), evened out among
+    neighbours; witnesses that the correction does not know say nothing.
     """
     if len(position) == 0:
         return MapUpdate(torch.zeros(0, 4, 4, dtype=torch.float64), 0.0, 0.0)
     ids, similarities = anchor_transforms(correction)
-    own = similarities[_nearest_in_time(ids, anchor.cpu())].to(position.device)
+    slot = _nearest_in_time(ids, anchor.cpu()).to(position.device)
+    own = similarities.to(position.device)[slot]
     x = position.detach().double()
     target = apply_each(own, x)
     S = own
-    if strategy != "per_keyframe" and (fit := _fit_similarity(x, target)) is not None:
-        S = fit.expand(len(x), 4, 4).clone()
-        if strategy == "blended":
-            known = {int(i): n for n, i in enumerate(ids)}
-            heard = (
-                (w, similarities[known[w.keyframe_id]]) for w in witnesses if w.keyframe_id in known
-            )
-            S = blended_similarities(x, own, fit, heard)
+    if strategy == "coherent":
+        S = coherent_similarities(x, target, own, _revisited(x, target, slot, correction))
+    elif strategy == "blended" and (fit := _fit_similarity(x, target)) is not None:
+        known = {int(i): n for n, i in enumerate(ids)}
+        heard = (
+            (w, similarities[known[w.keyframe_id]]) for w in witnesses if w.keyframe_id in known
+        )
+        S = blended_similarities(x, own, fit, heard)
     return MapUpdate(S, _rms(target - x), _rms(target - apply_each(S, x)))
+
+
+def coherent_similarities(
+    x: Float[Tensor, "n 3"],
+    target: Float[Tensor, "n 3"],
+    own: Float[Tensor, "n 4 4"],
+    revisited: Bool[Tensor, "n"],
+) -> Float[Tensor, "n 4 4"]:
+    """One Sim(3) for the revisited disks, fitted to their targets; the others stay.
+
+    ``own``, the correction of each disk's anchor, where the revisited disks determine no Sim(3), or
+    where they are only a part of all and it leaves more than ``DESCRIBED`` of their correction.
+    """
+    fit = _fit_similarity(x[revisited], target[revisited])
+    if not bool(revisited.any()) or fit is None:
+        return own
+    S = torch.where(revisited[:, None, None], fit, torch.eye(4).to(x))
+    left = _rms((target - apply_each(S, x))[revisited])
+    if not bool(revisited.all()) and left > DESCRIBED * _rms((target - x)[revisited]):
+        return own
+    return S
+
+
+def _revisited(
+    x: Float[Tensor, "n 3"],
+    target: Float[Tensor, "n 3"],
+    slot: Int[Tensor, "n"],
+    correction: PoseCorrection,
+) -> Bool[Tensor, "n"]:
+    """Disks whose anchors lie where the correction begins, or later: those that were adjusted.
+
+    All of them where all keyframes were.
+    ``slot`` is an anchor's place among the corrected keyframes. It begins with the first that has
+    moved; where that is the second, with the first of all, which only holds the world in place.
+    """
+    if correction.of_all:
+        return torch.ones_like(slot, dtype=torch.bool)
+    poses = torch.stack([correction.before[i] for i in sorted(correction.after)]).double()
+    centres = se3_inverse(poses)[:, :3, 3].to(x.device)
+    way, distance = x.new_zeros(2, len(centres))
+    way.index_add_(0, slot, (target - x).norm(dim=1))
+    distance.index_add_(0, slot, (x - centres[slot]).norm(dim=1))
+    moved = (way > STILL * distance).nonzero()[:, 0]
+    if len(moved) == 0:
+        return torch.zeros_like(slot, dtype=torch.bool)
+    begin = int(moved[0])
+    return slot >= (0 if begin == 1 else begin)
 
 
 def _nearest_in_time(ids: Int[Tensor, "k"], anchor: Int[Tensor, "n"]) -> Int[Tensor, "n"]:

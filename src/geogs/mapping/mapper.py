@@ -164,6 +164,12 @@ class Mapper:
         for i, T_cw in poses.items():
             self.keyframes[i].T_cw = T_cw
 
+    def refine_all_poses(self) -> None:
+        """The same for all mapped keyframes, in windows that overlap by half, earliest first."""
+        step = max(self.config.window // 2, 1)
+        for start in range(0, max(len(self.mapped) - step, 1), step):
+            self.refine_poses(self.mapped[start : start + 2 * step])
+
     def correct(self, correction: PoseCorrection) -> MapUpdate:
         """Move the map with a global correction that the keyframes have taken over."""
         views = [v for v in self.views.values() if v.has_depth]
@@ -308,9 +314,15 @@ class Mapper:
         return map_trainer(self.map, self.cameras, self.config, unit, self.keyframes.resident)
 
     def _estimate_ahead(self, keyframe_id: int) -> None:
-        """Depths of the keyframe and of its next ones, which then check each other."""
+        """Depths of the keyframe and of its next ones, which then check each other.
+
+        The tracker's own depths are taken as they are now, of the window around, too.
+        """
         later = [i for i in self.views if i >= keyframe_id][: 1 + self.config.lag // 2]
-        self._depths.estimate([self.views[i] for i in later if not self.views[i].has_depth])
+        wanted = [i for i in later if not self.views[i].has_depth]
+        if self.config.depth.engine == "tracker":
+            wanted = [*self.mapped[-self.config.window :], *later]
+        self._depths.estimate([self.views[i] for i in wanted])
 
     def _mapped_around(self, view: MapView, count: int) -> list[MapView]:
         return views_around(view, [self.views[i] for i in self.mapped], count)
@@ -337,7 +349,7 @@ class Mapper:
         return [(v, draw_partners(v, self.views, self.config, self._random)) for v in views]
 
     def _carve(self, views: list[MapView]) -> None:
-        if len(self.map):
+        if len(self.map) and self.config.disk.carve:
             self._training().optimizer.keep(self._vote(self.map.position.detach(), views))
 
     def _vote(self, points: Float[Tensor, "n 3"], views: list[MapView]) -> Bool[Tensor, "n"]:
@@ -360,9 +372,10 @@ class Mapper:
         T_wc = view.T_wc.float().to(depth.device)
         rays = camera.rays(device=depth.device)[v, u]
         points = (rays * z[:, None]) @ T_wc[:3, :3].T + T_wc[:3, 3]
-        others = [v for v in self._mapped_around(view, _VOTERS) if v.id != view.id]
-        kept = self._vote(points, others)
-        points, z = points[kept], z[kept]
+        if disk.carve:
+            others = [v for v in self._mapped_around(view, _VOTERS) if v.id != view.id]
+            kept = self._vote(points, others)
+            points, z = points[kept], z[kept]
         if len(points) + len(self.map) < disk.neighbours or len(points) == 0:
             return
         footprint = disk.stride * z / camera.fx
@@ -383,7 +396,9 @@ class Mapper:
         trainer = self._training()
         fills, prunes = {total // 3, 2 * total // 3}, max(total // 4, 1)
         splits = {int(total * part) for part in self.config.disk.split_times}
-        events = fills | splits | set(range(prunes, total, prunes))
+        rounds = self.config.final_pose_rounds
+        poses = {total * (n + 1) // (rounds + 1) for n in range(rounds)}
+        events = fills | splits | poses | set(range(prunes, total, prunes))
         stops = sorted(events | set(range(_REPORTED_STEPS, total, _REPORTED_STEPS)) | {total})
         done = self.trained.steps
         for stop in (stop for stop in stops if stop > done):
@@ -405,6 +420,8 @@ class Mapper:
                 self.prune()
             if done in splits:
                 self._split()
+            if done in poses:
+                self.refine_all_poses()
             if done in fills:
                 for view in views:
                     self._insert(view, self.config.disk.fill_confidence)

@@ -68,7 +68,7 @@ class MapView:
     @property
     def photo(self) -> PhotoView:
         """What the multi-view losses need."""
-        return PhotoView(self.pool.maps(self.id).photo, self.pool.cameras.photo, self.T_cw)
+        return PhotoView.of(self.pool.maps(self.id).photo, self.pool.cameras.photo, self.T_cw)
 
     @property
     def light(self) -> Float[Tensor, "2"]:

@@ -29,8 +29,8 @@ class ViewMaps:
     grey: Float32[np.ndarray, "h w"]
     fine: Float32[np.ndarray, "fh fw"]
     """Of the :class:`DepthView`."""
-    photo: Float[Tensor, "ph pw"]
-    """Smoothed grey image of the :class:`PhotoView` in the light of all, on the map's device."""
+    photo: Float[Tensor, "k ph pw"]
+    """Planes of the :class:`PhotoView` in the light of all, on the map's device."""
     normal: Float[Tensor, "h w 3"] | None
     """A prior's normals at the render size, on the map's device."""
     depth: DenseDepth | None = None
@@ -282,15 +282,15 @@ class ViewPool:
         """The maps of a view; its depth at the keyframe's scale, or as it was archived."""
         cameras, loss, keyframe = self.cameras, self.loss, stored.keyframe
         image = keyframe.image
-        grey = PhotoView.prepare(
-            image, cameras.photo, keyframe.T_cw, loss.photo_blur, self.device
-        ).grey
+        photo = PhotoView.prepare(
+            image, cameras.photo, keyframe.T_cw, loss.photo_blur, self.device, loss.colour
+        ).planes
         if stored.light is not None:
-            grey = stored.light[0] * grey + stored.light[1]
+            photo = stored.light[0] * photo + stored.light[1]
         normal = None
         if loss.normal_weight:
             normal = _shrunk_normal(keyframe, cameras.render, self.device)
-        maps = ViewMaps(image, *depth_images(image, cameras.render), grey, normal)
+        maps = ViewMaps(image, *depth_images(image, cameras.render), photo, normal)
         if stored.depth is not None:
             maps.scale = stored.depth.scale if as_archived else keyframe.scale
             maps.depth = stored.depth.load(maps.scale, self.device)

@@ -109,45 +109,26 @@ def new_disks(
 
     The arguments are those of :func:`initialise_disks`; ``random`` is a generator on the CPU.
     """
-    if start == "random":
-        return random_disks(points, existing, config.neighbours, config.opacity, random)
-    return initialise_disks(
-        points, camera_centre, footprint, existing,
+    disks = initialise_disks(
+        points, camera_centre, footprint if config.bound_spacing else None, existing,
         neighbours=config.neighbours, scale_factor=config.scale_factor,
         planarity_threshold=config.planarity_threshold,
         planarity_shrink=config.planarity_shrink, opacity=config.opacity,
     )  # fmt: skip
+    return disks if start == "local_plane" else turned_at_random(disks, random)
 
 
-def random_disks(
-    points: Float[Tensor, "n 3"],
-    existing: Float[Tensor, "m 3"],
-    neighbours: int,
-    opacity: float,
-    random: torch.Generator,
-) -> DiskParameters:
-    """Round disks at ``points`` whose orientation is uniform over all rotations.
-
-    Their standard deviation is the distance to the three nearest points, as in 3DGS: its root mean
-    square, among ``neighbours`` of the points and those that are there already.
-    """
-    count = len(points)
+def turned_at_random(disks: DiskParameters, random: torch.Generator) -> DiskParameters:
+    """The same disks, of the same scales, with orientations uniform over all rotations."""
     # A normalised Gaussian sample in four dimensions is uniform on the unit quaternions.
-    quaternion = torch.randn(count, 4, generator=random).to(points)
-    quaternion = quaternion / quaternion.norm(dim=-1, keepdim=True)
-    spacing = points.new_ones(0)
-    if count:
-        spacing = fit_local_planes(points, existing, neighbours).spacing.clamp(min=1e-7)
-    log_scale = spacing.log()[:, None].expand(-1, 2).clone()
-    return DiskParameters(
-        points, quaternion, log_scale, torch.logit(points.new_full((count,), opacity))
-    )
+    quaternion = torch.randn(len(disks.position), 4, generator=random).to(disks.position)
+    return disks._replace(quaternion=quaternion / quaternion.norm(dim=-1, keepdim=True))
 
 
 def initialise_disks(
     points: Float[Tensor, "n 3"],
     camera_centre: Float[Tensor, "3"],
-    footprint: Float[Tensor, "n"],
+    footprint: Float[Tensor, "n"] | None,
     existing: Float[Tensor, "m 3"],
     *,
     neighbours: int,
@@ -160,7 +141,8 @@ def initialise_disks(
 
     ``footprint`` is the distance between neighbouring samples at each point's depth; the spacing
     is kept within [0.3, 1.5] of it so that a stray point makes neither a speck nor a blanket.
-    Where planarity is under the threshold the scale shrinks, as the paper does with a factor 0.1.
+    Without it the spacing is what it is, as in the paper. Where planarity is under the threshold
+    the scale shrinks, as the paper does with a factor 0.1.
     """
     if len(points) == 0:
         empty = points.new_zeros
@@ -172,7 +154,9 @@ def initialise_disks(
     tangent = plane.tangent - (plane.tangent * normal).sum(-1, keepdim=True) * normal
     tangent = tangent / tangent.norm(dim=-1, keepdim=True).clamp(min=1e-12)
     rotation = torch.stack([tangent, torch.linalg.cross(normal, tangent), normal], -1)
-    spacing = torch.minimum(torch.maximum(plane.spacing, 0.3 * footprint), 1.5 * footprint)
+    spacing = plane.spacing.clamp(min=1e-7)
+    if footprint is not None:
+        spacing = torch.minimum(torch.maximum(spacing, 0.3 * footprint), 1.5 * footprint)
     shrink = torch.where(plane.planarity < planarity_threshold, planarity_shrink, 1.0)
     scale = scale_factor * spacing * shrink
     logit = torch.logit(points.new_full((len(points),), opacity))

@@ -40,7 +40,7 @@ def score_motion(scene: Scene, result: ResultFolder) -> MotionScore:
     reference = read_true_poses(scene)
     if reference is None:
         raise InputError(f"{scene.name} has no true poses to compare with.")
-    estimate = result.trajectory("final")
+    estimate = result.poses()
     said = result.summary.get("verdict") or {}
     if estimate is None:
         return MotionScore(tracked=0.0, is_called_reliable=said.get("is_reliable"))

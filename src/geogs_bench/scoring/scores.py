@@ -35,7 +35,7 @@ def score(scene: Scene, command: Command, result: ResultFolder, seed: int) -> Sc
     """
     if scene.kind == "motion":
         return Scores(motion=score_motion(scene, result))
-    if command == "run":
+    if command in ("run", "update"):
         stages = score_slam(scene, result, seed)
         _draw_last(stages, result)
         return Scores(tuple(stage.score for stage in stages))
@@ -56,5 +56,5 @@ def _draw_last(stages: list[StageErrors], result: ResultFolder) -> None:
     if last.trajectory is not None:
         draw(last, result, last.trajectory.aligned)
         return
-    poses = result.trajectory("final")
+    poses = result.poses()
     draw(last, result, np.eye(4)[None] if poses is None else poses.T_wc)

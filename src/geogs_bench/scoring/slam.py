@@ -48,7 +48,7 @@ def _stage(
     seed: int,
 ) -> StageErrors:
     own = result.trajectory(stage)
-    estimate = own or result.trajectory("final")  # depth fusion has no trajectory of its own
+    estimate = own or result.poses()  # depth fusion has no trajectory of its own
     if estimate is None:
         raise InputError(f"{result.path} holds no trajectory.tum; was the run cut off?")
     errors = evaluate_trajectory(estimate, reference)

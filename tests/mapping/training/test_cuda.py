@@ -62,8 +62,8 @@ def rendered() -> list[tuple[Sample, np.ndarray]]:
     return out
 
 
-def make_views(rendered, device: torch.device) -> list[MapView]:
-    views, pool = [], ViewPool(CAMERAS, CONFIG.loss, device, 128)
+def make_views(rendered, device: torch.device, config=CONFIG) -> list[MapView]:
+    views, pool = [], ViewPool(CAMERAS, config.loss, device, 128)
     segment = segment_of([keyframe for keyframe, _ in rendered], WORKING, device)
     for keyframe, (_, depth) in zip(segment, rendered, strict=True):
         pool.add(keyframe)
@@ -109,11 +109,11 @@ def make_batches(views: list[MapView]) -> list[Batch]:
 def pair(rendered, device: torch.device) -> Callable[[], tuple[CudaTrainer, Trainer, list, list]]:
     """A CUDA and a CPU trainer of equal maps, each with its views."""
 
-    def make():
+    def make(config=CONFIG):
         cpu = torch.device("cpu")
-        fast = CudaTrainer(make_map(rendered, device), CAMERAS, CONFIG, UNIT, 128)
-        slow = Trainer(make_map(rendered, cpu), CAMERAS, CONFIG, UNIT)
-        return fast, slow, make_views(rendered, device), make_views(rendered, cpu)
+        fast = CudaTrainer(make_map(rendered, device), CAMERAS, config, UNIT, 128)
+        slow = Trainer(make_map(rendered, cpu), CAMERAS, config, UNIT)
+        return fast, slow, make_views(rendered, device, config), make_views(rendered, cpu, config)
 
     return make
 
@@ -123,8 +123,16 @@ def moved(before: torch.Tensor, a: torch.Tensor, b: torch.Tensor) -> float:
     return float((a.cpu() - b).norm() / (b - before).norm().clamp(min=1e-12))
 
 
-def test_steps_equal_those_of_the_cpu(pair, rendered) -> None:
-    fast, slow, fast_views, slow_views = pair()
+FRESH = replace(
+    CONFIG,
+    photo=replace(CONFIG.photo, fresh=True),
+    loss=replace(CONFIG.loss, colour=True, ssim_weight=0.2),
+)
+
+
+@pytest.mark.parametrize("config", [CONFIG, FRESH], ids=["default", "fresh colours"])
+def test_steps_equal_those_of_the_cpu(pair, rendered, config) -> None:
+    fast, slow, fast_views, slow_views = pair(config)
     start = [p.detach().clone() for p in make_map(rendered, torch.device("cpu")).parameters]
     factors = [1.0, 0.5, 0.7]
     fast.train(make_batches(fast_views), factors)
@@ -141,6 +149,10 @@ def test_steps_equal_those_of_the_cpu(pair, rendered) -> None:
     assert same_steps > 0.99
     assert same_seen > 0.99
     assert int(slow.disks.steps.max()) == 3
+    for a, b in zip(fast_views, slow_views, strict=True) if config is FRESH else ():
+        shown = fast.known.table.rendered_depth(fast.known.slots([a])[0]).cpu()
+        assert b.rendered_depth is not None
+        assert ((shown > 0) == (b.rendered_depth > 0)).float().mean() > 0.98
 
 
 def test_steps_without_room_are_done_again(pair) -> None:

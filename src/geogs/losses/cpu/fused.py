@@ -19,8 +19,8 @@ from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_inverse
 from geogs.losses.cpu import multi_view_kernels as multi
 from geogs.losses.cpu.single_view_kernels import single_view_rows
-from geogs.losses.multi_view import PhotoView
-from geogs.losses.photometric import ssim
+from geogs.losses.cpu.structure import structure_gradient
+from geogs.losses.multi_view import PhotoView, compared_planes
 from geogs.losses.settings import photo_settings, record, single_view_settings
 from geogs.losses.single_view import ViewConstants, visible
 from geogs.threads import run_chunks, worker_count
@@ -104,19 +104,6 @@ def _enlargement(source: int, size: int) -> tuple[np.ndarray, np.ndarray]:
     return np.stack([left, right]), share
 
 
-def _ssim_gradient(
-    reference: np.ndarray, warped: np.ndarray, mask: np.ndarray, config: LossConfig
-) -> tuple[float, np.ndarray]:
-    """Weighted L_ssim and its gradient to the warped image, by PyTorch: off by default, slow."""
-    image = torch.from_numpy(warped).requires_grad_()
-    with torch.enable_grad():
-        inside = torch.from_numpy(mask > 0)
-        loss, _ = ssim(torch.from_numpy(reference), image, inside, config.ncc_min_coverage)
-        total = config.ssim_weight / mask.size * loss.sum()
-        (gradient,) = torch.autograd.grad(total, image)
-    return float(total), gradient.numpy()
-
-
 class _MultiView(torch.autograd.Function):
     @staticmethod
     def forward(ctx, depth, T, reference, target, target_depth, config):  # type: ignore[no-untyped-def]
@@ -156,7 +143,7 @@ class _MultiView(torch.autograd.Function):
         g_image = np.zeros((2, height, width) if with_pose else (2, 0, 0), np.float32)
         if config.ssim_weight > 0:
             g_image = np.zeros((2, height, width), np.float32)
-            value, g_image[0] = _ssim_gradient(grey, warped, mask, config)
+            value, g_image[0] = structure_gradient(grey, warped, mask, config)
             total += value
 
         g_depth, g_T = np.zeros_like(small), np.zeros((4, 4))
@@ -197,4 +184,8 @@ def fused_multi_view(
     depth and, where they require it, in ``reference.T_cw`` and ``target.T_cw``.
     """
     T = target.T_cw @ se3_inverse(reference.T_cw)
-    return _MultiView.apply(depth, T, reference, target, target_depth, config)
+    loss = depth.new_zeros(())
+    for k, weights in compared_planes(config):
+        one = _MultiView.apply(depth, T, reference.plane(k), target.plane(k), target_depth, weights)
+        loss = loss + one
+    return loss

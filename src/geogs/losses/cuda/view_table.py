@@ -45,6 +45,9 @@ class ViewTable:
             capacity, len(ViewField), dtype=torch.int64, device=device
         )
         """Addresses of each slot's maps, 0 where it has none."""
+        self.planes: list[Int[Tensor, "slots fields"]] = [self.pointers]
+        """The same with each plane of the photometric image for the grey one, which comes first;
+        colours where the first slot was given some."""
         self.poses: Float[Tensor, "slots 12"] = torch.zeros(
             capacity, 12, dtype=torch.float64, device=device
         )
@@ -55,7 +58,7 @@ class ViewTable:
         """1 where the slot's rendered depth is known."""
         self._maps: list[Float[Tensor, "fields h w"]] = []
         self._normals: list[Float[Tensor, "3 h w"] | None] = []
-        self._greys: list[Float[Tensor, "ph pw"]] = []
+        self._photos: list[Float[Tensor, "k ph pw"]] = []
 
     def __len__(self) -> int:
         return len(self._maps)
@@ -67,12 +70,16 @@ class ViewTable:
             self._grow()
         size = (self.render.height, self.render.width)
         maps = torch.zeros(5, *size, device=self.device)
-        grey = self._upload(photo.grey)
-        if grey.shape != (self.photo.height, self.photo.width):
-            raise ValueError(f"the grey image has size {tuple(grey.shape)}, not the photo camera's")
+        planes = self._upload(photo.planes)
+        if planes.shape[1:] != (self.photo.height, self.photo.width):
+            raise ValueError(
+                f"the grey image has size {tuple(planes.shape[1:])}, not the photo camera's"
+            )
         self._maps.append(maps)
         self._normals.append(None)
-        self._greys.append(grey)
+        self._photos.append(planes)
+        while len(self.planes) < len(planes):
+            self.planes.append(torch.zeros_like(self.pointers))
         self._point(slot)
         if view is not None:
             self.set_constants(slot, view)
@@ -85,7 +92,7 @@ class ViewTable:
         All maps stay where they are, so captured graphs remain valid.
         """
         self._maps[slot].zero_()
-        self._greys[slot].copy_(self._upload(photo.grey))
+        self._photos[slot].copy_(self._upload(photo.planes))
         self.rendered[slot : slot + 1].zero_()
         if view is not None:
             self.set_constants(slot, view)
@@ -131,14 +138,16 @@ class ViewTable:
                                      ViewField.RENDERED_DEPTH)):  # fmt: skip
             address[field] = maps[row].data_ptr()
         address[ViewField.PRIOR_NORMAL] = 0 if normal is None else normal.data_ptr()
-        address[ViewField.GREY] = self._greys[slot].data_ptr()
-        line = torch.tensor([address[field] for field in ViewField], dtype=torch.int64)
-        self.pointers[slot].copy_(to_device(line, self.device))
+        for pointers, plane in zip(self.planes, self._photos[slot], strict=True):
+            address[ViewField.GREY] = plane.data_ptr()
+            line = torch.tensor([address[field] for field in ViewField], dtype=torch.int64)
+            pointers[slot].copy_(to_device(line, self.device))
 
     def _grow(self) -> None:
         """Double the capacity; the keyframes' maps stay where they are."""
         more = torch.zeros_like
-        self.pointers = torch.cat([self.pointers, more(self.pointers)])
+        self.planes = [torch.cat([pointers, more(pointers)]) for pointers in self.planes]
+        self.pointers = self.planes[0]
         self.poses = torch.cat([self.poses, more(self.poses)])
         self.rendered = torch.cat([self.rendered, more(self.rendered)])
         self.generation += 1

@@ -10,12 +10,13 @@ from enum import IntFlag
 from pathlib import Path
 
 import torch
-from jaxtyping import Float32, Float64, Int32
+from jaxtyping import Float32, Float64, Int32, Int64
 from torch import Tensor
 
 from geogs.config import LossConfig
 from geogs.gpu.kernels import kernels_for
 from geogs.losses.cuda.view_table import ViewTable
+from geogs.losses.multi_view import compared_planes
 from geogs.losses.settings import photo_settings, single_view_settings
 
 _SOURCE = Path(__file__).with_name("losses.cu")
@@ -65,6 +66,11 @@ class WindowLosses:
         self._photo = partners > 0 and max(weights) > 0
         self._view_settings = self._uploaded(single_view_settings(config, table.render, unit))
         self._photo_settings = self._uploaded(photo_settings(config, table.photo, pair_share))
+        self._compared = [
+            (k, c, self._uploaded(photo_settings(c, table.photo, pair_share)))
+            for k, c in compared_planes(config)
+        ]
+        """Planes of the photometric images with their weights."""
         self._allocate()
 
     def _uploaded(self, settings: tuple[float | bool, ...]) -> Float32[Tensor, "k"]:
@@ -83,7 +89,7 @@ class WindowLosses:
         self._targets = torch.full((pairs,), -1, dtype=torch.int32, device=device)
         size = (pairs if self._photo else 0, photo.height, photo.width)
         self._warped, self._pull = maps(*size), maps(*size)
-        two_measures = c.ssim_weight > 0 and c.ncc_weight > 0
+        two_measures = c.ssim_weight > 0 and c.ncc_weight > 0 and not c.colour
         held = self._photo and (self._with_pose or two_measures)
         self._image_gradient = maps(*size) if held else None
 
@@ -136,18 +142,23 @@ class WindowLosses:
             self._view_settings, depth, normal, alpha, distortion, self._inverse_median,
             self._clean, d_depth, d_normal, d_alpha, d_distortion, loss, height, width,
         )  # fmt: skip
-        if self._photo:
-            self._launch_pairs(batch, d_depth, loss, relative_gradient)
+        for plane, weights, settings in self._compared if self._photo else ():
+            self._launch_pairs(
+                t.planes[plane], weights, settings, batch, d_depth, loss, relative_gradient
+            )
 
     def _launch_pairs(
         self,
+        pointers: Int64[Tensor, "slots fields"],
+        c: LossConfig,
+        settings: Float32[Tensor, "k"],
         batch: Int32[Tensor, "b"],
         d_depth: Float32[Tensor, "b h w"],
         loss: Float32[Tensor, "b"],
         relative_gradient: Float64[Tensor, "b p 12"] | None,
     ) -> None:
-        """Adds the multi-view terms, given the visible depth and the pairs' motions."""
-        t, kernels, c = self.table, self._kernels, self.config
+        """Adds the multi-view terms of a plane, given the visible depth and the pairs' motions."""
+        t, kernels = self.table, self._kernels
         pairs = self.views * self.partners
         height, width = t.photo.height, t.photo.width
         sizes = (t.render.height, t.render.width, height, width, self.partners)
@@ -156,21 +167,22 @@ class WindowLosses:
         columns = _blocks(width, 32)
         kernels["warp_pairs"](
             (columns, _blocks(height, _WARP_ROWS), pairs), (32, 8), batch, self._targets,
-            self._motions, t.pointers, t.rendered, self._photo_settings, self._clean, self._warped,
+            self._motions, pointers, t.rendered, settings, self._clean, self._warped,
             self._pull, self._image_gradient, loss, *sizes, sobel, not windowed,
         )  # fmt: skip
         keep = _Flags.KEEP_GRADIENT if self._with_pose else _Flags(0)
         if c.ssim_weight > 0:
             flags = _Flags(0) if c.ncc_weight > 0 else _Flags.FINISH | keep
-            self._compare("compare_structure", _SSIM_HALF, batch, loss, flags)
+            self._compare("compare_structure", _SSIM_HALF, pointers, settings, batch, loss, flags)
         if c.ncc_weight > 0:
             earlier = _Flags.ADD_EARLIER if c.ssim_weight > 0 else _Flags(0)
             flags = earlier | _Flags.FINISH | keep
-            self._compare(f"correlate_{c.ncc_patch}", c.ncc_patch // 2, batch, loss, flags)
+            kernel, half = f"correlate_{c.ncc_patch}", c.ncc_patch // 2
+            self._compare(kernel, half, pointers, settings, batch, loss, flags)
         if relative_gradient is not None:
             kernels["motion_gradient"](
                 (columns, _blocks(height, _MOTION_ROWS), pairs), (32, 8), self._targets,
-                self._motions, t.pointers, self._photo_settings, self._clean, self._warped,
+                self._motions, pointers, settings, self._clean, self._warped,
                 self._image_gradient, relative_gradient, *sizes, sobel,
             )  # fmt: skip
         grid = (_blocks(t.render.width, 32), _blocks(t.render.height, 8), self.views)
@@ -180,6 +192,8 @@ class WindowLosses:
         self,
         kernel: str,
         half: int,
+        pointers: Int64[Tensor, "slots fields"],
+        settings: Float32[Tensor, "k"],
         batch: Int32[Tensor, "b"],
         loss: Float32[Tensor, "b"],
         flags: _Flags,
@@ -188,8 +202,8 @@ class WindowLosses:
         strips = _blocks(photo.width, _STRIP - 4 * half)
         grid = (strips, _blocks(photo.height, _STRIP_ROWS), self.views * self.partners)
         self._kernels[kernel](
-            grid, _STRIP, batch, self._targets, self.table.pointers, self._photo_settings,
-            self._warped, self._pull, self._image_gradient, loss, photo.height, photo.width,
+            grid, _STRIP, batch, self._targets, pointers, settings, self._warped, self._pull,
+            self._image_gradient, loss, photo.height, photo.width,
             self.partners, _STRIP_ROWS, int(flags),
         )  # fmt: skip
 

@@ -86,6 +86,8 @@ class Trainer:
     def _in_view(self, batches: Sequence[Batch]) -> Int[Tensor, "m"]:
         """Disks that the views of some steps can see, or could after these steps."""
         views = {view.id: view for batch in batches for view, _ in batch}
+        if self.config.photo.fresh:
+            views |= {o.id: o for batch in batches for _, others in batch for o in others}
         if not views or not len(self.disks):
             return torch.zeros(0, dtype=torch.int64)
         steps = 1.5 * len(batches)  # Adam's moves are about as long as the learning rate
@@ -112,6 +114,8 @@ class Trainer:
             return 0.0
         visible = torch.zeros(len(self.disks), dtype=torch.bool, device=self.disks.device)
         total = 0.0
+        if self.config.photo.fresh:
+            self._show_partners(batch)
         for view, partners in batch:
             output = render(self.disks, self.cameras.render, view.T_cw)
             loss = view_loss(view, partners, output, self.config, self.unit)
@@ -126,6 +130,13 @@ class Trainer:
         self.optimizer.zero_grad()
         self._bound_scales()
         return total
+
+    @torch.no_grad()
+    def _show_partners(self, batch: Batch) -> None:
+        """Render the partners as the map is now, for the occlusion tests of this step."""
+        for other in {o.id: o for _, partners in batch for o in partners}.values():
+            output = render(self.disks, self.cameras.render, other.T_cw)
+            other.rendered_depth = _within(other, output.shown_depth(self.config.loss.min_alpha))
 
     @torch.no_grad()
     def _bound_scales(self) -> None:

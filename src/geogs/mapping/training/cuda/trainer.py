@@ -100,7 +100,7 @@ class _TrainingStep:
         self._kernels = kernels_for(_ADAM, disks.device)
         self.window = WindowPass(
             trainer.known.table, trainer.cameras.render, config.loss, trainer.unit, views, partners,
-            1 / config.photo.per_step, disks.capacity,
+            1 / config.photo.per_step, disks.capacity, fresh=config.photo.fresh,
         )  # fmt: skip
         integers = torch.zeros(2, dtype=torch.int32, device=disks.device)
         self._count, self._completed = integers[:1], integers[1:]
@@ -134,9 +134,9 @@ class _TrainingStep:
         self._completed.zero_()
 
     def _make_room(self) -> None:
-        rasterizer = self.window.rasterizer
-        rasterizer.reserve(int(rasterizer.status[0]))
-        rasterizer.status.zero_()
+        status = self.window.rasterizer.status
+        self.window.reserve(int(status[0]))
+        status.zero_()
         self._graph = None
 
     def _step(self) -> None:

@@ -31,7 +31,9 @@ class WindowPass:
         pair_share: float,
         capacity: int,
         for_poses: bool = False,
+        fresh: bool = False,
     ) -> None:
+        """``fresh`` renders all partners first, for the occlusion tests of the same pass."""
         device = table.device
         self.table, self.views, self.partners, self.capacity = table, views, partners, capacity
         self._generation = table.generation
@@ -47,6 +49,11 @@ class WindowPass:
         self.slots: Int[Tensor, "s"] = slots
         """Batch, then pairs, in one piece."""
         self.batch, self.pairs = slots[:views], slots[views:].view(views, partners)
+        self._partners: tuple[Rasterizer, Maps] | None = None
+        if fresh and partners > 0:
+            shown = Rasterizer(capacity, views * partners, camera, NEAR, device)
+            shown.status = self.rasterizer.status  # both have room, or neither counts
+            self._partners = shown, Maps.empty(camera, (views * partners,), capacity, device)
         self.loss: Float[Tensor, "b"] = torch.zeros(views, device=device)
         sizes = ((3,), (4,), (2,), ())
         self.d_disks: DiskParameters | None = None
@@ -65,8 +72,21 @@ class WindowPass:
         """Whether the map or the table have moved in memory since."""
         return self.table.generation != self._generation or disks.capacity != self.capacity
 
+    def reserve(self, entries: int) -> None:
+        """Make room in the lists for so many entries in all."""
+        self.rasterizer.reserve(entries)
+        if self._partners is not None:
+            self._partners[0].reserve(entries)
+
     def launch(self, disks: DiskParameters, count: Int[Tensor, "1"]) -> None:
         """Maps, losses and gradients of the views in ``batch``; ``disks`` have all their room."""
+        if self._partners is not None:
+            shown, maps = self._partners
+            others = self.pairs.view(-1)
+            seen = Views(self.table.poses, others, count)
+            shown.project(disks, seen, maps)
+            shown.blend(seen, maps, with_trace=False)
+            self.losses.store_rendered(others, maps.depth, maps.alpha)
         views = Views(self.table.poses, self.batch, count)
         m, d = self.maps, self._gradients
         self.rasterizer.project(disks, views, m)

@@ -1,0 +1,76 @@
+"""Settings that change nothing beside others: what to tell who has given them."""
+
+from collections.abc import Iterator
+
+from geogs.config.known_poses import ReconstructConfig
+from geogs.config.losses import LossConfig
+from geogs.config.mapping import DiskConfig, MappingConfig
+from geogs.config.prior import PriorConfig
+from geogs.config.slam import Config
+from geogs.config.tracking import TrackingConfig
+
+
+def idle_settings(config: Config | ReconstructConfig) -> list[str]:
+    """A sentence for every setting that was changed and does nothing, with what it would need."""
+    found = []
+    if isinstance(config, Config):
+        found += [*_tracking(config.tracking), *_prior(config.prior), *_run(config)]
+    return [*found, *_mapping(config.mapping), *_losses(config.mapping.loss)]
+
+
+def _tracking(tracking: TrackingConfig) -> Iterator[str]:
+    if tracking.weights and tracking.operator in ("auto", "classical"):
+        yield (
+            "tracking.weights does nothing: the classical operator has none; tracking.operator "
+            "own, raft or droid takes them."
+        )
+
+
+def _prior(prior: PriorConfig) -> Iterator[str]:
+    if prior.card and not prior.model:
+        yield "prior.card does nothing without prior.model."
+    if prior.normal_card and not prior.normal_model:
+        yield "prior.normal-card does nothing without prior.normal-model."
+
+
+def _run(config: Config) -> Iterator[str]:
+    mapping = config.mapping
+    if mapping.final_iterations == 0 and not mapping.final_depth:
+        yield (
+            "mapping.no-final-depth does nothing: with mapping.final-iterations 0 no depth is "
+            "searched again."
+        )
+    if mapping.pose_iterations == 0 and mapping.pose_lr != MappingConfig.pose_lr:
+        yield "mapping.pose-lr does nothing: mapping.pose-iterations is 0."
+    if mapping.final_pose_rounds and 0 in (mapping.final_iterations, mapping.pose_iterations):
+        yield (
+            "mapping.final-pose-rounds does nothing: it needs mapping.final-iterations and "
+            "mapping.pose-iterations above 0."
+        )
+    if config.loop.matches and not config.loop.enabled:
+        yield "loop.matches does nothing: no loops are looked for."
+
+
+def _mapping(mapping: MappingConfig) -> Iterator[str]:
+    if mapping.depth.weights and mapping.depth.engine in ("classical", "tracker"):
+        yield (
+            f"mapping.depth.weights does nothing: the engine {mapping.depth.engine} has none; "
+            "network or joint takes them."
+        )
+    if not mapping.disk.carve and mapping.disk.carve_every != DiskConfig.carve_every:
+        yield "mapping.disk.carve-every does nothing: mapping.disk.carve is off."
+
+
+def _losses(loss: LossConfig) -> Iterator[str]:
+    if loss.smoothness_weight == 0:
+        if loss.smoothness_eta != LossConfig.smoothness_eta:
+            yield "mapping.loss.smoothness-eta does nothing: the loss's weight is 0."
+        if loss.ablation.smoothness_rewards_edges:
+            yield (
+                "mapping.loss.ablation.smoothness-rewards-edges does nothing: "
+                "mapping.loss.smoothness-weight is 0."
+            )
+    if loss.occlusion_share > 0 and loss.occlusion != LossConfig.occlusion:
+        yield "mapping.loss.occlusion does nothing beside mapping.loss.occlusion-share."
+    if loss.colour and max(loss.l1_weight, loss.ssim_weight) == 0:
+        yield "mapping.loss.colour does nothing: L_1 and L_ssim have no weight."

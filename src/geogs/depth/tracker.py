@@ -1,0 +1,76 @@
+"""The tracker's own depth as a keyframe's dense depth: the paper's D_f, with no search."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from geogs.depth.base import DepthEngine, Limits, Progress, silent
+from geogs.depth.completion import known_cells, upsample_grid
+from geogs.depth.view import DenseDepth, DepthView, KeyframeDepth, PosedDepth
+from geogs.geometry.camera import Camera
+
+VALID_DEVIATION = 0.3
+"""Relative deviation, as the adjustment expects it, up to which a cell's depth is valid."""
+
+
+def enlarged_depth(view: DepthView, working: Camera, render: Camera) -> KeyframeDepth:
+    """Inverse depth of the tracker's grid, bilinear between the cells that are valid.
+
+    A pixel is valid, with confidence 1, where these have more than half of the weight; elsewhere it
+    has the median depth with confidence 0.
+    """
+    grid, information = view.inverse_depth, view.information
+    valid = known_cells(grid, information)
+    valid &= (VALID_DEVIATION * grid) ** 2 * information > 1
+    share = upsample_grid(valid.astype(np.float32), working, render)
+    total = upsample_grid(np.where(valid, grid, np.float32(0)), working, render)
+    sure = share > 0.5
+    typical = np.median(grid[valid]) if valid.any() else np.float32(1)
+    inverse = np.where(sure, total / np.where(sure, share, 1), typical)
+    return KeyframeDepth((1 / inverse).astype(np.float32), sure.astype(np.float32))
+
+
+class TrackerDepthEngine:
+    """Depths as the bundle adjustment has left them; a search engine votes on points, if asked."""
+
+    def __init__(
+        self, search: DepthEngine, device: torch.device, render: Camera, working: Camera
+    ) -> None:
+        self.search = search
+        self.device = device
+        self.render = render
+        self.working = working
+
+    def observe(self, view: DepthView) -> None:
+        """As in the protocol; nothing is matched."""
+
+    def estimate(
+        self,
+        references: Sequence[DepthView],
+        neighbours: Sequence[Sequence[DepthView]],
+        progress: Progress = silent,
+        limits: Sequence[Limits | None] | None = None,
+    ) -> list[DenseDepth]:
+        """As in the protocol; neighbours and limits say nothing."""
+        return [self._dense(enlarged_depth(r, self.working, self.render)) for r in references]
+
+    def check(
+        self, depths: Sequence[PosedDepth], others: Sequence[Sequence[PosedDepth]]
+    ) -> list[DenseDepth]:
+        """As in the protocol; the depths stay what they are."""
+        return [d.depth for d in depths]
+
+    def keep(self, points: Float[Tensor, "n 3"], depths: Sequence[PosedDepth]) -> Bool[Tensor, "n"]:
+        """As in the protocol."""
+        return self.search.keep(points, depths)
+
+    def _dense(self, depth: KeyframeDepth) -> DenseDepth:
+        known = depth.depth[depth.confidence > 0]
+        typical = np.median(known if known.size else depth.depth)
+        values, confidence = (
+            torch.from_numpy(m).to(self.device) for m in (depth.depth, depth.confidence)
+        )
+        return DenseDepth(values, confidence, torch.tensor(typical))

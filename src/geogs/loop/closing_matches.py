@@ -1,0 +1,64 @@
+"""The dense matches that close loops: of the frame graph, and of the loops themselves."""
+
+from collections.abc import Mapping, Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from geogs.keyframes.grid import SampleGrid
+from geogs.keyframes.store import Segment
+from geogs.loop.detect import Loop
+from geogs.loop.matched_edges import MatchedEdges
+from geogs.tracking.graph import Edge, Pair
+from geogs.tracking.moving import still_weight
+
+
+def closing_matches(
+    segment: Segment, edges: Mapping[Pair, Edge], loops: Sequence[Loop]
+) -> MatchedEdges | None:
+    """Matches between places in the segment's order, on the CPU; none where there are none.
+
+    Both directions of the frame graph's edges and of the loops within the segment; where a pair is
+    in both, the frame graph's.
+    """
+    found: dict[Pair, tuple[Tensor, Tensor]] = {}
+    for loop in loops:
+        if loop.first in segment and loop.second in segment:
+            for pair, flow in (
+                ((loop.first, loop.second), loop.there),
+                ((loop.second, loop.first), loop.back),
+            ):
+                found[pair] = flow.pixels[0], flow.weight[0]
+    found |= {pair: (edge.pixels, edge.weight) for pair, edge in edges.items()}
+    if not found:
+        return None
+    pairs, ids = sorted(found), segment.ids
+    place = {k: n for n, k in enumerate(ids)}
+    pixels = torch.stack([found[p][0] for p in pairs])
+    weight = torch.stack([found[p][1] for p in pairs])
+    grid = SampleGrid(segment.grid.camera) if segment.grid.on_gpu else segment.grid
+    return MatchedEdges(
+        grid.camera,
+        grid.rays,
+        segment.inverse_depths(ids).cpu(),
+        torch.tensor([place[i] for i, _ in pairs]),
+        torch.tensor([place[j] for _, j in pairs]),
+        pixels.cpu().float(),
+        still_weight(segment, pairs, pixels, weight).cpu().float(),
+    )
+
+
+def take_over_depths(
+    segment: Segment, edges: Mapping[Pair, Edge], inverse_depth: Float[Tensor, "n p"]
+) -> None:
+    """Give keyframes the inverse depth that a closing has found, before its scales are applied.
+
+    Only those of the frame graph: what is left of the matches of others is a loop's, which alone
+    says less of a depth than all those that have made it.
+    """
+    sources = {i for i, _ in edges}
+    for id, own in zip(segment.ids, inverse_depth, strict=True):
+        if id in sources:
+            keyframe = segment[id]
+            keyframe.inverse_depth = own.to(keyframe.inverse_depth)

@@ -1,0 +1,78 @@
+"""One map as the stream has left it, corrected again and again: the rules of its update alone.
+
+The paper saves the map before its final bundle adjustment and moves that one map by every rule.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+
+from geogs.application.priors import open_prior
+from geogs.application.progress import RunProgress
+from geogs.application.result import Result
+from geogs.application.results import write_results
+from geogs.application.run_checkpoint import RunCheckpoint, RunFacts, SavedRun
+from geogs.application.settings import RunSettings
+from geogs.application.shutter import with_shutter_found
+from geogs.errors import InputError
+from geogs.gpu.installation import require_device
+from geogs.io.sources.sniff import open_source
+from geogs.io.writers.atomic import prepare_output_folder
+from geogs.slam import Slam
+from geogs.threads import on_one_torch_thread
+
+FOLDER = "before"
+"""Beside the folders of the variants: the map before its correction."""
+
+
+@on_one_torch_thread
+def correct_saved_map(settings: RunSettings, output: Path, progress: RunProgress) -> None:
+    """Move the map that the stream has left by the settings' rule; write what comes of it.
+
+    The first call in a place runs the stream and keeps a checkpoint of its end; others with the
+    same settings but for the rule start from there.
+
+    Raises:
+        InputError: the source or a setting cannot be used, or no map was started.
+        OutputError, DeviceError, TrackingLost: as of a run.
+    """
+    settings = settings.absolute()
+    place = output.parent / FOLDER
+    saved = _saved(place, settings) or _run_stream(place, settings, progress)
+    source = saved.calibrated(open_source(settings.source, settings.config.input))
+    slam = Slam(source.camera, settings.config, str(require_device(settings.device)))
+    saved.restore(slam)
+    slam.adjust(progress.stage)
+    write_results(output, Result(slam, source, False, progress), keyframe_images=False)
+
+
+def _saved(place: Path, settings: RunSettings) -> SavedRun | None:
+    """The checkpoint of the same stream, if there is one."""
+    try:
+        saved = SavedRun(place)
+    except InputError:
+        return None
+    same = _without_rule(saved.facts.settings) == _without_rule(settings)
+    return saved if same else None
+
+
+def _run_stream(place: Path, settings: RunSettings, progress: RunProgress) -> SavedRun:
+    """Track and map up to the end of the stream, and keep that."""
+    config, device = settings.config, require_device(settings.device)
+    source = with_shutter_found(open_source(settings.source, config.input))
+    slam = Slam(source.camera, config, str(device), open_prior(config.prior, source.camera, device))
+    facts = RunFacts(settings, device.type, source.fingerprint(), None, shutter=source.shutter)
+    progress.expect(source.length)
+    for frame in source:
+        progress.frame(slam.process(frame))
+    slam.end_stream()
+    if not RunCheckpoint(prepare_output_folder(place), facts, 1.0, progress).write(slam, source):
+        raise InputError("no map was started; there is nothing to correct.")
+    return SavedRun(place)
+
+
+def _without_rule(settings: RunSettings) -> RunSettings:
+    """All that decides about the map before it is corrected at the end."""
+    config = settings.deciding().config
+    ablation = replace(config.mapping.ablation, map_update="coherent")
+    mapping = replace(config.mapping, ablation=ablation)
+    return replace(settings.deciding(), config=replace(config, mapping=mapping))

@@ -1,0 +1,41 @@
+"""One map before its correction, moved by several rules: the stream is run once."""
+
+import json
+
+import numpy as np
+import pytest
+
+from geogs.io.poses import read_tum_trajectory
+from geogs.io.writers.native import load_map
+from geogs_bench.commands import UpdateRunner
+from geogs_bench.runner import Task
+from geogs_bench.saved_map import FOLDER
+from geogs_bench.scene import Option
+
+pytestmark = pytest.mark.system
+
+TINY = {
+    "stop": "24", "mapping.render-long-edge": "64", "mapping.iterations": "1",
+    "mapping.pose-iterations": "0", "mapping.final-iterations": "0",
+    "tracking.init-keyframes": "6", "mapping.depth.min-planes": "24",
+    "mapping.depth.max-planes": "48", "device": "cpu",
+}  # fmt: skip
+
+
+def test_every_rule_moves_the_same_map_by_the_same_correction(small_room, tmp_path):
+    rules = ["per_keyframe", "coherent"]
+    checkpoints = []
+    for rule in rules:
+        options = {**TINY, "mapping.ablation.map-update": rule}
+        given = (*(Option(k, v) for k, v in options.items()), Option("loop.no-enabled"))
+        UpdateRunner().run(Task("update", small_room, tmp_path / rule, given))
+        manifest = tmp_path / FOLDER / "checkpoint" / "manifest.json"
+        checkpoints.append((manifest.stat().st_mtime_ns, manifest.read_text()))
+    assert checkpoints[0] == checkpoints[1]
+    poses = [read_tum_trajectory(tmp_path / r / "trajectory.tum").T_wc for r in rules]
+    assert np.array_equal(*poses)
+    maps = [load_map(tmp_path / r / "map.safetensors") for r in rules]
+    assert len(maps[0]) == len(maps[1]) > 100
+    moved = np.abs(np.asarray(maps[0].position) - np.asarray(maps[1].position)).max()
+    assert 0 < moved < 0.1
+    assert not json.loads((tmp_path / rules[0] / "summary.json").read_text())["refined"]

@@ -1,0 +1,51 @@
+"""Settings that silently do nothing say so, and no others."""
+
+import pytest
+
+from geogs.cli.reconstruct import parse as reconstruct_options
+from geogs.cli.run import parse as run_options
+from geogs.config import preset, reconstruct_preset
+from geogs.config.idle import idle_settings
+
+
+def said(command: str, *words: str) -> list[str]:
+    parse = run_options if command == "run" else reconstruct_options
+    return idle_settings(parse(["source", "--device", "cpu", *words]).config)
+
+
+@pytest.mark.parametrize("name", ["fast", "default", "accurate", "paper"])
+def test_presets_have_nothing_idle(name) -> None:
+    assert idle_settings(preset(name)) == []
+    assert idle_settings(reconstruct_preset(name)) == []
+
+
+CASES = {
+    "--tracking.weights x.pth": "tracking.weights does nothing",
+    "--mapping.no-final-depth --mapping.final-iterations 0": "mapping.no-final-depth does nothing",
+    "--mapping.pose-lr 1e-3 --mapping.pose-iterations 0": "mapping.pose-lr does nothing",
+    "--mapping.final-pose-rounds 2 --mapping.pose-iterations 0": "final-pose-rounds does nothing",
+    "--loop.matches --loop.no-enabled": "loop.matches does nothing",
+    "--mapping.depth.weights x": "mapping.depth.weights does nothing: the engine classical",
+    "--mapping.disk.no-carve --mapping.disk.carve-every 3": "mapping.disk.carve-every does",
+    "--mapping.loss.smoothness-eta 3": "mapping.loss.smoothness-eta does nothing",
+    "--mapping.loss.ablation.smoothness-rewards-edges": "rewards-edges does nothing",
+    "--mapping.loss.occlusion-share 0.1 --mapping.loss.occlusion 1": "mapping.loss.occlusion does",
+    "--mapping.loss.colour --mapping.loss.l1-weight 0": "mapping.loss.colour does nothing",
+    "--prior.card omnidata": "prior.card does nothing",
+    "--prior.normal-card omnidata": "prior.normal-card does nothing",
+}
+
+
+@pytest.mark.parametrize("words", CASES)
+def test_what_does_nothing_says_so(words: str) -> None:
+    (sentence,) = said("run", *words.split())
+    assert CASES[words] in sentence
+
+
+def test_what_is_heeded_says_nothing() -> None:
+    assert said("run", "--tracking.weights", "x.pth", "--tracking.operator", "raft") == []
+    assert said("run", "--mapping.no-final-depth") == []
+    assert said("run", "--mapping.final-iterations", "0") == []
+    eta = ["--mapping.loss.smoothness-eta", "3"]
+    assert said("run", "--mapping.loss.smoothness-weight", "1", *eta) == []
+    assert "smoothness-eta" in said("reconstruct", *eta)[0]

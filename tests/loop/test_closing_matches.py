@@ -1,0 +1,142 @@
+"""The matches that close loops: whose they are, in which order, and whose depth they decide."""
+
+from types import SimpleNamespace
+
+import torch
+
+from geogs.bundle.projection import project
+from geogs.config import LoopConfig
+from geogs.geometry.camera import Camera
+from geogs.geometry.lie import se3_inverse
+from geogs.loop.closer import LoopCloser
+from geogs.loop.closing_matches import closing_matches, take_over_depths
+from geogs.loop.detect import Loop
+from geogs.tracking.flow.base import FlowMatch
+from geogs.tracking.graph import MeasuredEdge
+from geogs.tracking.tracker import Tracker
+from keyframe_samples import Sample, segment_of
+
+CAMERA = Camera(60.0, 60.0, 31.5, 23.5, 64, 48)
+
+
+def segment():
+    samples = []
+    for n in range(5):
+        image = torch.full((48, 64, 3), 20 * n, dtype=torch.uint8).numpy()
+        d = torch.full((6, 8), 0.5 + 0.1 * n)
+        samples.append(Sample(n, image, torch.eye(4, dtype=torch.float64), d, torch.ones_like(d)))
+    return segment_of(samples, CAMERA)
+
+
+def flow(value: float, cells: int) -> FlowMatch:
+    return FlowMatch(torch.full((1, cells, 2), value), torch.full((1, cells, 2), value + 1))
+
+
+def edge(value: float, cells: int) -> MeasuredEdge:
+    one = flow(value, cells)
+    return MeasuredEdge(one.pixels[0], one.weight[0], one.pixels[0])
+
+
+def test_edges_and_loops_come_by_source_and_the_graph_wins():
+    keyframes = segment()
+    ids, cells = keyframes.ids, keyframes.grid.size
+    pose = torch.eye(4, dtype=torch.float64)
+    known = {"cause": "geometry", "T_ji": pose, "scale": 1.0, "inliers": 0, "matched": 1.0}
+    loops = [
+        Loop(ids[0], ids[4], there=flow(1.0, cells), back=flow(2.0, cells), **known),
+        Loop(ids[2], ids[3], there=flow(3.0, cells), back=flow(4.0, cells), **known),
+        Loop(ids[1], 99, there=flow(5.0, cells), back=flow(6.0, cells), **known),
+    ]
+    edges = {(ids[3], ids[2]): edge(7.0, cells), (ids[2], ids[3]): edge(8.0, cells)}
+    matches = closing_matches(keyframes, edges, loops)
+    assert matches is not None
+    pairs = list(zip(matches.source.tolist(), matches.target.tolist(), strict=True))
+    assert pairs == [(0, 4), (2, 3), (3, 2), (4, 0)]
+    assert matches.pixels[:, 0, 0].tolist() == [1.0, 8.0, 7.0, 2.0]
+    assert torch.equal(matches.weight, matches.pixels + 1)
+    assert torch.equal(matches.inverse_depth, keyframes.inverse_depths(ids))
+    assert closing_matches(keyframes, {}, loops[2:]) is None
+
+
+def test_depths_of_the_frame_graph_alone_are_taken_over():
+    keyframes = segment()
+    ids, cells = keyframes.ids, keyframes.grid.size
+    before = keyframes.inverse_depths(ids).clone()
+    edges = {(ids[3], ids[2]): edge(7.0, cells), (ids[2], ids[3]): edge(8.0, cells)}
+    take_over_depths(keyframes, edges, 2 * before)
+    after = keyframes.inverse_depths(ids)
+    assert torch.equal(after[[2, 3]], 2 * before[[2, 3]])
+    assert torch.equal(after[[0, 1, 4]], before[[0, 1, 4]])
+
+
+COUNT = 8
+
+
+def true_pose(n: int) -> torch.Tensor:
+    """World to camera of a walk to the right and back, a little beside the way there."""
+    T = torch.eye(4, dtype=torch.float64)
+    T[0, 3] = -0.15 * min(n, COUNT - 1 - n)
+    T[1, 3] = -0.05 * (n >= COUNT // 2)
+    return T
+
+
+def exact_flow(grid, inverse_depth, T_ji) -> tuple[torch.Tensor, torch.Tensor]:
+    seen = project(grid.camera, grid.rays, T_ji[None], inverse_depth[None])
+    return seen.pixels[0].float(), torch.full((grid.size, 2), 25.0)
+
+
+def world(drift: float):
+    """A segment whose poses have drifted, with its exact edges, and the loop of its two ends."""
+    g = torch.Generator().manual_seed(2)
+    samples = []
+    for n in range(COUNT):
+        image = torch.zeros(48, 64, 3, dtype=torch.uint8).numpy()
+        d = 0.3 + 0.5 * torch.rand(6, 8, generator=g)
+        T = true_pose(n)
+        T[:2, 3] *= 1 + drift * n
+        samples.append(Sample(n, image, T, d, torch.full_like(d, 1e4)))
+    keyframes = segment_of(samples, CAMERA)
+
+    def flow_of(i: int, j: int) -> tuple[torch.Tensor, torch.Tensor]:
+        T_ji = true_pose(j) @ se3_inverse(true_pose(i))
+        return exact_flow(keyframes.grid, keyframes[i].inverse_depth, T_ji)
+
+    edges = {}
+    for i in range(COUNT - 1):
+        for pair in ((i, i + 1), (i + 1, i)):
+            pixels, weight = flow_of(*pair)
+            edges[pair] = MeasuredEdge(pixels, weight, pixels)
+    last = COUNT - 1
+    ways = [FlowMatch(*(x[None] for x in flow_of(*pair))) for pair in ((0, last), (last, 0))]
+    T_ji = true_pose(last) @ se3_inverse(true_pose(0))
+    loop = Loop(0, last, "geometry", T_ji, 1.0, 0, 1.0, *ways)
+    graph = SimpleNamespace(edges=edges, retire=lambda keep: {})
+    tracker = Tracker.__new__(Tracker)  # nothing of it but its keyframes and their edges
+    tracker.keyframes, tracker.graph = keyframes, graph
+    return tracker, loop
+
+
+def closed(matches: bool) -> float:
+    """Mean error of the relative translations of neighbours after the loop was closed."""
+    tracker, loop = world(drift=0.06)
+    segments = SimpleNamespace(world=tracker, tracker_of=lambda id: tracker, trackers=[tracker])
+    config = LoopConfig(matches=matches, strain=0.0, min_change=0.0)
+    closer = LoopCloser.__new__(LoopCloser)
+    closer.segments, closer.config, closer.closures = segments, config, 0
+    closer.detector = SimpleNamespace(loops=(loop,))
+    closer._known, closer._between = {}, []
+    closer._take(loop)
+    closer._close(is_last=True)
+    assert closer.closures == 1
+    keyframes, error = tracker.keyframes, 0.0
+    for i in range(COUNT - 1):
+        now = keyframes[i + 1].T_cw @ se3_inverse(keyframes[i].T_cw)
+        true = true_pose(i + 1) @ se3_inverse(true_pose(i))
+        error += float((now - true)[:3, 3].norm())
+    assert all(bool(torch.isfinite(k.inverse_depth).all()) for k in keyframes)
+    return error / (COUNT - 1)
+
+
+def test_closing_with_matches_finds_what_relative_poses_cannot_know() -> None:
+    """The odometry is the drift itself; only the flow between neighbours knows better."""
+    assert closed(matches=True) < 0.75 * closed(matches=False)
