@@ -97,7 +97,7 @@ RELATIONS = (
     Relation("mirrored", mirrored, 0.03, 0.05, is_mirrored=True),
     Relation("half the frame rate", half_the_rate, 0.03, 0.04),
     Relation("another clock", slower, 0.001, 0.001),
-    Relation("another unit of intrinsics", other_unit, 0.001, 0.001),
+    Relation("another unit of intrinsics", other_unit, 0.005, 0.01),
     Relation("gain 0.85, gamma 1.15", darker, 0.03, 0.04),
     Relation("backwards", backwards, 0.04, 0.05),
 )
