@@ -123,7 +123,8 @@ def test_clips_spread_over_the_selection(tmp_path, monkeypatch):
     given = [[int(raw.image[0, 0, 0]) for raw in clip] for clip in source.clips()]
     assert given == [[1, 2, 3], [5, 6, 7], [10, 11, 12]]
     assert base.clip_starts(0, 2) == []
-    assert base.clip_starts(4, 5) == [4]
+    assert base.clip_starts(4, 5) == [4, 6]
+    assert base.clip_starts(4, 4) == [4]
 
 
 def test_clips_of_a_video_are_those_of_its_images(tmp_path, monkeypatch):
@@ -132,7 +133,7 @@ def test_clips_of_a_video_are_those_of_its_images(tmp_path, monkeypatch):
     write_video(tmp_path / "video.mp4", images)
     source = open_source(tmp_path / "video.mp4", InputConfig("50,50,31.5,23.5", start=1))
     given = [[round(raw.image.mean() / 12) for raw in clip] for clip in source.clips()]
-    assert given == [[1, 2, 3], [5, 6, 7], [9, 10, 11]]
+    assert given == [[1, 2, 3], [3, 4, 5], [5, 6, 7], [7, 8, 9], [9, 10, 11]]
 
 
 def test_who_says_what_the_shutter_is(folder):
