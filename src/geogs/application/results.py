@@ -80,7 +80,7 @@ def write_results(
     summary = summarise(result)
     write_text(output / "summary.json", json.dumps(summary, indent=2))
     with scene.stopwatch("report"):
-        write_report(output / "report", result.trajectory, result.renders, mesh, summary)
+        write_report(output / "report", result.trajectory, result.renders, mesh, summary, disks)
 
 
 def write_config(path: Path, config: Config | ReconstructConfig) -> None:
