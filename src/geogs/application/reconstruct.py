@@ -4,6 +4,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+from geogs.application.forecast import reconstruction_forecast
 from geogs.application.interrupt import Stop
 from geogs.application.machine import compiled_kernels, full_memory_in_a_sentence
 from geogs.application.progress import RunProgress
@@ -91,6 +92,7 @@ def reconstruct_to_folder(
     made_from = fingerprint(config, settings.hold_out, names)
     checkpoint = ReconstructCheckpoint(output, made_from, settings.checkpoint_every, progress)
     snapshots = Snapshots(settings.snapshots)
+    progress.plan(reconstruction_forecast())
     with full_memory_in_a_sentence(), stop:
         resumed = checkpoint.read() if settings.resume else None
         if settings.check_poses and resumed is None:

@@ -21,12 +21,6 @@ from geogs.io.writers.tum import write_tum_trajectory
 from geogs.io.writers.uncertainty import write_uncertainty
 from geogs.threads import on_one_torch_thread
 
-NOT_JUDGED = (
-    "How far this is to be relied on was not worked out: the adjustment of all keyframes is "
-    "missing."
-)
-"""Said of a run that was stopped."""
-
 
 @on_one_torch_thread
 def write_results(
@@ -73,14 +67,12 @@ def write_results(
             f"warning: {lost} of {scene.frames} frames were not tracked; slower motion, texture "
             "or the right --intrinsics may help."
         )
-    if result.verdict is not None:
-        progress.write(result.verdict.sentence)
-    elif not isinstance(source, PosedSource):
-        progress.write(NOT_JUDGED)
     summary = summarise(result)
     write_text(output / "summary.json", json.dumps(summary, indent=2))
+    progress.stage("report", 0.0)
     with scene.stopwatch("report"):
         write_report(output / "report", result.trajectory, result.renders, mesh, summary, disks)
+    progress.stage("report", 1.0)
 
 
 def write_config(path: Path, config: Config | ReconstructConfig) -> None:

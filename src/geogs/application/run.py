@@ -9,6 +9,7 @@ import torch
 
 from geogs.application.calibrate import self_calibrated
 from geogs.application.checkpoint import has_checkpoint
+from geogs.application.forecast import RunForecast
 from geogs.application.interrupt import Stop
 from geogs.application.machine import REMEDY, compiled_kernels, full_memory_in_a_sentence
 from geogs.application.priors import open_prior
@@ -129,6 +130,7 @@ class _Run:
         slam, source, settings, output = self.slam, self.source, self.settings, self.output
         progress = self.progress
         checkpoint = RunCheckpoint(output, self.facts, settings.checkpoint_every, progress)
+        progress.plan(RunForecast(slam.config, slam.stopwatch, source.length, slam.frames))
         progress.expect(source.length, slam.frames)
         kept = False
         with full_memory_in_a_sentence(), self.stop:

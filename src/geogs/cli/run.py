@@ -7,13 +7,15 @@ from pathlib import Path
 from typing import cast
 
 from geogs.application.settings import RunSettings
+from geogs.application.verbosity import Verbosity
 from geogs.cli.options import Given, parse_options, record
+from geogs.cli.speech import followed
 from geogs.config import Preset, preset
 from geogs.errors import InputError
 
 
 @dataclass(frozen=True)
-class RunOptions(RunSettings):
+class RunOptions(Verbosity, RunSettings):
     """Reconstruct a video, a folder of images, or a Replica, TUM RGB-D or 7-Scenes sequence.
 
     Every default works: ``geogs run video.mp4``. Intrinsics: ``--intrinsics fx,fy,cx,cy``.
@@ -34,14 +36,12 @@ def main(argv: Sequence[str]) -> int:
 
     from geogs.application.interrupt import Interruption
     from geogs.application.run import resume, run
-    from geogs.application.terminal import TerminalProgress
 
     go = run if options.resume is None else partial(resume, options.resume)
-    with TerminalProgress() as progress:
-        written = go(record(RunSettings, options), progress, Interruption())
+    settings = record(RunSettings, options)
+    written = followed(options, lambda progress: go(settings, progress, Interruption()))
     if written.can_resume:
         print(f"geogs run --resume {written.output} goes on from here.")
-    print(f"Results are in {written.output}/")
     return 0
 
 

@@ -71,7 +71,7 @@ def run_figures(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
     return [(name, text) for name, text in shown if text]
 
 
-def duration(seconds: float) -> str:
+def duration(seconds: int | float) -> str:
     """A time as people say it."""
     whole = round(seconds)
     if whole < 60:
