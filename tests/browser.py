@@ -31,8 +31,8 @@ class Tab:
 
 
 @contextmanager
-def open_tab(address: str) -> Iterator[Tab]:
-    """A tab of Chromium with an address, drawn by software, 900 x 800."""
+def open_tab(address: str, width: int = 900, height: int = 800) -> Iterator[Tab]:
+    """A tab of Chromium with an address, drawn by software."""
     playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
     program = next(filter(None, map(shutil.which, ("chromium", "chromium-browser"))), None)
     if program is None:
@@ -40,7 +40,7 @@ def open_tab(address: str) -> Iterator[Tab]:
     with playwright.sync_playwright() as found:
         browser = found.chromium.launch(executable_path=program, args=list(_SOFTWARE))
         try:
-            tab = Tab(browser.new_page(viewport={"width": 900, "height": 800}))
+            tab = Tab(browser.new_page(viewport={"width": width, "height": height}))
             tab.page.goto(address)
             yield tab
         finally:

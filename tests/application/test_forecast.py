@@ -37,7 +37,17 @@ def test_a_slower_machine_stretches_what_is_to_come():
     assert forecast.after_stage("one", 1.0) == pytest.approx(30)
     forecast.after_stage("two", 0.0)
     clock.now += 20
-    assert forecast.after_stage("two", 0.5) == pytest.approx(20)  # by its own pace
+    # Half by its own pace, 20 s, and half by that of all, 12 s for what was planned to take one.
+    assert forecast.after_stage("two", 0.5) == pytest.approx(0.5 * 20 + 0.5 * 18)
+
+
+def test_seconds_that_were_planned_hold_back_a_slow_beginning():
+    clock = Clock()
+    forecast = StageForecast([("one", 10.0), ("two", 90.0)], clock, trust=50.0)
+    assert forecast.after_stage("one", 0.0) == pytest.approx(100)
+    clock.now += 20
+    pace = (20 + 50) / (1 + 50)
+    assert forecast.after_stage("one", 0.1) == pytest.approx(0.9 * pace * 9 + 0.1 * 180 + pace * 90)
 
 
 def test_a_stage_that_was_left_out_is_not_waited_for():

@@ -21,8 +21,8 @@ MESH_SHARES = {"fuse": 0.4, "colour": 0.3, "merge": 0.3}
 """Of its stages; what is done between two of them counts to the first."""
 REPORT_STEPS, REPORT_SECONDS = 30.0, 4.0
 """What writing and the report cost: steps, but at least seconds."""
-_EARLY = 0.08
-"""Part of a stage from which on its own pace is believed, rather than what was planned."""
+_TRUST = 0.5
+"""Part of the final stages as planned that counts as if it had been seen."""
 
 
 @runtime_checkable
@@ -45,6 +45,9 @@ class StageForecast:
     plan: Sequence[tuple[str, float]]
     """Beginnings of their names, and weights or seconds."""
     clock: Callable[[], float] = time.perf_counter
+    trust: float = 0.0
+    """Seconds of the plan that count as if they had been seen to last what they should; 0 where
+    the plan has weights that are no seconds."""
     _begun: list[tuple[int, float]] = field(default_factory=list)
     """Number of each stage that has been, and when it began."""
 
@@ -67,10 +70,12 @@ class StageForecast:
         inside = now - start
         # How much slower than planned it all went, the present stage as far as it is done.
         done = before + fraction * planned
-        if done <= 0 or now <= first:
+        if done + self.trust <= 0 or now + self.trust <= first:
             return None
-        pace = (now - first) / done
-        rest = inside * (1 - fraction) / fraction if fraction > _EARLY else pace * planned
+        pace = (now - first + self.trust) / (done + self.trust)
+        rest = pace * planned * (1 - fraction)
+        if fraction > 0:  # its own pace counts the more, the more of it is done
+            rest += fraction * (inside * (1 - fraction) / fraction - rest)
         return rest + pace * sum(weight for _, weight in self.plan[number + 1 :])
 
 
@@ -107,7 +112,9 @@ class RunForecast:
     def after_stage(self, name: str, fraction: float) -> float | None:
         """Seconds left within the stages after the last frame."""
         if self._final is None:
-            self._final = StageForecast(self.final_stages(self._keyframes, 1.0), self.clock)
+            plan = self.final_stages(self._keyframes, 1.0)
+            trust = _TRUST * sum(seconds for _, seconds in plan)
+            self._final = StageForecast(plan, self.clock, trust)
         return self._final.after_stage(name, fraction)
 
     def final_stages(self, keyframes: int | float, growth: float) -> list[tuple[str, float]]:

@@ -12,6 +12,7 @@ from geogs.application.checkpoint import has_checkpoint
 from geogs.application.forecast import RunForecast
 from geogs.application.interrupt import Stop
 from geogs.application.machine import REMEDY, compiled_kernels, full_memory_in_a_sentence
+from geogs.application.observer import RunObserver
 from geogs.application.priors import open_prior
 from geogs.application.progress import RunProgress
 from geogs.application.result import Result, Written
@@ -32,7 +33,10 @@ from geogs.types import Frame
 
 @on_one_torch_thread
 def run(
-    settings: RunSettings, progress: RunProgress | None = None, stop: Stop | None = None
+    settings: RunSettings,
+    progress: RunProgress | None = None,
+    stop: Stop | None = None,
+    observer: RunObserver | None = None,
 ) -> Written:
     """Open the sources, calibrate, track and map every frame, write the results.
 
@@ -59,7 +63,8 @@ def run(
             f"Starting anew; geogs run --resume {output} would go on with the unfinished run "
             "there, until the first checkpoint of this one."
         )
-    return _Run(slam, source, settings, output, facts, progress, stop).complete(iter(source))
+    prepared = _Run(slam, source, settings, output, facts, progress, stop, observer)
+    return prepared.complete(iter(source))
 
 
 @on_one_torch_thread
@@ -68,6 +73,7 @@ def resume(
     settings: RunSettings | None = None,
     progress: RunProgress | None = None,
     stop: Stop | None = None,
+    observer: RunObserver | None = None,
 ) -> Written:
     """Go on with the run whose checkpoint lies in a folder, as if nothing had happened.
 
@@ -91,7 +97,8 @@ def resume(
     progress.write(f"Going on after {slam.frames} frames.")
     facts = replace(saved.facts, settings=settings.absolute())
     frames = frames_after(source, saved.facts.place)
-    return _Run(slam, source, settings, output, facts, progress, stop).complete(frames)
+    prepared = _Run(slam, source, settings, output, facts, progress, stop, observer)
+    return prepared.complete(frames)
 
 
 def continued(facts: RunFacts, settings: RunSettings, output: Path) -> RunSettings:
@@ -124,6 +131,7 @@ class _Run:
     facts: RunFacts
     progress: RunProgress
     stop: Stop
+    observer: RunObserver | None = None
 
     def complete(self, frames: Generator[Frame, None, None]) -> Written:
         """The frames that are left, the final stages, the files."""
@@ -151,6 +159,8 @@ class _Run:
             more = [lambda: write_depth_mesh(output, slam, progress)]
             more = more if settings.depth_mesh else []
             write_results(output, result, more, settings.keyframe_images)
+            if self.observer is not None:
+                self.observer.result(result)
         if full:
             raise DeviceError(
                 f"The memory of the GPU was full after {slam.frames} frames, whose results are in "
@@ -168,7 +178,10 @@ class _Run:
             return True
         try:
             for frame in _timed(frames, slam.stopwatch):
-                self.progress.frame(slam.process(frame))
+                status = slam.process(frame)
+                self.progress.frame(status)
+                if self.observer is not None:
+                    self.observer.frame(frame, status, slam)
                 if self.stop.requested:
                     break
                 checkpoint.after_frame(slam, self.source)

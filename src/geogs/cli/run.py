@@ -1,21 +1,26 @@
 """``geogs run SOURCE``: a video in; trajectory, mesh and disk map out."""
 
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import cast
+from typing import TYPE_CHECKING, cast
 
 from geogs.application.settings import RunSettings
 from geogs.application.verbosity import Verbosity
+from geogs.application.viewer.settings import LiveSettings
 from geogs.cli.options import Given, parse_options, record
 from geogs.cli.speech import followed
 from geogs.config import Preset, preset
 from geogs.errors import InputError
 
+if TYPE_CHECKING:
+    from geogs.application.observer import RunObserver
+
 
 @dataclass(frozen=True)
-class RunOptions(Verbosity, RunSettings):
+class RunOptions(LiveSettings, Verbosity, RunSettings):
     """Reconstruct a video, a folder of images, or a Replica, TUM RGB-D or 7-Scenes sequence.
 
     Every default works: ``geogs run video.mp4``. Intrinsics: ``--intrinsics fx,fy,cx,cy``.
@@ -38,11 +43,24 @@ def main(argv: Sequence[str]) -> int:
     from geogs.application.run import resume, run
 
     go = run if options.resume is None else partial(resume, options.resume)
-    settings = record(RunSettings, options)
-    written = followed(options, lambda progress: go(settings, progress, Interruption()))
+    settings, observer = record(RunSettings, options), _observer(options)
+    written = followed(options, lambda progress: go(settings, progress, Interruption(), observer))
     if written.can_resume:
         print(f"geogs run --resume {written.output} goes on from here.")
     return 0
+
+
+def _observer(options: LiveSettings) -> "RunObserver | None":
+    """Who looks on, if somebody should."""
+    if not options.viewer:
+        return None
+
+    from geogs.application.viewer.live import LiveViewer
+    from geogs.application.viewer.window import Window
+
+    window = Window("geogs", options.viewer_host, options.viewer_port)
+    print(f"Open {window.address} in a browser to look on.", file=sys.stderr)
+    return LiveViewer(window)
 
 
 def parse(argv: Sequence[str]) -> RunOptions:

@@ -1,0 +1,33 @@
+"""What a viewer is told."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from geogs.config.setting import Basic, Positional, Range, Settings
+
+Port = Annotated[int, Range(1, 65535)]
+
+
+@dataclass(frozen=True)
+class ViewSettings(Settings):
+    """All that a viewer of a result is told."""
+
+    result: Annotated[Path, Positional()]
+    """Folder of a result, as geogs run and geogs reconstruct write it."""
+    port: Annotated[Port, Basic("-p")] = 8080
+    """Where the page is served; if it is taken, the next that is free."""
+    host: str = "127.0.0.1"
+    """Address at which it is served; 0.0.0.0 lets other machines look, too."""
+
+
+@dataclass(frozen=True)
+class LiveSettings(Settings):
+    """All that a viewer of a run is told."""
+
+    viewer: bool = False
+    """Show the run in the browser while it goes on; needs pip install 'geogs[viewer]'."""
+    viewer_port: Port = 8080
+    """Where that page is served; if it is taken, the next that is free."""
+    viewer_host: str = "127.0.0.1"
+    """Address at which it is served; 0.0.0.0 lets other machines look, too."""
