@@ -58,7 +58,7 @@ def _observer(options: LiveSettings) -> "RunObserver | None":
     from geogs.application.viewer.live import LiveViewer
     from geogs.application.viewer.window import Window
 
-    window = Window("geogs", options.viewer_host, options.viewer_port)
+    window = Window("geogs", options.viewer_host, options.viewer_port, with_disks=True)
     print(f"Open {window.address} in a browser to look on.", file=sys.stderr)
     return LiveViewer(window)
 

@@ -23,7 +23,6 @@ def test_a_result_is_shown_in_the_browser(tmp_path):
             tab.page.wait_for_timeout(3000)
             assert window.clients == 1
             assert tab.picture("canvas").std() > 2  # frusta and their images
-            assert not [c for c in tab.complaints if "NaN" in c]
             window._layer.value = "depth"
             tab.page.wait_for_timeout(500)
             depth = np.asarray(window._picture.image)

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from contextlib import redirect_stdout
-from dataclasses import dataclass
 from io import StringIO
 from typing import Any
 
@@ -18,23 +17,15 @@ from geogs.mesh.types import Mesh
 from geogs.types import MapSnapshot
 
 PATH, FRUSTUM, NOW = (242, 163, 58), (111, 177, 240), (255, 209, 102)
-
-
-@dataclass(frozen=True)
-class Shown:
-    """The layers of the scene, by the names of their switches."""
-
-    mesh: str = "Mesh"
-    disks: str = "Disks"
-    path: str = "Path"
-    keyframes: str = "Keyframes"
+PARTS = ("Mesh", "Disks", "Path", "Keyframes")
+"""Of the scene, by the names of their switches."""
 
 
 class Window:
     """A page at ``http://host:port`` with a scene and a panel; nobody has to look at it."""
 
-    def __init__(self, title: str, host: str, port: int) -> None:
-        """Begin to serve.
+    def __init__(self, title: str, host: str, port: int, with_disks: bool = False) -> None:
+        """Begin to serve; ``with_disks`` shows these, too, from the beginning.
 
         Raises:
             InputError: viser is not installed.
@@ -57,8 +48,8 @@ class Window:
         self._layer = gui.add_dropdown("Layer", LAYERS)
         self._switches = {}
         with gui.add_folder("Show"):
-            for name in vars(Shown()).values():
-                self._switches[name] = gui.add_checkbox(name, name != "Disks")
+            for name in PARTS:
+                self._switches[name] = gui.add_checkbox(name, with_disks or name != "Disks")
                 self._switches[name].on_update(lambda _: self._apply_switches())
         self._parts: dict[str, list[Any]] = {name: [] for name in self._switches}
         self._size = 1.0
