@@ -1,7 +1,8 @@
 // What of three.js the pages use. `three.min.js` is made of this by
 //   npm install three@0.187.0 esbuild
 //   npx esbuild three_entry.js --bundle --minify --format=iife --global-name=THREE \
-//     --target=es2020 --banner:js="/*! three.js r187, threejs.org ... */" --outfile=three.min.js
+//     --target=es2020 --legal-comments=none --outfile=three.min.js
+// with the version and the text of three.LICENSE put before it as a comment: /*! ... */
 export {
   AmbientLight, BufferAttribute, BufferGeometry, CanvasTexture, Color, DoubleSide, FrontSide,
   Group, InstancedBufferAttribute, InstancedBufferGeometry, LineBasicMaterial, LineSegments,
