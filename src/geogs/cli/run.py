@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, cast
 
 from geogs.application.settings import RunSettings
 from geogs.application.verbosity import Verbosity
-from geogs.application.viewer.settings import LiveSettings
+from geogs.application.viewer.settings import HERE, LiveSettings
 from geogs.cli.options import Given, parse_options, record
 from geogs.cli.speech import followed
 from geogs.config import Preset, preset
@@ -58,7 +58,7 @@ def _observer(options: LiveSettings) -> "RunObserver | None":
     from geogs.application.viewer.live import LiveViewer
     from geogs.application.viewer.window import Window
 
-    window = Window("geogs", options.viewer_host, options.viewer_port, with_disks=True)
+    window = Window("geogs", HERE, options.viewer_port, with_disks=True)
     print(f"Open {window.address} in a browser to look on.", file=sys.stderr)
     return LiveViewer(window)
 

@@ -6,6 +6,8 @@ from typing import Annotated
 
 from geogs.config.setting import Basic, Positional, Range, Settings
 
+HERE = "127.0.0.1"
+"""Address that only this machine sees."""
 Port = Annotated[int, Range(1, 65535)]
 
 
@@ -17,7 +19,7 @@ class ViewSettings(Settings):
     """Folder of a result, as geogs run and geogs reconstruct write it."""
     port: Annotated[Port, Basic("-p")] = 8080
     """Where the page is served; if it is taken, the next that is free."""
-    host: str = "127.0.0.1"
+    host: str = HERE
     """Address at which it is served; 0.0.0.0 lets other machines look, too."""
 
 
@@ -28,6 +30,4 @@ class LiveSettings(Settings):
     viewer: bool = False
     """Show the run in the browser while it goes on; needs pip install 'geogs[viewer]'."""
     viewer_port: Port = 8080
-    """Where that page is served; if it is taken, the next that is free."""
-    viewer_host: str = "127.0.0.1"
-    """Address at which it is served; 0.0.0.0 lets other machines look, too."""
+    """Where that page is served, to this machine alone; if it is taken, the next that is free."""
