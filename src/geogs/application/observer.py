@@ -1,5 +1,6 @@
 """Who looks on while a run goes on."""
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from geogs.types import Frame
@@ -21,3 +22,20 @@ class RunObserver:
 
     def result(self, result: "Result") -> None:
         """After all files have been written."""
+
+
+class Observers(RunObserver):
+    """Several who look on, one after the other."""
+
+    def __init__(self, several: Sequence[RunObserver]) -> None:
+        self._several = several
+
+    def frame(self, frame: Frame, status: "SlamStatus", slam: "Slam") -> None:
+        """Tell each of them."""
+        for observer in self._several:
+            observer.frame(frame, status, slam)
+
+    def result(self, result: "Result") -> None:
+        """Tell each of them."""
+        for observer in self._several:
+            observer.result(result)

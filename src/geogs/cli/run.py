@@ -52,15 +52,21 @@ def main(argv: Sequence[str]) -> int:
 
 def _observer(options: LiveSettings) -> "RunObserver | None":
     """Who looks on, if somebody should."""
-    if not options.viewer:
-        return None
+    from geogs.application.observer import Observers
 
-    from geogs.application.viewer.live import LiveViewer
-    from geogs.application.viewer.window import Window
+    several: list[RunObserver] = []
+    if options.record is not None:
+        from geogs.application.viewer.recording import Recorder
 
-    window = Window("geogs", HERE, options.viewer_port, with_disks=True)
-    print(f"Open {window.address} in a browser to look on.", file=sys.stderr)
-    return LiveViewer(window)
+        several.append(Recorder(options.record))
+    if options.viewer:
+        from geogs.application.viewer.live import LiveViewer
+        from geogs.application.viewer.window import Window
+
+        window = Window("geogs", HERE, options.viewer_port, with_disks=True)
+        print(f"Open {window.address} in a browser to look on.", file=sys.stderr)
+        several.append(LiveViewer(window))
+    return Observers(several) if several else None
 
 
 def parse(argv: Sequence[str]) -> RunOptions:

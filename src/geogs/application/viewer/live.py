@@ -77,10 +77,10 @@ class LiveViewer(RunObserver):
             return
         begin = time.thread_time()
         update = self._look(frame, status, slam, now)
+        self._used += time.thread_time() - begin  # before the other thread adds its own
         with self._wake:
             self._next = update
             self._wake.notify()
-        self._used += time.thread_time() - begin
 
     def result(self, result: "Result") -> None:
         """Show the mesh and the verdict."""
@@ -108,7 +108,7 @@ class LiveViewer(RunObserver):
         disks = None
         if now - self._last_map >= _MAP_SECONDS and status.disks:
             self._last_map = now
-            disks = _thinned(slam.snapshot())
+            disks = thinned(slam.snapshot())
         return Update(
             words,
             _small(picture),
@@ -159,7 +159,7 @@ class LiveViewer(RunObserver):
                 self._frusta[id] = (frustum, T_wc)
 
 
-def _thinned(disks: MapSnapshot) -> MapSnapshot:
+def thinned(disks: MapSnapshot) -> MapSnapshot:
     """Not more than can be sent."""
     step = -(-len(disks) // MOST_DISKS)
     kept = {name: getattr(disks, name)[::step].cpu() for name in MapSnapshot.__slots__}

@@ -31,3 +31,6 @@ class LiveSettings(Settings):
     """Show the run in the browser while it goes on; needs pip install 'geogs[viewer]'."""
     viewer_port: Port = 8080
     """Where that page is served, to this machine alone; if it is taken, the next that is free."""
+    record: Path | None = None
+    """Also record the run in this file, .rrd, for the rerun viewer; needs pip install
+    'geogs[record]'."""
