@@ -47,7 +47,6 @@ class TerminalProgress(RunProgress):
             transient=True,
         )
         self._task = self._bar.add_task("", total=1.0, share="", info="", left="", start=False)
-        self._is_shown = False
         self._forecast: Forecast | None = None
         self._frames: int | None = None
         self._start = self._printed = time.perf_counter()
@@ -127,9 +126,6 @@ class TerminalProgress(RunProgress):
         self._end_phase()
         self._phase, self._phase_began = phase, time.perf_counter()
         self._printed = self._phase_began
-        if not self._is_shown and self._console.is_terminal:
-            self._bar.start()
-        self._is_shown = True
 
     def _end_phase(self) -> None:
         """Say how long it took, where lines of text are wanted."""
@@ -157,6 +153,8 @@ class TerminalProgress(RunProgress):
             info=info,
             left=ahead,
         )
+        if self._console.is_terminal and not self._bar.live.is_started:
+            self._bar.start()
         every = _VERBOSE_SECONDS if self._verbosity.verbose else _LOG_SECONDS
         if now - self._printed < every:
             return

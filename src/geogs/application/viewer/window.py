@@ -1,5 +1,7 @@
 """The page that a viewer serves: the scene on it, and the panel beside that."""
 
+import atexit
+import time
 from collections.abc import Callable
 from contextlib import redirect_stdout
 from io import StringIO
@@ -17,6 +19,8 @@ from geogs.mesh.types import Mesh
 from geogs.types import MapSnapshot
 
 PATH, FRUSTUM, NOW = (242, 163, 58), (111, 177, 240), (255, 209, 102)
+_FAREWELL = 0.3
+"""Seconds that the server takes to end."""
 PARTS = ("Mesh", "Disks", "Path", "Keyframes")
 """Of the scene, by the names of their switches."""
 
@@ -55,6 +59,7 @@ class Window:
         self._size = 1.0
         self._home: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
         self._server.on_client_connect(self._welcome)
+        atexit.register(self.stop)
 
     @property
     def clients(self) -> int:
@@ -81,7 +86,10 @@ class Window:
 
     def stop(self) -> None:
         """No longer serve."""
-        self._server.stop()
+        atexit.unregister(self.stop)
+        with redirect_stdout(StringIO()):  # its thread says that it has ended
+            self._server.stop()
+            time.sleep(_FAREWELL)
 
     def say(self, markdown: str) -> None:
         """The words at the top of the panel."""
