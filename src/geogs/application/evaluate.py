@@ -12,7 +12,7 @@ from geogs.application.evaluate_surface import (
     compare_surface,
     photoconsistency,
 )
-from geogs.application.model_beside_truth import model_beside_truth
+from geogs.application.saved_model import model_beside_truth
 from geogs.errors import InputError
 from geogs.evaluation.report import SAME_POSES_CM, Evaluation, write_report
 from geogs.evaluation.run_report import PICTURES, figures, run_figures, run_sections

@@ -1,4 +1,4 @@
-"""The model of a result's page where there is a truth: errors as colours, and the true path."""
+"""The model of the page of a saved result: beside a truth, errors as colours and the true path."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -13,6 +13,7 @@ from geogs.application.shown_model import ShownView, shown_model
 from geogs.errors import InputError
 from geogs.evaluation.model_view.records import Colouring, Legend, Model
 from geogs.evaluation.plots import ERROR_STOPS, error_colours
+from geogs.evaluation.run_report import write_run_page
 from geogs.evaluation.trajectory import TrajectoryErrors
 from geogs.io.writers.keyframe_images import image_path, read_image
 from geogs.mesh.types import Mesh
@@ -64,3 +65,18 @@ def shown_views(result: SavedResult) -> list[ShownView]:
         ShownView(float(time), np.linalg.inv(T_cw), partial(image, int(id)))
         for id, time, T_cw in zip(views.keyframe_id, views.timestamp, views.T_cw, strict=True)
     ]
+
+
+def write_page_anew(folder: Path) -> None:
+    """The page of a result whose mesh is another now; where it has none, nothing.
+
+    Raises:
+        OutputError: it cannot be written.
+    """
+    if not (folder / "summary.json").is_file() or not (folder / "report").is_dir():
+        return
+    result = load_result(folder)
+    mesh, disks = result.mesh, result.disks
+    faces = 0 if mesh is None else len(mesh.faces)
+    model = shown_model(result.trajectory, shown_views(result), result.camera, mesh, disks)
+    write_run_page(folder / "report", {**result.summary, "mesh_faces": faces}, model)
