@@ -64,6 +64,18 @@ def test_rooms_are_seen_from_above_and_wholly():
     assert np.linalg.norm(eye - target) < 10
 
 
+def test_objects_are_seen_from_the_side_of_the_cameras():
+    inwards = circle()
+    inwards[:, 2, 3] = 0
+    inwards[:, :3, [0, 2]] *= -1  # half a turn about the image's vertical axis
+    points = np.random.default_rng(0).uniform(-0.1, 0.1, (2000, 3))
+    axes, eye, target = first_view(points, inwards)
+    assert np.allclose(target, 0, atol=0.02)
+    side = (eye - target) / np.linalg.norm(eye - target)
+    assert side @ inwards[0, :3, 3] > 0.4  # of half a metre
+    assert 0.1 < side @ axes[2] < 0.5  # a little from above
+
+
 @pytest.mark.system
 def test_page_draws_turns_and_says_nothing(tmp_path):
     page = box_page(tmp_path, with_truth=True)

@@ -24,7 +24,7 @@ from geogs.types import MapSnapshot, Trajectory
 
 MOST_FACES, MOST_DISKS, MOST_IMAGES = 400_000, 100_000, 240
 """Of a page."""
-IMAGE_BYTES = 2_400_000
+IMAGE_BYTES = 1_800_000
 """Of all images of a page together, about."""
 _BYTES_A_PIXEL = 0.2
 _LONGEST_EDGE, _SHORTEST_EDGE = 480, 128
