@@ -72,7 +72,7 @@ class TerminalProgress(RunProgress):
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        self._end_phase()
+        self.end_phase()
         if self._bar.live.is_started:  # to stop what never began would print an empty line
             self._bar.stop()
         if error is not None:
@@ -123,11 +123,11 @@ class TerminalProgress(RunProgress):
         """Begin another phase, if it is another."""
         if phase == self._phase:
             return
-        self._end_phase()
+        self.end_phase()
         self._phase, self._phase_began = phase, time.perf_counter()
         self._printed = self._phase_began
 
-    def _end_phase(self) -> None:
+    def end_phase(self) -> None:
         """Say how long it took, where lines of text are wanted."""
         if not self._phase:
             return

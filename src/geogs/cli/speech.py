@@ -27,6 +27,7 @@ def followed(options: Verbosity, work: Callable[["RunProgress"], "Written"]) -> 
             handler.setFormatter(logging.Formatter("%(message)s"))
     with TerminalProgress(record(Verbosity, options)) as progress:
         written = work(progress)
+        progress.end_phase()
         words = last_words(written, time.perf_counter() - begin)
         progress.note("\n".join(words))
     if not options.quiet:
