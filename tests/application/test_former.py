@@ -7,7 +7,7 @@ from geogs.application.former import free_folder, remove_former
 OURS = [
     "summary.json", "mesh.ply", "eval.json", "map.safetensors", "keyframes/000012.jpg",
     "keyframes/000012.mask.png", "report/index.html", "report/mesh_truth.png",
-    "depth_fusion/mesh.ply",
+    "depth_fusion/mesh.ply", "adjusted/trajectory.tum",
 ]  # fmt: skip
 THEIRS = ["notes.txt", "keyframes/mine.jpg", "export/tum/trajectory.txt", "checkpoint/manifest"]
 
@@ -24,7 +24,7 @@ def fill(folder, names):
 
 def test_only_files_of_a_result_are_removed(tmp_path):
     fill(tmp_path, [*OURS, *THEIRS, "online/mesh.ply"])
-    remove_former(tmp_path, is_online_new=True)
+    remove_former(tmp_path, new_stages=["online"])
     assert files(tmp_path) == {*THEIRS, "online/mesh.ply"}
     assert not (tmp_path / "report").exists()
     remove_former(tmp_path)

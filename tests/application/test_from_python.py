@@ -1,6 +1,7 @@
 """Everything a command does can be done from Python, with the same result, and without a word."""
 
 import json
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -11,7 +12,7 @@ import pytest
 
 import geogs
 from geogs.application.interrupt import Interruption
-from geogs.application.results import NOT_JUDGED
+from geogs.application.last_words import NOT_JUDGED, last_words
 from geogs.application.run import run
 from geogs.application.settings import RunSettings
 from geogs.cli import main as cli
@@ -84,8 +85,15 @@ def test_a_run_frame_by_frame_is_that_of_the_command(small_room, tmp_path, capfd
     argv = [str(small_room), "-o", str(tmp_path / "out"), *RUN, "--device", "cpu"]
     assert cli.main(["run", *argv]) == 0
     said = capfd.readouterr()
-    assert said.out == f"Results are in {tmp_path}/out/\n"
-    assert "tracking" in said.err
+    verdict, counts, where, page = said.out.splitlines()
+    assert verdict == result.verdict.sentence
+    assert f"{FRAMES} frames in " in counts
+    assert f"{len(result.mesh.faces)} triangles" in counts
+    assert where.startswith(f"Results are in {tmp_path}/out/: trajectory.tum, mesh.ply")
+    assert page == f"Open {tmp_path}/out/report/index.html in a browser."
+    phases = re.findall(r"^([a-z ]+): \d+", said.err, re.MULTILINE)
+    final = ["bundle adjustment", "map refinement", "mesh", "report"]
+    assert phases == ["shutter", "frames", *final]
     require_same(tmp_path / "own", tmp_path / "out")
     seconds = json.loads((tmp_path / "out" / "summary.json").read_text())["seconds"]
     assert seconds["reading"] > 0
@@ -122,10 +130,9 @@ def test_a_whole_run_is_one_call_that_can_be_followed_and_stopped(small_room, tm
     )
     written = run(settings, progress, stop)
     assert progress.seen == 22
-    stopping, verdict = progress.said
-    assert stopping == "Stopping early; keeping what there is. Press Ctrl-C again to quit."
+    assert progress.said == ["Stopping early; keeping what there is. Press Ctrl-C again to quit."]
     assert written.result.verdict is None
-    assert verdict == NOT_JUDGED
+    assert last_words(written, 3.0)[0] == NOT_JUDGED
     assert written.output == tmp_path / "out"
     assert written.can_resume
     assert written.result.is_interrupted

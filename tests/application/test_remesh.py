@@ -40,3 +40,16 @@ def test_the_command_takes_the_settings_of_the_run_where_none_are_given(tmp_path
     with pytest.raises(InputError, match=r"config.yaml is damaged"):
         mesh_settings(folder)
     assert mesh_settings(tmp_path / "nowhere") == MeshConfig()
+
+
+def test_the_page_shows_the_mesh_that_was_made_anew(tmp_path):
+    folder = make_result(tmp_path)
+    assert remesh(RemeshSettings(folder, FINE, device="cpu")) == folder / "mesh.ply"
+    assert not (folder / "report").exists()  # of a result without a page none is made
+    (folder / "summary.json").write_text('{"source": "planes", "mesh_faces": 7, "frames": 5}')
+    (folder / "report").mkdir()
+    remesh(RemeshSettings(folder, FINE, device="cpu"))
+    page = (folder / "report" / "index.html").read_text()
+    faces = f"{len(geogs.load_result(folder).mesh.faces):,}".replace(",", " ")
+    assert f"<dt>triangles</dt><dd>{faces}</dd>" in page
+    assert 'id="model-arrays"' in page

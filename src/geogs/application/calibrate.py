@@ -31,6 +31,11 @@ def self_calibrated(
     """
     config, progress, stop = config or Config(), progress or RunProgress(), stop or Stop()
     if not (config.calibration.refine and source.is_calibration_open):
+        if source.calibration.is_guess:
+            progress.write(
+                f"warning: the intrinsics are unknown; assuming {source.intrinsics_origin}. Give "
+                "--intrinsics fx,fy,cx,cy for a better result."
+            )
         return source
     from geogs.tracking.calibration.estimate import self_calibrate
 

@@ -11,10 +11,11 @@ from geogs.application.evaluate_surface import (
     compare_surface,
     photoconsistency,
 )
+from geogs.application.saved_model import model_beside_truth
 from geogs.documents import read_json
 from geogs.errors import InputError
 from geogs.evaluation.report import SAME_POSES_CM, Evaluation, write_report
-from geogs.evaluation.run_report import PICTURES, run_sections
+from geogs.evaluation.run_report import PICTURES, figures, run_figures, run_sections
 from geogs.evaluation.surface import read_surface
 from geogs.evaluation.trajectory import Alignment, TrajectoryErrors, evaluate_trajectory
 from geogs.evaluation.truth import TrueScene, read_true_scene, scaled
@@ -69,7 +70,13 @@ def evaluate(settings: EvalSettings) -> Evaluation:
     page = settings.output / "report" / "index.html"
     title = str(summary.get("source", settings.output.resolve().name))
     run = run_sections(summary) if summary else []
-    write_report(evaluation, settings.output / "eval.json", page, pictures, run, title)
+    judged = figures(summary, run_figures(summary)[:4]) if summary else None
+    model = model_beside_truth(settings.output, trajectory, surface) if settings.plots else None
+    if model is not None:
+        pictures = [(name, file) for name, file in pictures if file.name != "mesh.png"]
+    write_report(
+        evaluation, settings.output / "eval.json", page, pictures, run, title, judged, model
+    )
     return evaluation
 
 

@@ -1,6 +1,7 @@
 """What an earlier run left in a folder: where it may be replaced, and what goes with it."""
 
 import re
+from collections.abc import Collection
 from contextlib import suppress
 from itertools import count
 from pathlib import Path
@@ -15,18 +16,22 @@ _FILES = (
     "depth_fusion/mesh.ply",
 )  # fmt: skip
 """In the order in which they go: the summary first, so that no half of a result has one."""
-_ONLINE = ("online/trajectory.tum", "online/keyframes.tum", "online/mesh.ply")
+_STAGES = ("online", "adjusted")
+_OF_A_STAGE = ("trajectory.tum", "keyframes.tum", "mesh.ply")
 _KEYFRAME = re.compile(r"\d{6,}\.(jpg|mask\.png)")
 _REPORT = re.compile(r"\w+\.(png|html|css|js)")
 
 
-def remove_former(folder: Path, is_online_new: bool = False) -> None:
+def remove_former(folder: Path, new_stages: Collection[str] = ()) -> None:
     """Delete the files of an earlier result, so that none stays beside those of a new one.
 
     Only files of names that geogs gives are touched; exports and what others put there stay, and
-    what is in online/ where that is of the new result.
+    the folders of stages that are of the new result already.
     """
-    for name in _FILES if is_online_new else _FILES + _ONLINE:
+    former = [
+        f"{stage}/{name}" for stage in _STAGES for name in _OF_A_STAGE if stage not in new_stages
+    ]
+    for name in (*_FILES, *former):
         _delete(folder / name)
     for inner, names in (("keyframes", _KEYFRAME), ("report", _REPORT)):
         place = folder / inner
@@ -34,7 +39,7 @@ def remove_former(folder: Path, is_online_new: bool = False) -> None:
             for path in list(place.iterdir()):
                 if names.fullmatch(path.name):
                     _delete(path)
-    for inner in ("depth_fusion", "online", "keyframes", "report"):
+    for inner in ("depth_fusion", *_STAGES, "keyframes", "report"):
         with suppress(OSError):  # not empty, or not there
             (folder / inner).rmdir()
 

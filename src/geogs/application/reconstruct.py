@@ -8,6 +8,7 @@ import torch
 
 from geogs.application.checkpoint import has_checkpoint
 from geogs.application.folder_lock import only_writer
+from geogs.application.forecast import reconstruction_forecast
 from geogs.application.former import free_folder
 from geogs.application.interrupt import Stop
 from geogs.application.machine import compiled_kernels, full_memory_in_a_sentence
@@ -122,6 +123,7 @@ def _to_folder(
         kept = has_checkpoint(output)
         return " The same command with --resume goes on from the last checkpoint." if kept else ""
 
+    progress.plan(reconstruction_forecast())
     with full_memory_in_a_sentence(way_on), stop:
         resumed = checkpoint.read() if settings.resume else None
         if settings.check_poses and resumed is None:

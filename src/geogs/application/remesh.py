@@ -47,6 +47,9 @@ def mesh_settings(folder: Path) -> MeshConfig:
 def remesh(settings: RemeshSettings, progress: "RunProgress | None" = None) -> Path:
     """Render the keyframes of a result, fuse their depths and write the mesh; the file's path.
 
+    Where that is the mesh of the result, its page is made anew, too, without what an evaluation
+    had said of the former one.
+
     On the CPU, with the settings of the run, the surface is that of the run to the last byte;
     colours differ by what JPEG does to the images.
 
@@ -56,6 +59,7 @@ def remesh(settings: RemeshSettings, progress: "RunProgress | None" = None) -> P
         DeviceError: the device cannot be used.
     """
     from geogs.application.progress import RunProgress
+    from geogs.application.saved_model import write_page_anew
     from geogs.application.saved_result import load_result
     from geogs.application.surfaces import fusion_views
     from geogs.gpu.installation import require_device
@@ -73,4 +77,6 @@ def remesh(settings: RemeshSettings, progress: "RunProgress | None" = None) -> P
         lambda part, done, of: follow.stage(f"mesh: {part}", done / of),
     )
     write_mesh(path, mesh.vertices, mesh.faces, mesh.colours, mesh.normals)
+    if path == settings.result / "mesh.ply":
+        write_page_anew(settings.result)
     return path

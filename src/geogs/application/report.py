@@ -1,12 +1,15 @@
 """``report/``: a page with what needs no ground truth."""
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import UInt8
 
+from geogs.application.shown_model import ShownView, shown_model
 from geogs.mesh.types import Mesh
-from geogs.types import RenderedKeyframe, Trajectory
+from geogs.types import MapSnapshot, RenderedKeyframe, Trajectory
 
 
 def write_report(
@@ -15,8 +18,10 @@ def write_report(
     renders: Sequence[RenderedKeyframe],
     mesh: Mesh | None,
     summary: Mapping[str, object],
+    disks: MapSnapshot | None = None,
 ) -> None:
-    """The path, renders beside images, the shaded mesh, and the numbers of the summary.
+    """A model that turns, the path, renders beside images, the shaded mesh, and the numbers of
+    the summary.
 
     Raises:
         OutputError: a file cannot be written.
@@ -45,4 +50,20 @@ def write_report(
             if name == "mesh" or colours is not None
         ]
         plots.plot_meshes(folder / "mesh.png", surfaces, views)
-    write_run_page(folder, summary)
+    model = None
+    if renders:
+        keyframes, camera = shown_views(renders), renders[0].camera
+        model = shown_model(trajectory, keyframes, camera, mesh, disks)
+    write_run_page(folder, summary, model)
+
+
+def shown_views(renders: Sequence[RenderedKeyframe]) -> list[ShownView]:
+    """The keyframes of the page; those of a long video stay where they are until they are shown."""
+
+    def image(number: int) -> UInt8[np.ndarray, "h w 3"] | None:
+        return renders[number].image
+
+    return [
+        ShownView(r.timestamp, np.linalg.inv(r.T_cw.numpy()), partial(image, i))
+        for i, r in enumerate(renders)
+    ]

@@ -1,7 +1,7 @@
 """Everything that a run or a reconstruction leaves in its folder."""
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
@@ -22,12 +22,6 @@ from geogs.io.writers.tum import write_tum_trajectory
 from geogs.io.writers.uncertainty import write_uncertainty
 from geogs.threads import on_one_torch_thread
 
-NOT_JUDGED = (
-    "How far this is to be relied on was not worked out: the adjustment of all keyframes is "
-    "missing."
-)
-"""Said of a run that was stopped."""
-
 
 @on_one_torch_thread
 def write_results(
@@ -35,19 +29,19 @@ def write_results(
     result: Result,
     more: Sequence[Callable[[], None]] = (),
     keyframe_images: bool = True,
-    is_online_new: bool = False,
+    new_stages: Collection[str] = (),
 ) -> None:
     """Write poses first, then the map, the mesh, what else was asked for, and the report on them.
 
     ``more`` writes the rest, which the summary then counts. ``keyframe_images`` says whether the
     images of the keyframes are kept, too. Files of an earlier result in the folder are deleted;
-    online/ stays where it is said to be of this one.
+    ``new_stages`` names folders of stages that are of this one.
 
     Raises:
         OutputError: a file cannot be written.
     """
     output = prepare_output_folder(output)
-    remove_former(output, is_online_new)
+    remove_former(output, new_stages)
     scene, source, progress = result.scene, result.source, result.progress
     write_tum_trajectory(output / "trajectory.tum", result.trajectory)
     write_tum_trajectory(output / "keyframes.tum", result.keyframes)
@@ -77,14 +71,12 @@ def write_results(
             f"warning: {lost} of {scene.frames} frames were not tracked; slower motion, texture "
             "or the right --intrinsics may help."
         )
-    if result.verdict is not None:
-        progress.write(result.verdict.sentence)
-    elif not isinstance(source, PosedSource):
-        progress.write(NOT_JUDGED)
     summary = summarise(result)
     write_text(output / "summary.json", json.dumps(summary, indent=2))
+    progress.stage("report", 0.0)
     with scene.stopwatch("report"):
-        write_report(output / "report", result.trajectory, result.renders, mesh, summary)
+        write_report(output / "report", result.trajectory, result.renders, mesh, summary, disks)
+    progress.stage("report", 1.0)
 
 
 def write_config(path: Path, config: Config | ReconstructConfig) -> None:

@@ -2,17 +2,20 @@
 
 from collections.abc import Generator, Iterator
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Literal
 
 import torch
 
 from geogs.application.calibrate import self_calibrated
 from geogs.application.checkpoint import has_checkpoint
 from geogs.application.folder_lock import only_writer
+from geogs.application.forecast import RunForecast
 from geogs.application.former import free_folder
 from geogs.application.interrupt import Stop
 from geogs.application.machine import REMEDY, compiled_kernels, full_memory_in_a_sentence
+from geogs.application.observer import RunObserver
 from geogs.application.priors import open_prior
 from geogs.application.progress import RunProgress
 from geogs.application.result import Result, Written
@@ -34,7 +37,10 @@ from geogs.types import Frame
 
 @on_one_torch_thread
 def run(
-    settings: RunSettings, progress: RunProgress | None = None, stop: Stop | None = None
+    settings: RunSettings,
+    progress: RunProgress | None = None,
+    stop: Stop | None = None,
+    observer: RunObserver | None = None,
 ) -> Written:
     """Open the sources, calibrate, track and map every frame, write the results.
 
@@ -52,7 +58,7 @@ def run(
     wanted = settings.output or free_folder(Path("out") / opened.name, opened.fingerprint())
     output = prepare_output_folder(wanted)
     with only_writer(output):
-        return _run(settings, opened, output, device, progress, stop)
+        return _run(settings, opened, output, device, progress, stop, observer)
 
 
 def _run(
@@ -62,6 +68,7 @@ def _run(
     device: torch.device,
     progress: RunProgress,
     stop: Stop,
+    observer: RunObserver | None,
 ) -> Written:
     """The same once the source is opened and the folder is ours."""
     config = settings.config
@@ -78,7 +85,8 @@ def _run(
             f"Starting anew; geogs run --resume {output} would go on with the unfinished run "
             "there, until the first checkpoint of this one."
         )
-    return _Run(slam, source, settings, output, facts, progress, stop).complete(iter(source))
+    prepared = _Run(slam, source, settings, output, facts, progress, stop, observer)
+    return prepared.complete(iter(source))
 
 
 @on_one_torch_thread
@@ -87,6 +95,7 @@ def resume(
     settings: RunSettings | None = None,
     progress: RunProgress | None = None,
     stop: Stop | None = None,
+    observer: RunObserver | None = None,
 ) -> Written:
     """Go on with the run whose checkpoint lies in a folder, as if nothing had happened.
 
@@ -112,7 +121,8 @@ def resume(
         progress.write(f"Going on after {slam.frames} frames.")
         facts = replace(saved.facts, settings=settings.absolute(), device=device.type)
         frames = frames_after(source, saved.facts.place)
-        return _Run(slam, source, settings, output, facts, progress, stop).complete(frames)
+        prepared = _Run(slam, source, settings, output, facts, progress, stop, observer)
+        return prepared.complete(frames)
 
 
 def continued(facts: RunFacts, settings: RunSettings, output: Path) -> RunSettings:
@@ -145,12 +155,16 @@ class _Run:
     facts: RunFacts
     progress: RunProgress
     stop: Stop
+    observer: RunObserver | None = None
+    stages: list[str] = field(default_factory=list)
+    """Whose results have been written."""
 
     def complete(self, frames: Generator[Frame, None, None]) -> Written:
         """The frames that are left, the final stages, the files."""
         slam, source, settings, output = self.slam, self.source, self.settings, self.output
         progress = self.progress
         checkpoint = RunCheckpoint(output, self.facts, settings.checkpoint_every, progress)
+        progress.plan(RunForecast(slam.config, slam.stopwatch, source.length, slam.frames))
         progress.expect(source.length, slam.frames)
         kept = False
         with full_memory_in_a_sentence(self._way_on), self.stop:
@@ -165,12 +179,14 @@ class _Run:
             if not interrupted:
                 kept = checkpoint.write(slam, source)
             if settings.online_results:
-                write_stage(output, slam, progress, "online")
+                self._write_stage("online")
             interrupted |= not self._finish(correct=not interrupted)
             result = Result(slam, source, interrupted, progress)
             more = [lambda: write_depth_mesh(output, slam, progress)]
             more = more if settings.depth_mesh else []
-            write_results(output, result, more, settings.keyframe_images, settings.online_results)
+            write_results(output, result, more, settings.keyframe_images, self.stages)
+            if self.observer is not None:
+                self.observer.result(result)
         if full:
             raise DeviceError(
                 f"The memory of the GPU was full after {slam.frames} frames, whose results are in "
@@ -195,7 +211,10 @@ class _Run:
             return True
         try:
             for frame in _timed(frames, slam.stopwatch):
-                self.progress.frame(slam.process(frame))
+                status = slam.process(frame)
+                self.progress.frame(status)
+                if self.observer is not None:
+                    self.observer.frame(frame, status, slam)
                 if self.stop.requested:
                     break
                 checkpoint.after_frame(slam, self.source)
@@ -230,8 +249,12 @@ class _Run:
         slam = self.slam
         slam.adjust(report)
         if self.settings.online_results and slam.will_refine:
-            write_stage(self.output, slam, self.progress, "adjusted")
+            self._write_stage("adjusted")
         slam.refine(report)
+
+    def _write_stage(self, name: Literal["online", "adjusted"]) -> None:
+        write_stage(self.output, self.slam, self.progress, name)
+        self.stages.append(name)
 
 
 def _timed(frames: Iterator[Frame], stopwatch: Stopwatch) -> Iterator[Frame]:

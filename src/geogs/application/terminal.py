@@ -1,90 +1,181 @@
-"""A run on the terminal: a line of frames, frames/s, keyframes, disks, memory, time left."""
+"""A run on the terminal: one line with how far it is and how long it will take; and a log."""
 
+import logging
 import time
-from typing import TYPE_CHECKING
+from datetime import datetime
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, TextIO
 
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    Progress,
-    TaskID,
-    TaskProgressColumn,
-    TextColumn,
-    TimeRemainingColumn,
-)
+from rich.progress import BarColumn, Progress, TextColumn
 
+from geogs.application.forecast import Forecast
 from geogs.application.machine import peak_memory
 from geogs.application.progress import RunProgress
+from geogs.application.verbosity import Verbosity
+from geogs.errors import OutputError
+from geogs.evaluation.run_report import duration
 
 if TYPE_CHECKING:
     from geogs.slam import SlamStatus
 
-
-_LOG_SECONDS = 2.0
-"""Where no terminal redraws the bars, a line of text comes this often."""
+_LOG_SECONDS, _VERBOSE_SECONDS = 20.0, 2.0
+"""Where no terminal redraws the line, one of text comes this often, and with ``-v`` this often."""
 
 _REDRAWS = 4
-"""A second; drawing the bars holds the interpreter's lock for milliseconds."""
+"""A second; drawing the line holds the interpreter's lock for milliseconds."""
 
 
 class TerminalProgress(RunProgress):
-    """Bars on the standard error, while it is entered and from the first of them on."""
+    """A line on the standard error, while it is entered and from the first news on.
 
-    def __init__(self) -> None:
-        self._console = Console(stderr=True)
+    Without a terminal there is a line of text for every phase, and now and then within one.
+    """
+
+    def __init__(self, verbosity: Verbosity | None = None) -> None:
+        self._verbosity = verbosity or Verbosity()
+        self._console = Console(stderr=True, quiet=self._verbosity.quiet, highlight=False)
         self._bar = Progress(
-            TextColumn("{task.description:<18}"),
+            TextColumn("{task.description}"),
             BarColumn(bar_width=24),
-            TaskProgressColumn(),
+            TextColumn("{task.fields[share]:>4}"),
             TextColumn("{task.fields[info]}"),
-            TimeRemainingColumn(compact=True),
+            TextColumn("{task.fields[left]}", style="cyan"),
             console=self._console,
             refresh_per_second=_REDRAWS,
+            transient=True,
         )
+        self._task = self._bar.add_task("", total=1.0, share="", info="", left="", start=False)
+        self._forecast: Forecast | None = None
         self._frames: int | None = None
-        self._begun = 0
         self._start = self._printed = time.perf_counter()
-        self._tasks: dict[str, TaskID] = {}
+        self._phase, self._phase_began, self._last = "", self._start, ""
+        self._log: TextIO | None = None
+        self._handler: logging.Handler | None = None
 
     def __enter__(self) -> "TerminalProgress":
+        if self._verbosity.log is not None:
+            self._log = _opened(self._verbosity.log)
+            self._handler = logging.StreamHandler(self._log)
+            self._handler.setLevel(logging.INFO)
+            form = logging.Formatter("%(asctime)s %(message)s", "%Y-%m-%d %H:%M:%S")
+            self._handler.setFormatter(form)
+            log = logging.getLogger("geogs")
+            log.addHandler(self._handler)
+            log.setLevel(min(log.level or logging.INFO, logging.INFO))
         return self
 
-    def __exit__(self, *exception: object) -> None:
-        if self._tasks:  # to stop what never began would print an empty line
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.end_phase()
+        if self._bar.live.is_started:  # to stop what never began would print an empty line
             self._bar.stop()
+        if error is not None:
+            self.note(f"ended by {kind.__name__ if kind else ''}: {error}")
+        if self._handler is not None:
+            logging.getLogger("geogs").removeHandler(self._handler)
+        if self._log is not None:
+            self._log.close()
 
     def write(self, text: str) -> None:
-        """A line above the bars, if there is something to say."""
-        if text:
-            self._bar.console.print(text, markup=False)  # names may hold brackets
+        """A line above the other, if there is something to say; warnings with ``-q``, too."""
+        if not text:
+            return
+        self.note(text)
+        if text.startswith("warning") and self._verbosity.quiet:
+            Console(stderr=True, highlight=False).print(text, soft_wrap=True, markup=False)
+        self._bar.console.print(text, soft_wrap=True, markup=False)
+
+    def plan(self, forecast: Forecast) -> None:
+        """Say from now on how long the rest will take."""
+        self._forecast = forecast
 
     def expect(self, frames: int | None, begun: int = 0) -> None:
-        """Show the bar of the frames."""
-        self._frames, self._begun = frames, begun
-        self._start = self._printed = time.perf_counter()
-        self._bar.start()
-        self._tasks["tracking"] = self._bar.add_task(
-            "tracking", total=frames, completed=begun, info=""
-        )
+        """Begin with the frames."""
+        self._frames = frames
+        self._enter("frames")
 
     def frame(self, status: "SlamStatus") -> None:
-        """Move the bar of the frames, with what there is to say beside it."""
-        rate = (status.frames - self._begun) / max(time.perf_counter() - self._start, 1e-9)
+        """Move the line, with what there is to say beside it."""
+        left = None
+        if self._forecast is not None:
+            left = self._forecast.after_frame(status.frames, status.keyframes)
         info = (
-            f"{status.frames} frames  {rate:.1f}/s  {status.keyframes} keyframes  "
-            f"{status.disks / 1000:.1f}k disks  {peak_memory() / 2**30:.1f} GB"
+            f"{status.keyframes} keyframes  {status.disks / 1000:.1f}k disks  "
+            f"{peak_memory() / 2**30:.1f} GB"
         )
         if status.state.value != "tracking":
-            info += f"  [bold]{status.state.value}[/bold]"
-        self._bar.update(self._tasks["tracking"], completed=status.frames, info=info)
-        now = time.perf_counter()
-        if not self._console.is_terminal and now - self._printed > _LOG_SECONDS:
-            self._printed = now
-            self._console.print(f"frame {status.frames}/{self._frames or '?'}: {info}")
+            info += f"  {status.state.value}"
+        self._show(f"frame {status.frames}/{self._frames or '?'}", info, left)
 
     def stage(self, name: str, fraction: float) -> None:
-        """Move the bar of a stage, or begin one."""
-        if name not in self._tasks:
+        """Move the line to a stage, or within it."""
+        self._enter(name.split(":")[0])
+        left = None if self._forecast is None else self._forecast.after_stage(name, fraction)
+        self._show(f"{name} {fraction:.0%}", "", left)
+
+    def _enter(self, phase: str) -> None:
+        """Begin another phase, if it is another."""
+        if phase == self._phase:
+            return
+        self.end_phase()
+        self._phase, self._phase_began = phase, time.perf_counter()
+        self._printed = self._phase_began
+
+    def end_phase(self) -> None:
+        """Say how long it took, where lines of text are wanted."""
+        if not self._phase:
+            return
+        seconds = time.perf_counter() - self._phase_began
+        text = f"{self._phase}: {duration(seconds)}{self._last}"
+        self._phase = self._last = ""
+        self.note(text)
+        if not self._console.is_terminal or self._verbosity.verbose:
+            self._bar.console.print(text, soft_wrap=True, markup=False)
+
+    def _show(self, what: str, info: str, left: float | None) -> None:
+        """The line as it is now, or a line of text if it is time for one."""
+        now = time.perf_counter()
+        elapsed = now - self._start
+        share = None if left is None else elapsed / max(elapsed + left, 1e-9)
+        ahead = "" if left is None else f"{duration(left)} left"
+        self._last = f", {info}" if info else ""
+        self._bar.update(
+            self._task,
+            description=f"{what:<20}",
+            completed=share or 0.0,
+            share="" if share is None else f"{share:.0%}",
+            info=info,
+            left=ahead,
+        )
+        if self._console.is_terminal and not self._bar.live.is_started:
             self._bar.start()
-            self._tasks[name] = self._bar.add_task(name, total=1.0, info="")
-        self._bar.update(self._tasks[name], completed=fraction)
+        every = _VERBOSE_SECONDS if self._verbosity.verbose else _LOG_SECONDS
+        if now - self._printed < every:
+            return
+        self._printed = now
+        text = "  ".join(filter(None, (what, info, ahead and f"about {ahead}")))
+        self.note(text)
+        if not self._console.is_terminal:
+            self._console.print(text, soft_wrap=True, markup=False)
+
+    def note(self, text: str) -> None:
+        """Lines for the log alone, if there is one."""
+        if self._log is not None:
+            for line in text.splitlines():
+                self._log.write(f"{datetime.now():%Y-%m-%d %H:%M:%S} {line}\n")
+            self._log.flush()
+
+
+def _opened(path: Path) -> TextIO:
+    """A log to add to. Raises OutputError if it cannot be written."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return path.open("a", encoding="utf-8")
+    except OSError as error:
+        raise OutputError(f"{path} cannot be written ({error.strerror}).") from None

@@ -50,5 +50,5 @@ def demo(options: DemoOptions) -> int:
         code = command(arguments)
         if code:
             return code
-    print(f"Look at {result}/report/ and open {result}/mesh.ply in a mesh viewer.")
+    print(f"Open {result}/report/index.html in a browser.")
     return 0

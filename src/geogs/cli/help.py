@@ -44,7 +44,8 @@ def _head(leaf: Leaf) -> str:
     """Names of an option and what its value is."""
     kind = leaf.kind
     if kind.base is bool:
-        return leaf.switch_off.replace("no-", "[no-]", 1)
+        switch = leaf.switch_off.replace("no-", "[no-]", 1)
+        return ", ".join([*reversed(leaf.options[1:]), switch])
     value = ",".join(kind.choices) if kind.choices else _METAVARS[kind.base]
     value = "TIME" if Time in kind.marks else value
     return f"{', '.join(reversed(leaf.options))} {value}"

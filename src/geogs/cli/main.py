@@ -37,6 +37,7 @@ COMMANDS = {
     "reconstruct": Command("geogs.cli.reconstruct", "reconstruct images whose poses are known"),
     "mesh": Command("geogs.cli.mesh", "make the mesh of a result anew, without running again"),
     "export": Command("geogs.cli.export", "write a result in the formats of other programs"),
+    "view": Command("geogs.cli.view", "look at a result in the browser"),
     "eval": Command("geogs.cli.eval", "compare a result with the ground truth"),
     "bench": Command("geogs_bench.cli", "run a benchmark and write its tables"),
     "train": Command("geogs_train.cli", "train the flow network that is shipped"),

@@ -81,7 +81,7 @@ def _named(
         name: (leaf, text)
         for leaf in known
         if leaf.kind.base is bool
-        for text, name in (("on", leaf.options[0]), ("off", leaf.switch_off))
+        for text, name in (*(("on", name) for name in leaf.options), ("off", leaf.switch_off))
     }
     loose: list[str] = []
     given: dict[str, list[str]] = {}

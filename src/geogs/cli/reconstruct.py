@@ -6,12 +6,14 @@ from dataclasses import dataclass, replace
 from typing import cast
 
 from geogs.application.settings import ReconstructSettings
+from geogs.application.verbosity import Verbosity
 from geogs.cli.options import Given, parse_options, record
+from geogs.cli.speech import followed
 from geogs.config import Preset, reconstruct_preset
 
 
 @dataclass(frozen=True)
-class ReconstructOptions(ReconstructSettings):
+class ReconstructOptions(Verbosity, ReconstructSettings):
     """Reconstruct images whose poses are known: a COLMAP model, nerfstudio, DTU, Replica, TUM...
 
     Lengths of the result are in the unit of the poses. Every default works.
@@ -25,20 +27,20 @@ class ReconstructOptions(ReconstructSettings):
 def main(argv: Sequence[str]) -> int:
     """Run the command; returns the exit code."""
     begin = time.perf_counter()
-    settings = record(ReconstructSettings, parse(argv))
+    options = parse(argv)
+    settings = record(ReconstructSettings, options)
 
     from geogs.application.interrupt import Interruption
     from geogs.application.reconstruct import LEAST_BUDGET, reconstruct_to_folder
-    from geogs.application.terminal import TerminalProgress
 
     if settings.budget is not None:  # which counts from the start of the command
         left = settings.budget - (time.perf_counter() - begin)
         settings = replace(settings, budget=max(left, LEAST_BUDGET))
-    with TerminalProgress() as progress:
-        written = reconstruct_to_folder(settings, progress, Interruption())
+    written = followed(
+        options, lambda progress: reconstruct_to_folder(settings, progress, Interruption())
+    )
     if written.can_resume:
         print("The same command with --resume goes on from here.")
-    print(f"Results are in {written.output}/")
     return 0
 
 

@@ -1,19 +1,26 @@
 """``geogs run SOURCE``: a video in; trajectory, mesh and disk map out."""
 
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import cast
+from typing import TYPE_CHECKING, cast
 
 from geogs.application.settings import RunSettings
+from geogs.application.verbosity import Verbosity
+from geogs.application.viewer.settings import HERE, LiveSettings
 from geogs.cli.options import Given, parse_options, record
+from geogs.cli.speech import followed
 from geogs.config import Preset, preset
 from geogs.errors import InputError
 
+if TYPE_CHECKING:
+    from geogs.application.observer import RunObserver
+
 
 @dataclass(frozen=True)
-class RunOptions(RunSettings):
+class RunOptions(LiveSettings, Verbosity, RunSettings):
     """Reconstruct a video, a folder of images, or a Replica, TUM RGB-D or 7-Scenes sequence.
 
     Every default works: ``geogs run video.mp4``. Intrinsics: ``--intrinsics fx,fy,cx,cy``.
@@ -34,15 +41,32 @@ def main(argv: Sequence[str]) -> int:
 
     from geogs.application.interrupt import Interruption
     from geogs.application.run import resume, run
-    from geogs.application.terminal import TerminalProgress
 
     go = run if options.resume is None else partial(resume, options.resume)
-    with TerminalProgress() as progress:
-        written = go(record(RunSettings, options), progress, Interruption())
+    settings, observer = record(RunSettings, options), _observer(options)
+    written = followed(options, lambda progress: go(settings, progress, Interruption(), observer))
     if written.can_resume:
         print(f"geogs run --resume {written.output} goes on from here.")
-    print(f"Results are in {written.output}/")
     return 0
+
+
+def _observer(options: LiveSettings) -> "RunObserver | None":
+    """Who looks on, if somebody should."""
+    from geogs.application.observer import Observers
+
+    several: list[RunObserver] = []
+    if options.record is not None:
+        from geogs.application.viewer.recording import Recorder
+
+        several.append(Recorder(options.record))
+    if options.viewer:
+        from geogs.application.viewer.live import LiveViewer
+        from geogs.application.viewer.window import Window
+
+        window = Window("geogs", HERE, options.viewer_port, with_disks=True)
+        print(f"Open {window.address} in a browser to look on.", file=sys.stderr)
+        several.append(LiveViewer(window))
+    return Observers(several) if several else None
 
 
 def parse(argv: Sequence[str]) -> RunOptions:

@@ -1,9 +1,11 @@
-"""Report pages: one static HTML file of tables, pictures and text; no server, no scripts."""
+"""Report pages: one HTML file of figures, tables, pictures and text; no server."""
 
+import base64
 import html
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
 from urllib.parse import quote
 
@@ -25,7 +27,7 @@ class TableSection:
 
 @dataclass(frozen=True)
 class PictureSection:
-    """A picture under a heading, linked relative to the page; left out where it is missing."""
+    """A picture under a heading; left out where it is missing or cannot be copied."""
 
     heading: str
     file: Path
@@ -41,20 +43,47 @@ class TextSection:
     preformatted: bool = True
 
 
-Section = TableSection | PictureSection | TextSection
+@dataclass(frozen=True)
+class FiguresSection:
+    """A sentence of judgement, and the few numbers that matter most, side by side."""
+
+    sentence: str
+    """Nothing where nothing was judged."""
+    is_good: bool | None
+    """How it is marked; none is neutral."""
+    figures: Sequence[tuple[str, str]]
+    """What each is, with its unit, and its value."""
 
 
-def write_page(path: Path, title: str, sections: Sequence[Section], subtitle: str = "") -> None:
+@dataclass(frozen=True)
+class HtmlSection:
+    """A part that is HTML already, such as a model that turns."""
+
+    html: str
+
+
+Section = TableSection | PictureSection | TextSection | FiguresSection | HtmlSection
+
+
+def write_page(
+    path: Path,
+    title: str,
+    sections: Sequence[Section],
+    subtitle: str = "",
+    is_whole: bool = False,
+) -> None:
     """Write a page that any browser shows from the disk: on a phone, and in the dark, too.
 
     All text is escaped. Pictures are linked by their place relative to the page and are not
-    copied, so they should lie beside it.
+    copied, so they should lie beside it; a page that ``is_whole`` holds copies of them, as WebP,
+    and needs no other file.
 
     Args:
         path: the page, usually ``index.html`` of a folder.
         title: of the page.
         sections: tables, pictures and texts in the order in which they appear.
         subtitle: a line under the title.
+        is_whole: whether pictures are inside.
 
     Raises:
         OutputError: it cannot be written.
@@ -62,7 +91,8 @@ def write_page(path: Path, title: str, sections: Sequence[Section], subtitle: st
     body = [f"<h1>{html.escape(title)}</h1>"]
     if subtitle:
         body.append(f"<p class=note>{html.escape(subtitle)}</p>")
-    body += [part for section in sections if (part := _section(section, path.parent))]
+    folder = None if is_whole else path.parent
+    body += [part for section in sections if (part := _section(section, folder))]
     text = "\n".join(body)
     write_text(path, f"{_head(title)}<body>\n{text}\n</body></html>\n")
 
@@ -76,12 +106,16 @@ def _head(title: str) -> str:
     )
 
 
-def _section(section: Section, folder: Path) -> str:
+def _section(section: Section, folder: Path | None) -> str:
     match section:
         case TableSection():
             return _table(section)
         case PictureSection():
             return _picture(section, folder)
+        case FiguresSection():
+            return _figures(section)
+        case HtmlSection():
+            return section.html
         case TextSection():
             tag = "pre" if section.preformatted else "p"
             return f"{_heading(section.heading)}<{tag}>{html.escape(section.text)}</{tag}>"
@@ -101,14 +135,41 @@ def _table(section: TableSection) -> str:
     return _heading(section.heading) + table + note
 
 
-def _picture(section: PictureSection, folder: Path) -> str:
+def _figures(section: FiguresSection) -> str:
+    mark = {True: "good", False: "bad", None: ""}[section.is_good]
+    sentence = f'<p class="verdict {mark}">{html.escape(section.sentence)}</p>'
+    cells = "".join(
+        f"<div><dt>{html.escape(name)}</dt><dd>{html.escape(value)}</dd></div>"
+        for name, value in section.figures
+    )
+    return (sentence if section.sentence else "") + f"<dl>{cells}</dl>"
+
+
+def _picture(section: PictureSection, folder: Path | None) -> str:
     if not section.file.is_file():
         return ""
-    place = quote(Path(os.path.relpath(section.file, folder)).as_posix())
+    if folder is None:
+        try:
+            place = _inside(section.file)
+        except OSError:  # no picture, or one that is cut off
+            return ""
+    else:
+        place = quote(Path(os.path.relpath(section.file, folder)).as_posix())
     caption = section.caption or section.heading
     below = f"<figcaption>{html.escape(section.caption)}</figcaption>" if section.caption else ""
-    image = f'<a href="{place}"><img src="{place}" alt="{html.escape(caption)}"></a>'
-    return f"{_heading(section.heading)}<figure>{image}{below}</figure>"
+    image = f'<img src="{place}" alt="{html.escape(caption)}">'
+    linked = image if folder is None else f'<a href="{place}">{image}</a>'
+    return f"{_heading(section.heading)}<figure>{linked}{below}</figure>"
+
+
+def _inside(file: Path) -> str:
+    """A picture as an address that holds it."""
+    from PIL import Image
+
+    stream = BytesIO()
+    with Image.open(file) as picture:
+        picture.convert("RGB").save(stream, "WEBP", quality=88)
+    return "data:image/webp;base64," + base64.b64encode(stream.getvalue()).decode("ascii")
 
 
 def _heading(text: str) -> str:
@@ -116,20 +177,31 @@ def _heading(text: str) -> str:
 
 
 _STYLE = """
-:root { --text: #1c2330; --soft: #5b6675; --line: #d9dee6; --back: #fff; --box: #f4f6f9; }
+:root { --text: #1d2127; --soft: #646c78; --line: #e3e6ea; --back: #fff; --box: #f5f6f8;
+  --good: #1f8a55; --bad: #b8561b; }
 @media (prefers-color-scheme: dark) {
-  :root { --text: #e3e7ee; --soft: #9aa5b5; --line: #343b47; --back: #14171c; --box: #1d2128; }
+  :root { --text: #e4e7ec; --soft: #949ca8; --line: #2c3138; --back: #121417; --box: #1b1e23;
+    --good: #5cc690; --bad: #eb9a5c; }
 }
 body { font: 15px/1.5 system-ui, sans-serif; color: var(--text); background: var(--back);
-  max-width: 1100px; margin: 0 auto; padding: 1.5em 1em 4em; }
-h1 { font-size: 1.6em; margin: 0.3em 0; } h2 { font-size: 1.15em; margin: 1.8em 0 0.5em; }
+  max-width: 1180px; margin: 0 auto; padding: 1.6em 1.2em 4em; }
+h1 { font-size: 1.5em; font-weight: 600; letter-spacing: -0.01em; margin: 0.2em 0; }
+h2 { font-size: 1.08em; font-weight: 600; margin: 2.2em 0 0.6em; }
+.verdict { margin: 0.3em 0 0.9em; padding-left: 1.15em; position: relative; max-width: 75ch; }
+.verdict::before { content: ""; position: absolute; left: 0; top: 0.5em; width: 0.55em;
+  height: 0.55em; border-radius: 50%; background: var(--soft); }
+.verdict.good::before { background: var(--good); } .verdict.bad::before { background: var(--bad); }
+dl { display: flex; flex-wrap: wrap; gap: 0.6em 2.2em; margin: 0.8em 0; }
+dt { color: var(--soft); font-size: 0.84em; } dd { margin: 0; font-size: 1.22em;
+  font-variant-numeric: tabular-nums; }
 .wide { overflow-x: auto; } table { border-collapse: collapse; }
-th, td { padding: 0.2em 1em 0.2em 0; border-bottom: 1px solid var(--line); white-space: pre;
+th, td { padding: 0.22em 1.2em 0.22em 0; border-bottom: 1px solid var(--line); white-space: pre;
   text-align: right; font-variant-numeric: tabular-nums; }
 th { font-weight: 600; } th:first-child, td:first-child { text-align: left; }
 tbody tr:hover { background: var(--box); }
-figure { margin: 0; } img { max-width: 100%; height: auto; border-radius: 4px; background: #fff; }
+figure { margin: 0; } figure img { max-width: 100%; height: auto; border-radius: 6px;
+  background: #fff; }
 figcaption, .note { color: var(--soft); font-size: 0.92em; margin: 0.4em 0; }
-pre { background: var(--box); color: var(--soft); padding: 0.8em 1em; border-radius: 4px;
+pre { background: var(--box); color: var(--soft); padding: 0.8em 1em; border-radius: 6px;
   overflow-x: auto; font-size: 0.87em; }
 """

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 _TRUTH, _ESTIMATE, _LOST = "0.45", "#0072b2", "#d55e00"
 _ERROR_MAP = "YlOrRd"
+ERROR_STOPS = ("#ffffcc", "#fed976", "#fd8d3c", "#e2191c", "#800026")
+"""Colours of :func:`error_colours` from none to the worst, as CSS has them."""
 _UNKNOWN = 190
 
 

@@ -6,7 +6,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from geogs.evaluation.page import PictureSection, Section, TableSection, TextSection, write_page
+from geogs.evaluation.model_view.records import Model
+from geogs.evaluation.model_view.section import model_html
+from geogs.evaluation.page import (
+    FiguresSection,
+    HtmlSection,
+    PictureSection,
+    Section,
+    TableSection,
+    TextSection,
+    write_page,
+)
 from geogs.evaluation.photoconsistency import PhotoScores
 from geogs.evaluation.scores import SurfaceScores
 from geogs.evaluation.trajectory import TrajectoryErrors
@@ -82,26 +92,46 @@ def write_report(
     pictures: list[tuple[str, Path]],
     run: Sequence[Section] = (),
     title: str = "report",
+    judged: FiguresSection | None = None,
+    model: Model | None = None,
 ) -> None:
     """Write ``eval.json`` and a page with the errors, the pictures and the run's own tables.
+
+    The page holds all that it shows.
 
     Args:
         evaluation: the errors.
         json_file: for programs.
         page: for people.
-        pictures: titles and files, which are linked and should lie beside the page.
+        pictures: titles and files; those that are missing are left out.
         run: what the run said of itself.
         title: what was reconstructed.
+        judged: the verdict of the run; the errors stand beneath it.
+        model: what turns at the head.
     """
     write_text(json_file, json.dumps(evaluation.as_dict(), indent=2, default=str) + "\n")
-    sections: list[Section] = [
-        TableSection(heading, (), rows) for heading, rows in groups(evaluation)
-    ]
+    judged = judged or FiguresSection("", None, ())
+    numbers = [*error_figures(evaluation), *judged.figures]
+    sections: list[Section] = [FiguresSection(judged.sentence, judged.is_good, numbers)]
+    sections += [HtmlSection(model_html(model))] if model is not None else []
+    sections += [TableSection(heading, (), rows) for heading, rows in groups(evaluation)]
     sections += [PictureSection(title, file) for title, file in pictures]
     sections += run
     settings = json.dumps(evaluation.settings, indent=2, default=str)
     sections.append(TextSection("Settings of the comparison", settings))
-    write_page(page, f"geogs: {title}", sections, "compared with the truth")
+    write_page(page, title, sections, "geogs, compared with the truth", is_whole=True)
+
+
+def error_figures(evaluation: Evaluation) -> list[tuple[str, str]]:
+    """The errors that matter most."""
+    result = []
+    path = evaluation.trajectory
+    if path is not None and path.ate_max_cm > SAME_POSES_CM:
+        result.append(("ATE RMSE", f"{path.ate_rmse_cm:.2f} cm"))
+    if evaluation.reconstruction is not None:
+        rows = [row for row in evaluation.reconstruction.rows() if not row[0].startswith(" ")]
+        result += rows[:3]
+    return result
 
 
 def _trajectory_rows(name: str, errors: TrajectoryErrors) -> list[tuple[str, str]]:

@@ -4,7 +4,16 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from geogs.evaluation.page import PictureSection, Section, TableSection, write_page
+from geogs.evaluation.model_view.records import Model
+from geogs.evaluation.model_view.section import model_html
+from geogs.evaluation.page import (
+    FiguresSection,
+    HtmlSection,
+    PictureSection,
+    Section,
+    TableSection,
+    write_page,
+)
 
 PICTURES = {
     "mesh.png": "Mesh",
@@ -14,20 +23,62 @@ PICTURES = {
 """Titles of the pictures that a run leaves in ``report/``, in the order of the page."""
 
 
-def write_run_page(folder: Path, summary: Mapping[str, Any]) -> None:
-    """Write ``index.html`` into the folder of the pictures.
+def write_run_page(folder: Path, summary: Mapping[str, Any], model: Model | None = None) -> None:
+    """Write ``index.html`` into the folder of the pictures; it holds all that it shows.
 
     Args:
         folder: ``report/`` of a result.
         summary: what ``summary.json`` holds; numbers that are not there are left out.
+        model: what turns at its head, instead of pictures of the mesh.
 
     Raises:
         OutputError: it cannot be written.
     """
-    pictures = [PictureSection(title, folder / name) for name, title in PICTURES.items()]
-    name = str(summary.get("source", ""))
-    first, *others = run_sections(summary)
-    write_page(folder / "index.html", f"geogs: {name}", [first, *pictures, *others])
+    name = str(summary.get("source", "")) or "result"
+    head: list[Section] = [figures(summary, run_figures(summary))]
+    head += [HtmlSection(model_html(model))] if model is not None else []
+    pictures = [
+        PictureSection(title, folder / file)
+        for file, title in PICTURES.items()
+        if model is None or file != "mesh.png"
+    ]
+    sections = [*head, *pictures, *run_sections(summary)]
+    write_page(folder / "index.html", name, sections, "geogs", is_whole=True)
+
+
+def figures(summary: Mapping[str, Any], numbers: list[tuple[str, str]]) -> FiguresSection:
+    """The verdict of a run above some numbers."""
+    verdict = summary.get("verdict")
+    if not isinstance(verdict, Mapping):
+        return FiguresSection("", None, numbers)
+    sentence = str(verdict.get("sentence", ""))
+    return FiguresSection(sentence, bool(verdict.get("is_reliable")), numbers)
+
+
+def run_figures(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """The numbers of a run that matter most."""
+    seconds, rates = summary.get("seconds"), summary.get("frames_per_second")
+    total = seconds.get("total") if isinstance(seconds, Mapping) else None
+    rate = rates.get("with_final_stages") if isinstance(rates, Mapping) else None
+    shown = [
+        ("frames", _count(summary.get("frames"))),
+        ("keyframes", _count(summary.get("keyframes"))),
+        ("triangles", _count(summary.get("mesh_faces"))),
+        ("disks", _count(summary.get("disks"))),
+        ("time", duration(total) if isinstance(total, int | float) else ""),
+        ("frames/s", f"{rate:.2f}" if isinstance(rate, int | float) else ""),
+    ]
+    return [(name, text) for name, text in shown if text]
+
+
+def duration(seconds: int | float) -> str:
+    """A time as people say it."""
+    whole = round(seconds)
+    if whole < 60:
+        return f"{seconds:.0f} s"
+    if whole < 3600:
+        return f"{whole // 60} min {whole % 60:02d} s"
+    return f"{whole // 3600} h {whole % 3600 // 60:02d} min"
 
 
 def run_sections(summary: Mapping[str, Any]) -> list[Section]:

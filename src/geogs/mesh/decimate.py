@@ -48,6 +48,15 @@ def decimate(mesh: Mesh, tolerance: float) -> Mesh:
     return remove_degenerate_faces(_dressed(mesh, vertices, faces))
 
 
+def with_at_most(mesh: Mesh, faces: int) -> Mesh:
+    """The mesh with about so many triangles, whatever that does to its surface; if it has no more
+    than that, the same."""
+    if len(mesh.faces) <= faces:
+        return mesh
+    fewer = _simplified(mesh.vertices, mesh.faces, faces / len(mesh.faces))
+    return remove_degenerate_faces(_dressed(mesh, *fewer))
+
+
 def _simplified(
     vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "m 3"], share: float
 ) -> tuple[Float[np.ndarray, "k 3"], Int[np.ndarray, "l 3"]]:

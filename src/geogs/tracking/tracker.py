@@ -242,6 +242,11 @@ class Tracker:
             keyframe = self.keyframes[last.keyframe]
             self._last = LastFrame(keyframe, last.T_rel, last.velocity, last.scale)
 
+    @property
+    def T_cw(self) -> Float[Tensor, "4 4"] | None:
+        """World to camera where the camera was last seen; none before that."""
+        return None if self._last is None else self._last.T_cw
+
     # --- writing ---------------------------------------------------------------------------
 
     def absorb(self, other: "Tracker") -> None:

@@ -106,7 +106,7 @@ def test_option_may_be_numbers_a_file_or_auto(tmp_path, caplog):
     assert resolve_intrinsics(str(tmp_path / "c.txt"), None, 640, 480).fx == 400
     known = calibration_from_numbers([450.0, 450.0, 320.0, 240.0], "the data set")
     assert resolve_intrinsics("auto", known, 640, 480).fx == 450
-    with caplog.at_level(logging.WARNING, logger="geogs"):
+    with caplog.at_level(logging.INFO, logger="geogs"):
         guess = resolve_intrinsics("auto", None, 640, 480)
     assert guess.is_guess
     assert "intrinsics are unknown" in caplog.text

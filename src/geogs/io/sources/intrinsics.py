@@ -49,11 +49,8 @@ def resolve_intrinsics(
     if option.strip().lower() == "auto":
         calibration = known or guess_calibration(width, height)
         if calibration.is_guess:
-            _log.warning(
-                "The intrinsics are unknown; assuming %s. Give intrinsics fx,fy,cx,cy "
-                "for a better result.",
-                calibration.origin,
-            )
+            # No warning yet: a run finds the focal length from the video.
+            _log.info("The intrinsics are unknown; assuming %s.", calibration.origin)
         return calibration.fit(width, height, quarter_turns)
     return _from_option(option).fit(width, height, quarter_turns)
 

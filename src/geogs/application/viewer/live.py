@@ -1,0 +1,171 @@
+"""A window on a run that is going on, which it may not hold up."""
+
+import threading
+import time
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from geogs.application.observer import RunObserver
+from geogs.application.viewer.window import Window
+from geogs.evaluation.layers import layer_picture
+from geogs.geometry.camera import Camera
+from geogs.types import Frame, MapSnapshot
+
+if TYPE_CHECKING:
+    from geogs.application.result import Result
+    from geogs.slam import Slam, SlamStatus
+
+SHARE = 0.02
+"""Of the time that looking may take, of the run's thread and of the viewer's together."""
+MOST_DISKS = 30_000
+_MAP_SECONDS = 3.0
+"""Least time between two looks at the map."""
+_PICTURE_EDGE = 320
+
+
+@dataclass(frozen=True)
+class Update:
+    """What there is to see at a moment; nothing in it changes any more."""
+
+    words: str
+    picture: UInt8[np.ndarray, "h w 3"] | None
+    camera: Camera
+    T_wc: Float[np.ndarray, "4 4"] | None
+    """Of the camera now; none while it is not known."""
+    keyframe_ids: tuple[int, ...]
+    keyframes: Float[np.ndarray, "k 4 4"]
+    """Camera to world."""
+    disks: MapSnapshot | None = None
+    """None where they are as before."""
+
+
+class LiveViewer(RunObserver):
+    """Shows a run in a window, by a thread of its own.
+
+    What comes while that is at work, or while it has used up its share of the time, is dropped.
+    """
+
+    def __init__(self, window: Window, share: float = SHARE) -> None:
+        self._window, self._share = window, share
+        self._follow = window.add_checkbox("Follow", True)
+        self._pause = window.add_checkbox("Pause", False)
+        self._next: Update | None = None
+        self._wake = threading.Condition()
+        self._ended = False
+        self._start = time.perf_counter()
+        self._used = 0.0
+        """Seconds of looking, of both threads."""
+        self._last_map = -_MAP_SECONDS
+        self._frusta: dict[int, tuple[object, np.ndarray]] = {}
+        self._thread = threading.Thread(target=self._serve, name="viewer", daemon=True)
+        self._thread.start()
+
+    @property
+    def used(self) -> float:
+        """Seconds of computing that looking has taken."""
+        return self._used
+
+    def frame(self, frame: Frame, status: "SlamStatus", slam: "Slam") -> None:
+        """Take what there is to see, if there is time for it."""
+        now = time.perf_counter()
+        if self._next is not None or self._used > self._share * (now - self._start):
+            return
+        if self._pause.value or not self._window.clients:
+            return
+        begin = time.thread_time()
+        update = self._look(frame, status, slam, now)
+        self._used += time.thread_time() - begin  # before the other thread adds its own
+        with self._wake:
+            self._next = update
+            self._wake.notify()
+
+    def result(self, result: "Result") -> None:
+        """Show the mesh and the verdict."""
+        with self._wake:
+            self._ended = True
+            self._wake.notify()
+        self._thread.join(timeout=5)
+        if result.mesh is not None:
+            self._window.show_mesh(result.mesh)
+        sentence = "" if result.verdict is None else result.verdict.sentence
+        self._window.say(f"**{result.source.name}**: done\n\n{sentence}")
+
+    def _look(self, frame: Frame, status: "SlamStatus", slam: "Slam", now: float) -> Update:
+        ids = tuple(slam.segments.keyframe_ids)
+        T_wc = [np.linalg.inv(slam.keyframes[i].T_cw.numpy()) for i in ids]
+        seen = slam.segments.current.T_cw if status.state.value == "tracking" else None
+        loops = len(slam.loops.detector.loops)
+        words = (
+            f"frame {status.frames}: {status.state.value}\n\n{status.keyframes} keyframes, "
+            f"{status.disks} disks, {loops} loops"
+        )
+        picture, layer = frame.image, self._window.layer
+        if layer != "image" and (searched := slam.depth_maps()):
+            picture = layer_picture(searched[len(searched) - 1], layer)
+        disks = None
+        if now - self._last_map >= _MAP_SECONDS and status.disks:
+            self._last_map = now
+            disks = thinned(slam.snapshot())
+        return Update(
+            words,
+            _small(picture),
+            slam.camera,
+            None if seen is None else np.linalg.inv(seen.numpy()),
+            ids,
+            np.array(T_wc).reshape(-1, 4, 4),
+            disks,
+        )
+
+    def _serve(self) -> None:
+        while True:
+            with self._wake:
+                self._wake.wait_for(lambda: self._next is not None or self._ended)
+                update = self._next
+                if update is None:
+                    return
+            begin = time.thread_time()
+            self._show(update)
+            self._used += time.thread_time() - begin
+            self._next = None
+
+    def _show(self, update: Update) -> None:
+        window = self._window
+        window.say(update.words)
+        if len(update.keyframes) > 1:
+            extent = np.ptp(update.keyframes[:, :3, 3], axis=0)
+            window.stand_upright(update.keyframes, 2.5 * float(np.linalg.norm(extent)) + 1.0)
+            window.show_path(update.keyframes[:, :3, 3])
+        self._show_keyframes(update)
+        if update.picture is not None:
+            window.show_picture(update.picture)
+        if update.T_wc is not None:
+            window.show_camera(update.T_wc, update.camera, update.picture)
+            if self._follow.value:
+                window.follow(update.T_wc)
+        if update.disks is not None:
+            window.show_disks(update.disks)
+
+    def _show_keyframes(self, update: Update) -> None:
+        """New ones, and those that a correction has moved."""
+        for id, T_wc in zip(update.keyframe_ids, update.keyframes, strict=True):
+            if id not in self._frusta:
+                self._frusta[id] = (self._window.show_keyframe(id, T_wc, update.camera), T_wc)
+            elif np.abs(self._frusta[id][1] - T_wc).max() > 1e-3:
+                frustum, _ = self._frusta[id]
+                self._window.move_keyframe(frustum, T_wc)
+                self._frusta[id] = (frustum, T_wc)
+
+
+def thinned(disks: MapSnapshot) -> MapSnapshot:
+    """Not more than can be sent."""
+    step = -(-len(disks) // MOST_DISKS)
+    kept = {name: getattr(disks, name)[::step].cpu() for name in MapSnapshot.__slots__}
+    return replace(disks, **kept)
+
+
+def _small(picture: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
+    step = -(-max(picture.shape[:2]) // _PICTURE_EDGE)
+    return np.ascontiguousarray(picture[::step, ::step])

@@ -1,0 +1,111 @@
+"""A window on a saved result."""
+
+import threading
+
+import numpy as np
+
+from geogs.application.saved_result import SavedResult
+from geogs.application.shown_model import first_view
+from geogs.application.viewer.window import Window
+from geogs.errors import InputError
+from geogs.evaluation.layers import layer_picture
+from geogs.io.writers.keyframe_images import image_path, read_image
+
+MOST_FRUSTA, MOST_IMAGES = 400, 60
+"""Of the keyframes, evenly along the path."""
+_IMAGE_EDGE = 160
+
+
+def open_window(result: SavedResult, host: str, port: int) -> Window:
+    """Show a result; the window serves until it is stopped.
+
+    Raises:
+        InputError: viser is not installed, or the result is damaged.
+    """
+    window = Window(f"geogs: {result.name}", host, port)
+    mesh, trajectory = result.mesh, result.trajectory
+    tracked = trajectory.T_wc[trajectory.tracked]
+    tracked = tracked if len(tracked) else trajectory.T_wc
+    points = result.disks.position.cpu().numpy() if mesh is None else mesh.vertices
+    axes, eye, target = first_view(np.concatenate([points, tracked[:, :3, 3]]), tracked)
+    window.stand_upright(tracked, float(np.linalg.norm(eye - target)))
+    window.look_from(eye, target, axes[2])
+    if mesh is not None:
+        window.show_mesh(mesh)
+    window.show_disks(result.disks)
+    window.show_path(tracked[:, :3, 3])
+    _show_keyframes(result, window)
+    _Inspector(result, window).begin()
+    return window
+
+
+def _show_keyframes(result: SavedResult, window: Window) -> None:
+    views = result.views
+    count = len(views.keyframe_id)
+    shown = np.unique(np.linspace(0, count - 1, min(count, MOST_FRUSTA)).round().astype(int))
+    every = -(-len(shown) // MOST_IMAGES)
+    for place, number in enumerate(shown):
+        id, image = int(views.keyframe_id[number]), None
+        if views.has_images and place % every == 0:
+            image = read_image(image_path(result.folder, id))
+            step = -(-max(image.shape) // _IMAGE_EDGE)
+            image = np.ascontiguousarray(image[::step, ::step])
+        window.show_keyframe(id, np.linalg.inv(views.T_cw[number]), result.camera, image)
+
+
+class _Inspector:
+    """Shows the keyframe that was chosen, in the layer that was chosen."""
+
+    def __init__(self, result: SavedResult, window: Window) -> None:
+        self._result, self._window = result, window
+        self._number = 0
+        self._lock = threading.Lock()
+
+    def begin(self) -> None:
+        """Put up the slider and show the first keyframe."""
+        count = len(self._result.keyframes)
+        if not count:
+            return
+        self._follow = self._window.add_checkbox("Follow", False)
+        self._window.add_slider("Keyframe", count, self._choose)
+        self._window.on_layer(self._show)
+        self._show()
+
+    def _choose(self, number: int) -> None:
+        self._number = number - 1
+        self._show()
+
+    def _show(self) -> None:
+        # Depth is rendered from the disks when it is asked for: one at a time.
+        with self._lock:
+            result, number = self._result, self._number
+            views = result.views
+            T_wc = np.linalg.inv(views.T_cw[number])
+            try:
+                picture = self._picture(number)
+            except InputError as error:
+                self._window.say(f"**{result.name}**\n\n{error}")
+                return
+            self._window.show_picture(picture)
+            self._window.show_camera(T_wc, result.camera, picture)
+            if self._follow.value:
+                self._window.follow(T_wc)
+            self._window.say(self._words(number))
+
+    def _picture(self, number: int) -> np.ndarray:
+        result, layer = self._result, self._window.layer
+        if layer == "image" and result.views.has_images:
+            return read_image(image_path(result.folder, int(result.views.keyframe_id[number])))
+        return layer_picture(result.keyframes[number], layer)
+
+    def _words(self, number: int) -> str:
+        result = self._result
+        try:
+            verdict = (result.summary.get("verdict") or {}).get("sentence", "")
+        except InputError:
+            verdict = ""
+        seconds = result.views.timestamp[number] - result.views.timestamp[0]
+        count = len(result.views.keyframe_id)
+        return (
+            f"**{result.name}**\n\n{verdict}\n\nkeyframe {number + 1} of {count}, {seconds:.1f} s"
+        )

@@ -1,0 +1,240 @@
+"""The page that a viewer serves: the scene on it, and the panel beside that."""
+
+import atexit
+import time
+from collections.abc import Callable
+from contextlib import redirect_stdout
+from io import StringIO
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from geogs.errors import InputError
+from geogs.evaluation.layers import LAYERS, Layer
+from geogs.evaluation.shading import level_axes
+from geogs.geometry.camera import Camera
+from geogs.geometry.lie import matrix_to_quaternion
+from geogs.mesh.types import Mesh
+from geogs.types import MapSnapshot
+
+PATH, FRUSTUM, NOW = (242, 163, 58), (111, 177, 240), (255, 209, 102)
+_FAREWELL = 0.3
+"""Seconds that the server takes to end."""
+PARTS = ("Mesh", "Disks", "Path", "Keyframes")
+"""Of the scene, by the names of their switches."""
+
+
+class Window:
+    """A page at ``http://host:port`` with a scene and a panel; nobody has to look at it."""
+
+    def __init__(self, title: str, host: str, port: int, with_disks: bool = False) -> None:
+        """Begin to serve; ``with_disks`` shows these, too, from the beginning.
+
+        Raises:
+            InputError: viser is not installed.
+        """
+        try:
+            import viser
+        except ImportError:
+            raise InputError("The viewer needs viser: pip install 'geogs[viewer]'.") from None
+        with redirect_stdout(StringIO()):  # it prints a box with the address
+            self._server = viser.ViserServer(host=host, port=port, label=title, verbose=False)
+        self._server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
+        # The light is in the colours already.
+        self._server.scene.configure_default_lights(False)
+        self._server.scene.add_light_ambient("/light", intensity=3.0)
+        self._server.scene.set_background_image(np.full((2, 2, 3), (27, 30, 35), np.uint8))
+        self.address = f"http://{host}:{self._server.get_port()}"
+        gui = self._server.gui
+        self._words = gui.add_markdown(f"**{title}**")
+        self._picture = gui.add_image(np.zeros((9, 16, 3), np.uint8), format="jpeg")
+        self._layer = gui.add_dropdown("Layer", LAYERS)
+        self._switches = {}
+        with gui.add_folder("Show"):
+            for name in PARTS:
+                self._switches[name] = gui.add_checkbox(name, with_disks or name != "Disks")
+                self._switches[name].on_update(lambda _: self._apply_switches())
+        self._parts: dict[str, list[Any]] = {name: [] for name in self._switches}
+        self._size = 1.0
+        self._home: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
+        self._server.on_client_connect(self._welcome)
+        atexit.register(self.stop)
+
+    @property
+    def clients(self) -> int:
+        """How many look."""
+        return len(self._server.get_clients())
+
+    @property
+    def layer(self) -> Layer:
+        """The layer that was asked for."""
+        return self._layer.value
+
+    def on_layer(self, act: Callable[[], None]) -> None:
+        """Do something whenever another layer is asked for."""
+        self._layer.on_update(lambda _: act())
+
+    def add_checkbox(self, name: str, value: bool) -> Any:
+        """Another switch, whose ``value`` says how it stands."""
+        return self._server.gui.add_checkbox(name, value)
+
+    def add_slider(self, name: str, last: int, act: Callable[[int], None]) -> None:
+        """A slider over numbers from 1."""
+        slider = self._server.gui.add_slider(name, 1, max(last, 2), 1, 1)
+        slider.on_update(lambda _: act(min(int(slider.value), last)))
+
+    def stop(self) -> None:
+        """No longer serve."""
+        atexit.unregister(self.stop)
+        with redirect_stdout(StringIO()):  # its thread says that it has ended
+            self._server.stop()
+            time.sleep(_FAREWELL)
+
+    def say(self, markdown: str) -> None:
+        """The words at the top of the panel."""
+        self._words.content = markdown
+
+    def show_picture(self, picture: UInt8[np.ndarray, "h w 3"]) -> None:
+        """The picture of the panel."""
+        self._picture.image = picture
+
+    def stand_upright(self, T_wc: Float[np.ndarray, "n 4 4"], size: float) -> None:
+        """Turn the scene as the camera was held; frusta are drawn for a scene of this size."""
+        axes = level_axes(T_wc)
+        self._size = size
+        self._server.scene.set_up_direction(tuple(axes[2]))
+
+    def look_from(
+        self,
+        eye: Float[np.ndarray, "3"],
+        target: Float[np.ndarray, "3"],
+        up: Float[np.ndarray, "3"],
+    ) -> None:
+        """Where those who look, and who come later, stand first."""
+        self._home = (eye, target, up)
+        for client in self._server.get_clients().values():
+            self._welcome(client)
+
+    def follow(self, T_wc: Float[np.ndarray, "4 4"]) -> None:
+        """Bring all who look behind a camera."""
+        eye = T_wc[:3, 3] - T_wc[:3, :3] @ np.array([0.0, 0.25, 0.6]) * self._size
+        for client in self._server.get_clients().values():
+            with client.atomic():
+                client.camera.up_direction = -T_wc[:3, 1]
+                client.camera.position = eye
+                client.camera.look_at = T_wc[:3, 3] + 0.5 * self._size * T_wc[:3, 2]
+
+    def show_mesh(self, mesh: Mesh) -> None:
+        """A surface in its colours."""
+        import trimesh
+
+        colours = mesh.colours
+        if colours is None:
+            colours = np.full((len(mesh.vertices), 3), 200, np.uint8)
+        shape = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=colours, process=False)
+        self._put("Mesh", self._server.scene.add_mesh_trimesh("/mesh", shape))
+
+    def show_disks(self, disks: MapSnapshot) -> None:
+        """Disks, coloured by where they face."""
+        from geogs.geometry.lie import quaternion_to_matrix
+
+        R = quaternion_to_matrix(disks.quaternion).cpu().numpy()
+        scale = np.concatenate(
+            [disks.scale.cpu().numpy(), 0.02 * disks.scale.cpu().numpy().min(1, keepdims=True)], 1
+        )
+        shape = R * scale[:, None]
+        splats = self._server.scene.add_gaussian_splats(
+            "/disks",
+            disks.position.cpu().numpy(),
+            shape @ shape.transpose(0, 2, 1),
+            (0.5 + 0.45 * R[..., 2]).clip(0, 1),
+            disks.opacity.cpu().numpy()[:, None],
+        )
+        self._put("Disks", splats)
+
+    def show_path(self, points: Float[np.ndarray, "n 3"]) -> None:
+        """The path of the camera."""
+        if len(points) < 2:
+            return
+        ends = np.stack([points[:-1], points[1:]], 1).astype(np.float32)
+        line = self._server.scene.add_line_segments(
+            "/path", ends, PATH, thickness=3.0, thickness_units="screen"
+        )
+        self._put("Path", line)
+
+    def show_keyframe(
+        self,
+        id: int,
+        T_wc: Float[np.ndarray, "4 4"],
+        camera: Camera,
+        image: UInt8[np.ndarray, "h w 3"] | None = None,
+    ) -> Any:
+        """A frustum; the same id replaces one."""
+        frustum = self._frustum(f"/keyframes/{id}", T_wc, camera, FRUSTUM, 0.035, image)
+        self._parts["Keyframes"].append(frustum)
+        frustum.visible = self._switches["Keyframes"].value
+        return frustum
+
+    def show_camera(
+        self,
+        T_wc: Float[np.ndarray, "4 4"],
+        camera: Camera,
+        image: UInt8[np.ndarray, "h w 3"] | None,
+    ) -> None:
+        """Where the camera is now, or the keyframe that was chosen."""
+        self._frustum("/camera", T_wc, camera, NOW, 0.07, image)
+
+    def move_keyframe(self, frustum: Any, T_wc: Float[np.ndarray, "4 4"]) -> None:
+        """Let a frustum follow a correction."""
+        frustum.wxyz, frustum.position = _place(T_wc)
+
+    def _frustum(
+        self,
+        name: str,
+        T_wc: Float[np.ndarray, "4 4"],
+        camera: Camera,
+        colour: tuple[int, int, int],
+        size: float,
+        image: UInt8[np.ndarray, "h w 3"] | None,
+    ) -> Any:
+        turn, position = _place(T_wc)
+        return self._server.scene.add_camera_frustum(
+            name,
+            fov=2 * float(np.arctan2(camera.height / 2, camera.fy)),
+            aspect=camera.width / camera.height,
+            scale=size * self._size,
+            thickness=1.5,
+            thickness_units="screen",
+            color=colour,
+            image=image,
+            format="jpeg",
+            wxyz=turn,
+            position=position,
+            cast_shadow=False,
+            receive_shadow=False,
+        )
+
+    def _put(self, layer: str, part: Any) -> None:
+        self._parts[layer] = [part]
+        part.visible = self._switches[layer].value
+
+    def _apply_switches(self) -> None:
+        for name, parts in self._parts.items():
+            for part in parts:
+                part.visible = self._switches[name].value
+
+    def _welcome(self, client: Any) -> None:
+        if self._home is not None:
+            eye, target, up = self._home
+            client.camera.up_direction = up
+            client.camera.position = eye
+            client.camera.look_at = target
+
+
+def _place(T_wc: Float[np.ndarray, "4 4"]) -> tuple[np.ndarray, np.ndarray]:
+    """Quaternion w, x, y, z and position."""
+    import torch
+
+    turn = matrix_to_quaternion(torch.from_numpy(np.ascontiguousarray(T_wc[:3, :3])))
+    return turn.numpy(), T_wc[:3, 3]

@@ -1,0 +1,98 @@
+"""What a command says: one line on a terminal, lines of text without, and a log."""
+
+import io
+import os
+import re
+
+import pytest
+from rich.console import Console
+
+from geogs.application import terminal
+from geogs.application.forecast import StageForecast
+from geogs.application.terminal import TerminalProgress
+from geogs.application.verbosity import Verbosity
+from geogs.errors import OutputError
+from geogs.slam import SlamStatus
+from geogs.tracking.tracker import TrackState
+
+
+def status(frames: int) -> SlamStatus:
+    return SlamStatus(TrackState.TRACKING, frames, frames // 2, 1500)
+
+
+def a_run(progress: TerminalProgress) -> None:
+    progress.stage("calibration", 0.5)
+    progress.plan(StageForecast([("mesh: fuse", 1.0)]))
+    progress.expect(4)
+    for number in range(1, 5):
+        progress.frame(status(number))
+    progress.write("Something happened at [1, 2].")
+    progress.write("warning: too dark.")
+    progress.stage("mesh: fuse", 0.5)
+
+
+def test_without_a_terminal_every_phase_is_a_line(capsys):
+    with TerminalProgress() as progress:
+        a_run(progress)
+    said = re.sub(r"\d+\.\d GB", "1 GB", capsys.readouterr().err).splitlines()
+    assert said == [
+        "calibration: 0 s",
+        "Something happened at [1, 2].",
+        "warning: too dark.",
+        "frames: 0 s, 2 keyframes  1.5k disks  1 GB",
+        "mesh: 0 s",
+    ]
+
+
+def test_quiet_leaves_warnings(capsys):
+    with TerminalProgress(Verbosity(quiet=True)) as progress:
+        a_run(progress)
+    assert capsys.readouterr().err == "warning: too dark.\n"
+
+
+def test_nothing_is_said_where_nothing_happened(capsys, tmp_path):
+    with TerminalProgress():
+        pass
+    assert capsys.readouterr().err == ""
+
+
+def test_log_holds_everything_with_the_time_of_day(capsys, tmp_path):
+    log = tmp_path / "new" / "run.log"
+    with TerminalProgress(Verbosity(quiet=True, log=log)) as progress:
+        a_run(progress)
+    with pytest.raises(ValueError, match="wrong"), TerminalProgress(Verbosity(log=log)):
+        raise ValueError("wrong")
+    lines = log.read_text().splitlines()
+    assert all(re.match(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d \S", line) for line in lines)
+    assert lines[1].endswith("Something happened at [1, 2].")
+    assert lines[-1].endswith("ended by ValueError: wrong")
+    assert len(lines) == 6
+
+
+def test_a_log_that_cannot_be_written_is_a_sentence(tmp_path):
+    with pytest.raises(OutputError, match="cannot be written"):
+        TerminalProgress(Verbosity(log=tmp_path)).__enter__()
+
+
+def test_a_terminal_shows_one_line_with_the_time_left(monkeypatch):
+    shown = io.StringIO()
+
+    def console(**options) -> Console:
+        return Console(file=shown, force_terminal=True, width=120, highlight=False)
+
+    monkeypatch.setattr(terminal, "Console", console)
+    with TerminalProgress() as progress:
+        progress.plan(StageForecast([("training", 1.0), ("report", 3.0)]))
+        progress.stage("training", 0.0)
+        monkeypatch.setattr(progress, "_start", progress._start - 10)
+        forecast = progress._forecast
+        forecast._begun[0] = (0, forecast._begun[0][1] - 10)
+        progress.stage("training", 0.5)
+        progress._bar.refresh()
+        line = shown.getvalue().split("\r")[-1]
+        assert "training 50%" in line
+        assert "25%" not in line  # of the stage's own; of the whole it is an eighth
+        assert re.search(r"1[23]%", line)
+        assert re.search(r"1 min 1\d s left", line)
+    words = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", shown.getvalue())
+    assert os.linesep * 2 not in words
