@@ -1,11 +1,14 @@
 """A reconstruction from known poses, from the path of the images to the result."""
 
+import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Literal
 
 from geogs.application.interrupt import Stop
 from geogs.application.machine import compiled_kernels, full_memory_in_a_sentence
+from geogs.application.photographs import open_photographs
 from geogs.application.progress import RunProgress
 from geogs.application.reconstruct_checkpoint import ReconstructCheckpoint, fingerprint
 from geogs.application.result import Result, Written
@@ -36,17 +39,19 @@ def reconstruct(
     device: str = "auto",
     budget: float | None = None,
     *,
+    poses: Literal["given", "auto"] = "given",
     check: bool = True,
     progress: RunProgress | None = None,
 ) -> Result:
-    """Map and mesh of images with known poses; nothing is written.
+    """Map and mesh of images with known poses, or of photographs; nothing is written.
 
     Args:
         source: a folder or file as ``open_posed_source`` takes it, or what that opened.
         config: all settings; the defaults if none.
         device: auto (a GPU where there is one), cpu, cuda or cuda:1.
         budget: about how many seconds it may take in all; none trains until it is good.
-        check: whether to see first, by matching images, that the poses fit them.
+        poses: given with the images, or auto: found from the photographs in a folder.
+        check: whether to see first, by matching images, that given poses fit them.
         progress: follows the work.
 
     Raises:
@@ -57,9 +62,13 @@ def reconstruct(
     config, progress = config or ReconstructConfig(), progress or RunProgress()
     used = require_device(device)
     if not isinstance(source, PosedSource):
-        source = open_posed_source(source, config.input)
+        if poses == "auto":
+            with tempfile.TemporaryDirectory(prefix="geogs-photos-") as kept:
+                source = open_photographs(Path(source), config, Path(kept), progress=progress)
+        else:
+            source = open_posed_source(source, config.input)
     clock.excuse(compiled_kernels(used))
-    if check:
+    if check and poses == "given":
         _check(source, progress)
     with full_memory_in_a_sentence():
         scene = Reconstruction(source.camera, config, str(used), clock.left())
@@ -84,8 +93,16 @@ def reconstruct_to_folder(
     clock = _Clock(settings.budget)
     progress, stop = progress or RunProgress(), stop or Stop()
     config, device = settings.config, require_device(settings.device)
-    source = open_posed_source(settings.source, config.input, settings.hold_out)
-    output = prepare_output_folder(settings.output or Path("out") / source.name)
+    if settings.poses == "auto":
+        name = settings.source.expanduser().resolve().name
+        output = prepare_output_folder(settings.output or Path("out") / name)
+        with stop:
+            source = open_photographs(
+                settings.source, config, output, settings.hold_out, settings.resume, progress, stop
+            )
+    else:
+        source = open_posed_source(settings.source, config.input, settings.hold_out)
+        output = prepare_output_folder(settings.output or Path("out") / source.name)
     clock.excuse(compiled_kernels(device))
     names = [Path(source.label(i)).name for i in range(len(source))]
     made_from = fingerprint(config, settings.hold_out, names)
@@ -93,7 +110,7 @@ def reconstruct_to_folder(
     snapshots = Snapshots(settings.snapshots)
     with full_memory_in_a_sentence(), stop:
         resumed = checkpoint.read() if settings.resume else None
-        if settings.check_poses and resumed is None:
+        if settings.check_poses and settings.poses == "given" and resumed is None:
             _check(source, progress)
         scene = Reconstruction(source.camera, config, str(device), clock.left())
 

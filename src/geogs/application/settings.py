@@ -5,7 +5,7 @@ Nothing here is imported but the settings, so that a command line can be read at
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from geogs.config import Config, MeshConfig, ReconstructConfig
 from geogs.config.setting import Basic, Positional, Positive, Range, Settings, Time, Unnamed, Weight
@@ -65,13 +65,16 @@ class ReconstructSettings(Settings):
     """All that a reconstruction from known poses is told."""
 
     source: Annotated[Path, Positional()] = Path()
-    """Folder of images with poses, or the file with the poses."""
+    """Folder of images with poses, or the file with the poses; with --poses auto a folder of
+    photographs."""
     config: Annotated[ReconstructConfig, Unnamed] = field(default_factory=ReconstructConfig)
     """How to compute."""
     output: Annotated[Path | None, Basic("-o")] = None
     """Folder for the results; out/NAME if none is given."""
     budget: Annotated[float | None, Range(above=0), Time] = None
     """About how long it may take in all, such as 90s, 10m or 1h; none trains until it is good."""
+    poses: Literal["given", "auto"] = "given"
+    """given with the images, or auto: found from the photographs alone, by pycolmap."""
     check_poses: bool = True
     """Whether to see by matching images that the poses follow the expected convention."""
     hold_out: Annotated[int | None, Range(2)] = None

@@ -34,6 +34,8 @@ def resolve_intrinsics(
     width: int,
     height: int,
     quarter_turns: int = 0,
+    *,
+    warn_of_guess: bool = True,
 ) -> Calibration:
     """Turn ``InputConfig.intrinsics`` into the calibration of ``width x height`` images.
 
@@ -43,10 +45,11 @@ def resolve_intrinsics(
         width: width of the images as shown, in pixels.
         height: their height.
         quarter_turns: clockwise turns from the stored to the shown images, see Calibration.fit.
+        warn_of_guess: whether to warn where nothing is known and the focal length is assumed.
     """
     if option.strip().lower() == "auto":
         calibration = known or guess_calibration(width, height)
-        if calibration.is_guess:
+        if calibration.is_guess and warn_of_guess:
             _log.warning(
                 "The intrinsics are unknown; assuming %s. Give intrinsics fx,fy,cx,cy "
                 "for a better result.",
