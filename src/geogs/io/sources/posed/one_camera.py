@@ -145,8 +145,9 @@ def common_place(keys: Sequence[Hashable]) -> int:
 
 
 def _is_unlike(way: "Resampler | Rectifier") -> bool:
-    is_other = isinstance(way, Resampler)
-    return is_other and (way.enlargement > MAX_ZOOM or way.shared < MIN_SHARED)
+    if isinstance(way, Rectifier):
+        return False
+    return way.enlargement > MAX_ZOOM or way.shared < MIN_SHARED
 
 
 def _check_shared(
