@@ -1,6 +1,6 @@
 """The image of a textured mesh: patches side by side, their colours levelled."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import cv2
@@ -29,7 +29,7 @@ class Atlas:
 
 def draw_atlas(
     patches: Patches,
-    views: Sequence[DepthMapView],
+    views: Mapping[int, DepthMapView],
     gains: Float32[np.ndarray, "v 3"],
     corrections: Float32[np.ndarray, "n 3"],
     swatches: UInt8[np.ndarray, "s 3"],
@@ -80,7 +80,7 @@ def draw_atlas(
 def _patch(
     patches: Patches,
     number: int,
-    views: Sequence[DepthMapView],
+    views: Mapping[int, DepthMapView],
     gains: Float32[np.ndarray, "v 3"],
     corrections: Float32[np.ndarray, "n 3"],
     local: Float64[np.ndarray, "n 2"],

@@ -30,7 +30,7 @@ def view_gains(candidates: Candidates, views: int) -> Float32[np.ndarray, "v 3"]
     first, second, one, other = (x[usable] for x in (first, second, one, other))
     gains = np.zeros((views, 3))
     if len(first):
-        log_ratio = np.log(other) - np.log(one)
+        log_ratio = (np.log(other) - np.log(one)).astype(np.float64)
         share = 1.0 / len(first)
         for channel in range(3):
             gains[:, channel] = _solve_gains(first, second, log_ratio[:, channel], views, share)
@@ -86,7 +86,7 @@ def seam_corrections(
     matrix = (seams.T @ seams + along.T @ along + 1e-4 * sparse.eye(count)).tocsr()
     wanted = seams.T @ (colour[other] - colour[one]).astype(np.float64)
     inverse = sparse.diags(1 / matrix.diagonal())
-    found = [cg(matrix, wanted[:, c], rtol=1e-4, maxiter=400, M=inverse)[0] for c in range(3)]
+    found = [cg(matrix, wanted[:, c], rtol=1e-6, maxiter=1000, M=inverse)[0] for c in range(3)]
     return np.stack(found, -1).astype(np.float32)
 
 

@@ -35,13 +35,14 @@ def without_odd_colours(
     has_view = candidates.view >= 0
     colour = candidates.colour * gains[candidates.view.clip(0)]
     masked = np.where(has_view[..., None], colour, np.nan)
-    enough = np.count_nonzero(has_view, axis=1) >= 3
+    enough = np.flatnonzero(has_view.sum(1) >= 3)
     median = np.zeros((len(colour), 3), np.float32)
     median[enough] = np.nanmedian(masked[enough], axis=1)
-    distance = np.asarray(np.linalg.norm(colour - median[:, None], axis=-1))
-    odd = (distance > ODD_COLOUR) & enough.reshape(-1, 1)
-    kept = np.where(odd, 0.0, candidates.score)
-    return np.where((kept > 0).any(1)[:, None], kept, candidates.score).astype(np.float32)
+    distance = np.linalg.norm(colour - median[:, None], axis=-1)
+    kept = candidates.score.copy()
+    kept[enough] *= distance[enough] <= ODD_COLOUR
+    any_left = np.any(kept > 0, axis=1, keepdims=True)
+    return np.where(any_left, kept, candidates.score).astype(np.float32)
 
 
 def choose_views(

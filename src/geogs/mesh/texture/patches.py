@@ -1,6 +1,6 @@
 """Connected faces that take their colours from one view, and what of its image they need."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -42,7 +42,7 @@ class Patches:
 
 def cut_patches(
     mesh: Mesh,
-    views: Sequence[DepthMapView],
+    views: Mapping[int, DepthMapView],
     label: Int32[np.ndarray, "m"],
     neighbours: Int64[np.ndarray, "e 2"],
 ) -> Patches:
@@ -65,7 +65,7 @@ def cut_patches(
     for v in np.unique(view):
         own = np.flatnonzero(view[corner_patch] == v)
         points = mesh.vertices[corner_vertex[own]].astype(np.float64)
-        pixel[own] = image_pixels(views[v], points)[0]
+        pixel[own] = image_pixels(views[int(v)], points)[0]
     box = _boxes(pixel, corner_patch, number, views, view)
     return Patches(
         view, faces, start, corners.reshape(-1, 3), corner_vertex, corner_patch, pixel, box
@@ -76,13 +76,13 @@ def _boxes(
     pixel: Float64[np.ndarray, "n 2"],
     patch: Int64[np.ndarray, "n"],
     number: int,
-    views: Sequence[DepthMapView],
+    views: Mapping[int, DepthMapView],
     view: Int64[np.ndarray, "p"],
 ) -> Int64[np.ndarray, "p 4"]:
     low, high = np.full((number, 2), np.inf), np.full((number, 2), -np.inf)
     np.minimum.at(low, patch, pixel)
     np.maximum.at(high, patch, pixel)
-    sizes = {int(v): views[v].image.shape[1::-1] for v in np.unique(view)}  # type: ignore[union-attr]
+    sizes = {int(v): views[int(v)].image.shape[1::-1] for v in np.unique(view)}  # type: ignore[union-attr]
     size = np.array([sizes[int(v)] for v in view]).reshape(-1, 2)
     low = np.maximum(np.floor(low) - PADDING, 0)
     high = np.minimum(np.ceil(high) + PADDING, size - 1)

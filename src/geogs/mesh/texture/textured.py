@@ -1,6 +1,6 @@
 """A mesh with an image for its surface, made from the images of its views."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -70,7 +70,7 @@ def texture_mesh(
     neighbours = face_neighbours(mesh.faces)
     score = without_odd_colours(candidates, gains)
     label = choose_views(candidates, score, neighbours)
-    images = _Images(views, np.unique(label[label >= 0]))
+    images = {int(v): views[int(v)] for v in np.unique(label[label >= 0])}
     patches = cut_patches(mesh, images, label, neighbours)
     colour = _corner_colours(patches, images, gains)
     corrections = seam_corrections(patches.corner_vertex, patches.edges(), colour)
@@ -82,22 +82,8 @@ def texture_mesh(
     return _assembled(mesh, patches, plain, swatch_of, atlas.corner, atlas.swatch, atlas.image)
 
 
-class _Images(Sequence[DepthMapView]):
-    """The views that are needed, each asked for once and kept."""
-
-    def __init__(self, views: Sequence[DepthMapView], needed: np.ndarray) -> None:
-        self._kept = {int(v): views[int(v)] for v in needed}
-        self._count = len(views)
-
-    def __len__(self) -> int:
-        return self._count
-
-    def __getitem__(self, index: int) -> DepthMapView:  # type: ignore[override]
-        return self._kept[int(index)]
-
-
 def _corner_colours(
-    patches: Patches, views: Sequence[DepthMapView], gains: np.ndarray
+    patches: Patches, views: Mapping[int, DepthMapView], gains: np.ndarray
 ) -> np.ndarray:
     """Colour of each corner in its view, after the gain, 0 to 255."""
     import cv2
@@ -106,7 +92,7 @@ def _corner_colours(
     own = patches.view[patches.corner_patch]
     for v in np.unique(patches.view):
         here = np.flatnonzero(own == v)
-        image = views[v].image
+        image = views[int(v)].image
         assert image is not None
         smooth = cv2.GaussianBlur(image, (0, 0), 1.0)
         x, y = np.round(patches.pixel[here]).astype(int).T
