@@ -25,6 +25,9 @@ class RunSettings(Settings):
     """Where to compute: auto (a GPU where there is one), cpu, cuda or cuda:1; see geogs doctor."""
     checkpoint_every: Weight = 60.0
     """Seconds between two checkpoints, from which --resume goes on; 0 makes none."""
+    offline: bool = False
+    """Do not track: place sharp frames by structure from motion (pycolmap) and all others against
+    them; for videos that tracking cannot follow."""
     online_results: bool = False
     """Also write trajectory and mesh as they are before the final stages, to online/."""
     depth_mesh: bool = False

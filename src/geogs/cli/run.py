@@ -33,10 +33,12 @@ def main(argv: Sequence[str]) -> int:
     options = parse(argv)
 
     from geogs.application.interrupt import Interruption
+    from geogs.application.offline import run_offline
     from geogs.application.run import resume, run
     from geogs.application.terminal import TerminalProgress
 
-    go = run if options.resume is None else partial(resume, options.resume)
+    begin = run_offline if options.offline else run
+    go = begin if options.resume is None else partial(resume, options.resume)
     with TerminalProgress() as progress:
         written = go(record(RunSettings, options), progress, Interruption())
     if written.can_resume:
