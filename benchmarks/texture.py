@@ -1,7 +1,8 @@
 """How much a textured mesh looks like images that were not used for it.
 
 Every so many-th keyframe of a result is left out of the texture, and the mesh is drawn from where
-it was taken. Prints decibels of each and the mean, over the pixels that show a surface.
+it was taken. Prints decibels of each and the mean, over the pixels that show a surface: as it is,
+and after one factor for each colour, since a camera chooses its exposure anew for every image.
 """
 
 import argparse
@@ -43,13 +44,16 @@ def main() -> None:
             textured.vertices, textured.faces, textured.texture_place, textured.texture,
             result.camera, view.T_cw.numpy(),
         )  # fmt: skip
-        scores.append(psnr(drawn, view.image, hit))
-        print(f"{number}: {scores[-1]:.2f} dB over {100 * hit.mean():.0f} %")
+        gain = view.image[hit].mean(0) / np.maximum(drawn[hit].mean(0), 1.0)
+        exposed = (drawn * gain).round().clip(0, 255).astype(np.uint8)
+        scores.append((psnr(drawn, view.image, hit), psnr(exposed, view.image, hit)))
+        print("{}: {:.2f} dB, exposed alike {:.2f}".format(number, *scores[-1]), end="")
+        print(f", over {100 * hit.mean():.0f} %")
         if options.pictures:
             options.pictures.mkdir(parents=True, exist_ok=True)
             beside = np.concatenate([drawn, view.image], axis=1)
             Image.fromarray(beside).save(options.pictures / f"{number:04d}.png")
-    print(f"mean {np.mean(scores):.2f} dB")
+    print("mean {:.2f} dB, exposed alike {:.2f}".format(*np.mean(scores, axis=0)))
     if options.pictures:
         Image.fromarray(textured.texture).save(options.pictures / "atlas.jpg")
 

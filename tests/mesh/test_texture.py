@@ -135,6 +135,7 @@ def test_what_stands_before_the_wall_is_not_painted_on_it():
     drawn, hit = render_textured(
         made.vertices, made.faces, made.texture_place, made.texture, CAMERA, np.eye(4)
     )
+    hit[:10] = hit[-10:] = hit[:, :10] = hit[:, -10:] = False  # no view shows all of these faces
     assert psnr(drawn, view(mesh, 0.0).image, hit) > 30
 
 

@@ -131,7 +131,7 @@ def _deviations(
     for image in images:
         config.add_image(image.image_id)
     config.fix_gauge(colmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    adjuster = colmap.create_default_bundle_adjuster(options, config, model)
+    adjuster = colmap.create_default_ceres_bundle_adjuster(options, config, model)
     wanted = colmap.BACovarianceOptions(params=colmap.BACovarianceOptionsParams.POSES)
     covariance = colmap.estimate_ba_covariance(wanted, model, adjuster)
     place, turn = np.full(len(images), np.inf), np.full(len(images), np.inf)

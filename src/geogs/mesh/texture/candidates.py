@@ -17,6 +17,8 @@ DEPTH_SLACK = 0.02
 """Part of the depth by which a face may lie off a depth map that shows it."""
 MARGIN = 1.5
 """Pixels from the border of an image within which nothing is taken."""
+PARTLY = 0.05
+"""What a face counts of which one corner is hidden, beside one that is seen."""
 _SHARP_POWER = 0.5
 
 
@@ -40,7 +42,8 @@ def find_candidates(
     """Views that show each face: near ones from the front first, sharp ones before blurred ones.
 
     A view shows a face whose corners project into its image, whose middle lies on its depth map
-    within ``tolerance`` map units and 2 % of the depth, two corners, too, and which faces it.
+    within ``tolerance`` map units and 2 % of the depth, two corners, too, and which faces it. One
+    whose third corner is hidden counts less.
     """
     count = len(mesh.faces)
     best = Candidates(
@@ -94,12 +97,14 @@ def _seen_faces(
     index = np.flatnonzero(inside)
     seen_corner[index] = _on_depth(view, pixels[index], z[index], image.shape, tolerance)
     at, depth = image_pixels(view, middle)
-    shown = (cosine > LEAST_COSINE) & (seen_corner[mesh.faces[faces]].sum(1) >= 2)
+    corners_seen = seen_corner[mesh.faces[faces]].sum(1)
+    shown = (cosine > LEAST_COSINE) & (corners_seen >= 2)
     shown &= _on_depth(view, at, depth, image.shape, tolerance)
-    faces, at = faces[shown], at[shown]
+    faces, at, corners_seen = faces[shown], at[shown], corners_seen[shown]
     p = pixels[mesh.faces[faces]]
     a, b = p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]
     area = 0.5 * np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+    area = np.where(corners_seen == 3, area, PARTLY * area)
     return faces, area, _sampled(cv2.GaussianBlur(image, (0, 0), 1.5), at)
 
 
