@@ -44,7 +44,7 @@ def run_offline(
             tell where they were taken.
         OutputError: a file cannot be written.
         DeviceError: the device cannot be used, or its memory is full.
-        KeyboardInterrupt: it was stopped; nothing is kept.
+        KeyboardInterrupt: it was stopped before there was a map; afterwards that is kept.
     """
     progress, stop = progress or RunProgress(), stop or Stop()
     config, device = settings.config, require_device(settings.device)
@@ -73,9 +73,18 @@ def run_offline(
         scene = Reconstruction(source.camera, own, str(device))
         with stopwatch("placing frames"):
             T_cw, found = _place_all(source, scene, placed, len(chosen.timestamps), own, report)
-        scene.finish(placed.all_points(), report)
+        try:
+            scene.finish(placed.all_points(), report)
+            finished = True
+        except KeyboardInterrupt:
+            if not (stop.requested and len(scene.snapshot())):
+                raise
+            progress.write("Stopping early; keeping what there is. Press Ctrl-C again to quit.")
+            finished = False
+        for stage, seconds in scene.stopwatch.seconds.items():
+            stopwatch.seconds[stage] = stopwatch.seconds.get(stage, 0.0) + seconds
         video = OfflineScene(scene, stopwatch, chosen, placed, T_cw, found)
-        result = Result(video, source, False, progress)
+        result = Result(video, source, not finished, progress)
         write_results(output, result, (), settings.keyframe_images)
     return Written(output, result, False)
 
