@@ -14,6 +14,7 @@ from geogs.geometry.camera import Camera
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.calibration_files import calibration_from_colmap
 from geogs.photos.database import Entry, SharedCamera
+from geogs.photos.deviations import pose_deviations
 from geogs.photos.features import find_features
 from geogs.photos.library import load_colmap
 from geogs.photos.pairs import choose_pairs
@@ -36,7 +37,7 @@ class PlacedFrames:
     T_cw: Float64[np.ndarray, "n 4 4"]
     """World to camera."""
     deviation: Float64[np.ndarray, "n"]
-    """Of the camera's centre, relative to the first two; infinite where unknown."""
+    """Of the camera's centre after the similarity that fits best; infinite where unknown."""
     rotation: Float64[np.ndarray, "n"]
     """Of its orientation, radians."""
     depth: Float64[np.ndarray, "n"]
@@ -112,43 +113,13 @@ def _placed(model: Any, frames: Sequence[Frame], entries: Sequence[Entry]) -> Pl
         camera.model.name, camera.width, camera.height, camera.params.tolist(), "the video itself"
     )
     error = float(model.compute_mean_reprojection_error())
-    deviation, rotation = _deviations(model, images, T_cw, error)
+    deviation, rotation = pose_deviations(model, images, T_cw, error)
     depth = np.array([_depth_deviation(model, image, error) for image in images])
     numbers = tuple(frames[int(image.name)].index for image in images)
     return PlacedFrames(
         numbers, T_cw, deviation, rotation, depth, tuple(positions), tuple(descriptors),
         calibration, error,
     )  # fmt: skip
-
-
-def _deviations(
-    model: Any, images: Sequence[Any], T_cw: Float64[np.ndarray, "n 4 4"], error: float
-) -> tuple[Float64[np.ndarray, "n"], Float64[np.ndarray, "n"]]:
-    """Standard deviations of centres and orientations, from the adjustment's covariance."""
-    colmap = load_colmap()
-    options = colmap.BundleAdjustmentOptions(print_summary=False)
-    config = colmap.BundleAdjustmentConfig()
-    for image in images:
-        config.add_image(image.image_id)
-    config.fix_gauge(colmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    adjuster = colmap.create_default_ceres_bundle_adjuster(options, config, model)
-    wanted = colmap.BACovarianceOptions(params=colmap.BACovarianceOptionsParams.POSES)
-    covariance = colmap.estimate_ba_covariance(wanted, model, adjuster)
-    place, turn = np.full(len(images), np.inf), np.full(len(images), np.inf)
-    if covariance is None:
-        return place, turn
-    for k, image in enumerate(images):
-        of_pose = covariance.get_cam_cov_from_world(image.image_id)
-        if of_pose is None or of_pose.shape != (6, 6):
-            place[k] = turn[k] = 0.0  # what the gauge holds
-            continue
-        t = T_cw[k, :3, 3]
-        cross = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
-        # c = -R^T t, with R = Exp(w) R0: its change is R^T (t x w) - R^T dt, up to a rotation.
-        J = np.concatenate([cross, -np.eye(3)], axis=1)
-        place[k] = error * np.sqrt(np.trace(J @ of_pose @ J.T))
-        turn[k] = error * np.sqrt(np.trace(of_pose[:3, :3]))
-    return place, turn
 
 
 def _depth_deviation(model: Any, image: Any, error: float) -> float:
