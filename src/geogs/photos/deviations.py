@@ -10,11 +10,15 @@ from geogs.photos.library import load_colmap
 
 
 def pose_deviations(
-    model: Any, images: Sequence[Any], T_cw: Float64[np.ndarray, "n 4 4"], error: float
+    model: Any,
+    images: Sequence[Any],
+    T_cw: Float64[np.ndarray, "n 4 4"],
+    error: float,
+    is_known: bool,
 ) -> tuple[Float64[np.ndarray, "n"], Float64[np.ndarray, "n"]]:
     """Standard deviations of the images' centres (world units) and orientations (radians).
 
-    From the covariance of the adjustment with cameras held; what a similarity of the world
+    From the covariance of the adjustment; what a similarity of the world
     changes is taken out, so that it is what is left after the best alignment. Infinite where the
     covariance cannot be computed.
 
@@ -23,14 +27,18 @@ def pose_deviations(
         images: those to tell of, with poses ``T_cw``, world to camera.
         T_cw: the same.
         error: deviation of a measured point, pixels.
+        is_known: whether the camera was given, or found along with the poses.
     """
     colmap = load_colmap()
-    options = colmap.BundleAdjustmentOptions(print_summary=False)
+    options = colmap.BundleAdjustmentOptions(
+        print_summary=False, refine_principal_point=not is_known
+    )
     config = colmap.BundleAdjustmentConfig()
     for image in images:
         config.add_image(image.image_id)
-    for number in model.cameras:
-        config.set_constant_cam_intrinsics(number)
+    if is_known:
+        for number in model.cameras:
+            config.set_constant_cam_intrinsics(number)
     config.fix_gauge(colmap.BundleAdjustmentGauge.THREE_POINTS)
     adjuster = colmap.create_default_ceres_bundle_adjuster(options, config, model)
     wanted = colmap.BACovarianceOptions(params=colmap.BACovarianceOptionsParams.POSES)

@@ -96,10 +96,12 @@ def place_frames(
     R_cw = np.stack([image.cam_from_world().rotation.matrix() for image in images])
     up = upright_rotation(R_cw, [0] * len(images))
     best.transform(colmap.Sim3d(1.0, colmap.Rotation3d(up), np.zeros(3)))
-    return _placed(best, frames, entries)
+    return _placed(best, frames, entries, is_known)
 
 
-def _placed(model: Any, frames: Sequence[Frame], entries: Sequence[Entry]) -> PlacedFrames:
+def _placed(
+    model: Any, frames: Sequence[Frame], entries: Sequence[Entry], is_known: bool
+) -> PlacedFrames:
     images = sorted((i for i in model.images.values() if i.has_pose), key=lambda i: i.name)
     T_cw = np.tile(np.eye(4), (len(images), 1, 1))
     positions, descriptors = [], []
@@ -113,7 +115,7 @@ def _placed(model: Any, frames: Sequence[Frame], entries: Sequence[Entry]) -> Pl
         camera.model.name, camera.width, camera.height, camera.params.tolist(), "the video itself"
     )
     error = float(model.compute_mean_reprojection_error())
-    deviation, rotation = pose_deviations(model, images, T_cw, error)
+    deviation, rotation = pose_deviations(model, images, T_cw, error, is_known)
     depth = np.array([_depth_deviation(model, image, error) for image in images])
     numbers = tuple(frames[int(image.name)].index for image in images)
     return PlacedFrames(
