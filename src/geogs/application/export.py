@@ -9,11 +9,12 @@ from geogs.application.saved_result import SavedResult, load_result
 from geogs.application.seen_points import cloud
 from geogs.application.splat_colours import splat_colours
 from geogs.application.surfaces import fusion_views
+from geogs.application.texture import require_images, textured
 from geogs.errors import InputError
 from geogs.gpu.installation import require_device
 from geogs.io.writers.exports.cloud import write_las
 from geogs.io.writers.exports.gsplat import write_gsplat_start
-from geogs.io.writers.exports.mesh import write_glb, write_obj
+from geogs.io.writers.exports.mesh import write_glb, write_obj, write_textured_glb
 from geogs.io.writers.exports.poses import write_euroc, write_kitti
 from geogs.io.writers.ply import write_points, write_splats
 from geogs.io.writers.tum import write_tum_trajectory
@@ -117,6 +118,10 @@ def _tum(result: SavedResult, settings: ExportSettings, place: Path) -> Path:
 
 def _glb(result: SavedResult, settings: ExportSettings, place: Path) -> Path:
     mesh, path = _mesh(result), _file(place, "mesh.glb")
+    if settings.textured:
+        m = textured(result, mesh, settings.texture_size)
+        write_textured_glb(path, m.vertices, m.faces, m.normals, m.texture_place, m.texture)
+        return path
     write_glb(path, mesh.vertices, mesh.faces, mesh.normals, mesh.colours)
     return path
 
@@ -134,8 +139,7 @@ def _mesh(result: SavedResult) -> Mesh:
 
 
 def _views(result: SavedResult) -> Sequence[DepthMapView]:
-    if not result.views.has_images:
-        raise InputError("The result was written without keyframe images, which this needs.")
+    require_images(result)
     return fusion_views(result.keyframes)
 
 

@@ -27,6 +27,11 @@ class ExportSettings(Settings):
     """Write a COLMAP model as text, which is binary otherwise."""
     points: Annotated[int, Range(100, 10_000_000)] = 50_000
     """Points with tracks to look for in colmap and nerfstudio."""
+    textured: bool = False
+    """Give a glb an image of its surface, put together from the keyframes' images, instead of
+    vertex colours."""
+    texture_size: Annotated[int, Range(64, 16384)] = 4096
+    """Longest side of that image, pixels; it is no larger than the keyframes' images call for."""
     sh_degree: Annotated[int, Range(0, 4)] = 3
     """Degree of the spherical harmonics in splats; all but the constant one are zero, and some
     viewers insist on them."""

@@ -144,9 +144,17 @@ class RunForecast:
         return (now - start) / max(last - first, 1)
 
 
-def reconstruction_forecast() -> StageForecast:
-    """That of a reconstruction from known poses."""
-    plan = [("reading", 4.0), ("first look", 6.0), ("depth", 35.0), ("training", 35.0)]
+FINDING_POSES = (
+    ("features", 10.0), ("choosing pairs", 5.0), ("matching", 15.0), ("finding poses", 15.0),
+    ("adjusting", 3.0), ("placing frames", 5.0),
+)  # fmt: skip
+"""Stages before a reconstruction whose poses have to be found."""
+
+
+def reconstruction_forecast(finds_poses: bool = False) -> StageForecast:
+    """That of a reconstruction from known poses, or from some that it finds before."""
+    plan = list(FINDING_POSES) if finds_poses else []
+    plan += [("reading", 4.0), ("first look", 6.0), ("depth", 35.0), ("training", 35.0)]
     return StageForecast([*plan, *mesh_stages(15.0), ("report", 5.0)])
 
 

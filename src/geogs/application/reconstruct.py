@@ -1,8 +1,10 @@
 """A reconstruction from known poses, from the path of the images to the result."""
 
+import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Literal
 
 import torch
 
@@ -12,6 +14,7 @@ from geogs.application.forecast import reconstruction_forecast
 from geogs.application.former import free_folder
 from geogs.application.interrupt import Stop
 from geogs.application.machine import compiled_kernels, full_memory_in_a_sentence
+from geogs.application.photographs import open_photographs
 from geogs.application.progress import RunProgress
 from geogs.application.reconstruct_checkpoint import ReconstructCheckpoint, fingerprint
 from geogs.application.result import Result, Written
@@ -21,6 +24,7 @@ from geogs.application.snapshots import Snapshots
 from geogs.application.surfaces import write_depth_mesh
 from geogs.config import ReconstructConfig
 from geogs.config.idle import idle_settings
+from geogs.documents import expanded
 from geogs.gpu.installation import require_device
 from geogs.io.sources.posed.base import PosedSource
 from geogs.io.sources.posed.check import check_poses
@@ -43,17 +47,19 @@ def reconstruct(
     device: str = "auto",
     budget: float | None = None,
     *,
+    poses: Literal["given", "auto"] = "given",
     check: bool = True,
     progress: RunProgress | None = None,
 ) -> Result:
-    """Map and mesh of images with known poses; nothing is written.
+    """Map and mesh of images with known poses, or of photographs; nothing is written.
 
     Args:
         source: a folder or file as ``open_posed_source`` takes it, or what that opened.
         config: all settings; the defaults if none.
         device: auto (a GPU where there is one), cpu, cuda or cuda:1.
         budget: about how many seconds it may take in all; none trains until it is good.
-        check: whether to see first, by matching images, that the poses fit them.
+        poses: given with the images, or auto: found from the photographs in a folder.
+        check: whether to see first, by matching images, that given poses fit them.
         progress: follows the work.
 
     Raises:
@@ -64,9 +70,13 @@ def reconstruct(
     config, progress = config or ReconstructConfig(), progress or RunProgress()
     used = require_device(device)
     if not isinstance(source, PosedSource):
-        source = open_posed_source(source, config.input)
+        if poses == "auto":
+            with tempfile.TemporaryDirectory(prefix="geogs-photos-") as kept:
+                source = open_photographs(Path(source), config, Path(kept), progress=progress)
+        else:
+            source = open_posed_source(source, config.input)
     clock.excuse(compiled_kernels(used))
-    if check:
+    if check and poses == "given":
         _check(source, progress)
     with full_memory_in_a_sentence():
         scene = Reconstruction(source.camera, config, str(used), clock.left())
@@ -93,6 +103,23 @@ def reconstruct_to_folder(
     config, device = settings.config, require_device(settings.device)
     for sentence in idle_settings(config):
         progress.write(f"note: {sentence}")
+    finds_poses = settings.poses == "auto"
+    progress.plan(reconstruction_forecast(finds_poses))
+    if finds_poses:
+        name = expanded(settings.source).resolve().name
+        output = prepare_output_folder(settings.output or Path("out") / name)
+        with only_writer(output):
+            with full_memory_in_a_sentence(), stop:
+                source = open_photographs(
+                    settings.source,
+                    config,
+                    output,
+                    settings.hold_out,
+                    settings.resume,
+                    progress,
+                    stop,
+                )
+            return _to_folder(settings, source, output, device, clock, progress, stop)
     source = open_posed_source(settings.source, config.input, settings.hold_out)
     output = Path("out") / source.name
     if not settings.resume:
@@ -126,7 +153,7 @@ def _to_folder(
     progress.plan(reconstruction_forecast())
     with full_memory_in_a_sentence(way_on), stop:
         resumed = checkpoint.read() if settings.resume else None
-        if settings.check_poses and resumed is None:
+        if settings.check_poses and settings.poses == "given" and resumed is None:
             _check(source, progress)
         scene = Reconstruction(source.camera, config, str(device), clock.left())
 

@@ -5,7 +5,7 @@ Nothing here is imported but the settings, so that a command line can be read at
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from geogs.config import Config, MeshConfig, ReconstructConfig
 from geogs.config.setting import Basic, Positional, Positive, Range, Settings, Time, Unnamed, Weight
@@ -26,6 +26,9 @@ class RunSettings(Settings):
     """Where to compute: auto (a GPU where there is one), cpu, cuda or cuda:1; see geogs doctor."""
     checkpoint_every: Weight = 60.0
     """Seconds between two checkpoints, from which --resume goes on; 0 makes none."""
+    offline: bool = False
+    """Do not track: place sharp frames by structure from motion (pycolmap) and all others against
+    them; for videos that tracking cannot follow."""
     online_results: bool = False
     """Also write trajectory and mesh as they are after the stream, to online/, and after the final
     bundle adjustment and the map's update, to adjusted/, where a refinement follows."""
@@ -67,13 +70,16 @@ class ReconstructSettings(Settings):
     """All that a reconstruction from known poses is told."""
 
     source: Annotated[Path, Positional()] = Path()
-    """Folder of images with poses, or the file with the poses."""
+    """Folder of images with poses, or the file with the poses; with --poses auto a folder of
+    photographs."""
     config: Annotated[ReconstructConfig, Unnamed] = field(default_factory=ReconstructConfig)
     """How to compute."""
     output: Annotated[Path | None, Basic("-o")] = None
     """Folder for the results; out/NAME if none is given."""
     budget: Annotated[float | None, Range(above=0), Time] = None
     """About how long it may take in all, such as 90s, 10m or 1h; none trains until it is good."""
+    poses: Literal["given", "auto"] = "given"
+    """given with the images, or auto: found from the photographs alone, by pycolmap."""
     check_poses: bool = True
     """Whether to see by matching images that the poses follow the expected convention."""
     hold_out: Annotated[int | None, Range(2)] = None

@@ -58,7 +58,13 @@ def source_summary(source: Stream | PosedSource) -> dict[str, object]:
     """What a unit of the map is, and which images were not used."""
     if isinstance(source, PosedSource):
         held_out = {"held_out": source.held_out} if source.held_out else {}
-        return {"scale": f"of the poses ({source.scene_scale})", "skipped_images": 0, **held_out}
+        left_out = [{"image": name, "reason": why} for name, why in source.left_out]
+        return {
+            "scale": f"of the poses ({source.scene_scale})",
+            "skipped_images": len(left_out),
+            **({"left_out": left_out} if left_out else {}),
+            **held_out,
+        }
     spans = source.spans if isinstance(source, SeveralSources) else []
     videos = {"videos": [asdict(span) for span in spans]} if spans else {}
     return {

@@ -1,4 +1,4 @@
-"""``geogs reconstruct SOURCE``: images with known poses in; mesh and disk map out."""
+"""``geogs reconstruct SOURCE``: images with known poses, or photographs, in; mesh and map out."""
 
 import time
 from collections.abc import Sequence
@@ -16,7 +16,8 @@ from geogs.config import Preset, reconstruct_preset
 class ReconstructOptions(Verbosity, ReconstructSettings):
     """Reconstruct images whose poses are known: a COLMAP model, nerfstudio, DTU, Replica, TUM...
 
-    Lengths of the result are in the unit of the poses. Every default works.
+    Lengths of the result are in the unit of the poses. Every default works. Photographs without
+    poses: ``geogs reconstruct PHOTOS --poses auto``.
     """
 
     preset: Preset = "default"

@@ -40,11 +40,18 @@ def main(argv: Sequence[str]) -> int:
     options = parse(argv)
 
     from geogs.application.interrupt import Interruption
+    from geogs.application.offline import run_offline
     from geogs.application.run import resume, run
 
-    go = run if options.resume is None else partial(resume, options.resume)
-    settings, observer = record(RunSettings, options), _observer(options)
-    written = followed(options, lambda progress: go(settings, progress, Interruption(), observer))
+    settings, stop = record(RunSettings, options), Interruption()
+    if options.offline and options.resume is None:
+        if options.viewer or options.record is not None:
+            raise InputError("--viewer and --record follow tracking, which --offline has none of.")
+        written = followed(options, lambda progress: run_offline(settings, progress, stop))
+    else:
+        go = run if options.resume is None else partial(resume, options.resume)
+        observer = _observer(options)
+        written = followed(options, lambda progress: go(settings, progress, stop, observer))
     if written.can_resume:
         print(f"geogs run --resume {written.output} goes on from here.")
     return 0

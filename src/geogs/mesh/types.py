@@ -69,3 +69,11 @@ def cross(a: Float[np.ndarray, "n 3"], b: Float[np.ndarray, "n 3"]) -> Float[np.
     x, y, z = a.T
     u, v, w = b.T
     return np.stack([y * w - z * v, z * u - x * w, x * v - y * u], -1)
+
+
+def median_edge(mesh: Mesh) -> float:
+    """Median length of the edges of the faces; zero where there is none."""
+    if not len(mesh.faces):
+        return 0.0
+    corners = mesh.vertices.astype(np.float64)[mesh.faces]
+    return float(np.median(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)))

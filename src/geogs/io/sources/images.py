@@ -127,10 +127,15 @@ def _median_rate(times: Sequence[float]) -> float:
     return float(1 / np.median(steps)) if len(steps) else FRAMES_PER_SECOND
 
 
+def image_folder(folder: Path) -> Path | None:
+    """The folder itself or the sub-folder of a usual name that holds images; none if none does."""
+    places = (folder, *(folder / name for name in _SUBFOLDERS))
+    return next((place for place in places if place.is_dir() and _images(place)), None)
+
+
 def _folder_with_images(folder: Path) -> Path:
-    for place in (folder, *(folder / name for name in _SUBFOLDERS)):
-        if place.is_dir() and _images(place):
-            return place
+    if place := image_folder(folder):
+        return place
     raise InputError(
         f"{folder} holds no images ({', '.join(sorted(SUFFIXES))}) and is no data set known here; "
         f"give a video, a folder of images, or a Replica, TUM RGB-D or 7-Scenes sequence."

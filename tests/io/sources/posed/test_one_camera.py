@@ -147,11 +147,11 @@ def test_quite_another_camera_is_refused(other, tmp_path):
 
 def test_upright_photographs_among_wide_ones_are_cropped(tmp_path, caplog):
     upright = FIRST | {"cx": 60.5, "cy": 79.5, "w": 120, "h": 160}
-    cameras = [FIRST, upright, upright]
+    cameras = [FIRST, FIRST, upright, upright]
     write_transforms(tmp_path, [pattern(**camera) for camera in cameras], cameras)
     with caplog.at_level(logging.WARNING):
-        first, second, _ = open_posed_source(tmp_path, NATIVE)
-    assert "2 of 3 images are from other cameras" in caplog.text
+        first, _, second, _ = open_posed_source(tmp_path, NATIVE)
+    assert "2 of 4 images are from other cameras" in caplog.text
     # Columns 20 to 139 and one more on each side, half of which is seen.
     assert second.mask.sum(axis=1).tolist() == pytest.approx([120] * 120, abs=2)
     np.testing.assert_allclose(second.image[:, 22:138], first.image[:, 22:138], atol=1)

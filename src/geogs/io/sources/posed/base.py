@@ -52,7 +52,7 @@ class PosedSource:
             posed = posed.only(sorted(set(range(len(posed.files))) - set(left_out)))
         self._files = posed.files
         self.kind = posed.kind
-        """The format: colmap, nerfstudio, dtu, replica, tum, 7scenes or scannet."""
+        """The format: colmap, nerfstudio, dtu, replica, tum, 7scenes, scannet or photographs."""
         self.name = posed.name
         """Name of the scene."""
         self.scene_scale = posed.scene_scale
@@ -61,6 +61,8 @@ class PosedSource:
         """Sparse points of the world with which images see them, if the format has any."""
         self.region: Sphere | None = posed.region
         """Where the object lies, if the data set says so."""
+        self.left_out: tuple[tuple[str, str], ...] = posed.left_out
+        """Names of images that have no pose, each with the reason as a clause."""
         self.T_cw: Float64[np.ndarray, "n 4 4"] = np.stack([file.T_cw for file in posed.files])
         """World to camera of all images, OpenCV axes."""
         self.timestamps: Float64[np.ndarray, "n"] = np.array(

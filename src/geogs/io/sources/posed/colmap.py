@@ -25,8 +25,11 @@ def find_model(folder: Path) -> Path | None:
     return next((place for place in places if is_model(place)), None)
 
 
-def open_colmap(folder: Path) -> PosedSet:
-    """Read the model in a project folder (or given itself), images in natural order of names."""
+def open_colmap(folder: Path, images: Path | None = None) -> PosedSet:
+    """Read the model in a project folder (or given itself), images in natural order of names.
+
+    ``images`` is where they lie; without it, they are looked for around the model.
+    """
     place = find_model(folder)
     if place is None:
         raise InputError(f"{folder} holds no COLMAP model (cameras, images, points3D).")
@@ -35,7 +38,7 @@ def open_colmap(folder: Path) -> PosedSet:
     if not model.images:
         raise InputError(f"The COLMAP model {place} has no registered image.")
     numbers = sorted(model.images, key=lambda number: natural_key(model.images[number].name))
-    root = _image_folder(place, [model.images[number] for number in numbers])
+    root = images or _image_folder(place, [model.images[number] for number in numbers])
     files = tuple(
         _file(model, model.images[number], root, place, k) for k, number in enumerate(numbers)
     )
@@ -67,7 +70,7 @@ def _file(model: Model, image: ModelImage, root: Path, place: Path, index: int) 
     )
     path = _image_path(root, image.name)
     time = index / FRAMES_PER_SECOND
-    return PosedFile(path, pose_of(image), calibration, _mask(root, image.name), time)
+    return PosedFile(path, pose_of(image), calibration, mask_beside(root, image.name), time)
 
 
 def _project(place: Path) -> Path:
@@ -103,8 +106,11 @@ def _or_without_folder(path: Path, root: Path, name: str) -> Path:
     return short if short.is_file() else path
 
 
-def _mask(root: Path, name: str) -> Path | None:
-    """COLMAP's own masks are called like the image with .png behind it."""
+def mask_beside(root: Path, name: str) -> Path | None:
+    """The mask of an image of a folder, in a folder of masks beside that, or none.
+
+    COLMAP's own masks are called like the image with .png behind it.
+    """
     if not Path(name).name:
         return None
     for folder in ("masks", "mask", "rgb_masks"):

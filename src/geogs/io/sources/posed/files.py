@@ -78,6 +78,8 @@ class PosedSet:
     points: SparsePoints | None = None
     region: Sphere | None = None
     """Where the object lies, if the data set says so."""
+    left_out: tuple[tuple[str, str], ...] = ()
+    """Names of images that have no pose, each with the reason as a clause."""
 
     def only(self, kept: Sequence[int]) -> "PosedSet":
         """The set reduced to the images ``kept``, in this order."""

@@ -1,7 +1,8 @@
 """All images of a set as one pinhole camera sees them, though several cameras took them."""
 
 import logging
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Hashable, Sequence
 
 import cv2
 import numpy as np
@@ -29,13 +30,14 @@ MAX_KEPT_MAPS = 8
 
 
 class OneCamera:
-    """The common camera, that of the first image, and the way of each image into it."""
+    """The common camera, that of most images, and the way of each image into it."""
 
     def __init__(self, files: Sequence[PosedFile], config: InputConfig) -> None:
         self._sizes = [_size(file) for file in files]
         keys = [(file.calibration, size) for file, size in zip(files, self._sizes, strict=True)]
         cameras = {key: _resolved(config, *key) for key in dict.fromkeys(keys)}
-        first = cameras[keys[0]]
+        most = common_place(keys)
+        first = cameras[keys[most]]
         rectifier = Rectifier(first, config.long_edge)
         self.camera: Camera = rectifier.camera
         """The pinhole camera of every image."""
@@ -50,7 +52,7 @@ class OneCamera:
                 if isinstance(way, Resampler):
                     way.keep_maps()
         self._ways = [ways[key] for key in keys]
-        _check_shared(files, self._ways)
+        _check_shared(files, self._ways, files[most])
 
     def stored_shape(self, index: int) -> tuple[int, int]:
         """Width and height of image ``index`` on disk."""
@@ -126,21 +128,45 @@ class Resampler:
         return x, y
 
 
-def _check_shared(files: Sequence[PosedFile], ways: Sequence[Resampler | Rectifier]) -> None:
+def unlike_common(files: Sequence[PosedFile], config: InputConfig) -> list[int]:
+    """Places of the images whose cameras differ too much from that of most for one to stand in."""
+    keys = [(file.calibration, _size(file)) for file in files]
+    cameras = {key: _resolved(config, *key) for key in dict.fromkeys(keys)}
+    common = cameras[keys[common_place(keys)]]
+    rectifier = Rectifier(common, config.long_edge)
+    ways = {key: _way(c, rectifier.camera, rectifier.zoom) for key, c in cameras.items()}
+    return [place for place, key in enumerate(keys) if _is_unlike(ways[key])]
+
+
+def common_place(keys: Sequence[Hashable]) -> int:
+    """Place of the first image of the camera that took most; of several the first one."""
+    counts = Counter(keys)
+    return keys.index(max(counts, key=lambda key: counts[key]))
+
+
+def _is_unlike(way: "Resampler | Rectifier") -> bool:
+    if isinstance(way, Rectifier):
+        return False
+    return way.enlargement > MAX_ZOOM or way.shared < MIN_SHARED
+
+
+def _check_shared(
+    files: Sequence[PosedFile], ways: Sequence[Resampler | Rectifier], common: PosedFile
+) -> None:
     """Raise InputError where cameras differ too much for one to stand for the other."""
     cropped = 0
     for file, way in zip(files, ways, strict=True):
         if isinstance(way, Rectifier):
             continue
-        if way.enlargement > MAX_ZOOM or way.shared < MIN_SHARED:
+        if _is_unlike(way):
             raise InputError(
                 f"{file.path} ({way.description}) was taken with quite another camera than "
-                f"{files[0].path}; give images of one camera, or undistort and crop them to one."
+                f"{common.path}; give images of one camera, or undistort and crop them to one."
             )
         cropped += way.shared < 0.9
     if cropped:
         _log.warning(
-            "%d of %d images are from other cameras than the first one; what only they see at "
+            "%d of %d images are from other cameras than most; what only they see at "
             "their edges is not used.",
             cropped, len(files),
         )  # fmt: skip

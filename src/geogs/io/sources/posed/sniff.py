@@ -63,5 +63,6 @@ def _posed_set(path: Path) -> PosedSet:
             return open_format(path)
     raise InputError(
         f"{path} holds no images with known poses (COLMAP model, nerfstudio transforms.json, DTU "
-        f"cameras.npz, Replica, TUM RGB-D, 7-Scenes or ScanNet); use geogs run for images alone."
+        f"cameras.npz, Replica, TUM RGB-D, 7-Scenes or ScanNet); use --poses auto for photographs, "
+        "geogs run for a video."
     )

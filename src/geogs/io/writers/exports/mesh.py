@@ -1,17 +1,17 @@
 """Meshes for other programs: binary glTF (GLB) and Wavefront OBJ."""
 
-import json
-import struct
 from pathlib import Path
 
+import cv2
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from geogs.io.writers.atomic import atomic_file
+from geogs.io.writers.exports.gltf import PLAIN, GltfBuffer
 from geogs.io.writers.exports.records import OPENGL_FROM_OPENCV
 
-_FLOAT, _UINT16, _UINT32 = 5126, 5123, 5125
-_VERTICES, _CORNERS = 34962, 34963
+_QUALITY = 92
+"""Of the JPEG in a textured mesh."""
 
 
 def write_glb(
@@ -27,51 +27,49 @@ def write_glb(
     Colours are linear in the file, as glTF has them; ours are sRGB.
     """
     turn = OPENGL_FROM_OPENCV[:3, :3]
-    places = (vertices @ turn).astype("<f4")
-    parts = [
-        (places, "VEC3", _FLOAT, _VERTICES),
-        ((normals @ turn).astype("<f4"), "VEC3", _FLOAT, _VERTICES),
-        (faces.astype("<u4").reshape(-1), "SCALAR", _UINT32, _CORNERS),
-    ]
-    attributes = {"POSITION": 0, "NORMAL": 1}
+    gltf = GltfBuffer()
+    attributes = {
+        "POSITION": gltf.add(vertices @ turn, "VEC3", has_range=True),
+        "NORMAL": gltf.add(normals @ turn, "VEC3"),
+    }
+    corners = gltf.add_corners(faces)
     if colours is not None:
         steps = np.round(linear(colours) * 65535).astype("<u2")
         opaque = np.concatenate([steps, np.full((len(steps), 1), 65535, "<u2")], 1)
-        parts.append((opaque, "VEC4", _UINT16, _VERTICES))
-        attributes["COLOR_0"] = 3
-    accessors: list[dict[str, object]] = []
-    views, data = [], b""
-    for number, (values, kind, component, target) in enumerate(parts):
-        views.append({
-            "buffer": 0, "byteOffset": len(data), "byteLength": values.nbytes, "target": target,
-        })  # fmt: skip
-        accessors.append({
-            "bufferView": number, "componentType": component, "count": len(values), "type": kind,
-        })  # fmt: skip
-        data += values.tobytes()
-    accessors[0] |= {"min": places.min(0).tolist(), "max": places.max(0).tolist()}
-    if colours is not None:
-        accessors[3]["normalized"] = True
-    surface = {"pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0}}
-    primitive = {"attributes": attributes, "indices": 2, "material": 0}
-    document = {
-        "asset": {"version": "2.0", "generator": "geogs"},
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, "name": "surface"}],
-        "meshes": [{"primitives": [primitive]}],
-        "materials": [{**surface, "doubleSided": True}],
-        "accessors": accessors,
-        "bufferViews": views,
-        "buffers": [{"byteLength": len(data)}],
+        attributes["COLOR_0"] = gltf.add_steps(opaque)
+    gltf.write(path, attributes, corners, PLAIN)
+
+
+def write_textured_glb(
+    path: Path,
+    vertices: Float[np.ndarray, "n 3"],
+    faces: Int[np.ndarray, "m 3"],
+    normals: Float[np.ndarray, "n 3"],
+    texture_place: Float[np.ndarray, "n 2"],
+    texture: UInt8[np.ndarray, "h w 3"],
+) -> None:
+    """Write glTF 2.0 in one file, with axes as ``write_glb`` has them and a JPEG inside.
+
+    Light is in the texture already, so the material asks to be shown as it is
+    (KHR_materials_unlit); readers that do not know that see a rough surface. ``texture_place`` is
+    in pixels of the texture, whose centres are at integers.
+    """
+    turn = OPENGL_FROM_OPENCV[:3, :3]
+    size = np.array(texture.shape[1::-1])
+    gltf = GltfBuffer()
+    attributes = {
+        "POSITION": gltf.add(vertices @ turn, "VEC3", has_range=True),
+        "NORMAL": gltf.add(normals @ turn, "VEC3"),
+        "TEXCOORD_0": gltf.add((texture_place + 0.5) / size, "VEC2"),
     }
-    text = json.dumps(document).encode()
-    text += b" " * (-len(text) % 4)
-    data += b"\0" * (-len(data) % 4)
-    with atomic_file(path) as stream:
-        stream.write(struct.pack("<4sII", b"glTF", 2, 12 + 8 + len(text) + 8 + len(data)))
-        stream.write(struct.pack("<I4s", len(text), b"JSON") + text)
-        stream.write(struct.pack("<I4s", len(data), b"BIN\0") + data)
+    corners = gltf.add_corners(faces)
+    gltf.write(path, attributes, corners, gltf.textured(_jpeg(texture)))
+
+
+def _jpeg(texture: UInt8[np.ndarray, "h w 3"]) -> bytes:
+    options = [cv2.IMWRITE_JPEG_QUALITY, _QUALITY]
+    _, data = cv2.imencode(".jpg", cv2.cvtColor(texture, cv2.COLOR_RGB2BGR), options)
+    return data.tobytes()
 
 
 def write_obj(

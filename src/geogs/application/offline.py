@@ -1,0 +1,231 @@
+"""A video without tracking: sharp frames, structure from motion, every frame against the map."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float64
+from scipy.spatial.transform import Rotation, Slerp
+
+from geogs.application.folder_lock import only_writer
+from geogs.application.forecast import reconstruction_forecast
+from geogs.application.former import free_folder
+from geogs.application.interrupt import Stop
+from geogs.application.machine import compiled_kernels, full_memory_in_a_sentence
+from geogs.application.progress import RunProgress
+from geogs.application.result import Result, Written
+from geogs.application.results import write_results
+from geogs.application.settings import RunSettings
+from geogs.config import ReconstructConfig
+from geogs.gpu.installation import require_device
+from geogs.io.sources.calibration import Calibration
+from geogs.io.sources.sniff import Stream, open_source
+from geogs.io.writers.atomic import prepare_output_folder
+from geogs.mapping.rendered import MapRenderer
+from geogs.photos.localise import Localiser
+from geogs.photos.poses import Progress
+from geogs.photos.sharp_frames import ChosenFrames, sharpest_frames, stretch_length
+from geogs.photos.video import PlacedFrames, place_frames
+from geogs.reconstruction import Reconstruction
+from geogs.stopwatch import Stopwatch
+from geogs.threads import on_one_torch_thread
+from geogs.types import MapSnapshot, RenderedKeyframe, Trajectory, Uncertainty
+
+
+@on_one_torch_thread
+def run_offline(
+    settings: RunSettings, progress: RunProgress | None = None, stop: Stop | None = None
+) -> Written:
+    """Place sharp frames by structure from motion, all others against them, map, write.
+
+    For a video that tracking cannot follow. The map is that of ``geogs reconstruct`` with its
+    default settings; of the run's, input, mesh and seed count.
+
+    Raises:
+        InputError: pycolmap is missing, a source or a setting cannot be used, or the frames do not
+            tell where they were taken.
+        OutputError: a file cannot be written.
+        DeviceError: the device cannot be used, or its memory is full.
+        KeyboardInterrupt: it was stopped before there was a map; afterwards that is kept.
+    """
+    progress, stop = progress or RunProgress(), stop or Stop()
+    config, device = settings.config, require_device(settings.device)
+    opened = open_source(settings.source, config.input)
+    wanted = settings.output or free_folder(Path("out") / opened.name, opened.fingerprint())
+    output = prepare_output_folder(wanted)
+    with only_writer(output):
+        return _to_folder(settings, opened, output, device, progress, stop)
+
+
+def _to_folder(
+    settings: RunSettings,
+    opened: Stream,
+    output: Path,
+    device: torch.device,
+    progress: RunProgress,
+    stop: Stop,
+) -> Written:
+    """The same once the source is opened and the folder is ours."""
+    config = settings.config
+    compiled_kernels(device)
+    progress.plan(reconstruction_forecast(finds_poses=True))
+    own = replace(ReconstructConfig(), seed=config.seed, input=config.input, mesh=config.mesh)
+    stopwatch = Stopwatch()
+
+    def report(stage: str, fraction: float) -> None:
+        progress.stage(stage, fraction)
+        stop.check()
+
+    with full_memory_in_a_sentence(), stop:
+        with stopwatch("choosing frames"):
+            every = stretch_length(_fps(opened), opened.length)
+            chosen = sharpest_frames(opened, every)
+        is_known = not opened.is_calibration_open
+        with stopwatch("structure from motion"):
+            placed = place_frames(chosen.frames, opened.camera, is_known, config.seed, report)
+        progress.write(
+            f"{len(placed.numbers)} of {len(chosen.frames)} sharp frames have a pose; points are "
+            f"{placed.error:.2f} pixels from where they were seen."
+        )
+        source = opened if is_known else opened.with_calibration(_of_source(opened, placed))
+        scene = Reconstruction(source.camera, own, str(device))
+        with stopwatch("placing frames"):
+            T_cw, found = _place_all(source, scene, placed, len(chosen.timestamps), own, report)
+        try:
+            scene.finish(placed.all_points(), report)
+            finished = True
+        except KeyboardInterrupt:
+            if not (stop.requested and len(scene.snapshot())):
+                raise
+            progress.write("Stopping early; keeping what there is. Press Ctrl-C again to quit.")
+            finished = False
+        for stage, seconds in scene.stopwatch.seconds.items():
+            stopwatch.seconds[stage] = stopwatch.seconds.get(stage, 0.0) + seconds
+        video = OfflineScene(scene, stopwatch, chosen, placed, T_cw, found)
+        result = Result(video, source, not finished, progress)
+        write_results(output, result, (), settings.keyframe_images)
+    return Written(output, result, False)
+
+
+@dataclass(eq=False)
+class OfflineScene:
+    """A map of chosen frames, and the poses of all."""
+
+    scene: Reconstruction
+    stopwatch: Stopwatch
+    chosen: ChosenFrames
+    placed: PlacedFrames
+    T_cw: Float64[np.ndarray, "n 4 4"]
+    """World to camera of all frames; between others where ``found`` is false."""
+    found: Bool[np.ndarray, "n"]
+
+    @property
+    def config(self) -> ReconstructConfig:
+        """By which the map was made."""
+        return self.scene.config
+
+    @property
+    def frames(self) -> int:
+        """Of the video."""
+        return len(self.T_cw)
+
+    def trajectory(self) -> Trajectory:
+        """Poses of all frames."""
+        times = self.chosen.timestamps[: self.frames]
+        return Trajectory(times, np.linalg.inv(self.T_cw), self.found)
+
+    def keyframe_trajectory(self) -> Trajectory:
+        """Poses of the frames that structure from motion placed."""
+        return self.scene.trajectory()
+
+    def uncertainty(self) -> Uncertainty:
+        """What the adjustment leaves open."""
+        times = self.keyframe_trajectory().timestamps
+        placed = self.placed
+        return Uncertainty(times, placed.deviation, placed.rotation, placed.depth)
+
+    def snapshot(self) -> MapSnapshot:
+        """The disks."""
+        return self.scene.snapshot()
+
+    def renders(self) -> Sequence[RenderedKeyframe]:
+        """The map seen from the frames that structure from motion placed."""
+        return self.scene.renders()
+
+    def renderer(self) -> MapRenderer:
+        """What shows the map from anywhere."""
+        return self.scene.renderer()
+
+    def depth_maps(self) -> Sequence[RenderedKeyframe]:
+        """Their depths as searched."""
+        return self.scene.depth_maps()
+
+    def particulars(self) -> Mapping[str, object]:
+        """That nothing was tracked, and how the poses were found."""
+        return {
+            "offline": {
+                "sharp_frames": len(self.chosen.frames),
+                "placed_by_structure": len(self.placed.numbers),
+                "placed_against_the_map": int(np.sum(self.found)) - len(self.placed.numbers),
+                "reprojection_error": self.placed.error,
+                "calibration": asdict(self.placed.calibration),
+            }
+        }
+
+
+def _place_all(
+    source: Stream,
+    scene: Reconstruction,
+    placed: PlacedFrames,
+    count: int,
+    config: ReconstructConfig,
+    report: Progress,
+) -> tuple[Float64[np.ndarray, "n 4 4"], Bool[np.ndarray, "n"]]:
+    """Poses of all frames and which were found; those of structure from motion go to ``scene``."""
+    localiser = Localiser(
+        placed.positions, placed.descriptors, placed.numbers, source.camera, config.seed
+    )
+    of = dict(zip(placed.numbers, placed.T_cw, strict=True))
+    T_cw, found = np.tile(np.eye(4), (count, 1, 1)), np.zeros(count, bool)
+    for frame in source:
+        pose = of.get(frame.index)
+        if pose is not None:
+            scene.add(frame.image, pose, None, frame.timestamp)
+        else:
+            pose = localiser.place(frame.index, frame.image)
+        if pose is not None:
+            T_cw[frame.index], found[frame.index] = pose, True
+        report("placing frames", (frame.index + 1) / count)
+    return filled(T_cw, found), found
+
+
+def filled(T_cw: Float64[np.ndarray, "n 4 4"], found: np.ndarray) -> Float64[np.ndarray, "n 4 4"]:
+    """The poses with those that were not found put between the ones around, or held at the ends."""
+    known = np.flatnonzero(found)
+    T_wc = np.linalg.inv(T_cw)
+    at = np.clip(np.arange(len(T_cw)), known[0], known[-1]).astype(float)
+    made = T_wc.copy()
+    if len(known) > 1:
+        turns = Slerp(known, Rotation.from_matrix(T_wc[known, :3, :3]))(at).as_matrix()
+        made[:, :3, :3] = turns
+        for axis in range(3):
+            made[:, axis, 3] = np.interp(at, known, T_wc[known, axis, 3])
+    else:
+        made[:] = T_wc[known[0]]
+    made[known] = T_wc[known]
+    return np.linalg.inv(made)
+
+
+def _of_source(source: Stream, placed: PlacedFrames) -> Calibration:
+    """The camera that was found, for the images as they came."""
+    was = source.calibration
+    found = replace(placed.calibration, origin="structure from motion of the video")
+    assert was.width is not None
+    assert was.height is not None
+    return found.fit(was.width, was.height)
+
+
+def _fps(source: Stream) -> float:
+    return float(getattr(source, "fps", 30.0))

@@ -1,0 +1,115 @@
+"""Photographs without poses: these are found once, kept beside the result, and read from there."""
+
+import json
+from dataclasses import asdict, replace
+from pathlib import Path
+
+from geogs.application.interrupt import Stop
+from geogs.application.progress import RunProgress
+from geogs.config import ReconstructConfig
+from geogs.errors import InputError
+from geogs.io.sources.posed.base import PosedSource
+from geogs.io.sources.posed.colmap import open_colmap
+from geogs.io.sources.posed.one_camera import unlike_common
+from geogs.io.writers.atomic import write_text
+from geogs.photos.photograph import PhotoFolder, find_photographs
+from geogs.photos.poses import FoundPoses, LeftOut, find_poses
+
+NAMED = 8
+"""Photographs that were left out and are named one by one on the terminal."""
+
+
+def open_photographs(
+    folder: Path,
+    config: ReconstructConfig,
+    kept: Path,
+    hold_out: int | None = None,
+    again: bool = False,
+    progress: RunProgress | None = None,
+    stop: Stop | None = None,
+) -> PosedSource:
+    """A source of photographs whose poses are found from themselves, or were found before.
+
+    Args:
+        folder: the photographs.
+        config: its ``input`` selects photographs and says what is known of the camera.
+        kept: the folder of the result: the poses go to ``sparse/0`` there, as a COLMAP model, and
+            what was left out to ``photographs.json``.
+        hold_out: every so many-th photograph with a pose is left out afterwards; none leaves out
+            none.
+        again: whether to take the poses that were kept there before.
+        progress: follows the work.
+        stop: ends it.
+
+    Raises:
+        InputError: pycolmap is missing, or the photographs do not tell where they were taken.
+        OutputError: the poses cannot be kept.
+        KeyboardInterrupt: it was stopped.
+    """
+    progress, stop = progress or RunProgress(), stop or Stop()
+    chosen, selection = find_photographs(folder), config.input
+    some = chosen.photographs[selection.start : selection.stop : selection.stride]
+    chosen = replace(chosen, photographs=some)
+    note = kept / "photographs.json"
+    model = kept / "sparse" / "0"
+    if again and note.is_file():
+        found = _read(note)
+    else:
+
+        def report(stage: str, fraction: float) -> None:
+            progress.stage(stage, fraction)
+            stop.check()
+
+        found = find_poses(chosen, model, selection.intrinsics, config.seed, report)
+        write_text(note, json.dumps(asdict(found), indent=2))
+    source = _source(folder, chosen, model, found, config, hold_out)
+    count = len(chosen.photographs) + len(chosen.damaged)
+    _tell(found, source.left_out, count, progress)
+    return source
+
+
+def _source(
+    folder: Path,
+    chosen: PhotoFolder,
+    model: Path,
+    found: FoundPoses,
+    config: ReconstructConfig,
+    hold_out: int | None,
+) -> PosedSource:
+    """The photographs that have a pose, but for those of quite other cameras."""
+    posed = open_colmap(model, chosen.root)
+    auto = replace(config.input, intrinsics="auto", start=0, stop=None, stride=1)
+    unlike = unlike_common(posed.files, auto)
+    names = [file.path.relative_to(chosen.root).as_posix() for file in posed.files]
+    left_out = [(out.name, out.reason) for out in found.left_out]
+    left_out += [(names[i], "was taken with quite another camera than most") for i in unlike]
+    posed = posed.only([i for i in range(len(names)) if i not in set(unlike)])
+    name = folder.expanduser().resolve().name
+    posed = replace(posed, kind="photographs", name=name, left_out=tuple(left_out))
+    return PosedSource(posed, auto, hold_out)
+
+
+def _tell(
+    found: FoundPoses,
+    left_out: tuple[tuple[str, str], ...],
+    count: int,
+    progress: RunProgress,
+) -> None:
+    progress.write(
+        f"{count - len(left_out)} of {count} photographs have a pose; points are "
+        f"{found.error:.2f} pixels from where they were seen."
+    )
+    for name, reason in left_out[:NAMED]:
+        progress.write(f"left out: {name} {reason}.")
+    if len(left_out) > NAMED:
+        progress.write(f"left out: {len(left_out) - NAMED} more; summary.json says which and why.")
+
+
+def _read(note: Path) -> FoundPoses:
+    """What an earlier call found. Raises InputError if that cannot be read."""
+    try:
+        values = json.loads(note.read_text(encoding="utf-8"))
+        left_out = tuple(LeftOut(str(o["name"]), str(o["reason"])) for o in values["left_out"])
+        return FoundPoses(tuple(map(str, values["placed"])), left_out, float(values["error"]))
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{note} is damaged ({error}); leave out --resume.") from error

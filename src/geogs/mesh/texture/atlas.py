@@ -1,0 +1,107 @@
+"""The image of a textured mesh: patches side by side, their colours levelled."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Float32, Float64, UInt8
+
+from geogs.mesh.texture.atlas_kernels import draw_triangles
+from geogs.mesh.texture.packing import scale_that_fits
+from geogs.mesh.texture.patches import Patches
+from geogs.mesh.types import DepthMapView
+
+SWATCH = 3
+"""Side of the square of one colour that faces get which no view shows, pixels."""
+
+
+@dataclass(frozen=True, slots=True)
+class Atlas:
+    """An image and where the corners of patches and the plain colours are in it."""
+
+    image: UInt8[np.ndarray, "h w 3"]
+    corner: Float64[np.ndarray, "n 2"]
+    """Of each corner, pixels."""
+    swatch: Float64[np.ndarray, "s 2"]
+    """Middle of each plain colour, pixels."""
+
+
+def draw_atlas(
+    patches: Patches,
+    views: Mapping[int, DepthMapView],
+    gains: Float32[np.ndarray, "v 3"],
+    corrections: Float32[np.ndarray, "n 3"],
+    swatches: UInt8[np.ndarray, "s 3"],
+    limit: int,
+    progress: Callable[[int, int], None] = lambda done, of: None,
+) -> Atlas:
+    """Draw the part of its view that each patch needs, levelled, into an atlas.
+
+    Args:
+        patches: of the mesh.
+        views: their images.
+        gains: of the views; factors of the colours.
+        corrections: at the corners, added to the colours (0 to 255).
+        swatches: plain colours for the faces that no view shows.
+        limit: longest side of the atlas, pixels.
+        progress: called with the patches done and their number.
+
+    Raises:
+        InputError: the atlas has no room for them.
+    """
+    across = int(np.ceil(np.sqrt(len(swatches))))
+    sizes = patches.box[:, 2:] - patches.box[:, :2] + 1
+    plain = np.array([[SWATCH * across, SWATCH * across]], np.int64)[: len(swatches)]
+    together = np.concatenate([sizes, plain])
+    scaled, places, (width, height) = scale_that_fits(together, limit, fixed=len(plain))
+    image = np.zeros((height, width, 3), np.uint8)
+    factor = scaled[: len(sizes)] / sizes
+    own = patches.corner_patch
+    local = (patches.pixel - patches.box[own, :2] + 0.5) * factor[own] - 0.5
+    for number in range(len(sizes)):
+        x, y = places[number]
+        w, h = scaled[number]
+        drawn = _patch(patches, number, views, gains, corrections, local, (int(w), int(h)))
+        image[y : y + h, x : x + w] = drawn
+        progress(number + 1, len(sizes))
+    corner = places[: len(sizes)][own] + local if len(own) else np.zeros((0, 2))
+    index = np.arange(len(swatches))
+    middle = np.zeros((0, 2))
+    if len(swatches):
+        row, column = np.divmod(index, across)
+        at = places[-1] + SWATCH * np.stack([column, row], -1)
+        for (x, y), colour in zip(at.tolist(), swatches, strict=True):
+            image[y : y + SWATCH, x : x + SWATCH] = colour
+        middle = at + (SWATCH - 1) / 2
+    return Atlas(image, corner, middle)
+
+
+def _patch(
+    patches: Patches,
+    number: int,
+    views: Mapping[int, DepthMapView],
+    gains: Float32[np.ndarray, "v 3"],
+    corrections: Float32[np.ndarray, "n 3"],
+    local: Float64[np.ndarray, "n 2"],
+    size: tuple[int, int],
+) -> UInt8[np.ndarray, "h w 3"]:
+    """The pixels of a patch."""
+    view = int(patches.view[number])
+    left, top, right, bottom = patches.box[number]
+    source = views[view].image
+    assert source is not None
+    crop = source[top : bottom + 1, left : right + 1]
+    if (crop.shape[1], crop.shape[0]) != size:
+        crop = cv2.resize(crop, size, interpolation=cv2.INTER_AREA)
+    corners = patches.corners[patches.start[number] : patches.start[number + 1]]
+    drawn = np.zeros((size[1], size[0], 3), np.float32)
+    covered = np.zeros((size[1], size[0]), np.float32)
+    draw_triangles(local[corners], corrections[corners].astype(np.float64), drawn, covered)
+    reach = (9, 9)
+    spread = cv2.blur(drawn, reach, borderType=cv2.BORDER_CONSTANT)
+    share = cv2.blur(covered, reach, borderType=cv2.BORDER_CONSTANT)
+    outside = covered == 0
+    drawn[outside] = spread[outside] / np.maximum(share[outside], 1e-6)[:, None]
+    levelled = crop.astype(np.float32) * gains[view] + drawn
+    return (levelled + 0.5).clip(0, 255).astype(np.uint8)

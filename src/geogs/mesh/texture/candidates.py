@@ -1,0 +1,153 @@
+"""Which views show each face of a mesh, and how well."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int32, UInt8
+
+from geogs.mesh.types import DepthMapView, Mesh, cross
+
+MOST = 8
+"""Views of a face that are kept, those that show it best."""
+LEAST_COSINE = 0.1
+"""Cosine between a face's normal and the ray to a view that shows it, at least."""
+DEPTH_SLACK = 0.02
+"""Part of the depth by which a face may lie off a depth map that shows it."""
+MARGIN = 1.5
+"""Pixels from the border of an image within which nothing is taken."""
+PARTLY = 0.05
+"""What a face counts of which one corner is hidden, beside one that is seen."""
+_SHARP_POWER = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class Candidates:
+    """Up to ``MOST`` views of each face, the best ones in no order; -1 where there are no more."""
+
+    view: Int32[np.ndarray, "m k"]
+    score: Float32[np.ndarray, "m k"]
+    """Pixels that the face covers, counted less in a blurred image; 0 where there is none."""
+    colour: Float32[np.ndarray, "m k 3"]
+    """Mean of the image over about the face, 0 to 255."""
+
+
+def find_candidates(
+    mesh: Mesh,
+    views: Sequence[DepthMapView],
+    tolerance: float,
+    progress: Callable[[int, int], None] = lambda done, of: None,
+) -> Candidates:
+    """Views that show each face: near ones from the front first, sharp ones before blurred ones.
+
+    A view shows a face whose corners project into its image, whose middle lies on its depth map
+    within ``tolerance`` map units and 2 % of the depth, two corners, too, and which faces it. One
+    whose third corner is hidden counts less.
+    """
+    count = len(mesh.faces)
+    best = Candidates(
+        np.full((count, MOST), -1, np.int32),
+        np.zeros((count, MOST), np.float32),
+        np.zeros((count, MOST, 3), np.float32),
+    )
+    sharpness = _sharpness(views)
+    for number, view in enumerate(views):
+        if view.image is not None:
+            faces, score, colour = _seen_faces(mesh, view, tolerance)
+            _enter(best, number, faces, score * sharpness[number], colour)
+        progress(number + 1, len(views))
+    return best
+
+
+def image_pixels(
+    view: DepthMapView, points: Float[np.ndarray, "n 3"]
+) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n"]]:
+    """Where world points are in the image of a view, and their depths."""
+    T_cw = view.T_cw.cpu().numpy()
+    camera = view.camera
+    local = points @ T_cw[:3, :3].T + T_cw[:3, 3]
+    z = local[:, 2]
+    safe = np.where(np.abs(z) < 1e-9, 1e-9, z)
+    pixels = local[:, :2] / safe[:, None] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
+    height, width = view.image.shape[:2]  # type: ignore[union-attr]
+    scale = np.array([width / camera.width, height / camera.height])
+    return (pixels + 0.5) * scale - 0.5, z
+
+
+def _seen_faces(
+    mesh: Mesh, view: DepthMapView, tolerance: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Numbers of the faces that a view shows, pixels each covers, colours."""
+    image = view.image
+    assert image is not None
+    height, width = image.shape[:2]
+    pixels, z = image_pixels(view, mesh.vertices.astype(np.float64))
+    low, high = MARGIN, np.array([width, height]) - 1 - MARGIN
+    inside = (z > 0) & ((pixels >= low) & (pixels <= high)).all(-1)
+    faces = np.flatnonzero(inside[mesh.faces].all(1))
+    corners = mesh.vertices[mesh.faces[faces]].astype(np.float64)
+    middle = corners.mean(1)
+    normal = cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    T_cw = view.T_cw.cpu().numpy()
+    ray = middle - (-T_cw[:3, :3].T @ T_cw[:3, 3])
+    length = np.linalg.norm(normal, axis=1) * np.linalg.norm(ray, axis=1)
+    cosine = -(normal * ray).sum(1) / np.maximum(length, 1e-30)
+    seen_corner = np.zeros(len(mesh.vertices), bool)
+    index = np.flatnonzero(inside)
+    seen_corner[index] = _on_depth(view, pixels[index], z[index], image.shape, tolerance)
+    at, depth = image_pixels(view, middle)
+    corners_seen = seen_corner[mesh.faces[faces]].sum(1)
+    shown = (cosine > LEAST_COSINE) & (corners_seen >= 2)
+    shown &= _on_depth(view, at, depth, image.shape, tolerance)
+    faces, at, corners_seen = faces[shown], at[shown], corners_seen[shown]
+    p = pixels[mesh.faces[faces]]
+    a, b = p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]
+    area = 0.5 * np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+    area = np.where(corners_seen == 3, area, PARTLY * area)
+    return faces, area, _sampled(cv2.GaussianBlur(image, (0, 0), 1.5), at)
+
+
+def _on_depth(
+    view: DepthMapView,
+    pixels: Float[np.ndarray, "n 2"],
+    z: Float[np.ndarray, "n"],
+    shape: tuple[int, ...],
+    tolerance: float,
+) -> Bool[np.ndarray, "n"]:
+    """Whether points at image pixels lie on the depth map."""
+    camera = view.camera
+    depth = np.where(view.valid().cpu().numpy(), view.depth.cpu().numpy(), np.inf)
+    scale = np.array([camera.width / shape[1], camera.height / shape[0]])
+    place = np.round((pixels + 0.5) * scale - 0.5).astype(int)
+    column = place[:, 0].clip(0, camera.width - 1)
+    row = place[:, 1].clip(0, camera.height - 1)
+    return np.abs(depth[row, column] - z) < tolerance + DEPTH_SLACK * z
+
+
+def _sampled(image: UInt8[np.ndarray, "h w 3"], at: Float[np.ndarray, "n 2"]) -> np.ndarray:
+    column, row = np.round(at).astype(int).T
+    return image[row.clip(0, image.shape[0] - 1), column.clip(0, image.shape[1] - 1)].astype(float)
+
+
+def _sharpness(views: Sequence[DepthMapView]) -> Float[np.ndarray, "v"]:
+    """Root of the strength of each image's fine structure over the median image's, at most 1."""
+    strength = np.array([
+        0.0 if view.image is None
+        else cv2.Laplacian(cv2.cvtColor(view.image, cv2.COLOR_RGB2GRAY), cv2.CV_32F).std()
+        for view in views
+    ])  # fmt: skip
+    usual = np.median(strength[strength > 0]) if (strength > 0).any() else 1.0
+    return np.minimum(strength / usual, 1.0) ** _SHARP_POWER
+
+
+def _enter(
+    best: Candidates, view: int, faces: np.ndarray, score: np.ndarray, colour: np.ndarray
+) -> None:
+    """Put a view in its place among the candidates of the faces, if it is good enough."""
+    worst = best.score[faces].argmin(1)
+    better = score > best.score[faces, worst]
+    faces, worst = faces[better], worst[better]
+    best.view[faces, worst] = view
+    best.score[faces, worst] = score[better]
+    best.colour[faces, worst] = colour[better]

@@ -1,0 +1,105 @@
+"""Photographs in a folder: which there are, how large, and by which camera."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from geogs.errors import InputError
+from geogs.io.sources.images import SUFFIXES, image_folder, natural_key
+
+_MAKE, _MODEL, _ORIENTATION, _EXIF_IFD = 0x010F, 0x0110, 0x0112, 0x8769
+_FOCAL_LENGTH, _FOCAL_LENGTH_35MM, _LENS_MODEL = 0x920A, 0xA405, 0xA434
+_QUARTER_TURNS = {6: 1, 7: 1, 3: 2, 4: 2, 8: 3, 5: 3}
+"""Clockwise turns that make a picture upright, by its EXIF orientation."""
+
+
+@dataclass(frozen=True, slots=True)
+class Lens:
+    """What a picture says of the camera; pictures with the same words share their intrinsics."""
+
+    width: int
+    height: int
+    """Of the picture as it is stored, pixels."""
+    words: tuple[str, ...] = ()
+    """Make, model, lens and focal lengths from the EXIF."""
+
+
+@dataclass(frozen=True, slots=True)
+class Photograph:
+    """A picture on disk, its pixels taken as they are stored."""
+
+    path: Path
+    name: str
+    """Relative to the folder, with slashes."""
+    lens: Lens
+    quarter_turns: int = 0
+    """Clockwise, from the stored picture to the upright one."""
+
+
+@dataclass(frozen=True, slots=True)
+class PhotoFolder:
+    """A folder of photographs."""
+
+    root: Path
+    """What the names of the pictures are relative to."""
+    photographs: tuple[Photograph, ...]
+    """In natural order of their names."""
+    damaged: tuple[str, ...]
+    """Names of files that are called like pictures and cannot be read."""
+
+
+def find_photographs(folder: str | Path) -> PhotoFolder:
+    """The photographs in a folder, in a sub-folder called images or alike, or in all below it.
+
+    Raises:
+        InputError: there are none.
+    """
+    folder = Path(folder).expanduser()
+    if not folder.is_dir():
+        raise InputError(f"{folder} is no folder; --poses auto needs a folder of photographs.")
+    root = image_folder(folder)
+    paths = _pictures(root.iterdir() if root else folder.rglob("*"))
+    root = root or folder
+    found = [(path, _photograph(path, root)) for path in paths]
+    good = tuple(photograph for _, photograph in found if photograph is not None)
+    damaged = tuple(_name(path, root) for path, photograph in found if photograph is None)
+    if not good:
+        raise InputError(
+            f"{folder} holds no photographs that can be read ({', '.join(sorted(SUFFIXES))})."
+        )
+    return PhotoFolder(root, good, damaged)
+
+
+def _pictures(paths: object) -> list[Path]:
+    kept = [
+        path
+        for path in paths  # type: ignore[attr-defined]
+        if path.suffix.lower() in SUFFIXES and not path.name.startswith(".") and path.is_file()
+    ]
+    return sorted(kept, key=lambda path: (natural_key(str(path)), str(path)))
+
+
+def _name(path: Path, root: Path) -> str:
+    return path.relative_to(root).as_posix()
+
+
+def _photograph(path: Path, root: Path) -> Photograph | None:
+    """A picture with what its header says; none where it is damaged."""
+    from PIL import Image, UnidentifiedImageError
+
+    try:
+        with Image.open(path) as picture:
+            width, height = picture.size
+            base = picture.getexif()
+            exif = base.get_ifd(_EXIF_IFD)
+    except (OSError, UnidentifiedImageError, SyntaxError, ValueError):
+        return None
+    own = (base.get(_MAKE), base.get(_MODEL))
+    words = (*own, *(exif.get(tag) for tag in (_LENS_MODEL, _FOCAL_LENGTH, _FOCAL_LENGTH_35MM)))
+    lens = Lens(width, height, tuple("" if w is None else str(w).strip("\0 ") for w in words))
+    return Photograph(path, _name(path, root), lens, _turns(base))
+
+
+def _turns(exif: Mapping[int, object]) -> int:
+    orientation = exif.get(_ORIENTATION)
+    return _QUARTER_TURNS.get(orientation, 0) if isinstance(orientation, int) else 0

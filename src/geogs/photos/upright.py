@@ -1,0 +1,42 @@
+"""Which way is up in a world that photographs tell of."""
+
+import numpy as np
+from jaxtyping import Float64
+
+LEAST_SPREAD = 0.05
+"""Second smallest eigenvalue of the cameras' x axes from which on they tell the vertical."""
+
+
+def upright_rotation(
+    R_cw: Float64[np.ndarray, "n 3 3"], quarter_turns: list[int]
+) -> Float64[np.ndarray, "3 3"]:
+    """The rotation of the world after which y points down, as in an upright image.
+
+    Photographs are mostly held level: their x axes, once they are turned upright, are horizontal,
+    and the vertical is what is most nearly at right angles to all of them. Where all look the same
+    way, the mean of their y axes has to do. The first camera looks along z as far as that goes.
+
+    Args:
+        R_cw: world to camera of each picture.
+        quarter_turns: clockwise, from each picture as it is stored to the upright one.
+    """
+    turned = np.stack([_turn(k) @ R for k, R in zip(quarter_turns, R_cw, strict=True)])
+    x_axes, y_axes = turned[:, 0], turned[:, 1]
+    values, vectors = np.linalg.eigh(x_axes.T @ x_axes / len(x_axes))
+    mean_down = y_axes.mean(0)
+    down = vectors[:, 0] if values[1] > LEAST_SPREAD else mean_down
+    if down @ mean_down < 0:
+        down = -down
+    length = np.linalg.norm(down)
+    down = down / length if length > 1e-6 else y_axes[0]
+    forward = turned[0, 2] - down * (down @ turned[0, 2])
+    if np.linalg.norm(forward) < 1e-3:  # the first one looks straight up or down
+        forward = turned[0, 1] - down * (down @ turned[0, 1])
+    forward /= np.linalg.norm(forward)
+    return np.stack([np.cross(down, forward), down, forward])
+
+
+def _turn(quarter_turns: int) -> Float64[np.ndarray, "3 3"]:
+    """From the axes of a stored picture to those of the upright one, turned clockwise."""
+    quarter = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    return np.linalg.matrix_power(quarter, quarter_turns % 4)

@@ -1,0 +1,44 @@
+"""A video without tracking: chosen frames by structure from motion, the others against them."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from geogs.cli.main import main
+from geogs.geometry.umeyama import umeyama
+from geogs.io.poses import read_tum_trajectory
+from geogs.photos import sharp_frames
+from io_samples import write_image
+from posed_layouts import render_room
+
+FRAMES = 12
+
+
+@pytest.mark.system
+def test_every_frame_gets_its_pose_and_there_is_a_mesh(tmp_path, monkeypatch, capfd):
+    pytest.importorskip("pycolmap")
+    monkeypatch.setattr(sharp_frames, "FEWEST", FRAMES // 2)
+    room = render_room(FRAMES, 3, 320, 240)
+    for k, image in enumerate(room.images):
+        write_image(tmp_path / "video" / f"{k:03d}.png", image)
+    c, output = room.camera, tmp_path / "out"
+    code = main([
+        "run", str(tmp_path / "video"), "-o", str(output), "--offline", "--device", "cpu",
+        "--intrinsics", f"{c.fx},{c.fy},{c.cx},{c.cy}",
+    ])  # fmt: skip
+    said = capfd.readouterr().err
+    assert code == 0, said
+    summary = json.loads((output / "summary.json").read_text())
+    assert summary["frames"] == FRAMES
+    assert summary["keyframes"] == FRAMES // 2
+    assert summary["offline"]["placed_against_the_map"] == FRAMES // 2
+    assert summary["verdict"]["lost"] == 0
+    assert (output / "mesh.ply").is_file()
+    places = read_tum_trajectory(output / "trajectory.tum").T_wc[:, :3, 3].copy()
+    truth = room.T_wc[:, :3, 3].copy()
+    scale, R, t = (x.numpy() for x in umeyama(*map(torch.from_numpy, (places, truth))))
+    error = np.linalg.norm(scale * places @ R.T + t - truth, axis=1)
+    extent = np.linalg.norm(truth[:, None] - truth, axis=2).max()
+    assert error.max() < 0.02 * extent

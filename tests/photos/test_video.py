@@ -1,0 +1,106 @@
+"""Frames of a video that are placed without tracking."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from geogs.application.offline import filled
+from geogs.photos.features import find_features
+from geogs.photos.localise import Localiser, matches_to_points
+from geogs.photos.sharp_frames import sharpest_frames, sharpness, stretch_length
+from geogs.photos.video import place_frames
+from geogs.types import Frame
+from posed_layouts import render_room
+
+
+def test_of_each_stretch_the_sharpest_frame_is_taken():
+    import cv2
+
+    random = np.random.default_rng(0)
+    sharp = random.integers(0, 255, (40, 50, 3), dtype=np.uint8)
+    blurs = [2.0, 0.0, 1.0, 1.5, 3.0, 0.5, 2.5]
+    images = [cv2.GaussianBlur(sharp, (0, 0), b) if b else sharp for b in blurs]
+    frames = [Frame(k, k / 10, image) for k, image in enumerate(images)]
+    chosen = sharpest_frames(frames, 3)
+    assert [frame.index for frame in chosen.frames] == [1, 5, 6]
+    np.testing.assert_allclose(chosen.timestamps, np.arange(7) / 10)
+    assert sharpness(images[1]) > sharpness(images[5]) > sharpness(images[0])
+
+
+@pytest.mark.parametrize(
+    ("fps", "length", "every"),
+    [(30.0, None, 10), (30.0, 1000, 10), (30.0, 100, 2), (30.0, 10_000, 40)],
+)
+def test_about_three_frames_a_second_but_neither_few_nor_very_many(fps, length, every):
+    assert stretch_length(fps, length) == every
+
+
+def test_a_point_seen_twice_does_not_compete_with_itself():
+    random = np.random.default_rng(0)
+    looks = random.integers(0, 120, (20, 128), dtype=np.uint8)
+    positions = random.normal(size=(20, 3))
+    twice = np.concatenate([looks, looks ^ 1])
+    own, known = matches_to_points(looks[::-1].copy(), twice, np.tile(positions, (2, 1)))
+    assert len(own) == 20
+    np.testing.assert_allclose(np.tile(positions, (2, 1))[known], positions[::-1])
+    # Another point that looks the same does.
+    own, _ = matches_to_points(looks[:1] ^ 2, twice[[0, 20]], random.normal(size=(2, 3)))
+    assert not len(own)
+
+
+def test_frames_without_a_pose_lie_between_those_around():
+    T_wc = np.tile(np.eye(4), (5, 1, 1))
+    T_wc[1, :3, 3], T_wc[3, :3, 3] = (1, 0, 0), (3, 2, 0)
+    T_wc[3, :3, :3] = Rotation.from_euler("y", 30, degrees=True).as_matrix()
+    found = np.array([False, True, False, True, False])
+    made = np.linalg.inv(filled(np.linalg.inv(T_wc), found))
+    np.testing.assert_allclose(made[2, :3, 3], (2, 1, 0), atol=1e-12)
+    turned = Rotation.from_matrix(made[2, :3, :3]).magnitude()
+    assert turned == pytest.approx(np.radians(15))
+    np.testing.assert_allclose(made[0], T_wc[1], atol=1e-12)
+    np.testing.assert_allclose(made[4], T_wc[3], atol=1e-12)
+
+
+@pytest.mark.system
+def test_a_frame_is_placed_against_points(tmp_path):
+    """Points of the truth with the looks that two frames give them; a third frame is placed."""
+    pytest.importorskip("pycolmap")
+    room = render_room(3, 2, 320, 240)
+    from posed_layouts import raycaster_and_scene
+
+    raycaster, _ = raycaster_and_scene()
+    positions, looks = [], []
+    for k in (0, 2):
+        depth = raycaster.render(room.camera, room.T_wc[k]).depth
+        features = find_features(room.images[k])
+        u, v = features.keypoints[:, :2].T
+        z = depth[v.round().astype(int).clip(0, 239), u.round().astype(int).clip(0, 319)]
+        c = room.camera
+        local = np.stack([(u - c.cx) / c.fx * z, (v - c.cy) / c.fy * z, z], -1)
+        local = local[z > 0].astype(np.float64)
+        positions.append(local @ room.T_wc[k, :3, :3].T + room.T_wc[k, :3, 3])
+        looks.append(features.descriptors[z > 0])
+    localiser = Localiser(positions, looks, [0, 2], room.camera, 0)
+    T_cw = localiser.place(1, room.images[1])
+    assert T_cw is not None
+    off = np.linalg.inv(T_cw) @ room.T_cw[1]
+    assert np.linalg.norm(off[:3, 3]) < 0.01
+    assert Rotation.from_matrix(off[:3, :3]).magnitude() < np.radians(0.2)
+    assert localiser.place(1, np.zeros_like(room.images[1])) is None
+
+
+@pytest.mark.system
+def test_deviations_hold_what_the_truth_is_off(tmp_path):
+    pytest.importorskip("pycolmap")
+    room = render_room(9, 3, 320, 240)
+    frames = [Frame(k, k / 10, image) for k, image in enumerate(room.images)]
+    placed = place_frames(frames, room.camera, True, 0, lambda *_: None)
+    assert placed.numbers == tuple(range(9))
+    centres, truth = np.linalg.inv(placed.T_cw)[:, :3, 3], room.T_wc[:, :3, 3]
+    one, other = (np.linalg.norm(c - c[0], axis=1) for c in (centres, truth))
+    scale = other.sum() / one.sum()
+    off = np.abs(scale * one - other)
+    assert off.max() < 0.02 * other.max()
+    assert np.isfinite(placed.deviation).all()
+    assert 0 < np.median(placed.depth) < 0.1
+    assert scale * placed.deviation.max() < 0.05 * other.max()
