@@ -20,9 +20,8 @@ BORDER = 2
 TOLERANCE = 0.004
 """Radians by which a cell may differ from rotation before it loses half of its weight."""
 ROUNDS = 10
-MEDIAN, SMOOTH = 3, 0.6
-"""Cells that the median of parallax is taken over each way, and the standard deviation of the mean
-that it is smoothed by. More takes from the floor at the border, where parallax is largest."""
+SMOOTH = 1.0
+"""Cells, standard deviation of the mean that parallax is smoothed by."""
 AGREEING = 0.2
 """Share of the cells that have to agree with the rotation within twice the tolerance."""
 
@@ -150,7 +149,7 @@ def parallax(
     velocity = np.subtract(*ahead) / between[:, None]
     lines, columns = flow.shape
     field = np.where(known[:, None], velocity, 0).astype(np.float32).reshape(lines, columns, 2)
-    field = np.dstack([cv2.medianBlur(part.copy(), MEDIAN) for part in np.moveaxis(field, 2, 0)])
+    field = np.dstack([cv2.medianBlur(part.copy(), 5) for part in np.moveaxis(field, 2, 0)])
     ends = np.rint((flow.ends - STEP // 2) / STEP).astype(int)
     column, row = np.clip(ends, 0, [columns - 1, lines - 1]).T
     there = row * columns + column
