@@ -1,6 +1,7 @@
 """All settings of a reconstruction from known poses, and their presets."""
 
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Annotated
 
 from geogs.config.input import InputConfig
@@ -79,7 +80,7 @@ class ReconstructConfig(Settings):
     input: InputConfig = field(default_factory=InputConfig)
     search: SearchConfig = field(default_factory=SearchConfig)
     mapping: MappingConfig = field(default_factory=known_pose_mapping)
-    mesh: MeshConfig = field(default_factory=MeshConfig)
+    mesh: MeshConfig = field(default_factory=partial(MeshConfig, detail=0.5))
 
 
 def reconstruct_preset(name: Preset) -> ReconstructConfig:

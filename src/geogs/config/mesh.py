@@ -24,7 +24,7 @@ class MeshConfig(Settings, group="mesh"):
     triangle_budget: Annotated[int, Range(100, 1_000_000_000), Basic()] = 1_500_000
     """Triangles that a chosen voxel size aims at, to about 20 %, before those that the surface does
     not need are merged."""
-    detail: Annotated[float, Range(0, 16), Basic()] = 0.5
+    detail: Annotated[float, Range(0, 16), Basic()] = 1.0
     """How far triangles may be merged: 99 % of the surface moves by less, and on average by less
     than 0.15 of it; voxels, 0 merges none."""
     memory_limit: Annotated[float, Range(1e-3, 1e6)] = 2.0
