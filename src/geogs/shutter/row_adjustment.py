@@ -60,7 +60,7 @@ def readout_equation(
     nodes = _nodes(count)
     share, slope = interpolation(tracks, readout), interpolation_slope(tracks, readout)
     around = at.projected()[nodes]
-    error = tracks.plane - np.einsum("knj,kjna->kna", share, around)
+    error = tracks.plane - _blended(share, around)
     square = (error**2).sum(axis=-1)
     weight = tracks.seen / (1 + square / tolerance**2) ** 2 / tolerance**2
     root = np.sqrt(weight)
@@ -71,8 +71,7 @@ def readout_equation(
         part = (root * share[..., j])[..., None, None]
         np.multiply(part, by_own_pose[node], out=by_poses[..., j, :])
         by_point += part * by_own_point[node]
-    sheared = np.einsum("knj,kjna->kna", slope, around)
-    other = root[..., None, None] * np.stack([error, sheared], axis=-1)
+    other = root[..., None, None] * np.stack([error, _blended(slope, around)], axis=-1)
     joined = np.concatenate([by_poses.reshape(*tracks.seen.shape, 2, -1), other], axis=-1)
     # The middle pose stays where it is.
     free = np.arange(count) != tracks.middle
@@ -109,7 +108,7 @@ def _eliminated(
         columns = np.r_[6 * nodes[0] : 6 * nodes[-1] + 6, size - 2 : size]
         flat = own.reshape(2 * n, -1)
         H[columns[:, None], columns] += flat.T @ flat
-        told[..., columns] += np.einsum("nai,nac->nic", point, own)
+        told[..., columns] += np.swapaxes(point, 1, 2) @ own
     kept = np.append(np.repeat(free, 6), [True, True])
     told = told[..., kept]
     flat = told.reshape(3 * n, -1)
@@ -127,6 +126,16 @@ def _eliminated(
     curvature = float(H[-1, -1] - H[-1, :-2] @ for_readout)
     gradient = float(H[-2, -1] - H[-2, :-2] @ for_readout)
     return ReadoutEquation(curvature, gradient, weight, square, steps[0], by_readout)
+
+
+def _blended(
+    share: Float[np.ndarray, "k n j"], around: Float[np.ndarray, "k j n 2"]
+) -> Float[np.ndarray, "k n 2"]:
+    """Sums over the nodes."""
+    blended = share[..., 0, None] * around[:, 0]
+    for j in range(1, NODES):
+        blended += share[..., j, None] * around[:, j]
+    return blended
 
 
 def _nodes(count: int) -> Int[np.ndarray, "k j"]:
