@@ -67,12 +67,25 @@ def test_help_lists_every_command_and_is_quick():
     assert min(seconds) < 0.6
 
 
-@pytest.mark.parametrize("command", ["", "run", "reconstruct", "eval", "synth", "demo"])
+@pytest.mark.parametrize("command", ["", *cli.COMMANDS])
 def test_help_imports_nothing_heavy(command: str):
     heavy = ("torch", "numpy", "cv2", "numba", "rich", "av", "matplotlib", "scipy", "yaml")
     code = (
         f"import sys; from geogs.cli.main import main; main({[*command.split(), '--help']}); "
         f"print([m for m in {heavy} if m in sys.modules])"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert result.stdout.splitlines()[-1] == "[]"
+
+
+def test_a_run_imports_before_its_first_frame_only_what_that_needs():
+    """What keyframes, maps, meshes and reports need comes with the first of them."""
+    later = ("numba", "scipy", "skimage", "matplotlib", "PIL", "av", "onnxruntime", "yaml")
+    code = (
+        "import sys, geogs.application.run, geogs.application.terminal; "
+        "from geogs.geometry.camera import Camera; "
+        "geogs.application.run.Slam(Camera(300.0, 300.0, 160.0, 120.0, 320, 240)); "
+        f"print([m for m in {later} if m in sys.modules])"
     )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert result.stdout.splitlines()[-1] == "[]"

@@ -10,9 +10,6 @@ from collections.abc import Iterable
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
-from scipy.linalg import LinAlgError, solveh_banded
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import reverse_cuthill_mckee
 from torch import Tensor
 
 from geogs.bundle.linearise import Star
@@ -88,6 +85,8 @@ class SparseCameraSystem:
         right = self._gradient.reshape(-1).numpy().copy()
         if not (np.isfinite(band).all() and np.isfinite(right).all()):
             return xi.masked_fill(self._free[:, None], torch.nan)
+        from scipy.linalg import LinAlgError, solveh_banded
+
         try:
             solution = solveh_banded(
                 band, right, overwrite_ab=True, overwrite_b=True, lower=True, check_finite=False
@@ -108,6 +107,9 @@ def _ordered_slots(
     slot[free_pose] = torch.arange(n)
     if not n:
         return slot
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import reverse_cuthill_mckee
+
     # Edges that share a source are joined by the elimination: two steps in the graph of pairs.
     i, j = slot[source].numpy(), slot[target].numpy()
     both = (i >= 0) & (j >= 0)

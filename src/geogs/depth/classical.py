@@ -1,4 +1,7 @@
-"""Keyframe depths by matching and fusion without a network, on the CPU."""
+"""Keyframe depths by matching and fusion without a network, on the CPU.
+
+What is compiled is imported by the first keyframe that needs it, long after the first frame.
+"""
 
 from collections.abc import Sequence
 
@@ -9,12 +12,8 @@ from torch import Tensor
 
 from geogs.config import DepthConfig
 from geogs.depth.base import Limits, Progress, silent
-from geogs.depth.carve import vote
-from geogs.depth.estimate import estimate_depth
-from geogs.depth.fusion import check_depth
 from geogs.depth.view import DenseDepth, DepthView, PosedDepth
 from geogs.geometry.camera import Camera
-from geogs.splat.cpu.in_view import disks_in_view
 from geogs.threads import thread_map
 
 # Views whose depths may be in memory at once.
@@ -40,6 +39,7 @@ class CpuDepthEngine:
         limits: Sequence[Limits | None] | None = None,
     ) -> list[DenseDepth]:
         """As in the protocol."""
+        from geogs.depth.estimate import estimate_depth
 
         def one(task: tuple[DepthView, Sequence[DepthView], Limits | None]) -> DenseDepth:
             reference, others, searched = task
@@ -54,6 +54,7 @@ class CpuDepthEngine:
         self, depths: Sequence[PosedDepth], others: Sequence[Sequence[PosedDepth]]
     ) -> list[DenseDepth]:
         """As in the protocol."""
+        from geogs.depth.fusion import check_depth
 
         def one(pair: tuple[PosedDepth, Sequence[PosedDepth]]) -> DenseDepth:
             own, rest = pair
@@ -68,6 +69,9 @@ class CpuDepthEngine:
 
     def keep(self, points: Float[Tensor, "n 3"], depths: Sequence[PosedDepth]) -> Bool[Tensor, "n"]:
         """As in the protocol."""
+        from geogs.depth.carve import vote
+        from geogs.splat.cpu.in_view import disks_in_view
+
         if not 0 < len(depths) <= _FEW_VIEWS:
             # One view after the other, so that not all are in memory at once.
             views = ((d.T_cw, d.depth.arrays()) for d in depths)

@@ -15,8 +15,6 @@ from dataclasses import dataclass, field
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
-from scipy.sparse import coo_matrix
-from scipy.sparse.linalg import splu
 from torch import Tensor
 
 from geogs.geometry.lie import (
@@ -321,6 +319,9 @@ def _solve_blocks(
     parts: Sequence[BlockEquations], fixed: Bool[Tensor, "n"], damping: float
 ) -> Float[Tensor, "n 7"] | None:
     """Solve the damped sparse system over the free keyframes; None if it is singular."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.linalg import splu
+
     free = ~fixed
     n = int(free.sum())
     xi = torch.zeros(len(fixed), 7, dtype=torch.float64)

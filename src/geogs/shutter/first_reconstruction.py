@@ -77,10 +77,10 @@ def _located(
         return near
     for _ in range(ROUNDS):
         error = plane - near.projected()[0]
-        by_pose = near.derivatives()[0][0]
+        by_pose = near.derivatives_by_pose()[0].reshape(-1, 6)
         weight = seen / (1 + (error**2).sum(1) / tolerance**2) ** 2
-        normal = np.einsum("nai,n,naj->ij", by_pose, weight, by_pose)
-        right = np.einsum("nai,n,na->i", by_pose, weight, error)
+        weighted = np.repeat(weight, 2)[:, None] * by_pose
+        normal, right = weighted.T @ by_pose, weighted.T @ error.ravel()
         step = np.linalg.solve(normal + (1e-6 * np.trace(normal) + 1e-12) * np.eye(6), right)
         moved = near.stepped(step[None], np.zeros_like(near.points))
         near = Reconstruction(moved.R, moved.t, moved.points)

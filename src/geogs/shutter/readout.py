@@ -33,6 +33,8 @@ EARLY_TOLERANCES, TOLERANCES = (4.0, 2.0, 1.2), (1.2, 0.6, 0.6, 0.3, 0.3, 0.3, 0
 alone as if its shutter were global, and of all together with the readout."""
 LARGEST_STEP = 0.015
 """Seconds."""
+SETTLED = 5e-5
+"""Seconds of a step at the last tolerance after which there are no more."""
 MISFIT = 1.5
 """A clip whose error is so many times the median's is left out."""
 COMMON = 0.03
@@ -144,6 +146,8 @@ def _verdict(clips: list[_Adjusted], focal: float) -> FoundReadout:
             _Adjusted(c.tracks, part.stepped(c.reconstruction, step))
             for c, part in zip(clips, parts, strict=True)
         ]
+        if tolerance == TOLERANCES[-1] and abs(step) < SETTLED:
+            break
     if len(parts) < LEAST_CLIPS:
         return FoundReadout(clips=len(parts))
     error = float(np.hypot(_standard_error(parts), TREMOR * readout))

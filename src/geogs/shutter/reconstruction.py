@@ -40,7 +40,22 @@ class Reconstruction:
         self,
     ) -> tuple[Float[np.ndarray, "k n 2 6"], Float[np.ndarray, "k n 2 3"]]:
         """Those of :meth:`projected` by the steps of an image's own pose and of a point."""
-        at, turned, inverse = self.in_cameras(), self._turned(), self.points[:, 2]
+        by_pose, by_place = self._by_pose_and_place()
+        # Of rays (x, y, 1) and the inverse depth.
+        by = np.concatenate([self.R[..., :2], self.t[..., None]], axis=-1)
+        lines = by_place.reshape(len(by), -1, 3) @ by
+        return by_pose, lines.reshape(by_place.shape)
+
+    def derivatives_by_pose(self) -> Float[np.ndarray, "k n 2 6"]:
+        """The first of :meth:`derivatives` alone."""
+        return self._by_pose_and_place()[0]
+
+    def _by_pose_and_place(
+        self,
+    ) -> tuple[Float[np.ndarray, "k n 2 6"], Float[np.ndarray, "k n 2 3"]]:
+        """Derivatives of :meth:`projected` by the steps of a pose, and by :meth:`in_cameras`."""
+        turned, inverse = self._turned(), self.points[:, 2]
+        at = turned + inverse[:, None] * self.t[:, None]
         depth = _depth(at)
         by_place = np.zeros((*at.shape[:2], 2, 3))
         by_place[..., 0, 0] = by_place[..., 1, 1] = 1 / depth[..., 0]
@@ -48,9 +63,7 @@ class Reconstruction:
         # Of row g of the above, g . (phi x turned) = phi . (turned x g).
         by_turn = cross(turned[..., None, :], by_place)
         by_pose = np.concatenate([by_turn, by_place * inverse[:, None, None]], axis=-1)
-        by_ray = by_place @ self.R[:, None, :, :2]
-        by_inverse = by_place @ self.t[:, None, :, None]
-        return by_pose, np.concatenate([by_ray, by_inverse], axis=-1)
+        return by_pose, by_place
 
     def stepped(
         self, poses: Float[np.ndarray, "k 6"], points: Float[np.ndarray, "n 3"]
@@ -59,8 +72,9 @@ class Reconstruction:
 
         The median inverse depth is one again afterwards.
         """
-        turns = zip(self.R, poses[:, :3], strict=True)
-        R = np.stack([rotated(old.T, np.tile(by, (3, 1))).T for old, by in turns])
+        columns = np.swapaxes(self.R, 1, 2)
+        turned = rotated(columns.reshape(-1, 3), np.repeat(poses[:, :3], 3, axis=0))
+        R = np.swapaxes(turned.reshape(columns.shape), 1, 2)
         t, moved = self.t + poses[:, 3:], self.points + points
         scale = max(float(np.median(np.abs(moved[:, 2]))), 1e-9)
         return Reconstruction(R, t * scale, moved / [1, 1, scale])

@@ -9,7 +9,7 @@ one time instead would smooth its errors, the more the further, and prefer a rea
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from geogs.shutter.clip_tracks import ClipTracks
 from geogs.shutter.reconstruction import Reconstruction
@@ -56,74 +56,86 @@ def readout_equation(
         readout: seconds.
         tolerance: error at which a measurement counts for a quarter, share of the focal length.
     """
-    count, n = tracks.seen.shape
+    count = len(tracks.times)
     nodes = _nodes(count)
     share, slope = interpolation(tracks, readout), interpolation_slope(tracks, readout)
     around = at.projected()[nodes]
-    error = tracks.plane - np.einsum("knj,kjna->kna", share, around)
+    error = tracks.plane - _blended(share, around)
     square = (error**2).sum(axis=-1)
     weight = tracks.seen / (1 + square / tolerance**2) ** 2 / tolerance**2
     root = np.sqrt(weight)
     by_own_pose, by_own_point = at.derivatives()
-    by_pose, by_point = np.zeros((n, count, 2, count, 6)), np.zeros((n, count, 2, 3))
-    images = np.arange(count)
+    by_poses = np.empty((*tracks.seen.shape, 2, NODES, 6))
+    by_point = np.zeros_like(by_own_point)
     for j, node in enumerate(nodes.T):
         part = (root * share[..., j])[..., None, None]
-        by_pose[:, images, :, node, :] = part * by_own_pose[node]
-        by_point += np.swapaxes(part * by_own_point[node], 0, 1)
+        np.multiply(part, by_own_pose[node], out=by_poses[..., j, :])
+        by_point += part * by_own_point[node]
+    other = root[..., None, None] * np.stack([error, _blended(slope, around)], axis=-1)
+    joined = np.concatenate([by_poses.reshape(*tracks.seen.shape, 2, -1), other], axis=-1)
     # The middle pose stays where it is.
-    free = images != tracks.middle
-    other = np.stack([error, np.einsum("knj,kjna->kna", slope, around)], axis=-1)
-    other = np.swapaxes(root[..., None, None] * other, 0, 1).reshape(n, 2 * count, 2)
-    return _eliminated(
-        by_pose[:, :, :, free].reshape(n, 2 * count, -1),
-        by_point.reshape(n, 2 * count, 3),
-        other,
-        free,
-        float(weight.sum()),
-        float((weight * square).sum()),
-    )
+    free = np.arange(count) != tracks.middle
+    return _eliminated(joined, by_point, free, float(weight.sum()), float((weight * square).sum()))
 
 
 def _eliminated(
-    by_pose: Float[np.ndarray, "n m p"],
-    by_point: Float[np.ndarray, "n m 3"],
-    other: Float[np.ndarray, "n m 2"],
-    free: np.ndarray,
+    joined: Float[np.ndarray, "k n 2 w"],
+    by_point: Float[np.ndarray, "k n 2 3"],
+    free: Bool[np.ndarray, "k"],
     weight: float,
     square: float,
 ) -> ReadoutEquation:
     """The equation that is left without points, which each see only their own, and poses.
 
     Args:
-        by_pose: derivatives of the predictions by the free poses.
+        joined: derivatives of the predictions by the poses of an image's nodes; then errors, and
+            derivatives of the predictions by the readout.
         by_point: by the point.
-        other: errors, and derivatives of the predictions by the readout.
         free: of all images, whether their pose is free.
         weight: of the result.
         square: of the result.
     """
-    normal = np.swapaxes(by_point, 1, 2) @ by_point
+    count, n = joined.shape[:2]
+    each = np.swapaxes(by_point, 0, 1).reshape(n, -1, 3)
+    normal = np.swapaxes(each, 1, 2) @ each
     trace = np.trace(normal, axis1=1, axis2=2)[:, None, None]
     normal += (DAMPING / 3 * trace + 1e-9) * np.eye(3)
     root = np.linalg.cholesky(np.linalg.inv(normal))
-    joined = np.concatenate([by_pose, other], axis=2)
-    told = np.swapaxes(by_point @ root, 1, 2) @ joined
-    size = joined.shape[2]
-    H = joined.reshape(-1, size).T @ joined.reshape(-1, size)
-    H -= told.reshape(-1, size).T @ told.reshape(-1, size)
+    # What an image sees concerns the poses around it alone, so each adds to few columns.
+    size = 6 * count + 2
+    H, told = np.zeros((size, size)), np.zeros((n, 3, size))
+    for own, point, nodes in zip(joined, by_point @ root, _nodes(count), strict=True):
+        columns = np.r_[6 * nodes[0] : 6 * nodes[-1] + 6, size - 2 : size]
+        flat = own.reshape(2 * n, -1)
+        H[columns[:, None], columns] += flat.T @ flat
+        told[..., columns] += np.swapaxes(point, 1, 2) @ own
+    kept = np.append(np.repeat(free, 6), [True, True])
+    told = told[..., kept]
+    flat = told.reshape(3 * n, -1)
+    H = H[np.ix_(kept, kept)] - flat.T @ flat
     poses = H[:-2, :-2] + np.diag(DAMPING * H.diagonal()[:-2] + 1e-7 * H.diagonal()[:-2].mean())
     for_error, for_readout = np.linalg.solve(poses, H[:-2, -2:]).T
     steps = []
     for step, column in ((for_error, -2), (for_readout, -1)):
-        points = np.einsum("nij,nj->ni", root, told[..., column] - told[..., :-2] @ step)
-        all_poses = np.zeros((len(free), 6))
+        left = told[..., column] - told[..., :-2] @ step
+        points = (root @ left[..., None])[..., 0]
+        all_poses = np.zeros((count, 6))
         all_poses[free] = step.reshape(-1, 6)
         steps.append((all_poses, points))
     by_readout = (-steps[1][0], -steps[1][1])
     curvature = float(H[-1, -1] - H[-1, :-2] @ for_readout)
     gradient = float(H[-2, -1] - H[-2, :-2] @ for_readout)
     return ReadoutEquation(curvature, gradient, weight, square, steps[0], by_readout)
+
+
+def _blended(
+    share: Float[np.ndarray, "k n j"], around: Float[np.ndarray, "k j n 2"]
+) -> Float[np.ndarray, "k n 2"]:
+    """Sums over the nodes."""
+    blended = share[..., 0, None] * around[:, 0]
+    for j in range(1, NODES):
+        blended += share[..., j, None] * around[:, j]
+    return blended
 
 
 def _nodes(count: int) -> Int[np.ndarray, "k j"]:
@@ -134,13 +146,15 @@ def _nodes(count: int) -> Int[np.ndarray, "k j"]:
 
 def interpolation(tracks: ClipTracks, readout: float) -> Float[np.ndarray, "k n j"]:
     """Shares that the nodes have in the place of a point at the time of its row (Lagrange)."""
-    when = (tracks.times[:, None] + readout * tracks.line_times)[..., None]
-    at = tracks.times[_nodes(len(tracks.times))][:, None]
-    shares = []
+    when = tracks.times[:, None] + readout * tracks.line_times
+    at = tracks.times[_nodes(len(tracks.times))].T[..., None]
+    ahead = when - at
+    shares = np.ones((*when.shape, NODES))
     for j in range(NODES):
-        others = np.delete(at, j, axis=2)
-        shares.append(((when - others) / (at[..., j, None] - others)).prod(axis=2))
-    return np.stack(shares, axis=-1)
+        for other in range(NODES):
+            if other != j:
+                shares[..., j] *= ahead[other] / (at[j] - at[other])
+    return shares
 
 
 def interpolation_slope(tracks: ClipTracks, readout: float) -> Float[np.ndarray, "k n j"]:

@@ -46,26 +46,27 @@ def _followed(
     """Places of the corners of the first image of a way in all others."""
     window, start = (WINDOW, WINDOW), cv2.OPTFLOW_USE_INITIAL_FLOW
     first, here, motion = images[way[0]], corners, np.zeros_like(corners)
-    lost = np.zeros(len(corners), bool)
+    left = np.arange(len(corners))  # those that are not lost yet
     for before, after in itertools.pairwise(way):
-        if len(corners) == 0:
-            yield np.zeros((0, 2))
-            continue
-        there, _, _ = cv2.calcOpticalFlowPyrLK(
-            images[before], images[after], here, here + motion, None, None, window, LEVELS, _STEPS,
-            start,
-        )  # fmt: skip
-        there, found, _ = cv2.calcOpticalFlowPyrLK(
-            first, images[after], corners, there, None, None, window, 0, _STEPS, start
-        )
-        back, returned, _ = cv2.calcOpticalFlowPyrLK(
-            images[after], first, there, corners.copy(), None, None, window, 0, _STEPS, start
-        )
-        missed = np.linalg.norm((back - corners)[:, 0], axis=1) > RETURN
-        lost |= (found[:, 0] == 0) | (returned[:, 0] == 0) | missed
-        lost |= ~_inside(there[:, 0], images[after])
-        motion, here = there - here, there
-        yield np.where(lost[:, None], np.nan, there[:, 0].astype(np.float64))
+        places = np.full((len(corners), 2), np.nan)
+        if len(left):
+            from_first = corners[left]
+            there, _, _ = cv2.calcOpticalFlowPyrLK(
+                images[before], images[after], here, here + motion, None, None, window, LEVELS,
+                _STEPS, start,
+            )  # fmt: skip
+            there, found, _ = cv2.calcOpticalFlowPyrLK(
+                first, images[after], from_first, there, None, None, window, 0, _STEPS, start
+            )
+            back, returned, _ = cv2.calcOpticalFlowPyrLK(
+                images[after], first, there, from_first.copy(), None, None, window, 0, _STEPS, start
+            )
+            missed = np.linalg.norm((back - from_first)[:, 0], axis=1) > RETURN
+            kept = (found[:, 0] != 0) & (returned[:, 0] != 0) & ~missed
+            kept &= _inside(there[:, 0], images[after])
+            left, motion, here = left[kept], (there - here)[kept], there[kept]
+            places[left] = here[:, 0]
+        yield places
 
 
 def _inside(

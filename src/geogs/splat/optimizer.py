@@ -10,7 +10,6 @@ from torch import Tensor
 
 from geogs.errors import InputError
 from geogs.geometry.lie import matrix_to_quaternion, sim3_scale
-from geogs.splat.cpu.adam import adam_rows
 from geogs.splat.map import DiskParameters, GaussianMap
 from geogs.splat.rows import GrowingRows
 
@@ -133,7 +132,11 @@ class MapOptimizer:
         groups = zip(
             self.disks.parameters, self.first, self.second, self.learning_rates, strict=True
         )
-        update = adam_rows if self._is_fused() else adam_reference
+        update = adam_reference
+        if self._is_fused():
+            from geogs.splat.cpu.adam import adam_rows
+
+            update = adam_rows
         for p, m, v, rate in groups:
             if p.grad is not None:
                 update(

@@ -8,7 +8,6 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from geogs.geometry.camera import Camera
-from geogs.splat.cpu.rasterize import rasterize_backward, rasterize_forward
 from geogs.splat.map import DiskParameters, GaussianMap
 from geogs.splat.reference import render_reference
 from geogs.threads import worker_count
@@ -132,6 +131,8 @@ class _Rasterize(torch.autograd.Function):
         near: float,
         threads: int,
     ) -> tuple[Tensor, ...]:
+        from geogs.splat.cpu.rasterize import rasterize_forward
+
         disks = (position, quaternion, log_scale, opacity_logit)
         x, q, scale, logit = (p.detach().contiguous().numpy() for p in disks)
         arrays = x, q, scale, logit
@@ -150,6 +151,8 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
+        from geogs.splat.cpu.rasterize import rasterize_backward
+
         *_, T_cw = ctx.saved_tensors
         depth, normal, alpha, distortion = (
             g.to(torch.float32).contiguous().numpy() for g in gradients[:4]

@@ -7,8 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Float64
-from scipy.sparse import coo_matrix
-from scipy.sparse.linalg import spsolve
 from torch import Tensor
 
 from geogs.geometry.lie import so3_exp, so3_log
@@ -90,6 +88,9 @@ def _spread(
     With ``R_b R_a^T`` for the turn R of b against a, the error is ``log(R (R_b R_a^T)^T)``; to
     first order it falls by ``phi_b - (R_b R_a^T) phi_a``.
     """
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.linalg import spsolve
+
     column = {n: 3 * k for k, n in enumerate(free)}
     first = torch.stack([found[a] for a, _, _, _ in links])
     second = torch.stack([found[b] for _, b, _, _ in links])

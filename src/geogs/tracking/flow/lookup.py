@@ -17,7 +17,6 @@ from torch.nn import functional
 
 from geogs.gpu.kernels import kernels_for
 from geogs.threads import thread_map
-from geogs.tracking.flow.lookup_kernels import lookup_windows
 
 SOURCE = Path(__file__).parents[1] / "cuda" / "flow_lookup.cu"
 RADIUS = 3
@@ -111,6 +110,8 @@ def correlation_windows_reference(
 def _compiled_windows(
     source: Tensor, pyramid: DescriptorPyramid, edges: Edges, centres: Tensor
 ) -> Tensor:
+    from geogs.tracking.flow.lookup_kernels import lookup_windows
+
     mine, theirs = (x.float().numpy() for x in (source, pyramid.descriptors))
     points, table, scales = centres.float().contiguous().numpy(), pyramid.table, pyramid.scales
     out = np.empty((*points.shape[:2], len(table), WINDOW), np.float32)
