@@ -24,6 +24,8 @@ CLIPS = 12
 """That are worth giving, from all over the video."""
 ENOUGH_CLIPS, ENOUGH = (5, 7, 9), 0.002
 """No more clips are looked at where so many leave a standard error of so many seconds."""
+SURE, SMALL = 3.0, 0.01
+"""Nor where the readout is less than so many seconds by so many standard errors."""
 LONGEST_INTERVAL = 0.12
 """Seconds between two images; over more, nothing says how points move from one to the next."""
 FIRST_TOLERANCE = 1.2
@@ -102,7 +104,7 @@ def find_readout(
             adjusted.append(start)
         if number in ENOUGH_CLIPS:
             found = _verdict(adjusted, focal)
-            if found.error <= ENOUGH:
+            if found.error <= ENOUGH or found.best + SURE * found.error < SMALL:
                 break
     report(1.0)
     return found if found.clips == len(adjusted) else _verdict(adjusted, focal)
