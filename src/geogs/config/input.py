@@ -17,6 +17,8 @@ class InputConfig(Settings, group="input"):
     readout: Annotated[float | Literal["auto"], Range(-0.1, 0.1), Only("run")] = "auto"
     """Seconds a rolling shutter takes from the first to the last row as the sensor reads them, such
     as 0.0276; 0 for a global shutter, auto finds it in the video."""
+    topic: Annotated[str, Only("run"), Basic("--topic")] = "auto"
+    """Topic of the images in a bag of ROS; auto takes the one that most likely is the camera."""
     start: Annotated[int, Range(0), Basic("--start")] = 0
     """First frame of the source, from 0."""
     stop: Annotated[int | None, Range(above="start"), Basic("--stop")] = None

@@ -146,7 +146,7 @@ class Source:
 
     @property
     def kind(self) -> str:
-        """The format: video, images, replica, tum or 7scenes."""
+        """The format: video, images, bag, replica, tum or 7scenes."""
         return self._reader.kind
 
     @property
