@@ -237,7 +237,7 @@ def test_blender_field_of_view_and_alpha(room, tmp_path):
     [
         ({"frames": [{"file_path": "a.png"}]}, "transform_matrix"),
         ({"frames": []}, "lists no images"),
-        ({"camera_model": "OPENCV_FISHEYE"}, "OPENCV_FISHEYE"),
+        ({"camera_model": "EQUIRECTANGULAR"}, "EQUIRECTANGULAR"),
         ({"fl_x": float("nan")}, "NaN"),
         ({"applied_transform": [[0, 0, 0, 0]] * 3}, "cannot be understood"),
     ],

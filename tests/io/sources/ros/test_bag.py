@@ -111,6 +111,22 @@ def test_rectified_images_have_the_projection_matrix_and_no_distortion(tmp_path)
     assert not source.calibration.is_distorted
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_lens_of_a_fisheye(tmp_path, kind):
+    k = (-0.02, 0.004, -0.003, 0.0007)
+    with BagWriter(tmp_path, kind) as bag:
+        bag.camera_info("/camera_info", 0, distortion=k, model="equidistant")
+        bag.image("/image", 0, gradient_image(0))
+    calibration = geogs.open_source(bag.path, InputConfig(field_of_view=50.0)).calibration
+    assert (calibration.lens, calibration.distortion) == ("fisheye", k)
+    (tmp_path / "other").mkdir()
+    with BagWriter(tmp_path / "other", kind) as bag:
+        bag.camera_info("/camera_info", 0, distortion=k, model="omni")
+        bag.image("/image", 0, gradient_image(0))
+    with pytest.raises(InputError, match="not supported; undistort"):
+        geogs.open_source(bag.path)
+
+
 def test_a_region_of_interest_and_binning(tmp_path):
     """K is that of the whole sensor, 128 x 96; the images are its lower right, by two pixels."""
     with BagWriter(tmp_path, "sqlite") as bag:

@@ -7,6 +7,7 @@ from geogs.io.sources.calibration import Calibration
 
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 """Name of the type, that of ROS 1 too as ``rosbags`` gives it."""
+_FISHEYES = ("equidistant", "fisheye")
 _POLYNOMIALS = ("plumb_bob", "rational_polynomial", "")
 
 
@@ -27,8 +28,11 @@ def calibration_of(message: Any, topic: str, is_rectified: bool) -> Calibration 
     if fx == 0 or fy == 0:
         return None
     model, distortion = str(message.distortion_model).lower(), tuple(D)
+    is_fisheye = model in _FISHEYES and not is_rectified
     if is_rectified or not any(distortion):
         distortion = ()
+    elif is_fisheye:
+        pass
     elif model not in _POLYNOMIALS:
         raise InputError(
             f"The lens of {topic} is of a model that is not supported; undistort the images first."
@@ -46,6 +50,7 @@ def calibration_of(message: Any, topic: str, is_rectified: bool) -> Calibration 
         width=int(roi.width if is_part else message.width) or None,
         height=int(roi.height if is_part else message.height) or None,
         origin=f"{topic} of the bag",
+        lens="fisheye" if is_fisheye else "polynomial",
     )  # fmt: skip
 
 
