@@ -103,13 +103,13 @@ def lens_maps(
     target: Camera, source: Camera, distortion: Sequence[float], lens: LensModel
 ) -> tuple[np.ndarray, np.ndarray]:
     """Column and row in the image of a lens of what each pixel of a pinhole sees, float32."""
-    arguments = (None, _matrix(target), (target.width, target.height), cv2.CV_32FC1)
-    coefficients = np.array(distortion or (0.0,) * 4, dtype=np.float64)
+    K, target_K, size = _matrix(source), _matrix(target), (target.width, target.height)
+    D = np.array(distortion or (0.0,) * 4, dtype=np.float64)
     if lens == "fisheye":
-        u, v = cv2.fisheye.initUndistortRectifyMap(_matrix(source), coefficients, *arguments)
+        maps = cv2.fisheye.initUndistortRectifyMap(K, D, np.eye(3), target_K, size, cv2.CV_32FC1)
     else:
-        u, v = cv2.initUndistortRectifyMap(_matrix(source), coefficients, *arguments)
-    return u, v
+        maps = cv2.initUndistortRectifyMap(K, D, None, target_K, size, cv2.CV_32FC1)
+    return maps[0], maps[1]
 
 
 @dataclass(frozen=True)
