@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from geogs.geometry.camera import Camera
-from geogs.geometry.distortion import undistorted_rays
+from geogs.geometry.distortion import LensModel, undistorted_rays
 from geogs.geometry.lie import so3_exp
 from geogs.types import Frame
 from tracking_scenes import CAMERA, render, seen
@@ -46,12 +46,13 @@ def rolling_image(
     readout: float = READOUT,
     camera: Camera = CAMERA,
     distortion: tuple[float, ...] = (),
+    lens: LensModel = "polynomial",
 ) -> np.ndarray:
     """What a sensor reads whose middle row is seen at ``time``."""
     lines = np.arange(camera.height) / (camera.height - 1) - 0.5
     poses = np.stack([path(time + s * readout) for s in lines])
     v, u = np.mgrid[: camera.height, : camera.width].astype(float)
-    rays = undistorted_rays(np.stack([u.ravel(), v.ravel()], 1), camera, distortion)
+    rays = undistorted_rays(np.stack([u.ravel(), v.ravel()], 1), camera, distortion, lens)
     rays = np.concatenate([rays, np.ones((len(rays), 1))], 1).reshape(*u.shape, 3)
     directions = np.einsum("hij,hwj->hwi", poses[:, :3, :3], rays)
     return seen(poses[:, None, :3, 3], directions)[0]

@@ -1,10 +1,13 @@
 """OpenCV's lens: against its formula written out, and there and back."""
 
+import math
+
+import cv2
 import numpy as np
 import pytest
 
 from geogs.geometry.camera import Camera
-from geogs.geometry.distortion import distorted_pixels, undistorted_rays
+from geogs.geometry.distortion import FISHEYE_LIMIT, distorted_pixels, undistorted_rays
 
 CAMERA = Camera(500.0, 490.0, 321.0, 237.0, 640, 480)
 RAYS = np.array([[0.0, 0.0], [0.3, 0.2], [-0.35, 0.1], [0.1, -0.3], [0.55, 0.4]])
@@ -26,3 +29,40 @@ def test_there_and_back(distortion):
     distortion = tuple(map(float, distortion))
     pixels = distorted_pixels(RAYS, CAMERA, distortion)
     np.testing.assert_allclose(undistorted_rays(pixels, CAMERA, distortion), RAYS, atol=1e-6)
+
+
+FISHEYES = [(), (-0.02, 0.004, -0.003, 0.0007), (0.1, -0.05, 0.02, -0.004)]
+
+
+@pytest.mark.parametrize("k", FISHEYES)
+def test_pixels_of_a_fisheye_follow_the_formula(k):
+    rays = np.concatenate([RAYS, [[4.0, -3.0], [0.0, 1.2], [1e-14, 0.0]]])
+    pixels = distorted_pixels(rays, CAMERA, k, "fisheye")
+    for (x, y), pixel in zip(rays, pixels, strict=True):
+        angle = math.atan(math.hypot(x, y))
+        radius = angle + sum(c * angle ** (2 * n + 3) for n, c in enumerate(k))
+        way = math.atan2(y, x)
+        expected = [500 * radius * math.cos(way) + 321, 490 * radius * math.sin(way) + 237]
+        np.testing.assert_allclose(pixel, expected, atol=1e-9)
+
+
+@pytest.mark.parametrize("k", FISHEYES)
+def test_pixels_of_a_fisheye_are_those_of_opencv(k):
+    points = np.concatenate([RAYS, np.ones((len(RAYS), 1))], axis=1)[:, None]
+    K, D = CAMERA.matrix().numpy(), np.array(k or (0.0,) * 4)
+    expected, _ = cv2.fisheye.projectPoints(points, np.zeros(3), np.zeros(3), K, D)
+    found = distorted_pixels(RAYS, CAMERA, k, "fisheye")
+    np.testing.assert_allclose(found, expected[:, 0], atol=1e-9)
+
+
+@pytest.mark.parametrize("k", FISHEYES)
+def test_there_and_back_by_a_fisheye(k):
+    rays = np.concatenate([RAYS, [[1.5, -1.0], [0.0, 2.0]]])
+    pixels = distorted_pixels(rays, CAMERA, k, "fisheye")
+    np.testing.assert_allclose(undistorted_rays(pixels, CAMERA, k, "fisheye"), rays, atol=1e-9)
+
+
+def test_what_a_fisheye_sees_behind_itself_is_given_at_the_limit():
+    pixels = np.array([[321 + 500 * 1.8, 237.0], [321.0, 237 - 490 * 2.5]])
+    angles = np.arctan(np.linalg.norm(undistorted_rays(pixels, CAMERA, (), "fisheye"), axis=1))
+    np.testing.assert_allclose(angles, FISHEYE_LIMIT, atol=1e-9)

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class RunOptions(LiveSettings, Verbosity, RunSettings):
-    """Reconstruct a video, a folder of images, or a Replica, TUM RGB-D or 7-Scenes sequence.
+    """Reconstruct a video, images, a bag of ROS, or a Replica, TUM RGB-D or 7-Scenes sequence.
 
     Every default works: ``geogs run video.mp4``. Intrinsics: ``--intrinsics fx,fy,cx,cy``.
     Several videos of one place: ``geogs run a.mp4 b.mp4``.

@@ -11,12 +11,20 @@ class InputConfig(Settings, group="input"):
     """How the source is read."""
 
     intrinsics: Annotated[str, Basic("--intrinsics")] = "auto"
-    """auto, a file, or fx,fy,cx,cy[,k1,k2,p1,p2[,k3]] in pixels of the source image."""
+    """auto, a file, fx,fy,cx,cy[,k1,k2,p1,p2[,k3]] in pixels of the source image, or
+    fisheye,fx,fy,cx,cy[,k1,k2,k3,k4] (OpenCV's, Kannala and Brandt's)."""
     long_edge: Annotated[int, Range(32, 16384, or_zero=True), Basic("--long-edge")] = 512
     """Longer side of the working image in pixels; smaller sources are not enlarged, 0 keeps all."""
+    field_of_view: Annotated[float | Literal["auto"], Range(5, 150), Basic("--field-of-view")] = (
+        "auto"
+    )
+    """Degrees along the longer side of the working image, a pinhole's; auto keeps all that fits
+    without a border, and of a fisheye at most 90."""
     readout: Annotated[float | Literal["auto"], Range(-0.1, 0.1), Only("run")] = "auto"
     """Seconds a rolling shutter takes from the first to the last row as the sensor reads them, such
     as 0.0276; 0 for a global shutter, auto finds it in the video."""
+    topic: Annotated[str, Only("run"), Basic("--topic")] = "auto"
+    """Topic of the images in a bag of ROS; auto takes the one that most likely is the camera."""
     start: Annotated[int, Range(0), Basic("--start")] = 0
     """First frame of the source, from 0."""
     stop: Annotated[int | None, Range(above="start"), Basic("--stop")] = None

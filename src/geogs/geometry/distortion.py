@@ -1,6 +1,13 @@
-"""OpenCV's lens distortion: from rays to the pixels of an image as it came, and back."""
+"""Lens distortion as OpenCV has it: from rays to the pixels of an image as it came, and back.
+
+A *polynomial* lens bends the plane z = 1 by k1, k2, p1, p2(, k3(, k4, k5, k6)). A *fisheye*
+(Kannala and Brandt, "A generic camera model and calibration method for conventional, wide-angle,
+and fish-eye lenses", PAMI 2006) puts a ray at the angle a from its axis at the radius
+a (1 + k1 a^2 + k2 a^4 + k3 a^6 + k4 a^8); without coefficients the radius is the angle.
+"""
 
 from collections.abc import Sequence
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -8,18 +15,30 @@ from jaxtyping import Float
 
 from geogs.geometry.camera import Camera
 
+LensModel = Literal["polynomial", "fisheye"]
+FISHEYE_LIMIT = np.radians(88.0)
+"""Angle from the axis beyond which the plane z = 1 is no use; rays that are farther end there."""
 _POLISHING = 8
 """Corrections after OpenCV's own few, which leave errors that an image can show."""
+_HALVINGS = 52
 
 
 def distorted_pixels(
-    rays: Float[np.ndarray, "n 2"], camera: Camera, distortion: Sequence[float]
+    rays: Float[np.ndarray, "n 2"],
+    camera: Camera,
+    distortion: Sequence[float],
+    lens: LensModel = "polynomial",
 ) -> Float[np.ndarray, "n 2"]:
     """Where rays x/z, y/z are seen in the image of a lens.
 
-    ``camera`` is its pinhole part; ``distortion`` holds OpenCV's coefficients
-    k1, k2, p1, p2(, k3(, k4, k5, k6)), none of them for a pinhole.
+    ``camera`` is its pinhole part; ``distortion`` holds OpenCV's coefficients of the lens, none of
+    them for a pinhole or a fisheye whose radius is the angle.
     """
+    if lens == "fisheye":
+        radius = np.linalg.norm(rays, axis=1, keepdims=True)
+        bent = _bent(np.arctan(radius), distortion)
+        rays = rays * np.divide(bent, radius, out=np.ones_like(bent), where=radius > 1e-12)
+        return rays * (camera.fx, camera.fy) + (camera.cx, camera.cy)
     if not any(distortion):
         return rays * (camera.fx, camera.fy) + (camera.cx, camera.cy)
     points = np.concatenate([rays, np.ones((len(rays), 1))], axis=1)
@@ -29,17 +48,52 @@ def distorted_pixels(
 
 
 def undistorted_rays(
-    pixels: Float[np.ndarray, "n 2"], camera: Camera, distortion: Sequence[float]
+    pixels: Float[np.ndarray, "n 2"],
+    camera: Camera,
+    distortion: Sequence[float],
+    lens: LensModel = "polynomial",
 ) -> Float[np.ndarray, "n 2"]:
-    """The rays x/z, y/z that pixels of a lens's image see: the inverse of the above."""
+    """The rays x/z, y/z that pixels of a lens's image see: the inverse of the above.
+
+    Those of a fisheye that look farther than ``FISHEYE_LIMIT`` from its axis are given there.
+    """
+    plane = (pixels - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
+    if lens == "fisheye":
+        bent = np.linalg.norm(plane, axis=1, keepdims=True)
+        radius = np.tan(_straight(bent, distortion))
+        return plane * np.divide(radius, bent, out=np.ones_like(bent), where=bent > 1e-12)
     if not any(distortion):
-        return (pixels - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
+        return plane
     coefficients = np.array(distortion, dtype=np.float64)
     points = np.ascontiguousarray(pixels, dtype=np.float64)[:, None]
     rays = cv2.undistortPoints(points, _matrix(camera), coefficients)[:, 0]
     for _ in range(_POLISHING):
         rays = rays + (pixels - distorted_pixels(rays, camera, distortion)) / (camera.fx, camera.fy)
     return rays
+
+
+def _bent(angle: np.ndarray, coefficients: Sequence[float]) -> np.ndarray:
+    """The radius at which a fisheye shows an angle, of focal length 1."""
+    square, factor = angle**2, np.zeros_like(angle)
+    for k in reversed(coefficients):
+        factor = square * (k + factor)
+    return angle * (1 + factor)
+
+
+def _straight(radius: np.ndarray, coefficients: Sequence[float]) -> np.ndarray:
+    """The angle that a fisheye shows at a radius, up to the limit or where the radius turns back.
+
+    By halving, which is safe whatever the coefficients are.
+    """
+    angles = np.linspace(0.0, FISHEYE_LIMIT, 1000)
+    falls = np.flatnonzero(np.diff(_bent(angles, coefficients)) <= 0)
+    high = np.full_like(radius, angles[falls[0]] if len(falls) else FISHEYE_LIMIT)
+    low = np.zeros_like(radius)
+    for _ in range(_HALVINGS):
+        middle = (low + high) / 2
+        is_below = _bent(middle, coefficients) < radius
+        low, high = np.where(is_below, middle, low), np.where(is_below, high, middle)
+    return (low + high) / 2
 
 
 def _matrix(camera: Camera) -> Float[np.ndarray, "3 3"]:

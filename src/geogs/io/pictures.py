@@ -59,6 +59,11 @@ def decoded(path: Path, flags: int) -> Decoded:
         data = np.frombuffer(read_bytes(path, LARGEST_PICTURE), np.uint8)
     except InputError:
         return Decoded(None)
+    return decoded_bytes(data, flags)
+
+
+def decoded_bytes(data: np.ndarray, flags: int) -> Decoded:
+    """The same for what such a file holds, as bytes."""
     if not len(data):
         return Decoded(None)
     if _promises_too_much(data):

@@ -116,6 +116,11 @@ def _camera(colmap: Any, number: int, shared: SharedCamera) -> Any:
         camera.has_prior_focal_length = not c.is_guess
         return camera
     camera = colmap.Camera(camera_id=number, width=c.width, height=c.height)
+    if c.lens == "fisheye":
+        camera.model = colmap.CameraModelId.OPENCV_FISHEYE
+        camera.params = [c.fx, c.fy, c.cx + 0.5, c.cy + 0.5, *(c.distortion or (0.0,) * 4)]
+        camera.has_prior_focal_length = True
+        return camera
     distortion = [*c.distortion, *[0.0] * 8][:8]
     is_short = not any(distortion[4:])
     models = colmap.CameraModelId

@@ -1,12 +1,12 @@
 """A camera that reads its image line by line: its lens, and when each pixel is seen."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float
 
 from geogs.geometry.camera import Camera
-from geogs.geometry.distortion import distorted_pixels, undistorted_rays
+from geogs.geometry.distortion import LensModel, distorted_pixels, undistorted_rays
 
 
 @dataclass(frozen=True)
@@ -17,6 +17,8 @@ class RollingCamera:
     """The pinhole part."""
     distortion: tuple[float, ...] = ()
     """OpenCV's coefficients; empty for a pinhole."""
+    lens: LensModel = field(default="polynomial", kw_only=True)
+    """What they are the coefficients of."""
     quarter_turns: int = 0
     """Clockwise, from the images as the sensor read them to the upright ones."""
     lines: int | None = None
@@ -38,10 +40,11 @@ class RollingCamera:
 
     def rays(self, pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:
         """Unit vectors towards what pixels see."""
-        plane = undistorted_rays(pixels, self.camera, self.distortion)
+        plane = undistorted_rays(pixels, self.camera, self.distortion, self.lens)
         rays = np.concatenate([plane, np.ones((len(plane), 1))], axis=1)
         return rays / np.linalg.norm(rays, axis=1, keepdims=True)
 
     def pixels(self, rays: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
         """Where vectors of any length are seen; they point forward."""
-        return distorted_pixels(rays[:, :2] / rays[:, 2:], self.camera, self.distortion)
+        plane = rays[:, :2] / rays[:, 2:]
+        return distorted_pixels(plane, self.camera, self.distortion, self.lens)

@@ -130,7 +130,7 @@ class Source:
         """The camera of the images as they came, upright, with its distortion."""
         self.shutter = shutter or shutter_of(config.readout)
         """By which rows are rectified."""
-        self._rectifier = Rectifier(self.calibration, config.long_edge)
+        self._rectifier = Rectifier(self.calibration, config.long_edge, config.field_of_view)
         check_large_enough(self._rectifier.camera, reader.name)
         self.skipped = 0
         """Images that could not be read or are of another size, so far in this iteration."""
@@ -146,7 +146,7 @@ class Source:
 
     @property
     def kind(self) -> str:
-        """The format: video, images, replica, tum or 7scenes."""
+        """The format: video, images, bag, replica, tum or 7scenes."""
         return self._reader.kind
 
     @property

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
+from geogs.geometry.distortion import LensModel
 
 _LEAST_FOCAL, _MOST_FOCAL = 0.1, 100.0
 """Focal lengths by the longer side of the image: fields of view from 157 down to 0.6 degrees."""
@@ -37,7 +38,7 @@ class Calibration:
     cx: float
     cy: float
     distortion: tuple[float, ...] = ()
-    """k1, k2, p1, p2(, k3(, k4, k5, k6)); empty for a pinhole."""
+    """k1, k2, p1, p2(, k3(, k4, k5, k6)), empty for a pinhole; k1, k2, k3, k4 of a fisheye."""
     width: int | None = None
     """Image size the numbers hold for; none where the description does not say."""
     height: int | None = None
@@ -49,11 +50,18 @@ class Calibration:
     """Whether the focal length is what the maker says of the lens, to a few percent."""
     refinement: Refinement | None = None
     """What the video said of it, where it was asked."""
+    lens: LensModel = "polynomial"
+    """What the coefficients are of."""
 
     def __post_init__(self) -> None:
         numbers = (self.fx, self.fy, self.cx, self.cy, *self.distortion)
         if not all(math.isfinite(number) for number in numbers):
             raise InputError(f"The intrinsics ({self.origin}) hold NaN or infinity; correct them.")
+        if self.lens == "fisheye" and len(self.distortion) not in (0, 4):
+            raise InputError(
+                f"The intrinsics ({self.origin}) have {len(self.distortion)} distortion numbers; "
+                "give k1, k2, k3, k4 of a fisheye."
+            )
         if len(self.distortion) not in (0, 4, 5, 8):
             raise InputError(
                 f"The intrinsics ({self.origin}) have {len(self.distortion)} distortion numbers; "
@@ -78,7 +86,7 @@ class Calibration:
     @property
     def is_distorted(self) -> bool:
         """Whether there is any distortion to remove."""
-        return any(number != 0 for number in self.distortion)
+        return self.lens == "fisheye" or any(number != 0 for number in self.distortion)
 
     def camera(self) -> Camera:
         """The pinhole part, once the size is known."""
@@ -153,7 +161,7 @@ class Calibration:
         """Pixel (x, y) moves to (height - 1 - y, x); the tangential terms turn with the axes."""
         width, height = self._size()
         distortion = self.distortion
-        if len(distortion) >= 4:
+        if len(distortion) >= 4 and self.lens == "polynomial":
             k1, k2, p1, p2, *radial = distortion
             distortion = (k1, k2, p2, -p1, *radial)
         return replace(

@@ -18,6 +18,7 @@ from geogs.documents import (
     yaml_value,
 )
 from geogs.errors import InputError
+from geogs.geometry.distortion import LensModel
 from geogs.io.sources.calibration import Calibration
 
 Numbers = Sequence[float]
@@ -33,7 +34,19 @@ _COLMAP_MODELS: dict[str, tuple[int | None, ...]] = {
     "FULL_OPENCV": (0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11),
 }
 
-_OTHER_LENSES = ("FISHEYE", "FOV", "EQUIDISTANT", "EQUIRECT")
+# Of those that are a fisheye's: fx, fy, cx, cy and k1, k2, k3, k4.
+_COLMAP_FISHEYES: dict[str, tuple[int | None, ...]] = {
+    "SIMPLE_RADIAL_FISHEYE": (0, 0, 1, 2, 3, None, None, None),
+    "RADIAL_FISHEYE": (0, 0, 1, 2, 3, 4, None, None),
+    "OPENCV_FISHEYE": (0, 1, 2, 3, 4, 5, 6, 7),
+}
+FISHEYE = "fisheye"
+"""What numbers begin with that are a fisheye's."""
+_FISHEYES = (FISHEYE, "equidistant", "opencv_fisheye", "kannala_brandt", "kb4")
+"""What files call a fisheye, in small letters."""
+_OTHER_LENSES = (
+    "FISHEYE", "FOV", "EQUIDISTANT", "EQUIRECT", "OMNI", "EUCM", "DOUBLE", "SPHER", "MEI", "PRISM",
+)  # fmt: skip
 """What names of camera models hold that the images have to be undistorted for."""
 
 
@@ -41,7 +54,7 @@ def read_calibration(path: str | Path) -> Calibration:
     """Read the camera in ``path``; the format follows from the name and the content.
 
     Raises:
-        InputError: the file is missing, unreadable, of no known format, or of a fisheye camera.
+        InputError: the file is missing, unreadable, of no known format, or of another lens.
     """
     path = Path(path)
     if path.suffix == ".json":
@@ -59,8 +72,23 @@ def read_calibration(path: str | Path) -> Calibration:
     except UNUSABLE as error:
         raise InputError(
             f"{path} is no calibration that can be understood{_reason(error)}; "
-            f"give fx fy cx cy [k1 k2 p1 p2 [k3]]."
+            f"give fx fy cx cy [k1 k2 p1 p2 [k3]], or fisheye fx fy cx cy [k1 k2 k3 k4]."
         ) from None
+
+
+def calibration_from_words(words: Sequence[str], origin: str) -> Calibration:
+    """The same from their words, of which the first may be ``fisheye``. Raises ValueError, too."""
+    is_fisheye = words[:1] == [FISHEYE]
+    numbers = [float(word) for word in (words[1:] if is_fisheye else words)]
+    if not is_fisheye:
+        return calibration_from_numbers(numbers, origin)
+    if len(numbers) not in (4, 8):
+        raise InputError(
+            f"The intrinsics ({origin}) hold {len(numbers)} numbers; "
+            f"expected fisheye,fx,fy,cx,cy[,k1,k2,k3,k4]."
+        )
+    fx, fy, cx, cy, *distortion = numbers
+    return Calibration(fx, fy, cx, cy, tuple(distortion), origin=origin, lens="fisheye")
 
 
 def calibration_from_numbers(numbers: Numbers, origin: str) -> Calibration:
@@ -94,13 +122,15 @@ def _from_json(document: Any, path: Path) -> Calibration:
         height=_optional_int(entry.get("height", entry.get("h"))),
         origin=str(path),
         is_guess=bool(entry.get("is_guess", False)),
+        lens=_lens(str(entry.get("lens", "polynomial")), path),
     )
 
 
 def calibration_from_nerfstudio(entry: dict[str, Any], path: Path) -> Calibration:
     """Translate the keys of ``transforms.json``; raises KeyError, TypeError or ValueError."""
-    _refuse_fisheye(str(entry.get("camera_model", "OPENCV")), path)
-    distortion = tuple(float(entry.get(key, 0.0)) for key in ("k1", "k2", "p1", "p2", "k3"))
+    lens = _lens(str(entry.get("camera_model", "OPENCV")), path)
+    keys = ("k1", "k2", "k3", "k4") if lens == "fisheye" else ("k1", "k2", "p1", "p2", "k3")
+    distortion = tuple(float(entry.get(key, 0.0)) for key in keys)
     return Calibration(
         float(entry["fl_x"]),
         float(entry.get("fl_y", entry["fl_x"])),
@@ -110,6 +140,7 @@ def calibration_from_nerfstudio(entry: dict[str, Any], path: Path) -> Calibratio
         width=_optional_int(entry.get("w")),
         height=_optional_int(entry.get("h")),
         origin=str(path),
+        lens=lens,
     )
 
 
@@ -131,20 +162,24 @@ def calibration_from_colmap(
     """Translate a camera of COLMAP (https://colmap.github.io/cameras.html).
 
     Raises:
-        InputError: the camera model is unknown here, or a fisheye.
+        InputError: the camera model is not supported.
     """
-    _refuse_fisheye(model, origin)
-    if model not in _COLMAP_MODELS:
+    is_fisheye = model in _COLMAP_FISHEYES
+    models = _COLMAP_FISHEYES if is_fisheye else _COLMAP_MODELS
+    if not is_fisheye:
+        _refuse_others(model, origin)
+    if model not in models:
         raise InputError(
             f"{origin} describes a camera of a model that is not supported; undistort the images "
             f"with COLMAP's image_undistorter first."
         )
     fx, fy, cx, cy, *distortion = (
-        0.0 if index is None else float(parameters[index]) for index in _COLMAP_MODELS[model]
+        0.0 if index is None else float(parameters[index]) for index in models[model]
     )
     return Calibration(
         fx, fy, cx - 0.5, cy - 0.5,
         distortion=tuple(distortion), width=width, height=height, origin=origin,
+        lens="fisheye" if is_fisheye else "polynomial",
     )  # fmt: skip
 
 
@@ -152,14 +187,16 @@ def _from_yaml(text: str, path: Path) -> Calibration:
     # OpenCV writes a directive and a tag that plain YAML readers refuse.
     text = re.sub(r"^%YAML.*$|!!opencv-matrix", "", text, flags=re.MULTILINE)
     document = yaml_value(text, str(path))
+    document = document.get("cam0", document)  # the first camera of Kalibr's chain
+    _refuse_others(str(document.get("camera_model", "")), path)
+    lens = _lens(str(document.get("distortion_model", "")), path)
     if "intrinsics" in document:  # EuRoC and Kalibr
         fx, fy, cx, cy = document["intrinsics"]
-        distortion = document.get("distortion_coefficients", [])
-        _refuse_fisheye(str(document.get("distortion_model", "")), path)
+        coefficients = document.get("distortion_coeffs", [])
+        distortion = document.get("distortion_coefficients", coefficients)
     else:
         fx, _, cx, _, fy, cy = document["camera_matrix"]["data"][:6]
         distortion = document.get("distortion_coefficients", {}).get("data", [])
-        _refuse_fisheye(str(document.get("distortion_model", "")), path)
     width, height = document.get("resolution", (None, None))
     return Calibration(
         float(fx), float(fy), float(cx), float(cy),
@@ -167,11 +204,15 @@ def _from_yaml(text: str, path: Path) -> Calibration:
         width=_optional_int(document.get("image_width", width)),
         height=_optional_int(document.get("image_height", height)),
         origin=str(path),
+        lens=lens,
     )  # fmt: skip
 
 
 def _from_numbers(text: str, path: Path) -> Calibration:
     rows = [line.split("#", 1)[0].replace(",", " ").split() for line in text.splitlines()]
+    words = [word for row in rows for word in row]
+    if words[:1] == [FISHEYE]:
+        return calibration_from_words(words, str(path))
     numbers = [[float(word) for word in row] for row in rows if row]
     if len(numbers) >= 3 and all(len(row) == len(numbers) for row in numbers):
         return Calibration(  # a 3x3 or 4x4 matrix
@@ -180,7 +221,15 @@ def _from_numbers(text: str, path: Path) -> Calibration:
     return calibration_from_numbers([number for row in numbers for number in row], str(path))
 
 
-def _refuse_fisheye(model: str, path: Path | str) -> None:
+def _lens(model: str, path: Path | str) -> LensModel:
+    """What a file calls a lens. Raises InputError for one that is not supported."""
+    if model.lower() in _FISHEYES:
+        return "fisheye"
+    _refuse_others(model, path)
+    return "polynomial"
+
+
+def _refuse_others(model: str, path: Path | str) -> None:
     is_other = any(word in model.upper() for word in _OTHER_LENSES)
     if is_other:
         name = f"{model} camera" if re.fullmatch(r"\w{1,40}", model) else "camera of another model"

@@ -9,7 +9,7 @@ from pathlib import Path
 from geogs.errors import InputError
 from geogs.io.pictures import decoder_noise
 from geogs.io.sources.calibration import Calibration
-from geogs.io.sources.calibration_files import calibration_from_numbers, read_calibration
+from geogs.io.sources.calibration_files import calibration_from_words, read_calibration
 
 GUESSED_FIELD_OF_VIEW = 60.0
 """Degrees along the longer image side, assumed where nothing is known: a phone's main camera."""
@@ -103,10 +103,9 @@ def _from_option(option: str) -> Calibration:
         return read_calibration(option)
     words = option.replace(",", " ").split()
     try:
-        numbers = [float(word) for word in words]
+        return calibration_from_words(words, "as given")
     except ValueError:
         raise InputError(
             f"intrinsics {option} is neither auto, nor a file that exists, nor numbers "
-            f"fx,fy,cx,cy[,k1,k2,p1,p2[,k3]]."
+            f"fx,fy,cx,cy[,k1,k2,p1,p2[,k3]] or fisheye,fx,fy,cx,cy[,k1,k2,k3,k4]."
         ) from None
-    return calibration_from_numbers(numbers, "as given")

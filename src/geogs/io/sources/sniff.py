@@ -10,6 +10,7 @@ from geogs.errors import InputError
 from geogs.io.sources.base import Reader, Source
 from geogs.io.sources.images import SUFFIXES, open_image_folder
 from geogs.io.sources.replica import is_replica, open_replica
+from geogs.io.sources.ros.bag import Bag, is_bag
 from geogs.io.sources.seven_scenes import is_seven_scenes, open_seven_scenes
 from geogs.io.sources.several import SeveralSources
 from geogs.io.sources.tum import is_tum, open_tum
@@ -25,7 +26,7 @@ def open_source(path: Sequence[str | Path], config: InputConfig | None = None) -
 def open_source(
     path: str | Path | Sequence[str | Path], config: InputConfig | None = None
 ) -> Stream:
-    """Open a video, a folder of images, or a Replica, TUM RGB-D or 7-Scenes sequence.
+    """Open a video, a folder of images, a bag of ROS, or a Replica, TUM RGB-D or 7-Scenes sequence.
 
     The format follows from the content. Ground truth that lies beside the images is not read.
 
@@ -37,15 +38,20 @@ def open_source(
         InputError: nothing usable is there, ``config`` does not fit it, or the cameras differ.
     """
     if isinstance(path, str | Path):
-        return Source(_reader(expanded(path)), config or InputConfig())
+        config = config or InputConfig()
+        return Source(_reader(expanded(path), config.topic), config)
     if not path:
         raise InputError("Nothing to read; give a video or a folder of images.")
     sources = [open_source(one, config) for one in path]
     return sources[0] if len(sources) == 1 else SeveralSources(sources)
 
 
-def _reader(path: Path) -> Reader:
+def _reader(path: Path, topic: str) -> Reader:
     try:
+        if path.exists() and is_bag(path):
+            return Bag(path, topic)
+        if topic != "auto":
+            raise InputError(f"{path} is no bag of ROS, which alone has topics; leave out --topic.")
         if path.is_dir():
             return _folder_reader(path)
         if not path.exists():

@@ -1,6 +1,9 @@
 """From the image as it came to the working image: resize, then straighten it."""
 
+import math
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -9,22 +12,31 @@ from jaxtyping import Float, UInt8
 
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
-from geogs.geometry.distortion import distorted_pixels
+from geogs.geometry.distortion import LensModel, distorted_pixels
 from geogs.io.sources.calibration import Calibration
 from geogs.shutter.camera import RollingCamera
+
+FieldOfView = float | Literal["auto"]
+"""Degrees along the longer side of the working image."""
+FISHEYE_VIEW = 90.0
+"""Degrees that are kept of a fisheye where nobody asks for others; a pinhole stretches more."""
 
 
 class Rectifier:
     """Makes working images: longer side at most ``long_edge`` pixels, straight lines straight.
 
     The focal length is enlarged just enough that no pixel looks outside the source image, so
-    there are no black borders; ``camera`` is the exact pinhole of the result.
+    there are no black borders, or such that the image has the field of view that is asked for;
+    ``camera`` is the exact pinhole of the result.
     """
 
-    def __init__(self, calibration: Calibration, long_edge: int) -> None:
+    def __init__(
+        self, calibration: Calibration, long_edge: int, field_of_view: FieldOfView = "auto"
+    ) -> None:
+        """Raises InputError if the lens folds the image, or does not see so much."""
         source = calibration.camera()
         distortion = calibration.distortion if calibration.is_distorted else ()
-        self._distortion = distortion
+        self._distortion, self._lens = distortion, calibration.lens
         enlarges = long_edge <= 0 or long_edge >= max(source.width, source.height)
         resized = source if enlarges else source.with_long_edge(long_edge)
         self.resized_camera = resized
@@ -35,13 +47,16 @@ class Rectifier:
         """Factor on the focal length that removes black borders; the crop is 1 - 1 / zoom."""
         self.camera = resized
         """The pinhole camera of the working image."""
-        if distortion:
-            self.zoom = _zoom_without_borders(resized, distortion)
+        bends = _Bending(resized, distortion, calibration.lens)
+        if field_of_view != "auto":
+            self.zoom = _zoom_to(field_of_view, bends)
+        elif calibration.lens == "fisheye":
+            self.zoom = max(_focal(FISHEYE_VIEW, resized) / resized.fx, bends.least_zoom())
+        elif distortion:
+            self.zoom = max(1.0, bends.least_zoom(1.0))
+        if calibration.is_distorted or self.zoom != 1:
             self.camera = _zoomed(resized, self.zoom)
-            self._maps = cv2.initUndistortRectifyMap(
-                _matrix(resized), np.array(distortion, dtype=np.float64), None,
-                _matrix(self.camera), self._size, cv2.CV_32FC1,
-            )  # fmt: skip
+            self._maps = lens_maps(self.camera, resized, distortion, calibration.lens)
 
     def __call__(self, image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h2 w2 3"]:
         """The working image of a source image."""
@@ -49,7 +64,9 @@ class Rectifier:
 
     def rolling_camera(self, lines: int, quarter_turns: int) -> RollingCamera:
         """The camera of resized images whose sensor has so many lines and was turned so often."""
-        return RollingCamera(self.resized_camera, self._distortion, quarter_turns, lines)
+        return RollingCamera(
+            self.resized_camera, self._distortion, quarter_turns, lines, lens=self._lens
+        )
 
     def resized(self, image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h2 w2 3"]:
         """A source image at working size, with its distortion."""
@@ -82,6 +99,82 @@ class Rectifier:
         return u, v
 
 
+def lens_maps(
+    target: Camera, source: Camera, distortion: Sequence[float], lens: LensModel
+) -> tuple[np.ndarray, np.ndarray]:
+    """Column and row in the image of a lens of what each pixel of a pinhole sees, float32."""
+    K, target_K, size = _matrix(source), _matrix(target), (target.width, target.height)
+    D = np.array(distortion or (0.0,) * 4, dtype=np.float64)
+    if lens == "fisheye":
+        maps = cv2.fisheye.initUndistortRectifyMap(K, D, np.eye(3), target_K, size, cv2.CV_32FC1)
+    else:
+        maps = cv2.initUndistortRectifyMap(K, D, None, target_K, size, cv2.CV_32FC1)
+    return maps[0], maps[1]
+
+
+@dataclass(frozen=True)
+class _Bending:
+    """How the lens of a source bends rays."""
+
+    source: Camera
+    distortion: Sequence[float]
+    lens: LensModel
+
+    def sees(self, zoom: float) -> bool:
+        """Whether the border of the zoomed image lies in the source, and before any fold."""
+        source = self.source
+        rays = _border_rays(_zoomed(source, zoom))
+        pixels, inner = self._pixels(rays), self._pixels(0.99 * rays)
+        centre = np.array([source.cx, source.cy])
+        grows = np.linalg.norm(pixels - centre, axis=1) > np.linalg.norm(inner - centre, axis=1)
+        inside = (pixels >= -0.5) & (pixels <= (source.width - 0.5, source.height - 0.5))
+        return bool(grows.all() and inside.all())
+
+    def least_zoom(self, least: float = 0.05) -> float:
+        """The smallest factor of at least ``least`` on the focal length that shows no outside.
+
+        To 1e-4. Raises InputError where the lens folds the image.
+        """
+        low, high = least, least
+        while not self.sees(high):
+            low, high = high, high * 1.25
+            if high > 8:
+                raise InputError(
+                    "The distortion coefficients fold the image over itself; check their order "
+                    "(k1, k2, p1, p2, k3; of a fisheye k1, k2, k3, k4) and that they belong to "
+                    "this camera."
+                )
+        while high - low > 1e-4:
+            middle = (low + high) / 2
+            if self.sees(middle):
+                high = middle
+            else:
+                low = middle
+        return high
+
+    def _pixels(self, rays: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+        return distorted_pixels(rays, self.source, self.distortion, self.lens)
+
+
+def _zoom_to(degrees: float, bends: _Bending) -> float:
+    """The factor for a field of view. Raises InputError if the lens does not see so much."""
+    source = bends.source
+    zoom = _focal(degrees, source) / source.fx
+    if not bends.sees(zoom) and zoom < (least := bends.least_zoom()):
+        edge = max(source.width, source.height)
+        most = 2 * math.degrees(math.atan(edge / 2 / (least * source.fx)))
+        raise InputError(
+            f"A straight image with a field of view of {degrees:g} degrees would show more than "
+            f"the lens saw; give at most {math.floor(10 * most) / 10:g}."
+        )
+    return zoom
+
+
+def _focal(degrees: float, camera: Camera) -> float:
+    """Of a pinhole image of the camera's size with a field of view along its longer side."""
+    return max(camera.width, camera.height) / 2 / math.tan(math.radians(degrees) / 2)
+
+
 def _matrix(camera: Camera) -> Float[np.ndarray, "3 3"]:
     return camera.matrix().numpy()
 
@@ -90,36 +183,6 @@ def _zoomed(camera: Camera, zoom: float) -> Camera:
     return Camera(
         camera.fx * zoom, camera.fy * zoom, camera.cx, camera.cy, camera.width, camera.height
     )
-
-
-def _zoom_without_borders(camera: Camera, distortion: Sequence[float]) -> float:
-    """The smallest factor of at least one on the focal length that shows no outside, to 1e-4."""
-    low, high = 1.0, 1.0
-    while not _sees_only_source(_zoomed(camera, high), camera, distortion):
-        low, high = high, high * 1.25
-        if high > 8:
-            raise InputError(
-                "The distortion coefficients fold the image over itself; check their order "
-                "(k1, k2, p1, p2, k3) and that they belong to this camera."
-            )
-    while high - low > 1e-4:
-        middle = (low + high) / 2
-        if _sees_only_source(_zoomed(camera, middle), camera, distortion):
-            high = middle
-        else:
-            low = middle
-    return high
-
-
-def _sees_only_source(target: Camera, source: Camera, distortion: Sequence[float]) -> bool:
-    """Whether the border of the undistorted image lies in the source, and before any fold."""
-    rays = _border_rays(target)
-    pixels = distorted_pixels(rays, source, distortion)
-    inner = distorted_pixels(0.99 * rays, source, distortion)
-    centre = np.array([source.cx, source.cy])
-    grows = np.linalg.norm(pixels - centre, axis=1) > np.linalg.norm(inner - centre, axis=1)
-    inside = (pixels >= -0.5) & (pixels <= (source.width - 0.5, source.height - 0.5))
-    return bool(grows.all() and inside.all())
 
 
 def _border_rays(camera: Camera) -> Float[np.ndarray, "n 2"]:

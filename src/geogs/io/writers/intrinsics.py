@@ -46,6 +46,7 @@ def write_intrinsics(
             "fy": calibration.fy,
             "cx": calibration.cx,
             "cy": calibration.cy,
+            "lens": calibration.lens,
             "distortion": list(calibration.distortion),
             "origin": calibration.origin,
             "is_guess": calibration.is_guess,

@@ -2,7 +2,9 @@
 
 import json
 import logging
+import math
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -131,7 +133,17 @@ def test_colmap_distortion_is_removed(room, tmp_path):
     assert source[0].mask is None
 
 
-def test_colmap_fisheye_is_refused_by_name(room, tmp_path):
+def test_colmap_fisheye_becomes_a_pinhole_of_the_asked_field_of_view(room, tmp_path):
+    fx, fy, cx, cy = room.pinhole
+    camera = {"model": "OPENCV_FISHEYE", "parameters": (fx, fy, cx, cy, 0.01, 0.0, 0.0, 0.0)}
+    project = write_colmap_project(room, tmp_path, **camera)
+    source = open_posed_source(project, replace(NATIVE, field_of_view=30.0))
+    half = max(source.camera.width, source.camera.height) / 2
+    assert math.degrees(2 * math.atan(half / source.camera.fx)) == pytest.approx(30)
+    assert source[0].mask is None
+
+
+def test_colmap_lens_of_another_model_is_refused_by_name(room, tmp_path):
     fx, fy, cx, cy = room.pinhole
     write_colmap_project(room, tmp_path, model="FOV", parameters=(fx, fy, cx, cy, 0.9))
     with pytest.raises(InputError, match=r"FOV camera.*undistort"):
@@ -237,7 +249,7 @@ def test_blender_field_of_view_and_alpha(room, tmp_path):
     [
         ({"frames": [{"file_path": "a.png"}]}, "transform_matrix"),
         ({"frames": []}, "lists no images"),
-        ({"camera_model": "OPENCV_FISHEYE"}, "OPENCV_FISHEYE"),
+        ({"camera_model": "EQUIRECTANGULAR"}, "EQUIRECTANGULAR"),
         ({"fl_x": float("nan")}, "NaN"),
         ({"applied_transform": [[0, 0, 0, 0]] * 3}, "cannot be understood"),
     ],

@@ -15,7 +15,7 @@ from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.intrinsics import resolve_intrinsics
 from geogs.io.sources.posed.files import PosedFile
 from geogs.io.sources.posed.pictures import stored_size
-from geogs.io.sources.undistort import Rectifier
+from geogs.io.sources.undistort import Rectifier, lens_maps
 
 _log = logging.getLogger(__name__)
 
@@ -38,7 +38,7 @@ class OneCamera:
         cameras = {key: _resolved(config, *key) for key in dict.fromkeys(keys)}
         most = common_place(keys)
         first = cameras[keys[most]]
-        rectifier = Rectifier(first, config.long_edge)
+        rectifier = Rectifier(first, config.long_edge, config.field_of_view)
         self.camera: Camera = rectifier.camera
         """The pinhole camera of every image."""
         self.origin = first.origin
@@ -92,7 +92,7 @@ class Resampler:
         resized = camera.resized(max(size[0], 1), max(size[1], 1))
         self._size = (resized.width, resized.height)
         self._resized = resized
-        self._distortion = np.array(source.distortion or (0.0,) * 4, dtype=np.float64)
+        self._distortion, self._lens = source.distortion, source.lens
         self._target = target
         self._kept: tuple[np.ndarray, np.ndarray] | None = None
 
@@ -117,15 +117,7 @@ class Resampler:
         """Column and row in the resized source of each pixel of the target."""
         if self._kept is not None:
             return self._kept
-        x, y = cv2.initUndistortRectifyMap(
-            self._resized.matrix().numpy(),
-            self._distortion,
-            None,
-            self._target.matrix().numpy(),
-            (self._target.width, self._target.height),
-            cv2.CV_32FC1,
-        )
-        return x, y
+        return lens_maps(self._target, self._resized, self._distortion, self._lens)
 
 
 def unlike_common(files: Sequence[PosedFile], config: InputConfig) -> list[int]:
@@ -133,7 +125,7 @@ def unlike_common(files: Sequence[PosedFile], config: InputConfig) -> list[int]:
     keys = [(file.calibration, _size(file)) for file in files]
     cameras = {key: _resolved(config, *key) for key in dict.fromkeys(keys)}
     common = cameras[keys[common_place(keys)]]
-    rectifier = Rectifier(common, config.long_edge)
+    rectifier = Rectifier(common, config.long_edge, config.field_of_view)
     ways = {key: _way(c, rectifier.camera, rectifier.zoom) for key, c in cameras.items()}
     return [place for place, key in enumerate(keys) if _is_unlike(ways[key])]
 

@@ -1,0 +1,225 @@
+"""Bags of ROS 1 (``.bag``) and ROS 2 (a folder, ``.db3``, ``.mcap``), read without ROS."""
+
+import logging
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from geogs.errors import InputError
+from geogs.io.poses import FRAMES_PER_SECOND
+from geogs.io.sources.base import RawFrame
+from geogs.io.sources.calibration import Calibration
+from geogs.io.sources.ros.camera_info import CAMERA_INFO, calibration_of
+from geogs.io.sources.ros.images import COMPRESSED, RAW, is_picture, picture_of
+
+_log = logging.getLogger(__name__)
+
+_BEGINNINGS = {
+    ".bag": b"#ROSBAG V2.0",
+    ".mcap": b"\x89MCAP0\r\n",
+    ".db3": b"SQLite format 3\0",
+}
+_METADATA = "metadata.yaml"
+_SUFFIXES = ("/compressed", "/compressedDepth", "/theora", "/ffmpeg")
+"""What image transports put behind the name of a topic."""
+_LOOKED_AT = 30
+"""Messages that tell the rate, and among which the first picture must be."""
+
+
+def is_bag(path: Path) -> bool:
+    """Whether ``path`` is a recording of ROS: by its ending and its first bytes."""
+    if path.is_dir():
+        metadata = path / _METADATA
+        return metadata.is_file() and b"rosbag2_bagfile_information" in _head(metadata)
+    beginning = _BEGINNINGS.get(path.suffix.lower())
+    return beginning is not None and _head(path).startswith(beginning)
+
+
+class Bag:
+    """Reader of the images of one topic."""
+
+    kind = "bag"
+    quarter_turns = 0
+
+    def __init__(self, path: Path, topic: str = "auto") -> None:
+        """``topic`` is that of the images, or ``auto`` for the one that most likely is the camera.
+
+        Raises:
+            InputError: ``rosbags`` is not installed, the bag is damaged, or has no such images.
+        """
+        self._path = path
+        self.name = path.resolve().name
+        with _opened(path) as bag:
+            chosen = _chosen(bag, path, topic)
+            self.topic: str = chosen
+            """Whose images are read."""
+            connections = _connections(bag, chosen)
+            self.length: int | None = sum(c.msgcount for c in connections)
+            times = [t for _, t, _ in islice(bag.messages(connections=connections), _LOOKED_AT)]
+            self.fps = _rate(times)
+            first = _first_picture(bag, connections)
+            if first is None:
+                raise InputError(f"{path}: no image on {chosen} can be read; is the bag whole?")
+            self.height, self.width = first.shape[:2]
+            self.calibration: Calibration | None = _calibration(bag, chosen)
+
+    @property
+    def paths(self) -> list[Path]:
+        """The files that are read, the one with the index of a ROS 2 bag left out."""
+        if not self._path.is_dir():
+            return [self._path]
+        files = (path for path in self._path.iterdir() if path.is_file())
+        return sorted(path for path in files if path.name != _METADATA)
+
+    def read(self, start: int, stop: int | None, stride: int) -> Iterator[RawFrame]:
+        """Go through the topic from its beginning and decode ``start, start + stride, ...``.
+
+        Times are those of the headers; where they do not increase, an image cannot be used.
+        """
+        last = -np.inf
+        with _opened(self._path) as bag:
+            messages = bag.messages(connections=_connections(bag, self.topic))
+            for index, (connection, received, data) in enumerate(islice(messages, stop)):
+                if index < start or (index - start) % stride:
+                    continue
+                label = f"{self.name}, image {index}"
+                message = _read(bag, connection, data)
+                if message is None:
+                    yield RawFrame(label, max(last, 0.0), None)
+                    continue
+                time = _stamp(message) or received * 1e-9
+                if time <= last:
+                    late = "is stamped no later than the one before"
+                    yield RawFrame(label, time, None, why_not=late)
+                    continue
+                last, found = time, picture_of(message)
+                yield RawFrame(label, time, found.picture, found.is_damaged)
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    """A bag, closed at the end. Raises InputError for what its reader finds wrong at opening."""
+    try:
+        from rosbags.highlevel import AnyReader
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError as error:
+        raise InputError(
+            f"{path} is a recording of ROS; pip install 'geogs[ros]' brings what reads it."
+        ) from error
+    try:
+        # The images' types are alike in all of ROS 2, whose older bags do not describe them.
+        bag = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
+        bag.open()
+    except Exception as error:  # of its own, of SQLite, of YAML, of whatever a damaged file causes
+        raise InputError(
+            f"{path} cannot be opened as a recording of ROS; is it complete and closed?"
+        ) from error
+    try:
+        yield bag
+    finally:
+        bag.close()
+
+
+def _chosen(bag: Any, path: Path, asked: str) -> str:
+    """The topic to read: that asked for, or the likeliest. Raises InputError without any."""
+    topics = {t: info.msgcount for t, info in bag.topics.items() if _has_images(bag, t)}
+    listed = ", ".join(sorted(topics)) or "none"
+    if asked != "auto":
+        if asked not in topics:
+            raise InputError(f"{path} has no images on the topic asked for; there are: {listed}.")
+        return asked
+    likely = [t for t in sorted(topics) if _first_is_picture(bag, t)]
+    if not likely:
+        raise InputError(f"{path} holds no topic with images; topics with some: {listed}.")
+    chosen = max(likely, key=lambda t: (_likelihood(bag, t), topics[t]))
+    if len(likely) > 1:
+        _log.info("Reading %s; --topic takes another of %s.", chosen, ", ".join(likely))
+    return chosen
+
+
+def _likelihood(bag: Any, topic: str) -> tuple[bool, bool, bool]:
+    """Colour before infrared, with a camera before without, the left of two as sorted, raw before
+    compressed."""
+    base = _without_transport(topic).lower()
+    is_other = any(word in base for word in ("infra", "/ir/", "thermal", "depth", "mask", "debug"))
+    return not is_other, _camera_topic(bag, topic) is not None, base == topic.lower()
+
+
+def _has_images(bag: Any, topic: str) -> bool:
+    return any(c.msgtype in (RAW, COMPRESSED) and c.msgcount for c in _connections(bag, topic))
+
+
+def _first_is_picture(bag: Any, topic: str) -> bool:
+    connections = _connections(bag, topic)
+    some = islice(bag.messages(connections=connections), 1)
+    messages = [_read(bag, connection, data) for connection, _, data in some]
+    return any(m is not None and is_picture(m) for m in messages)
+
+
+def _first_picture(bag: Any, connections: Sequence[Any]) -> np.ndarray | None:
+    for connection, _, data in islice(bag.messages(connections=connections), _LOOKED_AT):
+        message = _read(bag, connection, data)
+        if message is not None and (found := picture_of(message).picture) is not None:
+            return found
+    return None
+
+
+def _calibration(bag: Any, topic: str) -> Calibration | None:
+    source = _camera_topic(bag, topic)
+    if source is None:
+        return None
+    is_rectified = _without_transport(topic).rsplit("/", 1)[-1].startswith("image_rect")
+    for connection, _, data in islice(bag.messages(connections=_connections(bag, source)), 1):
+        message = _read(bag, connection, data)
+        if message is not None:
+            return calibration_of(message, source, is_rectified)
+    return None
+
+
+def _camera_topic(bag: Any, topic: str) -> str | None:
+    """Where the camera of an image topic is described: beside it, or the only one in the bag."""
+    known = [c.topic for c in bag.connections if c.msgtype == CAMERA_INFO and c.msgcount]
+    base = _without_transport(topic)
+    beside = (f"{base.rpartition('/')[0]}/camera_info", f"{base}/camera_info")
+    images = [c.topic for c in bag.connections if c.msgtype in (RAW, COMPRESSED)]
+    is_alone = len(set(known)) == 1 and len(set(map(_without_transport, images))) == 1
+    alone = known if is_alone else []
+    return next((name for name in (*beside, *alone) if name in known), None)
+
+
+def _without_transport(topic: str) -> str:
+    suffix = next((s for s in _SUFFIXES if topic.endswith(s)), "")
+    return topic.removesuffix(suffix)
+
+
+def _connections(bag: Any, topic: str) -> list[Any]:
+    return [c for c in bag.connections if c.topic == topic]
+
+
+def _read(bag: Any, connection: Any, data: bytes) -> Any:
+    """The message; none where it is damaged."""
+    try:
+        return bag.deserialize(data, connection.msgtype)
+    except Exception:  # whatever wrong lengths make its reader stumble over
+        return None
+
+
+def _stamp(message: Any) -> float:
+    """Seconds of the header; 0 where nobody has set it."""
+    stamp = message.header.stamp
+    return float(stamp.sec) + float(stamp.nanosec) * 1e-9
+
+
+def _rate(nanoseconds: Sequence[int]) -> float:
+    steps = np.diff(np.array(nanoseconds, dtype=np.float64)) * 1e-9
+    steps = steps[steps > 0]
+    return float(1 / np.median(steps)) if len(steps) else FRAMES_PER_SECOND
+
+
+def _head(path: Path) -> bytes:
+    with path.open("rb") as stream:
+        return stream.read(4096)
