@@ -15,7 +15,7 @@ from typing import Any, Literal
 
 from geogs.application.settings import RunSettings
 from geogs.errors import GeogsError
-from geogs.evaluation.run_report import duration
+from geogs.evaluation.duration import duration
 from geogs.fleet.places import Place
 from geogs.fleet.row import FILE, Row, numbers_of, row_text
 from geogs.fleet.sources import FleetSource

@@ -18,12 +18,11 @@ def rows_of(ray: Any, jobs: Iterable[Job], share: Share, attempts: int) -> Itera
     All jobs are handed to Ray at once. One whose node or process fails is handed in again, up to
     ``attempts`` times in all. When the caller stops listening, what is out is ended.
     """
-    task = ray.remote(attempt).options(
+    task = ray.remote(max_calls=0)(attempt).options(
         num_cpus=share.cpus,
         num_gpus=share.gpus or None,
         memory=share.memory,
         max_retries=0,
-        max_calls=0,
         scheduling_strategy="SPREAD",
     )
     out: dict[Any, Job] = {task.remote(job): job for job in jobs}

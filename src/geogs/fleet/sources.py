@@ -10,24 +10,13 @@ from pathlib import Path, PurePosixPath
 from geogs.errors import InputError
 from geogs.fleet.places import Place
 
-VIDEOS = frozenset(
-    [
-        ".mp4",
-        ".mov",
-        ".mkv",
-        ".avi",
-        ".webm",
-        ".m4v",
-        ".mts",
-        ".m2ts",
-        ".mpg",
-        ".mpeg",
-        ".wmv",
-        ".3gp",
-        ".insv",
-    ]
-)
+VIDEOS = frozenset({
+    ".3gp", ".avi", ".insv", ".m2ts", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".mts",
+    ".webm", ".wmv",
+})  # fmt: skip
 """Endings by which a video in a folder is known; one that is named itself may have any."""
+_TABLES = frozenset({"rgb.txt", "traj.txt"})
+"""Of a data set, which is one source whatever else lies in it."""
 _PATTERN = re.compile(r"[*?\[]")
 
 
@@ -93,23 +82,13 @@ def _lines(place: Place, folder: Path | None) -> Iterator[str]:
 def _inside(place: Place) -> list[str]:
     """Sources in a folder; nothing if it is a source itself."""
     listed = {name: kind for name, kind in place.listed().items() if not name.startswith(".")}
-    if place.path is not None and _is_data_set(place.path):
-        return []
     videos = [n for n, is_folder in listed.items() if not is_folder and _suffix(n) in VIDEOS]
     folders = [name for name, is_folder in listed.items() if is_folder]
     plain = [name for name, is_folder in listed.items() if not is_folder]
-    if not videos and (plain or not folders):  # images, or a data set with its tables
+    is_data_set = not _TABLES.isdisjoint(plain)
+    if is_data_set or (not videos and (plain or not folders)):
         return []
     return [_absolute((place / name).address) for name in sorted([*videos, *folders])]
-
-
-def _is_data_set(folder: Path) -> bool:
-    """Whether a folder is one source, whatever else lies in it."""
-    from geogs.io.sources.replica import is_replica
-    from geogs.io.sources.seven_scenes import is_seven_scenes
-    from geogs.io.sources.tum import is_tum
-
-    return is_tum(folder) or is_seven_scenes(folder) or is_replica(folder)
 
 
 def _absolute(address: str) -> str:

@@ -4,6 +4,7 @@ import os
 import subprocess
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryFile
@@ -85,10 +86,8 @@ def _tell(process: "subprocess.Popen[bytes]", message: bytes) -> None:
 
 
 def _wait(process: "subprocess.Popen[bytes]", seconds: float) -> None:
-    try:
+    with suppress(subprocess.TimeoutExpired):
         process.wait(seconds)
-    except subprocess.TimeoutExpired:
-        pass
 
 
 def _exceeded(process: int, seconds: float, limits: Limits) -> Literal["", "time", "memory"]:

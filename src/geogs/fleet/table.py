@@ -9,7 +9,7 @@ from tempfile import TemporaryDirectory
 from urllib.parse import quote
 
 from geogs.evaluation.page import FiguresSection, HtmlSection, write_page
-from geogs.evaluation.run_report import duration
+from geogs.evaluation.duration import duration
 from geogs.fleet.places import Place
 from geogs.fleet.row import Row
 

@@ -2,7 +2,7 @@
 
 from rich.console import Console
 
-from geogs.evaluation.run_report import duration
+from geogs.evaluation.duration import duration
 from geogs.fleet.progress import FleetProgress
 from geogs.fleet.row import Row
 
