@@ -1,9 +1,9 @@
 """A stand-in for ``geogs.fleet.child`` that computes nothing: tests of fleets run it as a program.
 
 What it does follows from the text of its source: ``fail`` and a sentence, ``kill`` (each time),
-``kill once``, ``wait`` and seconds, ``eat`` and MiB; anything else is a success. Every start adds a
-line to ``starts`` in the folder of results. Of a ``steps`` source each step is kept in a file, as of
-a checkpoint, and where there is one already it goes on after it.
+``kill once``, ``wait`` and seconds, ``eat`` and MiB; anything else is a success. Every start adds
+a line to ``starts`` in the folder of results. Of a ``steps`` source each step is kept in a file, as
+of a checkpoint, and where there is one already it goes on after it.
 """
 
 import json
@@ -33,7 +33,7 @@ def main() -> None:
         time.sleep(float(rest))
     elif word == "eat":
         eaten = bytearray(int(rest) << 20)
-        eaten[:: 1024] = b"x" * len(eaten[:: 1024])
+        eaten[::1024] = b"x" * len(eaten[::1024])
         time.sleep(60)
     elif word == "steps":
         _take_steps(output / "steps", int(rest))

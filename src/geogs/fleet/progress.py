@@ -20,10 +20,10 @@ class Pace:
     """How long the sources that are left will take, from those that have ended."""
 
     def __init__(
-        self, sources: int, at_once: float, clock: Callable[[], float] = time.monotonic
+        self, sources: int, at_once: int, clock: Callable[[], float] = time.monotonic
     ) -> None:
         self._left = sources
-        self._at_once = max(at_once, 1.0)
+        self._at_once = max(at_once, 1)
         self._clock = clock
         self._begin = clock()
         self._ended = 0

@@ -62,4 +62,4 @@ def numbers_of(summary: Mapping[str, Any]) -> dict[str, float]:
     found = {name: summary.get(name) for name in names}
     verdict = summary.get("verdict")
     found["lost"] = verdict.get("lost") if isinstance(verdict, Mapping) else None
-    return {name: value for name, value in found.items() if isinstance(value, int | float)}
+    return {name: float(v) for name, v in found.items() if isinstance(v, int | float)}

@@ -8,8 +8,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from urllib.parse import quote
 
-from geogs.evaluation.page import FiguresSection, HtmlSection, write_page
 from geogs.evaluation.duration import duration
+from geogs.evaluation.page import FiguresSection, HtmlSection, write_page
 from geogs.fleet.places import Place
 from geogs.fleet.row import Row
 
