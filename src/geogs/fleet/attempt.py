@@ -57,7 +57,8 @@ def attempt(job: Job) -> Row:
         sentence, summary = str(error), {}
     except Exception as error:
         sentence, summary = f"The attempt failed ({type(error).__name__}: {error}).", {}
-    verdict = summary.get("verdict") if isinstance(summary.get("verdict"), dict) else {}
+    judgement = summary.get("verdict")
+    verdict: dict[str, Any] = judgement if isinstance(judgement, dict) else {}
     row = Row(
         job.source.name, job.source.address, state, verdict.get("sentence", sentence), job.digest,
         verdict.get("is_reliable"), round(time.monotonic() - begin, 3), job.attempt,

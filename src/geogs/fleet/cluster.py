@@ -59,9 +59,10 @@ def share_of(ray: Any, settings: FleetSettings) -> Share:
     nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
     most_gpus = max((node.get("GPU", 0.0) for node in nodes), default=0.0)
     gpus = settings.gpus if settings.gpus != "auto" else float(min(most_gpus, 1.0))
-    cpus = settings.cpus
-    if cpus == "auto":
-        cpus = 1
+    cpus = 1
+    if settings.cpus != "auto":
+        cpus = settings.cpus
+    else:
         if gpus:
             shares = [n.get("CPU", 0.0) * gpus / n["GPU"] for n in nodes if n.get("GPU", 0.0)]
             cpus = max(1, min(16, int(min(shares, default=1.0))))

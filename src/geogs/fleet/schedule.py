@@ -1,6 +1,7 @@
 """The jobs of a fleet through Ray, and again where a machine or a process failed."""
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Generator, Iterable
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
@@ -12,7 +13,9 @@ _LOOK = 0.5
 """Seconds between two looks at what has ended, while some jobs are out."""
 
 
-def rows_of(ray: Any, jobs: Iterable[Job], share: Share, attempts: int) -> Iterator[Row]:
+def rows_of(
+    ray: Any, jobs: Iterable[Job], share: Share, attempts: int
+) -> Generator[Row, None, None]:
     """The row of every job, in the order in which they end; each job has exactly one.
 
     All jobs are handed to Ray at once. One whose node or process fails is handed in again, up to
@@ -39,7 +42,7 @@ def rows_of(ray: Any, jobs: Iterable[Job], share: Share, attempts: int) -> Itera
                     yield replace(row, state="failed") if row.state == "crashed" else row
     finally:
         for reference in out:
-            _quietly(lambda reference=reference: ray.cancel(reference, force=True))
+            _cancel(ray, reference)
 
 
 def _row(ray: Any, reference: Any, job: Job) -> Row:
@@ -63,9 +66,7 @@ def _sentence(ray: Any, error: Exception) -> str:
     return f"Ray lost the task ({said[-1][:200]})."
 
 
-def _quietly(work: Callable[[], object]) -> None:
-    """Do what may fail as the cluster goes away."""
-    try:
-        work()
-    except Exception:
-        return
+def _cancel(ray: Any, reference: Any) -> None:
+    """End a task, also while the cluster goes away."""
+    with suppress(Exception):
+        ray.cancel(reference, force=True)
