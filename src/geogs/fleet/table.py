@@ -9,7 +9,7 @@ from tempfile import TemporaryDirectory
 from urllib.parse import quote
 
 from geogs.evaluation.duration import duration
-from geogs.evaluation.page import FiguresSection, HtmlSection, write_page
+from geogs.evaluation.page import FiguresSection, HtmlSection, Section, write_page
 from geogs.fleet.places import Place
 from geogs.fleet.row import Row
 
@@ -45,7 +45,10 @@ def write_table(output: Place, rows: Sequence[Row], waiting: int, seconds: float
     (output / "fleet.json").write(json.dumps(document, indent=2))
     with TemporaryDirectory() as folder:
         page = Path(folder) / "index.html"
-        sections = [_figures(rows, waiting, seconds), HtmlSection(table_html(ordered))]
+        sections: list[Section] = [
+            _figures(rows, waiting, seconds),
+            HtmlSection(table_html(ordered)),
+        ]
         write_page(page, output.name or "fleet", sections, "geogs fleet")
         (output / "index.html").write(page.read_text("utf-8"))
 
