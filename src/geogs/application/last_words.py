@@ -1,7 +1,7 @@
 """What a command says at its end: how good, how much, how long, and what lies where."""
 
 from geogs.application.result import Written
-from geogs.evaluation.run_report import duration
+from geogs.evaluation.duration import duration
 from geogs.io.sources.posed.base import PosedSource
 
 NOT_JUDGED = (

@@ -15,7 +15,7 @@ from geogs.application.machine import peak_memory
 from geogs.application.progress import RunProgress
 from geogs.application.verbosity import Verbosity
 from geogs.errors import OutputError
-from geogs.evaluation.run_report import duration
+from geogs.evaluation.duration import duration
 
 if TYPE_CHECKING:
     from geogs.slam import SlamStatus

@@ -34,6 +34,7 @@ class Command:
 
 COMMANDS = {
     "run": Command("geogs.cli.run", "reconstruct a video, a folder of images or a data set"),
+    "fleet": Command("geogs.cli.fleet", "reconstruct many videos, on one machine or many"),
     "reconstruct": Command("geogs.cli.reconstruct", "reconstruct images whose poses are known"),
     "mesh": Command("geogs.cli.mesh", "make the mesh of a result anew, without running again"),
     "export": Command("geogs.cli.export", "write a result in the formats of other programs"),

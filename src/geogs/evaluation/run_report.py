@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from geogs.evaluation.duration import duration
 from geogs.evaluation.model_view.records import Model
 from geogs.evaluation.model_view.section import model_html
 from geogs.evaluation.page import (
@@ -69,16 +70,6 @@ def run_figures(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
         ("frames/s", f"{rate:.2f}" if isinstance(rate, int | float) else ""),
     ]
     return [(name, text) for name, text in shown if text]
-
-
-def duration(seconds: int | float) -> str:
-    """A time as people say it."""
-    whole = round(seconds)
-    if whole < 60:
-        return f"{seconds:.0f} s"
-    if whole < 3600:
-        return f"{whole // 60} min {whole % 60:02d} s"
-    return f"{whole // 3600} h {whole % 3600 // 60:02d} min"
 
 
 def run_sections(summary: Mapping[str, Any]) -> list[Section]:

@@ -1,0 +1,65 @@
+"""``geogs fleet run SOURCES``: many videos, each a run of its own, on Ray."""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated, cast
+
+from geogs.cli.options import Given, parse_options, record
+from geogs.config import Preset, preset
+from geogs.config.setting import Basic
+from geogs.errors import InputError
+from geogs.fleet.settings import FleetSettings
+
+EXIT_FAILED = 1
+"""Exit code where all has been tried, and a source failed."""
+
+
+@dataclass(frozen=True)
+class FleetOptions(FleetSettings):
+    """Reconstruct many videos, each on its own, on one machine or many: geogs fleet run clips/.
+
+    Needs pip install 'geogs[fleet]' (Ray) on every machine. Started again, it does what is missing,
+    and goes on from the checkpoints of what was under way.
+    """
+
+    preset: Preset = "default"
+    """Group of settings; single ones given beside it win."""
+    quiet: Annotated[bool, Basic("-q")] = False
+    """Say nothing but errors."""
+
+
+def main(argv: Sequence[str]) -> int:
+    """Run the command; returns 0, or 1 where a source failed: the table says which."""
+    words = list(argv)
+    if words and not words[0].startswith("-"):
+        if words[0] != "run":
+            raise InputError(f"geogs fleet cannot {words[0]}; it can run: geogs fleet run SOURCES.")
+        words = words[1:]
+    options = parse(words)
+
+    from geogs.fleet.run import run_fleet
+    from geogs.fleet.terminal import TerminalFleet, closing_words
+
+    begin = time.perf_counter()
+    settings = record(FleetSettings, options)
+    result = run_fleet(settings, TerminalFleet(options.quiet))
+    seconds = time.perf_counter() - begin
+    if not options.quiet:
+        print(closing_words(result.rows, result.computed, result.output, seconds))
+    return EXIT_FAILED if any(row.state != "done" for row in result.rows) else 0
+
+
+def parse(argv: Sequence[str]) -> FleetOptions:
+    """Options over those of a preset.
+
+    Raises:
+        SystemExit: after ``--help``.
+        InputError: an option is wrong or missing.
+    """
+    return parse_options(FleetOptions, argv, "fleet run", _defaults)
+
+
+def _defaults(given: Given) -> FleetOptions:
+    name = cast(Preset, given.get("preset", "default"))
+    return FleetOptions(config=preset(name), preset=name)

@@ -1,0 +1,162 @@
+"""Files and folders by their address: a path of this machine, or whatever fsspec can reach."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+from geogs.documents import expanded
+from geogs.errors import GeogsError, InputError, OutputError
+from geogs.io.writers.atomic import write_text
+
+
+class Place:
+    """A file or a folder, here or elsewhere."""
+
+    def __init__(self, address: str) -> None:
+        self.address = address
+
+    def __truediv__(self, name: str) -> "Place":
+        return Place(f"{self.address.rstrip('/')}/{name}")
+
+    @property
+    def path(self) -> Path | None:
+        """Where it lies on this machine; none if it does not."""
+        address = self.address.removeprefix("file://")
+        return None if "://" in address else expanded(address)
+
+    @property
+    def name(self) -> str:
+        """The last part of the address."""
+        return PurePosixPath(self.address.split("?")[0]).name
+
+    def read(self) -> str | None:
+        """The text of a file in UTF-8; none if there is no such file.
+
+        Raises:
+            InputError: it cannot be read.
+        """
+        try:
+            if self.path is not None:
+                return self.path.read_text("utf-8-sig")
+            with self._reached() as (system, path):
+                return str(system.cat_file(path).decode("utf-8-sig"))
+        except (FileNotFoundError, NotADirectoryError):
+            return None
+        except (OSError, UnicodeDecodeError) as error:
+            raise InputError(f"{self.address} cannot be read ({_reason(error)}).") from error
+
+    def write(self, text: str) -> None:
+        """Make a text file in UTF-8, completely or not at all.
+
+        Raises:
+            OutputError: it cannot be written.
+        """
+        if self.path is not None:
+            write_text(self.path, text)
+            return
+        try:
+            with self._reached() as (system, path):
+                system.pipe_file(path, text.encode("utf-8", "backslashreplace"))
+        except OSError as error:
+            raise OutputError(f"{self.address} cannot be written ({_reason(error)}).") from error
+
+    def delete(self) -> None:
+        """Remove a file, if it is there. Raises OutputError if it cannot be removed."""
+        try:
+            if self.path is not None:
+                self.path.unlink(missing_ok=True)
+                return
+            with self._reached() as (system, path):
+                system.rm_file(path)
+        except FileNotFoundError:
+            return
+        except OSError as error:
+            raise OutputError(f"{self.address} cannot be deleted ({_reason(error)}).") from error
+
+    def listed(self) -> dict[str, bool]:
+        """Names in a folder, and whether each is a folder; nothing if this is no folder.
+
+        Raises:
+            InputError: it cannot be read.
+        """
+        try:
+            if self.path is not None:
+                return {p.name: p.is_dir() for p in self.path.iterdir()}
+            with self._reached() as (system, path):
+                found = system.ls(path, detail=True)
+        except (FileNotFoundError, NotADirectoryError):
+            return {}
+        except OSError as error:
+            raise InputError(f"{self.address} cannot be read ({_reason(error)}).") from error
+        return {
+            PurePosixPath(entry["name"]).name: entry["type"] == "directory"
+            for entry in found
+            if entry["name"].strip("/") != path.strip("/")
+        }
+
+    def matching(self) -> list[str]:
+        """Addresses that fit a pattern, in their order; the address is the pattern."""
+        import glob
+
+        if self.path is not None:
+            return sorted(glob.glob(str(self.path), recursive=True))
+        with self._reached() as (system, path):
+            return sorted(system.unstrip_protocol(found) for found in system.glob(path))
+
+    def download(self, target: Path) -> None:
+        """Copy the file, or all in the folder, to a path of this machine.
+
+        Raises:
+            InputError: it is not there, or cannot be read.
+        """
+        try:
+            with self._reached() as (system, path):
+                if system.isfile(path):
+                    target.parent.mkdir(parents=True, exist_ok=True)
+                    system.get_file(path, str(target))
+                    return
+                files = system.find(path)
+                if not files:
+                    raise InputError(f"{self.address} does not exist; give a source that does.")
+                for file in files:
+                    inner = target / PurePosixPath(file).relative_to(path.rstrip("/"))
+                    inner.parent.mkdir(parents=True, exist_ok=True)
+                    system.get_file(file, str(inner))
+        except OSError as error:
+            raise InputError(f"{self.address} cannot be read ({_reason(error)}).") from error
+
+    def upload(self, file: Path) -> None:
+        """Copy a file of this machine here. Raises OutputError if it cannot be written."""
+        try:
+            with self._reached() as (system, path):
+                system.makedirs(str(PurePosixPath(path).parent), exist_ok=True)
+                system.put_file(str(file), path)
+        except OSError as error:
+            raise OutputError(f"{self.address} cannot be written ({_reason(error)}).") from error
+
+    @contextmanager
+    def _reached(self) -> Iterator[tuple[Any, str]]:
+        """The file system and the path in it. Raises InputError if there is none of that kind.
+
+        What a file system raises of its own kind leaves as an OSError.
+        """
+        try:
+            from fsspec.core import url_to_fs
+        except ImportError:
+            raise InputError(f"{self.address} needs fsspec: pip install 'geogs[fleet]'.") from None
+        try:
+            reached = url_to_fs(self.address)
+        except (ImportError, ValueError) as error:
+            raise InputError(f"{self.address} cannot be reached ({_reason(error)}).") from error
+        try:
+            yield reached
+        except (GeogsError, OSError):
+            raise
+        except Exception as error:
+            raise OSError(_reason(error)) from error
+
+
+def _reason(error: Exception) -> str:
+    said = getattr(error, "strerror", None) or str(error) or type(error).__name__
+    return said.splitlines()[0].rstrip(".")

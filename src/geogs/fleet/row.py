@@ -1,0 +1,65 @@
+"""What became of one source: a row of the fleet's table."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, fields
+from typing import Any, Literal
+
+from geogs.documents import UNUSABLE
+
+FILE = "source.json"
+"""Name of a row in the folder of its source; it is there once the source is done."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """A source, and how it ended."""
+
+    name: str
+    source: str
+    """Its address."""
+    state: Literal["done", "failed", "crashed"]
+    """crashed is worth another attempt: the machine or the process ended, not the work."""
+    sentence: str
+    """The verdict, or what went wrong."""
+    settings: str
+    """Digest of the settings it was computed with."""
+    is_reliable: bool | None = None
+    """The verdict; none where nothing was judged."""
+    seconds: float = 0.0
+    """Of the attempt that ended it."""
+    attempts: int = 1
+    node: str = ""
+    """Name of the machine of that attempt."""
+    numbers: dict[str, float] = field(default_factory=dict)
+    """Frames, keyframes, disks, mesh_faces, lost (share of the frames), peak_memory_bytes."""
+
+    @property
+    def trouble(self) -> tuple[int, float]:
+        """Higher comes first in the table: failed, not to be relied on, much of it lost."""
+        rank = 3 if self.state != "done" else {False: 2, None: 1, True: 0}[self.is_reliable]
+        return rank, self.numbers.get("lost", 0.0)
+
+
+def row_text(row: Row) -> str:
+    """A row as JSON."""
+    return json.dumps(asdict(row), indent=2)
+
+
+def read_row(text: str | None) -> Row | None:
+    """The row of a text that ``row_text`` made; none if there is none, or it is damaged."""
+    try:
+        given = json.loads(text or "")
+        row = Row(**{f.name: given[f.name] for f in fields(Row)})
+        return row if isinstance(row.numbers, dict) and isinstance(row.name, str) else None
+    except UNUSABLE:
+        return None
+
+
+def numbers_of(summary: Mapping[str, Any]) -> dict[str, float]:
+    """What the table shows of a ``summary.json``; what is not there is left out."""
+    names = ("frames", "keyframes", "disks", "mesh_faces", "peak_memory_bytes")
+    found = {name: summary.get(name) for name in names}
+    verdict = summary.get("verdict")
+    found["lost"] = verdict.get("lost") if isinstance(verdict, Mapping) else None
+    return {name: float(v) for name, v in found.items() if isinstance(v, int | float)}

@@ -1,0 +1,95 @@
+"""One attempt at one source, without Ray: what is fetched, delivered and said."""
+
+import sys
+import uuid
+from pathlib import Path
+
+import pytest
+
+from geogs.application import checkpoint_folder
+from geogs.application.settings import RunSettings
+from geogs.fleet import work_folder
+from geogs.fleet.attempt import Job, attempt, judged
+from geogs.fleet.places import Place
+from geogs.fleet.row import FILE, read_row
+from geogs.fleet.sources import FleetSource
+from geogs.fleet.supervise import Ending, Limits
+
+FAKE = (sys.executable, str(Path(__file__).with_name("fake_child.py")))
+
+
+@pytest.fixture(autouse=True)
+def scratch(tmp_path, monkeypatch):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+
+
+def job(source: str, output: str) -> Job:
+    return Job(FleetSource(source, "clip"), output, RunSettings(), "d", Limits(), FAKE)
+
+
+def test_results_here_have_their_row_last(tmp_path):
+    (tmp_path / "clip.mp4").write_text("ok")
+    row = attempt(job(str(tmp_path / "clip.mp4"), str(tmp_path / "out")))
+    assert (row.state, row.sentence, row.is_reliable) == ("done", "Good: ok.", True)
+    assert read_row((tmp_path / "out" / FILE).read_text()) == row
+
+
+def test_source_and_results_may_be_elsewhere(tmp_path):
+    pytest.importorskip("fsspec", reason="fsspec is not installed")
+    far = Place(f"memory://{uuid.uuid4().hex}")
+    (far / "clip.mp4").write("ok")
+    row = attempt(job((far / "clip.mp4").address, (far / "out").address))
+    assert row.state == "done"
+    assert read_row((far / "out" / FILE).read()) == row
+    assert {"summary.json", "run.log", FILE} <= set((far / "out").listed())
+    assert not list(tmp_path.rglob("clip.mp4"))  # nothing stays on the node
+
+
+def test_a_former_row_goes_before_the_work_begins(tmp_path):
+    (tmp_path / "clip.mp4").write_text("fail Bad.")
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / FILE).write_text("{}")
+    row = attempt(job(str(tmp_path / "clip.mp4"), str(tmp_path / "out")))
+    assert (row.state, row.sentence) == ("failed", "Bad.")
+    assert not (tmp_path / "out" / FILE).exists()
+
+
+def test_a_source_that_is_gone_is_a_row():
+    pytest.importorskip("fsspec", reason="fsspec is not installed")
+    far = f"memory://{uuid.uuid4().hex}"
+    row = attempt(job(f"{far}/none.mp4", f"{far}/out"))
+    assert (row.state, "does not exist" in row.sentence) == ("failed", True)
+
+
+@pytest.mark.parametrize(
+    ("ending", "state", "said"),
+    [
+        (Ending(0, '{"state": "done", "sentence": ""}'), "done", ""),
+        (Ending(0, '{"state": "failed", "sentence": "No."}'), "failed", "No."),
+        (Ending(-11, ""), "crashed", "SIGSEGV"),
+        (Ending(1, "nonsense"), "failed", "error of the program"),
+        (Ending(-9, "", "time"), "failed", "longer than 1 min 30 s"),
+        (Ending(-9, "", "memory"), "failed", "more than 2 GiB"),
+    ],
+)
+def test_what_an_ending_means(ending, state, said):
+    found, sentence = judged(ending, Limits(90.0, 2 << 30), "run.log")
+    assert (found, said in sentence) == (state, True)
+
+
+def test_the_name_of_the_manifest_is_that_of_checkpoints():
+    assert work_folder._MANIFEST == checkpoint_folder.MANIFEST
+
+
+def test_a_checkpoint_elsewhere_moves_between_nodes_and_its_manifest_comes_last(tmp_path):
+    pytest.importorskip("fsspec", reason="fsspec is not installed")
+    far = Place(f"memory://{uuid.uuid4().hex}")
+    first = work_folder.WorkFolder(far)
+    (first.path / "checkpoint").mkdir()
+    for name in ("manifest.json", "state-1.json", ".manifest.json.part"):
+        (first.path / "checkpoint" / name).write_text(name)
+    first.keep_checkpoint()
+    assert set((far / "checkpoint").listed()) == {"manifest.json", "state-1.json"}
+    (first.path / "checkpoint" / "state-1.json").unlink()
+    second = work_folder.WorkFolder(far)  # what is here gives way to what is there
+    assert (second.path / "checkpoint" / "state-1.json").read_text() == "state-1.json"
