@@ -324,7 +324,7 @@ def run_on(frames: list[np.ndarray], folder: Path) -> list[str]:
 def test_a_camera_that_does_not_move_leaves_orientations(name, tmp_path, capsys):
     frames, words = TURNING[name]
     assert cli.main(run_on(frames, tmp_path)) == 0
-    said = " ".join(capsys.readouterr().err.split())
+    said = " ".join(capsys.readouterr().out.split())
     assert "Rotation only: no shape." in said
     assert words in said
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())

@@ -31,7 +31,7 @@ from geogs.types import Frame
 
 _log = logging.getLogger(__name__)
 T = TypeVar("T")
-LEAST_EDGE = 16
+LEAST_EDGE = 12
 """Pixels of the shorter side of a working image."""
 MINUTE = 60.0
 """Seconds of a video that are looked at for its readout."""
