@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from geogs.application.offline import filled
 from geogs.photos.features import find_features
 from geogs.photos.localise import Localiser, matches_to_points
 from geogs.photos.sharp_frames import sharpest_frames, sharpness, stretch_length
@@ -46,19 +45,6 @@ def test_a_point_seen_twice_does_not_compete_with_itself():
     # Another point that looks the same does.
     own, _ = matches_to_points(looks[:1] ^ 2, twice[[0, 20]], random.normal(size=(2, 3)))
     assert not len(own)
-
-
-def test_frames_without_a_pose_lie_between_those_around():
-    T_wc = np.tile(np.eye(4), (5, 1, 1))
-    T_wc[1, :3, 3], T_wc[3, :3, 3] = (1, 0, 0), (3, 2, 0)
-    T_wc[3, :3, :3] = Rotation.from_euler("y", 30, degrees=True).as_matrix()
-    found = np.array([False, True, False, True, False])
-    made = np.linalg.inv(filled(np.linalg.inv(T_wc), found))
-    np.testing.assert_allclose(made[2, :3, 3], (2, 1, 0), atol=1e-12)
-    turned = Rotation.from_matrix(made[2, :3, :3]).magnitude()
-    assert turned == pytest.approx(np.radians(15))
-    np.testing.assert_allclose(made[0], T_wc[1], atol=1e-12)
-    np.testing.assert_allclose(made[4], T_wc[3], atol=1e-12)
 
 
 @pytest.mark.system

@@ -116,11 +116,9 @@ def _write_images(folder: Path, result: SavedResult) -> list[PosedImage]:
 
 def _maps(number: int, result: SavedResult, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     """Depth and normals of a keyframe inside its mask, rendered for another camera."""
-    maps, mask = (
-        result.render(torch.from_numpy(result.views.T_cw[number]), camera),
-        result.mask(number),
-    )
+    maps = result.render(torch.from_numpy(result.views.T_cw[number]), camera)
     depth, normal = maps.depth.cpu().numpy(), maps.normal.cpu().numpy()
+    mask = result.mask(number)
     if mask is not None:
         inside = _full_size(mask, camera)
         depth, normal = np.where(inside, depth, 0), np.where(inside[..., None], normal, 0)

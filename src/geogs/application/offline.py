@@ -4,10 +4,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
-import numpy as np
 import torch
-from jaxtyping import Bool, Float64
-from scipy.spatial.transform import Rotation, Slerp
+from jaxtyping import Float64
+from torch import Tensor
 
 from geogs.application.folder_lock import only_writer
 from geogs.application.forecast import reconstruction_forecast
@@ -31,6 +30,7 @@ from geogs.photos.video import PlacedFrames, place_frames
 from geogs.reconstruction import Reconstruction
 from geogs.stopwatch import Stopwatch
 from geogs.threads import on_one_torch_thread
+from geogs.tracking.gaps import bridged
 from geogs.types import MapSnapshot, RenderedKeyframe, Trajectory, Uncertainty
 
 
@@ -92,7 +92,7 @@ def _to_folder(
         source = opened if is_known else opened.with_calibration(_of_source(opened, placed))
         scene = Reconstruction(source.camera, own, str(device))
         with stopwatch("placing frames"):
-            T_cw, found = _place_all(source, scene, placed, len(chosen.timestamps), own, report)
+            T_cw = _place_all(source, scene, placed, len(chosen.timestamps), own, report)
         try:
             scene.finish(placed.all_points(), report)
             finished = True
@@ -103,7 +103,7 @@ def _to_folder(
             finished = False
         for stage, seconds in scene.stopwatch.seconds.items():
             stopwatch.seconds[stage] = stopwatch.seconds.get(stage, 0.0) + seconds
-        video = OfflineScene(scene, stopwatch, chosen, placed, T_cw, found)
+        video = OfflineScene(scene, stopwatch, chosen, placed, T_cw)
         result = Result(video, source, not finished, progress)
         write_results(output, result, (), settings.keyframe_images)
     return Written(output, result, False)
@@ -117,9 +117,8 @@ class OfflineScene:
     stopwatch: Stopwatch
     chosen: ChosenFrames
     placed: PlacedFrames
-    T_cw: Float64[np.ndarray, "n 4 4"]
-    """World to camera of all frames; between others where ``found`` is false."""
-    found: Bool[np.ndarray, "n"]
+    T_cw: Sequence[Float64[Tensor, "4 4"] | None]
+    """World to camera of all frames; none of those that found no place."""
 
     @property
     def config(self) -> ReconstructConfig:
@@ -132,9 +131,9 @@ class OfflineScene:
         return len(self.T_cw)
 
     def trajectory(self) -> Trajectory:
-        """Poses of all frames."""
+        """Poses of all frames, between others where one has none."""
         times = self.chosen.timestamps[: self.frames]
-        return Trajectory(times, np.linalg.inv(self.T_cw), self.found)
+        return bridged(times, self.T_cw, [None] * self.frames)
 
     def keyframe_trajectory(self) -> Trajectory:
         """Poses of the frames that structure from motion placed."""
@@ -164,11 +163,12 @@ class OfflineScene:
 
     def particulars(self) -> Mapping[str, object]:
         """That nothing was tracked, and how the poses were found."""
+        found = sum(pose is not None for pose in self.T_cw)
         return {
             "offline": {
                 "sharp_frames": len(self.chosen.frames),
                 "placed_by_structure": len(self.placed.numbers),
-                "placed_against_the_map": int(np.sum(self.found)) - len(self.placed.numbers),
+                "placed_against_the_map": found - len(self.placed.numbers),
                 "reprojection_error": self.placed.error,
                 "calibration": asdict(self.placed.calibration),
             }
@@ -182,13 +182,13 @@ def _place_all(
     count: int,
     config: ReconstructConfig,
     report: Progress,
-) -> tuple[Float64[np.ndarray, "n 4 4"], Bool[np.ndarray, "n"]]:
-    """Poses of all frames and which were found; those of structure from motion go to ``scene``."""
+) -> list[Float64[Tensor, "4 4"] | None]:
+    """Poses of the frames that find a place; those of structure from motion go to ``scene``."""
     localiser = Localiser(
         placed.positions, placed.descriptors, placed.numbers, source.camera, config.seed
     )
     of = dict(zip(placed.numbers, placed.T_cw, strict=True))
-    T_cw, found = np.tile(np.eye(4), (count, 1, 1)), np.zeros(count, bool)
+    T_cw: list[Tensor | None] = [None] * count
     for frame in source:
         pose = of.get(frame.index)
         if pose is not None:
@@ -196,26 +196,9 @@ def _place_all(
         else:
             pose = localiser.place(frame.index, frame.image)
         if pose is not None:
-            T_cw[frame.index], found[frame.index] = pose, True
+            T_cw[frame.index] = torch.from_numpy(pose)
         report("placing frames", (frame.index + 1) / count)
-    return filled(T_cw, found), found
-
-
-def filled(T_cw: Float64[np.ndarray, "n 4 4"], found: np.ndarray) -> Float64[np.ndarray, "n 4 4"]:
-    """The poses with those that were not found put between the ones around, or held at the ends."""
-    known = np.flatnonzero(found)
-    T_wc = np.linalg.inv(T_cw)
-    at = np.clip(np.arange(len(T_cw)), known[0], known[-1]).astype(float)
-    made = T_wc.copy()
-    if len(known) > 1:
-        turns = Slerp(known, Rotation.from_matrix(T_wc[known, :3, :3]))(at).as_matrix()
-        made[:, :3, :3] = turns
-        for axis in range(3):
-            made[:, axis, 3] = np.interp(at, known, T_wc[known, axis, 3])
-    else:
-        made[:] = T_wc[known[0]]
-    made[known] = T_wc[known]
-    return np.linalg.inv(made)
+    return T_cw
 
 
 def _of_source(source: Stream, placed: PlacedFrames) -> Calibration:

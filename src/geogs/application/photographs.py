@@ -7,6 +7,7 @@ from pathlib import Path
 from geogs.application.interrupt import Stop
 from geogs.application.progress import RunProgress
 from geogs.config import ReconstructConfig
+from geogs.documents import expanded, read_json
 from geogs.errors import InputError
 from geogs.io.sources.posed.base import PosedSource
 from geogs.io.sources.posed.colmap import open_colmap
@@ -84,7 +85,7 @@ def _source(
     left_out = [(out.name, out.reason) for out in found.left_out]
     left_out += [(names[i], "was taken with quite another camera than most") for i in unlike]
     posed = posed.only([i for i in range(len(names)) if i not in set(unlike)])
-    name = folder.expanduser().resolve().name
+    name = expanded(folder).resolve().name
     posed = replace(posed, kind="photographs", name=name, left_out=tuple(left_out))
     return PosedSource(posed, auto, hold_out)
 
@@ -108,8 +109,8 @@ def _tell(
 def _read(note: Path) -> FoundPoses:
     """What an earlier call found. Raises InputError if that cannot be read."""
     try:
-        values = json.loads(note.read_text(encoding="utf-8"))
+        values = read_json(note)
         left_out = tuple(LeftOut(str(o["name"]), str(o["reason"])) for o in values["left_out"])
         return FoundPoses(tuple(map(str, values["placed"])), left_out, float(values["error"]))
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError) as error:
         raise InputError(f"{note} is damaged ({error}); leave out --resume.") from error
