@@ -32,6 +32,14 @@ Once = Callable[[str, Callable[[Path], object]], Path]
 """Of a name and what fills a folder: the folder, filled by whoever asks first."""
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Tests that share what their module has made go to one process, which makes it once."""
+    for item in items:
+        used = item._fixtureinfo.name2fixturedefs.values()
+        if any(made.scope == "module" for definitions in used for made in definitions):
+            item.add_marker(pytest.mark.xdist_group(item.nodeid.partition("::")[0]))
+
+
 @pytest.fixture(scope="session")
 def once(tmp_path_factory) -> Once:
     """Folders that are filled once for all tests, those in other processes of pytest-xdist too.
