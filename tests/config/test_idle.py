@@ -25,7 +25,7 @@ CASES = {
     "--mapping.pose-lr 1e-3 --mapping.pose-iterations 0": "mapping.pose-lr does nothing",
     "--mapping.final-pose-rounds 2 --mapping.pose-iterations 0": "final-pose-rounds does nothing",
     "--loop.matches --loop.no-enabled": "loop.matches does nothing",
-    "--mapping.depth.weights x": "mapping.depth.weights does nothing: the engine classical",
+    "--mapping.depth.engine classical --mapping.depth.weights x": "the engine classical has none",
     "--mapping.disk.no-carve --mapping.disk.carve-every 3": "mapping.disk.carve-every does",
     "--mapping.loss.smoothness-eta 3": "mapping.loss.smoothness-eta does nothing",
     "--mapping.loss.ablation.smoothness-rewards-edges": "rewards-edges does nothing",

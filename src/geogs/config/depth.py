@@ -19,9 +19,10 @@ from geogs.config.setting import (
 class DepthConfig(Settings, group="mapping.depth"):
     """Dense depth of a keyframe before any disk is made."""
 
-    engine: Literal["classical", "network", "joint", "tracker"] = "classical"
+    engine: Literal["auto", "classical", "network", "joint", "tracker"] = "auto"
     """Who finds depth: matching without a network, the network of geogs train depth, both, each
-    where it is surer, or nobody: the tracker's own depth, enlarged, as the paper has it."""
+    where it is surer (auto on a GPU; on a CPU that is classical), or nobody: the tracker's own
+    depth, enlarged, as the paper has it."""
     weights: str = ""
     """Weights file of the network; "" takes the one that is found."""
     network_edge: Annotated[int, Range(32, 16384)] = 512

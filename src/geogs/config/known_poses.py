@@ -4,6 +4,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Annotated
 
+from geogs.config.depth import DepthConfig
 from geogs.config.input import InputConfig
 from geogs.config.losses import LossConfig
 from geogs.config.mapping import MappingConfig, PhotoConfig
@@ -42,7 +43,8 @@ def known_pose_mapping() -> MappingConfig:
     """Mapping where poses are exact: the images say more about the surface than the first depths.
 
     So photo-consistency weighs more than in a run, down to faint texture, and the occlusion test is
-    sharper; disks move in smaller steps.
+    sharper; disks move in smaller steps; depths are searched without the network, which is less
+    precise than what exact poses allow.
     """
     loss = LossConfig(
         depth_weight=0.5,
@@ -64,6 +66,7 @@ def known_pose_mapping() -> MappingConfig:
         lr_final=0.03,
         max_spread=0.003,
         photo=PhotoConfig(per_step=4),
+        depth=DepthConfig(engine="classical"),
         loss=loss,
     )
 

@@ -44,7 +44,12 @@ def preset(name: Preset) -> Config:
     base = Config()
     if name == "fast":
         mapping = replace(
-            base.mapping, iterations=5, pose_iterations=0, final_iterations=100, final_depth=False
+            base.mapping,
+            iterations=5,
+            pose_iterations=0,
+            final_iterations=100,
+            final_depth=False,
+            depth=replace(base.mapping.depth, engine="classical"),
         )
         return replace(base, mapping=mapping)
     if name == "accurate":

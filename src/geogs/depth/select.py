@@ -20,9 +20,12 @@ def depth_engine(
     Raises InputError if the network is asked for and no weights are found or they do not fit.
     """
     classical = _classical(device, render, working, config, resident)
-    if config.engine == "classical":
+    engine = config.engine
+    if engine == "auto":
+        engine = "joint" if torch.device(device).type == "cuda" else "classical"
+    if engine == "classical":
         return classical
-    if config.engine == "tracker":
+    if engine == "tracker":
         from geogs.depth.tracker import TrackerDepthEngine
 
         return TrackerDepthEngine(classical, torch.device(device), render, working)
@@ -34,7 +37,7 @@ def depth_engine(
     network = NetworkDepthEngine(
         trained, classical, torch.device(device), render, working, config, resident
     )
-    if config.engine == "network":
+    if engine == "network":
         return network
     from geogs.depth.network.joint import JointDepthEngine
 

@@ -14,6 +14,7 @@ from torch.nn import functional
 from geogs.config import DepthConfig
 from geogs.depth.base import DepthEngine, Limits, Progress, silent
 from geogs.depth.completion import known_cells
+from geogs.depth.network.recorded import RecordedSearch
 from geogs.depth.network.search_range import SearchRange, search_range
 from geogs.depth.network.views import DepthPrediction, StereoViews
 from geogs.depth.network.weights import TrainedDepth
@@ -61,6 +62,7 @@ class NetworkDepthEngine:
         self.network = trained.network.to(device)
         lens = [self.seen.fx, self.seen.fy, self.seen.cx, self.seen.cy]
         self._intrinsics = torch.tensor([lens], dtype=torch.float32, device=device)
+        self._recorded = RecordedSearch(lambda views: self._at_render(self.network(views)))
         self._images: Swap[int, UInt8[Tensor, "h w 3"]] = Swap(resident)
 
     def observe(self, view: DepthView) -> None:
@@ -101,8 +103,7 @@ class NetworkDepthEngine:
         self, reference: DepthView, others: Sequence[DepthView], limits: Limits | None
     ) -> DenseDepth:
         between = self._range(reference, others, limits)
-        prediction = self.network(self._views(reference, others, between))
-        depth, confidence, normal = self._at_render(prediction)
+        depth, confidence, normal = self._recorded(self._views(reference, others, between))
         (dense,) = dense_depths([(between.typical * depth, confidence)])
         return replace(dense, normal=normal)
 

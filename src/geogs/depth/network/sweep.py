@@ -80,8 +80,8 @@ def see_planes(
         rays.norm(dim=1)[:, None] * point.square().sum(1).sqrt().clamp_min(1e-6)
     )
     cells = (pixels - (CELL - 1) / 2) / CELL
-    limit = cells.new_tensor([width, height])[:, None, None] - 0.5
-    inside = ((cells > -0.5) & (cells < limit)).all(1)
+    x, y = cells.unbind(1)
+    inside = (x > -0.5) & (x < width - 0.5) & (y > -0.5) & (y < height - 0.5)
     return PlaneViews(
         cells.movedim(1, -1),
         inside & (depth > LEAST_Z),
@@ -96,6 +96,6 @@ def sample_cells(
 ) -> Float[Tensor, "b c d p"]:
     """Bilinear features at positions among the cells; zero outside."""
     height, width = features.shape[-2:]
-    size = cells.new_tensor([width, height])
-    grid = (2 * cells + 1) / size - 1
+    x, y = cells.unbind(-1)
+    grid = torch.stack([(2 * x + 1) / width - 1, (2 * y + 1) / height - 1], -1)
     return functional.grid_sample(features, grid.clamp(-4, 4), align_corners=False)
