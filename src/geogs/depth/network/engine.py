@@ -154,7 +154,7 @@ class NetworkDepthEngine:
         maps = torch.cat([found.log_depth[:, None], confidence[:, None], normal], 1)
         maps = resampled(maps, (self.render.height, self.render.width))[0]
         length = maps[2:].norm(dim=0)
-        unit = torch.where(length > 0.5, maps[2:] / length.clamp_min(1e-6), 0.0)
+        unit = maps[2:] / length.clamp_min(1e-6) * (length > 0.5)
         return maps[0].exp(), maps[1].contiguous(), unit.movedim(0, -1).contiguous()
 
 

@@ -1,5 +1,6 @@
 """The network as a recorded sequence of kernels: its thousand launches cost the CPU one."""
 
+import logging
 from collections.abc import Callable
 from dataclasses import fields
 
@@ -7,6 +8,8 @@ import torch
 from torch import Tensor
 
 from geogs.depth.network.views import StereoViews
+
+_log = logging.getLogger(__name__)
 
 Maps = tuple[Tensor, ...]
 """What is made of views, on their device."""
@@ -16,12 +19,13 @@ class RecordedSearch:
     """Does ``work``, which no value of the views may change the course of.
 
     On a GPU it is recorded as a CUDA graph at the first views of each number of neighbours, and
-    played back from then on; the images are all of one size. Elsewhere it is called as it is.
+    played back from then on; the images are all of one size. Elsewhere, and where a driver cannot
+    record it, it is called as it is.
     """
 
     def __init__(self, work: Callable[[StereoViews], Maps]) -> None:
         self._work = work
-        self._recordings: dict[int, _Recording] = {}
+        self._recordings: dict[int, Callable[[StereoViews], Maps]] = {}
 
     def __call__(self, views: StereoViews) -> Maps:
         """What ``work`` returns."""
@@ -29,8 +33,17 @@ class RecordedSearch:
             return self._work(views)
         count = views.others.shape[1]
         if count not in self._recordings:
-            self._recordings[count] = _Recording(self._work, views)
+            self._recordings[count] = self._recorded(views)
         return self._recordings[count](views)
+
+    def _recorded(self, views: StereoViews) -> Callable[[StereoViews], Maps]:
+        try:
+            return _Recording(self._work, views)
+        except torch.cuda.OutOfMemoryError:
+            raise
+        except RuntimeError as error:
+            _log.warning("The depth network is slower than it could be: %s", error)
+            return self._work
 
 
 class _Recording:
