@@ -70,7 +70,7 @@ def test_the_mesh_lies_on_the_room_in_metres_without_alignment(room, result):
 def test_it_leaves_every_file_and_the_given_poses(room, result):
     names = [
         "trajectory.tum", "keyframes.tum", "intrinsics.json", "mesh.ply", "splats.ply",
-        "map.safetensors", "config.yaml", "summary.json", "report/mesh.png",
+        "map.safetensors", "config.yaml", "summary.json", "report/keyframes.png",
     ]  # fmt: skip
     assert [n for n in names if not (result / n).is_file()] == []
     given = np.loadtxt(room / "traj.txt").reshape(-1, 4, 4)[::5]

@@ -74,7 +74,7 @@ def test_objects_are_seen_from_three_cameras_and_rooms_from_above():
 
 
 def test_page_of_a_run_holds_its_numbers_and_pictures(tmp_path):
-    Image.new("RGB", (20, 10), "red").save(tmp_path / "mesh.png")
+    Image.new("RGB", (20, 10), "red").save(tmp_path / "keyframes.png")
     (tmp_path / "trajectory.png").write_bytes(b"cut off")
     summary = {
         "source": "room", "frames": 1234, "skipped_images": 0, "device": "cpu",
@@ -90,12 +90,12 @@ def test_page_of_a_run_holds_its_numbers_and_pictures(tmp_path):
         "4.50 until stream end",
         "1024 MiB",
         "<td>tracking</td>",
-        '<h2>Mesh</h2>\n<figure><img src="data:image/webp;base64,',
+        '<h2>Rendered keyframes</h2>\n<figure><img src="data:image/webp;base64,',
         "<dt>frames</dt><dd>1 234</dd>",
         "<dd>3 s</dd>",
     ):
         assert text in page
-    for text in ("skipped", "stopped early", "Rendered keyframes", "Trajectory", ".png"):
+    for text in ("skipped", "stopped early", "Trajectory", ".png"):
         assert text not in page
 
 

@@ -72,8 +72,6 @@ def evaluate(settings: EvalSettings) -> Evaluation:
     run = run_sections(summary) if summary else []
     judged = figures(summary, run_figures(summary)[:4]) if summary else None
     model = model_beside_truth(settings.output, trajectory, surface) if settings.plots else None
-    if model is not None:
-        pictures = [(name, file) for name, file in pictures if file.name != "mesh.png"]
     write_report(
         evaluation, settings.output / "eval.json", page, pictures, run, title, judged, model
     )

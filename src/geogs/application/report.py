@@ -20,15 +20,13 @@ def write_report(
     summary: Mapping[str, object],
     disks: MapSnapshot | None = None,
 ) -> None:
-    """A model that turns, the path, renders beside images, the shaded mesh, and the numbers of
-    the summary.
+    """A model that turns, the path, renders beside images, and the numbers of the summary.
 
     Raises:
         OutputError: a file cannot be written.
     """
     from geogs.evaluation import plots
     from geogs.evaluation.run_report import write_run_page
-    from geogs.evaluation.shading import viewpoints
 
     folder.mkdir(exist_ok=True)
     plots.plot_path(folder / "trajectory.png", trajectory)
@@ -41,15 +39,6 @@ def write_report(
             [r.depth.cpu().numpy() for r in shown],
             [r.normal.cpu().numpy() for r in shown],
         )
-    if mesh is not None:
-        views = viewpoints(mesh.vertices, trajectory.T_wc[trajectory.tracked], renders[0].camera)
-        colourings = {"mesh": None, "colours": mesh.colours}
-        surfaces = [
-            (name, mesh.vertices, mesh.faces, colours)
-            for name, colours in colourings.items()
-            if name == "mesh" or colours is not None
-        ]
-        plots.plot_meshes(folder / "mesh.png", surfaces, views)
     model = None
     if renders:
         keyframes, camera = shown_views(renders), renders[0].camera

@@ -17,7 +17,6 @@ from geogs.evaluation.page import (
 )
 
 PICTURES = {
-    "mesh.png": "Mesh",
     "keyframes.png": "Rendered keyframes",
     "trajectory.png": "Trajectory",
 }
@@ -30,7 +29,7 @@ def write_run_page(folder: Path, summary: Mapping[str, Any], model: Model | None
     Args:
         folder: ``report/`` of a result.
         summary: what ``summary.json`` holds; numbers that are not there are left out.
-        model: what turns at its head, instead of pictures of the mesh.
+        model: what turns at its head.
 
     Raises:
         OutputError: it cannot be written.
@@ -38,11 +37,7 @@ def write_run_page(folder: Path, summary: Mapping[str, Any], model: Model | None
     name = str(summary.get("source", "")) or "result"
     head: list[Section] = [figures(summary, run_figures(summary))]
     head += [HtmlSection(model_html(model))] if model is not None else []
-    pictures = [
-        PictureSection(title, folder / file)
-        for file, title in PICTURES.items()
-        if model is None or file != "mesh.png"
-    ]
+    pictures = [PictureSection(title, folder / file) for file, title in PICTURES.items()]
     sections = [*head, *pictures, *run_sections(summary)]
     write_page(folder / "index.html", name, sections, "geogs", is_whole=True)
 

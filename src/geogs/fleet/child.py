@@ -22,7 +22,7 @@ PATIENCE = 60.0
 """Seconds to wait for an earlier attempt that still writes into the folder."""
 THUMBNAIL = "thumbnail.webp"
 _LARGEST = (320, 200)
-_PICTURES = ("mesh.png", "keyframes.png", "trajectory.png")
+_PICTURES = ("keyframes.png", "trajectory.png")
 
 
 def main() -> int:
