@@ -60,7 +60,7 @@ class Star:
     """Over the relative motions of its k edges, then shared unknowns; float64."""
     gradient: Float[Tensor, "m"]
     information: Float[Tensor, "p"]
-    """sum w |dp/dd|^2."""
+    """sum w |dp/dd|^2, and what was measured beside."""
     residual: Float[Tensor, "k"]
     """As in ``BundleResult``."""
     depth: EliminatedDepth | None
@@ -162,7 +162,11 @@ def linearise_stars(
         depth = None
         if bool(problem.free_depth[frame]):
             damped = damped_curvature(c, options.depth_damping, problem.damping_of(frame))
-            depth = EliminatedDepth(coupling[e].flatten(0, 1), damped, depth_gradient[e].sum(0))
+            b = depth_gradient[e].sum(0)
+            if problem.measured is not None:
+                curved, pull = problem.measured.pull(frame, d[frame], options.huber)
+                c, damped, b = c + curved, damped + curved, b + pull
+            depth = EliminatedDepth(coupling[e].flatten(0, 1), damped, b)
             block, g = depth.reduce(block, g)
         stars.append(Star(frame, j[e], adjoint[e], block, g, c, residual[e], depth))
     return stars

@@ -12,6 +12,32 @@ Matches = Callable[[slice], tuple[Float[Tensor, "e p 2"], Float[Tensor, "e p 2"]
 
 
 @dataclass(frozen=True)
+class MeasuredDepths:
+    """Inverse depths that were measured beside the matches, each on its own; robust by Huber."""
+
+    inverse_depth: Float[Tensor, "n p"]
+    information: Float[Tensor, "n p"]
+    """Inverse variances; 0 where nothing was measured."""
+
+    def of(self, frame: int) -> tuple[Float[Tensor, "p"], Float[Tensor, "p"]]:
+        """Measurements of a frame and their information."""
+        return self.inverse_depth[frame], self.information[frame]
+
+    def pull(
+        self, frame: int, inverse_depth: Float[Tensor, "p"], huber: float
+    ) -> tuple[Float[Tensor, "p"], Float[Tensor, "p"]]:
+        """Curvature and gradient a, a (measured - d) of a frame at inverse depths d.
+
+        a is the information times Huber's factor ``min(1, huber / |residual| in deviations)``.
+        """
+        measured, information = self.of(frame)
+        residual = measured - inverse_depth
+        norm = information.sqrt() * residual.abs()
+        curvature = information * (huber / norm.clamp(min=huber))
+        return curvature, curvature * residual
+
+
+@dataclass(frozen=True)
 class BundleProblem:
     """Frames and edges of one adjustment; edges are sorted by source.
 
@@ -31,6 +57,7 @@ class BundleProblem:
     free_depth: Bool[Tensor, "n"]
     damping: Float[Tensor, "n p"] | None = None
     """Added to the curvature sum_e w |dp/dd|^2 of each inverse depth (DROID-SLAM's eta)."""
+    measured: MeasuredDepths | None = None
 
     def damping_of(self, frame: int) -> Float[Tensor, "p"] | float:
         """``damping`` of a frame; zero where there is none."""
@@ -49,13 +76,14 @@ class StreamedProblem:
     free_pose: Bool[Tensor, "n"]
     free_depth: Bool[Tensor, "n"]
     damping: Float[Tensor, "n p"] | None = None
+    measured: MeasuredDepths | None = None
 
     def part(self, edges: slice) -> BundleProblem:
         """The same frames with some of the edges."""
         pixels, weight = self.matches(edges)
         return BundleProblem(
             self.T_cw, self.inverse_depth, self.source[edges], self.target[edges], pixels, weight,
-            self.free_pose, self.free_depth, self.damping,
+            self.free_pose, self.free_depth, self.damping, self.measured,
         )  # fmt: skip
 
 

@@ -104,7 +104,11 @@ class StreamedBundle:
                 if bool(part.free_depth[frame]):
                     c, extra = curvature[e].sum(0), part.damping_of(frame)
                     damped = damped_curvature(c, options.depth_damping, extra)
-                    steps.append((frame, gradient[e].sum(0) / damped))
+                    b = gradient[e].sum(0)
+                    if part.measured is not None:
+                        curved, pull = part.measured.pull(frame, d[frame], options.huber)
+                        damped, b = damped + curved, b + pull
+                    steps.append((frame, b / damped))
             return steps
 
         delta = torch.zeros_like(d)
