@@ -159,13 +159,13 @@ def linearise_stars(
     stars = []
     for frame, e in sources_within(i):
         block, g, c = torch.block_diag(*H[e]), v[e].reshape(-1), curvature[e].sum(0)
+        damped = damped_curvature(c, options.depth_damping, problem.damping_of(frame))
+        b = depth_gradient[e].sum(0)
+        if problem.measured is not None:
+            curved, pull = problem.measured.pull(frame, d[frame], options.huber)
+            c, damped, b = c + curved, damped + curved, b + pull
         depth = None
         if bool(problem.free_depth[frame]):
-            damped = damped_curvature(c, options.depth_damping, problem.damping_of(frame))
-            b = depth_gradient[e].sum(0)
-            if problem.measured is not None:
-                curved, pull = problem.measured.pull(frame, d[frame], options.huber)
-                c, damped, b = c + curved, damped + curved, b + pull
             depth = EliminatedDepth(coupling[e].flatten(0, 1), damped, b)
             block, g = depth.reduce(block, g)
         stars.append(Star(frame, j[e], adjoint[e], block, g, c, residual[e], depth))

@@ -103,6 +103,13 @@ class MotionProblem:
     weight: Float[Tensor, "e p 2"]
 
 
+def known_before(problem: BundleProblem | StreamedProblem) -> Float[Tensor, "n p"]:
+    """Information of every inverse depth without its matches: of what was measured beside them."""
+    if problem.measured is None:
+        return torch.zeros_like(problem.inverse_depth)
+    return problem.measured.information.clone()
+
+
 def sources_within(source: Int[Tensor, "e"]) -> list[tuple[int, slice]]:
     """The sources of sorted edges and which edges are theirs."""
     frames, counts = torch.unique_consecutive(source, return_counts=True)

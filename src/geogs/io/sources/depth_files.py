@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
 
 import cv2
 import numpy as np
@@ -12,6 +11,7 @@ from geogs.geometry.camera import Camera
 from geogs.geometry.distortion import distorted_pixels
 from geogs.io.pictures import decoded
 from geogs.io.sources.calibration import Calibration
+from geogs.io.sources.undistort import Rectifier
 
 SAME_SURFACE = 0.03
 """Relative difference of depth up to which neighbouring pixels are interpolated."""
@@ -50,21 +50,6 @@ class DepthFile:
         return np.where(unknown, np.float32(0), metres)
 
 
-class Straightener(Protocol):
-    """What made the working image."""
-
-    @property
-    def resized_camera(self) -> Camera:
-        """Of the image before its lens is straightened."""
-        ...
-
-    def places(
-        self, offsets: Float[np.ndarray, "h w 2"] | None = None
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Column and row of each pixel of the working image in that one."""
-        ...
-
-
 @dataclass(frozen=True)
 class RectifiedDepth:
     """The same of the pixels of a working image, made when it is asked for."""
@@ -72,7 +57,8 @@ class RectifiedDepth:
     file: DepthFile
     colour: Calibration
     """Of the image as it came."""
-    rectifier: Straightener
+    rectifier: Rectifier
+    """What made the working image."""
     offsets: Float[np.ndarray, "h w 2"] | None = None
     """By which its rows were moved, since the shutter rolls."""
 
