@@ -105,6 +105,7 @@ class Slam:
         """Whether the map was trained over all keyframes at the end."""
         self._is_ended = False
         self._known: Uncertainty | None = None
+        self._told_scale: MetricScale | None = None
 
     def new_tracker(self) -> Tracker:
         """A tracker of another segment."""
@@ -149,12 +150,12 @@ class Slam:
 
     @property
     def metric_scale(self) -> MetricScale | None:
-        """By what lengths are metres, as a depth sensor that started the map makes them; else None.
+        """By what lengths are metres: what :meth:`rescale` was told, or a depth sensor; else None.
 
-        All its depths share a part of their error, which is the scale's.
+        All depths of a sensor share a part of their error, which is the scale's.
         """
-        if not self.segments.world.is_metric:
-            return None
+        if self._told_scale is not None or not self.segments.world.is_metric:
+            return self._told_scale
         return MetricScale("depth sensor", 1.0, self.config.sensor.share)
 
     @property
@@ -210,6 +211,18 @@ class Slam:
         with self.stopwatch("final mapping"):
             self.mapper.refine(lambda f: progress("map refinement", f))
         self.is_refined = self.will_refine
+
+    @on_one_torch_thread
+    def rescale(self, scale: MetricScale) -> None:
+        """Multiply all lengths of poses, depths and map, after which they are metres."""
+        keyframes, factor = self.segments.world.keyframes, scale.factor
+        shrunk = torch.eye(4, dtype=torch.float64)
+        shrunk[:3, :3] /= factor
+        keyframes.correct(keyframes.moved(shrunk))
+        self._move_map()
+        if self._known is not None:
+            self._known = replace(self._known, position=factor * self._known.position)
+        self._told_scale = scale
 
     @on_one_torch_thread
     def trajectory(self) -> Trajectory:

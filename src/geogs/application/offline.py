@@ -52,6 +52,8 @@ def run_offline(
     """
     progress, stop = progress or RunProgress(), stop or Stop()
     config, device = settings.config, require_device(settings.device)
+    if settings.scale_from or config.input.depth != "none":
+        raise InputError("--offline knows no metres: leave out --scale-from and --depth.")
     opened = open_source(settings.source, config.input)
     wanted = settings.output or free_folder(Path("out") / opened.name, opened.fingerprint())
     output = prepare_output_folder(wanted)
