@@ -19,6 +19,7 @@ from geogs.application.result import Result, Written
 from geogs.application.results import write_results
 from geogs.application.settings import RunSettings
 from geogs.config import ReconstructConfig
+from geogs.errors import InputError
 from geogs.gpu.installation import require_device
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.sniff import Stream, open_source

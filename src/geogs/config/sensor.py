@@ -24,7 +24,7 @@ class DepthSensorConfig(Settings, group="sensor"):
     edge: Annotated[float, Range(above=0, most=1)] = 0.04
     """Relative step of depth between neighbouring pixels that is an edge, where nothing is
     believed, nor on the next pixels."""
-    near: Positive = 0.1
+    near: Annotated[float, Range(above=0, most=1e3)] = 0.1
     """Metres from which on depths are believed ..."""
     far: Annotated[float, Range(above="near", most=1e4)] = 10.0
     """... and up to which."""
