@@ -18,6 +18,9 @@ SAME_SURFACE = 0.03
 INVALID = 65535
 """What some sensors write where they saw nothing, beside 0."""
 
+LONGEST = 32_000
+"""Pixels of a side beyond which OpenCV interpolates nothing."""
+
 
 @dataclass(frozen=True)
 class DepthCamera:
@@ -41,7 +44,7 @@ class DepthFile:
     def metres(self) -> Float32[np.ndarray, "h w"] | None:
         """The depth of the picture's own pixels, 0 where unknown; None where it cannot be read."""
         picture = decoded(self.path, cv2.IMREAD_UNCHANGED).picture
-        if picture is None or picture.ndim != 2:
+        if picture is None or picture.ndim != 2 or max(picture.shape) > LONGEST:
             return None
         metres = picture.astype(np.float32) / np.float32(self.per_metre)
         unknown = ~np.isfinite(metres) | (metres < 0)
