@@ -69,7 +69,7 @@ def gauss_newton_step(
     if problem.measured is not None:
         away = problem.measured.inverse_depth.double() - problem.inverse_depth.double()
         a = problem.measured.information.double()
-        a = a * (options.huber / (a.sqrt() * away.abs()).clamp(min=options.huber))
+        a = a * (3.0 / (a.sqrt() * away.abs()).clamp(min=3.0))
         C = C + a.reshape(-1)[depth]
         pull = a * away
     C = torch.diag(C)

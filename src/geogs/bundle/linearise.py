@@ -162,7 +162,7 @@ def linearise_stars(
         damped = damped_curvature(c, options.depth_damping, problem.damping_of(frame))
         b = depth_gradient[e].sum(0)
         if problem.measured is not None:
-            curved, pull = problem.measured.pull(frame, d[frame], options.huber)
+            curved, pull = problem.measured.pull(frame, d[frame])
             c, damped, b = c + curved, damped + curved, b + pull
         depth = None
         if bool(problem.free_depth[frame]):

@@ -11,6 +11,12 @@ Matches = Callable[[slice], tuple[Float[Tensor, "e p 2"], Float[Tensor, "e p 2"]
 """Measured positions and their inverse variances for a slice of edges; asked from threads."""
 
 
+MEASURED_HUBER = 3.0
+"""Deviations of a measured depth beyond which it counts linearly. Errors of matches, which are many
+deviations now and then, have a smaller one; with that for both, matches would win everywhere, and
+what they err lengthens the path: a depth that follows its matches correlates with their noise."""
+
+
 @dataclass(frozen=True)
 class MeasuredDepths:
     """Inverse depths that were measured beside the matches, each on its own; robust by Huber."""
@@ -24,16 +30,16 @@ class MeasuredDepths:
         return self.inverse_depth[frame], self.information[frame]
 
     def pull(
-        self, frame: int, inverse_depth: Float[Tensor, "p"], huber: float
+        self, frame: int, inverse_depth: Float[Tensor, "p"]
     ) -> tuple[Float[Tensor, "p"], Float[Tensor, "p"]]:
         """Curvature and gradient a, a (measured - d) of a frame at inverse depths d.
 
-        a is the information times Huber's factor ``min(1, huber / |residual| in deviations)``.
+        a is the information times Huber's factor, see ``MEASURED_HUBER``.
         """
         measured, information = self.of(frame)
         residual = measured - inverse_depth
         norm = information.sqrt() * residual.abs()
-        curvature = information * (huber / norm.clamp(min=huber))
+        curvature = information * (MEASURED_HUBER / norm.clamp(min=MEASURED_HUBER))
         return curvature, curvature * residual
 
 

@@ -106,7 +106,7 @@ class StreamedBundle:
                     damped = damped_curvature(c, options.depth_damping, extra)
                     b = gradient[e].sum(0)
                     if part.measured is not None:
-                        curved, pull = part.measured.pull(frame, d[frame], options.huber)
+                        curved, pull = part.measured.pull(frame, d[frame])
                         damped, b = damped + curved, b + pull
                     steps.append((frame, b / damped))
             return steps

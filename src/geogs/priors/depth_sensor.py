@@ -7,6 +7,9 @@ is slanted:
 
     sigma^2 = deviation^2 + (share d)^2 + (lateral |grad d|)^2 .
 
+What is wrong in common is the scale's error, which no comparison of depths shows; the share stands
+for what it leaves behind from place to place.
+
 At edges a sensor averages both sides or shows the wrong one, and holes eat into what is around
 them: pixels next to either are not believed. After Khoshelham and Elberink, "Accuracy and
 resolution of Kinect depth data", Sensors 2012, and Nguyen et al., "Modeling Kinect sensor noise",
@@ -26,6 +29,8 @@ from geogs.config import DepthSensorConfig
 _EVERYWHERE = np.ones((3, 3), np.uint8)
 _STEPS = 4.0
 """Deviations of the sensor that a step between neighbouring pixels exceeds at an edge, too."""
+INDEPENDENT = 9.0
+"""Of 25 neighbouring pixels, so many whose noise has nothing to do with each other."""
 _MARGIN = 1
 """Pixels beside a hole or an edge that are not believed."""
 
@@ -42,7 +47,8 @@ class SensorDepth:
     def at_cells(self, offset: int, stride: int, height: int, width: int) -> "SensorDepth":
         """At every ``stride``-th pixel from ``offset`` on, the mean of the pixels around.
 
-        On a plane the mean is what the pixel itself would show without noise.
+        On a plane the mean is what the pixel itself would show without noise; neighbours err
+        partly alike, so that 25 of them count as ``INDEPENDENT``.
         """
         known = (self.inverse_depth > 0).astype(np.float32)
         share, total, worst = (
@@ -52,7 +58,8 @@ class SensorDepth:
         is_known = (known > 0) & (share > 12)
         count = np.maximum(share, 1)
         inverse = np.where(is_known, total / count, 0)
-        deviation = np.where(is_known, worst / count, np.inf)
+        fewer = np.maximum(INDEPENDENT * share / 25, 1)
+        deviation = np.where(is_known, worst / count / np.sqrt(fewer), np.inf)
         rows = slice(offset, offset + stride * height, stride)
         columns = slice(offset, offset + stride * width, stride)
         return SensorDepth(

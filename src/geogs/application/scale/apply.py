@@ -6,7 +6,7 @@ from jaxtyping import Float64
 
 from geogs.application.progress import RunProgress
 from geogs.application.scale.find import find_scale
-from geogs.application.scale.scene import FoundScale, MeasurableScene, SeenKeyframe
+from geogs.application.scale.scene import MeasurableScene, SeenKeyframe, said
 from geogs.application.scale.source import ScaleSource, SensorScale
 from geogs.errors import InputError
 from geogs.io.sources.sniff import Stream
@@ -38,12 +38,6 @@ def make_metric(
         return
     slam.rescale(MetricScale(found.origin, found.factor, found.deviation))
     progress.write(said(found))
-
-
-def said(found: FoundScale) -> str:
-    """A found scale in a sentence."""
-    share = f"{found.deviation:.1%}"
-    return f"Scale: {found.factor:.5g} metres to the map unit (+- {share}), by {found.origin}."
 
 
 def measurable(slam: Slam) -> MeasurableScene:

@@ -55,3 +55,9 @@ class FoundScale:
     """Standard deviation of the factor, as a part of it."""
     origin: str
     """What told it, in words."""
+
+
+def said(found: FoundScale) -> str:
+    """A found scale in a sentence."""
+    share = f"{found.deviation:.1%}"
+    return f"Scale: {found.factor:.5g} metres to the map unit (+- {share}), by {found.origin}."

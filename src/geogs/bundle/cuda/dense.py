@@ -9,7 +9,7 @@ from jaxtyping import Bool, Int
 from torch import Tensor
 
 from geogs.bundle.base import BundleOptions, BundleResult
-from geogs.bundle.problem import BundleProblem
+from geogs.bundle.problem import MEASURED_HUBER, BundleProblem
 from geogs.gpu.kernels import kernels_for
 from geogs.gpu.transfer import to_device
 from geogs.keyframes.grid import SampleGrid
@@ -199,7 +199,7 @@ class CudaDenseBundle:
         )  # fmt: skip
         self._step["sum_sources"](
             s.frames, block, s.first, w.curvature, w.gradient, w.cells, options.depth_damping,
-            w.damping, w.inverse_depth, *w.measured, options.huber, w.information,
+            w.damping, w.inverse_depth, *w.measured, MEASURED_HUBER, w.information,
             w.inverse_curvature, w.depth_gradient,
         )  # fmt: skip
 
