@@ -12,9 +12,8 @@ Matches = Callable[[slice], tuple[Float[Tensor, "e p 2"], Float[Tensor, "e p 2"]
 
 
 MEASURED_HUBER = 3.0
-"""Deviations of a measured depth beyond which it counts linearly. Errors of matches, which are many
-deviations now and then, have a smaller one; with that for both, matches would win everywhere, and
-what they err lengthens the path: a depth that follows its matches correlates with their noise."""
+"""Deviations of a measured depth beyond which it counts linearly. Matches have a smaller knee: they
+are wrong altogether more often than what a sensor says away from edges."""
 
 
 @dataclass(frozen=True)
