@@ -5,6 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 import torch
 from hypothesis import strategies as st
@@ -50,6 +51,13 @@ def tiny_room() -> Room:
     T_cw = se3_exp(torch.tensor(tangents, dtype=torch.float64)).numpy()
     points = np.array([[0.0, 0.1, 2.0], [0.1, 0.0, 3.0]])
     return Room(camera, [gradient_image(i) for i in range(3)], T_cw, points, [[0, 1], [1, 2]])
+
+
+def write_depth(path: Path) -> None:
+    """A picture of depth in 16 bits."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    ramp = np.linspace(1000, 3000, 64 * 48).reshape(48, 64).astype(np.uint16)
+    assert cv2.imwrite(str(path), ramp)
 
 
 def parsers() -> dict[str, Parser]:
@@ -133,7 +141,32 @@ def _sources() -> dict[str, Parser]:
             (name,), mutations.binary, all_of(name),
         )  # fmt: skip
 
+    def depths(folder: Path) -> object:
+        config = InputConfig(intrinsics="50,50,31.5,23.5", depth="auto")
+        found = [f.depth for f in open_source(folder, config)]
+        return [None if d is None else d.metres() for d in found]
+
+    def replica(folder: Path) -> None:
+        write_image(folder / "results/frame000000.jpg", gradient_image(0))
+        write_depth(folder / "results/depth000000.png")
+        camera = {"w": 64, "h": 48, "fx": 50, "fy": 50, "cx": 31.5, "cy": 23.5, "scale": 2000}
+        (folder / "cam_params.json").write_text(json.dumps({"camera": camera}))
+
+    def tum(folder: Path) -> None:
+        write_tum(tiny_room(), folder)
+        write_depth(folder / "depth/0.png")
+        (folder / "depth.txt").write_text("# time file\n0.0 depth/0.png\n0.04 depth/0.png\n")
+
+    def stray(folder: Path) -> None:
+        write_video(folder / "rgb.mp4", [gradient_image(i) for i in range(3)])
+        write_depth(folder / "depth/000000.png")
+        (folder / "camera_matrix.csv").write_text("50,0,31.5\n0,50,23.5\n0,0,1\n")
+
     return {
+        "depth-picture": Parser(replica, ("results/depth000000.png",), mutations.binary, depths),
+        "depth-scale": Parser(replica, ("cam_params.json",), mutations.json_text, depths),
+        "depth-list": Parser(tum, ("depth.txt",), mutations.text, depths),
+        "stray-camera": Parser(stray, ("camera_matrix.csv",), mutations.text, depths),
         **{f"images-{s}": images(s) for s in ("jpg", "png", "tif", "bmp", "webp", "ppm")},
         "video-mp4": video("v.mp4"),
         "video-mkv": video("v.mkv"),

@@ -25,7 +25,14 @@ from geogs.tracking.flow.select import build_operator
 from geogs.tracking.moving import moving_share
 from geogs.tracking.segments import Segments, SegmentsState
 from geogs.tracking.tracker import Tracker, TrackResult, TrackState
-from geogs.types import Frame, MapSnapshot, RenderedKeyframe, Trajectory, Uncertainty
+from geogs.types import (
+    Frame,
+    MapSnapshot,
+    MetricScale,
+    RenderedKeyframe,
+    Trajectory,
+    Uncertainty,
+)
 
 Progress = Callable[[str, float], None]
 """Called with the name of a stage and its finished fraction in [0, 1]."""
@@ -66,8 +73,9 @@ class SlamState:
 class Slam:
     """Dense monocular SLAM: feed frames, finish, read the trajectory, the map and its depth maps.
 
-    Poses are world to camera in units of the sequence's own scale; nothing here is metric. A
-    monocular prior, where one is given, sees every keyframe.
+    Poses are world to camera in units of the sequence's own scale, or in metres where frames come
+    with the depth that a sensor measured. A monocular prior, where one is given, sees every
+    keyframe.
     """
 
     def __init__(
@@ -87,7 +95,7 @@ class Slam:
         self.keyframes = KeyframeStore(grid, self.operator.encode, c.resident_keyframes)
         self.segments = Segments(self.new_tracker, c.tracking.patience)
         self.loops = LoopCloser(self.segments, c.loop)
-        self.mapper = Mapper(self.keyframes, c.mapping, c.seed)
+        self.mapper = self._new_mapper()
         self.stopwatch = Stopwatch()
         self.frames = 0
         self._waiting: deque[int] = deque()
@@ -97,14 +105,19 @@ class Slam:
         """Whether the map was trained over all keyframes at the end."""
         self._is_ended = False
         self._known: Uncertainty | None = None
+        self._told_scale: MetricScale | None = None
 
     def new_tracker(self) -> Tracker:
         """A tracker of another segment."""
         c = self.config
         return Tracker(
             self.camera, c.tracking, self.device, c.seed, self.operator, self.prior, c.prior,
-            self.keyframes,
+            self.keyframes, c.sensor,
         )  # fmt: skip
+
+    def _new_mapper(self) -> Mapper:
+        c = self.config
+        return Mapper(self.keyframes, c.mapping, c.seed, c.sensor)
 
     def state(self) -> SlamState:
         """What a checkpoint holds: to be written before the next frame, as it refers to all."""
@@ -136,6 +149,16 @@ class Slam:
         return self._is_ended
 
     @property
+    def metric_scale(self) -> MetricScale | None:
+        """By what lengths are metres: what :meth:`rescale` was told, or a depth sensor; else None.
+
+        All depths of a sensor share a part of their error, which is the scale's.
+        """
+        if self._told_scale is not None or not self.segments.world.is_metric:
+            return self._told_scale
+        return MetricScale("depth sensor", 1.0, self.config.sensor.share)
+
+    @property
     def will_refine(self) -> bool:
         """Whether a refinement of the map follows the final bundle adjustment."""
         return self.config.mapping.final_iterations > 0
@@ -159,7 +182,7 @@ class Slam:
         with self.stopwatch("tracking"):
             result = self.segments.finish()
         if result.is_new_world:
-            self.mapper = Mapper(self.keyframes, self.config.mapping, self.config.seed)
+            self.mapper = self._new_mapper()
             self.segments.world.keyframes.take_corrections()
             self._waiting.clear()
         self._map(self._close_loops(result, is_last=True), lag=0)
@@ -190,6 +213,18 @@ class Slam:
         self.is_refined = self.will_refine
 
     @on_one_torch_thread
+    def rescale(self, scale: MetricScale) -> None:
+        """Multiply all lengths of poses, depths and map, after which they are metres."""
+        keyframes, factor = self.segments.world.keyframes, scale.factor
+        shrunk = torch.eye(4, dtype=torch.float64)
+        shrunk[:3, :3] /= factor
+        keyframes.correct(keyframes.moved(shrunk))
+        self._move_map()
+        if self._known is not None:
+            self._known = replace(self._known, position=factor * self._known.position)
+        self._told_scale = scale
+
+    @on_one_torch_thread
     def trajectory(self) -> Trajectory:
         """Poses of all frames so far."""
         with self.stopwatch("trajectory"):
@@ -216,6 +251,7 @@ class Slam:
         """What a summary says of segments, loops and things that move, ready for JSON."""
         return {
             "refined": self.is_refined,
+            "metric_scale": None if self.metric_scale is None else asdict(self.metric_scale),
             "moving": round(moving_share(self.segments.world.keyframes), 4),
             "segments": [asdict(segment) for segment in self.segments.summary()],
             "not_started": self.segments.why_not or None,

@@ -1,14 +1,23 @@
 """What flows between the parts: frozen records, no behaviour."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Float32, UInt8
 from torch import Tensor
 
 from geogs.geometry.camera import Camera
+
+
+@runtime_checkable
+class MeasuredDepth(Protocol):
+    """What a depth sensor saw, read when it is asked for."""
+
+    def metres(self) -> Float32[np.ndarray, "h w"] | None:
+        """Depth z of every pixel, 0 where unknown; None where it cannot be read."""
+        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,6 +32,8 @@ class Frame:
     """RGB."""
     follows_cut: bool = False
     """Whether it begins another video, so that no motion links it to the frame before."""
+    depth: MeasuredDepth | None = None
+    """Of the pixels of the image, where a sensor measured it and it is to be used."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,6 +47,18 @@ class PoseCorrection:
     of_all: bool = False
     """Whether everything was adjusted together, as a bundle adjustment of all keyframes does; else
     those before the place where it begins were not."""
+
+
+@dataclass(frozen=True, slots=True)
+class MetricScale:
+    """By what the lengths of a map are metres."""
+
+    origin: str
+    """What told them."""
+    factor: float
+    """By which all lengths were multiplied."""
+    deviation: float
+    """Of the factor, as a part of it."""
 
 
 FrameState = Literal["tracked", "orientation only", "lost"]

@@ -16,6 +16,10 @@ from torch import Tensor
 
 from geogs.application.records import pack, schema, unpack
 from geogs.errors import InputError
+from geogs.geometry.camera import Camera
+from geogs.keyframes.grid import SampleGrid
+from geogs.keyframes.keyframe import KeyframeState, MeasuredCells
+from geogs.keyframes.store import KeyframeStore
 
 
 class Mood(Enum):
@@ -175,3 +179,19 @@ def test_a_schema_changes_with_names_types_and_shapes():
     B.__annotations__ = {"x": Float32[Tensor, "n 2"], "y": int | None}
     seen.add(schema(B))
     assert len(seen) == 6
+
+
+def test_a_keyframe_with_measured_depth_comes_back():
+    grid = SampleGrid(Camera(60.0, 60.0, 31.5, 23.5, 64, 48))
+    segment = KeyframeStore(grid).new_segment()
+    image, eye = np.zeros((48, 64, 3), np.uint8), torch.eye(4, dtype=torch.float64)
+    keyframe = segment.add(0, 0.0, image, None, eye)
+    keyframe.picture.depth = np.linspace(1, 3, 64 * 48, dtype=np.float32).reshape(48, 64)
+    keyframe.measured = MeasuredCells(torch.rand(grid.size), torch.rand(grid.size))
+    packed = pack(KeyframeState, keyframe.state())
+    back = unpack(KeyframeState, packed.values, packed.arrays, packed.archives)
+    assert torch.equal(back.measured.information, keyframe.measured.information)
+    np.testing.assert_allclose(
+        back.depth.load().astype(np.float32), keyframe.picture.depth, rtol=1e-6
+    )
+    assert keyframe.picture.depth[0, 1] == pytest.approx(1 + 2 / (64 * 48 - 1), rel=5e-4)

@@ -15,6 +15,7 @@ RUN = {
     "shutter": {"readout": 0.0276, "origin": "as given"},
     "verdict": {"is_reliable": True, "sentence": "Well.", "lost": 0.0, "orientation_only": 0.1,
                 "position": 0.01, "rotation_deg": None, "depth": 0.02},
+    "metric_scale": {"origin": "a known distance", "factor": 1.2, "deviation": 0.01},
     "keyframes": 20, "lost_spans": [[0.5, 1.25]], "orientation_only_spans": [], "moving": 0.0,
     "segments": [{"first_time": 0.0, "last_time": 4.0, "keyframes": 20, "fate": "world"}],
     "not_started": None, "loops": 1, "loop_closures": 1, "disks": 20_000, "mesh_faces": 5,
@@ -36,7 +37,8 @@ def test_a_summary_is_as_the_schema_says():
         (("verdict", "lost"), 1.5), (("verdict", "position"), float("nan")),
         (("verdict", "depth"), float("inf")), (("lost_spans", 0), [1.0]),
         (("segments", 0, "fate"), None), (("seconds", "tracking"), "1"), (("seconds",), {}),
-        (("fingerprint",), "x"), (("shutter", "readout"), 0.2), (("versions", "torch"), 2),
+        (("metric_scale", "factor"), -1), (("fingerprint",), "x"), (("shutter", "readout"), 0.2),
+        (("versions", "torch"), 2),
     ],
 )  # fmt: skip
 def test_what_is_wrong_is_found(path, value):

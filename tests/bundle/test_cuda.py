@@ -18,7 +18,7 @@ from geogs.bundle.dense import DenseBundle
 from geogs.bundle.fields import CpuFields
 from geogs.bundle.motion import CpuMotion
 from geogs.bundle.pairs import CpuPairs
-from geogs.bundle.problem import BundleProblem, MotionProblem
+from geogs.bundle.problem import BundleProblem, MeasuredDepths, MotionProblem
 from geogs.bundle.projection import MIN_Z, linearise, project, relative_motion
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import retract, se3_exp
@@ -129,6 +129,23 @@ def test_damped_depths_match_the_cpu(device):
     damped = replace(problem, damping=damping)
     slow = DenseBundle(SampleGrid(camera)).solve(damped, options)
     sent = replace(on(problem, device), damping=damping.to(device))
+    fast = cuda_bundle.CudaDenseBundle(SampleGrid(camera, device)).solve(sent, options)
+    assert_same(fast, slow)
+    plain = DenseBundle(SampleGrid(camera)).solve(problem, options)
+    assert float((plain.inverse_depth - slow.inverse_depth).abs().max()) > 0.01
+
+
+def test_measured_depths_match_the_cpu(device):
+    camera = camera_for(device)
+    problem = scene(camera)
+    g = torch.Generator().manual_seed(6)
+    known = torch.rand(problem.inverse_depth.shape, generator=g) < 0.7
+    measured = MeasuredDepths(problem.inverse_depth + 0.05, 2e3 * known)
+    sensed = replace(problem, measured=measured)
+    options = BundleOptions(2, huber=0.5)
+    slow = DenseBundle(SampleGrid(camera)).solve(sensed, options)
+    there = MeasuredDepths(measured.inverse_depth.to(device), measured.information.to(device))
+    sent = replace(on(problem, device), measured=there)
     fast = cuda_bundle.CudaDenseBundle(SampleGrid(camera, device)).solve(sent, options)
     assert_same(fast, slow)
     plain = DenseBundle(SampleGrid(camera)).solve(problem, options)

@@ -8,6 +8,7 @@ import torch
 from bundle_scenes import CAMERA, disturbed, scene
 from geogs.bundle.base import BundleOptions
 from geogs.bundle.dense import DenseBundle
+from geogs.bundle.problem import BundleProblem, MeasuredDepths
 from geogs.bundle.projection import linearise, relative_motion
 from geogs.geometry.lie import retract, se3_inverse
 from oracles.bundle_reference import gauss_newton_step
@@ -48,6 +49,60 @@ def test_damping_resists_the_depth_it_is_given_for():
     moved, freely = ((r.inverse_depth - problem.inverse_depth).abs() for r in (result, plain))
     assert float(moved[2, 7]) < 1e-5 < 1e-3 < float(freely[2, 7])
     assert float(moved[1].mean()) < 0.8 * float(freely[1].mean())
+
+
+def measured_anew(problem: BundleProblem, seed: int = 3) -> MeasuredDepths:
+    """Some cells measured, a few of them far off."""
+    g = torch.Generator().manual_seed(seed)
+    shape = problem.inverse_depth.shape
+    off = 0.02 * torch.randn(shape, generator=g) + 0.5 * (torch.rand(shape, generator=g) < 0.05)
+    known = torch.rand(shape, generator=g) < 0.7
+    return MeasuredDepths(problem.inverse_depth + off, 2e3 * known)
+
+
+@pytest.mark.parametrize("huber", [0.5, 50.0])
+def test_measured_depths_pull_as_in_the_reference(huber):
+    grid, truth = scene()
+    problem = replace(disturbed(truth, 0.02, 0.05), measured=measured_anew(truth))
+    free_depth = problem.free_depth.clone()
+    free_depth[1] = False
+    problem = replace(problem, free_depth=free_depth)
+    options = BundleOptions(iterations=1, huber=huber)
+    xi, delta = gauss_newton_step(problem, CAMERA, grid.rays, options)
+    result = DenseBundle(grid).solve(problem, options)
+    torch.testing.assert_close(result.T_cw, retract(xi, problem.T_cw), rtol=0, atol=2e-5)
+    expected = problem.inverse_depth.double() + delta
+    torch.testing.assert_close(result.inverse_depth.double(), expected, rtol=0, atol=5e-5)
+    plain = DenseBundle(grid).solve(replace(problem, measured=None), options)
+    assert float((plain.inverse_depth - result.inverse_depth).abs().max()) > 0.01
+    assert float((result.information - plain.information).max()) > 10
+
+
+def test_measured_depths_say_how_long_a_step_is():
+    grid, truth = scene()
+    free = torch.ones(len(truth.T_cw), dtype=torch.bool)
+    free[0] = False
+    start = replace(
+        disturbed(replace(truth, free_pose=free), 0.02, 0.05),
+        measured=MeasuredDepths(truth.inverse_depth, torch.full_like(truth.inverse_depth, 1e4)),
+    )
+    result = DenseBundle(grid).solve(start, BundleOptions(iterations=12, huber=10.0))
+    centres = [
+        se3_inverse(T)[:, :3, 3] - se3_inverse(T)[0, :3, 3] for T in (result.T_cw, truth.T_cw)
+    ]
+    assert float((centres[0] - centres[1]).norm(dim=1).max()) < 1e-4
+
+
+def test_what_was_measured_stays_known_without_matches():
+    grid, problem = scene()
+    alone = (problem.source != 3) & (problem.target != 3)
+    problem = replace(
+        problem, source=problem.source[alone], target=problem.target[alone],
+        pixels=problem.pixels[alone], weight=problem.weight[alone],
+        measured=measured_anew(problem),
+    )  # fmt: skip
+    result = DenseBundle(grid).solve(problem, BundleOptions(iterations=1))
+    assert torch.equal(result.information[3], problem.measured.information[3])
 
 
 def test_recovers_a_disturbed_scene():

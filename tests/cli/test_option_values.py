@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 
 import pytest
 
-from geogs.cli import demo, doctor, eval, export, mesh, reconstruct, run, synth
+from geogs.cli import demo, doctor, eval, export, mesh, reconstruct, run, scale, synth
 from geogs.cli.options import parse_options
 from geogs.config.leaves import Leaf, leaves
 from geogs.config.setting import Positional, Range
@@ -28,6 +28,7 @@ COMMANDS: dict[str, tuple[type, Parse, list[str]]] = {
     "export": (export.ExportOptions, plain(export.ExportOptions, "export"),
                ["out", "--to", "tum"]),
     "mesh": (mesh.MeshOptions, plain(mesh.MeshOptions, "mesh"), ["out"]),
+    "scale": (scale.ScaleOptions, plain(scale.ScaleOptions, "scale"), ["out"]),
     "synth": (synth.SynthOptions, lambda argv: parse_options(
         synth.SynthOptions, argv, "synth", synth._defaults), ["out"]),
     "demo": (demo.DemoOptions, plain(demo.DemoOptions, "demo"), []),

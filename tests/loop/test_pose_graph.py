@@ -542,3 +542,23 @@ def test_no_loop_to_believe_corrects_nothing():
     d = drive()
     assert close_loops(range(KEYFRAMES), d.T_cw, d.odometry) is None
     assert close_loops(range(KEYFRAMES), d.T_cw, joined(d.odometry, random_loops(3))) is None
+
+
+def test_a_metric_map_keeps_its_scales():
+    """Odometry that measures metres drifts in place alone; loops that err in scale move none."""
+    d = drive(drift=0.0)
+    relative = d.odometry
+    i, j = torch.tensor([0, 2, 5]), torch.tensor([KEYFRAMES - 8, KEYFRAMES - 6, KEYFRAMES - 3])
+    wrong = torch.tensor([0.0] * 6 + [0.02], dtype=F64)
+    G = sim3_exp(wrong) @ d.truth[j] @ se3_inverse(d.truth[i])
+    both = as_loops(i, j, G)
+    parts = ("source", "target", "G", "information", "is_loop")
+    together = RelativePoses(*(torch.cat([getattr(r, p) for r in (relative, both)]) for p in parts))
+    free = close_loops(range(KEYFRAMES), d.T_cw, together)
+    held = close_loops(range(KEYFRAMES), d.T_cw, together, is_metric=True)
+    assert max(abs(s - 1) for s in free.correction.scale.values()) > 1e-3
+    assert max(abs(s - 1) for s in held.correction.scale.values()) < 1e-9
+    after = torch.stack([held.correction.after[k] for k in range(KEYFRAMES)])
+    error = (se3_inverse(after) - se3_inverse(d.truth))[:, :3, 3].norm(dim=1).max()
+    before = (se3_inverse(d.T_cw) - se3_inverse(d.truth))[:, :3, 3].norm(dim=1).max()
+    assert float(error) < 0.7 * float(before)

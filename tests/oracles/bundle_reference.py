@@ -42,7 +42,8 @@ def gauss_newton_step(
 ) -> tuple[Float[Tensor, "n 6"], Float[Tensor, "n p"]]:
     """The step of the free poses and inverse depths from the full normal equations.
 
-    Minimises sum w rho(r) with Huber's weights at the present state. The same damping as the fast
+    Minimises sum w rho(r) with Huber's weights at the present state, and sum a rho(measured - d) of
+    inverse depths that were measured. The same damping as the fast
     solver: of inverse depth in the full system, of poses in the system without depths.
     """
     n, p = problem.inverse_depth.shape
@@ -64,9 +65,16 @@ def gauss_newton_step(
     C = C + options.depth_damping * mean + 1e-8
     if problem.damping is not None:
         C = C + problem.damping.double().reshape(-1)[depth]
+    pull = torch.zeros_like(delta)
+    if problem.measured is not None:
+        away = problem.measured.inverse_depth.double() - problem.inverse_depth.double()
+        a = problem.measured.information.double()
+        a = a * (3.0 / (a.sqrt() * away.abs()).clamp(min=3.0))
+        C = C + a.reshape(-1)[depth]
+        pull = a * away
     C = torch.diag(C)
     H, E = Jx.mT @ (w[:, None] * Jx), Jx.mT @ (w[:, None] * Jd)
-    v, b = Jx.mT @ (w * r), Jd.mT @ (w * r)
+    v, b = Jx.mT @ (w * r), Jd.mT @ (w * r) + pull.reshape(-1)[depth]
     S = H - E @ torch.linalg.inv(C) @ E.mT
     H = H + torch.diag(options.damping * S.diagonal().abs() + 1e-2)
     step = torch.linalg.solve(

@@ -18,6 +18,7 @@ from geogs.application.result import Result, Written
 from geogs.application.results import write_results
 from geogs.application.settings import RunSettings
 from geogs.config import ReconstructConfig
+from geogs.errors import InputError
 from geogs.gpu.installation import require_device
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.sniff import Stream, open_source
@@ -52,6 +53,8 @@ def run_offline(
     """
     progress, stop = progress or RunProgress(), stop or Stop()
     config, device = settings.config, require_device(settings.device)
+    if settings.scale_from or config.input.depth != "none":
+        raise InputError("--offline knows no metres: leave out --scale-from and --depth.")
     opened = open_source(settings.source, config.input)
     wanted = settings.output or free_folder(Path("out") / opened.name, opened.fingerprint())
     output = prepare_output_folder(wanted)

@@ -21,6 +21,8 @@ from geogs.application.progress import RunProgress
 from geogs.application.result import Result, Written
 from geogs.application.results import write_results
 from geogs.application.run_checkpoint import RunCheckpoint, RunFacts, SavedRun, frames_after
+from geogs.application.scale.apply import check_scale_source, make_metric
+from geogs.application.scale.source import scale_source
 from geogs.application.settings import RunSettings
 from geogs.application.shutter import with_shutter_found
 from geogs.application.surfaces import write_depth_mesh, write_stage
@@ -54,7 +56,9 @@ def run(
     config, device = settings.config, require_device(settings.device)
     for sentence in idle_settings(config):
         progress.write(f"note: {sentence}")
+    scale = scale_source(settings.scale_from)
     opened = open_source(settings.source, config.input)
+    check_scale_source(scale, opened)
     wanted = settings.output or free_folder(Path("out") / opened.name, opened.fingerprint())
     output = prepare_output_folder(wanted)
     with only_writer(output):
@@ -135,8 +139,8 @@ def continued(facts: RunFacts, settings: RunSettings, output: Path) -> RunSettin
     if elsewhere or settings.deciding() != facts.settings.deciding():
         raise InputError(
             "--resume goes on with the source and the settings of the run; leave out everything "
-            "else but --device, --mesh, --checkpoint-every, --online-results, --depth-mesh and "
-            "--keyframe-images."
+            "else but --device, --mesh, --checkpoint-every, --online-results, --depth-mesh, "
+            "--keyframe-images and --scale-from."
         )
     device = facts.device if settings.device == "auto" else settings.device
     if not device.startswith(facts.device) and device != "cpu":
@@ -181,6 +185,7 @@ class _Run:
             if settings.online_results:
                 self._write_stage("online")
             interrupted |= not self._finish(correct=not interrupted)
+            make_metric(slam, source, scale_source(settings.scale_from), progress)
             result = Result(slam, source, interrupted, progress)
             more = [lambda: write_depth_mesh(output, slam, progress)]
             more = more if settings.depth_mesh else []

@@ -26,6 +26,10 @@ class RunSettings(Settings):
     """Where to compute: auto (a GPU where there is one), cpu, cuda or cuda:1; see geogs doctor."""
     checkpoint_every: Weight = 60.0
     """Seconds between two checkpoints, from which --resume goes on; 0 makes none."""
+    scale_from: Annotated[str, Basic()] = ""
+    """What is known in metres, so that the result is in metres: FRAME:u1,v1,u2,v2=1.25m (pixels of
+    an image as it came; several with semicolons), aruco:DICT_5X5_50:0.12 (tags whose side is so
+    long), height:1.6 (of the camera over the ground), or sensor (with --depth)."""
     offline: bool = False
     """Do not track: place sharp frames by structure from motion (pycolmap) and all others against
     them; for videos that tracking cannot follow."""

@@ -9,6 +9,7 @@ import torch
 
 from geogs.application.machine import device_summary, peak_memory
 from geogs.application.result import Result
+from geogs.application.scene import MappedScene
 from geogs.io.sources.posed.base import PosedSource
 from geogs.io.sources.several import SeveralSources
 from geogs.io.sources.sniff import Stream
@@ -30,7 +31,7 @@ def summarise(result: Result) -> dict[str, object]:
         "keyframes": len(result.keyframes.timestamps),
         "lost_spans": lost_spans(result.trajectory),
         "orientation_only_spans": spans(result.trajectory, "orientation only"),
-        **scene.particulars(),
+        **particulars(scene),
         "disks": len(result.map),
         "mesh_faces": 0 if mesh is None else len(mesh.faces),
         **time_summary(scene.stopwatch, scene.frames),
@@ -45,6 +46,15 @@ def summarise(result: Result) -> dict[str, object]:
             "python": platform.python_version(),
         },
     }
+
+
+def particulars(scene: MappedScene) -> dict[str, object]:
+    """What the scene says of itself; where its lengths are metres, ``scale`` says by what."""
+    said = dict(scene.particulars())
+    metric = said.get("metric_scale")
+    if isinstance(metric, dict):
+        said["scale"] = f"metric ({metric['origin']})"
+    return said
 
 
 def _finite(values: dict[str, object]) -> dict[str, object]:

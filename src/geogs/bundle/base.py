@@ -37,7 +37,8 @@ class BundleResult:
     T_cw: Float[Tensor, "n 4 4"]
     inverse_depth: Float[Tensor, "n p"]
     information: Float[Tensor, "n p"]
-    """Sum over a frame's edges of w |dp/dd|^2 before the last step."""
+    """Sum over a frame's edges of w |dp/dd|^2 before the last step, and the information of what was
+    measured beside the matches."""
     residual: Float[Tensor, "e"]
     """Root of the robustly weighted mean squared residual of each edge in pixels."""
     finite: bool

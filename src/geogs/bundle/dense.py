@@ -10,7 +10,7 @@ from torch import Tensor
 
 from geogs.bundle.base import BundleOptions, BundleResult
 from geogs.bundle.linearise import Star, linearise_stars
-from geogs.bundle.problem import BundleProblem, StreamedProblem, source_chunks
+from geogs.bundle.problem import BundleProblem, StreamedProblem, known_before, source_chunks
 from geogs.geometry.lie import move
 from geogs.keyframes.grid import SampleGrid
 from geogs.threads import thread_map
@@ -26,7 +26,7 @@ class DenseBundle:
         """As in the protocol."""
         options = options or BundleOptions()
         T, d = problem.T_cw, problem.inverse_depth
-        information = torch.zeros_like(d)
+        information = known_before(problem)
         residual = d.new_zeros(len(problem.source))
         finite = True
         for _ in range(options.iterations):

@@ -60,7 +60,7 @@ class Star:
     """Over the relative motions of its k edges, then shared unknowns; float64."""
     gradient: Float[Tensor, "m"]
     information: Float[Tensor, "p"]
-    """sum w |dp/dd|^2."""
+    """sum w |dp/dd|^2, and what was measured beside."""
     residual: Float[Tensor, "k"]
     """As in ``BundleResult``."""
     depth: EliminatedDepth | None
@@ -159,10 +159,14 @@ def linearise_stars(
     stars = []
     for frame, e in sources_within(i):
         block, g, c = torch.block_diag(*H[e]), v[e].reshape(-1), curvature[e].sum(0)
+        damped = damped_curvature(c, options.depth_damping, problem.damping_of(frame))
+        b = depth_gradient[e].sum(0)
+        if problem.measured is not None:
+            curved, pull = problem.measured.pull(frame, d[frame])
+            c, damped, b = c + curved, damped + curved, b + pull
         depth = None
         if bool(problem.free_depth[frame]):
-            damped = damped_curvature(c, options.depth_damping, problem.damping_of(frame))
-            depth = EliminatedDepth(coupling[e].flatten(0, 1), damped, depth_gradient[e].sum(0))
+            depth = EliminatedDepth(coupling[e].flatten(0, 1), damped, b)
             block, g = depth.reduce(block, g)
         stars.append(Star(frame, j[e], adjoint[e], block, g, c, residual[e], depth))
     return stars

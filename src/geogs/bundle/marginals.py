@@ -14,7 +14,13 @@ from torch import Tensor
 
 from geogs.bundle.base import BundleOptions
 from geogs.bundle.linearise import Star, linearise_stars
-from geogs.bundle.problem import BundleProblem, StreamedProblem, source_chunks, sources_within
+from geogs.bundle.problem import (
+    BundleProblem,
+    MeasuredDepths,
+    StreamedProblem,
+    source_chunks,
+    sources_within,
+)
 from geogs.bundle.projection import project, relative_motion
 from geogs.geometry.lie import se3_inverse
 from geogs.keyframes.grid import SampleGrid
@@ -124,10 +130,14 @@ class _Thinned:
         else:
             pixels, weight = p.pixels[chunk], p.weight[chunk]
         damping = None if p.damping is None else p.damping[:, every].cpu()
+        measured = None
+        if p.measured is not None:
+            both = (p.measured.inverse_depth, p.measured.information)
+            measured = MeasuredDepths(*(m[:, every].cpu() for m in both))
         return BundleProblem(
             p.T_cw.cpu(), self.inverse_depth, p.source[chunk].cpu(), p.target[chunk].cpu(),
             pixels[:, every].cpu(), weight[:, every].cpu(), p.free_pose.cpu(), p.free_depth.cpu(),
-            damping,
+            damping, measured,
         )  # fmt: skip
 
 

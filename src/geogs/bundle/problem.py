@@ -11,6 +11,37 @@ Matches = Callable[[slice], tuple[Float[Tensor, "e p 2"], Float[Tensor, "e p 2"]
 """Measured positions and their inverse variances for a slice of edges; asked from threads."""
 
 
+MEASURED_HUBER = 3.0
+"""Deviations of a measured depth beyond which it counts linearly. Matches have a smaller knee: they
+are wrong altogether more often than what a sensor says away from edges."""
+
+
+@dataclass(frozen=True)
+class MeasuredDepths:
+    """Inverse depths that were measured beside the matches, each on its own; robust by Huber."""
+
+    inverse_depth: Float[Tensor, "n p"]
+    information: Float[Tensor, "n p"]
+    """Inverse variances; 0 where nothing was measured."""
+
+    def of(self, frame: int) -> tuple[Float[Tensor, "p"], Float[Tensor, "p"]]:
+        """Measurements of a frame and their information."""
+        return self.inverse_depth[frame], self.information[frame]
+
+    def pull(
+        self, frame: int, inverse_depth: Float[Tensor, "p"]
+    ) -> tuple[Float[Tensor, "p"], Float[Tensor, "p"]]:
+        """Curvature and gradient a, a (measured - d) of a frame at inverse depths d.
+
+        a is the information times Huber's factor, see ``MEASURED_HUBER``.
+        """
+        measured, information = self.of(frame)
+        residual = measured - inverse_depth
+        norm = information.sqrt() * residual.abs()
+        curvature = information * (MEASURED_HUBER / norm.clamp(min=MEASURED_HUBER))
+        return curvature, curvature * residual
+
+
 @dataclass(frozen=True)
 class BundleProblem:
     """Frames and edges of one adjustment; edges are sorted by source.
@@ -31,6 +62,7 @@ class BundleProblem:
     free_depth: Bool[Tensor, "n"]
     damping: Float[Tensor, "n p"] | None = None
     """Added to the curvature sum_e w |dp/dd|^2 of each inverse depth (DROID-SLAM's eta)."""
+    measured: MeasuredDepths | None = None
 
     def damping_of(self, frame: int) -> Float[Tensor, "p"] | float:
         """``damping`` of a frame; zero where there is none."""
@@ -49,13 +81,14 @@ class StreamedProblem:
     free_pose: Bool[Tensor, "n"]
     free_depth: Bool[Tensor, "n"]
     damping: Float[Tensor, "n p"] | None = None
+    measured: MeasuredDepths | None = None
 
     def part(self, edges: slice) -> BundleProblem:
         """The same frames with some of the edges."""
         pixels, weight = self.matches(edges)
         return BundleProblem(
             self.T_cw, self.inverse_depth, self.source[edges], self.target[edges], pixels, weight,
-            self.free_pose, self.free_depth, self.damping,
+            self.free_pose, self.free_depth, self.damping, self.measured,
         )  # fmt: skip
 
 
@@ -73,6 +106,13 @@ class MotionProblem:
     """Which of the frames an edge sees."""
     pixels: Float[Tensor, "e p 2"]
     weight: Float[Tensor, "e p 2"]
+
+
+def known_before(problem: BundleProblem | StreamedProblem) -> Float[Tensor, "n p"]:
+    """Information of every inverse depth without its matches: of what was measured beside them."""
+    if problem.measured is None:
+        return torch.zeros_like(problem.inverse_depth)
+    return problem.measured.information.clone()
 
 
 def sources_within(source: Int[Tensor, "e"]) -> list[tuple[int, slice]]:

@@ -17,7 +17,7 @@ from geogs.bundle.base import BundleOptions, BundleResult
 from geogs.bundle.camera_system import SparseCameraSystem
 from geogs.bundle.dense import stepped
 from geogs.bundle.linearise import Star, damped_curvature, linearise_stars, weighed_residuals
-from geogs.bundle.problem import StreamedProblem, source_chunks, sources_within
+from geogs.bundle.problem import StreamedProblem, known_before, source_chunks, sources_within
 from geogs.bundle.projection import linearise, relative_motion
 from geogs.geometry.lie import se3_adjoint
 from geogs.keyframes.grid import SampleGrid
@@ -39,7 +39,7 @@ class StreamedBundle:
         """
         options = options or BundleOptions()
         T, d = problem.T_cw, problem.inverse_depth
-        information = torch.zeros_like(d)
+        information = known_before(problem)
         residual = d.new_zeros(len(problem.source))
         finite = True
         system = SparseCameraSystem(problem.source, problem.target, problem.free_pose)
@@ -104,7 +104,11 @@ class StreamedBundle:
                 if bool(part.free_depth[frame]):
                     c, extra = curvature[e].sum(0), part.damping_of(frame)
                     damped = damped_curvature(c, options.depth_damping, extra)
-                    steps.append((frame, gradient[e].sum(0) / damped))
+                    b = gradient[e].sum(0)
+                    if part.measured is not None:
+                        curved, pull = part.measured.pull(frame, d[frame])
+                        damped, b = damped + curved, b + pull
+                    steps.append((frame, b / damped))
             return steps
 
         delta = torch.zeros_like(d)

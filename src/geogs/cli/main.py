@@ -37,6 +37,7 @@ COMMANDS = {
     "fleet": Command("geogs.cli.fleet", "reconstruct many videos, on one machine or many"),
     "reconstruct": Command("geogs.cli.reconstruct", "reconstruct images whose poses are known"),
     "mesh": Command("geogs.cli.mesh", "make the mesh of a result anew, without running again"),
+    "scale": Command("geogs.cli.scale", "bring a result to metres by a length that is known"),
     "export": Command("geogs.cli.export", "write a result in the formats of other programs"),
     "view": Command("geogs.cli.view", "look at a result in the browser"),
     "eval": Command("geogs.cli.eval", "compare a result with the ground truth"),

@@ -41,6 +41,9 @@ class SynthOptions(Settings):
     """Share of the image that people cover who cross the view; 0 lets nothing move."""
     depth: bool = True
     """Write depth images too."""
+    depth_sensor: bool = False
+    """Write depth as a sensor measures it: with noise that grows with its square, holes, and
+    nothing beyond 5 m; else it is exact."""
     image_format: Literal["jpg", "png"] = "jpg"
     """JPEG of quality 95, or lossless."""
     video: bool = False
@@ -54,6 +57,7 @@ def main(argv: Sequence[str]) -> int:
     from rich.console import Console
     from rich.progress import Progress
 
+    from geogs.synth.depth_sensor import DepthSensor
     from geogs.synth.export import write_sequence
 
     with Progress(console=Console(stderr=True), transient=True) as progress:
@@ -68,6 +72,7 @@ def main(argv: Sequence[str]) -> int:
             flaws=options.flaws,
             moving=options.moving,
             depth=options.depth,
+            depth_sensor=DepthSensor() if options.depth_sensor else None,
             image_format=options.image_format,
             video=options.video,
             on_frame=lambda index: progress.update(task, completed=index + 1),

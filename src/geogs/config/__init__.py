@@ -17,6 +17,7 @@ from geogs.config.losses import LossAblation, LossConfig
 from geogs.config.mapping import DiskConfig, MapAblation, MappingConfig, PhotoConfig
 from geogs.config.mesh import MeshConfig
 from geogs.config.prior import PriorConfig
+from geogs.config.sensor import DepthSensorConfig
 from geogs.config.slam import Config, Preset, Seed, preset
 from geogs.config.tracking import TrackingConfig
 
@@ -24,6 +25,7 @@ __all__ = [
     "CalibrationConfig",
     "Config",
     "DepthConfig",
+    "DepthSensorConfig",
     "DiskConfig",
     "InputConfig",
     "LoopConfig",

@@ -6,6 +6,7 @@ from geogs.config.known_poses import ReconstructConfig
 from geogs.config.losses import LossConfig
 from geogs.config.mapping import DiskConfig, MappingConfig
 from geogs.config.prior import PriorConfig
+from geogs.config.sensor import DepthSensorConfig
 from geogs.config.slam import Config
 from geogs.config.tracking import TrackingConfig
 
@@ -35,6 +36,8 @@ def _prior(prior: PriorConfig) -> Iterator[str]:
 
 def _run(config: Config) -> Iterator[str]:
     mapping = config.mapping
+    if config.input.depth == "none" and config.sensor != DepthSensorConfig():
+        yield "sensor does nothing: input.depth is none, so that no measured depth is used."
     if mapping.final_iterations == 0 and not mapping.final_depth:
         yield (
             "mapping.no-final-depth does nothing: with mapping.final-iterations 0 no depth is "

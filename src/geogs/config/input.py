@@ -23,6 +23,9 @@ class InputConfig(Settings, group="input"):
     readout: Annotated[float | Literal["auto"], Range(-0.1, 0.1), Only("run")] = "auto"
     """Seconds a rolling shutter takes from the first to the last row as the sensor reads them, such
     as 0.0276; 0 for a global shutter, auto finds it in the video."""
+    depth: Annotated[Literal["none", "auto", "sensor"], Only("run"), Basic("--depth")] = "none"
+    """Depth that a sensor measured, beside the images: none leaves it, auto takes it where there
+    is any, sensor must have it. With it the result is in metres."""
     topic: Annotated[str, Only("run"), Basic("--topic")] = "auto"
     """Topic of the images in a bag of ROS; auto takes the one that most likely is the camera."""
     start: Annotated[int, Range(0), Basic("--start")] = 0

@@ -10,6 +10,7 @@ from geogs.config.mapping import MappingConfig
 from geogs.config.mesh import MeshConfig
 from geogs.config.paper import LONG_EDGE, paper_loops, paper_mapping, paper_prior
 from geogs.config.prior import PriorConfig
+from geogs.config.sensor import DepthSensorConfig
 from geogs.config.setting import Count, Range, Settings
 from geogs.config.tracking import TrackingConfig
 
@@ -27,6 +28,7 @@ class Config(Settings):
     """Keyframes whose images, depths and the like stay in memory or on the GPU, those used last;
     others wait in a temporary file. More than the window that is mapped and its history."""
     input: InputConfig = field(default_factory=InputConfig)
+    sensor: DepthSensorConfig = field(default_factory=DepthSensorConfig)
     calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
     prior: PriorConfig = field(default_factory=PriorConfig)

@@ -40,6 +40,20 @@ class KeyframePrior:
         self.information = self.information * factor**2
 
 
+@dataclass
+class MeasuredCells:
+    """What a depth sensor says of a keyframe's cells, in the lengths of the map; mutable."""
+
+    inverse_depth: Float[Tensor, "p"]
+    information: Float[Tensor, "p"]
+    """Inverse variance of inverse depth; 0 where it says nothing."""
+
+    def rescale(self, factor: float) -> None:
+        """Multiply every length by ``factor``."""
+        self.inverse_depth = self.inverse_depth / factor
+        self.information = self.information * factor**2
+
+
 @dataclass(frozen=True, eq=False)
 class KeyframeState:
     """What a checkpoint holds of a keyframe; the fields are the keyframe's."""
@@ -55,6 +69,8 @@ class KeyframeState:
     prior: KeyframePrior | None
     scale: float
     moving: Bool[Tensor, "p"] | None
+    depth: Archived | None
+    measured: MeasuredCells | None
 
 
 @dataclass(eq=False)
@@ -77,13 +93,15 @@ class Keyframe:
     """World to camera, float64, on the CPU whatever the device of the grid."""
     inverse_depth: Float[Tensor, "p"]
     information: Float[Tensor, "p"]
-    """Of the matches alone: sum over edges of w |dp/dd|^2."""
+    """Of the matches, sum over edges of w |dp/dd|^2, and of a depth sensor; not of a prior."""
     prior: KeyframePrior | None = None
     scale: float = 1.0
     """Factor by which corrections have multiplied the lengths around it; what was measured from it
     at another scale is to be multiplied by the ratio of the two."""
     moving: Bool[Tensor, "p"] | None = None
     """Cells that are held for showing something that moves; none where nobody has judged yet."""
+    measured: MeasuredCells | None = None
+    """Of a depth sensor; none without, or where the map is not metric."""
 
     @property
     def image(self) -> UInt8[np.ndarray, "h w 3"]:
@@ -101,6 +119,7 @@ class Keyframe:
         return KeyframeState(
             self.id, self.frame_index, self.timestamp, picture.archived, picture.archived_normal,
             self.T_cw, self.inverse_depth, self.information, self.prior, self.scale, self.moving,
+            picture.archived_depth, self.measured,
         )  # fmt: skip
 
     def rescale(self, factor: float) -> None:
@@ -112,6 +131,8 @@ class Keyframe:
         self.scale = self.scale * factor
         if self.prior is not None:
             self.prior.rescale(factor)
+        if self.measured is not None:
+            self.measured.rescale(factor)
 
     def at_present_scale(self, T: Float[Tensor, "4 4"], scale: float) -> Float[Tensor, "4 4"]:
         """A motion measured from here when the keyframe had that scale, in its lengths of now."""

@@ -28,6 +28,7 @@ class StoreState:
     next_id: int
     images: Archive
     normals: Archive
+    depths: Archive
 
 
 class KeyframeStore:
@@ -61,12 +62,14 @@ class KeyframeStore:
 
     def state(self) -> StoreState:
         """What a checkpoint holds."""
-        return StoreState(self.next_id, self.pictures.images, self.pictures.normals)
+        pictures = self.pictures
+        return StoreState(self.next_id, pictures.images, pictures.normals, pictures.depths)
 
     def load(self, state: StoreState) -> None:
         """Give a store without keyframes the state of another."""
         self.next_id = state.next_id
         self.pictures.images, self.pictures.normals = state.images, state.normals
+        self.pictures.depths = state.depths
 
     def new_segment(self) -> "Segment":
         """A segment without keyframes, with a world of its own."""
@@ -143,16 +146,16 @@ class Segment:
         size = grid.camera.height, grid.camera.width, 3
         for s in states:
             cells = s.inverse_depth if s.moving is None else s.moving
-            if (s.image.shape, s.inverse_depth.shape, cells.shape) != (
-                size, (grid.size,), (grid.size,)
-            ):  # fmt: skip
+            measured = cells if s.measured is None else s.measured.inverse_depth
+            shapes = {s.inverse_depth.shape, cells.shape, measured.shape}
+            if s.image.shape != size or shapes != {(grid.size,)}:
                 raise InputError(f"keyframe {s.id} is of another camera")
             if s.id in self.store or not max(self._keyframes, default=-1) < s.id:
                 raise InputError(f"keyframe {s.id} is not in its place")
-            picture = Picture(pictures, s.image, s.normal)
+            picture = Picture(pictures, s.image, s.normal, s.depth)
             self._keyframes[s.id] = Keyframe(
                 s.id, s.frame_index, s.timestamp, grid, picture, s.T_cw, s.inverse_depth,
-                s.information, s.prior, s.scale, s.moving,
+                s.information, s.prior, s.scale, s.moving, s.measured,
             )  # fmt: skip
         self.store.assign(self.ids, self)
 

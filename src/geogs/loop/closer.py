@@ -9,7 +9,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from geogs.config import LoopConfig
-from geogs.geometry.lie import se3_inverse, sim3_inverse
+from geogs.geometry.lie import se3_inverse, sim3_inverse, sim3_scale
 from geogs.loop.closing_matches import closing_matches, take_over_depths
 from geogs.loop.closure import close_loops
 from geogs.loop.constraints import (
@@ -173,6 +173,9 @@ class LoopCloser:
         """Sim(3) from the host's world to the guest's as a loop has it."""
         host, guest = self._ends(loop)
         S = loop.S_ji.cpu()
+        if host.is_metric and guest.is_metric:
+            S = S.clone()
+            S[:3, :3] /= sim3_scale(S)
         here, there = loop.first, loop.second
         if loop.first in guest.keyframes:
             S, here, there = sim3_inverse(S), loop.second, loop.first
@@ -225,7 +228,9 @@ class LoopCloser:
         edges, matches = world.graph.edges, None
         if self.config.matches:
             matches = closing_matches(world.keyframes, edges, self.detector.loops)
-        closure = close_loops(ids, world.keyframes.poses(ids), relative, matches)
+        closure = close_loops(
+            ids, world.keyframes.poses(ids), relative, matches, is_metric=world.is_metric
+        )
         if closure is None or self._change(closure.correction) < self.config.min_change:
             return
         if closure.inverse_depth is not None:

@@ -51,16 +51,18 @@ def close_loops(
     relative: RelativePoses,
     matches: MatchedEdges | None = None,
     options: ClosureOptions | None = None,
+    is_metric: bool = False,
 ) -> LoopClosure | None:
     """Correct keyframes ``ids`` (ascending) by their loops; None if no loop is believed.
 
     Loops that contradict the others are left out, those that the kernel lets go of too, and matches
-    between their keyframes with them. The first keyframe keeps its pose and unit.
+    between their keyframes with them. The first keyframe keeps its pose and unit; all keep theirs
+    where the map ``is_metric``.
     """
     options = options or ClosureOptions()
     keep = consistent_loops(T_cw, relative, options.consistency)
     fixed = torch.arange(len(T_cw)) == 0
-    result = solve(PoseGraph(T_cw, relative.select(keep), fixed), options.graph)
+    result = solve(PoseGraph(T_cw, relative.select(keep), fixed, None, is_metric), options.graph)
     keep = keep.clone()
     keep[keep.clone()] = result.loop_weight >= options.least_weight
     if not bool((keep & relative.is_loop).any()):
@@ -68,7 +70,7 @@ def close_loops(
     kept = relative.select(keep)
     if matches is not None:
         believed = _without(matches, relative.select(~keep), kept)
-        result = solve(PoseGraph(result.S, kept, fixed, believed), options.graph)
+        result = solve(PoseGraph(result.S, kept, fixed, believed, is_metric), options.graph)
     return LoopClosure(
         pose_correction(ids, T_cw, result.S),
         kept.rescaled(result.scale),

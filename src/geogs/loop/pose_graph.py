@@ -10,7 +10,7 @@ memory is linear in edges. Source: the Sim(3) pose graph of HI-SLAM2, with exact
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -86,6 +86,8 @@ class PoseGraph:
     fixed: Bool[Tensor, "n"]
     """Keyframes whose similarity stays; at least one, or the world is undetermined."""
     matches: MatchedEdges | None = None
+    is_metric: bool = False
+    """Whether no unit drifts, so that all scales stay what they are at the start."""
 
 
 @dataclass(frozen=True)
@@ -288,9 +290,10 @@ class _Problem:
         self, state: _State, width: float, linear: LinearMatches, damping: float
     ) -> _State | None:
         """The state one damped step on; None where the system cannot be solved."""
-        xi = _solve_blocks(
-            [self._relative_equations(state, width), linear.equations], self.graph.fixed, damping
-        )
+        parts = [self._relative_equations(state, width), linear.equations]
+        if self.graph.is_metric:
+            parts = [_without_scale(part) for part in parts]
+        xi = _solve_blocks(parts, self.graph.fixed, damping)
         if xi is None:
             return None
         S = torch.where(self.graph.fixed[:, None, None], state.S, retract(xi, state.S))
@@ -313,6 +316,13 @@ class _Problem:
         gradient.index_add_(0, j, -(J_j.mT @ r)[..., 0])
         blocks = torch.cat([J_i.mT @ WJ_i, J_j.mT @ WJ_j, cross, cross.mT])
         return BlockEquations(torch.cat([i, j, i, j]), torch.cat([i, j, j, i]), blocks, gradient)
+
+
+def _without_scale(part: BlockEquations) -> BlockEquations:
+    """The same equations with nothing that moves a scale."""
+    rigid = torch.ones(7, dtype=torch.float64)
+    rigid[6] = 0
+    return replace(part, block=part.block * rigid[:, None] * rigid, gradient=part.gradient * rigid)
 
 
 def _solve_blocks(

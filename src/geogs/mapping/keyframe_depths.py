@@ -1,7 +1,8 @@
-"""The dense depths of a mapper's keyframes: searched, and checked by those around."""
+"""The dense depths of a mapper's keyframes: searched, measured, and checked by those around."""
 
-from geogs.config import DepthConfig
+from geogs.config import DepthConfig, DepthSensorConfig
 from geogs.depth.base import DepthEngine, Progress, silent
+from geogs.depth.sensor import joined
 from geogs.depth.sweep_neighbors import select_sweep_neighbours
 from geogs.mapping.view import MapView
 from geogs.mapping.view_pool import StoredDepth, ViewPool
@@ -24,7 +25,9 @@ class KeyframeDepths:
         views: dict[int, MapView],
         config: DepthConfig,
         pool: ViewPool,
+        sensor: DepthSensorConfig | None = None,
     ) -> None:
+        self.sensor = sensor or DepthSensorConfig()
         self.engine = engine
         self.views = views
         self.config = config
@@ -51,7 +54,8 @@ class KeyframeDepths:
             neighbours.append([candidates[i].depth_view for i in chosen])
         depths = self.engine.estimate(references, neighbours, progress, limits)
         for view, dense in zip(views, depths, strict=True):
-            self.pool.set_depth(view.id, dense)
+            sensed = view.sensed(self.sensor)
+            self.pool.set_depth(view.id, dense if sensed is None else joined(dense, *sensed))
 
     def check(self, views: list[MapView]) -> None:
         """Let the neighbours' depths, as they were estimated, revise those of the views."""

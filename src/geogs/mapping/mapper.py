@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from geogs.config import MappingConfig
+from geogs.config import DepthSensorConfig, MappingConfig
 from geogs.depth.base import Progress, silent
 from geogs.depth.select import depth_engine
 from geogs.errors import InputError
@@ -62,7 +62,13 @@ class Mapper:
     scaled.
     """
 
-    def __init__(self, keyframes: KeyframeStore, config: MappingConfig, seed: int = 0):
+    def __init__(
+        self,
+        keyframes: KeyframeStore,
+        config: MappingConfig,
+        seed: int = 0,
+        sensor: DepthSensorConfig | None = None,
+    ):
         self.config = config
         self.keyframes = keyframes
         self.cameras = MapCameras.of(keyframes.grid.camera, config)
@@ -76,7 +82,7 @@ class Mapper:
         )
         self.views: dict[int, MapView] = {}
         self.pool = ViewPool(self.cameras, config.loss, self.map.device, keyframes.resident)
-        self._depths = KeyframeDepths(engine, self.views, config.depth, self.pool)
+        self._depths = KeyframeDepths(engine, self.views, config.depth, self.pool, sensor)
         self.mapped: list[int] = []
         self.trained = TrainingPlace()
         """How far the training over all keyframes is, at each report of its progress."""

@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from geogs.config import DepthSensorConfig
 from geogs.depth.view import DenseDepth, DepthSearch, DepthView, Place, PosedDepth
 from geogs.geometry.lie import se3_inverse
 from geogs.keyframes.keyframe import Keyframe
@@ -13,6 +14,7 @@ from geogs.losses.light import same_light
 from geogs.losses.multi_view import PhotoView
 from geogs.losses.single_view import ViewConstants
 from geogs.mapping.view_pool import ViewPool
+from geogs.priors.depth_sensor import sensor_depth
 
 UNSURE = 1e3
 """Relative deviation of a depth that is nobody's measurement: it outweighs nothing."""
@@ -64,6 +66,20 @@ class MapView:
         return DepthView(
             self.id, self.T_cw.numpy(), maps.grey, maps.fine, maps.image, inverse_depth, information
         )
+
+    def sensed(
+        self, config: DepthSensorConfig
+    ) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]] | None:
+        """What a sensor measured at the render size: inverse depth and its information, map units.
+
+        On the map's device; None where it did not.
+        """
+        if self.keyframe.measured is None or (metres := self.keyframe.picture.depth) is None:
+            return None
+        render, scale = self.pool.cameras.render, self.keyframe.scale
+        found = sensor_depth(metres, config).resized(render.width, render.height)
+        inverse_depth, information = found.tensors(self.pool.device)
+        return inverse_depth / scale, information * scale**2
 
     @property
     def photo(self) -> PhotoView:

@@ -13,6 +13,7 @@ from geogs.errors import InputError, OutputError
 from geogs.geometry.camera import Camera
 from geogs.io.writers.atomic import prepare_output_folder
 from geogs.io.writers.ply import write_mesh, write_points
+from geogs.synth.depth_sensor import DepthSensor
 from geogs.synth.flaws import Flaws
 from geogs.synth.lens import Lens
 from geogs.synth.motion_kinds import MotionKind
@@ -44,6 +45,7 @@ def write_sequence(
     flaws: Flaws | None = None,
     moving: float = 0.0,
     depth: bool = True,
+    depth_sensor: DepthSensor | None = None,
     image_format: str = "jpg",
     video: bool = False,
     threads: int = 2,
@@ -57,9 +59,10 @@ def write_sequence(
     ``cam_params.json``, ``mesh.ply`` (the whole scene), ``points_seen_1cm.ply`` (what the camera
     saw), and ``video.mp4`` if asked for. Where the motion has not 30 frames a second, ``rgb.txt``
     and ``groundtruth.txt`` hold the times, in the layout of TUM. Depth and poses are those of the
-    middle row at mid-exposure, whatever the flaws. With ``moving``, things that cover about this
-    share of the image cross the view: they are in the images and the depths, but in neither the
-    mesh nor the points, and ``results/moving%06d.png`` is white where the depth is theirs.
+    middle row at mid-exposure, whatever the flaws; a ``depth_sensor`` adds its own. With
+    ``moving``, things that cover about this share of the image cross the view: they are in the
+    images and the depths, but in neither the mesh nor the points, and ``results/moving%06d.png`` is
+    white where the depth is theirs.
     ``raycaster`` of the same scene, where there is one, saves its making. ``on_frame`` is called
     after each frame.
 
@@ -94,7 +97,10 @@ def write_sequence(
         options = [cv2.IMWRITE_JPEG_QUALITY, quality] if image_format == "jpg" else []
         _write_image(name, cv2.cvtColor(shot.image, cv2.COLOR_RGB2BGR), options)
         if depth:
-            units = np.rint(shot.truth.depth * stage.depth_scale)
+            metres = shot.truth.depth
+            if depth_sensor is not None:
+                metres = depth_sensor.measure(metres, lens.camera.fx, seed, index)
+            units = np.rint(metres * stage.depth_scale)
             units = np.where(units > _DEPTH_UNITS, 0, units).astype(np.uint16)
             _write_image(results / f"depth{index:06d}.png", units, _FAST_PNG)
         if moving:

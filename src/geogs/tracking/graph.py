@@ -9,10 +9,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from geogs.bundle.base import BundleOptions, BundleResult
-from geogs.bundle.problem import BundleProblem, StreamedProblem
+from geogs.bundle.problem import BundleProblem, MeasuredDepths, StreamedProblem
 from geogs.bundle.select import bundle_solver, grid_fields, keyframe_pairs
 from geogs.bundle.streamed import StreamedBundle
 from geogs.errors import InputError
+from geogs.keyframes.keyframe import Keyframe
 from geogs.keyframes.store import Segment
 from geogs.threads import thread_map
 from geogs.tracking.flow.base import FlowMatch, FlowOperator
@@ -203,6 +204,7 @@ class FrameGraph:
             free_pose=torch.tensor([k in poses for k in ids]),
             free_depth=torch.tensor([k in depths for k in ids]),
             damping=_frame_damping(edges, [slot[i] for i, _ in directed], len(ids)),
+            measured=_measured([self.keyframes[k] for k in ids]),
         )
         return problem, ids
 
@@ -256,6 +258,21 @@ class FrameGraph:
             return self.bundle.solve(problem, options), ids
         streamed, ids = self.streamed_problem(directed, free_pose, free_depth)
         return StreamedBundle(grid).solve(streamed, options), ids
+
+
+def _measured(keyframes: Sequence[Keyframe]) -> MeasuredDepths | None:
+    """What depth sensors say of the cells of keyframes; none where there is nothing of any."""
+    if all(k.measured is None for k in keyframes):
+        return None
+    unknown = torch.zeros_like(keyframes[0].inverse_depth)
+    both = [
+        (unknown, unknown)
+        if k.measured is None
+        else (k.measured.inverse_depth, k.measured.information)
+        for k in keyframes
+    ]
+    inverse_depth, information = (torch.stack(m) for m in zip(*both, strict=True))
+    return MeasuredDepths(inverse_depth, information)
 
 
 def _reprojections(edges: Sequence[Edge]) -> Float[Tensor, "e p 2"]:

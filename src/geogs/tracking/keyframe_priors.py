@@ -33,13 +33,13 @@ class KeyframePriors:
         self._warned = False
 
     def ask(self, state: Keyframe) -> None:
-        """Let the prior look at a new keyframe."""
+        """Let the prior look at a new keyframe; of a depth that was measured it is not asked."""
         if self.prior is None:
             return
         maps, grid = self.prior.predict(state.image), self.graph.keyframes.grid
         if maps.normal is not None:
             state.picture.normal = self._facing(maps.normal.cpu())
-        if maps.depth is not None and self.config.depth:
+        if maps.depth is not None and self.config.depth and state.measured is None:
             values = on_cells(grid, maps.depth.to(grid.device))
             zero = torch.zeros_like(values)
             one = values.new_ones(self.config.scale_rows * self.config.scale_columns)

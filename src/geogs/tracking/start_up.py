@@ -145,6 +145,11 @@ class StartUp:
         step = self._gather(frame, encoded, turns)
         return StartStep(step.has_started, step.is_keyframe, removed)
 
+    def give_up(self, ids: Sequence[int]) -> tuple[int, ...]:
+        """Drop the keyframes gathered so far, since the map is started without them."""
+        self._chain.reset()
+        return self._forget(len(ids))
+
     def _thin_out(self) -> tuple[int, ...]:
         """Make every other keyframe an ordinary frame; the first and the last stay."""
         ids = self.keyframes.ids

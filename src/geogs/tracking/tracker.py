@@ -12,7 +12,7 @@ from torch import Tensor
 
 from geogs.bundle.base import BundleOptions
 from geogs.bundle.select import grid_fields
-from geogs.config import PriorConfig, TrackingConfig
+from geogs.config import DepthSensorConfig, PriorConfig, TrackingConfig
 from geogs.errors import InputError, TrackingLost
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_inverse
@@ -34,6 +34,7 @@ from geogs.tracking.motion import (
 from geogs.tracking.moving import carried
 from geogs.tracking.orientation_chain import Followed, OrientationChain, OrientationState
 from geogs.tracking.proximity import Pair, frame_distances, proximity_pairs
+from geogs.tracking.sensing import DepthSensing, stands_alone
 from geogs.tracking.start_up import MIN_KEYFRAMES, StartUp, StartUpState
 from geogs.tracking.trajectory import FrameRecord, RecorderState, TrajectoryRecorder
 from geogs.tracking.turns import Turn
@@ -127,6 +128,7 @@ class TrackerState:
     sharpness: list[float]
     """Of the latest frames."""
     orientation: OrientationState
+    is_metric: bool
 
 
 class Tracker:
@@ -142,6 +144,7 @@ class Tracker:
         prior: MonocularPrior | None = None,
         prior_config: PriorConfig | None = None,
         store: KeyframeStore | None = None,
+        sensor: DepthSensorConfig | None = None,
     ) -> None:
         """``store`` is where the keyframes are kept, in a segment of their own."""
         cv2.setRNGSeed(seed)
@@ -152,6 +155,9 @@ class Tracker:
         self.keyframes = (store or KeyframeStore(self.grid, self.operator.encode)).new_segment()
         self.graph = FrameGraph(self.keyframes, self.operator)
         self.priors = KeyframePriors(self.graph, prior, prior_config or PriorConfig())
+        self.sensing = DepthSensing(self.grid, sensor or DepthSensorConfig())
+        self.is_metric = False
+        """Whether a depth sensor started the map, which then is in metres."""
         self.recorder = TrajectoryRecorder(self.keyframes, self.operator)
         self.state = TrackState.INITIALIZING
         edge = max(camera.width, camera.height)
@@ -224,6 +230,7 @@ class Tracker:
             self.keyframes.state(), self.graph.state(), self.recorder.state(),
             self._start_up.state(), self.state, list(self._finalized), self._breaks, last,
             self._misses, self.frames_lost, self._choice.state(), self.orientation.state(),
+            self.is_metric,
         )  # fmt: skip
 
     def load(self, state: TrackerState) -> None:
@@ -232,7 +239,7 @@ class Tracker:
         self.graph.load(state.edges)
         self.recorder.load(state.recorder)
         self._start_up.load(state.start_up)
-        self.state = state.state
+        self.state, self.is_metric = state.state, state.is_metric
         self._finalized, self._breaks = dict.fromkeys(state.finalized), state.breaks
         self._misses, self.frames_lost = state.misses, state.frames_lost
         self._choice.load(state.sharpness)
@@ -339,6 +346,8 @@ class Tracker:
         if not len(self.keyframes):
             followed = self.orientation.follow(frame, encoded)
             turns = [] if followed is None else [followed.turn]
+        if frame.depth is not None and (result := self._start_metric(frame, encoded, turns)):
+            return result
         step = self._start_up.take(frame, encoded, turns)
         if not step.has_started:
             return TrackResult(self.state, removed=step.removed)
@@ -347,6 +356,24 @@ class Tracker:
         newest = self.keyframes.ids[-1] if step.is_keyframe else None
         fresh = self._finalise(self.keyframes.ids[:-1])
         return TrackResult(self.state, newest, fresh, self.active, step.removed)
+
+    def _start_metric(
+        self, frame: Frame, encoded: Any, turns: Sequence[Turn]
+    ) -> TrackResult | None:
+        """Start the map at once from what a depth sensor saw; None where that is too little."""
+        eye = torch.eye(4, dtype=torch.float64)
+        earlier = list(self.keyframes.ids)
+        state = self.keyframes.add(frame.index, frame.timestamp, frame.image, encoded, eye)
+        if not self.sensing.start(state, frame.depth, self.config.min_known):
+            self.keyframes.remove(state.id)
+            return None
+        removed = self._start_up.give_up(earlier)
+        self.priors.ask(state)
+        self.recorder.add_keyframe(state.id, turns)
+        self.is_metric = True
+        self._begin()
+        self.orientation.located(frame, encoded)
+        return TrackResult(self.state, state.id, removed=removed)
 
     def _begin(self) -> None:
         self.state = TrackState.TRACKING
@@ -428,7 +455,9 @@ class Tracker:
         T_rel = motion.T_cw @ se3_inverse(anchor.T_cw)
         self._seen_at(anchor, T_rel, velocity)
         turns = [] if followed is None else [followed.turn]
-        if not self._choice.calls_for(motion.flow, motion.overlap):
+        # Where few frames were measured, each of these is worth a keyframe.
+        is_first_measured = frame.depth is not None and self.is_metric and anchor.measured is None
+        if not (is_first_measured or self._choice.calls_for(motion.flow, motion.overlap)):
             self.recorder.add(frame, encoded, anchor.id, T_rel, motion.match, turns)
             return TrackResult(self.state, active=self.active)
         return self._insert(frame, encoded, motion, velocity, turns)
@@ -443,11 +472,13 @@ class Tracker:
     ) -> TrackResult:
         anchor = self.keyframes[motion.keyframe]
         state = self.keyframes.add(frame.index, frame.timestamp, frame.image, encoded, motion.T_cw)
-        self.priors.ask(state)
         T = motion.T_cw @ se3_inverse(anchor.T_cw)
         state.inverse_depth, state.information = grid_fields(self.grid).transfer(
             T, anchor.inverse_depth, anchor.information
         )
+        if self.is_metric:
+            self.sensing.join(state, frame.depth)
+        self.priors.ask(state)
         self.recorder.add_keyframe(state.id, turns)
         self._connect(state.id, anchor.id)
         seen = self.graph.edges[state.id, anchor.id]
@@ -501,6 +532,8 @@ class Tracker:
         if len(ids) <= MIN_KEYFRAMES or ids[-2] in self._finalized:
             return ()
         before, id = ids[-3], ids[-2]
+        if stands_alone([self.keyframes[k] for k in ids[-3:]]):
+            return ()
         distance = frame_distances(self.keyframes, [(before, id), (id, before)]).mean()
         if float(distance) >= self.config.cull_distance * self._long_edge:
             return ()

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Int
 from torch import Tensor
 
 from geogs.bundle.base import BundleOptions, BundleResult
-from geogs.bundle.problem import BundleProblem
+from geogs.bundle.problem import MEASURED_HUBER, BundleProblem
 from geogs.gpu.kernels import kernels_for
 from geogs.gpu.transfer import to_device
 from geogs.keyframes.grid import SampleGrid
@@ -150,6 +150,11 @@ class _Workspace:
         self.inverse_curvature, self.depth_gradient, self.delta = d.new_empty(3, d.numel()).unbind()
         self.residual = d.new_zeros(edges)
         self.damping = None if problem.damping is None else problem.damping.contiguous()
+        self.measured: tuple[Tensor | None, Tensor | None] = (None, None)
+        """Inverse depths measured beside the matches, and their information."""
+        if problem.measured is not None:
+            m = problem.measured
+            self.measured = (m.inverse_depth.contiguous(), m.information.contiguous())
 
 
 class CudaDenseBundle:
@@ -194,7 +199,8 @@ class CudaDenseBundle:
         )  # fmt: skip
         self._step["sum_sources"](
             s.frames, block, s.first, w.curvature, w.gradient, w.cells, options.depth_damping,
-            w.damping, w.information, w.inverse_curvature, w.depth_gradient,
+            w.damping, w.inverse_depth, *w.measured, MEASURED_HUBER, w.information,
+            w.inverse_curvature, w.depth_gradient,
         )  # fmt: skip
 
     def _solve_cameras(self, w: _Workspace, options: BundleOptions) -> None:

@@ -47,10 +47,13 @@ extern "C" __global__ void __launch_bounds__(256) linearise_edges(
 }
 
 // Curvature and gradient of the inverse depths of a frame over all of its edges. One block each.
-// added: further damping of every cell, or null.
+// added: further damping of every cell, or null. measured: inverse depths measured beside the
+// matches with their information, both or null; robust by Huber's factor, as on the CPU.
 extern "C" __global__ void __launch_bounds__(256) sum_sources(
     const int* first, const float* curvature, const float* gradient, int cells,
-    float depth_damping, const float* added, float* information, float* inverse_curvature, float* depth_gradient) {
+    float depth_damping, const float* added, const float* inverse_depth, const float* measured,
+    const float* measured_information, float huber, float* information, float* inverse_curvature,
+    float* depth_gradient) {
   size_t at = (size_t)blockIdx.x * cells;
   int begin = first[blockIdx.x], end = first[blockIdx.x + 1];
   float total = 0.f;
@@ -60,9 +63,15 @@ extern "C" __global__ void __launch_bounds__(256) sum_sources(
       c += curvature[e * cells + p];
       g += gradient[e * cells + p];
     }
+    total += c;
+    if (measured) {
+      float a = measured_information[at + p], r = measured[at + p] - inverse_depth[at + p];
+      a *= huber / fmaxf(sqrtf(a) * fabsf(r), huber);
+      c += a;
+      g += a * r;
+    }
     information[at + p] = c;
     depth_gradient[at + p] = g;
-    total += c;
   }
   float damping = depth_damping * block_sum(total) / cells + 1e-8f;
   for (int p = threadIdx.x; p < cells; p += blockDim.x)

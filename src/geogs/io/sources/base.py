@@ -14,12 +14,13 @@ from pathlib import Path
 from typing import Literal, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
 
 from geogs.config import InputConfig
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.io.sources.calibration import Calibration
+from geogs.io.sources.depth_files import DepthFile, RectifiedDepth
 from geogs.io.sources.intrinsics import resolve_intrinsics
 from geogs.io.sources.undistort import Rectifier
 from geogs.shutter.camera import RollingCamera
@@ -27,7 +28,7 @@ from geogs.shutter.neighbours import with_turning
 from geogs.shutter.readout import CLIP, CLIPS
 from geogs.shutter.rows import RowOffsets
 from geogs.shutter.shutter import Shutter
-from geogs.types import Frame
+from geogs.types import Frame, MeasuredDepth
 
 _log = logging.getLogger(__name__)
 T = TypeVar("T")
@@ -51,6 +52,8 @@ class RawFrame:
     """Whether its decoder found that a part is wrong."""
     why_not: str = "cannot be read"
     """What is wrong where there is no image."""
+    depth: MeasuredDepth | None = None
+    """What a depth sensor saw at that time, as it came or of the pixels of a working image."""
 
     @property
     def fault(self) -> str:
@@ -91,6 +94,11 @@ class Reader(Protocol):
     """The camera as far as the data set says."""
 
     @property
+    def has_depth(self) -> bool:
+        """Whether a sensor's depth comes with any of the images."""
+        ...
+
+    @property
     def paths(self) -> Sequence[Path]:
         """The files that are read."""
         ...
@@ -118,6 +126,11 @@ class Source:
         ``shutter``, where it is known better than the settings'.
         """
         _check_selection(config, reader.length)
+        if config.depth == "sensor" and not reader.has_depth:
+            raise InputError(
+                f"{reader.name} has no depth of a sensor beside its images that can be read here; "
+                "leave out --depth."
+            )
         self._reader = reader
         self._config = config
         self.calibration = calibration or resolve_intrinsics(
@@ -153,6 +166,11 @@ class Source:
     def camera(self) -> Camera:
         """The pinhole camera of every frame."""
         return self._rectifier.camera
+
+    @property
+    def uses_depth(self) -> bool:
+        """Whether frames come with the depth that a sensor measured."""
+        return self._config.depth != "none" and self._reader.has_depth
 
     @property
     def is_calibration_open(self) -> bool:
@@ -266,7 +284,7 @@ class Source:
                 if self.damaged == 1:
                     _log.warning("%s is damaged; used as far as it goes.", raw.label)
             self.place = ReadingPlace(index + 1, self.skipped, self.damaged)
-            yield Frame(index, raw.timestamp, raw.image)
+            yield Frame(index, raw.timestamp, raw.image, depth=raw.depth)
             index += 1
         if index == 0:
             raise InputError(self._why_empty())
@@ -284,7 +302,20 @@ class Source:
             return
         for raw in reader.read(start, config.stop, config.stride):
             raw = of_one_size(raw, reader)
-            yield raw if raw.image is None else replace(raw, image=self._rectifier(raw.image))
+            if raw.image is not None:
+                image = self._rectifier(raw.image)
+                raw = replace(raw, image=image, depth=self._rectified(raw.depth))
+            yield raw
+
+    def _rectified(
+        self,
+        depth: MeasuredDepth | None,
+        moved: Float[np.ndarray, "h w 2"] | None = None,
+    ) -> MeasuredDepth | None:
+        """Depth as it came, of the pixels of a working image, whose rows were ``moved``."""
+        if not (self.uses_depth and isinstance(depth, DepthFile)):
+            return None
+        return RectifiedDepth(depth, self.calibration, self._rectifier, moved)
 
     def _with_rows_rectified(self, start: int) -> Iterator[RawFrame]:
         """The same for a rolling shutter, from a place in the source on.
@@ -308,7 +339,8 @@ class Source:
                 yield raw
                 continue
             moved = None if turning.is_still else offsets(turning, readout)
-            yield replace(raw, image=self._rectifier.straightened(raw.image, moved))
+            image = self._rectifier.straightened(raw.image, moved)
+            yield replace(raw, image=image, depth=self._rectified(raw.depth, moved))
 
     def _why_empty(self) -> str:
         if self.skipped:

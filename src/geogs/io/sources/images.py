@@ -14,6 +14,7 @@ from geogs.io.pictures import decoded
 from geogs.io.poses import FRAMES_PER_SECOND
 from geogs.io.sources.base import RawFrame
 from geogs.io.sources.calibration import Calibration
+from geogs.io.sources.depth_files import DepthFile
 from geogs.io.sources.intrinsics import calibration_from_exif, find_calibration
 
 SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm"})
@@ -30,6 +31,8 @@ class ImageFile:
 
     path: Path
     timestamp: float
+    depth: DepthFile | None = None
+    """What a depth sensor saw at that time."""
 
 
 class ImageList:
@@ -58,13 +61,20 @@ class ImageList:
         """The files that are read."""
         return [file.path for file in self.files]
 
+    @property
+    def has_depth(self) -> bool:
+        """Whether a sensor's depth lies beside any of them."""
+        return any(file.depth is not None for file in self.files)
+
     def read(self, start: int, stop: int | None, stride: int) -> Iterator[RawFrame]:
         """Read images ``start, start + stride, ...`` before ``stop``."""
         for file in self.files[start:stop:stride]:
             found = decoded(file.path, cv2.IMREAD_COLOR)
             image = found.picture
             image = None if image is None else cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
-            yield RawFrame(str(file.path), file.timestamp, image, found.is_damaged)
+            yield RawFrame(
+                str(file.path), file.timestamp, image, found.is_damaged, depth=file.depth
+            )
 
 
 def read_image(path: Path) -> UInt8[np.ndarray, "h w 3"] | None:

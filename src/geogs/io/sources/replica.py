@@ -1,17 +1,24 @@
-"""Replica as rendered for iMAP: ``results/frame000000.jpg, ...``, ``cam_params.json``."""
+"""Replica as rendered for iMAP: ``results/frame000000.jpg, depth000000.png, ...``.
+
+``cam_params.json`` has the camera, and how many units of the depths make a metre.
+"""
 
 import re
 from pathlib import Path
 
+from geogs.documents import read_json
+from geogs.errors import InputError
 from geogs.io.poses import FRAMES_PER_SECOND
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.calibration_files import read_calibration
+from geogs.io.sources.depth_files import DepthFile
 from geogs.io.sources.images import ImageFile, ImageList
 
 _NAME = re.compile(r"frame(\d+)\.(jpg|jpeg|png)", re.IGNORECASE)
 _CAMERA = Calibration(
     600.0, 600.0, 599.5, 339.5, width=1200, height=680, origin="the Replica data set"
 )  # fmt: skip
+_PER_METRE = 6553.5
 
 
 def is_replica(folder: Path) -> bool:
@@ -26,10 +33,33 @@ def open_replica(folder: Path) -> ImageList:
     scene = results.parent.resolve()
     matches = ((_NAME.fullmatch(path.name), path) for path in results.iterdir())
     numbered = sorted((int(match[1]), path) for match, path in matches if match)
-    files = [ImageFile(path, number / FRAMES_PER_SECOND) for number, path in numbered]
+    per_metre = _units_per_metre(scene)
+    files = [
+        ImageFile(path, k / FRAMES_PER_SECOND, _depth(path, k, per_metre)) for k, path in numbered
+    ]
     reader = ImageList("replica", scene.name, files, None)
     reader.calibration = _find_calibration(scene, reader.width, reader.height)
     return reader
+
+
+def _depth(image: Path, number: int, per_metre: float) -> DepthFile | None:
+    digits = len(image.stem) - len("frame")
+    path = image.with_name(f"depth{number:0{digits}d}.png")
+    return DepthFile(path, per_metre) if path.is_file() else None
+
+
+def _units_per_metre(scene: Path) -> float:
+    """By ``cam_params.json``, else the data set's. Raises InputError for what cannot be."""
+    for file in (scene / "cam_params.json", scene.parent / "cam_params.json"):
+        if not file.is_file():
+            continue
+        document = read_json(file)
+        camera = document.get("camera") if isinstance(document, dict) else None
+        scale = camera.get("scale", _PER_METRE) if isinstance(camera, dict) else _PER_METRE
+        if type(scale) not in (int, float) or not 0 < scale < 1e9:
+            raise InputError(f"{file}: the scale of the depths is {str(scale)[:40]}, not a number.")
+        return float(scale)
+    return _PER_METRE
 
 
 def _results(folder: Path) -> Path:

@@ -1,11 +1,13 @@
-"""7-Scenes: ``frame-000000.color.png, ...`` in ``seq-01``."""
+"""7-Scenes: ``frame-000000.color.png, frame-000000.depth.png, ...`` in ``seq-01``."""
 
 import re
 from pathlib import Path
 
 from geogs.errors import InputError
+from geogs.geometry.camera import Camera
 from geogs.io.poses import FRAMES_PER_SECOND
 from geogs.io.sources.calibration import Calibration
+from geogs.io.sources.depth_files import DepthCamera, DepthFile
 from geogs.io.sources.images import ImageFile, ImageList
 from geogs.io.sources.intrinsics import find_calibration
 
@@ -15,6 +17,9 @@ _CAMERA = Calibration(
     525.0, 525.0, 320.0, 240.0, width=640, height=480,
     origin="the 7-Scenes colour camera, nominal", is_nominal=True,
 )  # fmt: skip
+_PER_METRE = 1000.0
+# Depth has not been registered to colour: the sensor's nominal camera is 25 mm beside it.
+_SENSOR = DepthCamera(Camera(585.0, 585.0, 320.0, 240.0, 640, 480), (-0.025, 0.0, 0.0))
 
 
 def is_seven_scenes(folder: Path) -> bool:
@@ -31,9 +36,14 @@ def open_seven_scenes(folder: Path) -> ImageList:
     sequence = sequences[0].resolve()
     matches = ((_NAME.fullmatch(path.name), path) for path in sequence.iterdir())
     numbered = sorted((int(match[1]), path) for match, path in matches if match)
-    files = [ImageFile(path, number / FRAMES_PER_SECOND) for number, path in numbered]
+    files = [ImageFile(path, k / FRAMES_PER_SECOND, _depth(path)) for k, path in numbered]
     calibration = find_calibration(sequence, sequence.parent) or _CAMERA
     return ImageList("7scenes", f"{sequence.parent.name}-{sequence.name}", files, calibration)
+
+
+def _depth(image: Path) -> DepthFile | None:
+    path = image.with_name(image.name.split(".")[0] + ".depth.png")
+    return DepthFile(path, _PER_METRE, _SENSOR) if path.is_file() else None
 
 
 def _sequences(folder: Path) -> list[Path]:

@@ -95,6 +95,11 @@ class SeveralSources:
         return SeveralSources([s.with_calibration(calibration) for s in self._sources])
 
     @property
+    def uses_depth(self) -> bool:
+        """Whether frames of any come with the depth that a sensor measured."""
+        return any(s.uses_depth for s in self._sources)
+
+    @property
     def shutter(self) -> Shutter:
         """By which rows are rectified."""
         return self._sources[0].shutter

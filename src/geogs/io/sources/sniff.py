@@ -11,6 +11,7 @@ from geogs.io.sources.base import Reader, Source
 from geogs.io.sources.images import SUFFIXES, open_image_folder
 from geogs.io.sources.replica import is_replica, open_replica
 from geogs.io.sources.ros.bag import Bag, is_bag
+from geogs.io.sources.scannet import is_scannet, open_scannet
 from geogs.io.sources.seven_scenes import is_seven_scenes, open_seven_scenes
 from geogs.io.sources.several import SeveralSources
 from geogs.io.sources.tum import is_tum, open_tum
@@ -74,4 +75,10 @@ def _folder_reader(folder: Path) -> Reader:
         return open_seven_scenes(folder)
     if is_replica(folder):
         return open_replica(folder)
+    if is_scannet(folder):
+        return open_scannet(folder)
+    if (folder / "rgb.mp4").is_file() and (folder / "depth").is_dir():
+        from geogs.io.sources.stray import StrayRecording  # loads FFmpeg
+
+        return StrayRecording(folder)
     return open_image_folder(folder)

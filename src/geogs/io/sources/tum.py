@@ -1,11 +1,15 @@
-"""TUM RGB-D: ``rgb.txt`` lists the colour images with their times."""
+"""TUM RGB-D: ``rgb.txt`` lists the colour images with their times, ``depth.txt`` the depths."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
+
+import numpy as np
 
 from geogs.documents import read_text
 from geogs.errors import InputError
 from geogs.io.sources.calibration import Calibration
+from geogs.io.sources.depth_files import DepthFile
 from geogs.io.sources.images import ImageFile, ImageList
 from geogs.io.sources.intrinsics import find_calibration
 
@@ -26,6 +30,11 @@ _FREIBURG_3 = Calibration(
 )  # fmt: skip
 
 
+_PER_METRE = 5000.0
+ASSOCIATED = 0.02
+"""Seconds between an image and a depth that belong together."""
+
+
 def is_tum(folder: Path) -> bool:
     """Whether ``folder`` is a sequence."""
     return (folder / "rgb.txt").is_file()
@@ -34,7 +43,7 @@ def is_tum(folder: Path) -> bool:
 def open_tum(folder: Path) -> ImageList:
     """Read a sequence; times are those of ``rgb.txt``."""
     name = folder.resolve().name
-    files = _read_list(folder)
+    files = _with_depths(folder, _read_list(folder / "rgb.txt"))
     return ImageList("tum", name, files, find_calibration(folder) or known_camera(name))
 
 
@@ -46,8 +55,24 @@ def known_camera(name: str) -> Calibration | None:
     return None
 
 
-def _read_list(folder: Path) -> list[ImageFile]:
-    listing = folder / "rgb.txt"
+def _with_depths(folder: Path, files: list[ImageFile]) -> list[ImageFile]:
+    """Images with the depth that is nearest in time, where one is near."""
+    listing = folder / "depth.txt"
+    if not listing.is_file():
+        return files
+    depths = _read_list(listing)
+    times = np.array([depth.timestamp for depth in depths])
+    found = []
+    for file in files:
+        n = int(np.abs(times - file.timestamp).argmin())
+        is_near = abs(times[n] - file.timestamp) <= ASSOCIATED
+        found.append(
+            replace(file, depth=DepthFile(depths[n].path, _PER_METRE) if is_near else None)
+        )
+    return found
+
+
+def _read_list(listing: Path) -> list[ImageFile]:
     lines, files = read_text(listing).splitlines(), []
     for number, line in enumerate(lines, start=1):
         words = line.split("#", 1)[0].split()
@@ -57,7 +82,7 @@ def _read_list(folder: Path) -> list[ImageFile]:
             time, image = float(words[0]), words[1]
             if len(words) != 2 or not math.isfinite(time):
                 raise ValueError
-            files.append(ImageFile(folder / image, time))
+            files.append(ImageFile(listing.parent / image, time))
         except (ValueError, IndexError):
             raise InputError(f"{listing}, line {number}: expected a time and a file.") from None
     if not files:

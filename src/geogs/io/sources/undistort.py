@@ -86,11 +86,17 @@ class Rectifier:
         """
         maps = self._maps
         if offsets is not None:
-            u, v = self._lens_maps()
-            maps = u + offsets[..., 0], v + offsets[..., 1]
+            maps = self.places(offsets)
         if maps is not None:
             image = cv2.remap(image, *maps, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
         return np.ascontiguousarray(image)
+
+    def places(
+        self, offsets: Float[np.ndarray, "h w 2"] | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Column and row of each pixel of the working image in the resized image."""
+        u, v = self._lens_maps()
+        return (u, v) if offsets is None else (u + offsets[..., 0], v + offsets[..., 1])
 
     def _lens_maps(self) -> tuple[np.ndarray, np.ndarray]:
         if self._maps is not None:

@@ -26,6 +26,7 @@ class VideoFile:
     """Reader of one video; turned upright by the container's display matrix."""
 
     kind = "video"
+    has_depth = False
 
     def __init__(self, path: Path) -> None:
         self.name = path.name

@@ -43,6 +43,7 @@ class Bag:
     """Reader of the images of one topic."""
 
     kind = "bag"
+    has_depth = False
     quarter_turns = 0
 
     def __init__(self, path: Path, topic: str = "auto") -> None:

@@ -1,0 +1,1 @@
+"""Metres for a map: by a known distance, tags of known size, or the camera's height."""

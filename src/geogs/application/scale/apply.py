@@ -1,0 +1,57 @@
+"""Brings a run's map to metres, at its end."""
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+
+from geogs.application.progress import RunProgress
+from geogs.application.scale.find import find_scale
+from geogs.application.scale.scene import MeasurableScene, SeenKeyframe, said
+from geogs.application.scale.source import ScaleSource, SensorScale
+from geogs.errors import InputError
+from geogs.io.sources.sniff import Stream
+from geogs.on_demand import OnDemand
+from geogs.slam import Slam
+from geogs.types import MetricScale
+
+
+def check_scale_source(source: ScaleSource | None, stream: Stream) -> None:
+    """Raises InputError where a scale is asked for that cannot be had of a source."""
+    if isinstance(source, SensorScale) and not stream.uses_depth:
+        raise InputError("--scale-from sensor needs measured depth: give --depth sensor, too.")
+
+
+def make_metric(
+    slam: Slam, stream: Stream, source: ScaleSource | None, progress: RunProgress
+) -> None:
+    """Bring the map to metres by what is known; where it does not tell, say so and leave it."""
+    if source is None or not slam.segments.keyframe_ids:
+        return
+    if isinstance(source, SensorScale):
+        if slam.metric_scale is None:
+            progress.write("warning: the scale is unknown: the map was not started from depth.")
+        return
+    try:
+        found = find_scale(measurable(slam), source, stream.calibration)
+    except InputError as why:
+        progress.write(f"warning: the scale stays unknown. {why}")
+        return
+    slam.rescale(MetricScale(found.origin, found.factor, found.deviation))
+    progress.write(said(found))
+
+
+def measurable(slam: Slam) -> MeasurableScene:
+    """The world of a run as a scale is looked for in."""
+    renderer = slam.renderer()
+
+    def surface(T_cw: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "h w"]:
+        return renderer.surface(torch.from_numpy(T_cw)).depth.double().cpu().numpy()
+
+    def seen(id: int) -> SeenKeyframe:
+        keyframe = slam.keyframes[id]
+        return SeenKeyframe(keyframe.T_cw.numpy(), keyframe.image)
+
+    return MeasurableScene(
+        slam.camera, renderer.camera, OnDemand(slam.segments.keyframe_ids, seen),
+        slam.trajectory(), surface,
+    )  # fmt: skip

@@ -1,0 +1,100 @@
+"""The scale by points whose distance is known: pixels of a frame, lifted by the map's depth."""
+
+import numpy as np
+from jaxtyping import Float64
+
+from geogs.application.scale.scene import FoundScale, MeasurableScene
+from geogs.application.scale.source import KnownDistance, KnownDistances
+from geogs.errors import InputError
+from geogs.geometry.distortion import undistorted_rays
+from geogs.io.sources.calibration import Calibration
+
+CLICK = 1.0
+"""Pixels of the image as it came by which a point that somebody gives is off."""
+_AROUND = 2
+"""Pixels of the depth map on each side of a point that say how far it is."""
+
+
+def scale_by_distances(
+    scene: MeasurableScene, known: KnownDistances, calibration: Calibration
+) -> FoundScale:
+    """The mean of what the distances say, by their variances.
+
+    Args:
+        scene: whose unit is asked.
+        known: pixels of images as they came.
+        calibration: of these images.
+
+    Raises:
+        InputError: a frame or a pixel is not there, or the map has no depth at it.
+    """
+    each = [_one(scene, one, calibration) for one in known.each]
+    factors, deviations = np.array(each).T
+    weight = deviations**-2.0
+    factor = float((weight * factors).sum() / weight.sum())
+    deviation = weight.sum() ** -0.5
+    if len(each) > 1:  # their disagreement says what no depth map knows of itself
+        chi = float((weight * (factors - factor) ** 2).sum() / (len(each) - 1))
+        deviation *= max(1.0, chi) ** 0.5
+    count = "a known distance" if len(each) == 1 else f"{len(each)} known distances"
+    return FoundScale(factor, float(deviation / factor), count)
+
+
+def _one(
+    scene: MeasurableScene, known: KnownDistance, calibration: Calibration
+) -> tuple[float, float]:
+    """Metres to the unit by one distance, and its deviation."""
+    trajectory = scene.trajectory
+    if known.frame >= len(trajectory.T_wc) or not trajectory.tracked[known.frame]:
+        raise InputError(
+            f"--scale-from: frame {known.frame} has no place; give one of the "
+            f"{len(trajectory.T_wc)} frames that was tracked."
+        )
+    depth = scene.surface(np.linalg.inv(trajectory.T_wc[known.frame]))
+    both = np.array([known.first, known.second])
+    rays = undistorted_rays(both, calibration.camera(), calibration.distortion, calibration.lens)
+    ends, along = zip(*(_lifted(scene, depth, ray, known) for ray in rays), strict=True)
+    apart = ends[1] - ends[0]
+    length = float(np.linalg.norm(apart))
+    focal = calibration.fx
+    variance = 0.0
+    for point, ray, deviation in zip(ends, rays, along, strict=True):
+        variance += 2 * (CLICK * point[2] / focal) ** 2 / 2
+        towards = np.append(ray, 1.0) @ apart / length
+        variance += (towards * deviation) ** 2
+    return known.metres / length, known.metres / length * variance**0.5 / length
+
+
+def _lifted(
+    scene: MeasurableScene,
+    depth: Float64[np.ndarray, "h w"],
+    ray: Float64[np.ndarray, "2"],
+    known: KnownDistance,
+) -> tuple[Float64[np.ndarray, "3"], float]:
+    """The point on a ray in the camera, and the deviation of its depth.
+
+    Inverse depth is fitted by a plane to the pixels around, without those of another surface.
+    """
+    camera = scene.depth_camera
+    u, v = ray[0] * camera.fx + camera.cx, ray[1] * camera.fy + camera.cy
+    column, row = round(float(u)), round(float(v))
+    if not (0 <= column < camera.width and 0 <= row < camera.height):
+        raise InputError(f"--scale-from: a pixel lies outside the working image of {known.frame}.")
+    rows = slice(max(row - _AROUND, 0), row + _AROUND + 1)
+    columns = slice(max(column - _AROUND, 0), column + _AROUND + 1)
+    y, x = np.mgrid[rows, columns]
+    y, x = y[: depth[rows, columns].shape[0]], x[:, : depth[rows, columns].shape[1]]
+    near = depth[rows, columns]
+    middle = np.median(near[near > 0]) if (near > 0).any() else 0.0
+    used = (near > 0) & (np.abs(near - middle) < 0.05 * middle)
+    if used.sum() < 4:
+        raise InputError(
+            f"--scale-from: the map has no depth at a pixel of frame {known.frame}; give points "
+            "on surfaces that are mapped."
+        )
+    A = np.stack([np.ones(used.sum()), x[used] - u, y[used] - v], 1)
+    inverse = 1 / near[used]
+    fit = np.linalg.lstsq(A, inverse, rcond=None)[0]
+    z = 1 / fit[0]
+    noise = float(np.sqrt(np.mean((A @ fit - inverse) ** 2))) * z * z
+    return np.append(ray, 1.0) * z, max(noise, 1e-3 * z)

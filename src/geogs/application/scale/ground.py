@@ -1,0 +1,120 @@
+"""The scale by the camera's height: the ground is the plane under its path."""
+
+import numpy as np
+from jaxtyping import Float64
+
+from geogs.application.scale.scene import FoundScale, MeasurableScene
+from geogs.application.scale.source import CameraHeight
+from geogs.errors import InputError
+
+VIEWS = 40
+"""Keyframes whose surfaces are looked at, at most."""
+POINTS = 400
+"""Points of each."""
+LEVEL = np.radians(35.0)
+"""Angle by which the ground's normal may differ from the mean of the cameras' own upward axes."""
+NEAR = 0.02
+"""Distance of a point from the plane, as a part of the cameras' height, that makes it ground."""
+_SAMPLES = 1000
+_JUDGES = 3000
+"""Points that say how good a plane is, at most."""
+_BELOW = 0.05
+"""Share of all points that may lie clearly under the ground."""
+_LEAST = 0.03
+"""Share of all points that the ground has, at least."""
+
+
+def scale_by_height(scene: MeasurableScene, known: CameraHeight, seed: int = 0) -> FoundScale:
+    """The median height of the keyframes over the ground, which is found by RANSAC.
+
+    The deviation is the spread of the heights over the path: nobody carries a camera level.
+
+    Raises:
+        InputError: there is no such plane.
+    """
+    step = max(1, -(-len(scene.keyframes) // VIEWS))
+    poses = np.array([k.T_cw for k in scene.keyframes])
+    if not len(poses):
+        raise InputError("--scale-from: there is no keyframe, and so no ground.")
+    rng = np.random.default_rng(seed)
+    clouds = []
+    for T_cw in poses[::step]:
+        points, _ = scene.points(T_cw)
+        chosen = rng.choice(len(points), min(POINTS, len(points)), replace=False)
+        clouds.append(points[chosen])
+    cloud = np.concatenate(clouds)
+    centres = -np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])
+    up = -poses[:, 1, :3].mean(0)
+    plane = ground_plane(cloud, centres, up, rng)
+    if plane is None:
+        raise InputError(
+            "--scale-from: no ground was found under the camera's path; let it be seen, or give "
+            "another known length."
+        )
+    heights = centres @ plane[:3] + plane[3]
+    height = float(np.median(heights))
+    spread = 1.4826 * float(np.median(np.abs(heights - height))) / height
+    origin = f"a camera height of {known.metres:g} m"
+    return FoundScale(known.metres / height, float(np.hypot(spread, 0.005)), origin)
+
+
+def ground_plane(
+    cloud: Float64[np.ndarray, "n 3"],
+    centres: Float64[np.ndarray, "k 3"],
+    up: Float64[np.ndarray, "3"],
+    rng: np.random.Generator,
+) -> Float64[np.ndarray, "4"] | None:
+    """Unit normal n, upward, and offset of the plane ``n . x + offset = 0`` below all cameras.
+
+    The one with most points of all that have hardly any below them; None without.
+    """
+    if len(cloud) < 3:
+        return None
+    up = up / max(float(np.linalg.norm(up)), 1e-12)
+    judges = cloud[rng.permutation(len(cloud))[:_JUDGES]]
+    best, most = None, _LEAST * len(judges)
+    for a, b, c in cloud[rng.integers(len(cloud), size=(_SAMPLES, 3))]:
+        plane = _through(a, b, c, up)
+        count = 0.0 if plane is None else _support(plane, judges, centres)
+        if count > most:
+            best, most = plane, count
+    if best is None:
+        return None
+    for _ in range(3):
+        height = float(np.median(centres @ best[:3] + best[3]))
+        near = cloud[np.abs(cloud @ best[:3] + best[3]) < NEAR * height]
+        middle = near.mean(0)
+        normal = np.linalg.svd(near - middle, full_matrices=False)[2][2]
+        normal = normal if normal @ up > 0 else -normal
+        best = np.append(normal, -normal @ middle)
+    return best
+
+
+def _through(
+    a: Float64[np.ndarray, "3"],
+    b: Float64[np.ndarray, "3"],
+    c: Float64[np.ndarray, "3"],
+    up: Float64[np.ndarray, "3"],
+) -> Float64[np.ndarray, "4"] | None:
+    normal = np.cross(b - a, c - a)
+    length = float(np.linalg.norm(normal))
+    if length < 1e-12:
+        return None
+    normal = normal / length if normal @ up > 0 else -normal / length
+    return np.append(normal, -normal @ a) if normal @ up > np.cos(LEVEL) else None
+
+
+def _support(
+    plane: Float64[np.ndarray, "4"],
+    cloud: Float64[np.ndarray, "n 3"],
+    centres: Float64[np.ndarray, "k 3"],
+) -> float:
+    """Points on a plane; 0 where a camera is not above it, or much lies below."""
+    heights = centres @ plane[:3] + plane[3]
+    height = float(np.median(heights))
+    if heights.min() <= 0:
+        return 0.0
+    above = cloud @ plane[:3] + plane[3]
+    if (above < -4 * NEAR * height).mean() > _BELOW:
+        return 0.0
+    return float((np.abs(above) < NEAR * height).sum())

@@ -1,0 +1,63 @@
+"""What a scale is looked for in: a map seen from anywhere, and its keyframes' images."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float64, UInt8
+
+from geogs.geometry.camera import Camera
+from geogs.types import Trajectory
+
+Surface = Callable[[Float64[np.ndarray, "4 4"]], Float64[np.ndarray, "h w"]]
+"""Depth of the map seen from a pose (world to camera), 0 where unknown, map units."""
+
+
+@dataclass(frozen=True, eq=False)
+class SeenKeyframe:
+    """One image of the map."""
+
+    T_cw: Float64[np.ndarray, "4 4"]
+    image: UInt8[np.ndarray, "h w 3"] | None
+    """RGB, at the size of the scene's camera."""
+
+
+@dataclass(frozen=True, eq=False)
+class MeasurableScene:
+    """A map whose unit is to be told."""
+
+    camera: Camera
+    """Of images."""
+    depth_camera: Camera
+    """Of depths."""
+    keyframes: Sequence[SeenKeyframe]
+    trajectory: Trajectory
+    """Of all frames."""
+    surface: Surface
+
+    def points(
+        self, T_cw: Float64[np.ndarray, "4 4"]
+    ) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"]]:
+        """World points of the surface seen from a pose, and their rays in the camera."""
+        depth = self.surface(T_cw)
+        rays = self.depth_camera.rays(torch.float64).numpy()[depth > 0]
+        points = rays * depth[depth > 0][:, None]
+        return (points - T_cw[:3, 3]) @ T_cw[:3, :3], rays
+
+
+@dataclass(frozen=True)
+class FoundScale:
+    """Metres to the map unit."""
+
+    factor: float
+    deviation: float
+    """Standard deviation of the factor, as a part of it."""
+    origin: str
+    """What told it, in words."""
+
+
+def said(found: FoundScale) -> str:
+    """A found scale in a sentence."""
+    share = f"{found.deviation:.1%}"
+    return f"Scale: {found.factor:.5g} metres to the map unit (+- {share}), by {found.origin}."

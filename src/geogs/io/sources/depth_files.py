@@ -1,0 +1,135 @@
+"""Depth that a sensor measured: pictures of it beside the images, brought to the image's pixels."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Float32, Shaped
+
+from geogs.geometry.camera import Camera
+from geogs.geometry.distortion import distorted_pixels
+from geogs.io.pictures import decoded
+from geogs.io.sources.calibration import Calibration
+from geogs.io.sources.undistort import Rectifier
+
+SAME_SURFACE = 0.03
+"""Relative difference of depth up to which neighbouring pixels are interpolated."""
+INVALID = 65535
+"""What some sensors write where they saw nothing, beside 0."""
+
+LONGEST = 32_000
+"""Pixels of a side beyond which OpenCV interpolates nothing."""
+
+
+@dataclass(frozen=True)
+class DepthCamera:
+    """A depth sensor that does not see from where the colour camera does."""
+
+    camera: Camera
+    T_colour_depth: tuple[float, float, float]
+    """From the depth camera's axes to the colour camera's, which are parallel; metres."""
+
+
+@dataclass(frozen=True)
+class DepthFile:
+    """A picture of depth as it came."""
+
+    path: Path
+    per_metre: float
+    """Units of the picture to the metre."""
+    sensor: DepthCamera | None = None
+    """Who saw it; none where its pixels are those of the colour image, at whatever size."""
+
+    def metres(self) -> Float32[np.ndarray, "h w"] | None:
+        """The depth of the picture's own pixels, 0 where unknown; None where it cannot be read."""
+        picture = decoded(self.path, cv2.IMREAD_UNCHANGED).picture
+        if picture is None or picture.ndim != 2 or max(picture.shape) > LONGEST:
+            return None
+        metres = picture.astype(np.float32) / np.float32(self.per_metre)
+        unknown = ~np.isfinite(metres) | (metres < 0)
+        if picture.dtype == np.uint16:
+            unknown |= picture == INVALID
+        return np.where(unknown, np.float32(0), metres)
+
+
+@dataclass(frozen=True)
+class RectifiedDepth:
+    """The same of the pixels of a working image, made when it is asked for."""
+
+    file: DepthFile
+    colour: Calibration
+    """Of the image as it came."""
+    rectifier: Rectifier
+    """What made the working image."""
+    offsets: Float[np.ndarray, "h w 2"] | None = None
+    """By which its rows were moved, since the shutter rolls."""
+
+    def metres(self) -> Float32[np.ndarray, "h w"] | None:
+        """Depth z in the working image's camera; 0 where unknown, None where it cannot be read."""
+        depth = self.file.metres()
+        if depth is None:
+            return None
+        if self.file.sensor is not None:
+            depth = registered(depth, self.file.sensor, self.colour)
+        resized = self.rectifier.resized_camera
+        u, v = self.rectifier.places(self.offsets)
+        height, width = depth.shape
+        x = (u + 0.5) * (width / resized.width) - 0.5
+        y = (v + 0.5) * (height / resized.height) - 0.5
+        return sampled(depth, x.astype(np.float32), y.astype(np.float32))
+
+
+def sampled(
+    depth: Float32[np.ndarray, "h w"],
+    x: Float32[np.ndarray, "h2 w2"],
+    y: Float32[np.ndarray, "h2 w2"],
+) -> Float32[np.ndarray, "h2 w2"]:
+    """Depth at any columns and rows: interpolated on a surface, the nearest pixel's at its edge.
+
+    Inverse depth is interpolated, which is linear on planes. 0 where nothing is known.
+    """
+    known = (depth > 0).astype(np.float32)
+    inverse = known / np.where(known > 0, depth, 1)
+    linear, share = (
+        cv2.remap(m, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0.0)
+        for m in (inverse, known)
+    )
+    nearest = cv2.remap(
+        inverse, x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0.0
+    )
+    smooth = (share > 0.999) & (np.abs(linear - nearest) < SAME_SURFACE * nearest)
+    chosen = np.where(smooth, linear, nearest)
+    return np.where(chosen > 0, 1 / np.where(chosen > 0, chosen, 1), 0).astype(np.float32)
+
+
+def registered(
+    depth: Float32[np.ndarray, "h w"], sensor: DepthCamera, colour: Calibration
+) -> Float32[np.ndarray, "h2 w2"]:
+    """Depth as the colour camera sees it, lens distortion included; the nearest surface wins.
+
+    ``colour`` knows the size of its images.
+    """
+    own = sensor.camera.resized(depth.shape[1], depth.shape[0])
+    rows, columns = np.nonzero(depth)
+    z = depth[rows, columns].astype(np.float64)
+    tx, ty, tz = sensor.T_colour_depth
+    x = (columns - own.cx) / own.fx * z + tx
+    y = (rows - own.cy) / own.fy * z + ty
+    z = z + tz
+    seen = colour.camera()
+    z = np.where(z > 0, z, np.inf)
+    pixels = distorted_pixels(np.stack([x / z, y / z], 1), seen, colour.distortion, colour.lens)
+    return _nearest_first(pixels, z, seen.width, seen.height)
+
+
+def _nearest_first(
+    pixels: Float[np.ndarray, "n 2"], z: Shaped[np.ndarray, "n"], width: int, height: int
+) -> Float32[np.ndarray, "h w"]:
+    u, v = np.rint(pixels).T
+    inside = (u >= 0) & (u < width) & (v >= 0) & (v < height) & np.isfinite(z)
+    order = np.argsort(-z[inside], kind="stable")  # what is written last stays
+    at = (v[inside].astype(int) * width + u[inside].astype(int))[order]
+    out = np.zeros(width * height, np.float32)
+    out[at] = z[inside][order]
+    return out.reshape(height, width)

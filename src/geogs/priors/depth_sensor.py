@@ -1,0 +1,127 @@
+"""The noise of a depth sensor: what a measured depth says of inverse depth, and where nothing.
+
+Triangulating sensors (structured light, stereo) measure a disparity, so that inverse depth errs
+alike everywhere, and depth with its square. Beside that a share of the depth is wrong in common
+(calibration, temperature), and a depth may belong to a pixel nearby, which counts where the surface
+is slanted:
+
+    sigma^2 = deviation^2 + (share d)^2 + (lateral |grad d|)^2 .
+
+What is wrong in common is the scale's error, which no comparison of depths shows; the share stands
+for what it leaves behind from place to place.
+
+At edges a sensor averages both sides or shows the wrong one, and holes eat into what is around
+them: pixels next to either are not believed. After Khoshelham and Elberink, "Accuracy and
+resolution of Kinect depth data", Sensors 2012, and Nguyen et al., "Modeling Kinect sensor noise",
+3DIMPVT 2012.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float, Float32
+from torch import Tensor
+
+from geogs.config import DepthSensorConfig
+
+_EVERYWHERE = np.ones((3, 3), np.uint8)
+_STEPS = 4.0
+"""Deviations of the sensor that a step between neighbouring pixels exceeds at an edge, too."""
+INDEPENDENT = 9.0
+"""Of 25 neighbouring pixels, so many whose noise has nothing to do with each other."""
+_MARGIN = 1
+"""Pixels beside a hole or an edge that are not believed."""
+
+
+@dataclass(frozen=True)
+class SensorDepth:
+    """Inverse depth as it was measured."""
+
+    inverse_depth: Float32[np.ndarray, "h w"]
+    """Per metre; 0 where nothing is believed."""
+    deviation: Float32[np.ndarray, "h w"]
+    """Its standard deviation; infinite where nothing is believed."""
+
+    def at_cells(self, offset: int, stride: int, height: int, width: int) -> "SensorDepth":
+        """At every ``stride``-th pixel from ``offset`` on, the mean of the pixels around.
+
+        On a plane the mean is what the pixel itself would show without noise; neighbours err
+        partly alike, so that 25 of them count as ``INDEPENDENT``.
+        """
+        known = (self.inverse_depth > 0).astype(np.float32)
+        share, total, worst = (
+            cv2.boxFilter(m, -1, (5, 5), normalize=False, borderType=cv2.BORDER_CONSTANT)
+            for m in (known, self.inverse_depth, np.where(known > 0, self.deviation, 0))
+        )
+        is_known = (known > 0) & (share > 12)
+        count = np.maximum(share, 1)
+        inverse = np.where(is_known, total / count, 0)
+        fewer = np.maximum(INDEPENDENT * share / 25, 1)
+        deviation = np.where(is_known, worst / count / np.sqrt(fewer), np.inf)
+        rows = slice(offset, offset + stride * height, stride)
+        columns = slice(offset, offset + stride * width, stride)
+        return SensorDepth(
+            np.ascontiguousarray(inverse[rows, columns], np.float32),
+            np.ascontiguousarray(deviation[rows, columns], np.float32),
+        )
+
+    def resized(self, width: int, height: int) -> "SensorDepth":
+        """Averages over the pixels of a smaller image; unknown where most of them are.
+
+        The deviation is the pixels' own: what they err in common does not average.
+        """
+        known = (self.inverse_depth > 0).astype(np.float32)
+        if (width, height) == known.shape[::-1]:
+            return self
+        share, inverse, deviation = (
+            cv2.resize(m, (width, height), interpolation=cv2.INTER_AREA)
+            for m in (known, self.inverse_depth, np.where(known > 0, self.deviation, 0))
+        )
+        is_known = share > 0.5
+        count = np.where(is_known, share, 1)
+        return SensorDepth(
+            np.where(is_known, inverse / count, 0).astype(np.float32),
+            np.where(is_known, deviation / count, np.inf).astype(np.float32),
+        )
+
+    def tensors(
+        self, device: torch.device | str
+    ) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
+        """Inverse depth and its information 1 / sigma^2, 0 where nothing is believed."""
+        information = np.where(self.inverse_depth > 0, self.deviation, np.inf) ** -2.0
+        return (
+            torch.from_numpy(self.inverse_depth).to(device),
+            torch.from_numpy(information.astype(np.float32)).to(device),
+        )
+
+
+def sensor_depth(metres: Float32[np.ndarray, "h w"], config: DepthSensorConfig) -> SensorDepth:
+    """What a picture of depth z, 0 where the sensor saw nothing, says of every pixel."""
+    known = (metres >= config.near) & (metres <= config.far)
+    z = np.where(known, metres, 1.0).astype(np.float32)
+    d = np.where(known, 1 / z, 0).astype(np.float32)
+    # Holes neither make a step nor a gradient: the pixels around stand for them.
+    highest = cv2.dilate(d, _EVERYWHERE)
+    lowest = cv2.erode(np.where(known, d, np.float32(1e6)), _EVERYWHERE)
+    step = np.where(known, highest - lowest, 0)
+    is_edge = step > 2 * np.maximum(config.edge * d, _STEPS * np.float32(config.deviation))
+    bad = cv2.dilate((is_edge | ~known).astype(np.uint8), _EVERYWHERE, iterations=_MARGIN) > 0
+    gradient = np.hypot(_slope(d, known, 1), _slope(d, known, 0))
+    share, lateral = np.float32(config.share), np.float32(config.lateral)
+    variance = config.deviation**2 + (share * d) ** 2 + (lateral * gradient) ** 2
+    return SensorDepth(
+        np.where(bad, 0, d).astype(np.float32),
+        np.where(bad, np.inf, np.sqrt(variance)).astype(np.float32),
+    )
+
+
+def _slope(
+    d: Float32[np.ndarray, "h w"], known: np.ndarray, axis: int
+) -> Float32[np.ndarray, "h w"]:
+    """Change of inverse depth from pixel to pixel over five of them; 0 next to holes."""
+    kernel = np.array([[-2, -1, 0, 1, 2]], np.float32) / 10
+    kernel = kernel if axis == 1 else kernel.T
+    whole = cv2.erode(known.astype(np.uint8), np.ones(kernel.shape, np.uint8)) > 0
+    return np.where(whole, cv2.filter2D(d, -1, kernel), 0)
