@@ -118,17 +118,18 @@ def _count_inside(lowest, seen):
 
 
 @njit(**_FAST)
-def _mean_of_better_half(sorted_costs, seen, least, out):
-    """Mean of the smallest costs: half as many as ``seen`` neighbours, rounded up, or ``least``."""
+def _mean_of_better_half(sorted_costs, seen, shares, out):
+    """Mean of the smallest costs: half as many as ``seen`` neighbours, rounded up, or two.
+
+    ``shares[n]`` is what each of the costs counts where n neighbours see the point.
+    """
     keep, w = sorted_costs.shape
     for x in range(w):
         out[x] = np.float32(0.0)
     for k in range(keep):
         row = sorted_costs[k]
         for x in range(w):
-            used = max((seen[x] + np.int32(1)) >> np.int32(1), np.int32(least))
-            share = np.float32(1.0) / np.float32(used)
-            out[x] += row[x] * share if k < used else np.float32(0.0)
+            out[x] += shares[seen[x], k] * row[x]
 
 
 @njit(**_FAST)
@@ -160,6 +161,10 @@ def match_planes(reference, mean, scale, images, a, b, planes, radius, floor, vo
     keep = max(least, (images.shape[0] + 1) // 2)
     best = np.empty((STRIP, keep, w), np.float32)
     seen = np.empty((STRIP, w), np.int32)
+    shares = np.zeros((images.shape[0] + 1, keep), np.float32)
+    for n in range(images.shape[0] + 1):
+        used = max((n + 1) // 2, least)
+        shares[n, :used] = np.float32(1.0) / np.float32(used)
     block = np.empty((STRIP, BLOCK, w), np.float32)
     norm = np.float32(1.0 / (2 * radius + 1) ** 2)
     for y0 in range(0, h, STRIP):
@@ -190,7 +195,7 @@ def match_planes(reference, mean, scale, images, a, b, planes, radius, floor, vo
                         )  # fmt: skip
                         _count_inside(lowest[i + radius], seen[i])
                 for i in range(rows):
-                    _mean_of_better_half(best[i], seen[i], least, block[i, k])
+                    _mean_of_better_half(best[i], seen[i], shares, block[i, k])
             for i in range(rows):
                 _transpose(block[i], count, volume[y0 + i], start)
 
