@@ -1,5 +1,7 @@
 """The compiled loops of the depth estimation against slow, obvious versions."""
 
+from itertools import product
+
 import cv2
 import numpy as np
 import pytest
@@ -106,6 +108,39 @@ def test_cost_outside_every_neighbour_is_the_outside_cost():
     costs = matching_costs(scene.views[0], [scene.views[1]], RENDER, planes, DepthConfig())
     assert costs[36, 0, 1] == sweep.OUTSIDE
     assert np.isfinite(costs).all()
+
+
+def test_matching_cost_is_the_mean_over_the_better_half_of_those_that_see_the_point():
+    scene = make_scene()
+    reference, *others = scene.views
+    planes = np.array([0.5, 1.4, 2.2], F)  # 0.5, 3 and more of the four look past some pixels
+    costs = matching_costs(reference, others, RENDER, planes, DepthConfig())
+    alone = np.stack(
+        [matching_costs(reference, [o], RENDER, planes, DepthConfig()) for o in others]
+    )
+    k = RENDER.matrix().numpy()
+    cameras = [(k @ (v.T_cw @ np.linalg.inv(reference.T_cw))[:3], v) for v in others]
+    rays = RENDER.rays().numpy()
+    counts = set()
+    for p, rho in enumerate(planes):
+        for y, x in product(range(0, RENDER.height, 3), range(0, RENDER.width, 3)):
+            point = np.append(rays[y, x] / rho, 1.0)
+            images = [projection @ point for projection, _ in cameras]
+            places = [(q[0] / q[2], q[1] / q[2]) for q in images]
+            if any(
+                _near_border(u, RENDER.width) or _near_border(v, RENDER.height) for u, v in places
+            ):
+                continue  # rounding decides
+            inside = [0 < u < RENDER.width - 1 and 0 < v < RENDER.height - 1 for u, v in places]
+            used = max(2, (sum(inside) + 1) // 2)
+            counts.add(sum(inside))
+            expected = np.sort(alone[:, y, x, p])[:used].mean()
+            assert costs[y, x, p] == pytest.approx(expected, abs=1e-4)
+    assert counts == {0, 1, 2, 3, 4}
+
+
+def _near_border(place, size):
+    return min(abs(place), abs(place - (size - 1))) < 0.01
 
 
 def test_winner_finds_the_vertex_and_its_margin():

@@ -94,7 +94,7 @@ def matching_costs(
     planes: Float32[np.ndarray, "p"],
     config: DepthConfig,
 ) -> Float32[np.ndarray, "h w p"]:
-    """Mean 1 - NCC of the better half (at least two) of the neighbours, per pixel and plane."""
+    """Mean 1 - NCC of the better half (at least two) of the neighbours that see a point."""
     radius, floor = config.window // 2, np.float32(config.variance_floor)
     grey = reference.grey - np.float32(0.5)
     images = np.stack([v.grey for v in neighbours]) - np.float32(0.5)
@@ -102,10 +102,9 @@ def matching_costs(
     mean = cv2.blur(grey, size, borderType=cv2.BORDER_REPLICATE)
     square = cv2.blur(grey * grey, size, borderType=cv2.BORDER_REPLICATE)
     scale = 1.0 / np.sqrt(np.maximum(square - mean * mean, 0.0) + floor)
-    keep = max(min(2, len(neighbours)), (len(neighbours) + 1) // 2)
     a, b = _homographies(reference, neighbours, camera)
     volume = np.empty((*grey.shape, len(planes)), np.float32)
-    kernels.match_planes(grey, mean, scale, images, a, b, planes, radius, floor, keep, volume)
+    kernels.match_planes(grey, mean, scale, images, a, b, planes, radius, floor, volume)
     return volume
 
 

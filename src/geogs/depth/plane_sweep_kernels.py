@@ -111,13 +111,25 @@ def _ncc_row(sum_b, sum_bb, sum_ab, mean, scale, lowest, norm, floor, best):
 
 
 @njit(**_FAST)
-def _mean_rows(rows, share, out):
-    """out = share times the sum of the rows."""
-    for x in range(out.shape[0]):
-        out[x] = rows[0, x] * share
-    for k in range(1, rows.shape[0]):
-        for x in range(out.shape[0]):
-            out[x] += rows[k, x] * share
+def _count_inside(lowest, seen):
+    """One more where the sample lies in the image."""
+    for x in range(seen.shape[0]):
+        seen[x] += np.int32(lowest[x] < OUTSIDE)
+
+
+@njit(**_FAST)
+def _mean_of_better_half(sorted_costs, seen, shares, out):
+    """Mean of the smallest costs: half as many as ``seen`` neighbours, rounded up, or two.
+
+    ``shares[n]`` is what each of the costs counts where n neighbours see the point.
+    """
+    keep, w = sorted_costs.shape
+    for x in range(w):
+        out[x] = np.float32(0.0)
+    for k in range(keep):
+        row = sorted_costs[k]
+        for x in range(w):
+            out[x] += shares[seen[x], k] * row[x]
 
 
 @njit(**_FAST)
@@ -129,9 +141,11 @@ def _transpose(block, count, volume, start):
 
 
 @njit(**_FAST)
-def match_planes(reference, mean, scale, images, a, b, planes, radius, floor, keep, volume):
-    """volume[y, x, k] = mean of the ``keep`` smallest 1 - NCC over the neighbours, at plane k.
+def match_planes(reference, mean, scale, images, a, b, planes, radius, floor, volume):
+    """volume[y, x, k] = mean of the smaller half of 1 - NCC over the neighbours, at plane k.
 
+    That is half of those into whose images the pixel falls, rounded up, but at least two (one if
+    there is but one), so that what few look at is matched with these; who is missing costs OUTSIDE.
     ``a`` (n, 3, 3), ``b`` (n, 3): homographies a + rho b e_3^T of the neighbours (float64).
     Windows have (2 radius + 1)^2 pixels; image borders repeat. Images should be centred about zero,
     so that little is lost to cancellation in the variances.
@@ -143,15 +157,23 @@ def match_planes(reference, mean, scale, images, a, b, planes, radius, floor, ke
     fraction_u, fraction_v = np.empty(w, np.float32), np.empty(w, np.float32)
     columns = np.empty((3, w + 2 * radius), np.float32)
     sums = np.empty((3, w), np.float32)
+    least = min(2, images.shape[0])
+    keep = max(least, (images.shape[0] + 1) // 2)
     best = np.empty((STRIP, keep, w), np.float32)
+    seen = np.empty((STRIP, w), np.int32)
+    shares = np.zeros((images.shape[0] + 1, keep), np.float32)
+    for n in range(images.shape[0] + 1):
+        used = max((n + 1) // 2, least)
+        shares[n, :used] = np.float32(1.0) / np.float32(used)
     block = np.empty((STRIP, BLOCK, w), np.float32)
-    norm, share = np.float32(1.0 / (2 * radius + 1) ** 2), np.float32(1.0 / keep)
+    norm = np.float32(1.0 / (2 * radius + 1) ** 2)
     for y0 in range(0, h, STRIP):
         rows = min(STRIP, h - y0)
         for start in range(0, planes.shape[0], BLOCK):
             count = min(BLOCK, planes.shape[0] - start)
             for k in range(count):
                 best[:] = FAR
+                seen[:] = 0
                 for j in range(images.shape[0]):
                     for i in range(rows + 2 * radius):
                         y = min(max(y0 + i - radius, 0), h - 1)
@@ -171,8 +193,9 @@ def match_planes(reference, mean, scale, images, a, b, planes, radius, floor, ke
                             sums[0], sums[1], sums[2], mean[y], scale[y], lowest[i + radius],
                             norm, floor, best[i],
                         )  # fmt: skip
+                        _count_inside(lowest[i + radius], seen[i])
                 for i in range(rows):
-                    _mean_rows(best[i], share, block[i, k])
+                    _mean_of_better_half(best[i], seen[i], shares, block[i, k])
             for i in range(rows):
                 _transpose(block[i], count, volume[y0 + i], start)
 

@@ -97,7 +97,7 @@ __device__ void match_tile(
   const int t = threadIdx.x, px = t % TILE_W, py = t / TILE_W;
   const int x = x0 + radius + px, y = y0 + radius + py;
   const bool matches = py < TILE_H, writes = matches && x < w && y < h;
-  const float norm = 1.f / (side * side), share = 1.f / keep;
+  const float norm = 1.f / (side * side);
   float4* homs = (float4*)shared;
   float *reference = shared + 12 * neighbours, *warped = reference + size;
   for (int j = t; j < 3 * neighbours; j += blockDim.x) {
@@ -121,6 +121,7 @@ __device__ void match_tile(
     float best[MAX_KEPT];
 #pragma unroll
     for (int k = 0; k < MAX_KEPT; k++) best[k] = FAR;
+    int seen = 0;
     // Two buffers in turn: one barrier between writing and reading is enough.
     for (int j = 0; j < neighbours && rho >= 0.f; j++, turn ^= 1) {
       float* tile = warped + turn * size;
@@ -134,18 +135,23 @@ __device__ void match_tile(
       if (matches) {
         float cost = window_cost<RADIUS>(
             reference + corner, tile + corner, row, radius, own, norm, floor);
-        insert_cost(best, keep, fmaxf(cost, is_outside(tile[centre]) ? OUTSIDE : 0.f));
+        const bool outside = is_outside(tile[centre]);
+        insert_cost(best, keep, fmaxf(cost, outside ? OUTSIDE : 0.f));
+        seen += !outside;
       }
     }
     if (!writes) continue;
+    const int used = max((seen + 1) / 2, min(2, neighbours));
+    const float share = 1.f / used;
     float mean = 0.f;
 #pragma unroll
-    for (int k = 0; k < MAX_KEPT; k++) mean += k < keep ? best[k] * share : 0.f;
+    for (int k = 0; k < MAX_KEPT; k++) mean += k < used ? best[k] * share : 0.f;
     volume[((long long)y * w + x) * slots + slot] = rho >= 0.f ? mean : FAR;
   }
 }
 
-// volume[pixel, slot] = mean of the `keep` smallest 1 - NCC over the neighbours at the slot's plane.
+// volume[pixel, slot] = mean of the smaller half of 1 - NCC over the neighbours at the slot's plane:
+// half of those into whose images the pixel falls, at least two; `keep` is the most that can be.
 // grey (h, w) and images (n, h, w) are centred about zero; homographies (n, 12): a (3 x 3), b (3);
 // pixel p at inverse depth rho appears at a p + rho b. Grid: tiles of 32 x 8 pixels, slots / 8.
 extern "C" __global__ void match_planes(

@@ -67,7 +67,7 @@ def match_planes(
     planes: PlaneSlots,
     config: DepthConfig,
 ) -> Float32[Tensor, "h w s"]:
-    """Mean 1 - NCC of the better half (at least two) of the neighbours, per pixel and slot."""
+    """Mean 1 - NCC of the better half (at least two) of the neighbours that see a point."""
     (h, w), n, radius = grey.shape, len(images), config.window // 2
     keep = max(min(2, n), (n + 1) // 2)
     size = (_TILE_W + 2 * radius) * (_TILE_H + 2 * radius)
