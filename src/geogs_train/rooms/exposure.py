@@ -20,7 +20,7 @@ def exposed(
     x = (torch.arange(w, device=image.device) + 0.5) * (2 / w) - 1
     y = (torch.arange(h, device=image.device)[:, None] + 0.5) * (2 / h) - 1
     grid = torch.stack(torch.broadcast_tensors(x, y), -1)
-    step = way * torch.tensor([2 / w, 2 / h], device=image.device)
+    step = torch.stack([way[..., 0] * (2 / w), way[..., 1] * (2 / h)], -1)
     total = torch.zeros_like(image)
     for tap in range(_TAPS):
         at = grid + (tap / (_TAPS - 1) - 0.5) * step
