@@ -1,5 +1,6 @@
 """The flow network's course: clips of random rooms and one of the two stages of its training."""
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,7 @@ from torch import Tensor
 
 from geogs.tracking.flow.own import load_network
 from geogs.tracking.flow.own_network import FlowNetwork
-from geogs_train.ahead import PlansAhead
+from geogs_train.ahead import PROCESSES, PlansAhead
 from geogs_train.course import Panels, Worker
 from geogs_train.export import export_weights
 from geogs_train.objective import objective
@@ -85,7 +86,9 @@ class FlowCourse:
         if self.worker.device.type != "cuda":
             return self.rooms.plan(step, options.batch, rank)
         if self._plans is None:
+            cores = len(os.sched_getaffinity(0)) // self.worker.count
             self._plans = PlansAhead(
-                options.rooms, self.rooms.bank.materials, options.seed, options.batch, rank
-            )
+                options.rooms, self.rooms.bank.materials, options.seed, options.batch, rank,
+                processes=max(PROCESSES, min(6, (cores - 2) // 2)),
+            )  # fmt: skip
         return self._plans.plan(step)

@@ -101,13 +101,13 @@ def _starts(
     options: StartOptions,
     generator: torch.Generator,
 ) -> Tensor:
-    largest = None
+    largest, truth = None, _at_cells(truth)
     if clips.scene is not None:
         # What poses and depths say knows of no motion but the camera's.
-        truth = clips.still_flow(*pair)
+        truth = clips.still_flow(_at_cells(clips.points(pair[0])), pair[1])
         largest = torch.full_like(clips.intrinsics[:, 0], options.largest)
         largest = torch.where(clips.scene.kind == PAPERED, REPEATING, largest)
-    depth, truth = _at_cells(clips.depth[:, pair[0]]), _at_cells(truth)
+    depth = _at_cells(clips.depth[:, pair[0]])
     cells = cell_pixels(depth.shape[1], depth.shape[2], depth).reshape(*depth.shape[1:], 2)
     intrinsics = clips.intrinsics.float()
     f, c = intrinsics[:, None, None, :2], intrinsics[:, None, None, 2:]

@@ -83,6 +83,20 @@ def test_starts_are_off_by_what_is_asked_for():
     assert step < 0.5 * error.norm(dim=-1).mean()
 
 
+def test_far_starts_lie_beyond_the_others_and_edges_may_have_limits_of_their_own():
+    pair = plane_pair()
+    off = {}
+    for far in (0.0, 1.0):
+        options = StartOptions(smallest=0.5, largest=4.0, cold=0.0, far=far, farthest=12.0)
+        largest = torch.full((64,), 1.0)
+        generator = torch.Generator().manual_seed(1)
+        start = disturbed_starts(**pair, options=options, generator=generator, largest=largest)
+        off[far] = (start - pair["truth"]).norm(dim=-1).flatten(1).median(1).values
+    assert off[0.0].max() < 1.01
+    assert off[1.0].max() < 12.01
+    assert off[1.0].quantile(0.9) > 4
+
+
 def test_cold_starts_know_nothing():
     pair = plane_pair()
     options = StartOptions(cold=1.0)

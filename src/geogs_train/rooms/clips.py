@@ -52,9 +52,8 @@ class ClipBatch:
         solids = self.solids.moved_by(self.scene.ways, second)
         return flow(solids, self.views, points, second)
 
-    def still_flow(self, first: int, second: int) -> Float[Tensor, "b h w 2"]:
-        """Where they would be if nothing had moved but the camera."""
-        points = self.points(first)
+    def still_flow(self, points: Float[Tensor, "b h w 3"], second: int) -> Float[Tensor, "b h w 2"]:
+        """Where what is at these points would be in a view if nothing but the camera moved."""
         pixels, _ = project(self.views, second, points.flatten(1, 2))
         return pixels.unflatten(1, points.shape[1:3])
 

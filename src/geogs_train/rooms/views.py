@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from geogs_train.rooms.draw import from_vector
+from geogs_train.rooms.draw import turned
 
 MIN_Z = 0.01
 """Metres before a camera from where on points have a place in its image."""
@@ -56,16 +56,15 @@ class Views:
         intrinsics = self.intrinsics.repeat_interleave(self.T_cw.shape[1], 0)
         return Views(self.T_cw.flatten(0, 1)[:, None], intrinsics, self.width, self.height, sweep)
 
-    def at_row(
-        self, view: int, y: Float[Tensor, "*rows"]
-    ) -> tuple[Float[Tensor, "b m 3 3"], Float[Tensor, "b m 3"]] | None:
-        """Rotation of a row's camera to the middle row's, and its centre there; None where all
-        rows are read at once. ``y`` is (m,) or (b, m); a row may lie outside by half an image."""
-        if self.sweep is None:
-            return None
-        share = (y / max(self.height - 1, 1) - 0.5).clamp(-1, 1)[..., None]
+    def share_of_row(self, y: Float[Tensor, "*rows"]) -> Float[Tensor, "*rows 1"]:
+        """When a row is read, from -1/2 to 1/2; a row may lie outside by half an image."""
+        return (y / max(self.height - 1, 1) - 0.5).clamp(-1, 1)[..., None]
+
+    def swept(self, view: int) -> tuple[Float[Tensor, "b 1 3"], Float[Tensor, "b 1 3"]]:
+        """Rotation vector and way of a view from its first row to its last."""
+        assert self.sweep is not None
         turn, way = self.sweep[:, view, None].split(3, -1)
-        return from_vector(share * turn), share * way
+        return turn, way
 
 
 def rays(
@@ -75,10 +74,10 @@ def rays(
     fx, fy, cx, cy = views.intrinsics[:, :, None].unbind(1)
     d = torch.stack(torch.broadcast_tensors((x - cx) / fx, (y - cy) / fy, torch.ones_like(fx)), -1)
     centre = views.centre[:, view, None]
-    row = views.at_row(view, y)
-    if row is not None:
-        d = (row[0] @ d[..., None])[..., 0]
-        centre = centre + torch.einsum("bij,bmj->bmi", views.R_wc[:, view], row[1])
+    if views.sweep is not None:
+        share, (turn, way) = views.share_of_row(y), views.swept(view)
+        d = turned(d, share * turn)
+        centre = centre + torch.einsum("bij,bmj->bmi", views.R_wc[:, view], share * way)
     direction = torch.einsum("bij,bmj->bmi", views.R_wc[:, view], d)
     return centre.expand_as(direction), direction
 
@@ -93,20 +92,21 @@ def project(
     ray = point - views.centre[:, view, None]
     middle = torch.einsum("bij,bmj->bmi", views.T_cw[:, view, :3, :3], ray)
     pixels, before = _pinhole(views, middle)
-    for _ in range(0 if views.sweep is None else ROUNDS):
-        row = views.at_row(view, pixels[..., 1])
-        assert row is not None
-        pixels, before = _pinhole(views, (row[0].mT @ (middle - row[1])[..., None])[..., 0])
+    if views.sweep is not None:
+        turn, way = views.swept(view)
+        for _ in range(ROUNDS):
+            share = views.share_of_row(pixels[..., 1])
+            pixels, before = _pinhole(views, turned(middle - share * way, -share * turn))
     return pixels, before
 
 
 def row_centre(views: Views, view: int, pixels: Float[Tensor, "b m 2"]) -> Float[Tensor, "b m 3"]:
     """World position of the camera when the rows of these pixels are read."""
     centre = views.centre[:, view, None]
-    row = views.at_row(view, pixels[..., 1])
-    if row is None:
+    if views.sweep is None:
         return centre.expand(*pixels.shape[:2], 3)
-    return centre + torch.einsum("bij,bmj->bmi", views.R_wc[:, view], row[1])
+    way = views.share_of_row(pixels[..., 1]) * views.swept(view)[1]
+    return centre + torch.einsum("bij,bmj->bmi", views.R_wc[:, view], way)
 
 
 def _pinhole(

@@ -7,7 +7,7 @@ import torch
 
 from geogs_train.pairs import REPEATING, flow_batch
 from geogs_train.rooms.clips import ClipBatch
-from geogs_train.rooms.draw import Draw
+from geogs_train.rooms.draw import Draw, from_vector, turned
 from geogs_train.rooms.exposure import exposed, motion_while_open
 from geogs_train.rooms.kinds import NAMES, STREET, draw_kinds, only_scene
 from geogs_train.rooms.options import RoomOptions, SceneShares
@@ -90,7 +90,6 @@ def test_blur_is_along_what_finite_differences_say():
 
 
 def _after(T_cw: torch.Tensor, twist: torch.Tensor) -> torch.Tensor:
-    from geogs_train.rooms.draw import from_vector
 
     done = torch.eye(4, dtype=T_cw.dtype)
     done[:3, :3], done[:3, 3] = from_vector(twist[:3]), twist[3:]
@@ -111,7 +110,7 @@ def test_a_point_is_drawn_out_and_loses_no_light():
 def test_people_move_and_their_flow_is_their_own(sampler):
     clips = film(sampler, "people", 4)
     assert clips.scene is not None
-    truth, still = clips.flow(0, 1), clips.still_flow(0, 1)
+    truth, still = clips.flow(0, 1), clips.still_flow(clips.points(0), 1)
     moving = clips.scene.ways_of(clips.solid[:, 0]).norm(dim=-1) > 0
     apart = (truth.pixels - still).norm(dim=-1)
     assert 0.005 < moving.float().mean() < 0.7
@@ -143,7 +142,7 @@ def test_papered_walls_start_from_the_right_one(sampler):
     assert clips.scene is not None
     generator = torch.Generator().manual_seed(0)
     batch = flow_batch(clips, StartOptions(cold=0.0), generator)
-    still = torch.cat([clips.still_flow(0, 1), clips.still_flow(1, 0)])
+    still = torch.cat([clips.still_flow(clips.points(k), 1 - k) for k in (0, 1)])
     off = (batch.start - batch.at_cells(still)).norm(dim=-1).median(1).values
     assert off.max() < REPEATING + 0.01
     generator.manual_seed(0)
@@ -160,3 +159,11 @@ def test_only_shaken_clips_are_read_row_by_row():
     rolling = shake.sweep[kind == 1].abs().amax((1, 2)) > 0
     assert 0.7 < rolling.float().mean() < 0.9
     assert torch.rad2deg(shake.sweep[..., :3].abs()).max() < 15
+
+
+def test_vectors_are_turned_as_by_the_matrix():
+    g = torch.Generator().manual_seed(3)
+    vector, rotation = (torch.randn(5, 7, 3, generator=g, dtype=torch.float64) for _ in range(2))
+    rotation[0, 0] = 0
+    expected = (from_vector(rotation) @ vector[..., None])[..., 0]
+    torch.testing.assert_close(turned(vector, rotation), expected)
