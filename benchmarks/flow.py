@@ -1,15 +1,17 @@
 """Our flow network against the classical operator on the same pairs of images.
 
     python benchmarks/flow.py [--weights FILE] [--batches 4]       unseen synthetic rooms (a GPU)
+    python benchmarks/flow.py --scenes usual,shaken,people,papered,bare,street    other kinds, too
     python benchmarks/flow.py --data ROOM_DIR [--gaps 5,15,40]     rendered rooms with depth images
 
 ROOM_DIR is in Replica layout with some depth images: every frame that has one is matched with the
 frames before and after it; occlusions are not known there, so medians and shares tell more than
-means. Both operators start from the same disturbed flow ("warm") or from nothing ("cold").
+means. Both operators start from the same disturbed flow ("warm", 0.05 to 16 pixels; "far", 16 to
+64) or from nothing ("cold").
 """
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import cv2
@@ -34,7 +36,11 @@ from geogs_train.scores import CellErrors, summarise
 from geogs_train.starts import StartOptions, disturbed_starts
 from geogs_train.validation import Validation, cell_errors
 
-WARM, COLD = StartOptions(cold=0.0), StartOptions(cold=1.0)
+STARTS = {
+    "warm": StartOptions(cold=0.0),
+    "far": StartOptions(cold=0.0, far=1.0),
+    "cold": StartOptions(cold=1.0),
+}
 DEPTH_UNIT = 6553.5
 
 
@@ -44,23 +50,35 @@ def main() -> None:
     parser.add_argument("--batches", type=int, default=4)
     parser.add_argument("--data", type=Path)
     parser.add_argument("--gaps", default="5,15,40")
-    parser.add_argument("--iterations", type=int, nargs=2, default=(4, 12), help="warm and cold")
+    parser.add_argument("--iterations", type=int, nargs=2, default=(4, 12), help="warm, others")
+    parser.add_argument("--scenes", default="usual", help="kinds, separated by commas")
     options = parser.parse_args()
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     network = load_network(options.weights).to(device)
-    for name, starts, count in zip(("warm", "cold"), (WARM, COLD), options.iterations, strict=True):
-        found: dict[str, list[CellErrors]] = {"own": [], "classical": []}
+    bank = None
+    for scene in options.scenes.split(",") if options.data is None else ["data"]:
+        validation: Validation | None = None
         if options.data is None:
-            validation = Validation(FlowTraining(), device, options.batches)
-            batches = (validation.batch(n, starts) for n in range(options.batches))
-        else:
-            gaps = [int(g) for g in options.gaps.split(",")]
-            batches = (b.to(device) for b in data_batches(options.data, gaps, starts))
-        for batch in batches:
-            found["own"].append(own_errors(network, batch, count))
-            found["classical"].append(classical_errors(batch, name == "cold"))
-        for operator, parts in found.items():
-            print(f"{name:5} {operator:9} {summarise(parts).line()}", flush=True)
+            validation = Validation(FlowTraining(), device, options.batches, scene, bank)
+            bank = validation.bank
+        for name, starts in STARTS.items():
+            batches = (
+                data_batches(options.data, [int(g) for g in options.gaps.split(",")], starts)
+                if validation is None
+                else (validation.batch(n, starts) for n in range(options.batches))
+            )
+            compare(network, batches, f"{scene:8} {name:5}", options.iterations[name != "warm"])
+
+
+def compare(network: FlowNetwork, batches: Iterable[FlowBatch], name: str, count: int) -> None:
+    """Print the scores of both operators on the same pairs."""
+    found: dict[str, list[CellErrors]] = {"own": [], "classical": []}
+    device = next(network.parameters()).device
+    for batch in batches:
+        found["own"].append(own_errors(network, batch.to(device), count))
+        found["classical"].append(classical_errors(batch, "cold" in name))
+    for operator, parts in found.items():
+        print(f"{name} {operator:9} {summarise(parts).line()}", flush=True)
 
 
 @torch.no_grad()

@@ -1,10 +1,23 @@
 """Rooms with known contents for the tests of the training data."""
 
+import pytest
 import torch
 
+import geogs_train.rooms.clips as clips_module
+import geogs_train.rooms.render as render_module
+import geogs_train.rooms.sampler as sampler_module
+from cuda_emulator import use_emulator
 from geogs_train.rooms.scene import NONE, Lights, Rooms, Solids, Surfaces
 from geogs_train.rooms.textures import TextureBank
 from geogs_train.rooms.views import Views
+
+
+def use_fast_rooms(patch: pytest.MonkeyPatch) -> None:
+    """Render with the emulated kernels, many times as fast as the reference."""
+    use_emulator(patch, render_module)
+    for module in (render_module, sampler_module):
+        patch.setattr(module, "render", render_module.render_by_kernel)
+    patch.setattr(clips_module, "flow", render_module.flow_by_kernel)
 
 
 def solids_of(*rows: tuple[int, list[float], list[float], torch.Tensor | None]) -> Solids:

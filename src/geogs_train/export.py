@@ -8,10 +8,10 @@ import torch
 from safetensors.torch import save_file
 
 from geogs.tracking.flow.own_network import FlowNetwork
-from geogs_train.scores import FlowScores
+from geogs_train.validation import SceneScores
 
 
-def export_weights(network: FlowNetwork, path: Path, step: int, scores: FlowScores) -> None:
+def export_weights(network: FlowNetwork, path: Path, step: int, scores: SceneScores) -> None:
     """Write a network in half precision, with its sizes and scores as metadata."""
     tensors = {k: v.detach().cpu().to(torch.float16) for k, v in network.state_dict().items()}
     metadata = {

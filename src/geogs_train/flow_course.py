@@ -1,5 +1,6 @@
 """The flow network's course: clips of random rooms and one of the two stages of its training."""
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -9,14 +10,14 @@ from torch import Tensor
 
 from geogs.tracking.flow.own import load_network
 from geogs.tracking.flow.own_network import FlowNetwork
-from geogs_train.ahead import PlansAhead
+from geogs_train.ahead import PROCESSES, PlansAhead
 from geogs_train.course import Panels, Worker
 from geogs_train.export import export_weights
 from geogs_train.objective import objective
 from geogs_train.options import FlowTraining
+from geogs_train.rooms.kinds import NAMES
 from geogs_train.rooms.sampler import Plan, RoomSampler
-from geogs_train.scores import FlowScores
-from geogs_train.validation import Validation
+from geogs_train.validation import SceneScores, SceneValidation
 
 
 class FlowCourse:
@@ -24,8 +25,15 @@ class FlowCourse:
 
     weights = "flow.safetensors"
     curves: Panels = (
-        ("validation error, pixels", ("epe", "dense", "textureless", "large", "median"), True),
-        ("shares of validation cells", ("within", "outliers", "sure_share"), False),
+        (
+            "usual rooms: error, pixels",
+            ("usual.epe", "usual.dense", "usual.textureless", "usual.large", "usual.median"),
+            True,
+        ),
+        ("usual rooms: shares", ("usual.within", "usual.outliers", "usual.sure_share"), False),
+        ("error, pixels", tuple(f"others.{name}.epe" for name in NAMES[1:]), True),
+        ("median error, pixels", tuple(f"others.{name}.median" for name in NAMES[1:]), True),
+        ("within two deviations", tuple(f"others.{name}.within" for name in NAMES[1:]), False),
     )
 
     def __init__(self, options: FlowTraining, worker: Worker) -> None:
@@ -56,15 +64,15 @@ class FlowCourse:
         """As in the protocol."""
         return self.objective.loss(network, batch)
 
-    def examination(self, batches: int) -> Validation:
+    def examination(self, batches: int) -> SceneValidation:
         """As in the protocol."""
-        return Validation(self.options, self.worker.device, batches)
+        return SceneValidation(self.options, self.worker.device, batches)
 
     def load(self, path: Path) -> FlowNetwork:
         """As in the protocol."""
         return load_network(path)
 
-    def export(self, network: FlowNetwork, path: Path, step: int, scores: FlowScores) -> None:
+    def export(self, network: FlowNetwork, path: Path, step: int, scores: SceneScores) -> None:
         """As in the protocol."""
         export_weights(network, path, step, scores)
 
@@ -78,7 +86,9 @@ class FlowCourse:
         if self.worker.device.type != "cuda":
             return self.rooms.plan(step, options.batch, rank)
         if self._plans is None:
+            cores = len(os.sched_getaffinity(0)) // self.worker.count
             self._plans = PlansAhead(
-                options.rooms, self.rooms.bank.materials, options.seed, options.batch, rank
-            )
+                options.rooms, self.rooms.bank.materials, options.seed, options.batch, rank,
+                processes=max(PROCESSES, min(6, (cores - 2) // 2)),
+            )  # fmt: skip
         return self._plans.plan(step)

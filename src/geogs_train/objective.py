@@ -6,11 +6,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from geogs.errors import InputError
 from geogs.tracking.flow.own_network import FlowEstimate, FlowNetwork, ImageFeatures
 from geogs_train.flow_loss import flow_loss
 from geogs_train.options import FlowTraining
 from geogs_train.pairs import FlowBatch, flow_batch
 from geogs_train.rooms.clips import ClipBatch
+from geogs_train.rooms.kinds import only_scene
 from geogs_train.starts import StartOptions
 
 
@@ -40,7 +42,7 @@ class FlowObjective:
 
     def prepare(self, clips: ClipBatch, generator: torch.Generator) -> FlowBatch:
         """Every ordered pair of neighbouring views, from disturbed starts."""
-        return flow_batch(clips, StartOptions(), generator)
+        return flow_batch(clips, StartOptions(far=self.options.far), generator)
 
     def loss(self, network: FlowNetwork, batch: FlowBatch) -> Float[Tensor, ""]:
         """Of all iterations."""
@@ -52,6 +54,11 @@ def objective(options: FlowTraining) -> Objective:
     """The stage that the options name."""
     if options.stage == "flow":
         return FlowObjective(options)
+    if options.rooms.scenes != only_scene("usual"):
+        raise InputError(
+            "The bundle stage is for still rooms: --training.rooms.scenes.* must be 0 for all "
+            "kinds but usual."
+        )
     from geogs_train.bundle_objective import BundleObjective
 
     return BundleObjective(options)

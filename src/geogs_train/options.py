@@ -4,9 +4,9 @@ from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
 from geogs.config import Seed
-from geogs.config.setting import Count, Positive, Range, Settings, Weight
+from geogs.config.setting import Count, Positive, Range, Settings, Share, Weight
 from geogs.tracking.flow.own_options import NetworkOptions
-from geogs_train.rooms.options import RoomOptions
+from geogs_train.rooms.options import RoomOptions, SceneShares
 
 
 @dataclass(frozen=True)
@@ -35,8 +35,16 @@ class FlowTraining(Settings, group="training"):
     """Steps of the whole run; the learning rate ends at zero with the last."""
     batch: Count = 16
     """Clips per step and device."""
-    rooms: RoomOptions = field(default_factory=lambda: RoomOptions(width=416, height=288))
+    rooms: RoomOptions = field(
+        default_factory=lambda: RoomOptions(
+            width=416,
+            height=288,
+            scenes=SceneShares(0.5, 0.12, 0.08, 0.08, 0.04, 0.18),
+        )
+    )
     """What the clips show; every ordered pair of neighbouring views is an edge."""
+    far: Share = 0.2
+    """Share of the edges, beside those from nothing, whose start is off by 16 to 64 pixels."""
     iterations: Count = 6
     """Of the network per edge."""
     learning_rate: Positive = 8e-4

@@ -12,8 +12,11 @@ from geogs.keyframes.grid import OFFSET, STRIDE
 from geogs.tracking.flow.lookup import Edges
 from geogs.tracking.flow.own_network import cell_pixels
 from geogs_train.rooms.clips import ClipBatch
+from geogs_train.rooms.kinds import PAPERED
 from geogs_train.starts import StartOptions, disturbed_starts
 
+REPEATING = 5.0
+"""Largest disturbance in pixels where patterns repeat: the right one of them is the nearest."""
 MARGIN = 48
 """Cells that lie further outside the second image, in pixels, teach nothing."""
 PROBE = 1.0, 100.0
@@ -98,11 +101,19 @@ def _starts(
     options: StartOptions,
     generator: torch.Generator,
 ) -> Tensor:
-    depth, truth = _at_cells(clips.depth[:, pair[0]]), _at_cells(truth)
+    largest, truth = None, _at_cells(truth)
+    if clips.scene is not None:
+        # What poses and depths say knows of no motion but the camera's.
+        truth = clips.still_flow(_at_cells(clips.points(pair[0])), pair[1])
+        largest = torch.full_like(clips.intrinsics[:, 0], options.largest)
+        largest = torch.where(clips.scene.kind == PAPERED, REPEATING, largest)
+    depth = _at_cells(clips.depth[:, pair[0]])
     cells = cell_pixels(depth.shape[1], depth.shape[2], depth).reshape(*depth.shape[1:], 2)
     intrinsics = clips.intrinsics.float()
     f, c = intrinsics[:, None, None, :2], intrinsics[:, None, None, 2:]
     rays = torch.cat([(cells - c) / f, torch.ones_like(depth)[..., None]], -1)
     T_cw = clips.T_cw.float()
     T_ji = T_cw[:, pair[1]] @ se3_inverse(T_cw[:, pair[0]])
-    return disturbed_starts(truth, depth, rays, T_ji, intrinsics, cells, options, generator)
+    return disturbed_starts(
+        truth, depth, rays, T_ji, intrinsics, cells, options, generator, largest
+    )

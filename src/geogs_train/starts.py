@@ -22,6 +22,10 @@ class StartOptions:
     """Share of the edges that start from no motion at all."""
     bleed: float = 0.6
     """Share of the edges whose depth is blurred over the edges of things."""
+    far: float = 0.0
+    """Share of the edges, beside the cold ones, that are off by between ``largest`` and
+    ``farthest``."""
+    farthest: float = 64.0
 
 
 def disturbed_starts(
@@ -33,11 +37,13 @@ def disturbed_starts(
     cells: Float[Tensor, "gh gw 2"],
     options: StartOptions,
     generator: torch.Generator,
+    largest: Float[Tensor, "b"] | None = None,
 ) -> Float[Tensor, "b gh gw 2"]:
     """Positions in the second view by a wrong pose and wrong depths, scaled to a drawn amount.
 
     ``truth`` are the true positions in pixels, ``rays`` the cells' K^-1 (x, y, 1), ``T_ji`` takes
-    points of the first view to the second.
+    points of the first view to the second. ``largest`` is each edge's largest mean disturbance,
+    where it is not that of the options.
     """
     n, device = len(truth), truth.device
 
@@ -51,7 +57,11 @@ def disturbed_starts(
         return x.reshape(n, 1, 1)
 
     log = math.log(options.smallest)
-    amount = (log + (math.log(options.largest) - log) * uniform()).exp()
+    most = torch.full((n,), options.largest, device=device) if largest is None else largest
+    amount = (log + (most.log() - log) * uniform()).exp()
+    if options.far:
+        beyond = (uniform() * math.log(options.farthest / options.largest)).exp()
+        amount = torch.where(uniform() < options.far, options.largest * beyond, amount)
     inverse = 1 / depth.clamp(min=1e-2)
     middle = inverse.flatten(1).median(1).values
     # Depth: bled over edges, scaled by a smooth field, in places by noise.

@@ -1,6 +1,6 @@
 """The fixed validation set: rooms and textures that training never shows."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 
@@ -8,19 +8,62 @@ from geogs.tracking.flow.own_network import FlowNetwork
 from geogs_train.objective import run_network
 from geogs_train.options import FlowTraining
 from geogs_train.pairs import FlowBatch, flow_batch
+from geogs_train.rooms.kinds import NAMES, only_scene
 from geogs_train.rooms.sampler import RoomSampler
+from geogs_train.rooms.textures import TextureBank
 from geogs_train.scores import CellErrors, FlowScores, has_texture, summarise
 from geogs_train.starts import StartOptions
 
 SEED = 2718
 
 
-class Validation:
-    """Batches of unseen rooms, made again whenever they are needed."""
+@dataclass(frozen=True)
+class SceneScores:
+    """Of the kinds of scenes that a network is trained with."""
+
+    usual: FlowScores
+    others: dict[str, FlowScores]
+    """By the names of :class:`SceneShares`."""
+
+    def line(self) -> str:
+        """On a line for each kind."""
+        rows = {"usual": self.usual, **self.others}
+        return "\n".join(f"{name:8} {scores.line()}" for name, scores in rows.items())
+
+
+class SceneValidation:
+    """One validation set for each kind of scene; the usual one is always there."""
 
     def __init__(self, options: FlowTraining, device: torch.device, batches: int = 8) -> None:
-        rooms = replace(options.rooms, views=2, validation=True)
-        self._rooms = RoomSampler(rooms, device, SEED)
+        self._usual = Validation(options, device, batches)
+        shares, few = options.rooms.scenes, max(1, batches // 2)
+        self._others = {
+            name: Validation(options, device, few, name, self._usual.bank)
+            for name in NAMES[1:]
+            if getattr(shares, name) > 0
+        }
+
+    def score(self, network: FlowNetwork) -> SceneScores:
+        """Scores of a network."""
+        others = {name: v.score(network) for name, v in self._others.items()}
+        return SceneScores(self._usual.score(network), others)
+
+
+class Validation:
+    """Batches of unseen scenes of one kind, made again whenever they are needed."""
+
+    def __init__(
+        self,
+        options: FlowTraining,
+        device: torch.device,
+        batches: int = 8,
+        scene: str = "usual",
+        bank: TextureBank | None = None,
+    ) -> None:
+        """``bank`` may be that of another set."""
+        rooms = replace(options.rooms, views=2, validation=True, scenes=only_scene(scene))
+        self._rooms = RoomSampler(rooms, device, SEED, bank)
+        self.bank = self._rooms.bank
         self._iterations = options.iterations
         self.batches, self._batch, self._device = batches, options.batch, device
 

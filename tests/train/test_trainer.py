@@ -30,6 +30,7 @@ from geogs_train.rooms.options import RoomOptions
 from geogs_train.scores import CellErrors, has_texture, summarise
 from geogs_train.starts import StartOptions, disturbed_starts
 from geogs_train.trainer import Trainer, schedule
+from random_rooms import use_fast_rooms
 
 pytestmark = pytest.mark.system
 
@@ -44,6 +45,11 @@ TINY = FlowTraining(
     rooms=ROOMS,
     network=NetworkOptions(stem=8, middle=8, deep=16, hidden=16, context=16, motion=16),
 )
+ONLY_STREETS = [
+    f"--training.rooms.scenes.{name}={weight}"
+    for name, weight in [("usual", 1), ("street", 1), ("shaken", 0), ("people", 0), ("papered", 0),
+                         ("bare", 0)]
+]  # fmt: skip
 CPU = Worker(torch.device("cpu"))
 
 
@@ -75,6 +81,20 @@ def test_starts_are_off_by_what_is_asked_for():
     error = start - pair["truth"]
     step = (error[:, :, 1:] - error[:, :, :-1]).norm(dim=-1).mean()
     assert step < 0.5 * error.norm(dim=-1).mean()
+
+
+def test_far_starts_lie_beyond_the_others_and_edges_may_have_limits_of_their_own():
+    pair = plane_pair()
+    off = {}
+    for far in (0.0, 1.0):
+        options = StartOptions(smallest=0.5, largest=4.0, cold=0.0, far=far, farthest=12.0)
+        largest = torch.full((64,), 1.0)
+        generator = torch.Generator().manual_seed(1)
+        start = disturbed_starts(**pair, options=options, generator=generator, largest=largest)
+        off[far] = (start - pair["truth"]).norm(dim=-1).flatten(1).median(1).values
+    assert off[0.0].max() < 1.01
+    assert off[1.0].max() < 12.01
+    assert off[1.0].quantile(0.9) > 4
 
 
 def test_cold_starts_know_nothing():
@@ -210,7 +230,8 @@ def test_the_learning_rate_rises_and_falls():
     assert rates[-1] < 0.011
 
 
-def test_a_resumed_run_equals_one_that_was_never_stopped(tmp_path):
+def test_a_resumed_run_equals_one_that_was_never_stopped(tmp_path, monkeypatch):
+    use_fast_rooms(monkeypatch)
     whole = trainer_of(TINY)
     losses = [float(whole.advance()) for _ in range(3)]
     first = trainer_of(TINY)
@@ -230,18 +251,21 @@ def test_a_resumed_run_equals_one_that_was_never_stopped(tmp_path):
         assert torch.equal(a, b)
 
 
-def test_the_command_trains_resumes_and_writes_weights(tmp_path):
+def test_the_command_trains_resumes_and_writes_weights(tmp_path, monkeypatch):
+    use_fast_rooms(monkeypatch)
     out = tmp_path / "run"
     options = ["--training.batch", "1", "--training.iterations", "2", "--run.validation-batches",
                "1", "--training.rooms.width", "64", "--training.rooms.height", "48",
                "--training.rooms.textures", "6", "--training.rooms.texture-size", "64",
+               *ONLY_STREETS,
                "--training.rooms.least-density", "0.02",
                "--training.rooms.most-density", "0.05", "--device", "cpu"]  # fmt: skip
     assert main(["train", "flow", str(out), "--training.steps", "1", *options]) == 0
     network = load_network(out / "flow.safetensors")
     assert sum(p.numel() for p in network.parameters()) > 1e6
     entries = [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()]
-    assert entries[-1]["scores"]["epe"] > 0
+    assert entries[-1]["scores"]["usual"]["epe"] > 0
+    assert set(entries[-1]["scores"]["others"]) == {"street"}
     assert (out / "curves.png").stat().st_size > 10_000
     assert main(["train", "flow", str(out), "--run.resume", "--device", "cpu"]) == 0
 

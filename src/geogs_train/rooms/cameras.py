@@ -20,6 +20,8 @@ _FAN = (6, 5)
 """Rays across and down that say what a candidate sees."""
 _NEAREST, _MEAN_DEPTH = 0.25, (0.5, 6.0)
 """Metres."""
+_SKY = 12.0
+"""Metres from where on something is no part of a room and does not count as seen."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +40,8 @@ def choose_cameras(
     """The path that each room is filmed from; consecutive views share what they see."""
     clear = _clearance(paths, size, solids)
     sight = _look(paths, size, solids, width, height)
-    mean = sight.depth.mean(-1)
+    near = (sight.depth < _SKY).float()
+    mean = (sight.depth * near).sum(-1) / near.sum(-1).clamp_min(1.0)
     fair = (sight.depth.amin(-1) > _NEAREST) & (mean > _MEAN_DEPTH[0]) & (mean < _MEAN_DEPTH[1])
     shared = _share_in_next(paths, sight, width, height) > _LEAST_SHARED
     good = (clear > _CLEARANCE) & fair.all(-1) & shared.all(-1)

@@ -9,7 +9,7 @@ from torch import Tensor
 from geogs_train.rooms.draw import Draw
 from geogs_train.rooms.scene import Lights
 
-_MOST = 3
+MOST_LIGHTS = 3
 
 
 def draw_lights(draw: Draw, size: Float[Tensor, "b 3"], views: int, change: float) -> Lights:
@@ -30,10 +30,10 @@ def draw_lights(draw: Draw, size: Float[Tensor, "b 3"], views: int, change: floa
 def _draw(draw: Draw, size: Float[Tensor, "b 3"]) -> Lights:
     """One state of the light: a single view."""
     b = len(size)
-    n = (b, 1, _MOST)
+    n = (b, 1, MOST_LIGHTS)
     position = draw.uniform(0.05, 0.95, *n, 3)
     position[..., 2] = 1 - 0.5 * position[..., 2].square()
-    there = torch.arange(_MOST) <= draw.integers(_MOST, b, 1, 1)
+    there = torch.arange(MOST_LIGHTS) <= draw.integers(MOST_LIGHTS, b, 1, 1)
     warmth = draw.uniform(-0.2, 0.35, *n)[..., None]
     white = 1 + warmth * torch.tensor([1.0, 0.1, -1.0])
     power = there * draw.log_uniform(0.7, 6.0, *n)

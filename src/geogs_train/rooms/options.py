@@ -23,6 +23,24 @@ class MotionShares(Settings, group="training.rooms.motions"):
 
 
 @dataclass(frozen=True)
+class SceneShares(Settings, group="training.rooms.scenes"):
+    """Relative frequency of the kinds of scenes."""
+
+    usual: Weight = 1.0
+    """A still room, seen by a camera whose shutter opens for a moment."""
+    shaken: Weight = 0.0
+    """The same with a camera that moves while it looks: rolling shutter, motion blur."""
+    people: Weight = 0.0
+    """People walk from view to view."""
+    papered: Weight = 0.0
+    """Walls that repeat one pattern exactly."""
+    bare: Weight = 0.0
+    """Next to no texture."""
+    street: Weight = 0.0
+    """Houses along a road, with cars and people that move, seen by who drives, walks or turns."""
+
+
+@dataclass(frozen=True)
 class RoomOptions(Settings, group="training.rooms"):
     """Size and variety of the clips; the defaults are those that the network is trained with."""
 
@@ -38,6 +56,9 @@ class RoomOptions(Settings, group="training.rooms"):
     """Largest share of them."""
     motions: MotionShares = MotionShares()
     """Kinds of camera motion."""
+    scenes: SceneShares = SceneShares()
+    """Kinds of scenes. All but the usual ones, and the streets, are rooms with those motions; in
+    two fifths of them the camera moves while it looks, too."""
     sway: Weight = 0.0
     """Deviation of the views of longer clips from their path, over the way from view to view."""
     candidates: Count = 24

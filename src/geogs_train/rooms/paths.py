@@ -70,7 +70,7 @@ def draw_paths(draw: Draw, options: RoomOptions, size: Float[Tensor, "b 3"]) -> 
     target[..., 2] = draw.uniform(0.05, 0.7, b, k) * size[:, 2:]
     forward = torch.nn.functional.normalize(target - start, dim=-1)
     roll = torch.where(draw.chance(0.1, b, k), draw.normal(0.5, b, k), draw.normal(0.06, b, k))
-    R0 = _looking(forward) @ from_vector(torch.nn.functional.pad(roll[..., None], (2, 0)))
+    R0 = looking(forward) @ from_vector(torch.nn.functional.pad(roll[..., None], (2, 0)))
     move = _draw_steps(draw, options.motions, forward)
 
     # Longer clips go further, but each of their steps is shorter.
@@ -85,10 +85,11 @@ def draw_paths(draw: Draw, options: RoomOptions, size: Float[Tensor, "b 3"]) -> 
     jitter = draw.normal(0.1, b, k, v, 3) * shaken
     R = R0[:, :, None] @ from_vector((steps + jitter) * move.spin[:, :, None])
     R = _keep_in_view(R, centre, seen, R0, start, move.hold)
-    return Paths(R, centre, _draw_intrinsics(draw, options, b), draw.uniform(0, 0.7, b))
+    return Paths(R, centre, draw_intrinsics(draw, options, b), draw.uniform(0, 0.7, b))
 
 
-def _draw_intrinsics(draw: Draw, options: RoomOptions, rooms: int) -> Float[Tensor, "b 4"]:
+def draw_intrinsics(draw: Draw, options: RoomOptions, rooms: int) -> Float[Tensor, "b 4"]:
+    """Fields of view of 45 to 90 degrees, a principal point near the middle."""
     angle = draw.uniform(math.radians(45), math.radians(90), rooms)
     fx = 0.5 * options.width / (angle / 2).tan()
     fy = fx * (1 + draw.uniform(-0.02, 0.02, rooms))
@@ -134,7 +135,7 @@ def _keep_in_view(
     return from_vector(cross / sine.clamp_min(1e-9) * angle * hold[..., None, None]) @ R
 
 
-def _looking(forward: Float[Tensor, "... 3"]) -> Float[Tensor, "... 3 3"]:
+def looking(forward: Float[Tensor, "... 3"]) -> Float[Tensor, "... 3 3"]:
     """Camera to world for an upright camera that looks ahead like this."""
     up = torch.zeros_like(forward)
     up[..., 2] = 1

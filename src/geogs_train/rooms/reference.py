@@ -3,14 +3,14 @@
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from geogs_train.rooms.raycast import closest_hit, occluded, surface_point
 from geogs_train.rooms.scene import Rooms, Solids, only
 from geogs_train.rooms.shading import ambient_access, shade
 from geogs_train.rooms.textures import TextureBank
-from geogs_train.rooms.views import Views, pixel_grid, project, rays
+from geogs_train.rooms.views import Views, pixel_grid, project, rays, row_centre
 
 MARGIN = 1.5e-3
 """Metres before a point within which nothing hides it, since it lies on a solid itself."""
@@ -30,18 +30,20 @@ class Rendering:
     """z along the optical axis in metres, of the ray through the pixel's centre."""
     normal: Float[Tensor, "b v 3 h w"]
     """Unit, camera frame, facing the camera, of the surface that this ray meets."""
+    solid: Int[Tensor, "b v h w"]
+    """Place of the solid that it meets; -1 for the room itself."""
 
 
 @dataclass(frozen=True)
 class FlowTruth:
-    """Where the points that one view sees are in another."""
+    """Where points are in a view."""
 
     pixels: Float[Tensor, "b h w 2"]
-    """x, y in the second view."""
+    """x, y."""
     visible: Bool[Tensor, "b h w"]
-    """In the second image, and nothing hides it there."""
+    """In the image, and nothing hides it there."""
     valid: Bool[Tensor, "b h w"]
-    """In front of the second camera; elsewhere the pixels mean nothing."""
+    """In front of the camera; elsewhere the pixels mean nothing."""
 
 
 def render_by_torch(rooms: Rooms, bank: TextureBank, views: Views) -> Rendering:
@@ -55,26 +57,25 @@ def render_by_torch(rooms: Rooms, bank: TextureBank, views: Views) -> Rendering:
         for part in _chunks(len(x))
     ]
     shape = (b, v, views.height, views.width)
-    colour, depth, normal = (torch.cat([s[k] for s in seen], 1) for k in range(3))
+    colour, depth, normal, solid = (torch.cat([s[k] for s in seen], 1) for k in range(4))
     colour, normal = (x.reshape(*shape, 3) for x in (colour, normal))
     normal = torch.einsum("bvij,bvhwj->bvhwi", views.T_cw[..., :3, :3], normal)
     colour, normal = (x.movedim(-1, 2).contiguous() for x in (colour, normal))
-    return Rendering(colour, depth.reshape(shape), normal)
+    return Rendering(colour, depth.reshape(shape), normal, solid.reshape(shape))
 
 
 def flow_by_torch(
-    solids: Solids, views: Views, depth: Float[Tensor, "b v h w"], first: int, second: int
+    solids: Solids, views: Views, points: Float[Tensor, "b h w 3"], view: int
 ) -> FlowTruth:
-    """Where the points that the view ``first`` sees are in the view ``second``."""
-    shape = (len(depth), views.height, views.width)
-    origin, direction = rays(views, first, *pixel_grid(views))
-    point = origin + depth[:, first].flatten(1)[..., None] * direction
-    pixels, valid = project(views, second, point)
+    """Where points of the world are in a view."""
+    shape = points.shape[:3]
+    point = points.flatten(1, 2)
+    pixels, valid = project(views, view, point)
     limit = torch.tensor([views.width - 1, views.height - 1], device=pixels.device)
     inside = valid & ((pixels >= 0) & (pixels <= limit)).all(-1)
-    centre = views.centre[:, second, None].expand_as(point)
+    centre = row_centre(views, view, pixels)
     hidden = []
-    for room in range(len(depth)):
+    for room in range(len(points)):
         for part in _chunks(point.shape[1]):
             start = centre[room : room + 1, part]
             ray = point[room : room + 1, part] - start
@@ -91,8 +92,8 @@ def _chunks(pixels: int) -> list[slice]:
 def _look(
     rooms: Rooms, bank: TextureBank, views: Views, view: int,
     x: Float[Tensor, "m"], y: Float[Tensor, "m"],
-) -> tuple[Float[Tensor, "b m 3"], Float[Tensor, "b m"], Float[Tensor, "b m 3"]]:  # fmt: skip
-    """Colour, depth and normal (world frame) of some pixels of a view."""
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
+    """Colour, depth, normal (world frame) and solid of some pixels of a view."""
     origin, direction = rays(views, view, x, y)
     hit = closest_hit(rooms.size, rooms.solids, origin, direction)
     middle = surface_point(rooms, hit, origin, direction)
@@ -105,4 +106,4 @@ def _look(
         point = surface_point(rooms, seen, origin, ray)
         footprint = 0.5 * seen.t * ray.norm(dim=-1) / focal
         total = total + shade(rooms, bank, point, view, k, ray, footprint, access)
-    return total / 4, hit.t, middle.normal
+    return total / 4, hit.t, middle.normal, hit.solid

@@ -15,7 +15,7 @@ from geogs_train.rooms.reference import (
     flow_by_torch,
     render_by_torch,
 )
-from geogs_train.rooms.scene import Rooms, Solids, packed_solids
+from geogs_train.rooms.scene import Rooms, Solids, apart, packed_solids
 from geogs_train.rooms.textures import TextureBank
 from geogs_train.rooms.views import Views
 
@@ -31,13 +31,20 @@ def render(rooms: Rooms, bank: TextureBank, views: Views) -> Rendering:
     return render_by_torch(rooms, bank, views)
 
 
-def flow(
-    solids: Solids, views: Views, depth: Float[Tensor, "b v h w"], first: int, second: int
-) -> FlowTruth:
-    """Where the points that the view ``first`` sees at ``depth`` are in the view ``second``."""
+def render_apart(
+    rooms: Rooms, bank: TextureBank, views: Views, ways: Float[Tensor, "b n 3"]
+) -> Rendering:
+    """The same where solids move by ``ways`` (metres) from view to view."""
+    b, v = views.T_cw.shape[:2]
+    seen = render(apart(rooms, v, ways), bank, views.apart())
+    return Rendering(*(x.flatten(0, 1).unflatten(0, (b, v)) for x in vars(seen).values()))
+
+
+def flow(solids: Solids, views: Views, points: Float[Tensor, "b h w 3"], view: int) -> FlowTruth:
+    """Where points of the world are in a view."""
     if views.T_cw.device.type == "cuda":
-        return flow_by_kernel(solids, views, depth, first, second)
-    return flow_by_torch(solids, views, depth, first, second)
+        return flow_by_kernel(solids, views, points, view)
+    return flow_by_torch(solids, views, points, view)
 
 
 def first_hit(
@@ -56,29 +63,27 @@ def render_by_kernel(rooms: Rooms, bank: TextureBank, views: Views) -> Rendering
     shape, device = (b, v, views.height, views.width), views.T_cw.device
     depth = torch.empty(shape, device=device)
     colour, normal = (torch.empty(b, v, 3, *shape[2:], device=device) for _ in range(2))
+    solid = torch.empty(shape, dtype=torch.int32, device=device)
     count, lights = _count(rooms.solids), rooms.lights.position.shape[2]
     kernels_for(SOURCE, device)["render_rooms"](
         _grid(views, b * v), _BLOCK, rooms.size.float().contiguous(), packed_solids(rooms.solids),
         rooms.surfaces.packed(), rooms.lights.packed(), views.packed(), bank.texels, colour, depth,
-        normal, v, count, lights, bank.size, bank.levels, bank.texels.shape[1], views.width,
+        normal, solid, v, count, lights, bank.size, bank.levels, bank.texels.shape[1], views.width,
         views.height,
     )  # fmt: skip
-    return Rendering(colour, depth, normal)
+    return Rendering(colour, depth, normal, solid.long())
 
 
 def flow_by_kernel(
-    solids: Solids, views: Views, depth: Float[Tensor, "b v h w"], first: int, second: int
+    solids: Solids, views: Views, points: Float[Tensor, "b h w 3"], view: int
 ) -> FlowTruth:
     """:func:`flow` by the CUDA kernel."""
-    b, device = len(depth), depth.device
-    shape = (b, views.height, views.width)
-    pixels = torch.empty(*shape, 2, device=device)
-    visible, valid = (torch.empty(shape, dtype=torch.bool, device=device) for _ in range(2))
-    cameras = views.packed()
-    kernels_for(SOURCE, device)["flow_rooms"](
-        _grid(views, b), _BLOCK, packed_solids(solids), cameras[:, first].contiguous(),
-        cameras[:, second].contiguous(), depth[:, first].contiguous(), pixels, visible, valid,
-        _count(solids), views.width, views.height, MARGIN,
+    b, height, width = points.shape[:3]
+    pixels = torch.empty(b, height, width, 2, device=points.device)
+    visible, valid = (torch.empty_like(pixels[..., 0], dtype=torch.bool) for _ in range(2))
+    kernels_for(SOURCE, points.device)["flow_rooms"](
+        _grid(views, b), _BLOCK, packed_solids(solids), views.packed()[:, view].contiguous(),
+        points.float().contiguous(), pixels, visible, valid, _count(solids), width, height, MARGIN,
     )  # fmt: skip
     return FlowTruth(pixels, visible, valid)
 

@@ -1,6 +1,6 @@
 """Clips of random rooms: a room, its light, a camera path, pictures of an imperfect camera."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
@@ -12,14 +12,16 @@ from geogs_train.rooms.clips import ClipBatch
 from geogs_train.rooms.develop import develop
 from geogs_train.rooms.draw import Draw
 from geogs_train.rooms.flaws import Flaws, draw_flaws
+from geogs_train.rooms.kinds import only_scene
 from geogs_train.rooms.layout import draw_layout
 from geogs_train.rooms.lights import draw_lights
 from geogs_train.rooms.materials import draw_surfaces
 from geogs_train.rooms.options import RoomOptions
 from geogs_train.rooms.paths import Paths, draw_paths
-from geogs_train.rooms.render import render
+from geogs_train.rooms.render import render, render_apart
 from geogs_train.rooms.scene import Rooms, moved
 from geogs_train.rooms.textures import TextureBank
+from geogs_train.rooms.unusual import Scene, draw_scene
 
 _LEAST, _MOST = (2.5, 2.5, 2.2), (8.0, 8.0, 3.5)
 """Sizes of rooms, metres."""
@@ -35,6 +37,8 @@ class Plan:
     rooms: Rooms
     paths: Paths
     flaws: Flaws
+    scene: Scene | None = None
+    """What is unusual; None where nothing is."""
 
 
 class RoomSampler:
@@ -75,12 +79,21 @@ class RoomSampler:
         size, solids = plan.rooms.size, plan.rooms.solids
         views = choose_cameras(plan.paths, size, solids, options.width, options.height)
         solids = solids.without(too_near(solids, views))
+        scene = plan.scene
+        if scene is not None:
+            solids = scene.out_of_the_way(solids, views)
+            views = replace(views, sweep=scene.shake.sweep)
         rooms = Rooms(size, solids, plan.rooms.surfaces, plan.rooms.lights)
-        rendering = render(rooms, self.bank, views)
-        images = develop(Draw(self.device, *key), plan.flaws, rendering.colour)
+        if scene is None:
+            rendering = render(rooms, self.bank, views)
+            light = rendering.colour
+        else:
+            rendering = render_apart(rooms, self.bank, views, scene.ways)
+            light = scene.blurred(rendering, views)
+        images = develop(Draw(self.device, *key), plan.flaws, light)
         return ClipBatch(
-            images, rendering.colour, rendering.depth, rendering.normal, views.T_cw,
-            views.intrinsics, solids,
+            images, light, rendering.depth, rendering.normal, views.T_cw,
+            views.intrinsics, solids, rendering.solid, views.sweep, scene,
         )  # fmt: skip
 
 
@@ -100,7 +113,11 @@ def draw_plan(
     lights = draw_lights(draw, size, options.views, options.light_change)
     paths = draw_paths(draw, options, size)
     flaws = draw_flaws(draw, options, batch)
-    return Plan(key, Rooms(size, layout.solids, surfaces, lights), paths, flaws)
+    rooms = Rooms(size, layout.solids, surfaces, lights)
+    if options.scenes == only_scene("usual"):
+        return Plan(key, rooms, paths, flaws)
+    rooms, paths, scene = draw_scene(draw, options, rooms, paths, materials)
+    return Plan(key, rooms, paths, flaws, scene)
 
 
 def _draw_sizes(draw: Draw, rooms: int) -> Float[Tensor, "b 3"]:

@@ -51,6 +51,10 @@ class Solids:
         """The same places, some emptied."""
         return replace(self, kind=torch.where(gone, NONE, self.kind))
 
+    def moved_by(self, ways: Float[Tensor, "b n 3"], steps: int | Tensor) -> "Solids":
+        """What moves by ``ways`` per step, that many steps later."""
+        return replace(self, centre=self.centre + steps * ways)
+
     @staticmethod
     def join(parts: Sequence["Solids"]) -> "Solids":
         """All places of several sets, one after the other."""
@@ -153,6 +157,31 @@ def moved(part: Part, device: torch.device) -> Part:
 def only(part: Part, room: int) -> Part:
     """One room, or a part of it, as a batch of its own."""
     return _each(part, lambda t: t[room : room + 1])
+
+
+def chosen(which: Bool[Tensor, "b"], first: Part, second: Part) -> Part:
+    """Of each room what ``first`` says, or ``second``; rooms or parts of them."""
+    values = [(getattr(first, f.name), getattr(second, f.name)) for f in fields(first)]  # type: ignore[arg-type]
+    return type(first)(
+        *(
+            torch.where(which.reshape(-1, *[1] * (a.ndim - 1)), a, b)
+            if isinstance(a, Tensor)
+            else chosen(which, a, b)
+            for a, b in values
+        )
+    )
+
+
+def apart(rooms: Rooms, views: int, ways: Float[Tensor, "b n 3"]) -> Rooms:
+    """A room for each view, with what moves by ``ways`` from view to view where it is then."""
+
+    def repeated(part: Part) -> Part:
+        return _each(part, lambda t: t.repeat_interleave(views, 0))
+
+    step = torch.arange(views, device=ways.device).repeat(len(ways))[:, None, None]
+    solids = repeated(rooms.solids).moved_by(ways.repeat_interleave(views, 0), step)
+    lights = _each(rooms.lights, lambda t: t.flatten(0, 1)[:, None])
+    return Rooms(rooms.size.repeat_interleave(views, 0), solids, repeated(rooms.surfaces), lights)
 
 
 def _each(part: Part, change: Callable[[Tensor], Tensor]) -> Part:

@@ -20,6 +20,7 @@ from geogs.tracking.flow.own_network import (
 )
 from geogs_train.export import export_weights
 from geogs_train.scores import FlowScores
+from geogs_train.validation import SceneScores
 
 SMALL = NetworkOptions(stem=8, middle=16, deep=16, hidden=16, context=16, motion=16)
 CAMERA = Camera(fx=80.0, fy=80.0, cx=51.5, cy=38.5, width=103, height=77)
@@ -34,7 +35,7 @@ def network() -> FlowNetwork:
 @pytest.fixture
 def operator(network, tmp_path) -> OwnFlow:
     path = tmp_path / "w.safetensors"
-    export_weights(network, path, 3, FlowScores(*[0.5] * 10))
+    export_weights(network, path, 3, SceneScores(FlowScores(*[0.5] * 10), {}))
     grid = SampleGrid(CAMERA)
     return OwnFlow(grid, path, ClassicalFlow(grid))
 

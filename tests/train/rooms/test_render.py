@@ -6,10 +6,6 @@ from dataclasses import replace
 import pytest
 import torch
 
-import geogs_train.rooms.clips as clips_module
-import geogs_train.rooms.render as render_module
-import geogs_train.rooms.sampler as sampler_module
-from cuda_emulator import use_emulator
 from geogs_train.rooms.clips import ClipBatch
 from geogs_train.rooms.develop import develop
 from geogs_train.rooms.draw import Draw
@@ -20,7 +16,8 @@ from geogs_train.rooms.raycast import signed_distance, wall_distance
 from geogs_train.rooms.reference import flow_by_torch, render_by_torch
 from geogs_train.rooms.sampler import RoomSampler
 from geogs_train.rooms.scene import BOX, ELLIPSOID, FRUSTUM
-from random_rooms import looking_along_y, nothing, room_of, small_bank, solids_of
+from geogs_train.rooms.views import pixel_grid, rays
+from random_rooms import looking_along_y, nothing, room_of, small_bank, solids_of, use_fast_rooms
 
 OPTIONS = RoomOptions(width=64, height=48, textures=8, texture_size=32, candidates=12)
 
@@ -29,9 +26,7 @@ OPTIONS = RoomOptions(width=64, height=48, textures=8, texture_size=32, candidat
 def sampler() -> RoomSampler:
     """Renders with the emulated kernel, many times as fast as the reference."""
     with pytest.MonkeyPatch.context() as patch:
-        use_emulator(patch, render_module)
-        patch.setattr(sampler_module, "render", render_module.render_by_kernel)
-        patch.setattr(clips_module, "flow", render_module.flow_by_kernel)
+        use_fast_rooms(patch)
         yield RoomSampler(OPTIONS, "cpu")
 
 
@@ -78,7 +73,9 @@ def test_a_box_hides_what_is_behind_it():
     solids = solids_of((BOX, [2, 3, 1.5], [0.2, 0.2, 0.2], None))
     views = looking_along_y([2.0, 1.0, 1.5], [2.6, 1.0, 1.5])
     depth = render_by_torch(room_of(solids), small_bank(), views).depth
-    truth = flow_by_torch(solids, views, depth, 0, 1)
+    origin, direction = rays(views, 0, *pixel_grid(views))
+    points = (origin + depth[:, 0].flatten(1)[..., None] * direction).unflatten(1, depth.shape[2:])
+    truth = flow_by_torch(solids, views, points, 1)
     # Each point of the far wall moves by 30 * 0.6 / 4 pixels.
     assert truth.pixels[0, 5, 16, 0] == pytest.approx(16 - 4.5)
     assert truth.visible[0, 5, 16]

@@ -25,7 +25,7 @@ from geogs_train.rooms.render import (
 )
 from geogs_train.rooms.sampler import RoomSampler
 from geogs_train.rooms.scene import Rooms, moved
-from geogs_train.rooms.views import Views
+from geogs_train.rooms.views import Views, pixel_grid, rays
 from random_rooms import small_bank
 
 
@@ -57,6 +57,21 @@ def furnished(device: torch.device) -> tuple[Rooms, Views]:
     return moved(Rooms(size, solids, surfaces, lights), device), moved(views, device)
 
 
+def sweep_of(views: Views) -> torch.Tensor:
+    """A few degrees and centimetres from the first row to the last."""
+    g = torch.Generator().manual_seed(4)
+    b, v = views.T_cw.shape[:2]
+    sweep = torch.cat([0.04 * torch.randn(b, v, 3, generator=g),
+                       0.03 * torch.randn(b, v, 3, generator=g)], -1)  # fmt: skip
+    return sweep.to(views.T_cw)
+
+
+def seen_points(views: Views, depth: torch.Tensor) -> torch.Tensor:
+    """World points at depths before the first view."""
+    origin, direction = rays(views, 0, *pixel_grid(views))
+    return (origin + depth.flatten(1)[..., None] * direction).unflatten(1, depth.shape[1:])
+
+
 def test_sources_and_python_agree_on_sizes():
     text = SOURCE.with_name("solids.cuh").read_text()
     assert f"#define MOST_SOLIDS {MOST_SOLIDS}\n" in text
@@ -64,6 +79,7 @@ def test_sources_and_python_agree_on_sizes():
 
 def test_renders_like_the_reference(device):
     rooms, views = furnished(device)
+    views = replace(views, sweep=sweep_of(views))
     bank = small_bank()
     bank = replace(bank, texels=bank.texels.to(device))
     fast, slow = render_by_kernel(rooms, bank, views), render_by_torch(rooms, bank, views)
@@ -75,6 +91,7 @@ def test_renders_like_the_reference(device):
     difference = (fast.colour - slow.colour).abs().amax(2)
     assert difference.quantile(0.98) < 2e-3 if difference.numel() < 1e6 else True
     assert (difference > 5e-3).float().mean() < 0.01
+    assert (fast.solid != slow.solid).float().mean() < 2e-3
 
 
 def test_hits_like_the_reference(device):
@@ -92,10 +109,11 @@ def test_hits_like_the_reference(device):
 
 def test_flows_like_the_reference(device):
     rooms, views = furnished(device)
-    b, v = views.T_cw.shape[:2]
-    depth = 1 + torch.rand(b, v, views.height, views.width, device=device)
-    fast = flow_by_kernel(rooms.solids, views, depth, 0, 1)
-    slow = flow_by_torch(rooms.solids, views, depth, 0, 1)
+    b = len(views.T_cw)
+    views = replace(views, sweep=sweep_of(views))
+    points = seen_points(views, 1 + torch.rand(b, views.height, views.width, device=device))
+    fast = flow_by_kernel(rooms.solids, views, points, 1)
+    slow = flow_by_torch(rooms.solids, views, points, 1)
     torch.testing.assert_close(fast.pixels, slow.pixels, rtol=1e-4, atol=1e-2)
     assert (fast.valid == slow.valid).all()
     assert (fast.visible != slow.visible).float().mean() < 2e-3
