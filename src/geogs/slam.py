@@ -4,8 +4,11 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 
+import cv2
 import numpy as np
 import torch
+from jaxtyping import Bool
+from torch import Tensor
 
 from geogs.config import Config
 from geogs.errors import InputError
@@ -96,6 +99,8 @@ class Slam:
         self.is_refined = False
         """Whether the map was trained over all keyframes at the end."""
         self._is_ended = False
+        self.is_continued = False
+        """Whether it goes on in the world of a saved map."""
         self._known: Uncertainty | None = None
 
     def new_tracker(self) -> Tracker:
@@ -130,6 +135,27 @@ class Slam:
         self.frames, self._waiting = state.frames, deque(state.waiting)
         self.adjusted, self._is_ended = state.adjusted, state.is_ended
 
+    @on_one_torch_thread
+    def start_from(self, disks: MapSnapshot, keyframes: Sequence[RenderedKeyframe]) -> None:
+        """Before the first frame: go on in the world of a saved map, which stays where it is.
+
+        The camera is looked for among its keyframes, which need their images; what cannot be found
+        there is a segment of its own until loops join it. Trajectories are those of new frames.
+
+        Raises:
+            InputError: there is no keyframe, one has no image, or one of another camera.
+        """
+        if self.frames or not keyframes:
+            raise InputError("A map with keyframes has to be given, and before the first frame.")
+        world = self.segments.world
+        ids = world.hold(keyframes)
+        self.loops.remember(ids)
+        size, given = (self.camera.width, self.camera.height), zip(ids, keyframes, strict=True)
+        masks = {i: _enlarged(k.mask, size) for i, k in given if k.mask is not None}
+        with self.stopwatch("mapping"):
+            self.mapper.take_over(disks, masks, ids)
+        self.is_continued = True
+
     @property
     def is_ended(self) -> bool:
         """Whether the stream has ended."""
@@ -143,6 +169,8 @@ class Slam:
     @on_one_torch_thread
     def process(self, frame: Frame) -> SlamStatus:
         """Track one frame and, where it completes a keyframe, train the map."""
+        if self.is_continued and self.frames == 0:
+            frame = replace(frame, follows_cut=True)
         with self.stopwatch("tracking"):
             result = self.segments.track(frame, self.loops.recognise)
         self.frames += 1
@@ -197,7 +225,7 @@ class Slam:
 
     def keyframe_trajectory(self) -> Trajectory:
         """Poses of the keyframes alone."""
-        keyframes = [self.keyframes[i] for i in self.segments.keyframe_ids]
+        keyframes = [self.keyframes[i] for i in self.segments.world.free]
         T_wc = [torch.linalg.inv(k.T_cw).numpy() for k in keyframes]
         times = np.array([k.timestamp for k in keyframes], dtype=np.float64)
         return Trajectory(times, np.array(T_wc).reshape(-1, 4, 4), np.ones(len(times), dtype=bool))
@@ -293,3 +321,9 @@ class Slam:
         if trained and self.config.mapping.pose_iterations:
             with self.stopwatch("pose refinement"):
                 self.mapper.refine_poses(result.active)
+
+
+def _enlarged(mask: Tensor, size: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
+    """A mask at the size of the images, width and height."""
+    small = mask.cpu().numpy().astype(np.uint8)
+    return cv2.resize(small, size, interpolation=cv2.INTER_NEAREST) > 0

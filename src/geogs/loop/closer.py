@@ -19,6 +19,7 @@ from geogs.loop.constraints import (
     none_known,
     of_edges,
     of_loop,
+    of_poses,
     rescaled,
     strains,
     thinned,
@@ -86,6 +87,11 @@ class LoopCloser:
         self.closures, self._between = state.closures, state.between
         self._known = {self.segments.trackers[n]: known for n, known in state.known.items()}
 
+    def remember(self, ids: Sequence[int]) -> None:
+        """Know keyframes of a saved map again from now on; among themselves they make no loops."""
+        if self.config.enabled:
+            self.detector.remember(ids)
+
     def recognise(self, image: UInt8[np.ndarray, "h w 3"]) -> Sequence[Recognition]:
         """Keyframes that show what an image shows."""
         return self.detector.recognise(image) if self.config.enabled else ()
@@ -115,11 +121,14 @@ class LoopCloser:
         edges = {
             e: v for e, v in world.graph.edges.items() if order[e[1]] - order[e[0]] not in (2, 3)
         }
-        self._known[world] = Known(of_edges(world.keyframes, edges))
+        held = of_poses(world.keyframes, sorted(world.held))
+        self._known[world] = Known(joined([held, of_edges(world.keyframes, edges)]))
         self._retire(world)
 
     def _of(self, tracker: Tracker) -> Known:
-        return self._known.setdefault(tracker, Known())
+        if tracker not in self._known:
+            self._known[tracker] = Known(of_poses(tracker.keyframes, sorted(tracker.held)))
+        return self._known[tracker]
 
     def _retire(self, tracker: Tracker) -> None:
         """Turn the edges that the local adjustment has left behind into relative poses."""
@@ -225,10 +234,12 @@ class LoopCloser:
         edges, matches = world.graph.edges, None
         if self.config.matches:
             matches = closing_matches(world.keyframes, edges, self.detector.loops)
-        closure = close_loops(ids, world.keyframes.poses(ids), relative, matches)
+        held = max(len(world.held), 1)
+        closure = close_loops(ids, world.keyframes.poses(ids), relative, matches, held=held)
         if closure is None or self._change(closure.correction) < self.config.min_change:
             return
         if closure.inverse_depth is not None:
+            edges = {e: edge for e, edge in edges.items() if e[0] not in world.held}
             take_over_depths(world.keyframes, edges, closure.inverse_depth)
         world.keyframes.correct(closure.correction)
         known.rescale(closure.correction)

@@ -137,6 +137,12 @@ class LoopDetector:
             found += self._decide(self._pending.popleft().result())
         return tuple(found)
 
+    def remember(self, ids: Sequence[int]) -> None:
+        """Take keyframes that are to be recognised, and are loops of none before them."""
+        for id in ids:
+            self._order[id] = len(self._order)
+            self._thread.submit(self._search.remember, id, self.keyframes[id].image)
+
     def recognise(self, image: UInt8[np.ndarray, "h w 3"]) -> list[Recognition]:
         """Keyframes that show what an image shows, with its pose; most alike first."""
         return self._thread.submit(self._search.recognise, image, self._depths()).result()

@@ -84,6 +84,11 @@ class PlaceSearch:
         self.index.load(state.index)
         self._features = state.features
 
+    def remember(self, id: int, image: UInt8[np.ndarray, "h w 3"]) -> None:
+        """Remember a keyframe, whatever it may show again."""
+        self._features[id] = self.index.describe(image)
+        self.index.add(id, self._features[id])
+
     def find(self, query: Query) -> list[Sighting]:
         """Remember a keyframe; the pairs it makes with earlier ones, most promising first."""
         id = query.id

@@ -24,6 +24,7 @@ from geogs.tracking.back_fill import back_fill
 from geogs.tracking.flow.base import FlowOperator
 from geogs.tracking.flow.select import build_operator
 from geogs.tracking.graph import EdgeState, FrameGraph
+from geogs.tracking.held import add_held
 from geogs.tracking.keyframe_choice import KeyframeChoice
 from geogs.tracking.keyframe_priors import KeyframePriors
 from geogs.tracking.motion import (
@@ -39,7 +40,7 @@ from geogs.tracking.trajectory import FrameRecord, RecorderState, TrajectoryReco
 from geogs.tracking.turns import Turn
 from geogs.tracking.view_choice import seeing
 from geogs.tracking.window import reach
-from geogs.types import Frame, Trajectory
+from geogs.types import Frame, RenderedKeyframe, Trajectory
 
 SELDOM = 5
 """While a camera only turns, the orientation says what it sees; only so often it is looked for as
@@ -165,6 +166,8 @@ class Tracker:
             self.config.min_ncc,
         )
         self._finalized: dict[int, None] = {}
+        self.held: frozenset[int] = frozenset()
+        """Keyframes of a saved map, in whose world this one goes on: they stay as they are."""
         self._breaks: list[int] = []
         """Keyframes that no motion links to the one before them."""
         self._last: LastFrame | None = None
@@ -201,13 +204,20 @@ class Tracker:
     def active(self) -> tuple[int, ...]:
         """Ids whose poses the local adjustment moves, earliest first; never the very first."""
         ids = self.keyframe_ids
-        return tuple(k for k in ids[-self._reach() :] if k != ids[0]) if ids else ()
+        fixed = self.held or {*ids[:1]}
+        return tuple(k for k in ids[-self._reach() :] if k not in fixed)
 
     @property
     def deep(self) -> list[int]:
         """Ids whose inverse depth it moves, earliest first."""
         c = self.config
-        return self.keyframes.ids[-(self._reach() + c.depth_window - c.window) :]
+        latest = self.keyframes.ids[-(self._reach() + c.depth_window - c.window) :]
+        return [k for k in latest if k not in self.held]
+
+    @property
+    def free(self) -> list[int]:
+        """Ids of the keyframes that adjustments of all move, earliest first."""
+        return [k for k in self.keyframe_ids if k not in self.held]
 
     def _reach(self) -> int:
         c = self.config
@@ -248,6 +258,17 @@ class Tracker:
         return None if self._last is None else self._last.T_cw
 
     # --- writing ---------------------------------------------------------------------------
+
+    def hold(self, places: Sequence[RenderedKeyframe]) -> list[int]:
+        """Begin in the world of a saved map, whose keyframes stay as they are; returns their ids.
+
+        The camera is lost there until a frame is recognised at one of them.
+        """
+        ids = [add_held(self.keyframes, place, n - len(places)) for n, place in enumerate(places)]
+        self.held = frozenset(ids)
+        self._finalized = dict.fromkeys(ids)
+        self.state = TrackState.LOST
+        return ids
 
     def absorb(self, other: "Tracker") -> None:
         """Take over the keyframes and frames of another tracker, already in this one's world.
