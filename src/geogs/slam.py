@@ -3,6 +3,8 @@
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -17,6 +19,7 @@ from geogs.keyframes.grid import SampleGrid
 from geogs.keyframes.store import KeyframeStore, StoreState
 from geogs.loop.closer import LoopCloser, LoopsState
 from geogs.loop.global_bundle import global_bundle
+from geogs.mapping.background import BackgroundMapper
 from geogs.mapping.mapper import Mapper
 from geogs.mapping.rendered import MapRenderer
 from geogs.mapping.state import MapperState
@@ -29,6 +32,8 @@ from geogs.tracking.moving import moving_share
 from geogs.tracking.segments import Segments, SegmentsState
 from geogs.tracking.tracker import Tracker, TrackResult, TrackState
 from geogs.types import Frame, MapSnapshot, RenderedKeyframe, Trajectory, Uncertainty
+
+R = TypeVar("R")
 
 Progress = Callable[[str, float], None]
 """Called with the name of a stage and its finished fraction in [0, 1]."""
@@ -79,7 +84,10 @@ class Slam:
         config: Config | None = None,
         device: str = "cpu",
         prior: MonocularPrior | None = None,
+        live: bool = False,
     ):
+        """``live`` maps in a thread beside tracking, which waits neither for it nor for the search
+        of loops: results then depend on how fast the machine is."""
         self.config = config or Config()
         self.camera = camera
         c = self.config
@@ -89,7 +97,9 @@ class Slam:
         self.operator = build_operator(c.tracking, grid)
         self.keyframes = KeyframeStore(grid, self.operator.encode, c.resident_keyframes)
         self.segments = Segments(self.new_tracker, c.tracking.patience)
-        self.loops = LoopCloser(self.segments, c.loop)
+        self.loops = LoopCloser(self.segments, c.loop, waits=not live)
+        self.background = BackgroundMapper(self.keyframes, c.mapping, c.seed) if live else None
+        """Maps until the stream ends, in a live system; then the mapper goes on from there."""
         self.mapper = Mapper(self.keyframes, c.mapping, c.seed)
         self.stopwatch = Stopwatch()
         self.frames = 0
@@ -153,7 +163,11 @@ class Slam:
         size, given = (self.camera.width, self.camera.height), zip(ids, keyframes, strict=True)
         masks = {i: _enlarged(k.mask, size) for i, k in given if k.mask is not None}
         with self.stopwatch("mapping"):
-            self.mapper.take_over(disks, masks, ids)
+            if self.background is None:
+                self.mapper.take_over(disks, masks, ids)
+            else:
+                take_over = partial(Mapper.take_over, disks=disks, masks=masks, ids=ids)
+                self.background.begin_with(take_over, ids)
         self.is_continued = True
 
     @property
@@ -176,9 +190,8 @@ class Slam:
         self.frames += 1
         self._map(self._close_loops(result), self.config.mapping.lag)
         self._adjust_now_and_then()
-        return SlamStatus(
-            result.state, self.frames, len(self.segments.keyframe_ids), len(self.mapper.map)
-        )
+        disks = len(self.mapper.map) if self.background is None else self.background.disks
+        return SlamStatus(result.state, self.frames, len(self.segments.keyframe_ids), disks)
 
     @on_one_torch_thread
     def end_stream(self) -> None:
@@ -186,6 +199,9 @@ class Slam:
         self._is_ended = True
         with self.stopwatch("tracking"):
             result = self.segments.finish()
+        if self.background is not None:
+            with self.stopwatch("mapping"):
+                self.mapper, self.background = self.background.settled(), None
         if result.is_new_world:
             self.mapper = Mapper(self.keyframes, self.config.mapping, self.config.seed)
             self.segments.world.keyframes.take_corrections()
@@ -253,7 +269,7 @@ class Slam:
 
     def snapshot(self) -> MapSnapshot:
         """The disks as they are now."""
-        return self.mapper.map.snapshot()
+        return self._ask(lambda mapper: mapper.map.snapshot())
 
     @on_one_torch_thread
     def renders(self) -> Sequence[RenderedKeyframe]:
@@ -262,18 +278,22 @@ class Slam:
         Of a long video most are read from a temporary file when they are asked for.
         """
         with self.stopwatch("rendering"):
-            return self.mapper.renders()
+            return self._ask(Mapper.renders)
 
     def renderer(self) -> MapRenderer:
         """What shows the map as it is now from anywhere."""
-        return self.mapper.renderer()
+        return self._ask(Mapper.renderer)
 
     def depth_maps(self) -> Sequence[RenderedKeyframe]:
         """Depth and confidence of every mapped keyframe as searched, without the disks.
 
         Each is read when it is asked for, as it is at that time.
         """
-        return self.mapper.depth_maps()
+        return self._ask(Mapper.depth_maps)
+
+    def _ask(self, question: Callable[[Mapper], R]) -> R:
+        """An answer from the mapper; while it works in its thread, from there."""
+        return question(self.mapper) if self.background is None else self.background.ask(question)
 
     def _close_loops(self, result: TrackResult, is_last: bool = False) -> TrackResult:
         """Act on loops that a frame closed; what is to be mapped then."""
@@ -306,19 +326,20 @@ class Slam:
         """Let the map follow the corrections of the world's keyframes."""
         for correction in self.segments.world.keyframes.take_corrections():
             with self.stopwatch("map update"):
-                self.mapper.correct(correction)
+                (self.background or self.mapper).correct(correction)
 
     def _map(self, result: TrackResult, lag: int) -> None:
         """Hand settled keyframes to the mapper; train those whose successors are known."""
         self._waiting.extend(result.finalized)
+        mapper = self.background or self.mapper
         with self.stopwatch("mapping"):
             for id in result.finalized:
-                self.mapper.observe(id)
+                mapper.observe(id)
             trained = False
             while len(self._waiting) > lag:
-                self.mapper.map_keyframe(self._waiting.popleft())
+                mapper.map_keyframe(self._waiting.popleft())
                 trained = True
-        if trained and self.config.mapping.pose_iterations:
+        if trained and self.config.mapping.pose_iterations and self.background is None:
             with self.stopwatch("pose refinement"):
                 self.mapper.refine_poses(result.active)
 

@@ -25,6 +25,9 @@ class InputConfig(Settings, group="input"):
     as 0.0276; 0 for a global shutter, auto finds it in the video."""
     topic: Annotated[str, Only("run"), Basic("--topic")] = "auto"
     """Topic of the images in a bag of ROS; auto takes the one that most likely is the camera."""
+    pipe: Annotated[str, Only("run"), Basic("--pipe")] = "auto"
+    """Format of raw frames from a pipe (SOURCE -): WIDTHxHEIGHT:FORMAT[@FPS], such as
+    640x480:rgb24@30; FORMAT is rgb24, bgr24, gray or yuv420p. auto reads YUV4MPEG2's own header."""
     start: Annotated[int, Range(0), Basic("--start")] = 0
     """First frame of the source, from 0."""
     stop: Annotated[int | None, Range(above="start"), Basic("--stop")] = None

@@ -64,11 +64,12 @@ class LoopsState:
 class LoopCloser:
     """Watches the segments of a run: closes loops within each, and joins segments that meet."""
 
-    def __init__(self, segments: Segments, config: LoopConfig) -> None:
+    def __init__(self, segments: Segments, config: LoopConfig, waits: bool = True) -> None:
+        """``waits`` as the detector's."""
         self.segments = segments
         self.config = config
         tracker = segments.world
-        self.detector = LoopDetector(tracker.keyframes.store, tracker.operator, config)
+        self.detector = LoopDetector(tracker.keyframes.store, tracker.operator, config, waits)
         self.closures = 0
         """Loop closures so far."""
         self._known: dict[Tracker, Known] = {}

@@ -56,8 +56,8 @@ def close_loops(
     """Correct keyframes ``ids`` (ascending) by their loops; None if no loop is believed.
 
     Loops that contradict the others are left out, those that the kernel lets go of too, and matches
-    between their keyframes with them. The first keyframes, as many as are ``held``, keep their poses
-    and units.
+    between their keyframes with them. The first keyframes, as many as are ``held``, keep pose and
+    unit.
     """
     options = options or ClosureOptions()
     keep = consistent_loops(T_cw, relative, options.consistency)

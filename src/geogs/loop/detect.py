@@ -90,14 +90,22 @@ class LoopDetector:
         keyframes: KeyframeStore,
         operator: FlowOperator,
         config: LoopConfig | None = None,
+        waits: bool = True,
     ) -> None:
+        """Unless it ``waits`` for searches that take longer, what they find is taken up later."""
         self.keyframes = keyframes
         self.grid = keyframes.grid
         self.operator = operator
         self.config = config or LoopConfig()
         self.refusals: list[Refusal] = []
         """Of the last update."""
-        self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="loops")
+        self._waits = waits
+        # What the search reads was written in the stream of whoever made the detector.
+        stream = torch.cuda.current_stream() if keyframes.grid.on_gpu else None
+        self._thread = ThreadPoolExecutor(
+            max_workers=1, thread_name_prefix="loops",
+            initializer=lambda: None if stream is None else torch.cuda.set_stream(stream),
+        )  # fmt: skip
         self._order: dict[int, int] = {}
         """Place in time of each keyframe taken so far."""
         self._search = PlaceSearch(self.grid, self.config, self._order)
@@ -131,7 +139,8 @@ class LoopDetector:
         for id in ids:
             self._order[id] = len(self._order)
             self._pending.append(self._thread.submit(self._search.find, self._query(id)))
-            if len(self._pending) > self.config.lag:
+            due = len(self._pending) > self.config.lag
+            if due and (self._waits or self._pending[0].done()):
                 found += self._decide(self._pending.popleft().result())
         while is_last and self._pending:
             found += self._decide(self._pending.popleft().result())

@@ -129,6 +129,13 @@ class Mapper:
         self._training().optimizer.append(parameters, ids[0])
         self.map.seen.fill_(1)
 
+    def move_to(self, keyframes: KeyframeStore) -> None:
+        """Go on with the keyframes of another store, which are what its own are."""
+        self.keyframes = keyframes
+        self.pool.move_to(keyframes)
+        for i, view in self.views.items():
+            view.keyframe = keyframes[i]
+
     def state(self) -> MapperState:
         """What a checkpoint holds."""
         trainer, training = self._trainer, None

@@ -34,6 +34,7 @@ from geogs.tracking.motion import (
 )
 from geogs.tracking.moving import carried
 from geogs.tracking.orientation_chain import Followed, OrientationChain, OrientationState
+from geogs.tracking.pose_deviation import PoseDeviation, pose_deviation
 from geogs.tracking.proximity import Pair, frame_distances, proximity_pairs
 from geogs.tracking.start_up import MIN_KEYFRAMES, StartUp, StartUpState
 from geogs.tracking.trajectory import FrameRecord, RecorderState, TrajectoryRecorder
@@ -171,6 +172,8 @@ class Tracker:
         self._breaks: list[int] = []
         """Keyframes that no motion links to the one before them."""
         self._last: LastFrame | None = None
+        self._motion: FrameMotion | None = None
+        """By which the last frame was located; none where it was not."""
         self._start_up = StartUp(self.graph, self.recorder, self.priors, self.config, self._choice)
         self.orientation = OrientationChain(self.grid, self.operator, self.config)
         """How the camera has turned since it was last located."""
@@ -257,6 +260,15 @@ class Tracker:
         """World to camera where the camera was last seen; none before that."""
         return None if self._last is None else self._last.T_cw
 
+    def deviation(self) -> PoseDeviation | None:
+        """How well the last frame's pose is known relative to the keyframes around; none if it has
+        no pose, or was placed with others at the start."""
+        motion = self._motion
+        if motion is None or motion.keyframe not in self.keyframes:
+            return None
+        anchor = self.keyframes[motion.keyframe]
+        return pose_deviation(self.grid, anchor, motion.T_cw, motion.match)
+
     # --- writing ---------------------------------------------------------------------------
 
     def hold(self, places: Sequence[RenderedKeyframe]) -> list[int]:
@@ -301,6 +313,7 @@ class Tracker:
                 f"Frame {frame.index} is {width} x {height} pixels, the camera is "
                 f"{self.camera.width} x {self.camera.height}; all frames must have one size."
             )
+        self._motion = None
         encoded = self.operator.encode(frame.image)
         self._choice.see(frame.image)
         if self.operator.texture(encoded) < self.config.min_texture:
@@ -438,7 +451,7 @@ class Tracker:
     def _follow(
         self, frame: Frame, encoded: Any, motion: FrameMotion, followed: Followed | None = None
     ) -> TrackResult:
-        velocity = None
+        velocity, self._motion = None, motion
         if self._last is not None and self.state is TrackState.TRACKING:
             velocity = motion.T_cw @ se3_inverse(self._last.T_cw)
         if self.state is TrackState.LOST:

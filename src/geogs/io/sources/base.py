@@ -100,6 +100,15 @@ class Reader(Protocol):
         ...
 
 
+@runtime_checkable
+class NeverWaits(Protocol):
+    """A reader whose frames do not wait until they are asked for."""
+
+    is_live: Literal[True]
+    dropped: int
+    """Frames of the present reading that came too fast."""
+
+
 class Source:
     """Frames at working resolution, undistorted, in time order; can be iterated repeatedly.
 
@@ -166,8 +175,20 @@ class Source:
         return Source(self._reader, self._config, fitted, self.shutter)
 
     @property
+    def is_live(self) -> bool:
+        """Whether frames do not wait until they are asked for."""
+        return isinstance(self._reader, NeverWaits)
+
+    @property
+    def dropped(self) -> int:
+        """Frames of a live source that came too fast to be used, so far in this iteration."""
+        return self._reader.dropped if isinstance(self._reader, NeverWaits) else 0
+
+    @property
     def is_shutter_open(self) -> bool:
-        """Whether nobody has said yet how long the readout takes."""
+        """Whether nobody has said yet how long the readout takes, and the frames can be asked."""
+        if self.is_live:
+            return False
         return self._config.readout == "auto" and self.shutter == Shutter()
 
     def with_shutter(self, shutter: Shutter) -> "Source":
@@ -255,7 +276,8 @@ class Source:
         """Yield the frames after a place; otherwise as the iteration over all."""
         self.place, self.skipped, index = place, place.skipped, place.frames
         self.damaged = place.damaged
-        for raw in read_ahead(self._working(place.frames + place.skipped)):
+        working = self._working(place.frames + place.skipped)
+        for raw in working if self.is_live else read_ahead(working):
             if raw.image is None:
                 self.skipped += 1
                 if self.skipped == 1:

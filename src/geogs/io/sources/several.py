@@ -100,6 +100,16 @@ class SeveralSources:
         return self._sources[0].shutter
 
     @property
+    def is_live(self) -> bool:
+        """Never: what does not wait is read alone."""
+        return False
+
+    @property
+    def dropped(self) -> int:
+        """None."""
+        return 0
+
+    @property
     def is_shutter_open(self) -> bool:
         """Whether nobody has said yet how long the readout takes."""
         return self._sources[0].is_shutter_open
