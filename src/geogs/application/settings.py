@@ -24,7 +24,7 @@ class RunSettings(Settings):
     """How to compute."""
     output: Annotated[Path | None, Basic("-o")] = None
     """Folder for the results; out/NAME if none is given."""
-    map: Annotated[Path | None, Basic("--map")] = None
+    map: Annotated[Path | None, Basic()] = None
     """Folder of an earlier result of the same place and camera: localise in its map, which stays
     where it is, and add to it."""
     device: str = "auto"

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float64, UInt8
+from jaxtyping import Float64
 from torch import Tensor
 
 from geogs.application.keyframe_files import write_keyframes
@@ -113,7 +113,7 @@ class Slam(Algorithm):
         return slam
 
     def process(  # type: ignore[override]  # takes what the algorithm takes, and more
-        self, image: Frame | UInt8[np.ndarray, "h w 3"], timestamp: float | None = None
+        self, image: Frame | np.ndarray, timestamp: float | None = None
     ) -> PoseEstimate:
         """Track an image and, where it completes a keyframe, train the map.
 
@@ -124,8 +124,13 @@ class Slam(Algorithm):
 
         Returns where the camera is. Raises InputError if the image cannot be used.
         """
-        frame = image if isinstance(image, Frame) else self._frame(image, timestamp)
-        self._check(frame)
+        if isinstance(image, Frame):
+            self._check(image.image, image.timestamp)
+            frame = image
+        else:
+            seconds = self._next_time() if timestamp is None else float(timestamp)
+            self._check(image, seconds)
+            frame = Frame(self.frames, seconds, image)
         status = super().process(frame)
         self.pose = self._estimate(status, frame.timestamp)
         return self.pose
@@ -136,7 +141,9 @@ class Slam(Algorithm):
         return surface_of(renders, self.config.mesh, RunProgress()) if len(renders) else None
 
     @on_one_torch_thread
-    def render(self, T_cw: Float64[Tensor, "4 4"], camera: Camera | None = None) -> SurfaceMaps:
+    def render(
+        self, T_cw: Float64[Tensor, "4 4"] | np.ndarray, camera: Camera | None = None
+    ) -> SurfaceMaps:
         """Depth, normal and weight of the map as it is now, seen from a pose, world to camera.
 
         ``camera`` is that of the keyframes' depth maps if none is given.
@@ -172,16 +179,12 @@ class Slam(Algorithm):
         save_map_with_views(output / "map.safetensors", self.snapshot(), views, facts)
         return output
 
-    def _frame(self, image: np.ndarray, timestamp: float | None) -> Frame:
-        before = None if self.pose is None else self.pose.timestamp
-        if timestamp is None:
-            timestamp = 0.0 if before is None else before + 1 / 30
-        return Frame(self.frames, float(timestamp), image)
+    def _next_time(self) -> float:
+        return 0.0 if self.pose is None else self.pose.timestamp + 1 / 30
 
-    def _check(self, frame: Frame) -> None:
-        """Raises InputError if a frame cannot be used, before anything has changed."""
-        image: object = frame.image
-        if isinstance(image, Tensor) or not isinstance(image, np.ndarray):
+    def _check(self, image: object, timestamp: float) -> None:
+        """Raises InputError if an image cannot be used, before anything has changed."""
+        if not isinstance(image, np.ndarray):
             raise InputError("An image is a NumPy array, uint8 of height x width x 3 (RGB).")
         size = self.camera.height, self.camera.width
         if image.ndim == 2 or (image.ndim == 3 and image.shape[2] == 1):
@@ -202,11 +205,11 @@ class Slam(Algorithm):
                 f"The image is {width} x {height} pixels, the camera {size[1]} x {size[0]}; all "
                 "images must have the camera's size."
             )
-        if not np.isfinite(frame.timestamp):
+        if not np.isfinite(timestamp):
             raise InputError("The time of an image is a finite number of seconds.")
-        if self.pose is not None and frame.timestamp <= self.pose.timestamp:
+        if self.pose is not None and timestamp <= self.pose.timestamp:
             raise InputError(
-                f"The image is of {frame.timestamp:g} s, the one before of "
+                f"The image is of {timestamp:g} s, the one before of "
                 f"{self.pose.timestamp:g} s; times have to increase."
             )
         if self.is_ended:

@@ -9,7 +9,7 @@ import time
 from collections.abc import Generator
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import BinaryIO
+from io import BufferedIOBase
 
 import cv2
 import numpy as np
@@ -97,7 +97,7 @@ class Pipe:
     kind = "pipe"
     name = "pipe"
 
-    def __init__(self, stream: BinaryIO, told: str = "auto") -> None:
+    def __init__(self, stream: BufferedIOBase, told: str = "auto") -> None:
         """``told`` is the format in words, or auto for YUV4MPEG2. Raises InputError."""
         self._stream = stream
         self._number = 0
