@@ -9,10 +9,12 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
+from geogs.application.calibrate import self_calibrated
 from geogs.application.keyframe_files import write_keyframes
 from geogs.application.progress import RunProgress
 from geogs.application.results import write_config
 from geogs.application.saved_result import load_result
+from geogs.application.shutter import with_shutter_found
 from geogs.application.surfaces import surface_of
 from geogs.config import Config, InputConfig
 from geogs.errors import InputError
@@ -236,8 +238,9 @@ def track(
     """Where the camera is after each frame of a video, a folder, a camera or a stream.
 
     Args:
-        source: what ``geogs.open_source`` opens, or has opened. Its focal length is taken as known
-            or guessed: ``geogs.application.self_calibrated`` finds it beforehand.
+        source: what ``geogs.open_source`` opens, or has opened. Of a path, the focal length and the
+            readout of the shutter are found beforehand as ``geogs run`` does, if nobody says them
+            and no ``slam`` is given; what is opened already is taken as it is.
         config: settings, also those of how the source is read.
         device: cpu, cuda, cuda:1, or auto for a GPU where there is one.
         slam: to use instead of a new one, such as a loaded one; it can be asked meanwhile and
@@ -250,6 +253,9 @@ def track(
     settings = config or (Config() if slam is None else slam.config)
     stream = _opened(source, settings.input)
     if slam is None:
+        if stream is not source:
+            stream = self_calibrated(stream, settings, require_device(device))
+            stream = with_shutter_found(stream)
         slam = Slam(stream.camera, settings, device, live=stream.is_live)
     for frame in stream:
         yield slam.process(frame)
