@@ -27,6 +27,7 @@ from geogs.priors.base import MonocularPrior
 from geogs.stopwatch import Stopwatch, StopwatchState
 from geogs.threads import on_one_torch_thread
 from geogs.tracking.certainty import certainty
+from geogs.tracking.flow.masked import MaskedFlow
 from geogs.tracking.flow.select import build_operator
 from geogs.tracking.moving import moving_share
 from geogs.tracking.segments import Segments, SegmentsState
@@ -85,19 +86,25 @@ class Slam:
         device: str = "cpu",
         prior: MonocularPrior | None = None,
         live: bool = False,
+        mask: Bool[np.ndarray, "h w"] | None = None,
     ):
-        """``live`` maps in a thread beside tracking, which waits neither for it nor for the search
-        of loops: results then depend on how fast the machine is."""
+        """``mask``, of the size of the images, is true where they may show the scene: elsewhere
+        nothing is matched, searched or mapped. ``live`` maps in a thread beside tracking, which
+        waits neither for it nor for the search of loops: results then depend on how fast the
+        machine is."""
         self.config = config or Config()
         self.camera = camera
         c = self.config
         self.device = device
         self.prior = prior
         grid = SampleGrid(camera, device)
+        self.mask = mask
         self.operator = build_operator(c.tracking, grid)
+        if mask is not None:
+            self.operator = MaskedFlow(self.operator, grid, mask)
         self.keyframes = KeyframeStore(grid, self.operator.encode, c.resident_keyframes)
         self.segments = Segments(self.new_tracker, c.tracking.patience)
-        self.loops = LoopCloser(self.segments, c.loop, waits=not live)
+        self.loops = LoopCloser(self.segments, c.loop, not live, mask)
         self.background = BackgroundMapper(self.keyframes, c.mapping, c.seed) if live else None
         """Maps until the stream ends, in a live system; then the mapper goes on from there."""
         self.mapper = Mapper(self.keyframes, c.mapping, c.seed)
@@ -129,7 +136,7 @@ class Slam:
         )  # fmt: skip
 
     @on_one_torch_thread
-    def load(self, state: SlamState) -> None:
+    def restore(self, state: SlamState) -> None:
         """Give a new system, made with the same camera and settings, the state of another.
 
         Raises:
@@ -140,6 +147,8 @@ class Slam:
         if not all(i in self.keyframes for i in (*state.waiting, *state.loops.detector.order)):
             raise InputError("a keyframe is missing")
         self.loops.load(state.loops)
+        for id in state.mapper.pool.maps if self.mask is not None else ():
+            self.mapper.pool.add(self.keyframes[id], self.mask)
         self.mapper.load(state.mapper)
         self.stopwatch.load(state.stopwatch)
         self.frames, self._waiting = state.frames, deque(state.waiting)
@@ -334,7 +343,7 @@ class Slam:
         mapper = self.background or self.mapper
         with self.stopwatch("mapping"):
             for id in result.finalized:
-                mapper.observe(id)
+                mapper.observe(id, self.mask)
             trained = False
             while len(self._waiting) > lag:
                 mapper.map_keyframe(self._waiting.popleft())

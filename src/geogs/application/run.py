@@ -93,7 +93,7 @@ def _run(
     found = None if calibrated is opened else calibrated.calibration
     source = with_shutter_found(calibrated, progress, stop)
     prior = open_prior(config.prior, source.camera, device)
-    slam = Slam(source.camera, config, str(device), prior, live=source.is_live)
+    slam = Slam(source.camera, config, str(device), prior, source.is_live, source.mask)
     if former is not None:
         slam.start_from(former.disks, former.keyframes)
     if former is not None or source.is_live:
@@ -137,7 +137,7 @@ def resume(
     with only_writer(output):
         compiled_kernels(device)
         prior = open_prior(config.prior, source.camera, device)
-        slam = Slam(source.camera, config, str(device), prior)
+        slam = Slam(source.camera, config, str(device), prior, mask=source.mask)
         saved.restore(slam)
         progress.write(f"Going on after {slam.frames} frames.")
         facts = replace(saved.facts, settings=settings.absolute(), device=device.type)

@@ -52,10 +52,14 @@ class RunSettings(Settings):
                 path if live_address(path) else expanded(path).absolute() for path in self.source
             ),
             output=None,
-            map=None if self.map is None else expanded(self.map).absolute(),
+            map=_absolute(self.map),
             config=replace(
                 config,
-                input=replace(config.input, intrinsics=_file(config.input.intrinsics)),
+                input=replace(
+                    config.input,
+                    intrinsics=_file(config.input.intrinsics),
+                    mask=_absolute(config.input.mask),
+                ),
                 tracking=replace(tracking, weights=_file(tracking.weights)),
                 prior=replace(
                     prior, model=_file(prior.model), card=_file(prior.card),
@@ -106,6 +110,10 @@ class ReconstructSettings(Settings):
     none."""
     device: str = "auto"
     """Where to compute: auto (a GPU where there is one), cpu, cuda or cuda:1; see geogs doctor."""
+
+
+def _absolute(path: Path | None) -> Path | None:
+    return None if path is None else expanded(path).absolute()
 
 
 def _file(name: str) -> str:

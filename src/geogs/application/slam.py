@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 from torch import Tensor
 
 from geogs.application.calibrate import self_calibrated
@@ -81,14 +81,16 @@ class Slam(Algorithm):
         device: str = "cpu",
         prior: MonocularPrior | None = None,
         live: bool = False,
+        mask: Bool[np.ndarray, "h w"] | None = None,
     ) -> None:
-        """``camera`` is the pinhole of all images; ``device`` is cpu, cuda, cuda:1 or auto.
+        """``camera`` is the pinhole of all images; ``device`` is cpu, cuda, cuda:1 or auto;
+        ``mask``, of the images' size, is true where they may show the scene.
 
         Raises:
             InputError: images of that size cannot be tracked.
             DeviceError: there is no such device, or it cannot be used.
         """
-        super().__init__(camera, config, str(require_device(device)), prior, live)
+        super().__init__(camera, config, str(require_device(device)), prior, live, mask)
         self.pose: PoseEstimate | None = None
         """After the last image; none before the first."""
 
@@ -99,6 +101,7 @@ class Slam(Algorithm):
         config: Config | None = None,
         device: str = "cpu",
         live: bool = False,
+        mask: Bool[np.ndarray, "h w"] | None = None,
     ) -> "Slam":
         """A system in the world of a saved map, or of the result of a run, to go on with there.
 
@@ -110,7 +113,7 @@ class Slam(Algorithm):
             InputError: there is no map, it is damaged, or was kept without keyframe images.
         """
         former = load_result(folder, require_device(device))
-        slam = cls(former.camera, config, device, live=live)
+        slam = cls(former.camera, config, device, live=live, mask=mask)
         slam.start_from(former.disks, former.keyframes)
         return slam
 
@@ -256,7 +259,7 @@ def track(
         if stream is not source:
             stream = self_calibrated(stream, settings, require_device(device))
             stream = with_shutter_found(stream)
-        slam = Slam(stream.camera, settings, device, live=stream.is_live)
+        slam = Slam(stream.camera, settings, device, live=stream.is_live, mask=stream.mask)
     for frame in stream:
         yield slam.process(frame)
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from geogs.config import LoopConfig
@@ -64,12 +64,18 @@ class LoopsState:
 class LoopCloser:
     """Watches the segments of a run: closes loops within each, and joins segments that meet."""
 
-    def __init__(self, segments: Segments, config: LoopConfig, waits: bool = True) -> None:
-        """``waits`` as the detector's."""
+    def __init__(
+        self,
+        segments: Segments,
+        config: LoopConfig,
+        waits: bool = True,
+        mask: Bool[np.ndarray, "h w"] | None = None,
+    ) -> None:
+        """``waits`` and ``mask`` as the detector's."""
         self.segments = segments
         self.config = config
         tracker = segments.world
-        self.detector = LoopDetector(tracker.keyframes.store, tracker.operator, config, waits)
+        self.detector = LoopDetector(tracker.keyframes.store, tracker.operator, config, waits, mask)
         self.closures = 0
         """Loop closures so far."""
         self._known: dict[Tracker, Known] = {}

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from geogs.config import LoopConfig
@@ -91,8 +91,12 @@ class LoopDetector:
         operator: FlowOperator,
         config: LoopConfig | None = None,
         waits: bool = True,
+        mask: Bool[np.ndarray, "h w"] | None = None,
     ) -> None:
-        """Unless it ``waits`` for searches that take longer, what they find is taken up later."""
+        """Unless it ``waits`` for searches that take longer, what they find is taken up later.
+
+        Outside a ``mask`` of the size of the images no features are found.
+        """
         self.keyframes = keyframes
         self.grid = keyframes.grid
         self.operator = operator
@@ -108,7 +112,7 @@ class LoopDetector:
         )  # fmt: skip
         self._order: dict[int, int] = {}
         """Place in time of each keyframe taken so far."""
-        self._search = PlaceSearch(self.grid, self.config, self._order)
+        self._search = PlaceSearch(self.grid, self.config, self._order, mask)
         self._pending: deque[Future[list[Sighting]]] = deque()
         self._loops: list[Loop] = []
 

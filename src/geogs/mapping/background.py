@@ -8,7 +8,9 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from typing import TypeVar
 
+import numpy as np
 import torch
+from jaxtyping import Bool
 from torch import Tensor
 
 from geogs.config import MappingConfig
@@ -64,10 +66,10 @@ class BackgroundMapper:
 
     # --- what tracking tells ---------------------------------------------------------------
 
-    def observe(self, id: int) -> None:
+    def observe(self, id: int, mask: Bool[np.ndarray, "h w"] | None = None) -> None:
         """See ``Mapper.observe``."""
         self._handed[id] = ()
-        self._tell(lambda mapper: mapper.observe(id))
+        self._tell(lambda mapper: mapper.observe(id, mask))
 
     def map_keyframe(self, id: int) -> None:
         """See ``Mapper.map_keyframe``."""

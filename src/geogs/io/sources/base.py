@@ -14,11 +14,13 @@ from pathlib import Path
 from typing import Literal, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Bool, UInt8
 
 from geogs.config import InputConfig
+from geogs.documents import expanded
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
+from geogs.io.pictures import read_mask
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.intrinsics import resolve_intrinsics
 from geogs.io.sources.undistort import Rectifier
@@ -141,12 +143,23 @@ class Source:
         """By which rows are rectified."""
         self._rectifier = Rectifier(self.calibration, config.long_edge, config.field_of_view)
         check_large_enough(self._rectifier.camera, reader.name)
+        self.mask = self._working_mask()
+        """Pixels of every frame that may show the scene; none where all do."""
         self.skipped = 0
         """Images that could not be read or are of another size, so far in this iteration."""
         self.damaged = 0
         """Images of which a part is damaged, so far in this iteration."""
         self.place = ReadingPlace()
         """How far the source has been read, at each frame of this iteration."""
+
+    def _working_mask(self) -> Bool[np.ndarray, "h w"] | None:
+        """The mask of the settings, straightened as the images are."""
+        if self._config.mask is None:
+            return None
+        reader = self._reader
+        shown = read_mask(expanded(self._config.mask), (reader.height, reader.width))
+        grey = np.repeat(np.where(shown, np.uint8(255), np.uint8(0))[..., None], 3, 2)
+        return self._rectifier(grey)[..., 0] > 127
 
     @property
     def name(self) -> str:

@@ -19,7 +19,8 @@ class Capture:
 
     def __init__(self, address: LiveAddress) -> None:
         """Raises InputError if it cannot be opened or gives no image."""
-        self.kind, self.name = address.kind, address.name
+        self.kind: str = address.kind
+        self.name = address.name
         self._target: int | str = address.target
         if address.kind == "camera":
             self._target = int(address.target)

@@ -1,7 +1,9 @@
 """Open what does not wait."""
 
 import sys
+from io import BufferedIOBase
 from pathlib import Path
+from typing import cast
 
 from geogs.errors import InputError
 from geogs.io.sources.address import LiveAddress
@@ -24,4 +26,4 @@ def open_live(address: LiveAddress, pipe: str, played: Reader | None = None) -> 
         return LiveReader(Capture(address))
     if sys.stdin is None or sys.stdin.isatty():
         raise InputError("- reads raw frames from a pipe, and nothing is piped in.")
-    return LiveReader(Pipe(sys.stdin.buffer, pipe))
+    return LiveReader(Pipe(cast(BufferedIOBase, sys.stdin.buffer), pipe))

@@ -152,5 +152,5 @@ def rgb(form: RawFormat, data: bytes) -> UInt8[np.ndarray, "h w 3"]:
         halves = rest.reshape(2, (form.height + 1) // 2, (form.width + 1) // 2)
         cb, cr = (np.repeat(np.repeat(c, 2, 0), 2, 1)[: size[0], : size[1]] for c in halves)
     if not form.is_full_range:
-        y, cb, cr = cv2.LUT(y, _FULL_Y), cv2.LUT(cb, _FULL_C), cv2.LUT(cr, _FULL_C)
+        y, cb, cr = _FULL_Y[y], _FULL_C[cb], _FULL_C[cr]
     return cv2.cvtColor(np.dstack([y, cr, cb]), cv2.COLOR_YCrCb2RGB)
