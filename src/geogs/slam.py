@@ -94,20 +94,13 @@ class Slam:
         machine is."""
         self.config = config or Config()
         self.camera = camera
-        c = self.config
         self.device = device
         self.prior = prior
-        grid = SampleGrid(camera, device)
         self.mask = mask
-        self.operator = build_operator(c.tracking, grid)
-        if mask is not None:
-            self.operator = MaskedFlow(self.operator, grid, mask)
-        self.keyframes = KeyframeStore(grid, self.operator.encode, c.resident_keyframes)
-        self.segments = Segments(self.new_tracker, c.tracking.patience)
-        self.loops = LoopCloser(self.segments, c.loop, not live, mask)
-        self.background = BackgroundMapper(self.keyframes, c.mapping, c.seed) if live else None
-        """Maps until the stream ends, in a live system; then the mapper goes on from there."""
-        self.mapper = Mapper(self.keyframes, c.mapping, c.seed)
+        self._stream = _urgent_stream(device) if live else None
+        """In which a live system tracks on a GPU until the stream ends; mapping's gives way."""
+        with torch.cuda.stream(self._stream):
+            self._make_parts(live)
         self.stopwatch = Stopwatch()
         self.frames = 0
         self._waiting: deque[int] = deque()
@@ -119,6 +112,18 @@ class Slam:
         self.is_continued = False
         """Whether it goes on in the world of a saved map."""
         self._known: Uncertainty | None = None
+
+    def _make_parts(self, live: bool) -> None:
+        c, grid = self.config, SampleGrid(self.camera, self.device)
+        self.operator = build_operator(c.tracking, grid)
+        if self.mask is not None:
+            self.operator = MaskedFlow(self.operator, grid, self.mask)
+        self.keyframes = KeyframeStore(grid, self.operator.encode, c.resident_keyframes)
+        self.segments = Segments(self.new_tracker, c.tracking.patience)
+        self.loops = LoopCloser(self.segments, c.loop, not live, self.mask)
+        self.background = BackgroundMapper(self.keyframes, c.mapping, c.seed) if live else None
+        """Maps until the stream ends, in a live system; then the mapper goes on from there."""
+        self.mapper = Mapper(self.keyframes, c.mapping, c.seed)
 
     def new_tracker(self) -> Tracker:
         """A tracker of another segment."""
@@ -177,6 +182,8 @@ class Slam:
             else:
                 take_over = partial(Mapper.take_over, disks=disks, masks=masks, ids=ids)
                 self.background.begin_with(take_over, ids)
+        if self._stream is not None:
+            torch.cuda.synchronize()  # the stream in which frames are tracked reads all this
         self.is_continued = True
 
     @property
@@ -192,6 +199,14 @@ class Slam:
     @on_one_torch_thread
     def process(self, frame: Frame) -> SlamStatus:
         """Track one frame and, where it completes a keyframe, train the map."""
+        if self._stream is None:
+            return self._process(frame)
+        with torch.cuda.stream(self._stream):
+            status = self._process(frame)
+        self._stream.synchronize()  # others may read what it has written
+        return status
+
+    def _process(self, frame: Frame) -> SlamStatus:
         if self.is_continued and self.frames == 0:
             frame = replace(frame, follows_cut=True)
         with self.stopwatch("tracking"):
@@ -211,6 +226,7 @@ class Slam:
         if self.background is not None:
             with self.stopwatch("mapping"):
                 self.mapper, self.background = self.background.settled(), None
+            self._stream = None
         if result.is_new_world:
             self.mapper = Mapper(self.keyframes, self.config.mapping, self.config.seed)
             self.segments.world.keyframes.take_corrections()
@@ -351,6 +367,12 @@ class Slam:
         if trained and self.config.mapping.pose_iterations and self.background is None:
             with self.stopwatch("pose refinement"):
                 self.mapper.refine_poses(result.active)
+
+
+def _urgent_stream(device: str) -> "torch.cuda.Stream | None":
+    """A stream of a GPU whose work goes before that of others; none on a CPU."""
+    where = torch.device(device)
+    return torch.cuda.Stream(where, priority=-1) if where.type == "cuda" else None
 
 
 def _enlarged(mask: Tensor, size: tuple[int, int]) -> Bool[np.ndarray, "h w"]:

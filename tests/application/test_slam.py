@@ -146,3 +146,20 @@ def test_images_that_cannot_be_used_end_in_a_sentence():
 def test_there_has_to_be_a_map_to_load(tmp_path):
     with pytest.raises(InputError, match="holds no result"):
         geogs.Slam.load(tmp_path)
+
+
+@pytest.mark.gpu
+@pytest.mark.system
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+def test_a_live_system_on_a_gpu_tracks_and_maps(small_room, tmp_path):
+    source = geogs.open_source(small_room, InputConfig(stop=FIRST))
+    slam = geogs.Slam(source.camera, config(), device="cuda", live=True)
+    poses = list(geogs.track(source, slam=slam))
+    assert poses[-1].is_tracked
+    assert poses[-1].sigma_position < np.inf
+    slam.finish()
+    assert slam.trajectory().tracked.mean() > 0.9
+    assert len(slam.snapshot()) > 100
+    again = geogs.Slam.load(slam.save(tmp_path), config(), device="cuda", live=True)
+    assert next(geogs.track(source, slam=again)).is_tracked
+    again.finish()
