@@ -26,7 +26,7 @@ class InputConfig(Settings, group="input"):
     as 0.0276; 0 for a global shutter, auto finds it in the video."""
     topic: Annotated[str, Only("run"), Basic("--topic")] = "auto"
     """Topic of the images in a bag of ROS; auto takes the one that most likely is the camera."""
-    pipe: Annotated[str, Only("run"), Basic("--pipe")] = "auto"
+    pipe: Annotated[str, Only("run")] = "auto"
     """Format of raw frames from a pipe (SOURCE -): WIDTHxHEIGHT:FORMAT[@FPS], such as
     640x480:rgb24@30; FORMAT is rgb24, bgr24, gray or yuv420p. auto reads YUV4MPEG2's own header."""
     mask: Annotated[Path | None, Only("run"), Basic("--mask")] = None

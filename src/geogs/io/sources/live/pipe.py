@@ -59,7 +59,7 @@ def format_from_words(words: str) -> RawFormat:
     found = _RAW.fullmatch(words.strip())
     if found is None:
         raise InputError(
-            f"--pipe {words} is no format of raw frames; give it as 640x480:rgb24@30 "
+            f"--input.pipe {words} is no format of raw frames; give it as 640x480:rgb24@30 "
             "(rgb24, bgr24, gray or yuv420p), or send YUV4MPEG2, which needs none."
         )
     fps = None if found[4] is None else float(found[4])
@@ -106,7 +106,7 @@ class Pipe:
             if not line.startswith(_MAGIC):
                 raise InputError(
                     "The pipe gives no YUV4MPEG2 (as of ffmpeg -f yuv4mpegpipe); for bare pixels "
-                    "give their format: --pipe 640x480:rgb24@30."
+                    "give their format: --input.pipe 640x480:rgb24@30."
                 )
             self._format = format_from_header(line)
         else:
