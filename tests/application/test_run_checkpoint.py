@@ -96,7 +96,7 @@ ANEW = (SampleGrid, Archive, MethodType, type)
 """Of the process, or compared elsewhere."""
 DROPPED = {
     "memory", "held",  # of a flow operator, of a GPU
-    "refusals", "_warned",  # for who looks on
+    "refusals", "_warned", "_motion",  # for who looks on
     "_recent", "encoded", "_values", "own_encoded",  # made again
     "operator", "_locator", "_search_thread", "_start",
 }  # fmt: skip
