@@ -9,12 +9,12 @@ if TYPE_CHECKING:
     from geogs import application
     from geogs.application.reconstruct import reconstruct
     from geogs.application.saved_result import load_result
+    from geogs.application.slam import PoseEstimate, Slam, track
     from geogs.config import Config, ReconstructConfig
     from geogs.geometry.camera import Camera
     from geogs.io.sources.posed.sniff import open_posed_source
     from geogs.io.sources.sniff import open_source
     from geogs.io.writers.native import load_map
-    from geogs.slam import Slam
     from geogs.splat.map import GaussianMap
     from geogs.splat.render import render
     from geogs.types import Frame
@@ -24,6 +24,7 @@ __all__ = [
     "Config",
     "Frame",
     "GaussianMap",
+    "PoseEstimate",
     "ReconstructConfig",
     "Slam",
     "__version__",
@@ -34,6 +35,7 @@ __all__ = [
     "open_source",
     "reconstruct",
     "render",
+    "track",
 ]
 
 _HOMES = {
@@ -41,14 +43,16 @@ _HOMES = {
     "Config": "geogs.config",
     "Frame": "geogs.types",
     "GaussianMap": "geogs.splat.map",
+    "PoseEstimate": "geogs.application.slam",
     "ReconstructConfig": "geogs.config",
-    "Slam": "geogs.slam",
+    "Slam": "geogs.application.slam",
     "load_map": "geogs.io.writers.native",
     "load_result": "geogs.application.saved_result",
     "open_posed_source": "geogs.io.sources.posed.sniff",
     "open_source": "geogs.io.sources.sniff",
     "reconstruct": "geogs.application.reconstruct",
     "render": "geogs.splat.render",
+    "track": "geogs.application.slam",
 }
 
 

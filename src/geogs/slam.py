@@ -3,9 +3,14 @@
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
+from typing import TypeVar
 
+import cv2
 import numpy as np
 import torch
+from jaxtyping import Bool
+from torch import Tensor
 
 from geogs.config import Config
 from geogs.errors import InputError
@@ -14,6 +19,7 @@ from geogs.keyframes.grid import SampleGrid
 from geogs.keyframes.store import KeyframeStore, StoreState
 from geogs.loop.closer import LoopCloser, LoopsState
 from geogs.loop.global_bundle import global_bundle
+from geogs.mapping.background import BackgroundMapper
 from geogs.mapping.mapper import Mapper
 from geogs.mapping.rendered import MapRenderer
 from geogs.mapping.state import MapperState
@@ -21,6 +27,7 @@ from geogs.priors.base import MonocularPrior
 from geogs.stopwatch import Stopwatch, StopwatchState
 from geogs.threads import on_one_torch_thread
 from geogs.tracking.certainty import certainty
+from geogs.tracking.flow.masked import MaskedFlow
 from geogs.tracking.flow.select import build_operator
 from geogs.tracking.moving import moving_share
 from geogs.tracking.segments import Segments, SegmentsState
@@ -33,6 +40,8 @@ from geogs.types import (
     Trajectory,
     Uncertainty,
 )
+
+R = TypeVar("R")
 
 Progress = Callable[[str, float], None]
 """Called with the name of a stage and its finished fraction in [0, 1]."""
@@ -84,18 +93,22 @@ class Slam:
         config: Config | None = None,
         device: str = "cpu",
         prior: MonocularPrior | None = None,
+        live: bool = False,
+        mask: Bool[np.ndarray, "h w"] | None = None,
     ):
+        """``mask``, of the size of the images, is true where they may show the scene: elsewhere
+        nothing is matched, searched or mapped. ``live`` maps in a thread beside tracking, which
+        waits neither for it nor for the search of loops: results then depend on how fast the
+        machine is."""
         self.config = config or Config()
         self.camera = camera
-        c = self.config
         self.device = device
         self.prior = prior
-        grid = SampleGrid(camera, device)
-        self.operator = build_operator(c.tracking, grid)
-        self.keyframes = KeyframeStore(grid, self.operator.encode, c.resident_keyframes)
-        self.segments = Segments(self.new_tracker, c.tracking.patience)
-        self.loops = LoopCloser(self.segments, c.loop)
-        self.mapper = self._new_mapper()
+        self.mask = mask
+        self._stream = _urgent_stream(device) if live else None
+        """In which a live system tracks on a GPU until the stream ends; mapping's gives way."""
+        with torch.cuda.stream(self._stream):
+            self._make_parts(live)
         self.stopwatch = Stopwatch()
         self.frames = 0
         self._waiting: deque[int] = deque()
@@ -104,8 +117,22 @@ class Slam:
         self.is_refined = False
         """Whether the map was trained over all keyframes at the end."""
         self._is_ended = False
+        self.is_continued = False
+        """Whether it goes on in the world of a saved map."""
         self._known: Uncertainty | None = None
         self._told_scale: MetricScale | None = None
+
+    def _make_parts(self, live: bool) -> None:
+        c, grid = self.config, SampleGrid(self.camera, self.device)
+        self.operator = build_operator(c.tracking, grid)
+        if self.mask is not None:
+            self.operator = MaskedFlow(self.operator, grid, self.mask)
+        self.keyframes = KeyframeStore(grid, self.operator.encode, c.resident_keyframes)
+        self.segments = Segments(self.new_tracker, c.tracking.patience)
+        self.loops = LoopCloser(self.segments, c.loop, not live, self.mask)
+        self.background = BackgroundMapper(self.keyframes, self._new_mapper) if live else None
+        """Maps until the stream ends, in a live system; then the mapper goes on from there."""
+        self.mapper = self._new_mapper(self.keyframes)
 
     def new_tracker(self) -> Tracker:
         """A tracker of another segment."""
@@ -115,9 +142,9 @@ class Slam:
             self.keyframes, c.sensor,
         )  # fmt: skip
 
-    def _new_mapper(self) -> Mapper:
+    def _new_mapper(self, keyframes: KeyframeStore) -> Mapper:
         c = self.config
-        return Mapper(self.keyframes, c.mapping, c.seed, c.sensor)
+        return Mapper(keyframes, c.mapping, c.seed, c.sensor)
 
     def state(self) -> SlamState:
         """What a checkpoint holds: to be written before the next frame, as it refers to all."""
@@ -127,7 +154,7 @@ class Slam:
         )  # fmt: skip
 
     @on_one_torch_thread
-    def load(self, state: SlamState) -> None:
+    def restore(self, state: SlamState) -> None:
         """Give a new system, made with the same camera and settings, the state of another.
 
         Raises:
@@ -138,10 +165,39 @@ class Slam:
         if not all(i in self.keyframes for i in (*state.waiting, *state.loops.detector.order)):
             raise InputError("a keyframe is missing")
         self.loops.load(state.loops)
+        for id in state.mapper.pool.maps if self.mask is not None else ():
+            self.mapper.pool.add(self.keyframes[id], self.mask)
         self.mapper.load(state.mapper)
         self.stopwatch.load(state.stopwatch)
         self.frames, self._waiting = state.frames, deque(state.waiting)
         self.adjusted, self._is_ended = state.adjusted, state.is_ended
+
+    @on_one_torch_thread
+    def start_from(self, disks: MapSnapshot, keyframes: Sequence[RenderedKeyframe]) -> None:
+        """Before the first frame: go on in the world of a saved map, which stays where it is.
+
+        The camera is looked for among its keyframes, which need their images; what cannot be found
+        there is a segment of its own until loops join it. Trajectories are those of new frames.
+
+        Raises:
+            InputError: there is no keyframe, one has no image, or one of another camera.
+        """
+        if self.frames or not keyframes:
+            raise InputError("A map with keyframes has to be given, and before the first frame.")
+        world = self.segments.world
+        ids = world.hold(keyframes)
+        self.loops.remember(ids)
+        size, given = (self.camera.width, self.camera.height), zip(ids, keyframes, strict=True)
+        masks = {i: _enlarged(k.mask, size) for i, k in given if k.mask is not None}
+        with self.stopwatch("mapping"):
+            if self.background is None:
+                self.mapper.take_over(disks, masks, ids)
+            else:
+                take_over = partial(Mapper.take_over, disks=disks, masks=masks, ids=ids)
+                self.background.begin_with(take_over, ids)
+        if self._stream is not None:
+            torch.cuda.synchronize()  # the stream in which frames are tracked reads all this
+        self.is_continued = True
 
     @property
     def is_ended(self) -> bool:
@@ -166,14 +222,23 @@ class Slam:
     @on_one_torch_thread
     def process(self, frame: Frame) -> SlamStatus:
         """Track one frame and, where it completes a keyframe, train the map."""
+        if self._stream is None:
+            return self._process(frame)
+        with torch.cuda.stream(self._stream):
+            status = self._process(frame)
+        self._stream.synchronize()  # others may read what it has written
+        return status
+
+    def _process(self, frame: Frame) -> SlamStatus:
+        if self.is_continued and self.frames == 0:
+            frame = replace(frame, follows_cut=True)
         with self.stopwatch("tracking"):
             result = self.segments.track(frame, self.loops.recognise)
         self.frames += 1
         self._map(self._close_loops(result), self.config.mapping.lag)
         self._adjust_now_and_then()
-        return SlamStatus(
-            result.state, self.frames, len(self.segments.keyframe_ids), len(self.mapper.map)
-        )
+        disks = len(self.mapper.map) if self.background is None else self.background.disks
+        return SlamStatus(result.state, self.frames, len(self.segments.keyframe_ids), disks)
 
     @on_one_torch_thread
     def end_stream(self) -> None:
@@ -181,8 +246,12 @@ class Slam:
         self._is_ended = True
         with self.stopwatch("tracking"):
             result = self.segments.finish()
+        if self.background is not None:
+            with self.stopwatch("mapping"):
+                self.mapper, self.background = self.background.settled(), None
+            self._stream = None
         if result.is_new_world:
-            self.mapper = self._new_mapper()
+            self.mapper = self._new_mapper(self.keyframes)
             self.segments.world.keyframes.take_corrections()
             self._waiting.clear()
         self._map(self._close_loops(result, is_last=True), lag=0)
@@ -232,7 +301,7 @@ class Slam:
 
     def keyframe_trajectory(self) -> Trajectory:
         """Poses of the keyframes alone."""
-        keyframes = [self.keyframes[i] for i in self.segments.keyframe_ids]
+        keyframes = [self.keyframes[i] for i in self.segments.world.free]
         T_wc = [torch.linalg.inv(k.T_cw).numpy() for k in keyframes]
         times = np.array([k.timestamp for k in keyframes], dtype=np.float64)
         return Trajectory(times, np.array(T_wc).reshape(-1, 4, 4), np.ones(len(times), dtype=bool))
@@ -261,7 +330,7 @@ class Slam:
 
     def snapshot(self) -> MapSnapshot:
         """The disks as they are now."""
-        return self.mapper.map.snapshot()
+        return self._ask(lambda mapper: mapper.map.snapshot())
 
     @on_one_torch_thread
     def renders(self) -> Sequence[RenderedKeyframe]:
@@ -270,18 +339,22 @@ class Slam:
         Of a long video most are read from a temporary file when they are asked for.
         """
         with self.stopwatch("rendering"):
-            return self.mapper.renders()
+            return self._ask(Mapper.renders)
 
     def renderer(self) -> MapRenderer:
         """What shows the map as it is now from anywhere."""
-        return self.mapper.renderer()
+        return self._ask(Mapper.renderer)
 
     def depth_maps(self) -> Sequence[RenderedKeyframe]:
         """Depth and confidence of every mapped keyframe as searched, without the disks.
 
         Each is read when it is asked for, as it is at that time.
         """
-        return self.mapper.depth_maps()
+        return self._ask(Mapper.depth_maps)
+
+    def _ask(self, question: Callable[[Mapper], R]) -> R:
+        """An answer from the mapper; while it works in its thread, from there."""
+        return question(self.mapper) if self.background is None else self.background.ask(question)
 
     def _close_loops(self, result: TrackResult, is_last: bool = False) -> TrackResult:
         """Act on loops that a frame closed; what is to be mapped then."""
@@ -314,18 +387,31 @@ class Slam:
         """Let the map follow the corrections of the world's keyframes."""
         for correction in self.segments.world.keyframes.take_corrections():
             with self.stopwatch("map update"):
-                self.mapper.correct(correction)
+                (self.background or self.mapper).correct(correction)
 
     def _map(self, result: TrackResult, lag: int) -> None:
         """Hand settled keyframes to the mapper; train those whose successors are known."""
         self._waiting.extend(result.finalized)
+        mapper = self.background or self.mapper
         with self.stopwatch("mapping"):
             for id in result.finalized:
-                self.mapper.observe(id)
+                mapper.observe(id, self.mask)
             trained = False
             while len(self._waiting) > lag:
-                self.mapper.map_keyframe(self._waiting.popleft())
+                mapper.map_keyframe(self._waiting.popleft())
                 trained = True
-        if trained and self.config.mapping.pose_iterations:
+        if trained and self.config.mapping.pose_iterations and self.background is None:
             with self.stopwatch("pose refinement"):
                 self.mapper.refine_poses(result.active)
+
+
+def _urgent_stream(device: str) -> "torch.cuda.Stream | None":
+    """A stream of a GPU whose work goes before that of others; none on a CPU."""
+    where = torch.device(device)
+    return torch.cuda.Stream(where, priority=-1) if where.type == "cuda" else None
+
+
+def _enlarged(mask: Tensor, size: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
+    """A mask at the size of the images, width and height."""
+    small = mask.cpu().numpy().astype(np.uint8)
+    return cv2.resize(small, size, interpolation=cv2.INTER_NEAREST) > 0

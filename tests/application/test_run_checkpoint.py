@@ -54,7 +54,7 @@ def again(slam: Slam, output: Path, copy: Path) -> Slam:
     write_checkpoint(checkpoint_folder(output), Work(slam.state()))
     shutil.copytree(output, copy)
     other = Slam(slam.camera, slam.config)
-    other.load(SavedState(copy, Work).work("slam"))
+    other.restore(SavedState(copy, Work).work("slam"))
     return other
 
 
@@ -96,7 +96,7 @@ ANEW = (SampleGrid, Archive, MethodType, type)
 """Of the process, or compared elsewhere."""
 DROPPED = {
     "memory", "held",  # of a flow operator, of a GPU
-    "refusals", "_warned",  # for who looks on
+    "refusals", "_warned", "_motion",  # for who looks on
     "_recent", "encoded", "_values", "own_encoded",  # made again
     "operator", "_locator", "_search_thread", "_start",
 }  # fmt: skip
@@ -179,7 +179,7 @@ def test_a_state_of_another_camera_or_without_a_keyframe_is_one_sentence(frames,
         slam.process(frame)
     state = slam.state()
     with pytest.raises(InputError, match="of another camera"):
-        Slam(camera.resized(64, 48), quick(3)).load(state)
+        Slam(camera.resized(64, 48), quick(3)).restore(state)
     first, *rest = state.segments.trackers[0].keyframes
     wrong = [
         replace(state, waiting=[99]),
@@ -189,7 +189,7 @@ def test_a_state_of_another_camera_or_without_a_keyframe_is_one_sentence(frames,
     ]
     for changed in wrong:
         with pytest.raises(InputError, match=r"is missing|has no place|not in its place"):
-            Slam(camera, quick(3)).load(changed)
+            Slam(camera, quick(3)).restore(changed)
 
 
 def with_keyframes(state: SlamState, keyframes: list) -> SlamState:

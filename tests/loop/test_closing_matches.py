@@ -112,7 +112,7 @@ def world(drift: float):
     loop = Loop(0, last, "geometry", T_ji, 1.0, 0, 1.0, *ways)
     graph = SimpleNamespace(edges=edges, retire=lambda keep: {})
     tracker = Tracker.__new__(Tracker)  # nothing of it but its keyframes and their edges
-    tracker.keyframes, tracker.graph = keyframes, graph
+    tracker.keyframes, tracker.graph, tracker.held = keyframes, graph, frozenset()
     return tracker, loop
 
 

@@ -48,7 +48,13 @@ def self_calibrated(
 
         try:
             found = self_calibrate(
-                frames, source.camera, config.calibration, torch.device(device), config.seed, report
+                frames,
+                source.camera,
+                config.calibration,
+                torch.device(device),
+                config.seed,
+                report,
+                source.mask,
             )
         except KeyboardInterrupt:
             if not stop.requested:

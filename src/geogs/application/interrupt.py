@@ -19,6 +19,10 @@ class Stop:
     def __exit__(self, *exception: object) -> None:
         pass
 
+    def request(self) -> None:
+        """Ask to stop."""
+        self.requested = True
+
     def check(self) -> None:
         """A safe point inside a long stage: raises KeyboardInterrupt after a request."""
         if self.requested:

@@ -21,11 +21,13 @@ from geogs.application.progress import RunProgress
 from geogs.application.result import Result, Written
 from geogs.application.results import write_results
 from geogs.application.run_checkpoint import RunCheckpoint, RunFacts, SavedRun, frames_after
+from geogs.application.saved_result import SavedResult, load_result
 from geogs.application.scale.apply import check_scale_source, make_metric
 from geogs.application.scale.source import scale_source
 from geogs.application.settings import RunSettings
 from geogs.application.shutter import with_shutter_found
 from geogs.application.surfaces import write_depth_mesh, write_stage
+from geogs.config import Config, InputConfig
 from geogs.config.idle import idle_settings
 from geogs.errors import DeviceError, InputError
 from geogs.gpu.installation import require_device
@@ -57,17 +59,31 @@ def run(
     for sentence in idle_settings(config):
         progress.write(f"note: {sentence}")
     scale = scale_source(settings.scale_from)
-    opened = open_source(settings.source, config.input)
+    former = None if settings.map is None else load_result(settings.map, device)
+    opened = open_source(
+        settings.source, config.input if former is None else seen_by(former, config)
+    )
     check_scale_source(scale, opened)
     wanted = settings.output or free_folder(Path("out") / opened.name, opened.fingerprint())
+    if former is not None and wanted.resolve() == former.folder.resolve():
+        raise InputError(f"{wanted} holds the map to go on with; give another folder by -o.")
     output = prepare_output_folder(wanted)
     with only_writer(output):
-        return _run(settings, opened, output, device, progress, stop, observer)
+        return _run(settings, opened, former, output, device, progress, stop, observer)
+
+
+def seen_by(former: SavedResult, config: Config) -> InputConfig:
+    """How a source is read that the camera of an earlier result took, if nobody says otherwise."""
+    known = former.folder / "intrinsics.json"
+    if config.input.intrinsics.strip().lower() != "auto" or not known.is_file():
+        return config.input
+    return replace(config.input, intrinsics=str(known))
 
 
 def _run(
     settings: RunSettings,
     opened: Stream,
+    former: SavedResult | None,
     output: Path,
     device: torch.device,
     progress: RunProgress,
@@ -80,7 +96,12 @@ def _run(
     calibrated = self_calibrated(opened, config, device, progress, stop)
     found = None if calibrated is opened else calibrated.calibration
     source = with_shutter_found(calibrated, progress, stop)
-    slam = Slam(source.camera, config, str(device), open_prior(config.prior, source.camera, device))
+    prior = open_prior(config.prior, source.camera, device)
+    slam = Slam(source.camera, config, str(device), prior, source.is_live, source.mask)
+    if former is not None:
+        slam.start_from(former.disks, former.keyframes)
+    if former is not None or source.is_live:
+        settings = replace(settings, checkpoint_every=0.0)  # neither can be gone on with
     facts = RunFacts(
         settings.absolute(), device.type, source.fingerprint(), found, shutter=source.shutter
     )
@@ -120,7 +141,7 @@ def resume(
     with only_writer(output):
         compiled_kernels(device)
         prior = open_prior(config.prior, source.camera, device)
-        slam = Slam(source.camera, config, str(device), prior)
+        slam = Slam(source.camera, config, str(device), prior, mask=source.mask)
         saved.restore(slam)
         progress.write(f"Going on after {slam.frames} frames.")
         facts = replace(saved.facts, settings=settings.absolute(), device=device.type)
@@ -174,6 +195,9 @@ class _Run:
         with full_memory_in_a_sentence(self._way_on), self.stop:
             with closing(frames):
                 full = not self._feed(frames, checkpoint)
+            if source.is_live and self.stop.requested:  # the usual end of what has none
+                self.stop.requested = False
+                progress.write("Stopping; finishing the map. Press Ctrl-C to stop that, too.")
             interrupted = full or self.stop.requested
             if interrupted:
                 why = "The GPU has no memory left" if full else "Stopping early"

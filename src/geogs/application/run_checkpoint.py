@@ -77,7 +77,7 @@ class SavedRun:
         """Give a new system the state. Raises InputError if that cannot be."""
         state = self._saved.work("slam", slam.device)
         with self._saved.in_a_sentence():
-            slam.load(state)
+            slam.restore(state)
 
     def calibrated(self, source: Stream) -> Stream:
         """The source as the run read it. Raises InputError if its files are not what they were."""

@@ -10,6 +10,7 @@ from typing import Annotated, Literal
 from geogs.config import Config, MeshConfig, ReconstructConfig
 from geogs.config.setting import Basic, Positional, Positive, Range, Settings, Time, Unnamed, Weight
 from geogs.documents import expanded
+from geogs.io.sources.address import live_address
 
 
 @dataclass(frozen=True)
@@ -17,11 +18,15 @@ class RunSettings(Settings):
     """All that a run is told: what it reads, how it computes, what it writes."""
 
     source: Annotated[tuple[Path, ...], Positional(unless="resume")] = ()
-    """Video file or folder; several of one place, by one camera, make one map."""
+    """Video file or folder; several of one place, by one camera, make one map. Or what does not
+    wait: camera:0, rtsp://HOST/PATH, - (raw frames from a pipe), play:FILE (a file at its pace)."""
     config: Annotated[Config, Unnamed] = field(default_factory=Config)
     """How to compute."""
     output: Annotated[Path | None, Basic("-o")] = None
     """Folder for the results; out/NAME if none is given."""
+    map: Annotated[Path | None, Basic()] = None
+    """Folder of an earlier result of the same place and camera: localise in its map, which stays
+    where it is, and add to it."""
     device: str = "auto"
     """Where to compute: auto (a GPU where there is one), cpu, cuda or cuda:1; see geogs doctor."""
     checkpoint_every: Weight = 60.0
@@ -47,11 +52,18 @@ class RunSettings(Settings):
         prior, tracking = config.prior, config.tracking
         return replace(
             self,
-            source=tuple(expanded(path).absolute() for path in self.source),
+            source=tuple(
+                path if live_address(path) else expanded(path).absolute() for path in self.source
+            ),
             output=None,
+            map=_absolute(self.map),
             config=replace(
                 config,
-                input=replace(config.input, intrinsics=_file(config.input.intrinsics)),
+                input=replace(
+                    config.input,
+                    intrinsics=_file(config.input.intrinsics),
+                    mask=_absolute(config.input.mask),
+                ),
                 tracking=replace(tracking, weights=_file(tracking.weights)),
                 prior=replace(
                     prior, model=_file(prior.model), card=_file(prior.card),
@@ -66,7 +78,7 @@ class RunSettings(Settings):
         Two runs on the same kind of device that differ elsewhere compute the same.
         """
         config = replace(self.absolute().config, mesh=MeshConfig())
-        return RunSettings(self.absolute().source, config)
+        return RunSettings(self.absolute().source, config, map=self.absolute().map)
 
 
 @dataclass(frozen=True)
@@ -102,6 +114,10 @@ class ReconstructSettings(Settings):
     none."""
     device: str = "auto"
     """Where to compute: auto (a GPU where there is one), cpu, cuda or cuda:1; see geogs doctor."""
+
+
+def _absolute(path: Path | None) -> Path | None:
+    return None if path is None else expanded(path).absolute()
 
 
 def _file(name: str) -> str:

@@ -76,12 +76,14 @@ def source_summary(source: Stream | PosedSource) -> dict[str, object]:
             **held_out,
         }
     spans = source.spans if isinstance(source, SeveralSources) else []
+    live = {"dropped_frames": source.dropped} if source.is_live else {}
     videos = {"videos": [asdict(span) for span in spans]} if spans else {}
     return {
         "scale": "arbitrary (monocular)",
         "skipped_images": source.skipped,
         "damaged_images": source.damaged,
         "shutter": asdict(source.shutter),
+        **live,
         **videos,
     }
 

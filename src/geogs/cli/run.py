@@ -2,6 +2,7 @@
 
 import sys
 from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -14,8 +15,10 @@ from geogs.cli.options import Given, parse_options, record
 from geogs.cli.speech import followed
 from geogs.config import Preset, preset
 from geogs.errors import InputError
+from geogs.io.sources.address import live_address
 
 if TYPE_CHECKING:
+    from geogs.application.interrupt import Stop
     from geogs.application.observer import RunObserver
 
 
@@ -24,7 +27,8 @@ class RunOptions(LiveSettings, Verbosity, RunSettings):
     """Reconstruct a video, images, a bag of ROS, or a Replica, TUM RGB-D or 7-Scenes sequence.
 
     Every default works: ``geogs run video.mp4``. Intrinsics: ``--intrinsics fx,fy,cx,cy``.
-    Several videos of one place: ``geogs run a.mp4 b.mp4``.
+    Several videos of one place: ``geogs run a.mp4 b.mp4``. A camera: ``geogs run camera:0``, until
+    q or Ctrl-C is pressed.
     """
 
     preset: Preset = "default"
@@ -38,6 +42,10 @@ class RunOptions(LiveSettings, Verbosity, RunSettings):
 def main(argv: Sequence[str]) -> int:
     """Run the command; returns the exit code."""
     options = parse(argv)
+    if options.offline and any(live_address(source) is not None for source in options.source):
+        raise InputError("--offline reads a video several times; a live source comes but once.")
+    if options.offline and options.map is not None:
+        raise InputError("--map is gone on with by tracking; leave out --offline.")
 
     from geogs.application.interrupt import Interruption
     from geogs.application.offline import run_offline
@@ -51,10 +59,21 @@ def main(argv: Sequence[str]) -> int:
     else:
         go = run if options.resume is None else partial(resume, options.resume)
         observer = _observer(options)
-        written = followed(options, lambda progress: go(settings, progress, stop, observer))
+        with _keys(options, stop):
+            written = followed(options, lambda progress: go(settings, progress, stop, observer))
     if written.can_resume:
         print(f"geogs run --resume {written.output} goes on from here.")
     return 0
+
+
+def _keys(options: RunOptions, stop: "Stop") -> AbstractContextManager[bool]:
+    """Hears the key q during a live run."""
+    from geogs.cli.quit_key import quit_key
+
+    is_live = any(live_address(source) is not None for source in options.source)
+    if not is_live or any(str(source) == "-" for source in options.source):
+        return nullcontext(False)
+    return quit_key(stop.request)
 
 
 def _observer(options: LiveSettings) -> "RunObserver | None":

@@ -1,6 +1,7 @@
 """How a source is read."""
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Literal
 
 from geogs.config.setting import Basic, Only, Range, Settings
@@ -28,6 +29,12 @@ class InputConfig(Settings, group="input"):
     is any, sensor must have it. With it the result is in metres."""
     topic: Annotated[str, Only("run"), Basic("--topic")] = "auto"
     """Topic of the images in a bag of ROS; auto takes the one that most likely is the camera."""
+    pipe: Annotated[str, Only("run")] = "auto"
+    """Format of raw frames from a pipe (SOURCE -): WIDTHxHEIGHT:FORMAT[@FPS], such as
+    640x480:rgb24@30; FORMAT is rgb24, bgr24, gray or yuv420p. auto reads YUV4MPEG2's own header."""
+    mask: Annotated[Path | None, Only("run"), Basic("--mask")] = None
+    """Picture of the source images' size, bright where they show the scene and black where they
+    always show something else: a car's bonnet, a robot's arm, a time stamp."""
     start: Annotated[int, Range(0), Basic("--start")] = 0
     """First frame of the source, from 0."""
     stop: Annotated[int | None, Range(above="start"), Basic("--stop")] = None

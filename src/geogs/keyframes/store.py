@@ -132,6 +132,11 @@ class Segment:
         self._keyframes[id] = keyframe
         return keyframe
 
+    def put(self, keyframe: Keyframe) -> None:
+        """Add a keyframe as it is, of another store, with the id that it has there."""
+        self._keyframes[keyframe.id] = keyframe
+        self.store.assign([keyframe.id], self)
+
     def state(self) -> list[KeyframeState]:
         """What a checkpoint holds, once the corrections have been taken."""
         return [keyframe.state() for keyframe in self]

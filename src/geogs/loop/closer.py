@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from geogs.config import LoopConfig
@@ -19,6 +19,7 @@ from geogs.loop.constraints import (
     none_known,
     of_edges,
     of_loop,
+    of_poses,
     rescaled,
     strains,
     thinned,
@@ -63,11 +64,18 @@ class LoopsState:
 class LoopCloser:
     """Watches the segments of a run: closes loops within each, and joins segments that meet."""
 
-    def __init__(self, segments: Segments, config: LoopConfig) -> None:
+    def __init__(
+        self,
+        segments: Segments,
+        config: LoopConfig,
+        waits: bool = True,
+        mask: Bool[np.ndarray, "h w"] | None = None,
+    ) -> None:
+        """``waits`` and ``mask`` as the detector's."""
         self.segments = segments
         self.config = config
         tracker = segments.world
-        self.detector = LoopDetector(tracker.keyframes.store, tracker.operator, config)
+        self.detector = LoopDetector(tracker.keyframes.store, tracker.operator, config, waits, mask)
         self.closures = 0
         """Loop closures so far."""
         self._known: dict[Tracker, Known] = {}
@@ -85,6 +93,11 @@ class LoopCloser:
         self.detector.load(state.detector)
         self.closures, self._between = state.closures, state.between
         self._known = {self.segments.trackers[n]: known for n, known in state.known.items()}
+
+    def remember(self, ids: Sequence[int]) -> None:
+        """Know keyframes of a saved map again from now on; among themselves they make no loops."""
+        if self.config.enabled:
+            self.detector.remember(ids)
 
     def recognise(self, image: UInt8[np.ndarray, "h w 3"]) -> Sequence[Recognition]:
         """Keyframes that show what an image shows."""
@@ -115,11 +128,14 @@ class LoopCloser:
         edges = {
             e: v for e, v in world.graph.edges.items() if order[e[1]] - order[e[0]] not in (2, 3)
         }
-        self._known[world] = Known(of_edges(world.keyframes, edges))
+        held = of_poses(world.keyframes, sorted(world.held))
+        self._known[world] = Known(joined([held, of_edges(world.keyframes, edges)]))
         self._retire(world)
 
     def _of(self, tracker: Tracker) -> Known:
-        return self._known.setdefault(tracker, Known())
+        if tracker not in self._known:
+            self._known[tracker] = Known(of_poses(tracker.keyframes, sorted(tracker.held)))
+        return self._known[tracker]
 
     def _retire(self, tracker: Tracker) -> None:
         """Turn the edges that the local adjustment has left behind into relative poses."""
@@ -229,11 +245,17 @@ class LoopCloser:
         if self.config.matches:
             matches = closing_matches(world.keyframes, edges, self.detector.loops)
         closure = close_loops(
-            ids, world.keyframes.poses(ids), relative, matches, is_metric=world.is_metric
+            ids,
+            world.keyframes.poses(ids),
+            relative,
+            matches,
+            held=max(len(world.held), 1),
+            is_metric=world.is_metric,
         )
         if closure is None or self._change(closure.correction) < self.config.min_change:
             return
         if closure.inverse_depth is not None:
+            edges = {e: edge for e, edge in edges.items() if e[0] not in world.held}
             take_over_depths(world.keyframes, edges, closure.inverse_depth)
         world.keyframes.correct(closure.correction)
         known.rescale(closure.correction)

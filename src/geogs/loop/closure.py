@@ -51,17 +51,18 @@ def close_loops(
     relative: RelativePoses,
     matches: MatchedEdges | None = None,
     options: ClosureOptions | None = None,
+    held: int = 1,
     is_metric: bool = False,
 ) -> LoopClosure | None:
     """Correct keyframes ``ids`` (ascending) by their loops; None if no loop is believed.
 
     Loops that contradict the others are left out, those that the kernel lets go of too, and matches
-    between their keyframes with them. The first keyframe keeps its pose and unit; all keep theirs
-    where the map ``is_metric``.
+    between their keyframes with them. The first keyframes, as many as are ``held``, keep pose and
+    unit; all keep their unit where the map ``is_metric``.
     """
     options = options or ClosureOptions()
     keep = consistent_loops(T_cw, relative, options.consistency)
-    fixed = torch.arange(len(T_cw)) == 0
+    fixed = torch.arange(len(T_cw)) < held
     result = solve(PoseGraph(T_cw, relative.select(keep), fixed, None, is_metric), options.graph)
     keep = keep.clone()
     keep[keep.clone()] = result.loop_weight >= options.least_weight

@@ -60,6 +60,21 @@ def of_edges(segment: Segment, edges: Mapping[Pair, Edge | PackedEdge]) -> Relat
     return _named(relative_poses(grid, matched, segment.poses(ids), False, SETTLED), ids)
 
 
+def of_poses(segment: Segment, ids: Sequence[int]) -> RelativePoses:
+    """Relative poses between neighbours in a list of ids, as sure as any can be."""
+    if len(ids) < 2:
+        return none_known()
+    T_cw = segment.poses(ids)
+    depth = 1 / segment.inverse_depths(ids[1:]).median(1).values.cpu().double()
+    sure = 1 / torch.tensor([SETTLED.least_turn] * 6 + [SETTLED.least_scale]).double().square()
+    information = sure.repeat(len(ids) - 1, 1)
+    information[:, :3] /= depth[:, None].square()
+    slots = torch.arange(len(ids))
+    is_loop = torch.zeros(len(ids) - 1, dtype=torch.bool)
+    G = T_cw[1:] @ se3_inverse(T_cw[:-1])
+    return _named(RelativePoses(slots[:-1], slots[1:], G, information, is_loop), ids)
+
+
 def of_loop(keyframes: KeyframeStore, loop: Loop) -> RelativePoses:
     """Relative poses, between ids, of a loop: one for each direction of its flow."""
     one, other = keyframes[loop.first], keyframes[loop.second]

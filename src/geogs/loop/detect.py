@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from geogs.config import LoopConfig
@@ -90,17 +90,29 @@ class LoopDetector:
         keyframes: KeyframeStore,
         operator: FlowOperator,
         config: LoopConfig | None = None,
+        waits: bool = True,
+        mask: Bool[np.ndarray, "h w"] | None = None,
     ) -> None:
+        """Unless it ``waits`` for searches that take longer, what they find is taken up later.
+
+        Outside a ``mask`` of the size of the images no features are found.
+        """
         self.keyframes = keyframes
         self.grid = keyframes.grid
         self.operator = operator
         self.config = config or LoopConfig()
         self.refusals: list[Refusal] = []
         """Of the last update."""
-        self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="loops")
+        self._waits = waits
+        # What the search reads was written in the stream of whoever made the detector.
+        stream = torch.cuda.current_stream() if keyframes.grid.on_gpu else None
+        self._thread = ThreadPoolExecutor(
+            max_workers=1, thread_name_prefix="loops",
+            initializer=lambda: None if stream is None else torch.cuda.set_stream(stream),
+        )  # fmt: skip
         self._order: dict[int, int] = {}
         """Place in time of each keyframe taken so far."""
-        self._search = PlaceSearch(self.grid, self.config, self._order)
+        self._search = PlaceSearch(self.grid, self.config, self._order, mask)
         self._pending: deque[Future[list[Sighting]]] = deque()
         self._loops: list[Loop] = []
 
@@ -131,11 +143,18 @@ class LoopDetector:
         for id in ids:
             self._order[id] = len(self._order)
             self._pending.append(self._thread.submit(self._search.find, self._query(id)))
-            if len(self._pending) > self.config.lag:
+            due = len(self._pending) > self.config.lag
+            if due and (self._waits or self._pending[0].done()):
                 found += self._decide(self._pending.popleft().result())
         while is_last and self._pending:
             found += self._decide(self._pending.popleft().result())
         return tuple(found)
+
+    def remember(self, ids: Sequence[int]) -> None:
+        """Take keyframes that are to be recognised, and are loops of none before them."""
+        for id in ids:
+            self._order[id] = len(self._order)
+            self._thread.submit(self._search.remember, id, self.keyframes[id].image)
 
     def recognise(self, image: UInt8[np.ndarray, "h w 3"]) -> list[Recognition]:
         """Keyframes that show what an image shows, with its pose; most alike first."""

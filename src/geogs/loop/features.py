@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import Bool, Float32, UInt8
 
 from geogs.config import RetrievalOptions
 
@@ -30,7 +30,11 @@ class Features:
 class FeatureExtractor:
     """Finds oriented FAST corners at eight scales and describes them by ORB."""
 
-    def __init__(self, options: RetrievalOptions) -> None:
+    def __init__(
+        self, options: RetrievalOptions, mask: Bool[np.ndarray, "h w"] | None = None
+    ) -> None:
+        """Outside a ``mask`` of the size of the images nothing is found."""
+        self._mask = None if mask is None else mask.astype(np.uint8)
         self.options = options
         self.count = options.features
         self._orb = cv2.ORB.create(
@@ -40,7 +44,7 @@ class FeatureExtractor:
     def __call__(self, image: UInt8[np.ndarray, "h w 3"]) -> Features:
         """Features of an RGB image; none where nothing stands out."""
         grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-        points = self._orb.detect(grey, None)
+        points = self._orb.detect(grey, self._mask)
         if not points:
             return Features(np.zeros((0, 2), np.float32), np.zeros((0, 32), np.uint8))
         pixels = np.array([p.pt for p in points], np.float32)

@@ -24,7 +24,8 @@ def global_bundle(
 ) -> PoseCorrection:
     """Refine keyframes of a tracker on a fresh graph that also joins places seen again.
 
-    ``keyframes`` (all where None) are ids, earliest first; the pose of the first of them stays.
+    ``keyframes`` (all where None) are ids, earliest first; the pose of the first of them stays, or,
+    in the world of a saved map, all that is of those it holds.
     Each round measures the pairs whose reprojection has moved and adjusts everything; every round
     sharpens the next. Poses, inverse depth and information of the tracker are updated, and its
     graph holds the fresh edges alone: one that goes on tracking needs only those that
@@ -37,6 +38,7 @@ def global_bundle(
     before = {k: store[k].T_cw for k in ids}
     if not ids:
         return PoseCorrection({}, {}, {})
+    free = [k for k in ids if k not in tracker.held]
     pairs = global_pairs(tracker, ids)
     graph.edges = {}
     batch = MATCHED_TOGETHER[store.grid.on_gpu]
@@ -53,10 +55,10 @@ def global_bundle(
             if progress is not None:
                 share = (n + start / len(stale)) / config.global_rounds
                 progress(share, "matching all keyframes")
-        graph.adjust(list(graph.edges), ids[1:], ids, options)
-        graph.judge_moving(set(ids), config.moving)
-    for start in range(0, len(ids), PRIORS_TOGETHER):
-        tracker.priors.adjust(ids[start : start + PRIORS_TOGETHER], config.huber)  # moves no pose
+        graph.adjust(list(graph.edges), free if tracker.held else ids[1:], free, options)
+        graph.judge_moving(set(free), config.moving)
+    for start in range(0, len(free), PRIORS_TOGETHER):
+        tracker.priors.adjust(free[start : start + PRIORS_TOGETHER], config.huber)  # moves no pose
     if progress is not None:
         progress(1.0, "all keyframes adjusted")
     after = {k: store[k].T_cw for k in ids}
@@ -66,7 +68,7 @@ def global_bundle(
 
 
 def global_pairs(tracker: Tracker, keyframes: Sequence[int] | None = None) -> list[Pair]:
-    """Neighbours in time and all places seen again, thinned evenly."""
+    """Neighbours in time and all places seen again, thinned evenly; not within a saved map."""
     config = tracker.config
     ids = tracker.keyframe_ids if keyframes is None else list(keyframes)
     pairs = proximity_pairs(
@@ -80,4 +82,4 @@ def global_pairs(tracker: Tracker, keyframes: Sequence[int] | None = None) -> li
         config.global_pairs * len(ids),
     )
     wanted = set(ids)
-    return [p for p in pairs if wanted.issuperset(p)]
+    return [p for p in pairs if wanted.issuperset(p) and not tracker.held.issuperset(p)]

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Float64, Int64, UInt8
+from jaxtyping import Bool, Float64, Int64, UInt8
 
 from geogs.config import RetrievalOptions
 from geogs.errors import InputError
@@ -43,9 +43,14 @@ class AppearanceIndex:
     merging of words). Words that many keyframes share count little (inverse document frequency).
     """
 
-    def __init__(self, options: RetrievalOptions | None = None) -> None:
+    def __init__(
+        self,
+        options: RetrievalOptions | None = None,
+        mask: Bool[np.ndarray, "h w"] | None = None,
+    ) -> None:
+        """Outside a ``mask`` of the size of the images nothing is looked at."""
         self.options = options or RetrievalOptions()
-        self._extract = FeatureExtractor(self.options)
+        self._extract = FeatureExtractor(self.options, mask)
         self._matcher = cv2.BFMatcher(cv2.NORM_HAMMING)
         self._words = np.zeros((0, 32), np.uint8)
         self._postings: list[list[tuple[int, int]]] = []

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from geogs.config import LoopConfig
@@ -66,11 +66,18 @@ class SearchState:
 class PlaceSearch:
     """Remembers keyframes by their features, and finds those that a new one may show again."""
 
-    def __init__(self, grid: SampleGrid, config: LoopConfig, order: Mapping[int, int]) -> None:
-        """``order`` is the place in time of each keyframe; it may grow meanwhile."""
+    def __init__(
+        self,
+        grid: SampleGrid,
+        config: LoopConfig,
+        order: Mapping[int, int],
+        mask: Bool[np.ndarray, "h w"] | None = None,
+    ) -> None:
+        """``order`` is the place in time of each keyframe; it may grow meanwhile. Outside a
+        ``mask`` of the size of the images no features are found."""
         self.grid = grid
         self.config = config
-        self.index = AppearanceIndex(config.retrieval)
+        self.index = AppearanceIndex(config.retrieval, mask)
         self._verifier = TwoViewVerifier(grid.camera, config.verification)
         self._features: dict[int, Features] = {}
         self._order = order
@@ -83,6 +90,11 @@ class PlaceSearch:
         """Give a search that knows nothing yet the state of another."""
         self.index.load(state.index)
         self._features = state.features
+
+    def remember(self, id: int, image: UInt8[np.ndarray, "h w 3"]) -> None:
+        """Remember a keyframe, whatever it may show again."""
+        self._features[id] = self.index.describe(image)
+        self.index.add(id, self._features[id])
 
     def find(self, query: Query) -> list[Sighting]:
         """Remember a keyframe; the pairs it makes with earlier ones, most promising first."""

@@ -1,7 +1,7 @@
 """The back end: keyframe depths in, a trained disk map and refined poses out."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from operator import attrgetter
 
@@ -21,7 +21,14 @@ from geogs.mapping.keyframe_depths import CANDIDATES, KeyframeDepths
 from geogs.mapping.levelling import light_of
 from geogs.mapping.map_frame import WORLD, MapFrame
 from geogs.mapping.map_update import MapUpdate, plan_update, witness
-from geogs.mapping.rendered import MapRenderer, SurfaceRules, rendered_keyframe, searched_keyframe
+from geogs.mapping.rendered import (
+    MapRenderer,
+    SurfaceRules,
+    rendered_keyframe,
+    rendered_surface,
+    searched_keyframe,
+    shown_depth,
+)
 from geogs.mapping.state import MapperState, RandomState, TrainedState, ViewState
 from geogs.mapping.stored_renders import StoredRender, stored_render
 from geogs.mapping.training.base import Batch, MapTrainer, TrainingPlace, draw_partners
@@ -86,6 +93,8 @@ class Mapper:
         self.mapped: list[int] = []
         self.trained = TrainingPlace()
         """How far the training over all keyframes is, at each report of its progress."""
+        self._given: frozenset[int] = frozenset()
+        """Keyframes of a saved map."""
         self._order: list[int] = []
         """Of the keyframes that it comes to next, by their places among those mapped."""
         self._trainer: MapTrainer | None = None
@@ -107,6 +116,31 @@ class Mapper:
         view = MapView(keyframe, self.pool)
         self.views[keyframe_id] = view
         self._depths.engine.observe(view.depth_view)
+
+    def take_over(
+        self, disks: MapSnapshot, masks: Mapping[int, Bool[np.ndarray, "h w"]], ids: Sequence[int]
+    ) -> None:
+        """Begin with a saved map, and the keyframes of the store that it was made from.
+
+        Their depths are what the map shows from them, inside ``masks``, and are not searched again.
+        """
+        parameters, rules = DiskParameters.of(disks), SurfaceRules.of(self.config)
+        for i in ids:
+            self.observe(i, masks.get(i))
+            view = self.views[i]
+            shown = rendered_surface(parameters, self.cameras.render, view.T_cw, rules, view.mask)
+            self.pool.set_depth(i, shown_depth(shown))
+        self.mapped, self._given = [*ids], frozenset(ids)
+        self.choose_partners()
+        self._training().optimizer.append(parameters, ids[0])
+        self.map.seen.fill_(1)
+
+    def move_to(self, keyframes: KeyframeStore) -> None:
+        """Go on with the keyframes of another store, which are what its own are."""
+        self.keyframes = keyframes
+        self.pool.move_to(keyframes)
+        for i, view in self.views.items():
+            view.keyframe = keyframes[i]
 
     def state(self) -> MapperState:
         """What a checkpoint holds."""
@@ -163,6 +197,7 @@ class Mapper:
 
     def refine_poses(self, active: Sequence[int]) -> None:
         """Give the active keyframes poses that agree better with the map; the earliest stays."""
+        active = [i for i in active if i not in self._given]
         views = [self.views[i] for i in active if i in self.views and self.views[i].has_depth]
         if len(views) < 2 or len(self.map) == 0:
             return
@@ -196,8 +231,8 @@ class Mapper:
         """Train over all keyframes with the final poses, after searching their depths again."""
         if not self.mapped or self.config.final_iterations <= 0:
             return
-        views = [self.views[i] for i in self.mapped]
-        if self.config.final_depth:
+        views = [self.views[i] for i in self.mapped if i not in self._given]
+        if self.config.final_depth and views:
             self._depths.estimate(views, lambda fraction: progress(0.4 * fraction))
             self._depths.check(views)
         self.grow()

@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from geogs.config import MappingConfig
+from geogs.depth.view import DenseDepth
 from geogs.geometry.camera import Camera
 from geogs.geometry.depth import averaged_over_planes, normals_from_depth
 from geogs.mapping.map_frame import MapFrame
@@ -97,6 +98,15 @@ def rendered_surface(
     if rules.max_spread > 0:
         depth = averaged_over_planes(depth, normal, camera, _RADIUS, 2 * rules.max_spread)
     return SurfaceMaps(depth, normal, weight)
+
+
+def shown_depth(maps: SurfaceMaps) -> DenseDepth:
+    """What a map shows from a keyframe, as if that had been searched there."""
+    known = maps.depth > 0
+    shown = maps.depth[known]
+    typical = shown.median() if len(shown) else maps.depth.new_ones(())
+    depth = torch.where(known, maps.depth, typical)
+    return DenseDepth(depth, maps.weight, typical.cpu(), normal=maps.normal)
 
 
 def rendered_keyframe(

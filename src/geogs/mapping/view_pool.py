@@ -15,6 +15,7 @@ from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.keyframes.archive import Archive, Archived
 from geogs.keyframes.keyframe import Keyframe
+from geogs.keyframes.store import KeyframeStore
 from geogs.keyframes.swap import Swap
 from geogs.losses.multi_view import PhotoView
 from geogs.losses.single_view import OUTSIDE, ViewConstants
@@ -148,6 +149,11 @@ class ViewPool:
             inside = torch.from_numpy(share > 0.5).to(self.device)
         self._stored[keyframe.id] = StoredMaps(keyframe, inside)
         self.maps(keyframe.id)
+
+    def move_to(self, keyframes: KeyframeStore) -> None:
+        """Go on with the keyframes of another store, which are what its own are."""
+        for id, stored in self._stored.items():
+            stored.keyframe = keyframes[id]
 
     def mask(self, id: int) -> Bool[Tensor, "h w"] | None:
         """Pixels of the render size that belong to the scene; none takes all."""

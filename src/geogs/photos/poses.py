@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 
 from geogs.errors import InputError
+from geogs.io.pictures import read_mask
 from geogs.io.sources.intrinsics import calibration_from_exif, resolve_intrinsics
 from geogs.io.sources.posed.colmap import mask_beside
-from geogs.io.sources.posed.pictures import read_mask, read_picture
+from geogs.io.sources.posed.pictures import read_picture
 from geogs.photos.database import Entry, SharedCamera, match_pairs, write_database
 from geogs.photos.features import Features, find_features
 from geogs.photos.library import load_colmap

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from jaxtyping import Float64
 
 from geogs.bundle.base import BundleOptions
@@ -50,11 +51,13 @@ class Certainty:
 def certainty(tracker: Tracker) -> Certainty:
     """Of all keyframes of a tracker that has a map, from the edges that it has at present.
 
+    In the world of a saved map: of those that it did not bring, relative to it.
+
     Lengths are relative to the length of the path: the unit of the map is anyone's. In a long
     video each part begins where the one before it ended, so that errors add up along the way
     whatever loops say: what is told of it is rather too much.
     """
-    ids = tracker.keyframe_ids
+    ids = tracker.free
     position, rotation, depth, strain = (np.full(len(ids), np.inf) for _ in range(4))
     carried = np.zeros(2)
     for first in range(0, max(len(ids) - 1, 1), TOGETHER):
@@ -66,16 +69,19 @@ def certainty(tracker: Tracker) -> Certainty:
         squares = squares + carried
         position[part], rotation[part] = np.sqrt(squares).T
         depth[part], strain[part] = found.depth_deviation.numpy(), found.strain.numpy()
-        carried = squares[-1]
+        carried = squares[-1] if not tracker.held else carried
     return Certainty(tuple(ids), position, rotation, depth, strain)
 
 
 def _marginals(tracker: Tracker, ids: list[int]) -> Marginals | None:
     """Of some keyframes, by the edges between them; none where there are none."""
-    among = set(ids)
+    free = ids if tracker.held else ids[1:]
+    among = {*ids, *tracker.held}
     edges = [e for e in tracker.graph.edges if among.issuperset(e)]
     if not edges:
         return None
-    problem, _ = tracker.graph.streamed_problem(edges, ids[1:], ids)
+    problem, frames = tracker.graph.streamed_problem(edges, free, ids)
     grid = tracker.keyframes.grid
-    return marginals(grid, problem, BundleOptions(huber=tracker.config.huber), cells=512)
+    found = marginals(grid, problem, BundleOptions(huber=tracker.config.huber), cells=512)
+    own = torch.tensor([frames.index(k) for k in ids])
+    return Marginals(found.pose[own], found.relative_depth[own], found.strain[own])

@@ -99,7 +99,7 @@ class Segments:
         present = [
             _segment(t, "world" if t is self.world else "apart")
             for t in self.trackers
-            if t.keyframe_ids
+            if t.keyframe_ids and t.recorder.records
         ]
         return sorted([*present, *self._joined], key=lambda s: s.first_time)
 
@@ -195,7 +195,8 @@ class Segments:
                     raise
                 self.why_not = str(reason)
                 return TrackResult(tracker.state)
-        largest = max(finals, key=lambda t: len(t.keyframes))
+        # A saved map is the world whatever else there is.
+        largest = max(finals, key=lambda t: (bool(t.held), len(t.keyframes)))
         if largest is self.world:
             return finals[largest]
         self.world = largest

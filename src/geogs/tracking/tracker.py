@@ -24,6 +24,7 @@ from geogs.tracking.back_fill import back_fill
 from geogs.tracking.flow.base import FlowOperator
 from geogs.tracking.flow.select import build_operator
 from geogs.tracking.graph import EdgeState, FrameGraph
+from geogs.tracking.held import add_held
 from geogs.tracking.keyframe_choice import KeyframeChoice
 from geogs.tracking.keyframe_priors import KeyframePriors
 from geogs.tracking.motion import (
@@ -33,6 +34,7 @@ from geogs.tracking.motion import (
 )
 from geogs.tracking.moving import carried
 from geogs.tracking.orientation_chain import Followed, OrientationChain, OrientationState
+from geogs.tracking.pose_deviation import PoseDeviation, pose_deviation
 from geogs.tracking.proximity import Pair, frame_distances, proximity_pairs
 from geogs.tracking.sensing import DepthSensing, stands_alone
 from geogs.tracking.start_up import MIN_KEYFRAMES, StartUp, StartUpState
@@ -40,7 +42,7 @@ from geogs.tracking.trajectory import FrameRecord, RecorderState, TrajectoryReco
 from geogs.tracking.turns import Turn
 from geogs.tracking.view_choice import seeing
 from geogs.tracking.window import reach
-from geogs.types import Frame, Trajectory
+from geogs.types import Frame, RenderedKeyframe, Trajectory
 
 SELDOM = 5
 """While a camera only turns, the orientation says what it sees; only so often it is looked for as
@@ -171,9 +173,13 @@ class Tracker:
             self.config.min_ncc,
         )
         self._finalized: dict[int, None] = {}
+        self.held: frozenset[int] = frozenset()
+        """Keyframes of a saved map, in whose world this one goes on: they stay as they are."""
         self._breaks: list[int] = []
         """Keyframes that no motion links to the one before them."""
         self._last: LastFrame | None = None
+        self._motion: FrameMotion | None = None
+        """By which the last frame was located; none where it was not."""
         self._start_up = StartUp(self.graph, self.recorder, self.priors, self.config, self._choice)
         self.orientation = OrientationChain(self.grid, self.operator, self.config)
         """How the camera has turned since it was last located."""
@@ -207,13 +213,20 @@ class Tracker:
     def active(self) -> tuple[int, ...]:
         """Ids whose poses the local adjustment moves, earliest first; never the very first."""
         ids = self.keyframe_ids
-        return tuple(k for k in ids[-self._reach() :] if k != ids[0]) if ids else ()
+        fixed = self.held or {*ids[:1]}
+        return tuple(k for k in ids[-self._reach() :] if k not in fixed)
 
     @property
     def deep(self) -> list[int]:
         """Ids whose inverse depth it moves, earliest first."""
         c = self.config
-        return self.keyframes.ids[-(self._reach() + c.depth_window - c.window) :]
+        latest = self.keyframes.ids[-(self._reach() + c.depth_window - c.window) :]
+        return [k for k in latest if k not in self.held]
+
+    @property
+    def free(self) -> list[int]:
+        """Ids of the keyframes that adjustments of all move, earliest first."""
+        return [k for k in self.keyframe_ids if k not in self.held]
 
     def _reach(self) -> int:
         c = self.config
@@ -254,7 +267,27 @@ class Tracker:
         """World to camera where the camera was last seen; none before that."""
         return None if self._last is None else self._last.T_cw
 
+    def deviation(self) -> PoseDeviation | None:
+        """How well the last frame's pose is known relative to the keyframes around; none if it has
+        no pose, or was placed with others at the start."""
+        motion = self._motion
+        if motion is None or motion.keyframe not in self.keyframes:
+            return None
+        anchor = self.keyframes[motion.keyframe]
+        return pose_deviation(self.grid, anchor, motion.T_cw, motion.match)
+
     # --- writing ---------------------------------------------------------------------------
+
+    def hold(self, places: Sequence[RenderedKeyframe]) -> list[int]:
+        """Begin in the world of a saved map, whose keyframes stay as they are; returns their ids.
+
+        The camera is lost there until a frame is recognised at one of them.
+        """
+        ids = [add_held(self.keyframes, place, n - len(places)) for n, place in enumerate(places)]
+        self.held = frozenset(ids)
+        self._finalized = dict.fromkeys(ids)
+        self.state = TrackState.LOST
+        return ids
 
     def absorb(self, other: "Tracker") -> None:
         """Take over the keyframes and frames of another tracker, already in this one's world.
@@ -287,6 +320,7 @@ class Tracker:
                 f"Frame {frame.index} is {width} x {height} pixels, the camera is "
                 f"{self.camera.width} x {self.camera.height}; all frames must have one size."
             )
+        self._motion = None
         encoded = self.operator.encode(frame.image)
         self._choice.see(frame.image)
         if self.operator.texture(encoded) < self.config.min_texture:
@@ -444,7 +478,7 @@ class Tracker:
     def _follow(
         self, frame: Frame, encoded: Any, motion: FrameMotion, followed: Followed | None = None
     ) -> TrackResult:
-        velocity = None
+        velocity, self._motion = None, motion
         if self._last is not None and self.state is TrackState.TRACKING:
             velocity = motion.T_cw @ se3_inverse(self._last.T_cw)
         if self.state is TrackState.LOST:

@@ -14,11 +14,13 @@ from pathlib import Path
 from typing import Literal, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 
 from geogs.config import InputConfig
+from geogs.documents import expanded
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
+from geogs.io.pictures import read_mask
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.depth_files import DepthFile, RectifiedDepth
 from geogs.io.sources.intrinsics import resolve_intrinsics
@@ -108,6 +110,15 @@ class Reader(Protocol):
         ...
 
 
+@runtime_checkable
+class NeverWaits(Protocol):
+    """A reader whose frames do not wait until they are asked for."""
+
+    is_live: Literal[True]
+    dropped: int
+    """Frames of the present reading that came too fast."""
+
+
 class Source:
     """Frames at working resolution, undistorted, in time order; can be iterated repeatedly.
 
@@ -145,12 +156,23 @@ class Source:
         """By which rows are rectified."""
         self._rectifier = Rectifier(self.calibration, config.long_edge, config.field_of_view)
         check_large_enough(self._rectifier.camera, reader.name)
+        self.mask = self._working_mask()
+        """Pixels of every frame that may show the scene; none where all do."""
         self.skipped = 0
         """Images that could not be read or are of another size, so far in this iteration."""
         self.damaged = 0
         """Images of which a part is damaged, so far in this iteration."""
         self.place = ReadingPlace()
         """How far the source has been read, at each frame of this iteration."""
+
+    def _working_mask(self) -> Bool[np.ndarray, "h w"] | None:
+        """The mask of the settings, straightened as the images are."""
+        if self._config.mask is None:
+            return None
+        reader = self._reader
+        shown = read_mask(expanded(self._config.mask), (reader.height, reader.width))
+        grey = np.repeat(np.where(shown, np.uint8(255), np.uint8(0))[..., None], 3, 2)
+        return self._rectifier(grey)[..., 0] > 127
 
     @property
     def name(self) -> str:
@@ -184,8 +206,20 @@ class Source:
         return Source(self._reader, self._config, fitted, self.shutter)
 
     @property
+    def is_live(self) -> bool:
+        """Whether frames do not wait until they are asked for."""
+        return isinstance(self._reader, NeverWaits)
+
+    @property
+    def dropped(self) -> int:
+        """Frames of a live source that came too fast to be used, so far in this iteration."""
+        return self._reader.dropped if isinstance(self._reader, NeverWaits) else 0
+
+    @property
     def is_shutter_open(self) -> bool:
-        """Whether nobody has said yet how long the readout takes."""
+        """Whether nobody has said yet how long the readout takes, and the frames can be asked."""
+        if self.is_live:
+            return False
         return self._config.readout == "auto" and self.shutter == Shutter()
 
     def with_shutter(self, shutter: Shutter) -> "Source":
@@ -273,7 +307,8 @@ class Source:
         """Yield the frames after a place; otherwise as the iteration over all."""
         self.place, self.skipped, index = place, place.skipped, place.frames
         self.damaged = place.damaged
-        for raw in read_ahead(self._working(place.frames + place.skipped)):
+        working = self._working(place.frames + place.skipped)
+        for raw in working if self.is_live else read_ahead(working):
             if raw.image is None:
                 self.skipped += 1
                 if self.skipped == 1:

@@ -3,6 +3,9 @@
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+from jaxtyping import Bool
+
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.io.sources.base import RawFrame, ReadingPlace, Source
@@ -103,6 +106,21 @@ class SeveralSources:
     def shutter(self) -> Shutter:
         """By which rows are rectified."""
         return self._sources[0].shutter
+
+    @property
+    def mask(self) -> Bool[np.ndarray, "h w"] | None:
+        """Pixels of every frame that may show the scene; none where all do."""
+        return self._sources[0].mask
+
+    @property
+    def is_live(self) -> bool:
+        """Never: what does not wait is read alone."""
+        return False
+
+    @property
+    def dropped(self) -> int:
+        """None."""
+        return 0
 
     @property
     def is_shutter_open(self) -> bool:

@@ -7,6 +7,7 @@ from typing import overload
 from geogs.config import InputConfig
 from geogs.documents import expanded
 from geogs.errors import InputError
+from geogs.io.sources.address import LiveAddress, live_address
 from geogs.io.sources.base import Reader, Source
 from geogs.io.sources.images import SUFFIXES, open_image_folder
 from geogs.io.sources.replica import is_replica, open_replica
@@ -30,6 +31,8 @@ def open_source(
     """Open a video, a folder of images, a bag of ROS, or a Replica, TUM RGB-D or 7-Scenes sequence.
 
     The format follows from the content. Ground truth that lies beside the images is not read.
+    ``camera:0``, an URL such as ``rtsp://…``, ``-`` (raw frames from standard input) and
+    ``play:FILE`` (a file at its pace) do not wait: of their frames the newest is given each time.
 
     Args:
         path: the file or folder; several of one place, by one camera, become one stream.
@@ -40,11 +43,26 @@ def open_source(
     """
     if isinstance(path, str | Path):
         config = config or InputConfig()
+        address = live_address(path)
+        if address is not None:
+            return Source(_live_reader(address, config), config)
         return Source(_reader(expanded(path), config.topic), config)
     if not path:
         raise InputError("Nothing to read; give a video or a folder of images.")
+    if len(path) > 1 and any(live_address(one) is not None for one in path):
+        raise InputError(
+            "A camera, a stream or a pipe is read alone; give no other source with it."
+        )
     sources = [open_source(one, config) for one in path]
     return sources[0] if len(sources) == 1 else SeveralSources(sources)
+
+
+def _live_reader(address: LiveAddress, config: InputConfig) -> Reader:
+    from geogs.io.sources.live.open import open_live  # loads OpenCV
+
+    is_played = address.kind == "play"
+    played = _reader(expanded(address.target), config.topic) if is_played else None
+    return open_live(address, config.pipe, played)
 
 
 def _reader(path: Path, topic: str) -> Reader:

@@ -5,7 +5,9 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import cv2
+import numpy as np
 import torch
+from jaxtyping import Bool
 
 from geogs.config import CalibrationConfig, TrackingConfig
 from geogs.geometry.camera import Camera
@@ -16,6 +18,7 @@ from geogs.tracking.calibration.growth import GrowingBundle
 from geogs.tracking.calibration.keyframes import View, ViewGatherer, flows_from_first
 from geogs.tracking.calibration.start import Start, candidates, try_candidate
 from geogs.tracking.flow.base import FlowMatch, FlowOperator
+from geogs.tracking.flow.masked import MaskedFlow
 from geogs.tracking.flow.select import build_operator
 from geogs.types import Frame
 
@@ -61,16 +64,19 @@ def self_calibrate(
     device: torch.device | str = "cpu",
     seed: int = 0,
     report: Report = lambda fraction: None,
+    mask: Bool[np.ndarray, "h w"] | None = None,
 ) -> SelfCalibration:
     """Estimate the focal length, and k1 if ``config.radial``, of the camera that took ``frames``.
 
     Aspect and principal point of ``camera`` are believed, its focal length is only one of several
     to start from. Flow is measured by the operator without a network. ``report`` is called with
-    the fraction done; what it raises passes through.
+    the fraction done; what it raises passes through. Outside a ``mask`` nothing is matched.
     """
     cv2.setRNGSeed(seed)
     grid = SampleGrid(camera, device)
     operator = build_operator(TrackingConfig(operator="classical"), grid)
+    if mask is not None:
+        operator = MaskedFlow(operator, grid, mask)
     edge = max(camera.width, camera.height)
     gatherer = ViewGatherer(iter(frames), grid, operator, config.keyframe_flow * edge)
     search = _Search(grid, operator, gatherer, config, report)

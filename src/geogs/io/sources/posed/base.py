@@ -10,10 +10,11 @@ from jaxtyping import Bool, Float64, UInt8
 from geogs.config import InputConfig
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
+from geogs.io.pictures import read_mask
 from geogs.io.sources.base import check_large_enough, fingerprint_of, read_ahead
 from geogs.io.sources.posed.files import PosedSet, SparsePoints, Sphere, without_invalid_poses
 from geogs.io.sources.posed.one_camera import OneCamera
-from geogs.io.sources.posed.pictures import read_mask, read_picture, stored_size
+from geogs.io.sources.posed.pictures import read_picture, stored_size
 
 _log = logging.getLogger(__name__)
 

@@ -1,0 +1,48 @@
+"""What is no file: a camera, a stream in the network, a pipe, a file that plays at its pace."""
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+_NETWORK = re.compile(r"(rtsps?|rtmps?|https?|udp|tcp):/{1,2}(?=[^/])(.+)", re.DOTALL)
+_CAMERA = re.compile(r"camera:(\d{1,3})")
+_PLAY = re.compile(r"play:(.+)", re.DOTALL)
+
+
+@dataclass(frozen=True)
+class LiveAddress:
+    """Where frames come from that do not wait."""
+
+    kind: Literal["camera", "stream", "pipe", "play"]
+    target: str
+    """Number of the camera, URL, path of the file; empty for the pipe."""
+
+    @property
+    def name(self) -> str:
+        """To call it in messages and folders: without what an URL says of users and passwords."""
+        if self.kind == "camera":
+            return f"camera-{self.target}"
+        if self.kind == "play":
+            return f"{Path(self.target).name} (played)"
+        if self.kind == "pipe":
+            return "pipe"
+        host = re.split(r"[/?#]", self.target.split("://", 1)[1], maxsplit=1)[0]
+        return f"stream-{re.sub(r'[^A-Za-z0-9.-]', '-', host.rsplit('@', 1)[-1])}"
+
+
+def live_address(source: str | Path) -> LiveAddress | None:
+    """What ``camera:0``, ``rtsp://…``, ``-`` or ``play:FILE`` name; none where it is a path.
+
+    A path made of an URL has lost one of its slashes, which counts as there.
+    """
+    words = str(source)
+    if words == "-":
+        return LiveAddress("pipe", "")
+    if found := _CAMERA.fullmatch(words):
+        return LiveAddress("camera", str(int(found[1])))
+    if found := _NETWORK.fullmatch(words):
+        return LiveAddress("stream", f"{found[1]}://{found[2]}")
+    if found := _PLAY.fullmatch(words):
+        return LiveAddress("play", found[1])
+    return None

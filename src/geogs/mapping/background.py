@@ -1,0 +1,205 @@
+"""Mapping in a thread of its own, so that tracking never waits for it."""
+
+import copy
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from typing import TypeVar
+
+import numpy as np
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
+from geogs.errors import GeogsError
+from geogs.keyframes.keyframe import Keyframe
+from geogs.keyframes.store import KeyframeStore
+from geogs.mapping.mapper import Mapper
+from geogs.types import PoseCorrection
+
+R = TypeVar("R")
+
+SWITCH_SECONDS = 0.0005
+"""After which a thread that computes in Python lets another go on, while tracking and mapping share
+the interpreter; Python's own 5 ms, several times a frame, would be felt."""
+
+
+class BackgroundMapper:
+    """What a mapper is told, done later by a thread, in the order in which it was told.
+
+    The thread's mapper has keyframes of its own: copies of the store's, which are brought up to
+    date with each thing it is told, to what they were at that time. So neither sees the other in
+    the middle of its work, and tracking only ever pays for the copying of references. Poses that a
+    mapper would refine stay the tracker's. On a GPU the thread has a stream of its own, which gives
+    way to the tracker's if that has a higher priority.
+    """
+
+    def __init__(
+        self, keyframes: KeyframeStore, new_mapper: Callable[[KeyframeStore], Mapper]
+    ) -> None:
+        """``new_mapper`` makes the mapper of a store."""
+        self._store = keyframes
+        device = torch.device(keyframes.grid.device)
+        self._stream = torch.cuda.Stream(device) if device.type == "cuda" else None
+        self._mirror = KeyframeStore(keyframes.grid, None, keyframes.resident)
+        self._copies = self._mirror.new_segment()
+        self._mapper = new_mapper(self._mirror)
+        self._handed: dict[int, tuple[object, ...]] = {}
+        """Of each keyframe that was handed over, what it was then."""
+        self._tasks: deque[Callable[[], None]] = deque()
+        self._news = threading.Condition()
+        self._is_closed = False
+        self._failure: BaseException | None = None
+        self.disks = 0
+        """In the map when a keyframe was last finished."""
+        self.seconds = 0.0
+        """Spent by the thread."""
+        self._interval = sys.getswitchinterval()
+        sys.setswitchinterval(min(SWITCH_SECONDS, self._interval))
+        self._thread = threading.Thread(target=self._work, name="mapping", daemon=True)
+        self._thread.start()
+
+    @property
+    def waiting(self) -> int:
+        """Things that it was told and has not done yet."""
+        return len(self._tasks)
+
+    # --- what tracking tells ---------------------------------------------------------------
+
+    def observe(self, id: int, mask: Bool[np.ndarray, "h w"] | None = None) -> None:
+        """See ``Mapper.observe``."""
+        self._handed[id] = ()
+        self._tell(lambda mapper: mapper.observe(id, mask))
+
+    def map_keyframe(self, id: int) -> None:
+        """See ``Mapper.map_keyframe``."""
+        self._tell(lambda mapper: mapper.map_keyframe(id))
+
+    def correct(self, correction: PoseCorrection) -> None:
+        """See ``Mapper.correct``."""
+        self._tell(lambda mapper: mapper.correct(correction))
+
+    def begin_with(self, take_over: Callable[[Mapper], object], ids: Sequence[int]) -> None:
+        """Let the mapper take over a saved map, whose keyframes have these ids."""
+        self._handed |= dict.fromkeys(ids, ())
+        self._tell(take_over)
+
+    def ask(self, question: Callable[[Mapper], R]) -> R:
+        """An answer from the mapper as it is between two things that it was told.
+
+        Waits for what is under way, and for nothing else that it was told before.
+        """
+        answers: list[R] = []
+        done = threading.Event()
+
+        def answer() -> None:
+            try:
+                answers.append(question(self._mapper))
+                self._wait_for_gpu()
+            finally:
+                done.set()
+
+        with self._news:
+            self._raise()
+            self._tasks.appendleft(answer)
+            self._news.notify()
+        while not done.wait(0.1):
+            self._raise()
+        self._raise()
+        return answers[0]
+
+    def settled(self) -> Mapper:
+        """The mapper after all that it was told, on the keyframes of the store; the thread ends."""
+        with self._news:
+            self._is_closed = True
+            self._news.notify()
+        self._thread.join()
+        sys.setswitchinterval(self._interval)
+        self._raise()
+        self._mapper.move_to(self._store)
+        return self._mapper
+
+    # --- the hand-over ---------------------------------------------------------------------
+
+    def _tell(self, what: Callable[[Mapper], object]) -> None:
+        changed, event = self._changed(), None
+        if self._stream is not None:
+            event = torch.cuda.Event()
+            event.record()
+
+        def task() -> None:
+            self._take(changed, event)
+            what(self._mapper)
+            self.disks = len(self._mapper.map)
+
+        with self._news:
+            self._raise()
+            self._tasks.append(task)
+            self._news.notify()
+
+    def _changed(self) -> list[Keyframe]:
+        """Copies of the keyframes that are not what they were when they were last handed over."""
+        changed = []
+        for id, before in self._handed.items():
+            keyframe = self._store[id]
+            now = _parts(keyframe)
+            if len(before) != len(now) or any(a is not b for a, b in zip(now, before, strict=True)):
+                self._handed[id] = now
+                twin = copy.copy(keyframe)
+                twin.prior = copy.copy(keyframe.prior)
+                changed.append(twin)
+        return changed
+
+    def _take(self, changed: Sequence[Keyframe], event: torch.cuda.Event | None) -> None:
+        """Bring the thread's keyframes up to date: their fields are replaced, never changed."""
+        if self._stream is not None and event is not None:
+            self._stream.wait_event(event)
+        for keyframe in changed:
+            if keyframe.id in self._copies:
+                vars(self._copies[keyframe.id]).update(vars(keyframe))
+            else:
+                self._copies.put(keyframe)
+            for value in vars(keyframe).values():
+                if self._stream is not None and isinstance(value, Tensor) and value.is_cuda:
+                    value.record_stream(self._stream)
+
+    # --- the thread ------------------------------------------------------------------------
+
+    def _work(self) -> None:
+        torch.set_num_threads(1)
+        with torch.cuda.stream(self._stream):
+            while (task := self._next()) is not None:
+                start = time.perf_counter()
+                try:
+                    task()
+                except BaseException as error:
+                    self._failure = error
+                    self._tasks.clear()
+                    return
+                self.seconds += time.perf_counter() - start
+            self._wait_for_gpu()
+
+    def _next(self) -> Callable[[], None] | None:
+        with self._news:
+            while not self._tasks and not self._is_closed:
+                self._news.wait()
+            return self._tasks.popleft() if self._tasks else None
+
+    def _wait_for_gpu(self) -> None:
+        if self._stream is not None:
+            self._stream.synchronize()
+
+    def _raise(self) -> None:
+        """What ended the thread, if anything did."""
+        if isinstance(self._failure, GeogsError | torch.cuda.OutOfMemoryError):
+            raise self._failure
+        if self._failure is not None:
+            raise RuntimeError("mapping failed in its thread") from self._failure
+
+
+def _parts(keyframe: Keyframe) -> tuple[object, ...]:
+    """All of a keyframe that is ever replaced."""
+    k = keyframe
+    return k.T_cw, k.inverse_depth, k.information, k.prior, k.scale, k.moving

@@ -1,0 +1,65 @@
+"""Keyframes of a saved map, at which a camera can be found again: placed once, never moved."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from geogs.bundle.select import grid_fields
+from geogs.errors import InputError
+from geogs.keyframes.grid import SampleGrid
+from geogs.keyframes.store import Segment
+from geogs.types import RenderedKeyframe
+
+DEVIATION = 0.01
+"""Relative deviation of a depth that a map shows, where it is sure."""
+ONE_SURFACE = 1.1
+"""Ratio up to which the depths of four neighbouring pixels count as those of one surface."""
+
+
+def add_held(keyframes: Segment, place: RenderedKeyframe, frame_index: int) -> int:
+    """Add a keyframe with the depth of a saved map to a segment; returns its id.
+
+    Raises:
+        InputError: it has no image, or one of another camera.
+    """
+    grid, store = keyframes.grid, keyframes.store
+    if place.image is None:
+        raise InputError("The map was saved without the images of its keyframes.")
+    height, width = place.image.shape[:2]
+    if (width, height) != (grid.camera.width, grid.camera.height):
+        raise InputError(
+            f"The images of the map are {width} x {height} pixels, those of the video "
+            f"{grid.camera.width} x {grid.camera.height}; both have to be of one camera."
+        )
+    encoded = None if store.pictures.encode is None else store.pictures.encode(place.image)
+    keyframe = keyframes.add(frame_index, place.timestamp, place.image, encoded, place.T_cw)
+    inverse_depth, sure = depth_on_grid(grid, place)
+    information = sure / (DEVIATION * inverse_depth.clamp(min=1e-6)).square() * (sure > 0)
+    filled = grid_fields(grid).fill(inverse_depth[None], information[None])[0]
+    keyframe.inverse_depth, keyframe.information = filled.clone(), information
+    return keyframe.id
+
+
+def depth_on_grid(
+    grid: SampleGrid, place: RenderedKeyframe
+) -> tuple[Float[Tensor, "p"], Float[Tensor, "p"]]:
+    """Inverse depth of the cells, and how far it is to be trusted; both 0 where it is not known.
+
+    Inverse depth is linear over the image of a plane, so it is interpolated; not across an edge.
+    """
+    height, width = place.depth.shape
+    size = grid.pixels.new_tensor([width, height])
+    own = grid.pixels.new_tensor([grid.camera.width, grid.camera.height])
+    at = (grid.pixels + 0.5) * size / own - 0.5
+    low = at.floor().clamp(min=0).minimum(size - 2)
+    share = (at - low).clamp(0, 1)
+    x, y = low.long().unbind(-1)
+    depth, weight = place.depth.to(grid.device), place.weight.to(grid.device)
+    corners = [(x, y), (x + 1, y), (x, y + 1), (x + 1, y + 1)]
+    z = torch.stack([depth[v, u] for u, v in corners], -1)
+    trust = torch.stack([weight[v, u] for u, v in corners], -1).amin(-1)
+    known = (z > 0).all(-1) & (z.amax(-1) <= ONE_SURFACE * z.amin(-1))
+    (a, b), (c, d) = (1 - share).unbind(-1), share.unbind(-1)
+    part = torch.stack([a * b, c * b, a * d, c * d], -1)
+    inverse = (part / z.clamp(min=1e-9)).sum(-1)
+    return torch.where(known, inverse, 0.0).float(), torch.where(known, trust, 0.0).float()
