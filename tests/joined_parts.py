@@ -72,10 +72,10 @@ def seen(T_wc: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.n
     return depth, 2 * axis + (sign > 0), place
 
 
-def image(T_wc: np.ndarray, paint: list[np.ndarray]) -> np.ndarray:
+def image(T_wc: np.ndarray, paint: list[np.ndarray], camera: Camera = CAMERA) -> np.ndarray:
     """What the camera takes."""
-    _, wall, place = seen(T_wc, CAMERA)
-    shown = np.zeros((CAMERA.height, CAMERA.width, 3), np.uint8)
+    _, wall, place = seen(T_wc, camera)
+    shown = np.zeros((camera.height, camera.width, 3), np.uint8)
     for n, picture in enumerate(paint):
         u, v = (511 * place).astype(np.float32).transpose(2, 0, 1)
         shown[wall == n] = cv2.remap(picture, u, v, cv2.INTER_LINEAR)[wall == n]

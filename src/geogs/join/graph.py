@@ -14,7 +14,7 @@ from geogs.join.part import PartViews
 from geogs.loop.constraints import joined
 from geogs.loop.pose_graph import PoseGraph, RelativePoses, solve
 
-STEP = 3e-4
+STEP = 1e-3
 """What a part's own adjustment leaves open between two keyframes near each other: radians, parts of
 the depth, and of the scale."""
 STEPS = (1, 2, 4)
@@ -46,23 +46,24 @@ def placed(parts: Sequence[PartViews], gauge: Gauge) -> dict[int, Placement]:
     The first keyframe of the first part stays where it is.
     """
     numbers = gauge.parts
-    first = dict(zip(numbers, np.cumsum([0, *(len(parts[n].T_cw) for n in numbers)]), strict=False))
+    counts = [len(parts[n].T_cw) for n in numbers]
+    first = {n: sum(counts[:place]) for place, n in enumerate(numbers)}
     start = torch.cat([torch.from_numpy(parts[n].T_cw) @ gauge.world[n] for n in numbers])
-    ties = [_stiff(parts[n], int(first[n])) for n in numbers]
+    ties = [_stiff(parts[n], first[n]) for n in numbers]
     relative = joined([*ties, *_linked(gauge, first)])
     fixed = torch.arange(len(start)) == 0
     S = solve(PoseGraph(start, relative, fixed)).S
     scale = sim3_scale(S)
     after = S / scale[:, None, None]
     after[:, 3] = S[:, 3]
-    ends = {n: int(first[n]) + len(parts[n].T_cw) for n in numbers}
-    return {n: Placement(*(x[int(first[n]) : ends[n]] for x in (after, scale))) for n in numbers}
+    ends = {n: first[n] + len(parts[n].T_cw) for n in numbers}
+    return {n: Placement(*(x[first[n] : ends[n]] for x in (after, scale))) for n in numbers}
 
 
 def _linked(gauge: Gauge, first: Mapping[int, int]) -> list[RelativePoses]:
     found = []
     for link in gauge.links:
-        ends = torch.tensor([int(first[p]) + n for p, n in (link.first, link.second)])
+        ends = torch.tensor([first[p] + n for p, n in (link.first, link.second)])
         r = link.relative
         loops = torch.ones_like(r.is_loop)
         found.append(RelativePoses(ends[r.source], ends[r.target], r.G, r.information, loops))

@@ -1,12 +1,13 @@
 """Who does the jobs of a join: this process, or others."""
 
 from collections.abc import Callable, Sequence
-from typing import Protocol, TypeVar
+from typing import Protocol, TypeVar, runtime_checkable
 
 J = TypeVar("J")
 R = TypeVar("R")
 
 
+@runtime_checkable
 class Workers(Protocol):
     """Does jobs that do not depend on each other."""
 
