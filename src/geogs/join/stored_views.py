@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float64
+from jaxtyping import Float, Float64
+from torch import Tensor
 
 from geogs.application.saved_result import load_result
 from geogs.geometry.camera import Camera
@@ -30,7 +31,12 @@ class StoredView:
         with np.load(self.file, allow_pickle=False) as file:
             depth, weight = torch.from_numpy(file["depth"]), torch.from_numpy(file["weight"])
         image = read_image(self.image) if with_image else None
-        return DepthMapView(depth, weight.float(), self.camera, torch.from_numpy(self.T_cw), image)
+        return DepthMapView(depth, weight.float(), self.camera, self.pose, image)
+
+    @property
+    def pose(self) -> Float[Tensor, "4 4"]:
+        """World to camera; a copy, as what Ray brings cannot be written."""
+        return torch.tensor(self.T_cw)
 
 
 def loaded(views: Sequence[StoredView], with_images: bool = False) -> Sequence[DepthMapView]:

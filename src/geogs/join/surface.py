@@ -73,7 +73,7 @@ def box_surface(job: BoxJob) -> MeshBlock:
 
 def colours_of(job: ColourJob) -> UInt8[np.ndarray, "n 3"]:
     """Colours of some points."""
-    mesh = Mesh(job.points, _NO_FACES, job.normals)
+    mesh = Mesh(job.points.copy(), _NO_FACES, job.normals.copy())  # what Ray brings is read-only
     colours = colour_mesh(mesh, loaded(job.views, True), job.tolerance).colours
     assert colours is not None
     return colours
@@ -149,4 +149,4 @@ def coloured(
 
 
 def _sees(view: StoredView, plan: VolumePlan, box: BlockBox) -> bool:
-    return sees_box(view.camera, torch.from_numpy(view.T_cw), plan, box)
+    return sees_box(view.camera, view.pose, plan, box)
