@@ -40,6 +40,8 @@ def test_a_part_is_described_by_the_depths_that_its_map_shows(tmp_path):
     features = FeatureExtractor(Config().loop.retrieval)(image(pose(0.0), walls(0)))
     assert len(views.features[0]) == pytest.approx(len(features), rel=0.2)  # JPEG
     assert views.features[1].descriptors.shape == (len(views.features[1]), 32)
+    assert views.outline().median_depth == pytest.approx(views.median_depth)
+    assert views.outline().inverse_depth.nbytes < views.inverse_depth.nbytes / 100
 
 
 def test_results_that_cannot_be_joined_are_refused(tmp_path):

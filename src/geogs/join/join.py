@@ -83,8 +83,8 @@ class _Join:
         yield
         self.seconds[name] = round(time.perf_counter() - begin, 3)
 
-    def links(self, views: Sequence[PartViews]) -> list[Link]:
-        jobs = []
+    def links(self) -> list[Link]:
+        jobs, views = [], map(PartViews.load, self.files)  # one at a time
         for (a, b), pairs in candidates(views, self.config.loop).items():
             for start in range(0, len(pairs), _PAIRS):
                 jobs.append(
@@ -192,9 +192,9 @@ def _joined(join: _Join, adjust: bool, say: Callable[[str], None], begin: float)
         ]
         keyframes = sum(join.workers.map("describing", describe, described))
     say(f"{len(parts)} parts, {keyframes} keyframes.")
-    views = [PartViews.load(file) for file in join.files]
+    views = [PartViews.load(file).outline() for file in join.files]
     with join.timed("linking"):
-        links = join.links(views)
+        links = join.links()
         gauge = common_gauge(views, links, config.loop)
     if len(gauge.world) < 2:
         raise InputError(

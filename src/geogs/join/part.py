@@ -52,6 +52,12 @@ class PartViews:
         """Of each keyframe."""
         return 1 / np.median(self.inverse_depth, axis=1).astype(np.float64)
 
+    def outline(self) -> "PartViews":
+        """The same with one depth a keyframe and no features: so little that all parts fit into one
+        memory."""
+        middle = np.median(self.inverse_depth, axis=1, keepdims=True)
+        return PartViews(self.T_cw, self.timestamp, middle, 0 * middle, ())
+
     def save(self, path: Path) -> None:
         """Write all to a file."""
         counts = np.array([len(f) for f in self.features], np.int64)
