@@ -26,6 +26,8 @@ from geogs.tracking.flow.select import build_operator
 from geogs.tracking.graph import FrameGraph
 from geogs.tracking.proximity import Pair, proximity_pairs
 
+SWEEPS = 2
+"""Times that every part is adjusted; the first brings most."""
 ROUNDS = 2
 """Measurements of each pair, from poses that become better."""
 
@@ -72,7 +74,7 @@ def adjusted(
     def seen(n: int) -> Neighbour:
         return Neighbour(parts[n], files[n], now[n])
 
-    for colour in _colours(beside):
+    for colour in SWEEPS * _colours(beside):
         jobs = [
             AdjustJob(seen(n), tuple(seen(m) for m in sorted(beside[n])), camera, config)
             for n in colour
