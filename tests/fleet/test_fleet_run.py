@@ -90,7 +90,7 @@ def test_limits_end_what_takes_too_long_or_too_much(cluster, tmp_path):
 
 def test_what_a_lost_node_computed_is_gone_on_with_elsewhere(cluster, tmp_path):
     node = add_node(cluster)
-    given = sources(tmp_path / "clips", **{f"s{i}": "steps 12" for i in range(4)})
+    given = sources(tmp_path / "clips", **{f"s{i}": "steps 30" for i in range(4)})
     out = tmp_path / "out"
 
     def remove_when_under_way() -> None:
@@ -105,7 +105,7 @@ def test_what_a_lost_node_computed_is_gone_on_with_elsewhere(cluster, tmp_path):
     assert [row.state for row in result.rows] == ["done"] * 4
     assert 2 in {row.attempts for row in result.rows}
     for i in range(4):  # no step is lost, and none is done twice
-        assert (out / f"s{i}" / "steps").read_text().split() == list(map(str, range(12)))
+        assert (out / f"s{i}" / "steps").read_text().split() == list(map(str, range(30)))
 
 
 def test_many_small_ones_cost_little_each(cluster, tmp_path):
