@@ -2,6 +2,7 @@
 
 import sys
 import uuid
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -32,6 +33,17 @@ def test_results_here_have_their_row_last(tmp_path):
     row = attempt(job(str(tmp_path / "clip.mp4"), str(tmp_path / "out")))
     assert (row.state, row.sentence, row.is_reliable) == ("done", "Good: ok.", True)
     assert read_row((tmp_path / "out" / FILE).read_text()) == row
+
+
+def test_two_attempts_at_a_time_leave_one_result(tmp_path):
+    (tmp_path / "clip.mp4").write_text("steps 3")  # a node that was thought to be lost works on
+    both = [job(str(tmp_path / "clip.mp4"), str(tmp_path / "out")) for _ in range(2)]
+    with ThreadPoolExecutor(2) as pool:
+        rows = list(pool.map(attempt, both))
+    assert [row.state for row in rows] == ["done", "done"]
+    left = read_row((tmp_path / "out" / FILE).read_text())
+    assert left is not None
+    assert (left.state, left.numbers) == ("done", rows[0].numbers)
 
 
 def test_source_and_results_may_be_elsewhere(tmp_path):

@@ -7,6 +7,7 @@ import time
 from pathlib import Path
 
 import pytest
+from cluster_nodes import add_node, simulated_cluster
 
 from geogs.errors import InputError
 from geogs.fleet.progress import FleetProgress
@@ -23,17 +24,9 @@ FAKE = (sys.executable, str(Path(__file__).with_name("fake_child.py")))
 
 @pytest.fixture(scope="module")
 def cluster():
-    """A head and two more nodes, each with two cores, in one machine."""
-    from ray.cluster_utils import Cluster
-
-    made = Cluster(
-        initialize_head=True,
-        head_node_args={"num_cpus": 2, "object_store_memory": 80 << 20, "include_dashboard": False},
-    )
-    ray.init(address=made.address, log_to_driver=False, logging_level="ERROR")
-    yield made
-    ray.shutdown()
-    made.shutdown()
+    """A head with two cores; tests add nodes."""
+    with simulated_cluster() as made:
+        yield made
 
 
 def sources(folder: Path, **texts: str) -> Path:
@@ -96,7 +89,7 @@ def test_limits_end_what_takes_too_long_or_too_much(cluster, tmp_path):
 
 
 def test_what_a_lost_node_computed_is_gone_on_with_elsewhere(cluster, tmp_path):
-    node = cluster.add_node(num_cpus=2, object_store_memory=80 << 20)
+    node = add_node(cluster)
     given = sources(tmp_path / "clips", **{f"s{i}": "steps 30" for i in range(4)})
     out = tmp_path / "out"
 
@@ -116,7 +109,7 @@ def test_what_a_lost_node_computed_is_gone_on_with_elsewhere(cluster, tmp_path):
 
 
 def test_many_small_ones_cost_little_each(cluster, tmp_path):
-    given = sources(tmp_path / "clips", **{f"s{i}": "ok" for i in range(40)})
+    given = sources(tmp_path / "clips", **{f"s{i}": "ok" for i in range(10)})
     heard = []
 
     class Listener(FleetProgress):
@@ -125,7 +118,7 @@ def test_many_small_ones_cost_little_each(cluster, tmp_path):
 
     result = fleet(given, tmp_path / "out", progress=Listener())
     assert all(row.state == "done" for row in result.rows)
-    assert [left for left, _ in heard] == list(range(39, -1, -1))
+    assert [left for left, _ in heard] == list(range(9, -1, -1))
     assert heard[-1][1] == 0
 
 

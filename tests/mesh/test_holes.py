@@ -8,6 +8,7 @@ from geogs.config import MeshConfig
 from geogs.geometry.camera import Camera
 from geogs.mesh.clean import keep_faces
 from geogs.mesh.extract import extract_mesh
+from geogs.mesh.free_space import FreeSpace
 from geogs.mesh.holes import border_loops, close_holes
 from geogs.mesh.tsdf import BLOCK, SparseTsdf
 from geogs.mesh.types import DepthMapView, Mesh
@@ -73,26 +74,27 @@ def test_what_is_free_and_what_folds_over_stays_open():
     assert len(close_holes(lone, 16, never).faces) == 1  # its outer border runs the other way
 
 
-def test_the_voxel_nearest_to_a_point_is_looked_up():
+def test_what_is_free_is_asked_of_the_voxel_nearest_to_a_point():
     tsdf = SparseTsdf(0.1, 4.0)
     camera = Camera(40.0, 40.0, 19.5, 14.5, 40, 30)
     depth = torch.full((30, 40), 2.0)
     tsdf.integrate(depth, torch.ones(30, 40), camera, torch.eye(4, dtype=torch.float64))
     random = np.random.default_rng(0)
-    points = torch.from_numpy(random.uniform([-1, -1, 1.4], [1, 1, 2.5], (200, 3)))
-    distance, weight = tsdf.nearest(points)
-    for point, d, w in zip(points, distance, weight, strict=True):
-        voxel = torch.round(point / 0.1).long()
-        block = torch.div(voxel, BLOCK, rounding_mode="floor")
-        slot = (tsdf.coordinates == block).all(-1).nonzero()[:, 0]
+    points = random.uniform([-1, -1, 1.2], [1, 1, 2.5], (200, 3))
+    free, expected = FreeSpace.of(tsdf, 0.9), []
+    for point in points:
+        voxel = np.rint(point / 0.1).astype(int)
+        block = voxel // BLOCK
+        slot = (tsdf.coordinates.numpy() == block).all(-1).nonzero()[0]
         place = tuple((voxel - BLOCK * block).tolist())
-        expected = (1.0, 0.0)
-        if len(slot):
-            expected = (float(tsdf.distance[slot[0]][place]), float(tsdf.weight[slot[0]][place]))
-        assert (float(d), float(w)) == expected
-    assert float((weight > 0).float().mean()) > 0.2
-    far = tsdf.nearest(torch.tensor([[1e9, 0.0, 0.0]]))
-    assert (float(far[0]), float(far[1])) == (1.0, 0.0)
+        expected.append(
+            bool(len(slot))
+            and float(tsdf.weight[slot[0]][place]) >= 0.9
+            and float(tsdf.distance[slot[0]][place]) > 0.5
+        )
+    assert free(points).tolist() == expected
+    assert 0.03 < np.mean(expected) < 0.97
+    assert not free(np.array([[1e9, 0.0, 0.0]]))[0]
 
 
 @pytest.mark.parametrize("looked_through", [False, True])

@@ -160,7 +160,7 @@ def test_box_from_inside_spans_chunks_without_seams(monkeypatch):
     inwards = -(face_normals(mesh) * mesh.vertices[mesh.faces].mean(1)).sum(1)
     assert (inwards > 0).mean() > 0.9999  # no back faces
     assert len(np.unique(mesh.vertices, axis=0)) == len(mesh.vertices)
-    monkeypatch.setattr(surface, "_CHUNK_BLOCKS", 64)  # all in one piece, of course without seams
+    monkeypatch.setattr(surface, "CHUNK", 64)  # all in one piece, of course without seams
     whole = extract_surface(tsdf, min_weight=1.0)
     assert np.array_equal(by_position(mesh), by_position(whole))
 

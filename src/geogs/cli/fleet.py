@@ -1,4 +1,4 @@
-"""``geogs fleet run SOURCES``: many videos, each a run of its own, on Ray."""
+"""``geogs fleet run`` and ``geogs fleet join``: many videos, one by one or to one place, on Ray."""
 
 import time
 from collections.abc import Sequence
@@ -9,6 +9,7 @@ from geogs.cli.options import Given, parse_options, record
 from geogs.config import Preset, preset
 from geogs.config.setting import Basic
 from geogs.errors import InputError
+from geogs.fleet.join import JoinSettings
 from geogs.fleet.settings import FleetSettings
 
 EXIT_FAILED = 1
@@ -29,12 +30,31 @@ class FleetOptions(FleetSettings):
     """Say nothing but errors."""
 
 
+@dataclass(frozen=True)
+class JoinOptions(JoinSettings):
+    """Make one place of many videos that overlap: geogs fleet join a.mp4 b.mp4 c.mp4.
+
+    Each is run by itself, on one machine or many; where keyframes of two show the same, they are
+    joined. Needs pip install 'geogs[fleet]' (Ray) on every machine.
+    """
+
+    preset: Preset = "default"
+    """Group of settings; single ones given beside it win."""
+    quiet: Annotated[bool, Basic("-q")] = False
+    """Say nothing but errors."""
+
+
 def main(argv: Sequence[str]) -> int:
-    """Run the command; returns 0, or 1 where a source failed: the table says which."""
+    """Run the command; returns 0, or 1 where a source failed or a part stays apart."""
     words = list(argv)
+    if words and words[0] == "join":
+        return _join(words[1:])
     if words and not words[0].startswith("-"):
         if words[0] != "run":
-            raise InputError(f"geogs fleet cannot {words[0]}; it can run: geogs fleet run SOURCES.")
+            raise InputError(
+                f"geogs fleet cannot {words[0]}; it can run: geogs fleet run SOURCES, and join: "
+                "geogs fleet join PARTS."
+            )
         words = words[1:]
     options = parse(words)
 
@@ -50,6 +70,19 @@ def main(argv: Sequence[str]) -> int:
     return EXIT_FAILED if any(row.state != "done" for row in result.rows) else 0
 
 
+def _join(words: Sequence[str]) -> int:
+    options = parse_options(JoinOptions, words, "fleet join", _join_defaults)
+
+    from geogs.fleet.join import run_join
+    from geogs.fleet.terminal import TerminalFleet
+
+    progress = TerminalFleet(options.quiet)
+    joint = run_join(record(JoinSettings, options), progress, progress.say)
+    if not options.quiet:
+        print(f"{joint.sentence}\nOpen {joint.output}/report/index.html in a browser.")
+    return EXIT_FAILED if joint.apart else 0
+
+
 def parse(argv: Sequence[str]) -> FleetOptions:
     """Options over those of a preset.
 
@@ -63,3 +96,8 @@ def parse(argv: Sequence[str]) -> FleetOptions:
 def _defaults(given: Given) -> FleetOptions:
     name = cast(Preset, given.get("preset", "default"))
     return FleetOptions(config=preset(name), preset=name)
+
+
+def _join_defaults(given: Given) -> JoinOptions:
+    name = cast(Preset, given.get("preset", "default"))
+    return JoinOptions(config=preset(name), preset=name)

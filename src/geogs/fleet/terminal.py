@@ -28,6 +28,10 @@ class TerminalFleet(FleetProgress):
         head = f"{done}/{self._sources} {row.name} ({duration(row.seconds)}{rest})"
         self._console.print(f"{head}: {how}{row.sentence}", markup=False)
 
+    def say(self, sentence: str) -> None:
+        """Say anything else."""
+        self._console.print(sentence, markup=False)
+
 
 def closing_words(rows: list[Row], computed: int, output: str, seconds: float) -> str:
     """What is said at the end, for the standard output."""

@@ -3,7 +3,18 @@
 import numpy as np
 from jaxtyping import Float, Int
 
+from geogs.config import MeshConfig
+from geogs.mesh.holes import IsFree, close_holes
 from geogs.mesh.types import Mesh, cross
+
+
+def cleaned(mesh: Mesh, config: MeshConfig, is_free: IsFree) -> Mesh:
+    """Without what is no surface, and with small holes closed where nobody looked through them."""
+    mesh = remove_degenerate_faces(mesh)
+    mesh = keep_components(
+        mesh, config.min_component_faces, config.min_component_fraction, config.max_components
+    )
+    return close_holes(mesh, config.close_holes, is_free)
 
 
 def remove_degenerate_faces(mesh: Mesh) -> Mesh:

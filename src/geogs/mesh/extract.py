@@ -4,19 +4,17 @@ import logging
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 
-import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from geogs.config import MeshConfig
 from geogs.errors import InputError
-from geogs.mesh.clean import keep_components, remove_degenerate_faces
+from geogs.mesh.clean import cleaned
 from geogs.mesh.colour import colour_mesh
 from geogs.mesh.decimate import decimate
-from geogs.mesh.holes import close_holes
+from geogs.mesh.free_space import FreeSpace
 from geogs.mesh.surface import extract_surface
 from geogs.mesh.tsdf import BLOCK, BYTES_PER_BLOCK, SparseTsdf, band_blocks, pack
 from geogs.mesh.types import DepthMapView, Mesh
@@ -25,8 +23,6 @@ from geogs.threads import on_one_torch_thread
 _log = logging.getLogger(__name__)
 _SAMPLED_VIEWS = 40
 _SAMPLED_POINTS = 400_000
-_FREE = 0.5
-"""Of the truncation; nearer to a surface than that may be its noise."""
 _FACES_PER_SQUARE = 2.4
 """Marching cubes makes about so many triangles per voxel face of surface."""
 
@@ -105,11 +101,7 @@ def extract_mesh(
     _log.info("voxel %.4g, about %.0f MiB", plan.voxel, plan.bytes / 2**20)
     tsdf = fuse(views, plan, progress)
     mesh = extract_surface(tsdf, config.min_weight)
-    mesh = remove_degenerate_faces(mesh)
-    mesh = keep_components(
-        mesh, config.min_component_faces, config.min_component_fraction, config.max_components
-    )
-    mesh = close_holes(mesh, config.close_holes, partial(_is_free, tsdf, config.min_weight))
+    mesh = cleaned(mesh, config, FreeSpace.of(tsdf, config.min_weight))
     del tsdf
     if not len(mesh.faces):
         raise InputError(
@@ -141,14 +133,6 @@ def fuse(
         if progress:
             progress("fuse", number + 1, len(views))
     return tsdf
-
-
-def _is_free(
-    tsdf: SparseTsdf, min_weight: float, points: Float[np.ndarray, "k 3"]
-) -> Bool[np.ndarray, "k"]:
-    """Whether a point was seen to be well before any surface."""
-    distance, weight = tsdf.nearest(torch.from_numpy(points))
-    return ((weight >= min_weight) & (distance > _FREE)).cpu().numpy()
 
 
 def _sample_points(

@@ -1,6 +1,7 @@
 """From signed distances to triangles."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -10,8 +11,22 @@ from torch import Tensor
 from geogs.mesh.tsdf import BLOCK, LIMIT, SparseTsdf
 from geogs.mesh.types import Mesh
 
-_CHUNK_BLOCKS = 16
+CHUNK = 16
+"""Blocks along a side of a chunk."""
 _SMALLEST = 1e-3
+
+
+@dataclass(frozen=True)
+class SurfacePart:
+    """The surface in one chunk of the space."""
+
+    chunk: tuple[int, int, int]
+    """Which of the chunks of :data:`CHUNK` blocks along a side."""
+    keys: Int[np.ndarray, "n"]
+    """Of the voxel edge on which each vertex lies; the same in every part that has the vertex."""
+    position: Float[np.ndarray, "n 3"]
+    """Of the vertices, in voxels."""
+    faces: Int[np.ndarray, "m 3"]
 
 
 def extract_surface(tsdf: SparseTsdf, min_weight: float = 1.5) -> Mesh:
@@ -24,42 +39,50 @@ def extract_surface(tsdf: SparseTsdf, min_weight: float = 1.5) -> Mesh:
 
     Method: marching cubes (Lorensen and Cline 1987) with Lewiner's topology (2003), scikit-image.
     """
-    keys, positions, faces, offset = [], [], [], 0
-    for origin, distance, cell in _chunks(tsdf, min_weight):
+    return stitched(surface_parts(tsdf, min_weight), tsdf.voxel)
+
+
+def surface_parts(tsdf: SparseTsdf, min_weight: float = 1.5) -> Iterator[SurfacePart]:
+    """The surface chunk by chunk, of those chunks that belong to the box of ``tsdf``."""
+    for chunk, origin, distance, cell in _chunks(tsdf, min_weight):
         vertices, triangles = _march(distance, cell)
-        if not len(triangles):
-            continue
-        position = vertices.astype(np.float64) + origin
-        keys.append(_edge_keys(position))
-        positions.append(position)
-        faces.append(triangles.astype(np.int64) + offset)
-        offset += len(position)
-    if not faces:
+        if len(triangles):
+            position = vertices.astype(np.float64) + origin
+            yield SurfacePart(chunk, _edge_keys(position), position, triangles.astype(np.int64))
+
+
+def stitched(parts: Iterable[SurfacePart], voxel: float) -> Mesh:
+    """One mesh of the parts, which may come in any order and from several volumes."""
+    ordered = sorted(parts, key=lambda part: part.chunk)
+    if not ordered:
         return Mesh.from_triangles(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32))
-    _, first, inverse = np.unique(np.concatenate(keys), return_index=True, return_inverse=True)
-    vertices = np.concatenate(positions)[first] * tsdf.voxel
-    return Mesh.from_triangles(
-        vertices.astype(np.float32), inverse[np.concatenate(faces)].astype(np.int32)
-    )
+    keys = np.concatenate([part.keys for part in ordered])
+    offsets = np.cumsum([0, *(len(part.keys) for part in ordered)])
+    faces = np.concatenate([p.faces + n for p, n in zip(ordered, offsets[:-1], strict=True)])
+    _, first, inverse = np.unique(keys, return_index=True, return_inverse=True)
+    vertices = np.concatenate([part.position for part in ordered])[first] * voxel
+    return Mesh.from_triangles(vertices.astype(np.float32), inverse[faces].astype(np.int32))
 
 
 def _chunks(
     tsdf: SparseTsdf, min_weight: float
-) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """First voxel, distances and cells of dense boxes that overlap by one voxel layer.
+) -> Iterator[tuple[tuple[int, int, int], np.ndarray, np.ndarray, np.ndarray]]:
+    """Chunk, first voxel, distances and cells of dense boxes that overlap by one voxel layer.
 
     A cell is true at its upper corner if all its eight voxels were seen. Boxes without a cell or
     without a zero are left out.
     """
     blocks = tsdf.coordinates
-    chunk_of = torch.div(blocks, _CHUNK_BLOCKS, rounding_mode="floor")
+    chunk_of = torch.div(blocks, CHUNK, rounding_mode="floor")
     # A cell reaches one voxel up, so a chunk also needs the first layer of the next blocks.
     for chunk in torch.unique(chunk_of, dim=0):
-        low = chunk * _CHUNK_BLOCKS
-        member = ((blocks >= low) & (blocks <= low + _CHUNK_BLOCKS)).all(-1).nonzero()[:, 0]
+        low = chunk * CHUNK
+        if not tsdf.owns(low):
+            continue
+        member = ((blocks >= low) & (blocks <= low + CHUNK)).all(-1).nonzero()[:, 0]
         first = blocks[member].amin(0)
         extent = blocks[member].amax(0) - first + 1
-        last = low + _CHUNK_BLOCKS
+        last = low + CHUNK
         crop = torch.minimum(extent * BLOCK, (last - first) * BLOCK + 1).tolist()
         if min(crop) < 2:
             continue
@@ -68,7 +91,9 @@ def _chunks(
         weight = _dense(tsdf.weight[member], place, extent, 0.0, crop)
         cell = _seen_cells(weight >= max(min_weight, 1e-6))
         if bool(cell.any() & (distance.amin() < 0) & (distance.amax() > 0)):
-            yield first.cpu().numpy() * BLOCK, distance.cpu().numpy(), cell.cpu().numpy()
+            x, y, z = chunk.tolist()
+            numbers = first.cpu().numpy() * BLOCK, distance.cpu().numpy(), cell.cpu().numpy()
+            yield (x, y, z), *numbers
 
 
 def _off_zero(distance: Float[Tensor, "x y z"]) -> Float[Tensor, "x y z"]:

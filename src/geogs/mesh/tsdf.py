@@ -6,6 +6,7 @@ GPU the voxels are updated by a kernel.
 """
 
 import math
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -24,6 +25,15 @@ _HALF = BLOCK // 2
 _BITS = 20
 _CHUNK = 256
 _SOURCE = Path(__file__).parent / "cuda" / "tsdf.cu"
+
+
+@dataclass(frozen=True)
+class BlockBox:
+    """A part of the space, in coordinates of blocks."""
+
+    low: tuple[int, int, int]
+    high: tuple[int, int, int]
+    """The first beyond it along each axis."""
 
 
 def pack(coordinates: Int[Tensor, "n 3"]) -> Int[Tensor, "n"]:
@@ -74,8 +84,14 @@ class SparseTsdf:
         truncation: float = 4.0,
         device: torch.device | str = "cpu",
         expected_blocks: int = 1024,
+        box: BlockBox | None = None,
     ) -> None:
-        """``voxel`` in map units, ``truncation`` in voxels."""
+        """``voxel`` in map units, ``truncation`` in voxels.
+
+        With a ``box`` only its blocks are kept, and one layer beyond its upper sides, which cells
+        on these reach into; where a voxel is kept it is what it would be without the box.
+        """
+        self.box = box
         self.voxel = voxel
         self.truncation = truncation
         self.device = torch.device(device)
@@ -107,23 +123,12 @@ class SparseTsdf:
         """Sums of observation weights."""
         return self._weight[: len(self)].unflatten(1, (BLOCK, BLOCK, BLOCK))
 
-    def nearest(
-        self, points: Float[Tensor, "n 3"]
-    ) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:
-        """Distance and weight of the voxel nearest to each point; 1 and 0 where there is none."""
-        voxel = torch.round(points.to(self.device) / self.voxel).long()
-        block = torch.div(voxel, BLOCK, rounding_mode="floor")
-        distance, weight = torch.ones(2, len(points), device=self.device)
-        if len(self) and len(points):
-            keys = pack(block.clamp(-LIMIT // BLOCK, LIMIT // BLOCK))
-            place = torch.searchsorted(self._keys, keys).clamp(max=len(self) - 1)
-            known = (self._keys[place] == keys) & (voxel.abs() < LIMIT).all(-1)
-            x, y, z = (voxel - block * BLOCK).unbind(-1)
-            inner, slot = (x * BLOCK + y) * BLOCK + z, self._slots[place]
-            distance = torch.where(known, self._distance[slot, inner], distance)
-            weight = torch.where(known, self._weight[slot, inner], 0.0)
-            return distance, weight
-        return distance, 0 * weight
+    def owns(self, block: Int[Tensor, "*b 3"]) -> Bool[Tensor, "*b"]:
+        """Whether blocks lie in the box; all do where there is none."""
+        if self.box is None:
+            return torch.ones(block.shape[:-1], dtype=torch.bool, device=block.device)
+        low, high = (block.new_tensor(side) for side in (self.box.low, self.box.high))
+        return ((block >= low) & (block < high)).all(-1)
 
     def integrate(
         self,
@@ -149,7 +154,9 @@ class SparseTsdf:
         T_cw = T_cw.to(self.device, torch.float64)
         points = camera.back_project(depth)[valid].double()
         points = (points - T_cw[:3, 3]) @ T_cw[:3, :3]
-        self._allocate(band_blocks(points, self.voxel, self.truncation))
+        self._allocate(self._kept(band_blocks(points, self.voxel, self.truncation)))
+        if not len(self):
+            return
         table = _plane_table(depth, torch.where(valid, weight, 0.0), valid)
         if self.device.type == "cuda":
             self.update_by_kernel(table, camera, T_cw, torch.where(valid, depth, 0.0).amax())
@@ -178,6 +185,13 @@ class SparseTsdf:
             T_cw.contiguous(), far, c.width, c.height, c.fx, c.fy, c.cx, c.cy,
             self.voxel, self.truncation,
         )  # fmt: skip
+
+    def _kept(self, blocks: Int[Tensor, "k 3"]) -> Int[Tensor, "l 3"]:
+        """Those in the box and in the layer above it."""
+        if self.box is None:
+            return blocks
+        low, high = (blocks.new_tensor(side) for side in (self.box.low, self.box.high))
+        return blocks[((blocks >= low) & (blocks <= high)).all(-1)]
 
     def _allocate(self, blocks: Int[Tensor, "k 3"]) -> None:
         keys = pack(blocks)

@@ -1,0 +1,76 @@
+"""The joint map seen from every keyframe, in files, so that each is rendered once."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float64
+from torch import Tensor
+
+from geogs.application.saved_result import load_result
+from geogs.geometry.camera import Camera
+from geogs.io.writers.keyframe_images import image_path, read_image
+from geogs.mesh.types import DepthMapView
+from geogs.on_demand import OnDemand
+
+
+@dataclass(frozen=True)
+class StoredView:
+    """A depth map in a file."""
+
+    file: Path
+    image: Path
+    camera: Camera
+    T_cw: Float64[np.ndarray, "4 4"]
+
+    def load(self, with_image: bool = False) -> DepthMapView:
+        """What is in the file; with the image only where it is wanted."""
+        with np.load(self.file, allow_pickle=False) as file:
+            depth, weight = torch.from_numpy(file["depth"]), torch.from_numpy(file["weight"])
+        image = read_image(self.image) if with_image else None
+        return DepthMapView(depth, weight.float(), self.camera, self.pose, image)
+
+    @property
+    def pose(self) -> Float[Tensor, "4 4"]:
+        """World to camera; a copy, as what Ray brings cannot be written."""
+        return torch.tensor(self.T_cw)
+
+
+def loaded(views: Sequence[StoredView], with_images: bool = False) -> Sequence[DepthMapView]:
+    """Each when it is asked for."""
+    return OnDemand(views, lambda view: view.load(with_images))
+
+
+@dataclass(frozen=True)
+class RenderJob:
+    """Keyframes of a written result to be rendered."""
+
+    result: Path
+    places: tuple[int, ...]
+    """Of the keyframes among all."""
+    folder: Path
+    """Where the depth maps go."""
+    device: str = "cpu"
+
+
+def render_views(job: RenderJob) -> list[StoredView]:
+    """Render some keyframes into files."""
+    result, made = load_result(job.result, job.device), []
+    for n in job.places:
+        T_cw = result.views.T_cw[n]
+        maps = result.render(torch.from_numpy(T_cw))
+        file = job.folder / f"{n:06d}.npz"
+        # 0, a half and 1 are the same in half precision.
+        np.savez(file, depth=maps.depth.cpu().numpy(), weight=maps.weight.cpu().half().numpy())
+        image = image_path(job.result, int(result.views.keyframe_id[n]))
+        made.append(StoredView(file, image, result.depth_camera, T_cw))
+    return made
+
+
+def shares(count: int, parts: int) -> list[tuple[int, ...]]:
+    """The numbers below ``count`` in so many runs of about equal length, none of them empty."""
+    ends = np.linspace(0, count, min(max(parts, 1), max(count, 1)) + 1).round().astype(int)
+    return [tuple(range(a, b)) for a, b in pairwise(ends) if b > a]

@@ -1,0 +1,132 @@
+"""A mesh in boxes of space, each worked on alone, and stitched to what one volume would give.
+
+All boxes sample the same grid of voxels, and each has one layer of its neighbours' blocks: where
+two boxes meet they compute the same distances, so the same vertices on the same voxel edges.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Int
+from torch import Tensor
+
+from geogs.config import MeshConfig
+from geogs.errors import InputError
+from geogs.geometry.camera import Camera
+from geogs.mesh.clean import cleaned
+from geogs.mesh.extract import VolumePlan
+from geogs.mesh.free_space import FreeSpace
+from geogs.mesh.surface import CHUNK, SurfacePart, stitched, surface_parts
+from geogs.mesh.tsdf import BLOCK, BlockBox, SparseTsdf, band_blocks
+from geogs.mesh.types import DepthMapView, Mesh
+from geogs.threads import on_one_torch_thread
+
+
+@dataclass(frozen=True)
+class MeshBlock:
+    """What the work on one box of space comes to."""
+
+    parts: tuple[SurfacePart, ...]
+    free: FreeSpace
+
+
+def blocks_of(view: DepthMapView, plan: VolumePlan) -> Int[Tensor, "k 3"]:
+    """Coordinates of the blocks in which the surface of a view lies, with its band."""
+    valid = view.valid() & (view.depth <= plan.max_depth)
+    T_cw = view.T_cw.to(view.depth.device, torch.float64)
+    points = view.camera.back_project(view.depth.float())[valid].double()
+    return band_blocks((points - T_cw[:3, 3]) @ T_cw[:3, :3], plan.voxel, plan.truncation)
+
+
+def boxes_of(blocks: Int[np.ndarray, "k 3"], most: int) -> list[BlockBox]:
+    """Boxes that have every block once, each with at most so many or else as small as can be.
+
+    Args:
+        blocks: coordinates, each once.
+        most: blocks in a box. One of the chunks that surfaces are extracted in is not divided.
+    """
+    chunks, counts = np.unique(np.floor_divide(blocks, CHUNK), axis=0, return_counts=True)
+    return _divided(chunks, counts, most) if len(chunks) else []
+
+
+def _divided(
+    chunks: Int[np.ndarray, "c 3"], counts: Int[np.ndarray, "c"], most: int
+) -> list[BlockBox]:
+    low, high = chunks.min(axis=0), chunks.max(axis=0) + 1
+    if len(chunks) == 1 or counts.sum() <= most:
+        (a, b, c), (d, e, f) = (low * CHUNK).tolist(), (high * CHUNK).tolist()
+        return [BlockBox((a, b, c), (d, e, f))]
+    axis = int(np.argmax(high - low))
+    along = np.bincount(chunks[:, axis] - low[axis], counts)
+    half = int(np.searchsorted(np.cumsum(along), counts.sum() / 2))
+    border = low[axis] + min(max(half, 0) + 1, len(along) - 1)
+    below = chunks[:, axis] < border
+    return [
+        *_divided(chunks[below], counts[below], most),
+        *_divided(chunks[~below], counts[~below], most),
+    ]
+
+
+def sees_box(camera: Camera, T_cw: Tensor, plan: VolumePlan, box: BlockBox) -> bool:
+    """Whether a view may change a voxel of a box; those that may not need not be fused there."""
+    side = plan.voxel * BLOCK
+    low, high = (np.array(c, dtype=np.float64) for c in (box.low, box.high))
+    centre, radius = (low + high + 1) * side / 2, float(np.linalg.norm(high + 1 - low)) * side / 2
+    T = T_cw.double().numpy()
+    x, y, z = T[:3, :3] @ centre + T[:3, 3]
+    far = plan.max_depth + plan.truncation * plan.voxel
+    if not -radius < z < far + radius:
+        return False
+    for p, f, c, size in (
+        (x, camera.fx, camera.cx, camera.width),
+        (y, camera.fy, camera.cy, camera.height),
+    ):
+        for slope, sign in (((-0.5 - c) / f, 1.0), ((size - 0.5 - c) / f, -1.0)):
+            if sign * (p - slope * z) <= -radius * (1 + slope**2) ** 0.5:
+                return False
+    return True
+
+
+@on_one_torch_thread
+def mesh_block(
+    views: Iterable[DepthMapView],
+    plan: VolumePlan,
+    box: BlockBox,
+    min_weight: float,
+    device: torch.device | str = "cpu",
+) -> MeshBlock:
+    """Fuse the views in one box of space and extract its surface.
+
+    ``views`` are those that see the box, in the order in which all would be fused; others change
+    nothing.
+    """
+    tsdf = SparseTsdf(plan.voxel, plan.truncation, device, box=box)
+    for view in views:
+        weight = torch.where(view.depth <= plan.max_depth, view.weight, 0.0)
+        tsdf.integrate(view.depth, weight, view.camera, view.T_cw)
+    return MeshBlock(tuple(surface_parts(tsdf, min_weight)), FreeSpace.of(tsdf, min_weight))
+
+
+def stitched_blocks(blocks: Sequence[MeshBlock], plan: VolumePlan, config: MeshConfig) -> Mesh:
+    """The mesh of all boxes, cleaned as one; neither coloured nor decimated.
+
+    Raises:
+        InputError: there is no surface.
+    """
+    mesh = stitched((part for block in blocks for part in block.parts), plan.voxel)
+    mesh = cleaned(mesh, config, FreeSpace.joined([block.free for block in blocks]))
+    if not len(mesh.faces):
+        raise InputError(
+            f"No surface was seen with a total weight of {config.min_weight:g}; lower min-weight "
+            f"or use more views."
+        )
+    return mesh
+
+
+def near(mesh: Mesh, box: BlockBox, plan: VolumePlan) -> Bool[np.ndarray, "n"]:
+    """Which vertices lie in a box."""
+    side = plan.voxel * BLOCK
+    block = np.floor_divide(mesh.vertices.astype(np.float64), side)
+    return np.asarray(((block >= box.low) & (block < box.high)).all(axis=1))

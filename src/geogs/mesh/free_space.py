@@ -1,0 +1,57 @@
+"""Where nothing is: which voxels of a volume were seen to lie well before any surface."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int, UInt8
+
+from geogs.mesh.tsdf import BLOCK, LIMIT, SparseTsdf, pack
+
+FREE = 0.5
+"""Of the truncation; nearer to a surface than that may be its noise."""
+
+
+@dataclass(frozen=True)
+class FreeSpace:
+    """A bit for every voxel of a volume, which takes a 64th of the volume's memory."""
+
+    voxel: float
+    """Map units."""
+    keys: Int[np.ndarray, "k"]
+    """Of the blocks, ascending, as ``pack`` makes them."""
+    bits: UInt8[np.ndarray, "k 64"]
+
+    @staticmethod
+    def of(tsdf: SparseTsdf, min_weight: float) -> "FreeSpace":
+        """Of the blocks that belong to the box of a volume."""
+        own = tsdf.owns(tsdf.coordinates)
+        is_free = (tsdf.weight[own] >= min_weight) & (tsdf.distance[own] > FREE)
+        keys = pack(tsdf.coordinates[own]).cpu().numpy()
+        bits = np.packbits(is_free.flatten(1).cpu().numpy(), axis=1)
+        order = np.argsort(keys)
+        return FreeSpace(tsdf.voxel, keys[order], bits[order])
+
+    @staticmethod
+    def joined(parts: Sequence["FreeSpace"]) -> "FreeSpace":
+        """Of volumes with the same voxels that share no block; at least one."""
+        keys = np.concatenate([part.keys for part in parts])
+        bits = np.concatenate([part.bits for part in parts])
+        order = np.argsort(keys)
+        return FreeSpace(parts[0].voxel, keys[order], bits[order])
+
+    def __call__(self, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
+        """Whether the voxel nearest to each point is free; where there is none it is not."""
+        if not len(self.keys) or not len(points):
+            return np.zeros(len(points), bool)
+        voxel = np.rint(points / self.voxel).astype(np.int64)
+        block = np.floor_divide(voxel, BLOCK)
+        limit = LIMIT // BLOCK
+        keys = pack(torch.from_numpy(block.clip(-limit, limit))).numpy()
+        place = np.searchsorted(self.keys, keys).clip(max=len(self.keys) - 1)
+        known = (self.keys[place] == keys) & (np.abs(voxel) < LIMIT).all(axis=1)
+        x, y, z = (voxel - block * BLOCK).T
+        inner = (x * BLOCK + y) * BLOCK + z
+        bit = self.bits[place, inner >> 3] >> (7 - (inner & 7)) & 1
+        return known & (bit == 1)

@@ -1,0 +1,36 @@
+"""Which results words name, and what cannot be joined; Ray is not needed to find that out."""
+
+import json
+
+import pytest
+
+from geogs.errors import InputError
+from geogs.fleet.join import JoinSettings, _names, finished_results, run_join
+
+
+def test_a_result_is_one_and_a_fleet_is_all_that_are_done(tmp_path):
+    for name in ("fleet/b", "fleet/a", "fleet/failed", "lone"):
+        (tmp_path / name).mkdir(parents=True)
+        (tmp_path / name / "map.safetensors").touch()
+    (tmp_path / "fleet" / "without").mkdir()
+    states = {"b": "done", "a": "done", "failed": "failed", "without": "done", "../lone": "done"}
+    rows = [{"name": name, "state": state} for name, state in states.items()]
+    (tmp_path / "fleet" / "fleet.json").write_text(json.dumps({"sources": [*rows, 3]}))
+    assert finished_results(str(tmp_path / "lone")) == [tmp_path / "lone"]
+    assert finished_results(str(tmp_path / "fleet")) == [tmp_path / f"fleet/{n}" for n in "ab"]
+    for nothing in (tmp_path, tmp_path / "none", "s3://bucket/result"):
+        assert finished_results(str(nothing)) == []
+    (tmp_path / "fleet" / "fleet.json").write_text("{")
+    with pytest.raises(InputError):
+        finished_results(str(tmp_path / "fleet"))
+
+
+def test_equal_names_are_told_apart(tmp_path):
+    folders = [tmp_path / "x" / "a", tmp_path / "y" / "a", tmp_path / "b", tmp_path / "z" / "a"]
+    assert _names(folders) == ["a", "a-2", "b", "a-3"]
+
+
+@pytest.mark.parametrize("output", ["", "s3://bucket/joined"])
+def test_the_joint_result_needs_a_folder(output):
+    with pytest.raises(InputError, match="needs a folder that all machines see"):
+        run_join(JoinSettings(("a", "b"), output=output))
