@@ -6,8 +6,9 @@
 import os
 import signal
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -53,25 +54,31 @@ def read(parser: Parser, folder: Path) -> None:
             assert len(text) < 800, text
 
 
+Example = tuple[Path, dict[str, bytes]]
+
+
 @pytest.fixture(scope="module")
-def examples(tmp_path_factory) -> dict[str, tuple[Path, dict[str, bytes]]]:
-    """The folder of the good example of each parser, and what its files hold."""
-    found = {}
-    for name, parser in PARSERS.items():
-        folder = tmp_path_factory.mktemp(name)
+def example(tmp_path_factory) -> Callable[[str], Example]:
+    """The folder of the good example of a parser, and what its files hold."""
+
+    @cache
+    def written(name: str) -> Example:
+        folder, parser = tmp_path_factory.mktemp(name), PARSERS[name]
         parser.write(folder)
-        found[name] = folder, {file: (folder / file).read_bytes() for file in parser.files}
-    return found
+        parser.read(folder)  # kernels are compiled, which takes its time
+        return folder, {file: (folder / file).read_bytes() for file in parser.files}
+
+    return written
 
 
 @pytest.mark.parametrize("name", PARSERS)
-def test_the_good_example_is_read(name, examples):
-    PARSERS[name].read(examples[name][0])
+def test_the_good_example_is_read(name, example):
+    PARSERS[name].read(example(name)[0])
 
 
 @pytest.mark.parametrize("name", PARSERS)
-def test_damaged_files_are_read_or_refused_in_a_sentence(name, examples):
-    parser, (folder, good) = PARSERS[name], examples[name]
+def test_damaged_files_are_read_or_refused_in_a_sentence(name, example):
+    parser, (folder, good) = PARSERS[name], example(name)
 
     @settings(
         max_examples=EXAMPLES, deadline=None, database=None, derandomize=EXAMPLES < 100,
@@ -90,8 +97,8 @@ def test_damaged_files_are_read_or_refused_in_a_sentence(name, examples):
 
 
 @pytest.mark.parametrize("name", sorted(path.name for path in CORPUS.iterdir()))
-def test_files_that_once_led_to_something_else(name, examples):
-    parser, (folder, good) = PARSERS[name], examples[name]
+def test_files_that_once_led_to_something_else(name, example):
+    parser, (folder, good) = PARSERS[name], example(name)
     for case in sorted((CORPUS / name).iterdir()):
         file = next(file for file in good if Path(file).suffix == case.suffix)
         (folder / file).write_bytes(case.read_bytes())
