@@ -131,7 +131,7 @@ def load_card(name: str) -> PriorCard:
     return _from_settings(name, content)
 
 
-def _from_settings(name: str, content: dict[str, Any]) -> PriorCard:
+def _from_settings(name: str, content: dict[Any, Any]) -> PriorCard:
     known = {f.name for f in fields(PriorCard)}
     unknown = [str(key)[:40] for key in content if key not in known]
     if unknown:
