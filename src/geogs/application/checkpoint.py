@@ -18,6 +18,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load, save
 
 from geogs.application.checkpoint_folder import FORMAT, CheckpointFolder
+from geogs.application.machine import is_gpu_failure
 from geogs.application.progress import RunProgress
 from geogs.application.records import pack, schema, unpack
 from geogs.documents import UNUSABLE, in_short
@@ -116,6 +117,8 @@ class SavedState(Generic[S]):
         try:
             yield
         except _UNUSABLE as error:
+            if is_gpu_failure(error):
+                raise  # the checkpoint is well
             reason = in_short(error)
             raise InputError(
                 f"{self._folder.path} cannot be used ({reason}); start anew without --resume."

@@ -22,6 +22,8 @@ EXIT_ERROR = 2
 """Exit code after an error that the user can mend."""
 EXIT_INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells give it (128 + SIGINT)."""
+_GPU_FAILS = ("CUDA error", "CUDA out of memory", "CUDA driver error", "cuDNN error", "NVRTC")
+"""What errors of PyTorch begin with that no command has said in its own words."""
 
 
 @dataclass(frozen=True)
@@ -137,6 +139,9 @@ def _of_the_system(error: Exception) -> str | None:
         return "Too many files are open; raise the limit (ulimit -n)."
     if isinstance(error, OSError) and error.errno == errno.ENOSPC:
         return f"A disk is full ({error.filename or 'of temporary files, see TMPDIR'})."
+    if type(error).__name__ == "OutOfMemoryError" or said.startswith(_GPU_FAILS):
+        first = said.splitlines()[0][:200].rstrip(".") if said else "out of memory"
+        return f"The GPU failed ({first}); --device cpu computes without it."
     lacks = ("allocate memory", "start new thread", "failed to map segment", "Insufficient memory")
     if isinstance(error, MemoryError) or any(words in said for words in lacks):
         return (
