@@ -3,6 +3,7 @@
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from geogs.kernel_folder import find_kernel_folder
 from geogs.version import __version__
 
 if TYPE_CHECKING:
@@ -50,6 +51,8 @@ _HOMES = {
     "reconstruct": "geogs.application.reconstruct",
     "render": "geogs.splat.render",
 }
+
+find_kernel_folder()
 
 
 def __getattr__(name: str) -> Any:
