@@ -98,6 +98,8 @@ class Soak:
                     self.report.cut_off += 1
                 shutil.rmtree(folder, ignore_errors=True)
                 return
+            except Exception as error:  # a fault of the soak must not look like all being well
+                found = [f"the soak broke off: {error!r}"]
             with self._lock:
                 self.report.rounds += 1
                 self.report.faults += [{"round": folder.name, "what": what} for what in found]
