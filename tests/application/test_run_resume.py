@@ -176,9 +176,6 @@ def test_a_killed_run_goes_on_even_after_another_interruption(
     assert "nothing to resume" in again.stderr.splitlines()[-1]
 
 
-@pytest.mark.xfail(
-    reason="the mesh differs after ten kills, the trajectory does not; not understood"
-)
 @pytest.mark.usefixtures("no_report")
 def test_ten_kills_change_nothing(whole, killed, tmp_path, capsys):
     """SIGKILL at ten points, at each of the files of a checkpoint; in the end, bit for bit."""
