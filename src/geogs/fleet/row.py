@@ -64,6 +64,7 @@ def _is_sound(row: Row) -> bool:
     numbers = (row.seconds, row.attempts, *row.numbers.values())
     return (
         all(isinstance(word, str) for word in words)
+        and row.name.isprintable()
         and all(isinstance(n, int | float) and math.isfinite(n) for n in numbers)
         and row.state in get_args(State)
         and row.is_reliable in (True, False, None)
