@@ -1,46 +1,35 @@
 """Endurance: random synthetic videos with random settings, killed and gone on with, for hours.
 
-    python benchmarks/soak.py [--minutes 180] [--seed 0] [--size 160 120] [--frames 30 90]
-        [--repeats 8] [--folder FOLDER]
+    python benchmarks/soak.py [--minutes 180] [--workers 1] [--seed 0] [--size 160 120]
+        [--frames 30 90] [--repeats 8] [--folder FOLDER] [--report FILE.json]
 
-Every round renders a video, runs it in a process of its own, which is killed now and then (SIGKILL,
-SIGTERM, Ctrl-C, in the middle of whatever it does) and gone on with by ``--resume``, and checks
-what it leaves: every exit code, no traceback, no NaN in any file, a summary as
-docs/summary.schema.json says, nothing unfinished in the folder. Then one process runs the last
-video ``--repeats`` times: how much its memory grows a frame, and whether files stay open. Ends with
-1 if anything is wrong.
+Every round renders a video and runs it twice, in processes of their own: once undisturbed, and once
+killed now and then (SIGKILL, SIGTERM, Ctrl-C, in the middle of whatever it does), on another number
+of threads each time, and gone on with by ``--resume``. Both must leave the same poses, map and mesh
+to the last bit. Looked at are all exit codes, tracebacks, NaN in any file, summaries as
+docs/summary.schema.json says, files that are not finished. As many rounds as there are workers go
+on at a time; no GPU is used. Meanwhile ``leaks.py`` runs one video again and again in one process.
+The report says how often what happened, and all that is wrong; the command ends with 1 if anything
+is. Folders of rounds in which nothing was wrong are deleted.
 """
 
 import argparse
-import gc
 import json
-import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
 import tempfile
+import threading
 import time
-from collections.abc import Iterator
+from collections import Counter
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
-import numpy as np
+from soak_checks import differences, wrong_in
+from soak_process import GEOGS, Ending, TimeIsUp, ended
 
-from geogs.application.run import run
-from geogs.application.saved_result import load_result
-from geogs.application.settings import RunSettings
-from geogs.config import preset
-from geogs.errors import GeogsError
-from json_schema import faults
-
-GEOGS = [sys.executable, "-m", "geogs.cli.main"]
-SCHEMA = Path(__file__).parents[1] / "docs" / "summary.schema.json"
-HANGS = 1800.0
-"""Seconds after which a process counts as one that hangs."""
-MOST_LEAKED = 1024.0
-"""Bytes a frame."""
-WARM_UP = 2
-"""Repetitions before memory counts: kernels are compiled, pools are filled."""
 CHOICES: dict[str, tuple[str, ...]] = {
     "--stride": ("1", "2"),
     "--seed": ("0", "7"),
@@ -48,65 +37,176 @@ CHOICES: dict[str, tuple[str, ...]] = {
     "--mapping.window": ("3", "8"),
     "--mapping.iterations": ("2", "10"),
     "--mapping.render-long-edge": ("64", "128"),
+    "--resident-keyframes": ("3", "100"),
     "--input.readout": ("0", "0.02", "auto"),
     "--mesh.detail": ("0.2", "1"),
     "--checkpoint-every": ("1", "5"),
     "--intrinsics": ("auto", "150,150,79.5,59.5"),
 }
 SWITCHES = ("--online-results", "--depth-mesh", "--no-keyframe-images")
+SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
+MOST_KILLS = 4
+"""Of a run."""
+STARTED = 2.0
+"""Seconds after which Python has begun with the program, to which signals belong from then on."""
+
+
+@dataclass
+class Report:
+    """What happened, over all rounds."""
+
+    seed: int
+    workers: int
+    rounds: int = 0
+    cut_off: int = 0
+    """Rounds that were going on when the time was over."""
+    runs: int = 0
+    """Processes."""
+    kills: Counter[str] = field(default_factory=Counter)
+    """By signal."""
+    resumes: int = 0
+    compared: int = 0
+    """Runs that were disturbed and ended like their undisturbed twin, or should have."""
+    refusals: Counter[str] = field(default_factory=Counter)
+    """Sentences of undisturbed runs that ended with 2, such as of a camera that stands still."""
+    faults: list[dict[str, str]] = field(default_factory=list)
+    leaks: dict[str, object] = field(default_factory=dict)
+    """As leaks.py says."""
+    seconds: float = 0.0
+
+
+class Soak:
+    """Rounds of several workers until the time is over."""
+
+    def __init__(self, options: argparse.Namespace, folder: Path) -> None:
+        self._options, self._folder = options, folder
+        self._end = time.monotonic() + 60 * options.minutes
+        self._lock = threading.Lock()
+        self._begun = 0
+        self.report = Report(options.seed, options.workers)
+
+    def work(self) -> None:
+        """Round after round."""
+        while time.monotonic() < self._end:
+            with self._lock:
+                number, self._begun = self._begun, self._begun + 1
+            folder = self._folder / f"round-{number}"
+            try:
+                found = self._round(folder, random.Random(f"{self._options.seed}-{number}"))
+            except TimeIsUp:
+                with self._lock:
+                    self.report.cut_off += 1
+                shutil.rmtree(folder, ignore_errors=True)
+                return
+            except Exception as error:  # a fault of the soak must not look like all being well
+                found = [f"the soak broke off: {error!r}"]
+            with self._lock:
+                self.report.rounds += 1
+                self.report.faults += [{"round": folder.name, "what": what} for what in found]
+            print(f"{folder.name}: {'; '.join(found) or 'well'}", flush=True)
+            if not found:
+                shutil.rmtree(folder, ignore_errors=True)
+
+    def _round(self, folder: Path, dice: random.Random) -> list[str]:
+        """Render, run undisturbed and disturbed, check; what is wrong."""
+        video, twin, out = (folder / name for name in ("video", "twin", "out"))
+        folder.mkdir(parents=True)
+        synth = self._ended([*GEOGS, *synth_words(video, self._options, dice)])
+        if synth.code:
+            return [f"geogs synth ends with {synth.code}: {synth.last}"]
+        words = settings(dice)
+        (folder / "settings.txt").write_text(" ".join(words) + "\n")
+        command = [*GEOGS, "run", str(video), "--device", "cpu", *words]
+        whole = self._ended([*command, "-o", str(twin)])
+        wrong = [f"undisturbed: {what}" for what in whole.wrong((0, 2))]
+        last, more = self._disturbed([*command, "-o", str(out)], out, whole.seconds, dice)
+        wrong += more
+        if whole.code == 2:
+            with self._lock:
+                self.report.refusals[whole.last] += 1
+            return wrong + ([] if last.code == 2 else ["only the undisturbed run was refused"])
+        if wrong:
+            return wrong
+        with self._lock:
+            self.report.compared += 1
+        return [*wrong_in(twin), *wrong_in(out), *differences(twin, out)]
+
+    def _disturbed(
+        self, first: list[str], out: Path, seconds: float, dice: random.Random
+    ) -> tuple[Ending, list[str]]:
+        """Run with interruptions until it has ended; how it ended at last, and what was wrong."""
+        kills, wrong, command = dice.randint(1, MOST_KILLS), list[str](), first
+        while True:
+            number = dice.choice(SIGNALS) if kills else None
+            kills -= number is not None
+            after = max(dice.uniform(0.0, 1.0) * seconds, STARTED)
+            ending = self._ended(command, number, after, dice.choice(("1", "2", "3")))
+            wrong += ending.wrong((0, 2, 130, -signal.SIGKILL) if number else (0, 2))
+            is_open = (out / "checkpoint" / "manifest.json").is_file()
+            if wrong or ((number is None or not ending.was_hit) and not is_open):
+                return ending, wrong
+            command = first
+            if is_open:
+                command = [*GEOGS, "run", "--resume", str(out), "--device", "cpu"]
+                with self._lock:
+                    self.report.resumes += 1
+
+    def _ended(
+        self,
+        command: list[str],
+        number: signal.Signals | None = None,
+        after: float = 0.0,
+        threads: str = "1",
+    ) -> Ending:
+        ending = ended(command, self._end, number, after, threads)
+        with self._lock:
+            self.report.runs += 1
+            if number is not None and ending.was_hit:
+                self.report.kills[number.name] += 1
+        return ending
 
 
 def main() -> None:
-    """Rounds until the time is over, then the repetitions."""
+    """Workers and leaks side by side, then the report."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--minutes", type=float, default=180.0)
+    parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--size", type=int, nargs=2, default=(160, 120))
     parser.add_argument("--frames", type=int, nargs=2, default=(30, 90))
     parser.add_argument("--repeats", type=int, default=8)
     parser.add_argument("--folder", type=Path, default=None)
+    parser.add_argument("--report", type=Path, default=None)
     options = parser.parse_args()
     folder = options.folder or Path(tempfile.mkdtemp(prefix="geogs-soak-"))
     folder.mkdir(parents=True, exist_ok=True)
-    dice, wrong, rounds = random.Random(options.seed), [], 0
-    end = time.monotonic() + 60 * options.minutes
-    while time.monotonic() < end or not rounds:
-        found = list(one_round(folder / f"round-{rounds}", options, dice))
-        wrong += found
-        rounds += 1
-        print(f"round {rounds}: {'; '.join(found) or 'well'}", flush=True)
-    if options.repeats > WARM_UP + 1:
-        wrong += repetitions(folder / f"round-{rounds - 1}" / "video", folder, options.repeats)
-    print(f"{rounds} rounds, {len(wrong)} faults; everything is in {folder}")
-    sys.exit(1 if wrong else 0)
+    begin = time.monotonic()
+    soak = Soak(options, folder)
+    threads = [threading.Thread(target=soak.work) for _ in range(options.workers)]
+    for thread in threads:
+        thread.start()
+    report = soak.report
+    if options.repeats:
+        report.leaks, said = leaks(folder / "leaks", options, begin + 60 * options.minutes)
+        report.faults += [{"round": "leaks", "what": what} for what in said]
+    for thread in threads:
+        thread.join()
+    report.seconds = round(time.monotonic() - begin, 1)
+    text = json.dumps(asdict(report), indent=2)
+    if options.report is not None:
+        options.report.write_text(text + "\n")
+    print(text)
+    sys.exit(1 if report.faults else 0)
 
 
-def one_round(folder: Path, options: argparse.Namespace, dice: random.Random) -> Iterator[str]:
-    """Render, run with interruptions, check; yields what is wrong."""
-    video, out = folder / "video", folder / "out"
+def synth_words(video: Path, options: argparse.Namespace, dice: random.Random) -> list[str]:
+    """What to render."""
     width, height = options.size
-    synth = [
-        *GEOGS, "synth", str(video), "--frames", str(dice.randint(*options.frames)), "--width",
-        str(width), "--height", str(height), "--seed", str(dice.randint(0, 999)), "--no-depth",
-        "--camera", dice.choice(("clean", "phone")),
+    return [
+        "synth", str(video), "--frames", str(dice.randint(*options.frames)), "--width", str(width),
+        "--height", str(height), "--seed", str(dice.randint(0, 999)), "--no-depth", "--camera",
+        dice.choice(("clean", "phone")),
     ]  # fmt: skip
-    if subprocess.run(synth, capture_output=True).returncode:
-        yield "geogs synth fails"
-        return
-    command = [*GEOGS, "run", str(video), "-o", str(out), "--device", "cpu", *settings(dice)]
-    print("  " + " ".join(command[3:]), flush=True)
-    for kills in range(4):
-        number = dice.choice((signal.SIGKILL, signal.SIGTERM, signal.SIGINT, None))
-        number = None if kills == 3 else number
-        code, said = ended(command, number, dice.uniform(3, 60))
-        if "Traceback" in said or code not in (0, 2, 130, -signal.SIGKILL):
-            yield f"ended with {code}: {said.strip().splitlines()[-1:]}"
-        is_open = (out / "checkpoint" / "manifest.json").is_file()
-        if code == 0 and not is_open:
-            break
-        if is_open:
-            command = [*GEOGS, "run", "--resume", str(out), "--device", "cpu"]
-    yield from wrong_in(out)
 
 
 def settings(dice: random.Random) -> list[str]:
@@ -116,78 +216,30 @@ def settings(dice: random.Random) -> list[str]:
     return words + dice.sample(SWITCHES, dice.randint(0, len(SWITCHES)))
 
 
-def ended(command: list[str], number: signal.Signals | None, seconds: float) -> tuple[int, str]:
-    """The exit code of a process that gets a signal after a while, and what it said."""
-    with tempfile.TemporaryFile("w+") as said:
-        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=said)
-        try:
-            process.wait(seconds if number else HANGS)
-        except subprocess.TimeoutExpired:
-            process.send_signal(number or signal.SIGKILL)
-            try:
-                process.wait(HANGS)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
-                return 1, "it hangs"
-        said.seek(0)
-        return process.returncode, said.read()
-
-
-def wrong_in(out: Path) -> Iterator[str]:
-    """What is wrong with the files of a result."""
-    for path in out.rglob("*"):
-        if path.name.endswith((".part", ".lock")):
-            yield f"{path.name} was left behind"
+def leaks(
+    folder: Path, options: argparse.Namespace, end: float
+) -> tuple[dict[str, object], list[str]]:
+    """What leaks.py finds in the time that there is, and what is wrong with it."""
+    folder.mkdir(parents=True, exist_ok=True)
+    video = folder / "video"
+    dice = random.Random(f"{options.seed}-leaks")
     try:
-        summary = json.loads((out / "summary.json").read_text())
-    except (OSError, ValueError) as error:
-        yield f"no summary ({type(error).__name__})"
-        return
-    yield from faults(summary, json.loads(SCHEMA.read_text()))
-    for name in ("trajectory.tum", "keyframes.tum"):
-        rows = np.loadtxt(out / name, ndmin=2)
-        if not np.isfinite(rows).all():
-            yield f"NaN in {name}"
-    if summary["not_started"] is not None or not summary["disks"]:
-        return
+        if ended([*GEOGS, *synth_words(video, options, dice)], end).code:
+            return {}, ["geogs synth fails"]
+    except TimeIsUp:
+        return {}, []
+    script = Path(__file__).with_name("leaks.py")
+    minutes = max(end - time.monotonic(), 1.0) / 60
+    command = [
+        sys.executable, str(script), str(video), "--repeats", str(options.repeats), "--minutes",
+        f"{minutes:.2f}", "--folder", str(folder),
+    ]  # fmt: skip
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
     try:
-        result = load_result(out)  # refuses a map that is not finite
-    except GeogsError as error:
-        yield str(error)
-        return
-    if not np.isfinite(result.views.T_cw).all():
-        yield "NaN in the poses of map.safetensors"
-    mesh = result.mesh
-    if mesh is not None and not (
-        np.isfinite(mesh.vertices).all() and np.isfinite(mesh.normals).all()
-    ):
-        yield "NaN in mesh.ply"
-
-
-def repetitions(video: Path, folder: Path, repeats: int) -> list[str]:
-    """The same run again and again in this process: growth of memory and of open files."""
-    memory, files, frames = [], [], 0
-    for _ in range(repeats):
-        out = folder / "again"
-        settings = RunSettings((video,), preset("fast"), output=out, device="cpu")
-        frames = run(settings).result.scene.frames
-        gc.collect()
-        memory.append(resident())
-        files.append(len(os.listdir("/proc/self/fd")))
-    runs = np.arange(WARM_UP, repeats)
-    leak = float(np.polyfit(runs, memory[WARM_UP:], 1)[0]) / frames
-    grown = files[-1] - files[WARM_UP]
-    print(f"{repeats} x {frames} frames: {leak:.0f} bytes a frame, {grown:+d} open files")
-    print("  resident MiB: " + " ".join(f"{m / 2**20:.1f}" for m in memory))
-    wrong = [f"{leak:.0f} bytes a frame are lost"] if leak > MOST_LEAKED else []
-    return wrong + ([f"{grown} files stay open"] if grown > 0 else [])
-
-
-def resident() -> int:
-    """Bytes of this process in memory."""
-    pages = int(Path("/proc/self/statm").read_text().split()[1])
-    return pages * os.sysconf("SC_PAGE_SIZE")
+        found = json.loads(done.stdout.splitlines()[-1])
+    except (ValueError, IndexError):
+        return {}, [f"leaks.py ends with {done.returncode}: {done.stderr[-300:]}"]
+    return found, ["memory or files are lost"] if done.returncode else []
 
 
 if __name__ == "__main__":

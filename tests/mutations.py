@@ -204,7 +204,8 @@ def archive(draw: st.DrawFn, data: bytes) -> bytes:
             case _:
                 odd = st.sampled_from((np.nan, np.inf, 1e300, 1e-300, 0.0, -1.0))
                 array = array.astype(np.float64)
-                array.flat[draw(st.integers(0, max(array.size - 1, 0)))] = draw(odd)
+                if array.size:
+                    array.flat[draw(st.integers(0, array.size - 1))] = draw(odd)
                 arrays[name] = array
         if not arrays:
             break

@@ -3,6 +3,7 @@
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from geogs.kernel_folder import find_kernel_folder
 from geogs.version import __version__
 
 if TYPE_CHECKING:
@@ -54,6 +55,8 @@ _HOMES = {
     "render": "geogs.splat.render",
     "track": "geogs.application.slam",
 }
+
+find_kernel_folder()
 
 
 def __getattr__(name: str) -> Any:

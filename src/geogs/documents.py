@@ -125,6 +125,13 @@ def yaml_value(text: str, name: str) -> Any:
         raise InputError(said) from None
 
 
+def in_short(error: Exception, longest: int = 200) -> str:
+    """What an error says, for the inside of a sentence: its first line, plain and not for ever."""
+    said = (str(error).strip() or type(error).__name__).splitlines()[0]
+    plain = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in said)
+    return plain if len(plain) <= longest else f"{plain[:longest]}..."
+
+
 def whole_number(value: Any) -> int:
     """The value of a document as a whole number. Raises ValueError if it is none."""
     number = float(value)

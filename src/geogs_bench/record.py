@@ -6,6 +6,7 @@ from pathlib import Path
 from types import UnionType
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
+from geogs.documents import UNUSABLE, read_json
 from geogs.errors import InputError
 from geogs.io.writers.atomic import write_text
 
@@ -177,8 +178,8 @@ def write_json(path: Path, value: Any) -> None:
 def read_record(path: Path) -> Record | None:
     """Read what :func:`write_json` wrote; none where there is nothing or it is damaged."""
     try:
-        return read_dataclass(Record, json.loads(path.read_text(encoding="utf-8")))
-    except (OSError, ValueError, TypeError, KeyError, InputError):
+        return read_dataclass(Record, read_json(path))
+    except (InputError, *UNUSABLE):
         return None
 
 

@@ -1,7 +1,6 @@
 """Reading the folder that ``geogs run`` or ``geogs reconstruct`` leaves."""
 
 import csv
-import json
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float64
 
+from geogs.documents import UNUSABLE, read_json, read_text
 from geogs.errors import InputError
 from geogs.evaluation.surface import Surface, read_surface
 from geogs.geometry.camera import Camera
@@ -62,10 +62,10 @@ class ResultFolder:
     def summary(self) -> dict[str, Any]:
         """``summary.json``. Raises InputError if it is missing or damaged."""
         file = self.path / "summary.json"
-        try:
-            return json.loads(file.read_text(encoding="utf-8"))
-        except (OSError, ValueError) as error:
-            raise InputError(f"{file} cannot be read ({error}); was the run cut off?") from error
+        summary = read_json(file)
+        if not isinstance(summary, dict):
+            raise InputError(f"{file} is damaged; it holds no summary of a run.")
+        return summary
 
     @cached_property
     def camera(self) -> Camera:
@@ -116,18 +116,22 @@ class ResultFolder:
         return read_tum_trajectory(file) if file.is_file() else None
 
     def uncertainty(self) -> FrameStates | None:
-        """``trajectory_uncertainty.csv``; none where it is not there."""
+        """``trajectory_uncertainty.csv``; none where it is not there.
+
+        Raises InputError if it is damaged.
+        """
         file = self.path / "trajectory_uncertainty.csv"
         if not file.is_file():
             return None
-        with file.open(encoding="utf-8", newline="") as lines:
-            rows = list(csv.DictReader(lines))
-        sigma = [float(row["sigma_position"] or "inf") for row in rows]
-        return FrameStates(
-            np.array([float(row["timestamp"]) for row in rows]),
-            np.array([row["state"] for row in rows]),
-            np.array(sigma),
-        )
+        try:
+            rows = list(csv.DictReader(read_text(file).splitlines()))
+            return FrameStates(
+                np.array([float(row["timestamp"]) for row in rows]),
+                np.array([row["state"] or "" for row in rows]),
+                np.array([float(row["sigma_position"] or "inf") for row in rows]),
+            )
+        except (csv.Error, *UNUSABLE):
+            raise InputError(f"{file} is damaged; run again to write it anew.") from None
 
     def snapshots(self) -> list[tuple[float, Path]]:
         """Folders of the map after so many seconds, in order of time."""

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from geogs.documents import UNUSABLE, read_json
 from geogs.errors import InputError
 from geogs.io.writers.atomic import prepare_output_folder
 from geogs_bench.record import Cost, Provenance, Record, read_dataclass, read_record, write_json
@@ -42,9 +43,10 @@ def config_hash(command: Command, settings: Mapping[str, object]) -> str:
 def completed_run(folder: Path, source: Path, digest: str) -> CompletedRun | None:
     """The run that a folder holds, if it is one of this source with these settings."""
     try:
-        values = json.loads((folder / _RUN_FILE).read_text(encoding="utf-8"))
-        run = read_dataclass(CompletedRun, values)
-    except (OSError, ValueError, TypeError, KeyError, InputError):
+        run = read_dataclass(CompletedRun, read_json(folder / _RUN_FILE))
+    except (InputError, *UNUSABLE):
+        return None
+    if not isinstance(run.provenance, Provenance):
         return None
     fits = run.source == str(source.resolve()) and run.provenance.config_hash == digest
     return run if fits else None

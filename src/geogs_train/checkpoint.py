@@ -10,6 +10,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
+from geogs.documents import UNUSABLE, in_short
 from geogs.errors import InputError
 from geogs.io.writers.atomic import atomic_file
 from geogs_train.trainer import Trainer
@@ -52,8 +53,9 @@ def read_options(out: Path, kind: type[T]) -> T:
     header, _ = _read(out, with_tensors=False)
     try:
         return _revived(kind, json.loads(header["options"]))
-    except AttributeError as error:
-        raise InputError(f"The checkpoint in {out} is of another network ({error}).") from error
+    except UNUSABLE as error:
+        reason = in_short(error)
+        raise InputError(f"The checkpoint in {out} is of another network ({reason}).") from error
 
 
 def load_checkpoint(trainer: Trainer, out: Path) -> None:
@@ -103,7 +105,7 @@ def _read(out: Path, with_tensors: bool) -> tuple[dict[str, str], dict[str, Tens
             names = file.keys() if with_tensors else ()
             header, tensors = file.metadata() or {}, {n: file.get_tensor(n) for n in names}
     except (SafetensorError, OSError) as error:
-        raise InputError(f"The checkpoint in {out} is damaged ({error}).") from error
+        raise InputError(f"The checkpoint in {out} is damaged ({in_short(error)}).") from error
     if not header.keys() >= {"step", "progress", "options"}:
         raise InputError(f"{path} is no checkpoint of a training run.")
     return header, tensors

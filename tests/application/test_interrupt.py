@@ -36,12 +36,20 @@ def test_the_second_signal_names_the_way_on():
     assert str(quits.value) == WAY.strip()
 
 
+def test_of_blocks_in_blocks_the_inner_one_names_the_way_on():
+    inner = full_memory_in_a_sentence(lambda: WAY)
+    with pytest.raises(KeyboardInterrupt) as quits, full_memory_in_a_sentence(), inner:
+        raise KeyboardInterrupt
+    assert str(quits.value) == WAY.strip()
+
+
 @pytest.mark.parametrize(
     ("error", "said"),
     [
         (torch.cuda.OutOfMemoryError("tried to allocate"), "The memory of the GPU is full"),
         (RuntimeError("CUDA error: unspecified launch failure\nmore"), "The GPU failed"),
         (RuntimeError("CUDA error: device not ready"), "The GPU failed"),
+        (torch.AcceleratorError("CUDA error: an illegal memory access (Xid 31)"), "The GPU failed"),
     ],
 )
 def test_a_gpu_that_fails_is_told_with_the_way_on(error, said):

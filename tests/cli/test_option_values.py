@@ -6,11 +6,13 @@ from collections.abc import Callable, Sequence
 
 import pytest
 
-from geogs.cli import demo, doctor, eval, export, mesh, reconstruct, run, scale, synth
+from geogs.cli import demo, doctor, eval, export, fleet, mesh, reconstruct, run, scale, synth, view
 from geogs.cli.options import parse_options
 from geogs.config.leaves import Leaf, leaves
 from geogs.config.setting import Positional, Range
 from geogs.errors import GeogsError, InputError
+from geogs_bench.cli import BenchOptions
+from geogs_train.cli import TrainDepthOptions, TrainOptions
 
 Parse = Callable[[Sequence[str]], object]
 
@@ -33,6 +35,11 @@ COMMANDS: dict[str, tuple[type, Parse, list[str]]] = {
         synth.SynthOptions, argv, "synth", synth._defaults), ["out"]),
     "demo": (demo.DemoOptions, plain(demo.DemoOptions, "demo"), []),
     "doctor": (doctor.DoctorOptions, plain(doctor.DoctorOptions, "doctor"), []),
+    "fleet": (fleet.FleetOptions, fleet.parse, ["v.mp4"]),
+    "view": (view.ViewOptions, plain(view.ViewOptions, "view"), ["out"]),
+    "bench": (BenchOptions, plain(BenchOptions, "bench"), ["replica"]),
+    "train flow": (TrainOptions, plain(TrainOptions, "train"), ["flow", "out"]),
+    "train depth": (TrainDepthOptions, plain(TrainDepthOptions, "train"), ["depth", "out"]),
 }  # fmt: skip
 """Options, what reads them, and what is needed beside the one that is looked at."""
 

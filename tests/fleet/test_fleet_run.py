@@ -7,8 +7,8 @@ import time
 from pathlib import Path
 
 import pytest
-from cluster_nodes import add_node, simulated_cluster
 
+from cluster_nodes import add_node, simulated_cluster
 from geogs.errors import InputError
 from geogs.fleet.progress import FleetProgress
 from geogs.fleet.run import run_fleet

@@ -1,5 +1,6 @@
 """Files here and elsewhere; elsewhere is fsspec's file system in memory."""
 
+import os
 import uuid
 
 import pytest
@@ -26,6 +27,12 @@ def test_text_is_read_as_written_until_it_is_deleted(place):
     file.delete()
     file.delete()
     assert file.read() is None
+
+
+@pytest.mark.parametrize("make", [os.mkfifo, os.mkdir])
+def test_what_is_no_plain_file_holds_no_text_and_is_not_waited_for(tmp_path, make):
+    make(tmp_path / "source.json")
+    assert (Place(str(tmp_path)) / "source.json").read() is None
 
 
 def test_a_folder_comes_back_as_it_went(tmp_path):

@@ -18,8 +18,10 @@ from safetensors import SafetensorError
 from safetensors.torch import load, save
 
 from geogs.application.checkpoint_folder import FORMAT, CheckpointFolder
+from geogs.application.machine import is_gpu_failure
 from geogs.application.progress import RunProgress
 from geogs.application.records import pack, schema, unpack
+from geogs.documents import UNUSABLE, in_short
 from geogs.errors import InputError, OutputError
 from geogs.keyframes.archive import Archive, SettledArchive
 from geogs.version import __version__
@@ -27,8 +29,7 @@ from geogs.version import __version__
 S = TypeVar("S")
 
 _UNUSABLE = (
-    OSError, InputError, SafetensorError, ValueError, TypeError, LookupError, ArithmeticError,
-    MemoryError, RuntimeError,
+    OSError, InputError, SafetensorError, MemoryError, RuntimeError, *UNUSABLE,
 )  # fmt: skip
 """What reading a file may end with that somebody made up."""
 
@@ -116,7 +117,9 @@ class SavedState(Generic[S]):
         try:
             yield
         except _UNUSABLE as error:
-            reason = (str(error) or type(error).__name__).splitlines()[0]
+            if is_gpu_failure(error):
+                raise  # the checkpoint is well
+            reason = in_short(error)
             raise InputError(
                 f"{self._folder.path} cannot be used ({reason}); start anew without --resume."
             ) from error

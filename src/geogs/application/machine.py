@@ -8,6 +8,7 @@ from pathlib import Path
 
 import torch
 
+from geogs.documents import in_short
 from geogs.errors import DeviceError
 from geogs.gpu.kernels import prepare_kernels
 from geogs.gpu.source import PACKAGE
@@ -33,19 +34,27 @@ def full_memory_in_a_sentence(way_on: Callable[[], str] = str) -> Iterator[None]
     """Inside, errors of a GPU that fails or is full become a DeviceError with the remedy.
 
     ``way_on`` gives a sentence on how to go on with the work, behind a space, or nothing; a second
-    Ctrl-C says it, too.
+    Ctrl-C says it, too. Where one such block is in another, the inner one says the way.
     """
     try:
         yield
     except torch.cuda.OutOfMemoryError as error:
         raise DeviceError(f"The memory of the GPU is full; {REMEDY}.{way_on()}") from error
-    except KeyboardInterrupt:
-        raise KeyboardInterrupt(way_on().strip()) from None
-    except RuntimeError as error:  # of a class of its own in some versions of PyTorch only
-        said = str(error).splitlines() or [""]
-        if not any(word in said[0] for word in _GPU_FAILS):
+    except KeyboardInterrupt as interrupt:
+        way = way_on().strip()
+        raise KeyboardInterrupt(*((way,) if way else interrupt.args)) from None
+    except RuntimeError as error:
+        if not is_gpu_failure(error):
             raise
-        raise DeviceError(f"The GPU failed ({said[0][:200].rstrip('.')}).{way_on()}") from error
+        raise DeviceError(f"The GPU failed ({in_short(error).rstrip('.')}).{way_on()}") from error
+
+
+def is_gpu_failure(error: Exception) -> bool:
+    """Whether an error came from a GPU that fails or is full, not from what was computed on it."""
+    if isinstance(error, torch.cuda.OutOfMemoryError):
+        return True
+    # Of a class of its own in some versions of PyTorch only.
+    return isinstance(error, RuntimeError) and any(w in in_short(error) for w in _GPU_FAILS)
 
 
 def device_summary(device: torch.device) -> dict[str, object]:

@@ -7,7 +7,7 @@ from pathlib import Path
 from geogs.application.interrupt import Stop
 from geogs.application.progress import RunProgress
 from geogs.config import ReconstructConfig
-from geogs.documents import expanded, read_json
+from geogs.documents import UNUSABLE, expanded, read_json
 from geogs.errors import InputError
 from geogs.io.sources.posed.base import PosedSource
 from geogs.io.sources.posed.colmap import open_colmap
@@ -112,5 +112,5 @@ def _read(note: Path) -> FoundPoses:
         values = read_json(note)
         left_out = tuple(LeftOut(str(o["name"]), str(o["reason"])) for o in values["left_out"])
         return FoundPoses(tuple(map(str, values["placed"])), left_out, float(values["error"]))
-    except (ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{note} is damaged ({error}); leave out --resume.") from error
+    except UNUSABLE as error:
+        raise InputError(f"{note} is damaged; leave out --resume.") from error

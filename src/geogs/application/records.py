@@ -287,7 +287,9 @@ class _Unpacker:
     def _array(self, kind: Any, place: Values, name: str) -> Tensor | np.ndarray:
         if name not in self._arrays or not _is_in(place, ("host", "device")):
             self._wrong(name)
-        made: Any = self._arrays[name]
+        # In memory of its own, aligned as PyTorch does: by how the bytes of a file happen to lie,
+        # some libraries choose another order of additions.
+        made: Any = self._arrays[name].clone()
         if issubclass(kind.array_type, Tensor):
             made = made.to(self._device) if place == "device" else made
         else:

@@ -40,6 +40,7 @@ from geogs.types import Frame
 
 
 @on_one_torch_thread
+@full_memory_in_a_sentence()
 def run(
     settings: RunSettings,
     progress: RunProgress | None = None,
@@ -115,6 +116,7 @@ def _run(
 
 
 @on_one_torch_thread
+@full_memory_in_a_sentence()
 def resume(
     output: Path,
     settings: RunSettings | None = None,

@@ -101,11 +101,14 @@ class SavedResult:
     def mask(self, number: int) -> Bool[np.ndarray, "h w"] | None:
         """The mask of a keyframe, by its place among them; none if it has none.
 
-        Raises InputError if its file is missing or damaged.
+        Raises InputError if its file is missing, damaged or of another size.
         """
         if not self.views.has_mask[number]:
             return None
-        return read_mask(mask_path(self.folder, int(self.views.keyframe_id[number])))
+        path = mask_path(self.folder, int(self.views.keyframe_id[number]))
+        mask = read_mask(path)
+        _check_size(path, mask, self.depth_camera)
+        return mask
 
     @on_one_torch_thread
     def _keyframe(self, number: int) -> RenderedKeyframe:
@@ -117,6 +120,7 @@ class SavedResult:
             mask = torch.from_numpy(stored).to(self.disks.position.device)
         if views.has_images:
             image = read_image(image_path(self.folder, id))
+            _check_size(image_path(self.folder, id), image, self.camera)
         maps = self.renderer.surface(T_cw, mask=mask)
         seconds = float(views.timestamp[number])
         return RenderedKeyframe(id, self.depth_camera, T_cw, *maps, image, seconds, mask)
@@ -132,3 +136,9 @@ def load_result(folder: str | Path, device: torch.device | str = "cpu") -> Saved
     if not (folder / "map.safetensors").is_file():
         raise InputError(f"{folder} holds no result of geogs: there is no map.safetensors in it.")
     return SavedResult(folder, *load_map_views(folder / "map.safetensors", device))
+
+
+def _check_size(path: Path, picture: np.ndarray, camera: Camera) -> None:
+    """Raises InputError if a picture of the result is not of the size that the map says."""
+    if picture.shape[:2] != (camera.height, camera.width):
+        raise InputError(f"{path} is of another size than the result says; was it changed?")

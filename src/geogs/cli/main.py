@@ -22,6 +22,8 @@ EXIT_ERROR = 2
 """Exit code after an error that the user can mend."""
 EXIT_INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells give it (128 + SIGINT)."""
+_GPU_FAILS = ("CUDA error", "CUDA out of memory", "CUDA driver error", "cuDNN error", "NVRTC")
+"""What errors of PyTorch begin with that no command has said in its own words."""
 
 
 @dataclass(frozen=True)
@@ -138,13 +140,29 @@ def _of_the_system(error: Exception) -> str | None:
         return "Too many files are open; raise the limit (ulimit -n)."
     if isinstance(error, OSError) and error.errno == errno.ENOSPC:
         return f"A disk is full ({error.filename or 'of temporary files, see TMPDIR'})."
+    if type(error).__name__ == "OutOfMemoryError" or said.startswith(_GPU_FAILS):
+        first = said.splitlines()[0][:200].rstrip(".") if said else "out of memory"
+        return f"The GPU failed ({first}); --device cpu computes without it."
+    if "no locator available" in said:  # numba's words
+        return "No folder can be written for compiled kernels; name one by NUMBA_CACHE_DIR."
     lacks = ("allocate memory", "start new thread", "failed to map segment", "Insufficient memory")
-    if isinstance(error, MemoryError) or any(words in said for words in lacks):
+    is_told = isinstance(error, MemoryError) or any(words in said for words in lacks)
+    # Libraries that cannot be loaded say so each in its own way.
+    is_unloaded = isinstance(error, ImportError | OSError) and getattr(error, "errno", None) is None
+    if is_told or (is_unloaded and _has_memory_limit()):
         return (
             "The memory is full, or may not be used (ulimit -v); use a smaller --long-edge or "
             "fewer frames, and go on with --resume where there is a checkpoint."
         )
     return None
+
+
+def _has_memory_limit() -> bool:
+    try:
+        import resource
+    except ImportError:  # not on this system
+        return False
+    return resource.getrlimit(resource.RLIMIT_AS)[0] != resource.RLIM_INFINITY
 
 
 def _take_ends_for_interrupts() -> None:

@@ -243,6 +243,10 @@ class Settings:
                 raise InputError(refusal(at + name, value, kind, self))
 
 
+_SHORT = reprlib.Repr()
+_SHORT.maxtuple = 16  # all that a setting has
+
+
 def refusal(name: str, value: object, kind: Kind, group: object = None) -> str:
     """The sentence for a value that a setting cannot have."""
     partners = [name for bounds in kind.ranges for name in bounds.partners()]
@@ -250,7 +254,7 @@ def refusal(name: str, value: object, kind: Kind, group: object = None) -> str:
     if group is not None:
         known = [f"{dashed(name)} is {getattr(group, name)}" for name in partners]
     beside = f" ({', '.join(known)})" if known else ""
-    given = reprlib.repr(value) if isinstance(value, str | int) else repr(value)
+    given = _SHORT.repr(value) if isinstance(value, str | int | tuple) else repr(value)
     return f"{dashed(name)} is {given}, but must be {kind}{beside}."
 
 

@@ -1,9 +1,10 @@
 """The page of a run: what happened in numbers, and the pictures that need no truth."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from geogs.documents import UNUSABLE
 from geogs.evaluation.duration import duration
 from geogs.evaluation.model_view.records import Model
 from geogs.evaluation.model_view.section import model_html
@@ -23,6 +24,9 @@ PICTURES = {
 """Titles of the pictures that a run leaves in ``report/``, in the order of the page."""
 
 
+Show = Callable[[Any], str]
+
+
 def write_run_page(folder: Path, summary: Mapping[str, Any], model: Model | None = None) -> None:
     """Write ``index.html`` into the folder of the pictures; it holds all that it shows.
 
@@ -34,7 +38,7 @@ def write_run_page(folder: Path, summary: Mapping[str, Any], model: Model | None
     Raises:
         OutputError: it cannot be written.
     """
-    name = str(summary.get("source", "")) or "result"
+    name = _shown(_plain, summary.get("source")) or "result"
     head: list[Section] = [figures(summary, run_figures(summary))]
     head += [HtmlSection(model_html(model))] if model is not None else []
     pictures = [PictureSection(title, folder / file) for file, title in PICTURES.items()]
@@ -47,7 +51,7 @@ def figures(summary: Mapping[str, Any], numbers: list[tuple[str, str]]) -> Figur
     verdict = summary.get("verdict")
     if not isinstance(verdict, Mapping):
         return FiguresSection("", None, numbers)
-    sentence = str(verdict.get("sentence", ""))
+    sentence = _shown(_plain, verdict.get("sentence"))
     return FiguresSection(sentence, bool(verdict.get("is_reliable")), numbers)
 
 
@@ -56,30 +60,44 @@ def run_figures(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
     seconds, rates = summary.get("seconds"), summary.get("frames_per_second")
     total = seconds.get("total") if isinstance(seconds, Mapping) else None
     rate = rates.get("with_final_stages") if isinstance(rates, Mapping) else None
-    shown = [
-        ("frames", _count(summary.get("frames"))),
-        ("keyframes", _count(summary.get("keyframes"))),
-        ("triangles", _count(summary.get("mesh_faces"))),
-        ("disks", _count(summary.get("disks"))),
-        ("time", duration(total) if isinstance(total, int | float) else ""),
-        ("frames/s", f"{rate:.2f}" if isinstance(rate, int | float) else ""),
+    shown: list[tuple[str, Show, object]] = [
+        ("frames", _count, summary.get("frames")),
+        ("keyframes", _count, summary.get("keyframes")),
+        ("triangles", _count, summary.get("mesh_faces")),
+        ("disks", _count, summary.get("disks")),
+        ("time", _time, total),
+        ("frames/s", "{:.2f}".format, rate),
     ]
-    return [(name, text) for name, text in shown if text]
+    return [(name, text) for name, show, value in shown if (text := _shown(show, value))]
 
 
 def run_sections(summary: Mapping[str, Any]) -> list[Section]:
     """Tables of what ``summary.json`` holds: the run, and the seconds of its stages."""
-    facts = [(title, text) for title, key, show in _FACTS if (text := show(summary.get(key))) != ""]
+    facts = [
+        (title, text) for title, key, show in _FACTS if (text := _shown(show, summary.get(key)))
+    ]
     sections: list[Section] = [TableSection("The run", (), facts)]
     seconds = summary.get("seconds")
     if isinstance(seconds, Mapping):
-        rows = [(name, f"{value:.1f}") for name, value in seconds.items()]
+        rows = [(name, _shown("{:.1f}".format, value)) for name, value in seconds.items()]
         sections.append(TableSection("Time", ("stage", "seconds"), rows))
     return sections
 
 
+def _shown(show: Show, value: object) -> str:
+    """A fact of the summary in words; nothing where it is none, or not what a run writes."""
+    try:
+        return "" if value is None else show(value)
+    except UNUSABLE:
+        return ""
+
+
 def _plain(value: object) -> str:
-    return "" if value is None else str(value)
+    return str(value)
+
+
+def _time(value: object) -> str:
+    return duration(value) if isinstance(value, int | float) else ""
 
 
 def _count(value: object) -> str:

@@ -11,20 +11,19 @@ import signal
 import sys
 import time
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any
 
 from geogs.application.settings import RunSettings
 from geogs.errors import GeogsError
 from geogs.evaluation.duration import duration
 from geogs.fleet.places import Place
-from geogs.fleet.row import FILE, Row, numbers_of, row_text
+from geogs.fleet.row import FILE, Row, State, numbers_of, row_text
 from geogs.fleet.sources import FleetSource
 from geogs.fleet.supervise import Ending, Limits, supervise
 from geogs.fleet.work_folder import WorkFolder, fetched
 
 LOG = "run.log"
 CHILD = (sys.executable, "-m", "geogs.fleet.child")
-State = Literal["done", "failed", "crashed"]
 
 
 @dataclass(frozen=True)

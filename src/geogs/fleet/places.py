@@ -5,7 +5,7 @@ from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from geogs.documents import expanded
+from geogs.documents import expanded, read_text
 from geogs.errors import GeogsError, InputError, OutputError
 from geogs.io.writers.atomic import write_text
 
@@ -38,7 +38,7 @@ class Place:
         """
         try:
             if self.path is not None:
-                return self.path.read_text("utf-8-sig")
+                return read_text(self.path) if self.path.is_file() else None
             with self._reached() as (system, path):
                 return str(system.cat_file(path).decode("utf-8-sig"))
         except (FileNotFoundError, NotADirectoryError):

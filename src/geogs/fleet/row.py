@@ -1,12 +1,15 @@
 """What became of one source: a row of the fleet's table."""
 
 import json
+import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from geogs.documents import UNUSABLE
 
+State = Literal["done", "failed", "crashed"]
+"""crashed is worth another attempt: the machine or the process ended, not the work."""
 FILE = "source.json"
 """Name of a row in the folder of its source; it is there once the source is done."""
 
@@ -18,8 +21,7 @@ class Row:
     name: str
     source: str
     """Its address."""
-    state: Literal["done", "failed", "crashed"]
-    """crashed is worth another attempt: the machine or the process ended, not the work."""
+    state: State
     sentence: str
     """The verdict, or what went wrong."""
     settings: str
@@ -51,9 +53,22 @@ def read_row(text: str | None) -> Row | None:
     try:
         given = json.loads(text or "")
         row = Row(**{f.name: given[f.name] for f in fields(Row)})
-        return row if isinstance(row.numbers, dict) and isinstance(row.name, str) else None
+        return row if _is_sound(row) else None
     except UNUSABLE:
         return None
+
+
+def _is_sound(row: Row) -> bool:
+    """Whether everything in a row that was read is of the kind that it should be."""
+    words = (row.name, row.source, row.sentence, row.settings, row.node)
+    numbers = (row.seconds, row.attempts, *row.numbers.values())
+    return (
+        all(isinstance(word, str) for word in words)
+        and row.name.isprintable()
+        and all(isinstance(n, int | float) and math.isfinite(n) for n in numbers)
+        and row.state in get_args(State)
+        and row.is_reliable in (True, False, None)
+    )
 
 
 def numbers_of(summary: Mapping[str, Any]) -> dict[str, float]:

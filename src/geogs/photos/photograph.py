@@ -1,10 +1,12 @@
 """Photographs in a folder: which there are, how large, and by which camera."""
 
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 from geogs.errors import InputError
+from geogs.io.pictures import decoder_noise
 from geogs.io.sources.images import SUFFIXES, image_folder, natural_key
 
 _MAKE, _MODEL, _ORIENTATION, _EXIF_IFD = 0x010F, 0x0110, 0x0112, 0x8769
@@ -85,19 +87,20 @@ def _name(path: Path, root: Path) -> str:
 
 def _photograph(path: Path, root: Path) -> Photograph | None:
     """A picture with what its header says; none where it is damaged."""
-    from PIL import Image, UnidentifiedImageError
+    from PIL import Image
 
     try:
-        with Image.open(path) as picture:
+        with decoder_noise(), warnings.catch_warnings(action="ignore"), Image.open(path) as picture:
             width, height = picture.size
             base = picture.getexif()
             exif = base.get_ifd(_EXIF_IFD)
-    except (OSError, UnidentifiedImageError, SyntaxError, ValueError):
+            own = [base.get(_MAKE), base.get(_MODEL)]
+            own += [exif.get(tag) for tag in (_LENS_MODEL, _FOCAL_LENGTH, _FOCAL_LENGTH_35MM)]
+            words = tuple("" if w is None else str(w).strip("\0 ") for w in own)
+            turns = _turns(base)
+    except Exception:  # whatever a damaged file makes one of its many readers stumble over
         return None
-    own = (base.get(_MAKE), base.get(_MODEL))
-    words = (*own, *(exif.get(tag) for tag in (_LENS_MODEL, _FOCAL_LENGTH, _FOCAL_LENGTH_35MM)))
-    lens = Lens(width, height, tuple("" if w is None else str(w).strip("\0 ") for w in words))
-    return Photograph(path, _name(path, root), lens, _turns(base))
+    return Photograph(path, _name(path, root), Lens(width, height, words), turns)
 
 
 def _turns(exif: Mapping[int, object]) -> int:

@@ -100,7 +100,7 @@ class PriorCard:
         signs = {"+": 1.0, "-": -1.0}
         if len(text) != 6 or text[1::2] != "xyz" or not set(text[::2]) <= set(signs):
             raise InputError(
-                f"The card {self.name} is wrong: normal_axes {self.normal_axes} is not like +x-y-z."
+                f"The card {self.name} is wrong: normal_axes {text[:40]!r} is not like +x-y-z."
             )
         return (signs[text[0]], signs[text[2]], signs[text[4]])
 
@@ -131,7 +131,7 @@ def load_card(name: str) -> PriorCard:
     return _from_settings(name, content)
 
 
-def _from_settings(name: str, content: dict[str, Any]) -> PriorCard:
+def _from_settings(name: str, content: dict[Any, Any]) -> PriorCard:
     known = {f.name for f in fields(PriorCard)}
     unknown = [str(key)[:40] for key in content if key not in known]
     if unknown:

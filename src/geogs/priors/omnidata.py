@@ -78,10 +78,10 @@ def _weights(path: Path) -> dict[str, Tensor]:
             "state_dict alone: torch.save({'state_dict': torch.load(FILE, weights_only=False)"
             "['state_dict']}, NEW)."
         ) from error
-    except (RuntimeError, EOFError, OSError, ValueError) as error:
+    except Exception as error:  # whatever a damaged file makes the reader stumble over
         raise InputError(f"{path} cannot be read as a checkpoint of PyTorch.") from error
     content = content.get("state_dict", content) if isinstance(content, dict) else {}
-    named = {k.removeprefix(PREFIX): v for k, v in content.items() if isinstance(v, Tensor)}
+    named = {str(k).removeprefix(PREFIX): v for k, v in content.items() if isinstance(v, Tensor)}
     if not named:
         raise InputError(f"{path} holds no weights.")
     return named

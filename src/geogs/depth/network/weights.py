@@ -9,6 +9,7 @@ from safetensors import safe_open
 from geogs.depth.network.calibration import DepthCalibration
 from geogs.depth.network.model import DepthNetwork
 from geogs.depth.network.options import DepthNetworkOptions
+from geogs.documents import in_short
 from geogs.errors import InputError
 
 
@@ -37,6 +38,8 @@ def load_depth_network(path: Path) -> TrainedDepth:
         network.load_state_dict(tensors)
         found = TrainedDepth(network, DepthCalibration(**calibration))
     except Exception as error:
-        raise InputError(f"{path} does not hold weights of our depth network ({error}).") from error
+        raise InputError(
+            f"{path} does not hold weights of our depth network ({in_short(error)})."
+        ) from error
     network.eval().requires_grad_(False)
     return found

@@ -13,6 +13,7 @@ from jaxtyping import Float, UInt8
 from safetensors import safe_open
 from torch import Tensor
 
+from geogs.documents import in_short
 from geogs.errors import InputError
 from geogs.keyframes.grid import SampleGrid
 from geogs.tracking.flow.base import FlowMatch, FlowOperator, Memories
@@ -217,7 +218,9 @@ def load_network(path: Path) -> FlowNetwork:
         network = FlowNetwork(NetworkOptions(**{**values, "levels": tuple(values["levels"])}))
         network.load_state_dict(tensors)
     except Exception as error:
-        raise InputError(f"{path} does not hold weights of our flow network ({error}).") from error
+        raise InputError(
+            f"{path} does not hold weights of our flow network ({in_short(error)})."
+        ) from error
     return network.eval().requires_grad_(False)
 
 

@@ -33,10 +33,10 @@ def open_dtu(folder: Path) -> PosedSet:
     world, scale = _read_matrices(_cameras(folder))
     images = _pictures(folder, ("image", "images", "rgb"))
     masks = _pictures(folder, ("mask", "masks"))
-    if len(images) < len(world):
+    if len(images) <= max(world):
         raise InputError(
             f"{folder} has {len(images)} images but {_cameras(folder).name} holds {len(world)} "
-            f"cameras; complete the images."
+            f"cameras, the last of number {max(world)}; complete the images."
         )
     by_number = {_number(path): path for path in masks}
     decomposed = [decompose(matrix[:3]) for matrix in world.values()]
@@ -88,7 +88,7 @@ def _read_matrices(
             matrices = {name: archive[name].astype(np.float64) for name in archive.files}
     except Exception as error:  # a damaged archive raises whatever zipfile, zlib or numpy find
         raise InputError(f"{path} is damaged or no NumPy archive; copy it again.") from error
-    found = (re.fullmatch(r"world_mat_(\d+)", name) for name in matrices)
+    found = (re.fullmatch(r"world_mat_(0|[1-9][0-9]{0,8})", name) for name in matrices)
     numbers = sorted(int(match[1]) for match in found if match)
     shapes = {matrices[f"world_mat_{i}"].shape for i in numbers}
     scale = matrices.get(f"scale_mat_{numbers[0]}") if numbers else None

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from geogs.errors import InputError
+from geogs.errors import GeogsError, InputError
 from geogs.io.poses import FRAMES_PER_SECOND
 from geogs.io.sources.base import RawFrame
 from geogs.io.sources.calibration import Calibration
@@ -103,7 +103,7 @@ class Bag:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[Any]:
-    """A bag, closed at the end. Raises InputError for what its reader finds wrong at opening."""
+    """A bag, closed at the end. Raises InputError for what its reader stumbles over."""
     try:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
@@ -121,6 +121,10 @@ def _opened(path: Path) -> Iterator[Any]:
         ) from error
     try:
         yield bag
+    except (GeogsError, MemoryError):
+        raise
+    except Exception as error:  # what an index that opened well may still lead its reader to
+        raise InputError(f"{path} is damaged as a recording of ROS; copy it again.") from error
     finally:
         bag.close()
 

@@ -1,0 +1,51 @@
+"""Where numba keeps the kernels that it has compiled for the CPU.
+
+It takes the folder of a kernel's source, or else one of the user's; where both can only be read, as
+in many containers, it raises an error.
+"""
+
+import os
+import stat
+import tempfile
+from pathlib import Path
+
+VARIABLE = "NUMBA_CACHE_DIR"
+"""By which numba is told of another folder; what the user says there stays."""
+
+
+def find_kernel_folder() -> None:
+    """Where numba would find no folder to write into, name one among the temporary files.
+
+    It has to be called before numba is imported.
+    """
+    if VARIABLE in os.environ:
+        return
+    home = os.path.expanduser("~")
+    cache = os.environ.get("XDG_CACHE_HOME") or os.path.join(home, ".cache")
+    usual = (Path(__file__).parent, Path(cache) / "numba")
+    if not any(can_be_written(folder) for folder in usual):
+        os.environ[VARIABLE] = str(temporary_folder())
+
+
+def can_be_written(folder: Path) -> bool:
+    """Whether files can be made in a folder, which is made itself if need be."""
+    there = next((f for f in (folder, *folder.parents) if f.exists()), None)
+    return there is not None and there.is_dir() and os.access(there, os.W_OK | os.X_OK)
+
+
+def temporary_folder() -> Path:
+    """The same for all processes of a user, if nobody else can write there; else a new one.
+
+    Who can write where kernels are kept can have programs run.
+    """
+    user = os.getuid() if hasattr(os, "getuid") else 0
+    folder = Path(tempfile.gettempdir()) / f"geogs-kernels-{user}"
+    try:
+        folder.mkdir(mode=0o700, exist_ok=True)
+        status = folder.lstat()
+        is_own = stat.S_ISDIR(status.st_mode) and status.st_uid == user
+        if is_own and not status.st_mode & 0o077:
+            return folder
+    except OSError:
+        pass
+    return Path(tempfile.mkdtemp(prefix="geogs-kernels-"))

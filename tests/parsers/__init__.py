@@ -1,0 +1,22 @@
+"""Every parser of files from outside: a small good example of each, and what reads it."""
+
+from parsers.base import Parser
+from parsers.calibrations import calibrations
+from parsers.depths import depths
+from parsers.fleets import fleets
+from parsers.networks import networks
+from parsers.photographs import photographs
+from parsers.posed import posed
+from parsers.recordings import recordings
+from parsers.results import results
+from parsers.states import states
+from parsers.surfaces import surfaces
+
+
+def parsers() -> dict[str, Parser]:
+    """All of them by name."""
+    groups = (
+        calibrations, recordings, depths, photographs, posed, results, surfaces, states,
+        fleets, networks,
+    )  # fmt: skip
+    return {name: parser for group in groups for name, parser in group().items()}

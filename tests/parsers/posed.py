@@ -1,0 +1,64 @@
+"""Images with known poses."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import mutations
+from geogs.io.poses import read_poses
+from geogs.io.sources.posed.sniff import open_posed_source
+from parsers.base import Damage, Parser, tiny_room
+from posed_layouts import (
+    write_colmap_binary,
+    write_colmap_text,
+    write_dtu,
+    write_nerfstudio,
+    write_replica,
+    write_room_images,
+    write_scannet,
+    write_seven_scenes,
+    write_tum,
+)
+
+
+def posed() -> dict[str, Parser]:
+    """By the formats that ``geogs reconstruct`` reads."""
+
+    def use(folder: Path) -> object:
+        source = open_posed_source(folder)
+        return [image.image for image in source], source.points
+
+    room = tiny_room()
+
+    def with_images(write: Callable[..., object]) -> Callable[[Path], object]:
+        def both(folder: Path) -> None:
+            names = write_room_images(room, folder / "images", "{:d}.png")
+            write(room, folder / "sparse" / "0", names)
+
+        return both
+
+    model = tuple(f"sparse/0/{name}" for name in ("cameras", "images", "points3D"))
+    layouts: dict[str, tuple[Callable[[Path], object], tuple[str, ...], Damage]] = {
+        "colmap-text": (with_images(write_colmap_text),
+                        tuple(f"{name}.txt" for name in model), mutations.text),
+        "colmap-binary": (with_images(write_colmap_binary),
+                          tuple(f"{name}.bin" for name in model), mutations.binary),
+        "nerfstudio": (lambda f: write_nerfstudio(room, f), ("transforms.json",),
+                       mutations.json_text),
+        "dtu": (lambda f: write_dtu(room, f), ("cameras.npz",), mutations.archive),
+        "dtu-masks": (lambda f: write_dtu(room, f), ("mask/000.png", "image/000000.png"),
+                      mutations.binary),
+        "replica-poses": (lambda f: write_replica(room, f), ("traj.txt",), mutations.text),
+        "replica-camera": (lambda f: write_replica(room, f), ("cam_params.json",),
+                           mutations.json_text),
+        "tum-poses": (lambda f: write_tum(room, f), ("groundtruth.txt",), mutations.text),
+        "seven-scenes": (lambda f: write_seven_scenes(room, f), ("frame-000001.pose.txt",),
+                         mutations.text),
+        "scannet": (lambda f: write_scannet(room, f),
+                    ("pose/0.txt", "intrinsic/intrinsic_color.txt"), mutations.text),
+    }  # fmt: skip
+    found = {k: Parser(write, files, damage, use) for k, (write, files, damage) in layouts.items()}
+    found["true-poses"] = Parser(
+        lambda f: write_tum(room, f), ("groundtruth.txt",), mutations.text,
+        lambda f: read_poses(f / "groundtruth.txt"),
+    )  # fmt: skip
+    return found
