@@ -113,6 +113,7 @@ def world(drift: float):
     graph = SimpleNamespace(edges=edges, retire=lambda keep: {})
     tracker = Tracker.__new__(Tracker)  # nothing of it but its keyframes and their edges
     tracker.keyframes, tracker.graph, tracker.held = keyframes, graph, frozenset()
+    tracker.is_metric = False
     return tracker, loop
 
 

@@ -21,7 +21,7 @@ class Clip:
     """Twelve images of their own number, one in ``SECONDS``."""
 
     kind, name, width, height, fps = "clip", "clip", 64, 48, 1 / SECONDS
-    quarter_turns, length, calibration, paths = 0, 12, None, ()
+    quarter_turns, length, calibration, paths, has_depth = 0, 12, None, (), False
 
     def read(self, start, stop, stride):
         for n in range(start, 12 if stop is None else stop, stride):
