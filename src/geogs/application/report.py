@@ -53,6 +53,6 @@ def shown_views(renders: Sequence[RenderedKeyframe]) -> list[ShownView]:
         return renders[number].image
 
     return [
-        ShownView(r.timestamp, np.linalg.inv(r.T_cw.numpy()), partial(image, i))
+        ShownView(r.timestamp, np.linalg.inv(r.T_cw.cpu().numpy()), partial(image, i))
         for i, r in enumerate(renders)
     ]
