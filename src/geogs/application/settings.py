@@ -24,13 +24,13 @@ class RunSettings(Settings):
     """How to compute."""
     output: Annotated[Path | None, Basic("-o")] = None
     """Folder for the results; out/NAME if none is given."""
-    map: Annotated[Path | None, Basic()] = None
-    """Folder of an earlier result of the same place and camera: localise in its map, which stays
-    where it is, and add to it."""
     device: str = "auto"
     """Where to compute: auto (a GPU where there is one), cpu, cuda or cuda:1; see geogs doctor."""
     checkpoint_every: Weight = 60.0
     """Seconds between two checkpoints, from which --resume goes on; 0 makes none."""
+    map: Annotated[Path | None, Basic()] = None
+    """Folder of an earlier result of the same place and camera: localise in its map, which stays
+    where it is, and add to it."""
     scale_from: Annotated[str, Basic()] = ""
     """What is known in metres, so that the result is in metres: FRAME:u1,v1,u2,v2=1.25m (pixels of
     an image as it came; several with semicolons), aruco:DICT_5X5_50:0.12 (tags whose side is so
