@@ -29,7 +29,9 @@ from geogs.tracking.segments import Segments
 from geogs.types import Frame
 from geogs.version import __version__
 
-pytestmark = pytest.mark.system
+# One process runs them all: a room that they share is changed for a moment, and a run of another
+# process that reads it just then gets another result.
+pytestmark = [pytest.mark.system, pytest.mark.xdist_group("resumed-room")]
 
 GEOGS = [sys.executable, "-m", "geogs.cli.main"]
 FRAMES = 26

@@ -118,7 +118,7 @@ def test_no_truth_and_no_mesh_are_sentences(tmp_path):
     with pytest.raises(InputError, match="no mesh to score"):
         score(scene, "reconstruct", ResultFolder(tmp_path / "out"), 0)
     (tmp_path / "out" / "summary.json").write_text("{")
-    with pytest.raises(InputError, match="cannot be read"):
+    with pytest.raises(InputError, match="is damaged"):
         _ = ResultFolder(tmp_path / "out").summary
 
 
