@@ -10,8 +10,11 @@ from geogs.config.setting import Basic, Positional, Settings
 from geogs.errors import InputError
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from geogs.application.saved_result import SavedResult
     from geogs.application.scale.scene import FoundScale, MeasurableScene
+    from geogs.types import MapSnapshot
 
 _STAGES = ("", "online/", "adjusted/")
 
@@ -90,25 +93,29 @@ def _measurable(result: "SavedResult") -> "MeasurableScene":
 
 def _scale_files(result: "SavedResult", factor: float) -> None:
     """All files of a result that hold lengths, multiplied."""
-    folder = result.folder
-    splats = _scaled_splats(result, factor)
-    _scale_map(result, factor)
+    from geogs.io.writers.ply import write_splats
+
+    folder, disks = result.folder, result.disks
+    world = replace(disks, position=factor * disks.position, scale=factor * disks.scale)
+    colours = _splat_colours(folder / "splats.ply", len(disks))
+    _scale_map(result, world, factor)
     for stage in _STAGES:
         for name in ("trajectory.tum", "keyframes.tum"):
             _scale_poses(folder / f"{stage}{name}", factor)
         _scale_mesh(folder / f"{stage}mesh.ply", factor)
     _scale_mesh(folder / "depth_fusion" / "mesh.ply", factor)
     _scale_table(folder / "trajectory_uncertainty.csv", factor)
-    splats()
+    if colours is not None:
+        write_splats(folder / "splats.ply", world, colours)
 
 
-def _scale_map(result: "SavedResult", factor: float) -> None:
+def _scale_map(result: "SavedResult", world: "MapSnapshot", factor: float) -> None:
+    """``map.safetensors`` with the disks as they are in metres."""
     from geogs.io.writers.map_views import save_map_with_views
     from geogs.io.writers.native import load_map_file
 
-    path, views, disks = result.folder / "map.safetensors", result.views, result.disks
+    path, views = result.folder / "map.safetensors", result.views
     said = {k: v for k, v in load_map_file(path).metadata.items() if k != "views"}
-    world = replace(disks, position=factor * disks.position, scale=factor * disks.scale)
     T_cw = views.T_cw.copy()
     T_cw[:, :3, 3] *= factor
     # A map in the world's own frame stays in it; another keeps its digits in its own unit.
@@ -123,33 +130,30 @@ def _scale_map(result: "SavedResult", factor: float) -> None:
     save_map_with_views(path, world, moved, said)
 
 
-def _scaled_splats(result: "SavedResult", factor: float) -> Any:
-    """What writes the splats again, with the colours that they have now."""
+def _splat_colours(path: Path, count: int) -> "np.ndarray | None":
+    """The colours of the splats; none where there are none. Raises InputError if they are not as
+    many as the disks, before anything has been changed."""
     import numpy as np
 
     from geogs.io.ply import read_ply
-    from geogs.io.writers.ply import SH_DEGREE_0, write_splats
+    from geogs.io.writers.ply import SH_DEGREE_0
 
-    path, disks = result.folder / "splats.ply", result.disks
     if not path.is_file():
-        return lambda: None
+        return None
     columns = read_ply(path)["vertex"].columns
-    colours = np.stack([columns[f"f_dc_{k}"] for k in range(3)], 1) * SH_DEGREE_0 + 0.5
-    if len(colours) != len(disks):
+    colours: np.ndarray = np.stack([columns[f"f_dc_{k}"] for k in range(3)], 1) * SH_DEGREE_0 + 0.5
+    if len(colours) != count:
         raise InputError(f"{path} has not as many disks as the map; was it changed?")
-    world = replace(disks, position=factor * disks.position, scale=factor * disks.scale)
-    return lambda: write_splats(path, world, colours)
+    return colours
 
 
 def _scale_poses(path: Path, factor: float) -> None:
+    from geogs.evaluation.truth import scaled
     from geogs.io.poses import read_tum_trajectory
     from geogs.io.writers.tum import write_tum_trajectory
 
     if path.is_file():
-        poses = read_tum_trajectory(path)
-        T_wc = poses.T_wc.copy()
-        T_wc[:, :3, 3] *= factor
-        write_tum_trajectory(path, replace(poses, T_wc=T_wc))
+        write_tum_trajectory(path, scaled(read_tum_trajectory(path), factor))
 
 
 def _scale_mesh(path: Path, factor: float) -> None:
@@ -162,17 +166,11 @@ def _scale_mesh(path: Path, factor: float) -> None:
 
 
 def _scale_table(path: Path, factor: float) -> None:
-    """The deviations of places, which are the third column."""
-    from geogs.documents import read_text
     from geogs.io.writers.atomic import write_text
+    from geogs.io.writers.uncertainty import HEADER, moved_rows
 
-    if not path.is_file():
-        return
-    rows = [line.split(",") for line in read_text(path).splitlines()]
-    for row in rows[1:]:
-        if len(row) > 2 and row[2]:
-            row[2] = f"{factor * float(row[2]):.6g}"
-    write_text(path, "\n".join([*(",".join(row) for row in rows), ""]))
+    if path.is_file():
+        write_text(path, "\n".join([HEADER, *moved_rows(path, factor), ""]))
 
 
 def _told(summary: dict[str, Any], found: "FoundScale") -> dict[str, Any]:

@@ -1,6 +1,6 @@
 """True poses of whatever data set there is, and the images that belong to them."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -62,7 +62,7 @@ def scaled(trajectory: Trajectory, factor: float) -> Trajectory:
     """The trajectory in another unit of length."""
     T_wc = trajectory.T_wc.copy()
     T_wc[:, :3, 3] *= factor
-    return Trajectory(trajectory.timestamps, T_wc, trajectory.tracked)
+    return replace(trajectory, T_wc=T_wc)
 
 
 def silhouettes(source: PosedSource) -> list[Silhouette] | None:

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from geogs.geometry.lie import se3_inverse
+from geogs.geometry.lie import quaternion_to_matrix, se3_inverse
 from geogs.geometry.neighbors import nearest_neighbors
 from geogs.geometry.umeyama import umeyama
 from geogs.io.writers.native import load_map_file, save_map
@@ -131,8 +131,6 @@ def is_covered(disks: MapSnapshot, others: MapSnapshot) -> Bool[Tensor, "n"]:
 
 def _axes(disks: MapSnapshot) -> Float[Tensor, "n 3 3"]:
     """Tangents and normal of each disk, as columns."""
-    from geogs.geometry.lie import quaternion_to_matrix
-
     return quaternion_to_matrix(disks.quaternion.double())
 
 

@@ -13,14 +13,13 @@ from jaxtyping import Float64
 from geogs.application.results import write_config
 from geogs.application.saved_result import SavedResult
 from geogs.config import Config
-from geogs.documents import read_text
 from geogs.geometry.camera import Camera
 from geogs.io.writers.atomic import write_text
 from geogs.io.writers.intrinsics import write_intrinsics
 from geogs.io.writers.keyframe_images import image_path, write_image
 from geogs.io.writers.map_views import MapViews, save_map_with_views
 from geogs.io.writers.tum import write_tum_trajectory
-from geogs.io.writers.uncertainty import HEADER
+from geogs.io.writers.uncertainty import HEADER, moved_rows
 from geogs.join.graph import Placement
 from geogs.join.part import PartViews, image_of
 from geogs.join.trajectory import Span, joined_trajectory, keyframe_poses, moved_trajectory
@@ -123,13 +122,4 @@ def _times(parts: Sequence[JoinedPart]) -> Float64[np.ndarray, "n"]:
 def _uncertainty_rows(part: JoinedPart) -> list[str]:
     """The rows of a part's table in the joint time and unit; deviations stay those in the part."""
     path = part.result.folder / "trajectory_uncertainty.csv"
-    if not path.is_file():
-        return []
-    unit, rows = float(part.placement.scale.median()), []
-    for line in read_text(path).splitlines()[1:]:
-        cells = line.split(",")
-        cells[0] = repr(float(cells[0]) + part.span.shift)
-        if len(cells) > 2 and cells[2]:
-            cells[2] = f"{float(cells[2]) / unit:.6g}"
-        rows.append(",".join(cells))
-    return rows
+    return moved_rows(path, 1 / float(part.placement.scale.median()), part.span.shift)

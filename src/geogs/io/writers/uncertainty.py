@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from geogs.documents import read_text
+from geogs.errors import InputError
 from geogs.io.writers.atomic import write_text
 from geogs.types import Trajectory, Uncertainty
 
@@ -28,6 +29,27 @@ def write_uncertainty(path: str | Path, trajectory: Trajectory, known: Uncertain
         numbers = [f"{c[n]:.6g}" if state == "tracked" else "" for c in between]
         rows.append(",".join([repr(float(at[n])), state, *numbers]))
     write_text(path, "\n".join([*rows, ""]))
+
+
+def moved_rows(path: Path, factor: float, shift: float = 0.0) -> list[str]:
+    """The rows of a table, without its header, in another unit of length and ``shift`` seconds
+    later; none where there is no table.
+
+    Raises InputError if it is damaged.
+    """
+    if not path.is_file():
+        return []
+    rows = []
+    try:
+        for line in read_text(path).splitlines()[1:]:
+            cells = line.split(",")
+            cells[0] = repr(float(cells[0]) + shift)
+            if len(cells) > 2 and cells[2]:
+                cells[2] = f"{factor * float(cells[2]):.6g}"
+            rows.append(",".join(cells))
+    except ValueError:
+        raise InputError(f"{path} is damaged; leave it out.") from None
+    return rows
 
 
 def read_tracked(path: Path, timestamps: Float[np.ndarray, "n"]) -> Bool[np.ndarray, "n"]:

@@ -8,9 +8,8 @@ from jaxtyping import Float64
 from geogs.documents import read_text
 from geogs.errors import InputError
 from geogs.io.poses import FRAMES_PER_SECOND
-from geogs.io.sources.calibration_files import read_calibration
-from geogs.io.sources.images import SUFFIXES
 from geogs.io.sources.posed.files import PosedFile, PosedSet
+from geogs.io.sources.scannet import numbered_images, scannet_calibration
 
 
 def is_scannet(folder: Path) -> bool:
@@ -20,19 +19,13 @@ def is_scannet(folder: Path) -> bool:
 
 def open_scannet(folder: Path) -> PosedSet:
     """Read a scene; names count as numbers, padded with zeros or not."""
-    intrinsic = folder / "intrinsic" / "intrinsic_color.txt"
-    calibration = read_calibration(intrinsic) if intrinsic.is_file() else None
+    calibration = scannet_calibration(folder)
     poses = {
         int(path.stem): path for path in (folder / "pose").glob("*.txt") if path.stem.isdecimal()
     }
-    images = sorted(
-        (int(path.stem), path)
-        for path in (folder / "color").iterdir()
-        if path.stem.isdecimal() and path.suffix.lower() in SUFFIXES
-    )
     files = tuple(
         PosedFile(path, _read_pose(poses[k]), calibration, None, k / FRAMES_PER_SECOND)
-        for k, path in images
+        for k, path in numbered_images(folder)
         if k in poses
     )
     return PosedSet("scannet", folder.resolve().name, files, scene_scale="metres")
