@@ -18,7 +18,7 @@ from geogs.io.writers.atomic import prepare_output_folder, write_text
 from geogs.io.writers.intrinsics import write_intrinsics
 from geogs.io.writers.map_views import save_map_with_views
 from geogs.io.writers.ply import write_mesh, write_splats
-from geogs.io.writers.tum import write_tum_trajectory
+from geogs.io.writers.tum import write_trajectories
 from geogs.io.writers.uncertainty import write_uncertainty
 from geogs.threads import on_one_torch_thread
 
@@ -43,8 +43,7 @@ def write_results(
     output = prepare_output_folder(output)
     remove_former(output, new_stages)
     scene, source, progress = result.scene, result.source, result.progress
-    write_tum_trajectory(output / "trajectory.tum", result.trajectory)
-    write_tum_trajectory(output / "keyframes.tum", result.keyframes)
+    write_trajectories(output, result.trajectory, result.keyframes)
     if result.uncertainty is not None:
         table = output / "trajectory_uncertainty.csv"
         write_uncertainty(table, result.trajectory, result.uncertainty)

@@ -25,7 +25,7 @@ from geogs.io.sources.sniff import Stream, open_source
 from geogs.io.writers.atomic import prepare_output_folder
 from geogs.io.writers.intrinsics import write_intrinsics
 from geogs.io.writers.map_views import save_map_with_views
-from geogs.io.writers.tum import write_tum_trajectory
+from geogs.io.writers.tum import write_trajectories
 from geogs.io.writers.uncertainty import write_uncertainty
 from geogs.mapping.rendered import SurfaceMaps
 from geogs.mesh.types import Mesh
@@ -172,8 +172,7 @@ class Slam(Algorithm):
         if not len(renders):
             raise InputError("There is no map to save yet; no keyframe has been mapped.")
         output, trajectory = prepare_output_folder(folder), self.trajectory()
-        write_tum_trajectory(output / "trajectory.tum", trajectory)
-        write_tum_trajectory(output / "keyframes.tum", self.keyframe_trajectory())
+        write_trajectories(output, trajectory, self.keyframe_trajectory())
         known = self.uncertainty()
         if known is not None:
             write_uncertainty(output / "trajectory_uncertainty.csv", trajectory, known)

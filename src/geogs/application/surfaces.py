@@ -9,7 +9,7 @@ from geogs.application.scene import MappedScene
 from geogs.config import MeshConfig
 from geogs.errors import InputError
 from geogs.io.writers.ply import write_mesh
-from geogs.io.writers.tum import write_tum_trajectory
+from geogs.io.writers.tum import write_trajectories
 from geogs.mesh.extract import extract_mesh
 from geogs.mesh.types import DepthMapView, Mesh
 from geogs.on_demand import OnDemand
@@ -74,7 +74,6 @@ def write_stage(
     """
     with scene.stopwatch(f"{name} results"):
         folder = output / name
-        write_tum_trajectory(folder / "trajectory.tum", scene.trajectory())
-        write_tum_trajectory(folder / "keyframes.tum", scene.keyframe_trajectory())
+        write_trajectories(folder, scene.trajectory(), scene.keyframe_trajectory())
         path = folder / "mesh.ply"
         write_surface(path, scene.renders(), scene.config.mesh, progress, f"{name} mesh")

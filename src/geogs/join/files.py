@@ -18,7 +18,7 @@ from geogs.io.writers.atomic import write_text
 from geogs.io.writers.intrinsics import write_intrinsics
 from geogs.io.writers.keyframe_images import image_path, write_image
 from geogs.io.writers.map_views import MapViews, save_map_with_views
-from geogs.io.writers.tum import write_tum_trajectory
+from geogs.io.writers.tum import write_trajectories
 from geogs.io.writers.uncertainty import HEADER, moved_rows
 from geogs.join.graph import Placement
 from geogs.join.part import PartViews, image_of
@@ -54,8 +54,7 @@ def write_poses(output: Path, parts: Sequence[JoinedPart]) -> Trajectory:
         np.concatenate([keyframe_poses(part.placement) for part in parts]),
         np.ones(sum(len(part.views.timestamp) for part in parts), bool),
     )
-    write_tum_trajectory(output / "trajectory.tum", trajectory)
-    write_tum_trajectory(output / "keyframes.tum", keyframes)
+    write_trajectories(output, trajectory, keyframes)
     rows = [row for part in parts for row in _uncertainty_rows(part)]
     if rows:
         write_text(output / "trajectory_uncertainty.csv", "\n".join([HEADER, *rows, ""]))

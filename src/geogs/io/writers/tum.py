@@ -10,6 +10,12 @@ from geogs.io.writers.atomic import write_text
 from geogs.types import Trajectory
 
 
+def write_trajectories(folder: Path, frames: Trajectory, keyframes: Trajectory) -> None:
+    """``trajectory.tum`` and ``keyframes.tum`` of a result or one of its stages."""
+    write_tum_trajectory(folder / "trajectory.tum", frames)
+    write_tum_trajectory(folder / "keyframes.tum", keyframes)
+
+
 def write_tum_trajectory(path: str | Path, trajectory: Trajectory) -> None:
     """Write every pose, so that reading it again gives the same numbers up to rounding.
 
