@@ -24,7 +24,7 @@ import tempfile
 import threading
 import time
 from collections import Counter
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from soak_checks import differences, wrong_in
@@ -141,7 +141,8 @@ class Soak:
             kills -= number is not None
             after = max(dice.uniform(0.0, 1.0) * seconds, STARTED)
             ending = self._ended(command, number, after, dice.choice(("1", "2", "3")))
-            wrong += ending.wrong((0, 2, 130, -signal.SIGKILL) if number else (0, 2))
+            # Python itself ends by the signal that comes as it shuts down, or amid an exec.
+            wrong += ending.wrong((0, 2, 130, -number) if number else (0, 2))
             is_open = (out / "checkpoint" / "manifest.json").is_file()
             if wrong or ((number is None or not ending.was_hit) and not is_open):
                 return ending, wrong
@@ -192,7 +193,7 @@ def main() -> None:
     for thread in threads:
         thread.join()
     report.seconds = round(time.monotonic() - begin, 1)
-    text = json.dumps(asdict(report), indent=2)
+    text = json.dumps(vars(report), indent=2)
     if options.report is not None:
         options.report.write_text(text + "\n")
     print(text)
