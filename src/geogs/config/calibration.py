@@ -20,13 +20,17 @@ class CalibrationConfig(Settings, group="calibration"):
     frames: Count = 600
     """Frames of the video that are looked at, at most."""
     start_keyframes: Annotated[int, Range(8, 1000)] = 12
-    """Keyframes that are solved first."""
+    """Keyframes of a stretch that are solved first."""
     keyframes: Annotated[int, Range("start_keyframes", 1000)] = 36
-    """Most keyframes that are used; they are added until the focal length is sure enough."""
+    """Most keyframes of a stretch; they are added until the focal length is sure enough."""
     keyframe_flow: Share = 0.025
     """Median motion that makes a frame a keyframe, of the long edge."""
     enough: Share = 0.0021
-    """Relative deviation of the focal length that ends the search early."""
+    """Relative deviation of the focal length from which no more keyframes of a stretch are used."""
+    sure: Share = 0.01
+    """Relative deviation from which no other stretch of the video is asked."""
+    stretches: Count = 4
+    """Stretches of the video that are asked, at most, each after the one before it."""
     too_much: Share = 0.1
     """Relative deviation above which the focal length is not believed and the guess is kept."""
     min_parallax: Share = 0.02

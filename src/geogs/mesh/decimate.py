@@ -13,8 +13,8 @@ MEAN_SHARE = 0.15
 """Of what is allowed, that they may lie away on average: else what is smooth would become facets,
 all of it as far away as may be."""
 _WITNESSES = 10_000
-_SHARES = (0.5, 0.75)
-"""Of its triangles that a mesh is brought to next; the second where the first is too few."""
+_SHARES = (0.5, 0.75, 0.88)
+"""Of its triangles that a mesh is brought to next; the next where the one before is too few."""
 _FEWEST = 200
 """Triangles below which nothing is gained."""
 

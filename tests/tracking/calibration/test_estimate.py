@@ -11,8 +11,9 @@ import tracking_scenes
 from geogs.bundle.lens import Lens, lens_rays
 from geogs.config import CalibrationConfig
 from geogs.geometry.camera import Camera
-from geogs.tracking.calibration.estimate import LEAST_DEVIATION, self_calibrate
+from geogs.tracking.calibration.estimate import self_calibrate
 from geogs.tracking.calibration.keyframes import with_focal
+from geogs.tracking.calibration.sureness import LEAST_DEVIATION
 from geogs.types import Frame
 from tracking_scenes import CAMERA, frames, pose, render
 

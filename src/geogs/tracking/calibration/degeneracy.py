@@ -17,6 +17,8 @@ from geogs.keyframes.grid import SampleGrid
 from geogs.tracking.calibration.keyframes import on_cpu, with_focal
 from geogs.tracking.flow.base import FlowMatch
 
+MAX_COST = 6.0
+"""Mean cost of a match, in variances, above which no pinhole camera explains the flow."""
 PLANAR_SHARE = 0.9
 """Of the matches; where one homography explains so many in every view, the scene is a plane."""
 _TOLERANCE = 1 / 400
@@ -31,6 +33,7 @@ class Degeneracy(Enum):
     STILL = "the camera hardly moves"
     TURNING = "the camera only turns (no parallax)"
     PLANAR = "it shows a single plane"
+    UNEXPLAINED = "no pinhole camera explains its motion"
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,10 @@ from torch import Tensor
 from geogs.config import TrackingConfig
 from geogs.geometry.camera import Camera
 from geogs.keyframes.grid import SampleGrid
+from geogs.tracking.features import surer_flow
 from geogs.tracking.flow.base import FlowMatch, FlowOperator
 from geogs.tracking.flow.filled import filled_flow, filled_positions
+from geogs.tracking.keyframe_choice import calls_for_keyframe
 from geogs.tracking.motion import FlowChain
 from geogs.types import Frame
 
@@ -38,11 +40,14 @@ class ViewGatherer:
     def __init__(
         self, frames: Iterator[Frame], grid: SampleGrid, operator: FlowOperator, motion: float
     ) -> None:
-        """``motion``: pixels of median flow that make a keyframe."""
-        self._frames, self._grid, self._operator, self._motion = frames, grid, operator, motion
-        self._chain = FlowChain(grid, operator, TrackingConfig().min_ncc)
+        """``motion``: median flow that makes a keyframe, of the long edge."""
+        self._frames, self._grid, self._operator = frames, grid, operator
+        self._config = replace(TrackingConfig(), keyframe_flow=motion)
+        self._chain = FlowChain(grid, operator, self._config.min_ncc)
         self.frames = 0
         """Frames taken so far."""
+        self.is_over = False
+        """Whether no frame is left."""
 
     def gather(
         self, views: list[View], count: int, limit: int, tick: Callable[[], None]
@@ -52,9 +57,11 @@ class ViewGatherer:
         The frames begin anew where the view changes at once, with what comes after.
         """
         views = list(views)
+        edge = max(self._grid.camera.width, self._grid.camera.height)
         while len(views) < count and self.frames < limit:
             frame = next(self._frames, None)
             if frame is None:
+                self.is_over = True
                 break
             self.frames += 1
             tick()
@@ -68,7 +75,7 @@ class ViewGatherer:
                     if len(views) >= count // 2:
                         break
                     views = []
-                elif match.flow < self._motion:
+                elif not calls_for_keyframe(self._config, edge, match.flow, match.matched):
                     continue
                 else:
                     step = match.there
@@ -88,17 +95,16 @@ def flows_from_first(
     """Flow from the first view to each later one: chained over the steps and measured again."""
     there: Float[Tensor, "p 2"] = grid.pixels
     encoded = [v.encoded for v in views]
-    _, back_steps = operator.measure(encoded[:-1], encoded[1:], fine=False)
     back = grid.pixels
     flows = []
     for k in range(1, len(views)):
         step = views[k].step
         assert step is not None
-        flow = filled_flow(grid, step)
-        there = there + grid.sample_field(flow, there)
-        back_step = filled_positions(
-            grid, FlowMatch(back_steps.pixels[k - 1][None], back_steps.weight[k - 1][None])
-        )
+        pair = encoded[k - 1], encoded[k]
+        both = operator.measure(pair[:1], pair[1:], fine=False)
+        _, back_match = surer_flow(grid, operator, *pair, *both)
+        there = there + grid.sample_field(filled_flow(grid, step), there)
+        back_step = filled_positions(grid, back_match)
         back = back_step + grid.sample_field(back - grid.pixels, back_step)
         match, reverse = operator.measure(
             [encoded[0]], [encoded[k]], there[None], back[None], fine=True

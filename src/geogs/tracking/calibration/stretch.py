@@ -1,0 +1,97 @@
+"""One stretch of a video whose views are placed and adjusted together with the focal length."""
+
+from collections.abc import Callable
+
+from geogs.config import CalibrationConfig
+from geogs.keyframes.grid import SampleGrid
+from geogs.threads import thread_map
+from geogs.tracking.calibration.degeneracy import MAX_COST, Degeneracy, degeneracy
+from geogs.tracking.calibration.growth import GrowingBundle
+from geogs.tracking.calibration.keyframes import View, ViewGatherer, flows_from_first
+from geogs.tracking.calibration.start import Start, candidates, try_candidate
+from geogs.tracking.calibration.sureness import relative_error
+from geogs.tracking.flow.base import FlowMatch, FlowOperator
+
+LEAST_VIEWS = 4
+
+Report = Callable[[float], None]
+
+
+class Stretch:
+    """Views that follow each other, from where the gatherer is."""
+
+    def __init__(
+        self,
+        grid: SampleGrid,
+        operator: FlowOperator,
+        gatherer: ViewGatherer,
+        config: CalibrationConfig,
+        report: Report,
+    ) -> None:
+        self.grid, self.operator, self.config = grid, operator, config
+        self._gatherer, self._report = gatherer, report
+        self._views: list[View] = []
+        self._done = 0.0
+        edge = max(grid.camera.width, grid.camera.height)
+        self._min_parallax = config.min_parallax * edge
+
+    def _tick(self) -> None:
+        """Every frame is a safe point."""
+        self._report(self._done)
+
+    def _gather(self, count: int) -> bool:
+        """Whether there are more views than before."""
+        before = len(self._views)
+        self._views = self._gatherer.gather(self._views, count, self.config.frames, self._tick)
+        return len(self._views) > before
+
+    def start(self) -> Start | Degeneracy:
+        """The first views that show parallax and depth, placed by the best candidate."""
+        count = max(self.config.start_keyframes, 2 * LEAST_VIEWS)
+        failure = Degeneracy.BLANK
+        while self._gather(count):
+            if len(self._views) < LEAST_VIEWS:
+                return Degeneracy.STILL
+            flows = flows_from_first(self.grid, self.operator, self._views)
+            found = self._solve_start(flows)
+            if isinstance(found, Start):
+                self._done = 0.3
+                return found
+            failure = found
+            # What comes later may show more.
+            self._views = self._views[len(self._views) // 2 :]
+        return failure
+
+    def _solve_start(self, flows: list[FlowMatch]) -> Start | Degeneracy:
+        camera = self.grid.camera
+        wrong = degeneracy(camera, flows, self._min_parallax)
+        if wrong is not None:
+            return wrong
+        starts = thread_map(
+            lambda c: try_candidate(c, flows, self._min_parallax), candidates(camera)
+        )
+        found = [s for s in starts if s is not None]
+        if not found:
+            return Degeneracy.TURNING
+        best = min(found, key=lambda s: s.cost)
+        return best if best.cost <= MAX_COST else Degeneracy.UNEXPLAINED
+
+    def grow(self, start: Start) -> GrowingBundle | None:
+        """Adjust, with more keyframes until the focal length is sure; None if it fails at once."""
+        config, bundle = self.config, GrowingBundle(self.grid, self.operator, self._views, start)
+        best = None
+        while True:
+            for view in self._views[len(bundle) :]:
+                self._tick()
+                if not bundle.place(view):
+                    return best
+            for fine in (False, True):
+                bundle.measure(fine, self._tick)
+                if not bundle.adjust(config.radial):
+                    return best
+            best = bundle
+            self._done = 0.3 + 0.7 * min(1.0, len(bundle) / config.keyframes)
+            if relative_error(bundle) < config.enough or len(bundle) >= config.keyframes:
+                return best
+            if not self._gather(min(len(bundle) + config.start_keyframes, config.keyframes)):
+                return best
