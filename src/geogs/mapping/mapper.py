@@ -21,6 +21,7 @@ from geogs.mapping.keyframe_depths import CANDIDATES, KeyframeDepths
 from geogs.mapping.levelling import light_of
 from geogs.mapping.map_frame import WORLD, MapFrame
 from geogs.mapping.map_update import MapUpdate, plan_update, witness
+from geogs.mapping.near_views import NearViews
 from geogs.mapping.rendered import (
     MapRenderer,
     SurfaceRules,
@@ -35,7 +36,7 @@ from geogs.mapping.training.base import Batch, MapTrainer, TrainingPlace, draw_p
 from geogs.mapping.training.select import map_trainer
 from geogs.mapping.view import MapView
 from geogs.mapping.view_pool import ViewPool
-from geogs.mapping.window import choose_partners, draw_views, views_around
+from geogs.mapping.window import choose_partners, draw_views
 from geogs.on_demand import OnDemand
 from geogs.splat.density import (
     candidate_pixels,
@@ -91,6 +92,7 @@ class Mapper:
         self.pool = ViewPool(self.cameras, config.loss, self.map.device, keyframes.resident)
         self._depths = KeyframeDepths(engine, self.views, config.depth, self.pool, sensor)
         self.mapped: list[int] = []
+        self._near = NearViews(self.views)
         self.trained = TrainingPlace()
         """How far the training over all keyframes is, at each report of its progress."""
         self._given: frozenset[int] = frozenset()
@@ -366,7 +368,7 @@ class Mapper:
         self._depths.estimate([self.views[i] for i in wanted])
 
     def _mapped_around(self, view: MapView, count: int) -> list[MapView]:
-        return views_around(view, [self.views[i] for i in self.mapped], count)
+        return self._near.around(view, self.mapped, count)
 
     def _choose_partners(self, view: MapView) -> None:
         """Photometric partners of a view; it becomes a candidate for those before it."""
