@@ -189,7 +189,8 @@ class LoopDetector:
     def _query(self, id: int) -> Query:
         near, by_pose = self._near(id), tuple(self.candidates(id))
         known = tuple(self._found_near(id))
-        return Query(id, self.keyframes[id].image, near, by_pose, known, self._depths())
+        features = self._search.describe(self.keyframes[id].image)
+        return Query(id, features, near, by_pose, known, self._depths())
 
     def _enter(self, id: int) -> None:
         """Take a keyframe as the latest."""

@@ -5,8 +5,9 @@ from geogs.depth.base import DepthEngine, Progress, silent
 from geogs.depth.sensor import joined
 from geogs.depth.sweep_neighbors import select_sweep_neighbours
 from geogs.mapping.near_views import NearViews
+from geogs.mapping.stored_maps import StoredDepth
 from geogs.mapping.view import MapView
-from geogs.mapping.view_pool import StoredDepth, ViewPool
+from geogs.mapping.view_pool import ViewPool
 
 CANDIDATES = 128
 """Nearest keyframes among which those are looked for that match or check one."""

@@ -181,6 +181,10 @@ class Mapper:
     def map_keyframe(self, keyframe_id: int) -> None:
         """Give a keyframe its depth, carve and grow the map with it, train the window."""
         view = self.views[keyframe_id]
+        trained = [*self.mapped, keyframe_id]
+        drawn = draw_views(trained, self.config.iterations, self.config, self._random)
+        # Old ones have to be read from a file; meanwhile the depth is searched.
+        self.pool.read_ahead({i for ids in drawn for i in ids if i != keyframe_id})
         self._estimate_ahead(keyframe_id)
         self._depths.check([view])
         self.mapped.append(keyframe_id)
@@ -192,8 +196,10 @@ class Mapper:
         if len(self.mapped) > self.config.window:
             left = self.views[self.mapped[-1 - self.config.window]]
             self._insert(left, self.config.disk.fill_confidence)
-        drawn = draw_views(self.mapped, self.config.iterations, self.config, self._random)
-        trainer.train([self._batch(ids) for ids in drawn])
+        batches = [self._batch(ids) for ids in drawn]
+        seen = {v.id for batch in batches for own, others in batch for v in (own, *others)}
+        self.pool.read_ahead(seen)
+        trainer.train(batches)
         if len(self.mapped) % self.config.disk.carve_every == 0:
             self._prune_around(view)
 
