@@ -1,6 +1,6 @@
 """The large parts of one view, in memory and in an archive."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -46,9 +46,6 @@ class StoredDepth:
     """Of the keyframe when its depth was archived."""
     normal: Archived | None = None
     """Half precision; none where the depth came without."""
-    held: DenseDepth | None = field(default=None, metadata={"stored": False})
-    """The depth itself, where it can also stay: on a GPU it is small beside all else there, and
-    bringing it there again takes longer than using it."""
 
     @staticmethod
     def of(depth: DenseDepth, scale: float, archive: Archive) -> "StoredDepth":
@@ -57,7 +54,6 @@ class StoredDepth:
         return StoredDepth(
             archive.put(arrays.depth), archive.put(arrays.confidence), depth.typical, scale,
             None if depth.normal is None else archive.put(depth.normal.half().cpu().numpy()),
-            depth if depth.depth.is_cuda else None,
         )  # fmt: skip
 
     def typical_at(self, scale: float) -> float:
@@ -67,9 +63,6 @@ class StoredDepth:
     def load(self, scale: float, device: torch.device) -> DenseDepth:
         """The depth at another scale of the keyframe."""
         factor, typical = scale / self.scale, torch.tensor(self.typical_at(scale))
-        if self.held is not None:
-            held = self.held
-            return DenseDepth(held.depth * factor, held.confidence, typical, normal=held.normal)
         depth = torch.from_numpy(self.depth.load())
         if factor != 1.0:
             depth = depth * factor

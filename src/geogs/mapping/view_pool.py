@@ -20,6 +20,7 @@ from geogs.keyframes.swap import Swap
 from geogs.losses.multi_view import PhotoView
 from geogs.losses.single_view import OUTSIDE, ViewConstants
 from geogs.mapping.cameras import MapCameras
+from geogs.mapping.held_depths import HeldDepths
 from geogs.mapping.read_ahead import ReadAhead
 from geogs.mapping.stored_maps import StoredDepth, StoredMaps, ViewMaps
 
@@ -59,6 +60,7 @@ class ViewPool:
         self.archive = Archive()
         self._stored: dict[int, StoredMaps] = {}
         self._maps: Swap[int, ViewMaps] = Swap(resident, self._store)
+        self._held = HeldDepths(device)
         self._ahead = ReadAhead(self._load_with_constants)
 
     def add(self, keyframe: Keyframe, mask: Bool[np.ndarray, "h w"] | None = None) -> None:
@@ -117,7 +119,7 @@ class ViewPool:
             return self._at_scale(maps, stored).depth
         if stored.depth is None:
             return None
-        return stored.depth.load(stored.keyframe.scale, self.device)
+        return self._load_depth(stored, stored.depth, stored.keyframe.scale)
 
     def typical_depth(self, id: int) -> float:
         """Median of the dense depth, map units."""
@@ -140,6 +142,7 @@ class ViewPool:
             depth = depth.within(stored.mask)
         if maps is None:
             stored.depth = StoredDepth.of(depth, stored.keyframe.scale, self.archive)
+            self._held.put(id, stored.depth, depth)
             return
         maps.depth, maps.scale, maps.is_depth_stored = depth, stored.keyframe.scale, False
         if maps.constants is not None:
@@ -213,6 +216,7 @@ class ViewPool:
         stored = self._stored[id]
         if not maps.is_depth_stored and maps.depth is not None:
             stored.depth = StoredDepth.of(maps.depth, maps.scale, self.archive)
+            self._held.put(id, stored.depth, maps.depth)
         if not maps.is_render_stored and maps.rendered_depth is not None:
             stored.rendered_depth = self.archive.put(maps.rendered_depth.cpu().numpy())
         maps.is_depth_stored = maps.is_render_stored = True
@@ -232,11 +236,15 @@ class ViewPool:
         maps = ViewMaps(image, photo, normal)
         if stored.depth is not None:
             maps.scale = stored.depth.scale if as_archived else keyframe.scale
-            maps.depth = stored.depth.load(maps.scale, self.device)
+            maps.depth = self._load_depth(stored, stored.depth, maps.scale)
         if stored.rendered_depth is not None:
             rendered = torch.from_numpy(stored.rendered_depth.load())
             maps.rendered_depth = rendered.to(self.device)
         return maps
+
+    def _load_depth(self, stored: StoredMaps, depth: StoredDepth, scale: float) -> DenseDepth:
+        held = self._held.get(stored.keyframe.id, depth, scale)
+        return depth.load(scale, self.device) if held is None else held
 
     def _load_with_constants(self, stored: StoredMaps) -> ViewMaps:
         """The maps of a view that is about to be trained."""
