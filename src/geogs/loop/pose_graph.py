@@ -19,11 +19,11 @@ from torch import Tensor
 from geogs.geometry.lie import (
     retract,
     sim3_adjoint,
-    sim3_exp,
     sim3_inverse,
     sim3_inverse_jacobian,
     sim3_log,
     sim3_scale,
+    sim3_small_adjoint,
 )
 from geogs.loop.block_system import BlockSystem
 from geogs.loop.matched_edges import (
@@ -156,11 +156,10 @@ def relative_jacobians(
     """d error / d xi of source and target (left perturbations), exact.
 
     A motion of the source reaches the error's left through Ad(G), one of the target through
-    Ad(Exp(e)): Jl(e)^-1 Ad(G) and -Jl(e)^-1 Ad(Exp(e)) = -Jr(e)^-1.
+    Ad(Exp(e)): Jl(e)^-1 Ad(G) and -Jl(e)^-1 Ad(Exp(e)) = -Jr(e)^-1 = -(Jl(e)^-1 + ad(e)).
     """
-    reach = torch.cat([sim3_adjoint(relative.G), -sim3_adjoint(sim3_exp(error))], -1)
-    both = sim3_inverse_jacobian(error) @ reach
-    return both[..., :7], both[..., 7:]
+    inverse = sim3_inverse_jacobian(error)
+    return inverse @ sim3_adjoint(relative.G), -(inverse + sim3_small_adjoint(error))
 
 
 def solve(graph: PoseGraph, options: PoseGraphOptions | None = None) -> PoseGraphResult:
