@@ -150,10 +150,15 @@ def to_and_fro(n: int, images: int) -> int:
     return min(n % period, period - n % period)
 
 
-def last_against_first(first: dict[str, float], last: dict[str, float]) -> dict[str, list[float]]:
-    """Milliseconds per keyframe of each stage in the first and the last block, and their ratio."""
+def last_against_first(
+    first: dict[str, float], last: dict[str, float]
+) -> dict[str, list[float | None]]:
+    """Milliseconds per keyframe of each stage in the first and the last block, and their ratio.
+
+    There is none for a stage that was not there at first.
+    """
     both = {k: (first.get(k, 0.0), v) for k, v in last.items()}
-    return {k: [a, b, round(b / a, 2) if a else float("inf")] for k, (a, b) in both.items()}
+    return {k: [a, b, round(b / a, 2) if a else None] for k, (a, b) in both.items()}
 
 
 def follow(

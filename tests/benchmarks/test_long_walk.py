@@ -15,4 +15,4 @@ def test_stages_are_held_against_what_they_took_at_first():
     first, last = {"tracking": 20.0, "mapping": 30.0}, {"tracking": 25.0, "loops": 2.0}
     found = last_against_first(first, last)
     assert found["tracking"] == [20.0, 25.0, pytest.approx(1.25)]
-    assert found["loops"] == [0.0, 2.0, float("inf")]
+    assert found["loops"] == [0.0, 2.0, None]
