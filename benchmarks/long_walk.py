@@ -1,13 +1,15 @@
 """Time and memory along a long video: a walk through many furnished rooms.
 
-    python benchmarks/long_walk.py [--frames 5000] [--size 512 288] [--device cuda]
-        [--preset fast] [--folder FOLDER] [--online] [--output FILE]
+    python benchmarks/long_walk.py [--frames 5000] [--images 5000] [--size 512 288] [--device cuda]
+        [--preset fast] [--folder FOLDER] [--online] [--seconds 540] [--output FILE]
 
 The walk is rendered first, in another process and once for all runs into ``--folder``. Then the
 whole system follows it; reading images does not count. Printed are, for every 500 frames, the
 milliseconds per keyframe of each stage, the memory of the process (and of the GPU), keyframes and
-disks; then the ratio of the last to the first 500 frames and the trajectory errors. ``--walk``
-keeps the rooms of a longer walk of which only the beginning is followed.
+disks; then, stage by stage and for memory, the last 500 frames against the first, and the
+trajectory errors. ``--walk`` keeps the rooms of a longer walk of which only the beginning is
+followed. With fewer ``--images`` than frames the walk goes back the way it came, and so on.
+``--seconds`` ends it early, with what there is then.
 """
 
 import argparse
@@ -64,12 +66,14 @@ def main() -> None:
     suite, camera = Suite.for_walk(options.walk or options.frames), default_camera(*options.size)
     folder = options.folder / f"{suite.rooms}-rooms-{camera.width}x{camera.height}"
     if options.render_only:
-        render(suite, camera, folder, options.frames)
+        render(suite, camera, folder, min(options.images or options.frames, options.frames))
         return
     subprocess.run([sys.executable, __file__, *sys.argv[1:], "--render-only"], check=True)
     slam = Slam(camera, preset(options.preset), options.device)
-    truth = suite.walk(options.frames)
-    blocks = follow(slam, folder, options.frames, options.every)
+    rendered = min(options.images or options.frames, options.frames)
+    images = [to_and_fro(n, rendered) for n in range(options.frames)]
+    blocks = follow(slam, folder, images, options.every, options.seconds)
+    truth = suite.walk(rendered)[images[: slam.frames]]
     errors = {}
     start = time.perf_counter()
     slam.end_stream()
@@ -81,7 +85,13 @@ def main() -> None:
     result = {
         "options": {k: str(v) for k, v in vars(options).items()},
         "blocks": [asdict(b) for b in blocks],
+        "frames": slam.frames,
         "ratio": round(used[-1].total / used[0].total, 3),
+        "stage_ratios": last_against_first(used[0].stages, used[-1].stages),
+        "memory_ratios": {
+            k: round(getattr(used[-1], k) / max(getattr(used[0], k), 1e-3), 2)
+            for k in ("resident", "gpu")
+        },
         "per_frame_ratio": round(used[-1].per_frame / used[0].per_frame, 3),
         "processor_ratio": round(used[-1].processor / used[0].processor, 3),
         "peak": memory("VmHWM"),
@@ -98,6 +108,10 @@ def main() -> None:
 def parse() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--frames", type=int, default=5000)
+    parser.add_argument(
+        "--images", type=int, help="frames rendered; to and fro where there are more"
+    )
+    parser.add_argument("--seconds", type=float, help="ends the walk early")
     parser.add_argument("--walk", type=int, help="frames of the whole walk, if only begun")
     parser.add_argument("--size", type=int, nargs=2, default=(512, 288))
     parser.add_argument("--device", default="cpu")
@@ -130,17 +144,40 @@ def write(path: Path, image: np.ndarray) -> None:
     part.rename(path)
 
 
-def follow(slam: Slam, folder: Path, frames: int, every: int) -> list[Block]:
-    """Feed the frames and take stock of every so many."""
+def to_and_fro(n: int, images: int) -> int:
+    """Which image frame n of a walk shows that turns back where the images end."""
+    period = max(2 * (images - 1), 1)
+    return min(n % period, period - n % period)
+
+
+def last_against_first(
+    first: dict[str, float], last: dict[str, float]
+) -> dict[str, list[float | None]]:
+    """Milliseconds per keyframe of each stage in the first and the last block, and their ratio.
+
+    There is none for a stage that was not there at first.
+    """
+    both = {k: (first.get(k, 0.0), v) for k, v in last.items()}
+    return {k: [a, b, round(b / a, 2) if a else None] for k, (a, b) in both.items()}
+
+
+def follow(
+    slam: Slam, folder: Path, images: list[int], every: int, seconds: float | None
+) -> list[Block]:
+    """Feed the frames and take stock of every so many, and when the time is up."""
     blocks: list[Block] = []
     before, known, lost, status, spent = {}, 0, 0, None, 0.0
-    for n in range(frames):
-        pixels = cv2.imread(str(folder / f"frame{n:06d}.jpg"))
+    end, frames = time.perf_counter() + (seconds or float("inf")), len(images)
+    for n, image in enumerate(images):
+        pixels = cv2.imread(str(folder / f"frame{image:06d}.jpg"))
         start = time.process_time()
         status = slam.process(Frame(n, n / 30, np.ascontiguousarray(pixels[..., ::-1])))
         spent += time.process_time() - start
         lost += status.state.value == "lost"
+        is_late = time.perf_counter() > end
         if (n + 1) % every and n + 1 < frames:
+            if is_late:
+                break  # a block that was cut short says less than the last whole one
             continue
         now = dict(slam.stopwatch.seconds)
         fresh = max(status.keyframes - known, 1)
@@ -157,6 +194,8 @@ def follow(slam: Slam, folder: Path, frames: int, every: int) -> list[Block]:
         ))  # fmt: skip
         print(json.dumps(asdict(blocks[-1])), flush=True)
         before, known, spent = now, status.keyframes, 0.0
+        if is_late:
+            break
     return blocks
 
 

@@ -458,7 +458,7 @@ def test_check(setting):
     assert torch.equal(checked[1].depth.cpu(), expected[1].depth)
 
 
-def test_votes_on_points(setting):
+def test_votes_on_points(setting, monkeypatch):
     cpu, cuda = _engines(setting)
     depths = _disturbed(setting)
     here, there = _posed(setting, depths, "cpu"), _posed(setting, depths, str(setting.device))
@@ -476,5 +476,7 @@ def test_votes_on_points(setting):
     assert np.array_equal(
         expected.numpy(), vote(points, zip(poses, arrays, strict=True), setting.render, cpu.config)
     )
+    monkeypatch.setattr(check_module, "VOTERS_TOGETHER", 1)
+    assert torch.equal(cuda.keep(_to(setting, points), there), kept)
     alone = cuda.keep(_to(setting, points), [])
     assert int(alone.sum()) == len(points) - 2

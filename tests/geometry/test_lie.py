@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from geogs.geometry import lie
+from geogs.geometry.sim3_translation import TranslationMap
 
 F64 = torch.float64
 GROUPS = {
@@ -99,3 +100,26 @@ def test_quaternion_product_is_the_product_of_rotations():
     a, b = torch.randn(2, 50, 4, dtype=F64, generator=torch.Generator().manual_seed(3)).unbind(0)
     product = lie.quaternion_to_matrix(lie.quaternion_multiply(a, b))
     assert (product - lie.quaternion_to_matrix(a) @ lie.quaternion_to_matrix(b)).abs().max() < 1e-12
+
+
+@pytest.mark.parametrize(("turn", "growth"), [(0.0, 0.0), (1e-6, 1e-6), (0.4, 0.2), (3.1, 2.0)])
+def test_a_similarity_s_translation_is_the_integral_of_its_linear_part(turn, growth):
+    phi = turn * torch.nn.functional.normalize(torch.tensor([[1.0, -2.0, 0.5]]).double())
+    sigma, tau = torch.tensor([growth], dtype=F64), torch.tensor([[0.3, 1.0, -2.0]], dtype=F64)
+    M = growth * torch.eye(3, dtype=F64) + lie.so3_hat(phi)[0]
+    # The upper right block of the exponential of [[M, I], [0, 0]] is the integral of exp(s M).
+    both = torch.zeros(6, 6, dtype=F64)
+    both[:3, :3], both[:3, 3:] = M, torch.eye(3)
+    V = torch.linalg.matrix_exp(both)[:3, 3:]
+    found = TranslationMap(phi, sigma)
+    torch.testing.assert_close((found @ tau)[0], V @ tau[0], rtol=1e-12, atol=1e-13)
+    torch.testing.assert_close(found.solve(found @ tau), tau, rtol=1e-12, atol=1e-13)
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-3, 0.1, 0.3, 2.0])
+def test_the_inverse_jacobian_undoes_the_jacobian(size):
+    random = torch.Generator().manual_seed(4)
+    xi = size * torch.randn(20, 7, dtype=F64, generator=random)
+    product = lie.sim3_inverse_jacobian(xi) @ lie.sim3_left_jacobian(xi)
+    eye = torch.eye(7, dtype=F64).expand(20, 7, 7)
+    torch.testing.assert_close(product, eye, rtol=0, atol=1e-12)

@@ -101,3 +101,27 @@ def test_a_full_vocabulary_still_finds_places(lap, again):
         index.add(n, image)
     hits = [index.query(image, count=3) for image in again]
     assert all(5 * n in {c.keyframe for c in found} for n, found in enumerate(hits))
+
+
+def test_scores_are_those_of_comparing_word_by_word(index, lap, again):
+    """Shared mass of words, each as often as it is in both, over the image's own mass."""
+    features = index.describe(again[0])
+    words, distance = index._nearest(features)
+    known = words[distance <= index._radius].tolist()
+    rows = len(index)
+    expected, own = np.zeros(rows), (len(words) - len(known)) * np.log((rows + 1) / 0.5)
+    for word in sorted({*known}):
+        held = dict(index._postings[word].rows.tolist())
+        weight = max(np.log((rows + 1) / (len(held) + 0.5)), 0.0)
+        own += weight * known.count(word)
+        for row, count in held.items():
+            expected[row] += weight * min(count, known.count(word))
+    found = index.query(features, count=rows)
+    assert len(found) > 3
+    for candidate in found:
+        row = index._keyframes.index(candidate.keyframe)
+        assert candidate.score == pytest.approx(expected[row] / own, rel=1e-12)
+    state = index.state()
+    other = AppearanceIndex()
+    other.load(state)
+    assert other.query(features, count=rows) == found

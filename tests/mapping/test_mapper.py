@@ -10,7 +10,7 @@ from geogs.config import Config, MappingConfig
 from geogs.geometry.lie import retract, se3_exp, se3_inverse
 from geogs.mapping.map_update import MapUpdate
 from geogs.mapping.mapper import Mapper
-from geogs.mapping.window import draw_views, views_around
+from geogs.mapping.window import draw_views
 from geogs.synth.export import default_camera
 from geogs.synth.raycast import Raycaster
 from geogs.synth.room import make_room
@@ -274,12 +274,3 @@ def test_parked_views_change_nothing(sequence):
     parked.keyframes[0].rescale(2.0)
     torch.testing.assert_close(parked.views[0].dense.depth, 2 * held.views[0].dense.depth)
     assert parked.views[0].typical_depth == pytest.approx(2 * held.views[0].typical_depth)
-
-
-def test_only_the_nearest_keyframes_are_looked_at(sequence):
-    mapper = build(sequence[0][:5], replace(MAPPING, iterations=0))
-    views = list(mapper.views.values())
-    assert views_around(views[2], views, 5) == views
-    apart = [float(np.linalg.norm(v.place.center - views[2].place.center)) for v in views]
-    nearest = sorted(sorted(range(5), key=lambda n: apart[n])[:3])
-    assert views_around(views[2], views, 3) == [views[n] for n in nearest]

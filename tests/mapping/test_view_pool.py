@@ -8,7 +8,10 @@ import torch
 from geogs.config import Config
 from geogs.depth.view import DenseDepth
 from geogs.geometry.camera import Camera
+from geogs.keyframes.archive import Archive
 from geogs.mapping.cameras import MapCameras
+from geogs.mapping.held_depths import HeldDepths
+from geogs.mapping.stored_maps import StoredDepth
 from geogs.mapping.view_pool import ViewPool
 from keyframe_samples import Sample, segment_of
 
@@ -33,3 +36,22 @@ def test_depth_of_what_moves_is_not_believed():
     torch.testing.assert_close(found.confidence, expected)
     torch.testing.assert_close(found.depth, 2 * one)
     assert found.typical == 2
+
+
+def test_few_depths_are_held_beside_their_archive():
+    one, archive = torch.ones(4, 5), Archive()
+    held = HeldDepths(torch.device("cuda"), limit=2)  # nothing here asks a GPU
+    stored = {}
+    for id in range(3):
+        depth = DenseDepth((1.0 + id) * one, one, torch.tensor(1.0 + id))
+        stored[id] = StoredDepth.of(depth, 1.0, archive)
+        held.put(id, stored[id], depth)
+    assert held.get(0, stored[0], 1.0) is None
+    found = held.get(1, stored[1], 3.0)
+    assert found is not None
+    torch.testing.assert_close(found.depth, 6 * one)
+    torch.testing.assert_close(found.depth, stored[1].load(3.0, torch.device("cpu")).depth)
+    assert found.typical == 6
+    held.put(3, stored[0], depth)  # 2 was used longer ago than 1
+    assert held.get(2, stored[2], 1.0) is None
+    assert held.get(1, stored[0], 1.0) is None  # archived anew meanwhile

@@ -89,8 +89,9 @@ def test_only_moved_pairs_are_stale():
     graph.measure(pairs)
     assert graph.stale(pairs, 0.5) == []
     state = graph.keyframes[4]
-    state.T_cw = state.T_cw.clone()
-    state.T_cw[0, 3] += 0.05
+    moved = state.T_cw.clone()
+    moved[0, 3] += 0.05
+    state.T_cw = moved
     assert graph.stale(pairs, 0.5) == [(3, 4)]
     assert set(graph.edges) == {(0, 1), (1, 0), (1, 2), (2, 1), (3, 4), (4, 3)}
 
@@ -113,8 +114,9 @@ def test_adjustment_of_real_flow_repairs_poses():
     ids = graph.keyframes.ids
     for k in ids[2:]:
         state = graph.keyframes[k]
-        state.T_cw = state.T_cw.clone()
-        state.T_cw[:3, 3] += torch.tensor([0.01, -0.008, 0.012])
+        moved = state.T_cw.clone()
+        moved[:3, 3] += torch.tensor([0.01, -0.008, 0.012])
+        state.T_cw = moved
     for _ in range(3):
         graph.measure([(i, j) for i in ids for j in ids if i < j <= i + 3])
         result = graph.adjust(list(graph.edges), ids[2:], ids, BundleOptions(iterations=6))

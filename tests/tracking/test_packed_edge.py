@@ -31,8 +31,9 @@ def test_a_packed_edge_tells_the_same():
         torch.testing.assert_close(edge.weight, plain[e].weight, rtol=1e-3, atol=0)
         torch.testing.assert_close(edge.reprojection, plain[e].reprojection, rtol=0, atol=1e-4)
     state = graph.keyframes[3]
-    state.T_cw = state.T_cw.clone()
-    state.T_cw[0, 3] += 0.05
+    moved = state.T_cw.clone()
+    moved[0, 3] += 0.05
+    state.T_cw = moved
     assert graph.stale(pairs, 0.5) == [(1, 3)]
     assert graph.stale(pairs, 5.0) == []
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+import geogs.tracking.overlap as overlap
 import geogs.tracking.proximity as proximity
 from geogs.geometry.lie import se3_exp
 from geogs.keyframes.grid import SampleGrid
@@ -39,6 +40,20 @@ def test_no_pair_within_reach_is_left_out():
         assert finite.sum() > 0.4 * may.sum()
     short = scattered(60)
     assert may_overlap(short, short.ids, short.ids, 0.2, 2).mean() < 0.5
+
+
+def test_keyframes_that_are_skipped_as_a_whole_have_no_tile_in_view():
+    for store in (scattered(60), planted_tracker(200)[0].keyframes):
+        ids = store.ids
+        spheres = overlap._spheres(store, ids, 2)
+        planes = overlap._view_planes(store.grid.camera, store.poses(ids))
+        share = spheres.reach(*planes).float() @ spheres.share
+        expected = (share > 0.2 - 1e-6).numpy()
+        assert np.array_equal(may_overlap(store, ids, ids, 0.2, 2), expected)
+        assert may_overlap(store, ids, ids, 0.0, 2).all()
+        skipped = ~spheres.around().reach(*planes)[..., 0]
+        assert float(skipped.float().mean()) > 0.05
+        assert not (skipped & (share > 0)).any()
 
 
 def test_pairs_of_many_keyframes_are_those_of_looking_at_all(monkeypatch):

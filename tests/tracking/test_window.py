@@ -19,7 +19,8 @@ def test_it_ends_where_the_baseline_is_reached():
     keyframes = list(tracker.keyframes)
     depth = 1 / float(keyframes[-1].inverse_depth.median())
     for n, keyframe in enumerate(keyframes):
-        keyframe.T_cw = torch.eye(4, dtype=torch.float64)
-        keyframe.T_cw[0, 3] = 0.01 * depth * n
+        T_cw = torch.eye(4, dtype=torch.float64)
+        T_cw[0, 3] = 0.01 * depth * n
+        keyframe.T_cw = T_cw
     assert reach(keyframes, 4, 10, 0.055) == 7
     assert reach(keyframes, 4, 6, 0.055) == 6

@@ -7,7 +7,7 @@ from typing import Protocol, runtime_checkable
 from jaxtyping import Float
 from torch import Tensor
 
-from geogs.bundle.problem import BundleProblem, MotionProblem
+from geogs.bundle.problem import BundleProblem, MotionProblem, StreamedProblem
 from geogs.keyframes.keyframe import Keyframe
 
 
@@ -53,6 +53,15 @@ class BundleSolver(Protocol):
 
         A step that is not finite is not taken, and ``finite`` is False in the result.
         """
+        ...
+
+
+@runtime_checkable
+class LargeBundleSolver(Protocol):
+    """What adjusts a problem whose matches are fetched when they are needed."""
+
+    def solve(self, problem: StreamedProblem, options: BundleOptions | None = None) -> BundleResult:
+        """As a ``BundleSolver`` does; a small step may end it on either device."""
         ...
 
 

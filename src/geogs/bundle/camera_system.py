@@ -51,6 +51,26 @@ class SparseCameraSystem:
             return 0
         return int((self._keys // self._count - self._keys % self._count).max())
 
+    @property
+    def size(self) -> int:
+        """Number of blocks."""
+        return len(self._keys)
+
+    def places(
+        self, row: Int[np.ndarray, "k"], column: Int[np.ndarray, "k"]
+    ) -> Int[np.ndarray, "k"]:
+        """Which block belongs to each pair of frames; -1 above the diagonal and for fixed poses."""
+        slot = self._slot.numpy()
+        i, j = slot[row], slot[column]
+        found = np.searchsorted(self._keys.numpy(), i * self._count + j)
+        return np.where((i >= j) & (j >= 0), found, -1)
+
+    def add_sums(self, blocks: Float[Tensor, "m 6 6"], gradient: Float[Tensor, "n 6"]) -> None:
+        """Add to all blocks, and the right-hand sides of all frames, what others have summed up."""
+        self._blocks += blocks
+        free = self._free
+        self._gradient.index_add_(0, self._slot[free], gradient[free])
+
     def add(self, stars: Iterable[Star]) -> None:
         """Add what the edges of some sources say of the poses."""
         for star in stars:

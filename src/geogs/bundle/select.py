@@ -5,7 +5,13 @@ from collections.abc import Sequence
 from jaxtyping import Int
 from torch import Tensor
 
-from geogs.bundle.base import BundleSolver, GridFields, KeyframePairs, MotionSolver
+from geogs.bundle.base import (
+    BundleSolver,
+    GridFields,
+    KeyframePairs,
+    LargeBundleSolver,
+    MotionSolver,
+)
 from geogs.keyframes.grid import SampleGrid
 from geogs.keyframes.store import Segment
 
@@ -19,6 +25,17 @@ def bundle_solver(grid: SampleGrid) -> BundleSolver:
     from geogs.bundle.dense import DenseBundle
 
     return DenseBundle(grid)
+
+
+def large_bundle_solver(grid: SampleGrid) -> LargeBundleSolver:
+    """The solver for the device of a grid whose memory is bounded."""
+    if grid.on_gpu:
+        from geogs.bundle.cuda.streamed import CudaStreamedBundle
+
+        return CudaStreamedBundle(grid)
+    from geogs.bundle.streamed import StreamedBundle
+
+    return StreamedBundle(grid)
 
 
 def motion_solver(grid: SampleGrid, cells: Int[Tensor, "p"] | None = None) -> MotionSolver:

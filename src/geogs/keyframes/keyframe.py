@@ -11,6 +11,7 @@ from geogs.geometry.lie import scaled
 from geogs.keyframes.archive import Archived
 from geogs.keyframes.grid import SampleGrid
 from geogs.keyframes.pictures import Picture
+from geogs.keyframes.poses import PoseTable
 from geogs.priors.base import DepthKind
 
 KNOWN = 0.3
@@ -89,8 +90,8 @@ class Keyframe:
     """Where depth is kept."""
     picture: Picture
     """Image, its encoded form and normals, in memory or not."""
-    T_cw: Float[Tensor, "4 4"]
-    """World to camera, float64, on the CPU whatever the device of the grid."""
+    poses: PoseTable
+    """Which has its pose, by its id."""
     inverse_depth: Float[Tensor, "p"]
     information: Float[Tensor, "p"]
     """Of the matches, sum over edges of w |dp/dd|^2, and of a depth sensor; not of a prior."""
@@ -102,6 +103,15 @@ class Keyframe:
     """Cells that are held for showing something that moves; none where nobody has judged yet."""
     measured: MeasuredCells | None = None
     """Of a depth sensor; none without, or where the map is not metric."""
+
+    @property
+    def T_cw(self) -> Float[Tensor, "4 4"]:
+        """World to camera, float64, on the CPU whatever the device of the grid."""
+        return self.poses[self.id]
+
+    @T_cw.setter
+    def T_cw(self, T_cw: Float[Tensor, "4 4"]) -> None:
+        self.poses[self.id] = T_cw
 
     @property
     def image(self) -> UInt8[np.ndarray, "h w 3"]:

@@ -15,6 +15,7 @@ from geogs.keyframes.archive import Archive
 from geogs.keyframes.grid import SampleGrid
 from geogs.keyframes.keyframe import Keyframe, KeyframeState
 from geogs.keyframes.pictures import Encode, Picture, Pictures
+from geogs.keyframes.poses import PoseTable
 from geogs.types import PoseCorrection
 
 RESIDENT = 128
@@ -46,6 +47,7 @@ class KeyframeStore:
         self.grid = grid
         self.resident = resident
         self.pictures = Pictures(encode, resident)
+        self.poses = PoseTable()
         self.next_id = 0
         """The id that the next keyframe gets; ids grow and are never used twice."""
         self._segment: dict[int, Segment] = {}
@@ -128,12 +130,17 @@ class Segment:
         grid, id = self.grid, self.store.take_id(self)
         picture = self.store.pictures.add(image, encoded)
         ones = torch.ones(grid.size, device=grid.device)
-        keyframe = Keyframe(id, frame_index, timestamp, grid, picture, T_cw, ones, 0 * ones)
+        poses = self.store.poses
+        poses[id] = T_cw
+        keyframe = Keyframe(id, frame_index, timestamp, grid, picture, poses, ones, 0 * ones)
         self._keyframes[id] = keyframe
         return keyframe
 
     def put(self, keyframe: Keyframe) -> None:
-        """Add a keyframe as it is, of another store, with the id that it has there."""
+        """Add a keyframe as it is, of another store, with the id that it has there.
+
+        Its pose is to be in this store's table.
+        """
         self._keyframes[keyframe.id] = keyframe
         self.store.assign([keyframe.id], self)
 
@@ -158,8 +165,9 @@ class Segment:
             if s.id in self.store or not max(self._keyframes, default=-1) < s.id:
                 raise InputError(f"keyframe {s.id} is not in its place")
             picture = Picture(pictures, s.image, s.normal, s.depth)
+            self.store.poses[s.id] = s.T_cw
             self._keyframes[s.id] = Keyframe(
-                s.id, s.frame_index, s.timestamp, grid, picture, s.T_cw, s.inverse_depth,
+                s.id, s.frame_index, s.timestamp, grid, picture, self.store.poses, s.inverse_depth,
                 s.information, s.prior, s.scale, s.moving, s.measured,
             )  # fmt: skip
         self.store.assign(self.ids, self)
@@ -177,7 +185,7 @@ class Segment:
 
     def poses(self, ids: Sequence[int]) -> Float[Tensor, "n 4 4"]:
         """World to camera, float64, on the CPU."""
-        return torch.stack([self._keyframes[i].T_cw for i in ids])
+        return torch.from_numpy(self.store.poses.rows(ids))
 
     def inverse_depths(self, ids: Sequence[int]) -> Float[Tensor, "n p"]:
         """On the grid."""

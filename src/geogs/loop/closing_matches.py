@@ -26,8 +26,8 @@ def closing_matches(
     for loop in loops:
         if loop.first in segment and loop.second in segment:
             for pair, flow in (
-                ((loop.first, loop.second), loop.there),
-                ((loop.second, loop.first), loop.back),
+                ((loop.first, loop.second), loop.flows[0]),
+                ((loop.second, loop.first), loop.flows[1]),
             ):
                 found[pair] = flow.pixels[0], flow.weight[0]
     found |= {pair: (edge.pixels, edge.weight) for pair, edge in edges.items()}

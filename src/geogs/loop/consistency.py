@@ -10,6 +10,7 @@ more often. Source: pairwise consistency maximisation (Mangelson et al. 2018), g
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -125,30 +126,34 @@ def consistent_loops(
     agree = (pairs <= options.threshold) & plausible & plausible[:, None]
     loops = relative.select(relative.is_loop)
     ends = torch.stack([loops.source, loops.target], 1).sort(1).values.tolist()
+    agreeing = agree.numpy()
     best: tuple[int, float] = (0, 0.0)
     winner: list[int] = []
     for seed in torch.nonzero(plausible)[:, 0].tolist():
-        party = _grow(agree, seed)
+        party = _grow(agreeing, seed)
         size = len({tuple(ends[a]) for a in party})
         score = size, -float(pairs[party][:, party].mean())
         if score > best:
             best, winner = score, party
+        if len(party) == int(plausible.sum()):
+            break  # all agree, so that all others grow to the same party
     if best[0] >= options.support:
         keep[torch.nonzero(relative.is_loop)[:, 0][winner]] = True
     return keep
 
 
-def _grow(agree: Bool[Tensor, "l l"], seed: int) -> list[int]:
+def _grow(agree: Bool[np.ndarray, "l l"], seed: int) -> list[int]:
     """A set around a loop of which every two agree."""
-    party, open_to = [seed], agree[seed].clone()
+    party, open_to = [seed], agree[seed].copy()
     open_to[seed] = False
-    while bool(open_to.any()):
-        friends = (agree & open_to).sum(1)
-        friends[~open_to] = -1
-        taken = int(friends.argmax())
+    friends = agree @ open_to.astype(np.int32)
+    while open_to.any():
+        taken = int(np.where(open_to, friends, -1).argmax())
         party.append(taken)
-        open_to &= agree[taken]
-        open_to[taken] = False
+        closed = open_to & ~agree[taken]
+        closed[taken] = True
+        open_to &= ~closed
+        friends -= agree[:, closed].sum(1)
     return sorted(party)
 
 

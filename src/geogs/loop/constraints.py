@@ -78,7 +78,7 @@ def of_poses(segment: Segment, ids: Sequence[int]) -> RelativePoses:
 def of_loop(keyframes: KeyframeStore, loop: Loop) -> RelativePoses:
     """Relative poses, between ids, of a loop: one for each direction of its flow."""
     one, other = keyframes[loop.first], keyframes[loop.second]
-    there, back = loop.there, loop.back
+    there, back = loop.flows
     grid = _on_cpu(keyframes.grid)
     matched = MatchedEdges(
         grid.camera,

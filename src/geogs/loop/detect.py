@@ -3,7 +3,8 @@
 from collections import deque
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import islice, takewhile
 
 import numpy as np
 import torch
@@ -11,7 +12,7 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from geogs.config import LoopConfig
-from geogs.geometry.lie import se3_inverse, so3_log
+from geogs.geometry.lie import se3_inverse
 from geogs.keyframes.store import KeyframeStore
 from geogs.loop.dense import dense_check
 from geogs.loop.search import (
@@ -44,9 +45,9 @@ class Loop:
     """Features that agree with the pose; 0 where the flow alone found it."""
     matched: float
     """Share of the cells whose flow does."""
-    there: FlowMatch
-    """The flow from the first to the second, one edge."""
-    back: FlowMatch
+    there: FlowMatch | None
+    """The flow from the first to the second, one edge; none where it is no longer needed."""
+    back: FlowMatch | None
 
     @property
     def S_ji(self) -> Float[Tensor, "4 4"]:
@@ -54,6 +55,17 @@ class Loop:
         S = self.scale * self.T_ji
         S[3, 3] = 1.0
         return S
+
+    @property
+    def flows(self) -> tuple[FlowMatch, FlowMatch]:
+        """There and back, where they are still kept."""
+        assert self.there is not None
+        assert self.back is not None
+        return self.there, self.back
+
+    def without_flows(self) -> "Loop":
+        """The same without what is as large as the grid."""
+        return replace(self, there=None, back=None)
 
 
 @dataclass(frozen=True)
@@ -112,6 +124,8 @@ class LoopDetector:
         )  # fmt: skip
         self._order: dict[int, int] = {}
         """Place in time of each keyframe taken so far."""
+        self._ids = np.zeros(64, np.int64)
+        """Ids of the keyframes by their place, with room for more."""
         self._search = PlaceSearch(self.grid, self.config, self._order, mask)
         self._pending: deque[Future[list[Sighting]]] = deque()
         self._loops: list[Loop] = []
@@ -123,7 +137,8 @@ class LoopDetector:
 
     def load(self, state: DetectorState) -> None:
         """Give a detector that has seen nothing yet the state of another."""
-        self._order.update((id, n) for n, id in enumerate(state.order))
+        for id in state.order:
+            self._enter(id)
         self._search.load(state.search)
         self._pending = deque(map(_done, state.pending))
         self._loops = state.loops
@@ -141,7 +156,7 @@ class LoopDetector:
         self.refusals = []
         found: list[Loop] = []
         for id in ids:
-            self._order[id] = len(self._order)
+            self._enter(id)
             self._pending.append(self._thread.submit(self._search.find, self._query(id)))
             due = len(self._pending) > self.config.lag
             if due and (self._waits or self._pending[0].done()):
@@ -153,7 +168,7 @@ class LoopDetector:
     def remember(self, ids: Sequence[int]) -> None:
         """Take keyframes that are to be recognised, and are loops of none before them."""
         for id in ids:
-            self._order[id] = len(self._order)
+            self._enter(id)
             self._thread.submit(self._search.remember, id, self.keyframes[id].image)
 
     def recognise(self, image: UInt8[np.ndarray, "h w 3"]) -> list[Recognition]:
@@ -162,12 +177,9 @@ class LoopDetector:
 
     def candidates(self, id: int) -> list[int]:
         """Keyframes that the present poses say a taken one sees again, nearest first."""
-        near = self._near(id)
-        store = self.keyframes.segment_of(id)
-        old = [k for k in self._order if k not in near and k in store]
-        if not old:
+        facing, store = self._facing(id), self.keyframes.segment_of(id)
+        if not facing:
             return []
-        facing = self._facing(id, old)
         directed = [(k, id) for k in facing] + [(id, k) for k in facing]
         there, back = frame_distances(store, directed, self.config.rotation_weight).chunk(2)
         limit = self.config.max_distance * max(self.grid.camera.width, self.grid.camera.height)
@@ -175,14 +187,29 @@ class LoopDetector:
         return [facing[n] for n in order[distance < limit].tolist()]
 
     def _query(self, id: int) -> Query:
-        known = tuple((loop.first, loop.second) for loop in self._loops)
         near, by_pose = self._near(id), tuple(self.candidates(id))
-        return Query(id, self.keyframes[id].image, near, by_pose, known, self._depths())
+        known = tuple(self._found_near(id))
+        features = self._search.describe(self.keyframes[id].image)
+        return Query(id, features, near, by_pose, known, self._depths())
+
+    def _enter(self, id: int) -> None:
+        """Take a keyframe as the latest."""
+        place = self._order[id] = len(self._order)
+        if place == len(self._ids):
+            self._ids = np.concatenate([self._ids, np.zeros_like(self._ids)])
+        self._ids[place] = id
+
+    def _found_near(self, id: int) -> list[tuple[int, int]]:
+        """Pairs of the loops found whose later keyframe is so near to one that they can rule out
+        others of it; loops are found in the order of their later keyframes."""
+        least = self._order[id] - self.config.suppression
+        recent = takewhile(lambda loop: self._order[loop.second] >= least, reversed(self._loops))
+        return [(loop.first, loop.second) for loop in recent]
 
     def _near(self, id: int) -> frozenset[int]:
         """The keyframe itself and those of the same time and segment."""
         gap, store = self._order[id] - self.config.min_gap, self.keyframes.segment_of(id)
-        recent = [k for k, n in self._order.items() if n >= gap]
+        recent = self._ids[max(gap, 0) : len(self._order)].tolist()
         return frozenset(k for k in recent if k in store)
 
     def _depths(self) -> Depths:
@@ -190,31 +217,28 @@ class LoopDetector:
         states = {k: self.keyframes[k] for k in self._order}
         return {k: (s.inverse_depth, s.information) for k, s in states.items()}
 
-    def _facing(self, id: int, old: Sequence[int]) -> list[int]:
-        """The keyframes nearest by that look roughly the same way; there are never many."""
-        store = self.keyframes.segment_of(id)
-        state, T = store[id], store.poses(old)
-        angle = torch.rad2deg(so3_log(state.T_cw[:3, :3] @ T[:, :3, :3].mT).norm(dim=-1))
-        away = (se3_inverse(T)[:, :3, 3] - se3_inverse(state.T_cw)[:3, 3]).norm(dim=-1)
-        depth = 1 / float(state.inverse_depth.median())
-        facing = (angle < self.config.max_angle) & (away < self.config.max_baseline * depth)
-        order = torch.argsort(away, stable=True)
-        return [old[n] for n in order.tolist() if facing[n]][: self.config.measured]
+    def _facing(self, id: int) -> list[int]:
+        """The earlier keyframes nearest by that look roughly the same way; there are never many."""
+        c, store = self.config, self.keyframes.segment_of(id)
+        old = self._ids[: max(self._order[id] - c.min_gap, 0)]
+        depth = 1 / float(store[id].inverse_depth.median())
+        around = self.keyframes.poses.around(id, old, c.max_angle, c.max_baseline * depth)
+        return list(islice((k for k in around.tolist() if k in store), c.measured))
 
     def _decide(self, sightings: Sequence[Sighting]) -> list[Loop]:
         """The loops among what was seen of one keyframe."""
         found: list[Loop] = []
         for sighting in sightings:
             pair = sighting.proposal.first, sighting.proposal.second
-            known = [(loop.first, loop.second) for loop in self._loops]
-            if self._search.is_suppressed(pair, known):
+            if self._search.is_suppressed(pair, self._found_near(sighting.proposal.second)):
                 continue
             loop = self._verify(sighting)
             if isinstance(loop, Refusal):
                 self.refusals.append(loop)
                 continue
             found.append(loop)
-            self._loops.append(loop)
+            # Of a long video the flows of all loops would fill the memory.
+            self._loops.append(loop if self.config.matches else loop.without_flows())
             if len(found) == self.config.max_loops:
                 break
         return found

@@ -37,14 +37,15 @@ class FeatureExtractor:
         self._mask = None if mask is None else mask.astype(np.uint8)
         self.options = options
         self.count = options.features
-        self._orb = cv2.ORB.create(
-            nfeatures=round(SURPLUS * options.features), fastThreshold=options.fast_threshold
-        )
 
     def __call__(self, image: UInt8[np.ndarray, "h w 3"]) -> Features:
-        """Features of an RGB image; none where nothing stands out."""
+        """Features of an RGB image; none where nothing stands out. For any thread."""
         grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-        points = self._orb.detect(grey, self._mask)
+        orb = cv2.ORB.create(
+            nfeatures=round(SURPLUS * self.options.features),
+            fastThreshold=self.options.fast_threshold,
+        )
+        points = orb.detect(grey, self._mask)
         if not points:
             return Features(np.zeros((0, 2), np.float32), np.zeros((0, 32), np.uint8))
         pixels = np.array([p.pt for p in points], np.float32)
@@ -55,7 +56,7 @@ class FeatureExtractor:
         for n in order:
             points[n].class_id = len(kept)
             kept.append(points[n])
-        described, descriptors = self._orb.compute(grey, kept)
+        described, descriptors = orb.compute(grey, kept)
         if descriptors is None:
             return Features(np.zeros((0, 2), np.float32), np.zeros((0, 32), np.uint8))
         back = np.argsort([p.class_id for p in described], kind="stable")

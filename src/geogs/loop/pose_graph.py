@@ -12,7 +12,6 @@ memory is linear in edges. Source: the Sim(3) pose graph of HI-SLAM2, with exact
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -20,12 +19,13 @@ from torch import Tensor
 from geogs.geometry.lie import (
     retract,
     sim3_adjoint,
-    sim3_exp,
     sim3_inverse,
-    sim3_left_jacobian,
+    sim3_inverse_jacobian,
     sim3_log,
     sim3_scale,
+    sim3_small_adjoint,
 )
+from geogs.loop.block_system import BlockSystem
 from geogs.loop.matched_edges import (
     BlockEquations,
     LinearMatches,
@@ -156,11 +156,10 @@ def relative_jacobians(
     """d error / d xi of source and target (left perturbations), exact.
 
     A motion of the source reaches the error's left through Ad(G), one of the target through
-    Ad(Exp(e)): Jl(e)^-1 Ad(G) and -Jl(e)^-1 Ad(Exp(e)) = -Jr(e)^-1.
+    Ad(Exp(e)): Jl(e)^-1 Ad(G) and -Jl(e)^-1 Ad(Exp(e)) = -Jr(e)^-1 = -(Jl(e)^-1 + ad(e)).
     """
-    reach = torch.cat([sim3_adjoint(relative.G), -sim3_adjoint(sim3_exp(error))], -1)
-    both = torch.linalg.solve(sim3_left_jacobian(error), reach)
-    return both[..., :7], both[..., 7:]
+    inverse = sim3_inverse_jacobian(error)
+    return inverse @ sim3_adjoint(relative.G), -(inverse + sim3_small_adjoint(error))
 
 
 def solve(graph: PoseGraph, options: PoseGraphOptions | None = None) -> PoseGraphResult:
@@ -215,6 +214,8 @@ class _Problem:
 
     def __init__(self, graph: PoseGraph, options: PoseGraphOptions) -> None:
         self.graph, self.options = graph, options
+        self._system: BlockSystem | None = None
+        """Of the last step; the next has the same blocks."""
         relative = graph.relative
         trust = 1 / options.drift if bool(relative.is_loop.any()) else 1.0
         self._information = torch.where(
@@ -293,7 +294,7 @@ class _Problem:
         parts = [self._relative_equations(state, width), linear.equations]
         if self.graph.is_metric:
             parts = [_without_scale(part) for part in parts]
-        xi = _solve_blocks(parts, self.graph.fixed, damping)
+        xi = self._solve(parts, damping)
         if xi is None:
             return None
         S = torch.where(self.graph.fixed[:, None, None], state.S, retract(xi, state.S))
@@ -302,6 +303,27 @@ class _Problem:
             return _State(S, state.inverse_depth)
         d = state.inverse_depth + depth_step(linear, xi, state.inverse_depth)
         return _State(S, d.clamp(limits.min_inverse_depth, limits.max_inverse_depth))
+
+    def _solve(
+        self, parts: Sequence[BlockEquations], damping: float
+    ) -> Float[Tensor, "n 7"] | None:
+        """Solve the damped sparse system over the free keyframes; None if it is singular."""
+        free = ~self.graph.fixed
+        n = int(free.sum())
+        xi = torch.zeros(len(free), 7, dtype=torch.float64)
+        if not n:
+            return xi
+        slot = torch.full((len(free),), -1, dtype=torch.long)
+        slot[free] = torch.arange(n)
+        row, column = (slot[torch.cat([getattr(p, k) for p in parts])] for k in ("row", "column"))
+        if self._system is None or not self._system.is_of(row, column):
+            self._system = BlockSystem(row, column, n)
+        gradient = sum((p.gradient for p in parts), torch.zeros_like(xi))[free]
+        found = self._system.solve(torch.cat([p.block for p in parts]), gradient, damping)
+        if found is None:
+            return None
+        xi[free] = found
+        return xi
 
     def _relative_equations(self, state: _State, width: float) -> BlockEquations:
         relative = self.graph.relative
@@ -323,47 +345,3 @@ def _without_scale(part: BlockEquations) -> BlockEquations:
     rigid = torch.ones(7, dtype=torch.float64)
     rigid[6] = 0
     return replace(part, block=part.block * rigid[:, None] * rigid, gradient=part.gradient * rigid)
-
-
-def _solve_blocks(
-    parts: Sequence[BlockEquations], fixed: Bool[Tensor, "n"], damping: float
-) -> Float[Tensor, "n 7"] | None:
-    """Solve the damped sparse system over the free keyframes; None if it is singular."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.linalg import splu
-
-    free = ~fixed
-    n = int(free.sum())
-    xi = torch.zeros(len(fixed), 7, dtype=torch.float64)
-    if not n:
-        return xi
-    slot = torch.full((len(fixed),), -1, dtype=torch.long)
-    slot[free] = torch.arange(n)
-    row, column = (slot[torch.cat([getattr(p, k) for p in parts])] for k in ("row", "column"))
-    block = torch.cat([p.block for p in parts])
-    keep = (row >= 0) & (column >= 0)
-    row, column, block = row[keep], column[keep], block[keep]
-    within = torch.arange(7)
-    rows = (7 * row[:, None, None] + within[:, None]).expand(-1, 7, 7)
-    columns = (7 * column[:, None, None] + within).expand(-1, 7, 7)
-    H = coo_matrix(
-        (block.numpy().ravel(), (rows.numpy().ravel(), columns.numpy().ravel())),
-        shape=(7 * n, 7 * n),
-    ).tocsc()
-    diagonal = H.diagonal()
-    # A keyframe that nothing ties down stays where it is.
-    floor = 1e-12 * max(float(diagonal.max(initial=0.0)), 1e-300)
-    H.setdiag(diagonal * (1 + damping) + floor)
-    gradient = sum((p.gradient for p in parts), torch.zeros_like(xi))[free]
-    try:
-        # Symmetric and positive definite: pivots stay on the diagonal, and fill-in small.
-        factor = splu(
-            H, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
-        )
-    except RuntimeError:
-        return None
-    solution = factor.solve(gradient.reshape(-1).numpy())
-    if not np.isfinite(solution).all():
-        return None
-    xi[free] = torch.from_numpy(solution).reshape(n, 7)
-    return xi

@@ -15,6 +15,29 @@ LOOSE = 15
 """Bits by which the radius of the words grows once the vocabulary is full."""
 
 
+class Posting:
+    """The keyframes that hold a word: their rows, and how often they hold it."""
+
+    def __init__(self) -> None:
+        self._room = np.zeros((4, 2), np.int64)
+        self._count = 0
+
+    def __len__(self) -> int:
+        return self._count
+
+    @property
+    def rows(self) -> Int64[np.ndarray, "m 2"]:
+        """Row and how often, earliest first."""
+        return self._room[: self._count]
+
+    def add(self, row: int, count: int) -> None:
+        """Enter a keyframe."""
+        if self._count == len(self._room):
+            self._room = np.concatenate([self._room, np.zeros_like(self._room)])
+        self._room[self._count] = row, count
+        self._count += 1
+
+
 @dataclass(frozen=True)
 class Candidate:
     """An earlier keyframe that looks alike."""
@@ -53,10 +76,12 @@ class AppearanceIndex:
         self._extract = FeatureExtractor(self.options, mask)
         self._matcher = cv2.BFMatcher(cv2.NORM_HAMMING)
         self._words = np.zeros((0, 32), np.uint8)
-        self._postings: list[list[tuple[int, int]]] = []
-        """Of each word, the keyframes that hold it with their row and how often."""
+        self._postings: list[Posting] = []
+        """Of each word."""
         self._keyframes: list[int] = []
         """Keyframe of each row."""
+        self._row: dict[int, int] = {}
+        """Row of each keyframe."""
         self._recent: tuple[Features, np.ndarray, np.ndarray] | None = None
         """Features last looked up with their words: a keyframe is queried, then added."""
 
@@ -65,15 +90,10 @@ class AppearanceIndex:
 
     def state(self) -> IndexState:
         """What a checkpoint holds."""
-        postings = [
-            (word, row, count)
-            for word, posting in enumerate(self._postings)
-            for row, count in posting
-        ]
-        return IndexState(
-            self._words, np.array(postings, np.int64).reshape(-1, 3),
-            np.array(self._keyframes, np.int64),
-        )  # fmt: skip
+        rows = [posting.rows for posting in self._postings]
+        words = np.repeat(np.arange(len(rows)), [len(r) for r in rows])
+        postings = np.column_stack([words, np.concatenate([*rows, np.zeros((0, 2), np.int64)])])
+        return IndexState(self._words, postings, np.array(self._keyframes, np.int64))
 
     def load(self, state: IndexState) -> None:
         """Give an empty index the state of another. Raises InputError if it is incomplete."""
@@ -81,9 +101,10 @@ class AppearanceIndex:
         if ((state.postings[:, :2] < 0) | (state.postings[:, :2] >= counts)).any():
             raise InputError("the index of looks is incomplete")
         self._words, self._keyframes = state.words, state.keyframes.tolist()
-        self._postings = [[] for _ in state.words]
+        self._row = {k: n for n, k in enumerate(self._keyframes)}
+        self._postings = [Posting() for _ in state.words]
         for word, row, count in state.postings.tolist():
-            self._postings[word].append((row, count))
+            self._postings[word].add(row, count)
 
     def describe(self, image: UInt8[np.ndarray, "h w 3"]) -> Features:
         """Features of an image, to be given to :meth:`add` and :meth:`query` in its stead."""
@@ -102,11 +123,11 @@ class AppearanceIndex:
         known[fresh] = True
         self._words = np.concatenate([self._words, descriptors[fresh]])
         self._recent = None
-        self._postings.extend([] for _ in fresh)
-        row = len(self._keyframes)
+        self._postings.extend(Posting() for _ in fresh)
+        row = self._row[keyframe] = len(self._keyframes)
         self._keyframes.append(keyframe)
         for word, count in _counts(words[known]):
-            self._postings[word].append((row, count))
+            self._postings[word].add(row, count)
 
     def query(
         self,
@@ -116,26 +137,25 @@ class AppearanceIndex:
     ) -> list[Candidate]:
         """The ``count`` most similar keyframes that are not excluded, best first."""
         score = self._scores(self._features(image))
-        for row, keyframe in enumerate(self._keyframes):
-            if keyframe in exclude:
-                score[row] = 0.0
+        score[[self._row[k] for k in exclude if k in self._row]] = 0.0
         best = np.argsort(-score, kind="stable")[:count]
         return [Candidate(self._keyframes[r], float(score[r])) for r in best if score[r] > 0]
 
     def _scores(self, features: Features) -> Float64[np.ndarray, "rows"]:
         """Similarity of every row to an image."""
         rows = len(self._keyframes)
-        score = np.zeros(rows)
         words, distance = self._nearest(features)
         known = distance <= self._radius
         # A word that no keyframe has yet still belongs to what the image is.
         own = float((~known).sum()) * np.log((rows + 1) / 0.5)
+        held, share = [np.zeros(0, np.int64)], [np.zeros(0)]
         for word, count in _counts(words[known]):
-            posting = self._postings[word]
+            posting = self._postings[word].rows
             weight = max(np.log((rows + 1) / (len(posting) + 0.5)), 0.0)
             own += weight * count
-            for row, other in posting:
-                score[row] += weight * min(count, other)
+            held.append(posting[:, 0])
+            share.append(weight * np.minimum(posting[:, 1], count))
+        score = np.bincount(np.concatenate(held), np.concatenate(share), minlength=rows)
         return score / max(own, 1e-9)
 
     @property

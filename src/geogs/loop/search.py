@@ -1,6 +1,7 @@
 """The part of loop detection that can run beside tracking: looks and features, no flow."""
 
 from collections.abc import Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Literal
 
@@ -13,6 +14,7 @@ from geogs.keyframes.grid import SampleGrid
 from geogs.loop.features import Features
 from geogs.loop.retrieval import AppearanceIndex, IndexState
 from geogs.loop.verification import DepthView, TwoView, TwoViewVerifier
+from geogs.threads import worker_count
 from geogs.tracking.motion import Recognition
 
 Cause = Literal["geometry", "appearance"]
@@ -45,7 +47,8 @@ class Query:
     """A keyframe to search loops for; nothing in it changes any more."""
 
     id: int
-    image: UInt8[np.ndarray, "h w 3"]
+    features: Future[Features]
+    """Of its image."""
     near: frozenset[int]
     """Keyframes that cannot be its loops, for being of the same time."""
     by_pose: tuple[int, ...]
@@ -81,6 +84,10 @@ class PlaceSearch:
         self._verifier = TwoViewVerifier(grid.camera, config.verification)
         self._features: dict[int, Features] = {}
         self._order = order
+        self._helpers = ThreadPoolExecutor(
+            min(worker_count(), config.verified), thread_name_prefix="looks"
+        )
+        """Find features before their keyframe's turn, and hold several pairs together at once."""
 
     def state(self) -> SearchState:
         """What a checkpoint holds, while nothing is searched."""
@@ -91,6 +98,10 @@ class PlaceSearch:
         self.index.load(state.index)
         self._features = state.features
 
+    def describe(self, image: UInt8[np.ndarray, "h w 3"]) -> Future[Features]:
+        """What a keyframe is remembered by, as soon as somebody has the time to find it."""
+        return self._helpers.submit(self.index.describe, image)
+
     def remember(self, id: int, image: UInt8[np.ndarray, "h w 3"]) -> None:
         """Remember a keyframe, whatever it may show again."""
         self._features[id] = self.index.describe(image)
@@ -99,8 +110,11 @@ class PlaceSearch:
     def find(self, query: Query) -> list[Sighting]:
         """Remember a keyframe; the pairs it makes with earlier ones, most promising first."""
         id = query.id
-        self._features[id] = self.index.describe(query.image)
-        sightings = [Sighting(p, self._verify(p, query.depths)) for p in self._proposals(query)]
+        self._features[id] = query.features.result()
+        proposals = self._proposals(query)
+        views = [self._depth_views(p, query.depths) for p in proposals]
+        seen = self._helpers.map(lambda both: self._verifier.verify(*both), views)
+        sightings = [Sighting(p, view) for p, view in zip(proposals, seen, strict=True)]
         self.index.add(id, self._features[id])
         return sightings
 
@@ -147,8 +161,8 @@ class PlaceSearch:
         found = self.index.query(features, excluded, self.config.appearance)
         return [c.keyframe for c in found if c.score >= self.config.min_score]
 
-    def _verify(self, p: Proposal, depths: Depths) -> TwoView:
+    def _depth_views(self, p: Proposal, depths: Depths) -> tuple[DepthView, DepthView]:
         first, second = (
             DepthView.of(self.grid, *depths[k], self._features[k]) for k in (p.first, p.second)
         )
-        return self._verifier.verify(first, second)
+        return first, second

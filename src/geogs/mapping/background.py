@@ -10,7 +10,7 @@ from typing import TypeVar
 
 import numpy as np
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from geogs.errors import GeogsError
@@ -139,8 +139,9 @@ class BackgroundMapper:
             self._tasks.append(task)
             self._news.notify()
 
-    def _changed(self) -> list[Keyframe]:
-        """Copies of the keyframes that are not what they were when they were last handed over."""
+    def _changed(self) -> list[tuple[Keyframe, Float[Tensor, "4 4"]]]:
+        """Copies of the keyframes that are not what they were when they were last handed over, and
+        their poses."""
         changed = []
         for id, before in self._handed.items():
             keyframe = self._store[id]
@@ -149,14 +150,20 @@ class BackgroundMapper:
                 self._handed[id] = now
                 twin = copy.copy(keyframe)
                 twin.prior = copy.copy(keyframe.prior)
-                changed.append(twin)
+                twin.poses = self._mirror.poses
+                changed.append((twin, keyframe.T_cw))
         return changed
 
-    def _take(self, changed: Sequence[Keyframe], event: torch.cuda.Event | None) -> None:
+    def _take(
+        self,
+        changed: Sequence[tuple[Keyframe, Float[Tensor, "4 4"]]],
+        event: torch.cuda.Event | None,
+    ) -> None:
         """Bring the thread's keyframes up to date: their fields are replaced, never changed."""
         if self._stream is not None and event is not None:
             self._stream.wait_event(event)
-        for keyframe in changed:
+        for keyframe, T_cw in changed:
+            keyframe.T_cw = T_cw
             if keyframe.id in self._copies:
                 vars(self._copies[keyframe.id]).update(vars(keyframe))
             else:

@@ -4,9 +4,10 @@ from geogs.config import DepthConfig, DepthSensorConfig
 from geogs.depth.base import DepthEngine, Progress, silent
 from geogs.depth.sensor import joined
 from geogs.depth.sweep_neighbors import select_sweep_neighbours
+from geogs.mapping.near_views import NearViews
+from geogs.mapping.stored_maps import StoredDepth
 from geogs.mapping.view import MapView
-from geogs.mapping.view_pool import StoredDepth, ViewPool
-from geogs.mapping.window import views_around
+from geogs.mapping.view_pool import ViewPool
 
 CANDIDATES = 128
 """Nearest keyframes among which those are looked for that match or check one."""
@@ -30,6 +31,7 @@ class KeyframeDepths:
         self.sensor = sensor or DepthSensorConfig()
         self.engine = engine
         self.views = views
+        self._near = NearViews(views)
         self.config = config
         self.pool = pool
 
@@ -48,7 +50,7 @@ class KeyframeDepths:
         limits = [None if v.search is None else (v.search.near, v.search.far) for v in views]
         for view in views:
             depth = view.tracked_depth if view.search is None else view.search.typical
-            candidates = views_around(view, list(self.views.values()), CANDIDATES)
+            candidates = self._near.around(view, self.views, CANDIDATES)
             places = [v.place for v in candidates]
             chosen = select_sweep_neighbours(view.place, places, depth, self.config)
             neighbours.append([candidates[i].depth_view for i in chosen])
@@ -74,7 +76,7 @@ class KeyframeDepths:
 
     def near(self, view: MapView) -> list[MapView]:
         """The keyframes with a depth that see a view's surface best from elsewhere."""
-        around = views_around(view, list(self.views.values()), CANDIDATES)
+        around = self._near.around(view, self.views, CANDIDATES)
         known = [v for v in around if v.has_depth and v.id != view.id]
         places = [v.place for v in known]
         depth = view.typical_depth

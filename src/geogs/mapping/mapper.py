@@ -21,6 +21,7 @@ from geogs.mapping.keyframe_depths import CANDIDATES, KeyframeDepths
 from geogs.mapping.levelling import light_of
 from geogs.mapping.map_frame import WORLD, MapFrame
 from geogs.mapping.map_update import MapUpdate, plan_update, witness
+from geogs.mapping.near_views import NearViews
 from geogs.mapping.rendered import (
     MapRenderer,
     SurfaceRules,
@@ -35,7 +36,7 @@ from geogs.mapping.training.base import Batch, MapTrainer, TrainingPlace, draw_p
 from geogs.mapping.training.select import map_trainer
 from geogs.mapping.view import MapView
 from geogs.mapping.view_pool import ViewPool
-from geogs.mapping.window import choose_partners, draw_views, views_around
+from geogs.mapping.window import choose_partners, draw_views
 from geogs.on_demand import OnDemand
 from geogs.splat.density import (
     candidate_pixels,
@@ -91,6 +92,7 @@ class Mapper:
         self.pool = ViewPool(self.cameras, config.loss, self.map.device, keyframes.resident)
         self._depths = KeyframeDepths(engine, self.views, config.depth, self.pool, sensor)
         self.mapped: list[int] = []
+        self._near = NearViews(self.views)
         self.trained = TrainingPlace()
         """How far the training over all keyframes is, at each report of its progress."""
         self._given: frozenset[int] = frozenset()
@@ -179,6 +181,10 @@ class Mapper:
     def map_keyframe(self, keyframe_id: int) -> None:
         """Give a keyframe its depth, carve and grow the map with it, train the window."""
         view = self.views[keyframe_id]
+        trained = [*self.mapped, keyframe_id]
+        drawn = draw_views(trained, self.config.iterations, self.config, self._random)
+        # Old ones have to be read from a file; meanwhile the depth is searched.
+        self.pool.read_ahead({i for ids in drawn for i in ids if i != keyframe_id})
         self._estimate_ahead(keyframe_id)
         self._depths.check([view])
         self.mapped.append(keyframe_id)
@@ -190,8 +196,10 @@ class Mapper:
         if len(self.mapped) > self.config.window:
             left = self.views[self.mapped[-1 - self.config.window]]
             self._insert(left, self.config.disk.fill_confidence)
-        drawn = draw_views(self.mapped, self.config.iterations, self.config, self._random)
-        trainer.train([self._batch(ids) for ids in drawn])
+        batches = [self._batch(ids) for ids in drawn]
+        seen = {v.id for batch in batches for own, others in batch for v in (own, *others)}
+        self.pool.read_ahead(seen)
+        trainer.train(batches)
         if len(self.mapped) % self.config.disk.carve_every == 0:
             self._prune_around(view)
 
@@ -366,7 +374,7 @@ class Mapper:
         self._depths.estimate([self.views[i] for i in wanted])
 
     def _mapped_around(self, view: MapView, count: int) -> list[MapView]:
-        return views_around(view, [self.views[i] for i in self.mapped], count)
+        return self._near.around(view, self.mapped, count)
 
     def _choose_partners(self, view: MapView) -> None:
         """Photometric partners of a view; it becomes a candidate for those before it."""

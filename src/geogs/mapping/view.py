@@ -60,11 +60,12 @@ class MapView:
     def depth_view(self) -> DepthView:
         """What the depth estimation needs."""
         maps, (inverse_depth, information) = self.pool.maps(self.id), self.keyframe.depth_field()
+        grey, fine = self.pool.depth_images(self.id)
         if self.search is not None:  # the grid says only what is usual, and next to nothing of that
             inverse_depth = np.full_like(inverse_depth, 1.0 / self.search.typical)
             information = np.full_like(inverse_depth, (self.search.typical / UNSURE) ** 2)
         return DepthView(
-            self.id, self.T_cw.numpy(), maps.grey, maps.fine, maps.image, inverse_depth, information
+            self.id, self.T_cw.numpy(), grey, fine, maps.image, inverse_depth, information
         )
 
     def sensed(

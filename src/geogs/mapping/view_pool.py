@@ -1,12 +1,12 @@
 """The large parts of the mapper's views: in memory while they are used, else in a file."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, UInt8
+from jaxtyping import Bool, Float, Float32
 from torch import Tensor
 
 from geogs.config import LossConfig
@@ -20,87 +20,9 @@ from geogs.keyframes.swap import Swap
 from geogs.losses.multi_view import PhotoView
 from geogs.losses.single_view import OUTSIDE, ViewConstants
 from geogs.mapping.cameras import MapCameras
-
-
-@dataclass(eq=False)
-class ViewMaps:
-    """What is as large as an image: all but the depths follows from the keyframe's image."""
-
-    image: UInt8[np.ndarray, "wh ww 3"]
-    grey: Float32[np.ndarray, "h w"]
-    fine: Float32[np.ndarray, "fh fw"]
-    """Of the :class:`DepthView`."""
-    photo: Float[Tensor, "k ph pw"]
-    """Planes of the :class:`PhotoView` in the light of all, on the map's device."""
-    normal: Float[Tensor, "h w 3"] | None
-    """A prior's normals at the render size, on the map's device."""
-    depth: DenseDepth | None = None
-    scale: float = 1.0
-    """Of the keyframe when the depth was as it is here."""
-    constants: ViewConstants | None = None
-    rendered_depth: Float[Tensor, "h w"] | None = None
-    is_depth_stored: bool = True
-    """Whether the archive has the depth."""
-    is_render_stored: bool = True
-
-
-@dataclass(frozen=True, eq=False)
-class StoredDepth:
-    """A dense depth in an archive."""
-
-    depth: Archived
-    confidence: Archived
-    typical: float
-    """Median depth, map units."""
-    scale: float
-    """Of the keyframe when its depth was archived."""
-    normal: Archived | None = None
-    """Half precision; none where the depth came without."""
-    held: DenseDepth | None = field(default=None, metadata={"stored": False})
-    """The depth itself, where it can also stay: on a GPU it is small beside all else there, and
-    bringing it there again takes longer than using it."""
-
-    @staticmethod
-    def of(depth: DenseDepth, scale: float, archive: Archive) -> "StoredDepth":
-        """Archive a depth of a keyframe that has a scale."""
-        arrays = depth.arrays()
-        return StoredDepth(
-            archive.put(arrays.depth), archive.put(arrays.confidence), depth.typical, scale,
-            None if depth.normal is None else archive.put(depth.normal.half().cpu().numpy()),
-            depth if depth.depth.is_cuda else None,
-        )  # fmt: skip
-
-    def typical_at(self, scale: float) -> float:
-        """Median depth at another scale of the keyframe."""
-        return self.typical * (scale / self.scale)
-
-    def load(self, scale: float, device: torch.device) -> DenseDepth:
-        """The depth at another scale of the keyframe."""
-        factor, typical = scale / self.scale, torch.tensor(self.typical_at(scale))
-        if self.held is not None:
-            held = self.held
-            return DenseDepth(held.depth * factor, held.confidence, typical, normal=held.normal)
-        depth = torch.from_numpy(self.depth.load())
-        if factor != 1.0:
-            depth = depth * factor
-        confidence = torch.from_numpy(self.confidence.load())
-        normal = None
-        if self.normal is not None:
-            normal = torch.from_numpy(self.normal.load()).float().to(device)
-        return DenseDepth(depth.to(device), confidence.to(device), typical, normal=normal)
-
-
-@dataclass(eq=False)
-class StoredMaps:
-    """Of a view that is not in use: its depths in an archive, the rest can be made again."""
-
-    keyframe: Keyframe
-    mask: Bool[Tensor, "h w"] | None
-    """Pixels of the render size that belong to the scene; none takes all. On the map's device."""
-    depth: StoredDepth | None = None
-    rendered_depth: Archived | None = None
-    light: Float[Tensor, "2"] | None = None
-    """Gain and offset that bring its grey values into the light of all; None until known."""
+from geogs.mapping.held_depths import HeldDepths
+from geogs.mapping.read_ahead import ReadAhead
+from geogs.mapping.stored_maps import StoredDepth, StoredMaps, ViewMaps
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,6 +60,8 @@ class ViewPool:
         self.archive = Archive()
         self._stored: dict[int, StoredMaps] = {}
         self._maps: Swap[int, ViewMaps] = Swap(resident, self._store)
+        self._held = HeldDepths(device)
+        self._ahead = ReadAhead(self._load_with_constants)
 
     def add(self, keyframe: Keyframe, mask: Bool[np.ndarray, "h w"] | None = None) -> None:
         """Take up a keyframe; it has no depth outside a mask of the size of its image."""
@@ -165,8 +89,23 @@ class ViewPool:
 
     def maps(self, id: int) -> ViewMaps:
         """Everything in memory, brought back if need be."""
-        maps = self._maps.get(id, lambda: self._load(self._stored[id]))
-        return self._at_scale(maps, self._stored[id])
+        stored = self._stored[id]
+        maps = self._maps.get(id, lambda: self._ahead.take(stored) or self._load(stored))
+        return self._at_scale(maps, stored)
+
+    def read_ahead(self, ids: Iterable[int]) -> None:
+        """Let threads bring some views back that will soon be asked for, and forget the views of
+        the last such call that were not."""
+        self._ahead.begin([self._stored[i] for i in ids if i not in self._maps])
+
+    def depth_images(
+        self, id: int
+    ) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "fh fw"]]:
+        """The grey images that depths are matched by, see :func:`geogs.depth.view.depth_images`."""
+        maps = self.maps(id)
+        if maps.matched is None:
+            maps.matched = depth_images(maps.image, self.cameras.render)
+        return maps.matched
 
     def has_depth(self, id: int) -> bool:
         """Whether its depth has been estimated."""
@@ -180,7 +119,7 @@ class ViewPool:
             return self._at_scale(maps, stored).depth
         if stored.depth is None:
             return None
-        return stored.depth.load(stored.keyframe.scale, self.device)
+        return self._load_depth(stored, stored.depth, stored.keyframe.scale)
 
     def typical_depth(self, id: int) -> float:
         """Median of the dense depth, map units."""
@@ -203,6 +142,7 @@ class ViewPool:
             depth = depth.within(stored.mask)
         if maps is None:
             stored.depth = StoredDepth.of(depth, stored.keyframe.scale, self.archive)
+            self._held.put(id, stored.depth, depth)
             return
         maps.depth, maps.scale, maps.is_depth_stored = depth, stored.keyframe.scale, False
         if maps.constants is not None:
@@ -217,11 +157,7 @@ class ViewPool:
         """What the single-view losses need; None until the keyframe has a depth."""
         maps = self.maps(id)
         if maps.constants is None and maps.depth is not None:
-            prior = self._prior_depth(self._stored[id], maps.depth)
-            maps.constants = ViewConstants.prepare(
-                maps.image, self.cameras.render, prior, maps.depth.confidence,
-                self._prior_normal(maps, maps.depth),
-            )  # fmt: skip
+            maps.constants = self._constants(maps, maps.depth, self._stored[id])
         return maps.constants
 
     def light(self, id: int) -> Float[Tensor, "2"] | None:
@@ -280,6 +216,7 @@ class ViewPool:
         stored = self._stored[id]
         if not maps.is_depth_stored and maps.depth is not None:
             stored.depth = StoredDepth.of(maps.depth, maps.scale, self.archive)
+            self._held.put(id, stored.depth, maps.depth)
         if not maps.is_render_stored and maps.rendered_depth is not None:
             stored.rendered_depth = self.archive.put(maps.rendered_depth.cpu().numpy())
         maps.is_depth_stored = maps.is_render_stored = True
@@ -296,14 +233,31 @@ class ViewPool:
         normal = None
         if loss.normal_weight:
             normal = _shrunk_normal(keyframe, cameras.render, self.device)
-        maps = ViewMaps(image, *depth_images(image, cameras.render), photo, normal)
+        maps = ViewMaps(image, photo, normal)
         if stored.depth is not None:
             maps.scale = stored.depth.scale if as_archived else keyframe.scale
-            maps.depth = stored.depth.load(maps.scale, self.device)
+            maps.depth = self._load_depth(stored, stored.depth, maps.scale)
         if stored.rendered_depth is not None:
             rendered = torch.from_numpy(stored.rendered_depth.load())
             maps.rendered_depth = rendered.to(self.device)
         return maps
+
+    def _load_depth(self, stored: StoredMaps, depth: StoredDepth, scale: float) -> DenseDepth:
+        held = self._held.get(stored.keyframe.id, depth, scale)
+        return depth.load(scale, self.device) if held is None else held
+
+    def _load_with_constants(self, stored: StoredMaps) -> ViewMaps:
+        """The maps of a view that is about to be trained."""
+        maps = self._load(stored)
+        if maps.depth is not None:
+            maps.constants = self._constants(maps, maps.depth, stored)
+        return maps
+
+    def _constants(self, maps: ViewMaps, depth: DenseDepth, stored: StoredMaps) -> ViewConstants:
+        return ViewConstants.prepare(
+            maps.image, self.cameras.render, self._prior_depth(stored, depth), depth.confidence,
+            self._prior_normal(maps, depth),
+        )  # fmt: skip
 
     def _at_scale(self, maps: ViewMaps, stored: StoredMaps) -> ViewMaps:
         """The maps, whose depth follows the keyframe's scale."""

@@ -1,7 +1,5 @@
 """Which views are trained together, and which check each other."""
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from geogs.config import MappingConfig, PhotoConfig
@@ -46,13 +44,3 @@ def choose_partners(
     scores = misfit(parallax, turn, config.parallax)
     scored = sorted((scores[i], o.id) for i, o in enumerate(others) if usable[i])
     return [i for _, i in scored[: config.candidates]]
-
-
-def views_around(view: MapView, views: Sequence[MapView], count: int) -> list[MapView]:
-    """The ``count`` of some views taken nearest to one, which may be among them, in their order."""
-    if len(views) <= count:
-        return list(views)
-    poses = np.stack([v.place.T_cw for v in views])
-    centres = -(np.swapaxes(poses[:, :3, :3], 1, 2) @ poses[:, :3, 3:])[:, :, 0]
-    distance = np.linalg.norm(centres - view.place.center, axis=1)
-    return [views[i] for i in np.sort(np.argsort(distance, kind="stable")[:count])]

@@ -10,19 +10,28 @@ from torch import Tensor
 
 from geogs.bundle.base import BundleOptions, BundleResult
 from geogs.bundle.problem import BundleProblem, MeasuredDepths, StreamedProblem
-from geogs.bundle.select import bundle_solver, grid_fields, keyframe_pairs
-from geogs.bundle.streamed import StreamedBundle
+from geogs.bundle.select import (
+    bundle_solver,
+    grid_fields,
+    keyframe_pairs,
+    large_bundle_solver,
+)
 from geogs.errors import InputError
 from geogs.keyframes.keyframe import Keyframe
 from geogs.keyframes.store import Segment
 from geogs.threads import thread_map
 from geogs.tracking.flow.base import FlowMatch, FlowOperator
 from geogs.tracking.moving import judge, still_weight
-from geogs.tracking.packed_edge import PackedEdge, PackedFlow, packed_reprojections
+from geogs.tracking.packed_edge import (
+    PackedEdge,
+    PackedFlow,
+    packed_matches,
+    packed_reprojections,
+)
 from geogs.tracking.proximity import PAIRS_TOGETHER, Pair
 
-STACKED_EDGES = 1024
-"""Directed edges up to which an adjustment on the CPU has all matches in one piece."""
+STACKED_EDGES = 1024, 8192
+"""Directed edges up to which an adjustment has all matches in one piece, on CPU and GPU."""
 
 
 @dataclass
@@ -190,9 +199,7 @@ class FrameGraph:
         edges = [self.edges[e] for e in directed]
 
         def matches(part: slice) -> tuple[Tensor, Tensor]:
-            wanted = edges[part]
-            pixels = torch.stack([e.pixels for e in wanted])
-            weight = torch.stack([e.weight for e in wanted])
+            pixels, weight = _matches(edges[part])
             return pixels, still_weight(self.keyframes, directed[part], pixels, weight)
 
         problem = StreamedProblem(
@@ -253,11 +260,11 @@ class FrameGraph:
         options: BundleOptions,
     ) -> tuple[BundleResult, list[int]]:
         grid = self.keyframes.grid
-        if len(directed) <= STACKED_EDGES or grid.on_gpu:
+        if len(directed) <= STACKED_EDGES[grid.on_gpu]:
             problem, ids = self.problem(directed, free_pose, free_depth)
             return self.bundle.solve(problem, options), ids
         streamed, ids = self.streamed_problem(directed, free_pose, free_depth)
-        return StreamedBundle(grid).solve(streamed, options), ids
+        return large_bundle_solver(grid).solve(streamed, options), ids
 
 
 def _measured(keyframes: Sequence[Keyframe]) -> MeasuredDepths | None:
@@ -283,6 +290,14 @@ def _reprojections(edges: Sequence[Edge]) -> Float[Tensor, "e p 2"]:
     return torch.stack([e.reprojection for e in edges])
 
 
+def _matches(edges: Sequence[Edge]) -> tuple[Float[Tensor, "e p 2"], Float[Tensor, "e p 2"]]:
+    """Measured positions and weights of edges, one behind the other."""
+    packed = [e for e in edges if isinstance(e, PackedEdge)]
+    if packed and len(packed) == len(edges):
+        return packed_matches(packed)
+    return torch.stack([e.pixels for e in edges]), torch.stack([e.weight for e in edges])
+
+
 def _in_parts(
     work: Callable[[Sequence[Pair]], Float[Tensor, "k"]], directed: Sequence[Pair], on_gpu: bool
 ) -> Float[Tensor, "e"]:
@@ -303,8 +318,8 @@ def _frame_damping(
         return None
     count = torch.bincount(torch.tensor([n for _, n in given]), minlength=frames)
     total = torch.zeros(frames, given[0][0].shape[0], device=given[0][0].device)
-    for start in range(0, len(given), STACKED_EDGES):
-        part = given[start : start + STACKED_EDGES]
+    for start in range(0, len(given), STACKED_EDGES[0]):
+        part = given[start : start + STACKED_EDGES[0]]
         damping = torch.stack([d for d, _ in part])
         share = torch.nn.functional.one_hot(torch.tensor([n for _, n in part]), frames).float()
         share = share / count.clamp(min=1)

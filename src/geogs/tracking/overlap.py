@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from geogs.geometry.camera import Camera
@@ -27,6 +27,23 @@ class _Spheres:
     share: Float[Tensor, "t"]
     """Of the cells."""
 
+    def around(self) -> "_Spheres":
+        """One sphere around all of each keyframe."""
+        centre = self.centre.mean(1, keepdim=True)
+        reach = (self.centre - centre).norm(dim=-1) + self.radius
+        return _Spheres(centre, 1.001 * reach.amax(1, keepdim=True), torch.ones(1))
+
+    def of(self, rows: Int[Tensor, "m"]) -> "_Spheres":
+        """Those of some of the keyframes."""
+        return _Spheres(self.centre[rows], self.radius[rows], self.share)
+
+    def reach(
+        self, normal: Float[Tensor, "m k 3"], offset: Float[Tensor, "m k"]
+    ) -> Bool[Tensor, "n m t"]:
+        """Whether each reaches into what the planes of each view bound."""
+        distance = torch.einsum("ntd,mkd->nmtk", self.centre, normal) + offset[:, None]
+        return (distance >= -self.radius[:, None, :, None]).all(-1)
+
 
 def may_overlap(
     store: Segment, source: Sequence[int], target: Sequence[int], least: float, step: int
@@ -37,14 +54,15 @@ def may_overlap(
     did, so True proves nothing and False is certain.
     """
     spheres = _spheres(store, source, step)
-    out = np.empty((len(source), len(target)), dtype=bool)
+    whole = spheres.around()
+    out = np.full((len(source), len(target)), least <= 1e-6)
     for begin in range(0, len(target), TARGETS_TOGETHER):
         part = target[begin : begin + TARGETS_TOGETHER]
-        normal, offset = _view_planes(store.grid.camera, store.poses(part))
-        distance = torch.einsum("ntd,mkd->nmtk", spheres.centre, normal) + offset[:, None]
-        reached = (distance >= -spheres.radius[:, None, :, None]).all(-1)
-        share = reached.float() @ spheres.share
-        out[:, begin : begin + len(part)] = (share > least - 1e-6).numpy()
+        planes = _view_planes(store.grid.camera, store.poses(part))
+        # Of a long walk most keyframes are nowhere near these few.
+        near = torch.nonzero(whole.reach(*planes)[..., 0].any(1))[:, 0]
+        share = spheres.of(near).reach(*planes).float() @ spheres.share
+        out[near.numpy(), begin : begin + len(part)] = (share > least - 1e-6).numpy()
     return out
 
 

@@ -112,6 +112,15 @@ def unpacked_positions(grid: SampleGrid, position: Int16[Tensor, "*b 2"]) -> Flo
     return position.float() * position_step(grid.camera) + _centre(grid)
 
 
+def packed_matches(
+    edges: Sequence[PackedEdge],
+) -> tuple[Float[Tensor, "e p 2"], Float[Tensor, "e p 2"]]:
+    """Positions and weights of edges, all unpacked at once."""
+    position = torch.stack([e.flow.position for e in edges])
+    weight = torch.stack([e.flow.half_weight for e in edges]).float()
+    return unpacked_positions(edges[0].grid, position), weight
+
+
 def packed_reprojections(edges: Sequence[PackedEdge]) -> Float[Tensor, "e p 2"]:
     """Where the cells fell when the flow of each edge was measured."""
     grid, flows = edges[0].grid, [e.flow for e in edges]

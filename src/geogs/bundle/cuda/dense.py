@@ -64,7 +64,7 @@ def _structure(problem: BundleProblem, device: torch.device) -> _Structure:
         for x in (problem.source, problem.target, problem.free_pose, problem.free_depth)
     )
     first = np.searchsorted(source, np.arange(len(free_pose) + 1))
-    a, b = _joined_edges(first, free_depth)
+    a, b = joined_edges(first, free_depth)
     slot = np.where(free_pose, np.cumsum(free_pose) - 1, -1)
     poses = int(free_pose.sum())
     system = _system_parts(slot[source[a]], slot[target[a]], slot[target[b]], a == b, poses)
@@ -73,7 +73,7 @@ def _structure(problem: BundleProblem, device: torch.device) -> _Structure:
     return _Structure(poses, *sent.split([len(p) for p in parts]))
 
 
-def _joined_edges(
+def joined_edges(
     first: Int[np.ndarray, "m"], free_depth: Bool[np.ndarray, "n"]
 ) -> tuple[Int[np.ndarray, "k"], Int[np.ndarray, "k"]]:
     """Pairs a <= b of edges of one source; only a = b where its depth is fixed."""

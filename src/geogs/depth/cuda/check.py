@@ -17,6 +17,8 @@ from geogs.geometry.camera import Camera
 from geogs.gpu.kernels import kernels_for
 
 SOURCE = Path(__file__).with_name("reprojection.cu")
+VOTERS_TOGETHER = 256
+"""Views that vote in one launch."""
 
 
 def check(
@@ -49,16 +51,22 @@ def vote(
     camera: Camera,
     config: DepthConfig,
 ) -> Bool[Tensor, "n"]:
-    """World points that do not stand in the free space of the views (``carve.vote``)."""
+    """World points that do not stand in the free space of the views (``carve.vote``).
+
+    Not all depths are on the GPU at once.
+    """
     device = points.device
     keep = torch.empty(len(points), dtype=torch.bool, device=device)
-    matrices = upload(transforms(np.stack([d.T_cw for d in depths])), device)
-    kernels_for(SOURCE, device)["vote_on_points"](
-        -(-len(points) // 128), 128, points, upload(_addresses(depths), device), matrices,
-        len(points), len(depths), *depths[0].depth.depth.shape, camera.fx, camera.fy, camera.cx,
-        camera.cy, config.vote_confidence, config.vote_support, config.vote_violation,
-        config.vote_free_views, keep,
-    )  # fmt: skip
+    votes = torch.zeros(len(points), 2, dtype=torch.int32, device=device)
+    for start in range(0, len(depths), VOTERS_TOGETHER):
+        held = list(depths[start : start + VOTERS_TOGETHER])  # the kernel reads where they lie
+        matrices = upload(transforms(np.stack([d.T_cw for d in held])), device)
+        kernels_for(SOURCE, device)["vote_on_points"](
+            -(-len(points) // 128), 128, points, upload(_addresses(held), device), matrices,
+            len(points), len(held), *held[0].depth.depth.shape, camera.fx, camera.fy, camera.cx,
+            camera.cy, config.vote_confidence, config.vote_support, config.vote_violation,
+            config.vote_free_views, votes, keep,
+        )  # fmt: skip
     return keep
 
 

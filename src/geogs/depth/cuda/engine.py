@@ -117,8 +117,7 @@ class CudaDepthEngine:
         points = points.detach().float().contiguous()
         if not depths:
             return torch.isfinite(points).all(1)
-        held = list(depths)  # the kernel reads where they lie
-        return vote(points, held, self.render, self.config)
+        return vote(points, depths, self.render, self.config)
 
     def _images_of(self, view: DepthView) -> KeyframeImages:
         """The images on the GPU, brought there at their first use."""

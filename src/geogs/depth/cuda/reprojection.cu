@@ -136,16 +136,17 @@ extern "C" __global__ void check_depth(
 }
 
 // Which world points to keep: those that are finite and that fewer than `free_views` views, or no
-// more than see them on their surface, see in free space. transforms: world to view.
+// more than see them on their surface, see in free space. transforms: world to view. votes (n, 2):
+// how many views of earlier launches see each point on their surface and in free space; added to.
 extern "C" __global__ void vote_on_points(
     const float* points, const long long* maps, const float* transforms, int count, int views, int h,
     int w, float fx, float fy, float cx, float cy, float vote_confidence, float vote_support,
-    float vote_violation, int free_views, bool* keep) {
+    float vote_violation, int free_views, int2* votes, bool* keep) {
   const int i = blockIdx.x * blockDim.x + threadIdx.x;
   if (i >= count) return;
   const Lens lens = {fx, fy, cx, cy};
   const Point point = {points[3 * i], points[3 * i + 1], points[3 * i + 2]};
-  int surface = 0, open = 0;
+  int surface = votes[i].x, open = votes[i].y;
   for (int j = 0; j < views; j++) {
     const Seen s = look_up(lens, transform(transforms + 12 * j, point), depth_map(maps, j),
                            confidence_map(maps, j), h, w);
@@ -153,6 +154,7 @@ extern "C" __global__ void vote_on_points(
     surface += fabsf(s.ratio - 1.f) < vote_support;
     open += s.ratio < 1.f - vote_violation;
   }
+  votes[i] = {surface, open};
   const bool finite = isfinite(point.x) && isfinite(point.y) && isfinite(point.z);
   keep[i] = finite && (open < free_views || open <= surface);
 }

@@ -1,0 +1,80 @@
+"""Where all keyframes of a run are: a pose each, and all of them as rows of one array.
+
+A step that looks over every keyframe so far, to find those around one, reads the array; so it costs
+next to nothing of what asking keyframe by keyframe would.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float, Float64, Int, Int64
+from torch import Tensor
+
+
+class PoseTable:
+    """World-to-camera poses by keyframe id, float64, on the CPU.
+
+    A pose is replaced, never changed in place: who keeps a reference sees what it was.
+    """
+
+    def __init__(self) -> None:
+        self._poses: dict[int, Float[Tensor, "4 4"]] = {}
+        self._rows: Float64[np.ndarray, "c 4 4"] = np.zeros((0, 4, 4))
+        """By id, with room for more."""
+        self._centres: Float64[np.ndarray, "c 3"] = np.zeros((0, 3))
+
+    def __getitem__(self, id: int) -> Float[Tensor, "4 4"]:
+        return self._poses[id]
+
+    def __setitem__(self, id: int, T_cw: Float[Tensor, "4 4"]) -> None:
+        if id >= len(self._rows):
+            self._grow(id + 1)
+        self._poses[id] = T_cw
+        self._rows[id] = T = T_cw.numpy()
+        self._centres[id] = -T[:3, :3].T @ T[:3, 3]
+
+    def rows(self, ids: Sequence[int] | Int[np.ndarray, "n"]) -> Float64[np.ndarray, "n 4 4"]:
+        """Poses of some keyframes: a copy."""
+        return self._rows[np.asarray(ids, np.int64)]
+
+    def centres(self, ids: Sequence[int] | Int[np.ndarray, "n"]) -> Float64[np.ndarray, "n 3"]:
+        """Camera centres of some keyframes in the world: a copy."""
+        return self._centres[np.asarray(ids, np.int64)]
+
+    def nearest(self, id: int, ids: Int64[np.ndarray, "n"], count: int) -> Int64[np.ndarray, "m"]:
+        """Those of some keyframes whose cameras were nearest to one's, at most ``count``, nearest
+        first; of equally near ones the first."""
+        distance = np.linalg.norm(self.centres(ids) - self._centres[id], axis=1)
+        if count < len(ids):
+            # Whatever is as near as the last of them takes part, so that the first are taken.
+            limit = np.partition(distance, count - 1)[count - 1]
+            within = np.flatnonzero(distance <= limit)
+        else:
+            within = np.arange(len(ids))
+        return ids[within[np.argsort(distance[within], kind="stable")[:count]]]
+
+    def around(
+        self, id: int, ids: Int64[np.ndarray, "n"], angle: float, distance: float
+    ) -> Int64[np.ndarray, "m"]:
+        """Those of some keyframes less than a ``distance`` from one's camera that look the same way
+        to less than an ``angle`` in degrees; nearest first."""
+        away = np.linalg.norm(self.centres(ids) - self._centres[id], axis=1)
+        within = np.flatnonzero(away < distance)
+        within = within[np.argsort(away[within], kind="stable")]
+        turned = turns(self._rows[id], self.rows(ids[within]))
+        return ids[within[turned < angle]]
+
+    def _grow(self, least: int) -> None:
+        more = max(least, 2 * len(self._rows), 64) - len(self._rows)
+        self._rows = np.concatenate([self._rows, np.zeros((more, 4, 4))])
+        self._centres = np.concatenate([self._centres, np.zeros((more, 3))])
+
+
+def turns(
+    T: Float64[np.ndarray, "4 4"], others: Float64[np.ndarray, "n 4 4"]
+) -> Float64[np.ndarray, "n"]:
+    """Angles in degrees between the orientation of a pose and those of others."""
+    relative = np.einsum("ik,njk->nij", T[:3, :3], others[:, :3, :3])
+    axis = relative[:, [2, 0, 1], [1, 2, 0]] - relative[:, [1, 2, 0], [2, 0, 1]]
+    cosine = np.trace(relative, axis1=1, axis2=2) - 1
+    return np.degrees(np.arctan2(np.linalg.norm(axis, axis=1), cosine))
