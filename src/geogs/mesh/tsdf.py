@@ -242,8 +242,8 @@ class SparseTsdf:
         """Average a depth map into blocks on the CPU; they share no voxel, so threads may."""
         from geogs.mesh.tsdf_kernels import average_in
 
-        block = projection[:, :3] @ (self._coordinates[slots].double().mT * BLOCK * self.voxel)
-        block = (block + projection[:, 3:]).float().mT.contiguous().numpy()
+        corner = projection[:, :3] @ (self._coordinates[slots].double().mT * BLOCK * self.voxel)
+        block = (corner + projection[:, 3:]).float().mT.contiguous().numpy()
         local = (projection[:, :3] @ (self._offsets.double().mT * self.voxel)).float().numpy()
         distance, weight, planes = (x.numpy() for x in (self._distance, self._weight, table))
         truncation = np.float32(self.truncation * self.voxel)
