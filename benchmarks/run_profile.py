@@ -1,17 +1,19 @@
-"""Where a second of ``geogs run`` goes: by stage, and by function within a stage.
+"""Where a second of ``geogs run`` goes, from the command to its exit.
 
     python benchmarks/run_profile.py SOURCE [--device cpu] [--functions 10] [--config.key VALUE ...]
 
 Start-up is measured in processes of their own: the help, PyTorch's import, all imports of a run.
-Then the run is made here, the report included, into a folder that is deleted again. Of every stage
-two times are printed: by the clock on the wall, and of all threads of the process on the CPU, which
-tells on a machine that others use, too. With ``--functions N`` a second run follows under
-Python's profiler, and the N costliest functions of each stage are printed; compiled loops and
-PyTorch's operators appear under the function that calls them or their own names.
+The whole command is another one, with the files it writes into a folder that is deleted again.
+Then the same run is made here, and of every stage two times are printed: by the clock on the wall,
+and of all threads of the process on the CPU, which tells on a machine that others use, too. A stage
+within another counts for itself alone. With ``--functions N`` a second run follows under Python's
+profiler, and the N costliest functions of each stage are printed; compiled loops and PyTorch's
+operators appear under the function that calls them or their own names.
 """
 
 import argparse
 import cProfile
+import os
 import pstats
 import subprocess
 import sys
@@ -45,32 +47,47 @@ LEAST_SHARE = 0.01
 
 
 class StageMeter(Stopwatch):
-    """A stopwatch that counts the seconds of the CPU as well, and can profile each stage."""
+    """A stopwatch that counts the seconds of the CPU as well, and can profile each stage.
+
+    Unlike in a run, a stage within another is taken out of that.
+    """
 
     def __init__(self, profiles: bool) -> None:
         super().__init__()
         self.processor: dict[str, float] = {}
         self.profiles: dict[str, cProfile.Profile] = {}
         self._with_profiles = profiles
-        self._is_inside = False
+        self._stages: list[str] = []
+        self._since = (0.0, 0.0)
 
     @contextmanager
     def __call__(self, stage: str) -> Iterator[None]:
-        if self._is_inside:
-            yield
-            return
-        profile = self.profiles.setdefault(stage, cProfile.Profile(time.thread_time))
-        self._is_inside, start = True, time.process_time()
+        self._settle()
+        self._stages.append(stage)
+        self._follow(True)
         try:
-            with super().__call__(stage):
-                if self._with_profiles:
-                    profile.enable()
-                yield
+            yield
         finally:
-            profile.disable()
-            self._is_inside = False
-            spent = time.process_time() - start
-            self.processor[stage] = self.processor.get(stage, 0.0) + spent
+            self._settle()
+            self._stages.pop()
+            self._follow(True)
+
+    def _settle(self) -> None:
+        """Give the stage at hand the seconds since it began or went on."""
+        now = (time.perf_counter(), time.process_time())
+        if self._stages:
+            stage, (wall, processor) = self._stages[-1], self._since
+            self.seconds[stage] = self.seconds.get(stage, 0.0) + now[0] - wall
+            self.processor[stage] = self.processor.get(stage, 0.0) + now[1] - processor
+            self._follow(False)
+
+    def _follow(self, begins: bool) -> None:
+        """The stage at hand goes on, or gives way to another."""
+        self._since = (time.perf_counter(), time.process_time())
+        if self._with_profiles and self._stages:
+            stage = self._stages[-1]
+            profile = self.profiles.setdefault(stage, cProfile.Profile(time.thread_time))
+            profile.enable() if begins else profile.disable()
 
 
 def start_up(code: str) -> tuple[float, float]:
@@ -86,6 +103,21 @@ def start_up(code: str) -> tuple[float, float]:
     return time.perf_counter() - start, float(done.stdout)
 
 
+def whole_command(source: Path, device: str, options: list[str]) -> tuple[float, float]:
+    """Seconds of the wall and of the CPU of ``geogs run`` in a process of its own.
+
+    Raises:
+        CalledProcessError: it failed; what it said has been printed.
+    """
+    before, start = os.times(), time.perf_counter()
+    with tempfile.TemporaryDirectory() as folder:
+        call = ["run", str(source), "-o", folder, "--device", device, "--quiet", *options]
+        subprocess.run([sys.executable, "-m", "geogs.cli.main", *call], check=True)
+    wall, after = time.perf_counter() - start, os.times()
+    spent = after.children_user - before.children_user
+    return wall, spent + after.children_system - before.children_system
+
+
 @on_one_torch_thread
 def measured_run(
     source: Path, config: Config, device: str, profiles: bool
@@ -98,7 +130,7 @@ def measured_run(
     with meter("shutter"):
         stream = with_shutter_found(stream)
     with meter("making the system"):
-        slam = Slam(stream.camera, config, device)
+        slam = Slam(stream.camera, config, device, mask=stream.mask)
     slam.stopwatch = meter
     frames = iter(stream)
     while True:
@@ -111,12 +143,7 @@ def measured_run(
             first = time.process_time() - start
     slam.finish()
     with tempfile.TemporaryDirectory() as folder, meter("other files"):
-        result = Result(slam, stream)
-        inner = Stopwatch()  # what is made for the files is no stage of its own here
-        slam.stopwatch = inner
-        write_results(folder, result)
-        for name, seconds in inner.seconds.items():
-            print(f"  of the files, {name}: {seconds:.2f} s")
+        write_results(folder, Result(slam, stream))
     return meter, first, slam.frames
 
 
@@ -143,20 +170,31 @@ def main() -> None:
     parser.add_argument("--functions", type=int, default=0)
     given, rest = parser.parse_known_args()
     config = parse_options(Config, rest, "run")
+    imports = 0.0
     for name, code in STARTS.items():
         wall, processor = min(start_up(code) for _ in range(3))
-        print(f"{name:<26} {wall:7.2f} s wall {processor:7.2f} s CPU")
+        imports = processor
+        print(f"{name:<26} {wall:7.2f} s wall {processor:7.2f} s CPU", flush=True)
+    wall, processor = whole_command(given.source, given.device, rest)
+    print(f"{'the whole command':<26} {wall:7.2f} s wall {processor:7.2f} s CPU", flush=True)
     meter, first, frames = measured_run(given.source, config, given.device, profiles=False)
     print(f"\n{frames} frames on {given.device}, {worker_count()} threads of the kernels;")
-    print(f"first frame tracked {first:.2f} s of CPU after the imports\n")
-    total, total_cpu = meter.total, sum(meter.processor.values())
-    for stage, seconds in sorted(meter.seconds.items(), key=lambda item: -item[1]):
-        share = meter.processor[stage] / total_cpu
-        print(f"{stage:<26} {seconds:7.2f} s wall {meter.processor[stage]:7.2f} s CPU {share:6.1%}")
-    print(f"{'total':<26} {total:7.2f} s wall {total_cpu:7.2f} s CPU")
+    print(f"first frame tracked {first:.2f} s of CPU after the imports, {imports + first:.2f}")
+    print("after the command\n")
+    print_stages(meter)
     if given.functions:
         meter, _, _ = measured_run(given.source, config, given.device, profiles=True)
         print_functions(meter, given.functions)
+
+
+def print_stages(meter: StageMeter, show: Callable[[str], None] = print) -> None:
+    """The seconds of each stage, the longest first."""
+    total, total_cpu = meter.total, sum(meter.processor.values())
+    for stage, seconds in sorted(meter.seconds.items(), key=lambda item: -item[1]):
+        processor = meter.processor[stage]
+        share = processor / max(total_cpu, 1e-9)
+        show(f"{stage:<26} {seconds:7.2f} s wall {processor:7.2f} s CPU {share:6.1%}")
+    show(f"{'total':<26} {total:7.2f} s wall {total_cpu:7.2f} s CPU")
 
 
 if __name__ == "__main__":

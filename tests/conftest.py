@@ -25,7 +25,7 @@ def _typed_modules() -> list[str]:
 
 
 torch.set_num_threads(1)  # as the system works; more only wait for each other
-jaxtyping.install_import_hook(_typed_modules(), "beartype.beartype")
+jaxtyping.install_import_hook(_typed_modules(), "lazy_check.checked")
 
 
 Once = Callable[[str, Callable[[Path], object]], Path]

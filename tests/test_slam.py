@@ -78,8 +78,7 @@ def small_result(small_room, once) -> Path:
 
 def test_a_run_reaches_its_accuracy(room, result, tmp_path):
     out = shutil.copytree(result, tmp_path / "out")
-    done = geogs("eval", out, "--gt", room, "--no-plots")
-    assert done.returncode == 0, done.stderr
+    assert cli.main(["eval", str(out), "--gt", str(room), "--no-plots"]) == 0
     scores = json.loads((out / "eval.json").read_text())
     assert scores["trajectory"]["ate_rmse_cm"] < 0.3
     assert scores["trajectory"]["pairs"] == FRAMES
@@ -177,8 +176,7 @@ def test_the_preset_of_the_paper_runs_and_ends_with_the_adjustment(small_room, t
     assert not json.loads((out / "summary.json").read_text())["refined"]
     assert (out / "online" / "mesh.ply").is_file()
     assert not (out / "adjusted").exists()
-    done = geogs("eval", out, "--gt", small_room, "--no-plots")
-    assert done.returncode == 0, done.stderr
+    assert cli.main(["eval", str(out), "--gt", str(small_room), "--no-plots"]) == 0
     assert json.loads((out / "eval.json").read_text())["trajectory"]["ate_rmse_cm"] < 2.0
     assert len(read_surface(out / "mesh.ply").faces) > 300
 

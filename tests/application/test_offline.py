@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 import torch
 
+from geogs.application import offline
 from geogs.cli.main import main
 from geogs.geometry.umeyama import umeyama
 from geogs.io.poses import read_tum_trajectory
 from geogs.photos import sharp_frames
 from io_samples import write_image
 from posed_layouts import render_room
+from posed_scene import SMALL
 
 FRAMES = 12
 
@@ -20,6 +22,7 @@ FRAMES = 12
 def test_every_frame_gets_its_pose_and_there_is_a_mesh(tmp_path, monkeypatch, capfd):
     pytest.importorskip("pycolmap")
     monkeypatch.setattr(sharp_frames, "FEWEST", FRAMES // 2)
+    monkeypatch.setattr(offline, "ReconstructConfig", lambda: SMALL)
     room = render_room(FRAMES, 3, 320, 240)
     for k, image in enumerate(room.images):
         write_image(tmp_path / "video" / f"{k:03d}.png", image)

@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 
 from geogs.application.checkpoint import checkpoint_folder, has_checkpoint, write_checkpoint
 from geogs.application.reconstruct_checkpoint import ReconstructState, fingerprint, read_work
+from geogs.cli import main as cli
 from geogs.config import ReconstructConfig
 from geogs.errors import InputError
 from geogs.reconstruction import Reconstruction
@@ -46,8 +47,16 @@ def write_work(output: Path, scene: Reconstruction) -> None:
     write_checkpoint(checkpoint_folder(output), ReconstructState("these", scene.state()))
 
 
+@pytest.fixture(scope="module")
+def whole() -> Reconstruction:
+    """One that nothing disturbed."""
+    scene = ball_and_wall(far=10.0)
+    scene.finish()
+    return scene
+
+
 @pytest.mark.parametrize("fraction", [0.0, 0.6])
-def test_work_that_was_cut_off_is_gone_on_with(tmp_path, fraction):
+def test_work_that_was_cut_off_is_gone_on_with(whole, tmp_path, fraction):
     first = ball_and_wall(far=10.0)
     interrupted(first, fraction)
     write_work(tmp_path, first)
@@ -57,8 +66,6 @@ def test_work_that_was_cut_off_is_gone_on_with(tmp_path, fraction):
     second.resume(state, lambda stage, _: stages.append(stage))
     assert set(stages) == {"training"}
     assert second.elapsed > state.seconds
-    whole = ball_and_wall(far=10.0)
-    whole.finish()
     assert second.mapper.trained.steps == whole.mapper.trained.steps
     counts = len(second.snapshot()), len(whole.snapshot())
     assert abs(counts[0] - counts[1]) < 0.05 * counts[1]
@@ -113,11 +120,11 @@ def test_fingerprints_change_with_settings_and_images():
     assert own != fingerprint(DEFAULT, None, names[:1])
 
 
-def test_an_interrupted_command_resumes(room, tmp_path):
+def test_an_interrupted_command_resumes(small_room, tmp_path, capsys):
     """Ctrl-C in the training leaves a result and a checkpoint; the rest is done later."""
     call = [
-        "reconstruct", room, "-o", tmp_path, "--stride", 5, "--mapping.render-long-edge", 160,
-        "--search.least-steps", 1500, "--search.no-repeat", "--device", "cpu",
+        "reconstruct", small_room, "-o", tmp_path, "--stride", 6, "--mapping.render-long-edge", 96,
+        "--search.least-steps", 500, "--search.no-repeat", "--device", "cpu",
     ]  # fmt: skip
     checkpoint = tmp_path / "checkpoint" / "manifest.json"
     process = subprocess.Popen(
@@ -132,10 +139,10 @@ def test_an_interrupted_command_resumes(room, tmp_path):
     assert "--resume goes on" in printed
     assert json.loads((tmp_path / "summary.json").read_text())["interrupted"] is True
     assert checkpoint.is_file()
-    other = geogs(*call, "--resume", "--mapping.disk.opacity", 0.6)
-    assert other.returncode == 2
-    assert "other settings" in other.stderr.splitlines()[-1]
-    assert "Traceback" not in other.stderr
+    assert cli.main([*map(str, call), "--resume", "--mapping.disk.opacity", "0.6"]) == 2
+    said = capsys.readouterr().err
+    assert "other settings" in said.splitlines()[-1]
+    assert "Traceback" not in said
     done = geogs(*call, "--resume")
     assert done.returncode == 0, done.stderr
     assert "Going on after" in done.stderr
@@ -143,9 +150,8 @@ def test_an_interrupted_command_resumes(room, tmp_path):
     assert summary["interrupted"] is False
     assert "depth" not in summary["seconds"]
     assert not checkpoint.parent.exists()
-    again = geogs(*call, "--resume")
-    assert again.returncode == 2
-    assert "nothing to resume" in again.stderr.splitlines()[-1]
-    seen = vertices(room / "points_seen_1cm.ply")
+    assert cli.main([*map(str, call), "--resume"]) == 2
+    assert "nothing to resume" in capsys.readouterr().err.splitlines()[-1]
+    seen = vertices(small_room / "points_seen_1cm.ply")
     accuracy = cKDTree(seen).query(surface_points(tmp_path / "mesh.ply"))[0]
-    assert np.median(accuracy) < 0.01
+    assert np.median(accuracy) < 0.02

@@ -49,6 +49,16 @@ def frames(small_room):
     return source.camera, list(source)
 
 
+@pytest.fixture(scope="module")
+def tracked(frames) -> Slam:
+    """A system that has seen frames, with few keyframes in memory."""
+    camera, images = frames
+    slam = Slam(camera, quick(3))
+    for frame in images[:AT]:
+        slam.process(frame)
+    return slam
+
+
 def again(slam: Slam, output: Path, copy: Path) -> Slam:
     """The same system once more, from its state; what is written later does not reach it."""
     write_checkpoint(checkpoint_folder(output), Work(slam.state()))
@@ -156,12 +166,9 @@ def names(a: object) -> set[str]:
     return set(getattr(a, "__slots__", ()) or vars(a))
 
 
-def test_the_maps_in_memory_are_those_that_were(frames, tmp_path):
+def test_the_maps_in_memory_are_those_that_were(tracked, tmp_path):
     """A depth that a correction scaled is the same whether it stayed in memory or came back."""
-    camera, images = frames
-    slam = Slam(camera, quick(3))
-    for frame in images[:AT]:
-        slam.process(frame)
+    slam = tracked
     id, maps = slam.mapper.pool._maps.items()[-1]
     slam.keyframes[id].rescale(1.1)
     other = again(slam, tmp_path / "own", tmp_path / "copy")
@@ -172,12 +179,8 @@ def test_the_maps_in_memory_are_those_that_were(frames, tmp_path):
         assert own.typical == theirs.typical
 
 
-def test_a_state_of_another_camera_or_without_a_keyframe_is_one_sentence(frames, tmp_path):
-    camera, images = frames
-    slam = Slam(camera, quick(3))
-    for frame in images[:AT]:
-        slam.process(frame)
-    state = slam.state()
+def test_a_state_of_another_camera_or_without_a_keyframe_is_one_sentence(tracked):
+    camera, state = tracked.camera, tracked.state()
     with pytest.raises(InputError, match="of another camera"):
         Slam(camera.resized(64, 48), quick(3)).restore(state)
     first, *rest = state.segments.trackers[0].keyframes

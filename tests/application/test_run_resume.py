@@ -173,9 +173,8 @@ def test_a_killed_run_goes_on_even_after_another_interruption(
     summary = json.loads((out / "summary.json").read_text())
     assert summary["interrupted"] is False
     assert 0 < summary["seconds"]["checkpoints"] < summary["seconds"]["total"]
-    again = geogs("run", "--resume", out)
-    assert again.returncode == 2
-    assert "nothing to resume" in again.stderr.splitlines()[-1]
+    assert cli.main(["run", "--resume", str(out)]) == 2
+    assert "nothing to resume" in capsys.readouterr().err.splitlines()[-1]
 
 
 @pytest.mark.usefixtures("no_report")

@@ -8,7 +8,6 @@ from box_room import CAMERA, box, circle
 from geogs.evaluation import plots
 from geogs.evaluation.run_report import write_run_page
 from geogs.evaluation.shading import Viewpoint, level_axes, look, look_at_one_place, viewpoints
-from geogs.types import Trajectory
 
 
 def test_level_axes_stand_upright():
@@ -40,20 +39,6 @@ def test_shading_is_the_cosine_and_the_ceiling_is_cut():
     depth_of_floor = np.abs(centre.astype(int) - 190).max()
     assert depth_of_floor <= 1
     assert (look(vertices, faces, above).paint()[0] == 255).all()
-
-
-def test_keyframe_and_path_pictures_are_written(tmp_path):
-    depth = np.full((48, 64), 2.0)
-    depth[:5] = 0
-    normal = np.zeros((48, 64, 3))
-    normal[10:, :, 2] = -1
-    image = np.full((96, 128, 3), 90, np.uint8)
-    plots.plot_keyframes(tmp_path / "k.png", [image] * 2, [depth] * 2, [normal] * 2)
-    tracked = np.ones(60, bool)
-    tracked[20:25] = False
-    plots.plot_path(tmp_path / "p.png", Trajectory(np.arange(60) / 30, circle(), tracked))
-    for name in ("k.png", "p.png"):
-        assert (tmp_path / name).stat().st_size > 5000
 
 
 def test_objects_are_seen_from_three_cameras_and_rooms_from_above():

@@ -25,15 +25,15 @@ def write_report(
     Raises:
         OutputError: a file cannot be written.
     """
-    from geogs.evaluation import plots
+    from geogs.evaluation import run_pictures
     from geogs.evaluation.run_report import write_run_page
 
     folder.mkdir(exist_ok=True)
-    plots.plot_path(folder / "trajectory.png", trajectory)
+    run_pictures.draw_path(folder / "trajectory.png", trajectory)
     if renders:
         numbers = np.linspace(0, len(renders) - 1, min(5, len(renders))).round().astype(int)
         shown = [renders[i] for i in numbers]
-        plots.plot_keyframes(
+        run_pictures.draw_keyframes(
             folder / "keyframes.png",
             [r.image for r in shown if r.image is not None],
             [r.depth.cpu().numpy() for r in shown],

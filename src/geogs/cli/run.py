@@ -48,15 +48,17 @@ def main(argv: Sequence[str]) -> int:
         raise InputError("--map is gone on with by tracking; leave out --offline.")
 
     from geogs.application.interrupt import Interruption
-    from geogs.application.offline import run_offline
-    from geogs.application.run import resume, run
 
     settings, stop = record(RunSettings, options), Interruption()
     if options.offline and options.resume is None:
         if options.viewer or options.record is not None:
             raise InputError("--viewer and --record follow tracking, which --offline has none of.")
+        from geogs.application.offline import run_offline
+
         written = followed(options, lambda progress: run_offline(settings, progress, stop))
     else:
+        from geogs.application.run import resume, run
+
         go = run if options.resume is None else partial(resume, options.resume)
         observer = _observer(options)
         with _keys(options, stop):

@@ -9,7 +9,7 @@ from numba import njit
 
 BLOCK = 16
 """Planes matched before their costs are transposed into the volume: one cache line of float32."""
-STRIP = 16
+STRIP = 32
 """Rows matched at a time, so that all buffers stay in the first cache levels."""
 FAR = np.float32(1e9)
 OUTSIDE = np.float32(1.2)

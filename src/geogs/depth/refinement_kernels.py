@@ -76,10 +76,14 @@ def photometric_step(
     fu, fv = np.empty(w, np.float32), np.empty(w, np.float32)
     value, slope = np.empty(w, np.float32), np.empty(w, np.float32)
     inside = np.empty(w, np.float32)
-    sums = np.empty((10, w), np.float32)
+    own = np.empty((3, w), np.float32)
+    sums = np.empty((7, w), np.float32)
     total = np.empty((2, w), np.float32)
     for y in range(h):
         total[:] = ZERO
+        own[:] = ZERO
+        for s in range(count):
+            _accumulate_own(patches[s, y], weights[s, y], own)
         for j in range(n):
             sums[:] = ZERO
             inside[:] = ONE
@@ -102,25 +106,34 @@ def photometric_step(
                     inside,
                 )
                 _accumulate(patches[s, y], weights[s, y], value, slope, sums)
-            _add_neighbour(sums, inside, floor, total)
+            _add_neighbour(own, sums, inside, floor, total)
         for x in range(w):
             curvature[y, x] = total[1, x]
             step[y, x] = total[0, x] / (total[1, x] + np.float32(1e-6))
 
 
 @njit(**_FAST)
+def _accumulate_own(reference, weight, own):
+    """Weighted first and second moments of reference a, the same for all neighbours."""
+    sw, sa, saa = own[0], own[1], own[2]
+    for x in range(reference.shape[0]):
+        m, p = weight[x], reference[x]
+        sw[x] += m
+        sa[x] += m * p
+        saa[x] += m * p * p
+
+
+@njit(**_FAST)
 def _accumulate(reference, weight, value, slope, sums):
-    """Weighted first and second moments of reference a, sample b and derivative g."""
-    sw, sa, sb, sg, saa = sums[0], sums[1], sums[2], sums[3], sums[4]
-    sbb, sgg, sab, sag, sbg = sums[5], sums[6], sums[7], sums[8], sums[9]
+    """Weighted first and second moments with sample b and derivative g, and of these."""
+    sb, sg, sbb, sgg, sab, sag, sbg = (
+        sums[0], sums[1], sums[2], sums[3], sums[4], sums[5], sums[6],
+    )  # fmt: skip
     for x in range(value.shape[0]):
         m, p, q, g = weight[x], reference[x], value[x], slope[x]
         mp, mq, mg = m * p, m * q, m * g
-        sw[x] += m
-        sa[x] += mp
         sb[x] += mq
         sg[x] += mg
-        saa[x] += mp * p
         sbb[x] += mq * q
         sgg[x] += mg * g
         sab[x] += mp * q
@@ -129,17 +142,17 @@ def _accumulate(reference, weight, value, slope, sums):
 
 
 @njit(**_FAST)
-def _add_neighbour(sums, inside, floor, total):
+def _add_neighbour(own, sums, inside, floor, total):
     """NCC of one neighbour, its derivative and Gauss-Newton curvature, added with its weight."""
     for x in range(inside.shape[0]):
-        norm = ONE / sums[0, x]
-        ma, mb, mg = sums[1, x] * norm, sums[2, x] * norm, sums[3, x] * norm
-        va = max(sums[4, x] * norm - ma * ma, ZERO) + floor
-        vb = max(sums[5, x] * norm - mb * mb, ZERO) + floor
-        vg = max(sums[6, x] * norm - mg * mg, ZERO)
-        ab = sums[7, x] * norm - ma * mb
-        ag = sums[8, x] * norm - ma * mg
-        bg = sums[9, x] * norm - mb * mg
+        norm = ONE / own[0, x]
+        ma, mb, mg = own[1, x] * norm, sums[0, x] * norm, sums[1, x] * norm
+        va = max(own[2, x] * norm - ma * ma, ZERO) + floor
+        vb = max(sums[2, x] * norm - mb * mb, ZERO) + floor
+        vg = max(sums[3, x] * norm - mg * mg, ZERO)
+        ab = sums[4, x] * norm - ma * mb
+        ag = sums[5, x] * norm - ma * mg
+        bg = sums[6, x] * norm - mb * mg
         scale = ONE / np.sqrt(va * vb)
         ncc = ab * scale
         climb = ag * scale - ncc * bg / vb
@@ -174,6 +187,8 @@ def fit_planes(
     the slopes at their present values. ``support`` is the sum of weights.
     """
     h, w = rho.shape
+    # What one row of samples adds; what it is multiplied by is the same for all of a row.
+    row = np.empty((5, w), np.float32)
     sums = np.empty((9, w), np.float32)
     for y in range(h):
         sums[:] = ZERO
@@ -181,12 +196,14 @@ def fit_planes(
             yy = y + j
             if yy < 0 or yy >= h:
                 continue
+            row[:] = ZERO
             for i in range(-radius, radius + 1):
                 first, last = max(0, -i), min(w, w - i)
                 _add_samples(
                     rho, slope_x, slope_y, confidence, guide, y, yy, i, first, last, contrast,
-                    tolerance, sums,
+                    tolerance, row,
                 )  # fmt: skip
+            _add_row(row, np.float32(j), sums)
         for x in range(w):
             s0, sx, sy = sums[0, x] + np.float32(1e-9), sums[1, x], sums[2, x]
             xx = sums[3, x] - sx * sx / s0 + stiffness
@@ -207,15 +224,14 @@ def fit_planes(
 def _add_samples(
     rho, slope_x, slope_y, confidence, guide, y, yy, dx, first, last, contrast, tolerance, sums
 ):
-    """Moments of the residuals to the present planes of row y at samples (dx, yy - y) away."""
+    """Moments by dx of the residuals to the planes of row y at samples (dx, yy - y) away."""
     # Views, because an index that could be negative would keep the loop from vectorising.
     here, there = rho[y, first:last], rho[yy, first + dx : last + dx]
     gx, gy = slope_x[y, first:last], slope_y[y, first:last]
     sure = confidence[yy, first + dx : last + dx]
     fx, fy = np.float32(dx), np.float32(yy - y)
-    row = sums[:, first:last]
-    t0, t1, t2, t3, t4 = row[0], row[1], row[2], row[3], row[4]
-    t5, t6, t7, t8 = row[5], row[6], row[7], row[8]
+    own_sums = sums[:, first:last]
+    t0, t1, t2, t3, t4 = own_sums[0], own_sums[1], own_sums[2], own_sums[3], own_sums[4]
     own, other = guide[:, y, first:last], guide[:, yy, first + dx : last + dx]
     g0, g1, g2 = own[0], own[1], own[2]
     k0, k1, k2 = other[0], other[1], other[2]
@@ -227,10 +243,22 @@ def _add_samples(
         m = sure[x] / (like * (ONE + far * far))
         t0[x] += m
         t1[x] += m * fx
-        t2[x] += m * fy
-        t3[x] += m * fx * fx
-        t4[x] += m * fx * fy
-        t5[x] += m * fy * fy
-        t6[x] += m * r
-        t7[x] += m * r * fx
-        t8[x] += m * r * fy
+        t2[x] += m * fx * fx
+        t3[x] += m * r
+        t4[x] += m * r * fx
+
+
+@njit(**_FAST)
+def _add_row(row, fy, sums):
+    """The moments by x of a row that is ``fy`` away, as moments by both."""
+    for x in range(row.shape[1]):
+        m, mx, r = row[0, x], row[1, x], row[3, x]
+        sums[0, x] += m
+        sums[1, x] += mx
+        sums[2, x] += m * fy
+        sums[3, x] += row[2, x]
+        sums[4, x] += mx * fy
+        sums[5, x] += m * fy * fy
+        sums[6, x] += r
+        sums[7, x] += row[4, x]
+        sums[8, x] += r * fy

@@ -1,4 +1,4 @@
-"""Pictures of a result, drawn by matplotlib without a display and written as PNG."""
+"""Pictures of a result beside the truth, drawn by matplotlib without a display, written as PNG."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -14,33 +14,16 @@ from geogs.evaluation.surface import Surface
 from geogs.evaluation.trajectory import TrajectoryErrors
 from geogs.io.writers.atomic import atomic_file
 from geogs.threads import thread_map
-from geogs.types import Trajectory
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_TRUTH, _ESTIMATE, _LOST = "0.45", "#0072b2", "#d55e00"
+_TRUTH, _ESTIMATE = "0.45", "#0072b2"
 _ERROR_MAP = "YlOrRd"
 ERROR_STOPS = ("#ffffcc", "#fed976", "#fd8d3c", "#e2191c", "#800026")
 """Colours of :func:`error_colours` from none to the worst, as CSS has them."""
 _UNKNOWN = 190
-
-
-def plot_path(path: Path, trajectory: Trajectory) -> None:
-    """The camera path from above and from the side, in map units; lost stretches are marked."""
-    figure = new_figure(10.0, 4.2)
-    axes = level_axes(trajectory.T_wc)
-    points = (trajectory.T_wc[:, :3, 3] - trajectory.T_wc[0, :3, 3]) @ axes.T
-    for column, (name, vertical) in enumerate((("from above", 1), ("from the side", 2))):
-        plot = figure.add_subplot(1, 2, column + 1)
-        plot.plot(points[:, 0], points[:, vertical], color=_ESTIMATE, lw=1.2, label="camera")
-        plot.plot(points[0, 0], points[0, vertical], "o", color=_ESTIMATE, ms=5, label="start")
-        lost = points[~trajectory.tracked]
-        if len(lost):
-            plot.plot(lost[:, 0], lost[:, vertical], ".", color=_LOST, ms=3, label="lost")
-        _finish_map(plot, name, "map units")
-    _save_maps(figure, path)
 
 
 def plot_trajectory(path: Path, errors: TrajectoryErrors) -> None:
@@ -81,40 +64,6 @@ def plot_error_over_time(path: Path, errors: TrajectoryErrors) -> None:
         plot.legend(loc="upper right")
         plot.grid(alpha=0.3)
     plot.set_xlabel("time (s)")
-    save_figure(figure, path)
-
-
-def plot_keyframes(
-    path: Path,
-    images: Sequence[UInt8[np.ndarray, "ih iw 3"]],
-    depths: Sequence[Float[np.ndarray, "h w"]],
-    normals: Sequence[Float[np.ndarray, "h w 3"]],
-) -> None:
-    """One row a keyframe: image, rendered depth (one colour scale for all) and normals.
-
-    Depth is white where it is 0 or not finite; normals (camera frame) show x, y, z as red, green,
-    blue, from -1 dark to 1 bright, towards the camera being bright blue.
-    """
-    known = [d[np.isfinite(d) & (d > 0)] for d in depths]
-    values = np.concatenate(known) if known else np.zeros(0)
-    low, high = np.quantile(values, [0.01, 0.99]) if len(values) else (0.0, 1.0)
-    height, width = images[0].shape[:2]
-    figure = new_figure(12.0, 0.4 + len(images) * 3.7 * height / width)
-    plots = []
-    for row, (image, depth, normal) in enumerate(zip(images, depths, normals, strict=True)):
-        hidden = np.ma.masked_where(~(np.isfinite(depth) & (depth > 0)), depth)
-        missing = ~(np.linalg.norm(normal, axis=-1) > 0.5)
-        flipped = np.where(missing[..., None], 1.0, 0.5 + 0.5 * normal * [1, -1, -1])
-        for column, (title, picture) in enumerate(
-            (("image", image), ("depth", hidden), ("normals", flipped.clip(0, 1)))
-        ):
-            plot = figure.add_subplot(len(images), 3, 3 * row + column + 1)
-            plot.imshow(picture, cmap="turbo", vmin=low, vmax=high)
-            plot.set(xticks=[], yticks=[])
-            if row == 0:
-                plot.set_title(title)
-            plots.append(plot)
-    _colour_bar(figure, plots, "turbo", (float(low), float(high)), "depth (map units)")
     save_figure(figure, path)
 
 

@@ -6,6 +6,7 @@ from jaxtyping import Float, Int
 from geogs.mesh.clean import remove_degenerate_faces
 from geogs.mesh.deviation import deviations
 from geogs.mesh.types import Mesh, vertex_normals
+from geogs.threads import worker_count
 
 QUANTILE = 0.99
 """Part of the vertices that may not lie farther from the decimated surface than is allowed."""
@@ -13,8 +14,8 @@ MEAN_SHARE = 0.15
 """Of what is allowed, that they may lie away on average: else what is smooth would become facets,
 all of it as far away as may be."""
 _WITNESSES = 10_000
-_SHARES = (0.5, 0.75, 0.88)
-"""Of its triangles that a mesh is brought to next; the next where the one before is too few."""
+_SHARES = (0.25, 0.5, 0.75, 0.88)
+"""Of its triangles that a mesh is brought to next; a later one where those before are too few."""
 _FEWEST = 200
 """Triangles below which nothing is gained."""
 
@@ -28,24 +29,39 @@ def decimate(mesh: Mesh, tolerance: float) -> Mesh:
     nothing changes.
 
     Method: Garland and Heckbert (1997), as in fast-simplification. It is told how many triangles to
-    leave, so it is asked for half as many, again and again, until that is too few.
+    leave, so it is asked for a quarter, again and again, until that is too few; then for a half,
+    and so on. Deviations grow the faster the fewer triangles are left, so that what would be too
+    few even if they grew as before is not tried: trying takes longest there.
     """
     if tolerance <= 0 or len(mesh.faces) < _FEWEST:
         return mesh
     witnesses = mesh.vertices[:: 1 + len(mesh.vertices) // _WITNESSES]
     vertices, faces = mesh.vertices, mesh.faces
+    allowed, growth = np.array([tolerance, MEAN_SHARE * tolerance]), np.zeros(2)
+    reached = np.zeros(2)
     for share in _SHARES:
-        while len(faces) >= _FEWEST:
+        while len(faces) >= _FEWEST and (reached * share**-growth <= allowed).all():
             fewer = _simplified(vertices, faces, share)
             if len(fewer[1]) > 0.97 * len(faces) or not len(fewer[1]):
                 break
             away = deviations(witnesses, *fewer)
-            if np.quantile(away, QUANTILE) > tolerance or away.mean() > MEAN_SHARE * tolerance:
+            deviation = np.array([np.quantile(away, QUANTILE), away.mean()])
+            if (deviation > allowed).any():
                 break
+            growth, reached = _growth(reached, deviation, len(fewer[1]) / len(faces)), deviation
             vertices, faces = fewer
     if faces is mesh.faces:
         return mesh
     return remove_degenerate_faces(_dressed(mesh, vertices, faces))
+
+
+def _growth(
+    before: Float[np.ndarray, "2"], after: Float[np.ndarray, "2"], share: float
+) -> Float[np.ndarray, "2"]:
+    """The power of one over the share of triangles that deviations grew by; 0 after the first."""
+    if not (before > 0).all():
+        return np.zeros(2)
+    return np.log(np.maximum(after / before, 1.0)) / -np.log(share)
 
 
 def with_at_most(mesh: Mesh, faces: int) -> Mesh:
@@ -74,7 +90,7 @@ def _dressed(mesh: Mesh, vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarr
     """The vertices and faces with normals and colours of the mesh that they were made from."""
     from scipy.spatial import cKDTree
 
-    _, nearest = cKDTree(vertices).query(mesh.vertices)
+    _, nearest = cKDTree(vertices).query(mesh.vertices, workers=worker_count())
     count = np.bincount(nearest, minlength=len(vertices))
 
     def mean(values: np.ndarray) -> np.ndarray:

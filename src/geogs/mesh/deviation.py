@@ -4,6 +4,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from geogs.mesh.types import cross
+from geogs.threads import worker_count
 
 _NEAREST = 3
 """Vertices around a point whose faces are looked at."""
@@ -21,7 +22,8 @@ def deviations(
     from scipy.spatial import cKDTree
 
     used = np.unique(faces)
-    _, near = cKDTree(vertices[used]).query(points, k=min(_NEAREST, len(used)))
+    tree, count = cKDTree(vertices[used]), min(_NEAREST, len(used))
+    _, near = tree.query(points, k=count, workers=worker_count())
     first, around = _faces_around(len(vertices), faces)
     corners = vertices.astype(np.float64)[faces]
     nearest = np.full(len(points), np.inf)

@@ -140,9 +140,11 @@ def _sample_points(
 ) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"], Float[Tensor, "n 3"]]:
     """Depths, pixel footprints and world points of a regular part of all pixels."""
     depths, footprints, points = [], [], []
-    pixels = sum(view.depth.numel() for view in views)
-    step = max(1, round((pixels / _SAMPLED_POINTS) ** 0.5))
+    step = 0
     for view in views:
+        if not step:  # a view may be rendered when it is asked for; they are of one size
+            pixels = len(views) * view.depth.numel()
+            step = max(1, round((pixels / _SAMPLED_POINTS) ** 0.5))
         valid = view.valid()[::step, ::step]
         depth = view.depth[::step, ::step][valid].double()
         rays = view.camera.rays(torch.float64, depth.device)[::step, ::step][valid]

@@ -1,20 +1,22 @@
 """Truncated signed distances of depth maps in sparse blocks of 8 x 8 x 8 voxels.
 
 Curless and Levoy 1996, in blocks allocated where surface was seen (voxel hashing, Niessner 2013).
-Blocks are found by binary search in their sorted keys, in plain batched torch on any device; on a
-GPU the voxels are updated by a kernel.
+Blocks are found by binary search in their sorted keys, in plain batched torch on any device; the
+voxels are updated by a kernel of the device.
 """
 
 import math
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from geogs.geometry.camera import Camera
 from geogs.gpu.kernels import kernels_for
+from geogs.threads import run_chunks, worker_count
 
 BLOCK = 8
 """Voxels along a side of a block."""
@@ -24,6 +26,7 @@ BYTES_PER_BLOCK = BLOCK**3 * 2 * 4
 _HALF = BLOCK // 2
 _BITS = 20
 _CHUNK = 256
+"""Blocks that a thread takes at a time."""
 _SOURCE = Path(__file__).parent / "cuda" / "tsdf.cu"
 
 
@@ -163,9 +166,7 @@ class SparseTsdf:
             return
         far = float(depth[valid].max()) + self.truncation * self.voxel
         projection = camera.matrix() @ T_cw[:3]
-        visible = self._in_view(camera, T_cw, far)
-        for slots in visible.split(_CHUNK):
-            self._update(slots, projection, table, camera)
+        self._update(self._in_view(camera, T_cw, far), projection, table, camera)
 
     def update_by_kernel(
         self,
@@ -238,27 +239,23 @@ class SparseTsdf:
         table: Float[Tensor, "p 4"],
         camera: Camera,
     ) -> None:
-        block = projection[:, :3] @ (self._coordinates[slots].double().mT * BLOCK * self.voxel)
-        block = (block + projection[:, 3:]).float()
-        local = (projection[:, :3] @ (self._offsets.double().mT * self.voxel)).float()
-        z = block[2, :, None] + local[2]
-        inverse = 1.0 / z
-        u = (block[0, :, None] + local[0]) * inverse
-        v = (block[1, :, None] + local[1]) * inverse
-        column, row = u.round(), v.round()
-        inside = (z > 1e-6) & (column >= 0) & (row >= 0)
-        inside &= (column < camera.width) & (row < camera.height)
-        pixel = torch.where(inside, row * camera.width + column, 0.0).long()
-        sample = table.index_select(0, pixel.flatten()).unflatten(0, z.shape)
-        surface = sample[..., 0] + sample[..., 1] * (u - column) + sample[..., 2] * (v - row)
-        ahead = (1.0 / surface - z) / (self.truncation * self.voxel)
-        fade = (2.0 + 2.0 * ahead).clamp(max=1.0)
-        gain = torch.where(inside & (ahead > -1.0), sample[..., 3] * fade, 0.0)
-        old = self._weight[slots]
-        new = old + gain
-        change = (ahead.clamp(max=1.0) - self._distance[slots]) * (gain / new.clamp(min=1e-20))
-        self._distance[slots] += torch.where(gain > 0, change, 0.0)
-        self._weight[slots] = new
+        """Average a depth map into blocks on the CPU; they share no voxel, so threads may."""
+        from geogs.mesh.tsdf_kernels import average_in
+
+        corner = projection[:, :3] @ (self._coordinates[slots].double().mT * BLOCK * self.voxel)
+        block = (corner + projection[:, 3:]).float().mT.contiguous().numpy()
+        local = (projection[:, :3] @ (self._offsets.double().mT * self.voxel)).float().numpy()
+        distance, weight, planes = (x.numpy() for x in (self._distance, self._weight, table))
+        truncation = np.float32(self.truncation * self.voxel)
+
+        def update(chunk: int) -> None:
+            some = slice(chunk * _CHUNK, (chunk + 1) * _CHUNK)
+            average_in(
+                slots.numpy()[some], block[some], local, planes, camera.width, camera.height,
+                truncation, distance, weight,
+            )  # fmt: skip
+
+        run_chunks(update, -(-len(slots) // _CHUNK), worker_count())
 
 
 def _plane_table(

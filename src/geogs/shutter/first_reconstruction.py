@@ -82,6 +82,5 @@ def _located(
         weighted = np.repeat(weight, 2)[:, None] * by_pose
         normal, right = weighted.T @ by_pose, weighted.T @ error.ravel()
         step = np.linalg.solve(normal + (1e-6 * np.trace(normal) + 1e-12) * np.eye(6), right)
-        moved = near.stepped(step[None], np.zeros_like(near.points))
-        near = Reconstruction(moved.R, moved.t, moved.points)
+        near = near.stepped(step[None], np.zeros_like(near.points))
     return near

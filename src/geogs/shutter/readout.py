@@ -6,6 +6,8 @@ of a camera changes from image to image, and with it by how much rows are sheare
 stays the same. Errors of the matches change slowly and are hardly taken for it.
 """
 
+import functools
+import itertools
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
@@ -17,6 +19,7 @@ from geogs.shutter.first_reconstruction import first_reconstruction
 from geogs.shutter.neighbours import Image
 from geogs.shutter.reconstruction import Reconstruction
 from geogs.shutter.row_adjustment import ReadoutEquation, readout_equation
+from geogs.threads import thread_map
 
 CLIP = 30
 """Neighbouring images that points are followed through."""
@@ -91,23 +94,32 @@ def find_readout(
     """Find the readout with which clips of a video fit best; 0 unless it is clearly better.
 
     Args:
-        clips: ``CLIP`` neighbours in the video each; no more are taken than are needed.
+        clips: ``CLIP`` neighbours in the video each; no more are taken than are needed, and the
+            points of several are followed at a time.
         camera: that took them.
         report: called with the fraction done; what it raises passes through.
     """
     adjusted, found = list[_Adjusted](), FoundReadout()
-    focal = camera.camera.fx
-    for number, clip in enumerate(clips, 1):
-        report(min(1.0, (number - 1) / CLIPS))
-        start = _started(clip, camera)
-        if start is not None:
-            adjusted.append(start)
-        if number in ENOUGH_CLIPS:
+    focal, left, seen = camera.camera.fx, iter(clips), 0
+    for enough in (*ENOUGH_CLIPS, CLIPS):
+        group = list(itertools.islice(left, enough - seen))
+        done = functools.partial(_reported, report, seen, len(group))
+        starts = thread_map(functools.partial(_started, camera=camera), group, done)
+        adjusted += [start for start in starts if start is not None]
+        seen += len(group)
+        if seen < enough:
+            break
+        if enough in ENOUGH_CLIPS:
             found = _verdict(adjusted, focal)
             if found.error <= ENOUGH or found.best + SURE * found.error < SMALL:
                 break
     report(1.0)
     return found if found.clips == len(adjusted) else _verdict(adjusted, focal)
+
+
+def _reported(report: Report, before: int, group: int, fraction: float) -> None:
+    """Tell what is done when so much is of some clips, before which there were others."""
+    report(min(1.0, (before + fraction * group) / CLIPS))
 
 
 def _started(clip: Sequence[Image], camera: RollingCamera) -> _Adjusted | None:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from geogs.shutter.turning import cross, rotated
+from geogs.shutter.turning import rotated
 
 _NEAREST = 1e-3
 """Depth, in the unit of the points, below which a point is taken to be there."""
@@ -56,13 +56,18 @@ class Reconstruction:
         """Derivatives of :meth:`projected` by the steps of a pose, and by :meth:`in_cameras`."""
         turned, inverse = self._turned(), self.points[:, 2]
         at = turned + inverse[:, None] * self.t[:, None]
-        depth = _depth(at)
-        by_place = np.zeros((*at.shape[:2], 2, 3))
-        by_place[..., 0, 0] = by_place[..., 1, 1] = 1 / depth[..., 0]
-        by_place[..., 2] = -at[..., :2] / depth**2
+        depth = _depth(at)[..., 0]
+        once, across, down = 1 / depth, -at[..., 0] / depth**2, -at[..., 1] / depth**2
+        by_place = np.zeros((*depth.shape, 2, 3))
+        by_place[..., 0, 0] = by_place[..., 1, 1] = once
+        by_place[..., 0, 2], by_place[..., 1, 2] = across, down
+        by_pose = np.empty((*depth.shape, 2, 6))
         # Of row g of the above, g . (phi x turned) = phi . (turned x g).
-        by_turn = cross(turned[..., None, :], by_place)
-        by_pose = np.concatenate([by_turn, by_place * inverse[:, None, None]], axis=-1)
+        x, y, z = turned[..., 0], turned[..., 1], turned[..., 2]
+        by_pose[..., 0, 0], by_pose[..., 1, 0] = y * across, y * down - z * once
+        by_pose[..., 0, 1], by_pose[..., 1, 1] = z * once - x * across, -x * down
+        by_pose[..., 0, 2], by_pose[..., 1, 2] = -y * once, x * once
+        np.multiply(by_place, inverse[:, None, None], out=by_pose[..., 3:])
         return by_pose, by_place
 
     def stepped(

@@ -48,7 +48,8 @@ def cross(
     a: Float[np.ndarray, "*#n 3"], b: Float[np.ndarray, "*#n 3"]
 ) -> Float[np.ndarray, "*#n 3"]:
     """Vector products; NumPy's own is several times slower for some hundred vectors."""
-    (ax, ay, az), (bx, by, bz) = np.moveaxis(a, -1, 0), np.moveaxis(b, -1, 0)
+    ax, ay, az = a[..., 0], a[..., 1], a[..., 2]
+    bx, by, bz = b[..., 0], b[..., 1], b[..., 2]
     return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], -1)
 
 
