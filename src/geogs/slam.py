@@ -139,7 +139,7 @@ class Slam:
         c = self.config
         return Tracker(
             self.camera, c.tracking, self.device, c.seed, self.operator, self.prior, c.prior,
-            self.keyframes, c.sensor,
+            self.keyframes, c.sensor, c.odometry,
         )  # fmt: skip
 
     def _new_mapper(self, keyframes: KeyframeStore) -> Mapper:
@@ -268,6 +268,7 @@ class Slam:
         if correct:
             self.adjust(progress)
             self.refine(progress)
+        self.to_metres()
 
     @on_one_torch_thread
     def adjust(self, progress: Progress = _silent) -> None:
@@ -292,6 +293,18 @@ class Slam:
         if self._known is not None:
             self._known = replace(self._known, position=factor * self._known.position)
         self._told_scale = scale
+
+    @on_one_torch_thread
+    def to_metres(self) -> None:
+        """At the end: bring the map to metres where poses beside the images say by which factor.
+
+        What is in metres already stays, and so does the world of a saved map.
+        """
+        odometry = self.segments.world.odometry
+        if self.metric_scale is None and odometry.scale is not None and not self.is_continued:
+            drift = (odometry.config.drift**2 + odometry.deviation**2) ** 0.5
+            self.rescale(MetricScale("poses beside the images", odometry.scale, drift))
+            odometry.scale = 1.0
 
     @on_one_torch_thread
     def trajectory(self) -> Trajectory:
@@ -321,11 +334,23 @@ class Slam:
         return {
             "refined": self.is_refined,
             "metric_scale": None if self.metric_scale is None else asdict(self.metric_scale),
+            "poses": self._pose_agreement(),
             "moving": round(moving_share(self.segments.world.keyframes), 4),
             "segments": [asdict(segment) for segment in self.segments.summary()],
             "not_started": self.segments.why_not or None,
             "loops": len(self.loops.detector.loops),
             "loop_closures": self.loops.closures,
+        }
+
+    def _pose_agreement(self) -> dict[str, object] | None:
+        """How far poses beside the images fit them; none where there are none."""
+        agreement = self.segments.world.odometry.agreement()
+        if not agreement.motions:
+            return None
+        return {
+            "motions": agreement.motions,
+            "fitting": round(agreement.share, 4),
+            "used": agreement.used,
         }
 
     def snapshot(self) -> MapSnapshot:

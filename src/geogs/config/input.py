@@ -27,6 +27,10 @@ class InputConfig(Settings, group="input"):
     depth: Annotated[Literal["none", "auto", "sensor"], Only("run"), Basic("--depth")] = "none"
     """Depth that a sensor measured, beside the images: none leaves it, auto takes it where there
     is any, sensor must have it. With it the result is in metres."""
+    poses: Annotated[str, Only("run"), Basic("--poses")] = "auto"
+    """Poses beside the images as priors on the motion and the scale: none leaves them, auto takes
+    those of an app that tracks its camera (Stray Scanner, Record3D, Polycam), prior must have some,
+    and a file (TUM's rows) is taken as given. With them the result is in metres."""
     topic: Annotated[str, Only("run"), Basic("--topic")] = "auto"
     """Topic of the images in a bag of ROS; auto takes the one that most likely is the camera."""
     pipe: Annotated[str, Only("run")] = "auto"

@@ -12,6 +12,7 @@ from geogs.keyframes.archive import Archived
 from geogs.keyframes.grid import SampleGrid
 from geogs.keyframes.pictures import Picture
 from geogs.priors.base import DepthKind
+from geogs.types import MeasuredPose
 
 KNOWN = 0.3
 """Relative deviation up to which a depth helps to tell where a camera is."""
@@ -71,6 +72,7 @@ class KeyframeState:
     moving: Bool[Tensor, "p"] | None
     depth: Archived | None
     measured: MeasuredCells | None
+    pose: MeasuredPose | None
 
 
 @dataclass(eq=False)
@@ -102,6 +104,8 @@ class Keyframe:
     """Cells that are held for showing something that moves; none where nobody has judged yet."""
     measured: MeasuredCells | None = None
     """Of a depth sensor; none without, or where the map is not metric."""
+    pose: MeasuredPose | None = None
+    """By another tracker, in its own world; none where there is none."""
 
     @property
     def image(self) -> UInt8[np.ndarray, "h w 3"]:
@@ -119,7 +123,7 @@ class Keyframe:
         return KeyframeState(
             self.id, self.frame_index, self.timestamp, picture.archived, picture.archived_normal,
             self.T_cw, self.inverse_depth, self.information, self.prior, self.scale, self.moving,
-            picture.archived_depth, self.measured,
+            picture.archived_depth, self.measured, self.pose,
         )  # fmt: skip
 
     def rescale(self, factor: float) -> None:

@@ -160,7 +160,7 @@ class Segment:
             picture = Picture(pictures, s.image, s.normal, s.depth)
             self._keyframes[s.id] = Keyframe(
                 s.id, s.frame_index, s.timestamp, grid, picture, s.T_cw, s.inverse_depth,
-                s.information, s.prior, s.scale, s.moving, s.measured,
+                s.information, s.prior, s.scale, s.moving, s.measured, s.pose,
             )  # fmt: skip
         self.store.assign(self.ids, self)
 

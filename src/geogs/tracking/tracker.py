@@ -12,7 +12,7 @@ from torch import Tensor
 
 from geogs.bundle.base import BundleOptions
 from geogs.bundle.select import grid_fields
-from geogs.config import DepthSensorConfig, PriorConfig, TrackingConfig
+from geogs.config import DepthSensorConfig, OdometryConfig, PriorConfig, TrackingConfig
 from geogs.errors import InputError, TrackingLost
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_inverse
@@ -33,6 +33,7 @@ from geogs.tracking.motion import (
     Recognition,
 )
 from geogs.tracking.moving import carried
+from geogs.tracking.odometry import Odometry, OdometryState
 from geogs.tracking.orientation_chain import Followed, OrientationChain, OrientationState
 from geogs.tracking.pose_deviation import PoseDeviation, pose_deviation
 from geogs.tracking.proximity import Pair, frame_distances, proximity_pairs
@@ -131,6 +132,7 @@ class TrackerState:
     """Of the latest frames."""
     orientation: OrientationState
     is_metric: bool
+    odometry: OdometryState
 
 
 class Tracker:
@@ -147,6 +149,7 @@ class Tracker:
         prior_config: PriorConfig | None = None,
         store: KeyframeStore | None = None,
         sensor: DepthSensorConfig | None = None,
+        odometry: OdometryConfig | None = None,
     ) -> None:
         """``store`` is where the keyframes are kept, in a segment of their own."""
         cv2.setRNGSeed(seed)
@@ -155,7 +158,9 @@ class Tracker:
         self.grid = SampleGrid(camera, device) if store is None else store.grid
         self.operator = operator or build_operator(self.config, self.grid)
         self.keyframes = (store or KeyframeStore(self.grid, self.operator.encode)).new_segment()
-        self.graph = FrameGraph(self.keyframes, self.operator)
+        self.odometry = Odometry(self.keyframes, odometry or OdometryConfig())
+        """What another tracker says of the motion, where frames come with its poses."""
+        self.graph = FrameGraph(self.keyframes, self.operator, self.odometry)
         self.priors = KeyframePriors(self.graph, prior, prior_config or PriorConfig())
         self.sensing = DepthSensing(self.grid, sensor or DepthSensorConfig())
         self.is_metric = False
@@ -243,7 +248,7 @@ class Tracker:
             self.keyframes.state(), self.graph.state(), self.recorder.state(),
             self._start_up.state(), self.state, list(self._finalized), self._breaks, last,
             self._misses, self.frames_lost, self._choice.state(), self.orientation.state(),
-            self.is_metric,
+            self.is_metric, self.odometry.state(),
         )  # fmt: skip
 
     def load(self, state: TrackerState) -> None:
@@ -257,6 +262,7 @@ class Tracker:
         self._misses, self.frames_lost = state.misses, state.frames_lost
         self._choice.load(state.sharpness)
         self.orientation.load(state.orientation)
+        self.odometry.load(state.odometry)
         if state.last is not None:
             last = state.last
             keyframe = self.keyframes[last.keyframe]
@@ -327,7 +333,7 @@ class Tracker:
             return self._lose(frame)
         if self.state is TrackState.INITIALIZING:
             return self._start(frame, encoded)
-        motion = self._expected(encoded)
+        motion = self._expected(frame, encoded)
         if motion is not None and motion.known >= self.config.min_known:
             return self._follow(frame, encoded, motion)
         followed = self.orientation.follow(frame, encoded)
@@ -398,6 +404,7 @@ class Tracker:
         eye = torch.eye(4, dtype=torch.float64)
         earlier = list(self.keyframes.ids)
         state = self.keyframes.add(frame.index, frame.timestamp, frame.image, encoded, eye)
+        state.pose = frame.pose
         if not self.sensing.start(state, frame.depth, self.config.min_known):
             self.keyframes.remove(state.id)
             return None
@@ -411,17 +418,21 @@ class Tracker:
 
     def _begin(self) -> None:
         self.state = TrackState.TRACKING
+        self.odometry.look()
         back_fill(self.recorder, self._locator, self.config.min_known)
         self._seen_at(self.keyframes[self.keyframes.ids[-1]])
 
     # --- with a map ------------------------------------------------------------------------
 
-    def _expected(self, encoded: Any) -> FrameMotion | None:
+    def _expected(self, frame: Frame, encoded: Any) -> FrameMotion | None:
         """The frame near where the last one was; None if the camera is not there, or was lost."""
         last = self._last
         if last is None or self.state is not TrackState.TRACKING:
             return None
         motion = self._locator.locate(last.keyframe, encoded, last.predicted())
+        told = self.odometry.since(last.keyframe, frame.pose) if motion is None else None
+        if told is not None:
+            motion = self._locator.locate(last.keyframe, encoded, told @ last.keyframe.T_cw)
         if motion is None and last.velocity is not None:
             motion = self._locator.locate(last.keyframe, encoded, last.T_cw)
         return motion
@@ -506,6 +517,7 @@ class Tracker:
     ) -> TrackResult:
         anchor = self.keyframes[motion.keyframe]
         state = self.keyframes.add(frame.index, frame.timestamp, frame.image, encoded, motion.T_cw)
+        state.pose = frame.pose
         T = motion.T_cw @ se3_inverse(anchor.T_cw)
         state.inverse_depth, state.information = grid_fields(self.grid).transfer(
             T, anchor.inverse_depth, anchor.information
@@ -518,6 +530,7 @@ class Tracker:
         seen = self.graph.edges[state.id, anchor.id]
         state.moving = carried(self.grid, anchor.moving, seen.pixels, seen.weight)
         self._adjust_locally()
+        self.odometry.look()
         removed = self._cull()
         self._seen_at(state, velocity=velocity)
         fresh = self._finalise(self.keyframes.ids[:-1])

@@ -22,15 +22,16 @@ from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.io.pictures import read_mask
 from geogs.io.sources.calibration import Calibration
-from geogs.io.sources.depth_files import DepthFile, RectifiedDepth
+from geogs.io.sources.depth_files import RectifiedDepth, StoredDepth
 from geogs.io.sources.intrinsics import resolve_intrinsics
+from geogs.io.sources.pose_priors import chosen_poses
 from geogs.io.sources.undistort import Rectifier
 from geogs.shutter.camera import RollingCamera
 from geogs.shutter.neighbours import with_turning
 from geogs.shutter.readout import CLIP, CLIPS
 from geogs.shutter.rows import RowOffsets
 from geogs.shutter.shutter import Shutter
-from geogs.types import Frame, MeasuredDepth
+from geogs.types import Frame, MeasuredDepth, MeasuredPose
 
 _log = logging.getLogger(__name__)
 T = TypeVar("T")
@@ -56,6 +57,8 @@ class RawFrame:
     """What is wrong where there is no image."""
     depth: MeasuredDepth | None = None
     """What a depth sensor saw at that time, as it came or of the pixels of a working image."""
+    pose: MeasuredPose | None = None
+    """Of the upright image, by another tracker."""
 
     @property
     def fault(self) -> str:
@@ -142,6 +145,7 @@ class Source:
                 f"{reader.name} has no depth of a sensor beside its images that can be read here; "
                 "leave out --depth."
             )
+        self._poses = chosen_poses(config.poses, reader, reader.name)
         self._reader = reader
         self._config = config
         self.calibration = calibration or resolve_intrinsics(
@@ -193,6 +197,11 @@ class Source:
     def uses_depth(self) -> bool:
         """Whether frames come with the depth that a sensor measured."""
         return self._config.depth != "none" and self._reader.has_depth
+
+    @property
+    def uses_poses(self) -> bool:
+        """Whether frames come with poses of another tracker, as priors."""
+        return self._poses.is_used
 
     @property
     def is_calibration_open(self) -> bool:
@@ -319,7 +328,8 @@ class Source:
                 if self.damaged == 1:
                     _log.warning("%s is damaged; used as far as it goes.", raw.label)
             self.place = ReadingPlace(index + 1, self.skipped, self.damaged)
-            yield Frame(index, raw.timestamp, raw.image, depth=raw.depth)
+            pose = self._poses.of(raw.timestamp, raw.pose)
+            yield Frame(index, raw.timestamp, raw.image, depth=raw.depth, pose=pose)
             index += 1
         if index == 0:
             raise InputError(self._why_empty())
@@ -348,7 +358,7 @@ class Source:
         moved: Float[np.ndarray, "h w 2"] | None = None,
     ) -> MeasuredDepth | None:
         """Depth as it came, of the pixels of a working image, whose rows were ``moved``."""
-        if not (self.uses_depth and isinstance(depth, DepthFile)):
+        if not (self.uses_depth and isinstance(depth, StoredDepth)):
             return None
         return RectifiedDepth(depth, self.calibration, self._rectifier, moved)
 

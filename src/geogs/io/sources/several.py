@@ -103,6 +103,11 @@ class SeveralSources:
         return any(s.uses_depth for s in self._sources)
 
     @property
+    def uses_poses(self) -> bool:
+        """Whether frames of any come with poses of another tracker."""
+        return any(s.uses_poses for s in self._sources)
+
+    @property
     def shutter(self) -> Shutter:
         """By which rows are rectified."""
         return self._sources[0].shutter
@@ -189,7 +194,10 @@ class SeveralSources:
                 end = frame.timestamp + shift
                 places = tuple(s.place for s in self._sources[: n + 1])
                 self.place = JointPlace(index + 1, end, tuple(self.spans), places)
-                yield replace(frame, index=index, timestamp=end, follows_cut=starts and index > 0)
+                pose = None if frame.pose is None else replace(frame.pose, world=n)
+                yield replace(
+                    frame, index=index, timestamp=end, follows_cut=starts and index > 0, pose=pose
+                )
                 index += 1
 
 
