@@ -157,7 +157,7 @@ class Record3dRecording:
             self.calibration: Calibration | None = self._calibration(facts)
             self._poses = _poses(facts.get("poses", []))
             self._times = [float(t) for t in facts.get("frameTimestamps") or []]
-            self._size = (int(facts.get("dh") or _LIDAR[0]), int(facts.get("dw") or _LIDAR[1]))
+            self._size = _whole(facts, "dh", _LIDAR[0]), _whole(facts, "dw", _LIDAR[1])
         except (*UNUSABLE, UnicodeDecodeError) as error:
             raise InputError(f"{path}: its metadata cannot be understood ({error}).") from None
         if not (0 < self.fps < 1e4):
@@ -221,6 +221,11 @@ def _poses(rows: object) -> dict[int, MeasuredPose]:
         if pose is not None:
             found[number] = measured_pose(pose)
     return found
+
+
+def _whole(facts: dict[str, Any], name: str, default: int) -> int:
+    value = facts.get(name)
+    return default if value is None else int(value)
 
 
 def _lzfse() -> Any:
