@@ -21,9 +21,8 @@ def main(video: str, trajectory: Path = Path("trajectory.tum")) -> None:
             print(f"{pose.timestamp:8.3f} s  {pose.state.value}")
         else:
             x, y, z = pose.T_wc[:3, 3].tolist()
-            print(
-                f"{pose.timestamp:8.3f} s  {x:7.3f} {y:7.3f} {z:7.3f} ± {pose.sigma_position:.4f}"
-            )
+            at = f"{x:7.3f} {y:7.3f} {z:7.3f} ± {pose.sigma_position:.4f}"
+            print(f"{pose.timestamp:8.3f} s  {at}")
     slam.finish()
     write_tum_trajectory(trajectory, slam.trajectory())
 

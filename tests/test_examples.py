@@ -27,8 +27,8 @@ def quick(name: str) -> Config:
     c = preset(name)
     depth = replace(c.mapping.depth, min_planes=16, max_planes=32)
     mapping = replace(c.mapping, render_long_edge=64, iterations=1, final_iterations=0, depth=depth)
-    tracking = replace(c.tracking, init_keyframes=6)
-    return replace(c, mapping=mapping, tracking=tracking, input=replace(c.input, stop=26))
+    tracking = replace(c.tracking, init_keyframes=5)
+    return replace(c, mapping=mapping, tracking=tracking, input=replace(c.input, stop=20))
 
 
 @pytest.mark.parametrize("path", SCRIPTS, ids=lambda p: p.stem)
