@@ -38,7 +38,8 @@ class InputConfig(Settings, group="input"):
     640x480:rgb24@30; FORMAT is rgb24, bgr24, gray or yuv420p. auto reads YUV4MPEG2's own header."""
     mask: Annotated[Path | None, Only("run"), Basic("--mask")] = None
     """Picture of the source images' size, bright where they show the scene and black where they
-    always show something else: a car's bonnet, a robot's arm, a time stamp."""
+    always show something else: a car's bonnet, a robot's arm, a time stamp. Or a folder with one
+    for each image, by its name or the number of the frame; where one is missing, all is shown."""
     start: Annotated[int, Range(0), Basic("--start")] = 0
     """First frame of the source, from 0."""
     stop: Annotated[int | None, Range(above="start"), Basic("--stop")] = None

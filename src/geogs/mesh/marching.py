@@ -117,4 +117,4 @@ def _on_one_face(first: int, second: int) -> bool:
 def _edge(a: int, b: int) -> int:
     """The number of the edge between two corners."""
     low, axis = min(a, b), (a ^ b).bit_length() - 1
-    return int(np.flatnonzero(((low, axis) == EDGES).all(1))[0])
+    return EDGES.tolist().index([low, axis])

@@ -85,7 +85,7 @@ class ImageList:
             image = None if image is None else cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
             yield RawFrame(
                 str(file.path), file.timestamp, image, found.is_damaged, depth=file.depth,
-                pose=file.pose,
+                pose=file.pose, name=file.path.name,
             )  # fmt: skip
 
 

@@ -183,7 +183,9 @@ class Record3dRecording:
             seconds = self._times[n] if len(self._times) == self.length else n / self.fps
             pose = self._poses.get(number)
             label = f"{self.name}, frame {number}"
-            yield RawFrame(label, seconds, self._picture(number), depth=depth, pose=pose)
+            yield RawFrame(
+                label, seconds, self._picture(number), depth=depth, pose=pose, name=str(number)
+            )
 
     def _picture(self, number: int) -> np.ndarray | None:
         try:
@@ -197,7 +199,7 @@ class Record3dRecording:
         if "K" not in facts:
             return None
         K = np.array(facts["K"], dtype=np.float64).reshape(3, 3).T
-        width, height = int(facts.get("w", self.width)), int(facts.get("h", self.height))
+        width, height = _whole(facts, "w", self.width), _whole(facts, "h", self.height)
         return Calibration(
             K[0, 0], K[1, 1], K[0, 2], K[1, 2], width=width, height=height, origin="Record3D"
         ).fit(self.width, self.height)

@@ -118,6 +118,11 @@ class SeveralSources:
         return self._sources[0].mask
 
     @property
+    def black_is_hidden(self) -> bool:
+        """Whether pixels that are quite black show something else than the scene."""
+        return self._sources[0].black_is_hidden
+
+    @property
     def is_live(self) -> bool:
         """Never: what does not wait is read alone."""
         return False
