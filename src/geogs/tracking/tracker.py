@@ -15,7 +15,7 @@ from geogs.bundle.select import grid_fields
 from geogs.config import DepthSensorConfig, OdometryConfig, PriorConfig, TrackingConfig
 from geogs.errors import InputError, TrackingLost
 from geogs.geometry.camera import Camera
-from geogs.geometry.lie import se3_inverse
+from geogs.geometry.lie import se3_exp, se3_inverse, se3_log
 from geogs.keyframes.grid import SampleGrid
 from geogs.keyframes.keyframe import Keyframe, KeyframeState
 from geogs.keyframes.store import KeyframeStore
@@ -48,6 +48,13 @@ from geogs.types import Frame, RenderedKeyframe, Trajectory
 SELDOM = 5
 """While a camera only turns, the orientation says what it sees; only so often it is looked for as
 if it could be anywhere."""
+
+
+SAME_PACE = 0.2
+"""Part by which a frame may come sooner or later than the one before without a word: time stamps
+are rounded."""
+LONGEST_STEP = 3.0
+"""Of the last motion that is expected at most, however long no frame came."""
 
 
 class TrackState(Enum):
@@ -90,15 +97,25 @@ class LastFrame:
     """Motion from the frame before; None where the camera had been lost."""
     scale: float
     """Of the keyframe when the two were measured."""
+    timestamp: float
+    """Seconds."""
+    interval: float
+    """Seconds that the motion took."""
 
     @property
     def T_cw(self) -> Float[Tensor, "4 4"]:
         """World to camera by the keyframe's present pose and scale."""
         return self._present(self.T_rel) @ self.keyframe.T_cw
 
-    def predicted(self) -> Float[Tensor, "4 4"]:
-        """World to camera of the next frame if the motion goes on."""
-        return self.T_cw if self.velocity is None else self._present(self.velocity) @ self.T_cw
+    def predicted(self, timestamp: float) -> Float[Tensor, "4 4"]:
+        """World to camera of the next frame, at a time, if the motion goes on."""
+        if self.velocity is None:
+            return self.T_cw
+        motion = self._present(self.velocity)
+        ratio = (timestamp - self.timestamp) / self.interval if self.interval > 0 else 1.0
+        if abs(ratio - 1) > SAME_PACE:
+            motion = se3_exp(min(max(ratio, 0.0), LONGEST_STEP) * se3_log(motion))
+        return motion @ self.T_cw
 
     def _present(self, T: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:
         return self.keyframe.at_present_scale(T, self.scale)
@@ -112,6 +129,8 @@ class LastFrameState:
     T_rel: Float64[Tensor, "4 4"]
     velocity: Float64[Tensor, "4 4"] | None
     scale: float
+    timestamp: float
+    interval: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -243,7 +262,10 @@ class Tracker:
         """What a checkpoint holds; ``state`` is only what the tracker is doing."""
         seen, last = self._last, None
         if seen is not None:
-            last = LastFrameState(seen.keyframe.id, seen.T_rel, seen.velocity, seen.scale)
+            last = LastFrameState(
+                seen.keyframe.id, seen.T_rel, seen.velocity, seen.scale, seen.timestamp,
+                seen.interval,
+            )  # fmt: skip
         return TrackerState(
             self.keyframes.state(), self.graph.state(), self.recorder.state(),
             self._start_up.state(), self.state, list(self._finalized), self._breaks, last,
@@ -266,7 +288,9 @@ class Tracker:
         if state.last is not None:
             last = state.last
             keyframe = self.keyframes[last.keyframe]
-            self._last = LastFrame(keyframe, last.T_rel, last.velocity, last.scale)
+            self._last = LastFrame(
+                keyframe, last.T_rel, last.velocity, last.scale, last.timestamp, last.interval
+            )
 
     @property
     def T_cw(self) -> Float[Tensor, "4 4"] | None:
@@ -429,7 +453,7 @@ class Tracker:
         last = self._last
         if last is None or self.state is not TrackState.TRACKING:
             return None
-        motion = self._locator.locate(last.keyframe, encoded, last.predicted())
+        motion = self._locator.locate(last.keyframe, encoded, last.predicted(frame.timestamp))
         told = self.odometry.since(last.keyframe, frame.pose) if motion is None else None
         if told is not None:
             motion = self._locator.locate(last.keyframe, encoded, told @ last.keyframe.T_cw)
@@ -463,10 +487,13 @@ class Tracker:
         keyframe: Keyframe,
         T_rel: Float[Tensor, "4 4"] | None = None,
         velocity: Float[Tensor, "4 4"] | None = None,
+        timestamp: float | None = None,
+        interval: float = 0.0,
     ) -> None:
         """Note where the last frame was: relative to a keyframe, or at it."""
         T_rel = torch.eye(4, dtype=torch.float64) if T_rel is None else T_rel
-        self._last = LastFrame(keyframe, T_rel, velocity, keyframe.scale)
+        seconds = keyframe.timestamp if timestamp is None else timestamp
+        self._last = LastFrame(keyframe, T_rel, velocity, keyframe.scale, seconds, interval)
 
     def _places(self) -> list[Keyframe]:
         """Where to look for a lost camera: recent keyframes, and older ones in turn."""
@@ -489,23 +516,24 @@ class Tracker:
     def _follow(
         self, frame: Frame, encoded: Any, motion: FrameMotion, followed: Followed | None = None
     ) -> TrackResult:
-        velocity, self._motion = None, motion
+        velocity, interval, self._motion = None, 0.0, motion
         if self._last is not None and self.state is TrackState.TRACKING:
             velocity = motion.T_cw @ se3_inverse(self._last.T_cw)
+            interval = frame.timestamp - self._last.timestamp
         if self.state is TrackState.LOST:
             self._breaks.append(self.keyframes.store.next_id)
         self.state, self._misses, self.frames_lost = TrackState.TRACKING, 0, 0
         self.orientation.located(frame, encoded)
         anchor = self.keyframes[motion.keyframe]
         T_rel = motion.T_cw @ se3_inverse(anchor.T_cw)
-        self._seen_at(anchor, T_rel, velocity)
+        self._seen_at(anchor, T_rel, velocity, frame.timestamp, interval)
         turns = [] if followed is None else [followed.turn]
         # Where few frames were measured, each of these is worth a keyframe.
         is_first_measured = frame.depth is not None and self.is_metric and anchor.measured is None
         if not (is_first_measured or self._choice.calls_for(motion.flow, motion.overlap)):
             self.recorder.add(frame, encoded, anchor.id, T_rel, motion.match, turns)
             return TrackResult(self.state, active=self.active)
-        return self._insert(frame, encoded, motion, velocity, turns)
+        return self._insert(frame, encoded, motion, velocity, interval, turns)
 
     def _insert(
         self,
@@ -513,6 +541,7 @@ class Tracker:
         encoded: Any,
         motion: FrameMotion,
         velocity: Float[Tensor, "4 4"] | None,
+        interval: float,
         turns: Sequence[Turn],
     ) -> TrackResult:
         anchor = self.keyframes[motion.keyframe]
@@ -532,7 +561,7 @@ class Tracker:
         self._adjust_locally()
         self.odometry.look()
         removed = self._cull()
-        self._seen_at(state, velocity=velocity)
+        self._seen_at(state, velocity=velocity, interval=interval)
         fresh = self._finalise(self.keyframes.ids[:-1])
         return TrackResult(self.state, state.id, fresh, self.active, removed)
 

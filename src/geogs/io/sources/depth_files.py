@@ -57,6 +57,8 @@ class DepthFile:
     """Who saw it; none where its pixels are those of the colour image, at whatever size."""
     confidence: Path | None = None
     """Picture of how far each pixel is to be trusted, see ``LEAST_CONFIDENCE``."""
+    quarter_turns: int = 0
+    """Clockwise, from the picture as stored to the upright image."""
 
     def metres(self) -> Float32[np.ndarray, "h w"] | None:
         """The depth of the picture's own pixels, 0 where unknown; None where it cannot be read."""
@@ -71,7 +73,8 @@ class DepthFile:
             trust = decoded(self.confidence, cv2.IMREAD_UNCHANGED).picture
             if trust is not None and trust.shape == metres.shape:
                 unknown |= trust < LEAST_CONFIDENCE
-        return np.where(unknown, np.float32(0), metres)
+        known = np.where(unknown, np.float32(0), metres)
+        return np.ascontiguousarray(np.rot90(known, -self.quarter_turns))
 
 
 @dataclass(frozen=True)

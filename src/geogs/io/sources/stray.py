@@ -43,8 +43,9 @@ class StrayRecording(VideoFile):
         super().__init__(folder / "rgb.mp4")
         self.name = folder.resolve().name
         found = (p for p in (folder / "depth").glob("*.png") if p.stem.isdecimal())
-        self._depths = {int(path.stem): _depth(folder, path) for path in found}
-        self.has_depth = bool(self._depths) and self.quarter_turns == 0
+        turns = self.quarter_turns
+        self._depths = {int(path.stem): _depth(folder, path, turns) for path in found}
+        self.has_depth = bool(self._depths)
         matrix, odometry = folder / "camera_matrix.csv", folder / "odometry.csv"
         if matrix.is_file():
             self.calibration = _calibration(matrix, self.width, self.height)
@@ -58,9 +59,10 @@ class StrayRecording(VideoFile):
             yield replace(raw, depth=self._depths.get(at), pose=self._poses.get(at))
 
 
-def _depth(folder: Path, path: Path) -> DepthFile:
+def _depth(folder: Path, path: Path, quarter_turns: int) -> DepthFile:
     confidence = folder / "confidence" / path.name
-    return DepthFile(path, _PER_METRE, confidence=confidence if confidence.is_file() else None)
+    known = confidence if confidence.is_file() else None
+    return DepthFile(path, _PER_METRE, confidence=known, quarter_turns=quarter_turns)
 
 
 def _poses(path: Path, quarter_turns: int) -> dict[int, MeasuredPose]:
