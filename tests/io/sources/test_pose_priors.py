@@ -127,6 +127,7 @@ def test_portrait_recordings_have_poses_of_upright_images(tmp_path):
     write_stray(tmp_path, PATH, rotation=-90)
     source = open_source(tmp_path, InputConfig(depth="sensor", readout=0.0))
     assert (source.camera.width, source.camera.height) == (48, 64)
+    assert (source.camera.cx, source.camera.cy) == (47 - 23.5, 31.5)
     metres = list(source)[1].depth.metres()
     assert (metres[:30] == 0).all()  # the left half as stored is above now
     assert (metres[34:] == 1.5).all()

@@ -48,7 +48,8 @@ class StrayRecording(VideoFile):
         self.has_depth = bool(self._depths)
         matrix, odometry = folder / "camera_matrix.csv", folder / "odometry.csv"
         if matrix.is_file():
-            self.calibration = _calibration(matrix, self.width, self.height)
+            stored = (self.width, self.height)[:: -1 if turns % 2 else 1]
+            self.calibration = _calibration(matrix, *stored)
         self._poses = _poses(odometry, self.quarter_turns) if odometry.is_file() else {}
         self.poses_by = "Stray Scanner" if self._poses else None
 
@@ -91,6 +92,7 @@ def _poses(path: Path, quarter_turns: int) -> dict[int, MeasuredPose]:
 
 
 def _calibration(path: Path, width: int, height: int) -> Calibration:
+    """The camera of the images as they are stored."""
     try:
         rows = [[float(x) for x in line.split(",")] for line in read_text(path).split()]
         K = np.array(rows).reshape(3, 3)
