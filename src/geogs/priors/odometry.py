@@ -12,6 +12,8 @@ from geogs.geometry.lie import se3_inverse, so3_log
 
 FIT = 16.8
 """Squared deviations (six numbers) up to which two motions fit: 99 % of those that do."""
+PROPOSALS = 256
+"""Scales that are tried at most, evenly chosen along the path."""
 ROUNDS = 10
 """Of reweighting."""
 
@@ -65,6 +67,7 @@ def vote_on_scale(
     lengths = t.norm(dim=1)
     moved = lengths > 0
     proposals = t_measured.norm(dim=1)[moved] / lengths[moved]
+    proposals = proposals[:: 1 + len(proposals) // PROPOSALS]
     if not len(proposals):
         return ScaleVote(1.0, math.inf, torch.zeros(len(t), dtype=torch.bool))
     support = (1 / (1 + misfit(proposals) / FIT)).sum(1)
