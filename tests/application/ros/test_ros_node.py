@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from rosbags.typesys import Stores, get_typestore
 
 from geogs.application.ros.messages import Messages
 from geogs.application.ros.node import CameraNode, run_node
@@ -17,7 +16,10 @@ from geogs.errors import InputError
 from geogs.mesh.types import Mesh
 from geogs.types import MapSnapshot
 
-STORE = get_typestore(Stores.ROS2_HUMBLE)
+typesys = pytest.importorskip(
+    "rosbags.typesys", reason="messages need rosbags (pip install 'geogs[ros]')"
+)
+STORE = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
 _PLAIN = {"int": 0, "float": 0.0, "bool": False, "str": ""}
 
 
