@@ -28,6 +28,7 @@ from geogs.stopwatch import Stopwatch, StopwatchState
 from geogs.threads import on_one_torch_thread
 from geogs.tracking.certainty import certainty
 from geogs.tracking.flow.masked import MaskedFlow
+from geogs.tracking.flow.painted import PaintedFlow, shown_pixels
 from geogs.tracking.flow.select import build_operator
 from geogs.tracking.moving import moving_share
 from geogs.tracking.segments import Segments, SegmentsState
@@ -95,16 +96,18 @@ class Slam:
         prior: MonocularPrior | None = None,
         live: bool = False,
         mask: Bool[np.ndarray, "h w"] | None = None,
+        black_is_hidden: bool = False,
     ):
         """``mask``, of the size of the images, is true where they may show the scene: elsewhere
-        nothing is matched, searched or mapped. ``live`` maps in a thread beside tracking, which
+        nothing is matched, searched or mapped; with ``black_is_hidden`` nor are pixels of an image
+        that are quite black. ``live`` maps in a thread beside tracking, which
         waits neither for it nor for the search of loops: results then depend on how fast the
         machine is."""
         self.config = config or Config()
         self.camera = camera
         self.device = device
         self.prior = prior
-        self.mask = mask
+        self.mask, self.black_is_hidden = mask, black_is_hidden
         self._stream = _urgent_stream(device) if live else None
         """In which a live system tracks on a GPU until the stream ends; mapping's gives way."""
         with torch.cuda.stream(self._stream):
@@ -127,6 +130,8 @@ class Slam:
         self.operator = build_operator(c.tracking, grid)
         if self.mask is not None:
             self.operator = MaskedFlow(self.operator, grid, self.mask)
+        if self.black_is_hidden:
+            self.operator = PaintedFlow(self.operator, grid)
         self.keyframes = KeyframeStore(grid, self.operator.encode, c.resident_keyframes)
         self.segments = Segments(self.new_tracker, c.tracking.patience)
         self.loops = LoopCloser(self.segments, c.loop, not live, self.mask)
@@ -139,7 +144,7 @@ class Slam:
         c = self.config
         return Tracker(
             self.camera, c.tracking, self.device, c.seed, self.operator, self.prior, c.prior,
-            self.keyframes, c.sensor,
+            self.keyframes, c.sensor, c.odometry,
         )  # fmt: skip
 
     def _new_mapper(self, keyframes: KeyframeStore) -> Mapper:
@@ -165,8 +170,9 @@ class Slam:
         if not all(i in self.keyframes for i in (*state.waiting, *state.loops.detector.order)):
             raise InputError("a keyframe is missing")
         self.loops.load(state.loops)
-        for id in state.mapper.pool.maps if self.mask is not None else ():
-            self.mapper.pool.add(self.keyframes[id], self.mask)
+        for id in state.mapper.pool.maps:
+            if (mask := self._mask_of(id)) is not None:
+                self.mapper.pool.add(self.keyframes[id], mask)
         self.mapper.load(state.mapper)
         self.stopwatch.load(state.stopwatch)
         self.frames, self._waiting = state.frames, deque(state.waiting)
@@ -268,6 +274,7 @@ class Slam:
         if correct:
             self.adjust(progress)
             self.refine(progress)
+        self.to_metres()
 
     @on_one_torch_thread
     def adjust(self, progress: Progress = _silent) -> None:
@@ -292,6 +299,18 @@ class Slam:
         if self._known is not None:
             self._known = replace(self._known, position=factor * self._known.position)
         self._told_scale = scale
+
+    @on_one_torch_thread
+    def to_metres(self) -> None:
+        """At the end: bring the map to metres where poses beside the images say by which factor.
+
+        What is in metres already stays, and so does the world of a saved map.
+        """
+        odometry = self.segments.world.odometry
+        if self.metric_scale is None and odometry.scale is not None and not self.is_continued:
+            drift = (odometry.config.drift**2 + odometry.deviation**2) ** 0.5
+            self.rescale(MetricScale("poses beside the images", odometry.scale, drift))
+            odometry.scale = 1.0
 
     @on_one_torch_thread
     def trajectory(self) -> Trajectory:
@@ -321,11 +340,23 @@ class Slam:
         return {
             "refined": self.is_refined,
             "metric_scale": None if self.metric_scale is None else asdict(self.metric_scale),
+            "poses": self._pose_agreement(),
             "moving": round(moving_share(self.segments.world.keyframes), 4),
             "segments": [asdict(segment) for segment in self.segments.summary()],
             "not_started": self.segments.why_not or None,
             "loops": len(self.loops.detector.loops),
             "loop_closures": self.loops.closures,
+        }
+
+    def _pose_agreement(self) -> dict[str, object] | None:
+        """How far poses beside the images fit them; none where there are none."""
+        agreement = self.segments.world.odometry.agreement()
+        if not agreement.motions:
+            return None
+        return {
+            "motions": agreement.motions,
+            "fitting": round(agreement.share, 4),
+            "used": agreement.used,
         }
 
     def snapshot(self) -> MapSnapshot:
@@ -395,7 +426,7 @@ class Slam:
         mapper = self.background or self.mapper
         with self.stopwatch("mapping"):
             for id in result.finalized:
-                mapper.observe(id, self.mask)
+                mapper.observe(id, self._mask_of(id))
             trained = False
             while len(self._waiting) > lag:
                 mapper.map_keyframe(self._waiting.popleft())
@@ -403,6 +434,15 @@ class Slam:
         if trained and self.config.mapping.pose_iterations and self.background is None:
             with self.stopwatch("pose refinement"):
                 self.mapper.refine_poses(result.active)
+
+    def _mask_of(self, id: int) -> Bool[np.ndarray, "h w"] | None:
+        """What a keyframe shows of the scene; none where that is all of its image."""
+        if not self.black_is_hidden:
+            return self.mask
+        shown = shown_pixels(self.keyframes[id].image)
+        if self.mask is not None:
+            shown &= self.mask
+        return None if shown.all() else shown
 
 
 def _urgent_stream(device: str) -> "torch.cuda.Stream | None":

@@ -5,7 +5,7 @@ from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, UInt8
+from jaxtyping import Bool, Float, Float32, Float64, UInt8
 from torch import Tensor
 
 from geogs.geometry.camera import Camera
@@ -18,6 +18,16 @@ class MeasuredDepth(Protocol):
     def metres(self) -> Float32[np.ndarray, "h w"] | None:
         """Depth z of every pixel, 0 where unknown; None where it cannot be read."""
         ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MeasuredPose:
+    """Where something else than the images says that the camera was."""
+
+    T_cw: Float64[Tensor, "4 4"]
+    """World to camera, metres, in a world of its own."""
+    world: int = 0
+    """Poses of different worlds say nothing of each other."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,6 +44,8 @@ class Frame:
     """Whether it begins another video, so that no motion links it to the frame before."""
     depth: MeasuredDepth | None = None
     """Of the pixels of the image, where a sensor measured it and it is to be used."""
+    pose: MeasuredPose | None = None
+    """By another tracker, where there is one and it is to be used as a prior."""
 
 
 @dataclass(frozen=True, slots=True)

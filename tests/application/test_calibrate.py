@@ -104,7 +104,7 @@ def test_what_is_given_or_not_wanted_is_left_alone(video, monkeypatch):
 
 
 def test_ctrl_c_goes_on_with_the_guess(video, monkeypatch):
-    def interrupted(frames, camera, config, device, seed, report, mask):
+    def interrupted(frames, camera, config, device, seed, report, *masks):
         signal.raise_signal(signal.SIGINT)
         report(0.1)
         pytest.fail("the request was not heard")

@@ -16,12 +16,13 @@ from cuda_emulator import use_emulator
 from geogs.bundle.base import BundleOptions, BundleResult
 from geogs.bundle.dense import DenseBundle
 from geogs.bundle.fields import CpuFields
+from geogs.bundle.measured_motions import MeasuredMotions
 from geogs.bundle.motion import CpuMotion
 from geogs.bundle.pairs import CpuPairs
 from geogs.bundle.problem import BundleProblem, MeasuredDepths, MotionProblem
 from geogs.bundle.projection import MIN_Z, linearise, project, relative_motion
 from geogs.geometry.camera import Camera
-from geogs.geometry.lie import retract, se3_exp
+from geogs.geometry.lie import retract, se3_exp, se3_inverse
 from geogs.keyframes.grid import SampleGrid
 from geogs.keyframes.store import KeyframeStore, Segment
 from geogs.loop.global_bundle import global_bundle
@@ -150,6 +151,24 @@ def test_measured_depths_match_the_cpu(device):
     assert_same(fast, slow)
     plain = DenseBundle(SampleGrid(camera)).solve(problem, options)
     assert float((plain.inverse_depth - slow.inverse_depth).abs().max()) > 0.01
+
+
+@pytest.mark.parametrize("frames", [5, 19])
+def test_measured_motions_match_the_cpu(device, frames):
+    camera = camera_for(device)
+    problem = scene(camera, frames=frames, reach=1)
+    T, at = problem.T_cw, torch.arange(frames - 1)
+    information = torch.tensor([1e6] * 3 + [1e7] * 3, dtype=torch.float64).expand(frames - 1, 6)
+    off = se3_exp(0.01 * torch.ones(6, dtype=torch.float64))
+    motions = MeasuredMotions(at, at + 1, off @ T[1:] @ se3_inverse(T[:-1]), information)
+    told = replace(problem, motions=motions)
+    options = BundleOptions(2, huber=0.5)
+    slow = DenseBundle(SampleGrid(camera)).solve(told, options)
+    sent = replace(on(problem, device), motions=motions)
+    fast = cuda_bundle.CudaDenseBundle(SampleGrid(camera, device)).solve(sent, options)
+    assert_same(fast, slow)
+    plain = DenseBundle(SampleGrid(camera)).solve(problem, options)
+    assert float((plain.T_cw - slow.T_cw).abs().max()) > 1e-3
 
 
 def test_same_input_same_result(device):

@@ -8,7 +8,7 @@ from geogs.bundle.base import BundleOptions
 from geogs.bundle.problem import BundleProblem
 from geogs.bundle.projection import MIN_Z
 from geogs.geometry.camera import Camera
-from geogs.geometry.lie import retract, se3_inverse
+from geogs.geometry.lie import retract, se3_inverse, se3_log
 
 
 def reproject(
@@ -37,14 +37,23 @@ def residuals(
     return torch.stack(rows)
 
 
+def motion_residuals(problem: BundleProblem, xi: Tensor) -> Float[Tensor, "m 6"]:
+    """What is between the motions after the steps xi of poses and the measured ones."""
+    m, T = problem.motions, retract(xi, problem.T_cw)
+    return torch.stack([
+        se3_log(T[j] @ se3_inverse(T[i]) @ se3_inverse(measured))
+        for i, j, measured in zip(m.source.tolist(), m.target.tolist(), m.T_ts, strict=True)
+    ])  # fmt: skip
+
+
 def gauss_newton_step(
     problem: BundleProblem, camera: Camera, rays: Float[Tensor, "p 3"], options: BundleOptions
 ) -> tuple[Float[Tensor, "n 6"], Float[Tensor, "n p"]]:
     """The step of the free poses and inverse depths from the full normal equations.
 
-    Minimises sum w rho(r) with Huber's weights at the present state, and sum a rho(measured - d) of
-    inverse depths that were measured. The same damping as the fast
-    solver: of inverse depth in the full system, of poses in the system without depths.
+    Minimises sum w rho(r) with Huber's weights at the present state, sum a rho(measured - d) of
+    inverse depths that were measured, and Cauchy's loss of motions that were. The same damping as
+    the fast solver: of inverse depth in the full system, of poses in the system without depths.
     """
     n, p = problem.inverse_depth.shape
     xi = torch.zeros(n, 6, dtype=torch.float64)
@@ -75,6 +84,14 @@ def gauss_newton_step(
     C = torch.diag(C)
     H, E = Jx.mT @ (w[:, None] * Jx), Jx.mT @ (w[:, None] * Jd)
     v, b = Jx.mT @ (w * r), Jd.mT @ (w * r) + pull.reshape(-1)[depth]
+    if problem.motions is not None:
+        e = motion_residuals(problem, xi)
+        Jm = torch.func.jacrev(lambda a: motion_residuals(problem, a).reshape(-1))(xi)
+        Jm = Jm.reshape(-1, 6 * n)[:, pose]
+        a = problem.motions.information
+        a = a / (1 + (a * e * e).sum(-1, keepdim=True) / 3.0**2)
+        H = H + Jm.mT @ (a.reshape(-1, 1) * Jm)
+        v = v - Jm.mT @ (a * e).reshape(-1)
     S = H - E @ torch.linalg.inv(C) @ E.mT
     H = H + torch.diag(options.damping * S.diagonal().abs() + 1e-2)
     step = torch.linalg.solve(

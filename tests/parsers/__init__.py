@@ -6,6 +6,7 @@ from parsers.depths import depths
 from parsers.fleets import fleets
 from parsers.networks import networks
 from parsers.photographs import photographs
+from parsers.pose_priors import pose_priors
 from parsers.posed import posed
 from parsers.recordings import recordings
 from parsers.results import results
@@ -16,7 +17,7 @@ from parsers.surfaces import surfaces
 def parsers() -> dict[str, Parser]:
     """All of them by name."""
     groups = (
-        calibrations, recordings, depths, photographs, posed, results, surfaces, states,
-        fleets, networks,
+        calibrations, recordings, depths, pose_priors, photographs, posed, results, surfaces,
+        states, fleets, networks,
     )  # fmt: skip
     return {name: parser for group in groups for name, parser in group().items()}

@@ -55,6 +55,7 @@ def self_calibrated(
                 config.seed,
                 report,
                 source.mask,
+                source.black_is_hidden,
             )
         except KeyboardInterrupt:
             if not stop.requested:

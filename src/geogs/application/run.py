@@ -98,7 +98,10 @@ def _run(
     found = None if calibrated is opened else calibrated.calibration
     source = with_shutter_found(calibrated, progress, stop)
     prior = open_prior(config.prior, source.camera, device)
-    slam = Slam(source.camera, config, str(device), prior, source.is_live, source.mask)
+    slam = Slam(
+        source.camera, config, str(device), prior, source.is_live, source.mask,
+        source.black_is_hidden,
+    )  # fmt: skip
     if former is not None:
         slam.start_from(former.disks, former.keyframes)
     if former is not None or source.is_live:
@@ -143,7 +146,10 @@ def resume(
     with only_writer(output):
         compiled_kernels(device)
         prior = open_prior(config.prior, source.camera, device)
-        slam = Slam(source.camera, config, str(device), prior, mask=source.mask)
+        slam = Slam(
+            source.camera, config, str(device), prior, mask=source.mask,
+            black_is_hidden=source.black_is_hidden,
+        )  # fmt: skip
         saved.restore(slam)
         progress.write(f"Going on after {slam.frames} frames.")
         facts = replace(saved.facts, settings=settings.absolute(), device=device.type)

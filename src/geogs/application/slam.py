@@ -82,15 +82,18 @@ class Slam(Algorithm):
         prior: MonocularPrior | None = None,
         live: bool = False,
         mask: Bool[np.ndarray, "h w"] | None = None,
+        black_is_hidden: bool = False,
     ) -> None:
         """``camera`` is the pinhole of all images; ``device`` is cpu, cuda, cuda:1 or auto;
-        ``mask``, of the images' size, is true where they may show the scene.
+        ``mask``, of the images' size, is true where they may show the scene. What hides it in some
+        images alone is painted black in them, and ``black_is_hidden`` says so.
 
         Raises:
             InputError: images of that size cannot be tracked.
             DeviceError: there is no such device, or it cannot be used.
         """
-        super().__init__(camera, config, str(require_device(device)), prior, live, mask)
+        where = str(require_device(device))
+        super().__init__(camera, config, where, prior, live, mask, black_is_hidden)
         self.pose: PoseEstimate | None = None
         """After the last image; none before the first."""
 
@@ -258,7 +261,10 @@ def track(
         if stream is not source:
             stream = self_calibrated(stream, settings, require_device(device))
             stream = with_shutter_found(stream)
-        slam = Slam(stream.camera, settings, device, live=stream.is_live, mask=stream.mask)
+        slam = Slam(
+            stream.camera, settings, device, None, stream.is_live, stream.mask,
+            stream.black_is_hidden,
+        )  # fmt: skip
     for frame in stream:
         yield slam.process(frame)
 

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from geogs.bundle.base import BundleOptions, BundleResult
-from geogs.bundle.linearise import Star, linearise_stars
+from geogs.bundle.linearise import Star, linearise_stars, motion_stars
 from geogs.bundle.problem import BundleProblem, StreamedProblem, known_before, source_chunks
 from geogs.geometry.lie import move
 from geogs.keyframes.grid import SampleGrid
@@ -34,7 +34,8 @@ class DenseBundle:
             for star in stars:
                 information[star.frame] = star.information
             residual = torch.cat([star.residual for star in stars]) if stars else residual
-            xi = _pose_step(problem, stars, options.damping)
+            motions = motion_stars(problem.motions, T)
+            xi = _pose_step(problem, [*stars, *motions], options.damping)
             delta = _depth_step(stars, xi, d)
             if not bool(torch.isfinite(xi).all() and torch.isfinite(delta).all()):
                 finite = False

@@ -16,6 +16,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from geogs.bundle.base import BundleOptions
+from geogs.bundle.measured_motions import MeasuredMotions
 from geogs.bundle.problem import BundleProblem, sources_within
 from geogs.bundle.projection import Projection, linearise, relative_motion
 from geogs.geometry.camera import Camera
@@ -94,6 +95,18 @@ class Star:
         hessian, gradient = self.chained()
         n = len(self.targets) + 1
         return hessian.reshape(n, 6, n, 6).transpose(1, 2), gradient.reshape(n, 6)
+
+
+def motion_stars(motions: MeasuredMotions | None, T_cw: Float[Tensor, "n 4 4"]) -> list[Star]:
+    """What measured motions say of the poses: stars of one edge each, without depths."""
+    if motions is None:
+        return []
+    none, no_match = T_cw.new_zeros(0), T_cw.new_zeros(1)
+    parts = (motions.source.tolist(), motions.target, *motions.equations(T_cw))
+    return [
+        Star(i, j[None], adjoint[None], hessian, gradient, none, no_match, None)
+        for i, j, adjoint, hessian, gradient in zip(*parts, strict=True)
+    ]
 
 
 def weighed_residuals(

@@ -7,6 +7,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from geogs.bundle.measured_motions import MeasuredMotions
+
 Matches = Callable[[slice], tuple[Float[Tensor, "e p 2"], Float[Tensor, "e p 2"]]]
 """Measured positions and their inverse variances for a slice of edges; asked from threads."""
 
@@ -63,6 +65,7 @@ class BundleProblem:
     damping: Float[Tensor, "n p"] | None = None
     """Added to the curvature sum_e w |dp/dd|^2 of each inverse depth (DROID-SLAM's eta)."""
     measured: MeasuredDepths | None = None
+    motions: MeasuredMotions | None = None
 
     def damping_of(self, frame: int) -> Float[Tensor, "p"] | float:
         """``damping`` of a frame; zero where there is none."""
@@ -82,13 +85,14 @@ class StreamedProblem:
     free_depth: Bool[Tensor, "n"]
     damping: Float[Tensor, "n p"] | None = None
     measured: MeasuredDepths | None = None
+    motions: MeasuredMotions | None = None
 
     def part(self, edges: slice) -> BundleProblem:
         """The same frames with some of the edges."""
         pixels, weight = self.matches(edges)
         return BundleProblem(
             self.T_cw, self.inverse_depth, self.source[edges], self.target[edges], pixels, weight,
-            self.free_pose, self.free_depth, self.damping, self.measured,
+            self.free_pose, self.free_depth, self.damping, self.measured, self.motions,
         )  # fmt: skip
 
 

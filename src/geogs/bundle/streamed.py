@@ -10,13 +10,19 @@ from dataclasses import replace
 from typing import TypeVar
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from geogs.bundle.base import BundleOptions, BundleResult
 from geogs.bundle.camera_system import SparseCameraSystem
 from geogs.bundle.dense import stepped
-from geogs.bundle.linearise import Star, damped_curvature, linearise_stars, weighed_residuals
+from geogs.bundle.linearise import (
+    Star,
+    damped_curvature,
+    linearise_stars,
+    motion_stars,
+    weighed_residuals,
+)
 from geogs.bundle.problem import StreamedProblem, known_before, source_chunks, sources_within
 from geogs.bundle.projection import linearise, relative_motion
 from geogs.geometry.lie import se3_adjoint
@@ -42,7 +48,7 @@ class StreamedBundle:
         information = known_before(problem)
         residual = d.new_zeros(len(problem.source))
         finite = True
-        system = SparseCameraSystem(problem.source, problem.target, problem.free_pose)
+        system = SparseCameraSystem(*_joined(problem), problem.free_pose)
         chunks = source_chunks(problem.source, options.chunk)
         for _ in range(options.iterations):
             system.clear()
@@ -51,6 +57,7 @@ class StreamedBundle:
                 residual[chunk] = torch.cat([star.residual for star in stars])
                 for star in stars:
                     information[star.frame] = star.information
+            system.add(motion_stars(problem.motions, T))
             xi = system.solve(options.damping)
             delta = self._depth_steps(problem, T, d, xi, options, chunks)
             if not bool(torch.isfinite(xi).all() and torch.isfinite(delta).all()):
@@ -116,6 +123,16 @@ class StreamedBundle:
             for frame, step in steps:
                 delta[frame] = step
         return delta
+
+
+def _joined(problem: StreamedProblem) -> tuple[Int[Tensor, "e"], Int[Tensor, "e"]]:
+    """Sources and targets of all that joins poses, sorted by source."""
+    if problem.motions is None:
+        return problem.source, problem.target
+    source = torch.cat([problem.source, problem.motions.source])
+    target = torch.cat([problem.target, problem.motions.target])
+    order = source.argsort(stable=True)
+    return source[order], target[order]
 
 
 def _few_at_a_time(work: Callable[[slice], R], chunks: Sequence[slice]) -> Iterator[R]:

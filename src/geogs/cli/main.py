@@ -38,6 +38,7 @@ COMMANDS = {
     "run": Command("geogs.cli.run", "reconstruct a video, a folder of images or a data set"),
     "fleet": Command("geogs.cli.fleet", "reconstruct many videos, on one machine or many"),
     "reconstruct": Command("geogs.cli.reconstruct", "reconstruct images whose poses are known"),
+    "ros2": Command("geogs.cli.ros2", "track a camera in ROS 2 and publish where it is"),
     "mesh": Command("geogs.cli.mesh", "make the mesh of a result anew, without running again"),
     "scale": Command("geogs.cli.scale", "bring a result to metres by a length that is known"),
     "export": Command("geogs.cli.export", "write a result in the formats of other programs"),

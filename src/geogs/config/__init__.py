@@ -16,6 +16,7 @@ from geogs.config.loop import LoopConfig, RetrievalOptions, VerificationOptions
 from geogs.config.losses import LossAblation, LossConfig
 from geogs.config.mapping import DiskConfig, MapAblation, MappingConfig, PhotoConfig
 from geogs.config.mesh import MeshConfig
+from geogs.config.odometry import OdometryConfig
 from geogs.config.prior import PriorConfig
 from geogs.config.sensor import DepthSensorConfig
 from geogs.config.slam import Config, Preset, Seed, preset
@@ -34,6 +35,7 @@ __all__ = [
     "MapAblation",
     "MappingConfig",
     "MeshConfig",
+    "OdometryConfig",
     "PhotoConfig",
     "Preset",
     "PriorConfig",

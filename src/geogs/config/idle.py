@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from geogs.config.known_poses import ReconstructConfig
 from geogs.config.losses import LossConfig
 from geogs.config.mapping import DiskConfig, MappingConfig
+from geogs.config.odometry import OdometryConfig
 from geogs.config.prior import PriorConfig
 from geogs.config.sensor import DepthSensorConfig
 from geogs.config.slam import Config
@@ -38,6 +39,8 @@ def _run(config: Config) -> Iterator[str]:
     mapping = config.mapping
     if config.input.depth == "none" and config.sensor != DepthSensorConfig():
         yield "sensor does nothing: input.depth is none, so that no measured depth is used."
+    if config.input.poses == "none" and config.odometry != OdometryConfig():
+        yield "odometry does nothing: input.poses is none, so that no measured pose is used."
     if mapping.final_iterations == 0 and not mapping.final_depth:
         yield (
             "mapping.no-final-depth does nothing: with mapping.final-iterations 0 no depth is "

@@ -27,6 +27,10 @@ class InputConfig(Settings, group="input"):
     depth: Annotated[Literal["none", "auto", "sensor"], Only("run"), Basic("--depth")] = "none"
     """Depth that a sensor measured, beside the images: none leaves it, auto takes it where there
     is any, sensor must have it. With it the result is in metres."""
+    poses: Annotated[str, Only("run"), Basic("--poses")] = "auto"
+    """Poses beside the images as priors on the motion and the scale: none leaves them, auto takes
+    those of an app that tracks its camera (Stray Scanner, Record3D, Polycam), prior must have some,
+    and a file (TUM's rows) is taken as given. With them the result is in metres."""
     topic: Annotated[str, Only("run"), Basic("--topic")] = "auto"
     """Topic of the images in a bag of ROS; auto takes the one that most likely is the camera."""
     pipe: Annotated[str, Only("run")] = "auto"
@@ -34,7 +38,8 @@ class InputConfig(Settings, group="input"):
     640x480:rgb24@30; FORMAT is rgb24, bgr24, gray or yuv420p. auto reads YUV4MPEG2's own header."""
     mask: Annotated[Path | None, Only("run"), Basic("--mask")] = None
     """Picture of the source images' size, bright where they show the scene and black where they
-    always show something else: a car's bonnet, a robot's arm, a time stamp."""
+    always show something else: a car's bonnet, a robot's arm, a time stamp. Or a folder with one
+    for each image, by its name or the number of the frame; where one is missing, all is shown."""
     start: Annotated[int, Range(0), Basic("--start")] = 0
     """First frame of the source, from 0."""
     stop: Annotated[int | None, Range(above="start"), Basic("--stop")] = None

@@ -8,6 +8,7 @@ from geogs.config.input import InputConfig
 from geogs.config.loop import LoopConfig
 from geogs.config.mapping import MappingConfig
 from geogs.config.mesh import MeshConfig
+from geogs.config.odometry import OdometryConfig
 from geogs.config.paper import LONG_EDGE, paper_loops, paper_mapping, paper_prior
 from geogs.config.prior import PriorConfig
 from geogs.config.sensor import DepthSensorConfig
@@ -29,6 +30,7 @@ class Config(Settings):
     others wait in a temporary file. More than the window that is mapped and its history."""
     input: InputConfig = field(default_factory=InputConfig)
     sensor: DepthSensorConfig = field(default_factory=DepthSensorConfig)
+    odometry: OdometryConfig = field(default_factory=OdometryConfig)
     calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
     prior: PriorConfig = field(default_factory=PriorConfig)

@@ -205,6 +205,11 @@ def sim3_inverse_jacobian(xi: Float[Tensor, "*b 7"]) -> Float[Tensor, "*b 7 7"]:
     return inverse
 
 
+def se3_left_jacobian(xi: Float[Tensor, "*b 6"]) -> Float[Tensor, "*b 6 6"]:
+    """``J`` with ``Exp(xi + d) = Exp(J d) Exp(xi)`` to first order, of rigid motions."""
+    return sim3_left_jacobian(torch.nn.functional.pad(xi, (0, 1)))[..., :6, :6]
+
+
 def retract(xi: Float[Tensor, "*b k"], T: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 4 4"]:
     """Left retraction ``Exp(xi) T``; six numbers move an SE(3), seven a Sim(3)."""
     return (se3_exp(xi) if xi.shape[-1] == 6 else sim3_exp(xi)) @ T

@@ -13,6 +13,7 @@ from geogs.keyframes.grid import SampleGrid
 from geogs.keyframes.pictures import Picture
 from geogs.keyframes.poses import PoseTable
 from geogs.priors.base import DepthKind
+from geogs.types import MeasuredPose
 
 KNOWN = 0.3
 """Relative deviation up to which a depth helps to tell where a camera is."""
@@ -72,6 +73,7 @@ class KeyframeState:
     moving: Bool[Tensor, "p"] | None
     depth: Archived | None
     measured: MeasuredCells | None
+    pose: MeasuredPose | None
 
 
 @dataclass(eq=False)
@@ -103,6 +105,8 @@ class Keyframe:
     """Cells that are held for showing something that moves; none where nobody has judged yet."""
     measured: MeasuredCells | None = None
     """Of a depth sensor; none without, or where the map is not metric."""
+    pose: MeasuredPose | None = None
+    """By another tracker, in its own world; none where there is none."""
 
     @property
     def T_cw(self) -> Float[Tensor, "4 4"]:
@@ -129,7 +133,7 @@ class Keyframe:
         return KeyframeState(
             self.id, self.frame_index, self.timestamp, picture.archived, picture.archived_normal,
             self.T_cw, self.inverse_depth, self.information, self.prior, self.scale, self.moving,
-            picture.archived_depth, self.measured,
+            picture.archived_depth, self.measured, self.pose,
         )  # fmt: skip
 
     def rescale(self, factor: float) -> None:

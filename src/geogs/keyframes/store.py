@@ -168,7 +168,7 @@ class Segment:
             self.store.poses[s.id] = s.T_cw
             self._keyframes[s.id] = Keyframe(
                 s.id, s.frame_index, s.timestamp, grid, picture, self.store.poses, s.inverse_depth,
-                s.information, s.prior, s.scale, s.moving, s.measured,
+                s.information, s.prior, s.scale, s.moving, s.measured, s.pose,
             )  # fmt: skip
         self.store.assign(self.ids, self)
 

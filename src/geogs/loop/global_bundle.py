@@ -41,6 +41,7 @@ def global_bundle(
     free = [k for k in ids if k not in tracker.held]
     pairs = global_pairs(tracker, ids)
     graph.edges = {}
+    tracker.odometry.look_at_all()
     batch = MATCHED_TOGETHER[store.grid.on_gpu]
     options = BundleOptions(
         iterations=config.global_iterations, huber=config.huber, tolerance=SMALL_STEP
@@ -57,6 +58,7 @@ def global_bundle(
                 progress(share, "matching all keyframes")
         graph.adjust(list(graph.edges), free if tracker.held else ids[1:], free, options)
         graph.judge_moving(set(free), config.moving)
+        tracker.odometry.look_at_all()
     for start in range(0, len(free), PRIORS_TOGETHER):
         tracker.priors.adjust(free[start : start + PRIORS_TOGETHER], config.huber)  # moves no pose
     if progress is not None:

@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from geogs.mesh.marching import march
 from geogs.mesh.tsdf import BLOCK, LIMIT, SparseTsdf
 from geogs.mesh.types import Mesh
 
@@ -37,7 +38,7 @@ def extract_surface(tsdf: SparseTsdf, min_weight: float = 1.5) -> Mesh:
     through in chunks of 128 voxels that share one layer; a vertex is identified by the voxel edge
     it lies on, so chunks join without seams or double vertices.
 
-    Method: marching cubes (Lorensen and Cline 1987) with Lewiner's topology (2003), scikit-image.
+    Method: marching cubes (Lorensen and Cline 1987), see :mod:`geogs.mesh.marching`.
     """
     return stitched(surface_parts(tsdf, min_weight), tsdf.voxel)
 
@@ -45,10 +46,10 @@ def extract_surface(tsdf: SparseTsdf, min_weight: float = 1.5) -> Mesh:
 def surface_parts(tsdf: SparseTsdf, min_weight: float = 1.5) -> Iterator[SurfacePart]:
     """The surface chunk by chunk, of those chunks that belong to the box of ``tsdf``."""
     for chunk, origin, distance, cell in _chunks(tsdf, min_weight):
-        vertices, triangles = _march(distance, cell)
+        vertices, axis, triangles = march(distance, cell)
         if len(triangles):
-            position = vertices.astype(np.float64) + origin
-            yield SurfacePart(chunk, _edge_keys(position), position, triangles.astype(np.int64))
+            keys = _edge_keys(np.floor(vertices).astype(np.int64) + origin, axis)
+            yield SurfacePart(chunk, keys, vertices + origin, triangles)
 
 
 def stitched(parts: Iterable[SurfacePart], voxel: float) -> Mesh:
@@ -103,7 +104,7 @@ def _off_zero(distance: Float[Tensor, "x y z"]) -> Float[Tensor, "x y z"]:
 
 
 def _seen_cells(seen: Bool[Tensor, "x y z"]) -> Bool[Tensor, "x y z"]:
-    """Cells whose eight corners were seen, at their upper corners as in scikit-image's mask."""
+    """Cells whose eight corners were seen, each at its upper corner."""
     cell = seen
     for axis in range(3):
         length = cell.shape[axis]
@@ -126,23 +127,8 @@ def _dense(
     return dense[: crop[0], : crop[1], : crop[2]].contiguous()
 
 
-def _march(distance: np.ndarray, cell: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    from skimage.measure import marching_cubes
-
-    try:
-        vertices, faces, _, _ = marching_cubes(
-            distance, 0.0, mask=cell, gradient_direction="descent", allow_degenerate=True
-        )
-    except RuntimeError:  # how scikit-image says that no masked cell has a zero
-        return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32)
-    return vertices, faces
-
-
-def _edge_keys(position: Float[np.ndarray, "n 3"]) -> np.ndarray:
-    """A key of the voxel edge (or cell, for Lewiner's inner vertex) on which a vertex lies."""
-    base = np.floor(position + 0.2 * _SMALLEST)
-    inner = position - base > 0.4 * _SMALLEST
-    axis = np.where(inner.sum(1) > 1, 3, inner.argmax(1))
-    x, y, z = (base.astype(np.int64) + LIMIT).T
+def _edge_keys(base: Int[np.ndarray, "n 3"], axis: Int[np.ndarray, "n"]) -> Int[np.ndarray, "n"]:
+    """A key of the voxel edge on which a vertex lies: its lower voxel and its axis."""
+    x, y, z = (base + LIMIT).T
     width = 2 * LIMIT
     return ((x * width + y) * width + z) * 4 + axis

@@ -22,6 +22,7 @@ from geogs.keyframes.store import Segment
 from geogs.threads import thread_map
 from geogs.tracking.flow.base import FlowMatch, FlowOperator
 from geogs.tracking.moving import judge, still_weight
+from geogs.tracking.odometry import Odometry
 from geogs.tracking.packed_edge import (
     PackedEdge,
     PackedFlow,
@@ -64,8 +65,12 @@ EdgeState = MeasuredEdge | PackedFlow
 class FrameGraph:
     """Pairs of keyframes with their flow in both directions."""
 
-    def __init__(self, keyframes: Segment, operator: FlowOperator) -> None:
+    def __init__(
+        self, keyframes: Segment, operator: FlowOperator, odometry: Odometry | None = None
+    ) -> None:
+        """``odometry`` takes part in adjustments, where there is one."""
         self.keyframes = keyframes
+        self.odometry = odometry
         self.operator = operator
         self.edges: dict[Pair, Edge] = {}
         self.bundle = bundle_solver(keyframes.grid)
@@ -212,6 +217,7 @@ class FrameGraph:
             free_depth=torch.tensor([k in depths for k in ids]),
             damping=_frame_damping(edges, [slot[i] for i, _ in directed], len(ids)),
             measured=_measured([self.keyframes[k] for k in ids]),
+            motions=None if self.odometry is None else self.odometry.between(ids),
         )
         return problem, ids
 

@@ -115,6 +115,7 @@ class StartUp:
         """Add a keyframe to those the map will be started from, and start it with enough."""
         eye = torch.eye(4, dtype=torch.float64)
         state = self.keyframes.add(frame.index, frame.timestamp, frame.image, encoded, eye)
+        state.pose = frame.pose
         self.priors.ask(state)
         self._chain.reset()
         self.recorder.add_keyframe(state.id, turns)

@@ -12,10 +12,10 @@ from torch import Tensor
 
 from geogs.bundle.base import BundleOptions
 from geogs.bundle.select import grid_fields
-from geogs.config import DepthSensorConfig, PriorConfig, TrackingConfig
+from geogs.config import DepthSensorConfig, OdometryConfig, PriorConfig, TrackingConfig
 from geogs.errors import InputError, TrackingLost
 from geogs.geometry.camera import Camera
-from geogs.geometry.lie import se3_inverse
+from geogs.geometry.lie import se3_exp, se3_inverse, se3_log
 from geogs.keyframes.grid import SampleGrid
 from geogs.keyframes.keyframe import Keyframe, KeyframeState
 from geogs.keyframes.store import KeyframeStore
@@ -33,6 +33,7 @@ from geogs.tracking.motion import (
     Recognition,
 )
 from geogs.tracking.moving import carried
+from geogs.tracking.odometry import Odometry, OdometryState
 from geogs.tracking.orientation_chain import Followed, OrientationChain, OrientationState
 from geogs.tracking.pose_deviation import PoseDeviation, pose_deviation
 from geogs.tracking.proximity import Pair, frame_distances, proximity_pairs
@@ -47,6 +48,13 @@ from geogs.types import Frame, RenderedKeyframe, Trajectory
 SELDOM = 5
 """While a camera only turns, the orientation says what it sees; only so often it is looked for as
 if it could be anywhere."""
+
+
+SAME_PACE = 0.2
+"""Part by which a frame may come sooner or later than the one before without a word: time stamps
+are rounded."""
+LONGEST_STEP = 3.0
+"""Of the last motion that is expected at most, however long no frame came."""
 
 
 class TrackState(Enum):
@@ -89,15 +97,25 @@ class LastFrame:
     """Motion from the frame before; None where the camera had been lost."""
     scale: float
     """Of the keyframe when the two were measured."""
+    timestamp: float
+    """Seconds."""
+    interval: float
+    """Seconds that the motion took."""
 
     @property
     def T_cw(self) -> Float[Tensor, "4 4"]:
         """World to camera by the keyframe's present pose and scale."""
         return self._present(self.T_rel) @ self.keyframe.T_cw
 
-    def predicted(self) -> Float[Tensor, "4 4"]:
-        """World to camera of the next frame if the motion goes on."""
-        return self.T_cw if self.velocity is None else self._present(self.velocity) @ self.T_cw
+    def predicted(self, timestamp: float) -> Float[Tensor, "4 4"]:
+        """World to camera of the next frame, at a time, if the motion goes on."""
+        if self.velocity is None:
+            return self.T_cw
+        motion = self._present(self.velocity)
+        ratio = (timestamp - self.timestamp) / self.interval if self.interval > 0 else 1.0
+        if abs(ratio - 1) > SAME_PACE:
+            motion = se3_exp(min(max(ratio, 0.0), LONGEST_STEP) * se3_log(motion))
+        return motion @ self.T_cw
 
     def _present(self, T: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:
         return self.keyframe.at_present_scale(T, self.scale)
@@ -111,6 +129,8 @@ class LastFrameState:
     T_rel: Float64[Tensor, "4 4"]
     velocity: Float64[Tensor, "4 4"] | None
     scale: float
+    timestamp: float
+    interval: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,6 +151,7 @@ class TrackerState:
     """Of the latest frames."""
     orientation: OrientationState
     is_metric: bool
+    odometry: OdometryState
 
 
 class Tracker:
@@ -147,6 +168,7 @@ class Tracker:
         prior_config: PriorConfig | None = None,
         store: KeyframeStore | None = None,
         sensor: DepthSensorConfig | None = None,
+        odometry: OdometryConfig | None = None,
     ) -> None:
         """``store`` is where the keyframes are kept, in a segment of their own."""
         cv2.setRNGSeed(seed)
@@ -155,7 +177,9 @@ class Tracker:
         self.grid = SampleGrid(camera, device) if store is None else store.grid
         self.operator = operator or build_operator(self.config, self.grid)
         self.keyframes = (store or KeyframeStore(self.grid, self.operator.encode)).new_segment()
-        self.graph = FrameGraph(self.keyframes, self.operator)
+        self.odometry = Odometry(self.keyframes, odometry or OdometryConfig())
+        """What another tracker says of the motion, where frames come with its poses."""
+        self.graph = FrameGraph(self.keyframes, self.operator, self.odometry)
         self.priors = KeyframePriors(self.graph, prior, prior_config or PriorConfig())
         self.sensing = DepthSensing(self.grid, sensor or DepthSensorConfig())
         self.is_metric = False
@@ -238,12 +262,15 @@ class Tracker:
         """What a checkpoint holds; ``state`` is only what the tracker is doing."""
         seen, last = self._last, None
         if seen is not None:
-            last = LastFrameState(seen.keyframe.id, seen.T_rel, seen.velocity, seen.scale)
+            last = LastFrameState(
+                seen.keyframe.id, seen.T_rel, seen.velocity, seen.scale, seen.timestamp,
+                seen.interval,
+            )  # fmt: skip
         return TrackerState(
             self.keyframes.state(), self.graph.state(), self.recorder.state(),
             self._start_up.state(), self.state, list(self._finalized), self._breaks, last,
             self._misses, self.frames_lost, self._choice.state(), self.orientation.state(),
-            self.is_metric,
+            self.is_metric, self.odometry.state(),
         )  # fmt: skip
 
     def load(self, state: TrackerState) -> None:
@@ -257,10 +284,13 @@ class Tracker:
         self._misses, self.frames_lost = state.misses, state.frames_lost
         self._choice.load(state.sharpness)
         self.orientation.load(state.orientation)
+        self.odometry.load(state.odometry)
         if state.last is not None:
             last = state.last
             keyframe = self.keyframes[last.keyframe]
-            self._last = LastFrame(keyframe, last.T_rel, last.velocity, last.scale)
+            self._last = LastFrame(
+                keyframe, last.T_rel, last.velocity, last.scale, last.timestamp, last.interval
+            )
 
     @property
     def T_cw(self) -> Float[Tensor, "4 4"] | None:
@@ -327,7 +357,7 @@ class Tracker:
             return self._lose(frame)
         if self.state is TrackState.INITIALIZING:
             return self._start(frame, encoded)
-        motion = self._expected(encoded)
+        motion = self._expected(frame, encoded)
         if motion is not None and motion.known >= self.config.min_known:
             return self._follow(frame, encoded, motion)
         followed = self.orientation.follow(frame, encoded)
@@ -398,6 +428,7 @@ class Tracker:
         eye = torch.eye(4, dtype=torch.float64)
         earlier = list(self.keyframes.ids)
         state = self.keyframes.add(frame.index, frame.timestamp, frame.image, encoded, eye)
+        state.pose = frame.pose
         if not self.sensing.start(state, frame.depth, self.config.min_known):
             self.keyframes.remove(state.id)
             return None
@@ -411,17 +442,21 @@ class Tracker:
 
     def _begin(self) -> None:
         self.state = TrackState.TRACKING
+        self.odometry.look()
         back_fill(self.recorder, self._locator, self.config.min_known)
         self._seen_at(self.keyframes[self.keyframes.ids[-1]])
 
     # --- with a map ------------------------------------------------------------------------
 
-    def _expected(self, encoded: Any) -> FrameMotion | None:
+    def _expected(self, frame: Frame, encoded: Any) -> FrameMotion | None:
         """The frame near where the last one was; None if the camera is not there, or was lost."""
         last = self._last
         if last is None or self.state is not TrackState.TRACKING:
             return None
-        motion = self._locator.locate(last.keyframe, encoded, last.predicted())
+        motion = self._locator.locate(last.keyframe, encoded, last.predicted(frame.timestamp))
+        told = self.odometry.since(last.keyframe, frame.pose) if motion is None else None
+        if told is not None:
+            motion = self._locator.locate(last.keyframe, encoded, told @ last.keyframe.T_cw)
         if motion is None and last.velocity is not None:
             motion = self._locator.locate(last.keyframe, encoded, last.T_cw)
         return motion
@@ -452,10 +487,13 @@ class Tracker:
         keyframe: Keyframe,
         T_rel: Float[Tensor, "4 4"] | None = None,
         velocity: Float[Tensor, "4 4"] | None = None,
+        timestamp: float | None = None,
+        interval: float = 0.0,
     ) -> None:
         """Note where the last frame was: relative to a keyframe, or at it."""
         T_rel = torch.eye(4, dtype=torch.float64) if T_rel is None else T_rel
-        self._last = LastFrame(keyframe, T_rel, velocity, keyframe.scale)
+        seconds = keyframe.timestamp if timestamp is None else timestamp
+        self._last = LastFrame(keyframe, T_rel, velocity, keyframe.scale, seconds, interval)
 
     def _places(self) -> list[Keyframe]:
         """Where to look for a lost camera: recent keyframes, and older ones in turn."""
@@ -478,23 +516,24 @@ class Tracker:
     def _follow(
         self, frame: Frame, encoded: Any, motion: FrameMotion, followed: Followed | None = None
     ) -> TrackResult:
-        velocity, self._motion = None, motion
+        velocity, interval, self._motion = None, 0.0, motion
         if self._last is not None and self.state is TrackState.TRACKING:
             velocity = motion.T_cw @ se3_inverse(self._last.T_cw)
+            interval = frame.timestamp - self._last.timestamp
         if self.state is TrackState.LOST:
             self._breaks.append(self.keyframes.store.next_id)
         self.state, self._misses, self.frames_lost = TrackState.TRACKING, 0, 0
         self.orientation.located(frame, encoded)
         anchor = self.keyframes[motion.keyframe]
         T_rel = motion.T_cw @ se3_inverse(anchor.T_cw)
-        self._seen_at(anchor, T_rel, velocity)
+        self._seen_at(anchor, T_rel, velocity, frame.timestamp, interval)
         turns = [] if followed is None else [followed.turn]
         # Where few frames were measured, each of these is worth a keyframe.
         is_first_measured = frame.depth is not None and self.is_metric and anchor.measured is None
         if not (is_first_measured or self._choice.calls_for(motion.flow, motion.overlap)):
             self.recorder.add(frame, encoded, anchor.id, T_rel, motion.match, turns)
             return TrackResult(self.state, active=self.active)
-        return self._insert(frame, encoded, motion, velocity, turns)
+        return self._insert(frame, encoded, motion, velocity, interval, turns)
 
     def _insert(
         self,
@@ -502,10 +541,12 @@ class Tracker:
         encoded: Any,
         motion: FrameMotion,
         velocity: Float[Tensor, "4 4"] | None,
+        interval: float,
         turns: Sequence[Turn],
     ) -> TrackResult:
         anchor = self.keyframes[motion.keyframe]
         state = self.keyframes.add(frame.index, frame.timestamp, frame.image, encoded, motion.T_cw)
+        state.pose = frame.pose
         T = motion.T_cw @ se3_inverse(anchor.T_cw)
         state.inverse_depth, state.information = grid_fields(self.grid).transfer(
             T, anchor.inverse_depth, anchor.information
@@ -518,8 +559,9 @@ class Tracker:
         seen = self.graph.edges[state.id, anchor.id]
         state.moving = carried(self.grid, anchor.moving, seen.pixels, seen.weight)
         self._adjust_locally()
+        self.odometry.look()
         removed = self._cull()
-        self._seen_at(state, velocity=velocity)
+        self._seen_at(state, velocity=velocity, interval=interval)
         fresh = self._finalise(self.keyframes.ids[:-1])
         return TrackResult(self.state, state.id, fresh, self.active, removed)
 

@@ -7,6 +7,7 @@ import pytest
 from geogs.config import InputConfig
 from geogs.errors import InputError
 from geogs.io.sources.sniff import open_source
+from io_samples import gradient_image, write_video
 
 LENS = "80,80,63.5,47.5,-0.3,0.05,0,0"
 
@@ -39,3 +40,42 @@ def test_without_a_mask_there_is_none_and_a_missing_one_is_told(folder):
     assert open_source(images).mask is None
     with pytest.raises(InputError, match="missing or damaged"):
         open_source(images, InputConfig(mask=mask.with_name("none.png")))
+
+
+def test_masks_of_a_folder_are_found_by_name_and_paint_what_they_hide(folder):
+    images, mask = folder
+    masks = mask.with_suffix("")
+    masks.mkdir()
+    shown = np.full((96, 128), 255, np.uint8)
+    for name, column in (("0.png", 30), ("2.png.png", 60)):
+        picture = shown.copy()
+        picture[:, :column] = 0
+        cv2.imwrite(str(masks / name), picture)
+    config = InputConfig(intrinsics="80,80,63.5,47.5", mask=masks, readout=0.0)
+    source = open_source(images, config)
+    assert source.mask is None
+    assert source.black_is_hidden
+    hidden = [~frame.image.any(-1) for frame in source]
+    assert [int(h.argmin(1)[0]) for h in hidden] == [30, 0, 60]
+    assert [int(h.sum()) for h in hidden] == [30 * 96, 0, 60 * 96]  # not the black below the line
+    assert not open_source(images, InputConfig(readout=0.0)).black_is_hidden
+
+
+def test_masks_of_a_video_are_found_by_the_number_of_the_frame(tmp_path):
+    write_video(tmp_path / "v.mp4", [gradient_image(k) for k in range(4)])
+    (tmp_path / "masks").mkdir()
+    picture = np.full((48, 64), 255, np.uint8)
+    picture[:, 40:] = 0
+    cv2.imwrite(str(tmp_path / "masks/000002.png"), picture)
+    config = InputConfig(
+        intrinsics="50,50,31.5,23.5", mask=tmp_path / "masks", stride=2, readout=0.0
+    )
+    first, second = open_source(tmp_path / "v.mp4", config)
+    assert first.image.any(-1).all()
+    assert (~second.image.any(-1)).sum() == 24 * 48
+    (tmp_path / "masks/000002.png").write_bytes(b"no picture")
+    with pytest.raises(InputError, match="missing or damaged"):
+        list(open_source(tmp_path / "v.mp4", config))
+    (tmp_path / "masks/000002.png").unlink()
+    with pytest.raises(InputError, match="holds no masks"):
+        open_source(tmp_path / "v.mp4", config)

@@ -12,6 +12,7 @@ from geogs.errors import InputError
 from geogs.io.sources.sniff import Stream
 from geogs.on_demand import OnDemand
 from geogs.slam import Slam
+from geogs.tracking.odometry import Agreement
 from geogs.types import MetricScale
 
 
@@ -25,7 +26,12 @@ def make_metric(
     slam: Slam, stream: Stream, source: ScaleSource | None, progress: RunProgress
 ) -> None:
     """Bring the map to metres by what is known; where it does not tell, say so and leave it."""
-    if source is None or not slam.segments.keyframe_ids:
+    if not slam.segments.keyframe_ids:
+        return
+    for sentence in sentences_on_poses(slam.segments.world.odometry.agreement()):
+        progress.write(sentence)
+    if source is None:
+        slam.to_metres()
         return
     if isinstance(source, SensorScale):
         if slam.metric_scale is None:
@@ -38,6 +44,19 @@ def make_metric(
         return
     slam.rescale(MetricScale(found.origin, found.factor, found.deviation))
     progress.write(said(found))
+
+
+def sentences_on_poses(found: Agreement) -> list[str]:
+    """What to tell of poses beside the images; nothing where there are none."""
+    if not found.motions:
+        return []
+    fitting = f"{found.share:.0%} of {found.motions} motions between keyframes"
+    if found.used:
+        return [f"Poses beside the images: {fitting} fit what the images show."]
+    return [
+        f"warning: the poses beside the images are not used: only {fitting} fit what the images "
+        "show. Are they of this video? --poses none leaves them out."
+    ]
 
 
 def measurable(slam: Slam) -> MeasurableScene:

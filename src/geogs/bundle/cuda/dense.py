@@ -9,6 +9,7 @@ from jaxtyping import Bool, Int
 from torch import Tensor
 
 from geogs.bundle.base import BundleOptions, BundleResult
+from geogs.bundle.linearise import motion_stars
 from geogs.bundle.problem import MEASURED_HUBER, BundleProblem
 from geogs.gpu.kernels import kernels_for
 from geogs.gpu.transfer import to_device
@@ -157,6 +158,31 @@ class _Workspace:
             self.measured = (m.inverse_depth.contiguous(), m.information.contiguous())
 
 
+def _add_motions(w: _Workspace, problem: BundleProblem, damping: float) -> None:
+    """Add what measured motions say to the assembled camera system, which waits for the poses."""
+    if problem.motions is None:
+        return
+    n = w.structure.poses
+    size = 6 * n
+    slot = torch.full((len(problem.free_pose),), -1)
+    slot[problem.free_pose.cpu()] = torch.arange(n)
+    stars = motion_stars(problem.motions, w.T.reshape(-1, 4, 4).cpu())
+    added = torch.zeros(size + 1, size, dtype=torch.float64)
+    for star in stars:
+        block, gradient = star.pose_blocks()
+        at = slot[star.poses].tolist()
+        for a, p in enumerate(at):
+            if p < 0:
+                continue
+            added[size, 6 * p : 6 * p + 6] += gradient[a]
+            for b, q in enumerate(at):
+                if 0 <= q <= p:
+                    added[6 * p : 6 * p + 6, 6 * q : 6 * q + 6] += block[a, b]
+    diagonal = added[:size].diagonal()
+    diagonal += damping * diagonal.abs()
+    w.system += to_device(added.reshape(-1), w.system.device)
+
+
 class CudaDenseBundle:
     """Solver for one grid on its GPU, with the interface of ``DenseBundle``.
 
@@ -181,7 +207,7 @@ class CudaDenseBundle:
         pixels, weight = problem.pixels.contiguous(), problem.weight.contiguous()
         for _ in range(options.iterations):
             self._linearise(w, pixels, weight, options)
-            self._solve_cameras(w, options)
+            self._solve_cameras(w, problem, options)
             self._move(w, options)
         state = w.state.cpu()
         T = state[:-1].reshape(-1, 4, 4).to(problem.T_cw.device)
@@ -203,7 +229,7 @@ class CudaDenseBundle:
             w.inverse_curvature, w.depth_gradient,
         )  # fmt: skip
 
-    def _solve_cameras(self, w: _Workspace, options: BundleOptions) -> None:
+    def _solve_cameras(self, w: _Workspace, problem: BundleProblem, options: BundleOptions) -> None:
         s = w.structure
         if not s.poses:
             return
@@ -216,6 +242,7 @@ class CudaDenseBundle:
             len(s.places), 256, s.places, s.first_part, s.parts, w.blocks, w.vectors, s.poses,
             options.damping, w.system,
         )  # fmt: skip
+        _add_motions(w, problem, options.damping)
         if s.poses <= MAX_FEW:
             threads = min(256, 32 * s.poses)
             self._solve["solve_few_poses"](1, threads, w.system, s.slot, s.poses, s.frames, w.xi)

@@ -22,15 +22,17 @@ from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.io.pictures import read_mask
 from geogs.io.sources.calibration import Calibration
-from geogs.io.sources.depth_files import DepthFile, RectifiedDepth
+from geogs.io.sources.depth_files import RectifiedDepth, StoredDepth
+from geogs.io.sources.frame_masks import FrameMasks, painted
 from geogs.io.sources.intrinsics import resolve_intrinsics
+from geogs.io.sources.pose_priors import chosen_poses
 from geogs.io.sources.undistort import Rectifier
 from geogs.shutter.camera import RollingCamera
 from geogs.shutter.neighbours import with_turning
 from geogs.shutter.readout import CLIP, CLIPS
 from geogs.shutter.rows import RowOffsets
 from geogs.shutter.shutter import Shutter
-from geogs.types import Frame, MeasuredDepth
+from geogs.types import Frame, MeasuredDepth, MeasuredPose
 
 _log = logging.getLogger(__name__)
 T = TypeVar("T")
@@ -56,6 +58,10 @@ class RawFrame:
     """What is wrong where there is no image."""
     depth: MeasuredDepth | None = None
     """What a depth sensor saw at that time, as it came or of the pixels of a working image."""
+    pose: MeasuredPose | None = None
+    """Of the upright image, by another tracker."""
+    name: str = ""
+    """Of its file, or the number of the frame: by what a mask of its own is found."""
 
     @property
     def fault(self) -> str:
@@ -142,6 +148,7 @@ class Source:
                 f"{reader.name} has no depth of a sensor beside its images that can be read here; "
                 "leave out --depth."
             )
+        self._poses = chosen_poses(config.poses, reader, reader.name)
         self._reader = reader
         self._config = config
         self.calibration = calibration or resolve_intrinsics(
@@ -156,7 +163,9 @@ class Source:
         """By which rows are rectified."""
         self._rectifier = Rectifier(self.calibration, config.long_edge, config.field_of_view)
         check_large_enough(self._rectifier.camera, reader.name)
-        self.mask = self._working_mask()
+        masks = None if config.mask is None else expanded(config.mask)
+        self._masks = FrameMasks(masks) if masks is not None and masks.is_dir() else None
+        self.mask = None if masks is None or self._masks is not None else self._working_mask(masks)
         """Pixels of every frame that may show the scene; none where all do."""
         self.skipped = 0
         """Images that could not be read or are of another size, so far in this iteration."""
@@ -165,12 +174,16 @@ class Source:
         self.place = ReadingPlace()
         """How far the source has been read, at each frame of this iteration."""
 
-    def _working_mask(self) -> Bool[np.ndarray, "h w"] | None:
-        """The mask of the settings, straightened as the images are."""
-        if self._config.mask is None:
-            return None
-        reader = self._reader
-        shown = read_mask(expanded(self._config.mask), (reader.height, reader.width))
+    @property
+    def black_is_hidden(self) -> bool:
+        """Whether pixels of frames that are quite black show something else than the scene."""
+        return self._masks is not None
+
+    def _working_mask(self, path: Path) -> Bool[np.ndarray, "h w"]:
+        """A mask for all images, straightened as they are."""
+        return self._straight(read_mask(path, (self._reader.height, self._reader.width)))
+
+    def _straight(self, shown: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h2 w2"]:
         grey = np.repeat(np.where(shown, np.uint8(255), np.uint8(0))[..., None], 3, 2)
         return self._rectifier(grey)[..., 0] > 127
 
@@ -193,6 +206,11 @@ class Source:
     def uses_depth(self) -> bool:
         """Whether frames come with the depth that a sensor measured."""
         return self._config.depth != "none" and self._reader.has_depth
+
+    @property
+    def uses_poses(self) -> bool:
+        """Whether frames come with poses of another tracker, as priors."""
+        return self._poses.is_used
 
     @property
     def is_calibration_open(self) -> bool:
@@ -307,7 +325,7 @@ class Source:
         """Yield the frames after a place; otherwise as the iteration over all."""
         self.place, self.skipped, index = place, place.skipped, place.frames
         self.damaged = place.damaged
-        working = self._working(place.frames + place.skipped)
+        working = self._masked(self._working(place.frames + place.skipped))
         for raw in working if self.is_live else read_ahead(working):
             if raw.image is None:
                 self.skipped += 1
@@ -319,7 +337,8 @@ class Source:
                 if self.damaged == 1:
                     _log.warning("%s is damaged; used as far as it goes.", raw.label)
             self.place = ReadingPlace(index + 1, self.skipped, self.damaged)
-            yield Frame(index, raw.timestamp, raw.image, depth=raw.depth)
+            pose = self._poses.of(raw.timestamp, raw.pose)
+            yield Frame(index, raw.timestamp, raw.image, depth=raw.depth, pose=pose)
             index += 1
         if index == 0:
             raise InputError(self._why_empty())
@@ -342,13 +361,23 @@ class Source:
                 raw = replace(raw, image=image, depth=self._rectified(raw.depth))
             yield raw
 
+    def _masked(self, working: Iterator[RawFrame]) -> Iterator[RawFrame]:
+        """Working images with what masks of their own hide painted black."""
+        for raw in working:
+            if self._masks is None or raw.image is None:
+                yield raw
+                continue
+            shown = self._masks.read(raw.name, (self._reader.height, self._reader.width))
+            straight = None if shown is None else self._straight(shown)
+            yield replace(raw, image=painted(raw.image, straight))
+
     def _rectified(
         self,
         depth: MeasuredDepth | None,
         moved: Float[np.ndarray, "h w 2"] | None = None,
     ) -> MeasuredDepth | None:
         """Depth as it came, of the pixels of a working image, whose rows were ``moved``."""
-        if not (self.uses_depth and isinstance(depth, DepthFile)):
+        if not (self.uses_depth and isinstance(depth, StoredDepth)):
             return None
         return RectifiedDepth(depth, self.calibration, self._rectifier, moved)
 

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol, runtime_checkable
 
 import cv2
 import numpy as np
@@ -18,6 +19,8 @@ SAME_SURFACE = 0.03
 INVALID = 65535
 """What some sensors write where they saw nothing, beside 0."""
 
+LEAST_CONFIDENCE = 1
+"""Of a phone's lidar (0 low, 1 medium, 2 high) from which on a depth is taken."""
 LONGEST = 32_000
 """Pixels of a side beyond which OpenCV interpolates nothing."""
 
@@ -31,6 +34,18 @@ class DepthCamera:
     """From the depth camera's axes to the colour camera's, which are parallel; metres."""
 
 
+@runtime_checkable
+class StoredDepth(Protocol):
+    """A depth as it came."""
+
+    sensor: DepthCamera | None
+    """Who saw it; none where its pixels are those of the colour image, at whatever size."""
+
+    def metres(self) -> Float32[np.ndarray, "h w"] | None:
+        """The depth of its own pixels, 0 where unknown; None where it cannot be read."""
+        ...
+
+
 @dataclass(frozen=True)
 class DepthFile:
     """A picture of depth as it came."""
@@ -40,6 +55,10 @@ class DepthFile:
     """Units of the picture to the metre."""
     sensor: DepthCamera | None = None
     """Who saw it; none where its pixels are those of the colour image, at whatever size."""
+    confidence: Path | None = None
+    """Picture of how far each pixel is to be trusted, see ``LEAST_CONFIDENCE``."""
+    quarter_turns: int = 0
+    """Clockwise, from the picture as stored to the upright image."""
 
     def metres(self) -> Float32[np.ndarray, "h w"] | None:
         """The depth of the picture's own pixels, 0 where unknown; None where it cannot be read."""
@@ -50,14 +69,19 @@ class DepthFile:
         unknown = ~np.isfinite(metres) | (metres < 0)
         if picture.dtype == np.uint16:
             unknown |= picture == INVALID
-        return np.where(unknown, np.float32(0), metres)
+        if self.confidence is not None:
+            trust = decoded(self.confidence, cv2.IMREAD_UNCHANGED).picture
+            if trust is not None and trust.shape == metres.shape:
+                unknown |= trust < LEAST_CONFIDENCE
+        known = np.where(unknown, np.float32(0), metres)
+        return np.ascontiguousarray(np.rot90(known, -self.quarter_turns))
 
 
 @dataclass(frozen=True)
 class RectifiedDepth:
     """The same of the pixels of a working image, made when it is asked for."""
 
-    file: DepthFile
+    file: StoredDepth
     colour: Calibration
     """Of the image as it came."""
     rectifier: Rectifier

@@ -16,6 +16,7 @@ from geogs.io.sources.base import RawFrame
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.depth_files import DepthFile
 from geogs.io.sources.intrinsics import calibration_from_exif, find_calibration
+from geogs.types import MeasuredPose
 
 SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm"})
 """Names that are taken for images."""
@@ -33,6 +34,8 @@ class ImageFile:
     timestamp: float
     depth: DepthFile | None = None
     """What a depth sensor saw at that time."""
+    pose: MeasuredPose | None = None
+    """By another tracker."""
 
 
 class ImageList:
@@ -41,8 +44,16 @@ class ImageList:
     quarter_turns = 0
 
     def __init__(
-        self, kind: str, name: str, files: Sequence[ImageFile], calibration: Calibration | None
+        self,
+        kind: str,
+        name: str,
+        files: Sequence[ImageFile],
+        calibration: Calibration | None,
+        poses_by: str | None = None,
+        is_capture: bool = False,
     ) -> None:
+        """``poses_by`` and ``is_capture`` as of :class:`KnowsPoses`."""
+        self.poses_by, self.is_capture = poses_by, is_capture
         self.kind = kind
         self.name = name
         self.calibration = calibration
@@ -73,8 +84,9 @@ class ImageList:
             image = found.picture
             image = None if image is None else cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
             yield RawFrame(
-                str(file.path), file.timestamp, image, found.is_damaged, depth=file.depth
-            )
+                str(file.path), file.timestamp, image, found.is_damaged, depth=file.depth,
+                pose=file.pose, name=file.path.name,
+            )  # fmt: skip
 
 
 def read_image(path: Path) -> UInt8[np.ndarray, "h w 3"] | None:

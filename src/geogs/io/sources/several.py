@@ -103,6 +103,11 @@ class SeveralSources:
         return any(s.uses_depth for s in self._sources)
 
     @property
+    def uses_poses(self) -> bool:
+        """Whether frames of any come with poses of another tracker."""
+        return any(s.uses_poses for s in self._sources)
+
+    @property
     def shutter(self) -> Shutter:
         """By which rows are rectified."""
         return self._sources[0].shutter
@@ -111,6 +116,11 @@ class SeveralSources:
     def mask(self) -> Bool[np.ndarray, "h w"] | None:
         """Pixels of every frame that may show the scene; none where all do."""
         return self._sources[0].mask
+
+    @property
+    def black_is_hidden(self) -> bool:
+        """Whether pixels that are quite black show something else than the scene."""
+        return self._sources[0].black_is_hidden
 
     @property
     def is_live(self) -> bool:
@@ -189,7 +199,10 @@ class SeveralSources:
                 end = frame.timestamp + shift
                 places = tuple(s.place for s in self._sources[: n + 1])
                 self.place = JointPlace(index + 1, end, tuple(self.spans), places)
-                yield replace(frame, index=index, timestamp=end, follows_cut=starts and index > 0)
+                pose = None if frame.pose is None else replace(frame.pose, world=n)
+                yield replace(
+                    frame, index=index, timestamp=end, follows_cut=starts and index > 0, pose=pose
+                )
                 index += 1
 
 

@@ -9,7 +9,9 @@ from geogs.documents import expanded
 from geogs.errors import InputError
 from geogs.io.sources.address import LiveAddress, live_address
 from geogs.io.sources.base import Reader, Source
+from geogs.io.sources.captures import open_polycam, polycam_folders, with_transforms
 from geogs.io.sources.images import SUFFIXES, open_image_folder
+from geogs.io.sources.record3d import Record3dRecording, is_record3d
 from geogs.io.sources.replica import is_replica, open_replica
 from geogs.io.sources.ros.bag import Bag, is_bag
 from geogs.io.sources.scannet import is_scannet, open_scannet
@@ -46,7 +48,7 @@ def open_source(
         address = live_address(path)
         if address is not None:
             return Source(_live_reader(address, config), config)
-        return Source(_reader(expanded(path), config.topic), config)
+        return Source(_reader(expanded(path), config), config)
     if not path:
         raise InputError("Nothing to read; give a video or a folder of images.")
     if len(path) > 1 and any(live_address(one) is not None for one in path):
@@ -61,18 +63,21 @@ def _live_reader(address: LiveAddress, config: InputConfig) -> Reader:
     from geogs.io.sources.live.open import open_live  # loads OpenCV
 
     is_played = address.kind == "play"
-    played = _reader(expanded(address.target), config.topic) if is_played else None
+    played = _reader(expanded(address.target), config) if is_played else None
     return open_live(address, config.pipe, played)
 
 
-def _reader(path: Path, topic: str) -> Reader:
+def _reader(path: Path, config: InputConfig) -> Reader:
+    topic = config.topic
     try:
         if path.exists() and is_bag(path):
             return Bag(path, topic)
         if topic != "auto":
             raise InputError(f"{path} is no bag of ROS, which alone has topics; leave out --topic.")
+        if path.exists() and is_record3d(path):
+            return Record3dRecording(path)
         if path.is_dir():
-            return _folder_reader(path)
+            return _folder_reader(path, config.poses.strip().lower() == "prior")
         if not path.exists():
             raise InputError(f"{path} does not exist; give a video or a folder of images.")
         if path.suffix.lower() in SUFFIXES:
@@ -86,7 +91,7 @@ def _reader(path: Path, topic: str) -> Reader:
     return VideoFile(path)
 
 
-def _folder_reader(folder: Path) -> Reader:
+def _folder_reader(folder: Path, wants_poses: bool) -> Reader:
     if is_tum(folder):
         return open_tum(folder)
     if is_seven_scenes(folder):
@@ -95,8 +100,12 @@ def _folder_reader(folder: Path) -> Reader:
         return open_replica(folder)
     if is_scannet(folder):
         return open_scannet(folder)
-    if (folder / "rgb.mp4").is_file() and (folder / "depth").is_dir():
-        from geogs.io.sources.stray import StrayRecording  # loads FFmpeg
+    if (folder / "rgb.mp4").is_file():
+        from geogs.io.sources.stray import StrayRecording, is_stray  # loads FFmpeg
 
-        return StrayRecording(folder)
-    return open_image_folder(folder)
+        if is_stray(folder):
+            return StrayRecording(folder)
+    if polycam_folders(folder) is not None:
+        return open_polycam(folder)
+    images = open_image_folder(folder)
+    return with_transforms(images, folder) if wants_poses else images

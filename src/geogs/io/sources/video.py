@@ -63,7 +63,8 @@ class VideoFile:
                     last = self._time(frame, last)
                     if is_wanted:
                         image = frame.to_ndarray(format="rgb24")
-                        yield RawFrame(label, last, turn_upright(image, self.quarter_turns))
+                        upright = turn_upright(image, self.quarter_turns)
+                        yield RawFrame(label, last, upright, name=str(index))
                 elif is_wanted:
                     yield RawFrame(label, last or 0.0, None)
 

@@ -18,6 +18,7 @@ from geogs.tracking.calibration.keyframes import ViewGatherer
 from geogs.tracking.calibration.stretch import Report, Stretch
 from geogs.tracking.calibration.sureness import Estimate, estimate, joined
 from geogs.tracking.flow.masked import MaskedFlow
+from geogs.tracking.flow.painted import PaintedFlow
 from geogs.tracking.flow.select import build_operator
 from geogs.types import Frame
 
@@ -49,19 +50,23 @@ def self_calibrate(
     seed: int = 0,
     report: Report = lambda fraction: None,
     mask: Bool[np.ndarray, "h w"] | None = None,
+    black_is_hidden: bool = False,
 ) -> SelfCalibration:
     """Estimate the focal length, and k1 if ``config.radial``, of the camera that took ``frames``.
 
     Aspect and principal point of ``camera`` are believed, its focal length is only one of several
     to start from. Flow is measured by the operator without a network. Stretch after stretch of the
     video is asked until they are sure together. ``report`` is called with the fraction done; what
-    it raises passes through. Outside a ``mask`` nothing is matched.
+    it raises passes through. Outside a ``mask`` nothing is matched, nor what is quite black where
+    ``black_is_hidden``.
     """
     cv2.setRNGSeed(seed)
     grid = SampleGrid(camera, device)
     operator = build_operator(TrackingConfig(operator="classical"), grid)
     if mask is not None:
         operator = MaskedFlow(operator, grid, mask)
+    if black_is_hidden:
+        operator = PaintedFlow(operator, grid)
     gatherer = ViewGatherer(iter(frames), grid, operator, config.keyframe_flow)
     estimates: list[Estimate] = []
     failure = ""

@@ -1,0 +1,52 @@
+"""Motions between frames that something else than the images has measured, as terms on poses."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from geogs.geometry.lie import se3_adjoint, se3_inverse, se3_left_jacobian, se3_log
+
+KNEE = 3.0
+"""Deviations (of all six numbers together) at which a motion counts half as much. What lies far
+beyond pulls less the farther it is, so that motions that are wrong altogether are out-voted."""
+
+
+@dataclass(frozen=True)
+class MeasuredMotions:
+    """Motions between pairs of frames, in the lengths of the map; robust by Cauchy's loss.
+
+    They join poses alone, so that the elimination of depths does not know of them. All is best on
+    the CPU.
+    """
+
+    source: Int[Tensor, "m"]
+    target: Int[Tensor, "m"]
+    T_ts: Float[Tensor, "m 4 4"]
+    """From the camera of the source to that of the target, float64."""
+    information: Float[Tensor, "m 6"]
+    """Inverse variances of translation and rotation (radians), in the target's axes."""
+
+    def residual(self, T_cw: Float[Tensor, "n 4 4"]) -> Float[Tensor, "m 6"]:
+        """What is between the motions by the poses and the measured: Log(T_t T_s^-1 T_ts^-1)."""
+        present = T_cw[self.target] @ se3_inverse(T_cw[self.source])
+        return se3_log(present @ se3_inverse(self.T_ts))
+
+    def trust(self, residual: Float[Tensor, "m 6"]) -> Float[Tensor, "m"]:
+        """Cauchy's weight 1 / (1 + chi^2 / KNEE^2) of each motion."""
+        return 1 / (1 + (self.information * residual.square()).sum(-1) / KNEE**2)
+
+    def equations(
+        self, T_cw: Float[Tensor, "n 4 4"]
+    ) -> tuple[Float[Tensor, "m 6 6"], Float[Tensor, "m 6 6"], Float[Tensor, "m 6"]]:
+        """Adjoints of the present motions; Hessian and gradient of a step of each.
+
+        A step ``xi_rel = xi_t - Ad(T_ts) xi_s`` of the motion changes the residual e by
+        ``Jl(e)^-1 xi_rel``.
+        """
+        present = T_cw[self.target] @ se3_inverse(T_cw[self.source])
+        e = self.residual(T_cw)
+        J = torch.linalg.inv(se3_left_jacobian(e))
+        JW = J.mT * (self.trust(e)[:, None] * self.information)[:, None]
+        return se3_adjoint(present), JW @ J, -(JW @ e[..., None])[..., 0]

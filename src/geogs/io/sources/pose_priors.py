@@ -1,0 +1,131 @@
+"""Poses beside the images that another tracker said: which a source has, and which it uses."""
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+
+from geogs.documents import expanded
+from geogs.errors import InputError
+from geogs.geometry.lie import se3_inverse, so3_exp, so3_log
+from geogs.io.poses import read_tum_trajectory
+from geogs.types import MeasuredPose, Trajectory
+
+LONGEST_GAP = 0.25
+"""Seconds between two poses beyond which none is interpolated between them."""
+NEAR = 0.02
+"""Seconds before the first and after the last pose within which that is taken."""
+KEYWORDS = ("none", "auto", "prior")
+"""What ``input.poses`` may be beside a file."""
+
+OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+"""Camera axes x right, y down, z forward from x right, y up, z backward; it is its own inverse."""
+
+
+@runtime_checkable
+class KnowsPoses(Protocol):
+    """A reader whose images come with poses that are no truth."""
+
+    poses_by: str | None
+    """Who said them; none where there are none."""
+    is_capture: bool
+    """Whether they are plainly those of an app that tracked its camera, in metres."""
+
+
+@dataclass(frozen=True)
+class TimedPoses:
+    """Poses of a file by time."""
+
+    trajectory: Trajectory
+
+    @staticmethod
+    def read(path: Path) -> "TimedPoses":
+        """Raises InputError where the file is not one of rows ``t tx ty tz qx qy qz qw``."""
+        return TimedPoses(read_tum_trajectory(path))
+
+    def at(self, seconds: float) -> MeasuredPose | None:
+        """The pose at a time, interpolated between the two around; none where they are far."""
+        times, T_wc = self.trajectory.timestamps, self.trajectory.T_wc
+        after = int(np.searchsorted(times, seconds))
+        if after == 0 or after == len(times):
+            end = min(after, len(times) - 1)
+            is_near = abs(times[end] - seconds) <= NEAR
+            return measured_pose(T_wc[end]) if is_near else None
+        before, gap = after - 1, times[after] - times[after - 1]
+        if gap > LONGEST_GAP:
+            return None
+        a, b = (torch.from_numpy(T_wc[k]) for k in (before, after))
+        share = (seconds - times[before]) / gap if gap > 0 else 0.0
+        T = a.clone()
+        T[:3, :3] = a[:3, :3] @ so3_exp(share * so3_log(a[:3, :3].mT @ b[:3, :3]))
+        T[:3, 3] = torch.lerp(a[:3, 3], b[:3, 3], share)
+        return measured_pose(T.numpy())
+
+
+def measured_pose(T_wc: Float64[np.ndarray, "4 4"]) -> MeasuredPose:
+    """A pose from camera to world, OpenCV axes, metres."""
+    return MeasuredPose(se3_inverse(torch.from_numpy(np.ascontiguousarray(T_wc))))
+
+
+def rigid(T_wc: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "4 4"] | None:
+    """The pose with the nearest rotation; none where it is no rigid motion."""
+    R = T_wc[:3, :3]
+    if not np.isfinite(T_wc).all() or np.abs(R @ R.T - np.eye(3)).max() > 0.02:
+        return None
+    u, _, vt = np.linalg.svd(R)
+    if np.linalg.det(u @ vt) < 0:
+        return None
+    out = np.eye(4)
+    out[:3, :3], out[:3, 3] = u @ vt, T_wc[:3, 3]
+    return out
+
+
+def turned_upright(
+    T_wc: Float64[np.ndarray, "4 4"], quarter_turns: int
+) -> Float64[np.ndarray, "4 4"]:
+    """The pose of the camera whose images were turned clockwise by quarter turns."""
+    angle = math.radians(90 * quarter_turns)
+    c, s = round(math.cos(angle)), round(math.sin(angle))
+    turned = np.eye(4)
+    turned[:2, :2] = [[c, s], [-s, c]]  # upright axes to stored ones
+    return T_wc @ turned
+
+
+@dataclass(frozen=True)
+class ChosenPoses:
+    """What a source does with the poses beside its images."""
+
+    is_used: bool = False
+    file: TimedPoses | None = None
+    """In place of the reader's."""
+
+    def of(self, seconds: float, own: MeasuredPose | None) -> MeasuredPose | None:
+        """The pose of an image that the reader has one of, or none."""
+        if not self.is_used:
+            return None
+        return own if self.file is None else self.file.at(seconds)
+
+
+def chosen_poses(asked: str, reader: object, name: str) -> ChosenPoses:
+    """By what ``input.poses`` asks of a reader.
+
+    Raises:
+        InputError: there are none, or the file cannot be read.
+    """
+    word = asked.strip().lower()
+    if word == "none":
+        return ChosenPoses()
+    if word not in KEYWORDS:
+        return ChosenPoses(True, TimedPoses.read(expanded(asked)))
+    has_poses = isinstance(reader, KnowsPoses) and reader.poses_by is not None
+    if word == "prior" and not has_poses:
+        raise InputError(
+            f"{name} has no poses of another tracker beside its images that can be read here; "
+            "name their file (rows t tx ty tz qx qy qz qw), or leave out --poses."
+        )
+    is_wanted = word == "prior" or (isinstance(reader, KnowsPoses) and reader.is_capture)
+    return ChosenPoses(has_poses and is_wanted)

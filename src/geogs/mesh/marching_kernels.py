@@ -1,0 +1,95 @@
+"""The loops of marching cubes over all cells, in numba."""
+
+import numpy as np
+from numba import njit
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _case(distance, x, y, z):
+    """Which corners of the cell below an upper corner lie inside, as bits."""
+    case = 0
+    for c in range(8):
+        if distance[x - 1 + (c & 1), y - 1 + (c >> 1 & 1), z - 1 + (c >> 2 & 1)] < 0:
+            case |= 1 << c
+    return case
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def count_triangles(distance, seen, counts):
+    """Triangles of all cells that were seen."""
+    total = 0
+    for x in range(1, seen.shape[0]):
+        for y in range(1, seen.shape[1]):
+            for z in range(1, seen.shape[2]):
+                if seen[x, y, z]:
+                    total += counts[_case(distance, x, y, z)]
+    return total
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _touches(seen, x, y, z, axis):
+    """Whether a cell that was seen has the edge from a voxel along an axis."""
+    for i in range(2):
+        for j in range(2):
+            a = x + (1 if axis == 0 else i)
+            b = y + (1 if axis == 1 else (i if axis == 0 else j))
+            c = z + (1 if axis == 2 else j)
+            if (
+                0 < a < seen.shape[0]
+                and 0 < b < seen.shape[1]
+                and 0 < c < seen.shape[2]
+                and seen[a, b, c]
+            ):
+                return True
+    return False
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def find_vertices(distance, seen, number):
+    """Position and axis of the vertices; ``number`` gets the place of that of each edge."""
+    found = 0
+    room = 1024
+    vertices = np.empty((room, 4), np.float64)
+    nx, ny, nz = distance.shape
+    for x in range(nx):
+        for y in range(ny):
+            for z in range(nz):
+                here = distance[x, y, z]
+                for axis in range(3):
+                    a, b, c = x + (axis == 0), y + (axis == 1), z + (axis == 2)
+                    if a >= nx or b >= ny or c >= nz:
+                        continue
+                    there = distance[a, b, c]
+                    if (here < 0) == (there < 0) or not _touches(seen, x, y, z, axis):
+                        continue
+                    if found == room:
+                        room *= 2
+                        larger = np.empty((room, 4), np.float64)
+                        larger[:found] = vertices
+                        vertices = larger
+                    vertices[found, 0], vertices[found, 1], vertices[found, 2] = x, y, z
+                    vertices[found, axis] += here / (here - there)
+                    vertices[found, 3] = axis
+                    number[x, y, z, axis] = found
+                    found += 1
+    return vertices[:found]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def write_triangles(distance, seen, counts, table, edges, corners, number, faces):
+    """Fill ``faces`` with the vertices of the triangles of all cells that were seen."""
+    at = 0
+    for x in range(1, seen.shape[0]):
+        for y in range(1, seen.shape[1]):
+            for z in range(1, seen.shape[2]):
+                if not seen[x, y, z]:
+                    continue
+                case = _case(distance, x, y, z)
+                for n in range(counts[case]):
+                    for k in range(3):
+                        corner, axis = edges[table[case, n, k]]
+                        a = x - 1 + corners[corner, 0]
+                        b = y - 1 + corners[corner, 1]
+                        c = z - 1 + corners[corner, 2]
+                        faces[at, k] = number[a, b, c, axis]
+                    at += 1

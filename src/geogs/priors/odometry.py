@@ -1,0 +1,82 @@
+"""Motions by another tracker: their noise, and the scale by which those of the images fit them."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from geogs.config import OdometryConfig
+from geogs.geometry.lie import se3_inverse, so3_log
+
+FIT = 16.8
+"""Squared deviations (six numbers) up to which two motions fit: 99 % of those that do."""
+PROPOSALS = 256
+"""Scales that are tried at most, evenly chosen along the path."""
+ROUNDS = 10
+"""Of reweighting."""
+
+
+@dataclass(frozen=True)
+class ScaleVote:
+    """What pairs of motions, of the images and measured, say of the scale between them."""
+
+    scale: float
+    """Metres to the unit of the images' motions."""
+    deviation: float
+    """Of the scale, as a part of it; infinite where nothing tells."""
+    fits: Bool[Tensor, "m"]
+    """Which motions fit at that scale."""
+
+    @property
+    def share(self) -> float:
+        """Of the motions, those that fit."""
+        return float(self.fits.double().mean()) if len(self.fits) else 0.0
+
+
+def information_of(motion: Float[Tensor, "m 4 4"], config: OdometryConfig) -> Float[Tensor, "m 6"]:
+    """Inverse variances of translation (metres) and rotation (radians) of measured motions."""
+    distance = motion[:, :3, 3].norm(dim=1, keepdim=True)
+    place = config.deviation**2 + (config.drift * distance) ** 2
+    turn = math.radians(1) ** 2 * (config.rotation**2 + (config.turn * distance) ** 2)
+    return torch.cat([1 / place.expand(-1, 3), 1 / turn.expand(-1, 3)], 1)
+
+
+def vote_on_scale(
+    seen: Float[Tensor, "m 4 4"],
+    measured: Float[Tensor, "m 4 4"],
+    config: OdometryConfig,
+) -> ScaleVote:
+    """The scale at which most motions seen in the images fit those that were measured in metres.
+
+    Each pair proposes the ratio of its lengths; the proposal with the highest sum of Cauchy's
+    weights is refined by reweighted least squares. Rotations have to fit, too.
+    """
+    information = information_of(measured, config)
+    turned = so3_log(measured[:, :3, :3].mT @ seen[:, :3, :3])
+    turn = (information[:, 3:] * turned.square()).sum(1)
+    # Places of the targets in the sources: how the targets are turned does not count twice.
+    t, t_measured = se3_inverse(seen)[:, :3, 3], se3_inverse(measured)[:, :3, 3]
+    precision = information[:, 0]
+
+    def misfit(scale: Float[Tensor, "*s"]) -> Float[Tensor, "*s m"]:
+        away = scale[..., None, None] * t - t_measured
+        return turn + precision * away.square().sum(-1)
+
+    lengths = t.norm(dim=1)
+    moved = lengths > 0
+    proposals = t_measured.norm(dim=1)[moved] / lengths[moved]
+    proposals = proposals[:: 1 + len(proposals) // PROPOSALS]
+    if not len(proposals):
+        return ScaleVote(1.0, math.inf, torch.zeros(len(t), dtype=torch.bool))
+    support = (1 / (1 + misfit(proposals) / FIT)).sum(1)
+    scale = proposals[support.argmax()]
+    weight = precision
+    for _ in range(ROUNDS):
+        weight = precision / (1 + misfit(scale) / FIT) ** 2
+        scale = (weight * (t * t_measured).sum(1)).sum() / (weight * lengths.square()).sum()
+    fits = misfit(scale) <= FIT
+    told = float((precision * lengths.square())[fits].sum())
+    deviation = 1 / (float(scale) * math.sqrt(told)) if told > 0 and scale > 0 else math.inf
+    return ScaleVote(float(scale), deviation, fits)

@@ -1,0 +1,144 @@
+"""Poses of another tracker in ours: whether they fit, at which scale, and what they say of motion.
+
+Only motions between neighbouring keyframes are used, so that a world of its own and a drift do no
+harm. Until enough of them fit those of the images they are not used at all.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import torch
+
+from geogs.bundle.measured_motions import MeasuredMotions
+from geogs.config import OdometryConfig
+from geogs.geometry.lie import se3_inverse
+from geogs.keyframes.keyframe import Keyframe
+from geogs.keyframes.store import Segment
+from geogs.priors.odometry import ScaleVote, information_of, vote_on_scale
+from geogs.types import MeasuredPose
+
+LEAST = 5
+"""Motions that must fit before any is used."""
+SURE = 0.1
+"""Relative deviation of the scale up to which motions are used ..."""
+SETTLED = 0.003
+"""... and up to which it is asked again with every keyframe."""
+REACH = 200
+"""Latest motions that are asked while the camera is tracked."""
+
+
+@dataclass(frozen=True)
+class OdometryState:
+    """What a checkpoint holds of it; the fields are those of :class:`Odometry`."""
+
+    scale: float | None
+    deviation: float
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """How far measured motions fit those of the images."""
+
+    motions: int
+    """That were measured between neighbouring keyframes."""
+    share: float
+    """Of these, those that fit within their deviations."""
+    deviation: float
+    """Of the scale that they tell, as a part of it; infinite where they tell none."""
+    used: bool
+    """Whether they took part."""
+
+
+class Odometry:
+    """What another tracker says of the motion between the keyframes of a segment."""
+
+    def __init__(self, keyframes: Segment, config: OdometryConfig) -> None:
+        self.keyframes = keyframes
+        self.config = config
+        self.scale: float | None = None
+        """Metres to the unit of the map; none as long as the measured motions do not fit."""
+        self.deviation = float("inf")
+        """Of the scale, as a part of it."""
+
+    def state(self) -> OdometryState:
+        """What a checkpoint holds."""
+        return OdometryState(self.scale, self.deviation)
+
+    def load(self, state: OdometryState) -> None:
+        """Go on where another was."""
+        self.scale, self.deviation = state.scale, state.deviation
+
+    def look(self) -> None:
+        """Find the scale, if it is not settled, by the latest keyframes."""
+        if self.scale is None or self.deviation > SETTLED:
+            self._take(self._vote(self.keyframes.ids[-REACH:]))
+
+    def look_at_all(self) -> None:
+        """Find the scale by all keyframes."""
+        self._take(self._vote(self.keyframes.ids))
+
+    def agreement(self) -> Agreement:
+        """How far all motions fit, at the present poses."""
+        vote = self._vote(self.keyframes.ids)
+        return Agreement(len(vote.fits), vote.share, vote.deviation, self.scale is not None)
+
+    def between(self, ids: Sequence[int]) -> MeasuredMotions | None:
+        """Motions from each of some keyframes to the next, in the unit of the map.
+
+        Sources and targets are places among the ids. None where they are not to be used.
+        """
+        if self.scale is None:
+            return None
+        known = [(n, self.keyframes[id]) for n, id in enumerate(ids)]
+        steps = _steps([(n, k) for n, k in known if k.pose is not None])
+        if not steps:
+            return None
+        motion = torch.stack([_measured(a, b) for (_, a), (_, b) in steps])
+        information = information_of(motion, self.config)
+        information[:, :3] *= self.scale**2
+        motion[:, :3, 3] /= self.scale
+        source, target = (torch.tensor([pair[k][0] for pair in steps]) for k in (0, 1))
+        return MeasuredMotions(source, target, motion, information)
+
+    def since(self, keyframe: Keyframe, pose: MeasuredPose | None) -> torch.Tensor | None:
+        """Motion from a keyframe to where the camera is said to be, in the unit of the map."""
+        before = keyframe.pose
+        if self.scale is None or pose is None or before is None or before.world != pose.world:
+            return None
+        motion = pose.T_cw @ se3_inverse(before.T_cw)
+        motion[:3, 3] /= self.scale
+        return motion
+
+    def _vote(self, ids: Sequence[int]) -> ScaleVote:
+        known = [(n, self.keyframes[id]) for n, id in enumerate(ids)]
+        steps = _steps([(n, k) for n, k in known if k.pose is not None])
+        empty = torch.zeros(0, 4, 4, dtype=torch.float64)
+        seen = [b.T_cw @ se3_inverse(a.T_cw) for (_, a), (_, b) in steps]
+        measured = [_measured(a, b) for (_, a), (_, b) in steps]
+        if not steps:
+            return vote_on_scale(empty, empty, self.config)
+        return vote_on_scale(torch.stack(seen), torch.stack(measured), self.config)
+
+    def _take(self, vote: ScaleVote) -> None:
+        enough = int(vote.fits.sum()) >= LEAST and vote.share >= self.config.agreement
+        if enough and vote.deviation <= SURE:
+            self.scale, self.deviation = vote.scale, vote.deviation
+
+
+def _steps(
+    known: Sequence[tuple[int, Keyframe]],
+) -> list[tuple[tuple[int, Keyframe], tuple[int, Keyframe]]]:
+    """Neighbours whose poses are of one world."""
+    return [(a, b) for a, b in pairwise(known) if _world(a[1]) == _world(b[1])]
+
+
+def _world(keyframe: Keyframe) -> int | None:
+    return None if keyframe.pose is None else keyframe.pose.world
+
+
+def _measured(a: Keyframe, b: Keyframe) -> torch.Tensor:
+    """The motion from a keyframe to another, metres."""
+    assert a.pose is not None
+    assert b.pose is not None
+    return b.pose.T_cw @ se3_inverse(a.pose.T_cw)
