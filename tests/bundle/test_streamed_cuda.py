@@ -10,6 +10,7 @@ from bundle_scenes import disturbed, scene
 from cuda_emulator import use_emulator
 from geogs.bundle.base import BundleOptions
 from geogs.bundle.dense import DenseBundle
+from geogs.bundle.measured_motions import MeasuredMotions
 from geogs.bundle.problem import BundleProblem, MeasuredDepths, StreamedProblem
 from geogs.keyframes.grid import SampleGrid
 
@@ -35,7 +36,7 @@ def streamed(p: BundleProblem, device: torch.device) -> StreamedProblem:
     return StreamedProblem(
         p.T_cw, p.inverse_depth.to(device), p.source, p.target,
         lambda e: (p.pixels[e].to(device), p.weight[e].to(device)), p.free_pose, p.free_depth,
-        None if p.damping is None else p.damping.to(device), measured,
+        None if p.damping is None else p.damping.to(device), measured, p.motions,
     )  # fmt: skip
 
 
@@ -71,6 +72,23 @@ def test_steps_are_those_of_the_dense_solver(device, edges, monkeypatch):
     ratio = fast.information.cpu()[known] / slow.information[known]
     assert float((ratio - 1).abs().median()) < 1e-3
     torch.testing.assert_close(fast.residual.cpu(), slow.residual, rtol=1e-3, atol=1e-4)
+
+
+def test_measured_motions_count_as_in_the_dense_solver(device):
+    grid, truth = scene(frames=4)
+    problem = disturbed(truth, 0.02, 0.05)
+    ends = torch.tensor([0, 1, 2]), torch.tensor([1, 2, 3])
+    motion = truth.T_cw[ends[1]] @ torch.linalg.inv(truth.T_cw[ends[0]])
+    motion[:, 0, 3] += 0.002
+    motions = MeasuredMotions(*ends, motion, torch.full((3, 6), 1e6, dtype=torch.float64))
+    options = BundleOptions(iterations=2, huber=0.5)
+    solver = cuda_streamed.CudaStreamedBundle(SampleGrid(grid.camera, device))
+    slow, without = (
+        DenseBundle(grid).solve(replace(problem, motions=m), options) for m in (motions, None)
+    )
+    fast = solver.solve(streamed(replace(problem, motions=motions), device), options)
+    assert float((slow.T_cw - without.T_cw).abs().max()) > 3e-4
+    torch.testing.assert_close(fast.T_cw, slow.T_cw, rtol=0, atol=2e-5)
 
 
 def test_steps_that_are_not_finite_are_refused(device):

@@ -95,6 +95,15 @@ class StreamedProblem:
             self.free_pose, self.free_depth, self.damping, self.measured, self.motions,
         )  # fmt: skip
 
+    def joined(self) -> tuple[Int[Tensor, "e"], Int[Tensor, "e"]]:
+        """Sources and targets of all that joins poses, sorted by source."""
+        if self.motions is None:
+            return self.source, self.target
+        source = torch.cat([self.source, self.motions.source])
+        target = torch.cat([self.target, self.motions.target])
+        order = source.argsort(stable=True)
+        return source[order], target[order]
+
 
 @dataclass(frozen=True)
 class MotionProblem:

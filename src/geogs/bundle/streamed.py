@@ -10,7 +10,7 @@ from dataclasses import replace
 from typing import TypeVar
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from geogs.bundle.base import BundleOptions, BundleResult
@@ -48,7 +48,7 @@ class StreamedBundle:
         information = known_before(problem)
         residual = d.new_zeros(len(problem.source))
         finite = True
-        system = SparseCameraSystem(*_joined(problem), problem.free_pose)
+        system = SparseCameraSystem(*problem.joined(), problem.free_pose)
         chunks = source_chunks(problem.source, options.chunk)
         for _ in range(options.iterations):
             system.clear()
@@ -123,16 +123,6 @@ class StreamedBundle:
             for frame, step in steps:
                 delta[frame] = step
         return delta
-
-
-def _joined(problem: StreamedProblem) -> tuple[Int[Tensor, "e"], Int[Tensor, "e"]]:
-    """Sources and targets of all that joins poses, sorted by source."""
-    if problem.motions is None:
-        return problem.source, problem.target
-    source = torch.cat([problem.source, problem.motions.source])
-    target = torch.cat([problem.target, problem.motions.target])
-    order = source.argsort(stable=True)
-    return source[order], target[order]
 
 
 def _few_at_a_time(work: Callable[[slice], R], chunks: Sequence[slice]) -> Iterator[R]:

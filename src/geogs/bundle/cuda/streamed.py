@@ -18,6 +18,7 @@ from torch import Tensor
 from geogs.bundle.base import BundleOptions, BundleResult
 from geogs.bundle.camera_system import SparseCameraSystem
 from geogs.bundle.cuda.dense import block_size, joined_edges
+from geogs.bundle.linearise import motion_stars
 from geogs.bundle.problem import MEASURED_HUBER, StreamedProblem, known_before, source_chunks
 from geogs.geometry.lie import move
 from geogs.gpu.kernels import kernels_for
@@ -88,7 +89,7 @@ class CudaStreamedBundle:
         options = options or BundleOptions()
         T, d = problem.T_cw, problem.inverse_depth
         information, residual = known_before(problem), d.new_zeros(len(problem.source))
-        system = SparseCameraSystem(problem.source, problem.target, problem.free_pose)
+        system = SparseCameraSystem(*problem.joined(), problem.free_pose)
         edges = source_chunks(problem.source, EDGES_TOGETHER)
         chunks = [_chunk(problem, part, system, d.device) for part in edges]
         finite = True
@@ -102,6 +103,7 @@ class CudaStreamedBundle:
                 information[chunk.sources.to(d.device)] = linear.information
                 residual[chunk.edges] = linear.residual
             system.add_sums(blocks.cpu().reshape(-1, 6, 6), pull.cpu())
+            system.add(motion_stars(problem.motions, T))
             xi = system.solve(options.damping)
             delta = self._depth_steps(problem, chunks, T, d, xi, options)
             if not bool(torch.isfinite(xi).all() and torch.isfinite(delta).all()):
