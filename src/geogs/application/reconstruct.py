@@ -2,7 +2,6 @@
 
 import tempfile
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Literal
 
@@ -14,7 +13,9 @@ from geogs.application.forecast import reconstruction_forecast
 from geogs.application.former import free_folder
 from geogs.application.interrupt import Stop
 from geogs.application.machine import compiled_kernels, full_memory_in_a_sentence
+from geogs.application.output_forecast import output_seconds
 from geogs.application.photographs import open_photographs
+from geogs.application.posed_views import PosedViews, Report
 from geogs.application.progress import RunProgress
 from geogs.application.reconstruct_checkpoint import ReconstructCheckpoint, fingerprint
 from geogs.application.result import Result, Written
@@ -35,9 +36,6 @@ from geogs.threads import on_one_torch_thread
 
 LEAST_BUDGET = 1.0
 """Seconds that are left of a budget at least, when reading and checking have used it up."""
-
-Report = Callable[[str, float], None]
-"""Called with the name of a stage and its finished fraction in [0, 1]."""
 
 
 @on_one_torch_thread
@@ -80,7 +78,7 @@ def reconstruct(
         _check(source, progress)
     with full_memory_in_a_sentence():
         scene = Reconstruction(source.camera, config, str(used), clock.left())
-        _complete(scene, source, None, progress.stage)
+        _complete(scene, source, None, progress.stage, budget is not None)
     return Result(scene, source, progress=progress)
 
 
@@ -160,13 +158,15 @@ def _to_folder(
         def report(stage: str, fraction: float) -> None:
             progress.stage(stage, fraction)
             if stage == "growing":
-                progress.write(_too_few_depths(scene))
+                progress.write(_chosen_views(scene))
+                if settings.budget is not None:
+                    scene.output_seconds = output_seconds(scene)
             snapshots.take(scene)
             checkpoint.report(stage, scene)
             stop.check()
 
         try:
-            _complete(scene, source, resumed, report)
+            _complete(scene, source, resumed, report, settings.budget is not None)
             finished, kept = True, False
         except KeyboardInterrupt:
             if not (stop.requested and len(scene.snapshot())):
@@ -194,25 +194,31 @@ def _complete(
     source: PosedSource,
     resumed: ReconstructionState | None,
     report: Report,
+    budgeted: bool,
 ) -> None:
     """Everything up to the trained map; what ``report`` raises ends it early."""
-    for image in source:
-        scene.add(image.image, image.T_cw, image.mask, image.timestamp)
-        report("reading", scene.frames / source.length)
+    views = PosedViews(scene, source, report)
     if resumed is not None:
+        views.give_these(resumed.images)
         scene.resume(resumed, report)
+        return
+    points = views.first_look()
+    views.choose(points)
+    if budgeted:
+        views.give(scene.config.search.first_batch)
+        scene.finish(points, report, views.give)
     else:
-        scene.finish(None if source.points is None else source.points.positions, report)
+        views.give()
+        scene.finish(points, report)
 
 
-def _too_few_depths(scene: Reconstruction) -> str:
-    """What to say where the time did not last for the depths of all images; else nothing."""
+def _chosen_views(scene: Reconstruction) -> str:
+    """What to say where not all images make the map; else nothing."""
     if scene.with_depth == scene.frames:
         return ""
     return (
-        f"There is time for the depths of {scene.with_depth} of {scene.frames} images; the others "
-        "only help to find them. A longer --budget or a smaller --mapping.render-long-edge takes "
-        "them all."
+        f"The map is made of {scene.with_depth} of {scene.frames} images, which show the scene "
+        "best; a longer --budget or a larger --search.most-views takes more."
     )
 
 

@@ -301,8 +301,10 @@ class Mapper:
         self._carve(self._mapped_around(view, _VOTERS))
 
     @torch.no_grad()
-    def renders(self, disks: MapSnapshot | None = None) -> Sequence[RenderedKeyframe]:
-        """The map, or other disks in its frame, seen from every mapped keyframe.
+    def renders(
+        self, disks: MapSnapshot | None = None, of: Sequence[int] | None = None
+    ) -> Sequence[RenderedKeyframe]:
+        """The map, or other disks in its frame, seen from every mapped keyframe, or from some.
 
         Rendered now, from a snapshot, so that disks that were written show the same; of a long
         video most are read from a temporary file when they are asked for.
@@ -313,7 +315,7 @@ class Mapper:
         parameters = DiskParameters.of(self.map.snapshot() if disks is None else disks)
         camera, archive, stored = self.cameras.render, Archive(), []
         rules = SurfaceRules.of(self.config)
-        for view in (self.views[i] for i in self.mapped):
+        for view in (self.views[i] for i in (self.mapped if of is None else of)):
             render = rendered_keyframe(view, parameters, camera, rules)
             stored.append(stored_render(render, view.keyframe.picture.archived, archive))
         return OnDemand(stored, StoredRender.load)
@@ -323,12 +325,13 @@ class Mapper:
         rules = SurfaceRules.of(self.config)
         return MapRenderer(self.map.snapshot(), frame, self.cameras.render, rules)
 
-    def depth_maps(self) -> Sequence[RenderedKeyframe]:
-        """The dense depths of the mapped keyframes, weighted by confidence: no disk is in them.
+    def depth_maps(self, of: Sequence[int] | None = None) -> Sequence[RenderedKeyframe]:
+        """The dense depths of the mapped keyframes, or of some, weighted by confidence: no disk is
+        in them.
 
         Each is read when it is asked for, as it is at that time.
         """
-        views = [self.views[i] for i in self.mapped]
+        views = [self.views[i] for i in (self.mapped if of is None else of)]
         return OnDemand(views, partial(searched_keyframe, camera=self.cameras.render))
 
     @property
