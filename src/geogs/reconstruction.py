@@ -21,7 +21,9 @@ from geogs.mapping.map_frame import MapFrame
 from geogs.mapping.mapper import Mapper
 from geogs.mapping.rendered import MapRenderer
 from geogs.mapping.state import MapperState
+from geogs.mapping.time_shares import ViewCost, affordable_views
 from geogs.mapping.training.base import TrainingPlace
+from geogs.mapping.window import views_around
 from geogs.on_demand import OnDemand
 from geogs.stopwatch import Stopwatch
 from geogs.threads import on_one_torch_thread
@@ -29,8 +31,22 @@ from geogs.types import MapSnapshot, RenderedKeyframe, Trajectory
 
 Progress = Callable[[str, float], None]
 """Called with the name of a stage and its finished fraction in [0, 1]."""
-More = Callable[[int], None]
-"""Adds at most so many further images."""
+More = Callable[[Callable[[], int]], None]
+"""Adds at most as many further images as what it is given says, once it is asked."""
+
+
+@dataclass(frozen=True)
+class OutputCost:
+    """What the mesh and the files are going to take, seconds."""
+
+    once: float
+    """However many images make the map."""
+    a_view: float
+    """For each of them."""
+
+    def of(self, views: int) -> float:
+        """Of so many images."""
+        return self.once + views * self.a_view
 
 
 def _silent(stage: str, fraction: float) -> None:
@@ -39,8 +55,6 @@ def _silent(stage: str, fraction: float) -> None:
 
 # Steps after which their time tells that of the next ones.
 _TELLING_STEPS = 100
-# What checking depths and growing disks take, as a part of one search of the depths.
-_GROWING = 0.4
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,13 +102,15 @@ class Reconstruction:
         self._random = np.random.default_rng(self.config.seed)
         self._begin: float | None = None
         self._deadline = None if budget is None else time.perf_counter() + budget
-        self.output_seconds = self.config.search.output_share * (budget or 0.0)
-        """What the mesh and the files are going to take: a part of the budget until it is known."""
+        self.output_cost = OutputCost(self.config.search.output_share * (budget or 0.0), 0.0)
+        """What comes after the training: a part of the budget until somebody knows better."""
 
     @property
     def _end(self) -> float | None:
         """When training must have ended for what comes after it."""
-        return None if self._deadline is None else self._deadline - self.output_seconds
+        if self._deadline is None:
+            return None
+        return self._deadline - self.output_cost.of(self.with_depth or self.views)
 
     @property
     def frames(self) -> int:
@@ -151,8 +167,8 @@ class Reconstruction:
         """Depths of all images, the map from them, training; ``points`` of the scene help.
 
         An exception raised by ``progress`` ends it early; the depths found by then make the map.
-        Where there is a budget, ``more`` is called once it is known how many further images the
-        time lasts for, and adds them.
+        Where there is a budget, ``more`` is called when some depths have been searched. It may set
+        ``output_cost``, then ask for how many further images the time lasts, and add them.
 
         Raises:
             InputError: too few images, or no two of them show the same thing from two places.
@@ -247,11 +263,15 @@ class Reconstruction:
         chosen = self._in_order(self.mapper.mapped if of is None else of)
         return self._in_world(self.mapper.depth_maps(chosen))
 
+    def image_of(self, keyframe_id: int) -> int:
+        """Place in its set of the image of a keyframe."""
+        return self._images[keyframe_id]
+
     def neighbouring(self, count: int) -> list[int]:
-        """Ids of at most so many mapped keyframes that show the same place."""
-        mapper = self.mapper
-        first = max(mapper.mapped, key=lambda i: len(mapper.views[i].partners))
-        return [first, *mapper.views[first].partners][:count]
+        """Ids of at most so many mapped keyframes that were taken near each other."""
+        mapped = [self.mapper.views[i] for i in self.mapper.mapped]
+        around = views_around(mapped[0], mapped, count)
+        return [view.id for view in around]
 
     def _in_world(self, renders: Sequence[RenderedKeyframe]) -> Sequence[RenderedKeyframe]:
         frame, poses = self._frame, self._poses
@@ -290,7 +310,8 @@ class Reconstruction:
             progress("depth", fraction)
 
         if more is not None and self._deadline is not None:
-            more(max(self._affordable_views() - self.views, 0))
+            searched, seconds = self._try_depths()
+            more(lambda: self._further_views(searched, seconds))
             self._place_keyframes()
             new = [v for v in mapper.views.values() if v.search is None]
             known.expect_depths(new, points, self.camera, search.margin)
@@ -311,31 +332,33 @@ class Reconstruction:
             search_depths(mapper, mapper.keyframe_ids, lambda f: report(share + share * f))
         report(1.0)
 
-    def _affordable_views(self) -> int:
-        """How many images time lasts for, by what adding them took and the search of some depths.
+    def _try_depths(self) -> tuple[int, float]:
+        """Search some depths to see how long that takes: how many, and seconds for each.
 
-        Of two groups, as the first one makes ready what is needed but once.
+        In two groups, as the first one makes ready what is needed but once.
         """
-        group, search, ids = group_size(), self.config.search, self.mapper.keyframe_ids
+        group, ids = group_size(), self.mapper.keyframe_ids
         groups = [g for g in (ids[:group], ids[group : 2 * group]) if g]
         for some in groups:
             begin = time.perf_counter()
             self.mapper.search_depths(some)
             float(self.mapper.views[some[-1]].typical_depth)  # waits for a GPU
-        now, end = time.perf_counter(), self._end
-        assert end is not None
-        searched = (now - begin) / len(groups[-1])
-        rounds = _GROWING + (2.0 if search.repeat else 1.0)
-        done = sum(map(len, groups))
-        more = (search.depth_share * (end - now) - (rounds - 1.0) * searched * done) / (
-            self._seconds_to_add() + rounds * searched
-        )
-        return done + max(int(more), 0)
+        seconds = (time.perf_counter() - begin) / len(groups[-1])
+        return sum(map(len, groups)), seconds
 
-    def _seconds_to_add(self) -> float:
-        """What reading and adding an image took."""
-        times = self._added
-        return (times[-1] - times[0]) / max(len(times) - 1, 1)
+    def _further_views(self, searched: int, seconds: float) -> int:
+        """How many more images time lasts for, of which some have been searched already."""
+        search, times, output = self.config.search, self._added, self.output_cost
+        assert self._deadline is not None
+        reading = (times[-1] - times[0]) / max(len(times) - 1, 1)
+        count = affordable_views(
+            self._deadline - time.perf_counter() - output.once,
+            ViewCost(reading, seconds, output.a_view),
+            search,
+            searched,
+            self.views,
+        )
+        return max(count - self.views, 0)
 
     def _train(self, progress: Progress, goes_on: bool = False) -> None:
         with self.stopwatch("training"):

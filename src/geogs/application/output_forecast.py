@@ -7,19 +7,17 @@ all of them show. What is needed but once, such as compiled code, is made ready 
 
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from geogs.application.keyframe_files import write_keyframes
-from geogs.application.splat_colours import splat_colours
 from geogs.application.surfaces import fusion_views
-from geogs.config import MeshConfig
 from geogs.errors import InputError
-from geogs.mesh.extract import extract_mesh, plan_volume
-from geogs.mesh.tsdf import BLOCK
-from geogs.reconstruction import Reconstruction
+from geogs.mesh.extract import extract_mesh
+from geogs.reconstruction import OutputCost, Reconstruction
 
 Clock = Callable[[], float]
+Share = Callable[[Sequence[int]], float]
 
 VIEWS = 3
 """Views of the rehearsal; and of the one before it, which makes ready what is needed but once."""
@@ -45,25 +43,28 @@ class StageTimes:
         self._last = now
 
 
-def output_seconds(scene: Reconstruction, clock: Clock = time.perf_counter) -> float:
-    """Seconds that rendering all mapped views, the mesh and the files are going to take.
+def output_cost(
+    scene: Reconstruction, times_the_surface: Share, clock: Clock = time.perf_counter
+) -> OutputCost:
+    """What the mesh and the files are going to take.
 
-    Called when the map has grown; it does all of that for a few views, twice, and writes nothing
-    that stays.
+    Called when some depths have been searched. Of a few views all of it is done with these, twice,
+    and nothing stays. ``times_the_surface`` tells how much more surface all views show than some,
+    given as places in the set.
     """
     views = scene.neighbouring(VIEWS)
     _rehearse(scene, views[:1], clock)
     a_view, surface = _rehearse(scene, views, clock)
-    return REPORT + a_view * scene.with_depth + surface * _times_the_surface(scene, views)
+    more = times_the_surface([scene.image_of(i) for i in views])
+    return OutputCost(REPORT + more * surface, a_view)
 
 
 def _rehearse(scene: Reconstruction, views: list[int], clock: Clock) -> tuple[float, float]:
     """Seconds for each of some views, and for the surface that they show."""
     start = clock()
-    renders = scene.renders(of=views)
+    renders = scene.depth_maps(of=views)
     with tempfile.TemporaryDirectory(prefix="geogs-rehearsal-") as folder:
         write_keyframes(Path(folder), scene, scene.camera, renders, True)
-    splat_colours(scene.snapshot(), fusion_views(renders))
     of_views, times = clock() - start, StageTimes(clock)
     try:
         extract_mesh(fusion_views(renders), scene.config.mesh, times)
@@ -71,19 +72,3 @@ def _rehearse(scene: Reconstruction, views: list[int], clock: Clock) -> tuple[fl
         times("merge", 1, 1)
     of_views += times.seconds.get("views", 0.0) * len(views) / max(len(views) - 1, 1)
     return of_views / len(views), times.seconds.get("surface", 0.0)
-
-
-def _times_the_surface(scene: Reconstruction, views: list[int]) -> float:
-    """How much more surface all views show than some of them."""
-    config = scene.config.mesh
-    try:
-        some = _blocks(scene, config, views)
-        return max(_blocks(scene, config, None) / some, 1.0)
-    except InputError:
-        return scene.with_depth / len(views)
-
-
-def _blocks(scene: Reconstruction, config: MeshConfig, views: list[int] | None) -> float:
-    """Voxels of the surface that views show, in blocks' area."""
-    plan = plan_volume(fusion_views(scene.depth_maps(of=views)), config)
-    return plan.blocks / BLOCK

@@ -6,13 +6,13 @@ from itertools import islice
 import numpy as np
 from jaxtyping import Float64
 
-from geogs.config import ReconstructConfig
 from geogs.depth.view import Place
 from geogs.io.sources.base import read_ahead
 from geogs.io.sources.posed.base import PosedSource
 from geogs.mapping.first_look import SmallImage, first_points
 from geogs.mapping.known_poses import FEWEST_POINTS, depth_search
 from geogs.mapping.view_choice import (
+    Sightings,
     coverage_order,
     relative_sharpness,
     scene_points,
@@ -39,6 +39,7 @@ class PosedViews:
         self._source = source
         self._report = report
         self._order: Iterator[int] = iter(())
+        self._seen: Sightings | None = None
         T_wc = np.linalg.inv(source.T_cw)
         known = np.ones(len(source), dtype=bool)
         scene.know(Trajectory(source.timestamps, T_wc, known))
@@ -67,8 +68,14 @@ class PosedViews:
     def choose(self, points: Float64[np.ndarray, "n 3"]) -> None:
         """Put the images into an order in which every beginning shows the scene well."""
         with self._scene.stopwatch("choosing views"):
-            order = order_of(self._source, points, self._scene.config)
-        self._order = islice(order, self._scene.config.search.most_views)
+            source, config = self._source, self._scene.config
+            typical, random = usual_depths(source, points), np.random.default_rng(config.seed)
+            shown = scene_points(source.T_cw, source.camera, typical, random)
+            self._seen = sightings(source.T_cw, source.camera, typical, shown)
+            usual = float(np.median(typical))
+            sharpness = relative_sharpness(source.T_cw, usual, source.stored_bytes())
+            order = coverage_order(self._seen, config.mapping.depth, sharpness)
+        self._order = islice(order, config.search.most_views)
 
     def give(self, count: int | None = None) -> None:
         """The next so many images, or all that there are.
@@ -87,17 +94,19 @@ class PosedViews:
             scene.add(image.image, image.T_cw, image.mask, image.timestamp, image.index)
             self._report("reading", (done + 1) / len(places))
 
+    def times_the_surface(self, places: Sequence[int]) -> float:
+        """How much more of the scene all images see than those at some places of the source."""
+        if self._seen is None:
+            return 1.0
+        some = np.isin(self._seen.view, places)
+        part = len(np.unique(self._seen.point[some])) / len(np.unique(self._seen.point))
+        return 1.0 / max(part, 1e-3)
 
-def order_of(
-    source: PosedSource, points: Float64[np.ndarray, "n 3"], config: ReconstructConfig
-) -> Iterator[int]:
-    """Places of the images in the source, the one that adds most first, without copies."""
-    T_cw, camera = source.T_cw, source.camera
+
+def usual_depths(
+    source: PosedSource, points: Float64[np.ndarray, "n 3"]
+) -> Float64[np.ndarray, "v"]:
+    """Median depth of the points that each image sees."""
     some = points[:: 1 + len(points) // _TELLING_POINTS]
-    typical = np.array(
-        [depth_search(Place(i, T), some, camera, 1.0).typical for i, T in enumerate(T_cw)]
-    )
-    random = np.random.default_rng(config.seed)
-    seen = sightings(T_cw, camera, typical, scene_points(T_cw, camera, typical, random))
-    sharpness = relative_sharpness(T_cw, float(np.median(typical)), source.stored_bytes())
-    return coverage_order(seen, config.mapping.depth, sharpness)
+    places = [Place(i, T_cw) for i, T_cw in enumerate(source.T_cw)]
+    return np.array([depth_search(p, some, source.camera, 1.0).typical for p in places])

@@ -2,6 +2,7 @@
 
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Literal
 
@@ -13,7 +14,7 @@ from geogs.application.forecast import reconstruction_forecast
 from geogs.application.former import free_folder
 from geogs.application.interrupt import Stop
 from geogs.application.machine import compiled_kernels, full_memory_in_a_sentence
-from geogs.application.output_forecast import output_seconds
+from geogs.application.output_forecast import output_cost
 from geogs.application.photographs import open_photographs
 from geogs.application.posed_views import PosedViews, Report
 from geogs.application.progress import RunProgress
@@ -159,8 +160,6 @@ def _to_folder(
             progress.stage(stage, fraction)
             if stage == "growing":
                 progress.write(_chosen_views(scene))
-                if settings.budget is not None:
-                    scene.output_seconds = output_seconds(scene)
             snapshots.take(scene)
             checkpoint.report(stage, scene)
             stop.check()
@@ -204,12 +203,18 @@ def _complete(
         return
     points = views.first_look()
     views.choose(points)
-    if budgeted:
-        views.give(scene.config.search.first_batch)
-        scene.finish(points, report, views.give)
-    else:
+    if not budgeted:
         views.give()
         scene.finish(points, report)
+        return
+
+    def more(count_of: Callable[[], int]) -> None:
+        with scene.stopwatch("rehearsal"):
+            scene.output_cost = output_cost(scene, views.times_the_surface)
+        views.give(count_of())
+
+    views.give(scene.config.search.first_batch)
+    scene.finish(points, report, more)
 
 
 def _chosen_views(scene: Reconstruction) -> str:

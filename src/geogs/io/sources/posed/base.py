@@ -115,10 +115,11 @@ class PosedSource:
         """
         index = range(self.length)[index]
         file = self._files[index]
-        picture = read_picture(file.path, self._one_camera.stored_shape(index))
+        stored, needed = self._one_camera.stored_shape(index), self._one_camera.needed_shape(index)
+        picture = read_picture(file.path, stored, needed)
         mask = None
         if file.mask is not None:
-            mask = read_mask(file.mask, picture.shape[:2], of_alpha=file.mask == file.path)
+            mask = read_mask(file.mask, stored[::-1], of_alpha=file.mask == file.path)
         image, mask = self._one_camera.view(index, picture, mask)
         return PosedImage(index, self.label(index), file.timestamp, image, file.T_cw, mask)
 
