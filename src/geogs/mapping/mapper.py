@@ -98,6 +98,7 @@ class Mapper:
         self._order: list[int] = []
         """Of the keyframes that it comes to next, by their places among those mapped."""
         self._trainer: MapTrainer | None = None
+        self._seconds_to_prune = 0.0
         self._random = np.random.default_rng(seed)
         self._torch_random = torch.Generator().manual_seed(seed)
 
@@ -443,12 +444,15 @@ class Mapper:
         rounds = self.config.final_pose_rounds
         poses = {total * (n + 1) // (rounds + 1) for n in range(rounds)}
         events = fills | splits | poses | set(range(prunes, total, prunes))
-        stops = sorted(events | set(range(_REPORTED_STEPS, total, _REPORTED_STEPS)) | {total})
+        # Where time is short steps are few and slow, so that it is looked at the clock more often.
+        at_once = _REPORTED_STEPS if until is None else min(_REPORTED_STEPS, max(total // 50, 1))
+        stops = sorted(events | set(range(at_once, total, at_once)) | {total})
         done = self.trained.steps
         for stop in (stop for stop in stops if stop > done):
             late = 0.0
             if until is not None:
-                late = (time.perf_counter() - start) / max(until - start, 1e-9)
+                end = until - self._seconds_to_prune
+                late = (time.perf_counter() - start) / max(end - start, 1e-9)
             if late >= 1.0:
                 break
             batches = []
@@ -461,7 +465,9 @@ class Mapper:
             trainer.train(batches, rates)
             done = stop
             if done % prunes == 0 and done < total:
+                begin = time.perf_counter()
                 self.prune()
+                self._seconds_to_prune = time.perf_counter() - begin
             if done in splits:
                 self._split()
             if done in poses:
