@@ -323,7 +323,8 @@ class Reconstruction:
         order = [i for i in order if not mapper.views[i].has_depth]
         search_depths(mapper, order, lambda f: report(share * f), until)
         now = time.perf_counter()
-        affordable = end is None or 2.5 * (now - start) < end - now
+        again = (now - start) * len(views) / max(len(order), 1)
+        affordable = end is None or 3 * again < end - now
         if search.repeat and affordable and len(mapper.mapped) == len(views):
             mapper.check_depths()
             sure = known.dense_points(views, mapper.cameras.render, self._random)

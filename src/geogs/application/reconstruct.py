@@ -3,6 +3,7 @@
 import tempfile
 import time
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Literal
 
@@ -27,9 +28,10 @@ from geogs.application.surfaces import write_depth_mesh
 from geogs.config import ReconstructConfig
 from geogs.config.idle import idle_settings
 from geogs.documents import expanded
+from geogs.errors import InputError
 from geogs.gpu.installation import require_device
 from geogs.io.sources.posed.base import PosedSource
-from geogs.io.sources.posed.check import check_poses
+from geogs.io.sources.posed.check import PoseCheck, check_poses
 from geogs.io.sources.posed.sniff import open_posed_source
 from geogs.io.writers.atomic import prepare_output_folder
 from geogs.reconstruction import Reconstruction, ReconstructionState
@@ -75,11 +77,10 @@ def reconstruct(
         else:
             source = open_posed_source(source, config.input)
     clock.excuse(compiled_kernels(used))
-    if check and poses == "given":
-        _check(source, progress)
+    checks = progress if check and poses == "given" else None
     with full_memory_in_a_sentence():
         scene = Reconstruction(source.camera, config, str(used), clock.left())
-        _complete(scene, source, None, progress.stage, budget is not None)
+        _complete(scene, source, None, progress.stage, budget is not None, checks)
     return Result(scene, source, progress=progress)
 
 
@@ -152,8 +153,7 @@ def _to_folder(
     progress.plan(reconstruction_forecast())
     with full_memory_in_a_sentence(way_on), stop:
         resumed = checkpoint.read() if settings.resume else None
-        if settings.check_poses and settings.poses == "given" and resumed is None:
-            _check(source, progress)
+        checks = progress if settings.check_poses and settings.poses == "given" else None
         scene = Reconstruction(source.camera, config, str(device), clock.left())
 
         def report(stage: str, fraction: float) -> None:
@@ -165,7 +165,7 @@ def _to_folder(
             stop.check()
 
         try:
-            _complete(scene, source, resumed, report, settings.budget is not None)
+            _complete(scene, source, resumed, report, settings.budget is not None, checks)
             finished, kept = True, False
         except KeyboardInterrupt:
             if not (stop.requested and len(scene.snapshot())):
@@ -182,10 +182,11 @@ def _to_folder(
     return Written(output, result, kept)
 
 
-def _check(source: PosedSource, progress: RunProgress) -> None:
-    """See whether the poses fit the images. Raises InputError if they clearly do not."""
-    warning = check_poses(source).warning
-    progress.write(f"warning: {warning}" if warning else "")
+def _tell(progress: RunProgress | None, checked: Future[PoseCheck] | None) -> None:
+    """Whether the poses fit the images. Raises InputError if they clearly do not."""
+    if progress is not None and checked is not None:
+        warning = checked.result().warning
+        progress.write(f"warning: {warning}" if warning else "")
 
 
 def _complete(
@@ -194,14 +195,26 @@ def _complete(
     resumed: ReconstructionState | None,
     report: Report,
     budgeted: bool,
+    checks: RunProgress | None,
 ) -> None:
-    """Everything up to the trained map; what ``report`` raises ends it early."""
+    """Everything up to the trained map; what ``report`` raises ends it early.
+
+    ``checks`` is told where the poses do not fit the images; none where that is not looked at.
+    """
     views = PosedViews(scene, source, report)
     if resumed is not None:
         views.give_these(resumed.images)
         scene.resume(resumed, report)
         return
-    points = views.first_look()
+    with ThreadPoolExecutor(1, "check") as thread:
+        checked = None if checks is None else thread.submit(check_poses, source)
+        try:
+            points = views.first_look()
+        except InputError:
+            # Whether the poses are of another convention says more than that nothing matches.
+            _tell(checks, checked)
+            raise
+        _tell(checks, checked)
     views.choose(points)
     if not budgeted:
         views.give()
