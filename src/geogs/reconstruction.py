@@ -99,6 +99,7 @@ class Reconstruction:
         self._images: list[int] = []
         self._added: list[float] = []
         self._all: Trajectory | None = None
+        self._expected = 0
         self._random = np.random.default_rng(self.config.seed)
         self._begin: float | None = None
         self._deadline = None if budget is None else time.perf_counter() + budget
@@ -110,7 +111,12 @@ class Reconstruction:
         """When training must have ended for what comes after it."""
         if self._deadline is None:
             return None
-        return self._deadline - self.output_cost.of(self.with_depth or self.views)
+        return self._deadline - self.output_cost.of(self._expected or self.views)
+
+    @property
+    def seconds_left(self) -> float:
+        """Of the budget, until training must have ended; infinite without a budget."""
+        return np.inf if self._end is None else self._end - time.perf_counter()
 
     @property
     def frames(self) -> int:
@@ -331,6 +337,7 @@ class Reconstruction:
             if len(sure) >= known.FEWEST_POINTS:
                 known.expect_depths(views, sure, self.camera, search.margin)
             search_depths(mapper, mapper.keyframe_ids, lambda f: report(share + share * f))
+        self._expected = self.with_depth
         report(1.0)
 
     def _try_depths(self) -> tuple[int, float]:

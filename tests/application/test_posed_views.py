@@ -5,9 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from geogs.application.posed_views import PosedViews
 from geogs.config import ReconstructConfig
+from geogs.evaluation.surface import read_surface
 from geogs.io.sources.posed.base import PosedImage, PosedSource
 from geogs.io.sources.posed.sniff import open_posed_source
 from geogs.reconstruction import Reconstruction
@@ -88,3 +90,17 @@ def test_a_few_images_see_less_of_the_scene_than_all(small_room):
     near, all_views = views.times_the_surface([0, 1]), views.times_the_surface(range(len(source)))
     assert near > 1.2
     assert all_views == pytest.approx(1.0)
+
+
+def test_the_first_look_reads_what_it_matches_and_finds_the_room(small_room, alive):
+    source = open_posed_source(small_room, CONFIG.input)
+    config = replace(CONFIG, search=replace(CONFIG.search, first_edge=64, first_views=4))
+    scene = Reconstruction(source.camera, config)
+    points = PosedViews(scene, source, lambda stage, fraction: None).first_look()
+    assert len(alive.read) == len(set(alive.read))
+    assert alive.most <= 2
+    truth = read_surface(small_room / "points_seen_1cm.ply").vertices
+    distance = cKDTree(truth).query(points)[0]
+    print(f"{len(points)} points, {100 * np.median(distance):.1f} cm from the room")
+    assert len(points) > 500
+    assert np.median(distance) < 0.1

@@ -15,7 +15,7 @@ from pathlib import Path
 from geogs.application.keyframe_files import write_keyframes
 from geogs.application.surfaces import fusion_views
 from geogs.errors import InputError
-from geogs.mesh.extract import extract_mesh
+from geogs.mesh.extract import extract_mesh, plan_volume
 from geogs.reconstruction import OutputCost, Reconstruction
 
 _log = logging.getLogger(__name__)
@@ -27,9 +27,11 @@ VIEWS = 3
 """Views of the rehearsal; and of the one before it, which makes ready what is needed but once."""
 REPORT = 5.0
 """What the report takes, and what else is written once, in times of one picture of the path."""
-CAUTION = 1.35
+CAUTION = 1.25
 """By how much more is kept than was measured, on two CPU cores: a larger volume, with more vertices
 to look for in each image, and the disks, which are not there yet."""
+WORTH = 0.05
+"""Part of the time that is left which a last rehearsal may take."""
 
 
 class StageTimes:
@@ -50,24 +52,6 @@ class StageTimes:
         self._last = now
 
 
-def output_cost(
-    scene: Reconstruction, times_the_surface: Share, clock: Clock = time.perf_counter
-) -> OutputCost:
-    """What the mesh and the files are going to take.
-
-    Called when some depths have been searched. Of a few views all of it is done with these, twice,
-    and nothing stays. ``times_the_surface`` tells how much more surface all views show than some,
-    given as places in the set.
-    """
-    views = scene.neighbouring(VIEWS)
-    _rehearse(scene, views[:1], clock)
-    cost = _rehearse(scene, views, clock)
-    surface = times_the_surface([scene.image_of(i) for i in views]) * cost.surface
-    found = OutputCost(CAUTION * (REPORT * cost.picture + surface), CAUTION * cost.a_view)
-    _log.info("mesh and files: %.1f s, and %.3f s for each image", found.once, found.a_view)
-    return found
-
-
 @dataclass(frozen=True)
 class _Rehearsal:
     """Seconds that some views took."""
@@ -78,6 +62,58 @@ class _Rehearsal:
     """Each view."""
     surface: float
     """The surface that they show."""
+    seconds: float
+    """All of it."""
+
+
+class OutputForecast:
+    """What the mesh and the files are going to take, the better known the more of the map there is.
+
+    A rehearsal does all of it with a few views, and leaves nothing.
+    """
+
+    def __init__(self, scene: Reconstruction, clock: Clock = time.perf_counter) -> None:
+        self._scene = scene
+        self._clock = clock
+        self._views: list[int] = []
+        self._found: _Rehearsal | None = None
+
+    def first(self, times_the_surface: Share) -> OutputCost:
+        """Once some depths have been searched: rehearsed twice.
+
+        ``times_the_surface`` tells how much more surface all views show than some, given as places
+        in the set.
+        """
+        scene = self._scene
+        self._views = scene.neighbouring(VIEWS)
+        _rehearse(scene, self._views[:1], self._clock)
+        self._found = _rehearse(scene, self._views, self._clock)
+        return _cost(self._found, times_the_surface([scene.image_of(i) for i in self._views]))
+
+    def settled(self, left: float) -> OutputCost:
+        """Once all depths have been checked: with these, rehearsed again if that is but a small
+        part of the seconds that are left."""
+        scene, found = self._scene, self._found
+        if found is None or found.seconds < WORTH * left:
+            self._views = self._views or scene.neighbouring(VIEWS)
+            found = _rehearse(scene, self._views, self._clock)
+        try:
+            some = plan_volume(fusion_views(scene.depth_maps(self._views)), scene.config.mesh)
+            whole = plan_volume(fusion_views(scene.depth_maps()), scene.config.mesh)
+            times = max(whole.blocks / some.blocks, 1.0)
+        except InputError:  # no view shows anything that is sure
+            times = 1.0
+        return _cost(found, times)
+
+
+def _cost(found: _Rehearsal, times_the_surface: float) -> OutputCost:
+    once = CAUTION * (REPORT * found.picture + times_the_surface * found.surface)
+    a_view = CAUTION * found.a_view
+    _log.info(
+        "mesh and files: %.1f s, %.1f times the surface, and %.3f s an image",
+        once, times_the_surface, a_view,
+    )  # fmt: skip
+    return OutputCost(once, a_view)
 
 
 def _rehearse(scene: Reconstruction, views: list[int], clock: Clock) -> _Rehearsal:
@@ -95,4 +131,5 @@ def _rehearse(scene: Reconstruction, views: list[int], clock: Clock) -> _Rehears
     except InputError:  # these views show no surface: the others may
         times("merge", 1, 1)
     of_views += times.seconds.get("views", 0.0) * len(views) / max(len(views) - 1, 1)
-    return _Rehearsal(drawn - start, of_views / len(views), times.seconds.get("surface", 0.0))
+    surface = times.seconds.get("surface", 0.0)
+    return _Rehearsal(drawn - start, of_views / len(views), surface, clock() - start)

@@ -15,7 +15,7 @@ from geogs.application.forecast import reconstruction_forecast
 from geogs.application.former import free_folder
 from geogs.application.interrupt import Stop
 from geogs.application.machine import compiled_kernels, full_memory_in_a_sentence
-from geogs.application.output_forecast import output_cost
+from geogs.application.output_forecast import OutputForecast
 from geogs.application.photographs import open_photographs
 from geogs.application.posed_views import PosedViews, Report
 from geogs.application.progress import RunProgress
@@ -221,13 +221,19 @@ def _complete(
         scene.finish(points, report)
         return
 
+    forecast = OutputForecast(scene)
+
     def more(count_of: Callable[[], int]) -> None:
-        with scene.stopwatch("rehearsal"):
-            scene.output_cost = output_cost(scene, views.times_the_surface)
+        scene.output_cost = forecast.first(views.times_the_surface)
         views.give(count_of())
 
+    def reported(stage: str, fraction: float) -> None:
+        report(stage, fraction)
+        if stage == "growing":
+            scene.output_cost = forecast.settled(scene.seconds_left)
+
     views.give(scene.config.search.first_batch)
-    scene.finish(points, report, more)
+    scene.finish(points, reported, more)
 
 
 def _chosen_views(scene: Reconstruction) -> str:

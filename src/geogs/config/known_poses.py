@@ -33,7 +33,8 @@ class SearchConfig(Settings, group="search"):
     """Most of the time up to then that reading and the depths may take; images for which it does
     not last are not read, or get no depth and only serve to find those of the others."""
     output_share: Annotated[float, Range(0, below=1)] = 0.2
-    """Part of a given time that is kept for the mesh and the report."""
+    """Part of a given time that is kept for the mesh and the report until a few views have shown
+    what these take."""
     first_edge: Annotated[int, Range(16, 4096)] = 128
     """First look at the scene: longer side of its images, pixels."""
     first_views: Annotated[int, Range(1, 1000)] = 8
