@@ -21,7 +21,7 @@ from geogs.mapping.map_frame import MapFrame
 from geogs.mapping.mapper import Mapper
 from geogs.mapping.rendered import MapRenderer
 from geogs.mapping.state import MapperState
-from geogs.mapping.time_shares import ViewCost, affordable_views
+from geogs.mapping.time_shares import ViewCost, affordable_views, helpers
 from geogs.mapping.training.base import TrainingPlace
 from geogs.mapping.window import views_around
 from geogs.on_demand import OnDemand
@@ -99,7 +99,7 @@ class Reconstruction:
         self._images: list[int] = []
         self._added: list[float] = []
         self._all: Trajectory | None = None
-        self._expected = 0
+        self._wanted = 0
         self._random = np.random.default_rng(self.config.seed)
         self._begin: float | None = None
         self._deadline = None if budget is None else time.perf_counter() + budget
@@ -111,7 +111,7 @@ class Reconstruction:
         """When training must have ended for what comes after it."""
         if self._deadline is None:
             return None
-        return self._deadline - self.output_cost.of(self._expected or self.views)
+        return self._deadline - self.output_cost.of(self._wanted or self.views)
 
     @property
     def seconds_left(self) -> float:
@@ -224,8 +224,9 @@ class Reconstruction:
         return self.keyframe_trajectory() if self._all is None else self._all
 
     def keyframe_trajectory(self) -> Trajectory:
-        """The given poses of the images that were added, in the order of their set."""
-        order = self._in_order(range(self.views))
+        """The given poses of the images that make the map, or of all that were added while there is
+        none, in the order of their set."""
+        order = self._in_order(self.mapper.mapped or range(self.views))
         times = [self._keyframes[i].timestamp for i in order]
         T_wc = torch.linalg.inv(torch.stack([self._poses[i] for i in order])).numpy()
         return Trajectory(np.array(times, np.float64), T_wc, np.ones(len(times), dtype=bool))
@@ -321,23 +322,23 @@ class Reconstruction:
             self._place_keyframes()
             new = [v for v in mapper.views.values() if v.search is None]
             known.expect_depths(new, points, self.camera, search.margin)
-        views, start, end = list(mapper.views.values()), time.perf_counter(), self._end
+        ids = [*mapper.views] if self._all is not None else spread_order(mapper.keyframe_ids)
+        ids = ids[: self._wanted or len(ids)]
+        start, end = time.perf_counter(), self._end
         until = None if end is None else start + search.depth_share * (end - start)
-        order = (
-            [v.id for v in views] if self._all is not None else spread_order(mapper.keyframe_ids)
-        )
-        order = [i for i in order if not mapper.views[i].has_depth]
+        order = [i for i in ids if not mapper.views[i].has_depth]
         search_depths(mapper, order, lambda f: report(share * f), until)
         now = time.perf_counter()
-        again = (now - start) * len(views) / max(len(order), 1)
+        again = (now - start) * len(ids) / max(len(order), 1)
         affordable = end is None or 3 * again < end - now
-        if search.repeat and affordable and len(mapper.mapped) == len(views):
+        if search.repeat and affordable and len(mapper.mapped) >= len(ids):
+            views = [mapper.views[i] for i in mapper.mapped]
             mapper.check_depths()
             sure = known.dense_points(views, mapper.cameras.render, self._random)
             if len(sure) >= known.FEWEST_POINTS:
                 known.expect_depths(views, sure, self.camera, search.margin)
-            search_depths(mapper, mapper.keyframe_ids, lambda f: report(share + share * f))
-        self._expected = self.with_depth
+            search_depths(mapper, mapper.mapped, lambda f: report(share + share * f))
+        self._wanted = self.with_depth
         report(1.0)
 
     def _try_depths(self) -> tuple[int, float]:
@@ -355,18 +356,17 @@ class Reconstruction:
         return sum(map(len, groups)), seconds
 
     def _further_views(self, searched: int, seconds: float) -> int:
-        """How many more images time lasts for, of which some have been searched already."""
+        """How many more images to read, of which some have been searched already.
+
+        As many as the time lasts for; where these are few, so that none may stand next to another,
+        some that only help to find the depths of these.
+        """
         search, times, output = self.config.search, self._added, self.output_cost
         assert self._deadline is not None
-        reading = (times[-1] - times[0]) / max(len(times) - 1, 1)
-        count = affordable_views(
-            self._deadline - time.perf_counter() - output.once,
-            ViewCost(reading, seconds, output.a_view),
-            search,
-            searched,
-            self.views,
-        )
-        return max(count - self.views, 0)
+        cost = ViewCost((times[-1] - times[0]) / max(len(times) - 1, 1), seconds, output.a_view)
+        left = self._deadline - time.perf_counter() - output.once
+        self._wanted = max(affordable_views(left, cost, search, searched, self.views), searched)
+        return max(self._wanted + helpers(self._wanted, left, cost) - self.views, 0)
 
     def _train(self, progress: Progress, goes_on: bool = False) -> None:
         with self.stopwatch("training"):

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from geogs.config import SearchConfig
-from geogs.mapping.time_shares import ViewCost, affordable_views, rounds
+from geogs.mapping.time_shares import ViewCost, affordable_views, helpers, rounds
 
 
 @pytest.mark.parametrize("repeat", [True, False])
@@ -32,3 +32,12 @@ def test_what_has_been_done_is_not_paid_for_again():
 def test_too_little_time_is_for_no_image():
     assert affordable_views(-5.0, ViewCost(0.1, 0.5, 0.1), SearchConfig()) == 0
     assert affordable_views(1e9, ViewCost(0.0, 0.0, 0.0), SearchConfig()) > 1000
+
+
+def test_few_images_get_others_to_be_matched_with_and_many_have_each_other():
+    cost = ViewCost(0.01, 1.0, 0.1)
+    assert helpers(10, 100.0, cost) == 30
+    assert helpers(40, 100.0, cost) == 60
+    assert helpers(150, 100.0, cost) == 0
+    assert helpers(10, 100.0, ViewCost(0.5, 1.0, 0.1)) == 10
+    assert helpers(10, -1.0, cost) == 0

@@ -7,6 +7,11 @@ from geogs.config import SearchConfig
 # What checking depths and growing disks take, as a part of one search of the depths.
 _GROWING = 0.4
 
+# Images for each that is to get a depth, where these are few, and how many are not few.
+_HELPERS, _FEW = 4, 100
+# Part of the time that is left which reading such helpers may take.
+_HELP = 0.05
+
 
 @dataclass(frozen=True)
 class ViewCost:
@@ -43,3 +48,15 @@ def affordable_views(
     paid = cost.reading * read + cost.search * searched
     a_view = cost.reading + rounds(search) * cost.search + search.depth_share * cost.output
     return max(int((search.depth_share * seconds + paid) / max(a_view, 1e-9)), 0)
+
+
+def helpers(views: int, seconds: float, cost: ViewCost) -> int:
+    """How many more images to read than get a depth, so that there are some to match these with.
+
+    Args:
+        views: that get a depth.
+        seconds: left.
+        cost: of an image.
+    """
+    few = max(min(_HELPERS * views, _FEW) - views, 0)
+    return min(few, max(int(_HELP * seconds / max(cost.reading, 1e-9)), 0))
