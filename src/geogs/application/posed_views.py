@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from geogs.depth.view import Place
+from geogs.errors import InputError
 from geogs.io.sources.base import read_ahead
 from geogs.io.sources.posed.base import PosedSource
 from geogs.mapping.first_look import SmallImage, first_points
@@ -48,9 +49,11 @@ class PosedViews:
         """Points of the scene: those of the source, or where some small images match.
 
         Raises:
-            InputError: hardly anything matches anywhere.
+            InputError: there is one image only, or hardly anything matches anywhere.
         """
         source, config = self._source, self._scene.config
+        if len(source) < 2:
+            raise InputError("There is only 1 image; depth needs at least two.")
         if source.points is not None and len(source.points.positions) >= FEWEST_POINTS:
             return source.points.positions
 
