@@ -67,11 +67,11 @@ def test_the_second_rehearsal_counts_by_views_and_by_surface(monkeypatch, scene)
     monkeypatch.setattr(plots, "plot_path", draw)
     monkeypatch.setattr(output_forecast, "write_keyframes", write)
     monkeypatch.setattr(output_forecast, "extract_mesh", extract)
-    cost = OutputForecast(scene, clock).first(lambda places: 4.0)
+    cost = OutputForecast(scene, clock).first(lambda places: 3.0)
     assert rehearsed == [1, 3]
-    # Three views: 0.2 s of files and 0.3 of fusion for each; 3 s for a quarter of the surface.
+    # Three views: 0.2 s of files and 0.3 of fusion for each; 3 s for a third of the surface.
     assert cost.a_view == pytest.approx(CAUTION * 0.5)
-    assert cost.once == pytest.approx(CAUTION * (REPORT * 0.5 + 4.0 * 3.0))
+    assert cost.once == pytest.approx(CAUTION * (REPORT * 0.5 + 3.0 * 3.0))
     assert cost.of(10) == pytest.approx(cost.once + 10 * cost.a_view)
 
 

@@ -27,9 +27,12 @@ VIEWS = 3
 """Views of the rehearsal; and of the one before it, which makes ready what is needed but once."""
 REPORT = 5.0
 """What the report takes, and what else is written once, in times of one picture of the path."""
-CAUTION = 1.25
+CAUTION = 1.1
 """By how much more is kept than was measured, on two CPU cores: a larger volume, with more vertices
 to look for in each image, and the disks, which are not there yet."""
+MOST_SURFACE = 4.0
+"""Times the surface of the rehearsal that is expected at most before the depths tell it: of a large
+scene only a few views may be affordable, and then what was kept for its mesh is lost to them."""
 WORTH = 0.05
 """Part of the time that is left which a last rehearsal may take."""
 
@@ -88,7 +91,8 @@ class OutputForecast:
         self._views = scene.neighbouring(VIEWS)
         _rehearse(scene, self._views[:1], self._clock)
         self._found = _rehearse(scene, self._views, self._clock)
-        return _cost(self._found, times_the_surface([scene.image_of(i) for i in self._views]))
+        times = times_the_surface([scene.image_of(i) for i in self._views])
+        return _cost(self._found, min(times, MOST_SURFACE))
 
     def settled(self, left: float) -> OutputCost:
         """Once all depths have been checked: with these, rehearsed again if that is but a small
