@@ -24,7 +24,8 @@ from geogs.io.poses import read_tum_trajectory
 from geogs.io.sources.posed.sniff import open_posed_source
 from geogs.io.writers.native import load_map
 from geogs.mapping.depth_schedule import spread_order
-from geogs.mapping.known_poses import depth_search, distances_to_try
+from geogs.mapping.first_look import distances_to_try
+from geogs.mapping.known_poses import depth_search
 from geogs.mesh.files import read_mesh
 from geogs.reconstruction import Reconstruction
 from keyframe_samples import Sample, segment_of

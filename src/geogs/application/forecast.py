@@ -154,7 +154,7 @@ FINDING_POSES = (
 def reconstruction_forecast(finds_poses: bool = False) -> StageForecast:
     """That of a reconstruction from known poses, or from some that it finds before."""
     plan = list(FINDING_POSES) if finds_poses else []
-    plan += [("reading", 4.0), ("first look", 6.0), ("depth", 35.0), ("training", 35.0)]
+    plan += [("first look", 6.0), ("reading", 4.0), ("depth", 35.0), ("training", 35.0)]
     return StageForecast([*plan, *mesh_stages(15.0), ("report", 5.0)])
 
 

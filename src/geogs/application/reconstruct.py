@@ -3,6 +3,7 @@
 import tempfile
 import time
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Literal
 
@@ -14,7 +15,9 @@ from geogs.application.forecast import reconstruction_forecast
 from geogs.application.former import free_folder
 from geogs.application.interrupt import Stop
 from geogs.application.machine import compiled_kernels, full_memory_in_a_sentence
+from geogs.application.output_forecast import OutputForecast
 from geogs.application.photographs import open_photographs
+from geogs.application.posed_views import PosedViews, Report
 from geogs.application.progress import RunProgress
 from geogs.application.reconstruct_checkpoint import ReconstructCheckpoint, fingerprint
 from geogs.application.result import Result, Written
@@ -25,9 +28,10 @@ from geogs.application.surfaces import write_depth_mesh
 from geogs.config import ReconstructConfig
 from geogs.config.idle import idle_settings
 from geogs.documents import expanded
+from geogs.errors import InputError
 from geogs.gpu.installation import require_device
 from geogs.io.sources.posed.base import PosedSource
-from geogs.io.sources.posed.check import check_poses
+from geogs.io.sources.posed.check import PoseCheck, check_poses
 from geogs.io.sources.posed.sniff import open_posed_source
 from geogs.io.writers.atomic import prepare_output_folder
 from geogs.reconstruction import Reconstruction, ReconstructionState
@@ -35,9 +39,6 @@ from geogs.threads import on_one_torch_thread
 
 LEAST_BUDGET = 1.0
 """Seconds that are left of a budget at least, when reading and checking have used it up."""
-
-Report = Callable[[str, float], None]
-"""Called with the name of a stage and its finished fraction in [0, 1]."""
 
 
 @on_one_torch_thread
@@ -76,11 +77,10 @@ def reconstruct(
         else:
             source = open_posed_source(source, config.input)
     clock.excuse(compiled_kernels(used))
-    if check and poses == "given":
-        _check(source, progress)
+    checks = progress if check and poses == "given" else None
     with full_memory_in_a_sentence():
         scene = Reconstruction(source.camera, config, str(used), clock.left())
-        _complete(scene, source, None, progress.stage)
+        _complete(scene, source, None, progress.stage, budget is not None, checks)
     return Result(scene, source, progress=progress)
 
 
@@ -153,20 +153,19 @@ def _to_folder(
     progress.plan(reconstruction_forecast())
     with full_memory_in_a_sentence(way_on), stop:
         resumed = checkpoint.read() if settings.resume else None
-        if settings.check_poses and settings.poses == "given" and resumed is None:
-            _check(source, progress)
+        checks = progress if settings.check_poses and settings.poses == "given" else None
         scene = Reconstruction(source.camera, config, str(device), clock.left())
 
         def report(stage: str, fraction: float) -> None:
             progress.stage(stage, fraction)
             if stage == "growing":
-                progress.write(_too_few_depths(scene))
+                progress.write(_chosen_views(scene))
             snapshots.take(scene)
             checkpoint.report(stage, scene)
             stop.check()
 
         try:
-            _complete(scene, source, resumed, report)
+            _complete(scene, source, resumed, report, settings.budget is not None, checks)
             finished, kept = True, False
         except KeyboardInterrupt:
             if not (stop.requested and len(scene.snapshot())):
@@ -183,10 +182,11 @@ def _to_folder(
     return Written(output, result, kept)
 
 
-def _check(source: PosedSource, progress: RunProgress) -> None:
-    """See whether the poses fit the images. Raises InputError if they clearly do not."""
-    warning = check_poses(source).warning
-    progress.write(f"warning: {warning}" if warning else "")
+def _tell(progress: RunProgress | None, checked: Future[PoseCheck] | None) -> None:
+    """Whether the poses fit the images. Raises InputError if they clearly do not."""
+    if progress is not None and checked is not None:
+        warning = checked.result().warning
+        progress.write(f"warning: {warning}" if warning else "")
 
 
 def _complete(
@@ -194,25 +194,55 @@ def _complete(
     source: PosedSource,
     resumed: ReconstructionState | None,
     report: Report,
+    budgeted: bool,
+    checks: RunProgress | None,
 ) -> None:
-    """Everything up to the trained map; what ``report`` raises ends it early."""
-    for image in source:
-        scene.add(image.image, image.T_cw, image.mask, image.timestamp)
-        report("reading", scene.frames / source.length)
+    """Everything up to the trained map; what ``report`` raises ends it early.
+
+    ``checks`` is told where the poses do not fit the images; none where that is not looked at.
+    """
+    views = PosedViews(scene, source, report)
     if resumed is not None:
+        views.give_these(resumed.images)
         scene.resume(resumed, report)
-    else:
-        scene.finish(None if source.points is None else source.points.positions, report)
+        return
+    with ThreadPoolExecutor(1, "check") as thread:
+        checked = None if checks is None else thread.submit(check_poses, source)
+        try:
+            points = views.first_look()
+        except InputError:
+            # Whether the poses are of another convention says more than that nothing matches.
+            _tell(checks, checked)
+            raise
+        _tell(checks, checked)
+    views.choose(points)
+    if not budgeted:
+        views.give()
+        scene.finish(points, report)
+        return
+
+    forecast = OutputForecast(scene)
+
+    def more(count_of: Callable[[], int]) -> None:
+        scene.output_cost = forecast.first(views.times_the_surface)
+        views.give(count_of())
+
+    def reported(stage: str, fraction: float) -> None:
+        report(stage, fraction)
+        if stage == "growing":
+            scene.output_cost = forecast.settled(scene.seconds_left)
+
+    views.give(scene.config.search.first_batch)
+    scene.finish(points, reported, more)
 
 
-def _too_few_depths(scene: Reconstruction) -> str:
-    """What to say where the time did not last for the depths of all images; else nothing."""
+def _chosen_views(scene: Reconstruction) -> str:
+    """What to say where not all images make the map; else nothing."""
     if scene.with_depth == scene.frames:
         return ""
     return (
-        f"There is time for the depths of {scene.with_depth} of {scene.frames} images; the others "
-        "only help to find them. A longer --budget or a smaller --mapping.render-long-edge takes "
-        "them all."
+        f"The map is made of {scene.with_depth} of {scene.frames} images, which show the scene "
+        "best; a longer --budget or a larger --search.most-views takes more."
     )
 
 

@@ -24,11 +24,17 @@ class SearchConfig(Settings, group="search"):
     """Fewest training steps where no time is given."""
     most_steps_per_view: Count = 200
     """Most training steps for every image, whatever the time."""
+    most_views: Annotated[int, Range(2, 100_000), Basic()] = 400
+    """Most images that make the map. Of more, and of as many as the time lasts for, those are read
+    that see all of the scene from places apart; of near ones the sharper."""
+    first_batch: Annotated[int, Range(2, 100_000)] = 24
+    """Images read before it is known for how many the time lasts."""
     depth_share: Annotated[float, Range(above=0, most=1)] = 0.6
-    """Most of the time up to then that the depths may take; images for which it does not
-    last get none and only serve to find those of the others."""
+    """Most of the time up to then that reading and the depths may take; images for which it does
+    not last are not read, or get no depth and only serve to find those of the others."""
     output_share: Annotated[float, Range(0, below=1)] = 0.2
-    """Part of a given time that is kept for the mesh and the report."""
+    """Part of a given time that is kept for the mesh and the report until a few views have shown
+    what these take."""
     first_edge: Annotated[int, Range(16, 4096)] = 128
     """First look at the scene: longer side of its images, pixels."""
     first_views: Annotated[int, Range(1, 1000)] = 8

@@ -20,6 +20,11 @@ def spread_order(items: Sequence[int]) -> list[int]:
     return [items[i] for i in places]
 
 
+def group_size() -> int:
+    """Keyframes whose depths are searched in one go where time is short."""
+    return max(_FIRST, worker_count())
+
+
 def search_depths(
     mapper: Mapper,
     keyframe_ids: Sequence[int],
@@ -29,11 +34,11 @@ def search_depths(
     """Search the depths of keyframes in groups; those that get one are mapped.
 
     An exception raised by ``progress`` loses nothing of the groups before. With ``until``, a time
-    of ``time.perf_counter``, evenly spread keyframes come first, in small groups; as soon as the
-    next group would last longer the rest is left without depth; the first group is always done.
+    of ``time.perf_counter``, groups are small, and as soon as the next one would last longer the
+    rest is left without depth; the first group is always done.
     """
-    ids = list(keyframe_ids) if until is None else spread_order(keyframe_ids)
-    done, size = 0, _AT_ONCE if until is None else max(_FIRST, worker_count())
+    ids = list(keyframe_ids)
+    done, size = 0, _AT_ONCE if until is None else group_size()
     while done < len(ids) and size > 0:
         start, group = time.perf_counter(), ids[done : done + size]
         mapper.search_depths(group)

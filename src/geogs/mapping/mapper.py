@@ -100,6 +100,7 @@ class Mapper:
         self._order: list[int] = []
         """Of the keyframes that it comes to next, by their places among those mapped."""
         self._trainer: MapTrainer | None = None
+        self._seconds_to_prune = 0.0
         self._random = np.random.default_rng(seed)
         self._torch_random = torch.Generator().manual_seed(seed)
 
@@ -309,8 +310,10 @@ class Mapper:
         self._carve(self._mapped_around(view, _VOTERS))
 
     @torch.no_grad()
-    def renders(self, disks: MapSnapshot | None = None) -> Sequence[RenderedKeyframe]:
-        """The map, or other disks in its frame, seen from every mapped keyframe.
+    def renders(
+        self, disks: MapSnapshot | None = None, of: Sequence[int] | None = None
+    ) -> Sequence[RenderedKeyframe]:
+        """The map, or other disks in its frame, seen from every mapped keyframe, or from some.
 
         Rendered now, from a snapshot, so that disks that were written show the same; of a long
         video most are read from a temporary file when they are asked for.
@@ -321,7 +324,7 @@ class Mapper:
         parameters = DiskParameters.of(self.map.snapshot() if disks is None else disks)
         camera, archive, stored = self.cameras.render, Archive(), []
         rules = SurfaceRules.of(self.config)
-        for view in (self.views[i] for i in self.mapped):
+        for view in (self.views[i] for i in (self.mapped if of is None else of)):
             render = rendered_keyframe(view, parameters, camera, rules)
             stored.append(stored_render(render, view.keyframe.picture.archived, archive))
         return OnDemand(stored, StoredRender.load)
@@ -331,12 +334,13 @@ class Mapper:
         rules = SurfaceRules.of(self.config)
         return MapRenderer(self.map.snapshot(), frame, self.cameras.render, rules)
 
-    def depth_maps(self) -> Sequence[RenderedKeyframe]:
-        """The dense depths of the mapped keyframes, weighted by confidence: no disk is in them.
+    def depth_maps(self, of: Sequence[int] | None = None) -> Sequence[RenderedKeyframe]:
+        """The dense depths of the mapped keyframes, or of some, weighted by confidence: no disk is
+        in them.
 
         Each is read when it is asked for, as it is at that time.
         """
-        views = [self.views[i] for i in self.mapped]
+        views = [self.views[i] for i in (self.mapped if of is None else of)]
         return OnDemand(views, partial(searched_keyframe, camera=self.cameras.render))
 
     @property
@@ -448,12 +452,15 @@ class Mapper:
         rounds = self.config.final_pose_rounds
         poses = {total * (n + 1) // (rounds + 1) for n in range(rounds)}
         events = fills | splits | poses | set(range(prunes, total, prunes))
-        stops = sorted(events | set(range(_REPORTED_STEPS, total, _REPORTED_STEPS)) | {total})
+        # Where time is short steps are few and slow, so that it is looked at the clock more often.
+        at_once = _REPORTED_STEPS if until is None else min(_REPORTED_STEPS, max(total // 50, 1))
+        stops = sorted(events | set(range(at_once, total, at_once)) | {total})
         done = self.trained.steps
         for stop in (stop for stop in stops if stop > done):
             late = 0.0
             if until is not None:
-                late = (time.perf_counter() - start) / max(until - start, 1e-9)
+                end = until - self._seconds_to_prune
+                late = (time.perf_counter() - start) / max(end - start, 1e-9)
             if late >= 1.0:
                 break
             batches = []
@@ -466,7 +473,9 @@ class Mapper:
             trainer.train(batches, rates)
             done = stop
             if done % prunes == 0 and done < total:
+                begin = time.perf_counter()
                 self.prune()
+                self._seconds_to_prune = time.perf_counter() - begin
             if done in splits:
                 self._split()
             if done in poses:

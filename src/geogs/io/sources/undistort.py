@@ -41,7 +41,8 @@ class Rectifier:
         resized = source if enlarges else source.with_long_edge(long_edge)
         self.resized_camera = resized
         """The pinhole part of the resized image, before its lens distortion is removed."""
-        self._size = (resized.width, resized.height)
+        self.size = (resized.width, resized.height)
+        """Width and height to which images are resized before their distortion is removed."""
         self._maps: tuple[np.ndarray, np.ndarray] | None = None
         self.zoom = 1.0
         """Factor on the focal length that removes black borders; the crop is 1 - 1 / zoom."""
@@ -70,9 +71,9 @@ class Rectifier:
 
     def resized(self, image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h2 w2 3"]:
         """A source image at working size, with its distortion."""
-        if (image.shape[1], image.shape[0]) == self._size:
+        if (image.shape[1], image.shape[0]) == self.size:
             return image
-        return cv2.resize(image, self._size, interpolation=cv2.INTER_AREA)
+        return cv2.resize(image, self.size, interpolation=cv2.INTER_AREA)
 
     def straightened(
         self,
@@ -101,7 +102,7 @@ class Rectifier:
     def _lens_maps(self) -> tuple[np.ndarray, np.ndarray]:
         if self._maps is not None:
             return self._maps
-        v, u = np.mgrid[: self._size[1], : self._size[0]].astype(np.float32)
+        v, u = np.mgrid[: self.size[1], : self.size[0]].astype(np.float32)
         return u, v
 
 

@@ -58,10 +58,17 @@ class OneCamera:
         """Width and height of image ``index`` on disk."""
         return self._sizes[index]
 
+    def needed_shape(self, index: int) -> tuple[int, int]:
+        """Width and height to which image ``index`` is resized first, whatever comes after it."""
+        return self._ways[index].size
+
     def view(
-        self, index: int, picture: UInt8[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"] | None
+        self,
+        index: int,
+        picture: UInt8[np.ndarray, "h w 3"],
+        mask: Bool[np.ndarray, "mh mw"] | None,
     ) -> tuple[UInt8[np.ndarray, "h2 w2 3"], Bool[np.ndarray, "h2 w2"] | None]:
-        """Image ``index`` and its mask as the common camera sees them."""
+        """Image ``index`` and its mask, each of any size, as the common camera sees them."""
         way = self._ways[index]
         image = way(picture)
         if mask is not None:
@@ -90,7 +97,8 @@ class Resampler:
         scale = min(1.0, target.fx / zoom / camera.fx)
         size = (round(camera.width * scale), round(camera.height * scale))
         resized = camera.resized(max(size[0], 1), max(size[1], 1))
-        self._size = (resized.width, resized.height)
+        self.size = (resized.width, resized.height)
+        """Width and height to which images are resized before they are resampled."""
         self._resized = resized
         self._distortion, self._lens = source.distortion, source.lens
         self._target = target
@@ -102,14 +110,14 @@ class Resampler:
 
     def __call__(self, image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h2 w2 3"]:
         """The image of the target."""
-        if (image.shape[1], image.shape[0]) != self._size:
-            image = cv2.resize(image, self._size, interpolation=cv2.INTER_AREA)
+        if (image.shape[1], image.shape[0]) != self.size:
+            image = cv2.resize(image, self.size, interpolation=cv2.INTER_AREA)
         return cv2.remap(image, *self._maps(), cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
 
     def covered(self) -> Bool[np.ndarray, "h w"] | None:
         """Pixels of the target that the source sees; none where it sees all."""
         x, y = self._maps()
-        width, height = self._size
+        width, height = self.size
         covered = (x >= -1) & (x <= width) & (y >= -1) & (y <= height)
         return None if covered.all() else covered
 

@@ -9,6 +9,14 @@ from jaxtyping import UInt8
 from geogs.errors import InputError
 from geogs.io.pictures import decoded, header_of
 
+_REDUCED = {
+    1: cv2.IMREAD_COLOR,
+    2: cv2.IMREAD_REDUCED_COLOR_2,
+    4: cv2.IMREAD_REDUCED_COLOR_4,
+    8: cv2.IMREAD_REDUCED_COLOR_8,
+}
+"""How OpenCV is told to decode a picture at a part of its size."""
+
 
 def stored_size(path: Path) -> tuple[int, int] | None:
     """Width and height as stored, from the header alone; none where there is no picture."""
@@ -16,20 +24,52 @@ def stored_size(path: Path) -> tuple[int, int] | None:
     return None if header is None else header[0]
 
 
-def read_picture(path: Path, size: tuple[int, int] | None = None) -> UInt8[np.ndarray, "h w 3"]:
+def read_picture(
+    path: Path, size: tuple[int, int] | None = None, needed: tuple[int, int] | None = None
+) -> UInt8[np.ndarray, "h w 3"]:
     """Read a picture as RGB, not turned by its EXIF orientation: poses are for stored pixels.
 
     Args:
         path: the file.
         size: width and height it must have.
+        needed: width and height that suffice: a JPEG of a known size is decoded at a half, a
+            quarter or an eighth of it, which averages whole blocks of pixels, where that is no
+            smaller. That takes a part of the time and the memory.
 
     Raises:
         InputError: it is missing or damaged, or of another size.
     """
-    picture = decoded(path, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION).picture
-    if picture is None or (size is not None and picture.shape[1::-1] != size):
+    parts = 1
+    if size is not None and needed is not None and _is_jpeg(path):
+        parts = reduction(size, needed)
+    picture = decoded(path, _REDUCED[parts] | cv2.IMREAD_IGNORE_ORIENTATION).picture
+    wrong = size is not None and picture is not None and _size(picture, parts) != size
+    if picture is None or wrong:
         raise InputError(f"{path} is damaged; copy it again, or leave it out.")
     return cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
+
+
+def reduction(size: tuple[int, int], needed: tuple[int, int]) -> int:
+    """The largest of 8, 4, 2 and 1 parts into which both sides can be divided without a rest, such
+    that no side becomes smaller than needed."""
+    fits = (
+        n
+        for n in (8, 4, 2)
+        if all(s % n == 0 and s // n >= least for s, least in zip(size, needed, strict=True))
+    )
+    return next(fits, 1)
+
+
+def _size(picture: UInt8[np.ndarray, "h w 3"], parts: int) -> tuple[int, int]:
+    return parts * picture.shape[1], parts * picture.shape[0]
+
+
+def _is_jpeg(path: Path) -> bool:
+    try:
+        with path.open("rb") as file:
+            return file.read(3) == b"\xff\xd8\xff"
+    except OSError:
+        return False
 
 
 def has_alpha(path: Path) -> bool:

@@ -1,0 +1,115 @@
+"""The images of a source that make the map: chosen by where they were taken, then read."""
+
+from collections.abc import Callable, Iterator, Sequence
+from itertools import islice
+
+import numpy as np
+from jaxtyping import Float64
+
+from geogs.depth.view import Place
+from geogs.errors import InputError
+from geogs.io.sources.base import read_ahead
+from geogs.io.sources.posed.base import PosedSource
+from geogs.mapping.first_look import SmallImage, first_points
+from geogs.mapping.known_poses import FEWEST_POINTS, depth_search
+from geogs.mapping.view_choice import (
+    Sightings,
+    coverage_order,
+    relative_sharpness,
+    scene_points,
+    sightings,
+)
+from geogs.reconstruction import Reconstruction
+from geogs.types import Trajectory
+
+Report = Callable[[str, float], None]
+"""Called with the name of a stage and its finished fraction in [0, 1]."""
+
+# Points of the scene by which the usual depth of each image is told, at most.
+_TELLING_POINTS = 4000
+
+
+class PosedViews:
+    """Gives a reconstruction the images of a source, those first that say most.
+
+    An image is read when it is given, the next one meanwhile; none is kept here.
+    """
+
+    def __init__(self, scene: Reconstruction, source: PosedSource, report: Report) -> None:
+        self._scene = scene
+        self._source = source
+        self._report = report
+        self._order: Iterator[int] = iter(())
+        self._seen: Sightings | None = None
+        T_wc = np.linalg.inv(source.T_cw)
+        known = np.ones(len(source), dtype=bool)
+        scene.know(Trajectory(source.timestamps, T_wc, known))
+
+    def first_look(self) -> Float64[np.ndarray, "n 3"]:
+        """Points of the scene: those of the source, or where some small images match.
+
+        Raises:
+            InputError: there is one image only, or hardly anything matches anywhere.
+        """
+        source, config = self._source, self._scene.config
+        if len(source) < 2:
+            raise InputError("There is only 1 image; depth needs at least two.")
+        if source.points is not None and len(source.points.positions) >= FEWEST_POINTS:
+            return source.points.positions
+
+        def image_at(index: int) -> SmallImage:
+            image = source[index]
+            return image.image, image.mask
+
+        places = [Place(i, T_cw) for i, T_cw in enumerate(source.T_cw)]
+        with self._scene.stopwatch("first look"):
+            return first_points(
+                places, image_at, source.camera, config.mapping.depth, config.search,
+                lambda fraction: self._report("first look", fraction),
+            )  # fmt: skip
+
+    def choose(self, points: Float64[np.ndarray, "n 3"]) -> None:
+        """Put the images into an order in which every beginning shows the scene well."""
+        with self._scene.stopwatch("choosing views"):
+            source, config = self._source, self._scene.config
+            typical, random = usual_depths(source, points), np.random.default_rng(config.seed)
+            shown = scene_points(source.T_cw, source.camera, typical, random)
+            self._seen = sightings(source.T_cw, source.camera, typical, shown)
+            usual = float(np.median(typical))
+            sharpness = relative_sharpness(source.T_cw, usual, source.stored_bytes())
+            order = coverage_order(self._seen, config.mapping.depth, sharpness)
+        self._order = islice(order, config.search.most_views)
+
+    def give(self, count: int | None = None) -> None:
+        """The next so many images, or all that there are.
+
+        Raises:
+            InputError: an image cannot be read.
+        """
+        with self._scene.stopwatch("choosing views"):
+            places = list(islice(self._order, count))
+        self.give_these(places)
+
+    def give_these(self, places: Sequence[int]) -> None:
+        """The images at some places of the source, in this order."""
+        source, scene = self._source, self._scene
+        for done, image in enumerate(read_ahead(source[i] for i in places)):
+            scene.add(image.image, image.T_cw, image.mask, image.timestamp, image.index)
+            self._report("reading", (done + 1) / len(places))
+
+    def times_the_surface(self, places: Sequence[int]) -> float:
+        """How much more of the scene all images see than those at some places of the source."""
+        if self._seen is None:
+            return 1.0
+        some = np.isin(self._seen.view, places)
+        part = len(np.unique(self._seen.point[some])) / len(np.unique(self._seen.point))
+        return 1.0 / max(part, 1e-3)
+
+
+def usual_depths(
+    source: PosedSource, points: Float64[np.ndarray, "n 3"]
+) -> Float64[np.ndarray, "v"]:
+    """Median depth of the points that each image sees."""
+    some = points[:: 1 + len(points) // _TELLING_POINTS]
+    places = [Place(i, T_cw) for i, T_cw in enumerate(source.T_cw)]
+    return np.array([depth_search(p, some, source.camera, 1.0).typical for p in places])

@@ -1,0 +1,223 @@
+"""Where the scene is, seen in a few small images whose poses are known.
+
+A tracker says how far the scene is; here that is found first. A few small images are swept over
+ranges of depth around growing distances, each with neighbours that suit the distance. At the right
+one many pixels match. Of many images only those that are swept or matched are ever asked for.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float64, UInt8
+
+from geogs.config import DepthConfig, SearchConfig
+from geogs.depth.plane_sweep import SweepResult, plane_sweep
+from geogs.depth.sweep_neighbors import parallax_degrees, select_sweep_neighbours
+from geogs.depth.view import DepthView, Place
+from geogs.errors import InputError
+from geogs.geometry.camera import Camera
+from geogs.mapping.known_poses import FEWEST_POINTS
+from geogs.threads import thread_map
+
+# A sweep around a distance d goes from d / NEAR to d * FAR; the next distance is RATIO times d.
+_NEAR, _FAR, _RATIO = 3.0, 6.0, 2.5
+# Parallax in degrees of the nearest two cameras at the first distance, of the farthest at the last.
+_WIDEST, _NARROWEST = 25.0, 1.5
+_NEIGHBOURS, _PLANES = 6, 64
+# Images that try every distance; the others try the best one of these and those next to it.
+_SCOUTS = 3
+# Images among which the first distance to try and neighbours are looked for, at most.
+_CANDIDATES = 200
+# A match counts if the windows are this alike and the next best plane is this much worse.
+_MAX_COST, _MIN_MARGIN = 0.3, 1.0
+# Share of the pixels that must match somewhere. Measured: 0.4 to 0.9 where poses are right, below
+# 0.06 with camera-to-world taken for world-to-camera.
+_LEAST_CLEAR = 0.05
+# Planes at the ends of a range win for whatever lies beyond it.
+_END = 0.04
+
+SmallImage = tuple[UInt8[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"] | None]
+"""An image, of any size of the same view, and which of its pixels count; none where all do."""
+
+
+def distances_to_try(views: Sequence[Place]) -> Float64[np.ndarray, "n"]:
+    """Typical depths that images from these places could show, in a geometric series.
+
+    None where all cameras stand in the same place: then no depth shows.
+    """
+    centres = np.stack([v.center for v in views])
+    apart = np.linalg.norm(centres[:, None] - centres, axis=2)
+    extent = apart.max()
+    if extent <= 1e-9 * max(1.0, float(np.abs(centres).max())):
+        return np.empty(0)
+    nearest = np.where(apart > 1e-6 * extent, apart, np.inf).min(1)
+    first = float(np.median(nearest)) / np.tan(np.radians(_WIDEST))
+    last = extent / np.tan(np.radians(_NARROWEST))
+    count = 2 + int(np.log(last / first) / np.log(_RATIO))
+    return first * _RATIO ** np.arange(count)
+
+
+def first_points(
+    places: Sequence[Place],
+    image_at: Callable[[int], SmallImage],
+    working: Camera,
+    config: DepthConfig,
+    search: SearchConfig,
+    progress: Callable[[float], None],
+) -> Float64[np.ndarray, "n 3"]:
+    """Points of the scene that some of the images show without doubt, in the world.
+
+    Of the distances that can be tried, those at the one where most pixels find a clear match.
+
+    Args:
+        places: where the images were taken; their ids are their places in this sequence.
+        image_at: reads an image by its id.
+        working: the camera of the images, of any size.
+        config: how planes are swept.
+        search: how many images, and how large.
+        progress: called with the finished fraction.
+
+    Raises:
+        InputError: hardly anything matches anywhere.
+    """
+    look = _FirstLook(places, image_at, working, config, search)
+    chosen = _spread(len(places), search.first_views)
+    scouts = [chosen[i] for i in _spread(len(chosen), _SCOUTS)]
+    distances = distances_to_try([places[i] for i in _spread(len(places), _CANDIDATES)])
+    tasks = [(i, float(d)) for d in distances for i in scouts]
+    share = len(tasks) / max(len(tasks) + 3 * (len(chosen) - len(scouts)), 1)
+    found = look.points(tasks, lambda f: progress(share * f))
+    best = max(range(len(distances)), key=lambda k: _count(found, float(distances[k])), default=0)
+    others = [i for i in chosen if i not in scouts]
+    tasks = [(i, float(d)) for d in distances[max(best - 1, 0) : best + 2] for i in others]
+    found |= look.points(tasks, lambda f: progress(share + (1 - share) * f))
+    wanted = max(distances.tolist(), key=lambda d: _count(found, d), default=0.0)
+    points = [p for (_, d), p in found.items() if d == wanted]
+    gathered = np.concatenate(points) if points else np.empty((0, 3))
+    if len(gathered) < max(FEWEST_POINTS, _LEAST_CLEAR * look.pixels(chosen)):
+        raise InputError(
+            "No two images show the same surface from two places where their poses say; are the "
+            "poses, their axes and the intrinsics those of these images?"
+        )
+    return gathered
+
+
+Found = dict[tuple[int, float], Float64[np.ndarray, "n 3"]]
+"""World points by image and distance."""
+
+
+def _count(found: Found, distance: float) -> int:
+    return sum(len(points) for (_, d), points in found.items() if d == distance)
+
+
+def _spread(count: int, most: int) -> list[int]:
+    """At most so many numbers below ``count``, evenly spread, first and last among them."""
+    return np.unique(np.linspace(0, count - 1, min(most, count)).astype(int)).tolist()
+
+
+@dataclass(frozen=True)
+class _Look:
+    """A small view swept around a distance."""
+
+    reference: DepthView
+    neighbours: list[DepthView]
+    distance: float
+    mask: Bool[np.ndarray, "h w"]
+
+
+class _FirstLook:
+    """Small images, each read once when it is first needed, and sweeps over them."""
+
+    def __init__(
+        self,
+        places: Sequence[Place],
+        image_at: Callable[[int], SmallImage],
+        working: Camera,
+        config: DepthConfig,
+        search: SearchConfig,
+    ) -> None:
+        self._places = places
+        self._image_at = image_at
+        edge = min(search.first_edge, max(working.width, working.height))
+        self._camera = working.with_long_edge(edge)
+        self._config = config
+        self._small: dict[int, tuple[DepthView, Bool[np.ndarray, "h w"]]] = {}
+
+    def points(
+        self, tasks: Sequence[tuple[int, float]], progress: Callable[[float], None]
+    ) -> Found:
+        """Clear matches of images around distances; none where neighbours are not well placed."""
+        matched = {task: self._matched_at(*task) for task in tasks}
+        looks = {
+            (i, d): _Look(self._view(i), [self._view(k) for k in others], d, self._mask(i))
+            for (i, d), others in matched.items()
+            if others
+        }
+        clear = thread_map(
+            lambda look: _clear_matches(look, self._camera, self._config),
+            list(looks.values()),
+            progress,
+        )
+        return dict(zip(looks, clear, strict=True))
+
+    def pixels(self, images: Sequence[int]) -> int:
+        """Pixels of some images that count."""
+        return sum(int(self._mask(i).sum()) for i in images)
+
+    def _read(self, index: int) -> tuple[DepthView, Bool[np.ndarray, "h w"]]:
+        if index not in self._small:
+            image, mask = self._image_at(index)
+            size = (self._camera.width, self._camera.height)
+            large = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
+            grey = cv2.resize(large * np.float32(1 / 255), size, interpolation=cv2.INTER_AREA)
+            colours = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+            unknown = np.zeros((1, 1), np.float32)
+            place, inside = self._places[index], np.ones(grey.shape, bool)
+            if mask is not None:
+                inside = cv2.resize(mask.astype(np.uint8), size) > 0
+            view = DepthView(place.id, place.T_cw, grey, grey, colours, unknown, unknown)
+            self._small[index] = (view, inside)
+        return self._small[index]
+
+    def _view(self, index: int) -> DepthView:
+        return self._read(index)[0]
+
+    def _mask(self, index: int) -> Bool[np.ndarray, "h w"]:
+        return self._read(index)[1]
+
+    def _matched_at(self, index: int, distance: float) -> list[int]:
+        """Images to match one with at a distance; none where none is well placed for it."""
+        config, reference = replace(self._config, neighbours=_NEIGHBOURS), self._places[index]
+        others = [p for p in self._places if p.id != reference.id]
+        if not others:
+            return []
+        parallax, turn = parallax_degrees(reference, others, distance)
+        usable = (parallax > config.min_parallax) & (parallax < config.max_parallax)
+        usable &= turn < config.max_turn
+        others = [p for p, good in zip(others, usable, strict=True) if good]
+        if len(others) < min(2, len(self._places) - 1):
+            return []
+        return [others[i].id for i in select_sweep_neighbours(reference, others, distance, config)]
+
+
+def _clear_matches(look: _Look, camera: Camera, config: DepthConfig) -> Float64[np.ndarray, "n 3"]:
+    """World points of the pixels with one good match inside the swept range."""
+    low, high = 1.0 / (_FAR * look.distance), _NEAR / look.distance
+    planes = np.linspace(low, high, _PLANES, dtype=np.float32)
+    nothing = np.zeros_like(look.reference.grey)
+    swept = plane_sweep(
+        look.reference, look.neighbours, camera, planes, nothing + planes[0], nothing, config
+    )
+    v, u = np.nonzero(_is_clear(swept, low, high) & look.mask)
+    local = camera.rays(torch.float64).numpy()[v, u] / swept.inverse_depth[v, u, None]
+    T_cw = look.reference.T_cw
+    return (local - T_cw[:3, 3]) @ T_cw[:3, :3]
+
+
+def _is_clear(swept: SweepResult, low: float, high: float) -> Bool[np.ndarray, "h w"]:
+    place = (swept.inverse_depth - low) / (high - low)
+    inside = (place > _END) & (place < 1.0 - _END)
+    return inside & (swept.cost < _MAX_COST) & (swept.margin > _MIN_MARGIN)

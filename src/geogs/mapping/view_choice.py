@@ -1,0 +1,168 @@
+"""Which of many images with known poses make a map: those that see all of it, from apart.
+
+The scene is stood for by points. An image helps at a point that it sees as much as nobody has
+looked there yet, and as its ray makes an angle with the rays of the images chosen before that
+depth can be told from. Chosen one by one, each time the one that helps most, so that every
+beginning of the order is a good choice of so many.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float32, Float64, Int64
+
+from geogs.config import DepthConfig
+from geogs.geometry.camera import Camera
+
+# Rays by which each image says where the scene is, across and down.
+_ACROSS, _DOWN = 4, 3
+# Points that stand for the scene, at most, and how many of their cells the usual depth takes.
+_POINTS, _CELLS = 1000, 10.0
+# A point counts as seen from 1/x to x times the depth that is usual in the image.
+_DEPTHS = 3.0
+# Rays of another image that are as far apart see another side, degrees.
+_SAME_SIDE = 75.0
+# What a point is worth that one image sees, of one that two see well; and of one whose rays are
+# too far apart to be matched.
+_ALONE, _UNMATCHED = 0.5, 0.5
+# Newness below which an image is taken for a copy of one that was chosen.
+_COPY = 0.02
+# Images next to each that tell how much detail is usual there; least worth of a blurred one.
+_ALIKE, _LEAST_SHARP = 6, 0.3
+
+
+@dataclass(frozen=True, eq=False)
+class Sightings:
+    """Which images see which of some points of the scene, and along which ray: one row for each
+    point and image, those of a point next to each other."""
+
+    point: Int64[np.ndarray, "s"]
+    view: Int64[np.ndarray, "s"]
+    ray: Float32[np.ndarray, "s 3"]
+    """Unit, from the camera to the point."""
+    views: int
+    """Number of images."""
+
+
+def scene_points(
+    T_cw: Float64[np.ndarray, "v 4 4"],
+    camera: Camera,
+    typical: Float64[np.ndarray, "v"],
+    random: np.random.Generator,
+) -> Float64[np.ndarray, "p 3"]:
+    """Points about where the images see the scene, evenly spread: at the usual depth of each."""
+    u = (np.arange(_ACROSS) + 0.5) / _ACROSS * camera.width
+    v = (np.arange(_DOWN) + 0.5) / _DOWN * camera.height
+    x, y = np.meshgrid((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy)
+    rays = np.stack([x.ravel(), y.ravel(), np.ones(x.size)], 1)
+    local = rays * typical[:, None, None] - T_cw[:, None, :3, 3]
+    points = (local @ T_cw[:, :3, :3]).reshape(-1, 3)
+    side = float(np.median(typical)) / _CELLS
+    _, first = np.unique(np.floor(points / side).astype(np.int64), axis=0, return_index=True)
+    if len(first) > _POINTS:
+        first = random.choice(first, _POINTS, replace=False)
+    return points[np.sort(first)]
+
+
+def sightings(
+    T_cw: Float64[np.ndarray, "v 4 4"],
+    camera: Camera,
+    typical: Float64[np.ndarray, "v"],
+    points: Float64[np.ndarray, "p 3"],
+) -> Sightings:
+    """Points in the image of each camera, not much nearer or farther than is usual there."""
+    point, view, ray = [], [], []
+    for i, T in enumerate(T_cw):
+        x, y, z = (points @ T[:3, :3].T + T[:3, 3]).T
+        ahead = (z > typical[i] / _DEPTHS) & (z < typical[i] * _DEPTHS)
+        safe = np.where(ahead, z, 1.0)
+        u, v = camera.fx * x / safe + camera.cx, camera.fy * y / safe + camera.cy
+        inside = (u > 0) & (v > 0) & (u < camera.width - 1) & (v < camera.height - 1)
+        seen = np.flatnonzero(ahead & inside)
+        way = points[seen] + T[:3, :3].T @ T[:3, 3]
+        point.append(seen)
+        view.append(np.full(len(seen), i))
+        ray.append((way / np.linalg.norm(way, axis=1, keepdims=True)).astype(np.float32))
+    by_point = np.argsort(np.concatenate(point), kind="stable")
+    all_points, all_views = np.concatenate(point)[by_point], np.concatenate(view)[by_point]
+    return Sightings(all_points, all_views, np.concatenate(ray)[by_point], len(T_cw))
+
+
+def coverage_order(
+    seen: Sightings, config: DepthConfig, sharpness: Float64[np.ndarray, "v"]
+) -> Iterator[int]:
+    """Places of the images, the one that adds most first; copies of chosen ones are left out.
+
+    Args:
+        seen: which points the images see.
+        config: its ``parallax`` is the best angle between rays, ``max_parallax`` the largest that
+            matches.
+        sharpness: by which the worth of each image is multiplied, at most 1.
+    """
+    points = int(seen.point.max(initial=-1)) + 1
+    begin = np.searchsorted(seen.point, np.arange(points + 1))
+    by_view = np.argsort(seen.view, kind="stable")
+    own = np.searchsorted(seen.view[by_view], np.arange(seen.views + 1))
+    nearest = np.full(len(seen.point), -1.0, np.float32)  # cosine to the nearest chosen ray
+    newness = np.ones(len(seen.point))
+    worth = _ALONE * newness
+    sees = np.diff(own).astype(np.float64)
+    gain, fresh = _ALONE * sees, sees.copy()
+    count, left = np.zeros(points, np.int64), np.ones(seen.views, bool)
+    while True:
+        left &= (fresh > _COPY * sees) | (sees == 0)
+        if not left.any():
+            return
+        best = int(np.argmax(np.where(left, gain * sharpness, -1.0)))
+        yield best
+        left[best] = False
+        rows = by_view[own[best] : own[best + 1]]
+        some = seen.point[rows]
+        count[some] += 1
+        sizes = begin[some + 1] - begin[some]
+        rivals = np.repeat(begin[some] - np.cumsum(sizes) + sizes, sizes) + np.arange(sizes.sum())
+        own_ray = np.repeat(seen.ray[rows], sizes, axis=0)
+        cosine = np.einsum("ni,ni->n", seen.ray[rivals], own_ray)
+        nearest[rivals] = np.maximum(nearest[rivals], cosine)
+        now = _newness(nearest[rivals], config)
+        value = now * np.repeat(_worth(count[some]), sizes)
+        of = seen.view[rivals]
+        fresh += np.bincount(of, now - newness[rivals], seen.views)
+        gain += np.bincount(of, value - worth[rivals], seen.views)
+        newness[rivals], worth[rivals] = now, value
+
+
+def _newness(cosine: Float32[np.ndarray, "*n"], config: DepthConfig) -> Float64[np.ndarray, "*n"]:
+    """How much a ray at an angle to the nearest chosen one tells: nothing if it is the same."""
+    angle = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+    matched = np.minimum(angle / config.parallax, 1.0)
+    matched = np.where(angle > config.max_parallax, _UNMATCHED, matched)
+    return np.where(angle > _SAME_SIDE, 1.0, matched).astype(np.float64)
+
+
+def _worth(count: Int64[np.ndarray, "*n"]) -> Float64[np.ndarray, "*n"]:
+    """What another ray to points is worth that so many see; the second one most."""
+    return np.where(count == 0, _ALONE, 1.0 / np.maximum(count, 1))
+
+
+def relative_sharpness(
+    T_cw: Float64[np.ndarray, "v 4 4"], typical: float, detail: Sequence[int]
+) -> Float64[np.ndarray, "v"]:
+    """How much detail each image has, of what is usual of those taken next to it; 1 at most.
+
+    Args:
+        T_cw: where they were taken.
+        typical: the usual depth, by which turns and ways are compared.
+        detail: of each image, such as the bytes that it takes compressed.
+    """
+    own = np.asarray(detail, np.float64)
+    if len(own) <= _ALIKE:
+        return np.ones(len(own))
+    centres = -(np.swapaxes(T_cw[:, :3, :3], 1, 2) @ T_cw[:, :3, 3:])[:, :, 0]
+    places = np.concatenate([centres / typical, T_cw[:, 2, :3]], 1)
+    usual = np.empty(len(own))
+    for i, place in enumerate(places):
+        around = np.argpartition(((places - place) ** 2).sum(1), _ALIKE)[: _ALIKE + 1]
+        usual[i] = np.median(own[around])
+    return np.clip(own / np.maximum(usual, 1e-12), _LEAST_SHARP, 1.0)
