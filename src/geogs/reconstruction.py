@@ -19,11 +19,11 @@ from geogs.mapping.depth_schedule import group_size, search_depths, spread_order
 from geogs.mapping.first_look import SmallImage, first_points
 from geogs.mapping.map_frame import MapFrame
 from geogs.mapping.mapper import Mapper
+from geogs.mapping.near_views import NearViews
 from geogs.mapping.rendered import MapRenderer
 from geogs.mapping.state import MapperState
 from geogs.mapping.time_shares import ViewCost, affordable_views, helpers
 from geogs.mapping.training.base import TrainingPlace
-from geogs.mapping.window import views_around
 from geogs.on_demand import OnDemand
 from geogs.stopwatch import Stopwatch
 from geogs.threads import on_one_torch_thread
@@ -276,9 +276,9 @@ class Reconstruction:
 
     def neighbouring(self, count: int) -> list[int]:
         """Ids of at most so many mapped keyframes that were taken near each other."""
-        mapped = [self.mapper.views[i] for i in self.mapper.mapped]
-        around = views_around(mapped[0], mapped, count)
-        return [view.id for view in around]
+        mapped, near = self.mapper.mapped, NearViews(self.mapper.views)
+        first = self.mapper.views[next(iter(mapped))]
+        return [view.id for view in near.around(first, mapped, count)]
 
     def _in_world(self, renders: Sequence[RenderedKeyframe]) -> Sequence[RenderedKeyframe]:
         frame, poses = self._frame, self._poses

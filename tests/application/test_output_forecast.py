@@ -3,8 +3,7 @@
 import pytest
 
 from geogs.application import output_forecast
-from geogs.application.output_forecast import CAUTION, REPORT, OutputForecast, StageTimes
-from geogs.evaluation import plots
+from geogs.application.output_forecast import CAUTION, OutputForecast, StageTimes
 from geogs.reconstruction import Reconstruction
 from posed_scene import ball_and_wall
 
@@ -49,8 +48,8 @@ def scene() -> Reconstruction:
 def test_the_second_rehearsal_counts_by_views_and_by_surface(monkeypatch, scene):
     clock, drawn, rehearsed = FakeClock(), [], []
 
-    def draw(path: object, trajectory: object) -> None:
-        drawn.append(path)
+    def draw(folder: object, *of: object) -> None:
+        drawn.append(folder)
         clock.now += 9.0 if len(drawn) == 1 else 0.5
 
     def write(folder: object, scene: object, camera: object, renders: list, images: bool) -> None:
@@ -64,14 +63,14 @@ def test_the_second_rehearsal_counts_by_views_and_by_surface(monkeypatch, scene)
         clock.now += 2.0
         progress("merge", 1, 1)
 
-    monkeypatch.setattr(plots, "plot_path", draw)
+    monkeypatch.setattr(output_forecast, "write_report", draw)
     monkeypatch.setattr(output_forecast, "write_keyframes", write)
     monkeypatch.setattr(output_forecast, "extract_mesh", extract)
     cost = OutputForecast(scene, clock).first(lambda places: 3.0)
     assert rehearsed == [1, 3]
     # Three views: 0.2 s of files and 0.3 of fusion for each; 3 s for a third of the surface.
     assert cost.a_view == pytest.approx(CAUTION * 0.5)
-    assert cost.once == pytest.approx(CAUTION * (REPORT * 0.5 + 3.0 * 3.0))
+    assert cost.once == pytest.approx(CAUTION * (0.5 + 3.0 * 3.0))
     assert cost.of(10) == pytest.approx(cost.once + 10 * cost.a_view)
 
 

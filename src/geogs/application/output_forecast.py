@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from geogs.application.keyframe_files import write_keyframes
+from geogs.application.report import write_report
 from geogs.application.surfaces import fusion_views
 from geogs.errors import InputError
 from geogs.mesh.extract import extract_mesh, plan_volume
@@ -25,8 +26,6 @@ Share = Callable[[Sequence[int]], float]
 
 VIEWS = 3
 """Views of the rehearsal; and of the one before it, which makes ready what is needed but once."""
-REPORT = 5.0
-"""What the report takes, and what else is written once, in times of one picture of the path."""
 CAUTION = 1.1
 """By how much more is kept than was measured, on two CPU cores: a larger volume, with more vertices
 to look for in each image, and the disks, which are not there yet."""
@@ -59,8 +58,8 @@ class StageTimes:
 class _Rehearsal:
     """Seconds that some views took."""
 
-    picture: float
-    """A picture of the path."""
+    report: float
+    """The report, and what else is written once."""
     a_view: float
     """Each view."""
     surface: float
@@ -111,7 +110,7 @@ class OutputForecast:
 
 
 def _cost(found: _Rehearsal, times_the_surface: float) -> OutputCost:
-    once = CAUTION * (REPORT * found.picture + times_the_surface * found.surface)
+    once = CAUTION * (found.report + times_the_surface * found.surface)
     a_view = CAUTION * found.a_view
     _log.info(
         "mesh and files: %.1f s, %.1f times the surface, and %.3f s an image",
@@ -121,19 +120,18 @@ def _cost(found: _Rehearsal, times_the_surface: float) -> OutputCost:
 
 
 def _rehearse(scene: Reconstruction, views: list[int], clock: Clock) -> _Rehearsal:
-    from geogs.evaluation.plots import plot_path
-
-    start = clock()
+    start, mesh = clock(), None
     with tempfile.TemporaryDirectory(prefix="geogs-rehearsal-") as folder:
-        plot_path(Path(folder) / "trajectory.png", scene.trajectory())
-        drawn = clock()
         renders = scene.depth_maps(of=views)
         write_keyframes(Path(folder), scene, scene.camera, renders, True)
-    of_views, times = clock() - drawn, StageTimes(clock)
-    try:
-        extract_mesh(fusion_views(renders), scene.config.mesh, times)
-    except InputError:  # these views show no surface: the others may
-        times("merge", 1, 1)
+        of_views, times = clock() - start, StageTimes(clock)
+        try:
+            mesh = extract_mesh(fusion_views(renders), scene.config.mesh, times)
+        except InputError:  # these views show no surface: the others may
+            times("merge", 1, 1)
+        fused = clock()
+        write_report(Path(folder) / "report", scene.trajectory(), renders, mesh, {})
+        report = clock() - fused
     of_views += times.seconds.get("views", 0.0) * len(views) / max(len(views) - 1, 1)
     surface = times.seconds.get("surface", 0.0)
-    return _Rehearsal(drawn - start, of_views / len(views), surface, clock() - start)
+    return _Rehearsal(report, of_views / len(views), surface, clock() - start)
