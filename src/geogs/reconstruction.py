@@ -323,15 +323,17 @@ class Reconstruction:
             new = [v for v in mapper.views.values() if v.search is None]
             known.expect_depths(new, points, self.camera, search.margin)
         ids = [*mapper.views] if self._all is not None else spread_order(mapper.keyframe_ids)
-        ids = ids[: self._wanted or len(ids)]
-        start, end = time.perf_counter(), self._end
+        wanted = self._wanted or len(ids)
+        start, end, before = time.perf_counter(), self._end, len(mapper.mapped)
         until = None if end is None else start + search.depth_share * (end - start)
+        if until is not None:  # each that is searched beyond those is paid for in the mesh, too
+            until -= self.output_cost.a_view * group_size()
         order = [i for i in ids if not mapper.views[i].has_depth]
         search_depths(mapper, order, lambda f: report(share * f), until)
         now = time.perf_counter()
-        again = (now - start) * len(ids) / max(len(order), 1)
+        again = (now - start) * wanted / max(len(mapper.mapped) - before, 1)
         affordable = end is None or 3 * again < end - now
-        if search.repeat and affordable and len(mapper.mapped) >= len(ids):
+        if search.repeat and affordable and len(mapper.mapped) >= wanted:
             views = [mapper.views[i] for i in mapper.mapped]
             mapper.check_depths()
             sure = known.dense_points(views, mapper.cameras.render, self._random)
