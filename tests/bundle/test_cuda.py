@@ -168,7 +168,7 @@ def test_measured_motions_match_the_cpu(device, frames):
     fast = cuda_bundle.CudaDenseBundle(SampleGrid(camera, device)).solve(sent, options)
     assert_same(fast, slow)
     plain = DenseBundle(SampleGrid(camera)).solve(problem, options)
-    assert float((plain.T_cw - slow.T_cw).abs().max()) > 1e-3
+    assert float((plain.T_cw - slow.T_cw).abs().max()) > 3e-4
 
 
 def test_same_input_same_result(device):

@@ -108,4 +108,5 @@ def test_small_steps_end_the_adjustment(device):
     solver = cuda_streamed.CudaStreamedBundle(SampleGrid(grid.camera, device))
     ended = solver.solve(start, BundleOptions(iterations=50, huber=10.0, tolerance=0.5))
     one = solver.solve(start, BundleOptions(iterations=1, huber=10.0))
-    assert torch.equal(ended.T_cw, one.T_cw)
+    # Sums on a GPU are not always in the same order.
+    torch.testing.assert_close(ended.T_cw, one.T_cw, rtol=0, atol=1e-9)
