@@ -125,8 +125,9 @@ def test_few_slots_serve_many_keyframes():
     known = KnownViews(CAMERAS, torch.device("cpu"), 2)
     a, b = views()
     pose = se3_exp(torch.full((6,), 0.2, dtype=torch.float64))
-    a.pool.add(replace(a.keyframe, id=7, T_cw=pose))
-    c = MapView(replace(a.keyframe, id=7, T_cw=pose), a.pool)
+    a.keyframe.poses[7] = pose
+    a.pool.add(replace(a.keyframe, id=7))
+    c = MapView(replace(a.keyframe, id=7), a.pool)
     a.pool.set_depth(7, a.dense)
     first = known.slots([a, b])
     known.table.rendered.fill_(1)

@@ -45,6 +45,8 @@ def averaged_over_planes(
     ``reach``; so planes stay as they are, however slanted, and steps stay steps. Pixels without
     depth, and those that are seen at less than six degrees, stay as they are and say nothing.
     """
+    if reach**2 == 0:
+        return depth
     slope = (normal * camera.rays(depth.dtype, depth.device)).sum(-1)
     good = (depth > 0) & (slope.abs() > 0.1)
     inverse = torch.where(good, 1 / depth.clamp(min=1e-9), 0.0)

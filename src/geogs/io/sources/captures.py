@@ -1,5 +1,6 @@
 """Images with poses that an app exported: Polycam's folder, nerfstudio's ``transforms.json``."""
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -47,7 +48,10 @@ def open_polycam(folder: Path) -> ImageList:
             rows = [[document[f"t_{i}{j}"] for j in range(4)] for i in range(3)]
             T_wc = np.array([*rows, [0, 0, 0, 1]], dtype=np.float64)
             lens = [float(document[k]) for k in ("fx", "fy", "cx", "cy")]
-            lenses.append([*lens, float(document["width"]), float(document["height"])])
+            lens += [float(document["width"]), float(document["height"])]
+            if not all(map(math.isfinite, lens)):
+                raise ValueError
+            lenses.append(lens)
         except UNUSABLE:
             raise InputError(f"{path} holds no camera of Polycam; export it again.") from None
         pose = rigid(T_wc @ OPENCV_FROM_OPENGL)

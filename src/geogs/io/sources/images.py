@@ -1,6 +1,7 @@
 """Images as files: a folder of photographs or frames, and the list that the data sets share."""
 
 import re
+import unicodedata
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -116,8 +117,14 @@ def _folders_of_project(folder: Path, place: Path) -> list[Path]:
 
 def natural_key(name: str) -> list[tuple[int, int, str]]:
     """Sort key that puts ``frame10`` after ``frame9``: runs of digits compare as numbers."""
-    parts = re.split(r"(\d+)", name.lower())
-    return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in parts if part]
+    key = []
+    for part in re.split(r"(\d+)", name.lower()):
+        if part.isdecimal():  # of two numbers the longer is larger; they may be too long for an int
+            digits = "".join(str(unicodedata.decimal(c)) for c in part).lstrip("0")
+            key.append((0, len(digits), digits))
+        elif part:
+            key.append((1, 0, part))
+    return key
 
 
 def in_order_of_time(paths: Sequence[Path]) -> list[ImageFile]:

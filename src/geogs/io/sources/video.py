@@ -91,9 +91,16 @@ def turn_upright(
     return np.ascontiguousarray(np.rot90(image, -quarter_turns))
 
 
+def _container(path: Path) -> InputContainer:
+    try:
+        return av.open(str(path), metadata_errors="replace", options=_LOCAL)
+    except TypeError:  # PyAV 19 no longer has it
+        return av.open(str(path), options=_LOCAL)
+
+
 def _open(path: Path) -> InputContainer:
     try:
-        container = av.open(str(path), metadata_errors="replace", options=_LOCAL)
+        container = _container(path)
     except (av.error.FFmpegError, OSError) as error:
         raise InputError(
             f"{path} cannot be opened as a video ({error.strerror}); "

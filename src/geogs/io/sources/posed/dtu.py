@@ -69,7 +69,10 @@ def decompose(
     signs = np.sign(np.diag(K))
     K, R = K * signs, signs[:, None] * R
     T_cw[:3, :3] = R
-    T_cw[:3, 3] = np.linalg.solve(K, P[:, 3])
+    try:
+        T_cw[:3, 3] = np.linalg.solve(K, P[:, 3])
+    except np.linalg.LinAlgError:
+        return np.full((3, 3), np.nan), np.full((4, 4), np.nan)
     return K / K[2, 2], T_cw
 
 

@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -126,7 +126,8 @@ def _opened(path: Path) -> Iterator[Any]:
     except Exception as error:  # what an index that opened well may still lead its reader to
         raise InputError(f"{path} is damaged as a recording of ROS; copy it again.") from error
     finally:
-        bag.close()
+        with suppress(Exception):  # a damaged index may lead it astray here, too
+            bag.close()
 
 
 def _chosen(bag: Any, path: Path, asked: str) -> str:
