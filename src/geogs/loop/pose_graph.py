@@ -107,7 +107,7 @@ class PoseGraphOptions:
     """Most steps of every other stage."""
     iterations: int = 20
     """Most steps of the last stage."""
-    tolerance: float = 1e-9
+    tolerance: float = 1e-6
     """A stage ends when a step lowers the cost by no more than this fraction of it, or when less
     than this is left, in squared standard deviations."""
     damping: float = 1e-8
@@ -268,7 +268,8 @@ class _Problem:
             state, steps = candidate, steps + 1
             damping = max(damping / 10, self.options.damping)
             linear = self.linearise(state, damping)
-            cost = self.cost(state, width, linear.valid)
+            # Which matches are valid has changed with the state; without any nothing has.
+            cost = lowered if self.graph.matches is None else self.cost(state, width, linear.valid)
             if gain <= self.options.tolerance * cost or cost < self.options.tolerance:
                 break
         return state, steps

@@ -71,8 +71,11 @@ class Odometry:
 
     def look(self) -> None:
         """Find the scale, if it is not settled, by the latest keyframes."""
+        ids = self.keyframes.ids[-REACH:]
+        if not ids or self.keyframes[ids[-1]].pose is None:
+            return
         if self.scale is None or self.deviation > SETTLED:
-            self._take(self._vote(self.keyframes.ids[-REACH:]))
+            self._take(self._vote(ids))
 
     def look_at_all(self) -> None:
         """Find the scale by all keyframes."""
