@@ -5,6 +5,7 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from secrets import token_hex
 from tempfile import TemporaryFile
 from typing import BinaryIO
 
@@ -25,7 +26,8 @@ def atomic_file(path: str | Path) -> Iterator[BinaryIO]:
         OutputError: the disk is full, or the place cannot be written.
     """
     path = Path(path)
-    unfinished = path.with_name(f".{path.name}.{os.getpid()}.part")
+    # Others may write the same file at the same time, also from another machine.
+    unfinished = path.with_name(f".{path.name}.{token_hex(6)}.part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with unfinished.open("wb") as stream:
