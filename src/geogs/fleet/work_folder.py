@@ -10,6 +10,7 @@ import shutil
 import tempfile
 from hashlib import sha256
 from pathlib import Path
+from secrets import token_hex
 
 from geogs.errors import InputError, OutputError
 from geogs.fleet.places import Place
@@ -81,7 +82,7 @@ def fetched(source: FleetSource, scratch: Path) -> Path:
     place = Place(source.address)
     target = scratch / "source" / (place.name or "source")
     if not target.exists():
-        unfinished = target.with_name(f"{target.name}.{os.getpid()}.part")
+        unfinished = target.with_name(f"{target.name}.{token_hex(6)}.part")
         place.download(unfinished)
         try:
             os.replace(unfinished, target)

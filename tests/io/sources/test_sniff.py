@@ -63,6 +63,10 @@ def test_names_that_are_times(tmp_path):
 def test_natural_key_orders_numbers_inside_names():
     names = ["a10", "a9", "a1b2", "a1", "b0", "7"]
     assert sorted(names, key=natural_key) == ["7", "a1", "a1b2", "a9", "a10", "b0"]
+    long, longer = "9" * 5000, "1" + "0" * 5000  # too long for Python to make numbers of
+    assert sorted([longer, long, "007", "6", "8"], key=natural_key) == [
+        "6", "007", "8", long, longer,
+    ]  # fmt: skip
 
 
 def test_working_image_is_shrunk_with_its_camera(tmp_path):

@@ -289,6 +289,20 @@ def test_decompose_any_scale_and_sign():
         np.testing.assert_allclose(T[:3], np.c_[R, t], atol=1e-11)
 
 
+@pytest.mark.parametrize(
+    "rows",
+    [
+        [[1, 0, 0], [0, 1, 0], [0, 0, 0]],
+        # Its determinant is not quite nothing, but the camera that comes out is singular.
+        [[0, -1, 3], [-2, 3, -3], [-2, 2, 1e-15]],
+    ],
+)
+def test_a_matrix_of_no_camera_is_said_to_be_none(rows):
+    found_K, T = decompose(np.c_[np.array(rows, float), np.ones(3)])
+    assert np.isnan(found_K).all()
+    assert np.isnan(T).all()
+
+
 def test_dtu_needs_all_images(room, tmp_path):
     write_dtu(room, tmp_path)
     (tmp_path / "image" / "000004.png").unlink()
