@@ -108,7 +108,7 @@ DROPPED = {
     "memory", "held",  # of a flow operator, of a GPU
     "refusals", "_warned", "_motion",  # for who looks on
     "_recent", "encoded", "_values", "own_encoded",  # made again
-    "operator", "_locator", "_search_thread", "_start",
+    "operator", "_locator", "_search_thread", "_start", "_ahead",
 }  # fmt: skip
 """In memory for speed alone, or of the process."""
 

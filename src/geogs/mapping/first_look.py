@@ -39,7 +39,7 @@ _LEAST_CLEAR = 0.05
 # Planes at the ends of a range win for whatever lies beyond it.
 _END = 0.04
 
-SmallImage = tuple[UInt8[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"] | None]
+SmallImage = tuple[UInt8[np.ndarray, "h w 3"], Bool[np.ndarray, "mh mw"] | None]
 """An image, of any size of the same view, and which of its pixels count; none where all do."""
 
 
