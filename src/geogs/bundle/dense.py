@@ -66,11 +66,11 @@ def stepped(
     delta: Float[Tensor, "n p"],
     options: BundleOptions,
 ) -> tuple[Float[Tensor, "n 4 4"], Float[Tensor, "n p"]]:
-    """Poses and inverse depths after a step of those that are free."""
+    """Poses and inverse depths, each on its device, after a step of those that are free."""
     d = (d + delta).clamp(options.min_inverse_depth, options.max_inverse_depth)
     return (
         torch.where(problem.free_pose[:, None, None], move(xi, T), T),
-        torch.where(problem.free_depth[:, None], d, problem.inverse_depth),
+        torch.where(problem.free_depth[:, None].to(d.device), d, problem.inverse_depth),
     )
 
 

@@ -5,7 +5,7 @@ from itertools import pairwise
 from jaxtyping import Float
 from torch import Tensor
 
-from geogs.tracking.features import surer_flow
+from geogs.tracking.features import surer_flows
 from geogs.tracking.flow.base import FlowMatch
 from geogs.tracking.flow.filled import filled_positions
 from geogs.tracking.graph import FrameGraph
@@ -73,8 +73,6 @@ class ChainedFlows:
         if not new:
             return
         first, second = ([keyframes[p[k]].encoded for p in new] for k in (0, 1))
-        matches = operator.measure(first, second, fine=False)
-        for n, pair in enumerate(new):
-            one = [FlowMatch(m.pixels[n : n + 1], m.weight[n : n + 1]) for m in matches]
-            there, back = surer_flow(keyframes.grid, operator, first[n], second[n], *one)
+        flows = surer_flows(keyframes.grid, operator, first, second)
+        for pair, (there, back) in zip(new, flows, strict=True):
             self._steps[pair] = there.pixels[0], back.pixels[0]

@@ -101,6 +101,18 @@ def surer_flow(
     return seeded if _matched(seeded[0]) > 0.5 * share else (there, back)
 
 
+def surer_flows(
+    grid: SampleGrid, operator: FlowOperator, first: list[Any], second: list[Any]
+) -> list[tuple[FlowMatch, FlowMatch]]:
+    """The same of pairs of images, from a cold start: from the first to the second, and back."""
+    matches = operator.measure(first, second, fine=False)
+    found = []
+    for n, pair in enumerate(zip(first, second, strict=True)):
+        there, back = (FlowMatch(m.pixels[n : n + 1], m.weight[n : n + 1]) for m in matches)
+        found.append(surer_flow(grid, operator, *pair, there, back))
+    return found
+
+
 def spread_positions(
     grid: SampleGrid, points: Float[Tensor, "n 2"], moved: Float[Tensor, "n 2"]
 ) -> Float[Tensor, "p 2"]:

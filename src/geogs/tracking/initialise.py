@@ -26,7 +26,7 @@ from geogs.keyframes.keyframe import Keyframe
 from geogs.keyframes.store import Segment
 from geogs.threads import thread_map
 from geogs.tracking.evidence import Evidence, correlation_at
-from geogs.tracking.features import surer_flow
+from geogs.tracking.features import surer_flows
 from geogs.tracking.flow.base import FlowMatch
 from geogs.tracking.graph import FrameGraph
 from geogs.tracking.motion import pnp
@@ -156,9 +156,8 @@ def _place_all(graph: FrameGraph, flows: Sequence[FlowMatch], best: tuple[int, T
 
 def placed_after(graph: FrameGraph, before: Keyframe, state: Keyframe) -> Float[Tensor, "4 4"]:
     """Pose of a keyframe by PnP on the depth of the one before it, or that one's pose."""
-    grid, pair = graph.keyframes.grid, (before.encoded, state.encoded)
-    matches = graph.operator.measure(pair[:1], pair[1:], fine=False)
-    match, _ = surer_flow(grid, graph.operator, *pair, *matches)
+    grid, pair = graph.keyframes.grid, [before.encoded, state.encoded]
+    ((match, _),) = surer_flows(grid, graph.operator, pair[:1], pair[1:])
     T_rel = pnp(grid, before.inverse_depth, match.pixels[0], match.sure()[0])
     return before.T_cw if T_rel is None else T_rel.to(before.T_cw) @ before.T_cw
 

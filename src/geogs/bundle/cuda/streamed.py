@@ -18,9 +18,9 @@ from torch import Tensor
 from geogs.bundle.base import BundleOptions, BundleResult
 from geogs.bundle.camera_system import SparseCameraSystem
 from geogs.bundle.cuda.dense import block_size, joined_edges
+from geogs.bundle.dense import stepped
 from geogs.bundle.linearise import motion_stars
 from geogs.bundle.problem import MEASURED_HUBER, StreamedProblem, known_before, source_chunks
-from geogs.geometry.lie import move
 from geogs.gpu.kernels import kernels_for
 from geogs.gpu.transfer import to_device
 from geogs.keyframes.grid import SampleGrid
@@ -109,7 +109,7 @@ class CudaStreamedBundle:
             if not bool(torch.isfinite(xi).all() and torch.isfinite(delta).all()):
                 finite = False
                 break
-            T, d = self._stepped(problem, T, d, xi, delta, options)
+            T, d = stepped(problem, T, d, xi, delta, options)
             if float(xi.abs().max()) < options.tolerance:
                 break
         return BundleResult(T, d, information, residual, finite)
@@ -186,21 +186,6 @@ class CudaStreamedBundle:
             )  # fmt: skip
             delta[chunk.sources.to(d.device)] = steps
         return delta
-
-    @staticmethod
-    def _stepped(
-        problem: StreamedProblem,
-        T: Float[Tensor, "n 4 4"],
-        d: Float[Tensor, "n p"],
-        xi: Float[Tensor, "n 6"],
-        delta: Float[Tensor, "n p"],
-        options: BundleOptions,
-    ) -> tuple[Float[Tensor, "n 4 4"], Float[Tensor, "n p"]]:
-        """Poses on the CPU, depths where they are."""
-        low, high = options.min_inverse_depth, options.max_inverse_depth
-        moved = torch.where(problem.free_pose[:, None, None], move(xi, T), T)
-        free = problem.free_depth.to(d.device)[:, None]
-        return moved, torch.where(free, (d + delta).clamp(low, high), d)
 
 
 def _chunk(

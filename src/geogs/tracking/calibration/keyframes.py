@@ -11,7 +11,7 @@ from torch import Tensor
 from geogs.config import TrackingConfig
 from geogs.geometry.camera import Camera
 from geogs.keyframes.grid import SampleGrid
-from geogs.tracking.features import surer_flow
+from geogs.tracking.features import surer_flows
 from geogs.tracking.flow.base import FlowMatch, FlowOperator
 from geogs.tracking.flow.filled import filled_flow, filled_positions
 from geogs.tracking.keyframe_choice import calls_for_keyframe
@@ -95,16 +95,14 @@ def flows_from_first(
     """Flow from the first view to each later one: chained over the steps and measured again."""
     there: Float[Tensor, "p 2"] = grid.pixels
     encoded = [v.encoded for v in views]
+    steps = surer_flows(grid, operator, encoded[:-1], encoded[1:])
     back = grid.pixels
     flows = []
     for k in range(1, len(views)):
         step = views[k].step
         assert step is not None
-        pair = encoded[k - 1], encoded[k]
-        both = operator.measure(pair[:1], pair[1:], fine=False)
-        _, back_match = surer_flow(grid, operator, *pair, *both)
         there = there + grid.sample_field(filled_flow(grid, step), there)
-        back_step = filled_positions(grid, back_match)
+        back_step = filled_positions(grid, steps[k - 1][1])
         back = back_step + grid.sample_field(back - grid.pixels, back_step)
         match, reverse = operator.measure(
             [encoded[0]], [encoded[k]], there[None], back[None], fine=True
