@@ -1,6 +1,7 @@
 # make demo     set up, run the whole system on a small synthetic room, print the error table
 # make quick    set up, lint, type-check, test what does not run the whole system: the inner loop
-# make test     set up, lint, type-check, test everything
+# make test     set up, lint, type-check, test all but what takes long and seldom fails alone
+# make test-all set up, lint, type-check, test everything
 # make fuzz     set up, damage files and options at random, FUZZ (1000) times each
 # make format   set up, sort imports, mend what the linter can, format
 PYTHON ?= python3
@@ -14,15 +15,20 @@ PYTEST := OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n 
 TORCH  := 2.13.0
 TORCH_CPU_INDEX := https://download.pytorch.org/whl/cpu
 
-.PHONY: demo quick test fuzz lint format setup clean
+.PHONY: demo quick test test-all fuzz lint kernels format setup clean
 
 demo: $(STAMP)
 	$(BIN)/geogs demo -o out/demo
 
 quick: lint
-	$(PYTEST) -m 'not system and not gpu'
+	$(PYTEST) -m 'not system and not gpu and not long'
 
-test: lint
+test: $(STAMP)
+	$(MAKE) -j 2 lint kernels
+	$(PYTEST) -m 'not long'
+
+test-all: $(STAMP)
+	$(MAKE) -j 2 lint kernels
 	$(PYTEST)
 
 lint: $(STAMP)
@@ -30,6 +36,10 @@ lint: $(STAMP)
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports
 	$(BIN)/mypy
+
+# Compiled where nothing is yet: on the core that lint leaves, and once instead of by each process.
+kernels: $(STAMP)
+	-find src -name '*.nbi' | grep -q . || $(PYTEST) -n 0 tests/application/scale/test_metric_run.py
 
 fuzz: $(STAMP)
 	GEOGS_FUZZ=$(FUZZ) $(PYTEST) tests/fuzz tests/cli/test_option_values.py

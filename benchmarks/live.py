@@ -9,7 +9,9 @@ tells where the time went.
 """
 
 import argparse
+import cProfile
 import json
+import pstats
 import time
 from dataclasses import replace
 
@@ -33,6 +35,9 @@ def main() -> None:
     parser.add_argument("--warm", type=float, default=3.0, help="seconds after the first pose")
     parser.add_argument("--in-line", action="store_true", help="map between frames, as files do")
     parser.add_argument("--json", help="file for the figures")
+    parser.add_argument("--profile", type=int, default=0, metavar="N",
+                        help="say the N functions in which process itself spends most time; that "
+                        "costs time, too")  # fmt: skip
     given = parser.parse_args()
     source = geogs.open_source(
         given.sequence, InputConfig(stop=given.stop, long_edge=given.long_edge)
@@ -40,18 +45,32 @@ def main() -> None:
     frames = list(source)
     config = replace(geogs.Config(), input=InputConfig(long_edge=given.long_edge))
     slam = geogs.Slam(source.camera, config, given.device, live=not given.in_line)
-    figures = play(slam, frames, given.fps, given.warm)
+    profile = cProfile.Profile() if given.profile else None
+    figures = play(slam, frames, given.fps, given.warm, profile)
     for name, value in figures.items():
         print(f"{name}: {value}")
     if given.json:
         with open(given.json, "w") as file:
             json.dump(figures, file, indent=2)
+    if profile is not None:
+        pstats.Stats(profile).sort_stats("tottime").print_stats(given.profile)
+        pstats.Stats(profile).sort_stats("cumulative").print_stats(given.profile)
 
 
-def play(slam: geogs.Slam, frames: list[geogs.Frame], fps: float, warm: float) -> dict[str, object]:
-    """Feed frames when they are due, drop those that come too soon; what came of it."""
+def play(
+    slam: geogs.Slam,
+    frames: list[geogs.Frame],
+    fps: float,
+    warm: float,
+    profile: cProfile.Profile | None = None,
+) -> dict[str, object]:
+    """Feed frames when they are due, drop those that come too soon; what came of it.
+
+    The profile is of the calls that are counted, in this thread alone.
+    """
     took: list[float] = []
     stages: list[dict[str, float]] = []
+    kinds: list[str] = []
     tracked, behind, dropped, counted_from = 0, 0, 0, None
     began = time.perf_counter()
     index = 0
@@ -60,15 +79,21 @@ def play(slam: geogs.Slam, frames: list[geogs.Frame], fps: float, warm: float) -
         now = time.perf_counter()
         if now < due:
             time.sleep(due - now)
-        before, start = dict(slam.stopwatch.seconds), time.perf_counter()
-        pose = slam.process(frames[index])
+        before, made = dict(slam.stopwatch.seconds), slam.keyframes.next_id
+        start = time.perf_counter()
+        is_counted = counted_from is not None and start >= counted_from
+        if profile is not None and is_counted:
+            pose = profile.runcall(slam.process, frames[index])
+        else:
+            pose = slam.process(frames[index])
         end = time.perf_counter()
         if pose.is_tracked and counted_from is None:
             counted_from = end + warm
-        if counted_from is not None and start >= counted_from:
+        if is_counted:
             took.append(end - start)
             after = slam.stopwatch.seconds
             stages.append({k: s - before.get(k, 0.0) for k, s in after.items()})
+            kinds.append(kind(stages[-1], slam.keyframes.next_id > made))
             tracked += pose.is_tracked
             behind = max(behind, slam.background.waiting if slam.background else 0)
         newest = max(index + 1, int((end - began) * fps))
@@ -90,14 +115,32 @@ def play(slam: geogs.Slam, frames: list[geogs.Frame], fps: float, warm: float) -
         "share tracked": round(tracked / len(took), 4),
         "ms in 50, 90, 99, 100 of 100": [round(float(np.percentile(ms, q)), 1)
                                          for q in (50, 90, 99, 100)],
+        "ms in 50, 90, 100 of 100, and how many there are, by kind": by_kind(ms, kinds),
         "99th percentile": "aim" if p99 <= 1000 * LIMITS[0] else
                            "at least" if p99 <= 1000 * LIMITS[1] else "missed",
         "ms of the stages in the slowest hundredth": worst,
         "keyframes": len(slam.segments.keyframe_ids),
+        "loop closures": slam.loops.closures,
         "disks": len(slam.snapshot()),
         "most tasks that mapping was behind": behind,
         "seconds of mapping after the last frame": round(waited, 2),
     }  # fmt: skip
+
+
+def kind(stages: dict[str, float], has_keyframe: bool) -> str:
+    """What a frame was: one that waited for a keyframe to be completed, became one, or neither."""
+    if stages.get("waiting", 0.0) > 0.001:
+        return "waited"
+    return "keyframe" if has_keyframe else "neither"
+
+
+def by_kind(ms: np.ndarray, kinds: list[str]) -> dict[str, list[float]]:
+    """Percentiles and number of the frames of each kind."""
+    found = {}
+    for name in sorted(set(kinds)):
+        of = ms[np.array(kinds) == name]
+        found[name] = [*(round(float(np.percentile(of, q)), 1) for q in (50, 90, 100)), len(of)]
+    return found
 
 
 if __name__ == "__main__":

@@ -124,14 +124,14 @@ def parse() -> argparse.Namespace:
     return parser.parse_args()
 
 
-def render(suite: Suite, camera: Camera, folder: Path, frames: int) -> None:
-    """Write the images that are not there yet."""
+def render(suite: Suite, camera: Camera, folder: Path, frames: int, every: int = 1) -> None:
+    """Write the images, one in so many, that are not there yet."""
     folder.mkdir(parents=True, exist_ok=True)
-    paths = [folder / f"frame{n:06d}.jpg" for n in range(frames)]
+    paths = [folder / f"frame{n:06d}.jpg" for n in range(0, frames, every)]
     if all(path.exists() for path in paths):
         return
     threads = len(os.sched_getaffinity(0))
-    caster, poses = SuiteRaycaster(suite, threads), suite.walk(frames)
+    caster, poses = SuiteRaycaster(suite, threads), suite.walk(frames)[::every]
     with ThreadPoolExecutor(threads) as pool:
         for path, T_wc in zip(paths, poses, strict=True):
             if not path.exists():

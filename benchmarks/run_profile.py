@@ -8,7 +8,8 @@ Then the same run is made here, and of every stage two times are printed: by the
 and of all threads of the process on the CPU, which tells on a machine that others use, too. A stage
 within another counts for itself alone. With ``--functions N`` a second run follows under Python's
 profiler, and the N costliest functions of each stage are printed; compiled loops and PyTorch's
-operators appear under the function that calls them or their own names.
+operators appear under the function that calls them or their own names. Python 3.11 alone can do
+that: later ones count in one profile what all threads do.
 """
 
 import argparse
@@ -169,6 +170,8 @@ def main() -> None:
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--functions", type=int, default=0)
     given, rest = parser.parse_known_args()
+    if given.functions and sys.version_info >= (3, 12):
+        parser.error("--functions needs Python 3.11")
     config = parse_options(Config, rest, "run")
     imports = 0.0
     for name, code in STARTS.items():

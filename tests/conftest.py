@@ -9,6 +9,8 @@ import jaxtyping
 import pytest
 import torch
 
+import lazy_check
+
 SOURCE = Path(__file__).parents[1] / "src"
 
 
@@ -25,6 +27,7 @@ def _typed_modules() -> list[str]:
 
 
 torch.set_num_threads(1)  # as the system works; more only wait for each other
+jaxtyping.jaxtyped = lazy_check.jaxtyped  # what the hook decorates with
 jaxtyping.install_import_hook(_typed_modules(), "lazy_check.checked")
 
 
@@ -38,6 +41,11 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         used = item._fixtureinfo.name2fixturedefs.values()
         if any(made.scope == "module" for definitions in used for made in definitions):
             item.add_marker(pytest.mark.xdist_group(item.nodeid.partition("::")[0]))
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """In tests of the whole system not every call of a function has its types checked."""
+    lazy_check.CALLS.begin(all_checked=item.get_closest_marker("system") is None)
 
 
 @pytest.fixture(scope="session")

@@ -25,7 +25,7 @@ SMALL = replace(
 
 def geogs(*arguments: object) -> subprocess.CompletedProcess[str]:
     command = [*GEOGS, *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=300)
+    return subprocess.run(command, capture_output=True, text=True, timeout=1800)
 
 
 def make_room(folder: Path) -> Path:

@@ -25,6 +25,7 @@ def quick(name: str) -> Config:
     return replace(c, mapping=mapping, tracking=tracking, input=InputConfig(stop=FRAMES))
 
 
+@pytest.mark.long
 @pytest.mark.system
 def test_the_examples_run_as_they_stand(small_room, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("geogs.config.preset", quick)

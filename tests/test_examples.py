@@ -44,6 +44,7 @@ def test_the_notebook_has_no_outputs():
         compile("".join(cell["source"]), "first_steps.ipynb", "exec")
 
 
+@pytest.mark.long
 @pytest.mark.system
 def test_the_notebook_and_the_scripts_run(small_room, tmp_path, monkeypatch, capsys):
     import matplotlib

@@ -5,7 +5,7 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import cv2
@@ -46,7 +46,7 @@ SMALL = [
 ]  # fmt: skip
 
 
-def geogs(*arguments: object, timeout: float = 400) -> subprocess.CompletedProcess[str]:
+def geogs(*arguments: object, timeout: float = 1800) -> subprocess.CompletedProcess[str]:
     command = [*GEOGS, *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, timeout=timeout)
 
@@ -76,6 +76,7 @@ def small_result(small_room, once) -> Path:
     return once("small-slam", run)
 
 
+@pytest.mark.long
 def test_a_run_reaches_its_accuracy(room, result, tmp_path):
     out = shutil.copytree(result, tmp_path / "out")
     assert cli.main(["eval", str(out), "--gt", str(room), "--no-plots"]) == 0
@@ -100,6 +101,21 @@ def test_a_run_reaches_its_accuracy(room, result, tmp_path):
     assert [state for _, state, *_ in states] == ["tracked"] * FRAMES
     claimed = np.median([float(sigma) for _, _, sigma, *_ in states])
     assert 100 * scale * claimed > 0.3 * scores["trajectory"]["ate_rmse_cm"]
+
+
+def test_a_small_run_is_near_the_truth(small_room, small_result, tmp_path):
+    out = shutil.copytree(small_result, tmp_path / "out")
+    assert cli.main(["eval", str(out), "--gt", str(small_room), "--no-plots"]) == 0
+    scores = json.loads((out / "eval.json").read_text())
+    assert scores["trajectory"]["pairs"] == SMALL_FRAMES
+    assert scores["trajectory"]["ate_rmse_cm"] < 0.4
+    surface = scores["reconstruction"]
+    assert surface["accuracy_cm"] < 8.0
+    assert surface["completeness_ratio"] > 20.0
+    said = json.loads((small_result / "summary.json").read_text())["verdict"]
+    assert said["is_reliable"]
+    assert said["lost"] == 0
+    assert said["position"] < 0.05
 
 
 def test_a_run_leaves_every_file(small_result):
@@ -164,6 +180,7 @@ def test_the_papers_stage_lies_between_the_stream_and_the_refinement(small_resul
     assert json.loads((small_result / "summary.json").read_text())["refined"]
 
 
+@pytest.mark.long
 def test_the_preset_of_the_paper_runs_and_ends_with_the_adjustment(small_room, tmp_path):
     out = tmp_path / "paper"
     done = geogs(
@@ -181,6 +198,7 @@ def test_the_preset_of_the_paper_runs_and_ends_with_the_adjustment(small_room, t
     assert len(read_surface(out / "mesh.ply").faces) > 300
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("no_report")
 def test_ground_truth_is_never_read(small_room, small_result, tmp_path):
     """Without the truth beside the images the poses come out the same, bit for bit.
@@ -236,6 +254,7 @@ def test_interrupting_keeps_what_there_is(small_room, tmp_path, monkeypatch, cap
     assert len(load_map(tmp_path / "map.safetensors")) > 300
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("no_report")
 def test_a_full_gpu_memory_keeps_what_there_is(small_room, tmp_path, monkeypatch, capsys):
     at_frame_24(monkeypatch, full)
@@ -247,6 +266,7 @@ def test_a_full_gpu_memory_keeps_what_there_is(small_room, tmp_path, monkeypatch
     assert json.loads((tmp_path / "summary.json").read_text())["interrupted"] is True
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("no_report")
 def test_a_gpu_that_is_full_in_the_final_stages_keeps_the_online_result(
     small_room, tmp_path, monkeypatch, capsys
@@ -298,7 +318,12 @@ TURNING = {
 }
 
 
-@pytest.mark.parametrize("name", CASES)
+def some_long(names: Iterable[str], long: str) -> list:
+    """Cases by name, one of which takes long."""
+    return [pytest.param(n, marks=pytest.mark.long) if n == long else n for n in names]
+
+
+@pytest.mark.parametrize("name", some_long(CASES, "unrelated frames"))
 def test_hopeless_input_gets_one_sentence(name, tmp_path, capsys):
     frames, words = CASES[name]
     assert cli.main(run_on(frames, tmp_path)) == 2
@@ -318,7 +343,7 @@ def run_on(frames: list[np.ndarray], folder: Path) -> list[str]:
 
 
 @pytest.mark.usefixtures("no_report")
-@pytest.mark.parametrize("name", TURNING)
+@pytest.mark.parametrize("name", some_long(TURNING, "pure rotation"))
 def test_a_camera_that_does_not_move_leaves_orientations(name, tmp_path, capsys):
     frames, words = TURNING[name]
     assert cli.main(run_on(frames, tmp_path)) == 0
@@ -333,6 +358,7 @@ def test_a_camera_that_does_not_move_leaves_orientations(name, tmp_path, capsys)
     assert [row.split(",")[1] for row in rows] == ["orientation only"] * len(frames)
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("no_report")
 def test_a_result_of_little_worth_says_so(small_room, tmp_path, capsys):
     """Frames that have nothing to do with each other after a good start."""
@@ -346,6 +372,7 @@ def test_a_result_of_little_worth_says_so(small_room, tmp_path, capsys):
     assert (round(30 * first), round(30 * last)) == (20, 39)
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("no_report")
 def test_a_gap_of_black_frames_is_survived_and_reported(small_room, tmp_path):
     """Frames that show nothing are marked as lost; the camera is found again after them."""

@@ -1,5 +1,7 @@
 """Seconds per stage: what overlaps counts once, and the stream has an end."""
 
+import threading
+
 import pytest
 
 from geogs import stopwatch as module
@@ -70,3 +72,21 @@ def test_one_that_goes_on_from_where_another_was_does_not_run(pass_time):
     assert again.seconds == {"tracking": 1.0, "mesh": 2.0}
     assert again.until_stream_end == 1.0
     assert stopwatch.seconds.keys() == {"tracking", "checkpoints"}
+
+
+def test_what_a_thread_does_aside_does_not_count(pass_time):
+    stopwatch = Stopwatch()
+
+    def work() -> None:
+        with stopwatch.aside(), stopwatch("mapping"):
+            pass_time(4.0)
+
+    with stopwatch("tracking"):
+        pass_time(1.0)
+    thread = threading.Thread(target=work)
+    thread.start()
+    thread.join()
+    assert stopwatch.seconds == {"tracking": 1.0}
+    with stopwatch("mapping"):
+        pass_time(0.5)
+    assert stopwatch.seconds == {"tracking": 1.0, "mapping": 0.5}

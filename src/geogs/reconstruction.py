@@ -114,6 +114,11 @@ class Reconstruction:
         return self._deadline - self.output_cost.of(self._wanted or self.views)
 
     @property
+    def budget_left(self) -> float:
+        """Seconds of the budget, for all that is still to be done; infinite without one."""
+        return np.inf if self._deadline is None else self._deadline - time.perf_counter()
+
+    @property
     def seconds_left(self) -> float:
         """Of the budget, until training must have ended; infinite without a budget."""
         return np.inf if self._end is None else self._end - time.perf_counter()

@@ -9,7 +9,7 @@ from typing import TypeVar
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float64
 from torch import Tensor
 
 from geogs.config import Config
@@ -27,10 +27,12 @@ from geogs.priors.base import MonocularPrior
 from geogs.stopwatch import Stopwatch, StopwatchState
 from geogs.threads import on_one_torch_thread
 from geogs.tracking.certainty import certainty
+from geogs.tracking.completion import Completion
 from geogs.tracking.flow.masked import MaskedFlow
 from geogs.tracking.flow.painted import PaintedFlow, shown_pixels
 from geogs.tracking.flow.select import build_operator
 from geogs.tracking.moving import moving_share
+from geogs.tracking.pose_deviation import PoseDeviation
 from geogs.tracking.segments import Segments, SegmentsState
 from geogs.tracking.tracker import Tracker, TrackResult, TrackState
 from geogs.types import (
@@ -100,9 +102,9 @@ class Slam:
     ):
         """``mask``, of the size of the images, is true where they may show the scene: elsewhere
         nothing is matched, searched or mapped; with ``black_is_hidden`` nor are pixels of an image
-        that are quite black. ``live`` maps in a thread beside tracking, which
-        waits neither for it nor for the search of loops: results then depend on how fast the
-        machine is."""
+        that are quite black. ``live`` maps in a thread beside tracking, and completes
+        keyframes in another, which frames do not wait for as long as they are found without, nor
+        for the search and the closing of loops: results then depend on how fast the machine is."""
         self.config = config or Config()
         self.camera = camera
         self.device = device
@@ -110,9 +112,9 @@ class Slam:
         self.mask, self.black_is_hidden = mask, black_is_hidden
         self._stream = _urgent_stream(device) if live else None
         """In which a live system tracks on a GPU until the stream ends; mapping's gives way."""
+        self.stopwatch = Stopwatch()
         with torch.cuda.stream(self._stream):
             self._make_parts(live)
-        self.stopwatch = Stopwatch()
         self.frames = 0
         self._waiting: deque[int] = deque()
         self.adjusted = 0
@@ -133,18 +135,22 @@ class Slam:
         if self.black_is_hidden:
             self.operator = PaintedFlow(self.operator, grid)
         self.keyframes = KeyframeStore(grid, self.operator.encode, c.resident_keyframes)
-        self.segments = Segments(self.new_tracker, c.tracking.patience)
+        self.segments = Segments(partial(self.new_tracker, live), c.tracking.patience)
+        self.completion = (
+            Completion(self.segments, self._act_on, self.stopwatch, self._stream) if live else None
+        )
+        """Of keyframes, beside the frames of a live system."""
         self.loops = LoopCloser(self.segments, c.loop, not live, self.mask)
         self.background = BackgroundMapper(self.keyframes, self._new_mapper) if live else None
         """Maps until the stream ends, in a live system; then the mapper goes on from there."""
         self.mapper = self._new_mapper(self.keyframes)
 
-    def new_tracker(self) -> Tracker:
-        """A tracker of another segment."""
+    def new_tracker(self, defers: bool = False) -> Tracker:
+        """A tracker of another segment; ``defers`` as the tracker's."""
         c = self.config
         return Tracker(
             self.camera, c.tracking, self.device, c.seed, self.operator, self.prior, c.prior,
-            self.keyframes, c.sensor, c.odometry,
+            self.keyframes, c.sensor, c.odometry, defers,
         )  # fmt: skip
 
     def _new_mapper(self, keyframes: KeyframeStore) -> Mapper:
@@ -153,6 +159,7 @@ class Slam:
 
     def state(self) -> SlamState:
         """What a checkpoint holds: to be written before the next frame, as it refers to all."""
+        self.settle()
         return SlamState(
             self.keyframes.state(), self.segments.state(), self.loops.state(), self.mapper.state(),
             self.stopwatch.state(), self.frames, list(self._waiting), self.adjusted, self._is_ended,
@@ -227,13 +234,39 @@ class Slam:
 
     @on_one_torch_thread
     def process(self, frame: Frame) -> SlamStatus:
-        """Track one frame and, where it completes a keyframe, train the map."""
-        if self._stream is None:
+        """Track one frame and, where it completes a keyframe, train the map.
+
+        A live system returns when it knows where the frame is; the rest follows beside.
+        """
+        if self.background is None or self.completion is None:
             return self._process(frame)
-        with torch.cuda.stream(self._stream):
-            status = self._process(frame)
-        self._stream.synchronize()  # others may read what it has written
-        return status
+        with self.background.giving_way(), torch.cuda.stream(self._stream):
+            return self._process_live(frame, self.completion)
+
+    @on_one_torch_thread
+    def settle(self) -> None:
+        """Wait for what the last keyframe brings, where a live system is still at it."""
+        if self.completion is not None:
+            self.completion.settle()
+
+    @property
+    def T_cw(self) -> Float64[Tensor, "4 4"] | None:
+        """World to camera where the camera was last seen, in whatever segment; none before that."""
+        return (self.completion or self.segments.current).T_cw
+
+    def deviation(self) -> PoseDeviation | None:
+        """How well the last frame's pose is known relative to the map around; none without one."""
+        return (self.completion or self.segments.current).deviation()
+
+    def _process_live(self, frame: Frame, completion: Completion) -> SlamStatus:
+        with self.stopwatch("tracking"):
+            is_found = completion.follow(frame)
+        if is_found:
+            self.frames += 1
+            return self._status(TrackState.TRACKING)
+        with self.stopwatch("waiting"):
+            completion.settle()
+        return self._process(frame)
 
     def _process(self, frame: Frame) -> SlamStatus:
         if self.is_continued and self.frames == 0:
@@ -241,21 +274,36 @@ class Slam:
         with self.stopwatch("tracking"):
             result = self.segments.track(frame, self.loops.recognise)
         self.frames += 1
+        if self.completion is not None and self.segments.current.is_unfinished:
+            status = self._status(result.state)
+            self.completion.begin(result)
+            return status
+        self._act_on(result)
+        if self._stream is not None:
+            self._stream.synchronize()  # others may read what it has written
+        return self._status(result.state)
+
+    def _act_on(self, result: TrackResult) -> None:
+        """Close loops, correct and map, as a frame calls for it."""
         self._map(self._close_loops(result), self.config.mapping.lag)
         self._adjust_now_and_then()
+
+    def _status(self, state: TrackState) -> SlamStatus:
         disks = len(self.mapper.map) if self.background is None else self.background.disks
-        return SlamStatus(result.state, self.frames, len(self.segments.keyframe_ids), disks)
+        return SlamStatus(state, self.frames, len(self.segments.keyframe_ids), disks)
 
     @on_one_torch_thread
     def end_stream(self) -> None:
         """After the last frame: map what waits. What there is then is the online result."""
+        with self.stopwatch("waiting"):
+            self.settle()
         self._is_ended = True
         with self.stopwatch("tracking"):
             result = self.segments.finish()
         if self.background is not None:
             with self.stopwatch("mapping"):
                 self.mapper, self.background = self.background.settled(), None
-            self._stream = None
+            self._stream = self.completion = None
         if result.is_new_world:
             self.mapper = self._new_mapper(self.keyframes)
             self.segments.world.keyframes.take_corrections()
@@ -291,6 +339,7 @@ class Slam:
     @on_one_torch_thread
     def rescale(self, scale: MetricScale) -> None:
         """Multiply all lengths of poses, depths and map, after which they are metres."""
+        self.settle()
         keyframes, factor = self.segments.world.keyframes, scale.factor
         shrunk = torch.eye(4, dtype=torch.float64)
         shrunk[:3, :3] /= factor
@@ -315,11 +364,13 @@ class Slam:
     @on_one_torch_thread
     def trajectory(self) -> Trajectory:
         """Poses of all frames so far."""
+        self.settle()
         with self.stopwatch("trajectory"):
             return self.segments.trajectory()
 
     def keyframe_trajectory(self) -> Trajectory:
         """Poses of the keyframes alone."""
+        self.settle()
         keyframes = [self.keyframes[i] for i in self.segments.world.free]
         T_wc = [torch.linalg.inv(k.T_cw).numpy() for k in keyframes]
         times = np.array([k.timestamp for k in keyframes], dtype=np.float64)
@@ -337,6 +388,7 @@ class Slam:
 
     def particulars(self) -> dict[str, object]:
         """What a summary says of segments, loops and things that move, ready for JSON."""
+        self.settle()
         return {
             "refined": self.is_refined,
             "metric_scale": None if self.metric_scale is None else asdict(self.metric_scale),

@@ -1,5 +1,6 @@
 """Wall-clock seconds per stage."""
 
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -14,10 +15,17 @@ class StopwatchState:
     until_stream_end: float | None
 
 
+class _Here(threading.local):
+    """What is so in one thread and not in others."""
+
+    is_aside = False
+
+
 class Stopwatch:
     """``with stopwatch("tracking"): ...`` adds to that stage's seconds.
 
-    Inside another stage it adds nothing: the seconds of all stages never overlap.
+    Inside another stage it adds nothing, nor does a thread that works ``aside``: the seconds of all
+    stages never overlap.
     """
 
     def __init__(self) -> None:
@@ -25,6 +33,7 @@ class Stopwatch:
         self.until_stream_end: float | None = None
         """Seconds of all stages up to the end of the stream; none before it."""
         self._is_running = False
+        self._here = _Here()
 
     def state(self) -> StopwatchState:
         """What a checkpoint holds."""
@@ -45,7 +54,7 @@ class Stopwatch:
 
     @contextmanager
     def __call__(self, stage: str) -> Iterator[None]:
-        if self._is_running:
+        if self._is_running or self._here.is_aside:
             yield
             return
         self._is_running, start = True, time.perf_counter()
@@ -54,3 +63,12 @@ class Stopwatch:
         finally:
             self._is_running = False
             self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - start
+
+    @contextmanager
+    def aside(self) -> Iterator[None]:
+        """What this thread does meanwhile, beside the one whose stages count, adds nothing."""
+        before, self._here.is_aside = self._here.is_aside, True
+        try:
+            yield
+        finally:
+            self._here.is_aside = before

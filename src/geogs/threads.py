@@ -20,15 +20,19 @@ R = TypeVar("R")
 P = ParamSpec("P")
 
 
+def available_cores() -> int:
+    """CPUs that this process may use."""
+    try:
+        return len(os.sched_getaffinity(0))
+    except AttributeError:  # not on macOS and Windows
+        return os.cpu_count() or 1
+
+
 @functools.cache
 def worker_count() -> int:
     """CPUs that this process may use, at most OMP_NUM_THREADS where that is set, at most 16."""
-    try:
-        available = len(os.sched_getaffinity(0))
-    except AttributeError:  # not on macOS and Windows
-        available = os.cpu_count() or 1
     wanted = os.environ.get("OMP_NUM_THREADS", "")
-    return max(1, min(available, int(wanted) if wanted.isdigit() else 16, 16))
+    return max(1, min(available_cores(), int(wanted) if wanted.isdigit() else 16, 16))
 
 
 def thread_map(
@@ -66,7 +70,9 @@ def run_chunks(function: Callable[[int], object], chunks: int, threads: int) -> 
         work()
     finally:
         for future in futures:
-            future.result()
+            # One that has not begun waits behind others' work, and there is nothing left to do.
+            if not future.cancel():
+                future.result()
 
 
 @functools.cache

@@ -5,7 +5,7 @@ from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, Float64, UInt8
+from jaxtyping import Bool, Float, Float16, Float32, Float64, UInt8
 from torch import Tensor
 
 from geogs.geometry.camera import Camera
@@ -30,6 +30,22 @@ class MeasuredPose:
     """Poses of different worlds say nothing of each other."""
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class SeenRows:
+    """Where and when a rolling shutter saw what an image shows whose rows were rectified.
+
+    The nodes lie in the middle of each eight pixels, and a step beyond the border; the image was
+    made with what lies between them bilinearly.
+    """
+
+    offset: Float16[Tensor, "h w 2"]
+    """Pixels from a node to where a pinhole at the camera's place of that time saw the same."""
+    seconds: Float16[Tensor, "h w"]
+    """That time, from the middle row's."""
+    doubt: float = 0.0
+    """Standard error of the readout, as a part of it; 0 where it was told."""
+
+
 @dataclass(frozen=True, slots=True)
 class Frame:
     """One undistorted image of the source at working resolution."""
@@ -46,6 +62,8 @@ class Frame:
     """Of the pixels of the image, where a sensor measured it and it is to be used."""
     pose: MeasuredPose | None = None
     """By another tracker, where there is one and it is to be used as a prior."""
+    rows: SeenRows | None = None
+    """How its rows were rectified; none of a global shutter."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,6 +20,8 @@ class Variant:
     options: tuple[Option, ...] = ()
     command: Command | None = None
     """Other than the benchmark's."""
+    needs_depth: bool = False
+    """Whether it is of scenes alone whose images come with the depth of a sensor."""
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,6 @@
 """The columns from which the tables of the benchmarks are made."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from geogs_bench.benchmark import Column, Layout, Published
 from geogs_bench.published import PublishedTable
@@ -86,6 +86,41 @@ def trajectory_layout(published: PublishedTable | None = None) -> Layout:
             ),
             *(Column(f"keyframes {_STAGES[s]}", keyframes_ate(s), 3) for s in stages),
         ),
+    )
+
+
+def rgbd_layout(
+    variant: str, published: PublishedTable | None = None, methods: Sequence[str] = ()
+) -> Layout:
+    """ATE of results in metres beside published figures of systems that were given depth, too.
+
+    The published stand in the rows of a ``variant``; all methods of the table if none is named.
+    """
+    if published is not None and not methods:
+        methods = [row.method for row in published.rows]
+
+    def rigid(stage: StageName) -> Callable[[Record], float | None]:
+        def value(record: Record) -> float | None:
+            scored = record.stage(stage)
+            return scored.trajectory.rigid_ate if scored and scored.trajectory else None
+
+        return value
+
+    def printed(method: str) -> Callable[[Record], float | None]:
+        def value(record: Record) -> float | None:
+            if published is None or record.variant != variant:
+                return None
+            return published.value(record.scene, "ATE", method)
+
+        return value
+
+    stages = [stage for stage in _RUN if stage != "depth fusion"]
+    beside = (Column(f"{method} (published)", printed(method)) for method in methods)
+    source = "" if published is None else f" Published: {published.source}."
+    return Layout(
+        "Trajectory with the depth of the sensor, ATE RMSE after a rigid alignment (cm)",
+        (*(Column(_STAGES[stage], rigid(stage), 3) for stage in stages), *beside),
+        f"Of results in metres alone.{source}",
     )
 
 

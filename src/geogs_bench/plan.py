@@ -60,10 +60,10 @@ def find_scenes(benchmark: Benchmark, folder: Path, names: Sequence[str] = ()) -
 def make_jobs(
     benchmark: Benchmark, scenes: Sequence[Scene], output: Path, wishes: Wishes
 ) -> list[Job]:
-    """One job for each scene and variant, scene by scene.
+    """One job for each scene and variant, scene by scene; what needs depth only where it is there.
 
     Raises:
-        InputError: a variant that is named does not exist.
+        InputError: a variant that is named does not exist, or can be run on none of the scenes.
     """
     variants = _variants(benchmark, wishes)
     known = [variant.name for variant in variants]
@@ -72,7 +72,16 @@ def make_jobs(
             f"{benchmark.name} has no variant {missing[0]}, only {', '.join(known) or 'one'}."
         )
     chosen = [v for v in variants if v.name in wishes.variants or not wishes.variants]
-    return [_job(benchmark, scene, v, output, wishes) for scene in scenes for v in chosen]
+    jobs = [
+        _job(benchmark, scene, v, output, wishes)
+        for scene in scenes
+        for v in chosen
+        if scene.has_depth or not v.needs_depth
+    ]
+    if not jobs and scenes:
+        names = ", ".join(v.name for v in chosen)
+        raise InputError(f"No scene has depth images, which {names} needs.")
+    return jobs
 
 
 def _variants(benchmark: Benchmark, wishes: Wishes) -> list[Variant]:

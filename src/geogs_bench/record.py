@@ -51,6 +51,8 @@ class TrajectoryScore:
     scale: float
     keyframes_ate: float | None = None
     """RMSE over the keyframes alone, with an alignment of their own."""
+    rigid_ate: float | None = None
+    """RMSE over all frames after a rigid alignment, cm; none unless the result is in metres."""
 
 
 @dataclass(frozen=True)

@@ -3,13 +3,14 @@
 from geogs.errors import InputError
 from geogs_bench import published as paper
 from geogs_bench.ablations import ABLATIONS
-from geogs_bench.benchmark import Benchmark
+from geogs_bench.benchmark import Benchmark, Variant
 from geogs_bench.columns import (
     COST,
     area_layout,
     dtu_layout,
     motion_layout,
     photo_layout,
+    rgbd_layout,
     trajectory_layout,
     vertex_layout,
 )
@@ -23,6 +24,7 @@ from geogs_bench.layouts.scannetpp import find_scannetpp
 from geogs_bench.layouts.seven_scenes import find_seven_scenes
 from geogs_bench.layouts.tum import find_tum
 from geogs_bench.motion_cells import FULL, SMALL
+from geogs_bench.scene import Option
 
 _ONLINE = (
     "Published online figures include the paper's final global bundle adjustment and map update, "
@@ -31,6 +33,17 @@ _ONLINE = (
 _PLAIN_DISTANCES = (
     "The paper prints squared distances in its formulas; its toolbox and its figures are plain "
     "distances, and so are ours."
+)
+
+RGB, RGBD = "rgb", "rgb-d"
+_WITH_AND_WITHOUT_DEPTH = (
+    Variant(RGB),
+    Variant(RGBD, (Option("depth", "sensor"),), needs_depth=True),
+)
+_DEPTH = (
+    "Rows rgb use the images alone, rows rgb-d the depth of the sensor, too (--depth sensor), "
+    "where it is there; --variants rgb leaves these out. Results with depth are in metres and need "
+    "no more than a rigid alignment."
 )
 
 REPLICA = Benchmark(
@@ -59,11 +72,18 @@ SCANNET = Benchmark(
     find_scannet,
     "scenes exported from their .sens files: <scene>/color, <scene>/pose, <scene>/intrinsic",
     "http://www.scan-net.org (terms of use), exported with its SensReader",
-    (trajectory_layout(paper.SCANNET), area_layout(), COST),
+    (
+        trajectory_layout(paper.SCANNET),
+        rgbd_layout(RGBD, paper.SCANNET, paper.RGBD_METHODS),
+        area_layout(),
+        COST,
+    ),
+    _WITH_AND_WITHOUT_DEPTH,
     scenes=paper.SCANNET_SCENES,
     published=(paper.SCANNET,),
     notes=(
         _ONLINE,
+        _DEPTH,
         "The published systems cut the black borders of the images off; here they stay.",
     ),
 )
@@ -91,9 +111,12 @@ TUM = Benchmark(
     "TUM RGB-D: tracking",
     "run",
     find_tum,
-    "unpacked sequences: <sequence>/rgb.txt, <sequence>/groundtruth.txt",
+    "unpacked sequences: <sequence>/rgb.txt, <sequence>/groundtruth.txt, for depth depth.txt",
     "https://cvg.cit.tum.de/data/datasets/rgbd-dataset/download",
-    (trajectory_layout(), COST),
+    (trajectory_layout(), rgbd_layout(RGBD, paper.TUM_RGBD), COST),
+    _WITH_AND_WITHOUT_DEPTH,
+    published=(paper.TUM_RGBD,),
+    notes=(_DEPTH,),
 )
 
 SEVEN_SCENES = Benchmark(
@@ -101,10 +124,13 @@ SEVEN_SCENES = Benchmark(
     "7-Scenes: tracking and reconstruction",
     "run",
     find_seven_scenes,
-    "<scene>/seq-01/frame-000000.color.png and frame-000000.pose.txt",
+    "<scene>/seq-01/frame-000000.color.png, frame-000000.pose.txt, and for depth "
+    "frame-000000.depth.png",
     "https://www.microsoft.com/en-us/research/project/rgb-d-dataset-7-scenes",
-    (trajectory_layout(), area_layout(), COST),
+    (trajectory_layout(), rgbd_layout(RGBD), area_layout(), COST),
+    _WITH_AND_WITHOUT_DEPTH,
     notes=(
+        _DEPTH,
         "The true poses come from KinectFusion, a few centimetres off themselves, and are those "
         "of the depth camera.",
     ),

@@ -74,3 +74,5 @@ class Scene:
     kind: Literal["room", "object", "scan", "motion"] = "room"
     """How a surface from known poses is scored: as a room in cm, an object in mm, or by DTU; of a
     motion the trajectory alone is scored."""
+    has_depth: bool = False
+    """Whether the images come with the depth of a sensor."""

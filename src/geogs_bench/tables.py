@@ -43,7 +43,7 @@ def result_tables(benchmark: Benchmark, records: Sequence[Record]) -> list[Table
 
 
 def published_tables(benchmark: Benchmark) -> list[Table]:
-    """The paper's tables as printed; nothing in them was measured here."""
+    """Papers' tables as printed; nothing in them was measured here."""
     return [_published_table(table) for table in benchmark.published]
 
 
@@ -55,7 +55,7 @@ def _published_table(table: PublishedTable) -> Table:
          *((f"{row.mean:.2f}",) if has_mean and row.mean is not None else ()))
         for row in table.rows
     ]  # fmt: skip
-    note = f"{table.caption}. The paper's figures, not measured here ({table.label})."
+    note = f"{table.caption}. Figures of {table.source}, not measured here ({table.label})."
     return Table(f"Published: {table.label}", header, tuple(rows), note)
 
 

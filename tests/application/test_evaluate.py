@@ -101,6 +101,7 @@ def test_toolbox_protocols_run_from_the_command(result, protocol):
         assert 4 < evaluation.reconstruction.accuracy_cm < 8
 
 
+@pytest.mark.long
 def test_object_protocol_measures_in_the_silhouettes_of_the_truth(result):
     truth, out = result
     write_mesh(truth / "near.ply", *box((3.015, 2.015, 1.215)))  # the result is 5 mm beyond

@@ -1,9 +1,19 @@
 """What mesh and files are going to take, from a rehearsal with a clock that only it moves on."""
 
+from dataclasses import replace
+
 import pytest
 
 from geogs.application import output_forecast
-from geogs.application.output_forecast import CAUTION, OutputForecast, StageTimes
+from geogs.application.output_forecast import (
+    CAUTION,
+    COARSER,
+    MESH_SHARE,
+    ONE_VIEW,
+    OutputForecast,
+    StageTimes,
+)
+from geogs.errors import InputError
 from geogs.reconstruction import Reconstruction
 from posed_scene import ball_and_wall
 
@@ -45,33 +55,77 @@ def scene() -> Reconstruction:
     return scene
 
 
-def test_the_second_rehearsal_counts_by_views_and_by_surface(monkeypatch, scene):
-    clock, drawn, rehearsed = FakeClock(), [], []
+@pytest.fixture
+def rehearsed() -> list[int]:
+    """How many views each rehearsal had."""
+    return []
+
+
+@pytest.fixture
+def rehearsal(monkeypatch, rehearsed) -> FakeClock:
+    """A clock that only what is rehearsed moves on."""
+    clock = FakeClock()
 
     def draw(folder: object, *of: object) -> None:
-        drawn.append(folder)
-        clock.now += 9.0 if len(drawn) == 1 else 0.5
+        clock.now += 0.5
 
     def write(folder: object, scene: object, camera: object, renders: list, images: bool) -> None:
         clock.now += 0.2 * len(renders)
 
-    def extract(views: list, config: object, progress: StageTimes) -> None:
+    def extract(views: list, config: object, progress: StageTimes | None = None) -> None:
+        is_rehearsal = len(views) > 1
+        assert config.min_weight == (ONE_VIEW if is_rehearsal else 1.5)
         rehearsed.append(len(views))
         for number in range(len(views)):
             clock.now += 1.0 if number == 0 else 0.3
-            progress("fuse", number + 1, len(views))
+            if progress is not None:
+                progress("fuse", number + 1, len(views))
         clock.now += 2.0
-        progress("merge", 1, 1)
+        if progress is not None:
+            progress("merge", 1, 1)
 
     monkeypatch.setattr(output_forecast, "write_report", draw)
     monkeypatch.setattr(output_forecast, "write_keyframes", write)
     monkeypatch.setattr(output_forecast, "extract_mesh", extract)
+    return clock
+
+
+def test_the_second_rehearsal_counts_by_views_and_by_surface(rehearsal, rehearsed, scene):
+    clock, usual = rehearsal, scene.config.mesh
     cost = OutputForecast(scene, clock).first(lambda places: 3.0)
     assert rehearsed == [1, 3]
-    # Three views: 0.2 s of files and 0.3 of fusion for each; 3 s for a third of the surface.
+    # Three views: 0.2 s of files and 0.3 of fusion for each; 3 s for a third of the surface, in
+    # larger voxels.
     assert cost.a_view == pytest.approx(CAUTION * 0.5)
-    assert cost.once == pytest.approx(CAUTION * (0.5 + 3.0 * 3.0))
+    assert cost.once == pytest.approx(CAUTION * (0.5 + COARSER**2 * 3.0 * 3.0))
     assert cost.of(10) == pytest.approx(cost.once + 10 * cost.a_view)
+    assert scene.config.mesh == usual
+
+
+def test_a_mesh_gets_what_triangles_there_is_time_for(rehearsal, monkeypatch, scene):
+    clock, usual = rehearsal, scene.config.mesh
+    whole = CAUTION * (0.5 + COARSER**2 * 3.0 * 3.0)
+    monkeypatch.setattr(Reconstruction, "budget_left", 0.5 * whole / MESH_SHARE)
+    cost = OutputForecast(scene, clock).first(lambda places: 3.0)
+    assert cost.once == pytest.approx(0.5 * whole)
+    triangles = scene.config.mesh.triangle_budget
+    assert 1000 < triangles < usual.triangle_budget
+    assert scene.config.mesh == replace(usual, triangle_budget=triangles)
+
+
+def test_a_rehearsal_without_a_surface_says_nothing_of_how_much_there_is(
+    rehearsal, monkeypatch, scene
+):
+    def unsure(*of: object) -> None:
+        raise InputError("no depth")
+
+    monkeypatch.setattr(output_forecast, "extract_mesh", unsure)
+    plan = output_forecast.plan_volume
+    monkeypatch.setattr(output_forecast, "plan_volume", unsure)
+    forecast = OutputForecast(scene, rehearsal)
+    forecast.first(lambda places: 3.0)
+    monkeypatch.setattr(output_forecast, "plan_volume", plan)
+    assert forecast.settled(0.0).once == pytest.approx(CAUTION * 0.5)
 
 
 def test_a_rehearsal_takes_time_and_leaves_nothing(scene):

@@ -2,8 +2,6 @@
 
 import json
 import signal
-import subprocess
-import time
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +9,7 @@ import pytest
 import torch
 from scipy.spatial import cKDTree
 
-from geogs.application.checkpoint import checkpoint_folder, has_checkpoint, write_checkpoint
+from geogs.application.checkpoint import checkpoint_folder, write_checkpoint
 from geogs.application.reconstruct_checkpoint import ReconstructState, fingerprint, read_work
 from geogs.cli import main as cli
 from geogs.config import ReconstructConfig
@@ -19,14 +17,13 @@ from geogs.errors import InputError
 from geogs.reconstruction import Reconstruction
 from posed_scene import (
     DEFAULT,
-    GEOGS,
     SMALL,
     ball_and_wall,
     depth_errors,
-    geogs,
     surface_points,
     vertices,
 )
+from stopped_commands import stop
 
 pytestmark = pytest.mark.system
 
@@ -55,6 +52,7 @@ def whole() -> Reconstruction:
     return scene
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("fraction", [0.0, 0.6])
 def test_work_that_was_cut_off_is_gone_on_with(whole, tmp_path, fraction):
     first = ball_and_wall(far=10.0)
@@ -120,32 +118,24 @@ def test_fingerprints_change_with_settings_and_images():
     assert own != fingerprint(DEFAULT, None, names[:1])
 
 
+@pytest.mark.usefixtures("no_report")
 def test_an_interrupted_command_resumes(small_room, tmp_path, capsys):
     """Ctrl-C in the training leaves a result and a checkpoint; the rest is done later."""
     call = [
         "reconstruct", small_room, "-o", tmp_path, "--stride", 6, "--mapping.render-long-edge", 96,
-        "--search.least-steps", 500, "--search.no-repeat", "--device", "cpu",
+        "--search.least-steps", 200, "--search.no-repeat", "--device", "cpu",
     ]  # fmt: skip
     checkpoint = tmp_path / "checkpoint" / "manifest.json"
-    process = subprocess.Popen(
-        [*GEOGS, *map(str, call)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
-    deadline = time.monotonic() + 200
-    while not has_checkpoint(tmp_path) and process.poll() is None and time.monotonic() < deadline:
-        time.sleep(0.05)
-    process.send_signal(signal.SIGINT)
-    printed, said = process.communicate(timeout=200)
-    assert process.returncode == 0, said
-    assert "--resume goes on" in printed
+    said = stop([*map(str, call)], signal.SIGINT, checkpoints=1)
+    assert "--resume goes on" in said
     assert json.loads((tmp_path / "summary.json").read_text())["interrupted"] is True
     assert checkpoint.is_file()
     assert cli.main([*map(str, call), "--resume", "--mapping.disk.opacity", "0.6"]) == 2
     said = capsys.readouterr().err
     assert "other settings" in said.splitlines()[-1]
     assert "Traceback" not in said
-    done = geogs(*call, "--resume")
-    assert done.returncode == 0, done.stderr
-    assert "Going on after" in done.stderr
+    assert cli.main([*map(str, call), "--resume"]) == 0
+    assert "Going on after" in capsys.readouterr().err
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert summary["interrupted"] is False
     assert "depth" not in summary["seconds"]

@@ -81,7 +81,7 @@ def test_page_draws_turns_and_says_nothing(tmp_path):
     page = box_page(tmp_path, with_truth=True)
     assert page.stat().st_size < 1.2e6
     with open_tab(page.as_uri()) as tab:
-        tab.page.wait_for_selector("#model[data-state=drawn]", timeout=30_000)
+        tab.page.wait_for_selector("#model[data-state=drawn]", timeout=600_000)
         tab.page.wait_for_selector(".strip button")
         assert "Reliable & sound." in tab.page.inner_text("p.verdict")
         first = tab.picture()

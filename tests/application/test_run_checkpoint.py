@@ -78,7 +78,7 @@ def assert_same(a: Slam, b: Slam) -> None:
         assert torch.equal(own.depth, other.depth)
 
 
-@pytest.mark.parametrize("cut", [None, 17])
+@pytest.mark.parametrize("cut", [None, pytest.param(17, marks=pytest.mark.long)])
 def test_a_system_goes_on_as_if_nothing_had_happened(frames, tmp_path, cut):
     """Bit for bit, with most keyframes in archives; also while a second segment starts."""
     camera, images = frames

@@ -2,13 +2,11 @@
 
 import json
 import os
-import re
 import shutil
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -28,6 +26,7 @@ from geogs.slam import Slam, SlamStatus
 from geogs.tracking.segments import Segments
 from geogs.types import Frame
 from geogs.version import __version__
+from stopped_commands import STOPPED, stop
 
 # One process runs them all: a room that they share is changed for a moment, and a run of another
 # process that reads it just then gets another result.
@@ -47,7 +46,7 @@ OFTEN = ["--checkpoint-every", "0.001"]
 
 def geogs(*arguments: object) -> subprocess.CompletedProcess[str]:
     command = [*GEOGS, *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=400)
+    return subprocess.run(command, capture_output=True, text=True, timeout=1800)
 
 
 @pytest.fixture(scope="session")
@@ -80,60 +79,6 @@ def killed(own_room, once) -> Path:
         assert not (out / "summary.json").exists()
 
     return once("resumed-killed", run)
-
-
-STOPPED = """
-import os, sys
-from geogs.cli.main import main
-import geogs.application.run
-
-def stop_at(number, name, count):
-    \"\"\"Get the signal when the process puts a file into its place for that many times.\"\"\"
-    left = [count]
-
-    def watch(event, arguments):
-        if event == "os.rename" and str(arguments[1]).endswith(name):
-            left[0] -= 1
-            if not left[0]:
-                os.kill(os.getpid(), number)
-
-    sys.addaudithook(watch)
-
-number, name, counts, *arguments = sys.argv[1:]
-for count in map(int, counts.split(",")):
-    child = os.fork()
-    if not child:
-        stop_at(int(number), name, count)
-        code = main(arguments)
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(code)
-    print("exit code", os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
-"""
-"""Runs a command that stops itself, one time for each number in a list."""
-
-
-def stop(
-    arguments: list[str],
-    number: int,
-    *,
-    checkpoints: int = 0,
-    files: Sequence[int] = (),
-    cwd: Path | None = None,
-) -> str:
-    """Start the command, signal it when it completes a checkpoint; what it said.
-
-    Or start it again and again, each time signalled when it puts one of a checkpoint's files, of
-    that number since the start, into its place. No clock decides where.
-    """
-    name, counts = ("", files) if files else ("manifest.json", [checkpoints])
-    command = [sys.executable, "-c", STOPPED, str(int(number)), name]
-    command += [",".join(map(str, counts)), *arguments]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=400, cwd=cwd)
-    said = done.stdout + done.stderr
-    code = 0 if number == signal.SIGINT else -number
-    assert re.findall(r"exit code (\S+)", done.stdout) == [str(int(code))] * len(counts), said
-    return " ".join(said.split())
 
 
 def assert_same_map(out: Path, other: Path) -> None:
@@ -177,6 +122,7 @@ def test_a_killed_run_goes_on_even_after_another_interruption(
     assert "nothing to resume" in capsys.readouterr().err.splitlines()[-1]
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("no_report")
 def test_ten_kills_change_nothing(whole, killed, tmp_path, capsys):
     """SIGKILL at ten points, at each of the files of a checkpoint; in the end, bit for bit."""
@@ -190,6 +136,7 @@ def test_ten_kills_change_nothing(whole, killed, tmp_path, capsys):
     assert_same_map(out, whole)
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("no_report")
 def test_a_run_whose_gpu_fails_and_is_full_goes_on_each_time(
     own_room, whole, tmp_path, capsys, monkeypatch
@@ -224,6 +171,7 @@ def test_a_run_whose_gpu_fails_and_is_full_goes_on_each_time(
         assert (out / name).read_bytes() == (whole / name).read_bytes(), name
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("no_report")
 def test_a_run_killed_in_its_final_stages_does_only_those_again(
     own_room, whole, killed, tmp_path, capsys
@@ -235,7 +183,7 @@ def test_a_run_killed_in_its_final_stages_does_only_those_again(
     # Nothing is due before the end of the stream; the next to be put into its place is a result.
     call = ["run", str(own_room), "-o", str(out), *QUICK, "--checkpoint-every", "900"]
     command = [sys.executable, "-c", STOPPED, str(int(signal.SIGKILL)), "trajectory.tum", "1"]
-    done = subprocess.run([*command, *call], capture_output=True, text=True, timeout=400)
+    done = subprocess.run([*command, *call], capture_output=True, text=True, timeout=1800)
     assert "exit code -9" in done.stdout, done.stderr
     assert f"Starting anew; geogs run --resume {out} would go on" in " ".join(done.stderr.split())
     assert f"Going on after {FRAMES} frames." in goes_on(out, capsys)
@@ -261,7 +209,7 @@ def sentences(calls: list[list[object]]) -> list[str]:
     """What each of some commands says when it fails; one process for all."""
     argument = json.dumps([[str(a) for a in call] for call in calls])
     command = [sys.executable, "-c", SEVERAL, argument]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=200)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=1800)
     assert done.returncode == 0, done.stderr
     said = json.loads(done.stdout)
     assert [code for code, _ in said] == [2] * len(calls), said

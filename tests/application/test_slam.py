@@ -1,5 +1,6 @@
 """The system as Python programs use it."""
 
+import threading
 from dataclasses import replace
 
 import numpy as np
@@ -9,9 +10,11 @@ import torch
 import geogs
 from geogs.config import Config, InputConfig
 from geogs.errors import InputError
+from geogs.evaluation.trajectory import evaluate_trajectory
 from geogs.geometry.umeyama import umeyama
 from geogs.io.poses import read_tum_trajectory
 from geogs.tracking.tracker import TrackState
+from geogs.types import Trajectory
 
 FIRST, SECOND, END = 28, 24, 42
 """Frames where the first video ends, and where the second begins and ends."""
@@ -113,12 +116,43 @@ def test_mapping_beside_tracking_comes_to_the_same_where_nothing_is_late(small_r
         slam = geogs.Slam(source.camera, without_loops, live=live)
         for frame in source:
             pose = slam.process(frame)
+            slam.settle()
         if live:
             assert slam.render(pose.T_cw).depth.shape == (48, 64)  # asked of the thread
         slam.finish()
         maps.append(slam.snapshot())
     assert len(maps[0]) > 100
     assert torch.equal(maps[0].position, maps[1].position)
+
+
+@pytest.mark.system
+def test_a_frame_does_not_wait_for_a_keyframe_that_is_being_completed(small_room):
+    source = geogs.open_source(small_room, InputConfig(stop=FIRST))
+    slam = geogs.Slam(source.camera, config(), live=True)
+    go_on, complete, beside = threading.Event(), slam.segments.complete, 0
+
+    def complete_when_told() -> object:
+        assert go_on.wait(60)
+        return complete()
+
+    slam.segments.complete = complete_when_told
+    for frame in source:
+        pose = slam.process(frame)
+        if pose.is_tracked and beside:
+            assert 0 < pose.sigma_position < 0.1
+        beside += slam.completion.is_going_on
+        if beside == 2:  # the frame of a keyframe, and the one after it
+            before = pose.T_cw
+            go_on.set()
+            slam.settle()
+            torch.testing.assert_close(slam.T_cw, before, rtol=0, atol=0.02)
+    assert beside >= 2
+    slam.finish()
+    trajectory = slam.trajectory()
+    assert trajectory.tracked.all()
+    truth = np.loadtxt(small_room / "traj.txt").reshape(-1, 4, 4)[:FIRST]
+    reference = Trajectory(trajectory.timestamps, truth, np.ones(FIRST, dtype=bool))
+    assert evaluate_trajectory(trajectory, reference).ate_rmse_cm < 0.6
 
 
 def test_images_that_cannot_be_used_end_in_a_sentence():

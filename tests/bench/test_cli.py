@@ -22,7 +22,7 @@ TINY = [
 
 def geogs(*arguments: object) -> subprocess.CompletedProcess[str]:
     command = [*GEOGS, *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=300)
+    return subprocess.run(command, capture_output=True, text=True, timeout=1800)
 
 
 @pytest.fixture(scope="module")

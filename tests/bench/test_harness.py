@@ -1,6 +1,7 @@
 """The harness: plans, failures, resuming, options."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -125,6 +126,18 @@ def test_variants_have_folders_and_their_options_win(scenes, tmp_path):
     assert jobs[0].task.option("seed") == "1"
     with pytest.raises(InputError, match="no variant medium, only slow, fast"):
         make_jobs(test, scenes, tmp_path, Wishes(variants=("medium",)))
+
+
+def test_depth_is_used_where_it_is_there(scenes, tmp_path):
+    depth = Variant("rgb-d", (Option("depth", "sensor"),), needs_depth=True)
+    test = benchmark(scenes, variants=(Variant("rgb"), depth))
+    scenes = [scenes[0], replace(scenes[1], has_depth=True)]
+    jobs = make_jobs(test, scenes, tmp_path, Wishes())
+    assert [(job.scene.name, job.variant, job.task.option("depth")) for job in jobs] == [
+        ("attic", "rgb", None), ("cellar", "rgb", None), ("cellar", "rgb-d", "sensor"),
+    ]  # fmt: skip
+    with pytest.raises(InputError, match="No scene has depth images, which rgb-d needs"):
+        make_jobs(test, scenes[:1], tmp_path, Wishes(variants=("rgb-d",)))
 
 
 def test_budgets_and_the_baseline_make_variants(scenes, tmp_path):

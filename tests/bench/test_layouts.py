@@ -149,13 +149,18 @@ def test_tum_and_seven_scenes(tmp_path):
     touch(desk / "rgb.txt")
     touch(desk / "groundtruth.txt")
     touch(tmp_path / "tum" / "rgbd_dataset_freiburg1_xyz" / "rgb.txt")
-    assert [s.name for s in find_tum(tmp_path / "tum")] == [desk.name]
+    (found,) = find_tum(tmp_path / "tum")
+    assert (found.name, found.has_depth) == (desk.name, False)
+    touch(desk / "depth.txt")
+    assert find_tum(desk)[0].has_depth
     for sequence in ("chess/seq-01", "chess/seq-02", "fire/seq-01"):
         touch(tmp_path / "7" / sequence / "frame-000000.color.png")
         touch(tmp_path / "7" / sequence / "frame-000000.pose.txt")
+    touch(tmp_path / "7" / "chess" / "seq-02" / "frame-000020.depth.png")
     surface = touch(tmp_path / "7" / "fire" / "tsdf_pseudo_gt.ply")
     names = [s.name for s in find_seven_scenes(tmp_path / "7")]
     assert names == ["chess-seq-01", "chess-seq-02", "fire-seq-01"]
+    assert [s.has_depth for s in find_seven_scenes(tmp_path / "7")] == [False, True, False]
     assert find_seven_scenes(tmp_path / "7" / "fire")[0].truth.surface == surface
 
 

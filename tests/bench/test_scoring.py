@@ -23,7 +23,7 @@ from geogs_bench.record import (
     read_record,
     write_json,
 )
-from geogs_bench.registry import DTU, REPLICA
+from geogs_bench.registry import DTU, REPLICA, TUM
 from geogs_bench.report import markdown, write_report
 from geogs_bench.result import ResultFolder
 from geogs_bench.scoring.scores import score
@@ -67,6 +67,38 @@ def test_slam_stages_are_aligned_each_by_its_own_trajectory(tmp_path):
     assert (tmp_path / "out" / "report" / "bench_trajectory.png").is_file()
 
 
+def test_a_result_in_metres_is_aligned_rigidly_too(tmp_path):
+    scene = write_truth(tmp_path / "hall")
+    write_result(tmp_path / "out", 0.01, None)
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    (plain,) = score(scene, "run", ResultFolder(tmp_path / "out"), 0).stages
+    assert plain.trajectory.rigid_ate is None
+    summary["metric_scale"] = {"origin": "depth sensor", "factor": 1.0, "deviation": 0.01}
+    (tmp_path / "out" / "summary.json").write_text(json.dumps(summary))
+    (metric,) = score(scene, "run", ResultFolder(tmp_path / "out"), 0).stages
+    assert metric.trajectory.ate == plain.trajectory.ate
+    # It calls itself metric at a quarter of the size: the way is off by three quarters of itself.
+    truth = poses()[:, :3, 3]
+    off = 75 * np.sqrt(np.square(truth - truth.mean(0)).sum(1).mean())
+    assert metric.trajectory.rigid_ate == pytest.approx(off, rel=0.02)
+
+
+def test_published_figures_with_depth_stand_beside_results_with_depth():
+    name = "rgbd_dataset_freiburg1_desk"
+    rows = [record(name, "rgb", benchmark="tum"), record(name, "rgb-d", benchmark="tum")]
+    trajectory = replace(rows[1].stages[0].trajectory, rigid_ate=0.75)
+    rows[1] = replace(rows[1], stages=(replace(rows[1].stages[0], trajectory=trajectory),))
+    text = markdown(TUM, rows)
+    table = text.split("## Trajectory with the depth of the sensor")[1].split("##")[0]
+    lines = [line for line in table.splitlines() if line.startswith("|")]
+    ours, theirs = ([cell.strip() for cell in line.split("|")[1:-1]] for line in lines[2:4])
+    assert "ElasticFusion (published)" in lines[0]
+    assert ours[1:] == ["–"] * (len(ours) - 1)
+    assert theirs[1:4] == ["0.750", "3.70", "2.53"]
+    assert "Keetha" in table
+    assert "Figures of SplaTAM" in text
+
+
 def test_a_result_without_refinement_is_the_papers_stage(tmp_path):
     scene = write_truth(tmp_path / "hall")
     write_result(tmp_path / "out", 0.01, 0.0, refined=False)
@@ -94,6 +126,7 @@ def test_known_poses_are_not_aligned_and_make_a_curve(tmp_path):
     assert point.surface.chamfer > 2 * final.surface("area").chamfer
 
 
+@pytest.mark.long
 def test_an_object_is_scored_in_millimetres_inside_its_masks(tmp_path):
     from io_samples import write_image
 
@@ -192,7 +225,8 @@ def test_curves_are_drawn(tmp_path):
 
 
 def test_published_tables_are_complete_and_their_means_are_those_printed():
-    for table in (paper.REPLICA_SURFACE, paper.SCANNETPP, paper.SCANNET, paper.DTU):
+    tables = paper.REPLICA_SURFACE, paper.SCANNETPP, paper.SCANNET, paper.DTU, paper.TUM_RGBD
+    for table in tables:
         for row in table.rows:
             assert len(row.values) == len(table.columns)
             # The paper rounds some means down, and some to a tenth.
@@ -202,6 +236,7 @@ def test_published_tables_are_complete_and_their_means_are_those_printed():
     assert paper.DTU.mean(["other"], "CD") is None
 
 
+@pytest.mark.long
 def test_without_a_true_surface_held_out_images_judge_the_mesh(tmp_path):
     from geogs.synth.room import make_room
     from geogs.synth.tessellation import scene_mesh

@@ -40,6 +40,7 @@ def test_the_walk_leads_through_every_room_and_back():
     assert np.degrees(np.arccos(np.clip((turns - 1) / 2, -1, 1))).max() < 3.0
 
 
+@pytest.mark.long
 def test_rooms_are_drawn_from_seed_and_place_and_leave_room_for_the_camera():
     room, again = SUITE.room(1), Suite(4, seed=2).room(5)  # counted round the ring
     assert np.array_equal(room.centre, again.centre)
@@ -49,6 +50,7 @@ def test_rooms_are_drawn_from_seed_and_place_and_leave_room_for_the_camera():
     assert room.clearance(poses[own, :3, 3] - SUITE.origin(1)).min() > 0.2
 
 
+@pytest.mark.long
 def test_other_rooms_are_seen_through_doors():
     camera, caster = default_camera(96, 54), SuiteRaycaster(SUITE, threads=1)
     poses = SUITE.walk(120)

@@ -23,7 +23,7 @@ def geogs(words: str, before: str = "", **variables: str | None) -> subprocess.C
     environment = {name: value for name, value in environment.items() if value is not None}
     return subprocess.run(
         ["bash", "-c", f"{before}\n{GEOGS} {words}"],
-        env=environment, capture_output=True, timeout=400, check=False,
+        env=environment, capture_output=True, timeout=1800, check=False,
     )  # fmt: skip
 
 
@@ -110,7 +110,7 @@ def test_where_only_results_can_be_written_a_scene_is_rendered(tmp_path):
     environment = {k: v for k, v in environment.items() if k not in ("XDG_CACHE_HOME", VARIABLE)}
     done = subprocess.run(
         ["unshare", "-m", "bash", "-c", " && ".join([*mounts, words])],
-        env=environment, capture_output=True, timeout=400, check=False,
+        env=environment, capture_output=True, timeout=1800, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr.decode()
     assert any((tmp_path / f"geogs-kernels-{os.getuid()}").iterdir())

@@ -21,7 +21,7 @@ sys.exit(0 if file.fileno() > 2 and os.stat(sys.argv[1]).st_size == 0 else 1)
 
 def shell(command: str, **more: object) -> subprocess.CompletedProcess:
     return subprocess.run(
-        ["bash", "-c", f"set -o pipefail; {command}"], env=ENVIRONMENT, timeout=60,
+        ["bash", "-c", f"set -o pipefail; {command}"], env=ENVIRONMENT, timeout=1800,
         capture_output=True, **more,
     )  # fmt: skip
 

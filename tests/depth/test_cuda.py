@@ -220,7 +220,9 @@ def test_grids_are_upsampled_and_patches_gathered_as_opencv_does(setting):
 
 
 @pytest.mark.system
-@pytest.mark.parametrize("shape", [(6, 11), (9, 5), (3, 4)])
+@pytest.mark.parametrize(
+    "shape", [*(pytest.param(s, marks=pytest.mark.long) for s in ((6, 11), (9, 5))), (3, 4)]
+)
 def test_completed_grids(setting, shape):
     config = setting.config
     shape = tuple(7 * n for n in shape)

@@ -1,4 +1,5 @@
-"""Files here and elsewhere; elsewhere is fsspec's file system in memory."""
+"""Files here and elsewhere; elsewhere is fsspec's file system in memory, and a server that speaks
+S3 where moto and s3fs are installed."""
 
 import os
 import uuid
@@ -11,8 +12,30 @@ from geogs.fleet.places import Place
 pytest.importorskip("fsspec", reason="fsspec is not installed: pip install 'geogs[fleet]'")
 
 
-@pytest.fixture(params=["path", "file", "memory"])
+@pytest.fixture(scope="module")
+def bucket():
+    """A bucket of a server in this process."""
+    server_of = pytest.importorskip("moto.server", reason="pip install 'moto[server]' s3fs")
+    s3fs = pytest.importorskip("s3fs", reason="pip install 'moto[server]' s3fs")
+    server = server_of.ThreadedMotoServer(ip_address="127.0.0.1", port=0)
+    server.start()
+    host, port = server.get_host_and_port()
+    said = {
+        "AWS_ENDPOINT_URL": f"http://{host}:{port}", "AWS_DEFAULT_REGION": "us-east-1",
+        "AWS_ACCESS_KEY_ID": "any", "AWS_SECRET_ACCESS_KEY": "any",
+    }  # fmt: skip
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in said.items():
+            patch.setenv(name, value)
+        s3fs.S3FileSystem().mkdir("geogs")
+        yield f"s3://geogs/{uuid.uuid4().hex}"
+    server.stop()
+
+
+@pytest.fixture(params=["path", "file", "memory", "s3"])
 def place(request, tmp_path) -> Place:
+    if request.param == "s3":
+        return Place(request.getfixturevalue("bucket"))
     kinds = {"path": str(tmp_path), "file": f"file://{tmp_path}"}
     return Place(kinds.get(request.param, f"memory://{uuid.uuid4().hex}"))
 

@@ -189,6 +189,7 @@ def test_update_is_deterministic(path):
     assert run() == run()
 
 
+@pytest.mark.long
 def test_a_room_of_another_shape_with_the_same_pictures_closes_no_loop(path):
     seen, poses = path
     other = stretched(room(3).scene, 1.35)

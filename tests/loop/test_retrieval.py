@@ -67,6 +67,7 @@ def test_exposure_does_not_matter(index, again, gain):
         assert 100 + 5 * n in best
 
 
+@pytest.mark.long
 def test_other_rooms_score_far_less(index, again):
     here = min(index.query(image, count=1)[0].score for image in again)
     for view in room_views(5, orbit(room(5).scene, 4)):

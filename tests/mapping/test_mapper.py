@@ -102,6 +102,7 @@ def test_training_and_refining_make_it_better(sequence):
     assert final < 0.97 * online
 
 
+@pytest.mark.long
 def test_same_seed_same_map(sequence):
     first, second = (build(sequence[0][:6]) for _ in range(2))
     assert (first.map.position == second.map.position).all()
@@ -183,6 +184,7 @@ def test_a_rigid_correction_moves_map_and_views_together(sequence):
     assert depth_error(mapper, truth[:6]) == pytest.approx(before, abs=0.02)
 
 
+@pytest.mark.long
 def test_mapping_goes_on_in_corrected_units(sequence):
     """Half-way the world turns, moves and shrinks to nine tenths; the map hardly differs after."""
     keyframes, truth = sequence
@@ -248,6 +250,7 @@ def test_windows_hold_the_newest_and_draw_older_ones():
     assert set(range(16, 20)) <= set(whole)
 
 
+@pytest.mark.long
 def test_parked_views_change_nothing(sequence):
     """With next to no keyframe in memory the same map comes out, bit by bit."""
     keyframes, _ = sequence

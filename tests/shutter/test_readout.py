@@ -73,7 +73,10 @@ def clips(readout: float) -> list[list]:
 
 
 @pytest.mark.system
-@pytest.mark.parametrize(("readout", "least", "most"), [(0.0, 0.0, 0.0), (0.03, 0.024, 0.034)])
+@pytest.mark.parametrize(
+    ("readout", "least", "most"),
+    [pytest.param(0.0, 0.0, 0.0, marks=pytest.mark.long), (0.03, 0.024, 0.034)],
+)
 def test_a_rendered_video_tells_its_readout(readout, least, most):
     done = []
     found = find_readout(clips(readout), RollingCamera(CAMERA), done.append)

@@ -8,6 +8,7 @@ from geogs.geometry.camera import Camera
 from geogs.geometry.lie import so3_exp
 from geogs.shutter.camera import RollingCamera
 from geogs.shutter.rows import RowOffsets
+from geogs.shutter.shutter import Shutter
 from geogs.shutter.turning import Turning
 
 CAMERA = Camera(420.0, 415.0, 255.0, 190.0, 512, 384)
@@ -75,3 +76,22 @@ def test_parallax_counts_little_where_the_rate_changes_fast():
     alone = offsets(shaken, READOUT)
     both = offsets(Turning(acceleration=shaken.acceleration, parallax=drift), READOUT)
     assert np.abs(both - alone).max() < 0.05 * 420 * 0.3 * READOUT / 2
+
+
+@pytest.mark.parametrize("distortion", [(), (-0.28, 0.08, 0.001, -0.002)])
+def test_what_is_kept_of_the_rows_says_where_and_when_each_node_was_seen(distortion):
+    rolling, zoom = RollingCamera(CAMERA, distortion), 1.15
+    target = Camera(420.0 * zoom, 415.0 * zoom, 255.0, 190.0, 512, 384)
+    offsets = RowOffsets(rolling, target)
+    rows = offsets.seen(offsets.nodes(FAST, READOUT), Shutter(READOUT, error=0.003))
+    assert rows.seconds.shape == (384 // 8 + 2, 512 // 8 + 2)
+    assert rows.doubt == pytest.approx(0.003 / READOUT)
+    for line, column in [(3, 4), (25, 33), (46, 60)]:
+        u, v = 8 * column - 4.5, 8 * line - 4.5  # of the node after the border's
+        ray = np.array([(u - target.cx) / target.fx, (v - target.cy) / target.fy, 1.0])
+        pixel = seen_at(rolling, ray, FAST)
+        seconds = READOUT * rolling.line_times(pixel[None])[0]
+        assert float(rows.seconds[line, column]) == pytest.approx(seconds, abs=2e-5)
+        moved = so3_exp(torch.tensor(FAST.angles(np.array([seconds]))[0])).numpy() @ ray
+        there = moved[:2] / moved[2] * [target.fx, target.fy] + [target.cx, target.cy]
+        np.testing.assert_allclose(rows.offset[line, column], there - [u, v], atol=0.03)

@@ -86,11 +86,13 @@ def test_a_good_prior_gives_bare_walls_their_depth(walk, alone: Score, helped: T
     assert good.ate < 1.1 * alone.ate
 
 
+@pytest.mark.long
 def test_a_prior_known_up_to_a_shift_helps_as_well(walk, alone: Score):
     prior = DegradedPrior(walk[0], PLAUSIBLE, DepthKind.AFFINE_INVERSE)
     assert score(track(walk[0], prior), walk).bare < 0.8 * alone.bare
 
 
+@pytest.mark.long
 def test_a_bad_prior_costs_little(walk, alone: Score):
     bad = score(track(walk[0], DegradedPrior(walk[0], BAD)), walk)
     assert bad.ate < 1.2 * alone.ate
@@ -145,6 +147,7 @@ class _Normals:
         return PriorMaps(normal=normal)
 
 
+@pytest.mark.long
 def test_normals_reach_the_keyframes_and_depth_can_be_left_alone(walk):
     views = walk[0][:20]
     without, normals = track(views, None), track(views, _Normals())

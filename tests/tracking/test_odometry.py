@@ -82,12 +82,18 @@ def test_poses_bring_metres_and_wrong_ones_are_out_voted():
     path = sideways(40)
     alone, unknown = errors(tracked(path, None), path)
     assert unknown is None
-    for wrong in (0.0, 0.2):
-        tracker = tracked(path, drifting(path, 0, wrong=wrong))
-        ate, scale = errors(tracker, path)
-        assert ate < 1.1 * alone + 0.005
-        assert abs(scale) < 0.01
-        assert tracker.odometry.agreement().share > 0.5
+    tracker = tracked(path, drifting(path, 0, wrong=0.2))
+    ate, scale = errors(tracker, path)
+    assert ate < 1.1 * alone + 0.005
+    assert abs(scale) < 0.01
+    assert tracker.odometry.agreement().share > 0.5
+
+
+@pytest.mark.long
+@pytest.mark.system
+def test_poses_of_another_motion_change_nothing():
+    path = sideways(40)
+    alone, _ = errors(tracked(path, None), path)
     other = [pose(0.05 * np.cos(0.4 * k), 0.02 * k, 0.06 * k, 0.09 * k) for k in range(40)]
     tracker = tracked(path, drifting(other))
     agreement = tracker.odometry.agreement()

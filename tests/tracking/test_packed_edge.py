@@ -59,6 +59,7 @@ def peak_mib() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
+@pytest.mark.long
 @pytest.mark.system
 def test_a_walk_of_a_thousand_keyframes_is_adjusted_in_little_memory():
     tiny = Camera(fx=45.0, fy=45.0, cx=23.5, cy=19.5, width=48, height=40)

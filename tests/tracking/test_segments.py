@@ -80,6 +80,7 @@ def test_a_covered_lens_is_survived_where_the_place_was_seen_before():
     assert error_cm(segments, angles) < 0.3
 
 
+@pytest.mark.long
 def test_a_jump_cut_begins_a_segment_that_a_loop_joins():
     there = np.arange(0, 48, 2.0)
     back = np.arange(150, 10, -2.5)
@@ -97,6 +98,7 @@ def test_a_jump_cut_begins_a_segment_that_a_loop_joins():
     assert ids == sorted(set(ids))
 
 
+@pytest.mark.long
 def test_a_segment_that_meets_nothing_stays_apart():
     angles = [*np.arange(0, 60, 2.0), *np.arange(180, 210, 2.0)]
     segments, results = run(stream(angles, cuts=[30]))

@@ -77,6 +77,7 @@ def test_median_depth_is_about_one_unit(tracked):
     assert 0.7 < float(depth.median()) < 1.5
 
 
+@pytest.mark.long
 def test_same_seed_same_result(tracked):
     again, _ = run(frames(PATH))
     assert np.array_equal(again.trajectory().T_wc, tracked[0].trajectory().T_wc)
@@ -117,6 +118,7 @@ def test_garbage_in_the_middle_is_lost_and_recovered():
     assert error_cm(trajectory.T_wc[good, :3, 3], np.stack(PATH)[good, :3, 3]) < 0.6
 
 
+@pytest.mark.long
 def test_lost_until_the_end_keeps_what_there_is():
     stream = frames(PATH)
     rng = np.random.default_rng(1)
@@ -129,6 +131,7 @@ def test_lost_until_the_end_keeps_what_there_is():
     assert len(tracker.keyframe_ids) >= 5
 
 
+@pytest.mark.long
 def test_noise_is_lost_even_if_the_flow_believes_in_it():
     stream = frames(PATH[:30])
     rng = np.random.default_rng(1)
@@ -153,6 +156,7 @@ def test_dark_start_is_skipped():
     assert np.flatnonzero(~tracker.trajectory().tracked).tolist() == [0, 1, 2]
 
 
+@pytest.mark.long
 def test_light_switched_on_the_way():
     stream = frames(PATH)
     for k in range(20, 40):
@@ -170,6 +174,7 @@ def test_static_video_says_so():
         run(frames([pose(0.0)] * 12))
 
 
+@pytest.mark.long
 def test_pure_rotation_says_so():
     with pytest.raises(TrackingLost, match="parallax"):
         run(frames([pose(0.0, yaw=0.02 * k) for k in range(24)]))
@@ -192,6 +197,7 @@ def test_tiny_image_is_refused():
         Tracker(Camera(20.0, 20.0, 10.0, 10.0, 24, 20), CONFIG)
 
 
+@pytest.mark.long
 def test_correct_scales_depth_with_the_pose():
     tracker, _ = run(frames(PATH[:30]))
     id = tracker.keyframe_ids[2]
@@ -210,6 +216,7 @@ def test_correct_scales_depth_with_the_pose():
     torch.testing.assert_close(*sigma)
 
 
+@pytest.mark.long
 def test_slow_motion_makes_few_keyframes_and_culling_removes_more():
     slow = frames(sideways(30, 0.012))
     few, _ = run(slow)

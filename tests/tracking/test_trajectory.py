@@ -1,5 +1,7 @@
 """Poses of the frames between keyframes."""
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 
@@ -7,7 +9,7 @@ from geogs.geometry.lie import se3_exp, se3_inverse
 from geogs.tracking.flow.base import FlowMatch
 from geogs.tracking.gaps import interpolate
 from geogs.tracking.trajectory import TrajectoryRecorder, depth_aware_weight
-from geogs.types import Frame
+from geogs.types import Frame, SeenRows
 from planted_walk import planted_tracker
 
 
@@ -68,3 +70,18 @@ def test_what_is_kept_of_a_frame_is_small_and_finds_its_pose():
     found = torch.from_numpy(recorder.solve().T_wc[0])
     # Positions are known to 1/800 pixel here, of 75 pixels focal length at 3 metres.
     torch.testing.assert_close(se3_inverse(found), T[2], rtol=0, atol=2e-4)
+
+
+def test_rows_go_where_the_frames_go():
+    tracker, _ = planted_tracker(3)
+    rows = SeenRows(torch.zeros(3, 4, 2).half(), torch.zeros(3, 4).half())
+    recorders = [TrajectoryRecorder(tracker.keyframes, tracker.operator) for _ in range(4)]
+    for n, recorder in enumerate(recorders[:3]):
+        recorder.see(replace(frame(n), rows=rows))
+        recorder.see(frame(10 + n))  # of a global shutter
+    recorders[0].absorb(recorders[1])
+    recorders[0].give_up(recorders[2])
+    recorders[3].load(recorders[0].state())
+    assert set(recorders[3].rows) == {0, 1, 2}
+    assert recorders[1].row_errors() is not None
+    assert TrajectoryRecorder(tracker.keyframes, tracker.operator).row_errors() is None

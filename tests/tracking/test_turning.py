@@ -71,6 +71,7 @@ def turning_away() -> tuple[list[np.ndarray], Segments, list]:
     return path, segments, results
 
 
+@pytest.mark.long
 def test_turning_away_leaves_the_orientation(turning_away):
     path, segments, _ = turning_away
     trajectory = segments.trajectory()
@@ -81,6 +82,7 @@ def test_turning_away_leaves_the_orientation(turning_away):
     assert turned(path, trajectory).max() < 0.5
 
 
+@pytest.mark.long
 def test_coming_back_goes_on_in_the_same_world(turning_away):
     path, segments, _ = turning_away
     trajectory = segments.trajectory()
@@ -91,6 +93,7 @@ def test_coming_back_goes_on_in_the_same_world(turning_away):
     assert error_cm(trajectory.T_wc[known, :3, 3], np.stack(path)[known, :3, 3]) < 0.6
 
 
+@pytest.mark.long
 def test_no_keyframe_is_made_where_no_depth_is_known(turning_away):
     path, segments, _ = turning_away
     for keyframe in segments.world.keyframes:
@@ -109,6 +112,7 @@ def test_frames_before_a_start_are_located_by_its_keyframes():
     assert turned(path, trajectory).max() < 0.6
 
 
+@pytest.mark.long
 def test_a_state_goes_on_as_if_nothing_had_happened():
     path = [pose(0.0, yaw=0.03 * k) for k in range(20)]
     stream = frames(path)

@@ -6,7 +6,7 @@ import torch
 from geogs.geometry.lie import se3_exp
 from geogs.keyframes.grid import SampleGrid
 from geogs.keyframes.store import KeyframeStore
-from geogs.tracking.tracker import LastFrame
+from geogs.tracking.last_frame import LastFrame
 from tracking_scenes import CAMERA
 
 

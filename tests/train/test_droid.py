@@ -134,6 +134,7 @@ def test_every_part_learns_from_poses_and_depths_alone(clip):
     assert all(p.grad is None for p in network.update.agg.upmask.parameters())
 
 
+@pytest.mark.long
 def test_training_through_the_adjustment_lowers_the_loss(clip):
     """To less than 0.4, for poses that are a guess and depths that are all one.
 

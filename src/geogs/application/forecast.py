@@ -15,12 +15,14 @@ FINAL_STEP = 0.85
 """What a step of the final training costs, in those of the training on the way."""
 ADJUSTMENT = 0.33
 """What the final adjustment of all keyframes costs, as a part of all tracking."""
-MESH = 9.0
-"""What the mesh costs a keyframe, in training steps."""
+MESH, MESH_SECONDS = 4.0, 3.0
+"""What the mesh costs a keyframe, in training steps, and all of it besides."""
 MESH_SHARES = {"fuse": 0.4, "colour": 0.3, "merge": 0.3}
 """Of its stages; what is done between two of them counts to the first."""
-REPORT_STEPS, REPORT_SECONDS = 30.0, 4.0
+REPORT_STEPS, REPORT_SECONDS = 10.0, 1.5
 """What writing and the report cost: steps, but at least seconds."""
+_FEW_MARKS = 8
+"""Frames up to which the mean is that of all."""
 _TRUST = 0.5
 """Part of the final stages as planned that counts as if it had been seen."""
 
@@ -88,26 +90,25 @@ class RunForecast:
     """Of the run."""
     frames: int | None
     """Of the source, if that is known."""
-    begun: int = 0
-    """Frames that an earlier run did."""
     clock: Callable[[], float] = time.perf_counter
 
     def __post_init__(self) -> None:
-        self._start = self.clock()
-        self._marks: list[tuple[int, float]] = [(self.begun, self._start)]
+        self._marks: list[tuple[int, float]] = []
         self._final: StageForecast | None = None
         self._keyframes = 0
 
     def after_frame(self, frames: int, keyframes: int) -> float | None:
         """Seconds left after so many frames; none where that cannot be said."""
         now = self.clock()
+        if not self._keyframes:  # frames up to the first keyframes cost other than those after
+            self._marks = []
         self._marks.append((frames, now))
         self._keyframes = keyframes
-        if self.frames is None or frames <= self.begun or not keyframes:
+        if self.frames is None or len(self._marks) < 2 or not keyframes:
             return None
         share = frames / max(self.frames, frames)
         final = sum(seconds for _, seconds in self.final_stages(keyframes / share, 1 / share))
-        return (self.frames - frames) * self._seconds_a_frame(keyframes) + final
+        return (self.frames - frames) * self._seconds_a_frame() + final
 
     def after_stage(self, name: str, fraction: float) -> float | None:
         """Seconds left within the stages after the last frame."""
@@ -131,16 +132,14 @@ class RunForecast:
         return [
             ("bundle adjustment", ADJUSTMENT * tracking),
             ("map refinement", FINAL_STEP * final * step),
-            *mesh_stages(MESH * keyframes * step),
+            *mesh_stages(MESH * keyframes * step + MESH_SECONDS),
             ("report", max(REPORT_STEPS * step, REPORT_SECONDS)),
         ]
 
-    def _seconds_a_frame(self, keyframes: int) -> float:
-        """The mean so far; of a long run, where that changes, the mean of its later half."""
+    def _seconds_a_frame(self) -> float:
+        """The mean of the later half, as the first keyframes are trained with fewer views."""
         last, now = self._marks[-1]
-        first, start = self._marks[0]
-        if keyframes > 40:
-            first, start = self._marks[len(self._marks) // 2]
+        first, start = self._marks[len(self._marks) // 2 if len(self._marks) > _FEW_MARKS else 0]
         return (now - start) / max(last - first, 1)
 
 

@@ -1,22 +1,25 @@
 """What the mesh and the files of a reconstruction are going to take: a rehearsal with a few views.
 
 Some of it is done once for each view, some once for each piece of the surface. Both are measured on
-views that show the same place, and multiplied by how many views there are and how much more surface
-all of them show. What is needed but once, such as compiled code, is made ready by then.
+views that show the same place, with larger voxels, and multiplied by how many views there are and
+how many more voxels the surface of all of them has. What is needed but once, such as compiled code,
+is made ready by then.
 """
 
 import logging
 import tempfile
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from geogs.application.keyframe_files import write_keyframes
 from geogs.application.report import write_report
 from geogs.application.surfaces import fusion_views
+from geogs.config import MeshConfig
 from geogs.errors import InputError
-from geogs.mesh.extract import extract_mesh, plan_volume
+from geogs.mesh.extract import VolumePlan, extract_mesh, plan_volume
 from geogs.reconstruction import OutputCost, Reconstruction
 
 _log = logging.getLogger(__name__)
@@ -26,12 +29,24 @@ Share = Callable[[Sequence[int]], float]
 
 VIEWS = 3
 """Views of the rehearsal; and of the one before it, which makes ready what is needed but once."""
+ONE_VIEW = 0.3
+"""Weight from which a surface counts in a rehearsal: what one view has seen is part of it, too, as
+all views together are going to confirm it."""
+COARSER = 2.0
+"""Times the voxels that all views are going to have, in a rehearsal."""
 CAUTION = 1.1
 """By how much more is kept than was measured, on two CPU cores: a larger volume, with more vertices
 to look for in each image, and the disks, which are not there yet."""
 MOST_SURFACE = 4.0
 """Times the surface of the rehearsal that is expected at most before the depths tell it: of a large
 scene only a few views may be affordable, and then what was kept for its mesh is lost to them."""
+MESH_SHARE = 0.4
+"""Part of the time that is left which mesh and files may take; where they would take more, the mesh
+gets fewer triangles."""
+FEWEST_TRIANGLES = 0.25
+"""Part of its triangles that it keeps in any case."""
+FEWEST = 1000
+"""Triangles below which nothing is gained."""
 WORTH = 0.05
 """Part of the time that is left which a last rehearsal may take."""
 
@@ -64,6 +79,10 @@ class _Rehearsal:
     """Each view."""
     surface: float
     """The surface that they show."""
+    blocks: int
+    """Of its volume, had its voxels been as small as planned."""
+    triangles: int
+    """Of its surface, likewise."""
     seconds: float
     """All of it."""
 
@@ -84,14 +103,18 @@ class OutputForecast:
         """Once some depths have been searched: rehearsed twice.
 
         ``times_the_surface`` tells how much more surface all views show than some, given as places
-        in the set.
+        in the set. Where little time is left, the scene's mesh gets a smaller budget of triangles.
         """
         scene = self._scene
         self._views = scene.neighbouring(VIEWS)
-        _rehearse(scene, self._views[:1], self._clock)
+        _make_ready(scene, self._views[:1])
         self._found = _rehearse(scene, self._views, self._clock)
         times = times_the_surface([scene.image_of(i) for i in self._views])
-        return _cost(self._found, min(times, MOST_SURFACE))
+        # However much surface there is, its triangles are no more than this.
+        most = scene.config.mesh.triangle_budget / max(self._found.triangles, 1)
+        times = min(times, max(most, 1.0), MOST_SURFACE)
+        times *= self._affordable_triangles(self._found, times)
+        return _cost(self._found, COARSER**2 * times)
 
     def settled(self, left: float) -> OutputCost:
         """Once all depths have been checked: with these, rehearsed again if that is but a small
@@ -101,32 +124,54 @@ class OutputForecast:
             self._views = self._views or scene.neighbouring(VIEWS)
             found = _rehearse(scene, self._views, self._clock)
         try:
-            some = plan_volume(fusion_views(scene.depth_maps(self._views)), scene.config.mesh)
             whole = plan_volume(fusion_views(scene.depth_maps()), scene.config.mesh)
-            times = max(whole.blocks / some.blocks, 1.0)
+            times = whole.blocks / found.blocks if found.blocks else 1.0
         except InputError:  # no view shows anything that is sure
             times = 1.0
-        return _cost(found, times)
+        return _cost(found, COARSER**2 * times)
+
+    def _affordable_triangles(self, found: _Rehearsal, times: float) -> float:
+        """The part of the triangles for which there is time; the scene's mesh is told so."""
+        scene, mesh = self._scene, self._scene.config.mesh
+        surface = CAUTION * COARSER**2 * times * found.surface
+        spare = MESH_SHARE * scene.budget_left - CAUTION * found.report
+        if mesh.voxel is not None or surface <= max(spare, 0.0):
+            return 1.0
+        part = max(spare / surface, FEWEST_TRIANGLES)
+        fewer = max(round(part * times * found.triangles), FEWEST)
+        if fewer < mesh.triangle_budget:
+            scene.config = replace(scene.config, mesh=replace(mesh, triangle_budget=fewer))
+        return part
 
 
 def _cost(found: _Rehearsal, times_the_surface: float) -> OutputCost:
     once = CAUTION * (found.report + times_the_surface * found.surface)
     a_view = CAUTION * found.a_view
     _log.info(
-        "mesh and files: %.1f s, %.1f times the surface, and %.3f s an image",
+        "mesh and files: %.1f s, %.1f times those of the rehearsal, and %.3f s an image",
         once, times_the_surface, a_view,
     )  # fmt: skip
     return OutputCost(once, a_view)
 
 
+def _make_ready(scene: Reconstruction, views: list[int]) -> None:
+    """Load and compile what a mesh and its files need."""
+    from geogs.evaluation import run_pictures, run_report  # noqa: F401
+
+    with suppress(InputError):  # what one view shows is not sure enough for a surface
+        extract_mesh(fusion_views(scene.depth_maps(of=views)), scene.config.mesh)
+
+
 def _rehearse(scene: Reconstruction, views: list[int], clock: Clock) -> _Rehearsal:
-    start, mesh = clock(), None
+    start, mesh, blocks, triangles = clock(), None, 0, 0
     with tempfile.TemporaryDirectory(prefix="geogs-rehearsal-") as folder:
         renders = scene.depth_maps(of=views)
         write_keyframes(Path(folder), scene, scene.camera, renders, True)
         of_views, times = clock() - start, StageTimes(clock)
         try:
-            mesh = extract_mesh(fusion_views(renders), scene.config.mesh, times)
+            plan = plan_volume(fusion_views(renders), scene.config.mesh)
+            blocks, triangles = plan.blocks, plan.triangles
+            mesh = extract_mesh(fusion_views(renders), _coarse(scene.config.mesh, plan), times)
         except InputError:  # these views show no surface: the others may
             times("merge", 1, 1)
         fused = clock()
@@ -134,4 +179,10 @@ def _rehearse(scene: Reconstruction, views: list[int], clock: Clock) -> _Rehears
         report = clock() - fused
     of_views += times.seconds.get("views", 0.0) * len(views) / max(len(views) - 1, 1)
     surface = times.seconds.get("surface", 0.0)
-    return _Rehearsal(report, of_views / len(views), surface, clock() - start)
+    return _Rehearsal(report, of_views / len(views), surface, blocks, triangles, clock() - start)
+
+
+def _coarse(config: MeshConfig, plan: VolumePlan) -> MeshConfig:
+    """How the surface of a few views is made, in place of what was planned."""
+    lenient = min(config.min_weight, ONE_VIEW)
+    return replace(config, voxel=COARSER * plan.voxel, min_weight=lenient)

@@ -159,7 +159,7 @@ def _to_folder(
         def report(stage: str, fraction: float) -> None:
             progress.stage(stage, fraction)
             if stage == "growing":
-                progress.write(_chosen_views(scene))
+                progress.write(_chosen_views(scene, config))
             snapshots.take(scene)
             checkpoint.report(stage, scene)
             stop.check()
@@ -236,14 +236,20 @@ def _complete(
     scene.finish(points, reported, more)
 
 
-def _chosen_views(scene: Reconstruction) -> str:
-    """What to say where not all images make the map; else nothing."""
-    if scene.with_depth == scene.frames:
-        return ""
-    return (
-        f"The map is made of {scene.with_depth} of {scene.frames} images, which show the scene "
-        "best; a longer --budget or a larger --search.most-views takes more."
-    )
+def _chosen_views(scene: Reconstruction, asked: ReconstructConfig) -> str:
+    """What to say where not all images make the map, or its mesh is coarse; else nothing."""
+    said = []
+    if scene.with_depth < scene.frames:
+        said.append(
+            f"The map is made of {scene.with_depth} of {scene.frames} images, which show the scene "
+            "best; a longer --budget or a larger --search.most-views takes more."
+        )
+    if scene.config.mesh != asked.mesh:
+        said.append(
+            "For a finer mesh the --budget is too short; geogs mesh OUT --mesh.triangle-budget "
+            f"{asked.mesh.triangle_budget} makes one afterwards."
+        )
+    return " ".join(said)
 
 
 class _Clock:

@@ -197,7 +197,7 @@ class _Run:
         slam, source, settings, output = self.slam, self.source, self.settings, self.output
         progress = self.progress
         checkpoint = RunCheckpoint(output, self.facts, settings.checkpoint_every, progress)
-        progress.plan(RunForecast(slam.config, slam.stopwatch, source.length, slam.frames))
+        progress.plan(RunForecast(slam.config, slam.stopwatch, source.length))
         progress.expect(source.length, slam.frames)
         kept = False
         with full_memory_in_a_sentence(self._way_on), self.stop:

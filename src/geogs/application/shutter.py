@@ -52,7 +52,8 @@ def with_shutter_found(
         f"Rolling shutter: {1000 * found.readout:.1f} ms from the first to the last row "
         f"({_evidence(found)}); rows are rectified."
     )
-    return source.with_shutter(Shutter(found.readout, f"found in the video: {_evidence(found)}"))
+    origin = f"found in the video: {_evidence(found)}"
+    return source.with_shutter(Shutter(found.readout, origin, found.error))
 
 
 def _evidence(found: "FoundReadout") -> str:

@@ -225,8 +225,8 @@ class Slam(Algorithm):
     def _estimate(self, status: SlamStatus, timestamp: float) -> PoseEstimate:
         tracker = self.segments.current
         in_world = tracker is self.segments.world and status.state is TrackState.TRACKING
-        T_cw = tracker.T_cw if in_world else None
-        known = tracker.deviation() if T_cw is not None else None
+        T_cw = self.T_cw if in_world else None
+        known = self.deviation() if T_cw is not None else None
         sigma = (np.inf, np.inf) if known is None else (known.position, known.rotation)
         return PoseEstimate(
             status.state, status.frames, status.keyframes, status.disks, timestamp,

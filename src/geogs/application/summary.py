@@ -82,7 +82,7 @@ def source_summary(source: Stream | PosedSource) -> dict[str, object]:
         "scale": "arbitrary (monocular)",
         "skipped_images": source.skipped,
         "damaged_images": source.damaged,
-        "shutter": asdict(source.shutter),
+        "shutter": {"readout": source.shutter.readout, "origin": source.shutter.origin},
         **live,
         **videos,
     }

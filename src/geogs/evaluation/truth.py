@@ -11,7 +11,7 @@ from geogs.evaluation.masks import Silhouette
 from geogs.evaluation.photoconsistency import PhotoView
 from geogs.io.poses import read_poses
 from geogs.io.sources.posed.base import PosedSource
-from geogs.io.sources.posed.sniff import open_posed_source
+from geogs.io.sources.posed.sniff import holds_posed_images, open_posed_source
 from geogs.types import Trajectory
 
 _METRES = {"millimetres": 0.001}
@@ -49,8 +49,8 @@ def read_true_scene(path: Path) -> TrueScene:
             raise
         try:
             source = open_posed_source(path)
-        except InputError:
-            raise error from None
+        except InputError as why:
+            raise (why if holds_posed_images(path) else error) from None
     metres = _METRES.get(source.scene_scale, 1.0)
     T_wc = np.linalg.inv(source.T_cw)
     T_wc[:, :3, 3] *= metres

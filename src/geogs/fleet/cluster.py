@@ -87,6 +87,8 @@ def _times(node: dict[str, float], wanted: dict[str, float]) -> int:
 def _connect(ray: Any, address: str) -> None:
     import logging
 
+    from geogs.threads import available_cores
+
     quiet = {"logging_level": logging.ERROR, "log_to_driver": False}
     if address != "local":
         try:
@@ -98,4 +100,10 @@ def _connect(ray: Any, address: str) -> None:
         except (ValueError, RuntimeError, OSError) as error:
             said = str(error).splitlines()[0] if str(error) else type(error).__name__
             raise InputError(f"Ray cannot be reached at {address} ({said}).") from error
-    ray.init(address="local", include_dashboard=False, object_store_memory=_OBJECTS, **quiet)
+    ray.init(
+        address="local",
+        num_cpus=available_cores(),  # Ray would count those that others have, too
+        include_dashboard=False,
+        object_store_memory=_OBJECTS,
+        **quiet,
+    )

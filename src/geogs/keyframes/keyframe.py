@@ -1,5 +1,6 @@
 """A keyframe: what was seen, from where, and how far it is."""
 
+import copy
 from dataclasses import dataclass
 from typing import Any
 
@@ -126,6 +127,14 @@ class Keyframe:
     def encoded(self) -> Any:
         """The flow operator's form of the image."""
         return self.picture.encoded
+
+    def as_it_is(self) -> "Keyframe":
+        """A copy that stays what this one is now; it has no place in any store."""
+        twin = copy.copy(self)
+        twin.prior, twin.measured = copy.copy(self.prior), copy.copy(self.measured)
+        twin.poses = PoseTable()
+        twin.T_cw = self.T_cw
+        return twin
 
     def state(self) -> KeyframeState:
         """What a checkpoint holds."""

@@ -1,6 +1,7 @@
 """Loops along the way: found at keyframes that are final, closed when that changes something."""
 
 from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -10,8 +11,9 @@ from torch import Tensor
 
 from geogs.config import LoopConfig
 from geogs.geometry.lie import se3_inverse, sim3_inverse, sim3_scale
+from geogs.loop.closing import ClosingQuestion, brought_forward
 from geogs.loop.closing_matches import closing_matches, take_over_depths
-from geogs.loop.closure import close_loops
+from geogs.loop.closure import LoopClosure
 from geogs.loop.constraints import (
     between_positions,
     disagreement,
@@ -50,6 +52,17 @@ class Known:
         self.loops = rescaled(self.loops, correction.scale)
 
 
+@dataclass(frozen=True)
+class _Asked:
+    """A closing that a thread computes."""
+
+    question: ClosingQuestion
+    answer: Future[LoopClosure | None]
+    world: Tracker
+    age: int
+    """Of the world then."""
+
+
 @dataclass(frozen=True, eq=False)
 class LoopsState:
     """What a checkpoint holds of loops."""
@@ -71,7 +84,8 @@ class LoopCloser:
         waits: bool = True,
         mask: Bool[np.ndarray, "h w"] | None = None,
     ) -> None:
-        """``waits`` and ``mask`` as the detector's."""
+        """``waits`` and ``mask`` as the detector's. Without waiting, closings are computed by a
+        thread, too, and take effect at a keyframe that becomes final after that."""
         self.segments = segments
         self.config = config
         tracker = segments.world
@@ -81,6 +95,11 @@ class LoopCloser:
         self._known: dict[Tracker, Known] = {}
         self._between: list[Loop] = []
         """Loops between segments."""
+        self._thread = None if waits else ThreadPoolExecutor(1, thread_name_prefix="closing")
+        self._asked: _Asked | None = None
+        """What the thread is at, or has answered."""
+        self._age = 0
+        """Of the world: how often more than a closing has changed it."""
 
     def state(self) -> LoopsState:
         """What a checkpoint holds."""
@@ -118,11 +137,15 @@ class LoopCloser:
             self._take(loop)
         # Between keyframes nothing changes that could let segments meet.
         became_final = self._join() if fresh or is_last else ()
-        self._close(is_last)
+        if self._asked is not None and (is_last or (fresh and self._asked.answer.done())):
+            self._take_answer()
+        if self._thread is None or fresh or is_last:
+            self._close(is_last)
         return became_final
 
     def replaced_by_bundle(self) -> None:
         """All of the world was adjusted together: what its edges say now replaces all else."""
+        self._age += 1
         world = self.segments.world
         order = {k: n for n, k in enumerate(world.keyframes.ids)}
         edges = {
@@ -206,6 +229,7 @@ class LoopCloser:
         return float(error) < self.config.join_tolerance
 
     def _merge(self, host: Tracker, guest: Tracker, S: Float[Tensor, "4 4"]) -> tuple[int, ...]:
+        self._age += 1
         self._retire(guest)
         theirs, ours = self._known.pop(guest, Known()), self._of(host)
         # The loops between the two were measured in the guest's unit, too.
@@ -231,34 +255,68 @@ class LoopCloser:
         # A correction costs in proportion to the keyframes, so it comes once in a part of them.
         pause = max(self.config.close_every, len(ids) // 10)
         due = is_last or len(ids) - known.last_attempt >= pause
-        if not known.pending or not due:
+        if not known.pending or not due or self._asked is not None:
             return
         known.pending, known.last_attempt = 0, len(ids)
-        relative = joined([
-            known.odometry, of_edges(world.keyframes, world.graph.edges), known.loops,
-        ])  # fmt: skip
+        question = self._question(known)
+        if question is None:
+            return
+        if self._thread is None or is_last:
+            self._correct(question, question.answer())
+        else:
+            answer = self._thread.submit(question.answer)
+            self._asked = _Asked(question, answer, world, self._age)
+
+    def _question(self, known: Known) -> ClosingQuestion | None:
+        """What the closing of the world's loops is computed from; none where hardly anything
+        matches: then nothing tells how far the camera has drifted."""
+        world, config = self.segments.world, self.config
+        keyframes, edges = world.keyframes, world.graph.edges
+        ids = keyframes.ids
+        relative = joined([known.odometry, of_edges(keyframes, edges), known.loops])
         relative = between_positions(relative, ids)
         steps = ~relative.is_loop & ((relative.target - relative.source).abs() == 1)
         if not bool(steps.any()):
-            return  # hardly anything matches: nothing tells how far the camera has drifted
-        edges, matches = world.graph.edges, None
-        if self.config.matches:
-            matches = closing_matches(world.keyframes, edges, self.detector.loops)
-        closure = close_loops(
-            ids,
-            world.keyframes.poses(ids),
-            relative,
-            matches,
-            held=max(len(world.held), 1),
-            is_metric=world.is_metric,
+            return None
+        matches = None
+        if config.matches:
+            matches = closing_matches(keyframes, edges, self.detector.loops)
+        depths = {k: keyframes[k].inverse_depth for k in ids}
+        held = max(len(world.held), 1)
+        return ClosingQuestion(
+            ids, keyframes.poses(ids), depths, relative, matches, held, world.is_metric
         )
-        if closure is None or self._change(closure.correction) < self.config.min_change:
+
+    def _take_answer(self) -> None:
+        """Correct the world by what the thread has found, or have it found again if that is of
+        another world."""
+        asked, self._asked = self._asked, None
+        assert asked is not None
+        closure, world = asked.answer.result(), self.segments.world
+        if asked.world is world and asked.age == self._age:
+            self._correct(asked.question, closure)
+        else:
+            self._of(world).pending += 1
+
+    def _correct(self, question: ClosingQuestion, closure: LoopClosure | None) -> None:
+        """Act on a closing, if it changes anything."""
+        if closure is None:
+            return
+        world = self.segments.world
+        keyframes = world.keyframes
+        correction = brought_forward(closure.correction, {k.id: k.T_cw for k in keyframes})
+        if self._change(correction) < self.config.min_change:
             return
         if closure.inverse_depth is not None:
-            edges = {e: edge for e, edge in edges.items() if e[0] not in world.held}
-            take_over_depths(world.keyframes, edges, closure.inverse_depth)
-        world.keyframes.correct(closure.correction)
-        known.rescale(closure.correction)
+            same = {
+                k: depth
+                for k, depth in zip(question.ids, closure.inverse_depth, strict=True)
+                if k in keyframes and keyframes[k].inverse_depth is question.inverse_depths[k]
+            }
+            edges = {e: v for e, v in world.graph.edges.items() if e[0] not in world.held}
+            take_over_depths(keyframes, edges, same)
+        keyframes.correct(correction)
+        self._of(world).rescale(correction)
         self.closures += 1
 
     def _change(self, correction: PoseCorrection) -> float:

@@ -50,7 +50,7 @@ def closing_matches(
 
 
 def take_over_depths(
-    segment: Segment, edges: Mapping[Pair, Edge], inverse_depth: Float[Tensor, "n p"]
+    segment: Segment, edges: Mapping[Pair, Edge], inverse_depth: Mapping[int, Float[Tensor, "p"]]
 ) -> None:
     """Give keyframes the inverse depth that a closing has found, before its scales are applied.
 
@@ -58,7 +58,7 @@ def take_over_depths(
     says less of a depth than all those that have made it.
     """
     sources = {i for i, _ in edges}
-    for id, own in zip(segment.ids, inverse_depth, strict=True):
+    for id, own in inverse_depth.items():
         if id in sources:
             keyframe = segment[id]
             keyframe.inverse_depth = own.to(keyframe.inverse_depth)

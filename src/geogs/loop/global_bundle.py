@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 
 from geogs.bundle.base import BundleOptions
+from geogs.loop.settled_rows import settle_rows
 from geogs.tracking.proximity import Pair, proximity_pairs
 from geogs.tracking.tracker import Tracker
 from geogs.types import PoseCorrection
@@ -59,6 +60,7 @@ def global_bundle(
         graph.adjust(list(graph.edges), free if tracker.held else ids[1:], free, options)
         graph.judge_moving(set(free), config.moving)
         tracker.odometry.look_at_all()
+    settle_rows(tracker, free if tracker.held else ids[1:], free, options)
     for start in range(0, len(free), PRIORS_TOGETHER):
         tracker.priors.adjust(free[start : start + PRIORS_TOGETHER], config.huber)  # moves no pose
     if progress is not None:

@@ -6,6 +6,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from typing import TypeVar
 
 import numpy as np
@@ -13,17 +14,23 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from geogs.beside import RightOfWay
 from geogs.errors import GeogsError
 from geogs.keyframes.keyframe import Keyframe
 from geogs.keyframes.store import KeyframeStore
-from geogs.mapping.mapper import Mapper
+from geogs.mapping.mapper import Mapper, never_pause
 from geogs.types import PoseCorrection
 
 R = TypeVar("R")
 
-SWITCH_SECONDS = 0.0005
+SWITCH_SECONDS = 0.0001
 """After which a thread that computes in Python lets another go on, while tracking and mapping share
 the interpreter; Python's own 5 ms, several times a frame, would be felt."""
+COURTESY_SECONDS = 0.05
+"""For which mapping waits at most, between two parts of its work, while a frame is tracked."""
+PATIENT = 12
+"""Things to be done up to which it waits at all, so that it does not fall behind for ever; each
+keyframe makes two, and a correction another."""
 
 
 class BackgroundMapper:
@@ -46,6 +53,8 @@ class BackgroundMapper:
         self._mirror = KeyframeStore(keyframes.grid, None, keyframes.resident)
         self._copies = self._mirror.new_segment()
         self._mapper = new_mapper(self._mirror)
+        self._mapper.pause = self._give_way
+        self._way = RightOfWay(COURTESY_SECONDS)
         self._handed: dict[int, tuple[object, ...]] = {}
         """Of each keyframe that was handed over, what it was then."""
         self._tasks: deque[Callable[[], None]] = deque()
@@ -65,6 +74,10 @@ class BackgroundMapper:
     def waiting(self) -> int:
         """Things that it was told and has not done yet."""
         return len(self._tasks)
+
+    def giving_way(self) -> AbstractContextManager[None]:
+        """While a frame is tracked, for whose pose somebody waits."""
+        return self._way.taken()
 
     # --- what tracking tells ---------------------------------------------------------------
 
@@ -118,6 +131,7 @@ class BackgroundMapper:
         self._thread.join()
         sys.setswitchinterval(self._interval)
         self._raise()
+        self._mapper.pause = never_pause
         self._mapper.move_to(self._store)
         return self._mapper
 
@@ -178,6 +192,7 @@ class BackgroundMapper:
         torch.set_num_threads(1)
         with torch.cuda.stream(self._stream):
             while (task := self._next()) is not None:
+                self._give_way()
                 start = time.perf_counter()
                 try:
                     task()
@@ -193,6 +208,10 @@ class BackgroundMapper:
             while not self._tasks and not self._is_closed:
                 self._news.wait()
             return self._tasks.popleft() if self._tasks else None
+
+    def _give_way(self) -> None:
+        if len(self._tasks) <= PATIENT and not self._is_closed:
+            self._way.give()
 
     def _wait_for_gpu(self) -> None:
         if self._stream is not None:

@@ -1,7 +1,7 @@
 """The back end: keyframe depths in, a trained disk map and refined poses out."""
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from operator import attrgetter
 
@@ -61,6 +61,10 @@ _REPORTED_STEPS = 20
 _REHEARSED_STEPS = 16
 
 
+def never_pause() -> None:
+    """Nobody is let go first."""
+
+
 class Mapper:
     """Grows and trains the map keyframe by keyframe.
 
@@ -101,6 +105,8 @@ class Mapper:
         """Of the keyframes that it comes to next, by their places among those mapped."""
         self._trainer: MapTrainer | None = None
         self._seconds_to_prune = 0.0
+        self.pause: Callable[[], None] = never_pause
+        """Called between the parts of the work on a keyframe, where others may go first."""
         self._random = np.random.default_rng(seed)
         self._torch_random = torch.Generator().manual_seed(seed)
 
@@ -187,12 +193,15 @@ class Mapper:
         # Old ones have to be read from a file; meanwhile the depth is searched.
         self.pool.read_ahead({i for ids in drawn for i in ids if i != keyframe_id})
         self._estimate_ahead(keyframe_id)
+        self.pause()
         self._depths.check([view])
+        self.pause()
         self.mapped.append(keyframe_id)
         self._choose_partners(view)
         self._level(view)
         trainer = self._training()
         self._carve([view, *self._depths.near(view)])
+        self.pause()
         self._insert(view, self.config.disk.insert_confidence)
         if len(self.mapped) > self.config.window:
             left = self.views[self.mapped[-1 - self.config.window]]
@@ -200,7 +209,9 @@ class Mapper:
         batches = [self._batch(ids) for ids in drawn]
         seen = {v.id for batch in batches for own, others in batch for v in (own, *others)}
         self.pool.read_ahead(seen)
+        self.pause()
         trainer.train(batches)
+        self.pause()
         if len(self.mapped) % self.config.disk.carve_every == 0:
             self._prune_around(view)
 
@@ -375,7 +386,7 @@ class Mapper:
         wanted = [i for i in later if not self.views[i].has_depth]
         if self.config.depth.engine == "tracker":
             wanted = [*self.mapped[-self.config.window :], *later]
-        self._depths.estimate([self.views[i] for i in wanted])
+        self._depths.estimate([self.views[i] for i in wanted], lambda _: self.pause())
 
     def _mapped_around(self, view: MapView, count: int) -> list[MapView]:
         return self._near.around(view, self.mapped, count)

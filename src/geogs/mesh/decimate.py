@@ -16,6 +16,8 @@ all of it as far away as may be."""
 _WITNESSES = 10_000
 _SHARES = (0.25, 0.5, 0.75, 0.88)
 """Of its triangles that a mesh is brought to next; a later one where those before are too few."""
+_USUAL_GROWTH = 1.0
+"""Power of one over the share of triangles, by which deviations grow."""
 _FEWEST = 200
 """Triangles below which nothing is gained."""
 
@@ -58,9 +60,10 @@ def decimate(mesh: Mesh, tolerance: float) -> Mesh:
 def _growth(
     before: Float[np.ndarray, "2"], after: Float[np.ndarray, "2"], share: float
 ) -> Float[np.ndarray, "2"]:
-    """The power of one over the share of triangles that deviations grew by; 0 after the first."""
+    """The power of one over the share of triangles that deviations grew by; after the first, what
+    is usual."""
     if not (before > 0).all():
-        return np.zeros(2)
+        return np.full(2, _USUAL_GROWTH)
     return np.log(np.maximum(after / before, 1.0)) / -np.log(share)
 
 

@@ -39,6 +39,8 @@ class VolumePlan:
     """Map units; pixels farther away are left out."""
     blocks: int
     """Estimated number."""
+    triangles: int
+    """Estimated number, before those that the surface does not need are merged."""
 
     @property
     def bytes(self) -> int:
@@ -72,12 +74,14 @@ def plan_volume(views: Sequence[DepthMapView], config: MeshConfig) -> VolumePlan
                 f"GiB for the volume, more than the limit of {config.memory_limit:g}; use a "
                 f"larger voxel or leave it to be chosen."
             )
-        return VolumePlan(config.voxel, config.truncation, max_depth, blocks)
+        triangles = round(_FACES_PER_SQUARE * _area(points, config.voxel) / config.voxel**2)
+        return VolumePlan(config.voxel, config.truncation, max_depth, blocks, triangles)
     voxel = config.voxel_per_pixel * float(footprints.median())
-    voxel = max(voxel, _budget_voxel(points, voxel, config.triangle_budget))
+    faces = _FACES_PER_SQUARE * _area(points, voxel)
+    voxel = max(voxel, math.sqrt(faces / config.triangle_budget))
     while (n := len(band_blocks(points, voxel, config.truncation))) * BYTES_PER_BLOCK > limit:
         voxel *= 1.1
-    return VolumePlan(voxel, config.truncation, max_depth, n)
+    return VolumePlan(voxel, config.truncation, max_depth, n, round(faces / voxel**2))
 
 
 @on_one_torch_thread
@@ -155,13 +159,12 @@ def _sample_points(
     return torch.cat(depths), torch.cat(footprints), torch.cat(points)
 
 
-def _budget_voxel(points: Float[Tensor, "n 3"], voxel: float, triangles: int) -> float:
-    """The voxel with which the surface through the points has so many triangles.
+def _area(points: Float[Tensor, "n 3"], voxel: float) -> float:
+    """Of the surface through the points.
 
-    The area is that of the cells of a coarse grid that hold a point: a plane at any slant meets
-    about 1.5 cells of area side^2 per side^2.
+    It is that of the cells of a coarse grid that hold a point: a plane at any slant meets about 1.5
+    cells of area side^2 per side^2.
     """
     side = BLOCK * voxel
     cells = len(torch.unique(pack(torch.floor(points / side).long())))
-    area = cells * side**2 / 1.5
-    return math.sqrt(_FACES_PER_SQUARE * area / triangles)
+    return cells * side**2 / 1.5

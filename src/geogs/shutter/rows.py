@@ -2,11 +2,14 @@
 
 import cv2
 import numpy as np
+import torch
 from jaxtyping import Float
 
 from geogs.geometry.camera import Camera
 from geogs.shutter.camera import RollingCamera
+from geogs.shutter.shutter import Shutter
 from geogs.shutter.turning import Turning, rotated
+from geogs.types import SeenRows
 
 CELL = 8
 """Pixels between two nodes; offsets are interpolated between them."""
@@ -23,7 +26,7 @@ class RowOffsets:
     """
 
     def __init__(self, rolling: RollingCamera, rectified: Camera) -> None:
-        self._rolling, self._size = rolling, (rectified.width, rectified.height)
+        self._rolling, self._rectified = rolling, rectified
         # A cell more on every side, so that all pixels lie between nodes.
         columns = np.arange(-1, -(-rectified.width // CELL) + 1) * CELL + (CELL - 1) / 2
         lines = np.arange(-1, -(-rectified.height // CELL) + 1) * CELL + (CELL - 1) / 2
@@ -31,6 +34,7 @@ class RowOffsets:
         u, v = (x.ravel() for x in np.meshgrid(columns, lines))
         plane = [(u - rectified.cx) / rectified.fx, (v - rectified.cy) / rectified.fy]
         self._rays = np.stack([*plane, np.ones_like(u)], axis=1)
+        self._pixels = np.stack([u, v], axis=1)
         self._still = rolling.pixels(self._rays)
 
     def nodes(self, turning: Turning, readout: float) -> Float[np.ndarray, "n 2"]:
@@ -70,8 +74,30 @@ class RowOffsets:
             turning: of the camera, at this image.
             readout: seconds from the first to the last row.
         """
-        width, height = self._size
-        nodes = self.nodes(turning, readout).astype(np.float32).reshape(*self._shape, 2)
+        return self.dense(self.nodes(turning, readout))
+
+    def dense(self, nodes: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "h w 2"]:
+        """Offsets at every pixel of the rectified image from those at the nodes."""
+        width, height = self._rectified.width, self._rectified.height
         size = (CELL * self._shape[1], CELL * self._shape[0])
-        dense = cv2.resize(nodes, size, interpolation=cv2.INTER_LINEAR)
+        laid = nodes.astype(np.float32).reshape(*self._shape, 2)
+        dense = cv2.resize(laid, size, interpolation=cv2.INTER_LINEAR)
         return dense[CELL : CELL + height, CELL : CELL + width]
+
+    def seen(self, nodes: Float[np.ndarray, "n 2"], shutter: Shutter) -> SeenRows:
+        """Where and when what a rectified image shows was seen, which was made with such offsets.
+
+        Args:
+            nodes: offsets in pixels of the rolling image at the nodes.
+            shutter: that they are for.
+        """
+        pixels, target = self._still + nodes, self._rectified
+        rays = self._rolling.rays(pixels)
+        focal, centre = [target.fx, target.fy], [target.cx, target.cy]
+        offset = rays[:, :2] / rays[:, 2:] * focal + centre - self._pixels
+        seconds = shutter.readout * self._rolling.line_times(pixels)
+        return SeenRows(
+            torch.from_numpy(offset.reshape(*self._shape, 2)).half(),
+            torch.from_numpy(seconds.reshape(self._shape)).half(),
+            abs(shutter.error / shutter.readout) if shutter.readout else 0.0,
+        )

@@ -17,6 +17,8 @@ class Shutter:
     """Seconds; 0 is a global shutter, negative where the last line is read first."""
     origin: str = "taken for a global shutter"
     """Where that comes from, for the log and ``intrinsics.json``."""
+    error: float = 0.0
+    """Standard error where the video told it, seconds."""
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.readout) and abs(self.readout) <= LONGEST):

@@ -9,6 +9,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from geogs.errors import TrackingLost
+from geogs.tracking.follower import Follower
 from geogs.tracking.motion import Recognition
 from geogs.tracking.tracker import Tracker, TrackerState, TrackResult, TrackState
 from geogs.types import Frame, Trajectory
@@ -174,6 +175,14 @@ class Segments:
             if not frame.follows_cut:
                 self.current.orientation = before.orientation
         return self._report(self.current.track(frame))
+
+    def complete(self) -> TrackResult:
+        """What a new keyframe of a tracker that defers takes beyond its place."""
+        return self._report(self.current.complete())
+
+    def take(self, follower: Follower) -> None:
+        """Take over the frames that were followed meanwhile."""
+        self.tracker_of(follower.last.keyframe.id).take(follower)
 
     def finish(self) -> TrackResult:
         """End of the stream: every keyframe becomes final, and the largest segment the world.

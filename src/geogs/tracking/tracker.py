@@ -7,7 +7,7 @@ from typing import Any
 
 import cv2
 import torch
-from jaxtyping import Float, Float64
+from jaxtyping import Float
 from torch import Tensor
 
 from geogs.bundle.base import BundleOptions
@@ -15,7 +15,7 @@ from geogs.bundle.select import grid_fields
 from geogs.config import DepthSensorConfig, OdometryConfig, PriorConfig, TrackingConfig
 from geogs.errors import InputError, TrackingLost
 from geogs.geometry.camera import Camera
-from geogs.geometry.lie import se3_exp, se3_inverse, se3_log
+from geogs.geometry.lie import se3_inverse
 from geogs.keyframes.grid import SampleGrid
 from geogs.keyframes.keyframe import Keyframe, KeyframeState
 from geogs.keyframes.store import KeyframeStore
@@ -23,10 +23,12 @@ from geogs.priors.base import MonocularPrior
 from geogs.tracking.back_fill import back_fill
 from geogs.tracking.flow.base import FlowOperator
 from geogs.tracking.flow.select import build_operator
+from geogs.tracking.follower import Follower
 from geogs.tracking.graph import EdgeState, FrameGraph
 from geogs.tracking.held import add_held
 from geogs.tracking.keyframe_choice import KeyframeChoice
 from geogs.tracking.keyframe_priors import KeyframePriors
+from geogs.tracking.last_frame import LastFrame, LastFrameState
 from geogs.tracking.motion import (
     FrameLocator,
     FrameMotion,
@@ -48,13 +50,6 @@ from geogs.types import Frame, RenderedKeyframe, Trajectory
 SELDOM = 5
 """While a camera only turns, the orientation says what it sees; only so often it is looked for as
 if it could be anywhere."""
-
-
-SAME_PACE = 0.2
-"""Part by which a frame may come sooner or later than the one before without a word: time stamps
-are rounded."""
-LONGEST_STEP = 3.0
-"""Of the last motion that is expected at most, however long no frame came."""
 
 
 class TrackState(Enum):
@@ -87,50 +82,14 @@ class TrackResult:
 
 
 @dataclass(frozen=True)
-class LastFrame:
-    """Where the camera was last seen, relative to a keyframe, so that corrections carry it."""
+class Unfinished:
+    """A keyframe that nothing but its place is known of, and what it was located by."""
 
     keyframe: Keyframe
-    T_rel: Float[Tensor, "4 4"]
-    """Keyframe to this frame."""
-    velocity: Float[Tensor, "4 4"] | None
-    """Motion from the frame before; None where the camera had been lost."""
-    scale: float
-    """Of the keyframe when the two were measured."""
-    timestamp: float
-    """Seconds."""
-    interval: float
-    """Seconds that the motion took."""
-
-    @property
-    def T_cw(self) -> Float[Tensor, "4 4"]:
-        """World to camera by the keyframe's present pose and scale."""
-        return self._present(self.T_rel) @ self.keyframe.T_cw
-
-    def predicted(self, timestamp: float) -> Float[Tensor, "4 4"]:
-        """World to camera of the next frame, at a time, if the motion goes on."""
-        if self.velocity is None:
-            return self.T_cw
-        motion = self._present(self.velocity)
-        ratio = (timestamp - self.timestamp) / self.interval if self.interval > 0 else 1.0
-        if abs(ratio - 1) > SAME_PACE:
-            motion = se3_exp(min(max(ratio, 0.0), LONGEST_STEP) * se3_log(motion))
-        return motion @ self.T_cw
-
-    def _present(self, T: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:
-        return self.keyframe.at_present_scale(T, self.scale)
-
-
-@dataclass(frozen=True, eq=False)
-class LastFrameState:
-    """What a checkpoint holds of where the camera was last seen; the fields are a last frame's."""
-
-    keyframe: int
-    T_rel: Float64[Tensor, "4 4"]
-    velocity: Float64[Tensor, "4 4"] | None
-    scale: float
-    timestamp: float
-    interval: float
+    anchor: int
+    """Keyframe at which it was located."""
+    motion: FrameMotion
+    turns: Sequence[Turn]
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,8 +128,10 @@ class Tracker:
         store: KeyframeStore | None = None,
         sensor: DepthSensorConfig | None = None,
         odometry: OdometryConfig | None = None,
+        defers: bool = False,
     ) -> None:
-        """``store`` is where the keyframes are kept, in a segment of their own."""
+        """``store`` is where the keyframes are kept, in a segment of their own. One that ``defers``
+        leaves to :meth:`complete` what a new keyframe takes beyond its place."""
         cv2.setRNGSeed(seed)
         self.camera = camera
         self.config = config or TrackingConfig()
@@ -204,6 +165,8 @@ class Tracker:
         self._last: LastFrame | None = None
         self._motion: FrameMotion | None = None
         """By which the last frame was located; none where it was not."""
+        self._defers = defers
+        self._unfinished: Unfinished | None = None
         self._start_up = StartUp(self.graph, self.recorder, self.priors, self.config, self._choice)
         self.orientation = OrientationChain(self.grid, self.operator, self.config)
         """How the camera has turned since it was last located."""
@@ -293,6 +256,11 @@ class Tracker:
             )
 
     @property
+    def is_unfinished(self) -> bool:
+        """Whether a new keyframe waits to be completed."""
+        return self._unfinished is not None
+
+    @property
     def T_cw(self) -> Float[Tensor, "4 4"] | None:
         """World to camera where the camera was last seen; none before that."""
         return None if self._last is None else self._last.T_cw
@@ -351,6 +319,7 @@ class Tracker:
                 f"{self.camera.width} x {self.camera.height}; all frames must have one size."
             )
         self._motion = None
+        self.recorder.see(frame)
         encoded = self.operator.encode(frame.image)
         self._choice.see(frame.image)
         if self.operator.texture(encoded) < self.config.min_texture:
@@ -372,6 +341,7 @@ class Tracker:
 
         A place is believed where the dense flow agrees with it over ``recognised`` of the cells.
         """
+        self.recorder.see(frame)
         encoded = self.operator.encode(frame.image)
         for place in places:
             if place.keyframe not in self.keyframes:
@@ -553,17 +523,49 @@ class Tracker:
         )
         if self.is_metric:
             self.sensing.join(state, frame.depth)
+        self._seen_at(state, velocity=velocity, interval=interval)
+        self._unfinished = Unfinished(state, anchor.id, motion, turns)
+        if self._defers:
+            return TrackResult(self.state, state.id)
+        return self.complete()
+
+    def complete(self) -> TrackResult:
+        """Do what the new keyframe takes beyond its place: neighbours, depth, local adjustment."""
+        new, self._unfinished = self._unfinished, None
+        assert new is not None, "no keyframe waits to be completed"
+        state, anchor = new.keyframe, self.keyframes[new.anchor]
         self.priors.ask(state)
-        self.recorder.add_keyframe(state.id, turns)
+        self.recorder.add_keyframe(state.id, new.turns)
         self._connect(state.id, anchor.id)
         seen = self.graph.edges[state.id, anchor.id]
         state.moving = carried(self.grid, anchor.moving, seen.pixels, seen.weight)
         self._adjust_locally()
         self.odometry.look()
         removed = self._cull()
-        self._seen_at(state, velocity=velocity, interval=interval)
         fresh = self._finalise(self.keyframes.ids[:-1])
         return TrackResult(self.state, state.id, fresh, self.active, removed)
+
+    def follower(self) -> Follower:
+        """What locates the frames that come while another thread completes the keyframe."""
+        assert self._unfinished is not None, "no keyframe waits to be completed"
+        assert self._last is not None
+        last = replace(self._last, keyframe=self._last.keyframe.as_it_is())
+        anchor = self.keyframes[self._unfinished.anchor].as_it_is()
+        return Follower(
+            self._locator, self.operator, self.config, last, anchor, self._unfinished.motion
+        )
+
+    def take(self, follower: Follower) -> None:
+        """Take over the frames that were followed while the keyframe was completed."""
+        keyframe = self.keyframes[follower.last.keyframe.id]
+        for found in follower.frames:
+            frame, encoded = found.frame, found.encoded
+            T_rel = keyframe.at_present_scale(found.T_rel, follower.last.scale)
+            self.recorder.add(frame, encoded, keyframe.id, T_rel, found.motion.match)
+            self.orientation.located(frame, encoded)
+            self._choice.see(frame.image)
+        self._last = replace(follower.last, keyframe=keyframe)
+        self._motion = None  # by which a frame was located at what the keyframe was
 
     def _connect(self, id: int, anchor: int) -> None:
         """Measure a new keyframe against the one it was located at, and its neighbours."""

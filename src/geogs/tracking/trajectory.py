@@ -19,9 +19,10 @@ from geogs.keyframes.keyframe import Keyframe
 from geogs.keyframes.store import Segment
 from geogs.tracking.flow.base import FlowMatch, FlowOperator
 from geogs.tracking.gaps import bridged
-from geogs.tracking.packed_edge import pack_matches, unpacked_positions
+from geogs.tracking.packed_edge import pack_matches, position_step, unpacked_positions
+from geogs.tracking.row_errors import RowErrors
 from geogs.tracking.turns import Turn, orientations
-from geogs.types import Frame, Trajectory
+from geogs.types import Frame, SeenRows, Trajectory
 
 ASTRAY = 0.05
 """Radians by which a frame's orientation may differ from one between its keyframes."""
@@ -34,6 +35,13 @@ class Observation:
     keyframe: int
     position: Int16[Tensor, "s 2"]
     half_weight: Float16[Tensor, "s 2"]
+    shift: Int16[Tensor, "s 2"] | None = None
+    """Steps to be added to the position, for the rows of the two (``row_errors.py``)."""
+
+    @property
+    def shifted(self) -> Int16[Tensor, "s 2"]:
+        """The position with its shift."""
+        return self.position if self.shift is None else self.position + self.shift
 
 
 @dataclass
@@ -71,6 +79,8 @@ class RecorderState:
     records: list[FrameRecord]
     pending: dict[int, UInt8[np.ndarray, "h w 3"]]
     """Images of the frames that wait, by their indices."""
+    rows: dict[int, SeenRows] = field(default_factory=dict)
+    """How those of a rolling shutter were rectified, by the indices of the frames."""
 
 
 class TrajectoryRecorder:
@@ -83,12 +93,15 @@ class TrajectoryRecorder:
     def __init__(self, store: Segment, operator: FlowOperator, max_pending: int = 64) -> None:
         self.keyframes, self.operator, self.max_pending = store, operator, max_pending
         self.records: list[FrameRecord] = []
+        self.rows: dict[int, SeenRows] = {}
+        """How those of a rolling shutter were rectified, by the indices of the frames."""
         self._pending: list[_Pending] = []
         self._subset = torch.nonzero(sparse_cells(store.grid))[:, 0]
 
     def state(self) -> RecorderState:
         """What a checkpoint holds."""
-        return RecorderState(self.records, {p.record.index: p.image for p in self._pending})
+        waiting = {p.record.index: p.image for p in self._pending}
+        return RecorderState(self.records, waiting, self.rows)
 
     def load(self, state: RecorderState) -> None:
         """Give a recorder without frames those of another.
@@ -104,11 +117,16 @@ class TrajectoryRecorder:
             raise InputError("the frames are of another camera")
         if state.pending.keys() - by_index.keys():
             raise InputError("a frame that waits is unknown")
-        self.records = state.records
+        self.records, self.rows = state.records, state.rows
         self._pending = [
             _Pending(by_index[n], image, self.operator.encode(image))
             for n, image in state.pending.items()
         ]
+
+    def see(self, frame: Frame) -> None:
+        """Note how the rows of a frame were rectified, whatever becomes of it."""
+        if frame.rows is not None:
+            self.rows[frame.index] = frame.rows
 
     def add_untracked(self, index: int, timestamp: float, turns: Sequence[Turn] = ()) -> None:
         """A frame that could not be located, though its orientation may be known."""
@@ -187,11 +205,13 @@ class TrajectoryRecorder:
         """Take over the frames of another recorder, whose keyframes are now in this one's store."""
         self.records = sorted([*self.records, *other.records], key=lambda r: r.index)
         self._pending = sorted([*self._pending, *other._pending], key=lambda p: p.record.index)
+        self.rows |= other.rows
 
     def give_up(self, other: "TrajectoryRecorder") -> None:
         """Take over the frames of another recorder as frames that were not tracked."""
         for record in other.records:
             self.add_untracked(record.index, record.timestamp, record.turns)
+        self.rows |= other.rows
 
     def anchor_to_keyframes(self) -> None:
         """Give the frames seen before the map was started a pose between their keyframes.
@@ -291,6 +311,32 @@ class TrajectoryRecorder:
             [turned.get(r.index) for r in records],
         )
 
+    def row_errors(self) -> RowErrors | None:
+        """What rectified rows are off by at the present state; none where there are none."""
+        if not self.rows:
+            return None
+        frames = sorted(record.index for record in self.records)
+        return RowErrors(self.keyframes.grid, self.rows, frames, self.solve())
+
+    def shift_rows(self, errors: RowErrors, chunk: int = 64) -> None:
+        """Correct what was found of frames by the errors of their rows and their keyframes'."""
+        grid, cells = self.keyframes.grid, self._subset
+        seen = [
+            (r, o) for r in self.records for o in r.observations if o.keyframe in self.keyframes
+        ]
+        for start in range(0, len(seen), chunk):
+            part = seen[start : start + chunk]
+            ids = [o.keyframe for _, o in part]
+            T = errors.poses([r.index for r, _ in part]) @ se3_inverse(self.keyframes.poses(ids))
+            shifts = errors.of_matches(
+                [self.keyframes[k].frame_index for k in ids], [r.index for r, _ in part], T,
+                grid.rays[cells], self.keyframes.inverse_depths(ids)[:, cells],
+                unpacked_positions(grid, torch.stack([o.position for _, o in part])),
+            )  # fmt: skip
+            steps = (shifts / position_step(grid.camera)).round().short()
+            for (_, observation), shift in zip(part, steps, strict=True):
+                observation.shift = shift
+
     def _solve_chunk(self, records: list[FrameRecord]) -> Float[Tensor, "n 4 4"]:
         grid, cells = self.keyframes.grid, self._subset
         pairs = [
@@ -310,7 +356,7 @@ class TrajectoryRecorder:
         weight = torch.stack([o.half_weight for _, o in pairs]).float()
         p = linearise(grid.camera, grid.rays[cells], start[frame] @ se3_inverse(source), depth)
         weight = depth_aware_weight(weight, p.depth_jacobian, information)
-        pixels = unpacked_positions(grid, torch.stack([o.position for _, o in pairs]))
+        pixels = unpacked_positions(grid, torch.stack([o.shifted for _, o in pairs]))
         problem = MotionProblem(start, depth, source, frame, pixels, weight)
         T, _ = motion_solver(grid, cells).solve(problem, iterations=8)
         return T

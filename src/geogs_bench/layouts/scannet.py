@@ -28,4 +28,5 @@ def _scene(folder: Path) -> Scene:
     options = (Option("input.intrinsics", str(calibration)),) if calibration.is_file() else ()
     surface = first_file(folder / f"{name}_vh_clean_2.ply", folder / f"{name}_vh_clean.ply")
     poses = TruePoses(frames, "scannet")
-    return Scene(name, frames / "color", Truth(poses, surface), options)
+    has_depth = next((frames / "depth").glob("*.png"), None) is not None
+    return Scene(name, frames / "color", Truth(poses, surface), options, has_depth=has_depth)

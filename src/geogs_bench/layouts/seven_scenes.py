@@ -22,4 +22,5 @@ def _sequences(folder: Path) -> list[Path]:
 def _scene(sequence: Path) -> Scene:
     surface = first_file(sequence.parent / "tsdf_pseudo_gt.ply", sequence.parent / "mesh.ply")
     name = f"{sequence.parent.name}-{sequence.name}"
-    return Scene(name, sequence, Truth(TruePoses(sequence), surface))
+    has_depth = next(sequence.glob("frame-*.depth.png"), None) is not None
+    return Scene(name, sequence, Truth(TruePoses(sequence), surface), has_depth=has_depth)

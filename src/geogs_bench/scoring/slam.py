@@ -55,8 +55,11 @@ def _stage(
     trajectory = None
     if own is not None:
         keyframes = result.trajectory(stage, "keyframes.tum")
+        rigid = None
+        if result.summary.get("metric_scale") is not None:
+            rigid = evaluate_trajectory(own, reference, alignment="se3").ate_rmse_cm
         trajectory = TrajectoryScore(
-            errors.ate_rmse_cm, errors.pairs, errors.scale, _ate(keyframes, reference)
+            errors.ate_rmse_cm, errors.pairs, errors.scale, _ate(keyframes, reference), rigid
         )
     scores: tuple[SurfaceScore, ...] = ()
     comparison, mesh = None, result.mesh(stage)

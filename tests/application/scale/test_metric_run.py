@@ -67,6 +67,7 @@ def test_measured_depth_makes_metres(small_room, tmp_path, no_report):
         assert np.median(np.abs(depth / exact - 1)[depth > 0]) < 0.02
 
 
+@pytest.mark.long
 def test_a_known_distance_makes_metres(small_room, tmp_path, no_report):
     # Two pixels of the twelfth frame, and how far their points are apart.
     depth = cv2.imread(str(small_room / "results/depth000012.png"), -1) / 6553.5

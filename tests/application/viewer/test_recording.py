@@ -25,7 +25,7 @@ class FakeSlam:
 
     def __init__(self) -> None:
         self.poses = circle()
-        self.segments = SimpleNamespace(current=SimpleNamespace(T_cw=None))
+        self.T_cw = None
 
     def keyframe_trajectory(self) -> Trajectory:
         return Trajectory(np.arange(10) / 30, self.poses[:10], np.ones(10, bool))
@@ -42,7 +42,7 @@ def test_keyframes_map_and_mesh_are_recorded(tmp_path):
     random = np.random.default_rng(0)
     image = random.integers(0, 255, (96, 128, 3), dtype=np.uint8)
     for number in range(12):
-        slam.segments.current.T_cw = torch.from_numpy(np.linalg.inv(slam.poses[number]))
+        slam.T_cw = torch.from_numpy(np.linalg.inv(slam.poses[number]))
         status = SlamStatus(TrackState.TRACKING, number, number // 2, 50)
         recorder.frame(Frame(number, number / 30, image), status, slam)
     vertices, faces = box((3.0, 2.0, 1.2))

@@ -17,7 +17,7 @@ def test_a_result_is_shown_in_the_browser(tmp_path):
     window = open_window(result, "127.0.0.1", 8399)
     try:
         with open_tab(window.address, 480, 360) as tab:
-            tab.page.wait_for_selector(f"text=keyframe 1 of {len(IDS)}", timeout=60_000)
+            tab.page.wait_for_selector(f"text=keyframe 1 of {len(IDS)}", timeout=600_000)
             for name in ("Mesh", "Disks", "Path", "Keyframes", "Follow", "Layer"):
                 assert tab.page.get_by_text(name, exact=True).count() >= 1
             tab.page.wait_for_timeout(3000)

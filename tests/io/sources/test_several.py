@@ -90,6 +90,7 @@ def test_two_videos_of_a_place_make_one_map(small_room, tmp_path):
     assert lost <= 2
 
 
+@pytest.mark.long
 def test_all_keyframes_are_adjusted_on_the_way_where_asked_for():
     path = sideways(30)
     reference = Trajectory(np.arange(30) / 30, np.stack(path), np.ones(30, dtype=bool))
@@ -107,6 +108,7 @@ def test_all_keyframes_are_adjusted_on_the_way_where_asked_for():
     assert error < 0.3
 
 
+@pytest.mark.long
 def test_the_map_shows_the_largest_of_videos_that_have_nothing_in_common():
     """The first is short; the second shows a mirrored room."""
     first, second = frames(sideways(10)), frames(sideways(28))

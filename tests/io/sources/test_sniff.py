@@ -182,7 +182,7 @@ def test_reading_ahead_makes_the_next_item_meanwhile_and_passes_errors_on():
         for item in read_ahead(items()):
             seen.append(item)
             if item + 1 < len(made):
-                assert made[item + 1].wait(timeout=10)  # without being asked for
+                assert made[item + 1].wait(timeout=600)  # without being asked for
 
     with pytest.raises(ValueError, match="at the end"):
         consume()

@@ -174,6 +174,7 @@ def test_steps_without_room_are_done_again(pair) -> None:
         assert torch.allclose(a, b, atol=1e-4)
 
 
+@pytest.mark.long
 def test_growing_and_dropping_between_steps(pair) -> None:
     fast, _, views, _ = pair()
     fast.train([[(views[0], [views[1]])]])
@@ -194,6 +195,7 @@ def test_growing_and_dropping_between_steps(pair) -> None:
     assert torch.isfinite(fast.disks.position).all()
 
 
+@pytest.mark.long
 def test_poses_equal_those_of_the_cpu(pair, rendered) -> None:
     fast, slow, fast_views, slow_views = pair()
     config = replace(CONFIG, pose_iterations=4, pose_lr=1e-3)

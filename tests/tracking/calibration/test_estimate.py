@@ -30,7 +30,7 @@ def swinging(count: int) -> list[np.ndarray]:
     ]
 
 
-@pytest.mark.parametrize("factor", [0.65, 1.5])
+@pytest.mark.parametrize("factor", [0.65, pytest.param(1.5, marks=pytest.mark.long)])
 def test_finds_the_focal_length_of_a_rendered_room(factor):
     guess = with_focal(CAMERA, factor * CAMERA.fx)
     shares = []
@@ -49,6 +49,7 @@ def test_finds_the_focal_length_of_a_rendered_room(factor):
     assert shares[-1] == 1.0
 
 
+@pytest.mark.long
 def test_the_radial_term_of_a_pinhole_is_none():
     config = replace(CONFIG, radial=True)
     found = self_calibrate(frames(swinging(22)), with_focal(CAMERA, 200.0), config)
@@ -58,6 +59,7 @@ def test_the_radial_term_of_a_pinhole_is_none():
     assert abs(found.camera.fx / CAMERA.fx - 1) < 0.03
 
 
+@pytest.mark.long
 def test_finds_the_radial_term_of_a_distorting_lens():
     wide = Camera(CAMERA.fx, CAMERA.fy, 143.5, 107.5, 288, 216)
     rays = lens_rays(Lens(CAMERA, -0.15), torch.from_numpy(pixels_of(CAMERA))).rays.numpy()

@@ -51,6 +51,7 @@ def test_nothing_is_matched_from_or_to_what_is_painted_over():
     assert flow.texture(first) <= float(first.cells.mean()) < 0.6
 
 
+@pytest.mark.long
 @pytest.mark.system
 def test_an_arm_that_moves_with_the_camera_does_no_harm_where_it_is_painted_over():
     path = sideways(24)

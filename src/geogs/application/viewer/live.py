@@ -95,8 +95,9 @@ class LiveViewer(RunObserver):
 
     def _look(self, frame: Frame, status: "SlamStatus", slam: "Slam", now: float) -> Update:
         ids = tuple(slam.segments.keyframe_ids)
-        T_wc = [np.linalg.inv(slam.keyframes[i].T_cw.numpy()) for i in ids]
-        seen = slam.segments.current.T_cw if status.state.value == "tracking" else None
+        # The table keeps places of keyframes that another thread may be removing.
+        T_wc = [np.linalg.inv(slam.keyframes.poses[i].numpy()) for i in ids]
+        seen = slam.T_cw if status.state.value == "tracking" else None
         loops = len(slam.loops.detector.loops)
         words = (
             f"frame {status.frames}: {status.state.value}\n\n{status.keyframes} keyframes, "

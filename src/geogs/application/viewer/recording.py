@@ -48,7 +48,7 @@ class Recorder(RunObserver):
 
     def frame(self, frame: Frame, status: "SlamStatus", slam: "Slam") -> None:
         """Record what a new keyframe changed."""
-        seen = slam.segments.current.T_cw
+        seen = slam.T_cw
         if seen is None or status.keyframes <= self._keyframes:
             return
         before, self._keyframes = self._keyframes, status.keyframes

@@ -32,7 +32,8 @@ from geogs.shutter.neighbours import with_turning
 from geogs.shutter.readout import CLIP, CLIPS
 from geogs.shutter.rows import RowOffsets
 from geogs.shutter.shutter import Shutter
-from geogs.types import Frame, MeasuredDepth, MeasuredPose
+from geogs.shutter.turning import Turning
+from geogs.types import Frame, MeasuredDepth, MeasuredPose, SeenRows
 
 _log = logging.getLogger(__name__)
 T = TypeVar("T")
@@ -62,6 +63,8 @@ class RawFrame:
     """Of the upright image, by another tracker."""
     name: str = ""
     """Of its file, or the number of the frame: by what a mask of its own is found."""
+    rows: SeenRows | None = None
+    """How those of a working image were rectified; none of a global shutter."""
 
     @property
     def fault(self) -> str:
@@ -338,7 +341,7 @@ class Source:
                     _log.warning("%s is damaged; used as far as it goes.", raw.label)
             self.place = ReadingPlace(index + 1, self.skipped, self.damaged)
             pose = self._poses.of(raw.timestamp, raw.pose)
-            yield Frame(index, raw.timestamp, raw.image, depth=raw.depth, pose=pose)
+            yield Frame(index, raw.timestamp, raw.image, depth=raw.depth, pose=pose, rows=raw.rows)
             index += 1
         if index == 0:
             raise InputError(self._why_empty())
@@ -402,9 +405,11 @@ class Source:
             if raw.image is None:
                 yield raw
                 continue
-            moved = None if turning.is_still else offsets(turning, readout)
+            nodes = offsets.nodes(Turning() if turning.is_still else turning, readout)
+            moved = None if turning.is_still else offsets.dense(nodes)
             image = self._rectifier.straightened(raw.image, moved)
-            yield replace(raw, image=image, depth=self._rectified(raw.depth, moved))
+            depth, rows = self._rectified(raw.depth, moved), offsets.seen(nodes, self.shutter)
+            yield replace(raw, image=image, depth=depth, rows=rows)
 
     def _why_empty(self) -> str:
         if self.skipped:

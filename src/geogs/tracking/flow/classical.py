@@ -96,7 +96,6 @@ class ClassicalFlow:
     def __init__(self, grid: SampleGrid) -> None:
         cv2.setNumThreads(1)
         self.grid = grid
-        self._pool = ThreadPoolExecutor(worker_count())
         self._local = threading.local()
         self._full, self._half = _Level(grid, 1), _Level(grid, 2)
         self._pixels = grid.pixels.cpu().numpy()
@@ -130,9 +129,10 @@ class ClassicalFlow:
         start = [None] * (2 * n)
         if forward is not None and backward is not None:
             start = list(torch.cat([forward, backward]).cpu().numpy())
-        flows = list(self._pool.map(lambda x, y, s: self._dense(x, y, s, fine), a, b, start))
+        pool = self._workers()
+        flows = list(pool.map(lambda x, y, s: self._dense(x, y, s, fine), a, b, start))
         reverse = [*flows[n:], *flows[:n]]
-        matches = list(self._pool.map(self._match, a, flows, reverse))
+        matches = list(pool.map(self._match, a, flows, reverse))
         pixels = torch.from_numpy(np.stack([m[0] for m in matches])).to(self.grid.device)
         weight = torch.from_numpy(np.stack([m[1] for m in matches])).to(self.grid.device)
         return FlowMatch(pixels[:n], weight[:n]), FlowMatch(pixels[n:], weight[n:])
@@ -146,6 +146,13 @@ class ClassicalFlow:
         flow = self._dense(first, second, start, True)
         rows = [flow.at(np.stack(row, -1), 0.0) for row in zip(u, v, strict=True)]
         return np.stack(rows)
+
+    def _workers(self) -> ThreadPoolExecutor:
+        """Of the thread that asks: a frame does not wait behind all that a keyframe measures."""
+        found: ThreadPoolExecutor | None = getattr(self._local, "pool", None)
+        if found is None:
+            found = self._local.pool = ThreadPoolExecutor(worker_count())
+        return found
 
     def _dis(self, cold: bool) -> cv2.DISOpticalFlow:
         """This thread's flow object, for unwarped or warped pairs."""

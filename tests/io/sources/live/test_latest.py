@@ -8,7 +8,7 @@ import pytest
 from geogs.io.sources.live.latest import Latest
 
 
-def wait_for(condition, seconds=5.0):
+def wait_for(condition, seconds=600.0):
     end = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < end
@@ -64,4 +64,4 @@ def test_closing_ends_the_iterator():
     latest = Latest(items())
     assert latest.take() == 0
     latest.close()
-    assert closed.wait(5)
+    assert closed.wait(600)

@@ -11,6 +11,7 @@ import pytest
 
 from geogs.config import InputConfig
 from geogs.errors import InputError
+from geogs.evaluation.truth import read_true_scene
 from geogs.io.sources.posed.colmap_model import read_model
 from geogs.io.sources.posed.dtu import decompose
 from geogs.io.sources.posed.files import SparsePoints, renumbered
@@ -376,3 +377,13 @@ def test_dtu_scan_projects_like_its_matrices(shared_data):
         np.testing.assert_allclose(
             seen[:, :2] / seen[:, 2:] + 0.5, true[:, :2] / true[:, 2:], atol=0.01
         )
+
+
+def test_a_truth_whose_images_are_missing_says_so(room, tmp_path):
+    write_colmap_project(room, tmp_path)
+    for image in (tmp_path / "images").iterdir():
+        image.unlink()
+    with pytest.raises(InputError, match=r"images of the COLMAP model .* are not in"):
+        read_true_scene(tmp_path)
+    with pytest.raises(InputError, match="holds no"):
+        read_true_scene(tmp_path / "images")

@@ -51,6 +51,11 @@ def open_posed_source(
         raise InputError(f"{path} cannot be read: {error.strerror}.") from error
 
 
+def holds_posed_images(path: Path) -> bool:
+    """Whether a folder is laid out as a set of images with known poses, usable or not."""
+    return path.is_dir() and any(is_format(path) for is_format, _ in _FORMATS)
+
+
 def _posed_set(path: Path) -> PosedSet:
     if not path.exists():
         raise InputError(f"{path} does not exist; give a folder of images with poses.")

@@ -1,0 +1,135 @@
+"""Rows of a rolling shutter in the adjustment of all keyframes, by the trajectory that it gives.
+
+The matches are those of images whose rows were rectified before anything was known of the scene.
+What is left is told by the adjusted trajectory and depths (``tracking/row_errors.py``), taken off
+the matches, and everything is adjusted again. Flow is not measured anew. A readout that was found
+in the video, and may be off by some percent, is found once more on the way: it is right where all
+matches together would become neither better nor worse with another.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from geogs.bundle.base import BundleOptions
+from geogs.bundle.linearise import weighed_residuals
+from geogs.bundle.projection import project
+from geogs.geometry.lie import se3_inverse
+from geogs.tracking.graph import FrameGraph
+from geogs.tracking.moving import still_weight
+from geogs.tracking.packed_edge import PackedEdge, packed_matches, position_step
+from geogs.tracking.proximity import Pair
+from geogs.tracking.row_errors import RowErrors
+from geogs.tracking.tracker import Tracker
+
+ROUNDS = 2
+"""The first takes most of it."""
+READOUT_ROUNDS = 3
+"""With another readout each, after these."""
+FIRST_STEP, FARTHEST = 0.04, 0.25
+"""Share of the readout that is tried first, and by which it changes at most."""
+EVIDENCE = 0.02
+"""Share of what matches say of the readout that counts, as those of an edge err together."""
+TOGETHER = 64
+"""Edges that are corrected at a time; bounds memory."""
+
+
+def settle_rows(
+    tracker: Tracker, free_pose: Sequence[int], free_depth: Sequence[int], options: BundleOptions
+) -> None:
+    """Correct all matches for their rows and adjust again; nothing where no rows were rectified.
+
+    What was measured of the frames between the keyframes is corrected, too.
+    """
+    graph, recorder = tracker.graph, tracker.recorder
+    measured = {e: edge for e, edge in graph.edges.items() if isinstance(edge, PackedEdge)}
+    search = _Search()
+    for n in range(ROUNDS + READOUT_ROUNDS):
+        errors = recorder.row_errors() if measured else None
+        if errors is None:
+            return
+        if n >= ROUNDS:
+            search.step(_readout_gradient(graph, measured, errors, search.factor, options))
+        present = errors.with_readout(search.factor)
+        for part, shift in _shifts(graph, measured, present):
+            graph.edges |= {
+                pair: _moved(measured[pair], s) for pair, s in zip(part, shift, strict=True)
+            }
+        graph.adjust(list(graph.edges), free_pose, free_depth, options)
+        recorder.shift_rows(present)
+        if n + 1 >= ROUNDS and not errors.doubt:
+            return
+
+
+class _Search:
+    """Where the gradient of a cost is zero, by secants, held by what was known before."""
+
+    def __init__(self) -> None:
+        self.factor = 1.0
+        self._last: tuple[float, float] | None = None
+
+    def step(self, gradient: float) -> None:
+        """Go on from the gradient at the present factor, which falls from it on."""
+        here = self.factor
+        if self._last is None:
+            self.factor -= FIRST_STEP if gradient > 0 else -FIRST_STEP
+        else:
+            before, there = self._last
+            slope = (gradient - there) / (here - before) if here != before else 0.0
+            # No minimum lies there.
+            self.factor = here - gradient / slope if slope > 0 else 1.0
+        self.factor = min(max(self.factor, 1 - FARTHEST), 1 + FARTHEST)
+        self._last = here, gradient
+
+
+def _readout_gradient(
+    graph: FrameGraph,
+    measured: dict[Pair, PackedEdge],
+    errors: RowErrors,
+    factor: float,
+    options: BundleOptions,
+) -> float:
+    """Half the derivative of the cost by the factor on the readout, and of what was known of it."""
+    small, total = 0.02, (factor - 1) / errors.doubt**2
+    low, high = (errors.with_readout(factor + by) for by in (-small, small))
+    grid, keyframes = graph.keyframes.grid, graph.keyframes
+    both = zip(_shifts(graph, measured, low), _shifts(graph, measured, high), strict=True)
+    for (part, before), (_, after) in both:
+        T, depth = _relative(graph, part), keyframes.inverse_depths([i for i, _ in part])
+        pixels, weight = packed_matches([measured[pair] for pair in part])
+        weight = still_weight(keyframes, part, pixels, weight)
+        p = project(grid.camera, grid.rays, T, depth)
+        middle = pixels + (before + after) / 2
+        residual, weight = weighed_residuals(p, middle, weight, options.huber)
+        slope = (after - before) / (2 * small)
+        total += EVIDENCE * float((weight * residual * slope).double().sum())
+    return total
+
+
+def _shifts(
+    graph: FrameGraph, measured: dict[Pair, PackedEdge], errors: RowErrors
+) -> Iterator[tuple[list[Pair], Float[Tensor, "e p 2"]]]:
+    """Pixels by which the matches of edges are to be corrected, some edges at a time."""
+    keyframes, pairs = graph.keyframes, sorted(measured)
+    for start in range(0, len(pairs), TOGETHER):
+        part = pairs[start : start + TOGETHER]
+        first, second = ([keyframes[pair[k]].frame_index for pair in part] for k in (0, 1))
+        yield part, errors.of_matches(
+            first, second, _relative(graph, part), keyframes.grid.rays,
+            keyframes.inverse_depths([i for i, _ in part]),
+            packed_matches([measured[pair] for pair in part])[0],
+        )  # fmt: skip
+
+
+def _relative(graph: FrameGraph, pairs: Sequence[Pair]) -> Float[Tensor, "e 4 4"]:
+    source, target = (graph.keyframes.poses([pair[k] for pair in pairs]) for k in (0, 1))
+    return target @ se3_inverse(source)
+
+
+def _moved(edge: PackedEdge, shift: Float[Tensor, "p 2"]) -> PackedEdge:
+    """An edge with its matches elsewhere."""
+    steps = (shift / position_step(edge.grid.camera)).round().to(torch.int16)
+    return replace(edge, flow=replace(edge.flow, position=edge.flow.position + steps))

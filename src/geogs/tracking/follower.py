@@ -1,0 +1,94 @@
+"""Frames that come while others still work on a new keyframe: where they are, and nothing more."""
+
+from dataclasses import dataclass
+from typing import Any
+
+from jaxtyping import Float
+from torch import Tensor
+
+from geogs.config import TrackingConfig
+from geogs.geometry.lie import se3_inverse
+from geogs.keyframes.keyframe import Keyframe
+from geogs.tracking.flow.base import FlowOperator
+from geogs.tracking.keyframe_choice import calls_for_keyframe
+from geogs.tracking.last_frame import LastFrame
+from geogs.tracking.motion import FrameLocator, FrameMotion
+from geogs.tracking.pose_deviation import PoseDeviation, pose_deviation
+from geogs.types import Frame
+
+FARTHER = 1.0
+"""Part of the motion that calls for a keyframe by which a frame may be farther than that from the
+one that is not finished."""
+MOST_FRAMES = 60
+"""Whose images wait with a follower."""
+
+
+@dataclass(frozen=True)
+class FollowedFrame:
+    """A frame and where it was found."""
+
+    frame: Frame
+    encoded: Any
+    motion: FrameMotion
+    T_rel: Float[Tensor, "4 4"]
+    """The new keyframe to this frame, in the keyframe's lengths when the follower was made."""
+
+
+class Follower:
+    """Locates frames at a keyframe as it was when it was made, whatever becomes of it meanwhile.
+
+    It changes nothing that others know of: the tracker takes over what it has found when the
+    keyframe is finished.
+    """
+
+    def __init__(
+        self,
+        locator: FrameLocator,
+        operator: FlowOperator,
+        config: TrackingConfig,
+        last: LastFrame,
+        anchor: Keyframe,
+        motion: FrameMotion,
+    ) -> None:
+        """``last`` is relative to the new keyframe, ``motion`` by which its frame was located at
+        another, ``anchor``; neither keyframe may change any more."""
+        self.last = last
+        """Where the last frame was, relative to the keyframe as it was."""
+        self.frames: list[FollowedFrame] = []
+        """All that were found so far, earliest first."""
+        self._locator, self._operator, self._config = locator, operator, config
+        self._anchor, self._motion = anchor, motion
+
+    def follow(self, frame: Frame) -> FollowedFrame | None:
+        """Find the next frame; None where that takes more than the keyframe as it was.
+
+        So it is where the camera is not near where it is expected, or has moved so far that
+        another keyframe is overdue, and after a cut.
+        """
+        last, config, keyframe = self.last, self._config, self.last.keyframe
+        camera = keyframe.grid.camera
+        is_sensed = frame.depth is not None and keyframe.measured is None
+        has_size = frame.image.shape[:2] == (camera.height, camera.width)
+        if frame.follows_cut or is_sensed or not has_size or len(self.frames) >= MOST_FRAMES:
+            return None
+        encoded = self._operator.encode(frame.image)
+        if self._operator.texture(encoded) < config.min_texture:
+            return None
+        motion = self._locator.locate(keyframe, encoded, last.predicted(frame.timestamp))
+        if motion is None or motion.known < config.min_known:
+            return None
+        long_edge = max(camera.width, camera.height)
+        if calls_for_keyframe(config, long_edge, motion.flow, motion.overlap, FARTHER):
+            return None
+        velocity = motion.T_cw @ se3_inverse(last.T_cw)
+        T_rel = motion.T_cw @ se3_inverse(keyframe.T_cw)
+        interval = frame.timestamp - last.timestamp
+        self.last = LastFrame(keyframe, T_rel, velocity, keyframe.scale, frame.timestamp, interval)
+        self._anchor, self._motion = keyframe, motion
+        self.frames.append(FollowedFrame(frame, encoded, motion, T_rel))
+        return self.frames[-1]
+
+    def deviation(self) -> PoseDeviation:
+        """How well the last frame's pose is known relative to the keyframe it was located at."""
+        motion = self._motion
+        return pose_deviation(self._anchor.grid, self._anchor, motion.T_cw, motion.match)

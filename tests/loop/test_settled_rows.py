@@ -1,0 +1,165 @@
+"""Rows in the adjustment of all keyframes: a hall that is read row by row, with exact matches."""
+
+import functools
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from geogs.bundle.base import BundleOptions
+from geogs.config import TrackingConfig
+from geogs.geometry.camera import Camera
+from geogs.geometry.lie import se3_exp, se3_inverse
+from geogs.keyframes.grid import SampleGrid
+from geogs.loop.global_bundle import global_bundle
+from geogs.loop.settled_rows import _readout_gradient, _Search, settle_rows
+from geogs.tracking.flow.base import FlowMatch
+from geogs.tracking.row_errors import RowErrors
+from geogs.tracking.tracker import Tracker, TrackState
+from geogs.types import SeenRows
+from planted_walk import PlantedFlow, true_inverse_depth
+
+CAMERA = Camera(fx=90.0, fy=90.0, cx=47.5, cy=35.5, width=96, height=72)
+GRID = SampleGrid(CAMERA)
+COUNT, RATE, READOUT = 8, 30.0, 0.02
+
+
+def pose(k: np.ndarray) -> Tensor:
+    """World to camera at numbers of frames, which need not be whole."""
+    xi = np.zeros((len(k), 6))
+    xi[:, 3], xi[:, 4] = 0.03 * np.sin(0.9 * k), 0.1 + 0.05 * np.sin(0.6 * k)
+    T_wc = se3_exp(torch.from_numpy(xi))
+    T_wc[:, :3, 3] = torch.from_numpy(
+        np.stack([0.06 * k, 0.02 * np.sin(0.8 * k), 0.03 * np.sin(0.5 * k)], -1)
+    )
+    return se3_inverse(T_wc)
+
+
+def row_times(v: Tensor) -> Tensor:
+    """Seconds from the middle row."""
+    return READOUT * (v / (CAMERA.height - 1) - 0.5)
+
+
+class RollingFlow(PlantedFlow):
+    """Exact matches between images whose rows were left as they were read."""
+
+    def _match(self, source, target) -> FlowMatch:
+        found = [self._one(i, j) for i, j in zip(source, target, strict=True)]
+        pixels = torch.stack(found).float()
+        weight = torch.where(GRID.inside(pixels), 400.0, 0.0)
+        return FlowMatch(pixels, weight[..., None].expand(-1, -1, 2).contiguous())
+
+    def _one(self, i: int, j: int) -> Tensor:
+        world, pixels = self._points(i), GRID.pixels.double()
+        for _ in range(4):
+            T = pose(j + RATE * row_times(pixels[:, 1]).numpy())
+            seen = (T[:, :3, :3] @ world[..., None])[..., 0] + T[:, :3, 3]
+            pixels = seen[:, :2] / seen[:, 2:] * CAMERA.fx + torch.tensor([CAMERA.cx, CAMERA.cy])
+        return pixels
+
+    @functools.cache  # noqa: B019
+    def _points(self, i: int) -> Tensor:
+        """What the cells of an image see, in the world."""
+        rows = GRID.pixels.reshape(GRID.height, GRID.width, 2)[:, 0, 1].double()
+        T = pose(i + RATE * row_times(rows).numpy())
+        depth = 1 / true_inverse_depth(T, GRID).reshape(-1, GRID.height, GRID.width).double()
+        own = depth[range(GRID.height), range(GRID.height)]
+        points = GRID.rays.reshape(GRID.height, GRID.width, 3).double() * own[..., None]
+        return ((points - T[:, None, :3, 3]) @ T[:, :3, :3]).reshape(-1, 3)
+
+
+def as_read(factor: float = 1.0, doubt: float = 0.0) -> SeenRows:
+    """Rows that nothing was done about, by a readout so many times as long as it is."""
+    v = torch.arange(-1, CAMERA.height // 8 + 1) * 8 + 3.5
+    seconds = factor * row_times(v)[:, None].repeat(1, CAMERA.width // 8 + 2)
+    return SeenRows(torch.zeros(*seconds.shape, 2).half(), seconds.half(), doubt)
+
+
+def tracker_of_rows(rows: SeenRows) -> Tracker:
+    """A tracker with the true poses and depths of the middle rows, and matches as they are read."""
+    T = pose(np.arange(COUNT))
+    d = true_inverse_depth(T, GRID)
+    config = TrackingConfig(global_rounds=1, global_pairs=4, global_iterations=5)
+    tracker = Tracker(CAMERA, config, operator=RollingFlow(GRID, T, d, 0.0))
+    for n in range(COUNT):
+        image = np.full((4, 4, 3), (n, 0, 0), np.uint8)
+        state = tracker.keyframes.add(n, n / RATE, image, n, T[n].clone())
+        state.inverse_depth, state.information = d[n].clone(), torch.full_like(d[n], 1e4)
+        tracker.recorder.add_keyframe(n)
+        tracker.recorder.rows[n] = rows
+    tracker.state = TrackState.TRACKING
+    return tracker
+
+
+def error(T_cw: Tensor) -> float:
+    """Mean error of the steps between keyframes, as a part of the whole way."""
+    found, true = (se3_inverse(T)[:, :3, 3] for T in (T_cw, pose(np.arange(COUNT))))
+    steps, others = ((c[1:] - c[:-1]) / (c[-1] - c[0]).norm() for c in (found, true))
+    return float((steps - others).norm(dim=1).mean())
+
+
+def test_the_trajectory_straightens_rows_that_nothing_was_done_about(monkeypatch):
+    tracker, bent = tracker_of_rows(as_read()), []
+
+    def settle(tracker, *others):
+        bent.append(error(tracker.keyframes.poses(tracker.keyframes.ids)))
+        settle_rows(tracker, *others)
+
+    monkeypatch.setattr("geogs.loop.global_bundle.settle_rows", settle)
+    global_bundle(tracker)
+    assert bent[0] > 0.05
+    assert error(tracker.keyframes.poses(tracker.keyframes.ids)) < 0.4 * bent[0]
+
+
+def test_the_gradient_falls_to_zero_at_the_true_readout():
+    """With the true poses and depths, and rows that count as read 1.15 times as slowly."""
+    tracker = tracker_of_rows(as_read(1.15, doubt=10.0))
+    graph, pairs = tracker.graph, [(n, n + 1) for n in range(COUNT - 1)]
+    graph.measure(pairs, packed=True)
+    errors = tracker.recorder.row_errors()
+    assert errors.doubt == 10.0
+    at = [
+        _readout_gradient(graph, graph.edges, errors, factor, BundleOptions())
+        for factor in (0.8, 1 / 1.15, 1.0)
+    ]
+    assert at[0] < 0 < at[2]
+    assert abs(at[1]) < 0.05 * at[2]
+
+
+def test_a_readout_that_was_told_is_kept(monkeypatch):
+    tracker, factors = tracker_of_rows(as_read(1.15)), set()
+    given = RowErrors.with_readout
+
+    def noted(errors, factor):
+        factors.add(factor)
+        return given(errors, factor)
+
+    monkeypatch.setattr(RowErrors, "with_readout", noted)
+    tracker.graph.measure([(0, 1), (1, 2)], packed=True)
+    settle_rows(tracker, [1, 2], [0, 1, 2], BundleOptions())
+    assert factors == {1.0}
+
+
+def test_a_search_ends_where_the_gradient_is_zero():
+    search = _Search()
+    for _ in range(3):
+        search.step(40 * (search.factor - 0.9))
+    assert search.factor == pytest.approx(0.9)
+
+
+def test_a_search_without_a_minimum_stays():
+    search = _Search()
+    for _ in range(2):
+        search.step(-3 * (search.factor - 0.9))
+    assert search.factor == 1.0
+
+
+def test_nothing_happens_to_a_global_shutter():
+    tracker = tracker_of_rows(as_read())
+    tracker.recorder.rows = {}
+    tracker.graph.measure([(0, 1)], packed=True)
+    before = tracker.graph.edges[0, 1].pixels.clone()
+    settle_rows(tracker, [1], [0, 1], BundleOptions())
+    assert torch.equal(tracker.graph.edges[0, 1].pixels, before)
+    assert torch.equal(tracker.keyframes[1].T_cw, pose(np.arange(COUNT))[1])
