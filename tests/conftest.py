@@ -35,6 +35,7 @@ Once = Callable[[str, Callable[[Path], object]], Path]
 """Of a name and what fills a folder: the folder, filled by whoever asks first."""
 
 
+@pytest.hookimpl(tryfirst=True)  # before pytest-xdist asks for the groups
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Tests that share what their module has made go to one process, which makes it once."""
     for item in items:

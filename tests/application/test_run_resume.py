@@ -97,6 +97,11 @@ def goes_on(out: Path, capsys: pytest.CaptureFixture[str]) -> str:
     return said.err
 
 
+@pytest.mark.skipif("PYTEST_XDIST_WORKER" not in os.environ, reason="one process in any case")
+def test_one_process_runs_all_of_these(request):
+    assert request.node.nodeid.endswith("@resumed-room"), "run with --dist loadgroup"
+
+
 @pytest.mark.usefixtures("no_report")
 def test_a_killed_run_goes_on_even_after_another_interruption(
     small_room, whole, killed, tmp_path, capsys
