@@ -52,14 +52,14 @@ class StreamedBundle:
         chunks = source_chunks(problem.source, options.chunk)
         for _ in range(options.iterations):
             system.clear()
-            for chunk, stars in self._linearised(problem, T, d, options, chunks):
+            for chunk, stars in self.linearised(problem, T, d, options, chunks):
                 system.add(stars)
                 residual[chunk] = torch.cat([star.residual for star in stars])
                 for star in stars:
                     information[star.frame] = star.information
             system.add(motion_stars(problem.motions, T))
             xi = system.solve(options.damping)
-            delta = self._depth_steps(problem, T, d, xi, options, chunks)
+            delta = self.depth_steps(problem, T, d, xi, options, chunks)
             if not bool(torch.isfinite(xi).all() and torch.isfinite(delta).all()):
                 finite = False
                 break
@@ -68,7 +68,7 @@ class StreamedBundle:
                 break
         return BundleResult(T, d, information, residual, finite)
 
-    def _linearised(
+    def linearised(
         self,
         problem: StreamedProblem,
         T: Float[Tensor, "n 4 4"],
@@ -76,6 +76,8 @@ class StreamedBundle:
         options: BundleOptions,
         chunks: Sequence[slice],
     ) -> Iterator[tuple[slice, list[Star]]]:
+        """What the edges of each chunk say of the poses; stars without their depths."""
+
         def work(chunk: slice) -> tuple[slice, list[Star]]:
             stars = linearise_stars(
                 self.grid.camera, self.grid.rays, problem.part(chunk), T, d, options
@@ -85,7 +87,7 @@ class StreamedBundle:
 
         return _few_at_a_time(work, chunks)
 
-    def _depth_steps(
+    def depth_steps(
         self,
         problem: StreamedProblem,
         T: Float[Tensor, "n 4 4"],
@@ -94,7 +96,10 @@ class StreamedBundle:
         options: BundleOptions,
         chunks: Sequence[slice],
     ) -> Float[Tensor, "n p"]:
-        """Back-substitution: sum_e w dp/dd (r - dp/dxi xi_rel) over the damped curvature."""
+        """Steps of the inverse depths after those of the poses.
+
+        Back-substitution: sum_e w dp/dd (r - dp/dxi xi_rel) over the damped curvature.
+        """
 
         def work(chunk: slice) -> list[tuple[int, Tensor]]:
             part = problem.part(chunk)

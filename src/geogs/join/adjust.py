@@ -1,54 +1,67 @@
-"""Bundle adjustment over the overlaps, a part at a time: its keyframes move, those around stay."""
+"""Bundle adjustment of all parts of a world together, of which no worker sees more than one.
+
+What the matches of a part say of the poses, its depths eliminated, is small and is summed up here;
+the step of all poses goes back to the parts, which bring their depths after it. So it is one
+adjustment of everything, whose matches and depths stay in files.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from geogs.bundle.base import BundleOptions
+from geogs.bundle.camera_system import SparseCameraSystem
+from geogs.bundle.dense import stepped
+from geogs.bundle.linearise import Star
+from geogs.bundle.problem import source_chunks
+from geogs.bundle.select import grid_fields
+from geogs.bundle.streamed import StreamedBundle
 from geogs.config import Config
 from geogs.geometry.camera import Camera
-from geogs.geometry.lie import se3_inverse
+from geogs.geometry.lie import move
 from geogs.join.gauge import Gauge
 from geogs.join.graph import Placement
-from geogs.join.links import loaded_keyframes
-from geogs.join.part import Part, PartViews
+from geogs.join.matches import Depths, Matches, MatchJob, Member, match
+from geogs.join.part import Node, Part
 from geogs.join.workers import Workers
 from geogs.keyframes.grid import SampleGrid
-from geogs.keyframes.store import KeyframeStore, Segment
-from geogs.loop.global_bundle import MATCHED_TOGETHER, SMALL_STEP
+from geogs.keyframes.store import KeyframeStore
+from geogs.loop.global_bundle import SETTLED, SMALL_STEP
 from geogs.threads import on_one_torch_thread
-from geogs.tracking.flow.base import FlowOperator
 from geogs.tracking.flow.select import build_operator
 from geogs.tracking.graph import FrameGraph
-from geogs.tracking.proximity import Pair, proximity_pairs
+from geogs.tracking.packed_edge import PackedEdge
 
-SWEEPS = 2
-"""Times that every part is adjusted; the first brings most."""
-ROUNDS = 2
-"""Measurements of each pair, from poses that become better."""
+_NO_IMAGE = np.zeros((1, 1, 3), np.uint8)
+"""Of a keyframe whose matches are known."""
 
 
 @dataclass(frozen=True)
-class Neighbour:
-    """A part as the adjustment of another sees it."""
+class StepJob:
+    """A part after a step of all poses: its depths are to follow, and what it says of the next."""
 
-    part: Part
-    views: Path
-    placement: Placement
-
-
-@dataclass(frozen=True)
-class AdjustJob:
-    """A part to be adjusted among its neighbours."""
-
-    own: Neighbour
-    others: tuple[Neighbour, ...]
+    own: Member
+    others: tuple[Member, ...]
+    """All that are linked to it."""
+    first: Mapping[int, int]
+    """Number of the first keyframe of each of them in the whole."""
+    matches: tuple[Path, ...]
+    """Files of the edges that leave its keyframes."""
     camera: Camera
     config: Config
+    after: Path
+    """File of the depths, to be written."""
+    T_before: Float[Tensor, "m 4 4"] | None
+    """Of all keyframes of the whole; none where there was no step yet."""
+    step: Float[Tensor, "m 6"] | None
+    """Of their poses."""
+    is_last: bool = False
+    """Nothing is said of the next; cells without matches are filled, and what moves is found."""
 
 
 def adjusted(
@@ -59,94 +72,205 @@ def adjusted(
     camera: Camera,
     config: Config,
     workers: Workers,
+    folder: Path,
 ) -> dict[int, Placement]:
-    """The keyframes of a world after each part was adjusted among those linked to it.
+    """The keyframes of a world by all matches within its parts and between those that are linked.
 
-    Parts without a link between them are adjusted side by side, the others one after the other, so
-    that each sees where its neighbours have come to.
+    The first keyframe of the first part stays. Depths and matches are kept in ``folder``, which all
+    workers see.
     """
-    beside = {n: set[int]() for n in gauge.parts}
-    for link in gauge.links:
-        beside[link.first[0]].add(link.second[0])
-        beside[link.second[0]].add(link.first[0])
-    now = dict(placements)
-
-    def seen(n: int) -> Neighbour:
-        return Neighbour(parts[n], files[n], now[n])
-
-    for colour in SWEEPS * _colours(beside):
-        jobs = [
-            AdjustJob(seen(n), tuple(seen(m) for m in sorted(beside[n])), camera, config)
-            for n in colour
-        ]
-        now |= zip(colour, workers.map("adjusting", adjust_part, jobs), strict=True)
-    return now
+    now = {
+        n: Member(n, parts[n], files[n], placements[n].T_cw, placements[n].scale)
+        for n in gauge.parts
+    }
+    adjustment = _Adjustment(now, _beside(gauge), camera, config, workers, folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    for _ in range(config.tracking.global_rounds):
+        if adjustment.match() <= SETTLED * adjustment.pairs:
+            break
+        adjustment.solve()
+    return {n: replace(placements[n], T_cw=member.T_cw) for n, member in adjustment.members.items()}
 
 
-def _colours(beside: Mapping[int, set[int]]) -> list[list[int]]:
-    """Groups of parts that are not beside each other, greedily."""
-    groups: list[list[int]] = []
-    for n in sorted(beside, key=lambda n: (-len(beside[n]), n)):
-        free = (group for group in groups if beside[n].isdisjoint(group))
-        group = next(free, None)
-        if group is None:
-            groups.append([n])
-        else:
-            group.append(n)
-    return [sorted(group) for group in groups]
+class _Adjustment:
+    """What is known between two steps."""
+
+    def __init__(
+        self,
+        members: dict[int, Member],
+        beside: Mapping[int, list[int]],
+        camera: Camera,
+        config: Config,
+        workers: Workers,
+        folder: Path,
+    ) -> None:
+        self.members, self.beside, self.folder = members, beside, folder
+        self.camera, self.config, self.workers = camera, config, workers
+        counts = np.cumsum([0, *(len(m.T_cw) for m in members.values())]).tolist()
+        self.first = dict(zip(members, counts[:-1], strict=True))
+        self.keyframes = counts[-1]
+        self.matches: dict[tuple[int, int], Path] = {}
+        """Edges that leave the keyframes of the second part, matched by the first."""
+        self.ends = np.zeros((0, 4), np.int64)
+        self.written = 0
+        """Files so far, so that each gets a name of its own."""
+
+    @property
+    def pairs(self) -> int:
+        """Pairs of keyframes that are matched."""
+        return len(self.ends) // 2
+
+    def match(self) -> int:
+        """Match what has moved; how many pairs."""
+        jobs, written = [], []
+        for n, own in self.members.items():
+            later = [m for m in self.beside[n] if m > n]
+            paths = {(n, m): self._new(f"matches-{n}-{m}") for m in (n, *later)}
+            before = tuple(self.matches[key] for key in paths if key in self.matches)
+            others = tuple(self.members[m] for m in later)
+            jobs.append(
+                MatchJob(own, others, self.camera, self.config, before, tuple(paths.values()))
+            )
+            written.append(paths)
+        found = self.workers.map("matching", match, jobs)
+        for path in self.matches.values():
+            path.unlink()
+        self.matches = {key: path for paths in written for key, path in paths.items()}
+        self.ends = np.concatenate([f.ends for f in found])
+        return sum(f.fresh for f in found)
+
+    def solve(self) -> None:
+        """Gauss-Newton steps until they are small."""
+        first = np.zeros(max(self.first) + 1, np.int64)
+        first[list(self.first)] = list(self.first.values())
+        source, target = (first[self.ends[:, k]] + self.ends[:, k + 1] for k in (0, 2))
+        order = np.argsort(source, kind="stable")
+        free = torch.arange(self.keyframes) > 0
+        source, target = source[order], target[order]
+        system = SparseCameraSystem(torch.from_numpy(source), torch.from_numpy(target), free)
+        options = _options(self.config)
+        T, step = self._poses(), None
+        for _ in range(options.iterations):
+            system.clear()
+            for stars in self._follow(T, step):
+                system.add(stars)
+            T, step = self._poses(), system.solve(options.damping)
+            if not bool(torch.isfinite(step).all()):
+                return
+            moved = move(step, T)
+            self.members = {
+                n: replace(m, T_cw=moved[self.first[n] :][: len(m.T_cw)])
+                for n, m in self.members.items()
+            }
+            if float(step.abs().max()) < options.tolerance:
+                break
+        self._follow(T, step, is_last=True)
+
+    def _follow(
+        self, T_before: Tensor, step: Tensor | None, is_last: bool = False
+    ) -> list[list[Star]]:
+        """Bring the depths after a step; what the parts say of the next."""
+        jobs = []
+        for n, own in self.members.items():
+            others = tuple(self.members[m] for m in self.beside[n])
+            leaving = tuple(path for (_, m), path in self.matches.items() if m == n)
+            first = {m: self.first[m] for m in (n, *self.beside[n])}
+            jobs.append(
+                StepJob(
+                    own, others, first, leaving, self.camera, self.config,
+                    self._new(f"depths-{n}"), None if step is None else T_before, step, is_last,
+                )
+            )  # fmt: skip
+        stars = self.workers.map("adjusting", follow, jobs)
+        for job in jobs:
+            if job.own.adjusted is not None:
+                job.own.adjusted.unlink()
+            self.members[job.own.number] = replace(job.own, adjusted=job.after)
+        return stars
+
+    def _poses(self) -> Float[Tensor, "m 4 4"]:
+        return torch.cat([member.T_cw for member in self.members.values()])
+
+    def _new(self, name: str) -> Path:
+        """A file that no job has written: one that is done again finds what the first found."""
+        self.written += 1
+        return self.folder / f"{name}-{self.written}.npz"
 
 
 @on_one_torch_thread
-def adjust_part(job: AdjustJob) -> Placement:
-    """Poses of a part's keyframes by all matches among them and with those of its neighbours."""
-    c, grid = job.config.tracking, SampleGrid(job.camera)
-    operator = build_operator(c, grid)
-    segment = KeyframeStore(grid, operator.encode).new_segment()
-    own = _load(job.own, segment, operator, None)
-    around = _centres(job.own)
-    others = [id for other in job.others for id in _load(other, segment, operator, around)]
-    limit = c.global_distance * max(grid.camera.width, grid.camera.height)
-    among = proximity_pairs(
-        segment, own, own, [], c.radius, c.global_suppression, limit, c.global_pairs * len(own)
-    )
-    beyond: list[Pair] = []
-    if others:
-        beyond = proximity_pairs(
-            segment, others, own, [], 0, c.global_suppression, limit, c.global_pairs * len(own)
-        )
-    graph, pairs = FrameGraph(segment, operator), sorted([*among, *beyond])
-    options = BundleOptions(iterations=c.global_iterations, huber=c.huber, tolerance=SMALL_STEP)
-    free = own if beyond else own[1:]
-    batch = MATCHED_TOGETHER[grid.on_gpu]
-    for _ in range(ROUNDS if pairs else 0):
-        stale = sorted(graph.stale(pairs, c.global_remeasure))
-        for start in range(0, len(stale), batch):
-            graph.measure(stale[start : start + batch], packed=True)
-        graph.adjust(list(graph.edges), free, own, options)
-        graph.judge_moving(set(own), c.moving)
-    return replace(job.own.placement, T_cw=segment.poses(own).double())
+def follow(job: StepJob) -> list[Star]:
+    """Bring the depths of a part after a step and write them; what it says of the next step.
+
+    The stars have the numbers of the whole, and no depths.
+    """
+    grid, options = SampleGrid(job.camera), _options(job.config)
+    graph, nodes = _known_graph(job, grid)
+    own = graph.keyframes.ids[: len(job.own.T_cw)]
+    problem, ids = graph.streamed_problem(list(graph.edges), [], own)
+    solver, chunks = StreamedBundle(grid), source_chunks(problem.source, options.chunk)
+    numbers = torch.tensor([job.first[part] + place for part, place in (nodes[k] for k in ids)])
+    d, T = problem.inverse_depth, problem.T_cw
+    if job.step is not None and job.T_before is not None:
+        before, step = job.T_before[numbers], job.step[numbers]
+        delta = solver.depth_steps(problem, before, d, step, options, chunks)
+        d = stepped(problem, before, d, step, delta, options)[1]
+    information = graph.keyframes.informations(own)
+    stars: list[Star] = []
+    if not job.is_last:
+        for _, some in solver.linearised(problem, T, d, options, chunks):
+            for star in some:
+                information[star.frame] = star.information
+                stars.append(
+                    replace(star, frame=int(numbers[star.frame]), targets=numbers[star.targets])
+                )
+    depth = d[: len(own)]
+    if job.is_last:
+        depth = grid_fields(grid).fill(depth, information)
+        for id, field in zip(own, depth, strict=True):
+            graph.keyframes[id].inverse_depth = field
+        graph.judge_moving(set(own), job.config.tracking.moving)
+    none = torch.zeros(grid.size, dtype=torch.bool)
+    moving = [graph.keyframes[id].moving for id in own]
+    held = torch.stack([none if m is None else m for m in moving])
+    Depths(depth.contiguous(), information, held).save(job.after)
+    return stars
 
 
-def _load(
-    neighbour: Neighbour,
-    segment: Segment,
-    operator: FlowOperator,
-    around: Float[np.ndarray, "n 3"] | None,
-) -> list[int]:
-    """Ids of the keyframes of a part, or of those near some places, put into a segment."""
-    views, placement = PartViews.load(neighbour.views), neighbour.placement
-    places = list(range(len(views.T_cw)))
-    if around is not None:
-        centre = _centres(neighbour)
-        depth = views.median_depth / placement.scale.numpy()
-        away = np.linalg.norm(centre[:, None] - around, axis=2).min(axis=1)
-        places = [n for n in places if away[n] < depth[n]]
-    loaded = loaded_keyframes(
-        segment, operator, neighbour.part, views, places, placement.T_cw, placement.scale.tolist()
-    )
-    return [keyframe.id for keyframe in loaded.values()]
+def _known_graph(job: StepJob, grid: SampleGrid) -> tuple[FrameGraph, list[Node]]:
+    """The edges that leave a part's keyframes, which come first; the node of each keyframe."""
+    edges: dict[tuple[Node, Node], PackedEdge] = {}
+    for path in job.matches:
+        edges |= Matches.load(path).edges(grid)
+    seen = {target for _, target in edges}
+    segment = KeyframeStore(grid).new_segment()
+    nodes: list[Node] = []
+    ids: dict[Node, int] = {}
+    for member in (job.own, *job.others):
+        depths = member.depths()
+        for node in member.nodes:
+            if member is not job.own and node not in seen:
+                continue
+            place = node[1]
+            keyframe = segment.add(place, float(place), _NO_IMAGE, None, member.T_cw[place])
+            keyframe.inverse_depth = depths.inverse[place]
+            keyframe.information = depths.information[place]
+            keyframe.moving = depths.moving[place]
+            ids[node] = keyframe.id
+            nodes.append(node)
+    graph = FrameGraph(segment, build_operator(job.config.tracking, grid))
+    graph.edges = {(ids[a], ids[b]): edge for (a, b), edge in edges.items()}
+    return graph, nodes
 
 
-def _centres(neighbour: Neighbour) -> Float[np.ndarray, "n 3"]:
-    T_wc: Tensor = se3_inverse(neighbour.placement.T_cw)
-    return np.asarray(T_wc[:, :3, 3].numpy())
+def _options(config: Config) -> BundleOptions:
+    c = config.tracking
+    return BundleOptions(iterations=c.global_iterations, huber=c.huber, tolerance=SMALL_STEP)
+
+
+def _beside(gauge: Gauge) -> dict[int, list[int]]:
+    """The parts that each is linked to, ascending."""
+    beside: dict[int, set[int]] = {n: set() for n in gauge.parts}
+    for link in gauge.links:
+        beside[link.first[0]].add(link.second[0])
+        beside[link.second[0]].add(link.first[0])
+    return {n: sorted(others) for n, others in beside.items()}

@@ -208,8 +208,9 @@ def _joined(join: _Join, adjust: bool, say: Callable[[str], None], begin: float)
     if adjust:
         with join.timed("bundle adjustment"):
             placements = adjusted(
-                parts, join.files, placements, gauge, join.camera, config, join.workers
-            )
+                parts, join.files, placements, gauge, join.camera, config, join.workers,
+                join.work / "adjust",
+            )  # fmt: skip
     results = {n: opened(parts[n]) for n in gauge.parts}
     spans = spans_of(
         [parts[n].name for n in gauge.parts],

@@ -1,0 +1,113 @@
+"""The adjustment of parts against one of everything."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from geogs.bundle.base import BundleOptions
+from geogs.config import Config
+from geogs.config.tracking import TrackingConfig
+from geogs.join.adjust import adjusted
+from geogs.join.gauge import Gauge
+from geogs.join.graph import Placement
+from geogs.join.links import Link, loaded_keyframes
+from geogs.join.matches import Matches
+from geogs.join.part import DescribeJob, Part, PartViews, describe
+from geogs.join.workers import OneProcess
+from geogs.keyframes.grid import SampleGrid
+from geogs.keyframes.store import KeyframeStore
+from geogs.loop.global_bundle import SMALL_STEP
+from geogs.loop.pose_graph import RelativePoses
+from geogs.tracking.flow.select import build_operator
+from geogs.tracking.graph import FrameGraph
+from joined_parts import CAMERA, make_part
+
+PLACES = [np.linspace(-0.8, -0.1, 4), np.linspace(-0.4, 0.4, 4), np.linspace(0.1, 0.8, 4)]
+
+
+class Recording(OneProcess):
+    """Keeps the matches, which are deleted as soon as there are newer ones."""
+
+    def __init__(self, folder):
+        self.folder = folder
+        self.files = []
+
+    def map(self, stage, function, jobs):
+        done = super().map(stage, function, jobs)
+        if stage == "matching":
+            for path in (path for job in jobs for path in job.after):
+                self.files.append(Path(shutil.copy(path, self.folder)))
+        return done
+
+
+@pytest.fixture
+def placed(tmp_path):
+    """Three parts that were put together badly; the first and the last share nothing."""
+    rng, config = np.random.default_rng(0), Config(tracking=TrackingConfig(global_rounds=1))
+    parts, files, placements = [], [], {}
+    for n, places in enumerate(PLACES):
+        parts.append(Part(str(n), make_part(tmp_path / str(n), places, 0)))
+        files.append(tmp_path / f"{n}.npz")
+        describe(DescribeJob(parts[-1], CAMERA, config, files[-1]))
+        T = torch.from_numpy(PartViews.load(files[-1]).T_cw)
+        T[:, :3, 3] += torch.from_numpy(rng.normal(0, 0.003, 3)) * (n > 0)
+        placements[n] = Placement(T, torch.ones(len(T)))
+    none = torch.zeros(0, dtype=torch.long)
+    relative = RelativePoses(none, none, torch.zeros(0, 4, 4), torch.zeros(0, 7), none.bool())
+    links = tuple(Link((n, 3), (n + 1, 0), torch.eye(4), 1.0, relative) for n in range(2))
+    gauge = Gauge({n: torch.eye(4) for n in range(3)}, links)
+    return parts, files, placements, gauge, config
+
+
+def test_parts_together_are_adjusted_as_one_problem(placed, tmp_path):
+    parts, files, placements, gauge, config = placed
+    (tmp_path / "kept").mkdir()
+    workers = Recording(tmp_path / "kept")
+    found = adjusted(
+        parts, files, placements, gauge, CAMERA, config, workers, tmp_path / "work"
+    )  # fmt: skip
+
+    grid = SampleGrid(CAMERA)
+    operator = build_operator(config.tracking, grid)
+    segment = KeyframeStore(grid, operator.encode).new_segment()
+    ids = {}
+    for n, part in enumerate(parts):
+        views, T = PartViews.load(files[n]), placements[n].T_cw
+        for place, k in loaded_keyframes(segment, operator, part, views, range(4), T).items():
+            ids[n, place] = k.id
+    graph = FrameGraph(segment, operator)
+    for path in workers.files:
+        for (a, b), edge in Matches.load(path).edges(grid).items():
+            graph.edges[ids[a], ids[b]] = edge
+    assert {(a // 4, b // 4) for a, b in graph.edges} == {
+        (n, m) for n in range(3) for m in range(3) if abs(n - m) < 2
+    }
+    c = config.tracking
+    options = BundleOptions(iterations=c.global_iterations, huber=c.huber, tolerance=SMALL_STEP)
+    graph.adjust(list(graph.edges), segment.ids[1:], segment.ids, options)
+    for n in range(3):
+        wanted = segment.poses([ids[n, place] for place in range(4)])
+        moved = float((wanted - placements[n].T_cw).abs().max())
+        assert float((found[n].T_cw - wanted).abs().max()) < 1e-3 * moved + 1e-7
+    assert torch.allclose(found[0].T_cw[0], placements[0].T_cw[0], rtol=0, atol=1e-12)
+
+
+def test_what_has_settled_is_not_matched_again(placed, tmp_path):
+    parts, files, placements, gauge, _ = placed
+    matched = []
+
+    class Counting(OneProcess):
+        def map(self, stage, function, jobs):
+            done = super().map(stage, function, jobs)
+            if stage == "matching":
+                matched.append((sum(d.fresh for d in done), sum(len(d.ends) for d in done) // 2))
+            return done
+
+    adjusted(parts, files, placements, gauge, CAMERA, Config(), Counting(), tmp_path / "work")
+    (fresh, pairs), *again = matched
+    assert fresh == pairs > 20
+    assert [p for _, p in again] == [pairs] * len(again)
+    assert again[-1][0] < 0.3 * pairs
