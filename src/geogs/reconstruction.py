@@ -27,7 +27,7 @@ from geogs.mapping.training.base import TrainingPlace
 from geogs.on_demand import OnDemand
 from geogs.stopwatch import Stopwatch
 from geogs.threads import on_one_torch_thread
-from geogs.types import MapSnapshot, RenderedKeyframe, Trajectory
+from geogs.types import MapSnapshot, RenderedKeyframe, SeenRows, Trajectory
 
 Progress = Callable[[str, float], None]
 """Called with the name of a stage and its finished fraction in [0, 1]."""
@@ -262,6 +262,10 @@ class Reconstruction:
     def renderer(self) -> MapRenderer:
         """What shows the map as it is now from anywhere."""
         return self.mapper.renderer(self._frame)
+
+    def rows(self) -> dict[int, SeenRows]:
+        """None: poses that were given are those of whole images."""
+        return {}
 
     def particulars(self) -> dict[str, object]:
         """Nothing that is not said of every result."""

@@ -40,6 +40,7 @@ from geogs.types import (
     MapSnapshot,
     MetricScale,
     RenderedKeyframe,
+    SeenRows,
     Trajectory,
     Uncertainty,
 )
@@ -427,6 +428,11 @@ class Slam:
     def renderer(self) -> MapRenderer:
         """What shows the map as it is now from anywhere."""
         return self._ask(Mapper.renderer)
+
+    def rows(self) -> dict[int, SeenRows]:
+        """Of keyframes, by id, whose rows were rectified: where and when they were seen."""
+        known, keyframes = self.segments.world.recorder.rows, self.segments.world.keyframes
+        return {k.id: known[k.frame_index] for k in keyframes if k.frame_index in known}
 
     def depth_maps(self) -> Sequence[RenderedKeyframe]:
         """Depth and confidence of every mapped keyframe as searched, without the disks.

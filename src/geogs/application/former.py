@@ -18,7 +18,7 @@ _FILES = (
 """In the order in which they go: the summary first, so that no half of a result has one."""
 _STAGES = ("online", "adjusted")
 _OF_A_STAGE = ("trajectory.tum", "keyframes.tum", "mesh.ply")
-_KEYFRAME = re.compile(r"\d{6,}\.(jpg|mask\.png)")
+_KEYFRAME = re.compile(r"\d{6,}\.(jpg|mask\.png)|rows\.safetensors")
 _REPORT = re.compile(r"\w+\.(png|html|css|js)")
 
 

@@ -8,6 +8,7 @@ import numpy as np
 from geogs.application.scene import MappedScene
 from geogs.geometry.camera import Camera
 from geogs.io.writers.keyframe_images import image_path, mask_path, write_image, write_mask
+from geogs.io.writers.keyframe_rows import rows_path, write_rows
 from geogs.io.writers.map_views import MapViews
 from geogs.types import RenderedKeyframe
 
@@ -19,14 +20,14 @@ def write_keyframes(
     renders: Sequence[RenderedKeyframe],
     with_images: bool,
 ) -> MapViews:
-    """Write masks, and images as they were used, to ``keyframes/``; all else is returned.
+    """Write masks, images and rows as they were used to ``keyframes/``; all else is returned.
 
     Args:
         folder: of the result.
         scene: whose map is seen.
         camera: of the images.
         renders: the map seen from the keyframes.
-        with_images: whether images are written.
+        with_images: whether images and rows are written.
 
     Raises:
         OutputError: a file cannot be written.
@@ -41,6 +42,10 @@ def write_keyframes(
             write_mask(mask_path(folder, render.keyframe_id), render.mask.cpu().numpy())
         if with_images and render.image is not None:
             write_image(image_path(folder, render.keyframe_id), render.image)
+    rows = scene.rows() if with_images else {}
+    kept = {id: rows[id] for id in ids if id in rows}
+    if kept:
+        write_rows(rows_path(folder), kept)
     renderer = scene.renderer()
     return MapViews(
         camera=camera,

@@ -32,7 +32,7 @@ from geogs.reconstruction import Reconstruction
 from geogs.stopwatch import Stopwatch
 from geogs.threads import on_one_torch_thread
 from geogs.tracking.gaps import bridged
-from geogs.types import MapSnapshot, RenderedKeyframe, Trajectory, Uncertainty
+from geogs.types import MapSnapshot, RenderedKeyframe, SeenRows, Trajectory, Uncertainty
 
 
 @on_one_torch_thread
@@ -163,6 +163,10 @@ class OfflineScene:
     def depth_maps(self) -> Sequence[RenderedKeyframe]:
         """Their depths as searched."""
         return self.scene.depth_maps()
+
+    def rows(self) -> Mapping[int, SeenRows]:
+        """None: rows of photographs are taken as they are."""
+        return {}
 
     def particulars(self) -> Mapping[str, object]:
         """That nothing was tracked, and how the poses were found."""

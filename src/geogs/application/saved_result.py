@@ -16,6 +16,7 @@ from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.io.poses import read_tum_trajectory
 from geogs.io.writers.keyframe_images import image_path, mask_path, read_image, read_mask
+from geogs.io.writers.keyframe_rows import read_rows, rows_path
 from geogs.io.writers.map_views import MapViews, load_map_views
 from geogs.io.writers.uncertainty import read_tracked
 from geogs.mapping.map_frame import MapFrame
@@ -23,8 +24,9 @@ from geogs.mapping.rendered import MapRenderer, SurfaceMaps, SurfaceRules
 from geogs.mesh.files import read_mesh
 from geogs.mesh.types import Mesh
 from geogs.on_demand import OnDemand
+from geogs.shutter.rows import CELL
 from geogs.threads import on_one_torch_thread
-from geogs.types import MapSnapshot, RenderedKeyframe, Trajectory
+from geogs.types import MapSnapshot, RenderedKeyframe, SeenRows, Trajectory
 
 
 @dataclass(frozen=True)
@@ -97,6 +99,19 @@ class SavedResult:
         ``camera`` is that of the keyframes' depth maps if none is given.
         """
         return self.renderer.surface(T_cw, camera)
+
+    def rows(self) -> dict[int, SeenRows]:
+        """Where and when a rolling shutter saw what keyframes show, by their place among them.
+
+        Raises InputError if the file is damaged.
+        """
+        path = rows_path(self.folder)
+        place = {id: number for number, id in enumerate(self.views.keyframe_id.tolist())}
+        size = tuple(-(-n // CELL) + 2 for n in (self.camera.height, self.camera.width))
+        rows = {place[id]: r for id, r in read_rows(path).items() if id in place}
+        if any(r.seconds.shape != size for r in rows.values()):
+            raise InputError(f"{path} is of another size than the result says; was it changed?")
+        return rows
 
     def mask(self, number: int) -> Bool[np.ndarray, "h w"] | None:
         """The mask of a keyframe, by its place among them; none if it has none.

@@ -6,7 +6,7 @@ from typing import Protocol, runtime_checkable
 from geogs.config import Config, ReconstructConfig
 from geogs.mapping.rendered import MapRenderer
 from geogs.stopwatch import Stopwatch
-from geogs.types import MapSnapshot, RenderedKeyframe, Trajectory, Uncertainty
+from geogs.types import MapSnapshot, RenderedKeyframe, SeenRows, Trajectory, Uncertainty
 
 
 @runtime_checkable
@@ -51,6 +51,10 @@ class MappedScene(Protocol):
 
     def depth_maps(self) -> Sequence[RenderedKeyframe]:
         """The keyframes' depths as searched."""
+        ...
+
+    def rows(self) -> Mapping[int, SeenRows]:
+        """Of keyframes, by id, whose rows were rectified: where and when they were seen."""
         ...
 
     def particulars(self) -> Mapping[str, object]:

@@ -11,6 +11,8 @@ from geogs.fleet.settings import FleetSettings
 
 _OBJECTS = 80 << 20
 """Bytes of the object store of a local cluster; rows are small."""
+_PASSING = "geogs: ends with its command"
+"""What a cluster has that another command must not rely on, where it finds it on this machine."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +95,9 @@ def _connect(ray: Any, address: str) -> None:
     if address != "local":
         try:
             ray.init(address=address, **quiet)
-            return
+            if address != "auto" or _PASSING not in ray.cluster_resources():
+                return
+            ray.shutdown()
         except ConnectionError as error:
             if address != "auto":
                 raise InputError(f"No Ray cluster answers at {address}.") from error
@@ -105,5 +109,6 @@ def _connect(ray: Any, address: str) -> None:
         num_cpus=available_cores(),  # Ray would count those that others have, too
         include_dashboard=False,
         object_store_memory=_OBJECTS,
+        resources={_PASSING: 1},
         **quiet,
     )

@@ -112,6 +112,8 @@ class _Adjustment:
         self.matches: dict[tuple[int, int], Path] = {}
         """Edges that leave the keyframes of the second part, matched by the first."""
         self.ends = np.zeros((0, 4), np.int64)
+        self.steps = 0
+        """Of all poses, so far."""
         self.written = 0
         """Files so far, so that each gets a name of its own."""
 
@@ -181,7 +183,8 @@ class _Adjustment:
                     self._new(f"depths-{n}"), None if step is None else T_before, step, is_last,
                 )
             )  # fmt: skip
-        stars = self.workers.map("adjusting", follow, jobs)
+        self.steps += step is not None
+        stars = self.workers.map(f"adjusting, {self.steps} steps", follow, jobs)
         for job in jobs:
             if job.own.adjusted is not None:
                 job.own.adjusted.unlink()

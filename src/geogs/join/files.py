@@ -17,6 +17,7 @@ from geogs.geometry.camera import Camera
 from geogs.io.writers.atomic import write_text
 from geogs.io.writers.intrinsics import write_intrinsics
 from geogs.io.writers.keyframe_images import image_path, write_image
+from geogs.io.writers.keyframe_rows import rows_path, write_rows
 from geogs.io.writers.map_views import MapViews, save_map_with_views
 from geogs.io.writers.tum import write_trajectories
 from geogs.io.writers.uncertainty import HEADER, moved_rows
@@ -24,7 +25,7 @@ from geogs.join.graph import Placement
 from geogs.join.part import PartViews, image_of
 from geogs.join.trajectory import Span, joined_trajectory, keyframe_poses, moved_trajectory
 from geogs.mapping.map_frame import WORLD
-from geogs.types import MapSnapshot, Trajectory
+from geogs.types import MapSnapshot, SeenRows, Trajectory
 
 
 @dataclass(frozen=True)
@@ -71,8 +72,9 @@ def write_map(
         OutputError: a file cannot be written.
     """
     first = parts[0].result.views
-    count = 0
+    count, rows = 0, dict[int, SeenRows]()
     for part in parts:
+        own = part.result.rows() if part.result.camera == camera else {}
         for n, id in enumerate(part.result.views.keyframe_id.tolist()):
             target = image_path(output, count)
             if part.result.camera == camera:
@@ -80,7 +82,11 @@ def write_map(
                 shutil.copyfile(image_path(part.result.folder, id), target)
             else:
                 write_image(target, image_of(part.result, n, camera))
+            if n in own:
+                rows[count] = own[n]
             count += 1
+    if rows:
+        write_rows(rows_path(output), rows)
     T_cw = np.concatenate([part.placement.T_cw.numpy() for part in parts])
     long_edge = max(first.render_camera.width, first.render_camera.height)
     views = MapViews(

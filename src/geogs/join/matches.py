@@ -1,7 +1,7 @@
 """What the keyframes of a part match, among each other and in linked parts, kept in files."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,15 +13,20 @@ from geogs.config import Config, TrackingConfig
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_inverse
 from geogs.join.links import loaded_keyframes
-from geogs.join.part import Node, Part, PartViews
+from geogs.join.part import Node, Part, PartViews, opened
 from geogs.keyframes.grid import SampleGrid
 from geogs.keyframes.store import KeyframeStore
 from geogs.loop.global_bundle import MATCHED_TOGETHER
+from geogs.loop.settled_rows import TOGETHER
 from geogs.threads import on_one_torch_thread
 from geogs.tracking.flow.select import build_operator
 from geogs.tracking.graph import FrameGraph
-from geogs.tracking.packed_edge import PackedEdge, PackedFlow
+from geogs.tracking.packed_edge import PackedEdge, PackedFlow, position_step
 from geogs.tracking.proximity import Pair, proximity_pairs
+from geogs.tracking.row_errors import RowErrors
+
+Directed = tuple[Node, Node]
+"""An edge: source and target."""
 
 
 @dataclass(frozen=True)
@@ -87,18 +92,23 @@ class Matches:
     inverse_depth: Float32[np.ndarray, "e p"]
     """Of the source at that time."""
     damping: Float32[np.ndarray, "d p"]
-    """Of the source's depth; without rows where the flow gives none."""
+    """Of the source's depth; of no edge where the flow gives none."""
+    shift: Int16[np.ndarray, "s p 2"]
+    """To be added to the positions, for the rows of a rolling shutter; of no edge without one."""
 
     @staticmethod
-    def of(edges: Mapping[tuple[Node, Node], PackedEdge], cells: int) -> "Matches":
-        """Edges in order."""
+    def of(
+        edges: Mapping[Directed, PackedEdge], shift: Mapping[Directed, Tensor], cells: int
+    ) -> "Matches":
+        """Edges in order, with the shift of each where there are any."""
         flows = [edges[pair].flow for pair in sorted(edges)]
         if not flows:
             empty, pixels = np.zeros((0, cells), np.float32), np.zeros((0, cells, 2))
             return Matches(
                 np.zeros((0, 4), np.int64), pixels.astype(np.int16), pixels.astype(np.float16),
-                np.zeros((0, 2, 4, 4)), empty, empty,
+                np.zeros((0, 2, 4, 4)), empty, empty, pixels.astype(np.int16),
             )  # fmt: skip
+        shifts = [shift[pair].numpy() for pair in sorted(edges)] if shift else []
         damping = [f.damping for f in flows if f.damping is not None]
         return Matches(
             np.array([(*a, *b) for a, b in sorted(edges)], np.int64),
@@ -107,10 +117,11 @@ class Matches:
             torch.stack([torch.stack([f.T_source, f.T_target]) for f in flows]).numpy(),
             torch.stack([f.inverse_depth for f in flows]).numpy(),
             torch.stack(damping).numpy() if damping else np.zeros((0, cells), np.float32),
+            np.stack(shifts) if shifts else np.zeros((0, cells, 2), np.int16),
         )
 
-    def edges(self, grid: SampleGrid) -> dict[tuple[Node, Node], PackedEdge]:
-        """As a graph has them."""
+    def edges(self, grid: SampleGrid, as_found: bool = False) -> dict[Directed, PackedEdge]:
+        """As a graph has them; without the shifts ``as_found``."""
         found = {}
         for n, (a, i, b, j) in enumerate(self.ends.tolist()):
             position, weight, poses, depth = (
@@ -118,6 +129,8 @@ class Matches:
                 for x in (self.position, self.half_weight, self.poses, self.inverse_depth)
             )
             damping = torch.from_numpy(self.damping[n]) if len(self.damping) else None
+            if len(self.shift) and not as_found:
+                position = position + torch.from_numpy(self.shift[n])
             flow = PackedFlow(position, weight, poses[0], poses[1], depth, damping)
             found[(a, i), (b, j)] = PackedEdge(grid, flow)
         return found
@@ -164,9 +177,9 @@ def match(job: MatchJob) -> Matched:
     grid, members = SampleGrid(job.camera), (job.own, *job.others)
     operator = build_operator(job.config.tracking, grid)
     segment = KeyframeStore(grid, operator.encode).new_segment()
-    before: dict[tuple[Node, Node], PackedEdge] = {}
+    before: dict[Directed, PackedEdge] = {}
     for path in job.before:
-        before |= Matches.load(path).edges(grid)
+        before |= Matches.load(path).edges(grid, as_found=True)
     seen = {node for ends in before for node in ends} if before else _near(job.own, job.others)
     ids: dict[Node, int] = {}
     for member in members:
@@ -185,19 +198,67 @@ def match(job: MatchJob) -> Matched:
     for start in range(0, len(stale), MATCHED_TOGETHER[0]):
         graph.measure(stale[start : start + MATCHED_TOGETHER[0]], packed=True)
     node = {id: n for n, id in ids.items()}
-    found = {(node[i], node[j]): e for (i, j), e in graph.edges.items()}
+    found = {
+        (node[i], node[j]): e for (i, j), e in graph.edges.items() if isinstance(e, PackedEdge)
+    }
+    errors = _row_errors(grid, members, ids)
+    shifts = {} if errors is None else _shifts(graph, errors)
+    shift = {(node[i], node[j]): steps for (i, j), steps in shifts.items()}
     ends = []
     for member, path in zip(members, job.after, strict=True):
-        leaving = Matches.of(
-            {
-                (a, b): e for (a, b), e in found.items()
-                if a[0] == member.number and isinstance(e, PackedEdge)
-            },
-            grid.size,
-        )  # fmt: skip
+        own = {pair: e for pair, e in found.items() if pair[0][0] == member.number}
+        leaving = Matches.of(own, shift, grid.size)
         leaving.save(path)
         ends.append(leaving.ends)
     return Matched(np.concatenate(ends), len(stale))
+
+
+def _row_errors(
+    grid: SampleGrid, members: Sequence[Member], ids: Mapping[Node, int]
+) -> RowErrors | None:
+    """What rectified rows of the keyframes are off by, as the trajectories of their parts tell.
+
+    None where nothing was rectified. Rows of another camera than the grid's stay as they are.
+    """
+    found: RowErrors | None = None
+    others = 0
+    for member in members:
+        result = opened(member.part)
+        rows = result.rows() if result.camera == grid.camera else {}
+        if not rows:
+            continue
+        trajectory = result.trajectory
+        T_wc = trajectory.T_wc.copy()
+        T_wc[:, :3, 3] /= float(member.scale.median())
+        numbers = list(range(others - len(T_wc), others))  # of frames that are no keyframes
+        others -= len(T_wc)
+        nearest = np.abs(trajectory.timestamps - result.views.timestamp[:, None]).argmin(1)
+        known = {}
+        for place, frame in enumerate(nearest.tolist()):
+            id = ids.get((member.number, place))
+            if id is not None:
+                numbers[frame] = id
+                if place in rows:
+                    known[id] = rows[place]
+        own = RowErrors(grid, known, numbers, replace(trajectory, T_wc=T_wc))
+        found = own if found is None else found.beside(own)
+    return found
+
+
+def _shifts(graph: FrameGraph, errors: RowErrors) -> dict[Pair, Int16[Tensor, "p 2"]]:
+    """Steps by which the matches of each edge are off for its rows."""
+    keyframes, step = graph.keyframes, position_step(graph.keyframes.grid.camera)
+    directed, found = sorted(graph.edges), dict[Pair, Tensor]()
+    for start in range(0, len(directed), TOGETHER):
+        part = directed[start : start + TOGETHER]
+        source, target = ([pair[k] for pair in part] for k in (0, 1))
+        T_ji = keyframes.poses(target) @ se3_inverse(keyframes.poses(source))
+        shift = errors.of_matches(
+            source, target, T_ji, keyframes.grid.rays, keyframes.inverse_depths(source),
+            torch.stack([graph.edges[pair].pixels for pair in part]),
+        )  # fmt: skip
+        found |= zip(part, (shift / step).round().short(), strict=True)
+    return found
 
 
 def _pairs(graph: FrameGraph, own: int, c: TrackingConfig) -> list[Pair]:

@@ -59,6 +59,13 @@ class RowErrors:
                 self._times[frame] = torch.from_numpy(times).float()
                 self._motions[frame] = (se3_inverse(T_wc[around]) @ T_wc[n]).float()
 
+    def beside(self, other: "RowErrors") -> "RowErrors":
+        """Those of the frames of both, of one camera and one unit; their numbers differ."""
+        both = copy.copy(self)
+        for name in ("_T_cw", "_rows", "_times", "_motions"):
+            setattr(both, name, getattr(self, name) | getattr(other, name))
+        return both
+
     @property
     def doubt(self) -> float:
         """Standard error of the readout, as a part of it; 0 where it was told, or nothing known."""

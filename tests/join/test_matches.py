@@ -1,0 +1,85 @@
+"""What parts match, and what the rows of their keyframes were off by."""
+
+import numpy as np
+import torch
+
+from geogs.application.saved_result import load_result
+from geogs.config import Config
+from geogs.geometry.lie import se3_inverse, sim3_scale
+from geogs.io.writers.keyframe_rows import rows_path, write_rows
+from geogs.join.matches import Matches, MatchJob, Member, match
+from geogs.join.part import DescribeJob, Part, PartViews, describe
+from geogs.keyframes.grid import SampleGrid
+from geogs.shutter.rows import CELL
+from geogs.tracking.packed_edge import position_step
+from geogs.tracking.row_errors import RowErrors
+from geogs.types import SeenRows
+from joined_parts import CAMERA, FRAMES, gauge, make_part
+
+GRID, CONFIG = SampleGrid(CAMERA), Config()
+PLACES = np.linspace(-0.6, 0.2, 5)
+READOUT = 0.03
+
+
+def rows() -> SeenRows:
+    """Of an image whose rows were taken for those of a camera that stands still."""
+    height, width = -(-CAMERA.height // CELL) + 2, -(-CAMERA.width // CELL) + 2
+    line = (torch.arange(height) - 1) * CELL + (CELL - 1) / 2
+    seconds = READOUT * (line / (CAMERA.height - 1) - 0.5)
+    offset = torch.zeros(height, width, 2)
+    return SeenRows(offset.half(), seconds[:, None].expand(height, width).half().contiguous())
+
+
+def matched(folder, number: int, with_rows: bool) -> tuple[Member, Matches]:
+    """The matches of one part, in the world of the box, whatever its own."""
+    part = Part(folder.name, make_part(folder, PLACES, number))
+    if with_rows:
+        write_rows(rows_path(folder), dict.fromkeys(range(len(PLACES)), rows()))
+    views = folder / "views.npz"
+    describe(DescribeJob(part, CAMERA, CONFIG, views))
+    S = gauge(number)
+    T = torch.from_numpy(PartViews.load(views).T_cw) @ S
+    scale = sim3_scale(T)
+    T_cw = T / scale[:, None, None]
+    T_cw[:, 3] = T[:, 3]
+    member, file = Member(number, part, views, T_cw, scale), folder / "matches.npz"
+    done = match(MatchJob(member, (), CAMERA, CONFIG, (), (file,)))
+    found = Matches.load(file)
+    assert done.fresh == len(found.ends) // 2 > 5
+    return member, found
+
+
+def test_rows_are_corrected_as_within_a_run(tmp_path):
+    member, found = matched(tmp_path / "a", 0, with_rows=True)
+    result = load_result(tmp_path / "a")
+    frames = range(len(result.trajectory.timestamps))
+    middle = [FRAMES * n + 1 for n in range(len(PLACES))]
+    errors = RowErrors(GRID, dict.fromkeys(middle, rows()), frames, result.trajectory)
+    source, target = found.ends[:, 1], found.ends[:, 3]
+    T, depth = member.T_cw, member.depths().inverse
+    plain = [edge.pixels for edge in found.edges(GRID, as_found=True).values()]
+    shift = errors.of_matches(
+        [middle[n] for n in source], [middle[n] for n in target],
+        T[target] @ se3_inverse(T[source]), GRID.rays, depth[source], torch.stack(plain),
+    )  # fmt: skip
+    step = position_step(CAMERA)
+    assert float(shift.norm(dim=-1).median()) > 0.05  # pixels
+    assert np.array_equal(found.shift, (shift / step).round().short().numpy())
+    corrected = torch.stack([edge.pixels for edge in found.edges(GRID).values()])
+    assert float((corrected - torch.stack(plain) - shift).abs().max()) < 0.51 * step
+
+
+def test_rows_are_corrected_in_any_world_and_unit(tmp_path):
+    _, found = matched(tmp_path / "a", 0, with_rows=True)
+    _, other = matched(tmp_path / "b", 3, with_rows=True)
+    assert np.array_equal(found.ends[:, [1, 3]], other.ends[:, [1, 3]])
+    size = np.median(np.abs(found.shift[..., 0]))
+    apart = np.abs(found.shift.astype(int) - other.shift)
+    assert np.median(apart) < 0.02 * size
+
+
+def test_nothing_is_shifted_where_no_rows_were_rectified(tmp_path):
+    _, found = matched(tmp_path / "a", 0, with_rows=False)
+    assert len(found.shift) == 0
+    for edge, plain in zip(found.edges(GRID).values(), found.position, strict=True):
+        assert np.array_equal(edge.flow.position.numpy(), plain)
