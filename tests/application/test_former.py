@@ -6,8 +6,8 @@ from geogs.application.former import free_folder, remove_former
 
 OURS = [
     "summary.json", "mesh.ply", "eval.json", "map.safetensors", "keyframes/000012.jpg",
-    "keyframes/000012.mask.png", "report/index.html", "report/mesh_truth.png",
-    "depth_fusion/mesh.ply", "adjusted/trajectory.tum",
+    "keyframes/000012.mask.png", "keyframes/rows.safetensors", "report/index.html",
+    "report/mesh_truth.png", "depth_fusion/mesh.ply", "adjusted/trajectory.tum",
 ]  # fmt: skip
 THEIRS = ["notes.txt", "keyframes/mine.jpg", "export/tum/trajectory.txt", "checkpoint/manifest"]
 

@@ -17,6 +17,7 @@ from safetensors.torch import load_file
 
 from geogs.application.progress import RunProgress
 from geogs.application.run_checkpoint import RunCheckpoint, RunFacts, frames_after
+from geogs.application.saved_result import load_result
 from geogs.application.settings import RunSettings
 from geogs.cli import main as cli
 from geogs.config import InputConfig
@@ -40,6 +41,7 @@ QUICK = [
     "--mapping.pose-iterations", "1", "--mapping.final-iterations", "10",
     "--mapping.depth.min-planes", "16", "--mapping.depth.max-planes", "32",
     "--mapping.no-final-depth", "--resident-keyframes", "4", "--device", "cpu",
+    "--input.readout", "0.01",
 ]  # fmt: skip
 OFTEN = ["--checkpoint-every", "0.001"]
 
@@ -117,11 +119,15 @@ def test_a_killed_run_goes_on_even_after_another_interruption(
     assert summary["frames"] < FRAMES
     assert f"Going on after {summary['frames']} frames." in goes_on(out, capsys)
     assert not (out / "checkpoint").exists()
-    for name in ("trajectory.tum", "keyframes.tum", "mesh.ply"):
+    for name in ("trajectory.tum", "keyframes.tum", "mesh.ply", "keyframes/rows.safetensors"):
         assert (out / name).read_bytes() == (whole / name).read_bytes(), name
     assert_same_map(out, whole)
     summary = json.loads((out / "summary.json").read_text())
     assert summary["interrupted"] is False
+    rows, size = load_result(out).rows(), (96 // 8 + 2, 128 // 8 + 2)
+    assert len(rows) == summary["keyframes"]
+    assert {tuple(r.seconds.shape) for r in rows.values()} == {size}
+    assert 0.004 < max(float(r.seconds.abs().max()) for r in rows.values()) < 0.0075
     assert 0 < summary["seconds"]["checkpoints"] < summary["seconds"]["total"]
     assert cli.main(["run", "--resume", str(out)]) == 2
     assert "nothing to resume" in capsys.readouterr().err.splitlines()[-1]

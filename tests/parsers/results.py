@@ -5,6 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import torch
 
 import mutations
 from geogs.application.eval_settings import EvalSettings
@@ -19,9 +20,11 @@ from geogs.io.poses import read_tum_trajectory
 from geogs.io.sources.posed.sniff import open_posed_source
 from geogs.io.writers.intrinsics import write_intrinsics
 from geogs.io.writers.keyframe_images import image_path, mask_path, read_image, read_mask
+from geogs.io.writers.keyframe_rows import rows_path, write_rows
 from geogs.io.writers.uncertainty import write_uncertainty
 from geogs.mapping.rendered import SurfaceMaps
-from geogs.types import Uncertainty
+from geogs.shutter.rows import CELL
+from geogs.types import SeenRows, Uncertainty
 from parsers.base import Damage, Parser
 from saved_results import CAMERA, make_result
 
@@ -55,6 +58,8 @@ def results() -> dict[str, Parser]:
         ),
     }  # fmt: skip
     found = {k: Parser(complete, (file,), damage, use) for k, (file, damage, use) in files.items()}
+    rows = ("keyframes/rows.safetensors",)
+    found["keyframe-rows"] = Parser(complete, rows, mutations.safetensors, whole)
     pictures = ("keyframes/000003.jpg", "keyframes/000003.mask.png")
     found["keyframe-images"] = Parser(complete, pictures, mutations.binary, shown)
     exported = ("out/transforms.json", "out/masks/000003.png", "out/points.ply")
@@ -77,12 +82,16 @@ def complete(folder: Path) -> None:
     write_intrinsics(folder / "intrinsics.json", CAMERA)
     (folder / "truth.txt").write_bytes((folder / "trajectory.tum").read_bytes())
     (folder / "report").mkdir()
+    size = tuple(-(-n // CELL) + 2 for n in (CAMERA.height, CAMERA.width))
+    seen = SeenRows(torch.zeros(*size, 2).half(), torch.zeros(size).half())
+    write_rows(rows_path(folder), {3: seen})
 
 
 def whole(folder: Path) -> object:
     """What is read of a result before anything is computed."""
     found = load_result(folder)
-    return found.trajectory, found.camera, len(found.keyframes), mesh_settings(folder)
+    settings = mesh_settings(folder)
+    return found.trajectory, found.camera, len(found.keyframes), found.rows(), settings
 
 
 def shown(folder: Path) -> SurfaceMaps:
