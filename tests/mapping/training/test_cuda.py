@@ -8,31 +8,25 @@ import pytest
 import torch
 
 from cuda_emulator import use_emulator
-from geogs.config import Config
-from geogs.depth.view import DenseDepth
-from geogs.geometry.lie import retract, se3_exp, se3_inverse
+from geogs.geometry.lie import retract, se3_exp
 from geogs.losses.cuda import window
-from geogs.mapping.cameras import MapCameras
-from geogs.mapping.training.base import Batch
 from geogs.mapping.training.cpu import Trainer
 from geogs.mapping.training.cuda import trainer as cuda_trainer
 from geogs.mapping.training.cuda.trainer import CudaTrainer
-from geogs.mapping.view import MapView
-from geogs.mapping.view_pool import ViewPool
 from geogs.splat.cuda import rasterize
-from geogs.splat.map import DiskParameters, GaussianMap
-from geogs.synth.export import default_camera
-from geogs.synth.raycast import Raycaster
-from geogs.synth.room import make_room
-from geogs.synth.trajectory import handheld_trajectory
-from keyframe_samples import Sample, segment_of
+from geogs.splat.map import DiskParameters
+from keyframe_samples import Sample
+from trained_room import (
+    CAMERAS,
+    CONFIG,
+    UNIT,
+    make_batches,
+    make_map,
+    make_views,
+    rendered_keyframes,
+)  # fmt: skip
 
 pytestmark = pytest.mark.system
-
-WORKING = default_camera(96, 72)
-CAMERAS = MapCameras(WORKING, WORKING.with_long_edge(40), WORKING.with_long_edge(80))
-CONFIG = Config().mapping
-UNIT = 2.0
 
 
 @pytest.fixture(params=["emulated", pytest.param("gpu", marks=pytest.mark.gpu)])
@@ -48,61 +42,7 @@ def device(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> t
 
 @pytest.fixture(scope="module")
 def rendered() -> list[tuple[Sample, np.ndarray]]:
-    """Four keyframes of a room with their true depth at render size."""
-    scene = make_room(3)
-    caster = Raycaster(scene)
-    poses = handheld_trajectory(scene, 64)
-    out = []
-    for index in range(0, 32, 8):
-        view = caster.render(WORKING, poses[index])
-        grid = torch.from_numpy(1 / view.depth[4:-3:8, 4:-3:8]).float()
-        T_cw = se3_inverse(torch.from_numpy(poses[index]))
-        keyframe = Sample(index, view.image, T_cw, grid, torch.ones_like(grid))
-        out.append((keyframe, caster.render(CAMERAS.render, poses[index]).depth))
-    return out
-
-
-def make_views(rendered, device: torch.device, config=CONFIG) -> list[MapView]:
-    views, pool = [], ViewPool(CAMERAS, config.loss, device, 128)
-    segment = segment_of([keyframe for keyframe, _ in rendered], WORKING, device)
-    for keyframe, (_, depth) in zip(segment, rendered, strict=True):
-        pool.add(keyframe)
-        view = MapView(keyframe, pool)
-        dense = torch.from_numpy(depth).float().to(device)
-        confidence = torch.full_like(dense, 0.8)
-        pool.set_depth(view.id, DenseDepth(dense, confidence, dense.median().cpu()))
-        view.partners = [i for i in range(len(rendered)) if i != view.id][:2]
-        views.append(view)
-    return views
-
-
-def make_map(rendered, device: torch.device) -> GaussianMap:
-    """Disks a little off the first keyframe's surface."""
-    keyframe, depth = rendered[0]
-    g = torch.Generator().manual_seed(0)
-    rays = CAMERAS.render.rays()[::2, ::2].reshape(-1, 3)
-    z = torch.from_numpy(depth[::2, ::2]).float().reshape(-1, 1)
-    T_wc = se3_inverse(keyframe.T_cw).float()
-    points = (rays * z * (1 + 0.02 * torch.randn(z.shape, generator=g))) @ T_wc[:3, :3].T
-    n = len(points)
-    disks = DiskParameters(
-        points + T_wc[:3, 3],
-        torch.randn(n, 4, generator=g),
-        torch.full((n, 2), -2.6) + 0.2 * torch.randn(n, 2, generator=g),
-        torch.randn(n, generator=g),
-    )
-    map = GaussianMap.empty(device)
-    map.append(disks, 0)
-    return map
-
-
-def make_batches(views: list[MapView]) -> list[Batch]:
-    """Steps of one and of two views; with two partners, one or none."""
-    return [
-        [(views[0], [views[1], views[2]]), (views[1], [views[0]])],
-        [(views[2], [])],
-        [(views[3], [views[0], views[1]]), (views[0], [views[3], views[2]])],
-    ]
+    return rendered_keyframes()
 
 
 @pytest.fixture
@@ -136,7 +76,6 @@ def test_steps_equal_those_of_the_cpu(pair, rendered, config) -> None:
     start = [p.detach().clone() for p in make_map(rendered, torch.device("cpu")).parameters]
     factors = [1.0, 0.5, 0.7]
     fast.train(make_batches(fast_views), factors)
-    # A step on the CPU stores each view's rendering before the next view's loss; here after all.
     slow.train(make_batches(slow_views), factors)
     names = DiskParameters._fields
     for name, p, a, b in zip(

@@ -1,6 +1,7 @@
 """Training the map on a CPU, view by view."""
 
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -17,6 +18,7 @@ from geogs.splat.cpu.in_view import disks_in_view
 from geogs.splat.map import DiskParameters, GaussianMap
 from geogs.splat.optimizer import MapOptimizer
 from geogs.splat.render import RenderOutput, render
+from geogs.threads import thread_map
 
 # Part of the map up to which an excerpt is trained rather than all of it.
 _LARGE_EXCERPT = 0.7
@@ -46,6 +48,18 @@ def view_loss(
                 depth, view.photo, other.photo, other.rendered_depth, config.loss
             ) / max(len(partners), config.photo.per_step)
     return loss
+
+
+@dataclass(frozen=True)
+class _Pass:
+    """What a view adds to a step."""
+
+    gradients: list[Tensor]
+    """Of the disks' parameters."""
+    loss: float
+    depth: Float[Tensor, "h w"]
+    """As the view shows it, within its mask."""
+    visible: Bool[Tensor, "n"]
 
 
 class Trainer:
@@ -112,24 +126,35 @@ class Trainer:
         """One Adam step on the summed losses of views with their partners; returns the loss."""
         if len(self.disks) == 0:
             return 0.0
-        visible = torch.zeros(len(self.disks), dtype=torch.bool, device=self.disks.device)
-        total = 0.0
         if self.config.photo.fresh:
             self._show_partners(batch)
-        for view, partners in batch:
-            output = render(self.disks, self.cameras.render, view.T_cw)
-            loss = view_loss(view, partners, output, self.config, self.unit)
-            loss.backward()
-            with torch.no_grad():
-                shown = output.shown_depth(self.config.loss.min_alpha)
-                view.rendered_depth = _within(view, shown)
-            visible |= output.visible
-            total += float(loss.detach())
+        # Side by side, as much of a pass is done by one thread; added up in order.
+        passes = thread_map(lambda pair: self._pass(*pair), batch)
+        visible = torch.zeros(len(self.disks), dtype=torch.bool, device=self.disks.device)
+        total = 0.0
+        for (view, _), done in zip(batch, passes, strict=True):
+            view.rendered_depth = done.depth
+            visible |= done.visible
+            total += done.loss
+        sums = [sum(g[1:], g[0]) for g in zip(*(p.gradients for p in passes), strict=True)]
+        for parameter, gradient in zip(self.disks.parameters, sums, strict=True):
+            parameter.grad = gradient
         self.disks.mark_seen(visible)
         self.optimizer.step(visible & _sane_gradients(self.disks.parameters))
         self.optimizer.zero_grad()
         self._bound_scales()
         return total
+
+    def _pass(self, view: MapView, partners: list[MapView]) -> "_Pass":
+        """One view forth and back; nothing that other views use is changed."""
+        parameters = DiskParameters(*(p.detach().requires_grad_() for p in self.disks.parameters))
+        output = render(parameters, self.cameras.render, view.T_cw)
+        loss = view_loss(view, partners, output, self.config, self.unit)
+        loss.backward()
+        with torch.no_grad():
+            depth = _within(view, output.shown_depth(self.config.loss.min_alpha))
+        gradients = [torch.zeros_like(p) if p.grad is None else p.grad for p in parameters]
+        return _Pass(gradients, float(loss.detach()), depth, output.visible)
 
     @torch.no_grad()
     def _show_partners(self, batch: Batch) -> None:
