@@ -42,6 +42,10 @@ def thread_map(
 ) -> list[R]:
     """``list(map(function, items))`` over the workers; results in the order of the items."""
     results = []
+    if len(items) == 1:
+        results.append(function(items[0]))
+        progress(1.0)
+        return results
     with ThreadPoolExecutor(worker_count()) as pool:
         for result in pool.map(function, items):
             results.append(result)
@@ -73,6 +77,13 @@ def run_chunks(function: Callable[[int], object], chunks: int, threads: int) -> 
             # One that has not begun waits behind others' work, and there is nothing left to do.
             if not future.cancel():
                 future.result()
+
+
+def over_rows(kernel: Callable[[int, int], object], height: int) -> None:
+    """Call ``kernel(first, last)`` on equal spans of rows, one per worker."""
+    count = max(1, min(worker_count(), height // 16))
+    bounds = [height * k // count for k in range(count + 1)]
+    run_chunks(lambda k: kernel(bounds[k], bounds[k + 1]), count, count)
 
 
 @functools.cache

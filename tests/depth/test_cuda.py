@@ -155,9 +155,11 @@ def test_support_average_and_prior(setting, count):
     config = setting.config
     expected = np.empty_like(volume)
     radius, sharpness = config.support_radius, F(config.support_sharpness)
-    sweep_loops.average_support(volume, colours, radius, sharpness, expected)
+    sweep_loops.average_support(0, len(volume), volume, colours, radius, sharpness, expected)
     pull = F(config.prior_pull) * weight
-    sweep_loops.pull_to_prior(expected, rho, prior, pull, F(config.prior_tolerance))
+    sweep_loops.pull_to_prior(
+        0, len(expected), expected, rho, prior, pull, F(config.prior_tolerance)
+    )
     out = sweep_module.average_support(
         _by_slot(setting, volume, planes), _to(setting, colours.transpose(2, 0, 1)), planes,
         _to(setting, prior), _to(setting, weight), config,
@@ -180,7 +182,7 @@ def test_path_costs_and_winners(setting, count, size):
     paths = sweep_module.follow_paths(slots, _to(setting, guide), planes, config)
     _close(torch.from_numpy(_by_plane(paths.sum(0), planes)), total, 1e-4)
     expected = [np.empty((h, w), F) for _ in range(3)]
-    sweep_loops.pick_planes(total, volume, *expected)
+    sweep_loops.pick_planes(0, len(total), total, volume, *expected)
     won = sweep_module.pick_planes(paths, slots, planes)
     position = (won.inverse_depth.cpu() - planes.first) / planes.spacing
     for a, b in zip((position, won.cost, won.margin), expected, strict=True):

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from depth_scene import RENDER, WORKING, DepthScene, make_scene
+from geogs import threads
 from geogs.config import DepthConfig
 from geogs.depth.carve import vote
 from geogs.depth.estimate import estimate_depth
@@ -53,6 +54,14 @@ def test_depth_is_accurate_and_confidence_separates_right_from_wrong(scene, dept
     assert (error[sure] < 0.02).mean() > 0.93
     assert (error[sure] > 0.05).mean() < 0.03
     assert error[sure].mean() < 0.3 * error[~sure].mean()
+
+
+def test_depth_does_not_depend_on_the_number_of_threads(scene, depths, monkeypatch):
+    for count in (1, 3):
+        monkeypatch.setattr(threads, "worker_count", lambda count=count: count)
+        again = _estimate(scene, 1)
+        assert np.array_equal(again.depth, depths[1].depth)
+        assert np.array_equal(again.confidence, depths[1].confidence)
 
 
 def test_depth_beats_the_trackers_own_by_far(scene, depths):

@@ -68,7 +68,7 @@ def test_one_scan_follows_half_of_the_directions():
 def test_support_average_equals_the_weighted_mean():
     volume, guide = _random(7, 8, 5), _random(7, 8, 3, seed=2)
     out = np.empty_like(volume)
-    sweep.average_support(volume, guide, 2, F(3.0), out)
+    sweep.average_support(0, len(volume), volume, guide, 2, F(3.0), out)
     for y, x in [(0, 0), (3, 4), (6, 7)]:
         rows, columns = slice(max(y - 2, 0), y + 3), slice(max(x - 2, 0), x + 3)
         difference = ((guide[rows, columns] - guide[y, x]) ** 2).sum(-1)
@@ -147,7 +147,7 @@ def test_winner_finds_the_vertex_and_its_margin():
     planes = np.arange(9, dtype=F)
     total = np.broadcast_to((planes - F(4.3)) ** 2, (2, 3, 9)).astype(F)
     position, cost, margin = (np.empty((2, 3), F) for _ in range(3))
-    sweep.pick_planes(total, total, position, cost, margin)
+    sweep.pick_planes(0, len(total), total, total, position, cost, margin)
     assert np.abs(position - 4.3).max() < 1e-5
     assert np.abs(cost - 0.09).max() < 1e-5
     assert np.abs(margin - (2.7**2 - 0.09)).max() < 1e-5
@@ -159,9 +159,9 @@ def test_plane_fit_equals_weighted_least_squares():
     slope_x, slope_y = F(0.004) * _random(h, w, seed=2), F(0.004) * _random(h, w, seed=3)
     guide = _random(3, h, w, seed=4)
     out = [np.empty((h, w), F) for _ in range(4)]
-    refinement.fit_planes(
-        rho, slope_x, slope_y, sure, guide, radius, F(20), F(0.03), F(0.5), *out
-    )  # fmt: skip
+    given = rho, slope_x, slope_y, sure, guide, radius, F(20), F(0.03), F(0.5)
+    for first, last in ((0, 3), (3, len(rho))):
+        refinement.fit_planes(first, last, *given, *out)
     for y, x in [(0, 0), (4, 5), (8, 2)]:
         rows, values, weights = [], [], []
         for v in range(max(y - radius, 0), min(y + radius + 1, h)):
@@ -193,8 +193,8 @@ def test_photometric_step_climbs_the_ncc():
     def step(rho):
         out = [np.empty_like(zero) for _ in range(2)]
         refinement.photometric_step(
-            patches.samples, patches.offsets, patches.weights, patches.images, patches.a,
-            patches.b, rho, zero, zero, F(1e-6), *out,
+            0, len(rho), patches.samples, patches.offsets, patches.weights, patches.images,
+            patches.a, patches.b, rho, zero, zero, F(1e-6), *out,
         )  # fmt: skip
         return out
 

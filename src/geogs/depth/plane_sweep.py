@@ -11,6 +11,7 @@ from geogs.config import DepthConfig
 from geogs.depth import plane_sweep_kernels as kernels
 from geogs.depth.view import DepthView
 from geogs.geometry.camera import Camera
+from geogs.threads import over_rows, run_chunks, worker_count
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,17 +73,29 @@ def plane_sweep(
     colours = colours.astype(np.float32) * np.float32(1 / 255)
     volume = np.empty_like(raw)
     sharpness = np.float32(config.support_sharpness)
-    kernels.average_support(raw, colours, config.support_radius, sharpness, volume)
     weight = np.float32(config.prior_pull) * prior_weight
-    kernels.pull_to_prior(volume, planes, prior, weight, np.float32(config.prior_tolerance))
+    tolerance, radius = np.float32(config.prior_tolerance), config.support_radius
+
+    def support(first: int, last: int) -> None:
+        kernels.average_support(first, last, raw, colours, radius, sharpness, volume)
+        kernels.pull_to_prior(first, last, volume, planes, prior, weight, tolerance)
+
+    over_rows(support, len(volume))
     guide = cv2.GaussianBlur(reference.grey, (0, 0), 0.7)
-    total = np.zeros_like(volume)
     small, large = np.float32(config.small_jump), np.float32(config.large_jump)
-    for forward in (True, False):
-        contrast = np.float32(config.jump_contrast)
-        kernels.aggregate_paths(volume, guide, small, large, contrast, forward, total)
+    contrast = np.float32(config.jump_contrast)
+    totals = np.zeros_like(volume), np.zeros_like(volume)
+    run_chunks(
+        lambda k: kernels.aggregate_paths(
+            volume, guide, small, large, contrast, k == 0, totals[k]
+        ),
+        len(totals), worker_count(),
+    )  # fmt: skip
+    total = np.add(*totals, out=totals[0])
     position, cost, margin = (np.empty_like(guide) for _ in range(3))
-    kernels.pick_planes(total, volume, position, cost, margin)
+    over_rows(
+        lambda *rows: kernels.pick_planes(*rows, total, volume, position, cost, margin), len(guide)
+    )
     spacing = (planes[-1] - planes[0]) / np.float32(len(planes) - 1)
     return SweepResult(planes[0] + position * spacing, cost, margin)
 
@@ -104,7 +117,12 @@ def matching_costs(
     scale = 1.0 / np.sqrt(np.maximum(square - mean * mean, 0.0) + floor)
     a, b = _homographies(reference, neighbours, camera)
     volume = np.empty((*grey.shape, len(planes)), np.float32)
-    kernels.match_planes(grey, mean, scale, images, a, b, planes, radius, floor, volume)
+    over_rows(
+        lambda *rows: kernels.match_planes(
+            *rows, grey, mean, scale, images, a, b, planes, radius, floor, volume
+        ),
+        len(grey),
+    )
     return volume
 
 

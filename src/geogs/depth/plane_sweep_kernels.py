@@ -1,7 +1,8 @@
 """Compiled loops of the plane sweep: matching cost, semi-global aggregation, winner.
 
 Images are (h, w); cost volumes are (h, w, planes), so that the innermost loops run over planes with
-unit stride. All arrays are float32 and C-contiguous. Every kernel releases the interpreter lock.
+unit stride. All arrays are float32 and C-contiguous. Every kernel releases the interpreter lock;
+those that are given the first row and the one behind the last do the rows between them alone.
 """
 
 import numpy as np
@@ -141,7 +142,7 @@ def _transpose(block, count, volume, start):
 
 
 @njit(**_FAST)
-def match_planes(reference, mean, scale, images, a, b, planes, radius, floor, volume):
+def match_planes(first, last, reference, mean, scale, images, a, b, planes, radius, floor, volume):
     """volume[y, x, k] = mean of the smaller half of 1 - NCC over the neighbours, at plane k.
 
     That is half of those into whose images the pixel falls, rounded up, but at least two (one if
@@ -167,8 +168,8 @@ def match_planes(reference, mean, scale, images, a, b, planes, radius, floor, vo
         shares[n, :used] = np.float32(1.0) / np.float32(used)
     block = np.empty((STRIP, BLOCK, w), np.float32)
     norm = np.float32(1.0 / (2 * radius + 1) ** 2)
-    for y0 in range(0, h, STRIP):
-        rows = min(STRIP, h - y0)
+    for y0 in range(first, last, STRIP):
+        rows = min(STRIP, last - y0)
         for start in range(0, planes.shape[0], BLOCK):
             count = min(BLOCK, planes.shape[0] - start)
             for k in range(count):
@@ -201,7 +202,7 @@ def match_planes(reference, mean, scale, images, a, b, planes, radius, floor, vo
 
 
 @njit(**_FAST)
-def average_support(volume, guide, radius, contrast, out):
+def average_support(first, last, volume, guide, radius, contrast, out):
     """Mean cost over (2 radius + 1)^2 pixels, weighted by 1 / (1 + contrast |dI|^2)^2.
 
     ``guide`` (h, w, 3) is the colour image: pixels of another colour are likely to be of another
@@ -209,7 +210,7 @@ def average_support(volume, guide, radius, contrast, out):
     """
     h, w, planes = volume.shape
     one = np.float32(1.0)
-    for y in range(h):
+    for y in range(first, last):
         for x in range(w):
             mean = out[y, x]
             for k in range(planes):
@@ -232,10 +233,10 @@ def average_support(volume, guide, radius, contrast, out):
 
 
 @njit(**_FAST)
-def pull_to_prior(volume, planes, prior, weight, tolerance):
+def pull_to_prior(first, last, volume, planes, prior, weight, tolerance):
     """Add weight min(|rho / prior - 1| / tolerance, 1) to the cost of each plane."""
     one = np.float32(1.0)
-    for y in range(volume.shape[0]):
+    for y in range(first, last):
         for x in range(volume.shape[1]):
             pull = weight[y, x]
             if pull > np.float32(0.0):
@@ -295,13 +296,13 @@ def aggregate_paths(volume, image, small, large, edge, forward, total):
 
 
 @njit(**_FAST)
-def pick_planes(total, volume, position, cost, margin):
+def pick_planes(first, last, total, volume, position, cost, margin):
     """Winning plane with its parabola's vertex, its matching cost, and how far the others are.
 
     ``margin`` is the smallest aggregated cost more than two planes away less the winner's.
     """
-    h, w, planes = total.shape
-    for y in range(h):
+    _, w, planes = total.shape
+    for y in range(first, last):
         for x in range(w):
             t = total[y, x]
             best, low = 0, t[0]

@@ -12,6 +12,7 @@ from geogs.depth import refinement_kernels as kernels
 from geogs.depth.evidence import DepthEvidence
 from geogs.depth.view import DepthView
 from geogs.geometry.camera import Camera
+from geogs.threads import over_rows
 
 PATCH_REACH = 2
 """Patches of 5 x 5 samples, one render pixel apart."""
@@ -97,9 +98,13 @@ def _photometric_step(
     """
     rho = state.inverse_depth
     step, curvature = np.empty_like(rho), np.empty_like(rho)
-    kernels.photometric_step(
-        patches.samples, patches.offsets, patches.weights, patches.images, patches.a, patches.b,
-        rho, state.slope_x, state.slope_y, np.float32(0.5 * config.variance_floor), step, curvature,
+    floor = np.float32(0.5 * config.variance_floor)
+    over_rows(
+        lambda *rows: kernels.photometric_step(
+            *rows, patches.samples, patches.offsets, patches.weights, patches.images, patches.a,
+            patches.b, rho, state.slope_x, state.slope_y, floor, step, curvature,
+        ),
+        len(rho),
     )  # fmt: skip
     limit = np.float32(config.step_limit) * rho
     state.inverse_depth = rho = rho + np.clip(step, -limit, limit)
@@ -118,10 +123,13 @@ def _fit_planes(
 ) -> None:
     """Replace ``state`` by the local planes."""
     rho, slope_x, slope_y = (np.empty_like(state.inverse_depth) for _ in range(3))
-    kernels.fit_planes(
-        state.inverse_depth, state.slope_x, state.slope_y, sure, guide, radius,
-        np.float32(config.guide_contrast), np.float32(tolerance), np.float32(stiffness),
-        rho, slope_x, slope_y, state.support,
+    settings = [np.float32(x) for x in (config.guide_contrast, tolerance, stiffness)]
+    over_rows(
+        lambda *rows: kernels.fit_planes(
+            *rows, state.inverse_depth, state.slope_x, state.slope_y, sure, guide, radius,
+            *settings, rho, slope_x, slope_y, state.support,
+        ),
+        len(rho),
     )  # fmt: skip
     positive = rho > np.float32(0.2) * state.inverse_depth
     state.inverse_depth = np.where(positive, rho, state.inverse_depth)

@@ -2,7 +2,8 @@
 
 A surface is described per pixel by its inverse depth and the two slopes of inverse depth in units
 per render pixel: a plane in space has constant slopes. Rows are processed sample by sample so that
-the loops over x vectorise; all but the gathering of image samples does.
+the loops over x vectorise; all but the gathering of image samples does. Kernels that are given the
+first row and the one behind the last do the rows between them alone.
 """
 
 import numpy as np
@@ -61,8 +62,9 @@ def _sample_row(image, a, b, y, ox, oy, rho, slope_x, slope_y, index, fu, fv, va
 
 @njit(**_FAST)
 def photometric_step(
-    patches, offsets, weights, images, a, b, rho, slope_x, slope_y, floor, step, curvature
-):
+    first, last, patches, offsets, weights, images, a, b, rho, slope_x, slope_y, floor, step,
+    curvature,
+):  # fmt: skip
     """One Gauss-Newton step per pixel on the zero-mean normalised patches of all neighbours.
 
     patches (s, h, w): the reference at each patch sample; offsets (s, 2): (x, y) in render pixels;
@@ -70,7 +72,7 @@ def photometric_step(
     sum of (1 - NCC) by inverse depth; neighbours that do not match (NCC below 0.4, or partly out
     of view) count for nothing, better ones for more.
     """
-    count, h, w = patches.shape
+    count, _, w = patches.shape
     n = images.shape[0]
     index = np.empty(w, np.uint32)
     fu, fv = np.empty(w, np.float32), np.empty(w, np.float32)
@@ -79,7 +81,7 @@ def photometric_step(
     own = np.empty((3, w), np.float32)
     sums = np.empty((7, w), np.float32)
     total = np.empty((2, w), np.float32)
-    for y in range(h):
+    for y in range(first, last):
         total[:] = ZERO
         own[:] = ZERO
         for s in range(count):
@@ -165,6 +167,8 @@ def _add_neighbour(own, sums, inside, floor, total):
 
 @njit(**_FAST)
 def fit_planes(
+    first,
+    last,
     rho,
     slope_x,
     slope_y,
@@ -190,7 +194,7 @@ def fit_planes(
     # What one row of samples adds; what it is multiplied by is the same for all of a row.
     row = np.empty((5, w), np.float32)
     sums = np.empty((9, w), np.float32)
-    for y in range(h):
+    for y in range(first, last):
         sums[:] = ZERO
         for j in range(-radius, radius + 1):
             yy = y + j
@@ -198,9 +202,9 @@ def fit_planes(
                 continue
             row[:] = ZERO
             for i in range(-radius, radius + 1):
-                first, last = max(0, -i), min(w, w - i)
+                left, right = max(0, -i), min(w, w - i)
                 _add_samples(
-                    rho, slope_x, slope_y, confidence, guide, y, yy, i, first, last, contrast,
+                    rho, slope_x, slope_y, confidence, guide, y, yy, i, left, right, contrast,
                     tolerance, row,
                 )  # fmt: skip
             _add_row(row, np.float32(j), sums)

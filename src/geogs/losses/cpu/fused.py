@@ -6,7 +6,6 @@ value, so the backward pass only scales it. Results do not depend on the number 
 """
 
 import functools
-from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -23,14 +22,7 @@ from geogs.losses.cpu.structure import structure_gradient
 from geogs.losses.multi_view import PhotoView, compared_planes
 from geogs.losses.settings import photo_settings, record, single_view_settings
 from geogs.losses.single_view import ViewConstants, visible
-from geogs.threads import run_chunks, worker_count
-
-
-def _over_rows(kernel: Callable[[int, int], None], height: int) -> None:
-    """Runs ``kernel(first, last)`` on equal spans of rows, one per worker."""
-    count = max(1, min(worker_count(), height // 16))
-    bounds = [height * k // count for k in range(count + 1)]
-    run_chunks(lambda k: kernel(bounds[k], bounds[k + 1]), count, count)
+from geogs.threads import over_rows
 
 
 def _array(tensor: Tensor) -> np.ndarray:
@@ -65,7 +57,7 @@ class _SingleView(torch.autograd.Function):
             arguments = *maps, *constants, prior_normal, settings, np.float32(scale), scratch, loss
             single_view_rows(first, last, *arguments, *gradients)
 
-        _over_rows(rows, height)
+        over_rows(rows, height)
         ctx.gradients = [torch.from_numpy(g) for g in gradients]
         return depth.new_tensor(loss.sum(dtype=np.float64))
 
@@ -124,7 +116,7 @@ class _MultiView(torch.autograd.Function):
         fields = np.empty((3, height, width) if half >= 0 else (3, 0, 0), np.float32)
         loss = np.zeros(height, np.float32)
         sobel = config.ablation.photo_gradient == "sobel"
-        _over_rows(
+        over_rows(
             lambda a, b: multi.warp_rows(
                 a, b, small, *tables, grey, image, hidden, lenses, T34, settings, sobel,
                 warped, slope, mask, extra, loss,
@@ -132,7 +124,7 @@ class _MultiView(torch.autograd.Function):
             height,
         )  # fmt: skip
         if half >= 0:
-            _over_rows(
+            over_rows(
                 lambda a, b: multi.correlate_rows(
                     a, b, grey, warped, mask, half, settings, fields, loss
                 ),
@@ -148,7 +140,7 @@ class _MultiView(torch.autograd.Function):
 
         g_depth, g_T = np.zeros_like(small), np.zeros((4, 4))
         if with_depth or with_pose:
-            _over_rows(
+            over_rows(
                 lambda a, b: multi.depth_gradient_rows(
                     a, b, *tables, grey, warped, slope, mask, half, settings, fields, g_image,
                     g_depth,
@@ -157,7 +149,7 @@ class _MultiView(torch.autograd.Function):
             )  # fmt: skip
         if with_pose:
             g_rows = np.empty((height, 12))
-            _over_rows(
+            over_rows(
                 lambda a, b: multi.pose_gradient_rows(a, b, g_image, extra, lenses, T34, g_rows),
                 height,
             )
