@@ -111,3 +111,23 @@ def test_what_has_settled_is_not_matched_again(placed, tmp_path):
     assert fresh == pairs > 20
     assert [p for _, p in again] == [pairs] * len(again)
     assert again[-1][0] < 0.3 * pairs
+
+
+def test_a_part_that_matches_nothing_stays(placed, tmp_path):
+    """One keyframe alone, too far from all others to see what they do."""
+    parts, files, placements, gauge, config = placed
+    lone = Part("lone", make_part(tmp_path / "lone", np.array([0.7, 0.8]), 0))
+    views = tmp_path / "lone.npz"
+    describe(DescribeJob(lone, CAMERA, config, views))
+    T = torch.from_numpy(PartViews.load(views).T_cw)[:1]
+    T[:, :3, 3] += 50.0
+    parts, files = [*parts[:2], lone], [*files[:2], views]
+    one = PartViews.load(views)
+    fields = (one.T_cw[:1], one.timestamp[:1], one.inverse_depth[:1], one.information[:1])
+    PartViews(*fields, one.features[:1]).save(views)
+    placements = {**placements, 2: Placement(T, torch.ones(1))}
+    found = adjusted(
+        parts, files, placements, gauge, CAMERA, config, OneProcess(), tmp_path / "work"
+    )
+    assert torch.allclose(found[2].T_cw, T, rtol=0, atol=1e-9)
+    assert float((found[1].T_cw - placements[1].T_cw).abs().max()) > 1e-4

@@ -6,6 +6,7 @@ other, the band is the whole lower triangle.
 """
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -14,6 +15,18 @@ from torch import Tensor
 
 from geogs.bundle.linearise import Star
 from geogs.bundle.problem import sources_within
+
+
+@dataclass(frozen=True)
+class PoseSums:
+    """What some sources say of the poses, summed up, for others to add to what they know."""
+
+    row: Int[Tensor, "m"]
+    column: Int[Tensor, "m"]
+    """Frames that each block joins; no two frames have more than one."""
+    blocks: Float[Tensor, "m 6 6"]
+    frame: Int[Tensor, "k"]
+    gradient: Float[Tensor, "k 6"]
 
 
 class SparseCameraSystem:
@@ -81,6 +94,23 @@ class SparseCameraSystem:
             keys, rows, columns = _lower(at, self._count)
             place = torch.searchsorted(self._keys, keys)
             self._blocks.index_add_(0, place, block[rows, columns])
+
+    def sums(self, numbers: Int[Tensor, "n"]) -> PoseSums:
+        """All that has been added, by the numbers that the frames have elsewhere."""
+        at = torch.empty(self._count, dtype=torch.long)
+        at[self._slot[self._free]] = numbers[self._free]
+        row, column = at[self._keys // self._count], at[self._keys % self._count]
+        return PoseSums(row, column, self._blocks, at, self._gradient)
+
+    def add_elsewhere_summed(self, sums: PoseSums) -> None:
+        """Add what a system of some of the sources has summed up."""
+        i, j = self._slot[sums.row], self._slot[sums.column]
+        known = (i >= 0) & (j >= 0)
+        blocks = torch.where((i < j)[:, None, None], sums.blocks.mT, sums.blocks)[known]
+        keys = (torch.maximum(i, j) * self._count + torch.minimum(i, j))[known]
+        self._blocks.index_add_(0, torch.searchsorted(self._keys, keys), blocks)
+        at = self._slot[sums.frame]
+        self._gradient.index_add_(0, at[at >= 0], sums.gradient[at >= 0])
 
     def solve(self, damping: float) -> Float[Tensor, "n 6"]:
         """Steps of all frames, zero for the fixed, NaN where the system is not definite.

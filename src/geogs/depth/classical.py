@@ -21,7 +21,7 @@ _FEW_VIEWS = 128
 
 
 class CpuDepthEngine:
-    """The compiled CPU loops, one keyframe per thread."""
+    """The compiled CPU loops; keyframes, and the rows of one, are worked on side by side."""
 
     def __init__(self, render: Camera, working: Camera, config: DepthConfig) -> None:
         self.render = render

@@ -15,9 +15,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from geogs.bundle.base import BundleOptions
-from geogs.bundle.camera_system import SparseCameraSystem
+from geogs.bundle.camera_system import PoseSums, SparseCameraSystem
 from geogs.bundle.dense import stepped
-from geogs.bundle.linearise import Star
 from geogs.bundle.problem import source_chunks
 from geogs.bundle.select import grid_fields
 from geogs.bundle.streamed import StreamedBundle
@@ -154,8 +153,9 @@ class _Adjustment:
         T, step = self._poses(), None
         for _ in range(options.iterations):
             system.clear()
-            for stars in self._follow(T, step):
-                system.add(stars)
+            for sums in self._follow(T, step):
+                if sums is not None:
+                    system.add_elsewhere_summed(sums)
             T, step = self._poses(), system.solve(options.damping)
             if not bool(torch.isfinite(step).all()):
                 return
@@ -170,7 +170,7 @@ class _Adjustment:
 
     def _follow(
         self, T_before: Tensor, step: Tensor | None, is_last: bool = False
-    ) -> list[list[Star]]:
+    ) -> list[PoseSums | None]:
         """Bring the depths after a step; what the parts say of the next."""
         jobs = []
         for n, own in self.members.items():
@@ -184,12 +184,12 @@ class _Adjustment:
                 )
             )  # fmt: skip
         self.steps += step is not None
-        stars = self.workers.map(f"adjusting, {self.steps} steps", follow, jobs)
+        said = self.workers.map(f"adjusting, {self.steps} steps", follow, jobs)
         for job in jobs:
             if job.own.adjusted is not None:
                 job.own.adjusted.unlink()
             self.members[job.own.number] = replace(job.own, adjusted=job.after)
-        return stars
+        return said
 
     def _poses(self) -> Float[Tensor, "m 4 4"]:
         return torch.cat([member.T_cw for member in self.members.values()])
@@ -201,10 +201,10 @@ class _Adjustment:
 
 
 @on_one_torch_thread
-def follow(job: StepJob) -> list[Star]:
+def follow(job: StepJob) -> PoseSums | None:
     """Bring the depths of a part after a step and write them; what it says of the next step.
 
-    The stars have the numbers of the whole, and no depths.
+    By the numbers of the whole; nothing where there is no next.
     """
     grid, options = SampleGrid(job.camera), _options(job.config)
     graph, nodes = _known_graph(job, grid)
@@ -218,14 +218,15 @@ def follow(job: StepJob) -> list[Star]:
         delta = solver.depth_steps(problem, before, d, step, options, chunks)
         d = stepped(problem, before, d, step, delta, options)[1]
     information = graph.keyframes.informations(own)
-    stars: list[Star] = []
+    sums: PoseSums | None = None
     if not job.is_last:
-        for _, some in solver.linearised(problem, T, d, options, chunks):
-            for star in some:
+        every = torch.ones(len(ids), dtype=torch.bool)
+        system = SparseCameraSystem(problem.source, problem.target, every)
+        for _, stars in solver.linearised(problem, T, d, options, chunks):
+            system.add(stars)
+            for star in stars:
                 information[star.frame] = star.information
-                stars.append(
-                    replace(star, frame=int(numbers[star.frame]), targets=numbers[star.targets])
-                )
+        sums = system.sums(numbers)
     depth = d[: len(own)]
     if job.is_last:
         depth = grid_fields(grid).fill(depth, information)
@@ -236,7 +237,7 @@ def follow(job: StepJob) -> list[Star]:
     moving = [graph.keyframes[id].moving for id in own]
     held = torch.stack([none if m is None else m for m in moving])
     Depths(depth.contiguous(), information, held).save(job.after)
-    return stars
+    return sums
 
 
 def _known_graph(job: StepJob, grid: SampleGrid) -> tuple[FrameGraph, list[Node]]:

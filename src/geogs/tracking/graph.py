@@ -210,8 +210,8 @@ class FrameGraph:
         problem = StreamedProblem(
             T_cw=self.keyframes.poses(ids),
             inverse_depth=self.keyframes.inverse_depths(ids),
-            source=torch.tensor([slot[i] for i, _ in directed]),
-            target=torch.tensor([slot[j] for _, j in directed]),
+            source=torch.tensor([slot[i] for i, _ in directed], dtype=torch.long),
+            target=torch.tensor([slot[j] for _, j in directed], dtype=torch.long),
             matches=matches,
             free_pose=torch.tensor([k in poses for k in ids]),
             free_depth=torch.tensor([k in depths for k in ids]),
