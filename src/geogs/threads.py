@@ -9,7 +9,7 @@ here, and PyTorch is held to one while they work.
 import functools
 import itertools
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import ParamSpec, TypeVar
 
@@ -41,16 +41,18 @@ def thread_map(
     progress: Callable[[float], None] = lambda fraction: None,
 ) -> list[R]:
     """``list(map(function, items))`` over the workers; results in the order of the items."""
-    results = []
-    if len(items) == 1:
-        results.append(function(items[0]))
-        progress(1.0)
-        return results
-    with ThreadPoolExecutor(worker_count()) as pool:
-        for result in pool.map(function, items):
+    results: list[R] = []
+
+    def gather(found: Iterable[R]) -> list[R]:
+        for result in found:
             results.append(result)
             progress(len(results) / len(items))
-    return results
+        return results
+
+    if min(len(items), worker_count()) == 1:
+        return gather(map(function, items))
+    with ThreadPoolExecutor(worker_count()) as pool:
+        return gather(pool.map(function, items))
 
 
 def run_chunks(function: Callable[[int], object], chunks: int, threads: int) -> None:
