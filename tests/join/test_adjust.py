@@ -15,7 +15,7 @@ from geogs.join.gauge import Gauge
 from geogs.join.graph import Placement
 from geogs.join.links import Link, loaded_keyframes
 from geogs.join.matches import Matches
-from geogs.join.part import DescribeJob, Part, PartViews, describe
+from geogs.join.part import DescribeJob, Part, PartViews, describe, opened
 from geogs.join.workers import OneProcess
 from geogs.keyframes.grid import SampleGrid
 from geogs.keyframes.store import KeyframeStore
@@ -76,7 +76,8 @@ def test_parts_together_are_adjusted_as_one_problem(placed, tmp_path):
     ids = {}
     for n, part in enumerate(parts):
         views, T = PartViews.load(files[n]), placements[n].T_cw
-        for place, k in loaded_keyframes(segment, operator, part, views, range(4), T).items():
+        result = opened(part)
+        for place, k in loaded_keyframes(segment, operator, result, views, range(4), T).items():
             ids[n, place] = k.id
     graph = FrameGraph(segment, operator)
     for path in workers.files:

@@ -14,7 +14,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from geogs.bundle.base import BundleOptions
 from geogs.bundle.camera_system import PoseSums, SparseCameraSystem
 from geogs.bundle.dense import stepped
 from geogs.bundle.problem import source_chunks
@@ -25,12 +24,12 @@ from geogs.geometry.camera import Camera
 from geogs.geometry.lie import move
 from geogs.join.gauge import Gauge
 from geogs.join.graph import Placement
-from geogs.join.matches import Depths, Matches, MatchJob, Member, match
+from geogs.join.matches import Depths, Directed, Matches, MatchJob, Member, match
 from geogs.join.part import Node, Part
 from geogs.join.workers import Workers
 from geogs.keyframes.grid import SampleGrid
 from geogs.keyframes.store import KeyframeStore
-from geogs.loop.global_bundle import SETTLED, SMALL_STEP
+from geogs.loop.global_bundle import SETTLED, global_options
 from geogs.threads import on_one_torch_thread
 from geogs.tracking.flow.select import build_operator
 from geogs.tracking.graph import FrameGraph
@@ -149,7 +148,7 @@ class _Adjustment:
         free = torch.arange(self.keyframes) > 0
         source, target = source[order], target[order]
         system = SparseCameraSystem(torch.from_numpy(source), torch.from_numpy(target), free)
-        options = _options(self.config)
+        options = global_options(self.config.tracking)
         T, step = self._poses(), None
         for _ in range(options.iterations):
             system.clear()
@@ -206,7 +205,7 @@ def follow(job: StepJob) -> PoseSums | None:
 
     By the numbers of the whole; nothing where there is no next.
     """
-    grid, options = SampleGrid(job.camera), _options(job.config)
+    grid, options = SampleGrid(job.camera), global_options(job.config.tracking)
     graph, nodes = _known_graph(job, grid)
     own = graph.keyframes.ids[: len(job.own.T_cw)]
     problem, ids = graph.streamed_problem(list(graph.edges), [], own)
@@ -242,7 +241,7 @@ def follow(job: StepJob) -> PoseSums | None:
 
 def _known_graph(job: StepJob, grid: SampleGrid) -> tuple[FrameGraph, list[Node]]:
     """The edges that leave a part's keyframes, which come first; the node of each keyframe."""
-    edges: dict[tuple[Node, Node], PackedEdge] = {}
+    edges: dict[Directed, PackedEdge] = {}
     for path in job.matches:
         edges |= Matches.load(path).edges(grid)
     seen = {target for _, target in edges}
@@ -256,19 +255,12 @@ def _known_graph(job: StepJob, grid: SampleGrid) -> tuple[FrameGraph, list[Node]
                 continue
             place = node[1]
             keyframe = segment.add(place, float(place), _NO_IMAGE, None, member.T_cw[place])
-            keyframe.inverse_depth = depths.inverse[place]
-            keyframe.information = depths.information[place]
-            keyframe.moving = depths.moving[place]
+            depths.give(keyframe, place)
             ids[node] = keyframe.id
             nodes.append(node)
     graph = FrameGraph(segment, build_operator(job.config.tracking, grid))
     graph.edges = {(ids[a], ids[b]): edge for (a, b), edge in edges.items()}
     return graph, nodes
-
-
-def _options(config: Config) -> BundleOptions:
-    c = config.tracking
-    return BundleOptions(iterations=c.global_iterations, huber=c.huber, tolerance=SMALL_STEP)
 
 
 def _beside(gauge: Gauge) -> dict[int, list[int]]:

@@ -1,6 +1,6 @@
 """Keyframes of two parts that show one place, verified: what loops are within a run."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from geogs.application.saved_result import SavedResult
 from geogs.config import Config
 from geogs.geometry.camera import Camera
 from geogs.join.part import Node, Part, PartViews, image_of, opened
@@ -71,7 +72,7 @@ def links_of(job: LinkJob) -> list[Link]:
     segments = store.new_segment(), store.new_segment()
     places = sorted({w[0] for w in wanted}), sorted({w[1] for w in wanted})
     loaded = [
-        loaded_keyframes(segment, operator, part, v, some)
+        loaded_keyframes(segment, operator, opened(part), v, some)
         for segment, part, v, some in zip(segments, job.parts, views, places, strict=True)
     ]
     found = []
@@ -96,18 +97,17 @@ def links_of(job: LinkJob) -> list[Link]:
 def loaded_keyframes(
     segment: Segment,
     operator: FlowOperator,
-    part: Part,
+    result: SavedResult,
     views: PartViews,
     places: Iterable[int],
     T_cw: Float[Tensor, "n 4 4"] | None = None,
-    scale: Sequence[float] | None = None,
 ) -> dict[int, Keyframe]:
     """Keyframes of a part put into a segment; by their place in the part.
 
-    With the poses ``T_cw`` of all keyframes in another world, in whose lengths those around each
-    have been divided by ``scale``; in the part's own world without.
+    With the poses ``T_cw`` that all keyframes have in another world, if they are given; depths are
+    in the lengths of the part.
     """
-    result, grid = opened(part), segment.grid
+    grid = segment.grid
     loaded = {}
     for n in places:
         image = image_of(result, n, grid.camera)
@@ -116,8 +116,6 @@ def loaded_keyframes(
         keyframe = segment.add(n, time, image, operator.encode(image), pose)
         keyframe.inverse_depth = torch.from_numpy(views.inverse_depth[n]).to(grid.device)
         keyframe.information = torch.from_numpy(views.information[n]).to(grid.device)
-        if scale is not None:
-            keyframe.rescale(1 / scale[n])
         loaded[n] = keyframe
     return loaded
 

@@ -9,21 +9,22 @@ import torch
 from jaxtyping import Bool, Float, Float16, Float32, Int, Int16
 from torch import Tensor
 
+from geogs.application.saved_result import SavedResult
 from geogs.config import Config, TrackingConfig
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_inverse
 from geogs.join.links import loaded_keyframes
 from geogs.join.part import Node, Part, PartViews, opened
 from geogs.keyframes.grid import SampleGrid
+from geogs.keyframes.keyframe import Keyframe
 from geogs.keyframes.store import KeyframeStore
 from geogs.loop.global_bundle import MATCHED_TOGETHER
-from geogs.loop.settled_rows import TOGETHER
 from geogs.threads import on_one_torch_thread
 from geogs.tracking.flow.select import build_operator
 from geogs.tracking.graph import FrameGraph
-from geogs.tracking.packed_edge import PackedEdge, PackedFlow, position_step
+from geogs.tracking.packed_edge import PackedEdge, PackedFlow, in_steps
 from geogs.tracking.proximity import Pair, proximity_pairs
-from geogs.tracking.row_errors import RowErrors
+from geogs.tracking.row_errors import RowErrors, edge_shifts
 
 Directed = tuple[Node, Node]
 """An edge: source and target."""
@@ -38,6 +39,11 @@ class Depths:
     """Inverse variances."""
     moving: Bool[Tensor, "n p"]
     """Cells that are held for showing something that moves."""
+
+    def give(self, keyframe: Keyframe, place: int) -> None:
+        """Let a keyframe, the one at a place in the part, have its depths."""
+        keyframe.inverse_depth, keyframe.information = self.inverse[place], self.information[place]
+        keyframe.moving = self.moving[place]
 
     def save(self, path: Path) -> None:
         """Write all to a file."""
@@ -182,14 +188,14 @@ def match(job: MatchJob) -> Matched:
         before |= Matches.load(path).edges(grid, as_found=True)
     seen = {node for ends in before for node in ends} if before else _near(job.own, job.others)
     ids: dict[Node, int] = {}
+    results = {member.number: opened(member.part) for member in members}
     for member in members:
         places = [k for n, k in member.nodes if member is job.own or (n, k) in seen]
         views, depths = PartViews.load(member.views), member.depths()
-        loaded = loaded_keyframes(segment, operator, member.part, views, places, member.T_cw)
+        result = results[member.number]
+        loaded = loaded_keyframes(segment, operator, result, views, places, member.T_cw)
         for place, keyframe in loaded.items():
-            keyframe.inverse_depth = depths.inverse[place]
-            keyframe.information = depths.information[place]
-            keyframe.moving = depths.moving[place]
+            depths.give(keyframe, place)
             ids[member.number, place] = keyframe.id
     graph, c = FrameGraph(segment, operator), job.config.tracking
     graph.edges = {(ids[a], ids[b]): edge for (a, b), edge in before.items()}
@@ -201,9 +207,13 @@ def match(job: MatchJob) -> Matched:
     found = {
         (node[i], node[j]): e for (i, j), e in graph.edges.items() if isinstance(e, PackedEdge)
     }
-    errors = _row_errors(grid, members, ids)
-    shifts = {} if errors is None else _shifts(graph, errors)
-    shift = {(node[i], node[j]): steps for (i, j), steps in shifts.items()}
+    errors = _row_errors(grid, members, results, ids)
+    shift: dict[Directed, Tensor] = {}
+    if errors is not None:
+        measured = {(ids[a], ids[b]): edge for (a, b), edge in found.items()}
+        for part, off in edge_shifts(errors, segment, measured, lambda id: id):
+            steps = in_steps(grid.camera, off)
+            shift |= {(node[i], node[j]): s for (i, j), s in zip(part, steps, strict=True)}
     ends = []
     for member, path in zip(members, job.after, strict=True):
         own = {pair: e for pair, e in found.items() if pair[0][0] == member.number}
@@ -214,7 +224,10 @@ def match(job: MatchJob) -> Matched:
 
 
 def _row_errors(
-    grid: SampleGrid, members: Sequence[Member], ids: Mapping[Node, int]
+    grid: SampleGrid,
+    members: Sequence[Member],
+    results: Mapping[int, SavedResult],
+    ids: Mapping[Node, int],
 ) -> RowErrors | None:
     """What rectified rows of the keyframes are off by, as the trajectories of their parts tell.
 
@@ -223,7 +236,7 @@ def _row_errors(
     found: RowErrors | None = None
     others = 0
     for member in members:
-        result = opened(member.part)
+        result = results[member.number]
         rows = result.rows() if result.camera == grid.camera else {}
         if not rows:
             continue
@@ -242,22 +255,6 @@ def _row_errors(
                     known[id] = rows[place]
         own = RowErrors(grid, known, numbers, replace(trajectory, T_wc=T_wc))
         found = own if found is None else found.beside(own)
-    return found
-
-
-def _shifts(graph: FrameGraph, errors: RowErrors) -> dict[Pair, Int16[Tensor, "p 2"]]:
-    """Steps by which the matches of each edge are off for its rows."""
-    keyframes, step = graph.keyframes, position_step(graph.keyframes.grid.camera)
-    directed, found = sorted(graph.edges), dict[Pair, Tensor]()
-    for start in range(0, len(directed), TOGETHER):
-        part = directed[start : start + TOGETHER]
-        source, target = ([pair[k] for pair in part] for k in (0, 1))
-        T_ji = keyframes.poses(target) @ se3_inverse(keyframes.poses(source))
-        shift = errors.of_matches(
-            source, target, T_ji, keyframes.grid.rays, keyframes.inverse_depths(source),
-            torch.stack([graph.edges[pair].pixels for pair in part]),
-        )  # fmt: skip
-        found |= zip(part, (shift / step).round().short(), strict=True)
     return found
 
 

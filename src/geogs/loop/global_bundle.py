@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 
 from geogs.bundle.base import BundleOptions
+from geogs.config import TrackingConfig
 from geogs.loop.settled_rows import settle_rows
 from geogs.tracking.proximity import Pair, proximity_pairs
 from geogs.tracking.tracker import Tracker
@@ -44,9 +45,7 @@ def global_bundle(
     graph.edges = {}
     tracker.odometry.look_at_all()
     batch = MATCHED_TOGETHER[store.grid.on_gpu]
-    options = BundleOptions(
-        iterations=config.global_iterations, huber=config.huber, tolerance=SMALL_STEP
-    )
+    options = global_options(config)
     for n in range(config.global_rounds if pairs else 0):
         # Pairs of the same keyframe one after the other: images of old ones are read from a file.
         stale = sorted(graph.stale(pairs, config.global_remeasure))
@@ -69,6 +68,11 @@ def global_bundle(
     correction = PoseCorrection(before, after, dict.fromkeys(ids, 1.0), of_all=True)
     store.correct(correction)
     return correction
+
+
+def global_options(c: TrackingConfig) -> BundleOptions:
+    """How an adjustment of all keyframes is solved."""
+    return BundleOptions(iterations=c.global_iterations, huber=c.huber, tolerance=SMALL_STEP)
 
 
 def global_pairs(tracker: Tracker, keyframes: Sequence[int] | None = None) -> list[Pair]:

@@ -10,7 +10,6 @@ matches together would become neither better nor worse with another.
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -20,9 +19,9 @@ from geogs.bundle.projection import project
 from geogs.geometry.lie import se3_inverse
 from geogs.tracking.graph import FrameGraph
 from geogs.tracking.moving import still_weight
-from geogs.tracking.packed_edge import PackedEdge, packed_matches, position_step
+from geogs.tracking.packed_edge import PackedEdge, in_steps, packed_matches
 from geogs.tracking.proximity import Pair
-from geogs.tracking.row_errors import RowErrors
+from geogs.tracking.row_errors import RowErrors, edge_shifts
 from geogs.tracking.tracker import Tracker
 
 ROUNDS = 2
@@ -33,8 +32,6 @@ FIRST_STEP, FARTHEST = 0.04, 0.25
 """Share of the readout that is tried first, and by which it changes at most."""
 EVIDENCE = 0.02
 """Share of what matches say of the readout that counts, as those of an edge err together."""
-TOGETHER = 64
-"""Edges that are corrected at a time; bounds memory."""
 
 
 def settle_rows(
@@ -112,16 +109,8 @@ def _readout_gradient(
 def _shifts(
     graph: FrameGraph, measured: dict[Pair, PackedEdge], errors: RowErrors
 ) -> Iterator[tuple[list[Pair], Float[Tensor, "e p 2"]]]:
-    """Pixels by which the matches of edges are to be corrected, some edges at a time."""
-    keyframes, pairs = graph.keyframes, sorted(measured)
-    for start in range(0, len(pairs), TOGETHER):
-        part = pairs[start : start + TOGETHER]
-        first, second = ([keyframes[pair[k]].frame_index for pair in part] for k in (0, 1))
-        yield part, errors.of_matches(
-            first, second, _relative(graph, part), keyframes.grid.rays,
-            keyframes.inverse_depths([i for i, _ in part]),
-            packed_matches([measured[pair] for pair in part])[0],
-        )  # fmt: skip
+    keyframes = graph.keyframes
+    return edge_shifts(errors, keyframes, measured, lambda id: keyframes[id].frame_index)
 
 
 def _relative(graph: FrameGraph, pairs: Sequence[Pair]) -> Float[Tensor, "e 4 4"]:
@@ -131,5 +120,5 @@ def _relative(graph: FrameGraph, pairs: Sequence[Pair]) -> Float[Tensor, "e 4 4"
 
 def _moved(edge: PackedEdge, shift: Float[Tensor, "p 2"]) -> PackedEdge:
     """An edge with its matches elsewhere."""
-    steps = (shift / position_step(edge.grid.camera)).round().to(torch.int16)
+    steps = in_steps(edge.grid.camera, shift)
     return replace(edge, flow=replace(edge.flow, position=edge.flow.position + steps))

@@ -98,6 +98,11 @@ def position_step(camera: Camera) -> float:
     return 2.0**-15 * max(camera.width, camera.height)
 
 
+def in_steps(camera: Camera, shift: Float[Tensor, "*b 2"]) -> Int16[Tensor, "*b 2"]:
+    """Pixels by which positions are moved, in whole steps."""
+    return (shift / position_step(camera)).round().short()
+
+
 def pack_matches(
     grid: SampleGrid, pixels: Float[Tensor, "*b 2"], weight: Float[Tensor, "*b 2"]
 ) -> tuple[Int16[Tensor, "*b 2"], Float16[Tensor, "*b 2"]]:

@@ -7,7 +7,7 @@ that by fractions of a pixel, so the matches are corrected to first order and th
 """
 
 import copy
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import numpy as np
 import torch
@@ -17,13 +17,18 @@ from torch import Tensor
 from geogs.bundle.projection import project, seen_from_targets
 from geogs.geometry.lie import se3_inverse
 from geogs.keyframes.grid import SampleGrid
+from geogs.keyframes.store import Segment
 from geogs.shutter.rows import CELL
+from geogs.tracking.packed_edge import PackedEdge, packed_matches
+from geogs.tracking.proximity import Pair
 from geogs.types import SeenRows, Trajectory
 
 NODES = 5
 """Frames whose poses say where a point is at the time of its row."""
 LONGEST_INTERVAL = 0.07
 """Seconds between two frames; over more, their poses say less of the rows than the video does."""
+TOGETHER = 64
+"""Edges that are corrected at a time; bounds memory."""
 LARGEST = 0.01
 """Of the long edge; an error that seems larger is none of the rows."""
 
@@ -164,6 +169,27 @@ class RowErrors:
             field, place[:, :, None], padding_mode="border", align_corners=False
         )[..., 0]
         return values[:, :2].mT, values[:, 2]
+
+
+def edge_shifts(
+    errors: RowErrors,
+    keyframes: Segment,
+    measured: Mapping[Pair, PackedEdge],
+    frame_of: Callable[[int], int],
+) -> Iterator[tuple[list[Pair], Float[Tensor, "e p 2"]]]:
+    """Pixels by which the matches of edges are to be corrected, some edges at a time.
+
+    ``frame_of`` a keyframe's id is the number that ``errors`` have of its frame.
+    """
+    pairs, grid = sorted(measured), keyframes.grid
+    for start in range(0, len(pairs), TOGETHER):
+        part = pairs[start : start + TOGETHER]
+        source, target = ([pair[k] for pair in part] for k in (0, 1))
+        T_ji = keyframes.poses(target) @ se3_inverse(keyframes.poses(source))
+        yield part, errors.of_matches(
+            [frame_of(k) for k in source], [frame_of(k) for k in target], T_ji, grid.rays,
+            keyframes.inverse_depths(source), packed_matches([measured[pair] for pair in part])[0],
+        )  # fmt: skip
 
 
 def lagrange(times: Float[Tensor, "e j"], at: Float[Tensor, "e p"]) -> Float[Tensor, "e p j"]:

@@ -19,7 +19,7 @@ from geogs.keyframes.keyframe import Keyframe
 from geogs.keyframes.store import Segment
 from geogs.tracking.flow.base import FlowMatch, FlowOperator
 from geogs.tracking.gaps import bridged
-from geogs.tracking.packed_edge import pack_matches, position_step, unpacked_positions
+from geogs.tracking.packed_edge import in_steps, pack_matches, unpacked_positions
 from geogs.tracking.row_errors import RowErrors
 from geogs.tracking.turns import Turn, orientations
 from geogs.types import Frame, SeenRows, Trajectory
@@ -333,7 +333,7 @@ class TrajectoryRecorder:
                 grid.rays[cells], self.keyframes.inverse_depths(ids)[:, cells],
                 unpacked_positions(grid, torch.stack([o.position for _, o in part])),
             )  # fmt: skip
-            steps = (shifts / position_step(grid.camera)).round().short()
+            steps = in_steps(grid.camera, shifts)
             for (_, observation), shift in zip(part, steps, strict=True):
                 observation.shift = shift
 

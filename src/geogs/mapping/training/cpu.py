@@ -145,7 +145,7 @@ class Trainer:
         self._bound_scales()
         return total
 
-    def _pass(self, view: MapView, partners: list[MapView]) -> "_Pass":
+    def _pass(self, view: MapView, partners: list[MapView]) -> _Pass:
         """One view forth and back; nothing that other views use is changed."""
         parameters = DiskParameters(*(p.detach().requires_grad_() for p in self.disks.parameters))
         output = render(parameters, self.cameras.render, view.T_cw)
