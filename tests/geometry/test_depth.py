@@ -84,7 +84,7 @@ def test_averages_over_planes_are_those_of_the_slow_way():
 
 def test_a_plane_stays_and_its_noise_goes():
     depth, normal = slanted(CAMERA, 1.7)
-    same = averaged_over_planes(depth, normal, CAMERA, 3, 1e-200)  # whose square is nothing
+    same = averaged_over_planes(depth, normal, CAMERA, 3, 1e-200)  # whom nobody is near
     assert torch.equal(same, depth)
     exact = averaged_over_planes(depth, normal, CAMERA, 3, 0.01)
     assert exact == pytest.approx(depth, rel=1e-9)

@@ -1,10 +1,18 @@
-"""From depth maps to normals."""
+"""Depth maps of surfaces: their normals, and their averages over tangent planes."""
+
+from pathlib import Path
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from geogs.geometry.camera import Camera
+from geogs.gpu.kernels import kernels_for
+
+_SOURCE = Path(__file__).parent / "cuda" / "depth.cu"
+_BLOCK = (32, 8)
+_LEAST_REACH = 1e-6
+"""Below which rounding alone tells pixels apart, and nothing would be averaged."""
 
 
 def normals_from_depth(
@@ -45,7 +53,7 @@ def averaged_over_planes(
     ``reach``; so planes stay as they are, however slanted, and steps stay steps. Pixels without
     depth, and those that are seen at less than six degrees, stay as they are and say nothing.
     """
-    if reach**2 == 0:
+    if reach < _LEAST_REACH:
         return depth
     slope = (normal * camera.rays(depth.dtype, depth.device)).sum(-1)
     good = (depth > 0) & (slope.abs() > 0.1)
@@ -54,24 +62,54 @@ def averaged_over_planes(
     tilt = [
         normal[..., k] / slope.where(good, 1.0) / f for k, f in enumerate((camera.fx, camera.fy))
     ]
-    height, width = depth.shape
+    one_round = _averaged_on_gpu if depth.device.type == "cuda" else _averaged
     for _ in range(rounds):
         right, down = (inverse * t for t in tilt)
-        before = torch.where(good, 1 / inverse.clamp(min=1e-9), 0.0)
-        top, total = torch.zeros_like(depth), torch.zeros_like(depth)
-        for dy in range(-radius, radius + 1):
-            above = inverse - dy * down
-            for dx in range(-radius, radius + 1):
-                here, there = _shifted(height, dy), _shifted(width, dx)
-                p, q = (here[0], there[0]), (here[1], there[1])
-                said = (above - dx * right)[q]
-                # Where either has no depth, e is -1 and the weight nothing.
-                e = (said * before[p]).sub_(1)
-                weight = e.square_().mul_(-1 / reach**2).add_(1).clamp_(min=0).square_()
-                top[p].addcmul_(weight, said)
-                total[p].add_(weight)
-        inverse = torch.where(good, top / total.clamp(min=1e-9), 0.0)
+        inverse = torch.where(good, one_round(inverse, right, down, radius, reach), 0.0)
     return torch.where(good, 1 / inverse.clamp(min=1e-9), depth)
+
+
+def _averaged(
+    inverse: Float[Tensor, "h w"],
+    right: Float[Tensor, "h w"],
+    down: Float[Tensor, "h w"],
+    radius: int,
+    reach: float,
+) -> Float[Tensor, "h w"]:
+    """One round of :func:`averaged_over_planes`: inverse depths, zero where there is none, and the
+    slopes of their planes per pixel to the right and down. Nothing is left where nobody says any.
+    """
+    height, width = inverse.shape
+    before = torch.where(inverse > 0, 1 / inverse.clamp(min=1e-9), 0.0)
+    top, total = torch.zeros_like(inverse), torch.zeros_like(inverse)
+    for dy in range(-radius, radius + 1):
+        above = inverse - dy * down
+        for dx in range(-radius, radius + 1):
+            here, there = _shifted(height, dy), _shifted(width, dx)
+            p, q = (here[0], there[0]), (here[1], there[1])
+            said = (above - dx * right)[q]
+            # Where either has no depth, e is -1 and the weight nothing.
+            e = (said * before[p]).sub_(1)
+            weight = e.square_().mul_(-1 / reach**2).add_(1).clamp_(min=0).square_()
+            top[p].addcmul_(weight, said)
+            total[p].add_(weight)
+    return top / total.clamp(min=1e-9)
+
+
+def _averaged_on_gpu(
+    inverse: Float[Tensor, "h w"],
+    right: Float[Tensor, "h w"],
+    down: Float[Tensor, "h w"],
+    radius: int,
+    reach: float,
+) -> Float[Tensor, "h w"]:
+    """The same by a CUDA kernel, in float32."""
+    height, width = inverse.shape
+    averaged = torch.empty_like(inverse)
+    grid = (-(-width // _BLOCK[0]), -(-height // _BLOCK[1]))
+    kernel = kernels_for(_SOURCE, inverse.device)["average_planes"]
+    kernel(grid, _BLOCK, inverse, right, down, height, width, radius, reach, averaged)
+    return averaged
 
 
 def _shifted(size: int, by: int) -> tuple[slice, slice]:
