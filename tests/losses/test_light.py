@@ -4,7 +4,17 @@ import numpy as np
 import pytest
 import torch
 
-from geogs.losses.light import relative_light
+from cuda_emulator import use_emulator
+from geogs.losses import light
+from geogs.losses.light import fitted_on_gpu, relative_light
+
+GPU = pytest.param(
+    "cuda",
+    marks=[
+        pytest.mark.gpu,
+        pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU"),
+    ],
+)
 
 
 def values(random: np.random.Generator, n: int = 2000, spread: float = 0.15) -> torch.Tensor:
@@ -49,3 +59,20 @@ def test_too_few_pixels_say_nothing():
     usable = torch.zeros(2000, dtype=torch.bool)
     usable[:40] = True
     assert relative_light(grey, 0.5 * grey, usable).tolist() == [1.0, 0.0]
+
+
+@pytest.mark.parametrize("device", ["cpu", GPU])
+@pytest.mark.parametrize("usable", [0.9, 0.2, 0.01, 0.0])
+def test_the_kernel_fits_what_pytorch_fits(device, usable, monkeypatch):
+    if device == "cpu":
+        use_emulator(monkeypatch, light)
+        monkeypatch.setattr(light, "_THREADS", 64)
+    random = np.random.default_rng(5)
+    grey = values(random)
+    other = 1.4 * grey - 0.1 + noise(random)
+    other[:500] = values(random, 500)
+    counts = torch.from_numpy(random.random(2000) < usable)
+    expected = relative_light(grey, other, counts)
+    found = fitted_on_gpu(grey.to(device), other.to(device), counts.to(device)).cpu()
+    assert found.tolist() == pytest.approx(expected.tolist(), abs=2e-4)
+    assert (expected[0] == 1) == (usable <= 0.01)

@@ -192,7 +192,8 @@ def test_the_blend_is_the_weighted_mean_in_the_lie_algebra():
     seen = [flat(i, correction) for i in range(0, COUNT, 2)]
     _, S = anchor_transforms(correction)
     reference = sim3_exp(torch.tensor([0.2, 0.1, 0, 0.03, 0, 0.1, -0.05], dtype=F64))
-    got = blended_similarities(x, S[5:6], reference, zip(seen, S[::2], strict=True))
+    heard = zip(seen, range(0, COUNT, 2), strict=True)
+    got = blended_similarities(x, S[5:6], reference, S, heard)
     total, weight = 0.1 * sim3_log(S[5] @ sim3_inverse(reference)), 0.1
     for w, S_i in zip(seen, S[::2], strict=True):
         say = float(agreement(x, w)[0])

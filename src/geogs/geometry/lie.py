@@ -8,6 +8,7 @@ and the logarithms hold up to (not at) a half turn.
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn.functional import pad
 
 from geogs.geometry.sim3_translation import TranslationMap, halvings_of
 
@@ -69,7 +70,9 @@ def _left_jacobian(phi: Tensor) -> Tensor:
 
 def _compose(linear: Tensor, translation: Tensor) -> Tensor:
     top = torch.cat([linear, translation[..., None]], -1)
-    row = top.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(*top.shape[:-2], 1, 4)
+    row = pad(
+        torch.ones_like(top[..., :1, :1]), (3, 0)
+    )  # numbers from the host would be waited for
     return torch.cat([top, row], -2)
 
 

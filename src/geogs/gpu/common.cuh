@@ -22,3 +22,15 @@ __device__ __forceinline__ int warp_max(int x) {
   for (int s = 16; s; s >>= 1) x = max(x, __shfl_xor_sync(ALL_LANES, x, s));
   return x;
 }
+
+// Sum over a block whose size is a multiple of 32, in every thread; all take part.
+__device__ __forceinline__ float block_sum(float x) {
+  __shared__ float partial[32];
+  x = warp_sum(x);
+  __syncthreads();
+  if (!(threadIdx.x & 31)) partial[threadIdx.x >> 5] = x;
+  __syncthreads();
+  float sum = 0.f;
+  for (int w = 0; w < (int)blockDim.x >> 5; w++) sum += partial[w];
+  return sum;
+}

@@ -61,15 +61,15 @@ def move_disks(job: MoveJob) -> int:
     x = result.disks.position.double()
     whole = overall(views, similarities).to(x)
 
-    def witnesses() -> Iterator[tuple[Witness, Tensor]]:
+    def witnesses() -> Iterator[tuple[Witness, int]]:
         for n, T_cw in enumerate(torch.from_numpy(views.T_cw)):
             maps = result.render(T_cw)
             witness = Witness(n, result.depth_camera, T_cw, maps.depth, maps.weight)
-            yield witness, similarities[n]
+            yield witness, n
 
     S = whole.expand(len(x), 4, 4)
     if len(x) > 1:
-        S = blended_similarities(x, S, whole, witnesses())
+        S = blended_similarities(x, S, whole, similarities, witnesses())
     save_map(job.file, transformed(result.disks, S), {})
     return len(x)
 

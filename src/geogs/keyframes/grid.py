@@ -8,6 +8,7 @@ from torch import Tensor
 
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
+from geogs.gpu.transfer import to_device
 
 STRIDE = 8
 """Pixels of the working image between two cells of the grid."""
@@ -29,6 +30,8 @@ class SampleGrid:
     """x, y of each cell, float32."""
     rays: Float[Tensor, "p 3"] = field(init=False)
     """K^-1 (x, y, 1) of each cell, float32."""
+    centre: Float[Tensor, "2"] = field(init=False)
+    """Half of the image's width and height, float32."""
 
     def __post_init__(self) -> None:
         x = torch.arange(OFFSET, max(self.camera.width - 3, OFFSET), STRIDE, dtype=torch.float64)
@@ -46,6 +49,8 @@ class SampleGrid:
         object.__setattr__(self, "height", len(y))
         object.__setattr__(self, "pixels", pixels.reshape(-1, 2).float().to(self.device))
         object.__setattr__(self, "rays", rays.reshape(-1, 3).float().to(self.device))
+        centre = torch.tensor([cam.width / 2, cam.height / 2])
+        object.__setattr__(self, "centre", centre.to(self.device))
 
     @property
     def on_gpu(self) -> bool:
@@ -67,8 +72,8 @@ class SampleGrid:
         self, values: Float[Tensor, "p c"], points: Float[Tensor, "n 2"]
     ) -> Float[Tensor, "n c"]:
         """Bilinear value of a field given on the grid at any pixels; replicated at the border."""
-        size = points.new_tensor([self.width - 1, self.height - 1])
-        normalised = (points - OFFSET) / STRIDE * (2 / size) - 1
+        cells, sides = (points - OFFSET) / STRIDE, (self.width - 1, self.height - 1)
+        normalised = torch.stack([cells[:, k] * (2 / sides[k]) - 1 for k in (0, 1)], -1)
         image = values.mT.reshape(1, -1, self.height, self.width)
         out = torch.nn.functional.grid_sample(
             image, normalised[None, None], align_corners=True, padding_mode="border"
@@ -85,7 +90,7 @@ class SampleGrid:
     def enlarged(self, values: Shaped[Tensor, "p"], width: int, height: int) -> Tensor:
         """A field as an image of another size of the whole view: that of the nearest cell."""
         rows, columns = (
-            _nearest(size, whole, cells).to(values.device)
+            to_device(_nearest(size, whole, cells), values.device)
             for size, whole, cells in (
                 (height, self.camera.height, self.height),
                 (width, self.camera.width, self.width),

@@ -1,9 +1,14 @@
 """How bright one view is against another: what exposure and white balance did between them."""
 
+from pathlib import Path
+
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from geogs.gpu.kernels import kernels_for
+
+_SOURCE = Path(__file__).parent / "cuda" / "light.cu"
 _ROUNDS = 12
 _SCALE = 0.02
 """Grey values that a pixel may be off; surfaces that hide each other are off by more."""
@@ -12,6 +17,8 @@ _PLAIN = 0.01
 _FEWEST = 50
 """Weights of pixels, summed, that tell anything."""
 _LARGEST_GAIN = 8.0
+_THREADS = 1024
+"""Of the one block that fits on a GPU."""
 
 
 def same_light(device: torch.device | str) -> Float[Tensor, "2"]:
@@ -29,6 +36,8 @@ def relative_light(
     that do not agree lose their weight (Cauchy's), and where the values hardly differ the gain
     stays near 1. Returns gain 1 and offset 0 where too few pixels agree. Nothing waits for a GPU.
     """
+    if grey.device.type == "cuda":
+        return fitted_on_gpu(grey, other, usable)
     weight = usable.to(grey.dtype)
     for n in range(_ROUNDS):
         total = weight.sum().clamp(min=1e-12)
@@ -47,3 +56,15 @@ def relative_light(
         weight = usable / (1 + (residual / scale).square())
     found = torch.stack([gain, mean_y - gain * mean_x])
     return torch.where(weight.sum() > _FEWEST, found, same_light(grey.device).to(grey))
+
+
+def fitted_on_gpu(
+    grey: Float[Tensor, "n"], other: Float[Tensor, "n"], usable: Bool[Tensor, "n"]
+) -> Float[Tensor, "2"]:
+    """:func:`relative_light` by one CUDA kernel, in float32."""
+    light = grey.new_empty(2)
+    values = (grey.contiguous(), other.contiguous(), usable.contiguous())
+    kernels_for(_SOURCE, grey.device)["fit_light"](
+        1, _THREADS, *values, len(grey), _ROUNDS, _SCALE, _PLAIN, _FEWEST, _LARGEST_GAIN, light
+    )
+    return light

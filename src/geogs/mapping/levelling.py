@@ -5,11 +5,12 @@ from collections.abc import Sequence
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn.functional import grid_sample
 
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_inverse
+from geogs.gpu.transfer import to_device
 from geogs.losses.light import relative_light, same_light
-from geogs.losses.multi_view import bilinear
 from geogs.mapping.view import MapView
 
 _STRIDE = 4
@@ -29,18 +30,16 @@ def light_of(view: MapView, others: Sequence[MapView]) -> Float[Tensor, "2"]:
     if not others:
         return same_light(view.dense.depth.device)
     points, sure = _sparse_points(view)
-    mine, inside = _sampled(view.photo.grey, view.photo.camera, points)
-    usable, T_wv = sure & inside & _is_exposed(mine), se3_inverse(view.T_cw)
-    theirs, common = [], []
-    for other in others:
-        T = (other.T_cw @ T_wv).to(points)
-        seen, inside = _sampled(
-            other.photo.grey, other.photo.camera, points @ T[:3, :3].mT + T[:3, 3]
-        )
-        gain, offset = other.light.unbind()
-        theirs.append(seen)
-        common.append(usable & inside & _is_exposed((seen - offset) / gain))
-    return relative_light(mine.repeat(len(others)), torch.cat(theirs), torch.cat(common))
+    (mine,), (inside,) = _sampled(view.photo.grey[None], view.photo.camera, points[None])
+    usable = sure & inside & _is_exposed(mine)
+    T_cw = torch.stack([other.T_cw for other in others]).cpu()
+    T = to_device((T_cw @ se3_inverse(view.T_cw).to(T_cw)).to(points.dtype), points.device)
+    greys = torch.stack([other.photo.grey for other in others])
+    there = points @ T[:, :3, :3].mT + T[:, None, :3, 3]
+    theirs, inside = _sampled(greys, view.photo.camera, there)
+    gain, offset = torch.stack([other.light for other in others])[..., None].unbind(1)
+    common = usable & inside & _is_exposed((theirs - offset) / gain)
+    return relative_light(mine.repeat(len(others)), theirs.flatten(), common.flatten())
 
 
 def _sparse_points(view: MapView) -> tuple[Float[Tensor, "n 3"], Bool[Tensor, "n"]]:
@@ -53,14 +52,18 @@ def _sparse_points(view: MapView) -> tuple[Float[Tensor, "n 3"], Bool[Tensor, "n
 
 
 def _sampled(
-    grey: Float[Tensor, "h w"], camera: Camera, points: Float[Tensor, "n 3"]
-) -> tuple[Float[Tensor, "n"], Bool[Tensor, "n"]]:
-    ahead = points[:, 2] > 1e-6
-    pixels, _ = camera.project(torch.where(ahead[:, None], points, torch.ones_like(points)))
-    edge = pixels.new_tensor([camera.width - 1, camera.height - 1])
-    inside = ahead & (pixels >= 0).all(-1) & (pixels <= edge).all(-1)
-    return bilinear(grey, torch.where(inside[:, None], pixels, torch.zeros_like(pixels))), inside
+    greys: Float[Tensor, "k h w"], camera: Camera, points: Float[Tensor, "k n 3"]
+) -> tuple[Float[Tensor, "k n"], Bool[Tensor, "k n"]]:
+    """What each image shows of points in its camera, and where it does."""
+    ahead = points[..., 2] > 1e-6
+    pixels, _ = camera.project(points)
+    edges = (camera.width - 1, camera.height - 1)
+    place = torch.stack([pixels[..., k] * (2 / edges[k]) - 1 for k in (0, 1)], -1)
+    inside = ahead & (place.abs() <= 1).all(-1)
+    place = torch.where(inside[..., None], place, 0.0)
+    shown = grid_sample(greys[:, None], place[:, None], align_corners=True)
+    return shown[:, 0, 0], inside
 
 
-def _is_exposed(grey: Float[Tensor, "n"]) -> Bool[Tensor, "n"]:
+def _is_exposed(grey: Float[Tensor, "*n"]) -> Bool[Tensor, "*n"]:
     return (grey > _DARK) & (grey < _BRIGHT)

@@ -103,10 +103,8 @@ def plan_update(
         S = coherent_similarities(x, target, own, _revisited(x, target, slot, correction))
     elif strategy == "blended" and (fit := _fit_similarity(x, target)) is not None:
         known = {int(i): n for n, i in enumerate(ids)}
-        heard = (
-            (w, similarities[known[w.keyframe_id]]) for w in witnesses if w.keyframe_id in known
-        )
-        S = blended_similarities(x, own, fit, heard)
+        heard = ((w, known[w.keyframe_id]) for w in witnesses if w.keyframe_id in known)
+        S = blended_similarities(x, own, fit, similarities, heard)
     return MapUpdate(S, _rms(target - x), _rms(target - apply_each(S, x)))
 
 

@@ -16,6 +16,7 @@ from torch import Tensor
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import sim3_exp, sim3_inverse, sim3_log
 from geogs.geometry.neighbors import nearest_neighbors
+from geogs.gpu.transfer import to_device
 
 _AGREEMENT = 0.03
 """Relative deviation from a keyframe's depth at which a disk counts as its surface no more."""
@@ -50,20 +51,23 @@ def blended_similarities(
     x: Float[Tensor, "n 3"],
     own: Float[Tensor, "n 4 4"],
     reference: Float[Tensor, "4 4"],
-    witnesses: Iterable[tuple[Witness, Float[Tensor, "4 4"]]],
+    similarities: Float[Tensor, "k 4 4"],
+    witnesses: Iterable[tuple[Witness, int]],
 ) -> Float[Tensor, "n 4 4"]:
     """World similarities of disks at ``x``, float64.
 
-    ``own`` is the correction of the keyframe that made each; every witness comes with its own, one
-    at a time. Blends are means in the Lie algebra of Sim(3) of what remains after ``reference``,
-    which should be near all of them; they do not depend on the origin of the world.
+    ``own`` is the correction of the keyframe that made each; every witness, one at a time, comes
+    with the place of its own among the ``similarities``. Blends are means in the Lie algebra of
+    Sim(3) of what remains after ``reference``, which should be near all of them; they do not depend
+    on the origin of the world.
     """
     back = sim3_inverse(reference)
     total = _OWN * sim3_log(own @ back)
     weight = torch.full_like(x[:, 0], _OWN)
-    for witness, similarity in witnesses:
+    told = to_device(sim3_log(similarities.cpu() @ back.cpu()), x.device)
+    for witness, k in witnesses:
         say = agreement(x, witness)
-        total += say[:, None] * sim3_log(similarity.to(back) @ back)
+        total += say[:, None] * told[k]
         weight += say
     moved = x @ reference[:3, :3].T + reference[:3, 3]
     return sim3_exp(smoothed(x, moved, total / weight[:, None])) @ reference

@@ -107,14 +107,14 @@ def pack_matches(
     grid: SampleGrid, pixels: Float[Tensor, "*b 2"], weight: Float[Tensor, "*b 2"]
 ) -> tuple[Int16[Tensor, "*b 2"], Float16[Tensor, "*b 2"]]:
     """Positions in whole steps from the image's centre, zero where unmatched; half weights."""
-    steps = (pixels - _centre(grid)) / position_step(grid.camera)
+    steps = (pixels - grid.centre) / position_step(grid.camera)
     position = torch.where(weight > 0, steps.round(), 0.0).clamp(-32768, 32767).short()
     return position, weight.clamp(max=MAX_WEIGHT).half()
 
 
 def unpacked_positions(grid: SampleGrid, position: Int16[Tensor, "*b 2"]) -> Float[Tensor, "*b 2"]:
     """Pixels of packed positions."""
-    return position.float() * position_step(grid.camera) + _centre(grid)
+    return position.float() * position_step(grid.camera) + grid.centre
 
 
 def packed_matches(
@@ -132,8 +132,3 @@ def packed_reprojections(edges: Sequence[PackedEdge]) -> Float[Tensor, "e p 2"]:
     source, target = (torch.stack([getattr(f, k) for f in flows]) for k in ("T_source", "T_target"))
     depth = torch.stack([f.inverse_depth for f in flows])
     return project(grid.camera, grid.rays, target @ se3_inverse(source), depth).pixels
-
-
-def _centre(grid: SampleGrid) -> Float[Tensor, "2"]:
-    camera = grid.camera
-    return grid.pixels.new_tensor([camera.width / 2, camera.height / 2])

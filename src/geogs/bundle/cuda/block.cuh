@@ -33,18 +33,6 @@ __device__ __forceinline__ void block_sums(float* v, double* sums) {
   __syncthreads();
 }
 
-// Sum over the block, in every thread.
-__device__ __forceinline__ float block_sum(float x) {
-  __shared__ float partial[32];
-  x = warp_sum(x);
-  __syncthreads();
-  if (!(threadIdx.x & 31)) partial[threadIdx.x >> 5] = x;
-  __syncthreads();
-  float sum = 0.f;
-  for (int w = 0; w < (int)blockDim.x >> 5; w++) sum += partial[w];
-  return sum;
-}
-
 // A value left out of a median; above every key of a number.
 #define LEFT_OUT 0xffffffffu
 
