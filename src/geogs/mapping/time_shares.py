@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from geogs.config import SearchConfig
 
 # What checking depths and growing disks take, as a part of one search of the depths.
-_GROWING = 0.4
+_GROWING = 0.6
 
 # Images for each that is to get a depth, where these are few, and how many are not few.
 _HELPERS, _FEW = 4, 100

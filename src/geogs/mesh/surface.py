@@ -1,6 +1,8 @@
 """From signed distances to triangles."""
 
+from collections import deque
 from collections.abc import Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +13,7 @@ from torch import Tensor
 from geogs.mesh.marching import march
 from geogs.mesh.tsdf import BLOCK, LIMIT, SparseTsdf
 from geogs.mesh.types import Mesh
+from geogs.threads import worker_count
 
 CHUNK = 16
 """Blocks along a side of a chunk."""
@@ -45,11 +48,29 @@ def extract_surface(tsdf: SparseTsdf, min_weight: float = 1.5) -> Mesh:
 
 def surface_parts(tsdf: SparseTsdf, min_weight: float = 1.5) -> Iterator[SurfacePart]:
     """The surface chunk by chunk, of those chunks that belong to the box of ``tsdf``."""
-    for chunk, origin, distance, cell in _chunks(tsdf, min_weight):
-        vertices, axis, triangles = march(distance, cell)
-        if len(triangles):
-            keys = _edge_keys(np.floor(vertices).astype(np.int64) + origin, axis)
-            yield SurfacePart(chunk, keys, vertices + origin, triangles)
+    return (part for part in _marched(tsdf, min_weight) if len(part.faces))
+
+
+def _marched(tsdf: SparseTsdf, min_weight: float) -> Iterator[SurfacePart]:
+    """What threads make of the chunks, in their order; some are empty."""
+    with ThreadPoolExecutor(worker_count()) as threads:
+        waiting: deque[Future[SurfacePart]] = deque()
+        for chunk in _chunks(tsdf, min_weight):
+            waiting.append(threads.submit(_part, *chunk))
+            if len(waiting) > worker_count():  # chunks are large
+                yield waiting.popleft().result()
+        yield from (part.result() for part in waiting)
+
+
+def _part(
+    chunk: tuple[int, int, int],
+    origin: Int[np.ndarray, "3"],
+    distance: Float[np.ndarray, "x y z"],
+    cell: Bool[np.ndarray, "x y z"],
+) -> SurfacePart:
+    vertices, axis, triangles = march(distance, cell)
+    keys = _edge_keys(np.floor(vertices).astype(np.int64) + origin, axis)
+    return SurfacePart(chunk, keys, vertices + origin, triangles)
 
 
 def stitched(parts: Iterable[SurfacePart], voxel: float) -> Mesh:

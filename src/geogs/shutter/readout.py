@@ -148,9 +148,8 @@ def _verdict(clips: list[_Adjusted], focal: float) -> FoundReadout:
         clips = [c for c in clips if c.reconstruction.is_finite]
         if len(clips) < LEAST_CLIPS:
             return FoundReadout(clips=len(clips))
-        parts = [
-            readout_equation(c.tracks, c.reconstruction, readout, tolerance / focal) for c in clips
-        ]
+        equation = functools.partial(_equation, readout=readout, tolerance=tolerance / focal)
+        parts = thread_map(equation, clips)
         clips, parts = _fitting(clips, parts)
         step = sum(p.gradient for p in parts) / (sum(p.curvature for p in parts) + 1e-12)
         step = float(np.clip(step, -LARGEST_STEP, LARGEST_STEP))
@@ -168,6 +167,10 @@ def _verdict(clips: list[_Adjusted], focal: float) -> FoundReadout:
     sure = error <= LARGEST_ERROR and readout >= LEAST_EVIDENCE * error
     believed = sure and SHORTEST <= readout <= LONGEST
     return FoundReadout(readout if believed else 0.0, readout, error, len(clips))
+
+
+def _equation(clip: _Adjusted, readout: float, tolerance: float) -> ReadoutEquation:
+    return readout_equation(clip.tracks, clip.reconstruction, readout, tolerance)
 
 
 def _fitting(
