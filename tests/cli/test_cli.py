@@ -206,3 +206,18 @@ def test_known_poses_take_the_preset_of_the_device_unless_one_is_given() -> None
     small, large = (reconstruct_preset(name) for name in ("default", "accurate"))
     assert small.mapping.render_long_edge < large.mapping.render_long_edge == 800
     assert small.mapping.loss == large.mapping.loss != Config().mapping.loss
+
+
+@pytest.mark.parametrize(("given", "expected"), [(None, "1"), ("3", "3")])
+def test_the_blas_of_numpy_is_told_its_threads_before_numpy_is_imported(given, expected):
+    code = (
+        "import os, sys; sys.argv = ['geogs', '--version']\n"
+        "from geogs.cli.main import main\n"
+        "main(); print('numpy' in sys.modules, os.environ['OPENBLAS_NUM_THREADS'])"
+    )
+    environment = {k: v for k, v in os.environ.items() if k != "OPENBLAS_NUM_THREADS"}
+    environment |= {} if given is None else {"OPENBLAS_NUM_THREADS": given}
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
+    )
+    assert done.stdout.splitlines()[-1] == f"False {expected}"
