@@ -6,7 +6,7 @@ import torch
 from cuda_emulator import use_emulator
 from geogs.geometry import depth as maps
 from geogs.geometry.camera import Camera
-from geogs.geometry.depth import _averaged, _averaged_on_gpu, averaged_over_planes
+from geogs.geometry.depth import averaged_once, averaged_once_on_gpu, averaged_over_planes
 
 CAMERA = Camera(fx=60.0, fy=62.0, cx=25.2, cy=17.1, width=53, height=37)
 GPU = pytest.param(
@@ -42,9 +42,9 @@ def test_one_round_is_that_of_pytorch(device, radius):
     depth, normal = steps_and_holes()
     inverse = torch.where(depth > 0, 1 / depth.clamp(min=1e-9), 0.0)
     tilted = [inverse * normal[..., k] / 60 for k in (0, 1)]
-    expected = _averaged(inverse, *tilted, radius, 0.02)
+    expected = averaged_once(inverse, *tilted, radius, 0.02)
     told = [m.contiguous().to(device) for m in (inverse, *tilted)]
-    found = _averaged_on_gpu(*told, radius, 0.02).cpu()
+    found = averaged_once_on_gpu(*told, radius, 0.02).cpu()
     assert found == pytest.approx(expected, rel=1e-4, abs=1e-7)
 
 

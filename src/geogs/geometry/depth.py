@@ -62,14 +62,14 @@ def averaged_over_planes(
     tilt = [
         normal[..., k] / slope.where(good, 1.0) / f for k, f in enumerate((camera.fx, camera.fy))
     ]
-    one_round = _averaged_on_gpu if depth.device.type == "cuda" else _averaged
+    one_round = averaged_once_on_gpu if depth.device.type == "cuda" else averaged_once
     for _ in range(rounds):
         right, down = (inverse * t for t in tilt)
         inverse = torch.where(good, one_round(inverse, right, down, radius, reach), 0.0)
     return torch.where(good, 1 / inverse.clamp(min=1e-9), depth)
 
 
-def _averaged(
+def averaged_once(
     inverse: Float[Tensor, "h w"],
     right: Float[Tensor, "h w"],
     down: Float[Tensor, "h w"],
@@ -96,7 +96,7 @@ def _averaged(
     return top / total.clamp(min=1e-9)
 
 
-def _averaged_on_gpu(
+def averaged_once_on_gpu(
     inverse: Float[Tensor, "h w"],
     right: Float[Tensor, "h w"],
     down: Float[Tensor, "h w"],
