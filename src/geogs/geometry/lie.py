@@ -70,9 +70,8 @@ def _left_jacobian(phi: Tensor) -> Tensor:
 
 def _compose(linear: Tensor, translation: Tensor) -> Tensor:
     top = torch.cat([linear, translation[..., None]], -1)
-    row = pad(
-        torch.ones_like(top[..., :1, :1]), (3, 0)
-    )  # numbers from the host would be waited for
+    # Numbers of the host would have to wait for a GPU.
+    row = pad(torch.ones_like(top[..., :1, :1]), (3, 0))
     return torch.cat([top, row], -2)
 
 
