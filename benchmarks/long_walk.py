@@ -1,10 +1,11 @@
 """Time and memory along a long video: a walk through many furnished rooms.
 
     python benchmarks/long_walk.py [--frames 5000] [--images 5000] [--size 512 288] [--device cuda]
-        [--preset fast] [--folder FOLDER] [--online] [--seconds 540] [--output FILE]
+        [--preset fast] [--folder FOLDER] [--online] [--seconds 540] [--output FILE] [--renderers 1]
 
-The walk is rendered first, in another process and once for all runs into ``--folder``. Then the
-whole system follows it; reading images does not count. Printed are, for every 500 frames, the
+The walk is rendered first, in another process and once for all runs into ``--folder``; several
+``--renderers`` share it while the system is at its beginning. Then the whole system follows it;
+reading images, and waiting for them, does not count. Printed are, for every 500 frames, the
 milliseconds per keyframe of each stage, the memory of the process (and of the GPU), keyframes and
 disks; then, stage by stage and for memory, the last 500 frames against the first, and the
 trajectory errors. ``--walk`` keeps the rooms of a longer walk of which only the beginning is
@@ -34,6 +35,9 @@ from geogs.synth.export import default_camera
 from geogs.types import Frame, Trajectory
 from portals import SuiteRaycaster
 from suite import Suite
+
+_PATIENCE = 600
+"""Seconds for which the next image is awaited."""
 
 
 @dataclass(frozen=True)
@@ -65,12 +69,22 @@ def main() -> None:
     options = parse()
     suite, camera = Suite.for_walk(options.walk or options.frames), default_camera(*options.size)
     folder = options.folder / f"{suite.rooms}-rooms-{camera.width}x{camera.height}"
-    if options.render_only:
-        render(suite, camera, folder, min(options.images or options.frames, options.frames))
-        return
-    subprocess.run([sys.executable, __file__, *sys.argv[1:], "--render-only"], check=True)
-    slam = Slam(camera, preset(options.preset), options.device)
     rendered = min(options.images or options.frames, options.frames)
+    if options.render_only:
+        part, parts = options.part
+        first, last = (rendered * n // parts for n in (part, part + 1))
+        render(suite, camera, folder, last, first=first, sharing=options.renderers)
+        return
+    renderers = [
+        subprocess.Popen([
+            sys.executable, __file__, *sys.argv[1:], "--render-only", "--part", str(n),
+            str(options.renderers),
+        ])
+        for n in range(options.renderers)
+    ]  # fmt: skip
+    if len(renderers) == 1 and renderers[0].wait():
+        sys.exit("The walk could not be rendered.")
+    slam = Slam(camera, preset(options.preset), options.device)
     images = [to_and_fro(n, rendered) for n in range(options.frames)]
     blocks = follow(slam, folder, images, options.every, options.seconds)
     truth = suite.walk(rendered)[images[: slam.frames]]
@@ -120,18 +134,26 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--online", action="store_true", help="leave out what follows the video")
     parser.add_argument("--folder", type=Path, default=Path("out/long_walk"))
     parser.add_argument("--output", type=Path, help="JSON file")
+    parser.add_argument("--renderers", type=int, default=1, help="processes")
     parser.add_argument("--render-only", action="store_true")
+    parser.add_argument("--part", type=int, nargs=2, default=(0, 1), help="of those processes")
     return parser.parse_args()
 
 
-def render(suite: Suite, camera: Camera, folder: Path, frames: int, every: int = 1) -> None:
-    """Write the images, one in so many, that are not there yet."""
+def render(
+    suite: Suite, camera: Camera, folder: Path, frames: int, every: int = 1, first: int = 0,
+    sharing: int = 1,
+) -> None:  # fmt: skip
+    """Write the images from the first on, one in so many, that are not there yet.
+
+    By this one of so many processes that share the cores.
+    """
     folder.mkdir(parents=True, exist_ok=True)
-    paths = [folder / f"frame{n:06d}.jpg" for n in range(0, frames, every)]
+    paths = [folder / f"frame{n:06d}.jpg" for n in range(first, frames, every)]
     if all(path.exists() for path in paths):
         return
-    threads = len(os.sched_getaffinity(0))
-    caster, poses = SuiteRaycaster(suite, threads), suite.walk(frames)[::every]
+    threads = max(len(os.sched_getaffinity(0)) // sharing, 1)
+    caster, poses = SuiteRaycaster(suite, threads), suite.walk(frames)[first::every]
     with ThreadPoolExecutor(threads) as pool:
         for path, T_wc in zip(paths, poses, strict=True):
             if not path.exists():
@@ -142,6 +164,16 @@ def write(path: Path, image: np.ndarray) -> None:
     part = path.with_suffix(".part")
     part.write_bytes(cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 95])[1])
     part.rename(path)
+
+
+def read(path: Path) -> np.ndarray:
+    """An image as soon as it is rendered."""
+    begin = time.perf_counter()
+    while not path.exists():
+        if time.perf_counter() - begin > _PATIENCE:
+            sys.exit(f"{path} is not being rendered.")
+        time.sleep(0.01)
+    return cv2.imread(str(path))
 
 
 def to_and_fro(n: int, images: int) -> int:
@@ -169,7 +201,7 @@ def follow(
     before, known, lost, status, spent = {}, 0, 0, None, 0.0
     end, frames = time.perf_counter() + (seconds or float("inf")), len(images)
     for n, image in enumerate(images):
-        pixels = cv2.imread(str(folder / f"frame{image:06d}.jpg"))
+        pixels = read(folder / f"frame{image:06d}.jpg")
         start = time.process_time()
         status = slam.process(Frame(n, n / 30, np.ascontiguousarray(pixels[..., ::-1])))
         spent += time.process_time() - start

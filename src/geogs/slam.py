@@ -19,6 +19,7 @@ from geogs.keyframes.grid import SampleGrid
 from geogs.keyframes.store import KeyframeStore, StoreState
 from geogs.loop.closer import LoopCloser, LoopsState
 from geogs.loop.global_bundle import global_bundle
+from geogs.mapping.all_at_once import map_all
 from geogs.mapping.background import BackgroundMapper
 from geogs.mapping.mapper import Mapper
 from geogs.mapping.rendered import MapRenderer
@@ -81,6 +82,7 @@ class SlamState:
     waiting: list[int]
     adjusted: int
     is_ended: bool
+    defers_map: bool = False
 
 
 class Slam:
@@ -100,12 +102,15 @@ class Slam:
         live: bool = False,
         mask: Bool[np.ndarray, "h w"] | None = None,
         black_is_hidden: bool = False,
+        defers_map: bool = False,
     ):
         """``mask``, of the size of the images, is true where they may show the scene: elsewhere
         nothing is matched, searched or mapped; with ``black_is_hidden`` nor are pixels of an image
         that are quite black. ``live`` maps in a thread beside tracking, and completes
         keyframes in another, which frames do not wait for as long as they are found without, nor
-        for the search and the closing of loops: results then depend on how fast the machine is."""
+        for the search and the closing of loops: results then depend on how fast the machine is.
+        Of a system that ``defers_map`` there is no map until :meth:`refine`, which makes it of all
+        keyframes at once, at their final poses; ``mapping.when`` may say otherwise."""
         self.config = config or Config()
         self.camera = camera
         self.device = device
@@ -117,6 +122,8 @@ class Slam:
         with torch.cuda.stream(self._stream):
             self._make_parts(live)
         self.frames = 0
+        self.defers_map = defers_map and not live and self.config.mapping.may_follow
+        """Whether keyframes are mapped at the end."""
         self._waiting: deque[int] = deque()
         self.adjusted = 0
         """Keyframes at the last bundle adjustment of all."""
@@ -164,6 +171,7 @@ class Slam:
         return SlamState(
             self.keyframes.state(), self.segments.state(), self.loops.state(), self.mapper.state(),
             self.stopwatch.state(), self.frames, list(self._waiting), self.adjusted, self._is_ended,
+            self.defers_map,
         )  # fmt: skip
 
     @on_one_torch_thread
@@ -185,6 +193,7 @@ class Slam:
         self.stopwatch.load(state.stopwatch)
         self.frames, self._waiting = state.frames, deque(state.waiting)
         self.adjusted, self._is_ended = state.adjusted, state.is_ended
+        self.defers_map = state.defers_map
 
     @on_one_torch_thread
     def start_from(self, disks: MapSnapshot, keyframes: Sequence[RenderedKeyframe]) -> None:
@@ -310,7 +319,8 @@ class Slam:
             self.segments.world.keyframes.take_corrections()
             self._waiting.clear()
         self._map(self._close_loops(result, is_last=True), lag=0)
-        self.stopwatch.end_stream()
+        if not self.defers_map:  # else there is no online result
+            self.stopwatch.end_stream()
 
     @on_one_torch_thread
     def finish(self, progress: Progress = _silent, correct: bool = True) -> None:
@@ -332,10 +342,24 @@ class Slam:
 
     @on_one_torch_thread
     def refine(self, progress: Progress = _silent) -> None:
-        """After that: train the map over all keyframes, if it is to be."""
+        """After that: train the map over all keyframes, if it is to be, or make it of them."""
         with self.stopwatch("final mapping"):
-            self.mapper.refine(lambda f: progress("map refinement", f))
+            if self.defers_map:
+                map_all(self.mapper, self._observed(), lambda f: progress("mapping", f))
+            else:
+                self.mapper.refine(lambda f: progress("map refinement", f))
+        self._waiting.clear()
         self.is_refined = self.will_refine
+
+    @on_one_torch_thread
+    def map_briefly(self, seconds: float, progress: Progress = _silent) -> None:
+        """After an interruption: a map within about so many seconds where there is none yet."""
+        if not self.defers_map or not self._waiting or len(self.mapper.map):
+            return
+        with self.stopwatch("final mapping"):
+            ids = self._observed()
+            map_all(self.mapper, ids, lambda f: progress("mapping", f), seconds)
+        self._waiting.clear()
 
     @on_one_torch_thread
     def rescale(self, scale: MetricScale) -> None:
@@ -481,6 +505,8 @@ class Slam:
     def _map(self, result: TrackResult, lag: int) -> None:
         """Hand settled keyframes to the mapper; train those whose successors are known."""
         self._waiting.extend(result.finalized)
+        if self.defers_map:
+            return
         mapper = self.background or self.mapper
         with self.stopwatch("mapping"):
             for id in result.finalized:
@@ -489,9 +515,20 @@ class Slam:
             while len(self._waiting) > lag:
                 mapper.map_keyframe(self._waiting.popleft())
                 trained = True
-        if trained and self.config.mapping.pose_iterations and self.background is None:
+        if trained and self.background is None and self._is_pose_step_due():
             with self.stopwatch("pose refinement"):
                 self.mapper.refine_poses(result.active)
+
+    def _observed(self) -> list[int]:
+        """The keyframes that wait; the mapper knows them from now on."""
+        for id in self._waiting:
+            if id not in self.mapper.views:
+                self.mapper.observe(id, self._mask_of(id))
+        return [*self._waiting]
+
+    def _is_pose_step_due(self) -> bool:
+        mapping = self.config.mapping
+        return mapping.pose_iterations > 0 and len(self.mapper.mapped) % mapping.pose_every == 0
 
     def _mask_of(self, id: int) -> Bool[np.ndarray, "h w"] | None:
         """What a keyframe shows of the scene; none where that is all of its image."""

@@ -103,7 +103,7 @@ POSE_RATE = Benchmark(
     (
         Variant("off", (*_set(pose_iterations="0"), *_NO_REFINEMENT)),
         *(
-            Variant(rate, (*_set(pose_lr=rate), *_NO_REFINEMENT))
+            Variant(rate, (*_set(pose_lr=rate, pose_every="1"), *_NO_REFINEMENT))
             for rate in paper.ABLATION_POSE_LR.columns
         ),
     ),

@@ -48,6 +48,7 @@ def test_the_papers_printed_numbers() -> None:
     assert mapping.disk.planarity_shrink == 0.1
     assert 2e-4 <= mapping.pose_lr <= 6e-4
     assert mapping.pose_iterations > 0
+    assert mapping.pose_every == 1
     assert mapping.final_iterations == 0
     assert (mapping.depth.engine, mapping.ablation.map_update) == ("tracker", "coherent")
     weights = (

@@ -38,6 +38,9 @@ from geogs.stopwatch import Stopwatch
 from geogs.threads import on_one_torch_thread
 from geogs.types import Frame
 
+BRIEFLY = 40.0
+"""Seconds for a map after an interruption, where there is none yet."""
+
 
 @on_one_torch_thread
 @full_memory_in_a_sentence()
@@ -73,6 +76,12 @@ def run(
         return _run(settings, opened, former, output, device, progress, stop, observer)
 
 
+def nobody_looks_on(settings: RunSettings, observer: RunObserver | None) -> bool:
+    """Whether the map of the way is not asked for: it may as well be made at the end."""
+    is_shown = observer is not None or settings.online_results
+    return settings.config.mapping.when == "after" or not is_shown
+
+
 def seen_by(former: SavedResult, config: Config) -> InputConfig:
     """How a source is read that the camera of an earlier result took, if nobody says otherwise."""
     known = former.folder / "intrinsics.json"
@@ -100,7 +109,7 @@ def _run(
     prior = open_prior(config.prior, source.camera, device)
     slam = Slam(
         source.camera, config, str(device), prior, source.is_live, source.mask,
-        source.black_is_hidden,
+        source.black_is_hidden, defers_map=nobody_looks_on(settings, observer),
     )  # fmt: skip
     if former is not None:
         slam.start_from(former.disks, former.keyframes)
@@ -197,7 +206,11 @@ class _Run:
         slam, source, settings, output = self.slam, self.source, self.settings, self.output
         progress = self.progress
         checkpoint = RunCheckpoint(output, self.facts, settings.checkpoint_every, progress)
-        progress.plan(RunForecast(slam.config, slam.stopwatch, source.length))
+        progress.plan(
+            RunForecast(
+                slam.config, slam.stopwatch, source.length, slam.defers_map, self.facts.device
+            )
+        )
         progress.expect(source.length, slam.frames)
         kept = False
         with full_memory_in_a_sentence(self._way_on), self.stop:
@@ -214,7 +227,7 @@ class _Run:
             slam.end_stream()
             if not interrupted:
                 kept = checkpoint.write(slam, source)
-            if settings.online_results:
+            if settings.online_results and not slam.defers_map:
                 self._write_stage("online")
             interrupted |= not self._finish(correct=not interrupted)
             make_metric(slam, source, scale_source(settings.scale_from), progress)
@@ -270,9 +283,12 @@ class _Run:
         try:
             if correct:
                 self._adjust_and_refine(report)
+            else:
+                self.slam.map_briefly(BRIEFLY, self.progress.stage)
         except KeyboardInterrupt:
             if not self.stop.requested:
                 raise
+            self.slam.map_briefly(BRIEFLY, self.progress.stage)
             return False
         except torch.cuda.OutOfMemoryError:
             torch.cuda.empty_cache()
@@ -285,7 +301,7 @@ class _Run:
     def _adjust_and_refine(self, report: Progress) -> None:
         slam = self.slam
         slam.adjust(report)
-        if self.settings.online_results and slam.will_refine:
+        if self.settings.online_results and slam.will_refine and not slam.defers_map:
             self._write_stage("adjusted")
         slam.refine(report)
 

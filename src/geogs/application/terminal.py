@@ -105,10 +105,10 @@ class TerminalProgress(RunProgress):
         left = None
         if self._forecast is not None:
             left = self._forecast.after_frame(status.frames, status.keyframes)
-        info = (
-            f"{status.keyframes} keyframes  {status.disks / 1000:.1f}k disks  "
-            f"{peak_memory() / 2**30:.1f} GB"
-        )
+        parts = [f"{status.keyframes} keyframes"]
+        if status.disks:  # else the map is made at the end
+            parts.append(f"{status.disks / 1000:.1f}k disks")
+        info = "  ".join([*parts, f"{peak_memory() / 2**30:.1f} GB"])
         if status.state.value != "tracking":
             info += f"  {status.state.value}"
         self._show(f"frame {status.frames}/{self._frames or '?'}", info, left)

@@ -46,8 +46,15 @@ def _run(config: Config) -> Iterator[str]:
             "mapping.no-final-depth does nothing: with mapping.final-iterations 0 no depth is "
             "searched again."
         )
+    if mapping.when == "after" and not mapping.may_follow:
+        yield (
+            "mapping.when after does nothing: without a final training that searches depths again "
+            "the map is made on the way."
+        )
     if mapping.pose_iterations == 0 and mapping.pose_lr != MappingConfig.pose_lr:
         yield "mapping.pose-lr does nothing: mapping.pose-iterations is 0."
+    if mapping.pose_iterations == 0 and mapping.pose_every != MappingConfig.pose_every:
+        yield "mapping.pose-every does nothing: mapping.pose-iterations is 0."
     if mapping.final_pose_rounds and 0 in (mapping.final_iterations, mapping.pose_iterations):
         yield (
             "mapping.final-pose-rounds does nothing: it needs mapping.final-iterations and "

@@ -110,6 +110,10 @@ class MappingConfig(Settings, group="mapping"):
     """Longer side of the rendered maps in pixels; never above the working image."""
     photo_scale: Annotated[float, Range(0.1, 16)] = 2.0
     """The images of L_mv are this much larger than the render, at most the working image."""
+    when: Annotated[Literal["auto", "online", "after"], Only("run")] = "auto"
+    """Map each keyframe as soon as it is settled, or all at once after the final bundle adjustment,
+    which takes less time and shows nothing before; auto: after, where the images come from files,
+    nobody looks on, and the final training searches depths again."""
     lag: Annotated[CountOrZero, Only("run")] = 4
     """A keyframe is mapped once this many later ones exist, so that its depth can be searched."""
     window: Annotated[Count, Only("run")] = 8
@@ -138,7 +142,9 @@ class MappingConfig(Settings, group="mapping"):
     lr_final: Annotated[float, Range(above=0, most=1)] = 0.1
     """Factor that the learning rates fall to over the final iterations."""
     pose_iterations: Annotated[CountOrZero, Only("run")] = 2
-    """Pose-only steps per mapped keyframe; 0 leaves the poses to the tracker."""
+    """Pose-only steps of a refinement on the map; 0 leaves the poses to the tracker."""
+    pose_every: Annotated[Count, Only("run")] = 4
+    """Mapped keyframes from one refinement of the latest poses to the next; the paper's is 1."""
     pose_lr: Annotated[Weight, Only("run")] = 4e-4
     """Adam step of the pose tangents: radians, and u for translations."""
     max_spread: Weight = 0.01
@@ -149,6 +155,11 @@ class MappingConfig(Settings, group="mapping"):
     depth: DepthConfig = field(default_factory=DepthConfig)
     loss: LossConfig = field(default_factory=LossConfig)
     ablation: MapAblation = field(default_factory=MapAblation)
+
+    @property
+    def may_follow(self) -> bool:
+        """Whether the map can be made after the video with no other result: no online one."""
+        return self.when != "online" and self.final_iterations > 0 and self.final_depth
 
     @property
     def pose_loss(self) -> LossConfig:

@@ -71,6 +71,7 @@ def paper_mapping() -> MappingConfig:
         views_per_step=0,
         final_iterations=0,
         pose_iterations=5,
+        pose_every=1,
         pose_lr=4e-4,
         max_spread=_UNBOUNDED,
         disk=paper_disks(),

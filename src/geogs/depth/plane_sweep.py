@@ -84,7 +84,7 @@ def plane_sweep(
     guide = cv2.GaussianBlur(reference.grey, (0, 0), 0.7)
     small, large = np.float32(config.small_jump), np.float32(config.large_jump)
     contrast = np.float32(config.jump_contrast)
-    totals = np.zeros_like(volume), np.zeros_like(volume)
+    totals = np.zeros(volume.shape, np.float32), np.zeros(volume.shape, np.float32)
     run_chunks(
         lambda k: kernels.aggregate_paths(
             volume, guide, small, large, contrast, k == 0, totals[k]

@@ -267,7 +267,7 @@ class Mapper:
 
     def check_depths(self) -> None:
         """Let the depths of all mapped keyframes revise each other, once per search."""
-        self._depths.check([self.views[i] for i in self.mapped])
+        self._depths.check([self.views[i] for i in self.mapped if i not in self._given])
 
     def grow(self) -> None:
         """Carve the map with all mapped keyframes, and add what their depths show beyond it."""

@@ -12,7 +12,7 @@ from itertools import pairwise
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
 from geogs.bundle.base import BundleOptions
@@ -31,6 +31,8 @@ from geogs.tracking.flow.base import FlowMatch
 from geogs.tracking.graph import FrameGraph
 from geogs.tracking.motion import pnp
 
+FARTHEST = 50.0
+"""Baselines beyond which a point says nothing on which of four poses is the right one."""
 LEAST_SEEN = 0.4
 """Share of the first keyframe's depths that a keyframe must see to be placed on them."""
 
@@ -107,24 +109,59 @@ def two_view(camera: Camera, match: FlowMatch) -> TwoView | None:
         return None
     if E is None or E.shape != (3, 3):
         return None
-    count, R, t, mask = cv2.recoverPose(E, p[used], q[used], K, mask=mask.copy())
-    if count < 0.3 * used.sum():
+    agreeing = np.flatnonzero(used)[mask[:, 0] > 0]
+    R, t, in_front = _pose_of(E, _rays(p[agreeing], K), _rays(q[agreeing], K))
+    if in_front.sum() < 0.3 * used.sum():
         return None
     T = np.eye(4)
-    T[:3, :3], T[:3, 3] = R, t[:, 0]
+    T[:3, :3], T[:3, 3] = R, t
     homogeneous = cv2.triangulatePoints(K @ np.eye(3, 4), K @ T[:3], p.T, q.T)
     z = homogeneous[2] / np.where(np.abs(homogeneous[3]) < 1e-12, 1e-12, homogeneous[3])
-    inlier = used.copy()
-    inlier[used] = mask[:, 0] > 0
+    inlier = np.zeros_like(used)
+    inlier[agreeing[in_front]] = True
     good = inlier & (z > 0)
     median = np.median(z[good])
     good &= (z > 0.1 * median) & (z < 10 * median)
-    rotated = (np.c_[(p - K[:2, 2]) / K[[0, 1], [0, 1]], np.ones(len(p))]) @ (K @ R).T
+    rotated = _rays(p, K) @ (K @ R).T
     parallax = np.median(np.linalg.norm(q - rotated[:, :2] / rotated[:, 2:], axis=1)[good])
     T[:3, 3] /= median
     depth = torch.from_numpy(np.where(good, median / np.where(good, z, 1), 1.0)).float()
     known = torch.from_numpy(np.asarray(good, bool))
     return TwoView(torch.from_numpy(T), depth, known, float(parallax))
+
+
+def _rays(
+    pixels: Float64[np.ndarray, "n 2"], K: Float64[np.ndarray, "3 3"]
+) -> Float64[np.ndarray, "n 3"]:
+    return np.c_[(pixels - K[:2, 2]) / K[[0, 1], [0, 1]], np.ones(len(pixels))]
+
+
+def _pose_of(
+    E: Float64[np.ndarray, "3 3"],
+    first: Float64[np.ndarray, "n 3"],
+    second: Float64[np.ndarray, "n 3"],
+) -> tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray, "3"], Bool[np.ndarray, "n"]]:
+    """Of the four poses of an essential matrix the one that sees most points before both cameras.
+
+    Returns the rotation, the unit translation (first camera to second) and which points lie there,
+    nearer than ``FARTHEST`` baselines. From z R a + t = z' b for the rays a and b of a point its
+    two depths follow by the cross products with b and with R a.
+    """
+    R1, R2, t = cv2.decomposeEssentialMat(E)
+    t, best = t[:, 0], None
+    for R in (R1, R2):
+        turned = first @ R.T
+        across = np.cross(turned, second)
+        square = np.maximum((across**2).sum(1), 1e-30)
+        z_first = -(np.cross(t, second) * across).sum(1) / square
+        z_second = -(np.cross(t, turned) * across).sum(1) / square
+        for sign in (1.0, -1.0):
+            z, other = sign * z_first, sign * z_second
+            seen = (z > 0) & (z < FARTHEST) & (other > 0) & (other < FARTHEST)
+            if best is None or seen.sum() > best[2].sum():
+                best = R, sign * t, seen
+    assert best is not None
+    return best
 
 
 def _place_all(graph: FrameGraph, flows: Sequence[FlowMatch], best: tuple[int, TwoView]) -> None:

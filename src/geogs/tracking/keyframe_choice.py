@@ -44,7 +44,7 @@ def sharpness(image: UInt8[np.ndarray, "h w 3"]) -> float:
     height, width = image.shape[:2]
     shrink = min(1.0, _EDGE / max(height, width))
     size = (max(round(width * shrink), 1), max(round(height * shrink), 1))
-    grey = cv2.cvtColor(cv2.resize(image, size, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2GRAY)
+    grey = cv2.resize(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), size, interpolation=cv2.INTER_AREA)
     grey = grey.astype(np.float32)
     x, y = cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1)
     xx, yy, xy = float((x * x).mean()), float((y * y).mean()), float((x * y).mean())

@@ -1,0 +1,38 @@
+"""A map of many keyframes at once, where none was made of them on the way."""
+
+import time
+from collections.abc import Sequence
+
+from geogs.depth.base import Progress, silent
+from geogs.mapping.depth_schedule import search_depths, spread_order
+from geogs.mapping.mapper import Mapper
+
+SEARCHED = 0.4
+"""Part of the time that the search of the depths takes, about."""
+
+
+def map_all(
+    mapper: Mapper,
+    keyframe_ids: Sequence[int],
+    progress: Progress = silent,
+    seconds: float | None = None,
+) -> None:
+    """Give observed keyframes their depths, grow the map with all of them, and train it.
+
+    As many steps as the final training has, or as all keyframes together would have had on the way
+    where these are more. An exception raised by ``progress`` keeps what there is by then. Of a
+    limited time about a part ``SEARCHED`` is for depths, of keyframes evenly spread over all; those
+    that get none are left out. Depths that there are already stay.
+    """
+    ids = [i for i in keyframe_ids if not mapper.views[i].has_depth]
+    until = None
+    if seconds is not None:
+        ids, until = spread_order(ids), time.perf_counter() + SEARCHED * seconds
+    search_depths(mapper, ids, lambda done: progress(SEARCHED * done), until)
+    mapper.check_depths()
+    mapper.grow()
+    steps = max(mapper.config.final_iterations, mapper.config.iterations * len(keyframe_ids))
+    if seconds is not None:  # but every keyframe is seen once
+        affordable = int((1 - SEARCHED) * seconds / mapper.seconds_per_step())
+        steps = min(steps, max(affordable, len(mapper.mapped)))
+    mapper.train(steps, lambda done: progress(SEARCHED + (1 - SEARCHED) * done))

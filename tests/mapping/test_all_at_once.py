@@ -1,0 +1,128 @@
+"""A map that is made at the end, instead of on the way."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from geogs.application.checkpoint import SavedState, checkpoint_folder, write_checkpoint
+from geogs.config import Config, InputConfig
+from geogs.io.sources.sniff import open_source
+from geogs.slam import Slam, SlamState
+
+pytestmark = pytest.mark.system
+
+FRAMES, AT = 34, 28
+
+
+class Interrupted(Exception):
+    """Somebody does not want to wait."""
+
+
+@dataclass
+class Work:
+    """A checkpoint of a system alone."""
+
+    slam: SlamState
+
+
+def quick() -> Config:
+    c = Config()
+    mapping = replace(
+        c.mapping, render_long_edge=64, iterations=2, pose_iterations=0, final_iterations=40,
+        depth=replace(c.mapping.depth, min_planes=16, max_planes=32),
+    )  # fmt: skip
+    return replace(c, mapping=mapping, tracking=replace(c.tracking, init_keyframes=6))
+
+
+@pytest.fixture(scope="module")
+def frames(small_room):
+    """The camera and the frames of a small room."""
+    source = open_source(small_room, InputConfig(stop=FRAMES))
+    return source.camera, list(source)
+
+
+def followed(frames, defers_map: bool, count: int = FRAMES) -> Slam:
+    """A system that has seen so many frames."""
+    camera, images = frames
+    slam = Slam(camera, quick(), defers_map=defers_map)
+    for frame in images[:count]:
+        slam.process(frame)
+    return slam
+
+
+@pytest.fixture(scope="module")
+def both(frames):
+    """A finished system with a map that grew on the way, and one with a map of the end."""
+    online, after = followed(frames, False), followed(frames, True)
+    assert online.mapper.mapped
+    assert not after.mapper.mapped
+    for slam in (online, after):
+        slam.finish()
+    return online, after
+
+
+def test_poses_are_the_same_and_the_surface_nearly(both):
+    online, after = both
+    assert np.array_equal(online.trajectory().T_wc, after.trajectory().T_wc)
+    assert after.mapper.mapped == online.mapper.mapped
+    assert after.is_refined
+    for a, b in zip(online.renders(), after.renders(), strict=True):
+        seen = (a.depth > 0) & (b.depth > 0)
+        assert seen.float().mean() > 0.9 * (a.depth > 0).float().mean()
+        assert float(((a.depth - b.depth).abs() / a.depth)[seen].median()) < 0.01
+
+
+def test_there_is_no_online_result(both):
+    online, after = both
+    assert online.stopwatch.until_stream_end is not None
+    assert after.stopwatch.until_stream_end is None
+    assert "mapping" not in after.stopwatch.seconds
+
+
+def test_a_system_goes_on_from_a_checkpoint(frames, both, tmp_path: Path):
+    slam = followed(frames, True, AT)
+    write_checkpoint(checkpoint_folder(tmp_path), Work(slam.state()))
+    other = Slam(slam.camera, slam.config)  # it is told by the state
+    other.restore(SavedState(tmp_path, Work).work("slam"))
+    for frame in frames[1][AT:]:
+        other.process(frame)
+    other.finish()
+    after = both[1]
+    assert np.array_equal(other.trajectory().T_wc, after.trajectory().T_wc)
+    for p, q in zip(other.mapper.map.parameters, after.mapper.map.parameters, strict=True):
+        assert torch.equal(p, q)
+
+
+def test_a_map_is_made_briefly_after_an_interruption(frames):
+    slam = followed(frames, True)
+    slam.finish(correct=False)
+
+    def interrupt(stage: str, fraction: float) -> None:
+        raise Interrupted
+
+    with pytest.raises(Interrupted):  # while depths are searched
+        slam.refine(interrupt)
+    assert len(slam.mapper.map) == 0
+    slam.map_briefly(0.0)
+    mapped, disks = list(slam.mapper.mapped), len(slam.mapper.map)
+    assert mapped
+    assert disks > 200
+    assert len(slam.renders()) == len(mapped)
+    slam.map_briefly(100.0)  # there is one now
+    assert (slam.mapper.mapped, len(slam.mapper.map)) == (mapped, disks)
+    assert not slam.is_refined
+
+
+def test_what_needs_the_map_on_the_way_has_it(frames):
+    config = quick()
+    for other in (
+        replace(config.mapping, when="online"),
+        replace(config.mapping, final_iterations=0),
+        replace(config.mapping, final_depth=False),
+    ):
+        assert not Slam(frames[0], replace(config, mapping=other), defers_map=True).defers_map
+    assert not Slam(frames[0], config).defers_map
+    assert Slam(frames[0], config, defers_map=True).defers_map
