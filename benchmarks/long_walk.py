@@ -2,6 +2,7 @@
 
     python benchmarks/long_walk.py [--frames 5000] [--images 5000] [--size 512 288] [--device cuda]
         [--preset fast] [--folder FOLDER] [--online] [--seconds 540] [--output FILE] [--renderers 1]
+        [--pace 1]
 
 The walk is rendered first, in another process and once for all runs into ``--folder``; several
 ``--renderers`` share it while the system is at its beginning. Then the whole system follows it;
@@ -9,7 +10,8 @@ reading images, and waiting for them, does not count. Printed are, for every 500
 milliseconds per keyframe of each stage, the memory of the process (and of the GPU), keyframes and
 disks; then, stage by stage and for memory, the last 500 frames against the first, and the
 trajectory errors. ``--walk`` keeps the rooms of a longer walk of which only the beginning is
-followed. With fewer ``--images`` than frames the walk goes back the way it came, and so on.
+followed. At half the ``--pace`` the camera goes half as far with each frame, through half as many
+rooms. With fewer ``--images`` than frames the walk goes back the way it came, and so on.
 ``--seconds`` ends it early, with what there is then.
 """
 
@@ -67,13 +69,19 @@ class Block:
 
 def main() -> None:
     options = parse()
-    suite, camera = Suite.for_walk(options.walk or options.frames), default_camera(*options.size)
-    folder = options.folder / f"{suite.rooms}-rooms-{camera.width}x{camera.height}"
+    suite, camera = (
+        Suite.for_walk(round(options.pace * (options.walk or options.frames))),
+        default_camera(*options.size),
+    )
+    name = f"{suite.rooms}-rooms-{camera.width}x{camera.height}"
+    folder = options.folder / (name if options.pace == 1 else f"{name}-{options.pace:g}")
     rendered = min(options.images or options.frames, options.frames)
     if options.render_only:
         part, parts = options.part
         first, last = (rendered * n // parts for n in (part, part + 1))
-        render(suite, camera, folder, last, first=first, sharing=options.renderers)
+        render(
+            suite, camera, folder, last, first=first, sharing=options.renderers, pace=options.pace
+        )
         return
     renderers = [
         subprocess.Popen([
@@ -87,7 +95,7 @@ def main() -> None:
     slam = Slam(camera, preset(options.preset), options.device)
     images = [to_and_fro(n, rendered) for n in range(options.frames)]
     blocks = follow(slam, folder, images, options.every, options.seconds)
-    truth = suite.walk(rendered)[images[: slam.frames]]
+    truth = suite.walk(rendered, options.pace)[images[: slam.frames]]
     errors = {}
     start = time.perf_counter()
     slam.end_stream()
@@ -135,6 +143,7 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--folder", type=Path, default=Path("out/long_walk"))
     parser.add_argument("--output", type=Path, help="JSON file")
     parser.add_argument("--renderers", type=int, default=1, help="processes")
+    parser.add_argument("--pace", type=float, default=1.0, help="of the camera")
     parser.add_argument("--render-only", action="store_true")
     parser.add_argument("--part", type=int, nargs=2, default=(0, 1), help="of those processes")
     return parser.parse_args()
@@ -142,7 +151,7 @@ def parse() -> argparse.Namespace:
 
 def render(
     suite: Suite, camera: Camera, folder: Path, frames: int, every: int = 1, first: int = 0,
-    sharing: int = 1,
+    sharing: int = 1, pace: float = 1.0,
 ) -> None:  # fmt: skip
     """Write the images from the first on, one in so many, that are not there yet.
 
@@ -153,7 +162,7 @@ def render(
     if all(path.exists() for path in paths):
         return
     threads = max(len(os.sched_getaffinity(0)) // sharing, 1)
-    caster, poses = SuiteRaycaster(suite, threads), suite.walk(frames)[first::every]
+    caster, poses = SuiteRaycaster(suite, threads), suite.walk(frames, pace)[first::every]
     with ThreadPoolExecutor(threads) as pool:
         for path, T_wc in zip(paths, poses, strict=True):
             if not path.exists():

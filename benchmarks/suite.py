@@ -120,14 +120,15 @@ class Suite:
         column = min(column, self.rooms // 2 - 1)
         return column if row == 0 else self.rooms - 1 - column
 
-    def walk(self, frames: int) -> Float64[np.ndarray, "n 4 4"]:
+    def walk(self, frames: int, pace: float = 1.0) -> Float64[np.ndarray, "n 4 4"]:
         """Camera-to-world poses round the ring, again and again; shorter walks begin longer ones.
 
+        From one frame to the next the camera goes ``pace`` times ``STEP``.
         The camera looks along its way and from side to side, at eye level, a little shaken.
         """
         path = _closed_path(self._waypoints())
         length = float(path.x[-1])
-        s = STEP * np.arange(frames)
+        s = pace * STEP * np.arange(frames)
         position, ahead = path(s % length), path((s + _AHEAD) % length)
         direction = ahead - position
         direction /= np.linalg.norm(direction, axis=1, keepdims=True)
