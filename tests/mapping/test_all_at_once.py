@@ -82,13 +82,17 @@ def test_there_is_no_online_result(both):
     assert "mapping" not in after.stopwatch.seconds
 
 
-def test_a_system_goes_on_from_a_checkpoint(frames, both, tmp_path: Path):
-    slam = followed(frames, True, AT)
+@pytest.mark.parametrize("seen", [AT, FRAMES])
+def test_a_system_goes_on_from_a_checkpoint(frames, both, tmp_path: Path, seen: int):
+    slam = followed(frames, True, seen)
+    if seen == FRAMES:
+        slam.end_stream()
     write_checkpoint(checkpoint_folder(tmp_path), Work(slam.state()))
     other = Slam(slam.camera, slam.config)  # it is told by the state
     other.restore(SavedState(tmp_path, Work).work("slam"))
-    for frame in frames[1][AT:]:
+    for frame in frames[1][seen:]:
         other.process(frame)
+    other.end_stream()
     other.finish()
     after = both[1]
     assert np.array_equal(other.trajectory().T_wc, after.trajectory().T_wc)
@@ -114,6 +118,13 @@ def test_a_map_is_made_briefly_after_an_interruption(frames):
     slam.map_briefly(100.0)  # there is one now
     assert (slam.mapper.mapped, len(slam.mapper.map)) == (mapped, disks)
     assert not slam.is_refined
+
+
+def test_without_a_keyframe_there_is_no_map(frames):
+    slam = Slam(frames[0], quick(), defers_map=True)
+    slam.process(frames[1][0])
+    slam.finish()
+    assert len(slam.snapshot()) == 0
 
 
 def test_what_needs_the_map_on_the_way_has_it(frames):

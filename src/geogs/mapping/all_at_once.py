@@ -29,6 +29,8 @@ def map_all(
     if seconds is not None:
         ids, until = spread_order(ids), time.perf_counter() + SEARCHED * seconds
     search_depths(mapper, ids, lambda done: progress(SEARCHED * done), until)
+    if not mapper.mapped:
+        return
     mapper.check_depths()
     mapper.grow()
     steps = max(mapper.config.final_iterations, mapper.config.iterations * len(keyframe_ids))

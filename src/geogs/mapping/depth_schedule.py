@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 
 from geogs.mapping.mapper import Mapper
 from geogs.threads import worker_count
@@ -41,12 +42,19 @@ def search_depths(
     done, size = 0, _AT_ONCE if until is None else group_size()
     while done < len(ids) and size > 0:
         start, group = time.perf_counter(), ids[done : done + size]
-        mapper.search_depths(group)
+        mapper.search_depths(group, partial(_report, progress, done, len(group), len(ids)))
         done += len(group)
         if until is not None:
             float(mapper.views[group[-1]].typical_depth)  # waits for a GPU
             size = _affordable(start, len(group), until)
         progress(done / len(ids))
+
+
+def _report(
+    progress: Callable[[float], None], before: int, count: int, total: int, fraction: float
+) -> None:
+    """A part of a group of ``count``, of the whole."""
+    progress((before + fraction * count) / total)
 
 
 def _affordable(start: float, searched: int, until: float) -> int:

@@ -260,9 +260,9 @@ class Mapper:
         steps = self.config.final_iterations
         self.train(steps, lambda fraction: progress(start + (1 - start) * fraction))
 
-    def search_depths(self, keyframe_ids: list[int]) -> None:
+    def search_depths(self, keyframe_ids: list[int], progress: Progress = silent) -> None:
         """Depths of some keyframes from their images; they are mapped then."""
-        self._depths.estimate([self.views[i] for i in keyframe_ids])
+        self._depths.estimate([self.views[i] for i in keyframe_ids], progress)
         self.mapped = sorted({*self.mapped, *keyframe_ids})
 
     def check_depths(self) -> None:
