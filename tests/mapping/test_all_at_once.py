@@ -122,8 +122,7 @@ def test_a_map_is_made_briefly_after_an_interruption(frames):
 
 def test_without_a_keyframe_there_is_no_map(frames):
     slam = Slam(frames[0], quick(), defers_map=True)
-    slam.process(frames[1][0])
-    slam.finish()
+    slam.refine()
     assert len(slam.snapshot()) == 0
 
 
