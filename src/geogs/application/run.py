@@ -76,10 +76,17 @@ def run(
         return _run(settings, opened, former, output, device, progress, stop, observer)
 
 
-def nobody_looks_on(settings: RunSettings, observer: RunObserver | None) -> bool:
-    """Whether the map of the way is not asked for: it may as well be made at the end."""
+def maps_at_the_end(
+    settings: RunSettings, observer: RunObserver | None, device: torch.device
+) -> bool:
+    """Whether the map is better made once, after the video: on a CPU, where nobody looks on."""
+    match settings.config.mapping.when:
+        case "online":
+            return False
+        case "after":
+            return True
     is_shown = observer is not None or settings.online_results
-    return settings.config.mapping.when == "after" or not is_shown
+    return device.type == "cpu" and not is_shown
 
 
 def seen_by(former: SavedResult, config: Config) -> InputConfig:
@@ -109,7 +116,7 @@ def _run(
     prior = open_prior(config.prior, source.camera, device)
     slam = Slam(
         source.camera, config, str(device), prior, source.is_live, source.mask,
-        source.black_is_hidden, defers_map=nobody_looks_on(settings, observer),
+        source.black_is_hidden, defers_map=maps_at_the_end(settings, observer, device),
     )  # fmt: skip
     if former is not None:
         slam.start_from(former.disks, former.keyframes)

@@ -112,8 +112,8 @@ class MappingConfig(Settings, group="mapping"):
     """The images of L_mv are this much larger than the render, at most the working image."""
     when: Annotated[Literal["auto", "online", "after"], Only("run")] = "auto"
     """Map each keyframe as soon as it is settled, or all at once after the final bundle adjustment,
-    which takes less time and shows nothing before; auto: after, where the images come from files,
-    nobody looks on, and the final training searches depths again."""
+    which takes less time, a little from the surface, and shows nothing before; auto: after, on a
+    CPU, where images come from files, nobody looks on, and the final training searches depths."""
     lag: Annotated[CountOrZero, Only("run")] = 4
     """A keyframe is mapped once this many later ones exist, so that its depth can be searched."""
     window: Annotated[Count, Only("run")] = 8
