@@ -1,5 +1,6 @@
 """Heavy calls hold PyTorch to one thread, whatever their caller uses, and give it back."""
 
+import time
 from collections.abc import Callable, Iterator
 
 import numpy as np
@@ -109,3 +110,19 @@ def test_results_come_in_the_order_of_the_items():
     fractions: list[float] = []
     assert thread_map(lambda n: n * n, range(5), fractions.append) == [0, 1, 4, 9, 16]
     assert fractions == [0.2, 0.4, 0.6, 0.8, 1.0]
+
+
+def test_after_an_interruption_what_nobody_has_begun_is_left(monkeypatch):
+    monkeypatch.setattr("geogs.threads.worker_count", lambda: 2)
+    begun: list[int] = []
+
+    def work(item: int) -> None:
+        begun.append(item)
+        time.sleep(0.02)
+
+    def interrupt(fraction: float) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        thread_map(work, range(50), interrupt)
+    assert len(begun) < 25

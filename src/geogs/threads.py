@@ -40,7 +40,10 @@ def thread_map(
     items: Sequence[T],
     progress: Callable[[float], None] = lambda fraction: None,
 ) -> list[R]:
-    """``list(map(function, items))`` over the workers; results in the order of the items."""
+    """``list(map(function, items))`` over the workers; results in the order of the items.
+
+    After an exception, which ``progress`` may raise, too, items that nobody has begun are left.
+    """
     results: list[R] = []
 
     def gather(found: Iterable[R]) -> list[R]:
@@ -52,7 +55,11 @@ def thread_map(
     if min(len(items), worker_count()) == 1:
         return gather(map(function, items))
     with ThreadPoolExecutor(worker_count()) as pool:
-        return gather(pool.map(function, items))
+        try:
+            return gather(pool.map(function, items))
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
 
 
 def run_chunks(function: Callable[[int], object], chunks: int, threads: int) -> None:

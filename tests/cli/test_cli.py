@@ -221,3 +221,17 @@ def test_the_blas_of_numpy_is_told_its_threads_before_numpy_is_imported(given, e
         [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
     )
     assert done.stdout.splitlines()[-1] == f"False {expected}"
+
+
+@pytest.mark.parametrize(("argument", "code"), [("--version", 0), ("nothing-of-ours", 2)])
+def test_a_process_ends_at_once_where_pytorch_was_loaded(argument, code):
+    """What was registered for the end is done, what was printed arrives; nothing comes after."""
+    script = (
+        f"import atexit, sys, torch; sys.argv = ['geogs', '{argument}']\n"
+        "atexit.register(print, 'registered')\n"
+        "from geogs.cli.main import main\n"
+        "main(); print('not reached')"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert done.returncode == code
+    assert done.stdout.splitlines()[-1] == "registered"
