@@ -79,14 +79,12 @@ def run(
 def maps_at_the_end(
     settings: RunSettings, observer: RunObserver | None, device: torch.device
 ) -> bool:
-    """Whether the map is better made once, after the video: on a CPU, where nobody looks on."""
-    match settings.config.mapping.when:
-        case "online":
-            return False
-        case "after":
-            return True
+    """Whether the map is made once, after the video; by default on a CPU, where nobody looks on."""
+    when = settings.config.mapping.when
+    if when != "auto":
+        return when == "after"
     is_shown = observer is not None or settings.online_results
-    return device.type == "cpu" and not is_shown
+    return device.type == "cpu" and not is_shown and settings.map is None
 
 
 def seen_by(former: SavedResult, config: Config) -> InputConfig:
