@@ -102,6 +102,19 @@ def test_training_and_refining_make_it_better(sequence):
     assert final < 0.97 * online
 
 
+def test_a_short_training_looks_only_where_it_trained(sequence, monkeypatch):
+    """Of more views than steps those that were trained; else all, each time."""
+    mapper = build(sequence[0], replace(MAPPING, iterations=1))
+    filled: list[int] = []
+    monkeypatch.setattr(mapper, "_insert", lambda view, confidence: filled.append(view.id))
+    mapper.train(6)
+    assert [filled.count(i) for i in filled[:2]] == [2, 2]  # after two steps, and after four
+    assert len(filled) == 2 + 4
+    filled.clear()
+    mapper.train(9)
+    assert filled == 2 * list(range(9))
+
+
 @pytest.mark.long
 def test_same_seed_same_map(sequence):
     first, second = (build(sequence[0][:6]) for _ in range(2))

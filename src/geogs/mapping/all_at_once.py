@@ -4,7 +4,7 @@ import time
 from collections.abc import Sequence
 
 from geogs.depth.base import Progress, silent
-from geogs.mapping.depth_schedule import search_depths, spread_order
+from geogs.mapping.depth_schedule import group_size, search_depths, spread_order
 from geogs.mapping.mapper import Mapper
 
 SEARCHED = 0.4
@@ -28,7 +28,8 @@ def map_all(
     until = None
     if seconds is not None:
         ids, until = spread_order(ids), time.perf_counter() + SEARCHED * seconds
-    search_depths(mapper, ids, lambda done: progress(SEARCHED * done), until)
+    # In groups that are as small as keeps all cores busy, so that an interruption is soon heard.
+    search_depths(mapper, ids, lambda done: progress(SEARCHED * done), until, group_size())
     if not mapper.mapped:
         return
     mapper.check_depths()

@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Callable, Sequence
-from functools import partial
 
 from geogs.mapping.mapper import Mapper
 from geogs.threads import worker_count
@@ -31,30 +30,24 @@ def search_depths(
     keyframe_ids: Sequence[int],
     progress: Callable[[float], None],
     until: float | None = None,
+    at_once: int = _AT_ONCE,
 ) -> None:
     """Search the depths of keyframes in groups; those that get one are mapped.
 
-    An exception raised by ``progress`` loses nothing of the groups before. With ``until``, a time
-    of ``time.perf_counter``, groups are small, and as soon as the next one would last longer the
-    rest is left without depth; the first group is always done.
+    Groups are of ``at_once``; an exception raised by ``progress`` loses nothing of those before.
+    With ``until``, a time of ``time.perf_counter``, groups are small, and as soon as the next one
+    would last longer the rest is left without depth; the first group is always done.
     """
     ids = list(keyframe_ids)
-    done, size = 0, _AT_ONCE if until is None else group_size()
+    done, size = 0, at_once if until is None else group_size()
     while done < len(ids) and size > 0:
         start, group = time.perf_counter(), ids[done : done + size]
-        mapper.search_depths(group, partial(_report, progress, done, len(group), len(ids)))
+        mapper.search_depths(group)
         done += len(group)
         if until is not None:
             float(mapper.views[group[-1]].typical_depth)  # waits for a GPU
             size = _affordable(start, len(group), until)
         progress(done / len(ids))
-
-
-def _report(
-    progress: Callable[[float], None], before: int, count: int, total: int, fraction: float
-) -> None:
-    """A part of a group of ``count``, of the whole."""
-    progress((before + fraction * count) / total)
 
 
 def _affordable(start: float, searched: int, until: float) -> int:

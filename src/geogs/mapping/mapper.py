@@ -260,9 +260,9 @@ class Mapper:
         steps = self.config.final_iterations
         self.train(steps, lambda fraction: progress(start + (1 - start) * fraction))
 
-    def search_depths(self, keyframe_ids: list[int], progress: Progress = silent) -> None:
+    def search_depths(self, keyframe_ids: list[int]) -> None:
         """Depths of some keyframes from their images; they are mapped then."""
-        self._depths.estimate([self.views[i] for i in keyframe_ids], progress)
+        self._depths.estimate([self.views[i] for i in keyframe_ids])
         self.mapped = sorted({*self.mapped, *keyframe_ids})
 
     def check_depths(self) -> None:
@@ -483,19 +483,29 @@ class Mapper:
             rates = [self.config.lr_final**share for share in shares]
             trainer.train(batches, rates)
             done = stop
+            seen = self._trained_lately(views, total)
             if done % prunes == 0 and done < total:
                 begin = time.perf_counter()
-                self.prune()
+                self._training().optimizer.keep(worth_keeping(self.map, self.config.disk))
+                self._carve(seen)
                 self._seconds_to_prune = time.perf_counter() - begin
             if done in splits:
                 self._split()
             if done in poses:
                 self.refine_all_poses()
             if done in fills:
-                for view in views:
+                for view in seen:
                     self._insert(view, self.config.disk.fill_confidence)
             self.trained = TrainingPlace(done, total, time.perf_counter() - start)
             progress(done / total)
+
+    def _trained_lately(self, views: list[MapView], total: int) -> list[MapView]:
+        """The views around which the map may have changed in a training of so many steps: all, but
+        of more views than steps those that have been trained."""
+        if len(views) <= total:
+            return views
+        left = set(self._order)
+        return [view for n, view in enumerate(views) if n not in left]
 
     def _split(self) -> None:
         """Split the disks that are pulled hardest; those below a pixel are small enough."""
