@@ -69,27 +69,22 @@ class Block:
 
 def main() -> None:
     options = parse()
-    suite, camera = (
-        Suite.for_walk(round(options.pace * (options.walk or options.frames))),
-        default_camera(*options.size),
-    )
+    suite = Suite.for_walk(round(options.pace * (options.walk or options.frames)))
+    camera = default_camera(*options.size)
     name = f"{suite.rooms}-rooms-{camera.width}x{camera.height}"
     folder = options.folder / (name if options.pace == 1 else f"{name}-{options.pace:g}")
     rendered = min(options.images or options.frames, options.frames)
     if options.render_only:
-        part, parts = options.part
+        part, parts = options.part, options.renderers
         first, last = (rendered * n // parts for n in (part, part + 1))
-        render(
-            suite, camera, folder, last, first=first, sharing=options.renderers, pace=options.pace
-        )
+        render(suite, camera, folder, last, first=first, sharing=parts, pace=options.pace)
         return
     renderers = [
-        subprocess.Popen([
-            sys.executable, __file__, *sys.argv[1:], "--render-only", "--part", str(n),
-            str(options.renderers),
-        ])
+        subprocess.Popen(
+            [sys.executable, __file__, *sys.argv[1:], "--render-only", "--part", str(n)]
+        )
         for n in range(options.renderers)
-    ]  # fmt: skip
+    ]
     if len(renderers) == 1 and renderers[0].wait():
         sys.exit("The walk could not be rendered.")
     slam = Slam(camera, preset(options.preset), options.device)
@@ -145,7 +140,7 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--renderers", type=int, default=1, help="processes")
     parser.add_argument("--pace", type=float, default=1.0, help="of the camera")
     parser.add_argument("--render-only", action="store_true")
-    parser.add_argument("--part", type=int, nargs=2, default=(0, 1), help="of those processes")
+    parser.add_argument("--part", type=int, default=0, help="which of those processes it is")
     return parser.parse_args()
 
 

@@ -82,7 +82,7 @@ class SlamState:
     waiting: list[int]
     adjusted: int
     is_ended: bool
-    defers_map: bool = False
+    defers_map: bool
 
 
 class Slam:
@@ -345,21 +345,17 @@ class Slam:
         """After that: train the map over all keyframes, if it is to be, or make it of them."""
         with self.stopwatch("final mapping"):
             if self.defers_map:
-                map_all(self.mapper, self._observed(), lambda f: progress("mapping", f))
+                self._map_at_once(progress)
             else:
                 self.mapper.refine(lambda f: progress("map refinement", f))
-        self._waiting.clear()
         self.is_refined = self.will_refine
 
     @on_one_torch_thread
     def map_briefly(self, seconds: float, progress: Progress = _silent) -> None:
         """After an interruption: a map within about so many seconds where there is none yet."""
-        if not self.defers_map or not self._waiting or len(self.mapper.map):
-            return
-        with self.stopwatch("final mapping"):
-            ids = self._observed()
-            map_all(self.mapper, ids, lambda f: progress("mapping", f), seconds)
-        self._waiting.clear()
+        if self.defers_map and self._waiting and not len(self.mapper.map):
+            with self.stopwatch("final mapping"):
+                self._map_at_once(progress, seconds)
 
     @on_one_torch_thread
     def rescale(self, scale: MetricScale) -> None:
@@ -519,12 +515,13 @@ class Slam:
             with self.stopwatch("pose refinement"):
                 self.mapper.refine_poses(result.active)
 
-    def _observed(self) -> list[int]:
-        """The keyframes that wait; the mapper knows them from now on."""
+    def _map_at_once(self, progress: Progress, seconds: float | None = None) -> None:
+        """Hand all keyframes that wait to the mapper, and make the map of them."""
         for id in self._waiting:
-            if id not in self.mapper.views:
+            if id not in self.mapper.views:  # else it was interrupted after that
                 self.mapper.observe(id, self._mask_of(id))
-        return [*self._waiting]
+        map_all(self.mapper, [*self._waiting], lambda f: progress("mapping", f), seconds)
+        self._waiting.clear()
 
     def _is_pose_step_due(self) -> bool:
         mapping = self.config.mapping

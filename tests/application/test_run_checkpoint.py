@@ -3,7 +3,7 @@
 import shutil
 from collections import deque
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from types import MethodType
 
@@ -19,27 +19,15 @@ from geogs.keyframes.archive import Archive, Archived
 from geogs.keyframes.grid import SampleGrid
 from geogs.slam import Slam, SlamState
 from geogs.splat.rows import GrowingRows
+from quick_systems import Work, quick_config
 
 pytestmark = pytest.mark.system
 
 FRAMES, AT = 30, 24
 
 
-@dataclass
-class Work:
-    """A checkpoint of a system alone."""
-
-    slam: SlamState
-
-
 def quick(resident: int) -> Config:
-    c = Config()
-    mapping = replace(
-        c.mapping, render_long_edge=64, iterations=2, pose_iterations=1,
-        depth=replace(c.mapping.depth, min_planes=16, max_planes=32),
-    )  # fmt: skip
-    tracking = replace(c.tracking, init_keyframes=6)
-    return replace(c, tracking=tracking, mapping=mapping, resident_keyframes=resident)
+    return replace(quick_config(pose_iterations=1), resident_keyframes=resident)
 
 
 @pytest.fixture(scope="module")

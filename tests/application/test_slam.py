@@ -15,6 +15,7 @@ from geogs.geometry.umeyama import umeyama
 from geogs.io.poses import read_tum_trajectory
 from geogs.tracking.tracker import TrackState
 from geogs.types import Trajectory
+from quick_systems import quick_config
 
 FIRST, SECOND, END = 28, 24, 42
 """Frames where the first video ends, and where the second begins and ends."""
@@ -22,13 +23,7 @@ CAMERA = geogs.Camera(fx=90.0, fy=90.0, cx=63.5, cy=47.5, width=128, height=96)
 
 
 def config() -> Config:
-    c = Config()
-    mapping = replace(
-        c.mapping, render_long_edge=64, iterations=2, pose_iterations=0, final_iterations=10,
-        depth=replace(c.mapping.depth, min_planes=16, max_planes=32),
-    )  # fmt: skip
-    tracking = replace(c.tracking, init_keyframes=6)
-    return replace(c, mapping=mapping, tracking=tracking)
+    return quick_config(pose_iterations=0, final_iterations=10)
 
 
 @pytest.fixture(scope="module")

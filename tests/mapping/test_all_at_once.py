@@ -1,6 +1,6 @@
 """A map that is made at the end, instead of on the way."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +10,8 @@ import torch
 from geogs.application.checkpoint import SavedState, checkpoint_folder, write_checkpoint
 from geogs.config import Config, InputConfig
 from geogs.io.sources.sniff import open_source
-from geogs.slam import Slam, SlamState
+from geogs.slam import Slam
+from quick_systems import Work, quick_config
 
 pytestmark = pytest.mark.system
 
@@ -21,20 +22,8 @@ class Interrupted(Exception):
     """Somebody does not want to wait."""
 
 
-@dataclass
-class Work:
-    """A checkpoint of a system alone."""
-
-    slam: SlamState
-
-
 def quick() -> Config:
-    c = Config()
-    mapping = replace(
-        c.mapping, render_long_edge=64, iterations=2, pose_iterations=0, final_iterations=40,
-        depth=replace(c.mapping.depth, min_planes=16, max_planes=32),
-    )  # fmt: skip
-    return replace(c, mapping=mapping, tracking=replace(c.tracking, init_keyframes=6))
+    return quick_config(pose_iterations=0, final_iterations=40)
 
 
 @pytest.fixture(scope="module")

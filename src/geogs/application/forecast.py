@@ -132,7 +132,7 @@ class RunForecast:
         tracking = growth * seconds.get("tracking", 0.0)
         final, stage = float(mapping.final_iterations), "map refinement"
         if self.maps_at_the_end:
-            final, stage = max(final, float(mapping.iterations * keyframes)), "mapping"
+            final, stage = float(mapping.steps_at_once(round(keyframes))), "mapping"
             step = STEP_OF_TRACKING[self.device] * tracking / max(keyframes, 1)
         else:
             views = mapping.views_per_step or mapping.window + mapping.history

@@ -80,11 +80,9 @@ def maps_at_the_end(
     settings: RunSettings, observer: RunObserver | None, device: torch.device
 ) -> bool:
     """Whether the map is made once, after the video; by default on a CPU, where nobody looks on."""
+    is_shown = observer is not None or settings.online_results or settings.map is not None
     when = settings.config.mapping.when
-    if when != "auto":
-        return when == "after"
-    is_shown = observer is not None or settings.online_results
-    return device.type == "cpu" and not is_shown and settings.map is None
+    return when == "after" or (when == "auto" and device.type == "cpu" and not is_shown)
 
 
 def seen_by(former: SavedResult, config: Config) -> InputConfig:
@@ -232,8 +230,7 @@ class _Run:
             slam.end_stream()
             if not interrupted:
                 kept = checkpoint.write(slam, source)
-            if settings.online_results and not slam.defers_map:
-                self._write_stage("online")
+            self._write_stage("online")
             interrupted |= not self._finish(correct=not interrupted)
             make_metric(slam, source, scale_source(settings.scale_from), progress)
             result = Result(slam, source, interrupted, progress)
@@ -279,40 +276,42 @@ class _Run:
         return True
 
     def _finish(self, correct: bool) -> bool:
-        """The final stages; false if a request to stop or a full GPU cut them short."""
+        """The final stages, if they are to be; false where they were not done to the end."""
 
         def report(stage: str, fraction: float) -> None:
             self.progress.stage(stage, fraction)
             self.stop.check()
 
         try:
-            if correct:
-                self._adjust_and_refine(report)
-            else:
-                self.slam.map_briefly(BRIEFLY, self.progress.stage)
-        except KeyboardInterrupt:
-            if not self.stop.requested:
-                raise
+            if correct and self._adjust_and_refine(report):
+                return True
             self.slam.map_briefly(BRIEFLY, self.progress.stage)
-            return False
         except torch.cuda.OutOfMemoryError:
             torch.cuda.empty_cache()
             self.progress.write(
                 "The GPU has no memory left for the final stages; keeping what there is."
             )
+        return False
+
+    def _adjust_and_refine(self, report: Progress) -> bool:
+        """False if a request to stop cut it short."""
+        slam = self.slam
+        try:
+            slam.adjust(report)
+            if slam.will_refine:
+                self._write_stage("adjusted")
+            slam.refine(report)
+        except KeyboardInterrupt:
+            if not self.stop.requested:
+                raise
             return False
         return True
 
-    def _adjust_and_refine(self, report: Progress) -> None:
-        slam = self.slam
-        slam.adjust(report)
-        if self.settings.online_results and slam.will_refine and not slam.defers_map:
-            self._write_stage("adjusted")
-        slam.refine(report)
-
     def _write_stage(self, name: Literal["online", "adjusted"]) -> None:
-        write_stage(self.output, self.slam, self.progress, name)
-        self.stages.append(name)
+        """What there is by now, if it is asked for, and if there is a map."""
+        if self.settings.online_results and not self.slam.defers_map:
+            write_stage(self.output, self.slam, self.progress, name)
+            self.stages.append(name)
 
 
 def _timed(frames: Iterator[Frame], stopwatch: Stopwatch) -> Iterator[Frame]:

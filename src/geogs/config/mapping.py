@@ -161,6 +161,11 @@ class MappingConfig(Settings, group="mapping"):
         """Whether the map can be made after the video with no other result: no online one."""
         return self.when != "online" and self.final_iterations > 0 and self.final_depth
 
+    def steps_at_once(self, keyframes: int) -> int:
+        """Training steps of a map that is made of so many keyframes at once: those of the final
+        training, or what all would have had on the way where that is more."""
+        return max(self.final_iterations, self.iterations * keyframes)
+
     @property
     def pose_loss(self) -> LossConfig:
         """The terms of the pose step: L_d, L_n and L_mv with their mapping weights."""

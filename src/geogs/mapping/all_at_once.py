@@ -5,10 +5,7 @@ from collections.abc import Sequence
 
 from geogs.depth.base import Progress, silent
 from geogs.mapping.depth_schedule import group_size, search_depths, spread_order
-from geogs.mapping.mapper import Mapper
-
-SEARCHED = 0.4
-"""Part of the time that the search of the depths takes, about."""
+from geogs.mapping.mapper import SEARCHED, Mapper
 
 
 def map_all(
@@ -19,10 +16,9 @@ def map_all(
 ) -> None:
     """Give observed keyframes their depths, grow the map with all of them, and train it.
 
-    As many steps as the final training has, or as all keyframes together would have had on the way
-    where these are more. An exception raised by ``progress`` keeps what there is by then. Of a
-    limited time about a part ``SEARCHED`` is for depths, of keyframes evenly spread over all; those
-    that get none are left out. Depths that there are already stay.
+    An exception raised by ``progress`` keeps what there is by then. Of a limited time about a part
+    ``SEARCHED`` is for depths, of keyframes evenly spread over all; those that get none are left
+    out. Depths that there are already stay.
     """
     ids = [i for i in keyframe_ids if not mapper.views[i].has_depth]
     until = None
@@ -34,7 +30,7 @@ def map_all(
         return
     mapper.check_depths()
     mapper.grow()
-    steps = max(mapper.config.final_iterations, mapper.config.iterations * len(keyframe_ids))
+    steps = mapper.config.steps_at_once(len(keyframe_ids))
     if seconds is not None:  # but every keyframe is seen once
         affordable = int((1 - SEARCHED) * seconds / mapper.seconds_per_step())
         steps = min(steps, max(affordable, len(mapper.mapped)))

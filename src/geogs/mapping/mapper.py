@@ -55,6 +55,8 @@ from geogs.types import MapSnapshot, PoseCorrection, RenderedKeyframe
 _VOTERS = 96
 # Keyframes that say how the map moves with a correction, at most: neighbours say the same.
 _WITNESSES = 256
+SEARCHED = 0.4
+"""Part of the time of a search of all depths and the training after it that the search takes."""
 # Steps of the final training between two reports of progress, at least.
 _REPORTED_STEPS = 20
 # Steps from which the time of one is judged.
@@ -213,7 +215,7 @@ class Mapper:
         trainer.train(batches)
         self.pause()
         if len(self.mapped) % self.config.disk.carve_every == 0:
-            self._prune_around(view)
+            self._prune_by(self._mapped_around(view, _VOTERS))
 
     def refine_poses(self, active: Sequence[int]) -> None:
         """Give the active keyframes poses that agree better with the map; the earliest stays."""
@@ -253,10 +255,10 @@ class Mapper:
             return
         views = [self.views[i] for i in self.mapped if i not in self._given]
         if self.config.final_depth and views:
-            self._depths.estimate(views, lambda fraction: progress(0.4 * fraction))
-            self._depths.check(views)
+            self._depths.estimate(views, lambda fraction: progress(SEARCHED * fraction))
+            self.check_depths()
         self.grow()
-        start = 0.4 if self.config.final_depth else 0.0
+        start = SEARCHED if self.config.final_depth else 0.0
         steps = self.config.final_iterations
         self.train(steps, lambda fraction: progress(start + (1 - start) * fraction))
 
@@ -312,13 +314,12 @@ class Mapper:
 
     def prune(self) -> None:
         """Drop transparent and broken disks, and those that the keyframes see in free space."""
-        self._training().optimizer.keep(worth_keeping(self.map, self.config.disk))
-        self._carve([self.views[i] for i in self.mapped])
+        self._prune_by([self.views[i] for i in self.mapped])
 
-    def _prune_around(self, view: MapView) -> None:
-        """The same with the keyframes around one only: votes of others do not change."""
+    def _prune_by(self, voters: list[MapView]) -> None:
+        """The same where only some keyframes have a say, as the votes of others do not change."""
         self._training().optimizer.keep(worth_keeping(self.map, self.config.disk))
-        self._carve(self._mapped_around(view, _VOTERS))
+        self._carve(voters)
 
     @torch.no_grad()
     def renders(
@@ -486,8 +487,7 @@ class Mapper:
             seen = self._trained_lately(views, total)
             if done % prunes == 0 and done < total:
                 begin = time.perf_counter()
-                self._training().optimizer.keep(worth_keeping(self.map, self.config.disk))
-                self._carve(seen)
+                self._prune_by(seen)
                 self._seconds_to_prune = time.perf_counter() - begin
             if done in splits:
                 self._split()

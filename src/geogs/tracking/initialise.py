@@ -110,7 +110,7 @@ def two_view(camera: Camera, match: FlowMatch) -> TwoView | None:
     if E is None or E.shape != (3, 3):
         return None
     agreeing = np.flatnonzero(used)[mask[:, 0] > 0]
-    R, t, in_front = _pose_of(E, _rays(p[agreeing], K), _rays(q[agreeing], K))
+    R, t, in_front = _pose_of(E, rays_through(p[agreeing], K), rays_through(q[agreeing], K))
     if in_front.sum() < 0.3 * used.sum():
         return None
     T = np.eye(4)
@@ -122,7 +122,7 @@ def two_view(camera: Camera, match: FlowMatch) -> TwoView | None:
     good = inlier & (z > 0)
     median = np.median(z[good])
     good &= (z > 0.1 * median) & (z < 10 * median)
-    rotated = _rays(p, K) @ (K @ R).T
+    rotated = rays_through(p, K) @ (K @ R).T
     parallax = np.median(np.linalg.norm(q - rotated[:, :2] / rotated[:, 2:], axis=1)[good])
     T[:3, 3] /= median
     depth = torch.from_numpy(np.where(good, median / np.where(good, z, 1), 1.0)).float()
@@ -130,9 +130,10 @@ def two_view(camera: Camera, match: FlowMatch) -> TwoView | None:
     return TwoView(torch.from_numpy(T), depth, known, float(parallax))
 
 
-def _rays(
+def rays_through(
     pixels: Float64[np.ndarray, "n 2"], K: Float64[np.ndarray, "3 3"]
 ) -> Float64[np.ndarray, "n 3"]:
+    """Rays of z = 1 through the pixels of a camera with the matrix K."""
     return np.c_[(pixels - K[:2, 2]) / K[[0, 1], [0, 1]], np.ones(len(pixels))]
 
 

@@ -16,7 +16,7 @@ from torch import Tensor
 from geogs.geometry.nearest_rotation import nearest_rotation
 from geogs.keyframes.grid import SampleGrid
 from geogs.tracking.flow.base import FlowMatch
-from geogs.tracking.initialise import two_view
+from geogs.tracking.initialise import rays_through, two_view
 
 AGREEING = 0.4
 """Share of the matched cells that must agree with a rotation for it to be believed."""
@@ -106,7 +106,7 @@ def fit_rotation(grid: SampleGrid, match: FlowMatch) -> RotationFit | None:
     weight = weight / (1 + SUREST**2 * weight)
     edge = max(camera.width, camera.height)
     focal, centre = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
-    seen = np.c_[(pixels - centre) / focal, np.ones(len(pixels))]
+    seen = rays_through(pixels, camera.matrix().numpy())
     first, second = (x / np.linalg.norm(x, axis=1, keepdims=True) for x in (rays, seen))
     R = nearest_rotation(second.T @ first)
     some = slice(None, None, -(-len(pixels) // MOST_CELLS))
