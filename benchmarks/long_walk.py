@@ -8,7 +8,8 @@ The walk is rendered first, in another process and once for all runs into ``--fo
 ``--renderers`` share it while the system is at its beginning. Then the whole system follows it;
 reading images, and waiting for them, does not count. Printed are, for every 500 frames, the
 milliseconds per keyframe of each stage, the memory of the process (and of the GPU), keyframes and
-disks; then, stage by stage and for memory, the last 500 frames against the first, and the
+disks; then how long after the last frame each part of what follows begins, until there is a mesh;
+then, stage by stage and for memory, the last 500 frames against the first, and the
 trajectory errors. ``--walk`` keeps the rooms of a longer walk of which only the beginning is
 followed. At half the ``--pace`` the camera goes half as far with each frame, through half as many
 rooms. With fewer ``--images`` than frames the walk goes back the way it came, and so on.
@@ -29,9 +30,11 @@ import cv2
 import numpy as np
 import torch
 
+from geogs.application.surfaces import fusion_views
 from geogs.config import preset
 from geogs.evaluation.trajectory import evaluate_trajectory
 from geogs.geometry.camera import Camera
+from geogs.mesh.extract import extract_mesh
 from geogs.slam import Slam
 from geogs.synth.export import default_camera
 from geogs.types import Frame, Trajectory
@@ -95,9 +98,13 @@ def main() -> None:
     start = time.perf_counter()
     slam.end_stream()
     errors["online"] = ate(slam, truth)
+    ending: dict[str, float] = {}
     if not options.online:
-        slam.finish()
+        slam.finish(Clock(start))
         errors["final"] = ate(slam, truth)
+        ending["finished"] = round(time.perf_counter() - start, 1)
+        mesh = extract_mesh(fusion_views(slam.renders()), slam.config.mesh)
+        ending |= {"triangles": len(mesh.faces), "mesh": round(time.perf_counter() - start, 1)}
     used = [b for b in blocks if b.total > 0]
     result = {
         "options": {k: str(v) for k, v in vars(options).items()},
@@ -113,7 +120,7 @@ def main() -> None:
         "processor_ratio": round(used[-1].processor / used[0].processor, 3),
         "peak": memory("VmHWM"),
         "gpu_peak": torch.cuda.max_memory_allocated() / 1e9 if options.device == "cuda" else 0.0,
-        "end": round(time.perf_counter() - start, 1),
+        "ending": ending,
         "ate_cm": errors,
         "seconds": {k: round(v, 2) for k, v in slam.stopwatch.seconds.items()},
     }
@@ -241,6 +248,18 @@ def memory(field: str) -> float:
         if line.startswith(field):
             return round(int(line.split()[1]) * 1024 / 1e9, 3)
     return 0.0
+
+
+class Clock:
+    """Progress of what follows the video: prints when each part begins."""
+
+    def __init__(self, start: float) -> None:
+        self.start, self.known = start, ""
+
+    def __call__(self, stage: str, fraction: float) -> None:
+        if stage != self.known:
+            seconds, self.known = time.perf_counter() - self.start, stage
+            print(f"{seconds:.1f} s, {memory('VmRSS')} GB: {stage}", flush=True)
 
 
 def ate(slam: Slam, truth: np.ndarray) -> float:
