@@ -240,7 +240,7 @@ class Slam:
     @property
     def will_refine(self) -> bool:
         """Whether a refinement of the map follows the final bundle adjustment."""
-        return self.config.mapping.final_iterations > 0
+        return self.config.mapping.final_iterations != 0
 
     @on_one_torch_thread
     def process(self, frame: Frame) -> SlamStatus:

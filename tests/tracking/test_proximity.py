@@ -9,7 +9,7 @@ import geogs.tracking.proximity as proximity
 from geogs.geometry.lie import se3_exp
 from geogs.keyframes.grid import SampleGrid
 from geogs.keyframes.store import KeyframeStore, Segment
-from geogs.tracking.overlap import may_overlap
+from geogs.tracking.overlap import LARGEST_ZOOM, alike_in_size, may_overlap
 from geogs.tracking.proximity import frame_distances, proximity_pairs
 from planted_walk import SMALL, planted_tracker
 
@@ -67,6 +67,39 @@ def test_pairs_of_many_keyframes_are_those_of_looking_at_all(monkeypatch):
     assert len(far) > 10  # the way back sees the way out
     position_apart = {abs(i - a) + abs(j - b) for i, j in far for a, b in far if (a, b) != (i, j)}
     assert min(position_apart) == 4
+
+
+def face_to_face(count: int, apart: float, depth: float) -> Segment:
+    """Two rows of cameras in one line that look towards each other, half a unit from one to the
+    next, all at the same depth from what they see."""
+    grid = SampleGrid(SMALL)
+    store = KeyframeStore(grid).new_segment()
+    for n in range(2 * count):
+        there = n < count
+        T_wc = torch.diag(torch.tensor([1.0, 1, 1, 1] if there else [-1.0, 1, -1, 1]).double())
+        T_wc[2, 3] = 0.5 * n if there else 0.5 * (2 * count - 1) + apart - 0.5 * (n - count)
+        state = store.add(n, n / 3, np.zeros((4, 4, 3), np.uint8), None, torch.linalg.inv(T_wc))
+        state.inverse_depth = torch.full((grid.size,), 1 / depth)
+    return store
+
+
+def test_what_is_seen_from_rooms_away_is_not_matched():
+    store, limit = face_to_face(20, apart=12.0, depth=2.0), 60.0
+    ids = store.ids
+    there, back = ids[:20], ids[20:]
+    both = frame_distances(store, [(i, j) for i in there for j in back])
+    both += frame_distances(store, [(j, i) for i in there for j in back])
+    # The motion alone is small enough, as what is far ahead moves little.
+    assert float((both / 2 < limit).float().mean()) > 0.9
+    assert not alike_in_size(store, there, back).any()
+    # Of those in a row what the one sees is as far from the other as it says.
+    gap = 0.5 * np.abs(np.subtract.outer(there, there))
+    zoom = np.stack([gap + 2, np.abs(gap - 2)]) / 2
+    expected = ((zoom <= LARGEST_ZOOM) & (zoom >= 1 / LARGEST_ZOOM)).all(0)
+    clear = (np.abs(np.abs(np.log(zoom + 1e-9)) - np.log(LARGEST_ZOOM)) > 1e-3).all(0)
+    assert np.array_equal(alike_in_size(store, there, there)[clear], expected[clear])
+    pairs = proximity_pairs(store, ids, ids, [], 1, 0, limit, 10**4)
+    assert {(i, j) for i, j in pairs if i < 20 <= j} == {(19, 20)}  # neighbours in time
 
 
 @pytest.mark.parametrize("count", [40, 90])

@@ -13,7 +13,7 @@ SEARCH = 10.0
 rooms on CPUs, as are the other factors here."""
 FINAL_STEP = 0.85
 """What a step of the final training costs, in those of the training on the way."""
-STEP_OF_TRACKING = {"cpu": 0.12, "cuda": 0.04}
+STEP_OF_TRACKING = {"cpu": 0.12, "cuda": 0.013}
 """What a training step costs where nothing was trained on the way, as a part of what tracking has
 taken for each keyframe."""
 ADJUSTMENT = 0.33
@@ -130,9 +130,10 @@ class RunForecast:
         tracked for ``growth`` times as long as it has until now."""
         mapping, seconds = self.config.mapping, self.stopwatch.seconds
         tracking = growth * seconds.get("tracking", 0.0)
-        final, stage = float(mapping.final_iterations), "map refinement"
+        on_gpu = self.device == "cuda"
+        final, stage = float(mapping.final_steps(on_gpu)), "map refinement"
         if self.maps_at_the_end:
-            final, stage = float(mapping.steps_at_once(round(keyframes))), "mapping"
+            final, stage = float(mapping.steps_at_once(round(keyframes), on_gpu)), "mapping"
             step = STEP_OF_TRACKING[self.device] * tracking / max(keyframes, 1)
         else:
             views = mapping.views_per_step or mapping.window + mapping.history

@@ -76,13 +76,11 @@ def run(
         return _run(settings, opened, former, output, device, progress, stop, observer)
 
 
-def maps_at_the_end(
-    settings: RunSettings, observer: RunObserver | None, device: torch.device
-) -> bool:
-    """Whether the map is made once, after the video; by default on a CPU, where nobody looks on."""
+def maps_at_the_end(settings: RunSettings, observer: RunObserver | None) -> bool:
+    """Whether the map is made once, after the video; by default where nobody looks on."""
     is_shown = observer is not None or settings.online_results or settings.map is not None
     when = settings.config.mapping.when
-    return when == "after" or (when == "auto" and device.type == "cpu" and not is_shown)
+    return when == "after" or (when == "auto" and not is_shown)
 
 
 def seen_by(former: SavedResult, config: Config) -> InputConfig:
@@ -112,7 +110,7 @@ def _run(
     prior = open_prior(config.prior, source.camera, device)
     slam = Slam(
         source.camera, config, str(device), prior, source.is_live, source.mask,
-        source.black_is_hidden, defers_map=maps_at_the_end(settings, observer, device),
+        source.black_is_hidden, defers_map=maps_at_the_end(settings, observer),
     )  # fmt: skip
     if former is not None:
         slam.start_from(former.disks, former.keyframes)

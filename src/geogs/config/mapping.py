@@ -18,6 +18,9 @@ from geogs.config.setting import (
     Weight,
 )
 
+FINAL_STEPS = 600, 3000
+"""Of the final training where nobody says how many, on the CPU and on a GPU."""
+
 
 @dataclass(frozen=True)
 class DiskConfig(Settings, group="mapping.disk"):
@@ -112,8 +115,8 @@ class MappingConfig(Settings, group="mapping"):
     """The images of L_mv are this much larger than the render, at most the working image."""
     when: Annotated[Literal["auto", "online", "after"], Only("run")] = "auto"
     """Map each keyframe as soon as it is settled, or all at once after the final bundle adjustment,
-    which takes less time, a little from the surface, and shows nothing before; auto: after, on a
-    CPU, where images come from files, nobody looks on, and the final training searches depths."""
+    which takes less time and shows nothing before; auto: after, where images come from files,
+    nobody looks on, and the final training searches depths."""
     lag: Annotated[CountOrZero, Only("run")] = 4
     """A keyframe is mapped once this many later ones exist, so that its depth can be searched."""
     window: Annotated[Count, Only("run")] = 8
@@ -124,8 +127,11 @@ class MappingConfig(Settings, group="mapping"):
     """Steps per keyframe."""
     views_per_step: Annotated[CountOrZero, Only("run")] = 2
     """Views of the window in each step; 0 sums the loss over the whole window as the paper does."""
-    final_iterations: Annotated[CountOrZero, Only("run"), Basic()] = 600
-    """Single-view steps over all keyframes after the final bundle adjustment; 0 stops online."""
+    final_iterations: Annotated[int | Literal["auto"], Range(0, 10**6), Only("run"), Basic()] = (
+        "auto"
+    )
+    """Single-view steps over all keyframes after the final bundle adjustment; 0 stops online;
+    auto: 600 on a CPU, 3000 on a GPU, where they take a few seconds."""
     final_depth: Annotated[bool, Only("run")] = True
     """Search all keyframe depths once more with the final poses."""
     final_pose_rounds: Annotated[CountOrZero, Only("run")] = 0
@@ -159,12 +165,18 @@ class MappingConfig(Settings, group="mapping"):
     @property
     def may_follow(self) -> bool:
         """Whether the map can be made after the video with no other result: no online one."""
-        return self.when != "online" and self.final_iterations > 0 and self.final_depth
+        return self.when != "online" and self.final_iterations != 0 and self.final_depth
 
-    def steps_at_once(self, keyframes: int) -> int:
+    def final_steps(self, on_gpu: bool) -> int:
+        """Steps of the final training."""
+        if self.final_iterations == "auto":
+            return FINAL_STEPS[on_gpu]
+        return self.final_iterations
+
+    def steps_at_once(self, keyframes: int, on_gpu: bool) -> int:
         """Training steps of a map that is made of so many keyframes at once: those of the final
         training, or what all would have had on the way where that is more."""
-        return max(self.final_iterations, self.iterations * keyframes)
+        return max(self.final_steps(on_gpu), self.iterations * keyframes)
 
     @property
     def pose_loss(self) -> LossConfig:

@@ -251,7 +251,7 @@ class Mapper:
 
     def refine(self, progress: Progress = silent) -> None:
         """Train over all keyframes with the final poses, after searching their depths again."""
-        if not self.mapped or self.config.final_iterations <= 0:
+        if not self.mapped or self.config.final_iterations == 0:
             return
         views = [self.views[i] for i in self.mapped if i not in self._given]
         if self.config.final_depth and views:
@@ -259,7 +259,7 @@ class Mapper:
             self.check_depths()
         self.grow()
         start = SEARCHED if self.config.final_depth else 0.0
-        steps = self.config.final_iterations
+        steps = self.config.final_steps(self.on_gpu)
         self.train(steps, lambda fraction: progress(start + (1 - start) * fraction))
 
     def search_depths(self, keyframe_ids: list[int]) -> None:
@@ -359,6 +359,11 @@ class Mapper:
     def optimizer(self) -> MapOptimizer:
         """What changes the map, once a keyframe is mapped."""
         return self._training().optimizer
+
+    @property
+    def on_gpu(self) -> bool:
+        """Whether the map is trained on a GPU."""
+        return self.map.device.type == "cuda"
 
     @property
     def unit(self) -> float:

@@ -1,4 +1,4 @@
-"""Which keyframes cannot see enough of each other, found without looking at single cells."""
+"""Which keyframes cannot be matched with each other, found without looking at single cells."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,6 +14,10 @@ from geogs.keyframes.store import Segment
 
 TILES = 4, 6
 """Rows and columns of tiles into which the cells of a keyframe are grouped."""
+LARGEST_ZOOM = 2.5
+"""By how much larger one of two keyframes may show what the other looks at: matching compares
+windows of one size. A view from rooms away, through all walls between, would pass by its motion
+alone, as what is far ahead moves little in the image when the camera goes towards it."""
 TARGETS_TOGETHER = 32
 """Keyframes against which all others are held at a time; bounds memory."""
 
@@ -64,6 +68,31 @@ def may_overlap(
         share = spheres.of(near).reach(*planes).float() @ spheres.share
         out[near.numpy(), begin : begin + len(part)] = (share > least - 1e-6).numpy()
     return out
+
+
+def alike_in_size(
+    store: Segment, first: Sequence[int], second: Sequence[int]
+) -> Bool[np.ndarray, "n m"]:
+    """Whether two keyframes show what either looks at in sizes up to ``LARGEST_ZOOM`` apart.
+
+    What a keyframe looks at is the point on its optical axis at the median depth.
+    """
+    ids = sorted({*first, *second})
+    row = {id: n for n, id in enumerate(ids)}
+    T_wc = se3_inverse(store.poses(ids)).float()
+    depth = torch.cat([
+        1 / store.inverse_depths(ids[n : n + 64]).median(1).values.cpu()
+        for n in range(0, len(ids), 64)
+    ])  # fmt: skip
+    centre, point = T_wc[:, :3, 3], T_wc[:, :3, 2] * depth[:, None] + T_wc[:, :3, 3]
+    i, j = ([row[id] for id in part] for part in (first, second))
+
+    def fits(looks: list[int], other: list[int]) -> Bool[Tensor, "a b"]:
+        zoom = torch.cdist(point[looks], centre[other]) / depth[looks, None]
+        return (zoom <= LARGEST_ZOOM) & (zoom >= 1 / LARGEST_ZOOM)
+
+    alike: Bool[np.ndarray, "n m"] = (fits(i, j) & fits(j, i).mT).numpy()
+    return alike
 
 
 def _spheres(store: Segment, ids: Sequence[int], step: int) -> _Spheres:

@@ -10,7 +10,7 @@ from geogs.bundle.pairs import LEAST_OVERLAP
 from geogs.bundle.select import keyframe_pairs
 from geogs.keyframes.store import Segment
 from geogs.threads import thread_map
-from geogs.tracking.overlap import may_overlap
+from geogs.tracking.overlap import alike_in_size, may_overlap
 
 Pair = tuple[int, int]
 """Two keyframe ids, the earlier first; an edge of the graph in both directions."""
@@ -39,9 +39,10 @@ def proximity_pairs(
 ) -> list[Pair]:
     """Pairs to add between ``later`` and ``earlier`` keyframes (DROID-SLAM's proximity factors).
 
-    Every later keyframe is paired with its ``radius`` predecessors; then pairs are taken by growing
-    distance up to ``max_distance`` pixels, each suppressing those within ``suppression`` keyframes
-    of it, as the existing pairs do, until ``max_pairs`` are found.
+    Every later keyframe is paired with its ``radius`` predecessors; then pairs that show things
+    alike in size are taken by growing distance up to ``max_distance`` pixels, each suppressing
+    those within ``suppression`` keyframes of it, as the existing pairs do, until ``max_pairs`` are
+    found.
     """
     ids = store.ids
     position = {k: n for n, k in enumerate(ids)}
@@ -82,8 +83,10 @@ def _by_distance(
 ) -> list[Pair]:
     """Wanted pairs of positions that are near enough, by growing distance."""
     ids = store.ids
+    first, second = ([ids[k] for k in part.tolist()] for part in (rows, columns))
+    if wanted.any():
+        wanted = wanted & alike_in_size(store, first, second)
     if int(wanted.sum()) > PAIRS_TOGETHER[0]:
-        first, second = ([ids[k] for k in part.tolist()] for part in (rows, columns))
         wanted = wanted & may_overlap(store, first, second, LEAST_OVERLAP, 2)
         wanted &= may_overlap(store, second, first, LEAST_OVERLAP, 2).T
     at = np.stack(np.nonzero(wanted), 1)
