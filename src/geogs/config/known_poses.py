@@ -52,21 +52,7 @@ def known_pose_mapping() -> MappingConfig:
     sharper; disks move in smaller steps; depths are searched without the network, which is less
     precise than what exact poses allow.
     """
-    loss = LossConfig(
-        depth_weight=0.5,
-        normal_consistency_weight=0.05,
-        distortion_weight=0.2,
-        opacity_weight=0.1,
-        silhouette_weight=0.3,
-        l1_weight=4.0,
-        l1_huber=0.005,
-        l1_cut=0.1,
-        ncc_patch=5,
-        ncc_reject=0.5,
-        ncc_min_variance=1e-8,
-        ncc_texture=1e-6,
-        occlusion=1.0,
-    )
+    loss = LossConfig(depth_weight=0.5, ncc_reject=0.5, occlusion=1.0)
     return MappingConfig(
         lr_position=3e-4,
         lr_final=0.03,

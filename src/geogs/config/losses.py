@@ -25,17 +25,17 @@ class LossConfig(Settings, group="mapping.loss"):
     Every term is the sum over its valid pixels divided by the number of all pixels of the view.
     """
 
-    depth_weight: Weight = 2.0
+    depth_weight: Weight = 0.15
     """L_d, rendered depth against the keyframe's depth."""
     normal_weight: Annotated[Weight, Only("run")] = 0.05
     """L_n, rendered normal against a monocular prior's where there is one."""
-    normal_consistency_weight: Weight = 0.02
+    normal_consistency_weight: Weight = 0.05
     """L_nc, rendered normal against the normal of the rendered depth."""
-    distortion_weight: Weight = 0.1
+    distortion_weight: Weight = 0.2
     """L_dist, spread of the depths along a ray over the map's length unit."""
-    opacity_weight: Weight = 0.02
+    opacity_weight: Weight = 0.1
     """1 - alpha, closes holes."""
-    silhouette_weight: Annotated[Weight, Only("reconstruct")] = 0.1
+    silhouette_weight: Annotated[Weight, Only("reconstruct")] = 0.3
     """alpha outside the masks, where there are masks."""
     smoothness_weight: Weight = 0.0
     """L_ds, edge-aware smoothness of depth over its median."""
@@ -43,21 +43,21 @@ class LossConfig(Settings, group="mapping.loss"):
     """Decay of smoothness with the image gradient (image in [0, 1])."""
     min_alpha: Annotated[float, Range(0, below=1)] = 0.5
     """Rendered depth and normals count where alpha exceeds this."""
-    l1_weight: Weight = 1.0
+    l1_weight: Weight = 4.0
     """L_1, difference between a view and its neighbour warped into it."""
-    l1_huber: Share = 0.02
+    l1_huber: Share = 0.005
     """Grey difference (of 1) up to which L_1 is quadratic; 0 for the plain absolute value."""
-    l1_cut: Annotated[float, Range(above="l1_huber", most=10)] = 0.2
+    l1_cut: Annotated[float, Range(above="l1_huber", most=10)] = 0.1
     """Grey difference (of 1) from which L_1 is constant."""
     ncc_weight: Weight = 0.5
     """L_ncc, 1 - normalised cross-correlation."""
-    ncc_patch: Annotated[int, Range(3, 15, odd=True)] = 7
+    ncc_patch: Annotated[int, Range(3, 15, odd=True)] = 5
     """Side of the correlation window in pixels of the photometric image."""
     ncc_reject: Annotated[float, Range(above=0, most=2)] = 0.9
     """Windows with 1 - NCC of this or more are taken for occluded or changed."""
-    ncc_min_variance: Annotated[float, Range(1e-12, 1)] = 1e-4
+    ncc_min_variance: Annotated[float, Range(1e-12, 1)] = 1e-8
     """Windows of the reference with less grey variance have no texture to correlate."""
-    ncc_texture: Share = 1e-4
+    ncc_texture: Share = 1e-6
     """A window of grey variance v weighs v / (v + this); 0 weighs all windows alike."""
     ncc_min_coverage: Annotated[float, Range(above=0, most=1)] = 0.7
     """Windows with a smaller valid share are left out."""

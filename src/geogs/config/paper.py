@@ -31,6 +31,7 @@ def paper_losses() -> LossConfig:
         l1_huber=0.0,
         l1_cut=10.0,
         ncc_weight=0.15,
+        ncc_patch=7,
         ncc_reject=2.0,
         ncc_min_variance=1e-8,
         ncc_texture=0.0,

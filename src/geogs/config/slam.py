@@ -42,8 +42,8 @@ class Config(Settings):
 def preset(name: Preset) -> Config:
     """The settings of a preset.
 
-    ``fast`` stops after the online map; ``accurate`` works on larger images and trains longer;
-    ``paper`` does what the GeoGS-SLAM paper does.
+    ``fast`` stops after the online map; ``accurate``, for a GPU, works on larger images, renders at
+    their size and trains longer; ``paper`` does what the GeoGS-SLAM paper does.
     """
     base = Config()
     if name == "fast":
@@ -57,7 +57,10 @@ def preset(name: Preset) -> Config:
         )
         return replace(base, mapping=mapping)
     if name == "accurate":
-        mapping = replace(base.mapping, render_long_edge=400, iterations=15, final_iterations=1500)
+        disk = replace(base.mapping.disk, stride=6)
+        mapping = replace(
+            base.mapping, render_long_edge=640, iterations=15, final_iterations=3000, disk=disk
+        )
         return replace(base, input=replace(base.input, long_edge=640), mapping=mapping)
     if name == "paper":
         return replace(
