@@ -9,6 +9,7 @@ from geogs.config import Config
 from geogs.depth.view import DenseDepth
 from geogs.geometry.camera import Camera
 from geogs.keyframes.archive import Archive
+from geogs.keyframes.keyframe import MeasuredCells
 from geogs.mapping.cameras import MapCameras
 from geogs.mapping.held_depths import HeldDepths
 from geogs.mapping.stored_maps import StoredDepth
@@ -36,6 +37,26 @@ def test_depth_of_what_moves_is_not_believed():
     torch.testing.assert_close(found.confidence, expected)
     torch.testing.assert_close(found.depth, 2 * one)
     assert found.typical == 2
+
+
+def test_measured_depth_weighs_more_in_the_losses_alone():
+    image = np.zeros((64, 80, 3), np.uint8)
+    poses = torch.eye(4, dtype=torch.float64)
+    segment = segment_of([Sample(n, image, poses) for n in (0, 1)], CAMERA)
+    config = replace(Config().mapping, render_long_edge=40)
+    pool = ViewPool(MapCameras.of(CAMERA, config), config.loss, torch.device("cpu"), 4)
+    none = torch.zeros(segment[1].grid.size)
+    segment[1].measured = MeasuredCells(none, none)
+    one = torch.ones(32, 40)
+    for n in (0, 1):
+        pool.add(segment[n])
+        for confidence in (0.5, 0.9):  # searched, then checked when the constants are there
+            pool.set_depth(n, DenseDepth(2 * one, confidence * one, torch.tensor(2.0)))
+            constants, depth = pool.constants(n), pool.depth(n)
+            assert constants is not None and depth is not None
+            factor = config.loss.measured_factor if n else 1.0
+            torch.testing.assert_close(constants.confidence, factor * confidence * one)
+            torch.testing.assert_close(depth.confidence, confidence * one)
 
 
 def test_few_depths_are_held_beside_their_archive():

@@ -46,11 +46,11 @@ class SearchConfig(Settings, group="search"):
 
 
 def known_pose_mapping() -> MappingConfig:
-    """Mapping where poses are exact: the images say more about the surface than the first depths.
+    """Mapping where poses are exact, so that images may be compared more strictly than in a run.
 
-    So photo-consistency weighs more than in a run, down to faint texture, and the occlusion test is
-    sharper; disks move in smaller steps; depths are searched without the network, which is less
-    precise than what exact poses allow.
+    What is hidden is told by less, windows that do not match are left out sooner, disks move in
+    smaller steps, and depths are searched without the network, which is less precise than what
+    exact poses allow.
     """
     loss = LossConfig(depth_weight=0.5, ncc_reject=0.5, occlusion=1.0)
     return MappingConfig(

@@ -27,6 +27,8 @@ class LossConfig(Settings, group="mapping.loss"):
 
     depth_weight: Weight = 0.15
     """L_d, rendered depth against the keyframe's depth."""
+    measured_factor: Annotated[Weight, Only("run")] = 13.0
+    """How much more L_d weighs in keyframes whose depth a sensor measured."""
     normal_weight: Annotated[Weight, Only("run")] = 0.05
     """L_n, rendered normal against a monocular prior's where there is one."""
     normal_consistency_weight: Weight = 0.05

@@ -37,7 +37,7 @@ class ViewConstants:
     prior_depth: Float[Tensor, "h w"]
     """The keyframe's own depth D_f in map units; 0 where unknown, ``OUTSIDE`` beyond a mask."""
     confidence: Float[Tensor, "h w"]
-    """Weight of the prior depth, in [0, 1]."""
+    """Weight of the prior depth, in [0, 1] unless it was measured."""
     prior_normal: Float[Tensor, "h w 3"] | None = None
     """Unit normals N_f in the camera frame, facing the camera; zero where unknown."""
 

@@ -149,7 +149,7 @@ class ViewPool:
             maps.constants = replace(
                 maps.constants,
                 prior_depth=self._prior_depth(stored, depth).float(),
-                confidence=depth.confidence.float(),
+                confidence=self._weight(stored, depth).float(),
                 prior_normal=self._prior_normal(maps, depth),
             )
 
@@ -255,9 +255,14 @@ class ViewPool:
 
     def _constants(self, maps: ViewMaps, depth: DenseDepth, stored: StoredMaps) -> ViewConstants:
         return ViewConstants.prepare(
-            maps.image, self.cameras.render, self._prior_depth(stored, depth), depth.confidence,
-            self._prior_normal(maps, depth),
+            maps.image, self.cameras.render, self._prior_depth(stored, depth),
+            self._weight(stored, depth), self._prior_normal(maps, depth),
         )  # fmt: skip
+
+    def _weight(self, stored: StoredMaps, depth: DenseDepth) -> Float[Tensor, "h w"]:
+        """Of each pixel in L_d."""
+        is_measured = stored.keyframe.measured is not None
+        return depth.confidence * (self.loss.measured_factor if is_measured else 1.0)
 
     def _at_scale(self, maps: ViewMaps, stored: StoredMaps) -> ViewMaps:
         """The maps, whose depth follows the keyframe's scale."""
