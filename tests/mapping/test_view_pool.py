@@ -53,7 +53,8 @@ def test_measured_depth_weighs_more_in_the_losses_alone():
         for confidence in (0.5, 0.9):  # searched, then checked when the constants are there
             pool.set_depth(n, DenseDepth(2 * one, confidence * one, torch.tensor(2.0)))
             constants, depth = pool.constants(n), pool.depth(n)
-            assert constants is not None and depth is not None
+            assert constants is not None
+            assert depth is not None
             factor = config.loss.measured_factor if n else 1.0
             torch.testing.assert_close(constants.confidence, factor * confidence * one)
             torch.testing.assert_close(depth.confidence, confidence * one)
