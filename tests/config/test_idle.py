@@ -33,6 +33,7 @@ CASES = {
     "--mapping.loss.ablation.smoothness-rewards-edges": "rewards-edges does nothing",
     "--mapping.loss.occlusion-share 0.1 --mapping.loss.occlusion 1": "mapping.loss.occlusion does",
     "--mapping.loss.colour --mapping.loss.l1-weight 0": "mapping.loss.colour does nothing",
+    "--mapping.loss.measured-factor 2": "mapping.loss.measured-factor does nothing",
     "--prior.card omnidata": "prior.card does nothing",
     "--prior.normal-card omnidata": "prior.normal-card does nothing",
 }
