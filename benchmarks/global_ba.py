@@ -29,12 +29,9 @@ from geogs.bundle.camera_system import SparseCameraSystem
 from geogs.config import TrackingConfig
 from geogs.geometry.lie import se3_inverse
 from geogs.geometry.umeyama import umeyama
-from geogs.keyframes.grid import SampleGrid
-from geogs.keyframes.store import KeyframeStore
 from geogs.loop.global_bundle import global_bundle, global_pairs
 from geogs.synth.export import default_camera
-from geogs.tracking.proximity import proximity_pairs
-from geogs.tracking.tracker import Tracker
+from geogs.tracking.tracker import Tracker, TrackState
 from planted_walk import CAMERA, drift, planted_tracker
 from suite import Suite
 
@@ -77,17 +74,14 @@ def through_rooms(count: int) -> None:
     """Pairs and camera system of a walk through many rooms in this process."""
     torch.set_num_threads(1)
     walk = Suite.for_walk(12_000).walk(20_000, 0.6)
-    grid, config = SampleGrid(default_camera(512, 288)), TrackingConfig()
-    store = KeyframeStore(grid).new_segment()
+    tracker = Tracker(default_camera(512, 288))
+    tracker.state = TrackState.TRACKING
     for n, at in enumerate(np.linspace(0, len(walk) - 1, count).astype(int)):
         T_cw = torch.from_numpy(np.linalg.inv(walk[at]))
-        state = store.add(n, n / 3, np.zeros((4, 4, 3), np.uint8), None, T_cw)
-        state.inverse_depth = torch.full((grid.size,), 1 / 2.2)
-    ids, tick = store.ids, time.perf_counter()
-    pairs = proximity_pairs(
-        store, ids, ids, [], config.radius, config.global_suppression,
-        config.global_distance * grid.camera.width, config.global_pairs * count,
-    )  # fmt: skip
+        state = tracker.keyframes.add(n, n / 3, np.zeros((4, 4, 3), np.uint8), None, T_cw)
+        state.inverse_depth = torch.full((tracker.keyframes.grid.size,), 1 / 2.2)
+    tick = time.perf_counter()
+    pairs = global_pairs(tracker)
     chosen = time.perf_counter() - tick
     edges = torch.tensor(sorted(pairs + [(j, i) for i, j in pairs]))
     system = SparseCameraSystem(edges[:, 0], edges[:, 1], torch.arange(count) > 0)

@@ -234,14 +234,8 @@ PAIRS = {
         "ablation": LossAblation(photo_gradient="sobel"),
     },
 }
-TOGETHER = LossConfig(
-    depth_weight=2.0, normal_consistency_weight=0.02, distortion_weight=0.1, opacity_weight=0.02,
-    silhouette_weight=0.1, l1_weight=1.0, l1_huber=0.02, l1_cut=0.2, ncc_patch=7,
-    ncc_min_variance=1e-4, ncc_texture=1e-4,
-)  # fmt: skip
-"""The terms of a run with thresholds that rounding seldom crosses."""
 EVERYTHING = replace(
-    TOGETHER, normal_weight=0.1, smoothness_weight=0.1, ssim_weight=0.3,
+    LossConfig(), normal_weight=0.1, smoothness_weight=0.1, ssim_weight=0.3,
     ablation=LossAblation(smoothness_rewards_edges=True),
 )  # fmt: skip
 
@@ -272,7 +266,7 @@ def test_each_multi_view_term_matches_the_plain_loss(name: str, device: torch.de
 
 
 @pytest.mark.parametrize("zoom", [0.8, 1.0, 1.5, 2.0])
-@pytest.mark.parametrize("config", [TOGETHER, EVERYTHING], ids=["of a run", "everything"])
+@pytest.mark.parametrize("config", [LossConfig(), EVERYTHING], ids=["default", "everything"])
 def test_all_terms_together_match_the_plain_loss(
     zoom: float, config: LossConfig, device: torch.device
 ) -> None:
@@ -286,7 +280,7 @@ def test_views_without_prior_normals_have_no_normal_term(device: torch.device) -
 def test_a_window_may_be_empty(device: torch.device) -> None:
     scene = Scene.make(device)
     scene.batch.fill_(-1)
-    losses = WindowLosses(scene.table, TOGETHER, UNIT, 4, 2, SHARE, with_pose=True)
+    losses = WindowLosses(scene.table, LossConfig(), UNIT, 4, 2, SHARE, with_pose=True)
     assert all((each == 0).all() for each in scene.launch(losses))
 
 
@@ -303,7 +297,7 @@ def test_views_without_depth_give_no_loss_and_no_gradient(
 
 def test_only_visible_depth_is_stored(device: torch.device) -> None:
     scene = Scene.make(device)
-    losses = WindowLosses(scene.table, TOGETHER, UNIT, 4, 2, SHARE)
+    losses = WindowLosses(scene.table, LossConfig(), UNIT, 4, 2, SHARE)
     depth, alpha = scene.maps[0].float(), scene.maps[2].float()
     losses.store_rendered(scene.batch, depth, alpha)
     known = (depth > 0) & torch.isfinite(depth) & (alpha > 0.5)
@@ -329,7 +323,7 @@ def test_the_table_grows_and_says_so(device: torch.device) -> None:
 
 def test_losses_follow_new_poses_and_constants(device: torch.device) -> None:
     scene = Scene.make(device)
-    losses = WindowLosses(scene.table, TOGETHER, UNIT, 4, 2, SHARE)
+    losses = WindowLosses(scene.table, LossConfig(), UNIT, 4, 2, SHARE)
     before = scene.launch(losses)
     poses = [p.T_cw for p in scene.photos]
     shift = se3_exp(torch.tensor([0.01, 0.02, 0.0, 0.001, 0.0, 0.002]).double()).to(device)
@@ -339,7 +333,7 @@ def test_losses_follow_new_poses_and_constants(device: torch.device) -> None:
     changed = replace(scene.views[2], prior_depth=1.1 * scene.views[2].prior_depth)
     scene.views[2] = changed
     scene.table.set_constants(2, changed)
-    fast, slow = scene.launch(losses), scene.plain(TOGETHER)
+    fast, slow = scene.launch(losses), scene.plain(LossConfig())
     assert relative(fast[0], slow[0]) < 3e-4 < relative(before[0], slow[0])
     assert relative(fast[1], slow[1]) < 3e-3
 

@@ -30,7 +30,7 @@ def map_all(
         return
     mapper.check_depths()
     mapper.grow()
-    steps = mapper.config.steps_at_once(len(keyframe_ids), mapper.on_gpu)
+    steps = mapper.config.steps_at_once(len(keyframe_ids), mapper.keyframes.grid.on_gpu)
     if seconds is not None:  # but every keyframe is seen once
         affordable = int((1 - SEARCHED) * seconds / mapper.seconds_per_step())
         steps = min(steps, max(affordable, len(mapper.mapped)))

@@ -259,7 +259,7 @@ class Mapper:
             self.check_depths()
         self.grow()
         start = SEARCHED if self.config.final_depth else 0.0
-        steps = self.config.final_steps(self.on_gpu)
+        steps = self.config.final_steps(self.keyframes.grid.on_gpu)
         self.train(steps, lambda fraction: progress(start + (1 - start) * fraction))
 
     def search_depths(self, keyframe_ids: list[int]) -> None:
@@ -359,11 +359,6 @@ class Mapper:
     def optimizer(self) -> MapOptimizer:
         """What changes the map, once a keyframe is mapped."""
         return self._training().optimizer
-
-    @property
-    def on_gpu(self) -> bool:
-        """Whether the map is trained on a GPU."""
-        return self.map.device.type == "cuda"
 
     @property
     def unit(self) -> float:

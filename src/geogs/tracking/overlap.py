@@ -16,8 +16,8 @@ TILES = 4, 6
 """Rows and columns of tiles into which the cells of a keyframe are grouped."""
 LARGEST_ZOOM = 2.5
 """By how much larger one of two keyframes may show what the other looks at: matching compares
-windows of one size. A view from rooms away, through all walls between, would pass by its motion
-alone, as what is far ahead moves little in the image when the camera goes towards it."""
+windows of one size. Two that look towards each other from rooms away, through all walls between,
+would pass by motion alone, as either sees what the other looks at far ahead, where little moves."""
 TARGETS_TOGETHER = 32
 """Keyframes against which all others are held at a time; bounds memory."""
 
