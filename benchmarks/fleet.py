@@ -162,8 +162,8 @@ def join(options: argparse.Namespace) -> None:
     """A walk through many rooms as one run, and as overlapping parts that are joined."""
     suite, camera = Suite.for_walk(options.walk), default_camera(512, 288)
     images = options.folder / f"{suite.rooms}-rooms"
-    render(suite, camera, images, options.walk, options.every)
     frames = range(0, options.walk, options.every)
+    render(suite, camera, images, frames)
     ends = np.linspace(0, len(frames), options.parts + 1).astype(int)
     overlap = len(frames) // options.parts // 10
     spans = [frames[max(a - overlap, 0) : b] for a, b in pairwise(ends)]

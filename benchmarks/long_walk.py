@@ -5,7 +5,7 @@
         [--pace 1]
 
 The walk is rendered first, in another process and once for all runs into ``--folder``; several
-``--renderers`` share it while the system is at its beginning. Then the whole system follows it;
+``--renderers`` share it while the system goes on. Then the whole system follows it;
 reading images, and waiting for them, does not count. Printed are, for every 500 frames, the
 milliseconds per keyframe of each stage, the memory of the process (and of the GPU), keyframes and
 disks; then how long after the last frame each part of what follows begins, until there is a mesh;
@@ -22,6 +22,7 @@ import os
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -43,6 +44,9 @@ from suite import Suite
 
 _PATIENCE = 600
 """Seconds for which the next image is awaited."""
+_TOGETHER = 100
+"""Frames in a row by one of several renderers: they keep a few rooms in memory, and the system does
+not wait for what comes much later."""
 
 
 @dataclass(frozen=True)
@@ -79,8 +83,8 @@ def main() -> None:
     rendered = min(options.images or options.frames, options.frames)
     if options.render_only:
         part, parts = options.part, options.renderers
-        first, last = (rendered * n // parts for n in (part, part + 1))
-        render(suite, camera, folder, last, first=first, sharing=parts, pace=options.pace)
+        mine = [n for n in range(rendered) if n // _TOGETHER % parts == part]
+        render(suite, camera, folder, mine, parts, options.pace)
         return
     renderers = [
         subprocess.Popen(
@@ -152,19 +156,17 @@ def parse() -> argparse.Namespace:
 
 
 def render(
-    suite: Suite, camera: Camera, folder: Path, frames: int, every: int = 1, first: int = 0,
+    suite: Suite, camera: Camera, folder: Path, frames: Sequence[int],
     sharing: int = 1, pace: float = 1.0,
 ) -> None:  # fmt: skip
-    """Write the images from the first on, one in so many, that are not there yet.
-
-    By this one of so many processes that share the cores.
-    """
+    """Write those of these frames that are not there yet, by one of so many processes that share
+    the cores."""
     folder.mkdir(parents=True, exist_ok=True)
-    paths = [folder / f"frame{n:06d}.jpg" for n in range(first, frames, every)]
+    paths = [folder / f"frame{n:06d}.jpg" for n in frames]
     if all(path.exists() for path in paths):
         return
     threads = max(len(os.sched_getaffinity(0)) // sharing, 1)
-    caster, poses = SuiteRaycaster(suite, threads), suite.walk(frames, pace)[first::every]
+    caster, poses = SuiteRaycaster(suite, threads), suite.walk(max(frames) + 1, pace)[list(frames)]
     with ThreadPoolExecutor(threads) as pool:
         for path, T_wc in zip(paths, poses, strict=True):
             if not path.exists():
