@@ -340,9 +340,10 @@ class Reconstruction:
         order = [i for i in ids if not mapper.views[i].has_depth]
         search_depths(mapper, order, lambda f: report(share * f), until)
         now = time.perf_counter()
-        again = (now - start) * wanted / max(len(mapper.mapped) - before, 1)
+        mapped = len(mapper.mapped)
+        again = (now - start) * mapped / max(mapped - before, 1)
         affordable = end is None or 3 * again < end - now
-        if search.repeat and affordable and len(mapper.mapped) >= wanted:
+        if search.repeat and affordable and mapped >= wanted:
             views = [mapper.views[i] for i in mapper.mapped]
             mapper.check_depths()
             sure = known.dense_points(views, mapper.cameras.render, self._random)

@@ -1,6 +1,8 @@
 """Cameras that only turn: before there is a map, where it is out of sight, and for ever."""
 
 from collections.abc import Sequence
+from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -10,7 +12,10 @@ from geogs.errors import TrackingLost
 from geogs.evaluation.trajectory import rotation_angle
 from geogs.keyframes.grid import SampleGrid
 from geogs.keyframes.store import KeyframeStore
+from geogs.tracking import start_up
 from geogs.tracking.flow.select import build_operator
+from geogs.tracking.graph import FrameGraph
+from geogs.tracking.initialise import FORGIVING, Attempt, initialise
 from geogs.tracking.segments import Segments
 from geogs.tracking.tracker import Tracker, TrackState
 from geogs.types import Frame, Trajectory
@@ -52,6 +57,35 @@ def test_a_camera_that_only_turns_has_orientations():
     assert trajectory.states == ["orientation only"] * len(path)
     assert (trajectory.T_wc[:, :3, 3] == 0).all()
     assert turned(path, trajectory).max() < 0.2
+
+
+def test_a_start_that_is_far_off_is_tried_again_with_a_quarter_more(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    """A little parallax, asked for depths surer than that gives them."""
+    attempts, adjustments = [], []
+
+    def tried(graph, config, flows):
+        adjustments.clear()
+        attempts.append((len(graph.keyframes), initialise(graph, config, flows)))
+        if attempts[-1][1] is Attempt.FAR_OFF:
+            assert len(adjustments) == FORGIVING  # no time is spent on the rest
+        return attempts[-1][1]
+
+    def adjusted(graph, *args):
+        adjustments.append(graph)
+        return adjust(graph, *args)
+
+    adjust = FrameGraph.adjust
+    monkeypatch.setattr(FrameGraph, "adjust", adjusted)
+    monkeypatch.setattr(start_up, "initialise", tried)
+    path = [pose(0.08 * np.sin(0.2 * k), yaw=0.3 * np.sin(0.1 * k)) for k in range(40)]
+    _, results = run(frames(path), replace(CONFIG, init_keyframes=8, start_deviation=1e-3))
+    assert results[-1].state is TrackState.INITIALIZING
+    assert sum(attempt is Attempt.FAR_OFF for _, attempt in attempts) >= 3
+    for (before, attempt), (now, _) in pairwise(attempts[:-1]):
+        assert now == before + 1 or attempt is Attempt.FAR_OFF or now < before
+        assert now >= 1.25 * before or attempt is not Attempt.FAR_OFF or now < before
 
 
 def test_nothing_known_is_still_an_error():

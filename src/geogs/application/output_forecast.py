@@ -40,7 +40,7 @@ to look for in each image, and the disks, which are not there yet."""
 MOST_SURFACE = 4.0
 """Times the surface of the rehearsal that is expected at most before the depths tell it: of a large
 scene only a few views may be affordable, and then what was kept for its mesh is lost to them."""
-MESH_SHARE = 0.4
+MESH_SHARE = 0.3
 """Part of the time that is left which mesh and files may take; where they would take more, the mesh
 gets fewer triangles."""
 FEWEST_TRIANGLES = 0.25

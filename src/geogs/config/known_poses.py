@@ -29,7 +29,7 @@ class SearchConfig(Settings, group="search"):
     that see all of the scene from places apart; of near ones the sharper."""
     first_batch: Annotated[int, Range(2, 100_000)] = 24
     """Images read before it is known for how many the time lasts."""
-    depth_share: Annotated[float, Range(above=0, most=1)] = 0.4
+    depth_share: Annotated[float, Range(above=0, most=1)] = 0.25
     """Most of the time up to then that reading and the depths may take; images for which it does
     not last are not read, or get no depth and only serve to find those of the others."""
     output_share: Annotated[float, Range(0, below=1)] = 0.2

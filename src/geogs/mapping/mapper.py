@@ -59,8 +59,8 @@ SEARCHED = 0.4
 """Part of the time of a search of all depths and the training after it that the search takes."""
 # Steps of the final training between two reports of progress, at least.
 _REPORTED_STEPS = 20
-# Steps from which the time of one is judged.
-_REHEARSED_STEPS = 16
+# Steps from which the time of one is judged, if they take so many seconds; else so often again.
+_REHEARSED_STEPS, _TELLING_SECONDS, _REHEARSALS = 16, 0.2, 8
 
 
 def never_pause() -> None:
@@ -304,13 +304,22 @@ class Mapper:
         self._training().optimizer.keep(self.map.seen > 0)
 
     def seconds_per_step(self) -> float:
-        """What a training step takes, from a few of them at full rate."""
-        for steps in (2, _REHEARSED_STEPS):  # the first ones make ready what is needed but once
-            start = time.perf_counter()
-            drawn = self._random.choice(self.mapped, steps)
-            self._training().train([self._batch([int(i)]) for i in drawn])
-            float(self.map.position.detach().sum())  # waits for a GPU
-        return (time.perf_counter() - start) / _REHEARSED_STEPS
+        """What a training step takes, from some of them at full rate: from more where these are
+        quick."""
+        self._rehearse(2)  # makes ready what is needed but once
+        seconds = self._rehearse(_REHEARSED_STEPS)
+        if seconds > _TELLING_SECONDS:
+            return seconds / _REHEARSED_STEPS
+        more = [self._rehearse(_REHEARSED_STEPS) for _ in range(_REHEARSALS)]
+        return float(np.median(more)) / _REHEARSED_STEPS
+
+    def _rehearse(self, steps: int) -> float:
+        """Seconds that so many training steps take."""
+        start = time.perf_counter()
+        drawn = self._random.choice(self.mapped, steps)
+        self._training().train([self._batch([int(i)]) for i in drawn])
+        float(self.map.position.detach().sum())  # waits for a GPU
+        return time.perf_counter() - start
 
     def prune(self) -> None:
         """Drop transparent and broken disks, and those that the keyframes see in free space."""

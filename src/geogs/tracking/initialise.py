@@ -7,6 +7,7 @@ dense bundle adjustment with re-measured flow polishes the whole.
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from enum import Enum
 from itertools import pairwise
 
 import cv2
@@ -35,6 +36,20 @@ FARTHEST = 50.0
 """Baselines beyond which a point says nothing on which of four poses is the right one."""
 LEAST_SEEN = 0.4
 """Share of the first keyframe's depths that a keyframe must see to be placed on them."""
+ROUNDS, FORGIVING = 6, 2
+"""Rounds of flow and adjustment; and those after which it shows how open depths are, for later ones
+only find less that tells them."""
+FAR = 1.5
+"""Times the allowed deviation of depths beyond which one more keyframe is not going to help."""
+
+
+class Attempt(Enum):
+    """What came of trying to start."""
+
+    STARTED = "started"
+    FAILED = "failed"
+    FAR_OFF = "far off"
+    """Depths are so open that only many more keyframes may help."""
 
 
 @dataclass(frozen=True)
@@ -49,10 +64,10 @@ class TwoView:
     """Median motion in pixels that rotation does not explain."""
 
 
-def initialise(graph: FrameGraph, config: TrackingConfig, flows: Sequence[FlowMatch]) -> bool:
+def initialise(graph: FrameGraph, config: TrackingConfig, flows: Sequence[FlowMatch]) -> Attempt:
     """Estimate all keyframes of the graph from nothing but the flows from the first to the others.
 
-    False if they show no parallax, if matches and poses leave their depths open
+    It fails if they show no parallax, if matches and poses leave their depths open
     (``start_deviation``), or if the images of two that follow each other do not correlate where
     poses and depths put them (``min_ncc``).
     On success poses, depths and information are set, the first pose is the identity and the median
@@ -63,13 +78,17 @@ def initialise(graph: FrameGraph, config: TrackingConfig, flows: Sequence[FlowMa
     min_parallax = config.min_parallax * max(camera.width, camera.height)
     best = _best_two_view(store.grid, flows, min_parallax)
     if best is None:
-        return False
+        return Attempt.FAILED
     _place_all(graph, flows, best)
-    return (
-        _polish(graph, config.radius, config.moving)
-        and _depth_deviation(graph, config.huber) <= config.start_deviation
-        and _is_borne_out(graph, config.min_ncc)
-    )
+    for rounds in (range(FORGIVING), range(FORGIVING, ROUNDS)):
+        if not _polish(graph, config.radius, config.moving, rounds):
+            return Attempt.FAILED
+        deviation = _depth_deviation(graph, config.huber)
+        if deviation > FAR * config.start_deviation:
+            return Attempt.FAR_OFF
+    if deviation > config.start_deviation or not _is_borne_out(graph, config.min_ncc):
+        return Attempt.FAILED
+    return Attempt.STARTED
 
 
 def _best_two_view(
@@ -200,17 +219,17 @@ def placed_after(graph: FrameGraph, before: Keyframe, state: Keyframe) -> Float[
     return before.T_cw if T_rel is None else T_rel.to(before.T_cw) @ before.T_cw
 
 
-def _polish(graph: FrameGraph, radius: int, moving: float, rounds: int = 6) -> bool:
+def _polish(graph: FrameGraph, radius: int, moving: float, rounds: Iterable[int]) -> bool:
     """Rounds of flow and adjustment, from forgiving to strict; then without what moves."""
     store, ids = graph.keyframes, graph.keyframes.ids
     near = [(a, b) for n, a in enumerate(ids) for b in ids[n + 1 : n + 1 + radius]]
-    for n in range(rounds):
-        graph.measure(graph.stale(near, 0.25), fine=n >= 2)
+    for n in rounds:
+        graph.measure(graph.stale(near, 0.25), fine=n >= FORGIVING)
         options = BundleOptions(iterations=4, huber=(30.0, 10.0, 3.0)[min(n, 2)])
         if graph.adjust(list(graph.edges), ids[1:], ids, options) is None:
             return False
         normalise(store)
-        if n >= 2:
+        if n >= FORGIVING:
             graph.judge_moving(ids, moving)
     return True
 

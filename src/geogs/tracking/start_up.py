@@ -1,5 +1,6 @@
 """Before there is a map: gather keyframes until one can be started from them."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -9,7 +10,7 @@ import torch
 from geogs.config import TrackingConfig
 from geogs.tracking.chained_flows import ChainedFlows
 from geogs.tracking.graph import FrameGraph
-from geogs.tracking.initialise import initialise
+from geogs.tracking.initialise import Attempt, initialise
 from geogs.tracking.keyframe_choice import KeyframeChoice
 from geogs.tracking.keyframe_priors import KeyframePriors
 from geogs.tracking.motion import ChainState, FlowChain
@@ -21,6 +22,8 @@ from geogs.types import Frame
 MIN_KEYFRAMES = 4
 MAX_MISSES = 5
 """Frames without a match after which a start that has not succeeded begins anew."""
+MORE = 0.25
+"""Part of the keyframes that are to come before a start is tried again that was far off."""
 
 
 @dataclass(frozen=True)
@@ -39,6 +42,7 @@ class StartUpState:
     """What a checkpoint holds of a start, beside keyframes and frames."""
 
     misses: int
+    enough: int
     chain: ChainState
 
 
@@ -59,14 +63,16 @@ class StartUp:
         self._chain = FlowChain(self.keyframes.grid, graph.operator, config.min_ncc)
         self._flows = ChainedFlows(graph)
         self._misses = 0
+        self._enough = 0
+        """Keyframes with which a start is tried, where an earlier one was far off."""
 
     def state(self) -> StartUpState:
         """What a checkpoint holds."""
-        return StartUpState(self._misses, self._chain.state())
+        return StartUpState(self._misses, self._enough, self._chain.state())
 
     def load(self, state: StartUpState) -> None:
         """Go on where another was."""
-        self._misses = state.misses
+        self._misses, self._enough = state.misses, state.enough
         self._chain.load(state.chain)
 
     def take(self, frame: Frame, encoded: Any, turns: Sequence[Turn] = ()) -> StartStep:
@@ -90,7 +96,10 @@ class StartUp:
         """Start with what there is; False if that cannot be."""
         if len(self.keyframes) < MIN_KEYFRAMES:
             return False
-        if not initialise(self.graph, self.config, self._flows.measure()):
+        attempt = initialise(self.graph, self.config, self._flows.measure())
+        if attempt is Attempt.FAR_OFF:
+            self._enough = math.ceil((1 + MORE) * len(self.keyframes))
+        if attempt is not Attempt.STARTED:
             return False
         self._flows.forget()
         self.priors.adjust(self.keyframes.ids, self.config.huber)
@@ -121,7 +130,7 @@ class StartUp:
         self.recorder.add_keyframe(state.id, turns)
         if len(self.keyframes) < max(self.config.init_keyframes, MIN_KEYFRAMES):
             return StartStep(is_keyframe=True)
-        if self.finish():
+        if len(self.keyframes) >= self._enough and self.finish():
             return StartStep(True, True)
         # More keyframes may bring parallax. With twice as many every other one is left out; where
         # the last no longer sees what the first saw, the first half is given up.
@@ -155,6 +164,7 @@ class StartUp:
         """Make every other keyframe an ordinary frame; the first and the last stay."""
         ids = self.keyframes.ids
         gone = tuple(ids[1:-1:2])
+        self._enough = 0
         for id in gone:
             self.graph.remove_keyframe(id)
             self.recorder.keyframe_removed(self.keyframes.remove(id), ids[ids.index(id) - 1])
@@ -163,6 +173,7 @@ class StartUp:
     def _forget(self, count: int) -> tuple[int, ...]:
         """Drop the earliest keyframes of a start that failed."""
         gone = tuple(self.keyframes.ids[:count])
+        self._enough = 0
         for id in gone:
             self.graph.remove_keyframe(id)
             self.recorder.keyframe_forgotten(self.keyframes.remove(id))
