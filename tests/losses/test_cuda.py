@@ -186,6 +186,8 @@ def spoil(maps: list[Tensor]) -> None:
 
 ACROSS = 2e-4
 """Part of the pixels that may lie on the other side of a threshold in float32."""
+OF_MOTION = 1e-2
+"""Relative difference of what all pixels together say of a pose, those across a threshold, too."""
 
 
 def relative(a: Tensor, b: Tensor, left_out: float = 0.0) -> float:
@@ -202,12 +204,12 @@ def check(scene: Scene, config: LossConfig, with_pose: bool, tolerance: float = 
     fast, slow = scene.launch(losses), scene.plain(config)
     assert fast[0].tolist() == pytest.approx(slow[0].tolist(), rel=3e-4, abs=1e-8)
     assert slow[0].norm() > 0
-    for f, s in zip(fast[1:], slow[1:], strict=False):
+    for f, s, allowed in zip(fast[1:], slow[1:], [tolerance] * 4 + [OF_MOTION], strict=False):
         assert torch.isfinite(f).all()
         if s.norm() == 0:
             assert (f == 0).all()
         else:
-            assert relative(f, s, ACROSS) < tolerance
+            assert relative(f, s, ACROSS) < allowed
             assert (f[2] == 0).all()  # the empty place
 
 
