@@ -37,8 +37,8 @@ FARTHEST = 50.0
 LEAST_SEEN = 0.4
 """Share of the first keyframe's depths that a keyframe must see to be placed on them."""
 ROUNDS, FORGIVING = 6, 2
-"""Rounds of flow and adjustment; and those after which it shows how open depths are, for later ones
-only find less that tells them."""
+"""Rounds of flow and adjustment; and those after which it shows whether depths are far too open:
+later ones find them more open yet."""
 FAR = 1.5
 """Times the allowed deviation of depths beyond which one more keyframe is not going to help."""
 
