@@ -4,8 +4,8 @@
         [--preset fast] [--folder FOLDER] [--online] [--seconds 540] [--output FILE] [--renderers 1]
         [--pace 1]
 
-The walk is rendered first, in another process and once for all runs into ``--folder``; several
-``--renderers`` share it while the system goes on. Then the whole system follows it;
+The walk is rendered once for all runs into ``--folder``, in another process before the whole system
+follows it, or by several ``--renderers`` that keep ahead of it;
 reading images, and waiting for them, does not count. Printed are, for every 500 frames, the
 milliseconds per keyframe of each stage, the memory of the process (and of the GPU), keyframes and
 disks; then how long after the last frame each part of what follows begins, until there is a mesh;

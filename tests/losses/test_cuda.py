@@ -184,10 +184,9 @@ def spoil(maps: list[Tensor]) -> None:
     spread[3, 8, 8] = spread[3, 2, 8] = float("inf")
 
 
-ACROSS = 2e-4
-"""Part of the pixels that may lie on the other side of a threshold in float32."""
-OF_MOTION = 1e-2
-"""Relative difference of what all pixels together say of a pose, those across a threshold, too."""
+ACROSS = 1e-4
+"""Part of the pixels that may lie on the other side of a threshold in float32: none in the
+emulator's small images."""
 
 
 def relative(a: Tensor, b: Tensor, left_out: float = 0.0) -> float:
@@ -197,19 +196,23 @@ def relative(a: Tensor, b: Tensor, left_out: float = 0.0) -> float:
     return float(difference[:kept].norm() / b.double().norm())
 
 
-def check(scene: Scene, config: LossConfig, with_pose: bool, tolerance: float = 6e-3) -> None:
+def check(
+    scene: Scene, config: LossConfig, with_pose: bool, tolerance: float = 6e-3, across: float = 0.0
+) -> None:
+    # Most of the difference is single pixels on the other side of a threshold; ``across`` is the
+    # part of the depth's gradient that is left out for that.
     size = (len(scene.batch), scene.pairs.shape[1])
     losses = WindowLosses(scene.table, config, UNIT, *size, SHARE, with_pose)
     scene.show(losses)
     fast, slow = scene.launch(losses), scene.plain(config)
     assert fast[0].tolist() == pytest.approx(slow[0].tolist(), rel=3e-4, abs=1e-8)
     assert slow[0].norm() > 0
-    for f, s, allowed in zip(fast[1:], slow[1:], [tolerance] * 4 + [OF_MOTION], strict=False):
+    for f, s, left_out in zip(fast[1:], slow[1:], [across, 0, 0, 0, 0], strict=False):
         assert torch.isfinite(f).all()
         if s.norm() == 0:
             assert (f == 0).all()
         else:
-            assert relative(f, s, ACROSS) < allowed
+            assert relative(f, s, left_out) < tolerance
             assert (f[2] == 0).all()  # the empty place
 
 
@@ -270,7 +273,7 @@ def test_smoothness_divides_by_the_lower_median(device: torch.device) -> None:
 
 @pytest.mark.parametrize("name", PAIRS)
 def test_each_multi_view_term_matches_the_plain_loss(name: str, device: torch.device) -> None:
-    check(Scene.make(device), replace(NOTHING, **PAIRS[name]), True)
+    check(Scene.make(device), replace(NOTHING, **PAIRS[name]), True, across=ACROSS)
 
 
 @pytest.mark.parametrize("zoom", [0.8, 1.0, 1.5, 2.0])

@@ -37,12 +37,11 @@ def _prior(prior: PriorConfig) -> Iterator[str]:
 
 def _run(config: Config) -> Iterator[str]:
     mapping = config.mapping
-    if config.input.depth == "none" and config.sensor != DepthSensorConfig():
-        yield "sensor does nothing: input.depth is none, so that no measured depth is used."
-    if config.input.depth == "none" and (
-        mapping.loss.measured_factor != LossConfig.measured_factor
-    ):
-        yield "mapping.loss.measured-factor does nothing: input.depth is none."
+    if config.input.depth == "none":
+        if config.sensor != DepthSensorConfig():
+            yield "sensor does nothing: input.depth is none, so that no measured depth is used."
+        if mapping.loss.measured_factor != LossConfig.measured_factor:
+            yield "mapping.loss.measured-factor does nothing: input.depth is none."
     if config.input.poses == "none" and config.odometry != OdometryConfig():
         yield "odometry does nothing: input.poses is none, so that no measured pose is used."
     if mapping.final_iterations == 0 and not mapping.final_depth:
