@@ -61,7 +61,7 @@ def world(drift: float):
     ways = [FlowMatch(*(x[None] for x in flow_of(*pair))) for pair in ((0, last), (last, 0))]
     T_ji = true_pose(last) @ se3_inverse(true_pose(0))
     loop = Loop(0, last, "geometry", T_ji, 1.0, 0, 1.0, *ways)
-    graph = SimpleNamespace(edges=edges, retire=lambda keep: {})
+    graph = SimpleNamespace(edges=edges, retire=lambda keep, least: {})
     tracker = Tracker.__new__(Tracker)  # nothing of it but its keyframes and their edges
     tracker.keyframes, tracker.graph, tracker.held = keyframes, graph, frozenset()
     tracker.is_metric, tracker.config = False, TrackingConfig()

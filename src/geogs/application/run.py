@@ -1,6 +1,7 @@
 """A run, from the paths of its videos to the files of its result; or on from a checkpoint."""
 
 from collections.abc import Generator, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -106,12 +107,15 @@ def _run(
     compiled_kernels(device)
     calibrated = self_calibrated(opened, config, device, progress, stop)
     found = None if calibrated is opened else calibrated.calibration
-    source = with_shutter_found(calibrated, progress, stop)
-    prior = open_prior(config.prior, source.camera, device)
-    slam = Slam(
-        source.camera, config, str(device), prior, source.is_live, source.mask,
-        source.black_is_hidden, defers_map=maps_at_the_end(settings, observer),
-    )  # fmt: skip
+    prior = open_prior(config.prior, calibrated.camera, device)
+    # A system loads much; meanwhile the images tell of the shutter, which does not concern it.
+    with ThreadPoolExecutor(1, thread_name_prefix="system") as beside:
+        made = beside.submit(
+            Slam, calibrated.camera, config, str(device), prior, calibrated.is_live,
+            calibrated.mask, calibrated.black_is_hidden, maps_at_the_end(settings, observer),
+        )  # fmt: skip
+        source = with_shutter_found(calibrated, progress, stop)
+        slam = made.result()
     if former is not None:
         slam.start_from(former.disks, former.keyframes)
     if former is not None or source.is_live:

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from io import BytesIO
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -136,9 +135,11 @@ def _keyframes(views: Sequence[ShownView], camera: Camera) -> list[KeyframeModel
 
 
 def _jpeg(image: UInt8[np.ndarray, "h w 3"], edge: int) -> bytes:
-    from PIL import Image
+    import cv2
 
-    picture, stream = Image.fromarray(image), BytesIO()
-    picture.thumbnail((edge, edge), Image.Resampling.LANCZOS)
-    picture.save(stream, "JPEG", quality=_QUALITY)
-    return stream.getvalue()
+    height, width = image.shape[:2]
+    shrink = min(1.0, edge / max(height, width))
+    size = (max(round(width * shrink), 1), max(round(height * shrink), 1))
+    small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    _, stream = cv2.imencode(".jpg", small[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
+    return stream.tobytes()

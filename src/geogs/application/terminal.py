@@ -1,6 +1,7 @@
 """A run on the terminal: one line with how far it is and how long it will take; and a log."""
 
 import logging
+import math
 import time
 from datetime import datetime
 from pathlib import Path
@@ -51,6 +52,7 @@ class TerminalProgress(RunProgress):
         self._frames: int | None = None
         self._start = self._printed = time.perf_counter()
         self._phase, self._phase_began, self._last = "", self._start, ""
+        self._memory, self._measured = "", -math.inf
         self._log: TextIO | None = None
         self._handler: logging.Handler | None = None
 
@@ -108,10 +110,17 @@ class TerminalProgress(RunProgress):
         parts = [f"{status.keyframes} keyframes"]
         if status.disks:  # else the map is made at the end
             parts.append(f"{status.disks / 1000:.1f}k disks")
-        info = "  ".join([*parts, f"{peak_memory() / 2**30:.1f} GB"])
+        info = "  ".join([*parts, self._memory_used()])
         if status.state.value != "tracking":
             info += f"  {status.state.value}"
         self._show(f"frame {status.frames}/{self._frames or '?'}", info, left)
+
+    def _memory_used(self) -> str:
+        """At the fullest so far; asked no more often than the line is drawn."""
+        now = time.perf_counter()
+        if now - self._measured > 1 / _REDRAWS:
+            self._memory, self._measured = f"{peak_memory() / 2**30:.1f} GB", now
+        return self._memory
 
     def stage(self, name: str, fraction: float) -> None:
         """Move the line to a stage, or within it."""

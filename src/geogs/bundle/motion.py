@@ -46,9 +46,11 @@ class CpuMotion:
         iterations: int,
         huber: float,
         limit: float,
-    ) -> tuple[Float[Tensor, "4 4"], Float[Tensor, "4"]]:
+    ) -> tuple[Float[Tensor, "4 4"], Float[Tensor, "6"]]:
         """As in the protocol."""
-        weight = weight * (keyframe.information > 0)[:, None]
+        informed = keyframe.information > 0
+        placed = keyframe.has_known_depth & (weight[:, 0] > 0)
+        weight = weight * informed[:, None]
         frame = torch.zeros(1, dtype=torch.long)
         T, residual = self.solve(
             MotionProblem(
@@ -60,5 +62,6 @@ class CpuMotion:
         used = weight[:, 0] > 0
         error, flow = residual[0].norm(dim=-1), (pixels - self.grid.pixels).norm(dim=-1)
         agree = used & (error < limit)
-        shares = (used.float().mean(), agree.float().mean())
-        return T[0], torch.stack([*shares, error[used].median(), flow[used].median()])
+        matched, agreeing, known, sure = (x.float().mean() for x in (used, agree, informed, placed))
+        medians = error[used].median(), flow[used].median()
+        return T[0], torch.stack([matched, agreeing, *medians, known, sure])

@@ -168,7 +168,7 @@ def _inside(file: Path) -> str:
 
     stream = BytesIO()
     with Image.open(file) as picture:
-        picture.convert("RGB").save(stream, "WEBP", quality=88)
+        picture.convert("RGB").save(stream, "WEBP", quality=88, method=2)
     return "data:image/webp;base64," + base64.b64encode(stream.getvalue()).decode("ascii")
 
 

@@ -33,6 +33,9 @@ from geogs.tracking.segments import Segments
 from geogs.tracking.tracker import Tracker, TrackResult
 from geogs.types import PoseCorrection
 
+RETIRED_TOGETHER = 64
+"""Directed edges, of some eight keyframes, that become relative poses in one go."""
+
 
 @dataclass
 class Known:
@@ -132,7 +135,7 @@ class LoopCloser:
             return ()
         fresh = [*result.finalized, *result.apart]
         if fresh:
-            self._retire(self.segments.tracker_of(fresh[0]))
+            self._retire(self.segments.tracker_of(fresh[0]), RETIRED_TOGETHER)
         for loop in self.detector.update(fresh, is_last):
             self._take(loop)
         # Between keyframes nothing changes that could let segments meet.
@@ -160,9 +163,12 @@ class LoopCloser:
             self._known[tracker] = Known(of_poses(tracker.keyframes, sorted(tracker.held)))
         return self._known[tracker]
 
-    def _retire(self, tracker: Tracker) -> None:
-        """Turn the edges that the local adjustment has left behind into relative poses."""
-        old = tracker.graph.retire(tracker.deep)
+    def _retire(self, tracker: Tracker, least: int = 1) -> None:
+        """Turn the edges that the local adjustment has left behind into relative poses.
+
+        Nothing changes with fewer than ``least`` of them.
+        """
+        old = tracker.graph.retire(tracker.deep, least)
         if old:
             known = self._of(tracker)
             known.odometry = joined([known.odometry, of_edges(tracker.keyframes, old)])

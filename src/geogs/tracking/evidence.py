@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional
 
+from geogs.gpu.transfer import to_device
 from geogs.keyframes.grid import STRIDE, SampleGrid
 
 SIDE = STRIDE + 1
@@ -62,9 +63,11 @@ def correlation_at(
 ) -> Float[Tensor, "2"]:
     """The numbers of an :class:`Evidence`, of two images in grey levels at a relative pose.
 
-    Depth is the first's, and unknown where it has no information. All tensors are on the grid's
-    device; so is the result, and nothing waits for a GPU.
+    Depth is the first's, and unknown where it has no information. All tensors but the pose, which
+    may be on the CPU, are on the grid's device; so is the result, and nothing waits for a GPU.
     """
+    if grid.on_gpu:
+        return _on_gpu(grid, first, second, T_ji, inverse_depth, information)
     some = _spread(grid)
     places = reprojected_windows(grid, T_ji, inverse_depth)
     return _median_correlation(grid, first, second, places, information[some] > 0)
@@ -80,9 +83,31 @@ def correlation_matched(
 
     Says less, since a flow leads where images look alike; but it cannot make them alike.
     """
+    if grid.on_gpu:
+        return _on_gpu(grid, first, second, pixels=pixels)
     some = _spread(grid)
     places = pixels[some, None] + _offsets(grid)
     return _median_correlation(grid, first, second, places, torch.ones_like(places[:, 0, 0]) > 0)
+
+
+def _on_gpu(
+    grid: SampleGrid,
+    first: Float[Tensor, "h w"],
+    second: Float[Tensor, "h w"],
+    T_ji: Float[Tensor, "4 4"] | None = None,
+    inverse_depth: Float[Tensor, "p"] | None = None,
+    information: Float[Tensor, "p"] | None = None,
+    pixels: Float[Tensor, "p 2"] | None = None,
+) -> Float[Tensor, "2"]:
+    """The same by kernels: where a pose and depths put the cells, or at ``pixels``."""
+    from geogs.tracking.cuda.evidence import median_correlation
+
+    if T_ji is not None:
+        T_ji = to_device(T_ji.contiguous(), first.device)
+    return median_correlation(
+        grid, first, second, _spread(grid).step, MIN_CONTRAST**2, T_ji, inverse_depth, information,
+        pixels,
+    )  # fmt: skip
 
 
 def reprojected_windows(
@@ -118,7 +143,7 @@ def _median_correlation(
     a, b = (_smoothed(x) for x in (_windows(grid, first), there))
     contrast, other = a.square().mean(1), b.square().mean(1)
     ncc = (a * b).mean(1) / (contrast * other).sqrt().clamp(min=1e-6)
-    return _median_where(ncc, known & seen & (contrast > MIN_CONTRAST**2))
+    return median_where(ncc, known & seen & (contrast > MIN_CONTRAST**2))
 
 
 def _windows(grid: SampleGrid, image: Float[Tensor, "h w"]) -> Float[Tensor, "n s"]:
@@ -136,7 +161,7 @@ def _smoothed(windows: Float[Tensor, "n s"]) -> Float[Tensor, "n r"]:
     return x - x.mean(1, keepdim=True)
 
 
-def _median_where(values: Float[Tensor, "n"], counts: Bool[Tensor, "n"]) -> Float[Tensor, "2"]:
+def median_where(values: Float[Tensor, "n"], counts: Bool[Tensor, "n"]) -> Float[Tensor, "2"]:
     """Lower median of the values that count, 0 without any, and their number.
 
     ``torch.nanmedian`` would wait for the GPU.

@@ -104,12 +104,16 @@ class FrameGraph:
         """Forget every edge of a keyframe."""
         self.edges = {e: v for e, v in self.edges.items() if id not in e}
 
-    def retire(self, keep: Collection[int]) -> dict[Pair, Edge]:
-        """Take out the edges that join none of the given keyframes, and return them."""
+    def retire(self, keep: Collection[int], least: int = 1) -> dict[Pair, Edge]:
+        """Take out the edges that join none of the given keyframes, and return them.
+
+        None where they are fewer than ``least``.
+        """
         kept = set(keep)
         old = {e: v for e, v in self.edges.items() if e[0] not in kept and e[1] not in kept}
-        if old:
-            self.edges = {e: v for e, v in self.edges.items() if e not in old}
+        if len(old) < least:
+            return {}
+        self.edges = {e: v for e, v in self.edges.items() if e not in old}
         return old
 
     def reprojections(self, directed: Sequence[Pair]) -> Float[Tensor, "e p 2"]:

@@ -13,7 +13,7 @@ from itertools import pairwise
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float64
+from jaxtyping import Bool, Float, Float64, Int
 from torch import Tensor
 
 from geogs.bundle.base import BundleOptions
@@ -116,7 +116,33 @@ def best_two_view(
 
 
 def two_view(camera: Camera, match: FlowMatch) -> TwoView | None:
-    """Relative pose by the essential matrix (MAGSAC) and depth by triangulation, on the CPU."""
+    """Relative pose by the essential matrix and depth by triangulation, on the CPU."""
+    found = relative_pose(camera, match)
+    if found is None:
+        return None
+    T, inliers = found
+    p, q = SampleGrid(camera).pixels.double().numpy(), match.pixels[0].double().numpy()
+    K, count = camera.matrix().numpy(), len(p)
+    homogeneous = cv2.triangulatePoints(K @ np.eye(3, 4), K @ T[:3], p[inliers].T, q[inliers].T)
+    z = homogeneous[2] / np.where(np.abs(homogeneous[3]) < 1e-12, 1e-12, homogeneous[3])
+    median = np.median(z[z > 0])
+    near = (z > 0.1 * median) & (z < 10 * median)
+    z, inliers = z[near], inliers[near]
+    rotated = rays_through(p[inliers], K) @ (K @ T[:3, :3]).T
+    parallax = np.median(np.linalg.norm(q[inliers] - rotated[:, :2] / rotated[:, 2:], axis=1))
+    T[:3, 3] /= median
+    depth, known = torch.ones(count), torch.zeros(count, dtype=torch.bool)
+    depth[inliers], known[inliers] = torch.from_numpy(median / z).float(), True
+    return TwoView(torch.from_numpy(T), depth, known, float(parallax))
+
+
+def relative_pose(
+    camera: Camera, match: FlowMatch
+) -> tuple[Float64[np.ndarray, "4 4"], Int[np.ndarray, "n"]] | None:
+    """First camera to second by the essential matrix (MAGSAC), and the cells that agree with it.
+
+    The translation is a unit. None where too few cells are matched, or lie before both cameras.
+    """
     used = match.sure()[0].numpy()
     if used.sum() < 0.1 * len(used):
         return None
@@ -134,19 +160,7 @@ def two_view(camera: Camera, match: FlowMatch) -> TwoView | None:
         return None
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = R, t
-    homogeneous = cv2.triangulatePoints(K @ np.eye(3, 4), K @ T[:3], p.T, q.T)
-    z = homogeneous[2] / np.where(np.abs(homogeneous[3]) < 1e-12, 1e-12, homogeneous[3])
-    inlier = np.zeros_like(used)
-    inlier[agreeing[in_front]] = True
-    good = inlier & (z > 0)
-    median = np.median(z[good])
-    good &= (z > 0.1 * median) & (z < 10 * median)
-    rotated = rays_through(p, K) @ (K @ R).T
-    parallax = np.median(np.linalg.norm(q - rotated[:, :2] / rotated[:, 2:], axis=1)[good])
-    T[:3, 3] /= median
-    depth = torch.from_numpy(np.where(good, median / np.where(good, z, 1), 1.0)).float()
-    known = torch.from_numpy(np.asarray(good, bool))
-    return TwoView(torch.from_numpy(T), depth, known, float(parallax))
+    return T, agreeing[in_front]
 
 
 def rays_through(

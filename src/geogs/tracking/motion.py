@@ -17,7 +17,12 @@ from geogs.geometry.lie import se3_inverse
 from geogs.gpu.transfer import to_device
 from geogs.keyframes.grid import SampleGrid
 from geogs.keyframes.keyframe import Keyframe
-from geogs.tracking.evidence import Evidence, correlation_at, correlation_matched
+from geogs.tracking.evidence import (
+    Evidence,
+    correlation_at,
+    correlation_matched,
+    median_where,
+)
 from geogs.tracking.features import FeatureMatches, match_features, surer_flow
 from geogs.tracking.flow.base import FlowMatch, FlowOperator
 from geogs.tracking.flow.filled import filled_positions
@@ -166,14 +171,12 @@ class FrameLocator:
             keyframe.inverse_depth,
             keyframe.information,
         )
-        some = (keyframe.information > 0).to(T).mean()[None]
-        known = (keyframe.has_known_depth & (match.weight[0, :, 0] > 0)).to(T).mean()[None]
         # All at once, so that a GPU is waited for once.
-        found = torch.cat([T.reshape(-1), judged.to(T), seen.to(T), some, known]).cpu()
-        _, agree, residual, flow = found[16:20].tolist()
+        found = torch.cat([T.reshape(-1), judged.to(T), seen.to(T)]).cpu()
+        _, agree, residual, flow, informed, known = found[16:22].tolist()
         if agree < self.min_matched or not residual < self.max_residual:
             return None
-        evidence = Evidence.of(found[20:22])
+        evidence = Evidence.of(found[22:24])
         if not evidence.bears_out(self.min_ncc, is_expected):
             return None
         return FrameMotion(
@@ -182,8 +185,8 @@ class FrameLocator:
             match,
             flow,
             agree,
-            agree / float(found[22]),
-            float(found[23]),
+            agree / informed,
+            known,
             residual,
             evidence,
         )
@@ -241,21 +244,19 @@ class FlowChain:
         )
         there, back = surer_flow(self.grid, self.operator, keyframe, encoded, there, back)
         used = there.weight[0, :, 0] > 0
-        matched = float(used.float().mean())
-        if not self._is_borne_out(keyframe, encoded, there):
+        # What the images say where the flow, for want of a pose, leads.
+        images = self.operator.grey(keyframe), self.operator.grey(encoded)
+        seen = correlation_matched(self.grid, *images, there.pixels[0])
+        median = median_where((there.pixels[0] - self.grid.pixels).norm(dim=-1), used)
+        # All at once, so that a GPU is waited for once.
+        found = torch.cat([used.to(median).mean()[None], median[:1], seen.to(median)]).cpu()
+        matched, flow = found[:2].tolist()
+        if not Evidence.of(found[2:]).bears_out(self.min_ncc, is_expected=True):
             matched = 0.0
-        flow = (there.pixels[0] - self.grid.pixels).norm(dim=-1)
-        median = float(flow[used].median()) if matched else 0.0
         if matched > 0:
             self._there = filled_positions(self.grid, there)[None]
             self._back = filled_positions(self.grid, back)[None]
-        return ChainedMatch(there, median, matched)
-
-    def _is_borne_out(self, keyframe: Any, encoded: Any, match: FlowMatch) -> bool:
-        """Whether the images agree where the flow, for want of a pose, leads."""
-        images = self.operator.grey(keyframe), self.operator.grey(encoded)
-        evidence = Evidence.of(correlation_matched(self.grid, *images, match.pixels[0]))
-        return evidence.bears_out(self.min_ncc, is_expected=True)
+        return ChainedMatch(there, flow if matched else 0.0, matched)
 
 
 def pnp(

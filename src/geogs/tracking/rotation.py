@@ -16,7 +16,7 @@ from torch import Tensor
 from geogs.geometry.nearest_rotation import nearest_rotation
 from geogs.keyframes.grid import SampleGrid
 from geogs.tracking.flow.base import FlowMatch
-from geogs.tracking.initialise import rays_through, two_view
+from geogs.tracking.initialise import rays_through, relative_pose
 
 AGREEING = 0.4
 """Share of the matched cells that must agree with a rotation for it to be believed."""
@@ -67,11 +67,12 @@ def relative_rotation(grid: SampleGrid, match: FlowMatch) -> RelativeRotation | 
     if turned is None:
         return None
     pair = FlowMatch(match.pixels.cpu(), match.weight.cpu())
-    moved = two_view(grid.camera, pair)
+    moved = relative_pose(grid.camera, pair)
     if moved is not None:
-        off = epipolar_squares(grid, pair, moved.T_ji)
+        T_ji = torch.from_numpy(moved[0])
+        off = epipolar_squares(grid, pair, T_ji)
         if gric(turned.squares, 2, 3) > gric(off, 3, 5):
-            return RelativeRotation(moved.T_ji[:3, :3].double(), turned.deviation, False)
+            return RelativeRotation(T_ji[:3, :3], turned.deviation, False)
     if turned.agreeing < AGREEING:
         return None
     return RelativeRotation(turned.R, turned.deviation, True)
@@ -114,8 +115,9 @@ def fit_rotation(grid: SampleGrid, match: FlowMatch) -> RotationFit | None:
         for _ in range(2):
             error, J = _linearised(rays[some] @ R.T, pixels[some], focal, centre)
             say = weight[some] / (1 + (error**2).sum(1, keepdims=True) / (reach * edge) ** 2) ** 2
-            H = np.einsum("nca,nc,ncb->ab", J, say, J)
-            step = np.linalg.solve(H + 1e-9 * np.eye(3), np.einsum("nca,nc,nc->a", J, say, error))
+            weighed = (say[..., None] * J).reshape(-1, 3).T
+            H = weighed @ J.reshape(-1, 3)
+            step = np.linalg.solve(H + 1e-9 * np.eye(3), weighed @ error.reshape(-1))
             R = _exponential(step) @ R
     error, _ = _linearised(rays @ R.T, pixels, focal, centre)
     agreeing = float((np.linalg.norm(error, axis=1) < TOLERANCE * edge).mean())

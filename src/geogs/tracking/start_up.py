@@ -1,14 +1,17 @@
 """Before there is a map: gather keyframes until one can be started from them."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import torch
 
 from geogs.config import TrackingConfig
+from geogs.keyframes.grid import SampleGrid
 from geogs.tracking.chained_flows import ChainedFlows
+from geogs.tracking.flow.base import FlowMatch
 from geogs.tracking.graph import FrameGraph
 from geogs.tracking.initialise import Attempt, initialise
 from geogs.tracking.keyframe_choice import KeyframeChoice
@@ -60,6 +63,8 @@ class StartUp:
         self.graph, self.recorder, self.priors, self.config = graph, recorder, priors, config
         self.keyframes = graph.keyframes
         self._choice = choice
+        self._grid = SampleGrid(self.keyframes.grid.camera)
+        """On the CPU, where turns are measured."""
         self._chain = FlowChain(self.keyframes.grid, graph.operator, config.min_ncc)
         self._flows = ChainedFlows(graph)
         self._misses = 0
@@ -83,13 +88,14 @@ class StartUp:
             if match.matched < self.config.min_matched:
                 return self._miss(frame, encoded, turns)
             self._misses = 0
-            found = relative_rotation(self.keyframes.grid, match.there)
-            if found is not None:
-                turns = (Turn(last.frame_index, found.R, found.deviation), *turns)
-            if not self._choice.calls_for(match.flow, match.matched):
-                eye = torch.eye(4, dtype=torch.float64)
-                self.recorder.add(frame, encoded, last.id, eye, match.there, turns)
-                return StartStep()
+            there = FlowMatch(match.there.pixels.cpu(), match.there.weight.cpu())
+            measure = partial(_turn, last.frame_index, self._grid, there)
+            if self._choice.calls_for(match.flow, match.matched):
+                return self._gather(frame, encoded, turns, measure)
+            eye = torch.eye(4, dtype=torch.float64)
+            self.recorder.add(frame, encoded, last.id, eye, match.there, turns)
+            self.recorder.turned(measure)
+            return StartStep()
         return self._gather(frame, encoded, turns)
 
     def finish(self) -> bool:
@@ -120,7 +126,13 @@ class StartUp:
             "move the camera sideways while recording."
         )
 
-    def _gather(self, frame: Frame, encoded: Any, turns: Sequence[Turn]) -> StartStep:
+    def _gather(
+        self,
+        frame: Frame,
+        encoded: Any,
+        turns: Sequence[Turn],
+        measure: Callable[[], Turn | None] | None = None,
+    ) -> StartStep:
         """Add a keyframe to those the map will be started from, and start it with enough."""
         eye = torch.eye(4, dtype=torch.float64)
         state = self.keyframes.add(frame.index, frame.timestamp, frame.image, encoded, eye)
@@ -128,6 +140,8 @@ class StartUp:
         self.priors.ask(state)
         self._chain.reset()
         self.recorder.add_keyframe(state.id, turns)
+        if measure is not None:
+            self.recorder.turned(measure)
         if len(self.keyframes) < max(self.config.init_keyframes, MIN_KEYFRAMES):
             return StartStep(is_keyframe=True)
         if len(self.keyframes) >= self._enough and self.finish():
@@ -178,3 +192,9 @@ class StartUp:
             self.graph.remove_keyframe(id)
             self.recorder.keyframe_forgotten(self.keyframes.remove(id))
         return gone
+
+
+def _turn(earlier: int, grid: SampleGrid, match: FlowMatch) -> Turn | None:
+    """How a frame is turned against an earlier one, by the flow from there; all on the CPU."""
+    found = relative_rotation(grid, match)
+    return None if found is None else Turn(earlier, found.R, found.deviation)

@@ -1,6 +1,8 @@
 """The pose of every frame, solved at the end from sparse flow kept along the way."""
 
-from collections.abc import Sequence
+from collections import deque
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -26,6 +28,8 @@ from geogs.types import Frame, SeenRows, Trajectory
 
 ASTRAY = 0.05
 """Radians by which a frame's orientation may differ from one between its keyframes."""
+MOST_TURNING = 8
+"""Frames whose turns are measured beside while others come."""
 
 
 @dataclass
@@ -92,11 +96,19 @@ class TrajectoryRecorder:
 
     def __init__(self, store: Segment, operator: FlowOperator, max_pending: int = 64) -> None:
         self.keyframes, self.operator, self.max_pending = store, operator, max_pending
-        self.records: list[FrameRecord] = []
+        self._records: list[FrameRecord] = []
+        self._turning: deque[tuple[FrameRecord, Future[Turn | None]]] = deque()
+        self._beside = ThreadPoolExecutor(1, thread_name_prefix="turns")
         self.rows: dict[int, SeenRows] = {}
         """How those of a rolling shutter were rectified, by the indices of the frames."""
         self._pending: list[_Pending] = []
         self._subset = torch.nonzero(sparse_cells(store.grid))[:, 0]
+
+    @property
+    def records(self) -> list[FrameRecord]:
+        """Of all frames, with all that is known of their turns."""
+        self._turn(0)
+        return self._records
 
     def state(self) -> RecorderState:
         """What a checkpoint holds."""
@@ -117,7 +129,7 @@ class TrajectoryRecorder:
             raise InputError("the frames are of another camera")
         if state.pending.keys() - by_index.keys():
             raise InputError("a frame that waits is unknown")
-        self.records, self.rows = state.records, state.rows
+        self._records, self.rows = state.records, state.rows
         self._pending = [
             _Pending(by_index[n], image, self.operator.encode(image))
             for n, image in state.pending.items()
@@ -131,7 +143,7 @@ class TrajectoryRecorder:
     def add_untracked(self, index: int, timestamp: float, turns: Sequence[Turn] = ()) -> None:
         """A frame that could not be located, though its orientation may be known."""
         eye = torch.eye(4, dtype=torch.float64)
-        self.records.append(FrameRecord(index, timestamp, None, eye, turns=[*turns]))
+        self._records.append(FrameRecord(index, timestamp, None, eye, turns=[*turns]))
 
     def add(
         self,
@@ -147,7 +159,7 @@ class TrajectoryRecorder:
         record = FrameRecord(frame.index, frame.timestamp, anchor, T_rel, scale, turns=[*turns])
         if match is not None:
             self._observe([(record, anchor)], match)
-        self.records.append(record)
+        self._records.append(record)
         self._pending.append(_Pending(record, frame.image, encoded))
         if len(self._pending) > self.max_pending:
             del self._pending[: self.max_pending // 2]
@@ -156,15 +168,28 @@ class TrajectoryRecorder:
         """A frame that is a keyframe."""
         state = self.keyframes[id]
         eye = torch.eye(4, dtype=torch.float64)
-        self.records.append(
+        self._records.append(
             FrameRecord(state.frame_index, state.timestamp, id, eye, state.scale, turns=[*turns])
         )
+
+    def turned(self, measure: Callable[[], Turn | None]) -> None:
+        """Have another turn of the latest frame measured beside what is done with the next ones."""
+        self._turning.append((self._records[-1], self._beside.submit(measure)))
+        self._turn(MOST_TURNING)
+
+    def _turn(self, most: int) -> None:
+        """Wait until no more turns than that are being measured."""
+        while len(self._turning) > most:
+            record, measured = self._turning.popleft()
+            found = measured.result()
+            if found is not None:
+                record.turns.insert(0, found)
 
     def keyframe_removed(self, removed: Keyframe, substitute: int) -> None:
         """Make a culled keyframe an ordinary frame; frames anchored to it move to another one."""
         base = removed.T_cw @ se3_inverse(self.keyframes[substitute].T_cw)
         # Frames are located from keyframes before them.
-        for record in reversed(self.records):
+        for record in reversed(self._records):
             if record.index < removed.frame_index:
                 break
             if record.anchor == removed.id:
@@ -203,7 +228,7 @@ class TrajectoryRecorder:
 
     def absorb(self, other: "TrajectoryRecorder") -> None:
         """Take over the frames of another recorder, whose keyframes are now in this one's store."""
-        self.records = sorted([*self.records, *other.records], key=lambda r: r.index)
+        self._records = sorted([*self.records, *other.records], key=lambda r: r.index)
         self._pending = sorted([*self._pending, *other._pending], key=lambda p: p.record.index)
         self.rows |= other.rows
 

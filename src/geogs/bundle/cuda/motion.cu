@@ -78,14 +78,20 @@ extern "C" __global__ void __launch_bounds__(512) solve_poses(
 }
 
 // What tells whether a frame was found: the share of the cells that are matched, the share whose
-// residual is below `limit`, the median residual and the median motion of the matched. One block.
+// residual is below `limit`, the median residual and the median motion of the matched, the share of
+// the cells that have information, and of those that are matched and have enough of it to know their
+// depth to sqrt(known). One block.
 extern "C" __global__ void __launch_bounds__(512) judge_match(
-    const float2* pixels, const float2* weight, const float* information, const float2* residual,
-    const float2* grid_pixels, int cells, float limit, double* judgement) {
+    const float2* pixels, const float2* weight, const float* information,
+    const float* inverse_depth, const float2* residual, const float2* grid_pixels, int cells,
+    float limit, float known, double* judgement) {
   SHARED_MEMORY(u32, keys);
-  float used = 0.f, agree = 0.f;
+  float used = 0.f, agree = 0.f, informed = 0.f, placed = 0.f;
   for (int p = threadIdx.x; p < cells; p += blockDim.x) {
-    bool counts = weight[p].x > 0.f && (!information || information[p] > 0.f);
+    float d = inverse_depth[p], told = information[p];
+    bool counts = weight[p].x > 0.f && told > 0.f;
+    informed += told > 0.f;
+    placed += weight[p].x > 0.f && known * d * d * told > 1.f;
     float error = sqrtf(residual[p].x * residual[p].x + residual[p].y * residual[p].y);
     used += counts;
     agree += counts && error < limit;
@@ -93,6 +99,8 @@ extern "C" __global__ void __launch_bounds__(512) judge_match(
   }
   used = block_sum(used);
   agree = block_sum(agree);
+  informed = block_sum(informed);
+  placed = block_sum(placed);
   float median_error = block_median(keys, cells);
   __syncthreads();
   for (int p = threadIdx.x; p < cells; p += blockDim.x) {
@@ -105,5 +113,7 @@ extern "C" __global__ void __launch_bounds__(512) judge_match(
     judgement[1] = agree / cells;
     judgement[2] = median_error;
     judgement[3] = median_flow;
+    judgement[4] = informed / cells;
+    judgement[5] = placed / cells;
   }
 }

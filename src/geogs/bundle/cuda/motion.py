@@ -10,7 +10,7 @@ from geogs.bundle.problem import MotionProblem
 from geogs.gpu.kernels import kernels_for
 from geogs.gpu.transfer import to_device
 from geogs.keyframes.grid import SampleGrid
-from geogs.keyframes.keyframe import Keyframe
+from geogs.keyframes.keyframe import KNOWN, Keyframe
 
 SOURCE = Path(__file__).with_name("motion.cu")
 
@@ -62,22 +62,22 @@ class CudaMotion:
         iterations: int,
         huber: float,
         limit: float,
-    ) -> tuple[Float[Tensor, "4 4"], Float[Tensor, "4"]]:
+    ) -> tuple[Float[Tensor, "4 4"], Float[Tensor, "6"]]:
         """As in the protocol."""
         grid, c, known = self.grid, self.grid.camera, keyframe.information
         device, threads = known.device, _threads(grid.size)
-        state = torch.cat([T_guess.reshape(-1), T_guess.new_zeros(4), keyframe.T_cw.reshape(-1)])
+        state = torch.cat([T_guess.reshape(-1), T_guess.new_zeros(6), keyframe.T_cw.reshape(-1)])
         state = to_device(state, device)
         rows = torch.arange(2, dtype=torch.int32, device=device)
         pixels, weight = pixels.contiguous(), weight.contiguous()
         residual = torch.empty_like(pixels)
         kernels = kernels_for(SOURCE, device)
         kernels["solve_poses"](
-            1, threads, rows, rows, keyframe.inverse_depth, state[20:], pixels, weight, known,
+            1, threads, rows, rows, keyframe.inverse_depth, state[22:], pixels, weight, known,
             self.rays, grid.size, c.fx, c.fy, c.cx, c.cy, iterations, huber, state, residual,
         )  # fmt: skip
         kernels["judge_match"](
-            1, threads, pixels, weight, known, residual, grid.pixels, grid.size, limit,
-            state[16:], shared=4 * grid.size,
+            1, threads, pixels, weight, known, keyframe.inverse_depth, residual, grid.pixels,
+            grid.size, limit, KNOWN**2, state[16:], shared=4 * grid.size,
         )  # fmt: skip
-        return state[:16].reshape(4, 4), state[16:20]
+        return state[:16].reshape(4, 4), state[16:22]

@@ -57,7 +57,7 @@ def pack(model: Model) -> tuple[dict[str, Any], bytes, bytes]:
         scene["keyframes"].append(entry)
     if model.disks is not None:
         scene["disks"] = _disks(model.disks, R, arrays)
-    return scene, zlib.compress(bytes(arrays.content), 9), bytes(images)
+    return scene, zlib.compress(bytes(arrays.content), 6), bytes(images)
 
 
 def webgl_axes(axes: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:

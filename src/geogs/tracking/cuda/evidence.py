@@ -1,0 +1,46 @@
+"""Whether images bear a location out, on the GPU: two launches."""
+
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from geogs.gpu.kernels import kernels_for
+from geogs.keyframes.grid import STRIDE, SampleGrid
+
+SOURCE = Path(__file__).with_name("evidence.cu")
+WINDOWS = 8
+"""Windows of a block of threads."""
+
+
+def median_correlation(
+    grid: SampleGrid,
+    first: Float[Tensor, "h w"],
+    second: Float[Tensor, "h w"],
+    step: int,
+    least_variance: float,
+    T_ji: Float[Tensor, "4 4"] | None = None,
+    inverse_depth: Float[Tensor, "p"] | None = None,
+    information: Float[Tensor, "p"] | None = None,
+    pixels: Float[Tensor, "p 2"] | None = None,
+) -> Float[Tensor, "2"]:
+    """Median correlation of the windows around every ``step``-th cell that count, and their number.
+
+    Cells lie where the relative pose ``T_ji`` (float64) and their depth put them, or, without it,
+    at ``pixels``. Those without information do not count, nor do windows whose variance in the
+    first image, once smoothed, is no more than ``least_variance``. The result is float64 and stays
+    on the GPU.
+    """
+    c, device = grid.camera, first.device
+    count = -(-grid.size // step)
+    keys = torch.empty(count, dtype=torch.int32, device=device)
+    found = torch.empty(2, dtype=torch.float64, device=device)
+    kernels = kernels_for(SOURCE, device)
+    kernels["correlate_windows"](
+        -(-count // WINDOWS), (32, WINDOWS), first, second, c.width, c.height, grid.rays,
+        grid.width, STRIDE, step, count, T_ji, inverse_depth, information, pixels,
+        c.fx, c.fy, c.cx, c.cy, least_variance, keys,
+    )  # fmt: skip
+    kernels["median_correlation"](1, 256, keys, count, found)
+    return found
