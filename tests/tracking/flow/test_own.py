@@ -8,6 +8,7 @@ from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.keyframes.grid import SampleGrid
 from geogs.tracking.flow.classical import ClassicalFlow
+from geogs.tracking.flow.classical_cuda import CudaClassicalFlow
 from geogs.tracking.flow.lookup import Edges
 from geogs.tracking.flow.own import OwnFlow, OwnFlowOptions, load_network
 from geogs.tracking.flow.own_network import (
@@ -180,3 +181,31 @@ def test_cells_that_jump_from_a_warm_start_have_no_weight(operator):
     assert not warm[far].any()
     assert warm[inner].sum() == inner.sum() - 3  # a shift of all is no jump
     assert (operator._weight(estimate, None)[0, far, 0] > 0).all()
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+def test_what_is_recorded_on_a_gpu_says_what_is_not(network, tmp_path, caplog):
+    path = tmp_path / "w.safetensors"
+    export_weights(network, path, 3, SceneScores(FlowScores(*[0.5] * 10), {}))
+    grid = SampleGrid(CAMERA, "cuda")
+    options = OwnFlowOptions(min_share=0.0, max_deviation=1e6)
+    operator = OwnFlow(grid, path, CudaClassicalFlow(grid), options)
+    a, b, c = (operator.encode(i) for i in images(3))
+    with torch.inference_mode():
+        again = operator._features(torch.from_numpy(images(3)[2]).cuda())
+    f = c.features
+    for one, other in zip(
+        (f.source, f.pyramid.descriptors, f.hidden, f.context), again, strict=True
+    ):
+        torch.testing.assert_close(one.float(), other.float(), rtol=0.02, atol=0.05)
+    assert not torch.equal(a.features.source, f.source)  # it was not overwritten
+    near = (operator.grid.pixels + 1.5)[None]
+    starts = near.expand(2, -1, -1).contiguous()
+    together = operator.measure([a, b], [b, c], starts, starts)
+    for n, (one, other) in enumerate(((a, b), (b, c))):
+        alone = operator.measure([one], [other], near, near)
+        for both, single in zip(together, alone, strict=True):
+            torch.testing.assert_close(both.pixels[n], single.pixels[0], atol=0.1, rtol=0)
+            assert float((single.weight > 0).float().mean()) > 0.5
+    assert not caplog.text  # nothing is slower than it could be

@@ -14,13 +14,13 @@ from torch.nn import functional
 from geogs.config import DepthConfig
 from geogs.depth.base import DepthEngine, Limits, Progress, silent
 from geogs.depth.completion import known_cells
-from geogs.depth.network.recorded import RecordedSearch
 from geogs.depth.network.search_range import SearchRange, search_range
 from geogs.depth.network.views import DepthPrediction, StereoViews
 from geogs.depth.network.weights import TrainedDepth
 from geogs.depth.sweep_neighbors import seen_inverse_depth
 from geogs.depth.view import DenseDepth, DepthView, PosedDepth, dense_depths
 from geogs.geometry.camera import Camera
+from geogs.gpu.recorded import Recorded
 from geogs.gpu.transfer import to_device
 from geogs.keyframes.swap import Swap
 
@@ -62,7 +62,9 @@ class NetworkDepthEngine:
         self.network = trained.network.to(device)
         lens = [self.seen.fx, self.seen.fy, self.seen.cx, self.seen.cy]
         self._intrinsics = torch.tensor([lens], dtype=torch.float32, device=device)
-        self._recorded = RecordedSearch(lambda views: self._at_render(self.network(views)))
+        self._recorded = Recorded(
+            lambda *views: self._at_render(self.network(StereoViews(*views))), "The depth network"
+        )
         self._images: Swap[int, UInt8[Tensor, "h w 3"]] = Swap(resident)
 
     def observe(self, view: DepthView) -> None:
@@ -103,7 +105,7 @@ class NetworkDepthEngine:
         self, reference: DepthView, others: Sequence[DepthView], limits: Limits | None
     ) -> DenseDepth:
         between = self._range(reference, others, limits)
-        depth, confidence, normal = self._recorded(self._views(reference, others, between))
+        depth, confidence, normal = self._recorded(*self._views(reference, others, between))
         (dense,) = dense_depths([(between.typical * depth, confidence)])
         return replace(dense, normal=normal)
 
@@ -117,14 +119,15 @@ class NetworkDepthEngine:
 
     def _views(
         self, reference: DepthView, others: Sequence[DepthView], between: SearchRange
-    ) -> StereoViews:
+    ) -> tuple[Tensor, ...]:
+        """The fields of ``StereoViews``."""
         relative = np.stack([v.T_cw for v in others]) @ np.linalg.inv(reference.T_cw)
         images = torch.stack([self._image(v) for v in (reference, *others)])
         images = images.permute(0, 3, 1, 2).float() / 255
         numbers = (between.near, between.far, between.typical)
         bounds = to_device(torch.tensor(numbers, dtype=torch.float32), self.device)
         near, far, typical = bounds.split(1)
-        return StereoViews(
+        return (
             images[:1],
             images[None, 1:],
             self._intrinsics,

@@ -1,7 +1,8 @@
 """The flow operator that is trained for this system (``geogs train flow``)."""
 
+import functools
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,10 +16,12 @@ from torch import Tensor
 
 from geogs.documents import in_short
 from geogs.errors import InputError
+from geogs.gpu.recorded import Maps, Recorded
+from geogs.gpu.transfer import to_device
 from geogs.keyframes.grid import SampleGrid
 from geogs.tracking.flow.base import FlowMatch, FlowOperator, Memories
 from geogs.tracking.flow.filled import filled_positions
-from geogs.tracking.flow.lookup import DescriptorPyramid, Edges
+from geogs.tracking.flow.lookup import DescriptorPyramid, Edges, PyramidLevel
 from geogs.tracking.flow.own_network import (
     FlowEstimate,
     FlowNetwork,
@@ -93,6 +96,10 @@ class OwnFlow:
         network.to(self.device)
         # PyTorch's stubs do not know the memory format.
         self.network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self._levels: tuple[PyramidLevel, ...] = ()
+        """Of every image, known from the first on."""
+        self._encoded = Recorded(self._features, "The flow network")
+        self._refined = functools.cache(self._refinement)
 
     @torch.inference_mode()
     def encode(self, image: UInt8[np.ndarray, "h w 3"]) -> OwnImage:
@@ -102,10 +109,18 @@ class OwnFlow:
                 f"An image of shape {image.shape} does not fit a camera of {width} x {height} "
                 "pixels."
             )
-        pixels = torch.from_numpy(np.ascontiguousarray(image)).to(self.device)
-        with self._autocast():
-            features = self.network.encode(pixels.permute(2, 0, 1)[None].float() / 255)
+        pixels = to_device(torch.from_numpy(np.ascontiguousarray(image)), self.device)
+        source, descriptors, hidden, context = self._encoded(pixels)
+        pyramid = DescriptorPyramid(descriptors, self._levels)
+        features = ImageFeatures(source, pyramid, hidden, context)
         return OwnImage(features, self.classical.encode(image))
+
+    def _features(self, pixels: UInt8[Tensor, "h w 3"]) -> Maps:
+        """What the network keeps of an image."""
+        with self._autocast():
+            found = self.network.encode(pixels.permute(2, 0, 1)[None].float() / 255)
+        self._levels = found.pyramid.levels
+        return found.source, found.pyramid.descriptors, found.hidden, found.context
 
     def texture(self, encoded: OwnImage) -> float:
         return self.classical.texture(encoded.classical)
@@ -127,26 +142,51 @@ class OwnFlow:
         images = list({id(i): i for i in (*first, *second)}.values())
         slot = {id(image): n for n, image in enumerate(images)}
         a, b = ([slot[id(i)] for i in side] for side in (first, second))
-        warm: Tensor | None = None
+        is_warm = forward is not None and backward is not None
         if forward is None or backward is None:
             start = self._cold_start(first, second)
             iterations = options.cold_iterations
         else:
-            start = warm = torch.cat([forward, backward]).float()
+            start = torch.cat([forward, backward]).float()
             iterations = options.warm_iterations if fine else options.coarse_iterations
-        features = _stack([i.features for i in images])
-        source, target = torch.tensor([*a, *b]), torch.tensor([*b, *a])
+        # One pair is what each frame asks for; of more there are many numbers.
+        refined = self._refined(iterations, is_warm, pairs == 1)
+        f = _stack([i.features for i in images])
+        source, target = (
+            to_device(torch.tensor(x), self.device, torch.int32) for x in ([*a, *b], [*b, *a])
+        )
         parts = []
         for at in range(0, 2 * pairs, options.edges_at_once):
             part = slice(at, at + options.edges_at_once)
-            edges = Edges(*(x[part].int().to(self.device) for x in (source, target)))
-            with self._autocast():
-                *_, last = self.network.iterate(features, edges, start[part], iterations)
-            parts.append((last.pixels, self._weight(last, None if warm is None else warm[part])))
+            parts.append(
+                refined(
+                    f.source, f.pyramid.descriptors, f.hidden, f.context, source[part],
+                    target[part], start[part],
+                )
+            )  # fmt: skip
         pixels, weight = (torch.cat(p).clone() for p in zip(*parts, strict=True))
         if options.polish:
             pixels, weight = self._polished(first, second, pixels, weight, fine)
         return FlowMatch(pixels[:pairs], weight[:pairs]), FlowMatch(pixels[pairs:], weight[pairs:])
+
+    def _refinement(self, iterations: int, is_warm: bool, is_recorded: bool) -> Callable[..., Maps]:
+        """What takes some edges from their start to positions and weights.
+
+        Its arguments are the features of images but for the levels, the two images of each edge,
+        and the start of each.
+        """
+
+        def work(
+            source: Tensor, descriptors: Tensor, hidden: Tensor, context: Tensor,
+            first: Tensor, second: Tensor, start: Tensor,
+        ) -> Maps:  # fmt: skip
+            pyramid = DescriptorPyramid(descriptors, self._levels)
+            features = ImageFeatures(source, pyramid, hidden, context)
+            with self._autocast():
+                *_, last = self.network.iterate(features, Edges(first, second), start, iterations)
+            return last.pixels, self._weight(last, start if is_warm else None)
+
+        return Recorded(work, "The flow network") if is_recorded else work
 
     def _cold_start(
         self, first: Sequence[OwnImage], second: Sequence[OwnImage]

@@ -1,0 +1,73 @@
+"""Work on a GPU as a recorded sequence of kernels: its many launches cost the CPU one."""
+
+import logging
+import threading
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+_log = logging.getLogger(__name__)
+
+Maps = tuple[Tensor, ...]
+"""What is made of tensors, on their device."""
+
+
+class Recorded:
+    """Does ``work``, which no value of the tensors that it is given may change the course of.
+
+    On a GPU it is recorded as a CUDA graph at the first tensors of each set of shapes, and played
+    back from then on. Elsewhere, and where a driver cannot record it, it is called as it is.
+    Threads and streams may share one: each waits until what another has begun is done.
+    """
+
+    def __init__(self, work: Callable[..., Maps], name: str) -> None:
+        """``name`` is what is said to be slow where it cannot be recorded."""
+        self._work, self._name = work, name
+        self._recordings: dict[tuple[torch.Size, ...], Callable[..., Maps]] = {}
+        self._lock = threading.Lock()
+        self._done: torch.cuda.Event | None = None
+
+    def __call__(self, *given: Tensor) -> Maps:
+        """What ``work`` returns."""
+        if not given[0].is_cuda:
+            return self._work(*given)
+        shapes = tuple(tensor.shape for tensor in given)
+        with self._lock:
+            stream = torch.cuda.current_stream(given[0].device)
+            if self._done is not None:
+                stream.wait_event(self._done)
+            if shapes not in self._recordings:
+                self._recordings[shapes] = self._recording(given)
+            found = self._recordings[shapes](*given)
+            self._done = stream.record_event(self._done)
+        return found
+
+    def _recording(self, given: Maps) -> Callable[..., Maps]:
+        try:
+            return _Recording(self._work, given)
+        except torch.cuda.OutOfMemoryError:
+            raise
+        except RuntimeError as error:
+            _log.warning("%s is slower than it could be: %s", self._name, error)
+            return self._work
+
+
+class _Recording:
+    def __init__(self, work: Callable[..., Maps], given: Maps) -> None:
+        self._given = tuple(tensor.clone() for tensor in given)
+        with torch.cuda.device(given[0].device):
+            aside = torch.cuda.Stream()
+            aside.wait_stream(torch.cuda.current_stream())
+            with torch.cuda.stream(aside):
+                work(*self._given)  # libraries choose their kernels
+            torch.cuda.current_stream().wait_stream(aside)
+            self._graph = torch.cuda.CUDAGraph()
+            with torch.cuda.graph(self._graph, capture_error_mode="thread_local"):
+                self._found = work(*self._given)
+
+    def __call__(self, *given: Tensor) -> Maps:
+        for mine, tensor in zip(self._given, given, strict=True):
+            mine.copy_(tensor)
+        self._graph.replay()
+        return tuple(found.clone() for found in self._found)
