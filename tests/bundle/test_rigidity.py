@@ -3,10 +3,12 @@
 import pytest
 import torch
 
+import geogs.bundle.cuda.rigidity as cuda_rigidity
 from bundle_scenes import scene
+from cuda_emulator import use_emulator
 from geogs.bundle.problem import BundleProblem
 from geogs.bundle.projection import project, relative_motion
-from geogs.bundle.rigidity import DEPTH_RANGE, best_residuals
+from geogs.bundle.rigidity import BEHIND, DEPTH_RANGE, best_residuals
 from geogs.keyframes.grid import SampleGrid
 
 HUBER = 0.5
@@ -69,3 +71,27 @@ def test_unmatched_cells_have_no_residual_and_points_behind_a_large_one():
     )  # fmt: skip
     assert float(left[0, 7:].min()) > 10
     assert DEPTH_RANGE[0] < 0.05
+
+
+@pytest.mark.parametrize("place", ["emulated", pytest.param("gpu", marks=pytest.mark.gpu)])
+def test_the_kernel_leaves_what_pytorch_leaves(place, monkeypatch):
+    device = torch.device("cuda" if place == "gpu" else "cpu")
+    if place == "emulated":
+        use_emulator(monkeypatch, cuda_rigidity)
+    elif not torch.cuda.is_available():
+        pytest.skip("needs a CUDA GPU")
+    grid, p = scene(seed=3)
+    g = torch.Generator().manual_seed(5)
+    p.pixels.add_(1.5 * torch.randn(p.pixels.shape, generator=g))
+    p.weight[0, :7] = 0
+    p.T_cw[2, 2, 3] -= 3.0  # some of what it shows is behind the others
+    expected = residuals(grid, p, 3)
+    assert int((expected == BEHIND).sum()) > 20
+    turned = torch.randperm(len(p.source), generator=g)  # the edges may come in any order
+    T_ji = relative_motion(p.T_cw, p.source, p.target)[turned]
+    found = cuda_rigidity.best_residuals(
+        grid.camera, grid.rays.to(device), T_ji, p.inverse_depth.to(device), p.source[turned],
+        p.pixels[turned].to(device), p.weight[turned].to(device), HUBER, 3, DEPTH_RANGE, BEHIND,
+    ).cpu()  # fmt: skip
+    off = (found - expected[turned]).abs() > 1e-3 + 1e-3 * expected[turned]
+    assert float(off.float().mean()) < 0.002  # on the verge of lying behind

@@ -45,6 +45,14 @@ def best_residuals(
 
     Returns 0 where there is no match.
     """
+    if inverse_depth.is_cuda:
+        from geogs.bundle.cuda import rigidity
+
+        T_ji = relative_motion(T_cw, source, target).cpu()
+        return rigidity.best_residuals(
+            camera, rays, T_ji, inverse_depth, source.cpu(), pixels, weight, huber, iterations,
+            DEPTH_RANGE, BEHIND,
+        )  # fmt: skip
     T_ji = relative_motion(T_cw, source, target).to(inverse_depth)
     source = source.to(inverse_depth.device)
     # Axis by axis, in units of the focal lengths: far faster than pairs of numbers.
