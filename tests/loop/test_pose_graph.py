@@ -452,6 +452,25 @@ def test_relative_poses_of_matched_edges():
     torch.testing.assert_close(sim3_scale(found.G), torch.ones(2, dtype=F64))
 
 
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+def test_matches_on_a_gpu_say_what_they_say_on_the_cpu():
+    grid, S, edges = matched_scene()
+    g = torch.Generator().manual_seed(0)
+    pixels = edges.pixels + torch.randn(edges.pixels.shape, generator=g)
+    start = se3_exp(noise(2, torch.tensor([0.05] * 3 + [0.02] * 3, dtype=F64), 0)) @ S
+    expected = relative_poses(grid, replace(edges, pixels=pixels), start, is_loop=False)
+    there = SampleGrid(CAMERA, "cuda")
+    sent = replace(
+        edges, rays=there.rays, inverse_depth=edges.inverse_depth.cuda(), pixels=pixels.cuda(),
+        weight=edges.weight.cuda(),
+    )  # fmt: skip
+    found = relative_poses(there, sent, start, is_loop=False)
+    assert found.G.device.type == "cpu"
+    torch.testing.assert_close(found.G, expected.G, rtol=0, atol=1e-5)
+    torch.testing.assert_close(found.information, expected.information, rtol=1e-3, atol=0)
+
+
 def test_a_loop_measures_the_ratio_of_units():
     grid, S, edges = matched_scene(1.07)
     start = S.clone()

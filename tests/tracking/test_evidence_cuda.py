@@ -8,7 +8,12 @@ from cuda_emulator import use_emulator
 from geogs.geometry.camera import Camera
 from geogs.keyframes.grid import SampleGrid
 from geogs.tracking import evidence
-from geogs.tracking.evidence import MIN_CONTRAST, correlation_at, correlation_matched
+from geogs.tracking.evidence import (
+    MIN_CONTRAST,
+    correlation_at,
+    correlation_matched,
+    matched_motion,
+)
 from tracking_scenes import CAMERA, pose, render
 
 SIDES = [(192, 144), (95, 61), (511, 290)]
@@ -78,3 +83,21 @@ def test_where_a_flow_leads_it_is_what_pytorch_says(device, width, height):
     agrees(found, expected)
     assert 0.1 < float(found[0]) < 0.95
     assert 0.3 < int(found[1]) / min(grid.size, 512) < 0.7
+
+
+@pytest.mark.parametrize("share", [0.6, 0.0])
+def test_the_motion_of_matches_is_what_pytorch_says(device, share):
+    grid, g = SampleGrid(CAMERA), torch.Generator().manual_seed(3)
+    pixels = grid.pixels + 9 * torch.randn(grid.pixels.shape, generator=g)
+    weight = (torch.rand(grid.size, 1, generator=g) < share).float().expand(-1, 2).contiguous()
+    expected = matched_motion(grid, pixels, weight)
+    there = SampleGrid(CAMERA, device)
+    found = cuda_evidence.matched_motion(there, pixels.to(device), weight.to(device)).cpu()
+    torch.testing.assert_close(found.float(), expected, rtol=1e-5, atol=1e-6)
+    used = weight[:, 0] > 0
+    assert float(found[0]) == pytest.approx(float(used.float().mean()), abs=1e-6)
+    if share:
+        motion = (pixels - grid.pixels).norm(dim=-1)[used]
+        assert float(found[1]) == pytest.approx(float(motion.median()), rel=1e-5)
+    else:
+        assert float(found[1]) == 0

@@ -45,17 +45,17 @@ def of_edges(segment: Segment, edges: Mapping[Pair, Edge | PackedEdge]) -> Relat
         return none_known()
     ids = sorted({k for p in pairs for k in p})
     slot = {k: n for n, k in enumerate(ids)}
-    grid = _on_cpu(segment.grid)
+    grid = segment.grid
     pixels = torch.stack([edges[p].pixels for p in pairs])
     weight = torch.stack([edges[p].weight for p in pairs])
     matched = MatchedEdges(
         grid.camera,
         grid.rays,
-        segment.inverse_depths(ids).cpu(),
+        segment.inverse_depths(ids),
         torch.tensor([slot[i] for i, _ in pairs]),
         torch.tensor([slot[j] for _, j in pairs]),
-        pixels.cpu().float(),
-        still_weight(segment, pairs, pixels, weight).cpu().float(),
+        pixels.float(),
+        still_weight(segment, pairs, pixels, weight).float(),
     )
     return _named(relative_poses(grid, matched, segment.poses(ids), False, SETTLED), ids)
 

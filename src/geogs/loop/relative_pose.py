@@ -26,6 +26,9 @@ class RelativePoseOptions:
     """How edges are solved, and which are kept."""
 
     iterations: int = 8
+    """At most."""
+    settled: float = 1e-6
+    """A step in which no number of a motion changes by more is the last."""
     huber: float = 3.0
     """Standard deviations beyond which a residual counts linearly."""
     sure: float = 0.1
@@ -55,6 +58,8 @@ def relative_poses(
     start: Float[Tensor, "e 4 4"] | None = None,
 ) -> RelativePoses:
     """Solve every edge; those with too few sure cells are left out.
+
+    Matches and depths may be on a GPU; poses are on the CPU, and so is the result.
 
     From the present poses on, or from ``start``, the motion of each edge in its source's unit.
 
@@ -97,13 +102,16 @@ def _solve_edges(
     for _ in range(options.iterations):
         p = linearise(edges.camera, edges.rays, T, d)
         H, g, _ = _normal_equations(p, pixels, weight, options)
-        T = move(torch.linalg.solve(H, g).nan_to_num(0.0, 0.0, 0.0), T)
+        step = torch.linalg.solve(H, g).nan_to_num(0.0, 0.0, 0.0)
+        T = move(step, T)
+        if float(step.abs().max()) < options.settled:
+            break
     p = linearise(edges.camera, edges.rays, T, d)
     H, _, square = _normal_equations(p, pixels, weight, options)
     variance = (
         square[:, None] / options.independent * torch.linalg.inv(H).diagonal(dim1=-2, dim2=-1)
     )
-    depth = 1 / d.median(1).values.double()
+    depth = 1 / d.median(1).values.cpu().double()
     least = options.least_turn**2 * torch.ones_like(variance)
     least[:, :3] *= depth[:, None] ** 2
     variance = torch.maximum(variance, least)
@@ -120,7 +128,7 @@ def _solve_edges(
         T[:, :3] *= scale[:, None, None]
         variance[:, :3] *= scale[:, None] ** 2
     information = 1 / torch.cat([variance, scale_variance[:, None]], 1)
-    keep = sure.double().mean(1) > options.share
+    keep = sure.double().mean(1).cpu() > options.share
     keep = keep & torch.isfinite(information).all(1) & torch.isfinite(T).flatten(1).all(1)
     return T, information.nan_to_num(0.0, 0.0, 0.0), keep
 
@@ -128,13 +136,13 @@ def _solve_edges(
 def _normal_equations(
     p: LinearProjection, pixels: Tensor, weight: Tensor, options: RelativePoseOptions
 ) -> tuple[Float[Tensor, "e 6 6"], Float[Tensor, "e 6"], Float[Tensor, "e"]]:
-    """Damped H, g and the robustly weighted sum of squared residuals; float64."""
+    """Damped H, g and the robustly weighted sum of squared residuals; float64, on the CPU."""
     r, w = weighed_residuals(p, pixels, weight, options.huber)
     wJ = (p.pose_jacobian * w.mT[:, None]).flatten(2)
-    H = (wJ @ p.pose_jacobian.flatten(2).mT).double()
-    g = (wJ @ r.mT.flatten(1)[..., None])[..., 0].double()
+    H = (wJ @ p.pose_jacobian.flatten(2).mT).cpu().double()
+    g = (wJ @ r.mT.flatten(1)[..., None])[..., 0].cpu().double()
     floor = options.damping * H.diagonal(dim1=-2, dim2=-1) + 1e-9
-    return H + torch.diag_embed(floor), g, (w * r.square()).sum((1, 2)).double()
+    return H + torch.diag_embed(floor), g, (w * r.square()).sum((1, 2)).cpu().double()
 
 
 def _depth_ratio(

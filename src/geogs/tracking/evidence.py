@@ -90,6 +90,22 @@ def correlation_matched(
     return _median_correlation(grid, first, second, places, torch.ones_like(places[:, 0, 0]) > 0)
 
 
+def matched_motion(
+    grid: SampleGrid, pixels: Float[Tensor, "p 2"], weight: Float[Tensor, "p 2"]
+) -> Float[Tensor, "2"]:
+    """Share of the cells that are matched, and the median of their motion in pixels, 0 without any.
+
+    On a GPU both stay there, and nothing waits.
+    """
+    if grid.on_gpu:
+        from geogs.tracking.cuda import evidence
+
+        return evidence.matched_motion(grid, pixels, weight)
+    used = weight[:, 0] > 0
+    median = _median_where((pixels - grid.pixels).norm(dim=-1), used)[:1]
+    return torch.cat([used.to(median).mean()[None], median])
+
+
 def _on_gpu(
     grid: SampleGrid,
     first: Float[Tensor, "h w"],
@@ -143,7 +159,7 @@ def _median_correlation(
     a, b = (_smoothed(x) for x in (_windows(grid, first), there))
     contrast, other = a.square().mean(1), b.square().mean(1)
     ncc = (a * b).mean(1) / (contrast * other).sqrt().clamp(min=1e-6)
-    return median_where(ncc, known & seen & (contrast > MIN_CONTRAST**2))
+    return _median_where(ncc, known & seen & (contrast > MIN_CONTRAST**2))
 
 
 def _windows(grid: SampleGrid, image: Float[Tensor, "h w"]) -> Float[Tensor, "n s"]:
@@ -161,7 +177,7 @@ def _smoothed(windows: Float[Tensor, "n s"]) -> Float[Tensor, "n r"]:
     return x - x.mean(1, keepdim=True)
 
 
-def median_where(values: Float[Tensor, "n"], counts: Bool[Tensor, "n"]) -> Float[Tensor, "2"]:
+def _median_where(values: Float[Tensor, "n"], counts: Bool[Tensor, "n"]) -> Float[Tensor, "2"]:
     """Lower median of the values that count, 0 without any, and their number.
 
     ``torch.nanmedian`` would wait for the GPU.

@@ -21,7 +21,7 @@ from geogs.tracking.evidence import (
     Evidence,
     correlation_at,
     correlation_matched,
-    median_where,
+    matched_motion,
 )
 from geogs.tracking.features import FeatureMatches, match_features, surer_flow
 from geogs.tracking.flow.base import FlowMatch, FlowOperator
@@ -243,13 +243,12 @@ class FlowChain:
             [keyframe], [encoded], self._there, self._back, fine=False
         )
         there, back = surer_flow(self.grid, self.operator, keyframe, encoded, there, back)
-        used = there.weight[0, :, 0] > 0
         # What the images say where the flow, for want of a pose, leads.
         images = self.operator.grey(keyframe), self.operator.grey(encoded)
         seen = correlation_matched(self.grid, *images, there.pixels[0])
-        median = median_where((there.pixels[0] - self.grid.pixels).norm(dim=-1), used)
+        moved = matched_motion(self.grid, there.pixels[0], there.weight[0])
         # All at once, so that a GPU is waited for once.
-        found = torch.cat([used.to(median).mean()[None], median[:1], seen.to(median)]).cpu()
+        found = torch.cat([moved, seen]).cpu()
         matched, flow = found[:2].tolist()
         if not Evidence.of(found[2:]).bears_out(self.min_ncc, is_expected=True):
             matched = 0.0

@@ -28,8 +28,8 @@ from geogs.types import Frame, SeenRows, Trajectory
 
 ASTRAY = 0.05
 """Radians by which a frame's orientation may differ from one between its keyframes."""
-MOST_TURNING = 8
-"""Frames whose turns are measured beside while others come."""
+MOST_TURNING, TURNING_THREADS = 16, 4
+"""Frames whose turns are measured beside while others come, and by how many threads."""
 
 
 @dataclass
@@ -98,7 +98,7 @@ class TrajectoryRecorder:
         self.keyframes, self.operator, self.max_pending = store, operator, max_pending
         self._records: list[FrameRecord] = []
         self._turning: deque[tuple[FrameRecord, Future[Turn | None]]] = deque()
-        self._beside = ThreadPoolExecutor(1, thread_name_prefix="turns")
+        self._beside = ThreadPoolExecutor(TURNING_THREADS, thread_name_prefix="turns")
         self.rows: dict[int, SeenRows] = {}
         """How those of a rolling shutter were rectified, by the indices of the frames."""
         self._pending: list[_Pending] = []

@@ -97,3 +97,23 @@ extern "C" __global__ void median_correlation(const unsigned* keys, int count, d
     evidence[1] = counted;
   }
 }
+
+// Share of the cells that are matched, and the lower median of their motion in pixels, 0 without
+// any. `keys` has room for all cells. One block.
+extern "C" __global__ void matched_motion(
+    const float2* pixels, const float2* weight, const float2* grid_pixels, int cells, unsigned* keys,
+    double* judgement) {
+  float used = 0.f;
+  for (int p = threadIdx.x; p < cells; p += blockDim.x) {
+    float x = pixels[p].x - grid_pixels[p].x, y = pixels[p].y - grid_pixels[p].y;
+    bool counts = weight[p].x > 0.f;
+    used += counts;
+    keys[p] = counts ? median_key(sqrtf(x * x + y * y)) : LEFT_OUT;
+  }
+  used = block_sum(used);
+  float median = block_median(keys, cells);
+  if (threadIdx.x == 0) {
+    judgement[0] = used / cells;
+    judgement[1] = used > 0.f ? median : 0.f;
+  }
+}

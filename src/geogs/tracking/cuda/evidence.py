@@ -1,4 +1,4 @@
-"""Whether images bear a location out, on the GPU: two launches."""
+"""Whether images bear a location out, on the GPU, in a few launches."""
 
 from pathlib import Path
 
@@ -43,4 +43,16 @@ def median_correlation(
         c.fx, c.fy, c.cx, c.cy, least_variance, keys,
     )  # fmt: skip
     kernels["median_correlation"](1, 256, keys, count, found)
+    return found
+
+
+def matched_motion(
+    grid: SampleGrid, pixels: Float[Tensor, "p 2"], weight: Float[Tensor, "p 2"]
+) -> Float[Tensor, "2"]:
+    """As :func:`geogs.tracking.evidence.matched_motion`, float64; it stays on the GPU."""
+    keys = torch.empty(grid.size, dtype=torch.int32, device=pixels.device)
+    found = torch.empty(2, dtype=torch.float64, device=pixels.device)
+    kernels_for(SOURCE, pixels.device)["matched_motion"](
+        1, 512, pixels.contiguous(), weight.contiguous(), grid.pixels, grid.size, keys, found
+    )
     return found
