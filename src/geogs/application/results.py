@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable, Collection, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from pathlib import Path
 
@@ -31,7 +32,7 @@ def write_results(
     keyframe_images: bool = True,
     new_stages: Collection[str] = (),
 ) -> None:
-    """Write poses first, then the map, the mesh, what else was asked for, and the report on them.
+    """Write poses first, then map and mesh beside each other, what else was asked for, the report.
 
     ``more`` writes the rest, which the summary then counts. ``keyframe_images`` says whether the
     images of the keyframes are kept, too. Files of an earlier result in the folder are deleted;
@@ -52,16 +53,16 @@ def write_results(
     write_config(output / "config.yaml", scene.config)
     disks = result.map
     if result.why_no_map is None:
+        result.renders  # noqa: B018 - made once, for both
+    with ThreadPoolExecutor(1, thread_name_prefix="map") as beside:
+        written = beside.submit(_write_map, output, result, keyframe_images)
+        if (mesh := result.mesh) is not None:
+            with scene.stopwatch("mesh"):
+                write_mesh(
+                    output / "mesh.ply", mesh.vertices, mesh.faces, mesh.colours, mesh.normals
+                )
         with scene.stopwatch("keyframes"):
-            views = write_keyframes(output, scene, source.camera, result.renders, keyframe_images)
-            facts = {"source": source.name, "seed": scene.config.seed}
-            save_map_with_views(output / "map.safetensors", disks, views, facts)
-    if len(disks):
-        colours = splat_colours(disks, fusion_views(result.renders))
-        write_splats(output / "splats.ply", disks, colours)
-    if (mesh := result.mesh) is not None:
-        with scene.stopwatch("mesh"):
-            write_mesh(output / "mesh.ply", mesh.vertices, mesh.faces, mesh.colours, mesh.normals)
+            written.result()
     for write in more:
         write()
     lost = result.trajectory.states.count("lost")
@@ -76,6 +77,20 @@ def write_results(
     with scene.stopwatch("report"):
         write_report(output / "report", result.trajectory, result.renders, mesh, summary, disks)
     progress.stage("report", 1.0)
+
+
+@on_one_torch_thread
+def _write_map(output: Path, result: Result, keyframe_images: bool) -> None:
+    """Keyframes, map and splats, beside the mesh."""
+    scene, source, disks = result.scene, result.source, result.map
+    with scene.stopwatch.aside():
+        if result.why_no_map is None:
+            views = write_keyframes(output, scene, source.camera, result.renders, keyframe_images)
+            facts = {"source": source.name, "seed": scene.config.seed}
+            save_map_with_views(output / "map.safetensors", disks, views, facts)
+        if len(disks):
+            colours = splat_colours(disks, fusion_views(result.renders))
+            write_splats(output / "splats.ply", disks, colours)
 
 
 def write_config(path: Path, config: Config | ReconstructConfig) -> None:

@@ -1,11 +1,11 @@
 """What is removed from an extracted mesh."""
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Int
 
 from geogs.config import MeshConfig
 from geogs.mesh.holes import IsFree, close_holes
-from geogs.mesh.types import Mesh, cross
+from geogs.mesh.types import Mesh
 
 
 def cleaned(mesh: Mesh, config: MeshConfig, is_free: IsFree) -> Mesh:
@@ -20,12 +20,12 @@ def cleaned(mesh: Mesh, config: MeshConfig, is_free: IsFree) -> Mesh:
 def remove_degenerate_faces(mesh: Mesh) -> Mesh:
     """Without faces that repeat a vertex or whose squared area is below 1e-12 of the
     squared mean edge length squared, and without the vertices this leaves unused."""
-    vertices, (a, b, c) = mesh.vertices.astype(np.float64), mesh.faces.T
-    edges = [vertices[i] - vertices[j] for i, j in ((a, c), (b, a), (c, b))]
-    squared = np.stack([_squared_norm(e) for e in edges], -1)
-    area = _squared_norm(cross(edges[0], edges[1]))
+    from geogs.mesh.face_kernels import face_sizes
+
+    a, b, c = mesh.faces.T
+    area = np.empty(len(mesh.faces))
+    scale = face_sizes(mesh.vertices, np.ascontiguousarray(mesh.faces), area)
     distinct = (a != b) & (b != c) & (c != a)
-    scale = squared.mean() if len(squared) else 0.0
     return keep_faces(mesh, distinct & (area > 1e-12 * scale**2))
 
 
@@ -62,11 +62,6 @@ def keep_faces(mesh: Mesh, keep: np.ndarray) -> Mesh:
         mesh.normals[used],
         None if mesh.colours is None else mesh.colours[used],
     )
-
-
-def _squared_norm(rows: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, "m"]:
-    x, y, z = rows.T
-    return x * x + y * y + z * z
 
 
 def _components(mesh: Mesh) -> tuple[Int[np.ndarray, "m"], Int[np.ndarray, "c"]]:

@@ -22,8 +22,12 @@ def deviations(
 
     from geogs.mesh.deviation_kernels import faces_around, nearest_faces
 
-    used = np.unique(faces)
-    tree, count = cKDTree(vertices[used]), min(_NEAREST, len(used))
+    is_used = np.zeros(len(vertices), bool)
+    is_used[faces] = True
+    used = np.flatnonzero(is_used)
+    # Of a tree that is asked once, most of the time would go into balancing it.
+    tree = cKDTree(vertices[used], balanced_tree=False, compact_nodes=False)
+    count = min(_NEAREST, len(used))
     _, near = tree.query(points, k=count, workers=worker_count())
     first, around = faces_around(len(vertices), faces)
     corners = vertices.astype(np.float64)[faces]

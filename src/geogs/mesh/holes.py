@@ -44,8 +44,9 @@ def border_loops(faces: Int[np.ndarray, "m 3"]) -> Iterator[Loop]:
 
     Chains through a vertex where two borders meet are left out.
     """
-    edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64)
-    border = edges[~_is_shared(edges)]
+    from geogs.mesh.face_kernels import border_edges
+
+    border = border_edges(np.ascontiguousarray(faces), int(faces.max(initial=-1)) + 1)
     starts, counts = np.unique(border[:, 1], return_counts=True)
     single = set(starts[counts == 1].tolist())
     following = {end: start for start, end in border.tolist() if end in single}
@@ -57,14 +58,6 @@ def border_loops(faces: Int[np.ndarray, "m 3"]) -> Iterator[Loop]:
             vertex = following.pop(vertex)
         if vertex == first:
             yield loop
-
-
-def _is_shared(edges: Int[np.ndarray, "e 2"]) -> Bool[np.ndarray, "e"]:
-    """Which directed edges are there in the other direction, too."""
-    size = int(edges.max(initial=0)) + 1
-    there, back = edges[:, 0] * size + edges[:, 1], np.sort(edges[:, 1] * size + edges[:, 0])
-    place = np.searchsorted(back, there).clip(max=max(len(back) - 1, 0))
-    return np.asarray(back[place] == there)
 
 
 def _is_flat(mesh: Mesh, loop: Loop) -> bool:

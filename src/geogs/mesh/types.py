@@ -54,12 +54,9 @@ def vertex_normals(
     vertices: Float[np.ndarray, "n 3"], faces: Int32[np.ndarray, "m 3"]
 ) -> Float[np.ndarray, "n 3"]:
     """Unit normals, the mean of a vertex's faces weighted by area; zero where it has none."""
-    corners = vertices.astype(np.float64)[faces]
-    doubled_area = cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    index = faces.T.ravel()
-    total = np.stack(
-        [np.bincount(index, np.tile(axis, 3), len(vertices)) for axis in doubled_area.T], -1
-    )
+    from geogs.mesh.face_kernels import normal_sums
+
+    total = normal_sums(np.ascontiguousarray(vertices), np.ascontiguousarray(faces))
     length = np.linalg.norm(total, axis=1, keepdims=True)
     return (total / np.where(length > 0, length, 1)).astype(np.float32)
 
