@@ -8,7 +8,7 @@ from jaxtyping import Float64
 
 from geogs.depth.view import Place
 from geogs.errors import InputError
-from geogs.io.sources.base import read_ahead
+from geogs.io.sources.base import read_side_by_side
 from geogs.io.sources.posed.base import PosedSource
 from geogs.mapping.first_look import SmallImage, first_points
 from geogs.mapping.known_poses import FEWEST_POINTS, depth_search
@@ -93,7 +93,7 @@ class PosedViews:
     def give_these(self, places: Sequence[int]) -> None:
         """The images at some places of the source, in this order."""
         source, scene = self._source, self._scene
-        for done, image in enumerate(read_ahead(source[i] for i in places)):
+        for done, image in enumerate(read_side_by_side(source.__getitem__, places)):
             scene.add(image.image, image.T_cw, image.mask, image.timestamp, image.index)
             self._report("reading", (done + 1) / len(places))
 

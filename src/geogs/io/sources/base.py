@@ -7,8 +7,9 @@ ahead.
 
 import hashlib
 import logging
-from collections.abc import Generator, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, Protocol, TypeVar, runtime_checkable
@@ -36,7 +37,10 @@ from geogs.shutter.turning import Turning
 from geogs.types import Frame, MeasuredDepth, MeasuredPose, SeenRows
 
 _log = logging.getLogger(__name__)
+S = TypeVar("S")
 T = TypeVar("T")
+READERS = 4
+"""Threads that read side by side what may be read in any order."""
 LEAST_EDGE = 12
 """Pixels of the shorter side of a working image."""
 MINUTE = 60.0
@@ -265,7 +269,7 @@ class Source:
         count = min(ends) - config.start if ends else CLIP * CLIPS
         if len(reader.paths) > 1:
             starts = clip_starts(config.start, count)
-            yield from read_ahead(list(self._resized(n, n + CLIP)) for n in starts)
+            yield from read_side_by_side(lambda n: list(self._resized(n, n + CLIP)), starts)
             return
         starts = clip_starts(config.start, min(count, round(MINUTE * reader.fps)))
         if not starts:
@@ -425,6 +429,21 @@ def read_ahead(items: Iterator[T]) -> Iterator[T]:
         while (item := pending.result()) is not end:
             pending = thread.submit(next, items, end)
             yield item  # type: ignore[misc]  # not the end mark
+
+
+def read_side_by_side(read: Callable[[S], T], places: Iterable[S]) -> Iterator[T]:
+    """``map(read, places)``, the next ones being read meanwhile in a few threads."""
+    pool = ThreadPoolExecutor(READERS, thread_name_prefix="read-ahead")
+    pending: deque[Future[T]] = deque()
+    try:
+        for place in places:
+            pending.append(pool.submit(read, place))
+            if len(pending) > READERS:
+                yield pending.popleft().result()
+        while pending:
+            yield pending.popleft().result()
+    finally:
+        pool.shutdown(cancel_futures=True)
 
 
 def fingerprint_of(paths: Sequence[Path]) -> str:
