@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from geogs.errors import InputError
-from geogs.io.pictures import decoded, decoder_noise, header_of
+from geogs.io.decoder_noise import decoder_noise
+from geogs.io.pictures import decoded, header_of
 from io_samples import gradient_image, write_image
 
 

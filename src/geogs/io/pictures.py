@@ -5,11 +5,7 @@ gives half a picture and such a line, and no error.
 """
 
 import io
-import os
-import threading
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,29 +15,14 @@ from jaxtyping import Bool
 
 from geogs.documents import read_bytes
 from geogs.errors import InputError
+from geogs.io.decoder_noise import decoder_noise
 
 LARGEST_PICTURE = 1 << 31
 """Bytes of a file."""
-_NOISE = (
-    "jpeg",
-    "png",
-    "tiff",
-    "webp",
-    "opencv",
-    " warn:",
-    " error:",
-    "bmp",
-    "exif",
-    "iccp",
-    "cv::",
-)
-"""What lines of the decoders hold, in small letters."""
 _PIXELS_A_BYTE = 10_000
 """Of a picture of nothing but black, compressed as well as any format can."""
 _HARMLESS = 1 << 24
 """Pixels that are decoded in no time, whatever the file holds."""
-_PIPE_SIZE = 1 << 20
-_ONE_AT_A_TIME = threading.Lock()
 
 
 @dataclass(frozen=True)
@@ -69,13 +50,21 @@ def decoded_bytes(data: np.ndarray, flags: int) -> Decoded:
         return Decoded(None)
     if _promises_too_much(data):
         return Decoded(None)
-    with decoder_noise() as noise:
+    picture, noise = _decode(data, flags, alone=False)
+    if noise:  # of this one, or of one that another thread decodes
+        picture, noise = _decode(data, flags, alone=True)
+    is_damaged = any("corrupt" in line.lower() for line in noise) or _is_cut_off(data)
+    return Decoded(picture, picture is not None and is_damaged)
+
+
+def _decode(data: np.ndarray, flags: int, alone: bool) -> tuple[np.ndarray | None, list[str]]:
+    """The picture, if there is one, and what decoders printed."""
+    with decoder_noise(alone) as noise:
         try:
             picture = cv2.imdecode(data, flags)
         except (cv2.error, MemoryError):
             picture = None
-    is_damaged = any("corrupt" in line.lower() for line in noise) or _is_cut_off(data)
-    return Decoded(picture, picture is not None and is_damaged)
+    return picture, noise
 
 
 def header_of(path: Path) -> tuple[tuple[int, int], str] | None:
@@ -95,54 +84,6 @@ def header_of(path: Path) -> tuple[tuple[int, int], str] | None:
         raise InputError(f"{path} has more than 178 megapixels; make it smaller.") from None
     except Exception:  # whatever a damaged file makes one of its many readers stumble over
         return None
-
-
-@contextmanager
-def decoder_noise() -> Iterator[list[str]]:
-    """Inside, lines of decoders on the standard error are caught; afterwards the list has them.
-
-    Lines of others come to the standard error at the end of the block.
-    """
-    lines: list[str] = []
-    with _ONE_AT_A_TIME:
-        try:
-            there, here = os.pipe()
-        except OSError:  # too many files are open
-            yield lines
-            return
-        try:
-            kept = os.dup(2)
-        except OSError:  # there is no standard error
-            os.close(there)
-            os.close(here)
-            yield lines
-            return
-        os.set_blocking(there, False)
-        os.set_blocking(here, False)  # what no longer fits is dropped rather than waited for
-        os.dup2(here, 2)
-        os.close(here)
-        try:
-            yield lines
-        finally:
-            os.dup2(kept, 2)
-            os.close(kept)
-            _sort(there, lines)
-            os.close(there)
-
-
-def _sort(pipe: int, noise: list[str]) -> None:
-    """Lines of decoders in a pipe go to a list, those of others to the standard error."""
-    try:
-        caught = os.read(pipe, _PIPE_SIZE)
-    except BlockingIOError:
-        return
-    for line in caught.splitlines(keepends=True):
-        text = line.decode("utf-8", "replace").strip()
-        if any(word in text.lower() for word in _NOISE):
-            noise.append(text)
-        elif text:
-            with suppress(OSError):
-                os.write(2, line)
 
 
 def _promises_too_much(data: np.ndarray) -> bool:

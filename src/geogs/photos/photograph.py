@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from geogs.errors import InputError
-from geogs.io.pictures import decoder_noise
+from geogs.io.decoder_noise import decoder_noise
 from geogs.io.sources.images import SUFFIXES, image_folder, natural_key
 
 _MAKE, _MODEL, _ORIENTATION, _EXIF_IFD = 0x010F, 0x0110, 0x0112, 0x8769

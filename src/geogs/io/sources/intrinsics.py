@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from geogs.errors import InputError
-from geogs.io.pictures import decoder_noise
+from geogs.io.decoder_noise import decoder_noise
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.calibration_files import calibration_from_words, read_calibration
 
