@@ -335,7 +335,7 @@ def test_fit_of_a_frame_matches_the_cpu(device):
     edge = int(torch.nonzero((problem.source == 0) & (problem.target == 2))[0])
     pixels, weight = problem.pixels[edge], problem.weight[edge]
     pixels[::7] += 30.0
-    (expected_T, expected), (T, found) = (
+    (expected_T, expected_motion, expected), (T, motion, found) = (
         solver(kept.grid).fit(
             problem.T_cw[2], kept[0], pixels.to(where), weight.to(where), 6, 5.0, 3.0
         )
@@ -344,6 +344,8 @@ def test_fit_of_a_frame_matches_the_cpu(device):
         )
     )  # fmt: skip
     torch.testing.assert_close(T.cpu(), expected_T, rtol=0, atol=2e-5)
+    torch.testing.assert_close(motion.cpu(), expected_motion, rtol=0, atol=3e-5)
+    torch.testing.assert_close(motion.cpu() @ slow[0].T_cw, T.cpu(), rtol=0, atol=1e-9)
     used, matched, residual, flow, informed, known = found.tolist()
     share = ((weight[:, 0] > 0) & (slow[0].information > 0)).float().mean()
     assert used == pytest.approx(float(share), abs=1e-6)

@@ -46,7 +46,7 @@ class CpuMotion:
         iterations: int,
         huber: float,
         limit: float,
-    ) -> tuple[Float[Tensor, "4 4"], Float[Tensor, "6"]]:
+    ) -> tuple[Float[Tensor, "4 4"], Float[Tensor, "4 4"], Float[Tensor, "6"]]:
         """As in the protocol."""
         informed = keyframe.information > 0
         placed = keyframe.has_known_depth & (weight[:, 0] > 0)
@@ -64,4 +64,5 @@ class CpuMotion:
         agree = used & (error < limit)
         matched, agreeing, known, sure = (x.float().mean() for x in (used, agree, informed, placed))
         medians = error[used].median(), flow[used].median()
-        return T[0], torch.stack([matched, agreeing, *medians, known, sure])
+        T_ji = T[0] @ se3_inverse(keyframe.T_cw)
+        return T[0], T_ji, torch.stack([matched, agreeing, *medians, known, sure])

@@ -76,7 +76,10 @@ def initialise(graph: FrameGraph, config: TrackingConfig, flows: Sequence[FlowMa
     store = graph.keyframes
     camera = store.grid.camera
     min_parallax = config.min_parallax * max(camera.width, camera.height)
-    best = _best_two_view(store.grid, flows, min_parallax)
+    # Poses are guessed on the CPU.
+    flows = [FlowMatch(f.pixels.cpu(), f.weight.cpu()) for f in flows]
+    found = thread_map(lambda match: two_view(camera, match), flows)
+    best = best_two_view(found, min_parallax)
     if best is None:
         return Attempt.FAILED
     _place_all(graph, flows, best)
@@ -89,15 +92,6 @@ def initialise(graph: FrameGraph, config: TrackingConfig, flows: Sequence[FlowMa
     if deviation > config.start_deviation or not _is_borne_out(graph, config.min_ncc):
         return Attempt.FAILED
     return Attempt.STARTED
-
-
-def _best_two_view(
-    grid: SampleGrid, flows: Sequence[FlowMatch], min_parallax: float
-) -> tuple[int, TwoView] | None:
-    flows = [FlowMatch(f.pixels.cpu(), f.weight.cpu()) for f in flows]
-    return best_two_view(
-        thread_map(lambda match: two_view(grid.camera, match), flows), min_parallax
-    )
 
 
 def best_two_view(
@@ -199,7 +193,7 @@ def _pose_of(
 
 
 def _place_all(graph: FrameGraph, flows: Sequence[FlowMatch], best: tuple[int, TwoView]) -> None:
-    """Poses by PnP on the first keyframe's depth, depths by carrying it over.
+    """Poses by PnP on the first keyframe's depth, depths by carrying it over; flows on the CPU.
 
     Keyframes that no longer see it are placed on what the one before them was given.
     """
@@ -207,10 +201,11 @@ def _place_all(graph: FrameGraph, flows: Sequence[FlowMatch], best: tuple[int, T
     chosen, view = best
     states, fields = list(store), grid_fields(store.grid)
     first = states[0]
-    eye = torch.eye(4, dtype=torch.float64)
-    known = view.good.to(store.grid.device)
-    first.T_cw, first.information = eye, known.float()
-    first.inverse_depth = fields.fill(view.inverse_depth.to(known.device), first.information)
+    device, grid = store.grid.device, SampleGrid(store.grid.camera)
+    first.T_cw, known = torch.eye(4, dtype=torch.float64), view.good
+    first.information = known.float().to(device)
+    first.inverse_depth = fields.fill(view.inverse_depth.to(device), first.information)
+    depth = first.inverse_depth.cpu()
     for n, (state, match) in enumerate(zip(states[1:], flows, strict=True)):
         if n == chosen:
             state.T_cw = view.T_ji
@@ -218,7 +213,7 @@ def _place_all(graph: FrameGraph, flows: Sequence[FlowMatch], best: tuple[int, T
             good = known & match.sure()[0]
             T = None
             if float(good.sum()) > LEAST_SEEN * float(known.sum()):
-                T = pnp(store.grid, first.inverse_depth, match.pixels[0], good)
+                T = pnp(grid, depth, match.pixels[0], good)
             state.T_cw = placed_after(graph, states[n], state) if T is None else T
         state.inverse_depth, state.information = fields.transfer(
             state.T_cw, first.inverse_depth, first.information

@@ -13,8 +13,6 @@ from torch import Tensor
 from geogs.bundle.select import grid_fields, motion_solver
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
-from geogs.geometry.lie import se3_inverse
-from geogs.gpu.transfer import to_device
 from geogs.keyframes.grid import SampleGrid
 from geogs.keyframes.keyframe import Keyframe
 from geogs.tracking.evidence import (
@@ -154,7 +152,7 @@ class FrameLocator:
         T_guess: Float[Tensor, "4 4"],
         is_expected: bool,
     ) -> FrameMotion | None:
-        T, judged = motion_solver(self.grid).fit(
+        T, T_ji, judged = motion_solver(self.grid).fit(
             T_guess,
             keyframe,
             match.pixels[0],
@@ -167,7 +165,7 @@ class FrameLocator:
             self.grid,
             self.operator.grey(keyframe.encoded),
             self.operator.grey(encoded),
-            T @ to_device(se3_inverse(keyframe.T_cw), T.device),
+            T_ji,
             keyframe.inverse_depth,
             keyframe.information,
         )

@@ -124,9 +124,9 @@ def _system_parts(
 class _Workspace:
     """State of one solve on the device."""
 
-    def __init__(self, problem: BundleProblem, device: torch.device) -> None:
+    def __init__(self, problem: BundleProblem, structure: _Structure, device: torch.device) -> None:
         d = problem.inverse_depth
-        self.structure = s = _structure(problem, device)
+        self.structure = s = structure
         edges, cells = s.edges, d.shape[1]
         self.cells = cells
         # Poses and the sign of failure travel back together.
@@ -195,6 +195,7 @@ class CudaDenseBundle:
         device = torch.device(grid.device)
         self._step = kernels_for(Path(__file__).with_name("linearise.cu"), device)
         self._solve = kernels_for(Path(__file__).with_name("solve.cu"), device)
+        self._last: tuple[tuple[bytes, ...], _Structure] | None = None
 
     def solve(self, problem: BundleProblem, options: BundleOptions | None = None) -> BundleResult:
         """Take ``options.iterations`` damped Gauss-Newton steps.
@@ -203,7 +204,8 @@ class CudaDenseBundle:
         returned where they were given.
         """
         options = options or BundleOptions()
-        w = _Workspace(problem, problem.inverse_depth.device)
+        device = problem.inverse_depth.device
+        w = _Workspace(problem, self._structure_of(problem, device), device)
         pixels, weight = problem.pixels.contiguous(), problem.weight.contiguous()
         for _ in range(options.iterations):
             self._linearise(w, pixels, weight, options)
@@ -213,6 +215,14 @@ class CudaDenseBundle:
         T = state[:-1].reshape(-1, 4, 4).to(problem.T_cw.device)
         finite = int(state[-1:].view(torch.int32)[0]) == 0
         return BundleResult(T, w.inverse_depth, w.information, w.residual, finite)
+
+    def _structure_of(self, problem: BundleProblem, device: torch.device) -> _Structure:
+        """That of the last problem, if it is the same: edges are adjusted in rounds."""
+        parts = (problem.source, problem.target, problem.free_pose, problem.free_depth)
+        key = tuple(x.cpu().numpy().tobytes() for x in parts)
+        if self._last is None or self._last[0] != key:
+            self._last = key, _structure(problem, device)
+        return self._last[1]
 
     def _linearise(
         self, w: _Workspace, pixels: Tensor, weight: Tensor, options: BundleOptions

@@ -80,11 +80,13 @@ extern "C" __global__ void __launch_bounds__(512) solve_poses(
 // What tells whether a frame was found: the share of the cells that are matched, the share whose
 // residual is below `limit`, the median residual and the median motion of the matched, the share of
 // the cells that have information, and of those that are matched and have enough of it to know their
-// depth to sqrt(known). One block.
+// depth to sqrt(known). Also the upper rows of the motion from the keyframe at T_source to the frame
+// at T. One block.
 extern "C" __global__ void __launch_bounds__(512) judge_match(
     const float2* pixels, const float2* weight, const float* information,
     const float* inverse_depth, const float2* residual, const float2* grid_pixels, int cells,
-    float limit, float known, double* judgement) {
+    float limit, float known, const double* T, const double* T_source, double* judgement,
+    double* T_ji) {
   SHARED_MEMORY(u32, keys);
   float used = 0.f, agree = 0.f, informed = 0.f, placed = 0.f;
   for (int p = threadIdx.x; p < cells; p += blockDim.x) {
@@ -115,5 +117,6 @@ extern "C" __global__ void __launch_bounds__(512) judge_match(
     judgement[3] = median_flow;
     judgement[4] = informed / cells;
     judgement[5] = placed / cells;
+    relative_motion(T, T_source, T_ji);
   }
 }

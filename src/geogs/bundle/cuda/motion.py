@@ -62,22 +62,25 @@ class CudaMotion:
         iterations: int,
         huber: float,
         limit: float,
-    ) -> tuple[Float[Tensor, "4 4"], Float[Tensor, "6"]]:
+    ) -> tuple[Float[Tensor, "4 4"], Float[Tensor, "4 4"], Float[Tensor, "6"]]:
         """As in the protocol."""
         grid, c, known = self.grid, self.grid.camera, keyframe.information
         device, threads = known.device, _threads(grid.size)
-        state = torch.cat([T_guess.reshape(-1), T_guess.new_zeros(6), keyframe.T_cw.reshape(-1)])
+        # Both poses in one piece; behind them what is found.
+        found = torch.cat([torch.eye(4).reshape(-1), torch.zeros(6)]).to(T_guess)
+        state = torch.cat([T_guess.reshape(-1), keyframe.T_cw.reshape(-1), found])
         state = to_device(state, device)
+        T, T_source, T_ji, judged = state.split([16, 16, 16, 6])
         rows = torch.arange(2, dtype=torch.int32, device=device)
         pixels, weight = pixels.contiguous(), weight.contiguous()
         residual = torch.empty_like(pixels)
         kernels = kernels_for(SOURCE, device)
         kernels["solve_poses"](
-            1, threads, rows, rows, keyframe.inverse_depth, state[22:], pixels, weight, known,
-            self.rays, grid.size, c.fx, c.fy, c.cx, c.cy, iterations, huber, state, residual,
+            1, threads, rows, rows, keyframe.inverse_depth, T_source, pixels, weight, known,
+            self.rays, grid.size, c.fx, c.fy, c.cx, c.cy, iterations, huber, T, residual,
         )  # fmt: skip
         kernels["judge_match"](
             1, threads, pixels, weight, known, keyframe.inverse_depth, residual, grid.pixels,
-            grid.size, limit, KNOWN**2, state[16:], shared=4 * grid.size,
+            grid.size, limit, KNOWN**2, T, T_source, judged, T_ji, shared=4 * grid.size,
         )  # fmt: skip
-        return state[:16].reshape(4, 4), state[16:22]
+        return T.reshape(4, 4), T_ji.reshape(4, 4), judged
