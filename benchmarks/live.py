@@ -33,6 +33,7 @@ def main() -> None:
     parser.add_argument("--stop", type=int)
     parser.add_argument("--long-edge", type=int, default=640)
     parser.add_argument("--warm", type=float, default=3.0, help="seconds after the first pose")
+    parser.add_argument("--operator", default="classical", help="of the flow")
     parser.add_argument("--in-line", action="store_true", help="map between frames, as files do")
     parser.add_argument("--json", help="file for the figures")
     parser.add_argument("--profile", type=int, default=0, metavar="N",
@@ -43,7 +44,12 @@ def main() -> None:
         given.sequence, InputConfig(stop=given.stop, long_edge=given.long_edge)
     )
     frames = list(source)
-    config = replace(geogs.Config(), input=InputConfig(long_edge=given.long_edge))
+    config = geogs.Config()
+    config = replace(
+        config,
+        input=InputConfig(long_edge=given.long_edge),
+        tracking=replace(config.tracking, operator=given.operator),
+    )
     slam = geogs.Slam(source.camera, config, given.device, live=not given.in_line)
     profile = cProfile.Profile() if given.profile else None
     figures = play(slam, frames, given.fps, given.warm, profile)
