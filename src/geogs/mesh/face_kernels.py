@@ -5,23 +5,35 @@ from numba import njit
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def _edge(vertices, a, b):
+    """From one vertex to another, in double precision."""
+    return (
+        np.float64(vertices[b, 0]) - vertices[a, 0],
+        np.float64(vertices[b, 1]) - vertices[a, 1],
+        np.float64(vertices[b, 2]) - vertices[a, 2],
+    )
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _cross(u, v):
+    return u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _square(u):
+    return u[0] * u[0] + u[1] * u[1] + u[2] * u[2]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def normal_sums(vertices, faces):
     """Cross products of two edges of each face, added up at its three vertices."""
     total = np.zeros((len(vertices), 3), np.float64)
     for f in range(len(faces)):
         a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
-        ax, ay, az = (
-            np.float64(vertices[a, 0]),
-            np.float64(vertices[a, 1]),
-            np.float64(vertices[a, 2]),
-        )
-        ux, uy, uz = vertices[b, 0] - ax, vertices[b, 1] - ay, vertices[b, 2] - az
-        vx, vy, vz = vertices[c, 0] - ax, vertices[c, 1] - ay, vertices[c, 2] - az
-        x, y, z = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+        normal = _cross(_edge(vertices, a, b), _edge(vertices, a, c))
         for k in (a, b, c):
-            total[k, 0] += x
-            total[k, 1] += y
-            total[k, 2] += z
+            for axis in range(3):
+                total[k, axis] += normal[axis]
     return total
 
 
@@ -31,18 +43,9 @@ def face_sizes(vertices, faces, squared_area):
     total = 0.0
     for f in range(len(faces)):
         a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
-        ax, ay, az = (
-            np.float64(vertices[a, 0]),
-            np.float64(vertices[a, 1]),
-            np.float64(vertices[a, 2]),
-        )
-        ux, uy, uz = vertices[b, 0] - ax, vertices[b, 1] - ay, vertices[b, 2] - az
-        vx, vy, vz = vertices[c, 0] - ax, vertices[c, 1] - ay, vertices[c, 2] - az
-        wx, wy, wz = vx - ux, vy - uy, vz - uz
-        x, y, z = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
-        squared_area[f] = x * x + y * y + z * z
-        total += ux * ux + uy * uy + uz * uz
-        total += vx * vx + vy * vy + vz * vz + wx * wx + wy * wy + wz * wz
+        u, v = _edge(vertices, a, b), _edge(vertices, a, c)
+        squared_area[f] = _square(_cross(u, v))
+        total += _square(u) + _square(v) + _square(_edge(vertices, b, c))
     return total / max(3 * len(faces), 1)
 
 
