@@ -22,6 +22,7 @@ from geogs.io.writers.ply import write_mesh, write_splats
 from geogs.io.writers.tum import write_trajectories
 from geogs.io.writers.uncertainty import write_uncertainty
 from geogs.threads import on_one_torch_thread
+from geogs.types import RenderedKeyframe
 
 
 @on_one_torch_thread
@@ -52,10 +53,9 @@ def write_results(
     write_intrinsics(output / "intrinsics.json", source.camera, *as_it_came)
     write_config(output / "config.yaml", scene.config)
     disks = result.map
-    if result.why_no_map is None:
-        result.renders  # noqa: B018 - made once, for both
+    renders = result.renders if result.why_no_map is None else ()
     with ThreadPoolExecutor(1, thread_name_prefix="map") as beside:
-        written = beside.submit(_write_map, output, result, keyframe_images)
+        written = beside.submit(_write_map, output, result, renders, keyframe_images)
         if (mesh := result.mesh) is not None:
             with scene.stopwatch("mesh"):
                 write_mesh(
@@ -80,16 +80,18 @@ def write_results(
 
 
 @on_one_torch_thread
-def _write_map(output: Path, result: Result, keyframe_images: bool) -> None:
+def _write_map(
+    output: Path, result: Result, renders: Sequence[RenderedKeyframe], keyframe_images: bool
+) -> None:
     """Keyframes, map and splats, beside the mesh."""
     scene, source, disks = result.scene, result.source, result.map
     with scene.stopwatch.aside():
         if result.why_no_map is None:
-            views = write_keyframes(output, scene, source.camera, result.renders, keyframe_images)
+            views = write_keyframes(output, scene, source.camera, renders, keyframe_images)
             facts = {"source": source.name, "seed": scene.config.seed}
             save_map_with_views(output / "map.safetensors", disks, views, facts)
         if len(disks):
-            colours = splat_colours(disks, fusion_views(result.renders))
+            colours = splat_colours(disks, fusion_views(renders))
             write_splats(output / "splats.ply", disks, colours)
 
 

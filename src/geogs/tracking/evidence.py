@@ -119,7 +119,7 @@ def _on_gpu(
     from geogs.tracking.cuda.evidence import median_correlation
 
     if T_ji is not None:
-        T_ji = to_device(T_ji.contiguous(), first.device)
+        T_ji = to_device(T_ji, first.device)
     return median_correlation(
         grid, first, second, _spread(grid).step, MIN_CONTRAST**2, T_ji, inverse_depth, information,
         pixels,

@@ -36,10 +36,12 @@ def median_correlation(
     count = -(-grid.size // step)
     keys = torch.empty(count, dtype=torch.int32, device=device)
     found = torch.empty(2, dtype=torch.float64, device=device)
+    where = (T_ji, inverse_depth, information, pixels)
     kernels = kernels_for(SOURCE, device)
     kernels["correlate_windows"](
-        -(-count // WINDOWS), (32, WINDOWS), first, second, c.width, c.height, grid.rays,
-        grid.width, STRIDE, step, count, T_ji, inverse_depth, information, pixels,
+        -(-count // WINDOWS), (32, WINDOWS), first.contiguous(), second.contiguous(), c.width,
+        c.height, grid.rays, grid.width, STRIDE, step, count,
+        *(None if x is None else x.contiguous() for x in where),
         c.fx, c.fy, c.cx, c.cy, least_variance, keys,
     )  # fmt: skip
     kernels["median_correlation"](1, 256, keys, count, found)
