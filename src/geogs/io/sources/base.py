@@ -7,6 +7,7 @@ ahead.
 
 import hashlib
 import logging
+import stat
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -448,8 +449,17 @@ def read_side_by_side(read: Callable[[S], T], places: Iterable[S]) -> Iterator[T
 
 def fingerprint_of(paths: Sequence[Path]) -> str:
     """Sixteen digits that change with the names and sizes of files."""
-    sizes = [(p.name, p.stat().st_size if p.is_file() else -1) for p in paths]
+    sizes = [(p.name, -1 if (size := size_of(p)) is None else size) for p in paths]
     return hashlib.sha256(repr(sizes).encode()).hexdigest()[:16]
+
+
+def size_of(path: Path) -> int | None:
+    """Bytes of a file, asked for once, as folders may be far away; none where there is none."""
+    try:
+        found = path.stat()
+    except OSError:
+        return None
+    return found.st_size if stat.S_ISREG(found.st_mode) else None
 
 
 def clip_starts(first: int, count: int) -> list[int]:

@@ -31,21 +31,24 @@ def open_replica(folder: Path) -> ImageList:
     """Read a scene; frame k is at k / 30 s, which matches line k of ``traj.txt``."""
     results = _results(folder)
     scene = results.parent.resolve()
-    matches = ((_NAME.fullmatch(path.name), path) for path in results.iterdir())
+    there = {path.name for path in results.iterdir()}
+    matches = ((_NAME.fullmatch(name), results / name) for name in there)
     numbered = sorted((int(match[1]), path) for match, path in matches if match)
     per_metre = _units_per_metre(scene)
-    files = [
-        ImageFile(path, k / FRAMES_PER_SECOND, _depth(path, k, per_metre)) for k, path in numbered
-    ]
+    files = []
+    for k, path in numbered:
+        depth = DepthFile(_depth(path, k), per_metre)
+        known = depth if depth.path.name in there else None
+        files.append(ImageFile(path, k / FRAMES_PER_SECOND, known))
     reader = ImageList("replica", scene.name, files, None)
     reader.calibration = _find_calibration(scene, reader.width, reader.height)
     return reader
 
 
-def _depth(image: Path, number: int, per_metre: float) -> DepthFile | None:
+def _depth(image: Path, number: int) -> Path:
+    """Where the depth of an image would lie."""
     digits = len(image.stem) - len("frame")
-    path = image.with_name(f"depth{number:0{digits}d}.png")
-    return DepthFile(path, per_metre) if path.is_file() else None
+    return image.with_name(f"depth{number:0{digits}d}.png")
 
 
 def _units_per_metre(scene: Path) -> float:

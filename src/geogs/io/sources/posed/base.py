@@ -11,7 +11,7 @@ from geogs.config import InputConfig
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.io.pictures import read_mask
-from geogs.io.sources.base import check_large_enough, fingerprint_of, read_ahead
+from geogs.io.sources.base import check_large_enough, fingerprint_of, read_ahead, size_of
 from geogs.io.sources.posed.files import PosedSet, SparsePoints, Sphere, without_invalid_poses
 from geogs.io.sources.posed.one_camera import OneCamera
 from geogs.io.sources.posed.pictures import read_picture, stored_size
@@ -100,7 +100,7 @@ class PosedSource:
 
         Of images of the same thing by the same camera, a blurred one takes least.
         """
-        return [f.path.stat().st_size if f.path.is_file() else 0 for f in self._files]
+        return [size_of(file.path) or 0 for file in self._files]
 
     def label(self, index: int) -> str:
         """What to call image ``index`` in a message."""
