@@ -1,4 +1,4 @@
-"""Threads of a live system that work beside the one to which frames come."""
+"""Threads that work beside the one to which frames come."""
 
 import threading
 from collections.abc import Callable, Iterator

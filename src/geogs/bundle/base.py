@@ -88,11 +88,11 @@ class MotionSolver(Protocol):
         """Pose of a frame against one keyframe, and what tells whether it is right.
 
         Cells without information do not count. Returns the pose; the motion from the keyframe to
-        it; and in one tensor the share of the cells that are
-        matched, the share whose residual is below ``limit`` pixels, and the medians over the
-        matched of the residual and of the motion, in pixels: not numbers where nothing is matched;
-        the share of the cells that have information, and of those that are matched and have
-        known depth (``Keyframe.has_known_depth``). On a GPU all stays there, and nothing waits.
+        it; and in one tensor the share of the cells that are matched, the share whose residual is
+        below ``limit`` pixels, the medians over the matched of the residual and of the motion, in
+        pixels, which are not numbers where nothing is matched, the share of the cells that have
+        information, and of those that are matched and have known depth
+        (``Keyframe.has_known_depth``). On a GPU all stays there, and nothing waits.
         """
         ...
 

@@ -54,8 +54,10 @@ class _StandardError:
         with self._turn:
             if alone:
                 self._waiting += 1
-                self._turn.wait_for(lambda: not self._inside)
-                self._waiting -= 1
+                try:
+                    self._turn.wait_for(lambda: not self._inside)
+                finally:  # whoever gives up waiting keeps nobody out
+                    self._waiting -= 1
                 self._is_one_alone = True
             else:
                 self._turn.wait_for(lambda: not self._is_one_alone and not self._waiting)

@@ -2,12 +2,12 @@
 
 import math
 from collections import deque
-from concurrent.futures import Future, ThreadPoolExecutor
 
 import cv2
 import numpy as np
 from jaxtyping import UInt8
 
+from geogs.beside import Errand
 from geogs.config import TrackingConfig
 
 LEAST_FLOW = 0.2
@@ -61,25 +61,24 @@ class KeyframeChoice:
         self.config = config
         self.long_edge = long_edge
         self._recent: deque[float] = deque(maxlen=_COMPARED)
-        self._latest: Future[float] | None = None
-        self._beside = ThreadPoolExecutor(1, thread_name_prefix="sharpness")
+        self._beside = Errand("sharpness")
 
     def see(self, image: UInt8[np.ndarray, "h w 3"]) -> None:
         """Take note of the next frame, about which :meth:`calls_for` is asked.
 
         It is looked at beside what its tracking takes.
         """
-        self._note()
-        self._latest = self._beside.submit(sharpness, image)
+        self._beside.start(lambda: self._recent.append(sharpness(image)))
 
     def state(self) -> list[float]:
         """What a checkpoint holds: the sharpness of the latest frames."""
-        self._note()
+        self._beside.wait()
         return list(self._recent)
 
     def load(self, state: list[float]) -> None:
         """Go on where another was."""
-        self._recent, self._latest = deque(state, maxlen=_COMPARED), None
+        self._beside.wait()
+        self._recent = deque(state, maxlen=_COMPARED)
 
     def calls_for(self, flow: float, overlap: float) -> bool:
         """Whether the frame seen last becomes one: see :func:`calls_for_keyframe`.
@@ -90,14 +89,8 @@ class KeyframeChoice:
         patience = self.config.blur_wait if self._is_blurred() else 0.0
         return calls_for_keyframe(self.config, self.long_edge, flow, overlap, patience)
 
-    def _note(self) -> None:
-        """Wait for the frame that was seen last."""
-        if self._latest is not None:
-            self._recent.append(self._latest.result())
-            self._latest = None
-
     def _is_blurred(self) -> bool:
-        self._note()
+        self._beside.wait()
         if len(self._recent) < 3:
             return False
         return self._recent[-1] < self.config.blur_share * float(np.median(self._recent))

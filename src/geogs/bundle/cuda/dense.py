@@ -23,9 +23,19 @@ TILE = 32
 """Rows and columns of the tiles of a larger system; ``TILE`` of the source."""
 
 
-def block_size(cells: int) -> int:
-    """Threads of a block that goes over the cells of an edge: whole warps, 64 to 256."""
-    return max(64, min(-(-cells // 32) * 32, 256))
+def block_size(cells: int, most: int = 256) -> int:
+    """Threads of a block that goes over the cells of an edge: whole warps, 64 to ``most``."""
+    return max(64, min(-(-cells // 32) * 32, most))
+
+
+def edges_by_frame(
+    frame: Int[Tensor, "e"], frames: int, device: torch.device
+) -> tuple[Int[Tensor, "m"], Int[Tensor, "e"]]:
+    """Where the edges of each frame begin, and the end, in a list of all edges; and that list."""
+    order = torch.argsort(frame, stable=True)
+    first = torch.searchsorted(frame[order], torch.arange(frames + 1))
+    rows = to_device(torch.cat([first, order]), device, torch.int32)
+    return rows[: frames + 1], rows[frames + 1 :]
 
 
 @dataclass(frozen=True)

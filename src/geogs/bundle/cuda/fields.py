@@ -7,16 +7,15 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from geogs.bundle.cuda.dense import block_size
 from geogs.gpu.kernels import kernels_for
 from geogs.gpu.transfer import to_device
 from geogs.keyframes.grid import OFFSET, STRIDE, SampleGrid
 from geogs.keyframes.keyframe import Keyframe
 
 SOURCE = Path(__file__).with_name("fields.cu")
-
-
-def _threads(grid: SampleGrid) -> int:
-    return max(64, min(-(-grid.size // 32) * 32, 1024))
+MOST_THREADS = 1024
+"""Of a block."""
 
 
 def _pyramid_size(grid: SampleGrid) -> int:
@@ -42,8 +41,8 @@ class CudaFields:
         out, size = torch.empty_like(values), _pyramid_size(self.grid)
         count = out.numel() // self.grid.size
         kernels_for(SOURCE, values.device)["fill_fields"](
-            count, _threads(self.grid), values, confidence, self.grid.width, self.grid.height, size,
-            values.new_empty(count * size), out,
+            count, block_size(self.grid.size, MOST_THREADS), values, confidence, self.grid.width,
+            self.grid.height, size, values.new_empty(count * size), out,
         )  # fmt: skip
         return out
 
@@ -102,9 +101,9 @@ class CudaFields:
         out = inverse_depth.new_empty(shape)
         there, back = out.unbind() if reproject else (None, None)
         kernels_for(SOURCE, device)["carry_depth"](
-            n, _threads(grid), poses[:n], poses[n:], rows, inverse_depth, information, grid.rays,
-            grid.width, grid.height, OFFSET, STRIDE, camera.fx, camera.fy, camera.cx, camera.cy,
-            size, scratch, depth, None if reproject else out, there, back,
+            n, block_size(grid.size, MOST_THREADS), poses[:n], poses[n:], rows, inverse_depth,
+            information, grid.rays, grid.width, grid.height, OFFSET, STRIDE, camera.fx, camera.fy,
+            camera.cx, camera.cy, size, scratch, depth, None if reproject else out, there, back,
         )  # fmt: skip
         if there is None or back is None:
             return depth.reshape(n, -1), out

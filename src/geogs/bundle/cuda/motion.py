@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from geogs.bundle.cuda.dense import block_size, edges_by_frame
 from geogs.bundle.problem import MotionProblem
 from geogs.gpu.kernels import kernels_for
 from geogs.gpu.transfer import to_device
@@ -14,9 +15,8 @@ from geogs.keyframes.keyframe import KNOWN, Keyframe
 
 SOURCE = Path(__file__).with_name("motion.cu")
 
-
-def _threads(cells: int) -> int:
-    return max(64, min(-(-cells // 32) * 32, 512))
+MOST_THREADS = 512
+"""Of a block: the launch bound of these kernels."""
 
 
 class CudaMotion:
@@ -40,14 +40,12 @@ class CudaMotion:
             self.grid.camera,
         )
         n, device = len(T_cw), d.device
-        order = torch.argsort(frame, stable=True)
-        first = torch.searchsorted(frame[order], torch.arange(n + 1))
-        rows = to_device(torch.cat([first, order]).int(), device)
+        first, order = edges_by_frame(frame, n, device)
         poses = to_device(torch.cat([T_cw, problem.T_source]), device)
         pixels, weight = problem.pixels.contiguous(), problem.weight.contiguous()
         residual = torch.empty_like(pixels)
         kernels_for(SOURCE, device)["solve_poses"](
-            n, _threads(d.shape[1]), rows[: n + 1], rows[n + 1 :], d.contiguous(), poses[n:],
+            n, block_size(d.shape[1], MOST_THREADS), first, order, d.contiguous(), poses[n:],
             pixels, weight, None, self.rays, d.shape[1], c.fx, c.fy, c.cx, c.cy, iterations, huber,
             poses, residual,
         )  # fmt: skip
@@ -65,7 +63,7 @@ class CudaMotion:
     ) -> tuple[Float[Tensor, "4 4"], Float[Tensor, "4 4"], Float[Tensor, "6"]]:
         """As in the protocol."""
         grid, c, known = self.grid, self.grid.camera, keyframe.information
-        device, threads = known.device, _threads(grid.size)
+        device, threads = known.device, block_size(grid.size, MOST_THREADS)
         # Both poses in one piece; behind them what is found.
         found = torch.cat([torch.eye(4).reshape(-1), torch.zeros(6)]).to(T_guess)
         state = torch.cat([T_guess.reshape(-1), keyframe.T_cw.reshape(-1), found])

@@ -6,11 +6,14 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from geogs.bundle.cuda.dense import block_size, edges_by_frame
 from geogs.geometry.camera import Camera
 from geogs.gpu.kernels import kernels_for
 from geogs.gpu.transfer import to_device
 
 SOURCE = Path(__file__).with_name("rigidity.cu")
+MOST_THREADS = 512
+"""Of a block: the launch bound of the kernel."""
 
 
 def best_residuals(
@@ -31,16 +34,14 @@ def best_residuals(
     These and ``source`` are on the CPU, all else on the GPU, where nothing waits.
     """
     device, (frames, cells) = inverse_depth.device, inverse_depth.shape
-    order = torch.argsort(source, stable=True)
-    first = torch.searchsorted(source[order], torch.arange(frames + 1))
-    rows = to_device(torch.cat([first, order]), device, torch.int32)
+    first, order = edges_by_frame(source, frames, device)
     motions = to_device(T_ji[:, :3].reshape(-1), device, torch.float32)
     depth = inverse_depth.clone(memory_format=torch.contiguous_format)
     scratch = depth.new_empty(2 * depth.numel())
     residual = depth.new_empty(len(source), cells)
     kernels_for(SOURCE, device)["best_residuals"](
-        frames, max(64, min(-(-cells // 32) * 32, 512)), rows[: frames + 1], rows[frames + 1 :],
-        motions, rays, pixels.contiguous(), weight.contiguous(), cells, camera.fx, camera.fy,
-        camera.cx, camera.cy, huber, iterations, *between, behind, depth, scratch, residual,
+        frames, block_size(cells, MOST_THREADS), first, order, motions, rays, pixels.contiguous(),
+        weight.contiguous(), cells, camera.fx, camera.fy, camera.cx, camera.cy, huber, iterations,
+        *between, behind, depth, scratch, residual,
     )  # fmt: skip
     return residual

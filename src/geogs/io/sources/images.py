@@ -173,11 +173,14 @@ def _folder_with_images(folder: Path) -> Path:
 
 
 def _images(folder: Path) -> list[Path]:
-    with os.scandir(folder) as entries:  # which know what is a file, without being asked each
-        return [
-            folder / entry.name
-            for entry in entries
-            if Path(entry.name).suffix.lower() in SUFFIXES
-            and not entry.name.startswith(".")
-            and entry.is_file()
-        ]
+    return [
+        folder / name
+        for name in file_names(folder)
+        if Path(name).suffix.lower() in SUFFIXES and not name.startswith(".")
+    ]
+
+
+def file_names(folder: Path) -> list[str]:
+    """Names of the files in a folder, which is asked once for all of them."""
+    with os.scandir(folder) as entries:  # of which only a link has to be asked what it leads to
+        return [e.name for e in entries if (Path(e) if e.is_symlink() else e).is_file()]

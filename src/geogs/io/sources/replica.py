@@ -4,6 +4,7 @@
 """
 
 import re
+from collections.abc import Container
 from pathlib import Path
 
 from geogs.documents import read_json
@@ -12,7 +13,7 @@ from geogs.io.poses import FRAMES_PER_SECOND
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.calibration_files import read_calibration
 from geogs.io.sources.depth_files import DepthFile
-from geogs.io.sources.images import ImageFile, ImageList
+from geogs.io.sources.images import ImageFile, ImageList, file_names
 
 _NAME = re.compile(r"frame(\d+)\.(jpg|jpeg|png)", re.IGNORECASE)
 _CAMERA = Calibration(
@@ -31,24 +32,22 @@ def open_replica(folder: Path) -> ImageList:
     """Read a scene; frame k is at k / 30 s, which matches line k of ``traj.txt``."""
     results = _results(folder)
     scene = results.parent.resolve()
-    there = {path.name for path in results.iterdir()}
-    matches = ((_NAME.fullmatch(name), results / name) for name in there)
+    matches = ((_NAME.fullmatch(path.name), path) for path in results.iterdir())
     numbered = sorted((int(match[1]), path) for match, path in matches if match)
-    per_metre = _units_per_metre(scene)
-    files = []
-    for k, path in numbered:
-        depth = DepthFile(_depth(path, k), per_metre)
-        known = depth if depth.path.name in there else None
-        files.append(ImageFile(path, k / FRAMES_PER_SECOND, known))
+    per_metre, there = _units_per_metre(scene), {*file_names(results)}
+    files = [
+        ImageFile(path, k / FRAMES_PER_SECOND, _depth(path, k, per_metre, there))
+        for k, path in numbered
+    ]
     reader = ImageList("replica", scene.name, files, None)
     reader.calibration = _find_calibration(scene, reader.width, reader.height)
     return reader
 
 
-def _depth(image: Path, number: int) -> Path:
-    """Where the depth of an image would lie."""
+def _depth(image: Path, number: int, per_metre: float, there: Container[str]) -> DepthFile | None:
     digits = len(image.stem) - len("frame")
-    return image.with_name(f"depth{number:0{digits}d}.png")
+    path = image.with_name(f"depth{number:0{digits}d}.png")
+    return DepthFile(path, per_metre) if path.name in there else None
 
 
 def _units_per_metre(scene: Path) -> float:

@@ -1,6 +1,7 @@
 """7-Scenes: ``frame-000000.color.png, frame-000000.depth.png, ...`` in ``seq-01``."""
 
 import re
+from collections.abc import Container
 from pathlib import Path
 
 from geogs.errors import InputError
@@ -8,7 +9,7 @@ from geogs.geometry.camera import Camera
 from geogs.io.poses import FRAMES_PER_SECOND
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.depth_files import DepthCamera, DepthFile
-from geogs.io.sources.images import ImageFile, ImageList
+from geogs.io.sources.images import ImageFile, ImageList, file_names
 from geogs.io.sources.intrinsics import find_calibration
 
 _NAME = re.compile(r"frame-(\d+)\.color\.(png|jpg|jpeg)", re.IGNORECASE)
@@ -36,14 +37,15 @@ def open_seven_scenes(folder: Path) -> ImageList:
     sequence = sequences[0].resolve()
     matches = ((_NAME.fullmatch(path.name), path) for path in sequence.iterdir())
     numbered = sorted((int(match[1]), path) for match, path in matches if match)
-    files = [ImageFile(path, k / FRAMES_PER_SECOND, _depth(path)) for k, path in numbered]
+    there = {*file_names(sequence)}
+    files = [ImageFile(path, k / FRAMES_PER_SECOND, _depth(path, there)) for k, path in numbered]
     calibration = find_calibration(sequence, sequence.parent) or _CAMERA
     return ImageList("7scenes", f"{sequence.parent.name}-{sequence.name}", files, calibration)
 
 
-def _depth(image: Path) -> DepthFile | None:
+def _depth(image: Path, there: Container[str]) -> DepthFile | None:
     path = image.with_name(image.name.split(".")[0] + ".depth.png")
-    return DepthFile(path, _PER_METRE, _SENSOR) if path.is_file() else None
+    return DepthFile(path, _PER_METRE, _SENSOR) if path.name in there else None
 
 
 def _sequences(folder: Path) -> list[Path]:
