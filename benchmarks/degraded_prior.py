@@ -10,9 +10,9 @@ import torch
 from jaxtyping import Float32, UInt8
 
 from geogs.priors.base import DepthKind, PriorMaps
-from geogs.synth.raycast import View
-from geogs.synth.scene import BOX, Scene
-from geogs.synth.texture import fractal_noise
+from geogs_synth.raycast import View
+from geogs_synth.scene import BOX, Scene
+from geogs_synth.texture import fractal_noise
 
 
 @dataclass(frozen=True)

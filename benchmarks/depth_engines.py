@@ -24,13 +24,13 @@ from geogs.depth.view import DenseDepth, DepthView, PosedDepth, depth_images
 from geogs.geometry.camera import Camera
 from geogs.geometry.depth import normals_from_depth
 from geogs.geometry.lie import se3_exp
-from geogs.keyframes.grid import OFFSET, STRIDE
-from geogs.synth.raycast import Raycaster
-from geogs.synth.room import make_room
-from geogs.synth.scene import Scene
-from geogs.synth.stage import centred_camera
-from geogs.synth.trajectory import handheld_trajectory
 from geogs.threads import worker_count
+from geogs.world.grid import OFFSET, STRIDE
+from geogs_synth.raycast import Raycaster
+from geogs_synth.room import make_room
+from geogs_synth.scene import Scene
+from geogs_synth.stage import centred_camera
+from geogs_synth.trajectory import handheld_trajectory
 from geogs_train.depth.scores import KINDS, texture_kind
 
 STEP = 6

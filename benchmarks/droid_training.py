@@ -15,11 +15,11 @@ import time
 import numpy as np
 import torch
 
-from geogs.synth.export import default_camera
-from geogs.synth.raycast import Raycaster
-from geogs.synth.room import make_room
-from geogs.synth.trajectory import handheld_trajectory
 from geogs.tracking.flow.droid_network import DroidNetwork, DroidSize
+from geogs_synth.export import default_camera
+from geogs_synth.raycast import Raycaster
+from geogs_synth.room import make_room
+from geogs_synth.trajectory import handheld_trajectory
 from geogs_train.bundle import ClipState
 from geogs_train.clip_state import blind_start, neighbour_edges, true_state
 from geogs_train.droid_unroll import (

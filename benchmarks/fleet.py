@@ -31,12 +31,12 @@ from scipy.spatial import cKDTree
 
 import geogs
 from geogs.evaluation.trajectory import TrajectoryErrors, evaluate_trajectory
-from geogs.fleet.cluster import ray_cluster
-from geogs.fleet.run import run_fleet
-from geogs.fleet.settings import FleetSettings
 from geogs.geometry.camera import Camera
-from geogs.synth.export import default_camera
 from geogs.types import Trajectory
+from geogs_fleet.cluster import ray_cluster
+from geogs_fleet.run import run_fleet
+from geogs_fleet.settings import FleetSettings
+from geogs_synth.export import default_camera
 from long_walk import render
 from portals import SuiteRaycaster
 from suite import Suite

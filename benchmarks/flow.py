@@ -23,12 +23,12 @@ from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_inverse
 from geogs.io.poses import read_replica_trajectory
 from geogs.io.sources.sniff import open_source
-from geogs.keyframes.grid import SampleGrid
 from geogs.networks.weights_files import PACKAGED
 from geogs.tracking.flow.classical import ClassicalFlow
 from geogs.tracking.flow.lookup import Edges
 from geogs.tracking.flow.own import load_network
 from geogs.tracking.flow.own_network import FlowNetwork, cell_pixels
+from geogs.world.grid import SampleGrid
 from geogs_train.objective import run_network
 from geogs_train.options import FlowTraining
 from geogs_train.pairs import FlowBatch

@@ -22,10 +22,10 @@ import numpy as np
 import torch
 
 from geogs.geometry.camera import Camera
-from geogs.keyframes.grid import SampleGrid
 from geogs.networks.weights_files import PACKAGED
 from geogs.tracking.flow.classical import ClassicalFlow
 from geogs.tracking.flow.own import OwnFlowOptions, load_network
+from geogs.world.grid import SampleGrid
 from geogs_train.objective import run_network
 from geogs_train.options import FlowTraining
 from geogs_train.pairs import FlowBatch, flow_batch

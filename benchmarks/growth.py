@@ -19,16 +19,16 @@ import torch
 from geogs.config import LoopConfig, preset
 from geogs.depth.view import DenseDepth
 from geogs.geometry.lie import se3_inverse, sim3_exp, so3_exp
-from geogs.keyframes.grid import SampleGrid
-from geogs.keyframes.store import KeyframeStore
 from geogs.loop.consistency import consistent_loops
 from geogs.loop.detect import LoopDetector
 from geogs.loop.features import Features
 from geogs.loop.pose_graph import PoseGraph, RelativePoses, solve
 from geogs.loop.retrieval import AppearanceIndex
 from geogs.mapping.mapper import Mapper
-from geogs.synth.export import default_camera
 from geogs.tracking.flow.classical import ClassicalFlow
+from geogs.world.grid import SampleGrid
+from geogs.world.store import KeyframeStore
+from geogs_synth.export import default_camera
 
 STEP = 0.15
 LOOPS = 100

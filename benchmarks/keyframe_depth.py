@@ -23,8 +23,8 @@ from geogs.depth.sweep_neighbors import select_sweep_neighbours
 from geogs.depth.view import DepthView, KeyframeDepth, depth_view
 from geogs.geometry.camera import Camera
 from geogs.geometry.umeyama import umeyama
-from geogs.keyframes.grid import SampleGrid
-from geogs.keyframes.store import KeyframeStore
+from geogs.world.grid import SampleGrid
+from geogs.world.store import KeyframeStore
 
 
 def load_views(

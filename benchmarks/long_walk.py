@@ -37,8 +37,8 @@ from geogs.evaluation.trajectory import evaluate_trajectory
 from geogs.geometry.camera import Camera
 from geogs.mesh.extract import extract_mesh
 from geogs.slam import Slam
-from geogs.synth.export import default_camera
 from geogs.types import Frame, Trajectory
+from geogs_synth.export import default_camera
 from portals import SuiteRaycaster
 from suite import Suite
 

@@ -27,13 +27,13 @@ from geogs.bundle.select import grid_fields
 from geogs.config import LoopConfig
 from geogs.evaluation.surface import read_surface
 from geogs.geometry.lie import se3_exp, se3_inverse, so3_log
-from geogs.keyframes.grid import SampleGrid
-from geogs.keyframes.store import KeyframeStore, Segment
 from geogs.loop.dense import dense_check
 from geogs.loop.detect import LoopDetector
 from geogs.loop.retrieval import AppearanceIndex
 from geogs.loop.verification import DepthView, TwoViewVerifier
 from geogs.tracking.flow.classical import ClassicalFlow
+from geogs.world.grid import SampleGrid
+from geogs.world.store import KeyframeStore, Segment
 from tracking import Sequence, load
 
 OVERLAP, DEGREES, SHARE_OF_DEPTH = 0.3, 5.0, 0.1

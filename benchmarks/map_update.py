@@ -45,19 +45,19 @@ from geogs.geometry.lie import (
 )
 from geogs.geometry.neighbors import nearest_neighbors
 from geogs.geometry.umeyama import umeyama
-from geogs.keyframes.grid import SampleGrid
-from geogs.keyframes.store import KeyframeStore
 from geogs.loop.closure import close_loops
 from geogs.loop.pose_graph import RelativePoses
 from geogs.mapping.map_update import MapUpdate, plan_update, witness
 from geogs.mapping.mapper import Mapper
 from geogs.mesh.extract import extract_mesh
-from geogs.synth.export import default_camera
-from geogs.synth.raycast import Raycaster
-from geogs.synth.room import make_room
-from geogs.synth.tessellation import SeenSurface, scene_mesh
-from geogs.synth.trajectory import FRAMES_PER_LAP, handheld_trajectory
 from geogs.types import PoseCorrection
+from geogs.world.grid import SampleGrid
+from geogs.world.store import KeyframeStore
+from geogs_synth.export import default_camera
+from geogs_synth.raycast import Raycaster
+from geogs_synth.room import make_room
+from geogs_synth.tessellation import SeenSurface, scene_mesh
+from geogs_synth.trajectory import FRAMES_PER_LAP, handheld_trajectory
 
 CAMERA = default_camera(320, 240)
 EVERY = 4

@@ -31,13 +31,13 @@ from geogs.geometry.camera import Camera
 from geogs.geometry.umeyama import umeyama
 from geogs.io.poses import read_replica_trajectory
 from geogs.io.sources.sniff import open_source
-from geogs.keyframes.grid import SampleGrid
-from geogs.keyframes.store import KeyframeStore, Segment
 from geogs.loop.global_bundle import global_bundle
 from geogs.mapping.mapper import Mapper
 from geogs.mesh.extract import extract_mesh
 from geogs.mesh.types import DepthMapView, Mesh
 from geogs.tracking.tracker import Tracker
+from geogs.world.grid import SampleGrid
+from geogs.world.store import KeyframeStore, Segment
 
 
 def track(sequence: Path, config: Config) -> Segment:

@@ -26,8 +26,6 @@ from geogs.config import LossAblation, LossConfig, MappingConfig
 from geogs.depth.view import DenseDepth
 from geogs.geometry.depth import normals_from_depth
 from geogs.geometry.lie import se3_inverse
-from geogs.keyframes.grid import SampleGrid
-from geogs.keyframes.store import KeyframeStore, Segment
 from geogs.losses import multi_view_loss, single_view_loss
 from geogs.mapping.cameras import MapCameras
 from geogs.mapping.training.base import Batch
@@ -38,10 +36,12 @@ from geogs.splat.cuda import autograd
 from geogs.splat.init import initialise_disks
 from geogs.splat.map import DiskParameters, GaussianMap
 from geogs.splat.render import render_views
-from geogs.synth.export import default_camera
-from geogs.synth.raycast import Raycaster
-from geogs.synth.room import make_room
-from geogs.synth.trajectory import handheld_trajectory
+from geogs.world.grid import SampleGrid
+from geogs.world.store import KeyframeStore, Segment
+from geogs_synth.export import default_camera
+from geogs_synth.raycast import Raycaster
+from geogs_synth.room import make_room
+from geogs_synth.trajectory import handheld_trajectory
 
 FRAMES_APART = 6
 """Frames between two views on the path."""

@@ -17,8 +17,6 @@ import torch
 from geogs.config import MappingConfig
 from geogs.depth.view import DenseDepth, KeyframeDepth
 from geogs.geometry.lie import se3_inverse
-from geogs.keyframes.grid import SampleGrid
-from geogs.keyframes.store import KeyframeStore
 from geogs.mapping.cameras import MapCameras
 from geogs.mapping.training.cpu import Trainer, view_loss
 from geogs.mapping.view import MapView
@@ -26,11 +24,13 @@ from geogs.mapping.view_pool import ViewPool
 from geogs.splat.init import initialise_disks
 from geogs.splat.map import GaussianMap
 from geogs.splat.render import render
-from geogs.synth.export import default_camera
-from geogs.synth.raycast import Raycaster
-from geogs.synth.room import make_room
-from geogs.synth.trajectory import handheld_trajectory
 from geogs.threads import worker_count
+from geogs.world.grid import SampleGrid
+from geogs.world.store import KeyframeStore
+from geogs_synth.export import default_camera
+from geogs_synth.raycast import Raycaster
+from geogs_synth.room import make_room
+from geogs_synth.trajectory import handheld_trajectory
 
 
 def make_views(config: MappingConfig, width: int) -> tuple[list[MapView], MapCameras]:

@@ -5,7 +5,7 @@
 
 Rooms whose walls are painted in one colour are tracked without a prior, with one that errs as
 networks do, and with one that is wrong by a factor of two and more in a third of each image (see
-``geogs.synth.prior``). Depth errors are relative, over the tracker's grid of all keyframes but the
+``geogs_synth.prior``). Depth errors are relative, over the tracker's grid of all keyframes but the
 first and last, after the similarity that aligns the trajectory. With ``--map`` the whole system
 runs, and the errors are those of the depth and normals of the map seen from all keyframes.
 """
@@ -24,16 +24,16 @@ from degraded_prior import BAD, PATCHY, PLAUSIBLE, DegradedPrior, with_bare_wall
 from geogs.config import Config, MappingConfig, PriorConfig
 from geogs.geometry.camera import Camera
 from geogs.geometry.umeyama import umeyama
-from geogs.keyframes.grid import OFFSET, STRIDE
 from geogs.loop.global_bundle import global_bundle
 from geogs.priors.base import DepthKind, MonocularPrior
 from geogs.slam import Slam
-from geogs.synth.raycast import Raycaster, View
-from geogs.synth.room import make_room
-from geogs.synth.trajectory import handheld_trajectory
 from geogs.tracking.flow.texture import MIN_STRUCTURE, cell_structure, smaller_eigenvalue
 from geogs.tracking.tracker import Tracker
 from geogs.types import Frame
+from geogs.world.grid import OFFSET, STRIDE
+from geogs_synth.raycast import Raycaster, View
+from geogs_synth.room import make_room
+from geogs_synth.trajectory import handheld_trajectory
 
 PRIORS = {"none": None, "good": PLAUSIBLE, "patchy": PATCHY, "bad": BAD}
 

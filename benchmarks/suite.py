@@ -12,11 +12,11 @@ from jaxtyping import Float64
 from scipy.interpolate import CubicSpline
 
 from geogs.errors import InputError
-from geogs.synth import furniture, texture
-from geogs.synth.furniture import Materials
-from geogs.synth.room import add_ceiling_and_floor, add_ceiling_lamp, add_picture, wall_image
-from geogs.synth.scene import Scene, SceneBuilder
-from geogs.synth.trajectory import look_at, with_shake
+from geogs_synth import furniture, texture
+from geogs_synth.furniture import Materials
+from geogs_synth.room import add_ceiling_and_floor, add_ceiling_lamp, add_picture, wall_image
+from geogs_synth.scene import Scene, SceneBuilder
+from geogs_synth.trajectory import look_at, with_shake
 
 ROOM = np.array([5.0, 4.4, 2.6])
 """Metres across, deep and high."""

@@ -22,7 +22,6 @@ import torch
 from geogs.config import InputConfig, TrackingConfig
 from geogs.geometry.camera import Camera
 from geogs.io.sources.sniff import open_source
-from geogs.keyframes.grid import SampleGrid
 from geogs.threads import on_one_torch_thread
 from geogs.tracking.flow.base import FlowMatch, FlowOperator, Memories
 from geogs.tracking.flow.droid import DroidFlow
@@ -30,6 +29,7 @@ from geogs.tracking.flow.droid_network import DroidNetwork
 from geogs.tracking.flow.select import build_operator
 from geogs.tracking.tracker import Tracker
 from geogs.types import Frame
+from geogs.world.grid import SampleGrid
 
 
 class Shadowed:

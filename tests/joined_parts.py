@@ -14,8 +14,8 @@ from geogs.geometry.lie import sim3_exp, sim3_scale
 from geogs.io.writers.keyframe_images import image_path, write_image
 from geogs.io.writers.map_views import MapViews, save_map_with_views
 from geogs.io.writers.tum import write_tum_trajectory
-from geogs.join.disks import transformed
 from geogs.types import MapSnapshot, Trajectory
+from geogs_fleet.join.disks import transformed
 
 CAMERA = Camera(160.0, 160.0, 127.5, 95.5, 256, 192)
 DEPTH_CAMERA = CAMERA.with_long_edge(128)

@@ -9,9 +9,9 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from geogs.geometry.camera import Camera
-from geogs.keyframes.grid import SampleGrid
-from geogs.keyframes.keyframe import Keyframe
-from geogs.keyframes.store import KeyframeStore, Segment
+from geogs.world.grid import SampleGrid
+from geogs.world.keyframe import Keyframe
+from geogs.world.store import KeyframeStore, Segment
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,7 +8,7 @@ from geogs.bundle.lens import Lens, LensBlock
 from geogs.bundle.problem import BundleProblem
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp
-from geogs.keyframes.grid import SampleGrid
+from geogs.world.grid import SampleGrid
 
 CAMERA = Camera(fx=70.0, fy=72.0, cx=39.0, cy=29.0, width=80, height=60)
 GRID = SampleGrid(CAMERA)

@@ -12,8 +12,6 @@ from torch import Tensor
 from geogs.config import ReconstructConfig
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
-from geogs.keyframes.grid import SampleGrid
-from geogs.keyframes.store import KeyframeStore
 from geogs.mapping import known_poses as known
 from geogs.mapping.depth_schedule import group_size, search_depths, spread_order
 from geogs.mapping.first_look import SmallImage, first_points
@@ -28,6 +26,8 @@ from geogs.on_demand import OnDemand
 from geogs.stopwatch import Stopwatch
 from geogs.threads import on_one_torch_thread
 from geogs.types import MapSnapshot, RenderedKeyframe, SeenRows, Trajectory
+from geogs.world.grid import SampleGrid
+from geogs.world.store import KeyframeStore
 
 Progress = Callable[[str, float], None]
 """Called with the name of a stage and its finished fraction in [0, 1]."""

@@ -15,8 +15,6 @@ from torch import Tensor
 from geogs.config import Config
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
-from geogs.keyframes.grid import SampleGrid
-from geogs.keyframes.store import KeyframeStore, StoreState
 from geogs.loop.closer import LoopCloser, LoopsState
 from geogs.loop.global_bundle import global_bundle
 from geogs.mapping.all_at_once import map_all
@@ -45,6 +43,8 @@ from geogs.types import (
     Trajectory,
     Uncertainty,
 )
+from geogs.world.grid import SampleGrid
+from geogs.world.store import KeyframeStore, StoreState
 
 R = TypeVar("R")
 

@@ -7,10 +7,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from geogs.geometry.lie import retract
-from geogs.keyframes.grid import OFFSET, STRIDE
 from geogs.tracking.flow.lookup import Edges
 from geogs.tracking.flow.own import OwnFlowOptions
 from geogs.tracking.flow.own_network import FlowNetwork, cell_pixels
+from geogs.world.grid import OFFSET, STRIDE
 from geogs_train.bundle import (
     ClipBundleOptions,
     ClipCameras,

@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from geogs.keyframes.grid import OFFSET, STRIDE
+from geogs.world.grid import OFFSET, STRIDE
 from geogs_train.bundle import ClipEdges, ClipState
 
 

@@ -6,7 +6,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from geogs.keyframes.grid import OFFSET, STRIDE
 from geogs.tracking.flow.correlation import CorrelationVolume
 from geogs.tracking.flow.droid import DAMPING_SHARE, WEIGHT_SCALE
 from geogs.tracking.flow.droid_network import (
@@ -18,6 +17,7 @@ from geogs.tracking.flow.droid_network import (
     motion_features,
     on_cells,
 )
+from geogs.world.grid import OFFSET, STRIDE
 from geogs_train.bundle import (
     ClipBundleOptions,
     ClipCameras,

@@ -27,8 +27,8 @@ from geogs.application.checkpoint import (
 )
 from geogs.application.progress import RunProgress
 from geogs.errors import InputError, OutputError
-from geogs.keyframes.archive import Archive, Archived
 from geogs.version import __version__
+from geogs.world.archive import Archive, Archived
 
 
 @dataclass

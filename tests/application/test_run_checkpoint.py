@@ -15,10 +15,10 @@ from geogs.application.checkpoint import SavedState, checkpoint_folder, write_ch
 from geogs.config import Config, InputConfig
 from geogs.errors import InputError
 from geogs.io.sources.sniff import open_source
-from geogs.keyframes.archive import Archive, Archived
-from geogs.keyframes.grid import SampleGrid
 from geogs.slam import Slam, SlamState
 from geogs.splat.rows import GrowingRows
+from geogs.world.archive import Archive, Archived
+from geogs.world.grid import SampleGrid
 from quick_systems import Work, quick_config
 
 pytestmark = pytest.mark.system

@@ -23,10 +23,10 @@ from geogs.bundle.problem import BundleProblem, MeasuredDepths, MotionProblem
 from geogs.bundle.projection import MIN_Z, linearise, project, relative_motion
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import retract, se3_exp, se3_inverse
-from geogs.keyframes.grid import SampleGrid
-from geogs.keyframes.store import KeyframeStore, Segment
 from geogs.loop.global_bundle import global_bundle
 from geogs.tracking.tracker import Tracker, TrackState
+from geogs.world.grid import SampleGrid
+from geogs.world.store import KeyframeStore, Segment
 from tracking_runs import CONFIG, PATH, error_cm
 from tracking_scenes import CAMERA as ROOM
 from tracking_scenes import frames

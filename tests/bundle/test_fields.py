@@ -5,7 +5,7 @@ import torch
 
 from bundle_scenes import CAMERA
 from geogs.bundle.fields import CpuFields
-from geogs.keyframes.grid import SampleGrid
+from geogs.world.grid import SampleGrid
 
 
 def test_fill_keeps_known_values_and_bridges_holes():

@@ -12,7 +12,7 @@ from geogs.bundle.marginals import marginals
 from geogs.bundle.problem import BundleProblem, StreamedProblem
 from geogs.bundle.projection import project, relative_motion
 from geogs.geometry.lie import se3_exp, se3_inverse, se3_log
-from geogs.keyframes.grid import SampleGrid
+from geogs.world.grid import SampleGrid
 from oracles.bundle_reference import residuals
 
 EXACT = BundleOptions(huber=50.0, depth_damping=0.0)

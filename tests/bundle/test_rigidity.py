@@ -9,7 +9,7 @@ from cuda_emulator import use_emulator
 from geogs.bundle.problem import BundleProblem
 from geogs.bundle.projection import project, relative_motion
 from geogs.bundle.rigidity import BEHIND, DEPTH_RANGE, best_residuals
-from geogs.keyframes.grid import SampleGrid
+from geogs.world.grid import SampleGrid
 
 HUBER = 0.5
 

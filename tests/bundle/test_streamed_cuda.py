@@ -12,7 +12,7 @@ from geogs.bundle.base import BundleOptions
 from geogs.bundle.dense import DenseBundle
 from geogs.bundle.measured_motions import MeasuredMotions
 from geogs.bundle.problem import BundleProblem, MeasuredDepths, StreamedProblem
-from geogs.keyframes.grid import SampleGrid
+from geogs.world.grid import SampleGrid
 
 
 @pytest.fixture(params=["emulated", pytest.param("gpu", marks=pytest.mark.gpu)])

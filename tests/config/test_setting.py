@@ -18,8 +18,8 @@ from geogs.cli.demo import DemoOptions
 from geogs.cli.synth import SynthOptions
 from geogs.config.setting import Kind, Only, Range, Settings, Time, kinds
 from geogs.errors import InputError
-from geogs.synth.flaws import Flaws
 from geogs_bench.settings import BenchSettings
+from geogs_synth.flaws import Flaws
 from geogs_train.cli import TrainOptions
 
 TREES = (config.Config(), config.ReconstructConfig())

@@ -10,8 +10,8 @@ from geogs.depth.select import depth_engine
 from geogs.depth.tracker import TrackerDepthEngine, enlarged_depth
 from geogs.depth.view import PosedDepth
 from geogs.errors import InputError
-from geogs.keyframes.grid import OFFSET, STRIDE
 from geogs.reconstruction import Reconstruction
+from geogs.world.grid import OFFSET, STRIDE
 
 
 def slow_pixel(view, u: int, v: int) -> float | None:

@@ -1,4 +1,4 @@
-"""A stand-in for ``geogs.fleet.child`` that computes nothing: tests of fleets run it as a program.
+"""A stand-in for ``geogs_fleet.child`` that computes nothing: tests of fleets run it as a program.
 
 What it does follows from the text of its source: ``fail`` and a sentence, ``kill`` (each time),
 ``kill once``, ``wait`` and seconds, ``eat`` and MiB; anything else is a success. Every start adds

@@ -9,12 +9,12 @@ import pytest
 
 from geogs.application import checkpoint_folder
 from geogs.application.settings import RunSettings
-from geogs.fleet import work_folder
-from geogs.fleet.attempt import Job, attempt, judged
-from geogs.fleet.places import Place
-from geogs.fleet.row import FILE, read_row
-from geogs.fleet.sources import FleetSource
-from geogs.fleet.supervise import Ending, Limits
+from geogs_fleet import work_folder
+from geogs_fleet.attempt import Job, attempt, judged
+from geogs_fleet.places import Place
+from geogs_fleet.row import FILE, read_row
+from geogs_fleet.sources import FleetSource
+from geogs_fleet.supervise import Ending, Limits
 
 FAKE = (sys.executable, str(Path(__file__).with_name("fake_child.py")))
 

@@ -5,11 +5,11 @@ import sys
 
 import pytest
 
-from geogs.fleet.cluster import ray_cluster
+from geogs_fleet.cluster import ray_cluster
 
 ray = pytest.importorskip("ray", reason="Ray is not installed: pip install 'geogs[fleet]'")
 OTHER = """
-from geogs.fleet.cluster import ray_cluster
+from geogs_fleet.cluster import ray_cluster
 with ray_cluster("auto") as ray:
     print(ray.get_runtime_context().gcs_address)
 """

@@ -10,9 +10,9 @@ import pytest
 
 from cluster_nodes import add_node, simulated_cluster
 from geogs.errors import InputError
-from geogs.fleet.progress import FleetProgress
-from geogs.fleet.run import run_fleet
-from geogs.fleet.settings import FleetSettings
+from geogs_fleet.progress import FleetProgress
+from geogs_fleet.run import run_fleet
+from geogs_fleet.settings import FleetSettings
 
 ray = pytest.importorskip("ray", reason="Ray is not installed: pip install 'geogs[fleet]'")
 pytestmark = [

@@ -5,7 +5,7 @@ import json
 import pytest
 
 from geogs.errors import InputError
-from geogs.fleet.join import JoinSettings, _names, finished_results, run_join
+from geogs_fleet.join_run import JoinSettings, _names, finished_results, run_join
 
 
 def test_a_result_is_one_and_a_fleet_is_all_that_are_done(tmp_path):

@@ -7,7 +7,7 @@ import uuid
 import pytest
 
 from geogs.errors import InputError
-from geogs.fleet.places import Place
+from geogs_fleet.places import Place
 
 pytest.importorskip("fsspec", reason="fsspec is not installed: pip install 'geogs[fleet]'")
 

@@ -3,7 +3,7 @@
 import pytest
 
 from geogs.errors import InputError
-from geogs.fleet.sources import find_sources
+from geogs_fleet.sources import find_sources
 
 
 def test_a_folder_holds_videos_and_folders_of_images(tmp_path):

@@ -4,10 +4,10 @@ import json
 
 import pytest
 
-from geogs.fleet.places import Place
-from geogs.fleet.progress import Pace
-from geogs.fleet.row import Row, read_row, row_text
-from geogs.fleet.table import write_table
+from geogs_fleet.places import Place
+from geogs_fleet.progress import Pace
+from geogs_fleet.row import Row, read_row, row_text
+from geogs_fleet.table import write_table
 
 ROWS = [
     Row("good", "/s/good.mp4", "done", "Fine.", "d", True, 3.0, 1, "n", {"lost": 0.0}),

@@ -13,13 +13,13 @@ import torch
 from cluster_nodes import add_node, simulated_cluster
 from geogs.config import Config, MeshConfig
 from geogs.errors import DeviceError, InputError
-from geogs.fleet.cluster import Share
-from geogs.fleet.workers import RayWorkers
 from geogs.io.writers.native import load_map_file
-from geogs.join.join import join_parts
-from geogs.join.part import Part
-from geogs.join.workers import OneProcess
 from geogs.mesh.files import read_mesh
+from geogs_fleet.cluster import Share
+from geogs_fleet.join.join import join_parts
+from geogs_fleet.join.part import Part
+from geogs_fleet.join.workers import OneProcess
+from geogs_fleet.workers import RayWorkers
 from joined_parts import make_part
 
 ray = pytest.importorskip("ray", reason="Ray is not installed: pip install 'geogs[fleet]'")
@@ -115,7 +115,10 @@ def test_a_job_whose_node_is_removed_is_done_elsewhere_and_counts_once(cluster, 
 
 
 def test_a_join_on_a_cluster_is_that_of_one_process(cluster, tmp_path, monkeypatch):
-    monkeypatch.setattr("geogs.join.join.write_report", lambda *a: None)  # takes half of the time
+    # Takes half of the time.
+    monkeypatch.setattr(
+        "geogs_fleet.join.join.write_report", lambda *a: None
+    )  # takes half of the time
     places = np.linspace(-0.2, 0.0, 3), np.linspace(-0.15, 0.05, 3)
     config = Config(mesh=MeshConfig(voxel=0.08, min_component_faces=10))
     parts = [Part(n, make_part(tmp_path / n, p, k)) for k, (n, p) in enumerate(zip("ab", places))]  # noqa: B905

@@ -10,19 +10,19 @@ import torch
 from geogs.bundle.base import BundleOptions
 from geogs.config import Config
 from geogs.config.tracking import TrackingConfig
-from geogs.join.adjust import adjusted
-from geogs.join.gauge import Gauge
-from geogs.join.graph import Placement
-from geogs.join.links import Link, loaded_keyframes
-from geogs.join.matches import Matches
-from geogs.join.part import DescribeJob, Part, PartViews, describe, opened
-from geogs.join.workers import OneProcess
-from geogs.keyframes.grid import SampleGrid
-from geogs.keyframes.store import KeyframeStore
 from geogs.loop.global_bundle import SMALL_STEP
 from geogs.loop.pose_graph import RelativePoses
 from geogs.tracking.flow.select import build_operator
 from geogs.tracking.graph import FrameGraph
+from geogs.world.grid import SampleGrid
+from geogs.world.store import KeyframeStore
+from geogs_fleet.join.adjust import adjusted
+from geogs_fleet.join.gauge import Gauge
+from geogs_fleet.join.graph import Placement
+from geogs_fleet.join.links import Link, loaded_keyframes
+from geogs_fleet.join.matches import Matches
+from geogs_fleet.join.part import DescribeJob, Part, PartViews, describe, opened
+from geogs_fleet.join.workers import OneProcess
 from joined_parts import CAMERA, make_part
 
 PLACES = [np.linspace(-0.8, -0.1, 4), np.linspace(-0.4, 0.4, 4), np.linspace(0.1, 0.8, 4)]

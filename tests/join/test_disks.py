@@ -6,10 +6,10 @@ import numpy as np
 import torch
 
 from geogs.geometry.lie import quaternion_to_matrix, se3_exp, sim3_exp, sim3_inverse, sim3_scale
-from geogs.join.disks import is_covered, joined_disks, kept, overall, transformed
-from geogs.join.part import PartViews
 from geogs.loop.features import Features
 from geogs.types import MapSnapshot
+from geogs_fleet.join.disks import is_covered, joined_disks, kept, overall, transformed
+from geogs_fleet.join.part import PartViews
 
 
 def some_disks(n: int, seed: int, size: float = 0.1) -> MapSnapshot:

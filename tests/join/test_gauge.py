@@ -5,12 +5,12 @@ import torch
 
 from geogs.config import LoopConfig
 from geogs.geometry.lie import se3_exp, sim3_exp, sim3_inverse, sim3_log, sim3_scale
-from geogs.join.gauge import claim, common_gauge
-from geogs.join.graph import Placement, placed
-from geogs.join.links import Link
-from geogs.join.part import PartViews
 from geogs.loop.features import Features
 from geogs.loop.pose_graph import RelativePoses
+from geogs_fleet.join.gauge import claim, common_gauge
+from geogs_fleet.join.graph import Placement, placed
+from geogs_fleet.join.links import Link
+from geogs_fleet.join.part import PartViews
 
 N = 10
 FEATURES = Features(np.zeros((0, 2), np.float32), np.zeros((0, 32), np.uint8))

@@ -9,9 +9,9 @@ from geogs.application.remesh import RemeshSettings, remesh
 from geogs.application.saved_result import load_result
 from geogs.config import Config
 from geogs.errors import InputError
-from geogs.join.join import join_parts
-from geogs.join.part import Part
-from geogs.join.workers import OneProcess
+from geogs_fleet.join.join import join_parts
+from geogs_fleet.join.part import Part
+from geogs_fleet.join.workers import OneProcess
 from joined_parts import HALF, make_part, true_frames
 
 PLACES = [np.linspace(-0.8, 0.1, 6), np.linspace(-0.2, 0.8, 6)]

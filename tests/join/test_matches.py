@@ -7,13 +7,13 @@ from geogs.application.saved_result import load_result
 from geogs.config import Config
 from geogs.geometry.lie import se3_inverse, sim3_scale
 from geogs.io.writers.keyframe_rows import rows_path, write_rows
-from geogs.join.matches import Matches, MatchJob, Member, match
-from geogs.join.part import DescribeJob, Part, PartViews, describe
-from geogs.keyframes.grid import SampleGrid
 from geogs.shutter.rows import CELL
 from geogs.tracking.packed_edge import position_step
 from geogs.tracking.row_errors import RowErrors
 from geogs.types import SeenRows
+from geogs.world.grid import SampleGrid
+from geogs_fleet.join.matches import Matches, MatchJob, Member, match
+from geogs_fleet.join.part import DescribeJob, Part, PartViews, describe
 from joined_parts import CAMERA, FRAMES, gauge, make_part
 
 GRID, CONFIG = SampleGrid(CAMERA), Config()

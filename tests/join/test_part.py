@@ -6,10 +6,10 @@ import pytest
 from geogs.config import Config
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
-from geogs.join.part import DescribeJob, Part, PartViews, describe, opened, resampled
-from geogs.join.places import candidates
-from geogs.keyframes.grid import SampleGrid
 from geogs.loop.features import FeatureExtractor, Features
+from geogs.world.grid import SampleGrid
+from geogs_fleet.join.part import DescribeJob, Part, PartViews, describe, opened, resampled
+from geogs_fleet.join.places import candidates
 from joined_parts import CAMERA, image, make_part, pose, seen, walls
 from saved_results import make_result
 

@@ -8,10 +8,10 @@ from geogs.config import MeshConfig
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp
 from geogs.io.writers.keyframe_images import write_image
-from geogs.join.stored_views import StoredView, loaded, shares
-from geogs.join.surface import joint_mesh, plan_space
-from geogs.join.workers import OneProcess
 from geogs.mesh.extract import extract_mesh
+from geogs_fleet.join.stored_views import StoredView, loaded, shares
+from geogs_fleet.join.surface import joint_mesh, plan_space
+from geogs_fleet.join.workers import OneProcess
 
 CAMERA = Camera(fx=40.0, fy=40.0, cx=31.5, cy=23.5, width=64, height=48)
 

@@ -5,11 +5,11 @@ import pytest
 import torch
 
 from geogs.geometry.lie import se3_exp, sim3_exp, sim3_scale
-from geogs.join.graph import Placement
-from geogs.join.part import PartViews
-from geogs.join.trajectory import joined_trajectory, moved_trajectory, spans_of
 from geogs.loop.features import Features
 from geogs.types import Trajectory
+from geogs_fleet.join.graph import Placement
+from geogs_fleet.join.part import PartViews
+from geogs_fleet.join.trajectory import joined_trajectory, moved_trajectory, spans_of
 
 NONE = Features(np.zeros((0, 2), np.float32), np.zeros((0, 32), np.uint8))
 

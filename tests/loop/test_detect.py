@@ -8,12 +8,12 @@ import torch
 
 from geogs.config import LoopConfig, RetrievalOptions
 from geogs.geometry.lie import se3_exp, se3_inverse, so3_log
-from geogs.keyframes.store import Segment
 from geogs.loop.dense import dense_check
 from geogs.loop.detect import LoopDetector
 from geogs.loop.features import FeatureExtractor, Features
 from geogs.loop.verification import DepthView, TwoViewVerifier
-from geogs.synth.raycast import View
+from geogs.world.store import Segment
+from geogs_synth.raycast import View
 from loop_scenes import CAMERA, keyframes, orbit, room, room_views, stretched, views
 
 LAP = 18

@@ -22,7 +22,6 @@ from geogs.geometry.lie import (
     sim3_small_adjoint,
 )
 from geogs.geometry.umeyama import umeyama
-from geogs.keyframes.grid import SampleGrid
 from geogs.loop.closure import close_loops
 from geogs.loop.consistency import ConsistencyOptions, consistent_loops, cycle_errors
 from geogs.loop.matched_edges import MatchedEdges, MatchOptions
@@ -38,6 +37,7 @@ from geogs.loop.pose_graph import (
 )
 from geogs.loop.relative_pose import relative_poses
 from geogs.mapping.map_update import anchor_transforms
+from geogs.world.grid import SampleGrid
 from oracles.pose_graph_reference import (
     gauss_newton_step,
     match_residuals,

@@ -11,13 +11,13 @@ from geogs.bundle.base import BundleOptions
 from geogs.config import TrackingConfig
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp, se3_inverse
-from geogs.keyframes.grid import SampleGrid
 from geogs.loop.global_bundle import global_bundle
 from geogs.loop.settled_rows import _readout_gradient, _Search, settle_rows
 from geogs.tracking.flow.base import FlowMatch
 from geogs.tracking.row_errors import RowErrors
 from geogs.tracking.tracker import Tracker, TrackState
 from geogs.types import SeenRows
+from geogs.world.grid import SampleGrid
 from planted_walk import PlantedFlow, true_inverse_depth
 
 CAMERA = Camera(fx=90.0, fy=90.0, cx=47.5, cy=35.5, width=96, height=72)

@@ -9,10 +9,10 @@ import torch
 from geogs.beside import RightOfWay
 from geogs.config import preset
 from geogs.geometry.camera import Camera
-from geogs.keyframes.grid import SampleGrid
-from geogs.keyframes.store import KeyframeStore
 from geogs.mapping.background import PATIENT, BackgroundMapper
 from geogs.mapping.mapper import Mapper, never_pause
+from geogs.world.grid import SampleGrid
+from geogs.world.store import KeyframeStore
 
 LONG = 0.5
 """Seconds that mapping waits here at most."""

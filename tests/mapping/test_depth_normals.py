@@ -8,9 +8,9 @@ import torch
 from geogs.config import LossConfig
 from geogs.depth.view import DenseDepth, KeyframeDepth
 from geogs.geometry.camera import Camera
-from geogs.keyframes.keyframe import Keyframe
 from geogs.mapping.cameras import MapCameras
 from geogs.mapping.view_pool import ViewPool
+from geogs.world.keyframe import Keyframe
 from keyframe_samples import Sample, segment_of
 
 WORKING = Camera(80.0, 80.0, 47.5, 35.5, 96, 72)

@@ -9,10 +9,10 @@ import torch
 from geogs.config import Config
 from geogs.geometry.lie import se3_inverse
 from geogs.mapping.mapper import Mapper
-from geogs.synth.export import default_camera
-from geogs.synth.raycast import Raycaster
-from geogs.synth.room import make_room
-from geogs.synth.trajectory import handheld_trajectory
+from geogs_synth.export import default_camera
+from geogs_synth.raycast import Raycaster
+from geogs_synth.room import make_room
+from geogs_synth.trajectory import handheld_trajectory
 from keyframe_samples import Sample, segment_of
 
 CAMERA = default_camera(160, 120)

@@ -11,11 +11,11 @@ from geogs.geometry.lie import retract, se3_exp, se3_inverse
 from geogs.mapping.map_update import MapUpdate
 from geogs.mapping.mapper import Mapper
 from geogs.mapping.window import draw_views
-from geogs.synth.export import default_camera
-from geogs.synth.raycast import Raycaster
-from geogs.synth.room import make_room
-from geogs.synth.trajectory import handheld_trajectory
 from geogs.types import PoseCorrection
+from geogs_synth.export import default_camera
+from geogs_synth.raycast import Raycaster
+from geogs_synth.room import make_room
+from geogs_synth.trajectory import handheld_trajectory
 from keyframe_samples import Sample, add, segment_of
 
 pytestmark = pytest.mark.system

@@ -6,12 +6,12 @@ import torch
 from geogs.config import Config
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp
-from geogs.keyframes.grid import SampleGrid
-from geogs.keyframes.store import KeyframeStore
 from geogs.mapping.cameras import MapCameras
 from geogs.mapping.near_views import NearViews
 from geogs.mapping.view import MapView
 from geogs.mapping.view_pool import ViewPool
+from geogs.world.grid import SampleGrid
+from geogs.world.store import KeyframeStore
 
 CAMERA = Camera(fx=60.0, fy=60.0, cx=31.5, cy=23.5, width=64, height=48)
 

@@ -9,9 +9,6 @@ import torch
 from geogs.config import LossConfig, PriorConfig
 from geogs.depth.view import DenseDepth, KeyframeDepth
 from geogs.geometry.camera import Camera
-from geogs.keyframes.grid import SampleGrid
-from geogs.keyframes.keyframe import Keyframe
-from geogs.keyframes.store import KeyframeStore
 from geogs.losses.cpu import fused_single_view
 from geogs.losses.single_view import single_view_loss
 from geogs.mapping.cameras import MapCameras
@@ -21,6 +18,9 @@ from geogs.priors.base import PriorMaps
 from geogs.tracking.flow.classical import ClassicalFlow
 from geogs.tracking.graph import FrameGraph
 from geogs.tracking.keyframe_priors import KeyframePriors
+from geogs.world.grid import SampleGrid
+from geogs.world.keyframe import Keyframe
+from geogs.world.store import KeyframeStore
 from keyframe_samples import Sample, segment_of
 
 WORKING = Camera(80.0, 80.0, 47.5, 35.5, 96, 72)

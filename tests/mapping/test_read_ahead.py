@@ -6,10 +6,10 @@ import torch
 from geogs.config import Config
 from geogs.depth.view import DenseDepth
 from geogs.geometry.camera import Camera
-from geogs.keyframes.grid import SampleGrid
-from geogs.keyframes.store import KeyframeStore, Segment
 from geogs.mapping.cameras import MapCameras
 from geogs.mapping.view_pool import ViewPool
+from geogs.world.grid import SampleGrid
+from geogs.world.store import KeyframeStore, Segment
 
 CAMERA = Camera(fx=60.0, fy=60.0, cx=31.5, cy=23.5, width=64, height=48)
 

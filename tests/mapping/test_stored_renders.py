@@ -14,7 +14,6 @@ from geogs.application.splat_colours import splat_colours
 from geogs.application.surfaces import fusion_views, write_surface
 from geogs.config import MeshConfig
 from geogs.geometry.camera import Camera
-from geogs.keyframes.archive import Archive, Archived
 from geogs.mapping.rendered import SurfaceRules, rendered_keyframe
 from geogs.mapping.stored_renders import StoredRender, stored_render
 from geogs.mesh.extract import extract_mesh
@@ -22,6 +21,7 @@ from geogs.on_demand import OnDemand
 from geogs.reconstruction import Reconstruction
 from geogs.splat.map import DiskParameters
 from geogs.types import MapSnapshot, RenderedKeyframe, Trajectory
+from geogs.world.archive import Archive, Archived
 from posed_scene import ball_and_wall
 
 CAMERA = Camera(120.0, 120.0, 79.5, 59.5, 160, 120)

@@ -8,12 +8,12 @@ import torch
 from geogs.config import Config
 from geogs.depth.view import DenseDepth
 from geogs.geometry.camera import Camera
-from geogs.keyframes.archive import Archive
-from geogs.keyframes.keyframe import MeasuredCells
 from geogs.mapping.cameras import MapCameras
 from geogs.mapping.held_depths import HeldDepths
 from geogs.mapping.stored_maps import StoredDepth
 from geogs.mapping.view_pool import ViewPool
+from geogs.world.archive import Archive
+from geogs.world.keyframe import MeasuredCells
 from keyframe_samples import Sample, segment_of
 
 CAMERA = Camera(fx=60.0, fy=60.0, cx=39.5, cy=31.5, width=80, height=64)

@@ -11,7 +11,6 @@ from safetensors.torch import save_file
 from geogs.cli.main import main
 from geogs.config import TrackingConfig
 from geogs.errors import InputError
-from geogs.keyframes.grid import SampleGrid
 from geogs.networks import weights_files
 from geogs.networks.weights import read_tensors
 from geogs.networks.weights_catalogue import CATALOGUE, KnownWeights
@@ -20,6 +19,7 @@ from geogs.tracking.flow.classical import ClassicalFlow
 from geogs.tracking.flow.raft import RaftFlow
 from geogs.tracking.flow.select import build_operator
 from geogs.tracking.tracker import Tracker
+from geogs.world.grid import SampleGrid
 from raft_oracle import published
 from tracking_scenes import CAMERA
 

@@ -7,8 +7,8 @@ from torch import Tensor
 
 from geogs.bundle.problem import BundleProblem
 from geogs.geometry.lie import se3_inverse
-from geogs.keyframes.grid import SampleGrid
 from geogs.tracking.depth_prior import DEPTH_DAMPING, SCALE_DAMPING
+from geogs.world.grid import SampleGrid
 from oracles.bundle_reference import reproject
 
 

@@ -3,10 +3,10 @@
 from pathlib import Path
 
 import mutations
-from geogs.fleet.places import Place
-from geogs.fleet.row import FILE, Row, read_row, row_text
-from geogs.fleet.sources import find_sources
-from geogs.fleet.table import table_html
+from geogs_fleet.places import Place
+from geogs_fleet.row import FILE, Row, read_row, row_text
+from geogs_fleet.sources import find_sources
+from geogs_fleet.table import table_html
 from parsers.base import Parser, written
 
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import mutations
 from geogs.application.photographs import open_photographs
 from geogs.config import ReconstructConfig
-from geogs.photos.photograph import find_photographs
-from geogs.photos.poses import FoundPoses, LeftOut
+from geogs_photos.photograph import find_photographs
+from geogs_photos.poses import FoundPoses, LeftOut
 from io_samples import gradient_image, write_image
 from parsers.base import Parser, tiny_room
 from parsers.recordings import write_photograph

@@ -6,7 +6,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from geogs.geometry.umeyama import umeyama
-from geogs.photos.deviations import without_gauge
+from geogs_photos.deviations import without_gauge
 
 
 def test_against_samples_that_are_aligned():

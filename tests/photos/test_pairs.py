@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from geogs.photos import pairs as pairs_module
-from geogs.photos.features import Features
-from geogs.photos.pairs import choose_pairs, mutual_matches, vlad
+from geogs_photos import pairs as pairs_module
+from geogs_photos.features import Features
+from geogs_photos.pairs import choose_pairs, mutual_matches, vlad
 
 
 def descriptors(random: np.random.Generator, count: int) -> np.ndarray:

@@ -8,9 +8,9 @@ from scipy.spatial.transform import Rotation
 from geogs.errors import InputError
 from geogs.io.sources.posed.files import PosedFile
 from geogs.io.sources.posed.one_camera import common_place
-from geogs.photos.photograph import find_photographs
-from geogs.photos.poses import shared_cameras
-from geogs.photos.upright import upright_rotation
+from geogs_photos.photograph import find_photographs
+from geogs_photos.poses import shared_cameras
+from geogs_photos.upright import upright_rotation
 
 
 def photograph(path, size=(64, 48), model="", equivalent=0, orientation=1):

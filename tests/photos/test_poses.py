@@ -11,10 +11,10 @@ from geogs.cli.main import main
 from geogs.errors import InputError
 from geogs.geometry.umeyama import umeyama
 from geogs.io.sources.posed.colmap import open_colmap
-from geogs.photos.features import Features, find_features
-from geogs.photos.library import load_colmap
-from geogs.photos.photograph import find_photographs
-from geogs.photos.poses import Entry, find_poses, reasons
+from geogs_photos.features import Features, find_features
+from geogs_photos.library import load_colmap
+from geogs_photos.photograph import find_photographs
+from geogs_photos.poses import Entry, find_poses, reasons
 from io_samples import write_image
 from posed_layouts import render_room
 

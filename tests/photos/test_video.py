@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from geogs.photos.features import find_features
-from geogs.photos.localise import Localiser, matches_to_points
-from geogs.photos.sharp_frames import sharpest_frames, sharpness, stretch_length
-from geogs.photos.video import place_frames
 from geogs.types import Frame
+from geogs_photos.features import find_features
+from geogs_photos.localise import Localiser, matches_to_points
+from geogs_photos.sharp_frames import sharpest_frames, sharpness, stretch_length
+from geogs_photos.video import place_frames
 from posed_layouts import render_room
 
 

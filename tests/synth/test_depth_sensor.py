@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from geogs.synth.depth_sensor import DepthSensor
+from geogs_synth.depth_sensor import DepthSensor
 
 SENSOR = DepthSensor()
 

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from geogs.synth.motion_kinds import ROOM_MOTIONS, MotionKind
-from geogs.synth.motions import room_motion
-from geogs.synth.room import make_room
-from geogs.synth.scene import Scene
-from geogs.synth.trajectory import handheld_trajectory
+from geogs_synth.motion_kinds import ROOM_MOTIONS, MotionKind
+from geogs_synth.motions import room_motion
+from geogs_synth.room import make_room
+from geogs_synth.scene import Scene
+from geogs_synth.trajectory import handheld_trajectory
 
 
 @pytest.fixture(scope="module")

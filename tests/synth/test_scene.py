@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from geogs.errors import InputError
-from geogs.synth.export import default_camera
-from geogs.synth.raycast import Raycaster
-from geogs.synth.room import make_room
-from geogs.synth.scene import Scene, SceneBuilder, yaw_rotation
-from geogs.synth.tessellation import SeenSurface, scene_mesh
-from geogs.synth.trajectory import FRAMES_PER_LAP, handheld_trajectory
+from geogs_synth.export import default_camera
+from geogs_synth.raycast import Raycaster
+from geogs_synth.room import make_room
+from geogs_synth.scene import Scene, SceneBuilder, yaw_rotation
+from geogs_synth.tessellation import SeenSurface, scene_mesh
+from geogs_synth.trajectory import FRAMES_PER_LAP, handheld_trajectory
 
 
 @pytest.fixture(scope="module", params=[0, 3])

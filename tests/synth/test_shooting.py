@@ -5,16 +5,16 @@ import pytest
 import torch
 
 from geogs.errors import InputError
-from geogs.synth.flaws import Flaws
-from geogs.synth.lens import Lens
-from geogs.synth.motions import room_motion
-from geogs.synth.raycast import Raycaster
-from geogs.synth.room import make_room
-from geogs.synth.scene import Scene
-from geogs.synth.sensor import Sensor
-from geogs.synth.shooting import Shooting
-from geogs.synth.stage import centred_camera
-from geogs.synth.walkers import crossing_walkers
+from geogs_synth.flaws import Flaws
+from geogs_synth.lens import Lens
+from geogs_synth.motions import room_motion
+from geogs_synth.raycast import Raycaster
+from geogs_synth.room import make_room
+from geogs_synth.scene import Scene
+from geogs_synth.sensor import Sensor
+from geogs_synth.shooting import Shooting
+from geogs_synth.stage import centred_camera
+from geogs_synth.walkers import crossing_walkers
 
 CAMERA = centred_camera(96, 72)
 LENS = Lens(CAMERA)

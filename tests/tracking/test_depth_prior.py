@@ -10,7 +10,6 @@ from geogs.bundle.projection import project, relative_motion
 from geogs.config import PriorConfig
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp
-from geogs.keyframes.grid import SampleGrid
 from geogs.priors.alignment import align_inverse_depth
 from geogs.priors.base import DepthKind
 from geogs.tracking.depth_prior import (
@@ -24,6 +23,7 @@ from geogs.tracking.depth_prior import (
     node_differences,
     node_weights,
 )
+from geogs.world.grid import SampleGrid
 from oracles.depth_prior_reference import joint_step, residuals, scale_field
 
 CAMERA = Camera(fx=70.0, fy=72.0, cx=39.0, cy=29.0, width=80, height=60)

@@ -5,7 +5,6 @@ import pytest
 import torch
 
 from geogs.geometry.camera import Camera
-from geogs.keyframes.grid import SampleGrid
 from geogs.tracking import evidence
 from geogs.tracking.evidence import (
     MAX_WINDOWS,
@@ -16,6 +15,7 @@ from geogs.tracking.evidence import (
     correlation_matched,
     reprojected_windows,
 )
+from geogs.world.grid import SampleGrid
 from tracking_scenes import CAMERA, pose, render
 
 GRID = SampleGrid(CAMERA)

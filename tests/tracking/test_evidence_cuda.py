@@ -6,7 +6,6 @@ import torch
 import geogs.tracking.cuda.evidence as cuda_evidence
 from cuda_emulator import use_emulator
 from geogs.geometry.camera import Camera
-from geogs.keyframes.grid import SampleGrid
 from geogs.tracking import evidence
 from geogs.tracking.evidence import (
     MIN_CONTRAST,
@@ -14,6 +13,7 @@ from geogs.tracking.evidence import (
     correlation_matched,
     matched_motion,
 )
+from geogs.world.grid import SampleGrid
 from tracking_scenes import CAMERA, pose, render
 
 SIDES = [(192, 144), (95, 61), (511, 290)]

@@ -5,10 +5,10 @@ import pytest
 import torch
 
 from geogs.geometry.lie import se3_inverse
-from geogs.keyframes.grid import SampleGrid
 from geogs.tracking.features import UNSURE, match_features, spread_positions, surer_flow
 from geogs.tracking.flow.base import FlowMatch
 from geogs.tracking.flow.classical import ClassicalFlow
+from geogs.world.grid import SampleGrid
 from tracking_scenes import CAMERA, pose, render
 
 HERE, AHEAD = pose(0.0), pose(0.2, 0.0, 0.9, 0.05)

@@ -8,14 +8,14 @@ from credulous_flow import CredulousFlow
 from geogs.bundle.base import BundleOptions
 from geogs.bundle.projection import project
 from geogs.bundle.select import grid_fields
-from geogs.keyframes.grid import SampleGrid
-from geogs.keyframes.store import KeyframeStore, Segment
 from geogs.tracking.evidence import MIN_WINDOWS
 from geogs.tracking.features import FeatureMatches
 from geogs.tracking.flow.classical import ClassicalFlow
 from geogs.tracking.graph import FrameGraph
 from geogs.tracking.motion import FrameLocator, pnp, pnp_features
 from geogs.tracking.proximity import frame_distances, proximity_pairs
+from geogs.world.grid import SampleGrid
+from geogs.world.store import KeyframeStore, Segment
 from tracking_scenes import CAMERA, pose, render
 
 POSES = [pose(0.06 * k, yaw=0.01 * k) for k in range(6)]

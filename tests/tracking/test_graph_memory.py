@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from geogs.keyframes.grid import SampleGrid
-from geogs.keyframes.store import KeyframeStore
 from geogs.tracking.flow.base import FlowMatch, FlowOperator, Memories
 from geogs.tracking.graph import FrameGraph
+from geogs.world.grid import SampleGrid
+from geogs.world.store import KeyframeStore
 from tracking_scenes import CAMERA, pose
 
 GRID = SampleGrid(CAMERA)

@@ -7,11 +7,11 @@ import torch
 from geogs.config import TrackingConfig
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
-from geogs.keyframes.grid import SampleGrid
 from geogs.tracking.certainty import certainty
 from geogs.tracking.held import depth_on_grid
 from geogs.tracking.tracker import Tracker, TrackState
 from geogs.types import Frame, RenderedKeyframe
+from geogs.world.grid import SampleGrid
 from tracking_scenes import CAMERA, frames, render, sideways
 
 PATH = sideways(30)

@@ -6,11 +6,11 @@ import pytest
 import torch
 
 from geogs.geometry.lie import se3_inverse
-from geogs.keyframes.grid import SampleGrid
-from geogs.keyframes.store import KeyframeStore
 from geogs.tracking.flow.classical import ClassicalFlow
 from geogs.tracking.graph import FrameGraph
 from geogs.tracking.initialise import _pose_of, placed_after
+from geogs.world.grid import SampleGrid
+from geogs.world.store import KeyframeStore
 from tracking_scenes import CAMERA, pose, render
 
 

@@ -13,12 +13,12 @@ from geogs.geometry.camera import Camera
 from geogs.geometry.umeyama import umeyama
 from geogs.loop.global_bundle import global_bundle
 from geogs.priors.base import DepthKind, PriorMaps
-from geogs.synth.raycast import Raycaster, View
-from geogs.synth.room import make_room
-from geogs.synth.trajectory import handheld_trajectory
 from geogs.tracking.flow.texture import MIN_STRUCTURE, cell_structure
 from geogs.tracking.tracker import Tracker
 from geogs.types import Frame, PoseCorrection
+from geogs_synth.raycast import Raycaster, View
+from geogs_synth.room import make_room
+from geogs_synth.trajectory import handheld_trajectory
 
 pytestmark = pytest.mark.system
 

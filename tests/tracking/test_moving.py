@@ -7,9 +7,9 @@ import torch
 from geogs.bundle.base import BundleOptions
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_inverse
-from geogs.keyframes.grid import SampleGrid
 from geogs.tracking.graph import FrameGraph
 from geogs.tracking.moving import carried, judge, moving_cells, moving_share, still_weight
+from geogs.world.grid import SampleGrid
 from planted_walk import planted_tracker
 
 CAMERA = Camera(fx=150.0, fy=150.0, cx=103.5, cy=79.5, width=208, height=160)

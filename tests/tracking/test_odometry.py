@@ -8,12 +8,12 @@ from geogs.config import OdometryConfig
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_inverse
 from geogs.geometry.umeyama import umeyama
-from geogs.keyframes.grid import SampleGrid
-from geogs.keyframes.store import KeyframeStore, Segment
 from geogs.loop.global_bundle import global_bundle
 from geogs.tracking.odometry import Odometry
 from geogs.tracking.tracker import Tracker
 from geogs.types import MeasuredPose
+from geogs.world.grid import SampleGrid
+from geogs.world.store import KeyframeStore, Segment
 from measured_poses import drifting, with_poses
 from tracking_runs import CONFIG, error_cm
 from tracking_scenes import CAMERA, frames, pose, sideways

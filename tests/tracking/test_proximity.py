@@ -7,10 +7,10 @@ import torch
 import geogs.tracking.overlap as overlap
 import geogs.tracking.proximity as proximity
 from geogs.geometry.lie import se3_exp
-from geogs.keyframes.grid import SampleGrid
-from geogs.keyframes.store import KeyframeStore, Segment
 from geogs.tracking.overlap import LARGEST_ZOOM, alike_in_size, may_overlap
 from geogs.tracking.proximity import frame_distances, proximity_pairs
+from geogs.world.grid import SampleGrid
+from geogs.world.store import KeyframeStore, Segment
 from planted_walk import SMALL, planted_tracker
 
 

@@ -7,13 +7,13 @@ import torch
 from geogs.bundle.projection import project
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp, se3_inverse
-from geogs.keyframes.grid import SampleGrid
 from geogs.shutter.camera import RollingCamera
 from geogs.shutter.rows import RowOffsets
 from geogs.shutter.shutter import Shutter
 from geogs.shutter.turning import Turning
 from geogs.tracking.row_errors import LONGEST_INTERVAL, RowErrors, _carried, lagrange
 from geogs.types import SeenRows, Trajectory
+from geogs.world.grid import SampleGrid
 
 CAMERA = Camera(220.0, 215.0, 157.0, 121.0, 320, 240)
 GRID = SampleGrid(CAMERA)

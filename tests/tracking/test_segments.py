@@ -11,13 +11,13 @@ from geogs.config import LoopConfig, TrackingConfig
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import sim3_exp
 from geogs.geometry.umeyama import umeyama
-from geogs.keyframes.grid import SampleGrid
-from geogs.keyframes.store import KeyframeStore
 from geogs.loop.closer import LoopCloser
 from geogs.tracking.flow.select import build_operator
 from geogs.tracking.segments import Segments
 from geogs.tracking.tracker import Tracker, TrackState
 from geogs.types import Frame
+from geogs.world.grid import SampleGrid
+from geogs.world.store import KeyframeStore
 from loop_scenes import at_angle, room
 
 pytestmark = pytest.mark.system

@@ -11,10 +11,10 @@ from credulous_flow import CredulousFlow
 from geogs.config import TrackingConfig
 from geogs.errors import InputError, TrackingLost
 from geogs.geometry.camera import Camera
-from geogs.keyframes.grid import SampleGrid
 from geogs.loop.global_bundle import global_bundle
 from geogs.tracking.tracker import Tracker, TrackState
 from geogs.types import Frame, PoseCorrection
+from geogs.world.grid import SampleGrid
 from tracking_runs import CONFIG, PATH, error_cm
 from tracking_scenes import CAMERA, frames, pose, render, sideways
 

@@ -8,7 +8,6 @@ import torch
 
 from geogs.bundle.projection import project
 from geogs.config import TrackingConfig
-from geogs.keyframes.grid import SampleGrid
 from geogs.loop.global_bundle import global_bundle
 from geogs.tracking.flow.droid import DroidFlow
 from geogs.tracking.flow.droid_network import (
@@ -20,6 +19,7 @@ from geogs.tracking.flow.droid_network import (
     on_cells,
 )
 from geogs.tracking.tracker import Tracker
+from geogs.world.grid import SampleGrid
 from tracking_runs import error_cm
 from tracking_scenes import CAMERA, frames, render, sideways
 

@@ -10,8 +10,6 @@ import pytest
 from geogs.config import TrackingConfig
 from geogs.errors import TrackingLost
 from geogs.evaluation.trajectory import rotation_angle
-from geogs.keyframes.grid import SampleGrid
-from geogs.keyframes.store import KeyframeStore
 from geogs.tracking import start_up
 from geogs.tracking.flow.select import build_operator
 from geogs.tracking.graph import FrameGraph
@@ -19,6 +17,8 @@ from geogs.tracking.initialise import FORGIVING, Attempt, initialise
 from geogs.tracking.segments import Segments
 from geogs.tracking.tracker import Tracker, TrackState
 from geogs.types import Frame, Trajectory
+from geogs.world.grid import SampleGrid
+from geogs.world.store import KeyframeStore
 from tracking_runs import CONFIG, error_cm
 from tracking_scenes import CAMERA, frames, pose, sideways
 

@@ -4,9 +4,9 @@ import numpy as np
 import torch
 
 from geogs.geometry.lie import se3_exp
-from geogs.keyframes.grid import SampleGrid
-from geogs.keyframes.store import KeyframeStore
 from geogs.tracking.last_frame import LastFrame
+from geogs.world.grid import SampleGrid
+from geogs.world.store import KeyframeStore
 from tracking_scenes import CAMERA
 
 

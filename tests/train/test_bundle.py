@@ -12,7 +12,7 @@ from geogs.bundle.problem import BundleProblem
 from geogs.bundle.projection import project, relative_motion
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import retract, se3_inverse
-from geogs.keyframes.grid import SampleGrid
+from geogs.world.grid import SampleGrid
 from geogs_train.bundle import (
     ClipBundleOptions,
     ClipCameras,

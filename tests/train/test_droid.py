@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from geogs.keyframes.grid import SampleGrid
 from geogs.tracking.flow.droid import DroidFlow, DroidOptions
 from geogs.tracking.flow.droid_network import DroidNetwork, DroidSize
+from geogs.world.grid import SampleGrid
 from geogs_train.bundle import ClipEdges, ClipMatches, ClipState, adjust, reproject
 from geogs_train.clip_state import blind_start, neighbour_edges, true_state
 from geogs_train.droid_unroll import (

@@ -208,8 +208,8 @@ def test_scores_are_means_over_the_right_cells():
 
 
 def test_texture_is_what_the_tracker_calls_texture():
-    from geogs.keyframes.grid import OFFSET, STRIDE
     from geogs.tracking.flow.texture import MIN_STRUCTURE, cell_structure
+    from geogs.world.grid import OFFSET, STRIDE
 
     rng = np.random.default_rng(2)
     image = np.repeat(rng.normal(120, np.linspace(0, 12, 96), (64, 96))[..., None], 3, 2)

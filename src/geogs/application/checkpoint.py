@@ -1,6 +1,6 @@
 """Checkpoints: the state of some work in ``checkpoint/`` of its results, to go on from later.
 
-The state, a record, is taken apart (:mod:`geogs.application.records`) into JSON and a safetensors
+The state, a record, is taken apart (:mod:`geogs.world.pack`) into JSON and a safetensors
 file; large arrays of old keyframes lie in archives beside them, which only grow or are written
 where the last complete state refers to nothing. What belongs to the process (device, flow operator,
 prior, kernels, threads) is not stored: whoever reads has it.
@@ -20,11 +20,11 @@ from safetensors.torch import load, save
 from geogs.application.checkpoint_folder import FORMAT, CheckpointFolder
 from geogs.application.machine import is_gpu_failure
 from geogs.application.progress import RunProgress
-from geogs.application.records import pack, schema, unpack
 from geogs.documents import UNUSABLE, in_short
 from geogs.errors import InputError, OutputError
-from geogs.keyframes.archive import Archive, SettledArchive
 from geogs.version import __version__
+from geogs.world.archive import Archive, SettledArchive
+from geogs.world.pack import pack, schema, unpack
 
 S = TypeVar("S")
 

@@ -17,9 +17,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import BinaryIO, cast
 
-from geogs.application.records import pack, unpack
 from geogs.errors import InputError, OutputError
 from geogs.version import __version__
+from geogs.world.pack import pack, unpack
 
 FORMAT = "geogs checkpoint 2"
 MANIFEST = "manifest.json"
@@ -56,7 +56,7 @@ class Manifest:
     geogs: str
     """The version that wrote it."""
     schema: str
-    """Of the state, see :func:`geogs.application.records.schema`."""
+    """Of the state, see :func:`geogs.world.pack.schema`."""
     is_our_folder: bool
     """Whether geogs made it."""
     number: int

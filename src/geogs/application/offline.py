@@ -24,15 +24,15 @@ from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.sniff import Stream, open_source
 from geogs.io.writers.atomic import prepare_output_folder
 from geogs.mapping.rendered import MapRenderer
-from geogs.photos.localise import Localiser
-from geogs.photos.poses import Progress
-from geogs.photos.sharp_frames import ChosenFrames, sharpest_frames, stretch_length
-from geogs.photos.video import PlacedFrames, place_frames
 from geogs.reconstruction import Reconstruction
 from geogs.stopwatch import Stopwatch
 from geogs.threads import on_one_torch_thread
 from geogs.tracking.gaps import bridged
 from geogs.types import MapSnapshot, RenderedKeyframe, SeenRows, Trajectory, Uncertainty
+from geogs_photos.localise import Localiser
+from geogs_photos.poses import Progress
+from geogs_photos.sharp_frames import ChosenFrames, sharpest_frames, stretch_length
+from geogs_photos.video import PlacedFrames, place_frames
 
 
 @on_one_torch_thread

@@ -13,8 +13,8 @@ from geogs.io.sources.posed.base import PosedSource
 from geogs.io.sources.posed.colmap import open_colmap
 from geogs.io.sources.posed.one_camera import unlike_common
 from geogs.io.writers.atomic import write_text
-from geogs.photos.photograph import PhotoFolder, find_photographs
-from geogs.photos.poses import FoundPoses, LeftOut, find_poses
+from geogs_photos.photograph import PhotoFolder, find_photographs
+from geogs_photos.poses import FoundPoses, LeftOut, find_poses
 
 NAMED = 8
 """Photographs that were left out and are named one by one on the terminal."""

@@ -12,8 +12,8 @@ from geogs.bundle.base import BundleOptions, BundleResult
 from geogs.bundle.linearise import Star, linearise_stars, motion_stars
 from geogs.bundle.problem import BundleProblem, StreamedProblem, known_before, source_chunks
 from geogs.geometry.lie import move
-from geogs.keyframes.grid import SampleGrid
 from geogs.threads import thread_map
+from geogs.world.grid import SampleGrid
 
 
 class DenseBundle:

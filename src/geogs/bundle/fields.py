@@ -8,8 +8,8 @@ from torch import Tensor
 
 from geogs.bundle.projection import project
 from geogs.geometry.lie import se3_inverse
-from geogs.keyframes.grid import SampleGrid
-from geogs.keyframes.keyframe import Keyframe
+from geogs.world.grid import SampleGrid
+from geogs.world.keyframe import Keyframe
 
 
 class CpuFields:

@@ -23,7 +23,7 @@ from geogs.bundle.problem import (
 )
 from geogs.bundle.projection import project, relative_motion
 from geogs.geometry.lie import se3_inverse
-from geogs.keyframes.grid import SampleGrid
+from geogs.world.grid import SampleGrid
 
 ALIKE = 2.25
 """Matches of neighbouring cells err alike, and so do those of one cell along several edges: by how

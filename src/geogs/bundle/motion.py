@@ -8,8 +8,8 @@ from geogs.bundle.linearise import normal_equations, weighed_residuals
 from geogs.bundle.problem import MotionProblem
 from geogs.bundle.projection import linearise, project
 from geogs.geometry.lie import move, se3_inverse
-from geogs.keyframes.grid import SampleGrid
-from geogs.keyframes.keyframe import Keyframe
+from geogs.world.grid import SampleGrid
+from geogs.world.keyframe import Keyframe
 
 
 class CpuMotion:

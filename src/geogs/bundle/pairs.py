@@ -8,7 +8,7 @@ from torch import Tensor
 
 from geogs.bundle.projection import project
 from geogs.geometry.lie import se3_inverse
-from geogs.keyframes.store import Segment
+from geogs.world.store import Segment
 
 LEAST_OVERLAP = 0.2
 """A pair of which no more than this fraction of the cells falls into the other image is far."""

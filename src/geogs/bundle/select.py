@@ -12,8 +12,8 @@ from geogs.bundle.base import (
     LargeBundleSolver,
     MotionSolver,
 )
-from geogs.keyframes.grid import SampleGrid
-from geogs.keyframes.store import Segment
+from geogs.world.grid import SampleGrid
+from geogs.world.store import Segment
 
 
 def bundle_solver(grid: SampleGrid) -> BundleSolver:

@@ -26,8 +26,8 @@ from geogs.bundle.linearise import (
 from geogs.bundle.problem import StreamedProblem, known_before, source_chunks, sources_within
 from geogs.bundle.projection import linearise, relative_motion
 from geogs.geometry.lie import se3_adjoint
-from geogs.keyframes.grid import SampleGrid
 from geogs.threads import thread_map, worker_count
+from geogs.world.grid import SampleGrid
 
 R = TypeVar("R")
 

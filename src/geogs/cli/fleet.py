@@ -9,8 +9,8 @@ from geogs.cli.options import Given, parse_options, record
 from geogs.config import Preset, preset
 from geogs.config.setting import Basic
 from geogs.errors import InputError
-from geogs.fleet.join import JoinSettings
-from geogs.fleet.settings import FleetSettings
+from geogs_fleet.join_run import JoinSettings
+from geogs_fleet.settings import FleetSettings
 
 EXIT_FAILED = 1
 """Exit code where all has been tried, and a source failed."""
@@ -58,8 +58,8 @@ def main(argv: Sequence[str]) -> int:
         words = words[1:]
     options = parse(words)
 
-    from geogs.fleet.run import run_fleet
-    from geogs.fleet.terminal import TerminalFleet, closing_words
+    from geogs_fleet.run import run_fleet
+    from geogs_fleet.terminal import TerminalFleet, closing_words
 
     begin = time.perf_counter()
     settings = record(FleetSettings, options)
@@ -73,8 +73,8 @@ def main(argv: Sequence[str]) -> int:
 def _join(words: Sequence[str]) -> int:
     options = parse_options(JoinOptions, words, "fleet join", _join_defaults)
 
-    from geogs.fleet.join import run_join
-    from geogs.fleet.terminal import TerminalFleet
+    from geogs_fleet.join_run import run_join
+    from geogs_fleet.terminal import TerminalFleet
 
     progress = TerminalFleet(options.quiet)
     joint = run_join(record(JoinSettings, options), progress, progress.say)

@@ -10,7 +10,7 @@ from scipy.linalg import solveh_banded
 
 from geogs.config import DepthConfig
 from geogs.geometry.camera import Camera
-from geogs.keyframes.grid import OFFSET, STRIDE
+from geogs.world.grid import OFFSET, STRIDE
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from jaxtyping import Float64
 from geogs.config import DepthConfig
 from geogs.depth.view import DepthView, Place
 from geogs.geometry.camera import Camera
-from geogs.keyframes.grid import OFFSET, STRIDE
+from geogs.world.grid import OFFSET, STRIDE
 
 
 def parallax_degrees(

@@ -6,12 +6,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from geogs.keyframes.grid import SampleGrid
-from geogs.keyframes.store import Segment
 from geogs.loop.detect import Loop
 from geogs.loop.matched_edges import MatchedEdges
 from geogs.tracking.graph import Edge, Pair
 from geogs.tracking.moving import still_weight
+from geogs.world.grid import SampleGrid
+from geogs.world.store import Segment
 
 
 def closing_matches(

@@ -8,8 +8,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from geogs.geometry.lie import scaled, se3_inverse, sim3_inverse, sim3_log
-from geogs.keyframes.grid import SampleGrid
-from geogs.keyframes.store import KeyframeStore, Segment
 from geogs.loop.detect import Loop
 from geogs.loop.matched_edges import MatchedEdges
 from geogs.loop.pose_graph import RelativePoses
@@ -17,6 +15,8 @@ from geogs.loop.relative_pose import RelativePoseOptions, relative_poses
 from geogs.tracking.graph import Edge, Pair
 from geogs.tracking.moving import still_weight
 from geogs.tracking.packed_edge import PackedEdge
+from geogs.world.grid import SampleGrid
+from geogs.world.store import KeyframeStore, Segment
 
 SETTLED = RelativePoseOptions(iterations=0)
 """For edges that a bundle adjustment has fitted, with more than they tell alone."""

@@ -10,10 +10,10 @@ from torch import Tensor
 from geogs.bundle.projection import project
 from geogs.config import VerificationOptions
 from geogs.geometry.lie import scaled, se3_inverse, so3_log
-from geogs.keyframes.grid import SampleGrid
-from geogs.keyframes.keyframe import Keyframe
 from geogs.tracking.flow.base import FlowMatch, FlowOperator
 from geogs.tracking.motion import FrameLocator, FrameMotion
+from geogs.world.grid import SampleGrid
+from geogs.world.keyframe import Keyframe
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,6 @@ from torch import Tensor
 
 from geogs.config import LoopConfig
 from geogs.geometry.lie import se3_inverse
-from geogs.keyframes.store import KeyframeStore
 from geogs.loop.dense import dense_check
 from geogs.loop.search import (
     Cause,
@@ -27,6 +26,7 @@ from geogs.loop.search import (
 from geogs.tracking.flow.base import FlowMatch, FlowOperator
 from geogs.tracking.motion import Recognition
 from geogs.tracking.proximity import frame_distances
+from geogs.world.store import KeyframeStore
 
 
 @dataclass(frozen=True)

@@ -16,9 +16,9 @@ from torch import Tensor
 from geogs.bundle.linearise import weighed_residuals
 from geogs.bundle.projection import LinearProjection, linearise
 from geogs.geometry.lie import move, se3_inverse
-from geogs.keyframes.grid import SampleGrid
 from geogs.loop.matched_edges import MatchedEdges
 from geogs.loop.pose_graph import RelativePoses
+from geogs.world.grid import SampleGrid
 
 
 @dataclass(frozen=True)

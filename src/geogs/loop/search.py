@@ -10,12 +10,12 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from geogs.config import LoopConfig
-from geogs.keyframes.grid import SampleGrid
 from geogs.loop.features import Features
 from geogs.loop.retrieval import AppearanceIndex, IndexState
 from geogs.loop.verification import DepthView, TwoView, TwoViewVerifier
 from geogs.threads import worker_count
 from geogs.tracking.motion import Recognition
+from geogs.world.grid import SampleGrid
 
 Cause = Literal["geometry", "appearance"]
 """What proposed a pair: the present poses, or nothing but the looks."""

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from geogs.config import VerificationOptions
 from geogs.geometry.camera import Camera
-from geogs.keyframes.grid import SampleGrid
 from geogs.loop.features import Features
+from geogs.world.grid import SampleGrid
 
 RASTER = 4
 """Cells per side in which the spread of the inliers is counted."""

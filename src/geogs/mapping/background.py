@@ -16,10 +16,10 @@ from torch import Tensor
 
 from geogs.beside import RightOfWay
 from geogs.errors import GeogsError
-from geogs.keyframes.keyframe import Keyframe
-from geogs.keyframes.store import KeyframeStore
 from geogs.mapping.mapper import Mapper, never_pause
 from geogs.types import PoseCorrection
+from geogs.world.keyframe import Keyframe
+from geogs.world.store import KeyframeStore
 
 R = TypeVar("R")
 

@@ -3,8 +3,8 @@
 import torch
 
 from geogs.depth.view import DenseDepth
-from geogs.keyframes.swap import Swap
 from geogs.mapping.stored_maps import StoredDepth
+from geogs.world.swap import Swap
 
 HELD = 512
 """Most depths; at 320 x 180 pixels with normals they take 600 MB."""

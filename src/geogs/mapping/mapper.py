@@ -14,8 +14,6 @@ from geogs.config import DepthSensorConfig, MappingConfig
 from geogs.depth.base import Progress, silent
 from geogs.depth.select import depth_engine
 from geogs.errors import InputError
-from geogs.keyframes.archive import Archive
-from geogs.keyframes.store import KeyframeStore
 from geogs.mapping.cameras import MapCameras
 from geogs.mapping.keyframe_depths import CANDIDATES, KeyframeDepths
 from geogs.mapping.levelling import light_of
@@ -50,6 +48,8 @@ from geogs.splat.map import DiskParameters, GaussianMap
 from geogs.splat.optimizer import MapOptimizer
 from geogs.splat.render import render
 from geogs.types import MapSnapshot, PoseCorrection, RenderedKeyframe
+from geogs.world.archive import Archive
+from geogs.world.store import KeyframeStore
 
 # Nearest keyframes that vote on a keyframe's disks; others are too far away to know better.
 _VOTERS = 96

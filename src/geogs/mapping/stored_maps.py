@@ -8,9 +8,9 @@ from jaxtyping import Bool, Float, Float32, UInt8
 from torch import Tensor
 
 from geogs.depth.view import DenseDepth
-from geogs.keyframes.archive import Archive, Archived
-from geogs.keyframes.keyframe import Keyframe
 from geogs.losses.single_view import ViewConstants
+from geogs.world.archive import Archive, Archived
+from geogs.world.keyframe import Keyframe
 
 
 @dataclass(eq=False)

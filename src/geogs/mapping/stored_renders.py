@@ -7,8 +7,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from geogs.geometry.camera import Camera
-from geogs.keyframes.archive import Archive, Archived
 from geogs.types import RenderedKeyframe
+from geogs.world.archive import Archive, Archived
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -9,12 +9,12 @@ from torch import Tensor
 from geogs.config import DepthSensorConfig
 from geogs.depth.view import DenseDepth, DepthSearch, DepthView, Place, PosedDepth
 from geogs.geometry.lie import se3_inverse
-from geogs.keyframes.keyframe import Keyframe
 from geogs.losses.light import same_light
 from geogs.losses.multi_view import PhotoView
 from geogs.losses.single_view import ViewConstants
 from geogs.mapping.view_pool import ViewPool
 from geogs.priors.depth_sensor import sensor_depth
+from geogs.world.keyframe import Keyframe
 
 UNSURE = 1e3
 """Relative deviation of a depth that is nobody's measurement: it outweighs nothing."""

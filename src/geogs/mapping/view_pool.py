@@ -13,16 +13,16 @@ from geogs.config import LossConfig
 from geogs.depth.view import DenseDepth, depth_images
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
-from geogs.keyframes.archive import Archive, Archived
-from geogs.keyframes.keyframe import Keyframe
-from geogs.keyframes.store import KeyframeStore
-from geogs.keyframes.swap import Swap
 from geogs.losses.multi_view import PhotoView
 from geogs.losses.single_view import OUTSIDE, ViewConstants
 from geogs.mapping.cameras import MapCameras
 from geogs.mapping.held_depths import HeldDepths
 from geogs.mapping.read_ahead import ReadAhead
 from geogs.mapping.stored_maps import StoredDepth, StoredMaps, ViewMaps
+from geogs.world.archive import Archive, Archived
+from geogs.world.keyframe import Keyframe
+from geogs.world.store import KeyframeStore
+from geogs.world.swap import Swap
 
 
 @dataclass(frozen=True, eq=False)

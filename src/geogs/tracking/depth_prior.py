@@ -23,7 +23,7 @@ from geogs.bundle.linearise import weighed_residuals
 from geogs.bundle.problem import BundleProblem
 from geogs.bundle.projection import linearise, relative_motion
 from geogs.config import PriorConfig
-from geogs.keyframes.grid import SampleGrid
+from geogs.world.grid import SampleGrid
 
 SCALE_DAMPING = 1e-4
 """Of the scales, relative to the curvature of the prior's term."""

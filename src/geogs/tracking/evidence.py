@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from geogs.gpu.transfer import to_device
-from geogs.keyframes.grid import STRIDE, SampleGrid
+from geogs.world.grid import STRIDE, SampleGrid
 
 SIDE = STRIDE + 1
 """Pixels along the edge of a window; those of neighbouring cells share their border."""

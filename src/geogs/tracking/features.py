@@ -15,8 +15,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from geogs.bundle.select import grid_fields
-from geogs.keyframes.grid import SampleGrid
 from geogs.tracking.flow.base import FlowMatch, FlowOperator
+from geogs.world.grid import SampleGrid
 
 FEATURES = 2000
 """Most features per image."""

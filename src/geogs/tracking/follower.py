@@ -8,13 +8,13 @@ from torch import Tensor
 
 from geogs.config import TrackingConfig
 from geogs.geometry.lie import se3_inverse
-from geogs.keyframes.keyframe import Keyframe
 from geogs.tracking.flow.base import FlowOperator
 from geogs.tracking.keyframe_choice import calls_for_keyframe
 from geogs.tracking.last_frame import LastFrame
 from geogs.tracking.motion import FrameLocator, FrameMotion
 from geogs.tracking.pose_deviation import PoseDeviation, pose_deviation
 from geogs.types import Frame
+from geogs.world.keyframe import Keyframe
 
 FARTHER = 1.0
 """Part of the motion that calls for a keyframe by which a frame may be farther than that from the

@@ -17,8 +17,6 @@ from geogs.bundle.select import (
     large_bundle_solver,
 )
 from geogs.errors import InputError
-from geogs.keyframes.keyframe import Keyframe
-from geogs.keyframes.store import Segment
 from geogs.threads import thread_map
 from geogs.tracking.flow.base import FlowMatch, FlowOperator
 from geogs.tracking.moving import judge, still_weight
@@ -30,6 +28,8 @@ from geogs.tracking.packed_edge import (
     packed_reprojections,
 )
 from geogs.tracking.proximity import PAIRS_TOGETHER, Pair
+from geogs.world.keyframe import Keyframe
+from geogs.world.store import Segment
 
 STACKED_EDGES = 1024, 8192
 """Directed edges up to which an adjustment has all matches in one piece, on CPU and GPU."""

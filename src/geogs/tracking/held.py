@@ -6,9 +6,9 @@ from torch import Tensor
 
 from geogs.bundle.select import grid_fields
 from geogs.errors import InputError
-from geogs.keyframes.grid import SampleGrid
-from geogs.keyframes.store import Segment
 from geogs.types import RenderedKeyframe
+from geogs.world.grid import SampleGrid
+from geogs.world.store import Segment
 
 DEVIATION = 0.01
 """Relative deviation of a depth that a map shows, where it is sure."""

@@ -22,15 +22,15 @@ from geogs.bundle.select import grid_fields
 from geogs.config import TrackingConfig
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_inverse
-from geogs.keyframes.grid import SampleGrid
-from geogs.keyframes.keyframe import Keyframe
-from geogs.keyframes.store import Segment
 from geogs.threads import thread_map
 from geogs.tracking.evidence import Evidence, correlation_at
 from geogs.tracking.features import surer_flows
 from geogs.tracking.flow.base import FlowMatch
 from geogs.tracking.graph import FrameGraph
 from geogs.tracking.motion import pnp
+from geogs.world.grid import SampleGrid
+from geogs.world.keyframe import Keyframe
+from geogs.world.store import Segment
 
 FARTHEST = 50.0
 """Baselines beyond which a point says nothing on which of four poses is the right one."""

@@ -8,12 +8,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from geogs.config import PriorConfig
-from geogs.keyframes.grid import OFFSET, STRIDE, SampleGrid
-from geogs.keyframes.keyframe import Keyframe, KeyframePrior
 from geogs.priors.alignment import align_inverse_depth
 from geogs.priors.base import MonocularPrior
 from geogs.tracking.depth_prior import FlowEvidence, adjust_depth, flow_evidence
 from geogs.tracking.graph import FrameGraph
+from geogs.world.grid import OFFSET, STRIDE, SampleGrid
+from geogs.world.keyframe import Keyframe, KeyframePrior
 
 _log = logging.getLogger(__name__)
 

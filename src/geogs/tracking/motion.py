@@ -13,8 +13,6 @@ from torch import Tensor
 from geogs.bundle.select import grid_fields, motion_solver
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
-from geogs.keyframes.grid import SampleGrid
-from geogs.keyframes.keyframe import Keyframe
 from geogs.tracking.evidence import (
     Evidence,
     correlation_at,
@@ -24,6 +22,8 @@ from geogs.tracking.evidence import (
 from geogs.tracking.features import FeatureMatches, match_features, surer_flow
 from geogs.tracking.flow.base import FlowMatch, FlowOperator
 from geogs.tracking.flow.filled import filled_positions
+from geogs.world.grid import SampleGrid
+from geogs.world.keyframe import Keyframe
 
 FIT_ITERATIONS = 6
 """Steps of the motion-only adjustment of a frame."""

@@ -17,9 +17,9 @@ from torch.nn.functional import avg_pool2d
 from geogs.bundle.problem import source_chunks
 from geogs.bundle.rigidity import best_residuals
 from geogs.bundle.select import grid_fields
-from geogs.keyframes.grid import SampleGrid
-from geogs.keyframes.store import Segment
 from geogs.tracking.proximity import Pair
+from geogs.world.grid import SampleGrid
+from geogs.world.store import Segment
 
 LEAST_SCALE = 0.2
 """Deviations of a match below which the usual residual of an edge is not taken to lie."""

@@ -13,10 +13,10 @@ import torch
 from geogs.bundle.measured_motions import MeasuredMotions
 from geogs.config import OdometryConfig
 from geogs.geometry.lie import se3_inverse
-from geogs.keyframes.keyframe import Keyframe
-from geogs.keyframes.store import Segment
 from geogs.priors.odometry import ScaleVote, information_of, vote_on_scale
 from geogs.types import MeasuredPose
+from geogs.world.keyframe import Keyframe
+from geogs.world.store import Segment
 
 LEAST = 5
 """Motions that must fit before any is used."""

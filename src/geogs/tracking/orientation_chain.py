@@ -10,13 +10,13 @@ from torch import Tensor
 
 from geogs.config import TrackingConfig
 from geogs.errors import InputError
-from geogs.keyframes.grid import SampleGrid
 from geogs.tracking.flow.base import FlowOperator
 from geogs.tracking.keyframe_choice import calls_for_keyframe
 from geogs.tracking.motion import ChainState, FlowChain
 from geogs.tracking.rotation import relative_rotation
 from geogs.tracking.turns import Turn
 from geogs.types import Frame
+from geogs.world.grid import SampleGrid
 
 MAX_MISSES = 5
 """Frames that do not match the view after which the next one takes its place, without a link."""

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_inverse
-from geogs.keyframes.store import Segment
+from geogs.world.store import Segment
 
 TILES = 4, 6
 """Rows and columns of tiles into which the cells of a keyframe are grouped."""

@@ -11,9 +11,9 @@ from torch import Tensor
 from geogs.bundle.projection import project
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_inverse
-from geogs.keyframes.grid import SampleGrid
-from geogs.keyframes.keyframe import Keyframe
 from geogs.tracking.flow.base import FlowMatch
+from geogs.world.grid import SampleGrid
+from geogs.world.keyframe import Keyframe
 
 MAX_WEIGHT = 6e4
 """Largest weight that half precision holds, 1 / pixel^2."""

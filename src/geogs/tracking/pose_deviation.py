@@ -9,10 +9,10 @@ from torch import Tensor
 from geogs.bundle.marginals import ALIKE
 from geogs.bundle.projection import linearise
 from geogs.geometry.lie import se3_inverse
-from geogs.keyframes.grid import SampleGrid
-from geogs.keyframes.keyframe import Keyframe
 from geogs.tracking.flow.base import FlowMatch
 from geogs.tracking.trajectory import depth_aware_weight
+from geogs.world.grid import SampleGrid
+from geogs.world.keyframe import Keyframe
 
 
 @dataclass(frozen=True)

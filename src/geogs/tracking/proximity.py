@@ -8,9 +8,9 @@ from torch import Tensor
 
 from geogs.bundle.pairs import LEAST_OVERLAP
 from geogs.bundle.select import keyframe_pairs
-from geogs.keyframes.store import Segment
 from geogs.threads import thread_map
 from geogs.tracking.overlap import alike_in_size, may_overlap
+from geogs.world.store import Segment
 
 Pair = tuple[int, int]
 """Two keyframe ids, the earlier first; an edge of the graph in both directions."""

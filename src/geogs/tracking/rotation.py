@@ -14,9 +14,9 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from geogs.geometry.nearest_rotation import nearest_rotation
-from geogs.keyframes.grid import SampleGrid
 from geogs.tracking.flow.base import FlowMatch
 from geogs.tracking.initialise import rays_through, relative_pose
+from geogs.world.grid import SampleGrid
 
 AGREEING = 0.4
 """Share of the matched cells that must agree with a rotation for it to be believed."""

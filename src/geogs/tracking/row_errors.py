@@ -16,12 +16,12 @@ from torch import Tensor
 
 from geogs.bundle.projection import project, seen_from_targets
 from geogs.geometry.lie import se3_inverse
-from geogs.keyframes.grid import SampleGrid
-from geogs.keyframes.store import Segment
 from geogs.shutter.rows import CELL
 from geogs.tracking.packed_edge import PackedEdge, packed_matches
 from geogs.tracking.proximity import Pair
 from geogs.types import SeenRows, Trajectory
+from geogs.world.grid import SampleGrid
+from geogs.world.store import Segment
 
 NODES = 5
 """Frames whose poses say where a point is at the time of its row."""

@@ -6,10 +6,10 @@ import torch
 
 from geogs.bundle.select import grid_fields
 from geogs.config import DepthSensorConfig
-from geogs.keyframes.grid import OFFSET, STRIDE, SampleGrid
-from geogs.keyframes.keyframe import Keyframe, MeasuredCells
 from geogs.priors.depth_sensor import sensor_depth
 from geogs.types import MeasuredDepth
+from geogs.world.grid import OFFSET, STRIDE, SampleGrid
+from geogs.world.keyframe import Keyframe, MeasuredCells
 
 
 class DepthSensing:

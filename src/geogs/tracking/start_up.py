@@ -9,7 +9,6 @@ from typing import Any
 import torch
 
 from geogs.config import TrackingConfig
-from geogs.keyframes.grid import SampleGrid
 from geogs.tracking.chained_flows import ChainedFlows
 from geogs.tracking.flow.base import FlowMatch
 from geogs.tracking.graph import FrameGraph
@@ -21,6 +20,7 @@ from geogs.tracking.rotation import relative_rotation
 from geogs.tracking.trajectory import TrajectoryRecorder
 from geogs.tracking.turns import Turn
 from geogs.types import Frame
+from geogs.world.grid import SampleGrid
 
 MIN_KEYFRAMES = 4
 MAX_MISSES = 5

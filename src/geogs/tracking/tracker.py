@@ -16,9 +16,6 @@ from geogs.config import DepthSensorConfig, OdometryConfig, PriorConfig, Trackin
 from geogs.errors import InputError, TrackingLost
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_inverse
-from geogs.keyframes.grid import SampleGrid
-from geogs.keyframes.keyframe import Keyframe, KeyframeState
-from geogs.keyframes.store import KeyframeStore
 from geogs.priors.base import MonocularPrior
 from geogs.tracking.back_fill import back_fill
 from geogs.tracking.flow.base import FlowOperator
@@ -46,6 +43,9 @@ from geogs.tracking.turns import Turn
 from geogs.tracking.view_choice import seeing
 from geogs.tracking.window import reach
 from geogs.types import Frame, RenderedKeyframe, Trajectory
+from geogs.world.grid import SampleGrid
+from geogs.world.keyframe import Keyframe, KeyframeState
+from geogs.world.store import KeyframeStore
 
 SELDOM = 5
 """While a camera only turns, the orientation says what it sees; only so often it is looked for as

@@ -13,8 +13,8 @@ import torch
 from jaxtyping import UInt8
 from PIL import Image
 
-from geogs.synth import artwork, texture
-from geogs.synth.texture import Colour
+from geogs_synth import artwork, texture
+from geogs_synth.texture import Colour
 from geogs_train.rooms.textures import TextureBank
 
 Recipe = Callable[[np.random.Generator, int], UInt8[np.ndarray, "s s 3"]]

@@ -1,7 +1,7 @@
 """What a batch of random rooms is made of.
 
 World frame: z up, metres; a room fills [0, size]. A solid has a local frame and three numbers
-``half`` whose meaning depends on its kind, as in :mod:`geogs.synth.scene`: half extents of a BOX;
+``half`` whose meaning depends on its kind, as in :mod:`geogs_synth.scene`: half extents of a BOX;
 radius at -z, radius at +z and half height of a FRUSTUM; the radii of an ELLIPSOID.
 
 Surfaces: 0..5 are the room's faces -x, +x, -y, +y, -z (floor), +z (ceiling); solid i has surface

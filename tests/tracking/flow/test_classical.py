@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from geogs.bundle.projection import project
-from geogs.keyframes.grid import SampleGrid
 from geogs.tracking.flow.base import FlowMatch, FlowOperator
 from geogs.tracking.flow.classical import ClassicalFlow, match_deviation
+from geogs.world.grid import SampleGrid
 from tracking_scenes import CAMERA, pose, render
 
 GRID = SampleGrid(CAMERA)

@@ -11,11 +11,11 @@ import torch
 from cuda_emulator import use_emulator
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
-from geogs.keyframes.grid import SampleGrid
 from geogs.tracking.flow import classical_cuda
 from geogs.tracking.flow.base import FlowOperator
 from geogs.tracking.flow.classical import ClassicalFlow
 from geogs.tracking.flow.classical_cuda import CudaClassicalFlow
+from geogs.world.grid import SampleGrid
 from tracking_scenes import CAMERA, pose, render
 
 SMALL = Camera(90.0, 90.0, 38.5, 27.0, 76, 55)

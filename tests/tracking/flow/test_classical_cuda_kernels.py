@@ -9,10 +9,10 @@ import torch
 
 from cuda_emulator import use_emulator
 from geogs.geometry.camera import Camera
-from geogs.keyframes.grid import SampleGrid
 from geogs.tracking.flow import classical_cuda
 from geogs.tracking.flow.classical import ClassicalFlow, _DenseFlow
 from geogs.tracking.flow.classical_cuda import DEVIATION, SOURCES, CudaClassicalFlow
+from geogs.world.grid import SampleGrid
 
 ALPHA, GAMMA, DELTA, ZETA2, EPS2, RELAXATION = 30.0, 10.0, 2.0, 0.01, 1e-4, 1.5
 

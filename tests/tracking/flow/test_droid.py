@@ -14,12 +14,12 @@ from geogs.bundle.problem import BundleProblem
 from geogs.bundle.projection import linearise, relative_motion
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
-from geogs.keyframes.grid import SampleGrid
-from geogs.keyframes.store import KeyframeStore
 from geogs.tracking.flow.base import FlowOperator
 from geogs.tracking.flow.droid import DroidFlow, DroidOptions
 from geogs.tracking.flow.droid_network import DroidNetwork, DroidSize
 from geogs.tracking.graph import FrameGraph
+from geogs.world.grid import SampleGrid
+from geogs.world.store import KeyframeStore
 from tracking_scenes import CAMERA, pose, render
 
 GRID = SampleGrid(CAMERA)

@@ -7,10 +7,10 @@ import torch
 
 from geogs.config import RetrievalOptions, TrackingConfig
 from geogs.errors import InputError
-from geogs.keyframes.grid import STRIDE, SampleGrid
 from geogs.loop.features import FeatureExtractor
 from geogs.tracking.flow.masked import MaskedFlow
 from geogs.tracking.flow.select import build_operator
+from geogs.world.grid import STRIDE, SampleGrid
 from tracking_scenes import CAMERA, pose, render
 
 MASK = np.ones((144, 192), bool)

@@ -6,7 +6,6 @@ import torch
 
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
-from geogs.keyframes.grid import SampleGrid
 from geogs.tracking.flow.classical import ClassicalFlow
 from geogs.tracking.flow.classical_cuda import CudaClassicalFlow
 from geogs.tracking.flow.lookup import Edges
@@ -19,6 +18,7 @@ from geogs.tracking.flow.own_network import (
     Residual,
     cell_pixels,
 )
+from geogs.world.grid import SampleGrid
 from geogs_train.export import export_weights
 from geogs_train.scores import FlowScores
 from geogs_train.validation import SceneScores

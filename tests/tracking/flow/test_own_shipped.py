@@ -7,13 +7,13 @@ import pytest
 import torch
 
 from geogs.geometry.camera import Camera
-from geogs.keyframes.grid import OFFSET, STRIDE, SampleGrid
 from geogs.networks.weights_files import PACKAGED
-from geogs.synth.raycast import Raycaster
-from geogs.synth.room import make_room
-from geogs.synth.trajectory import handheld_trajectory
 from geogs.tracking.flow.classical import ClassicalFlow
 from geogs.tracking.flow.own import OwnFlow, OwnFlowOptions
+from geogs.world.grid import OFFSET, STRIDE, SampleGrid
+from geogs_synth.raycast import Raycaster
+from geogs_synth.room import make_room
+from geogs_synth.trajectory import handheld_trajectory
 
 pytestmark = pytest.mark.system
 

@@ -8,10 +8,10 @@ import pytest
 import torch
 
 from geogs.config import TrackingConfig
-from geogs.keyframes.grid import STRIDE, SampleGrid
 from geogs.tracking.flow.painted import PaintedFlow
 from geogs.tracking.flow.select import build_operator
 from geogs.tracking.tracker import Tracker
+from geogs.world.grid import STRIDE, SampleGrid
 from tracking_runs import CONFIG, error_cm
 from tracking_scenes import CAMERA, frames, pose, render, sideways
 

@@ -9,7 +9,6 @@ import torch
 from geogs.config import TrackingConfig
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
-from geogs.keyframes.grid import SampleGrid
 from geogs.tracking.flow.base import FlowOperator
 from geogs.tracking.flow.classical import ClassicalFlow
 from geogs.tracking.flow.correlation import CorrelationVolume
@@ -23,6 +22,7 @@ from geogs.tracking.flow.raft import (
 )
 from geogs.tracking.flow.raft_network import SMALL, RaftEstimate, RaftFeatures
 from geogs.tracking.tracker import Tracker
+from geogs.world.grid import SampleGrid
 from raft_oracle import original, published
 from tracking_runs import error_cm
 from tracking_scenes import CAMERA as ROOM_CAMERA

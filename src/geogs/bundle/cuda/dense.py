@@ -13,7 +13,7 @@ from geogs.bundle.linearise import motion_stars
 from geogs.bundle.problem import MEASURED_HUBER, BundleProblem
 from geogs.gpu.kernels import kernels_for
 from geogs.gpu.transfer import to_device
-from geogs.keyframes.grid import SampleGrid
+from geogs.world.grid import SampleGrid
 
 MAX_FEW = 16
 """Free poses up to which one block solves the camera system; ``MAX_POSES`` of the source."""

@@ -10,8 +10,8 @@ from torch import Tensor
 from geogs.bundle.cuda.dense import block_size
 from geogs.gpu.kernels import kernels_for
 from geogs.gpu.transfer import to_device
-from geogs.keyframes.grid import OFFSET, STRIDE, SampleGrid
-from geogs.keyframes.keyframe import Keyframe
+from geogs.world.grid import OFFSET, STRIDE, SampleGrid
+from geogs.world.keyframe import Keyframe
 
 SOURCE = Path(__file__).with_name("fields.cu")
 MOST_THREADS = 1024

@@ -10,8 +10,8 @@ from geogs.bundle.cuda.dense import block_size, edges_by_frame
 from geogs.bundle.problem import MotionProblem
 from geogs.gpu.kernels import kernels_for
 from geogs.gpu.transfer import to_device
-from geogs.keyframes.grid import SampleGrid
-from geogs.keyframes.keyframe import KNOWN, Keyframe
+from geogs.world.grid import SampleGrid
+from geogs.world.keyframe import KNOWN, Keyframe
 
 SOURCE = Path(__file__).with_name("motion.cu")
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from geogs.bundle.cuda.dense import block_size
 from geogs.gpu.kernels import Kernel, kernels_for
 from geogs.gpu.transfer import to_device
-from geogs.keyframes.store import Segment
+from geogs.world.store import Segment
 
 SOURCE = Path(__file__).with_name("pairs.cu")
 

@@ -23,7 +23,7 @@ from geogs.bundle.linearise import motion_stars
 from geogs.bundle.problem import MEASURED_HUBER, StreamedProblem, known_before, source_chunks
 from geogs.gpu.kernels import kernels_for
 from geogs.gpu.transfer import to_device
-from geogs.keyframes.grid import SampleGrid
+from geogs.world.grid import SampleGrid
 
 EDGES_TOGETHER = 1024
 """Directed edges that are linearised at a time; bounds memory (100 MB at 64 x 36 cells)."""

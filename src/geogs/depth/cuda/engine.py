@@ -23,8 +23,8 @@ from geogs.depth.plane_sweep import sweep_planes
 from geogs.depth.sweep_neighbors import depth_range
 from geogs.depth.view import DenseDepth, DepthView, PosedDepth, dense_depths
 from geogs.geometry.camera import Camera
-from geogs.keyframes.swap import Swap
 from geogs.threads import worker_count
+from geogs.world.swap import Swap
 
 # Keyframes whose grids are completed at once.
 _BATCH = 32

@@ -15,7 +15,7 @@ from geogs.depth.cuda.sweep import SweptDepth
 from geogs.depth.refinement import FLOOR_DEVIATION, FULL_SUPPORT, PATCH_REACH
 from geogs.geometry.camera import Camera
 from geogs.gpu.kernels import kernels_for
-from geogs.keyframes.grid import OFFSET, STRIDE
+from geogs.world.grid import OFFSET, STRIDE
 
 SOURCE = Path(__file__).with_name("refinement.cu")
 

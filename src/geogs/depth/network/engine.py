@@ -22,7 +22,7 @@ from geogs.depth.view import DenseDepth, DepthView, PosedDepth, dense_depths
 from geogs.geometry.camera import Camera
 from geogs.gpu.recorded import Recorded
 from geogs.gpu.transfer import to_device
-from geogs.keyframes.swap import Swap
+from geogs.world.swap import Swap
 
 MOST_NEIGHBOURS = 8
 """The training shows no more; they come best first."""

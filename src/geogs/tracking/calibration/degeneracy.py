@@ -13,9 +13,9 @@ import numpy as np
 from jaxtyping import Float
 
 from geogs.geometry.camera import Camera
-from geogs.keyframes.grid import SampleGrid
 from geogs.tracking.calibration.keyframes import on_cpu, with_focal
 from geogs.tracking.flow.base import FlowMatch
+from geogs.world.grid import SampleGrid
 
 MAX_COST = 6.0
 """Mean cost of a match, in variances, above which no pinhole camera explains the flow."""

@@ -11,7 +11,6 @@ from jaxtyping import Bool
 
 from geogs.config import CalibrationConfig, TrackingConfig
 from geogs.geometry.camera import Camera
-from geogs.keyframes.grid import SampleGrid
 from geogs.threads import on_one_torch_thread
 from geogs.tracking.calibration.degeneracy import Degeneracy
 from geogs.tracking.calibration.keyframes import ViewGatherer
@@ -21,6 +20,7 @@ from geogs.tracking.flow.masked import MaskedFlow
 from geogs.tracking.flow.painted import PaintedFlow
 from geogs.tracking.flow.select import build_operator
 from geogs.types import Frame
+from geogs.world.grid import SampleGrid
 
 
 @dataclass(frozen=True)

@@ -10,11 +10,11 @@ from geogs.bundle.lens import LensBlock
 from geogs.bundle.levenberg import LevenbergResult, solve_shared
 from geogs.bundle.problem import BundleProblem
 from geogs.bundle.select import grid_fields
-from geogs.keyframes.grid import SampleGrid
 from geogs.tracking.calibration.keyframes import View, on_cpu
 from geogs.tracking.calibration.start import Start
 from geogs.tracking.flow.base import FlowOperator
 from geogs.tracking.motion import pnp
+from geogs.world.grid import SampleGrid
 
 OFFSETS = (1, 3, 6)
 """Every keyframe is matched with those so many before it."""

@@ -3,7 +3,6 @@
 from collections.abc import Callable
 
 from geogs.config import CalibrationConfig
-from geogs.keyframes.grid import SampleGrid
 from geogs.threads import thread_map
 from geogs.tracking.calibration.degeneracy import MAX_COST, Degeneracy, degeneracy
 from geogs.tracking.calibration.growth import GrowingBundle
@@ -11,6 +10,7 @@ from geogs.tracking.calibration.keyframes import View, ViewGatherer, flows_from_
 from geogs.tracking.calibration.start import Start, candidates, try_candidate
 from geogs.tracking.calibration.sureness import relative_error
 from geogs.tracking.flow.base import FlowMatch, FlowOperator
+from geogs.world.grid import SampleGrid
 
 LEAST_VIEWS = 4
 

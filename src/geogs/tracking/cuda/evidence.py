@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from geogs.gpu.kernels import kernels_for
-from geogs.keyframes.grid import STRIDE, SampleGrid
+from geogs.world.grid import STRIDE, SampleGrid
 
 SOURCE = Path(__file__).with_name("evidence.cu")
 WINDOWS = 8

@@ -17,10 +17,10 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from geogs.keyframes.grid import OFFSET, STRIDE, SampleGrid
 from geogs.threads import worker_count
 from geogs.tracking.flow.base import FlowMatch, Memories
 from geogs.tracking.flow.texture import MIN_STRUCTURE, cell_structure
+from geogs.world.grid import OFFSET, STRIDE, SampleGrid
 
 FAR = 1e3
 """Stands for a position outside the image, in pixels."""

@@ -19,7 +19,6 @@ from torch import Tensor
 from geogs.errors import InputError
 from geogs.gpu.kernels import Kernel, kernels_for
 from geogs.gpu.transfer import to_device
-from geogs.keyframes.grid import SampleGrid
 from geogs.tracking.flow.base import FlowMatch, Memories
 from geogs.tracking.flow.classical import (
     COARSE_DEVIATION,
@@ -27,6 +26,7 @@ from geogs.tracking.flow.classical import (
     SMALL_IMAGE,
 )
 from geogs.tracking.flow.texture import MIN_STRUCTURE
+from geogs.world.grid import SampleGrid
 
 SOURCES = Path(__file__).parents[1] / "cuda"
 TILE = 32

@@ -24,7 +24,6 @@ from torch import Tensor
 
 from geogs.errors import InputError
 from geogs.gpu.transfer import to_device
-from geogs.keyframes.grid import OFFSET, STRIDE, SampleGrid
 from geogs.networks.weights import read_tensors
 from geogs.tracking.flow.base import FlowMatch, Memories
 from geogs.tracking.flow.correlation import CorrelationLookup, CorrelationVolume, LocalCorrelation
@@ -38,6 +37,7 @@ from geogs.tracking.flow.droid_network import (
     on_cells,
 )
 from geogs.tracking.flow.texture import grey_levels, textured_fraction
+from geogs.world.grid import OFFSET, STRIDE, SampleGrid
 
 FAR = 1e4
 """Cells beyond which a position is as good as lost."""

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from geogs.errors import InputError
-from geogs.keyframes.grid import OFFSET, STRIDE
+from geogs.world.grid import OFFSET, STRIDE
 
 LEVELS = 4
 """Levels of the correlation pyramid."""

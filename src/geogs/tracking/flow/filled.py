@@ -4,8 +4,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from geogs.bundle.select import grid_fields
-from geogs.keyframes.grid import SampleGrid
 from geogs.tracking.flow.base import FlowMatch
+from geogs.world.grid import SampleGrid
 
 
 def filled_positions(grid: SampleGrid, match: FlowMatch) -> Float[Tensor, "p 2"]:

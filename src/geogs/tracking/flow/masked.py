@@ -11,8 +11,8 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from geogs.errors import InputError
-from geogs.keyframes.grid import STRIDE, SampleGrid
 from geogs.tracking.flow.base import FlowMatch, FlowOperator, Memories
+from geogs.world.grid import STRIDE, SampleGrid
 
 
 class MaskedFlow:

@@ -18,7 +18,6 @@ from geogs.documents import in_short
 from geogs.errors import InputError
 from geogs.gpu.recorded import Maps, Recorded
 from geogs.gpu.transfer import to_device
-from geogs.keyframes.grid import SampleGrid
 from geogs.tracking.flow.base import FlowMatch, FlowOperator, Memories
 from geogs.tracking.flow.filled import filled_positions
 from geogs.tracking.flow.lookup import DescriptorPyramid, Edges, PyramidLevel
@@ -28,6 +27,7 @@ from geogs.tracking.flow.own_network import (
     ImageFeatures,
     NetworkOptions,
 )
+from geogs.world.grid import SampleGrid
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,6 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from geogs.keyframes.grid import OFFSET, STRIDE
 from geogs.tracking.flow.lookup import (
     CHANNELS,
     WINDOW,
@@ -24,6 +23,7 @@ from geogs.tracking.flow.lookup import (
     correlation_windows,
 )
 from geogs.tracking.flow.own_options import NetworkOptions
+from geogs.world.grid import OFFSET, STRIDE
 
 FLOW_UNIT = 16.0
 """Pixels of flow that are one to the network."""

@@ -10,8 +10,8 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
-from geogs.keyframes.grid import STRIDE, SampleGrid
 from geogs.tracking.flow.base import FlowMatch, FlowOperator, Memories
+from geogs.world.grid import STRIDE, SampleGrid
 
 
 def shown_pixels(image: UInt8[np.ndarray, "h w 3"]) -> Bool[np.ndarray, "h w"]:

@@ -17,13 +17,13 @@ from torch.nn import functional
 
 from geogs.errors import InputError
 from geogs.gpu.transfer import to_device
-from geogs.keyframes.grid import OFFSET, STRIDE, SampleGrid
 from geogs.networks.weights import read_tensors
 from geogs.tracking.flow.base import FlowMatch, Memories
 from geogs.tracking.flow.correlation import CorrelationVolume, LocalCorrelation
 from geogs.tracking.flow.raft_layout import network_from
 from geogs.tracking.flow.raft_network import CELL, RaftFeatures
 from geogs.tracking.flow.texture import grey_levels, textured_fraction
+from geogs.world.grid import OFFSET, STRIDE, SampleGrid
 
 FAR = 1e3
 """Stands for a position outside the image, in pixels."""

@@ -1,9 +1,9 @@
 """Which flow operator the tracker uses."""
 
 from geogs.config import TrackingConfig
-from geogs.keyframes.grid import SampleGrid
 from geogs.networks.weights_files import find_weights
 from geogs.tracking.flow.base import FlowOperator
+from geogs.world.grid import SampleGrid
 
 
 def build_operator(config: TrackingConfig, grid: SampleGrid) -> FlowOperator:

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from geogs.keyframes.grid import OFFSET, STRIDE
+from geogs.world.grid import OFFSET, STRIDE
 
 MIN_STRUCTURE = 0.5
 """Smaller eigenvalue of the structure tensor that counts as texture, grey levels^2 / pixel^2."""

@@ -7,10 +7,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from geogs.keyframes.swap import Swap
 from geogs.losses.cuda.view_table import ViewTable
 from geogs.mapping.cameras import MapCameras
 from geogs.mapping.view import MapView
+from geogs.world.swap import Swap
 
 
 class KnownViews:

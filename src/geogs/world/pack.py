@@ -1,0 +1,353 @@
+"""States as plain values for JSON and named arrays, and back; nothing in a file is ever executed.
+
+A state is a record: a dataclass or named tuple of plain values, arrays, arrays in archives, and of
+lists, tuples, dictionaries, unions and records of such. How one is read follows from the types that
+its class declares, never from the file: every value is checked against its field, every array
+against the type and the shape that jaxtyping's annotation names, where a letter stands for the
+same length throughout a record. Fields marked ``NOT_STORED`` belong to the process and are left at
+their default.
+"""
+
+import hashlib
+import types
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, is_dataclass
+from enum import Enum
+from pathlib import Path
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+
+import numpy as np
+import torch
+from jaxtyping import AbstractArray
+from torch import Tensor
+
+from geogs.errors import InputError
+from geogs.world.archive import Archive, Archived
+
+Values = Any
+"""What JSON holds: None, booleans, numbers, strings, lists and dictionaries of such."""
+
+_PLAIN = (bool, int, float, str, type(None))
+
+
+_DTYPES = frozenset({
+    "bool", "uint8", "int8", "uint16", "int16", "uint32", "int32", "uint64", "int64", "float16",
+    "float32", "float64",
+})  # fmt: skip
+"""Of arrays in archives."""
+
+
+@dataclass
+class Packed:
+    """A record taken apart."""
+
+    values: Values = None
+    arrays: dict[str, Tensor] = field(default_factory=dict)
+    """By their place in the record, such as ``mapper.map.position``; copies on the CPU."""
+    archives: dict[str, Archive] = field(default_factory=dict)
+    """Those that arrays of the record lie in, by name."""
+
+
+def pack(kind: Any, record: object) -> Packed:
+    """Take apart a record of a kind (a type as an annotation has it).
+
+    Raises:
+        TypeError: something in it is not of its declared type, or cannot be stored.
+    """
+    packed = Packed()
+    packed.values = _Packer(packed).value(kind, record, "")
+    return packed
+
+
+def unpack(
+    kind: Any,
+    values: Values,
+    arrays: Mapping[str, Tensor],
+    archives: Mapping[str, Archive],
+    device: torch.device | str = "cpu",
+    name: str = "",
+) -> Any:
+    """Make a record of a kind again; tensors that were on a GPU go to ``device``.
+
+    ``name`` is the place of the record in the one that was packed.
+
+    Raises:
+        InputError: a part is missing, superfluous, or not of its declared type; the text names it.
+    """
+    return _Unpacker(arrays, archives, torch.device(device)).value(kind, values, name)
+
+
+def schema(kind: Any) -> str:
+    """64 digits that change with any name, type or shape that a record of the kind declares."""
+    return hashlib.sha256(_described(kind).encode()).hexdigest()
+
+
+def _described(kind: Any) -> str:
+    if _is_record(kind):
+        named = (f"{n}:{_described(k)}" for n, k in _stored(kind).items())
+        return f"{kind.__name__}({','.join(named)})"
+    if _is_array(kind):
+        return f"{kind.array_type.__name__}[{'|'.join(kind.dtypes)};{kind.dim_str}]"
+    if isinstance(kind, type) and issubclass(kind, Enum):
+        return f"{kind.__name__}({','.join(kind.__members__)})"
+    origin, parts = get_origin(kind), get_args(kind)
+    if origin is Literal:
+        return f"Literal{list(parts)}"
+    if origin is not None:
+        label = "union" if origin in (Union, types.UnionType) else origin.__name__
+        return f"{label}[{','.join('...' if p is ... else _described(p) for p in parts)}]"
+    return kind.__name__
+
+
+# --- kinds ---------------------------------------------------------------------------------------
+
+
+def _is_record(kind: Any) -> bool:
+    is_named_tuple = isinstance(kind, type) and issubclass(kind, tuple) and hasattr(kind, "_fields")
+    return is_named_tuple or (isinstance(kind, type) and is_dataclass(kind))
+
+
+def _is_array(kind: Any) -> bool:
+    return isinstance(kind, type) and issubclass(kind, AbstractArray)
+
+
+def _stored(kind: Any) -> dict[str, Any]:
+    """Names and kinds of the fields of a record that are stored."""
+    hints = get_type_hints(kind)
+    if not is_dataclass(kind):
+        return hints
+    return {f.name: hints[f.name] for f in fields(kind) if f.metadata.get("stored", True)}
+
+
+def _alternatives(kind: Any) -> tuple[Any, ...]:
+    """Of a union, but for None."""
+    return tuple(k for k in get_args(kind) if k is not type(None))
+
+
+def _fits(kind: Any, value: object) -> bool:
+    """Whether a value is of a kind, as far as one sees from outside."""
+    if kind in (bool, int):
+        return type(value) is kind
+    if get_origin(kind) is Literal:
+        return value in get_args(kind)
+    return isinstance(value, get_origin(kind) or kind) or (kind is float and type(value) is int)
+
+
+# --- to plain values and arrays ------------------------------------------------------------------
+
+
+class _Packer:
+    def __init__(self, packed: Packed) -> None:
+        self._packed = packed
+
+    def value(self, kind: Any, value: Any, name: str) -> Values:
+        """JSON's form of a value; its arrays are noted by name."""
+        origin = get_origin(kind)
+        if origin in (Union, types.UnionType):
+            return self._one_of(kind, value, name)
+        if origin is Literal:
+            return value if value in get_args(kind) else self._wrong(kind, value, name)
+        if not _fits(kind, value):
+            return self._wrong(kind, value, name)
+        if _is_record(kind):
+            stored = _stored(kind).items()
+            return {n: self.value(k, getattr(value, n), _joined(name, n)) for n, k in stored}
+        if _is_array(kind):
+            return self._array(value, name)
+        if origin in (list, tuple):
+            kinds = _item_kinds(kind, len(value))
+            return [
+                self.value(k, v, _joined(name, n))
+                for n, (k, v) in enumerate(zip(kinds, value, strict=True))
+            ]
+        if origin is dict:
+            key, item = get_args(kind)
+            return [
+                [self.value(key, k, name), self.value(item, v, _joined(name, n))]
+                for n, (k, v) in enumerate(value.items())
+            ]
+        if kind is Archive:
+            return self._archive(value)
+        if kind is Archived:
+            return {
+                "archive": self._archive(value.archive), "offset": value.offset,
+                "shape": list(value.shape), "dtype": value.dtype.name, "checksum": value.checksum,
+            }  # fmt: skip
+        if isinstance(value, Enum):
+            return value.name
+        return str(value) if isinstance(value, Path) else value
+
+    def _one_of(self, kind: Any, value: Any, name: str) -> Values:
+        """None, the form of the only alternative, or the number of the alternative and its form."""
+        kinds = _alternatives(kind)
+        if value is None and type(None) in get_args(kind):
+            return None
+        if len(kinds) == 1:
+            return self.value(kinds[0], value, name)
+        for n, k in enumerate(kinds):
+            if _fits(k, value):
+                return [n, self.value(k, value, name)]
+        return self._wrong(kind, value, name)
+
+    def _array(self, array: Tensor | np.ndarray, name: str) -> str:
+        """Note an array; returns where it is to be made."""
+        tensor = array if isinstance(array, Tensor) else torch.from_numpy(np.array(array))
+        kept = torch.empty(tensor.shape, dtype=tensor.dtype)  # with no other memory than its own
+        self._packed.arrays[name] = kept.copy_(tensor.detach())
+        return "host" if tensor.device.type == "cpu" else "device"
+
+    def _archive(self, archive: Archive) -> str:
+        self._packed.archives[archive.name] = archive
+        return archive.name
+
+    @staticmethod
+    def _wrong(kind: Any, value: object, name: str) -> Values:
+        raise TypeError(f"{name} is a {type(value).__name__}, not {_described(kind)}")
+
+
+# --- and back ------------------------------------------------------------------------------------
+
+
+class _Unpacker:
+    def __init__(
+        self, arrays: Mapping[str, Tensor], archives: Mapping[str, Archive], device: torch.device
+    ) -> None:
+        self._arrays, self._archives, self._device = arrays, archives, device
+        self._pieces: dict[tuple[Any, ...], Archived] = {}
+        """One for each place in an archive: its space is free once that one is gone."""
+
+    def value(self, kind: Any, value: Values, name: str) -> Any:
+        """What a form stands for, given its kind."""
+        origin = get_origin(kind)
+        if origin in (Union, types.UnionType):
+            return self._one_of(kind, value, name)
+        if origin is Literal:
+            return value if _is_in(value, get_args(kind)) else self._wrong(name)
+        if _is_record(kind):
+            return self._record(kind, value, name)
+        if _is_array(kind):
+            return self._array(kind, value, name)
+        if origin in (list, tuple):
+            items = self._of(list, value, name)
+            kinds = _item_kinds(kind, len(items))
+            if len(kinds) != len(items):
+                self._wrong(name)
+            return origin(
+                self.value(k, v, _joined(name, n))
+                for n, (k, v) in enumerate(zip(kinds, items, strict=True))
+            )
+        if origin is dict:
+            return self._mapping(kind, value, name)
+        if kind is Archive:
+            return self._archive(value, name)
+        if kind is Archived:
+            return self._piece(value, name)
+        if issubclass(kind, Enum):
+            return kind[value] if _is_in(value, kind.__members__) else self._wrong(name)
+        if kind is Path:
+            return Path(self._of(str, value, name))
+        if kind is float and type(value) is int:
+            return float(value)
+        return self._of(kind, value, name)
+
+    def _one_of(self, kind: Any, value: Values, name: str) -> Any:
+        kinds = _alternatives(kind)
+        if value is None and type(None) in get_args(kind):
+            return None
+        if len(kinds) == 1:
+            return self.value(kinds[0], value, name)
+        number, form = self._pair(value, name)
+        if type(number) is not int or not 0 <= number < len(kinds):
+            self._wrong(name)
+        return self.value(kinds[number], form, name)
+
+    def _record(self, kind: Any, value: Values, name: str) -> Any:
+        stored, given = _stored(kind), self._of(dict, value, name)
+        if given.keys() != stored.keys():
+            self._wrong(name)
+        parts = {n: self.value(k, given[n], _joined(name, n)) for n, k in stored.items()}
+        lengths: dict[str, int] = {}
+        for n, k in stored.items():
+            if any(lengths.setdefault(x, m) != m for x, m in _lengths(k, parts[n])):
+                self._wrong(_joined(name, n))
+        try:
+            return kind(**parts)
+        except (TypeError, ValueError, ArithmeticError) as error:
+            raise InputError(f"{name} holds what it cannot ({error})") from error
+
+    def _mapping(self, kind: Any, value: Values, name: str) -> dict[Any, Any]:
+        key, item = get_args(kind)
+        pairs = [self._pair(p, name) for p in self._of(list, value, name)]
+        made = {
+            self.value(key, k, name): self.value(item, v, _joined(name, n))
+            for n, (k, v) in enumerate(pairs)
+        }
+        return made if len(made) == len(pairs) else self._wrong(name)
+
+    def _array(self, kind: Any, place: Values, name: str) -> Tensor | np.ndarray:
+        if name not in self._arrays or not _is_in(place, ("host", "device")):
+            self._wrong(name)
+        # In memory of its own, aligned as PyTorch does: by how the bytes of a file happen to lie,
+        # some libraries choose another order of additions.
+        made: Any = self._arrays[name].clone()
+        if issubclass(kind.array_type, Tensor):
+            made = made.to(self._device) if place == "device" else made
+        else:
+            made = made.numpy()
+        return made if isinstance(made, kind) else self._wrong(name)
+
+    def _archive(self, value: Values, name: str) -> Archive:
+        return self._archives[value] if _is_in(value, self._archives) else self._wrong(name)
+
+    def _piece(self, value: Values, name: str) -> Archived:
+        given = self._of(dict, value, name)
+        if given.keys() != {"archive", "offset", "shape", "dtype", "checksum"}:
+            self._wrong(name)
+        archive = self._archive(given["archive"], name)
+        offset, checksum = (self._of(int, given[k], name) for k in ("offset", "checksum"))
+        shape = tuple(self._of(int, n, name) for n in self._of(list, given["shape"], name))
+        if not _is_in(given["dtype"], _DTYPES):
+            self._wrong(name)
+        key = archive.name, offset, shape, given["dtype"]
+        piece = self._pieces.get(key)
+        if piece is None:
+            piece = archive.piece(offset, shape, np.dtype(given["dtype"]), checksum)
+            self._pieces[key] = piece
+        return piece if piece.checksum == checksum else self._wrong(name)
+
+    def _pair(self, value: Values, name: str) -> list[Values]:
+        pair = self._of(list, value, name)
+        return pair if len(pair) == 2 else self._wrong(name)
+
+    def _of(self, kind: type, value: Values, name: str) -> Any:
+        return value if type(value) is kind else self._wrong(name)
+
+    @staticmethod
+    def _wrong(name: str) -> Any:
+        raise InputError(f"{name or 'it'} is missing, or not what it should be")
+
+
+def _item_kinds(kind: Any, count: int) -> list[Any]:
+    """Kinds of the items of a list or tuple of so many."""
+    kinds = list(get_args(kind))
+    if get_origin(kind) is list:
+        return kinds * count
+    return kinds[:1] * count if kinds[1:] == [...] else kinds
+
+
+def _lengths(kind: Any, value: Any) -> list[tuple[str, int]]:
+    """The letters in the annotated shape of an array, or of one that there may be, and lengths."""
+    array = next((k for k in (kind, *get_args(kind)) if _is_array(k)), None)
+    if array is None or not isinstance(value, array.array_type):
+        return []
+    shape = zip(array.dim_str.split(), value.shape, strict=False)
+    return [(x, m) for x, m in shape if x.isidentifier()]
+
+
+def _is_in(value: Values, several: Any) -> bool:
+    """Whether a form, which may be unhashable, is one of several plain values."""
+    return isinstance(value, _PLAIN) and value in several
+
+
+def _joined(name: str, part: object) -> str:
+    return f"{name}.{part}" if name else str(part)

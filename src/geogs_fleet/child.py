@@ -1,0 +1,119 @@
+"""The process that computes one source: ``python -m geogs_fleet.child``, started by a node.
+
+Settings come as a pickle on the standard input, from the process that started this one; one line of
+JSON on the standard output says how it ended. Everything else goes to the standard error. When the
+standard input closes, who started this is gone, and it ends at once: another node goes on from the
+last checkpoint.
+"""
+
+import json
+import os
+import pickle
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import BinaryIO
+
+from geogs.application.settings import RunSettings
+from geogs.errors import DeviceError, GeogsError, InputError, OutputError
+
+PATIENCE = 60.0
+"""Seconds to wait for an earlier attempt that still writes into the folder."""
+THUMBNAIL = "thumbnail.webp"
+_LARGEST = (320, 200)
+_PICTURES = ("keyframes.png", "trajectory.png")
+
+
+def main() -> int:
+    """Compute what the standard input says; 0 once the standard output says how it ended."""
+    said = os.fdopen(os.dup(sys.stdout.fileno()), "w")
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
+    settings: RunSettings = pickle.load(sys.stdin.buffer)
+    threading.Thread(target=_end_with, args=(sys.stdin.buffer,), daemon=True).start()
+    try:
+        compute(settings)
+        ending = {"state": "done", "sentence": ""}
+    except DeviceError as error:  # another GPU may do
+        ending = {"state": "crashed", "sentence": str(error)}
+    except GeogsError as error:
+        ending = {"state": "failed", "sentence": str(error)}
+    said.write(json.dumps(ending))
+    said.close()
+    return 0
+
+
+def compute(settings: RunSettings) -> None:
+    """Run, or go on from the checkpoint in the folder if it is one of the same work.
+
+    Raises:
+        InputError, TrackingLost, OutputError, DeviceError: as of a run.
+    """
+    from geogs.application.run import resume, run
+    from geogs.application.terminal import TerminalProgress
+
+    output = settings.output
+    assert output is not None, "a fleet gives every source a folder"
+    _wait_for_others(output)
+    with TerminalProgress() as progress:
+        if _is_begun(output, settings):
+            try:
+                resume(output, settings, progress)
+            except InputError as error:  # the source has changed, say
+                progress.write(f"Starting anew: {error}")
+                run(settings, progress)
+        else:
+            run(settings, progress)
+    write_thumbnail(output)
+
+
+def write_thumbnail(output: Path) -> None:
+    """A small picture of the result, if its report has any."""
+    from PIL import Image
+
+    pictures = [output / "report" / name for name in _PICTURES]
+    for path in pictures:
+        if path.is_file():
+            with Image.open(path) as picture:
+                small = picture.convert("RGB")
+                small.thumbnail(_LARGEST)
+                small.save(output / THUMBNAIL, "WEBP", quality=80)
+            return
+
+
+def _is_begun(output: Path, settings: RunSettings) -> bool:
+    from geogs.application.checkpoint import has_checkpoint
+    from geogs.application.run_checkpoint import SavedRun
+
+    if not has_checkpoint(output):
+        return False
+    try:
+        return SavedRun(output).facts.settings.deciding() == settings.deciding()
+    except InputError:
+        return False
+
+
+def _wait_for_others(output: Path) -> None:
+    """Until an attempt that is about to end has left the folder; OutputError if none does."""
+    from geogs.application.folder_lock import only_writer
+    from geogs.io.writers.atomic import prepare_output_folder
+
+    prepare_output_folder(output)
+    last = time.monotonic() + PATIENCE
+    while True:
+        try:
+            with only_writer(output):
+                return
+        except OutputError:
+            if time.monotonic() > last:
+                raise
+            time.sleep(0.5)
+
+
+def _end_with(stream: BinaryIO) -> None:
+    stream.read()
+    os._exit(1)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,114 @@
+"""Ray: found or started, and what one source gets of it."""
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+from geogs.errors import InputError
+from geogs_fleet.settings import FleetSettings
+
+_OBJECTS = 80 << 20
+"""Bytes of the object store of a local cluster; rows are small."""
+_PASSING = "geogs: ends with its command"
+"""What a cluster has that another command must not rely on, where it finds it on this machine."""
+
+
+@dataclass(frozen=True)
+class Share:
+    """What one source gets of a node."""
+
+    cpus: int
+    gpus: float
+    memory: int | None = None
+    """Bytes, that tasks are placed by."""
+    at_once: int = 1
+    """How many sources the cluster can take at a time, as it is now."""
+
+
+@contextmanager
+def ray_cluster(address: str) -> Iterator[Any]:
+    """Inside, Ray is there: a cluster that runs, or one started here and ended afterwards.
+
+    Yields the module ``ray``. A connection that there is already is used, and kept.
+
+    Raises:
+        InputError: Ray is not installed, or the cluster cannot be reached.
+    """
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # nothing is reported to anybody
+    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
+    try:
+        import ray
+    except ImportError:
+        raise InputError("geogs fleet needs Ray: pip install 'geogs[fleet]'.") from None
+    if ray.is_initialized():
+        yield ray
+        return
+    _connect(ray, address)
+    try:
+        yield ray
+    finally:
+        ray.shutdown()
+
+
+def share_of(ray: Any, settings: FleetSettings) -> Share:
+    """What each source gets of the cluster, where settings leave that open.
+
+    Raises:
+        InputError: no node has as much as is asked for.
+    """
+    nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
+    most_gpus = max((node.get("GPU", 0.0) for node in nodes), default=0.0)
+    gpus = settings.gpus if settings.gpus != "auto" else float(min(most_gpus, 1.0))
+    cpus = 1
+    if settings.cpus != "auto":
+        cpus = settings.cpus
+    else:
+        if gpus:
+            shares = [n.get("CPU", 0.0) * gpus / n["GPU"] for n in nodes if n.get("GPU", 0.0)]
+            cpus = max(1, min(16, int(min(shares, default=1.0))))
+    memory = settings.memory_limit
+    memory_bytes = None if memory is None else int(memory * 2**30)
+    wanted = {"CPU": float(cpus), "GPU": gpus, "memory": float(memory_bytes or 0)}
+    at_once = sum(_times(node, wanted) for node in nodes)
+    if not at_once:
+        memory_said = f", {memory:.3g} GiB" if memory is not None else ""
+        raise InputError(
+            f"No machine of the cluster has {cpus} cores, {gpus:g} GPUs{memory_said} for a "
+            "source; ask for less (--cpus, --gpus, --memory-limit)."
+        )
+    return Share(cpus, gpus, memory_bytes, at_once)
+
+
+def _times(node: dict[str, float], wanted: dict[str, float]) -> int:
+    """How many times a node has what is wanted."""
+    return min(int(node.get(name, 0.0) / share + 1e-9) for name, share in wanted.items() if share)
+
+
+def _connect(ray: Any, address: str) -> None:
+    import logging
+
+    from geogs.threads import available_cores
+
+    quiet = {"logging_level": logging.ERROR, "log_to_driver": False}
+    if address != "local":
+        try:
+            ray.init(address=address, **quiet)
+            if address != "auto" or _PASSING not in ray.cluster_resources():
+                return
+            ray.shutdown()
+        except ConnectionError as error:
+            if address != "auto":
+                raise InputError(f"No Ray cluster answers at {address}.") from error
+        except (ValueError, RuntimeError, OSError) as error:
+            said = str(error).splitlines()[0] if str(error) else type(error).__name__
+            raise InputError(f"Ray cannot be reached at {address} ({said}).") from error
+    ray.init(
+        address="local",
+        num_cpus=available_cores(),  # Ray would count those that others have, too
+        include_dashboard=False,
+        object_store_memory=_OBJECTS,
+        resources={_PASSING: 1},
+        **quiet,
+    )

@@ -1,0 +1,272 @@
+"""Bundle adjustment of all parts of a world together, of which no worker sees more than one.
+
+What the matches of a part say of the poses, its depths eliminated, is small and is summed up here;
+the step of all poses goes back to the parts, which bring their depths after it. So it is one
+adjustment of everything, whose matches and depths stay in files.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from geogs.bundle.camera_system import PoseSums, SparseCameraSystem
+from geogs.bundle.dense import stepped
+from geogs.bundle.problem import source_chunks
+from geogs.bundle.select import grid_fields
+from geogs.bundle.streamed import StreamedBundle
+from geogs.config import Config
+from geogs.geometry.camera import Camera
+from geogs.geometry.lie import move
+from geogs.loop.global_bundle import SETTLED, global_options
+from geogs.threads import on_one_torch_thread
+from geogs.tracking.flow.select import build_operator
+from geogs.tracking.graph import FrameGraph
+from geogs.tracking.packed_edge import PackedEdge
+from geogs.world.grid import SampleGrid
+from geogs.world.store import KeyframeStore
+from geogs_fleet.join.gauge import Gauge
+from geogs_fleet.join.graph import Placement
+from geogs_fleet.join.matches import Depths, Directed, Matches, MatchJob, Member, match
+from geogs_fleet.join.part import Node, Part
+from geogs_fleet.join.workers import Workers
+
+_NO_IMAGE = np.zeros((1, 1, 3), np.uint8)
+"""Of a keyframe whose matches are known."""
+
+
+@dataclass(frozen=True)
+class StepJob:
+    """A part after a step of all poses: its depths are to follow, and what it says of the next."""
+
+    own: Member
+    others: tuple[Member, ...]
+    """All that are linked to it."""
+    first: Mapping[int, int]
+    """Number of the first keyframe of each of them in the whole."""
+    matches: tuple[Path, ...]
+    """Files of the edges that leave its keyframes."""
+    camera: Camera
+    config: Config
+    after: Path
+    """File of the depths, to be written."""
+    T_before: Float[Tensor, "m 4 4"] | None
+    """Of all keyframes of the whole; none where there was no step yet."""
+    step: Float[Tensor, "m 6"] | None
+    """Of their poses."""
+    is_last: bool = False
+    """Nothing is said of the next; cells without matches are filled, and what moves is found."""
+
+
+def adjusted(
+    parts: Sequence[Part],
+    files: Sequence[Path],
+    placements: Mapping[int, Placement],
+    gauge: Gauge,
+    camera: Camera,
+    config: Config,
+    workers: Workers,
+    folder: Path,
+) -> dict[int, Placement]:
+    """The keyframes of a world by all matches within its parts and between those that are linked.
+
+    The first keyframe of the first part stays. Depths and matches are kept in ``folder``, which all
+    workers see.
+    """
+    now = {
+        n: Member(n, parts[n], files[n], placements[n].T_cw, placements[n].scale)
+        for n in gauge.parts
+    }
+    adjustment = _Adjustment(now, _beside(gauge), camera, config, workers, folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    for _ in range(config.tracking.global_rounds):
+        if adjustment.match() <= SETTLED * adjustment.pairs:
+            break
+        adjustment.solve()
+    return {n: replace(placements[n], T_cw=member.T_cw) for n, member in adjustment.members.items()}
+
+
+class _Adjustment:
+    """What is known between two steps."""
+
+    def __init__(
+        self,
+        members: dict[int, Member],
+        beside: Mapping[int, list[int]],
+        camera: Camera,
+        config: Config,
+        workers: Workers,
+        folder: Path,
+    ) -> None:
+        self.members, self.beside, self.folder = members, beside, folder
+        self.camera, self.config, self.workers = camera, config, workers
+        counts = np.cumsum([0, *(len(m.T_cw) for m in members.values())]).tolist()
+        self.first = dict(zip(members, counts[:-1], strict=True))
+        self.keyframes = counts[-1]
+        self.matches: dict[tuple[int, int], Path] = {}
+        """Edges that leave the keyframes of the second part, matched by the first."""
+        self.ends = np.zeros((0, 4), np.int64)
+        self.steps = 0
+        """Of all poses, so far."""
+        self.written = 0
+        """Files so far, so that each gets a name of its own."""
+
+    @property
+    def pairs(self) -> int:
+        """Pairs of keyframes that are matched."""
+        return len(self.ends) // 2
+
+    def match(self) -> int:
+        """Match what has moved; how many pairs."""
+        jobs, written = [], []
+        for n, own in self.members.items():
+            later = [m for m in self.beside[n] if m > n]
+            paths = {(n, m): self._new(f"matches-{n}-{m}") for m in (n, *later)}
+            before = tuple(self.matches[key] for key in paths if key in self.matches)
+            others = tuple(self.members[m] for m in later)
+            jobs.append(
+                MatchJob(own, others, self.camera, self.config, before, tuple(paths.values()))
+            )
+            written.append(paths)
+        found = self.workers.map("matching", match, jobs)
+        for path in self.matches.values():
+            path.unlink()
+        self.matches = {key: path for paths in written for key, path in paths.items()}
+        self.ends = np.concatenate([f.ends for f in found])
+        return sum(f.fresh for f in found)
+
+    def solve(self) -> None:
+        """Gauss-Newton steps until they are small."""
+        first = np.zeros(max(self.first) + 1, np.int64)
+        first[list(self.first)] = list(self.first.values())
+        source, target = (first[self.ends[:, k]] + self.ends[:, k + 1] for k in (0, 2))
+        order = np.argsort(source, kind="stable")
+        free = torch.arange(self.keyframes) > 0
+        source, target = source[order], target[order]
+        system = SparseCameraSystem(torch.from_numpy(source), torch.from_numpy(target), free)
+        options = global_options(self.config.tracking)
+        T, step = self._poses(), None
+        for _ in range(options.iterations):
+            system.clear()
+            for sums in self._follow(T, step):
+                if sums is not None:
+                    system.add_elsewhere_summed(sums)
+            T, step = self._poses(), system.solve(options.damping)
+            if not bool(torch.isfinite(step).all()):
+                return
+            moved = move(step, T)
+            self.members = {
+                n: replace(m, T_cw=moved[self.first[n] :][: len(m.T_cw)])
+                for n, m in self.members.items()
+            }
+            if float(step.abs().max()) < options.tolerance:
+                break
+        self._follow(T, step, is_last=True)
+
+    def _follow(
+        self, T_before: Tensor, step: Tensor | None, is_last: bool = False
+    ) -> list[PoseSums | None]:
+        """Bring the depths after a step; what the parts say of the next."""
+        jobs = []
+        for n, own in self.members.items():
+            others = tuple(self.members[m] for m in self.beside[n])
+            leaving = tuple(path for (_, m), path in self.matches.items() if m == n)
+            first = {m: self.first[m] for m in (n, *self.beside[n])}
+            jobs.append(
+                StepJob(
+                    own, others, first, leaving, self.camera, self.config,
+                    self._new(f"depths-{n}"), None if step is None else T_before, step, is_last,
+                )
+            )  # fmt: skip
+        self.steps += step is not None
+        said = self.workers.map(f"adjusting, {self.steps} steps", follow, jobs)
+        for job in jobs:
+            if job.own.adjusted is not None:
+                job.own.adjusted.unlink()
+            self.members[job.own.number] = replace(job.own, adjusted=job.after)
+        return said
+
+    def _poses(self) -> Float[Tensor, "m 4 4"]:
+        return torch.cat([member.T_cw for member in self.members.values()])
+
+    def _new(self, name: str) -> Path:
+        """A file that no job has written: one that is done again finds what the first found."""
+        self.written += 1
+        return self.folder / f"{name}-{self.written}.npz"
+
+
+@on_one_torch_thread
+def follow(job: StepJob) -> PoseSums | None:
+    """Bring the depths of a part after a step and write them; what it says of the next step.
+
+    By the numbers of the whole; nothing where there is no next.
+    """
+    grid, options = SampleGrid(job.camera), global_options(job.config.tracking)
+    graph, nodes = _known_graph(job, grid)
+    own = graph.keyframes.ids[: len(job.own.T_cw)]
+    problem, ids = graph.streamed_problem(list(graph.edges), [], own)
+    solver, chunks = StreamedBundle(grid), source_chunks(problem.source, options.chunk)
+    numbers = torch.tensor([job.first[part] + place for part, place in (nodes[k] for k in ids)])
+    d, T = problem.inverse_depth, problem.T_cw
+    if job.step is not None and job.T_before is not None:
+        before, step = job.T_before[numbers], job.step[numbers]
+        delta = solver.depth_steps(problem, before, d, step, options, chunks)
+        d = stepped(problem, before, d, step, delta, options)[1]
+    information = graph.keyframes.informations(own)
+    sums: PoseSums | None = None
+    if not job.is_last:
+        every = torch.ones(len(ids), dtype=torch.bool)
+        system = SparseCameraSystem(problem.source, problem.target, every)
+        for _, stars in solver.linearised(problem, T, d, options, chunks):
+            system.add(stars)
+            for star in stars:
+                information[star.frame] = star.information
+        sums = system.sums(numbers)
+    depth = d[: len(own)]
+    if job.is_last:
+        depth = grid_fields(grid).fill(depth, information)
+        for id, field in zip(own, depth, strict=True):
+            graph.keyframes[id].inverse_depth = field
+        graph.judge_moving(set(own), job.config.tracking.moving)
+    none = torch.zeros(grid.size, dtype=torch.bool)
+    moving = [graph.keyframes[id].moving for id in own]
+    held = torch.stack([none if m is None else m for m in moving])
+    Depths(depth.contiguous(), information, held).save(job.after)
+    return sums
+
+
+def _known_graph(job: StepJob, grid: SampleGrid) -> tuple[FrameGraph, list[Node]]:
+    """The edges that leave a part's keyframes, which come first; the node of each keyframe."""
+    edges: dict[Directed, PackedEdge] = {}
+    for path in job.matches:
+        edges |= Matches.load(path).edges(grid)
+    seen = {target for _, target in edges}
+    segment = KeyframeStore(grid).new_segment()
+    nodes: list[Node] = []
+    ids: dict[Node, int] = {}
+    for member in (job.own, *job.others):
+        depths = member.depths()
+        for node in member.nodes:
+            if member is not job.own and node not in seen:
+                continue
+            place = node[1]
+            keyframe = segment.add(place, float(place), _NO_IMAGE, None, member.T_cw[place])
+            depths.give(keyframe, place)
+            ids[node] = keyframe.id
+            nodes.append(node)
+    graph = FrameGraph(segment, build_operator(job.config.tracking, grid))
+    graph.edges = {(ids[a], ids[b]): edge for (a, b), edge in edges.items()}
+    return graph, nodes
+
+
+def _beside(gauge: Gauge) -> dict[int, list[int]]:
+    """The parts that each is linked to, ascending."""
+    beside: dict[int, set[int]] = {n: set() for n in gauge.parts}
+    for link in gauge.links:
+        beside[link.first[0]].add(link.second[0])
+        beside[link.second[0]].add(link.first[0])
+    return {n: sorted(others) for n, others in beside.items()}

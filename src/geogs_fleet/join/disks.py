@@ -1,0 +1,146 @@
+"""The disks of a part, moved to the joint world; and those that another part has already."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from geogs.geometry.lie import quaternion_to_matrix, se3_inverse
+from geogs.geometry.neighbors import nearest_neighbors
+from geogs.geometry.umeyama import umeyama
+from geogs.io.writers.native import load_map_file, save_map
+from geogs.mapping.similarity_field import Witness, blended_similarities
+from geogs.splat.map import DiskParameters, GaussianMap
+from geogs.threads import on_one_torch_thread
+from geogs.types import MapSnapshot
+from geogs_fleet.join.graph import Placement
+from geogs_fleet.join.part import Part, PartViews, opened
+
+_NEAREST = 8
+_WITHIN = 2.0
+"""Standard deviations of a disk within which it stands for another in its plane."""
+_AWAY = 1.0
+"""Mean of these within which another is still its surface, along its normal."""
+_ALIKE = 0.8
+"""Cosine between the normals of two disks of one surface, at least."""
+
+
+@dataclass(frozen=True)
+class MoveJob:
+    """The map of a part to be moved with its keyframes."""
+
+    part: Part
+    views: Path
+    placement: Placement
+    file: Path
+    """Where the moved disks go."""
+    device: str = "cpu"
+
+
+@dataclass(frozen=True)
+class MergeJob:
+    """The disks of a part to be thinned where others have them, too."""
+
+    own: Path
+    """File of its disks."""
+    before: tuple[Path, ...]
+    """Those of the parts whose disks stay."""
+
+
+@on_one_torch_thread
+def move_disks(job: MoveJob) -> int:
+    """Move every disk of a part with the keyframes that see it in place; their number.
+
+    The update of a map after a correction, see :mod:`geogs.mapping.similarity_field`.
+    """
+    result, views = opened(job.part, job.device), PartViews.load(job.views)
+    similarities = job.placement.similarities(views.T_cw)
+    x = result.disks.position.double()
+    whole = overall(views, similarities).to(x)
+
+    def witnesses() -> Iterator[tuple[Witness, int]]:
+        for n, T_cw in enumerate(torch.from_numpy(views.T_cw)):
+            maps = result.render(T_cw)
+            witness = Witness(n, result.depth_camera, T_cw, maps.depth, maps.weight)
+            yield witness, n
+
+    S = whole.expand(len(x), 4, 4)
+    if len(x) > 1:
+        S = blended_similarities(x, S, whole, similarities, witnesses())
+    save_map(job.file, transformed(result.disks, S), {})
+    return len(x)
+
+
+def overall(views: PartViews, similarities: Float[Tensor, "n 4 4"]) -> Float[Tensor, "4 4"]:
+    """The one Sim(3) nearest to what the keyframes of a part say, of themselves and their view."""
+    T_wc = se3_inverse(torch.from_numpy(views.T_cw))
+    depth = torch.from_numpy(views.median_depth)
+    corners = depth.new_tensor([[0, 0, 0], [-0.5, -0.4, 1], [0.5, -0.4, 1], [0, 0.6, 1]])
+    points = corners * depth[:, None, None]
+    points = points @ T_wc[:, :3, :3].mT + T_wc[:, None, :3, 3]
+    moved = points @ similarities[:, :3, :3].mT + similarities[:, None, :3, 3]
+    scale, R, t = umeyama(points.flatten(0, 1), moved.flatten(0, 1))
+    S = torch.eye(4, dtype=torch.float64)
+    S[:3, :3], S[:3, 3] = scale * R, t
+    return S
+
+
+def transformed(disks: MapSnapshot, S: Float[Tensor, "n 4 4"]) -> MapSnapshot:
+    """Each disk by its own similarity."""
+    if not len(disks):
+        return disks
+    none = torch.zeros(len(disks), dtype=torch.long, device=disks.position.device)
+    moved = GaussianMap(DiskParameters.of(disks), none)
+    with torch.no_grad():
+        moved.transform(S)
+    return moved.snapshot()
+
+
+@on_one_torch_thread
+def merge_disks(job: MergeJob) -> Bool[Tensor, "n"]:
+    """Which disks of a part no disk of the parts before stands for."""
+    own = load_map_file(job.own, "cpu").disks
+    keep = torch.ones(len(own), dtype=torch.bool)
+    for path in job.before:
+        keep &= ~is_covered(own, load_map_file(path, "cpu").disks)
+    return keep
+
+
+def is_covered(disks: MapSnapshot, others: MapSnapshot) -> Bool[Tensor, "n"]:
+    """Which disks lie on one of others that turns the same way, within its extent."""
+    covered = torch.zeros(len(disks), dtype=torch.bool)
+    if not len(disks) or not len(others):
+        return covered
+    x, y = disks.position.double(), others.position.double()
+    axes = _axes(others)
+    own_normal = disks.normal.double()
+    _, index = nearest_neighbors(x, y, min(_NEAREST, len(others)))
+    for k in range(index.shape[1]):
+        at = index[:, k]
+        local = ((x - y[at])[:, None] @ axes[at])[:, 0]
+        scale = others.scale[at].double()
+        inside = (local[:, :2] / scale).norm(dim=1) < _WITHIN
+        near = local[:, 2].abs() < _AWAY * scale.mean(1)
+        alike = (own_normal * axes[at, :, 2]).sum(1) > _ALIKE
+        covered |= inside & near & alike
+    return covered
+
+
+def _axes(disks: MapSnapshot) -> Float[Tensor, "n 3 3"]:
+    """Tangents and normal of each disk, as columns."""
+    return quaternion_to_matrix(disks.quaternion.double())
+
+
+def joined_disks(disks: Sequence[MapSnapshot]) -> MapSnapshot:
+    """All of them."""
+    columns = ("position", "quaternion", "scale", "opacity")
+    return MapSnapshot(*(torch.cat([getattr(d, c) for d in disks]) for c in columns))
+
+
+def kept(disks: MapSnapshot, keep: Bool[Tensor, "n"]) -> MapSnapshot:
+    """The disks that are marked."""
+    columns = ("position", "quaternion", "scale", "opacity")
+    return MapSnapshot(*(getattr(disks, c)[keep] for c in columns))

@@ -1,0 +1,130 @@
+"""The files of a joint result: those of a run."""
+
+import hashlib
+import json
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64
+
+from geogs.application.results import write_config
+from geogs.application.saved_result import SavedResult
+from geogs.config import Config
+from geogs.geometry.camera import Camera
+from geogs.io.writers.atomic import write_text
+from geogs.io.writers.intrinsics import write_intrinsics
+from geogs.io.writers.keyframe_images import image_path, write_image
+from geogs.io.writers.keyframe_rows import rows_path, write_rows
+from geogs.io.writers.map_views import MapViews, save_map_with_views
+from geogs.io.writers.tum import write_trajectories
+from geogs.io.writers.uncertainty import HEADER, moved_rows
+from geogs.mapping.map_frame import WORLD
+from geogs.types import MapSnapshot, SeenRows, Trajectory
+from geogs_fleet.join.graph import Placement
+from geogs_fleet.join.part import PartViews, image_of
+from geogs_fleet.join.trajectory import Span, joined_trajectory, keyframe_poses, moved_trajectory
+
+
+@dataclass(frozen=True)
+class JoinedPart:
+    """A part that has its place in the joint world."""
+
+    result: SavedResult
+    views: PartViews
+    placement: Placement
+    span: Span
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """Of its frames, in the joint world and its own time."""
+        return moved_trajectory(self.result.trajectory, self.views, self.placement)
+
+
+def write_poses(output: Path, parts: Sequence[JoinedPart]) -> Trajectory:
+    """``trajectory.tum``, ``keyframes.tum`` and the table of what is known of each frame.
+
+    Returns the trajectory. Raises OutputError if a file cannot be written.
+    """
+    spans = [part.span for part in parts]
+    trajectory = joined_trajectory([part.trajectory for part in parts], spans)
+    keyframes = Trajectory(
+        _times(parts),
+        np.concatenate([keyframe_poses(part.placement) for part in parts]),
+        np.ones(sum(len(part.views.timestamp) for part in parts), bool),
+    )
+    write_trajectories(output, trajectory, keyframes)
+    rows = [row for part in parts for row in _uncertainty_rows(part)]
+    if rows:
+        write_text(output / "trajectory_uncertainty.csv", "\n".join([HEADER, *rows, ""]))
+    return trajectory
+
+
+def write_map(
+    output: Path, parts: Sequence[JoinedPart], disks: MapSnapshot, camera: Camera, config: Config
+) -> None:
+    """The disks with the keyframes of all parts, their images, the camera and the settings.
+
+    Raises:
+        InputError: an image of a part cannot be read.
+        OutputError: a file cannot be written.
+    """
+    first = parts[0].result.views
+    count, rows = 0, dict[int, SeenRows]()
+    for part in parts:
+        own = part.result.rows() if part.result.camera == camera else {}
+        for n, id in enumerate(part.result.views.keyframe_id.tolist()):
+            target = image_path(output, count)
+            if part.result.camera == camera:
+                target.parent.mkdir(parents=True, exist_ok=True)
+                shutil.copyfile(image_path(part.result.folder, id), target)
+            else:
+                write_image(target, image_of(part.result, n, camera))
+            if n in own:
+                rows[count] = own[n]
+            count += 1
+    if rows:
+        write_rows(rows_path(output), rows)
+    T_cw = np.concatenate([part.placement.T_cw.numpy() for part in parts])
+    long_edge = max(first.render_camera.width, first.render_camera.height)
+    views = MapViews(
+        camera=camera,
+        render_camera=camera.with_long_edge(long_edge),
+        min_alpha=first.min_alpha,
+        max_spread=first.max_spread,
+        origin=WORLD.origin,
+        unit=WORLD.unit,
+        disks=disks,
+        keyframe_id=np.arange(count),
+        timestamp=_times(parts),
+        T_cw=T_cw,
+        has_mask=np.zeros(count, bool),
+        has_images=True,
+    )
+    facts = {"source": " + ".join(part.span.name for part in parts), "seed": config.seed}
+    save_map_with_views(output / "map.safetensors", disks, views, facts)
+    write_intrinsics(output / "intrinsics.json", camera)
+    write_config(output / "config.yaml", config)
+
+
+def write_summary(output: Path, summary: Mapping[str, object]) -> None:
+    """``summary.json``. Raises OutputError if it cannot be written."""
+    write_text(output / "summary.json", json.dumps(summary, indent=2))
+
+
+def fingerprint(parts: Sequence[SavedResult]) -> str:
+    """Of the parts: changes with theirs."""
+    words = [str(part.summary.get("fingerprint", part.folder)) for part in parts]
+    return hashlib.sha256("\n".join(words).encode()).hexdigest()[:16]
+
+
+def _times(parts: Sequence[JoinedPart]) -> Float64[np.ndarray, "n"]:
+    return np.concatenate([part.views.timestamp + part.span.shift for part in parts])
+
+
+def _uncertainty_rows(part: JoinedPart) -> list[str]:
+    """The rows of a part's table in the joint time and unit; deviations stay those in the part."""
+    path = part.result.folder / "trajectory_uncertainty.csv"
+    return moved_rows(path, 1 / float(part.placement.scale.median()), part.span.shift)

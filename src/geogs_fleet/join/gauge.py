@@ -1,0 +1,105 @@
+"""A frame and unit for every part: which links of two parts agree, and what hangs together."""
+
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from geogs.config import LoopConfig
+from geogs.geometry.lie import se3_inverse, sim3_inverse
+from geogs.loop.constraints import disagreement
+from geogs_fleet.join.links import Link
+from geogs_fleet.join.part import PartViews
+
+
+@dataclass(frozen=True)
+class Gauge:
+    """The parts that make one world."""
+
+    world: dict[int, Float[Tensor, "4 4"]]
+    """Of each part in it, by number: the Sim(3) from the joint world to the part's."""
+    links: tuple[Link, ...]
+    """Between parts of the world that agree with it."""
+
+    @property
+    def parts(self) -> list[int]:
+        """Numbers of the parts, ascending."""
+        return sorted(self.world)
+
+
+@dataclass(frozen=True)
+class _Tie:
+    """Two parts whose links agree."""
+
+    S: Float[Tensor, "4 4"]
+    """World of the first to that of the second."""
+    links: tuple[Link, ...]
+
+
+def common_gauge(parts: Sequence[PartViews], links: Sequence[Link], config: LoopConfig) -> Gauge:
+    """The largest world that agreeing links make of the parts; its first part keeps its own frame.
+
+    Two parts are tied where enough of their links agree, as segments of a run are. Ties with most
+    links are taken first (a maximum spanning tree); a tie that contradicts those stays out.
+    """
+    ties = _ties(parts, links, config)
+    group = list(range(len(parts)))
+    tree: dict[int, list[tuple[int, Tensor]]] = defaultdict(list)
+    for (a, b), tie in sorted(ties.items(), key=lambda t: (-len(t[1].links), t[0])):
+        if group[a] != group[b]:
+            tree[a].append((b, tie.S))
+            tree[b].append((a, sim3_inverse(tie.S)))
+            group = [group[a] if g == group[b] else g for g in group]
+    sizes = {g: sum(len(parts[n].T_cw) for n in range(len(parts)) if group[n] == g) for g in group}
+    largest = max(sizes, key=lambda g: (sizes[g], -group.index(g)))
+    root = group.index(largest)
+    world, left = {root: torch.eye(4, dtype=torch.float64)}, [root]
+    while left:
+        here = left.pop()
+        for there, S in tree[here]:
+            if there not in world:
+                world[there] = S @ world[here]
+                left.append(there)
+    kept = [
+        link for (a, b), tie in ties.items() if a in world and b in world for link in tie.links
+        if _agrees(parts, link, world[b] @ sim3_inverse(world[a]), 2 * config.join_tolerance)
+    ]  # fmt: skip
+    return Gauge(world, tuple(kept))
+
+
+def _ties(
+    parts: Sequence[PartViews], links: Sequence[Link], config: LoopConfig
+) -> dict[tuple[int, int], _Tie]:
+    between: dict[tuple[int, int], list[Link]] = defaultdict(list)
+    for link in links:
+        between[link.first[0], link.second[0]].append(link)
+    ties = {}
+    for pair, some in sorted(between.items()):
+        parties = []
+        for link in some:
+            S = claim(parts, link)
+            agreeing = [o for o in some if _agrees(parts, o, S, config.join_tolerance)]
+            parties.append((len(agreeing), sum(o.matched for o in agreeing), S, agreeing))
+        size, _, S, agreeing = max(parties, key=lambda p: p[:2])
+        if size >= config.agreeing:
+            ties[pair] = _Tie(S, tuple(agreeing))
+    return ties
+
+
+def claim(parts: Sequence[PartViews], link: Link) -> Float[Tensor, "4 4"]:
+    """Sim(3) from the world of the first part to that of the second as a link has it."""
+    first, second = (torch.from_numpy(parts[p].T_cw[n]) for p, n in (link.first, link.second))
+    return se3_inverse(second) @ link.S_ji @ first
+
+
+def _agrees(
+    parts: Sequence[PartViews], link: Link, S: Float[Tensor, "4 4"], tolerance: float
+) -> bool:
+    """Whether a link lands where a Sim(3) between the worlds would."""
+    part, n = link.second
+    T = torch.from_numpy(parts[part].T_cw[n])
+    depth = torch.tensor(parts[part].median_depth[n])
+    return float(disagreement(T @ claim(parts, link), T @ S, depth)) < tolerance

@@ -1,0 +1,278 @@
+"""Parts to one place, from the first look at them to the files."""
+
+import shutil
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from geogs.application.former import remove_former
+from geogs.application.machine import device_summary, peak_memory
+from geogs.application.report import write_report
+from geogs.application.saved_result import SavedResult, load_result
+from geogs.application.summary import lost_spans
+from geogs.config import Config
+from geogs.errors import InputError
+from geogs.io.writers.atomic import prepare_output_folder
+from geogs.io.writers.native import load_map_file
+from geogs.io.writers.ply import write_mesh, write_splats
+from geogs.mesh.types import Mesh
+from geogs.types import MapSnapshot
+from geogs.version import __version__
+from geogs_fleet.join.adjust import adjusted
+from geogs_fleet.join.disks import MergeJob, MoveJob, joined_disks, kept, merge_disks, move_disks
+from geogs_fleet.join.files import (
+    JoinedPart,
+    fingerprint,
+    write_map,
+    write_poses,
+    write_summary,
+)
+from geogs_fleet.join.gauge import Gauge, common_gauge
+from geogs_fleet.join.graph import Placement, placed
+from geogs_fleet.join.links import Link, LinkJob, links_of
+from geogs_fleet.join.part import DescribeJob, Part, PartViews, describe, opened
+from geogs_fleet.join.places import candidates
+from geogs_fleet.join.stored_views import RenderJob, render_views, shares
+from geogs_fleet.join.surface import SpacePlan, coloured, joint_mesh, plan_space
+from geogs_fleet.join.trajectory import spans_of
+from geogs_fleet.join.workers import Workers
+
+_PAIRS = 24
+"""Pairs of keyframes that are verified in one go."""
+_SHARES = 4
+"""Runs of keyframes for each worker that are rendered in one go."""
+
+
+@dataclass(frozen=True)
+class Joint:
+    """What became of the parts."""
+
+    output: Path
+    joined: tuple[str, ...]
+    apart: tuple[str, ...]
+    """Parts in which nothing of the others was recognised: their own results are all there is."""
+    links: int
+    summary: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def sentence(self) -> str:
+        """For the terminal."""
+        return str(self.summary["verdict"]["sentence"])
+
+
+class _Join:
+    def __init__(
+        self, parts: Sequence[Part], output: Path, config: Config, workers: Workers, device: str
+    ) -> None:
+        self.parts, self.config, self.workers, self.device = list(parts), config, workers, device
+        self.output = output
+        self.work = output / "join"
+        self.files = [self.work / f"views-{n:04d}.npz" for n in range(len(parts))]
+        self.camera = opened(parts[0]).camera
+        self.seconds: dict[str, float] = {}
+
+    @contextmanager
+    def timed(self, name: str) -> Iterator[None]:
+        begin = time.perf_counter()
+        yield
+        self.seconds[name] = round(time.perf_counter() - begin, 3)
+
+    def links(self) -> list[Link]:
+        jobs, views = [], map(PartViews.load, self.files)  # one at a time
+        for (a, b), pairs in candidates(views, self.config.loop).items():
+            for start in range(0, len(pairs), _PAIRS):
+                jobs.append(
+                    LinkJob(
+                        (a, b), (self.parts[a], self.parts[b]), (self.files[a], self.files[b]),
+                        tuple(pairs[start : start + _PAIRS]), self.camera, self.config,
+                    )
+                )  # fmt: skip
+        return [link for some in self.workers.map("verifying", links_of, jobs) for link in some]
+
+    def disks(self, gauge: Gauge, placements: dict[int, Placement]) -> MapSnapshot:
+        """The maps of all parts, moved and merged; the earlier part's disks stay."""
+        numbers = gauge.parts
+        files = {n: self.work / f"disks-{n:04d}.safetensors" for n in numbers}
+        moves = [
+            MoveJob(self.parts[n], self.files[n], placements[n], files[n], self.device)
+            for n in numbers
+        ]
+        self.workers.map("moving maps", move_disks, moves)
+        beside = {tuple(sorted((k.first[0], k.second[0]))) for k in gauge.links}
+        merges = [
+            MergeJob(files[n], tuple(files[m] for m in numbers if m < n and (m, n) in beside))
+            for n in numbers
+        ]
+        keep = self.workers.map("merging maps", merge_disks, merges)
+        return joined_disks(
+            [
+                kept(load_map_file(files[n], "cpu").disks, k)
+                for n, k in zip(numbers, keep, strict=True)
+            ]
+        )
+
+    def surface(self, count: int, disks: MapSnapshot) -> Mesh | None:
+        """The mesh of the result that has been written, and colours of its disks."""
+        folder = self.work / "renders"
+        folder.mkdir(parents=True, exist_ok=True)
+        runs = shares(count, _SHARES * self.workers.at_once)
+        renders = [RenderJob(self.output, run, folder, self.device) for run in runs]
+        views = [v for some in self.workers.map("rendering", render_views, renders) for v in some]
+        try:
+            space = plan_space(views, self.config.mesh, self.workers)
+            mesh = joint_mesh(space, self.config.mesh, self.workers, self.device)
+        except InputError:
+            return None
+        write_mesh(self.output / "mesh.ply", mesh.vertices, mesh.faces, mesh.colours, mesh.normals)
+        self._write_splats(disks, space)
+        return mesh
+
+    def _write_splats(self, disks: MapSnapshot, space: SpacePlan) -> None:
+        none = np.zeros((0, 3), np.int32)
+        points = Mesh(disks.position.numpy(), none, disks.normal.numpy())
+        tolerance = 4 * float(disks.scale.median())
+        colours = coloured(points, tolerance, space, self.workers) / 255.0
+        write_splats(self.output / "splats.ply", disks, colours)
+
+
+def join_parts(
+    parts: Sequence[Part],
+    output: Path,
+    config: Config,
+    workers: Workers,
+    device: str = "cpu",
+    adjust: bool = True,
+    say: Callable[[str], None] = lambda sentence: None,
+) -> Joint:
+    """One result of the parts that hang together, in a folder, as a run would have written it.
+
+    The first part that is in it keeps its frame and unit. Parts in which nothing of the others was
+    recognised stay what they are.
+
+    Args:
+        parts: at least two.
+        output: the folder; everybody who works has to see it.
+        config: how places are recognised, keyframes adjusted and the surface made.
+        workers: who does the jobs.
+        device: where they render and fuse.
+        adjust: whether keyframes are adjusted with the matches of overlapping parts; else links
+            and parts alone say where they are.
+        say: is told how far the work is.
+
+    Raises:
+        InputError: a part cannot be used, or no two of them show one place.
+        OutputError: a file cannot be written.
+    """
+    if len(parts) < 2:
+        raise InputError("There is one part only, which is whole already; give two or more.")
+    begin = time.perf_counter()
+    output = prepare_output_folder(output)
+    join = _Join(parts, output, config, workers, device)
+    shutil.rmtree(join.work, ignore_errors=True)
+    join.work.mkdir(parents=True)
+    try:
+        joint = _joined(join, adjust, say, begin)
+    finally:
+        shutil.rmtree(join.work, ignore_errors=True)
+    return joint
+
+
+def _joined(join: _Join, adjust: bool, say: Callable[[str], None], begin: float) -> Joint:
+    parts, config = join.parts, join.config
+    with join.timed("describing"):
+        described = [
+            DescribeJob(part, join.camera, config, file, join.device)
+            for part, file in zip(parts, join.files, strict=True)
+        ]
+        keyframes = sum(join.workers.map("describing", describe, described))
+    say(f"{len(parts)} parts, {keyframes} keyframes.")
+    views = [PartViews.load(file).outline() for file in join.files]
+    with join.timed("linking"):
+        links = join.links()
+        gauge = common_gauge(views, links, config.loop)
+    if len(gauge.world) < 2:
+        raise InputError(
+            f"No place of one part was recognised in another ({len(links)} single views alike); "
+            "parts have to overlap, seen from similar sides."
+        )
+    apart = [parts[n].name for n in range(len(parts)) if n not in gauge.world]
+    say(f"{len(gauge.links)} links join {len(gauge.world)} of {len(parts)} parts.")
+    with join.timed("pose graph"):
+        placements = placed(views, gauge)
+    if adjust:
+        with join.timed("bundle adjustment"):
+            placements = adjusted(
+                parts, join.files, placements, gauge, join.camera, config, join.workers,
+                join.work / "adjust",
+            )  # fmt: skip
+    results = {n: opened(parts[n]) for n in gauge.parts}
+    spans = spans_of(
+        [parts[n].name for n in gauge.parts],
+        [results[n].trajectory.timestamps for n in gauge.parts],
+    )
+    placed_parts = [
+        JoinedPart(results[n], views[n], placements[n], span)
+        for n, span in zip(gauge.parts, spans, strict=True)
+    ]
+    with join.timed("moving and merging maps"):
+        disks = join.disks(gauge, placements)
+    say(f"{len(disks)} disks.")
+    remove_former(join.output)
+    trajectory = write_poses(join.output, placed_parts)
+    write_map(join.output, placed_parts, disks, join.camera, config)
+    with join.timed("mesh"):
+        mesh = join.surface(sum(len(p.views.T_cw) for p in placed_parts), disks)
+    summary = {
+        **_facts(list(results.values()), gauge, apart, adjust),
+        "videos": [asdict(span) for span in spans],
+        "frames": len(trajectory.timestamps),
+        "lost_spans": lost_spans(trajectory),
+        "disks": len(disks),
+        "mesh_faces": 0 if mesh is None else len(mesh.faces),
+        "seconds": {**join.seconds, "total": round(time.perf_counter() - begin, 3)},
+        "peak_memory_bytes": peak_memory(),
+        **device_summary(torch.device(join.device)),
+    }
+    write_summary(join.output, summary)
+    written = load_result(join.output, join.device)
+    write_report(
+        join.output / "report", trajectory, written.keyframes, mesh, summary, written.disks
+    )
+    names = tuple(parts[n].name for n in gauge.parts)
+    return Joint(join.output, names, tuple(apart), len(gauge.links), summary)
+
+
+def _facts(
+    results: Sequence[SavedResult], gauge: Gauge, apart: Sequence[str], adjusted: bool
+) -> dict[str, Any]:
+    """What a summary says of the parts."""
+    verdicts = [result.summary.get("verdict") for result in results]
+    doubted = [
+        result.name for result, verdict in zip(results, verdicts, strict=True)
+        if isinstance(verdict, dict) and verdict.get("is_reliable") is False
+    ]  # fmt: skip
+    whole = len(results) + len(apart)
+    sentence = f"{len(results)} of {whole} parts are one place, by {len(gauge.links)} links."
+    if apart:
+        sentence += f" Nothing of the others was recognised in {', '.join(apart)}."
+    if doubted:
+        sentence += f" Not to be relied on by themselves: {', '.join(doubted)}."
+    return {
+        "source": " + ".join(str(result.summary.get("source", result.name)) for result in results),
+        "kind": "joined parts",
+        "fingerprint": fingerprint(results),
+        "scale": "arbitrary (monocular)",
+        "verdict": {"is_reliable": not doubted and not apart, "sentence": sentence},
+        "keyframes": sum(len(result.views.keyframe_id) for result in results),
+        "parts": [str(result.folder) for result in results],
+        "apart": list(apart),
+        "links": len(gauge.links),
+        "bundle_adjusted": adjusted,
+        "versions": {"geogs": __version__, "torch": torch.__version__},
+    }

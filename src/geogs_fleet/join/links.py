@@ -1,0 +1,133 @@
+"""Keyframes of two parts that show one place, verified: what loops are within a run."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from geogs.application.saved_result import SavedResult
+from geogs.config import Config
+from geogs.geometry.camera import Camera
+from geogs.loop.constraints import of_loop
+from geogs.loop.dense import dense_check
+from geogs.loop.detect import Loop
+from geogs.loop.pose_graph import RelativePoses
+from geogs.loop.verification import DepthView, TwoViewVerifier
+from geogs.threads import on_one_torch_thread
+from geogs.tracking.flow.base import FlowOperator
+from geogs.tracking.flow.select import build_operator
+from geogs.world.grid import SampleGrid
+from geogs.world.keyframe import Keyframe
+from geogs.world.store import KeyframeStore, Segment
+from geogs_fleet.join.part import Node, Part, PartViews, image_of, opened
+
+
+@dataclass(frozen=True)
+class LinkJob:
+    """Pairs of keyframes of two parts to be verified."""
+
+    numbers: tuple[int, int]
+    """Of the parts."""
+    parts: tuple[Part, Part]
+    views: tuple[Path, Path]
+    """Files of their views."""
+    pairs: tuple[tuple[int, int], ...]
+    camera: Camera
+    config: Config
+
+
+@dataclass(frozen=True)
+class Link:
+    """A pair of keyframes of two parts that show one place."""
+
+    first: Node
+    second: Node
+    S_ji: Float[Tensor, "4 4"]
+    """Sim(3) that takes points of the first camera, in its part's lengths, to the second in its."""
+    matched: float
+    """Share of the cells whose flow agrees."""
+    relative: RelativePoses
+    """The same with information, between 0 (the first) and 1, in both directions."""
+
+
+@on_one_torch_thread
+def links_of(job: LinkJob) -> list[Link]:
+    """The pairs that are links: by features with depth, then by dense flow."""
+    grid = SampleGrid(job.camera)
+    verifier = TwoViewVerifier(job.camera, job.config.loop.verification)
+    views = [PartViews.load(path) for path in job.views]
+    wanted: list[tuple[int, int, Tensor, float, int]] = []
+    for a, b in job.pairs:
+        one, other = (_seen(grid, v, n) for v, n in zip(views, (a, b), strict=True))
+        view = verifier.verify(one, other)
+        if view.accepted and view.is_metric and view.T_ji is not None:
+            wanted.append((a, b, view.T_ji, view.scale or 1.0, view.inliers))
+    if not wanted:
+        return []
+    operator = build_operator(job.config.tracking, grid)
+    store = KeyframeStore(grid, operator.encode)
+    segments = store.new_segment(), store.new_segment()
+    places = sorted({w[0] for w in wanted}), sorted({w[1] for w in wanted})
+    loaded = [
+        loaded_keyframes(segment, operator, opened(part), v, some)
+        for segment, part, v, some in zip(segments, job.parts, views, places, strict=True)
+    ]
+    found = []
+    for a, b, T_ji, scale, inliers in wanted:
+        first, second = loaded[0][a], loaded[1][b]
+        check = dense_check(
+            grid, operator, first, second, T_ji, scale, job.config.loop.verification
+        )
+        if not check.accepted or check.T_ji is None or check.there is None or check.back is None:
+            continue
+        loop = Loop(
+            first.id, second.id, "appearance", check.T_ji, check.scale, inliers, check.matched,
+            check.there, check.back,
+        )  # fmt: skip
+        relative = _between(of_loop(store, loop), first.id)
+        if len(relative):
+            nodes = (job.numbers[0], a), (job.numbers[1], b)
+            found.append(Link(*nodes, loop.S_ji.cpu(), check.matched, relative))
+    return found
+
+
+def loaded_keyframes(
+    segment: Segment,
+    operator: FlowOperator,
+    result: SavedResult,
+    views: PartViews,
+    places: Iterable[int],
+    T_cw: Float[Tensor, "n 4 4"] | None = None,
+) -> dict[int, Keyframe]:
+    """Keyframes of a part put into a segment; by their place in the part.
+
+    With the poses ``T_cw`` that all keyframes have in another world, if they are given; depths are
+    in the lengths of the part.
+    """
+    grid = segment.grid
+    loaded = {}
+    for n in places:
+        image = image_of(result, n, grid.camera)
+        pose = torch.from_numpy(views.T_cw[n]) if T_cw is None else T_cw[n]
+        time = float(views.timestamp[n])
+        keyframe = segment.add(n, time, image, operator.encode(image), pose)
+        keyframe.inverse_depth = torch.from_numpy(views.inverse_depth[n]).to(grid.device)
+        keyframe.information = torch.from_numpy(views.information[n]).to(grid.device)
+        loaded[n] = keyframe
+    return loaded
+
+
+def _seen(grid: SampleGrid, views: PartViews, n: int) -> DepthView:
+    inverse, information = (
+        torch.from_numpy(x[n]) for x in (views.inverse_depth, views.information)
+    )
+    return DepthView.of(grid, inverse, information, views.features[n])
+
+
+def _between(relative: RelativePoses, first: int) -> RelativePoses:
+    """Between 0 and 1 in place of two ids."""
+    source, target = ((end != first).long() for end in (relative.source, relative.target))
+    return replace(relative, source=source, target=target)

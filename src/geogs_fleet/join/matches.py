@@ -1,0 +1,284 @@
+"""What the keyframes of a part match, among each other and in linked parts, kept in files."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float16, Float32, Int, Int16
+from torch import Tensor
+
+from geogs.application.saved_result import SavedResult
+from geogs.config import Config, TrackingConfig
+from geogs.geometry.camera import Camera
+from geogs.geometry.lie import se3_inverse
+from geogs.loop.global_bundle import MATCHED_TOGETHER
+from geogs.threads import on_one_torch_thread
+from geogs.tracking.flow.select import build_operator
+from geogs.tracking.graph import FrameGraph
+from geogs.tracking.packed_edge import PackedEdge, PackedFlow, in_steps
+from geogs.tracking.proximity import Pair, proximity_pairs
+from geogs.tracking.row_errors import RowErrors, edge_shifts
+from geogs.world.grid import SampleGrid
+from geogs.world.keyframe import Keyframe
+from geogs.world.store import KeyframeStore
+from geogs_fleet.join.links import loaded_keyframes
+from geogs_fleet.join.part import Node, Part, PartViews, opened
+
+Directed = tuple[Node, Node]
+"""An edge: source and target."""
+
+
+@dataclass(frozen=True)
+class Depths:
+    """The depths of a part's keyframes on the grid, in lengths of the joint world."""
+
+    inverse: Float32[Tensor, "n p"]
+    information: Float32[Tensor, "n p"]
+    """Inverse variances."""
+    moving: Bool[Tensor, "n p"]
+    """Cells that are held for showing something that moves."""
+
+    def give(self, keyframe: Keyframe, place: int) -> None:
+        """Let a keyframe, the one at a place in the part, have its depths."""
+        keyframe.inverse_depth, keyframe.information = self.inverse[place], self.information[place]
+        keyframe.moving = self.moving[place]
+
+    def save(self, path: Path) -> None:
+        """Write all to a file."""
+        np.savez(path, inverse=self.inverse, information=self.information, moving=self.moving)
+
+    @staticmethod
+    def load(path: Path) -> "Depths":
+        """Read what ``save`` wrote."""
+        with np.load(path, allow_pickle=False) as file:
+            names = ("inverse", "information", "moving")
+            return Depths(*(torch.from_numpy(file[name]) for name in names))
+
+
+@dataclass(frozen=True)
+class Member:
+    """A part at some point of the adjustment."""
+
+    number: int
+    part: Part
+    views: Path
+    T_cw: Float[Tensor, "n 4 4"]
+    """Joint world to camera."""
+    scale: Float[Tensor, "n"]
+    """By which the part's lengths around each keyframe were divided."""
+    adjusted: Path | None = None
+    """File of its depths; those that its map shows where there is none."""
+
+    @property
+    def nodes(self) -> list[Node]:
+        """All its keyframes."""
+        return [(self.number, place) for place in range(len(self.T_cw))]
+
+    def depths(self) -> Depths:
+        """As they are now."""
+        if self.adjusted is not None:
+            return Depths.load(self.adjusted)
+        views, scale = PartViews.load(self.views), self.scale.float()[:, None]
+        inverse, known = torch.from_numpy(views.inverse_depth), torch.from_numpy(views.information)
+        return Depths(inverse * scale, known / scale.square(), torch.zeros_like(known).bool())
+
+
+@dataclass(frozen=True)
+class Matches:
+    """Directed edges of the frame graph, as :class:`PackedFlow` has them."""
+
+    ends: Int[np.ndarray, "e 4"]
+    """Source and target: part and place of each."""
+    position: Int16[np.ndarray, "e p 2"]
+    half_weight: Float16[np.ndarray, "e p 2"]
+    poses: Float[np.ndarray, "e 2 4 4"]
+    """Of source and target when they were matched."""
+    inverse_depth: Float32[np.ndarray, "e p"]
+    """Of the source at that time."""
+    damping: Float32[np.ndarray, "d p"]
+    """Of the source's depth; of no edge where the flow gives none."""
+    shift: Int16[np.ndarray, "s p 2"]
+    """To be added to the positions, for the rows of a rolling shutter; of no edge without one."""
+
+    @staticmethod
+    def of(
+        edges: Mapping[Directed, PackedEdge], shift: Mapping[Directed, Tensor], cells: int
+    ) -> "Matches":
+        """Edges in order, with the shift of each where there are any."""
+        flows = [edges[pair].flow for pair in sorted(edges)]
+        if not flows:
+            empty, pixels = np.zeros((0, cells), np.float32), np.zeros((0, cells, 2))
+            return Matches(
+                np.zeros((0, 4), np.int64), pixels.astype(np.int16), pixels.astype(np.float16),
+                np.zeros((0, 2, 4, 4)), empty, empty, pixels.astype(np.int16),
+            )  # fmt: skip
+        shifts = [shift[pair].numpy() for pair in sorted(edges)] if shift else []
+        damping = [f.damping for f in flows if f.damping is not None]
+        return Matches(
+            np.array([(*a, *b) for a, b in sorted(edges)], np.int64),
+            torch.stack([f.position for f in flows]).numpy(),
+            torch.stack([f.half_weight for f in flows]).numpy(),
+            torch.stack([torch.stack([f.T_source, f.T_target]) for f in flows]).numpy(),
+            torch.stack([f.inverse_depth for f in flows]).numpy(),
+            torch.stack(damping).numpy() if damping else np.zeros((0, cells), np.float32),
+            np.stack(shifts) if shifts else np.zeros((0, cells, 2), np.int16),
+        )
+
+    def edges(self, grid: SampleGrid, as_found: bool = False) -> dict[Directed, PackedEdge]:
+        """As a graph has them; without the shifts ``as_found``."""
+        found = {}
+        for n, (a, i, b, j) in enumerate(self.ends.tolist()):
+            position, weight, poses, depth = (
+                torch.from_numpy(x[n])
+                for x in (self.position, self.half_weight, self.poses, self.inverse_depth)
+            )
+            damping = torch.from_numpy(self.damping[n]) if len(self.damping) else None
+            if len(self.shift) and not as_found:
+                position = position + torch.from_numpy(self.shift[n])
+            flow = PackedFlow(position, weight, poses[0], poses[1], depth, damping)
+            found[(a, i), (b, j)] = PackedEdge(grid, flow)
+        return found
+
+    def save(self, path: Path) -> None:
+        """Write all to a file."""
+        np.savez(path, **vars(self))
+
+    @staticmethod
+    def load(path: Path) -> "Matches":
+        """Read what ``save`` wrote."""
+        with np.load(path, allow_pickle=False) as file:
+            return Matches(**{name: file[name] for name in file.files})
+
+
+@dataclass(frozen=True)
+class MatchJob:
+    """A part whose keyframes are to be matched with each other and with those of other parts."""
+
+    own: Member
+    others: tuple[Member, ...]
+    """Linked to it, of higher numbers: with the lower ones it is theirs to do."""
+    camera: Camera
+    config: Config
+    before: tuple[Path, ...]
+    """Files of what was matched before; only what has moved since is matched again."""
+    after: tuple[Path, ...]
+    """Files to write: edges that leave its own keyframes, then those that leave each other part."""
+
+
+@dataclass(frozen=True)
+class Matched:
+    """What came of it."""
+
+    ends: Int[np.ndarray, "e 4"]
+    """All directed edges."""
+    fresh: int
+    """Pairs that were matched now."""
+
+
+@on_one_torch_thread
+def match(job: MatchJob) -> Matched:
+    """Match pairs that are near in what they show, in both directions, and write the files."""
+    grid, members = SampleGrid(job.camera), (job.own, *job.others)
+    operator = build_operator(job.config.tracking, grid)
+    segment = KeyframeStore(grid, operator.encode).new_segment()
+    before: dict[Directed, PackedEdge] = {}
+    for path in job.before:
+        before |= Matches.load(path).edges(grid, as_found=True)
+    seen = {node for ends in before for node in ends} if before else _near(job.own, job.others)
+    ids: dict[Node, int] = {}
+    results = {member.number: opened(member.part) for member in members}
+    for member in members:
+        places = [k for n, k in member.nodes if member is job.own or (n, k) in seen]
+        views, depths = PartViews.load(member.views), member.depths()
+        result = results[member.number]
+        loaded = loaded_keyframes(segment, operator, result, views, places, member.T_cw)
+        for place, keyframe in loaded.items():
+            depths.give(keyframe, place)
+            ids[member.number, place] = keyframe.id
+    graph, c = FrameGraph(segment, operator), job.config.tracking
+    graph.edges = {(ids[a], ids[b]): edge for (a, b), edge in before.items()}
+    pairs = graph.pairs if before else _pairs(graph, len(job.own.T_cw), c)
+    stale = sorted(graph.stale(pairs, c.global_remeasure))
+    for start in range(0, len(stale), MATCHED_TOGETHER[0]):
+        graph.measure(stale[start : start + MATCHED_TOGETHER[0]], packed=True)
+    node = {id: n for n, id in ids.items()}
+    found = {
+        (node[i], node[j]): e for (i, j), e in graph.edges.items() if isinstance(e, PackedEdge)
+    }
+    errors = _row_errors(grid, members, results, ids)
+    shift: dict[Directed, Tensor] = {}
+    if errors is not None:
+        measured = {(ids[a], ids[b]): edge for (a, b), edge in found.items()}
+        for part, off in edge_shifts(errors, segment, measured, lambda id: id):
+            steps = in_steps(grid.camera, off)
+            shift |= {(node[i], node[j]): s for (i, j), s in zip(part, steps, strict=True)}
+    ends = []
+    for member, path in zip(members, job.after, strict=True):
+        own = {pair: e for pair, e in found.items() if pair[0][0] == member.number}
+        leaving = Matches.of(own, shift, grid.size)
+        leaving.save(path)
+        ends.append(leaving.ends)
+    return Matched(np.concatenate(ends), len(stale))
+
+
+def _row_errors(
+    grid: SampleGrid,
+    members: Sequence[Member],
+    results: Mapping[int, SavedResult],
+    ids: Mapping[Node, int],
+) -> RowErrors | None:
+    """What rectified rows of the keyframes are off by, as the trajectories of their parts tell.
+
+    None where nothing was rectified. Rows of another camera than the grid's stay as they are.
+    """
+    found: RowErrors | None = None
+    others = 0
+    for member in members:
+        result = results[member.number]
+        rows = result.rows() if result.camera == grid.camera else {}
+        if not rows:
+            continue
+        trajectory = result.trajectory
+        T_wc = trajectory.T_wc.copy()
+        T_wc[:, :3, 3] /= float(member.scale.median())
+        numbers = list(range(others - len(T_wc), others))  # of frames that are no keyframes
+        others -= len(T_wc)
+        nearest = np.abs(trajectory.timestamps - result.views.timestamp[:, None]).argmin(1)
+        known = {}
+        for place, frame in enumerate(nearest.tolist()):
+            id = ids.get((member.number, place))
+            if id is not None:
+                numbers[frame] = id
+                if place in rows:
+                    known[id] = rows[place]
+        own = RowErrors(grid, known, numbers, replace(trajectory, T_wc=T_wc))
+        found = own if found is None else found.beside(own)
+    return found
+
+
+def _pairs(graph: FrameGraph, own: int, c: TrackingConfig) -> list[Pair]:
+    """Pairs within a part, and of it with others, whose keyframes come behind its own."""
+    segment, camera = graph.keyframes, graph.keyframes.grid.camera
+    first, others = segment.ids[:own], segment.ids[own:]
+    limit, count = c.global_distance * max(camera.width, camera.height), c.global_pairs * own
+    found = proximity_pairs(segment, first, first, [], c.radius, c.global_suppression, limit, count)
+    if others:
+        found += proximity_pairs(segment, others, first, [], 0, c.global_suppression, limit, count)
+    return found
+
+
+def _near(own: Member, others: Sequence[Member]) -> set[Node]:
+    """Keyframes of others that are no further from one of its own than what they show."""
+    around, near = _centres(own), set[Node]()
+    for other in others:
+        depth = PartViews.load(other.views).median_depth / other.scale.numpy()
+        away = np.linalg.norm(_centres(other)[:, None] - around, axis=2).min(axis=1)
+        near |= {(other.number, int(place)) for place in np.nonzero(away < depth)[0]}
+    return near
+
+
+def _centres(member: Member) -> Float[np.ndarray, "n 3"]:
+    T_wc: Tensor = se3_inverse(member.T_cw)
+    return np.asarray(T_wc[:, :3, 3].numpy())

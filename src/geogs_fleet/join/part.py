@@ -1,0 +1,170 @@
+"""A part of the place: a finished result, and its keyframes as one common camera sees them."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float32, Float64, UInt8
+
+from geogs.application.saved_result import SavedResult, load_result
+from geogs.config import Config
+from geogs.errors import InputError
+from geogs.geometry.camera import Camera
+from geogs.io.writers.keyframe_images import image_path, read_image
+from geogs.loop.features import FeatureExtractor, Features
+from geogs.threads import on_one_torch_thread
+from geogs.world.grid import SampleGrid
+
+DEVIATION = 0.01
+"""Relative deviation of a depth that a map was trained to show."""
+Node = tuple[int, int]
+"""A keyframe: the number of its part, and its place among the part's keyframes."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """A result that is to be joined with others."""
+
+    name: str
+    """No other part has it."""
+    folder: Path
+    """Of the result, as ``geogs run`` writes it."""
+
+
+@dataclass(frozen=True)
+class PartViews:
+    """What is known of the keyframes of a part, in its own world, on the grid of one camera."""
+
+    T_cw: Float64[np.ndarray, "n 4 4"]
+    """World of the part to camera."""
+    timestamp: Float64[np.ndarray, "n"]
+    """Seconds, in the part's own time."""
+    inverse_depth: Float32[np.ndarray, "n p"]
+    """On the grid; rendered from the part's map, filled where that shows nothing."""
+    information: Float32[np.ndarray, "n p"]
+    """Inverse variances of these; 0 where the map shows nothing."""
+    features: tuple[Features, ...]
+
+    @property
+    def median_depth(self) -> Float64[np.ndarray, "n"]:
+        """Of each keyframe."""
+        return 1 / np.median(self.inverse_depth, axis=1).astype(np.float64)
+
+    def outline(self) -> "PartViews":
+        """The same with one depth a keyframe and no features: so little that all parts fit into one
+        memory."""
+        middle = np.median(self.inverse_depth, axis=1, keepdims=True)
+        return PartViews(self.T_cw, self.timestamp, middle, 0 * middle, ())
+
+    def save(self, path: Path) -> None:
+        """Write all to a file."""
+        counts = np.array([len(f) for f in self.features], np.int64)
+        none = np.zeros((0, 2), np.float32), np.zeros((0, 32), np.uint8)
+        np.savez(
+            path, T_cw=self.T_cw, timestamp=self.timestamp, inverse_depth=self.inverse_depth,
+            information=self.information, counts=counts,
+            pixels=np.concatenate([none[0], *(f.pixels for f in self.features)]),
+            descriptors=np.concatenate([none[1], *(f.descriptors for f in self.features)]),
+        )  # fmt: skip
+
+    @staticmethod
+    def load(path: Path) -> "PartViews":
+        """Read what ``save`` wrote."""
+        with np.load(path, allow_pickle=False) as file:
+            ends = np.cumsum(file["counts"])[:-1]
+            pixels, descriptors = (np.split(file[k], ends) for k in ("pixels", "descriptors"))
+            features = tuple(map(Features, pixels, descriptors))
+            return PartViews(
+                file["T_cw"], file["timestamp"], file["inverse_depth"], file["information"],
+                features[: len(file["T_cw"])],
+            )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class DescribeJob:
+    """A part to be described."""
+
+    part: Part
+    camera: Camera
+    """That all parts are seen by, of the images."""
+    config: Config
+    file: Path
+    """Where the views go."""
+    device: str = "cpu"
+
+
+@on_one_torch_thread
+def describe(job: DescribeJob) -> int:
+    """Find the features of a part's keyframes, render their depths, and write both to a file.
+
+    Returns the number of keyframes. Raises InputError if the result has no images, or is damaged.
+    """
+    result = opened(job.part, job.device)
+    grid, extract = SampleGrid(job.camera), FeatureExtractor(job.config.loop.retrieval)
+    depths, known, features = [], [], []
+    for number, T_cw in enumerate(torch.from_numpy(result.views.T_cw)):
+        features.append(extract(image_of(result, number, job.camera)))
+        inverse, information = _on_grid(result, T_cw, grid)
+        depths.append(inverse)
+        known.append(information)
+    views = PartViews(
+        result.views.T_cw, result.views.timestamp, np.stack(depths), np.stack(known),
+        tuple(features),
+    )  # fmt: skip
+    views.save(job.file)
+    return len(depths)
+
+
+def opened(part: Part, device: str = "cpu") -> SavedResult:
+    """The result of a part. Raises InputError if it cannot be joined with others."""
+    result = load_result(part.folder, device)
+    if not len(result.views.keyframe_id):
+        raise InputError(f"{part.folder} has no keyframes; nothing can be joined to it.")
+    if not result.views.has_images:
+        raise InputError(
+            f"{part.folder} was written without the images of its keyframes, by which places are "
+            "recognised; run again with --keyframe-images."
+        )
+    return result
+
+
+def image_of(result: SavedResult, number: int, camera: Camera) -> UInt8[np.ndarray, "h w 3"]:
+    """The image of a keyframe, by its place, as another camera at its place would have taken it."""
+    path = image_path(result.folder, int(result.views.keyframe_id[number]))
+    return resampled(read_image(path), result.camera, camera)
+
+
+def resampled(
+    image: UInt8[np.ndarray, "h w 3"], own: Camera, other: Camera
+) -> UInt8[np.ndarray, "h2 w2 3"]:
+    """An image of one pinhole camera as another with the same pose sees it; black outside."""
+    if own == other:
+        return image
+    sx, sy = other.fx / own.fx, other.fy / own.fy
+    to_other = np.array([[sx, 0, other.cx - sx * own.cx], [0, sy, other.cy - sy * own.cy]])
+    size = (other.width, other.height)
+    return cv2.warpAffine(image, to_other, size, flags=cv2.INTER_LINEAR).astype(np.uint8)
+
+
+def _on_grid(
+    result: SavedResult, T_cw: torch.Tensor, grid: SampleGrid
+) -> tuple[np.ndarray, np.ndarray]:
+    """Inverse depth and information of the cells, from the depth that the map shows."""
+    from geogs.bundle.select import grid_fields
+
+    long_edge = max(result.depth_camera.width, result.depth_camera.height)
+    camera = grid.camera.with_long_edge(long_edge)
+    maps = result.render(T_cw, camera)
+    scale = grid.pixels.new_tensor(
+        [camera.width / grid.camera.width, camera.height / grid.camera.height]
+    )
+    column, row = ((grid.pixels + 0.5) * scale - 0.5).round().long().unbind(-1)
+    depth = maps.depth.cpu()[row, column]
+    is_known = (depth > 0) & (maps.weight.cpu()[row, column] > 0)
+    inverse = torch.where(is_known, 1 / torch.where(is_known, depth, 1.0), 0.0).float()
+    information = torch.where(is_known, 1 / (DEVIATION * inverse).square(), 0.0).float()
+    if not bool(is_known.any()):
+        return np.ones(grid.size, np.float32), np.zeros(grid.size, np.float32)
+    return grid_fields(grid).fill(inverse, information).numpy(), information.numpy()

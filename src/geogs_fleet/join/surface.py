@@ -1,0 +1,152 @@
+"""The surface of a joint map: boxes of space side by side, stitched here."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int, UInt8
+
+from geogs.config import MeshConfig
+from geogs.mesh.blocks import (
+    MeshBlock,
+    blocks_of,
+    boxes_of,
+    mesh_block,
+    near,
+    sees_box,
+    stitched_blocks,
+)
+from geogs.mesh.colour import colour_mesh
+from geogs.mesh.decimate import decimate
+from geogs.mesh.extract import VolumePlan, plan_volume
+from geogs.mesh.tsdf import BYTES_PER_BLOCK, BlockBox
+from geogs.mesh.types import Mesh
+from geogs_fleet.join.stored_views import StoredView, loaded, shares
+from geogs_fleet.join.workers import Workers
+
+_TURNS = 3
+"""Boxes for each worker, at least, so that none waits long for the last."""
+_NO_FACES = np.zeros((0, 3), np.int32)
+
+
+@dataclass(frozen=True)
+class OccupyJob:
+    """Views of which it is asked where their surface lies."""
+
+    views: tuple[StoredView, ...]
+    plan: VolumePlan
+
+
+@dataclass(frozen=True)
+class BoxJob:
+    """A box of space whose surface is to be made."""
+
+    views: tuple[StoredView, ...]
+    """That may change it, in their order among all."""
+    plan: VolumePlan
+    box: BlockBox
+    min_weight: float
+    device: str
+
+
+@dataclass(frozen=True)
+class ColourJob:
+    """Points that are to have the colour of what the images show there."""
+
+    views: tuple[StoredView, ...]
+    points: Float[np.ndarray, "n 3"]
+    normals: Float[np.ndarray, "n 3"]
+    tolerance: float
+
+
+def occupied(job: OccupyJob) -> Int[np.ndarray, "k 3"]:
+    """Coordinates of the blocks that have surface."""
+    found = [blocks_of(view, job.plan) for view in loaded(job.views)]
+    return torch.unique(torch.cat(found), dim=0).cpu().numpy()
+
+
+def box_surface(job: BoxJob) -> MeshBlock:
+    """The surface of a box of space."""
+    return mesh_block(loaded(job.views), job.plan, job.box, job.min_weight, job.device)
+
+
+def colours_of(job: ColourJob) -> UInt8[np.ndarray, "n 3"]:
+    """Colours of some points."""
+    mesh = Mesh(job.points.copy(), _NO_FACES, job.normals.copy())  # what Ray brings is read-only
+    colours = colour_mesh(mesh, loaded(job.views, True), job.tolerance).colours
+    assert colours is not None
+    return colours
+
+
+@dataclass(frozen=True)
+class SpacePlan:
+    """How the space of all views is divided."""
+
+    volume: VolumePlan
+    boxes: tuple[BlockBox, ...]
+    views: tuple[tuple[StoredView, ...], ...]
+    """That see each box."""
+
+
+def plan_space(views: Sequence[StoredView], config: MeshConfig, workers: Workers) -> SpacePlan:
+    """Voxels for all views, and boxes of which each fits into the memory limit.
+
+    Raises:
+        InputError: no view has a valid depth.
+    """
+    volume = plan_volume(loaded(views), config)
+    jobs = [
+        OccupyJob(tuple(views[n] for n in share), volume)
+        for share in shares(len(views), _TURNS * workers.at_once)
+    ]
+    found = np.concatenate(workers.map("looking for surface", occupied, jobs))
+    blocks = np.unique(found, axis=0)
+    most = min(
+        int(config.memory_limit * 2**30 / BYTES_PER_BLOCK),
+        1 + len(blocks) // (_TURNS * workers.at_once if workers.at_once > 1 else 1),
+    )
+    boxes = boxes_of(blocks, most)
+    seen = (tuple(v for v in views if _sees(v, volume, box)) for box in boxes)
+    return SpacePlan(volume, tuple(boxes), tuple(seen))
+
+
+def joint_mesh(space: SpacePlan, config: MeshConfig, workers: Workers, device: str) -> Mesh:
+    """Fuse, extract, colour and decimate.
+
+    But for the colours of points that no image shows, the mesh is that of one volume.
+
+    Raises:
+        InputError: there is no surface.
+    """
+    jobs = [
+        BoxJob(views, space.volume, box, config.min_weight, device)
+        for box, views in zip(space.boxes, space.views, strict=True)
+    ]
+    blocks = workers.map("meshing", box_surface, jobs)
+    mesh = stitched_blocks(blocks, space.volume, config)
+    del blocks
+    if config.colour:
+        colours = coloured(mesh, 2 * space.volume.voxel, space, workers)
+        mesh = Mesh(mesh.vertices, mesh.faces, mesh.normals, colours)
+    return decimate(mesh, config.detail * space.volume.voxel)
+
+
+def coloured(
+    mesh: Mesh, tolerance: float, space: SpacePlan, workers: Workers
+) -> UInt8[np.ndarray, "n 3"]:
+    """Colours of the vertices of a mesh, box by box; grey where there is no box."""
+    colours = np.full((len(mesh.vertices), 3), 128, np.uint8)
+    inside = [np.flatnonzero(near(mesh, box, space.volume)) for box in space.boxes]
+    some = [n for n, at in enumerate(inside) if len(at)]
+    jobs = [
+        ColourJob(space.views[n], mesh.vertices[inside[n]], mesh.normals[inside[n]], tolerance)
+        for n in some
+    ]
+    for n, made in zip(some, workers.map("colouring", colours_of, jobs), strict=True):
+        colours[inside[n]] = made
+    return colours
+
+
+def _sees(view: StoredView, plan: VolumePlan, box: BlockBox) -> bool:
+    return sees_box(view.camera, view.pose, plan, box)

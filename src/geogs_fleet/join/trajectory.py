@@ -1,0 +1,82 @@
+"""The frames of all parts in the joint world and in one time."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float64
+from torch import Tensor
+
+from geogs.geometry.lie import se3_inverse, sim3_scale, so3_exp, so3_log
+from geogs.io.sources.several import PAUSE
+from geogs.types import Trajectory
+from geogs_fleet.join.graph import Placement
+from geogs_fleet.join.part import PartViews
+
+
+@dataclass(frozen=True)
+class Span:
+    """A part within the joint trajectory."""
+
+    name: str
+    first_frame: int
+    first_time: float
+    """Seconds, in the joint time."""
+    own_time: float
+    """Of its first frame in its own time."""
+
+    @property
+    def shift(self) -> float:
+        """From its own time to the joint one."""
+        return self.first_time - self.own_time
+
+
+def spans_of(names: list[str], times: list[Float64[np.ndarray, "n"]]) -> list[Span]:
+    """The parts one after the other, as ``geogs run`` puts several videos."""
+    spans: list[Span] = []
+    frames, end = 0, 0.0
+    for name, own in zip(names, times, strict=True):
+        first = end + PAUSE if spans else float(own[0])
+        spans.append(Span(name, frames, first, float(own[0])))
+        frames, end = frames + len(own), float(own[-1]) + first - float(own[0])
+    return spans
+
+
+def moved_trajectory(trajectory: Trajectory, views: PartViews, placement: Placement) -> Trajectory:
+    """Poses of a part's frames in the joint world; between keyframes by both, in time."""
+    S = placement.similarities(views.T_cw)
+    times = views.timestamp
+    at = trajectory.timestamps.clip(times[0], times[-1])
+    after = np.searchsorted(times, at).clip(min(1, len(times) - 1), len(times) - 1)
+    before = (after - 1).clip(min=0)
+    length = np.maximum(times[after] - times[before], 1e-12)
+    share = torch.from_numpy(((at - times[before]) / length).clip(0, 1))
+    T_wc = torch.from_numpy(trajectory.T_wc)
+    first, second = (_moved(S[torch.from_numpy(n)], T_wc) for n in (before, after))
+    moved = first.clone()
+    turn = so3_log(second[:, :3, :3] @ first[:, :3, :3].mT)
+    moved[:, :3, :3] = so3_exp(share[:, None] * turn) @ first[:, :3, :3]
+    moved[:, :3, 3] += share[:, None] * (second[:, :3, 3] - first[:, :3, 3])
+    return Trajectory(trajectory.timestamps, moved.numpy(), trajectory.tracked, trajectory.oriented)
+
+
+def _moved(S: Float[Tensor, "n 4 4"], T_wc: Float[Tensor, "n 4 4"]) -> Float[Tensor, "n 4 4"]:
+    """Camera-to-world poses by world similarities."""
+    moved = S @ T_wc
+    moved[:, :3, :3] /= sim3_scale(S)[:, None, None]
+    return moved
+
+
+def joined_trajectory(parts: list[Trajectory], spans: list[Span]) -> Trajectory:
+    """All of them, in the joint time."""
+    times = [t.timestamps + span.shift for t, span in zip(parts, spans, strict=True)]
+    return Trajectory(
+        np.concatenate(times),
+        np.concatenate([t.T_wc for t in parts]),
+        np.concatenate([t.tracked for t in parts]),
+    )
+
+
+def keyframe_poses(placement: Placement) -> Float64[np.ndarray, "n 4 4"]:
+    """Camera to world."""
+    return np.asarray(se3_inverse(placement.T_cw).numpy())

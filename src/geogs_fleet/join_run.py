@@ -1,0 +1,127 @@
+"""``geogs fleet join``: parts of one place, run where they are not yet, then joined."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from geogs.application.folder_lock import only_writer
+from geogs.config.setting import Basic, Positional
+from geogs.documents import read_json
+from geogs.errors import InputError
+from geogs.io.writers.atomic import prepare_output_folder
+from geogs_fleet.cluster import ray_cluster, share_of
+from geogs_fleet.places import Place
+from geogs_fleet.progress import FleetProgress
+from geogs_fleet.run import run_fleet
+from geogs_fleet.settings import FleetSettings
+from geogs_fleet.sources import find_sources
+from geogs_fleet.workers import RayWorkers
+
+if TYPE_CHECKING:
+    from geogs_fleet.join.join import Joint
+    from geogs_fleet.join.part import Part
+
+PARTS = "parts"
+"""Folder for the results of parts that had to be run."""
+
+
+@dataclass(frozen=True)
+class JoinSettings(FleetSettings):
+    """All that the making of one place from many videos is told."""
+
+    source: Annotated[tuple[str, ...], Positional()] = ()
+    """Parts of one place that overlap: videos and folders of images, as of geogs fleet run, which
+    are run first; results of geogs run, or of geogs fleet run."""
+    output: Annotated[str, Basic("-o")] = "out/joined"
+    """Folder for the joint result, with one for each part that is run in parts/; every machine has
+    to see it under this name."""
+    adjust: Annotated[bool, Basic()] = True
+    """Adjust the keyframes with the matches of overlapping parts; else the parts, and the pairs of
+    keyframes that show one place, alone say where they are."""
+
+
+def run_join(
+    settings: JoinSettings,
+    progress: FleetProgress | None = None,
+    say: Callable[[str], None] = lambda sentence: None,
+) -> "Joint":
+    """Run the parts that are no results yet, and join all of them.
+
+    Raises:
+        InputError: a part is none, no two of them show one place, or Ray is missing.
+        OutputError: the result cannot be written.
+    """
+    path = Place(settings.output).path if settings.output else None
+    if path is None:
+        raise InputError("The joint result needs a folder that all machines see; give one (-o).")
+    output = prepare_output_folder(path.absolute())
+    with only_writer(output), ray_cluster(settings.address) as ray:
+        share = share_of(ray, settings)
+        parts = _parts(settings, output, progress, say)
+
+        from geogs_fleet.join.join import join_parts
+
+        device = "cuda" if share.gpus else "cpu"
+        workers = RayWorkers(ray, share, settings.attempts, say)
+        return join_parts(parts, output, settings.config, workers, device, settings.adjust, say)
+
+
+def _parts(
+    settings: JoinSettings,
+    output: Path,
+    progress: FleetProgress | None,
+    say: Callable[[str], None],
+) -> "list[Part]":
+    """The results to be joined, in the order in which they were named."""
+    from geogs_fleet.join.part import Part
+
+    found: list[Path | str] = []
+    for word in settings.source:
+        results = finished_results(word)
+        found += results or [source.address for source in find_sources([word])]
+    videos = list(dict.fromkeys(address for address in found if isinstance(address, str)))
+    made: dict[str, Path] = {}
+    if videos:
+        given = {f.name: getattr(settings, f.name) for f in fields(FleetSettings)}
+        place = {"source": tuple(videos), "output": str(output / PARTS)}
+        for row in run_fleet(FleetSettings(**{**given, **place}), progress).rows:
+            if row.state == "done":
+                made[row.source] = output / PARTS / row.name
+            else:
+                say(f"{row.name} is left out: {row.sentence}")
+    folders = [made.get(f) if isinstance(f, str) else f for f in dict.fromkeys(found)]
+    usable = [f for f in folders if f is not None and (f / "map.safetensors").is_file()]
+    if len(usable) < 2:
+        raise InputError(
+            f"{len(usable)} of {len(folders)} parts have a map; two or more are needed to be "
+            "joined."
+        )
+    return [Part(name, f) for name, f in zip(_names(usable), usable, strict=True)]
+
+
+def finished_results(word: str) -> list[Path]:
+    """Folders of the results that a word names: one, or those of a fleet; none if it is neither."""
+    path = Place(word).path
+    if path is None or not path.is_dir():
+        return []
+    if (path / "map.safetensors").is_file():
+        return [path.absolute()]
+    if not (path / "fleet.json").is_file():
+        return []
+    table = read_json(path / "fleet.json")
+    rows = table.get("sources", []) if isinstance(table, dict) else []
+    names = sorted(
+        str(row["name"]) for row in rows if isinstance(row, dict) and row.get("state") == "done"
+    )
+    folders = [(path / Path(name).name).absolute() for name in names]
+    return [folder for folder in folders if (folder / "map.safetensors").is_file()]
+
+
+def _names(folders: list[Path]) -> list[str]:
+    """A name for each that no other has."""
+    names: list[str] = []
+    for folder in folders:
+        same = sum(name == folder.name or name.startswith(f"{folder.name}-") for name in names)
+        names.append(folder.name if not same else f"{folder.name}-{same + 1}")
+    return names

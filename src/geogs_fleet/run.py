@@ -1,0 +1,135 @@
+"""A fleet, from the words that name its sources to its table."""
+
+import time
+from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, replace
+from hashlib import sha256
+
+from geogs.application.folder_lock import only_writer
+from geogs.application.settings import RunSettings
+from geogs.errors import InputError
+from geogs.io.writers.atomic import prepare_output_folder
+from geogs_fleet.attempt import CHILD, Job
+from geogs_fleet.cluster import Share, ray_cluster, share_of
+from geogs_fleet.places import Place
+from geogs_fleet.progress import FleetProgress, Pace
+from geogs_fleet.row import FILE, Row, read_row
+from geogs_fleet.schedule import rows_of
+from geogs_fleet.settings import FleetSettings
+from geogs_fleet.sources import FleetSource, find_sources
+from geogs_fleet.supervise import Limits
+from geogs_fleet.table import write_table
+
+_BETWEEN_TABLES = 5.0
+"""Seconds between two writings of the table, at least."""
+
+
+@dataclass(frozen=True)
+class FleetResult:
+    """What became of a fleet."""
+
+    output: str
+    rows: list[Row]
+    """Of all sources, in their order."""
+    computed: int
+    """How many were computed this time; the others were done before."""
+
+
+def run_fleet(
+    settings: FleetSettings,
+    progress: FleetProgress | None = None,
+    command: Sequence[str] = CHILD,
+) -> FleetResult:
+    """Compute every source that is not done yet, each into a folder of its name.
+
+    A source that fails has a row that says why. ``command`` is the program that computes one
+    source, see :mod:`geogs_fleet.child`.
+
+    Raises:
+        InputError: no source is found, Ray is missing, or no machine has what is asked for.
+        OutputError: the table cannot be written, or another fleet writes there.
+        KeyboardInterrupt: after Ctrl-C; the table has been written.
+    """
+    progress, begin = progress or FleetProgress(), time.monotonic()
+    sources = find_sources(settings.source)
+    output = _absolute(settings.output)
+    with _alone(output):
+        digest = _digest(_run_settings(settings, "auto"))
+        rows = {row.name: row for s in sources if (row := _done(output, s, digest)) is not None}
+        missing = [source for source in sources if source.name not in rows]
+        if missing:
+            with ray_cluster(settings.address) as ray:
+                share = share_of(ray, settings)
+                jobs = [_job(settings, source, output, share, digest) for source in missing]
+                jobs = [replace(job, command=tuple(command)) for job in jobs]
+                progress.begin(len(sources), len(rows), share.at_once)
+                pace, written = Pace(len(jobs), share.at_once), -_BETWEEN_TABLES
+                ended = rows_of(ray, jobs, share, settings.attempts)
+                try:
+                    for row in ended:
+                        rows[row.name] = row
+                        progress.ended(row, *pace.after_one(row.seconds))
+                        if (now := time.monotonic()) >= written + _BETWEEN_TABLES:
+                            _write(output, rows, sources, now - begin)
+                            written = now
+                finally:
+                    ended.close()
+                    _write(output, rows, sources, time.monotonic() - begin)
+        else:
+            _write(output, rows, sources, time.monotonic() - begin)
+    return FleetResult(output.address, [rows[s.name] for s in sources], len(missing))
+
+
+def _job(
+    settings: FleetSettings, source: FleetSource, output: Place, share: Share, digest: str
+) -> Job:
+    return Job(
+        source,
+        (output / source.name).address,
+        _run_settings(settings, "cuda" if share.gpus else "cpu"),
+        digest,
+        Limits(settings.time_limit, share.memory),
+        threads=share.cpus,
+    )
+
+
+def _run_settings(settings: FleetSettings, device: str) -> RunSettings:
+    return RunSettings(
+        config=settings.config,
+        device=device,
+        checkpoint_every=settings.checkpoint_every,
+        keyframe_images=settings.keyframe_images,
+    ).absolute()
+
+
+def _digest(settings: RunSettings) -> str:
+    """Of what decides about a result; where it is computed does not."""
+    deciding = replace(settings, checkpoint_every=60.0)
+    return sha256(repr(deciding).encode()).hexdigest()[:16]
+
+
+def _done(output: Place, source: FleetSource, digest: str) -> Row | None:
+    """The row of an earlier result of this source with these settings."""
+    row = read_row((output / source.name / FILE).read())
+    same = row is not None and (row.source, row.settings) == (source.address, digest)
+    return row if same and row is not None and row.state == "done" else None
+
+
+def _write(
+    output: Place, rows: dict[str, Row], sources: Sequence[FleetSource], seconds: float
+) -> None:
+    write_table(output, list(rows.values()), len(sources) - len(rows), seconds)
+
+
+def _absolute(address: str) -> Place:
+    if not address:
+        raise InputError("The results need a folder; give one (-o).")
+    path = Place(address).path
+    return Place(address if path is None else str(path.absolute()))
+
+
+def _alone(output: Place) -> AbstractContextManager[None]:
+    """One fleet at a time in a folder, where that can have locks."""
+    path = output.path
+    return nullcontext() if path is None else only_writer(prepare_output_folder(path))

@@ -1,0 +1,72 @@
+"""The jobs of a fleet through Ray, and again where a machine or a process failed."""
+
+from collections.abc import Generator, Iterable
+from contextlib import suppress
+from dataclasses import replace
+from typing import Any
+
+from geogs_fleet.attempt import Job, attempt
+from geogs_fleet.cluster import Share
+from geogs_fleet.row import Row
+
+_LOOK = 0.5
+"""Seconds between two looks at what has ended, while some jobs are out."""
+
+
+def rows_of(
+    ray: Any, jobs: Iterable[Job], share: Share, attempts: int
+) -> Generator[Row, None, None]:
+    """The row of every job, in the order in which they end; each job has exactly one.
+
+    All jobs are handed to Ray at once. One whose node or process fails is handed in again, up to
+    ``attempts`` times in all. When the caller stops listening, what is out is ended.
+    """
+    task = ray.remote(max_calls=0)(attempt).options(
+        num_cpus=share.cpus,
+        num_gpus=share.gpus or None,
+        memory=share.memory,
+        max_retries=0,
+        scheduling_strategy="SPREAD",
+    )
+    out: dict[Any, Job] = {task.remote(job): job for job in jobs}
+    try:
+        while out:
+            ended, _ = ray.wait(list(out), num_returns=len(out), timeout=_LOOK)
+            for reference in ended:
+                job = out.pop(reference)
+                row = _row(ray, reference, job)
+                if row.state == "crashed" and job.attempt < attempts:
+                    again = replace(job, attempt=job.attempt + 1)
+                    out[task.remote(again)] = again
+                else:
+                    yield replace(row, state="failed") if row.state == "crashed" else row
+    finally:
+        for reference in out:
+            _cancel(ray, reference)
+
+
+def _row(ray: Any, reference: Any, job: Job) -> Row:
+    """What came back; a crash where Ray lost the task."""
+    try:
+        row: Row = ray.get(reference)
+        return row
+    except ray.exceptions.RayError as error:
+        return Row(
+            job.source.name, job.source.address, "crashed", _sentence(ray, error), job.digest,
+            attempts=job.attempt,
+        )  # fmt: skip
+
+
+def _sentence(ray: Any, error: Exception) -> str:
+    if isinstance(error, ray.exceptions.OutOfMemoryError):
+        return "The memory of the machine was full; give fewer sources at once (--cpus, --gpus)."
+    if isinstance(error, ray.exceptions.NodeDiedError | ray.exceptions.WorkerCrashedError):
+        return "The machine or the process was lost."
+    said = str(error).strip().splitlines() or [type(error).__name__]
+    return f"Ray lost the task ({said[-1][:200]})."
+
+
+def _cancel(ray: Any, reference: Any) -> None:
+    """End a task, also while the cluster goes away."""
+    with suppress(Exception):
+        ray.cancel(reference, force=True)

@@ -1,0 +1,91 @@
+"""Where a run works on its node, and how what it writes gets to where it belongs.
+
+Results that lie on a path are worked on there. Where they are elsewhere, the run works in a folder
+for temporary files, and every new checkpoint and the results are copied; a checkpoint's manifest
+goes last, so that one which was cut off is known as damaged.
+"""
+
+import os
+import shutil
+import tempfile
+from hashlib import sha256
+from pathlib import Path
+from secrets import token_hex
+
+from geogs.errors import InputError, OutputError
+from geogs_fleet.places import Place
+from geogs_fleet.sources import FleetSource
+
+_MANIFEST = "manifest.json"  # of geogs.application.checkpoint_folder, which loads PyTorch
+
+
+class WorkFolder:
+    """The folder of one source's results, as a run on this node sees it."""
+
+    def __init__(self, place: Place) -> None:
+        self._place = place
+        mark = sha256(place.address.encode("utf-8", "backslashreplace")).hexdigest()[:16]
+        user = os.getuid() if hasattr(os, "getuid") else ""
+        # The same path on every node: a checkpoint holds that of its source.
+        self.scratch = Path(tempfile.gettempdir()) / f"geogs-fleet-{user}" / mark
+        self.path = place.path or self.scratch / "result"
+        self._kept: tuple[int, int] | None = None
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            reason = error.strerror or error
+            raise OutputError(f"{self.path} cannot be written ({reason}).") from error
+        if place.path is None:
+            self._take_checkpoint()
+
+    def keep_checkpoint(self) -> None:
+        """Copy the checkpoint, if it is a new one."""
+        manifest = self.path / "checkpoint" / _MANIFEST
+        if self._place.path is not None:
+            return
+        try:
+            status = manifest.stat()
+            if (status.st_mtime_ns, status.st_ino) == self._kept:
+                return
+            files = [path for path in manifest.parent.iterdir() if path.name[0] != "."]
+            files.sort(key=lambda path: path.name == _MANIFEST)
+            for path in files:
+                (self._place / f"checkpoint/{path.name}").upload(path)
+            self._kept = (status.st_mtime_ns, status.st_ino)
+        except (OSError, OutputError):  # the next one may succeed
+            return
+
+    def keep(self, files: list[Path]) -> None:
+        """Copy files of the folder. Raises OutputError if they cannot be."""
+        if self._place.path is None:
+            for path in files:
+                (self._place / path.relative_to(self.path).as_posix()).upload(path)
+
+    def leave(self) -> None:
+        """After success: what was for the time of work only."""
+        if self._place.path is None:
+            former = self._place / "checkpoint"
+            for name in former.listed():
+                (former / name).delete()
+        shutil.rmtree(self.scratch, ignore_errors=True)
+
+    def _take_checkpoint(self) -> None:
+        target = self.path / "checkpoint"
+        shutil.rmtree(target, ignore_errors=True)
+        former = self._place / "checkpoint"
+        if _MANIFEST in former.listed():
+            former.download(target)
+
+
+def fetched(source: FleetSource, scratch: Path) -> Path:
+    """A copy of a source that is elsewhere. Raises InputError if it cannot be had."""
+    place = Place(source.address)
+    target = scratch / "source" / (place.name or "source")
+    if not target.exists():
+        unfinished = target.with_name(f"{target.name}.{token_hex(6)}.part")
+        place.download(unfinished)
+        try:
+            os.replace(unfinished, target)
+        except OSError as error:
+            raise InputError(f"{target} cannot be written ({error.strerror}).") from error
+    return target

@@ -1,0 +1,130 @@
+"""COLMAP's database of cameras, pictures, features and verified matches.
+
+Its pixels have their centres at one half.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from geogs.io.sources.calibration import Calibration
+from geogs_photos.features import Features
+from geogs_photos.library import load_colmap
+from geogs_photos.pairs import Pairs
+
+ROUND = 40
+"""Pairs that are matched between two reports of progress."""
+
+
+@dataclass(frozen=True, slots=True)
+class SharedCamera:
+    """A camera that took some of the pictures."""
+
+    calibration: Calibration
+    """Where the search for it begins, for pictures as they are stored."""
+    is_known: bool
+    """Whether it is to stay as it is."""
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """A picture in the database; its number there is its place plus one."""
+
+    name: str
+    camera: int
+    """Place of its camera."""
+    features: Features
+
+
+def write_database(path: Path, cameras: Sequence[SharedCamera], entries: Sequence[Entry]) -> None:
+    """Write cameras, pictures and features; cameras and pictures are numbered from 1."""
+    colmap = load_colmap()
+    database = colmap.Database.open(path)
+    try:
+        for place, camera in enumerate(cameras):
+            database.write_camera(_camera(colmap, place + 1, camera), use_camera_id=True)
+        for place, entry in enumerate(entries):
+            image = colmap.Image(name=entry.name, camera_id=entry.camera + 1, image_id=place + 1)
+            database.write_image(image, use_image_id=True)
+            features = entry.features
+            offset = np.array([0.5, 0.5, 0, 0], np.float32)
+            database.write_keypoints(place + 1, features.keypoints + offset)
+            kind = colmap.FeatureExtractorType.SIFT
+            descriptors = colmap.FeatureDescriptors(type=kind, data=features.descriptors)
+            database.write_descriptors(place + 1, descriptors)
+    finally:
+        database.close()
+
+
+def match_pairs(
+    path: Path,
+    entries: Sequence[Entry],
+    pairs: Pairs,
+    seed: int,
+    threads: int,
+    progress: Callable[[float], None],
+) -> np.ndarray:
+    """Match pairs of pictures and keep what one motion of the camera explains.
+
+    Returns the number of kept matches between any two pictures, a symmetric matrix.
+    """
+    colmap = load_colmap()
+    matching = colmap.FeatureMatchingOptions(use_gpu=False, num_threads=threads)
+    verification = colmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = seed
+    listed = path.with_suffix(".pairs.txt")
+    for begin in range(0, len(pairs), ROUND):
+        some = pairs[begin : begin + ROUND]
+        lines = [f"{entries[i].name} {entries[j].name}" for i, j in some]
+        listed.write_text("\n".join([*lines, ""]), encoding="utf-8")
+        colmap.match_image_pairs(
+            path,
+            matching_options=matching,
+            pairing_options=colmap.ImportedPairingOptions(match_list_path=listed),
+            verification_options=verification,
+            device=colmap.Device.cpu,
+        )
+        progress(min(1.0, (begin + ROUND) / len(pairs)))
+    listed.unlink(missing_ok=True)
+    return _kept_matches(colmap, path, len(entries))
+
+
+def _kept_matches(colmap: Any, path: Path, count: int) -> np.ndarray:
+    database = colmap.Database.open(path)
+    try:
+        numbers, matches = database.read_two_view_geometry_num_inliers()
+    finally:
+        database.close()
+    kept = np.zeros((count, count), np.int64)
+    for number, inliers in zip(numbers, matches, strict=True):
+        one, other = colmap.pair_id_to_image_pair(number)
+        kept[one - 1, other - 1] = kept[other - 1, one - 1] = inliers
+    return kept
+
+
+def _camera(colmap: Any, number: int, shared: SharedCamera) -> Any:
+    """A camera as COLMAP has it: with all of OpenCV's terms where it is known, else one focal
+    length and one radial term to begin with."""
+    c = shared.calibration
+    if not shared.is_known:
+        camera = colmap.Camera.create_from_model_id(
+            number, colmap.CameraModelId.SIMPLE_RADIAL, c.fx, c.width, c.height
+        )
+        camera.has_prior_focal_length = not c.is_guess
+        return camera
+    camera = colmap.Camera(camera_id=number, width=c.width, height=c.height)
+    if c.lens == "fisheye":
+        camera.model = colmap.CameraModelId.OPENCV_FISHEYE
+        camera.params = [c.fx, c.fy, c.cx + 0.5, c.cy + 0.5, *(c.distortion or (0.0,) * 4)]
+        camera.has_prior_focal_length = True
+        return camera
+    distortion = [*c.distortion, *[0.0] * 8][:8]
+    is_short = not any(distortion[4:])
+    models = colmap.CameraModelId
+    camera.model = models.OPENCV if is_short else models.FULL_OPENCV
+    camera.params = [c.fx, c.fy, c.cx + 0.5, c.cy + 0.5, *distortion[: 4 if is_short else 8]]
+    camera.has_prior_focal_length = True
+    return camera

@@ -1,0 +1,106 @@
+"""How well structure from motion knows its poses, whatever frame of reference it was solved in."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64
+
+from geogs_photos.library import load_colmap
+
+
+def pose_deviations(
+    model: Any,
+    images: Sequence[Any],
+    T_cw: Float64[np.ndarray, "n 4 4"],
+    error: float,
+    is_known: bool,
+) -> tuple[Float64[np.ndarray, "n"], Float64[np.ndarray, "n"]]:
+    """Standard deviations of the images' centres (world units) and orientations (radians).
+
+    From the covariance of the adjustment; what a similarity of the world
+    changes is taken out, so that it is what is left after the best alignment. Infinite where the
+    covariance cannot be computed.
+
+    Args:
+        model: the reconstruction.
+        images: those to tell of, with poses ``T_cw``, world to camera.
+        T_cw: the same.
+        error: deviation of a measured point, pixels.
+        is_known: whether the camera was given, or found along with the poses.
+    """
+    colmap = load_colmap()
+    options = colmap.BundleAdjustmentOptions(
+        print_summary=False, refine_principal_point=not is_known
+    )
+    config = colmap.BundleAdjustmentConfig()
+    for image in images:
+        config.add_image(image.image_id)
+    if is_known:
+        for number in model.cameras:
+            config.set_constant_cam_intrinsics(number)
+    config.fix_gauge(colmap.BundleAdjustmentGauge.THREE_POINTS)
+    adjuster = colmap.create_default_ceres_bundle_adjuster(options, config, model)
+    wanted = colmap.BACovarianceOptions(params=colmap.BACovarianceOptionsParams.POSES)
+    covariance = colmap.estimate_ba_covariance(wanted, model, adjuster)
+    joint = None if covariance is None else _joint(covariance, [i.image_id for i in images])
+    if joint is None:
+        unknown = np.full(len(images), np.inf)
+        return unknown, unknown.copy()
+    place, turn = without_gauge(joint, T_cw)
+    return error * place, error * turn
+
+
+def without_gauge(
+    joint: Float64[np.ndarray, "k k"], T_cw: Float64[np.ndarray, "n 4 4"]
+) -> tuple[Float64[np.ndarray, "n"], Float64[np.ndarray, "n"]]:
+    """Deviations of centres and orientations without what a similarity of the world changes.
+
+    ``joint`` is the covariance of the poses' left tangents, rotation (3) then translation (3) of
+    each. With T = [Exp(w) R, t + dt] the centre -R^T t moves by R^T (w x t - dt), and the axes of
+    the camera turn by R^T w in the world.
+    """
+    count = len(T_cw)
+    moves, turns = np.zeros((3 * count, 6 * count)), np.zeros((3 * count, 6 * count))
+    for k, T in enumerate(T_cw):
+        back, t = T[:3, :3].T, T[:3, 3]
+        rows, own = slice(3 * k, 3 * k + 3), slice(6 * k, 6 * k + 6)
+        moves[rows, own] = back @ np.concatenate([-_cross(t), -np.eye(3)], 1)
+        turns[rows, own] = back @ np.concatenate([np.eye(3), np.zeros((3, 3))], 1)
+    centres = -np.einsum("nij,ni->nj", T_cw[:, :3, :3], T_cw[:, :3, 3])
+    centres = centres - centres.mean(0)
+    identity = np.tile(np.eye(3), (count, 1))
+    rotated = np.concatenate([-_cross(c) for c in centres])
+    similarity = np.concatenate([identity, rotated, centres.reshape(-1, 1)], 1)
+    return _left(moves, joint, similarity), _left(turns, joint, identity)
+
+
+def _left(
+    J: Float64[np.ndarray, "m k"],
+    joint: Float64[np.ndarray, "k k"],
+    gauge: Float64[np.ndarray, "m g"],
+) -> Float64[np.ndarray, "n"]:
+    """Deviation of each triple of J x beside what lies along ``gauge``."""
+    free = J - gauge @ (np.linalg.pinv(gauge) @ J)
+    variance = np.einsum("ij,jk,ik->i", free, joint, free, optimize=True)
+    return np.sqrt(variance.reshape(-1, 3).sum(1).clip(0))
+
+
+def _joint(covariance: Any, numbers: Sequence[int]) -> Float64[np.ndarray, "k k"] | None:
+    """The covariance of all poses; none where a pose was not free."""
+    joint = np.zeros((6 * len(numbers), 6 * len(numbers)))
+    for a, one in enumerate(numbers):
+        for b, other in enumerate(numbers[: a + 1]):
+            if a == b:
+                block = covariance.get_cam_cov_from_world(one)
+            else:
+                block = covariance.get_cam_cross_cov_from_world(one, other)
+            if block is None or block.shape != (6, 6):
+                return None
+            joint[6 * a : 6 * a + 6, 6 * b : 6 * b + 6] = block
+            joint[6 * b : 6 * b + 6, 6 * a : 6 * a + 6] = block.T
+    return joint
+
+
+def _cross(v: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3 3"]:
+    return np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])

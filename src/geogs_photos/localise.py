@@ -1,0 +1,101 @@
+"""Where a frame was taken, against the points of a reconstruction that other frames made."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float32, Float64, Int64, UInt8
+
+from geogs.geometry.camera import Camera
+from geogs_photos.features import find_features
+from geogs_photos.library import load_colmap
+
+NEIGHBOURS = 2
+"""Frames with a pose before and after one, whose points it is matched with."""
+LEAST_INLIERS = 20
+"""Points that have to agree on a pose."""
+MAX_ERROR = 4.0
+"""Pixels that a point that agrees may be off."""
+_RATIO = 0.8
+
+
+class Localiser:
+    """The points that the placed frames see, with their looks."""
+
+    def __init__(
+        self,
+        positions: Sequence[Float64[np.ndarray, "_n 3"]],
+        descriptors: Sequence[UInt8[np.ndarray, "_n 128"]],
+        places: Sequence[int],
+        camera: Camera,
+        seed: int,
+    ) -> None:
+        """``positions`` and ``descriptors`` of the points that each placed frame sees.
+
+        ``places`` are the frames' numbers in the video, ascending; ``camera`` is that of the frames
+        to place.
+        """
+        self._positions, self._descriptors = positions, descriptors
+        self._places = np.array(places)
+        colmap = load_colmap()
+        self._camera: Any = colmap.Camera(
+            model=colmap.CameraModelId.PINHOLE, width=camera.width, height=camera.height,
+            params=[camera.fx, camera.fy, camera.cx + 0.5, camera.cy + 0.5],
+        )  # fmt: skip
+        self._options = colmap.AbsolutePoseEstimationOptions()
+        self._options.ransac.max_error = MAX_ERROR
+        self._options.ransac.random_seed = seed
+
+    def place(
+        self, number: int, image: UInt8[np.ndarray, "h w 3"]
+    ) -> Float64[np.ndarray, "4 4"] | None:
+        """World to camera of frame ``number`` of the video; none where too few points agree."""
+        near = self._near(number)
+        positions = np.concatenate([self._positions[k] for k in near])
+        looks = np.concatenate([self._descriptors[k] for k in near])
+        features = find_features(image)
+        if len(features) < LEAST_INLIERS or len(positions) < LEAST_INLIERS:
+            return None
+        own, known = matches_to_points(features.descriptors, looks, positions)
+        if len(own) < LEAST_INLIERS:
+            return None
+        pixels = features.keypoints[own, :2].astype(np.float64) + 0.5
+        found = load_colmap().estimate_and_refine_absolute_pose(
+            pixels, positions[known], self._camera, self._options
+        )
+        if found is None or found["num_inliers"] < LEAST_INLIERS:
+            return None
+        T_cw = np.eye(4)
+        T_cw[:3] = found["cam_from_world"].matrix()
+        return T_cw
+
+    def _near(self, number: int) -> list[int]:
+        at = int(np.searchsorted(self._places, number))
+        return list(range(max(0, at - NEIGHBOURS), min(len(self._places), at + NEIGHBOURS)))
+
+
+def matches_to_points(
+    own: UInt8[np.ndarray, "n 128"],
+    looks: UInt8[np.ndarray, "m 128"],
+    positions: Float64[np.ndarray, "m 3"],
+) -> tuple[Int64[np.ndarray, "k"], Int64[np.ndarray, "k"]]:
+    """Features and points that are each other's nearest in looks.
+
+    The second nearest has to be clearly farther, but for the same point as another frame sees it.
+    """
+    distance = _squares(own.astype(np.float32), looks.astype(np.float32))
+    rows = np.arange(len(own))
+    nearest = distance.argmin(1)
+    best = distance[rows, nearest].copy()
+    is_mutual = distance.argmin(0)[nearest] == rows
+    other = np.abs(positions[None, :, :] - positions[nearest][:, None, :]).max(-1) > 1e-9
+    second = np.where(other, distance, np.inf).min(1)
+    kept = np.flatnonzero(is_mutual & (best < _RATIO**2 * second))
+    return kept, nearest[kept]
+
+
+def _squares(
+    one: Float32[np.ndarray, "n d"], other: Float32[np.ndarray, "m d"]
+) -> Float32[np.ndarray, "n m"]:
+    distance = (one**2).sum(1)[:, None] + (other**2).sum(1) - 2 * one @ other.T
+    return distance.clip(0)

@@ -1,0 +1,126 @@
+"""Which photographs to match with which: few are all matched, of many those that look alike.
+
+A pair is first looked at with the largest few hundred features of both (Wu 2013, preemptive
+matching), which costs a hundredth of matching all. Beyond some hundred pictures even that is
+only done for pictures whose features are spread alike over words (VLAD, Jegou et al. 2010), and for
+neighbours by name.
+"""
+
+from collections.abc import Callable, Sequence
+
+import cv2
+import numpy as np
+from jaxtyping import Float32, UInt8
+
+from geogs.threads import thread_map
+from geogs_photos.features import Features
+
+ALL_PAIRS = 20
+"""Most pictures of which every pair is matched in full."""
+ALL_LOOKS = 200
+"""Most pictures of which every pair is looked at."""
+PREVIEW = 400
+"""Features of a picture that a first look compares."""
+LEAST_ALIKE = 6
+"""Matches in a first look from which on a pair is matched in full."""
+ALWAYS = 8
+"""Pictures most alike to each that are matched in full in any case, if they share anything."""
+MOST = 40
+"""Most pictures that one brings along, those most alike to it."""
+NEIGHBOURS = 2
+"""Next pictures by name that are matched in any case: photographs are taken one after another."""
+_WORDS, _SAMPLE, _CANDIDATES = 64, 200, 60
+_RATIO = 0.85
+
+Pairs = list[tuple[int, int]]
+"""Places of two pictures each, the first before the second, ascending."""
+
+
+def choose_pairs(
+    features: Sequence[Features],
+    seed: int = 0,
+    progress: Callable[[float], None] = lambda fraction: None,
+) -> Pairs:
+    """Pairs worth matching in full; how they are chosen follows from the number of pictures."""
+    count = len(features)
+    everything = [(i, j) for i in range(count) for j in range(i + 1, count)]
+    if count <= ALL_PAIRS:
+        return everything
+    looked_at = everything if count <= ALL_LOOKS else _candidates(features, seed)
+    previews = [f.largest(PREVIEW).astype(np.float32) for f in features]
+    alike = thread_map(
+        lambda pair: mutual_matches(previews[pair[0]], previews[pair[1]]), looked_at, progress
+    )
+    return _best(count, looked_at, alike)
+
+
+def mutual_matches(one: Float32[np.ndarray, "n 128"], other: Float32[np.ndarray, "m 128"]) -> int:
+    """Features that are each other's nearest, and clearly nearer than the second nearest."""
+    if len(one) < 2 or len(other) < 2:
+        return 0
+    distance = (one**2).sum(1)[:, None] + (other**2).sum(1) - 2 * one @ other.T
+    forward, backward = distance.argmin(1), distance.argmin(0)
+    two = np.partition(distance, 1, axis=1)[:, :2].clip(0)
+    is_clear = two[:, 0] < _RATIO**2 * two[:, 1]
+    return int((is_clear & (backward[forward] == np.arange(len(one)))).sum())
+
+
+def _best(count: int, pairs: Pairs, alike: Sequence[int]) -> Pairs:
+    """The pairs that a first look speaks for, the most alike to each picture, and neighbours."""
+    of_picture: list[list[tuple[int, int]]] = [[] for _ in range(count)]
+    for (i, j), matches in zip(pairs, alike, strict=True):
+        if matches:
+            of_picture[i].append((-matches, j))
+            of_picture[j].append((-matches, i))
+    kept = {(i, j) for i in range(count) for j in range(i + 1, min(i + 1 + NEIGHBOURS, count))}
+    for i, others in enumerate(of_picture):
+        for rank, (matches, j) in enumerate(sorted(others)[:MOST]):
+            if rank < ALWAYS or -matches >= LEAST_ALIKE:
+                kept.add((min(i, j), max(i, j)))
+    return sorted(kept)
+
+
+def _candidates(features: Sequence[Features], seed: int) -> Pairs:
+    """Pairs of pictures whose features are spread alike."""
+    looks = vlad([f.largest(PREVIEW) for f in features], seed)
+    likeness = looks @ looks.T
+    np.fill_diagonal(likeness, -np.inf)
+    nearest = np.argpartition(-likeness, _CANDIDATES, axis=1)[:, :_CANDIDATES]
+    return sorted({(min(i, j), max(i, j)) for i, row in enumerate(nearest.tolist()) for j in row})
+
+
+def vlad(
+    descriptors: Sequence[UInt8[np.ndarray, "_n 128"]], seed: int = 0
+) -> Float32[np.ndarray, "k d"]:
+    """A unit vector for each picture: how its descriptors lie about words common to all of them.
+
+    The words are the means of clusters of the pictures' own descriptors. A picture without
+    descriptors gets zeros.
+    """
+    sample = np.concatenate([d[:_SAMPLE] for d in descriptors]).astype(np.float32)
+    words = _clusters(sample, min(_WORDS, len(sample)), seed)
+    vectors = np.zeros((len(descriptors), words.size), np.float32)
+    for vector, some in zip(vectors, descriptors, strict=True):
+        if not len(some):
+            continue
+        rows = some.astype(np.float32)
+        word = ((words**2).sum(1) - 2 * rows @ words.T).argmin(1)
+        residual = np.zeros_like(words)
+        np.add.at(residual, word, rows - words[word])
+        # Each word counts the same, however many features it has (intra-normalisation).
+        residual /= np.maximum(np.linalg.norm(residual, axis=1, keepdims=True), 1e-9)
+        vector[:] = residual.ravel() / max(float(np.linalg.norm(residual)), 1e-9)
+    return vectors
+
+
+def _clusters(
+    sample: Float32[np.ndarray, "n 128"], count: int, seed: int
+) -> Float32[np.ndarray, "k 128"]:
+    if count == 0:
+        return np.zeros((1, 128), np.float32)
+    cv2.setRNGSeed(seed)
+    criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 15, 1.0)
+    _, _, centres = cv2.kmeans(
+        sample, count, np.zeros((len(sample), 1), np.int32), criteria, 1, cv2.KMEANS_PP_CENTERS
+    )
+    return centres

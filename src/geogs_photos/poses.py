@@ -1,0 +1,194 @@
+"""Photographs in; a COLMAP model of the largest part that hangs together out, and what is not."""
+
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from geogs.errors import InputError
+from geogs.io.pictures import read_mask
+from geogs.io.sources.intrinsics import calibration_from_exif, resolve_intrinsics
+from geogs.io.sources.posed.colmap import mask_beside
+from geogs.io.sources.posed.pictures import read_picture
+from geogs.threads import thread_map, worker_count
+from geogs_photos.database import Entry, SharedCamera, match_pairs, write_database
+from geogs_photos.features import Features, find_features
+from geogs_photos.library import load_colmap
+from geogs_photos.pairs import Pairs, choose_pairs
+from geogs_photos.photograph import Lens, PhotoFolder, Photograph
+from geogs_photos.structure import put_together, refine
+from geogs_photos.upright import upright_rotation
+
+Progress = Callable[[str, float], None]
+"""Called with the name of a stage and its finished part; what it raises ends the work."""
+
+FEWEST_FEATURES = 50
+"""Features of a picture that can be matched with others."""
+FEWEST_MATCHES = 15
+"""Matches of two pictures that count as showing the same."""
+
+
+@dataclass(frozen=True, slots=True)
+class LeftOut:
+    """A photograph that has no pose."""
+
+    name: str
+    reason: str
+    """A clause that goes on after the name."""
+
+
+@dataclass(frozen=True, slots=True)
+class FoundPoses:
+    """What structure from motion came to."""
+
+    placed: tuple[str, ...]
+    """Names of the photographs that have a pose."""
+    left_out: tuple[LeftOut, ...]
+    error: float
+    """Mean distance of the points from where they were seen, pixels of the stored pictures."""
+
+
+def find_poses(
+    folder: PhotoFolder, model: Path, intrinsics: str, seed: int, progress: Progress
+) -> FoundPoses:
+    """Find where photographs were taken, and write it as a COLMAP model.
+
+    The world is upright, in an arbitrary unit. Pixels are those of the stored pictures.
+
+    Args:
+        folder: the photographs.
+        model: folder for ``cameras.bin``, ``images.bin`` and ``points3D.bin``.
+        intrinsics: as ``InputConfig.intrinsics``; other than auto, they are kept as they are.
+        seed: of the random choices.
+        progress: follows the work.
+
+    Raises:
+        InputError: pycolmap is missing, the intrinsics do not fit, or fewer than three photographs
+            hang together.
+    """
+    colmap = load_colmap()
+    photographs = folder.photographs
+    if len(photographs) < 3:
+        raise InputError(
+            f"{folder.root} holds {len(photographs)} photographs that can be read; finding their "
+            "poses needs three or more."
+        )
+    cameras, camera_of = shared_cameras(photographs, intrinsics)
+    features = thread_map(
+        lambda p: _features(p, folder.root), photographs, lambda f: progress("features", f)
+    )
+    pairs = choose_pairs(features, seed, lambda f: progress("choosing pairs", f))
+    names = [photograph.name for photograph in photographs]
+    entries = [Entry(*e) for e in zip(names, camera_of, features, strict=True)]
+    with tempfile.TemporaryDirectory(prefix="geogs-photos-") as work:
+        parts, kept = structure_of(Path(work), cameras, entries, pairs, seed, progress)
+    left_out = [LeftOut(name, "cannot be read") for name in folder.damaged]
+    left_out += reasons(entries, kept, [_names(part) for part in parts])
+    if not parts:
+        raise InputError(_nothing_found(folder.root, entries, kept))
+    progress("adjusting", 0.0)
+    best = refine(parts[0], cameras, worker_count())
+    progress("adjusting", 1.0)
+    _make_upright(colmap, best, {p.name: p.quarter_turns for p in photographs})
+    best.extract_colors_for_all_images(folder.root, worker_count())
+    model.mkdir(parents=True, exist_ok=True)
+    best.write(model)
+    placed = tuple(name for name in names if name in _names(best))
+    return FoundPoses(placed, tuple(left_out), float(best.compute_mean_reprojection_error()))
+
+
+def structure_of(
+    work: Path,
+    cameras: Sequence[SharedCamera],
+    entries: Sequence[Entry],
+    pairs: Pairs,
+    seed: int,
+    progress: Progress,
+) -> tuple[list[Any], np.ndarray]:
+    """Parts that hang together, largest first, and the kept matches of any two pictures."""
+    threads = worker_count()
+    database = work / "database.db"
+    write_database(database, cameras, entries)
+    kept = match_pairs(database, entries, pairs, seed, threads, lambda f: progress("matching", f))
+    known = [place + 1 for place, camera in enumerate(cameras) if camera.is_known]
+    parts = put_together(
+        database, work / "models", len(entries), known, seed, threads,
+        lambda f: progress("finding poses", f),
+    )  # fmt: skip
+    return parts, kept
+
+
+def shared_cameras(
+    photographs: Sequence[Photograph], intrinsics: str
+) -> tuple[list[SharedCamera], list[int]]:
+    """One camera for all photographs whose headers name the same, and which took each."""
+    lenses: dict[Lens, Photograph] = {}
+    for photograph in photographs:
+        lenses.setdefault(photograph.lens, photograph)
+    is_known = intrinsics.strip().lower() != "auto"
+    cameras = []
+    for lens, photograph in lenses.items():
+        nominal = None if is_known else calibration_from_exif(photograph.path)
+        begin = resolve_intrinsics(intrinsics, nominal, lens.width, lens.height)
+        cameras.append(SharedCamera(begin, is_known))
+    places = {lens: place for place, lens in enumerate(lenses)}
+    return cameras, [places[photograph.lens] for photograph in photographs]
+
+
+def reasons(entries: Sequence[Entry], kept: np.ndarray, parts: Sequence[set[str]]) -> list[LeftOut]:
+    """Why each picture that is not in the first part is not."""
+    left_out = []
+    for place, entry in enumerate(entries):
+        if parts and entry.name in parts[0]:
+            continue
+        others = next((len(part) for part in parts[1:] if entry.name in part), 0)
+        shared = np.flatnonzero(kept[place] >= FEWEST_MATCHES)
+        if len(entry.features) < FEWEST_FEATURES:
+            reason = f"has only {len(entry.features)} features: blurred, dark or bare"
+        elif others:
+            reason = f"belongs to a part of {others} photographs that nothing joins to the rest"
+        elif not len(shared):
+            reason = "shows nothing that another photograph shows"
+        else:
+            most = int(kept[place].max())
+            with_name = entries[int(kept[place].argmax())].name
+            reason = f"shares too little with the others (most, {most} matches, with {with_name})"
+        left_out.append(LeftOut(entry.name, reason))
+    return left_out
+
+
+def _features(photograph: Photograph, root: Path) -> Features:
+    """Features of a photograph, inside its mask where there is one; none where it is damaged."""
+    try:
+        picture = read_picture(photograph.path)
+    except InputError:
+        return Features.none()
+    mask = mask_beside(root, photograph.name)
+    return find_features(picture, None if mask is None else read_mask(mask, picture.shape[:2]))
+
+
+def _names(model: Any) -> set[str]:
+    return {image.name for image in model.images.values() if image.has_pose}
+
+
+def _make_upright(colmap: Any, model: Any, turns: dict[str, int]) -> None:
+    images = sorted((i for i in model.images.values() if i.has_pose), key=lambda i: i.image_id)
+    R_cw = np.stack([image.cam_from_world().rotation.matrix() for image in images])
+    rotation = upright_rotation(R_cw, [turns.get(image.name, 0) for image in images])
+    model.transform(colmap.Sim3d(1.0, colmap.Rotation3d(rotation), np.zeros(3)))
+
+
+def _nothing_found(root: Path, entries: Sequence[Entry], kept: np.ndarray) -> str:
+    matched = int((kept >= FEWEST_MATCHES).any(axis=1).sum())
+    if matched < 3:
+        return (
+            f"{root}: only {matched} of {len(entries)} photographs show something that another "
+            "one shows; are they of one place, with much overlap from one to the next?"
+        )
+    return (
+        f"{root}: {matched} of {len(entries)} photographs match, but no three of them tell where "
+        "they were taken; take them from different places, not by turning on the spot."
+    )

@@ -1,0 +1,117 @@
+"""Poses, cameras and points of matched photographs, by pycolmap's incremental mapping."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from geogs_photos.database import SharedCamera
+from geogs_photos.library import load_colmap
+
+LEAST_IMAGES = 3
+"""Fewest pictures of a part that counts as one."""
+FREE_IMAGES = 8
+"""Pictures of a camera from which on its principal point and a second radial term are found."""
+FREE_POINTS = 300
+"""Points that each of these pictures sees, in the mean, at least."""
+MAX_OFFSET = 0.08
+"""Most that a found principal point may lie from the middle, as a part of the longer side."""
+_ITERATIONS, _TOLERANCE = 50, 1e-6
+
+
+def put_together(
+    database: Path,
+    work: Path,
+    count: int,
+    known: Sequence[int],
+    seed: int,
+    threads: int,
+    progress: Callable[[float], None],
+) -> list[Any]:
+    """Reconstructions of the parts that hang together, the largest first.
+
+    Args:
+        database: with verified matches of ``count`` pictures.
+        work: folder for what pycolmap writes.
+        count: how many pictures there are.
+        known: numbers of the cameras that stay as they are.
+        seed: of the random choices.
+        threads: to compute with.
+        progress: called with the finished part; what it raises ends the work.
+    """
+    colmap = load_colmap()
+    options = colmap.IncrementalPipelineOptions(
+        num_threads=threads, random_seed=seed, min_model_size=LEAST_IMAGES, extract_colors=False
+    )
+    options.constant_cameras = set(known)
+    options.mapper.random_seed = options.triangulation.random_seed = seed
+    placed = 2
+
+    def after_image() -> None:
+        nonlocal placed
+        placed += 1
+        progress(min(placed / count, 1.0))
+
+    work.mkdir(parents=True, exist_ok=True)
+    models = colmap.incremental_mapping(
+        database, work, work, options=options, next_image_callback=after_image
+    )
+    parts = [model for model in models.values() if model.num_reg_images() >= LEAST_IMAGES]
+    return sorted(parts, key=lambda model: -model.num_reg_images())
+
+
+def refine(model: Any, cameras: Sequence[SharedCamera], threads: int) -> Any:
+    """The reconstruction adjusted once more, robustly, with more of each camera.
+
+    Cameras that are not known and have the pictures for it get their principal point and a second
+    radial term, unless that runs away; the others keep what they have. Pixels are square: with two
+    focal lengths, which pictures hardly tell apart, surveyed cameras came out no better.
+    """
+    colmap = load_colmap()
+    known = {place + 1 for place, camera in enumerate(cameras) if camera.is_known}
+    free = {number for number in model.cameras if _is_free(model, number) and number not in known}
+    trial = colmap.Reconstruction(model)
+    for number in free:
+        camera = trial.cameras[number]
+        focal, cx, cy, k1 = camera.params
+        camera.model = colmap.CameraModelId.RADIAL
+        camera.params = [focal, cx, cy, k1, 0.0]
+    if free:
+        _adjust(colmap, trial, set(model.cameras) - free, with_centres=True, threads=threads)
+        if all(_is_central(trial.cameras[number]) for number in free):
+            return trial
+    _adjust(colmap, model, known, with_centres=False, threads=threads)
+    return model
+
+
+def _is_free(model: Any, number: int) -> bool:
+    seen = [
+        image.num_points3D
+        for image in model.images.values()
+        if image.has_pose and image.camera_id == number
+    ]
+    return len(seen) >= FREE_IMAGES and sum(seen) >= FREE_POINTS * len(seen)
+
+
+def _is_central(camera: Any) -> bool:
+    offset = max(
+        abs(camera.principal_point_x - camera.width / 2),
+        abs(camera.principal_point_y - camera.height / 2),
+    )
+    return offset <= MAX_OFFSET * max(camera.width, camera.height)
+
+
+def _adjust(colmap: Any, model: Any, constant: set[int], with_centres: bool, threads: int) -> None:
+    options = colmap.BundleAdjustmentOptions(
+        refine_principal_point=with_centres, print_summary=False
+    )
+    options.ceres.loss_function_type = colmap.LossFunctionType.SOFT_L1
+    options.ceres.solver_options.max_num_iterations = _ITERATIONS
+    options.ceres.solver_options.function_tolerance = _TOLERANCE
+    options.ceres.solver_options.num_threads = threads
+    config = colmap.BundleAdjustmentConfig()
+    for number in model.reg_image_ids():
+        config.add_image(number)
+    for number in constant:
+        config.set_constant_cam_intrinsics(number)
+    config.fix_gauge(colmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    colmap.create_default_bundle_adjuster(options, config, model).solve()

@@ -1,0 +1,142 @@
+"""Structure from motion of chosen frames of a video."""
+
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64, UInt8
+
+from geogs.errors import InputError
+from geogs.geometry.camera import Camera
+from geogs.io.sources.calibration import Calibration
+from geogs.io.sources.calibration_files import calibration_from_colmap
+from geogs.threads import thread_map, worker_count
+from geogs.types import Frame
+from geogs_photos.database import Entry, SharedCamera
+from geogs_photos.deviations import pose_deviations
+from geogs_photos.features import find_features
+from geogs_photos.library import load_colmap
+from geogs_photos.pairs import choose_pairs
+from geogs_photos.poses import Progress, structure_of
+from geogs_photos.structure import refine
+from geogs_photos.upright import upright_rotation
+
+NEXT = 6
+"""Chosen frames after each that it is matched with in any case."""
+
+
+@dataclass(frozen=True, slots=True)
+class PlacedFrames:
+    """Chosen frames with a pose, in time order, and the points that they see."""
+
+    numbers: tuple[int, ...]
+    """Of the frames in the video."""
+    T_cw: Float64[np.ndarray, "n 4 4"]
+    """World to camera."""
+    deviation: Float64[np.ndarray, "n"]
+    """Of the camera's centre after the similarity that fits best; infinite where unknown."""
+    rotation: Float64[np.ndarray, "n"]
+    """Of its orientation, radians."""
+    depth: Float64[np.ndarray, "n"]
+    """Of its points' depths, as a part of them: the median."""
+    positions: tuple[Float64[np.ndarray, "_m 3"], ...]
+    """Of the points that each frame sees."""
+    descriptors: tuple[UInt8[np.ndarray, "_m 128"], ...]
+    calibration: Calibration
+    """Of the frames as they were given."""
+    error: float
+    """Mean distance of the points from where they were seen, pixels."""
+
+    def all_points(self) -> Float64[np.ndarray, "k 3"]:
+        """Every point once."""
+        return np.unique(np.concatenate(self.positions), axis=0)
+
+
+def place_frames(
+    frames: Sequence[Frame], camera: Camera, is_known: bool, seed: int, progress: Progress
+) -> PlacedFrames:
+    """Find where frames of one camera were taken; of the largest part that hangs together.
+
+    Args:
+        frames: in time order.
+        camera: of the frames; where the search begins if it is not known.
+        is_known: whether the camera is to stay as it is.
+        seed: of the random choices.
+        progress: follows the work.
+
+    Raises:
+        InputError: pycolmap is missing, or fewer than three frames hang together.
+    """
+    colmap = load_colmap()
+    begin = Calibration(
+        camera.fx, camera.fy, camera.cx, camera.cy, width=camera.width, height=camera.height,
+        is_guess=not is_known,
+    )  # fmt: skip
+    features = thread_map(
+        lambda frame: find_features(frame.image), frames, lambda f: progress("features", f)
+    )
+    chosen = choose_pairs(features, seed, lambda f: progress("choosing pairs", f))
+    count = len(frames)
+    following = {(i, j) for i in range(count) for j in range(i + 1, min(i + 1 + NEXT, count))}
+    pairs = sorted({*chosen, *following})
+    entries = [Entry(f"{k:06d}", 0, some) for k, some in enumerate(features)]
+    shared = [SharedCamera(begin, is_known)]
+    with tempfile.TemporaryDirectory(prefix="geogs-video-") as work:
+        parts, _ = structure_of(Path(work), shared, entries, pairs, seed, progress)
+    if not parts:
+        raise InputError(
+            f"Of {count} sharp frames no three tell where they were taken; the camera has to move, "
+            "and the scene to show texture."
+        )
+    best = refine(parts[0], shared, worker_count())
+    images = sorted((i for i in best.images.values() if i.has_pose), key=lambda i: i.name)
+    R_cw = np.stack([image.cam_from_world().rotation.matrix() for image in images])
+    up = upright_rotation(R_cw, [0] * len(images))
+    best.transform(colmap.Sim3d(1.0, colmap.Rotation3d(up), np.zeros(3)))
+    return _placed(best, frames, entries, is_known)
+
+
+def _placed(
+    model: Any, frames: Sequence[Frame], entries: Sequence[Entry], is_known: bool
+) -> PlacedFrames:
+    images = sorted((i for i in model.images.values() if i.has_pose), key=lambda i: i.name)
+    T_cw = np.tile(np.eye(4), (len(images), 1, 1))
+    positions, descriptors = [], []
+    for pose, image in zip(T_cw, images, strict=True):
+        pose[:3] = image.cam_from_world().matrix()
+        seen = [(k, p.point3D_id) for k, p in enumerate(image.points2D) if p.has_point3D()]
+        positions.append(np.array([model.points3D[p].xyz for _, p in seen]).reshape(-1, 3))
+        descriptors.append(entries[int(image.name)].features.descriptors[[k for k, _ in seen]])
+    camera = next(iter(model.cameras.values()))
+    calibration = calibration_from_colmap(
+        camera.model.name, camera.width, camera.height, camera.params.tolist(), "the video itself"
+    )
+    error = float(model.compute_mean_reprojection_error())
+    deviation, rotation = pose_deviations(model, images, T_cw, error, is_known)
+    depth = np.array([_depth_deviation(model, image, error) for image in images])
+    numbers = tuple(frames[int(image.name)].index for image in images)
+    return PlacedFrames(
+        numbers, T_cw, deviation, rotation, depth, tuple(positions), tuple(descriptors),
+        calibration, error,
+    )  # fmt: skip
+
+
+def _depth_deviation(model: Any, image: Any, error: float) -> float:
+    """Median relative deviation of the depths of an image's points, by their parallax.
+
+    Of a point whose rays meet at an angle a, depth is known to error / (f a) of itself.
+    """
+    focal = float(model.cameras[image.camera_id].mean_focal_length())
+    centre, found = image.projection_center(), []
+    for number in {p.point3D_id for p in image.points2D if p.has_point3D()}:
+        point = model.points3D[number]
+        others = [model.images[e.image_id] for e in point.track.elements]
+        rays = np.stack([point.xyz - other.projection_center() for other in others])
+        ray = point.xyz - centre
+        cosine = rays @ ray / (np.linalg.norm(rays, axis=1) * np.linalg.norm(ray)).clip(1e-12)
+        angle = float(np.arccos(cosine.clip(-1, 1)).max())
+        found.append(error / (focal * max(angle, 1e-6)))
+    return float(np.median(found)) if found else float("inf")
