@@ -5,8 +5,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from geogs.tracking.flow.base import FlowMatch, Memories
+from geogs.tracking.flow.base import Memories
 from geogs.tracking.flow.classical import ClassicalFlow, ClassicalImage
+from geogs.types import FlowMatch
 
 
 class CredulousFlow(ClassicalFlow):

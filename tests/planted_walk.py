@@ -11,8 +11,9 @@ from geogs.bundle.projection import project
 from geogs.config import TrackingConfig
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp, se3_inverse
-from geogs.tracking.flow.base import FlowMatch, Memories
+from geogs.tracking.flow.base import Memories
 from geogs.tracking.tracker import Tracker, TrackState
+from geogs.types import FlowMatch
 from geogs.world.grid import SampleGrid
 
 CAMERA = Camera(fx=480.0, fy=480.0, cx=255.5, cy=143.5, width=512, height=288)

@@ -7,8 +7,8 @@ from geogs.config import LoopConfig
 from geogs.geometry.lie import se3_inverse
 from geogs.loop.closing_matches import closing_matches, take_over_depths
 from geogs.loop.detect import Loop
-from geogs.tracking.flow.base import FlowMatch
 from geogs.tracking.graph import MeasuredEdge
+from geogs.types import FlowMatch
 from keyframe_samples import Sample, segment_of
 
 

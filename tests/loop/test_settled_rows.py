@@ -13,10 +13,9 @@ from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp, se3_inverse
 from geogs.loop.global_bundle import global_bundle
 from geogs.loop.settled_rows import _readout_gradient, _Search, settle_rows
-from geogs.tracking.flow.base import FlowMatch
 from geogs.tracking.row_errors import RowErrors
 from geogs.tracking.tracker import Tracker, TrackState
-from geogs.types import SeenRows
+from geogs.types import FlowMatch, SeenRows
 from geogs.world.grid import SampleGrid
 from planted_walk import PlantedFlow, true_inverse_depth
 

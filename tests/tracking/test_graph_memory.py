@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from geogs.tracking.flow.base import FlowMatch, FlowOperator, Memories
+from geogs.tracking.flow.base import FlowOperator, Memories
 from geogs.tracking.graph import FrameGraph
+from geogs.types import FlowMatch
 from geogs.world.grid import SampleGrid
 from geogs.world.store import KeyframeStore
 from tracking_scenes import CAMERA, pose

@@ -6,8 +6,8 @@ import torch
 
 from geogs.bundle.marginals import ALIKE
 from geogs.geometry.lie import retract, se3_inverse
-from geogs.tracking.flow.base import FlowMatch
 from geogs.tracking.pose_deviation import pose_deviation
+from geogs.types import FlowMatch
 from geogs.world.grid import SampleGrid
 from keyframe_samples import Sample, segment_of
 from tracking_scenes import CAMERA, pose, render

@@ -9,7 +9,6 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from geogs.geometry.lie import se3_inverse, so3_exp, so3_log
-from geogs.tracking.flow.base import FlowMatch
 from geogs.tracking.flow.classical import ClassicalFlow
 from geogs.tracking.rotation import (
     epipolar_squares,
@@ -17,6 +16,7 @@ from geogs.tracking.rotation import (
     gric,
     relative_rotation,
 )
+from geogs.types import FlowMatch
 from geogs.world.grid import SampleGrid
 from tracking_scenes import CAMERA, pose, render
 

@@ -6,10 +6,9 @@ import numpy as np
 import torch
 
 from geogs.geometry.lie import se3_exp, se3_inverse
-from geogs.tracking.flow.base import FlowMatch
 from geogs.tracking.gaps import interpolate
 from geogs.tracking.trajectory import TrajectoryRecorder, depth_aware_weight
-from geogs.types import Frame, SeenRows
+from geogs.types import FlowMatch, Frame, SeenRows
 from planted_walk import planted_tracker
 
 

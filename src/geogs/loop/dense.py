@@ -10,8 +10,9 @@ from torch import Tensor
 from geogs.bundle.projection import project
 from geogs.config import VerificationOptions
 from geogs.geometry.lie import scaled, se3_inverse, so3_log
-from geogs.tracking.flow.base import FlowMatch, FlowOperator
+from geogs.tracking.flow.base import FlowOperator
 from geogs.tracking.motion import FrameLocator, FrameMotion
+from geogs.types import FlowMatch
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframe import Keyframe
 

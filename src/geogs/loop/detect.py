@@ -23,9 +23,10 @@ from geogs.loop.search import (
     SearchState,
     Sighting,
 )
-from geogs.tracking.flow.base import FlowMatch, FlowOperator
+from geogs.tracking.flow.base import FlowOperator
 from geogs.tracking.motion import Recognition
 from geogs.tracking.proximity import frame_distances
+from geogs.types import FlowMatch
 from geogs.world.store import KeyframeStore
 
 

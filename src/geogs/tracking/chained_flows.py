@@ -6,10 +6,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from geogs.tracking.features import surer_flows
-from geogs.tracking.flow.base import FlowMatch
 from geogs.tracking.flow.filled import filled_positions
 from geogs.tracking.graph import FrameGraph
 from geogs.tracking.proximity import Pair
+from geogs.types import FlowMatch
 
 Positions = tuple[Float[Tensor, "p 2"], Float[Tensor, "p 2"]]
 """Where the cells of one keyframe lie in another, and those of the other in it."""

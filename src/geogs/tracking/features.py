@@ -15,7 +15,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from geogs.bundle.select import grid_fields
-from geogs.tracking.flow.base import FlowMatch, FlowOperator
+from geogs.tracking.flow.base import FlowOperator
+from geogs.types import FlowMatch
 from geogs.world.grid import SampleGrid
 
 FEATURES = 2000

@@ -18,7 +18,7 @@ from geogs.bundle.select import (
 )
 from geogs.errors import InputError
 from geogs.threads import thread_map
-from geogs.tracking.flow.base import FlowMatch, FlowOperator
+from geogs.tracking.flow.base import FlowOperator
 from geogs.tracking.moving import judge, still_weight
 from geogs.tracking.odometry import Odometry
 from geogs.tracking.packed_edge import (
@@ -28,6 +28,7 @@ from geogs.tracking.packed_edge import (
     packed_reprojections,
 )
 from geogs.tracking.proximity import PAIRS_TOGETHER, Pair
+from geogs.types import FlowMatch
 from geogs.world.keyframe import Keyframe
 from geogs.world.store import Segment
 

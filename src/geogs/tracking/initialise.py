@@ -25,9 +25,9 @@ from geogs.geometry.lie import se3_inverse
 from geogs.threads import thread_map
 from geogs.tracking.evidence import Evidence, correlation_at
 from geogs.tracking.features import surer_flows
-from geogs.tracking.flow.base import FlowMatch
 from geogs.tracking.graph import FrameGraph
 from geogs.tracking.motion import pnp
+from geogs.types import FlowMatch
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframe import Keyframe
 from geogs.world.store import Segment

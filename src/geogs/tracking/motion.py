@@ -20,8 +20,9 @@ from geogs.tracking.evidence import (
     matched_motion,
 )
 from geogs.tracking.features import FeatureMatches, match_features, surer_flow
-from geogs.tracking.flow.base import FlowMatch, FlowOperator
+from geogs.tracking.flow.base import FlowOperator
 from geogs.tracking.flow.filled import filled_positions
+from geogs.types import FlowMatch
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframe import Keyframe
 

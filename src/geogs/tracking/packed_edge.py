@@ -11,7 +11,7 @@ from torch import Tensor
 from geogs.bundle.projection import project
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_inverse
-from geogs.tracking.flow.base import FlowMatch
+from geogs.types import FlowMatch
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframe import Keyframe
 

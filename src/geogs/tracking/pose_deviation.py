@@ -9,8 +9,8 @@ from torch import Tensor
 from geogs.bundle.marginals import ALIKE
 from geogs.bundle.projection import linearise
 from geogs.geometry.lie import se3_inverse
-from geogs.tracking.flow.base import FlowMatch
 from geogs.tracking.trajectory import depth_aware_weight
+from geogs.types import FlowMatch
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframe import Keyframe
 

@@ -14,8 +14,8 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from geogs.geometry.nearest_rotation import nearest_rotation
-from geogs.tracking.flow.base import FlowMatch
 from geogs.tracking.initialise import rays_through, relative_pose
+from geogs.types import FlowMatch
 from geogs.world.grid import SampleGrid
 
 AGREEING = 0.4

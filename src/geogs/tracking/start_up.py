@@ -10,7 +10,6 @@ import torch
 
 from geogs.config import TrackingConfig
 from geogs.tracking.chained_flows import ChainedFlows
-from geogs.tracking.flow.base import FlowMatch
 from geogs.tracking.graph import FrameGraph
 from geogs.tracking.initialise import Attempt, initialise
 from geogs.tracking.keyframe_choice import KeyframeChoice
@@ -19,7 +18,7 @@ from geogs.tracking.motion import ChainState, FlowChain
 from geogs.tracking.rotation import relative_rotation
 from geogs.tracking.trajectory import TrajectoryRecorder
 from geogs.tracking.turns import Turn
-from geogs.types import Frame
+from geogs.types import FlowMatch, Frame
 from geogs.world.grid import SampleGrid
 
 MIN_KEYFRAMES = 4

@@ -16,12 +16,12 @@ from geogs.bundle.projection import linearise
 from geogs.bundle.select import grid_fields, motion_solver
 from geogs.errors import InputError
 from geogs.geometry.lie import retract, se3_inverse, se3_log, so3_log
-from geogs.tracking.flow.base import FlowMatch, FlowOperator
+from geogs.tracking.flow.base import FlowOperator
 from geogs.tracking.gaps import bridged
 from geogs.tracking.packed_edge import in_steps, pack_matches, unpacked_positions
 from geogs.tracking.row_errors import RowErrors
 from geogs.tracking.turns import Turn, orientations
-from geogs.types import Frame, SeenRows, Trajectory
+from geogs.types import FlowMatch, Frame, SeenRows, Trajectory
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframe import Keyframe
 from geogs.world.store import Segment

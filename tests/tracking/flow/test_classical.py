@@ -6,8 +6,9 @@ import pytest
 import torch
 
 from geogs.bundle.projection import project
-from geogs.tracking.flow.base import FlowMatch, FlowOperator
+from geogs.tracking.flow.base import FlowOperator
 from geogs.tracking.flow.classical import ClassicalFlow, match_deviation
+from geogs.types import FlowMatch
 from geogs.world.grid import SampleGrid
 from tracking_scenes import CAMERA, pose, render
 

@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from geogs.geometry.camera import Camera
 from geogs.tracking.calibration.keyframes import on_cpu, with_focal
-from geogs.tracking.flow.base import FlowMatch
+from geogs.types import FlowMatch
 from geogs.world.grid import SampleGrid
 
 MAX_COST = 6.0

@@ -11,11 +11,11 @@ from torch import Tensor
 from geogs.config import TrackingConfig
 from geogs.geometry.camera import Camera
 from geogs.tracking.features import surer_flows
-from geogs.tracking.flow.base import FlowMatch, FlowOperator
+from geogs.tracking.flow.base import FlowOperator
 from geogs.tracking.flow.filled import filled_flow, filled_positions
 from geogs.tracking.keyframe_choice import calls_for_keyframe
 from geogs.tracking.motion import FlowChain
-from geogs.types import Frame
+from geogs.types import FlowMatch, Frame
 from geogs.world.grid import SampleGrid
 
 MIN_MATCHED = 0.12

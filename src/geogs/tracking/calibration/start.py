@@ -17,9 +17,9 @@ from geogs.bundle.problem import BundleProblem
 from geogs.bundle.select import grid_fields
 from geogs.geometry.camera import Camera
 from geogs.tracking.calibration.keyframes import on_cpu, stacked, with_focal
-from geogs.tracking.flow.base import FlowMatch
 from geogs.tracking.initialise import best_two_view, two_view
 from geogs.tracking.motion import pnp
+from geogs.types import FlowMatch
 from geogs.world.grid import SampleGrid
 
 FIELDS_OF_VIEW = (50.0, 70.0, 95.0)

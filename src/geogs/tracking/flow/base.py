@@ -1,36 +1,13 @@
 """What the tracker asks of a flow operator."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
-import torch
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
-
-@dataclass(frozen=True)
-class FlowMatch:
-    """Where the cells of one image lie in another."""
-
-    pixels: Float[Tensor, "e p 2"]
-    """Position in the second image of each grid cell of the first."""
-    weight: Float[Tensor, "e p 2"]
-    """Inverse variance of x and y in 1 / pixel^2; zero where there is no match."""
-    damping: Float[Tensor, "e p"] | None = None
-    """What resists a change of the first image's inverse depth, in the units of its inverse
-    variance; equal for all edges of a call that share the first image. None for nothing."""
-    memory: tuple[Any, ...] | None = field(default=None, metadata={"stored": False})
-    """Of each edge, what the operator wants to be given when it measures that edge again."""
-
-    def sure(self) -> Bool[Tensor, "e p"]:
-        """Cells that a geometry may be guessed from: matched with no less than a hundredth of the
-        weight of the edge's best, where a mere guess would count like a good match."""
-        weight = self.weight[..., 0]
-        best = torch.quantile(weight.float(), 0.98, dim=-1, keepdim=True)
-        return (weight > 0) & (weight > 0.01 * best)
-
+from geogs.types import FlowMatch
 
 Memories = Sequence[tuple[Any, Any]]
 """Of each pair, what the operator returned as memory of the two directions; None for nothing."""

@@ -18,8 +18,9 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from geogs.threads import worker_count
-from geogs.tracking.flow.base import FlowMatch, Memories
+from geogs.tracking.flow.base import Memories
 from geogs.tracking.flow.texture import MIN_STRUCTURE, cell_structure
+from geogs.types import FlowMatch
 from geogs.world.grid import OFFSET, STRIDE, SampleGrid
 
 FAR = 1e3

@@ -19,13 +19,14 @@ from torch import Tensor
 from geogs.errors import InputError
 from geogs.gpu.kernels import Kernel, kernels_for
 from geogs.gpu.transfer import to_device
-from geogs.tracking.flow.base import FlowMatch, Memories
+from geogs.tracking.flow.base import Memories
 from geogs.tracking.flow.classical import (
     COARSE_DEVIATION,
     MAX_DISAGREEMENT,
     SMALL_IMAGE,
 )
 from geogs.tracking.flow.texture import MIN_STRUCTURE
+from geogs.types import FlowMatch
 from geogs.world.grid import SampleGrid
 
 SOURCES = Path(__file__).parents[1] / "cuda"

@@ -25,7 +25,7 @@ from torch import Tensor
 from geogs.errors import InputError
 from geogs.gpu.transfer import to_device
 from geogs.networks.weights import read_tensors
-from geogs.tracking.flow.base import FlowMatch, Memories
+from geogs.tracking.flow.base import Memories
 from geogs.tracking.flow.correlation import CorrelationLookup, CorrelationVolume, LocalCorrelation
 from geogs.tracking.flow.droid_network import (
     CORRELATION_SCALE,
@@ -37,6 +37,7 @@ from geogs.tracking.flow.droid_network import (
     on_cells,
 )
 from geogs.tracking.flow.texture import grey_levels, textured_fraction
+from geogs.types import FlowMatch
 from geogs.world.grid import OFFSET, STRIDE, SampleGrid
 
 FAR = 1e4

@@ -4,7 +4,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from geogs.bundle.select import grid_fields
-from geogs.tracking.flow.base import FlowMatch
+from geogs.types import FlowMatch
 from geogs.world.grid import SampleGrid
 
 

@@ -18,7 +18,7 @@ from geogs.documents import in_short
 from geogs.errors import InputError
 from geogs.gpu.recorded import Maps, Recorded
 from geogs.gpu.transfer import to_device
-from geogs.tracking.flow.base import FlowMatch, FlowOperator, Memories
+from geogs.tracking.flow.base import FlowOperator, Memories
 from geogs.tracking.flow.filled import filled_positions
 from geogs.tracking.flow.lookup import DescriptorPyramid, Edges, PyramidLevel
 from geogs.tracking.flow.own_network import (
@@ -27,6 +27,7 @@ from geogs.tracking.flow.own_network import (
     ImageFeatures,
     NetworkOptions,
 )
+from geogs.types import FlowMatch
 from geogs.world.grid import SampleGrid
 
 

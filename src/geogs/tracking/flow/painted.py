@@ -10,7 +10,8 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
-from geogs.tracking.flow.base import FlowMatch, FlowOperator, Memories
+from geogs.tracking.flow.base import FlowOperator, Memories
+from geogs.types import FlowMatch
 from geogs.world.grid import STRIDE, SampleGrid
 
 

@@ -18,11 +18,12 @@ from torch.nn import functional
 from geogs.errors import InputError
 from geogs.gpu.transfer import to_device
 from geogs.networks.weights import read_tensors
-from geogs.tracking.flow.base import FlowMatch, Memories
+from geogs.tracking.flow.base import Memories
 from geogs.tracking.flow.correlation import CorrelationVolume, LocalCorrelation
 from geogs.tracking.flow.raft_layout import network_from
 from geogs.tracking.flow.raft_network import CELL, RaftFeatures
 from geogs.tracking.flow.texture import grey_levels, textured_fraction
+from geogs.types import FlowMatch
 from geogs.world.grid import OFFSET, STRIDE, SampleGrid
 
 FAR = 1e3
