@@ -46,7 +46,7 @@ def test_what_does_nothing_says_so(words: str) -> None:
 
 
 def test_what_is_heeded_says_nothing() -> None:
-    assert said("run", "--tracking.weights", "x.pth", "--tracking.operator", "raft") == []
+    assert said("run", "--tracking.weights", "x.pth", "--tracking.operator", "droid") == []
     assert said("run", "--mapping.no-final-depth") == []
     assert said("run", "--mapping.final-iterations", "0") == []
     eta = ["--mapping.loss.smoothness-eta", "3"]

@@ -8,19 +8,18 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
+from droid_state import public_state
 from geogs.cli.main import main
 from geogs.config import TrackingConfig
 from geogs.errors import InputError
 from geogs.networks import weights_files
 from geogs.networks.weights import read_tensors
-from geogs.networks.weights_catalogue import CATALOGUE, KnownWeights
-from geogs.networks.weights_files import checksum, find_weights, weights_folders
+from geogs.networks.weights_files import CATALOGUE, checksum, find_weights, weights_folders
 from geogs.tracking.flow.classical import ClassicalFlow
-from geogs.tracking.flow.raft import RaftFlow
+from geogs.tracking.flow.droid import DroidFlow
 from geogs.tracking.flow.select import build_operator
 from geogs.tracking.tracker import Tracker
 from geogs.world.grid import SampleGrid
-from raft_oracle import published
 from tracking_scenes import CAMERA
 
 TENSORS = {"a.weight": torch.arange(6.0).reshape(2, 3), "a.bias": torch.tensor([1.0])}
@@ -53,32 +52,32 @@ def put(path: Path) -> Path:
 
 def test_order_is_given_then_variable_then_cache_then_package(places, tmp_path, monkeypatch):
     for name in ("package", "cache", "variable"):
-        path = put(places[name] / "raft-things.pth")
+        path = put(places[name] / "droid.pth")
         monkeypatch.setenv("GEOGS_WEIGHTS", str(places["variable"]))
-        assert find_weights("raft") == path
+        assert find_weights("droid") == path
     given = put(tmp_path / "given.pth")
-    assert find_weights("raft", str(given)) == given
+    assert find_weights("droid", str(given)) == given
 
 
 def test_the_variable_may_be_a_file_of_any_name(places, monkeypatch):
-    put(places["cache"] / "raft-things.pth")
-    path = put(places["variable"] / "my-raft.pth")
+    put(places["cache"] / "droid.pth")
+    path = put(places["variable"] / "my-droid.pth")
     monkeypatch.setenv("GEOGS_WEIGHTS", str(path))
-    assert find_weights("raft") == path
     assert find_weights("droid") == path
+    assert find_weights("own") == path
 
 
 def test_a_file_known_for_something_else_is_left_alone(places, monkeypatch):
-    cached = put(places["cache"] / "raft-small.pth")
+    cached = put(places["cache"] / "flow.safetensors")
     monkeypatch.setenv("GEOGS_WEIGHTS", str(put(places["variable"] / "droid.pth")))
-    assert find_weights("raft") == cached
+    assert find_weights("own") == cached
     assert find_weights("droid") == places["variable"] / "droid.pth"
 
 
 def test_of_several_files_the_first_of_the_catalogue_is_taken(places):
-    put(places["cache"] / "raft-small.pth")
-    put(places["package"] / "raft-sintel.pth")
-    assert find_weights("raft").name == "raft-sintel.pth"
+    put(places["cache"] / "omnidata_normal_dpt_hybrid.pth")
+    put(places["package"] / "metric3d-vit-small.onnx")
+    assert find_weights("prior").name == "metric3d-vit-small.onnx"
 
 
 def test_the_cache_is_geogs_own_where_that_is_set(tmp_path, monkeypatch):
@@ -88,40 +87,29 @@ def test_the_cache_is_geogs_own_where_that_is_set(tmp_path, monkeypatch):
 
 def test_what_is_not_there_is_told(tmp_path, monkeypatch):
     with pytest.raises(InputError, match=r"There is no weights file .*nowhere.pth\."):
-        find_weights("raft", str(tmp_path / "nowhere.pth"))
+        find_weights("droid", str(tmp_path / "nowhere.pth"))
     with pytest.raises(InputError, match=r"No weights for the operator droid .*geogs weights"):
         find_weights("droid")
     monkeypatch.setenv("GEOGS_WEIGHTS", str(tmp_path / "gone"))
     with pytest.raises(InputError, match=r"GEOGS_WEIGHTS is .*gone, which does not exist\."):
-        find_weights("raft")
+        find_weights("own")
 
 
 # --- checksums ---------------------------------------------------------------------------------
 
 
 def test_without_a_published_checksum_nothing_is_claimed(places):
-    found = checksum(put(places["cache"] / "raft-things.pth"))
+    found = checksum(put(places["cache"] / "droid.pth"))
     assert found.actual == hashlib.sha256(b"weights of weights").hexdigest()
     assert found.verdict == "no checksum is published, not verified"
     assert not found.is_wrong
 
 
-def test_published_digits_are_compared(places, monkeypatch):
-    path = put(places["cache"] / "some.pth")
-    digest = hashlib.sha256(path.read_bytes()).hexdigest()
-    for published_digits, verdict in (
-        (digest[:8], "first 8 digits of the checksum verified"),
-        (digest, "checksum verified"),
-        ("0" * 8, "WRONG checksum, 00000000 is published"),
-    ):
-        known = KnownWeights("some.pth", "raft", "", "", "", sha256=published_digits)
-        monkeypatch.setattr(weights_files, "known_as", lambda name, known=known: known)
-        assert checksum(path).verdict == verdict
-
-
 def test_another_file_of_a_published_name_is_not_read(places):
-    path = places["cache"] / "raft_small_C_T_V2-01064c6d.pth"
-    torch.save(TENSORS, path)
+    path = places["package"] / "flow.safetensors"
+    save_file(TENSORS, path)
+    (places["package"] / "SHA256SUMS").write_text(f"01064c6d{'0' * 56}  flow.safetensors\n")
+    assert checksum(path).verdict.startswith("WRONG checksum, 01064c6d0")
     with pytest.raises(InputError, match=r"its SHA-256 begins with \w{8}, not 01064c6d; get it ag"):
         read_tensors(path)
 
@@ -136,11 +124,9 @@ def test_packaged_weights_are_checked_against_their_list(places):
     assert checksum(put(places["cache"] / "flow.safetensors")).published == ""
 
 
-def test_names_of_the_catalogue_hold_the_digits_that_are_published():
+def test_names_of_the_catalogue_are_unique():
     names = [known.name for known in CATALOGUE]
     assert len(names) == len(set(names))
-    for known in CATALOGUE:
-        assert known.sha256 in known.name  # as PyTorch names its files
 
 
 # --- reading -----------------------------------------------------------------------------------
@@ -208,7 +194,7 @@ def test_more_than_tensors_is_told(tmp_path):
 
 
 def test_the_list_tells_where_files_are_and_where_they_are_had(places, capsys):
-    path = put(places["cache"] / "raft-things.pth")
+    path = put(places["cache"] / "droid.pth")
     assert main(["weights"]) == 0
     out = capsys.readouterr().out
     assert f"{path} (no checksum is published, not verified)" in out
@@ -218,7 +204,7 @@ def test_the_list_tells_where_files_are_and_where_they_are_had(places, capsys):
 
 
 def test_verify_tells_what_a_file_holds(tmp_path, capsys):
-    path = tmp_path / "raft-things.pth"
+    path = tmp_path / "droid.pth"
     torch.save(TENSORS, path)
     assert main(["weights", "verify", str(path)]) == 0
     out = capsys.readouterr().out
@@ -227,10 +213,11 @@ def test_verify_tells_what_a_file_holds(tmp_path, capsys):
     assert "not verified" in out
 
 
-def test_verify_ends_with_2_where_a_file_cannot_be_used(tmp_path, capsys):
-    wrong = tmp_path / "raft_large_C_T_V2-1bb1363a.pth"
-    torch.save(TENSORS, wrong)
-    broken = tmp_path / "raft-things.pth"
+def test_verify_ends_with_2_where_a_file_cannot_be_used(places, tmp_path, capsys):
+    wrong = places["package"] / "flow.safetensors"
+    save_file(TENSORS, wrong)
+    (places["package"] / "SHA256SUMS").write_text(f"{'0' * 64}  flow.safetensors\n")
+    broken = tmp_path / "droid.pth"
     broken.write_bytes(b"no weights")
     for path, sentence in (
         (tmp_path / "none.pth", "cannot be read (No such file or directory)."),
@@ -252,14 +239,14 @@ def test_the_configuration_names_the_operator(places):
     grid = SampleGrid(CAMERA)
     for name in ("auto", "classical"):
         assert isinstance(build_operator(TrackingConfig(operator=name), grid), ClassicalFlow)
-    path = places["cache"] / "raft-small.pth"
-    torch.save(published("small"), path)
-    assert isinstance(build_operator(TrackingConfig(operator="raft"), grid), RaftFlow)
-    config = TrackingConfig(operator="raft", weights=str(path))
-    assert isinstance(Tracker(CAMERA, config).operator, RaftFlow)
+    path = places["cache"] / "droid.pth"
+    torch.save(public_state(), path)
+    assert isinstance(build_operator(TrackingConfig(operator="droid"), grid), DroidFlow)
+    config = TrackingConfig(operator="droid", weights=str(path))
+    assert isinstance(Tracker(CAMERA, config).operator, DroidFlow)
 
 
-@pytest.mark.parametrize("name", ["own", "raft", "droid"])
+@pytest.mark.parametrize("name", ["own", "droid"])
 def test_an_operator_without_weights_is_told(name):
     with pytest.raises(InputError, match=f"No weights for the operator {name} were found"):
         build_operator(TrackingConfig(operator=name), SampleGrid(CAMERA))

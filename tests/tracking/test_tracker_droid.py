@@ -57,7 +57,7 @@ class KnowingUpdate:
     def agg(self, hidden, source) -> FrameOutput:
         found = source.unique()
         damping = torch.full((len(found), ROWS, COLUMNS), 1e-6)
-        return FrameOutput(found, damping, torch.zeros(len(found), 576, ROWS, COLUMNS))
+        return FrameOutput(found, damping)
 
 
 class KnowingNetwork:

@@ -2,8 +2,15 @@
 
 from pathlib import Path
 
-from geogs.networks.weights_catalogue import CATALOGUE, KnownWeights, known_as
-from geogs.networks.weights_files import checksum, locate, require_intact, weights_folders
+from geogs.networks.weights_files import (
+    CATALOGUE,
+    KnownWeights,
+    checksum,
+    known_as,
+    locate,
+    require_intact,
+    weights_folders,
+)
 
 
 def listing() -> str:
@@ -23,7 +30,6 @@ def listing() -> str:
     lines = ["looked for in " + ", ".join(map(str, weights_folders()))]
     titles = {
         "own": "--tracking.operator own",
-        "raft": "--tracking.operator raft",
         "droid": "--tracking.operator droid",
         "depth": "--mapping.depth.engine network",
         "prior": "monocular priors",

@@ -24,7 +24,7 @@ def _tracking(tracking: TrackingConfig) -> Iterator[str]:
     if tracking.weights and tracking.operator in ("auto", "classical"):
         yield (
             "tracking.weights does nothing: the classical operator has none; tracking.operator "
-            "own, raft or droid takes them."
+            "own or droid takes them."
         )
 
 

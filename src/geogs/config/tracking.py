@@ -13,7 +13,7 @@ class TrackingConfig(Settings, group="tracking"):
     Distances in the image are fractions of its longer side, so that they hold at any resolution.
     """
 
-    operator: Annotated[Literal["auto", "classical", "own", "raft", "droid"], Basic()] = "auto"
+    operator: Annotated[Literal["auto", "classical", "own", "droid"], Basic()] = "auto"
     """What measures image motion; auto takes classical, which needs no weights."""
     weights: Annotated[str, Basic()] = ""
     """File with the operator's weights; empty looks for one (geogs weights says where)."""

@@ -1,18 +1,96 @@
-"""Finding weights files, and checking that they are what they should be."""
+"""The weights files that can be used: where they are had and found, and whether they are intact.
+
+What is said of public files is what their own pages say; a checksum is known of the package's own.
+"""
 
 import hashlib
 import os
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from geogs.errors import InputError
 from geogs.gpu.cache import cache_folder
-from geogs.networks.weights_catalogue import CATALOGUE, KnownWeights, Purpose, known_as
 
 PACKAGED = Path(__file__).parents[1] / "data" / "weights"
 """Weights that come with the package, and their ``SHA256SUMS``."""
 VARIABLE = "GEOGS_WEIGHTS"
 """Environment variable with a weights file, or a folder of them."""
+
+
+Purpose = Literal["own", "droid", "depth", "prior"]
+"""A flow operator, the depth network, or a monocular prior."""
+
+COMES_ALONG = "comes with geogs"
+
+
+@dataclass(frozen=True)
+class KnownWeights:
+    """A weights file that is known by name."""
+
+    name: str
+    """File name under which it is looked for."""
+    purpose: Purpose
+    """What uses it."""
+    what: str
+    """What it is, in a few words."""
+    origin: str
+    """Where it is had."""
+    licence: str
+
+
+_HUB = "https://huggingface.co/"
+
+CATALOGUE = (
+    KnownWeights(
+        "flow.safetensors",
+        "own",
+        "flow for static scenes, trained by geogs",
+        COMES_ALONG,
+        "Apache-2.0",
+    ),
+    KnownWeights(
+        "droid.pth",
+        "droid",
+        "DROID-SLAM, TartanAir",
+        "https://github.com/princeton-vl/DROID-SLAM (README, droid.pth)",
+        "BSD-3-Clause",
+    ),
+    KnownWeights(
+        "depth.safetensors",
+        "depth",
+        "multi-view depth of still scenes, trained by geogs",
+        COMES_ALONG,
+        "Apache-2.0",
+    ),
+    KnownWeights(
+        "depth-anything-v2-small.onnx",
+        "prior",
+        "Depth Anything V2 small: inverse depth",
+        _HUB + "onnx-community/depth-anything-v2-small (onnx/model.onnx)",
+        "Apache-2.0",
+    ),
+    KnownWeights(
+        "metric3d-vit-small.onnx",
+        "prior",
+        "Metric3D v2 small: depth and normals",
+        _HUB + "onnx-community/metric3d-vit-small (onnx/model.onnx)",
+        "CC0-1.0 by that page; BSD-2-Clause repository of the authors",
+    ),
+    KnownWeights(
+        "omnidata_normal_dpt_hybrid.pth",
+        "prior",
+        "Omnidata DPT-hybrid: normals; a PyTorch checkpoint",
+        _HUB + "sashasax/omnidata_normal_dpt_hybrid_384",
+        "CC-BY-NC-4.0",
+    ),
+)
+"""In the order in which an operator takes what it finds."""
+
+
+def known_as(name: str) -> KnownWeights | None:
+    """What is known of a file of this name."""
+    return next((known for known in CATALOGUE if known.name == name), None)
 
 
 @dataclass(frozen=True)
@@ -21,12 +99,12 @@ class Checksum:
 
     actual: str
     published: str
-    """Whole, or the first digits; empty if none is known."""
+    """Empty if none is known."""
 
     @property
     def is_wrong(self) -> bool:
         """Whether the file is not the published one."""
-        return not self.actual.startswith(self.published)
+        return self.published not in ("", self.actual)
 
     @property
     def verdict(self) -> str:
@@ -35,8 +113,6 @@ class Checksum:
             return "no checksum is published, not verified"
         if self.is_wrong:
             return f"WRONG checksum, {self.published} is published"
-        if len(self.published) < len(self.actual):
-            return f"first {len(self.published)} digits of the checksum verified"
         return "checksum verified"
 
 
@@ -116,17 +192,12 @@ def require_intact(path: Path) -> Checksum:
 
 
 def _published(path: Path) -> str:
-    if path.parent.resolve() == PACKAGED.resolve():
-        return _packaged_sums().get(path.name, "")
-    known = known_as(path.name)
-    return known.sha256 if known else ""
-
-
-def _packaged_sums() -> dict[str, str]:
-    """Checksums by file name; the format is that of the ``sha256sum`` command."""
+    """The checksum that ``SHA256SUMS`` gives for a file of the package."""
+    if path.parent.resolve() != PACKAGED.resolve():
+        return ""
     try:
         lines = (PACKAGED / "SHA256SUMS").read_text().splitlines()
     except OSError:
-        return {}
+        return ""
     pairs = (line.split(maxsplit=1) for line in lines if line.strip())
-    return {name.lstrip("*"): digest for digest, name in pairs}
+    return {name.lstrip("*"): digest for digest, name in pairs}.get(path.name, "")

@@ -3,10 +3,7 @@
 import pytest
 import torch
 
-import geogs.tracking.flow.correlation as correlation
-from geogs.tracking.flow.correlation import CorrelationVolume, LocalCorrelation
-
-LOOKUPS = [CorrelationVolume, LocalCorrelation]
+from geogs.tracking.flow.correlation import CorrelationVolume
 
 
 def features(height: int = 11, width: int = 18, depth: int = 12, batch: int = 2) -> list:
@@ -32,12 +29,11 @@ def bilinear(image: torch.Tensor, x: float, y: float) -> float:
     return total
 
 
-@pytest.mark.parametrize("lookup", LOOKUPS)
-def test_channels_are_level_then_x_then_y(lookup):
+def test_channels_are_level_then_x_then_y():
     first, second = features()
     coords = positions()
     radius, levels, side = 2, 3, 5
-    found = lookup(first, second, levels, radius)(coords)
+    found = CorrelationVolume(first, second, levels, radius)(coords)
     assert found.shape == (2, levels * side * side, 11, 18)
     for b, row, column in ((0, 0, 0), (1, 5, 9), (1, 10, 17), (0, 3, 16)):
         products = torch.einsum("d,dhw->hw", first[b, :, row, column], second[b]) / 12**0.5
@@ -50,47 +46,35 @@ def test_channels_are_level_then_x_then_y(lookup):
                 assert float(found[b, channel, row, column]) == pytest.approx(wanted, abs=1e-5)
 
 
-def test_without_the_volume_the_numbers_are_the_same(monkeypatch):
+def test_scale_is_a_factor():
     first, second = features()
-    monkeypatch.setattr(correlation, "CHUNK_ELEMENTS", 50_000)  # more than one chunk
-    a, b = (lookup(first, second, 4, 4, 1 / 16)(positions()) for lookup in LOOKUPS)
-    assert float(a.abs().max()) > 0.1
-    torch.testing.assert_close(a, b, atol=1e-6, rtol=0)
-
-
-@pytest.mark.parametrize("lookup", LOOKUPS)
-def test_scale_is_a_factor(lookup):
-    first, second = features()
-    plain = lookup(first, second, 2, 1, 1.0)(positions())
+    plain = CorrelationVolume(first, second, 2, 1, 1.0)(positions())
     torch.testing.assert_close(
-        lookup(first, second, 2, 1, 1 / 16)(positions()), plain / 16, atol=1e-6, rtol=0
+        CorrelationVolume(first, second, 2, 1, 1 / 16)(positions()), plain / 16, atol=1e-6, rtol=0
     )
 
 
-@pytest.mark.parametrize("lookup", LOOKUPS)
-def test_far_away_and_not_a_number_are_zero(lookup):
+def test_far_away_and_not_a_number_are_zero():
     first, second = features()
     coords = positions()
     coords[0, 0, 0] = torch.tensor([1e9, -1e9])
     coords[0, 0, 1] = torch.nan
-    found = lookup(first, second, 3, 2)(coords)
+    found = CorrelationVolume(first, second, 3, 2)(coords)
     assert bool(torch.isfinite(found).all())
     assert float(found[0, :, 0, :2].abs().max()) == 0.0
     assert float(found[0, :, 1, :2].abs().max()) > 0.1
 
 
-@pytest.mark.parametrize("lookup", LOOKUPS)
-def test_maps_smaller_than_the_pyramid_have_empty_levels(lookup):
+def test_maps_smaller_than_the_pyramid_have_empty_levels():
     first, second = features(4, 5)
-    found = lookup(first, second, 4, 1)(positions(4, 5))
+    found = CorrelationVolume(first, second, 4, 1)(positions(4, 5))
     assert found.shape == (2, 36, 4, 5)
     assert float(found[:, 27:].abs().max()) == 0.0
     assert float(found[:, 18:27].abs().max()) > 0.01
 
 
-@pytest.mark.parametrize("lookup", LOOKUPS)
-def test_gradients_reach_both_features(lookup):
+def test_gradients_reach_both_features():
     first, second = (f.requires_grad_() for f in features(6, 7, 4, 1))
-    lookup(first, second, 2, 1)(positions(6, 7, 1)).square().sum().backward()
+    CorrelationVolume(first, second, 2, 1)(positions(6, 7, 1)).square().sum().backward()
     assert float(first.grad.abs().max()) > 0.1
     assert float(second.grad.abs().max()) > 0.1

@@ -6,7 +6,7 @@ from torch.nn import functional as F
 
 from droid_state import LAYERS, public_state
 from geogs.errors import InputError
-from geogs.tracking.flow.correlation import CorrelationVolume, LocalCorrelation
+from geogs.tracking.flow.correlation import CorrelationVolume
 from geogs.tracking.flow.droid_network import (
     CORRELATION_SCALE,
     LEVELS,
@@ -18,7 +18,6 @@ from geogs.tracking.flow.droid_network import (
     cell_positions,
     load_droid,
     motion_features,
-    upsample_convex,
 )
 
 
@@ -86,34 +85,20 @@ def textured(seed: int = 6) -> torch.Tensor:
     )
 
 
-@pytest.mark.parametrize("kind", [CorrelationVolume, LocalCorrelation])
-def test_correlation_finds_itself_and_a_shift(network, kind):
+def test_correlation_finds_itself_and_a_shift(network):
     """The largest of the 49 values of level 0: channel 24 in place, 7 * 4 + 3 one cell right."""
     with torch.no_grad():
         first = network.features(textured())
     second = first.roll(1, dims=3)
     at = cell_positions(*first.shape[2:])[None]
     for other, channel in ((first, 24), (second, 31)):
-        found = kind(first, other, LEVELS, RADIUS, CORRELATION_SCALE)(at)
+        found = CorrelationVolume(first, other, LEVELS, RADIUS, CORRELATION_SCALE)(at)
         assert found.shape == (1, LOOKUP, 12, 16)
         best = found[0, :49, :, :-1].argmax(0)
         assert float((best == channel).float().mean()) > 0.85
         # One sixteenth of the product, nothing else.
         expected = (first[0, :, 5, 6] * other[0, :, 5, 7]).sum() / 16
         torch.testing.assert_close(found[0, 31, 5, 6], expected)
-
-
-def test_both_correlations_agree_anywhere():
-    g = torch.Generator().manual_seed(7)
-    first, second = (torch.randn(2, 16, 9, 13, generator=g) for _ in range(2))
-    at = cell_positions(9, 13) + 6 * torch.randn(2, 9, 13, 2, generator=g)
-    stored, local = (
-        kind(first, second, LEVELS, RADIUS, CORRELATION_SCALE)(at)
-        for kind in (CorrelationVolume, LocalCorrelation)
-    )
-    torch.testing.assert_close(stored, local, rtol=1e-4, atol=1e-4)
-    assert float(stored.abs().max()) > 0.3
-    assert float(stored[:, 3 * 49 :].abs().max()) > 0.02  # of the coarsest level
 
 
 def test_gru_follows_its_equations(network):
@@ -150,13 +135,11 @@ def test_aggregation_groups_edges_by_source(network):
     hidden = torch.randn(5, 128, 6, 7, generator=torch.Generator().manual_seed(4))
     out = agg(hidden, torch.tensor([7, 2, 7, 2, 7]))
     assert out.frames.tolist() == [2, 7]
-    assert out.upsampling.shape == (2, 576, 6, 7)
     for n, edges in enumerate(([1, 3], [0, 2, 4])):
         mean = F.relu(agg.conv1(hidden[edges])).mean(0, keepdim=True)
         joined = F.relu(agg.conv2(mean))
         eta = 0.01 * F.softplus(agg.eta[0](joined))[0, 0]
         torch.testing.assert_close(out.damping[n], eta, rtol=1e-4, atol=1e-6)
-        torch.testing.assert_close(out.upsampling[n], agg.upmask(joined)[0], rtol=1e-4, atol=1e-4)
     alone = agg(hidden[[1, 3]], torch.tensor([0, 0]))
     torch.testing.assert_close(alone.damping[0], out.damping[0])
 
@@ -176,25 +159,3 @@ def test_motion_is_flow_and_last_error_cut_off():
     torch.testing.assert_close(
         motion[0, :, 1, 2], torch.tensor([5.0, -64.0, -0.25, 64.0]), rtol=0, atol=1e-5
     )
-
-
-def test_upsampling_reads_neighbours_and_pixels_in_order():
-    values = torch.arange(20.0).reshape(1, 4, 5)
-    logits = torch.full((1, 576, 4, 5), -30.0)
-    logits[:, 64 * 4 : 64 * 5] = 0
-    flat = upsample_convex(values, logits)
-    assert flat.shape == (1, 32, 40)
-    torch.testing.assert_close(flat, values.repeat_interleave(8, 1).repeat_interleave(8, 2))
-    # Pixel (3, 6) of a cell takes its right-hand neighbour, k = 5.
-    logits[:, 64 * 5 + 8 * 3 + 6] = 30
-    out = upsample_convex(values, logits)
-    assert float(out[0, 8 * 1 + 3, 8 * 2 + 6]) == pytest.approx(float(values[0, 1, 3]))
-    changed = (out - flat).abs() > 1e-3
-    assert int(changed.sum()) == 4 * 4  # the last column has nobody to its right
-    assert not changed[:, :, 32:].any()
-
-
-def test_upsampling_of_a_constant_is_constant_up_to_the_border():
-    logits = torch.randn(2, 576, 3, 4, generator=torch.Generator().manual_seed(5))
-    up = upsample_convex(torch.full((2, 3, 4), 0.7), logits)
-    torch.testing.assert_close(up, torch.full((2, 24, 32), 0.7))

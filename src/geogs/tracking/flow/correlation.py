@@ -1,9 +1,8 @@
-"""Correlation of two feature maps around given positions, as RAFT and DROID-SLAM look it up.
+"""Correlation of two feature maps around given positions, as DROID-SLAM looks it up (after RAFT).
 
 All-pairs products of the features, averaged over 2 x 2, 4 x 4, ... pixels of the second map, are
 read in a square window around a position (Teed & Deng, "RAFT: Recurrent All-Pairs Field Transforms
-for Optical Flow", ECCV 2020, section 3.2). Averaging products is averaging the second features, so
-the products can as well be made anew for each look: slower, but in little memory.
+for Optical Flow", ECCV 2020, section 3.2).
 
 Conventions, which are those of the published networks:
 
@@ -15,23 +14,9 @@ Conventions, which are those of the published networks:
   ``(l (2 r + 1) + i) (2 r + 1) + j`` is at (x + i - r, y + j - r).
 """
 
-from typing import Protocol, runtime_checkable
-
 import torch
 from jaxtyping import Float
 from torch import Tensor
-
-CHUNK_ELEMENTS = 1 << 24
-"""Most products that :func:`local_correlation` makes at once."""
-
-
-@runtime_checkable
-class CorrelationLookup(Protocol):
-    """What a recurrent network asks of the correlation of a batch of pairs."""
-
-    def __call__(self, coords: Float[Tensor, "b h w 2"]) -> Float[Tensor, "b c h w"]:
-        """Correlation of each pixel of the first maps with a window around ``coords``, float32."""
-        ...
 
 
 class CorrelationVolume:
@@ -67,54 +52,6 @@ class CorrelationVolume:
             for k, level in enumerate(self._levels)
         ]
         return torch.cat(windows, 1)
-
-
-class LocalCorrelation:
-    """The same numbers without the volume: for large images, or many pairs at once."""
-
-    def __init__(
-        self,
-        first: Float[Tensor, "b d h w"],
-        second: Float[Tensor, "b d h w"],
-        levels: int = 4,
-        radius: int = 4,
-        scale: float | None = None,
-    ) -> None:
-        """Keep the features; arguments as :class:`CorrelationVolume`."""
-        self.radius = radius
-        root = _scale(first, scale) ** 0.5
-        self._first = first * root
-        self._levels = _pyramid(second * root, levels)
-
-    def __call__(self, coords: Float[Tensor, "b h w 2"]) -> Float[Tensor, "b c h w"]:
-        windows = [
-            local_correlation(self._first, level, coords / 2**k, self.radius)
-            for k, level in enumerate(self._levels)
-        ]
-        return torch.cat(windows, 1)
-
-
-def local_correlation(
-    first: Float[Tensor, "b d h w"],
-    second: Float[Tensor, "b d h2 w2"],
-    coords: Float[Tensor, "b h w 2"],
-    radius: int,
-) -> Float[Tensor, "b c h w"]:
-    """Products of each pixel of ``first`` with ``second`` in a window around ``coords``, float32.
-
-    One level, in pixels of ``second``, without a factor. So many rows of the first image are taken
-    at a time that their products with all of the second stay small. (All of them, as one matrix
-    product is several times faster on a CPU than gathering the features of each window.)
-    """
-    batch, _, height, width = first.shape
-    every = second.flatten(2)
-    rows = max(1, CHUNK_ELEMENTS // max(1, batch * width * every.shape[-1]))
-    parts = []
-    for top in range(0, height, rows):
-        some = first[:, :, top : top + rows].flatten(2)
-        products = (some.mT @ every).flatten(0, 1)
-        parts.append(_window(products, second.shape[-2:], coords[:, top : top + rows], radius))
-    return torch.cat(parts, 2)
 
 
 def _scale(features: Float[Tensor, "b d h w"], scale: float | None) -> float:

@@ -26,7 +26,7 @@ from geogs.errors import InputError
 from geogs.gpu.transfer import to_device
 from geogs.networks.weights import read_tensors
 from geogs.tracking.flow.base import Memories
-from geogs.tracking.flow.correlation import CorrelationLookup, CorrelationVolume, LocalCorrelation
+from geogs.tracking.flow.correlation import CorrelationVolume
 from geogs.tracking.flow.droid_network import (
     CORRELATION_SCALE,
     LEVELS,
@@ -64,8 +64,6 @@ class DroidOptions:
     """Matches whose mean weight is smaller are none."""
     edges_at_once: int = 32
     """Directed edges that go through the network together; bounds memory."""
-    without_volume: bool = False
-    """Correlate around the flow instead of everywhere: slower, in little memory."""
 
 
 @dataclass(frozen=True)
@@ -212,10 +210,8 @@ class DroidFlow:
 
     def _lookup(
         self, source: Sequence[DroidImage], target: Sequence[DroidImage]
-    ) -> CorrelationLookup:
+    ) -> CorrelationVolume:
         first, second = (torch.stack([image.features for image in x]) for x in (source, target))
-        if self.options.without_volume:
-            return LocalCorrelation(first, second, LEVELS, RADIUS, CORRELATION_SCALE)
         return CorrelationVolume(first, second, LEVELS, RADIUS, CORRELATION_SCALE)
 
     def _damping(

@@ -176,12 +176,14 @@ class FrameOutput:
     """Which frames, ascending."""
     damping: Float[Tensor, "n h w"]
     """Damping of inverse depth, in the units of the network's own weights and cells."""
-    upsampling: Float[Tensor, "n 576 h w"]
-    """Logits for :func:`upsample_convex`."""
 
 
 class GraphAggregation(nn.Module):
-    """Mean over the edges of a source frame, read out as damping and upsampling of its depth."""
+    """Mean over the edges of a source frame, read out as damping of its depth.
+
+    ``upmask``, the learned enlargement of depth, is held for the public weights to load; nothing
+    here enlarges depth by it.
+    """
 
     def __init__(self, hidden: int, clip: float) -> None:
         super().__init__()
@@ -194,10 +196,10 @@ class GraphAggregation(nn.Module):
         frames, place, count = source.unique(return_inverse=True, return_counts=True)
         edges = F.relu(self.conv1(hidden))
         # A product, not scattered sums: always in the same order, summed in single precision.
-        share = F.one_hot(place, len(frames)).mT / count[:, None]
-        mean = (share.to(edges) @ edges.flatten(1)).unflatten(1, edges.shape[1:])
+        fraction = F.one_hot(place, len(frames)).mT / count[:, None]
+        mean = (fraction.to(edges) @ edges.flatten(1)).unflatten(1, edges.shape[1:])
         joined = F.relu(self.conv2(mean))
-        return FrameOutput(frames, DAMPING_SCALE * self.eta(joined)[:, 0], self.upmask(joined))
+        return FrameOutput(frames, DAMPING_SCALE * self.eta(joined)[:, 0])
 
 
 @dataclass(frozen=True)
@@ -290,23 +292,6 @@ def motion_features(
     flow = position - cell_positions(height, width, position.device)
     both = torch.cat([flow, target - position], -1)
     return both.clamp(-MOTION_LIMIT, MOTION_LIMIT).permute(0, 3, 1, 2)
-
-
-def upsample_convex(
-    values: Float[Tensor, "n h w"], logits: Float[Tensor, "n 576 h w"]
-) -> Float[Tensor, "n h8 w8"]:
-    """Eightfold resolution: every pixel a convex mean of the 3 x 3 cells around it.
-
-    Pixel (8 y + r, 8 x + c) takes channel 64 k + 8 r + c for neighbour k, row by row. Neighbours
-    outside the image take no part, as in HI-SLAM2.
-    """
-    n, h, w = values.shape
-    around = F.unfold(values[:, None], 3, padding=1).view(n, 9, 1, 1, h, w)
-    inside = F.unfold(torch.ones_like(values[:1, None]), 3, padding=1).view(1, 9, 1, 1, h, w)
-    share = logits.to(values).view(n, 9, UPSAMPLING, UPSAMPLING, h, w)
-    share = share.masked_fill(inside == 0, -torch.inf).softmax(1)
-    fine = (share * around).sum(1)
-    return fine.permute(0, 3, 1, 4, 2).reshape(n, h * UPSAMPLING, w * UPSAMPLING)
 
 
 def load_droid(state: Mapping[str, Tensor]) -> DroidNetwork:

@@ -17,10 +17,6 @@ def build_operator(config: TrackingConfig, grid: SampleGrid) -> FlowOperator:
         from geogs.tracking.flow.own import OwnFlow
 
         return OwnFlow(grid, find_weights("own", config.weights), _classical(grid))
-    if config.operator == "raft":
-        from geogs.tracking.flow.raft import RaftFlow
-
-        return RaftFlow(grid, find_weights("raft", config.weights))
     from geogs.tracking.flow.droid import DroidFlow
 
     return DroidFlow(grid, find_weights("droid", config.weights))
