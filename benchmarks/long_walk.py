@@ -31,7 +31,7 @@ import cv2
 import numpy as np
 import torch
 
-from geogs.application.surfaces import fusion_views
+from geogs.application.results.surfaces import fusion_views
 from geogs.config import preset
 from geogs.evaluation.trajectory import evaluate_trajectory
 from geogs.geometry.camera import Camera

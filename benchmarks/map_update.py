@@ -31,7 +31,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from geogs.application.surfaces import fusion_views
+from geogs.application.results.surfaces import fusion_views
 from geogs.config import Config, MapAblation, MappingConfig
 from geogs.evaluation.reconstruction import evaluate_reconstruction
 from geogs.evaluation.surface import Surface

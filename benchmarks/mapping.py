@@ -20,8 +20,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from geogs.application.machine import peak_memory
-from geogs.application.surfaces import fusion_views
+from geogs.application.machine.device import peak_memory
+from geogs.application.results.surfaces import fusion_views
 from geogs.config import Config
 from geogs.depth.completion import upsample_grid
 from geogs.errors import InputError

@@ -26,9 +26,9 @@ from pathlib import Path
 
 import torch
 
-from geogs.application.machine import compiled_kernels
-from geogs.application.result import Result
-from geogs.application.results import write_results
+from geogs.application.machine.device import compiled_kernels
+from geogs.application.results.result import Result
+from geogs.application.results.write import write_results
 from geogs.application.shutter import with_shutter_found
 from geogs.cli.options import parse_options
 from geogs.config import Config

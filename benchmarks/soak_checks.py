@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from safetensors.torch import load_file
 
-from geogs.application.saved_result import load_result
+from geogs.application.results.saved_result import load_result
 from geogs.errors import GeogsError
 from json_schema import faults
 

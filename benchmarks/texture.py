@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from geogs.application.saved_result import load_result
-from geogs.application.surfaces import fusion_views
-from geogs.application.texture import TOLERANCE
+from geogs.application.export.texture import TOLERANCE
+from geogs.application.results.saved_result import load_result
+from geogs.application.results.surfaces import fusion_views
 from geogs.evaluation.textured import psnr, render_textured
 from geogs.mesh.texture.textured import texture_mesh
 from geogs.mesh.types import median_edge

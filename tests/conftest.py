@@ -90,7 +90,7 @@ def small_room(once: Once) -> Path:
 @pytest.fixture
 def no_report(monkeypatch) -> None:
     """Results come without the pictures of the report, which take longer than a small run."""
-    monkeypatch.setattr("geogs.application.results.write_report", lambda *_: None)
+    monkeypatch.setattr("geogs.application.results.write.write_report", lambda *_: None)
 
 
 @pytest.fixture(scope="session")

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import torch
 
-from geogs.application.results import write_config
+from geogs.application.results.write import write_config
 from geogs.config import Config
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import sim3_exp, sim3_scale

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import torch
 
-from geogs.application.results import write_config
+from geogs.application.results.write import write_config
 from geogs.config import ReconstructConfig
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 import torch
 
-from geogs.application.remesh import RemeshSettings, mesh_settings, remesh
-from geogs.application.saved_result import load_result
+from geogs.application.results.remesh import RemeshSettings, mesh_settings, remesh
+from geogs.application.results.saved_result import load_result
 from geogs.cli import main as cli
 from geogs.evaluation.surface import read_surface
 from geogs.evaluation.trajectory import evaluate_trajectory

@@ -9,7 +9,7 @@ from geogs.version import __version__
 if TYPE_CHECKING:
     from geogs import application
     from geogs.application.reconstruct import reconstruct
-    from geogs.application.saved_result import load_result
+    from geogs.application.results.saved_result import load_result
     from geogs.application.slam import PoseEstimate, Slam, track
     from geogs.config import Config, ReconstructConfig
     from geogs.geometry.camera import Camera
@@ -48,7 +48,7 @@ _HOMES = {
     "ReconstructConfig": "geogs.config",
     "Slam": "geogs.application.slam",
     "load_map": "geogs.io.writers.native",
-    "load_result": "geogs.application.saved_result",
+    "load_result": "geogs.application.results.saved_result",
     "open_posed_source": "geogs.io.sources.posed.sniff",
     "open_source": "geogs.io.sources.sniff",
     "reconstruct": "geogs.application.reconstruct",

@@ -82,8 +82,8 @@ def write_thumbnail(output: Path) -> None:
 
 
 def _is_begun(output: Path, settings: RunSettings) -> bool:
-    from geogs.application.checkpoint import has_checkpoint
-    from geogs.application.run_checkpoint import SavedRun
+    from geogs.application.checkpoints.checkpoint import has_checkpoint
+    from geogs.application.checkpoints.run_state import SavedRun
 
     if not has_checkpoint(output):
         return False
@@ -95,7 +95,7 @@ def _is_begun(output: Path, settings: RunSettings) -> bool:
 
 def _wait_for_others(output: Path) -> None:
     """Until an attempt that is about to end has left the folder; OutputError if none does."""
-    from geogs.application.folder_lock import only_writer
+    from geogs.application.results.folder_lock import only_writer
     from geogs.io.writers.atomic import prepare_output_folder
 
     prepare_output_folder(output)

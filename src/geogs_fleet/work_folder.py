@@ -16,7 +16,7 @@ from geogs.errors import InputError, OutputError
 from geogs_fleet.places import Place
 from geogs_fleet.sources import FleetSource
 
-_MANIFEST = "manifest.json"  # of geogs.application.checkpoint_folder, which loads PyTorch
+_MANIFEST = "manifest.json"  # of geogs.application.checkpoints.folder, which loads PyTorch
 
 
 class WorkFolder:

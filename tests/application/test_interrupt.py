@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 import torch
 
+from geogs.application.checkpoints.run_state import RunFacts
 from geogs.application.interrupt import Interruption
-from geogs.application.machine import full_memory_in_a_sentence
+from geogs.application.machine.device import full_memory_in_a_sentence
 from geogs.application.run import continued
-from geogs.application.run_checkpoint import RunFacts
 from geogs.application.settings import RunSettings
 from geogs.errors import DeviceError, InputError
 

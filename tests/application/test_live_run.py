@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from geogs.application.interrupt import Stop
-from geogs.application.observer import RunObserver
 from geogs.application.run import run
 from geogs.application.settings import RunSettings
+from geogs.application.viewer.observer import RunObserver
 from geogs.config import Config
 from geogs.errors import InputError
 from geogs.io.sources.live.played import Played

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from geogs.application import doctor, self_test
+from geogs.application.machine import doctor, self_test
 from geogs.cli.doctor import main
 from geogs.errors import DeviceError
 from geogs.gpu import cache, installation, kernels

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from geogs.application import checkpoint_folder
+from geogs.application.checkpoints import folder as checkpoint_folder
 from geogs.application.settings import RunSettings
 from geogs_fleet import work_folder
 from geogs_fleet.attempt import Job, attempt, judged

@@ -5,8 +5,8 @@ import json
 import numpy as np
 import pytest
 
-from geogs.application.remesh import RemeshSettings, remesh
-from geogs.application.saved_result import load_result
+from geogs.application.results.remesh import RemeshSettings, remesh
+from geogs.application.results.saved_result import load_result
 from geogs.config import Config
 from geogs.errors import InputError
 from geogs_fleet.join.join import join_parts

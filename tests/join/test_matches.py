@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from geogs.application.saved_result import load_result
+from geogs.application.results.saved_result import load_result
 from geogs.config import Config
 from geogs.geometry.lie import se3_inverse, sim3_scale
 from geogs.io.writers.keyframe_rows import rows_path, write_rows

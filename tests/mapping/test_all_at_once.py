@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from geogs.application.checkpoint import SavedState, checkpoint_folder, write_checkpoint
+from geogs.application.checkpoints.checkpoint import SavedState, checkpoint_folder, write_checkpoint
 from geogs.config import Config, InputConfig
 from geogs.io.sources.sniff import open_source
 from geogs.slam import Slam

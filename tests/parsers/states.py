@@ -9,8 +9,12 @@ from pathlib import Path
 import numpy as np
 
 import mutations
-from geogs.application.checkpoint import checkpoint_folder, has_checkpoint, write_checkpoint
-from geogs.application.run_checkpoint import RunFacts, RunState, SavedRun
+from geogs.application.checkpoints.checkpoint import (
+    checkpoint_folder,
+    has_checkpoint,
+    write_checkpoint,
+)
+from geogs.application.checkpoints.run_state import RunFacts, RunState, SavedRun
 from geogs.application.settings import RunSettings
 from geogs.config import Config
 from geogs.geometry.camera import Camera

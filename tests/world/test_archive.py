@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from geogs.application.checkpoint_folder import CheckpointFolder
+from geogs.application.checkpoints.folder import CheckpointFolder
 from geogs.errors import OutputError
 from geogs.geometry.camera import Camera
 from geogs.tracking.flow.classical import ClassicalFlow

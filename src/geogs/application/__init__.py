@@ -6,18 +6,18 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from geogs.application.calibrate import self_calibrated
     from geogs.application.progress import RunProgress
-    from geogs.application.result import Result
-    from geogs.application.results import write_results
+    from geogs.application.results.result import Result
+    from geogs.application.results.write import write_results
     from geogs.application.shutter import with_shutter_found
 
 __all__ = ["Result", "RunProgress", "self_calibrated", "with_shutter_found", "write_results"]
 
 _HOMES = {
-    "Result": "geogs.application.result",
+    "Result": "geogs.application.results.result",
     "RunProgress": "geogs.application.progress",
     "self_calibrated": "geogs.application.calibrate",
     "with_shutter_found": "geogs.application.shutter",
-    "write_results": "geogs.application.results",
+    "write_results": "geogs.application.results.write",
 }
 
 

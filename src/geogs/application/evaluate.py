@@ -11,7 +11,7 @@ from geogs.application.evaluate_surface import (
     compare_surface,
     photoconsistency,
 )
-from geogs.application.saved_model import model_beside_truth
+from geogs.application.results.saved_model import model_beside_truth
 from geogs.documents import read_json
 from geogs.errors import InputError
 from geogs.evaluation.report import SAME_POSES_CM, Evaluation, write_report

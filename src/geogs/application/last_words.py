@@ -1,6 +1,6 @@
 """What a command says at its end: how good, how much, how long, and what lies where."""
 
-from geogs.application.result import Written
+from geogs.application.results.result import Written
 from geogs.evaluation.duration import duration
 from geogs.io.sources.posed.base import PosedSource
 

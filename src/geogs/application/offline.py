@@ -8,14 +8,14 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from geogs.application.folder_lock import only_writer
 from geogs.application.forecast import reconstruction_forecast
-from geogs.application.former import free_folder
 from geogs.application.interrupt import Stop
-from geogs.application.machine import compiled_kernels, full_memory_in_a_sentence
+from geogs.application.machine.device import compiled_kernels, full_memory_in_a_sentence
 from geogs.application.progress import RunProgress
-from geogs.application.result import Result, Written
-from geogs.application.results import write_results
+from geogs.application.results.folder_lock import only_writer
+from geogs.application.results.output_folder import free_folder
+from geogs.application.results.result import Result, Written
+from geogs.application.results.write import write_results
 from geogs.application.settings import RunSettings
 from geogs.config import ReconstructConfig
 from geogs.errors import InputError

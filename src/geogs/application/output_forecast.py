@@ -14,9 +14,9 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from geogs.application.keyframe_files import write_keyframes
-from geogs.application.report import write_report
-from geogs.application.surfaces import fusion_views
+from geogs.application.results.keyframe_files import write_keyframes
+from geogs.application.results.report import write_report
+from geogs.application.results.surfaces import fusion_views
 from geogs.config import MeshConfig
 from geogs.errors import InputError
 from geogs.mesh.extract import VolumePlan, extract_mesh, plan_volume

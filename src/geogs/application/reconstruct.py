@@ -9,22 +9,22 @@ from typing import Literal
 
 import torch
 
-from geogs.application.checkpoint import has_checkpoint
-from geogs.application.folder_lock import only_writer
+from geogs.application.checkpoints.checkpoint import has_checkpoint
+from geogs.application.checkpoints.reconstruct_state import ReconstructCheckpoint, fingerprint
 from geogs.application.forecast import reconstruction_forecast
-from geogs.application.former import free_folder
 from geogs.application.interrupt import Stop
-from geogs.application.machine import compiled_kernels, full_memory_in_a_sentence
+from geogs.application.machine.device import compiled_kernels, full_memory_in_a_sentence
 from geogs.application.output_forecast import OutputForecast
 from geogs.application.photographs import open_photographs
 from geogs.application.posed_views import PosedViews, Report
 from geogs.application.progress import RunProgress
-from geogs.application.reconstruct_checkpoint import ReconstructCheckpoint, fingerprint
-from geogs.application.result import Result, Written
-from geogs.application.results import write_results
+from geogs.application.results.folder_lock import only_writer
+from geogs.application.results.output_folder import free_folder
+from geogs.application.results.result import Result, Written
+from geogs.application.results.surfaces import write_depth_mesh
+from geogs.application.results.write import write_results
 from geogs.application.settings import ReconstructSettings
 from geogs.application.snapshots import Snapshots
-from geogs.application.surfaces import write_depth_mesh
 from geogs.config import ReconstructConfig
 from geogs.config.idle import idle_settings
 from geogs.documents import expanded

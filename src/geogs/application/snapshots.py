@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from geogs.application.progress import RunProgress
-from geogs.application.surfaces import write_surface
+from geogs.application.results.surfaces import write_surface
 from geogs.io.writers.native import save_map
 from geogs.reconstruction import Reconstruction
 from geogs.types import MapSnapshot

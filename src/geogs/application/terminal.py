@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
 from geogs.application.forecast import Forecast
-from geogs.application.machine import peak_memory
+from geogs.application.machine.device import peak_memory
 from geogs.application.progress import RunProgress
 from geogs.application.verbosity import Verbosity
 from geogs.errors import OutputError

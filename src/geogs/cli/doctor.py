@@ -18,7 +18,7 @@ def main(argv: Sequence[str]) -> int:
     """Run the command; returns 0 if the self-test passes, else 2."""
     options = parse_options(DoctorOptions, argv, "doctor")
 
-    from geogs.application.doctor import examine
+    from geogs.application.machine.doctor import examine
 
     findings = []
     for finding in examine(options.device):

@@ -20,7 +20,7 @@ def main(argv: Sequence[str]) -> int:
     """Run the command; returns the exit code."""
     options = parse_options(ExportOptions, argv, "export")
 
-    from geogs.application.export import export
+    from geogs.application.export.export import export
 
     print(f"Written: {export(options)}")
     return 0

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from geogs.application.remesh import RemeshSettings, mesh_settings
+from geogs.application.results.remesh import RemeshSettings, mesh_settings
 from geogs.cli.options import Given, parse_options
 
 
@@ -22,7 +22,7 @@ def main(argv: Sequence[str]) -> int:
     options = parse_options(MeshOptions, argv, "mesh", _defaults)
 
     from geogs.application.forecast import mesh_forecast
-    from geogs.application.remesh import remesh
+    from geogs.application.results.remesh import remesh
     from geogs.application.terminal import TerminalProgress
 
     with TerminalProgress() as progress:

@@ -19,7 +19,7 @@ from geogs.io.sources.address import live_address
 
 if TYPE_CHECKING:
     from geogs.application.interrupt import Stop
-    from geogs.application.observer import RunObserver
+    from geogs.application.viewer.observer import RunObserver
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ def _keys(options: RunOptions, stop: "Stop") -> AbstractContextManager[bool]:
 
 def _observer(options: LiveSettings) -> "RunObserver | None":
     """Who looks on, if somebody should."""
-    from geogs.application.observer import Observers
+    from geogs.application.viewer.observer import Observers
 
     several: list[RunObserver] = []
     if options.record is not None:
@@ -114,7 +114,7 @@ def _defaults(given: Given) -> RunOptions:
         name = cast(Preset, given.get("preset", "default"))
         return RunOptions(config=preset(name), preset=name)
 
-    from geogs.application.run_checkpoint import SavedRun
+    from geogs.application.checkpoints.run_state import SavedRun
 
     folder = Path(given["resume"])
     if "preset" in given:

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from geogs.application.rescale import RescaleSettings
+from geogs.application.results.rescale import RescaleSettings
 from geogs.cli.options import parse_options
 
 
@@ -20,7 +20,7 @@ def main(argv: Sequence[str]) -> int:
     """Run the command; returns the exit code."""
     options = parse_options(ScaleOptions, argv, "scale")
 
-    from geogs.application.rescale import rescale
+    from geogs.application.results.rescale import rescale
     from geogs.application.scale.scene import said
 
     print(said(rescale(options)))

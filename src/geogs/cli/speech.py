@@ -10,7 +10,7 @@ from geogs.cli.options import record
 
 if TYPE_CHECKING:
     from geogs.application.progress import RunProgress
-    from geogs.application.result import Written
+    from geogs.application.results.result import Written
 
 
 def followed(options: Verbosity, work: Callable[["RunProgress"], "Written"]) -> "Written":

@@ -21,7 +21,7 @@ def main(argv: Sequence[str]) -> int:
     """Run the command until Ctrl-C; returns the exit code."""
     options = parse_options(ViewOptions, argv, "view")
 
-    from geogs.application.saved_result import load_result
+    from geogs.application.results.saved_result import load_result
     from geogs.application.viewer.saved import open_window
 
     window = open_window(load_result(options.result), options.host, options.port)

@@ -28,7 +28,7 @@ def main(argv: Sequence[str]) -> int:
     """Run the command; returns 0, or raises InputError for a file that cannot be used."""
     options = parse_options(WeightsOptions, argv, "weights")
 
-    from geogs.application.weights import listing, verification
+    from geogs.application.machine.weights import listing, verification
 
     if options.action == "list":
         if options.file is not None:

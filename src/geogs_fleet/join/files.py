@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
-from geogs.application.results import write_config
-from geogs.application.saved_result import SavedResult
+from geogs.application.results.saved_result import SavedResult
+from geogs.application.results.write import write_config
 from geogs.config import Config
 from geogs.geometry.camera import Camera
 from geogs.io.writers.atomic import write_text

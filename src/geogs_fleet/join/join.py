@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from geogs.application.former import remove_former
-from geogs.application.machine import device_summary, peak_memory
-from geogs.application.report import write_report
-from geogs.application.saved_result import SavedResult, load_result
-from geogs.application.summary import lost_spans
+from geogs.application.machine.device import device_summary, peak_memory
+from geogs.application.results.output_folder import remove_former
+from geogs.application.results.report import write_report
+from geogs.application.results.saved_result import SavedResult, load_result
+from geogs.application.results.summary import lost_spans
 from geogs.config import Config
 from geogs.errors import InputError
 from geogs.io.writers.atomic import prepare_output_folder

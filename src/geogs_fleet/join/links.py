@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from geogs.application.saved_result import SavedResult
+from geogs.application.results.saved_result import SavedResult
 from geogs.config import Config
 from geogs.geometry.camera import Camera
 from geogs.loop.constraints import of_loop

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Float16, Float32, Int, Int16
 from torch import Tensor
 
-from geogs.application.saved_result import SavedResult
+from geogs.application.results.saved_result import SavedResult
 from geogs.config import Config, TrackingConfig
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_inverse

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from jaxtyping import Float32, Float64, UInt8
 
-from geogs.application.saved_result import SavedResult, load_result
+from geogs.application.results.saved_result import SavedResult, load_result
 from geogs.config import Config
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera

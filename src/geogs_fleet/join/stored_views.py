@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from geogs.application.saved_result import load_result
+from geogs.application.results.saved_result import load_result
 from geogs.geometry.camera import Camera
 from geogs.io.writers.keyframe_images import image_path, read_image
 from geogs.mesh.types import DepthMapView

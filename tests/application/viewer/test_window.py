@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from browser import open_tab
-from geogs.application.saved_result import load_result
+from geogs.application.results.saved_result import load_result
 from saved_results import IDS, make_result
 
 

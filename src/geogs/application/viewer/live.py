@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from geogs.application.observer import RunObserver
+from geogs.application.viewer.observer import RunObserver
 from geogs.application.viewer.window import Window
 from geogs.evaluation.layers import layer_picture
 from geogs.geometry.camera import Camera
 from geogs.types import Frame, MapSnapshot
 
 if TYPE_CHECKING:
-    from geogs.application.result import Result
+    from geogs.application.results.result import Result
     from geogs.slam import Slam, SlamStatus
 
 SHARE = 0.02

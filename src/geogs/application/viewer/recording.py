@@ -5,13 +5,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from geogs.application.observer import RunObserver
 from geogs.application.viewer.live import thinned
+from geogs.application.viewer.observer import RunObserver
 from geogs.errors import InputError, OutputError
 from geogs.types import Frame
 
 if TYPE_CHECKING:
-    from geogs.application.result import Result
+    from geogs.application.results.result import Result
     from geogs.slam import Slam, SlamStatus
 
 _EVERY = 5

@@ -4,8 +4,8 @@ import threading
 
 import numpy as np
 
-from geogs.application.saved_result import SavedResult
-from geogs.application.shown_model import first_view
+from geogs.application.results.saved_result import SavedResult
+from geogs.application.results.shown_model import first_view
 from geogs.application.viewer.window import Window
 from geogs.errors import InputError
 from geogs.evaluation.layers import layer_picture

@@ -1,0 +1,157 @@
+"""Checkpoints: the state of some work in ``checkpoint/`` of its results, to go on from later.
+
+The state, a record, is taken apart (:mod:`geogs.world.pack`) into JSON and a safetensors
+file; large arrays of old keyframes lie in archives beside them, which only grow or are written
+where the last complete state refers to nothing. What belongs to the process (device, flow operator,
+prior, kernels, threads) is not stored: whoever reads has it.
+"""
+
+import json
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Generic, TypeVar, get_type_hints
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load, save
+
+from geogs.application.checkpoints.folder import FORMAT, CheckpointFolder
+from geogs.application.machine.device import is_gpu_failure
+from geogs.application.progress import RunProgress
+from geogs.documents import UNUSABLE, in_short
+from geogs.errors import InputError, OutputError
+from geogs.version import __version__
+from geogs.world.archive import Archive, SettledArchive
+from geogs.world.pack import pack, schema, unpack
+
+S = TypeVar("S")
+
+_UNUSABLE = (
+    OSError, InputError, SafetensorError, MemoryError, RuntimeError, *UNUSABLE,
+)  # fmt: skip
+"""What reading a file may end with that somebody made up."""
+
+# Checkpoints may take this part of the time.
+_WRITING_SHARE = 0.05
+
+
+class Checkpoint:
+    """Writes the state of some work now and then; says once where that fails, and goes on."""
+
+    def __init__(self, output: Path, every: float, progress: RunProgress) -> None:
+        """In a folder of results, every so many seconds, never if 0."""
+        self._folder = checkpoint_folder(output)
+        self._every = every
+        self._progress = progress
+        self._due = time.perf_counter() + every
+
+    @property
+    def is_due(self) -> bool:
+        """Whether its time has come."""
+        return self._every > 0 and time.perf_counter() >= self._due
+
+    def write_state(self, state: Callable[[], object]) -> bool:
+        """Write the record that a call gives; whether there is a complete checkpoint of it now."""
+        if self._every <= 0:
+            return False
+        start = time.perf_counter()
+        try:
+            write_checkpoint(self._folder, state())
+        except OutputError as error:
+            self._progress.write(f"No more checkpoints: {error}")
+            self._every = 0.0
+        now = time.perf_counter()
+        self._due = now + max(self._every, (now - start) / _WRITING_SHARE)
+        return self._every > 0
+
+    def remove(self) -> None:
+        """After success: all that geogs wrote there."""
+        self._folder.remove()
+
+
+class SavedState(Generic[S]):
+    """A complete checkpoint of work whose state is a record of some kind."""
+
+    def __init__(self, output: Path, kind: type[S]) -> None:
+        """Raises InputError if there is none, it is damaged, or another version wrote it."""
+        self._kinds = get_type_hints(kind)
+        self._folder = checkpoint_folder(output)
+        with self.in_a_sentence():
+            manifest = self._folder.manifest()
+        if manifest is None or not manifest.state:
+            raise InputError(
+                f"There is nothing to resume: no complete checkpoint is in {self._folder.path}; "
+                "start anew without --resume."
+            )
+        with self.in_a_sentence():
+            if (manifest.format, manifest.geogs) != (FORMAT, __version__):
+                raise InputError(f"geogs {manifest.geogs} wrote it, another version than this")
+            if manifest.schema != schema(kind):
+                raise InputError("it is of another command, or another version wrote it")
+            self._files = manifest.state
+            self._values = json.loads(self._read("json"))
+
+    def facts(self, name: str) -> Any:
+        """A field of the state without any array. Raises InputError if it is damaged."""
+        with self.in_a_sentence():
+            return unpack(self._kinds[name], self._values["state"].get(name), {}, {}, name=name)
+
+    def work(self, name: str, device: torch.device | str = "cpu") -> Any:
+        """A field of the state, once; tensors that were on a GPU go to ``device``.
+
+        Raises:
+            InputError: it is not what the kind says, or an array has changed.
+        """
+        with self.in_a_sentence():
+            arrays, folder = load(self._read("safetensors")), self._folder
+            settled = unpack(dict[str, SettledArchive], self._values["archives"], {}, {})
+            archives = {n: Archive.reopened(folder, n, s) for n, s in settled.items()}
+            values = self._values["state"].pop(name)
+            return unpack(self._kinds[name], values, arrays, archives, device, name)
+
+    @contextmanager
+    def in_a_sentence(self) -> Iterator[None]:
+        """Whatever using it may end with becomes an InputError that says what to do."""
+        try:
+            yield
+        except _UNUSABLE as error:
+            if is_gpu_failure(error):
+                raise  # the checkpoint is well
+            reason = in_short(error)
+            raise InputError(
+                f"{self._folder.path} cannot be used ({reason}); start anew without --resume."
+            ) from error
+
+    def _read(self, ending: str) -> bytes:
+        """What the file of the state with this ending holds."""
+        (name,) = (name for name in self._files if name.endswith(f".{ending}"))
+        return self._folder.read(name, self._files[name])
+
+
+def write_checkpoint(folder: CheckpointFolder, state: object) -> None:
+    """Write a record in place of the last, completely or not at all. Raises OutputError."""
+    kind = type(state)
+    packed = pack(kind, state)
+    with folder.replaced(schema(kind), packed.archives) as write:
+        settled = {name: archive.settle(folder) for name, archive in packed.archives.items()}
+        archives = pack(dict[str, SettledArchive], settled).values
+        write("json", json.dumps({"archives": archives, "state": packed.values}).encode())
+        write("safetensors", save(packed.arrays))
+    for archive in packed.archives.values():
+        archive.release()
+
+
+def checkpoint_folder(output: Path) -> CheckpointFolder:
+    """Where the checkpoint of results lies."""
+    return CheckpointFolder(output / "checkpoint")
+
+
+def has_checkpoint(output: Path) -> bool:
+    """Whether work in a folder could be gone on with."""
+    try:
+        manifest = checkpoint_folder(output).manifest()
+    except (OSError, InputError):
+        return False
+    return manifest is not None and bool(manifest.state)

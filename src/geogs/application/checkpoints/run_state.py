@@ -1,0 +1,101 @@
+"""The checkpoint of a run: all of its work so far, which survives Ctrl-C and kill."""
+
+from collections.abc import Generator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from geogs.application.checkpoints.checkpoint import Checkpoint, SavedState
+from geogs.application.progress import RunProgress
+from geogs.application.settings import RunSettings
+from geogs.errors import InputError
+from geogs.io.sources.base import ReadingPlace
+from geogs.io.sources.calibration import Calibration
+from geogs.io.sources.several import JointPlace, SeveralSources
+from geogs.io.sources.sniff import Stream
+from geogs.shutter.shutter import Shutter
+from geogs.slam import Slam, SlamState
+from geogs.types import Frame
+
+
+@dataclass(frozen=True)
+class RunFacts:
+    """What a run is made of, beside its state."""
+
+    settings: RunSettings
+    """With absolute paths."""
+    device: str
+    """cpu or cuda."""
+    fingerprint: str
+    """Of the source."""
+    calibration: Calibration | None
+    """Found before the run; none if the source's own was taken."""
+    place: ReadingPlace | JointPlace = field(default_factory=ReadingPlace)
+    """How far the source has been read."""
+    shutter: Shutter = field(default_factory=Shutter)
+    """Given, or found before the run."""
+
+
+@dataclass(frozen=True)
+class RunState:
+    """What is stored of ``geogs run``."""
+
+    facts: RunFacts
+    slam: SlamState
+
+
+class RunCheckpoint(Checkpoint):
+    """Written between two frames when its time has come, and at the end of the stream."""
+
+    def __init__(self, output: Path, facts: RunFacts, every: float, progress: RunProgress) -> None:
+        """Every so many seconds it is written, never if 0."""
+        super().__init__(output, every, progress)
+        self._facts = facts
+
+    def after_frame(self, slam: Slam, source: Stream) -> None:
+        """Write it when its time has come."""
+        if self.is_due:
+            self.write(slam, source)
+
+    def write(self, slam: Slam, source: Stream) -> bool:
+        """Write it, if a map has been started; whether it has been."""
+        if not slam.segments.keyframe_ids:
+            return False
+        with slam.stopwatch("checkpoints"):
+            facts = replace(self._facts, place=source.place)
+            return self.write_state(lambda: RunState(facts, slam.state()))
+
+
+class SavedRun:
+    """A run's checkpoint to go on from."""
+
+    def __init__(self, output: Path) -> None:
+        """Raises InputError if there is none, it is damaged, or another version wrote it."""
+        self._saved = SavedState(output, RunState)
+        self.facts: RunFacts = self._saved.facts("facts")
+
+    def restore(self, slam: Slam) -> None:
+        """Give a new system the state. Raises InputError if that cannot be."""
+        state = self._saved.work("slam", slam.device)
+        with self._saved.in_a_sentence():
+            slam.restore(state)
+
+    def calibrated(self, source: Stream) -> Stream:
+        """The source as the run read it. Raises InputError if its files are not what they were."""
+        if source.fingerprint() != self.facts.fingerprint:
+            raise InputError(
+                f"{source.name} is not what it was when the run began (other files, or other "
+                "sizes); put it back, or start anew without --resume."
+            )
+        found = self.facts.calibration
+        calibrated = source if found is None else source.with_calibration(found)
+        return calibrated.with_shutter(self.facts.shutter)
+
+
+def frames_after(source: Stream, place: ReadingPlace | JointPlace) -> Generator[Frame, None, None]:
+    """The frames of a source after a place in it. Raises InputError if there cannot be one."""
+    if isinstance(source, SeveralSources):
+        if isinstance(place, JointPlace):
+            return source.frames_after(place)
+    elif isinstance(place, ReadingPlace):
+        return source.frames_after(place)
+    raise InputError(f"{source.name} is not what it was when the run began.")

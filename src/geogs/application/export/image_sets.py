@@ -1,0 +1,140 @@
+"""Exports that are folders of images: COLMAP, nerfstudio, depth maps, normal maps."""
+
+from pathlib import Path
+from typing import Literal
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool
+
+from geogs.application.export.seen_points import seen_points
+from geogs.application.results.saved_result import SavedResult
+from geogs.errors import InputError
+from geogs.geometry.camera import Camera
+from geogs.io.writers.atomic import atomic_file
+from geogs.io.writers.exports.colmap import write_colmap_model
+from geogs.io.writers.exports.maps import (
+    STEPS,
+    depth_unit,
+    write_depth_png,
+    write_description,
+    write_normal_png,
+    write_npz,
+)
+from geogs.io.writers.exports.nerfstudio import DEPTH_UNIT, write_transforms
+from geogs.io.writers.exports.records import PosedImage
+from geogs.io.writers.keyframe_images import image_path, write_mask
+from geogs.io.writers.ply import write_points
+
+
+def write_colmap_set(folder: Path, result: SavedResult, points: int, as_text: bool) -> None:
+    """``images/``, ``masks/`` and ``sparse/0/`` with about so many points and their tracks.
+
+    Raises:
+        InputError: the result has no images, or shows no surface.
+        OutputError: a file cannot be written.
+    """
+    images = _write_images(folder, result)
+    for number, image in enumerate(images):
+        mask = result.mask(number)
+        if mask is not None:
+            write_mask(folder / "masks" / f"{image.name}.png", _full_size(mask, result.camera))
+    seen = seen_points(result.keyframes, result.camera, points)
+    write_colmap_model(folder / "sparse" / "0", result.camera, images, seen, as_text)
+
+
+def write_nerfstudio_set(folder: Path, result: SavedResult, points: int) -> None:
+    """``transforms.json``, start points, and images with depth, normals and masks of their size.
+
+    Raises:
+        InputError: the result has no images, or shows no surface.
+        OutputError: a file cannot be written.
+    """
+    images = _write_images(folder, result)
+    unit, masked = _nerfstudio_unit(result), []
+    for number, image in enumerate(images):
+        name = Path(image.name).with_suffix(".png").name
+        mask = result.mask(number)
+        masked.append(mask is not None)
+        if mask is not None:
+            write_mask(folder / "masks" / name, _full_size(mask, result.camera))
+        depth, normal = _maps(number, result, result.camera)
+        write_depth_png(folder / "depth" / name, depth, unit)
+        write_normal_png(folder / "normals" / name, normal)
+    seen = seen_points(result.keyframes, result.camera, points)
+    write_points(folder / "points.ply", seen.positions, seen.colours, seen.normals)
+    path = folder / "transforms.json"
+    write_transforms(path, result.camera, images, masked, unit, "points.ply")
+
+
+def write_map_set(folder: Path, result: SavedResult, kind: Literal["depth", "normals"]) -> None:
+    """A PNG and an NPZ for every keyframe, of the size of its image, and ``description.json``.
+
+    Raises:
+        OutputError: a file cannot be written.
+    """
+    unit = depth_unit(_farthest(result))
+    for number, id in enumerate(result.views.keyframe_id.tolist()):
+        path = folder / f"{id:06d}.png"
+        depth, normal = _maps(number, result, result.camera)
+        if kind == "depth":
+            write_depth_png(path, depth, unit)
+            write_npz(path.with_suffix(".npz"), "depth", depth)
+        else:
+            write_normal_png(path, normal)
+            write_npz(path.with_suffix(".npz"), "normal", normal)
+    poses = {
+        f"{id:06d}": T.tolist()
+        for id, T in zip(result.views.keyframe_id, result.views.T_cw, strict=True)
+    }
+    facts: dict[str, object] = {
+        "depth": {"png": f"z along the optical axis in steps of {unit:g} map units, 0 unknown",
+                  "png_unit": unit, "npz": "the same in map units"},
+        "normals": {"png": f"2 v / {STEPS} - 1 of red, green, blue is x, y, z; black is unknown",
+                    "npz": "x, y, z", "frame": "camera: x right, y down, z forward"},
+    }  # fmt: skip
+    facts = {"values": facts[kind], "T_cw": poses}
+    write_description(folder / "description.json", result.camera, facts)
+
+
+def _write_images(folder: Path, result: SavedResult) -> list[PosedImage]:
+    """Copy the images as they are kept; what they are called, and where they were taken."""
+    views = result.views
+    if not views.has_images:
+        raise InputError("The result was written without keyframe images, which this needs.")
+    images = []
+    for id, T_cw in zip(views.keyframe_id.tolist(), views.T_cw, strict=True):
+        kept = image_path(result.folder, id)
+        if not kept.is_file():
+            raise InputError(f"{kept} is missing; the result needs it.")
+        with atomic_file(folder / "images" / kept.name) as stream:
+            stream.write(kept.read_bytes())
+        images.append(PosedImage(kept.name, T_cw))
+    return images
+
+
+def _maps(number: int, result: SavedResult, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Depth and normals of a keyframe inside its mask, rendered for another camera."""
+    maps = result.render(torch.from_numpy(result.views.T_cw[number]), camera)
+    depth, normal = maps.depth.cpu().numpy(), maps.normal.cpu().numpy()
+    mask = result.mask(number)
+    if mask is not None:
+        inside = _full_size(mask, camera)
+        depth, normal = np.where(inside, depth, 0), np.where(inside[..., None], normal, 0)
+    return depth.astype(np.float32), normal.astype(np.float32)
+
+
+def _full_size(mask: Bool[np.ndarray, "h w"], camera: Camera) -> Bool[np.ndarray, "h2 w2"]:
+    size = (camera.width, camera.height)
+    return cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
+
+
+def _farthest(result: SavedResult) -> float:
+    return max((float(keyframe.depth.max()) for keyframe in result.keyframes), default=0.0)
+
+
+def _nerfstudio_unit(result: SavedResult) -> float:
+    """nerfstudio's own unit of depth where that has enough steps, and reaches far enough."""
+    farthest = _farthest(result)
+    return DEPTH_UNIT if 0.5 < farthest < DEPTH_UNIT * STEPS else depth_unit(farthest)

@@ -1,0 +1,63 @@
+"""What of its keyframes a result keeps, so that it can be used again."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from geogs.application.results.scene import MappedScene
+from geogs.geometry.camera import Camera
+from geogs.io.writers.keyframe_images import image_path, mask_path, write_image, write_mask
+from geogs.io.writers.keyframe_rows import rows_path, write_rows
+from geogs.io.writers.map_views import MapViews
+from geogs.types import RenderedKeyframe
+
+
+def write_keyframes(
+    folder: Path,
+    scene: MappedScene,
+    camera: Camera,
+    renders: Sequence[RenderedKeyframe],
+    with_images: bool,
+) -> MapViews:
+    """Write masks, images and rows as they were used to ``keyframes/``; all else is returned.
+
+    Args:
+        folder: of the result.
+        scene: whose map is seen.
+        camera: of the images.
+        renders: the map seen from the keyframes.
+        with_images: whether images and rows are written.
+
+    Raises:
+        OutputError: a file cannot be written.
+    """
+    ids, times, poses, masked = [], [], [], []
+    for render in renders:
+        ids.append(render.keyframe_id)
+        times.append(render.timestamp)
+        poses.append(render.T_cw.numpy())
+        masked.append(render.mask is not None)
+        if render.mask is not None:
+            write_mask(mask_path(folder, render.keyframe_id), render.mask.cpu().numpy())
+        if with_images and render.image is not None:
+            write_image(image_path(folder, render.keyframe_id), render.image)
+    rows = scene.rows() if with_images else {}
+    kept = {id: rows[id] for id in ids if id in rows}
+    if kept:
+        write_rows(rows_path(folder), kept)
+    renderer = scene.renderer()
+    return MapViews(
+        camera=camera,
+        render_camera=renderer.camera,
+        min_alpha=renderer.rules.min_alpha,
+        max_spread=renderer.rules.max_spread,
+        origin=renderer.frame.origin,
+        unit=renderer.frame.unit,
+        disks=renderer.disks,
+        keyframe_id=np.array(ids, np.int64),
+        timestamp=np.array(times, np.float64),
+        T_cw=np.array(poses, np.float64).reshape(-1, 4, 4),
+        has_mask=np.array(masked, bool),
+        has_images=with_images,
+    )

@@ -1,0 +1,82 @@
+"""The mesh of a result, made anew from its folder without running again."""
+
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from geogs.config import MeshConfig
+from geogs.config.setting import Basic, Positional, Settings
+from geogs.documents import UNUSABLE, read_yaml
+from geogs.errors import InputError
+
+if TYPE_CHECKING:
+    from geogs.application.progress import RunProgress
+
+
+@dataclass(frozen=True)
+class RemeshSettings(Settings):
+    """All that the making of another mesh is told."""
+
+    result: Annotated[Path, Positional()]
+    """Folder of a result, as geogs run and geogs reconstruct write it."""
+    mesh: MeshConfig = field(default_factory=MeshConfig)
+    """How the surface is made; what is not given is as the result was made with."""
+    output: Annotated[Path | None, Basic("-o")] = None
+    """File of the mesh, PLY; mesh.ply in the folder of the result if none is given."""
+    device: str = "auto"
+    """Where to compute: auto (a GPU where there is one), cpu, cuda or cuda:1."""
+
+
+def mesh_settings(folder: Path) -> MeshConfig:
+    """The settings that the mesh of a result was made with; the defaults where nothing is said.
+
+    Raises:
+        InputError: ``config.yaml`` is damaged, or holds a value that a setting cannot have.
+    """
+    path = folder / "config.yaml"
+    if not path.is_file():
+        return MeshConfig()
+    try:
+        said: Any = read_yaml(path)["mesh"]
+        known = {name.name: said[name.name] for name in fields(MeshConfig) if name.name in said}
+    except UNUSABLE:
+        raise InputError(f"{path} is damaged; give the settings of the mesh anew.") from None
+    return replace(MeshConfig(), **known)
+
+
+def remesh(settings: RemeshSettings, progress: "RunProgress | None" = None) -> Path:
+    """Render the keyframes of a result, fuse their depths and write the mesh; the file's path.
+
+    Where that is the mesh of the result, its page is made anew, too, without what an evaluation
+    had said of the former one.
+
+    On the CPU, with the settings of the run, the surface is that of the run to the last byte;
+    colours differ by what JPEG does to the images.
+
+    Raises:
+        InputError: there is no result, it is too old, or its disks show no surface.
+        OutputError: the file cannot be written.
+        DeviceError: the device cannot be used.
+    """
+    from geogs.application.progress import RunProgress
+    from geogs.application.results.saved_model import write_page_anew
+    from geogs.application.results.saved_result import load_result
+    from geogs.application.results.surfaces import fusion_views
+    from geogs.gpu.installation import require_device
+    from geogs.io.writers.ply import write_mesh
+    from geogs.mesh.extract import extract_mesh
+
+    follow = progress or RunProgress()
+    path = settings.output or settings.result / "mesh.ply"
+    if path.suffix.lower() != ".ply":
+        raise InputError(f"{path} should end in .ply; geogs export writes other formats.")
+    result = load_result(settings.result, require_device(settings.device))
+    mesh = extract_mesh(
+        fusion_views(result.keyframes),
+        settings.mesh,
+        lambda part, done, of: follow.stage(f"mesh: {part}", done / of),
+    )
+    write_mesh(path, mesh.vertices, mesh.faces, mesh.colours, mesh.normals)
+    if path == settings.result / "mesh.ply":
+        write_page_anew(settings.result)
+    return path

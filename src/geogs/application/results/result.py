@@ -1,0 +1,90 @@
+"""What a run or a reconstruction came to."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+
+from geogs.application.progress import RunProgress
+from geogs.application.results.scene import MappedScene
+from geogs.application.results.surfaces import surface_of
+from geogs.application.results.verdict import Verdict, verdict
+from geogs.io.sources.posed.base import PosedSource
+from geogs.io.sources.sniff import Stream
+from geogs.mesh.types import Mesh
+from geogs.types import MapSnapshot, RenderedKeyframe, Trajectory, Uncertainty
+
+
+@dataclass(frozen=True)
+class Result:
+    """What there is of a scene; each part is made when it is first asked for, then kept."""
+
+    scene: MappedScene
+    """A ``Slam`` or a ``Reconstruction``, whose work is done."""
+    source: Stream | PosedSource
+    """What it was made from, read to the end."""
+    is_interrupted: bool = False
+    """Whether the final stages were left out, or cut short."""
+    progress: RunProgress = field(default_factory=RunProgress)
+    """Follows the extraction of the mesh."""
+
+    @cached_property
+    def trajectory(self) -> Trajectory:
+        """Poses of all frames."""
+        return self.scene.trajectory()
+
+    @cached_property
+    def keyframes(self) -> Trajectory:
+        """Poses of the keyframes alone."""
+        return self.scene.keyframe_trajectory()
+
+    @cached_property
+    def uncertainty(self) -> Uncertainty | None:
+        """How well the keyframes are known; none where the poses were given."""
+        return self.scene.uncertainty()
+
+    @cached_property
+    def verdict(self) -> Verdict | None:
+        """Whether trajectory and shape are to be relied on; none where the poses were given."""
+        if self.uncertainty is None:
+            return None
+        why_not = self.why_no_map or ""
+        return verdict(self.trajectory, self.keyframes, self.uncertainty, why_not)
+
+    @property
+    def why_no_map(self) -> str | None:
+        """Why no map could be started, where only orientations are known; else none."""
+        reason = self.scene.particulars().get("not_started")
+        return None if reason is None else str(reason)
+
+    @cached_property
+    def map(self) -> MapSnapshot:
+        """The disks."""
+        return self.scene.snapshot()
+
+    @cached_property
+    def renders(self) -> Sequence[RenderedKeyframe]:
+        """The map seen from every keyframe."""
+        return self.scene.renders()
+
+    @cached_property
+    def mesh(self) -> Mesh | None:
+        """The surface of the map; none where none was found, or where depths are no evidence of
+        one, of which ``progress`` is told."""
+        if self.verdict is not None and not self.verdict.has_shape:
+            self.progress.write("No mesh: nothing tells the depths of what was seen.")
+            return None
+        renders = self.renders
+        with self.scene.stopwatch("mesh"):
+            return surface_of(renders, self.scene.config.mesh, self.progress)
+
+
+@dataclass(frozen=True)
+class Written:
+    """A result whose files have been written."""
+
+    output: Path
+    """Their folder."""
+    result: Result
+    can_resume: bool
+    """Whether it was interrupted, and a checkpoint holds the work that had been done."""

@@ -1,0 +1,117 @@
+"""``summary.json``: what happened, in numbers."""
+
+import math
+import platform
+from dataclasses import asdict
+
+import numpy as np
+import torch
+
+from geogs.application.machine.device import device_summary, peak_memory
+from geogs.application.results.result import Result
+from geogs.application.results.scene import MappedScene
+from geogs.io.sources.posed.base import PosedSource
+from geogs.io.sources.several import SeveralSources
+from geogs.io.sources.sniff import Stream
+from geogs.stopwatch import Stopwatch
+from geogs.types import FrameState, Trajectory
+from geogs.version import __version__
+
+
+def summarise(result: Result) -> dict[str, object]:
+    """What ``summary.json`` holds."""
+    scene, source, mesh = result.scene, result.source, result.mesh
+    return {
+        "source": source.name,
+        "kind": source.kind,
+        "fingerprint": source.fingerprint(),
+        "frames": scene.frames,
+        **source_summary(source),
+        "verdict": None if result.verdict is None else _finite(asdict(result.verdict)),
+        "keyframes": len(result.keyframes.timestamps),
+        "lost_spans": lost_spans(result.trajectory),
+        "orientation_only_spans": spans(result.trajectory, "orientation only"),
+        **particulars(scene),
+        "disks": len(result.map),
+        "mesh_faces": 0 if mesh is None else len(mesh.faces),
+        **time_summary(scene.stopwatch, scene.frames),
+        "peak_memory_bytes": peak_memory(),
+        **device_summary(result.map.position.device),
+        "interrupted": result.is_interrupted,
+        "intrinsics": source.intrinsics_origin,
+        "seed": scene.config.seed,
+        "versions": {
+            "geogs": __version__,
+            "torch": torch.__version__,
+            "python": platform.python_version(),
+        },
+    }
+
+
+def particulars(scene: MappedScene) -> dict[str, object]:
+    """What the scene says of itself; where its lengths are metres, ``scale`` says by what."""
+    said = dict(scene.particulars())
+    metric = said.get("metric_scale")
+    if isinstance(metric, dict):
+        said["scale"] = f"metric ({metric['origin']})"
+    return said
+
+
+def _finite(values: dict[str, object]) -> dict[str, object]:
+    """The values with none instead of infinity and NaN, which JSON does not know."""
+    return {
+        k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in values.items()
+    }
+
+
+def source_summary(source: Stream | PosedSource) -> dict[str, object]:
+    """What a unit of the map is, and which images were not used."""
+    if isinstance(source, PosedSource):
+        held_out = {"held_out": source.held_out} if source.held_out else {}
+        left_out = [{"image": name, "reason": why} for name, why in source.left_out]
+        return {
+            "scale": f"of the poses ({source.scene_scale})",
+            "skipped_images": len(left_out),
+            **({"left_out": left_out} if left_out else {}),
+            **held_out,
+        }
+    spans = source.spans if isinstance(source, SeveralSources) else []
+    live = {"dropped_frames": source.dropped} if source.is_live else {}
+    videos = {"videos": [asdict(span) for span in spans]} if spans else {}
+    return {
+        "scale": "arbitrary (monocular)",
+        "skipped_images": source.skipped,
+        "damaged_images": source.damaged,
+        "shutter": {"readout": source.shutter.readout, "origin": source.shutter.origin},
+        **live,
+        **videos,
+    }
+
+
+def time_summary(stopwatch: Stopwatch, frames: int) -> dict[str, object]:
+    """Seconds of every stage, and frames/s.
+
+    ``until_stream_end`` counts every stage up to the last frame: reading, tracking, loops, mapping,
+    map updates, adjustments on the way, checkpoints. ``with_final_stages`` counts those after it,
+    too: final adjustment and refinement, what is rendered, the mesh.
+    """
+    total = stopwatch.total
+    rates = {"with_final_stages": round(frames / max(total, 1e-9), 3)}
+    if stopwatch.until_stream_end is not None:
+        online = round(frames / max(stopwatch.until_stream_end, 1e-9), 3)
+        rates = {"until_stream_end": online, **rates}
+    seconds = {name: round(s, 3) for name, s in stopwatch.seconds.items()}
+    return {"seconds": {**seconds, "total": round(total, 3)}, "frames_per_second": rates}
+
+
+def lost_spans(trajectory: Trajectory) -> list[list[float]]:
+    """First and last time of every stretch where the camera was lost."""
+    return spans(trajectory, "lost")
+
+
+def spans(trajectory: Trajectory, state: FrameState) -> list[list[float]]:
+    """First and last time of every stretch of frames in a state."""
+    inside = np.array([False, *(s == state for s in trajectory.states), False]).astype(int)
+    first, last = np.flatnonzero(np.diff(inside) == 1), np.flatnonzero(np.diff(inside) == -1) - 1
+    times = trajectory.timestamps
+    return [[float(times[a]), float(times[b])] for a, b in zip(first, last, strict=True)]

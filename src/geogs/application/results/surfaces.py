@@ -1,0 +1,79 @@
+"""Meshes as files: of the result, of what there was before it, and of depths without disks."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal
+
+from geogs.application.progress import RunProgress
+from geogs.application.results.scene import MappedScene
+from geogs.config import MeshConfig
+from geogs.errors import InputError
+from geogs.io.writers.ply import write_mesh
+from geogs.io.writers.tum import write_trajectories
+from geogs.mesh.extract import extract_mesh
+from geogs.mesh.types import DepthMapView, Mesh
+from geogs.on_demand import OnDemand
+from geogs.types import RenderedKeyframe
+
+
+def fusion_views(renders: Sequence[RenderedKeyframe]) -> Sequence[DepthMapView]:
+    """The renderings as what mesh extraction takes, each when it is asked for."""
+    return OnDemand(renders, lambda r: DepthMapView(r.depth, r.weight, r.camera, r.T_cw, r.image))
+
+
+def surface_of(
+    renders: Sequence[RenderedKeyframe],
+    config: MeshConfig,
+    progress: RunProgress,
+    name: str = "mesh",
+) -> Mesh | None:
+    """Fuse depth maps to a mesh; where there is no surface, say so as ``name``."""
+    try:
+        return extract_mesh(
+            fusion_views(renders),
+            config,
+            lambda part, done, of: progress.stage(f"{name}: {part}", done / of),
+        )
+    except InputError as error:
+        progress.write(f"No {name}: {error}")
+        return None
+
+
+def write_surface(
+    path: Path,
+    renders: Sequence[RenderedKeyframe],
+    config: MeshConfig,
+    progress: RunProgress,
+    name: str = "mesh",
+) -> Mesh | None:
+    """Fuse depth maps to a mesh and write that, if there is a surface.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    mesh = surface_of(renders, config, progress, name)
+    if mesh is not None:
+        write_mesh(path, mesh.vertices, mesh.faces, mesh.colours, mesh.normals)
+    return mesh
+
+
+def write_depth_mesh(output: Path, scene: MappedScene, progress: RunProgress) -> None:
+    """``depth_fusion/mesh.ply``: the surface of the searched depths, to compare the map with."""
+    with scene.stopwatch("depth fusion"):
+        path = output / "depth_fusion" / "mesh.ply"
+        write_surface(path, scene.depth_maps(), scene.config.mesh, progress, "depth mesh")
+
+
+def write_stage(
+    output: Path, scene: MappedScene, progress: RunProgress, name: Literal["online", "adjusted"]
+) -> None:
+    """Trajectories and mesh as they stand, to a folder of the stage's name.
+
+    ``online`` is the end of the stream, ``adjusted`` what the final bundle adjustment and the map's
+    update have made of it.
+    """
+    with scene.stopwatch(f"{name} results"):
+        folder = output / name
+        write_trajectories(folder, scene.trajectory(), scene.keyframe_trajectory())
+        path = folder / "mesh.ply"
+        write_surface(path, scene.renders(), scene.config.mesh, progress, f"{name} mesh")

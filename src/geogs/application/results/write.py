@@ -1,0 +1,103 @@
+"""Everything that a run or a reconstruction leaves in its folder."""
+
+import json
+from collections.abc import Callable, Collection, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict
+from pathlib import Path
+
+from geogs.application.results.keyframe_files import write_keyframes
+from geogs.application.results.output_folder import remove_former
+from geogs.application.results.report import write_report
+from geogs.application.results.result import Result
+from geogs.application.results.splat_colours import splat_colours
+from geogs.application.results.summary import summarise
+from geogs.application.results.surfaces import fusion_views
+from geogs.config import Config, ReconstructConfig
+from geogs.io.sources.posed.base import PosedSource
+from geogs.io.writers.atomic import prepare_output_folder, write_text
+from geogs.io.writers.intrinsics import write_intrinsics
+from geogs.io.writers.map_views import save_map_with_views
+from geogs.io.writers.ply import write_mesh, write_splats
+from geogs.io.writers.tum import write_trajectories
+from geogs.io.writers.uncertainty import write_uncertainty
+from geogs.threads import on_one_torch_thread
+from geogs.types import RenderedKeyframe
+
+
+@on_one_torch_thread
+def write_results(
+    output: str | Path,
+    result: Result,
+    more: Sequence[Callable[[], None]] = (),
+    keyframe_images: bool = True,
+    new_stages: Collection[str] = (),
+) -> None:
+    """Write poses first, then map and mesh beside each other, what else was asked for, the report.
+
+    ``more`` writes the rest, which the summary then counts. ``keyframe_images`` says whether the
+    images of the keyframes are kept, too. Files of an earlier result in the folder are deleted;
+    ``new_stages`` names folders of stages that are of this one.
+
+    Raises:
+        OutputError: a file cannot be written.
+    """
+    output = prepare_output_folder(output)
+    remove_former(output, new_stages)
+    scene, source, progress = result.scene, result.source, result.progress
+    write_trajectories(output, result.trajectory, result.keyframes)
+    if result.uncertainty is not None:
+        table = output / "trajectory_uncertainty.csv"
+        write_uncertainty(table, result.trajectory, result.uncertainty)
+    as_it_came = () if isinstance(source, PosedSource) else (source.calibration, source.shutter)
+    write_intrinsics(output / "intrinsics.json", source.camera, *as_it_came)
+    write_config(output / "config.yaml", scene.config)
+    disks = result.map
+    renders = result.renders if result.why_no_map is None else ()
+    with ThreadPoolExecutor(1, thread_name_prefix="map") as beside:
+        written = beside.submit(_write_map, output, result, renders, keyframe_images)
+        if (mesh := result.mesh) is not None:
+            with scene.stopwatch("mesh"):
+                write_mesh(
+                    output / "mesh.ply", mesh.vertices, mesh.faces, mesh.colours, mesh.normals
+                )
+        with scene.stopwatch("keyframes"):
+            written.result()
+    for write in more:
+        write()
+    lost = result.trajectory.states.count("lost")
+    if lost > 0.2 * scene.frames:
+        progress.write(
+            f"warning: {lost} of {scene.frames} frames were not tracked; slower motion, texture "
+            "or the right --intrinsics may help."
+        )
+    summary = summarise(result)
+    write_text(output / "summary.json", json.dumps(summary, indent=2))
+    progress.stage("report", 0.0)
+    with scene.stopwatch("report"):
+        write_report(output / "report", result.trajectory, result.renders, mesh, summary, disks)
+    progress.stage("report", 1.0)
+
+
+@on_one_torch_thread
+def _write_map(
+    output: Path, result: Result, renders: Sequence[RenderedKeyframe], keyframe_images: bool
+) -> None:
+    """Keyframes, map and splats, beside the mesh."""
+    scene, source, disks = result.scene, result.source, result.map
+    with scene.stopwatch.aside():
+        if result.why_no_map is None:
+            views = write_keyframes(output, scene, source.camera, renders, keyframe_images)
+            facts = {"source": source.name, "seed": scene.config.seed}
+            save_map_with_views(output / "map.safetensors", disks, views, facts)
+        if len(disks):
+            colours = splat_colours(disks, fusion_views(renders))
+            write_splats(output / "splats.ply", disks, colours)
+
+
+def write_config(path: Path, config: Config | ReconstructConfig) -> None:
+    """All settings as YAML."""
+    import yaml
+
+    plain = json.loads(json.dumps(asdict(config), default=str))
+    write_text(path, yaml.safe_dump(plain, sort_keys=False))

@@ -1,0 +1,147 @@
+"""Reconstructions that were cut off and go on: checkpoints, their file, the command."""
+
+import json
+import signal
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial import cKDTree
+
+from geogs.application.checkpoints.checkpoint import checkpoint_folder, write_checkpoint
+from geogs.application.checkpoints.reconstruct_state import ReconstructState, fingerprint, read_work
+from geogs.cli import main as cli
+from geogs.config import ReconstructConfig
+from geogs.errors import InputError
+from geogs.reconstruction import Reconstruction
+from posed_scene import (
+    DEFAULT,
+    SMALL,
+    ball_and_wall,
+    depth_errors,
+    surface_points,
+    vertices,
+)
+from stopped_commands import stop
+
+pytestmark = pytest.mark.system
+
+
+def interrupted(scene: Reconstruction, fraction: float) -> None:
+    """Finish a reconstruction up to a part of its training."""
+
+    def interrupt(name: str, done: float) -> None:
+        if name == "training" and done >= fraction:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        scene.finish(progress=interrupt)
+
+
+def write_work(output: Path, scene: Reconstruction) -> None:
+    """A checkpoint of its work."""
+    write_checkpoint(checkpoint_folder(output), ReconstructState("these", scene.state()))
+
+
+@pytest.fixture(scope="module")
+def whole() -> Reconstruction:
+    """One that nothing disturbed."""
+    scene = ball_and_wall(far=10.0)
+    scene.finish()
+    return scene
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("fraction", [0.0, 0.6])
+def test_work_that_was_cut_off_is_gone_on_with(whole, tmp_path, fraction):
+    first = ball_and_wall(far=10.0)
+    interrupted(first, fraction)
+    write_work(tmp_path, first)
+    state = read_work(tmp_path, "these")
+    assert state.seconds > 0
+    second, stages = ball_and_wall(far=10.0), []
+    second.resume(state, lambda stage, _: stages.append(stage))
+    assert set(stages) == {"training"}
+    assert second.elapsed > state.seconds
+    assert second.mapper.trained.steps == whole.mapper.trained.steps
+    counts = len(second.snapshot()), len(whole.snapshot())
+    assert abs(counts[0] - counts[1]) < 0.05 * counts[1]
+    errors, wanted = depth_errors(second), depth_errors(whole)
+    print(f"medians {np.median(errors):.5f} and {np.median(wanted):.5f}")
+    assert np.median(errors) < 1.15 * np.median(wanted)
+
+
+def test_a_restored_mapper_is_the_same(tmp_path):
+    first = ball_and_wall()
+    interrupted(first, 0.5)
+    write_work(tmp_path, first)
+    second = ball_and_wall()
+    state = read_work(tmp_path, "these")
+    second._frame = first._frame
+    second._place_keyframes()
+    second.mapper.load(state.mapper)
+    assert second.mapper.trained == first.mapper.trained
+    assert second.mapper.unit == first.mapper.unit
+    for a, b in zip(first.mapper.views.values(), second.mapper.views.values(), strict=True):
+        assert a.partners == b.partners
+        assert a.search == b.search
+        assert torch.equal(a.known.prior_depth, b.known.prior_depth)
+    for a, b in zip(first.mapper.map.parameters, second.mapper.map.parameters, strict=True):
+        assert torch.equal(a, b)
+    assert torch.equal(first.mapper.map.steps, second.mapper.map.steps)
+    for name in ("first", "second"):
+        rows = zip(
+            getattr(first.mapper.optimizer, name),
+            getattr(second.mapper.optimizer, name),
+            strict=True,
+        )
+        assert all(torch.equal(a, b) for a, b in rows)
+
+
+def test_a_wrong_checkpoint_is_one_sentence(tmp_path):
+    with pytest.raises(InputError, match="nothing to resume"):
+        read_work(tmp_path, "these")
+    scene = ball_and_wall()
+    interrupted(scene, 0.0)
+    write_work(tmp_path, scene)
+    with pytest.raises(InputError, match="other settings or images"):
+        read_work(tmp_path, "those")
+
+
+def test_fingerprints_change_with_settings_and_images():
+    names = ["a.png", "b.png"]
+    own = fingerprint(DEFAULT, None, names)
+    assert own == fingerprint(ReconstructConfig(), None, names)
+    assert own != fingerprint(SMALL, None, names)
+    assert own != fingerprint(DEFAULT, 8, names)
+    assert own != fingerprint(DEFAULT, None, names[:1])
+
+
+@pytest.mark.usefixtures("no_report")
+def test_an_interrupted_command_resumes(small_room, tmp_path, capsys):
+    """Ctrl-C in the training leaves a result and a checkpoint; the rest is done later."""
+    call = [
+        "reconstruct", small_room, "-o", tmp_path, "--stride", 6, "--mapping.render-long-edge", 96,
+        "--search.least-steps", 200, "--search.no-repeat", "--device", "cpu",
+    ]  # fmt: skip
+    checkpoint = tmp_path / "checkpoint" / "manifest.json"
+    said = stop([*map(str, call)], signal.SIGINT, checkpoints=1)
+    assert "--resume goes on" in said
+    assert json.loads((tmp_path / "summary.json").read_text())["interrupted"] is True
+    assert checkpoint.is_file()
+    assert cli.main([*map(str, call), "--resume", "--mapping.disk.opacity", "0.6"]) == 2
+    said = capsys.readouterr().err
+    assert "other settings" in said.splitlines()[-1]
+    assert "Traceback" not in said
+    assert cli.main([*map(str, call), "--resume"]) == 0
+    assert "Going on after" in capsys.readouterr().err
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["interrupted"] is False
+    assert "depth" not in summary["seconds"]
+    assert not checkpoint.parent.exists()
+    assert cli.main([*map(str, call), "--resume"]) == 2
+    assert "nothing to resume" in capsys.readouterr().err.splitlines()[-1]
+    seen = vertices(small_room / "points_seen_1cm.ply")
+    accuracy = cKDTree(seen).query(surface_points(tmp_path / "mesh.ply"))[0]
+    assert np.median(accuracy) < 0.02

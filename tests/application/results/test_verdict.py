@@ -1,0 +1,77 @@
+"""What a run says of itself in one line."""
+
+import numpy as np
+import pytest
+
+from geogs.application.results.verdict import verdict
+from geogs.types import Trajectory, Uncertainty
+
+
+def walk(count: int, tracked: int) -> Trajectory:
+    """A straight walk of one unit, of which the first frames are tracked."""
+    T = np.tile(np.eye(4), (count, 1, 1))
+    T[:, 0, 3] = np.linspace(0, 1, count)
+    return Trajectory(np.arange(count) / 30, T, np.arange(count) < tracked)
+
+
+def known(position: float, depth: float) -> Uncertainty:
+    n = 5
+    return Uncertainty(
+        np.arange(n) / 5, np.full(n, position), np.full(n, 0.01), np.full(n, depth)
+    )  # fmt: skip
+
+
+def test_a_good_run_says_how_good():
+    found = verdict(walk(30, 30), walk(5, 5), known(0.0035, 0.02))
+    assert found.is_reliable
+    assert found.position == pytest.approx(0.0035 / np.std(np.linspace(0, 1, 5)))
+    assert found.sentence == (
+        "Trajectory and shape are reliable: the camera's place is known to 1.0% of the extent of "
+        "its path, depths to 2.0%."
+    )
+
+
+@pytest.mark.parametrize(
+    ("tracked", "position", "depth", "reason"),
+    [
+        (20, 0.001, 0.01, "the camera was lost in 33% of the frames"),
+        (30, 0.1, 0.01, "its place is known only to 28% of the extent"),
+        (30, 0.001, 0.4, "depths are known only to 40%"),
+        (30, 0.001, np.inf, "depths are known only to nothing"),
+    ],
+)
+def test_a_bad_run_says_why(tracked, position, depth, reason):
+    found = verdict(walk(30, tracked), walk(5, 5), known(position, depth))
+    assert not found.is_reliable
+    assert found.sentence.startswith("Not to be relied on: ")
+    assert reason in found.sentence
+
+
+def test_a_run_without_motion_is_not_reliable():
+    still = Trajectory(np.arange(5.0), np.tile(np.eye(4), (5, 1, 1)), np.ones(5, bool))
+    assert not verdict(still, still, known(0.001, 0.01)).is_reliable
+
+
+def test_a_run_without_a_map_says_why():
+    turned = Trajectory(np.arange(4.0), walk(4, 4).T_wc, np.zeros(4, bool), np.ones(4, bool))
+    none = np.zeros(0)
+    nothing = Uncertainty(none, none, none, none)
+    found = verdict(turned, walk(0, 0), nothing, "The camera only turns.")
+    assert not found.is_reliable
+    assert found.sentence == "Rotation only: no shape. The camera only turns."
+    assert (found.lost, found.orientation_only) == (0, 1)
+
+
+def test_much_turning_is_told():
+    states = np.arange(30) < 10
+    turned = Trajectory(np.arange(30.0), walk(30, 30).T_wc, states, ~states)
+    found = verdict(turned, walk(5, 5), known(0.001, 0.01))
+    assert not found.is_reliable
+    assert "of 67% of the frames only the orientation is known" in found.sentence
+
+
+def test_depths_that_nobody_knows_are_no_shape():
+    moving = walk(20, 20)
+    assert verdict(moving, moving, known(0.001, 0.1)).has_shape
+    assert not verdict(moving, moving, known(0.001, 0.6)).has_shape
+    assert not verdict(moving, moving, known(0.001, np.inf)).has_shape
