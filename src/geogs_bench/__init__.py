@@ -1,1 +1,5 @@
 """Benchmarks: scenes of known data sets, run and scored in one go, beside the published figures."""
+
+from geogs.cli.command import Command
+
+COMMAND = Command("geogs_bench.cli", "run a benchmark and write its tables")

@@ -1,12 +1,13 @@
 """Where a frame was taken, against the points of a reconstruction that other frames made."""
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int64, UInt8
 
+from geogs.application.photos import PlacedVideo
 from geogs.geometry.camera import Camera
+from geogs.types import Frame
 from geogs_photos.features import find_features
 from geogs_photos.library import load_colmap
 
@@ -22,21 +23,10 @@ _RATIO = 0.8
 class Localiser:
     """The points that the placed frames see, with their looks."""
 
-    def __init__(
-        self,
-        positions: Sequence[Float64[np.ndarray, "_n 3"]],
-        descriptors: Sequence[UInt8[np.ndarray, "_n 128"]],
-        places: Sequence[int],
-        camera: Camera,
-        seed: int,
-    ) -> None:
-        """``positions`` and ``descriptors`` of the points that each placed frame sees.
-
-        ``places`` are the frames' numbers in the video, ascending; ``camera`` is that of the frames
-        to place.
-        """
-        self._positions, self._descriptors = positions, descriptors
-        self._places = np.array(places)
+    def __init__(self, video: PlacedVideo, camera: Camera, seed: int) -> None:
+        """``camera`` is that of the frames to place."""
+        self._positions, self._descriptors = video.positions, video.descriptors
+        self._places = np.array(video.numbers)
         colmap = load_colmap()
         self._camera: Any = colmap.Camera(
             model=colmap.CameraModelId.PINHOLE, width=camera.width, height=camera.height,
@@ -46,14 +36,12 @@ class Localiser:
         self._options.ransac.max_error = MAX_ERROR
         self._options.ransac.random_seed = seed
 
-    def place(
-        self, number: int, image: UInt8[np.ndarray, "h w 3"]
-    ) -> Float64[np.ndarray, "4 4"] | None:
-        """World to camera of frame ``number`` of the video; none where too few points agree."""
-        near = self._near(number)
+    def place(self, frame: Frame) -> Float64[np.ndarray, "4 4"] | None:
+        """World to camera of a frame of the video; none where too few points agree."""
+        near = self._near(frame.index)
         positions = np.concatenate([self._positions[k] for k in near])
         looks = np.concatenate([self._descriptors[k] for k in near])
-        features = find_features(image)
+        features = find_features(frame.image)
         if len(features) < LEAST_INLIERS or len(positions) < LEAST_INLIERS:
             return None
         own, known = matches_to_points(features.descriptors, looks, positions)

@@ -2,25 +2,26 @@
 
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64, UInt8
 
+from geogs.application.photos import PlacedVideo
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.calibration_files import calibration_from_colmap
+from geogs.io.sources.sniff import Stream
+from geogs.stopwatch import Stopwatch
 from geogs.threads import thread_map, worker_count
-from geogs.types import Frame
 from geogs_photos.database import Entry, SharedCamera
 from geogs_photos.deviations import pose_deviations
 from geogs_photos.features import find_features
 from geogs_photos.library import load_colmap
 from geogs_photos.pairs import choose_pairs
 from geogs_photos.poses import Progress, structure_of
+from geogs_photos.sharp_frames import ChosenFrames, sharpest_frames, stretch_length
 from geogs_photos.structure import refine
 from geogs_photos.upright import upright_rotation
 
@@ -28,40 +29,26 @@ NEXT = 6
 """Chosen frames after each that it is matched with in any case."""
 
 
-@dataclass(frozen=True, slots=True)
-class PlacedFrames:
-    """Chosen frames with a pose, in time order, and the points that they see."""
+def place_video(video: Stream, seed: int, report: Progress, stopwatch: Stopwatch) -> PlacedVideo:
+    """Choose the sharp frames of a video and find where they were taken.
 
-    numbers: tuple[int, ...]
-    """Of the frames in the video."""
-    T_cw: Float64[np.ndarray, "n 4 4"]
-    """World to camera."""
-    deviation: Float64[np.ndarray, "n"]
-    """Of the camera's centre after the similarity that fits best; infinite where unknown."""
-    rotation: Float64[np.ndarray, "n"]
-    """Of its orientation, radians."""
-    depth: Float64[np.ndarray, "n"]
-    """Of its points' depths, as a part of them: the median."""
-    positions: tuple[Float64[np.ndarray, "_m 3"], ...]
-    """Of the points that each frame sees."""
-    descriptors: tuple[UInt8[np.ndarray, "_m 128"], ...]
-    calibration: Calibration
-    """Of the frames as they were given."""
-    error: float
-    """Mean distance of the points from where they were seen, pixels."""
-
-    def all_points(self) -> Float64[np.ndarray, "k 3"]:
-        """Every point once."""
-        return np.unique(np.concatenate(self.positions), axis=0)
+    Its camera stays as it is where its calibration is given. What is wanted of it, and what it
+    raises: ``geogs.application.photos.place_video``.
+    """
+    with stopwatch("choosing frames"):
+        every = stretch_length(float(getattr(video, "fps", 30.0)), video.length)
+        chosen = sharpest_frames(video, every)
+    with stopwatch("structure from motion"):
+        return place_frames(chosen, video.camera, not video.is_calibration_open, seed, report)
 
 
 def place_frames(
-    frames: Sequence[Frame], camera: Camera, is_known: bool, seed: int, progress: Progress
-) -> PlacedFrames:
+    chosen: ChosenFrames, camera: Camera, is_known: bool, seed: int, progress: Progress
+) -> PlacedVideo:
     """Find where frames of one camera were taken; of the largest part that hangs together.
 
     Args:
-        frames: in time order.
+        chosen: the frames.
         camera: of the frames; where the search begins if it is not known.
         is_known: whether the camera is to stay as it is.
         seed: of the random choices.
@@ -76,12 +63,12 @@ def place_frames(
         is_guess=not is_known,
     )  # fmt: skip
     features = thread_map(
-        lambda frame: find_features(frame.image), frames, lambda f: progress("features", f)
+        lambda frame: find_features(frame.image), chosen.frames, lambda f: progress("features", f)
     )
-    chosen = choose_pairs(features, seed, lambda f: progress("choosing pairs", f))
-    count = len(frames)
+    alike = choose_pairs(features, seed, lambda f: progress("choosing pairs", f))
+    count = len(chosen.frames)
     following = {(i, j) for i in range(count) for j in range(i + 1, min(i + 1 + NEXT, count))}
-    pairs = sorted({*chosen, *following})
+    pairs = sorted({*alike, *following})
     entries = [Entry(f"{k:06d}", 0, some) for k, some in enumerate(features)]
     shared = [SharedCamera(begin, is_known)]
     with tempfile.TemporaryDirectory(prefix="geogs-video-") as work:
@@ -96,12 +83,12 @@ def place_frames(
     R_cw = np.stack([image.cam_from_world().rotation.matrix() for image in images])
     up = upright_rotation(R_cw, [0] * len(images))
     best.transform(colmap.Sim3d(1.0, colmap.Rotation3d(up), np.zeros(3)))
-    return _placed(best, frames, entries, is_known)
+    return _placed(best, chosen, entries, is_known)
 
 
 def _placed(
-    model: Any, frames: Sequence[Frame], entries: Sequence[Entry], is_known: bool
-) -> PlacedFrames:
+    model: Any, chosen: ChosenFrames, entries: Sequence[Entry], is_known: bool
+) -> PlacedVideo:
     images = sorted((i for i in model.images.values() if i.has_pose), key=lambda i: i.name)
     T_cw = np.tile(np.eye(4), (len(images), 1, 1))
     positions, descriptors = [], []
@@ -117,10 +104,10 @@ def _placed(
     error = float(model.compute_mean_reprojection_error())
     deviation, rotation = pose_deviations(model, images, T_cw, error, is_known)
     depth = np.array([_depth_deviation(model, image, error) for image in images])
-    numbers = tuple(frames[int(image.name)].index for image in images)
-    return PlacedFrames(
-        numbers, T_cw, deviation, rotation, depth, tuple(positions), tuple(descriptors),
-        calibration, error,
+    numbers = tuple(chosen.frames[int(image.name)].index for image in images)
+    return PlacedVideo(
+        chosen.timestamps, len(chosen.frames), numbers, T_cw, deviation, rotation, depth,
+        tuple(positions), tuple(descriptors), calibration, error,
     )  # fmt: skip
 
 

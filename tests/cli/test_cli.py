@@ -13,6 +13,7 @@ import pytest
 from geogs import __version__
 from geogs.cli import main as cli
 from geogs.cli import reconstruct
+from geogs.cli.command import COMMANDS, Command, all_commands
 from geogs.cli.options import parse_options
 from geogs.config import Config, InputConfig, reconstruct_preset
 from geogs.config.setting import Positional
@@ -46,7 +47,7 @@ def command(monkeypatch):
         module = types.ModuleType("geogs_test_command")
         module.main = body
         monkeypatch.setitem(sys.modules, module.__name__, module)
-        monkeypatch.setitem(cli.COMMANDS, "run", cli.Command(module.__name__, "test"))
+        monkeypatch.setitem(COMMANDS, "run", Command(module.__name__, "test"))
 
     return install
 
@@ -55,12 +56,16 @@ def test_help_lists_every_command():
     result = geogs("--help")
     assert result.returncode == 0
     assert result.stderr == ""
-    for name, entry in cli.COMMANDS.items():
+    for name, entry in all_commands().items():
         assert f"  {name} " in result.stdout
         assert entry.help in result.stdout
 
 
-@pytest.mark.parametrize("command", ["", *cli.COMMANDS])
+def test_packages_beside_register_their_commands():
+    assert {"bench", "fleet", "synth", "train"} == {*all_commands()} - {*COMMANDS}
+
+
+@pytest.mark.parametrize("command", ["", *all_commands()])
 def test_help_imports_nothing_heavy(command: str):
     """Which is why it is there at once."""
     heavy = ("torch", "numpy", "cv2", "numba", "rich", "av", "matplotlib", "scipy", "yaml")

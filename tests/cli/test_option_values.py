@@ -6,12 +6,14 @@ from collections.abc import Callable, Sequence
 
 import pytest
 
-from geogs.cli import demo, doctor, eval, export, fleet, mesh, reconstruct, run, scale, synth, view
+from geogs.cli import demo, doctor, eval, export, mesh, reconstruct, run, scale, view
 from geogs.cli.options import parse_options
 from geogs.config.leaves import Leaf, leaves
 from geogs.config.setting import Positional, Range
 from geogs.errors import GeogsError, InputError
 from geogs_bench.cli import BenchOptions
+from geogs_fleet import cli as fleet
+from geogs_synth import cli as synth
 from geogs_train.cli import TrainDepthOptions, TrainOptions
 
 Parse = Callable[[Sequence[str]], object]

@@ -9,8 +9,9 @@ from pathlib import Path
 import pytest
 
 import geogs as geogs_package
+from geogs.cli import command
 from geogs.cli import main as cli
-from geogs.cli.main import Command
+from geogs.cli.command import COMMANDS, Command
 from geogs.kernel_folder import VARIABLE
 
 ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
@@ -34,8 +35,8 @@ def failing_with(error: Exception, monkeypatch: pytest.MonkeyPatch) -> None:
         raise error
 
     module = type("Module", (), {"main": staticmethod(main)})
-    monkeypatch.setattr(cli.importlib, "import_module", lambda name: module)
-    monkeypatch.setitem(cli.COMMANDS, "fail", Command("nowhere", "fails"))
+    monkeypatch.setattr(command.importlib, "import_module", lambda name: module)
+    monkeypatch.setitem(COMMANDS, "fail", Command("nowhere", "fails"))
 
 
 class OutOfMemoryError(RuntimeError):

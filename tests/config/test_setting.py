@@ -15,10 +15,10 @@ from geogs import config
 from geogs.application.eval_settings import EvalSettings
 from geogs.application.settings import ReconstructSettings, RunSettings
 from geogs.cli.demo import DemoOptions
-from geogs.cli.synth import SynthOptions
 from geogs.config.setting import Kind, Only, Range, Settings, Time, kinds
 from geogs.errors import InputError
 from geogs_bench.settings import BenchSettings
+from geogs_synth.cli import SynthOptions
 from geogs_synth.flaws import Flaws
 from geogs_train.cli import TrainOptions
 

@@ -4,10 +4,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from geogs.application.photos import PlacedVideo
+from geogs.io.sources.calibration import Calibration
 from geogs.types import Frame
 from geogs_photos.features import find_features
 from geogs_photos.localise import Localiser, matches_to_points
-from geogs_photos.sharp_frames import sharpest_frames, sharpness, stretch_length
+from geogs_photos.sharp_frames import ChosenFrames, sharpest_frames, sharpness, stretch_length
 from geogs_photos.video import place_frames
 from posed_layouts import render_room
 
@@ -66,13 +68,17 @@ def test_a_frame_is_placed_against_points(tmp_path):
         local = local[z > 0].astype(np.float64)
         positions.append(local @ room.T_wc[k, :3, :3].T + room.T_wc[k, :3, 3])
         looks.append(features.descriptors[z > 0])
-    localiser = Localiser(positions, looks, [0, 2], room.camera, 0)
-    T_cw = localiser.place(1, room.images[1])
+    video = PlacedVideo(
+        np.arange(3.0), 2, (0, 2), room.T_cw[[0, 2]], *np.zeros((3, 2)), tuple(positions),
+        tuple(looks), Calibration(c.fx, c.fy, c.cx, c.cy), 0.0,
+    )  # fmt: skip
+    localiser = Localiser(video, room.camera, 0)
+    T_cw = localiser.place(Frame(1, 1.0, room.images[1]))
     assert T_cw is not None
     off = np.linalg.inv(T_cw) @ room.T_cw[1]
     assert np.linalg.norm(off[:3, 3]) < 0.01
     assert Rotation.from_matrix(off[:3, :3]).magnitude() < np.radians(0.2)
-    assert localiser.place(1, np.zeros_like(room.images[1])) is None
+    assert localiser.place(Frame(1, 1.0, np.zeros_like(room.images[1]))) is None
 
 
 @pytest.mark.system
@@ -80,7 +86,8 @@ def test_deviations_hold_what_the_truth_is_off(tmp_path):
     pytest.importorskip("pycolmap")
     room = render_room(9, 3, 320, 240)
     frames = [Frame(k, k / 10, image) for k, image in enumerate(room.images)]
-    placed = place_frames(frames, room.camera, True, 0, lambda *_: None)
+    chosen = ChosenFrames(tuple(frames), np.arange(9) / 10)
+    placed = place_frames(chosen, room.camera, True, 0, lambda *_: None)
     assert placed.numbers == tuple(range(9))
     centres, truth = np.linalg.inv(placed.T_cw)[:, :3, 3], room.T_wc[:, :3, 3]
     one, other = (np.linalg.norm(c - c[0], axis=1) for c in (centres, truth))

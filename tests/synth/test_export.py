@@ -8,11 +8,11 @@ import cv2
 import numpy as np
 import pytest
 
-from geogs.cli.synth import main
 from geogs.errors import InputError, OutputError
 from geogs.evaluation.surface import read_surface
 from geogs.io.poses import read_poses
 from geogs.io.sources.sniff import open_source
+from geogs_synth.cli import main
 from geogs_synth.export import default_camera, write_sequence
 from geogs_synth.flaws import Flaws, camera_flaws
 from geogs_synth.motions import room_motion

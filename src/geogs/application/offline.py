@@ -1,6 +1,6 @@
 """A video without tracking: sharp frames, structure from motion, every frame against the map."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -11,6 +11,7 @@ from torch import Tensor
 from geogs.application.forecast import reconstruction_forecast
 from geogs.application.interrupt import Stop
 from geogs.application.machine.device import compiled_kernels, full_memory_in_a_sentence
+from geogs.application.photos import PlacedVideo, localiser, place_video
 from geogs.application.progress import RunProgress
 from geogs.application.results.folder_lock import only_writer
 from geogs.application.results.output_folder import free_folder
@@ -29,10 +30,6 @@ from geogs.stopwatch import Stopwatch
 from geogs.threads import on_one_torch_thread
 from geogs.tracking.gaps import bridged
 from geogs.types import MapSnapshot, RenderedKeyframe, SeenRows, Trajectory, Uncertainty
-from geogs_photos.localise import Localiser
-from geogs_photos.poses import Progress
-from geogs_photos.sharp_frames import ChosenFrames, sharpest_frames, stretch_length
-from geogs_photos.video import PlacedFrames, place_frames
 
 
 @on_one_torch_thread
@@ -82,20 +79,17 @@ def _to_folder(
         stop.check()
 
     with full_memory_in_a_sentence(), stop:
-        with stopwatch("choosing frames"):
-            every = stretch_length(_fps(opened), opened.length)
-            chosen = sharpest_frames(opened, every)
-        is_known = not opened.is_calibration_open
-        with stopwatch("structure from motion"):
-            placed = place_frames(chosen.frames, opened.camera, is_known, config.seed, report)
+        placed = place_video(opened, config.seed, report, stopwatch)
         progress.write(
-            f"{len(placed.numbers)} of {len(chosen.frames)} sharp frames have a pose; points are "
+            f"{len(placed.numbers)} of {placed.sharp_frames} sharp frames have a pose; points are "
             f"{placed.error:.2f} pixels from where they were seen."
         )
-        source = opened if is_known else opened.with_calibration(_of_source(opened, placed))
+        source = opened
+        if opened.is_calibration_open:
+            source = opened.with_calibration(_of_source(opened, placed))
         scene = Reconstruction(source.camera, own, str(device))
         with stopwatch("placing frames"):
-            T_cw = _place_all(source, scene, placed, len(chosen.timestamps), own, report)
+            T_cw = _place_all(source, scene, placed, own, report)
         try:
             scene.finish(placed.all_points(), report)
             finished = True
@@ -106,7 +100,7 @@ def _to_folder(
             finished = False
         for stage, seconds in scene.stopwatch.seconds.items():
             stopwatch.seconds[stage] = stopwatch.seconds.get(stage, 0.0) + seconds
-        video = OfflineScene(scene, stopwatch, chosen, placed, T_cw)
+        video = OfflineScene(scene, stopwatch, placed, T_cw)
         result = Result(video, source, not finished, progress)
         write_results(output, result, (), settings.keyframe_images)
     return Written(output, result, False)
@@ -118,8 +112,7 @@ class OfflineScene:
 
     scene: Reconstruction
     stopwatch: Stopwatch
-    chosen: ChosenFrames
-    placed: PlacedFrames
+    placed: PlacedVideo
     T_cw: Sequence[Float64[Tensor, "4 4"] | None]
     """World to camera of all frames; none of those that found no place."""
 
@@ -135,7 +128,7 @@ class OfflineScene:
 
     def trajectory(self) -> Trajectory:
         """Poses of all frames, between others where one has none."""
-        times = self.chosen.timestamps[: self.frames]
+        times = self.placed.timestamps[: self.frames]
         return bridged(times, self.T_cw, [None] * self.frames)
 
     def keyframe_trajectory(self) -> Trajectory:
@@ -173,7 +166,7 @@ class OfflineScene:
         found = sum(pose is not None for pose in self.T_cw)
         return {
             "offline": {
-                "sharp_frames": len(self.chosen.frames),
+                "sharp_frames": self.placed.sharp_frames,
                 "placed_by_structure": len(self.placed.numbers),
                 "placed_against_the_map": found - len(self.placed.numbers),
                 "reprojection_error": self.placed.error,
@@ -185,37 +178,31 @@ class OfflineScene:
 def _place_all(
     source: Stream,
     scene: Reconstruction,
-    placed: PlacedFrames,
-    count: int,
+    placed: PlacedVideo,
     config: ReconstructConfig,
-    report: Progress,
+    report: Callable[[str, float], None],
 ) -> list[Float64[Tensor, "4 4"] | None]:
     """Poses of the frames that find a place; those of structure from motion go to ``scene``."""
-    localiser = Localiser(
-        placed.positions, placed.descriptors, placed.numbers, source.camera, config.seed
-    )
+    localise = localiser(placed, source.camera, config.seed)
     of = dict(zip(placed.numbers, placed.T_cw, strict=True))
+    count = len(placed.timestamps)
     T_cw: list[Tensor | None] = [None] * count
     for frame in source:
         pose = of.get(frame.index)
         if pose is not None:
             scene.add(frame.image, pose, None, frame.timestamp)
         else:
-            pose = localiser.place(frame.index, frame.image)
+            pose = localise(frame)
         if pose is not None:
             T_cw[frame.index] = torch.from_numpy(pose)
         report("placing frames", (frame.index + 1) / count)
     return T_cw
 
 
-def _of_source(source: Stream, placed: PlacedFrames) -> Calibration:
+def _of_source(source: Stream, placed: PlacedVideo) -> Calibration:
     """The camera that was found, for the images as they came."""
     was = source.calibration
     found = replace(placed.calibration, origin="structure from motion of the video")
     assert was.width is not None
     assert was.height is not None
     return found.fit(was.width, was.height)
-
-
-def _fps(source: Stream) -> float:
-    return float(getattr(source, "fps", 30.0))

@@ -15,7 +15,7 @@ from geogs.application.forecast import reconstruction_forecast
 from geogs.application.interrupt import Stop
 from geogs.application.machine.device import compiled_kernels, full_memory_in_a_sentence
 from geogs.application.output_forecast import OutputForecast
-from geogs.application.photographs import open_photographs
+from geogs.application.photos import open_photographs
 from geogs.application.posed_views import PosedViews, Report
 from geogs.application.progress import RunProgress
 from geogs.application.results.folder_lock import only_writer

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
+from geogs.cli.command import find_command
 from geogs.cli.options import parse_options
 from geogs.config import Seed
 from geogs.config.setting import Basic, Range, Settings
@@ -33,21 +34,16 @@ def main(argv: Sequence[str]) -> int:
 
 def demo(options: DemoOptions) -> int:
     """The three commands one after the other."""
-    from geogs.cli import run, synth
-    from geogs.cli.eval import main as evaluate
-
     room, result = str(options.output / "room"), str(options.output / "result")
     steps = [
-        ("synth", synth.main, [
-            room, "--frames", str(options.frames), "--width", str(options.width),
-            "--height", str(options.height), "--seed", str(options.seed),
-        ]),
-        ("run", run.main, [room, "-o", result]),
-        ("eval", evaluate, [result, "--gt", room]),
+        ["synth", room, "--frames", str(options.frames), "--width", str(options.width),
+         "--height", str(options.height), "--seed", str(options.seed)],
+        ["run", room, "-o", result],
+        ["eval", result, "--gt", room],
     ]  # fmt: skip
-    for name, command, arguments in steps:
+    for name, *arguments in steps:
         print(f"$ geogs {name} {' '.join(arguments)}", flush=True)
-        code = command(arguments)
+        code = find_command(name).run(arguments)
         if code:
             return code
     print(f"Open {result}/report/index.html in a browser.")

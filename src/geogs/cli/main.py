@@ -5,16 +5,15 @@ Nothing heavy is imported before a sub-command is chosen, so that help appears a
 
 import atexit
 import errno
-import importlib
 import logging
 import os
 import signal
 import sys
 import threading
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from types import FrameType
 
+from geogs.cli.command import all_commands, find_command
 from geogs.cli.streams import make_unbreakable
 from geogs.errors import GeogsError
 from geogs.version import __version__
@@ -25,35 +24,6 @@ EXIT_INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells give it (128 + SIGINT)."""
 _GPU_FAILS = ("CUDA error", "CUDA out of memory", "CUDA driver error", "cuDNN error", "NVRTC")
 """What errors of PyTorch begin with that no command has said in its own words."""
-
-
-@dataclass(frozen=True)
-class Command:
-    """A sub-command: the module whose ``main(argv) -> exit code`` runs it, and a line of help."""
-
-    module: str
-    help: str
-
-
-COMMANDS = {
-    "run": Command("geogs.cli.run", "reconstruct a video, a folder of images or a data set"),
-    "fleet": Command("geogs.cli.fleet", "reconstruct many videos, on one machine or many"),
-    "reconstruct": Command("geogs.cli.reconstruct", "reconstruct images whose poses are known"),
-    "ros2": Command("geogs.cli.ros2", "track a camera in ROS 2 and publish where it is"),
-    "mesh": Command("geogs.cli.mesh", "make the mesh of a result anew, without running again"),
-    "scale": Command("geogs.cli.scale", "bring a result to metres by a length that is known"),
-    "export": Command("geogs.cli.export", "write a result in the formats of other programs"),
-    "view": Command("geogs.cli.view", "look at a result in the browser"),
-    "eval": Command("geogs.cli.eval", "compare a result with the ground truth"),
-    "bench": Command("geogs_bench.cli", "run a benchmark and write its tables"),
-    "train": Command("geogs_train.cli", "train the flow network that is shipped"),
-    "synth": Command("geogs.cli.synth", "make a synthetic room sequence with exact ground truth"),
-    "demo": Command("geogs.cli.demo", "make a small room, reconstruct it and show the errors"),
-    "weights": Command("geogs.cli.weights", "list the networks' weights, or verify a file"),
-    "doctor": Command(
-        "geogs.cli.doctor", "show what this machine can do, test it, say what to mend"
-    ),
-}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -81,17 +51,16 @@ def _dispatch(arguments: list[str]) -> int:
     if name in ("-V", "--version"):
         print(f"geogs {__version__}")
         return 0
-    if name not in COMMANDS:
-        print_error(_unknown_command(name))
-        return EXIT_ERROR
+    command = find_command(name)
     _show_warnings()
-    return importlib.import_module(COMMANDS[name].module).main(arguments[1:])
+    return command.run(arguments[1:])
 
 
 def help_text() -> str:
     """What ``geogs --help`` prints."""
-    width = max(map(len, COMMANDS))
-    rows = [f"  {name:<{width}}  {command.help}" for name, command in COMMANDS.items()]
+    commands = all_commands()
+    width = max(map(len, commands))
+    rows = [f"  {name:<{width}}  {command.help}" for name, command in commands.items()]
     return "\n".join([
         "Dense monocular SLAM with a map of geometry-only Gaussian disks.",
         "",
@@ -201,14 +170,6 @@ def _take_ends_for_interrupts() -> None:
 
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, interrupt)
-
-
-def _unknown_command(name: str) -> str:
-    import difflib
-
-    near = difflib.get_close_matches(name, COMMANDS, n=1)
-    hint = f"did you mean {near[0]}?" if near else f"choose one of {', '.join(COMMANDS)}."
-    return f"there is no command {name}; {hint}"
 
 
 def _show_warnings() -> None:

@@ -31,21 +31,7 @@ def open_photographs(
 ) -> PosedSource:
     """A source of photographs whose poses are found from themselves, or were found before.
 
-    Args:
-        folder: the photographs.
-        config: its ``input`` selects photographs and says what is known of the camera.
-        kept: the folder of the result: the poses go to ``sparse/0`` there, as a COLMAP model, and
-            what was left out to ``photographs.json``.
-        hold_out: every so many-th photograph with a pose is left out afterwards; none leaves out
-            none.
-        again: whether to take the poses that were kept there before.
-        progress: follows the work.
-        stop: ends it.
-
-    Raises:
-        InputError: pycolmap is missing, or the photographs do not tell where they were taken.
-        OutputError: the poses cannot be kept.
-        KeyboardInterrupt: it was stopped.
+    What its arguments are, and what it raises: ``geogs.application.photos.open_photographs``.
     """
     progress, stop = progress or RunProgress(), stop or Stop()
     chosen, selection = find_photographs(folder), config.input

@@ -1,0 +1,131 @@
+"""Structure from motion of photographs and of videos, as a package beside this one registers it."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64, UInt8
+
+from geogs.application.interrupt import Stop
+from geogs.application.progress import RunProgress
+from geogs.config import ReconstructConfig
+from geogs.errors import InputError
+from geogs.geometry.camera import Camera
+from geogs.io.sources.calibration import Calibration
+from geogs.io.sources.posed.base import PosedSource
+from geogs.io.sources.sniff import Stream
+from geogs.stopwatch import Stopwatch
+from geogs.types import Frame
+
+GROUP = "geogs.photos"
+"""Entry points: ``open_photographs``, ``place_video`` and ``Localiser``, as used below."""
+
+Localise = Callable[[Frame], Float64[np.ndarray, "4 4"] | None]
+"""The pose, world to camera, of any frame of a video; none where too few points agree on one."""
+
+
+@dataclass(frozen=True, slots=True)
+class PlacedVideo:
+    """Sharp frames of a video that have a pose, in time order, and the points that they see."""
+
+    timestamps: Float64[np.ndarray, "n"]
+    """Of all frames of the video, seconds."""
+    sharp_frames: int
+    """How many frames structure from motion was given."""
+    numbers: tuple[int, ...]
+    """Which frames of the video have a pose, ascending: the rows of what follows."""
+    T_cw: Float64[np.ndarray, "m 4 4"]
+    """World to camera."""
+    deviation: Float64[np.ndarray, "m"]
+    """Of the camera's centre after the similarity that fits best; infinite where unknown."""
+    rotation: Float64[np.ndarray, "m"]
+    """Of its orientation, radians."""
+    depth: Float64[np.ndarray, "m"]
+    """Of its points' depths, relative: the median."""
+    positions: tuple[Float64[np.ndarray, "_k 3"], ...]
+    """Of the points that each frame sees."""
+    descriptors: tuple[UInt8[np.ndarray, "_k 128"], ...]
+    """Of the same points."""
+    calibration: Calibration
+    """Of the frames as they were given."""
+    error: float
+    """Mean distance of the points from where they were seen, pixels."""
+
+    def all_points(self) -> Float64[np.ndarray, "k 3"]:
+        """Every point once."""
+        return np.unique(np.concatenate(self.positions), axis=0)
+
+
+def place_video(
+    video: Stream,
+    seed: int,
+    report: Callable[[str, float], None],
+    stopwatch: Stopwatch,
+) -> PlacedVideo:
+    """Choose the sharp frames of a video and find where they were taken.
+
+    Args:
+        video: read once; its camera stays as it is where its calibration is given.
+        seed: of the random choices.
+        report: follows the work; what it raises ends it.
+        stopwatch: gets the seconds.
+
+    Raises:
+        InputError: pycolmap is missing, or fewer than three frames hang together.
+    """
+    placed: PlacedVideo = _registered("place_video")(video, seed, report, stopwatch)
+    return placed
+
+
+def localiser(video: PlacedVideo, camera: Camera, seed: int) -> Localise:
+    """What places any frame of ``camera`` against the points of a placed video.
+
+    Raises:
+        InputError: pycolmap is missing.
+    """
+    place: Localise = _registered("Localiser")(video, camera, seed).place
+    return place
+
+
+def open_photographs(
+    folder: Path,
+    config: ReconstructConfig,
+    kept: Path,
+    hold_out: int | None = None,
+    again: bool = False,
+    progress: RunProgress | None = None,
+    stop: Stop | None = None,
+) -> PosedSource:
+    """A source of photographs whose poses are found from themselves, or were found before.
+
+    Args:
+        folder: the photographs.
+        config: its ``input`` selects photographs and says what is known of the camera.
+        kept: the folder of the result: the poses go to ``sparse/0`` there, as a COLMAP model, and
+            what was left out to ``photographs.json``.
+        hold_out: every so many-th photograph with a pose is left out afterwards; none leaves out
+            none.
+        again: whether to take the poses that were kept there before.
+        progress: follows the work.
+        stop: ends it.
+
+    Raises:
+        InputError: pycolmap is missing, or the photographs do not tell where they were taken.
+        OutputError: the poses cannot be kept.
+        KeyboardInterrupt: it was stopped.
+    """
+    open_them = _registered("open_photographs")
+    source: PosedSource = open_them(folder, config, kept, hold_out, again, progress, stop)
+    return source
+
+
+def _registered(name: str) -> Any:
+    for point in entry_points(group=GROUP, name=name):
+        return point.load()
+    raise InputError(
+        "Finding the poses of photographs needs geogs_photos; pip install 'geogs[photos]' brings "
+        "it."
+    )
