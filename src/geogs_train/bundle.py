@@ -2,7 +2,7 @@
 
 The same Gauss-Newton steps as :mod:`geogs.bundle.dense`, without its robust weights: depths are
 eliminated, the small camera systems are solved in float64, poses move by left retraction. All of it
-is plain autograd, so that a network can be taught what measurements, weights and damping make the
+is plain autograd, so that a network can be taught what measurements and weights make the
 adjusted poses and depths right (Teed and Deng, "DROID-SLAM", NeurIPS 2021, section 3.2).
 
 The edges of all clips are the same. Positions may be in pixels or in cells, if only intrinsics,
@@ -73,8 +73,6 @@ class ClipMatches:
     """Position in the target of every cell of the source."""
     weight: Float[Tensor, "b e p 2"]
     """Inverse variance of x and y."""
-    damping: Float[Tensor, "b v p"] | None = None
-    """Added to the curvature of each inverse depth."""
 
 
 @dataclass(frozen=True)
@@ -191,8 +189,6 @@ def _normal_equations(
     depth_gradient = _summed(views, (i, (weight * J_depth * residual).sum(-1)))
     mean = curvature.mean(-1, keepdim=True)
     curvature = curvature + options.depth_damping * mean + options.depth_floor
-    if matches.damping is not None:
-        curvature = curvature + matches.damping
     free = slice(6 * options.fixed_poses, None)
     square = hessian.unflatten(1, (views, views)).transpose(2, 3).flatten(3).flatten(1, 2)
     wide = coupling.unflatten(1, (views, views)).transpose(2, 3).flatten(3).flatten(1, 2)

@@ -20,10 +20,9 @@ from geogs_train.bundle import (
     adjust,
     reproject,
 )
-from geogs_train.clip_state import neighbour_edges, true_state
 from geogs_train.options import FlowTraining
 from geogs_train.pairs import MARGIN
-from geogs_train.pose_loss import Estimate, PoseLossOptions, pose_loss
+from geogs_train.pose_loss import PoseLossOptions, pose_loss
 from geogs_train.rooms.clips import ClipBatch
 
 FLOOR = OwnFlowOptions().floor
@@ -43,11 +42,29 @@ class BundleBatch:
     start: ClipState
 
 
+def neighbour_edges(views: int, reach: int, device: torch.device | str = "cpu") -> ClipEdges:
+    """All ordered pairs of views at most ``reach`` apart."""
+    pairs = [(i, j) for i in range(views) for j in range(views) if 0 < abs(i - j) <= reach]
+    return ClipEdges(*torch.tensor(pairs, device=device).unbind(1))
+
+
+def true_state(T_cw: Float[Tensor, "b v 4 4"], depth: Float[Tensor, "b v h w"]) -> ClipState:
+    """The truth at the cells, at the scale that makes the median inverse depth of a clip one.
+
+    That is where a tracker's depths start, so that one is as good a guess as any.
+    """
+    d = 1 / depth[..., OFFSET:-3:STRIDE, OFFSET:-3:STRIDE].flatten(2)
+    scale = d.flatten(1).median(1).values[:, None, None]
+    T = T_cw.clone()
+    T[..., :3, 3] *= scale.to(T)
+    return ClipState(T, d / scale)
+
+
 class BundleObjective:
     """What poses and depths come out of adjusting the network's flow with its weights.
 
     Rounds of flow from the present reprojection and adjustment, as the tracker's; the loss is
-    DROID-SLAM's (poses, induced flow, residuals) and the likelihood of the flow, which keeps the
+    DROID-SLAM's (poses, induced flow) and the likelihood of the flow, which keeps the
     deviations true.
     """
 
@@ -102,8 +119,7 @@ class BundleObjective:
             inside = ((pixels > 1) & (pixels < size - MARGIN)).all(-1, keepdim=True)
             matches = ClipMatches(pixels, weight * inside)
             state = adjust(batch.cameras, state, edges, matches, SOLVER)
-            after = reproject(batch.cameras, state, edges)
-            found.append(Estimate(state, (pixels - after.pixels) * after.valid[..., None] * inside))
-        terms = PoseLossOptions(flow=options.bundle.flow, residual=0.0, pose=options.bundle.pose)
-        total, _ = pose_loss(batch.cameras, found, batch.truth, edges, terms)
+            found.append(state)
+        terms = PoseLossOptions(flow=options.bundle.flow, pose=options.bundle.pose)
+        total = pose_loss(batch.cameras, found, batch.truth, edges, terms)
         return total.float() + options.bundle.likelihood * likelihood

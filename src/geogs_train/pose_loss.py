@@ -1,8 +1,8 @@
 """What poses and depths that came out of a bundle adjustment are judged by.
 
 The losses of Teed and Deng, "DROID-SLAM", NeurIPS 2021, section 3.3: geodesic distance of relative
-poses, flow that poses and depths induce, and what the adjustment left over; each over all updates
-of an unrolled network, the later ones counting more.
+poses and flow that poses and depths induce, both over all updates of an unrolled network, the later
+ones counting more.
 """
 
 from collections.abc import Sequence
@@ -25,28 +25,6 @@ class PoseLossOptions:
     pose: float = 10.0
     flow: float = 0.4
     """Where positions are in cells of 8 pixels; DROID-SLAM's 0.05 is for pixels."""
-    residual: float = 0.01
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """Poses and depths after an update, and what its measurements still disagreed by."""
-
-    state: ClipState
-    residual: Float[Tensor, "b e p 2"]
-    """Measured minus reprojected position, zero behind cameras."""
-
-
-@dataclass(frozen=True)
-class PoseErrors:
-    """Means over a batch, each a scalar."""
-
-    pose: Tensor
-    """Sum of distance and angle of relative poses, map units plus radians."""
-    flow: Tensor
-    """Distance of induced positions."""
-    residual: Tensor
-    """Absolute residual of a coordinate."""
 
 
 def geodesic_errors(
@@ -69,35 +47,20 @@ def induced_flow_error(
     return (a.pixels - b.pixels).norm(dim=-1) * valid, valid
 
 
-def pose_errors(
-    cameras: ClipCameras,
-    estimate: Estimate,
-    truth: ClipState,
-    edges: ClipEdges,
-) -> PoseErrors:
-    """The terms of one update, without their weights."""
-    shift, angle = geodesic_errors(estimate.state.T_cw, truth.T_cw, edges)
-    flow, valid = induced_flow_error(cameras, estimate.state, truth, edges)
-    return PoseErrors(
-        shift.mean() + angle.mean(),
-        flow.sum() / valid.sum().clamp(min=1),
-        estimate.residual.abs().mean(),
-    )
-
-
 def pose_loss(
     cameras: ClipCameras,
-    estimates: Sequence[Estimate],
+    found: Sequence[ClipState],
     truth: ClipState,
     edges: ClipEdges,
     options: PoseLossOptions | None = None,
-) -> tuple[Tensor, list[PoseErrors]]:
-    """The loss of all updates, first to last, and the errors of each."""
+) -> Float[Tensor, ""]:
+    """The loss of the poses and depths after each update, first to last."""
     options = options or PoseLossOptions()
-    errors = [pose_errors(cameras, e, truth, edges) for e in estimates]
-    terms = [
-        options.decay**age
-        * (options.pose * e.pose + options.flow * e.flow + options.residual * e.residual)
-        for age, e in enumerate(reversed(errors))
-    ]
-    return torch.stack(terms).sum(), errors
+    terms = []
+    for age, state in enumerate(reversed(found)):
+        shift, angle = geodesic_errors(state.T_cw, truth.T_cw, edges)
+        distance, valid = induced_flow_error(cameras, state, truth, edges)
+        pose = shift.mean() + angle.mean()
+        flow = distance.sum() / valid.sum().clamp(min=1)
+        terms.append(options.decay**age * (options.pose * pose + options.flow * flow))
+    return torch.stack(terms).sum()
