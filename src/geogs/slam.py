@@ -27,8 +27,7 @@ from geogs.stopwatch import Stopwatch, StopwatchState
 from geogs.threads import on_one_torch_thread
 from geogs.tracking.certainty import certainty
 from geogs.tracking.completion import Completion
-from geogs.tracking.flow.masked import MaskedFlow
-from geogs.tracking.flow.painted import PaintedFlow, shown_pixels
+from geogs.tracking.flow.masked import valid_pixels
 from geogs.tracking.flow.select import build_operator
 from geogs.tracking.moving import moving_share
 from geogs.tracking.pose_deviation import PoseDeviation
@@ -101,11 +100,11 @@ class Slam:
         prior: MonocularPrior | None = None,
         live: bool = False,
         mask: Bool[np.ndarray, "h w"] | None = None,
-        black_is_hidden: bool = False,
+        black_is_masked: bool = False,
         defers_map: bool = False,
     ):
         """``mask``, of the size of the images, is true where they may show the scene: elsewhere
-        nothing is matched, searched or mapped; with ``black_is_hidden`` nor are pixels of an image
+        nothing is matched, searched or mapped; with ``black_is_masked`` nor are pixels of an image
         that are quite black. ``live`` maps in a thread beside tracking, and completes
         keyframes in another, which frames do not wait for as long as they are found without, nor
         for the search and the closing of loops: results then depend on how fast the machine is.
@@ -115,7 +114,7 @@ class Slam:
         self.camera = camera
         self.device = device
         self.prior = prior
-        self.mask, self.black_is_hidden = mask, black_is_hidden
+        self.mask, self.black_is_masked = mask, black_is_masked
         self._stream = _urgent_stream(device) if live else None
         """In which a live system tracks on a GPU until the stream ends; mapping's gives way."""
         self.stopwatch = Stopwatch()
@@ -137,11 +136,7 @@ class Slam:
 
     def _make_parts(self, live: bool) -> None:
         c, grid = self.config, SampleGrid(self.camera, self.device)
-        self.operator = build_operator(c.tracking, grid)
-        if self.mask is not None:
-            self.operator = MaskedFlow(self.operator, grid, self.mask)
-        if self.black_is_hidden:
-            self.operator = PaintedFlow(self.operator, grid)
+        self.operator = build_operator(c.tracking, grid, self.mask, self.black_is_masked)
         self.keyframes = KeyframeStore(grid, self.operator.encode, c.resident_keyframes)
         self.segments = Segments(partial(self.new_tracker, live), c.tracking.patience)
         self.completion = (
@@ -529,12 +524,12 @@ class Slam:
 
     def _mask_of(self, id: int) -> Bool[np.ndarray, "h w"] | None:
         """What a keyframe shows of the scene; none where that is all of its image."""
-        if not self.black_is_hidden:
+        if not self.black_is_masked:
             return self.mask
-        shown = shown_pixels(self.keyframes[id].image)
+        valid = valid_pixels(self.keyframes[id].image)
         if self.mask is not None:
-            shown &= self.mask
-        return None if shown.all() else shown
+            valid &= self.mask
+        return None if valid.all() else valid
 
 
 def _urgent_stream(device: str) -> "torch.cuda.Stream | None":

@@ -55,7 +55,7 @@ def self_calibrated(
                 config.seed,
                 report,
                 source.mask,
-                source.black_is_hidden,
+                source.black_is_masked,
             )
         except KeyboardInterrupt:
             if not stop.requested:

@@ -112,7 +112,7 @@ def _run(
     with ThreadPoolExecutor(1, thread_name_prefix="system") as beside:
         made = beside.submit(
             Slam, calibrated.camera, config, str(device), prior, calibrated.is_live,
-            calibrated.mask, calibrated.black_is_hidden, maps_at_the_end(settings, observer),
+            calibrated.mask, calibrated.black_is_masked, maps_at_the_end(settings, observer),
         )  # fmt: skip
         source = with_shutter_found(calibrated, progress, stop)
         slam = made.result()
@@ -162,7 +162,7 @@ def resume(
         prior = open_prior(config.prior, source.camera, device)
         slam = Slam(
             source.camera, config, str(device), prior, mask=source.mask,
-            black_is_hidden=source.black_is_hidden,
+            black_is_masked=source.black_is_masked,
         )  # fmt: skip
         saved.restore(slam)
         progress.write(f"Going on after {slam.frames} frames.")

@@ -82,18 +82,18 @@ class Slam(Algorithm):
         prior: MonocularPrior | None = None,
         live: bool = False,
         mask: Bool[np.ndarray, "h w"] | None = None,
-        black_is_hidden: bool = False,
+        black_is_masked: bool = False,
     ) -> None:
         """``camera`` is the pinhole of all images; ``device`` is cpu, cuda, cuda:1 or auto;
         ``mask``, of the images' size, is true where they may show the scene. What hides it in some
-        images alone is painted black in them, and ``black_is_hidden`` says so.
+        images alone is painted black in them, and ``black_is_masked`` says so.
 
         Raises:
             InputError: images of that size cannot be tracked.
             DeviceError: there is no such device, or it cannot be used.
         """
         where = str(require_device(device))
-        super().__init__(camera, config, where, prior, live, mask, black_is_hidden)
+        super().__init__(camera, config, where, prior, live, mask, black_is_masked)
         self.pose: PoseEstimate | None = None
         """After the last image; none before the first."""
 
@@ -263,7 +263,7 @@ def track(
             stream = with_shutter_found(stream)
         slam = Slam(
             stream.camera, settings, device, None, stream.is_live, stream.mask,
-            stream.black_is_hidden,
+            stream.black_is_masked,
         )  # fmt: skip
     for frame in stream:
         yield slam.process(frame)

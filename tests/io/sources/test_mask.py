@@ -54,11 +54,11 @@ def test_masks_of_a_folder_are_found_by_name_and_paint_what_they_hide(folder):
     config = InputConfig(intrinsics="80,80,63.5,47.5", mask=masks, readout=0.0)
     source = open_source(images, config)
     assert source.mask is None
-    assert source.black_is_hidden
+    assert source.black_is_masked
     hidden = [~frame.image.any(-1) for frame in source]
     assert [int(h.argmin(1)[0]) for h in hidden] == [30, 0, 60]
     assert [int(h.sum()) for h in hidden] == [30 * 96, 0, 60 * 96]  # not the black below the line
-    assert not open_source(images, InputConfig(readout=0.0)).black_is_hidden
+    assert not open_source(images, InputConfig(readout=0.0)).black_is_masked
 
 
 def test_masks_of_a_video_are_found_by_the_number_of_the_frame(tmp_path):

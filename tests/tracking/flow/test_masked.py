@@ -1,4 +1,4 @@
-"""A flow operator that is blind for a part of all images."""
+"""A flow operator that masks out a part of all images."""
 
 import cv2
 import numpy as np
@@ -25,13 +25,13 @@ def with_bonnet(image: np.ndarray) -> np.ndarray:
     return image
 
 
-def test_nothing_is_matched_from_or_to_what_is_hidden():
+def test_nothing_is_matched_from_or_to_what_is_masked_out():
     grid = SampleGrid(CAMERA)
     plain = build_operator(TrackingConfig(operator="classical"), grid)
     masked = MaskedFlow(plain, grid, MASK)
     images = [with_bonnet(render(pose(x))[0]) for x in (0.0, 0.15)]
     first, second = ([masked.encode(image)] for image in images)
-    before, _ = plain.measure(first, second)
+    before, _ = plain.measure([first[0].encoded], [second[0].encoded])
     after, back = masked.measure(first, second)
     hidden = grid.pixels[:, 1] > 104 - STRIDE
     assert bool((before.weight[0, hidden] > 0).any())
@@ -42,8 +42,8 @@ def test_nothing_is_matched_from_or_to_what_is_hidden():
     seen = grid.pixels[:, 1] < 80
     assert torch.equal(after.weight[0, seen], before.weight[0, seen])
     assert torch.equal(after.pixels, before.pixels)
-    assert masked.share == pytest.approx(float((~hidden).float().mean()), abs=0.06)
-    assert masked.texture(first[0]) <= masked.share
+    assert masked.fixed.fraction == pytest.approx(float((~hidden).float().mean()), abs=0.06)
+    assert masked.texture(first[0]) <= masked.fixed.fraction
 
 
 def test_a_mask_has_the_size_of_the_images_and_shows_something():

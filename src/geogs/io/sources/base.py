@@ -183,7 +183,7 @@ class Source:
         """How far the source has been read, at each frame of this iteration."""
 
     @property
-    def black_is_hidden(self) -> bool:
+    def black_is_masked(self) -> bool:
         """Whether pixels of frames that are quite black show something else than the scene."""
         return self._masks is not None
 

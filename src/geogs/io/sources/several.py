@@ -118,9 +118,9 @@ class SeveralSources:
         return self._sources[0].mask
 
     @property
-    def black_is_hidden(self) -> bool:
+    def black_is_masked(self) -> bool:
         """Whether pixels that are quite black show something else than the scene."""
-        return self._sources[0].black_is_hidden
+        return self._sources[0].black_is_masked
 
     @property
     def is_live(self) -> bool:

@@ -16,8 +16,6 @@ from geogs.tracking.calibration.degeneracy import Degeneracy
 from geogs.tracking.calibration.keyframes import ViewGatherer
 from geogs.tracking.calibration.stretch import Report, Stretch
 from geogs.tracking.calibration.sureness import Estimate, estimate, joined
-from geogs.tracking.flow.masked import MaskedFlow
-from geogs.tracking.flow.painted import PaintedFlow
 from geogs.tracking.flow.select import build_operator
 from geogs.types import Frame
 from geogs.world.grid import SampleGrid
@@ -50,7 +48,7 @@ def self_calibrate(
     seed: int = 0,
     report: Report = lambda fraction: None,
     mask: Bool[np.ndarray, "h w"] | None = None,
-    black_is_hidden: bool = False,
+    black_is_masked: bool = False,
 ) -> SelfCalibration:
     """Estimate the focal length, and k1 if ``config.radial``, of the camera that took ``frames``.
 
@@ -58,15 +56,11 @@ def self_calibrate(
     to start from. Flow is measured by the operator without a network. Stretch after stretch of the
     video is asked until they are sure together. ``report`` is called with the fraction done; what
     it raises passes through. Outside a ``mask`` nothing is matched, nor what is quite black where
-    ``black_is_hidden``.
+    ``black_is_masked``.
     """
     cv2.setRNGSeed(seed)
     grid = SampleGrid(camera, device)
-    operator = build_operator(TrackingConfig(operator="classical"), grid)
-    if mask is not None:
-        operator = MaskedFlow(operator, grid, mask)
-    if black_is_hidden:
-        operator = PaintedFlow(operator, grid)
+    operator = build_operator(TrackingConfig(operator="classical"), grid, mask, black_is_masked)
     gatherer = ViewGatherer(iter(frames), grid, operator, config.keyframe_flow)
     estimates: list[Estimate] = []
     failure = ""

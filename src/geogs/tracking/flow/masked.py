@@ -1,7 +1,7 @@
-"""A flow operator that is blind for a part of all images: a car's bonnet, an arm, a time stamp."""
+"""A flow operator that matches nothing from and to pixels that are masked out."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -16,63 +16,107 @@ from geogs.types import FlowMatch
 from geogs.world.grid import STRIDE, SampleGrid
 
 
-class MaskedFlow:
-    """Another operator whose matches from and to what a mask hides have no weight.
+def valid_pixels(image: UInt8[np.ndarray, "h w 3"]) -> Bool[np.ndarray, "h w"]:
+    """Valid mask of an image that brings its own along: pixels masked out are black."""
+    return image.max(-1) > 0
 
-    Operators match patches, so a cell counts as hidden if anything within a cell's width is.
-    """
+
+@dataclass(frozen=True, eq=False)
+class ValidMask:
+    """What of an image may be matched; 1 and 0, on the device of the grid."""
+
+    pixels: Float[Tensor, "h w"]
+    """Without what is nearer than a cell to pixels masked out: operators match patches."""
+    cells: Float[Tensor, "p"]
+
+    @property
+    def fraction(self) -> float:
+        """Of the cells that are valid."""
+        return float(self.cells.mean())
+
+
+@dataclass(frozen=True, eq=False)
+class MaskedImage:
+    """An encoded image and what of it may be matched."""
+
+    encoded: Any
+    valid: ValidMask
+
+
+class MaskedFlow:
+    """Another operator whose matches from and to what is masked out have no weight."""
 
     def __init__(
-        self, operator: FlowOperator, grid: SampleGrid, mask: Bool[np.ndarray, "h w"]
+        self,
+        operator: FlowOperator,
+        grid: SampleGrid,
+        mask: Bool[np.ndarray, "h w"] | None = None,
     ) -> None:
-        """``mask``, of the size of the images, is true where they show the scene.
+        """``mask``, of the size of the images, is true where all of them show the scene (a car's
+        bonnet, an arm, a time stamp are not); None where what is black in an image is masked out.
 
         Raises InputError if it has another size, or hides all.
         """
+        self._operator, self._device = operator, grid.device
+        self._x, self._y = grid.pixels.long().unbind(-1)
+        self.fixed: ValidMask | None = None
+        """The mask of all images."""
+        if mask is None:
+            return
         size = grid.camera.height, grid.camera.width
         if mask.shape != size:
             raise InputError(
                 f"The mask is {mask.shape[1]} x {mask.shape[0]} pixels, the images are "
                 f"{size[1]} x {size[0]}."
             )
-        around = np.ones((2 * STRIDE + 1, 2 * STRIDE + 1), np.uint8)
-        inside = cv2.erode(mask.astype(np.uint8), around, borderValue=1)
-        self._operator = operator
-        self._shown = torch.from_numpy(inside).float().to(grid.device)
-        x, y = grid.pixels.long().unbind(-1)
-        self._cells = self._shown[y, x]
-        self.share = float(self._cells.mean())
-        """Of the cells that are not hidden."""
-        if self.share == 0:
+        self.fixed = self._valid(mask)
+        if self.fixed.fraction == 0:
             raise InputError("The mask hides the whole image; it is bright where the scene is.")
 
-    def encode(self, image: UInt8[np.ndarray, "h w 3"]) -> Any:
-        """As the operator's."""
-        return self._operator.encode(image)
+    def encode(self, image: UInt8[np.ndarray, "h w 3"]) -> MaskedImage:
+        """As the operator's, with what is valid."""
+        valid = self.fixed or self._valid(valid_pixels(image))
+        return MaskedImage(self._operator.encode(image), valid)
 
-    def texture(self, encoded: Any) -> float:
-        """As the operator's, of what is not hidden at most."""
-        return min(self._operator.texture(encoded), self.share)
+    def texture(self, encoded: MaskedImage) -> float:
+        """As the operator's, at most the fraction of cells that are valid."""
+        return min(self._operator.texture(encoded.encoded), encoded.valid.fraction)
 
-    def grey(self, encoded: Any) -> Float[Tensor, "h w"]:
+    def grey(self, encoded: MaskedImage) -> Float[Tensor, "h w"]:
         """As the operator's."""
-        return self._operator.grey(encoded)
+        return self._operator.grey(encoded.encoded)
 
     def measure(
         self,
-        first: Sequence[Any],
-        second: Sequence[Any],
+        first: Sequence[MaskedImage],
+        second: Sequence[MaskedImage],
         forward: Float[Tensor, "e p 2"] | None = None,
         backward: Float[Tensor, "e p 2"] | None = None,
         fine: bool = True,
         memory: Memories | None = None,
     ) -> tuple[FlowMatch, FlowMatch]:
-        """As the operator's, without what is hidden."""
-        there, back = self._operator.measure(first, second, forward, backward, fine, memory)
-        return self._blinded(there), self._blinded(back)
+        """As the operator's, without what is masked out."""
+        a, b = ([image.encoded for image in side] for side in (first, second))
+        there, back = self._operator.measure(a, b, forward, backward, fine, memory)
+        return self._masked(there, first, second), self._masked(back, second, first)
 
-    def _blinded(self, match: FlowMatch) -> FlowMatch:
-        height, width = self._shown.shape
+    def _valid(self, mask: Bool[np.ndarray, "h w"]) -> ValidMask:
+        around = np.ones((2 * STRIDE + 1, 2 * STRIDE + 1), np.uint8)
+        inside = cv2.erode(mask.astype(np.uint8), around, borderValue=1)
+        pixels = torch.from_numpy(inside).float().to(self._device)
+        return ValidMask(pixels, pixels[self._y, self._x])
+
+    def _masked(
+        self, match: FlowMatch, source: Sequence[MaskedImage], target: Sequence[MaskedImage]
+    ) -> FlowMatch:
+        height, width = target[0].valid.pixels.shape
         x, y = match.pixels.nan_to_num(0.0, 0.0, 0.0).round().long().unbind(-1)
-        shown = self._shown[y.clamp(0, height - 1), x.clamp(0, width - 1)] * self._cells
-        return replace(match, weight=match.weight * shown[..., None].to(match.weight))
+        x, y = x.clamp(0, width - 1), y.clamp(0, height - 1)
+        if self.fixed:
+            valid = self.fixed.cells * self.fixed.pixels[y, x]
+        else:
+            valid = torch.stack([
+                a.valid.cells * b.valid.pixels[v, u]
+                for a, b, u, v in zip(source, target, x, y, strict=True)
+            ])  # fmt: skip
+        return replace(match, weight=match.weight * valid[..., None].to(match.weight))

@@ -1,16 +1,34 @@
 """Which flow operator the tracker uses."""
 
+import numpy as np
+from jaxtyping import Bool
+
 from geogs.config import TrackingConfig
 from geogs.networks.weights_files import find_weights
 from geogs.tracking.flow.base import FlowOperator
+from geogs.tracking.flow.masked import MaskedFlow
 from geogs.world.grid import SampleGrid
 
 
-def build_operator(config: TrackingConfig, grid: SampleGrid) -> FlowOperator:
+def build_operator(
+    config: TrackingConfig,
+    grid: SampleGrid,
+    mask: Bool[np.ndarray, "h w"] | None = None,
+    black_is_masked: bool = False,
+) -> FlowOperator:
     """The operator that the configuration names, with its weights, for the device of a grid.
 
-    Raises InputError if weights are needed and none are found or they do not fit.
+    Outside a ``mask``, true where all images show the scene, nothing is matched; nor is what is
+    black in an image where ``black_is_masked``. Raises InputError if weights are needed and none
+    are found or they do not fit, or if the mask does not fit.
     """
+    operator = _operator(config, grid)
+    if mask is not None:
+        operator = MaskedFlow(operator, grid, mask)
+    return MaskedFlow(operator, grid) if black_is_masked else operator
+
+
+def _operator(config: TrackingConfig, grid: SampleGrid) -> FlowOperator:
     if config.operator in ("auto", "classical"):
         return _classical(grid)
     if config.operator == "own":

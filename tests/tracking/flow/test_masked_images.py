@@ -1,4 +1,4 @@
-"""A flow operator that is blind where images are painted over."""
+"""A flow operator that masks out what is black in an image."""
 
 from dataclasses import replace
 
@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from geogs.config import TrackingConfig
-from geogs.tracking.flow.painted import PaintedFlow
+from geogs.tracking.flow.masked import MaskedFlow
 from geogs.tracking.flow.select import build_operator
 from geogs.tracking.tracker import Tracker
 from geogs.world.grid import STRIDE, SampleGrid
@@ -29,10 +29,10 @@ def with_arm(image: np.ndarray, left: int, paint: bool) -> np.ndarray:
     return image
 
 
-def test_nothing_is_matched_from_or_to_what_is_painted_over():
+def test_nothing_is_matched_from_or_to_what_is_black():
     grid = SampleGrid(CAMERA)
     plain = build_operator(TrackingConfig(operator="classical"), grid)
-    flow = PaintedFlow(plain, grid)
+    flow = MaskedFlow(plain, grid)
     images = [
         with_arm(render(pose(x))[0], left, True) for x, left in ((0.0, 60), (0.15, 30), (0.2, 0))
     ]
@@ -48,19 +48,19 @@ def test_nothing_is_matched_from_or_to_what_is_painted_over():
         assert not bool((back.weight[n, :, 0] > 0)[(x > left) & (x < left + 83)].any())
     before, _ = plain.measure([first.encoded], [second.encoded])
     assert torch.equal(there.pixels[0], before.pixels[0])
-    assert flow.texture(first) <= float(first.cells.mean()) < 0.6
+    assert flow.texture(first) <= float(first.valid.cells.mean()) < 0.6
 
 
 @pytest.mark.long
 @pytest.mark.system
-def test_an_arm_that_moves_with_the_camera_does_no_harm_where_it_is_painted_over():
+def test_an_arm_that_moves_with_the_camera_does_no_harm_where_it_is_black():
     path = sideways(24)
     found = {}
     for paint in (False, True):
         grid = SampleGrid(CAMERA)
         operator = build_operator(CONFIG, grid)
         tracker = Tracker(
-            CAMERA, CONFIG, operator=PaintedFlow(operator, grid) if paint else operator
+            CAMERA, CONFIG, operator=MaskedFlow(operator, grid) if paint else operator
         )
         for frame in frames(path):
             left = 60 + round(20 * np.sin(0.5 * frame.index))
