@@ -118,32 +118,6 @@ class Encoder(nn.Module):
         return self.conv2(self.layer3(self.layer2(self.layer1(x))))
 
 
-class _Clip(torch.autograd.Function):
-    """The identity, whose gradient drops entries that are large or not a number."""
-
-    @staticmethod
-    def forward(ctx, x: Tensor, limit: float) -> Tensor:  # type: ignore[no-untyped-def]
-        ctx.limit = limit
-        return x.view_as(x)
-
-    @staticmethod
-    def backward(ctx, gradient: Tensor) -> tuple[Tensor, None]:  # type: ignore[no-untyped-def, override]
-        # NaN compares false.
-        kept = gradient.abs() <= ctx.limit
-        return torch.where(kept, gradient, torch.zeros_like(gradient)), None
-
-
-class GradientClip(nn.Module):
-    """Keeps gradients of the bundle adjustment that blow up from the weights of the heads."""
-
-    def __init__(self, limit: float = 0.01) -> None:
-        super().__init__()
-        self.limit = limit
-
-    def forward(self, x: Tensor) -> Tensor:
-        return _Clip.apply(x, self.limit)
-
-
 class ConvGru(nn.Module):
     """A convolutional gated recurrent unit whose gates also see a mean over the whole image."""
 
@@ -185,11 +159,11 @@ class GraphAggregation(nn.Module):
     here enlarges depth by it.
     """
 
-    def __init__(self, hidden: int, clip: float) -> None:
+    def __init__(self, hidden: int) -> None:
         super().__init__()
         self.conv1 = nn.Conv2d(hidden, hidden, 3, 1, 1)
         self.conv2 = nn.Conv2d(hidden, hidden, 3, 1, 1)
-        self.eta = nn.Sequential(nn.Conv2d(hidden, 1, 3, 1, 1), GradientClip(clip), nn.Softplus())
+        self.eta = nn.Sequential(nn.Conv2d(hidden, 1, 3, 1, 1), nn.Softplus())
         self.upmask = nn.Sequential(nn.Conv2d(hidden, 9 * UPSAMPLING**2, 1))
 
     def forward(self, hidden: Float[Tensor, "e c h w"], source: Int[Tensor, "e"]) -> FrameOutput:
@@ -216,7 +190,7 @@ class EdgeOutput:
 class UpdateOperator(nn.Module):
     """The recurrent part: revises the flow of an edge from what lies around its present target."""
 
-    def __init__(self, size: DroidSize, clip: float) -> None:
+    def __init__(self, size: DroidSize) -> None:
         super().__init__()
         hidden, motion = size.features, size.motion
         self.corr_encoder = nn.Sequential(
@@ -226,14 +200,14 @@ class UpdateOperator(nn.Module):
             nn.Conv2d(4, hidden, 7, 1, 3), nn.ReLU(), nn.Conv2d(hidden, motion, 3, 1, 1), nn.ReLU()
         )
         self.gru = ConvGru(hidden, 2 * hidden + motion)
-        self.delta = nn.Sequential(*self._head(hidden, clip))
-        self.weight = nn.Sequential(*self._head(hidden, clip), nn.Sigmoid())
-        self.agg = GraphAggregation(hidden, clip)
+        self.delta = nn.Sequential(*self._head(hidden))
+        self.weight = nn.Sequential(*self._head(hidden), nn.Sigmoid())
+        self.agg = GraphAggregation(hidden)
 
     @staticmethod
-    def _head(hidden: int, clip: float) -> list[nn.Module]:
+    def _head(hidden: int) -> list[nn.Module]:
         first, second = nn.Conv2d(hidden, hidden, 3, 1, 1), nn.Conv2d(hidden, 2, 3, 1, 1)
-        return [first, nn.ReLU(), second, GradientClip(clip)]
+        return [first, nn.ReLU(), second]
 
     def forward(
         self,
@@ -251,14 +225,13 @@ class UpdateOperator(nn.Module):
 class DroidNetwork(nn.Module):
     """All parts, with the parameters of the public weights."""
 
-    def __init__(self, size: DroidSize | None = None, clip: float = 0.01) -> None:
-        """``clip`` is the size of a head's gradient from which on it is dropped."""
+    def __init__(self, size: DroidSize | None = None) -> None:
         super().__init__()
         self.size = size or DroidSize()
         features = self.size.features
         self.fnet = Encoder(self.size.base, features, norm=True)
         self.cnet = Encoder(self.size.base, 2 * features, norm=False)
-        self.update = UpdateOperator(self.size, clip)
+        self.update = UpdateOperator(self.size)
 
     def features(self, images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n c h8 w8"]:
         """What images are matched by; RGB in [0, 1], sides divisible by 8."""
