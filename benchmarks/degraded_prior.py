@@ -10,9 +10,9 @@ import torch
 from jaxtyping import Float32, UInt8
 
 from geogs.priors.base import DepthKind, PriorMaps
-from geogs_synth.raycast import View
-from geogs_synth.scene import BOX, Scene
-from geogs_synth.texture import fractal_noise
+from geogs_synth.raycast.raycaster import View
+from geogs_synth.scene.scene import BOX, Scene
+from geogs_synth.textures.patterns import fractal_noise
 
 
 @dataclass(frozen=True)

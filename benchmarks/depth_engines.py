@@ -26,11 +26,11 @@ from geogs.geometry.depth import normals_from_depth
 from geogs.geometry.lie import se3_exp
 from geogs.threads import worker_count
 from geogs.world.grid import OFFSET, STRIDE
-from geogs_synth.raycast import Raycaster
-from geogs_synth.room import make_room
-from geogs_synth.scene import Scene
-from geogs_synth.stage import centred_camera
-from geogs_synth.trajectory import handheld_trajectory
+from geogs_synth.motion.handheld import handheld_trajectory
+from geogs_synth.places.room import make_room
+from geogs_synth.raycast.raycaster import Raycaster
+from geogs_synth.scene.scene import Scene
+from geogs_synth.sequence.stage import centred_camera
 from geogs_train.depth.scores import KINDS, texture_kind
 
 STEP = 6

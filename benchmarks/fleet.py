@@ -36,7 +36,7 @@ from geogs.types import Trajectory
 from geogs_fleet.cluster import ray_cluster
 from geogs_fleet.run import run_fleet
 from geogs_fleet.settings import FleetSettings
-from geogs_synth.export import default_camera
+from geogs_synth.sequence.export import default_camera
 from long_walk import render
 from portals import SuiteRaycaster
 from suite import Suite

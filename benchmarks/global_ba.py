@@ -31,7 +31,7 @@ from geogs.geometry.lie import se3_inverse
 from geogs.geometry.umeyama import umeyama
 from geogs.loop.global_bundle import global_bundle, global_pairs
 from geogs.tracking.tracker import Tracker, TrackState
-from geogs_synth.export import default_camera
+from geogs_synth.sequence.export import default_camera
 from planted_walk import CAMERA, drift, planted_tracker
 from suite import Suite
 

@@ -28,7 +28,7 @@ from geogs.mapping.mapper import Mapper
 from geogs.tracking.flow.classical import ClassicalFlow
 from geogs.world.grid import SampleGrid
 from geogs.world.store import KeyframeStore
-from geogs_synth.export import default_camera
+from geogs_synth.sequence.export import default_camera
 
 STEP = 0.15
 LOOPS = 100

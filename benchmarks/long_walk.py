@@ -38,7 +38,7 @@ from geogs.geometry.camera import Camera
 from geogs.mesh.extract import extract_mesh
 from geogs.slam import Slam
 from geogs.types import Frame, Trajectory
-from geogs_synth.export import default_camera
+from geogs_synth.sequence.export import default_camera
 from portals import SuiteRaycaster
 from suite import Suite
 

@@ -53,11 +53,11 @@ from geogs.mesh.extract import extract_mesh
 from geogs.types import PoseCorrection
 from geogs.world.grid import SampleGrid
 from geogs.world.store import KeyframeStore
-from geogs_synth.export import default_camera
-from geogs_synth.raycast import Raycaster
-from geogs_synth.room import make_room
-from geogs_synth.tessellation import SeenSurface, scene_mesh
-from geogs_synth.trajectory import FRAMES_PER_LAP, handheld_trajectory
+from geogs_synth.motion.handheld import FRAMES_PER_LAP, handheld_trajectory
+from geogs_synth.places.room import make_room
+from geogs_synth.raycast.raycaster import Raycaster
+from geogs_synth.sequence.export import default_camera
+from geogs_synth.sequence.tessellation import SeenSurface, scene_mesh
 
 CAMERA = default_camera(320, 240)
 EVERY = 4

@@ -38,10 +38,10 @@ from geogs.splat.map import DiskParameters, GaussianMap
 from geogs.splat.render import render_views
 from geogs.world.grid import SampleGrid
 from geogs.world.store import KeyframeStore, Segment
-from geogs_synth.export import default_camera
-from geogs_synth.raycast import Raycaster
-from geogs_synth.room import make_room
-from geogs_synth.trajectory import handheld_trajectory
+from geogs_synth.motion.handheld import handheld_trajectory
+from geogs_synth.places.room import make_room
+from geogs_synth.raycast.raycaster import Raycaster
+from geogs_synth.sequence.export import default_camera
 
 FRAMES_APART = 6
 """Frames between two views on the path."""

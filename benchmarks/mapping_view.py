@@ -27,10 +27,10 @@ from geogs.splat.render import render
 from geogs.threads import worker_count
 from geogs.world.grid import SampleGrid
 from geogs.world.store import KeyframeStore
-from geogs_synth.export import default_camera
-from geogs_synth.raycast import Raycaster
-from geogs_synth.room import make_room
-from geogs_synth.trajectory import handheld_trajectory
+from geogs_synth.motion.handheld import handheld_trajectory
+from geogs_synth.places.room import make_room
+from geogs_synth.raycast.raycaster import Raycaster
+from geogs_synth.sequence.export import default_camera
 
 
 def make_views(config: MappingConfig, width: int) -> tuple[list[MapView], MapCameras]:

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
 from geogs.geometry.camera import Camera
-from geogs_synth.raycast import Raycaster, View
+from geogs_synth.raycast.raycaster import Raycaster, View
 from suite import Suite
 
 _ROOMS_IN_MEMORY = 6

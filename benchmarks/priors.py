@@ -31,9 +31,9 @@ from geogs.tracking.flow.texture import MIN_STRUCTURE, cell_structure, smaller_e
 from geogs.tracking.tracker import Tracker
 from geogs.types import Frame
 from geogs.world.grid import OFFSET, STRIDE
-from geogs_synth.raycast import Raycaster, View
-from geogs_synth.room import make_room
-from geogs_synth.trajectory import handheld_trajectory
+from geogs_synth.motion.handheld import handheld_trajectory
+from geogs_synth.places.room import make_room
+from geogs_synth.raycast.raycaster import Raycaster, View
 
 PRIORS = {"none": None, "good": PLAUSIBLE, "patchy": PATCHY, "bad": BAD}
 

@@ -12,11 +12,12 @@ from jaxtyping import Float64
 from scipy.interpolate import CubicSpline
 
 from geogs.errors import InputError
-from geogs_synth import furniture, texture
-from geogs_synth.furniture import Materials
-from geogs_synth.room import add_ceiling_and_floor, add_ceiling_lamp, add_picture, wall_image
-from geogs_synth.scene import Scene, SceneBuilder
-from geogs_synth.trajectory import look_at, with_shake
+from geogs_synth.motion.handheld import look_at, with_shake
+from geogs_synth.places import furniture
+from geogs_synth.places.furniture import Materials
+from geogs_synth.places.room import add_ceiling_and_floor, add_ceiling_lamp, add_picture, wall_image
+from geogs_synth.scene.scene import Scene, SceneBuilder
+from geogs_synth.textures import patterns
 
 ROOM = np.array([5.0, 4.4, 2.6])
 """Metres across, deep and high."""
@@ -257,7 +258,7 @@ def _middle(build: SceneBuilder, rng: np.random.Generator, materials: Materials)
     """Rug, round table, the ceiling lamp."""
     w, d = ROOM[:2]
     middle = build.at(w / 2, d / 2, yaw=rng.uniform(-0.3, 0.3))
-    middle.box((0, 0, 0.006), (2.3, 1.65, 0.012), build.texture(texture.rug(rng, (512, 720))))
+    middle.box((0, 0, 0.006), (2.3, 1.65, 0.012), build.texture(patterns.rug(rng, (512, 720))))
     x, y = rng.uniform(-0.5, 0.5, 2)
     furniture.round_table(middle.at(x, y, 0.012), rng, materials)
     add_ceiling_lamp(build, ROOM, materials)

@@ -3,13 +3,13 @@
 import pytest
 import torch
 
-import geogs_train.rooms.render as render_module
-import geogs_train.rooms.sampler as sampler_module
+import geogs_synth.clips.sampler as sampler_module
+import geogs_synth.raycast.render as render_module
 from cuda_emulator import use_emulator
 from geogs.depth.network.options import DepthNetworkOptions
 from geogs.depth.network.views import StereoViews
+from geogs_synth.clips.options import RoomOptions
 from geogs_train.depth.options import DepthTraining, PoolOptions, TupleOptions
-from geogs_train.rooms.options import RoomOptions
 
 NETWORK = DepthNetworkOptions(
     planes=12,

@@ -12,9 +12,9 @@ from geogs.geometry.lie import se3_inverse
 from geogs.tracking.flow.classical import ClassicalFlow
 from geogs.world.grid import SampleGrid
 from geogs.world.store import KeyframeStore, Segment
-from geogs_synth.raycast import Raycaster, View
-from geogs_synth.room import make_room
-from geogs_synth.scene import Scene
+from geogs_synth.places.room import make_room
+from geogs_synth.raycast.raycaster import Raycaster, View
+from geogs_synth.scene.scene import Scene
 
 CAMERA = Camera(fx=260.0, fy=260.0, cx=191.5, cy=143.5, width=384, height=288)
 

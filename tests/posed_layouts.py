@@ -41,8 +41,8 @@ class Room:
 @functools.cache
 def raycaster_and_scene():
     """One procedural room, furnished and lit once."""
-    from geogs_synth.raycast import Raycaster
-    from geogs_synth.room import make_room
+    from geogs_synth.places.room import make_room
+    from geogs_synth.raycast.raycaster import Raycaster
 
     scene = make_room(3)
     return Raycaster(scene, threads=1), scene
@@ -50,7 +50,7 @@ def raycaster_and_scene():
 
 def render_room(frames: int, step: int, width: int, height: int) -> Room:
     """A walk through the room."""
-    from geogs_synth.trajectory import handheld_trajectory
+    from geogs_synth.motion.handheld import handheld_trajectory
 
     camera = Camera(0.7 * width, 0.71 * width, width / 2 - 3.25, height / 2 + 1.5, width, height)
     raycaster, scene = raycaster_and_scene()

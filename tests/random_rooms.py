@@ -3,13 +3,13 @@
 import pytest
 import torch
 
-import geogs_train.rooms.clips as clips_module
-import geogs_train.rooms.render as render_module
-import geogs_train.rooms.sampler as sampler_module
+import geogs_synth.clips.clips as clips_module
+import geogs_synth.clips.sampler as sampler_module
+import geogs_synth.raycast.render as render_module
 from cuda_emulator import use_emulator
-from geogs_train.rooms.scene import NONE, Lights, Rooms, Solids, Surfaces
-from geogs_train.rooms.textures import TextureBank
-from geogs_train.rooms.views import Views
+from geogs_synth.camera.views import Views
+from geogs_synth.scene.rooms import NONE, Lights, Rooms, Solids, Surfaces
+from geogs_synth.textures.pyramids import TextureBank
 
 
 def use_fast_rooms(patch: pytest.MonkeyPatch) -> None:

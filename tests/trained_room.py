@@ -11,10 +11,10 @@ from geogs.mapping.training.base import Batch
 from geogs.mapping.view import MapView
 from geogs.mapping.view_pool import ViewPool
 from geogs.splat.map import DiskParameters, GaussianMap
-from geogs_synth.export import default_camera
-from geogs_synth.raycast import Raycaster
-from geogs_synth.room import make_room
-from geogs_synth.trajectory import handheld_trajectory
+from geogs_synth.motion.handheld import handheld_trajectory
+from geogs_synth.places.room import make_room
+from geogs_synth.raycast.raycaster import Raycaster
+from geogs_synth.sequence.export import default_camera
 from keyframe_samples import Sample, segment_of
 
 WORKING = default_camera(96, 72)

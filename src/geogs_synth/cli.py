@@ -8,8 +8,8 @@ from typing import Annotated, Literal, cast
 from geogs.cli.options import Given, parse_options
 from geogs.config import Seed
 from geogs.config.setting import Positional, Range, Settings
-from geogs_synth.flaws import CameraKind, Flaws, camera_flaws
-from geogs_synth.motion_kinds import MotionKind
+from geogs_synth.camera.flaws import CameraKind, Flaws, camera_flaws
+from geogs_synth.motion.kinds import MotionKind
 
 
 @dataclass(frozen=True)
@@ -57,8 +57,8 @@ def main(argv: Sequence[str]) -> int:
     from rich.console import Console
     from rich.progress import Progress
 
-    from geogs_synth.depth_sensor import DepthSensor
-    from geogs_synth.export import write_sequence
+    from geogs_synth.camera.depth_sensor import DepthSensor
+    from geogs_synth.sequence.export import write_sequence
 
     with Progress(console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task("rendering", total=options.frames)

@@ -6,8 +6,8 @@ from collections import deque
 from concurrent.futures import Future, ProcessPoolExecutor
 from functools import partial
 
-from geogs_train.rooms.options import RoomOptions
-from geogs_train.rooms.sampler import Plan, draw_plan
+from geogs_synth.clips.options import RoomOptions
+from geogs_synth.clips.sampler import Plan, draw_plan
 
 PROCESSES = 3
 AHEAD = 8

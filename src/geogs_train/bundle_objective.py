@@ -11,6 +11,7 @@ from geogs.tracking.flow.lookup import Edges
 from geogs.tracking.flow.own import OwnFlowOptions
 from geogs.tracking.flow.own_network import FlowNetwork, cell_pixels
 from geogs.world.grid import OFFSET, STRIDE
+from geogs_synth.clips.clips import ClipBatch
 from geogs_train.bundle import (
     ClipBundleOptions,
     ClipCameras,
@@ -23,7 +24,6 @@ from geogs_train.bundle import (
 from geogs_train.options import FlowTraining
 from geogs_train.pairs import MARGIN
 from geogs_train.pose_loss import PoseLossOptions, pose_loss
-from geogs_train.rooms.clips import ClipBatch
 
 FLOOR = OwnFlowOptions().floor
 """Deviation in pixels that no weight goes beyond, as in the operator."""

@@ -10,13 +10,13 @@ from torch import Tensor
 
 from geogs.tracking.flow.own import load_network
 from geogs.tracking.flow.own_network import FlowNetwork
+from geogs_synth.clips.kinds import NAMES
+from geogs_synth.clips.sampler import Plan, RoomSampler
 from geogs_train.ahead import PROCESSES, PlansAhead
 from geogs_train.course import Panels, Worker
 from geogs_train.export import export_weights
 from geogs_train.objective import objective
 from geogs_train.options import FlowTraining
-from geogs_train.rooms.kinds import NAMES
-from geogs_train.rooms.sampler import Plan, RoomSampler
 from geogs_train.validation import SceneScores, SceneValidation
 
 

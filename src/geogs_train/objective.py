@@ -8,11 +8,11 @@ from torch import Tensor
 
 from geogs.errors import InputError
 from geogs.tracking.flow.own_network import FlowEstimate, FlowNetwork, ImageFeatures
+from geogs_synth.clips.clips import ClipBatch
+from geogs_synth.clips.kinds import only_scene
 from geogs_train.flow_loss import flow_loss
 from geogs_train.options import FlowTraining
 from geogs_train.pairs import FlowBatch, flow_batch
-from geogs_train.rooms.clips import ClipBatch
-from geogs_train.rooms.kinds import only_scene
 from geogs_train.starts import StartOptions
 
 

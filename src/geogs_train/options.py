@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 from geogs.config import Seed
 from geogs.config.setting import Count, Positive, Range, Settings, Share, Weight
 from geogs.tracking.flow.own_options import NetworkOptions
-from geogs_train.rooms.options import RoomOptions, SceneShares
+from geogs_synth.clips.options import RoomOptions, SceneShares
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,8 @@ from geogs.geometry.lie import se3_inverse
 from geogs.tracking.flow.lookup import Edges
 from geogs.tracking.flow.own_network import cell_pixels
 from geogs.world.grid import OFFSET, STRIDE
-from geogs_train.rooms.clips import ClipBatch
-from geogs_train.rooms.kinds import PAPERED
+from geogs_synth.clips.clips import ClipBatch
+from geogs_synth.clips.kinds import PAPERED
 from geogs_train.starts import StartOptions, disturbed_starts
 
 REPEATING = 5.0

@@ -5,12 +5,12 @@ from dataclasses import dataclass, replace
 import torch
 
 from geogs.tracking.flow.own_network import FlowNetwork
+from geogs_synth.clips.kinds import NAMES, only_scene
+from geogs_synth.clips.sampler import RoomSampler
+from geogs_synth.textures.pyramids import TextureBank
 from geogs_train.objective import run_network
 from geogs_train.options import FlowTraining
 from geogs_train.pairs import FlowBatch, flow_batch
-from geogs_train.rooms.kinds import NAMES, only_scene
-from geogs_train.rooms.sampler import RoomSampler
-from geogs_train.rooms.textures import TextureBank
 from geogs_train.scores import CellErrors, FlowScores, has_texture, summarise
 from geogs_train.starts import StartOptions
 

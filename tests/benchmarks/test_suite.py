@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from geogs.errors import InputError
-from geogs_synth.export import default_camera
+from geogs_synth.sequence.export import default_camera
 from portals import SuiteRaycaster
 from suite import ROOM, STEP, WALL, Suite
 

@@ -18,8 +18,8 @@ from geogs.cli.demo import DemoOptions
 from geogs.config.setting import Kind, Only, Range, Settings, Time, kinds
 from geogs.errors import InputError
 from geogs_bench.settings import BenchSettings
+from geogs_synth.camera.flaws import Flaws
 from geogs_synth.cli import SynthOptions
-from geogs_synth.flaws import Flaws
 from geogs_train.cli import TrainOptions
 
 TREES = (config.Config(), config.ReconstructConfig())

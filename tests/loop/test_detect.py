@@ -13,7 +13,7 @@ from geogs.loop.detect import LoopDetector
 from geogs.loop.features import FeatureExtractor, Features
 from geogs.loop.verification import DepthView, TwoViewVerifier
 from geogs.world.store import Segment
-from geogs_synth.raycast import View
+from geogs_synth.raycast.raycaster import View
 from loop_scenes import CAMERA, keyframes, orbit, room, room_views, stretched, views
 
 LAP = 18

@@ -9,10 +9,10 @@ import torch
 from geogs.config import Config
 from geogs.geometry.lie import se3_inverse
 from geogs.mapping.mapper import Mapper
-from geogs_synth.export import default_camera
-from geogs_synth.raycast import Raycaster
-from geogs_synth.room import make_room
-from geogs_synth.trajectory import handheld_trajectory
+from geogs_synth.motion.handheld import handheld_trajectory
+from geogs_synth.places.room import make_room
+from geogs_synth.raycast.raycaster import Raycaster
+from geogs_synth.sequence.export import default_camera
 from keyframe_samples import Sample, segment_of
 
 CAMERA = default_camera(160, 120)

@@ -12,10 +12,10 @@ from geogs.mapping.map_update import MapUpdate
 from geogs.mapping.mapper import Mapper
 from geogs.mapping.window import draw_views
 from geogs.types import PoseCorrection
-from geogs_synth.export import default_camera
-from geogs_synth.raycast import Raycaster
-from geogs_synth.room import make_room
-from geogs_synth.trajectory import handheld_trajectory
+from geogs_synth.motion.handheld import handheld_trajectory
+from geogs_synth.places.room import make_room
+from geogs_synth.raycast.raycaster import Raycaster
+from geogs_synth.sequence.export import default_camera
 from keyframe_samples import Sample, add, segment_of
 
 pytestmark = pytest.mark.system

@@ -12,14 +12,14 @@ from geogs.errors import InputError, OutputError
 from geogs.evaluation.surface import read_surface
 from geogs.io.poses import read_poses
 from geogs.io.sources.sniff import open_source
+from geogs_synth.camera.flaws import Flaws, camera_flaws
 from geogs_synth.cli import main
-from geogs_synth.export import default_camera, write_sequence
-from geogs_synth.flaws import Flaws, camera_flaws
-from geogs_synth.motions import room_motion
-from geogs_synth.raycast import Raycaster
-from geogs_synth.room import make_room
-from geogs_synth.scene import Scene
-from geogs_synth.trajectory import handheld_trajectory
+from geogs_synth.motion.handheld import handheld_trajectory
+from geogs_synth.motion.motions import room_motion
+from geogs_synth.places.room import make_room
+from geogs_synth.raycast.raycaster import Raycaster
+from geogs_synth.scene.scene import Scene
+from geogs_synth.sequence.export import default_camera, write_sequence
 
 FRAMES, WIDTH, HEIGHT, SEED = 4, 96, 72, 2
 
@@ -133,7 +133,7 @@ def test_the_command_says_motion_and_flaws(tmp_path: Path, monkeypatch: pytest.M
     """Single flaws win over those of the camera."""
     asked = {}
     monkeypatch.setattr(
-        "geogs_synth.export.write_sequence", lambda *args, **options: asked.update(options)
+        "geogs_synth.sequence.export.write_sequence", lambda *args, **options: asked.update(options)
     )
     options = ["--motion", "handheld-5hz", "--camera", "action", "--flaws.readout", "0.03"]
     assert main([str(tmp_path), *options, "--moving", "0.2"]) == 0

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from geogs_synth.motion_kinds import ROOM_MOTIONS, MotionKind
-from geogs_synth.motions import room_motion
-from geogs_synth.room import make_room
-from geogs_synth.scene import Scene
-from geogs_synth.trajectory import handheld_trajectory
+from geogs_synth.motion.handheld import handheld_trajectory
+from geogs_synth.motion.kinds import ROOM_MOTIONS, MotionKind
+from geogs_synth.motion.motions import room_motion
+from geogs_synth.places.room import make_room
+from geogs_synth.scene.scene import Scene
 
 
 @pytest.fixture(scope="module")

@@ -9,12 +9,12 @@ import torch
 
 from geogs.geometry.camera import Camera
 from geogs.geometry.depth import normals_from_depth
-from geogs_synth.export import default_camera
-from geogs_synth.raycast import Raycaster, View
-from geogs_synth.room import make_room
-from geogs_synth.scene import Scene, SceneBuilder, yaw_rotation
-from geogs_synth.tessellation import scene_mesh
-from geogs_synth.trajectory import handheld_trajectory
+from geogs_synth.motion.handheld import handheld_trajectory
+from geogs_synth.places.room import make_room
+from geogs_synth.raycast.raycaster import Raycaster, View
+from geogs_synth.scene.scene import Scene, SceneBuilder, yaw_rotation
+from geogs_synth.sequence.export import default_camera
+from geogs_synth.sequence.tessellation import scene_mesh
 
 CAMERA = Camera(70.0, 72.0, 40.3, 29.1, 80, 60)
 

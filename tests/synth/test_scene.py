@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from geogs.errors import InputError
-from geogs_synth.export import default_camera
-from geogs_synth.raycast import Raycaster
-from geogs_synth.room import make_room
-from geogs_synth.scene import Scene, SceneBuilder, yaw_rotation
-from geogs_synth.tessellation import SeenSurface, scene_mesh
-from geogs_synth.trajectory import FRAMES_PER_LAP, handheld_trajectory
+from geogs_synth.motion.handheld import FRAMES_PER_LAP, handheld_trajectory
+from geogs_synth.places.room import make_room
+from geogs_synth.raycast.raycaster import Raycaster
+from geogs_synth.scene.scene import Scene, SceneBuilder, yaw_rotation
+from geogs_synth.sequence.export import default_camera
+from geogs_synth.sequence.tessellation import SeenSurface, scene_mesh
 
 
 @pytest.fixture(scope="module", params=[0, 3])

@@ -5,16 +5,16 @@ import pytest
 import torch
 
 from geogs.errors import InputError
-from geogs_synth.flaws import Flaws
-from geogs_synth.lens import Lens
-from geogs_synth.motions import room_motion
-from geogs_synth.raycast import Raycaster
-from geogs_synth.room import make_room
-from geogs_synth.scene import Scene
-from geogs_synth.sensor import Sensor
-from geogs_synth.shooting import Shooting
-from geogs_synth.stage import centred_camera
-from geogs_synth.walkers import crossing_walkers
+from geogs_synth.camera.flaws import Flaws
+from geogs_synth.camera.lens import Lens
+from geogs_synth.camera.sensor import Sensor
+from geogs_synth.motion.motions import room_motion
+from geogs_synth.places.room import make_room
+from geogs_synth.places.walkers import crossing_walkers
+from geogs_synth.raycast.raycaster import Raycaster
+from geogs_synth.scene.scene import Scene
+from geogs_synth.sequence.shooting import Shooting
+from geogs_synth.sequence.stage import centred_camera
 
 CAMERA = centred_camera(96, 72)
 LENS = Lens(CAMERA)

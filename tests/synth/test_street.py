@@ -7,13 +7,13 @@ import pytest
 import torch
 
 from geogs.errors import InputError
-from geogs_synth.export import write_sequence
-from geogs_synth.raycast import Raycaster, View
-from geogs_synth.scene import Scene
-from geogs_synth.stage import STREET_FOCAL, centred_camera
-from geogs_synth.street import DRIVE_METRES, drive, make_street
-from geogs_synth.tessellation import SeenSurface, scene_mesh
-from geogs_synth.traffic import street_traffic
+from geogs_synth.places.street import DRIVE_METRES, drive, make_street
+from geogs_synth.places.traffic import street_traffic
+from geogs_synth.raycast.raycaster import Raycaster, View
+from geogs_synth.scene.scene import Scene
+from geogs_synth.sequence.export import write_sequence
+from geogs_synth.sequence.stage import STREET_FOCAL, centred_camera
+from geogs_synth.sequence.tessellation import SeenSurface, scene_mesh
 
 CAMERA = centred_camera(124, 38, STREET_FOCAL)
 

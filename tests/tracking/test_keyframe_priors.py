@@ -16,9 +16,9 @@ from geogs.priors.base import DepthKind, PriorMaps
 from geogs.tracking.flow.texture import MIN_STRUCTURE, cell_structure
 from geogs.tracking.tracker import Tracker
 from geogs.types import Frame, PoseCorrection
-from geogs_synth.raycast import Raycaster, View
-from geogs_synth.room import make_room
-from geogs_synth.trajectory import handheld_trajectory
+from geogs_synth.motion.handheld import handheld_trajectory
+from geogs_synth.places.room import make_room
+from geogs_synth.raycast.raycaster import Raycaster, View
 
 pytestmark = pytest.mark.system
 

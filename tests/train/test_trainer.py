@@ -19,6 +19,7 @@ from geogs.tracking.flow.own_network import (
     NetworkOptions,
     cell_pixels,
 )
+from geogs_synth.clips.options import RoomOptions
 from geogs_train.bundle import reproject
 from geogs_train.checkpoint import load_checkpoint, read_options, save_checkpoint
 from geogs_train.course import Worker
@@ -26,7 +27,6 @@ from geogs_train.flow_course import FlowCourse
 from geogs_train.flow_loss import descriptor_loss, flow_loss
 from geogs_train.options import BundleTraining, FlowTraining
 from geogs_train.pairs import FlowBatch
-from geogs_train.rooms.options import RoomOptions
 from geogs_train.scores import CellErrors, has_texture, summarise
 from geogs_train.starts import StartOptions, disturbed_starts
 from geogs_train.trainer import Trainer, schedule

@@ -10,6 +10,8 @@ from torch import Tensor
 
 from geogs.depth.network.model import DepthNetwork
 from geogs.depth.network.weights import load_depth_network
+from geogs_synth.clips.sampler import RoomSampler
+from geogs_synth.draw import Draw
 from geogs_train.course import Panels, Worker
 from geogs_train.depth.export import export_depth_weights
 from geogs_train.depth.loss import depth_loss
@@ -18,8 +20,6 @@ from geogs_train.depth.pool import ClipPool
 from geogs_train.depth.scores import DepthScores
 from geogs_train.depth.tuples import Chance, DepthBatch, draw_tuples
 from geogs_train.depth.validation import DepthValidation
-from geogs_train.rooms.draw import Draw
-from geogs_train.rooms.sampler import RoomSampler
 
 CALIBRATION_BATCHES, CALIBRATION_SEED = 6, 9
 

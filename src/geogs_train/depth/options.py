@@ -6,7 +6,7 @@ from typing import Annotated
 from geogs.config import Seed
 from geogs.config.setting import Count, Positive, Range, Settings, Share, Weight
 from geogs.depth.network.options import DepthNetworkOptions
-from geogs_train.rooms.options import MotionShares, RoomOptions
+from geogs_synth.clips.options import MotionShares, RoomOptions
 
 
 @dataclass(frozen=True)

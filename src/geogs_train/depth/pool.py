@@ -6,9 +6,9 @@ import torch
 from jaxtyping import Float, Float16, UInt8
 from torch import Tensor
 
+from geogs_synth.clips.clips import ClipBatch
+from geogs_synth.clips.sampler import Plan, RoomSampler
 from geogs_train.ahead import PlansAhead
-from geogs_train.rooms.clips import ClipBatch
-from geogs_train.rooms.sampler import Plan, RoomSampler
 
 QUANTILES = (0.05, 0.5, 0.95)
 """Of depth, which stand for what a tracker knows of a view."""

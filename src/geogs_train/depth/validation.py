@@ -8,12 +8,12 @@ from torch import Tensor
 
 from geogs.depth.network.model import DepthNetwork
 from geogs.depth.network.views import DepthPrediction
+from geogs_synth.clips.sampler import RoomSampler
+from geogs_synth.textures.pyramids import TextureBank
 from geogs_train.depth.options import DepthTraining
 from geogs_train.depth.pool import StoredClips
 from geogs_train.depth.scores import DepthErrors, DepthScores, summarise, texture_kind
 from geogs_train.depth.tuples import Chance, DepthBatch, draw_tuples
-from geogs_train.rooms.sampler import RoomSampler
-from geogs_train.rooms.textures import TextureBank
 
 SEED = 3141
 EVERY = 3

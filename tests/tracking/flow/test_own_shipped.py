@@ -11,9 +11,9 @@ from geogs.networks.weights_files import PACKAGED
 from geogs.tracking.flow.classical import ClassicalFlow
 from geogs.tracking.flow.own import OwnFlow, OwnFlowOptions
 from geogs.world.grid import OFFSET, STRIDE, SampleGrid
-from geogs_synth.raycast import Raycaster
-from geogs_synth.room import make_room
-from geogs_synth.trajectory import handheld_trajectory
+from geogs_synth.motion.handheld import handheld_trajectory
+from geogs_synth.places.room import make_room
+from geogs_synth.raycast.raycaster import Raycaster
 
 pytestmark = pytest.mark.system
 

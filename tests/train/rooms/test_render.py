@@ -6,17 +6,17 @@ from dataclasses import replace
 import pytest
 import torch
 
-from geogs_train.rooms.clips import ClipBatch
-from geogs_train.rooms.develop import develop
-from geogs_train.rooms.draw import Draw
-from geogs_train.rooms.flaws import draw_flaws
-from geogs_train.rooms.jpeg import compress
-from geogs_train.rooms.options import RoomOptions
-from geogs_train.rooms.raycast import signed_distance, wall_distance
-from geogs_train.rooms.reference import flow_by_torch, render_by_torch
-from geogs_train.rooms.sampler import RoomSampler
-from geogs_train.rooms.scene import BOX, ELLIPSOID, FRUSTUM
-from geogs_train.rooms.views import pixel_grid, rays
+from geogs_synth.camera.develop import develop
+from geogs_synth.camera.jpeg import compress
+from geogs_synth.camera.random_flaws import draw_flaws
+from geogs_synth.camera.views import pixel_grid, rays
+from geogs_synth.clips.clips import ClipBatch
+from geogs_synth.clips.options import RoomOptions
+from geogs_synth.clips.sampler import RoomSampler
+from geogs_synth.draw import Draw
+from geogs_synth.raycast.rays import signed_distance, wall_distance
+from geogs_synth.raycast.reference import flow_by_torch, render_by_torch
+from geogs_synth.scene.rooms import BOX, ELLIPSOID, FRUSTUM
 from random_rooms import looking_along_y, nothing, room_of, small_bank, solids_of, use_fast_rooms
 
 OPTIONS = RoomOptions(width=64, height=48, textures=8, texture_size=32, candidates=12)
@@ -197,8 +197,8 @@ def test_compression_keeps_what_it_does_not_round():
 
 
 def test_pictures_without_flaws_are_those_of_the_light():
-    draw, options = Draw(torch.device("cpu"), 0), RoomOptions(disturbance=0.0)
-    flaws = draw_flaws(draw, options, 2)
+    draw = Draw(torch.device("cpu"), 0)
+    flaws = draw_flaws(draw, 2, 2, disturbance=0.0)
     light = torch.rand(2, 2, 3, 24, 32, generator=torch.Generator().manual_seed(1))
     image = develop(draw, flaws, light)
     assert ((image * 255) % 1).abs().max() < 1e-3

@@ -5,27 +5,27 @@ from dataclasses import replace
 import pytest
 import torch
 
-import geogs_train.rooms.render as render_module
+import geogs_synth.raycast.render as render_module
 from cuda_emulator import use_emulator
-from geogs_train.rooms.cameras import choose_cameras, too_near
-from geogs_train.rooms.draw import Draw
-from geogs_train.rooms.layout import draw_layout
-from geogs_train.rooms.lights import draw_lights
-from geogs_train.rooms.materials import draw_surfaces
-from geogs_train.rooms.options import RoomOptions
-from geogs_train.rooms.paths import draw_paths
-from geogs_train.rooms.raycast import closest_hit
-from geogs_train.rooms.reference import flow_by_torch, render_by_torch
-from geogs_train.rooms.render import (
+from geogs_synth.camera.views import Views, pixel_grid, rays
+from geogs_synth.clips.cameras import choose_cameras, too_near
+from geogs_synth.clips.layout import draw_layout
+from geogs_synth.clips.lights import draw_lights
+from geogs_synth.clips.materials import draw_surfaces
+from geogs_synth.clips.options import RoomOptions
+from geogs_synth.clips.paths import draw_paths
+from geogs_synth.clips.sampler import RoomSampler
+from geogs_synth.draw import Draw
+from geogs_synth.raycast.rays import closest_hit
+from geogs_synth.raycast.reference import flow_by_torch, render_by_torch
+from geogs_synth.raycast.render import (
     MOST_SOLIDS,
     SOURCE,
     first_hit_by_kernel,
     flow_by_kernel,
     render_by_kernel,
 )
-from geogs_train.rooms.sampler import RoomSampler
-from geogs_train.rooms.scene import Rooms, moved
-from geogs_train.rooms.views import Views, pixel_grid, rays
+from geogs_synth.scene.rooms import Rooms, moved
 from random_rooms import small_bank
 
 

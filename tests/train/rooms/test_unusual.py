@@ -5,15 +5,15 @@ from dataclasses import replace
 import pytest
 import torch
 
+from geogs_synth.camera.motion_blur import exposed, motion_while_open
+from geogs_synth.camera.views import pixel_grid, project, rays
+from geogs_synth.clips.clips import ClipBatch
+from geogs_synth.clips.kinds import NAMES, STREET, draw_kinds, only_scene
+from geogs_synth.clips.options import RoomOptions, SceneShares
+from geogs_synth.clips.sampler import RoomSampler, draw_plan
+from geogs_synth.clips.shake import draw_shake
+from geogs_synth.draw import Draw, from_vector, turned
 from geogs_train.pairs import REPEATING, flow_batch
-from geogs_train.rooms.clips import ClipBatch
-from geogs_train.rooms.draw import Draw, from_vector, turned
-from geogs_train.rooms.exposure import exposed, motion_while_open
-from geogs_train.rooms.kinds import NAMES, STREET, draw_kinds, only_scene
-from geogs_train.rooms.options import RoomOptions, SceneShares
-from geogs_train.rooms.sampler import RoomSampler, draw_plan
-from geogs_train.rooms.shake import draw_shake
-from geogs_train.rooms.views import pixel_grid, project, rays
 from geogs_train.starts import StartOptions
 from random_rooms import looking_along_y, use_fast_rooms
 

@@ -1,0 +1,54 @@
+"""Blur of what moves while a camera looks: of everything where it moves itself, and of things."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from geogs_synth.camera.views import Views
+
+_TAPS = 11
+_MOST = 40.0
+"""Pixels of blur at most."""
+
+
+def exposed(
+    colour: Float[Tensor, "b v 3 h w"], blur: Float[Tensor, "b v h w 2"]
+) -> Float[Tensor, "b v 3 h w"]:
+    """The mean of linear light along the motion of each pixel, which is centred on it."""
+    b, v, _, h, w = colour.shape
+    image, way = colour.flatten(0, 1), blur.flatten(0, 1).clamp(-_MOST, _MOST)
+    x = (torch.arange(w, device=image.device) + 0.5) * (2 / w) - 1
+    y = (torch.arange(h, device=image.device)[:, None] + 0.5) * (2 / h) - 1
+    grid = torch.stack(torch.broadcast_tensors(x, y), -1)
+    step = torch.stack([way[..., 0] * (2 / w), way[..., 1] * (2 / h)], -1)
+    total = torch.zeros_like(image)
+    for tap in range(_TAPS):
+        at = grid + (tap / (_TAPS - 1) - 0.5) * step
+        total += torch.nn.functional.grid_sample(
+            image, at, padding_mode="border", align_corners=False
+        )
+    return (total / _TAPS).unflatten(0, (b, v))
+
+
+def motion_while_open(
+    views: Views,
+    depth: Float[Tensor, "b v h w"],
+    camera: Float[Tensor, "b v 6"],
+    things: Float[Tensor, "b v h w 3"],
+) -> Float[Tensor, "b v h w 2"]:
+    """Pixels by which each point moves in the image while the shutter is open.
+
+    ``camera`` is what the camera does in this time (rotation vector, way, in its frame),
+    ``things`` what the points do, world frame.
+    """
+    h, w = depth.shape[-2:]
+    fx, fy, cx, cy = views.intrinsics[:, :, None, None, None].unbind(1)
+    x = (torch.arange(w, device=depth.device) - cx) / fx
+    y = (torch.arange(h, device=depth.device)[:, None] - cy) / fy
+    ray = torch.stack(torch.broadcast_tensors(x, y, torch.ones_like(depth)), -1)
+    point = ray * depth[..., None]
+    turn, way = (p[:, :, None, None].expand_as(point) for p in camera.split(3, -1))
+    moved = torch.einsum("bvij,bvhwj->bvhwi", views.T_cw[..., :3, :3], things)
+    rate = moved - way - torch.linalg.cross(turn, point)
+    across = (rate[..., :2] - ray[..., :2] * rate[..., 2:]) / depth[..., None].clamp_min(0.05)
+    return across * torch.stack([fx, fy], -1)

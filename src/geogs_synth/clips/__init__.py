@@ -1,0 +1,1 @@
+"""Batches of short clips of random rooms, for training."""

@@ -1,0 +1,64 @@
+"""Short clips of random rooms with exact geometry: what the trainer gets."""
+
+from dataclasses import dataclass
+
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from geogs_synth.camera.views import Views, pixel_grid, project, rays
+from geogs_synth.clips.unusual import Scene
+from geogs_synth.raycast.reference import FlowTruth
+from geogs_synth.raycast.render import flow
+from geogs_synth.scene.rooms import Solids
+
+
+@dataclass(frozen=True)
+class ClipBatch:
+    """b clips of v views each; every clip is of another room."""
+
+    images: Float[Tensor, "b v 3 h w"]
+    """RGB in 0..1, in 8-bit steps, as a camera with noise, blur and artefacts takes them."""
+    light: Float[Tensor, "b v 3 h w"]
+    """The same as linear light, before the camera: what there is to see."""
+    depth: Float[Tensor, "b v h w"]
+    """z along the optical axis in metres, exact at the (integer) pixel centres."""
+    normal: Float[Tensor, "b v 3 h w"]
+    """Unit, camera frame, facing the camera, exact at the pixel centres."""
+    T_cw: Float[Tensor, "b v 4 4"]
+    """World to camera, OpenCV axes."""
+    intrinsics: Float[Tensor, "b 4"]
+    """fx fy cx cy in pixels, pixel centres at integers."""
+    solids: Solids
+    """What stands in the rooms when the first view is taken; hides points from views."""
+    solid: Int[Tensor, "b v h w"]
+    """Place of the solid that each pixel shows; -1 for the room itself."""
+    sweep: Float[Tensor, "b v 6"] | None = None
+    """What the cameras do while their rows are read, as in :class:`Views`."""
+    scene: Scene | None = None
+    """What is unusual; None where nothing is."""
+
+    @property
+    def views(self) -> Views:
+        """The cameras."""
+        height, width = self.depth.shape[-2:]
+        return Views(self.T_cw, self.intrinsics, width, height, self.sweep)
+
+    def flow(self, first: int, second: int) -> FlowTruth:
+        """Where the points that the view ``first`` sees are in the view ``second``."""
+        points = self.points(first)
+        if self.scene is None:
+            return flow(self.solids, self.views, points, second)
+        points = points + (second - first) * self.scene.ways_of(self.solid[:, first])
+        solids = self.solids.moved_by(self.scene.ways, second)
+        return flow(solids, self.views, points, second)
+
+    def still_flow(self, points: Float[Tensor, "b h w 3"], second: int) -> Float[Tensor, "b h w 2"]:
+        """Where what is at these points would be in a view if nothing but the camera moved."""
+        pixels, _ = project(self.views, second, points.flatten(1, 2))
+        return pixels.unflatten(1, points.shape[1:3])
+
+    def points(self, view: int) -> Float[Tensor, "b h w 3"]:
+        """What a view sees, world frame."""
+        depth = self.depth[:, view]
+        origin, direction = rays(self.views, view, *pixel_grid(self.views))
+        return (origin + depth.flatten(1)[..., None] * direction).unflatten(1, depth.shape[1:])

@@ -1,0 +1,127 @@
+"""What the surfaces of random rooms look like."""
+
+from dataclasses import fields, replace
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from geogs_synth.clips.layout import Layout
+from geogs_synth.draw import Draw
+from geogs_synth.scene.rooms import Surfaces
+
+_PLAIN = (0.5, 0.5, 0.5, 0.5, 0.2, 0.8)
+"""Share of the walls, the floor and the ceiling that have next to no texture."""
+_PLAIN_SOLID = 0.35
+_SHOWS_IMAGE = (0.12, 0.12, 0.12, 0.12, 0.12, 0.04)
+"""Share of them that show images rather than materials."""
+_SOLID_SHOWS_IMAGE = 0.35
+
+
+def draw_surfaces(draw: Draw, layout: Layout, textures: int, materials: int) -> Surfaces:
+    """Looks of the room's six faces and of two surfaces of each solid.
+
+    Of the ``textures`` in the bank the first ``materials`` are materials, the others images.
+    """
+    b, n = layout.solids.kind.shape
+    plain = draw.uniform(0, 1, b, 6) < torch.tensor(_PLAIN)
+    image = draw.uniform(0, 1, b, 6) < torch.tensor(_SHOWS_IMAGE)
+    walls = _draw(draw, plain, _texture(draw, image, textures, materials), textures, (0.4, 8.0))
+    polished = (draw.chance(0.15, b) * draw.log_uniform(0.03, 0.5, b))[:, None]
+    walls = replace(walls, mirror=torch.tensor([0.0] * 4 + [1.0, 0.0]) * polished)
+
+    plain = draw.chance(_PLAIN_SOLID, b, 2 * n)
+    image = draw.chance(_SOLID_SHOWS_IMAGE, b, 2 * n)
+    texture = _texture(draw, image, textures, materials)
+    solids = _draw(draw, plain, texture, textures, (0.08, 5.0))
+    pictures = _texture(draw, torch.ones_like(image), textures, materials)
+    solids = _show_pictures(draw, solids, layout, pictures)
+
+    wall = torch.arange(6).repeat(b, 1)
+    wall[:, :4] = torch.where(draw.chance(0.6, b)[:, None], 0, wall[:, :4])
+    owner = torch.stack([2 * layout.material, 2 * layout.material + 1], -1).flatten().repeat(b, 1)
+    # The ends of most solids look like their sides.
+    owner = torch.where(draw.chance(0.6, b, 2 * n), owner - owner % 2, owner)
+    return _join(_pick(walls, wall), _pick(solids, owner))
+
+
+def _texture(
+    draw: Draw, image: Bool[Tensor, "b s"], textures: int, materials: int
+) -> Int[Tensor, "b s"]:
+    images = materials + draw.integers(textures - materials, *image.shape)
+    return torch.where(image, images, draw.integers(materials, *image.shape))
+
+
+def _draw(
+    draw: Draw,
+    plain: Bool[Tensor, "b s"],
+    texture: Int[Tensor, "b s"],
+    textures: int,
+    period: tuple[float, float],
+) -> Surfaces:
+    """Random surfaces; ``period`` is the range of a texture's width in metres."""
+    n = plain.shape
+    quarter = torch.where(draw.chance(0.7, *n), 0, draw.integers(4, *n)) * (torch.pi / 2)
+    angle = quarter + torch.where(draw.chance(0.7, *n), 0.0, draw.uniform(-3.15, 3.15, *n))
+    scale = 1 / draw.log_uniform(*period, *n)
+    lightness = torch.where(plain, draw.uniform(0.4, 1.9, *n), draw.uniform(0.7, 1.6, *n))
+    # Most surfaces are nearly grey, a few are colourful.
+    chroma = 0.4 * draw.uniform(0, 1, *n).pow(2.5)
+    hue = 1 + chroma[..., None] * draw.uniform(-1, 1, *n, 3)
+    warmth = draw.uniform(-0.02, 0.12, *n)[..., None] * torch.tensor([1.0, 0.2, -1.0])
+    faint = draw.chance(0.5, *n) * draw.log_uniform(0.005, 0.06, *n)
+    stain = draw.chance(0.5, *n) * draw.log_uniform(0.002, 0.03, *n)
+    detail = draw.chance(0.5, *n) * draw.log_uniform(0.03, 0.5, *n)
+    return Surfaces(
+        texture=texture,
+        matrix=_matrix(scale, angle),
+        offset=draw.uniform(0, 1, *n, 2),
+        contrast=torch.where(plain, faint, draw.log_uniform(0.25, 1.2, *n)),
+        tint=lightness[..., None] * hue * (1 + warmth),
+        noise=draw.integers(textures, *n),
+        noise_scale=1 / draw.log_uniform(0.05, 1.5, *n),
+        detail=torch.where(plain, stain, detail),
+        gloss=draw.chance(0.3, *n) * draw.log_uniform(0.02, 0.6, *n),
+        shininess=draw.log_uniform(4.0, 200.0, *n),
+        glow=torch.zeros(n),
+        mirror=draw.chance(0.06, *n) * draw.log_uniform(0.03, 0.5, *n),
+    )
+
+
+def _matrix(scale: Float[Tensor, "b s"], angle: Float[Tensor, "b s"]) -> Float[Tensor, "b s 2 2"]:
+    """Turned and scaled; upside down, because rows of an image go down."""
+    c, s = scale * angle.cos(), scale * angle.sin()
+    return torch.stack([c, s, s, -c], -1).unflatten(-1, (2, 2))
+
+
+def _show_pictures(
+    draw: Draw, surfaces: Surfaces, layout: Layout, images: Int[Tensor, "b s"]
+) -> Surfaces:
+    """What hangs on a wall shows about one image; some of it is a bright window or screen."""
+    picture = layout.picture.repeat_interleave(2)
+    half = layout.solids.half.repeat_interleave(2, 1)
+    b, n = half.shape[:2]
+    width = 2 * torch.maximum(half[..., 0], half[..., 2]) * draw.uniform(1.0, 1.8, b, n)
+    matrix = _matrix(1 / width, torch.zeros_like(width))
+    bright = draw.chance(0.2, b, n) * draw.log_uniform(0.5, 4.0, b, n)
+    plain = draw.chance(0.25, b, n)
+    glass = draw.chance(0.25, b, n) * draw.log_uniform(0.1, 0.9, b, n)
+    return replace(
+        surfaces,
+        texture=torch.where(picture, images, surfaces.texture),
+        matrix=torch.where(picture[:, None, None], matrix, surfaces.matrix),
+        contrast=torch.where(picture & ~plain, 1.0, surfaces.contrast),
+        detail=torch.where(picture, 0.0, surfaces.detail),
+        glow=torch.where(picture, bright, surfaces.glow),
+        mirror=torch.where(picture, glass, surfaces.mirror),
+    )
+
+
+def _pick(surfaces: Surfaces, index: Int[Tensor, "b s"]) -> Surfaces:
+    rows = torch.arange(len(index))[:, None]
+    return Surfaces(*(getattr(surfaces, f.name)[rows, index] for f in fields(Surfaces)))
+
+
+def _join(first: Surfaces, second: Surfaces) -> Surfaces:
+    names = [f.name for f in fields(Surfaces)]
+    return Surfaces(*(torch.cat([getattr(s, n) for s in (first, second)], 1) for n in names))

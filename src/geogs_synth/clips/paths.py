@@ -1,0 +1,143 @@
+"""Candidate camera paths through random rooms; which of them is filmed is decided elsewhere."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from geogs_synth.clips.options import MotionShares, RoomOptions
+from geogs_synth.draw import Draw, from_vector
+
+
+@dataclass(frozen=True)
+class Paths:
+    """k candidate paths of v views in each of b rooms."""
+
+    R_wc: Float[Tensor, "b k v 3 3"]
+    """Camera to world, OpenCV axes."""
+    centre: Float[Tensor, "b k v 3"]
+    """World, metres."""
+    intrinsics: Float[Tensor, "b 4"]
+    """fx fy cx cy in pixels."""
+    crowd: Float[Tensor, "b"]
+    """Share of the image that things other than the walls should fill."""
+
+
+@dataclass(frozen=True)
+class _Motion:
+    """What a kind of motion draws from."""
+
+    length: tuple[float, float]
+    """Metres between two views."""
+    turn: float
+    """Largest rotation about each axis, degrees."""
+    hold: tuple[float, float]
+    """Share of the turn that keeps the same point in view."""
+    along_axis: float = 0.0
+    """0 moves anyhow, 1 along the optical axis."""
+
+
+_KINDS = (
+    _Motion((0.02, 0.15), 4.0, (0.0, 1.0)),
+    _Motion((0.15, 0.5), 6.0, (0.2, 1.0)),
+    _Motion((0.5, 1.2), 8.0, (0.7, 1.1)),
+    _Motion((1e-4, 2e-4), 20.0, (0.0, 0.0)),
+    _Motion((0.1, 0.8), 4.0, (0.0, 1.0), along_axis=1.0),
+)
+"""In the order of :class:`MotionShares`."""
+
+
+@dataclass(frozen=True)
+class _Steps:
+    """How each of k candidates moves away from its first pose."""
+
+    way: Float[Tensor, "b k 3"]
+    """Metres, world frame."""
+    spin: Float[Tensor, "b k 3"]
+    """Rotation vector, camera frame."""
+    hold: Float[Tensor, "b k"]
+    """Share of the turn that keeps the same point in view."""
+
+
+def draw_paths(draw: Draw, options: RoomOptions, size: Float[Tensor, "b 3"]) -> Paths:
+    """Candidates anywhere in the rooms, without regard to what stands there."""
+    b, k, v = len(size), options.candidates, options.views
+    start = draw.uniform(0, 1, b, k, 3) * (size - 0.4)[:, None] + 0.2
+    start[..., 2] = torch.minimum(draw.uniform(0.4, 2.0, b, k), size[:, 2:] - 0.2)
+    target = draw.uniform(0, 1, b, k, 3) * size[:, None]
+    target[..., 2] = draw.uniform(0.05, 0.7, b, k) * size[:, 2:]
+    forward = torch.nn.functional.normalize(target - start, dim=-1)
+    roll = torch.where(draw.chance(0.1, b, k), draw.normal(0.5, b, k), draw.normal(0.06, b, k))
+    R0 = looking(forward) @ from_vector(torch.nn.functional.pad(roll[..., None], (2, 0)))
+    move = _draw_steps(draw, options.motions, forward)
+
+    # Longer clips go further, but each of their steps is shorter.
+    progress = torch.arange(v) / max(math.sqrt(v - 1), 1.0)
+    shaken = (v > 2) * (progress[:, None] > 0)
+    steps = progress[:, None] + draw.normal(0.12, b, k, v, 1) * shaken
+    centre = start[:, :, None] + steps * move.way[:, :, None]
+    if options.sway:
+        aside = draw.normal(options.sway, b, k, v, 3) * shaken
+        centre = centre + aside * move.way.norm(dim=-1)[:, :, None, None]
+    seen = start + forward * draw.log_uniform(0.8, 4.0, b, k)[..., None]
+    jitter = draw.normal(0.1, b, k, v, 3) * shaken
+    R = R0[:, :, None] @ from_vector((steps + jitter) * move.spin[:, :, None])
+    R = _keep_in_view(R, centre, seen, R0, start, move.hold)
+    return Paths(R, centre, draw_intrinsics(draw, options, b), draw.uniform(0, 0.7, b))
+
+
+def draw_intrinsics(draw: Draw, options: RoomOptions, rooms: int) -> Float[Tensor, "b 4"]:
+    """Fields of view of 45 to 90 degrees, a principal point near the middle."""
+    angle = draw.uniform(math.radians(45), math.radians(90), rooms)
+    fx = 0.5 * options.width / (angle / 2).tan()
+    fy = fx * (1 + draw.uniform(-0.02, 0.02, rooms))
+    cx = 0.5 * (options.width - 1) + draw.uniform(-0.03, 0.03, rooms) * options.width
+    cy = 0.5 * (options.height - 1) + draw.uniform(-0.03, 0.03, rooms) * options.height
+    return torch.stack([fx, fy, cx, cy], -1)
+
+
+def _draw_steps(draw: Draw, shares: MotionShares, forward: Float[Tensor, "b k 3"]) -> _Steps:
+    """All candidates of a room move in the same manner, so that none is taken less often."""
+    b, k = forward.shape[:2]
+    kind = draw.choose(
+        (shares.hand_held, shares.medium, shares.wide, shares.rotation, shares.forward), b
+    )
+    rows = [[*m.length, m.turn, *m.hold, m.along_axis] for m in _KINDS]
+    numbers = torch.tensor(rows)[kind][:, None].expand(b, k, 6)
+    low, high, turn, hold_low, hold_high, along = numbers.unbind(-1)
+    length = low * (high / low) ** draw.uniform(0, 1, b, k)
+    sign = (1 - 2 * draw.integers(2, b, k))[..., None]
+    axis = forward * sign + draw.normal(0.15, b, k, 3)
+    way = torch.where(along[..., None] > 0, axis, draw.normal(1.0, b, k, 3))
+    way = torch.nn.functional.normalize(way, dim=-1) * length[..., None]
+    spin = draw.uniform(-1, 1, b, k, 3) * torch.tensor([1.0, 1.0, 0.5])
+    spin = spin * (turn * math.pi / 180)[..., None]
+    return _Steps(way, spin, hold_low + (hold_high - hold_low) * draw.uniform(0, 1, b, k))
+
+
+def _keep_in_view(
+    R: Float[Tensor, "b k v 3 3"],
+    centre: Float[Tensor, "b k v 3"],
+    seen: Float[Tensor, "b k 3"],
+    R0: Float[Tensor, "b k 3 3"],
+    start: Float[Tensor, "b k 3"],
+    hold: Float[Tensor, "b k"],
+) -> Float[Tensor, "b k v 3 3"]:
+    """Turns views by the share ``hold`` of what brings the point seen first back to its pixel."""
+    before = (seen - start)[:, :, None].expand_as(centre)
+    now = torch.nn.functional.normalize(seen[:, :, None] - centre, dim=-1)
+    before = torch.nn.functional.normalize(before, dim=-1)
+    cross = torch.linalg.cross(before, now)
+    sine = cross.norm(dim=-1, keepdim=True)
+    angle = torch.atan2(sine, (before * now).sum(-1, keepdim=True))
+    return from_vector(cross / sine.clamp_min(1e-9) * angle * hold[..., None, None]) @ R
+
+
+def looking(forward: Float[Tensor, "... 3"]) -> Float[Tensor, "... 3 3"]:
+    """Camera to world for an upright camera that looks ahead like this."""
+    up = torch.zeros_like(forward)
+    up[..., 2] = 1
+    right = torch.nn.functional.normalize(torch.linalg.cross(forward, up), dim=-1)
+    return torch.stack([right, torch.linalg.cross(forward, right), forward], -1)

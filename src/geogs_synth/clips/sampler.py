@@ -1,0 +1,125 @@
+"""Clips of random rooms: a room, its light, a camera path, pictures of an imperfect camera."""
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from geogs_synth.camera.develop import develop
+from geogs_synth.camera.random_flaws import RandomFlaws, draw_flaws
+from geogs_synth.clips.cameras import choose_cameras, too_near
+from geogs_synth.clips.clips import ClipBatch
+from geogs_synth.clips.kinds import only_scene
+from geogs_synth.clips.layout import draw_layout
+from geogs_synth.clips.lights import draw_lights
+from geogs_synth.clips.materials import draw_surfaces
+from geogs_synth.clips.options import RoomOptions
+from geogs_synth.clips.paths import Paths, draw_paths
+from geogs_synth.clips.unusual import Scene, draw_scene
+from geogs_synth.draw import Draw
+from geogs_synth.raycast.render import render, render_apart
+from geogs_synth.scene.rooms import Rooms, moved
+from geogs_synth.textures.bank import make_bank
+from geogs_synth.textures.pyramids import TextureBank
+
+_LEAST, _MOST = (2.5, 2.5, 2.2), (8.0, 8.0, 3.5)
+"""Sizes of rooms, metres."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Everything random about a batch but the noise of its pixels; on the host."""
+
+    key: tuple[int, ...]
+    """What the random numbers depend on."""
+
+    rooms: Rooms
+    paths: Paths
+    flaws: RandomFlaws
+    scene: Scene | None = None
+    """What is unusual; None where nothing is."""
+
+
+class RoomSampler:
+    """An endless supply of clips; each batch depends only on the seed, the step and the rank."""
+
+    def __init__(
+        self,
+        options: RoomOptions,
+        device: torch.device | str,
+        seed: int = 0,
+        bank: TextureBank | None = None,
+    ) -> None:
+        """``bank`` may be that of a sampler with the same textures."""
+        self.options = options
+        self.device = torch.device(device)
+        self._seed = seed
+        self.bank = bank or make_bank(
+            options.textures, options.texture_size, seed, self.device, options.validation
+        )
+
+    def sample(self, step: int, batch: int, rank: int = 0) -> ClipBatch:
+        """``batch`` clips for a training step of a process; the same whenever it is asked for.
+
+        The rooms are the same on every device, only the noise differs. Nothing waits for the
+        device.
+        """
+        return self.film(self.plan(step, batch, rank))
+
+    def plan(self, step: int, batch: int, rank: int = 0) -> Plan:
+        """What :meth:`sample` draws on the host."""
+        return draw_plan(self.options, self.bank.materials, self._seed, step, batch, rank)
+
+    @torch.no_grad()
+    def film(self, plan: Plan) -> ClipBatch:
+        """The clips of a plan."""
+        options, key = self.options, plan.key
+        plan = moved(plan, self.device)
+        size, solids = plan.rooms.size, plan.rooms.solids
+        views = choose_cameras(plan.paths, size, solids, options.width, options.height)
+        solids = solids.without(too_near(solids, views))
+        scene = plan.scene
+        if scene is not None:
+            solids = scene.out_of_the_way(solids, views)
+            views = replace(views, sweep=scene.shake.sweep)
+        rooms = Rooms(size, solids, plan.rooms.surfaces, plan.rooms.lights)
+        if scene is None:
+            rendering = render(rooms, self.bank, views)
+            light = rendering.colour
+        else:
+            rendering = render_apart(rooms, self.bank, views, scene.ways)
+            light = scene.blurred(rendering, views)
+        images = develop(Draw(self.device, *key), plan.flaws, light)
+        return ClipBatch(
+            images, light, rendering.depth, rendering.normal, views.T_cw,
+            views.intrinsics, solids, rendering.solid, views.sweep, scene,
+        )  # fmt: skip
+
+
+@torch.no_grad()
+def draw_plan(
+    options: RoomOptions, materials: int, seed: int, step: int, batch: int, rank: int
+) -> Plan:
+    """A batch of rooms, lights, paths and flaws, given how many materials the bank has.
+
+    Drawn on the host: thousands of tiny steps, which a GPU would not do faster.
+    """
+    key = (seed, int(options.validation), step, rank)
+    draw = Draw(torch.device("cpu"), *key)
+    size = _draw_sizes(draw, batch)
+    layout = draw_layout(draw, size, options.least_density, options.most_density)
+    surfaces = draw_surfaces(draw, layout, options.textures, materials)
+    lights = draw_lights(draw, size, options.views, options.light_change)
+    paths = draw_paths(draw, options, size)
+    flaws = draw_flaws(draw, batch, options.views, options.clean, options.disturbance)
+    rooms = Rooms(size, layout.solids, surfaces, lights)
+    if options.scenes == only_scene("usual"):
+        return Plan(key, rooms, paths, flaws)
+    rooms, paths, scene = draw_scene(draw, options, rooms, paths, materials)
+    return Plan(key, rooms, paths, flaws, scene)
+
+
+def _draw_sizes(draw: Draw, rooms: int) -> Float[Tensor, "b 3"]:
+    least, most = torch.tensor(_LEAST), torch.tensor(_MOST)
+    return least + (most - least) * draw.uniform(0, 1, rooms, 3)

@@ -1,0 +1,66 @@
+"""How cameras move while they look: what a rolling shutter and the exposure make of it."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from geogs_synth.clips.kinds import SHAKEN, STREET
+from geogs_synth.draw import Draw
+
+_TURN = (0.15, 2.5)
+"""Degrees about each axis in the time in which all rows are read."""
+_WAY = (0.001, 0.02)
+"""Metres along each axis in this time, in rooms."""
+_DRIVE = (0.01, 0.06)
+"""The same along the optical axis on a street."""
+_OFTEN = 0.4
+"""Share of the clips of other kinds in which the camera moves, too."""
+
+
+@dataclass(frozen=True)
+class Shake:
+    """Motion of v cameras in each of b clips, in times that the reading of all rows takes."""
+
+    rate: Float[Tensor, "b v 6"]
+    """Rotation vector and way (metres), in the frame of the camera."""
+    rolling: Float[Tensor, "b"]
+    """1 where rows are read one after the other, 0 where all at once."""
+    exposure: Float[Tensor, "b v"]
+    """How long each row looks."""
+    objects: Float[Tensor, "b"]
+    """Share of what things move by from view to view that passes in this time."""
+
+    @property
+    def sweep(self) -> Float[Tensor, "b v 6"]:
+        """What the cameras do from their first row to their last."""
+        return self.rate * self.rolling[:, None, None]
+
+
+def draw_shake(draw: Draw, kind: Int[Tensor, "b"], views: int) -> Shake:
+    """Shaken clips, some of the other new kinds, none of the usual ones."""
+    b, n = len(kind), (len(kind), views)
+    shaken = (kind == SHAKEN) | ((kind > SHAKEN) & draw.chance(_OFTEN, b))
+    street = (kind == STREET)[:, None, None]
+
+    def vary(size: Tensor) -> Tensor:
+        """Alike in the views of a clip, but not the same."""
+        whole = 0.6 * draw.normal(1.0, b, 1, 3) + 0.8 * draw.normal(1.0, *n, 3)
+        return size[:, None, None] * whole
+
+    turn = vary(draw.log_uniform(*_TURN, b) * (math.pi / 180))
+    way = vary(draw.log_uniform(*_WAY, b))
+    ahead = draw.log_uniform(*_DRIVE, b)[:, None, None] * draw.uniform(0.8, 1.2, *n, 1)
+    ahead = torch.nn.functional.pad(ahead, (2, 0)) + 0.2 * way
+    # Who drives turns slowly.
+    turn = torch.where(street, 0.3 * turn, turn)
+    rate = torch.cat([turn, torch.where(street, ahead, way)], -1) * shaken[:, None, None]
+    long = draw.log_uniform(0.1, 1.0, b, 1) * draw.uniform(0.7, 1.3, *n)
+    return Shake(
+        rate=rate,
+        rolling=(shaken & draw.chance(0.8, b)).float(),
+        exposure=long * (shaken & draw.chance(0.8, b))[:, None],
+        objects=draw.log_uniform(0.02, 0.4, b),
+    )

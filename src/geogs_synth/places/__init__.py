@@ -1,0 +1,1 @@
+"""Rooms and streets, and what stands and moves in them."""

@@ -1,0 +1,65 @@
+"""Vehicles that move on the street: a van ahead and cars that come towards the camera."""
+
+import math
+
+import numpy as np
+
+from geogs.geometry.camera import Camera
+from geogs_synth.places.street import LANE, LENGTH, driven, heading, on_road, start_of_drive
+from geogs_synth.places.vehicles import VAN_HEIGHT, VAN_LENGTH, VAN_WIDTH, car, make_coachwork, van
+from geogs_synth.scene.bodies import Body, Path
+from geogs_synth.scene.scene import Scene, SceneBuilder
+
+_ONCOMING, _ONCOMING_SPEED = 3, 9.0
+_GAP_WAVE, _GAP_PERIOD = 0.08, 7.0
+_STREAM = 0x7AF
+
+
+def street_traffic(camera: Camera, share: float, seed: int = 0) -> list[Body]:
+    """A van ahead that covers about ``share`` of the image, and oncoming cars."""
+    rng = np.random.default_rng([seed, _STREAM])
+    covered = camera.fx * camera.fy * VAN_WIDTH * VAN_HEIGHT / (camera.width * camera.height)
+    gap = math.sqrt(covered / share) + VAN_LENGTH / 2
+    ahead = SceneBuilder(rng)
+    van(ahead, rng, make_coachwork(ahead, rng, 2))
+    bodies = [Body(_shape(ahead), _follows(gap, seed))]
+    for k in range(_ONCOMING):
+        build = SceneBuilder(rng)
+        car(build, rng, make_coachwork(build, rng, 2))
+        bodies.append(Body(_shape(build), _comes(k / _ONCOMING)))
+    return bodies
+
+
+def _shape(build: SceneBuilder) -> Scene:
+    return build.build((VAN_LENGTH, VAN_WIDTH, VAN_HEIGHT))
+
+
+def _follows(gap: float, seed: int) -> Path:
+    """Ahead of the camera in its lane, a little nearer and farther in turn."""
+
+    def path(times: np.ndarray) -> np.ndarray:
+        away = gap * (1 + _GAP_WAVE * np.sin(2 * np.pi * times / _GAP_PERIOD))
+        x = start_of_drive() + driven(times, seed) + away
+        return _placed(x, LANE, 0.0)
+
+    return path
+
+
+def _comes(part: float) -> Path:
+    """In the other lane, around and around; ``part`` of the street ahead of the first."""
+
+    def path(times: np.ndarray) -> np.ndarray:
+        return _placed((part * LENGTH - _ONCOMING_SPEED * times) % LENGTH, -LANE, np.pi)
+
+    return path
+
+
+def _placed(x: np.ndarray, left: float, turn: float) -> np.ndarray:
+    """Body to world on the road, heading along it but for ``turn``."""
+    T_wb = np.tile(np.eye(4), (len(x), 1, 1))
+    yaw = heading(x) + turn
+    T_wb[:, 0, 0] = T_wb[:, 1, 1] = np.cos(yaw)
+    T_wb[:, 1, 0], T_wb[:, 0, 1] = np.sin(yaw), -np.sin(yaw)
+    T_wb[:, :2, 3] = on_road(x, np.full(len(x), left))
+    T_wb[:, 2, 3] = 0.03
+    return T_wb

@@ -1,0 +1,128 @@
+"""People who cross the view of a camera, each a rigid figure."""
+
+import math
+
+import numpy as np
+from jaxtyping import Float64
+from scipy.interpolate import CubicSpline
+
+from geogs.geometry.camera import Camera
+from geogs_synth.scene.bodies import Body, Path
+from geogs_synth.scene.scene import Scene, SceneBuilder
+from geogs_synth.textures import patterns
+
+_HEIGHT = 1.72
+_WIDTH = 0.42
+"""Metres across that a figure covers on average over its height."""
+_PACE = 1.2
+"""Metres per second, past a camera that does not turn."""
+_GROUPS = 3
+_PAIR_FROM = 0.16
+"""Share of the image from which two walk side by side, so that they need not be too near."""
+_BOB, _STEP_RATE = 0.02, 1.8
+_KNOT_SECONDS = 0.5
+"""Walkers follow where the camera looks only as evened out over this time."""
+_AWAY = -100.0
+"""Height at which those wait who are not crossing: under the floor."""
+_STREAM = 0x9E0
+
+
+def crossing_walkers(
+    path: Path, seconds: float, camera: Camera, share: float, seed: int = 0
+) -> list[Body]:
+    """People who pass by before a camera, one group after the other, from either side.
+
+    While it passes, a group covers about ``share`` of the image: that sets its distance. They walk
+    around the camera, so that one that turns sees them, too.
+
+    Args:
+        path: of the camera.
+        seconds: for which they are needed.
+        camera: its intrinsics.
+        share: of the image, above 0 and at most 1/2.
+        seed: of their looks.
+    """
+    rng = np.random.default_rng([seed, _STREAM])
+    times = np.arange(-2 * _KNOT_SECONDS, seconds + 3 * _KNOT_SECONDS, _KNOT_SECONDS)
+    T_wc = path(times)
+    yaw = np.unwrap(np.arctan2(T_wc[:, 1, 2], T_wc[:, 0, 2]))
+    view = CubicSpline(times, np.column_stack([T_wc[:, :2, 3], yaw]))
+    abreast = 2 if share > _PAIR_FROM else 1
+    distance = _distance(T_wc, camera, share / abreast)
+    half_view = math.atan(camera.width / 2 / camera.fx)
+    reach = half_view + abreast * _WIDTH / distance
+    period = 2 * reach * distance / _PACE
+    return [
+        Body(
+            _figure(rng), _crossing(view, group, side * _WIDTH / distance, distance, reach, period)
+        )
+        for group in range(_GROUPS)
+        for side in (np.arange(abreast) - (abreast - 1) / 2)
+    ]
+
+
+def _distance(T_wc: Float64[np.ndarray, "n 4 4"], camera: Camera, share: float) -> float:
+    """Metres at which a figure on the floor covers a share of the image, by bisection."""
+    eye = float(T_wc[:, 2, 3].mean())
+    pitch = float(np.arcsin(T_wc[:, 2, 2]).mean())
+
+    def covered(distance: float) -> float:
+        ends = np.arctan2([_HEIGHT - eye, -eye], distance) - pitch
+        rows = np.clip(camera.cy - camera.fy * np.tan(ends), 0, camera.height)
+        width = min(camera.width, camera.fx * _WIDTH / distance)
+        return float((rows[1] - rows[0]) * width / (camera.width * camera.height))
+
+    near, far = 0.5, 30.0
+    for _ in range(40):
+        middle = math.sqrt(near * far)
+        near, far = (middle, far) if covered(middle) > share else (near, middle)
+    return near
+
+
+def _crossing(
+    view: CubicSpline, group: int, aside: float, distance: float, reach: float, period: float
+) -> Path:
+    """The way of one figure of a group; ``aside`` and ``reach`` in radians."""
+
+    def path(times: np.ndarray) -> np.ndarray:
+        turn = np.floor(times / period)
+        part = times / period - turn
+        x, y, yaw = view(times).T
+        sense = np.where(turn % 2 == 0, 1.0, -1.0)
+        bearing = yaw + sense * reach * (2 * part - 1) + aside
+        T_wb = np.tile(np.eye(4), (len(times), 1, 1))
+        # It faces the way it goes.
+        T_wb[:, 0, 0] = T_wb[:, 1, 1] = sense * np.cos(bearing)
+        T_wb[:, 1, 0], T_wb[:, 0, 1] = sense * np.sin(bearing), -sense * np.sin(bearing)
+        T_wb[:, 0, 3] = x + distance * np.cos(bearing)
+        T_wb[:, 1, 3] = y + distance * np.sin(bearing)
+        bob = _BOB * np.cos(2 * np.pi * _STEP_RATE * times)
+        T_wb[:, 2, 3] = np.where(turn % _GROUPS == group, bob, _AWAY)
+        return T_wb
+
+    return path
+
+
+def _figure(rng: np.random.Generator) -> Scene:
+    """A person who stands on the origin and faces along y."""
+    build = SceneBuilder(rng)
+
+    def cloth() -> int:
+        ground = patterns.random_colour(rng, (0.2, 0.8), (0.3, 0.9))
+        stripe = patterns.random_colour(rng, (0.1, 0.6), (0.3, 0.95))
+        return build.texture(patterns.fabric(rng, (256, 256), ground, stripe), 0.002)
+
+    coat, trousers = cloth(), cloth()
+    tone = float(rng.uniform(0.55, 1.0))
+    skin = build.texture(patterns.plaster(rng, (96, 192), (214 * tone, 168 * tone, 140 * tone)))
+    hair = build.texture(patterns.plaster(rng, (96, 192), (70 * tone, 52 * tone, 40 * tone)))
+    for side, forward in ((-1, 0.16), (1, -0.16)):
+        build.frustum((0.1 * side, forward / 2, 0.0), (0.06, 0.1), 0.86, trousers)
+        build.box((0.1 * side, forward / 2 + 0.05, 0.04), (0.1, 0.26, 0.08), hair)
+        build.frustum((0.25 * side, -forward / 2, 0.82), (0.045, 0.065), 0.62, coat)
+        build.ellipsoid((0.25 * side, -forward / 2, 0.78), (0.04, 0.05, 0.08), skin)
+    build.frustum((0, 0, 0.8), (0.19, 0.23), 0.66, coat)
+    build.frustum((0, 0, 1.44), (0.06, 0.055), 0.08, skin)
+    build.ellipsoid((0, 0, 1.6), (0.09, 0.11, 0.12), skin)
+    build.ellipsoid((0, -0.02, 1.64), (0.095, 0.11, 0.1), hair)
+    return build.build((1.0, 1.0, 2.0))

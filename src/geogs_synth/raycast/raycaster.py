@@ -1,0 +1,275 @@
+"""Renders a scene: exact depth, normals and solids at the pixel centres, smooth colour."""
+
+import copy
+import math
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Float32, Float64, Int64, UInt8
+
+from geogs.geometry.camera import Camera
+from geogs_synth.camera.lens import Lens
+from geogs_synth.raycast.placement import Placed
+from geogs_synth.raycast.scene_kernels import Lighting, Textures, cast_rows, shade_rows
+from geogs_synth.raycast.visibility_kernels import visibility_slices
+from geogs_synth.scene.bodies import Body
+from geogs_synth.scene.scene import Scene, SceneBuilder, Texture, joined
+
+_LEVELS = 8
+_VOXEL = 0.14
+_MAX_CELLS = 60_000
+"""Of the volume that holds the light; larger scenes have larger cells."""
+_AMBIENT_REACH = 0.7
+"""Metres over which solids darken the ambient light, in cells of the smallest size."""
+_SPHERE_SAMPLES = 24
+_SHADOW_MIN_HALF = 0.1
+"""Solids smaller than this in every direction cast no shadow, in cells of the smallest size; they
+cost as much as large ones."""
+_ROWS_PLACED = 8
+"""Rows of a rolling shutter between which solids move straight over the image."""
+_SKY_RADIUS = 1e5
+_SKY_EMISSION = 0.95
+
+
+@dataclass(frozen=True)
+class View:
+    """What a camera sees, exact at the pixel centres."""
+
+    image: UInt8[np.ndarray, "h w 3"]
+    """RGB, smoothed over the pixel."""
+    depth: Float32[np.ndarray, "h w"]
+    """z along the optical axis, metres; 0 where nothing is hit."""
+    normal: Float32[np.ndarray, "h w 3"]
+    """Unit, camera frame, facing the camera; zero where nothing is hit."""
+    solid: Int64[np.ndarray, "h w"]
+    """Index of the solid, -1 where nothing is hit; bodies come after the solids of the scene."""
+    shade: Float32[np.ndarray, "h w 3"]
+    """The image before rounding; its square is proportional to the light."""
+
+
+@dataclass(frozen=True)
+class _Traced:
+    """What the kernels fill in."""
+
+    depth: Float64[np.ndarray, "h w"]
+    solid: Int64[np.ndarray, "h w"]
+    face: Int64[np.ndarray, "h w"]
+    image: Float32[np.ndarray, "h w 3"]
+    normal: Float32[np.ndarray, "h w 3"]
+
+    @staticmethod
+    def empty(height: int, width: int) -> "_Traced":
+        shape = (height, width)
+        return _Traced(
+            np.full(shape, np.inf),
+            np.full(shape, -1, np.int64),
+            np.zeros(shape, np.int64),
+            np.zeros((*shape, 3), np.float32),
+            np.zeros((*shape, 3), np.float32),
+        )
+
+    @property
+    def hits(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Depth, solid and face."""
+        return self.depth, self.solid, self.face
+
+    def take(self, row: int, other: "_Traced", other_row: int) -> None:
+        """Copies a row of another."""
+        self.depth[row], self.solid[row] = other.depth[other_row], other.solid[other_row]
+        self.image[row], self.normal[row] = other.image[other_row], other.normal[other_row]
+
+
+class Raycaster:
+    """Renders one scene from any number of cameras; textures and lighting are prepared once.
+
+    Bodies move through it; they are lit as everything else, but cast no shadow.
+    """
+
+    def __init__(self, scene: Scene, threads: int = 2, bodies: Sequence[Body] = ()) -> None:
+        self.scene = scene
+        self._pool = ThreadPoolExecutor(threads)
+        self._threads = threads
+        self._lighting = self._compute_lighting()
+        self._use(bodies)
+
+    def with_bodies(self, bodies: Sequence[Body]) -> "Raycaster":
+        """The same scene with other bodies; what was prepared is shared."""
+        other = copy.copy(self)
+        other._use(bodies)
+        return other
+
+    def bodies(self) -> Iterator[tuple[int, Body]]:
+        """Each body with the index of its first solid in a view."""
+        first = len(self.scene)
+        for body in self._bodies:
+            yield first, body
+            first += len(body.shape)
+
+    def _use(self, bodies: Sequence[Body]) -> None:
+        self._bodies = tuple(bodies)
+        shapes = [body.shape for body in bodies]
+        self._sky: int | None = None
+        if self.scene.sky is not None:
+            self._sky = len(self.scene) + sum(map(len, shapes))
+            shapes.append(_dome(self.scene))
+        self._all = joined(self.scene, *shapes) if shapes else self.scene
+        self._textures = _pack_textures(self._all.textures)
+
+    def render(
+        self, camera: Camera | Lens, T_wc: Float64[np.ndarray, "4 4"], time: float = 0.0
+    ) -> View:
+        """What a camera with pose camera-to-world ``T_wc`` sees, all rows at once.
+
+        Depth, normal and solid are those of the ray through the pixel's centre; the colour is the
+        mean over the pixel. ``time`` in seconds places the bodies.
+        """
+        lens = camera if isinstance(camera, Lens) else Lens(camera)
+        placed = self._place(T_wc[None], np.array([time]))
+        solids, bounds = placed.solids(0), placed.bounds(lens)[0]
+        traced, (xs, ys) = _Traced.empty(lens.camera.height, lens.camera.width), lens.rays
+
+        def cast(first: int, last: int) -> None:
+            cast_rows(solids, bounds, xs, ys, first, last, *traced.hits)
+
+        def shade(first: int, last: int) -> None:
+            shade_rows(
+                solids, self._textures, self._lighting, T_wc, lens.pixel, xs, ys, first, last,
+                *traced.hits, traced.image, traced.normal,
+            )  # fmt: skip
+
+        self._in_bands(lens.camera.height, cast)
+        self._in_bands(lens.camera.height, shade)
+        return self._view(traced)
+
+    def render_rolling(
+        self,
+        camera: Camera | Lens,
+        T_wc: Float64[np.ndarray, "h 4 4"],
+        times: Float64[np.ndarray, "h"] | None = None,
+    ) -> View:
+        """What a camera sees whose row v is taken from the pose ``T_wc[v]`` at ``times[v]``.
+
+        Row v is that of :meth:`render` at this pose and time.
+        """
+        lens = camera if isinstance(camera, Lens) else Lens(camera)
+        height, width = lens.camera.height, lens.camera.width
+        times = np.zeros(height) if times is None else times
+        traced, (xs, ys) = _Traced.empty(height, width), lens.rays
+
+        def work(first: int, last: int) -> None:
+            placed = self._place(T_wc[first:last], times[first:last])
+            ends = placed.bounds(lens, np.array([0, last - first - 1]), margin=1.0)
+            # Over a few rows the corners of a solid move straight, between their ends.
+            bounds = np.concatenate([ends[..., :2].min(0), ends[..., 2:].max(0)], 1)
+            for row in range(first, last):
+                low, high = max(row - 1, 0), min(row + 2, height)
+                # The rows above and below as this row's pose sees them tell where edges are.
+                around = _Traced.empty(high - low, width)
+                near = bounds - [0, low, 0, low]
+                rays = xs[low:high], ys[low:high]
+                solids = placed.solids(row - first)
+                cast_rows(solids, near, *rays, 0, high - low, *around.hits)
+                shade_rows(
+                    solids, self._textures, self._lighting, T_wc[row], lens.pixel, *rays,
+                    row - low, row - low + 1, *around.hits, around.image, around.normal,
+                )  # fmt: skip
+                traced.take(row, around, row - low)
+
+        edges = [*range(0, height, _ROWS_PLACED), height]
+        list(self._pool.map(work, edges[:-1], edges[1:]))
+        return self._view(traced)
+
+    def _view(self, traced: "_Traced") -> View:
+        depth, solid = traced.depth, traced.solid
+        if self._sky is not None:
+            solid[solid == self._sky] = -1
+            traced.normal[solid < 0] = 0.0
+        depth[solid < 0] = 0.0
+        image = np.rint(traced.image).astype(np.uint8)
+        return View(image, depth.astype(np.float32), traced.normal, solid, traced.image)
+
+    def _in_bands(self, rows: int, work: Callable[[int, int], None]) -> None:
+        """Runs ``work(first, last)`` over bands of rows, several per thread to even the load."""
+        edges = np.linspace(0, rows, 4 * self._threads + 1).astype(int).tolist()
+        list(self._pool.map(work, edges[:-1], edges[1:]))
+
+    def _place(
+        self, T_wc: Float64[np.ndarray, "p 4 4"], times: Float64[np.ndarray, "p"]
+    ) -> "Placed":
+        """All solids as p cameras at p times see them."""
+        s = self._all
+        rotation, centre = s.rotation[None], s.centre[None]
+        if self._bodies:
+            rotation = np.repeat(rotation, len(times), 0)
+            centre = np.repeat(centre, len(times), 0)
+            for first, body in self.bodies():
+                T_wb, own = body.path(times), slice(first, first + len(body.shape))
+                rotation[:, own] = T_wb[:, None, :3, :3] @ body.shape.rotation
+                centre[:, own] = body.shape.centre @ T_wb[:, :3, :3].transpose(0, 2, 1)
+                centre[:, own] += T_wb[:, None, :3, 3]
+        return Placed(s, T_wc, rotation, centre)
+
+    def _compute_lighting(self) -> Lighting:
+        s = self.scene
+        coarser = max(1.0, float(np.cbrt(s.size.prod() / _MAX_CELLS)) / _VOXEL)
+        voxel, reach = coarser * _VOXEL, coarser * _AMBIENT_REACH
+        casts = (s.bounding_half.max(1) > coarser * _SHADOW_MIN_HALF) & (s.emission == 0)
+        lights = np.array([(*light.position, light.radius) for light in s.lights]).reshape(-1, 4)
+        colour = np.array([light.colour for light in s.lights]).reshape(-1, 3)
+        nx, ny, nz = np.ceil(s.size / voxel).astype(int)
+        volume = np.zeros((nz, ny, nx, 1 + len(lights)), np.float32)
+        radius = np.linalg.norm(s.bounding_half[casts], axis=1)
+        solids = s.kind[casts], s.half[casts], s.rotation[casts], s.centre[casts], radius
+        sphere = _fibonacci_sphere(_SPHERE_SAMPLES)
+
+        def fill(first: int, last: int) -> None:
+            visibility_slices(*solids, lights, sphere, reach, voxel, first, last, volume)
+
+        self._in_bands(int(nz), fill)
+        return Lighting(
+            volume=volume,
+            voxel=voxel,
+            position=lights[:, :3].copy(),
+            colour=colour,
+            above=np.array([0.30, 0.31, 0.33]),
+            below=np.array([0.24, 0.21, 0.18]),
+        )
+
+
+def _dome(scene: Scene) -> Scene:
+    """The sky as a shining ball around everything."""
+    assert scene.sky is not None
+    build = SceneBuilder(np.random.default_rng(0))
+    texture = build.texture(scene.sky.image)
+    radii = np.full(3, _SKY_RADIUS)
+    build.ellipsoid(scene.size / 2, radii, texture, emission=_SKY_EMISSION)
+    return build.build(scene.size)
+
+
+def _fibonacci_sphere(n: int) -> Float64[np.ndarray, "n 3"]:
+    """Evenly spread directions (Fibonacci lattice)."""
+    z = 1 - (2 * np.arange(n) + 1) / n
+    angle = np.arange(n) * math.pi * (3 - math.sqrt(5))
+    radius = np.sqrt(1 - z * z)
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], 1)
+
+
+def _pack_textures(textures: tuple[Texture, ...]) -> Textures:
+    """All textures and their pyramids (area averages) in one flat array."""
+    pieces: list[np.ndarray] = []
+    table = np.zeros((3, len(textures), _LEVELS), np.int64)
+    end = 0
+    for i, texture in enumerate(textures):
+        image = np.ascontiguousarray(texture.image)
+        for level in range(_LEVELS):
+            h, w = image.shape[:2]
+            table[:, i, level] = end, w, h
+            pieces.append(image.ravel())
+            end += image.size
+            half = (max(1, w // 2), max(1, h // 2))
+            image = cv2.resize(image, half, interpolation=cv2.INTER_AREA)
+    texel = np.array([t.metres_per_texel for t in textures])
+    return Textures(np.concatenate(pieces), table[0], table[1], table[2], texel)

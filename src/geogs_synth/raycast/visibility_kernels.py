@@ -1,0 +1,71 @@
+"""How much of the sky and of each light every cell of a room sees, compiled."""
+
+import numpy as np
+from numba import njit
+
+from geogs_synth.raycast.scene_kernels import hit
+
+_OPTIONS = {"cache": True, "nogil": True, "error_model": "numpy"}
+
+
+@njit(**_OPTIONS)
+def _blocked(kind, half, rotation, centre, radius, px, py, pz, dx, dy, dz, reach):
+    """Whether any solid lies within ``reach`` along the unit direction d from p."""
+    for i in range(len(kind)):
+        x, y, z = px - centre[i, 0], py - centre[i, 1], pz - centre[i, 2]
+        # Most solids are ruled out by their bounding sphere's distance from the segment.
+        along = min(max(-(x * dx + y * dy + z * dz), 0.0), reach)
+        sx, sy, sz = x + along * dx, y + along * dy, z + along * dz
+        if sx * sx + sy * sy + sz * sz > radius[i] * radius[i]:
+            continue
+        r = rotation[i]
+        t, _ = hit(
+            kind[i],
+            half[i],
+            r[0, 0] * x + r[1, 0] * y + r[2, 0] * z,
+            r[0, 1] * x + r[1, 1] * y + r[2, 1] * z,
+            r[0, 2] * x + r[1, 2] * y + r[2, 2] * z,
+            r[0, 0] * dx + r[1, 0] * dy + r[2, 0] * dz,
+            r[0, 1] * dx + r[1, 1] * dy + r[2, 1] * dz,
+            r[0, 2] * dx + r[1, 2] * dy + r[2, 2] * dz,
+        )
+        if t < reach:
+            return True
+    return False
+
+
+@njit(**_OPTIONS)
+def visibility_slices(
+    kind, half, rotation, centre, radius, lights, sphere, ambient_reach, voxel, first, last, volume
+):
+    """Fills slices [first, last) of ``volume`` (nz, ny, nx, 1 + lights).
+
+    Channel 0 is ambient openness: twice the share of directions free of solids within
+    ``ambient_reach``, at most 1, since a wall hides half of them. The others are the seen share of
+    each light, a ball (x, y, z, radius), sampled at the points ``sphere`` of the unit sphere.
+    """
+    samples = len(sphere)
+    for z in range(first, last):
+        for y in range(volume.shape[1]):
+            for x in range(volume.shape[2]):
+                px, py, pz = (x + 0.5) * voxel, (y + 0.5) * voxel, (z + 0.5) * voxel
+                free = 0
+                for s in range(samples):
+                    dx, dy, dz = sphere[s, 0], sphere[s, 1], sphere[s, 2]
+                    free += not _blocked(
+                        kind, half, rotation, centre, radius, px, py, pz, dx, dy, dz, ambient_reach
+                    )
+                volume[z, y, x, 0] = min(1.0, 2.0 * free / samples)
+                for i in range(len(lights)):
+                    free = 0
+                    # Every other direction is enough for a light and still spread evenly.
+                    for s in range(0, samples, 2):
+                        dx = lights[i, 0] + lights[i, 3] * sphere[s, 0] - px
+                        dy = lights[i, 1] + lights[i, 3] * sphere[s, 1] - py
+                        dz = lights[i, 2] + lights[i, 3] * sphere[s, 2] - pz
+                        reach = np.sqrt(dx * dx + dy * dy + dz * dz)
+                        free += not _blocked(
+                            kind, half, rotation, centre, radius, px, py, pz,
+                            dx / reach, dy / reach, dz / reach, reach,
+                        )  # fmt: skip
+                    volume[z, y, x, 1 + i] = 2.0 * free / samples

@@ -1,0 +1,1 @@
+"""What synthetic scenes are made of."""

@@ -1,0 +1,1 @@
+"""Sequences with their truth, written as a data set."""

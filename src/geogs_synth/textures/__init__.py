@@ -1,0 +1,1 @@
+"""Textures: drawn from random numbers, and photographs that come with scikit-image."""

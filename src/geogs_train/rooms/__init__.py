@@ -1,1 +1,0 @@
-"""Random rooms with exact geometry, made and rendered on the device while the network trains."""
