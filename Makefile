@@ -2,20 +2,22 @@
 # make quick    set up, lint, type-check, test what does not run the whole system: the inner loop
 # make test     set up, lint, type-check, test all but what takes long and seldom fails alone
 # make test-all set up, lint, type-check, test everything
+# make pytest   the tests of `make test` alone, by WORKERS (2) processes
 # make fuzz     set up, damage files and options at random, FUZZ (1000) times each
 # make format   set up, sort imports, mend what the linter can, format
-PYTHON ?= python3
-VENV   := .venv
-BIN    := $(VENV)/bin
-STAMP  := $(VENV)/.installed
-FUZZ   ?= 1000
-PIP    := $(BIN)/python -m pip install --quiet
+PYTHON  ?= python3
+VENV    := .venv
+BIN     := $(VENV)/bin
+STAMP   := $(VENV)/.installed
+FUZZ    ?= 1000
+WORKERS ?= 2
+PIP     := $(BIN)/python -m pip install --quiet
 # What is compiled is kept for the many processes that tests start, whatever the user's shell says.
-PYTEST := OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n 2 --dist loadgroup
-TORCH  := 2.13.0
+PYTEST  := OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n $(WORKERS) --dist loadgroup
+TORCH   := 2.13.0
 TORCH_CPU_INDEX := https://download.pytorch.org/whl/cpu
 
-.PHONY: demo quick test test-all fuzz lint kernels format setup clean
+.PHONY: demo quick test test-all pytest fuzz lint kernels format setup clean
 
 demo: $(STAMP)
 	$(BIN)/geogs demo -o out/demo
@@ -25,6 +27,9 @@ quick: lint
 
 test: $(STAMP)
 	$(MAKE) -j 2 lint kernels
+	$(MAKE) pytest
+
+pytest: $(STAMP)
 	$(PYTEST) -m 'not long'
 
 test-all: $(STAMP)

@@ -3,18 +3,13 @@
 Nothing heavy is imported before a sub-command is chosen, so that help appears at once.
 """
 
-import atexit
 import errno
-import logging
 import os
-import signal
 import sys
-import threading
 from collections.abc import Callable, Sequence
-from types import FrameType
 
+from geogs.cli import process
 from geogs.cli.command import all_commands, find_command
-from geogs.cli.streams import make_unbreakable
 from geogs.errors import GeogsError
 from geogs.version import __version__
 
@@ -32,14 +27,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     Returns:
         0 on success, 2 after an error of input, output or options, 130 after Ctrl-C.
     """
-    if argv is None:  # the process is ours
-        _hold_blas_to_one_thread()
-        make_unbreakable()
-        _take_ends_for_interrupts()
-    arguments = list(sys.argv[1:] if argv is None else argv)
-    code = _guarded(lambda: _dispatch(arguments))
-    if argv is None:
-        _leave(code)
+    if argv is not None:
+        return _guarded(lambda: _dispatch(list(argv)))
+    process.take_over()
+    code = _guarded(lambda: _dispatch(sys.argv[1:]))
+    process.leave(code)
     return code
 
 
@@ -52,7 +44,7 @@ def _dispatch(arguments: list[str]) -> int:
         print(f"geogs {__version__}")
         return 0
     command = find_command(name)
-    _show_warnings()
+    process.show_warnings()
     return command.run(arguments[1:])
 
 
@@ -138,48 +130,6 @@ def _has_memory_limit() -> bool:
     except ImportError:  # not on this system
         return False
     return resource.getrlimit(resource.RLIMIT_AS)[0] != resource.RLIM_INFINITY
-
-
-def _hold_blas_to_one_thread() -> None:
-    """Before NumPy is imported: our own threads use the cores.
-
-    Those of its BLAS spin while they wait for each other, for matrices that are small here: the
-    search for a readout took eight times as long on 64 cores as on 16, and on two a third longer
-    than with one thread.
-    """
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-
-
-def _leave(code: int) -> None:
-    """End the process where PyTorch was loaded, once what was registered for its end is done.
-
-    Taking modules and a GPU's memory apart, which the system takes back anyway, lasts a second.
-    """
-    if "torch" in sys.modules:
-        atexit._run_exitfuncs()
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(code)
-
-
-def _take_ends_for_interrupts() -> None:
-    """SIGTERM, by which systems and schedulers end programs, is taken as Ctrl-C."""
-
-    def interrupt(number: int, frame: FrameType | None) -> None:
-        raise KeyboardInterrupt
-
-    if threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGTERM, interrupt)
-
-
-def _show_warnings() -> None:
-    """Let the library's warnings appear on the standard error, one line each."""
-    handler = logging.StreamHandler()
-    handler.setFormatter(logging.Formatter("warning: %(message)s"))
-    handler.setLevel(logging.WARNING)
-    log = logging.getLogger("geogs")
-    log.handlers[:] = [handler]
-    log.propagate = False
 
 
 if __name__ == "__main__":
