@@ -26,10 +26,10 @@ from pathlib import Path
 
 import torch
 
+from geogs.application.calibrate import with_shutter_found
 from geogs.application.machine.device import compiled_kernels
 from geogs.application.results.result import Result
 from geogs.application.results.write import write_results
-from geogs.application.shutter import with_shutter_found
 from geogs.cli.options import parse_options
 from geogs.config import Config
 from geogs.io.sources.sniff import open_source

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from geogs.application.export.texture import TOLERANCE
+from geogs.application.export.export import TOLERANCE
 from geogs.application.results.saved_result import load_result
 from geogs.application.results.surfaces import fusion_views
 from geogs.evaluation.textured import psnr, render_textured

@@ -12,7 +12,8 @@ import torch
 from scipy.spatial import cKDTree
 
 from depth_scene import WORKING, make_scene, trace
-from geogs.application.results.remesh import RemeshSettings, mesh_settings, remesh
+from geogs.application.result_settings import RemeshSettings
+from geogs.application.results.remesh import mesh_settings, remesh
 from geogs.cli import main as cli
 from geogs.config import InputConfig
 from geogs.depth.classical import CpuDepthEngine

@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 import torch
 
-from geogs.application.results.remesh import RemeshSettings, mesh_settings, remesh
+from geogs.application.result_settings import RemeshSettings
+from geogs.application.results.remesh import mesh_settings, remesh
 from geogs.application.results.saved_result import load_result
 from geogs.cli import main as cli
 from geogs.evaluation.surface import read_surface

@@ -6,13 +6,13 @@ The paper saves the map before its final bundle adjustment and moves that one ma
 from dataclasses import replace
 from pathlib import Path
 
+from geogs.application.calibrate import with_shutter_found
 from geogs.application.checkpoints.run_state import RunCheckpoint, RunFacts, SavedRun
 from geogs.application.priors import open_prior
 from geogs.application.progress import RunProgress
 from geogs.application.results.result import Result
 from geogs.application.results.write import write_results
 from geogs.application.settings import RunSettings
-from geogs.application.shutter import with_shutter_found
 from geogs.errors import InputError
 from geogs.gpu.installation import require_device
 from geogs.io.sources.sniff import open_source

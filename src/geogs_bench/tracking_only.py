@@ -6,10 +6,10 @@ from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 
+from geogs.application.calibrate import with_shutter_found
 from geogs.application.results.summary import lost_spans
 from geogs.application.results.verdict import verdict
 from geogs.application.settings import RunSettings
-from geogs.application.shutter import with_shutter_found
 from geogs.errors import TrackingLost
 from geogs.gpu.installation import require_device
 from geogs.io.sources.sniff import open_source

@@ -95,7 +95,7 @@ def _is_begun(output: Path, settings: RunSettings) -> bool:
 
 def _wait_for_others(output: Path) -> None:
     """Until an attempt that is about to end has left the folder; OutputError if none does."""
-    from geogs.application.results.folder_lock import only_writer
+    from geogs.application.results.output_folder import only_writer
     from geogs.io.writers.atomic import prepare_output_folder
 
     prepare_output_folder(output)

@@ -5,7 +5,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from geogs.application.results.folder_lock import only_writer
+from geogs.application.results.output_folder import only_writer
 from geogs.config.setting import Basic, Positional
 from geogs.documents import read_json
 from geogs.errors import InputError

@@ -6,7 +6,7 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from hashlib import sha256
 
-from geogs.application.results.folder_lock import only_writer
+from geogs.application.results.output_folder import only_writer
 from geogs.application.settings import RunSettings
 from geogs.errors import InputError
 from geogs.io.writers.atomic import prepare_output_folder

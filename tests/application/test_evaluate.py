@@ -10,8 +10,8 @@ import torch
 from scipy.io import savemat
 
 from box_room import CAMERA, box, circle
-from geogs.application.eval_settings import EvalSettings
 from geogs.application.evaluate import evaluate, find_surface
+from geogs.application.result_settings import EvalSettings
 from geogs.cli.eval import main
 from geogs.errors import InputError
 from geogs.geometry.lie import so3_exp

@@ -12,10 +12,10 @@ import pytest
 
 import geogs
 from geogs.application.interrupt import Interruption
-from geogs.application.last_words import NOT_JUDGED, last_words
 from geogs.application.run import run
 from geogs.application.settings import RunSettings
 from geogs.cli import main as cli
+from geogs.cli.speech import NOT_JUDGED, closing_message
 from geogs.io.poses import read_tum_trajectory
 from geogs.slam import SlamStatus
 from posed_scene import vertices
@@ -132,7 +132,7 @@ def test_a_whole_run_is_one_call_that_can_be_followed_and_stopped(small_room, tm
     assert progress.seen == 22
     assert progress.said == ["Stopping early; keeping what there is. Press Ctrl-C again to quit."]
     assert written.result.verdict is None
-    assert last_words(written, 3.0)[0] == NOT_JUDGED
+    assert closing_message(written, 3.0)[0] == NOT_JUDGED
     assert written.output == tmp_path / "out"
     assert written.can_resume
     assert written.result.is_interrupted

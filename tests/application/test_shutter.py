@@ -6,12 +6,12 @@ from pathlib import Path
 
 import pytest
 
+from geogs.application.calibrate import with_shutter_found
 from geogs.application.checkpoints.run_state import RunFacts, SavedRun
 from geogs.application.interrupt import Interruption
 from geogs.application.progress import RunProgress
 from geogs.application.results.summary import source_summary
 from geogs.application.settings import RunSettings
-from geogs.application.shutter import with_shutter_found
 from geogs.config import Config, InputConfig
 from geogs.io.sources.sniff import open_source
 from geogs.io.writers.intrinsics import write_intrinsics

@@ -9,8 +9,8 @@ from rich.console import Console
 
 from geogs.application import terminal
 from geogs.application.forecast import StageForecast
+from geogs.application.settings import Verbosity
 from geogs.application.terminal import TerminalProgress
-from geogs.application.verbosity import Verbosity
 from geogs.errors import OutputError
 from geogs.slam import SlamStatus
 from geogs.tracking.tracker import TrackState

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 import pytest
 
-from geogs.application.eval_settings import EvalSettings
+from geogs.application.result_settings import EvalSettings
 from geogs.cli import reconstruct, run
 from geogs.cli.help import help_text
 from geogs.cli.options import parse_options

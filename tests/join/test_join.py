@@ -5,7 +5,8 @@ import json
 import numpy as np
 import pytest
 
-from geogs.application.results.remesh import RemeshSettings, remesh
+from geogs.application.result_settings import RemeshSettings
+from geogs.application.results.remesh import remesh
 from geogs.application.results.saved_result import load_result
 from geogs.config import Config
 from geogs.errors import InputError

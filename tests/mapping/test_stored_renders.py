@@ -10,8 +10,7 @@ import torch
 from depth_scene import make_scene
 from geogs.application.progress import RunProgress
 from geogs.application.results.report import write_report
-from geogs.application.results.splat_colours import splat_colours
-from geogs.application.results.surfaces import fusion_views, write_surface
+from geogs.application.results.surfaces import fusion_views, splat_colours, write_surface
 from geogs.config import MeshConfig
 from geogs.geometry.camera import Camera
 from geogs.mapping.rendered import SurfaceRules, rendered_keyframe

@@ -8,14 +8,13 @@ import numpy as np
 import torch
 
 import mutations
-from geogs.application.eval_settings import EvalSettings
 from geogs.application.evaluate import evaluate
 from geogs.application.export.image_sets import write_colmap_set, write_nerfstudio_set
+from geogs.application.result_settings import EvalSettings
 from geogs.application.results.output_folder import free_folder
 from geogs.application.results.remesh import mesh_settings
-from geogs.application.results.saved_model import shown_views, write_page_anew
+from geogs.application.results.report import shown_model, shown_views, write_page_anew
 from geogs.application.results.saved_result import load_result
-from geogs.application.results.shown_model import shown_model
 from geogs.io.poses import read_tum_trajectory
 from geogs.io.sources.posed.sniff import open_posed_source
 from geogs.io.writers.intrinsics import write_intrinsics

@@ -1,19 +1,22 @@
 """Errors of a result against the truth: trajectory and surface, as numbers, files and pictures."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from geogs.application.eval_settings import EvalSettings
 from geogs.application.evaluate_surface import (
     SurfaceComparison,
     compare_surface,
     photoconsistency,
 )
-from geogs.application.results.saved_model import model_beside_truth
+from geogs.application.result_settings import EvalSettings
+from geogs.application.results.report import shown_model, shown_views
+from geogs.application.results.saved_result import load_result
 from geogs.documents import read_json
 from geogs.errors import InputError
+from geogs.evaluation.model_view.records import Colouring, Legend, Model
 from geogs.evaluation.report import SAME_POSES_CM, Evaluation, write_report
 from geogs.evaluation.run_report import PICTURES, figures, run_figures, run_sections
 from geogs.evaluation.surface import read_surface
@@ -21,6 +24,7 @@ from geogs.evaluation.trajectory import Alignment, TrajectoryErrors, evaluate_tr
 from geogs.evaluation.truth import TrueScene, read_true_scene, scaled
 from geogs.io.poses import read_tum_trajectory
 from geogs.io.writers.intrinsics import read_camera
+from geogs.mesh.types import Mesh
 from geogs.threads import on_one_torch_thread
 
 _ICP_PROTOCOLS = ("samples", "vertex")
@@ -71,7 +75,7 @@ def evaluate(settings: EvalSettings) -> Evaluation:
     title = str(summary.get("source", settings.output.resolve().name))
     run = run_sections(summary) if summary else []
     judged = figures(summary, run_figures(summary)[:4]) if summary else None
-    model = model_beside_truth(settings.output, trajectory, surface) if settings.plots else None
+    model = _model_beside_truth(settings.output, trajectory, surface) if settings.plots else None
     write_report(
         evaluation, settings.output / "eval.json", page, pictures, run, title, judged, model
     )
@@ -161,3 +165,40 @@ def _draw(
 def _run_pictures(settings: EvalSettings) -> list[tuple[str, Path]]:
     """What the run drew without knowing the truth; titles and files."""
     return [(title, settings.output / "report" / name) for name, title in PICTURES.items()]
+
+
+def _model_beside_truth(
+    folder: Path, trajectory: TrajectoryErrors, surface: SurfaceComparison | None
+) -> Model | None:
+    """What the page of an evaluated result shows; none where no map was saved.
+
+    Args:
+        folder: of the result.
+        trajectory: its errors in metres, with the similarity that takes the map to the truth.
+        surface: what its mesh was compared with, in metres, if it was.
+    """
+    try:
+        result = load_result(folder)
+        views = shown_views(result)
+        mesh = result.mesh
+    except InputError:
+        return None
+    from geogs.evaluation.plots import ERROR_STOPS, error_colours
+
+    T = trajectory.T_ref_est
+
+    def coloured(mesh: Mesh) -> Sequence[Colouring]:
+        if surface is None:
+            return ()
+        places = mesh.vertices @ T[:3, :3].T + T[:3, 3]
+        limit = surface.scores.colour_limit_cm
+        errors = 100 * surface.distance
+        colours = error_colours(places, surface.points, errors, limit, surface.reach)
+        ends = ("0", f"{limit:g} cm and more")
+        legend = Legend("Distance to the truth", ends, ERROR_STOPS, "grey: not compared")
+        return [Colouring("Error", colours, legend)]
+
+    back = np.linalg.inv(T)
+    true_path = trajectory.truth[:, :3, 3] @ back[:3, :3].T + back[:3, 3]
+    disks = result.disks
+    return shown_model(result.trajectory, views, result.camera, mesh, disks, coloured, true_path)

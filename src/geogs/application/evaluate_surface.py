@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float
 
-from geogs.application.eval_settings import EvalSettings
+from geogs.application.result_settings import EvalSettings
 from geogs.errors import InputError
 from geogs.evaluation.culling import cull_mesh
 from geogs.evaluation.masks import Silhouette, cull_by_masks, mesh_silhouettes

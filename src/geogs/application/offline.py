@@ -13,8 +13,7 @@ from geogs.application.interrupt import Stop
 from geogs.application.machine.device import compiled_kernels, full_memory_in_a_sentence
 from geogs.application.photos import PlacedVideo, localiser, place_video
 from geogs.application.progress import RunProgress
-from geogs.application.results.folder_lock import only_writer
-from geogs.application.results.output_folder import free_folder
+from geogs.application.results.output_folder import free_folder, only_writer
 from geogs.application.results.result import Result, Written
 from geogs.application.results.write import write_results
 from geogs.application.settings import RunSettings

@@ -18,13 +18,11 @@ from geogs.application.output_forecast import OutputForecast
 from geogs.application.photos import open_photographs
 from geogs.application.posed_views import PosedViews, Report
 from geogs.application.progress import RunProgress
-from geogs.application.results.folder_lock import only_writer
-from geogs.application.results.output_folder import free_folder
+from geogs.application.results.output_folder import free_folder, only_writer
 from geogs.application.results.result import Result, Written
-from geogs.application.results.surfaces import write_depth_mesh
+from geogs.application.results.surfaces import Snapshots, write_depth_mesh
 from geogs.application.results.write import write_results
 from geogs.application.settings import ReconstructSettings
-from geogs.application.snapshots import Snapshots
 from geogs.config import ReconstructConfig
 from geogs.config.idle import idle_settings
 from geogs.documents import expanded

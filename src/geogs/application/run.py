@@ -9,7 +9,7 @@ from typing import Literal
 
 import torch
 
-from geogs.application.calibrate import self_calibrated
+from geogs.application.calibrate import self_calibrated, with_shutter_found
 from geogs.application.checkpoints.checkpoint import has_checkpoint
 from geogs.application.checkpoints.run_state import RunCheckpoint, RunFacts, SavedRun, frames_after
 from geogs.application.forecast import RunForecast
@@ -17,8 +17,7 @@ from geogs.application.interrupt import Stop
 from geogs.application.machine.device import REMEDY, compiled_kernels, full_memory_in_a_sentence
 from geogs.application.priors import open_prior
 from geogs.application.progress import RunProgress
-from geogs.application.results.folder_lock import only_writer
-from geogs.application.results.output_folder import free_folder
+from geogs.application.results.output_folder import free_folder, only_writer
 from geogs.application.results.result import Result, Written
 from geogs.application.results.saved_result import SavedResult, load_result
 from geogs.application.results.surfaces import write_depth_mesh, write_stage
@@ -26,7 +25,6 @@ from geogs.application.results.write import write_results
 from geogs.application.scale.apply import check_scale_source, make_metric
 from geogs.application.scale.source import scale_source
 from geogs.application.settings import RunSettings
-from geogs.application.shutter import with_shutter_found
 from geogs.application.viewer.observer import RunObserver
 from geogs.config import Config, InputConfig
 from geogs.config.idle import idle_settings

@@ -116,6 +116,18 @@ class ReconstructSettings(Settings):
     """Where to compute: auto (a GPU where there is one), cpu, cuda or cuda:1; see geogs doctor."""
 
 
+@dataclass(frozen=True)
+class Verbosity(Settings):
+    """What is said on the terminal, and in a file."""
+
+    verbose: Annotated[bool, Basic("-v")] = False
+    """Say how long each phase took, and what else there is to know."""
+    quiet: Annotated[bool, Basic("-q")] = False
+    """Say nothing but warnings and errors."""
+    log: Annotated[Path | None, Basic()] = None
+    """File to which everything is also written, with the time of day; added to if it exists."""
+
+
 def _absolute(path: Path | None) -> Path | None:
     return None if path is None else expanded(path).absolute()
 

@@ -9,13 +9,12 @@ import torch
 from jaxtyping import Bool, Float64
 from torch import Tensor
 
-from geogs.application.calibrate import self_calibrated
+from geogs.application.calibrate import self_calibrated, with_shutter_found
 from geogs.application.progress import RunProgress
 from geogs.application.results.keyframe_files import write_keyframes
 from geogs.application.results.saved_result import load_result
 from geogs.application.results.surfaces import surface_of
 from geogs.application.results.write import write_config
-from geogs.application.shutter import with_shutter_found
 from geogs.config import Config, InputConfig
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera

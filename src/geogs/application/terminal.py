@@ -14,7 +14,7 @@ from rich.progress import BarColumn, Progress, TextColumn
 from geogs.application.forecast import Forecast
 from geogs.application.machine.device import peak_memory
 from geogs.application.progress import RunProgress
-from geogs.application.verbosity import Verbosity
+from geogs.application.settings import Verbosity
 from geogs.errors import OutputError
 from geogs.evaluation.duration import duration
 

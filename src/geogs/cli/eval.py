@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from geogs.application.eval_settings import EvalSettings
+from geogs.application.result_settings import EvalSettings
 from geogs.cli.options import parse_options
 
 

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from geogs.application.export_settings import ExportSettings
+from geogs.application.result_settings import ExportSettings
 from geogs.cli.options import parse_options
 
 

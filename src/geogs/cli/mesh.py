@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from geogs.application.results.remesh import RemeshSettings, mesh_settings
+from geogs.application.result_settings import RemeshSettings
 from geogs.cli.options import Given, parse_options
 
 
@@ -34,5 +34,7 @@ def main(argv: Sequence[str]) -> int:
 
 def _defaults(given: Given) -> MeshOptions:
     """The settings that the result was made with."""
+    from geogs.application.results.remesh import mesh_settings
+
     folder = Path(given["result"])
     return MeshOptions(folder, mesh_settings(folder))

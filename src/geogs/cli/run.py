@@ -8,8 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
-from geogs.application.settings import RunSettings
-from geogs.application.verbosity import Verbosity
+from geogs.application.settings import RunSettings, Verbosity
 from geogs.application.viewer.settings import HERE, LiveSettings
 from geogs.cli.options import Given, parse_options, record
 from geogs.cli.speech import followed

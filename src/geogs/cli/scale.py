@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from geogs.application.results.rescale import RescaleSettings
+from geogs.application.result_settings import RescaleSettings
 from geogs.cli.options import parse_options
 
 

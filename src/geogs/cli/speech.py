@@ -5,7 +5,7 @@ import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from geogs.application.verbosity import Verbosity
+from geogs.application.settings import Verbosity
 from geogs.cli.options import record
 
 if TYPE_CHECKING:
@@ -13,10 +13,16 @@ if TYPE_CHECKING:
     from geogs.application.results.result import Written
 
 
+NOT_JUDGED = (
+    "How far this is to be relied on was not worked out: the adjustment of all keyframes is "
+    "missing."
+)
+"""Said of a run that was stopped."""
+
+
 def followed(options: Verbosity, work: Callable[["RunProgress"], "Written"]) -> "Written":
     """Do the work of a command, with a line of progress on the standard error, and say at its end
     on the standard output what came of it."""
-    from geogs.application.last_words import last_words
     from geogs.application.terminal import TerminalProgress
 
     begin = time.perf_counter()
@@ -28,8 +34,32 @@ def followed(options: Verbosity, work: Callable[["RunProgress"], "Written"]) -> 
     with TerminalProgress(record(Verbosity, options)) as progress:
         written = work(progress)
         progress.end_phase()
-        words = last_words(written, time.perf_counter() - begin)
+        words = closing_message(written, time.perf_counter() - begin)
         progress.note("\n".join(words))
     if not options.quiet:
         print("\n".join(words))
     return written
+
+
+def closing_message(written: "Written", seconds: float) -> list[str]:
+    """Lines for the user after a run or a reconstruction, which took so many seconds."""
+    from geogs.evaluation.duration import duration
+    from geogs.io.sources.posed.base import PosedSource
+
+    result, output = written.result, written.output
+    lines = []
+    if result.verdict is not None:
+        lines.append(result.verdict.sentence)
+    elif not isinstance(result.source, PosedSource):
+        lines.append(NOT_JUDGED)
+    mesh = result.mesh
+    parts = [f"{len(result.keyframes.timestamps)} keyframes", f"{len(result.map)} disks"]
+    parts += [] if mesh is None else [f"{len(mesh.faces)} triangles"]
+    lines.append(f"{result.scene.frames} frames in {duration(seconds)}: {', '.join(parts)}.")
+    there = ["trajectory.tum", "mesh.ply", "splats.ply", "map.safetensors", "summary.json"]
+    there = [name for name in there if (output / name).is_file()]
+    lines.append(f"Results are in {output}/: {', '.join(there)}")
+    page = output / "report" / "index.html"
+    if page.is_file():
+        lines.append(f"Open {page} in a browser.")
+    return lines

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from geogs.application.machine.device import device_summary, peak_memory
-from geogs.application.results.output_folder import remove_former
+from geogs.application.results.output_folder import remove_previous_output
 from geogs.application.results.report import write_report
 from geogs.application.results.saved_result import SavedResult, load_result
 from geogs.application.results.summary import lost_spans
@@ -223,7 +223,7 @@ def _joined(join: _Join, adjust: bool, say: Callable[[str], None], begin: float)
     with join.timed("moving and merging maps"):
         disks = join.disks(gauge, placements)
     say(f"{len(disks)} disks.")
-    remove_former(join.output)
+    remove_previous_output(join.output)
     trajectory = write_poses(join.output, placed_parts)
     write_map(join.output, placed_parts, disks, join.camera, config)
     with join.timed("mesh"):

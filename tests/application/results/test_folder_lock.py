@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-from geogs.application.results.folder_lock import LOCK, only_writer
+from geogs.application.results.output_folder import LOCK, only_writer
 from geogs.errors import OutputError
 
 OWNER = """

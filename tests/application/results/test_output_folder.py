@@ -2,7 +2,7 @@
 
 import json
 
-from geogs.application.results.output_folder import free_folder, remove_former
+from geogs.application.results.output_folder import free_folder, remove_previous_output
 
 OURS = [
     "summary.json", "mesh.ply", "eval.json", "map.safetensors", "keyframes/000012.jpg",
@@ -24,10 +24,10 @@ def fill(folder, names):
 
 def test_only_files_of_a_result_are_removed(tmp_path):
     fill(tmp_path, [*OURS, *THEIRS, "online/mesh.ply"])
-    remove_former(tmp_path, new_stages=["online"])
+    remove_previous_output(tmp_path, new_stages=["online"])
     assert files(tmp_path) == {*THEIRS, "online/mesh.ply"}
     assert not (tmp_path / "report").exists()
-    remove_former(tmp_path)
+    remove_previous_output(tmp_path)
     assert files(tmp_path) == set(THEIRS)
 
 
@@ -36,7 +36,7 @@ def test_links_are_not_followed(tmp_path):
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "keyframes").symlink_to(tmp_path / "elsewhere")
     (tmp_path / "out" / "mesh.ply").symlink_to(tmp_path / "elsewhere" / "000001.jpg")
-    remove_former(tmp_path / "out")
+    remove_previous_output(tmp_path / "out")
     assert files(tmp_path / "elsewhere") == {"000001.jpg"}
 
 

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 import geogs
-from geogs.application.results.remesh import RemeshSettings, mesh_settings, remesh
+from geogs.application.result_settings import RemeshSettings
+from geogs.application.results.remesh import mesh_settings, remesh
 from geogs.application.results.surfaces import fusion_views
 from geogs.cli.main import main
 from geogs.config import MeshConfig

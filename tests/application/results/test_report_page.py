@@ -6,7 +6,7 @@ import torch
 
 from box_room import box, circle
 from browser import open_tab
-from geogs.application.results.shown_model import ShownView, first_view, shown_model
+from geogs.application.results.report import ShownView, first_view, shown_model
 from geogs.evaluation.model_view.records import Colouring, Legend
 from geogs.evaluation.run_report import write_run_page
 from geogs.geometry.camera import Camera

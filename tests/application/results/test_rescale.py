@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 import geogs
-from geogs.application.results.remesh import RemeshSettings, remesh
-from geogs.application.results.rescale import RescaleSettings, rescale
+from geogs.application.result_settings import RemeshSettings, RescaleSettings
+from geogs.application.results.remesh import remesh
+from geogs.application.results.rescale import rescale
 from geogs.cli.main import main
 from geogs.config import MeshConfig
 from geogs.errors import InputError

@@ -9,11 +9,9 @@ from geogs.application.export.image_sets import (
     write_nerfstudio_set,
 )
 from geogs.application.export.seen_points import cloud
-from geogs.application.export.texture import require_images, textured
-from geogs.application.export_settings import ExportSettings, Format
+from geogs.application.result_settings import ExportSettings, Format
 from geogs.application.results.saved_result import SavedResult, load_result
-from geogs.application.results.splat_colours import splat_colours
-from geogs.application.results.surfaces import fusion_views
+from geogs.application.results.surfaces import fusion_views, splat_colours
 from geogs.errors import InputError
 from geogs.gpu.installation import require_device
 from geogs.io.writers.exports.cloud import write_las
@@ -22,13 +20,15 @@ from geogs.io.writers.exports.mesh import write_glb, write_obj, write_textured_g
 from geogs.io.writers.exports.poses import write_euroc, write_kitti
 from geogs.io.writers.ply import write_points, write_splats
 from geogs.io.writers.tum import write_tum_trajectory
-from geogs.mesh.types import DepthMapView, Mesh
+from geogs.mesh.texture.textured import TexturedMesh, texture_mesh
+from geogs.mesh.types import DepthMapView, Mesh, median_edge
 from geogs.threads import on_one_torch_thread
 
 Write = Callable[[SavedResult, ExportSettings, Path], Path]
 """Writes to a place, or to a file of its own name in it if that is a folder; what was written."""
 
-
+TOLERANCE = 2.0
+"""Median edges of the mesh that a face may lie off a depth map that shows it."""
 _SUFFIXES = frozenset({".csv", ".glb", ".las", ".laz", ".npz", ".obj", ".ply", ".tum", ".txt"})
 """Of files; a folder is not named so."""
 
@@ -45,6 +45,18 @@ def export(settings: ExportSettings) -> Path:
     result = load_result(settings.result, require_device(settings.device))
     place = settings.output or result.folder / "export" / settings.to
     return _WRITERS[settings.to](result, settings, place)
+
+
+def textured(result: SavedResult, mesh: Mesh, limit: int = 4096) -> TexturedMesh:
+    """The mesh of a result with the images of its keyframes put together on it.
+
+    ``limit`` is the longest side of the texture, pixels.
+
+    Raises:
+        InputError: the result has no keyframe images, or they show nothing of the mesh.
+    """
+    result.require_images()
+    return texture_mesh(mesh, fusion_views(result.keyframes), TOLERANCE * median_edge(mesh), limit)
 
 
 def _file(place: Path, name: str, *suffixes: str) -> Path:
@@ -143,7 +155,7 @@ def _mesh(result: SavedResult) -> Mesh:
 
 
 def _views(result: SavedResult) -> Sequence[DepthMapView]:
-    require_images(result)
+    result.require_images()
     return fusion_views(result.keyframes)
 
 

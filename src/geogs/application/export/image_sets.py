@@ -101,8 +101,7 @@ def write_map_set(folder: Path, result: SavedResult, kind: Literal["depth", "nor
 def _write_images(folder: Path, result: SavedResult) -> list[PosedImage]:
     """Copy the images as they are kept; what they are called, and where they were taken."""
     views = result.views
-    if not views.has_images:
-        raise InputError("The result was written without keyframe images, which this needs.")
+    result.require_images()
     images = []
     for id, T_cw in zip(views.keyframe_id.tolist(), views.T_cw, strict=True):
         kept = image_path(result.folder, id)

@@ -1,14 +1,15 @@
-"""What an earlier run left in a folder: where it may be replaced, and what goes with it."""
+"""The folder of a result: which is free, who may write there, what of a previous output goes."""
 
+import fcntl
+import os
 import re
-from collections.abc import Collection
-from contextlib import suppress
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager, suppress
 from itertools import count
 from pathlib import Path
 
-from geogs.application.checkpoints.checkpoint import has_checkpoint
 from geogs.documents import read_json
-from geogs.errors import InputError
+from geogs.errors import InputError, OutputError
 
 _FILES = (
     "summary.json", "eval.json", "trajectory.tum", "keyframes.tum", "trajectory_uncertainty.csv",
@@ -20,18 +21,61 @@ _STAGES = ("online", "adjusted")
 _OF_A_STAGE = ("trajectory.tum", "keyframes.tum", "mesh.ply")
 _KEYFRAME = re.compile(r"\d{6,}\.(jpg|mask\.png)|rows\.safetensors")
 _REPORT = re.compile(r"\w+\.(png|html|css|js)")
+LOCK = ".geogs.lock"
+"""Name of the file that is locked."""
 
 
-def remove_former(folder: Path, new_stages: Collection[str] = ()) -> None:
-    """Delete the files of an earlier result, so that none stays beside those of a new one.
+@contextmanager
+def only_writer(folder: Path) -> Iterator[None]:
+    """Inside, nobody else who asks likewise writes into a folder, where that can have locks.
+
+    Raises:
+        OutputError: another process writes there.
+    """
+    path = folder / LOCK
+    try:
+        file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o666)
+    except OSError:
+        yield
+        return
+    try:
+        if not _is_locked(file, path):
+            raise OutputError(
+                f"Another run is writing into {folder}; wait for it, or give another folder (-o)."
+            )
+        try:
+            yield
+        finally:
+            with suppress(OSError):
+                path.unlink()
+    finally:
+        os.close(file)
+
+
+def _is_locked(file: int, path: Path) -> bool:
+    """Whether the file is ours now, and still the one of that name."""
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:  # a file system without locks
+        return True
+    try:
+        return os.path.samestat(os.fstat(file), os.stat(path))
+    except FileNotFoundError:
+        return False
+
+
+def remove_previous_output(folder: Path, new_stages: Collection[str] = ()) -> None:
+    """Delete the files of a previous output, so that none stays beside those of a new one.
 
     Only files of names that geogs gives are touched; exports and what others put there stay, and
     the folders of stages that are of the new result already.
     """
-    former = [
+    stages = [
         f"{stage}/{name}" for stage in _STAGES for name in _OF_A_STAGE if stage not in new_stages
     ]
-    for name in (*_FILES, *former):
+    for name in (*_FILES, *stages):
         _delete(folder / name)
     for inner, names in (("keyframes", _KEYFRAME), ("report", _REPORT)):
         place = folder / inner
@@ -59,6 +103,8 @@ def free_folder(wanted: Path, fingerprint: str) -> Path:
 def _is_of_another(folder: Path, fingerprint: str) -> bool:
     if not folder.is_dir():
         return False
+    from geogs.application.checkpoints.checkpoint import has_checkpoint
+
     try:
         summary = read_json(folder / "summary.json")
     except InputError:

@@ -1,30 +1,20 @@
 """The mesh of a result, made anew from its folder without running again."""
 
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Any
 
+from geogs.application.progress import RunProgress
+from geogs.application.result_settings import RemeshSettings
+from geogs.application.results.report import write_page_anew
+from geogs.application.results.saved_result import load_result
+from geogs.application.results.surfaces import fusion_views
 from geogs.config import MeshConfig
-from geogs.config.setting import Basic, Positional, Settings
 from geogs.documents import UNUSABLE, read_yaml
 from geogs.errors import InputError
-
-if TYPE_CHECKING:
-    from geogs.application.progress import RunProgress
-
-
-@dataclass(frozen=True)
-class RemeshSettings(Settings):
-    """All that the making of another mesh is told."""
-
-    result: Annotated[Path, Positional()]
-    """Folder of a result, as geogs run and geogs reconstruct write it."""
-    mesh: MeshConfig = field(default_factory=MeshConfig)
-    """How the surface is made; what is not given is as the result was made with."""
-    output: Annotated[Path | None, Basic("-o")] = None
-    """File of the mesh, PLY; mesh.ply in the folder of the result if none is given."""
-    device: str = "auto"
-    """Where to compute: auto (a GPU where there is one), cpu, cuda or cuda:1."""
+from geogs.gpu.installation import require_device
+from geogs.io.writers.ply import write_mesh
+from geogs.mesh.extract import extract_mesh
 
 
 def mesh_settings(folder: Path) -> MeshConfig:
@@ -44,7 +34,7 @@ def mesh_settings(folder: Path) -> MeshConfig:
     return replace(MeshConfig(), **known)
 
 
-def remesh(settings: RemeshSettings, progress: "RunProgress | None" = None) -> Path:
+def remesh(settings: RemeshSettings, progress: RunProgress | None = None) -> Path:
     """Render the keyframes of a result, fuse their depths and write the mesh; the file's path.
 
     Where that is the mesh of the result, its page is made anew, too, without what an evaluation
@@ -58,14 +48,6 @@ def remesh(settings: RemeshSettings, progress: "RunProgress | None" = None) -> P
         OutputError: the file cannot be written.
         DeviceError: the device cannot be used.
     """
-    from geogs.application.progress import RunProgress
-    from geogs.application.results.saved_model import write_page_anew
-    from geogs.application.results.saved_result import load_result
-    from geogs.application.results.surfaces import fusion_views
-    from geogs.gpu.installation import require_device
-    from geogs.io.writers.ply import write_mesh
-    from geogs.mesh.extract import extract_mesh
-
     follow = progress or RunProgress()
     path = settings.output or settings.result / "mesh.ply"
     if path.suffix.lower() != ".ply":

@@ -1,15 +1,45 @@
-"""``report/``: a page with what needs no ground truth."""
+"""``report/``: the page of a result, with a model that turns; needs no ground truth."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
 
-from geogs.application.results.shown_model import ShownView, shown_model
+from geogs.application.results.saved_result import SavedResult, load_result
+from geogs.evaluation.model_view.records import (
+    Colouring,
+    DiskModel,
+    KeyframeModel,
+    Lens,
+    Model,
+    PathModel,
+    SurfaceModel,
+)
+from geogs.evaluation.shading import level_axes, look_at_one_place
+from geogs.geometry.camera import Camera
+from geogs.mesh.decimate import with_at_most
 from geogs.mesh.types import Mesh
 from geogs.types import MapSnapshot, RenderedKeyframe, Trajectory
+
+MOST_FACES, MOST_DISKS, MOST_IMAGES = 400_000, 100_000, 240
+"""Of a page."""
+IMAGE_BYTES = 1_800_000
+"""Of all images of a page together, about."""
+_BYTES_A_PIXEL = 0.2
+_LONGEST_EDGE, _SHORTEST_EDGE = 480, 128
+_QUALITY = 75
+
+
+@dataclass(frozen=True)
+class ShownView:
+    """A keyframe of the page, whose image is read when it is needed."""
+
+    timestamp: float
+    T_wc: Float[np.ndarray, "4 4"]
+    image: Callable[[], UInt8[np.ndarray, "h w 3"] | None]
 
 
 def write_report(
@@ -41,12 +71,37 @@ def write_report(
         )
     model = None
     if renders:
-        keyframes, camera = shown_views(renders), renders[0].camera
-        model = shown_model(trajectory, keyframes, camera, mesh, disks)
+        model = shown_model(trajectory, _rendered_views(renders), renders[0].camera, mesh, disks)
     write_run_page(folder, summary, model)
 
 
-def shown_views(renders: Sequence[RenderedKeyframe]) -> list[ShownView]:
+def write_page_anew(folder: Path) -> None:
+    """The page of a result whose mesh is another now; where it has none, nothing.
+
+    Raises:
+        OutputError: it cannot be written.
+    """
+    from geogs.evaluation.run_report import write_run_page
+
+    if not (folder / "summary.json").is_file() or not (folder / "report").is_dir():
+        return
+    result = load_result(folder)
+    mesh, disks = result.mesh, result.disks
+    faces = 0 if mesh is None else len(mesh.faces)
+    model = shown_model(result.trajectory, shown_views(result), result.camera, mesh, disks)
+    write_run_page(folder / "report", {**result.summary, "mesh_faces": faces}, model)
+
+
+def shown_views(result: SavedResult) -> list[ShownView]:
+    """The keyframes of a saved result, whose images are read when they are shown."""
+    views = result.views
+    return [
+        ShownView(float(time), np.linalg.inv(T_cw), partial(result.image, number))
+        for number, (time, T_cw) in enumerate(zip(views.timestamp, views.T_cw, strict=True))
+    ]
+
+
+def _rendered_views(renders: Sequence[RenderedKeyframe]) -> list[ShownView]:
     """The keyframes of the page; those of a long video stay where they are until they are shown."""
 
     def image(number: int) -> UInt8[np.ndarray, "h w 3"] | None:
@@ -56,3 +111,109 @@ def shown_views(renders: Sequence[RenderedKeyframe]) -> list[ShownView]:
         ShownView(r.timestamp, np.linalg.inv(r.T_cw.cpu().numpy()), partial(image, i))
         for i, r in enumerate(renders)
     ]
+
+
+def shown_model(
+    trajectory: Trajectory,
+    views: Sequence[ShownView],
+    camera: Camera,
+    mesh: Mesh | None,
+    disks: MapSnapshot | None,
+    more_colourings: Callable[[Mesh], Sequence[Colouring]] = lambda mesh: (),
+    true_path: Float[np.ndarray, "n 3"] | None = None,
+) -> Model:
+    """What the page of a result shows.
+
+    Args:
+        trajectory: of all frames.
+        views: the keyframes.
+        camera: of their images.
+        mesh: the surface, if there is one.
+        disks: of the map, if they are shown.
+        more_colourings: of the surface as it is shown, besides the colours of the images.
+        true_path: places of the true camera, in the frame of the map.
+    """
+    notes = []
+    surface = None
+    if mesh is not None and len(mesh.faces):
+        shown = with_at_most(mesh, MOST_FACES)
+        if shown is not mesh:
+            notes.append(f"Shown with {len(shown.faces):,} of {len(mesh.faces):,} triangles.")
+        own = [] if shown.colours is None else [Colouring("Colour", shown.colours)]
+        surface = SurfaceModel(shown.vertices, shown.faces, [*own, *more_colourings(shown)])
+    disk_model = None
+    if disks is not None and len(disks):
+        disk_model = _disks(disks)
+        if len(disk_model.position) < len(disks):
+            notes.append(f"The {MOST_DISKS:,} largest of {len(disks):,} disks are shown.")
+    paths = [PathModel("Path", trajectory.T_wc[:, :3, 3], trajectory.states)]
+    if true_path is not None:
+        paths.append(PathModel("True path", true_path))
+    points = trajectory.T_wc[:, :3, 3]
+    if surface is not None:
+        points = np.concatenate([surface.vertices, points])
+    elif disk_model is not None:
+        points = np.concatenate([disk_model.position, points])
+    posed = trajectory.T_wc[trajectory.tracked]
+    posed = posed if len(posed) else trajectory.T_wc
+    axes, eye, target = first_view(points, posed)
+    lens = Lens(camera.width / 2 / camera.fx, camera.height / 2 / camera.fy)
+    return Model(
+        axes, eye, target, lens, surface, paths, _keyframes(views, camera), disk_model, notes
+    )
+
+
+def first_view(
+    points: Float[np.ndarray, "n 3"], T_wc: Float[np.ndarray, "k 4 4"]
+) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+    """Level axes, and from where to look at what: an object from the side of the cameras, a place
+    from above, all of it (but the farthest half percent of the points) in the picture."""
+    axes = level_axes(T_wc)
+    local = points.astype(np.float64) @ axes.T
+    low, high = np.quantile(local, [0.005, 0.995], axis=0)
+    middle, radius = (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 1e-6)
+    direction = np.array([-0.45, -0.75, 0.85])
+    if look_at_one_place(T_wc):
+        side = axes @ T_wc[0, :3, 3] - middle
+        direction = np.array([*side[:2], max(side[2], 0.35 * np.linalg.norm(side[:2]))])
+    direction /= max(np.linalg.norm(direction), 1e-12)
+    return axes, axes.T @ (middle + 1.95 * radius * direction), axes.T @ middle
+
+
+def _disks(disks: MapSnapshot) -> DiskModel:
+    position, quaternion, scale = (
+        part.cpu().numpy() for part in (disks.position, disks.quaternion, disks.scale)
+    )
+    kept = np.arange(len(position))
+    if len(kept) > MOST_DISKS:
+        kept = np.sort(np.argsort(-scale.prod(1), kind="stable")[:MOST_DISKS])
+    return DiskModel(position[kept], quaternion[kept], scale[kept])
+
+
+def _keyframes(views: Sequence[ShownView], camera: Camera) -> list[KeyframeModel]:
+    """All keyframes; of many only some with images, and the more the smaller these."""
+    count = min(len(views), MOST_IMAGES)
+    with_image = set(np.linspace(0, len(views) - 1, count).round().astype(int).tolist())
+    pixels = IMAGE_BYTES / max(count, 1) / _BYTES_A_PIXEL
+    edge = int(
+        (pixels * max(camera.width, camera.height) / min(camera.width, camera.height)) ** 0.5
+    )
+    edge = min(max(edge, _SHORTEST_EDGE), _LONGEST_EDGE)
+    start = views[0].timestamp if views else 0.0
+    result = []
+    for number, view in enumerate(views):
+        image = view.image() if number in with_image else None
+        name = f"keyframe {number + 1} of {len(views)}, {view.timestamp - start:.1f} s"
+        result.append(KeyframeModel(name, view.T_wc, None if image is None else _jpeg(image, edge)))
+    return result
+
+
+def _jpeg(image: UInt8[np.ndarray, "h w 3"], edge: int) -> bytes:
+    import cv2
+
+    height, width = image.shape[:2]
+    shrink = min(1.0, edge / max(height, width))
+    size = (max(round(width * shrink), 1), max(round(height * shrink), 1))
+    small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    _, stream = cv2.imencode(".jpg", small[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
+    return stream.tobytes()

@@ -1,39 +1,39 @@
 """A result in metres by what is known of it afterwards, without running again."""
 
 import json
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Any
 
+import numpy as np
+import torch
+
+from geogs.application.result_settings import RescaleSettings
+from geogs.application.results.report import write_page_anew
+from geogs.application.results.saved_result import SavedResult, load_result
+from geogs.application.scale.find import find_scale
+from geogs.application.scale.scene import FoundScale, MeasurableScene, SeenKeyframe
 from geogs.application.scale.source import HOW, SensorScale, scale_source
-from geogs.config.setting import Basic, Positional, Settings
 from geogs.errors import InputError
-
-if TYPE_CHECKING:
-    import numpy as np
-
-    from geogs.application.results.saved_result import SavedResult
-    from geogs.application.scale.scene import FoundScale, MeasurableScene
-    from geogs.types import MapSnapshot
+from geogs.evaluation.truth import scaled
+from geogs.gpu.installation import require_device
+from geogs.io.ply import read_ply
+from geogs.io.poses import read_tum_trajectory
+from geogs.io.sources.calibration_files import read_calibration
+from geogs.io.writers.atomic import write_text
+from geogs.io.writers.map_views import save_map_with_views
+from geogs.io.writers.native import load_map_file
+from geogs.io.writers.ply import SH_DEGREE_0, write_mesh, write_splats
+from geogs.io.writers.tum import write_tum_trajectory
+from geogs.io.writers.uncertainty import HEADER, moved_rows
+from geogs.mesh.files import read_mesh
+from geogs.on_demand import OnDemand
+from geogs.types import MapSnapshot
 
 _STAGES = ("", "online/", "adjusted/")
 
 
-@dataclass(frozen=True)
-class RescaleSettings(Settings):
-    """All that the scaling of a result is told."""
-
-    result: Annotated[Path, Positional()]
-    """Folder of a result, as geogs run writes it."""
-    scale_from: Annotated[str, Basic("--from")] = ""
-    """What is known in metres: FRAME:u1,v1,u2,v2=1.25m (pixels of an image as it came; several with
-    semicolons), aruco:DICT_5X5_50:0.12 (tags whose side is so long), or height:1.6 (of the camera
-    over the ground)."""
-    device: str = "auto"
-    """Where to compute: auto (a GPU where there is one), cpu, cuda or cuda:1."""
-
-
-def rescale(settings: RescaleSettings) -> "FoundScale":
+def rescale(settings: RescaleSettings) -> FoundScale:
     """Find metres to the map unit, and write trajectories, map, meshes and summary in metres.
 
     The summary goes first and comes last, so that no half of a result has one. Exports that were
@@ -44,13 +44,6 @@ def rescale(settings: RescaleSettings) -> "FoundScale":
         OutputError: a file cannot be written.
         DeviceError: the device cannot be used.
     """
-    from geogs.application.results.saved_model import write_page_anew
-    from geogs.application.results.saved_result import load_result
-    from geogs.application.scale.find import find_scale
-    from geogs.gpu.installation import require_device
-    from geogs.io.sources.calibration_files import read_calibration
-    from geogs.io.writers.atomic import write_text
-
     source = scale_source(settings.scale_from)
     if source is None or isinstance(source, SensorScale):
         raise InputError(f"Nothing is known of the scale; {HOW.replace(' or sensor', '')}.")
@@ -63,24 +56,16 @@ def rescale(settings: RescaleSettings) -> "FoundScale":
     found = find_scale(_measurable(result), source, calibration)
     (folder / "summary.json").unlink()
     _scale_files(result, found.factor)
-    write_text(folder / "summary.json", json.dumps(_told(summary, found), indent=2))
+    write_text(folder / "summary.json", json.dumps(_scaled_summary(summary, found), indent=2))
     write_page_anew(folder)
     return found
 
 
-def _measurable(result: "SavedResult") -> "MeasurableScene":
-    import numpy as np
-    import torch
-
-    from geogs.application.scale.scene import MeasurableScene, SeenKeyframe
-    from geogs.io.writers.keyframe_images import image_path, read_image
-    from geogs.on_demand import OnDemand
-
+def _measurable(result: SavedResult) -> MeasurableScene:
     views = result.views
 
     def seen(number: int) -> SeenKeyframe:
-        path = image_path(result.folder, int(views.keyframe_id[number]))
-        return SeenKeyframe(views.T_cw[number], read_image(path) if views.has_images else None)
+        return SeenKeyframe(views.T_cw[number], result.image(number))
 
     def surface(T_cw: np.ndarray) -> np.ndarray:
         return result.render(torch.from_numpy(T_cw)).depth.double().cpu().numpy()
@@ -91,10 +76,8 @@ def _measurable(result: "SavedResult") -> "MeasurableScene":
     )
 
 
-def _scale_files(result: "SavedResult", factor: float) -> None:
+def _scale_files(result: SavedResult, factor: float) -> None:
     """All files of a result that hold lengths, multiplied."""
-    from geogs.io.writers.ply import write_splats
-
     folder, disks = result.folder, result.disks
     world = replace(disks, position=factor * disks.position, scale=factor * disks.scale)
     colours = _splat_colours(folder / "splats.ply", len(disks))
@@ -109,11 +92,8 @@ def _scale_files(result: "SavedResult", factor: float) -> None:
         write_splats(folder / "splats.ply", world, colours)
 
 
-def _scale_map(result: "SavedResult", world: "MapSnapshot", factor: float) -> None:
+def _scale_map(result: SavedResult, world: MapSnapshot, factor: float) -> None:
     """``map.safetensors`` with the disks as they are in metres."""
-    from geogs.io.writers.map_views import save_map_with_views
-    from geogs.io.writers.native import load_map_file
-
     path, views = result.folder / "map.safetensors", result.views
     said = {k: v for k, v in load_map_file(path).metadata.items() if k != "views"}
     T_cw = views.T_cw.copy()
@@ -130,14 +110,9 @@ def _scale_map(result: "SavedResult", world: "MapSnapshot", factor: float) -> No
     save_map_with_views(path, world, moved, said)
 
 
-def _splat_colours(path: Path, count: int) -> "np.ndarray | None":
+def _splat_colours(path: Path, count: int) -> np.ndarray | None:
     """The colours of the splats; none where there are none. Raises InputError if they are not as
     many as the disks, before anything has been changed."""
-    import numpy as np
-
-    from geogs.io.ply import read_ply
-    from geogs.io.writers.ply import SH_DEGREE_0
-
     if not path.is_file():
         return None
     columns = read_ply(path)["vertex"].columns
@@ -148,32 +123,22 @@ def _splat_colours(path: Path, count: int) -> "np.ndarray | None":
 
 
 def _scale_poses(path: Path, factor: float) -> None:
-    from geogs.evaluation.truth import scaled
-    from geogs.io.poses import read_tum_trajectory
-    from geogs.io.writers.tum import write_tum_trajectory
-
     if path.is_file():
         write_tum_trajectory(path, scaled(read_tum_trajectory(path), factor))
 
 
 def _scale_mesh(path: Path, factor: float) -> None:
-    from geogs.io.writers.ply import write_mesh
-    from geogs.mesh.files import read_mesh
-
     if path.is_file():
         mesh = read_mesh(path)
         write_mesh(path, factor * mesh.vertices, mesh.faces, mesh.colours, mesh.normals)
 
 
 def _scale_table(path: Path, factor: float) -> None:
-    from geogs.io.writers.atomic import write_text
-    from geogs.io.writers.uncertainty import HEADER, moved_rows
-
     if path.is_file():
         write_text(path, "\n".join([HEADER, *moved_rows(path, factor), ""]))
 
 
-def _told(summary: dict[str, Any], found: "FoundScale") -> dict[str, Any]:
+def _scaled_summary(summary: dict[str, Any], found: FoundScale) -> dict[str, Any]:
     """The summary with the scale; what had multiplied lengths before is multiplied in."""
     before = summary.get("metric_scale")
     factor = float(before["factor"]) if isinstance(before, dict) else 1.0

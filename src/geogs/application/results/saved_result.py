@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from geogs.documents import expanded, read_json
@@ -113,6 +113,23 @@ class SavedResult:
             raise InputError(f"{path} is of another size than the result says; was it changed?")
         return rows
 
+    def require_images(self) -> None:
+        """Raise InputError where the images of the keyframes were not kept."""
+        if not self.views.has_images:
+            raise InputError("The result was written without keyframe images, which this needs.")
+
+    def image(self, number: int) -> UInt8[np.ndarray, "h w 3"] | None:
+        """The image of a keyframe, by its place among them; none if the result has none.
+
+        Raises InputError if its file is missing, damaged or of another size.
+        """
+        if not self.views.has_images:
+            return None
+        path = image_path(self.folder, int(self.views.keyframe_id[number]))
+        image = read_image(path)
+        _check_size(path, image, self.camera)
+        return image
+
     def mask(self, number: int) -> Bool[np.ndarray, "h w"] | None:
         """The mask of a keyframe, by its place among them; none if it has none.
 
@@ -129,13 +146,11 @@ class SavedResult:
     def _keyframe(self, number: int) -> RenderedKeyframe:
         views = self.views
         number = range(len(views.keyframe_id))[number]
-        id, mask, image = int(views.keyframe_id[number]), None, None
+        id, mask = int(views.keyframe_id[number]), None
         T_cw = torch.from_numpy(views.T_cw[number])
         if (stored := self.mask(number)) is not None:
             mask = torch.from_numpy(stored).to(self.disks.position.device)
-        if views.has_images:
-            image = read_image(image_path(self.folder, id))
-            _check_size(image_path(self.folder, id), image, self.camera)
+        image = self.image(number)
         maps = self.renderer.surface(T_cw, mask=mask)
         seconds = float(views.timestamp[number])
         return RenderedKeyframe(id, self.depth_camera, T_cw, *maps, image, seconds, mask)

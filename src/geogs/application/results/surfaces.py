@@ -2,18 +2,25 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
 
 from geogs.application.progress import RunProgress
 from geogs.application.results.scene import MappedScene
 from geogs.config import MeshConfig
 from geogs.errors import InputError
+from geogs.io.writers.native import save_map
 from geogs.io.writers.ply import write_mesh
 from geogs.io.writers.tum import write_trajectories
+from geogs.mesh.colour import colour_mesh
 from geogs.mesh.extract import extract_mesh
 from geogs.mesh.types import DepthMapView, Mesh
 from geogs.on_demand import OnDemand
-from geogs.types import RenderedKeyframe
+from geogs.types import MapSnapshot, RenderedKeyframe
+
+if TYPE_CHECKING:
+    from geogs.reconstruction import Reconstruction
 
 
 def fusion_views(renders: Sequence[RenderedKeyframe]) -> Sequence[DepthMapView]:
@@ -77,3 +84,50 @@ def write_stage(
         write_trajectories(folder, scene.trajectory(), scene.keyframe_trajectory())
         path = folder / "mesh.ply"
         write_surface(path, scene.renders(), scene.config.mesh, progress, f"{name} mesh")
+
+
+def splat_colours(disks: MapSnapshot, views: Sequence[DepthMapView]) -> np.ndarray:
+    """RGB in [0, 1] of every disk, from the images that see it; the map itself has no colour."""
+    points = Mesh(
+        disks.position.cpu().numpy(), np.zeros((0, 3), np.int32), disks.normal.cpu().numpy()
+    )
+    tolerance = 4 * float(disks.scale.median())
+    colours = colour_mesh(points, views, tolerance).colours
+    return np.full((len(disks), 3), 0.5) if colours is None else colours / 255.0
+
+
+class Snapshots:
+    """Copies of the disks at the first report of progress after each of some seconds.
+
+    They count from the moment when the images have been read. Nothing is written meanwhile.
+    """
+
+    def __init__(self, seconds: Sequence[float]) -> None:
+        self._due = sorted(set(seconds))
+        self._kept: dict[float, MapSnapshot] = {}
+        self._early: list[float] = []
+
+    def take(self, scene: "Reconstruction") -> None:
+        """Copy the disks if the time for it has come; where there are none yet there is no copy."""
+        while self._due and scene.elapsed >= self._due[0]:
+            disks, seconds = scene.snapshot(), self._due.pop(0)
+            if len(disks):
+                self._kept[seconds] = disks
+            else:
+                self._early.append(seconds)
+
+    def write(self, output: Path, scene: "Reconstruction", progress: RunProgress) -> None:
+        """``snapshots/<seconds>/{map.safetensors, mesh.ply}`` for each copy.
+
+        Raises:
+            OutputError: a file cannot be written.
+        """
+        for seconds in self._early:
+            progress.write(f"No snapshot after {seconds:g} s: there was no map yet.")
+        for seconds, disks in self._kept.items():
+            folder = output / "snapshots" / f"{seconds:g}"
+            with scene.stopwatch("snapshots"):
+                save_map(folder / "map.safetensors", disks, {"seconds": seconds})
+                name = f"mesh at {seconds:g} s"
+                renders = scene.renders(disks)
+                write_surface(folder / "mesh.ply", renders, scene.config.mesh, progress, name)

@@ -7,12 +7,11 @@ from dataclasses import asdict
 from pathlib import Path
 
 from geogs.application.results.keyframe_files import write_keyframes
-from geogs.application.results.output_folder import remove_former
+from geogs.application.results.output_folder import remove_previous_output
 from geogs.application.results.report import write_report
 from geogs.application.results.result import Result
-from geogs.application.results.splat_colours import splat_colours
 from geogs.application.results.summary import summarise
-from geogs.application.results.surfaces import fusion_views
+from geogs.application.results.surfaces import fusion_views, splat_colours
 from geogs.config import Config, ReconstructConfig
 from geogs.io.sources.posed.base import PosedSource
 from geogs.io.writers.atomic import prepare_output_folder, write_text
@@ -43,7 +42,7 @@ def write_results(
         OutputError: a file cannot be written.
     """
     output = prepare_output_folder(output)
-    remove_former(output, new_stages)
+    remove_previous_output(output, new_stages)
     scene, source, progress = result.scene, result.source, result.progress
     write_trajectories(output, result.trajectory, result.keyframes)
     if result.uncertainty is not None:

@@ -4,12 +4,11 @@ import threading
 
 import numpy as np
 
+from geogs.application.results.report import first_view
 from geogs.application.results.saved_result import SavedResult
-from geogs.application.results.shown_model import first_view
 from geogs.application.viewer.window import Window
 from geogs.errors import InputError
 from geogs.evaluation.layers import layer_picture
-from geogs.io.writers.keyframe_images import image_path, read_image
 
 MOST_FRUSTA, MOST_IMAGES = 400, 60
 """Of the keyframes, evenly along the path."""
@@ -45,9 +44,9 @@ def _show_keyframes(result: SavedResult, window: Window) -> None:
     shown = np.unique(np.linspace(0, count - 1, min(count, MOST_FRUSTA)).round().astype(int))
     every = -(-len(shown) // MOST_IMAGES)
     for place, number in enumerate(shown):
-        id, image = int(views.keyframe_id[number]), None
-        if views.has_images and place % every == 0:
-            image = read_image(image_path(result.folder, id))
+        id = int(views.keyframe_id[number])
+        image = result.image(number) if place % every == 0 else None
+        if image is not None:
             step = -(-max(image.shape) // _IMAGE_EDGE)
             image = np.ascontiguousarray(image[::step, ::step])
         window.show_keyframe(id, np.linalg.inv(views.T_cw[number]), result.camera, image)
@@ -94,8 +93,9 @@ class _Inspector:
 
     def _picture(self, number: int) -> np.ndarray:
         result, layer = self._result, self._window.layer
-        if layer == "image" and result.views.has_images:
-            return read_image(image_path(result.folder, int(result.views.keyframe_id[number])))
+        image = result.image(number) if layer == "image" else None
+        if image is not None:
+            return image
         return layer_picture(result.keyframes[number], layer)
 
     def _words(self, number: int) -> str:

@@ -1,0 +1,124 @@
+"""What the commands that take a result are given: the same records for a command and a script.
+
+Nothing here is imported but the settings, so that a command line can be read at once.
+"""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Literal
+
+from geogs.config import MeshConfig, Seed
+from geogs.config.setting import Basic, Count, Positional, Positive, Range, Settings
+
+Format = Literal[
+    "colmap", "nerfstudio", "gsplat", "cloud", "depth", "normals", "kitti", "euroc", "tum", "glb",
+    "obj", "splats",
+]  # fmt: skip
+
+
+@dataclass(frozen=True)
+class ExportSettings(Settings):
+    """All that an export is told."""
+
+    result: Annotated[Path, Positional()]
+    """Folder of a result, as geogs run and geogs reconstruct write it."""
+    to: Format
+    """What to write; docs/formats.md says how each format is laid out."""
+    output: Annotated[Path | None, Basic("-o")] = None
+    """Folder or file; export/FORMAT in the folder of the result if none is given. A cloud that ends
+    in .las becomes LAS, else PLY."""
+    text: bool = False
+    """Write a COLMAP model as text, which is binary otherwise."""
+    points: Annotated[int, Range(100, 10_000_000)] = 50_000
+    """Points with tracks to look for in colmap and nerfstudio."""
+    textured: bool = False
+    """Give a glb an image of its surface, put together from the keyframes' images, instead of
+    vertex colours."""
+    texture_size: Annotated[int, Range(64, 16384)] = 4096
+    """Longest side of that image, pixels; it is no larger than the keyframes' images call for."""
+    sh_degree: Annotated[int, Range(0, 4)] = 3
+    """Degree of the spherical harmonics in splats; all but the constant one are zero, and some
+    viewers insist on them."""
+    device: str = "auto"
+    """Where to render: auto (a GPU where there is one), cpu, cuda or cuda:1."""
+
+
+@dataclass(frozen=True)
+class RemeshSettings(Settings):
+    """All that the making of another mesh is told."""
+
+    result: Annotated[Path, Positional()]
+    """Folder of a result, as geogs run and geogs reconstruct write it."""
+    mesh: MeshConfig = field(default_factory=MeshConfig)
+    """How the surface is made; what is not given is as the result was made with."""
+    output: Annotated[Path | None, Basic("-o")] = None
+    """File of the mesh, PLY; mesh.ply in the folder of the result if none is given."""
+    device: str = "auto"
+    """Where to compute: auto (a GPU where there is one), cpu, cuda or cuda:1."""
+
+
+@dataclass(frozen=True)
+class RescaleSettings(Settings):
+    """All that the scaling of a result is told."""
+
+    result: Annotated[Path, Positional()]
+    """Folder of a result, as geogs run writes it."""
+    scale_from: Annotated[str, Basic("--from")] = ""
+    """What is known in metres: FRAME:u1,v1,u2,v2=1.25m (pixels of an image as it came; several with
+    semicolons), aruco:DICT_5X5_50:0.12 (tags whose side is so long), or height:1.6 (of the camera
+    over the ground)."""
+    device: str = "auto"
+    """Where to compute: auto (a GPU where there is one), cpu, cuda or cuda:1."""
+
+
+@dataclass(frozen=True)
+class EvalSettings(Settings):
+    """All that an evaluation is told."""
+
+    output: Annotated[Path, Positional()]
+    """Folder of a result, as ``geogs run`` writes it."""
+    gt: Path
+    """True poses: a TUM file, a traj.txt of 4x4 rows (row k is at k / 30 s), or the folder of a
+    Replica, TUM, 7-Scenes or synthetic sequence, or of images with known poses (COLMAP, DTU...);
+    the true surface is then found, too."""
+    protocol: Literal["area", "samples", "vertex", "object", "dtu"] = "area"
+    """How surfaces are compared: by area with exact distances, area-weighted from samples to
+    samples (NICE-SLAM), vertex-weighted (Splat-SLAM, HI-SLAM2), a single object inside its masks
+    in mm, or DTU's in mm."""
+    gt_mesh: Path | None = None
+    """True surface as PLY in metres, in the frame of the true poses."""
+    gt_points: Path | None = None
+    """Points of the true surface that the camera saw, PLY; completeness is then measured on
+    them."""
+    surface: bool = True
+    """Compare the surface too."""
+    cull: bool = False
+    """Count only what the true cameras saw of the surfaces (frustum and occlusion)."""
+    cull_rule: Literal["frustum", "occlusion"] = "frustum"
+    """How the samples and vertex protocols cull meshes: NICE-SLAM's rule or Neural RGB-D's."""
+    cull_every: Count = 10
+    """Use every so many true poses for culling."""
+    icp: bool = False
+    """Refine the alignment of the surface by ICP (0.1 m), as Replica's usual scripts do; the
+    samples and vertex protocols always do."""
+    max_diff: Positive = 0.02
+    """Largest time between poses that are compared, seconds."""
+    alignment: Literal["auto", "sim3", "se3", "none"] = "auto"
+    """Auto takes Sim(3), as the scale of monocular results is arbitrary, but leaves what was made
+    with known poses as it is."""
+    threshold: Positive | None = None
+    """Distance that counts as reached, metres; 0.05, for objects 0.001."""
+    samples: Annotated[int | None, Range(1, 1_000_000_000)] = None
+    """Points on each surface; 200 000, for objects 4 000 000."""
+    dtu_data: Path | None = None
+    """Folder of the official DTU evaluation, with ObsMask and Points/stl."""
+    dtu_scan: Annotated[int | None, Range(1, 1000)] = None
+    """Number of the scan; by the name of the folder of the poses if none is given."""
+    photo: bool = False
+    """Measure how well the images beside the true poses agree on the surface (no truth needed)."""
+    photo_every: Count = 8
+    """In every so many images, which the result should not have used."""
+    seed: Seed = 0
+    """Of the sampling."""
+    plots: bool = True
+    """Draw the pictures of the report."""
