@@ -20,7 +20,7 @@ def test_every_setting_has_a_row_with_its_default_its_range_and_its_meaning():
     for name, leaf in known.items():
         assert leaf.help, name
         assert f"`{name}`" in text
-    assert "| `loop.lag` | `2` | a whole number from 0 to 1000000 | Keyframes for which" in text
+    assert "| `loop.close-every` | `5` | a whole number from 1 to 1000000 | Keyframes" in text
     assert "| `mapping.photo.per-step` | `2`, `4` in `reconstruct` | a whole number from 1" in text
     assert "| `mapping.final-depth` | `on` | `off` | `on` | `on` |" in text
     explained = [row for row in rows if " only) |" in row]

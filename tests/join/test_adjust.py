@@ -51,7 +51,7 @@ def placed(tmp_path):
     for n, places in enumerate(PLACES):
         parts.append(Part(str(n), make_part(tmp_path / str(n), places, 0)))
         files.append(tmp_path / f"{n}.npz")
-        describe(DescribeJob(parts[-1], CAMERA, config, files[-1]))
+        describe(DescribeJob(parts[-1], CAMERA, files[-1]))
         T = torch.from_numpy(PartViews.load(files[-1]).T_cw)
         T[:, :3, 3] += torch.from_numpy(rng.normal(0, 0.003, 3)) * (n > 0)
         placements[n] = Placement(T, torch.ones(len(T)))
@@ -119,7 +119,7 @@ def test_a_part_that_matches_nothing_stays(placed, tmp_path):
     parts, files, placements, gauge, config = placed
     lone = Part("lone", make_part(tmp_path / "lone", np.array([0.7, 0.8]), 0))
     views = tmp_path / "lone.npz"
-    describe(DescribeJob(lone, CAMERA, config, views))
+    describe(DescribeJob(lone, CAMERA, views))
     T = torch.from_numpy(PartViews.load(views).T_cw)[:1]
     T[:, :3, 3] += 50.0
     parts, files = [*parts[:2], lone], [*files[:2], views]

@@ -3,7 +3,6 @@
 import numpy as np
 import torch
 
-from geogs.config import LoopConfig
 from geogs.geometry.lie import se3_exp, sim3_exp, sim3_inverse, sim3_log, sim3_scale
 from geogs.loop.features import Features
 from geogs.loop.pose_graph import RelativePoses
@@ -75,7 +74,7 @@ def test_agreeing_links_tie_parts_and_false_ones_stay_out():
         link(0, 1, 2, 1, worlds, 0.7),
         link(2, 1, 3, 1, worlds),
     ]  # fmt: skip
-    gauge = common_gauge(parts, links, LoopConfig())
+    gauge = common_gauge(parts, links)
     assert gauge.parts == [0, 1, 2]  # one link is not enough for the fourth
     for n in gauge.parts:
         assert sim3_log(gauge.world[n] @ sim3_inverse(worlds[n])).abs().max() < 1e-4
@@ -89,17 +88,17 @@ def test_of_several_worlds_the_largest_is_taken_and_a_lone_part_is_one():
     parts = [part(n, S) for n, S in enumerate(worlds)]
     links = [link(0, i, 1, i, worlds) for i in (1, 2)]
     links += [link(a, i, a + 1, i, worlds) for a in (2, 3) for i in (1, 2)]
-    gauge = common_gauge(parts, links, LoopConfig())
+    gauge = common_gauge(parts, links)
     assert gauge.parts == [2, 3, 4]
     assert torch.equal(gauge.world[2], torch.eye(4, dtype=torch.float64))
-    assert common_gauge(parts, [], LoopConfig()).parts == [0]
+    assert common_gauge(parts, []).parts == [0]
 
 
 def test_the_graph_undoes_what_a_part_has_drifted():
     worlds = worlds_of(1)
     parts = [part(0, worlds[0]), part(0, worlds[1], drift=0.03)]
     links = [link_of_same(i, worlds, parts) for i in (0, 3, 6, 9)]
-    gauge = common_gauge(parts, links, LoopConfig())
+    gauge = common_gauge(parts, links)
     assert gauge.parts == [0, 1]
     found = placed(parts, gauge)
     assert torch.allclose(found[0].T_cw[0], poses(0)[0], atol=1e-9)

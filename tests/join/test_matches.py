@@ -36,7 +36,7 @@ def matched(folder, number: int, with_rows: bool) -> tuple[Member, Matches]:
     if with_rows:
         write_rows(rows_path(folder), dict.fromkeys(range(len(PLACES)), rows()))
     views = folder / "views.npz"
-    describe(DescribeJob(part, CAMERA, CONFIG, views))
+    describe(DescribeJob(part, CAMERA, views))
     S = gauge(number)
     T = torch.from_numpy(PartViews.load(views).T_cw) @ S
     scale = sim3_scale(T)

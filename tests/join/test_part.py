@@ -28,7 +28,7 @@ def test_another_camera_at_the_same_place_sees_the_same():
 def test_a_part_is_described_by_the_depths_that_its_map_shows(tmp_path):
     part = Part("a", make_part(tmp_path / "a", np.array([0.0, 0.1]), 0))
     file = tmp_path / "views.npz"
-    assert describe(DescribeJob(part, CAMERA, Config(), file)) == 2
+    assert describe(DescribeJob(part, CAMERA, file)) == 2
     views, grid = PartViews.load(file), SampleGrid(CAMERA)
     for n, s in enumerate((0.0, 0.1)):
         depth = seen(pose(s), CAMERA)[0]
@@ -37,7 +37,7 @@ def test_a_part_is_described_by_the_depths_that_its_map_shows(tmp_path):
         assert known.mean() > 0.8
         ratio = views.inverse_depth[n] * depth[y.numpy(), x.numpy()]
         assert np.median(np.abs(ratio[known] - 1)) < 0.01
-    features = FeatureExtractor(Config().loop.retrieval)(image(pose(0.0), walls(0)))
+    features = FeatureExtractor()(image(pose(0.0), walls(0)))
     assert len(views.features[0]) == pytest.approx(len(features), rel=0.2)  # JPEG
     assert views.features[1].descriptors.shape == (len(views.features[1]), 32)
     assert views.outline().median_depth == pytest.approx(views.median_depth)

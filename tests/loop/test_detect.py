@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from geogs.config import LoopConfig, RetrievalOptions
+from geogs.config import LoopConfig
 from geogs.geometry.lie import se3_exp, se3_inverse, so3_log
+from geogs.loop import detect, search
 from geogs.loop.dense import dense_check
 from geogs.loop.detect import LoopDetector
 from geogs.loop.features import FeatureExtractor, Features
@@ -41,6 +42,11 @@ def _relative(store: Segment, first: int, second: int) -> torch.Tensor:
     return store[second].T_cw @ se3_inverse(store[first].T_cw)
 
 
+def _suppress(monkeypatch: pytest.MonkeyPatch, keyframes: int) -> None:
+    for module in (search, detect):
+        monkeypatch.setattr(module, "SUPPRESSION", keyframes)
+
+
 def _turn(A: torch.Tensor, B: torch.Tensor) -> float:
     return math.degrees(float(so3_log(A[:3, :3] @ B[:3, :3].mT).norm()))
 
@@ -55,7 +61,7 @@ def _scale_depth(store: Segment, id: int, factor: float) -> None:
 
 
 def _views_of(store: Segment, *ids: int) -> list[DepthView]:
-    extract = FeatureExtractor(RetrievalOptions())
+    extract = FeatureExtractor()
     return [_depth_view(store, k, extract(store[k].image)) for k in ids]
 
 
@@ -126,11 +132,12 @@ def test_flow_refuses_a_pose_from_nowhere(walk):
     assert check.reason
 
 
-def test_looks_close_a_loop_that_drift_hides(walk):
+def test_looks_close_a_loop_that_drift_hides(walk, monkeypatch):
+    _suppress(monkeypatch, 1)
     store, operator = walk
     true = {k: _relative(store, k - LAP, k) for k in store.ids[LAP:]}
     _drift(store, range(LAP, LAP + AGAIN))
-    detector = LoopDetector(store.store, operator, LoopConfig(min_gap=10, suppression=1))
+    detector = LoopDetector(store.store, operator, LoopConfig(min_gap=10))
     loops = [x for k in store.ids for x in detector.update([k])] + [*detector.update([], True)]
     loops = [loop for loop in loops if loop.second >= LAP]
     assert {(0, LAP), (1, LAP + 1)} <= {(loop.first, loop.second) for loop in loops}
@@ -143,8 +150,8 @@ def test_looks_close_a_loop_that_drift_hides(walk):
 
 def test_poses_close_a_loop_without_features(walk):
     store, operator = walk
-    config = LoopConfig(min_gap=10, retrieval=RetrievalOptions(features=8, indexed=8))
-    detector = LoopDetector(store.store, operator, config)
+    detector = LoopDetector(store.store, operator, LoopConfig(min_gap=10))
+    detector._search.index._extract.count = 8
     loops = detector.update(store.ids, is_last=True)
     assert loops
     assert all(loop.cause == "geometry" and loop.inliers == 0 for loop in loops)
@@ -153,11 +160,11 @@ def test_poses_close_a_loop_without_features(walk):
         assert _turn(loop.T_ji, true) < 0.2
 
 
-def test_a_loop_as_a_similarity_takes_depth_to_depth(walk):
+def test_a_loop_as_a_similarity_takes_depth_to_depth(walk, monkeypatch):
+    _suppress(monkeypatch, 0)
     store, operator = walk
     _scale_depth(store, LAP, 1.2)
-    config = LoopConfig(min_gap=10, suppression=0)
-    detector = LoopDetector(store.store, operator, config)
+    detector = LoopDetector(store.store, operator, LoopConfig(min_gap=10))
     detector.update(store.ids[: LAP + 1], is_last=True)
     loop = next(x for x in detector.loops if x.second == LAP)
     assert loop.scale == pytest.approx(1.2, rel=0.02)
@@ -170,13 +177,13 @@ def test_a_loop_as_a_similarity_takes_depth_to_depth(walk):
 
 def test_close_pairs_suppress_each_other(walk):
     store, operator = walk
-    detector = LoopDetector(store.store, operator, LoopConfig(min_gap=10, suppression=3))
+    detector = LoopDetector(store.store, operator, LoopConfig(min_gap=10))
     detector.update(store.ids, is_last=True)
     pairs = [(loop.first, loop.second) for loop in detector.loops]
     assert pairs
     for n, (a, b) in enumerate(pairs):
         assert b - a > 10
-        assert all(abs(a - c) + abs(b - d) > 3 for c, d in pairs[:n])
+        assert all(abs(a - c) + abs(b - d) > search.SUPPRESSION for c, d in pairs[:n])
 
 
 def test_update_is_deterministic(path):

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from geogs.config import RetrievalOptions
 from geogs.loop.features import FeatureExtractor
 from geogs.loop.retrieval import AppearanceIndex
 from loop_scenes import orbit, room, room_views
@@ -33,7 +32,7 @@ def index(lap: list[np.ndarray]) -> AppearanceIndex:
 
 
 def test_features_are_spread_and_strongest_first(lap):
-    extract = FeatureExtractor(RetrievalOptions(features=240))
+    extract = FeatureExtractor(count=240)
     features = extract(lap[0])
     assert len(features) == len(features.descriptors) <= 240
     cells = (features.pixels // [48, 48]).astype(int) @ [1, 8]
@@ -97,7 +96,7 @@ def test_featureless_images_find_nothing(lap):
 
 
 def test_a_full_vocabulary_still_finds_places(lap, again):
-    index = AppearanceIndex(RetrievalOptions(words=2500))
+    index = AppearanceIndex(most_words=2500)
     for n, image in enumerate(lap):
         index.add(n, image)
     hits = [index.query(image, count=3) for image in again]

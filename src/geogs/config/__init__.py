@@ -12,7 +12,7 @@ from geogs.config.known_poses import (
     known_pose_mapping,
     reconstruct_preset,
 )
-from geogs.config.loop import LoopConfig, RetrievalOptions, VerificationOptions
+from geogs.config.loop import LoopConfig
 from geogs.config.losses import LossAblation, LossConfig
 from geogs.config.mapping import DiskConfig, MapAblation, MappingConfig, PhotoConfig
 from geogs.config.mesh import MeshConfig
@@ -40,11 +40,9 @@ __all__ = [
     "Preset",
     "PriorConfig",
     "ReconstructConfig",
-    "RetrievalOptions",
     "SearchConfig",
     "Seed",
     "TrackingConfig",
-    "VerificationOptions",
     "known_pose_mapping",
     "preset",
     "reconstruct_preset",

@@ -15,6 +15,8 @@ from geogs.loop.closing import ClosingQuestion, brought_forward
 from geogs.loop.closing_matches import closing_matches, take_over_depths
 from geogs.loop.closure import LoopClosure
 from geogs.loop.constraints import (
+    AGREEING_LOOPS,
+    JOIN_TOLERANCE,
     between_positions,
     disagreement,
     joined,
@@ -33,6 +35,8 @@ from geogs.tracking.segments import Segments
 from geogs.tracking.tracker import Tracker, TrackResult
 from geogs.types import PoseCorrection
 
+MOST_LOOPS = 200
+"""Relative poses of loops from which on older ones are thinned out: bounds the pose graph."""
 RETIRED_TOGETHER = 64
 """Directed edges, of some eight keyframes, that become relative poses in one go."""
 
@@ -179,7 +183,7 @@ class LoopCloser:
             self._between.append(loop)
             return
         known, constraint = self._of(first), self._constraint(loop)
-        known.loops = thinned(joined([known.loops, constraint]), self.config.kept)
+        known.loops = thinned(joined([known.loops, constraint]), MOST_LOOPS)
         ends = sorted({loop.first, loop.second})
         strain = strains(first.keyframes.poses(ends), between_positions(constraint, ends))
         known.pending += bool((strain > self.config.strain).any())
@@ -198,7 +202,7 @@ class LoopCloser:
             agreeing = [
                 o for o in self._between if self._ends(o) == (host, guest) and self._agrees(o, S)
             ]
-            if len(agreeing) < self.config.agreeing:
+            if len(agreeing) < AGREEING_LOOPS:
                 continue
             for o in agreeing:
                 self._of(host).loops = joined([self._of(host).loops, self._constraint(o)])
@@ -232,7 +236,7 @@ class LoopCloser:
         state = guest.keyframes[loop.second if loop.second in guest.keyframes else loop.first]
         depth = 1 / state.inverse_depth.median().cpu().double()
         error = disagreement(state.T_cw @ self._claim(loop), state.T_cw @ S, depth)
-        return float(error) < self.config.join_tolerance
+        return float(error) < JOIN_TOLERANCE
 
     def _merge(self, host: Tracker, guest: Tracker, S: Float[Tensor, "4 4"]) -> tuple[int, ...]:
         self._age += 1

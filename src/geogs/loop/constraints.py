@@ -18,6 +18,11 @@ from geogs.tracking.packed_edge import PackedEdge
 from geogs.world.grid import SampleGrid
 from geogs.world.store import KeyframeStore, Segment
 
+AGREEING_LOOPS = 2
+"""Loops that have to agree before a segment is joined to another: one may be a look-alike."""
+JOIN_TOLERANCE = 0.12
+"""Within which they agree: radians, parts of the median depth, or of the scale; what segments drift
+by within themselves."""
 SETTLED = RelativePoseOptions(iterations=0)
 """For edges that a bundle adjustment has fitted, with more than they tell alone."""
 

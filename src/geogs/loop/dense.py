@@ -8,13 +8,26 @@ from jaxtyping import Float
 from torch import Tensor
 
 from geogs.bundle.projection import project
-from geogs.config import VerificationOptions
 from geogs.geometry.lie import scaled, se3_inverse, so3_log
+from geogs.loop.verification import DEPTH_TOLERANCE, MAX_SCALE, MIN_CONSISTENT
 from geogs.tracking.flow.base import FlowOperator
 from geogs.tracking.motion import FrameLocator, FrameMotion
 from geogs.types import FlowMatch
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframe import Keyframe
+
+MIN_MATCHED = 0.15
+"""Least fraction of the cells whose flow agrees with the pose, in each direction."""
+MAX_RESIDUAL = 0.0033
+"""Largest median reprojection error of the flow, of the long edge: under two pixels of 512."""
+MAX_CONTRADICTION = 0.1
+"""Largest fraction of the surface of one view, where the other looks at it, through which the other
+sees. Tells look-alikes apart where their shapes differ within the view."""
+MAX_ROTATION_DISAGREEMENT_DEG = 3.0
+"""Largest rotation between the poses found in the two directions."""
+MIN_NCC = 0.5
+"""Least median correlation of the images at those poses, in each direction: unlike images come to
+0, one place to 0.7 and more."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +59,6 @@ def dense_check(
     second: Keyframe,
     T_ji: Float[Tensor, "4 4"],
     scale: float = 1.0,
-    options: VerificationOptions | None = None,
 ) -> DenseCheck:
     """Measure the flow between two keyframes from their supposed relative pose, and judge it.
 
@@ -55,8 +67,7 @@ def dense_check(
     match neither may see through what the other shows, and the images must agree at the poses.
     ``T_ji`` is in the first's lengths, ``scale`` as in :class:`DenseCheck`.
     """
-    o = options or VerificationOptions()
-    limit = o.max_residual * max(grid.camera.width, grid.camera.height)
+    limit = MAX_RESIDUAL * max(grid.camera.width, grid.camera.height)
     locator = FrameLocator(grid, operator, 0.0, limit, min_ncc=-1.0)
     T_ji = T_ji.to(first.T_cw)
     there = locator.locate(first, second.encoded, T_ji @ first.T_cw)
@@ -67,24 +78,24 @@ def dense_check(
     T_there = there.T_cw @ se3_inverse(first.T_cw)
     T_back = back.T_cw @ se3_inverse(second.T_cw)
     ratios = _depth_ratios(grid, first, second, there, T_there)
-    scale_dense, agreeing = _consensus(ratios, o.depth_tolerance)
+    scale_dense, agreeing = _consensus(ratios, DEPTH_TOLERANCE)
     T_far = se3_inverse(scaled(T_there, scale_dense))
     contradiction = max(
-        _seen_through(grid, first, second, T_there, scale_dense, o.depth_tolerance),
-        _seen_through(grid, second, first, T_far, 1 / scale_dense, o.depth_tolerance),
+        _seen_through(grid, first, second, T_there, scale_dense, DEPTH_TOLERANCE),
+        _seen_through(grid, second, first, T_far, 1 / scale_dense, DEPTH_TOLERANCE),
     )
     turn = math.degrees(float(so3_log((T_back @ T_there)[:3, :3]).norm()))
-    if matched < o.min_matched:
+    if matched < MIN_MATCHED:
         reason = f"the flow agrees on only {matched:.0%} of the image"
-    elif turn > o.max_turn:
+    elif turn > MAX_ROTATION_DISAGREEMENT_DEG:
         reason = f"the two directions differ by {turn:.1f} degrees"
-    elif agreeing < o.min_consistent:
+    elif agreeing < MIN_CONSISTENT:
         reason = f"the depths agree at only {agreeing:.0%} of the matches"
-    elif abs(math.log(scale_dense)) > math.log(o.max_scale):
+    elif abs(math.log(scale_dense)) > math.log(MAX_SCALE):
         reason = f"the depths differ by a factor of {scale_dense:.2f}"
-    elif contradiction > o.max_contradiction:
+    elif contradiction > MAX_CONTRADICTION:
         reason = f"one sees through {contradiction:.0%} of what the other shows"
-    elif not all(m.evidence.bears_out(o.min_ncc, is_expected=False) for m in (there, back)):
+    elif not all(m.evidence.bears_out(MIN_NCC, is_expected=False) for m in (there, back)):
         correlation = min(there.evidence.correlation, back.evidence.correlation)
         reason = f"the images correlate by only {correlation:.2f}"
     else:

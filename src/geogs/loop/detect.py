@@ -15,6 +15,7 @@ from geogs.config import LoopConfig
 from geogs.geometry.lie import se3_inverse
 from geogs.loop.dense import dense_check
 from geogs.loop.search import (
+    SUPPRESSION,
     Cause,
     Depths,
     PlaceSearch,
@@ -28,6 +29,26 @@ from geogs.tracking.motion import Recognition
 from geogs.tracking.proximity import frame_distances
 from geogs.types import FlowMatch
 from geogs.world.store import KeyframeStore
+
+MAX_FLOW_DISTANCE = 0.29
+"""Flow distance below which the present poses make a pair a candidate, of the long edge (22 cells
+of 8 pixels at 616 pixels, as HI-SLAM2 has it)."""
+ROTATION_WEIGHT = 0.3
+"""Weight of the flow with the rotation in that distance, the rest is without: a place may be seen
+again from another direction."""
+MAX_ANGLE_DEG = 120.0
+"""Largest angle between the orientations of such a pair."""
+MAX_BASELINE = 1.5
+"""Largest distance between their centres, of the keyframe's median depth."""
+MEASURED = 48
+"""Most such pairs, nearest first, whose flow distance is computed: bounds the cost."""
+MIN_MATCHED_ALONE = 0.3
+"""Least fraction of the cells whose flow agrees where only the present poses, and no features,
+speak for the loop."""
+MAX_LOOPS = 2
+"""Most loops per keyframe: more of one place say the same."""
+LAG = 2
+"""Keyframes for which a search may run beside tracking before it is waited for."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +114,7 @@ class LoopDetector:
     """Finds loops at keyframes that are final: looks and features propose, the flow decides.
 
     The search by looks and features runs in a thread beside tracking; what it finds is taken up
-    ``lag`` keyframes later, at the same place of the stream however fast the machine is. Keyframes
+    ``LAG`` keyframes later, at the same place of the stream however fast the machine is. Keyframes
     may lie in several segments, whose poses have nothing to do with each other: between them, only
     looks propose.
     """
@@ -159,7 +180,7 @@ class LoopDetector:
         for id in ids:
             self._enter(id)
             self._pending.append(self._thread.submit(self._search.find, self._query(id)))
-            due = len(self._pending) > self.config.lag
+            due = len(self._pending) > LAG
             if due and (self._waits or self._pending[0].done()):
                 found += self._decide(self._pending.popleft().result())
         while is_last and self._pending:
@@ -182,8 +203,8 @@ class LoopDetector:
         if not facing:
             return []
         directed = [(k, id) for k in facing] + [(id, k) for k in facing]
-        there, back = frame_distances(store, directed, self.config.rotation_weight).chunk(2)
-        limit = self.config.max_distance * max(self.grid.camera.width, self.grid.camera.height)
+        there, back = frame_distances(store, directed, ROTATION_WEIGHT).chunk(2)
+        limit = MAX_FLOW_DISTANCE * max(self.grid.camera.width, self.grid.camera.height)
         distance, order = torch.sort(((there + back) / 2).cpu(), stable=True)
         return [facing[n] for n in order[distance < limit].tolist()]
 
@@ -203,7 +224,7 @@ class LoopDetector:
     def _found_near(self, id: int) -> list[tuple[int, int]]:
         """Pairs of the loops found whose later keyframe is so near to one that they can rule out
         others of it; loops are found in the order of their later keyframes."""
-        least = self._order[id] - self.config.suppression
+        least = self._order[id] - SUPPRESSION
         recent = takewhile(lambda loop: self._order[loop.second] >= least, reversed(self._loops))
         return [(loop.first, loop.second) for loop in recent]
 
@@ -220,11 +241,11 @@ class LoopDetector:
 
     def _facing(self, id: int) -> list[int]:
         """The earlier keyframes nearest by that look roughly the same way; there are never many."""
-        c, store = self.config, self.keyframes.segment_of(id)
-        old = self._ids[: max(self._order[id] - c.min_gap, 0)]
+        store = self.keyframes.segment_of(id)
+        old = self._ids[: max(self._order[id] - self.config.min_gap, 0)]
         depth = 1 / float(store[id].inverse_depth.median())
-        around = self.keyframes.poses.around(id, old, c.max_angle, c.max_baseline * depth)
-        return list(islice((k for k in around.tolist() if k in store), c.measured))
+        around = self.keyframes.poses.around(id, old, MAX_ANGLE_DEG, MAX_BASELINE * depth)
+        return list(islice((k for k in around.tolist() if k in store), MEASURED))
 
     def _decide(self, sightings: Sequence[Sighting]) -> list[Loop]:
         """The loops among what was seen of one keyframe."""
@@ -240,7 +261,7 @@ class LoopDetector:
             found.append(loop)
             # Of a long video the flows of all loops would fill the memory.
             self._loops.append(loop if self.config.matches else loop.without_flows())
-            if len(found) == self.config.max_loops:
+            if len(found) == MAX_LOOPS:
                 break
         return found
 
@@ -257,8 +278,8 @@ class LoopDetector:
             T, scale, inliers = second.T_cw @ se3_inverse(first.T_cw), 1.0, 0
         else:
             return Refusal(p, view.reason or "too little depth is known")
-        check = dense_check(grid, self.operator, first, second, T, scale, self.config.verification)
-        if not inliers and check.matched < self.config.verification.min_matched_alone:
+        check = dense_check(grid, self.operator, first, second, T, scale)
+        if not inliers and check.matched < MIN_MATCHED_ALONE:
             share = f"{check.matched:.0%}"
             return Refusal(p, check.reason or f"without features, {share} matched is too little")
         if not check.accepted or check.T_ji is None or check.there is None or check.back is None:

@@ -6,8 +6,10 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
-from geogs.config import RetrievalOptions
-
+FEATURES = 800
+"""Most of a keyframe, strongest of each image cell first: plain walls leave a few hundred."""
+FAST_THRESHOLD = 7
+"""Least grey-level step of a corner: low, so that dark exposures still give features."""
 ROWS, COLUMNS = 6, 8
 """Cells of the image that share the features evenly."""
 SURPLUS = 1.5
@@ -30,21 +32,15 @@ class Features:
 class FeatureExtractor:
     """Finds oriented FAST corners at eight scales and describes them by ORB."""
 
-    def __init__(
-        self, options: RetrievalOptions, mask: Bool[np.ndarray, "h w"] | None = None
-    ) -> None:
-        """Outside a ``mask`` of the size of the images nothing is found."""
+    def __init__(self, mask: Bool[np.ndarray, "h w"] | None = None, count: int = FEATURES) -> None:
+        """At most ``count``; outside a ``mask`` of the size of the images nothing is found."""
         self._mask = None if mask is None else mask.astype(np.uint8)
-        self.options = options
-        self.count = options.features
+        self.count = count
 
     def __call__(self, image: UInt8[np.ndarray, "h w 3"]) -> Features:
         """Features of an RGB image; none where nothing stands out. For any thread."""
         grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-        orb = cv2.ORB.create(
-            nfeatures=round(SURPLUS * self.options.features),
-            fastThreshold=self.options.fast_threshold,
-        )
+        orb = cv2.ORB.create(nfeatures=round(SURPLUS * self.count), fastThreshold=FAST_THRESHOLD)
         points = orb.detect(grey, self._mask)
         if not points:
             return Features(np.zeros((0, 2), np.float32), np.zeros((0, 32), np.uint8))

@@ -7,10 +7,15 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float64, Int64, UInt8
 
-from geogs.config import RetrievalOptions
 from geogs.errors import InputError
 from geogs.loop.features import FeatureExtractor, Features
 
+INDEXED = 300
+"""Features of an image that are looked up and stored, strongest first; the rest serve to verify."""
+WORD_RADIUS = 50
+"""Bits (of 256) within which a descriptor belongs to an existing word."""
+WORDS = 6144
+"""Size at which the vocabulary stops growing; bounds the cost of a keyframe."""
 LOOSE = 15
 """Bits by which the radius of the words grows once the vocabulary is full."""
 
@@ -61,19 +66,17 @@ class IndexState:
 class AppearanceIndex:
     """Keyframes by the words they contain.
 
-    The vocabulary needs no training data: a descriptor farther than ``word_radius`` bits from
+    The vocabulary needs no training data: a descriptor farther than ``WORD_RADIUS`` bits from
     every word becomes a word itself (as in iBoW-LCD, Garcia-Fidalgo & Ortiz 2018, without its
     merging of words). Words that many keyframes share count little (inverse document frequency).
     """
 
     def __init__(
-        self,
-        options: RetrievalOptions | None = None,
-        mask: Bool[np.ndarray, "h w"] | None = None,
+        self, mask: Bool[np.ndarray, "h w"] | None = None, most_words: int = WORDS
     ) -> None:
         """Outside a ``mask`` of the size of the images nothing is looked at."""
-        self.options = options or RetrievalOptions()
-        self._extract = FeatureExtractor(self.options, mask)
+        self._extract = FeatureExtractor(mask)
+        self._most_words = most_words
         self._matcher = cv2.BFMatcher(cv2.NORM_HAMMING)
         self._words = np.zeros((0, 32), np.uint8)
         self._postings: list[Posting] = []
@@ -113,9 +116,9 @@ class AppearanceIndex:
     def add(self, keyframe: int, image: UInt8[np.ndarray, "h w 3"] | Features) -> None:
         """Enter a keyframe; what is new in it becomes words."""
         features = self._features(image)
-        descriptors = features.descriptors[: self.options.indexed]
+        descriptors = features.descriptors[:INDEXED]
         words, distance = self._nearest(features)
-        room = max(self.options.words - len(self._words), 0)
+        room = max(self._most_words - len(self._words), 0)
         fresh = np.flatnonzero(distance > self._radius)[:room]
         words = words.copy()
         words[fresh] = len(self._words) + np.arange(len(fresh))
@@ -160,8 +163,8 @@ class AppearanceIndex:
 
     @property
     def _radius(self) -> int:
-        full = len(self._words) >= self.options.words
-        return self.options.word_radius + LOOSE * full
+        full = len(self._words) >= self._most_words
+        return WORD_RADIUS + LOOSE * full
 
     def _features(self, image: UInt8[np.ndarray, "h w 3"] | Features) -> Features:
         return image if isinstance(image, Features) else self.describe(image)
@@ -170,7 +173,7 @@ class AppearanceIndex:
         """Nearest word of each indexed descriptor and its distance in bits; 256 without a word."""
         if self._recent is not None and self._recent[0] is features:
             return self._recent[1:]
-        descriptors = features.descriptors[: self.options.indexed]
+        descriptors = features.descriptors[:INDEXED]
         words = np.zeros(len(descriptors), np.int64)
         distance = np.full(len(descriptors), 256, np.int64)
         if len(descriptors) and len(self._words):

@@ -17,6 +17,14 @@ from geogs.threads import worker_count
 from geogs.tracking.motion import Recognition
 from geogs.world.grid import SampleGrid
 
+MIN_SCORE = 0.05
+"""Least similarity of a candidate by appearance, of that of a keyframe with itself."""
+VERIFIED = 4
+"""Most candidates of a keyframe that are verified: bounds the cost."""
+SUPPRESSION = 3
+"""A loop rules out others whose ends together lie within this many keyframes of its own, as they
+say nothing new."""
+
 Cause = Literal["geometry", "appearance"]
 """What proposed a pair: the present poses, or nothing but the looks."""
 
@@ -80,12 +88,12 @@ class PlaceSearch:
         ``mask`` of the size of the images no features are found."""
         self.grid = grid
         self.config = config
-        self.index = AppearanceIndex(config.retrieval, mask)
-        self._verifier = TwoViewVerifier(grid.camera, config.verification)
+        self.index = AppearanceIndex(mask)
+        self._verifier = TwoViewVerifier(grid.camera)
         self._features: dict[int, Features] = {}
         self._order = order
         self._helpers = ThreadPoolExecutor(
-            min(worker_count(), config.verified), thread_name_prefix="looks"
+            min(worker_count(), VERIFIED), thread_name_prefix="looks"
         )
         """Find features before their keyframe's turn, and hold several pairs together at once."""
 
@@ -132,7 +140,7 @@ class PlaceSearch:
         """Whether a pair is too near to another to say anything new."""
         a, b = (self._order[k] for k in pair)
         return any(
-            abs(a - self._order[first]) + abs(b - self._order[second]) <= self.config.suppression
+            abs(a - self._order[first]) + abs(b - self._order[second]) <= SUPPRESSION
             for first, second in others
         )
 
@@ -154,12 +162,12 @@ class PlaceSearch:
             if not self.is_suppressed((p.first, p.second), [*kept, *query.known]):
                 kept.append((p.first, p.second))
                 chosen.append(p)
-        return chosen[: self.config.verified]
+        return chosen[:VERIFIED]
 
     def _alike(self, features: Features, excluded: frozenset[int]) -> list[int]:
         """Keyframes that look alike, most alike first."""
         found = self.index.query(features, excluded, self.config.appearance)
-        return [c.keyframe for c in found if c.score >= self.config.min_score]
+        return [c.keyframe for c in found if c.score >= MIN_SCORE]
 
     def _depth_views(self, p: Proposal, depths: Depths) -> tuple[DepthView, DepthView]:
         first, second = (

@@ -8,11 +8,34 @@ import torch
 from jaxtyping import Bool, Float, Float32, Float64, Int64, UInt8
 from torch import Tensor
 
-from geogs.config import VerificationOptions
 from geogs.geometry.camera import Camera
 from geogs.loop.features import Features
 from geogs.world.grid import SampleGrid
 
+MATCH_RATIO = 0.87
+"""A match must be this much nearer than the second nearest descriptor: looser than Lowe's 0.8,
+since the pose sorts out what is wrong."""
+MAX_REPROJECTION = 0.006
+"""Largest error of an inlier of a resected pose, of the long edge: ORB's corners of coarse scales
+are found less exactly than finest ones."""
+MAX_EPIPOLAR = 0.002
+"""Largest distance of an inlier from its epipolar line, of the long edge: one pixel of 512."""
+MIN_INLIERS = 15
+"""Fewest matches that agree with the pose."""
+MIN_INLIERS_WITHOUT_DEPTH = 25
+"""The same where no depth is known and a match binds only half as much."""
+MIN_INLIER_RATIO = 0.3
+"""Least fraction of all matches that do."""
+MIN_SPREAD = 0.25
+"""Least fraction of the cells of the raster that hold inliers, in the poorer image: one picture
+that hangs in two rooms is no loop."""
+DEPTH_TOLERANCE = 0.15
+"""Relative deviation within which an inlier's depths in both views agree, up to one scale: more
+than tracked depth is wrong by."""
+MIN_CONSISTENT = 0.6
+"""Least fraction of the inliers with depth in both views for which they do."""
+MAX_SCALE = 3.0
+"""Largest factor between the scales of both views' depths, either way: drift is less."""
 RASTER = 4
 """Cells per side in which the spread of the inliers is counted."""
 ITERATIONS = 300
@@ -70,9 +93,8 @@ class DepthView:
 class TwoViewVerifier:
     """Matches features and accepts pairs whose matches agree on one pose."""
 
-    def __init__(self, camera: Camera, options: VerificationOptions | None = None) -> None:
+    def __init__(self, camera: Camera) -> None:
         self.camera = camera
-        self.options = options or VerificationOptions()
         self._K = camera.matrix().numpy()
         self._edge = max(camera.width, camera.height)
         self._matcher = cv2.BFMatcher(cv2.NORM_HAMMING)
@@ -84,11 +106,11 @@ class TwoViewVerifier:
         both must agree at the inliers up to one scale, which is returned.
         """
         pairs = self._match(first.features, second.features)
-        if len(pairs) < self.options.min_inliers:
+        if len(pairs) < MIN_INLIERS:
             return TwoView(False, f"only {len(pairs)} features match", matches=len(pairs))
         a, b = first.features.pixels[pairs[:, 0]], second.features.pixels[pairs[:, 1]]
         depth = None if first.depth is None else first.depth[pairs[:, 0]]
-        if depth is not None and int((depth > 0).sum()) >= self.options.min_inliers:
+        if depth is not None and int((depth > 0).sum()) >= MIN_INLIERS:
             a, b, pairs, depth = (x[depth > 0] for x in (a, b, pairs, depth))
             found = self._resect(a, b, depth)
         else:
@@ -131,8 +153,8 @@ class TwoViewVerifier:
         self, source: UInt8[np.ndarray, "n 32"], target: UInt8[np.ndarray, "m 32"]
     ) -> list[tuple[int, int]]:
         nearest = self._matcher.knnMatch(source, target, k=2)
-        ratio = self.options.ratio
-        return [(m.queryIdx, m.trainIdx) for m, n in nearest if m.distance < ratio * n.distance]
+        distinct = [(m, n) for m, n in nearest if m.distance < MATCH_RATIO * n.distance]
+        return [(m.queryIdx, m.trainIdx) for m, _ in distinct]
 
     def _points(
         self, pixels: Float32[np.ndarray, "m 2"], depth: Float32[np.ndarray, "m"]
@@ -150,7 +172,7 @@ class TwoViewVerifier:
     ) -> tuple[Float64[np.ndarray, "4 4"], Bool[np.ndarray, "m"]] | None:
         """Pose by RANSAC over three points, refined on its inliers."""
         points, image = self._points(a, depth), b.astype(np.float64)
-        limit = self.options.reprojection * self._edge
+        limit = MAX_REPROJECTION * self._edge
         ok, r, t, chosen = cv2.solvePnPRansac(
             points,
             image,
@@ -181,7 +203,7 @@ class TwoViewVerifier:
             self._K,
             method=cv2.USAC_MAGSAC,
             prob=0.999,
-            threshold=self.options.epipolar * self._edge,
+            threshold=MAX_EPIPOLAR * self._edge,
         )
         if E is None or E.shape != (3, 3):
             return None
@@ -199,12 +221,11 @@ class TwoViewVerifier:
         return len(np.unique(cell @ [1, RASTER])) / RASTER**2
 
     def _weakness(self, view: TwoView) -> str:
-        o = self.options
-        if view.inliers < (o.min_inliers if view.is_metric else o.min_epipolar):
+        if view.inliers < (MIN_INLIERS if view.is_metric else MIN_INLIERS_WITHOUT_DEPTH):
             return f"only {view.inliers} matches agree with the pose"
-        if view.share < o.min_share:
+        if view.share < MIN_INLIER_RATIO:
             return f"only {view.share:.0%} of the matches agree with the pose"
-        if view.spread < o.min_spread:
+        if view.spread < MIN_SPREAD:
             return f"the matches fill only {view.spread:.0%} of the image"
         return ""
 
@@ -213,13 +234,13 @@ class TwoViewVerifier:
     ) -> tuple[float | None, str]:
         """Median ratio of the second's depth to the first's, and a refusal if few keep to it."""
         known = own > 0
-        if int(known.sum()) < self.options.min_inliers // 2:
+        if int(known.sum()) < MIN_INLIERS // 2:
             return None, ""
         ratio = np.log(own[known] / predicted[known])
         middle = float(np.median(ratio))
-        if abs(middle) > np.log(self.options.max_scale):
+        if abs(middle) > np.log(MAX_SCALE):
             return None, f"the depths differ by a factor of {np.exp(abs(middle)):.1f}"
-        share = float((np.abs(ratio - middle) < self.options.depth_tolerance).mean())
-        if share < self.options.min_consistent:
+        share = float((np.abs(ratio - middle) < DEPTH_TOLERANCE).mean())
+        if share < MIN_CONSISTENT:
             return None, f"the depths agree at only {share:.0%} of the matches"
         return float(np.exp(middle)), ""

@@ -8,9 +8,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from geogs.config import LoopConfig
 from geogs.geometry.lie import se3_inverse, sim3_inverse
-from geogs.loop.constraints import disagreement
+from geogs.loop.constraints import AGREEING_LOOPS, JOIN_TOLERANCE, disagreement
 from geogs_fleet.join.links import Link
 from geogs_fleet.join.part import PartViews
 
@@ -39,13 +38,13 @@ class _Tie:
     links: tuple[Link, ...]
 
 
-def common_gauge(parts: Sequence[PartViews], links: Sequence[Link], config: LoopConfig) -> Gauge:
+def common_gauge(parts: Sequence[PartViews], links: Sequence[Link]) -> Gauge:
     """The largest world that agreeing links make of the parts; its first part keeps its own frame.
 
     Two parts are tied where enough of their links agree, as segments of a run are. Ties with most
     links are taken first (a maximum spanning tree); a tie that contradicts those stays out.
     """
-    ties = _ties(parts, links, config)
+    ties = _ties(parts, links)
     group = list(range(len(parts)))
     tree: dict[int, list[tuple[int, Tensor]]] = defaultdict(list)
     for (a, b), tie in sorted(ties.items(), key=lambda t: (-len(t[1].links), t[0])):
@@ -65,14 +64,12 @@ def common_gauge(parts: Sequence[PartViews], links: Sequence[Link], config: Loop
                 left.append(there)
     kept = [
         link for (a, b), tie in ties.items() if a in world and b in world for link in tie.links
-        if _agrees(parts, link, world[b] @ sim3_inverse(world[a]), 2 * config.join_tolerance)
+        if _agrees(parts, link, world[b] @ sim3_inverse(world[a]), 2 * JOIN_TOLERANCE)
     ]  # fmt: skip
     return Gauge(world, tuple(kept))
 
 
-def _ties(
-    parts: Sequence[PartViews], links: Sequence[Link], config: LoopConfig
-) -> dict[tuple[int, int], _Tie]:
+def _ties(parts: Sequence[PartViews], links: Sequence[Link]) -> dict[tuple[int, int], _Tie]:
     between: dict[tuple[int, int], list[Link]] = defaultdict(list)
     for link in links:
         between[link.first[0], link.second[0]].append(link)
@@ -81,10 +78,10 @@ def _ties(
         parties = []
         for link in some:
             S = claim(parts, link)
-            agreeing = [o for o in some if _agrees(parts, o, S, config.join_tolerance)]
+            agreeing = [o for o in some if _agrees(parts, o, S, JOIN_TOLERANCE)]
             parties.append((len(agreeing), sum(o.matched for o in agreeing), S, agreeing))
         size, _, S, agreeing = max(parties, key=lambda p: p[:2])
-        if size >= config.agreeing:
+        if size >= AGREEING_LOOPS:
             ties[pair] = _Tie(S, tuple(agreeing))
     return ties
 

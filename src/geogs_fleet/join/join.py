@@ -187,7 +187,7 @@ def _joined(join: _Join, adjust: bool, say: Callable[[str], None], begin: float)
     parts, config = join.parts, join.config
     with join.timed("describing"):
         described = [
-            DescribeJob(part, join.camera, config, file, join.device)
+            DescribeJob(part, join.camera, file, join.device)
             for part, file in zip(parts, join.files, strict=True)
         ]
         keyframes = sum(join.workers.map("describing", describe, described))
@@ -195,7 +195,7 @@ def _joined(join: _Join, adjust: bool, say: Callable[[str], None], begin: float)
     views = [PartViews.load(file).outline() for file in join.files]
     with join.timed("linking"):
         links = join.links()
-        gauge = common_gauge(views, links, config.loop)
+        gauge = common_gauge(views, links)
     if len(gauge.world) < 2:
         raise InputError(
             f"No place of one part was recognised in another ({len(links)} single views alike); "

@@ -57,7 +57,7 @@ class Link:
 def links_of(job: LinkJob) -> list[Link]:
     """The pairs that are links: by features with depth, then by dense flow."""
     grid = SampleGrid(job.camera)
-    verifier = TwoViewVerifier(job.camera, job.config.loop.verification)
+    verifier = TwoViewVerifier(job.camera)
     views = [PartViews.load(path) for path in job.views]
     wanted: list[tuple[int, int, Tensor, float, int]] = []
     for a, b in job.pairs:
@@ -78,9 +78,7 @@ def links_of(job: LinkJob) -> list[Link]:
     found = []
     for a, b, T_ji, scale, inliers in wanted:
         first, second = loaded[0][a], loaded[1][b]
-        check = dense_check(
-            grid, operator, first, second, T_ji, scale, job.config.loop.verification
-        )
+        check = dense_check(grid, operator, first, second, T_ji, scale)
         if not check.accepted or check.T_ji is None or check.there is None or check.back is None:
             continue
         loop = Loop(

@@ -9,7 +9,6 @@ import torch
 from jaxtyping import Float32, Float64, UInt8
 
 from geogs.application.results.saved_result import SavedResult, load_result
-from geogs.config import Config
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.io.writers.keyframe_images import image_path, read_image
@@ -89,7 +88,6 @@ class DescribeJob:
     part: Part
     camera: Camera
     """That all parts are seen by, of the images."""
-    config: Config
     file: Path
     """Where the views go."""
     device: str = "cpu"
@@ -102,7 +100,7 @@ def describe(job: DescribeJob) -> int:
     Returns the number of keyframes. Raises InputError if the result has no images, or is damaged.
     """
     result = opened(job.part, job.device)
-    grid, extract = SampleGrid(job.camera), FeatureExtractor(job.config.loop.retrieval)
+    grid, extract = SampleGrid(job.camera), FeatureExtractor()
     depths, known, features = [], [], []
     for number, T_cw in enumerate(torch.from_numpy(result.views.T_cw)):
         features.append(extract(image_of(result, number, job.camera)))

@@ -5,6 +5,7 @@ from collections.abc import Iterable
 
 from geogs.config import LoopConfig
 from geogs.loop.retrieval import AppearanceIndex
+from geogs.loop.search import MIN_SCORE, SUPPRESSION
 from geogs_fleet.join.part import PartViews
 
 Candidates = dict[tuple[int, int], list[tuple[int, int]]]
@@ -15,22 +16,22 @@ def candidates(parts: Iterable[PartViews], config: LoopConfig) -> Candidates:
     """Pairs of keyframes of different parts that look alike, most alike first.
 
     Each keyframe is compared with those of all parts before its own. Of a pair of parts, a pair of
-    keyframes rules out others whose ends together lie within ``suppression`` keyframes of its own.
+    keyframes rules out others whose ends together lie within ``SUPPRESSION`` keyframes of its own.
     Parts are looked at one at a time; what stays in memory is the index.
     """
-    index = AppearanceIndex(config.retrieval)
+    index = AppearanceIndex()
     names: list[tuple[int, int]] = []
     found: dict[tuple[int, int], list[tuple[float, int, int]]] = defaultdict(list)
     for number, part in enumerate(parts):
         for place, features in enumerate(part.features if number else ()):
             for alike in index.query(features, (), config.appearance):
-                if alike.score >= config.min_score:
+                if alike.score >= MIN_SCORE:
                     other, theirs = names[alike.keyframe]
                     found[other, number].append((alike.score, theirs, place))
         for place, features in enumerate(part.features):
             index.add(len(names), features)
             names.append((number, place))
-    return {pair: _thinned(scored, config.suppression) for pair, scored in sorted(found.items())}
+    return {pair: _thinned(scored, SUPPRESSION) for pair, scored in sorted(found.items())}
 
 
 def _thinned(scored: list[tuple[float, int, int]], reach: int) -> list[tuple[int, int]]:

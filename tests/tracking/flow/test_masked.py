@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from geogs.config import RetrievalOptions, TrackingConfig
+from geogs.config import TrackingConfig
 from geogs.errors import InputError
 from geogs.loop.features import FeatureExtractor
 from geogs.tracking.flow.masked import MaskedFlow
@@ -57,8 +57,7 @@ def test_a_mask_has_the_size_of_the_images_and_shows_something():
 
 def test_no_features_are_found_where_the_mask_hides():
     image = with_bonnet(render(pose(0.0))[0])
-    options = RetrievalOptions()
-    everywhere, shown = (FeatureExtractor(options, m)(image) for m in (None, MASK))
+    everywhere, shown = (FeatureExtractor(m)(image) for m in (None, MASK))
     assert (everywhere.pixels[:, 1] > 106).any()
     assert len(shown) > 20
     assert shown.pixels[:, 1].max() < 106
