@@ -22,7 +22,7 @@ import cv2
 import numpy as np
 import torch
 
-from geogs.config import CalibrationConfig, InputConfig
+from geogs.config import InputConfig
 from geogs.evaluation.trajectory import evaluate_trajectory
 from geogs.geometry.camera import Camera
 from geogs.io.sources.sniff import open_source
@@ -95,7 +95,6 @@ def main() -> None:
     parser.add_argument("--no-tracking", action="store_true")
     options = parser.parse_args()
     torch.set_num_threads(1)
-    config = CalibrationConfig(radial=options.radial)
     print(
         "| sequence | from | guess | estimate | deviation | known | error | error/dev. "
         "| keyframes | seconds | ATE known | ATE auto | ratio |"
@@ -109,7 +108,7 @@ def main() -> None:
         known = sequence.camera.fx
         for start in map(int, options.starts.split(",")):
             begin = time.perf_counter()
-            found = self_calibrate(sequence.frames[start:], first, config, options.device)
+            found = self_calibrate(sequence.frames[start:], first, options.radial, options.device)
             seconds = time.perf_counter() - begin
             error = found.camera.fx / known - 1
             row = [name, start, f"{first.fx:.1f}"]

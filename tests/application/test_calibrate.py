@@ -16,11 +16,15 @@ from geogs.config import CalibrationConfig, Config, InputConfig
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.sniff import open_source
 from geogs.io.writers.intrinsics import write_intrinsics
-from geogs.tracking.calibration import estimate
+from geogs.tracking.calibration import estimate, stretch
 from geogs.tracking.calibration.estimate import SelfCalibration
 from tracking_scenes import CAMERA, pose, render
 
-CONFIG = Config(calibration=CalibrationConfig(start_keyframes=8, keyframes=12))
+
+@pytest.fixture(autouse=True)
+def _few_keyframes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stretch, "START_KEYFRAMES", 8)
+    monkeypatch.setattr(stretch, "KEYFRAMES", 12)
 
 
 class Listener(RunProgress):
@@ -59,7 +63,7 @@ def written(source, folder: Path) -> dict:
 
 def test_intrinsics_json_holds_the_deviation(video, tmp_path, capfd):
     listener = Listener()
-    source = self_calibrated(open_source(video), CONFIG, progress=listener)
+    source = self_calibrated(open_source(video), Config(), progress=listener)
     document = written(source, tmp_path)
     of_source = document["source"]
     deviation = of_source["focal_deviation"]
@@ -82,7 +86,7 @@ def test_intrinsics_json_holds_the_deviation(video, tmp_path, capfd):
 def test_a_camera_that_stands_still_leaves_the_guess(tmp_path):
     before = open_source(write_images(tmp_path / "still", [pose(0.0)] * 4))
     listener = Listener()
-    source = self_calibrated(before, CONFIG, progress=listener)
+    source = self_calibrated(before, Config(), progress=listener)
     of_source = written(source, tmp_path)["source"]
     assert source.camera == before.camera
     assert of_source["is_guess"] is True
@@ -97,9 +101,9 @@ def test_a_camera_that_stands_still_leaves_the_guess(tmp_path):
 def test_what_is_given_or_not_wanted_is_left_alone(video, monkeypatch):
     monkeypatch.setattr(estimate, "self_calibrate", pytest.fail)
     given = open_source(video, InputConfig(intrinsics="140,140,95.5,71.5"))
-    assert self_calibrated(given, CONFIG) is given
+    assert self_calibrated(given, Config()) is given
     guessed = open_source(video)
-    off = replace(CONFIG, calibration=CalibrationConfig(refine=False))
+    off = Config(calibration=CalibrationConfig(refine=False))
     assert self_calibrated(guessed, off) is guessed
 
 
@@ -121,11 +125,11 @@ def test_ctrl_c_goes_on_with_the_guess(video, monkeypatch):
     monkeypatch.setattr(estimate, "self_calibrate", interrupted)
     source = open_source(video)
     listener = Listener()
-    assert self_calibrated(source, CONFIG, progress=listener, stop=Interruption()) is source
+    assert self_calibrated(source, Config(), progress=listener, stop=Interruption()) is source
     (said,) = listener.said
     assert said.startswith("Calibration stopped")
     with pytest.raises(KeyboardInterrupt):  # of a caller who has no way to stop
-        self_calibrated(source, CONFIG)
+        self_calibrated(source, Config())
 
 
 def test_what_was_found_at_working_size_is_carried_to_the_source():

@@ -51,7 +51,7 @@ def self_calibrated(
             found = self_calibrate(
                 frames,
                 source.camera,
-                config.calibration,
+                config.calibration.radial,
                 torch.device(device),
                 config.seed,
                 report,

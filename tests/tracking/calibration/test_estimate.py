@@ -9,8 +9,8 @@ import torch
 
 import tracking_scenes
 from geogs.bundle.lens import Lens, lens_rays
-from geogs.config import CalibrationConfig
 from geogs.geometry.camera import Camera
+from geogs.tracking.calibration import stretch
 from geogs.tracking.calibration.estimate import self_calibrate
 from geogs.tracking.calibration.keyframes import with_focal
 from geogs.tracking.calibration.sureness import LEAST_DEVIATION
@@ -19,7 +19,11 @@ from tracking_scenes import CAMERA, frames, pose, render
 
 pytestmark = pytest.mark.system
 
-CONFIG = CalibrationConfig(start_keyframes=8, keyframes=16)
+
+@pytest.fixture(autouse=True)
+def _few_keyframes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stretch, "START_KEYFRAMES", 8)
+    monkeypatch.setattr(stretch, "KEYFRAMES", 16)
 
 
 def swinging(count: int) -> list[np.ndarray]:
@@ -34,7 +38,7 @@ def swinging(count: int) -> list[np.ndarray]:
 def test_finds_the_focal_length_of_a_rendered_room(factor):
     guess = with_focal(CAMERA, factor * CAMERA.fx)
     shares = []
-    found = self_calibrate(frames(swinging(22)), guess, CONFIG, report=shares.append)
+    found = self_calibrate(frames(swinging(22)), guess, report=shares.append)
     assert found.failure is None
     error = abs(found.camera.fx / CAMERA.fx - 1)
     print(f"{found.camera.fx:.2f} +- {100 * found.deviation:.2f} %, error {100 * error:.2f} %")
@@ -51,8 +55,7 @@ def test_finds_the_focal_length_of_a_rendered_room(factor):
 
 @pytest.mark.long
 def test_the_radial_term_of_a_pinhole_is_none():
-    config = replace(CONFIG, radial=True)
-    found = self_calibrate(frames(swinging(22)), with_focal(CAMERA, 200.0), config)
+    found = self_calibrate(frames(swinging(22)), with_focal(CAMERA, 200.0), radial=True)
     assert found.failure is None
     assert found.deviation_k1 is not None
     assert abs(found.k1) < max(0.02, 2.5 * found.deviation_k1)
@@ -69,8 +72,7 @@ def test_finds_the_radial_term_of_a_distorting_lens():
         Frame(k, k / 30, cv2.remap(render(T, wide)[0], at, None, cv2.INTER_CUBIC))
         for k, T in enumerate(swinging(22))
     ]
-    config = replace(CONFIG, radial=True)
-    found = self_calibrate(video, with_focal(CAMERA, 190.0), config)
+    found = self_calibrate(video, with_focal(CAMERA, 190.0), radial=True)
     assert found.failure is None
     assert found.deviation_k1 is not None
     print(found)
@@ -87,7 +89,7 @@ def pixels_of(camera: Camera) -> np.ndarray:
 def test_a_camera_that_only_turns_is_said_to():
     path = [pose(0.0, 0.0, 0.0, 0.03 * k) for k in range(16)]
     guess = with_focal(CAMERA, 120.0)
-    found = self_calibrate(frames(path), guess, CONFIG)
+    found = self_calibrate(frames(path), guess)
     assert found.failure == "the camera only turns (no parallax)"
     assert found.camera == guess
 
@@ -96,14 +98,14 @@ def test_a_plane_is_said_to_be_one(monkeypatch):
     plane, hidden = ((0.2, 0.1, 1.0), 2.5), ((0.0, 0.0, 1.0), 100.0)
     monkeypatch.setattr(tracking_scenes, "PLANES", [plane, hidden])
     guess = with_focal(CAMERA, 120.0)
-    found = self_calibrate(frames(swinging(16)), guess, CONFIG)
+    found = self_calibrate(frames(swinging(16)), guess)
     assert found.failure == "it shows a single plane"
     assert found.camera == guess
 
 
 def test_a_camera_that_stands_still_is_said_to():
     guess = with_focal(CAMERA, 120.0)
-    found = self_calibrate(frames([pose(0.0)] * 5), guess, CONFIG)
+    found = self_calibrate(frames([pose(0.0)] * 5), guess)
     assert found.failure == "the camera hardly moves"
     assert found.camera == guess
     assert found.frames == 5
@@ -111,7 +113,7 @@ def test_a_camera_that_stands_still_is_said_to():
 
 def test_frames_without_texture_are_said_to_have_none():
     grey = [replace(f, image=np.full_like(f.image, 90)) for f in frames([pose(0.0)] * 3)]
-    assert self_calibrate(grey, CAMERA, CONFIG).failure == "no frame has enough texture"
+    assert self_calibrate(grey, CAMERA).failure == "no frame has enough texture"
 
 
 def test_what_the_report_raises_passes_through():
@@ -119,4 +121,4 @@ def test_what_the_report_raises_passes_through():
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        self_calibrate(frames(swinging(4)), CAMERA, CONFIG, report=stop)
+        self_calibrate(frames(swinging(4)), CAMERA, report=stop)

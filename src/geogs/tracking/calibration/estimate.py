@@ -9,16 +9,24 @@ import numpy as np
 import torch
 from jaxtyping import Bool
 
-from geogs.config import CalibrationConfig, TrackingConfig
+from geogs.config import TrackingConfig
 from geogs.geometry.camera import Camera
 from geogs.threads import on_one_torch_thread
 from geogs.tracking.calibration.degeneracy import Degeneracy
 from geogs.tracking.calibration.keyframes import ViewGatherer
-from geogs.tracking.calibration.stretch import Report, Stretch
+from geogs.tracking.calibration.stretch import FRAMES, Report, Stretch
 from geogs.tracking.calibration.sureness import Estimate, estimate, joined
 from geogs.tracking.flow.select import build_operator
 from geogs.types import Frame
 from geogs.world.grid import SampleGrid
+
+STRETCHES = 4
+"""Stretches of the video that are asked, at most, each after the one before it: bounds the time."""
+CONFIDENT = 0.01
+"""Relative deviation of the focal length from which no other stretch is asked."""
+UNRELIABLE = 0.1
+"""Relative deviation above which the focal length is not believed and the guess is kept, which may
+be as good."""
 
 
 @dataclass(frozen=True)
@@ -43,14 +51,14 @@ class SelfCalibration:
 def self_calibrate(
     frames: Iterable[Frame],
     camera: Camera,
-    config: CalibrationConfig,
+    radial: bool = False,
     device: torch.device | str = "cpu",
     seed: int = 0,
     report: Report = lambda fraction: None,
     mask: Bool[np.ndarray, "h w"] | None = None,
     black_is_masked: bool = False,
 ) -> SelfCalibration:
-    """Estimate the focal length, and k1 if ``config.radial``, of the camera that took ``frames``.
+    """Estimate the focal length, and k1 if ``radial``, of the camera that took ``frames``.
 
     Aspect and principal point of ``camera`` are believed, its focal length is only one of several
     to start from. Flow is measured by the operator without a network. Stretch after stretch of the
@@ -61,32 +69,34 @@ def self_calibrate(
     cv2.setRNGSeed(seed)
     grid = SampleGrid(camera, device)
     operator = build_operator(TrackingConfig(operator="classical"), grid, mask, black_is_masked)
-    gatherer = ViewGatherer(iter(frames), grid, operator, config.keyframe_flow)
+    gatherer = ViewGatherer(iter(frames), grid, operator)
     estimates: list[Estimate] = []
     failure = ""
-    for n in range(config.stretches):
-        found = _ask(Stretch(grid, operator, gatherer, config, _share_of(report, n)), config)
+    for n in range(STRETCHES):
+        found = _ask(Stretch(grid, operator, gatherer, radial, _share_of(report, n)))
         if isinstance(found, Estimate):
             estimates.append(found)
         else:
             failure = failure or found
-        if gatherer.frames >= config.frames or gatherer.is_over:
+        if gatherer.frames >= FRAMES or gatherer.is_over:
             break
-        if estimates and joined(estimates).deviation < config.sure:
+        if estimates and joined(estimates).deviation < CONFIDENT:
             break
     if not estimates:
         return SelfCalibration(camera, frames=gatherer.frames, failure=failure)
     report(1.0)
-    return _verdict(camera, config, joined(estimates), gatherer.frames)
+    return _verdict(camera, radial, joined(estimates), gatherer.frames)
 
 
-def _ask(stretch: Stretch, config: CalibrationConfig) -> Estimate | str:
+def _ask(stretch: Stretch) -> Estimate | str:
     """What the next stretch says, or why it says nothing."""
     start = stretch.start()
     if isinstance(start, Degeneracy):
         return start.value
     bundle = stretch.grow(start)
-    return "its motion could not be followed" if bundle is None else estimate(bundle, config.radial)
+    return (
+        "its motion could not be followed" if bundle is None else estimate(bundle, stretch.radial)
+    )
 
 
 def _share_of(report: Report, n: int) -> Report:
@@ -94,14 +104,12 @@ def _share_of(report: Report, n: int) -> Report:
     return lambda done: report(1 - 0.5**n * (1 - done / 2))
 
 
-def _verdict(
-    guess: Camera, config: CalibrationConfig, found: Estimate, frames: int
-) -> SelfCalibration:
+def _verdict(guess: Camera, radial: bool, found: Estimate, frames: int) -> SelfCalibration:
     """The estimate, or why it is not believed."""
-    if not found.deviation < config.too_much:
+    if not found.deviation < UNRELIABLE:
         failure = f"its motion leaves the focal length unsure by {100 * found.deviation:.0f} %"
         return SelfCalibration(guess, keyframes=found.keyframes, frames=frames, failure=failure)
-    deviation_k1 = found.deviation_k1 if config.radial else None
+    deviation_k1 = found.deviation_k1 if radial else None
     return SelfCalibration(
         found.camera, found.k1, found.deviation, deviation_k1, found.keyframes, frames
     )

@@ -37,12 +37,9 @@ class View:
 class ViewGatherer:
     """Takes keyframes by image motion alone, which needs no focal length."""
 
-    def __init__(
-        self, frames: Iterator[Frame], grid: SampleGrid, operator: FlowOperator, motion: float
-    ) -> None:
-        """``motion``: median flow that makes a keyframe, of the long edge."""
+    def __init__(self, frames: Iterator[Frame], grid: SampleGrid, operator: FlowOperator) -> None:
         self._frames, self._grid, self._operator = frames, grid, operator
-        self._config = replace(TrackingConfig(), keyframe_flow=motion)
+        self._config = TrackingConfig()
         self._chain = FlowChain(grid, operator, self._config.min_ncc)
         self.frames = 0
         """Frames taken so far."""

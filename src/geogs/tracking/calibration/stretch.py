@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 
-from geogs.config import CalibrationConfig
 from geogs.threads import thread_map
 from geogs.tracking.calibration.degeneracy import MAX_COST, Degeneracy, degeneracy
 from geogs.tracking.calibration.growth import GrowingBundle
@@ -13,6 +12,17 @@ from geogs.tracking.flow.base import FlowOperator
 from geogs.types import FlowMatch
 from geogs.world.grid import SampleGrid
 
+FRAMES = 600
+"""Frames of the video that are looked at, at most, in all of its stretches: bounds the time."""
+START_KEYFRAMES = 12
+"""Keyframes of a stretch that are solved first, and by which it then grows."""
+KEYFRAMES = 36
+"""Most keyframes of a stretch; they are added until the focal length is known well enough."""
+ENOUGH = 0.0021
+"""Relative deviation of the focal length from which no more keyframes of a stretch are used."""
+MIN_PARALLAX = 0.02
+"""Motion that rotation does not explain, needed between two keyframes, of the long edge: what the
+focal length is read off."""
 LEAST_VIEWS = 4
 
 Report = Callable[[float], None]
@@ -26,15 +36,16 @@ class Stretch:
         grid: SampleGrid,
         operator: FlowOperator,
         gatherer: ViewGatherer,
-        config: CalibrationConfig,
+        radial: bool,
         report: Report,
     ) -> None:
-        self.grid, self.operator, self.config = grid, operator, config
+        """``radial``: whether k1 is found, too."""
+        self.grid, self.operator, self.radial = grid, operator, radial
         self._gatherer, self._report = gatherer, report
         self._views: list[View] = []
         self._done = 0.0
         edge = max(grid.camera.width, grid.camera.height)
-        self._min_parallax = config.min_parallax * edge
+        self._min_parallax = MIN_PARALLAX * edge
 
     def _tick(self) -> None:
         """Every frame is a safe point."""
@@ -43,12 +54,12 @@ class Stretch:
     def _gather(self, count: int) -> bool:
         """Whether there are more views than before."""
         before = len(self._views)
-        self._views = self._gatherer.gather(self._views, count, self.config.frames, self._tick)
+        self._views = self._gatherer.gather(self._views, count, FRAMES, self._tick)
         return len(self._views) > before
 
     def start(self) -> Start | Degeneracy:
         """The first views that show parallax and depth, placed by the best candidate."""
-        count = max(self.config.start_keyframes, 2 * LEAST_VIEWS)
+        count = max(START_KEYFRAMES, 2 * LEAST_VIEWS)
         failure = Degeneracy.BLANK
         while self._gather(count):
             if len(self._views) < LEAST_VIEWS:
@@ -79,7 +90,7 @@ class Stretch:
 
     def grow(self, start: Start) -> GrowingBundle | None:
         """Adjust, with more keyframes until the focal length is sure; None if it fails at once."""
-        config, bundle = self.config, GrowingBundle(self.grid, self.operator, self._views, start)
+        bundle = GrowingBundle(self.grid, self.operator, self._views, start)
         best = None
         while True:
             for view in self._views[len(bundle) :]:
@@ -88,11 +99,11 @@ class Stretch:
                     return best
             for fine in (False, True):
                 bundle.measure(fine, self._tick)
-                if not bundle.adjust(config.radial):
+                if not bundle.adjust(self.radial):
                     return best
             best = bundle
-            self._done = 0.3 + 0.7 * min(1.0, len(bundle) / config.keyframes)
-            if relative_error(bundle) < config.enough or len(bundle) >= config.keyframes:
+            self._done = 0.3 + 0.7 * min(1.0, len(bundle) / KEYFRAMES)
+            if relative_error(bundle) < ENOUGH or len(bundle) >= KEYFRAMES:
                 return best
-            if not self._gather(min(len(bundle) + config.start_keyframes, config.keyframes)):
+            if not self._gather(min(len(bundle) + START_KEYFRAMES, KEYFRAMES)):
                 return best
