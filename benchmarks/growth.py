@@ -27,7 +27,7 @@ from geogs.loop.retrieval import AppearanceIndex
 from geogs.mapping.mapper import Mapper
 from geogs.tracking.flow.classical import ClassicalFlow
 from geogs.world.grid import SampleGrid
-from geogs.world.store import KeyframeStore
+from geogs.world.keyframes import KeyframeTable
 from geogs_synth.sequence.export import default_camera
 
 STEP = 0.15
@@ -73,8 +73,8 @@ def mapping(count: int, size: tuple[int, int]) -> dict[str, float]:
     """Steps of the mapper, and what the main thread does for the search of loops."""
     camera, random = default_camera(*size), np.random.default_rng(0)
     grid = SampleGrid(camera)
-    store = KeyframeStore(grid, ClassicalFlow(grid).encode, 128)
-    segment, mapper = store.new_segment(), Mapper(store, preset("fast").mapping)
+    store = KeyframeTable.on(grid, ClassicalFlow(grid).encode, 128)
+    segment, mapper = store.new_set(), Mapper(store, preset("fast").mapping)
     detector = LoopDetector(store, ClassicalFlow(grid), LoopConfig())
     image = random.integers(0, 256, (camera.height, camera.width, 3), dtype=np.uint8)
     render = mapper.cameras.render

@@ -24,7 +24,7 @@ from geogs.depth.view import DepthView, KeyframeDepth, depth_view
 from geogs.geometry.camera import Camera
 from geogs.geometry.umeyama import umeyama
 from geogs.world.grid import SampleGrid
-from geogs.world.store import KeyframeStore
+from geogs.world.keyframes import KeyframeTable
 
 
 def load_views(
@@ -44,7 +44,7 @@ def load_views(
     ate = 100 * np.sqrt(((poses[:, :3, 3] - true[:, :3, 3]) ** 2).sum(1).mean())
     print(f"{room.name}: {len(poses)} keyframes, ATE {ate:.2f} cm")
     files = sorted((room / "results").glob("frame*.jpg"))
-    views, segment = [], KeyframeStore(SampleGrid(working)).new_segment()
+    views, segment = [], KeyframeTable.on(SampleGrid(working)).new_set()
     for i, k in enumerate(data["k"]):
         image = cv2.cvtColor(cv2.imread(str(files[k])), cv2.COLOR_BGR2RGB)
         image = cv2.resize(image, (working.width, working.height), interpolation=cv2.INTER_AREA)

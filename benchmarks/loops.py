@@ -33,7 +33,7 @@ from geogs.loop.retrieval import AppearanceIndex
 from geogs.loop.verification import DepthView, TwoViewVerifier
 from geogs.tracking.flow.classical import ClassicalFlow
 from geogs.world.grid import SampleGrid
-from geogs.world.store import KeyframeStore, Segment
+from geogs.world.keyframes import KeyframeSet, KeyframeTable
 from tracking import Sequence, load
 
 OVERLAP, DEGREES, SHARE_OF_DEPTH = 0.3, 5.0, 0.1
@@ -117,7 +117,7 @@ def overlaps(depth: np.ndarray, T_wc: np.ndarray, grid: SampleGrid) -> np.ndarra
 
 def prepare(
     folder: Path, points: Path, every: int, long_edge: int, drift: float
-) -> tuple[Segment, ClassicalFlow, Truth]:
+) -> tuple[KeyframeSet, ClassicalFlow, Truth]:
     """Keyframes as a drifting tracker would have left them, and the truth about them."""
     whole = load(folder, long_edge, None)
     sequence = Sequence(whole.files[::every], whole.camera, whole.T_wc[::every], None)
@@ -126,7 +126,7 @@ def prepare(
     T_cw = se3_inverse(torch.from_numpy(sequence.T_wc))
     rng = np.random.default_rng(0)
     scale = np.exp(np.cumsum(drift * 0.01 * rng.standard_normal(len(depth))))
-    store, operator = KeyframeStore(grid).new_segment(), ClassicalFlow(grid)
+    store, operator = KeyframeTable.on(grid).new_set(), ClassicalFlow(grid)
     T, fields = T_cw[0], grid_fields(grid)
     for n, frame in enumerate(sequence.frames()):
         if n:
@@ -144,7 +144,7 @@ def prepare(
     return store, operator, Truth(T_cw, torch.from_numpy(depth), overlap, scale)
 
 
-def separate(store: Segment, operator: ClassicalFlow, truth: Truth, gap: int) -> None:
+def separate(store: KeyframeSet, operator: ClassicalFlow, truth: Truth, gap: int) -> None:
     """Retrieval, then verification of all that it returned, with and without depth."""
     clock, index = Clock(), AppearanceIndex()
     verifier, features = TwoViewVerifier(store.grid.camera), {}
@@ -231,10 +231,10 @@ def separate(store: Segment, operator: ClassicalFlow, truth: Truth, gap: int) ->
     print(f"  CPU ms: {clock.report()}")
 
 
-def together(store: Segment, operator: ClassicalFlow, truth: Truth, gap: int) -> None:
+def together(store: KeyframeSet, operator: ClassicalFlow, truth: Truth, gap: int) -> None:
     """The detector as a system would run it."""
     detector, clock = (
-        LoopDetector(store.store, operator, LoopConfig(min_gap=gap)),
+        LoopDetector(store.table, operator, LoopConfig(min_gap=gap)),
         Clock(),
     )
     for k in store.ids:

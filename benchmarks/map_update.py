@@ -52,7 +52,7 @@ from geogs.mapping.mapper import Mapper
 from geogs.mesh.extract import extract_mesh
 from geogs.types import PoseCorrection
 from geogs.world.grid import SampleGrid
-from geogs.world.store import KeyframeStore
+from geogs.world.keyframes import KeyframeTable
 from geogs_synth.motion.handheld import FRAMES_PER_LAP, handheld_trajectory
 from geogs_synth.places.room import make_room
 from geogs_synth.raycast.raycaster import Raycaster
@@ -197,8 +197,8 @@ def close(walk: Walk) -> PoseCorrection:
 
 def build(keyframes: Sequence[Observed], config: MappingConfig) -> Mapper:
     """The map as an online run makes it."""
-    segment = KeyframeStore(SampleGrid(CAMERA)).new_segment()
-    mapper = Mapper(segment.store, config)
+    segment = KeyframeTable.on(SampleGrid(CAMERA)).new_set()
+    mapper = Mapper(segment.table, config)
     for n, seen in enumerate(keyframes):
         keyframe = segment.add(EVERY * n, EVERY * n / 30, seen.image, None, seen.T_cw)
         keyframe.inverse_depth = seen.inverse_depth.float().ravel()
@@ -346,7 +346,7 @@ def compare(scene: str, drift: float, with_mesh: bool) -> None:
     for name, strategy, c in ways:
         moved = build(there.keyframes, MAPPING)
         moved.config = replace(MAPPING, ablation=MapAblation(map_update=strategy))
-        moved.keyframes.segment_of(0).correct(c)
+        moved.keyframes.set_of[0].correct(c)
         seconds = planning_time(moved, c)
         moved.correct(c)
         T_cw = torch.stack([c.after[k] for k in range(KEYFRAMES)])

@@ -37,10 +37,10 @@ from geogs.mesh.extract import extract_mesh
 from geogs.mesh.types import DepthMapView, Mesh
 from geogs.tracking.tracker import Tracker
 from geogs.world.grid import SampleGrid
-from geogs.world.store import KeyframeStore, Segment
+from geogs.world.keyframes import KeyframeSet, KeyframeTable
 
 
-def track(sequence: Path, config: Config) -> Segment:
+def track(sequence: Path, config: Config) -> KeyframeSet:
     """Keyframes after tracking and the global bundle adjustment."""
     source = open_source(sequence, config.input)
     tracker = Tracker(source.camera, config.tracking, seed=config.seed)
@@ -51,7 +51,7 @@ def track(sequence: Path, config: Config) -> Segment:
     return tracker.keyframes
 
 
-def save_state(path: Path, keyframes: Segment) -> None:
+def save_state(path: Path, keyframes: KeyframeSet) -> None:
     """Everything but the images."""
     np.savez(
         path,
@@ -63,12 +63,12 @@ def save_state(path: Path, keyframes: Segment) -> None:
     )
 
 
-def load_state(path: Path, sequence: Path, config: Config) -> Segment:
+def load_state(path: Path, sequence: Path, config: Config) -> KeyframeSet:
     """The keyframes of :func:`save_state`, images read again."""
     state = np.load(path)
     source = open_source(sequence, config.input)
     wanted = {int(f): n for n, f in enumerate(state["frame"])}
-    keyframes = KeyframeStore(SampleGrid(source.camera)).new_segment()
+    keyframes = KeyframeTable.on(SampleGrid(source.camera)).new_set()
     for frame in source:
         if frame.index in wanted:
             n = wanted[frame.index]
@@ -79,7 +79,7 @@ def load_state(path: Path, sequence: Path, config: Config) -> Segment:
     return keyframes
 
 
-def alignment(keyframes: Segment, truth: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+def alignment(keyframes: KeyframeSet, truth: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
     """Similarity from the tracker's world to the true one, and their ATE in cm."""
     centres = torch.stack([torch.linalg.inv(k.T_cw)[:3, 3] for k in keyframes])
     true = torch.from_numpy(truth[[k.frame_index for k in keyframes], :3, 3])
@@ -90,7 +90,7 @@ def alignment(keyframes: Segment, truth: np.ndarray) -> tuple[float, np.ndarray,
 
 
 def take_true_poses(
-    keyframes: Segment, truth: np.ndarray, sim: tuple[float, np.ndarray, np.ndarray]
+    keyframes: KeyframeSet, truth: np.ndarray, sim: tuple[float, np.ndarray, np.ndarray]
 ) -> None:
     """Give keyframes the true poses, expressed in the tracker's frame and scale."""
     scale, R, t = sim
@@ -101,9 +101,9 @@ def take_true_poses(
         k.T_cw = torch.from_numpy(np.linalg.inv(T_wc))
 
 
-def build(keyframes: Segment, config: Config) -> Mapper:
+def build(keyframes: KeyframeSet, config: Config) -> Mapper:
     """The map, keyframe by keyframe as in a run, then refined."""
-    mapper = Mapper(keyframes.store, config.mapping, seed=config.seed)
+    mapper = Mapper(keyframes.table, config.mapping, seed=config.seed)
     lag, start, ids = config.mapping.lag, time.perf_counter(), keyframes.ids
     for n, id in enumerate(ids):
         mapper.observe(id)

@@ -37,7 +37,7 @@ from geogs.splat.init import initialise_disks
 from geogs.splat.map import DiskParameters, GaussianMap
 from geogs.splat.render import render_views
 from geogs.world.grid import SampleGrid
-from geogs.world.store import KeyframeStore, Segment
+from geogs.world.keyframes import KeyframeSet, KeyframeTable
 from geogs_synth.motion.handheld import handheld_trajectory
 from geogs_synth.places.room import make_room
 from geogs_synth.raycast.raycaster import Raycaster
@@ -82,7 +82,7 @@ class Window:
         scene = make_room(0)
         caster, poses = Raycaster(scene), handheld_trajectory(scene, FRAMES_APART * views)
         own, depths = [], []
-        segment = KeyframeStore(SampleGrid(photo, device)).new_segment()
+        segment = KeyframeTable.on(SampleGrid(photo, device)).new_set()
         pool = ViewPool(cameras, LossConfig(), device, views)
         for T_wc in poses[::FRAMES_APART]:
             depths.append(torch.from_numpy(caster.render(cameras.render, T_wc).depth).float())
@@ -100,7 +100,7 @@ class Window:
 
 
 def _view(
-    segment: Segment, pool: ViewPool, image: np.ndarray, T_wc: np.ndarray, depth: Tensor
+    segment: KeyframeSet, pool: ViewPool, image: np.ndarray, T_wc: np.ndarray, depth: Tensor
 ) -> MapView:
     n, T_cw = len(segment), se3_inverse(torch.from_numpy(T_wc))
     view = MapView(segment.add(n, n / 30, image, None, T_cw), pool)

@@ -26,7 +26,7 @@ from geogs.splat.map import GaussianMap
 from geogs.splat.render import render
 from geogs.threads import worker_count
 from geogs.world.grid import SampleGrid
-from geogs.world.store import KeyframeStore
+from geogs.world.keyframes import KeyframeTable
 from geogs_synth.motion.handheld import handheld_trajectory
 from geogs_synth.places.room import make_room
 from geogs_synth.raycast.raycaster import Raycaster
@@ -41,7 +41,7 @@ def make_views(config: MappingConfig, width: int) -> tuple[list[MapView], MapCam
     caster = Raycaster(scene)
     poses = handheld_trajectory(scene, 60)
     views, pool = [], ViewPool(cameras, config.loss, torch.device("cpu"), 128)
-    segment = KeyframeStore(SampleGrid(photo)).new_segment()
+    segment = KeyframeTable.on(SampleGrid(photo)).new_set()
     for index in (0, 12, 24, 36, 48):
         image = caster.render(photo, poses[index]).image
         depth = caster.render(cameras.render, poses[index]).depth

@@ -10,8 +10,7 @@ from torch import Tensor
 
 from geogs.geometry.camera import Camera
 from geogs.world.grid import SampleGrid
-from geogs.world.keyframe import Keyframe
-from geogs.world.store import KeyframeStore, Segment
+from geogs.world.keyframes import Keyframe, KeyframeSet, KeyframeTable
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,15 +29,15 @@ def segment_of(
     camera: Camera,
     device: torch.device | str = "cpu",
     resident: int = 128,
-) -> Segment:
+) -> KeyframeSet:
     """A segment of a new store that holds them, ids from 0."""
-    segment = KeyframeStore(SampleGrid(camera, device), None, resident).new_segment()
+    segment = KeyframeTable.on(SampleGrid(camera, device), None, resident).new_set()
     for sample in samples:
         add(segment, sample)
     return segment
 
 
-def add(segment: Segment, sample: Sample) -> Keyframe:
+def add(segment: KeyframeSet, sample: Sample) -> Keyframe:
     """Append a keyframe."""
     keyframe = segment.add(
         sample.frame_index, sample.frame_index / 30, sample.image, None, sample.T_cw

@@ -11,7 +11,7 @@ from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_inverse
 from geogs.tracking.flow.classical import ClassicalFlow
 from geogs.world.grid import SampleGrid
-from geogs.world.store import KeyframeStore, Segment
+from geogs.world.keyframes import KeyframeSet, KeyframeTable
 from geogs_synth.places.room import make_room
 from geogs_synth.raycast.raycaster import Raycaster, View
 from geogs_synth.scene.scene import Scene
@@ -76,10 +76,12 @@ def rearranged(scene: Scene, seed: int = 0, reach: float = 0.35) -> Scene:
     return replace(scene, centre=np.where(large[:, None], scene.centre, scene.centre + shift))
 
 
-def keyframes(seen: Sequence[View], poses: Sequence[np.ndarray]) -> tuple[Segment, ClassicalFlow]:
+def keyframes(
+    seen: Sequence[View], poses: Sequence[np.ndarray]
+) -> tuple[KeyframeSet, ClassicalFlow]:
     """A store of the views with their true depth, and the operator that encoded them."""
     grid = SampleGrid(CAMERA)
-    store, operator = KeyframeStore(grid).new_segment(), ClassicalFlow(grid)
+    store, operator = KeyframeTable.on(grid).new_set(), ClassicalFlow(grid)
     for n, (view, T_wc) in enumerate(zip(seen, poses, strict=True)):
         T_cw = se3_inverse(torch.from_numpy(T_wc))
         state = store.add(n, n / 30, view.image, operator.encode(view.image), T_cw)

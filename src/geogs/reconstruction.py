@@ -27,7 +27,7 @@ from geogs.stopwatch import Stopwatch
 from geogs.threads import on_one_torch_thread
 from geogs.types import MapSnapshot, RenderedKeyframe, SeenRows, Trajectory
 from geogs.world.grid import SampleGrid
-from geogs.world.store import KeyframeStore
+from geogs.world.keyframes import KeyframeTable
 
 Progress = Callable[[str, float], None]
 """Called with the name of a stage and its finished fraction in [0, 1]."""
@@ -90,9 +90,9 @@ class Reconstruction:
         if self.config.mapping.depth.engine == "tracker":
             raise InputError("mapping.depth.engine tracker needs a tracker: geogs run has one.")
         self.camera = camera
-        store = KeyframeStore(SampleGrid(camera, device), None, self.config.resident_keyframes)
+        store = KeyframeTable.on(SampleGrid(camera, device), None, self.config.resident_keyframes)
         self.mapper = Mapper(store, self.config.mapping, self.config.seed)
-        self._keyframes = store.new_segment()
+        self._keyframes = store.new_set()
         self.stopwatch = Stopwatch()
         self._frame = MapFrame(np.zeros(3), 1.0)
         self._poses: list[Float[Tensor, "4 4"]] = []

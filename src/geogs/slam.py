@@ -43,7 +43,7 @@ from geogs.types import (
     Uncertainty,
 )
 from geogs.world.grid import SampleGrid
-from geogs.world.store import KeyframeStore, StoreState
+from geogs.world.keyframes import KeyframeTable
 
 R = TypeVar("R")
 
@@ -72,7 +72,7 @@ class SlamState:
     What a flow operator remembers of edges is left out; the classical has no memory.
     """
 
-    keyframes: StoreState
+    keyframes: KeyframeTable
     segments: SegmentsState
     loops: LoopsState
     mapper: MapperState
@@ -137,7 +137,7 @@ class Slam:
     def _make_parts(self, live: bool) -> None:
         c, grid = self.config, SampleGrid(self.camera, self.device)
         self.operator = build_operator(c.tracking, grid, self.mask, self.black_is_masked)
-        self.keyframes = KeyframeStore(grid, self.operator.encode, c.resident_keyframes)
+        self.keyframes = KeyframeTable.on(grid, self.operator.encode, c.resident_keyframes)
         self.segments = Segments(partial(self.new_tracker, live), c.tracking.patience)
         self.completion = (
             Completion(self.segments, self._act_on, self.stopwatch, self._stream) if live else None
@@ -156,7 +156,7 @@ class Slam:
             self.keyframes, c.sensor, c.odometry, defers,
         )  # fmt: skip
 
-    def _new_mapper(self, keyframes: KeyframeStore) -> Mapper:
+    def _new_mapper(self, keyframes: KeyframeTable) -> Mapper:
         c = self.config
         return Mapper(keyframes, c.mapping, c.seed, c.sensor)
 
@@ -164,7 +164,7 @@ class Slam:
         """What a checkpoint holds: to be written before the next frame, as it refers to all."""
         self.settle()
         return SlamState(
-            self.keyframes.state(), self.segments.state(), self.loops.state(), self.mapper.state(),
+            self.keyframes, self.segments.state(), self.loops.state(), self.mapper.state(),
             self.stopwatch.state(), self.frames, list(self._waiting), self.adjusted, self._is_ended,
             self.defers_map,
         )  # fmt: skip
@@ -176,7 +176,7 @@ class Slam:
         Raises:
             InputError: the state is of another camera, or incomplete.
         """
-        self.keyframes.load(state.keyframes)
+        self.keyframes.take_over(state.keyframes)
         self.segments.load(state.segments)
         if not all(i in self.keyframes for i in (*state.waiting, *state.loops.detector.order)):
             raise InputError("a keyframe is missing")

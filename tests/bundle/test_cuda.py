@@ -26,7 +26,7 @@ from geogs.geometry.lie import retract, se3_exp, se3_inverse
 from geogs.loop.global_bundle import global_bundle
 from geogs.tracking.tracker import Tracker, TrackState
 from geogs.world.grid import SampleGrid
-from geogs.world.store import KeyframeStore, Segment
+from geogs.world.keyframes import KeyframeSet, KeyframeTable
 from tracking_runs import CONFIG, PATH, error_cm
 from tracking_scenes import CAMERA as ROOM
 from tracking_scenes import frames
@@ -247,9 +247,9 @@ def test_not_finite_input_is_refused_and_reported(device, which, count):
     )
 
 
-def keyframes(problem: BundleProblem, camera: Camera, device: torch.device) -> Segment:
+def keyframes(problem: BundleProblem, camera: Camera, device: torch.device) -> KeyframeSet:
     """The frames of a problem; a fifth of their cells have no information."""
-    store = KeyframeStore(SampleGrid(camera, device)).new_segment()
+    store = KeyframeTable.on(SampleGrid(camera, device)).new_set()
     g = torch.Generator().manual_seed(5)
     image = np.zeros((4, 4, 3), np.uint8)
     for n, (T, d) in enumerate(zip(problem.T_cw, problem.inverse_depth, strict=True)):

@@ -15,7 +15,7 @@ from geogs.loop.pose_graph import RelativePoses
 from geogs.tracking.flow.select import build_operator
 from geogs.tracking.graph import FrameGraph
 from geogs.world.grid import SampleGrid
-from geogs.world.store import KeyframeStore
+from geogs.world.keyframes import KeyframeTable
 from geogs_fleet.join.adjust import adjusted
 from geogs_fleet.join.gauge import Gauge
 from geogs_fleet.join.graph import Placement
@@ -72,7 +72,7 @@ def test_parts_together_are_adjusted_as_one_problem(placed, tmp_path):
 
     grid = SampleGrid(CAMERA)
     operator = build_operator(config.tracking, grid)
-    segment = KeyframeStore(grid, operator.encode).new_segment()
+    segment = KeyframeTable.on(grid, operator.encode).new_set()
     ids = {}
     for n, part in enumerate(parts):
         views, T = PartViews.load(files[n]), placements[n].T_cw

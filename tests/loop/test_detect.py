@@ -13,7 +13,7 @@ from geogs.loop.dense import dense_check
 from geogs.loop.detect import LoopDetector
 from geogs.loop.features import FeatureExtractor, Features
 from geogs.loop.verification import DepthView, TwoViewVerifier
-from geogs.world.store import Segment
+from geogs.world.keyframes import KeyframeSet
 from geogs_synth.raycast.raycaster import View
 from loop_scenes import CAMERA, keyframes, orbit, room, room_views, stretched, views
 
@@ -38,7 +38,7 @@ def walk(path):
     return keyframes(*path)
 
 
-def _relative(store: Segment, first: int, second: int) -> torch.Tensor:
+def _relative(store: KeyframeSet, first: int, second: int) -> torch.Tensor:
     return store[second].T_cw @ se3_inverse(store[first].T_cw)
 
 
@@ -51,21 +51,21 @@ def _turn(A: torch.Tensor, B: torch.Tensor) -> float:
     return math.degrees(float(so3_log(A[:3, :3] @ B[:3, :3].mT).norm()))
 
 
-def _drift(store: Segment, ids: range) -> None:
+def _drift(store: KeyframeSet, ids: range) -> None:
     for id in ids:
         store[id].T_cw = se3_exp(DRIFT) @ store[id].T_cw
 
 
-def _scale_depth(store: Segment, id: int, factor: float) -> None:
+def _scale_depth(store: KeyframeSet, id: int, factor: float) -> None:
     store[id].inverse_depth = store[id].inverse_depth / factor
 
 
-def _views_of(store: Segment, *ids: int) -> list[DepthView]:
+def _views_of(store: KeyframeSet, *ids: int) -> list[DepthView]:
     extract = FeatureExtractor()
     return [_depth_view(store, k, extract(store[k].image)) for k in ids]
 
 
-def _depth_view(store: Segment, id: int, features: Features) -> DepthView:
+def _depth_view(store: KeyframeSet, id: int, features: Features) -> DepthView:
     state = store[id]
     return DepthView.of(store.grid, state.inverse_depth, state.information, features)
 
@@ -137,7 +137,7 @@ def test_looks_close_a_loop_that_drift_hides(walk, monkeypatch):
     store, operator = walk
     true = {k: _relative(store, k - LAP, k) for k in store.ids[LAP:]}
     _drift(store, range(LAP, LAP + AGAIN))
-    detector = LoopDetector(store.store, operator, LoopConfig(min_gap=10))
+    detector = LoopDetector(store.table, operator, LoopConfig(min_gap=10))
     loops = [x for k in store.ids for x in detector.update([k])] + [*detector.update([], True)]
     loops = [loop for loop in loops if loop.second >= LAP]
     assert {(0, LAP), (1, LAP + 1)} <= {(loop.first, loop.second) for loop in loops}
@@ -150,7 +150,7 @@ def test_looks_close_a_loop_that_drift_hides(walk, monkeypatch):
 
 def test_poses_close_a_loop_without_features(walk):
     store, operator = walk
-    detector = LoopDetector(store.store, operator, LoopConfig(min_gap=10))
+    detector = LoopDetector(store.table, operator, LoopConfig(min_gap=10))
     detector._search.index._extract.count = 8
     loops = detector.update(store.ids, is_last=True)
     assert loops
@@ -164,7 +164,7 @@ def test_a_loop_as_a_similarity_takes_depth_to_depth(walk, monkeypatch):
     _suppress(monkeypatch, 0)
     store, operator = walk
     _scale_depth(store, LAP, 1.2)
-    detector = LoopDetector(store.store, operator, LoopConfig(min_gap=10))
+    detector = LoopDetector(store.table, operator, LoopConfig(min_gap=10))
     detector.update(store.ids[: LAP + 1], is_last=True)
     loop = next(x for x in detector.loops if x.second == LAP)
     assert loop.scale == pytest.approx(1.2, rel=0.02)
@@ -177,7 +177,7 @@ def test_a_loop_as_a_similarity_takes_depth_to_depth(walk, monkeypatch):
 
 def test_close_pairs_suppress_each_other(walk):
     store, operator = walk
-    detector = LoopDetector(store.store, operator, LoopConfig(min_gap=10))
+    detector = LoopDetector(store.table, operator, LoopConfig(min_gap=10))
     detector.update(store.ids, is_last=True)
     pairs = [(loop.first, loop.second) for loop in detector.loops]
     assert pairs
@@ -189,7 +189,7 @@ def test_close_pairs_suppress_each_other(walk):
 def test_update_is_deterministic(path):
     def run() -> list[tuple[int, int, float]]:
         store, operator = keyframes(*path)
-        detector = LoopDetector(store.store, operator, LoopConfig(min_gap=10))
+        detector = LoopDetector(store.table, operator, LoopConfig(min_gap=10))
         loops = [x for k in store.ids for x in detector.update([k])] + [*detector.update([], True)]
         return [(x.first, x.second, float(x.T_ji.sum())) for x in loops]
 
@@ -203,7 +203,7 @@ def test_a_room_of_another_shape_with_the_same_pictures_closes_no_loop(path):
     twins = orbit(other, LAP, np.radians(4))[:AGAIN]
     store, operator = keyframes(seen[:LAP] + views(other, twins), poses[:LAP] + twins)
     _drift(store, range(LAP, LAP + AGAIN))
-    detector = LoopDetector(store.store, operator, LoopConfig(min_gap=10))
+    detector = LoopDetector(store.table, operator, LoopConfig(min_gap=10))
     # The lap itself closes where its end meets its beginning.
     assert [loop for loop in detector.update(store.ids, True) if loop.second >= LAP] == []
 
@@ -213,7 +213,8 @@ def test_blank_keyframes_close_nothing(path):
     store, operator = keyframes(seen[:14], poses[:14])
     for id in (0, 12, 13):
         blank = np.full_like(store[id].image, 120)
-        store[id].picture = store.store.pictures.add(blank, operator.encode(blank))
+        store.table.arrays.put("image", id, blank, recent=True)
+        store[id].own_encoded = operator.encode(blank)
         store[id].information = torch.zeros_like(store[id].information)
-    detector = LoopDetector(store.store, operator, LoopConfig(min_gap=5))
+    detector = LoopDetector(store.table, operator, LoopConfig(min_gap=5))
     assert detector.update([0, 12, 13], is_last=True) == ()

@@ -12,7 +12,7 @@ from geogs.geometry.camera import Camera
 from geogs.mapping.background import PATIENT, BackgroundMapper
 from geogs.mapping.mapper import Mapper, never_pause
 from geogs.world.grid import SampleGrid
-from geogs.world.store import KeyframeStore
+from geogs.world.keyframes import KeyframeTable
 
 LONG = 0.5
 """Seconds that mapping waits here at most."""
@@ -26,8 +26,8 @@ def shifted(x: float) -> torch.Tensor:
 
 
 def test_each_thing_is_told_with_the_poses_of_its_time():
-    config, store = preset("fast").mapping, KeyframeStore(SampleGrid(CAMERA))
-    segment, image = store.new_segment(), np.zeros((48, 64, 3), np.uint8)
+    config, store = preset("fast").mapping, KeyframeTable.on(SampleGrid(CAMERA))
+    segment, image = store.new_set(), np.zeros((48, 64, 3), np.uint8)
     background = BackgroundMapper(store, lambda keyframes: Mapper(keyframes, config))
     seen: list[float] = []
     for n in range(4):
@@ -43,7 +43,7 @@ def test_each_thing_is_told_with_the_poses_of_its_time():
 
 
 def test_mapping_waits_while_a_frame_is_tracked_unless_it_is_far_behind():
-    config, store = preset("fast").mapping, KeyframeStore(SampleGrid(CAMERA))
+    config, store = preset("fast").mapping, KeyframeTable.on(SampleGrid(CAMERA))
     background = BackgroundMapper(store, lambda keyframes: Mapper(keyframes, config))
     background._way = RightOfWay(LONG)
     waits: list[float] = []

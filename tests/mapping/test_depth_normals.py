@@ -10,7 +10,7 @@ from geogs.depth.view import DenseDepth, KeyframeDepth
 from geogs.geometry.camera import Camera
 from geogs.mapping.cameras import MapCameras
 from geogs.mapping.view_pool import ViewPool
-from geogs.world.keyframe import Keyframe
+from geogs.world.keyframes import Keyframe
 from keyframe_samples import Sample, segment_of
 
 WORKING = Camera(80.0, 80.0, 47.5, 35.5, 96, 72)
@@ -61,7 +61,7 @@ def test_a_depth_without_normals_takes_them_away():
 def test_those_of_a_prior_come_first():
     (keyframe, *_) = keyframes()
     turned = torch.tensor([0.0, -0.6, -0.8])
-    keyframe.picture.normal = turned.expand(72, 96, 3).half()
+    keyframe.prior_normal = turned.expand(72, 96, 3).half()
     pool = ViewPool(CAMERAS, LossConfig(), torch.device("cpu"), 8)
     pool.add(keyframe)
     pool.set_depth(keyframe.id, depth_with(facing()))

@@ -45,7 +45,7 @@ def mapped(samples: list[Sample], level: bool = True) -> Mapper:
         iterations=0,
         photo=replace(Config().mapping.photo, level=level, min_parallax=0.5),
     )
-    mapper = Mapper(segment_of(samples, CAMERA).store, config)
+    mapper = Mapper(segment_of(samples, CAMERA).table, config)
     for n in range(len(samples)):
         mapper.observe(n)
     for n in range(len(samples)):

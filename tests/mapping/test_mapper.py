@@ -57,7 +57,7 @@ def sequence() -> tuple[list[Sample], list[np.ndarray]]:
 
 
 def build(samples: list[Sample], config: MappingConfig = MAPPING, resident: int = 128) -> Mapper:
-    mapper = Mapper(segment_of(samples, CAMERA, resident=resident).store, config)
+    mapper = Mapper(segment_of(samples, CAMERA, resident=resident).table, config)
     for n in range(len(samples)):
         mapper.observe(n)
         if n >= config.lag:
@@ -179,7 +179,7 @@ def test_the_final_training_draws_poses_back_if_it_is_to(sequence):
 
 def correct(mapper: Mapper, correction: PoseCorrection) -> MapUpdate:
     """Let the keyframes take over a correction, and the map follow."""
-    segment = mapper.keyframes.segment_of(0)
+    segment = mapper.keyframes.set_of[0]
     segment.correct(correction)
     (made,) = segment.take_corrections()
     return mapper.correct(made)
@@ -220,7 +220,7 @@ def test_mapping_goes_on_in_corrected_units(sequence):
         assert (view.dense.depth / depths[i]).numpy() == pytest.approx(factor, rel=1e-5)
         assert (view.T_cw - new[i]).abs().max() == 0
         assert view.rendered_depth is None
-    segment = mapper.keyframes.segment_of(0)
+    segment = mapper.keyframes.set_of[0]
     added = [add(segment, sample).id for sample in moved[6:]]
     for n in added:
         mapper.observe(n)

@@ -11,15 +11,15 @@ from geogs.mapping.near_views import NearViews
 from geogs.mapping.view import MapView
 from geogs.mapping.view_pool import ViewPool
 from geogs.world.grid import SampleGrid
-from geogs.world.store import KeyframeStore
+from geogs.world.keyframes import KeyframeTable
 
 CAMERA = Camera(fx=60.0, fy=60.0, cx=31.5, cy=23.5, width=64, height=48)
 
 
 def test_the_nearest_come_in_the_order_in_which_they_were_given():
     random = torch.Generator().manual_seed(1)
-    config, store = Config(), KeyframeStore(SampleGrid(CAMERA))
-    segment, views = store.new_segment(), {}
+    config, store = Config(), KeyframeTable.on(SampleGrid(CAMERA))
+    segment, views = store.new_set(), {}
     cameras = MapCameras.of(CAMERA, config.mapping)
     pool = ViewPool(cameras, config.mapping.loss, torch.device("cpu"), 128)
     near, image = NearViews(views), np.zeros((48, 64, 3), np.uint8)

@@ -19,8 +19,7 @@ from geogs.tracking.flow.classical import ClassicalFlow
 from geogs.tracking.graph import FrameGraph
 from geogs.tracking.keyframe_priors import KeyframePriors
 from geogs.world.grid import SampleGrid
-from geogs.world.keyframe import Keyframe
-from geogs.world.store import KeyframeStore
+from geogs.world.keyframes import Keyframe, KeyframeTable
 from keyframe_samples import Sample, segment_of
 
 WORKING = Camera(80.0, 80.0, 47.5, 35.5, 96, 72)
@@ -32,7 +31,7 @@ def keyframe(normal: torch.Tensor | None) -> Keyframe:
     image = np.random.default_rng(0).integers(0, 255, (72, 96, 3), np.uint8)
     (made,) = segment_of([Sample(0, image, torch.eye(4, dtype=torch.float64))], WORKING)
     if normal is not None:
-        made.picture.normal = normal
+        made.prior_normal = normal
     return made
 
 
@@ -96,7 +95,7 @@ def test_normals_that_face_away_are_dropped_with_a_warning(caplog):
             return PriorMaps(normal=normal)
 
     grid = SampleGrid(WORKING)
-    store = KeyframeStore(grid).new_segment()
+    store = KeyframeTable.on(grid).new_set()
     operator = ClassicalFlow(grid)
     priors = KeyframePriors(FrameGraph(store, operator), Backwards(), PriorConfig())
     image = keyframe(None).image
@@ -105,9 +104,9 @@ def test_normals_that_face_away_are_dropped_with_a_warning(caplog):
         with caplog.at_level(logging.WARNING, "geogs"):
             priors.ask(state)
     assert state.prior is None
-    assert state.picture.normal.dtype == torch.float16
-    assert float(state.picture.normal[:, 10:48].abs().max()) == 0
-    torch.testing.assert_close(state.picture.normal[20, 5].tolist(), [0.0, 0.0, -1.0])
+    assert state.prior_normal.dtype == torch.float16
+    assert float(state.prior_normal[:, 10:48].abs().max()) == 0
+    torch.testing.assert_close(state.prior_normal[20, 5].tolist(), [0.0, 0.0, -1.0])
     assert [r.message for r in caplog.records] == [
         "Most prior normals face away from the camera; check their normal_axes."
     ]

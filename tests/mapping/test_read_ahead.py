@@ -9,15 +9,15 @@ from geogs.geometry.camera import Camera
 from geogs.mapping.cameras import MapCameras
 from geogs.mapping.view_pool import ViewPool
 from geogs.world.grid import SampleGrid
-from geogs.world.store import KeyframeStore, Segment
+from geogs.world.keyframes import KeyframeSet, KeyframeTable
 
 CAMERA = Camera(fx=60.0, fy=60.0, cx=31.5, cy=23.5, width=64, height=48)
 
 
-def pool_of(count: int, resident: int) -> tuple[ViewPool, Segment]:
+def pool_of(count: int, resident: int) -> tuple[ViewPool, KeyframeSet]:
     """A pool of views of noise at the depth of their number."""
     random, config = np.random.default_rng(0), Config().mapping
-    segment = KeyframeStore(SampleGrid(CAMERA)).new_segment()
+    segment = KeyframeTable.on(SampleGrid(CAMERA)).new_set()
     cameras = MapCameras.of(CAMERA, config)
     pool = ViewPool(cameras, config.loss, torch.device("cpu"), resident)
     for n in range(count):

@@ -13,7 +13,7 @@ from geogs.mapping.held_depths import HeldDepths
 from geogs.mapping.stored_maps import StoredDepth
 from geogs.mapping.view_pool import ViewPool
 from geogs.world.archive import Archive
-from geogs.world.keyframe import MeasuredCells
+from geogs.world.keyframes import MeasuredCells
 from keyframe_samples import Sample, segment_of
 
 CAMERA = Camera(fx=60.0, fy=60.0, cx=39.5, cy=31.5, width=80, height=64)

@@ -15,7 +15,7 @@ from geogs.tracking.graph import FrameGraph
 from geogs.tracking.motion import FrameLocator, pnp, pnp_features
 from geogs.tracking.proximity import frame_distances, proximity_pairs
 from geogs.world.grid import SampleGrid
-from geogs.world.store import KeyframeStore, Segment
+from geogs.world.keyframes import KeyframeSet, KeyframeTable
 from tracking_scenes import CAMERA, pose, render
 
 POSES = [pose(0.06 * k, yaw=0.01 * k) for k in range(6)]
@@ -25,7 +25,7 @@ def room_graph(poses: list[np.ndarray] = POSES) -> FrameGraph:
     """A graph whose keyframes have true poses and depths."""
     grid = SampleGrid(CAMERA)
     operator = ClassicalFlow(grid)
-    store = KeyframeStore(grid).new_segment()
+    store = KeyframeTable.on(grid).new_set()
     for k, T in enumerate(poses):
         image, depth = render(T)
         T_cw = torch.from_numpy(np.linalg.inv(T))
@@ -36,10 +36,10 @@ def room_graph(poses: list[np.ndarray] = POSES) -> FrameGraph:
     return FrameGraph(store, operator)
 
 
-def flat_store(centres: list[float]) -> Segment:
+def flat_store(centres: list[float]) -> KeyframeSet:
     """Cameras on a line in front of a wall at depth 2."""
     grid = SampleGrid(CAMERA)
-    store = KeyframeStore(grid).new_segment()
+    store = KeyframeTable.on(grid).new_set()
     for k, x in enumerate(centres):
         T = torch.from_numpy(np.linalg.inv(pose(x)))
         state = store.add(k, k / 30, np.zeros((144, 192, 3), np.uint8), None, T)

@@ -10,7 +10,7 @@ from geogs.tracking.flow.base import FlowOperator, Memories
 from geogs.tracking.graph import FrameGraph
 from geogs.types import FlowMatch
 from geogs.world.grid import SampleGrid
-from geogs.world.store import KeyframeStore
+from geogs.world.keyframes import KeyframeTable
 from tracking_scenes import CAMERA, pose
 
 GRID = SampleGrid(CAMERA)
@@ -58,7 +58,7 @@ class CountingFlow:
 
 @pytest.fixture
 def graph() -> FrameGraph:
-    store, operator = KeyframeStore(GRID).new_segment(), CountingFlow()
+    store, operator = KeyframeTable.on(GRID).new_set(), CountingFlow()
     for k in range(4):
         image = np.full((CAMERA.height, CAMERA.width, 3), k + 1, np.uint8)
         T = torch.from_numpy(np.linalg.inv(pose(0.1 * k)))

@@ -10,7 +10,7 @@ from geogs.tracking.flow.classical import ClassicalFlow
 from geogs.tracking.graph import FrameGraph
 from geogs.tracking.initialise import _pose_of, placed_after
 from geogs.world.grid import SampleGrid
-from geogs.world.store import KeyframeStore
+from geogs.world.keyframes import KeyframeTable
 from tracking_scenes import CAMERA, pose, render
 
 
@@ -18,7 +18,7 @@ def test_a_keyframe_is_placed_on_the_depth_of_the_one_before_it() -> None:
     before, after = pose(0.1, 0.05, -0.1, 0.02), pose(0.25, 0.0, 0.6, 0.05)
     grid = SampleGrid(CAMERA)
     operator = ClassicalFlow(grid)
-    store = KeyframeStore(grid).new_segment()
+    store = KeyframeTable.on(grid).new_set()
     for n, T_wc in enumerate((before, after)):
         image, depth = render(T_wc)
         T_cw = torch.from_numpy(np.linalg.inv(before))

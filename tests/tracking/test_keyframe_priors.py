@@ -108,7 +108,7 @@ def test_the_prior_adds_little_information_and_only_where_it_is_needed(walk, hel
     for id in helped.keyframe_ids[1:-1]:
         state, k = helped.keyframes[id], helped.keyframes[id]
         d = state.inverse_depth
-        told.append(1 / (d * k.sure_information.clamp(min=1e-9).sqrt()))
+        told.append(1 / (d * k.confident_information.clamp(min=1e-9).sqrt()))
         alone.append(1 / (d * state.information.clamp(min=1e-9).sqrt()))
         grey = cv2.cvtColor(views[k.frame_index].image, cv2.COLOR_RGB2GRAY)
         bare.append(torch.from_numpy(cell_structure(grey) < 0.05))
@@ -159,5 +159,5 @@ def test_normals_reach_the_keyframes_and_depth_can_be_left_alone(walk):
         for other in (b, c):
             assert torch.equal(a.inverse_depth, other.inverse_depth)
             assert torch.equal(a.T_cw, other.T_cw)
-        assert a.picture.normal is None
-        assert b.picture.normal.shape == c.picture.normal.shape == (144, 192, 3)
+        assert a.prior_normal is None
+        assert b.prior_normal.shape == c.prior_normal.shape == (144, 192, 3)

@@ -13,7 +13,7 @@ from geogs.tracking.odometry import Odometry
 from geogs.tracking.tracker import Tracker
 from geogs.types import MeasuredPose
 from geogs.world.grid import SampleGrid
-from geogs.world.store import KeyframeStore, Segment
+from geogs.world.keyframes import KeyframeSet, KeyframeTable
 from measured_poses import drifting, with_poses
 from tracking_runs import CONFIG, error_cm
 from tracking_scenes import CAMERA, frames, pose, sideways
@@ -21,9 +21,9 @@ from tracking_scenes import CAMERA, frames, pose, sideways
 SMALL = Camera(fx=40.0, fy=40.0, cx=23.5, cy=17.5, width=48, height=36)
 
 
-def segment(path: list[np.ndarray], poses: list[MeasuredPose | None], unit: float) -> Segment:
+def segment(path: list[np.ndarray], poses: list[MeasuredPose | None], unit: float) -> KeyframeSet:
     """Keyframes of a path in a unit of so many metres, with what another tracker says."""
-    keyframes = KeyframeStore(SampleGrid(SMALL)).new_segment()
+    keyframes = KeyframeTable.on(SampleGrid(SMALL)).new_set()
     image = np.zeros((36, 48, 3), np.uint8)
     for n, (T_wc, told) in enumerate(zip(path, poses, strict=True)):
         T_cw = torch.from_numpy(np.linalg.inv(T_wc))

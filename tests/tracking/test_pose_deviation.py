@@ -58,7 +58,7 @@ def test_it_is_the_inverse_of_what_the_cells_say_one_by_one():
             ahead, behind = (where(grid, ray, d, retract(s * xi, T)) for s in (1, -1))
             J[:, k] = (ahead - behind) / (2 * step)
         by_depth = (where(grid, ray, d + step, T) - where(grid, ray, d - step, T)) / (2 * step)
-        variance = 1 / w + by_depth.square() / float(keyframe.sure_information[n])
+        variance = 1 / w + by_depth.square() / float(keyframe.confident_information[n])
         H += J.T @ (J / variance[:, None])
     C = ALIKE * torch.linalg.inv(H)
     assert found.position == pytest.approx(float(C.diagonal()[:3].sum().sqrt()), rel=0.02)

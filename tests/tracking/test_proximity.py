@@ -10,14 +10,14 @@ from geogs.geometry.lie import se3_exp
 from geogs.tracking.overlap import LARGEST_ZOOM, alike_in_size, may_overlap
 from geogs.tracking.proximity import frame_distances, proximity_pairs
 from geogs.world.grid import SampleGrid
-from geogs.world.store import KeyframeStore, Segment
+from geogs.world.keyframes import KeyframeSet, KeyframeTable
 from planted_walk import SMALL, planted_tracker
 
 
-def scattered(count: int, seed: int = 0) -> Segment:
+def scattered(count: int, seed: int = 0) -> KeyframeSet:
     """Cameras anywhere, looking anywhere, with depths that vary from cell to cell."""
     grid, g = SampleGrid(SMALL), torch.Generator().manual_seed(seed)
-    store = KeyframeStore(grid).new_segment()
+    store = KeyframeTable.on(grid).new_set()
     turn = torch.tensor([2, 2, 2, 0.5, 1.5, 0.5], dtype=torch.float64)
     T = se3_exp(turn * torch.randn(count, 6, generator=g, dtype=torch.float64))
     for n in range(count):
@@ -69,11 +69,11 @@ def test_pairs_of_many_keyframes_are_those_of_looking_at_all(monkeypatch):
     assert min(position_apart) == 4
 
 
-def face_to_face(count: int, apart: float, depth: float) -> Segment:
+def face_to_face(count: int, apart: float, depth: float) -> KeyframeSet:
     """Two rows of cameras in one line that look towards each other, half a unit from one to the
     next, all at the same depth from what they see."""
     grid = SampleGrid(SMALL)
-    store = KeyframeStore(grid).new_segment()
+    store = KeyframeTable.on(grid).new_set()
     for n in range(2 * count):
         there = n < count
         T_wc = torch.diag(torch.tensor([1.0, 1, 1, 1] if there else [-1.0, 1, -1, 1]).double())

@@ -17,7 +17,7 @@ from geogs.tracking.segments import Segments
 from geogs.tracking.tracker import Tracker, TrackState
 from geogs.types import Frame
 from geogs.world.grid import SampleGrid
-from geogs.world.store import KeyframeStore
+from geogs.world.keyframes import KeyframeTable
 from loop_scenes import at_angle, room
 
 pytestmark = pytest.mark.system
@@ -44,7 +44,7 @@ def run(frames: Sequence[Frame]) -> tuple[Segments, list]:
     """The whole stream through segments and loops."""
     grid = SampleGrid(CAMERA)
     operator = build_operator(CONFIG, grid)
-    store = KeyframeStore(grid, operator.encode)
+    store = KeyframeTable.on(grid, operator.encode)
     segments = Segments(
         lambda: Tracker(CAMERA, CONFIG, "cpu", 0, operator, None, None, store), CONFIG.patience
     )

@@ -10,7 +10,7 @@ from geogs.geometry.lie import se3_inverse
 from geogs.tracking.tracker import Tracker, TrackState
 from geogs.types import Frame
 from geogs.world.grid import SampleGrid
-from geogs.world.keyframe import MeasuredCells
+from geogs.world.keyframes import MeasuredCells
 from tracking_runs import CONFIG
 from tracking_scenes import CAMERA, pose, render, sideways
 

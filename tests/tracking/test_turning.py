@@ -18,7 +18,8 @@ from geogs.tracking.segments import Segments
 from geogs.tracking.tracker import Tracker, TrackState
 from geogs.types import Frame, Trajectory
 from geogs.world.grid import SampleGrid
-from geogs.world.store import KeyframeStore
+from geogs.world.keyframes import KeyframeTable
+from records import copied
 from tracking_runs import CONFIG, error_cm
 from tracking_scenes import CAMERA, frames, pose, sideways
 
@@ -28,7 +29,7 @@ pytestmark = pytest.mark.system
 def new_segments(config: TrackingConfig = CONFIG) -> Segments:
     grid = SampleGrid(CAMERA)
     operator = build_operator(config, grid)
-    store = KeyframeStore(grid, operator.encode)
+    store = KeyframeTable.on(grid, operator.encode)
     return Segments(
         lambda: Tracker(CAMERA, config, "cpu", 0, operator, None, None, store), config.patience
     )
@@ -154,9 +155,9 @@ def test_a_state_goes_on_as_if_nothing_had_happened():
     first = new_segments()
     for frame in stream[:11]:
         first.track(frame, lambda image: ())
-    store, second = first.world.keyframes.store, new_segments()
-    second.world.keyframes.store.load(store.state())
-    second.load(first.state())
+    second = new_segments()
+    second.world.keyframes.table.take_over(copied(first.world.keyframes.table))
+    second.load(copied(first.state()))
     for frame in stream[11:]:
         second.track(frame, lambda image: ())
     second.finish()

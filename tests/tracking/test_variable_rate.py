@@ -6,12 +6,12 @@ import torch
 from geogs.geometry.lie import se3_exp
 from geogs.tracking.last_frame import LastFrame
 from geogs.world.grid import SampleGrid
-from geogs.world.store import KeyframeStore
+from geogs.world.keyframes import KeyframeTable
 from tracking_scenes import CAMERA
 
 
 def test_the_motion_goes_on_for_as_long_as_it_takes():
-    segment = KeyframeStore(SampleGrid(CAMERA)).new_segment()
+    segment = KeyframeTable.on(SampleGrid(CAMERA)).new_set()
     black, eye = np.zeros((144, 192, 3), np.uint8), torch.eye(4, dtype=torch.float64)
     keyframe = segment.add(0, 0.0, black, None, eye)
     step = torch.tensor([0.1, 0, 0.02, 0, 0.05, 0], dtype=torch.float64)

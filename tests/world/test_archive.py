@@ -13,8 +13,9 @@ from geogs.errors import OutputError
 from geogs.geometry.camera import Camera
 from geogs.tracking.flow.classical import ClassicalFlow
 from geogs.world.archive import Archive
+from geogs.world.arrays import ArrayTable
 from geogs.world.grid import SampleGrid
-from geogs.world.store import KeyframeStore
+from geogs.world.keyframes import KeyframeTable
 
 CAMERA = Camera(90.0, 90.0, 63.5, 47.5, 128, 96)
 
@@ -24,8 +25,7 @@ def resident_bytes() -> int:
         return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
-@pytest.mark.parametrize("resident", [0, 2])
-def test_arrays_of_any_type_come_back(tmp_path, resident):
+def test_arrays_of_any_type_come_back(tmp_path):
     rng = np.random.default_rng(0)
     arrays = [
         rng.integers(0, 255, (5, 7, 3), dtype=np.uint8),
@@ -34,7 +34,7 @@ def test_arrays_of_any_type_come_back(tmp_path, resident):
         np.array(3.5, np.float32),
         np.zeros((0, 3), np.float32),
     ]
-    archive = Archive(tmp_path, resident)
+    archive = Archive(tmp_path)
     archived = [archive.put(a) for a in arrays]
     for handle, array in [*zip(archived, arrays, strict=True)] * 2:
         loaded = handle.load()
@@ -44,14 +44,21 @@ def test_arrays_of_any_type_come_back(tmp_path, resident):
 
 
 def test_recent_arrays_are_not_read_again():
-    archive = Archive(resident=2)
+    table = ArrayTable(resident=2)
     arrays = [np.full(4, n) for n in range(3)]
-    handles = [archive.put(a) for a in arrays]
-    assert handles[2].load() is arrays[2]
-    assert handles[1].load() is arrays[1]
-    assert handles[0].load() is not arrays[0]
-    assert handles[0].load() is handles[0].load()
-    assert handles[2].load() is not arrays[2]
+    for n, array in enumerate(arrays):
+        table.put("image", n, array, recent=True)
+
+    def image(n: int) -> np.ndarray:
+        return table.get("image", n, recent=True)
+
+    assert image(2) is arrays[2]
+    assert image(1) is arrays[1]
+    assert image(0) is not arrays[0]
+    assert image(0) is image(0)
+    assert image(2) is not arrays[2]
+    table.forget(2)
+    assert image(2) is None
 
 
 def test_space_of_forgotten_arrays_is_used_again():
@@ -66,7 +73,7 @@ def test_space_of_forgotten_arrays_is_used_again():
 
 
 def test_a_large_archive_takes_no_memory():
-    archive, block = Archive(resident=2), np.ones((1 << 20,), np.float64)
+    archive, block = Archive(), np.ones((1 << 20,), np.float64)
     handles = [archive.put(block + n) for n in range(2)]
     before = resident_bytes()
     handles += [archive.put(block + n) for n in range(2, 40)]
@@ -93,12 +100,12 @@ def test_a_missing_folder_is_one_sentence(tmp_path):
 def test_old_keyframes_are_read_and_encoded_again():
     grid = SampleGrid(CAMERA)
     operator, rng = ClassicalFlow(grid), np.random.default_rng(1)
-    store = KeyframeStore(grid, operator.encode, resident=3).new_segment()
+    store = KeyframeTable.on(grid, operator.encode, resident=3).new_set()
     images = [rng.integers(0, 255, (96, 128, 3), dtype=np.uint8) for _ in range(8)]
     encoded = [operator.encode(image) for image in images]
     for n, image in enumerate(images):
         state = store.add(n, n / 30, image, encoded[n], torch.eye(4, dtype=torch.float64))
-        state.picture.normal = torch.full((96, 128, 3), float(n)).half()
+        state.prior_normal = torch.full((96, 128, 3), float(n)).half()
     assert store[7].image is images[7]
     assert store[7].encoded is encoded[7]
     for n, state in enumerate(store):
@@ -106,15 +113,15 @@ def test_old_keyframes_are_read_and_encoded_again():
         again = state.encoded
         for name in ("grey", "half", "structure"):
             np.testing.assert_array_equal(getattr(again, name), getattr(encoded[n], name))
-        assert state.picture.normal.dtype == torch.float16
-        assert float(state.picture.normal.min()) == float(state.picture.normal.max()) == n
+        assert state.prior_normal.dtype == torch.float16
+        assert float(state.prior_normal.min()) == float(state.prior_normal.max()) == n
     assert store[0].image is not images[0]
     assert store[7].encoded is store[7].encoded
 
 
 def test_keyframes_do_not_hold_their_images():
     grid = SampleGrid(CAMERA)
-    store = KeyframeStore(grid, lambda image: None, resident=2).new_segment()
+    store = KeyframeTable.on(grid, lambda image: None, resident=2).new_set()
     image = np.zeros((96, 128, 3), np.uint8)
     before = resident_bytes()
     for n in range(600):  # 21 MiB of images
@@ -126,7 +133,7 @@ def test_keyframes_do_not_hold_their_images():
 
 
 def test_archives_keep_what_the_last_checkpoint_refers_to(tmp_path):
-    archive = Archive(resident=0)
+    archive = Archive()
     first, kept = (archive.put(np.full(100, n)) for n in range(2))
     settled = archive.settle(CheckpointFolder(tmp_path))
     archive.release()

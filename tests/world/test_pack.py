@@ -17,9 +17,8 @@ from torch import Tensor
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.world.grid import SampleGrid
-from geogs.world.keyframe import KeyframeState, MeasuredCells
+from geogs.world.keyframes import KeyframeSet, KeyframeTable, MeasuredCells, check_keyframes
 from geogs.world.pack import pack, schema, unpack
-from geogs.world.store import KeyframeStore
 
 
 class Mood(Enum):
@@ -183,15 +182,19 @@ def test_a_schema_changes_with_names_types_and_shapes():
 
 def test_a_keyframe_with_measured_depth_comes_back():
     grid = SampleGrid(Camera(60.0, 60.0, 31.5, 23.5, 64, 48))
-    segment = KeyframeStore(grid).new_segment()
+    segment = KeyframeTable.on(grid).new_set()
     image, eye = np.zeros((48, 64, 3), np.uint8), torch.eye(4, dtype=torch.float64)
     keyframe = segment.add(0, 0.0, image, None, eye)
-    keyframe.picture.depth = np.linspace(1, 3, 64 * 48, dtype=np.float32).reshape(48, 64)
+    keyframe.sensor_depth = np.linspace(1, 3, 64 * 48, dtype=np.float32).reshape(48, 64)
     keyframe.measured = MeasuredCells(torch.rand(grid.size), torch.rand(grid.size))
-    packed = pack(KeyframeState, keyframe.state())
-    back = unpack(KeyframeState, packed.values, packed.arrays, packed.archives)
+    packed = pack(KeyframeTable, segment.table)
+    table = unpack(KeyframeTable, packed.values, packed.arrays, packed.archives).attached(grid)
+    packed = pack(KeyframeSet, segment)
+    again = unpack(KeyframeSet, packed.values, packed.arrays, {}).attached(table)
+    check_keyframes(table, [again])
+    back = again[0]
+    np.testing.assert_array_equal(back.image, image)
+    assert torch.equal(back.T_cw, eye)
     assert torch.equal(back.measured.information, keyframe.measured.information)
-    np.testing.assert_allclose(
-        back.depth.load().astype(np.float32), keyframe.picture.depth, rtol=1e-6
-    )
-    assert keyframe.picture.depth[0, 1] == pytest.approx(1 + 2 / (64 * 48 - 1), rel=5e-4)
+    np.testing.assert_allclose(back.sensor_depth, keyframe.sensor_depth, rtol=1e-6)
+    assert keyframe.sensor_depth[0, 1] == pytest.approx(1 + 2 / (64 * 48 - 1), rel=5e-4)

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from geogs.bundle.problem import BundleProblem, MotionProblem, StreamedProblem
-from geogs.world.keyframe import Keyframe
+from geogs.world.keyframes import Keyframe
 
 
 @dataclass(frozen=True)

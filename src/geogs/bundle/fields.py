@@ -9,7 +9,7 @@ from torch import Tensor
 from geogs.bundle.projection import project
 from geogs.geometry.lie import se3_inverse
 from geogs.world.grid import SampleGrid
-from geogs.world.keyframe import Keyframe
+from geogs.world.keyframes import Keyframe
 
 
 class CpuFields:

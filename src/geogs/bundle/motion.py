@@ -9,7 +9,7 @@ from geogs.bundle.problem import MotionProblem
 from geogs.bundle.projection import linearise, project
 from geogs.geometry.lie import move, se3_inverse
 from geogs.world.grid import SampleGrid
-from geogs.world.keyframe import Keyframe
+from geogs.world.keyframes import Keyframe
 
 
 class CpuMotion:

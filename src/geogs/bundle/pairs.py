@@ -8,7 +8,7 @@ from torch import Tensor
 
 from geogs.bundle.projection import project
 from geogs.geometry.lie import se3_inverse
-from geogs.world.store import Segment
+from geogs.world.keyframes import KeyframeSet
 
 LEAST_OVERLAP = 0.2
 """A pair of which no more than this fraction of the cells falls into the other image is far."""
@@ -17,7 +17,7 @@ LEAST_OVERLAP = 0.2
 class CpuPairs:
     """Pairs (source, target) of keyframe ids."""
 
-    def __init__(self, keyframes: Segment, directed: Sequence[tuple[int, int]]) -> None:
+    def __init__(self, keyframes: KeyframeSet, directed: Sequence[tuple[int, int]]) -> None:
         self.grid = keyframes.grid
         source, target = (keyframes.poses([e[k] for e in directed]) for k in (0, 1))
         self.motion = target @ se3_inverse(source)

@@ -13,7 +13,7 @@ from geogs.bundle.base import (
     MotionSolver,
 )
 from geogs.world.grid import SampleGrid
-from geogs.world.store import Segment
+from geogs.world.keyframes import KeyframeSet
 
 
 def bundle_solver(grid: SampleGrid) -> BundleSolver:
@@ -60,7 +60,7 @@ def grid_fields(grid: SampleGrid) -> GridFields:
     return CpuFields(grid)
 
 
-def keyframe_pairs(keyframes: Segment, directed: Sequence[tuple[int, int]]) -> KeyframePairs:
+def keyframe_pairs(keyframes: KeyframeSet, directed: Sequence[tuple[int, int]]) -> KeyframePairs:
     """Pairs (source, target) of keyframe ids."""
     if keyframes.grid.on_gpu:
         from geogs.bundle.cuda.pairs import CudaPairs

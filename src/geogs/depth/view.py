@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float32, Float64, UInt8
 from torch import Tensor
 
 from geogs.geometry.camera import Camera
-from geogs.world.keyframe import Keyframe
+from geogs.world.keyframes import Keyframe
 
 
 @dataclass(frozen=True, slots=True, eq=False)

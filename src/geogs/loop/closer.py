@@ -96,7 +96,7 @@ class LoopCloser:
         self.segments = segments
         self.config = config
         tracker = segments.world
-        self.detector = LoopDetector(tracker.keyframes.store, tracker.operator, config, waits, mask)
+        self.detector = LoopDetector(tracker.keyframes.table, tracker.operator, config, waits, mask)
         self.closures = 0
         """Loop closures so far."""
         self._known: dict[Tracker, Known] = {}
@@ -189,7 +189,7 @@ class LoopCloser:
         known.pending += bool((strain > self.config.strain).any())
 
     def _constraint(self, loop: Loop) -> RelativePoses:
-        return of_loop(self.segments.world.keyframes.store, loop)
+        return of_loop(self.segments.world.keyframes.table, loop)
 
     # --- joining segments ------------------------------------------------------------------
 

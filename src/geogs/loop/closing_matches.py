@@ -11,11 +11,11 @@ from geogs.loop.matched_edges import MatchedEdges
 from geogs.tracking.graph import Edge, Pair
 from geogs.tracking.moving import still_weight
 from geogs.world.grid import SampleGrid
-from geogs.world.store import Segment
+from geogs.world.keyframes import KeyframeSet
 
 
 def closing_matches(
-    segment: Segment, edges: Mapping[Pair, Edge], loops: Sequence[Loop]
+    segment: KeyframeSet, edges: Mapping[Pair, Edge], loops: Sequence[Loop]
 ) -> MatchedEdges | None:
     """Matches between places in the segment's order, on the CPU; none where there are none.
 
@@ -50,7 +50,9 @@ def closing_matches(
 
 
 def take_over_depths(
-    segment: Segment, edges: Mapping[Pair, Edge], inverse_depth: Mapping[int, Float[Tensor, "p"]]
+    segment: KeyframeSet,
+    edges: Mapping[Pair, Edge],
+    inverse_depth: Mapping[int, Float[Tensor, "p"]],
 ) -> None:
     """Give keyframes the inverse depth that a closing has found, before its scales are applied.
 

@@ -16,7 +16,7 @@ from geogs.tracking.graph import Edge, Pair
 from geogs.tracking.moving import still_weight
 from geogs.tracking.packed_edge import PackedEdge
 from geogs.world.grid import SampleGrid
-from geogs.world.store import KeyframeStore, Segment
+from geogs.world.keyframes import KeyframeSet, KeyframeTable
 
 AGREEING_LOOPS = 2
 """Loops that have to agree before a segment is joined to another: one may be a look-alike."""
@@ -40,7 +40,7 @@ def joined(parts: Sequence[RelativePoses]) -> RelativePoses:
     return RelativePoses(*(torch.cat([getattr(p, c) for p in parts]) for c in columns))
 
 
-def of_edges(segment: Segment, edges: Mapping[Pair, Edge | PackedEdge]) -> RelativePoses:
+def of_edges(segment: KeyframeSet, edges: Mapping[Pair, Edge | PackedEdge]) -> RelativePoses:
     """Relative poses, between ids, that fitted edges of a frame graph amount to.
 
     Of the two directions of a pair the one from the earlier keyframe is taken.
@@ -65,7 +65,7 @@ def of_edges(segment: Segment, edges: Mapping[Pair, Edge | PackedEdge]) -> Relat
     return _named(relative_poses(grid, matched, segment.poses(ids), False, SETTLED), ids)
 
 
-def of_poses(segment: Segment, ids: Sequence[int]) -> RelativePoses:
+def of_poses(segment: KeyframeSet, ids: Sequence[int]) -> RelativePoses:
     """Relative poses between neighbours in a list of ids, as sure as any can be."""
     if len(ids) < 2:
         return none_known()
@@ -80,7 +80,7 @@ def of_poses(segment: Segment, ids: Sequence[int]) -> RelativePoses:
     return _named(RelativePoses(slots[:-1], slots[1:], G, information, is_loop), ids)
 
 
-def of_loop(keyframes: KeyframeStore, loop: Loop) -> RelativePoses:
+def of_loop(keyframes: KeyframeTable, loop: Loop) -> RelativePoses:
     """Relative poses, between ids, of a loop: one for each direction of its flow."""
     one, other = keyframes[loop.first], keyframes[loop.second]
     there, back = loop.flows

@@ -14,7 +14,7 @@ from geogs.tracking.flow.base import FlowOperator
 from geogs.tracking.motion import FrameLocator, FrameMotion
 from geogs.types import FlowMatch
 from geogs.world.grid import SampleGrid
-from geogs.world.keyframe import Keyframe
+from geogs.world.keyframes import Keyframe
 
 MIN_MATCHED = 0.15
 """Least fraction of the cells whose flow agrees with the pose, in each direction."""

@@ -28,7 +28,7 @@ from geogs.tracking.flow.base import FlowOperator
 from geogs.tracking.motion import Recognition
 from geogs.tracking.proximity import frame_distances
 from geogs.types import FlowMatch
-from geogs.world.store import KeyframeStore
+from geogs.world.keyframes import KeyframeTable
 
 MAX_FLOW_DISTANCE = 0.29
 """Flow distance below which the present poses make a pair a candidate, of the long edge (22 cells
@@ -121,7 +121,7 @@ class LoopDetector:
 
     def __init__(
         self,
-        keyframes: KeyframeStore,
+        keyframes: KeyframeTable,
         operator: FlowOperator,
         config: LoopConfig | None = None,
         waits: bool = True,
@@ -199,7 +199,7 @@ class LoopDetector:
 
     def candidates(self, id: int) -> list[int]:
         """Keyframes that the present poses say a taken one sees again, nearest first."""
-        facing, store = self._facing(id), self.keyframes.segment_of(id)
+        facing, store = self._facing(id), self.keyframes.set_of[id]
         if not facing:
             return []
         directed = [(k, id) for k in facing] + [(id, k) for k in facing]
@@ -230,7 +230,7 @@ class LoopDetector:
 
     def _near(self, id: int) -> frozenset[int]:
         """The keyframe itself and those of the same time and segment."""
-        gap, store = self._order[id] - self.config.min_gap, self.keyframes.segment_of(id)
+        gap, store = self._order[id] - self.config.min_gap, self.keyframes.set_of[id]
         recent = self._ids[max(gap, 0) : len(self._order)].tolist()
         return frozenset(k for k in recent if k in store)
 
@@ -241,7 +241,7 @@ class LoopDetector:
 
     def _facing(self, id: int) -> list[int]:
         """The earlier keyframes nearest by that look roughly the same way; there are never many."""
-        store = self.keyframes.segment_of(id)
+        store = self.keyframes.set_of[id]
         old = self._ids[: max(self._order[id] - self.config.min_gap, 0)]
         depth = 1 / float(store[id].inverse_depth.median())
         around = self.keyframes.poses.around(id, old, MAX_ANGLE_DEG, MAX_BASELINE * depth)

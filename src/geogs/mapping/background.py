@@ -1,6 +1,5 @@
 """Mapping in a thread of its own, so that tracking never waits for it."""
 
-import copy
 import sys
 import threading
 import time
@@ -18,8 +17,7 @@ from geogs.beside import RightOfWay
 from geogs.errors import GeogsError
 from geogs.mapping.mapper import Mapper, never_pause
 from geogs.types import PoseCorrection
-from geogs.world.keyframe import Keyframe
-from geogs.world.store import KeyframeStore
+from geogs.world.keyframes import Keyframe, KeyframeTable
 
 R = TypeVar("R")
 
@@ -44,14 +42,14 @@ class BackgroundMapper:
     """
 
     def __init__(
-        self, keyframes: KeyframeStore, new_mapper: Callable[[KeyframeStore], Mapper]
+        self, keyframes: KeyframeTable, new_mapper: Callable[[KeyframeTable], Mapper]
     ) -> None:
         """``new_mapper`` makes the mapper of a store."""
         self._store = keyframes
         device = torch.device(keyframes.grid.device)
         self._stream = torch.cuda.Stream(device) if device.type == "cuda" else None
-        self._mirror = KeyframeStore(keyframes.grid, None, keyframes.resident)
-        self._copies = self._mirror.new_segment()
+        self._mirror = keyframes.mirror()
+        self._copies = self._mirror.new_set()
         self._mapper = new_mapper(self._mirror)
         self._mapper.pause = self._give_way
         self._way = RightOfWay(COURTESY_SECONDS)
@@ -162,10 +160,7 @@ class BackgroundMapper:
             now = _parts(keyframe)
             if len(before) != len(now) or any(a is not b for a, b in zip(now, before, strict=True)):
                 self._handed[id] = now
-                twin = copy.copy(keyframe)
-                twin.prior = copy.copy(keyframe.prior)
-                twin.poses = self._mirror.poses
-                changed.append((twin, keyframe.T_cw))
+                changed.append((keyframe.copied_to(self._mirror), keyframe.T_cw))
         return changed
 
     def _take(

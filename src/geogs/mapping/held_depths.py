@@ -4,7 +4,7 @@ import torch
 
 from geogs.depth.view import DenseDepth
 from geogs.mapping.stored_maps import StoredDepth
-from geogs.world.swap import Swap
+from geogs.world.lru import LruCache
 
 HELD = 512
 """Most depths; at 320 x 180 pixels with normals they take 600 MB."""
@@ -17,7 +17,7 @@ class HeldDepths:
     """
 
     def __init__(self, device: torch.device, limit: int = HELD) -> None:
-        self._depths: Swap[int, tuple[StoredDepth, DenseDepth]] = Swap(limit)
+        self._depths: LruCache[int, tuple[StoredDepth, DenseDepth]] = LruCache(limit)
         self._is_used = device.type == "cuda"
 
     def put(self, id: int, stored: StoredDepth, depth: DenseDepth) -> None:

@@ -49,7 +49,7 @@ from geogs.splat.optimizer import MapOptimizer
 from geogs.splat.render import render
 from geogs.types import MapSnapshot, PoseCorrection, RenderedKeyframe
 from geogs.world.archive import Archive
-from geogs.world.store import KeyframeStore
+from geogs.world.keyframes import KeyframeTable
 
 # Nearest keyframes that vote on a keyframe's disks; others are too far away to know better.
 _VOTERS = 96
@@ -78,7 +78,7 @@ class Mapper:
 
     def __init__(
         self,
-        keyframes: KeyframeStore,
+        keyframes: KeyframeTable,
         config: MappingConfig,
         seed: int = 0,
         sensor: DepthSensorConfig | None = None,
@@ -146,7 +146,7 @@ class Mapper:
         self._training().optimizer.append(parameters, ids[0])
         self.map.seen.fill_(1)
 
-    def move_to(self, keyframes: KeyframeStore) -> None:
+    def move_to(self, keyframes: KeyframeTable) -> None:
         """Go on with the keyframes of another store, which are what its own are."""
         self.keyframes = keyframes
         self.pool.move_to(keyframes)
@@ -347,7 +347,9 @@ class Mapper:
         rules = SurfaceRules.of(self.config)
         for view in (self.views[i] for i in (self.mapped if of is None else of)):
             render = rendered_keyframe(view, parameters, camera, rules)
-            stored.append(stored_render(render, view.keyframe.picture.archived, archive))
+            stored.append(
+                stored_render(render, view.keyframe.table.arrays.pieces["image"][view.id], archive)
+            )
         return OnDemand(stored, StoredRender.load)
 
     def renderer(self, frame: MapFrame = WORLD) -> MapRenderer:

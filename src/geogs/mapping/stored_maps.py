@@ -10,7 +10,7 @@ from torch import Tensor
 from geogs.depth.view import DenseDepth
 from geogs.losses.single_view import ViewConstants
 from geogs.world.archive import Archive, Archived
-from geogs.world.keyframe import Keyframe
+from geogs.world.keyframes import Keyframe
 
 
 @dataclass(eq=False)

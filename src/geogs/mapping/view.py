@@ -14,7 +14,7 @@ from geogs.losses.multi_view import PhotoView
 from geogs.losses.single_view import ViewConstants
 from geogs.mapping.view_pool import ViewPool
 from geogs.priors.depth_sensor import sensor_depth
-from geogs.world.keyframe import Keyframe
+from geogs.world.keyframes import Keyframe
 
 UNSURE = 1e3
 """Relative deviation of a depth that is nobody's measurement: it outweighs nothing."""
@@ -75,7 +75,7 @@ class MapView:
 
         On the map's device; None where it did not.
         """
-        if self.keyframe.measured is None or (metres := self.keyframe.picture.depth) is None:
+        if self.keyframe.measured is None or (metres := self.keyframe.sensor_depth) is None:
             return None
         render, scale = self.pool.cameras.render, self.keyframe.scale
         found = sensor_depth(metres, config).resized(render.width, render.height)
@@ -124,7 +124,7 @@ class MapView:
     def tracked_depth(self) -> float:
         """Median depth of the cells that the tracker is fairly sure of, else of all."""
         z = 1 / self.keyframe.inverse_depth.clamp(min=1e-3)
-        information = self.keyframe.sure_information
+        information = self.keyframe.confident_information
         sure = z / information.clamp(min=1e-12).sqrt() < 0.2
         return float(z[sure].median() if int(sure.sum()) > 8 else z.median())
 

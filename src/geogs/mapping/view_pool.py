@@ -20,9 +20,8 @@ from geogs.mapping.held_depths import HeldDepths
 from geogs.mapping.read_ahead import ReadAhead
 from geogs.mapping.stored_maps import StoredDepth, StoredMaps, ViewMaps
 from geogs.world.archive import Archive, Archived
-from geogs.world.keyframe import Keyframe
-from geogs.world.store import KeyframeStore
-from geogs.world.swap import Swap
+from geogs.world.keyframes import Keyframe, KeyframeTable
+from geogs.world.lru import LruCache
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +58,7 @@ class ViewPool:
         self.device = device
         self.archive = Archive()
         self._stored: dict[int, StoredMaps] = {}
-        self._maps: Swap[int, ViewMaps] = Swap(resident, self._store)
+        self._maps: LruCache[int, ViewMaps] = LruCache(resident, self._store)
         self._held = HeldDepths(device)
         self._ahead = ReadAhead(self._load_with_constants)
 
@@ -74,7 +73,7 @@ class ViewPool:
         self._stored[keyframe.id] = StoredMaps(keyframe, inside)
         self.maps(keyframe.id)
 
-    def move_to(self, keyframes: KeyframeStore) -> None:
+    def move_to(self, keyframes: KeyframeTable) -> None:
         """Go on with the keyframes of another store, which are what its own are."""
         for id, stored in self._stored.items():
             stored.keyframe = keyframes[id]
@@ -290,7 +289,7 @@ def _shrunk_normal(
 
     An average shorter than a half comes from an edge or from pixels that are not known.
     """
-    normal = keyframe.picture.normal
+    normal = keyframe.prior_normal
     if normal is None:
         return None
     size = (render.width, render.height)

@@ -14,7 +14,7 @@ from geogs.tracking.last_frame import LastFrame
 from geogs.tracking.motion import FrameLocator, FrameMotion
 from geogs.tracking.pose_deviation import PoseDeviation, pose_deviation
 from geogs.types import Frame
-from geogs.world.keyframe import Keyframe
+from geogs.world.keyframes import Keyframe
 
 FARTHER = 1.0
 """Part of the motion that calls for a keyframe by which a frame may be farther than that from the

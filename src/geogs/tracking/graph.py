@@ -29,8 +29,7 @@ from geogs.tracking.packed_edge import (
 )
 from geogs.tracking.proximity import PAIRS_TOGETHER, Pair
 from geogs.types import FlowMatch
-from geogs.world.keyframe import Keyframe
-from geogs.world.store import Segment
+from geogs.world.keyframes import Keyframe, KeyframeSet
 
 STACKED_EDGES = 1024, 8192
 """Directed edges up to which an adjustment has all matches in one piece, on CPU and GPU."""
@@ -67,7 +66,7 @@ class FrameGraph:
     """Pairs of keyframes with their flow in both directions."""
 
     def __init__(
-        self, keyframes: Segment, operator: FlowOperator, odometry: Odometry | None = None
+        self, keyframes: KeyframeSet, operator: FlowOperator, odometry: Odometry | None = None
     ) -> None:
         """``odometry`` takes part in adjustments, where there is one."""
         self.keyframes = keyframes

@@ -8,7 +8,7 @@ from geogs.bundle.select import grid_fields
 from geogs.errors import InputError
 from geogs.types import RenderedKeyframe
 from geogs.world.grid import SampleGrid
-from geogs.world.store import Segment
+from geogs.world.keyframes import KeyframeSet
 
 DEVIATION = 0.01
 """Relative deviation of a depth that a map shows, where it is sure."""
@@ -16,13 +16,13 @@ ONE_SURFACE = 1.1
 """Ratio up to which the depths of four neighbouring pixels count as those of one surface."""
 
 
-def add_held(keyframes: Segment, place: RenderedKeyframe, frame_index: int) -> int:
+def add_held(keyframes: KeyframeSet, place: RenderedKeyframe, frame_index: int) -> int:
     """Add a keyframe with the depth of a saved map to a segment; returns its id.
 
     Raises:
         InputError: it has no image, or one of another camera.
     """
-    grid, store = keyframes.grid, keyframes.store
+    grid, encode = keyframes.grid, keyframes.table.encode
     if place.image is None:
         raise InputError("The map was saved without the images of its keyframes.")
     height, width = place.image.shape[:2]
@@ -31,7 +31,7 @@ def add_held(keyframes: Segment, place: RenderedKeyframe, frame_index: int) -> i
             f"The images of the map are {width} x {height} pixels, those of the video "
             f"{grid.camera.width} x {grid.camera.height}; both have to be of one camera."
         )
-    encoded = None if store.pictures.encode is None else store.pictures.encode(place.image)
+    encoded = None if encode is None else encode(place.image)
     keyframe = keyframes.add(frame_index, place.timestamp, place.image, encoded, place.T_cw)
     inverse_depth, sure = depth_on_grid(grid, place)
     information = sure / (DEVIATION * inverse_depth.clamp(min=1e-6)).square() * (sure > 0)

@@ -29,8 +29,7 @@ from geogs.tracking.graph import FrameGraph
 from geogs.tracking.motion import pnp
 from geogs.types import FlowMatch
 from geogs.world.grid import SampleGrid
-from geogs.world.keyframe import Keyframe
-from geogs.world.store import Segment
+from geogs.world.keyframes import Keyframe, KeyframeSet
 
 FARTHEST = 50.0
 """Baselines beyond which a point says nothing on which of four poses is the right one."""
@@ -269,7 +268,7 @@ def _is_borne_out(graph: FrameGraph, min_ncc: float) -> bool:
     return all(e.bears_out(min_ncc, is_expected=False) for e in evidence)
 
 
-def normalise(store: Segment) -> None:
+def normalise(store: KeyframeSet) -> None:
     """Move the first pose to the identity and scale so that the median depth is one unit."""
     origin = se3_inverse(next(iter(store)).T_cw)
     for state in store:

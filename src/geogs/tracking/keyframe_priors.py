@@ -13,7 +13,7 @@ from geogs.priors.base import MonocularPrior
 from geogs.tracking.depth_prior import FlowEvidence, adjust_depth, flow_evidence
 from geogs.tracking.graph import FrameGraph
 from geogs.world.grid import OFFSET, STRIDE, SampleGrid
-from geogs.world.keyframe import Keyframe, KeyframePrior
+from geogs.world.keyframes import Keyframe, KeyframePrior
 
 _log = logging.getLogger(__name__)
 
@@ -38,7 +38,7 @@ class KeyframePriors:
             return
         maps, grid = self.prior.predict(state.image), self.graph.keyframes.grid
         if maps.normal is not None:
-            state.picture.normal = self._facing(maps.normal.cpu())
+            state.prior_normal = self._facing(maps.normal.cpu())
         if maps.depth is not None and self.config.depth and state.measured is None:
             values = on_cells(grid, maps.depth.to(grid.device))
             zero = torch.zeros_like(values)

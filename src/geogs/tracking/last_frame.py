@@ -6,7 +6,7 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from geogs.geometry.lie import se3_exp, se3_log
-from geogs.world.keyframe import Keyframe
+from geogs.world.keyframes import Keyframe
 
 SAME_PACE = 0.2
 """Part by which a frame may come sooner or later than the one before without a word: time stamps

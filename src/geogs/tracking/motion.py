@@ -24,7 +24,7 @@ from geogs.tracking.flow.base import FlowOperator
 from geogs.tracking.flow.filled import filled_positions
 from geogs.types import FlowMatch
 from geogs.world.grid import SampleGrid
-from geogs.world.keyframe import Keyframe
+from geogs.world.keyframes import Keyframe
 
 FIT_ITERATIONS = 6
 """Steps of the motion-only adjustment of a frame."""

@@ -19,7 +19,7 @@ from geogs.bundle.rigidity import best_residuals
 from geogs.bundle.select import grid_fields
 from geogs.tracking.proximity import Pair
 from geogs.world.grid import SampleGrid
-from geogs.world.store import Segment
+from geogs.world.keyframes import KeyframeSet
 
 LEAST_SCALE = 0.2
 """Deviations of a match below which the usual residual of an edge is not taken to lie."""
@@ -53,7 +53,7 @@ class Match(Protocol):
 
 
 def still_weight(
-    keyframes: Segment,
+    keyframes: KeyframeSet,
     directed: Sequence[Pair],
     pixels: Float[Tensor, "e p 2"],
     weight: Float[Tensor, "e p 2"],
@@ -77,14 +77,14 @@ def carried(
     return moving[cell] & inside & (weight[:, 0] > 0)
 
 
-def moving_share(keyframes: Segment) -> float:
+def moving_share(keyframes: KeyframeSet) -> float:
     """Part of all cells that is held for moving; 0 without keyframes."""
     held = [k.moving.float().mean().cpu() for k in keyframes if k.moving is not None]
     return float(torch.stack(held).sum()) / len(keyframes) if held else 0.0
 
 
 def judge(
-    keyframes: Segment, edges: Mapping[Pair, Match], judged: Sequence[Pair], threshold: float
+    keyframes: KeyframeSet, edges: Mapping[Pair, Match], judged: Sequence[Pair], threshold: float
 ) -> None:
     """Say anew of the sources of some directed edges which of their cells move.
 
@@ -141,7 +141,7 @@ def _mean(grid: SampleGrid, values: Float[Tensor, "n p"], size: int) -> Float[Te
 
 
 def _still(
-    keyframes: Segment, directed: Sequence[Pair], pixels: Float[Tensor, "e p 2"]
+    keyframes: KeyframeSet, directed: Sequence[Pair], pixels: Float[Tensor, "e p 2"]
 ) -> Bool[Tensor, "e p"]:
     """Which matches neither leave nor reach a cell that is held for moving."""
     grid = keyframes.grid
@@ -158,7 +158,7 @@ def _still(
 
 
 def _residuals(
-    keyframes: Segment, edges: Mapping[Pair, Match], directed: Sequence[Pair]
+    keyframes: KeyframeSet, edges: Mapping[Pair, Match], directed: Sequence[Pair]
 ) -> tuple[Float[Tensor, "e p"], Bool[Tensor, "e p"]]:
     """Best residuals of some edges, not a number without a match; and what is held for still."""
     grid = keyframes.grid

@@ -15,8 +15,7 @@ from geogs.config import OdometryConfig
 from geogs.geometry.lie import se3_inverse
 from geogs.priors.odometry import ScaleVote, information_of, vote_on_scale
 from geogs.types import MeasuredPose
-from geogs.world.keyframe import Keyframe
-from geogs.world.store import Segment
+from geogs.world.keyframes import Keyframe, KeyframeSet
 
 LEAST = 5
 """Motions that must fit before any is used."""
@@ -53,7 +52,7 @@ class Agreement:
 class Odometry:
     """What another tracker says of the motion between the keyframes of a segment."""
 
-    def __init__(self, keyframes: Segment, config: OdometryConfig) -> None:
+    def __init__(self, keyframes: KeyframeSet, config: OdometryConfig) -> None:
         self.keyframes = keyframes
         self.config = config
         self.scale: float | None = None

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_inverse
-from geogs.world.store import Segment
+from geogs.world.keyframes import KeyframeSet
 
 TILES = 4, 6
 """Rows and columns of tiles into which the cells of a keyframe are grouped."""
@@ -50,7 +50,7 @@ class _Spheres:
 
 
 def may_overlap(
-    store: Segment, source: Sequence[int], target: Sequence[int], least: float, step: int
+    store: KeyframeSet, source: Sequence[int], target: Sequence[int], least: float, step: int
 ) -> Bool[np.ndarray, "n m"]:
     """False where no more than ``least`` of every ``step``-th cell of a source falls into a target.
 
@@ -71,7 +71,7 @@ def may_overlap(
 
 
 def alike_in_size(
-    store: Segment, first: Sequence[int], second: Sequence[int]
+    store: KeyframeSet, first: Sequence[int], second: Sequence[int]
 ) -> Bool[np.ndarray, "n m"]:
     """Whether two keyframes show what either looks at in sizes up to ``LARGEST_ZOOM`` apart.
 
@@ -95,7 +95,7 @@ def alike_in_size(
     return alike
 
 
-def _spheres(store: Segment, ids: Sequence[int], step: int) -> _Spheres:
+def _spheres(store: KeyframeSet, ids: Sequence[int], step: int) -> _Spheres:
     grid = store.grid
     rows, columns = torch.arange(0, grid.height, step), torch.arange(0, grid.width, step)
     tile = (rows * TILES[0] // grid.height)[:, None] * TILES[1] + columns * TILES[1] // grid.width

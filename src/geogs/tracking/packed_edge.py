@@ -13,7 +13,7 @@ from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_inverse
 from geogs.types import FlowMatch
 from geogs.world.grid import SampleGrid
-from geogs.world.keyframe import Keyframe
+from geogs.world.keyframes import Keyframe
 
 MAX_WEIGHT = 6e4
 """Largest weight that half precision holds, 1 / pixel^2."""

@@ -12,7 +12,7 @@ from geogs.geometry.lie import se3_inverse
 from geogs.tracking.trajectory import depth_aware_weight
 from geogs.types import FlowMatch
 from geogs.world.grid import SampleGrid
-from geogs.world.keyframe import Keyframe
+from geogs.world.keyframes import Keyframe
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ def pose_deviation(
     """
     T = (T_cw @ se3_inverse(keyframe.T_cw).to(T_cw))[None]
     p = linearise(grid.camera, grid.rays, T.to(grid.device), keyframe.inverse_depth[None])
-    known = keyframe.sure_information[None]
+    known = keyframe.confident_information[None]
     weight = depth_aware_weight(match.weight[:1], p.depth_jacobian, known) * p.valid[..., None]
     J = p.pose_jacobian[0]
     H = torch.einsum("icp,jcp,pc->ij", J, J, weight[0]).double().cpu()

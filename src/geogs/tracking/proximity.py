@@ -10,7 +10,7 @@ from geogs.bundle.pairs import LEAST_OVERLAP
 from geogs.bundle.select import keyframe_pairs
 from geogs.threads import thread_map
 from geogs.tracking.overlap import alike_in_size, may_overlap
-from geogs.world.store import Segment
+from geogs.world.keyframes import KeyframeSet
 
 Pair = tuple[int, int]
 """Two keyframe ids, the earlier first; an edge of the graph in both directions."""
@@ -19,7 +19,7 @@ PAIRS_TOGETHER = 512, 8192
 
 
 def frame_distances(
-    store: Segment, directed: Sequence[Pair], rotation_weight: float = 0.3
+    store: KeyframeSet, directed: Sequence[Pair], rotation_weight: float = 0.3
 ) -> Float[Tensor, "e"]:
     """Distance of directed keyframe pairs in pixels; infinite at little overlap."""
     if not directed:
@@ -28,7 +28,7 @@ def frame_distances(
 
 
 def proximity_pairs(
-    store: Segment,
+    store: KeyframeSet,
     later: Sequence[int],
     earlier: Sequence[int],
     existing: Iterable[Pair],
@@ -75,7 +75,7 @@ def proximity_pairs(
 
 
 def _by_distance(
-    store: Segment,
+    store: KeyframeSet,
     rows: Int[np.ndarray, "r"],
     columns: Int[np.ndarray, "c"],
     wanted: Bool[np.ndarray, "r c"],

@@ -21,7 +21,7 @@ from geogs.tracking.packed_edge import PackedEdge, packed_matches
 from geogs.tracking.proximity import Pair
 from geogs.types import SeenRows, Trajectory
 from geogs.world.grid import SampleGrid
-from geogs.world.store import Segment
+from geogs.world.keyframes import KeyframeSet
 
 NODES = 5
 """Frames whose poses say where a point is at the time of its row."""
@@ -173,7 +173,7 @@ class RowErrors:
 
 def edge_shifts(
     errors: RowErrors,
-    keyframes: Segment,
+    keyframes: KeyframeSet,
     measured: Mapping[Pair, PackedEdge],
     frame_of: Callable[[int], int],
 ) -> Iterator[tuple[list[Pair], Float[Tensor, "e p 2"]]]:

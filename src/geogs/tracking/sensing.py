@@ -9,7 +9,7 @@ from geogs.config import DepthSensorConfig
 from geogs.priors.depth_sensor import sensor_depth
 from geogs.types import MeasuredDepth
 from geogs.world.grid import OFFSET, STRIDE, SampleGrid
-from geogs.world.keyframe import Keyframe, MeasuredCells
+from geogs.world.keyframes import Keyframe, MeasuredCells
 
 
 class DepthSensing:
@@ -53,7 +53,7 @@ class DepthSensing:
         metres = None if depth is None else depth.metres()
         if metres is None:
             return False
-        state.picture.depth = metres
+        state.sensor_depth = metres
         grid = self.grid
         cells = sensor_depth(metres, self.config).at_cells(OFFSET, STRIDE, grid.height, grid.width)
         inverse_depth, information = (m.reshape(-1) for m in cells.tensors(grid.device))

@@ -44,8 +44,7 @@ from geogs.tracking.view_choice import seeing
 from geogs.tracking.window import reach
 from geogs.types import Frame, RenderedKeyframe, Trajectory
 from geogs.world.grid import SampleGrid
-from geogs.world.keyframe import Keyframe, KeyframeState
-from geogs.world.store import KeyframeStore
+from geogs.world.keyframes import Keyframe, KeyframeSet, KeyframeTable, check_keyframes
 
 SELDOM = 5
 """While a camera only turns, the orientation says what it sees; only so often it is looked for as
@@ -96,7 +95,7 @@ class Unfinished:
 class TrackerState:
     """What a checkpoint holds of a tracker."""
 
-    keyframes: list[KeyframeState]
+    keyframes: KeyframeSet
     edges: dict[Pair, EdgeState]
     recorder: RecorderState
     start_up: StartUpState
@@ -125,7 +124,7 @@ class Tracker:
         operator: FlowOperator | None = None,
         prior: MonocularPrior | None = None,
         prior_config: PriorConfig | None = None,
-        store: KeyframeStore | None = None,
+        store: KeyframeTable | None = None,
         sensor: DepthSensorConfig | None = None,
         odometry: OdometryConfig | None = None,
         defers: bool = False,
@@ -137,7 +136,7 @@ class Tracker:
         self.config = config or TrackingConfig()
         self.grid = SampleGrid(camera, device) if store is None else store.grid
         self.operator = operator or build_operator(self.config, self.grid)
-        self.keyframes = (store or KeyframeStore(self.grid, self.operator.encode)).new_segment()
+        self.keyframes = (store or KeyframeTable.on(self.grid, self.operator.encode)).new_set()
         self.odometry = Odometry(self.keyframes, odometry or OdometryConfig())
         """What another tracker says of the motion, where frames come with its poses."""
         self.graph = FrameGraph(self.keyframes, self.operator, self.odometry)
@@ -230,7 +229,7 @@ class Tracker:
                 seen.interval,
             )  # fmt: skip
         return TrackerState(
-            self.keyframes.state(), self.graph.state(), self.recorder.state(),
+            self.keyframes, self.graph.state(), self.recorder.state(),
             self._start_up.state(), self.state, list(self._finalized), self._breaks, last,
             self._misses, self.frames_lost, self._choice.state(), self.orientation.state(),
             self.is_metric, self.odometry.state(),
@@ -238,7 +237,9 @@ class Tracker:
 
     def load(self, state: TrackerState) -> None:
         """Give a tracker that has seen nothing yet the state of another."""
-        self.keyframes.load(state.keyframes)
+        check_keyframes(self.keyframes.table, [state.keyframes])
+        self.keyframes.members = state.keyframes.members
+        self.keyframes.attached(self.keyframes.table)
         self.graph.load(state.edges)
         self.recorder.load(state.recorder)
         self._start_up.load(state.start_up)
@@ -491,7 +492,7 @@ class Tracker:
             velocity = motion.T_cw @ se3_inverse(self._last.T_cw)
             interval = frame.timestamp - self._last.timestamp
         if self.state is TrackState.LOST:
-            self._breaks.append(self.keyframes.store.next_id)
+            self._breaks.append(self.keyframes.table.next_id)
         self.state, self._misses, self.frames_lost = TrackState.TRACKING, 0, 0
         self.orientation.located(frame, encoded)
         anchor = self.keyframes[motion.keyframe]

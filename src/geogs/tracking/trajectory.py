@@ -23,8 +23,7 @@ from geogs.tracking.row_errors import RowErrors
 from geogs.tracking.turns import Turn, orientations
 from geogs.types import FlowMatch, Frame, SeenRows, Trajectory
 from geogs.world.grid import SampleGrid
-from geogs.world.keyframe import Keyframe
-from geogs.world.store import Segment
+from geogs.world.keyframes import Keyframe, KeyframeSet
 
 ASTRAY = 0.05
 """Radians by which a frame's orientation may differ from one between its keyframes."""
@@ -94,7 +93,7 @@ class TrajectoryRecorder:
     is measured and every second cell of it is kept.
     """
 
-    def __init__(self, store: Segment, operator: FlowOperator, max_pending: int = 64) -> None:
+    def __init__(self, store: KeyframeSet, operator: FlowOperator, max_pending: int = 64) -> None:
         self.keyframes, self.operator, self.max_pending = store, operator, max_pending
         self._records: list[FrameRecord] = []
         self._turning: deque[tuple[FrameRecord, Future[Turn | None]]] = deque()

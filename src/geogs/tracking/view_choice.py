@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from geogs.bundle.select import grid_fields
-from geogs.world.keyframe import Keyframe
+from geogs.world.keyframes import Keyframe
 
 CONSIDERED = 12
 """Keyframes that look most nearly the same way."""

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import torch
 
 from geogs.geometry.lie import se3_inverse
-from geogs.world.keyframe import Keyframe
+from geogs.world.keyframes import Keyframe
 
 
 def reach(keyframes: Sequence[Keyframe], least: int, most: int, baseline: float) -> int:

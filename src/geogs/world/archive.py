@@ -20,7 +20,6 @@ from typing import BinaryIO, Protocol
 import numpy as np
 
 from geogs.errors import InputError, OutputError
-from geogs.world.swap import Swap
 
 _PIECE = 1 << 24
 """Bytes copied at once."""
@@ -30,8 +29,8 @@ class Archive:
     """A file of arrays of any shape and type, for as long as the process lasts.
 
     It lies in ``folder``, or where the system keeps temporary files (``TMPDIR``), has no name there
-    and so vanishes with the process, however that ends. The last ``resident`` arrays written or
-    read stay in memory as well. Space of arrays that nobody refers to any more is used again.
+    and so vanishes with the process, however that ends. Space of arrays that nobody refers to any
+    more is used again.
 
     For a checkpoint the file gets a name (``settle``), and what the last checkpoint refers to stays
     until the next one is complete (``release``). Every array has a checksum from when it was
@@ -39,16 +38,15 @@ class Archive:
     and damage is told before any work is done with it.
     """
 
-    def __init__(self, folder: Path | str | None = None, resident: int = 0) -> None:
+    def __init__(self, folder: Path | str | None = None) -> None:
         self.folder = Path(folder or tempfile.gettempdir())
         self.name = f"archive-{uuid.uuid4().hex[:16]}"
         """Of the file, once it is settled."""
-        self._recent: Swap[int, np.ndarray] = Swap(resident)
         self._free: dict[int, list[int]] = {}
         """Offsets of unused pieces, by their size."""
-        self._gone: deque[tuple[int, int, int]] = deque()
-        """Key, offset and size of what nobody refers to any more; collected without a lock."""
-        self._end = self._next_key = 0
+        self._gone: deque[tuple[int, int]] = deque()
+        """Offset and size of what nobody refers to any more; collected without a lock."""
+        self._end = 0
         self._lock = threading.Lock()
         self._is_settled = False
         self._withheld: list[tuple[int, int]] = []
@@ -67,7 +65,7 @@ class Archive:
         return self._end
 
     def put(self, array: np.ndarray) -> "Archived":
-        """Write an array; it must not be changed while it is resident.
+        """Write an array.
 
         Raises:
             OutputError: the disk is full, or cannot be written.
@@ -80,15 +78,22 @@ class Archive:
         data = np.ascontiguousarray(array)
         archived = self._archived(offset, array.shape, array.dtype, zlib.crc32(_bytes(data)))
         self._write(data, offset)
-        if self._recent.limit:
-            self._recent.put(archived.key, array)
         return archived
 
     def read(self, archived: "Archived") -> np.ndarray:
-        """An array as it was written; one that is resident is not to be changed."""
-        if not self._recent.limit:
-            return self._read(archived)
-        return self._recent.get(archived.key, lambda: self._read(archived))
+        """An array as it was written.
+
+        Raises:
+            OutputError: the file has been cut off.
+        """
+        array = np.empty(archived.shape, archived.dtype)
+        rest, offset = _bytes(array), archived.offset
+        while rest:
+            done = os.preadv(self._file.fileno(), [rest], offset)
+            if done == 0:
+                raise OutputError(f"The archive in {self.folder} has been cut off.")
+            rest, offset = rest[done:], offset + done
+        return array
 
     # --- checkpoints -----------------------------------------------------------------------
 
@@ -108,7 +113,7 @@ class Archive:
             self._collect()
         self._releasing, self._withheld = self._releasing + self._withheld, []
         unused = [(o, size) for size, offsets in self._free.items() for o in offsets]
-        return SettledArchive(self._end, self._recent.limit, [*unused, *self._releasing])
+        return SettledArchive(self._end, [*unused, *self._releasing])
 
     def release(self) -> None:
         """The checkpoint that was written since ``settle`` is complete and replaces the last."""
@@ -124,9 +129,9 @@ class Archive:
             InputError: the file is missing, too short, or what is said of it cannot be.
         """
         parts = [(0, settled.end), *settled.free]
-        if settled.resident < 0 or any(min(p) < 0 or sum(p) > settled.end for p in parts):
+        if any(min(p) < 0 or sum(p) > settled.end for p in parts):
             raise InputError(f"what is said of {name} cannot be")
-        archive = cls(folder.path, settled.resident)
+        archive = cls(folder.path)
         with folder.change(name) as file:
             if os.fstat(file.fileno()).st_size < settled.end:
                 raise InputError(f"{name} is cut off")
@@ -148,7 +153,7 @@ class Archive:
         if min(offset, *shape, 0) < 0 or offset + math.prod(shape) * dtype.itemsize > self._end:
             raise InputError(f"{self.name} does not reach as far as it should")
         archived = self._archived(offset, shape, dtype, checksum)
-        if zlib.crc32(_bytes(self._read(archived))) != checksum:
+        if zlib.crc32(_bytes(self.read(archived))) != checksum:
             raise InputError(f"{self.name} has changed")
         return archived
 
@@ -169,12 +174,9 @@ class Archive:
         self, offset: int, shape: tuple[int, ...], dtype: np.dtype, checksum: int
     ) -> "Archived":
         """A reference to an array; its space is used again once nobody has one any more."""
-        with self._lock:
-            self._next_key += 1
-            key = self._next_key
-        archived = Archived(self, key, offset, shape, dtype, checksum)
+        archived = Archived(self, offset, shape, dtype, checksum)
         size = math.prod(shape) * dtype.itemsize
-        weakref.finalize(archived, self._gone.append, (key, offset, size))
+        weakref.finalize(archived, self._gone.append, (offset, size))
         return archived
 
     # --- the file --------------------------------------------------------------------------
@@ -188,21 +190,10 @@ class Archive:
         except OSError as error:
             raise self._unwritable(error) from error
 
-    def _read(self, archived: "Archived") -> np.ndarray:
-        array = np.empty(archived.shape, archived.dtype)
-        rest, offset = _bytes(array), archived.offset
-        while rest:
-            done = os.preadv(self._file.fileno(), [rest], offset)
-            if done == 0:
-                raise OutputError(f"The archive in {self.folder} has been cut off.")
-            rest, offset = rest[done:], offset + done
-        return array
-
     def _collect(self) -> None:
         """Make the space of arrays that are gone free for others."""
         while self._gone:
-            key, offset, size = self._gone.popleft()
-            self._recent.drop(key)
+            offset, size = self._gone.popleft()
             if self._is_settled:
                 self._withheld.append((offset, size))
             else:
@@ -226,8 +217,6 @@ class SettledArchive:
 
     end: int
     """Bytes of the file."""
-    resident: int
-    """Arrays that stay in memory."""
     free: list[tuple[int, int]]
     """Offset and size of its unused pieces."""
 
@@ -255,19 +244,17 @@ class NamedFiles(Protocol):
 class Archived:
     """An array in an archive."""
 
-    __slots__ = ("__weakref__", "archive", "checksum", "dtype", "key", "offset", "shape")
+    __slots__ = ("__weakref__", "archive", "checksum", "dtype", "offset", "shape")
 
     def __init__(
         self,
         archive: Archive,
-        key: int,
         offset: int,
         shape: tuple[int, ...],
         dtype: np.dtype,
         checksum: int,
     ) -> None:
         self.archive = archive
-        self.key = key
         self.offset = offset
         self.shape = shape
         self.dtype = dtype
@@ -275,7 +262,7 @@ class Archived:
         """CRC-32 of its bytes."""
 
     def load(self) -> np.ndarray:
-        """The array as it was archived, which is not to be changed."""
+        """The array as it was archived."""
         return self.archive.read(self)
 
 

@@ -28,7 +28,7 @@ from geogs.tracking.flow.select import build_operator
 from geogs.tracking.graph import FrameGraph
 from geogs.tracking.packed_edge import PackedEdge
 from geogs.world.grid import SampleGrid
-from geogs.world.store import KeyframeStore
+from geogs.world.keyframes import KeyframeTable
 from geogs_fleet.join.gauge import Gauge
 from geogs_fleet.join.graph import Placement
 from geogs_fleet.join.matches import Depths, Directed, Matches, MatchJob, Member, match
@@ -245,7 +245,7 @@ def _known_graph(job: StepJob, grid: SampleGrid) -> tuple[FrameGraph, list[Node]
     for path in job.matches:
         edges |= Matches.load(path).edges(grid)
     seen = {target for _, target in edges}
-    segment = KeyframeStore(grid).new_segment()
+    segment = KeyframeTable.on(grid).new_set()
     nodes: list[Node] = []
     ids: dict[Node, int] = {}
     for member in (job.own, *job.others):

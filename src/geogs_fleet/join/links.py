@@ -20,8 +20,7 @@ from geogs.threads import on_one_torch_thread
 from geogs.tracking.flow.base import FlowOperator
 from geogs.tracking.flow.select import build_operator
 from geogs.world.grid import SampleGrid
-from geogs.world.keyframe import Keyframe
-from geogs.world.store import KeyframeStore, Segment
+from geogs.world.keyframes import Keyframe, KeyframeSet, KeyframeTable
 from geogs_fleet.join.part import Node, Part, PartViews, image_of, opened
 
 
@@ -68,8 +67,8 @@ def links_of(job: LinkJob) -> list[Link]:
     if not wanted:
         return []
     operator = build_operator(job.config.tracking, grid)
-    store = KeyframeStore(grid, operator.encode)
-    segments = store.new_segment(), store.new_segment()
+    store = KeyframeTable.on(grid, operator.encode)
+    segments = store.new_set(), store.new_set()
     places = sorted({w[0] for w in wanted}), sorted({w[1] for w in wanted})
     loaded = [
         loaded_keyframes(segment, operator, opened(part), v, some)
@@ -93,7 +92,7 @@ def links_of(job: LinkJob) -> list[Link]:
 
 
 def loaded_keyframes(
-    segment: Segment,
+    segment: KeyframeSet,
     operator: FlowOperator,
     result: SavedResult,
     views: PartViews,

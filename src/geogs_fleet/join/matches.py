@@ -21,8 +21,7 @@ from geogs.tracking.packed_edge import PackedEdge, PackedFlow, in_steps
 from geogs.tracking.proximity import Pair, proximity_pairs
 from geogs.tracking.row_errors import RowErrors, edge_shifts
 from geogs.world.grid import SampleGrid
-from geogs.world.keyframe import Keyframe
-from geogs.world.store import KeyframeStore
+from geogs.world.keyframes import Keyframe, KeyframeTable
 from geogs_fleet.join.links import loaded_keyframes
 from geogs_fleet.join.part import Node, Part, PartViews, opened
 
@@ -182,7 +181,7 @@ def match(job: MatchJob) -> Matched:
     """Match pairs that are near in what they show, in both directions, and write the files."""
     grid, members = SampleGrid(job.camera), (job.own, *job.others)
     operator = build_operator(job.config.tracking, grid)
-    segment = KeyframeStore(grid, operator.encode).new_segment()
+    segment = KeyframeTable.on(grid, operator.encode).new_set()
     before: dict[Directed, PackedEdge] = {}
     for path in job.before:
         before |= Matches.load(path).edges(grid, as_found=True)

@@ -19,7 +19,9 @@ from geogs.slam import Slam, SlamState
 from geogs.splat.rows import GrowingRows
 from geogs.world.archive import Archive, Archived
 from geogs.world.grid import SampleGrid
+from geogs.world.keyframes import KeyframeSet
 from quick_systems import Work, quick_config
+from records import copied
 
 pytestmark = pytest.mark.system
 
@@ -170,8 +172,8 @@ def test_the_maps_in_memory_are_those_that_were(tracked, tmp_path):
 def test_a_state_of_another_camera_or_without_a_keyframe_is_one_sentence(tracked):
     camera, state = tracked.camera, tracked.state()
     with pytest.raises(InputError, match="of another camera"):
-        Slam(camera.resized(64, 48), quick(3)).restore(state)
-    first, *rest = state.segments.trackers[0].keyframes
+        Slam(camera.resized(64, 48), quick(3)).restore(copied(state))
+    first, *rest = state.segments.trackers[0].keyframes.members
     wrong = [
         replace(state, waiting=[99]),
         replace(state, mapper=replace(state.mapper, mapped=[99])),
@@ -180,10 +182,10 @@ def test_a_state_of_another_camera_or_without_a_keyframe_is_one_sentence(tracked
     ]
     for changed in wrong:
         with pytest.raises(InputError, match=r"is missing|has no place|not in its place"):
-            Slam(camera, quick(3)).restore(changed)
+            Slam(camera, quick(3)).restore(copied(changed))
 
 
-def with_keyframes(state: SlamState, keyframes: list) -> SlamState:
+def with_keyframes(state: SlamState, keyframes: list[int]) -> SlamState:
     """The state with other keyframes in its world."""
-    world = replace(state.segments.trackers[0], keyframes=keyframes)
+    world = replace(state.segments.trackers[0], keyframes=KeyframeSet(keyframes))
     return replace(state, segments=replace(state.segments, trackers=[world]))

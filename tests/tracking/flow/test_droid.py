@@ -19,7 +19,7 @@ from geogs.tracking.flow.droid import DroidFlow, DroidOptions
 from geogs.tracking.flow.droid_network import DroidNetwork, DroidSize
 from geogs.tracking.graph import FrameGraph
 from geogs.world.grid import SampleGrid
-from geogs.world.store import KeyframeStore
+from geogs.world.keyframes import KeyframeTable
 from tracking_scenes import CAMERA, pose, render
 
 GRID = SampleGrid(CAMERA)
@@ -214,7 +214,7 @@ def test_half_precision_is_close(operator, start, monkeypatch):
 def test_the_graph_adjusts_what_the_operator_measures():
     """The whole way: memory, weights and damping through the graph into the adjustment."""
     operator = DroidFlow(GRID, narrow(delta=(0.0, 0.0)))
-    store = KeyframeStore(GRID).new_segment()
+    store = KeyframeTable.on(GRID).new_set()
     for k, T in enumerate(POSES):
         image, depth = render(T)
         state = store.add(

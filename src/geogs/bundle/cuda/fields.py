@@ -11,7 +11,7 @@ from geogs.bundle.cuda.dense import block_size
 from geogs.gpu.kernels import kernels_for
 from geogs.gpu.transfer import to_device
 from geogs.world.grid import OFFSET, STRIDE, SampleGrid
-from geogs.world.keyframe import Keyframe
+from geogs.world.keyframes import Keyframe
 
 SOURCE = Path(__file__).with_name("fields.cu")
 MOST_THREADS = 1024

@@ -11,7 +11,7 @@ from geogs.bundle.problem import MotionProblem
 from geogs.gpu.kernels import kernels_for
 from geogs.gpu.transfer import to_device
 from geogs.world.grid import SampleGrid
-from geogs.world.keyframe import KNOWN, Keyframe
+from geogs.world.keyframes import KNOWN, Keyframe
 
 SOURCE = Path(__file__).with_name("motion.cu")
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from geogs.bundle.cuda.dense import block_size
 from geogs.gpu.kernels import Kernel, kernels_for
 from geogs.gpu.transfer import to_device
-from geogs.world.store import Segment
+from geogs.world.keyframes import KeyframeSet
 
 SOURCE = Path(__file__).with_name("pairs.cu")
 
@@ -18,7 +18,7 @@ SOURCE = Path(__file__).with_name("pairs.cu")
 class CudaPairs:
     """Pairs (source, target) of keyframe ids, on the device."""
 
-    def __init__(self, keyframes: Segment, directed: Sequence[tuple[int, int]]) -> None:
+    def __init__(self, keyframes: KeyframeSet, directed: Sequence[tuple[int, int]]) -> None:
         ids = sorted({k for pair in directed for k in pair})
         slot = {k: n for n, k in enumerate(ids)}
         rows = torch.tensor([[slot[i], slot[j]] for i, j in directed], dtype=torch.int32).mT

@@ -24,7 +24,7 @@ from geogs.depth.sweep_neighbors import depth_range
 from geogs.depth.view import DenseDepth, DepthView, PosedDepth, dense_depths
 from geogs.geometry.camera import Camera
 from geogs.threads import worker_count
-from geogs.world.swap import Swap
+from geogs.world.lru import LruCache
 
 # Keyframes whose grids are completed at once.
 _BATCH = 32
@@ -63,7 +63,7 @@ class CudaDepthEngine:
         self.working = working
         self.config = config
         self._places = PixelPlaces.of(render, working, device)
-        self._images: Swap[int, KeyframeImages] = Swap(
+        self._images: LruCache[int, KeyframeImages] = LruCache(
             resident, lambda id, _: self._edges.pop(id, None)
         )
         self._pixels: dict[int, Future[Float32[np.ndarray, "n"]]] = {}

@@ -22,7 +22,7 @@ from geogs.depth.view import DenseDepth, DepthView, PosedDepth, dense_depths
 from geogs.geometry.camera import Camera
 from geogs.gpu.recorded import Recorded
 from geogs.gpu.transfer import to_device
-from geogs.world.swap import Swap
+from geogs.world.lru import LruCache
 
 MOST_NEIGHBOURS = 8
 """The training shows no more; they come best first."""
@@ -65,7 +65,7 @@ class NetworkDepthEngine:
         self._recorded = Recorded(
             lambda *views: self._at_render(self.network(StereoViews(*views))), "The depth network"
         )
-        self._images: Swap[int, UInt8[Tensor, "h w 3"]] = Swap(resident)
+        self._images: LruCache[int, UInt8[Tensor, "h w 3"]] = LruCache(resident)
 
     def observe(self, view: DepthView) -> None:
         """As in the protocol."""

@@ -10,7 +10,7 @@ from torch import Tensor
 from geogs.losses.cuda.view_table import ViewTable
 from geogs.mapping.cameras import MapCameras
 from geogs.mapping.view import MapView
-from geogs.world.swap import Swap
+from geogs.world.lru import LruCache
 
 
 class KnownViews:
@@ -22,7 +22,7 @@ class KnownViews:
 
     def __init__(self, cameras: MapCameras, device: torch.device, resident: int) -> None:
         self.table = ViewTable(cameras.render, cameras.photo, device)
-        self._slots: Swap[int, int] = Swap(resident, self._free)
+        self._slots: LruCache[int, int] = LruCache(resident, self._free)
         self._unused: list[int] = []
         """Slots whose views had to go."""
         self._constants: dict[int, object] = {}

@@ -5,31 +5,39 @@ next to nothing of what asking keyframe by keyframe would.
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float, Float64, Int, Int64
 from torch import Tensor
 
+from geogs.world.arrays import NOT_STORED
 
+
+@dataclass(eq=False)
 class PoseTable:
     """World-to-camera poses by keyframe id, float64, on the CPU.
 
     A pose is replaced, never changed in place: who keeps a reference sees what it was.
     """
 
-    def __init__(self) -> None:
-        self._poses: dict[int, Float[Tensor, "4 4"]] = {}
-        self._rows: Float64[np.ndarray, "c 4 4"] = np.zeros((0, 4, 4))
-        """By id, with room for more."""
-        self._centres: Float64[np.ndarray, "c 3"] = np.zeros((0, 3))
+    T_cw: dict[int, Float64[Tensor, "4 4"]] = field(default_factory=dict)
+    _rows: Float64[np.ndarray, "c 4 4"] = field(init=False, repr=False, metadata=NOT_STORED)
+    """The same by id, with room for more."""
+    _centres: Float64[np.ndarray, "c 3"] = field(init=False, repr=False, metadata=NOT_STORED)
+
+    def __post_init__(self) -> None:
+        self._rows, self._centres = np.zeros((0, 4, 4)), np.zeros((0, 3))
+        for id, T_cw in self.T_cw.items():
+            self[id] = T_cw
 
     def __getitem__(self, id: int) -> Float[Tensor, "4 4"]:
-        return self._poses[id]
+        return self.T_cw[id]
 
     def __setitem__(self, id: int, T_cw: Float[Tensor, "4 4"]) -> None:
         if id >= len(self._rows):
             self._grow(id + 1)
-        self._poses[id] = T_cw
+        self.T_cw[id] = T_cw
         self._rows[id] = T = T_cw.numpy()
         self._centres[id] = -T[:3, :3].T @ T[:3, 3]
 
@@ -61,8 +69,8 @@ class PoseTable:
         away = np.linalg.norm(self.centres(ids) - self._centres[id], axis=1)
         within = np.flatnonzero(away < distance)
         within = within[np.argsort(away[within], kind="stable")]
-        turned = turns(self._rows[id], self.rows(ids[within]))
-        return ids[within[turned < angle]]
+        apart = rotation_angles(self._rows[id], self.rows(ids[within]))
+        return ids[within[apart < angle]]
 
     def _grow(self, least: int) -> None:
         more = max(least, 2 * len(self._rows), 64) - len(self._rows)
@@ -70,7 +78,7 @@ class PoseTable:
         self._centres = np.concatenate([self._centres, np.zeros((more, 3))])
 
 
-def turns(
+def rotation_angles(
     T: Float64[np.ndarray, "4 4"], others: Float64[np.ndarray, "n 4 4"]
 ) -> Float64[np.ndarray, "n"]:
     """Angles in degrees between the orientation of a pose and those of others."""

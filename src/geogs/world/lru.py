@@ -9,7 +9,7 @@ K = TypeVar("K", bound=Hashable)
 V = TypeVar("V")
 
 
-class Swap(Generic[K, V]):
+class LruCache(Generic[K, V]):
     """The values used last, at most ``limit`` of them; others are made again when they are wanted.
 
     ``leave`` is told of each value that has to go, so that it can be stored or its place be given

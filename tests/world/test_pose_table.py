@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from geogs.geometry.lie import se3_exp, se3_inverse, so3_log
-from geogs.world.poses import PoseTable, turns
+from geogs.world.pose_table import PoseTable, rotation_angles
 
 
 def random_table(count: int, seed: int = 0) -> PoseTable:
@@ -64,4 +64,4 @@ def test_turns_are_exact_at_small_and_large_angles(degrees):
     xi = torch.zeros(6, dtype=torch.float64)
     xi[4] = np.radians(degrees)
     T, other = torch.eye(4, dtype=torch.float64).numpy(), se3_exp(xi).numpy()
-    assert turns(T, other[None])[0] == pytest.approx(degrees, abs=1e-9)
+    assert rotation_angles(T, other[None])[0] == pytest.approx(degrees, abs=1e-9)

@@ -1,0 +1,437 @@
+"""All keyframes of a run, by stable id: what was seen, from where, and how far it is."""
+
+import copy
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float32, UInt8
+from torch import Tensor
+
+from geogs.errors import InputError
+from geogs.geometry.lie import scaled, sim3_scale
+from geogs.priors.base import DepthKind
+from geogs.types import MeasuredPose, PoseCorrection
+from geogs.world.arrays import NOT_STORED, RESIDENT, ArrayTable
+from geogs.world.grid import SampleGrid
+from geogs.world.pose_table import PoseTable
+
+Encode = Callable[[UInt8[np.ndarray, "h w 3"]], Any]
+"""A flow operator's form of an image."""
+
+KNOWN = 0.3
+"""Relative deviation up to which a depth helps to tell where a camera is."""
+RELATIVE_FLOOR = 0.004
+"""Relative depth deviation that no amount of matches removes."""
+
+
+@dataclass
+class KeyframePrior:
+    """What a monocular prior said of a keyframe's depth, and how it is scaled; mutable."""
+
+    kind: DepthKind
+    values: Float[Tensor, "p"]
+    """As the prior gave them, on the grid."""
+    inverse_depth: Float[Tensor, "p"]
+    """Aligned to the tracker's; 0 where unknown, and everywhere before the first alignment."""
+    scale: Float[Tensor, "k"]
+    """Factors of the aligned inverse depth at the nodes of a coarse grid, row by row."""
+    information: Float[Tensor, "p"]
+    """What it adds to the inverse variance of the keyframe's inverse depth."""
+    is_aligned: bool = False
+
+    def rescale(self, factor: float) -> None:
+        """Multiply every length by ``factor``."""
+        self.scale = self.scale / factor
+        self.information = self.information * factor**2
+
+
+@dataclass
+class MeasuredCells:
+    """What a depth sensor says of a keyframe's cells, in the lengths of the map; mutable."""
+
+    inverse_depth: Float[Tensor, "p"]
+    information: Float[Tensor, "p"]
+    """Inverse variance of inverse depth; 0 where it says nothing."""
+
+    def rescale(self, factor: float) -> None:
+        """Multiply every length by ``factor``."""
+        self.inverse_depth = self.inverse_depth / factor
+        self.information = self.information * factor**2
+
+
+@dataclass(eq=False)
+class Keyframe:
+    """The one record of a keyframe's depth and scale; its pose and its images are in its table.
+
+    A pose or a field is replaced, never changed in place: who keeps a reference sees what it was.
+    """
+
+    id: int
+    """Stable: never reused, increasing in time."""
+    frame_index: int
+    timestamp: float
+    """Seconds."""
+    inverse_depth: Float32[Tensor, "p"]
+    """On the grid of its table."""
+    information: Float32[Tensor, "p"]
+    """Of the matches, sum over edges of w |dp/dd|^2, and of a depth sensor; not of a prior."""
+    prior: KeyframePrior | None = None
+    scale: float = 1.0
+    """Factor by which corrections have multiplied the lengths around it; what was measured from it
+    at another scale is to be multiplied by the ratio of the two."""
+    moving: Bool[Tensor, "p"] | None = None
+    """Cells that show something dynamic; none where nobody has judged yet."""
+    measured: MeasuredCells | None = None
+    """Of a depth sensor; none without, or where the map is not metric."""
+    pose: MeasuredPose | None = None
+    """By another tracker, in its own world; none where there is none."""
+    table: "KeyframeTable" = field(init=False, repr=False, metadata=NOT_STORED)
+    """Which has it; given by the table."""
+    own_encoded: Any = field(default=None, repr=False, metadata=NOT_STORED)
+    """The encoded image, where the table cannot make it again."""
+
+    @property
+    def grid(self) -> SampleGrid:
+        """Where depth is kept."""
+        return self.table.grid
+
+    @property
+    def T_cw(self) -> Float[Tensor, "4 4"]:
+        """World to camera, float64, on the CPU whatever the device of the grid."""
+        return self.table.poses[self.id]
+
+    @T_cw.setter
+    def T_cw(self, T_cw: Float[Tensor, "4 4"]) -> None:
+        self.table.poses[self.id] = T_cw
+
+    @property
+    def image(self) -> UInt8[np.ndarray, "h w 3"]:
+        """RGB at working resolution; not to be changed in place."""
+        image = self.table.arrays.get("image", self.id, recent=True)
+        assert image is not None, f"keyframe {self.id} has no image"
+        return image
+
+    @property
+    def encoded(self) -> Any:
+        """The flow operator's form of the image, computed again where it is no longer kept."""
+        encode = self.table.encode
+        if encode is None:
+            return self.own_encoded
+        return self.table.arrays.made("encoded", self.id, lambda: encode(self.image))
+
+    @property
+    def prior_normal(self) -> Float[Tensor, "h w 3"] | None:
+        """A monocular prior's unit normals at working resolution, in the camera frame and facing
+        the camera; zero where unknown, None where nothing was asked."""
+        normal = self.table.arrays.get("prior normal", self.id)
+        return None if normal is None else torch.from_numpy(normal)
+
+    @prior_normal.setter
+    def prior_normal(self, normal: Float[Tensor, "h w 3"]) -> None:
+        self.table.arrays.put("prior normal", self.id, normal.cpu().numpy())
+
+    @property
+    def sensor_depth(self) -> Float32[np.ndarray, "h w"] | None:
+        """What a depth sensor saw, metres at working resolution, 0 where unknown; None without."""
+        depth = self.table.arrays.get("sensor depth", self.id)
+        return None if depth is None else depth.astype(np.float32)
+
+    @sensor_depth.setter
+    def sensor_depth(self, metres: Float32[np.ndarray, "h w"]) -> None:
+        # Half precision rounds by 0.05 %, a tenth of what a sensor errs.
+        self.table.arrays.put("sensor depth", self.id, metres.astype(np.float16))
+
+    def copied_to(self, table: "KeyframeTable") -> "Keyframe":
+        """A copy for another table, which stays what this one is now; its pose is not copied."""
+        twin = copy.copy(self)
+        twin.prior, twin.measured = copy.copy(self.prior), copy.copy(self.measured)
+        twin.table = table
+        return twin
+
+    def as_it_is(self) -> "Keyframe":
+        """A copy with its pose that stays what this one is now, in no table that others see."""
+        twin = self.copied_to(self.table.mirror())
+        twin.T_cw = self.T_cw
+        return twin
+
+    def rescale(self, factor: float) -> None:
+        """Multiply every length that the camera sees by ``factor``; the pose stays."""
+        if factor == 1.0:
+            return
+        self.inverse_depth = self.inverse_depth / factor
+        self.information = self.information * factor**2
+        self.scale = self.scale * factor
+        if self.prior is not None:
+            self.prior.rescale(factor)
+        if self.measured is not None:
+            self.measured.rescale(factor)
+
+    def at_present_scale(self, T: Float[Tensor, "4 4"], scale: float) -> Float[Tensor, "4 4"]:
+        """A motion measured from here when the keyframe had that scale, in its lengths of now."""
+        factor = self.scale / scale
+        return T if factor == 1.0 else scaled(T, factor)
+
+    @property
+    def has_known_depth(self) -> Bool[Tensor, "p"]:
+        """Where matches tell the depth to ``KNOWN``, if the poses are right."""
+        return KNOWN**2 * self.inverse_depth.square() * self.information > 1
+
+    @property
+    def confident_information(self) -> Float[Tensor, "p"]:
+        """Information less the error that no match removes: what others may trust depth by.
+
+        The relative deviation of depth is z / sqrt of this. What a prior adds is only told of where
+        depth has been adjusted with it.
+        """
+        # What matches agree on is still wrong by a common error of poses and scale.
+        floor = (RELATIVE_FLOOR * self.inverse_depth).square()
+        known = self.information
+        if self.prior is not None:
+            known = known + self.prior.information
+        return known / (1 + known * floor)
+
+    def depth_field(
+        self,
+    ) -> tuple[Float32[np.ndarray, "gh gw"], Float32[np.ndarray, "gh gw"]]:
+        """Inverse depth and its ``confident_information`` as images of cells, on the CPU."""
+        shape = (self.grid.height, self.grid.width)
+        return (
+            self.inverse_depth.reshape(shape).cpu().numpy(),
+            self.confident_information.reshape(shape).cpu().numpy(),
+        )
+
+
+@dataclass(eq=False)
+class KeyframeTable:
+    """All keyframes of a run by id, their poses as rows of one array, and their large arrays.
+
+    Who works with keyframes holds ids, or a :class:`KeyframeSet`, and asks here.
+    """
+
+    next_id: int = 0
+    """The id that the next keyframe gets; ids grow and are never used twice."""
+    keyframes: dict[int, Keyframe] = field(default_factory=dict)
+    poses: PoseTable = field(default_factory=PoseTable)
+    arrays: ArrayTable = field(default_factory=ArrayTable)
+    grid: SampleGrid = field(init=False, repr=False, metadata=NOT_STORED)
+    encode: Encode | None = field(init=False, repr=False, metadata=NOT_STORED)
+    """The flow operator's; images are encoded again by it when needed."""
+    set_of: dict[int, "KeyframeSet"] = field(init=False, repr=False, metadata=NOT_STORED)
+    """The set that a keyframe is in at present."""
+    _removed: list[int] = field(default_factory=list, init=False, repr=False, metadata=NOT_STORED)
+    """Keyframes that somebody may still be looking at."""
+
+    @staticmethod
+    def on(
+        grid: SampleGrid, encode: Encode | None = None, resident: int = RESIDENT
+    ) -> "KeyframeTable":
+        """A table without keyframes."""
+        return KeyframeTable().attached(grid, encode, resident)
+
+    def attached(
+        self, grid: SampleGrid, encode: Encode | None = None, resident: int = RESIDENT
+    ) -> "KeyframeTable":
+        """The table with what belongs to the process: where depth is kept, how images are encoded,
+        and how many of the large arrays of a name stay in memory."""
+        self.grid, self.encode, self.set_of = grid, encode, {}
+        self.arrays.resident = resident
+        for keyframe in self.keyframes.values():
+            keyframe.table = self
+        return self
+
+    def mirror(self) -> "KeyframeTable":
+        """A table without keyframes that has the large arrays of this one."""
+        twin = KeyframeTable(arrays=self.arrays)
+        twin.grid, twin.encode, twin.set_of = self.grid, self.encode, {}
+        return twin
+
+    def take_over(self, other: "KeyframeTable") -> None:
+        """Go on with what another table, just read, holds."""
+        self.next_id, self.keyframes = other.next_id, other.keyframes
+        self.poses, self.arrays = other.poses, other.arrays
+        self.attached(self.grid, self.encode, self.resident)
+
+    def __getitem__(self, id: int) -> Keyframe:
+        return self.keyframes[id]
+
+    def __contains__(self, id: int) -> bool:
+        return id in self.set_of
+
+    @property
+    def resident(self) -> int:
+        """Keyframes whose large arrays stay in memory."""
+        return self.arrays.resident
+
+    def pop(self, id: int) -> Keyframe:
+        """Take a keyframe out; what is kept of it by id goes with ``forget_removed``."""
+        del self.set_of[id]
+        self._removed.append(id)
+        return self.keyframes.pop(id)
+
+    def forget_removed(self) -> None:
+        """Let poses and large arrays of keyframes that were taken out go."""
+        for id in self._removed:
+            self.arrays.forget(id)
+            self.poses.T_cw.pop(id, None)
+        self._removed = []
+
+    def new_set(self) -> "KeyframeSet":
+        """A set without keyframes."""
+        return KeyframeSet().attached(self)
+
+
+@dataclass(eq=False)
+class KeyframeSet:
+    """Keyframes of a table that share a gauge, world and unit of their poses; in order of time."""
+
+    members: list[int] = field(default_factory=list)
+    """Their ids, earliest first."""
+    table: KeyframeTable = field(init=False, repr=False, metadata=NOT_STORED)
+    _corrections: list[PoseCorrection] = field(
+        default_factory=list, init=False, repr=False, metadata=NOT_STORED
+    )
+    """Not yet taken; a checkpoint is written when all are."""
+
+    def attached(self, table: KeyframeTable) -> "KeyframeSet":
+        """The set as one of a table that has its keyframes."""
+        self.table = table
+        table.set_of.update(dict.fromkeys(self.members, self))
+        return self
+
+    def __len__(self) -> int:
+        return len(self.members)
+
+    def __iter__(self) -> Iterator[Keyframe]:
+        return (self.table.keyframes[id] for id in self.members)
+
+    def __getitem__(self, id: int) -> Keyframe:
+        if id not in self:
+            raise KeyError(id)
+        return self.table.keyframes[id]
+
+    def __contains__(self, id: int) -> bool:
+        return self.table.set_of.get(id) is self
+
+    @property
+    def grid(self) -> SampleGrid:
+        """Where depth is kept."""
+        return self.table.grid
+
+    @property
+    def ids(self) -> list[int]:
+        """All ids, earliest first."""
+        return list(self.members)
+
+    def add(
+        self,
+        frame_index: int,
+        timestamp: float,
+        image: UInt8[np.ndarray, "h w 3"],
+        encoded: Any,
+        T_cw: Float[Tensor, "4 4"],
+    ) -> Keyframe:
+        """Append a new keyframe with unit inverse depth and no information."""
+        table, grid = self.table, self.table.grid
+        table.forget_removed()
+        id, table.next_id = table.next_id, table.next_id + 1
+        ones = torch.ones(grid.size, device=grid.device)
+        keyframe = Keyframe(id, frame_index, timestamp, ones, 0 * ones)
+        table.arrays.put("image", id, image, recent=True)
+        if table.encode is None:
+            keyframe.own_encoded = encoded
+        else:
+            table.arrays.recent("encoded").put(id, encoded)
+        table.poses[id] = T_cw
+        self.put(keyframe)
+        return keyframe
+
+    def put(self, keyframe: Keyframe) -> None:
+        """Add a keyframe as it is, with the id that it has; its pose is in the table."""
+        keyframe.table = self.table
+        self.table.keyframes[keyframe.id] = keyframe
+        self.table.set_of[keyframe.id] = self
+        self.members.append(keyframe.id)
+
+    def absorb(self, other: "KeyframeSet") -> None:
+        """Take over the keyframes of another set, which are in this one's world already."""
+        self.members = sorted([*self.members, *other.members])
+        self.table.set_of.update(dict.fromkeys(other.members, self))
+        other.members = []
+
+    def remove(self, id: int) -> Keyframe:
+        """Take a keyframe out of set and table; it has pose and images until the next is added."""
+        self.members.remove(id)
+        return self.table.pop(id)
+
+    def poses(self, ids: Sequence[int]) -> Float[Tensor, "n 4 4"]:
+        """World to camera, float64, on the CPU."""
+        return torch.from_numpy(self.table.poses.rows(ids))
+
+    def inverse_depths(self, ids: Sequence[int]) -> Float[Tensor, "n p"]:
+        """On the grid."""
+        return torch.stack([self[i].inverse_depth for i in ids])
+
+    def informations(self, ids: Sequence[int]) -> Float[Tensor, "n p"]:
+        """On the grid, pixels^2 per inverse depth^2."""
+        return torch.stack([self[i].information for i in ids])
+
+    def rescale(self, factor: float) -> None:
+        """Multiply every length by ``factor``."""
+        for keyframe in self:
+            keyframe.T_cw = scaled(keyframe.T_cw, factor)
+            keyframe.rescale(factor)
+
+    def correct(self, correction: PoseCorrection) -> None:
+        """Take over poses and scales of a loop closure or another global correction.
+
+        Who keeps something in world coordinates is told of it by ``take_corrections``.
+        """
+        for id, T in correction.after.items():
+            keyframe = self[id]
+            keyframe.T_cw = T.to(keyframe.T_cw)
+            keyframe.rescale(1 / correction.scale.get(id, 1.0))
+        self._corrections.append(correction)
+
+    def take_corrections(self) -> list[PoseCorrection]:
+        """Corrections made since the last call, earliest first."""
+        taken, self._corrections = self._corrections, []
+        return taken
+
+    def moved(self, S: Float[Tensor, "4 4"]) -> PoseCorrection:
+        """The correction that takes all to another world, given the Sim(3) from it to theirs."""
+        scale = float(sim3_scale(S))
+        before = {k.id: k.T_cw for k in self}
+        after = {}
+        for k, T in before.items():
+            after[k] = T @ S.to(T)
+            after[k][:3] /= scale
+        return PoseCorrection(before, after, dict.fromkeys(before, scale))
+
+
+def check_keyframes(table: KeyframeTable, sets: Iterable[KeyframeSet]) -> None:
+    """Look whether sets that were read are of a table that was, and this of the camera of its grid.
+
+    Raises:
+        InputError: a keyframe is missing, of another camera, or not in its place.
+    """
+    grid = table.grid
+    size = grid.camera.height, grid.camera.width, 3
+    images, seen = table.arrays.pieces.get("image", {}), set[int]()
+    for members in (keyframes.members for keyframes in sets):
+        last = -1
+        for id in members:
+            if id not in table.keyframes or id not in images or id not in table.poses.T_cw:
+                raise InputError(f"keyframe {id} is missing")
+            k = table.keyframes[id]
+            cells = k.inverse_depth if k.moving is None else k.moving
+            measured = cells if k.measured is None else k.measured.inverse_depth
+            shapes = {k.inverse_depth.shape, cells.shape, measured.shape}
+            if images[id].shape != size or shapes != {(grid.size,)}:
+                raise InputError(f"keyframe {id} is of another camera")
+            if k.id != id or id in seen or id <= last:
+                raise InputError(f"keyframe {id} is not in its place")
+            seen.add(id)
+            last = id
