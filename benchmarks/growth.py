@@ -21,13 +21,13 @@ from geogs.depth.view import DenseDepth
 from geogs.geometry.lie import se3_inverse, sim3_exp, so3_exp
 from geogs.loop.consistency import consistent_loops
 from geogs.loop.detect import LoopDetector
-from geogs.loop.features import Features
-from geogs.loop.pose_graph import PoseGraph, RelativePoses, solve
+from geogs.loop.pose_graph import PoseGraph, solve
 from geogs.loop.retrieval import AppearanceIndex
 from geogs.mapping.mapper import Mapper
 from geogs.tracking.flow.classical import ClassicalFlow
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import KeyframeTable
+from geogs.world.loops import Features, RelativePoses
 from geogs_synth.sequence.export import default_camera
 
 STEP = 0.15

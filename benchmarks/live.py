@@ -126,7 +126,7 @@ def play(
                            "at least" if p99 <= 1000 * LIMITS[1] else "missed",
         "ms of the stages in the slowest hundredth": worst,
         "keyframes": len(slam.segments.keyframe_ids),
-        "loop closures": slam.loops.closures,
+        "loop closures": slam.loops.table.closures,
         "disks": len(slam.snapshot()),
         "most tasks that mapping was behind": behind,
         "seconds of mapping after the last frame": round(waited, 2),

@@ -46,13 +46,13 @@ from geogs.geometry.lie import (
 from geogs.geometry.neighbors import nearest_neighbors
 from geogs.geometry.umeyama import umeyama
 from geogs.loop.closure import close_loops
-from geogs.loop.pose_graph import RelativePoses
 from geogs.mapping.map_update import MapUpdate, plan_update, witness
 from geogs.mapping.mapper import Mapper
 from geogs.mesh.extract import extract_mesh
 from geogs.types import PoseCorrection
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import KeyframeTable
+from geogs.world.loops import RelativePoses
 from geogs_synth.motion.handheld import FRAMES_PER_LAP, handheld_trajectory
 from geogs_synth.places.room import make_room
 from geogs_synth.raycast.raycaster import Raycaster

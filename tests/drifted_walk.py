@@ -9,12 +9,12 @@ from geogs.config import LoopConfig, TrackingConfig
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_inverse
 from geogs.loop.closer import LoopCloser
-from geogs.loop.detect import Loop
 from geogs.tracking.flow.classical import ClassicalFlow
 from geogs.tracking.graph import MeasuredEdge
 from geogs.tracking.segments import Segments
 from geogs.tracking.tracker import Tracker, TrackResult, TrackState
 from geogs.types import FlowMatch
+from geogs.world.loops import Loop
 from keyframe_samples import Sample, segment_of
 
 CAMERA = Camera(60.0, 60.0, 31.5, 23.5, 64, 48)

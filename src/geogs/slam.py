@@ -15,7 +15,7 @@ from torch import Tensor
 from geogs.config import Config
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
-from geogs.loop.closer import LoopCloser, LoopsState
+from geogs.loop.closer import LoopCloser
 from geogs.loop.global_bundle import global_bundle
 from geogs.mapping.all_at_once import map_all
 from geogs.mapping.background import BackgroundMapper
@@ -44,6 +44,7 @@ from geogs.types import (
 )
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import KeyframeTable
+from geogs.world.loops import LoopTable, check_loops
 
 R = TypeVar("R")
 
@@ -74,7 +75,7 @@ class SlamState:
 
     keyframes: KeyframeTable
     segments: SegmentsState
-    loops: LoopsState
+    loops: LoopTable
     mapper: MapperState
     stopwatch: StopwatchState
     frames: int
@@ -163,8 +164,9 @@ class Slam:
     def state(self) -> SlamState:
         """What a checkpoint holds: to be written before the next frame, as it refers to all."""
         self.settle()
+        self.loops.settle()
         return SlamState(
-            self.keyframes, self.segments.state(), self.loops.state(), self.mapper.state(),
+            self.keyframes, self.segments.state(), self.loops.table, self.mapper.state(),
             self.stopwatch.state(), self.frames, list(self._waiting), self.adjusted, self._is_ended,
             self.defers_map,
         )  # fmt: skip
@@ -178,9 +180,12 @@ class Slam:
         """
         self.keyframes.take_over(state.keyframes)
         self.segments.load(state.segments)
-        if not all(i in self.keyframes for i in (*state.waiting, *state.loops.detector.order)):
+        if not all(i in self.keyframes for i in (*state.waiting, *state.loops.keyframes)):
             raise InputError("a keyframe is missing")
-        self.loops.load(state.loops)
+        check_loops(state.loops)
+        self.loops = LoopCloser(
+            self.segments, self.config.loop, self.background is None, self.mask, state.loops
+        )
         for id in state.mapper.pool.maps:
             if (mask := self._mask_of(id)) is not None:
                 self.mapper.pool.add(self.keyframes[id], mask)
@@ -413,7 +418,7 @@ class Slam:
             "segments": [asdict(segment) for segment in self.segments.summary()],
             "not_started": self.segments.why_not or None,
             "loops": len(self.loops.detector.loops),
-            "loop_closures": self.loops.closures,
+            "loop_closures": self.loops.table.closures,
         }
 
     def _pose_agreement(self) -> dict[str, object] | None:

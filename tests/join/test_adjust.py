@@ -11,11 +11,11 @@ from geogs.bundle.base import BundleOptions
 from geogs.config import Config
 from geogs.config.tracking import TrackingConfig
 from geogs.loop.global_bundle import SMALL_STEP
-from geogs.loop.pose_graph import RelativePoses
 from geogs.tracking.flow.select import build_operator
 from geogs.tracking.graph import FrameGraph
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import KeyframeTable
+from geogs.world.loops import RelativePoses
 from geogs_fleet.join.adjust import adjusted
 from geogs_fleet.join.gauge import Gauge
 from geogs_fleet.join.graph import Placement

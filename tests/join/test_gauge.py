@@ -4,8 +4,7 @@ import numpy as np
 import torch
 
 from geogs.geometry.lie import se3_exp, sim3_exp, sim3_inverse, sim3_log, sim3_scale
-from geogs.loop.features import Features
-from geogs.loop.pose_graph import RelativePoses
+from geogs.world.loops import Features, RelativePoses
 from geogs_fleet.join.gauge import claim, common_gauge
 from geogs_fleet.join.graph import Placement, placed
 from geogs_fleet.join.links import Link

@@ -6,8 +6,9 @@ import pytest
 from geogs.config import Config
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
-from geogs.loop.features import FeatureExtractor, Features
+from geogs.loop.features import FeatureExtractor
 from geogs.world.grid import SampleGrid
+from geogs.world.loops import Features
 from geogs_fleet.join.part import DescribeJob, Part, PartViews, describe, opened, resampled
 from geogs_fleet.join.places import candidates
 from joined_parts import CAMERA, image, make_part, pose, seen, walls

@@ -5,8 +5,8 @@ import pytest
 import torch
 
 from geogs.geometry.lie import se3_exp, sim3_exp, sim3_scale
-from geogs.loop.features import Features
 from geogs.types import Trajectory
+from geogs.world.loops import Features
 from geogs_fleet.join.graph import Placement
 from geogs_fleet.join.part import PartViews
 from geogs_fleet.join.trajectory import joined_trajectory, moved_trajectory, spans_of

@@ -65,7 +65,7 @@ def corrected(waits: bool, meanwhile: bool = False):
     closer = closer_of(tracker, loop, OPTIONS, waits)
     segment = tracker.keyframes
     closer.update(FINAL)
-    assert closer.closures == waits
+    assert closer.table.closures == waits
     if meanwhile:
         segment[5].T_cw = STEP @ segment[5].T_cw
         image = torch.zeros(48, 64, 3, dtype=torch.uint8).numpy()
@@ -73,9 +73,9 @@ def corrected(waits: bool, meanwhile: bool = False):
     if not waits:
         closer._asked.answer.result(timeout=30)
         closer.update(NOTHING)  # which brings no keyframe: nothing happens
-        assert closer.closures == 0
+        assert closer.table.closures == 0
         closer.update(FINAL)
-    assert closer.closures == 1
+    assert closer.table.closures == 1
     return segment, closer
 
 
@@ -115,7 +115,7 @@ def test_a_closing_of_a_world_that_is_no_more_is_asked_for_again():
     closer._asked.answer.result(timeout=30)
     closer._age += 1  # as joining a segment does
     closer.update(FINAL)
-    assert closer.closures == 0
+    assert closer.table.closures == 0
     assert torch.equal(tracker.keyframes.poses(tracker.keyframes.ids), before)
     closer.update(NOTHING, is_last=True)
-    assert closer.closures == 1
+    assert closer.table.closures == 1

@@ -6,9 +6,9 @@ from drifted_walk import CAMERA, COUNT, NOTHING, closer_of, true_pose, world
 from geogs.config import LoopConfig
 from geogs.geometry.lie import se3_inverse
 from geogs.loop.closing_matches import closing_matches, take_over_depths
-from geogs.loop.detect import Loop
 from geogs.tracking.graph import MeasuredEdge
 from geogs.types import FlowMatch
+from geogs.world.loops import Loop
 from keyframe_samples import Sample, segment_of
 
 
@@ -67,7 +67,7 @@ def closed(matches: bool) -> float:
     tracker, loop = world(drift=0.06)
     closer = closer_of(tracker, loop, LoopConfig(matches=matches, strain=0.0, min_change=0.0))
     closer.update(NOTHING, is_last=True)
-    assert closer.closures == 1
+    assert closer.table.closures == 1
     keyframes, error = tracker.keyframes, 0.0
     for i in range(COUNT - 1):
         now = keyframes[i + 1].T_cw @ se3_inverse(keyframes[i].T_cw)

@@ -11,9 +11,10 @@ from geogs.geometry.lie import se3_exp, se3_inverse, so3_log
 from geogs.loop import detect, search
 from geogs.loop.dense import dense_check
 from geogs.loop.detect import LoopDetector
-from geogs.loop.features import FeatureExtractor, Features
+from geogs.loop.features import FeatureExtractor
 from geogs.loop.verification import DepthView, TwoViewVerifier
 from geogs.world.keyframes import KeyframeSet
+from geogs.world.loops import Features
 from geogs_synth.raycast.raycaster import View
 from loop_scenes import CAMERA, keyframes, orbit, room, room_views, stretched, views
 

@@ -29,7 +29,6 @@ from geogs.loop.pose_graph import (
     PoseGraph,
     PoseGraphOptions,
     PoseGraphResult,
-    RelativePoses,
     pose_correction,
     relative_errors,
     relative_jacobians,
@@ -38,6 +37,7 @@ from geogs.loop.pose_graph import (
 from geogs.loop.relative_pose import relative_poses
 from geogs.mapping.map_update import anchor_transforms
 from geogs.world.grid import SampleGrid
+from geogs.world.loops import RelativePoses
 from oracles.pose_graph_reference import (
     gauss_newton_step,
     match_residuals,

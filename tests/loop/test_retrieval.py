@@ -119,9 +119,7 @@ def test_scores_are_those_of_comparing_word_by_word(index, lap, again):
     found = index.query(features, count=rows)
     assert len(found) > 3
     for candidate in found:
-        row = index._keyframes.index(candidate.keyframe)
+        row = index._vocabulary.keyframes.index(candidate.keyframe)
         assert candidate.score == pytest.approx(expected[row] / own, rel=1e-12)
-    state = index.state()
-    other = AppearanceIndex()
-    other.load(state)
+    other = AppearanceIndex(vocabulary=index._vocabulary)
     assert other.query(features, count=rows) == found

@@ -6,7 +6,8 @@ from torch import Tensor
 
 from geogs.geometry.lie import retract, sim3_inverse, sim3_log
 from geogs.loop.matched_edges import MatchedEdges, MatchOptions
-from geogs.loop.pose_graph import PoseGraph, RelativePoses
+from geogs.loop.pose_graph import PoseGraph
+from geogs.world.loops import RelativePoses
 
 
 def relative_residuals(

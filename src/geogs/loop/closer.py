@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -20,7 +20,6 @@ from geogs.loop.constraints import (
     between_positions,
     disagreement,
     joined,
-    none_known,
     of_edges,
     of_loop,
     of_poses,
@@ -28,35 +27,17 @@ from geogs.loop.constraints import (
     strains,
     thinned,
 )
-from geogs.loop.detect import DetectorState, Loop, LoopDetector
-from geogs.loop.pose_graph import RelativePoses
+from geogs.loop.detect import LoopDetector
 from geogs.tracking.motion import Recognition
 from geogs.tracking.segments import Segments
 from geogs.tracking.tracker import Tracker, TrackResult
 from geogs.types import PoseCorrection
+from geogs.world.loops import Loop, LoopTable, RelativePoses, SegmentConstraints
 
 MOST_LOOPS = 200
 """Relative poses of loops from which on older ones are thinned out: bounds the pose graph."""
 RETIRED_TOGETHER = 64
 """Directed edges, of some eight keyframes, that become relative poses in one go."""
-
-
-@dataclass
-class Known:
-    """Relative poses of the keyframes of one tracker, by id."""
-
-    odometry: RelativePoses = field(default_factory=none_known)
-    """Of edges that the tracker has let go of."""
-    loops: RelativePoses = field(default_factory=none_known)
-    pending: int = 0
-    """Loops that disagree with the poses, found since the last attempt to close."""
-    last_attempt: int = 0
-    """Number of keyframes at it."""
-
-    def rescale(self, correction: PoseCorrection) -> None:
-        """Follow a correction."""
-        self.odometry = rescaled(self.odometry, correction.scale)
-        self.loops = rescaled(self.loops, correction.scale)
 
 
 @dataclass(frozen=True)
@@ -70,17 +51,6 @@ class _Asked:
     """Of the world then."""
 
 
-@dataclass(frozen=True, eq=False)
-class LoopsState:
-    """What a checkpoint holds of loops."""
-
-    detector: DetectorState
-    closures: int
-    known: dict[int, Known]
-    """By the place of the tracker among all."""
-    between: list[Loop]
-
-
 class LoopCloser:
     """Watches the segments of a run: closes loops within each, and joins segments that meet."""
 
@@ -90,35 +60,31 @@ class LoopCloser:
         config: LoopConfig,
         waits: bool = True,
         mask: Bool[np.ndarray, "h w"] | None = None,
+        table: LoopTable | None = None,
     ) -> None:
         """``waits`` and ``mask`` as the detector's. Without waiting, closings are computed by a
         thread, too, and take effect at a keyframe that becomes final after that."""
         self.segments = segments
         self.config = config
         tracker = segments.world
-        self.detector = LoopDetector(tracker.keyframes.table, tracker.operator, config, waits, mask)
-        self.closures = 0
-        """Loop closures so far."""
-        self._known: dict[Tracker, Known] = {}
-        self._between: list[Loop] = []
-        """Loops between segments."""
+        self.table = table or LoopTable()
+        self.detector = LoopDetector(
+            tracker.keyframes.table, tracker.operator, config, waits, mask, self.table
+        )
+        self._known = {segments.trackers[n]: c for n, c in self.table.constraints.items()}
         self._thread = None if waits else ThreadPoolExecutor(1, thread_name_prefix="closing")
         self._asked: _Asked | None = None
         """What the thread is at, or has answered."""
         self._age = 0
         """Of the world: how often more than a closing has changed it."""
 
-    def state(self) -> LoopsState:
-        """What a checkpoint holds."""
+    def settle(self) -> None:
+        """Bring the table up to date: searches under way are finished, segments have their rank."""
+        self.detector.settle()
         trackers = self.segments.trackers
-        known = {n: self._known[t] for n, t in enumerate(trackers) if t in self._known}
-        return LoopsState(self.detector.state(), self.closures, known, self._between)
-
-    def load(self, state: LoopsState) -> None:
-        """Give loops that know nothing yet the state of others, whose segments are here already."""
-        self.detector.load(state.detector)
-        self.closures, self._between = state.closures, state.between
-        self._known = {self.segments.trackers[n]: known for n, known in state.known.items()}
+        self.table.constraints = {
+            n: self._known[t] for n, t in enumerate(trackers) if t in self._known
+        }
 
     def remember(self, ids: Sequence[int]) -> None:
         """Know keyframes of a saved map again from now on; among themselves they make no loops."""
@@ -159,12 +125,14 @@ class LoopCloser:
             e: v for e, v in world.graph.edges.items() if order[e[1]] - order[e[0]] not in (2, 3)
         }
         held = of_poses(world.keyframes, sorted(world.held))
-        self._known[world] = Known(joined([held, of_edges(world.keyframes, edges)]))
+        self._known[world] = SegmentConstraints(joined([held, of_edges(world.keyframes, edges)]))
         self._retire(world)
 
-    def _of(self, tracker: Tracker) -> Known:
+    def _of(self, tracker: Tracker) -> SegmentConstraints:
         if tracker not in self._known:
-            self._known[tracker] = Known(of_poses(tracker.keyframes, sorted(tracker.held)))
+            self._known[tracker] = SegmentConstraints(
+                of_poses(tracker.keyframes, sorted(tracker.held))
+            )
         return self._known[tracker]
 
     def _retire(self, tracker: Tracker, least: int = 1) -> None:
@@ -180,13 +148,13 @@ class LoopCloser:
     def _take(self, loop: Loop) -> None:
         first, second = (self.segments.tracker_of(k) for k in (loop.first, loop.second))
         if first is not second:
-            self._between.append(loop)
+            self.table.between.append(loop)
             return
         known, constraint = self._of(first), self._constraint(loop)
         known.loops = thinned(joined([known.loops, constraint]), MOST_LOOPS)
         ends = sorted({loop.first, loop.second})
-        strain = strains(first.keyframes.poses(ends), between_positions(constraint, ends))
-        known.pending += bool((strain > self.config.strain).any())
+        residual = strains(first.keyframes.poses(ends), between_positions(constraint, ends))
+        known.pending += bool((residual > self.config.strain).any())
 
     def _constraint(self, loop: Loop) -> RelativePoses:
         return of_loop(self.segments.world.keyframes.table, loop)
@@ -196,11 +164,13 @@ class LoopCloser:
     def _join(self) -> tuple[int, ...]:
         """Join segments between which enough loops agree; ids that thereby reached the world."""
         final: tuple[int, ...] = ()
-        for loop in list(self._between):
+        for loop in list(self.table.between):
             host, guest = self._ends(loop)
             S = self._claim(loop)
             agreeing = [
-                o for o in self._between if self._ends(o) == (host, guest) and self._agrees(o, S)
+                o
+                for o in self.table.between
+                if self._ends(o) == (host, guest) and self._agrees(o, S)
             ]
             if len(agreeing) < AGREEING_LOOPS:
                 continue
@@ -241,17 +211,17 @@ class LoopCloser:
     def _merge(self, host: Tracker, guest: Tracker, S: Float[Tensor, "4 4"]) -> tuple[int, ...]:
         self._age += 1
         self._retire(guest)
-        theirs, ours = self._known.pop(guest, Known()), self._of(host)
+        theirs, ours = self._known.pop(guest, SegmentConstraints()), self._of(host)
         # The loops between the two were measured in the guest's unit, too.
         correction = guest.keyframes.moved(S)
-        theirs.rescale(correction)
+        _rescale(theirs, correction)
         both = correction.scale | dict.fromkeys(host.keyframes.ids, 1.0)
         ours.loops = joined([rescaled(ours.loops, both), theirs.loops])
         ours.odometry = joined([ours.odometry, theirs.odometry])
         ours.pending += 1
         final = self.segments.join(host, guest, S)
-        self._between = [
-            o for o in self._between
+        self.table.between = [
+            o for o in self.table.between
             if self.segments.tracker_of(o.first) is not self.segments.tracker_of(o.second)
         ]  # fmt: skip
         return final if host is self.segments.world else ()
@@ -277,7 +247,7 @@ class LoopCloser:
             answer = self._thread.submit(question.answer)
             self._asked = _Asked(question, answer, world, self._age)
 
-    def _question(self, known: Known) -> ClosingQuestion | None:
+    def _question(self, known: SegmentConstraints) -> ClosingQuestion | None:
         """What the closing of the world's loops is computed from; none where hardly anything
         matches: then nothing tells how far the camera has drifted."""
         world, config = self.segments.world, self.config
@@ -326,8 +296,8 @@ class LoopCloser:
             edges = {e: v for e, v in world.graph.edges.items() if e[0] not in world.held}
             take_over_depths(keyframes, edges, same)
         keyframes.correct(correction)
-        self._of(world).rescale(correction)
-        self.closures += 1
+        _rescale(self._of(world), correction)
+        self.table.closures += 1
 
     def _change(self, correction: PoseCorrection) -> float:
         """How far a correction moves the keyframe that it moves most."""
@@ -338,3 +308,9 @@ class LoopCloser:
         before = torch.stack([correction.before[k] for k in ids])
         depth = 1 / store.inverse_depths(ids).median(1).values.cpu().double()
         return float(disagreement(S, before, depth).max())
+
+
+def _rescale(known: SegmentConstraints, correction: PoseCorrection) -> None:
+    """Let relative poses follow a correction."""
+    known.odometry = rescaled(known.odometry, correction.scale)
+    known.loops = rescaled(known.loops, correction.scale)

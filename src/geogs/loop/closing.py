@@ -11,9 +11,9 @@ from torch import Tensor
 from geogs.geometry.lie import se3_inverse
 from geogs.loop.closure import LoopClosure, close_loops
 from geogs.loop.matched_edges import MatchedEdges
-from geogs.loop.pose_graph import RelativePoses
 from geogs.threads import on_one_torch_thread
 from geogs.types import PoseCorrection
+from geogs.world.loops import RelativePoses
 
 
 @dataclass(frozen=True)

@@ -6,12 +6,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from geogs.loop.detect import Loop
 from geogs.loop.matched_edges import MatchedEdges
 from geogs.tracking.graph import Edge, Pair
 from geogs.tracking.moving import still_weight
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import KeyframeSet
+from geogs.world.loops import Loop
 
 
 def closing_matches(

@@ -9,14 +9,9 @@ from torch import Tensor
 
 from geogs.loop.consistency import ConsistencyOptions, consistent_loops
 from geogs.loop.matched_edges import MatchedEdges
-from geogs.loop.pose_graph import (
-    PoseGraph,
-    PoseGraphOptions,
-    RelativePoses,
-    pose_correction,
-    solve,
-)
+from geogs.loop.pose_graph import PoseGraph, PoseGraphOptions, pose_correction, solve
 from geogs.types import PoseCorrection
+from geogs.world.loops import RelativePoses
 
 
 @dataclass(frozen=True)

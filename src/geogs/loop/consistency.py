@@ -17,7 +17,7 @@ from torch import Tensor
 
 from geogs.errors import GeogsError
 from geogs.geometry.lie import se3_inverse, sim3_adjoint, sim3_inverse, sim3_log
-from geogs.loop.pose_graph import RelativePoses
+from geogs.world.loops import RelativePoses
 
 
 @dataclass(frozen=True)

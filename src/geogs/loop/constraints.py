@@ -8,15 +8,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from geogs.geometry.lie import scaled, se3_inverse, sim3_inverse, sim3_log
-from geogs.loop.detect import Loop
 from geogs.loop.matched_edges import MatchedEdges
-from geogs.loop.pose_graph import RelativePoses
 from geogs.loop.relative_pose import RelativePoseOptions, relative_poses
 from geogs.tracking.graph import Edge, Pair
 from geogs.tracking.moving import still_weight
 from geogs.tracking.packed_edge import PackedEdge
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import KeyframeSet, KeyframeTable
+from geogs.world.loops import Loop, RelativePoses
 
 AGREEING_LOOPS = 2
 """Loops that have to agree before a segment is joined to another: one may be a look-alike."""
@@ -25,13 +24,6 @@ JOIN_TOLERANCE = 0.12
 by within themselves."""
 SETTLED = RelativePoseOptions(iterations=0)
 """For edges that a bundle adjustment has fitted, with more than they tell alone."""
-
-
-def none_known() -> RelativePoses:
-    """No relative pose at all."""
-    empty = torch.zeros(0, dtype=torch.long)
-    numbers = torch.zeros(0, 7, dtype=torch.float64)
-    return RelativePoses(empty, empty, numbers.new_zeros(0, 4, 4), numbers, empty.bool())
 
 
 def joined(parts: Sequence[RelativePoses]) -> RelativePoses:
@@ -47,7 +39,7 @@ def of_edges(segment: KeyframeSet, edges: Mapping[Pair, Edge | PackedEdge]) -> R
     """
     pairs = sorted(e for e in edges if e[0] < e[1])
     if not pairs:
-        return none_known()
+        return RelativePoses.none()
     ids = sorted({k for p in pairs for k in p})
     slot = {k: n for n, k in enumerate(ids)}
     grid = segment.grid
@@ -68,7 +60,7 @@ def of_edges(segment: KeyframeSet, edges: Mapping[Pair, Edge | PackedEdge]) -> R
 def of_poses(segment: KeyframeSet, ids: Sequence[int]) -> RelativePoses:
     """Relative poses between neighbours in a list of ids, as sure as any can be."""
     if len(ids) < 2:
-        return none_known()
+        return RelativePoses.none()
     T_cw = segment.poses(ids)
     depth = 1 / segment.inverse_depths(ids[1:]).median(1).values.cpu().double()
     sure = 1 / torch.tensor([SETTLED.least_turn] * 6 + [SETTLED.least_scale]).double().square()

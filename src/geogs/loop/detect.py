@@ -3,32 +3,22 @@
 from collections import deque
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import islice, takewhile
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, UInt8
-from torch import Tensor
+from jaxtyping import Bool, UInt8
 
 from geogs.config import LoopConfig
 from geogs.geometry.lie import se3_inverse
 from geogs.loop.dense import dense_check
-from geogs.loop.search import (
-    SUPPRESSION,
-    Cause,
-    Depths,
-    PlaceSearch,
-    Proposal,
-    Query,
-    SearchState,
-    Sighting,
-)
+from geogs.loop.search import SUPPRESSION, Depths, PlaceRecognition, Query
 from geogs.tracking.flow.base import FlowOperator
 from geogs.tracking.motion import Recognition
 from geogs.tracking.proximity import frame_distances
-from geogs.types import FlowMatch
 from geogs.world.keyframes import KeyframeTable
+from geogs.world.loops import Loop, LoopCandidate, LoopTable, VerifiedCandidate
 
 MAX_FLOW_DISTANCE = 0.29
 """Flow distance below which the present poses make a pair a candidate, of the long edge (22 cells
@@ -52,71 +42,20 @@ LAG = 2
 
 
 @dataclass(frozen=True)
-class Loop:
-    """A pair that is one."""
+class RejectedCandidate:
+    """A candidate that is no loop."""
 
-    first: int
-    second: int
-    """The later keyframe."""
-    cause: Cause
-    T_ji: Float[Tensor, "4 4"]
-    """First camera to second in the lengths of the first keyframe's depth, float64."""
-    scale: float
-    """Lengths of the second's depth per length of the first's: what drifted in between."""
-    inliers: int
-    """Features that agree with the pose; 0 where the flow alone found it."""
-    matched: float
-    """Share of the cells whose flow does."""
-    there: FlowMatch | None
-    """The flow from the first to the second, one edge; none where it is no longer needed."""
-    back: FlowMatch | None
-
-    @property
-    def S_ji(self) -> Float[Tensor, "4 4"]:
-        """Sim(3) that takes points of the first camera, in its lengths, to the second in its."""
-        S = self.scale * self.T_ji
-        S[3, 3] = 1.0
-        return S
-
-    @property
-    def flows(self) -> tuple[FlowMatch, FlowMatch]:
-        """There and back, where they are still kept."""
-        assert self.there is not None
-        assert self.back is not None
-        return self.there, self.back
-
-    def without_flows(self) -> "Loop":
-        """The same without what is as large as the grid."""
-        return replace(self, there=None, back=None)
-
-
-@dataclass(frozen=True)
-class Refusal:
-    """A proposal that came to nothing."""
-
-    proposal: Proposal
+    candidate: LoopCandidate
     reason: str
 
 
-@dataclass(frozen=True, eq=False)
-class DetectorState:
-    """What a checkpoint holds of a detector."""
-
-    order: list[int]
-    """Ids of the keyframes taken so far, earliest first."""
-    search: SearchState
-    pending: list[list[Sighting]]
-    """What was found at the last keyframes, to be decided later."""
-    loops: list[Loop]
-
-
 class LoopDetector:
-    """Finds loops at keyframes that are final: looks and features propose, the flow decides.
+    """Finds loops at final keyframes: appearance and features propose, dense flow decides.
 
-    The search by looks and features runs in a thread beside tracking; what it finds is taken up
-    ``LAG`` keyframes later, at the same place of the stream however fast the machine is. Keyframes
+    Place recognition runs in a thread concurrently with tracking; what it finds is taken up
+    ``LAG`` keyframes later, at the same frame however fast the machine is. Keyframes
     may lie in several segments, whose poses have nothing to do with each other: between them, only
-    looks propose.
+    appearance proposes.
     """
 
     def __init__(
@@ -126,6 +65,7 @@ class LoopDetector:
         config: LoopConfig | None = None,
         waits: bool = True,
         mask: Bool[np.ndarray, "h w"] | None = None,
+        table: LoopTable | None = None,
     ) -> None:
         """Unless it ``waits`` for searches that take longer, what they find is taken up later.
 
@@ -135,7 +75,7 @@ class LoopDetector:
         self.grid = keyframes.grid
         self.operator = operator
         self.config = config or LoopConfig()
-        self.refusals: list[Refusal] = []
+        self.rejected: list[RejectedCandidate] = []
         """Of the last update."""
         self._waits = waits
         # What the search reads was written in the stream of whoever made the detector.
@@ -144,38 +84,31 @@ class LoopDetector:
             max_workers=1, thread_name_prefix="loops",
             initializer=lambda: None if stream is None else torch.cuda.set_stream(stream),
         )  # fmt: skip
+        self.table = table or LoopTable()
         self._order: dict[int, int] = {}
-        """Place in time of each keyframe taken so far."""
+        """Rank in time of each keyframe searched so far."""
         self._ids = np.zeros(64, np.int64)
-        """Ids of the keyframes by their place, with room for more."""
-        self._search = PlaceSearch(self.grid, self.config, self._order, mask)
-        self._pending: deque[Future[list[Sighting]]] = deque()
-        self._loops: list[Loop] = []
+        """Ids of the keyframes by their rank, with room for more."""
+        for id in self.table.keyframes:
+            self._rank(id)
+        self._search = PlaceRecognition(self.grid, self.config, self._order, mask, self.table)
+        self._pending = deque(map(_done, self.table.found))
 
-    def state(self) -> DetectorState:
-        """What a checkpoint holds; searches that are under way are finished first."""
-        found = [future.result() for future in self._pending]
-        return DetectorState(list(self._order), self._search.state(), found, self._loops)
-
-    def load(self, state: DetectorState) -> None:
-        """Give a detector that has seen nothing yet the state of another."""
-        for id in state.order:
-            self._enter(id)
-        self._search.load(state.search)
-        self._pending = deque(map(_done, state.pending))
-        self._loops = state.loops
+    def settle(self) -> None:
+        """Finish the searches that are under way, so that the table holds what they found."""
+        self.table.found = [future.result() for future in self._pending]
 
     @property
     def loops(self) -> tuple[Loop, ...]:
         """All that were found, earliest first."""
-        return tuple(self._loops)
+        return tuple(self.table.loops)
 
     def update(self, ids: Sequence[int], is_last: bool = False) -> tuple[Loop, ...]:
         """Take keyframes that became final, earliest first, and return loops that were found.
 
         They are those of the keyframes ``lag`` earlier, and at the end of all.
         """
-        self.refusals = []
+        self.rejected = []
         found: list[Loop] = []
         for id in ids:
             self._enter(id)
@@ -216,16 +149,21 @@ class LoopDetector:
 
     def _enter(self, id: int) -> None:
         """Take a keyframe as the latest."""
-        place = self._order[id] = len(self._order)
-        if place == len(self._ids):
+        self.table.keyframes.append(id)
+        self._rank(id)
+
+    def _rank(self, id: int) -> None:
+        rank = self._order[id] = len(self._order)
+        if rank == len(self._ids):
             self._ids = np.concatenate([self._ids, np.zeros_like(self._ids)])
-        self._ids[place] = id
+        self._ids[rank] = id
 
     def _found_near(self, id: int) -> list[tuple[int, int]]:
         """Pairs of the loops found whose later keyframe is so near to one that they can rule out
         others of it; loops are found in the order of their later keyframes."""
         least = self._order[id] - SUPPRESSION
-        recent = takewhile(lambda loop: self._order[loop.second] >= least, reversed(self._loops))
+        found = reversed(self.table.loops)
+        recent = takewhile(lambda loop: self._order[loop.second] >= least, found)
         return [(loop.first, loop.second) for loop in recent]
 
     def _near(self, id: int) -> frozenset[int]:
@@ -247,51 +185,51 @@ class LoopDetector:
         around = self.keyframes.poses.around(id, old, MAX_ANGLE_DEG, MAX_BASELINE * depth)
         return list(islice((k for k in around.tolist() if k in store), MEASURED))
 
-    def _decide(self, sightings: Sequence[Sighting]) -> list[Loop]:
-        """The loops among what was seen of one keyframe."""
+    def _decide(self, views: Sequence[VerifiedCandidate]) -> list[Loop]:
+        """The loops among the candidates of one keyframe."""
         found: list[Loop] = []
-        for sighting in sightings:
-            pair = sighting.proposal.first, sighting.proposal.second
-            if self._search.is_suppressed(pair, self._found_near(sighting.proposal.second)):
+        for view in views:
+            pair = view.candidate.first, view.candidate.second
+            if self._search.is_suppressed(pair, self._found_near(view.candidate.second)):
                 continue
-            loop = self._verify(sighting)
-            if isinstance(loop, Refusal):
-                self.refusals.append(loop)
+            loop = self._verify(view)
+            if isinstance(loop, RejectedCandidate):
+                self.rejected.append(loop)
                 continue
             found.append(loop)
             # Of a long video the flows of all loops would fill the memory.
-            self._loops.append(loop if self.config.matches else loop.without_flows())
+            self.table.loops.append(loop if self.config.matches else loop.without_flows())
             if len(found) == MAX_LOOPS:
                 break
         return found
 
-    def _verify(self, sighting: Sighting) -> Loop | Refusal:
+    def _verify(self, verified: VerifiedCandidate) -> Loop | RejectedCandidate:
         """Features found the pose, the flow confirms it; where they failed, present poses may do.
 
         Plain surfaces have few corners, but when the drift is small the flow needs none.
         """
-        p, view = sighting.proposal, sighting.view
+        p, view = verified.candidate, verified.view
         first, second, grid = self.keyframes[p.first], self.keyframes[p.second], self.grid
         if view.accepted and view.is_metric and view.T_ji is not None:
             T, scale, inliers = view.T_ji, view.scale or 1.0, view.inliers
         elif p.cause == "geometry":
             T, scale, inliers = second.T_cw @ se3_inverse(first.T_cw), 1.0, 0
         else:
-            return Refusal(p, view.reason or "too little depth is known")
+            return RejectedCandidate(p, view.reason or "too little depth is known")
         check = dense_check(grid, self.operator, first, second, T, scale)
         if not inliers and check.matched < MIN_MATCHED_ALONE:
-            share = f"{check.matched:.0%}"
-            return Refusal(p, check.reason or f"without features, {share} matched is too little")
+            reason = f"without features, {check.matched:.0%} matched is too little"
+            return RejectedCandidate(p, check.reason or reason)
         if not check.accepted or check.T_ji is None or check.there is None or check.back is None:
-            return Refusal(p, check.reason)
+            return RejectedCandidate(p, check.reason)
         return Loop(
             p.first, p.second, p.cause, check.T_ji, check.scale, inliers, check.matched,
             check.there, check.back,
         )  # fmt: skip
 
 
-def _done(sightings: list[Sighting]) -> Future[list[Sighting]]:
+def _done(found: list[VerifiedCandidate]) -> Future[list[VerifiedCandidate]]:
     """A search whose result is known."""
-    future: Future[list[Sighting]] = Future()
-    future.set_result(sightings)
+    future: Future[list[VerifiedCandidate]] = Future()
+    future.set_result(found)
     return future

@@ -1,10 +1,10 @@
 """ORB features spread evenly over an image."""
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, UInt8
+from jaxtyping import Bool, UInt8
+
+from geogs.world.loops import Features
 
 FEATURES = 800
 """Most of a keyframe, strongest of each image cell first: plain walls leave a few hundred."""
@@ -14,19 +14,6 @@ ROWS, COLUMNS = 6, 8
 """Cells of the image that share the features evenly."""
 SURPLUS = 1.5
 """Features detected for each that is kept, so that poor cells find theirs."""
-
-
-@dataclass(frozen=True)
-class Features:
-    """What is kept of an image to recognise it; the strongest of every cell come first."""
-
-    pixels: Float32[np.ndarray, "n 2"]
-    """x, y."""
-    descriptors: UInt8[np.ndarray, "n 32"]
-    """256 bits each."""
-
-    def __len__(self) -> int:
-        return len(self.pixels)
 
 
 class FeatureExtractor:

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from geogs.geometry.lie import (
@@ -36,44 +36,7 @@ from geogs.loop.matched_edges import (
     match_cost,
 )
 from geogs.types import PoseCorrection
-
-
-@dataclass(frozen=True)
-class RelativePoses:
-    """Measured similarities between pairs of keyframes."""
-
-    source: Int[Tensor, "e"]
-    """Index of keyframe i."""
-    target: Int[Tensor, "e"]
-    """Index of keyframe j."""
-    G: Float[Tensor, "e 4 4"]
-    """Camera i, in the unit of keyframe i, to camera j in the unit of keyframe j; float64."""
-    information: Float[Tensor, "e 7"]
-    """Inverse variances of the error [tau, phi, sigma] in the frame of j: 1 / unit^2, 1 / rad^2
-    and of the logarithm of scale; float64. Zero where nothing is known."""
-    is_loop: Bool[Tensor, "e"]
-    """Edges that may be wrong altogether; the others are trusted."""
-
-    def __len__(self) -> int:
-        return len(self.source)
-
-    def select(self, keep: Bool[Tensor, "e"]) -> "RelativePoses":
-        """The edges that are marked."""
-        parts = (self.source, self.target, self.G, self.information, self.is_loop)
-        return RelativePoses(*(p[keep] for p in parts))
-
-    def rescaled(self, scale: Float[Tensor, "n"]) -> "RelativePoses":
-        """The same measurements after the unit of each keyframe was divided by ``scale``.
-
-        To be applied to edges kept beyond a correction, with :attr:`PoseGraphResult.scale`.
-        """
-        here, there = scale[self.source], scale[self.target]
-        G = self.G.clone()
-        G[:, :3, :3] *= (here / there)[:, None, None]
-        G[:, :3, 3] /= there[:, None]
-        information = self.information.clone()
-        information[:, :3] *= there[:, None] ** 2
-        return RelativePoses(self.source, self.target, G, information, self.is_loop)
+from geogs.world.loops import RelativePoses
 
 
 @dataclass(frozen=True)

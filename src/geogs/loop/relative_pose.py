@@ -17,8 +17,8 @@ from geogs.bundle.linearise import weighed_residuals
 from geogs.bundle.projection import LinearProjection, linearise
 from geogs.geometry.lie import move, se3_inverse
 from geogs.loop.matched_edges import MatchedEdges
-from geogs.loop.pose_graph import RelativePoses
 from geogs.world.grid import SampleGrid
+from geogs.world.loops import RelativePoses
 
 
 @dataclass(frozen=True)

@@ -1,21 +1,20 @@
-"""The part of loop detection that can run beside tracking: looks and features, no flow."""
+"""Place recognition: the part of loop detection that needs no flow, concurrent with tracking."""
 
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from geogs.config import LoopConfig
-from geogs.loop.features import Features
-from geogs.loop.retrieval import AppearanceIndex, IndexState
-from geogs.loop.verification import DepthView, TwoView, TwoViewVerifier
+from geogs.loop.retrieval import AppearanceIndex
+from geogs.loop.verification import DepthView, TwoViewVerifier
 from geogs.threads import worker_count
 from geogs.tracking.motion import Recognition
 from geogs.world.grid import SampleGrid
+from geogs.world.loops import Features, LoopCandidate, LoopTable, VerifiedCandidate
 
 MIN_SCORE = 0.05
 """Least similarity of a candidate by appearance, of that of a keyframe with itself."""
@@ -25,29 +24,8 @@ SUPPRESSION = 3
 """A loop rules out others whose ends together lie within this many keyframes of its own, as they
 say nothing new."""
 
-Cause = Literal["geometry", "appearance"]
-"""What proposed a pair: the present poses, or nothing but the looks."""
-
 Depths = Mapping[int, tuple[Float[Tensor, "p"], Float[Tensor, "p"]]]
 """Inverse depth and information on the grid, by keyframe."""
-
-
-@dataclass(frozen=True)
-class Proposal:
-    """A pair that may be a loop."""
-
-    first: int
-    second: int
-    """The later."""
-    cause: Cause
-
-
-@dataclass(frozen=True)
-class Sighting:
-    """A proposal and what the features of its views say of it."""
-
-    proposal: Proposal
-    view: TwoView
 
 
 @dataclass(frozen=True)
@@ -66,15 +44,7 @@ class Query:
     depths: Depths
 
 
-@dataclass(frozen=True, eq=False)
-class SearchState:
-    """What a checkpoint holds of a search."""
-
-    index: IndexState
-    features: dict[int, Features]
-
-
-class PlaceSearch:
+class PlaceRecognition:
     """Remembers keyframes by their features, and finds those that a new one may show again."""
 
     def __init__(
@@ -83,28 +53,20 @@ class PlaceSearch:
         config: LoopConfig,
         order: Mapping[int, int],
         mask: Bool[np.ndarray, "h w"] | None = None,
+        table: LoopTable | None = None,
     ) -> None:
-        """``order`` is the place in time of each keyframe; it may grow meanwhile. Outside a
+        """``order`` is the rank in time of each keyframe; it may grow meanwhile. Outside a
         ``mask`` of the size of the images no features are found."""
+        self.table = table or LoopTable()
         self.grid = grid
         self.config = config
-        self.index = AppearanceIndex(mask)
+        self.index = AppearanceIndex(mask, vocabulary=self.table.vocabulary)
         self._verifier = TwoViewVerifier(grid.camera)
-        self._features: dict[int, Features] = {}
         self._order = order
         self._helpers = ThreadPoolExecutor(
-            min(worker_count(), VERIFIED), thread_name_prefix="looks"
+            min(worker_count(), VERIFIED), thread_name_prefix="recognition"
         )
         """Find features before their keyframe's turn, and hold several pairs together at once."""
-
-    def state(self) -> SearchState:
-        """What a checkpoint holds, while nothing is searched."""
-        return SearchState(self.index.state(), self._features)
-
-    def load(self, state: SearchState) -> None:
-        """Give a search that knows nothing yet the state of another."""
-        self.index.load(state.index)
-        self._features = state.features
 
     def describe(self, image: UInt8[np.ndarray, "h w 3"]) -> Future[Features]:
         """What a keyframe is remembered by, as soon as somebody has the time to find it."""
@@ -112,25 +74,25 @@ class PlaceSearch:
 
     def remember(self, id: int, image: UInt8[np.ndarray, "h w 3"]) -> None:
         """Remember a keyframe, whatever it may show again."""
-        self._features[id] = self.index.describe(image)
-        self.index.add(id, self._features[id])
+        self.table.features[id] = self.index.describe(image)
+        self.index.add(id, self.table.features[id])
 
-    def find(self, query: Query) -> list[Sighting]:
+    def find(self, query: Query) -> list[VerifiedCandidate]:
         """Remember a keyframe; the pairs it makes with earlier ones, most promising first."""
         id = query.id
-        self._features[id] = query.features.result()
-        proposals = self._proposals(query)
-        views = [self._depth_views(p, query.depths) for p in proposals]
+        self.table.features[id] = query.features.result()
+        candidates = self._candidates(query)
+        views = [self._depth_views(p, query.depths) for p in candidates]
         seen = self._helpers.map(lambda both: self._verifier.verify(*both), views)
-        sightings = [Sighting(p, view) for p, view in zip(proposals, seen, strict=True)]
-        self.index.add(id, self._features[id])
-        return sightings
+        verified = [VerifiedCandidate(p, view) for p, view in zip(candidates, seen, strict=True)]
+        self.index.add(id, self.table.features[id])
+        return verified
 
     def recognise(self, image: UInt8[np.ndarray, "h w 3"], depths: Depths) -> list[Recognition]:
         """Keyframes that show what an image shows, with its pose; most alike first."""
         features, found = self.index.describe(image), []
-        for id in self._alike(features, frozenset()):
-            known = DepthView.of(self.grid, *depths[id], self._features[id])
+        for id in self._similar(features, frozenset()):
+            known = DepthView.of(self.grid, *depths[id], self.table.features[id])
             view = self._verifier.verify(known, DepthView(features))
             if view.accepted and view.is_metric and view.T_ji is not None:
                 found.append(Recognition(id, view.T_ji))
@@ -144,33 +106,33 @@ class PlaceSearch:
             for first, second in others
         )
 
-    def _proposals(self, query: Query) -> list[Proposal]:
-        """Pairs of a keyframe with earlier ones, thinned: geometry and looks take turns."""
+    def _candidates(self, query: Query) -> list[LoopCandidate]:
+        """Pairs of a keyframe with earlier ones, thinned: geometry and appearance take turns."""
         id, by_pose = query.id, query.by_pose
-        by_looks = self._alike(self._features[id], query.near)
-        turns: list[Proposal] = []
-        for n in range(max(len(by_pose), len(by_looks))):
+        by_appearance = self._similar(self.table.features[id], query.near)
+        alternating: list[LoopCandidate] = []
+        for n in range(max(len(by_pose), len(by_appearance))):
             # Where the poses agree with the looks, the flow may start from them if features fail.
-            turns += [
-                Proposal(k, id, "geometry" if k in by_pose else "appearance")
-                for k in by_looks[n : n + 1]
+            alternating += [
+                LoopCandidate(k, id, "geometry" if k in by_pose else "appearance")
+                for k in by_appearance[n : n + 1]
             ]
-            turns += [Proposal(k, id, "geometry") for k in by_pose[n : n + 1]]
+            alternating += [LoopCandidate(k, id, "geometry") for k in by_pose[n : n + 1]]
         kept: list[tuple[int, int]] = []
-        chosen: list[Proposal] = []
-        for p in turns:
+        chosen: list[LoopCandidate] = []
+        for p in alternating:
             if not self.is_suppressed((p.first, p.second), [*kept, *query.known]):
                 kept.append((p.first, p.second))
                 chosen.append(p)
         return chosen[:VERIFIED]
 
-    def _alike(self, features: Features, excluded: frozenset[int]) -> list[int]:
+    def _similar(self, features: Features, excluded: frozenset[int]) -> list[int]:
         """Keyframes that look alike, most alike first."""
         found = self.index.query(features, excluded, self.config.appearance)
         return [c.keyframe for c in found if c.score >= MIN_SCORE]
 
-    def _depth_views(self, p: Proposal, depths: Depths) -> tuple[DepthView, DepthView]:
+    def _depth_views(self, p: LoopCandidate, depths: Depths) -> tuple[DepthView, DepthView]:
         first, second = (
-            DepthView.of(self.grid, *depths[k], self._features[k]) for k in (p.first, p.second)
+            DepthView.of(self.grid, *depths[k], self.table.features[k]) for k in (p.first, p.second)
         )
         return first, second

@@ -9,8 +9,8 @@ from jaxtyping import Bool, Float, Float32, Float64, Int64, UInt8
 from torch import Tensor
 
 from geogs.geometry.camera import Camera
-from geogs.loop.features import Features
 from geogs.world.grid import SampleGrid
+from geogs.world.loops import Features, TwoViewMatch
 
 MATCH_RATIO = 0.87
 """A match must be this much nearer than the second nearest descriptor: looser than Lowe's 0.8,
@@ -40,30 +40,6 @@ RASTER = 4
 """Cells per side in which the spread of the inliers is counted."""
 ITERATIONS = 300
 """Samples drawn for a pose."""
-
-
-@dataclass(frozen=True)
-class TwoView:
-    """What the features of two views say of each other."""
-
-    accepted: bool
-    reason: str
-    """Why not; empty if accepted."""
-    T_ji: Float[Tensor, "4 4"] | None = None
-    """First camera to second, float64. In the first's lengths if metric, else with a translation
-    of length one, which means nothing where the views have no parallax. None without a pose."""
-    is_metric: bool = False
-    scale: float | None = None
-    """Lengths of the second's depth per length of the first's; None unless both have depth."""
-    matches: int = 0
-    inliers: int = 0
-    spread: float = 0.0
-    """Share of the raster's cells that hold inliers, in the poorer image."""
-
-    @property
-    def share(self) -> float:
-        """Inliers of all matches."""
-        return self.inliers / max(self.matches, 1)
 
 
 @dataclass(frozen=True)
@@ -99,7 +75,7 @@ class TwoViewVerifier:
         self._edge = max(camera.width, camera.height)
         self._matcher = cv2.BFMatcher(cv2.NORM_HAMMING)
 
-    def verify(self, first: DepthView, second: DepthView) -> TwoView:
+    def verify(self, first: DepthView, second: DepthView) -> TwoViewMatch:
         """Pose of the second view from matches with the first.
 
         With depth in the first view by PnP, metric; otherwise by the essential matrix. Depth in
@@ -107,7 +83,7 @@ class TwoViewVerifier:
         """
         pairs = self._match(first.features, second.features)
         if len(pairs) < MIN_INLIERS:
-            return TwoView(False, f"only {len(pairs)} features match", matches=len(pairs))
+            return TwoViewMatch(False, f"only {len(pairs)} features match", matches=len(pairs))
         a, b = first.features.pixels[pairs[:, 0]], second.features.pixels[pairs[:, 1]]
         depth = None if first.depth is None else first.depth[pairs[:, 0]]
         if depth is not None and int((depth > 0).sum()) >= MIN_INLIERS:
@@ -116,9 +92,9 @@ class TwoViewVerifier:
         else:
             depth, found = None, self._epipolar(a, b)
         if found is None:
-            return TwoView(False, "the matches agree on no pose", matches=len(pairs))
+            return TwoViewMatch(False, "the matches agree on no pose", matches=len(pairs))
         T, inlier = found
-        view = TwoView(
+        view = TwoViewMatch(
             True,
             "",
             torch.from_numpy(T),
@@ -220,11 +196,11 @@ class TwoViewVerifier:
         cell = np.clip((pixels + 0.5) * RASTER / size, 0, RASTER - 1).astype(int)
         return len(np.unique(cell @ [1, RASTER])) / RASTER**2
 
-    def _weakness(self, view: TwoView) -> str:
+    def _weakness(self, view: TwoViewMatch) -> str:
         if view.inliers < (MIN_INLIERS if view.is_metric else MIN_INLIERS_WITHOUT_DEPTH):
             return f"only {view.inliers} matches agree with the pose"
-        if view.share < MIN_INLIER_RATIO:
-            return f"only {view.share:.0%} of the matches agree with the pose"
+        if view.inlier_ratio < MIN_INLIER_RATIO:
+            return f"only {view.inlier_ratio:.0%} of the matches agree with the pose"
         if view.spread < MIN_SPREAD:
             return f"the matches fill only {view.spread:.0%} of the image"
         return ""

@@ -10,7 +10,8 @@ from torch import Tensor
 
 from geogs.geometry.lie import se3_inverse, sim3_scale
 from geogs.loop.constraints import joined
-from geogs.loop.pose_graph import PoseGraph, RelativePoses, solve
+from geogs.loop.pose_graph import PoseGraph, solve
+from geogs.world.loops import RelativePoses
 from geogs_fleet.join.gauge import Gauge
 from geogs_fleet.join.part import PartViews
 

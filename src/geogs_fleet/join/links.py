@@ -13,14 +13,13 @@ from geogs.config import Config
 from geogs.geometry.camera import Camera
 from geogs.loop.constraints import of_loop
 from geogs.loop.dense import dense_check
-from geogs.loop.detect import Loop
-from geogs.loop.pose_graph import RelativePoses
 from geogs.loop.verification import DepthView, TwoViewVerifier
 from geogs.threads import on_one_torch_thread
 from geogs.tracking.flow.base import FlowOperator
 from geogs.tracking.flow.select import build_operator
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import Keyframe, KeyframeSet, KeyframeTable
+from geogs.world.loops import Loop, RelativePoses
 from geogs_fleet.join.part import Node, Part, PartViews, image_of, opened
 
 

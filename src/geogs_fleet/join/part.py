@@ -12,9 +12,10 @@ from geogs.application.results.saved_result import SavedResult, load_result
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.io.writers.keyframe_images import image_path, read_image
-from geogs.loop.features import FeatureExtractor, Features
+from geogs.loop.features import FeatureExtractor
 from geogs.threads import on_one_torch_thread
 from geogs.world.grid import SampleGrid
+from geogs.world.loops import Features
 
 DEVIATION = 0.01
 """Relative deviation of a depth that a map was trained to show."""

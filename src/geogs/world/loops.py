@@ -1,0 +1,209 @@
+"""Loops: what keyframes are recognised by, candidates, verified loops, and relative poses kept."""
+
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float32, Int, Int64, UInt8
+from torch import Tensor
+
+from geogs.errors import InputError
+from geogs.types import FlowMatch
+
+Cause = Literal["geometry", "appearance"]
+"""What proposed a pair: the present poses, or appearance alone."""
+
+
+@dataclass(frozen=True)
+class Features:
+    """What is kept of an image to recognise it; the strongest of every cell come first."""
+
+    pixels: Float32[np.ndarray, "n 2"]
+    """x, y."""
+    descriptors: UInt8[np.ndarray, "n 32"]
+    """256 bits each."""
+
+    def __len__(self) -> int:
+        return len(self.pixels)
+
+
+@dataclass
+class Vocabulary:
+    """Binary words and which keyframes contain them; mutable."""
+
+    words: UInt8[np.ndarray, "w 32"] = field(default_factory=lambda: np.zeros((0, 32), np.uint8))
+    keyframes: list[int] = field(default_factory=list)
+    """Indexed so far, earliest first."""
+    counts: list[Int64[np.ndarray, "c 2"]] = field(default_factory=list)
+    """Of each of them: its words, ascending, and how often it contains them."""
+
+
+@dataclass(frozen=True)
+class TwoViewMatch:
+    """Outcome of matching the features of two views."""
+
+    accepted: bool
+    reason: str
+    """Why not; empty if accepted."""
+    T_ji: Float[Tensor, "4 4"] | None = None
+    """First camera to second, float64. In the first's lengths if metric, else with a translation
+    of length one, which means nothing where the views have no parallax. None without a pose."""
+    is_metric: bool = False
+    scale: float | None = None
+    """Lengths of the second's depth per length of the first's; None unless both have depth."""
+    matches: int = 0
+    inliers: int = 0
+    spread: float = 0.0
+    """Fraction of the raster's cells that hold inliers, in the poorer image."""
+
+    @property
+    def inlier_ratio(self) -> float:
+        """Fraction of the matches that are inliers."""
+        return self.inliers / max(self.matches, 1)
+
+
+@dataclass(frozen=True)
+class LoopCandidate:
+    """A pair of keyframes that may show one place."""
+
+    first: int
+    second: int
+    """The later."""
+    cause: Cause
+
+
+@dataclass(frozen=True)
+class VerifiedCandidate:
+    """A candidate and how the features of its two views match."""
+
+    candidate: LoopCandidate
+    view: TwoViewMatch
+
+
+@dataclass(frozen=True)
+class Loop:
+    """A pair of keyframes that show one place, confirmed by dense flow."""
+
+    first: int
+    second: int
+    """The later keyframe."""
+    cause: Cause
+    T_ji: Float[Tensor, "4 4"]
+    """First camera to second in the lengths of the first keyframe's depth, float64."""
+    scale: float
+    """Lengths of the second's depth per length of the first's: what drifted in between."""
+    inliers: int
+    """Features that agree with the pose; 0 where the flow alone found it."""
+    matched: float
+    """Fraction of the cells whose flow agrees."""
+    there: FlowMatch | None
+    """The flow from the first to the second, one edge; none where it is no longer needed."""
+    back: FlowMatch | None
+
+    @property
+    def S_ji(self) -> Float[Tensor, "4 4"]:
+        """Sim(3) that takes points of the first camera, in its lengths, to the second in its."""
+        S = self.scale * self.T_ji
+        S[3, 3] = 1.0
+        return S
+
+    @property
+    def flows(self) -> tuple[FlowMatch, FlowMatch]:
+        """There and back, where they are still kept."""
+        assert self.there is not None
+        assert self.back is not None
+        return self.there, self.back
+
+    def without_flows(self) -> "Loop":
+        """The same without what is as large as the grid."""
+        return replace(self, there=None, back=None)
+
+
+@dataclass(frozen=True)
+class RelativePoses:
+    """Measured similarities between pairs of keyframes."""
+
+    source: Int[Tensor, "e"]
+    """Index of keyframe i."""
+    target: Int[Tensor, "e"]
+    """Index of keyframe j."""
+    G: Float[Tensor, "e 4 4"]
+    """Camera i, in the unit of keyframe i, to camera j in the unit of keyframe j; float64."""
+    information: Float[Tensor, "e 7"]
+    """Inverse variances of the error [tau, phi, sigma] in the frame of j: 1 / unit^2, 1 / rad^2
+    and of the logarithm of scale; float64. Zero where nothing is known."""
+    is_loop: Bool[Tensor, "e"]
+    """Edges that may be wrong altogether; the others are trusted."""
+
+    def __len__(self) -> int:
+        return len(self.source)
+
+    def select(self, keep: Bool[Tensor, "e"]) -> "RelativePoses":
+        """The edges that are marked."""
+        parts = (self.source, self.target, self.G, self.information, self.is_loop)
+        return RelativePoses(*(p[keep] for p in parts))
+
+    def rescaled(self, scale: Float[Tensor, "n"]) -> "RelativePoses":
+        """The same measurements after the unit of each keyframe was divided by ``scale``.
+
+        To be applied to edges kept beyond a correction, with :attr:`PoseGraphResult.scale`.
+        """
+        here, there = scale[self.source], scale[self.target]
+        G = self.G.clone()
+        G[:, :3, :3] *= (here / there)[:, None, None]
+        G[:, :3, 3] /= there[:, None]
+        information = self.information.clone()
+        information[:, :3] *= there[:, None] ** 2
+        return RelativePoses(self.source, self.target, G, information, self.is_loop)
+
+    @staticmethod
+    def none() -> "RelativePoses":
+        """No relative pose at all."""
+        empty = torch.zeros(0, dtype=torch.long)
+        numbers = torch.zeros(0, 7, dtype=torch.float64)
+        return RelativePoses(empty, empty, numbers.new_zeros(0, 4, 4), numbers, empty.bool())
+
+
+@dataclass
+class SegmentConstraints:
+    """Relative poses between the keyframes of one segment, by id; mutable."""
+
+    odometry: RelativePoses = field(default_factory=RelativePoses.none)
+    """From edges that the tracker no longer adjusts."""
+    loops: RelativePoses = field(default_factory=RelativePoses.none)
+    pending: int = 0
+    """Loops that disagree with the poses, found since the last attempt to close."""
+    last_attempt: int = 0
+    """Number of keyframes at it."""
+
+
+@dataclass
+class LoopTable:
+    """All that is known of loops; mutable."""
+
+    keyframes: list[int] = field(default_factory=list)
+    """Searched for loops so far, earliest first."""
+    features: dict[int, Features] = field(default_factory=dict)
+    """By keyframe."""
+    vocabulary: Vocabulary = field(default_factory=Vocabulary)
+    found: list[list[VerifiedCandidate]] = field(default_factory=list)
+    """Candidates of the latest keyframes, about which the flow has not decided yet."""
+    loops: list[Loop] = field(default_factory=list)
+    """Verified, earliest first."""
+    between: list[Loop] = field(default_factory=list)
+    """Those between two segments."""
+    constraints: dict[int, SegmentConstraints] = field(default_factory=dict)
+    """By the position of the segment among all."""
+    closures: int = 0
+    """Corrections by loops so far."""
+
+
+def check_loops(table: LoopTable) -> None:
+    """Raises InputError if the vocabulary of a table that was read is incomplete."""
+    vocabulary, words = table.vocabulary, len(table.vocabulary.words)
+    counts = vocabulary.counts
+    if len(counts) != len(vocabulary.keyframes) or any(
+        ((c[:, 0] < 0) | (c[:, 0] >= words)).any() for c in counts
+    ):
+        raise InputError("the index of looks is incomplete")
