@@ -4,7 +4,7 @@ import pytest
 import torch
 
 import geogs_synth.clips.sampler as sampler_module
-import geogs_synth.raycast.render as render_module
+import geogs_synth.raycast.cuda as cuda_module
 from cuda_emulator import use_emulator
 from geogs.depth.network.options import DepthNetworkOptions
 from geogs.depth.network.views import StereoViews
@@ -46,9 +46,9 @@ TRAINING = DepthTraining(
 
 
 def use_fast_rooms(patch: pytest.MonkeyPatch) -> None:
-    """Render with the emulated kernel, many times as fast as the reference."""
-    use_emulator(patch, render_module)
-    patch.setattr(sampler_module, "render", render_module.render_by_kernel)
+    """Render with the emulated CUDA kernel."""
+    use_emulator(patch, cuda_module)
+    patch.setattr(sampler_module, "caster_for", lambda _device: cuda_module.CudaCaster())
 
 
 def random_views(b: int, k: int, h: int, w: int, seed: int = 0) -> StereoViews:

@@ -5,7 +5,7 @@ import torch
 
 import geogs_synth.clips.clips as clips_module
 import geogs_synth.clips.sampler as sampler_module
-import geogs_synth.raycast.render as render_module
+import geogs_synth.raycast.cuda as cuda_module
 from cuda_emulator import use_emulator
 from geogs_synth.camera.views import Views
 from geogs_synth.scene.rooms import NONE, Lights, Rooms, Solids, Surfaces
@@ -13,11 +13,10 @@ from geogs_synth.textures.pyramids import TextureBank
 
 
 def use_fast_rooms(patch: pytest.MonkeyPatch) -> None:
-    """Render with the emulated kernels, many times as fast as the reference."""
-    use_emulator(patch, render_module)
-    for module in (render_module, sampler_module):
-        patch.setattr(module, "render", render_module.render_by_kernel)
-    patch.setattr(clips_module, "flow", render_module.flow_by_kernel)
+    """Render with the emulated CUDA kernels."""
+    use_emulator(patch, cuda_module)
+    for module in (clips_module, sampler_module):
+        patch.setattr(module, "caster_for", lambda _device: cuda_module.CudaCaster())
 
 
 def solids_of(*rows: tuple[int, list[float], list[float], torch.Tensor | None]) -> Solids:

@@ -50,7 +50,7 @@ class Views:
         row[..., 0] = 1 / max(self.height - 1, 1)
         return torch.cat([pose, k, sweep, row], -1).float().contiguous()
 
-    def apart(self) -> "Views":
+    def as_rooms(self) -> "Views":
         """Every view as that of a room of its own."""
         sweep = None if self.sweep is None else self.sweep.flatten(0, 1)[:, None]
         intrinsics = self.intrinsics.repeat_interleave(self.T_cw.shape[1], 0)

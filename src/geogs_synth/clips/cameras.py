@@ -8,8 +8,8 @@ from torch import Tensor
 
 from geogs_synth.camera.views import Views
 from geogs_synth.clips.paths import Paths
-from geogs_synth.raycast.rays import signed_distance, wall_distance
-from geogs_synth.raycast.render import first_hit
+from geogs_synth.raycast.distance import signed_distance, wall_distance
+from geogs_synth.raycast.select import caster_for
 from geogs_synth.scene.rooms import Solids
 
 _CLEARANCE = 0.15
@@ -77,7 +77,8 @@ def _look(
     directions = _fan(paths.intrinsics, width, height)[:, None, None]
     ray = (paths.R_wc[..., None, :, :] @ directions[..., None])[..., 0]
     origin = paths.centre[..., None, :].expand_as(ray)
-    hit = first_hit(size, solids, origin.flatten(1, 3), ray.flatten(1, 3))
+    caster = caster_for(size.device)
+    hit = caster.first_hit(size, solids, origin.flatten(1, 3), ray.flatten(1, 3))
     depth, solid = (x.reshape(ray.shape[:-1]) for x in (hit.t, hit.solid))
     crowd = (solid[:, :, 0] >= 0).float().mean(-1)
     return _Sight(depth, origin + depth[..., None] * ray, crowd)

@@ -7,8 +7,8 @@ from torch import Tensor
 
 from geogs_synth.camera.views import Views, pixel_grid, project, rays
 from geogs_synth.clips.unusual import Scene
-from geogs_synth.raycast.reference import FlowTruth
-from geogs_synth.raycast.render import flow
+from geogs_synth.raycast.caster import FlowTruth
+from geogs_synth.raycast.select import caster_for
 from geogs_synth.scene.rooms import Solids
 
 
@@ -45,12 +45,11 @@ class ClipBatch:
 
     def flow(self, first: int, second: int) -> FlowTruth:
         """Where the points that the view ``first`` sees are in the view ``second``."""
-        points = self.points(first)
-        if self.scene is None:
-            return flow(self.solids, self.views, points, second)
-        points = points + (second - first) * self.scene.ways_of(self.solid[:, first])
-        solids = self.solids.moved_by(self.scene.ways, second)
-        return flow(solids, self.views, points, second)
+        points, solids = self.points(first), self.solids
+        if self.scene is not None:
+            points = points + (second - first) * self.scene.ways_of(self.solid[:, first])
+            solids = solids.moved_by(self.scene.ways, second)
+        return caster_for(points.device).flow(solids, self.views, points, second)
 
     def still_flow(self, points: Float[Tensor, "b h w 3"], second: int) -> Float[Tensor, "b h w 2"]:
         """Where what is at these points would be in a view if nothing but the camera moved."""

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from geogs_synth.camera.develop import develop
 from geogs_synth.camera.random_flaws import RandomFlaws, draw_flaws
+from geogs_synth.camera.views import Views
 from geogs_synth.clips.cameras import choose_cameras, too_near
 from geogs_synth.clips.clips import ClipBatch
 from geogs_synth.clips.kinds import only_scene
@@ -18,8 +19,9 @@ from geogs_synth.clips.options import RoomOptions
 from geogs_synth.clips.paths import Paths, draw_paths
 from geogs_synth.clips.unusual import Scene, draw_scene
 from geogs_synth.draw import Draw
-from geogs_synth.raycast.render import render, render_apart
-from geogs_synth.scene.rooms import Rooms, moved
+from geogs_synth.raycast.caster import Rendering
+from geogs_synth.raycast.select import caster_for
+from geogs_synth.scene.rooms import Rooms, moved, room_per_view
 from geogs_synth.textures.bank import make_bank
 from geogs_synth.textures.pyramids import TextureBank
 
@@ -85,16 +87,23 @@ class RoomSampler:
             views = replace(views, sweep=scene.shake.sweep)
         rooms = Rooms(size, solids, plan.rooms.surfaces, plan.rooms.lights)
         if scene is None:
-            rendering = render(rooms, self.bank, views)
+            rendering = caster_for(self.device).render(rooms, self.bank, views)
             light = rendering.colour
         else:
-            rendering = render_apart(rooms, self.bank, views, scene.ways)
+            rendering = self._render_moving(rooms, views, scene.ways)
             light = scene.blurred(rendering, views)
         images = develop(Draw(self.device, *key), plan.flaws, light)
         return ClipBatch(
             images, light, rendering.depth, rendering.normal, views.T_cw,
             views.intrinsics, solids, rendering.solid, views.sweep, scene,
         )  # fmt: skip
+
+    def _render_moving(self, rooms: Rooms, views: Views, ways: Float[Tensor, "b n 3"]) -> Rendering:
+        """What every view sees where solids move by ``ways`` (metres) from view to view."""
+        b, v = views.T_cw.shape[:2]
+        rooms = room_per_view(rooms, v, ways)
+        seen = caster_for(self.device).render(rooms, self.bank, views.as_rooms())
+        return Rendering(*(x.flatten(0, 1).unflatten(0, (b, v)) for x in vars(seen).values()))
 
 
 @torch.no_grad()

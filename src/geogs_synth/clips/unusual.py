@@ -17,7 +17,7 @@ from geogs_synth.clips.paths import Paths
 from geogs_synth.clips.shake import Shake, draw_shake
 from geogs_synth.clips.street_clips import MIDDLE, SCALE, draw_street
 from geogs_synth.draw import Draw
-from geogs_synth.raycast.reference import Rendering
+from geogs_synth.raycast.caster import Rendering
 from geogs_synth.scene.rooms import NONE, Rooms, Solids, chosen
 
 

@@ -1,5 +1,5 @@
-"""Ray-solid intersections and shading, compiled; rays are o + t d with d_z = 1 in the camera frame,
-so that t is the depth. Solids, faces and ``half`` are as in scene.py."""
+"""What pixels see of a scene and its shading, compiled; rays are o + t d with d_z = 1 in the camera
+frame, so that t is the depth."""
 
 import math
 from typing import NamedTuple
@@ -7,9 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-_BOX, _FRUSTUM = 0, 1
-_NEAR = 1e-6
-_OPTIONS = {"cache": True, "nogil": True, "error_model": "numpy"}
+from geogs_synth.raycast.solid_kernels import COMPILED, hit, outward_normal
+from geogs_synth.scene.scene import BOX, FRUSTUM
 
 
 class Solids(NamedTuple):
@@ -46,90 +45,7 @@ class Lighting(NamedTuple):
     below: np.ndarray  # 3, ambient from below
 
 
-@njit(inline="always", **_OPTIONS)
-def _hit_box(ox, oy, oz, dx, dy, dz, hx, hy, hz):
-    """Depth and face of the first crossing in front (slab method); inf if missed."""
-    near, far = -np.inf, np.inf
-    near_face, far_face = 0, 0
-    for axis in range(3):
-        if axis == 0:
-            o, d, h = ox, dx, hx
-        elif axis == 1:
-            o, d, h = oy, dy, hy
-        else:
-            o, d, h = oz, dz, hz
-        if d == 0.0:
-            if abs(o) > h:
-                return np.inf, 0
-            continue
-        inverse = 1.0 / d
-        # The ray enters through the side that faces it.
-        enter_side = 2 * axis + (1 if d < 0.0 else 0)
-        enter = (-o - h if d > 0.0 else h - o) * inverse
-        leave = (h - o if d > 0.0 else -o - h) * inverse
-        if enter > near:
-            near, near_face = enter, enter_side
-        if leave < far:
-            far, far_face = leave, enter_side ^ 1
-    if near > far or far < _NEAR:
-        return np.inf, 0
-    if near > _NEAR:
-        return near, near_face
-    return far, far_face
-
-
-@njit(inline="always", **_OPTIONS)
-def _hit_frustum(ox, oy, oz, dx, dy, dz, r0, r1, h):
-    """First crossing of the side x^2 + y^2 = (m + k z)^2 or of a cap."""
-    best, face = np.inf, 0
-    middle, slope = 0.5 * (r0 + r1), 0.5 * (r1 - r0) / h
-    reach = middle + slope * oz
-    a = dx * dx + dy * dy - slope * slope * dz * dz
-    b = ox * dx + oy * dy - slope * dz * reach
-    c = ox * ox + oy * oy - reach * reach
-    disc = b * b - a * c
-    if disc >= 0.0 and a != 0.0:
-        root = math.sqrt(disc)
-        for sign in (-1.0, 1.0):
-            t = (-b + sign * root) / a
-            if _NEAR < t < best and abs(oz + t * dz) <= h and reach + slope * t * dz >= 0.0:
-                best = t
-    if dz != 0.0:
-        for side in range(2):
-            t = ((h if side else -h) - oz) / dz
-            x, y, radius = ox + t * dx, oy + t * dy, (r1 if side else r0)
-            if _NEAR < t < best and x * x + y * y <= radius * radius:
-                best, face = t, 4 + side
-    return best, face
-
-
-@njit(inline="always", **_OPTIONS)
-def _hit_ellipsoid(ox, oy, oz, dx, dy, dz, rx, ry, rz):
-    """First crossing of the unit sphere after scaling by the radii."""
-    ox, oy, oz, dx, dy, dz = ox / rx, oy / ry, oz / rz, dx / rx, dy / ry, dz / rz
-    a = dx * dx + dy * dy + dz * dz
-    b = ox * dx + oy * dy + oz * dz
-    disc = b * b - a * (ox * ox + oy * oy + oz * oz - 1.0)
-    if disc < 0.0:
-        return np.inf, 0
-    root = math.sqrt(disc)
-    t = (-b - root) / a
-    if t < _NEAR:
-        t = (-b + root) / a
-    return (t, 0) if t > _NEAR else (np.inf, 0)
-
-
-@njit(**_OPTIONS)
-def hit(kind, half, ox, oy, oz, dx, dy, dz):
-    """Distance and face of the first crossing of a local ray with one solid; inf if missed."""
-    if kind == _BOX:
-        return _hit_box(ox, oy, oz, dx, dy, dz, half[0], half[1], half[2])
-    if kind == _FRUSTUM:
-        return _hit_frustum(ox, oy, oz, dx, dy, dz, half[0], half[1], half[2])
-    return _hit_ellipsoid(ox, oy, oz, dx, dy, dz, half[0], half[1], half[2])
-
-
-@njit(**_OPTIONS)
+@njit(**COMPILED)
 def _hit_pixel(solids, i, x, y):
     """Depth and face at which the pixel ray (x, y, 1) meets solid i."""
     o, m = solids.origin[i], solids.matrix[i]
@@ -145,7 +61,7 @@ def _hit_pixel(solids, i, x, y):
     )
 
 
-@njit(**_OPTIONS)
+@njit(**COMPILED)
 def cast_rows(solids, bounds, xs, ys, first, last, depth, solid, face):
     """Nearest solid in rows [first, last) of the rays (xs, ys, 1), both rows x columns.
 
@@ -161,37 +77,16 @@ def cast_rows(solids, bounds, xs, ys, first, last, depth, solid, face):
                     face[row, column] = f
 
 
-@njit(**_OPTIONS)
-def _normal(kind, half, face, px, py, pz):
-    """Outward unit normal at a local surface point."""
-    if kind == _BOX or face >= 4:
-        sign = 1.0 if face & 1 else -1.0
-        axis = face >> 1
-        return (
-            sign if axis == 0 else 0.0,
-            sign if axis == 1 else 0.0,
-            sign if axis == 2 else 0.0,
-        )
-    if kind == _FRUSTUM:
-        slope = 0.5 * (half[1] - half[0]) / half[2]
-        nx, ny = px, py
-        nz = -slope * math.sqrt(px * px + py * py)
-    else:
-        nx, ny, nz = px / half[0] ** 2, py / half[1] ** 2, pz / half[2] ** 2
-    scale = 1.0 / math.sqrt(nx * nx + ny * ny + nz * nz)
-    return nx * scale, ny * scale, nz * scale
-
-
-@njit(**_OPTIONS)
+@njit(**COMPILED)
 def _surface_coordinates(kind, half, face, px, py, pz):
     """Metres to the right and up on the face as seen from outside, and the face's width, height."""
-    if kind == _BOX:
+    if kind == BOX:
         if face < 2:
             return (py if face else -py), pz, 2.0 * half[1], 2.0 * half[2]
         if face < 4:
             return (-px if face == 3 else px), pz, 2.0 * half[0], 2.0 * half[2]
         return (px if face == 5 else -px), py, 2.0 * half[0], 2.0 * half[1]
-    if kind == _FRUSTUM:
+    if kind == FRUSTUM:
         if face >= 4:
             width = 2.0 * half[face - 4]
             return px, py, width, width
@@ -203,7 +98,7 @@ def _surface_coordinates(kind, half, face, px, py, pz):
     return longitude * half[0], latitude * half[2], width, math.pi * half[2]
 
 
-@njit(**_OPTIONS)
+@njit(**COMPILED)
 def _add_bilinear(texels, start, w, h, u, v, wrap, weight, out):
     """Adds ``weight`` times a w x h level of a texture at position (u, v) in [0, 1]."""
     if wrap:
@@ -225,7 +120,7 @@ def _add_bilinear(texels, start, w, h, u, v, wrap, weight, out):
         out[k] += weight * ((1.0 - fv) * upper + fv * lower)
 
 
-@njit(**_OPTIONS)
+@njit(**COMPILED)
 def _texture_colour(solids, textures, i, face, point, footprint, out):
     """Texture of a surface point, low-passed to ``footprint`` metres (trilinear filtering)."""
     kind, half = solids.kind[i], solids.half[i]
@@ -235,7 +130,7 @@ def _texture_colour(solids, textures, i, face, point, footprint, out):
     j = solids.texture[i, face]
     start, width, height = textures.start[j], textures.width[j], textures.height[j]
     texel = textures.texel[j]
-    wrap = texel > 0.0 or kind != _BOX
+    wrap = texel > 0.0 or kind != BOX
     if texel > 0.0:
         u = (across + solids.shift[i, 0]) / (texel * width[0])
         v = -(up + solids.shift[i, 1]) / (texel * height[0])
@@ -253,7 +148,7 @@ def _texture_colour(solids, textures, i, face, point, footprint, out):
         _add_bilinear(textures.texels, start[k], width[k], height[k], u, v, wrap, part, out)
 
 
-@njit(**_OPTIONS)
+@njit(**COMPILED)
 def _light(lighting, point, normal, out):
     """Display gain sqrt(E) of a diffuse surface from lights and ambient, with soft occlusion.
 
@@ -295,13 +190,13 @@ def _light(lighting, point, normal, out):
         out[k] = math.sqrt(out[k])
 
 
-@njit(**_OPTIONS)
+@njit(**COMPILED)
 def _surface(solids, camera, i, face, t, x, y, local, world, normal):
     """Fills the local and world point and world normal of a hit; returns |cos| of the incidence."""
     o, m, r = solids.origin[i], solids.matrix[i], solids.rotation[i]
     for k in range(3):
         local[k] = o[k] + t * (m[k, 0] * x + m[k, 1] * y + m[k, 2])
-    n = _normal(solids.kind[i], solids.half[i], face, local[0], local[1], local[2])
+    n = outward_normal(solids.kind[i], solids.half[i], face, local[0], local[1], local[2])
     cosine = 0.0
     for k in range(3):
         ray = camera[k, 0] * x + camera[k, 1] * y + camera[k, 2]
@@ -311,7 +206,7 @@ def _surface(solids, camera, i, face, t, x, y, local, world, normal):
     return abs(cosine) / math.sqrt(x * x + y * y + 1.0)
 
 
-@njit(**_OPTIONS)
+@njit(**COMPILED)
 def _around(solid, face, row, column, found):
     """Collects the distinct faces (8 solid + face) seen in 3 x 3 pixels; returns their number."""
     rows, columns = solid.shape
@@ -328,7 +223,7 @@ def _around(solid, face, row, column, found):
     return count
 
 
-@njit(**_OPTIONS)
+@njit(**COMPILED)
 def _gain(solids, lighting, i, world, normal, out):
     """What the texture of solid i is multiplied with."""
     if solids.emission[i] > 0.0:
@@ -338,7 +233,7 @@ def _gain(solids, lighting, i, world, normal, out):
         _light(lighting, world, normal, out)
 
 
-@njit(**_OPTIONS)
+@njit(**COMPILED)
 def shade_rows(
     solids, textures, lighting, camera, pixel, xs, ys, first, last, depth, solid, face,
     image, normals,

@@ -6,14 +6,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from geogs_synth.raycast.rays import (
-    SurfacePoint,
-    closest_hit,
-    occluded,
-    signed_distance,
-    surface_point,
-    wall_distance,
-)
+from geogs_synth.raycast.distance import signed_distance, wall_distance
+from geogs_synth.raycast.rays import closest_hit, occluded
+from geogs_synth.raycast.surface import SurfacePoint, surface_point
 from geogs_synth.scene.rooms import Lights, Rooms, Surfaces
 from geogs_synth.textures.pyramids import TextureBank
 

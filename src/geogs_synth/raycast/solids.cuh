@@ -1,4 +1,4 @@
-// Rays against the solids of a room; the arithmetic of raycast.py.
+// Rays against the solids of a room; the arithmetic of rays.py and surface.py.
 #include "common.cuh"
 
 #define MOST_SOLIDS 128

@@ -3,38 +3,23 @@
 import numpy as np
 from numba import njit
 
-from geogs_synth.raycast.scene_kernels import hit
-
-_OPTIONS = {"cache": True, "nogil": True, "error_model": "numpy"}
+from geogs_synth.raycast.solid_kernels import COMPILED, crossing
 
 
-@njit(**_OPTIONS)
+@njit(**COMPILED)
 def _blocked(kind, half, rotation, centre, radius, px, py, pz, dx, dy, dz, reach):
     """Whether any solid lies within ``reach`` along the unit direction d from p."""
     for i in range(len(kind)):
-        x, y, z = px - centre[i, 0], py - centre[i, 1], pz - centre[i, 2]
-        # Most solids are ruled out by their bounding sphere's distance from the segment.
-        along = min(max(-(x * dx + y * dy + z * dz), 0.0), reach)
-        sx, sy, sz = x + along * dx, y + along * dy, z + along * dz
-        if sx * sx + sy * sy + sz * sz > radius[i] * radius[i]:
-            continue
-        r = rotation[i]
-        t, _ = hit(
-            kind[i],
-            half[i],
-            r[0, 0] * x + r[1, 0] * y + r[2, 0] * z,
-            r[0, 1] * x + r[1, 1] * y + r[2, 1] * z,
-            r[0, 2] * x + r[1, 2] * y + r[2, 2] * z,
-            r[0, 0] * dx + r[1, 0] * dy + r[2, 0] * dz,
-            r[0, 1] * dx + r[1, 1] * dy + r[2, 1] * dz,
-            r[0, 2] * dx + r[1, 2] * dy + r[2, 2] * dz,
-        )
+        t, _ = crossing(
+            kind[i], half[i], rotation[i], centre[i], radius[i],
+            px, py, pz, dx, dy, dz, reach, False,
+        )  # fmt: skip
         if t < reach:
             return True
     return False
 
 
-@njit(**_OPTIONS)
+@njit(**COMPILED)
 def visibility_slices(
     kind, half, rotation, centre, radius, lights, sphere, ambient_reach, voxel, first, last, volume
 ):

@@ -171,7 +171,7 @@ def chosen(which: Bool[Tensor, "b"], first: Part, second: Part) -> Part:
     )
 
 
-def apart(rooms: Rooms, views: int, ways: Float[Tensor, "b n 3"]) -> Rooms:
+def room_per_view(rooms: Rooms, views: int, ways: Float[Tensor, "b n 3"]) -> Rooms:
     """A room for each view, with what moves by ``ways`` from view to view where it is then."""
 
     def repeated(part: Part) -> Part:

@@ -1,11 +1,11 @@
-"""The GPU's room kernels against their PyTorch counterparts."""
+"""The GPU's room kernels against the caster for the CPU."""
 
 from dataclasses import replace
 
 import pytest
 import torch
 
-import geogs_synth.raycast.render as render_module
+import geogs_synth.raycast.cuda as cuda_module
 from cuda_emulator import use_emulator
 from geogs_synth.camera.views import Views, pixel_grid, rays
 from geogs_synth.clips.cameras import choose_cameras, too_near
@@ -16,24 +16,19 @@ from geogs_synth.clips.options import RoomOptions
 from geogs_synth.clips.paths import draw_paths
 from geogs_synth.clips.sampler import RoomSampler
 from geogs_synth.draw import Draw
-from geogs_synth.raycast.rays import closest_hit
-from geogs_synth.raycast.reference import flow_by_torch, render_by_torch
-from geogs_synth.raycast.render import (
-    MOST_SOLIDS,
-    SOURCE,
-    first_hit_by_kernel,
-    flow_by_kernel,
-    render_by_kernel,
-)
+from geogs_synth.raycast.cpu import CpuCaster
+from geogs_synth.raycast.cuda import MOST_SOLIDS, SOURCE, CudaCaster
 from geogs_synth.scene.rooms import Rooms, moved
 from random_rooms import small_bank
+
+HOST = torch.device("cpu")
 
 
 @pytest.fixture(params=["emulated", pytest.param("gpu", marks=pytest.mark.gpu)])
 def device(request, monkeypatch) -> torch.device:
     """Where the kernels run; everything is emulated where there is no GPU."""
     if request.param == "emulated":
-        use_emulator(monkeypatch, render_module)
+        use_emulator(monkeypatch, cuda_module)
         return torch.device("cpu")
     if not torch.cuda.is_available():
         pytest.skip("needs a CUDA GPU")
@@ -82,7 +77,8 @@ def test_renders_like_the_reference(device):
     views = replace(views, sweep=sweep_of(views))
     bank = small_bank()
     bank = replace(bank, texels=bank.texels.to(device))
-    fast, slow = render_by_kernel(rooms, bank, views), render_by_torch(rooms, bank, views)
+    fast = moved(CudaCaster().render(rooms, bank, views), HOST)
+    slow = CpuCaster().render(moved(rooms, HOST), small_bank(), moved(views, HOST))
     # Rays that graze an edge, or whose texture level is between two, may fall on either side.
     wrong = (fast.depth - slow.depth).abs() > 1e-4 * slow.depth
     assert wrong.float().mean() < 2e-3
@@ -100,8 +96,9 @@ def test_hits_like_the_reference(device):
     b = len(rooms.size)
     direction = torch.randn(b, 500, 3, generator=g).to(device)
     origin = (0.5 * rooms.size[:, None]).expand_as(direction)
-    fast = first_hit_by_kernel(rooms.size, rooms.solids, origin, direction)
-    slow = closest_hit(rooms.size, rooms.solids, origin, direction)
+    fast = moved(CudaCaster().first_hit(rooms.size, rooms.solids, origin, direction), HOST)
+    rooms = moved(rooms, HOST)
+    slow = CpuCaster().first_hit(rooms.size, rooms.solids, origin.cpu(), direction.cpu())
     assert (fast.solid != slow.solid).float().mean() < 5e-3
     same = fast.solid == slow.solid
     torch.testing.assert_close(fast.t[same], slow.t[same], rtol=1e-4, atol=1e-5)
@@ -112,8 +109,8 @@ def test_flows_like_the_reference(device):
     b = len(views.T_cw)
     views = replace(views, sweep=sweep_of(views))
     points = seen_points(views, 1 + torch.rand(b, views.height, views.width, device=device))
-    fast = flow_by_kernel(rooms.solids, views, points, 1)
-    slow = flow_by_torch(rooms.solids, views, points, 1)
+    fast = moved(CudaCaster().flow(rooms.solids, views, points, 1), HOST)
+    slow = CpuCaster().flow(moved(rooms.solids, HOST), moved(views, HOST), points.cpu(), 1)
     torch.testing.assert_close(fast.pixels, slow.pixels, rtol=1e-4, atol=1e-2)
     assert (fast.valid == slow.valid).all()
     assert (fast.visible != slow.visible).float().mean() < 2e-3

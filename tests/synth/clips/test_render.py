@@ -14,8 +14,8 @@ from geogs_synth.clips.clips import ClipBatch
 from geogs_synth.clips.options import RoomOptions
 from geogs_synth.clips.sampler import RoomSampler
 from geogs_synth.draw import Draw
-from geogs_synth.raycast.rays import signed_distance, wall_distance
-from geogs_synth.raycast.reference import flow_by_torch, render_by_torch
+from geogs_synth.raycast.cpu import CpuCaster
+from geogs_synth.raycast.distance import signed_distance, wall_distance
 from geogs_synth.scene.rooms import BOX, ELLIPSOID, FRUSTUM
 from random_rooms import looking_along_y, nothing, room_of, small_bank, solids_of, use_fast_rooms
 
@@ -39,7 +39,7 @@ def depth_of(*rows) -> torch.Tensor:
     """Depth that a camera at (2, 1, 1.5) has of some solids; 25 x 33 pixels."""
     solids = solids_of(*rows) if rows else nothing()
     views = looking_along_y([2.0, 1.0, 1.5])
-    return render_by_torch(room_of(solids, 1), small_bank(), views).depth[0, 0]
+    return CpuCaster().render(room_of(solids, 1), small_bank(), views).depth[0, 0]
 
 
 def test_depth_of_the_walls():
@@ -72,10 +72,10 @@ def test_depth_of_a_turned_box():
 def test_a_box_hides_what_is_behind_it():
     solids = solids_of((BOX, [2, 3, 1.5], [0.2, 0.2, 0.2], None))
     views = looking_along_y([2.0, 1.0, 1.5], [2.6, 1.0, 1.5])
-    depth = render_by_torch(room_of(solids), small_bank(), views).depth
+    depth = CpuCaster().render(room_of(solids), small_bank(), views).depth
     origin, direction = rays(views, 0, *pixel_grid(views))
     points = (origin + depth[:, 0].flatten(1)[..., None] * direction).unflatten(1, depth.shape[2:])
-    truth = flow_by_torch(solids, views, points, 1)
+    truth = CpuCaster().flow(solids, views, points, 1)
     # Each point of the far wall moves by 30 * 0.6 / 4 pixels.
     assert truth.pixels[0, 5, 16, 0] == pytest.approx(16 - 4.5)
     assert truth.visible[0, 5, 16]
@@ -89,10 +89,10 @@ def test_a_box_hides_what_is_behind_it():
 def test_light_is_finite_and_shadows_are_dark():
     solids = solids_of((BOX, [2, 2.5, 1.5], [0.8, 0.8, 0.05], None))
     views = looking_along_y([2.0, 0.4, 0.8])
-    colour = render_by_torch(room_of(solids, 1), small_bank(), views).colour
+    colour = CpuCaster().render(room_of(solids, 1), small_bank(), views).colour
     assert colour.isfinite().all()
     assert (colour > 0).all()
-    open_ = render_by_torch(room_of(nothing(), 1), small_bank(), views).colour
+    open_ = CpuCaster().render(room_of(nothing(), 1), small_bank(), views).colour
     below = colour[0, 0, :, 18:24, 10:22].mean() / open_[0, 0, :, 18:24, 10:22].mean()
     assert below < 0.8
 
