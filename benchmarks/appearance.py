@@ -17,9 +17,9 @@ import torch
 
 from geogs.config import InputConfig, MeshConfig
 from geogs.errors import GeogsError
-from geogs.io.sources.posed.sniff import open_posed_source
+from geogs.io.sources.sniff import open_posed_source
 from geogs.io.writers.atomic import prepare_output_folder, write_text
-from geogs.io.writers.ply import write_mesh
+from geogs.io.writers.ply_writer import write_mesh
 from geogs.mesh.types import Mesh
 from geogs_bench.appearance.baseline import appearance_mesh, train_appearance
 from geogs_bench.appearance.config import AppearanceConfig

@@ -21,7 +21,7 @@ import torch
 from geogs.config import InputConfig
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_inverse
-from geogs.io.poses import read_replica_trajectory
+from geogs.io.pose_files import read_replica_trajectory
 from geogs.io.sources.sniff import open_source
 from geogs.networks.weights_files import PACKAGED
 from geogs.tracking.flow.classical import ClassicalFlow

@@ -29,7 +29,7 @@ from geogs.evaluation.reconstruction import evaluate_reconstruction
 from geogs.evaluation.surface import Surface, read_surface
 from geogs.geometry.camera import Camera
 from geogs.geometry.umeyama import umeyama
-from geogs.io.poses import read_replica_trajectory
+from geogs.io.pose_files import read_replica_trajectory
 from geogs.io.sources.sniff import open_source
 from geogs.loop.global_bundle import global_bundle
 from geogs.mapping.mapper import Mapper
@@ -246,7 +246,7 @@ def main() -> None:
         report_map("map, final", mapper, scorer)
     print(f"peak memory {peak_memory() / 2**30:.2f} GiB")
     if arguments.save_mesh:
-        from geogs.io.writers.ply import write_mesh
+        from geogs.io.writers.ply_writer import write_mesh
 
         write_mesh(arguments.save_mesh, scorer.last.vertices, scorer.last.faces)
     print(json.dumps(scorer.rows[-1]))

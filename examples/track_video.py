@@ -9,7 +9,7 @@ from pathlib import Path
 
 import geogs
 from geogs.config import preset
-from geogs.io.writers.tum import write_tum_trajectory
+from geogs.io.writers.trajectories import write_tum_trajectory
 
 
 def main(video: str, trajectory: Path = Path("trajectory.tum")) -> None:

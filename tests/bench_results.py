@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 
 from geogs.geometry.camera import Camera
-from geogs.io.writers.intrinsics import write_intrinsics
-from geogs.io.writers.ply import write_mesh
-from geogs.io.writers.tum import write_tum_trajectory
+from geogs.io.writers.intrinsics_file import write_intrinsics
+from geogs.io.writers.ply_writer import write_mesh
+from geogs.io.writers.trajectories import write_tum_trajectory
 from geogs.types import Trajectory
 from geogs_bench.runner import Task
 from geogs_bench.scene import Scene, TruePoses, Truth

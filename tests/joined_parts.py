@@ -11,9 +11,9 @@ from geogs.application.results.write import write_config
 from geogs.config import Config
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import sim3_exp, sim3_scale
-from geogs.io.writers.keyframe_images import image_path, write_image
-from geogs.io.writers.map_views import MapViews, save_map_with_views
-from geogs.io.writers.tum import write_tum_trajectory
+from geogs.io.writers.keyframe_folder import image_path, write_image
+from geogs.io.writers.map_file import MapViews, save_map_with_views
+from geogs.io.writers.trajectories import write_tum_trajectory
 from geogs.types import MapSnapshot, Trajectory
 from geogs_fleet.join.disks import transformed
 

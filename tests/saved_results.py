@@ -10,9 +10,9 @@ from geogs.application.results.write import write_config
 from geogs.config import ReconstructConfig
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp
-from geogs.io.writers.keyframe_images import image_path, mask_path, write_image, write_mask
-from geogs.io.writers.map_views import MapViews, save_map_with_views
-from geogs.io.writers.tum import write_tum_trajectory
+from geogs.io.writers.keyframe_folder import image_path, mask_path, write_image, write_mask
+from geogs.io.writers.map_file import MapViews, save_map_with_views
+from geogs.io.writers.trajectories import write_tum_trajectory
 from geogs.types import MapSnapshot, Trajectory
 
 CAMERA = Camera(70.0, 72.0, 40.2, 28.7, 80, 60)

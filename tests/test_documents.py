@@ -50,10 +50,10 @@ def test_yaml_neither_expands_nor_runs(tmp_path, text):
 
 
 def test_sentences_do_not_repeat_what_a_file_holds(tmp_path):
-    from geogs.io.poses import read_poses
+    from geogs.io.pose_files import read_poses
     from geogs.io.sources.calibration_files import read_calibration
-    from geogs.io.sources.posed.colmap_model import read_model
-    from geogs.io.sources.tum import open_tum
+    from geogs.io.sources.formats.colmap import read_model
+    from geogs.io.sources.formats.tum import open_tum
     from geogs.priors.card import load_card
 
     secret = "root:x:0:0:root secret:/root:/bin/bash\n"

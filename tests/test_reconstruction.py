@@ -20,9 +20,9 @@ from geogs.depth.classical import CpuDepthEngine
 from geogs.depth.estimate import estimate_depth
 from geogs.depth.view import depth_view
 from geogs.errors import InputError
-from geogs.io.poses import read_tum_trajectory
-from geogs.io.sources.posed.sniff import open_posed_source
-from geogs.io.writers.native import load_map
+from geogs.io.pose_files import read_tum_trajectory
+from geogs.io.sources.sniff import open_posed_source
+from geogs.io.writers.map_file import load_map
 from geogs.mapping.depth_schedule import spread_order
 from geogs.mapping.first_look import distances_to_try
 from geogs.mapping.known_poses import depth_search

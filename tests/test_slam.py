@@ -19,8 +19,8 @@ from geogs.application.results.saved_result import load_result
 from geogs.cli import main as cli
 from geogs.evaluation.surface import read_surface
 from geogs.evaluation.trajectory import evaluate_trajectory
-from geogs.io.poses import read_tum_trajectory
-from geogs.io.writers.native import load_map
+from geogs.io.pose_files import read_tum_trajectory
+from geogs.io.writers.map_file import load_map
 from geogs.mesh.files import read_mesh
 from geogs.slam import Slam
 from geogs.types import Frame, Trajectory

@@ -13,9 +13,8 @@ if TYPE_CHECKING:
     from geogs.application.slam import PoseEstimate, Slam, track
     from geogs.config import Config, ReconstructConfig
     from geogs.geometry.camera import Camera
-    from geogs.io.sources.posed.sniff import open_posed_source
-    from geogs.io.sources.sniff import open_source
-    from geogs.io.writers.native import load_map
+    from geogs.io.sources.sniff import open_posed_source, open_source
+    from geogs.io.writers.map_file import load_map
     from geogs.splat.map import GaussianMap
     from geogs.splat.render import render
     from geogs.types import Frame
@@ -47,9 +46,9 @@ _HOMES = {
     "PoseEstimate": "geogs.application.slam",
     "ReconstructConfig": "geogs.config",
     "Slam": "geogs.application.slam",
-    "load_map": "geogs.io.writers.native",
+    "load_map": "geogs.io.writers.map_file",
     "load_result": "geogs.application.results.saved_result",
-    "open_posed_source": "geogs.io.sources.posed.sniff",
+    "open_posed_source": "geogs.io.sources.sniff",
     "open_source": "geogs.io.sources.sniff",
     "reconstruct": "geogs.application.reconstruct",
     "render": "geogs.splat.render",

@@ -15,7 +15,7 @@ from geogs.io.writers.atomic import prepare_output_folder, write_text
 from geogs_bench.runner import Task
 
 if TYPE_CHECKING:
-    from geogs.io.sources.posed.base import PosedSource
+    from geogs.io.sources.posed.posed_source import PosedSource
     from geogs.mesh.types import Mesh
     from geogs_bench.appearance.disks import AppearanceDisks
     from geogs_bench.appearance.start_points import StartPoints
@@ -58,7 +58,7 @@ class BaselineRunner:
         import torch
 
         from geogs.gpu.installation import require_device
-        from geogs.io.sources.posed.sniff import open_posed_source
+        from geogs.io.sources.sniff import open_posed_source
         from geogs_bench.appearance.start_points import find_start_points
         from geogs_bench.appearance.views import training_views
 
@@ -142,8 +142,8 @@ def _train(
 
 
 def _write(output: Path, source: "PosedSource", result: "AppearanceResult", mesh: "Mesh") -> None:
-    from geogs.io.writers.intrinsics import write_intrinsics
-    from geogs.io.writers.tum import write_tum_trajectory
+    from geogs.io.writers.intrinsics_file import write_intrinsics
+    from geogs.io.writers.trajectories import write_tum_trajectory
     from geogs.types import Trajectory
 
     _write_mesh(output / "mesh.ply", mesh)
@@ -154,7 +154,7 @@ def _write(output: Path, source: "PosedSource", result: "AppearanceResult", mesh
 
 
 def _write_mesh(path: Path, mesh: "Mesh") -> None:
-    from geogs.io.writers.ply import write_mesh
+    from geogs.io.writers.ply_writer import write_mesh
 
     write_mesh(path, mesh.vertices, mesh.faces, mesh.colours, mesh.normals)
 

@@ -13,8 +13,8 @@ from geogs.documents import UNUSABLE, read_json, read_text
 from geogs.errors import InputError
 from geogs.evaluation.surface import Surface, read_surface
 from geogs.geometry.camera import Camera
-from geogs.io.poses import read_tum_trajectory
-from geogs.io.writers.intrinsics import read_camera
+from geogs.io.pose_files import read_tum_trajectory
+from geogs.io.writers.intrinsics_file import read_camera
 from geogs.types import Trajectory
 from geogs_bench.record import StageName
 

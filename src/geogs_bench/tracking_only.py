@@ -14,7 +14,7 @@ from geogs.errors import TrackingLost
 from geogs.gpu.installation import require_device
 from geogs.io.sources.sniff import open_source
 from geogs.io.writers.atomic import prepare_output_folder, write_text
-from geogs.io.writers.tum import write_tum_trajectory
+from geogs.io.writers.trajectories import write_tum_trajectory
 from geogs.io.writers.uncertainty import write_uncertainty
 from geogs.loop.global_bundle import global_bundle
 from geogs.slam import Slam

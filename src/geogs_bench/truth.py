@@ -6,11 +6,10 @@ from pathlib import Path
 import numpy as np
 
 from geogs.errors import InputError
-from geogs.io.poses import FRAMES_PER_SECOND, read_poses
-from geogs.io.sources.images import SUFFIXES, in_order_of_time
-from geogs.io.sources.posed.colmap import pose_of
-from geogs.io.sources.posed.colmap_model import read_model
-from geogs.io.sources.posed.scannet import open_scannet
+from geogs.io.pose_files import FRAMES_PER_SECOND, read_poses
+from geogs.io.sources.formats.colmap import pose_of, read_model
+from geogs.io.sources.formats.image_files import SUFFIXES, in_order_of_time
+from geogs.io.sources.formats.scannet import open_posed_scannet
 from geogs.types import Trajectory
 from geogs_bench.scene import Scene, TruePoses
 
@@ -39,7 +38,7 @@ def read_true_poses(scene: Scene) -> Trajectory | None:
 
 def _scannet(folder: Path) -> dict[int, np.ndarray]:
     """World to camera by frame number."""
-    posed = open_scannet(folder)
+    posed = open_posed_scannet(folder)
     return {round(file.timestamp * FRAMES_PER_SECOND): file.T_cw for file in posed.files}
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from geogs.errors import InputError
 from geogs.io.decoder_noise import decoder_noise
-from geogs.io.sources.images import SUFFIXES, image_folder, natural_key
+from geogs.io.sources.formats.image_files import SUFFIXES, image_folder, natural_key
 
 _MAKE, _MODEL, _ORIENTATION, _EXIF_IFD = 0x010F, 0x0110, 0x0112, 0x8769
 _FOCAL_LENGTH, _FOCAL_LENGTH_35MM, _LENS_MODEL = 0x920A, 0xA405, 0xA434

@@ -10,9 +10,9 @@ import numpy as np
 
 from geogs.errors import InputError
 from geogs.io.pictures import read_mask
-from geogs.io.sources.intrinsics import calibration_from_exif, resolve_intrinsics
-from geogs.io.sources.posed.colmap import mask_beside
-from geogs.io.sources.posed.pictures import read_picture
+from geogs.io.sources.formats.colmap import mask_beside
+from geogs.io.sources.known_intrinsics import calibration_from_exif, resolve_intrinsics
+from geogs.io.sources.posed.stored_pictures import read_picture
 from geogs.threads import thread_map, worker_count
 from geogs_photos.database import Entry, SharedCamera, match_pairs, write_database
 from geogs_photos.features import Features, find_features

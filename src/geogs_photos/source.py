@@ -9,9 +9,9 @@ from geogs.application.progress import RunProgress
 from geogs.config import ReconstructConfig
 from geogs.documents import UNUSABLE, expanded, read_json
 from geogs.errors import InputError
-from geogs.io.sources.posed.base import PosedSource
-from geogs.io.sources.posed.colmap import open_colmap
+from geogs.io.sources.formats.colmap import open_colmap
 from geogs.io.sources.posed.one_camera import unlike_common
+from geogs.io.sources.posed.posed_source import PosedSource
 from geogs.io.writers.atomic import write_text
 from geogs_photos.photograph import PhotoFolder, find_photographs
 from geogs_photos.poses import FoundPoses, LeftOut, find_poses

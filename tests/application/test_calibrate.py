@@ -15,7 +15,7 @@ from geogs.application.progress import RunProgress
 from geogs.config import CalibrationConfig, Config, InputConfig
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.sniff import open_source
-from geogs.io.writers.intrinsics import write_intrinsics
+from geogs.io.writers.intrinsics_file import write_intrinsics
 from geogs.tracking.calibration import estimate, stretch
 from geogs.tracking.calibration.estimate import SelfCalibration
 from tracking_scenes import CAMERA, pose, render

@@ -15,10 +15,10 @@ from geogs.application.result_settings import EvalSettings
 from geogs.cli.eval import main
 from geogs.errors import InputError
 from geogs.geometry.lie import so3_exp
-from geogs.io.poses import read_poses
-from geogs.io.writers.intrinsics import write_intrinsics
-from geogs.io.writers.ply import write_mesh
-from geogs.io.writers.tum import write_tum_trajectory
+from geogs.io.pose_files import read_poses
+from geogs.io.writers.intrinsics_file import write_intrinsics
+from geogs.io.writers.ply_writer import write_mesh
+from geogs.io.writers.trajectories import write_tum_trajectory
 from geogs.types import Trajectory
 
 pytestmark = pytest.mark.system

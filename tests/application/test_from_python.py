@@ -16,7 +16,7 @@ from geogs.application.run import run
 from geogs.application.settings import RunSettings
 from geogs.cli import main as cli
 from geogs.cli.speech import NOT_JUDGED, closing_message
-from geogs.io.poses import read_tum_trajectory
+from geogs.io.pose_files import read_tum_trajectory
 from geogs.slam import SlamStatus
 from posed_scene import vertices
 

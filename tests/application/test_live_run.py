@@ -13,7 +13,7 @@ from geogs.application.settings import RunSettings
 from geogs.application.viewer.observer import RunObserver
 from geogs.config import Config
 from geogs.errors import InputError
-from geogs.io.sources.live.played import Played
+from geogs.io.sources.live.feeds import Played
 
 LAST = 24
 """Frame at which somebody stops it."""
@@ -61,7 +61,7 @@ def settings(source: str, output: Path) -> RunSettings:
 def test_a_live_run_ends_when_asked_and_finishes_its_map(
     small_room, tmp_path, monkeypatch, no_report
 ):
-    monkeypatch.setattr("geogs.io.sources.live.open.Played", InStep)
+    monkeypatch.setattr("geogs.io.sources.live.feeds.Played", InStep)
     stop = Stop()
     onlooker = Onlooker(stop)
     written = run(settings(f"play:{small_room}", tmp_path / "out"), None, stop, onlooker)

@@ -9,7 +9,7 @@ import torch
 from geogs.application import offline
 from geogs.cli.main import main
 from geogs.geometry.umeyama import umeyama
-from geogs.io.poses import read_tum_trajectory
+from geogs.io.pose_files import read_tum_trajectory
 from geogs_photos import sharp_frames
 from io_samples import write_image
 from posed_layouts import render_room

@@ -10,8 +10,8 @@ from scipy.spatial import cKDTree
 from geogs.application.posed_views import PosedViews
 from geogs.config import ReconstructConfig
 from geogs.evaluation.surface import read_surface
-from geogs.io.sources.posed.base import PosedImage, PosedSource
-from geogs.io.sources.posed.sniff import open_posed_source
+from geogs.io.sources.posed.posed_source import PosedImage, PosedSource
+from geogs.io.sources.sniff import open_posed_source
 from geogs.reconstruction import Reconstruction
 
 RESIDENT = 4

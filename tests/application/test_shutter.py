@@ -14,7 +14,7 @@ from geogs.application.results.summary import source_summary
 from geogs.application.settings import RunSettings
 from geogs.config import Config, InputConfig
 from geogs.io.sources.sniff import open_source
-from geogs.io.writers.intrinsics import write_intrinsics
+from geogs.io.writers.intrinsics_file import write_intrinsics
 from geogs.shutter import readout
 from geogs.shutter.readout import FoundReadout
 from geogs.shutter.shutter import Shutter

@@ -12,7 +12,7 @@ from geogs.config import Config, InputConfig
 from geogs.errors import InputError
 from geogs.evaluation.trajectory import evaluate_trajectory
 from geogs.geometry.umeyama import umeyama
-from geogs.io.poses import read_tum_trajectory
+from geogs.io.pose_files import read_tum_trajectory
 from geogs.tracking.tracker import TrackState
 from geogs.types import Trajectory
 from quick_systems import quick_config

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from geogs.application.settings import RunSettings
 from geogs.errors import InputError
-from geogs.io.writers.tum import write_tum_trajectory
+from geogs.io.writers.trajectories import write_tum_trajectory
 from geogs.types import Trajectory
 from geogs_bench.layouts.motions import find_motions
 from geogs_bench.motion_cells import FULL, SMALL, render_cells

@@ -5,8 +5,8 @@ import json
 import numpy as np
 import pytest
 
-from geogs.io.poses import read_tum_trajectory
-from geogs.io.writers.native import load_map
+from geogs.io.pose_files import read_tum_trajectory
+from geogs.io.writers.map_file import load_map
 from geogs_bench.commands import UpdateRunner
 from geogs_bench.runner import Task
 from geogs_bench.saved_map import FOLDER

@@ -11,13 +11,13 @@ import torch
 
 from geogs.config import InputConfig
 from geogs.errors import GeogsError, InputError, OutputError
-from geogs.io.poses import read_tum_trajectory
+from geogs.io.pose_files import read_tum_trajectory
 from geogs.io.sources.sniff import open_source
 from geogs.io.writers import atomic
 from geogs.io.writers.atomic import prepare_output_folder, write_text
-from geogs.io.writers.native import save_map
-from geogs.io.writers.ply import write_mesh, write_splats
-from geogs.io.writers.tum import write_tum_trajectory
+from geogs.io.writers.map_file import save_map
+from geogs.io.writers.ply_writer import write_mesh, write_splats
+from geogs.io.writers.trajectories import write_tum_trajectory
 from geogs.types import MapSnapshot, Trajectory
 from io_samples import gradient_image, write_image, write_images, write_video
 

@@ -8,7 +8,7 @@ from geogs.errors import InputError
 from geogs.evaluation.dtu import evaluate_dtu, read_dtu_reference
 from geogs.evaluation.surface import Surface
 from geogs.evaluation.thinning import dense_points, thin
-from geogs.io.writers.ply import write_mesh
+from geogs.io.writers.ply_writer import write_mesh
 from surface_shapes import joined, plane
 
 HALF = 4.0

@@ -17,7 +17,7 @@ from geogs.evaluation.surface import (
 )
 from geogs.evaluation.visibility import Visibility
 from geogs.geometry.lie import se3_exp
-from geogs.io.writers.ply import write_mesh
+from geogs.io.writers.ply_writer import write_mesh
 from surface_shapes import CAMERA, NO_FACES, joined, plane
 
 

@@ -13,8 +13,8 @@ import torch
 from geogs.errors import InputError
 from geogs.evaluation.trajectory import associate, evaluate_trajectory, rotation_angle
 from geogs.geometry.lie import se3_exp, so3_exp
-from geogs.io.poses import read_poses
-from geogs.io.writers.tum import write_tum_trajectory
+from geogs.io.pose_files import read_poses
+from geogs.io.writers.trajectories import write_tum_trajectory
 from geogs.types import Trajectory
 
 

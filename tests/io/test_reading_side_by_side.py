@@ -4,7 +4,7 @@ import threading
 
 import pytest
 
-from geogs.io.sources.base import READERS, read_side_by_side
+from geogs.io.sources.reader import READERS, read_side_by_side
 
 
 def test_it_comes_in_order_whoever_is_first():

@@ -8,12 +8,12 @@ import torch
 
 from geogs.errors import InputError, OutputError
 from geogs.geometry.lie import quaternion_to_matrix, se3_exp
-from geogs.io.ply import read_ply
-from geogs.io.poses import read_tum_trajectory
+from geogs.io.ply_reader import read_ply
+from geogs.io.pose_files import read_tum_trajectory
 from geogs.io.writers.atomic import atomic_file, prepare_output_folder, write_text
-from geogs.io.writers.native import load_map, save_map
-from geogs.io.writers.ply import SPLAT_THICKNESS, write_mesh, write_splats
-from geogs.io.writers.tum import write_tum_trajectory
+from geogs.io.writers.map_file import load_map, save_map
+from geogs.io.writers.ply_writer import SPLAT_THICKNESS, write_mesh, write_splats
+from geogs.io.writers.trajectories import write_tum_trajectory
 from geogs.types import MapSnapshot, Trajectory
 
 TETRAHEDRON = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], dtype=np.float32)

@@ -6,7 +6,7 @@ import torch
 from geogs.application.results.saved_result import load_result
 from geogs.config import Config
 from geogs.geometry.lie import se3_inverse, sim3_scale
-from geogs.io.writers.keyframe_rows import rows_path, write_rows
+from geogs.io.writers.keyframe_folder import rows_path, write_rows
 from geogs.shutter.rows import CELL
 from geogs.tracking.packed_edge import position_step
 from geogs.tracking.row_errors import RowErrors

@@ -7,7 +7,7 @@ import torch
 from geogs.config import MeshConfig
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp
-from geogs.io.writers.keyframe_images import write_image
+from geogs.io.writers.keyframe_folder import write_image
 from geogs.mesh.extract import extract_mesh
 from geogs_fleet.join.stored_views import StoredView, loaded, shares
 from geogs_fleet.join.surface import joint_mesh, plan_space

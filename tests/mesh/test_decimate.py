@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from geogs.errors import InputError
-from geogs.io.writers.ply import write_mesh
+from geogs.io.writers.ply_writer import write_mesh
 from geogs.mesh.decimate import MEAN_SHARE, QUANTILE, decimate
 from geogs.mesh.deviation import deviations
 from geogs.mesh.deviation_kernels import triangle_distance

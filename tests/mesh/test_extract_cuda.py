@@ -13,8 +13,8 @@ from geogs.application.results.surfaces import fusion_views, splat_colours
 from geogs.config import MeshConfig
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp
-from geogs.io.writers.native import save_map
-from geogs.io.writers.ply import write_splats
+from geogs.io.writers.map_file import save_map
+from geogs.io.writers.ply_writer import write_splats
 from geogs.mesh import tsdf
 from geogs.mesh.colour import colour_mesh
 from geogs.mesh.extract import extract_mesh

@@ -10,7 +10,7 @@ import torch
 from geogs.errors import InputError
 from geogs.evaluation.textured import psnr, render_textured
 from geogs.geometry.camera import Camera
-from geogs.io.writers.exports.mesh import write_textured_glb
+from geogs.io.writers.exports.mesh_writers import write_textured_glb
 from geogs.mesh.texture.candidates import find_candidates
 from geogs.mesh.texture.exposure import seam_corrections, view_gains
 from geogs.mesh.texture.labels import face_neighbours

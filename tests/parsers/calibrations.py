@@ -12,7 +12,7 @@ def calibrations() -> dict[str, Parser]:
     """By the formats that say what a camera is like."""
     from geogs.io.sources.calibration_files import read_calibration
     from geogs.io.sources.undistort import Rectifier
-    from geogs.io.writers.intrinsics import read_camera
+    from geogs.io.writers.intrinsics_file import read_camera
 
     own = {
         "width": 64, "height": 48, "fx": 50.0, "fy": 50.0, "cx": 31.5, "cy": 23.5,

@@ -4,8 +4,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 import mutations
-from geogs.io.poses import read_poses
-from geogs.io.sources.posed.sniff import open_posed_source
+from geogs.io.pose_files import read_poses
+from geogs.io.sources.sniff import open_posed_source
 from parsers.base import Damage, Parser, tiny_room
 from posed_layouts import (
     write_colmap_binary,

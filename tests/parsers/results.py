@@ -15,11 +15,17 @@ from geogs.application.results.output_folder import free_folder
 from geogs.application.results.remesh import mesh_settings
 from geogs.application.results.report import shown_model, shown_views, write_page_anew
 from geogs.application.results.saved_result import load_result
-from geogs.io.poses import read_tum_trajectory
-from geogs.io.sources.posed.sniff import open_posed_source
-from geogs.io.writers.intrinsics import write_intrinsics
-from geogs.io.writers.keyframe_images import image_path, mask_path, read_image, read_mask
-from geogs.io.writers.keyframe_rows import rows_path, write_rows
+from geogs.io.pose_files import read_tum_trajectory
+from geogs.io.sources.sniff import open_posed_source
+from geogs.io.writers.intrinsics_file import write_intrinsics
+from geogs.io.writers.keyframe_folder import (
+    image_path,
+    mask_path,
+    read_image,
+    read_mask,
+    rows_path,
+    write_rows,
+)
 from geogs.io.writers.uncertainty import write_uncertainty
 from geogs.mapping.rendered import SurfaceMaps
 from geogs.shutter.rows import CELL

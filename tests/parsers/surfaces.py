@@ -7,7 +7,7 @@ import numpy as np
 import mutations
 from geogs.evaluation.dtu import read_dtu_reference
 from geogs.evaluation.surface import read_surface
-from geogs.io.writers.ply import write_mesh
+from geogs.io.writers.ply_writer import write_mesh
 from geogs.mesh.files import read_mesh
 from parsers.base import Parser, written
 

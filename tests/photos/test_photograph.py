@@ -6,8 +6,8 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from geogs.errors import InputError
-from geogs.io.sources.posed.files import PosedFile
 from geogs.io.sources.posed.one_camera import common_place
+from geogs.io.sources.posed.posed_set import PosedFile
 from geogs_photos.photograph import find_photographs
 from geogs_photos.poses import shared_cameras
 from geogs_photos.upright import upright_rotation

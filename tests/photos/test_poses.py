@@ -10,7 +10,7 @@ import torch
 from geogs.cli.main import main
 from geogs.errors import InputError
 from geogs.geometry.umeyama import umeyama
-from geogs.io.sources.posed.colmap import open_colmap
+from geogs.io.sources.formats.colmap import open_colmap
 from geogs_photos.features import Features, find_features
 from geogs_photos.library import load_colmap
 from geogs_photos.photograph import find_photographs

@@ -10,7 +10,7 @@ import pytest
 
 from geogs.errors import InputError, OutputError
 from geogs.evaluation.surface import read_surface
-from geogs.io.poses import read_poses
+from geogs.io.pose_files import read_poses
 from geogs.io.sources.sniff import open_source
 from geogs_synth.camera.flaws import Flaws, camera_flaws
 from geogs_synth.cli import main

@@ -22,8 +22,8 @@ from geogs.evaluation.run_report import PICTURES, figures, run_figures, run_sect
 from geogs.evaluation.surface import read_surface
 from geogs.evaluation.trajectory import Alignment, TrajectoryErrors, evaluate_trajectory
 from geogs.evaluation.truth import TrueScene, read_true_scene, scaled
-from geogs.io.poses import read_tum_trajectory
-from geogs.io.writers.intrinsics import read_camera
+from geogs.io.pose_files import read_tum_trajectory
+from geogs.io.writers.intrinsics_file import read_camera
 from geogs.mesh.types import Mesh
 from geogs.threads import on_one_torch_thread
 

@@ -18,7 +18,7 @@ from geogs.evaluation.surface import Surface, read_surface
 from geogs.evaluation.truth import TrueScene, photographs, silhouettes
 from geogs.evaluation.visibility import Visibility
 from geogs.geometry.camera import Camera
-from geogs.io.writers.intrinsics import read_camera
+from geogs.io.writers.intrinsics_file import read_camera
 
 if TYPE_CHECKING:
     from geogs.evaluation.reconstruction import SurfaceErrors

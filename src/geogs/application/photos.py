@@ -15,7 +15,7 @@ from geogs.config import ReconstructConfig
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.io.sources.calibration import Calibration
-from geogs.io.sources.posed.base import PosedSource
+from geogs.io.sources.posed.posed_source import PosedSource
 from geogs.io.sources.sniff import Stream
 from geogs.stopwatch import Stopwatch
 from geogs.types import Frame

@@ -8,8 +8,8 @@ from jaxtyping import Float64
 
 from geogs.depth.view import Place
 from geogs.errors import InputError
-from geogs.io.sources.base import read_side_by_side
-from geogs.io.sources.posed.base import PosedSource
+from geogs.io.sources.posed.posed_source import PosedSource
+from geogs.io.sources.reader import read_side_by_side
 from geogs.mapping.first_look import SmallImage, first_points
 from geogs.mapping.known_poses import FEWEST_POINTS, depth_search
 from geogs.mapping.view_choice import (

@@ -28,9 +28,9 @@ from geogs.config.idle import idle_settings
 from geogs.documents import expanded
 from geogs.errors import InputError
 from geogs.gpu.installation import require_device
-from geogs.io.sources.posed.base import PosedSource
-from geogs.io.sources.posed.check import PoseCheck, check_poses
-from geogs.io.sources.posed.sniff import open_posed_source
+from geogs.io.sources.posed.pose_check import PoseCheck, check_poses
+from geogs.io.sources.posed.posed_source import PosedSource
+from geogs.io.sources.sniff import open_posed_source
 from geogs.io.writers.atomic import prepare_output_folder
 from geogs.reconstruction import Reconstruction, ReconstructionState
 from geogs.threads import on_one_torch_thread

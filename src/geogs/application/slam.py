@@ -22,9 +22,9 @@ from geogs.geometry.lie import se3_inverse
 from geogs.gpu.installation import require_device
 from geogs.io.sources.sniff import Stream, open_source
 from geogs.io.writers.atomic import prepare_output_folder
-from geogs.io.writers.intrinsics import write_intrinsics
-from geogs.io.writers.map_views import save_map_with_views
-from geogs.io.writers.tum import write_trajectories
+from geogs.io.writers.intrinsics_file import write_intrinsics
+from geogs.io.writers.map_file import save_map_with_views
+from geogs.io.writers.trajectories import write_trajectories
 from geogs.io.writers.uncertainty import write_uncertainty
 from geogs.mapping.rendered import SurfaceMaps
 from geogs.mesh.types import Mesh

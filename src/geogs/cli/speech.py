@@ -44,7 +44,7 @@ def followed(options: Verbosity, work: Callable[["RunProgress"], "Written"]) -> 
 def closing_message(written: "Written", seconds: float) -> list[str]:
     """Lines for the user after a run or a reconstruction, which took so many seconds."""
     from geogs.evaluation.duration import duration
-    from geogs.io.sources.posed.base import PosedSource
+    from geogs.io.sources.posed.posed_source import PosedSource
 
     result, output = written.result, written.output
     lines = []

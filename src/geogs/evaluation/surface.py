@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from geogs.errors import InputError
-from geogs.io.ply import PlyLists, read_ply
+from geogs.io.ply_reader import PlyLists, read_ply
 
 _SAMPLES_PER_FACE = 4
 _LEAST_SAMPLES, _MOST_SAMPLES = 100_000, 2_000_000

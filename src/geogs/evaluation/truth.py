@@ -9,9 +9,9 @@ from geogs.config import InputConfig
 from geogs.errors import InputError
 from geogs.evaluation.masks import Silhouette
 from geogs.evaluation.photoconsistency import PhotoView
-from geogs.io.poses import read_poses
-from geogs.io.sources.posed.base import PosedSource
-from geogs.io.sources.posed.sniff import holds_posed_images, open_posed_source
+from geogs.io.pose_files import read_poses
+from geogs.io.sources.posed.posed_source import PosedSource
+from geogs.io.sources.sniff import holds_posed_images, open_posed_source
 from geogs.types import Trajectory
 
 _METRES = {"millimetres": 0.001}

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from geogs.errors import InputError
-from geogs.io.ply import PlyElement, read_ply
+from geogs.io.ply_reader import PlyElement, read_ply
 from geogs.mesh.types import Mesh, vertex_normals
 
 

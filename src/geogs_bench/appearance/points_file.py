@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 
 from geogs.errors import InputError
-from geogs.io.ply import PlyElement, read_ply
-from geogs.io.writers.ply import write_points as write_coloured_points
+from geogs.io.ply_reader import PlyElement, read_ply
+from geogs.io.writers.ply_writer import write_points as write_coloured_points
 from geogs_bench.appearance.start_points import StartPoints
 
 

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Float64, UInt8
 from torch import Tensor
 
 from geogs.geometry.camera import Camera
-from geogs.io.sources.posed.base import PosedSource
+from geogs.io.sources.posed.posed_source import PosedSource
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@
 import re
 from pathlib import Path
 
-from geogs.io.sources.posed.dtu import is_dtu
+from geogs.io.sources.formats.dtu import is_dtu
 from geogs_bench.layouts.places import folders_like
 from geogs_bench.scene import DtuTruth, Option, Scene, Truth
 

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from pathlib import Path
 
-from geogs.io.sources.images import natural_key
+from geogs.io.sources.formats.image_files import natural_key
 
 
 def folders_like(

@@ -3,7 +3,7 @@
 from dataclasses import replace
 from pathlib import Path
 
-from geogs.io.sources.replica import open_replica
+from geogs.io.sources.formats.replica import open_replica
 from geogs_bench.layouts.dtu import find_dtu
 from geogs_bench.layouts.objects import find_objects
 from geogs_bench.layouts.replica import find_rooms

@@ -8,7 +8,7 @@
 from dataclasses import replace
 from pathlib import Path
 
-from geogs.io.sources.replica import is_replica
+from geogs.io.sources.formats.replica import is_replica
 from geogs_bench.layouts.places import first_file, folders_like
 from geogs_bench.scene import Scene, TruePoses, Truth
 

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from geogs.io.sources.posed.scannet import is_scannet
+from geogs.io.sources.formats.scannet import is_posed_scannet
 from geogs_bench.layouts.places import first_file, folders_like
 from geogs_bench.scene import Option, Scene, TruePoses, Truth
 
@@ -18,7 +18,7 @@ def _frames(folder: Path) -> Path:
 
 
 def _is_scene(folder: Path) -> bool:
-    return is_scannet(_frames(folder))
+    return is_posed_scannet(_frames(folder))
 
 
 def _scene(folder: Path) -> Scene:

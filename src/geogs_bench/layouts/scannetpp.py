@@ -5,8 +5,8 @@
 
 from pathlib import Path
 
-from geogs.io.poses import FRAMES_PER_SECOND
-from geogs.io.sources.posed.colmap_model import is_model
+from geogs.io.pose_files import FRAMES_PER_SECOND
+from geogs.io.sources.formats.colmap import is_model
 from geogs_bench.layouts.places import first_file, folders_like
 from geogs_bench.scene import Option, Scene, TruePoses, Truth
 

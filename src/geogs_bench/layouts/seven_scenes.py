@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from geogs.io.sources.posed.seven_scenes import is_posed_seven_scenes
+from geogs.io.sources.formats.seven_scenes import is_posed_seven_scenes
 from geogs_bench.layouts.places import first_file, folders_like
 from geogs_bench.scene import Scene, TruePoses, Truth
 

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from geogs.io.sources.posed.tum import is_posed_tum
+from geogs.io.sources.formats.tum import is_posed_tum
 from geogs_bench.layouts.places import folders_like
 from geogs_bench.scene import Scene, TruePoses, Truth
 

@@ -11,7 +11,7 @@ from geogs.evaluation.masks import Silhouette, cull_by_masks
 from geogs.evaluation.object import MAX_DISTANCE, ObjectScores, evaluate_object
 from geogs.evaluation.surface import Surface, read_surface
 from geogs.evaluation.truth import silhouettes
-from geogs.io.sources.posed.sniff import open_posed_source
+from geogs.io.sources.sniff import open_posed_source
 from geogs_bench.record import SurfaceScore
 from geogs_bench.result import ResultFolder
 from geogs_bench.scene import Scene

@@ -6,8 +6,8 @@ from geogs.config import InputConfig
 from geogs.errors import InputError
 from geogs.evaluation.photoconsistency import evaluate_photoconsistency
 from geogs.evaluation.truth import photographs
-from geogs.io.sources.posed.base import PosedSource
-from geogs.io.sources.posed.sniff import open_posed_source
+from geogs.io.sources.posed.posed_source import PosedSource
+from geogs.io.sources.sniff import open_posed_source
 from geogs_bench.record import PhotoScore
 from geogs_bench.result import ResultFolder
 from geogs_bench.scene import Scene

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from geogs.errors import InputError
 from geogs.evaluation.surface import read_surface
-from geogs.io.writers.native import load_map
+from geogs.io.writers.map_file import load_map
 from geogs_bench.record import CurvePoint, StageScore
 from geogs_bench.result import ResultFolder
 from geogs_bench.scoring.judges import Judge

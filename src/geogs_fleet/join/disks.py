@@ -11,7 +11,7 @@ from torch import Tensor
 from geogs.geometry.lie import quaternion_to_matrix, se3_inverse
 from geogs.geometry.neighbors import nearest_neighbors
 from geogs.geometry.umeyama import umeyama
-from geogs.io.writers.native import load_map_file, save_map
+from geogs.io.writers.map_file import load_map_file, save_map
 from geogs.mapping.similarity_field import Witness, blended_similarities
 from geogs.splat.map import DiskParameters, GaussianMap
 from geogs.threads import on_one_torch_thread

@@ -15,11 +15,10 @@ from geogs.application.results.write import write_config
 from geogs.config import Config
 from geogs.geometry.camera import Camera
 from geogs.io.writers.atomic import write_text
-from geogs.io.writers.intrinsics import write_intrinsics
-from geogs.io.writers.keyframe_images import image_path, write_image
-from geogs.io.writers.keyframe_rows import rows_path, write_rows
-from geogs.io.writers.map_views import MapViews, save_map_with_views
-from geogs.io.writers.tum import write_trajectories
+from geogs.io.writers.intrinsics_file import write_intrinsics
+from geogs.io.writers.keyframe_folder import image_path, rows_path, write_image, write_rows
+from geogs.io.writers.map_file import MapViews, save_map_with_views
+from geogs.io.writers.trajectories import write_trajectories
 from geogs.io.writers.uncertainty import HEADER, moved_rows
 from geogs.mapping.map_frame import WORLD
 from geogs.types import MapSnapshot, SeenRows, Trajectory

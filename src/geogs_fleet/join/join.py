@@ -19,8 +19,8 @@ from geogs.application.results.summary import lost_spans
 from geogs.config import Config
 from geogs.errors import InputError
 from geogs.io.writers.atomic import prepare_output_folder
-from geogs.io.writers.native import load_map_file
-from geogs.io.writers.ply import write_mesh, write_splats
+from geogs.io.writers.map_file import load_map_file
+from geogs.io.writers.ply_writer import write_mesh, write_splats
 from geogs.mesh.types import Mesh
 from geogs.types import MapSnapshot
 from geogs.version import __version__

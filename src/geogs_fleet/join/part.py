@@ -11,7 +11,7 @@ from jaxtyping import Float32, Float64, UInt8
 from geogs.application.results.saved_result import SavedResult, load_result
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
-from geogs.io.writers.keyframe_images import image_path, read_image
+from geogs.io.writers.keyframe_folder import image_path, read_image
 from geogs.loop.features import FeatureExtractor
 from geogs.threads import on_one_torch_thread
 from geogs.world.grid import SampleGrid

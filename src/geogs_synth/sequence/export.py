@@ -12,7 +12,7 @@ import numpy as np
 from geogs.errors import InputError, OutputError
 from geogs.geometry.camera import Camera
 from geogs.io.writers.atomic import prepare_output_folder
-from geogs.io.writers.ply import write_mesh, write_points
+from geogs.io.writers.ply_writer import write_mesh, write_points
 from geogs_synth.camera.depth_sensor import DepthSensor
 from geogs_synth.camera.flaws import Flaws
 from geogs_synth.camera.lens import Lens

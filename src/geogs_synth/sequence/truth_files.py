@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from geogs.io.poses import FRAMES_PER_SECOND
+from geogs.io.pose_files import FRAMES_PER_SECOND
 from geogs.io.writers.atomic import atomic_file, write_text
-from geogs.io.writers.tum import write_tum_trajectory
+from geogs.io.writers.trajectories import write_tum_trajectory
 from geogs.types import Trajectory
 from geogs_synth.camera.flaws import Flaws
 from geogs_synth.camera.lens import Lens

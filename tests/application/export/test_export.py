@@ -15,10 +15,10 @@ from geogs.application.results.saved_result import SavedResult
 from geogs.cli.main import main
 from geogs.config import MeshConfig
 from geogs.errors import InputError
-from geogs.io.ply import read_ply
-from geogs.io.sources.posed.sniff import open_posed_source
-from geogs.io.writers.exports.mesh import linear
-from geogs.io.writers.ply import SH_DEGREE_0
+from geogs.io.ply_reader import read_ply
+from geogs.io.sources.sniff import open_posed_source
+from geogs.io.writers.exports.mesh_writers import linear
+from geogs.io.writers.ply_writer import SH_DEGREE_0
 from saved_results import BLOCK, CAMERA, IDS, MASKED, ORIGIN, UNIT, WALL, make_result
 
 NAMES = [f"{id:06d}.jpg" for id in IDS]

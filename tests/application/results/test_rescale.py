@@ -12,10 +12,10 @@ from geogs.application.results.rescale import rescale
 from geogs.cli.main import main
 from geogs.config import MeshConfig
 from geogs.errors import InputError
-from geogs.io.ply import read_ply
-from geogs.io.poses import read_tum_trajectory
-from geogs.io.writers.intrinsics import write_intrinsics
-from geogs.io.writers.ply import write_splats
+from geogs.io.ply_reader import read_ply
+from geogs.io.pose_files import read_tum_trajectory
+from geogs.io.writers.intrinsics_file import write_intrinsics
+from geogs.io.writers.ply_writer import write_splats
 from saved_results import CAMERA, UNIT, WALL, make_result
 
 FINE = MeshConfig(voxel=0.12, min_component_faces=10)

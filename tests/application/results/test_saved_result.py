@@ -7,8 +7,8 @@ import torch
 import geogs
 from geogs.errors import InputError
 from geogs.geometry.lie import se3_exp
-from geogs.io.writers.keyframe_images import image_path, read_image
-from geogs.io.writers.native import save_map
+from geogs.io.writers.keyframe_folder import image_path, read_image
+from geogs.io.writers.map_file import save_map
 from saved_results import (
     CAMERA,
     DEPTH_CAMERA,

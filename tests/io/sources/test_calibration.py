@@ -14,10 +14,14 @@ from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.calibration_files import calibration_from_numbers, read_calibration
-from geogs.io.sources.intrinsics import calibration_from_exif, guess_calibration, resolve_intrinsics
-from geogs.io.sources.tum import known_camera
+from geogs.io.sources.formats.tum import known_camera
+from geogs.io.sources.known_intrinsics import (
+    calibration_from_exif,
+    guess_calibration,
+    resolve_intrinsics,
+)
 from geogs.io.sources.undistort import Rectifier
-from geogs.io.writers.intrinsics import write_intrinsics
+from geogs.io.writers.intrinsics_file import write_intrinsics
 from io_samples import gradient_image, write_image
 
 BARREL = (-0.28, 0.07, 0.0002, 0.00002)

@@ -12,10 +12,10 @@ from geogs.config import InputConfig
 from geogs.errors import InputError
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.calibration_files import read_calibration
-from geogs.io.sources.intrinsics import resolve_intrinsics
+from geogs.io.sources.known_intrinsics import resolve_intrinsics
 from geogs.io.sources.sniff import open_source
 from geogs.io.sources.undistort import Rectifier
-from geogs.io.writers.intrinsics import write_intrinsics
+from geogs.io.writers.intrinsics_file import write_intrinsics
 from io_samples import write_image
 from rolling_scenes import RATE, READOUT, global_image, hand_held, rolling_image
 

@@ -9,8 +9,8 @@ import pytest
 
 from geogs.config import InputConfig
 from geogs.errors import InputError
-from geogs.io.sources.base import read_ahead
-from geogs.io.sources.images import natural_key, time_from_name
+from geogs.io.sources.formats.image_files import natural_key, time_from_name
+from geogs.io.sources.reader import read_ahead
 from geogs.io.sources.sniff import open_source
 from io_samples import gradient_image, write_image, write_images
 

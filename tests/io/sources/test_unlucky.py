@@ -7,8 +7,8 @@ import pytest
 
 from geogs.config import InputConfig
 from geogs.errors import InputError
-from geogs.io.sources.base import ReadingPlace
 from geogs.io.sources.calibration import Calibration
+from geogs.io.sources.frame_source import ReadingPlace
 from geogs.io.sources.sniff import open_source
 from geogs.io.writers.atomic import write_text
 from io_samples import gradient_image, write_image, write_images, write_video

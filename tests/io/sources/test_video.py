@@ -8,8 +8,8 @@ import pytest
 
 from geogs.config import InputConfig
 from geogs.errors import InputError
+from geogs.io.sources.formats.video import clockwise_quarter_turns, turn_upright
 from geogs.io.sources.sniff import open_source
-from geogs.io.sources.video import clockwise_quarter_turns, turn_upright
 from io_samples import gradient_image, write_video
 
 IMAGES = [gradient_image(i) for i in range(12)]

@@ -8,8 +8,8 @@ from geogs.application.checkpoints.checkpoint import Checkpoint, SavedState
 from geogs.application.progress import RunProgress
 from geogs.application.settings import RunSettings
 from geogs.errors import InputError
-from geogs.io.sources.base import ReadingPlace
 from geogs.io.sources.calibration import Calibration
+from geogs.io.sources.frame_source import ReadingPlace
 from geogs.io.sources.several import JointPlace, SeveralSources
 from geogs.io.sources.sniff import Stream
 from geogs.shutter.shutter import Shutter

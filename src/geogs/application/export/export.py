@@ -14,12 +14,11 @@ from geogs.application.results.saved_result import SavedResult, load_result
 from geogs.application.results.surfaces import fusion_views, splat_colours
 from geogs.errors import InputError
 from geogs.gpu.installation import require_device
-from geogs.io.writers.exports.cloud import write_las
 from geogs.io.writers.exports.gsplat import write_gsplat_start
-from geogs.io.writers.exports.mesh import write_glb, write_obj, write_textured_glb
-from geogs.io.writers.exports.poses import write_euroc, write_kitti
-from geogs.io.writers.ply import write_points, write_splats
-from geogs.io.writers.tum import write_tum_trajectory
+from geogs.io.writers.exports.las import write_las
+from geogs.io.writers.exports.mesh_writers import write_glb, write_obj, write_textured_glb
+from geogs.io.writers.ply_writer import write_points, write_splats
+from geogs.io.writers.trajectories import write_euroc, write_kitti, write_tum_trajectory
 from geogs.mesh.texture.textured import TexturedMesh, texture_mesh
 from geogs.mesh.types import DepthMapView, Mesh, median_edge
 from geogs.threads import on_one_torch_thread

@@ -13,7 +13,8 @@ from geogs.application.results.saved_result import SavedResult
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.io.writers.atomic import atomic_file
-from geogs.io.writers.exports.colmap import write_colmap_model
+from geogs.io.writers.exports.colmap_writer import write_colmap_model
+from geogs.io.writers.exports.exported import PosedImage
 from geogs.io.writers.exports.maps import (
     STEPS,
     depth_unit,
@@ -22,10 +23,9 @@ from geogs.io.writers.exports.maps import (
     write_normal_png,
     write_npz,
 )
-from geogs.io.writers.exports.nerfstudio import DEPTH_UNIT, write_transforms
-from geogs.io.writers.exports.records import PosedImage
-from geogs.io.writers.keyframe_images import image_path, write_mask
-from geogs.io.writers.ply import write_points
+from geogs.io.writers.exports.nerfstudio_writer import DEPTH_UNIT, write_transforms
+from geogs.io.writers.keyframe_folder import image_path, write_mask
+from geogs.io.writers.ply_writer import write_points
 
 
 def write_colmap_set(folder: Path, result: SavedResult, points: int, as_text: bool) -> None:

@@ -10,7 +10,7 @@ from torch import Tensor
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import transform
-from geogs.io.writers.exports.records import SeenPoints
+from geogs.io.writers.exports.exported import SeenPoints
 from geogs.types import RenderedKeyframe
 
 AGREEMENT = 0.01

@@ -7,9 +7,15 @@ import numpy as np
 
 from geogs.application.results.scene import MappedScene
 from geogs.geometry.camera import Camera
-from geogs.io.writers.keyframe_images import image_path, mask_path, write_image, write_mask
-from geogs.io.writers.keyframe_rows import rows_path, write_rows
-from geogs.io.writers.map_views import MapViews
+from geogs.io.writers.keyframe_folder import (
+    image_path,
+    mask_path,
+    rows_path,
+    write_image,
+    write_mask,
+    write_rows,
+)
+from geogs.io.writers.map_file import MapViews
 from geogs.types import RenderedKeyframe
 
 

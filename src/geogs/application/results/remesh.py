@@ -13,7 +13,7 @@ from geogs.config import MeshConfig
 from geogs.documents import UNUSABLE, read_yaml
 from geogs.errors import InputError
 from geogs.gpu.installation import require_device
-from geogs.io.writers.ply import write_mesh
+from geogs.io.writers.ply_writer import write_mesh
 from geogs.mesh.extract import extract_mesh
 
 

@@ -14,10 +14,16 @@ from torch import Tensor
 from geogs.documents import expanded, read_json
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
-from geogs.io.poses import read_tum_trajectory
-from geogs.io.writers.keyframe_images import image_path, mask_path, read_image, read_mask
-from geogs.io.writers.keyframe_rows import read_rows, rows_path
-from geogs.io.writers.map_views import MapViews, load_map_views
+from geogs.io.pose_files import read_tum_trajectory
+from geogs.io.writers.keyframe_folder import (
+    image_path,
+    mask_path,
+    read_image,
+    read_mask,
+    read_rows,
+    rows_path,
+)
+from geogs.io.writers.map_file import MapViews, load_map_views
 from geogs.io.writers.uncertainty import read_tracked
 from geogs.mapping.map_frame import MapFrame
 from geogs.mapping.rendered import MapRenderer, SurfaceMaps, SurfaceRules

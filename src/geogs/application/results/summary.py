@@ -10,7 +10,7 @@ import torch
 from geogs.application.machine.device import device_summary, peak_memory
 from geogs.application.results.result import Result
 from geogs.application.results.scene import MappedScene
-from geogs.io.sources.posed.base import PosedSource
+from geogs.io.sources.posed.posed_source import PosedSource
 from geogs.io.sources.several import SeveralSources
 from geogs.io.sources.sniff import Stream
 from geogs.stopwatch import Stopwatch

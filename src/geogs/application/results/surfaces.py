@@ -10,9 +10,9 @@ from geogs.application.progress import RunProgress
 from geogs.application.results.scene import MappedScene
 from geogs.config import MeshConfig
 from geogs.errors import InputError
-from geogs.io.writers.native import save_map
-from geogs.io.writers.ply import write_mesh
-from geogs.io.writers.tum import write_trajectories
+from geogs.io.writers.map_file import save_map
+from geogs.io.writers.ply_writer import write_mesh
+from geogs.io.writers.trajectories import write_trajectories
 from geogs.mesh.colour import colour_mesh
 from geogs.mesh.extract import extract_mesh
 from geogs.mesh.types import DepthMapView, Mesh

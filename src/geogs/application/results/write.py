@@ -13,12 +13,12 @@ from geogs.application.results.result import Result
 from geogs.application.results.summary import summarise
 from geogs.application.results.surfaces import fusion_views, splat_colours
 from geogs.config import Config, ReconstructConfig
-from geogs.io.sources.posed.base import PosedSource
+from geogs.io.sources.posed.posed_source import PosedSource
 from geogs.io.writers.atomic import prepare_output_folder, write_text
-from geogs.io.writers.intrinsics import write_intrinsics
-from geogs.io.writers.map_views import save_map_with_views
-from geogs.io.writers.ply import write_mesh, write_splats
-from geogs.io.writers.tum import write_trajectories
+from geogs.io.writers.intrinsics_file import write_intrinsics
+from geogs.io.writers.map_file import save_map_with_views
+from geogs.io.writers.ply_writer import write_mesh, write_splats
+from geogs.io.writers.trajectories import write_trajectories
 from geogs.io.writers.uncertainty import write_uncertainty
 from geogs.threads import on_one_torch_thread
 from geogs.types import RenderedKeyframe

@@ -12,8 +12,7 @@ from geogs.application.ros.messages import Messages
 from geogs.application.ros.settings import NodeSettings
 from geogs.application.slam import Slam
 from geogs.errors import InputError
-from geogs.io.sources.ros.camera_info import calibration_of
-from geogs.io.sources.ros.images import picture_of
+from geogs.io.sources.ros.messages import calibration_of, picture_of
 from geogs.io.sources.undistort import Rectifier
 
 _log = logging.getLogger(__name__)

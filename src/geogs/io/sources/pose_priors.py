@@ -12,7 +12,7 @@ from jaxtyping import Float64
 from geogs.documents import expanded
 from geogs.errors import InputError
 from geogs.geometry.lie import se3_inverse, so3_exp, so3_log
-from geogs.io.poses import read_tum_trajectory
+from geogs.io.pose_files import read_tum_trajectory
 from geogs.types import MeasuredPose, Trajectory
 
 LONGEST_GAP = 0.25

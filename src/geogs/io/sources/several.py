@@ -8,8 +8,9 @@ from jaxtyping import Bool
 
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
-from geogs.io.sources.base import RawFrame, ReadingPlace, Source
 from geogs.io.sources.calibration import Calibration
+from geogs.io.sources.frame_source import ReadingPlace, Source
+from geogs.io.sources.reader import RawFrame
 from geogs.shutter.camera import RollingCamera
 from geogs.shutter.shutter import Shutter
 from geogs.types import Frame

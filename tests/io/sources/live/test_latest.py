@@ -5,7 +5,7 @@ import time
 
 import pytest
 
-from geogs.io.sources.live.latest import Latest
+from geogs.io.sources.live.live_reader import Latest
 
 
 def wait_for(condition, seconds=600.0):

@@ -8,7 +8,7 @@ import pytest
 
 from geogs.config import InputConfig
 from geogs.errors import InputError
-from geogs.io.sources.posed.sniff import open_posed_source
+from geogs.io.sources.sniff import open_posed_source
 from io_samples import gradient_image, write_image
 
 NATIVE = InputConfig(long_edge=0)

@@ -7,8 +7,8 @@ import cv2
 
 from geogs.errors import InputError
 from geogs.io.sources.address import LiveAddress
-from geogs.io.sources.base import RawFrame
 from geogs.io.sources.calibration import Calibration
+from geogs.io.sources.reader import RawFrame
 
 MOST_MISSED = 30
 """Images in a row that do not come before a camera counts as gone."""

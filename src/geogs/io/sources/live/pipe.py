@@ -16,8 +16,8 @@ import numpy as np
 from jaxtyping import UInt8
 
 from geogs.errors import InputError
-from geogs.io.sources.base import RawFrame
 from geogs.io.sources.calibration import Calibration
+from geogs.io.sources.reader import RawFrame
 
 _RAW = re.compile(r"(\d{1,5})x(\d{1,5}):(rgb24|bgr24|gray|yuv420p)(?:@(\d+(?:\.\d+)?))?")
 _MAGIC = b"YUV4MPEG2 "

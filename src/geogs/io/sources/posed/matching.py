@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float64, UInt8
 
 from geogs.geometry.camera import Camera
-from geogs.io.sources.posed.base import PosedSource
+from geogs.io.sources.posed.posed_source import PosedSource
 
 LONG_EDGE = 640
 """Images are matched at this size at most."""

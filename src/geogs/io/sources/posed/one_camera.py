@@ -12,9 +12,9 @@ from geogs.config import InputConfig
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.io.sources.calibration import Calibration
-from geogs.io.sources.intrinsics import resolve_intrinsics
-from geogs.io.sources.posed.files import PosedFile
-from geogs.io.sources.posed.pictures import stored_size
+from geogs.io.sources.known_intrinsics import resolve_intrinsics
+from geogs.io.sources.posed.posed_set import PosedFile
+from geogs.io.sources.posed.stored_pictures import stored_size
 from geogs.io.sources.undistort import Rectifier, lens_maps
 
 _log = logging.getLogger(__name__)

@@ -10,11 +10,17 @@ from typing import Any
 import numpy as np
 
 from geogs.errors import GeogsError, InputError
-from geogs.io.poses import FRAMES_PER_SECOND
-from geogs.io.sources.base import RawFrame
+from geogs.io.pose_files import FRAMES_PER_SECOND
 from geogs.io.sources.calibration import Calibration
-from geogs.io.sources.ros.camera_info import CAMERA_INFO, calibration_of
-from geogs.io.sources.ros.images import COMPRESSED, RAW, is_picture, picture_of
+from geogs.io.sources.reader import RawFrame
+from geogs.io.sources.ros.messages import (
+    CAMERA_INFO,
+    COMPRESSED,
+    RAW,
+    calibration_of,
+    is_picture,
+    picture_of,
+)
 
 _log = logging.getLogger(__name__)
 

@@ -1,0 +1,192 @@
+"""Images as files: a folder of photographs or frames, and the list that the data sets share."""
+
+import os
+import re
+import unicodedata
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from geogs.errors import InputError
+from geogs.io.pictures import decoded
+from geogs.io.pose_files import FRAMES_PER_SECOND
+from geogs.io.sources.calibration import Calibration
+from geogs.io.sources.depth_files import DepthFile
+from geogs.io.sources.known_intrinsics import calibration_from_exif, find_calibration
+from geogs.io.sources.reader import RawFrame
+from geogs.types import MeasuredPose
+
+SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm"})
+"""Names that are taken for images."""
+
+# Where other tools put the images of a project.
+_SUBFOLDERS = ("images", "image", "rgb", "color", "frames", "data", "mav0/cam0/data")
+_SECONDS_BY_DIGITS = {13: 1e-3, 16: 1e-6, 19: 1e-9}
+
+
+@dataclass(frozen=True, slots=True)
+class ImageFile:
+    """An image on disk and when it was taken, in seconds."""
+
+    path: Path
+    timestamp: float
+    depth: DepthFile | None = None
+    """What a depth sensor saw at that time."""
+    pose: MeasuredPose | None = None
+    """By another tracker."""
+
+
+class ImageList:
+    """Reader of image files; the first one that can be read sets the size."""
+
+    quarter_turns = 0
+
+    def __init__(
+        self,
+        kind: str,
+        name: str,
+        files: Sequence[ImageFile],
+        calibration: Calibration | None,
+        poses_by: str | None = None,
+        is_capture: bool = False,
+    ) -> None:
+        """``poses_by`` and ``is_capture`` as of :class:`KnowsPoses`."""
+        self.poses_by, self.is_capture = poses_by, is_capture
+        self.kind = kind
+        self.name = name
+        self.calibration = calibration
+        self.length: int | None = len(files)
+        self.fps = _median_rate([file.timestamp for file in files])
+        self.files = files
+        first = next(
+            (image for file in files if (image := read_image(file.path)) is not None), None
+        )
+        if first is None:
+            raise InputError(f"{name}: none of its {len(files)} images can be read.")
+        self.height, self.width = first.shape[:2]
+
+    @property
+    def paths(self) -> list[Path]:
+        """The files that are read."""
+        return [file.path for file in self.files]
+
+    @property
+    def has_depth(self) -> bool:
+        """Whether a sensor's depth lies beside any of them."""
+        return any(file.depth is not None for file in self.files)
+
+    def read(self, start: int, stop: int | None, stride: int) -> Iterator[RawFrame]:
+        """Read images ``start, start + stride, ...`` before ``stop``."""
+        for file in self.files[start:stop:stride]:
+            found = decoded(file.path, cv2.IMREAD_COLOR)
+            image = found.picture
+            image = None if image is None else cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+            yield RawFrame(
+                str(file.path), file.timestamp, image, found.is_damaged, depth=file.depth,
+                pose=file.pose, name=file.path.name,
+            )  # fmt: skip
+
+
+def read_image(path: Path) -> UInt8[np.ndarray, "h w 3"] | None:
+    """Read an image as RGB, upright by its EXIF orientation; none if it is damaged or missing."""
+    image = decoded(path, cv2.IMREAD_COLOR).picture
+    return None if image is None else cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+
+
+def open_image_folder(folder: Path) -> ImageList:
+    """Read a folder of images, or its sub-folder that holds them, in order of time or name."""
+    place = _folder_with_images(folder)
+    files = in_order_of_time(_images(place))
+    calibration = find_calibration(*dict.fromkeys(_folders_of_project(folder, place)))
+    return ImageList(
+        "images",
+        folder.resolve().name,
+        files,
+        calibration or calibration_from_exif(files[0].path),
+    )
+
+
+def _folders_of_project(folder: Path, place: Path) -> list[Path]:
+    """Where a calibration of the images may lie: with them, or above a folder called images."""
+    above = [place.parent] if place.resolve().name in _SUBFOLDERS else []
+    return [folder, place, *above]
+
+
+def natural_key(name: str) -> list[tuple[int, int, str]]:
+    """Sort key that puts ``frame10`` after ``frame9``: runs of digits compare as numbers."""
+    key = []
+    for part in re.split(r"(\d+)", name.lower()):
+        if part.isdecimal():  # of two numbers the longer is larger; they may be too long for an int
+            digits = "".join(str(unicodedata.decimal(c)) for c in part).lstrip("0")
+            key.append((0, len(digits), digits))
+        elif part:
+            key.append((1, 0, part))
+    return key
+
+
+def in_order_of_time(paths: Sequence[Path]) -> list[ImageFile]:
+    """Sort images by the times in their names, or naturally with image k at k / 30 s.
+
+    Names are times where every one is: seconds with a fraction (TUM), or milli-, micro- or
+    nanoseconds of the epoch (EuRoC).
+    """
+    times = [time_from_name(path.stem) for path in paths]
+    known = {time: path for time, path in zip(times, paths, strict=True) if time is not None}
+    if len(known) == len(paths):
+        return [ImageFile(known[time], time) for time in sorted(known)]
+    ordered = sorted(paths, key=lambda path: (natural_key(path.name), path.name))
+    return [ImageFile(path, k / FRAMES_PER_SECOND) for k, path in enumerate(ordered)]
+
+
+def time_from_name(stem: str) -> float | None:
+    """Seconds that a file name stands for; none where it is an ordinary name or number."""
+    if re.fullmatch(r"\d+\.\d+", stem):
+        return float(stem)
+    unit = _SECONDS_BY_DIGITS.get(len(stem)) if stem.isdecimal() else None
+    seconds = 0.0 if unit is None else int(stem) * unit
+    return seconds if seconds >= 1e9 else None  # after 2001: not just a long frame number
+
+
+def _median_rate(times: Sequence[float]) -> float:
+    steps = np.diff(times)
+    steps = steps[steps > 0]
+    return float(1 / np.median(steps)) if len(steps) else FRAMES_PER_SECOND
+
+
+def image_folder(folder: Path) -> Path | None:
+    """The folder itself or the sub-folder of a usual name that holds images; none if none does."""
+    places = (folder, *(folder / name for name in _SUBFOLDERS))
+    return next((place for place in places if place.is_dir() and _images(place)), None)
+
+
+def _folder_with_images(folder: Path) -> Path:
+    if place := image_folder(folder):
+        return place
+    raise InputError(
+        f"{folder} holds no images ({', '.join(sorted(SUFFIXES))}) and is no data set known here; "
+        f"give a video, a folder of images, or a Replica, TUM RGB-D or 7-Scenes sequence."
+    )
+
+
+def _images(folder: Path) -> list[Path]:
+    return [
+        folder / name
+        for name in file_names(folder)
+        if Path(name).suffix.lower() in SUFFIXES and not name.startswith(".")
+    ]
+
+
+def numbered(folder: Path, pattern: re.Pattern[str]) -> list[tuple[int, Path]]:
+    """Files by the number that a pattern finds in their names, ascending."""
+    matches = ((pattern.fullmatch(path.name), path) for path in folder.iterdir())
+    return sorted((int(match[1]), path) for match, path in matches if match)
+
+
+def file_names(folder: Path) -> list[str]:
+    """Names of the files in a folder, which is asked once for all of them."""
+    with os.scandir(folder) as entries:  # of which only a link has to be asked what it leads to
+        return [e.name for e in entries if (Path(e) if e.is_symlink() else e).is_file()]

@@ -1,0 +1,71 @@
+"""Raw data that Polycam exported: keyframes with their cameras, poses and depths."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+
+from geogs.documents import UNUSABLE, read_json
+from geogs.errors import InputError
+from geogs.io.pose_files import FRAMES_PER_SECOND
+from geogs.io.sources.calibration import Calibration
+from geogs.io.sources.depth_files import DepthFile
+from geogs.io.sources.formats.image_files import ImageFile, ImageList, natural_key
+from geogs.io.sources.pose_priors import OPENCV_FROM_OPENGL, measured_pose, rigid
+
+_PER_METRE = 1000.0
+_FOLDERS = (("corrected_cameras", "corrected_images"), ("cameras", "images"))
+
+
+def polycam_folders(folder: Path) -> tuple[Path, Path] | None:
+    """Where an export of Polycam's raw data has cameras and images; none if it is no such."""
+    base = folder / "keyframes"
+    for cameras, images in _FOLDERS:
+        if (base / cameras).is_dir() and (base / images).is_dir():
+            return base / cameras, base / images
+    return None
+
+
+def open_polycam(folder: Path) -> ImageList:
+    """Read the keyframes of an export; they are taken to be a thirtieth of a second apart.
+
+    Raises:
+        InputError: there are none, or a camera cannot be understood.
+    """
+    places = polycam_folders(folder)
+    if places is None:
+        raise InputError(f"{folder} is no export of Polycam's raw data.")
+    cameras, images = places
+    files, lenses = [], []
+    for n, path in enumerate(sorted(cameras.glob("*.json"), key=lambda p: natural_key(p.name))):
+        image = images / f"{path.stem}.jpg"
+        if not image.is_file():
+            continue
+        document = read_json(path)
+        try:
+            rows = [[document[f"t_{i}{j}"] for j in range(4)] for i in range(3)]
+            T_wc = np.array([*rows, [0, 0, 0, 1]], dtype=np.float64)
+            lens = [float(document[k]) for k in ("fx", "fy", "cx", "cy")]
+            lens += [float(document["width"]), float(document["height"])]
+            if not all(map(math.isfinite, lens)):
+                raise ValueError
+            lenses.append(lens)
+        except UNUSABLE:
+            raise InputError(f"{path} holds no camera of Polycam; export it again.") from None
+        pose = rigid(T_wc @ OPENCV_FROM_OPENGL)
+        depth = folder / "keyframes" / "depth" / f"{path.stem}.png"
+        files.append(
+            ImageFile(
+                image, n / FRAMES_PER_SECOND,
+                DepthFile(depth, _PER_METRE) if depth.is_file() else None,
+                None if pose is None else measured_pose(pose),
+            )
+        )  # fmt: skip
+    if not files:
+        raise InputError(f"{folder} holds no images with cameras in keyframes/; export it again.")
+    fx, fy, cx, cy, width, height = np.median(np.array(lenses), axis=0)
+    calibration = Calibration(
+        fx, fy, cx, cy, width=int(width), height=int(height), origin="Polycam"
+    )
+    name = folder.resolve().name
+    return ImageList("polycam", name, files, calibration, "Polycam", is_capture=True)

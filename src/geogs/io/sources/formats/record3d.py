@@ -1,0 +1,238 @@
+"""A recording of Record3D: an ``.r3d`` archive, or its folder, with images, depths and poses.
+
+``metadata`` (JSON) holds the size ``w``, ``h`` of the images, their ``K`` column by column, ``fps``
+and ``poses`` ``qx qy qz qw tx ty tz`` (camera to world, axes of OpenGL); ``rgbd/`` holds
+``N.jpg``, ``N.depth`` (float32 metres) and ``N.conf`` (0 to 2), the last two compressed by LZFSE.
+"""
+
+import importlib
+import json
+import logging
+import zipfile
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float32
+
+from geogs.documents import LARGEST_DOCUMENT, UNUSABLE, read_bytes
+from geogs.errors import InputError
+from geogs.geometry.lie import quaternion_to_matrix
+from geogs.io.pictures import LARGEST_PICTURE, decoded_bytes
+from geogs.io.sources.calibration import Calibration
+from geogs.io.sources.depth_files import LEAST_CONFIDENCE, DepthCamera
+from geogs.io.sources.pose_priors import OPENCV_FROM_OPENGL, measured_pose, rigid
+from geogs.io.sources.reader import RawFrame
+from geogs.types import MeasuredPose
+
+_log = logging.getLogger(__name__)
+_LIDAR = (192, 256)
+"""Rows and columns of a depth whose size is not told."""
+_LARGEST_DEPTH = 1 << 26
+"""Bytes of a compressed depth."""
+
+
+def is_record3d(path: Path) -> bool:
+    """Whether ``path`` is an archive of Record3D or what was unpacked from one."""
+    if path.is_dir():
+        return (path / "metadata").is_file() and (path / "rgbd").is_dir()
+    return path.suffix.lower() == ".r3d" and zipfile.is_zipfile(path)
+
+
+@runtime_checkable
+class Files(Protocol):
+    """Files by their names within a recording."""
+
+    def names(self) -> list[str]:
+        """Names of all, such as ``rgbd/0.jpg``."""
+        ...
+
+    def read(self, name: str, largest: int) -> bytes:
+        """What one holds. Raises InputError if it is missing, too large, or damaged."""
+        ...
+
+
+@dataclass(frozen=True)
+class _Folder:
+    path: Path
+
+    def names(self) -> list[str]:
+        return [f"rgbd/{p.name}" for p in (self.path / "rgbd").iterdir()]
+
+    def read(self, name: str, largest: int) -> bytes:
+        return read_bytes(self.path / name, largest)
+
+
+@dataclass(frozen=True)
+class _Archive:
+    path: Path
+
+    def names(self) -> list[str]:
+        with self._opened() as archive:
+            return archive.namelist()
+
+    def read(self, name: str, largest: int) -> bytes:
+        with self._opened() as archive:
+            try:
+                if archive.getinfo(name).file_size > largest:
+                    raise InputError(f"{self.path}: {name} is larger than any such file.")
+                return archive.read(name)
+            except (KeyError, OSError, RuntimeError, NotImplementedError, *_DAMAGED):
+                raise InputError(f"{self.path}: {name} is missing or damaged.") from None
+
+    def _opened(self) -> zipfile.ZipFile:
+        try:
+            return zipfile.ZipFile(self.path)
+        except (OSError, *_DAMAGED):
+            raise InputError(f"{self.path} is damaged; export it again.") from None
+
+
+_DAMAGED = (zipfile.BadZipFile, EOFError, ValueError)
+
+
+@dataclass(frozen=True)
+class Record3dDepth:
+    """The depth of a frame, unpacked when it is asked for."""
+
+    files: Files
+    number: int
+    size: tuple[int, int]
+    """Rows and columns."""
+    sensor: DepthCamera | None = None
+    """None: its pixels are those of the colour image, fewer."""
+
+    def metres(self) -> Float32[np.ndarray, "h w"] | None:
+        """The depth of its own pixels, 0 where it is unknown or hardly to be trusted."""
+        values = self._unpacked("depth", np.dtype(np.float32))
+        if values is None:
+            return None
+        confidence = self._unpacked("conf", np.dtype(np.uint8))
+        known = np.isfinite(values) & (values > 0)
+        if confidence is not None:
+            known &= confidence >= LEAST_CONFIDENCE
+        return np.where(known, values, np.float32(0)).astype(np.float32)
+
+    def _unpacked(self, kind: str, dtype: np.dtype[Any]) -> np.ndarray | None:
+        lzfse = _lzfse()
+        try:
+            packed = self.files.read(f"rgbd/{self.number}.{kind}", _LARGEST_DEPTH)
+            data = lzfse.decompress(packed)
+        except Exception:  # missing, or whatever a damaged one makes the decoder stumble over
+            return None
+        values = np.frombuffer(data[: len(data) // dtype.itemsize * dtype.itemsize], dtype)
+        rows, columns = self.size
+        return values.reshape(rows, columns) if values.size == rows * columns else None
+
+
+class Record3dRecording:
+    """Reader of a recording."""
+
+    kind = "record3d"
+    quarter_turns = 0
+    is_capture = True
+
+    def __init__(self, path: Path) -> None:
+        self.name = path.resolve().stem
+        self._path = path
+        self._files: Files = _Folder(path) if path.is_dir() else _Archive(path)
+        names = [name for name in self._files.names() if name.startswith("rgbd/")]
+        numbers = [Path(name).stem for name in names if name.endswith((".jpg", ".png"))]
+        self._numbers = sorted(int(n) for n in numbers if n.isdecimal())
+        if not self._numbers:
+            raise InputError(f"{path} holds no images in rgbd/; export it again.")
+        suffix = {Path(name).stem: name for name in names if name.endswith((".jpg", ".png"))}
+        self._image = {int(stem): name for stem, name in suffix.items() if stem.isdecimal()}
+        first = self._picture(self._numbers[0])
+        if first is None:
+            raise InputError(f"{path}: its first image cannot be read; export it again.")
+        self.height, self.width = first.shape[:2]
+        self.length: int | None = len(self._numbers)
+        try:
+            facts: dict[str, Any] = json.loads(self._files.read("metadata", LARGEST_DOCUMENT))
+            self.fps = float(facts.get("fps") or 30)
+            self.calibration: Calibration | None = self._calibration(facts)
+            self._poses = _poses(facts.get("poses", []))
+            self._times = [float(t) for t in facts.get("frameTimestamps") or []]
+            self._size = _whole(facts, "dh", _LIDAR[0]), _whole(facts, "dw", _LIDAR[1])
+        except (*UNUSABLE, UnicodeDecodeError) as error:
+            raise InputError(f"{path}: its metadata cannot be understood ({error}).") from None
+        if not (0 < self.fps < 1e4):
+            raise InputError(f"{path}: its metadata says {self.fps} frames a second.")
+        self.poses_by = "Record3D" if self._poses else None
+        depths = any(name.endswith(".depth") for name in names)
+        self.has_depth = depths and _lzfse() is not None
+        if depths and not self.has_depth:
+            _log.info("Record3D's depth needs pip install 'geogs[record3d]'.")
+
+    @property
+    def paths(self) -> Sequence[Path]:
+        """The archive, or the images of the folder."""
+        if not self._path.is_dir():
+            return [self._path]
+        return [self._path / self._image[n] for n in self._numbers]
+
+    def read(self, start: int, stop: int | None, stride: int) -> Iterator[RawFrame]:
+        """Read frames ``start, start + stride, ...`` before ``stop``."""
+        for n in range(len(self._numbers))[start:stop:stride]:
+            number = self._numbers[n]
+            depth = Record3dDepth(self._files, number, self._size) if self.has_depth else None
+            seconds = self._times[n] if len(self._times) == self.length else n / self.fps
+            pose = self._poses.get(number)
+            label = f"{self.name}, frame {number}"
+            yield RawFrame(
+                label, seconds, self._picture(number), depth=depth, pose=pose, name=str(number)
+            )
+
+    def _picture(self, number: int) -> np.ndarray | None:
+        try:
+            data = self._files.read(self._image[number], LARGEST_PICTURE)
+        except InputError:
+            return None
+        picture = decoded_bytes(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR).picture
+        return None if picture is None else cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
+
+    def _calibration(self, facts: dict[str, Any]) -> Calibration | None:
+        if "K" not in facts:
+            return None
+        K = np.array(facts["K"], dtype=np.float64).reshape(3, 3).T
+        width, height = _whole(facts, "w", self.width), _whole(facts, "h", self.height)
+        return Calibration(
+            K[0, 0], K[1, 1], K[0, 2], K[1, 2], width=width, height=height, origin="Record3D"
+        ).fit(self.width, self.height)
+
+
+def _poses(rows: object) -> dict[int, MeasuredPose]:
+    """Poses by the number of the frame; what is none is left out."""
+    table = np.array(rows, dtype=np.float64)
+    if not table.size:
+        return {}
+    if table.ndim != 2 or table.shape[1] != 7:
+        raise ValueError(f"poses of shape {table.shape}")
+    found = {}
+    for number, row in enumerate(table):
+        if not np.isfinite(row).all() or np.linalg.norm(row[:4]) == 0:
+            continue
+        T_wc = np.eye(4)
+        T_wc[:3, :3] = quaternion_to_matrix(torch.from_numpy(row[[3, 0, 1, 2]])).numpy()
+        T_wc[:3, 3] = row[4:]
+        pose = rigid(T_wc @ OPENCV_FROM_OPENGL)
+        if pose is not None:
+            found[number] = measured_pose(pose)
+    return found
+
+
+def _whole(facts: dict[str, Any], name: str, default: int) -> int:
+    value = facts.get(name)
+    return default if value is None else int(value)
+
+
+def _lzfse() -> Any:
+    """The module that unpacks LZFSE; none where it is not installed."""
+    try:
+        return importlib.import_module("lzfse")
+    except ImportError:
+        return None

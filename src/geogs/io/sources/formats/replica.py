@@ -1,0 +1,102 @@
+"""Replica as rendered for iMAP: ``results/frame000000.jpg, depth000000.png, ...``.
+
+``cam_params.json`` has the camera, and how many units of the depths make a metre; ``traj.txt`` the
+pose of image k in line k, camera to world.
+"""
+
+import re
+from collections.abc import Container
+from pathlib import Path
+
+import numpy as np
+
+from geogs.documents import read_json
+from geogs.errors import InputError
+from geogs.io.pose_files import FRAMES_PER_SECOND, read_replica_trajectory
+from geogs.io.sources.calibration import Calibration
+from geogs.io.sources.calibration_files import read_calibration
+from geogs.io.sources.depth_files import DepthFile
+from geogs.io.sources.formats.image_files import ImageFile, ImageList, file_names, numbered
+from geogs.io.sources.posed.posed_set import PosedFile, PosedSet
+
+_NAME = re.compile(r"frame(\d+)\.(jpg|jpeg|png)", re.IGNORECASE)
+_CAMERA = Calibration(
+    600.0, 600.0, 599.5, 339.5, width=1200, height=680, origin="the Replica data set"
+)  # fmt: skip
+_PER_METRE = 6553.5
+
+
+def is_replica(folder: Path) -> bool:
+    """Whether ``folder`` is a scene, or the ``results`` folder of one."""
+    results = _results(folder)
+    return results.is_dir() and any(_NAME.fullmatch(path.name) for path in results.iterdir())
+
+
+def open_replica(folder: Path) -> ImageList:
+    """Read a scene; frame k is at k / 30 s, which matches line k of ``traj.txt``."""
+    results = _results(folder)
+    scene = results.parent.resolve()
+    per_metre, there = _units_per_metre(scene), {*file_names(results)}
+    files = [
+        ImageFile(path, k / FRAMES_PER_SECOND, _depth(path, k, per_metre, there))
+        for k, path in numbered(results, _NAME)
+    ]
+    reader = ImageList("replica", scene.name, files, None)
+    reader.calibration = _find_calibration(scene, reader.width, reader.height)
+    return reader
+
+
+def _depth(image: Path, number: int, per_metre: float, there: Container[str]) -> DepthFile | None:
+    digits = len(image.stem) - len("frame")
+    path = image.with_name(f"depth{number:0{digits}d}.png")
+    return DepthFile(path, per_metre) if path.name in there else None
+
+
+def _units_per_metre(scene: Path) -> float:
+    """By ``cam_params.json``, else the data set's. Raises InputError for what cannot be."""
+    for file in (scene / "cam_params.json", scene.parent / "cam_params.json"):
+        if not file.is_file():
+            continue
+        document = read_json(file)
+        camera = document.get("camera") if isinstance(document, dict) else None
+        scale = camera.get("scale", _PER_METRE) if isinstance(camera, dict) else _PER_METRE
+        if type(scale) not in (int, float) or not 0 < scale < 1e9:
+            raise InputError(f"{file}: the scale of the depths is {str(scale)[:40]}, not a number.")
+        return float(scale)
+    return _PER_METRE
+
+
+def is_posed_replica(folder: Path) -> bool:
+    """Whether ``folder`` is a scene with its poses."""
+    return is_replica(folder) and (_results(folder).parent / "traj.txt").is_file()
+
+
+def open_posed_replica(folder: Path) -> PosedSet:
+    """Read a scene; images without a valid pose are left out."""
+    poses = _results(folder).parent / "traj.txt"
+    reader, trajectory = open_replica(folder), read_replica_trajectory(poses)
+    frames = np.rint(trajectory.timestamps * FRAMES_PER_SECOND).astype(int)
+    T_cw = {int(k): np.linalg.inv(T) for k, T in zip(frames, trajectory.T_wc, strict=True)}
+    files = []
+    for file in reader.files:
+        number = round(file.timestamp * FRAMES_PER_SECOND)
+        if number not in T_cw:
+            continue
+        path = file.path.with_name(f"mask{number:06d}.png")
+        mask = path if path.is_file() else None
+        pose = T_cw[number]
+        files.append(PosedFile(file.path, pose, reader.calibration, mask, file.timestamp))
+    if not files:
+        raise InputError(f"{poses} holds no pose for any image of {poses.parent}.")
+    return PosedSet("replica", reader.name, tuple(files), scene_scale="metres")
+
+
+def _results(folder: Path) -> Path:
+    return folder if folder.name == "results" else folder / "results"
+
+
+def _find_calibration(scene: Path, width: int, height: int) -> Calibration | None:
+    for place in (scene, scene.parent):
+        if (place / "cam_params.json").is_file():
+            return read_calibration(place / "cam_params.json")
+    return _CAMERA if (width, height) == (1200, 680) else None

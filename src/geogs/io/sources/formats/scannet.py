@@ -1,0 +1,80 @@
+"""ScanNet as exported: ``color/0.jpg, ...`` with ``depth/``, ``pose/`` and ``intrinsic/``."""
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64
+
+from geogs.documents import read_text
+from geogs.errors import InputError
+from geogs.io.pose_files import FRAMES_PER_SECOND
+from geogs.io.sources.calibration import Calibration
+from geogs.io.sources.calibration_files import read_calibration
+from geogs.io.sources.depth_files import DepthFile
+from geogs.io.sources.formats.image_files import SUFFIXES, ImageFile, ImageList
+from geogs.io.sources.posed.posed_set import PosedFile, PosedSet
+
+_PER_METRE = 1000.0
+
+
+def is_scannet(folder: Path) -> bool:
+    """Whether ``folder`` is a scene."""
+    colour, depth = folder / "color", folder / "depth"
+    return colour.is_dir() and depth.is_dir() and bool(_images(folder))
+
+
+def open_scannet(folder: Path) -> ImageList:
+    """Read a scene; image k is at k / 30 s. Depth has been registered to colour."""
+    depths = {int(p.stem): p for p in (folder / "depth").glob("*.png") if p.stem.isdecimal()}
+    files = [
+        ImageFile(
+            path,
+            k / FRAMES_PER_SECOND,
+            DepthFile(depths[k], _PER_METRE) if k in depths else None,
+        )
+        for k, path in _images(folder)
+    ]
+    return ImageList("scannet", folder.resolve().name, files, _calibration(folder))
+
+
+def is_posed_scannet(folder: Path) -> bool:
+    """Whether ``folder`` is a scene with its poses."""
+    return (folder / "pose").is_dir() and (folder / "color").is_dir()
+
+
+def open_posed_scannet(folder: Path) -> PosedSet:
+    """Read a scene; names count as numbers, padded with zeros or not."""
+    calibration = _calibration(folder)
+    poses = {int(p.stem): p for p in (folder / "pose").glob("*.txt") if p.stem.isdecimal()}
+    files = tuple(
+        PosedFile(path, _read_pose(poses[k]), calibration, None, k / FRAMES_PER_SECOND)
+        for k, path in _images(folder)
+        if k in poses
+    )
+    return PosedSet("scannet", folder.resolve().name, files, scene_scale="metres")
+
+
+def _read_pose(path: Path) -> Float64[np.ndarray, "4 4"]:
+    """World to camera; NaN where tracking was lost (the file then holds -inf)."""
+    try:
+        T_wc = np.array(read_text(path).split(), dtype=np.float64).reshape(4, 4)
+    except ValueError:
+        raise InputError(f"{path} should hold a 4x4 matrix; copy it again.") from None
+    if not np.isfinite(T_wc).all() or abs(np.linalg.det(T_wc)) < 1e-9:
+        return np.full((4, 4), np.nan)
+    return np.linalg.inv(T_wc)
+
+
+def _calibration(folder: Path) -> Calibration | None:
+    """The colour camera of a scene, if it is told."""
+    intrinsic = folder / "intrinsic" / "intrinsic_color.txt"
+    return read_calibration(intrinsic) if intrinsic.is_file() else None
+
+
+def _images(folder: Path) -> list[tuple[int, Path]]:
+    """The images of a scene by their numbers, padded with zeros or not."""
+    return sorted(
+        (int(path.stem), path)
+        for path in (folder / "color").iterdir()
+        if path.stem.isdecimal() and path.suffix.lower() in SUFFIXES
+    )

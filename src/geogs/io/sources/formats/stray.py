@@ -1,0 +1,103 @@
+"""A recording of Stray Scanner: ``rgb.mp4`` with a depth, a confidence and a pose for each frame.
+
+https://github.com/strayrobots/scanner/blob/main/docs/format.md
+"""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from geogs.documents import read_text
+from geogs.errors import InputError
+from geogs.geometry.lie import quaternion_to_matrix
+from geogs.io.sources.calibration import Calibration
+from geogs.io.sources.depth_files import DepthFile
+from geogs.io.sources.formats.video import VideoFile
+from geogs.io.sources.pose_priors import measured_pose, rigid, turned_upright
+from geogs.io.sources.reader import RawFrame
+from geogs.types import MeasuredPose
+
+_PER_METRE = 1000.0
+_COLUMNS = ("frame", "x", "y", "z", "qx", "qy", "qz", "qw")
+
+
+def is_stray(folder: Path) -> bool:
+    """Whether ``folder`` is a recording."""
+    beside = (folder / "depth").is_dir() or (folder / "odometry.csv").is_file()
+    return (folder / "rgb.mp4").is_file() and beside
+
+
+class StrayRecording(VideoFile):
+    """Reader of the video with the depth, of fewer pixels, and the pose that belong to each frame.
+
+    Poses are ARKit's, camera to world, of the frames as they are stored.
+    """
+
+    kind = "stray"
+    is_capture = True
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(folder / "rgb.mp4")
+        self.name = folder.resolve().name
+        found = (p for p in (folder / "depth").glob("*.png") if p.stem.isdecimal())
+        turns = self.quarter_turns
+        self._depths = {int(path.stem): _depth(folder, path, turns) for path in found}
+        self.has_depth = bool(self._depths)
+        matrix, odometry = folder / "camera_matrix.csv", folder / "odometry.csv"
+        if matrix.is_file():
+            stored = (self.width, self.height)[:: -1 if turns % 2 else 1]
+            self.calibration = _calibration(matrix, *stored)
+        self._poses = _poses(odometry, self.quarter_turns) if odometry.is_file() else {}
+        self.poses_by = "Stray Scanner" if self._poses else None
+
+    def read(self, start: int, stop: int | None, stride: int) -> Iterator[RawFrame]:
+        """Read frames ``start, start + stride, ...`` before ``stop``."""
+        for n, raw in enumerate(super().read(start, stop, stride)):
+            at = start + n * stride
+            yield replace(raw, depth=self._depths.get(at), pose=self._poses.get(at))
+
+
+def _depth(folder: Path, path: Path, quarter_turns: int) -> DepthFile:
+    confidence = folder / "confidence" / path.name
+    known = confidence if confidence.is_file() else None
+    return DepthFile(path, _PER_METRE, confidence=known, quarter_turns=quarter_turns)
+
+
+def _poses(path: Path, quarter_turns: int) -> dict[int, MeasuredPose]:
+    """Poses by the number of the frame; rows that hold none are left out."""
+    header, *lines = read_text(path).splitlines() or [""]
+    names = [name.strip() for name in header.split(",")]
+    try:
+        at = [names.index(name) for name in _COLUMNS]
+        rows = [[float(words[k]) for k in at] for line in lines if (words := line.split(","))[1:]]
+    except (ValueError, IndexError):
+        raise InputError(
+            f"{path} should have the columns {', '.join(_COLUMNS)}; copy it again."
+        ) from None
+    found = {}
+    for number, *place_and_turn in rows:
+        place, xyzw = np.array(place_and_turn[:3]), np.array(place_and_turn[3:])
+        if not (np.isfinite(number) and np.isfinite(xyzw).all() and np.linalg.norm(xyzw) > 0):
+            continue
+        T_wc = np.eye(4)
+        wxyz = torch.from_numpy(xyzw[[3, 0, 1, 2]])
+        T_wc[:3, :3], T_wc[:3, 3] = quaternion_to_matrix(wxyz).numpy(), place
+        pose = rigid(T_wc)
+        if pose is not None:
+            found[int(number)] = measured_pose(turned_upright(pose, quarter_turns))
+    return found
+
+
+def _calibration(path: Path, width: int, height: int) -> Calibration:
+    """The camera of the images as they are stored."""
+    try:
+        rows = [[float(x) for x in line.split(",")] for line in read_text(path).split()]
+        K = np.array(rows).reshape(3, 3)
+    except ValueError:
+        raise InputError(f"{path} should hold a 3x3 camera matrix; copy it again.") from None
+    return Calibration(
+        K[0, 0], K[1, 1], K[0, 2], K[1, 2], width=width, height=height, origin="Stray Scanner"
+    )

@@ -1,0 +1,137 @@
+"""Video files through FFmpeg (PyAV), with the container's own time stamps."""
+
+import logging
+from collections.abc import Iterator
+from pathlib import Path
+
+import av
+import numpy as np
+from av.container import InputContainer
+from jaxtyping import UInt8
+
+from geogs.errors import InputError
+from geogs.io.sources.calibration import Calibration
+from geogs.io.sources.reader import RawFrame
+
+# FFmpeg also "plays" text, single pictures and play lists; none of them is a video file.
+_NOT_VIDEO = frozenset({"tty", "image2", "hls", "concat", "concatf", "dash", "sdp", "lrc", "srt"})
+
+_LOCAL = {"protocol_whitelist": "file"}
+"""No container may lead to the network."""
+
+_log = logging.getLogger(__name__)
+
+
+class VideoFile:
+    """Reader of one video; turned upright by the container's display matrix."""
+
+    kind = "video"
+    has_depth = False
+
+    def __init__(self, path: Path) -> None:
+        self.name = path.name
+        self._path = path
+        with _open(path) as container:
+            stream = container.streams.video[0]
+            self.length: int | None = stream.frames or None
+            self.fps = float(stream.average_rate or stream.guessed_rate or 30)
+            first = next((frame for frame in _decoded(container, path) if frame), None)
+            if first is None:
+                raise InputError(
+                    f"{path} holds no picture that can be decoded; is it complete and a video?"
+                )
+            self.quarter_turns = clockwise_quarter_turns(float(first.rotation))
+            size = (first.width, first.height)
+        self.width, self.height = size[::-1] if self.quarter_turns % 2 else size
+        self.calibration: Calibration | None = None
+
+    @property
+    def paths(self) -> list[Path]:
+        """The file that is read."""
+        return [self._path]
+
+    def read(self, start: int, stop: int | None, stride: int) -> Iterator[RawFrame]:
+        """Decode from the beginning and yield frames ``start, start + stride, ...``."""
+        last: float | None = None
+        with _open(self._path) as container:
+            for index, frame in enumerate(_decoded(container, self._path)):
+                if stop is not None and index >= stop:
+                    return
+                is_wanted = index >= start and (index - start) % stride == 0
+                label = f"{self.name}, frame {index}"
+                if frame is not None:
+                    last = self._time(frame, last)
+                    if is_wanted:
+                        image = frame.to_ndarray(format="rgb24")
+                        upright = turn_upright(image, self.quarter_turns)
+                        yield RawFrame(label, last, upright, name=str(index))
+                elif is_wanted:
+                    yield RawFrame(label, last or 0.0, None)
+
+    def _time(self, frame: av.VideoFrame, last: float | None) -> float:
+        """The presentation time; raw streams and broken muxers have none that increases."""
+        if frame.time is not None and (last is None or frame.time > last):
+            return frame.time
+        return 0.0 if last is None else last + 1 / self.fps
+
+
+def clockwise_quarter_turns(rotation: float) -> int:
+    """Quarter turns to the right that bring a frame upright.
+
+    Args:
+        rotation: counter-clockwise angle of the display matrix in degrees, as FFmpeg gives it.
+    """
+    return round(-rotation / 90) % 4
+
+
+def turn_upright(
+    image: UInt8[np.ndarray, "h w 3"], quarter_turns: int
+) -> UInt8[np.ndarray, "h2 w2 3"]:
+    """Turn an image by clockwise quarter turns."""
+    return np.ascontiguousarray(np.rot90(image, -quarter_turns))
+
+
+def _container(path: Path) -> InputContainer:
+    try:
+        return av.open(str(path), metadata_errors="replace", options=_LOCAL)
+    except TypeError:  # PyAV 19 no longer has it
+        return av.open(str(path), options=_LOCAL)
+
+
+def _open(path: Path) -> InputContainer:
+    try:
+        container = _container(path)
+    except (av.error.FFmpegError, OSError) as error:
+        raise InputError(
+            f"{path} cannot be opened as a video ({error.strerror}); "
+            f"is it complete and a video file?"
+        ) from error
+    formats = set(container.format.name.split(","))
+    is_picture = any(name.endswith("_pipe") for name in formats)
+    if formats & _NOT_VIDEO or is_picture or not container.streams.video:
+        container.close()
+        what = "a single picture" if is_picture or "image2" in formats else "no video"
+        raise InputError(f"{path} is {what}; give a video file or a folder of images.")
+    return container
+
+
+def _decoded(container: InputContainer, path: Path) -> Iterator[av.VideoFrame | None]:
+    """Decode to the end or to where the file is cut off; none stands for a damaged packet."""
+    stream = container.streams.video[0]
+    stream.thread_type = "AUTO"
+    packets = container.demux(stream)
+    while True:
+        try:
+            packet = next(packets, None)
+        except av.error.FFmpegError as error:
+            _log.warning("%s is damaged or cut off (%s).", path, error.strerror)
+            return
+        if packet is None:
+            return
+        try:
+            frames = packet.decode()
+        except av.error.FFmpegError:
+            yield None
+            continue
+        for frame in frames:
+            yield None if frame.is_corrupt else frame

@@ -1,0 +1,379 @@
+"""A source: working images in order, with their times and the camera that took them.
+
+A format supplies a reader (how images are stored); :class:`Source` adds what all have in common:
+the selection of frames, the calibration, the shutter, the working resolution and reading ahead.
+"""
+
+import logging
+from collections.abc import Generator, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from geogs.config import InputConfig
+from geogs.documents import expanded
+from geogs.errors import InputError
+from geogs.geometry.camera import Camera
+from geogs.io.pictures import read_mask
+from geogs.io.sources.calibration import Calibration
+from geogs.io.sources.depth_files import RectifiedDepth, StoredDepth
+from geogs.io.sources.frame_masks import FrameMasks, painted
+from geogs.io.sources.known_intrinsics import resolve_intrinsics
+from geogs.io.sources.pose_priors import chosen_poses
+from geogs.io.sources.reader import (
+    NeverWaits,
+    RawFrame,
+    Reader,
+    fingerprint_of,
+    of_one_size,
+    read_ahead,
+    read_side_by_side,
+)
+from geogs.io.sources.undistort import Rectifier
+from geogs.shutter.camera import RollingCamera
+from geogs.shutter.neighbours import with_turning
+from geogs.shutter.readout import CLIP, CLIPS
+from geogs.shutter.rows import RowOffsets
+from geogs.shutter.shutter import Shutter
+from geogs.shutter.turning import Turning
+from geogs.types import Frame, MeasuredDepth
+
+_log = logging.getLogger(__name__)
+LEAST_EDGE = 12
+"""Pixels of the shorter side of a working image."""
+MINUTE = 60.0
+"""Seconds of a video that are looked at for its readout."""
+
+
+@dataclass(frozen=True, slots=True)
+class ReadingPlace:
+    """How far a source has been read."""
+
+    frames: int = 0
+    """Given."""
+    skipped: int = 0
+    """Images before the last of them that could not be read, or are of another size."""
+    damaged: int = 0
+    """Images among them of which a part is damaged."""
+
+
+class Source:
+    """Frames at working resolution, undistorted, in time order; can be iterated repeatedly.
+
+    The rows of a rolling shutter, where its readout is known, are rectified to the middle one.
+    """
+
+    def __init__(
+        self,
+        reader: Reader,
+        config: InputConfig,
+        calibration: Calibration | None = None,
+        shutter: Shutter | None = None,
+    ) -> None:
+        """``calibration`` of the upright images, where it is known better than the reader's.
+
+        ``shutter``, where it is known better than the settings'.
+        """
+        _check_selection(config, reader.length)
+        if config.depth == "sensor" and not reader.has_depth:
+            raise InputError(
+                f"{reader.name} has no depth of a sensor beside its images that can be read here; "
+                "leave out --depth."
+            )
+        self._poses = chosen_poses(config.poses, reader, reader.name)
+        self._reader = reader
+        self._config = config
+        self.calibration = calibration or resolve_intrinsics(
+            config.intrinsics,
+            reader.calibration,
+            reader.width,
+            reader.height,
+            reader.quarter_turns,
+        )
+        """The camera of the images as they came, upright, with its distortion."""
+        self.shutter = shutter or shutter_of(config.readout)
+        """By which rows are rectified."""
+        self._rectifier = Rectifier(self.calibration, config.long_edge, config.field_of_view)
+        check_large_enough(self._rectifier.camera, reader.name)
+        masks = None if config.mask is None else expanded(config.mask)
+        self._masks = FrameMasks(masks) if masks is not None and masks.is_dir() else None
+        self.mask = None if masks is None or self._masks is not None else self._working_mask(masks)
+        """Pixels of every frame that may show the scene; none where all do."""
+        self.skipped = 0
+        """Images that could not be read or are of another size, so far in this iteration."""
+        self.damaged = 0
+        """Images of which a part is damaged, so far in this iteration."""
+        self.place = ReadingPlace()
+        """How far the source has been read, at each frame of this iteration."""
+
+    @property
+    def black_is_masked(self) -> bool:
+        """Whether pixels of frames that are quite black show something else than the scene."""
+        return self._masks is not None
+
+    def _working_mask(self, path: Path) -> Bool[np.ndarray, "h w"]:
+        """A mask for all images, straightened as they are."""
+        return self._straight(read_mask(path, (self._reader.height, self._reader.width)))
+
+    def _straight(self, shown: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h2 w2"]:
+        grey = np.repeat(np.where(shown, np.uint8(255), np.uint8(0))[..., None], 3, 2)
+        return self._rectifier(grey)[..., 0] > 127
+
+    @property
+    def name(self) -> str:
+        """Name of the sequence."""
+        return self._reader.name
+
+    @property
+    def kind(self) -> str:
+        """The format: video, images, bag, replica, tum or 7scenes."""
+        return self._reader.kind
+
+    @property
+    def camera(self) -> Camera:
+        """The pinhole camera of every frame."""
+        return self._rectifier.camera
+
+    @property
+    def uses_depth(self) -> bool:
+        """Whether frames come with the depth that a sensor measured."""
+        return self._config.depth != "none" and self._reader.has_depth
+
+    @property
+    def uses_poses(self) -> bool:
+        """Whether frames come with poses of another tracker, as priors."""
+        return self._poses.is_used
+
+    @property
+    def is_calibration_open(self) -> bool:
+        """Whether the focal length is a guess or nominal, and neither user nor data set gave it."""
+        asked = self._config.intrinsics.strip().lower() == "auto"
+        return asked and (self.calibration.is_guess or self.calibration.is_nominal)
+
+    def with_calibration(self, calibration: Calibration) -> "Source":
+        """The same frames, undistorted by another calibration of the images as they came."""
+        fitted = calibration.fit(self._reader.width, self._reader.height)
+        return Source(self._reader, self._config, fitted, self.shutter)
+
+    @property
+    def is_live(self) -> bool:
+        """Whether frames do not wait until they are asked for."""
+        return isinstance(self._reader, NeverWaits)
+
+    @property
+    def dropped(self) -> int:
+        """Frames of a live source that came too fast to be used, so far in this iteration."""
+        return self._reader.dropped if isinstance(self._reader, NeverWaits) else 0
+
+    @property
+    def is_shutter_open(self) -> bool:
+        """Whether nobody has said yet how long the readout takes, and the frames can be asked."""
+        if self.is_live:
+            return False
+        return self._config.readout == "auto" and self.shutter == Shutter()
+
+    def with_shutter(self, shutter: Shutter) -> "Source":
+        """The same frames, with their rows rectified by another readout."""
+        return Source(self._reader, self._config, self.calibration, shutter)
+
+    @property
+    def rolling_camera(self) -> RollingCamera:
+        """The camera of the images that :meth:`clips` gives."""
+        turns = self._reader.quarter_turns
+        lines = self._reader.width if turns % 2 else self._reader.height
+        return self._rectifier.rolling_camera(lines, turns)
+
+    def clips(self) -> Generator[list[RawFrame], None, None]:
+        """Neighbouring images at working size as they came, from all over the selection.
+
+        They are as many as tell the readout; the stride does not count. A video can only be read
+        from its beginning on, so that they come from its first minute.
+        """
+        config, reader = self._config, self._reader
+        ends = [n for n in (config.stop, reader.length) if n is not None]
+        count = min(ends) - config.start if ends else CLIP * CLIPS
+        if len(reader.paths) > 1:
+            starts = clip_starts(config.start, count)
+            yield from read_side_by_side(lambda n: list(self._resized(n, n + CLIP)), starts)
+            return
+        starts = clip_starts(config.start, min(count, round(MINUTE * reader.fps)))
+        if not starts:
+            return
+        clip: list[RawFrame] = []
+        raws = reader.read(starts[0], starts[-1] + CLIP, 1)
+        for position, raw in enumerate(raws, starts[0]):
+            if any(start <= position < start + CLIP for start in starts):
+                clip.append(self._at_working_size(raw))
+            if position - CLIP + 1 in starts:
+                yield clip[-CLIP:]
+            del clip[:-CLIP]
+
+    def _resized(self, start: int, stop: int | None) -> Iterator[RawFrame]:
+        """Neighbours in the source at working size, lens and rows as they came."""
+        return map(self._at_working_size, self._reader.read(start, stop, 1))
+
+    def _at_working_size(self, raw: RawFrame) -> RawFrame:
+        raw = of_one_size(raw, self._reader)
+        if raw.image is None:
+            return raw
+        return replace(raw, image=self._rectifier.resized(raw.image))
+
+    def linked_frames(self) -> Generator[Frame, None, None]:
+        """Frames between which there is no cut."""
+        return iter(self)
+
+    @property
+    def intrinsics_origin(self) -> str:
+        """Where the intrinsics come from."""
+        return self.calibration.origin
+
+    @property
+    def fps(self) -> float:
+        """Frames per second after the stride, nominal."""
+        return self._reader.fps / self._config.stride
+
+    @property
+    def length(self) -> int | None:
+        """Frames to expect, unreadable ones included; none where it is not known beforehand."""
+        if self._reader.length is None:
+            return None
+        stop = self._config.stop
+        stop = self._reader.length if stop is None else min(stop, self._reader.length)
+        return len(range(self._config.start, stop, self._config.stride))
+
+    def fingerprint(self) -> str:
+        """Sixteen digits that change with the names and sizes of the files."""
+        return fingerprint_of(self._reader.paths)
+
+    def __iter__(self) -> Generator[Frame, None, None]:
+        """Yield the frames; the next one is read while the present one is used.
+
+        Raises:
+            InputError: there is no image that can be used.
+        """
+        return self.frames_after(ReadingPlace())
+
+    def frames_after(self, place: ReadingPlace) -> Generator[Frame, None, None]:
+        """Yield the frames after a place; otherwise as the iteration over all."""
+        self.place, self.skipped, index = place, place.skipped, place.frames
+        self.damaged = place.damaged
+        working = self._masked(self._working(place.frames + place.skipped))
+        for raw in working if self.is_live else read_ahead(working):
+            if raw.image is None:
+                self.skipped += 1
+                if self.skipped == 1:
+                    _log.warning("%s; skipped.", raw.fault)
+                continue
+            if raw.is_damaged:
+                self.damaged += 1
+                if self.damaged == 1:
+                    _log.warning("%s is damaged; used as far as it goes.", raw.label)
+            self.place = ReadingPlace(index + 1, self.skipped, self.damaged)
+            pose = self._poses.of(raw.timestamp, raw.pose)
+            yield Frame(index, raw.timestamp, raw.image, depth=raw.depth, pose=pose, rows=raw.rows)
+            index += 1
+        if index == 0:
+            raise InputError(self._why_empty())
+        if self.skipped > 1:
+            _log.warning("%s: skipped %d images that cannot be used.", self.name, self.skipped)
+        if self.damaged > 1:
+            _log.warning("%s: %d images are damaged.", self.name, self.damaged)
+
+    def _working(self, first: int) -> Iterator[RawFrame]:
+        """The working images of the selection from its ``first`` on."""
+        config, reader = self._config, self._reader
+        start = config.start + first * config.stride
+        if self.shutter.readout:
+            yield from self._with_rows_rectified(start)
+            return
+        for raw in reader.read(start, config.stop, config.stride):
+            raw = of_one_size(raw, reader)
+            if raw.image is not None:
+                image = self._rectifier(raw.image)
+                raw = replace(raw, image=image, depth=self._rectified(raw.depth))
+            yield raw
+
+    def _masked(self, working: Iterator[RawFrame]) -> Iterator[RawFrame]:
+        """Working images with what masks of their own hide painted black."""
+        for raw in working:
+            if self._masks is None or raw.image is None:
+                yield raw
+                continue
+            shown = self._masks.read(raw.name, (self._reader.height, self._reader.width))
+            straight = None if shown is None else self._straight(shown)
+            yield replace(raw, image=painted(raw.image, straight))
+
+    def _rectified(
+        self,
+        depth: MeasuredDepth | None,
+        moved: Float[np.ndarray, "h w 2"] | None = None,
+    ) -> MeasuredDepth | None:
+        """Depth as it came, of the pixels of a working image, whose rows were ``moved``."""
+        if not (self.uses_depth and isinstance(depth, StoredDepth)):
+            return None
+        return RectifiedDepth(depth, self.calibration, self._rectifier, moved)
+
+    def _with_rows_rectified(self, start: int) -> Iterator[RawFrame]:
+        """The same for a rolling shutter, from a place in the source on.
+
+        The turning is measured between neighbours in the source, whatever the stride, and the
+        image before the first is read, too.
+        """
+        config, rolling, readout = self._config, self.rolling_camera, self.shutter.readout
+        before = min(start, 1)
+        stop = None if config.stop is None else config.stop + 1
+
+        def is_selected(position: int) -> bool:
+            after = position - before
+            inside = config.stop is None or start + after < config.stop
+            return after >= 0 and after % config.stride == 0 and inside
+
+        images = self._resized(start - before, stop)
+        offsets = RowOffsets(rolling, self.camera)
+        for raw, turning in with_turning(images, rolling, readout, is_selected):
+            if raw.image is None:
+                yield raw
+                continue
+            nodes = offsets.nodes(Turning() if turning.is_still else turning, readout)
+            moved = None if turning.is_still else offsets.dense(nodes)
+            image = self._rectifier.straightened(raw.image, moved)
+            depth, rows = self._rectified(raw.depth, moved), offsets.seen(nodes, self.shutter)
+            yield replace(raw, image=image, depth=depth, rows=rows)
+
+    def _why_empty(self) -> str:
+        if self.skipped:
+            return f"{self.name}: none of its {self.skipped} images can be used."
+        return f"{self.name} ends before frame {self._config.start}; give a smaller start."
+
+
+def clip_starts(first: int, count: int) -> list[int]:
+    """Where clips begin that spread over ``count`` images from ``first`` on.
+
+    Those of a short video overlap by half.
+    """
+    clips = min(CLIPS, max(0, count - CLIP // 2) // (CLIP - CLIP // 2))
+    return [first + round(k * (count - CLIP) / max(clips - 1, 1)) for k in range(clips)]
+
+
+def shutter_of(readout: float | Literal["auto"]) -> Shutter:
+    """The shutter that the settings ask for; a global one until it is found."""
+    return Shutter() if readout == "auto" else Shutter(readout, "as given")
+
+
+def _check_selection(config: InputConfig, length: int | None) -> None:
+    if length is not None and config.start >= length:
+        raise InputError(
+            f"start is {config.start}, but the source has only {length} frames; give a smaller one."
+        )
+
+
+def check_large_enough(camera: Camera, name: str) -> None:
+    """Raises InputError where working images have too few pixels on a side to track anything."""
+    if min(camera.width, camera.height) < LEAST_EDGE:
+        raise InputError(
+            f"{name} gives working images of {camera.width}x{camera.height} pixels; both sides "
+            f"need {LEAST_EDGE} at least, so give larger images or a larger --long-edge."
+        )

@@ -1,0 +1,129 @@
+"""A reader of frames that do not wait: whoever is late gets the newest, and the rest is counted."""
+
+import threading
+from collections.abc import Generator, Iterator, Sequence
+from pathlib import Path
+from typing import Generic, Protocol, TypeVar, runtime_checkable
+
+from geogs.io.sources.calibration import Calibration
+from geogs.io.sources.reader import RawFrame
+
+T = TypeVar("T")
+
+
+@runtime_checkable
+class Feed(Protocol):
+    """Where frames come from at their own pace."""
+
+    kind: str
+    name: str
+    width: int
+    """Of the upright images, pixels."""
+    height: int
+    fps: float
+    """Frames per second, nominal."""
+    calibration: Calibration | None
+    """The camera as far as the feed says."""
+
+    def frames(self) -> Generator[RawFrame, None, None]:
+        """Frames from now on; each is waited for."""
+        ...
+
+
+class LiveReader:
+    """Reader of a feed: at most one frame waits, older ones are dropped and counted."""
+
+    is_live = True
+    quarter_turns = 0
+    has_depth = False
+    length: int | None = None
+
+    def __init__(self, feed: Feed) -> None:
+        self._feed = feed
+        self.kind, self.name = feed.kind, feed.name
+        self.width, self.height, self.fps = feed.width, feed.height, feed.fps
+        self.calibration = feed.calibration
+        self.dropped = 0
+        """Frames of the last reading that came too fast to be used."""
+
+    @property
+    def paths(self) -> Sequence[Path]:
+        """No file is read."""
+        return ()
+
+    def read(self, start: int, stop: int | None, stride: int) -> Iterator[RawFrame]:
+        """Of frames ``start, start + stride, ...`` before ``stop`` the newest each time."""
+        latest = Latest(_selected(self._feed.frames(), start, stop, stride))
+        try:
+            while (frame := latest.take()) is not None:
+                self.dropped = latest.dropped
+                yield frame
+        finally:
+            latest.close()
+
+
+def _selected(
+    frames: Generator[RawFrame, None, None], start: int, stop: int | None, stride: int
+) -> Iterator[RawFrame]:
+    try:
+        for position, frame in enumerate(frames):
+            if stop is not None and position >= stop:
+                return
+            if position >= start and (position - start) % stride == 0:
+                yield frame
+    finally:
+        frames.close()
+
+
+class Latest(Generic[T]):
+    """The newest of items that an iterator gives at its own pace: it is run in a thread, and what
+    is not taken in time is gone."""
+
+    def __init__(self, items: Iterator[T]) -> None:
+        self._items = items
+        self._news = threading.Condition()
+        self._held: list[T] = []
+        self._has_ended = self._is_closed = False
+        self._failure: Exception | None = None
+        self.dropped = 0
+        """Items that another took the place of before anybody wanted them."""
+        self._thread = threading.Thread(target=self._work, name="grabber", daemon=True)
+        self._thread.start()
+
+    def take(self) -> T | None:
+        """The newest item that was not taken, waiting for one if need be; none after the last.
+
+        Raises what the iterator raised, once all it gave is taken.
+        """
+        with self._news:
+            while not (self._held or self._has_ended):
+                self._news.wait(0.2)  # so that signals are heard
+            if self._held:
+                return self._held.pop()
+            if self._failure is not None:
+                raise self._failure
+            return None
+
+    def close(self, patience: float = 2.0) -> None:
+        """Take no more; waits so many seconds at most for the iterator to end."""
+        self._is_closed = True
+        self._thread.join(patience)
+
+    def _work(self) -> None:
+        try:
+            for item in self._items:
+                if self._is_closed:
+                    break
+                with self._news:
+                    self.dropped += len(self._held)
+                    self._held = [item]
+                    self._news.notify()
+        except Exception as error:
+            self._failure = error
+        finally:
+            close = getattr(self._items, "close", None)
+            if close is not None:
+                close()
+            with self._news:
+                self._has_ended = True
+                self._news.notify()

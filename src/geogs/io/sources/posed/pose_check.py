@@ -1,0 +1,159 @@
+"""Do the poses fit the images? If not: are they in another axis convention than assumed?"""
+
+import logging
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64
+
+from geogs.errors import InputError
+from geogs.geometry.camera import Camera
+from geogs.io.sources.posed.conventions import Poses, conventions_for
+from geogs.io.sources.posed.matching import MatchedPair, Matcher
+from geogs.io.sources.posed.posed_source import PosedSource
+
+PAIRS = 8
+"""Pairs of images looked at."""
+GOOD_ERROR = 0.004
+"""Median epipolar error of poses that fit, at most, of the long edge."""
+GOOD_IN_FRONT = 0.75
+"""Part of the matches that lies in front of both cameras if the poses fit, at least."""
+CLEARLY = 3.0
+"""How many times larger the error of wrong poses must be than that of the convention that fits."""
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Fit:
+    """How well poses explain matches between images."""
+
+    error: float
+    """Median Sampson distance to the epipolar line, as a part of the long edge."""
+    in_front: float
+    """Part of the matches whose rays meet in front of both cameras."""
+
+    @property
+    def is_good(self) -> bool:
+        """Whether the poses explain the matches."""
+        return self.error <= GOOD_ERROR and self.in_front >= GOOD_IN_FRONT
+
+    @property
+    def badness(self) -> float:
+        """One number to compare conventions by: the error, more where points lie behind."""
+        return max(self.error, 1e-4) / max(self.in_front, 0.05) ** 2
+
+
+@dataclass(frozen=True, slots=True)
+class PoseCheck:
+    """Outcome of the check."""
+
+    given: Fit | None
+    """Of the poses as they are; none where no images could be matched."""
+    pairs: int
+    """Pairs of images that could be matched."""
+    warning: str | None
+    """What to tell the user; none where the poses fit."""
+
+
+def check_poses(source: PosedSource) -> PoseCheck:
+    """Match features between neighbouring images and see whether the poses explain them.
+
+    Neither the scale nor the place of the world matters. Takes about two seconds.
+
+    Raises:
+        InputError: the poses clearly do not fit, but do in another axis convention.
+    """
+    matcher = Matcher(source)
+    matched = matcher.pairs(PAIRS)
+    if not matched:
+        text = (
+            f"{source.name}: no two neighbouring images have enough features in common, so the "
+            f"poses could not be checked against the images."
+        )
+        return PoseCheck(None, 0, text)
+    return judge(source, matched, matcher.camera)
+
+
+def judge(source: PosedSource, pairs: list[MatchedPair], camera: Camera) -> PoseCheck:
+    """See whether the poses of ``source`` explain matches in pixels of ``camera``.
+
+    Raises:
+        InputError: as :func:`check_poses`.
+    """
+    given = fit_of(source.T_cw, pairs, camera)
+    if given.is_good:
+        _log.info("%s: the poses fit the images (%s).", source.name, _words(given, camera))
+        return PoseCheck(given, len(pairs), None)
+    best, convention = min(
+        ((fit_of(c.correct(source.T_cw), pairs, camera), c) for c in conventions_for(source.kind)),
+        key=lambda pair: pair[0].badness,
+    )
+    if best.is_good and given.badness > CLEARLY * best.badness:
+        raise InputError(
+            f"{source.name}: the poses do not fit the images ({_words(given, camera)}); they "
+            f"look like {convention.name} ({_words(best, camera)}): {convention.remedy}."
+        )
+    text = (
+        f"{source.name}: the poses explain the images badly ({_words(given, camera)}), and no "
+        f"other axis convention does better; are poses, intrinsics and images of one set?"
+    )
+    return PoseCheck(given, len(pairs), text)
+
+
+def fit_of(T_cw: Poses, pairs: list[MatchedPair], camera: Camera) -> Fit:
+    """How well poses explain matched pairs; every pair counts alike, the median one is taken."""
+    K_inverse = np.linalg.inv(camera.matrix().numpy())
+    errors, in_front = [], []
+    for pair in pairs:
+        T = T_cw[pair.second] @ np.linalg.inv(T_cw[pair.first])
+        one, two = (_homogeneous(p) for p in (pair.pixels_first, pair.pixels_second))
+        errors.append(np.median(_sampson(T, K_inverse, one, two)))
+        in_front.append(_part_in_front(T, one @ K_inverse.T, two @ K_inverse.T))
+    long_edge = max(camera.width, camera.height)
+    return Fit(float(np.median(errors)) / long_edge, float(np.median(in_front)))
+
+
+def _homogeneous(pixels: Float64[np.ndarray, "n 2"]) -> Float64[np.ndarray, "n 3"]:
+    return np.concatenate([pixels, np.ones((len(pixels), 1))], axis=1)
+
+
+def _sampson(
+    T: Float64[np.ndarray, "4 4"],
+    K_inverse: Float64[np.ndarray, "3 3"],
+    one: Float64[np.ndarray, "n 3"],
+    two: Float64[np.ndarray, "n 3"],
+) -> Float64[np.ndarray, "n"]:
+    """First-order distance in pixels to x2^T F x1 = 0 (Hartley and Zisserman, eq. 11.9).
+
+    Without any translation between the images: the distance from where the rotation takes x1.
+    """
+    t = T[:3, 3]
+    length = np.linalg.norm(t)
+    if length < 1e-12:
+        moved = one @ (np.linalg.inv(K_inverse) @ T[:3, :3] @ K_inverse).T
+        return np.linalg.norm(moved[:, :2] / moved[:, 2:] - two[:, :2], axis=1)
+    cross = np.cross(np.eye(3), t / length)
+    F = K_inverse.T @ -cross @ T[:3, :3] @ K_inverse
+    line_two, line_one = one @ F.T, two @ F
+    value = (two * line_two).sum(axis=1)
+    slope = (line_two[:, :2] ** 2).sum(axis=1) + (line_one[:, :2] ** 2).sum(axis=1)
+    return np.abs(value) / np.sqrt(slope.clip(1e-24))
+
+
+def _part_in_front(
+    T: Float64[np.ndarray, "4 4"], one: Float64[np.ndarray, "n 3"], two: Float64[np.ndarray, "n 3"]
+) -> float:
+    """Part of the ray pairs that come closest to each other in front of both cameras."""
+    rotated, t = one @ T[:3, :3].T, T[:3, 3]
+    # Least squares of z1 rotated + t = z2 two, by its two normal equations.
+    a, b, c = (rotated**2).sum(1), (rotated * two).sum(1), (two**2).sum(1)
+    determinant = (a * c - b * b).clip(1e-15)
+    p, q = -(rotated @ t), two @ t
+    z_one, z_two = (p * c + q * b) / determinant, (p * b + q * a) / determinant
+    return float(((z_one > 0) & (z_two > 0)).mean())
+
+
+def _words(fit: Fit, camera: Camera) -> str:
+    pixels = fit.error * max(camera.width, camera.height)
+    return f"{pixels:.1f} pixels off, {100 * fit.in_front:.0f} % in front of the cameras"

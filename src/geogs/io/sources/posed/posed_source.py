@@ -1,0 +1,182 @@
+"""A source of images with known poses: every image at working size in one pinhole camera."""
+
+import logging
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float64, UInt8
+
+from geogs.config import InputConfig
+from geogs.errors import InputError
+from geogs.geometry.camera import Camera
+from geogs.io.pictures import read_mask
+from geogs.io.sources.frame_source import check_large_enough
+from geogs.io.sources.posed.one_camera import OneCamera
+from geogs.io.sources.posed.posed_set import (
+    PosedSet,
+    SparsePoints,
+    Sphere,
+    without_invalid_poses,
+)
+from geogs.io.sources.posed.stored_pictures import read_picture, stored_size
+from geogs.io.sources.reader import fingerprint_of, read_ahead, size_of
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class PosedImage:
+    """One working image and where it was taken."""
+
+    index: int
+    """Its place in the source, from 0."""
+    label: str
+    """What to call it in a message: the file."""
+    timestamp: float
+    """Seconds."""
+    image: UInt8[np.ndarray, "h w 3"]
+    """RGB, undistorted."""
+    T_cw: Float64[np.ndarray, "4 4"]
+    """World to camera, OpenCV axes."""
+    mask: Bool[np.ndarray, "h w"] | None
+    """Pixels to use; none where all are."""
+
+
+class PosedSource:
+    """Images with known poses, all as one pinhole camera sees them; read when asked for.
+
+    ``len(source)``, ``source[i]`` and iteration (which reads ahead) give :class:`PosedImage`.
+    """
+
+    def __init__(self, posed: PosedSet, config: InputConfig, hold_out: int | None = None) -> None:
+        """Of the selected images every ``hold_out``-th is left out as if it were not there."""
+        posed = _selected(without_invalid_poses(_present(posed)), config)
+        left_out = held_out_places(len(posed.files), hold_out)
+        self.held_out: list[int] = [config.start + config.stride * i for i in left_out]
+        """Images left out: their places in the source with neither start nor stride, from 0."""
+        if left_out:
+            posed = posed.only(sorted(set(range(len(posed.files))) - set(left_out)))
+        self._files = posed.files
+        self.kind = posed.kind
+        """The format: colmap, nerfstudio, dtu, replica, tum, 7scenes, scannet or photographs."""
+        self.name = posed.name
+        """Name of the scene."""
+        self.scene_scale = posed.scene_scale
+        """What one unit of the world is: metres, millimetres or arbitrary."""
+        self.points: SparsePoints | None = posed.points
+        """Sparse points of the world with which images see them, if the format has any."""
+        self.region: Sphere | None = posed.region
+        """Where the object lies, if the data set says so."""
+        self.left_out: tuple[tuple[str, str], ...] = posed.left_out
+        """Names of images that have no pose, each with the reason as a clause."""
+        self.T_cw: Float64[np.ndarray, "n 4 4"] = np.stack([file.T_cw for file in posed.files])
+        """World to camera of all images, OpenCV axes."""
+        self.timestamps: Float64[np.ndarray, "n"] = np.array(
+            [file.timestamp for file in posed.files], dtype=np.float64
+        )
+        """Seconds."""
+        self._one_camera = OneCamera(posed.files, config)
+        check_large_enough(self._one_camera.camera, posed.name)
+
+    @property
+    def camera(self) -> Camera:
+        """The pinhole camera of every image."""
+        return self._one_camera.camera
+
+    @property
+    def intrinsics_origin(self) -> str:
+        """Where the intrinsics come from."""
+        return self._one_camera.origin
+
+    @property
+    def length(self) -> int:
+        """Number of images."""
+        return len(self._files)
+
+    def __len__(self) -> int:
+        return self.length
+
+    def fingerprint(self) -> str:
+        """Sixteen digits that change with the names and sizes of the images."""
+        return fingerprint_of([file.path for file in self._files])
+
+    def stored_bytes(self) -> list[int]:
+        """What each image takes in its file; 0 where it is gone.
+
+        Of images of the same thing by the same camera, a blurred one takes least.
+        """
+        return [size_of(file.path) or 0 for file in self._files]
+
+    def label(self, index: int) -> str:
+        """What to call image ``index`` in a message."""
+        return str(self._files[index].path)
+
+    def __getitem__(self, index: int) -> PosedImage:
+        """Read one image.
+
+        Raises:
+            IndexError: there is no such image.
+            InputError: it cannot be read.
+        """
+        index = range(self.length)[index]
+        file = self._files[index]
+        stored, needed = self._one_camera.stored_shape(index), self._one_camera.needed_shape(index)
+        picture = read_picture(file.path, stored, needed)
+        mask = None
+        if file.mask is not None:
+            mask = read_mask(file.mask, stored[::-1], of_alpha=file.mask == file.path)
+        image, mask = self._one_camera.view(index, picture, mask)
+        return PosedImage(index, self.label(index), file.timestamp, image, file.T_cw, mask)
+
+    def __iter__(self) -> Iterator[PosedImage]:
+        """Yield all images; the next one is read while the present one is used."""
+        return read_ahead(self[index] for index in range(self.length))
+
+
+def held_out_places(count: int, every: int | None) -> range:
+    """Which of ``count`` images are left out where every ``every``-th is; none where that is none.
+
+    Raises:
+        InputError: fewer than two images would be left, or ``every`` leaves none.
+    """
+    if every is None:
+        return range(0)
+    if every < 2:
+        raise InputError(f"hold-out is {every}; it must be at least 2, or every image would go.")
+    places = range(every // 2, count, every)
+    if count - len(places) < 2:
+        raise InputError(
+            f"Of {count} images only {count - len(places)} would be left to reconstruct from; "
+            "give more images or a larger --hold-out."
+        )
+    return places
+
+
+def _present(posed: PosedSet) -> PosedSet:
+    """The set without images that are missing or no pictures."""
+    if not posed.files:
+        raise InputError(f"{posed.name} ({posed.kind}) lists no images with poses.")
+    kept = [i for i, file in enumerate(posed.files) if stored_size(file.path) is not None]
+    missing = len(posed.files) - len(kept)
+    if not kept:
+        raise InputError(
+            f"{posed.name}: none of its {missing} images can be read, such as "
+            f"{posed.files[0].path}; put them there."
+        )
+    if missing:
+        _log.warning(
+            "%s: left out %d of %d images, which are missing or damaged.",
+            posed.name, missing, len(posed.files),
+        )  # fmt: skip
+    return posed.only(kept) if missing else posed
+
+
+def _selected(posed: PosedSet, config: InputConfig) -> PosedSet:
+    kept = range(len(posed.files))[config.start : config.stop : config.stride]
+    if not kept:
+        raise InputError(
+            f"{posed.name}: images {config.start} to {config.stop} of its {len(posed.files)} "
+            f"are none; choose others."
+        )
+    return posed if len(kept) == len(posed.files) else posed.only(kept)

@@ -1,0 +1,145 @@
+"""What a format supplies: how its images are stored, and read ahead or side by side."""
+
+import hashlib
+import stat
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal, Protocol, TypeVar, runtime_checkable
+
+import numpy as np
+from jaxtyping import UInt8
+
+from geogs.io.sources.calibration import Calibration
+from geogs.types import MeasuredDepth, MeasuredPose, SeenRows
+
+S = TypeVar("S")
+T = TypeVar("T")
+READERS = 4
+"""Threads that read side by side what may be read in any order."""
+
+
+@dataclass(frozen=True, slots=True)
+class RawFrame:
+    """One image as stored, upright."""
+
+    label: str
+    """What to call it in a message: the file, or the frame of the video."""
+    timestamp: float
+    """Seconds."""
+    image: UInt8[np.ndarray, "h w 3"] | None
+    """RGB; none where it could not be read."""
+    is_damaged: bool = False
+    """Whether its decoder found that a part is wrong."""
+    why_not: str = "cannot be read"
+    """What is wrong where there is no image."""
+    depth: MeasuredDepth | None = None
+    """What a depth sensor saw at that time, as it came or of the pixels of a working image."""
+    pose: MeasuredPose | None = None
+    """Of the upright image, by another tracker."""
+    name: str = ""
+    """Of its file, or the number of the frame: by what a mask of its own is found."""
+    rows: SeenRows | None = None
+    """How those of a working image were rectified; none of a global shutter."""
+
+    @property
+    def fault(self) -> str:
+        """What is wrong, with its name."""
+        return f"{self.label} {self.why_not}"
+
+
+@runtime_checkable
+class Reader(Protocol):
+    """How one format stores its images."""
+
+    kind: str
+    """Name of the format."""
+    name: str
+    """Name of the sequence."""
+    width: int
+    """Of the upright images, pixels."""
+    height: int
+    quarter_turns: int
+    """Clockwise quarter turns from the stored to the upright images."""
+    fps: float
+    """Frames per second, nominal."""
+    length: int | None
+    """Images in the source; none where only reading to the end would tell."""
+    calibration: Calibration | None
+    """The camera as far as the data set says."""
+
+    @property
+    def has_depth(self) -> bool:
+        """Whether a sensor's depth comes with any of the images."""
+        ...
+
+    @property
+    def paths(self) -> Sequence[Path]:
+        """The files that are read."""
+        ...
+
+    def read(self, start: int, stop: int | None, stride: int) -> Iterator[RawFrame]:
+        """Read images ``start, start + stride, ...`` before ``stop``."""
+        ...
+
+
+@runtime_checkable
+class NeverWaits(Protocol):
+    """A reader whose frames do not wait until they are asked for."""
+
+    is_live: Literal[True]
+    dropped: int
+    """Frames of the present reading that came too fast."""
+
+
+def of_one_size(raw: RawFrame, reader: Reader) -> RawFrame:
+    """The image as it is; without its picture if that has another size than the first."""
+    if raw.image is None:
+        return raw
+    height, width = raw.image.shape[:2]
+    if (width, height) == (reader.width, reader.height):
+        return raw
+    sizes = f"{width}x{height} but the first image is {reader.width}x{reader.height}"
+    return replace(raw, image=None, why_not=f"is {sizes}")
+
+
+def read_ahead(items: Iterator[T]) -> Iterator[T]:
+    """Yield the items of a generator, the next one being made meanwhile in a thread."""
+    end = object()
+    with ThreadPoolExecutor(max_workers=1, thread_name_prefix="read-ahead") as thread:
+        pending = thread.submit(next, items, end)
+        while (item := pending.result()) is not end:
+            pending = thread.submit(next, items, end)
+            yield item  # type: ignore[misc]  # not the end mark
+
+
+def read_side_by_side(read: Callable[[S], T], places: Iterable[S]) -> Iterator[T]:
+    """``map(read, places)``, the next ones being read meanwhile in a few threads."""
+    pool = ThreadPoolExecutor(READERS, thread_name_prefix="read-ahead")
+    pending: deque[Future[T]] = deque()
+    try:
+        for place in places:
+            pending.append(pool.submit(read, place))
+            if len(pending) > READERS:
+                yield pending.popleft().result()
+        while pending:
+            yield pending.popleft().result()
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def fingerprint_of(paths: Sequence[Path]) -> str:
+    """Sixteen digits that change with the names and sizes of files."""
+    sizes = [(p.name, -1 if (size := size_of(p)) is None else size) for p in paths]
+    return hashlib.sha256(repr(sizes).encode()).hexdigest()[:16]
+
+
+def size_of(path: Path) -> int | None:
+    """Bytes of a file, asked for once, as folders may be far away; none where there is none."""
+    try:
+        found = path.stat()
+    except OSError:
+        return None
+    return found.st_size if stat.S_ISREG(found.st_mode) else None

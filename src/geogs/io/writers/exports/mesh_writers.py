@@ -1,0 +1,200 @@
+"""Meshes for other programs: binary glTF 2.0 (GLB) and Wavefront OBJ.
+
+https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html. The container of one mesh is a hundred
+lines; a library for it (trimesh, pygltflib) would be a dependency of every installation.
+"""
+
+import json
+import struct
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Int, UInt8, UInt16
+
+from geogs.io.writers.atomic import atomic_file
+from geogs.io.writers.exports.exported import OPENGL_FROM_OPENCV
+
+_QUALITY = 92
+"""Of the JPEG in a textured mesh."""
+_FLOAT, _UINT16, _UINT32 = 5126, 5123, 5125
+_VERTICES, _CORNERS = 34962, 34963
+_LINEAR, _LINEAR_MIPMAP, _CLAMP = 9729, 9987, 33071
+_UNLIT = "KHR_materials_unlit"
+
+Material = dict[str, object]
+"""Entries of the document that say what the surface looks like."""
+
+PLAIN: Material = {
+    "materials": [{
+        "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0},
+        "doubleSided": True,
+    }],
+}  # fmt: skip
+"""Rough, seen from both sides, in the colours of the vertices."""
+
+
+class GltfBuffer:
+    """Arrays one after the other, and how the document names them."""
+
+    def __init__(self) -> None:
+        self._accessors: list[dict[str, object]] = []
+        self._views: list[dict[str, object]] = []
+        self._data = b""
+
+    def add(self, values: Float[np.ndarray, "n k"], kind: str, has_range: bool = False) -> int:
+        """Numbers of the vertices, as float32; ``has_range`` for positions. Returns its number."""
+        rows = values.astype("<f4")
+        entry: dict[str, object] = {"componentType": _FLOAT, "type": kind}
+        if has_range:
+            entry |= {"min": rows.min(0).tolist(), "max": rows.max(0).tolist()}
+        return self._accessor(rows, _VERTICES, entry)
+
+    def add_steps(self, values: UInt16[np.ndarray, "n 4"]) -> int:
+        """Shares of the vertices in steps of 1 / 65535."""
+        entry = {"componentType": _UINT16, "type": "VEC4", "normalized": True}
+        return self._accessor(values, _VERTICES, entry)
+
+    def add_corners(self, faces: Int[np.ndarray, "m 3"]) -> int:
+        """Vertices of the triangles."""
+        entry: dict[str, object] = {"componentType": _UINT32, "type": "SCALAR"}
+        return self._accessor(faces.astype("<u4").reshape(-1), _CORNERS, entry)
+
+    def textured(self, jpeg: bytes) -> Material:
+        """The material of a surface that shows an image just as it is."""
+        picture = {"mimeType": "image/jpeg", "bufferView": self._view(jpeg)}
+        filters = {"magFilter": _LINEAR, "minFilter": _LINEAR_MIPMAP}
+        surface = {
+            "baseColorTexture": {"index": 0}, "metallicFactor": 0.0, "roughnessFactor": 1.0,
+        }  # fmt: skip
+        material = {
+            "pbrMetallicRoughness": surface, "doubleSided": True, "extensions": {_UNLIT: {}},
+        }  # fmt: skip
+        return {
+            "extensionsUsed": [_UNLIT],
+            "materials": [material],
+            "images": [picture],
+            "samplers": [{**filters, "wrapS": _CLAMP, "wrapT": _CLAMP}],
+            "textures": [{"source": 0, "sampler": 0}],
+        }
+
+    def write(self, path: Path, attributes: dict[str, int], corners: int, look: Material) -> None:
+        """Write the file with one mesh of these arrays.
+
+        Raises:
+            OutputError: it cannot be written.
+        """
+        primitive = {"attributes": attributes, "indices": corners, "material": 0}
+        document = {
+            "asset": {"version": "2.0", "generator": "geogs"},
+            "scene": 0,
+            "scenes": [{"nodes": [0]}],
+            "nodes": [{"mesh": 0, "name": "surface"}],
+            "meshes": [{"primitives": [primitive]}],
+            **look,
+            "accessors": self._accessors,
+            "bufferViews": self._views,
+            "buffers": [{"byteLength": len(self._data)}],
+        }
+        text, data = json.dumps(document).encode(), self._data
+        text += b" " * (-len(text) % 4)
+        data += b"\0" * (-len(data) % 4)
+        with atomic_file(path) as stream:
+            stream.write(struct.pack("<4sII", b"glTF", 2, 12 + 8 + len(text) + 8 + len(data)))
+            stream.write(struct.pack("<I4s", len(text), b"JSON") + text)
+            stream.write(struct.pack("<I4s", len(data), b"BIN\0") + data)
+
+    def _accessor(self, values: np.ndarray, target: int, entry: dict[str, object]) -> int:
+        view = self._view(values.tobytes(), {"target": target})
+        self._accessors.append({"bufferView": view, "count": len(values), **entry})
+        return len(self._accessors) - 1
+
+    def _view(self, data: bytes, more: dict[str, int] | None = None) -> int:
+        self._data += b"\0" * (-len(self._data) % 4)
+        place = {"buffer": 0, "byteOffset": len(self._data), "byteLength": len(data)}
+        self._views.append({**place, **(more or {})})
+        self._data += data
+        return len(self._views) - 1
+
+
+def write_glb(
+    path: Path,
+    vertices: Float[np.ndarray, "n 3"],
+    faces: Int[np.ndarray, "m 3"],
+    normals: Float[np.ndarray, "n 3"],
+    colours: UInt8[np.ndarray, "n 3"] | None,
+) -> None:
+    """Write glTF 2.0 in one file: y up, looking along -z, counter-clockwise faces.
+
+    The world is turned by a half turn about x, so that what was down in the first image is down.
+    Colours are linear in the file, as glTF has them; ours are sRGB.
+    """
+    turn = OPENGL_FROM_OPENCV[:3, :3]
+    gltf = GltfBuffer()
+    attributes = {
+        "POSITION": gltf.add(vertices @ turn, "VEC3", has_range=True),
+        "NORMAL": gltf.add(normals @ turn, "VEC3"),
+    }
+    corners = gltf.add_corners(faces)
+    if colours is not None:
+        steps = np.round(linear(colours) * 65535).astype("<u2")
+        opaque = np.concatenate([steps, np.full((len(steps), 1), 65535, "<u2")], 1)
+        attributes["COLOR_0"] = gltf.add_steps(opaque)
+    gltf.write(path, attributes, corners, PLAIN)
+
+
+def write_textured_glb(
+    path: Path,
+    vertices: Float[np.ndarray, "n 3"],
+    faces: Int[np.ndarray, "m 3"],
+    normals: Float[np.ndarray, "n 3"],
+    texture_place: Float[np.ndarray, "n 2"],
+    texture: UInt8[np.ndarray, "h w 3"],
+) -> None:
+    """Write glTF 2.0 in one file, with axes as ``write_glb`` has them and a JPEG inside.
+
+    Light is in the texture already, so the material asks to be shown as it is
+    (KHR_materials_unlit); readers that do not know that see a rough surface. ``texture_place`` is
+    in pixels of the texture, whose centres are at integers.
+    """
+    turn = OPENGL_FROM_OPENCV[:3, :3]
+    size = np.array(texture.shape[1::-1])
+    gltf = GltfBuffer()
+    attributes = {
+        "POSITION": gltf.add(vertices @ turn, "VEC3", has_range=True),
+        "NORMAL": gltf.add(normals @ turn, "VEC3"),
+        "TEXCOORD_0": gltf.add((texture_place + 0.5) / size, "VEC2"),
+    }
+    corners = gltf.add_corners(faces)
+    gltf.write(path, attributes, corners, gltf.textured(_jpeg(texture)))
+
+
+def _jpeg(texture: UInt8[np.ndarray, "h w 3"]) -> bytes:
+    options = [cv2.IMWRITE_JPEG_QUALITY, _QUALITY]
+    _, data = cv2.imencode(".jpg", cv2.cvtColor(texture, cv2.COLOR_RGB2BGR), options)
+    return data.tobytes()
+
+
+def write_obj(
+    path: Path,
+    vertices: Float[np.ndarray, "n 3"],
+    faces: Int[np.ndarray, "m 3"],
+    normals: Float[np.ndarray, "n 3"],
+    colours: UInt8[np.ndarray, "n 3"] | None,
+) -> None:
+    """Write text with normals, y up as in ``write_glb``; sRGB from 0 to 1 stands behind x, y, z."""
+    turn = OPENGL_FROM_OPENCV[:3, :3]
+    rows = vertices @ turn
+    if colours is not None:
+        rows = np.concatenate([rows, colours / 255.0], 1)
+    lines = ["v " + " ".join(f"{x:.7g}" for x in row) for row in rows.tolist()]
+    lines += ["vn " + " ".join(f"{x:.5g}" for x in row) for row in (normals @ turn).tolist()]
+    lines += [f"f {a}//{a} {b}//{b} {c}//{c}" for a, b, c in (faces + 1).tolist()]
+    with atomic_file(path) as stream:
+        stream.write(("\n".join(lines) + "\n").encode())
+
+
+def linear(colours: UInt8[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    """sRGB from 0 to 255 as light from 0 to 1 (IEC 61966-2-1)."""
+    share = colours / 255.0
+    return np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)

@@ -1,0 +1,220 @@
+"""``map.safetensors``: the disks, ten numbers each, and from where and how they were seen."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float64, Int64
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor
+
+from geogs.documents import UNUSABLE
+from geogs.errors import InputError
+from geogs.geometry.camera import Camera
+from geogs.io.writers.atomic import atomic_file
+from geogs.io.writers.intrinsics_file import camera_of
+from geogs.types import MapSnapshot
+
+FORMAT_VERSION = 1
+"""Raised when older programs could not read the file any more."""
+
+_SHAPES = {"position": (3,), "quaternion": (4,), "scale": (2,), "opacity": ()}
+
+
+@dataclass(frozen=True)
+class MapFile:
+    """All that a map's file holds."""
+
+    disks: MapSnapshot
+    tensors: dict[str, Tensor]
+    """What else there is, on the CPU."""
+    metadata: dict[str, Any]
+
+
+def save_map(
+    path: str | Path,
+    disks: MapSnapshot,
+    metadata: Mapping[str, Any] = {},
+    tensors: Mapping[str, Tensor] = {},
+) -> None:
+    """Write the disks in float32.
+
+    Args:
+        path: the file.
+        disks: the map.
+        metadata: anything JSON can hold, kept beside the disks.
+        tensors: more to keep beside them, by names that the disks do not use.
+    """
+    own = {name: getattr(disks, name).detach().cpu().float().contiguous() for name in _SHAPES}
+    more = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
+    header = {
+        "format": "geogs-map",
+        "version": str(FORMAT_VERSION),
+        "metadata": json.dumps(dict(metadata)),
+    }
+    with atomic_file(path) as stream:
+        stream.write(save({**more, **own}, metadata=header))
+
+
+def load_map(path: str | Path, device: torch.device | str = "cpu") -> MapSnapshot:
+    """Read the disks of a map.
+
+    Raises:
+        InputError: the file is missing, damaged, no map, of a newer version, or holds NaN.
+    """
+    return load_map_file(path, device).disks
+
+
+def load_map_file(path: str | Path, device: torch.device | str = "cpu") -> MapFile:
+    """Read the disks of a map and what lies beside them.
+
+    Raises:
+        InputError: as of ``load_map``.
+    """
+    with _open(path) as file:
+        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        metadata = _metadata(path, (file.metadata() or {}).get("metadata", "{}"))
+    count = len(tensors["position"]) if "position" in tensors else 0
+    for name, shape in _SHAPES.items():
+        if name not in tensors or tensors[name].shape != (count, *shape):
+            raise InputError(f"{path} is no map of geogs: its {name} is missing or misshapen.")
+    disks = MapSnapshot(**{name: tensors.pop(name).to(device) for name in _SHAPES})
+    if not disks.is_finite():
+        raise InputError(f"{path} holds NaN or infinity; the map is damaged.")
+    return MapFile(disks, tensors, metadata)
+
+
+def _metadata(path: str | Path, text: str) -> dict[str, Any]:
+    try:
+        said = json.loads(text)
+    except (ValueError, RecursionError):
+        said = None
+    if not isinstance(said, dict):
+        raise InputError(f"{path} is damaged: what it says of itself cannot be understood.")
+    return said
+
+
+def _open(path: str | Path) -> "safe_open":
+    if not Path(path).is_file():
+        raise InputError(f"The map {path} does not exist.")
+    try:
+        file = safe_open(str(path), framework="pt")
+    except (SafetensorError, OSError) as error:
+        raise InputError(f"{path} is no map of geogs, or is damaged.") from error
+    header = file.metadata() or {}
+    if header.get("format") != "geogs-map":
+        raise InputError(f"{path} is no map of geogs.")
+    version = header.get("version", "")
+    if not (version.isascii() and version.isdigit() and len(version) < 9):
+        raise InputError(f"{path} is damaged: it does not say of which version it is.")
+    if int(version) > FORMAT_VERSION:
+        raise InputError(f"{path} was written by a newer geogs; update this one to read it.")
+    return file
+
+
+@dataclass(frozen=True)
+class MapViews:
+    """The keyframes that a map's depth maps are made for, and all that those depend on."""
+
+    camera: Camera
+    """Of the keyframes' images."""
+    render_camera: Camera
+    """Of the depth maps."""
+    min_alpha: float
+    """Opacity above which the map hides what lies behind."""
+    max_spread: float
+    """Relative difference of mean and median depth up to which a ray meets one surface."""
+    origin: Float64[np.ndarray, "3"]
+    """World coordinates of the origin of the map's own frame."""
+    unit: float
+    """Length of a unit of the map's own frame in the world."""
+    disks: MapSnapshot
+    """In the map's own frame, where they are rendered."""
+    keyframe_id: Int64[np.ndarray, "k"]
+    timestamp: Float64[np.ndarray, "k"]
+    """Seconds."""
+    T_cw: Float64[np.ndarray, "k 4 4"]
+    """World to camera."""
+    has_mask: Bool[np.ndarray, "k"]
+    """Whether a keyframe has a mask, in ``keyframes/``."""
+    has_images: bool
+    """Whether the images are kept, in ``keyframes/``."""
+
+
+def save_map_with_views(
+    path: str | Path, disks: MapSnapshot, views: MapViews, metadata: Mapping[str, Any] = {}
+) -> None:
+    """Write the disks in the world, and the views beside them.
+
+    A map in a frame of its own has its positions and scales there as well: those of the world have
+    lost digits.
+    """
+    tensors: dict[str, Tensor] = {
+        "keyframe_id": torch.from_numpy(views.keyframe_id),
+        "keyframe_time": torch.from_numpy(views.timestamp),
+        "keyframe_T_cw": torch.from_numpy(views.T_cw),
+        "keyframe_has_mask": torch.from_numpy(views.has_mask),
+    }
+    if views.origin.any() or views.unit != 1.0:
+        tensors |= {"map_position": views.disks.position, "map_scale": views.disks.scale}
+    description = {
+        "camera": asdict(views.camera),
+        "render_camera": asdict(views.render_camera),
+        "min_alpha": views.min_alpha,
+        "max_spread": views.max_spread,
+        "origin": views.origin.tolist(),
+        "unit": views.unit,
+        "has_images": views.has_images,
+    }
+    save_map(path, disks, {**metadata, "views": description}, tensors)
+
+
+def load_map_views(
+    path: str | Path, device: torch.device | str = "cpu"
+) -> tuple[MapSnapshot, MapViews]:
+    """Read the disks in the world, and the views beside them.
+
+    Raises:
+        InputError: the map cannot be read, or was written before maps had views.
+    """
+    file = load_map_file(path, device)
+    if "views" not in file.metadata:
+        raise InputError(
+            f"{path} has no camera and no keyframes beside the disks, as an older geogs wrote it; "
+            "run again to use the result further."
+        )
+    try:
+        return file.disks, _views(file)
+    except UNUSABLE as error:
+        raise InputError(f"{path} does not say how the map was seen; was it changed?") from error
+
+
+def _views(file: MapFile) -> MapViews:
+    said, tensors, disks = file.metadata["views"], file.tensors, file.disks
+    position = tensors.get("map_position", disks.position).to(disks.position)
+    scale = tensors.get("map_scale", disks.scale).to(disks.scale)
+    if position.shape != disks.position.shape or scale.shape != disks.scale.shape:
+        raise ValueError("its disks differ in number")
+    names = ("id", "time", "T_cw", "has_mask")
+    ids, times, T_cw, masked = (tensors[f"keyframe_{name}"] for name in names)
+    if not times.shape == masked.shape == ids.shape or T_cw.shape != (*ids.shape, 4, 4):
+        raise ValueError("its keyframes differ in number")
+    return MapViews(
+        camera=camera_of(said["camera"]),
+        render_camera=camera_of(said["render_camera"]),
+        min_alpha=float(said["min_alpha"]),
+        max_spread=float(said["max_spread"]),
+        origin=np.array(said["origin"], np.float64).reshape(3),
+        unit=float(said["unit"]),
+        disks=MapSnapshot(position, disks.quaternion, scale, disks.opacity),
+        keyframe_id=ids.long().numpy(),
+        timestamp=times.double().numpy(),
+        T_cw=T_cw.double().numpy(),
+        has_mask=masked.bool().numpy(),
+        has_images=bool(said["has_images"]),
+    )

@@ -1,0 +1,61 @@
+"""Trajectories as TUM, KITTI and EuRoC have them; all are camera to world in OpenCV axes."""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from geogs.geometry.lie import matrix_to_quaternion
+from geogs.io.writers.atomic import write_text
+from geogs.types import Trajectory
+
+_EUROC = (
+    "#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z []"
+)
+
+
+def write_trajectories(folder: Path, frames: Trajectory, keyframes: Trajectory) -> None:
+    """``trajectory.tum`` and ``keyframes.tum`` of a result or one of its stages."""
+    write_tum_trajectory(folder / "trajectory.tum", frames)
+    write_tum_trajectory(folder / "keyframes.tum", keyframes)
+
+
+def write_tum_trajectory(path: str | Path, trajectory: Trajectory) -> None:
+    """Write ``t tx ty tz qx qy qz qw`` of every pose.
+
+    Reading it again gives the same numbers up to rounding.
+    Poses that were only interpolated are written as well; ``tracked`` has no place in the format.
+    """
+    wxyz = matrix_to_quaternion(torch.from_numpy(trajectory.T_wc[:, :3, :3])).numpy()
+    rows = np.column_stack([
+        trajectory.timestamps, trajectory.T_wc[:, :3, 3], wxyz[:, 1:], wxyz[:, :1]
+    ])  # fmt: skip
+    lines = [" ".join(repr(float(number)) for number in row) for row in rows]
+    write_text(path, "\n".join(["# timestamp tx ty tz qx qy qz qw", *lines, ""]))
+
+
+def write_kitti(path: Path, trajectory: Trajectory) -> None:
+    """Twelve numbers a row, the upper 3x4 of camera to world; seconds in ``times.txt`` beside it.
+
+    Rows follow each other in time; KITTI has no other mark of a frame.
+    """
+    rows = trajectory.T_wc[:, :3].reshape(-1, 12)
+    write_text(path, "".join(_row(row, " ") for row in rows))
+    times = "".join(f"{float(t)!r}\n" for t in trajectory.timestamps)
+    write_text(path.with_name("times.txt"), times)
+
+
+def write_euroc(path: Path, trajectory: Trajectory) -> None:
+    """``data.csv`` of a ground truth: nanoseconds, position, quaternion w, x, y, z.
+
+    The body is the camera; velocities and biases are left out.
+    """
+    wxyz = matrix_to_quaternion(torch.from_numpy(trajectory.T_wc[:, :3, :3])).numpy()
+    poses = np.concatenate([trajectory.T_wc[:, :3, 3], wxyz], axis=1)
+    nanoseconds = np.round(trajectory.timestamps * 1e9).astype(np.int64)
+    rows = (f"{t},{_row(p, ',')}" for t, p in zip(nanoseconds.tolist(), poses, strict=True))
+    write_text(path, f"{_EUROC}\n" + "".join(rows))
+
+
+def _row(numbers: np.ndarray, between: str) -> str:
+    return between.join(repr(float(number)) for number in numbers) + "\n"

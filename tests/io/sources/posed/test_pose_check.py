@@ -1,0 +1,196 @@
+"""The check of poses against images passes for the true conventions and names the wrong ones."""
+
+import json
+
+import numpy as np
+import pytest
+
+from geogs.config import InputConfig
+from geogs.errors import InputError
+from geogs.io.sources.posed.conventions import conventions_for
+from geogs.io.sources.posed.matching import Matcher
+from geogs.io.sources.posed.pose_check import check_poses, judge
+from geogs.io.sources.sniff import open_posed_source
+from io_samples import write_image
+from posed_layouts import (
+    OPENGL,
+    quaternion_wxyz,
+    render_room,
+    write_nerfstudio,
+    write_replica,
+    write_room_images,
+    write_tum,
+)
+
+pytestmark = pytest.mark.system
+
+NATIVE = InputConfig(long_edge=0)
+# Camera-to-world rotations as others write them: columns are their x, y and z.
+Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # OpenCV axes of those of the camera
+BODY = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
+
+
+@pytest.fixture(scope="module")
+def room():
+    return render_room(14, 4, 320, 240)
+
+
+@pytest.fixture(scope="module")
+def folder(room, tmp_path_factory):
+    return write_replica(room, tmp_path_factory.mktemp("room"))
+
+
+def turned(axes):
+    """Camera-to-world poses of cameras with other axes."""
+    turn = np.eye(4)
+    turn[:3, :3] = axes
+    return lambda T_wc: T_wc @ turn
+
+
+def with_poses(folder, T_wc):
+    """The source of ``folder`` with other camera-to-world poses in its file."""
+    np.savetxt(folder / "traj.txt", T_wc.reshape(-1, 16), fmt="%.17g")
+    return open_posed_source(folder, NATIVE)
+
+
+MISTAKES = {
+    "OpenGL axes": turned(np.diag([1.0, -1, -1])),
+    "the inverse poses": np.linalg.inv,
+    "the inverse poses .* in OpenGL axes": lambda T: OPENGL @ np.linalg.inv(T),
+    "look along [+]y with z up": turned(Z_UP),
+    "look along -y with z down": turned(Z_UP.T),
+    "a body that looks along [+]x": turned(BODY),
+}
+
+
+def test_true_poses_pass(room, folder):
+    check = check_poses(with_poses(folder, room.T_wc))
+    assert check.warning is None
+    assert check.pairs == 8
+    assert check.given.error < 0.0015  # 0.5 pixels
+    assert check.given.in_front > 0.97
+
+
+def test_world_does_not_matter(room, folder):
+    world = np.eye(4)
+    world[:3, :3] = 40 * np.array([[0.0, 1, 0], [0.6, 0, 0.8], [0.8, 0, -0.6]])
+    T_wc = world @ room.T_wc
+    T_wc[:, :3, :3] /= 40
+    assert check_poses(with_poses(folder, T_wc)).warning is None
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_wrong_convention_is_named(mistake, room, folder):
+    source = with_poses(folder, MISTAKES[mistake](room.T_wc))
+    with pytest.raises(InputError, match=rf"look like .*{mistake}.*: .*(column|invert)"):
+        check_poses(source)
+
+
+def test_each_remedy_is_right(room, folder):
+    """What ``correct`` does to the poses that a mistake makes gives the true relative poses."""
+    corrected = set()
+    for mistake in MISTAKES.values():
+        T_cw = np.linalg.inv(mistake(room.T_wc))
+        for convention in conventions_for("replica"):
+            right = convention.correct(T_cw)
+            if np.allclose(right[1] @ np.linalg.inv(right[0]), room.T_cw[1] @ room.T_wc[0]):
+                corrected.add(convention.name)
+    assert len(corrected) == len(MISTAKES)
+
+
+def test_quaternions_with_w_first(room, tmp_path):
+    write_tum(room, tmp_path)
+    rows = [
+        (100 + 0.04 * i, *T[:3, 3], *quaternion_wxyz(T[:3, :3])) for i, T in enumerate(room.T_wc)
+    ]
+    np.savetxt(tmp_path / "groundtruth.txt", rows, fmt="%.12f")
+    with pytest.raises(InputError, match="order w x y z"):
+        check_poses(open_posed_source(tmp_path, NATIVE))
+
+
+@pytest.mark.parametrize(
+    ("mistake", "message"),
+    [
+        (lambda T: T @ OPENGL, "cameras in OpenCV axes.*: negate"),
+        (lambda T: np.linalg.inv(T @ OPENGL), "inverse .* in OpenCV axes .*: invert.* negate"),
+        (np.linalg.inv, "inverse poses [^:]*round[)] [(][^:]*: invert the matrices[.]"),
+    ],
+    ids=["OpenCV axes", "inverse in OpenCV axes", "inverse"],
+)
+def test_nerfstudio_expects_opengl_axes(mistake, message, room, tmp_path):
+    write_nerfstudio(room, tmp_path)
+    document = json.loads((tmp_path / "transforms.json").read_text())
+    assert check_poses(open_posed_source(tmp_path, NATIVE)).warning is None
+    for frame in document["frames"]:
+        frame["transform_matrix"] = mistake(np.array(frame["transform_matrix"])).tolist()
+    (tmp_path / "transforms.json").write_text(json.dumps(document))
+    with pytest.raises(InputError, match=message):
+        check_poses(open_posed_source(tmp_path, NATIVE))
+
+
+def test_poses_of_other_images_only_warn(room, folder):
+    shuffled = room.T_wc[np.random.default_rng(1).permutation(len(room.T_wc))]
+    check = check_poses(with_poses(folder, shuffled))
+    assert "explain the images badly" in check.warning
+
+
+def test_images_without_texture_cannot_be_checked(room, tmp_path):
+    write_replica(room, tmp_path)
+    for path in (tmp_path / "results").iterdir():
+        write_image(path, np.full((240, 320, 3), 90, dtype=np.uint8))
+    check = check_poses(open_posed_source(tmp_path, NATIVE))
+    assert (check.given, check.pairs) == (None, 0)
+    assert "could not be checked" in check.warning
+
+
+def test_one_image(room, tmp_path):
+    write_replica(room, tmp_path)
+    check = check_poses(open_posed_source(tmp_path, InputConfig(long_edge=0, stop=1)))
+    assert "could not be checked" in check.warning
+
+
+def test_unordered_photographs(room, tmp_path):
+    """Neighbours in the list show different things; those turned alike are tried then."""
+    order = np.random.default_rng(0).permutation(len(room.images))
+    names = write_room_images(room, tmp_path, "results/frame{:06d}.png", 100)
+    for k, i in enumerate(order):
+        (tmp_path / names[i]).rename(tmp_path / f"results/frame{k:06d}.png")
+    write_replica_files(room, tmp_path, room.T_wc[order])
+    check = check_poses(open_posed_source(tmp_path, NATIVE))
+    assert check.warning is None
+    assert check.pairs >= 4
+
+
+def write_replica_files(room, folder, T_wc):
+    np.savetxt(folder / "traj.txt", T_wc.reshape(-1, 16), fmt="%.17g")
+    c = room.camera
+    entry = {"w": c.width, "h": c.height, "fx": c.fx, "fy": c.fy, "cx": c.cx, "cy": c.cy}
+    (folder / "cam_params.json").write_text(json.dumps({"camera": entry}))
+
+
+@pytest.mark.parametrize(
+    ("name", "pixels"),
+    [
+        ("rooms/living-room-2", 0.4),
+        ("rooms/staircase", 0.4),
+        ("objects/horse", 0.4),
+        ("dtu/scan24", 0.4),
+        ("7scenes-redkitchen/seq-01", 2.5),  # its poses are a few centimetres off
+    ],
+)
+def test_real_sequences(name, pixels, shared_data):
+    if not (shared_data / name).is_dir():
+        pytest.skip(f"{name} is not on this machine")
+    source = open_posed_source(shared_data / name, InputConfig(long_edge=640))
+    matcher = Matcher(source)
+    pairs = matcher.pairs(8)
+    check = judge(source, pairs, matcher.camera)
+    assert check.warning is None
+    assert check.pairs >= 6
+    assert check.given.error * 640 < pixels
+    assert check.given.in_front > 0.95
+    true = source.T_cw
+    for mistake in MISTAKES.values():
+        source.T_cw = np.linalg.inv(mistake(np.linalg.inv(true)))
+        with pytest.raises(InputError, match="look like"):
+            judge(source, pairs, matcher.camera)
