@@ -117,11 +117,11 @@ def shoot(
     return Keyframe(view, coarse.depth, coarse.normal, kinds[1])
 
 
-def neighbours_of(keyframes: Sequence[Keyframe], index: int, config: DepthConfig) -> list[int]:
+def neighbours_of(keyframes: Sequence[Keyframe], index: int) -> list[int]:
     """As the mapper chooses them."""
     typical = float(np.median(keyframes[index].depth))
     views = [k.view for k in keyframes]
-    return select_sweep_neighbours(views[index], views, typical, config)
+    return select_sweep_neighbours(views[index], views, typical)
 
 
 def compare(keyframe: Keyframe, dense: DenseDepth, render: Camera) -> Found:
@@ -176,13 +176,12 @@ def searched(
     keyframes: Sequence[Keyframe],
     index: int,
     checked: bool,
-    config: DepthConfig,
 ) -> tuple[DenseDepth, float]:
     """The depth of a keyframe and the seconds of its search; ``checked`` by its neighbours'."""
-    chosen = neighbours_of(keyframes, index, config)
+    chosen = neighbours_of(keyframes, index)
 
     def search(at: int) -> DenseDepth:
-        some = [keyframes[j].view for j in neighbours_of(keyframes, at, config)]
+        some = [keyframes[j].view for j in neighbours_of(keyframes, at)]
         (dense,) = engine.estimate([keyframes[at].view], [some])
         return dense
 
@@ -217,7 +216,6 @@ def main() -> None:
     }
     print("| " + " | ".join(COLUMNS) + " |")
     print("|---" * len(COLUMNS) + "|")
-    config = DepthConfig()
     for bare in (False, True):
         found: dict[str, list[Found]] = {name: [] for name in engines}
         seconds: dict[str, list[float]] = {name: [] for name in engines}
@@ -234,7 +232,7 @@ def main() -> None:
                     keyframes.append(shoot(caster, path[frame], number, working, render))
                     number += 1
                 for name, engine in engines.items():
-                    dense, took = searched(engine, keyframes, AROUND, arguments.checked, config)
+                    dense, took = searched(engine, keyframes, AROUND, arguments.checked)
                     found[name].append(compare(keyframes[AROUND], dense, render))
                     seconds[name].append(took)
         for name in engines:

@@ -15,9 +15,9 @@ import cv2
 import numpy as np
 import torch
 
-from geogs.config import DepthConfig
 from geogs.depth.completion import complete_inverse_depth, upsample_grid
 from geogs.depth.estimate import estimate_depth
+from geogs.depth.evidence import CONFIDENT_DEVIATION
 from geogs.depth.fusion import check_depth
 from geogs.depth.sweep_neighbors import select_sweep_neighbours
 from geogs.depth.view import DepthView, KeyframeDepth, depth_view
@@ -121,15 +121,14 @@ def main() -> None:
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
     torch.set_num_threads(1)
-    config = DepthConfig()
     views, working, render, poses = load_views(arguments.room, arguments.track, arguments.width)
     chosen = range(0, len(views), arguments.every)
     truth = ray_cast(arguments.room, poses[chosen], render)
     raw, estimated, seconds = [], [], []
     for i in chosen:
         view = views[i]
-        completed = complete_inverse_depth(view.inverse_depth, view.information, view.image, config)
-        sure = 1.0 / (1.0 + (completed.deviation / config.sure_deviation) ** 2)
+        completed = complete_inverse_depth(view.inverse_depth, view.information, view.image)
+        sure = 1.0 / (1.0 + (completed.deviation / CONFIDENT_DEVIATION) ** 2)
         raw.append(
             KeyframeDepth(
                 1.0 / upsample_grid(completed.inverse_depth, working, render),
@@ -138,18 +137,18 @@ def main() -> None:
         )
         start = time.thread_time()
         candidates = views[: i + arguments.lag + 1]
-        picked = select_sweep_neighbours(view, candidates, typical_depth(view), config)
+        picked = select_sweep_neighbours(view, candidates, typical_depth(view))
         neighbours = [candidates[j] for j in picked]
-        estimated.append(estimate_depth(view, neighbours, render, working, config))
+        estimated.append(estimate_depth(view, neighbours, render, working))
         seconds.append(time.thread_time() - start)
     start, checked, kept = time.thread_time(), [], [views[i] for i in chosen]
     for n, (i, depth) in enumerate(zip(chosen, estimated, strict=True)):
         known = [v for v in kept if v.id <= i + arguments.lag]
         typical = float(np.median(depth.depth))
-        picked = select_sweep_neighbours(kept[n], known, typical, config)
+        picked = select_sweep_neighbours(kept[n], known, typical)
         others = [estimated[j] for j in picked]
         other_poses = [known[j].T_cw for j in picked]
-        checked.append(check_depth(depth, kept[n].T_cw, others, other_poses, render, config))
+        checked.append(check_depth(depth, kept[n].T_cw, others, other_poses, render))
     check_seconds = (time.thread_time() - start) / len(checked)
     print(
         "| depth | all, cm (median / mean) | sure | sure, cm | best 60 %, cm | right to 2 %, per"

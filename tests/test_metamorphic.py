@@ -12,8 +12,7 @@ from metamorphic import RELATIONS, Shape, distances, held, shape_of
 CONFIG = parse([
     "v.mp4", "--mapping.render-long-edge", "96", "--mapping.iterations", "2",
     "--mapping.pose-iterations", "1", "--mapping.final-iterations", "10",
-    "--tracking.init-keyframes", "6", "--mapping.depth.min-planes", "24",
-    "--mapping.depth.max-planes", "48",
+    "--tracking.init-keyframes", "6", "--mapping.depth.planes", "48",
 ]).config  # fmt: skip
 
 

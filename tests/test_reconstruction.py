@@ -315,11 +315,11 @@ def test_the_tried_distances_hold_the_right_one_and_scale_with_the_poses():
 
 
 def test_an_engine_searches_between_given_limits():
-    scene, config = make_scene(), DEFAULT.mapping.depth
+    scene = make_scene()
     views, cameras = scene.views[:3], (WORKING.resized(96, 72), WORKING)
-    engine = CpuDepthEngine(*cameras, config)
+    engine = CpuDepthEngine(*cameras, DEFAULT.mapping.depth.planes)
     (depth,) = engine.estimate(views[:1], [views[1:]], limits=[(2.6, 5.0)])
-    expected = estimate_depth(views[0], views[1:], *cameras, config, (2.6, 5.0))
+    expected = estimate_depth(views[0], views[1:], *cameras, (2.6, 5.0))
     assert (depth.depth.numpy() == expected.depth).all()
     (free,) = engine.estimate(views[:1], [views[1:]], limits=[None])
     (default,) = engine.estimate(views[:1], [views[1:]])

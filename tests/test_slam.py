@@ -42,8 +42,7 @@ SMALL_FRAMES = 28
 SMALL = [
     "--mapping.render-long-edge", "96", "--mapping.iterations", "2",
     "--mapping.pose-iterations", "1", "--mapping.final-iterations", "10",
-    "--tracking.init-keyframes", "6", "--mapping.depth.min-planes", "24",
-    "--mapping.depth.max-planes", "48", "--device", "cpu",
+    "--tracking.init-keyframes", "6", "--mapping.depth.planes", "48", "--device", "cpu",
 ]  # fmt: skip
 
 

@@ -298,7 +298,7 @@ class Reconstruction:
         return sorted(keyframe_ids, key=lambda i: self._images[i])
 
     def _first_points(self, progress: Callable[[float], None]) -> np.ndarray:
-        views, depth = list(self.mapper.views.values()), self.config.mapping.depth
+        views = list(self.mapper.views.values())
 
         def image_at(index: int) -> SmallImage:
             mask = views[index].mask
@@ -306,7 +306,7 @@ class Reconstruction:
             return image, None if mask is None else mask.cpu().numpy()
 
         places = [view.place for view in views]
-        return first_points(places, image_at, self.camera, depth, self.config.search, progress)
+        return first_points(places, image_at, self.camera, progress)
 
     def _place_keyframes(self) -> None:
         """Give the keyframes their poses in the map's frame."""

@@ -12,6 +12,7 @@ from geogs.config import ReconstructConfig
 from geogs.evaluation.surface import read_surface
 from geogs.io.sources.posed.posed_source import PosedImage, PosedSource
 from geogs.io.sources.sniff import open_posed_source
+from geogs.mapping import first_look
 from geogs.reconstruction import Reconstruction
 
 RESIDENT = 4
@@ -92,10 +93,11 @@ def test_a_few_images_see_less_of_the_scene_than_all(small_room):
     assert all_views == pytest.approx(1.0)
 
 
-def test_the_first_look_reads_what_it_matches_and_finds_the_room(small_room, alive):
+def test_the_first_look_reads_what_it_matches_and_finds_the_room(small_room, alive, monkeypatch):
+    monkeypatch.setattr(first_look, "EDGE", 64)
+    monkeypatch.setattr(first_look, "IMAGES", 4)
     source = open_posed_source(small_room, CONFIG.input)
-    config = replace(CONFIG, search=replace(CONFIG.search, first_edge=64, first_views=4))
-    scene = Reconstruction(source.camera, config)
+    scene = Reconstruction(source.camera, CONFIG)
     points = PosedViews(scene, source, lambda stage, fraction: None).first_look()
     assert len(alive.read) == len(set(alive.read))
     assert alive.most <= 2

@@ -17,8 +17,7 @@ pytestmark = pytest.mark.system
 TINY = {
     "stop": "24", "mapping.render-long-edge": "64", "mapping.iterations": "1",
     "mapping.pose-iterations": "0", "mapping.final-iterations": "0",
-    "tracking.init-keyframes": "6", "mapping.depth.min-planes": "24",
-    "mapping.depth.max-planes": "48", "device": "cpu",
+    "tracking.init-keyframes": "6", "mapping.depth.planes": "48", "device": "cpu",
 }  # fmt: skip
 
 

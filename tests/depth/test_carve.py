@@ -4,11 +4,8 @@ import numpy as np
 import pytest
 
 from depth_scene import RENDER, make_scene, trace
-from geogs.config import DepthConfig
 from geogs.depth.carve import count_votes, look_up, vote
 from geogs.depth.view import KeyframeDepth
-
-CONFIG = DepthConfig()
 
 
 def both(poses, depths):
@@ -27,19 +24,19 @@ def seen():
 
 def test_surface_points_stay_and_floaters_go(seen):
     points, poses, depths = seen
-    assert vote(points, both(poses, depths), RENDER, CONFIG).all()
+    assert vote(points, both(poses, depths), RENDER).all()
     floaters = 0.7 * points
-    assert not vote(floaters, both(poses, depths), RENDER, CONFIG).any()
-    surface, free = count_votes(floaters, both(poses, depths), RENDER, CONFIG)
+    assert not vote(floaters, both(poses, depths), RENDER).any()
+    surface, free = count_votes(floaters, both(poses, depths), RENDER)
     assert (surface == 0).all()
     assert (free >= 3).mean() > 0.9
 
 
 def test_points_behind_the_surface_or_unseen_are_not_judged(seen):
     points, poses, depths = seen
-    assert vote(3.0 * points, both(poses, depths), RENDER, CONFIG).all()
-    assert vote(-points, both(poses, depths), RENDER, CONFIG).all()
-    surface, free = count_votes(-points, both(poses, depths), RENDER, CONFIG)
+    assert vote(3.0 * points, both(poses, depths), RENDER).all()
+    assert vote(-points, both(poses, depths), RENDER).all()
+    surface, free = count_votes(-points, both(poses, depths), RENDER)
     assert (surface == 0).all()
     assert (free == 0).all()
 
@@ -47,10 +44,10 @@ def test_points_behind_the_surface_or_unseen_are_not_judged(seen):
 def test_one_view_or_an_unsure_one_cannot_remove(seen):
     points, poses, depths = seen
     floaters = 0.7 * points
-    assert vote(floaters, both(poses[:1], depths[:1]), RENDER, CONFIG).all()
+    assert vote(floaters, both(poses[:1], depths[:1]), RENDER).all()
     unsure = [KeyframeDepth(d.depth, np.full_like(d.depth, 0.2)) for d in depths]
-    assert vote(floaters, both(poses, unsure), RENDER, CONFIG).all()
-    assert vote(floaters, [], RENDER, CONFIG).all()
+    assert vote(floaters, both(poses, unsure), RENDER).all()
+    assert vote(floaters, [], RENDER).all()
 
 
 def test_support_outweighs_as_many_violations(seen):
@@ -58,7 +55,7 @@ def test_support_outweighs_as_many_violations(seen):
     floaters = 0.7 * points
     lifted = KeyframeDepth((0.7 * depths[0].depth).astype(np.float32), depths[0].confidence)
     views = [lifted, lifted, *depths[:2]]
-    kept = vote(floaters, both([poses[0], poses[0], *poses[:2]], views), RENDER, CONFIG)
+    kept = vote(floaters, both([poses[0], poses[0], *poses[:2]], views), RENDER)
     assert kept.mean() > 0.95
 
 
@@ -66,8 +63,8 @@ def test_points_that_are_not_finite_go(seen):
     points, poses, depths = seen
     broken = points[:4].copy()
     broken[0, 0], broken[1, 2] = np.nan, np.inf
-    assert vote(broken, both(poses, depths), RENDER, CONFIG).tolist() == [False, False, True, True]
-    assert vote(np.empty((0, 3)), both(poses, depths), RENDER, CONFIG).shape == (0,)
+    assert vote(broken, both(poses, depths), RENDER).tolist() == [False, False, True, True]
+    assert vote(np.empty((0, 3)), both(poses, depths), RENDER).shape == (0,)
 
 
 def test_depth_zero_does_not_vote(seen):

@@ -3,15 +3,15 @@
 import numpy as np
 import pytest
 
-from geogs.config import DepthConfig
 from geogs.depth.completion import (
+    BENDING,
+    MEMBRANE,
     _smoothness_bands,
     complete_inverse_depth,
     upsample_grid,
 )
 from geogs.geometry.camera import Camera
 
-CONFIG = DepthConfig()
 IMAGE = np.full((96, 128, 3), 127, np.uint8)
 SHAPE = (12, 16)
 
@@ -29,10 +29,10 @@ def test_bands_are_those_of_the_explicit_least_squares():
     energy = 0.0
     for axis in (0, 1):
         v, u = np.moveaxis(w, axis, 0), np.moveaxis(x, axis, 0)
-        bend = v[1:-1] * (u[:-2] - 2 * u[1:-1] + u[2:]) / (CONFIG.bending * typical)
-        stretch = np.minimum(v[1:], v[:-1]) * (u[1:] - u[:-1]) / (CONFIG.membrane * typical)
+        bend = v[1:-1] * (u[:-2] - 2 * u[1:-1] + u[2:]) / (BENDING * typical)
+        stretch = np.minimum(v[1:], v[:-1]) * (u[1:] - u[:-1]) / (MEMBRANE * typical)
         energy += (bend**2).sum() + (stretch**2).sum()
-    bands = _smoothness_bands(weight, typical, CONFIG)
+    bands = _smoothness_bands(weight, typical)
     n = x.size
     full = np.zeros((n, n))
     for k, band in enumerate(bands):
@@ -46,7 +46,7 @@ def test_a_plane_is_kept_and_outliers_are_replaced():
     plane = _plane()
     data, information = plane.copy(), np.full(SHAPE, 4e4, np.float32)
     data[3, 5], data[8, 10] = 1.2, 0.1
-    done = complete_inverse_depth(data, information, IMAGE, CONFIG)
+    done = complete_inverse_depth(data, information, IMAGE)
     assert np.abs(done.inverse_depth / plane - 1).max() < 0.01
     assert not done.inlier[3, 5]
     assert not done.inlier[8, 10]
@@ -59,7 +59,7 @@ def test_holes_are_filled_smoothly():
     information[4:9, 5:11] = 0.0
     data = plane.copy()
     data[4:9, 5:11] = np.nan
-    done = complete_inverse_depth(data, information, IMAGE, CONFIG)
+    done = complete_inverse_depth(data, information, IMAGE)
     assert np.abs(done.inverse_depth / plane - 1).max() < 0.02
     assert not done.inlier[4:9, 5:11].any()
     assert (done.deviation[4:9, 5:11] > 100).all()
@@ -74,15 +74,15 @@ def test_an_image_edge_keeps_a_depth_edge_sharp():
     image = IMAGE.copy()
     image[:, 64:] = 20
     information = np.full(SHAPE, 200.0, np.float32)
-    sharp = complete_inverse_depth(step, information, image, CONFIG).inverse_depth
-    blurred = complete_inverse_depth(step, information, IMAGE, CONFIG).inverse_depth
+    sharp = complete_inverse_depth(step, information, image).inverse_depth
+    blurred = complete_inverse_depth(step, information, IMAGE).inverse_depth
     assert np.abs(sharp - step).mean() < 0.3 * np.abs(blurred - step).mean()
 
 
 @pytest.mark.parametrize("value", [np.nan, 0.0, -2.0])
 def test_nothing_known_gives_something_finite(value):
     data = np.full(SHAPE, value, np.float32)
-    done = complete_inverse_depth(data, np.ones(SHAPE, np.float32), IMAGE, CONFIG)
+    done = complete_inverse_depth(data, np.ones(SHAPE, np.float32), IMAGE)
     assert np.isfinite(done.inverse_depth).all()
     assert (done.inverse_depth > 0).all()
     assert not done.inlier.any()

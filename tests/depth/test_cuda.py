@@ -10,6 +10,7 @@ import torch
 from cuda_emulator import use_emulator
 from depth_scene import WORKING, DepthScene, make_scene, trace
 from geogs.config import DepthConfig
+from geogs.depth import plane_sweep as cpu_sweep
 from geogs.depth import plane_sweep_kernels as sweep_loops
 from geogs.depth import refinement as cpu_refinement
 from geogs.depth.carve import vote
@@ -51,17 +52,17 @@ class Setting:
     working: Camera
     render: Camera
     scene: DepthScene
-    config: DepthConfig
+    most_planes: int
 
     @property
     def planes(self) -> np.ndarray:
-        return np.linspace(0.2, 0.8, self.config.max_planes, dtype=F)
+        return np.linspace(0.2, 0.8, self.most_planes, dtype=F)
 
 
-def _setting(device: str, working: Camera, scale: float, config: DepthConfig) -> Setting:
+def _setting(device: str, working: Camera, scale: float, most_planes: int) -> Setting:
     render = working.resized(round(working.width / scale), round(working.height / scale))
     scene = make_scene(working=working, render=render)
-    return Setting(torch.device(device), working, render, scene, config)
+    return Setting(torch.device(device), working, render, scene, most_planes)
 
 
 @pytest.fixture(scope="module")
@@ -77,15 +78,14 @@ def setting(
     """A few pixels in the emulator; the real size on a GPU."""
     if request.param == "emulated":
         use_emulator(monkeypatch, completion_module, sweep_module, refine_module, check_module)
-        config = DepthConfig(min_planes=24, max_planes=29, support_radius=2)
-        size, device = (WORKING.resized(37, 30), 1.6), "cpu"
+        monkeypatch.setattr(cpu_sweep, "SUPPORT_RADIUS", 2)
+        most_planes, device, size = 29, "cpu", (WORKING.resized(37, 30), 1.6)
     elif torch.cuda.is_available():
-        config, device = DepthConfig(), "cuda"
-        size = (WORKING.resized(512, 384), 1.6)
+        most_planes, device, size = DepthConfig.planes, "cuda", (WORKING.resized(512, 384), 1.6)
     else:
         pytest.skip("needs an NVIDIA GPU")
     if request.param not in settings:
-        settings[request.param] = _setting(device, *size, config)
+        settings[request.param] = _setting(device, *size, most_planes)
     return settings[request.param]
 
 
@@ -120,16 +120,15 @@ def _close(a: torch.Tensor, b: np.ndarray, tolerance: float, share: float = 1.0)
 
 @pytest.mark.parametrize("window", [3, 5])
 def test_matching_costs(setting, window):
-    config = replace(setting.config, window=window)
     reference, *others = setting.scene.views
     planes = PlaneSlots.of(setting.planes, setting.device)
     images = [KeyframeImages.of(v, setting.device) for v in setting.scene.views]
     across = homographies(reference, others, setting.render, setting.render)
     volume = sweep_module.match_planes(
         images[0].grey, torch.stack([i.grey for i in images[1:]]), _to(setting, across), planes,
-        config,
+        window,
     )  # fmt: skip
-    expected = matching_costs(reference, others, setting.render, setting.planes, config)
+    expected = matching_costs(reference, others, setting.render, setting.planes, window)
     # Samples at the very border of an image fall on one side of it or the other.
     _close(torch.from_numpy(_by_plane(volume, planes)), expected, 2e-3, 0.999)
 
@@ -152,17 +151,16 @@ def test_support_average_and_prior(setting, count):
     volume, colours = _random(h, w, count), _random(h, w, 3, seed=1)
     prior, weight = F(0.3) + F(0.2) * _random(h, w, seed=2), _random(h, w, seed=3)
     weight[2:5] = 0.0
-    config = setting.config
     expected = np.empty_like(volume)
-    radius, sharpness = config.support_radius, F(config.support_sharpness)
+    radius, sharpness = cpu_sweep.SUPPORT_RADIUS, F(cpu_sweep.SUPPORT_SHARPNESS)
     sweep_loops.average_support(0, len(volume), volume, colours, radius, sharpness, expected)
-    pull = F(config.prior_pull) * weight
+    pull = F(cpu_sweep.PRIOR_PULL) * weight
     sweep_loops.pull_to_prior(
-        0, len(expected), expected, rho, prior, pull, F(config.prior_tolerance)
+        0, len(expected), expected, rho, prior, pull, F(cpu_sweep.PRIOR_TOLERANCE)
     )
     out = sweep_module.average_support(
         _by_slot(setting, volume, planes), _to(setting, colours.transpose(2, 0, 1)), planes,
-        _to(setting, prior), _to(setting, weight), config,
+        _to(setting, prior), _to(setting, weight),
     )  # fmt: skip
     _close(torch.from_numpy(_by_plane(out, planes)), expected, 1e-4)
 
@@ -173,13 +171,12 @@ def test_path_costs_and_winners(setting, count, size):
     rho = np.linspace(0.2, 0.8, count, dtype=F)
     planes = PlaneSlots.of(rho, setting.device)
     volume, guide = _random(h, w, count), _random(h, w, seed=1)
-    config = setting.config
     total = np.zeros_like(volume)
-    small, large, edge = config.small_jump, config.large_jump, config.jump_contrast
+    small, large, edge = cpu_sweep.SMALL_JUMP, cpu_sweep.LARGE_JUMP, cpu_sweep.JUMP_CONTRAST
     for forward in (True, False):
         sweep_loops.aggregate_paths(volume, guide, F(small), F(large), F(edge), forward, total)
     slots = _by_slot(setting, volume, planes)
-    paths = sweep_module.follow_paths(slots, _to(setting, guide), planes, config)
+    paths = sweep_module.follow_paths(slots, _to(setting, guide), planes)
     _close(torch.from_numpy(_by_plane(paths.sum(0), planes)), total, 1e-4)
     expected = [np.empty((h, w), F) for _ in range(3)]
     sweep_loops.pick_planes(0, len(total), total, volume, *expected)
@@ -190,10 +187,10 @@ def test_path_costs_and_winners(setting, count, size):
 
 
 def _tracker(setting: Setting):
-    view, config = setting.scene.views[0], setting.config
-    completed = complete_inverse_depth(view.inverse_depth, view.information, view.image, config)
-    prior = tracker_prior(completed, setting.working, setting.render, config)
-    return prior, tracker_evidence(completed, setting.working, setting.render, config)
+    view = setting.scene.views[0]
+    completed = complete_inverse_depth(view.inverse_depth, view.information, view.image)
+    prior = tracker_prior(completed, setting.working, setting.render)
+    return prior, tracker_evidence(completed, setting.working, setting.render)
 
 
 def _maps(setting: Setting) -> TrackerMaps:
@@ -213,7 +210,7 @@ def test_grids_are_upsampled_and_patches_gathered_as_opencv_does(setting):
     for grid, out in zip(grids, upsampled, strict=True):
         _close(out, upsample_grid(grid, setting.working, setting.render), rounding)
     patches = cpu_refinement._gather_patches(
-        view, setting.scene.views[1:], setting.render, setting.working, setting.config
+        view, setting.scene.views[1:], setting.render, setting.working
     )
     images = KeyframeImages.of(view, setting.device)
     _close(refine_module.gather_patches(images.fine, places), patches.samples, rounding)
@@ -226,7 +223,6 @@ def test_grids_are_upsampled_and_patches_gathered_as_opencv_does(setting):
     "shape", [*(pytest.param(s, marks=pytest.mark.long) for s in ((6, 11), (9, 5))), (3, 4)]
 )
 def test_completed_grids(setting, shape):
-    config = setting.config
     shape = tuple(7 * n for n in shape)
     v, u = np.mgrid[: shape[0], : shape[1]]
     grids, typical, expected = [], [], []
@@ -238,18 +234,18 @@ def test_completed_grids(setting, shape):
         grid[1, 2], grid[0, 1], information[-2:, -3:] = 1.9, np.nan, 0.0
         smooth = np.exp(-2 * _random(*shape, seed=4 + seed))
         known = known_cells(grid, information)
-        done = complete_grid(grid, information, smooth, config)
+        done = complete_grid(grid, information, smooth)
         assert not done.inlier[1, 2]
         evidence = (
             done.inverse_depth,
-            prior_weight(done, config),
-            relative_precision(done, config),
+            prior_weight(done),
+            relative_precision(done),
         )
         grids.append(np.stack([grid, information, smooth]))
         typical.append(float(np.median(grid[known])))
         expected.append(np.stack(evidence))
     assert completion_module.can_complete(shape, setting.device)
-    out = completion_module.complete(_to(setting, np.stack(grids)), typical, config).cpu()
+    out = completion_module.complete(_to(setting, np.stack(grids)), typical).cpu()
     for got, want in zip(out, expected, strict=True):
         assert np.abs(got[0].numpy() / want[0] - 1).max() < 1e-5
         _close(got[1], want[1], 1e-5)
@@ -266,9 +262,9 @@ def test_grids_too_large_for_the_gpu_or_without_knowledge_are_completed_on_the_c
             cuda.observe(v)
         grids = cuda._complete([cuda._plan(v, []) for v in views]).cpu().numpy()
         for got, v in zip(grids, views, strict=True):
-            done = complete_inverse_depth(v.inverse_depth, v.information, v.image, setting.config)
+            done = complete_inverse_depth(v.inverse_depth, v.information, v.image)
             assert np.abs(got[0] / done.inverse_depth - 1).max() < 1e-4
-            assert np.abs(got[1] - prior_weight(done, setting.config)).max() < 1e-4
+            assert np.abs(got[1] - prior_weight(done)).max() < 1e-4
 
 
 def test_start_is_the_surer_of_sweep_and_tracker(setting):
@@ -284,16 +280,14 @@ def test_start_is_the_surer_of_sweep_and_tracker(setting):
 
 
 def test_photometric_step(setting):
-    config, views = setting.config, setting.scene.views
-    patches = cpu_refinement._gather_patches(
-        views[0], views[1:], setting.render, setting.working, config
-    )
+    views = setting.scene.views
+    patches = cpu_refinement._gather_patches(views[0], views[1:], setting.render, setting.working)
     _, tracker = _tracker(setting)
     shape = setting.scene.truth[0].shape
     rho = (1.0 / setting.scene.truth[0]) * (F(0.98) + F(0.04) * _random(*shape))
     slopes = [F(1e-3) * _random(*shape, seed=s) for s in (1, 2)]
     state = cpu_refinement.SlantedDepth(rho, *slopes, np.zeros_like(rho))
-    photo = cpu_refinement._photometric_step(state, patches, config)
+    photo = cpu_refinement._photometric_step(state, patches)
     misfit = (tracker.inverse_depth / state.inverse_depth - 1.0) ** 2 * tracker.weight
     known = tracker.weight / (1.0 + misfit / 4.0)
     data = (photo * state.inverse_depth + known * tracker.inverse_depth) / (photo + known)
@@ -302,30 +296,29 @@ def test_photometric_step(setting):
     maps = SlantedMaps(*(_to(setting, m) for m in (rho, *slopes, 0 * rho)))
     precision, sure = refine_module.photometric_step(
         maps, _to(setting, patches.samples), torch.stack([i.fine for i in images[1:]]),
-        _to(setting, finely), _maps(setting), config,
+        _to(setting, finely), _maps(setting),
     )  # fmt: skip
     _close(maps.inverse_depth, data, 1e-4, 0.995)
     _close(precision, photo + known, 1e-2, 0.995)
-    expected = 1.0 / (1.0 + 1.0 / ((photo + known) * F(config.fit_deviation**2))) + F(1e-3)
+    expected = 1.0 / (1.0 + 1.0 / ((photo + known) * F(cpu_refinement.FIT_DEVIATION**2))) + F(1e-3)
     _close(sure, expected, 1e-3, 0.995)
 
 
 def test_plane_fits_with_and_without_averaging(setting):
-    config = setting.config
     h, w = (13, 18) if setting.device.type == "cpu" else (180, 320)
     rho, sure = F(0.5) + F(0.02) * _random(h, w), _random(h, w, seed=1) + F(0.1)
     slopes = [F(4e-3) * _random(h, w, seed=s) for s in (2, 3)]
     colours, precision = _random(3, h, w, seed=4), F(1e5) * _random(h, w, seed=5)
     cpu = cpu_refinement.SlantedDepth(rho, *slopes, np.zeros_like(rho))
-    cpu_refinement._fit_planes(cpu, sure, colours, 4, 0.03, 0.5, config)
+    cpu_refinement._fit_planes(cpu, sure, colours, 4, 0.03, 0.5)
     plane = np.minimum(cpu.support / F(cpu_refinement.FULL_SUPPORT), F(1.0))
-    plane = plane * F(1.0 / config.plane_deviation**2)
+    plane = plane * F(1.0 / cpu_refinement.PLANE_DEVIATION**2)
     averaged = (precision * rho + plane * cpu.inverse_depth) / (precision + plane)
     for weight, expected in ((None, cpu.inverse_depth), (precision, averaged)):
         maps = SlantedMaps(*(_to(setting, m) for m in (rho, *slopes, 0 * rho)))
         given = None if weight is None else _to(setting, weight)
         refine_module.fit_planes(
-            maps, _to(setting, sure), _to(setting, colours), 4, 0.03, 0.5, config, given
+            maps, _to(setting, sure), _to(setting, colours), 4, 0.03, 0.5, given
         )
         _close(maps.inverse_depth, expected, 2e-5)
         _close(maps.slope_x, cpu.slope_x, 2e-5)
@@ -352,8 +345,8 @@ def test_confidence(setting):
 def _engines(setting: Setting) -> tuple[CpuDepthEngine, CudaDepthEngine]:
     cameras = (setting.render, setting.working)
     return (
-        CpuDepthEngine(*cameras, setting.config),
-        CudaDepthEngine(setting.device, *cameras, setting.config, 128),
+        CpuDepthEngine(*cameras, setting.most_planes),
+        CudaDepthEngine(setting.device, *cameras, 128, setting.most_planes),
     )
 
 
@@ -362,7 +355,6 @@ def test_sweep_of_a_view(setting):
     prior, _ = _tracker(setting)
     expected = plane_sweep(
         reference, others, setting.render, setting.planes, prior.inverse_depth, prior.weight,
-        setting.config,
     )  # fmt: skip
     images = [KeyframeImages.of(v, setting.device) for v in setting.scene.views]
     across = homographies(reference, others, setting.render, setting.render)
@@ -370,7 +362,6 @@ def test_sweep_of_a_view(setting):
     swept = sweep_module.sweep(
         images[0], torch.stack([i.grey for i in images[1:]]), _to(setting, across),
         PlaneSlots.of(setting.planes, setting.device), maps.inverse_depth, maps.prior_weight,
-        setting.config,
     )  # fmt: skip
     _close(swept.inverse_depth, expected.inverse_depth, 1e-3, 0.99)
     _close(swept.cost, expected.cost, 2e-3, 0.99)
@@ -478,7 +469,7 @@ def test_votes_on_points(setting, monkeypatch):
     assert not kept[3]
     poses, arrays = [v.T_cw for v in setting.scene.views], depths
     assert np.array_equal(
-        expected.numpy(), vote(points, zip(poses, arrays, strict=True), setting.render, cpu.config)
+        expected.numpy(), vote(points, zip(poses, arrays, strict=True), setting.render)
     )
     monkeypatch.setattr(check_module, "VOTERS_TOGETHER", 1)
     assert torch.equal(cuda.keep(_to(setting, points), there), kept)

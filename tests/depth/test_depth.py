@@ -21,8 +21,6 @@ from geogs.depth.sweep_neighbors import (
 )
 from geogs.depth.view import DenseDepth, KeyframeDepth, PosedDepth
 
-CONFIG = DepthConfig()
-
 
 @pytest.fixture(scope="module")
 def scene() -> DepthScene:
@@ -36,7 +34,7 @@ def depths(scene: DepthScene) -> list[KeyframeDepth]:
 
 def _estimate(scene: DepthScene, i: int) -> KeyframeDepth:
     others = [v for v in scene.views if v.id != i]
-    return estimate_depth(scene.views[i], others, RENDER, WORKING, CONFIG)
+    return estimate_depth(scene.views[i], others, RENDER, WORKING)
 
 
 def _relative_error(depth: KeyframeDepth, truth: np.ndarray) -> np.ndarray:
@@ -88,13 +86,13 @@ def test_scaling_the_world_scales_the_depth(scene, depths):
         inverse, information = view.inverse_depth / scale, view.information * scale**2
         inverse, information = inverse.astype(np.float32), information.astype(np.float32)
         scaled.append(replace(view, T_cw=T_cw, inverse_depth=inverse, information=information))
-    depth = estimate_depth(scaled[0], scaled[1:], RENDER, WORKING, CONFIG)
+    depth = estimate_depth(scaled[0], scaled[1:], RENDER, WORKING)
     same = np.abs(depth.depth / scale / depths[0].depth - 1.0) < 1e-3
     assert same.mean() > 0.98
 
 
 def test_without_neighbours_the_completed_tracker_remains(scene):
-    depth = estimate_depth(scene.views[0], [], RENDER, WORKING, CONFIG)
+    depth = estimate_depth(scene.views[0], [], RENDER, WORKING)
     assert np.median(_relative_error(depth, scene.truth[0])) < 0.02
     assert depth.confidence.max() <= 0.5
 
@@ -105,7 +103,7 @@ def test_bad_tracker_values_do_no_harm(scene, value):
     inverse = view.inverse_depth.copy()
     inverse[:3, 4:9] = value
     broken = replace(view, inverse_depth=inverse)
-    depth = estimate_depth(broken, scene.views[1:], RENDER, WORKING, CONFIG)
+    depth = estimate_depth(broken, scene.views[1:], RENDER, WORKING)
     assert np.isfinite(depth.depth).all()
     assert (depth.depth > 0).all()
     assert np.median(_relative_error(depth, scene.truth[0])) < 0.005
@@ -122,7 +120,7 @@ def test_hopeless_input_gives_finite_unsure_depth(scene, how):
     if how != "nothing known":
         black = {"grey": 0 * views[0].grey, "fine": 0 * views[0].fine, "image": 0 * views[0].image}
         views = [replace(v, information=nothing, **black) for v in views]
-    depth = estimate_depth(views[0], views[1:], RENDER, WORKING, CONFIG)
+    depth = estimate_depth(views[0], views[1:], RENDER, WORKING)
     assert np.isfinite(depth.depth).all()
     assert np.isfinite(depth.confidence).all()
     assert (depth.depth > 0).all()
@@ -139,7 +137,7 @@ def test_check_lowers_the_confidence_of_a_floater_and_averages_noise(scene, dept
     wrong[5:12, 5:12] *= 0.7
     poses = [v.T_cw for v in scene.views]
     checked = check_depth(
-        KeyframeDepth(wrong, clean[0].confidence), poses[0], clean[1:], poses[1:], RENDER, CONFIG
+        KeyframeDepth(wrong, clean[0].confidence), poses[0], clean[1:], poses[1:], RENDER
     )
     assert checked.confidence[5:12, 5:12].max() < 0.2
     inner = np.zeros_like(wrong, bool)
@@ -150,7 +148,7 @@ def test_check_lowers_the_confidence_of_a_floater_and_averages_noise(scene, dept
 
 
 def test_the_cpu_engine_is_the_functions(scene, depths):
-    engine = depth_engine("cpu", RENDER, WORKING, CONFIG, 128)
+    engine = depth_engine("cpu", RENDER, WORKING, DepthConfig(), 128)
     views = scene.views
     dense = engine.estimate(views[:2], [[v for v in views if v.id != i] for i in range(2)])
     posed = [PosedDepth(v.T_cw, DenseDepth.of(d)) for v, d in zip(views, depths, strict=True)]
@@ -160,7 +158,7 @@ def test_the_cpu_engine_is_the_functions(scene, depths):
         assert got.typical == np.median(expected.depth)
     checked, alone = engine.check(posed[:2], [posed[1:], []])
     poses = [v.T_cw for v in views]
-    expected = check_depth(depths[0], poses[0], depths[1:], poses[1:], RENDER, CONFIG)
+    expected = check_depth(depths[0], poses[0], depths[1:], poses[1:], RENDER)
     assert np.array_equal(checked.arrays().depth, expected.depth)
     assert np.array_equal(checked.arrays().confidence, expected.confidence)
     assert alone is posed[1].depth
@@ -170,7 +168,7 @@ def test_the_cpu_engine_is_the_functions(scene, depths):
     points = torch.rand(200, 3) * 3
     kept = engine.keep(points, posed)
     assert np.array_equal(
-        kept.numpy(), vote(points.numpy(), zip(poses, depths, strict=True), RENDER, CONFIG)
+        kept.numpy(), vote(points.numpy(), zip(poses, depths, strict=True), RENDER)
     )
     assert 0 < int(kept.sum()) < 200
 
@@ -188,7 +186,7 @@ def test_parallax_is_the_angle_at_the_point_ahead(scene):
 
 
 def test_check_without_others_changes_nothing(scene, depths):
-    same = check_depth(depths[0], scene.views[0].T_cw, [], [], RENDER, CONFIG)
+    same = check_depth(depths[0], scene.views[0].T_cw, [], [], RENDER)
     assert np.array_equal(same.confidence, depths[0].confidence)
 
 
@@ -204,18 +202,17 @@ def test_neighbours_have_parallax_look_the_same_way_and_spread(scene):
 
     reference = moved(0, 0, 0)
     few = [reference, moved(1, 0.005, 0), moved(2, 0.2, 0), moved(3, 0.2, 0, 50), moved(4, 3, 0)]
-    assert select_sweep_neighbours(reference, few, 2.0, CONFIG) == [2]
+    assert select_sweep_neighbours(reference, few, 2.0) == [2]
     lonely = [reference, moved(1, 0.001, 0), moved(2, 0.002, 0)]
-    assert len(select_sweep_neighbours(reference, lonely, 2.0, CONFIG)) == 2
+    assert len(select_sweep_neighbours(reference, lonely, 2.0)) == 2
     sideways = [moved(i, 0.2 + 0.001 * i, 0) for i in range(1, 5)]
     upwards = moved(9, 0, 0.3)
-    two = replace(CONFIG, neighbours=2)
-    chosen = select_sweep_neighbours(reference, [*sideways, upwards], 2.0, two)
+    chosen = select_sweep_neighbours(reference, [*sideways, upwards], 2.0, 2)
     assert 4 in chosen
 
 
 def test_depth_range_covers_the_scene_and_ignores_the_unsure(scene):
-    near, far = depth_range(scene.views[0], scene.views[1:], WORKING, CONFIG)
+    near, far = depth_range(scene.views[0], scene.views[1:], WORKING)
     truth = scene.truth[0]
     assert near < truth.min()
     assert far > np.percentile(truth, 99)
@@ -228,10 +225,10 @@ def test_unsure_pixels_take_what_the_others_agree_on(scene, depths):
     others = [KeyframeDepth(t, np.full_like(t, 0.9)) for t in truth[1:]]
     wrong, confidence = 1.6 * truth[0], np.full_like(truth[0], 0.1)
     hidden = KeyframeDepth(wrong.astype(np.float32), confidence)
-    checked = check_depth(hidden, poses[0], others, poses[1:], RENDER, CONFIG)
+    checked = check_depth(hidden, poses[0], others, poses[1:], RENDER)
     error = np.abs(checked.depth / truth[0] - 1.0)[8:-8, 12:-12]
     assert (error < 0.02).mean() > 0.95
     assert (checked.confidence[8:-8, 12:-12] > 0.5).mean() > 0.9
     sure = KeyframeDepth(hidden.depth, np.full_like(confidence, 0.9))
-    kept = check_depth(sure, poses[0], others, poses[1:], RENDER, CONFIG)
+    kept = check_depth(sure, poses[0], others, poses[1:], RENDER)
     assert np.abs(kept.depth / hidden.depth - 1.0).max() < 0.02

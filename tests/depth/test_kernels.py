@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 
 from depth_scene import RENDER, WORKING, make_scene
-from geogs.config import DepthConfig
 from geogs.depth import plane_sweep_kernels as sweep
 from geogs.depth import refinement_kernels as refinement
 from geogs.depth import reprojection_kernels as reprojection
-from geogs.depth.plane_sweep import matching_costs
+from geogs.depth.plane_sweep import VARIANCE_FLOOR, matching_costs
 
 F = np.float32
 
@@ -80,10 +79,9 @@ def test_support_average_equals_the_weighted_mean():
 @pytest.mark.parametrize("window", [3, 5])
 def test_matching_cost_equals_warped_ncc(window):
     scene = make_scene()
-    config = DepthConfig(window=window)
     planes = np.array([0.3, 0.37, 0.45], F)
     reference, neighbour = scene.views[:2]
-    costs = matching_costs(reference, [neighbour], RENDER, planes, config)
+    costs = matching_costs(reference, [neighbour], RENDER, planes, window)
     k = RENDER.matrix().numpy()
     relative = neighbour.T_cw @ np.linalg.inv(reference.T_cw)
     radius = window // 2
@@ -97,7 +95,7 @@ def test_matching_cost_equals_warped_ncc(window):
             b = cv2.remap(neighbour.grey, u.astype(F), v.astype(F), cv2.INTER_LINEAR)
             a = reference.grey[y - radius : y + radius + 1, x - radius : x + radius + 1]
             cross = (a * b).mean() - a.mean() * b.mean()
-            variances = (a.var() + config.variance_floor) * (b.var() + config.variance_floor)
+            variances = (a.var() + VARIANCE_FLOOR) * (b.var() + VARIANCE_FLOOR)
             # OpenCV interpolates with weights rounded to 1/32.
             assert abs(costs[y, x, p] - (1 - cross / np.sqrt(variances))) < 0.03
 
@@ -105,7 +103,7 @@ def test_matching_cost_equals_warped_ncc(window):
 def test_cost_outside_every_neighbour_is_the_outside_cost():
     scene = make_scene()
     planes = np.array([0.3, 3.0], F)
-    costs = matching_costs(scene.views[0], [scene.views[1]], RENDER, planes, DepthConfig())
+    costs = matching_costs(scene.views[0], [scene.views[1]], RENDER, planes)
     assert costs[36, 0, 1] == sweep.OUTSIDE
     assert np.isfinite(costs).all()
 
@@ -114,10 +112,8 @@ def test_matching_cost_is_the_mean_over_the_better_half_of_those_that_see_the_po
     scene = make_scene()
     reference, *others = scene.views
     planes = np.array([0.5, 1.4, 2.2], F)  # 0.5, 3 and more of the four look past some pixels
-    costs = matching_costs(reference, others, RENDER, planes, DepthConfig())
-    alone = np.stack(
-        [matching_costs(reference, [o], RENDER, planes, DepthConfig()) for o in others]
-    )
+    costs = matching_costs(reference, others, RENDER, planes)
+    alone = np.stack([matching_costs(reference, [o], RENDER, planes) for o in others])
     k = RENDER.matrix().numpy()
     cameras = [(k @ (v.T_cw @ np.linalg.inv(reference.T_cw))[:3], v) for v in others]
     rays = RENDER.rays().numpy()
@@ -187,7 +183,7 @@ def test_photometric_step_climbs_the_ncc():
     from geogs.depth.refinement import _gather_patches
 
     scene = make_scene()
-    patches = _gather_patches(scene.views[0], scene.views[1:2], RENDER, WORKING, DepthConfig())
+    patches = _gather_patches(scene.views[0], scene.views[1:2], RENDER, WORKING)
     zero = np.zeros_like(scene.truth[0])
 
     def step(rho):

@@ -6,7 +6,11 @@ from itertools import islice
 import numpy as np
 import pytest
 
-from geogs.config import DepthConfig
+from geogs.depth.sweep_neighbors import (
+    BEST_PARALLAX_DEG,
+    MAX_PARALLAX_DEG,
+    MIN_PARALLAX_DEG,
+)
 from geogs.geometry.camera import Camera
 from geogs.mapping.view_choice import (
     Sightings,
@@ -17,7 +21,6 @@ from geogs.mapping.view_choice import (
 )
 
 CAMERA = Camera(fx=100.0, fy=100.0, cx=79.5, cy=59.5, width=160, height=120)
-CONFIG = DepthConfig()
 
 
 def looking(centre: np.ndarray, yaw: float) -> np.ndarray:
@@ -63,8 +66,8 @@ def slow_order(seen: Sightings, sharpness: np.ndarray) -> list[int]:
                     continue
                 cosine = max(float(np.clip(ray @ o, -1, 1)) for o in others)
                 angle = np.degrees(np.arccos(cosine))
-                new = min(angle / CONFIG.parallax, 1.0)
-                if angle > CONFIG.max_parallax:
+                new = min(angle / BEST_PARALLAX_DEG, 1.0)
+                if angle > MAX_PARALLAX_DEG:
                     new = 1.0 if angle > 75.0 else 0.5
                 news.append(new)
                 gain += new / len(others)
@@ -81,7 +84,7 @@ def test_the_order_is_that_of_the_definition():
     rng = np.random.default_rng(3)
     T_cw = np.stack([looking(rng.uniform(-1, 1, 3), rng.uniform(-3, 3)) for _ in range(16)])
     seen, sharpness = seen_by(T_cw), rng.uniform(0.5, 1.0, 16)
-    order = list(coverage_order(seen, CONFIG, sharpness))
+    order = list(coverage_order(seen, sharpness))
     assert order == slow_order(seen, sharpness)
     assert len(order) == 16
 
@@ -97,11 +100,11 @@ def test_every_beginning_covers_what_as_many_evenly_spread_ones_do():
         for rows in map(slice, begin[:-1], begin[1:]):
             rays = seen.ray[rows][np.isin(seen.view[rows], views)].astype(np.float64)
             angles = np.degrees(np.arccos(np.clip(rays @ rays.T, -1, 1)))
-            apart = (angles > CONFIG.min_parallax) & (angles < CONFIG.max_parallax)
+            apart = (angles > MIN_PARALLAX_DEG) & (angles < MAX_PARALLAX_DEG)
             found.append(apart.any())
         return float(np.mean(found))
 
-    order = list(islice(coverage_order(seen, CONFIG, np.ones(100)), 20))
+    order = list(islice(coverage_order(seen, np.ones(100)), 20))
     for count, least in ((6, 0.4), (10, 0.7), (20, 0.97)):
         even = np.linspace(0, 99, count).astype(int).tolist()
         shares = measurable(order[:count]), measurable(even)
@@ -113,7 +116,7 @@ def test_every_beginning_covers_what_as_many_evenly_spread_ones_do():
 def test_copies_are_left_out_and_all_others_stay():
     T_cw = walk(40)
     rested = np.concatenate([T_cw, np.repeat(T_cw[7:8], 30, axis=0)])
-    order = list(coverage_order(seen_by(rested), CONFIG, np.ones(70)))
+    order = list(coverage_order(seen_by(rested), np.ones(70)))
     kept = {i if i < 40 else 7 for i in order}
     assert len(order) == 40
     assert kept == set(range(40))
@@ -121,7 +124,7 @@ def test_copies_are_left_out_and_all_others_stay():
 
 def test_a_camera_that_only_turns_adds_what_it_sees_anew():
     T_cw = np.stack([looking(np.zeros(3), 0.5 * i) for i in range(12)])
-    order = list(coverage_order(seen_by(T_cw), CONFIG, np.ones(12)))
+    order = list(coverage_order(seen_by(T_cw), np.ones(12)))
     assert len(order) > 6
 
 
@@ -132,7 +135,7 @@ def test_of_near_images_the_sharp_one_is_taken():
     detail[blurred & (np.arange(120) % 2 == 0)] = 500
     sharpness = relative_sharpness(T_cw, 2.0, detail.tolist())
     assert sharpness[detail == 1000].min() == 1.0
-    order = list(islice(coverage_order(seen_by(T_cw), CONFIG, sharpness), 30))
+    order = list(islice(coverage_order(seen_by(T_cw), sharpness), 30))
     assert np.mean(detail[order] == 500) < 0.1 < 0.3 < np.mean(detail == 500)
     assert relative_sharpness(T_cw[:3], 2.0, [1, 2, 3]).tolist() == [1, 1, 1]
 
@@ -151,7 +154,7 @@ def test_the_unit_of_the_world_does_not_matter(scale):
     typical = np.full(30, 2.0 * scale)
     points = scene_points(T_cw, CAMERA, typical, np.random.default_rng(0))
     assert 100 < len(points) <= 360
-    order = list(coverage_order(sightings(T_cw, CAMERA, typical, points), CONFIG, np.ones(30)))
+    order = list(coverage_order(sightings(T_cw, CAMERA, typical, points), np.ones(30)))
     assert len(order) == 30
 
 
@@ -159,5 +162,5 @@ def test_images_that_see_nothing_come_last():
     T_cw = walk(10)
     seen = seen_by(T_cw)
     blind = replace(seen, views=12)
-    order = list(coverage_order(blind, CONFIG, np.ones(12)))
+    order = list(coverage_order(blind, np.ones(12)))
     assert sorted(order[-2:]) == [10, 11]

@@ -51,7 +51,7 @@ class PosedViews:
         Raises:
             InputError: there is one image only, or hardly anything matches anywhere.
         """
-        source, config = self._source, self._scene.config
+        source = self._source
         if len(source) < 2:
             raise InputError("There is only 1 image; depth needs at least two.")
         if source.points is not None and len(source.points.positions) >= FEWEST_POINTS:
@@ -64,7 +64,7 @@ class PosedViews:
         places = [Place(i, T_cw) for i, T_cw in enumerate(source.T_cw)]
         with self._scene.stopwatch("first look"):
             return first_points(
-                places, image_at, source.camera, config.mapping.depth, config.search,
+                places, image_at, source.camera,
                 lambda fraction: self._report("first look", fraction),
             )  # fmt: skip
 
@@ -77,7 +77,7 @@ class PosedViews:
             self._seen = sightings(source.T_cw, source.camera, typical, shown)
             usual = float(np.median(typical))
             sharpness = relative_sharpness(source.T_cw, usual, source.stored_bytes())
-            order = coverage_order(self._seen, config.mapping.depth, sharpness)
+            order = coverage_order(self._seen, sharpness)
         self._order = islice(order, config.search.most_views)
 
     def give(self, count: int | None = None) -> None:

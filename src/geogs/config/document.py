@@ -16,7 +16,7 @@ Made from the classes in `src/geogs/config` by `python -m geogs.config.document`
 page to them.
 
 No setting is needed. On the command line a setting is an option with its dotted name
-(`--mapping.depth.neighbours 6`; a switch is turned off by `--mesh.no-colour`; numbers of a list
+(`--mapping.depth.planes 200`; a switch is turned off by `--mesh.no-colour`; numbers of a list
 have commas between them), from Python a field of the same name
 (`Config(mapping=MappingConfig(window=6))`). A value outside its range is refused when the settings
 are made. The settings of a result stand in its `config.yaml`.

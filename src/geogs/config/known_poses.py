@@ -35,10 +35,6 @@ class SearchConfig(Settings, group="search"):
     output_share: Annotated[float, Range(0, below=1)] = 0.2
     """Part of a given time that is kept for the mesh and the report until a few views have shown
     what these take."""
-    first_edge: Annotated[int, Range(16, 4096)] = 128
-    """First look at the scene: longer side of its images, pixels."""
-    first_views: Annotated[int, Range(1, 1000)] = 8
-    """First look: images whose depth is searched."""
     margin: Annotated[float, Range(1, 1000)] = 1.3
     """Factor by which searched depths go beyond those that are known."""
     repeat: Annotated[bool, Basic()] = True

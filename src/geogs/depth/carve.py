@@ -5,10 +5,19 @@ from collections.abc import Iterable
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int32
 
-from geogs.config import DepthConfig
 from geogs.depth.reprojection_kernels import relative_depths
 from geogs.depth.view import KeyframeDepth
 from geogs.geometry.camera import Camera
+
+VOTE_CONFIDENCE = 0.5
+"""Least confidence of a pixel that votes on points."""
+VOTE_SUPPORT = 0.04
+"""Relative distance from a depth within which a point lies on the surface."""
+VOTE_VIOLATION = 0.08
+"""Relative distance in front of a depth beyond which a point lies in free space: twice the former,
+so that neither is said in between."""
+VOTE_FREE_VIEWS = 2
+"""Fewest views in whose free space a point must lie to be removed: one may be wrong."""
 
 
 def look_up(
@@ -33,23 +42,22 @@ def count_votes(
     points: Float[np.ndarray, "n 3"],
     views: Iterable[tuple[Float64[np.ndarray, "4 4"], KeyframeDepth]],
     camera: Camera,
-    config: DepthConfig,
 ) -> tuple[Int32[np.ndarray, "n"], Int32[np.ndarray, "n"]]:
     """How many views see each world point on their surface, and how many in their free space.
 
     A view is its world-to-camera pose and its depth.
 
-    Only pixels with confidence above ``config.vote_confidence`` vote: for the surface within
-    ``config.vote_support`` of their depth, for free space if the point is more than
-    ``config.vote_violation`` in front of it (both relative).
+    Only pixels with confidence above ``VOTE_CONFIDENCE`` vote: for the surface within
+    ``VOTE_SUPPORT`` of their depth, for free space if the point is more than
+    ``VOTE_VIOLATION`` in front of it (both relative).
     """
     points = np.ascontiguousarray(points, np.float32)
     surface, free = np.zeros(len(points), np.int32), np.zeros(len(points), np.int32)
     for pose, depth in views:
         ratio, sure = look_up(points, pose, depth, camera)
-        votes = sure > config.vote_confidence
-        surface += votes & (np.abs(ratio - 1.0) < config.vote_support)
-        free += votes & (ratio < 1.0 - config.vote_violation)
+        votes = sure > VOTE_CONFIDENCE
+        surface += votes & (np.abs(ratio - 1.0) < VOTE_SUPPORT)
+        free += votes & (ratio < 1.0 - VOTE_VIOLATION)
     return surface, free
 
 
@@ -57,13 +65,12 @@ def vote(
     points: Float[np.ndarray, "n 3"],
     views: Iterable[tuple[Float64[np.ndarray, "4 4"], KeyframeDepth]],
     camera: Camera,
-    config: DepthConfig,
 ) -> Bool[np.ndarray, "n"]:
     """Which world points to keep: not those that at least two views, and more views than see them
     on their surface, see in free space; nor those that are not finite.
     """
     finite = np.isfinite(points).all(1)
-    surface, free = count_votes(points[finite], views, camera, config)
+    surface, free = count_votes(points[finite], views, camera)
     keep = np.zeros(len(points), bool)
-    keep[finite] = (free < config.vote_free_views) | (free <= surface)
+    keep[finite] = (free < VOTE_FREE_VIEWS) | (free <= surface)
     return keep

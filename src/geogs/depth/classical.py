@@ -10,7 +10,6 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from geogs.config import DepthConfig
 from geogs.depth.base import Limits, Progress, silent
 from geogs.depth.view import DenseDepth, DepthView, PosedDepth
 from geogs.geometry.camera import Camera
@@ -23,10 +22,11 @@ _FEW_VIEWS = 128
 class CpuDepthEngine:
     """The compiled CPU loops; keyframes, and the rows of one, are worked on side by side."""
 
-    def __init__(self, render: Camera, working: Camera, config: DepthConfig) -> None:
+    def __init__(self, render: Camera, working: Camera, planes: int) -> None:
+        """At most so many ``planes`` are swept."""
         self.render = render
         self.working = working
-        self.config = config
+        self.planes = planes
 
     def observe(self, view: DepthView) -> None:
         """As in the protocol; here nothing is kept."""
@@ -44,7 +44,7 @@ class CpuDepthEngine:
         def one(task: tuple[DepthView, Sequence[DepthView], Limits | None]) -> DenseDepth:
             reference, others, searched = task
             cameras = self.render, self.working
-            return DenseDepth.of(estimate_depth(reference, others, *cameras, self.config, searched))
+            return DenseDepth.of(estimate_depth(reference, others, *cameras, searched, self.planes))
 
         searched = limits or [None] * len(references)
         tasks = list(zip(references, neighbours, searched, strict=True))
@@ -62,7 +62,7 @@ class CpuDepthEngine:
                 return own.depth
             arrays, poses = [o.depth.arrays() for o in rest], [o.T_cw for o in rest]
             return DenseDepth.of(
-                check_depth(own.depth.arrays(), own.T_cw, arrays, poses, self.render, self.config)
+                check_depth(own.depth.arrays(), own.T_cw, arrays, poses, self.render)
             )
 
         return thread_map(one, list(zip(depths, others, strict=True)))
@@ -75,7 +75,7 @@ class CpuDepthEngine:
         if not 0 < len(depths) <= _FEW_VIEWS:
             # One view after the other, so that not all are in memory at once.
             views = ((d.T_cw, d.depth.arrays()) for d in depths)
-            return torch.from_numpy(vote(points.detach().numpy(), views, self.render, self.config))
+            return torch.from_numpy(vote(points.detach().numpy(), views, self.render))
         held = list(depths)
         poses = torch.from_numpy(np.stack([d.T_cw for d in held]))
         # No view has a say on the others, which may be most of a large map.
@@ -84,5 +84,5 @@ class CpuDepthEngine:
         if bool(seen.any()):
             some = points.detach()[seen].numpy()
             views = ((d.T_cw, d.depth.arrays()) for d in held)
-            kept[seen] = torch.from_numpy(vote(some, views, self.render, self.config))
+            kept[seen] = torch.from_numpy(vote(some, views, self.render))
         return kept

@@ -8,9 +8,18 @@ import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 from scipy.linalg import solveh_banded
 
-from geogs.config import DepthConfig
 from geogs.geometry.camera import Camera
 from geogs.world.grid import OFFSET, STRIDE
+
+DEVIATION_SCALE = 0.14
+"""Real over expected deviation of the tracker's inverse depth, as measured on rendered rooms."""
+BENDING = 0.02
+"""Second difference of inverse depth per cell, over its median, that is usual."""
+MEMBRANE = 0.3
+"""First difference of inverse depth per cell, over its median, that is usual: weak, as slanted
+surfaces are not flat."""
+EDGE_SHARPNESS = 48.0
+"""How fast smoothness falls with the image gradient (Lab, 0 to 1 per pixel)."""
 
 
 @dataclass(frozen=True)
@@ -29,24 +38,22 @@ def complete_inverse_depth(
     inverse_depth: Float32[np.ndarray, "gh gw"],
     information: Float32[np.ndarray, "gh gw"],
     image: UInt8[np.ndarray, "h w 3"],
-    config: DepthConfig,
 ) -> CompletedDepth:
     """Fit a smooth surface to the tracker's inverse depth, weighted by its information.
 
     Minimises sum rho((x - d) / s) + sum w (second differences)^2 + a weak sum w (differences)^2,
     by reweighted least squares with the Cauchy weight; w falls at image edges. s is the deviation
-    of inverse depth, ``config.sigma_scale`` / sqrt(information), plus 0.2 % of d. Cells without a
+    of inverse depth, ``DEVIATION_SCALE`` / sqrt(information), plus 0.2 % of d. Cells without a
     finite positive value or with no information get theirs from around them.
     """
-    smooth = edge_weights(image, inverse_depth.shape, config)
-    return complete_grid(inverse_depth, information, smooth, config)
+    smooth = edge_weights(image, inverse_depth.shape)
+    return complete_grid(inverse_depth, information, smooth)
 
 
 def complete_grid(
     inverse_depth: Float32[np.ndarray, "gh gw"],
     information: Float32[np.ndarray, "gh gw"],
     smooth: Float32[np.ndarray, "gh gw"],
-    config: DepthConfig,
 ) -> CompletedDepth:
     """``complete_inverse_depth`` with the weights of smoothness as ``edge_weights`` has them."""
     known = known_cells(inverse_depth, information)
@@ -57,8 +64,8 @@ def complete_grid(
     data = np.where(known, inverse_depth, typical).astype(np.float64)
     amount = np.where(known, information, 0.0).astype(np.float64)
     deviation = 1.0 / (data * np.sqrt(amount) + 1e-3)
-    scale = config.sigma_scale / np.sqrt(amount + 1e-9) + 0.002 * data
-    smoothness = _smoothness_bands(smooth, typical, config)
+    scale = DEVIATION_SCALE / np.sqrt(amount + 1e-9) + 0.002 * data
+    smoothness = _smoothness_bands(smooth, typical)
     weight = np.ones_like(data)
     for _ in range(4):
         precision = weight / scale**2
@@ -81,7 +88,7 @@ def known_cells(
 
 
 def edge_weights(
-    image: UInt8[np.ndarray, "h w 3"], shape: tuple[int, ...], config: DepthConfig
+    image: UInt8[np.ndarray, "h w 3"], shape: tuple[int, ...]
 ) -> Float32[np.ndarray, "gh gw"]:
     """exp(-sharpness |gradient of the Lab image|), the strongest within three pixels of a cell."""
     sharp = cv2.cvtColor(image, cv2.COLOR_RGB2LAB).astype(np.float32) * np.float32(1 / 255)
@@ -92,12 +99,10 @@ def edge_weights(
     edge = cv2.dilate(strongest, np.ones((7, 7), np.uint8))
     rows = np.minimum(OFFSET + STRIDE * np.arange(shape[0]), edge.shape[0] - 1)
     columns = np.minimum(OFFSET + STRIDE * np.arange(shape[1]), edge.shape[1] - 1)
-    return np.exp(-config.edge_sharpness * edge[np.ix_(rows, columns)])
+    return np.exp(-EDGE_SHARPNESS * edge[np.ix_(rows, columns)])
 
 
-def _smoothness_bands(
-    weight: Float32[np.ndarray, "gh gw"], typical: float, config: DepthConfig
-) -> np.ndarray:
+def _smoothness_bands(weight: Float32[np.ndarray, "gh gw"], typical: float) -> np.ndarray:
     """Lower bands, for ``solveh_banded``, of the smoothness term's normal matrix.
 
     Unknowns run down the columns of the grid (index = column * gh + row), which keeps the band
@@ -106,7 +111,7 @@ def _smoothness_bands(
     w = weight.astype(np.float64).T
     gw, gh = w.shape
     bands = np.zeros((2 * gh + 1, gw, gh))
-    bend, stretch = 1.0 / (config.bending * typical), 1.0 / (config.membrane * typical)
+    bend, stretch = 1.0 / (BENDING * typical), 1.0 / (MEMBRANE * typical)
     for axis, step in ((0, gh), (1, 1)):
         v = np.moveaxis(w, axis, 0)
         terms: list[tuple[tuple[float, ...], np.ndarray]] = [

@@ -20,8 +20,8 @@ def estimate_depth(
     neighbours: Sequence[DepthView],
     render: Camera,
     working: Camera,
-    config: DepthConfig,
     limits: tuple[float, float] | None = None,
+    most_planes: int = DepthConfig.planes,
 ) -> KeyframeDepth:
     """Dense depth of a keyframe from the tracker's grid and from matching with its neighbours.
 
@@ -32,19 +32,17 @@ def estimate_depth(
     releases the interpreter lock, so that several keyframes can be estimated at once in threads.
     """
     completed = complete_inverse_depth(
-        reference.inverse_depth, reference.information, reference.image, config
+        reference.inverse_depth, reference.information, reference.image
     )
-    prior = tracker_prior(completed, working, render, config)
+    prior = tracker_prior(completed, working, render)
     if not neighbours:
         return KeyframeDepth(1.0 / prior.inverse_depth, 0.5 * prior.weight)
-    near, far = limits or depth_range(reference, neighbours, working, config)
-    planes = sweep_planes(reference, neighbours, render, near, far, config)
-    sweep = plane_sweep(
-        reference, neighbours, render, planes, prior.inverse_depth, prior.weight, config
-    )
+    near, far = limits or depth_range(reference, neighbours, working)
+    planes = sweep_planes(reference, neighbours, render, near, far, most_planes)
+    sweep = plane_sweep(reference, neighbours, render, planes, prior.inverse_depth, prior.weight)
     start = choose_start(prior, sweep)
-    tracker = tracker_evidence(completed, working, render, config)
-    refined = refine_depth(reference, neighbours, render, working, start, tracker, config)
+    tracker = tracker_evidence(completed, working, render)
+    refined = refine_depth(reference, neighbours, render, working, start, tracker)
     refined.inverse_depth = np.clip(refined.inverse_depth, 0.5 / far, 2.0 / near)
     return KeyframeDepth(
         1.0 / refined.inverse_depth, depth_confidence(refined, sweep.margin, tracker)

@@ -5,11 +5,14 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float32
 
-from geogs.config import DepthConfig
 from geogs.depth.completion import CompletedDepth, upsample_grid
 from geogs.depth.plane_sweep import SweepResult
 from geogs.geometry.camera import Camera
 
+CONFIDENT_DEVIATION = 0.05
+"""Relative deviation at which the tracker is half sure."""
+TRACKER_SCALE = 0.2
+"""Real over expected relative deviation of the tracker's depth, as measured on rendered rooms."""
 UNKNOWN_DEVIATION = 10.0
 BEST_DEVIATION = 0.002
 """Relative deviation below which the tracker is not believed."""
@@ -25,43 +28,37 @@ class DepthEvidence:
     weight: Float32[np.ndarray, "h w"]
 
 
-def tracker_prior(
-    completed: CompletedDepth, working: Camera, render: Camera, config: DepthConfig
-) -> DepthEvidence:
+def tracker_prior(completed: CompletedDepth, working: Camera, render: Camera) -> DepthEvidence:
     """The completed depth, for the sweep, with ``prior_weight``."""
     return DepthEvidence(
         upsample_grid(completed.inverse_depth, working, render),
-        upsample_grid(prior_weight(completed, config), working, render),
+        upsample_grid(prior_weight(completed), working, render),
     )
 
 
-def prior_weight(completed: CompletedDepth, config: DepthConfig) -> Float32[np.ndarray, "gh gw"]:
-    """1 / (1 + (deviation / sure_deviation)^2) on the grid, 0 where the tracker was rejected."""
-    weight = 1.0 / (1.0 + (completed.deviation / np.float32(config.sure_deviation)) ** 2)
+def prior_weight(completed: CompletedDepth) -> Float32[np.ndarray, "gh gw"]:
+    """1 / (1 + (deviation / confident one)^2) on the grid, 0 where the tracker was rejected."""
+    weight = 1.0 / (1.0 + (completed.deviation / np.float32(CONFIDENT_DEVIATION)) ** 2)
     return np.where(completed.inlier, weight, np.float32(0.0))
 
 
-def tracker_evidence(
-    completed: CompletedDepth, working: Camera, render: Camera, config: DepthConfig
-) -> DepthEvidence:
+def tracker_evidence(completed: CompletedDepth, working: Camera, render: Camera) -> DepthEvidence:
     """The completed depth with its ``relative_precision`` as weight."""
     return DepthEvidence(
         upsample_grid(completed.inverse_depth, working, render),
-        upsample_grid(relative_precision(completed, config), working, render),
+        upsample_grid(relative_precision(completed), working, render),
     )
 
 
-def relative_precision(
-    completed: CompletedDepth, config: DepthConfig
-) -> Float32[np.ndarray, "gh gw"]:
+def relative_precision(completed: CompletedDepth) -> Float32[np.ndarray, "gh gw"]:
     """1 / sigma^2 on the grid.
 
-    sigma is ``config.tracker_scale`` times the deviation the tracker expects. Where inverse depth
+    sigma is ``TRACKER_SCALE`` times the deviation the tracker expects. Where inverse depth
     bends sharply between cells, interpolating makes a curtain from foreground to background: the
     weight falls to nothing there, as it does where the robust completion rejected the tracker.
     """
     deviation = np.where(completed.inlier, completed.deviation, np.float32(UNKNOWN_DEVIATION))
-    sigma = np.maximum(np.float32(config.tracker_scale) * deviation, np.float32(BEST_DEVIATION))
+    sigma = np.maximum(np.float32(TRACKER_SCALE) * deviation, np.float32(BEST_DEVIATION))
     return _flatness(completed.inverse_depth) ** 2 / sigma**2
 
 

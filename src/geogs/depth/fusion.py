@@ -5,7 +5,6 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float64
 
-from geogs.config import DepthConfig
 from geogs.depth.carve import look_up
 from geogs.depth.reprojection_kernels import agree_on_depth, splat_depth
 from geogs.depth.view import KeyframeDepth
@@ -23,6 +22,18 @@ WEIGHTS = (_BIAS, _OWN, _SUPPORT, _VIOLATION)
 SPLAT_CONFIDENCE = 0.5
 """Confidence from which pixels of other keyframes repair this one."""
 
+AVERAGE_REACH = 0.01
+"""Relative distance within which depths of several keyframes are averaged."""
+AGREEMENT_REACH = 0.015
+"""Relative distance within which another keyframe's depth supports a pixel."""
+VIOLATION_DISTANCE = 0.05
+"""Relative distance in front of another keyframe's depth that speaks against a pixel."""
+REPAIR_BELOW = 0.4
+"""Confidence below which a pixel takes the depth that others agree on."""
+REPAIR_VOTES = 1.0
+"""Sum of the others' confidences needed for that: more than one says it."""
+REPAIR_CONFIDENCE = 0.3
+"""Confidence of such a pixel before the others' votes are counted."""
 OCCLUSION_PENALTY = 0.7
 """Weight of a transferred depth that hides a candidate, against one that agrees with it."""
 
@@ -33,12 +44,11 @@ def check_depth(
     others: Sequence[KeyframeDepth],
     other_poses: Sequence[Float64[np.ndarray, "4 4"]],
     camera: Camera,
-    config: DepthConfig,
 ) -> KeyframeDepth:
     """A keyframe's depth repaired, averaged and judged by those of other keyframes.
 
     Unsure pixels on whose depth several others agree take it. Then each pixel's point is looked up
-    in the other views: surfaces within ``config.average_reach`` (relative, Gaussian) are averaged
+    in the other views: surfaces within ``AVERAGE_REACH`` (relative, Gaussian) are averaged
     by confidence; those near support the pixel; sure ones that are clearly behind the point violate
     it, since they see free space where it stands. Meant to be called once per estimate: votes
     counted twice make it surer than it is.
@@ -46,17 +56,17 @@ def check_depth(
     if not others:
         return depth
     T_wc = np.linalg.inv(T_cw)
-    depth = _repair(depth, T_wc, others, other_poses, camera, config)
+    depth = _repair(depth, T_wc, others, other_poses, camera)
     points = depth.depth.reshape(-1, 1) * camera.rays().numpy().reshape(-1, 3)
     shift, votes, support, violation = (np.zeros(len(points), np.float32) for _ in range(4))
     for other, pose in zip(others, other_poses, strict=True):
         ratio, sure = look_up(points, pose @ T_wc, other, camera)
         error = ratio - np.float32(1.0)
-        near = sure * np.exp(-0.5 * (error / np.float32(config.average_reach)) ** 2)
+        near = sure * np.exp(-0.5 * (error / np.float32(AVERAGE_REACH)) ** 2)
         shift += near * error
         votes += near
-        support += sure * np.exp(-0.5 * (error / np.float32(config.agreement_reach)) ** 2)
-        violation += sure * (error < -config.violation_distance)
+        support += sure * np.exp(-0.5 * (error / np.float32(AGREEMENT_REACH)) ** 2)
+        violation += sure * (error < -VIOLATION_DISTANCE)
     shape = depth.depth.shape
     averaged = depth.depth / (1.0 + shift / (votes + np.float32(0.5))).reshape(shape)
     own = np.clip(depth.confidence, 1e-3, 1.0 - 1e-3)
@@ -71,7 +81,6 @@ def _repair(
     others: Sequence[KeyframeDepth],
     other_poses: Sequence[Float64[np.ndarray, "4 4"]],
     camera: Camera,
-    config: DepthConfig,
 ) -> KeyframeDepth:
     """Unsure pixels replaced by what the sure pixels of the other views show there."""
     shape = (len(others), *depth.depth.shape)
@@ -87,9 +96,9 @@ def _repair(
             weight[j],
         )  # fmt: skip
     best, score = np.empty_like(depth.depth), np.empty_like(depth.depth)
-    reach, clearance = np.float32(config.agreement_reach), np.float32(config.violation_distance)
+    reach, clearance = np.float32(AGREEMENT_REACH), np.float32(VIOLATION_DISTANCE)
     agree_on_depth(seen, weight, reach, clearance, np.float32(OCCLUSION_PENALTY), best, score)
-    unsure = depth.confidence < config.repair_below
-    taken = unsure & (score > config.repair_votes)
-    confidence = np.where(taken, np.float32(config.repair_confidence), depth.confidence)
+    unsure = depth.confidence < REPAIR_BELOW
+    taken = unsure & (score > REPAIR_VOTES)
+    confidence = np.where(taken, np.float32(REPAIR_CONFIDENCE), depth.confidence)
     return KeyframeDepth(np.where(taken, best, depth.depth), confidence)

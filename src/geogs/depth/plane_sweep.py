@@ -7,11 +7,31 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from geogs.config import DepthConfig
 from geogs.depth import plane_sweep_kernels as kernels
 from geogs.depth.view import DepthView
 from geogs.geometry.camera import Camera
 from geogs.threads import over_rows, run_chunks, worker_count
+
+PLANE_STEP = 0.8
+"""Pixels that the median neighbour moves from plane to plane: no window steps over its match."""
+WINDOW = 3
+"""Side of the matching window in pixels: small, as like colours are averaged after it."""
+VARIANCE_FLOOR = 1e-5
+"""Grey variance (grey in 0 to 1) below which a window counts as without texture: noise."""
+SUPPORT_RADIUS = 3
+"""Pixels over which matching costs are averaged."""
+SUPPORT_SHARPNESS = 400.0
+"""How fast that average forgets pixels of another colour (RGB in 0 to 1, squared)."""
+PRIOR_PULL = 0.3
+"""Cost of a plane far from the tracker's depth where the tracker is sure."""
+PRIOR_TOLERANCE = 0.03
+"""Relative distance from the tracker's inverse depth at which the pull is full."""
+SMALL_JUMP = 0.1
+"""Semi-global matching: cost of a step by one plane, small, as slanted surfaces take many."""
+LARGE_JUMP = 1.5
+"""Semi-global matching: cost of a larger step where the image is flat."""
+JUMP_CONTRAST = 30.0
+"""Semi-global matching: how fast the large step gets cheaper with the grey difference."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,9 +51,12 @@ def sweep_planes(
     camera: Camera,
     near: float,
     far: float,
-    config: DepthConfig,
+    most: int,
 ) -> Float32[np.ndarray, "p"]:
-    """Inverse depths, equally spaced: the median neighbour moves ``config.plane_step`` pixels."""
+    """At most so many inverse depths, and at least half of them, equally spaced.
+
+    The median neighbour moves ``PLANE_STEP`` from one to the next.
+    """
     pixels = np.array([[x, y] for x in (0.1, 0.5, 0.9) for y in (0.1, 0.5, 0.9)])
     pixels = pixels * [camera.width, camera.height] - [camera.cx, camera.cy]
     rays = np.concatenate([pixels / [camera.fx, camera.fy], np.ones((len(pixels), 1))], 1)
@@ -46,8 +69,8 @@ def sweep_planes(
         p, q = (e[..., :2] / np.where(seen, e[..., 2], 1.0)[..., None] for e in ends)
         moved = np.linalg.norm((p - q) * [camera.fx, camera.fy], axis=2)
         shifts += [float(np.median(m[s])) for m, s in zip(moved, seen, strict=True) if s.any()]
-    steps = np.median(shifts[1:] or shifts) / config.plane_step
-    count = int(np.clip(np.ceil(steps), config.min_planes, config.max_planes))
+    steps = np.median(shifts[1:] or shifts) / PLANE_STEP
+    count = int(np.clip(np.ceil(steps), most // 2, most))
     return np.linspace(1.0 / far, 1.0 / near, count, dtype=np.float32)
 
 
@@ -58,7 +81,6 @@ def plane_sweep(
     planes: Float32[np.ndarray, "p"],
     prior: Float32[np.ndarray, "h w"],
     prior_weight: Float32[np.ndarray, "h w"],
-    config: DepthConfig,
 ) -> SweepResult:
     """Plane sweep with semi-global matching (Hirschmueller 2008) in eight directions.
 
@@ -67,14 +89,14 @@ def plane_sweep(
     and Kweon 2006), plus a bounded pull to the ``prior`` inverse depth where ``prior_weight`` (0 to
     1) is high.
     """
-    raw = matching_costs(reference, neighbours, camera, planes, config)
+    raw = matching_costs(reference, neighbours, camera, planes)
     size = (camera.width, camera.height)
     colours = cv2.resize(reference.image, size, interpolation=cv2.INTER_AREA)
     colours = colours.astype(np.float32) * np.float32(1 / 255)
     volume = np.empty_like(raw)
-    sharpness = np.float32(config.support_sharpness)
-    weight = np.float32(config.prior_pull) * prior_weight
-    tolerance, radius = np.float32(config.prior_tolerance), config.support_radius
+    sharpness = np.float32(SUPPORT_SHARPNESS)
+    weight = np.float32(PRIOR_PULL) * prior_weight
+    tolerance, radius = np.float32(PRIOR_TOLERANCE), SUPPORT_RADIUS
 
     def support(first: int, last: int) -> None:
         kernels.average_support(first, last, raw, colours, radius, sharpness, volume)
@@ -82,8 +104,8 @@ def plane_sweep(
 
     over_rows(support, len(volume))
     guide = cv2.GaussianBlur(reference.grey, (0, 0), 0.7)
-    small, large = np.float32(config.small_jump), np.float32(config.large_jump)
-    contrast = np.float32(config.jump_contrast)
+    small, large = np.float32(SMALL_JUMP), np.float32(LARGE_JUMP)
+    contrast = np.float32(JUMP_CONTRAST)
     totals = np.zeros(volume.shape, np.float32), np.zeros(volume.shape, np.float32)
     run_chunks(
         lambda k: kernels.aggregate_paths(
@@ -105,13 +127,13 @@ def matching_costs(
     neighbours: Sequence[DepthView],
     camera: Camera,
     planes: Float32[np.ndarray, "p"],
-    config: DepthConfig,
+    window: int = WINDOW,
 ) -> Float32[np.ndarray, "h w p"]:
     """Mean 1 - NCC of the better half (at least two) of the neighbours that see a point."""
-    radius, floor = config.window // 2, np.float32(config.variance_floor)
+    radius, floor = window // 2, np.float32(VARIANCE_FLOOR)
     grey = reference.grey - np.float32(0.5)
     images = np.stack([v.grey for v in neighbours]) - np.float32(0.5)
-    size = (config.window, config.window)
+    size = (window, window)
     mean = cv2.blur(grey, size, borderType=cv2.BORDER_REPLICATE)
     square = cv2.blur(grey * grey, size, borderType=cv2.BORDER_REPLICATE)
     scale = 1.0 / np.sqrt(np.maximum(square - mean * mean, 0.0) + floor)

@@ -7,15 +7,35 @@ import cv2
 import numpy as np
 from jaxtyping import Float32
 
-from geogs.config import DepthConfig
 from geogs.depth import refinement_kernels as kernels
 from geogs.depth.evidence import DepthEvidence
+from geogs.depth.plane_sweep import VARIANCE_FLOOR
 from geogs.depth.view import DepthView
 from geogs.geometry.camera import Camera
 from geogs.threads import over_rows
 
 PATCH_REACH = 2
 """Patches of 5 x 5 samples, one render pixel apart."""
+PATCH_CONTRAST = 200.0
+"""How fast a patch sample's weight falls with its grey difference, squared."""
+REFINE_STEPS = 3
+"""Photometric steps, each with a fit of local planes."""
+STEP_LIMIT = 0.03
+"""Largest step, relative to inverse depth: beyond it patches are no longer alike."""
+PHOTO_DEVIATION = 0.07
+"""Deviation of a photometric optimum times the root of its curvature, as measured."""
+FIT_RADIUS = 4
+"""Pixels around the centre that make the fit of a local plane."""
+FIT_DEVIATION = 0.01
+"""Relative deviation at which a pixel counts half in it."""
+FIT_TOLERANCE = 0.01
+"""Relative distance from the plane at which a pixel counts half in it."""
+FIT_STIFFNESS = 0.5
+"""Weight of the previous slopes in it, in sure pixels at distance 1."""
+GUIDE_CONTRAST = 200.0
+"""How fast a pixel's weight in it falls with its colour difference, squared."""
+PLANE_DEVIATION = 0.003
+"""Usual relative distance of a surface from local planes."""
 FLOOR_DEVIATION = 0.002
 """Relative deviation that no number of matches gets below (pose, calibration, resampling)."""
 FULL_SUPPORT = 5.0
@@ -54,7 +74,6 @@ def refine_depth(
     working: Camera,
     start: DepthEvidence,
     tracker: DepthEvidence,
-    config: DepthConfig,
 ) -> SlantedDepth:
     """Alternate photometric Gauss-Newton steps per pixel with bilateral plane fits.
 
@@ -62,43 +81,40 @@ def refine_depth(
     inverse depth is the precision-weighted mean of the photometric optimum, the tracker's value
     (``tracker.weight`` = relative precision, robust) and the local plane.
     """
-    patches = _gather_patches(reference, neighbours, render, working, config)
+    patches = _gather_patches(reference, neighbours, render, working)
     guide = _colour_guide(reference, render)
     rho = start.inverse_depth
     state = SlantedDepth(rho, *(np.zeros_like(rho) for _ in range(3)))
     sure = start.weight + np.float32(0.02)
-    for radius, tolerance in ((2, 0.05), (config.fit_radius, 0.03)):
-        _fit_planes(state, sure, guide, radius, tolerance, 0.0, config)
+    for radius, tolerance in ((2, 0.05), (FIT_RADIUS, 0.03)):
+        _fit_planes(state, sure, guide, radius, tolerance, 0.0)
     state.inverse_depth = rho.copy()
-    for _ in range(config.refine_steps):
-        photo_precision = _photometric_step(state, patches, config)
+    for _ in range(REFINE_STEPS):
+        photo_precision = _photometric_step(state, patches)
         rho = state.inverse_depth
         misfit = (tracker.inverse_depth / rho - 1.0) ** 2 * tracker.weight
         tracker_precision = tracker.weight / (1.0 + misfit / 4.0)
         precision = photo_precision + tracker_precision
         data = (photo_precision * rho + tracker_precision * tracker.inverse_depth) / precision
         state.inverse_depth = data
-        sure = 1.0 / (1.0 + 1.0 / (precision * np.float32(config.fit_deviation**2)))
+        sure = 1.0 / (1.0 + 1.0 / (precision * np.float32(FIT_DEVIATION**2)))
         sure += np.float32(1e-3)
-        tolerance, stiffness = config.fit_tolerance, config.fit_stiffness
-        _fit_planes(state, sure, guide, config.fit_radius, tolerance, stiffness, config)
+        _fit_planes(state, sure, guide, FIT_RADIUS, FIT_TOLERANCE, FIT_STIFFNESS)
         plane = np.minimum(state.support / np.float32(FULL_SUPPORT), np.float32(1.0))
-        plane *= np.float32(1.0 / config.plane_deviation**2)
+        plane *= np.float32(1.0 / PLANE_DEVIATION**2)
         state.inverse_depth = (precision * data + plane * state.inverse_depth) / (precision + plane)
     return state
 
 
-def _photometric_step(
-    state: SlantedDepth, patches: _Patches, config: DepthConfig
-) -> Float32[np.ndarray, "h w"]:
+def _photometric_step(state: SlantedDepth, patches: _Patches) -> Float32[np.ndarray, "h w"]:
     """Move ``state`` one bounded step; returns the relative precision of the optimum.
 
-    The deviation of a single optimum is measured to be ``config.photo_deviation`` over the square
+    The deviation of a single optimum is measured to be ``PHOTO_DEVIATION`` over the square
     root of the curvature (by relative inverse depth), whatever the likeness of the patches.
     """
     rho = state.inverse_depth
     step, curvature = np.empty_like(rho), np.empty_like(rho)
-    floor = np.float32(0.5 * config.variance_floor)
+    floor = np.float32(0.5 * VARIANCE_FLOOR)
     over_rows(
         lambda *rows: kernels.photometric_step(
             *rows, patches.samples, patches.offsets, patches.weights, patches.images, patches.a,
@@ -106,9 +122,9 @@ def _photometric_step(
         ),
         len(rho),
     )  # fmt: skip
-    limit = np.float32(config.step_limit) * rho
+    limit = np.float32(STEP_LIMIT) * rho
     state.inverse_depth = rho = rho + np.clip(step, -limit, limit)
-    variance = np.float32(config.photo_deviation**2) / (curvature * rho**2 + np.float32(1e-6))
+    variance = np.float32(PHOTO_DEVIATION**2) / (curvature * rho**2 + np.float32(1e-6))
     return 1.0 / (variance + np.float32(FLOOR_DEVIATION**2))
 
 
@@ -119,11 +135,10 @@ def _fit_planes(
     radius: int,
     tolerance: float,
     stiffness: float,
-    config: DepthConfig,
 ) -> None:
     """Replace ``state`` by the local planes."""
     rho, slope_x, slope_y = (np.empty_like(state.inverse_depth) for _ in range(3))
-    settings = [np.float32(x) for x in (config.guide_contrast, tolerance, stiffness)]
+    settings = [np.float32(x) for x in (GUIDE_CONTRAST, tolerance, stiffness)]
     over_rows(
         lambda *rows: kernels.fit_planes(
             *rows, state.inverse_depth, state.slope_x, state.slope_y, sure, guide, radius,
@@ -148,7 +163,6 @@ def _gather_patches(
     neighbours: Sequence[DepthView],
     render: Camera,
     working: Camera,
-    config: DepthConfig,
 ) -> _Patches:
     """The fine reference image around every render pixel; likeness to the centre as weight."""
     reach = np.arange(-PATCH_REACH, PATCH_REACH + 1, dtype=np.float32)
@@ -163,7 +177,7 @@ def _gather_patches(
         fine = cv2.remap(reference.fine, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         sample[:] = fine - np.float32(0.5)
     contrast = (samples - samples[len(samples) // 2]) ** 2
-    weights = 1.0 / (1.0 + np.float32(config.patch_contrast) * contrast)
+    weights = 1.0 / (1.0 + np.float32(PATCH_CONTRAST) * contrast)
     k, k_inverse = working.matrix().numpy(), np.linalg.inv(render.matrix().numpy())
     relative = [v.T_cw @ np.linalg.inv(reference.T_cw) for v in neighbours]
     return _Patches(

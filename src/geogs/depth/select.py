@@ -35,7 +35,7 @@ def depth_engine(
 
     trained = load_depth_network(find_weights("depth", config.weights))
     network = NetworkDepthEngine(
-        trained, classical, torch.device(device), render, working, config, resident
+        trained, classical, torch.device(device), render, working, resident
     )
     if engine == "network":
         return network
@@ -54,7 +54,7 @@ def _classical(
     if torch.device(device).type == "cuda":
         from geogs.depth.cuda.engine import CudaDepthEngine
 
-        return CudaDepthEngine(torch.device(device), render, working, config, resident)
+        return CudaDepthEngine(torch.device(device), render, working, resident, config.planes)
     from geogs.depth.classical import CpuDepthEngine
 
-    return CpuDepthEngine(render, working, config)
+    return CpuDepthEngine(render, working, config.planes)

@@ -5,10 +5,25 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float64
 
-from geogs.config import DepthConfig
 from geogs.depth.view import DepthView, Place
 from geogs.geometry.camera import Camera
 from geogs.world.grid import OFFSET, STRIDE
+
+NEIGHBOURS = 8
+"""Keyframes to match one with: more see it from farther aside."""
+BEST_PARALLAX_DEG = 6.0
+"""Best angle between the rays of two keyframes: smaller ones tell less, larger ones look less
+alike."""
+MIN_PARALLAX_DEG, MAX_PARALLAX_DEG = 1.0, 25.0
+"""Least and largest usable angle."""
+MAX_VIEW_ANGLE_DEG = 35.0
+"""Largest angle between viewing directions."""
+MAX_BASELINE_COSINE = 0.97
+"""Baselines closer to parallel than this are left to others where there is choice."""
+RANGE_MARGIN = 1.3
+"""Factor by which the searched depths go beyond what the tracker saw, which is not all."""
+RANGE_DEVIATION = 0.1
+"""Relative deviation below which the tracker's depth counts for the range."""
 
 
 def parallax_degrees(
@@ -37,11 +52,11 @@ def misfit(
 
 
 def select_sweep_neighbours(
-    reference: Place, candidates: Sequence[Place], depth: float, config: DepthConfig
+    reference: Place, candidates: Sequence[Place], depth: float, most: int = NEIGHBOURS
 ) -> list[int]:
-    """Indices of the at most ``config.neighbours`` best candidates, best first.
+    """Indices of the at most ``most`` best candidates, best first.
 
-    Good is a parallax near ``config.parallax`` degrees at ``depth`` (on a log scale) and a similar
+    Good is a parallax near ``BEST_PARALLAX_DEG`` at ``depth`` (on a log scale) and a similar
     viewing direction. Where there is choice, baselines point different ways, so that edges of any
     orientation can be matched. Too small or too large a parallax, or looking more than 35 degrees
     aside, excludes; if nobody is left, the two nearest to good are taken.
@@ -50,47 +65,47 @@ def select_sweep_neighbours(
     if len(others) == 0:
         return []
     parallax, turn = parallax_degrees(reference, [candidates[i] for i in others], depth)
-    usable = (config.min_parallax < parallax) & (parallax < config.max_parallax)
-    usable &= turn < config.max_turn
-    order = np.lexsort((misfit(parallax, turn, config.parallax), ~usable))
+    usable = (parallax > MIN_PARALLAX_DEG) & (parallax < MAX_PARALLAX_DEG)
+    usable &= turn < MAX_VIEW_ANGLE_DEG
+    order = np.lexsort((misfit(parallax, turn, BEST_PARALLAX_DEG), ~usable))
     ranked: list[int] = others[order].tolist()
     count = int(usable.sum())
     if count == 0:
         return ranked[:2]
     usable_ids = ranked[:count]
-    pool = usable_ids[: 3 * config.neighbours]
+    pool = usable_ids[: 3 * most]
     chosen: list[int] = []
     directions: list[np.ndarray] = []
-    spread = len(pool) >= 2 * config.neighbours
+    spread = len(pool) >= 2 * most
     for i in pool:
         baseline = candidates[i].center - reference.center
         baseline = baseline / np.linalg.norm(baseline)
-        if spread and any(baseline @ d > config.max_baseline_cosine for d in directions):
+        if spread and any(baseline @ d > MAX_BASELINE_COSINE for d in directions):
             continue
         chosen.append(i)
         directions.append(baseline)
     chosen += [i for i in pool if i not in chosen]
-    return chosen[: config.neighbours]
+    return chosen[:most]
 
 
 def depth_range(
-    reference: DepthView, others: Sequence[DepthView], working: Camera, config: DepthConfig
+    reference: DepthView, others: Sequence[DepthView], working: Camera
 ) -> tuple[float, float]:
     """Nearest and farthest depth to search in the reference view.
 
     From the surest half of what the tracker knows in this and the other views (and all whose
-    relative deviation is below ``config.range_deviation``), seen from the reference and widened by
-    ``config.range_margin`` on both sides. (0.1, 10) if the tracker knows next to nothing.
+    relative deviation is below ``RANGE_DEVIATION``), seen from the reference and widened by
+    ``RANGE_MARGIN`` on both sides. (0.1, 10) if the tracker knows next to nothing.
     """
-    inverse = seen_inverse_depth(reference, (reference, *others), working, config)
+    inverse = seen_inverse_depth(reference, (reference, *others), working)
     if len(inverse) < 8:
         return 0.1, 10.0
     low, high = np.percentile(inverse, [0.5, 99.5])
-    return float(1.0 / high / config.range_margin), float(1.0 / low * config.range_margin)
+    return float(1.0 / high / RANGE_MARGIN), float(1.0 / low * RANGE_MARGIN)
 
 
 def seen_inverse_depth(
-    reference: DepthView, views: Sequence[DepthView], working: Camera, config: DepthConfig
+    reference: DepthView, views: Sequence[DepthView], working: Camera
 ) -> Float64[np.ndarray, "n"]:
     """Inverse depths, in the reference view, of the views' sure cells that it can see."""
     grid = np.stack([v.inverse_depth for v in views]).astype(np.float64)
@@ -99,7 +114,7 @@ def seen_inverse_depth(
     z = 1.0 / np.where(known, grid, 1.0)
     deviation = z / np.sqrt(np.where(known, information, np.float32(1.0)))
     medians = [np.median(d[k]) if k.any() else 0.0 for d, k in zip(deviation, known, strict=True)]
-    limits = np.maximum(config.range_deviation, medians)
+    limits = np.maximum(RANGE_DEVIATION, medians)
     sure = known & (deviation <= limits[:, None, None])
     x = (OFFSET + STRIDE * np.arange(grid.shape[2]) - working.cx) / working.fx * z
     y = (OFFSET + STRIDE * np.arange(grid.shape[1])[:, None] - working.cy) / working.fy * z

@@ -6,22 +6,31 @@ one many pixels match. Of many images only those that are swept or matched are e
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float64, UInt8
 
-from geogs.config import DepthConfig, SearchConfig
 from geogs.depth.plane_sweep import SweepResult, plane_sweep
-from geogs.depth.sweep_neighbors import parallax_degrees, select_sweep_neighbours
+from geogs.depth.sweep_neighbors import (
+    MAX_PARALLAX_DEG,
+    MAX_VIEW_ANGLE_DEG,
+    MIN_PARALLAX_DEG,
+    parallax_degrees,
+    select_sweep_neighbours,
+)
 from geogs.depth.view import DepthView, Place
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.mapping.known_poses import FEWEST_POINTS
 from geogs.threads import thread_map
 
+EDGE = 128
+"""Longer side of the images, pixels: enough to see where the scene is."""
+IMAGES = 8
+"""Images whose depth is searched."""
 # A sweep around a distance d goes from d / NEAR to d * FAR; the next distance is RATIO times d.
 _NEAR, _FAR, _RATIO = 3.0, 6.0, 2.5
 # Parallax in degrees of the nearest two cameras at the first distance, of the farthest at the last.
@@ -64,8 +73,6 @@ def first_points(
     places: Sequence[Place],
     image_at: Callable[[int], SmallImage],
     working: Camera,
-    config: DepthConfig,
-    search: SearchConfig,
     progress: Callable[[float], None],
 ) -> Float64[np.ndarray, "n 3"]:
     """Points of the scene that some of the images show without doubt, in the world.
@@ -76,15 +83,13 @@ def first_points(
         places: where the images were taken; their ids are their places in this sequence.
         image_at: reads an image by its id.
         working: the camera of the images, of any size.
-        config: how planes are swept.
-        search: how many images, and how large.
         progress: called with the finished fraction.
 
     Raises:
         InputError: hardly anything matches anywhere.
     """
-    look = _FirstLook(places, image_at, working, config, search)
-    chosen = _spread(len(places), search.first_views)
+    look = _FirstLook(places, image_at, working)
+    chosen = _spread(len(places), IMAGES)
     scouts = [chosen[i] for i in _spread(len(chosen), _SCOUTS)]
     distances = distances_to_try([places[i] for i in _spread(len(places), _CANDIDATES)])
     tasks = [(i, float(d)) for d in distances for i in scouts]
@@ -136,14 +141,11 @@ class _FirstLook:
         places: Sequence[Place],
         image_at: Callable[[int], SmallImage],
         working: Camera,
-        config: DepthConfig,
-        search: SearchConfig,
     ) -> None:
         self._places = places
         self._image_at = image_at
-        edge = min(search.first_edge, max(working.width, working.height))
+        edge = min(EDGE, max(working.width, working.height))
         self._camera = working.with_long_edge(edge)
-        self._config = config
         self._small: dict[int, tuple[DepthView, Bool[np.ndarray, "h w"]]] = {}
 
     def points(
@@ -157,7 +159,7 @@ class _FirstLook:
             if others
         }
         clear = thread_map(
-            lambda look: _clear_matches(look, self._camera, self._config),
+            lambda look: _clear_matches(look, self._camera),
             list(looks.values()),
             progress,
         )
@@ -190,26 +192,27 @@ class _FirstLook:
 
     def _matched_at(self, index: int, distance: float) -> list[int]:
         """Images to match one with at a distance; none where none is well placed for it."""
-        config, reference = replace(self._config, neighbours=_NEIGHBOURS), self._places[index]
+        reference = self._places[index]
         others = [p for p in self._places if p.id != reference.id]
         if not others:
             return []
         parallax, turn = parallax_degrees(reference, others, distance)
-        usable = (parallax > config.min_parallax) & (parallax < config.max_parallax)
-        usable &= turn < config.max_turn
+        usable = (parallax > MIN_PARALLAX_DEG) & (parallax < MAX_PARALLAX_DEG)
+        usable &= turn < MAX_VIEW_ANGLE_DEG
         others = [p for p, good in zip(others, usable, strict=True) if good]
         if len(others) < min(2, len(self._places) - 1):
             return []
-        return [others[i].id for i in select_sweep_neighbours(reference, others, distance, config)]
+        chosen = select_sweep_neighbours(reference, others, distance, _NEIGHBOURS)
+        return [others[i].id for i in chosen]
 
 
-def _clear_matches(look: _Look, camera: Camera, config: DepthConfig) -> Float64[np.ndarray, "n 3"]:
+def _clear_matches(look: _Look, camera: Camera) -> Float64[np.ndarray, "n 3"]:
     """World points of the pixels with one good match inside the swept range."""
     low, high = 1.0 / (_FAR * look.distance), _NEAR / look.distance
     planes = np.linspace(low, high, _PLANES, dtype=np.float32)
     nothing = np.zeros_like(look.reference.grey)
     swept = plane_sweep(
-        look.reference, look.neighbours, camera, planes, nothing + planes[0], nothing, config
+        look.reference, look.neighbours, camera, planes, nothing + planes[0], nothing
     )
     v, u = np.nonzero(_is_clear(swept, low, high) & look.mask)
     local = camera.rays(torch.float64).numpy()[v, u] / swept.inverse_depth[v, u, None]

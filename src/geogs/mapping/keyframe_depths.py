@@ -1,6 +1,6 @@
 """The dense depths of a mapper's keyframes: searched, measured, and checked by those around."""
 
-from geogs.config import DepthConfig, DepthSensorConfig
+from geogs.config import DepthSensorConfig
 from geogs.depth.base import DepthEngine, Progress, silent
 from geogs.depth.sensor import joined
 from geogs.depth.sweep_neighbors import select_sweep_neighbours
@@ -24,7 +24,6 @@ class KeyframeDepths:
         self,
         engine: DepthEngine,
         views: dict[int, MapView],
-        config: DepthConfig,
         pool: ViewPool,
         sensor: DepthSensorConfig | None = None,
     ) -> None:
@@ -32,7 +31,6 @@ class KeyframeDepths:
         self.engine = engine
         self.views = views
         self._near = NearViews(views)
-        self.config = config
         self.pool = pool
 
     def estimate(self, views: list[MapView], progress: Progress = silent) -> None:
@@ -52,7 +50,7 @@ class KeyframeDepths:
             depth = view.tracked_depth if view.search is None else view.search.typical
             candidates = self._near.around(view, self.views, CANDIDATES)
             places = [v.place for v in candidates]
-            chosen = select_sweep_neighbours(view.place, places, depth, self.config)
+            chosen = select_sweep_neighbours(view.place, places, depth)
             neighbours.append([candidates[i].depth_view for i in chosen])
         depths = self.engine.estimate(references, neighbours, progress, limits)
         for view, dense in zip(views, depths, strict=True):
@@ -80,5 +78,5 @@ class KeyframeDepths:
         known = [v for v in around if v.has_depth and v.id != view.id]
         places = [v.place for v in known]
         depth = view.typical_depth
-        chosen = select_sweep_neighbours(view.place, places, depth, self.config)
+        chosen = select_sweep_neighbours(view.place, places, depth)
         return [known[i] for i in chosen[:CHECKING_VIEWS]]

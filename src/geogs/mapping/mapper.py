@@ -96,7 +96,7 @@ class Mapper:
         )
         self.views: dict[int, MapView] = {}
         self.pool = ViewPool(self.cameras, config.loss, self.map.device, keyframes.resident)
-        self._depths = KeyframeDepths(engine, self.views, config.depth, self.pool, sensor)
+        self._depths = KeyframeDepths(engine, self.views, self.pool, sensor)
         self.mapped: list[int] = []
         self._near = NearViews(self.views)
         self.trained = TrainingPlace()

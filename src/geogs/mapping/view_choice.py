@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
-from geogs.config import DepthConfig
+from geogs.depth.sweep_neighbors import BEST_PARALLAX_DEG, MAX_PARALLAX_DEG
 from geogs.geometry.camera import Camera
 
 # Rays by which each image says where the scene is, across and down.
@@ -89,15 +89,11 @@ def sightings(
     return Sightings(all_points, all_views, np.concatenate(ray)[by_point], len(T_cw))
 
 
-def coverage_order(
-    seen: Sightings, config: DepthConfig, sharpness: Float64[np.ndarray, "v"]
-) -> Iterator[int]:
+def coverage_order(seen: Sightings, sharpness: Float64[np.ndarray, "v"]) -> Iterator[int]:
     """Places of the images, the one that adds most first; copies of chosen ones are left out.
 
     Args:
         seen: which points the images see.
-        config: its ``parallax`` is the best angle between rays, ``max_parallax`` the largest that
-            matches.
         sharpness: by which the worth of each image is multiplied, at most 1.
     """
     points = int(seen.point.max(initial=-1)) + 1
@@ -125,7 +121,7 @@ def coverage_order(
         own_ray = np.repeat(seen.ray[rows], sizes, axis=0)
         cosine = np.einsum("ni,ni->n", seen.ray[rivals], own_ray)
         nearest[rivals] = np.maximum(nearest[rivals], cosine)
-        now = _newness(nearest[rivals], config)
+        now = _newness(nearest[rivals])
         value = now * np.repeat(_worth(count[some]), sizes)
         of = seen.view[rivals]
         fresh += np.bincount(of, now - newness[rivals], seen.views)
@@ -133,11 +129,11 @@ def coverage_order(
         newness[rivals], worth[rivals] = now, value
 
 
-def _newness(cosine: Float32[np.ndarray, "*n"], config: DepthConfig) -> Float64[np.ndarray, "*n"]:
+def _newness(cosine: Float32[np.ndarray, "*n"]) -> Float64[np.ndarray, "*n"]:
     """How much a ray at an angle to the nearest chosen one tells: nothing if it is the same."""
     angle = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
-    matched = np.minimum(angle / config.parallax, 1.0)
-    matched = np.where(angle > config.max_parallax, _UNMATCHED, matched)
+    matched = np.minimum(angle / BEST_PARALLAX_DEG, 1.0)
+    matched = np.where(angle > MAX_PARALLAX_DEG, _UNMATCHED, matched)
     return np.where(angle > _SAME_SIDE, 1.0, matched).astype(np.float64)
 
 

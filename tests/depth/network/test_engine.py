@@ -9,13 +9,14 @@ import torch
 from depth_scene import RENDER, WORKING, DepthScene, make_scene, trace
 from geogs.config import DepthConfig
 from geogs.depth.base import DepthEngine
+from geogs.depth.network import engine as network_engine
 from geogs.depth.network.engine import resampled
 from geogs.depth.network.search_range import RATIO, search_range
 from geogs.depth.select import depth_engine
 from geogs.depth.view import PosedDepth
 from geogs.geometry.depth import normals_from_depth
 
-CONFIG = DepthConfig(engine="network", network_edge=192)
+CONFIG = DepthConfig(engine="network")
 
 
 @pytest.fixture(scope="module")
@@ -25,7 +26,9 @@ def scene() -> DepthScene:
 
 @pytest.fixture(scope="module")
 def engine() -> DepthEngine:
-    return depth_engine("cpu", RENDER, WORKING, CONFIG, 8)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(network_engine, "EDGE", 192)
+        return depth_engine("cpu", RENDER, WORKING, CONFIG, 8)
 
 
 @pytest.fixture(scope="module")

@@ -9,6 +9,7 @@ import torch
 
 from depth_scene import RENDER, WORKING, make_scene
 from geogs.config import DepthConfig
+from geogs.depth.network import engine as network_engine
 from geogs.depth.network.joint import AGREE, APART, REACH, joined
 from geogs.depth.select import depth_engine
 from geogs.depth.view import DenseDepth
@@ -62,11 +63,11 @@ def test_two_depths_are_joined_as_a_loop_does():
 
 
 @pytest.mark.system
-def test_together_they_are_as_good_as_the_better_one():
+def test_together_they_are_as_good_as_the_better_one(monkeypatch):
+    monkeypatch.setattr(network_engine, "EDGE", 96)
     scene, errors = make_scene(), {}
     for name in ("classical", "network", "joint"):
-        config = DepthConfig(engine=name, network_edge=96)
-        engine = depth_engine("cpu", RENDER, WORKING, config, 8)
+        engine = depth_engine("cpu", RENDER, WORKING, DepthConfig(engine=name), 8)
         found = engine.estimate([scene.views[0]], [scene.views[1:3]])[0]
         errors[name] = np.abs(found.depth.numpy() / scene.truth[0] - 1)
     assert np.median(errors["joint"]) < 1.5 * np.median(errors["classical"])

@@ -26,7 +26,7 @@ QUICK = Config(
     tracking=TrackingConfig(init_keyframes=5),
     mapping=MappingConfig(
         render_long_edge=64, iterations=1, pose_iterations=0,
-        depth=DepthConfig(min_planes=16, max_planes=32),
+        depth=DepthConfig(planes=32),
     ),
 )  # fmt: skip
 
@@ -78,7 +78,7 @@ def test_two_videos_of_a_place_make_one_map(small_room, tmp_path):
         "run", *map(str, parts), "-o", str(tmp_path / "out"), "--intrinsics", intrinsics,
         "--preset", "fast", "--tracking.init-keyframes", "6", "--mapping.render-long-edge", "64",
         "--mapping.iterations", "1", "--mapping.final-iterations", "5", "--device", "cpu",
-        "--mapping.depth.min-planes", "16", "--mapping.depth.max-planes", "32",
+        "--mapping.depth.planes", "32",
     ]  # fmt: skip
     assert cli.main(argv) == 0
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())

@@ -9,8 +9,7 @@ import torch
 from jaxtyping import Bool, Float32, Int64
 from torch import Tensor
 
-from geogs.config import DepthConfig
-from geogs.depth import fusion
+from geogs.depth import carve, fusion
 from geogs.depth.cuda.images import transforms, upload
 from geogs.depth.view import PosedDepth
 from geogs.geometry.camera import Camera
@@ -21,16 +20,14 @@ VOTERS_TOGETHER = 256
 """Views that vote in one launch."""
 
 
-def check(
-    own: PosedDepth, others: Sequence[PosedDepth], camera: Camera, config: DepthConfig
-) -> tuple[Tensor, Tensor]:
+def check(own: PosedDepth, others: Sequence[PosedDepth], camera: Camera) -> tuple[Tensor, Tensor]:
     """Depth and confidence of a keyframe as revised by those of others (``check_depth``)."""
     depth, confidence = own.depth.depth, own.depth.confidence
     (h, w), n, device = depth.shape, len(others), depth.device
     to_others = np.stack([o.T_cw for o in others]) @ np.linalg.inv(own.T_cw)
     both = np.stack([transforms(to_others), transforms(np.linalg.inv(to_others))])
     matrices, maps = upload(both, device), upload(_addresses(others), device)
-    settings = upload(np.array(CheckSettings.of(config), np.float32), device)
+    settings = upload(np.array(CHECK, np.float32), device)
     lens, kernels = (camera.fx, camera.fy, camera.cx, camera.cy), kernels_for(SOURCE, device)
     seen = torch.full((n, h, w), -1, dtype=torch.int64, device=device)
     kernels["splat_depths"](
@@ -49,7 +46,6 @@ def vote(
     points: Float32[Tensor, "n 3"],
     depths: Sequence[PosedDepth],
     camera: Camera,
-    config: DepthConfig,
 ) -> Bool[Tensor, "n"]:
     """World points that do not stand in the free space of the views (``carve.vote``).
 
@@ -64,8 +60,8 @@ def vote(
         kernels_for(SOURCE, device)["vote_on_points"](
             -(-len(points) // 128), 128, points, upload(_addresses(held), device), matrices,
             len(points), len(held), *held[0].depth.depth.shape, camera.fx, camera.fy, camera.cx,
-            camera.cy, config.vote_confidence, config.vote_support, config.vote_violation,
-            config.vote_free_views, votes, keep,
+            camera.cy, carve.VOTE_CONFIDENCE, carve.VOTE_SUPPORT, carve.VOTE_VIOLATION,
+            carve.VOTE_FREE_VIEWS, votes, keep,
         )  # fmt: skip
     return keep
 
@@ -92,10 +88,9 @@ class CheckSettings(NamedTuple):
     support: float
     violation: float
 
-    @staticmethod
-    def of(c: DepthConfig) -> "CheckSettings":
-        """Those of the check, and the weights of its logistic regression."""
-        return CheckSettings(
-            c.average_reach, c.agreement_reach, c.violation_distance, c.repair_below,
-            c.repair_votes, c.repair_confidence, fusion.OCCLUSION_PENALTY, *fusion.WEIGHTS,
-        )  # fmt: skip
+
+CHECK = CheckSettings(
+    fusion.AVERAGE_REACH, fusion.AGREEMENT_REACH, fusion.VIOLATION_DISTANCE, fusion.REPAIR_BELOW,
+    fusion.REPAIR_VOTES, fusion.REPAIR_CONFIDENCE, fusion.OCCLUSION_PENALTY, *fusion.WEIGHTS,
+)  # fmt: skip
+"""Those of the check, and the weights of its logistic regression."""

@@ -9,8 +9,7 @@ import torch
 from jaxtyping import Float32
 from torch import Tensor
 
-from geogs.config import DepthConfig
-from geogs.depth import evidence
+from geogs.depth import completion, evidence
 from geogs.depth.cuda.images import upload
 from geogs.gpu.kernels import kernels_for
 
@@ -40,7 +39,7 @@ def can_complete(shape: tuple[int, ...], device: torch.device) -> bool:
 
 
 def complete(
-    grids: Float32[Tensor, "k 3 gh gw"], typical: Sequence[float], config: DepthConfig
+    grids: Float32[Tensor, "k 3 gh gw"], typical: Sequence[float]
 ) -> Float32[Tensor, "k 3 gh gw"]:
     """Completed inverse depth, ``prior_weight`` and ``relative_precision`` of some keyframes.
 
@@ -54,7 +53,7 @@ def complete(
     window, padded = _window(minors), -(-gh * gw // _PANEL) * _PANEL
     scratch = grids.new_empty(count * padded * (12 + window), dtype=torch.float64)
     out = torch.empty_like(grids)
-    settings = upload(np.array(CompletionSettings.of(config), np.float32), grids.device)
+    settings = upload(np.array(CompletionSettings(), np.float32), grids.device)
     kernels_for(SOURCE, grids.device)["complete_grids"](
         count, 32 * _PANEL, grids, upload(np.array(typical, np.float32), grids.device),
         settings, minors, majors, *strides, padded, window - _PANEL, scratch, out,
@@ -66,18 +65,11 @@ def complete(
 class CompletionSettings(NamedTuple):
     """The struct of this name in ``completion.cu``."""
 
-    sigma_scale: float
-    bending: float
-    membrane: float
-    sure_deviation: float
-    tracker_scale: float
+    sigma_scale: float = completion.DEVIATION_SCALE
+    bending: float = completion.BENDING
+    membrane: float = completion.MEMBRANE
+    sure_deviation: float = evidence.CONFIDENT_DEVIATION
+    tracker_scale: float = evidence.TRACKER_SCALE
     unknown_deviation: float = evidence.UNKNOWN_DEVIATION
     best_deviation: float = evidence.BEST_DEVIATION
     kink: float = evidence.KINK
-
-    @staticmethod
-    def of(c: DepthConfig) -> "CompletionSettings":
-        """Those of the completion, and constants of the evidence made from it."""
-        return CompletionSettings(
-            c.sigma_scale, c.bending, c.membrane, c.sure_deviation, c.tracker_scale
-        )

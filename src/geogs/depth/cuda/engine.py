@@ -10,7 +10,6 @@ import torch
 from jaxtyping import Bool, Float, Float32
 from torch import Tensor
 
-from geogs.config import DepthConfig
 from geogs.depth.base import Limits, Progress, silent
 from geogs.depth.completion import complete_grid, edge_weights, known_cells
 from geogs.depth.cuda.check import check, vote
@@ -55,13 +54,13 @@ class CudaDepthEngine:
         device: torch.device,
         render: Camera,
         working: Camera,
-        config: DepthConfig,
         resident: int,
+        planes: int,
     ) -> None:
         self.device = device
         self.render = render
         self.working = working
-        self.config = config
+        self.planes = planes
         self._places = PixelPlaces.of(render, working, device)
         self._images: LruCache[int, KeyframeImages] = LruCache(
             resident, lambda id, _: self._edges.pop(id, None)
@@ -74,7 +73,7 @@ class CudaDepthEngine:
         """As in the protocol: threads prepare its images."""
         shape = view.inverse_depth.shape
         self._pixels[view.id] = self._threads.submit(image_pixels, view)
-        self._edges[view.id] = self._threads.submit(edge_weights, view.image, shape, self.config)
+        self._edges[view.id] = self._threads.submit(edge_weights, view.image, shape)
 
     def estimate(
         self,
@@ -107,7 +106,7 @@ class CudaDepthEngine:
         for own, rest in zip(depths, others, strict=True):
             result = own.depth
             if rest:
-                depth, confidence = check(own, rest, self.render, self.config)
+                depth, confidence = check(own, rest, self.render)
                 result = replace(result, depth=depth, confidence=confidence)
             checked.append(result)
         return checked
@@ -117,7 +116,7 @@ class CudaDepthEngine:
         points = points.detach().float().contiguous()
         if not depths:
             return torch.isfinite(points).all(1)
-        return vote(points, depths, self.render, self.config)
+        return vote(points, depths, self.render)
 
     def _images_of(self, view: DepthView) -> KeyframeImages:
         """The images on the GPU, brought there at their first use."""
@@ -138,8 +137,8 @@ class CudaDepthEngine:
         grids = grids.astype(np.float32)
         if not neighbours:
             return SearchPlan(grids, typical, 0.0, 0.0, np.empty(0, np.float32))
-        near, far = limits or depth_range(reference, neighbours, self.working, self.config)
-        planes = sweep_planes(reference, neighbours, self.render, near, far, self.config)
+        near, far = limits or depth_range(reference, neighbours, self.working)
+        planes = sweep_planes(reference, neighbours, self.render, near, far, self.planes)
         if len(planes) > MAX_PLANES:
             planes = np.linspace(planes[0], planes[-1], MAX_PLANES, dtype=np.float32)
         return SearchPlan(grids, typical, near, far, planes)
@@ -148,12 +147,9 @@ class CudaDepthEngine:
         """The tracker's completed inverse depth, its prior weight and its relative precision."""
         grids, typical = np.stack([p.grids for p in plans]), [p.typical for p in plans]
         if min(typical) > 0 and can_complete(grids.shape[2:], self.device):
-            return complete(upload(grids, self.device), typical, self.config)
-        completed = [complete_grid(g[0], g[1], g[2], self.config) for g in grids]
-        evidence = [
-            (c.inverse_depth, prior_weight(c, self.config), relative_precision(c, self.config))
-            for c in completed
-        ]
+            return complete(upload(grids, self.device), typical)
+        completed = [complete_grid(g[0], g[1], g[2]) for g in grids]
+        evidence = [(c.inverse_depth, prior_weight(c), relative_precision(c)) for c in completed]
         return upload(np.array(evidence, np.float32), self.device)
 
     def _search(
@@ -164,7 +160,7 @@ class CudaDepthEngine:
         grids: Float32[Tensor, "3 gh gw"],
     ) -> tuple[Tensor, Tensor]:
         """Depth and confidence of one keyframe."""
-        config, device, own = self.config, self.device, self._images_of(reference)
+        device, own = self.device, self._images_of(reference)
         tracker = TrackerMaps.of(grids, self._places)
         if not neighbours:
             return 1.0 / tracker.inverse_depth, 0.5 * tracker.prior_weight
@@ -173,10 +169,10 @@ class CudaDepthEngine:
         finely = homographies(reference, neighbours, self.render, self.working)
         swept = sweep(
             own, torch.stack([o.grey for o in others]), upload(across, device),
-            PlaneSlots.of(plan.planes, device), tracker.inverse_depth, tracker.prior_weight, config,
+            PlaneSlots.of(plan.planes, device), tracker.inverse_depth, tracker.prior_weight,
         )  # fmt: skip
         refined = refine(
             own, torch.stack([o.fine for o in others]), upload(finely, device), self._places,
-            *choose_start(tracker, swept), tracker, config,
+            *choose_start(tracker, swept), tracker,
         )  # fmt: skip
         return judge(refined, swept.margin, tracker, plan.near, plan.far)

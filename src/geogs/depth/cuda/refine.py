@@ -8,11 +8,25 @@ import torch
 from jaxtyping import Float32
 from torch import Tensor
 
-from geogs.config import DepthConfig
 from geogs.depth.confidence import WEIGHTS
 from geogs.depth.cuda.images import KeyframeImages, upload
 from geogs.depth.cuda.sweep import SweptDepth
-from geogs.depth.refinement import FLOOR_DEVIATION, FULL_SUPPORT, PATCH_REACH
+from geogs.depth.plane_sweep import VARIANCE_FLOOR
+from geogs.depth.refinement import (
+    FIT_DEVIATION,
+    FIT_RADIUS,
+    FIT_STIFFNESS,
+    FIT_TOLERANCE,
+    FLOOR_DEVIATION,
+    FULL_SUPPORT,
+    GUIDE_CONTRAST,
+    PATCH_CONTRAST,
+    PATCH_REACH,
+    PHOTO_DEVIATION,
+    PLANE_DEVIATION,
+    REFINE_STEPS,
+    STEP_LIMIT,
+)
 from geogs.geometry.camera import Camera
 from geogs.gpu.kernels import kernels_for
 from geogs.world.grid import OFFSET, STRIDE
@@ -101,7 +115,6 @@ def photometric_step(
     images: Float32[Tensor, "n fh fw"],
     homographies: Float32[Tensor, "n 12"],
     tracker: TrackerMaps,
-    config: DepthConfig,
 ) -> tuple[Tensor, Tensor]:
     """Move ``state`` one step, averaged with the tracker; returns precision and plane weight."""
     h, w = state.inverse_depth.shape
@@ -109,8 +122,8 @@ def photometric_step(
     kernels_for(SOURCE, samples.device)["photometric_step"](
         (-(-w // 32), h), (32, len(images)), samples, images, homographies, state.inverse_depth,
         state.slope_x, state.slope_y, tracker.inverse_depth, tracker.precision, h, w,
-        *images.shape[1:], config.patch_contrast, 0.5 * config.variance_floor, config.step_limit,
-        config.photo_deviation**2, FLOOR_DEVIATION**2, config.fit_deviation**2, data, precision,
+        *images.shape[1:], PATCH_CONTRAST, 0.5 * VARIANCE_FLOOR, STEP_LIMIT,
+        PHOTO_DEVIATION**2, FLOOR_DEVIATION**2, FIT_DEVIATION**2, data, precision,
         sure,
     )  # fmt: skip
     state.inverse_depth = data
@@ -124,7 +137,6 @@ def fit_planes(
     radius: int,
     tolerance: float,
     stiffness: float,
-    config: DepthConfig,
     precision: Float32[Tensor, "h w"] | None = None,
 ) -> None:
     """Replace ``state`` by local planes, averaged with it by ``precision`` if that is given."""
@@ -132,8 +144,8 @@ def fit_planes(
     out = [torch.empty_like(sure) for _ in range(4)]
     kernels_for(SOURCE, sure.device)["fit_planes"](
         (-(-w // 32), -(-h // 4)), (32, 4), state.inverse_depth, state.slope_x, state.slope_y,
-        sure, colours, precision, h, w, radius, config.guide_contrast, tolerance, stiffness,
-        FULL_SUPPORT, 1.0 / config.plane_deviation**2, *out,
+        sure, colours, precision, h, w, radius, GUIDE_CONTRAST, tolerance, stiffness,
+        FULL_SUPPORT, 1.0 / PLANE_DEVIATION**2, *out,
     )  # fmt: skip
     state.inverse_depth, state.slope_x, state.slope_y, state.support = out
 
@@ -146,20 +158,19 @@ def refine(
     rho: Float32[Tensor, "h w"],
     sure: Float32[Tensor, "h w"],
     tracker: TrackerMaps,
-    config: DepthConfig,
 ) -> SlantedMaps:
     """``refine_depth`` from the inverse depth ``rho`` with the fine images of the neighbours."""
     samples = gather_patches(reference.fine, places)
     zero = torch.zeros_like(rho)
     state = SlantedMaps(rho, zero, zero, zero)
-    for radius, tolerance in ((2, 0.05), (config.fit_radius, 0.03)):
-        fit_planes(state, sure, reference.colours, radius, tolerance, 0.0, config)
+    for radius, tolerance in ((2, 0.05), (FIT_RADIUS, 0.03)):
+        fit_planes(state, sure, reference.colours, radius, tolerance, 0.0)
     state.inverse_depth = rho
-    for _ in range(config.refine_steps):
-        precision, sure = photometric_step(state, samples, images, homographies, tracker, config)
+    for _ in range(REFINE_STEPS):
+        precision, sure = photometric_step(state, samples, images, homographies, tracker)
         fit_planes(
-            state, sure, reference.colours, config.fit_radius, config.fit_tolerance,
-            config.fit_stiffness, config, precision,
+            state, sure, reference.colours, FIT_RADIUS, FIT_TOLERANCE,
+            FIT_STIFFNESS, precision,
         )  # fmt: skip
     return state
 

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float32
 from torch import Tensor
 
-from geogs.config import DepthConfig
+from geogs.depth import plane_sweep
 from geogs.depth.cuda.images import KeyframeImages, upload
 from geogs.gpu.kernels import kernels_for
 
@@ -65,10 +65,10 @@ def match_planes(
     images: Float32[Tensor, "n h w"],
     homographies: Float32[Tensor, "n 12"],
     planes: PlaneSlots,
-    config: DepthConfig,
+    window: int = plane_sweep.WINDOW,
 ) -> Float32[Tensor, "h w s"]:
     """Mean 1 - NCC of the better half (at least two) of the neighbours that see a point."""
-    (h, w), n, radius = grey.shape, len(images), config.window // 2
+    (h, w), n, radius = grey.shape, len(images), window // 2
     keep = max(min(2, n), (n + 1) // 2)
     size = (_TILE_W + 2 * radius) * (_TILE_H + 2 * radius)
     threads = min(1024, max(-(-size // 32) * 32, _TILE_W * _TILE_H))
@@ -76,7 +76,7 @@ def match_planes(
     volume = grey.new_empty(h, w, len(planes.rho))
     kernels_for(MATCHING, grey.device)["match_planes"](
         grid, threads, grey, images, homographies, planes.rho, len(planes.rho), n, h, w, radius,
-        keep, config.variance_floor, volume, shared=4 * (3 * size + 12 * n),
+        keep, plane_sweep.VARIANCE_FLOOR, volume, shared=4 * (3 * size + 12 * n),
     )  # fmt: skip
     return volume
 
@@ -87,15 +87,14 @@ def average_support(
     planes: PlaneSlots,
     prior: Float32[Tensor, "h w"],
     prior_weight: Float32[Tensor, "h w"],
-    config: DepthConfig,
 ) -> Float32[Tensor, "h w s"]:
     """Costs averaged over pixels of like colour, and pulled to the prior inverse depth."""
     h, w = volume.shape[:2]
-    radius, out = config.support_radius, torch.empty_like(volume)
+    radius, out = plane_sweep.SUPPORT_RADIUS, torch.empty_like(volume)
     kernels_for(MATCHING, volume.device)["average_support"](
         (-(-w // 8), -(-h // 4)), (32, 8, 4), volume, colours, planes.rho, prior, prior_weight,
-        planes.per, h, w, radius, config.support_sharpness, config.prior_pull,
-        config.prior_tolerance, out, shared=32 * 4 * (2 * radius + 1) ** 2,
+        planes.per, h, w, radius, plane_sweep.SUPPORT_SHARPNESS, plane_sweep.PRIOR_PULL,
+        plane_sweep.PRIOR_TOLERANCE, out, shared=32 * 4 * (2 * radius + 1) ** 2,
     )  # fmt: skip
     return out
 
@@ -104,14 +103,13 @@ def follow_paths(
     volume: Float32[Tensor, "h w s"],
     smooth: Float32[Tensor, "h w"],
     planes: PlaneSlots,
-    config: DepthConfig,
 ) -> Float32[Tensor, "8 h w s"]:
     """Semi-global path costs in each of the eight directions."""
     h, w = smooth.shape
     paths = volume.new_empty(8, *volume.shape)
     kernels_for(AGGREGATION, volume.device)["follow_paths"](
-        (-(-(w + h - 1) // 4), 8), (32, 4), volume, smooth, planes.per, h, w, config.small_jump,
-        config.large_jump, config.jump_contrast, paths,
+        (-(-(w + h - 1) // 4), 8), (32, 4), volume, smooth, planes.per, h, w,
+        plane_sweep.SMALL_JUMP, plane_sweep.LARGE_JUMP, plane_sweep.JUMP_CONTRAST, paths,
     )  # fmt: skip
     return paths
 
@@ -136,10 +134,9 @@ def sweep(
     planes: PlaneSlots,
     prior: Float32[Tensor, "h w"],
     prior_weight: Float32[Tensor, "h w"],
-    config: DepthConfig,
 ) -> SweptDepth:
     """``plane_sweep`` over the grey images of at most MAX_NEIGHBOURS neighbours."""
-    raw = match_planes(reference.grey, images, homographies, planes, config)
-    volume = average_support(raw, reference.colours, planes, prior, prior_weight, config)
+    raw = match_planes(reference.grey, images, homographies, planes)
+    volume = average_support(raw, reference.colours, planes, prior, prior_weight)
     del raw
-    return pick_planes(follow_paths(volume, reference.smooth, planes, config), volume, planes)
+    return pick_planes(follow_paths(volume, reference.smooth, planes), volume, planes)

@@ -11,7 +11,6 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 from torch.nn import functional
 
-from geogs.config import DepthConfig
 from geogs.depth.base import DepthEngine, Limits, Progress, silent
 from geogs.depth.completion import known_cells
 from geogs.depth.network.search_range import SearchRange, search_range
@@ -24,6 +23,8 @@ from geogs.gpu.recorded import Recorded
 from geogs.gpu.transfer import to_device
 from geogs.world.lru import LruCache
 
+EDGE = 512
+"""Longest edge of the images that the network sees, pixels: as large as it was trained on."""
 MOST_NEIGHBOURS = 8
 """The training shows no more; they come best first."""
 MOST_ANGLE = math.radians(15)
@@ -47,17 +48,13 @@ class NetworkDepthEngine:
         device: torch.device,
         render: Camera,
         working: Camera,
-        config: DepthConfig,
         resident: int,
     ) -> None:
         self.classical = classical
         self.device = device
         self.render = render
         self.working = working
-        self.config = config
-        self.seen = working.with_long_edge(
-            min(config.network_edge, max(working.width, working.height))
-        )
+        self.seen = working.with_long_edge(min(EDGE, max(working.width, working.height)))
         self.calibration = trained.calibration
         self.network = trained.network.to(device)
         lens = [self.seen.fx, self.seen.fy, self.seen.cx, self.seen.cy]
@@ -114,7 +111,7 @@ class NetworkDepthEngine:
     ) -> SearchRange:
         grid = reference.inverse_depth
         own = grid[known_cells(grid, reference.information)]
-        seen = seen_inverse_depth(reference, (reference, *others), self.working, self.config)
+        seen = seen_inverse_depth(reference, (reference, *others), self.working)
         return search_range(seen, own, limits)
 
     def _views(
