@@ -29,7 +29,7 @@ from geogs.io.sources.sniff import open_source
 from geogs.loop.global_bundle import global_bundle
 from geogs.threads import on_one_torch_thread
 from geogs.tracking.calibration.estimate import self_calibrate
-from geogs.tracking.tracker import Tracker
+from geogs.tracking.tracker import lone_tracker
 from geogs.types import Frame, Trajectory
 
 
@@ -73,7 +73,7 @@ def guess(camera: Camera, degrees: float) -> Camera:
 @on_one_torch_thread
 def ate(sequence: Sequence, camera: Camera, device: str) -> float:
     """Centimetres, after the adjustment of all keyframes."""
-    tracker = Tracker(camera, device=device)
+    tracker = lone_tracker(camera, device=device)
     for frame in sequence.frames:
         tracker.track(frame)
     tracker.finish()

@@ -30,7 +30,8 @@ from geogs.config import TrackingConfig
 from geogs.geometry.lie import se3_inverse
 from geogs.geometry.umeyama import umeyama
 from geogs.loop.global_bundle import global_bundle, global_pairs
-from geogs.tracking.tracker import Tracker, TrackState
+from geogs.tracking.tracker import Tracker, lone_tracker
+from geogs.world.segments import TrackState
 from geogs_synth.sequence.export import default_camera
 from planted_walk import CAMERA, drift, planted_tracker
 from suite import Suite
@@ -74,8 +75,8 @@ def through_rooms(count: int) -> None:
     """Pairs and camera system of a walk through many rooms in this process."""
     torch.set_num_threads(1)
     walk = Suite.for_walk(12_000).walk(20_000, 0.6)
-    tracker = Tracker(default_camera(512, 288))
-    tracker.state = TrackState.TRACKING
+    tracker = lone_tracker(default_camera(512, 288))
+    tracker.segment.status.state = TrackState.TRACKING
     for n, at in enumerate(np.linspace(0, len(walk) - 1, count).astype(int)):
         T_cw = torch.from_numpy(np.linalg.inv(walk[at]))
         state = tracker.keyframes.add(n, n / 3, np.zeros((4, 4, 3), np.uint8), None, T_cw)

@@ -35,7 +35,7 @@ from geogs.loop.global_bundle import global_bundle
 from geogs.mapping.mapper import Mapper
 from geogs.mesh.extract import extract_mesh
 from geogs.mesh.types import DepthMapView, Mesh
-from geogs.tracking.tracker import Tracker
+from geogs.tracking.tracker import lone_tracker
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import KeyframeSet, KeyframeTable
 
@@ -43,7 +43,7 @@ from geogs.world.keyframes import KeyframeSet, KeyframeTable
 def track(sequence: Path, config: Config) -> KeyframeSet:
     """Keyframes after tracking and the global bundle adjustment."""
     source = open_source(sequence, config.input)
-    tracker = Tracker(source.camera, config.tracking, seed=config.seed)
+    tracker = lone_tracker(source.camera, config)
     for frame in source:
         tracker.track(frame)
     tracker.finish()

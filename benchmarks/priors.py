@@ -28,7 +28,7 @@ from geogs.loop.global_bundle import global_bundle
 from geogs.priors.base import DepthKind, MonocularPrior
 from geogs.slam import Slam
 from geogs.tracking.flow.texture import MIN_STRUCTURE, cell_structure, smaller_eigenvalue
-from geogs.tracking.tracker import Tracker
+from geogs.tracking.tracker import Tracker, lone_tracker
 from geogs.types import Frame
 from geogs.world.grid import OFFSET, STRIDE
 from geogs_synth.motion.handheld import handheld_trajectory
@@ -74,7 +74,7 @@ def walk(seed: int, frames: int, long_edge: int, bare: bool = True) -> Walk:
 
 def track(walk: Walk, prior: MonocularPrior | None, config: PriorConfig) -> Tracker:
     """A tracker that has seen all of it."""
-    tracker = Tracker(walk.camera, prior=prior, prior_config=config)
+    tracker = lone_tracker(walk.camera, Config(prior=config or PriorConfig()), prior=prior)
     for n, view in enumerate(walk.views):
         tracker.track(Frame(n, n / 30, view.image))
     tracker.finish()
@@ -83,7 +83,7 @@ def track(walk: Walk, prior: MonocularPrior | None, config: PriorConfig) -> Trac
 
 def score(tracker: Tracker, walk: Walk) -> Score:
     """Errors of a tracker's keyframes."""
-    keyframes = [tracker.keyframes[k] for k in tracker.keyframe_ids]
+    keyframes = [tracker.keyframes[k] for k in tracker.segment.ids]
     centres = np.stack([torch.linalg.inv(k.T_cw)[:3, 3].numpy() for k in keyframes])
     truth = walk.T_wc[[k.frame_index for k in keyframes], :3, 3]
     x, y = torch.from_numpy(centres), torch.from_numpy(truth)
@@ -119,13 +119,13 @@ class MapScore:
 
 def map_score(slam: Slam, walk: Walk) -> MapScore:
     """Errors of a finished map."""
-    states = [slam.segments.world.keyframes[k] for k in slam.segments.world.keyframe_ids]
+    states = [slam.segments.main.keyframes[k] for k in slam.segments.main.keyframe_ids]
     x = torch.stack([torch.linalg.inv(s.T_cw)[:3, 3] for s in states])
     y = torch.from_numpy(walk.T_wc[[s.frame_index for s in states], :3, 3])
     scale = float(umeyama(x, y)[0])
     errors, angles, bare = [], [], []
     for seen in slam.renders():
-        view = walk.views[slam.segments.world.keyframes[seen.keyframe_id].frame_index]
+        view = walk.views[slam.segments.main.keyframes[seen.keyframe_id].frame_index]
         size = seen.depth.shape[::-1]
         nearest = cv2.INTER_NEAREST
         depth, normal = (

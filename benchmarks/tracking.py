@@ -20,12 +20,12 @@ import cv2
 import numpy as np
 import torch
 
-from geogs.config import TrackingConfig
+from geogs.config import Config, TrackingConfig
 from geogs.evaluation.surface import read_surface
 from geogs.geometry.camera import Camera
 from geogs.geometry.umeyama import umeyama
 from geogs.loop.global_bundle import global_bundle
-from geogs.tracking.tracker import Tracker
+from geogs.tracking.tracker import Tracker, lone_tracker
 from geogs.types import Frame
 
 
@@ -79,7 +79,7 @@ def align(estimate: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
 
 def keyframe_error(tracker: Tracker, sequence: Sequence) -> tuple[float, float]:
     """ATE of the keyframes in cm and the scale to metres."""
-    states = [tracker.keyframes[k] for k in tracker.keyframe_ids]
+    states = [tracker.keyframes[k] for k in tracker.segment.ids]
     centres = np.stack([torch.linalg.inv(s.T_cw)[:3, 3].numpy() for s in states])
     return align(centres, sequence.T_wc[[s.frame_index for s in states], :3, 3])
 
@@ -129,7 +129,7 @@ def _raster(p, faces, camera, xs, ys):
 
 def depth_report(tracker: Tracker, sequence: Sequence, scale: float, every: int) -> None:
     """Relative depth error of the keyframes by bins of the predicted relative deviation."""
-    ids = tracker.keyframe_ids[::every]
+    ids = tracker.segment.ids[::every]
     states = [tracker.keyframes[k] for k in ids]
     truth = true_depth(
         sequence.mesh, sequence.camera, sequence.T_wc[[s.frame_index for s in states]]
@@ -143,9 +143,8 @@ def depth_report(tracker: Tracker, sequence: Sequence, scale: float, every: int)
         metres.append(z[ok])
     error, sigma, metres = np.concatenate(error), np.concatenate(sigma), np.concatenate(metres)
     order = np.array_split(np.argsort(sigma), 8)
-    print(
-        f"depth on the grid: {len(error) / len(ids) / tracker.grid.size:.0%} of the cells measured"
-    )
+    cells = len(ids) * tracker.keyframes.grid.size
+    print(f"depth on the grid: {len(error) / cells:.0%} of the cells measured")
     print("  sigma     |error|   |error|/sigma   median |error| cm   > 5 %")
     for part in order:
         e = np.abs(error[part])
@@ -165,8 +164,8 @@ def depth_report(tracker: Tracker, sequence: Sequence, scale: float, every: int)
 
 def save(path: Path, tracker: Tracker) -> None:
     """Write the keyframes for work on mapping."""
-    states = [tracker.keyframes[k] for k in tracker.keyframe_ids]
-    c = tracker.camera
+    states = [tracker.keyframes[k] for k in tracker.segment.ids]
+    c = tracker.keyframes.grid.camera
     np.savez(
         path,
         T=np.stack([s.T_cw.numpy() for s in states]),
@@ -194,7 +193,7 @@ def main() -> None:
     changes = {k: json.loads(v) for k, v in (item.split("=") for item in args.set)}
     config = dataclasses.replace(TrackingConfig(), **changes)
     sequence = load(args.source, args.long_edge, args.frames)
-    tracker = Tracker(sequence.camera, config)
+    tracker = lone_tracker(sequence.camera, Config(tracking=config))
     print(f"{args.source.name}: {len(sequence.files)} frames, {sequence.camera}", flush=True)
 
     start, spent, lost, cpu = time.perf_counter(), 0.0, 0, time.process_time()
@@ -229,7 +228,7 @@ def main() -> None:
         global_bundle(tracker)
         final, scale = keyframe_error(tracker, sequence)
         print(
-            f"global: keyframe ATE {final:.3f} cm, {len(tracker.graph.pairs)} pairs, "
+            f"global: keyframe ATE {final:.3f} cm, {len(tracker.map.graph.pairs)} pairs, "
             f"{time.perf_counter() - tick:.1f} s, {time.process_time() - cpu:.1f} s CPU",
             flush=True,
         )

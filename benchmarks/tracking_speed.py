@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 import torch
 
-from geogs.config import InputConfig, TrackingConfig
+from geogs.config import Config, InputConfig, TrackingConfig
 from geogs.geometry.camera import Camera
 from geogs.io.sources.sniff import open_source
 from geogs.threads import on_one_torch_thread
@@ -27,7 +27,7 @@ from geogs.tracking.flow.base import FlowOperator, Memories
 from geogs.tracking.flow.droid import DroidFlow
 from geogs.tracking.flow.droid_network import DroidNetwork
 from geogs.tracking.flow.select import build_operator
-from geogs.tracking.tracker import Tracker
+from geogs.tracking.tracker import lone_tracker
 from geogs.types import FlowMatch, Frame
 from geogs.world.grid import SampleGrid
 
@@ -83,7 +83,7 @@ def track(camera: Camera, frames: list[np.ndarray], device: str, shadow: bool) -
     operator = Shadowed(build_operator(config, grid), droid, device)
     warm = [operator.encode(frames[k]) for k in (0, 5)]
     operator.measure(warm[:1], warm[1:])
-    tracker = Tracker(camera, config, device, operator=operator)
+    tracker = lone_tracker(camera, Config(tracking=config), device, operator=operator)
     operator.seconds = dict.fromkeys(operator.seconds, 0.0)
     _wait(device)
     start = time.perf_counter()
@@ -93,7 +93,8 @@ def track(camera: Camera, frames: list[np.ndarray], device: str, shadow: bool) -
     _wait(device)
     seconds = time.perf_counter() - start
     print(
-        f"{len(tracker.keyframe_ids)} keyframes, {len(frames)} frames, state {tracker.state.value}"
+        f"{len(tracker.segment.ids)} keyframes, {len(frames)} frames, "
+        f"state {tracker.segment.status.state.value}"
     )
     return seconds, operator
 

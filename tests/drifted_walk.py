@@ -5,16 +5,17 @@ from types import SimpleNamespace
 import torch
 
 from geogs.bundle.projection import project
-from geogs.config import LoopConfig, TrackingConfig
+from geogs.config import Config, LoopConfig
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_inverse
 from geogs.loop.closer import LoopCloser
 from geogs.tracking.flow.classical import ClassicalFlow
-from geogs.tracking.graph import MeasuredEdge
 from geogs.tracking.segments import Segments
-from geogs.tracking.tracker import Tracker, TrackResult, TrackState
+from geogs.tracking.tracker import Tracker, TrackResult
 from geogs.types import FlowMatch
+from geogs.world.edges import MeasuredEdge
 from geogs.world.loops import Loop
+from geogs.world.segments import SegmentTable, TrackState, VideoSegment
 from keyframe_samples import Sample, segment_of
 
 CAMERA = Camera(60.0, 60.0, 31.5, 23.5, 64, 48)
@@ -61,17 +62,17 @@ def world(drift: float):
     ways = [FlowMatch(*(x[None] for x in flow_of(*pair))) for pair in ((0, last), (last, 0))]
     T_ji = true_pose(last) @ se3_inverse(true_pose(0))
     loop = Loop(0, last, "geometry", T_ji, 1.0, 0, 1.0, *ways)
-    graph = SimpleNamespace(edges=edges, retire=lambda keep, least: {})
-    tracker = Tracker.__new__(Tracker)  # nothing of it but its keyframes and their edges
-    tracker.keyframes, tracker.graph, tracker.held = keyframes, graph, frozenset()
-    tracker.is_metric, tracker.config = False, TrackingConfig()
+    segment = VideoSegment(keyframes=keyframes, edges=edges)
+    tracker = Tracker(segment, ClassicalFlow(keyframes.grid), Config())
     return tracker, loop
 
 
 def closer_of(tracker: Tracker, loop: Loop, config: LoopConfig, waits: bool = True) -> LoopCloser:
     """What closes the loop, once it is asked to."""
-    tracker.operator = ClassicalFlow(tracker.keyframes.grid)
-    closer = LoopCloser(Segments(lambda: tracker, 1), config, waits)
+    table, keyframes = SegmentTable([tracker.segment]), tracker.keyframes.table
+    segments = Segments(table, keyframes, tracker.map.operator, Config())
+    segments.main.map.graph.retire = lambda keep, least: {}
+    closer = LoopCloser(segments, config, waits)
     closer.detector = SimpleNamespace(loops=(loop,), update=lambda ids, is_last: ())
     closer._take(loop)
     return closer

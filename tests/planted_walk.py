@@ -8,13 +8,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from geogs.bundle.projection import project
-from geogs.config import TrackingConfig
+from geogs.config import Config, TrackingConfig
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp, se3_inverse
 from geogs.tracking.flow.base import Memories
-from geogs.tracking.tracker import Tracker, TrackState
+from geogs.tracking.tracker import Tracker, lone_tracker
 from geogs.types import FlowMatch
 from geogs.world.grid import SampleGrid
+from geogs.world.segments import TrackState
 
 CAMERA = Camera(fx=480.0, fy=480.0, cx=255.5, cy=143.5, width=512, height=288)
 """Of a real run: 64 x 36 cells."""
@@ -99,13 +100,14 @@ def planted_tracker(
     T = walk(count)
     d = true_inverse_depth(T, grid)
     T = T @ se3_inverse(T[0])  # the first pose is the identity
-    tracker = Tracker(camera, config, operator=PlantedFlow(grid, T, d, sigma))
+    settings = Config(tracking=config or TrackingConfig())
+    tracker = lone_tracker(camera, settings, operator=PlantedFlow(grid, T, d, sigma))
     for n in range(count):
         image = np.full((4, 4, 3), (n % 256, n // 256, 0), np.uint8)
         state = tracker.keyframes.add(n, n / 3, image, n, T[n].clone())
         state.inverse_depth = d[n].clone()
         state.information = torch.full_like(d[n], 1e4)
-    tracker.state = TrackState.TRACKING
+    tracker.segment.status.state = TrackState.TRACKING
     return tracker, T
 
 

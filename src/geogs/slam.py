@@ -29,10 +29,11 @@ from geogs.tracking.certainty import certainty
 from geogs.tracking.completion import Completion
 from geogs.tracking.flow.masked import valid_pixels
 from geogs.tracking.flow.select import build_operator
+from geogs.tracking.held import add_saved_keyframes
 from geogs.tracking.moving import moving_share
 from geogs.tracking.pose_deviation import PoseDeviation
-from geogs.tracking.segments import Segments, SegmentsState
-from geogs.tracking.tracker import Tracker, TrackResult, TrackState
+from geogs.tracking.segments import Segments
+from geogs.tracking.tracker import TrackResult
 from geogs.types import (
     Frame,
     MapSnapshot,
@@ -43,8 +44,9 @@ from geogs.types import (
     Uncertainty,
 )
 from geogs.world.grid import SampleGrid
-from geogs.world.keyframes import KeyframeTable
+from geogs.world.keyframes import KeyframeTable, check_keyframes
 from geogs.world.loops import LoopTable, check_loops
+from geogs.world.segments import SegmentTable, TrackState, check_segment
 
 R = TypeVar("R")
 
@@ -74,7 +76,7 @@ class SlamState:
     """
 
     keyframes: KeyframeTable
-    segments: SegmentsState
+    segments: SegmentTable
     loops: LoopTable
     mapper: MapperState
     stopwatch: StopwatchState
@@ -139,7 +141,9 @@ class Slam:
         c, grid = self.config, SampleGrid(self.camera, self.device)
         self.operator = build_operator(c.tracking, grid, self.mask, self.black_is_masked)
         self.keyframes = KeyframeTable.on(grid, self.operator.encode, c.resident_keyframes)
-        self.segments = Segments(partial(self.new_tracker, live), c.tracking.patience)
+        self.segments = Segments(
+            SegmentTable(), self.keyframes, self.operator, c, self.prior, defers=live
+        )
         self.completion = (
             Completion(self.segments, self._act_on, self.stopwatch, self._stream) if live else None
         )
@@ -149,14 +153,6 @@ class Slam:
         """Maps until the stream ends, in a live system; then the mapper goes on from there."""
         self.mapper = self._new_mapper(self.keyframes)
 
-    def new_tracker(self, defers: bool = False) -> Tracker:
-        """A tracker of another segment; ``defers`` as the tracker's."""
-        c = self.config
-        return Tracker(
-            self.camera, c.tracking, self.device, c.seed, self.operator, self.prior, c.prior,
-            self.keyframes, c.sensor, c.odometry, defers,
-        )  # fmt: skip
-
     def _new_mapper(self, keyframes: KeyframeTable) -> Mapper:
         c = self.config
         return Mapper(keyframes, c.mapping, c.seed, c.sensor)
@@ -164,9 +160,10 @@ class Slam:
     def state(self) -> SlamState:
         """What a checkpoint holds: to be written before the next frame, as it refers to all."""
         self.settle()
+        self.segments.settle()
         self.loops.settle()
         return SlamState(
-            self.keyframes, self.segments.state(), self.loops.table, self.mapper.state(),
+            self.keyframes, self.segments.table, self.loops.table, self.mapper.state(),
             self.stopwatch.state(), self.frames, list(self._waiting), self.adjusted, self._is_ended,
             self.defers_map,
         )  # fmt: skip
@@ -178,8 +175,13 @@ class Slam:
         Raises:
             InputError: the state is of another camera, or incomplete.
         """
+        segments = state.segments.segments
         self.keyframes.take_over(state.keyframes)
-        self.segments.load(state.segments)
+        check_keyframes(self.keyframes, [segment.keyframes for segment in segments])
+        for segment in segments:
+            segment.keyframes.attached(self.keyframes)
+            check_segment(segment, self.keyframes.grid)
+        self.segments.resume(state.segments)
         if not all(i in self.keyframes for i in (*state.waiting, *state.loops.keyframes)):
             raise InputError("a keyframe is missing")
         check_loops(state.loops)
@@ -207,8 +209,7 @@ class Slam:
         """
         if self.frames or not keyframes:
             raise InputError("A map with keyframes has to be given, and before the first frame.")
-        world = self.segments.world
-        ids = world.hold(keyframes)
+        ids = add_saved_keyframes(self.segments.main.segment, keyframes)
         self.loops.remember(ids)
         size, given = (self.camera.width, self.camera.height), zip(ids, keyframes, strict=True)
         masks = {i: _enlarged(k.mask, size) for i, k in given if k.mask is not None}
@@ -233,7 +234,7 @@ class Slam:
 
         All depths of a sensor share a part of their error, which is the scale's.
         """
-        if self._told_scale is not None or not self.segments.world.is_metric:
+        if self._told_scale is not None or not self.segments.main.segment.is_metric:
             return self._told_scale
         return MetricScale("depth sensor", 1.0, self.config.sensor.share)
 
@@ -314,9 +315,9 @@ class Slam:
             with self.stopwatch("mapping"):
                 self.mapper, self.background = self.background.settled(), None
             self._stream = self.completion = None
-        if result.is_new_world:
+        if result.is_new_main:
             self.mapper = self._new_mapper(self.keyframes)
-            self.segments.world.keyframes.take_corrections()
+            self.segments.main.keyframes.take_corrections()
             self._waiting.clear()
         self._map(self._close_loops(result, is_last=True), lag=0)
         if not self.defers_map:  # else there is no online result
@@ -361,7 +362,7 @@ class Slam:
     def rescale(self, scale: MetricScale) -> None:
         """Multiply all lengths of poses, depths and map, after which they are metres."""
         self.settle()
-        keyframes, factor = self.segments.world.keyframes, scale.factor
+        keyframes, factor = self.segments.main.keyframes, scale.factor
         shrunk = torch.eye(4, dtype=torch.float64)
         shrunk[:3, :3] /= factor
         keyframes.correct(keyframes.moved(shrunk))
@@ -376,11 +377,11 @@ class Slam:
 
         What is in metres already stays, and so does the world of a saved map.
         """
-        odometry = self.segments.world.odometry
-        if self.metric_scale is None and odometry.scale is not None and not self.is_continued:
-            drift = (odometry.config.drift**2 + odometry.deviation**2) ** 0.5
-            self.rescale(MetricScale("poses beside the images", odometry.scale, drift))
-            odometry.scale = 1.0
+        odometry = self.segments.main.map.odometry
+        if self.metric_scale is None and odometry.found.scale is not None and not self.is_continued:
+            drift = (odometry.config.drift**2 + odometry.found.deviation**2) ** 0.5
+            self.rescale(MetricScale("poses beside the images", odometry.found.scale, drift))
+            odometry.found.scale = 1.0
 
     @on_one_torch_thread
     def trajectory(self) -> Trajectory:
@@ -392,7 +393,7 @@ class Slam:
     def keyframe_trajectory(self) -> Trajectory:
         """Poses of the keyframes alone."""
         self.settle()
-        keyframes = [self.keyframes[i] for i in self.segments.world.free]
+        keyframes = [self.keyframes[i] for i in self.segments.main.segment.free]
         T_wc = [torch.linalg.inv(k.T_cw).numpy() for k in keyframes]
         times = np.array([k.timestamp for k in keyframes], dtype=np.float64)
         return Trajectory(times, np.array(T_wc).reshape(-1, 4, 4), np.ones(len(times), dtype=bool))
@@ -414,16 +415,16 @@ class Slam:
             "refined": self.is_refined,
             "metric_scale": None if self.metric_scale is None else asdict(self.metric_scale),
             "poses": self._pose_agreement(),
-            "moving": round(moving_share(self.segments.world.keyframes), 4),
+            "moving": round(moving_share(self.segments.main.keyframes), 4),
             "segments": [asdict(segment) for segment in self.segments.summary()],
-            "not_started": self.segments.why_not or None,
+            "not_started": self.segments.table.why_not or None,
             "loops": len(self.loops.detector.loops),
             "loop_closures": self.loops.table.closures,
         }
 
     def _pose_agreement(self) -> dict[str, object] | None:
         """How far poses beside the images fit them; none where there are none."""
-        agreement = self.segments.world.odometry.agreement()
+        agreement = self.segments.main.map.odometry.agreement()
         if not agreement.motions:
             return None
         return {
@@ -451,7 +452,8 @@ class Slam:
 
     def rows(self) -> dict[int, SeenRows]:
         """Of keyframes, by id, whose rows were rectified: where and when they were seen."""
-        known, keyframes = self.segments.world.recorder.rows, self.segments.world.keyframes
+        segment = self.segments.main.segment
+        known, keyframes = segment.frames.rows, segment.keyframes
         return {k.id: known[k.frame_index] for k in keyframes if k.frame_index in known}
 
     def depth_maps(self) -> Sequence[RenderedKeyframe]:
@@ -479,8 +481,8 @@ class Slam:
 
     def _adjust_globally(self, progress: Progress) -> None:
         """Bundle-adjust all keyframes and let the map follow."""
-        world = self.segments.world
-        if not world.keyframe_ids:
+        world = self.segments.main
+        if not world.segment.ids:
             return
         with self.stopwatch("global bundle adjustment"):
             global_bundle(world, lambda f, _: progress("bundle adjustment", f))
@@ -489,12 +491,12 @@ class Slam:
                 self._known = certainty(world).calibrated(world)
         with self.stopwatch("global bundle adjustment"):
             self.loops.replaced_by_bundle()
-        self.adjusted = len(world.keyframe_ids)
+        self.adjusted = len(world.segment.ids)
         self._move_map()
 
     def _move_map(self) -> None:
         """Let the map follow the corrections of the world's keyframes."""
-        for correction in self.segments.world.keyframes.take_corrections():
+        for correction in self.segments.main.keyframes.take_corrections():
             with self.stopwatch("map update"):
                 (self.background or self.mapper).correct(correction)
 

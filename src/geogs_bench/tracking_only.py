@@ -42,7 +42,7 @@ def track_to_folder(
     frames = 0
     for frame in source:
         slam.loops.update(slam.segments.track(frame, slam.loops.recognise), False)
-        slam.segments.world.keyframes.take_corrections()
+        slam.segments.main.keyframes.take_corrections()
         frames += 1
         on_frame(frames)
     seconds = time.perf_counter() - start
@@ -54,13 +54,13 @@ def track_to_folder(
     }
     try:
         slam.loops.update(slam.segments.finish(), True)
-        global_bundle(slam.segments.world)
+        global_bundle(slam.segments.main)
         trajectory = slam.trajectory()
-        known = certainty(slam.segments.world).calibrated(slam.segments.world)
+        known = certainty(slam.segments.main).calibrated(slam.segments.main)
         write_tum_trajectory(folder / "trajectory.tum", trajectory)
         write_uncertainty(folder / "trajectory_uncertainty.csv", trajectory, known)
         summary["lost_spans"] = lost_spans(trajectory)
-        said = verdict(trajectory, slam.keyframe_trajectory(), known, slam.segments.why_not)
+        said = verdict(trajectory, slam.keyframe_trajectory(), known, slam.segments.table.why_not)
         summary["verdict"] = {"is_reliable": said.is_reliable, "sentence": said.sentence}
     except TrackingLost as error:
         summary["not_tracked"] = str(error)

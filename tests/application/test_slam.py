@@ -13,8 +13,8 @@ from geogs.errors import InputError
 from geogs.evaluation.trajectory import evaluate_trajectory
 from geogs.geometry.umeyama import umeyama
 from geogs.io.pose_files import read_tum_trajectory
-from geogs.tracking.tracker import TrackState
 from geogs.types import Trajectory
+from geogs.world.segments import TrackState
 from quick_systems import quick_config
 
 FIRST, SECOND, END = 28, 24, 42
@@ -70,7 +70,7 @@ def test_the_map_is_asked_and_kept(first):
 def test_another_video_is_found_in_a_saved_map(first, small_room):
     _, _, folder = first
     slam = geogs.Slam.load(folder, config())
-    held = {i: slam.keyframes[i].T_cw for i in slam.segments.world.held}
+    held = {i: slam.keyframes[i].T_cw for i in slam.segments.main.held}
     before = len(slam.snapshot())
     source = geogs.open_source(small_room, InputConfig(start=SECOND, stop=END))
     poses = list(geogs.track(source, slam=slam))

@@ -13,7 +13,7 @@ from geogs.application.settings import Verbosity
 from geogs.application.terminal import TerminalProgress
 from geogs.errors import OutputError
 from geogs.slam import SlamStatus
-from geogs.tracking.tracker import TrackState
+from geogs.world.segments import TrackState
 
 
 def status(frames: int) -> SlamStatus:

@@ -21,12 +21,14 @@ from geogs.bundle.motion import CpuMotion
 from geogs.bundle.pairs import CpuPairs
 from geogs.bundle.problem import BundleProblem, MeasuredDepths, MotionProblem
 from geogs.bundle.projection import MIN_Z, linearise, project, relative_motion
+from geogs.config import Config
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import retract, se3_exp, se3_inverse
 from geogs.loop.global_bundle import global_bundle
-from geogs.tracking.tracker import Tracker, TrackState
+from geogs.tracking.tracker import lone_tracker
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import KeyframeSet, KeyframeTable
+from geogs.world.segments import TrackState
 from tracking_runs import CONFIG, PATH, error_cm
 from tracking_scenes import CAMERA as ROOM
 from tracking_scenes import frames
@@ -402,7 +404,7 @@ def test_uncertain_observations_linearise_on_the_device(device):
 def test_tracker_runs_on_the_gpu_as_on_the_cpu():
     if not torch.cuda.is_available():
         pytest.skip("needs a CUDA GPU")
-    tracker = Tracker(ROOM, CONFIG, device="cuda")
+    tracker = lone_tracker(ROOM, Config(tracking=CONFIG), device="cuda")
     states = [tracker.track(f).state for f in frames(PATH)]
     tracker.finish()
     assert TrackState.LOST not in states
@@ -410,7 +412,7 @@ def test_tracker_runs_on_the_gpu_as_on_the_cpu():
     truth = np.stack(PATH)[:, :3, 3]
     assert trajectory.tracked.all()
     assert error_cm(trajectory.T_wc[:, :3, 3], truth) < 0.5
-    keyframe = tracker.keyframes[tracker.keyframe_ids[0]]
+    keyframe = tracker.keyframes[tracker.segment.ids[0]]
     assert keyframe.T_cw.device.type == "cpu"
     assert keyframe.inverse_depth.device.type == "cuda"
     global_bundle(tracker)

@@ -81,7 +81,7 @@ def test_parts_together_are_adjusted_as_one_problem(placed, tmp_path):
             ids[n, place] = k.id
     graph = FrameGraph(segment, operator)
     for path in workers.files:
-        for (a, b), edge in Matches.load(path).edges(grid).items():
+        for (a, b), edge in Matches.load(path).edges().items():
             graph.edges[ids[a], ids[b]] = edge
     assert {(a // 4, b // 4) for a, b in graph.edges} == {
         (n, m) for n in range(3) for m in range(3) if abs(n - m) < 2

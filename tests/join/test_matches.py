@@ -8,9 +8,9 @@ from geogs.config import Config
 from geogs.geometry.lie import se3_inverse, sim3_scale
 from geogs.io.writers.keyframe_folder import rows_path, write_rows
 from geogs.shutter.rows import CELL
-from geogs.tracking.packed_edge import position_step
 from geogs.tracking.row_errors import RowErrors
 from geogs.types import SeenRows
+from geogs.world.edges import position_step
 from geogs.world.grid import SampleGrid
 from geogs_fleet.join.matches import Matches, MatchJob, Member, match
 from geogs_fleet.join.part import DescribeJob, Part, PartViews, describe
@@ -57,7 +57,7 @@ def test_rows_are_corrected_as_within_a_run(tmp_path):
     errors = RowErrors(GRID, dict.fromkeys(middle, rows()), frames, result.trajectory)
     source, target = found.ends[:, 1], found.ends[:, 3]
     T, depth = member.T_cw, member.depths().inverse
-    plain = [edge.pixels for edge in found.edges(GRID, as_found=True).values()]
+    plain = [edge.pixels for edge in found.edges(as_found=True).values()]
     shift = errors.of_matches(
         [middle[n] for n in source], [middle[n] for n in target],
         T[target] @ se3_inverse(T[source]), GRID.rays, depth[source], torch.stack(plain),
@@ -65,7 +65,7 @@ def test_rows_are_corrected_as_within_a_run(tmp_path):
     step = position_step(CAMERA)
     assert float(shift.norm(dim=-1).median()) > 0.05  # pixels
     assert np.array_equal(found.shift, (shift / step).round().short().numpy())
-    corrected = torch.stack([edge.pixels for edge in found.edges(GRID).values()])
+    corrected = torch.stack([edge.pixels for edge in found.edges().values()])
     assert float((corrected - torch.stack(plain) - shift).abs().max()) < 0.51 * step
 
 
@@ -81,5 +81,5 @@ def test_rows_are_corrected_in_any_world_and_unit(tmp_path):
 def test_nothing_is_shifted_where_no_rows_were_rectified(tmp_path):
     _, found = matched(tmp_path / "a", 0, with_rows=False)
     assert len(found.shift) == 0
-    for edge, plain in zip(found.edges(GRID).values(), found.position, strict=True):
-        assert np.array_equal(edge.flow.position.numpy(), plain)
+    for edge, plain in zip(found.edges().values(), found.position, strict=True):
+        assert np.array_equal(edge.position.numpy(), plain)

@@ -88,7 +88,7 @@ def test_a_closing_by_a_thread_comes_to_the_same_as_at_once():
         assert one.scale == other.scale
     left = float((later[7].T_cw - true_pose(7)).norm())
     assert left < 0.5 * drift[7]
-    assert len(closer.segments.world.keyframes.take_corrections()) == 1
+    assert len(closer.segments.main.keyframes.take_corrections()) == 1
 
 
 def test_keyframes_of_the_meantime_move_with_their_neighbours():

@@ -6,8 +6,8 @@ from drifted_walk import CAMERA, COUNT, NOTHING, closer_of, true_pose, world
 from geogs.config import LoopConfig
 from geogs.geometry.lie import se3_inverse
 from geogs.loop.closing_matches import closing_matches, take_over_depths
-from geogs.tracking.graph import MeasuredEdge
 from geogs.types import FlowMatch
+from geogs.world.edges import MeasuredEdge
 from geogs.world.loops import Loop
 from keyframe_samples import Sample, segment_of
 

@@ -8,15 +8,17 @@ import torch
 from torch import Tensor
 
 from geogs.bundle.base import BundleOptions
-from geogs.config import TrackingConfig
+from geogs.config import Config, TrackingConfig
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp, se3_inverse
 from geogs.loop.global_bundle import global_bundle
 from geogs.loop.settled_rows import _readout_gradient, _Search, settle_rows
 from geogs.tracking.row_errors import RowErrors
-from geogs.tracking.tracker import Tracker, TrackState
+from geogs.tracking.tracker import Tracker, lone_tracker
+from geogs.tracking.trajectory import row_errors
 from geogs.types import FlowMatch, SeenRows
 from geogs.world.grid import SampleGrid
+from geogs.world.segments import TrackState
 from planted_walk import PlantedFlow, true_inverse_depth
 
 CAMERA = Camera(fx=90.0, fy=90.0, cx=47.5, cy=35.5, width=96, height=72)
@@ -80,14 +82,14 @@ def tracker_of_rows(rows: SeenRows) -> Tracker:
     T = pose(np.arange(COUNT))
     d = true_inverse_depth(T, GRID)
     config = TrackingConfig(global_rounds=1, global_pairs=4, global_iterations=5)
-    tracker = Tracker(CAMERA, config, operator=RollingFlow(GRID, T, d, 0.0))
+    tracker = lone_tracker(CAMERA, Config(tracking=config), operator=RollingFlow(GRID, T, d, 0.0))
     for n in range(COUNT):
         image = np.full((4, 4, 3), (n, 0, 0), np.uint8)
         state = tracker.keyframes.add(n, n / RATE, image, n, T[n].clone())
         state.inverse_depth, state.information = d[n].clone(), torch.full_like(d[n], 1e4)
-        tracker.recorder.add_keyframe(n)
-        tracker.recorder.rows[n] = rows
-    tracker.state = TrackState.TRACKING
+        tracker.map.recorder.add_keyframe(state)
+        tracker.segment.frames.rows[n] = rows
+    tracker.segment.status.state = TrackState.TRACKING
     return tracker
 
 
@@ -114,9 +116,9 @@ def test_the_trajectory_straightens_rows_that_nothing_was_done_about(monkeypatch
 def test_the_gradient_falls_to_zero_at_the_true_readout():
     """With the true poses and depths, and rows that count as read 1.15 times as slowly."""
     tracker = tracker_of_rows(as_read(1.15, doubt=10.0))
-    graph, pairs = tracker.graph, [(n, n + 1) for n in range(COUNT - 1)]
+    graph, pairs = tracker.map.graph, [(n, n + 1) for n in range(COUNT - 1)]
     graph.measure(pairs, packed=True)
-    errors = tracker.recorder.row_errors()
+    errors = row_errors(tracker.segment.frames, tracker.keyframes)
     assert errors.doubt == 10.0
     at = [
         _readout_gradient(graph, graph.edges, errors, factor, BundleOptions())
@@ -135,7 +137,7 @@ def test_a_readout_that_was_told_is_kept(monkeypatch):
         return given(errors, factor)
 
     monkeypatch.setattr(RowErrors, "with_readout", noted)
-    tracker.graph.measure([(0, 1), (1, 2)], packed=True)
+    tracker.map.graph.measure([(0, 1), (1, 2)], packed=True)
     settle_rows(tracker, [1, 2], [0, 1, 2], BundleOptions())
     assert factors == {1.0}
 
@@ -156,9 +158,9 @@ def test_a_search_without_a_minimum_stays():
 
 def test_nothing_happens_to_a_global_shutter():
     tracker = tracker_of_rows(as_read())
-    tracker.recorder.rows = {}
-    tracker.graph.measure([(0, 1)], packed=True)
-    before = tracker.graph.edges[0, 1].pixels.clone()
+    tracker.segment.frames.rows.clear()
+    tracker.map.graph.measure([(0, 1)], packed=True)
+    before = tracker.map.graph.edges[0, 1].pixels.clone()
     settle_rows(tracker, [1], [0, 1], BundleOptions())
-    assert torch.equal(tracker.graph.edges[0, 1].pixels, before)
+    assert torch.equal(tracker.map.graph.edges[0, 1].pixels, before)
     assert torch.equal(tracker.keyframes[1].T_cw, pose(np.arange(COUNT))[1])

@@ -10,7 +10,7 @@ from safetensors.torch import save_file
 
 from droid_state import public_state
 from geogs.cli.main import main
-from geogs.config import TrackingConfig
+from geogs.config import Config, TrackingConfig
 from geogs.errors import InputError
 from geogs.networks import weights_files
 from geogs.networks.weights import read_tensors
@@ -18,7 +18,7 @@ from geogs.networks.weights_files import CATALOGUE, checksum, find_weights, weig
 from geogs.tracking.flow.classical import ClassicalFlow
 from geogs.tracking.flow.droid import DroidFlow
 from geogs.tracking.flow.select import build_operator
-from geogs.tracking.tracker import Tracker
+from geogs.tracking.tracker import lone_tracker
 from geogs.world.grid import SampleGrid
 from tracking_scenes import CAMERA
 
@@ -243,7 +243,7 @@ def test_the_configuration_names_the_operator(places):
     torch.save(public_state(), path)
     assert isinstance(build_operator(TrackingConfig(operator="droid"), grid), DroidFlow)
     config = TrackingConfig(operator="droid", weights=str(path))
-    assert isinstance(Tracker(CAMERA, config).operator, DroidFlow)
+    assert isinstance(lone_tracker(CAMERA, Config(tracking=config)).map.operator, DroidFlow)
 
 
 @pytest.mark.parametrize("name", ["own", "droid"])

@@ -12,7 +12,7 @@ def measured(count: int):
     """A tracker at the truth whose neighbours are matched."""
     tracker, _ = planted_tracker(count)
     near = [(a, b) for a in range(count) for b in range(a + 1, min(a + 4, count))]
-    tracker.graph.measure(near)
+    tracker.map.graph.measure(near)
     return tracker
 
 

@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 import torch
 
+from geogs.config import Config
 from geogs.geometry.lie import se3_exp, se3_inverse
-from geogs.tracking.tracker import Tracker, TrackState
+from geogs.tracking.tracker import Tracker, lone_tracker
 from geogs.types import Frame
+from geogs.world.segments import TrackState
 from tracking_runs import CONFIG
 from tracking_scenes import CAMERA, render, sideways
 
@@ -36,7 +38,7 @@ def stream() -> list[Frame]:
 
 def until_keyframe(stream: list[Frame]) -> tuple[Tracker, int]:
     """A tracker that has just made a keyframe and not completed it, and the next frame's place."""
-    tracker = Tracker(CAMERA, CONFIG, defers=True)
+    tracker = lone_tracker(CAMERA, Config(tracking=CONFIG), defers=True)
     for n, frame in enumerate(stream):
         tracker.track(frame)
         if tracker.is_unfinished:
@@ -58,14 +60,15 @@ def errors_cm(tracker: Tracker) -> np.ndarray:
 
 def run(stream: list[Frame], beside: int) -> tuple[Tracker, list[np.ndarray]]:
     """The whole stream, ``beside`` frames while each keyframe is completed; places at once."""
-    tracker, follower, places = Tracker(CAMERA, CONFIG, defers=True), None, []
+    tracker = lone_tracker(CAMERA, Config(tracking=CONFIG), defers=True)
+    follower, places = None, []
     for frame in stream:
         if follower is not None and len(follower.frames) < beside and follower.follow(frame):
-            places.append(centre(follower.last.T_cw))
+            places.append(centre(follower.T_cw))
             continue
         if follower is not None:
             tracker.complete()
-            tracker.take(follower)
+            tracker.take_over(follower)
             follower = None
         result = tracker.track(frame)
         assert result.state is TrackState.TRACKING
@@ -73,7 +76,7 @@ def run(stream: list[Frame], beside: int) -> tuple[Tracker, list[np.ndarray]]:
         follower = tracker.follower() if tracker.is_unfinished else None
     if follower is not None:
         tracker.complete()
-        tracker.take(follower)
+        tracker.take_over(follower)
     tracker.finish()
     return tracker, places
 
@@ -85,11 +88,11 @@ def completed(stream) -> Tracker:
 
 
 def test_nothing_changes_where_nobody_comes_meanwhile(stream, completed):
-    tracker = Tracker(CAMERA, CONFIG)
+    tracker = lone_tracker(CAMERA, Config(tracking=CONFIG))
     for frame in stream:
         tracker.track(frame)
     tracker.finish()
-    assert len(tracker.keyframe_ids) > 2
+    assert len(tracker.segment.ids) > 2
     assert np.array_equal(tracker.trajectory().T_wc, completed.trajectory().T_wc)
 
 
@@ -97,7 +100,7 @@ def test_followed_frames_are_as_right_as_others(stream, completed):
     followed, places = run(stream, beside=2)
     usual = errors_cm(completed).max()
     assert errors_cm(followed).max() < max(1.5 * usual, 0.3)
-    assert len(followed.recorder.records) == LENGTH
+    assert len(followed.map.recorder.log.records) == LENGTH
     truth = np.stack(sideways(LENGTH))
     from_first = (np.linalg.inv(truth[0]) @ truth)[:, :3, 3]  # the map is in its frame
     assert 100 * np.linalg.norm(np.stack(places) - from_first, axis=1).max() < 1.0
@@ -113,13 +116,13 @@ def test_frames_move_with_their_keyframe_when_a_correction_came_meanwhile(stream
     S = 2 * se3_exp(torch.tensor([0.3, -0.2, 0.1, 0.2, 0.1, -0.3], dtype=torch.float64))
     S[3, 3] = 1.0
     tracker.keyframes.correct(tracker.keyframes.moved(S))
-    tracker.take(follower)
-    keyframe = tracker.keyframes[follower.last.keyframe.id]
+    tracker.take_over(follower)
+    keyframe = tracker.keyframes[follower.last.keyframe]
     assert keyframe.scale == pytest.approx(0.5)
     half = T_rel.clone()
     half[:3, 3] /= 2
     torch.testing.assert_close(tracker.T_cw, half @ keyframe.T_cw, rtol=0, atol=1e-12)
-    record = tracker.recorder.records[-1]
+    record = tracker.map.recorder.log.records[-1]
     assert record.anchor == keyframe.id
     torch.testing.assert_close(record.T_rel, half, rtol=0, atol=1e-12)
 
@@ -134,7 +137,7 @@ def test_a_follower_knows_what_it_cannot_do(stream):
     assert follower.follow(replace(stream[n], follows_cut=True)) is None
     assert follower.follow(stream[-1]) is None  # too far from the keyframe
     assert follower.frames == []
-    assert follower.last.keyframe.id == tracker.keyframes.ids[-1]
+    assert follower.last.keyframe == tracker.keyframes.ids[-1]
 
 
 def test_what_it_locates_at_stays_as_it_was(stream):
@@ -143,6 +146,6 @@ def test_what_it_locates_at_stays_as_it_was(stream):
     before, depth = keyframe.T_cw.clone(), keyframe.inverse_depth.clone()
     tracker.complete()
     assert not torch.equal(keyframe.inverse_depth, depth)
-    assert torch.equal(follower.last.keyframe.inverse_depth, depth)
-    assert torch.equal(follower.last.keyframe.T_cw, before)
+    assert torch.equal(follower._keyframe.inverse_depth, depth)
+    assert torch.equal(follower._keyframe.T_cw, before)
     assert follower.follow(stream[n]) is not None

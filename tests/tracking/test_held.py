@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 import torch
 
-from geogs.config import TrackingConfig
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.tracking.certainty import certainty
-from geogs.tracking.held import depth_on_grid
-from geogs.tracking.tracker import Tracker, TrackState
+from geogs.tracking.held import add_saved_keyframes, depth_on_grid
+from geogs.tracking.tracker import Tracker, lone_tracker
 from geogs.types import Frame, RenderedKeyframe
 from geogs.world.grid import SampleGrid
+from geogs.world.segments import TrackState
 from tracking_scenes import CAMERA, frames, render, sideways
 
 PATH = sideways(30)
@@ -30,8 +30,8 @@ def place(T_wc: np.ndarray, camera: Camera = SMALL) -> RenderedKeyframe:
 
 @pytest.fixture(scope="module")
 def tracker() -> Tracker:
-    tracker = Tracker(CAMERA, TrackingConfig())
-    tracker.hold([place(PATH[n]) for n in (0, 5, 10)])
+    tracker = lone_tracker(CAMERA)
+    add_saved_keyframes(tracker.segment, [place(PATH[n]) for n in (0, 5, 10)])
     for frame in frames(PATH[2:18]):
         tracker.track(frame)
     return tracker
@@ -46,16 +46,17 @@ def test_a_camera_is_found_in_the_map_and_followed_out_of_it(tracker):
 
 
 def test_what_is_held_stays(tracker):
-    ids = sorted(tracker.held)
+    ids = sorted(tracker.segment.fixed)
     for id, n in zip(ids, (0, 5, 10), strict=True):
         assert np.array_equal(tracker.keyframes[id].T_cw, np.linalg.inv(PATH[n]))
-    assert len(tracker.free) >= 2
-    assert tracker.held.isdisjoint([*tracker.free, *tracker.active, *tracker.deep])
+    assert len(tracker.segment.free) >= 2
+    segment, local = tracker.segment, tracker.local
+    assert set(segment.fixed).isdisjoint([*segment.free, *local.active, *local.deep])
 
 
 def test_new_keyframes_are_known_relative_to_the_map(tracker):
     found = certainty(tracker)
-    assert found.keyframes == tuple(tracker.free)
+    assert found.keyframes == tuple(tracker.segment.free)
     assert 0 < found.position[0] < 0.02
 
 
@@ -71,14 +72,14 @@ def test_depth_between_pixels_is_that_of_the_plane_and_unknown_across_an_edge():
 
 
 def test_images_of_another_camera_are_refused():
-    tracker = Tracker(CAMERA.with_long_edge(96))
+    tracker = lone_tracker(CAMERA.with_long_edge(96))
     with pytest.raises(InputError, match="192 x 144 pixels, those of the video 96 x 72"):
-        tracker.hold([place(PATH[0])])
+        add_saved_keyframes(tracker.segment, [place(PATH[0])])
 
 
 def test_a_map_that_shows_another_place_is_not_believed():
-    tracker = Tracker(CAMERA, TrackingConfig())
-    tracker.hold([place(PATH[0])])
+    tracker = lone_tracker(CAMERA)
+    add_saved_keyframes(tracker.segment, [place(PATH[0])])
     noise = np.random.default_rng(0).integers(0, 255, (144, 192, 3), np.uint8)
     assert tracker.track(Frame(0, 0.0, noise)).state is TrackState.LOST
     assert tracker.deviation() is None

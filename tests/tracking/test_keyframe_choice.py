@@ -64,9 +64,11 @@ def test_where_all_are_blurred_none_waits() -> None:
 
 
 def test_a_choice_goes_on_where_another_was() -> None:
-    choice, other = KeyframeChoice(CONFIG, 512), KeyframeChoice(CONFIG, 512)
+    recent: list[float] = []
+    choice = KeyframeChoice(CONFIG, 512, recent)
     for seed in range(5):
         choice.see(texture(seed))
-    other.load(choice.state())
+    choice.settle()
+    other = KeyframeChoice(CONFIG, 512, recent)
     other.see(cv2.blur(texture(5), (9, 1)))
     assert not other.calls_for(13.0, 1.0)

@@ -8,13 +8,13 @@ import pytest
 import torch
 
 from degraded_prior import BAD, PATCHY, PLAUSIBLE, DegradedPrior, with_bare_walls
-from geogs.config import PriorConfig, TrackingConfig
+from geogs.config import Config, PriorConfig, TrackingConfig
 from geogs.geometry.camera import Camera
 from geogs.geometry.umeyama import umeyama
 from geogs.loop.global_bundle import global_bundle
 from geogs.priors.base import DepthKind, PriorMaps
 from geogs.tracking.flow.texture import MIN_STRUCTURE, cell_structure
-from geogs.tracking.tracker import Tracker
+from geogs.tracking.tracker import Tracker, lone_tracker
 from geogs.types import Frame, PoseCorrection
 from geogs_synth.motion.handheld import handheld_trajectory
 from geogs_synth.places.room import make_room
@@ -45,7 +45,9 @@ def walk() -> tuple[list[View], np.ndarray]:
 
 
 def track(views: list[View], prior, config: PriorConfig | None = None) -> Tracker:
-    tracker = Tracker(CAMERA, CONFIG, prior=prior, prior_config=config)
+    tracker = lone_tracker(
+        CAMERA, Config(tracking=CONFIG, prior=config or PriorConfig()), prior=prior
+    )
     for n, view in enumerate(views):
         tracker.track(Frame(n, n / 30, view.image))
     tracker.finish()
@@ -54,7 +56,7 @@ def track(views: list[View], prior, config: PriorConfig | None = None) -> Tracke
 
 def score(tracker: Tracker, walk: tuple[list[View], np.ndarray]) -> Score:
     views, T_wc = walk
-    keyframes = [tracker.keyframes[k] for k in tracker.keyframe_ids]
+    keyframes = [tracker.keyframes[k] for k in tracker.segment.ids]
     x = torch.stack([torch.linalg.inv(k.T_cw)[:3, 3] for k in keyframes])
     y = torch.from_numpy(T_wc[[k.frame_index for k in keyframes], :3, 3])
     scale, R, t = umeyama(x, y)

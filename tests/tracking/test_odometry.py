@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 import torch
 
-from geogs.config import OdometryConfig
+from geogs.config import Config, OdometryConfig
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_inverse
 from geogs.geometry.umeyama import umeyama
 from geogs.loop.global_bundle import global_bundle
 from geogs.tracking.odometry import Odometry
-from geogs.tracking.tracker import Tracker
+from geogs.tracking.tracker import Tracker, lone_tracker
 from geogs.types import MeasuredPose
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import KeyframeSet, KeyframeTable
@@ -40,7 +40,7 @@ def test_motions_are_those_between_neighbours_in_the_unit_of_the_map():
     odometry = Odometry(keyframes, OdometryConfig())
     assert odometry.between(keyframes.ids) is None
     odometry.look()
-    assert odometry.scale == pytest.approx(2.0, rel=1e-9)
+    assert odometry.found.scale == pytest.approx(2.0, rel=1e-9)
     motions = odometry.between(keyframes.ids)
     pairs = list(zip(motions.source.tolist(), motions.target.tolist(), strict=True))
     assert pairs == [(0, 1), (1, 2), (2, 3), (3, 4), (4, 6), (6, 7), (7, 8), (10, 11)]
@@ -55,13 +55,13 @@ def test_few_motions_are_not_believed():
     path = sideways(5, 0.08)
     odometry = Odometry(segment(path, drifting(path), 2.0), OdometryConfig())
     odometry.look()
-    assert odometry.scale is None
+    assert odometry.found.scale is None
     assert not odometry.agreement().used
 
 
 def tracked(path: list[np.ndarray], poses: list[MeasuredPose] | None) -> Tracker:
     images = frames(path)
-    tracker = Tracker(CAMERA, CONFIG)
+    tracker = lone_tracker(CAMERA, Config(tracking=CONFIG))
     for frame in images if poses is None else with_poses(images, poses):
         tracker.track(frame)
     tracker.finish()
@@ -73,7 +73,7 @@ def errors(tracker: Tracker, path: list[np.ndarray]) -> tuple[float, float | Non
     """ATE in centimetres after a similarity, and the error of the scale that was found."""
     found, truth = tracker.trajectory().T_wc[:, :3, 3], np.stack(path)[:, :3, 3]
     scale = float(umeyama(torch.from_numpy(found), torch.from_numpy(truth))[0])
-    metres = tracker.odometry.scale
+    metres = tracker.map.odometry.found.scale
     return error_cm(found, truth), None if metres is None else metres / scale - 1
 
 
@@ -86,7 +86,7 @@ def test_poses_bring_metres_and_wrong_ones_are_out_voted():
     ate, scale = errors(tracker, path)
     assert ate < 1.1 * alone + 0.005
     assert abs(scale) < 0.01
-    assert tracker.odometry.agreement().share > 0.5
+    assert tracker.map.odometry.agreement().share > 0.5
 
 
 @pytest.mark.long
@@ -96,7 +96,7 @@ def test_poses_of_another_motion_change_nothing():
     alone, _ = errors(tracked(path, None), path)
     other = [pose(0.05 * np.cos(0.4 * k), 0.02 * k, 0.06 * k, 0.09 * k) for k in range(40)]
     tracker = tracked(path, drifting(other))
-    agreement = tracker.odometry.agreement()
+    agreement = tracker.map.odometry.agreement()
     assert not agreement.used
     assert agreement.share < 0.2
     assert errors(tracker, path)[0] == pytest.approx(alone, abs=1e-9)

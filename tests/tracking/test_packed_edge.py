@@ -11,13 +11,13 @@ from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_inverse
 from geogs.geometry.umeyama import umeyama
 from geogs.loop.global_bundle import global_bundle
-from geogs.tracking.packed_edge import PackedEdge, position_step
+from geogs.world.edges import PackedEdge, position_step
 from planted_walk import SMALL, drift, planted_tracker
 
 
 def test_a_packed_edge_tells_the_same():
     tracker, _ = planted_tracker(4)
-    graph = tracker.graph
+    graph = tracker.map.graph
     pairs = [(0, 1), (1, 3)]
     graph.measure(pairs)
     plain = dict(graph.edges)
@@ -68,7 +68,7 @@ def test_a_walk_of_a_thousand_keyframes_is_adjusted_in_little_memory():
     drift(tracker, scale=0.004)
     before, held = error_cm(tracker, truth), peak_mib()
     global_bundle(tracker)
-    assert len(tracker.graph.edges) == 8000
+    assert len(tracker.map.graph.edges) == 8000
     assert before > 2.0
     assert error_cm(tracker, truth) < 0.5 * before
     # A dense camera system alone is 274 MiB, the distances of all pairs are more.

@@ -7,17 +7,18 @@ import numpy as np
 import pytest
 import torch
 
-from geogs.config import LoopConfig, TrackingConfig
+from geogs.config import Config, LoopConfig, TrackingConfig
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import sim3_exp
 from geogs.geometry.umeyama import umeyama
 from geogs.loop.closer import LoopCloser
 from geogs.tracking.flow.select import build_operator
 from geogs.tracking.segments import Segments
-from geogs.tracking.tracker import Tracker, TrackState
+from geogs.tracking.tracker import lone_tracker
 from geogs.types import Frame
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import KeyframeTable
+from geogs.world.segments import SegmentTable, TrackState
 from loop_scenes import at_angle, room
 
 pytestmark = pytest.mark.system
@@ -45,9 +46,7 @@ def run(frames: Sequence[Frame]) -> tuple[Segments, list]:
     grid = SampleGrid(CAMERA)
     operator = build_operator(CONFIG, grid)
     store = KeyframeTable.on(grid, operator.encode)
-    segments = Segments(
-        lambda: Tracker(CAMERA, CONFIG, "cpu", 0, operator, None, None, store), CONFIG.patience
-    )
+    segments = Segments(SegmentTable(), store, operator, Config(tracking=CONFIG))
     closer, results = LoopCloser(segments, LOOPS), []
     for frame in frames:
         results.append(segments.track(frame, closer.recognise))
@@ -87,7 +86,7 @@ def test_a_jump_cut_begins_a_segment_that_a_loop_joins():
     angles = [*there, *back]
     segments, results = run(stream(angles))
     assert results[24].state is TrackState.LOST
-    assert [r.apart for r in results[24:60]] != [()] * 36
+    assert [r.finalized_elsewhere for r in results[24:60]] != [()] * 36
     fates = [s.fate for s in segments.summary()]
     assert fates == ["world", "joined"]
     untracked = np.flatnonzero(~segments.trajectory().tracked)
@@ -116,7 +115,7 @@ def test_a_segment_that_meets_nothing_stays_apart():
 def test_the_largest_segment_becomes_the_world():
     angles = [*np.arange(0, 16, 2.0), *np.arange(120, 180, 2.0)]
     segments, results = run(stream(angles, cuts=[8]))
-    assert results[-1].is_new_world
+    assert results[-1].is_new_main
     assert results[-1].finalized == tuple(segments.keyframe_ids)
     assert [s.fate for s in segments.summary()] == ["apart", "world"]
     assert segments.trajectory().tracked.tolist() == [False] * 8 + [True] * 30
@@ -124,16 +123,16 @@ def test_the_largest_segment_becomes_the_world():
 
 @pytest.mark.parametrize("scale", [0.5, 1.0, 3.0])
 def test_moving_keyframes_keeps_what_they_see(scale):
-    tracker = Tracker(CAMERA, CONFIG)
+    tracker = lone_tracker(CAMERA, Config(tracking=CONFIG))
     for frame in stream(np.arange(0, 16, 2.0)):
         tracker.track(frame)
     tracker.finish()
-    before = tracker.graph.reprojections([(0, 2), (3, 1)])
+    before = tracker.map.graph.reprojections([(0, 2), (3, 1)])
     centres = [torch.linalg.inv(s.T_cw)[:3, 3] for s in tracker.keyframes]
     xi = torch.tensor([0.3, -0.2, 0.5, 0.1, 0.4, -0.2, np.log(scale)], dtype=torch.float64)
     S = sim3_exp(xi)
     tracker.keyframes.correct(tracker.keyframes.moved(S))
-    after = tracker.graph.reprojections([(0, 2), (3, 1)])
+    after = tracker.map.graph.reprojections([(0, 2), (3, 1)])
     assert float((after - before).abs().max()) < 2e-3
     for centre, state in zip(centres, tracker.keyframes, strict=True):
         expected = torch.linalg.inv(S) @ torch.cat([centre, torch.ones(1)])

@@ -6,11 +6,14 @@ import numpy as np
 import pytest
 import torch
 
+from geogs.config import Config
 from geogs.geometry.lie import se3_inverse
-from geogs.tracking.tracker import Tracker, TrackState
+from geogs.tracking.tracker import Tracker, lone_tracker
 from geogs.types import Frame
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import MeasuredCells
+from geogs.world.segments import TrackState
+from records import copied
 from tracking_runs import CONFIG
 from tracking_scenes import CAMERA, pose, render, sideways
 
@@ -40,7 +43,7 @@ def sensed(path: list[np.ndarray], every: int = 1) -> list[Frame]:
 
 
 def tracked(frames: list[Frame]) -> Tracker:
-    tracker = Tracker(CAMERA, CONFIG)
+    tracker = lone_tracker(CAMERA, Config(tracking=CONFIG))
     for frame in frames:
         tracker.track(frame)
     tracker.finish()
@@ -56,10 +59,10 @@ def errors_cm(tracker: Tracker, path: list[np.ndarray]) -> np.ndarray:
 
 def test_the_first_frame_starts_a_map_in_metres():
     path = sideways(2)
-    tracker = Tracker(CAMERA, CONFIG)
+    tracker = lone_tracker(CAMERA, Config(tracking=CONFIG))
     result = tracker.track(sensed(path)[0])
     assert (result.state, result.new_keyframe) == (TrackState.TRACKING, 0)
-    assert tracker.is_metric
+    assert tracker.segment.is_metric
     (keyframe,) = tracker.keyframes
     truth = render(path[0])[1]
     grid = SampleGrid(CAMERA)
@@ -70,27 +73,27 @@ def test_the_first_frame_starts_a_map_in_metres():
     off = ((keyframe.inverse_depth - exact).abs() * keyframe.information.sqrt())[known]
     assert float(off.median()) < 0.5  # the noise of single pixels averages
     assert bool((keyframe.inverse_depth > 0).all())
-    state = tracker.full_state()
-    assert state.is_metric
-    assert torch.equal(state.keyframes[0].measured.information, keyframe.measured.information)
+    assert copied(tracker.segment).is_metric
+    again = copied(tracker.keyframes.table)[0]
+    assert torch.equal(again.measured.information, keyframe.measured.information)
 
 
 def test_frames_without_depth_wait_for_one_that_has_it():
     frames = [replace(f, depth=None) if f.index < 3 else f for f in sensed(sideways(5))]
-    tracker = Tracker(CAMERA, CONFIG)
+    tracker = lone_tracker(CAMERA, Config(tracking=CONFIG))
     states = [tracker.track(f).state for f in frames]
     assert states[:3] == [TrackState.INITIALIZING] * 3
     assert states[3:] == [TrackState.TRACKING] * 2
-    assert tracker.keyframes[tracker.keyframe_ids[0]].frame_index == 3
+    assert tracker.keyframes[tracker.segment.ids[0]].frame_index == 3
     assert len(tracker.trajectory().timestamps) == 5
 
 
 def test_too_little_depth_starts_nothing():
     frame = sensed(sideways(1))[0]
     nothing = Picture(np.full_like(frame.depth.depth, 50.0), 0)
-    tracker = Tracker(CAMERA, CONFIG)
+    tracker = lone_tracker(CAMERA, Config(tracking=CONFIG))
     assert tracker.track(replace(frame, depth=nothing)).state is TrackState.INITIALIZING
-    assert not tracker.is_metric
+    assert not tracker.segment.is_metric
     assert all(k.measured is None for k in tracker.keyframes)
 
 
@@ -111,7 +114,7 @@ def test_a_camera_that_only_turns_has_a_place():
 
 
 def test_measurements_follow_the_scale_of_their_keyframe():
-    tracker = Tracker(CAMERA, CONFIG)
+    tracker = lone_tracker(CAMERA, Config(tracking=CONFIG))
     tracker.track(sensed(sideways(1))[0])
     (keyframe,) = tracker.keyframes
     before = keyframe.measured

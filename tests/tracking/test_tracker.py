@@ -8,13 +8,14 @@ import pytest
 import torch
 
 from credulous_flow import CredulousFlow
-from geogs.config import TrackingConfig
+from geogs.config import Config, TrackingConfig
 from geogs.errors import InputError, TrackingLost
 from geogs.geometry.camera import Camera
 from geogs.loop.global_bundle import global_bundle
-from geogs.tracking.tracker import Tracker, TrackState
+from geogs.tracking.tracker import Tracker, lone_tracker
 from geogs.types import Frame, PoseCorrection
 from geogs.world.grid import SampleGrid
+from geogs.world.segments import TrackState
 from tracking_runs import CONFIG, PATH, error_cm
 from tracking_scenes import CAMERA, frames, pose, render, sideways
 
@@ -22,7 +23,7 @@ pytestmark = pytest.mark.system
 
 
 def run(stream: list[Frame], config: TrackingConfig = CONFIG) -> tuple[Tracker, list]:
-    tracker = Tracker(CAMERA, config)
+    tracker = lone_tracker(CAMERA, Config(tracking=config))
     results = [tracker.track(f) for f in stream]
     return tracker, [*results, tracker.finish()]
 
@@ -45,7 +46,7 @@ def test_every_frame_is_located_to_millimetres(tracked):
 def test_depth_is_right_where_information_is_high(tracked):
     tracker, _ = tracked
     ratios = []
-    for id in tracker.keyframe_ids[1:-1]:
+    for id in tracker.segment.ids[1:-1]:
         k = tracker.keyframes[id]
         z = render(PATH[k.frame_index])[1][4:-3:8, 4:-3:8]
         inverse_depth, information = k.depth_field()
@@ -59,12 +60,12 @@ def test_results_tell_what_happened(tracked):
     tracker, results = tracked
     finalized = [k for r in results for k in r.finalized]
     removed = [k for r in results for k in r.removed]
-    assert finalized == tracker.keyframe_ids
+    assert finalized == tracker.segment.ids
     assert finalized == sorted(set(finalized))
     assert not set(finalized) & set(removed)
     last = results[-2]
     assert last.state is TrackState.TRACKING
-    assert tracker.keyframe_ids[0] not in last.active
+    assert tracker.segment.ids[0] not in last.active
     assert list(last.active) == sorted(last.active)
     assert results[0].state is TrackState.INITIALIZING
 
@@ -72,7 +73,7 @@ def test_results_tell_what_happened(tracked):
 def test_median_depth_is_about_one_unit(tracked):
     tracker, _ = tracked
     depth = torch.cat(
-        [1 / tracker.keyframes[k].inverse_depth.flatten() for k in tracker.keyframe_ids]
+        [1 / tracker.keyframes[k].inverse_depth.flatten() for k in tracker.segment.ids]
     )
     assert 0.7 < float(depth.median()) < 1.5
 
@@ -94,7 +95,7 @@ def test_global_bundle_improves_and_reports_the_correction():
     assert final < 0.25
     assert seen == sorted(seen)
     assert seen[-1] == 1.0
-    assert list(correction.after) == tracker.keyframe_ids
+    assert list(correction.after) == tracker.segment.ids
     for id, T in correction.after.items():
         assert torch.equal(T, tracker.keyframes[id].T_cw)
     assert torch.equal(correction.after[0], correction.before[0])
@@ -128,7 +129,7 @@ def test_lost_until_the_end_keeps_what_there_is():
     tracker, results = run(stream)
     assert results[-1].state is TrackState.LOST
     assert np.flatnonzero(~tracker.trajectory().tracked).tolist() == list(range(30, 40))
-    assert len(tracker.keyframe_ids) >= 5
+    assert len(tracker.segment.ids) >= 5
 
 
 @pytest.mark.long
@@ -139,7 +140,8 @@ def test_noise_is_lost_even_if_the_flow_believes_in_it():
     for k in noise:
         image = rng.integers(0, 255, stream[0].image.shape, dtype=np.uint8)
         stream[k] = replace(stream[k], image=image)
-    tracker = Tracker(CAMERA, CONFIG, operator=CredulousFlow(SampleGrid(CAMERA)))
+    operator = CredulousFlow(SampleGrid(CAMERA))
+    tracker = lone_tracker(CAMERA, Config(tracking=CONFIG), operator=operator)
     lost = [k for k, f in enumerate(stream) if tracker.track(f).state is TrackState.LOST]
     assert lost == [20, 21, 22]  # the first come before there is a map
     tracker.finish()
@@ -152,7 +154,7 @@ def test_dark_start_is_skipped():
     for k in range(3):
         stream[k] = replace(stream[k], image=np.zeros_like(stream[k].image))
     tracker, _ = run(stream)
-    assert tracker.keyframes[tracker.keyframe_ids[0]].frame_index == 3
+    assert tracker.keyframes[tracker.segment.ids[0]].frame_index == 3
     assert np.flatnonzero(~tracker.trajectory().tracked).tolist() == [0, 1, 2]
 
 
@@ -187,20 +189,20 @@ def test_black_video_says_so():
 
 
 def test_frame_of_another_size_is_refused():
-    tracker = Tracker(CAMERA, CONFIG)
+    tracker = lone_tracker(CAMERA, Config(tracking=CONFIG))
     with pytest.raises(InputError, match="one size"):
         tracker.track(Frame(0, 0.0, np.zeros((50, 60, 3), np.uint8)))
 
 
 def test_tiny_image_is_refused():
     with pytest.raises(InputError, match="32 x 32"):
-        Tracker(Camera(20.0, 20.0, 10.0, 10.0, 24, 20), CONFIG)
+        lone_tracker(Camera(20.0, 20.0, 10.0, 10.0, 24, 20), Config(tracking=CONFIG))
 
 
 @pytest.mark.long
 def test_correct_scales_depth_with_the_pose():
     tracker, _ = run(frames(PATH[:30]))
-    id = tracker.keyframe_ids[2]
+    id = tracker.segment.ids[2]
     keyframe = tracker.keyframes[id]
     before = replace(keyframe)
     T = before.T_cw.clone()
@@ -222,11 +224,11 @@ def test_slow_motion_makes_few_keyframes_and_culling_removes_more():
     few, _ = run(slow)
     many, results = run(slow, replace(CONFIG, keyframe_flow=0.012, cull_distance=0.0))
     culled, results = run(slow, replace(CONFIG, keyframe_flow=0.012, cull_distance=0.02))
-    assert len(few.keyframe_ids) < len(many.keyframe_ids)
+    assert len(few.segment.ids) < len(many.segment.ids)
     removed = [k for r in results for k in r.removed]
     assert removed
-    assert len(culled.keyframe_ids) < len(many.keyframe_ids)
-    assert not set(removed) & set(culled.keyframe_ids)
+    assert len(culled.segment.ids) < len(many.segment.ids)
+    assert not set(removed) & set(culled.segment.ids)
     assert culled.trajectory().tracked.all()
     truth = np.stack(sideways(30, 0.012))[:, :3, 3]
     assert error_cm(culled.trajectory().T_wc[:, :3, 3], truth) < 0.4
@@ -236,7 +238,7 @@ def test_thirty_frames_of_a_rendered_living_room(shared_data):
     folder = shared_data / "rooms" / "living-room-2"
     T_wc = np.loadtxt(folder / "traj.txt").reshape(-1, 4, 4)
     camera = Camera(600.0, 600.0, 599.5, 339.5, 1200, 680).with_long_edge(320)
-    tracker = Tracker(camera, replace(CONFIG, keyframe_flow=0.02))
+    tracker = lone_tracker(camera, Config(tracking=replace(CONFIG, keyframe_flow=0.02)))
     for k in range(0, 60, 2):
         image = cv2.imread(str(folder / "results" / f"frame{k:06d}.jpg"))[..., ::-1]
         size = (camera.width, camera.height)

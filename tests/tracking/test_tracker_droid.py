@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from geogs.bundle.projection import project
-from geogs.config import TrackingConfig
+from geogs.config import Config, TrackingConfig
 from geogs.loop.global_bundle import global_bundle
 from geogs.tracking.flow.droid import DroidFlow
 from geogs.tracking.flow.droid_network import (
@@ -18,7 +18,7 @@ from geogs.tracking.flow.droid_network import (
     cell_positions,
     on_cells,
 )
-from geogs.tracking.tracker import Tracker
+from geogs.tracking.tracker import lone_tracker
 from geogs.world.grid import SampleGrid
 from tracking_runs import error_cm
 from tracking_scenes import CAMERA, frames, render, sideways
@@ -81,11 +81,11 @@ def tracked() -> SimpleNamespace:
     path = sideways(30, step=0.04)
     operator = DroidFlow(GRID, DroidNetwork(DroidSize(2)))
     operator.network = KnowingNetwork(path)
-    tracker = Tracker(CAMERA, CONFIG, operator=operator)
+    tracker = lone_tracker(CAMERA, Config(tracking=CONFIG), operator=operator)
     for frame in frames(path):
         tracker.track(frame)
     tracker.finish()
-    return SimpleNamespace(tracker=tracker, path=path, edges=dict(tracker.graph.edges))
+    return SimpleNamespace(tracker=tracker, path=path, edges=dict(tracker.map.graph.edges))
 
 
 def test_the_tracker_follows_a_network_that_is_right(tracked):
@@ -101,7 +101,7 @@ def test_the_tracker_follows_a_network_that_is_right(tracked):
 def test_memory_does_not_pile_up(tracked):
     """Only edges of the window that is still adjusted keep their hidden states."""
     kept = [e for e, v in tracked.edges.items() if v.memory is not None]
-    moving = set(tracked.tracker.keyframe_ids[-CONFIG.window :])
-    assert len(tracked.tracker.keyframe_ids) > 8
+    moving = set(tracked.tracker.segment.ids[-CONFIG.window :])
+    assert len(tracked.tracker.segment.ids) > 8
     assert 10 < len(kept) < 0.7 * len(tracked.edges)
     assert all(moving & set(e) for e in kept)

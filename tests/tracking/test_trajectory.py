@@ -7,9 +7,12 @@ import torch
 
 from geogs.geometry.lie import se3_exp, se3_inverse
 from geogs.tracking.gaps import interpolate
-from geogs.tracking.trajectory import TrajectoryRecorder, depth_aware_weight
+from geogs.tracking.recorder import FrameRecorder, pose_of
+from geogs.tracking.trajectory import depth_aware_weight, row_errors, solve_trajectory
 from geogs.types import FlowMatch, Frame, SeenRows
+from geogs.world.frames import FrameLog
 from planted_walk import planted_tracker
+from records import copied
 
 
 def test_gaps_are_bridged_by_constant_motion_and_ends_are_held():
@@ -41,32 +44,34 @@ def frame(index: int) -> Frame:
 
 def test_frames_of_a_culled_keyframe_keep_their_place_and_others_are_not_touched():
     tracker, _ = planted_tracker(6)
-    recorder = TrajectoryRecorder(tracker.keyframes, tracker.operator)
+    log = FrameLog()
+    recorder = FrameRecorder(log, tracker.keyframes, tracker.map.operator)
     step = se3_exp(torch.tensor([0.02, 0, 0, 0, 0.01, 0], dtype=torch.float64))
     for n in range(5):
         tracker.keyframes[n].frame_index = 3 * n
-        recorder.add_keyframe(n)
+        recorder.add_keyframe(tracker.keyframes[n])
         for k in (1, 2):
             recorder.add(frame(3 * n + k), n, n, step)
-    before = [recorder._pose(r).clone() for r in recorder.records]
+    before = [pose_of(r, tracker.keyframes).clone() for r in log.records]
     recorder.keyframe_removed(tracker.keyframes.remove(3), 2)
-    assert [r.anchor for r in recorder.records] == [0] * 3 + [1] * 3 + [2] * 6 + [4] * 3
-    for record, T_cw in zip(recorder.records, before, strict=True):
-        torch.testing.assert_close(recorder._pose(record), T_cw)
-    assert 9 in [p.record.index for p in recorder._pending]
+    assert [r.anchor for r in log.records] == [0] * 3 + [1] * 3 + [2] * 6 + [4] * 3
+    for record, T_cw in zip(log.records, before, strict=True):
+        torch.testing.assert_close(pose_of(record, tracker.keyframes), T_cw)
+    assert 9 in [r.index for r in log.records if r.image is not None]
 
 
 def test_what_is_kept_of_a_frame_is_small_and_finds_its_pose():
     tracker, T = planted_tracker(4, sigma=0.0)
-    recorder = TrajectoryRecorder(tracker.keyframes, tracker.operator)
-    match, _ = tracker.operator.measure([0], [2])
+    log = FrameLog()
+    recorder = FrameRecorder(log, tracker.keyframes, tracker.map.operator)
+    match, _ = tracker.map.operator.measure([0], [2])
     wrong = se3_exp(torch.tensor([0.02, 0, 0.01, 0, 0.01, 0], dtype=torch.float64))
     recorder.add(frame(50), 2, 0, wrong @ T[2], FlowMatch(match.pixels, match.weight))
-    kept = recorder.records[0].observations[0]
+    kept = log.records[0].observations[0]
     cells = len(kept.position)
     assert kept.position.nbytes + kept.half_weight.nbytes == 8 * cells
-    assert cells <= (tracker.grid.size + 9) // 3
-    found = torch.from_numpy(recorder.solve().T_wc[0])
+    assert cells <= (tracker.keyframes.grid.size + 9) // 3
+    found = torch.from_numpy(solve_trajectory(log, tracker.keyframes).T_wc[0])
     # Positions are known to 1/800 pixel here, of 75 pixels focal length at 3 metres.
     torch.testing.assert_close(se3_inverse(found), T[2], rtol=0, atol=2e-4)
 
@@ -74,13 +79,13 @@ def test_what_is_kept_of_a_frame_is_small_and_finds_its_pose():
 def test_rows_go_where_the_frames_go():
     tracker, _ = planted_tracker(3)
     rows = SeenRows(torch.zeros(3, 4, 2).half(), torch.zeros(3, 4).half())
-    recorders = [TrajectoryRecorder(tracker.keyframes, tracker.operator) for _ in range(4)]
-    for n, recorder in enumerate(recorders[:3]):
-        recorder.see(replace(frame(n), rows=rows))
-        recorder.see(frame(10 + n))  # of a global shutter
+    logs = [FrameLog() for _ in range(3)]
+    recorders = [FrameRecorder(log, tracker.keyframes, tracker.map.operator) for log in logs]
+    for n, recorder in enumerate(recorders):
+        recorder.note_rows(replace(frame(n), rows=rows))
+        recorder.note_rows(frame(10 + n))  # of a global shutter
     recorders[0].absorb(recorders[1])
     recorders[0].give_up(recorders[2])
-    recorders[3].load(recorders[0].state())
-    assert set(recorders[3].rows) == {0, 1, 2}
-    assert recorders[1].row_errors() is not None
-    assert TrajectoryRecorder(tracker.keyframes, tracker.operator).row_errors() is None
+    assert set(copied(logs[0]).rows) == {0, 1, 2}
+    assert row_errors(logs[1], tracker.keyframes) is not None
+    assert row_errors(FrameLog(), tracker.keyframes) is None

@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from geogs.config import TrackingConfig
+from geogs.config import Config, TrackingConfig
 from geogs.errors import TrackingLost
 from geogs.evaluation.trajectory import rotation_angle
 from geogs.tracking import start_up
@@ -15,10 +15,10 @@ from geogs.tracking.flow.select import build_operator
 from geogs.tracking.graph import FrameGraph
 from geogs.tracking.initialise import FORGIVING, Attempt, initialise
 from geogs.tracking.segments import Segments
-from geogs.tracking.tracker import Tracker, TrackState
 from geogs.types import Frame, Trajectory
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import KeyframeTable
+from geogs.world.segments import SegmentTable, TrackState, check_segment
 from records import copied
 from tracking_runs import CONFIG, error_cm
 from tracking_scenes import CAMERA, frames, pose, sideways
@@ -26,13 +26,22 @@ from tracking_scenes import CAMERA, frames, pose, sideways
 pytestmark = pytest.mark.system
 
 
+def resumed(keyframes: KeyframeTable, table: SegmentTable) -> Segments:
+    """Segments on tables that were just read."""
+    grid = SampleGrid(CAMERA)
+    operator = build_operator(CONFIG, grid)
+    keyframes.attached(grid, operator.encode)
+    for segment in table.segments:
+        segment.keyframes.attached(keyframes)
+        check_segment(segment, grid)
+    return Segments(table, keyframes, operator, Config(tracking=CONFIG))
+
+
 def new_segments(config: TrackingConfig = CONFIG) -> Segments:
     grid = SampleGrid(CAMERA)
     operator = build_operator(config, grid)
     store = KeyframeTable.on(grid, operator.encode)
-    return Segments(
-        lambda: Tracker(CAMERA, config, "cpu", 0, operator, None, None, store), config.patience
-    )
+    return Segments(SegmentTable(), store, operator, Config(tracking=config))
 
 
 def run(stream: Sequence[Frame], config: TrackingConfig = CONFIG) -> tuple[Segments, list]:
@@ -51,7 +60,7 @@ def turned(path: Sequence[np.ndarray], trajectory: Trajectory) -> np.ndarray:
 def test_a_camera_that_only_turns_has_orientations():
     path = [pose(0.0, yaw=0.5 * np.sin(0.1 * k)) for k in range(32)]
     segments, results = run(frames(path))
-    assert segments.why_not.startswith("The images show no parallax")
+    assert segments.table.why_not.startswith("The images show no parallax")
     assert results[-1].state is TrackState.INITIALIZING
     assert segments.keyframe_ids == []
     trajectory = segments.trajectory()
@@ -131,7 +140,7 @@ def test_coming_back_goes_on_in_the_same_world(turning_away):
 @pytest.mark.long
 def test_no_keyframe_is_made_where_no_depth_is_known(turning_away):
     path, segments, _ = turning_away
-    for keyframe in segments.world.keyframes:
+    for keyframe in segments.main.keyframes:
         assert abs(turn_of(path[keyframe.frame_index])) < 1.5
 
 
@@ -155,9 +164,8 @@ def test_a_state_goes_on_as_if_nothing_had_happened():
     first = new_segments()
     for frame in stream[:11]:
         first.track(frame, lambda image: ())
-    second = new_segments()
-    second.world.keyframes.table.take_over(copied(first.world.keyframes.table))
-    second.load(copied(first.state()))
+    first.settle()
+    second = resumed(copied(first.main.keyframes.table), copied(first.table))
     for frame in stream[11:]:
         second.track(frame, lambda image: ())
     second.finish()

@@ -5,7 +5,8 @@ import torch
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from geogs.tracking.turns import Turn, orientations
+from geogs.tracking.turns import orientations
+from geogs.world.frames import RelativeRotation
 
 
 def rotations(count: int, seed: int = 0) -> list[torch.Tensor]:
@@ -17,14 +18,16 @@ def rotations(count: int, seed: int = 0) -> list[torch.Tensor]:
     return [torch.from_numpy(r) for r in R]
 
 
-def turn(R: list[torch.Tensor], a: int, b: int, error: np.ndarray | None = None) -> Turn:
+def relative(
+    R: list[torch.Tensor], a: int, b: int, error: np.ndarray | None = None
+) -> RelativeRotation:
     wrong = np.eye(3) if error is None else Rotation.from_rotvec(error).as_matrix()
-    return Turn(a, torch.from_numpy(wrong) @ R[b] @ R[a].mT, 0.01)
+    return RelativeRotation(a, torch.from_numpy(wrong) @ R[b] @ R[a].mT, 0.01)
 
 
 def test_a_chain_is_followed_in_both_directions() -> None:
     R = rotations(6)
-    found = orientations({k: [turn(R, k - 1, k)] for k in range(1, 6)}, {3: R[3]})
+    found = orientations({k: [relative(R, k - 1, k)] for k in range(1, 6)}, {3: R[3]})
     assert sorted(found) == [0, 1, 2, 4, 5]
     for k, r in found.items():
         torch.testing.assert_close(r, R[k])
@@ -32,7 +35,7 @@ def test_a_chain_is_followed_in_both_directions() -> None:
 
 def test_what_nothing_links_has_no_orientation() -> None:
     R = rotations(8)
-    turns = {k: [turn(R, k - 1, k)] for k in (1, 2, 5, 6, 7)}
+    turns = {k: [relative(R, k - 1, k)] for k in (1, 2, 5, 6, 7)}
     assert sorted(orientations(turns, {0: R[0]})) == [1, 2]
     alone = orientations(turns, {})  # 4 to 7 are more than 0 to 2
     assert sorted(alone) == [4, 5, 6, 7]
@@ -44,10 +47,10 @@ def test_what_nothing_links_has_no_orientation() -> None:
 def test_contradictions_are_spread_as_by_a_general_minimiser() -> None:
     R, rng = rotations(7, 3), np.random.default_rng(1)
     links = [(0, 1), (1, 2), (2, 3), (3, 4), (4, 5), (5, 6), (0, 3), (2, 5)]
-    turns: dict[int, list[Turn]] = {}
+    turns: dict[int, list[RelativeRotation]] = {}
     for a, b in links:
-        one = turn(R, a, b, rng.normal(0, 0.02, 3))
-        turns.setdefault(b, []).append(Turn(a, one.R, float(rng.uniform(0.01, 0.03))))
+        one = relative(R, a, b, rng.normal(0, 0.02, 3))
+        turns.setdefault(b, []).append(RelativeRotation(a, one.R, float(rng.uniform(0.01, 0.03))))
     found = orientations(turns, {0: R[0], 6: R[6]})
 
     def errors(x: np.ndarray) -> np.ndarray:

@@ -2,16 +2,16 @@
 
 import torch
 
-from geogs.tracking.window import reach
+from geogs.tracking.local_mapping import window_length
 from planted_walk import planted_tracker
 
 
 def test_a_camera_that_moves_needs_no_more_than_the_least():
     tracker, _ = planted_tracker(12)
-    assert reach(list(tracker.keyframes), 4, 10, 0.0) == 4
-    assert reach(list(tracker.keyframes), 4, 10, 1e-6) == 4
-    assert reach(list(tracker.keyframes)[:3], 4, 10, 10.0) == 3
-    assert reach(list(tracker.keyframes), 4, 10, 1e3) == 10
+    assert window_length(list(tracker.keyframes), 4, 10, 0.0) == 4
+    assert window_length(list(tracker.keyframes), 4, 10, 1e-6) == 4
+    assert window_length(list(tracker.keyframes)[:3], 4, 10, 10.0) == 3
+    assert window_length(list(tracker.keyframes), 4, 10, 1e3) == 10
 
 
 def test_it_ends_where_the_baseline_is_reached():
@@ -22,5 +22,5 @@ def test_it_ends_where_the_baseline_is_reached():
         T_cw = torch.eye(4, dtype=torch.float64)
         T_cw[0, 3] = 0.01 * depth * n
         keyframe.T_cw = T_cw
-    assert reach(keyframes, 4, 10, 0.055) == 7
-    assert reach(keyframes, 4, 6, 0.055) == 6
+    assert window_length(keyframes, 4, 10, 0.055) == 7
+    assert window_length(keyframes, 4, 6, 0.055) == 6

@@ -32,8 +32,8 @@ from geogs.priors.base import MonocularPrior
 from geogs.slam import Slam as Algorithm
 from geogs.slam import SlamStatus
 from geogs.threads import on_one_torch_thread
-from geogs.tracking.tracker import TrackState
 from geogs.types import Frame
+from geogs.world.segments import TrackState
 
 
 @dataclass(frozen=True)
@@ -223,7 +223,7 @@ class Slam(Algorithm):
 
     def _estimate(self, status: SlamStatus, timestamp: float) -> PoseEstimate:
         tracker = self.segments.current
-        in_world = tracker is self.segments.world and status.state is TrackState.TRACKING
+        in_world = tracker is self.segments.main and status.state is TrackState.TRACKING
         T_cw = self.T_cw if in_world else None
         known = self.deviation() if T_cw is not None else None
         sigma = (np.inf, np.inf) if known is None else (known.position, known.rotation)

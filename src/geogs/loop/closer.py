@@ -66,10 +66,10 @@ class LoopCloser:
         thread, too, and take effect at a keyframe that becomes final after that."""
         self.segments = segments
         self.config = config
-        tracker = segments.world
+        tracker = segments.main
         self.table = table or LoopTable()
         self.detector = LoopDetector(
-            tracker.keyframes.table, tracker.operator, config, waits, mask, self.table
+            tracker.keyframes.table, tracker.map.operator, config, waits, mask, self.table
         )
         self._known = {segments.trackers[n]: c for n, c in self.table.constraints.items()}
         self._thread = None if waits else ThreadPoolExecutor(1, thread_name_prefix="closing")
@@ -103,7 +103,7 @@ class LoopCloser:
         """
         if not self.config.enabled:
             return ()
-        fresh = [*result.finalized, *result.apart]
+        fresh = [*result.finalized, *result.finalized_elsewhere]
         if fresh:
             self._retire(self.segments.tracker_of(fresh[0]), RETIRED_TOGETHER)
         for loop in self.detector.update(fresh, is_last):
@@ -119,19 +119,21 @@ class LoopCloser:
     def replaced_by_bundle(self) -> None:
         """All of the world was adjusted together: what its edges say now replaces all else."""
         self._age += 1
-        world = self.segments.world
+        world = self.segments.main
         order = {k: n for n, k in enumerate(world.keyframes.ids)}
         edges = {
-            e: v for e, v in world.graph.edges.items() if order[e[1]] - order[e[0]] not in (2, 3)
+            e: v
+            for e, v in world.map.graph.edges.items()
+            if order[e[1]] - order[e[0]] not in (2, 3)
         }
-        held = of_poses(world.keyframes, sorted(world.held))
+        held = of_poses(world.keyframes, sorted(world.segment.fixed))
         self._known[world] = SegmentConstraints(joined([held, of_edges(world.keyframes, edges)]))
         self._retire(world)
 
     def _of(self, tracker: Tracker) -> SegmentConstraints:
         if tracker not in self._known:
             self._known[tracker] = SegmentConstraints(
-                of_poses(tracker.keyframes, sorted(tracker.held))
+                of_poses(tracker.keyframes, sorted(tracker.segment.fixed))
             )
         return self._known[tracker]
 
@@ -140,7 +142,7 @@ class LoopCloser:
 
         Nothing changes with fewer than ``least`` of them.
         """
-        old = tracker.graph.retire(tracker.deep, least)
+        old = tracker.map.graph.retire(tracker.local.deep, least)
         if old:
             known = self._of(tracker)
             known.odometry = joined([known.odometry, of_edges(tracker.keyframes, old)])
@@ -157,7 +159,7 @@ class LoopCloser:
         known.pending += bool((residual > self.config.strain).any())
 
     def _constraint(self, loop: Loop) -> RelativePoses:
-        return of_loop(self.segments.world.keyframes.table, loop)
+        return of_loop(self.segments.main.keyframes.table, loop)
 
     # --- joining segments ------------------------------------------------------------------
 
@@ -183,7 +185,7 @@ class LoopCloser:
     def _ends(self, loop: Loop) -> tuple[Tracker, Tracker]:
         """Host and guest: the world is host, else the earlier segment."""
         a, b = (self.segments.tracker_of(k) for k in (loop.first, loop.second))
-        world, is_earlier = self.segments.world, b.keyframes.ids < a.keyframes.ids
+        world, is_earlier = self.segments.main, b.keyframes.ids < a.keyframes.ids
         if b is world or (a is not world and is_earlier):
             return b, a
         return a, b
@@ -192,7 +194,7 @@ class LoopCloser:
         """Sim(3) from the host's world to the guest's as a loop has it."""
         host, guest = self._ends(loop)
         S = loop.S_ji.cpu()
-        if host.is_metric and guest.is_metric:
+        if host.segment.is_metric and guest.segment.is_metric:
             S = S.clone()
             S[:3, :3] /= sim3_scale(S)
         here, there = loop.first, loop.second
@@ -224,13 +226,13 @@ class LoopCloser:
             o for o in self.table.between
             if self.segments.tracker_of(o.first) is not self.segments.tracker_of(o.second)
         ]  # fmt: skip
-        return final if host is self.segments.world else ()
+        return final if host is self.segments.main else ()
 
     # --- closing loops ---------------------------------------------------------------------
 
     def _close(self, is_last: bool) -> None:
         """Correct the world by its loops, if there are new ones and they change something."""
-        world = self.segments.world
+        world = self.segments.main
         known, ids = self._of(world), world.keyframes.ids
         # A correction costs in proportion to the keyframes, so it comes once in a part of them.
         pause = max(self.config.close_every, len(ids) // 10)
@@ -250,8 +252,8 @@ class LoopCloser:
     def _question(self, known: SegmentConstraints) -> ClosingQuestion | None:
         """What the closing of the world's loops is computed from; none where hardly anything
         matches: then nothing tells how far the camera has drifted."""
-        world, config = self.segments.world, self.config
-        keyframes, edges = world.keyframes, world.graph.edges
+        world, config = self.segments.main, self.config
+        keyframes, edges = world.keyframes, world.map.graph.edges
         ids = keyframes.ids
         relative = joined([known.odometry, of_edges(keyframes, edges), known.loops])
         relative = between_positions(relative, ids)
@@ -262,9 +264,9 @@ class LoopCloser:
         if config.matches:
             matches = closing_matches(keyframes, edges, self.detector.loops)
         depths = {k: keyframes[k].inverse_depth for k in ids}
-        held = max(len(world.held), 1)
+        held = max(len(world.segment.fixed), 1)
         return ClosingQuestion(
-            ids, keyframes.poses(ids), depths, relative, matches, held, world.is_metric
+            ids, keyframes.poses(ids), depths, relative, matches, held, world.segment.is_metric
         )
 
     def _take_answer(self) -> None:
@@ -272,7 +274,7 @@ class LoopCloser:
         another world."""
         asked, self._asked = self._asked, None
         assert asked is not None
-        closure, world = asked.answer.result(), self.segments.world
+        closure, world = asked.answer.result(), self.segments.main
         if asked.world is world and asked.age == self._age:
             self._correct(asked.question, closure)
         else:
@@ -282,7 +284,7 @@ class LoopCloser:
         """Act on a closing, if it changes anything."""
         if closure is None:
             return
-        world = self.segments.world
+        world = self.segments.main
         keyframes = world.keyframes
         correction = brought_forward(closure.correction, {k.id: k.T_cw for k in keyframes})
         if self._change(correction) < self.config.min_change:
@@ -293,7 +295,8 @@ class LoopCloser:
                 for k, depth in zip(question.ids, closure.inverse_depth, strict=True)
                 if k in keyframes and keyframes[k].inverse_depth is question.inverse_depths[k]
             }
-            edges = {e: v for e, v in world.graph.edges.items() if e[0] not in world.held}
+            fixed = set(world.segment.fixed)
+            edges = {e: v for e, v in world.map.graph.edges.items() if e[0] not in fixed}
             take_over_depths(keyframes, edges, same)
         keyframes.correct(correction)
         _rescale(self._of(world), correction)
@@ -301,7 +304,7 @@ class LoopCloser:
 
     def _change(self, correction: PoseCorrection) -> float:
         """How far a correction moves the keyframe that it moves most."""
-        store, ids = self.segments.world.keyframes, sorted(correction.before)
+        store, ids = self.segments.main.keyframes, sorted(correction.before)
         scale = torch.tensor([correction.scale[k] for k in ids], dtype=torch.float64)
         S = torch.stack([correction.after[k] for k in ids])
         S[:, :3] *= scale[:, None, None]

@@ -7,8 +7,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from geogs.loop.matched_edges import MatchedEdges
-from geogs.tracking.graph import Edge, Pair
 from geogs.tracking.moving import still_weight
+from geogs.world.edges import Edge, Pair, edge_matches
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import KeyframeSet
 from geogs.world.loops import Loop
@@ -30,13 +30,14 @@ def closing_matches(
                 ((loop.second, loop.first), loop.flows[1]),
             ):
                 found[pair] = flow.pixels[0], flow.weight[0]
-    found |= {pair: (edge.pixels, edge.weight) for pair, edge in edges.items()}
+    for pair, edge in edges.items():
+        (pixels,), (weight,) = edge_matches(segment.grid, [edge])
+        found[pair] = pixels, weight
     if not found:
         return None
     pairs, ids = sorted(found), segment.ids
     place = {k: n for n, k in enumerate(ids)}
-    pixels = torch.stack([found[p][0] for p in pairs])
-    weight = torch.stack([found[p][1] for p in pairs])
+    pixels, weight = (torch.stack([found[p][k] for p in pairs]) for k in (0, 1))
     grid = SampleGrid(segment.grid.camera) if segment.grid.on_gpu else segment.grid
     return MatchedEdges(
         grid.camera,

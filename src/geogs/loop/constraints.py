@@ -10,9 +10,8 @@ from torch import Tensor
 from geogs.geometry.lie import scaled, se3_inverse, sim3_inverse, sim3_log
 from geogs.loop.matched_edges import MatchedEdges
 from geogs.loop.relative_pose import RelativePoseOptions, relative_poses
-from geogs.tracking.graph import Edge, Pair
 from geogs.tracking.moving import still_weight
-from geogs.tracking.packed_edge import PackedEdge
+from geogs.world.edges import Edge, Pair, edge_matches
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import KeyframeSet, KeyframeTable
 from geogs.world.loops import Loop, RelativePoses
@@ -32,7 +31,7 @@ def joined(parts: Sequence[RelativePoses]) -> RelativePoses:
     return RelativePoses(*(torch.cat([getattr(p, c) for p in parts]) for c in columns))
 
 
-def of_edges(segment: KeyframeSet, edges: Mapping[Pair, Edge | PackedEdge]) -> RelativePoses:
+def of_edges(segment: KeyframeSet, edges: Mapping[Pair, Edge]) -> RelativePoses:
     """Relative poses, between ids, that fitted edges of a frame graph amount to.
 
     Of the two directions of a pair the one from the earlier keyframe is taken.
@@ -43,8 +42,7 @@ def of_edges(segment: KeyframeSet, edges: Mapping[Pair, Edge | PackedEdge]) -> R
     ids = sorted({k for p in pairs for k in p})
     slot = {k: n for n, k in enumerate(ids)}
     grid = segment.grid
-    pixels = torch.stack([edges[p].pixels for p in pairs])
-    weight = torch.stack([edges[p].weight for p in pairs])
+    pixels, weight = edge_matches(grid, [edges[p] for p in pairs])
     matched = MatchedEdges(
         grid.camera,
         grid.rays,

@@ -35,15 +35,17 @@ def global_bundle(
     message. Returns the poses before and after; scales are 1. A tracker without a map is left
     alone.
     """
-    config, store, graph = tracker.config, tracker.keyframes, tracker.graph
-    ids = tracker.keyframe_ids if keyframes is None else list(keyframes)
+    config, segment = tracker.config, tracker.segment
+    store, graph, odometry = segment.keyframes, tracker.map.graph, tracker.map.odometry
+    ids = tracker.segment.ids if keyframes is None else list(keyframes)
     before = {k: store[k].T_cw for k in ids}
     if not ids:
         return PoseCorrection({}, {}, {})
-    free = [k for k in ids if k not in tracker.held]
+    fixed = set(segment.fixed)
+    free = [k for k in ids if k not in fixed]
     pairs = global_pairs(tracker, ids)
-    graph.edges = {}
-    tracker.odometry.look_at_all()
+    graph.edges.clear()
+    odometry.look_at_all()
     batch = MATCHED_TOGETHER[store.grid.on_gpu]
     options = global_options(config)
     for n in range(config.global_rounds if pairs else 0):
@@ -56,12 +58,14 @@ def global_bundle(
             if progress is not None:
                 share = (n + start / len(stale)) / config.global_rounds
                 progress(share, "matching all keyframes")
-        graph.adjust(list(graph.edges), free if tracker.held else ids[1:], free, options)
+        graph.adjust(list(graph.edges), free if fixed else ids[1:], free, options)
         graph.judge_moving(set(free), config.moving)
-        tracker.odometry.look_at_all()
-    settle_rows(tracker, free if tracker.held else ids[1:], free, options)
+        odometry.look_at_all()
+    settle_rows(tracker, free if fixed else ids[1:], free, options)
     for start in range(0, len(free), PRIORS_TOGETHER):
-        tracker.priors.adjust(free[start : start + PRIORS_TOGETHER], config.huber)  # moves no pose
+        tracker.map.priors.adjust(
+            free[start : start + PRIORS_TOGETHER], config.huber
+        )  # moves no pose
     if progress is not None:
         progress(1.0, "all keyframes adjusted")
     after = {k: store[k].T_cw for k in ids}
@@ -77,8 +81,8 @@ def global_options(c: TrackingConfig) -> BundleOptions:
 
 def global_pairs(tracker: Tracker, keyframes: Sequence[int] | None = None) -> list[Pair]:
     """Neighbours in time and all places seen again, thinned evenly; not within a saved map."""
-    config = tracker.config
-    ids = tracker.keyframe_ids if keyframes is None else list(keyframes)
+    config, grid = tracker.config, tracker.keyframes.grid
+    ids = tracker.segment.ids if keyframes is None else list(keyframes)
     pairs = proximity_pairs(
         tracker.keyframes,
         ids,
@@ -86,8 +90,8 @@ def global_pairs(tracker: Tracker, keyframes: Sequence[int] | None = None) -> li
         [],
         config.radius,
         config.global_suppression,
-        config.global_distance * max(tracker.camera.width, tracker.camera.height),
+        config.global_distance * max(grid.camera.width, grid.camera.height),
         config.global_pairs * len(ids),
     )
-    wanted = set(ids)
-    return [p for p in pairs if wanted.issuperset(p) and not tracker.held.issuperset(p)]
+    wanted, fixed = set(ids), set(tracker.segment.fixed)
+    return [p for p in pairs if wanted.issuperset(p) and not fixed.issuperset(p)]

@@ -19,10 +19,11 @@ from geogs.bundle.projection import project
 from geogs.geometry.lie import se3_inverse
 from geogs.tracking.graph import FrameGraph
 from geogs.tracking.moving import still_weight
-from geogs.tracking.packed_edge import PackedEdge, in_steps, packed_matches
-from geogs.tracking.proximity import Pair
 from geogs.tracking.row_errors import RowErrors, edge_shifts
 from geogs.tracking.tracker import Tracker
+from geogs.tracking.trajectory import row_errors, shift_rows
+from geogs.world.edges import PackedEdge, Pair, edge_matches, in_steps
+from geogs.world.grid import SampleGrid
 
 ROUNDS = 2
 """The first takes most of it."""
@@ -41,22 +42,22 @@ def settle_rows(
 
     What was measured of the frames between the keyframes is corrected, too.
     """
-    graph, recorder = tracker.graph, tracker.recorder
+    graph, keyframes, log = tracker.map.graph, tracker.keyframes, tracker.map.recorder.log
     measured = {e: edge for e, edge in graph.edges.items() if isinstance(edge, PackedEdge)}
-    search = _Search()
+    search, grid = _Search(), keyframes.grid
     for n in range(ROUNDS + READOUT_ROUNDS):
-        errors = recorder.row_errors() if measured else None
+        errors = row_errors(log, keyframes) if measured else None
         if errors is None:
             return
         if n >= ROUNDS:
             search.step(_readout_gradient(graph, measured, errors, search.factor, options))
         present = errors.with_readout(search.factor)
         for part, shift in _shifts(graph, measured, present):
-            graph.edges |= {
-                pair: _moved(measured[pair], s) for pair, s in zip(part, shift, strict=True)
-            }
+            graph.edges.update(
+                {pair: _moved(grid, measured[pair], s) for pair, s in zip(part, shift, strict=True)}
+            )
         graph.adjust(list(graph.edges), free_pose, free_depth, options)
-        recorder.shift_rows(present)
+        shift_rows(log, keyframes, present)
         if n + 1 >= ROUNDS and not errors.doubt:
             return
 
@@ -96,7 +97,7 @@ def _readout_gradient(
     both = zip(_shifts(graph, measured, low), _shifts(graph, measured, high), strict=True)
     for (part, before), (_, after) in both:
         T, depth = _relative(graph, part), keyframes.inverse_depths([i for i, _ in part])
-        pixels, weight = packed_matches([measured[pair] for pair in part])
+        pixels, weight = edge_matches(grid, [measured[pair] for pair in part])
         weight = still_weight(keyframes, part, pixels, weight)
         p = project(grid.camera, grid.rays, T, depth)
         middle = pixels + (before + after) / 2
@@ -118,7 +119,6 @@ def _relative(graph: FrameGraph, pairs: Sequence[Pair]) -> Float[Tensor, "e 4 4"
     return target @ se3_inverse(source)
 
 
-def _moved(edge: PackedEdge, shift: Float[Tensor, "p 2"]) -> PackedEdge:
+def _moved(grid: SampleGrid, edge: PackedEdge, shift: Float[Tensor, "p 2"]) -> PackedEdge:
     """An edge with its matches elsewhere."""
-    steps = in_steps(edge.grid.camera, shift)
-    return replace(edge, flow=replace(edge.flow, position=edge.flow.position + steps))
+    return replace(edge, position=edge.position + in_steps(grid.camera, shift))

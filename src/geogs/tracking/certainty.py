@@ -57,7 +57,7 @@ def certainty(tracker: Tracker) -> Certainty:
     video each part begins where the one before it ended, so that errors add up along the way
     whatever loops say: what is told of it is rather too much.
     """
-    ids = tracker.free
+    ids = tracker.segment.free
     position, rotation, depth, strain = (np.full(len(ids), np.inf) for _ in range(4))
     carried = np.zeros(2)
     for first in range(0, max(len(ids) - 1, 1), TOGETHER):
@@ -69,18 +69,18 @@ def certainty(tracker: Tracker) -> Certainty:
         squares = squares + carried
         position[part], rotation[part] = np.sqrt(squares).T
         depth[part], strain[part] = found.depth_deviation.numpy(), found.strain.numpy()
-        carried = squares[-1] if not tracker.held else carried
+        carried = squares[-1] if not tracker.segment.fixed else carried
     return Certainty(tuple(ids), position, rotation, depth, strain)
 
 
 def _marginals(tracker: Tracker, ids: list[int]) -> Marginals | None:
     """Of some keyframes, by the edges between them; none where there are none."""
-    free = ids if tracker.held else ids[1:]
-    among = {*ids, *tracker.held}
-    edges = [e for e in tracker.graph.edges if among.issuperset(e)]
+    free = ids if tracker.segment.fixed else ids[1:]
+    among = {*ids, *tracker.segment.fixed}
+    edges = [e for e in tracker.map.graph.edges if among.issuperset(e)]
     if not edges:
         return None
-    problem, frames = tracker.graph.streamed_problem(edges, free, ids)
+    problem, frames = tracker.map.graph.streamed_problem(edges, free, ids)
     grid = tracker.keyframes.grid
     found = marginals(grid, problem, BundleOptions(huber=tracker.config.huber), cells=512)
     own = torch.tensor([frames.index(k) for k in ids])

@@ -8,8 +8,8 @@ from torch import Tensor
 from geogs.tracking.features import surer_flows
 from geogs.tracking.flow.filled import filled_positions
 from geogs.tracking.graph import FrameGraph
-from geogs.tracking.proximity import Pair
 from geogs.types import FlowMatch
+from geogs.world.edges import Pair
 
 Positions = tuple[Float[Tensor, "p 2"], Float[Tensor, "p 2"]]
 """Where the cells of one keyframe lie in another, and those of the other in it."""

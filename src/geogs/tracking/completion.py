@@ -47,7 +47,7 @@ class Completion:
     def T_cw(self) -> Float64[Tensor, "4 4"] | None:
         """World to camera where the camera was last seen, in whatever segment; none before that."""
         if self._follower is not None:
-            return self._follower.last.T_cw
+            return self._follower.T_cw
         return self._segments.current.T_cw
 
     def deviation(self) -> PoseDeviation | None:
@@ -74,7 +74,7 @@ class Completion:
             return
         follower, self._follower = self._follower, None
         with torch.cuda.stream(self._stream):
-            self._segments.take(follower)
+            self._segments.tracker_of(follower.last.keyframe).take_over(follower)
         if self._stream is not None:
             self._stream.synchronize()  # others may read it from their streams
 

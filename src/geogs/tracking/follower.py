@@ -8,13 +8,12 @@ from torch import Tensor
 
 from geogs.config import TrackingConfig
 from geogs.geometry.lie import se3_inverse
-from geogs.tracking.flow.base import FlowOperator
 from geogs.tracking.keyframe_choice import calls_for_keyframe
-from geogs.tracking.last_frame import LastFrame
 from geogs.tracking.motion import FrameLocator, FrameMotion
 from geogs.tracking.pose_deviation import PoseDeviation, pose_deviation
 from geogs.types import Frame
 from geogs.world.keyframes import Keyframe
+from geogs.world.segments import LastFrame
 
 FARTHER = 1.0
 """Part of the motion that calls for a keyframe by which a frame may be farther than that from the
@@ -44,20 +43,25 @@ class Follower:
     def __init__(
         self,
         locator: FrameLocator,
-        operator: FlowOperator,
         config: TrackingConfig,
         last: LastFrame,
+        keyframe: Keyframe,
         anchor: Keyframe,
         motion: FrameMotion,
     ) -> None:
-        """``last`` is relative to the new keyframe, ``motion`` by which its frame was located at
-        another, ``anchor``; neither keyframe may change any more."""
+        """``last`` is relative to ``keyframe``, the new one, ``motion`` by which its frame was
+        located at another, ``anchor``; neither keyframe may change any more."""
         self.last = last
         """Where the last frame was, relative to the keyframe as it was."""
         self.frames: list[FollowedFrame] = []
         """All that were found so far, earliest first."""
-        self._locator, self._operator, self._config = locator, operator, config
-        self._anchor, self._motion = anchor, motion
+        self._locator, self._config = locator, config
+        self._keyframe, self._anchor, self._motion = keyframe, anchor, motion
+
+    @property
+    def T_cw(self) -> Float[Tensor, "4 4"]:
+        """World to camera of the last frame, by the keyframe as it was."""
+        return self.last.T_cw(self._keyframe)
 
     def follow(self, frame: Frame) -> FollowedFrame | None:
         """Find the next frame; None where that takes more than the keyframe as it was.
@@ -65,25 +69,27 @@ class Follower:
         So it is where the camera is not near where it is expected, or has moved so far that
         another keyframe is overdue, and after a cut.
         """
-        last, config, keyframe = self.last, self._config, self.last.keyframe
+        last, config, keyframe = self.last, self._config, self._keyframe
         camera = keyframe.grid.camera
         is_sensed = frame.depth is not None and keyframe.measured is None
         has_size = frame.image.shape[:2] == (camera.height, camera.width)
         if frame.follows_cut or is_sensed or not has_size or len(self.frames) >= MOST_FRAMES:
             return None
-        encoded = self._operator.encode(frame.image)
-        if self._operator.texture(encoded) < config.min_texture:
+        encoded = self._locator.operator.encode(frame.image)
+        if self._locator.operator.texture(encoded) < config.min_texture:
             return None
-        motion = self._locator.locate(keyframe, encoded, last.predicted(frame.timestamp))
+        motion = self._locator.locate(keyframe, encoded, last.predicted(keyframe, frame.timestamp))
         if motion is None or motion.known < config.min_known:
             return None
         long_edge = max(camera.width, camera.height)
         if calls_for_keyframe(config, long_edge, motion.flow, motion.overlap, FARTHER):
             return None
-        velocity = motion.T_cw @ se3_inverse(last.T_cw)
+        velocity = motion.T_cw @ se3_inverse(self.T_cw)
         T_rel = motion.T_cw @ se3_inverse(keyframe.T_cw)
         interval = frame.timestamp - last.timestamp
-        self.last = LastFrame(keyframe, T_rel, velocity, keyframe.scale, frame.timestamp, interval)
+        self.last = LastFrame(
+            keyframe.id, T_rel, velocity, keyframe.scale, frame.timestamp, interval
+        )
         self._anchor, self._motion = keyframe, motion
         self.frames.append(FollowedFrame(frame, encoded, motion, T_rel))
         return self.frames[-1]

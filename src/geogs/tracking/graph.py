@@ -1,7 +1,6 @@
 """The frame graph: which keyframes see each other, and the flow measured between them."""
 
-from collections.abc import Callable, Collection, Iterable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -10,90 +9,45 @@ from torch import Tensor
 
 from geogs.bundle.base import BundleOptions, BundleResult
 from geogs.bundle.problem import BundleProblem, MeasuredDepths, StreamedProblem
+from geogs.bundle.projection import project
 from geogs.bundle.select import (
     bundle_solver,
     grid_fields,
     keyframe_pairs,
     large_bundle_solver,
 )
-from geogs.errors import InputError
+from geogs.geometry.lie import se3_inverse
 from geogs.threads import thread_map
 from geogs.tracking.flow.base import FlowOperator
 from geogs.tracking.moving import judge, still_weight
 from geogs.tracking.odometry import Odometry
-from geogs.tracking.packed_edge import (
-    PackedEdge,
-    PackedFlow,
-    packed_matches,
-    packed_reprojections,
-)
-from geogs.tracking.proximity import PAIRS_TOGETHER, Pair
+from geogs.tracking.proximity import PAIRS_TOGETHER
 from geogs.types import FlowMatch
+from geogs.world.edges import Edge, MeasuredEdge, PackedEdge, Pair, edge_matches, pack_matches
+from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import Keyframe, KeyframeSet
 
 STACKED_EDGES = 1024, 8192
 """Directed edges up to which an adjustment has all matches in one piece, on CPU and GPU."""
 
 
-@dataclass
-class MeasuredEdge:
-    """One direction of a measured pair."""
-
-    pixels: Float[Tensor, "p 2"]
-    weight: Float[Tensor, "p 2"]
-    reprojection: Float[Tensor, "p 2"]
-    """Where the cells fell when the flow was measured."""
-    damping: Float[Tensor, "p"] | None = None
-    """Of the source's inverse depth, if the operator gives one."""
-    memory: Any = field(default=None, metadata={"stored": False})
-    """What the operator keeps of this edge, and can do without."""
-
-    @staticmethod
-    def of(match: FlowMatch, n: int, reprojection: Float[Tensor, "p 2"]) -> "MeasuredEdge":
-        """The n-th edge of a measurement."""
-        damping = None if match.damping is None else match.damping[n]
-        memory = None if match.memory is None else match.memory[n]
-        return MeasuredEdge(match.pixels[n], match.weight[n], reprojection, damping, memory)
-
-
-Edge = MeasuredEdge | PackedEdge
-"""One direction of a measured pair, in full or packed."""
-EdgeState = MeasuredEdge | PackedFlow
-"""What a checkpoint holds of one."""
-
-
 class FrameGraph:
     """Pairs of keyframes with their flow in both directions."""
 
     def __init__(
-        self, keyframes: KeyframeSet, operator: FlowOperator, odometry: Odometry | None = None
+        self,
+        keyframes: KeyframeSet,
+        operator: FlowOperator,
+        odometry: Odometry | None = None,
+        edges: dict[Pair, Edge] | None = None,
     ) -> None:
-        """``odometry`` takes part in adjustments, where there is one."""
+        """``odometry`` takes part in adjustments, where there is one; ``edges`` are those that are
+        measured already, and are changed in place."""
         self.keyframes = keyframes
         self.odometry = odometry
         self.operator = operator
-        self.edges: dict[Pair, Edge] = {}
+        self.edges: dict[Pair, Edge] = {} if edges is None else edges
         self.bundle = bundle_solver(keyframes.grid)
-
-    def state(self) -> dict[Pair, EdgeState]:
-        """What a checkpoint holds: the edges."""
-        return {
-            directed: edge.flow if isinstance(edge, PackedEdge) else edge
-            for directed, edge in self.edges.items()
-        }
-
-    def load(self, state: dict[Pair, EdgeState]) -> None:
-        """Give a graph without edges those of another, whose keyframes are here already.
-
-        Raises:
-            InputError: an edge is of another camera, or joins what is not there.
-        """
-        grid = self.keyframes.grid
-        for (i, j), edge in state.items():
-            cells = edge.position if isinstance(edge, PackedFlow) else edge.pixels
-            if len(cells) != grid.size or i not in self.keyframes or j not in self.keyframes:
-                raise InputError(f"the edge from {i} to {j} has no place")
-            self.edges[i, j] = PackedEdge(grid, edge) if isinstance(edge, PackedFlow) else edge
 
     @property
     def pairs(self) -> list[Pair]:
@@ -102,7 +56,8 @@ class FrameGraph:
 
     def remove_keyframe(self, id: int) -> None:
         """Forget every edge of a keyframe."""
-        self.edges = {e: v for e, v in self.edges.items() if id not in e}
+        for directed in [e for e in self.edges if id in e]:
+            del self.edges[directed]
 
     def retire(self, keep: Collection[int], least: int = 1) -> dict[Pair, Edge]:
         """Take out the edges that join none of the given keyframes, and return them.
@@ -113,8 +68,15 @@ class FrameGraph:
         old = {e: v for e, v in self.edges.items() if e[0] not in kept and e[1] not in kept}
         if len(old) < least:
             return {}
-        self.edges = {e: v for e, v in self.edges.items() if e not in old}
+        for directed in old:
+            del self.edges[directed]
         return old
+
+    def replace(self, edges: Mapping[Pair, Edge]) -> None:
+        """Have these edges instead of all others."""
+        edges = dict(edges)
+        self.edges.clear()
+        self.edges.update(edges)
 
     def reprojections(self, directed: Sequence[Pair]) -> Float[Tensor, "e p 2"]:
         """Present positions of the cells of i in j for each directed edge (i, j)."""
@@ -147,16 +109,23 @@ class FrameGraph:
                 first, second, forward, backward, fine=fine, memory=memory
             )
         if packed:
-            grid, back_pairs = self.keyframes.grid, [(j, i) for i, j in pairs]
-            source, target = ([self.keyframes[p[k]] for p in pairs] for k in (0, 1))
-            forth = PackedEdge.all_of(there, grid, source, target)
-            reverse = PackedEdge.all_of(back, grid, target, source)
-            self.edges.update(zip(pairs, forth, strict=True))
-            self.edges.update(zip(back_pairs, reverse, strict=True))
+            self._keep_packed(pairs, there)
+            self._keep_packed([(j, i) for i, j in pairs], back)
             return
         for n, (i, j) in enumerate(pairs):
-            self.edges[i, j] = MeasuredEdge.of(there, n, forward[n])
-            self.edges[j, i] = MeasuredEdge.of(back, n, backward[n])
+            self.edges[i, j] = _edge_of(there, n, forward[n])
+            self.edges[j, i] = _edge_of(back, n, backward[n])
+
+    def _keep_packed(self, directed: Sequence[Pair], match: FlowMatch) -> None:
+        """Keep a measurement that started from the present state."""
+        position, half_weight = pack_matches(self.keyframes.grid, match.pixels, match.weight)
+        for n, (i, j) in enumerate(directed):
+            source, target = self.keyframes[i], self.keyframes[j]
+            self.edges[i, j] = PackedEdge(
+                position[n], half_weight[n], source.T_cw, target.T_cw, source.inverse_depth,
+                None if match.damping is None else match.damping[n],
+                None if match.memory is None else match.memory[n],
+            )  # fmt: skip
 
     def _memory(self, directed: Pair) -> Any:
         edge = self.edges.get(directed)
@@ -186,9 +155,9 @@ class FrameGraph:
         return _in_parts(self._moved_together, directed, self.keyframes.grid.on_gpu)
 
     def _moved_together(self, directed: Sequence[Pair]) -> Float[Tensor, "e"]:
-        before = _reprojections([self.edges[e] for e in directed])
-        weight = torch.stack([self.edges[e].weight for e in directed])
-        return keyframe_pairs(self.keyframes, directed).moved(before, weight)
+        grid, edges = self.keyframes.grid, [self.edges[e] for e in directed]
+        _, weight = edge_matches(grid, edges)
+        return keyframe_pairs(self.keyframes, directed).moved(_reprojections(grid, edges), weight)
 
     def problem(
         self, directed: Sequence[Pair], free_pose: Iterable[int], free_depth: Iterable[int]
@@ -208,7 +177,7 @@ class FrameGraph:
         edges = [self.edges[e] for e in directed]
 
         def matches(part: slice) -> tuple[Tensor, Tensor]:
-            pixels, weight = _matches(edges[part])
+            pixels, weight = edge_matches(self.keyframes.grid, edges[part])
             return pixels, still_weight(self.keyframes, directed[part], pixels, weight)
 
         problem = StreamedProblem(
@@ -292,20 +261,29 @@ def _measured(keyframes: Sequence[Keyframe]) -> MeasuredDepths | None:
     return MeasuredDepths(inverse_depth, information)
 
 
-def _reprojections(edges: Sequence[Edge]) -> Float[Tensor, "e p 2"]:
+def _edge_of(match: FlowMatch, n: int, reprojection: Float[Tensor, "p 2"]) -> MeasuredEdge:
+    """The n-th edge of a measurement."""
+    damping = None if match.damping is None else match.damping[n]
+    memory = None if match.memory is None else match.memory[n]
+    return MeasuredEdge(match.pixels[n], match.weight[n], reprojection, damping, memory)
+
+
+def _reprojections(grid: SampleGrid, edges: Sequence[Edge]) -> Float[Tensor, "e p 2"]:
     """Where the cells fell when the flow of each edge was measured."""
     packed = [e for e in edges if isinstance(e, PackedEdge)]
-    if len(packed) == len(edges):
-        return packed_reprojections(packed)
-    return torch.stack([e.reprojection for e in edges])
-
-
-def _matches(edges: Sequence[Edge]) -> tuple[Float[Tensor, "e p 2"], Float[Tensor, "e p 2"]]:
-    """Measured positions and weights of edges, one behind the other."""
-    packed = [e for e in edges if isinstance(e, PackedEdge)]
     if packed and len(packed) == len(edges):
-        return packed_matches(packed)
-    return torch.stack([e.pixels for e in edges]), torch.stack([e.weight for e in edges])
+        return _packed_reprojections(grid, packed)
+    return torch.stack([
+        e.reprojection if isinstance(e, MeasuredEdge) else _packed_reprojections(grid, [e])[0]
+        for e in edges
+    ])  # fmt: skip
+
+
+def _packed_reprojections(grid: SampleGrid, edges: Sequence[PackedEdge]) -> Float[Tensor, "e p 2"]:
+    """The same of packed edges, by the poses and depths of that time."""
+    source, target = (torch.stack([getattr(e, k) for e in edges]) for k in ("T_source", "T_target"))
+    depth = torch.stack([e.inverse_depth for e in edges])
+    return project(grid.camera, grid.rays, target @ se3_inverse(source), depth).pixels
 
 
 def _in_parts(

@@ -1,7 +1,6 @@
 """Which frames become keyframes."""
 
 import math
-from collections import deque
 
 import cv2
 import numpy as np
@@ -56,29 +55,26 @@ def sharpness(image: UInt8[np.ndarray, "h w 3"]) -> float:
 class KeyframeChoice:
     """Says which frames become keyframes, from their motion, overlap and sharpness."""
 
-    def __init__(self, config: TrackingConfig, long_edge: int) -> None:
-        """``long_edge`` is that of the images, in pixels."""
+    def __init__(
+        self, config: TrackingConfig, long_edge: int, recent: list[float] | None = None
+    ) -> None:
+        """``long_edge`` is that of the images, in pixels; ``recent`` the sharpness of the latest
+        frames, which is changed in place."""
         self.config = config
         self.long_edge = long_edge
-        self._recent: deque[float] = deque(maxlen=_COMPARED)
-        self._beside = Errand("sharpness")
+        self._recent = [] if recent is None else recent
+        self._concurrent = Errand("sharpness")
 
     def see(self, image: UInt8[np.ndarray, "h w 3"]) -> None:
         """Take note of the next frame, about which :meth:`calls_for` is asked.
 
-        It is looked at beside what its tracking takes.
+        Its sharpness is measured while it is tracked.
         """
-        self._beside.start(lambda: self._recent.append(sharpness(image)))
+        self._concurrent.start(lambda: self._note(sharpness(image)))
 
-    def state(self) -> list[float]:
-        """What a checkpoint holds: the sharpness of the latest frames."""
-        self._beside.wait()
-        return list(self._recent)
-
-    def load(self, state: list[float]) -> None:
-        """Go on where another was."""
-        self._beside.wait()
-        self._recent = deque(state, maxlen=_COMPARED)
+    def settle(self) -> None:
+        """Wait until the latest frame has been noted."""
+        self._concurrent.wait()
 
     def calls_for(self, flow: float, overlap: float) -> bool:
         """Whether the frame seen last becomes one: see :func:`calls_for_keyframe`.
@@ -89,8 +85,12 @@ class KeyframeChoice:
         patience = self.config.blur_wait if self._is_blurred() else 0.0
         return calls_for_keyframe(self.config, self.long_edge, flow, overlap, patience)
 
+    def _note(self, value: float) -> None:
+        self._recent.append(value)
+        del self._recent[:-_COMPARED]
+
     def _is_blurred(self) -> bool:
-        self._beside.wait()
+        self.settle()
         if len(self._recent) < 3:
             return False
         return self._recent[-1] < self.config.blur_share * float(np.median(self._recent))

@@ -7,11 +7,10 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from geogs.bundle.select import grid_fields, motion_solver
-from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.tracking.evidence import (
     Evidence,
@@ -25,6 +24,7 @@ from geogs.tracking.flow.filled import filled_positions
 from geogs.types import FlowMatch
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import Keyframe
+from geogs.world.segments import ChainedPositions
 
 FIT_ITERATIONS = 6
 """Steps of the motion-only adjustment of a frame."""
@@ -203,47 +203,20 @@ class ChainedMatch:
     """Fraction of the cells that are matched; 0 where the images do not agree there."""
 
 
-@dataclass(frozen=True, eq=False)
-class ChainState:
-    """What a checkpoint holds of a chain: where the cells are, in both directions."""
-
-    there: Float32[Tensor, "1 p 2"] | None
-    back: Float32[Tensor, "1 p 2"] | None
-
-
 class FlowChain:
-    """Follows the flow from a keyframe through the frames after it, each starting from the last."""
+    """Follows the flow from a first image through those after it, each starting from the last."""
 
     def __init__(self, grid: SampleGrid, operator: FlowOperator, min_ncc: float) -> None:
         self.grid = grid
         self.operator = operator
         self.min_ncc = min_ncc
-        self._there: Tensor | None = None
-        self._back: Tensor | None = None
 
-    def state(self) -> ChainState:
-        """What a checkpoint holds."""
-        return ChainState(self._there, self._back)
-
-    def load(self, state: ChainState) -> None:
-        """Go on where another was. Raises InputError if that was of another camera."""
-        for positions in (state.there, state.back):
-            if positions is not None and positions.shape[1] != self.grid.size:
-                raise InputError("the flow of the start is of another camera")
-        self._there, self._back = state.there, state.back
-
-    def reset(self) -> None:
-        """Begin again at a new keyframe."""
-        self._there = self._back = None
-
-    def follow(self, keyframe: Any, encoded: Any) -> ChainedMatch:
-        """Match the keyframe with the next frame."""
-        there, back = self.operator.measure(
-            [keyframe], [encoded], self._there, self._back, fine=False
-        )
-        there, back = surer_flow(self.grid, self.operator, keyframe, encoded, there, back)
+    def follow(self, chain: ChainedPositions, first: Any, encoded: Any) -> ChainedMatch:
+        """Match the first image with the next one, from where ``chain`` has come to."""
+        there, back = self.operator.measure([first], [encoded], chain.there, chain.back, fine=False)
+        there, back = surer_flow(self.grid, self.operator, first, encoded, there, back)
         # What the images say where the flow, for want of a pose, leads.
-        images = self.operator.grey(keyframe), self.operator.grey(encoded)
+        images = self.operator.grey(first), self.operator.grey(encoded)
         seen = correlation_matched(self.grid, *images, there.pixels[0])
         moved = matched_motion(self.grid, there.pixels[0], there.weight[0])
         # All at once, so that a GPU is waited for once.
@@ -252,8 +225,8 @@ class FlowChain:
         if not Evidence.of(found[2:]).bears_out(self.min_ncc, is_expected=True):
             matched = 0.0
         if matched > 0:
-            self._there = filled_positions(self.grid, there)[None]
-            self._back = filled_positions(self.grid, back)[None]
+            chain.there = filled_positions(self.grid, there)[None]
+            chain.back = filled_positions(self.grid, back)[None]
         return ChainedMatch(there, flow if matched else 0.0, matched)
 
 

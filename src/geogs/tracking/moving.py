@@ -7,7 +7,6 @@ that end in them, count nowhere.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float
@@ -17,7 +16,7 @@ from torch.nn.functional import avg_pool2d
 from geogs.bundle.problem import source_chunks
 from geogs.bundle.rigidity import best_residuals
 from geogs.bundle.select import grid_fields
-from geogs.tracking.proximity import Pair
+from geogs.world.edges import Edge, Pair, edge_matches
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import KeyframeSet
 
@@ -35,21 +34,6 @@ REGION = 0.4
 """Share of the cells around one that move, from which it is held for moving itself."""
 EDGES_TOGETHER = 128
 """Directed edges, of some ten keyframes, judged in one go; bounds memory."""
-
-
-@runtime_checkable
-class Match(Protocol):
-    """What is judged of an edge."""
-
-    @property
-    def pixels(self) -> Float[Tensor, "p 2"]:
-        """Position in the target of each cell of the source."""
-        ...
-
-    @property
-    def weight(self) -> Float[Tensor, "p 2"]:
-        """Inverse variance, 1 / pixel^2."""
-        ...
 
 
 def still_weight(
@@ -84,7 +68,7 @@ def moving_share(keyframes: KeyframeSet) -> float:
 
 
 def judge(
-    keyframes: KeyframeSet, edges: Mapping[Pair, Match], judged: Sequence[Pair], threshold: float
+    keyframes: KeyframeSet, edges: Mapping[Pair, Edge], judged: Sequence[Pair], threshold: float
 ) -> None:
     """Say anew of the sources of some directed edges which of their cells move.
 
@@ -158,14 +142,13 @@ def _still(
 
 
 def _residuals(
-    keyframes: KeyframeSet, edges: Mapping[Pair, Match], directed: Sequence[Pair]
+    keyframes: KeyframeSet, edges: Mapping[Pair, Edge], directed: Sequence[Pair]
 ) -> tuple[Float[Tensor, "e p"], Bool[Tensor, "e p"]]:
     """Best residuals of some edges, not a number without a match; and what is held for still."""
     grid = keyframes.grid
     ids = sorted({k for e in directed for k in e})
     slot = {k: n for n, k in enumerate(ids)}
-    pixels = torch.stack([edges[e].pixels for e in directed])
-    weight = torch.stack([edges[e].weight for e in directed])
+    pixels, weight = edge_matches(grid, [edges[e] for e in directed])
     residual = best_residuals(
         grid.camera, grid.rays, keyframes.poses(ids), keyframes.inverse_depths(ids),
         torch.tensor([slot[i] for i, _ in directed]), torch.tensor([slot[j] for _, j in directed]),

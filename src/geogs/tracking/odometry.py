@@ -16,6 +16,7 @@ from geogs.geometry.lie import se3_inverse
 from geogs.priors.odometry import ScaleVote, information_of, vote_on_scale
 from geogs.types import MeasuredPose
 from geogs.world.keyframes import Keyframe, KeyframeSet
+from geogs.world.segments import OdometryScale
 
 LEAST = 5
 """Motions that must fit before any is used."""
@@ -25,14 +26,6 @@ SETTLED = 0.003
 """... and up to which it is asked again with every keyframe."""
 REACH = 200
 """Latest motions that are asked while the camera is tracked."""
-
-
-@dataclass(frozen=True)
-class OdometryState:
-    """What a checkpoint holds of it; the fields are those of :class:`Odometry`."""
-
-    scale: float | None
-    deviation: float
 
 
 @dataclass(frozen=True)
@@ -52,28 +45,20 @@ class Agreement:
 class Odometry:
     """What another tracker says of the motion between the keyframes of a segment."""
 
-    def __init__(self, keyframes: KeyframeSet, config: OdometryConfig) -> None:
+    def __init__(
+        self, keyframes: KeyframeSet, config: OdometryConfig, found: OdometryScale | None = None
+    ) -> None:
+        """``found`` is what is known of the scale already, and is changed in place."""
         self.keyframes = keyframes
         self.config = config
-        self.scale: float | None = None
-        """Metres to the unit of the map; none as long as the measured motions do not fit."""
-        self.deviation = float("inf")
-        """Of the scale, as a part of it."""
-
-    def state(self) -> OdometryState:
-        """What a checkpoint holds."""
-        return OdometryState(self.scale, self.deviation)
-
-    def load(self, state: OdometryState) -> None:
-        """Go on where another was."""
-        self.scale, self.deviation = state.scale, state.deviation
+        self.found = found or OdometryScale()
 
     def look(self) -> None:
         """Find the scale, if it is not settled, by the latest keyframes."""
         ids = self.keyframes.ids[-REACH:]
         if not ids or self.keyframes[ids[-1]].pose is None:
             return
-        if self.scale is None or self.deviation > SETTLED:
+        if self.found.scale is None or self.found.deviation > SETTLED:
             self._take(self._vote(ids))
 
     def look_at_all(self) -> None:
@@ -83,14 +68,15 @@ class Odometry:
     def agreement(self) -> Agreement:
         """How far all motions fit, at the present poses."""
         vote = self._vote(self.keyframes.ids)
-        return Agreement(len(vote.fits), vote.share, vote.deviation, self.scale is not None)
+        return Agreement(len(vote.fits), vote.share, vote.deviation, self.found.scale is not None)
 
     def between(self, ids: Sequence[int]) -> MeasuredMotions | None:
         """Motions from each of some keyframes to the next, in the unit of the map.
 
         Sources and targets are places among the ids. None where they are not to be used.
         """
-        if self.scale is None:
+        scale = self.found.scale
+        if scale is None:
             return None
         known = [(n, self.keyframes[id]) for n, id in enumerate(ids)]
         steps = _steps([(n, k) for n, k in known if k.pose is not None])
@@ -98,18 +84,18 @@ class Odometry:
             return None
         motion = torch.stack([_measured(a, b) for (_, a), (_, b) in steps])
         information = information_of(motion, self.config)
-        information[:, :3] *= self.scale**2
-        motion[:, :3, 3] /= self.scale
+        information[:, :3] *= scale**2
+        motion[:, :3, 3] /= scale
         source, target = (torch.tensor([pair[k][0] for pair in steps]) for k in (0, 1))
         return MeasuredMotions(source, target, motion, information)
 
     def since(self, keyframe: Keyframe, pose: MeasuredPose | None) -> torch.Tensor | None:
         """Motion from a keyframe to where the camera is said to be, in the unit of the map."""
-        before = keyframe.pose
-        if self.scale is None or pose is None or before is None or before.world != pose.world:
+        before, scale = keyframe.pose, self.found.scale
+        if scale is None or pose is None or before is None or before.world != pose.world:
             return None
         motion = pose.T_cw @ se3_inverse(before.T_cw)
-        motion[:3, 3] /= self.scale
+        motion[:3, 3] /= scale
         return motion
 
     def _vote(self, ids: Sequence[int]) -> ScaleVote:
@@ -125,7 +111,7 @@ class Odometry:
     def _take(self, vote: ScaleVote) -> None:
         enough = int(vote.fits.sum()) >= LEAST and vote.share >= self.config.agreement
         if enough and vote.deviation <= SURE:
-            self.scale, self.deviation = vote.scale, vote.deviation
+            self.found.scale, self.found.deviation = vote.scale, vote.deviation
 
 
 def _steps(

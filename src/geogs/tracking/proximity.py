@@ -10,10 +10,9 @@ from geogs.bundle.pairs import LEAST_OVERLAP
 from geogs.bundle.select import keyframe_pairs
 from geogs.threads import thread_map
 from geogs.tracking.overlap import alike_in_size, may_overlap
+from geogs.world.edges import Pair
 from geogs.world.keyframes import KeyframeSet
 
-Pair = tuple[int, int]
-"""Two keyframe ids, the earlier first; an edge of the graph in both directions."""
 PAIRS_TOGETHER = 512, 8192
 """Directed pairs that are projected at a time, on the CPU and on a GPU; bounds memory."""
 

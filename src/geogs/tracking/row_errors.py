@@ -17,9 +17,8 @@ from torch import Tensor
 from geogs.bundle.projection import project, seen_from_targets
 from geogs.geometry.lie import se3_inverse
 from geogs.shutter.rows import CELL
-from geogs.tracking.packed_edge import PackedEdge, packed_matches
-from geogs.tracking.proximity import Pair
 from geogs.types import SeenRows, Trajectory
+from geogs.world.edges import Edge, Pair, edge_matches
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import KeyframeSet
 
@@ -174,7 +173,7 @@ class RowErrors:
 def edge_shifts(
     errors: RowErrors,
     keyframes: KeyframeSet,
-    measured: Mapping[Pair, PackedEdge],
+    measured: Mapping[Pair, Edge],
     frame_of: Callable[[int], int],
 ) -> Iterator[tuple[list[Pair], Float[Tensor, "e p 2"]]]:
     """Pixels by which the matches of edges are to be corrected, some edges at a time.
@@ -186,9 +185,10 @@ def edge_shifts(
         part = pairs[start : start + TOGETHER]
         source, target = ([pair[k] for pair in part] for k in (0, 1))
         T_ji = keyframes.poses(target) @ se3_inverse(keyframes.poses(source))
+        pixels, _ = edge_matches(grid, [measured[pair] for pair in part])
         yield part, errors.of_matches(
             [frame_of(k) for k in source], [frame_of(k) for k in target], T_ji, grid.rays,
-            keyframes.inverse_depths(source), packed_matches([measured[pair] for pair in part])[0],
+            keyframes.inverse_depths(source), pixels,
         )  # fmt: skip
 
 

@@ -1,64 +1,36 @@
-"""The front end: frames in, keyframes with poses and inverse depth out."""
+"""Tracking of one segment of video: frames in, keyframes with poses and inverse depth out."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from enum import Enum
 from typing import Any
 
-import cv2
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from geogs.bundle.base import BundleOptions
-from geogs.bundle.select import grid_fields
-from geogs.config import DepthSensorConfig, OdometryConfig, PriorConfig, TrackingConfig
+from geogs.config import Config
 from geogs.errors import InputError, TrackingLost
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_inverse
 from geogs.priors.base import MonocularPrior
-from geogs.tracking.back_fill import back_fill
+from geogs.tracking.early_frames import locate_early_frames
 from geogs.tracking.flow.base import FlowOperator
 from geogs.tracking.flow.select import build_operator
 from geogs.tracking.follower import Follower
-from geogs.tracking.graph import EdgeState, FrameGraph
-from geogs.tracking.held import add_held
 from geogs.tracking.keyframe_choice import KeyframeChoice
-from geogs.tracking.keyframe_priors import KeyframePriors
-from geogs.tracking.last_frame import LastFrame, LastFrameState
-from geogs.tracking.motion import (
-    FrameLocator,
-    FrameMotion,
-    Recognition,
-)
-from geogs.tracking.moving import carried
-from geogs.tracking.odometry import Odometry, OdometryState
-from geogs.tracking.orientation_chain import Followed, OrientationChain, OrientationState
+from geogs.tracking.local_mapping import LocalMapping
+from geogs.tracking.localisation import Localiser
+from geogs.tracking.motion import FrameMotion, Recognition
+from geogs.tracking.orientation_chain import Followed, OrientationFollower
 from geogs.tracking.pose_deviation import PoseDeviation, pose_deviation
-from geogs.tracking.proximity import Pair, frame_distances, proximity_pairs
-from geogs.tracking.sensing import DepthSensing, stands_alone
-from geogs.tracking.start_up import MIN_KEYFRAMES, StartUp, StartUpState
-from geogs.tracking.trajectory import FrameRecord, RecorderState, TrajectoryRecorder
-from geogs.tracking.turns import Turn
-from geogs.tracking.view_choice import seeing
-from geogs.tracking.window import reach
-from geogs.types import Frame, RenderedKeyframe, Trajectory
+from geogs.tracking.segment_map import SegmentMap
+from geogs.tracking.start_up import StartUp
+from geogs.tracking.trajectory import solve_trajectory
+from geogs.types import Frame, Trajectory
+from geogs.world.frames import FrameRecord, RelativeRotation
 from geogs.world.grid import SampleGrid
-from geogs.world.keyframes import Keyframe, KeyframeSet, KeyframeTable, check_keyframes
-
-SELDOM = 5
-"""While a camera only turns, the orientation says what it sees; only so often it is looked for as
-if it could be anywhere."""
-
-
-class TrackState(Enum):
-    """What the tracker is doing."""
-
-    INITIALIZING = "initializing"
-    TRACKING = "tracking"
-    TURNING = "orientation only"
-    """There is a map, but too little of it in view: where the camera is cannot be told."""
-    LOST = "lost"
+from geogs.world.keyframes import Keyframe, KeyframeTable
+from geogs.world.segments import LastFrame, TrackState, VideoSegment
 
 
 @dataclass(frozen=True)
@@ -74,42 +46,19 @@ class TrackResult:
     """Ids whose poses the local adjustment still moves, earliest first."""
     removed: tuple[int, ...] = ()
     """Ids that were culled."""
-    apart: tuple[int, ...] = ()
-    """Ids that became final in a segment which is not part of the world."""
-    is_new_world: bool = False
-    """Whether another segment became the world; what is final is all of it."""
+    finalized_elsewhere: tuple[int, ...] = ()
+    """Ids that became final in a segment that is not the main map."""
+    is_new_main: bool = False
+    """Whether another segment became the main map; what is final is all of it."""
 
 
 @dataclass(frozen=True)
-class Unfinished:
-    """A keyframe that nothing but its place is known of, and what it was located by."""
+class _Unfinished:
+    """A keyframe of which nothing but the pose is known, and what it was located by."""
 
     keyframe: Keyframe
-    anchor: int
-    """Keyframe at which it was located."""
     motion: FrameMotion
-    turns: Sequence[Turn]
-
-
-@dataclass(frozen=True, eq=False)
-class TrackerState:
-    """What a checkpoint holds of a tracker."""
-
-    keyframes: KeyframeSet
-    edges: dict[Pair, EdgeState]
-    recorder: RecorderState
-    start_up: StartUpState
-    state: TrackState
-    finalized: list[int]
-    breaks: list[int]
-    last: LastFrameState | None
-    misses: int
-    frames_lost: int
-    sharpness: list[float]
-    """Of the latest frames."""
-    orientation: OrientationState
-    is_metric: bool
-    odometry: OdometryState
+    rotations: Sequence[RelativeRotation]
 
 
 class Tracker:
@@ -117,194 +66,63 @@ class Tracker:
 
     def __init__(
         self,
-        camera: Camera,
-        config: TrackingConfig | None = None,
-        device: torch.device | str = "cpu",
-        seed: int = 0,
-        operator: FlowOperator | None = None,
+        segment: VideoSegment,
+        operator: FlowOperator,
+        config: Config,
         prior: MonocularPrior | None = None,
-        prior_config: PriorConfig | None = None,
-        store: KeyframeTable | None = None,
-        sensor: DepthSensorConfig | None = None,
-        odometry: OdometryConfig | None = None,
         defers: bool = False,
     ) -> None:
-        """``store`` is where the keyframes are kept, in a segment of their own. One that ``defers``
-        leaves to :meth:`complete` what a new keyframe takes beyond its place."""
-        cv2.setRNGSeed(seed)
-        self.camera = camera
-        self.config = config or TrackingConfig()
-        self.grid = SampleGrid(camera, device) if store is None else store.grid
-        self.operator = operator or build_operator(self.config, self.grid)
-        self.keyframes = (store or KeyframeTable.on(self.grid, self.operator.encode)).new_set()
-        self.odometry = Odometry(self.keyframes, odometry or OdometryConfig())
-        """What another tracker says of the motion, where frames come with its poses."""
-        self.graph = FrameGraph(self.keyframes, self.operator, self.odometry)
-        self.priors = KeyframePriors(self.graph, prior, prior_config or PriorConfig())
-        self.sensing = DepthSensing(self.grid, sensor or DepthSensorConfig())
-        self.is_metric = False
-        """Whether a depth sensor started the map, which then is in metres."""
-        self.recorder = TrajectoryRecorder(self.keyframes, self.operator)
-        self.state = TrackState.INITIALIZING
-        edge = max(camera.width, camera.height)
-        self._long_edge = edge
-        self._choice = KeyframeChoice(self.config, edge)
-        self._locator = FrameLocator(
-            self.grid,
-            self.operator,
-            self.config.min_matched,
-            self.config.max_residual * edge,
-            self.config.min_ncc,
+        """``segment`` is what is known so far, and is changed in place. One that ``defers`` leaves
+        to :meth:`complete` what a new keyframe takes beyond its pose."""
+        self.segment, self.keyframes, self.config = segment, segment.keyframes, config.tracking
+        self.map = SegmentMap(segment, operator, config, prior)
+        camera, grid = self.keyframes.grid.camera, self.keyframes.grid
+        self._choice = KeyframeChoice(
+            self.config, max(camera.width, camera.height), segment.sharpness
         )
-        self._finalized: dict[int, None] = {}
-        self.held: frozenset[int] = frozenset()
-        """Keyframes of a saved map, in whose world this one goes on: they stay as they are."""
-        self._breaks: list[int] = []
-        """Keyframes that no motion links to the one before them."""
-        self._last: LastFrame | None = None
+        self._start_up = StartUp(self.map, self._choice, self.config)
+        self._localiser = Localiser(self.map, self.config)
+        self._orientation = OrientationFollower(grid, operator, self.config)
+        self.local = LocalMapping(self.map, self.config)
         self._motion: FrameMotion | None = None
         """By which the last frame was located; none where it was not."""
         self._defers = defers
-        self._unfinished: Unfinished | None = None
-        self._start_up = StartUp(self.graph, self.recorder, self.priors, self.config, self._choice)
-        self.orientation = OrientationChain(self.grid, self.operator, self.config)
-        """How the camera has turned since it was last located."""
-        self._misses = 0
-        self.frames_lost = 0
-        """Frames with texture since the camera was last located, once the map has been started,
-        but for those that only turned."""
+        self._unfinished: _Unfinished | None = None
 
     # --- reading ---------------------------------------------------------------------------
 
     @property
-    def keyframe_ids(self) -> list[int]:
-        """Ids of all keyframes, earliest first; empty until the map has been started."""
-        return [] if self.state is TrackState.INITIALIZING else self.keyframes.ids
-
-    @property
-    def finalized(self) -> tuple[int, ...]:
-        """Ids that are never removed any more, earliest first."""
-        return tuple(self._finalized)
-
-    def trajectory(self, apart: Sequence[FrameRecord] = ()) -> Trajectory:
-        """Poses of all frames seen so far, solved on the present keyframes.
-
-        Before the map is started no more than orientations is known, and of frames ``apart`` no
-        more than that ever.
-        """
-        has_map = self.state is not TrackState.INITIALIZING
-        return self.recorder.solve(apart, has_map=has_map)
-
-    @property
-    def active(self) -> tuple[int, ...]:
-        """Ids whose poses the local adjustment moves, earliest first; never the very first."""
-        ids = self.keyframe_ids
-        fixed = self.held or {*ids[:1]}
-        return tuple(k for k in ids[-self._reach() :] if k not in fixed)
-
-    @property
-    def deep(self) -> list[int]:
-        """Ids whose inverse depth it moves, earliest first."""
-        c = self.config
-        latest = self.keyframes.ids[-(self._reach() + c.depth_window - c.window) :]
-        return [k for k in latest if k not in self.held]
-
-    @property
-    def free(self) -> list[int]:
-        """Ids of the keyframes that adjustments of all move, earliest first."""
-        return [k for k in self.keyframe_ids if k not in self.held]
-
-    def _reach(self) -> int:
-        c = self.config
-        return reach(list(self.keyframes), c.window, c.window_most, c.window_baseline)
-
-    # --- checkpoints -----------------------------------------------------------------------
-
-    def full_state(self) -> TrackerState:
-        """What a checkpoint holds; ``state`` is only what the tracker is doing."""
-        seen, last = self._last, None
-        if seen is not None:
-            last = LastFrameState(
-                seen.keyframe.id, seen.T_rel, seen.velocity, seen.scale, seen.timestamp,
-                seen.interval,
-            )  # fmt: skip
-        return TrackerState(
-            self.keyframes, self.graph.state(), self.recorder.state(),
-            self._start_up.state(), self.state, list(self._finalized), self._breaks, last,
-            self._misses, self.frames_lost, self._choice.state(), self.orientation.state(),
-            self.is_metric, self.odometry.state(),
-        )  # fmt: skip
-
-    def load(self, state: TrackerState) -> None:
-        """Give a tracker that has seen nothing yet the state of another."""
-        check_keyframes(self.keyframes.table, [state.keyframes])
-        self.keyframes.members = state.keyframes.members
-        self.keyframes.attached(self.keyframes.table)
-        self.graph.load(state.edges)
-        self.recorder.load(state.recorder)
-        self._start_up.load(state.start_up)
-        self.state, self.is_metric = state.state, state.is_metric
-        self._finalized, self._breaks = dict.fromkeys(state.finalized), state.breaks
-        self._misses, self.frames_lost = state.misses, state.frames_lost
-        self._choice.load(state.sharpness)
-        self.orientation.load(state.orientation)
-        self.odometry.load(state.odometry)
-        if state.last is not None:
-            last = state.last
-            keyframe = self.keyframes[last.keyframe]
-            self._last = LastFrame(
-                keyframe, last.T_rel, last.velocity, last.scale, last.timestamp, last.interval
-            )
+    def T_cw(self) -> Float[Tensor, "4 4"] | None:
+        """World to camera where the camera was last seen; none before that."""
+        last = self.segment.status.last
+        return None if last is None else last.T_cw(self.keyframes[last.keyframe])
 
     @property
     def is_unfinished(self) -> bool:
         """Whether a new keyframe waits to be completed."""
         return self._unfinished is not None
 
-    @property
-    def T_cw(self) -> Float[Tensor, "4 4"] | None:
-        """World to camera where the camera was last seen; none before that."""
-        return None if self._last is None else self._last.T_cw
-
     def deviation(self) -> PoseDeviation | None:
         """How well the last frame's pose is known relative to the keyframes around; none if it has
         no pose, or was placed with others at the start."""
-        motion = self._motion
-        if motion is None or motion.keyframe not in self.keyframes:
+        motion, keyframes = self._motion, self.keyframes
+        if motion is None or motion.keyframe not in keyframes:
             return None
-        anchor = self.keyframes[motion.keyframe]
-        return pose_deviation(self.grid, anchor, motion.T_cw, motion.match)
+        return pose_deviation(keyframes.grid, keyframes[motion.keyframe], motion.T_cw, motion.match)
 
-    # --- writing ---------------------------------------------------------------------------
+    def trajectory(self, elsewhere: Sequence[FrameRecord] = ()) -> Trajectory:
+        """Poses of all frames seen so far, solved on the present keyframes.
 
-    def hold(self, places: Sequence[RenderedKeyframe]) -> list[int]:
-        """Begin in the world of a saved map, whose keyframes stay as they are; returns their ids.
-
-        The camera is lost there until a frame is recognised at one of them.
+        Before the map is started no more than orientations is known, and of frames ``elsewhere``,
+        in other segments, no more than that ever.
         """
-        ids = [add_held(self.keyframes, place, n - len(places)) for n, place in enumerate(places)]
-        self.held = frozenset(ids)
-        self._finalized = dict.fromkeys(ids)
-        self.state = TrackState.LOST
-        return ids
+        has_map = self.segment.status.has_map
+        return solve_trajectory(self.map.recorder.log, self.keyframes, elsewhere, has_map)
 
-    def absorb(self, other: "Tracker") -> None:
-        """Take over the keyframes and frames of another tracker, already in this one's world.
-
-        The camera is where the later of the two saw it last. The other is of no more use.
-        """
-        if other.keyframes.ids[0] > self.keyframes.ids[0]:
-            self._breaks.append(other.keyframes.ids[0])
-        after = [k for k in self.keyframes.ids if k > other.keyframes.ids[-1]]
-        self._breaks = sorted({*self._breaks, *other._breaks, *after[:1]})
-        if other.keyframes.ids[-1] > self.keyframes.ids[-1]:
-            self.state, self._misses = other.state, other._misses
-            self._last, self.orientation = other._last, other.orientation
-            self.frames_lost = other.frames_lost
-        self._finalized = dict.fromkeys(sorted([*self._finalized, *other._finalized]))
-        self.keyframes.absorb(other.keyframes)
-        self.graph.edges = dict(sorted({**self.graph.edges, **other.graph.edges}.items()))
-        self.recorder.absorb(other.recorder)
+    def settle(self) -> None:
+        """Wait until the segment holds all that is being measured of frames by threads."""
+        self._choice.settle()
+        _ = self.map.recorder.log
 
     # --- the stream ------------------------------------------------------------------------
 
@@ -313,317 +131,205 @@ class Tracker:
 
         Raises InputError if its size is not the camera's.
         """
-        height, width = frame.image.shape[:2]
-        if (width, height) != (self.camera.width, self.camera.height):
-            raise InputError(
-                f"Frame {frame.index} is {width} x {height} pixels, the camera is "
-                f"{self.camera.width} x {self.camera.height}; all frames must have one size."
-            )
-        self._motion = None
-        self.recorder.see(frame)
-        encoded = self.operator.encode(frame.image)
+        self._check_size(frame)
+        status, self._motion = self.segment.status, None
+        self.map.recorder.note_rows(frame)
+        encoded = self.map.operator.encode(frame.image)
         self._choice.see(frame.image)
-        if self.operator.texture(encoded) < self.config.min_texture:
+        if self.map.operator.texture(encoded) < self.config.min_texture:
             return self._lose(frame)
-        if self.state is TrackState.INITIALIZING:
-            return self._start(frame, encoded)
-        motion = self._expected(frame, encoded)
-        if motion is not None and motion.known >= self.config.min_known:
-            return self._follow(frame, encoded, motion)
-        followed = self.orientation.follow(frame, encoded)
-        motion = self._found_again(encoded, followed)
+        if not status.has_map:
+            return self._initialise(frame, encoded)
+        if status.state is TrackState.TRACKING:
+            motion = self._localiser.track(frame, encoded)
+            if motion is not None:
+                return self._take(frame, encoded, motion)
+        followed = self._orientation.follow(status.orientation, frame, encoded)
+        motion = self._localiser.relocalise(encoded, followed)
         if motion is not None:
-            return self._follow(frame, encoded, motion, followed)
-        self.frames_lost += followed is None or not followed.is_pure
+            return self._take(frame, encoded, motion, followed)
+        status.frames_lost += followed is None or not followed.is_pure
         return self._lose(frame, followed)
 
-    def rejoin(self, frame: Frame, places: Sequence[Recognition]) -> TrackResult | None:
-        """Take the next frame, which was recognised at one of some keyframes; None if it was not.
-
-        A place is believed where the dense flow agrees with it over ``recognised`` of the cells.
-        """
-        self.recorder.see(frame)
-        encoded = self.operator.encode(frame.image)
-        for place in places:
-            if place.keyframe not in self.keyframes:
-                continue
-            keyframe = self.keyframes[place.keyframe]
-            guess = place.T_rel.to(keyframe.T_cw) @ keyframe.T_cw
-            motion = self._locator.locate(keyframe, encoded, guess, is_expected=False)
-            if motion is None or motion.known < self.config.min_known:
-                continue
-            if motion.matched >= self.config.recognised:
-                self.cut()
-                return self._follow(frame, encoded, motion)
-        return None
+    def rejoin(self, frame: Frame, recognised: Sequence[Recognition]) -> TrackResult | None:
+        """Take the next frame, which looks like some keyframes; None if it is at none of them."""
+        self.map.recorder.note_rows(frame)
+        encoded = self.map.operator.encode(frame.image)
+        motion = self._localiser.recognise(encoded, recognised)
+        if motion is None:
+            return None
+        self.cut()
+        return self._take(frame, encoded, motion)
 
     def cut(self) -> None:
         """No motion links the next frame to those before it; the camera has to be found anew."""
-        self.orientation.forget()
-        if self.state is not TrackState.INITIALIZING:
-            self._lost()
+        self.segment.status.orientation.reset()
+        if self.segment.status.has_map:
+            self.segment.status.lose()
 
     def finish(self) -> TrackResult:
         """End of the stream: every keyframe becomes final.
 
         Raises TrackingLost if the map could never be started.
         """
-        if self.state is TrackState.INITIALIZING:
+        if not self.segment.status.has_map:
             if not self._start_up.finish():
                 raise TrackingLost(self._start_up.why_not())
             self._begin()
-        fresh = self._finalise(self.keyframes.ids)
-        self.recorder.finalise(self.keyframes.ids[-1], None)
-        return TrackResult(self.state, None, fresh, ())
+        ids = self.keyframes.ids
+        fresh = self.map.finalise(ids)
+        self.map.recorder.finalise(ids[-1], None)
+        return TrackResult(self.segment.status.state, None, fresh, ())
 
-    def _start(self, frame: Frame, encoded: Any) -> TrackResult:
-        turns = []
-        if not len(self.keyframes):
-            followed = self.orientation.follow(frame, encoded)
-            turns = [] if followed is None else [followed.turn]
-        if frame.depth is not None and (result := self._start_metric(frame, encoded, turns)):
-            return result
-        step = self._start_up.take(frame, encoded, turns)
-        if not step.has_started:
-            return TrackResult(self.state, removed=step.removed)
-        self._begin()
-        self.orientation.located(frame, encoded)
-        newest = self.keyframes.ids[-1] if step.is_keyframe else None
-        fresh = self._finalise(self.keyframes.ids[:-1])
-        return TrackResult(self.state, newest, fresh, self.active, step.removed)
+    def absorb(self, other: "Tracker") -> None:
+        """Take over the keyframes and frames of another tracker, already in this one's gauge.
 
-    def _start_metric(
-        self, frame: Frame, encoded: Any, turns: Sequence[Turn]
-    ) -> TrackResult | None:
-        """Start the map at once from what a depth sensor saw; None where that is too little."""
-        eye = torch.eye(4, dtype=torch.float64)
-        earlier = list(self.keyframes.ids)
-        state = self.keyframes.add(frame.index, frame.timestamp, frame.image, encoded, eye)
-        state.pose = frame.pose
-        if not self.sensing.start(state, frame.depth, self.config.min_known):
-            self.keyframes.remove(state.id)
-            return None
-        removed = self._start_up.give_up(earlier)
-        self.priors.ask(state)
-        self.recorder.add_keyframe(state.id, turns)
-        self.is_metric = True
-        self._begin()
-        self.orientation.located(frame, encoded)
-        return TrackResult(self.state, state.id, removed=removed)
+        The camera is where the later of the two saw it last. The other is of no more use.
+        """
+        own, theirs = self.segment, other.segment
+        ids, guests = own.keyframes.ids, theirs.keyframes.ids
+        breaks = {*own.breaks, *theirs.breaks, *[k for k in ids if k > guests[-1]][:1]}
+        if guests[0] > ids[0]:
+            breaks.add(guests[0])
+        own.breaks[:] = sorted(breaks)
+        if guests[-1] > ids[-1]:
+            own.status = theirs.status
+        own.final[:] = sorted([*own.final, *theirs.final])
+        self.map.absorb(other.map)
 
-    def _begin(self) -> None:
-        self.state = TrackState.TRACKING
-        self.odometry.look()
-        back_fill(self.recorder, self._locator, self.config.min_known)
-        self._seen_at(self.keyframes[self.keyframes.ids[-1]])
-
-    # --- with a map ------------------------------------------------------------------------
-
-    def _expected(self, frame: Frame, encoded: Any) -> FrameMotion | None:
-        """The frame near where the last one was; None if the camera is not there, or was lost."""
-        last = self._last
-        if last is None or self.state is not TrackState.TRACKING:
-            return None
-        motion = self._locator.locate(last.keyframe, encoded, last.predicted(frame.timestamp))
-        told = self.odometry.since(last.keyframe, frame.pose) if motion is None else None
-        if told is not None:
-            motion = self._locator.locate(last.keyframe, encoded, told @ last.keyframe.T_cw)
-        if motion is None and last.velocity is not None:
-            motion = self._locator.locate(last.keyframe, encoded, last.T_cw)
-        return motion
-
-    def _found_again(self, encoded: Any, followed: Followed | None) -> FrameMotion | None:
-        """The frame anywhere: first where the camera would be if it had only turned."""
-        last = self._last
-        if last is not None and followed is not None and followed.R is not None:
-            turn = torch.eye(4, dtype=torch.float64)
-            turn[:3, :3] = followed.R
-            guess = turn @ last.T_cw
-            for keyframe in seeing(list(self.keyframes), guess):
-                motion = self._locator.locate(keyframe, encoded, guess, is_expected=False)
-                if motion is not None and motion.known >= self.config.min_known:
-                    return motion
-            if followed.is_pure and self._misses % SELDOM:
-                return None
-        motion = self._locator.relocate_any(self._places(), encoded)
-        return None if motion is None or motion.known < self.config.min_known else motion
-
-    def _lost(self) -> None:
-        self.state = TrackState.LOST
-        if self._last is not None:
-            self._last = replace(self._last, velocity=None)
-
-    def _seen_at(
-        self,
-        keyframe: Keyframe,
-        T_rel: Float[Tensor, "4 4"] | None = None,
-        velocity: Float[Tensor, "4 4"] | None = None,
-        timestamp: float | None = None,
-        interval: float = 0.0,
-    ) -> None:
-        """Note where the last frame was: relative to a keyframe, or at it."""
-        T_rel = torch.eye(4, dtype=torch.float64) if T_rel is None else T_rel
-        seconds = keyframe.timestamp if timestamp is None else timestamp
-        self._last = LastFrame(keyframe, T_rel, velocity, keyframe.scale, seconds, interval)
-
-    def _places(self) -> list[Keyframe]:
-        """Where to look for a lost camera: recent keyframes, and older ones in turn."""
-        count, states = self.config.relocalise, list(self.keyframes)
-        recent, older = states[: -count - 1 : -1], states[:-count]
-        turn = (self._misses * count) % max(len(older), 1)
-        return recent + (older[turn:] + older[:turn])[:count]
-
-    def _lose(self, frame: Frame, followed: Followed | None = None) -> TrackResult:
-        """The frame has no pose; no orientation, either, unless it was ``followed``."""
-        if self.state is not TrackState.INITIALIZING:
-            self._lost()
-            self._misses += 1
-        if followed is None:
-            self.recorder.add_untracked(frame.index, frame.timestamp)
-            return TrackResult(self.state, active=self.active)
-        self.recorder.add_untracked(frame.index, frame.timestamp, [followed.turn])
-        return TrackResult(TrackState.TURNING, active=self.active)
-
-    def _follow(
-        self, frame: Frame, encoded: Any, motion: FrameMotion, followed: Followed | None = None
-    ) -> TrackResult:
-        velocity, interval, self._motion = None, 0.0, motion
-        if self._last is not None and self.state is TrackState.TRACKING:
-            velocity = motion.T_cw @ se3_inverse(self._last.T_cw)
-            interval = frame.timestamp - self._last.timestamp
-        if self.state is TrackState.LOST:
-            self._breaks.append(self.keyframes.table.next_id)
-        self.state, self._misses, self.frames_lost = TrackState.TRACKING, 0, 0
-        self.orientation.located(frame, encoded)
-        anchor = self.keyframes[motion.keyframe]
-        T_rel = motion.T_cw @ se3_inverse(anchor.T_cw)
-        self._seen_at(anchor, T_rel, velocity, frame.timestamp, interval)
-        turns = [] if followed is None else [followed.turn]
-        # Where few frames were measured, each of these is worth a keyframe.
-        is_first_measured = frame.depth is not None and self.is_metric and anchor.measured is None
-        if not (is_first_measured or self._choice.calls_for(motion.flow, motion.overlap)):
-            self.recorder.add(frame, encoded, anchor.id, T_rel, motion.match, turns)
-            return TrackResult(self.state, active=self.active)
-        return self._insert(frame, encoded, motion, velocity, interval, turns)
-
-    def _insert(
-        self,
-        frame: Frame,
-        encoded: Any,
-        motion: FrameMotion,
-        velocity: Float[Tensor, "4 4"] | None,
-        interval: float,
-        turns: Sequence[Turn],
-    ) -> TrackResult:
-        anchor = self.keyframes[motion.keyframe]
-        state = self.keyframes.add(frame.index, frame.timestamp, frame.image, encoded, motion.T_cw)
-        state.pose = frame.pose
-        T = motion.T_cw @ se3_inverse(anchor.T_cw)
-        state.inverse_depth, state.information = grid_fields(self.grid).transfer(
-            T, anchor.inverse_depth, anchor.information
-        )
-        if self.is_metric:
-            self.sensing.join(state, frame.depth)
-        self._seen_at(state, velocity=velocity, interval=interval)
-        self._unfinished = Unfinished(state, anchor.id, motion, turns)
-        if self._defers:
-            return TrackResult(self.state, state.id)
-        return self.complete()
-
-    def complete(self) -> TrackResult:
-        """Do what the new keyframe takes beyond its place: neighbours, depth, local adjustment."""
-        new, self._unfinished = self._unfinished, None
-        assert new is not None, "no keyframe waits to be completed"
-        state, anchor = new.keyframe, self.keyframes[new.anchor]
-        self.priors.ask(state)
-        self.recorder.add_keyframe(state.id, new.turns)
-        self._connect(state.id, anchor.id)
-        seen = self.graph.edges[state.id, anchor.id]
-        state.moving = carried(self.grid, anchor.moving, seen.pixels, seen.weight)
-        self._adjust_locally()
-        self.odometry.look()
-        removed = self._cull()
-        fresh = self._finalise(self.keyframes.ids[:-1])
-        return TrackResult(self.state, state.id, fresh, self.active, removed)
+    # --- frames that come while a keyframe is being completed ---------------------------------
 
     def follower(self) -> Follower:
         """What locates the frames that come while another thread completes the keyframe."""
-        assert self._unfinished is not None, "no keyframe waits to be completed"
-        assert self._last is not None
-        last = replace(self._last, keyframe=self._last.keyframe.as_it_is())
-        anchor = self.keyframes[self._unfinished.anchor].as_it_is()
-        return Follower(
-            self._locator, self.operator, self.config, last, anchor, self._unfinished.motion
-        )
+        new, last = self._unfinished, self.segment.status.last
+        assert new is not None, "no keyframe waits to be completed"
+        assert last is not None
+        keyframes = self.keyframes
+        keyframe, anchor = (keyframes[k].as_it_is() for k in (last.keyframe, new.motion.keyframe))
+        locator = self._localiser.locator
+        return Follower(locator, self.config, replace(last), keyframe, anchor, new.motion)
 
-    def take(self, follower: Follower) -> None:
+    def take_over(self, follower: Follower) -> None:
         """Take over the frames that were followed while the keyframe was completed."""
-        keyframe = self.keyframes[follower.last.keyframe.id]
+        keyframe = self.keyframes[follower.last.keyframe]
         for found in follower.frames:
             frame, encoded = found.frame, found.encoded
             T_rel = keyframe.at_present_scale(found.T_rel, follower.last.scale)
-            self.recorder.add(frame, encoded, keyframe.id, T_rel, found.motion.match)
-            self.orientation.located(frame, encoded)
+            self.map.recorder.add(frame, encoded, keyframe.id, T_rel, found.motion.match)
+            self._orientation.located(self.segment.status.orientation, frame, encoded)
             self._choice.see(frame.image)
-        self._last = replace(follower.last, keyframe=keyframe)
+        self.segment.status.last = follower.last
         self._motion = None  # by which a frame was located at what the keyframe was
 
-    def _connect(self, id: int, anchor: int) -> None:
-        """Measure a new keyframe against the one it was located at, and its neighbours."""
-        c, ids = self.config, self.keyframes.ids
-        pairs = proximity_pairs(
-            self.keyframes,
-            [id],
-            ids[-c.proximity_window : -1],
-            self.graph.pairs,
-            c.radius,
-            1,
-            c.proximity_distance * self._long_edge,
-            c.radius + c.proximity_pairs,
-        )
-        # Neighbours in time are none where the camera was lost in between.
-        broken = [p for p in pairs if any(p[0] < b <= p[1] for b in self._breaks)]
-        there, back = frame_distances(self.keyframes, broken + [p[::-1] for p in broken]).chunk(2)
-        apart = {p for p, d in zip(broken, (there + back).tolist(), strict=True) if d == torch.inf}
-        pairs = [p for p in pairs if p not in apart]
-        self.graph.measure({*pairs, (anchor, id)}, fine=False)
+    def complete(self) -> TrackResult:
+        """Do what the new keyframe takes beyond its pose: neighbours, depth, local adjustment."""
+        new, self._unfinished = self._unfinished, None
+        assert new is not None, "no keyframe waits to be completed"
+        removed = self.local.update(new.keyframe, new.motion.keyframe, new.rotations)
+        fresh = self.map.finalise(self.keyframes.ids[:-1])
+        state, active = self.segment.status.state, self.local.active
+        return TrackResult(state, new.keyframe.id, fresh, active, removed)
 
-    def _adjust_locally(self) -> None:
-        c, poses, depths = self.config, self.active, self.deep
-        moving, deep = set(poses), set(depths)
-        for n in range(c.local_rounds):
-            edges = [e for e in self.graph.edges if e[0] in deep or not moving.isdisjoint(e)]
-            if n:
-                pairs = [e for e in edges if e[0] < e[1] and not moving.isdisjoint(e)]
-                self.graph.measure(self.graph.stale(pairs, c.remeasure), fine=False)
-            self.graph.adjust(
-                edges, poses, depths, BundleOptions(iterations=c.local_iterations, huber=c.huber)
+    # --- steps of a frame ----------------------------------------------------------------------
+
+    def _check_size(self, frame: Frame) -> None:
+        height, width = frame.image.shape[:2]
+        camera = self.keyframes.grid.camera
+        if (width, height) != (camera.width, camera.height):
+            raise InputError(
+                f"Frame {frame.index} is {width} x {height} pixels, the camera is "
+                f"{camera.width} x {camera.height}; all frames must have one size."
             )
-            if n == 0:
-                self.graph.judge_moving(deep, c.moving)
-            if n >= c.local_rounds - self.priors.config.rounds:
-                self.priors.adjust(depths, c.huber)
-        self.graph.release(moving)
 
-    def _cull(self) -> tuple[int, ...]:
-        """Remove the keyframe before the last if it adds little (DROID-SLAM's keyframe test)."""
-        ids = self.keyframes.ids
-        if len(ids) <= MIN_KEYFRAMES or ids[-2] in self._finalized:
-            return ()
-        before, id = ids[-3], ids[-2]
-        if stands_alone([self.keyframes[k] for k in ids[-3:]]):
-            return ()
-        distance = frame_distances(self.keyframes, [(before, id), (id, before)]).mean()
-        if float(distance) >= self.config.cull_distance * self._long_edge:
-            return ()
-        self.graph.remove_keyframe(id)
-        self.recorder.keyframe_removed(self.keyframes.remove(id), before)
-        return (id,)
+    def _initialise(self, frame: Frame, encoded: Any) -> TrackResult:
+        """Take a frame while there is no map, which may start it."""
+        status, keyframes, rotations = self.segment.status, self.keyframes, []
+        if not len(keyframes):
+            followed = self._orientation.follow(status.orientation, frame, encoded)
+            rotations = [] if followed is None else [followed.rotation]
+        given_up = self._start_up.take(frame, encoded, rotations)
+        if not status.has_map:
+            return TrackResult(status.state, removed=given_up)
+        self._begin()
+        self._orientation.located(status.orientation, frame, encoded)
+        newest = keyframes[keyframes.ids[-1]]
+        new = newest.id if newest.frame_index == frame.index else None
+        fresh = self.map.finalise(keyframes.ids[:-1])
+        return TrackResult(status.state, new, fresh, self.local.active, given_up)
 
-    def _finalise(self, ids: list[int]) -> tuple[int, ...]:
-        fresh = [k for k in ids if k not in self._finalized]
-        for id in fresh:
-            if self._finalized:
-                self.recorder.finalise(next(reversed(self._finalized)), id)
-            self._finalized[id] = None
-        return tuple(fresh)
+    def _begin(self) -> None:
+        """The map has just been started."""
+        self.map.odometry.look()
+        locator, keyframes = self._localiser.locator, self.keyframes
+        locate_early_frames(self.map.recorder, keyframes, locator, self.config.min_known)
+        newest = keyframes[keyframes.ids[-1]]
+        self.segment.status.last = _at(newest, newest.timestamp)
+
+    def _lose(self, frame: Frame, followed: Followed | None = None) -> TrackResult:
+        """The frame has no pose; no orientation, either, unless it was ``followed``."""
+        status = self.segment.status
+        if status.has_map:
+            status.lose()
+            status.misses += 1
+        rotations = [] if followed is None else [followed.rotation]
+        self.map.recorder.add_untracked(frame.index, frame.timestamp, rotations)
+        state = status.state if followed is None else TrackState.TURNING
+        return TrackResult(state, active=self.local.active)
+
+    def _take(
+        self, frame: Frame, encoded: Any, motion: FrameMotion, followed: Followed | None = None
+    ) -> TrackResult:
+        """The frame has been located: make it a keyframe where it is one, else log it."""
+        status, self._motion = self.segment.status, motion
+        anchor = self.keyframes[motion.keyframe]
+        last = LastFrame(
+            anchor.id, motion.T_cw @ se3_inverse(anchor.T_cw), None, anchor.scale, frame.timestamp,
+            0.0,
+        )  # fmt: skip
+        before, T_before = status.last, self.T_cw
+        if before is not None and T_before is not None and status.state is TrackState.TRACKING:
+            last.velocity = motion.T_cw @ se3_inverse(T_before)
+            last.interval = frame.timestamp - before.timestamp
+        if status.state is TrackState.LOST:
+            self.segment.breaks.append(self.keyframes.table.next_id)
+        status.state, status.misses, status.frames_lost = TrackState.TRACKING, 0, 0
+        self._orientation.located(status.orientation, frame, encoded)
+        status.last = last
+        rotations = [] if followed is None else [followed.rotation]
+        # Where few frames were measured, each of these is worth a keyframe.
+        is_first_measured = (
+            frame.depth is not None and self.segment.is_metric and anchor.measured is None
+        )
+        if not (is_first_measured or self._choice.calls_for(motion.flow, motion.overlap)):
+            self.map.recorder.add(frame, encoded, anchor.id, last.T_rel, motion.match, rotations)
+            return TrackResult(status.state, active=self.local.active)
+        keyframe = self.local.insert(frame, encoded, motion)
+        status.last = _at(keyframe, keyframe.timestamp, last.velocity, last.interval)
+        self._unfinished = _Unfinished(keyframe, motion, rotations)
+        return TrackResult(status.state, keyframe.id) if self._defers else self.complete()
+
+
+def lone_tracker(
+    camera: Camera,
+    config: Config | None = None,
+    device: torch.device | str = "cpu",
+    operator: FlowOperator | None = None,
+    prior: MonocularPrior | None = None,
+    defers: bool = False,
+) -> Tracker:
+    """A tracker of a video that is one segment, without loops and without a map of disks."""
+    grid, config = SampleGrid(camera, device), config or Config()
+    operator = operator or build_operator(config.tracking, grid)
+    segment = VideoSegment(keyframes=KeyframeTable.on(grid, operator.encode).new_set())
+    return Tracker(segment, operator, config, prior, defers)
+
+
+def _at(
+    keyframe: Keyframe,
+    timestamp: float,
+    velocity: Float[Tensor, "4 4"] | None = None,
+    interval: float = 0.0,
+) -> LastFrame:
+    """The last frame where it is a keyframe."""
+    eye = torch.eye(4, dtype=torch.float64)
+    return LastFrame(keyframe.id, eye, velocity, keyframe.scale, timestamp, interval)

@@ -1,8 +1,7 @@
-"""Orientations of frames from how each is turned against others."""
+"""Rotation averaging: orientations of frames from relative rotations between them."""
 
 from collections import defaultdict, deque
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -10,37 +9,27 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from geogs.geometry.lie import so3_exp, so3_log
+from geogs.world.frames import RelativeRotation
 
 ROUNDS = 3
-"""Gauss-Newton steps that spread what turns contradict each other by."""
-
-
-@dataclass(frozen=True, eq=False)
-class Turn:
-    """How a frame's camera is turned against that of an earlier frame."""
-
-    frame: int
-    """Index of the earlier."""
-    R: Float64[Tensor, "3 3"]
-    """The earlier camera to this one."""
-    deviation: float
-    """Standard deviation of the angle, radians."""
+"""Gauss-Newton steps that spread what rotations contradict each other by."""
 
 
 def orientations(
-    turns: Mapping[int, Sequence[Turn]], known: Mapping[int, Float64[Tensor, "3 3"]]
+    relative: Mapping[int, Sequence[RelativeRotation]],
+    known: Mapping[int, Float64[Tensor, "3 3"]],
 ) -> dict[int, Float64[Tensor, "3 3"]]:
-    """World to camera of all frames that turns link to the known ones, without these.
+    """World to camera of all frames that relative rotations link to the known ones, without these.
 
     Where several ways lead to a frame, what they contradict each other by is spread over them by
-    least squares, each turn as sure as it says (rotation averaging). If nothing is known, the
-    earliest frame of the largest group that turns link is the world.
+    least squares, each weighted by its deviation. If nothing is known, the earliest frame of the
+    largest group that is linked is the world.
 
     Args:
-        turns: of each frame, by its index.
+        relative: rotations relative to earlier frames, by the index of each frame.
         known: rotations of frames that stay as they are, by index.
     """
-    links = [(t.frame, n, t.R, t.deviation) for n, several in turns.items() for t in several]
+    links = [(t.frame, n, t.R, t.deviation) for n, several in relative.items() for t in several]
     neighbours: dict[int, list[tuple[int, Tensor]]] = defaultdict(list)
     for a, b, R, _ in links:
         neighbours[a].append((b, R))
@@ -69,7 +58,7 @@ def _earliest_of_largest(neighbours: Mapping[int, list]) -> dict[int, Tensor]:
 def _followed(
     neighbours: Mapping[int, list[tuple[int, Tensor]]], start: Mapping[int, Tensor]
 ) -> dict[int, Tensor]:
-    """The rotations of the start and of all frames linked to them, by the fewest turns."""
+    """The rotations of the start and of all frames linked to them, by the fewest links."""
     found, queue = dict(start), deque(start)
     while queue:
         a = queue.popleft()
@@ -85,8 +74,8 @@ def _spread(
 ) -> None:
     """A Gauss-Newton step over the free rotations, each moved from the left.
 
-    With ``R_b R_a^T`` for the turn R of b against a, the error is ``log(R (R_b R_a^T)^T)``; to
-    first order it falls by ``phi_b - (R_b R_a^T) phi_a``.
+    With ``R_b R_a^T`` for the rotation R of b relative to a, the error is
+    ``log(R (R_b R_a^T)^T)``; to first order it falls by ``phi_b - (R_b R_a^T) phi_a``.
     """
     from scipy.sparse import coo_matrix
     from scipy.sparse.linalg import spsolve
@@ -95,9 +84,9 @@ def _spread(
     first = torch.stack([found[a] for a, _, _, _ in links])
     second = torch.stack([found[b] for _, b, _, _ in links])
     measured = torch.stack([link[2] for link in links])
-    sure = 1 / torch.tensor([link[3] for link in links], dtype=torch.float64)
+    precision = 1 / torch.tensor([link[3] for link in links], dtype=torch.float64)
     relative = second @ first.mT
-    error = sure[:, None] * so3_log(measured @ relative.mT)
+    error = precision[:, None] * so3_log(measured @ relative.mT)
     rows: list[np.ndarray] = []
     columns: list[np.ndarray] = []
     values: list[np.ndarray] = []
@@ -107,7 +96,7 @@ def _spread(
             if n in column:
                 rows.append(np.repeat(3 * k + at, 3))
                 columns.append(np.tile(column[n] + at, 3))
-                values.append((sure[k] * block).numpy().ravel())
+                values.append((precision[k] * block).numpy().ravel())
     shape = (3 * len(links), 3 * len(free))
     J = coo_matrix(
         (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), shape

@@ -26,7 +26,7 @@ from geogs.loop.global_bundle import SETTLED, global_options
 from geogs.threads import on_one_torch_thread
 from geogs.tracking.flow.select import build_operator
 from geogs.tracking.graph import FrameGraph
-from geogs.tracking.packed_edge import PackedEdge
+from geogs.world.edges import PackedEdge
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import KeyframeTable
 from geogs_fleet.join.gauge import Gauge
@@ -243,7 +243,7 @@ def _known_graph(job: StepJob, grid: SampleGrid) -> tuple[FrameGraph, list[Node]
     """The edges that leave a part's keyframes, which come first; the node of each keyframe."""
     edges: dict[Directed, PackedEdge] = {}
     for path in job.matches:
-        edges |= Matches.load(path).edges(grid)
+        edges |= Matches.load(path).edges()
     seen = {target for _, target in edges}
     segment = KeyframeTable.on(grid).new_set()
     nodes: list[Node] = []
@@ -259,7 +259,7 @@ def _known_graph(job: StepJob, grid: SampleGrid) -> tuple[FrameGraph, list[Node]
             ids[node] = keyframe.id
             nodes.append(node)
     graph = FrameGraph(segment, build_operator(job.config.tracking, grid))
-    graph.edges = {(ids[a], ids[b]): edge for (a, b), edge in edges.items()}
+    graph.edges.update({(ids[a], ids[b]): edge for (a, b), edge in edges.items()})
     return graph, nodes
 
 

@@ -17,9 +17,9 @@ from geogs.loop.global_bundle import MATCHED_TOGETHER
 from geogs.threads import on_one_torch_thread
 from geogs.tracking.flow.select import build_operator
 from geogs.tracking.graph import FrameGraph
-from geogs.tracking.packed_edge import PackedEdge, PackedFlow, in_steps
-from geogs.tracking.proximity import Pair, proximity_pairs
+from geogs.tracking.proximity import proximity_pairs
 from geogs.tracking.row_errors import RowErrors, edge_shifts
+from geogs.world.edges import PackedEdge, Pair, in_steps
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import Keyframe, KeyframeTable
 from geogs_fleet.join.links import loaded_keyframes
@@ -86,7 +86,7 @@ class Member:
 
 @dataclass(frozen=True)
 class Matches:
-    """Directed edges of the frame graph, as :class:`PackedFlow` has them."""
+    """Directed edges of the frame graph, as :class:`PackedEdge` has them."""
 
     ends: Int[np.ndarray, "e 4"]
     """Source and target: part and place of each."""
@@ -106,7 +106,7 @@ class Matches:
         edges: Mapping[Directed, PackedEdge], shift: Mapping[Directed, Tensor], cells: int
     ) -> "Matches":
         """Edges in order, with the shift of each where there are any."""
-        flows = [edges[pair].flow for pair in sorted(edges)]
+        flows = [edges[pair] for pair in sorted(edges)]
         if not flows:
             empty, pixels = np.zeros((0, cells), np.float32), np.zeros((0, cells, 2))
             return Matches(
@@ -125,7 +125,7 @@ class Matches:
             np.stack(shifts) if shifts else np.zeros((0, cells, 2), np.int16),
         )
 
-    def edges(self, grid: SampleGrid, as_found: bool = False) -> dict[Directed, PackedEdge]:
+    def edges(self, as_found: bool = False) -> dict[Directed, PackedEdge]:
         """As a graph has them; without the shifts ``as_found``."""
         found = {}
         for n, (a, i, b, j) in enumerate(self.ends.tolist()):
@@ -136,8 +136,7 @@ class Matches:
             damping = torch.from_numpy(self.damping[n]) if len(self.damping) else None
             if len(self.shift) and not as_found:
                 position = position + torch.from_numpy(self.shift[n])
-            flow = PackedFlow(position, weight, poses[0], poses[1], depth, damping)
-            found[(a, i), (b, j)] = PackedEdge(grid, flow)
+            found[(a, i), (b, j)] = PackedEdge(position, weight, poses[0], poses[1], depth, damping)
         return found
 
     def save(self, path: Path) -> None:
@@ -184,7 +183,7 @@ def match(job: MatchJob) -> Matched:
     segment = KeyframeTable.on(grid, operator.encode).new_set()
     before: dict[Directed, PackedEdge] = {}
     for path in job.before:
-        before |= Matches.load(path).edges(grid, as_found=True)
+        before |= Matches.load(path).edges(as_found=True)
     seen = {node for ends in before for node in ends} if before else _near(job.own, job.others)
     ids: dict[Node, int] = {}
     results = {member.number: opened(member.part) for member in members}
@@ -197,7 +196,7 @@ def match(job: MatchJob) -> Matched:
             depths.give(keyframe, place)
             ids[member.number, place] = keyframe.id
     graph, c = FrameGraph(segment, operator), job.config.tracking
-    graph.edges = {(ids[a], ids[b]): edge for (a, b), edge in before.items()}
+    graph.edges.update({(ids[a], ids[b]): edge for (a, b), edge in before.items()})
     pairs = graph.pairs if before else _pairs(graph, len(job.own.T_cw), c)
     stale = sorted(graph.stale(pairs, c.global_remeasure))
     for start in range(0, len(stale), MATCHED_TOGETHER[0]):

@@ -126,7 +126,7 @@ def assert_nothing_is_forgotten(slam: Slam, other: Slam) -> None:
             assert a == b, name
         todo += [(x, y, f"{name}{part}") for part, x, y in parts(a, b)]
     wanted = {"Tracker", "Keyframe", "MeasuredEdge", "MapView", "GaussianMap", "MapOptimizer"}
-    assert wanted | {"TrajectoryRecorder", "LoopDetector", "AppearanceIndex"} <= kinds
+    assert wanted | {"FrameRecorder", "LoopDetector", "AppearanceIndex"} <= kinds
 
 
 def parts(a: object, b: object) -> Iterator[tuple[str, object, object]]:
@@ -173,7 +173,7 @@ def test_a_state_of_another_camera_or_without_a_keyframe_is_one_sentence(tracked
     camera, state = tracked.camera, tracked.state()
     with pytest.raises(InputError, match="of another camera"):
         Slam(camera.resized(64, 48), quick(3)).restore(copied(state))
-    first, *rest = state.segments.trackers[0].keyframes.members
+    first, *rest = state.segments.segments[0].keyframes.members
     wrong = [
         replace(state, waiting=[99]),
         replace(state, mapper=replace(state.mapper, mapped=[99])),
@@ -186,6 +186,6 @@ def test_a_state_of_another_camera_or_without_a_keyframe_is_one_sentence(tracked
 
 
 def with_keyframes(state: SlamState, keyframes: list[int]) -> SlamState:
-    """The state with other keyframes in its world."""
-    world = replace(state.segments.trackers[0], keyframes=KeyframeSet(keyframes))
-    return replace(state, segments=replace(state.segments, trackers=[world]))
+    """The state with other keyframes in its main map."""
+    main = replace(state.segments.segments[0], keyframes=KeyframeSet(keyframes))
+    return replace(state, segments=replace(state.segments, segments=[main]))

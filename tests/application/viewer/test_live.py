@@ -12,8 +12,8 @@ from geogs.application.viewer.live import MOST_DISKS, LiveViewer
 from geogs.application.viewer.window import Window
 from geogs.geometry.camera import Camera
 from geogs.slam import SlamStatus
-from geogs.tracking.tracker import TrackState
 from geogs.types import Frame, MapSnapshot
+from geogs.world.segments import TrackState
 
 CAMERA = Camera(80.0, 80.0, 63.5, 47.5, 128, 96)
 

@@ -12,8 +12,8 @@ from geogs.errors import InputError, OutputError
 from geogs.geometry.camera import Camera
 from geogs.mesh.types import Mesh
 from geogs.slam import SlamStatus
-from geogs.tracking.tracker import TrackState
 from geogs.types import Frame, MapSnapshot, Trajectory
+from geogs.world.segments import TrackState
 
 CAMERA = Camera(80.0, 80.0, 63.5, 47.5, 128, 96)
 

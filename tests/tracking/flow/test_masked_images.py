@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import torch
 
-from geogs.config import TrackingConfig
+from geogs.config import Config, TrackingConfig
 from geogs.tracking.flow.masked import MaskedFlow
 from geogs.tracking.flow.select import build_operator
-from geogs.tracking.tracker import Tracker
+from geogs.tracking.tracker import lone_tracker
 from geogs.world.grid import STRIDE, SampleGrid
 from tracking_runs import CONFIG, error_cm
 from tracking_scenes import CAMERA, frames, pose, render, sideways
@@ -59,8 +59,10 @@ def test_an_arm_that_moves_with_the_camera_does_no_harm_where_it_is_black():
     for paint in (False, True):
         grid = SampleGrid(CAMERA)
         operator = build_operator(CONFIG, grid)
-        tracker = Tracker(
-            CAMERA, CONFIG, operator=MaskedFlow(operator, grid) if paint else operator
+        tracker = lone_tracker(
+            CAMERA,
+            Config(tracking=CONFIG),
+            operator=MaskedFlow(operator, grid) if paint else operator,
         )
         for frame in frames(path):
             left = 60 + round(20 * np.sin(0.5 * frame.index))

@@ -28,7 +28,7 @@ def make_metric(
     """Bring the map to metres by what is known; where it does not tell, say so and leave it."""
     if not slam.segments.keyframe_ids:
         return
-    for sentence in sentences_on_poses(slam.segments.world.odometry.agreement()):
+    for sentence in sentences_on_poses(slam.segments.main.map.odometry.agreement()):
         progress.write(sentence)
     if source is None:
         slam.to_metres()

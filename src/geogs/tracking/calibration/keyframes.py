@@ -17,6 +17,7 @@ from geogs.tracking.keyframe_choice import calls_for_keyframe
 from geogs.tracking.motion import FlowChain
 from geogs.types import FlowMatch, Frame
 from geogs.world.grid import SampleGrid
+from geogs.world.segments import ChainedPositions
 
 MIN_MATCHED = 0.12
 """Share of a keyframe's cells that must be found in the next one."""
@@ -41,6 +42,7 @@ class ViewGatherer:
         self._frames, self._grid, self._operator = frames, grid, operator
         self._config = TrackingConfig()
         self._chain = FlowChain(grid, operator, self._config.min_ncc)
+        self._positions = ChainedPositions()
         self.frames = 0
         """Frames taken so far."""
         self.is_over = False
@@ -67,7 +69,7 @@ class ViewGatherer:
                 continue
             step = None
             if views:
-                match = self._chain.follow(views[-1].encoded, encoded)
+                match = self._chain.follow(self._positions, views[-1].encoded, encoded)
                 if match.matched < MIN_MATCHED:
                     if len(views) >= count // 2:
                         break
@@ -76,7 +78,7 @@ class ViewGatherer:
                     continue
                 else:
                     step = match.there
-            self._chain.reset()
+            self._positions.reset()
             views.append(View(frame, encoded, step))
         return views
 

@@ -1,0 +1,88 @@
+"""Where the camera is in a started map: near where it was, or anywhere when it is lost."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+
+from geogs.config import TrackingConfig
+from geogs.tracking.motion import FrameLocator, FrameMotion, Recognition
+from geogs.tracking.orientation_chain import Followed
+from geogs.tracking.segment_map import SegmentMap
+from geogs.tracking.view_choice import seeing
+from geogs.types import Frame
+from geogs.world.keyframes import Keyframe
+
+RELOCALISE_EVERY = 5
+"""While a camera only rotates, its orientation says what it sees; only every so many frames it is
+searched for as if it could be anywhere."""
+
+
+class Localiser:
+    """Locates frames at the keyframes of a segment."""
+
+    def __init__(self, map: SegmentMap, config: TrackingConfig) -> None:
+        self.map, self.config = map, config
+        grid = map.keyframes.grid
+        edge = max(grid.camera.width, grid.camera.height)
+        self.locator = FrameLocator(
+            grid, map.operator, config.min_matched, config.max_residual * edge, config.min_ncc
+        )
+
+    def track(self, frame: Frame, encoded: Any) -> FrameMotion | None:
+        """The frame near where the last one was; None if the camera is not there."""
+        last = self.map.segment.status.last
+        if last is None:
+            return None
+        keyframe, locate = self.map.keyframes[last.keyframe], self.locator.locate
+        motion = locate(keyframe, encoded, last.predicted(keyframe, frame.timestamp))
+        if motion is None:
+            given = self.map.odometry.since(keyframe, frame.pose)
+            if given is not None:
+                motion = locate(keyframe, encoded, given @ keyframe.T_cw)
+        if motion is None and last.velocity is not None:
+            motion = locate(keyframe, encoded, last.T_cw(keyframe))
+        return self._with_depth(motion)
+
+    def relocalise(self, encoded: Any, followed: Followed | None) -> FrameMotion | None:
+        """The frame anywhere: first where the camera would be if it had only rotated."""
+        status, keyframes = self.map.segment.status, list(self.map.keyframes)
+        last = status.last
+        if last is not None and followed is not None and followed.R is not None:
+            rotation = torch.eye(4, dtype=torch.float64)
+            rotation[:3, :3] = followed.R
+            guess = rotation @ last.T_cw(self.map.keyframes[last.keyframe])
+            for keyframe in seeing(keyframes, guess):
+                motion = self.locator.locate(keyframe, encoded, guess, is_expected=False)
+                if self._with_depth(motion) is not None:
+                    return motion
+            if followed.is_pure and status.misses % RELOCALISE_EVERY:
+                return None
+        return self._with_depth(self.locator.relocate_any(self._candidates(keyframes), encoded))
+
+    def recognise(self, encoded: Any, recognised: Sequence[Recognition]) -> FrameMotion | None:
+        """The frame at one of some keyframes that look like it.
+
+        One is believed where the dense flow agrees with it over ``recognised`` of the cells.
+        """
+        for candidate in recognised:
+            if candidate.keyframe not in self.map.keyframes:
+                continue
+            keyframe = self.map.keyframes[candidate.keyframe]
+            guess = candidate.T_rel.to(keyframe.T_cw) @ keyframe.T_cw
+            motion = self.locator.locate(keyframe, encoded, guess, is_expected=False)
+            motion = self._with_depth(motion)
+            if motion is not None and motion.matched >= self.config.recognised:
+                return motion
+        return None
+
+    def _with_depth(self, motion: FrameMotion | None) -> FrameMotion | None:
+        """A motion that enough cells of known depth say."""
+        return None if motion is None or motion.known < self.config.min_known else motion
+
+    def _candidates(self, keyframes: list[Keyframe]) -> list[Keyframe]:
+        """Where to search for a lost camera: recent keyframes, and older ones by turns."""
+        count = self.config.relocalise
+        recent, older = keyframes[: -count - 1 : -1], keyframes[:-count]
+        first = (self.map.segment.status.misses * count) % max(len(older), 1)
+        return recent + (older[first:] + older[:first])[:count]

@@ -1,0 +1,114 @@
+"""Edges between keyframes: the flow measured from one to another, in full or packed.
+
+A packed edge takes a third of the memory, for graphs over thousands of keyframes.
+"""
+
+from collections.abc import Container, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from jaxtyping import Float, Float16, Int16
+from torch import Tensor
+
+from geogs.errors import InputError
+from geogs.geometry.camera import Camera
+from geogs.world.grid import SampleGrid
+
+MAX_WEIGHT = 6e4
+"""Largest weight that half precision holds, 1 / pixel^2."""
+
+Pair = tuple[int, int]
+"""Two keyframe ids: source and target of a directed edge, or the earlier first for both."""
+
+
+@dataclass(eq=False)
+class MeasuredEdge:
+    """One direction of a measured pair."""
+
+    pixels: Float[Tensor, "p 2"]
+    """Position in the target of each cell of the source."""
+    weight: Float[Tensor, "p 2"]
+    """Inverse variance of x and y in 1 / pixel^2; zero where there is no match."""
+    reprojection: Float[Tensor, "p 2"]
+    """Where the cells fell when the flow was measured."""
+    damping: Float[Tensor, "p"] | None = None
+    """Of the source's inverse depth, if the operator gives one."""
+    memory: Any = field(default=None, metadata={"stored": False})
+    """What the operator keeps of this edge, and can do without."""
+
+
+@dataclass(eq=False)
+class PackedEdge:
+    """One direction of a measured pair, packed.
+
+    Positions are kept in steps of 2^-15 of the long edge (1/64 pixel at 512; matches half an image
+    outside are clamped to its border) and weights in half precision. Where the cells fell when the
+    flow was measured is computed again from the poses and depths of that time, which many edges
+    share.
+    """
+
+    position: Int16[Tensor, "p 2"]
+    half_weight: Float16[Tensor, "p 2"]
+    T_source: Float[Tensor, "4 4"]
+    """World to camera of the source when the flow was measured."""
+    T_target: Float[Tensor, "4 4"]
+    inverse_depth: Float[Tensor, "p"]
+    """Of the source when the flow was measured."""
+    damping: Float[Tensor, "p"] | None = None
+    """Of the source's inverse depth, if the operator gives one."""
+    memory: Any = field(default=None, metadata={"stored": False})
+    """What the operator keeps of this edge, and can do without."""
+
+
+Edge = MeasuredEdge | PackedEdge
+
+
+def edge_matches(
+    grid: SampleGrid, edges: Sequence[Edge]
+) -> tuple[Float[Tensor, "e p 2"], Float[Tensor, "e p 2"]]:
+    """Measured positions and weights of some edges."""
+    packed = [e for e in edges if isinstance(e, PackedEdge)]
+    if packed and len(packed) == len(edges):
+        position = torch.stack([e.position for e in packed])
+        weight = torch.stack([e.half_weight for e in packed]).float()
+        return unpacked_positions(grid, position), weight
+    each = [
+        (e.pixels, e.weight)
+        if isinstance(e, MeasuredEdge)
+        else (unpacked_positions(grid, e.position), e.half_weight.float())
+        for e in edges
+    ]
+    return torch.stack([pixels for pixels, _ in each]), torch.stack([weight for _, weight in each])
+
+
+def pack_matches(
+    grid: SampleGrid, pixels: Float[Tensor, "*b 2"], weight: Float[Tensor, "*b 2"]
+) -> tuple[Int16[Tensor, "*b 2"], Float16[Tensor, "*b 2"]]:
+    """Positions in whole steps from the image's centre, zero where unmatched; half weights."""
+    steps = (pixels - grid.centre) / position_step(grid.camera)
+    position = torch.where(weight > 0, steps.round(), 0.0).clamp(-32768, 32767).short()
+    return position, weight.clamp(max=MAX_WEIGHT).half()
+
+
+def unpacked_positions(grid: SampleGrid, position: Int16[Tensor, "*b 2"]) -> Float[Tensor, "*b 2"]:
+    """Pixels of packed positions; the image's centre where unmatched."""
+    return position.float() * position_step(grid.camera) + grid.centre
+
+
+def position_step(camera: Camera) -> float:
+    """Pixels between two packed positions that differ by one."""
+    return 2.0**-15 * max(camera.width, camera.height)
+
+
+def in_steps(camera: Camera, shift: Float[Tensor, "*b 2"]) -> Int16[Tensor, "*b 2"]:
+    """Pixels by which positions are moved, in whole steps."""
+    return (shift / position_step(camera)).round().short()
+
+
+def check_edges(edges: Mapping[Pair, Edge], grid: SampleGrid, keyframes: Container[int]) -> None:
+    """Raise InputError where an edge is of another camera, or joins a keyframe that is missing."""
+    for (i, j), edge in edges.items():
+        cells = edge.position if isinstance(edge, PackedEdge) else edge.pixels
+        if len(cells) != grid.size or i not in keyframes or j not in keyframes:
+            raise InputError(f"the edge from {i} to {j} has no place")

@@ -1,0 +1,234 @@
+"""Segments of video that no motion links to each other: all that tracking knows of each.
+
+Keyframes of one segment share a gauge, which is a coordinate frame and a unit of length. One of the
+segments is the main map, which is shown and written. Source: the atlas of ORB-SLAM3 (Campos et al.
+2021), with one map.
+"""
+
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Float, Float32, Float64, UInt8
+from torch import Tensor
+
+from geogs.errors import InputError
+from geogs.geometry.lie import se3_exp, se3_log
+from geogs.world.edges import Edge, Pair, check_edges
+from geogs.world.frames import FrameLog, check_frames
+from geogs.world.grid import SampleGrid
+from geogs.world.keyframes import Keyframe, KeyframeSet
+
+CONSTANT_RATE = 0.2
+"""Fraction by which a frame may come sooner or later than the one before and still count as one
+interval later: time stamps are rounded."""
+MAX_EXTRAPOLATION = 3.0
+"""Times the last motion that is predicted at most, however long no frame came."""
+
+
+class TrackState(Enum):
+    """What tracking of a segment is doing."""
+
+    INITIALIZING = "initializing"
+    TRACKING = "tracking"
+    TURNING = "orientation only"
+    """There is a map, but too little of it in view: the camera's position is not known."""
+    LOST = "lost"
+
+
+@dataclass(eq=False)
+class LastFrame:
+    """Pose of the last located frame relative to a keyframe, so that corrections apply to it."""
+
+    keyframe: int
+    T_rel: Float[Tensor, "4 4"]
+    """Keyframe to this frame."""
+    velocity: Float[Tensor, "4 4"] | None
+    """Motion from the frame before; None where the camera had been lost."""
+    scale: float
+    """Of the keyframe when the two were measured."""
+    timestamp: float
+    """Seconds."""
+    interval: float
+    """Seconds that the motion took."""
+
+    def T_cw(self, keyframe: Keyframe) -> Float[Tensor, "4 4"]:
+        """World to camera by the keyframe's present pose and scale."""
+        return keyframe.at_present_scale(self.T_rel, self.scale) @ keyframe.T_cw
+
+    def predicted(self, keyframe: Keyframe, timestamp: float) -> Float[Tensor, "4 4"]:
+        """World to camera of the next frame, at a time, at constant velocity."""
+        if self.velocity is None:
+            return self.T_cw(keyframe)
+        motion = keyframe.at_present_scale(self.velocity, self.scale)
+        ratio = (timestamp - self.timestamp) / self.interval if self.interval > 0 else 1.0
+        if abs(ratio - 1) > CONSTANT_RATE:
+            motion = se3_exp(min(max(ratio, 0.0), MAX_EXTRAPOLATION) * se3_log(motion))
+        return motion @ self.T_cw(keyframe)
+
+
+@dataclass(eq=False)
+class ChainedPositions:
+    """Where the cells of a first image lie in the latest, from where flow is followed on."""
+
+    there: Float32[Tensor, "1 p 2"] | None = None
+    back: Float32[Tensor, "1 p 2"] | None = None
+    """Where the cells of the latest lie in the first."""
+
+    def reset(self) -> None:
+        """Begin again at a new first image."""
+        self.there = self.back = None
+
+
+@dataclass(eq=False)
+class ReferenceView:
+    """A frame that later ones are matched with to follow the camera's orientation."""
+
+    index: int
+    image: UInt8[np.ndarray, "h w 3"]
+    R: Float64[Tensor, "3 3"] | None
+    """The camera that was located last to this one; none where nothing links them."""
+    encoded: Any = field(default=None, metadata={"stored": False})
+    """The flow operator's form of the image, or None where it has to be computed again."""
+
+
+@dataclass(eq=False)
+class OrientationTrack:
+    """Orientation of the camera since it was last located."""
+
+    view: ReferenceView | None = None
+    flow: ChainedPositions = field(default_factory=ChainedPositions)
+    """From the view to the latest frame."""
+    misses: int = 0
+    """Frames in a row that did not match the view."""
+
+    def reset(self, view: ReferenceView | None = None) -> None:
+        """Begin again at a view, or where nothing links the next frame to those before it."""
+        self.view, self.misses = view, 0
+        self.flow.reset()
+
+
+@dataclass(eq=False)
+class TrackStatus:
+    """Where the camera is by the frames so far."""
+
+    state: TrackState = TrackState.INITIALIZING
+    last: LastFrame | None = None
+    orientation: OrientationTrack = field(default_factory=OrientationTrack)
+    misses: int = 0
+    """Frames since the camera was last located."""
+    frames_lost: int = 0
+    """Those of them with texture that show more than a rotation."""
+
+    @property
+    def has_map(self) -> bool:
+        """Whether the segment's map has been started."""
+        return self.state is not TrackState.INITIALIZING
+
+    def lose(self) -> None:
+        """The camera is lost; nothing says how it moves on."""
+        self.state = TrackState.LOST
+        if self.last is not None:
+            self.last.velocity = None
+
+
+@dataclass(eq=False)
+class StartUpProgress:
+    """What a start needs to know beside its keyframes and frames."""
+
+    flow: ChainedPositions = field(default_factory=ChainedPositions)
+    """From the last keyframe to the latest frame."""
+    misses: int = 0
+    """Frames in a row that did not match the last keyframe."""
+    min_keyframes: int = 0
+    """Keyframes with which it is tried again, where an earlier attempt was far off."""
+
+
+@dataclass(eq=False)
+class OdometryScale:
+    """Scale of poses that another tracker gives beside the images."""
+
+    scale: float | None = None
+    """Metres to the unit of the map; none as long as the measured motions do not fit."""
+    deviation: float = float("inf")
+    """Of the scale, relative."""
+
+
+@dataclass(eq=False)
+class VideoSegment:
+    """All that tracking knows of one segment of video; mutable."""
+
+    number: int = 0
+    """Stable, never used again."""
+    keyframes: KeyframeSet = field(default_factory=KeyframeSet)
+    edges: dict[Pair, Edge] = field(default_factory=dict)
+    """Measured flow between keyframes, in both directions of each pair."""
+    frames: FrameLog = field(default_factory=FrameLog)
+    status: TrackStatus = field(default_factory=TrackStatus)
+    final: list[int] = field(default_factory=list)
+    """Keyframes that are never removed any more, earliest first."""
+    fixed: list[int] = field(default_factory=list)
+    """Keyframes of a saved map, in whose gauge this segment is: they never change."""
+    breaks: list[int] = field(default_factory=list)
+    """Keyframes that no motion links to the one before them."""
+    sharpness: list[float] = field(default_factory=list)
+    """Of the latest frames."""
+    start: StartUpProgress = field(default_factory=StartUpProgress)
+    odometry: OdometryScale = field(default_factory=OdometryScale)
+    is_metric: bool = False
+    """Whether a depth sensor started the map, which then is in metres."""
+
+    @property
+    def ids(self) -> list[int]:
+        """Ids of all keyframes, earliest first; empty until the map has been started."""
+        return self.keyframes.ids if self.status.has_map else []
+
+    @property
+    def free(self) -> list[int]:
+        """Ids of the keyframes that an adjustment of all moves, earliest first."""
+        fixed = set(self.fixed)
+        return [k for k in self.ids if k not in fixed]
+
+
+@dataclass(frozen=True)
+class SegmentFate:
+    """What became of one segment of video."""
+
+    first_time: float
+    """Seconds."""
+    last_time: float
+    keyframes: int
+    """It had when it was joined, or at the end."""
+    fate: Literal["world", "joined", "apart"]
+    """The main map, joined to it, or never: then its frames count as not tracked."""
+
+
+@dataclass(eq=False)
+class SegmentTable:
+    """All segments of a video that have not been joined to another."""
+
+    segments: list[VideoSegment] = field(default_factory=list)
+    """Earliest first."""
+    main: int = 0
+    """Number of the one that is the main map."""
+    current: int = 0
+    """Number of the one in which the camera is."""
+    count: int = 0
+    """Segments so far: the number that the next one gets."""
+    joined: list[SegmentFate] = field(default_factory=list)
+    why_not: str = ""
+    """Why no segment could be started, once the stream has ended; empty if one could."""
+
+
+def check_segment(segment: VideoSegment, grid: SampleGrid) -> None:
+    """Raise InputError where what is kept of a segment is of another camera, or has no place."""
+    check_edges(segment.edges, grid, segment.keyframes)
+    check_frames(segment.frames.records, grid)
+    view = segment.status.orientation.view
+    if view is not None and view.image.shape != (grid.camera.height, grid.camera.width, 3):
+        raise InputError("the view that orientations are relative to is of another camera")
+    for flow in (segment.start.flow, segment.status.orientation.flow):
+        for positions in (flow.there, flow.back):
+            if positions is not None and positions.shape[1] != grid.size:
+                raise InputError("the flow of the start is of another camera")
