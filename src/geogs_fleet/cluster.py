@@ -1,7 +1,7 @@
 """Ray: found or started, and what one source gets of it."""
 
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -79,6 +79,20 @@ def share_of(ray: Any, settings: FleetSettings) -> Share:
             "source; ask for less (--cpus, --gpus, --memory-limit)."
         )
     return Share(cpus, gpus, memory_bytes, at_once)
+
+
+def as_task(ray: Any, function: Callable[..., Any], share: Share, retries: int = 0) -> Any:
+    """A function as a task of Ray that gets its share of a node.
+
+    Ray calls it again, up to so many times, where its node or its process is lost.
+    """
+    return ray.remote(function).options(
+        num_cpus=share.cpus,
+        num_gpus=share.gpus or None,
+        memory=share.memory,
+        max_retries=retries,
+        scheduling_strategy="SPREAD",
+    )
 
 
 def _times(node: dict[str, float], wanted: dict[str, float]) -> int:

@@ -1,4 +1,7 @@
-"""The jobs of a fleet through Ray, and again where a machine or a process failed."""
+"""The jobs of a fleet through Ray, and again where a machine or a process failed.
+
+The number of an attempt stands in its row and is not known to Ray's own retries.
+"""
 
 from collections.abc import Generator, Iterable
 from contextlib import suppress
@@ -6,7 +9,7 @@ from dataclasses import replace
 from typing import Any
 
 from geogs_fleet.attempt import Job, attempt
-from geogs_fleet.cluster import Share
+from geogs_fleet.cluster import Share, as_task
 from geogs_fleet.row import Row
 
 _LOOK = 0.5
@@ -21,13 +24,7 @@ def rows_of(
     All jobs are handed to Ray at once. One whose node or process fails is handed in again, up to
     ``attempts`` times in all. When the caller stops listening, what is out is ended.
     """
-    task = ray.remote(max_calls=0)(attempt).options(
-        num_cpus=share.cpus,
-        num_gpus=share.gpus or None,
-        memory=share.memory,
-        max_retries=0,
-        scheduling_strategy="SPREAD",
-    )
+    task = as_task(ray, attempt, share)
     out: dict[Any, Job] = {task.remote(job): job for job in jobs}
     try:
         while out:
@@ -42,7 +39,8 @@ def rows_of(
                     yield replace(row, state="failed") if row.state == "crashed" else row
     finally:
         for reference in out:
-            _cancel(ray, reference)
+            with suppress(Exception):  # also while the cluster goes away
+                ray.cancel(reference, force=True)
 
 
 def _row(ray: Any, reference: Any, job: Job) -> Row:
@@ -64,9 +62,3 @@ def _sentence(ray: Any, error: Exception) -> str:
         return "The machine or the process was lost."
     said = str(error).strip().splitlines() or [type(error).__name__]
     return f"Ray lost the task ({said[-1][:200]})."
-
-
-def _cancel(ray: Any, reference: Any) -> None:
-    """End a task, also while the cluster goes away."""
-    with suppress(Exception):
-        ray.cancel(reference, force=True)

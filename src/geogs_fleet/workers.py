@@ -1,21 +1,36 @@
-"""The jobs of a join as tasks of Ray, and again where a machine or a process failed."""
+"""Who does the jobs of a join: the tasks of a Ray cluster."""
 
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar, TypeVarTuple, runtime_checkable
 
 from geogs.errors import DeviceError, GeogsError
-from geogs_fleet.cluster import Share
+from geogs_fleet.cluster import Share, as_task
 
-J = TypeVar("J")
+Ts = TypeVarTuple("Ts")
 R = TypeVar("R")
-_LOOK = 0.5
-"""Seconds between two looks at what has ended."""
+
+
+@runtime_checkable
+class Workers(Protocol):
+    """Does jobs that do not depend on each other."""
+
+    @property
+    def at_once(self) -> int:
+        """How many jobs can be done at a time."""
+        ...
+
+    def map(self, stage: str, function: Callable[[*Ts], R], jobs: Sequence[tuple[*Ts]]) -> list[R]:
+        """``function(*job)`` of every job, in their order; each counts once, however often done.
+
+        ``stage`` names the work for who follows it. Raises what ``function`` raises.
+        """
+        ...
 
 
 class RayWorkers:
-    """Does jobs on a cluster; each has one result, the first that comes back."""
+    """Does jobs on a cluster, again where a node or a process is lost."""
 
     def __init__(
         self,
@@ -24,7 +39,7 @@ class RayWorkers:
         attempts: int,
         say: Callable[[str], None] = lambda sentence: None,
     ) -> None:
-        """``share`` is what each job gets of a node; ``say`` is told of every stage and retry."""
+        """``share`` is what each job gets of a node; ``say`` is given a line for every stage."""
         self._ray, self._share, self._attempts, self._say = ray, share, attempts, say
 
     @property
@@ -32,52 +47,27 @@ class RayWorkers:
         """How many jobs can be done at a time."""
         return self._share.at_once
 
-    def map(self, stage: str, function: Callable[[J], R], jobs: Sequence[J]) -> list[R]:
-        """``function`` of every job, in their order.
-
-        A job whose node or process fails is done again, up to ``attempts`` times in all.
+    def map(self, stage: str, function: Callable[[*Ts], R], jobs: Sequence[tuple[*Ts]]) -> list[R]:
+        """As in the protocol.
 
         Raises:
             GeogsError: as ``function`` raises it, or a job failed as often as it was tried.
         """
-        begin, share = time.monotonic(), self._share
-        task = self._ray.remote(function).options(
-            num_cpus=share.cpus,
-            num_gpus=share.gpus or None,
-            memory=share.memory,
-            max_retries=0,
-            scheduling_strategy="SPREAD",
-        )
-        tried = [1] * len(jobs)
-        results: dict[int, R] = {}
-        out = {task.remote(job): number for number, job in enumerate(jobs)}
+        begin, ray = time.monotonic(), self._ray
+        task = as_task(ray, function, self._share, retries=self._attempts - 1)
+        references = [task.remote(*job) for job in jobs]
         try:
-            while out:
-                ended, _ = self._ray.wait(list(out), num_returns=len(out), timeout=_LOOK)
-                for reference in ended:
-                    number = out.pop(reference)
-                    try:
-                        results.setdefault(number, self._ray.get(reference))
-                    except self._ray.exceptions.RayTaskError as error:
-                        raise _cause(error) from error
-                    except self._ray.exceptions.RayError as error:
-                        if tried[number] >= self._attempts:
-                            raise DeviceError(
-                                f"{stage.capitalize()} failed {tried[number]} times, as the "
-                                "machine or the process was lost; is there enough memory?"
-                            ) from error
-                        self._say(f"{stage}: a machine or a process was lost; trying again.")
-                        tried[number] += 1
-                        out[task.remote(jobs[number])] = number
+            results: list[R] = ray.get(references)
+        except ray.exceptions.RayTaskError as error:
+            raise (error.cause if isinstance(error.cause, GeogsError) else error) from error
+        except ray.exceptions.RayError as error:
+            raise DeviceError(
+                f"{stage.capitalize()} failed {self._attempts} times, as the machine or the "
+                "process was lost; is there enough memory?"
+            ) from error
         finally:
-            for reference in out:
+            for reference in references:  # whatever is still under way; nothing if all is done
                 with suppress(Exception):
-                    self._ray.cancel(reference, force=True)
+                    ray.cancel(reference, force=True)
         self._say(f"{stage}: {len(jobs)} jobs, {time.monotonic() - begin:.1f} s")
-        return [results[number] for number in range(len(jobs))]
-
-
-def _cause(error: Any) -> Exception:
-    """What the function raised."""
-    cause = getattr(error, "cause", None)
-    return cause if isinstance(cause, GeogsError) else error
+        return results

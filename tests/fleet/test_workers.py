@@ -4,6 +4,7 @@ import os
 import sys
 import threading
 import time
+from argparse import Namespace
 from pathlib import Path
 
 import numpy as np
@@ -18,9 +19,9 @@ from geogs.mesh.files import read_mesh
 from geogs_fleet.cluster import Share
 from geogs_fleet.join.join import join_parts
 from geogs_fleet.join.part import Part
-from geogs_fleet.join.workers import OneProcess
 from geogs_fleet.workers import RayWorkers
 from joined_parts import make_part
+from one_process import OneProcess
 
 ray = pytest.importorskip("ray", reason="Ray is not installed: pip install 'geogs[fleet]'")
 pytestmark = [
@@ -50,9 +51,9 @@ def ends_its_process(number: int) -> int:
     os._exit(1)
 
 
-def slow_on_its_first_node(job: tuple[str, int]) -> int:
+def slow_on_its_first_node(place: str, number: int) -> int:
     """Says that it was begun; until somebody else has begun it as well, it never ends."""
-    folder, number = Path(job[0]), job[1]
+    folder = Path(place)
     (folder / f"{number}-{os.getpid()}").touch()
     while number == 0 and len(list(folder.glob("0-*"))) < 2:
         time.sleep(0.05)
@@ -64,50 +65,40 @@ def workers(attempts: int = 3) -> RayWorkers:
 
 
 def test_results_are_in_the_order_of_the_jobs_and_errors_are_what_they_were(cluster):
-    assert workers().map("counting", squared, range(7)) == [n * n for n in range(7)]
+    assert workers().map("counting", squared, [(n,) for n in range(7)]) == [n * n for n in range(7)]
     assert workers().map("counting", squared, []) == []
     with pytest.raises(InputError, match="No 3, please"):
-        workers().map("counting", refused, range(5))
+        workers().map("counting", refused, [(n,) for n in range(5)])
     with pytest.raises(DeviceError, match="Counting failed 2 times"):
-        workers(2).map("counting", ends_its_process, [1])
+        workers(2).map("counting", ends_its_process, [(1,)])
 
 
 def test_a_job_whose_node_is_removed_is_done_elsewhere_and_counts_once(cluster, tmp_path):
-    node = add_node(cluster, 1, resources={"apart": 1.0})
-    begun = threading.Event()
+    node = add_node(cluster, 1)
+    from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
     def remove_when_begun() -> None:
         while not list(tmp_path.glob("0-*")):
             time.sleep(0.05)
-        begun.set()
         cluster.remove_node(node, allow_graceful=False)
 
-    class OnThatNode:
-        """Ray, but first tasks go to the node that will be lost."""
+    class FirstOnThatNode:
+        """Ray, but tasks go to the node that will be lost, as long as it is there."""
 
         def __getattr__(self, name):
             return getattr(ray, name)
 
         def remote(self, function):
-            plain = ray.remote(function)
-
-            class Task:
-                def options(self, **o):
-                    o.pop("scheduling_strategy")
-                    self.first, self.next = plain.options(**o, resources={"apart": 1}), plain
-                    self.o = o
-                    return self
-
-                def remote(self, job):
-                    if job[1] == 0 and not begun.is_set():
-                        return self.first.remote(job)
-                    return plain.options(**self.o).remote(job)
-
-            return Task()
+            affinity = NodeAffinitySchedulingStrategy(node.node_id, soft=True)
+            return Namespace(
+                options=lambda **o: ray.remote(function).options(
+                    **{**o, "scheduling_strategy": affinity}
+                )
+            )
 
     remover = threading.Thread(target=remove_when_begun, daemon=True)
     remover.start()
-    lost = RayWorkers(OnThatNode(), Share(1, 0.0, None, 2), 3)
+    lost = RayWorkers(FirstOnThatNode(), Share(1, 0.0, None, 2), 3)
     jobs = [(str(tmp_path), n) for n in range(4)]
     assert lost.map("waiting", slow_on_its_first_node, jobs) == [100, 101, 102, 103]
     remover.join(600)

@@ -21,9 +21,9 @@ from geogs_fleet.join.gauge import Gauge
 from geogs_fleet.join.graph import Placement
 from geogs_fleet.join.links import Link, loaded_keyframes
 from geogs_fleet.join.matches import Matches
-from geogs_fleet.join.part import DescribeJob, Part, PartViews, describe, opened
-from geogs_fleet.join.workers import OneProcess
+from geogs_fleet.join.part import Part, PartViews, describe, opened
 from joined_parts import CAMERA, make_part
+from one_process import OneProcess
 
 PLACES = [np.linspace(-0.8, -0.1, 4), np.linspace(-0.4, 0.4, 4), np.linspace(0.1, 0.8, 4)]
 
@@ -38,7 +38,7 @@ class Recording(OneProcess):
     def map(self, stage, function, jobs):
         done = super().map(stage, function, jobs)
         if stage == "matching":
-            for path in (path for job in jobs for path in job.after):
+            for path in (path for job in jobs for path in job[-1]):
                 self.files.append(Path(shutil.copy(path, self.folder)))
         return done
 
@@ -51,7 +51,7 @@ def placed(tmp_path):
     for n, places in enumerate(PLACES):
         parts.append(Part(str(n), make_part(tmp_path / str(n), places, 0)))
         files.append(tmp_path / f"{n}.npz")
-        describe(DescribeJob(parts[-1], CAMERA, files[-1]))
+        describe(parts[-1], CAMERA, files[-1])
         T = torch.from_numpy(PartViews.load(files[-1]).T_cw)
         T[:, :3, 3] += torch.from_numpy(rng.normal(0, 0.003, 3)) * (n > 0)
         placements[n] = Placement(T, torch.ones(len(T)))
@@ -119,7 +119,7 @@ def test_a_part_that_matches_nothing_stays(placed, tmp_path):
     parts, files, placements, gauge, config = placed
     lone = Part("lone", make_part(tmp_path / "lone", np.array([0.7, 0.8]), 0))
     views = tmp_path / "lone.npz"
-    describe(DescribeJob(lone, CAMERA, views))
+    describe(lone, CAMERA, views)
     T = torch.from_numpy(PartViews.load(views).T_cw)[:1]
     T[:, :3, 3] += 50.0
     parts, files = [*parts[:2], lone], [*files[:2], views]

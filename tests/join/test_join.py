@@ -12,8 +12,8 @@ from geogs.config import Config
 from geogs.errors import InputError
 from geogs_fleet.join.join import join_parts
 from geogs_fleet.join.part import Part
-from geogs_fleet.join.workers import OneProcess
 from joined_parts import HALF, make_part, true_frames
+from one_process import OneProcess
 
 PLACES = [np.linspace(-0.8, 0.1, 6), np.linspace(-0.2, 0.8, 6)]
 

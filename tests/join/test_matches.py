@@ -12,8 +12,8 @@ from geogs.tracking.row_errors import RowErrors
 from geogs.types import SeenRows
 from geogs.world.edges import position_step
 from geogs.world.grid import SampleGrid
-from geogs_fleet.join.matches import Matches, MatchJob, Member, match
-from geogs_fleet.join.part import DescribeJob, Part, PartViews, describe
+from geogs_fleet.join.matches import Matches, Member, match
+from geogs_fleet.join.part import Part, PartViews, describe
 from joined_parts import CAMERA, FRAMES, gauge, make_part
 
 GRID, CONFIG = SampleGrid(CAMERA), Config()
@@ -36,14 +36,14 @@ def matched(folder, number: int, with_rows: bool) -> tuple[Member, Matches]:
     if with_rows:
         write_rows(rows_path(folder), dict.fromkeys(range(len(PLACES)), rows()))
     views = folder / "views.npz"
-    describe(DescribeJob(part, CAMERA, views))
+    describe(part, CAMERA, views)
     S = gauge(number)
     T = torch.from_numpy(PartViews.load(views).T_cw) @ S
     scale = sim3_scale(T)
     T_cw = T / scale[:, None, None]
     T_cw[:, 3] = T[:, 3]
     member, file = Member(number, part, views, T_cw, scale), folder / "matches.npz"
-    done = match(MatchJob(member, (), CAMERA, CONFIG, (), (file,)))
+    done = match(member, (), CAMERA, CONFIG, (), (file,))
     found = Matches.load(file)
     assert done.fresh == len(found.ends) // 2 > 5
     return member, found

@@ -1,5 +1,5 @@
 """One place from several results: places recognised, one Sim(3) graph, one map, one surface.
 
-Nothing here knows Ray: what can be done side by side is a function of a job that can be pickled,
-and :class:`geogs_fleet.join.workers.Workers` says where it is done.
+Nothing here knows Ray: what can be done concurrently is a function of values that can be pickled,
+and :class:`geogs_fleet.workers.Workers` says where it is called.
 """

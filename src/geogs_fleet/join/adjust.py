@@ -31,9 +31,9 @@ from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import KeyframeTable
 from geogs_fleet.join.gauge import Gauge
 from geogs_fleet.join.graph import Placement
-from geogs_fleet.join.matches import Depths, Directed, Matches, MatchJob, Member, match
+from geogs_fleet.join.matches import Depths, Directed, Matches, Member, match
 from geogs_fleet.join.part import Node, Part
-from geogs_fleet.join.workers import Workers
+from geogs_fleet.workers import Workers
 
 _NO_IMAGE = np.zeros((1, 1, 3), np.uint8)
 """Of a keyframe whose matches are known."""
@@ -128,9 +128,7 @@ class _Adjustment:
             paths = {(n, m): self._new(f"matches-{n}-{m}") for m in (n, *later)}
             before = tuple(self.matches[key] for key in paths if key in self.matches)
             others = tuple(self.members[m] for m in later)
-            jobs.append(
-                MatchJob(own, others, self.camera, self.config, before, tuple(paths.values()))
-            )
+            jobs.append((own, others, self.camera, self.config, before, tuple(paths.values())))
             written.append(paths)
         found = self.workers.map("matching", match, jobs)
         for path in self.matches.values():
@@ -183,7 +181,7 @@ class _Adjustment:
                 )
             )  # fmt: skip
         self.steps += step is not None
-        said = self.workers.map(f"adjusting, {self.steps} steps", follow, jobs)
+        said = self.workers.map(f"adjusting, {self.steps} steps", follow, [(job,) for job in jobs])
         for job in jobs:
             if job.own.adjusted is not None:
                 job.own.adjusted.unlink()

@@ -1,7 +1,6 @@
 """The disks of a part, moved to the joint world; and those that another part has already."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -28,36 +27,18 @@ _ALIKE = 0.8
 """Cosine between the normals of two disks of one surface, at least."""
 
 
-@dataclass(frozen=True)
-class MoveJob:
-    """The map of a part to be moved with its keyframes."""
-
-    part: Part
-    views: Path
-    placement: Placement
-    file: Path
-    """Where the moved disks go."""
-    device: str = "cpu"
-
-
-@dataclass(frozen=True)
-class MergeJob:
-    """The disks of a part to be thinned where others have them, too."""
-
-    own: Path
-    """File of its disks."""
-    before: tuple[Path, ...]
-    """Those of the parts whose disks stay."""
-
-
 @on_one_torch_thread
-def move_disks(job: MoveJob) -> int:
+def move_disks(
+    part: Part, views_file: Path, placement: Placement, after: Path, device: str = "cpu"
+) -> int:
     """Move every disk of a part with the keyframes that see it in place; their number.
+
+    The moved disks go to the file ``after``.
 
     The update of a map after a correction, see :mod:`geogs.mapping.similarity_field`.
     """
-    result, views = opened(job.part, job.device), PartViews.load(job.views)
-    similarities = job.placement.similarities(views.T_cw)
+    result, views = opened(part, device), PartViews.load(views_file)
+    similarities = placement.similarities(views.T_cw)
     x = result.disks.position.double()
     whole = overall(views, similarities).to(x)
 
@@ -70,7 +51,7 @@ def move_disks(job: MoveJob) -> int:
     S = whole.expand(len(x), 4, 4)
     if len(x) > 1:
         S = blended_similarities(x, S, whole, similarities, witnesses())
-    save_map(job.file, transformed(result.disks, S), {})
+    save_map(after, transformed(result.disks, S), {})
     return len(x)
 
 
@@ -100,11 +81,11 @@ def transformed(disks: MapSnapshot, S: Float[Tensor, "n 4 4"]) -> MapSnapshot:
 
 
 @on_one_torch_thread
-def merge_disks(job: MergeJob) -> Bool[Tensor, "n"]:
-    """Which disks of a part no disk of the parts before stands for."""
-    own = load_map_file(job.own, "cpu").disks
+def merge_disks(file: Path, before: Sequence[Path]) -> Bool[Tensor, "n"]:
+    """Which disks of a part no disk of the parts ``before`` stands for; all by their files."""
+    own = load_map_file(file, "cpu").disks
     keep = torch.ones(len(own), dtype=torch.bool)
-    for path in job.before:
+    for path in before:
         keep &= ~is_covered(own, load_map_file(path, "cpu").disks)
     return keep
 

@@ -25,7 +25,7 @@ from geogs.mesh.types import Mesh
 from geogs.types import MapSnapshot
 from geogs.version import __version__
 from geogs_fleet.join.adjust import adjusted
-from geogs_fleet.join.disks import MergeJob, MoveJob, joined_disks, kept, merge_disks, move_disks
+from geogs_fleet.join.disks import joined_disks, kept, merge_disks, move_disks
 from geogs_fleet.join.files import (
     JoinedPart,
     fingerprint,
@@ -35,13 +35,12 @@ from geogs_fleet.join.files import (
 )
 from geogs_fleet.join.gauge import Gauge, common_gauge
 from geogs_fleet.join.graph import Placement, placed
-from geogs_fleet.join.links import Link, LinkJob, links_of
-from geogs_fleet.join.part import DescribeJob, Part, PartViews, describe, opened
-from geogs_fleet.join.places import candidates
-from geogs_fleet.join.stored_views import RenderJob, render_views, shares
+from geogs_fleet.join.links import Link, candidates, links_of
+from geogs_fleet.join.part import Part, PartViews, describe, opened
+from geogs_fleet.join.stored_views import render_views, shares
 from geogs_fleet.join.surface import SpacePlan, coloured, joint_mesh, plan_space
 from geogs_fleet.join.trajectory import spans_of
-from geogs_fleet.join.workers import Workers
+from geogs_fleet.workers import Workers
 
 _PAIRS = 24
 """Pairs of keyframes that are verified in one go."""
@@ -87,12 +86,10 @@ class _Join:
         jobs, views = [], map(PartViews.load, self.files)  # one at a time
         for (a, b), pairs in candidates(views, self.config.loop).items():
             for start in range(0, len(pairs), _PAIRS):
-                jobs.append(
-                    LinkJob(
-                        (a, b), (self.parts[a], self.parts[b]), (self.files[a], self.files[b]),
-                        tuple(pairs[start : start + _PAIRS]), self.camera, self.config,
-                    )
-                )  # fmt: skip
+                jobs.append((
+                    (a, b), (self.parts[a], self.parts[b]), (self.files[a], self.files[b]),
+                    pairs[start : start + _PAIRS], self.camera, self.config,
+                ))  # fmt: skip
         return [link for some in self.workers.map("verifying", links_of, jobs) for link in some]
 
     def disks(self, gauge: Gauge, placements: dict[int, Placement]) -> MapSnapshot:
@@ -100,14 +97,12 @@ class _Join:
         numbers = gauge.parts
         files = {n: self.work / f"disks-{n:04d}.safetensors" for n in numbers}
         moves = [
-            MoveJob(self.parts[n], self.files[n], placements[n], files[n], self.device)
-            for n in numbers
+            (self.parts[n], self.files[n], placements[n], files[n], self.device) for n in numbers
         ]
         self.workers.map("moving maps", move_disks, moves)
         beside = {tuple(sorted((k.first[0], k.second[0]))) for k in gauge.links}
         merges = [
-            MergeJob(files[n], tuple(files[m] for m in numbers if m < n and (m, n) in beside))
-            for n in numbers
+            (files[n], [files[m] for m in numbers if m < n and (m, n) in beside]) for n in numbers
         ]
         keep = self.workers.map("merging maps", merge_disks, merges)
         return joined_disks(
@@ -122,7 +117,7 @@ class _Join:
         folder = self.work / "renders"
         folder.mkdir(parents=True, exist_ok=True)
         runs = shares(count, _SHARES * self.workers.at_once)
-        renders = [RenderJob(self.output, run, folder, self.device) for run in runs]
+        renders = [(self.output, run, folder, self.device) for run in runs]
         views = [v for some in self.workers.map("rendering", render_views, renders) for v in some]
         try:
             space = plan_space(views, self.config.mesh, self.workers)
@@ -187,7 +182,7 @@ def _joined(join: _Join, adjust: bool, say: Callable[[str], None], begin: float)
     parts, config = join.parts, join.config
     with join.timed("describing"):
         described = [
-            DescribeJob(part, join.camera, file, join.device)
+            (part, join.camera, file, join.device)
             for part, file in zip(parts, join.files, strict=True)
         ]
         keyframes = sum(join.workers.map("describing", describe, described))

@@ -1,6 +1,7 @@
-"""Keyframes of two parts that show one place, verified: what loops are within a run."""
+"""Keyframes of two parts that show one place, found by appearance and verified: loops of a run."""
 
-from collections.abc import Iterable
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -9,10 +10,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from geogs.application.results.saved_result import SavedResult
-from geogs.config import Config
+from geogs.config import Config, LoopConfig
 from geogs.geometry.camera import Camera
 from geogs.loop.constraints import of_loop
 from geogs.loop.dense import dense_check
+from geogs.loop.retrieval import AppearanceIndex
+from geogs.loop.search import MIN_SCORE, SUPPRESSION
 from geogs.loop.verification import DepthView, TwoViewVerifier
 from geogs.threads import on_one_torch_thread
 from geogs.tracking.flow.base import FlowOperator
@@ -22,19 +25,8 @@ from geogs.world.keyframes import Keyframe, KeyframeSet, KeyframeTable
 from geogs.world.loops import Loop, RelativePoses
 from geogs_fleet.join.part import Node, Part, PartViews, image_of, opened
 
-
-@dataclass(frozen=True)
-class LinkJob:
-    """Pairs of keyframes of two parts to be verified."""
-
-    numbers: tuple[int, int]
-    """Of the parts."""
-    parts: tuple[Part, Part]
-    views: tuple[Path, Path]
-    """Files of their views."""
-    pairs: tuple[tuple[int, int], ...]
-    camera: Camera
-    config: Config
+Candidates = dict[tuple[int, int], list[tuple[int, int]]]
+"""By the numbers of two parts, the earlier first: places of keyframes in the one and the other."""
 
 
 @dataclass(frozen=True)
@@ -51,27 +43,59 @@ class Link:
     """The same with information, between 0 (the first) and 1, in both directions."""
 
 
+def candidates(parts: Iterable[PartViews], config: LoopConfig) -> Candidates:
+    """Pairs of keyframes of different parts that look alike, most alike first.
+
+    Each keyframe is compared with those of all parts before its own. Of a pair of parts, a pair of
+    keyframes rules out others whose ends together lie within ``SUPPRESSION`` keyframes of its own.
+    Parts are looked at one at a time; what stays in memory is the index.
+    """
+    index = AppearanceIndex()
+    names: list[tuple[int, int]] = []
+    found: dict[tuple[int, int], list[tuple[float, int, int]]] = defaultdict(list)
+    for number, part in enumerate(parts):
+        for place, features in enumerate(part.features if number else ()):
+            for alike in index.query(features, (), config.appearance):
+                if alike.score >= MIN_SCORE:
+                    other, theirs = names[alike.keyframe]
+                    found[other, number].append((alike.score, theirs, place))
+        for place, features in enumerate(part.features):
+            index.add(len(names), features)
+            names.append((number, place))
+    return {pair: _thinned(scored, SUPPRESSION) for pair, scored in sorted(found.items())}
+
+
 @on_one_torch_thread
-def links_of(job: LinkJob) -> list[Link]:
-    """The pairs that are links: by features with depth, then by dense flow."""
-    grid = SampleGrid(job.camera)
-    verifier = TwoViewVerifier(job.camera)
-    views = [PartViews.load(path) for path in job.views]
+def links_of(
+    numbers: tuple[int, int],
+    parts: tuple[Part, Part],
+    files: tuple[Path, Path],
+    pairs: Sequence[tuple[int, int]],
+    camera: Camera,
+    config: Config,
+) -> list[Link]:
+    """Pairs of keyframes of two parts that are links: by features with depth, then by dense flow.
+
+    ``numbers`` are the parts' own, ``files`` those of their views; ``pairs`` are places in them.
+    """
+    grid = SampleGrid(camera)
+    verifier = TwoViewVerifier(camera)
+    views = [PartViews.load(path) for path in files]
     wanted: list[tuple[int, int, Tensor, float, int]] = []
-    for a, b in job.pairs:
+    for a, b in pairs:
         one, other = (_seen(grid, v, n) for v, n in zip(views, (a, b), strict=True))
         view = verifier.verify(one, other)
         if view.accepted and view.is_metric and view.T_ji is not None:
             wanted.append((a, b, view.T_ji, view.scale or 1.0, view.inliers))
     if not wanted:
         return []
-    operator = build_operator(job.config.tracking, grid)
+    operator = build_operator(config.tracking, grid)
     store = KeyframeTable.on(grid, operator.encode)
     segments = store.new_set(), store.new_set()
     places = sorted({w[0] for w in wanted}), sorted({w[1] for w in wanted})
     loaded = [
         loaded_keyframes(segment, operator, opened(part), v, some)
-        for segment, part, v, some in zip(segments, job.parts, views, places, strict=True)
+        for segment, part, v, some in zip(segments, parts, views, places, strict=True)
     ]
     found = []
     for a, b, T_ji, scale, inliers in wanted:
@@ -85,7 +109,7 @@ def links_of(job: LinkJob) -> list[Link]:
         )  # fmt: skip
         relative = _between(of_loop(store, loop), first.id)
         if len(relative):
-            nodes = (job.numbers[0], a), (job.numbers[1], b)
+            nodes = (numbers[0], a), (numbers[1], b)
             found.append(Link(*nodes, loop.S_ji.cpu(), check.matched, relative))
     return found
 
@@ -127,3 +151,11 @@ def _between(relative: RelativePoses, first: int) -> RelativePoses:
     """Between 0 and 1 in place of two ids."""
     source, target = ((end != first).long() for end in (relative.source, relative.target))
     return replace(relative, source=source, target=target)
+
+
+def _thinned(scored: list[tuple[float, int, int]], reach: int) -> list[tuple[int, int]]:
+    kept: list[tuple[int, int]] = []
+    for _, a, b in sorted(scored, key=lambda s: (-s[0], s[1], s[2])):
+        if all(abs(a - c) + abs(b - d) > reach for c, d in kept):
+            kept.append((a, b))
+    return kept

@@ -151,21 +151,6 @@ class Matches:
 
 
 @dataclass(frozen=True)
-class MatchJob:
-    """A part whose keyframes are to be matched with each other and with those of other parts."""
-
-    own: Member
-    others: tuple[Member, ...]
-    """Linked to it, of higher numbers: with the lower ones it is theirs to do."""
-    camera: Camera
-    config: Config
-    before: tuple[Path, ...]
-    """Files of what was matched before; only what has moved since is matched again."""
-    after: tuple[Path, ...]
-    """Files to write: edges that leave its own keyframes, then those that leave each other part."""
-
-
-@dataclass(frozen=True)
 class Matched:
     """What came of it."""
 
@@ -176,28 +161,44 @@ class Matched:
 
 
 @on_one_torch_thread
-def match(job: MatchJob) -> Matched:
-    """Match pairs that are near in what they show, in both directions, and write the files."""
-    grid, members = SampleGrid(job.camera), (job.own, *job.others)
-    operator = build_operator(job.config.tracking, grid)
+def match(
+    own: Member,
+    others: tuple[Member, ...],
+    camera: Camera,
+    config: Config,
+    before: Sequence[Path],
+    after: Sequence[Path],
+) -> Matched:
+    """Match pairs that are near in what they show, in both directions, and write the files.
+
+    Args:
+        own: a part whose keyframes are matched with each other and with those of others.
+        others: linked to it, of higher numbers: with the lower ones it is theirs to do.
+        camera: by which all keyframes are seen.
+        config: how they are matched.
+        before: files of what was matched before; only what has moved since is matched again.
+        after: files to write: edges that leave its own keyframes, then those of each other part.
+    """
+    grid, members = SampleGrid(camera), (own, *others)
+    operator = build_operator(config.tracking, grid)
     segment = KeyframeTable.on(grid, operator.encode).new_set()
-    before: dict[Directed, PackedEdge] = {}
-    for path in job.before:
-        before |= Matches.load(path).edges(as_found=True)
-    seen = {node for ends in before for node in ends} if before else _near(job.own, job.others)
+    known: dict[Directed, PackedEdge] = {}
+    for path in before:
+        known |= Matches.load(path).edges(as_found=True)
+    seen = {node for ends in known for node in ends} if known else _near(own, others)
     ids: dict[Node, int] = {}
     results = {member.number: opened(member.part) for member in members}
     for member in members:
-        places = [k for n, k in member.nodes if member is job.own or (n, k) in seen]
+        places = [k for n, k in member.nodes if member is own or (n, k) in seen]
         views, depths = PartViews.load(member.views), member.depths()
         result = results[member.number]
         loaded = loaded_keyframes(segment, operator, result, views, places, member.T_cw)
         for place, keyframe in loaded.items():
             depths.give(keyframe, place)
             ids[member.number, place] = keyframe.id
-    graph, c = FrameGraph(segment, operator), job.config.tracking
-    graph.edges.update({(ids[a], ids[b]): edge for (a, b), edge in before.items()})
-    pairs = graph.pairs if before else _pairs(graph, len(job.own.T_cw), c)
+    graph, c = FrameGraph(segment, operator), config.tracking
+    graph.edges.update({(ids[a], ids[b]): edge for (a, b), edge in known.items()})
+    pairs = graph.pairs if known else _pairs(graph, len(own.T_cw), c)
     stale = sorted(graph.stale(pairs, c.global_remeasure))
     for start in range(0, len(stale), MATCHED_TOGETHER[0]):
         graph.measure(stale[start : start + MATCHED_TOGETHER[0]], packed=True)
@@ -213,9 +214,9 @@ def match(job: MatchJob) -> Matched:
             steps = in_steps(grid.camera, off)
             shift |= {(node[i], node[j]): s for (i, j), s in zip(part, steps, strict=True)}
     ends = []
-    for member, path in zip(members, job.after, strict=True):
-        own = {pair: e for pair, e in found.items() if pair[0][0] == member.number}
-        leaving = Matches.of(own, shift, grid.size)
+    for member, path in zip(members, after, strict=True):
+        its = {pair: e for pair, e in found.items() if pair[0][0] == member.number}
+        leaving = Matches.of(its, shift, grid.size)
         leaving.save(path)
         ends.append(leaving.ends)
     return Matched(np.concatenate(ends), len(stale))

@@ -82,29 +82,18 @@ class PartViews:
             )  # fmt: skip
 
 
-@dataclass(frozen=True)
-class DescribeJob:
-    """A part to be described."""
-
-    part: Part
-    camera: Camera
-    """That all parts are seen by, of the images."""
-    file: Path
-    """Where the views go."""
-    device: str = "cpu"
-
-
 @on_one_torch_thread
-def describe(job: DescribeJob) -> int:
+def describe(part: Part, camera: Camera, file: Path, device: str = "cpu") -> int:
     """Find the features of a part's keyframes, render their depths, and write both to a file.
 
-    Returns the number of keyframes. Raises InputError if the result has no images, or is damaged.
+    Everything is seen by ``camera``, which is common to all parts. Returns the number of keyframes.
+    Raises InputError if the result has no images, or is damaged.
     """
-    result = opened(job.part, job.device)
-    grid, extract = SampleGrid(job.camera), FeatureExtractor()
+    result = opened(part, device)
+    grid, extract = SampleGrid(camera), FeatureExtractor()
     depths, known, features = [], [], []
     for number, T_cw in enumerate(torch.from_numpy(result.views.T_cw)):
-        features.append(extract(image_of(result, number, job.camera)))
+        features.append(extract(image_of(result, number, camera)))
         inverse, information = _on_grid(result, T_cw, grid)
         depths.append(inverse)
         known.append(information)
@@ -112,7 +101,7 @@ def describe(job: DescribeJob) -> int:
         result.views.T_cw, result.views.timestamp, np.stack(depths), np.stack(known),
         tuple(features),
     )  # fmt: skip
-    views.save(job.file)
+    views.save(file)
     return len(depths)
 
 

@@ -44,28 +44,18 @@ def loaded(views: Sequence[StoredView], with_images: bool = False) -> Sequence[D
     return OnDemand(views, lambda view: view.load(with_images))
 
 
-@dataclass(frozen=True)
-class RenderJob:
-    """Keyframes of a written result to be rendered."""
-
-    result: Path
-    places: tuple[int, ...]
-    """Of the keyframes among all."""
-    folder: Path
-    """Where the depth maps go."""
-    device: str = "cpu"
-
-
-def render_views(job: RenderJob) -> list[StoredView]:
-    """Render some keyframes into files."""
-    result, made = load_result(job.result, job.device), []
-    for n in job.places:
+def render_views(
+    written: Path, places: Sequence[int], folder: Path, device: str = "cpu"
+) -> list[StoredView]:
+    """Render some keyframes of a written result into files of a folder."""
+    result, made = load_result(written, device), []
+    for n in places:
         T_cw = result.views.T_cw[n]
         maps = result.render(torch.from_numpy(T_cw))
-        file = job.folder / f"{n:06d}.npz"
+        file = folder / f"{n:06d}.npz"
         # 0, a half and 1 are the same in half precision.
         np.savez(file, depth=maps.depth.cpu().numpy(), weight=maps.weight.cpu().half().numpy())
-        image = image_path(job.result, int(result.views.keyframe_id[n]))
+        image = image_path(written, int(result.views.keyframe_id[n]))
         made.append(StoredView(file, image, result.depth_camera, T_cw))
     return made
 

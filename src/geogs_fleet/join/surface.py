@@ -23,58 +23,35 @@ from geogs.mesh.extract import VolumePlan, plan_volume
 from geogs.mesh.tsdf import BYTES_PER_BLOCK, BlockBox
 from geogs.mesh.types import Mesh
 from geogs_fleet.join.stored_views import StoredView, loaded, shares
-from geogs_fleet.join.workers import Workers
+from geogs_fleet.workers import Workers
 
 _TURNS = 3
 """Boxes for each worker, at least, so that none waits long for the last."""
 _NO_FACES = np.zeros((0, 3), np.int32)
 
 
-@dataclass(frozen=True)
-class OccupyJob:
-    """Views of which it is asked where their surface lies."""
-
-    views: tuple[StoredView, ...]
-    plan: VolumePlan
-
-
-@dataclass(frozen=True)
-class BoxJob:
-    """A box of space whose surface is to be made."""
-
-    views: tuple[StoredView, ...]
-    """That may change it, in their order among all."""
-    plan: VolumePlan
-    box: BlockBox
-    min_weight: float
-    device: str
-
-
-@dataclass(frozen=True)
-class ColourJob:
-    """Points that are to have the colour of what the images show there."""
-
-    views: tuple[StoredView, ...]
-    points: Float[np.ndarray, "n 3"]
-    normals: Float[np.ndarray, "n 3"]
-    tolerance: float
-
-
-def occupied(job: OccupyJob) -> Int[np.ndarray, "k 3"]:
+def occupied(views: Sequence[StoredView], plan: VolumePlan) -> Int[np.ndarray, "k 3"]:
     """Coordinates of the blocks that have surface."""
-    found = [blocks_of(view, job.plan) for view in loaded(job.views)]
+    found = [blocks_of(view, plan) for view in loaded(views)]
     return torch.unique(torch.cat(found), dim=0).cpu().numpy()
 
 
-def box_surface(job: BoxJob) -> MeshBlock:
-    """The surface of a box of space."""
-    return mesh_block(loaded(job.views), job.plan, job.box, job.min_weight, job.device)
+def box_surface(
+    views: Sequence[StoredView], plan: VolumePlan, box: BlockBox, min_weight: float, device: str
+) -> MeshBlock:
+    """The surface of a box of space, from the views that may change it, in their order."""
+    return mesh_block(loaded(views), plan, box, min_weight, device)
 
 
-def colours_of(job: ColourJob) -> UInt8[np.ndarray, "n 3"]:
-    """Colours of some points."""
-    mesh = Mesh(job.points.copy(), _NO_FACES, job.normals.copy())  # what Ray brings is read-only
-    colours = colour_mesh(mesh, loaded(job.views, True), job.tolerance).colours
+def colours_of(
+    views: Sequence[StoredView],
+    points: Float[np.ndarray, "n 3"],
+    normals: Float[np.ndarray, "n 3"],
+    tolerance: float,
+) -> UInt8[np.ndarray, "n 3"]:
+    """Colours of points: what the images show there."""
+    mesh = Mesh(points.copy(), _NO_FACES, normals.copy())  # what Ray brings is read-only
+    colours = colour_mesh(mesh, loaded(views, True), tolerance).colours
     assert colours is not None
     return colours
 
@@ -97,7 +74,7 @@ def plan_space(views: Sequence[StoredView], config: MeshConfig, workers: Workers
     """
     volume = plan_volume(loaded(views), config)
     jobs = [
-        OccupyJob(tuple(views[n] for n in share), volume)
+        (tuple(views[n] for n in share), volume)
         for share in shares(len(views), _TURNS * workers.at_once)
     ]
     found = np.concatenate(workers.map("looking for surface", occupied, jobs))
@@ -120,7 +97,7 @@ def joint_mesh(space: SpacePlan, config: MeshConfig, workers: Workers, device: s
         InputError: there is no surface.
     """
     jobs = [
-        BoxJob(views, space.volume, box, config.min_weight, device)
+        (views, space.volume, box, config.min_weight, device)
         for box, views in zip(space.boxes, space.views, strict=True)
     ]
     blocks = workers.map("meshing", box_surface, jobs)
@@ -140,8 +117,7 @@ def coloured(
     inside = [np.flatnonzero(near(mesh, box, space.volume)) for box in space.boxes]
     some = [n for n, at in enumerate(inside) if len(at)]
     jobs = [
-        ColourJob(space.views[n], mesh.vertices[inside[n]], mesh.normals[inside[n]], tolerance)
-        for n in some
+        (space.views[n], mesh.vertices[inside[n]], mesh.normals[inside[n]], tolerance) for n in some
     ]
     for n, made in zip(some, workers.map("colouring", colours_of, jobs), strict=True):
         colours[inside[n]] = made
