@@ -21,6 +21,7 @@ from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp
 from geogs.losses import PhotoView, ViewConstants, multi_view_loss, single_view_loss
 from geogs.losses.cuda import ViewTable, WindowLosses
+from geogs.losses.single_view import MIN_ALPHA
 
 RENDER = Camera(308.0, 308.0, 307.5, 171.5, 616, 344)
 PHOTO = RENDER.resized(1232, 688)
@@ -75,7 +76,7 @@ class Window:
             view, photo = self.views[k], self.photos[k]
             normal = normal.permute(1, 2, 0)
             loss = single_view_loss(depth, normal, alpha, spread, view, config, UNIT)
-            shown = torch.where(alpha.detach() > config.min_alpha, depth, 0.0)
+            shown = torch.where(alpha.detach() > MIN_ALPHA, depth, 0.0)
             for i in self.partners[k]:
                 pair = multi_view_loss(shown, photo, self.photos[i], self.rendered[i], config)
                 loss = loss + pair / PARTNERS

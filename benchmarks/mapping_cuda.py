@@ -27,6 +27,7 @@ from geogs.depth.view import DenseDepth
 from geogs.geometry.depth import normals_from_depth
 from geogs.geometry.lie import se3_inverse
 from geogs.losses import multi_view_loss, single_view_loss
+from geogs.losses.single_view import MIN_ALPHA
 from geogs.mapping.cameras import MapCameras
 from geogs.mapping.training.base import Batch
 from geogs.mapping.training.cuda.trainer import CudaTrainer
@@ -185,7 +186,7 @@ class Plain:
     def _loss(self) -> Tensor:
         window, config = self.window, self.config
         out = render_views(self.disks, window.cameras.render, self.poses, "cuda")
-        shown = torch.where(out.alpha.detach() > config.min_alpha, out.depth, 0.0)
+        shown = torch.where(out.alpha.detach() > MIN_ALPHA, out.depth, 0.0)
         losses = []
         for k, (view, partners) in enumerate(window.batch):
             losses.append(

@@ -57,6 +57,13 @@ def _silent(stage: str, fraction: float) -> None:
 _TELLING_STEPS = 100
 
 
+OUTPUT_RATIO = 0.2
+"""Fraction of a given time that is kept for the mesh and the report until a few views have shown
+what these take."""
+RANGE_MARGIN = 1.3
+"""Factor by which searched depths go beyond those that are known, which are not all."""
+
+
 @dataclass(frozen=True, eq=False)
 class ReconstructionState:
     """The work of a reconstruction after its depths, to go on from later."""
@@ -103,7 +110,7 @@ class Reconstruction:
         self._random = np.random.default_rng(self.config.seed)
         self._begin: float | None = None
         self._deadline = None if budget is None else time.perf_counter() + budget
-        self.output_cost = OutputCost(self.config.search.output_share * (budget or 0.0), 0.0)
+        self.output_cost = OutputCost(OUTPUT_RATIO * (budget or 0.0), 0.0)
         """What comes after the training: a part of the budget until somebody knows better."""
 
     @property
@@ -319,7 +326,7 @@ class Reconstruction:
         Of fewer images where time is short, evenly spread.
         """
         search, mapper = self.config.search, self.mapper
-        known.expect_depths(mapper.views.values(), points, self.camera, search.margin)
+        known.expect_depths(mapper.views.values(), points, self.camera, RANGE_MARGIN)
         share = 0.5 if search.repeat else 1.0
 
         def report(fraction: float) -> None:
@@ -330,11 +337,11 @@ class Reconstruction:
             more(lambda: self._further_views(searched, seconds))
             self._place_keyframes()
             new = [v for v in mapper.views.values() if v.search is None]
-            known.expect_depths(new, points, self.camera, search.margin)
+            known.expect_depths(new, points, self.camera, RANGE_MARGIN)
         ids = [*mapper.views] if self._all is not None else spread_order(mapper.keyframe_ids)
         wanted = self._wanted or len(ids)
         start, end, before = time.perf_counter(), self._end, len(mapper.mapped)
-        until = None if end is None else start + search.depth_share * (end - start)
+        until = None if end is None else start + search.depth_ratio * (end - start)
         if until is not None:  # each that is searched beyond those is paid for in the mesh, too
             until -= self.output_cost.a_view * group_size()
         order = [i for i in ids if not mapper.views[i].has_depth]
@@ -348,7 +355,7 @@ class Reconstruction:
             mapper.check_depths()
             sure = known.dense_points(views, mapper.cameras.render, self._random)
             if len(sure) >= known.FEWEST_POINTS:
-                known.expect_depths(views, sure, self.camera, search.margin)
+                known.expect_depths(views, sure, self.camera, RANGE_MARGIN)
             search_depths(mapper, mapper.mapped, lambda f: report(share + share * f))
         self._wanted = self.with_depth
         report(1.0)

@@ -29,7 +29,6 @@ CASES = {
     "--loop.matches --loop.no-enabled": "loop.matches does nothing",
     "--mapping.depth.engine classical --mapping.depth.weights x": "the engine classical has none",
     "--mapping.disk.no-carve --mapping.disk.carve-every 3": "mapping.disk.carve-every does",
-    "--mapping.loss.smoothness-eta 3": "mapping.loss.smoothness-eta does nothing",
     "--mapping.loss.ablation.smoothness-rewards-edges": "rewards-edges does nothing",
     "--mapping.loss.occlusion-share 0.1 --mapping.loss.occlusion 1": "mapping.loss.occlusion does",
     "--mapping.loss.colour --mapping.loss.l1-weight 0": "mapping.loss.colour does nothing",
@@ -49,6 +48,6 @@ def test_what_is_heeded_says_nothing() -> None:
     assert said("run", "--tracking.weights", "x.pth", "--tracking.operator", "droid") == []
     assert said("run", "--mapping.no-final-depth") == []
     assert said("run", "--mapping.final-iterations", "0") == []
-    eta = ["--mapping.loss.smoothness-eta", "3"]
-    assert said("run", "--mapping.loss.smoothness-weight", "1", *eta) == []
-    assert "smoothness-eta" in said("reconstruct", *eta)[0]
+    edges = ["--mapping.loss.ablation.smoothness-rewards-edges"]
+    assert said("run", "--mapping.loss.smoothness-weight", "1", *edges) == []
+    assert "rewards-edges" in said("reconstruct", *edges)[0]

@@ -19,6 +19,7 @@ from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp
 from geogs.losses import PhotoView, ViewConstants, multi_view_loss, single_view_loss
 from geogs.losses.cuda import ViewTable, WindowLosses, window
+from geogs.losses.single_view import MIN_ALPHA
 from loss_scenes import random_view
 
 UNIT, SHARE = 1.7, 0.5
@@ -100,7 +101,7 @@ class Scene:
         alpha[:, : h // 8] = 0.2
         places = torch.tensor([-1, 0, -1, 3], dtype=torch.int32, device=depth.device)
         losses.store_rendered(places, depth, alpha)
-        opaque = alpha > losses.config.min_alpha
+        opaque = alpha > MIN_ALPHA
         inside = torch.stack([v.prior_depth >= 0 for v in self.views])[[1, 0, 2, 3]]
         shown = torch.where(opaque & inside, depth, 0.0)
         self.rendered = [shown[1], None, None, shown[3]]
@@ -127,7 +128,7 @@ class Scene:
             loss = depth.new_zeros(())
             if slot >= 0:
                 loss = single_view_loss(*(m[i] for m in leaves), self.views[slot], config, UNIT)
-                opaque = alpha[i].detach() > config.min_alpha
+                opaque = alpha[i].detach() > MIN_ALPHA
                 inside = self.views[slot].prior_depth >= 0
                 shown = torch.where(opaque & inside, depth[i], 0.0)
                 for j, other in enumerate(self.pairs[i].tolist()):

@@ -18,7 +18,7 @@ from geogs.losses.multi_view import (
     sample_image,
     warp,
 )
-from geogs.losses.photometric import ssim
+from geogs.losses.photometric import MIN_COVERAGE, ssim
 
 CAMERA = Camera(50.0, 52.0, 23.3, 19.1, 48, 40)
 NORMAL, DISTANCE = torch.tensor([0.2, -0.1, -1.0]).double(), 2.0
@@ -167,7 +167,7 @@ def test_colour_is_compared_as_printed_and_correlation_in_grey() -> None:
     channels = [reference.colours.permute(1, 2, 0), target.colours.permute(1, 2, 0)]
     other = warp(channels[1], wrong, CAMERA, CAMERA, REFERENCE, TARGET).image
     l1 = (channels[0] - other).abs().mean(-1)[mask].sum()
-    structure, _ = ssim(channels[0], other, mask, config.ncc_min_coverage)
+    structure, _ = ssim(channels[0], other, mask, MIN_COVERAGE)
     grey = replace(config, l1_weight=0.0, ssim_weight=0.0, colour=False)
     expected = (0.8 * l1 + 0.2 * structure.sum()) / depth.numel()
     expected = expected + multi_view_loss(wrong, reference, target, seen, grey)

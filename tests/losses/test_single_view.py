@@ -8,6 +8,7 @@ import torch
 from geogs.config import LossAblation, LossConfig
 from geogs.geometry.camera import Camera
 from geogs.losses.single_view import (
+    MIN_ALPHA,
     ViewConstants,
     depth_l1,
     depth_smoothness,
@@ -123,7 +124,7 @@ def test_outside_a_mask_only_the_silhouette_counts() -> None:
 
 def test_gradients_match_finite_differences() -> None:
     maps, view = random_view(2)
-    seen = maps[0][(maps[2] > ALL_TERMS.min_alpha) & (view.prior_depth >= 0)]
+    seen = maps[0][(maps[2] > MIN_ALPHA) & (view.prior_depth >= 0)]
     median = maps[0] == seen.median()  # constant in the loss, so it must not be moved
     fixed = maps[0].clone()
     maps = [m.requires_grad_() for m in maps]

@@ -11,7 +11,7 @@ from geogs.mapping.time_shares import ViewCost, affordable_views, helpers, round
 @pytest.mark.parametrize("repeat", [True, False])
 @pytest.mark.parametrize("cost", [ViewCost(0.01, 0.05, 0.02), ViewCost(0.2, 1.5, 0.4)])
 def test_the_depths_of_so_many_images_take_their_part_of_what_mesh_and_files_leave(cost, repeat):
-    search = replace(SearchConfig(), repeat=repeat, depth_share=0.6)
+    search = replace(SearchConfig(), repeat=repeat, depth_ratio=0.6)
     views = affordable_views(60.0, cost, search)
     before = views * (cost.reading + rounds(search) * cost.search)
     left = 60.0 - views * cost.output
@@ -21,7 +21,7 @@ def test_the_depths_of_so_many_images_take_their_part_of_what_mesh_and_files_lea
 
 
 def test_what_has_been_done_is_not_paid_for_again():
-    search, cost = replace(SearchConfig(), depth_share=0.6), ViewCost(0.1, 0.5, 0.0)
+    search, cost = replace(SearchConfig(), depth_ratio=0.6), ViewCost(0.1, 0.5, 0.0)
     views = affordable_views(100.0, cost, search)
     spent = 20 * cost.reading + 8 * cost.search
     again = affordable_views(100.0 - spent, cost, search, searched=8, read=20)

@@ -6,6 +6,7 @@ import torch
 
 from geogs.config import MeshConfig
 from geogs.geometry.camera import Camera
+from geogs.mesh import clean
 from geogs.mesh.clean import keep_faces
 from geogs.mesh.extract import extract_mesh
 from geogs.mesh.free_space import FreeSpace
@@ -98,13 +99,16 @@ def test_what_is_free_is_asked_of_the_voxel_nearest_to_a_point():
 
 
 @pytest.mark.parametrize("looked_through", [False, True])
-def test_a_gap_in_the_depths_is_closed_unless_there_is_more_behind(looked_through):
+def test_a_gap_in_the_depths_is_closed_unless_there_is_more_behind(looked_through, monkeypatch):
     camera = Camera(60.0, 60.0, 31.5, 23.5, 64, 48)
     depth = torch.full((48, 64), 2.0)
     depth[20:23, 30:33] = 2.6 if looked_through else 0.0
     pose = torch.eye(4, dtype=torch.float64)
     views = [DepthMapView(depth, (depth > 0).float(), camera, pose) for _ in range(3)]
     few = {"voxel": 0.035, "detail": 0, "min_component_faces": 10, "colour": False}
-    as_it_was = extract_mesh(views, MeshConfig(**few, close_holes=0))
-    closed = extract_mesh(views, MeshConfig(**few, close_holes=24))
+    made = []
+    for edges in (0, 24):
+        monkeypatch.setattr(clean, "CLOSED_HOLES", edges)
+        made.append(extract_mesh(views, MeshConfig(**few)))
+    as_it_was, closed = made
     assert (open_edges(closed) == open_edges(as_it_was)) == looked_through

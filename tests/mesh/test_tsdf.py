@@ -10,7 +10,7 @@ from geogs.config import MeshConfig
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp
-from geogs.mesh import surface
+from geogs.mesh import clean, surface
 from geogs.mesh.clean import keep_components, remove_degenerate_faces
 from geogs.mesh.extract import extract_mesh, plan_volume
 from geogs.mesh.surface import extract_surface
@@ -249,13 +249,14 @@ def test_rigid_motion_of_all_views_moves_the_mesh():
     assert np.abs(radius - RADIUS).mean() < 0.0015
 
 
-def test_plan_follows_pixel_budget_and_memory():
+def test_plan_follows_pixel_budget_and_memory(monkeypatch):
+    monkeypatch.setattr(clean, "CLOSED_HOLES", 0)
     views = sphere_views(6)
     plan = plan_volume(views, MeshConfig())
     assert plan.voxel == pytest.approx(1.2 / 120, rel=0.15)  # one pixel at about 1.2 m
     assert plan.max_depth == pytest.approx(2 * 1.4, rel=0.1)
     small = plan_volume(views, MeshConfig(triangle_budget=2000))
-    config = MeshConfig(triangle_budget=2000, min_weight=1.0, detail=0, close_holes=0)
+    config = MeshConfig(triangle_budget=2000, min_weight=1.0, detail=0)
     faces = len(extract_mesh(views, config).faces)
     assert small.voxel > 2 * plan.voxel
     assert 1000 < faces < 2400

@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from geogs.config import DepthSensorConfig
+from geogs.priors import depth_sensor
 from geogs.priors.depth_sensor import sensor_depth
 
 CONFIG = DepthSensorConfig()
@@ -24,8 +25,9 @@ def test_deviations_are_those_of_the_formula(slope):
     assert (found.inverse_depth[4:-4, 4:-4] > 0).all()
 
 
-def test_depth_errs_with_its_square():
-    config = DepthSensorConfig(share=1e-9, lateral=0)
+def test_depth_errs_with_its_square(monkeypatch):
+    monkeypatch.setattr(depth_sensor, "LATERAL", 0.0)
+    config = DepthSensorConfig(ratio=1e-9)
     for z in (1.0, 2.0, 4.0):
         found = sensor_depth(np.full((9, 9), z, np.float32), config)
         assert found.deviation[4, 4] * z**2 == pytest.approx(0.0015 * z**2, rel=1e-5)

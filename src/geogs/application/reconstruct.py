@@ -35,6 +35,8 @@ from geogs.io.writers.atomic import prepare_output_folder
 from geogs.reconstruction import Reconstruction, ReconstructionState
 from geogs.threads import on_one_torch_thread
 
+FIRST_BATCH = 24
+"""Images read before it is known for how many the time lasts: what one costs is told by some."""
 LEAST_BUDGET = 1.0
 """Seconds that are left of a budget at least, when reading and checking have used it up."""
 
@@ -230,7 +232,7 @@ def _complete(
         if stage == "growing":
             scene.output_cost = forecast.settled(scene.seconds_left)
 
-    views.give(scene.config.search.first_batch)
+    views.give(FIRST_BATCH)
     scene.finish(points, reported, more)
 
 

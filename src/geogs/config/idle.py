@@ -78,14 +78,11 @@ def _mapping(mapping: MappingConfig) -> Iterator[str]:
 
 
 def _losses(loss: LossConfig) -> Iterator[str]:
-    if loss.smoothness_weight == 0:
-        if loss.smoothness_eta != LossConfig.smoothness_eta:
-            yield "mapping.loss.smoothness-eta does nothing: the loss's weight is 0."
-        if loss.ablation.smoothness_rewards_edges:
-            yield (
-                "mapping.loss.ablation.smoothness-rewards-edges does nothing: "
-                "mapping.loss.smoothness-weight is 0."
-            )
+    if loss.smoothness_weight == 0 and loss.ablation.smoothness_rewards_edges:
+        yield (
+            "mapping.loss.ablation.smoothness-rewards-edges does nothing: "
+            "mapping.loss.smoothness-weight is 0."
+        )
     if loss.occlusion_share > 0 and loss.occlusion != LossConfig.occlusion:
         yield "mapping.loss.occlusion does nothing beside mapping.loss.occlusion-share."
     if loss.colour and max(loss.l1_weight, loss.ssim_weight) == 0:

@@ -27,16 +27,10 @@ class SearchConfig(Settings, group="search"):
     most_views: Annotated[int, Range(2, 100_000), Basic()] = 400
     """Most images that make the map. Of more, and of as many as the time lasts for, those are read
     that see all of the scene from places apart; of near ones the sharper."""
-    first_batch: Annotated[int, Range(2, 100_000)] = 24
-    """Images read before it is known for how many the time lasts."""
-    depth_share: Annotated[float, Range(above=0, most=1)] = 0.25
-    """Most of the time up to then that reading and the depths may take; images for which it does
-    not last are not read, or get no depth and only serve to find those of the others."""
-    output_share: Annotated[float, Range(0, below=1)] = 0.2
-    """Part of a given time that is kept for the mesh and the report until a few views have shown
-    what these take."""
-    margin: Annotated[float, Range(1, 1000)] = 1.3
-    """Factor by which searched depths go beyond those that are known."""
+    depth_ratio: Annotated[float, Range(above=0, most=1)] = 0.25
+    """Largest fraction of the time up to then that reading and the depths may take; images for
+    which it does not last are not read, or get no depth and only serve to find those of the
+    others."""
     repeat: Annotated[bool, Basic()] = True
     """Search all depths a second time, between the limits that the first time has shown."""
 

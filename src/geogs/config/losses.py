@@ -41,10 +41,6 @@ class LossConfig(Settings, group="mapping.loss"):
     """alpha outside the masks, where there are masks."""
     smoothness_weight: Weight = 0.0
     """L_ds, edge-aware smoothness of depth over its median."""
-    smoothness_eta: Weight = 10.0
-    """Decay of smoothness with the image gradient (image in [0, 1])."""
-    min_alpha: Annotated[float, Range(0, below=1)] = 0.5
-    """Rendered depth and normals count where alpha exceeds this."""
     l1_weight: Weight = 4.0
     """L_1, difference between a view and its neighbour warped into it."""
     l1_huber: Share = 0.005
@@ -57,12 +53,8 @@ class LossConfig(Settings, group="mapping.loss"):
     """Side of the correlation window in pixels of the photometric image."""
     ncc_reject: Annotated[float, Range(above=0, most=2)] = 0.9
     """Windows with 1 - NCC of this or more are taken for occluded or changed."""
-    ncc_min_variance: Annotated[float, Range(1e-12, 1)] = 1e-8
-    """Windows of the reference with less grey variance have no texture to correlate."""
     ncc_texture: Share = 1e-6
     """A window of grey variance v weighs v / (v + this); 0 weighs all windows alike."""
-    ncc_min_coverage: Annotated[float, Range(above=0, most=1)] = 0.7
-    """Windows with a smaller valid share are left out."""
     ssim_weight: Weight = 0.0
     """L_ssim, 1 - structural similarity; slow on a CPU."""
     occlusion: Annotated[float, Range(above=0, most=1e6)] = 2.25

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Annotated
 
-from geogs.config.setting import Basic, CountOrZero, Positive, Range, Settings, Share
+from geogs.config.setting import Basic, CountOrZero, Positive, Range, Settings
 
 
 @dataclass(frozen=True)
@@ -12,12 +12,8 @@ class MeshConfig(Settings, group="mesh"):
 
     voxel: Annotated[Positive | None, Basic()] = None
     """Voxel size in map units; chosen from depth, budget and memory limit if none is given."""
-    voxel_per_pixel: Positive = 1.0
-    """Chosen voxel size in footprints of a depth map's pixel at the median depth."""
     truncation: Annotated[float, Range(2, 16)] = 4.0
     """Voxels in front of and behind a surface in which distances are averaged."""
-    max_depth: Positive | None = None
-    """Farther pixels are left out, map units; twice the 95 % quantile if none is given."""
     min_weight: Positive = 1.5
     """Sum of view weights that a voxel needs to count as seen; just behind a surface a view counts
     less than in front, so 1.5 asks for two sure views."""
@@ -31,12 +27,7 @@ class MeshConfig(Settings, group="mesh"):
     """Most memory for the volume in GiB."""
     min_component_faces: CountOrZero = 100
     """Connected parts with fewer faces are removed."""
-    min_component_fraction: Share = 0.001
-    """Parts with fewer faces than this fraction of the largest part's are removed."""
     max_components: Annotated[int | None, Range(1), Basic()] = None
     """Keep only so many of the largest parts; none keeps all (1 suits a single object)."""
-    close_holes: Annotated[int, Range(0, 1000)] = 8
-    """Holes with so many edges or fewer are closed, unless somebody looked through them; 0 closes
-    none."""
     colour: bool = True
     """Colour the vertices from the keyframe images."""

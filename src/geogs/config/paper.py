@@ -33,7 +33,6 @@ def paper_losses() -> LossConfig:
         ncc_weight=0.15,
         ncc_patch=7,
         ncc_reject=2.0,
-        ncc_min_variance=1e-8,
         ncc_texture=0.0,
         ssim_weight=0.2,
         occlusion_share=0.05,

@@ -15,7 +15,7 @@ from geogs.config import LossConfig
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_inverse
-from geogs.losses.photometric import ncc, robust_l1, ssim
+from geogs.losses.photometric import MIN_COVERAGE, NCC_MIN_VARIANCE, ncc, robust_l1, ssim
 
 # A point must keep this share of its depth in the target's frame; nearer ones project wildly.
 MIN_DEPTH_RATIO = 0.05
@@ -307,10 +307,10 @@ def photometric_loss(
         loss, _ = robust_l1(reference, warped, mask, c.l1_huber, c.l1_cut)
         total = total + c.l1_weight * loss.sum()
     if c.ssim_weight > 0:
-        loss, _ = ssim(reference, warped, mask, c.ncc_min_coverage)
+        loss, _ = ssim(reference, warped, mask, MIN_COVERAGE)
         total = total + c.ssim_weight * loss.sum()
     if c.ncc_weight > 0:
-        thresholds = c.ncc_reject, c.ncc_min_variance, c.ncc_texture, c.ncc_min_coverage
+        thresholds = c.ncc_reject, NCC_MIN_VARIANCE, c.ncc_texture, MIN_COVERAGE
         loss, _ = ncc(reference, warped, mask, c.ncc_patch, *thresholds)
         total = total + c.ncc_weight * loss.sum()
     return total / mask.numel()

@@ -10,8 +10,8 @@ import numpy as np
 from geogs.config import LossConfig
 from geogs.geometry.camera import Camera
 from geogs.losses.multi_view import MIN_DEPTH_RATIO, occlusion_tolerance
-from geogs.losses.photometric import NCC_VARIANCE_FLOOR
-from geogs.losses.single_view import NORMAL_EPSILON
+from geogs.losses.photometric import MIN_COVERAGE, NCC_MIN_VARIANCE, NCC_VARIANCE_FLOOR
+from geogs.losses.single_view import MIN_ALPHA, NORMAL_EPSILON, SMOOTHNESS_ETA
 
 
 class SingleViewSettings(NamedTuple):
@@ -73,10 +73,10 @@ def single_view_settings(config: LossConfig, camera: Camera, unit: float) -> Sin
         opacity=c.opacity_weight / pixels,
         smoothness=c.smoothness_weight / pixels,
         silhouette=c.silhouette_weight / pixels,
-        min_alpha=c.min_alpha,
+        min_alpha=MIN_ALPHA,
         relative=c.ablation.depth_relative,
         normal_epsilon=NORMAL_EPSILON,
-        eta=c.smoothness_eta,
+        eta=SMOOTHNESS_ETA,
         rewards_edges=c.ablation.smoothness_rewards_edges,
     )  # fmt: skip
 
@@ -93,9 +93,9 @@ def photo_settings(config: LossConfig, camera: Camera, share: float = 1.0) -> Ph
         cut=c.l1_cut,
         ncc=share * c.ncc_weight / pixels,
         reject=c.ncc_reject,
-        min_variance=c.ncc_min_variance,
+        min_variance=NCC_MIN_VARIANCE,
         texture=c.ncc_texture,
-        min_coverage=c.ncc_min_coverage,
+        min_coverage=MIN_COVERAGE,
         variance_floor=NCC_VARIANCE_FLOOR,
         ssim=share * c.ssim_weight / pixels,
     )  # fmt: skip

@@ -20,6 +20,10 @@ from geogs.geometry.depth import normals_from_depth
 
 # Added to the squared length of a blended normal (about 1): bounds the slope of normalising it.
 NORMAL_EPSILON = 1e-6
+MIN_ALPHA = 0.5
+"""Depth and normals count where alpha exceeds this: most of the light ends at the surface."""
+SMOOTHNESS_ETA = 10.0
+"""Decay of smoothness with the image gradient (image in [0, 1]); the paper's eta."""
 OUTSIDE = -1.0
 """Prior depth where a mask says that nothing of the scene is."""
 
@@ -202,7 +206,7 @@ def silhouette(
 
 
 def visible(
-    depth: Float[Tensor, "h w"], alpha: Float[Tensor, "h w"], min_alpha: float = 0.5
+    depth: Float[Tensor, "h w"], alpha: Float[Tensor, "h w"], min_alpha: float = MIN_ALPHA
 ) -> Bool[Tensor, "h w"]:
     """The valid pixels Omega: a finite positive depth seen with more than ``min_alpha``."""
     return (alpha > min_alpha) & (depth > 0) & torch.isfinite(depth)
@@ -225,7 +229,7 @@ def single_view_loss(
     Any dtype and device; :func:`geogs.losses.cpu.fused_single_view` is the same on a CPU, faster.
     """
     inside = view.prior_depth >= 0
-    mask = visible(depth, alpha, config.min_alpha) & inside
+    mask = visible(depth, alpha) & inside
     zero = torch.zeros_like(depth)
     depth = torch.where(mask, depth, zero)
     normal = torch.where(mask[..., None] & torch.isfinite(normal), normal, zero[..., None])
@@ -243,8 +247,8 @@ def single_view_loss(
     if config.normal_weight > 0 and view.prior_normal is not None:
         terms.append((config.normal_weight, normal_l1(normal, view.prior_normal, mask)))
     if config.smoothness_weight > 0:
-        eta, both = config.smoothness_eta, config.ablation.smoothness_rewards_edges
-        loss = depth_smoothness(depth, view.image_gradient, eta, both)
+        both = config.ablation.smoothness_rewards_edges
+        loss = depth_smoothness(depth, view.image_gradient, SMOOTHNESS_ETA, both)
         terms.append((config.smoothness_weight, loss))
     total = torch.stack([weight * loss.sum() for weight, (loss, _) in terms]).sum()
     return total / depth.numel()

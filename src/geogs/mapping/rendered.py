@@ -11,6 +11,7 @@ from geogs.config import MappingConfig
 from geogs.depth.view import DenseDepth
 from geogs.geometry.camera import Camera
 from geogs.geometry.depth import averaged_over_planes, normals_from_depth
+from geogs.losses.single_view import MIN_ALPHA
 from geogs.mapping.map_frame import MapFrame
 from geogs.mapping.view import MapView
 from geogs.splat.map import DiskParameters
@@ -45,7 +46,7 @@ class SurfaceRules:
     @staticmethod
     def of(config: MappingConfig) -> "SurfaceRules":
         """Those of a run's settings."""
-        return SurfaceRules(config.loss.min_alpha, config.max_spread)
+        return SurfaceRules(MIN_ALPHA, config.max_spread)
 
 
 @dataclass(frozen=True, eq=False)

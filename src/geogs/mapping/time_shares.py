@@ -35,7 +35,7 @@ def affordable_views(
 ) -> int:
     """How many images a time lasts for, so that what they cost before the training is a part of it.
 
-    The part is ``search.depth_share`` of what is left when the mesh and the files of that many
+    The part is ``search.depth_ratio`` of what is left when the mesh and the files of that many
     images have been paid for.
 
     Args:
@@ -46,8 +46,8 @@ def affordable_views(
         read: images that have been read by now.
     """
     paid = cost.reading * read + cost.search * searched
-    a_view = cost.reading + rounds(search) * cost.search + search.depth_share * cost.output
-    return max(int((search.depth_share * seconds + paid) / max(a_view, 1e-9)), 0)
+    a_view = cost.reading + rounds(search) * cost.search + search.depth_ratio * cost.output
+    return max(int((search.depth_ratio * seconds + paid) / max(a_view, 1e-9)), 0)
 
 
 def helpers(views: int, seconds: float, cost: ViewCost) -> int:

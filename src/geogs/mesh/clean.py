@@ -7,14 +7,19 @@ from geogs.config import MeshConfig
 from geogs.mesh.holes import IsFree, close_holes
 from geogs.mesh.types import Mesh
 
+LEAST_OF_LARGEST = 0.001
+"""Parts with fewer faces than this fraction of the largest part's are removed: specks."""
+CLOSED_HOLES = 8
+"""Holes with so many edges or fewer are closed, unless somebody looked through them."""
+
 
 def cleaned(mesh: Mesh, config: MeshConfig, is_free: IsFree) -> Mesh:
     """Without what is no surface, and with small holes closed where nobody looked through them."""
     mesh = remove_degenerate_faces(mesh)
     mesh = keep_components(
-        mesh, config.min_component_faces, config.min_component_fraction, config.max_components
+        mesh, config.min_component_faces, LEAST_OF_LARGEST, config.max_components
     )
-    return close_holes(mesh, config.close_holes, is_free)
+    return close_holes(mesh, CLOSED_HOLES, is_free)
 
 
 def remove_degenerate_faces(mesh: Mesh) -> Mesh:

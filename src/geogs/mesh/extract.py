@@ -52,7 +52,7 @@ class VolumePlan:
 def plan_volume(views: Sequence[DepthMapView], config: MeshConfig) -> VolumePlan:
     """Choose voxel size and depth range from the depth maps, before anything is allocated.
 
-    The voxel is ``voxel_per_pixel`` footprints of a pixel at the median depth, larger if the
+    The voxel is the footprint of a pixel at the median depth, larger if the
     triangle budget or the memory limit demand it. The depth range is twice the 95 % quantile,
     so that a few stray far pixels do not blow up the volume. Looks at 40 views at most.
 
@@ -63,7 +63,7 @@ def plan_volume(views: Sequence[DepthMapView], config: MeshConfig) -> VolumePlan
     depths, footprints, points = _sample_points(views[::stride])
     if not len(depths):
         raise InputError("No depth map has a valid pixel, so there is no surface to extract.")
-    max_depth = config.max_depth or 2 * float(depths.quantile(0.95))
+    max_depth = 2 * float(depths.quantile(0.95))
     points = points[depths <= max_depth]
     limit = config.memory_limit * 2**30
     if config.voxel is not None:
@@ -76,7 +76,7 @@ def plan_volume(views: Sequence[DepthMapView], config: MeshConfig) -> VolumePlan
             )
         triangles = round(_FACES_PER_SQUARE * _area(points, config.voxel) / config.voxel**2)
         return VolumePlan(config.voxel, config.truncation, max_depth, blocks, triangles)
-    voxel = config.voxel_per_pixel * float(footprints.median())
+    voxel = float(footprints.median())
     faces = _FACES_PER_SQUARE * _area(points, voxel)
     voxel = max(voxel, math.sqrt(faces / config.triangle_budget))
     while (n := len(band_blocks(points, voxel, config.truncation))) * BYTES_PER_BLOCK > limit:

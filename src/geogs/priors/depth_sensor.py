@@ -1,13 +1,13 @@
 """The noise of a depth sensor: what a measured depth says of inverse depth, and where nothing.
 
 Triangulating sensors (structured light, stereo) measure a disparity, so that inverse depth errs
-alike everywhere, and depth with its square. Beside that a share of the depth is wrong in common
+alike everywhere, and depth with its square. Beside that a fraction of the depth is wrong in common
 (calibration, temperature), and a depth may belong to a pixel nearby, which counts where the surface
 is slanted:
 
-    sigma^2 = deviation^2 + (share d)^2 + (lateral |grad d|)^2 .
+    sigma^2 = deviation^2 + (ratio d)^2 + (lateral |grad d|)^2 .
 
-What is wrong in common is the scale's error, which no comparison of depths shows; the share stands
+What is wrong in common is the scale's error, which no comparison of depths shows; the ratio stands
 for what it leaves behind from place to place.
 
 At edges a sensor averages both sides or shows the wrong one, and holes eat into what is around
@@ -26,6 +26,13 @@ from torch import Tensor
 
 from geogs.config import DepthSensorConfig
 
+LATERAL = 0.5
+"""Pixels of the working image by which a depth may belong to another place."""
+EDGE = 0.04
+"""Relative step of depth between neighbouring pixels that is an edge, where nothing is believed,
+nor on the next pixels."""
+NEAR = 0.1
+"""Metres from which on depths are believed: no sensor measures nearer."""
 _EVERYWHERE = np.ones((3, 3), np.uint8)
 _STEPS = 4.0
 """Deviations of the sensor that a step between neighbouring pixels exceeds at an edge, too."""
@@ -99,18 +106,18 @@ class SensorDepth:
 
 def sensor_depth(metres: Float32[np.ndarray, "h w"], config: DepthSensorConfig) -> SensorDepth:
     """What a picture of depth z, 0 where the sensor saw nothing, says of every pixel."""
-    known = (metres >= config.near) & (metres <= config.far)
+    known = (metres >= NEAR) & (metres <= config.far)
     z = np.where(known, metres, 1.0).astype(np.float32)
     d = np.where(known, 1 / z, 0).astype(np.float32)
     # Holes neither make a step nor a gradient: the pixels around stand for them.
     highest = cv2.dilate(d, _EVERYWHERE)
     lowest = cv2.erode(np.where(known, d, np.float32(1e6)), _EVERYWHERE)
     step = np.where(known, highest - lowest, 0)
-    is_edge = step > 2 * np.maximum(config.edge * d, _STEPS * np.float32(config.deviation))
+    is_edge = step > 2 * np.maximum(EDGE * d, _STEPS * np.float32(config.deviation))
     bad = cv2.dilate((is_edge | ~known).astype(np.uint8), _EVERYWHERE, iterations=_MARGIN) > 0
     gradient = np.hypot(_slope(d, known, 1), _slope(d, known, 0))
-    share, lateral = np.float32(config.share), np.float32(config.lateral)
-    variance = config.deviation**2 + (share * d) ** 2 + (lateral * gradient) ** 2
+    ratio, lateral = np.float32(config.ratio), np.float32(LATERAL)
+    variance = config.deviation**2 + (ratio * d) ** 2 + (lateral * gradient) ** 2
     return SensorDepth(
         np.where(bad, 0, d).astype(np.float32),
         np.where(bad, np.inf, np.sqrt(variance)).astype(np.float32),

@@ -39,7 +39,7 @@ def information_of(motion: Float[Tensor, "m 4 4"], config: OdometryConfig) -> Fl
     """Inverse variances of translation (metres) and rotation (radians) of measured motions."""
     distance = motion[:, :3, 3].norm(dim=1, keepdim=True)
     place = config.deviation**2 + (config.drift * distance) ** 2
-    turn = math.radians(1) ** 2 * (config.rotation**2 + (config.turn * distance) ** 2)
+    turn = math.radians(1) ** 2 * (config.rotation**2 + (config.rotation_drift * distance) ** 2)
     return torch.cat([1 / place.expand(-1, 3), 1 / turn.expand(-1, 3)], 1)
 
 

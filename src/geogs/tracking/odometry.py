@@ -18,6 +18,9 @@ from geogs.types import MeasuredPose
 from geogs.world.keyframes import Keyframe, KeyframeSet
 from geogs.world.segments import OdometryScale
 
+MIN_AGREEMENT = 0.4
+"""Fraction of the motions that must fit those of the images before any of them is used: of another
+recording hardly any does."""
 LEAST = 5
 """Motions that must fit before any is used."""
 SURE = 0.1
@@ -109,7 +112,7 @@ class Odometry:
         return vote_on_scale(torch.stack(seen), torch.stack(measured), self.config)
 
     def _take(self, vote: ScaleVote) -> None:
-        enough = int(vote.fits.sum()) >= LEAST and vote.share >= self.config.agreement
+        enough = int(vote.fits.sum()) >= LEAST and vote.share >= MIN_AGREEMENT
         if enough and vote.deviation <= SURE:
             self.found.scale, self.found.deviation = vote.scale, vote.deviation
 

@@ -39,7 +39,7 @@ class _SingleView(torch.autograd.Function):
         height, width = depth.shape
         scale = 1.0
         if config.smoothness_weight > 0:
-            shown = visible(depth, alpha, config.min_alpha) & (view.prior_depth >= 0)
+            shown = visible(depth, alpha) & (view.prior_depth >= 0)
             known = depth[shown]
             scale = 1 / float(known.median()) if len(known) else 0.0
         settings = record(single_view_settings(config, view.camera, unit))

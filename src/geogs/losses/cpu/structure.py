@@ -5,6 +5,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from geogs.config import LossConfig
+from geogs.losses.photometric import MIN_COVERAGE
 
 # Of Wang et al. 2004, as in :func:`geogs.losses.photometric.ssim`.
 _C1, _C2, _SIGMA, _REACH = 0.01**2, 0.03**2, 1.5, 5
@@ -39,7 +40,7 @@ def structure_gradient(
     above, below = 2 * mean_a * mean_b + _C1, mean_a**2 + mean_b**2 + _C1
     upper, lower = 2 * covariance + _C2, variance_a + variance_b + _C2
     luminance, structure = above / below, upper / lower
-    used = m * (coverage >= np.float64(np.float32(config.ncc_min_coverage)))
+    used = m * (coverage >= np.float64(np.float32(MIN_COVERAGE)))
     weight = config.ssim_weight / mask.size
     loss = weight * float((used * (1 - luminance * structure)).sum())
 

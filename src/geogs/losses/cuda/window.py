@@ -18,6 +18,7 @@ from geogs.gpu.kernels import kernels_for
 from geogs.losses.cuda.view_table import ViewTable
 from geogs.losses.multi_view import compared_planes
 from geogs.losses.settings import photo_settings, single_view_settings
+from geogs.losses.single_view import MIN_ALPHA
 
 _SOURCE = Path(__file__).with_name("losses.cu")
 # As in the sources: columns a block walks down, rows of a block of other kernels.
@@ -135,7 +136,7 @@ class WindowLosses:
                 alpha,
                 self._inverse_median,
                 height * width,
-                c.min_alpha,
+                MIN_ALPHA,
             )
         kernels["single_view"](
             (_blocks(width, 32), _blocks(height, 16), views), 256, batch, t.pointers,
@@ -220,7 +221,7 @@ class WindowLosses:
         pixels = depth.shape[1] * depth.shape[2]
         self._kernels["store_rendered"](
             (_blocks(pixels, 256), len(batch)), 256, batch, self.table.pointers,
-            self.table.rendered, depth, alpha, pixels, self.config.min_alpha,
+            self.table.rendered, depth, alpha, pixels, MIN_ALPHA,
         )  # fmt: skip
 
 

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from geogs.config import MappingConfig
 from geogs.losses.cpu import fused_multi_view, fused_single_view
+from geogs.losses.single_view import MIN_ALPHA
 from geogs.mapping.cameras import MapCameras
 from geogs.mapping.training.base import GRADIENT_LIMIT, Batch, learning_rates
 from geogs.mapping.training.pose_refine import refine_poses
@@ -42,7 +43,7 @@ def view_loss(
         view.known, config.loss, unit,
     )  # fmt: skip
     if partners:
-        depth = _within(view, output.shown_depth(config.loss.min_alpha))
+        depth = _within(view, output.shown_depth(MIN_ALPHA))
         for other in partners:
             loss = loss + fused_multi_view(
                 depth, view.photo, other.photo, other.rendered_depth, config.loss
@@ -152,7 +153,7 @@ class Trainer:
         loss = view_loss(view, partners, output, self.config, self.unit)
         loss.backward()
         with torch.no_grad():
-            depth = _within(view, output.shown_depth(self.config.loss.min_alpha))
+            depth = _within(view, output.shown_depth(MIN_ALPHA))
         gradients = [torch.zeros_like(p) if p.grad is None else p.grad for p in parameters]
         return _Pass(gradients, float(loss.detach()), depth, output.visible)
 
@@ -161,7 +162,7 @@ class Trainer:
         """Render the partners as the map is now, for the occlusion tests of this step."""
         for other in {o.id: o for _, partners in batch for o in partners}.values():
             output = render(self.disks, self.cameras.render, other.T_cw)
-            other.rendered_depth = _within(other, output.shown_depth(self.config.loss.min_alpha))
+            other.rendered_depth = _within(other, output.shown_depth(MIN_ALPHA))
 
     @torch.no_grad()
     def _bound_scales(self) -> None:

@@ -9,6 +9,7 @@ from torch import Tensor
 from geogs.config import MappingConfig
 from geogs.geometry.lie import retract
 from geogs.losses.cpu import fused_multi_view, fused_single_view
+from geogs.losses.single_view import MIN_ALPHA
 from geogs.mapping.cameras import MapCameras
 from geogs.mapping.training.tangent_adam import TangentAdam
 from geogs.mapping.view import MapView
@@ -83,7 +84,7 @@ def _pose_loss(
             output.depth, output.normal, output.alpha.detach(), output.distortion.detach(),
             view.known, loss_config, unit,
         )  # fmt: skip
-        depth = output.shown_depth(loss_config.min_alpha)
+        depth = output.shown_depth(MIN_ALPHA)
         for i in view.partners[:1]:
             other = views[i]
             target = other.photo.at(pose_of.get(i, other.T_cw))
