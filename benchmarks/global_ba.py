@@ -13,7 +13,6 @@ band of the camera system and the seconds of one solution.
 """
 
 import argparse
-import dataclasses
 import resource
 import subprocess
 import sys
@@ -26,9 +25,9 @@ import numpy as np
 import torch
 
 from geogs.bundle.camera_system import SparseCameraSystem
-from geogs.config import TrackingConfig
 from geogs.geometry.lie import se3_inverse
 from geogs.geometry.umeyama import umeyama
+from geogs.loop import global_bundle as settings
 from geogs.loop.global_bundle import global_bundle, global_pairs
 from geogs.tracking.tracker import Tracker, lone_tracker
 from geogs.world.segments import TrackState
@@ -53,9 +52,8 @@ def peak() -> float:
 def measure(count: int, args: argparse.Namespace) -> None:
     """One walk in this process."""
     torch.set_num_threads(1)
-    changes = {"global_rounds": args.rounds, "global_iterations": args.iterations}
-    config = dataclasses.replace(TrackingConfig(), global_pairs=args.pairs, **changes)
-    tracker, truth = planted_tracker(count, CAMERA, config=config)
+    settings.ROUNDS, settings.ITERATIONS, settings.PAIRS = args.rounds, args.iterations, args.pairs
+    tracker, truth = planted_tracker(count, CAMERA)
     drift(tracker, args.drift, args.yaw)
     base, before = peak(), error_cm(tracker, truth)
     tick = time.perf_counter()

@@ -7,15 +7,14 @@ import numpy as np
 import pytest
 import torch
 
-from geogs.bundle.base import BundleOptions
 from geogs.config import Config
-from geogs.config.tracking import TrackingConfig
-from geogs.loop.global_bundle import SMALL_STEP
+from geogs.loop.global_bundle import global_options
 from geogs.tracking.flow.select import build_operator
 from geogs.tracking.graph import FrameGraph
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import KeyframeTable
 from geogs.world.loops import RelativePoses
+from geogs_fleet.join import adjust
 from geogs_fleet.join.adjust import adjusted
 from geogs_fleet.join.gauge import Gauge
 from geogs_fleet.join.graph import Placement
@@ -44,9 +43,10 @@ class Recording(OneProcess):
 
 
 @pytest.fixture
-def placed(tmp_path):
+def placed(tmp_path, monkeypatch):
     """Three parts that were put together badly; the first and the last share nothing."""
-    rng, config = np.random.default_rng(0), Config(tracking=TrackingConfig(global_rounds=1))
+    rng, config = np.random.default_rng(0), Config()
+    monkeypatch.setattr(adjust, "ROUNDS", 1)
     parts, files, placements = [], [], {}
     for n, places in enumerate(PLACES):
         parts.append(Part(str(n), make_part(tmp_path / str(n), places, 0)))
@@ -86,9 +86,7 @@ def test_parts_together_are_adjusted_as_one_problem(placed, tmp_path):
     assert {(a // 4, b // 4) for a, b in graph.edges} == {
         (n, m) for n in range(3) for m in range(3) if abs(n - m) < 2
     }
-    c = config.tracking
-    options = BundleOptions(iterations=c.global_iterations, huber=c.huber, tolerance=SMALL_STEP)
-    graph.adjust(list(graph.edges), segment.ids[1:], segment.ids, options)
+    graph.adjust(list(graph.edges), segment.ids[1:], segment.ids, global_options())
     for n in range(3):
         wanted = segment.poses([ids[n, place] for place in range(4)])
         moved = float((wanted - placements[n].T_cw).abs().max())

@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from geogs.bundle.base import BundleOptions
-from geogs.config import Config, TrackingConfig
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp, se3_inverse
 from geogs.loop.global_bundle import global_bundle
@@ -77,12 +76,17 @@ def as_read(factor: float = 1.0, doubt: float = 0.0) -> SeenRows:
     return SeenRows(torch.zeros(*seconds.shape, 2).half(), seconds.half(), doubt)
 
 
+@pytest.fixture(autouse=True)
+def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, value in (("ROUNDS", 1), ("PAIRS", 4), ("ITERATIONS", 5)):
+        monkeypatch.setattr(f"geogs.loop.global_bundle.{name}", value)
+
+
 def tracker_of_rows(rows: SeenRows) -> Tracker:
     """A tracker with the true poses and depths of the middle rows, and matches as they are read."""
     T = pose(np.arange(COUNT))
     d = true_inverse_depth(T, GRID)
-    config = TrackingConfig(global_rounds=1, global_pairs=4, global_iterations=5)
-    tracker = lone_tracker(CAMERA, Config(tracking=config), operator=RollingFlow(GRID, T, d, 0.0))
+    tracker = lone_tracker(CAMERA, operator=RollingFlow(GRID, T, d, 0.0))
     for n in range(COUNT):
         image = np.full((4, 4, 3), (n, 0, 0), np.uint8)
         state = tracker.keyframes.add(n, n / RATE, image, n, T[n].clone())

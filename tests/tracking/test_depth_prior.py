@@ -190,11 +190,11 @@ def test_deviation_is_that_of_the_cells_around():
     x = grid.pixels[:, 0]
     error = torch.where(x < 100, 0.02, 0.2)[None]
     sure = ((x < 100) | (x > 200)).float()[None]
-    deviation = local_deviation(grid, error, sure, PriorConfig(deviation=0.05))[0]
+    deviation = local_deviation(grid, error, sure)[0]
     assert float(deviation[x < 60].max()) < 0.1
     assert 0.17 < float(deviation[x > 280].min()) <= float(deviation.max()) < 0.2
     assert float(deviation[(x > 140) & (x < 160)].mean()) > 0.05
-    nothing = local_deviation(grid, error, torch.zeros_like(sure), PriorConfig(deviation=0.05))
+    nothing = local_deviation(grid, error, torch.zeros_like(sure))
     torch.testing.assert_close(nothing, torch.full_like(nothing, 0.05))
 
 

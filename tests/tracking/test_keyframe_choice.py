@@ -7,7 +7,7 @@ import pytest
 from geogs.config import TrackingConfig
 from geogs.tracking.keyframe_choice import KeyframeChoice, sharpness
 
-CONFIG = TrackingConfig(keyframe_flow=0.025, keyframe_overlap=0.7, blur_share=0.7, blur_wait=0.4)
+CONFIG = TrackingConfig(keyframe_flow=0.025, keyframe_overlap=0.7)
 
 
 def texture(seed: int = 0) -> np.ndarray:

@@ -1,12 +1,10 @@
 """Packed edges read like plain ones, and a long walk is adjusted on them in little memory."""
 
 import resource
-from dataclasses import replace
 
 import pytest
 import torch
 
-from geogs.config import TrackingConfig
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_inverse
 from geogs.geometry.umeyama import umeyama
@@ -61,10 +59,11 @@ def peak_mib() -> float:
 
 @pytest.mark.long
 @pytest.mark.system
-def test_a_walk_of_a_thousand_keyframes_is_adjusted_in_little_memory():
+def test_a_walk_of_a_thousand_keyframes_is_adjusted_in_little_memory(monkeypatch):
     tiny = Camera(fx=45.0, fy=45.0, cx=23.5, cy=19.5, width=48, height=40)
-    config = replace(TrackingConfig(), global_rounds=1, global_iterations=1, global_pairs=4)
-    tracker, truth = planted_tracker(1000, tiny, 0.02, config)
+    for name, value in (("ROUNDS", 1), ("ITERATIONS", 1), ("PAIRS", 4)):
+        monkeypatch.setattr(f"geogs.loop.global_bundle.{name}", value)
+    tracker, truth = planted_tracker(1000, tiny, 0.02)
     drift(tracker, scale=0.004)
     before, held = error_cm(tracker, truth), peak_mib()
     global_bundle(tracker)

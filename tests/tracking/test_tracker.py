@@ -12,6 +12,7 @@ from geogs.config import Config, TrackingConfig
 from geogs.errors import InputError, TrackingLost
 from geogs.geometry.camera import Camera
 from geogs.loop.global_bundle import global_bundle
+from geogs.tracking import local_mapping
 from geogs.tracking.tracker import Tracker, lone_tracker
 from geogs.types import Frame, PoseCorrection
 from geogs.world.grid import SampleGrid
@@ -219,11 +220,13 @@ def test_correct_scales_depth_with_the_pose():
 
 
 @pytest.mark.long
-def test_slow_motion_makes_few_keyframes_and_culling_removes_more():
+def test_slow_motion_makes_few_keyframes_and_culling_removes_more(monkeypatch):
     slow = frames(sideways(30, 0.012))
     few, _ = run(slow)
-    many, results = run(slow, replace(CONFIG, keyframe_flow=0.012, cull_distance=0.0))
-    culled, results = run(slow, replace(CONFIG, keyframe_flow=0.012, cull_distance=0.02))
+    monkeypatch.setattr(local_mapping, "CULL_DISTANCE", 0.0)
+    many, results = run(slow, replace(CONFIG, keyframe_flow=0.012))
+    monkeypatch.setattr(local_mapping, "CULL_DISTANCE", 0.02)
+    culled, results = run(slow, replace(CONFIG, keyframe_flow=0.012))
     assert len(few.segment.ids) < len(many.segment.ids)
     removed = [k for r in results for k in r.removed]
     assert removed

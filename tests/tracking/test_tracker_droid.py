@@ -26,7 +26,7 @@ from tracking_scenes import CAMERA, frames, render, sideways
 pytestmark = pytest.mark.system
 
 GRID = SampleGrid(CAMERA)
-CONFIG = TrackingConfig(init_keyframes=5, window=4, depth_window=6)
+CONFIG = TrackingConfig(init_keyframes=5, window=4)
 ROWS, COLUMNS = GRID.height, GRID.width
 
 

@@ -89,8 +89,9 @@ def test_a_start_that_is_far_off_is_tried_again_with_a_quarter_more(
     adjust = FrameGraph.adjust
     monkeypatch.setattr(FrameGraph, "adjust", adjusted)
     monkeypatch.setattr(start_up, "initialise", tried)
+    monkeypatch.setattr("geogs.tracking.initialise.MAX_DEVIATION", 1e-3)
     path = [pose(0.08 * np.sin(0.2 * k), yaw=0.3 * np.sin(0.1 * k)) for k in range(40)]
-    _, results = run(frames(path), replace(CONFIG, init_keyframes=8, start_deviation=1e-3))
+    _, results = run(frames(path), replace(CONFIG, init_keyframes=8))
     assert results[-1].state is TrackState.INITIALIZING
     assert sum(attempt is Attempt.FAR_OFF for _, attempt in attempts) >= 3
     for (before, attempt), (now, _) in pairwise(attempts[:-1]):

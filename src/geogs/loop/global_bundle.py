@@ -3,12 +3,24 @@
 from collections.abc import Callable, Sequence
 
 from geogs.bundle.base import BundleOptions
-from geogs.config import TrackingConfig
 from geogs.loop.settled_rows import settle_rows
-from geogs.tracking.proximity import Pair, proximity_pairs
+from geogs.tracking.graph import HUBER
+from geogs.tracking.proximity import RADIUS, Pair, proximity_pairs
 from geogs.tracking.tracker import Tracker
 from geogs.types import PoseCorrection
 
+ROUNDS = 4
+"""Most rounds of flow and adjustment: each sharpens the next, later ones by little."""
+ITERATIONS = 10
+"""Most Gauss-Newton steps per round."""
+REMEASURE = 0.25
+"""A pair is matched again when its reprojection has moved by this many pixels."""
+MAX_DISTANCE = 0.5
+"""Largest frame distance of a pair, of the long edge."""
+SUPPRESSION = 3
+"""Pairs within this many keyframes of a chosen one are left out, as they say the same."""
+PAIRS = 10
+"""Most pairs per keyframe: time against precision."""
 MATCHED_TOGETHER = 16, 48
 """Pairs that are matched in one go, on the CPU and on a GPU."""
 PRIORS_TOGETHER = 32
@@ -47,25 +59,23 @@ def global_bundle(
     graph.edges.clear()
     odometry.look_at_all()
     batch = MATCHED_TOGETHER[store.grid.on_gpu]
-    options = global_options(config)
-    for n in range(config.global_rounds if pairs else 0):
+    options = global_options()
+    for n in range(ROUNDS if pairs else 0):
         # Pairs of the same keyframe one after the other: images of old ones are read from a file.
-        stale = sorted(graph.stale(pairs, config.global_remeasure))
+        stale = sorted(graph.stale(pairs, REMEASURE))
         if len(stale) <= SETTLED * len(pairs):
             break
         for start in range(0, len(stale), batch):
             graph.measure(stale[start : start + batch], fine=True, packed=True)
             if progress is not None:
-                share = (n + start / len(stale)) / config.global_rounds
+                share = (n + start / len(stale)) / ROUNDS
                 progress(share, "matching all keyframes")
         graph.adjust(list(graph.edges), free if fixed else ids[1:], free, options)
         graph.judge_moving(set(free), config.moving)
         odometry.look_at_all()
     settle_rows(tracker, free if fixed else ids[1:], free, options)
     for start in range(0, len(free), PRIORS_TOGETHER):
-        tracker.map.priors.adjust(
-            free[start : start + PRIORS_TOGETHER], config.huber
-        )  # moves no pose
+        tracker.map.priors.adjust(free[start : start + PRIORS_TOGETHER])  # moves no pose
     if progress is not None:
         progress(1.0, "all keyframes adjusted")
     after = {k: store[k].T_cw for k in ids}
@@ -74,24 +84,24 @@ def global_bundle(
     return correction
 
 
-def global_options(c: TrackingConfig) -> BundleOptions:
+def global_options() -> BundleOptions:
     """How an adjustment of all keyframes is solved."""
-    return BundleOptions(iterations=c.global_iterations, huber=c.huber, tolerance=SMALL_STEP)
+    return BundleOptions(iterations=ITERATIONS, huber=HUBER, tolerance=SMALL_STEP)
 
 
 def global_pairs(tracker: Tracker, keyframes: Sequence[int] | None = None) -> list[Pair]:
     """Neighbours in time and all places seen again, thinned evenly; not within a saved map."""
-    config, grid = tracker.config, tracker.keyframes.grid
+    grid = tracker.keyframes.grid
     ids = tracker.segment.ids if keyframes is None else list(keyframes)
     pairs = proximity_pairs(
         tracker.keyframes,
         ids,
         ids,
         [],
-        config.radius,
-        config.global_suppression,
-        config.global_distance * max(grid.camera.width, grid.camera.height),
-        config.global_pairs * len(ids),
+        RADIUS,
+        SUPPRESSION,
+        MAX_DISTANCE * max(grid.camera.width, grid.camera.height),
+        PAIRS * len(ids),
     )
     wanted, fixed = set(ids), set(tracker.segment.fixed)
     return [p for p in pairs if wanted.issuperset(p) and not fixed.issuperset(p)]

@@ -8,6 +8,7 @@ from jaxtyping import Float64
 
 from geogs.bundle.base import BundleOptions
 from geogs.bundle.marginals import Marginals, marginals
+from geogs.tracking.graph import HUBER
 from geogs.tracking.tracker import Tracker
 from geogs.types import Uncertainty
 
@@ -82,6 +83,6 @@ def _marginals(tracker: Tracker, ids: list[int]) -> Marginals | None:
         return None
     problem, frames = tracker.map.graph.streamed_problem(edges, free, ids)
     grid = tracker.keyframes.grid
-    found = marginals(grid, problem, BundleOptions(huber=tracker.config.huber), cells=512)
+    found = marginals(grid, problem, BundleOptions(huber=HUBER), cells=512)
     own = torch.tensor([frames.index(k) for k in ids])
     return Marginals(found.pose[own], found.relative_depth[own], found.strain[own])

@@ -25,6 +25,14 @@ from geogs.bundle.projection import linearise, relative_motion
 from geogs.config import PriorConfig
 from geogs.world.grid import SampleGrid
 
+DEVIATION = 0.05
+"""Relative deviation of a good prior after its scale has been adjusted."""
+REACH = 0.06
+"""Matched depth judges the prior around it within about this fraction of the grid's width."""
+MAX_DEVIATION = 0.15
+"""Cells where the prior seems to be worse than this go without it: three times a good one's."""
+MAX_DISAGREEMENT = 0.2
+"""A prior that is off by more than this in a fifth of the matched cells is not used at all."""
 SCALE_DAMPING = 1e-4
 """Of the scales, relative to the curvature of the prior's term."""
 DEPTH_DAMPING = 1e-3
@@ -186,7 +194,7 @@ def adjust_depth(
     C = flow.curvature
     wanted = inverse_depth + torch.where(C > 0, flow.gradient / C.clamp(min=1e-30), 0.0)
     start = scale
-    deviation = torch.full_like(prior, config.deviation)
+    deviation = torch.full_like(prior, DEVIATION)
     trust = torch.ones_like(prior)
     for _ in range(REWEIGHTINGS):
         alpha = _prior_weight(prior, start, basis, deviation)
@@ -199,11 +207,11 @@ def adjust_depth(
         own = (deviation * fitted).square() + 1 / C.clamp(min=1e-12)
         trust = 1 / (1 + (error * fitted).square() / (_CAUCHY**2 * own))
         sure = known * C / (C + _prior_weight(prior, start, basis, deviation).clamp(min=1e-12))
-        deviation = local_deviation(grid, error, sure, config)
-        bent = _ROUGHNESS * roughness(grid, (start + step.scale) @ basis.mT, config)
+        deviation = local_deviation(grid, error, sure)
+        bent = _ROUGHNESS * roughness(grid, (start + step.scale) @ basis.mT)
         deviation = torch.hypot(deviation, bent)
     overall = _weighted_quantile(error.abs(), sure, _AGREEING)
-    used = (deviation < config.max_deviation) & (overall < config.reject)[:, None]
+    used = (deviation < MAX_DEVIATION) & (overall < MAX_DISAGREEMENT)[:, None]
     used &= (start + step.scale > 0).all(1, keepdim=True)
     alpha = torch.where(used, trust * _prior_weight(prior, start, basis, deviation), 0.0)
     step = depth_scale_step(flow, inverse_depth, ScaledPrior(prior, start, alpha), basis, stiffness)
@@ -222,7 +230,6 @@ def local_deviation(
     grid: SampleGrid,
     error: Float[Tensor, "n p"],
     sure: Float[Tensor, "n p"],
-    config: PriorConfig,
 ) -> Float[Tensor, "n p"]:
     """Relative deviation of the prior in every cell, by its errors in sure cells around it.
 
@@ -234,21 +241,19 @@ def local_deviation(
     square = (sure * error.square().clamp(max=1.0)).reshape(shape)
     both = torch.cat([square, sure.reshape(shape)])
     around = torch.full_like(both, _BELIEF, dtype=torch.float64)
-    around[: len(square)] *= config.deviation**2
+    around[: len(square)] *= DEVIATION**2
     for multiple, cells in _EVIDENCE:
-        around += cells * mean_around(both, multiple * config.reach * grid.width)
+        around += cells * mean_around(both, multiple * REACH * grid.width)
     total, count = around.chunk(2)
     return (total / count).sqrt().reshape(error.shape).to(error)
 
 
-def roughness(
-    grid: SampleGrid, factor: Float[Tensor, "n p"], config: PriorConfig
-) -> Float[Tensor, "n p"]:
+def roughness(grid: SampleGrid, factor: Float[Tensor, "n p"]) -> Float[Tensor, "n p"]:
     """Relative deviation of the scale within reach of a cell.
 
     A scale that has to change fast to follow the matches says little between them.
     """
-    radius = config.reach * grid.width
+    radius = REACH * grid.width
     field = factor.double().reshape(-1, grid.height, grid.width)
     mean, square = mean_around(torch.cat([field, field.square()]), radius).chunk(2)
     variance = (square - mean.square()).clamp(min=0)

@@ -9,7 +9,7 @@ from torch import Tensor
 from geogs.config import TrackingConfig
 from geogs.geometry.lie import se3_inverse
 from geogs.tracking.keyframe_choice import calls_for_keyframe
-from geogs.tracking.motion import FrameLocator, FrameMotion
+from geogs.tracking.motion import MIN_KNOWN, MIN_TEXTURE, FrameLocator, FrameMotion
 from geogs.tracking.pose_deviation import PoseDeviation, pose_deviation
 from geogs.types import Frame
 from geogs.world.keyframes import Keyframe
@@ -76,10 +76,10 @@ class Follower:
         if frame.follows_cut or is_sensed or not has_size or len(self.frames) >= MOST_FRAMES:
             return None
         encoded = self._locator.operator.encode(frame.image)
-        if self._locator.operator.texture(encoded) < config.min_texture:
+        if self._locator.operator.texture(encoded) < MIN_TEXTURE:
             return None
         motion = self._locator.locate(keyframe, encoded, last.predicted(keyframe, frame.timestamp))
-        if motion is None or motion.known < config.min_known:
+        if motion is None or motion.known < MIN_KNOWN:
             return None
         long_edge = max(camera.width, camera.height)
         if calls_for_keyframe(config, long_edge, motion.flow, motion.overlap, FARTHER):

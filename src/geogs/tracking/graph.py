@@ -27,6 +27,9 @@ from geogs.world.edges import Edge, MeasuredEdge, PackedEdge, Pair, edge_matches
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import Keyframe, KeyframeSet
 
+HUBER = 0.5
+"""Standard deviations of the flow beyond which a match counts linearly: the flow is more certain
+than it says."""
 STACKED_EDGES = 1024, 8192
 """Directed edges up to which an adjustment has all matches in one piece, on CPU and GPU."""
 

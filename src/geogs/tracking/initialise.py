@@ -25,12 +25,18 @@ from geogs.geometry.lie import se3_inverse
 from geogs.threads import thread_map
 from geogs.tracking.evidence import Evidence, correlation_at
 from geogs.tracking.features import surer_flows
-from geogs.tracking.graph import FrameGraph
-from geogs.tracking.motion import pnp
+from geogs.tracking.graph import HUBER, FrameGraph
+from geogs.tracking.motion import MIN_NCC, pnp
+from geogs.tracking.proximity import RADIUS
 from geogs.types import FlowMatch
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import Keyframe, KeyframeSet
 
+MIN_PARALLAX = 0.005
+"""Motion that rotation does not explain, needed to try to start, of the long edge."""
+MAX_DEVIATION = 0.2
+"""The map is started when the depths of its first keyframes are known to this, in the median:
+relative standard deviation by what matches and poses leave open."""
 FARTHEST = 50.0
 """Baselines beyond which a point says nothing on which of four poses is the right one."""
 LEAST_SEEN = 0.4
@@ -67,14 +73,14 @@ def initialise(graph: FrameGraph, config: TrackingConfig, flows: Sequence[FlowMa
     """Estimate all keyframes of the graph from nothing but the flows from the first to the others.
 
     It fails if they show no parallax, if matches and poses leave their depths open
-    (``start_deviation``), or if the images of two that follow each other do not correlate where
-    poses and depths put them (``min_ncc``).
+    (``MAX_DEVIATION``), or if the images of two that follow each other do not correlate where
+    poses and depths put them (``MIN_NCC``).
     On success poses, depths and information are set, the first pose is the identity and the median
     depth over all keyframes is one unit.
     """
     store = graph.keyframes
     camera = store.grid.camera
-    min_parallax = config.min_parallax * max(camera.width, camera.height)
+    min_parallax = MIN_PARALLAX * max(camera.width, camera.height)
     # Poses are guessed on the CPU.
     flows = [FlowMatch(f.pixels.cpu(), f.weight.cpu()) for f in flows]
     found = thread_map(lambda match: two_view(camera, match), flows)
@@ -83,12 +89,12 @@ def initialise(graph: FrameGraph, config: TrackingConfig, flows: Sequence[FlowMa
         return Attempt.FAILED
     _place_all(graph, flows, best)
     for rounds in (range(FORGIVING), range(FORGIVING, ROUNDS)):
-        if not _polish(graph, config.radius, config.moving, rounds):
+        if not _polish(graph, config.moving, rounds):
             return Attempt.FAILED
-        deviation = _depth_deviation(graph, config.huber)
-        if deviation > FAR * config.start_deviation:
+        deviation = _depth_deviation(graph)
+        if deviation > FAR * MAX_DEVIATION:
             return Attempt.FAR_OFF
-    if deviation > config.start_deviation or not _is_borne_out(graph, config.min_ncc):
+    if deviation > MAX_DEVIATION or not _is_borne_out(graph):
         return Attempt.FAILED
     return Attempt.STARTED
 
@@ -227,10 +233,10 @@ def placed_after(graph: FrameGraph, before: Keyframe, state: Keyframe) -> Float[
     return before.T_cw if T_rel is None else T_rel.to(before.T_cw) @ before.T_cw
 
 
-def _polish(graph: FrameGraph, radius: int, moving: float, rounds: Iterable[int]) -> bool:
+def _polish(graph: FrameGraph, moving: float, rounds: Iterable[int]) -> bool:
     """Rounds of flow and adjustment, from forgiving to strict; then without what moves."""
     store, ids = graph.keyframes, graph.keyframes.ids
-    near = [(a, b) for n, a in enumerate(ids) for b in ids[n + 1 : n + 1 + radius]]
+    near = [(a, b) for n, a in enumerate(ids) for b in ids[n + 1 : n + 1 + RADIUS]]
     for n in rounds:
         graph.measure(graph.stale(near, 0.25), fine=n >= FORGIVING)
         options = BundleOptions(iterations=4, huber=(30.0, 10.0, 3.0)[min(n, 2)])
@@ -242,15 +248,15 @@ def _polish(graph: FrameGraph, radius: int, moving: float, rounds: Iterable[int]
     return True
 
 
-def _depth_deviation(graph: FrameGraph, huber: float) -> float:
+def _depth_deviation(graph: FrameGraph) -> float:
     """Relative deviation of the depths, the poses being as open as they are: the median of all."""
     ids = graph.keyframes.ids
     problem, _ = graph.problem(list(graph.edges), ids[1:], ids)
-    found = marginals(graph.keyframes.grid, problem, BundleOptions(huber=huber))
+    found = marginals(graph.keyframes.grid, problem, BundleOptions(huber=HUBER))
     return float(found.depth_deviation.median())
 
 
-def _is_borne_out(graph: FrameGraph, min_ncc: float) -> bool:
+def _is_borne_out(graph: FrameGraph) -> bool:
     """Whether the images of all neighbours in time agree at their poses."""
     grey, found = graph.operator.grey, []
     for a, b in pairwise(graph.keyframes):
@@ -265,7 +271,7 @@ def _is_borne_out(graph: FrameGraph, min_ncc: float) -> bool:
             )
         )
     evidence = map(Evidence.of, torch.stack(found).cpu())
-    return all(e.bears_out(min_ncc, is_expected=False) for e in evidence)
+    return all(e.bears_out(MIN_NCC, is_expected=False) for e in evidence)
 
 
 def normalise(store: KeyframeSet) -> None:

@@ -12,6 +12,10 @@ from geogs.config import TrackingConfig
 LEAST_FLOW = 0.2
 """Fraction of the motion that makes a keyframe below which a lost overlap is none: the camera has
 hardly moved, so it is the image that is poor."""
+BLUR_RATIO = 0.7
+"""A frame with less than this fraction of the latest frames' sharpness is blurred ..."""
+BLUR_WAIT = 0.4
+"""... and becomes a keyframe only when it has moved by this much more: a sharper one may come."""
 _COMPARED = 12
 """Latest frames among which one is sharp or blurred."""
 _EDGE = 320
@@ -82,7 +86,7 @@ class KeyframeChoice:
         A frame that is blurred beside the latest ones waits for a sharper one, though not for
         long: nothing else sees what comes into view meanwhile.
         """
-        patience = self.config.blur_wait if self._is_blurred() else 0.0
+        patience = BLUR_WAIT if self._is_blurred() else 0.0
         return calls_for_keyframe(self.config, self.long_edge, flow, overlap, patience)
 
     def _note(self, value: float) -> None:
@@ -93,4 +97,4 @@ class KeyframeChoice:
         self.settle()
         if len(self._recent) < 3:
             return False
-        return self._recent[-1] < self.config.blur_share * float(np.median(self._recent))
+        return self._recent[-1] < BLUR_RATIO * float(np.median(self._recent))

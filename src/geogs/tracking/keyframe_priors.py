@@ -10,10 +10,14 @@ from torch import Tensor
 from geogs.config import PriorConfig
 from geogs.priors.alignment import align_inverse_depth
 from geogs.priors.base import MonocularPrior
-from geogs.tracking.depth_prior import FlowEvidence, adjust_depth, flow_evidence
-from geogs.tracking.graph import FrameGraph
+from geogs.tracking.depth_prior import DEVIATION, FlowEvidence, adjust_depth, flow_evidence
+from geogs.tracking.graph import HUBER, FrameGraph
 from geogs.world.grid import OFFSET, STRIDE, SampleGrid
 from geogs.world.keyframes import Keyframe, KeyframePrior
+
+CAUTION = 4.0
+"""Factor on the deviation that mapping is given of a prior, since it takes a tracker's deviations
+for larger than they are (``DEVIATION_SCALE``, ``TRACKER_SCALE`` of depth/)."""
 
 _log = logging.getLogger(__name__)
 
@@ -54,14 +58,14 @@ class KeyframePriors:
             _log.warning("Most prior normals face away from the camera; check their normal_axes.")
         return torch.where(away, 0.0, normal).half()
 
-    def adjust(self, ids: Sequence[int], huber: float) -> None:
+    def adjust(self, ids: Sequence[int]) -> None:
         """Joint depth and scale adjustment of those keyframes that have a prior, poses fixed."""
         store, deep = self.graph.keyframes, set(ids)
         edges = [e for e in self.graph.edges if e[0] in deep and store[e[0]].prior is not None]
         if not edges:
             return
         problem, frames = self.graph.problem(edges, [], {i for i, _ in edges})
-        flow = flow_evidence(store.grid, problem, huber)
+        flow = flow_evidence(store.grid, problem, HUBER)
         rows, states, priors = [], [], []
         for n, id in enumerate(frames):
             state, prior = store[id], store[id].prior
@@ -84,7 +88,7 @@ class KeyframePriors:
         for n, (state, prior) in enumerate(zip(states, priors, strict=True)):
             state.inverse_depth = adjusted.inverse_depth[n]
             prior.scale = adjusted.scale[n]
-            prior.information = adjusted.information[n] / self.config.caution**2
+            prior.information = adjusted.information[n] / CAUTION**2
 
     def _align(
         self,
@@ -99,7 +103,7 @@ class KeyframePriors:
         if prior.is_aligned and not prior.kind.has_shift:
             return
         relative = curvature * inverse_depth.square()
-        weight = relative / (relative + self.config.deviation**-2)
+        weight = relative / (relative + DEVIATION**-2)
         aligned = align_inverse_depth(prior.values, prior.kind, inverse_depth, weight)
         if aligned is not None:
             prior.inverse_depth = aligned.inverse_depth

@@ -9,9 +9,10 @@ from geogs.bundle.base import BundleOptions
 from geogs.bundle.select import grid_fields
 from geogs.config import TrackingConfig
 from geogs.geometry.lie import se3_inverse
+from geogs.tracking.graph import HUBER
 from geogs.tracking.motion import FrameMotion
 from geogs.tracking.moving import carried
-from geogs.tracking.proximity import frame_distances, proximity_pairs
+from geogs.tracking.proximity import RADIUS, frame_distances, proximity_pairs
 from geogs.tracking.segment_map import SegmentMap
 from geogs.tracking.sensing import stands_alone
 from geogs.tracking.start_up import MIN_KEYFRAMES
@@ -19,6 +20,24 @@ from geogs.types import Frame
 from geogs.world.edges import edge_matches
 from geogs.world.frames import RelativeRotation
 from geogs.world.keyframes import Keyframe
+
+CULL_DISTANCE = 0.012
+"""A keyframe nearer than this to the one before it is removed again, of the long edge: half of what
+makes one."""
+DEEPER = 3
+"""Keyframes before the window whose poses are adjusted whose inverse depth is adjusted, too."""
+PROXIMITY_WINDOW = 25
+"""Older keyframes among which further neighbours of a new one are looked for, as in DROID-SLAM."""
+PROXIMITY_DISTANCE = 0.2
+"""Largest frame distance of such neighbours, of the long edge."""
+PROXIMITY_PAIRS = 2
+"""Most such neighbours per keyframe: bounds the time."""
+ROUNDS = 2
+"""Of flow and adjustment per keyframe; the last is followed by the prior's."""
+ITERATIONS = 3
+"""Gauss-Newton steps per round."""
+REMEASURE = 0.5
+"""A pair is matched again when its reprojection has moved by this many pixels."""
 
 
 class LocalMapping:
@@ -35,18 +54,14 @@ class LocalMapping:
         """Ids whose poses the local adjustment moves, earliest first; never the very first."""
         ids = self.segment.ids
         fixed = {*(self.segment.fixed or ids[:1])}
-        return tuple(k for k in ids[-self._window() :] if k not in fixed)
+        return tuple(k for k in ids[-self.config.window :] if k not in fixed)
 
     @property
     def deep(self) -> list[int]:
         """Ids whose inverse depth it moves, earliest first."""
-        c, fixed = self.config, {*self.segment.fixed}
-        latest = self.keyframes.ids[-(self._window() + c.depth_window - c.window) :]
+        fixed = {*self.segment.fixed}
+        latest = self.keyframes.ids[-(self.config.window + DEEPER) :]
         return [k for k in latest if k not in fixed]
-
-    def _window(self) -> int:
-        c = self.config
-        return window_length(list(self.keyframes), c.window, c.window_most, c.window_baseline)
 
     def insert(self, frame: Frame, encoded: Any, motion: FrameMotion) -> Keyframe:
         """Make a located frame a keyframe, with the depths that its anchor gives it."""
@@ -80,16 +95,16 @@ class LocalMapping:
 
     def _connect(self, id: int, anchor: int) -> None:
         """Measure a new keyframe against the one it was located at, and its neighbours."""
-        c, ids = self.config, self.keyframes.ids
+        ids = self.keyframes.ids
         pairs = proximity_pairs(
             self.keyframes,
             [id],
-            ids[-c.proximity_window : -1],
+            ids[-PROXIMITY_WINDOW:-1],
             self.graph.pairs,
-            c.radius,
+            RADIUS,
             1,
-            c.proximity_distance * self._long_edge,
-            c.radius + c.proximity_pairs,
+            PROXIMITY_DISTANCE * self._long_edge,
+            RADIUS + PROXIMITY_PAIRS,
         )
         # Neighbours in time are none where the camera was lost in between.
         breaks = self.segment.breaks
@@ -101,20 +116,20 @@ class LocalMapping:
 
     def _adjust(self) -> None:
         """Rounds of bundle adjustment, with flow measured anew where poses have moved."""
-        c, poses, depths = self.config, self.active, self.deep
+        poses, depths = self.active, self.deep
         moving, deep, priors = set(poses), set(depths), self.map.priors
-        for n in range(c.local_rounds):
+        for n in range(ROUNDS):
             edges = [e for e in self.graph.edges if e[0] in deep or not moving.isdisjoint(e)]
             if n:
                 pairs = [e for e in edges if e[0] < e[1] and not moving.isdisjoint(e)]
-                self.graph.measure(self.graph.stale(pairs, c.remeasure), fine=False)
+                self.graph.measure(self.graph.stale(pairs, REMEASURE), fine=False)
             self.graph.adjust(
-                edges, poses, depths, BundleOptions(iterations=c.local_iterations, huber=c.huber)
+                edges, poses, depths, BundleOptions(iterations=ITERATIONS, huber=HUBER)
             )
             if n == 0:
-                self.graph.judge_moving(deep, c.moving)
-            if n >= c.local_rounds - priors.config.rounds:
-                priors.adjust(depths, c.huber)
+                self.graph.judge_moving(deep, self.config.moving)
+            if n == ROUNDS - 1:
+                priors.adjust(depths)
         self.graph.release(moving)
 
     def _cull(self) -> tuple[int, ...]:
@@ -126,30 +141,7 @@ class LocalMapping:
         if stands_alone([self.keyframes[k] for k in ids[-3:]]):
             return ()
         distance = frame_distances(self.keyframes, [(before, id), (id, before)]).mean()
-        if float(distance) >= self.config.cull_distance * self._long_edge:
+        if float(distance) >= CULL_DISTANCE * self._long_edge:
             return ()
         self.map.cull(id, before)
         return (id,)
-
-
-def window_length(keyframes: Sequence[Keyframe], least: int, most: int, baseline: float) -> int:
-    """How many of the latest keyframes are adjusted together, earliest of all first.
-
-    As many as it takes until the camera has moved from one of them to the newest by ``baseline`` of
-    the newest's median depth, so that together they say something about depth: a camera that
-    turns makes many keyframes at one position. Between ``least`` and ``most``, or all there are.
-    """
-    count = min(least, len(keyframes))
-    if baseline == 0 or count == len(keyframes):
-        return count
-    newest = keyframes[-1]
-    known = newest.information > 0
-    if not bool(known.any()):
-        return count
-    far = baseline / float(newest.inverse_depth[known].median().clamp(min=1e-9))
-    here = se3_inverse(newest.T_cw)[:3, 3]
-    for back in range(1, min(most, len(keyframes)) + 1):
-        there = se3_inverse(keyframes[-back].T_cw)[:3, 3]
-        if float(torch.linalg.norm(there - here)) >= far:
-            return max(count, back)
-    return max(count, min(most, len(keyframes)))

@@ -5,14 +5,27 @@ from typing import Any
 
 import torch
 
-from geogs.config import TrackingConfig
-from geogs.tracking.motion import FrameLocator, FrameMotion, Recognition
+from geogs.tracking.motion import (
+    MIN_KNOWN,
+    MIN_MATCHED,
+    MIN_NCC,
+    FrameLocator,
+    FrameMotion,
+    Recognition,
+)
 from geogs.tracking.orientation_chain import Followed
 from geogs.tracking.segment_map import SegmentMap
 from geogs.tracking.view_choice import seeing
 from geogs.types import Frame
 from geogs.world.keyframes import Keyframe
 
+MAX_RESIDUAL = 0.008
+"""The camera is lost when the median reprojection error exceeds this, of the long edge."""
+RECOGNISED = 0.25
+"""A keyframe that an image was recognised as counts if this fraction of it finds a match: twice
+what is asked where the camera was expected."""
+TRIED = 5
+"""Recent keyframes, and as many older ones in turn, tried when the camera is lost."""
 RELOCALISE_EVERY = 5
 """While a camera only rotates, its orientation says what it sees; only every so many frames it is
 searched for as if it could be anywhere."""
@@ -21,13 +34,11 @@ searched for as if it could be anywhere."""
 class Localiser:
     """Locates frames at the keyframes of a segment."""
 
-    def __init__(self, map: SegmentMap, config: TrackingConfig) -> None:
-        self.map, self.config = map, config
+    def __init__(self, map: SegmentMap) -> None:
+        self.map = map
         grid = map.keyframes.grid
         edge = max(grid.camera.width, grid.camera.height)
-        self.locator = FrameLocator(
-            grid, map.operator, config.min_matched, config.max_residual * edge, config.min_ncc
-        )
+        self.locator = FrameLocator(grid, map.operator, MIN_MATCHED, MAX_RESIDUAL * edge, MIN_NCC)
 
     def track(self, frame: Frame, encoded: Any) -> FrameMotion | None:
         """The frame near where the last one was; None if the camera is not there."""
@@ -63,7 +74,7 @@ class Localiser:
     def recognise(self, encoded: Any, recognised: Sequence[Recognition]) -> FrameMotion | None:
         """The frame at one of some keyframes that look like it.
 
-        One is believed where the dense flow agrees with it over ``recognised`` of the cells.
+        One is believed where the dense flow agrees with it over ``RECOGNISED`` of the cells.
         """
         for candidate in recognised:
             if candidate.keyframe not in self.map.keyframes:
@@ -72,17 +83,16 @@ class Localiser:
             guess = candidate.T_rel.to(keyframe.T_cw) @ keyframe.T_cw
             motion = self.locator.locate(keyframe, encoded, guess, is_expected=False)
             motion = self._with_depth(motion)
-            if motion is not None and motion.matched >= self.config.recognised:
+            if motion is not None and motion.matched >= RECOGNISED:
                 return motion
         return None
 
     def _with_depth(self, motion: FrameMotion | None) -> FrameMotion | None:
         """A motion that enough cells of known depth say."""
-        return None if motion is None or motion.known < self.config.min_known else motion
+        return None if motion is None or motion.known < MIN_KNOWN else motion
 
     def _candidates(self, keyframes: list[Keyframe]) -> list[Keyframe]:
         """Where to search for a lost camera: recent keyframes, and older ones by turns."""
-        count = self.config.relocalise
-        recent, older = keyframes[: -count - 1 : -1], keyframes[:-count]
-        first = (self.map.segment.status.misses * count) % max(len(older), 1)
-        return recent + (older[first:] + older[:first])[:count]
+        recent, older = keyframes[: -TRIED - 1 : -1], keyframes[:-TRIED]
+        first = (self.map.segment.status.misses * TRIED) % max(len(older), 1)
+        return recent + (older[first:] + older[:first])[:TRIED]

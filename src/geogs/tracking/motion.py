@@ -26,6 +26,18 @@ from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import Keyframe
 from geogs.world.segments import ChainedPositions
 
+MIN_TEXTURE = 0.05
+"""A frame is skipped when less than this fraction of it has structure."""
+MIN_MATCHED = 0.12
+"""The camera is lost when less than this fraction of a keyframe finds a match."""
+MIN_KNOWN = 0.1
+"""Where the camera is cannot be told when the depth of less than this fraction of a keyframe is
+known to 30 % and found in the image: then it is followed as if it only rotated."""
+MIN_NCC = 0.5
+"""A frame counts as located where the images agree: least median correlation (NCC) of windows of
+9 x 9 pixels, reprojected by pose and depth. Unlike images come to 0, one place to 0.7 and more.
+Where too few windows have texture the flow alone decides whether the camera is still where it was
+followed to; a map is never started, nor a camera found again, without evidence."""
 FIT_ITERATIONS = 6
 """Steps of the motion-only adjustment of a frame."""
 FIT_HUBER = 5.0
@@ -206,10 +218,9 @@ class ChainedMatch:
 class FlowChain:
     """Follows the flow from a first image through those after it, each starting from the last."""
 
-    def __init__(self, grid: SampleGrid, operator: FlowOperator, min_ncc: float) -> None:
+    def __init__(self, grid: SampleGrid, operator: FlowOperator) -> None:
         self.grid = grid
         self.operator = operator
-        self.min_ncc = min_ncc
 
     def follow(self, chain: ChainedPositions, first: Any, encoded: Any) -> ChainedMatch:
         """Match the first image with the next one, from where ``chain`` has come to."""
@@ -222,7 +233,7 @@ class FlowChain:
         # All at once, so that a GPU is waited for once.
         found = torch.cat([moved, seen]).cpu()
         matched, flow = found[:2].tolist()
-        if not Evidence.of(found[2:]).bears_out(self.min_ncc, is_expected=True):
+        if not Evidence.of(found[2:]).bears_out(MIN_NCC, is_expected=True):
             matched = 0.0
         if matched > 0:
             chain.there = filled_positions(self.grid, there)[None]

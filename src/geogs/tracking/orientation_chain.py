@@ -10,7 +10,7 @@ from torch import Tensor
 from geogs.config import TrackingConfig
 from geogs.tracking.flow.base import FlowOperator
 from geogs.tracking.keyframe_choice import calls_for_keyframe
-from geogs.tracking.motion import FlowChain
+from geogs.tracking.motion import MIN_MATCHED, FlowChain
 from geogs.tracking.rotation import relative_rotation
 from geogs.types import Frame
 from geogs.world.frames import RelativeRotation
@@ -41,7 +41,7 @@ class OrientationFollower:
 
     def __init__(self, grid: SampleGrid, operator: FlowOperator, config: TrackingConfig) -> None:
         self.grid, self.operator, self.config = grid, operator, config
-        self._flow = FlowChain(grid, operator, config.min_ncc)
+        self._flow = FlowChain(grid, operator)
 
     def located(self, track: OrientationTrack, frame: Frame, encoded: Any) -> None:
         """The frame has a pose: what follows may be matched with it."""
@@ -58,7 +58,7 @@ class OrientationFollower:
             view.encoded = self.operator.encode(view.image)
         match = self._flow.follow(track.flow, view.encoded, encoded)
         found = None
-        if match.matched >= self.config.min_matched:
+        if match.matched >= MIN_MATCHED:
             found = relative_rotation(self.grid, match.there)
         if found is None:
             track.misses += 1

@@ -13,6 +13,8 @@ from geogs.tracking.overlap import alike_in_size, may_overlap
 from geogs.world.edges import Pair
 from geogs.world.keyframes import KeyframeSet
 
+RADIUS = 3
+"""Every keyframe is matched with this many before it, as in DROID-SLAM."""
 PAIRS_TOGETHER = 512, 8192
 """Directed pairs that are projected at a time, on the CPU and on a GPU; bounds memory."""
 

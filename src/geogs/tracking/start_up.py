@@ -12,7 +12,7 @@ from geogs.tracking.chained_flows import ChainedFlows
 from geogs.tracking.early_frames import place_between_keyframes
 from geogs.tracking.initialise import Attempt, initialise
 from geogs.tracking.keyframe_choice import KeyframeChoice
-from geogs.tracking.motion import FlowChain
+from geogs.tracking.motion import MIN_KNOWN, MIN_MATCHED, FlowChain
 from geogs.tracking.rotation import relative_rotation
 from geogs.tracking.segment_map import SegmentMap
 from geogs.types import FlowMatch, Frame
@@ -21,6 +21,9 @@ from geogs.world.grid import SampleGrid
 from geogs.world.segments import TrackState
 
 MIN_KEYFRAMES = 4
+MIN_OVERLAP = 0.3
+"""While the map cannot be started: fraction of the first keyframe that the last has to see still
+for the first to be kept."""
 MAX_MISSES = 5
 """Frames without a match after which a start that has not succeeded begins anew."""
 MORE = 0.25
@@ -35,7 +38,7 @@ class StartUp:
         self.keyframes = map.keyframes
         self._grid = SampleGrid(map.keyframes.grid.camera)
         """On the CPU, where rotations are measured."""
-        self._chain = FlowChain(map.keyframes.grid, map.operator, config.min_ncc)
+        self._chain = FlowChain(map.keyframes.grid, map.operator)
         self._flows = ChainedFlows(map.graph)
         self._progress = map.segment.start
 
@@ -55,7 +58,7 @@ class StartUp:
             return self._gather(frame, encoded, rotations)
         last = list(self.keyframes)[-1]
         match = self._chain.follow(self._progress.flow, last.encoded, encoded)
-        if match.matched < self.config.min_matched:
+        if match.matched < MIN_MATCHED:
             return self._miss(frame, encoded, rotations)
         self._progress.misses = 0
         there = FlowMatch(match.there.pixels.cpu(), match.there.weight.cpu())
@@ -77,7 +80,7 @@ class StartUp:
         if attempt is not Attempt.STARTED:
             return False
         self._flows.forget()
-        self.map.priors.adjust(self.keyframes.ids, self.config.huber)
+        self.map.priors.adjust(self.keyframes.ids)
         place_between_keyframes(self.map.recorder.log, self.keyframes)
         self.map.segment.status.state = TrackState.TRACKING
         return True
@@ -105,7 +108,7 @@ class StartUp:
         """
         earlier = self.keyframes.ids
         keyframe = self.map.add(frame, encoded)
-        if not self.map.sensing.start(keyframe, frame.depth, self.config.min_known):
+        if not self.map.sensing.start(keyframe, frame.depth, MIN_KNOWN):
             self.keyframes.remove(keyframe.id)
             return None
         given_up = self._forget(earlier)
@@ -137,7 +140,7 @@ class StartUp:
         if count < 2 * wanted:
             return ()
         overlap = float((self._flows.measure()[-1].weight > 0).float().mean())
-        if overlap >= self.config.start_overlap:
+        if overlap >= MIN_OVERLAP:
             return self._thin_out()
         return self._forget(self.keyframes.ids[: count // 2])
 

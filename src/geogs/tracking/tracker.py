@@ -20,7 +20,7 @@ from geogs.tracking.follower import Follower
 from geogs.tracking.keyframe_choice import KeyframeChoice
 from geogs.tracking.local_mapping import LocalMapping
 from geogs.tracking.localisation import Localiser
-from geogs.tracking.motion import FrameMotion, Recognition
+from geogs.tracking.motion import MIN_KNOWN, MIN_TEXTURE, FrameMotion, Recognition
 from geogs.tracking.orientation_chain import Followed, OrientationFollower
 from geogs.tracking.pose_deviation import PoseDeviation, pose_deviation
 from geogs.tracking.segment_map import SegmentMap
@@ -81,7 +81,7 @@ class Tracker:
             self.config, max(camera.width, camera.height), segment.sharpness
         )
         self._start_up = StartUp(self.map, self._choice, self.config)
-        self._localiser = Localiser(self.map, self.config)
+        self._localiser = Localiser(self.map)
         self._orientation = OrientationFollower(grid, operator, self.config)
         self.local = LocalMapping(self.map, self.config)
         self._motion: FrameMotion | None = None
@@ -136,7 +136,7 @@ class Tracker:
         self.map.recorder.note_rows(frame)
         encoded = self.map.operator.encode(frame.image)
         self._choice.see(frame.image)
-        if self.map.operator.texture(encoded) < self.config.min_texture:
+        if self.map.operator.texture(encoded) < MIN_TEXTURE:
             return self._lose(frame)
         if not status.has_map:
             return self._initialise(frame, encoded)
@@ -261,7 +261,7 @@ class Tracker:
         """The map has just been started."""
         self.map.odometry.look()
         locator, keyframes = self._localiser.locator, self.keyframes
-        locate_early_frames(self.map.recorder, keyframes, locator, self.config.min_known)
+        locate_early_frames(self.map.recorder, keyframes, locator, MIN_KNOWN)
         newest = keyframes[keyframes.ids[-1]]
         self.segment.status.last = _at(newest, newest.timestamp)
 

@@ -22,7 +22,7 @@ from geogs.bundle.streamed import StreamedBundle
 from geogs.config import Config
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import move
-from geogs.loop.global_bundle import SETTLED, global_options
+from geogs.loop.global_bundle import ROUNDS, SETTLED, global_options
 from geogs.threads import on_one_torch_thread
 from geogs.tracking.flow.select import build_operator
 from geogs.tracking.graph import FrameGraph
@@ -83,7 +83,7 @@ def adjusted(
     }
     adjustment = _Adjustment(now, _beside(gauge), camera, config, workers, folder)
     folder.mkdir(parents=True, exist_ok=True)
-    for _ in range(config.tracking.global_rounds):
+    for _ in range(ROUNDS):
         if adjustment.match() <= SETTLED * adjustment.pairs:
             break
         adjustment.solve()
@@ -146,7 +146,7 @@ class _Adjustment:
         free = torch.arange(self.keyframes) > 0
         source, target = source[order], target[order]
         system = SparseCameraSystem(torch.from_numpy(source), torch.from_numpy(target), free)
-        options = global_options(self.config.tracking)
+        options = global_options()
         T, step = self._poses(), None
         for _ in range(options.iterations):
             system.clear()
@@ -203,7 +203,7 @@ def follow(job: StepJob) -> PoseSums | None:
 
     By the numbers of the whole; nothing where there is no next.
     """
-    grid, options = SampleGrid(job.camera), global_options(job.config.tracking)
+    grid, options = SampleGrid(job.camera), global_options()
     graph, nodes = _known_graph(job, grid)
     own = graph.keyframes.ids[: len(job.own.T_cw)]
     problem, ids = graph.streamed_problem(list(graph.edges), [], own)

@@ -10,14 +10,20 @@ from jaxtyping import Bool, Float, Float16, Float32, Int, Int16
 from torch import Tensor
 
 from geogs.application.results.saved_result import SavedResult
-from geogs.config import Config, TrackingConfig
+from geogs.config import Config
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_inverse
-from geogs.loop.global_bundle import MATCHED_TOGETHER
+from geogs.loop.global_bundle import (
+    MATCHED_TOGETHER,
+    MAX_DISTANCE,
+    PAIRS,
+    REMEASURE,
+    SUPPRESSION,
+)
 from geogs.threads import on_one_torch_thread
 from geogs.tracking.flow.select import build_operator
 from geogs.tracking.graph import FrameGraph
-from geogs.tracking.proximity import proximity_pairs
+from geogs.tracking.proximity import RADIUS, proximity_pairs
 from geogs.tracking.row_errors import RowErrors, edge_shifts
 from geogs.world.edges import PackedEdge, Pair, in_steps
 from geogs.world.grid import SampleGrid
@@ -196,10 +202,10 @@ def match(
         for place, keyframe in loaded.items():
             depths.give(keyframe, place)
             ids[member.number, place] = keyframe.id
-    graph, c = FrameGraph(segment, operator), config.tracking
+    graph = FrameGraph(segment, operator)
     graph.edges.update({(ids[a], ids[b]): edge for (a, b), edge in known.items()})
-    pairs = graph.pairs if known else _pairs(graph, len(own.T_cw), c)
-    stale = sorted(graph.stale(pairs, c.global_remeasure))
+    pairs = graph.pairs if known else _pairs(graph, len(own.T_cw))
+    stale = sorted(graph.stale(pairs, REMEASURE))
     for start in range(0, len(stale), MATCHED_TOGETHER[0]):
         graph.measure(stale[start : start + MATCHED_TOGETHER[0]], packed=True)
     node = {id: n for n, id in ids.items()}
@@ -257,14 +263,14 @@ def _row_errors(
     return found
 
 
-def _pairs(graph: FrameGraph, own: int, c: TrackingConfig) -> list[Pair]:
+def _pairs(graph: FrameGraph, own: int) -> list[Pair]:
     """Pairs within a part, and of it with others, whose keyframes come behind its own."""
     segment, camera = graph.keyframes, graph.keyframes.grid.camera
     first, others = segment.ids[:own], segment.ids[own:]
-    limit, count = c.global_distance * max(camera.width, camera.height), c.global_pairs * own
-    found = proximity_pairs(segment, first, first, [], c.radius, c.global_suppression, limit, count)
+    limit, count = MAX_DISTANCE * max(camera.width, camera.height), PAIRS * own
+    found = proximity_pairs(segment, first, first, [], RADIUS, SUPPRESSION, limit, count)
     if others:
-        found += proximity_pairs(segment, others, first, [], 0, c.global_suppression, limit, count)
+        found += proximity_pairs(segment, others, first, [], 0, SUPPRESSION, limit, count)
     return found
 
 

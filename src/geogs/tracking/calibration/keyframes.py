@@ -14,15 +14,10 @@ from geogs.tracking.features import surer_flows
 from geogs.tracking.flow.base import FlowOperator
 from geogs.tracking.flow.filled import filled_flow, filled_positions
 from geogs.tracking.keyframe_choice import calls_for_keyframe
-from geogs.tracking.motion import FlowChain
+from geogs.tracking.motion import MIN_MATCHED, MIN_TEXTURE, FlowChain
 from geogs.types import FlowMatch, Frame
 from geogs.world.grid import SampleGrid
 from geogs.world.segments import ChainedPositions
-
-MIN_MATCHED = 0.12
-"""Share of a keyframe's cells that must be found in the next one."""
-MIN_TEXTURE = 0.05
-"""Share of a frame that must have structure."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +36,7 @@ class ViewGatherer:
     def __init__(self, frames: Iterator[Frame], grid: SampleGrid, operator: FlowOperator) -> None:
         self._frames, self._grid, self._operator = frames, grid, operator
         self._config = TrackingConfig()
-        self._chain = FlowChain(grid, operator, self._config.min_ncc)
+        self._chain = FlowChain(grid, operator)
         self._positions = ChainedPositions()
         self.frames = 0
         """Frames taken so far."""
