@@ -1,9 +1,8 @@
 """Settings of poses beside the images: how far their relative motion is believed."""
 
 from dataclasses import dataclass
-from typing import Annotated
 
-from geogs.config.setting import Positive, Range, Settings, Share
+from geogs.config.setting import Positive, Settings, Share
 
 
 @dataclass(frozen=True)
@@ -11,14 +10,10 @@ class OdometryConfig(Settings, group="odometry"):
     """The noise of measured motions between keyframes, where ``input.poses`` uses them.
 
     The deviation along each axis of a motion by s metres is the root of ``deviation^2 +
-    (drift s)^2``, that of its rotation about each axis of ``rotation^2 + (rotation_drift s)^2``.
+    (drift s)^2``.
     """
 
     deviation: Positive = 0.003
     """Metres by which a position may be off from one keyframe to the next, however near."""
     drift: Share = 0.01
     """Fraction of the distance that is wrong besides."""
-    rotation: Annotated[float, Range(above=0, most=90)] = 0.15
-    """Degrees by which an orientation may be off, however near ..."""
-    rotation_drift: Annotated[float, Range(0, 90)] = 0.3
-    """... and what is added with each metre."""

@@ -18,8 +18,6 @@ class PriorConfig(Settings, group="prior"):
     """Another network for normals, where the first has none: a file."""
     normal_card: str = ""
     """What that one wants and gives."""
-    depth: bool = True
-    """Adjust the tracker's depth with the prior's; normals count by mapping.loss.normal_weight."""
     scale_rows: Annotated[int, Range(2, 64)] = 8
     """Nodes of the scale field from top to bottom."""
     scale_columns: Annotated[int, Range(2, 64)] = 10

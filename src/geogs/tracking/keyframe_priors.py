@@ -43,7 +43,7 @@ class KeyframePriors:
         maps, grid = self.prior.predict(state.image), self.graph.keyframes.grid
         if maps.normal is not None:
             state.prior_normal = self._facing(maps.normal.cpu())
-        if maps.depth is not None and self.config.depth and state.measured is None:
+        if maps.depth is not None and state.measured is None:
             values = on_cells(grid, maps.depth.to(grid.device))
             zero = torch.zeros_like(values)
             one = values.new_ones(self.config.scale_rows * self.config.scale_columns)
