@@ -10,7 +10,7 @@ from geogs.io.writers.keyframe_folder import rows_path, write_rows
 from geogs.shutter.rows import CELL
 from geogs.tracking.row_errors import RowErrors
 from geogs.types import SeenRows
-from geogs.world.edges import position_step
+from geogs.world.edges import position_step, unpacked_positions
 from geogs.world.grid import SampleGrid
 from geogs_fleet.join.matches import Matches, Member, match
 from geogs_fleet.join.part import Part, PartViews, describe
@@ -57,7 +57,9 @@ def test_rows_are_corrected_as_within_a_run(tmp_path):
     errors = RowErrors(GRID, dict.fromkeys(middle, rows()), frames, result.trajectory)
     source, target = found.ends[:, 1], found.ends[:, 3]
     T, depth = member.T_cw, member.depths().inverse
-    plain = [edge.pixels for edge in found.edges(as_found=True).values()]
+    plain = [
+        unpacked_positions(GRID, edge.position) for edge in found.edges(as_found=True).values()
+    ]
     shift = errors.of_matches(
         [middle[n] for n in source], [middle[n] for n in target],
         T[target] @ se3_inverse(T[source]), GRID.rays, depth[source], torch.stack(plain),
@@ -65,7 +67,9 @@ def test_rows_are_corrected_as_within_a_run(tmp_path):
     step = position_step(CAMERA)
     assert float(shift.norm(dim=-1).median()) > 0.05  # pixels
     assert np.array_equal(found.shift, (shift / step).round().short().numpy())
-    corrected = torch.stack([edge.pixels for edge in found.edges().values()])
+    corrected = torch.stack(
+        [unpacked_positions(GRID, edge.position) for edge in found.edges().values()]
+    )
     assert float((corrected - torch.stack(plain) - shift).abs().max()) < 0.51 * step
 
 
