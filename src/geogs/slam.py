@@ -236,7 +236,7 @@ class Slam:
         """
         if self._told_scale is not None or not self.segments.main.segment.is_metric:
             return self._told_scale
-        return MetricScale("depth sensor", 1.0, self.config.sensor.share)
+        return MetricScale("depth sensor", 1.0, self.config.sensor.ratio)
 
     @property
     def will_refine(self) -> bool:

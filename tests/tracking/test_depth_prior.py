@@ -13,6 +13,7 @@ from geogs.geometry.lie import se3_exp
 from geogs.priors.alignment import align_inverse_depth
 from geogs.priors.base import DepthKind
 from geogs.tracking.depth_prior import (
+    DEVIATION,
     FlowEvidence,
     ScaledPrior,
     adjust_depth,
@@ -180,7 +181,7 @@ def test_a_prior_that_is_wrong_in_places_is_not_used_there():
     error = (adjusted.inverse_depth / exact.inverse_depth - 1).abs()
     assert float(error.max()) < 0.05
     right = grid.pixels[:, 0] < 30
-    usual = 1 / (TWO.deviation * exact.inverse_depth) ** 2
+    usual = 1 / (DEVIATION * exact.inverse_depth) ** 2
     assert float((adjusted.information / usual)[:, wrong].max()) < 0.05
     assert float((adjusted.information / usual)[:, right].mean()) > 0.3
 
