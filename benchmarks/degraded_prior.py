@@ -10,8 +10,9 @@ import torch
 from jaxtyping import Float32, UInt8
 
 from geogs.priors.base import DepthKind, PriorMaps
-from geogs_synth.raycast.raycaster import View
-from geogs_synth.scene.scene import BOX, Scene
+from geogs_synth.raycast.raycaster import RenderedView
+from geogs_synth.scene.scene import Scene
+from geogs_synth.scene.solids import BOX
 from geogs_synth.textures.patterns import fractal_noise
 
 
@@ -52,7 +53,7 @@ class DegradedPrior:
 
     def __init__(
         self,
-        views: Iterable[View],
+        views: Iterable[RenderedView],
         errors: PriorErrors = PLAUSIBLE,
         kind: DepthKind = DepthKind.SCALE_FREE,
         seed: int = 0,
@@ -109,8 +110,9 @@ class DegradedPrior:
 
 def with_bare_walls(scene: Scene) -> Scene:
     """The same room with its walls painted in one colour each, so that they have no texture."""
-    rectangle = (scene.kind == BOX) & (scene.half[:, 2] == 0)
-    upright = np.abs(scene.rotation[:, 2, 2]) < 0.5
+    s = scene.solids
+    rectangle = (s.kind == BOX) & (s.half[:, 2] == 0)
+    upright = np.abs(s.rotation[:, 2, 2]) < 0.5
     textures = list(scene.textures)
     for k in np.unique(scene.face_texture[rectangle & upright]):
         image = textures[k].image

@@ -30,8 +30,8 @@ from geogs_synth.motion.handheld import handheld_trajectory
 from geogs_synth.places.room import make_room
 from geogs_synth.raycast.raycaster import Raycaster
 from geogs_synth.scene.scene import Scene
-from geogs_synth.sequence.stage import centred_camera
-from geogs_train.depth.scores import KINDS, texture_kind
+from geogs_synth.sequence.location import centred_camera
+from geogs_train.depth.depth_scores import KINDS, texture_kind
 
 STEP = 6
 """Frames between keyframes: 0.2 s."""

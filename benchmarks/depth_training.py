@@ -14,9 +14,9 @@ from dataclasses import replace
 import torch
 
 from geogs_train.course import Worker
-from geogs_train.depth.course import DepthCourse
-from geogs_train.depth.options import DepthTraining, PoolOptions
-from geogs_train.trainer import Trainer
+from geogs_train.depth.depth_course import DepthCourse
+from geogs_train.depth.depth_options import DepthTraining, PoolOptions
+from geogs_train.network_trainer import Trainer
 
 
 def main() -> None:

@@ -36,7 +36,7 @@ from geogs.types import Trajectory
 from geogs_fleet.cluster import ray_cluster
 from geogs_fleet.run import run_fleet
 from geogs_fleet.settings import FleetSettings
-from geogs_synth.sequence.export import default_camera
+from geogs_synth.sequence.location import centred_camera
 from long_walk import render
 from portals import SuiteRaycaster
 from suite import Suite
@@ -160,7 +160,7 @@ def gpus(options: argparse.Namespace) -> None:
 
 def join(options: argparse.Namespace) -> None:
     """A walk through many rooms as one run, and as overlapping parts that are joined."""
-    suite, camera = Suite.for_walk(options.walk), default_camera(512, 288)
+    suite, camera = Suite.for_walk(options.walk), centred_camera(512, 288)
     images = options.folder / f"{suite.rooms}-rooms"
     frames = range(0, options.walk, options.every)
     render(suite, camera, images, frames)

@@ -26,11 +26,11 @@ from geogs.networks.weights_files import PACKAGED
 from geogs.tracking.flow.classical import ClassicalFlow
 from geogs.tracking.flow.own import OwnFlowOptions, load_network
 from geogs.world.grid import SampleGrid
-from geogs_synth.clips.kinds import only_scene
 from geogs_synth.clips.sampler import RoomSampler
+from geogs_synth.clips.scene_kinds import only_scene
+from geogs_train.flow_options import FlowTraining
+from geogs_train.flow_pairs import FlowBatch, flow_batch
 from geogs_train.objective import run_network
-from geogs_train.options import FlowTraining
-from geogs_train.pairs import FlowBatch, flow_batch
 from geogs_train.starts import StartOptions
 
 EDGES = 6

@@ -31,7 +31,7 @@ from geogs.loop import global_bundle as settings
 from geogs.loop.global_bundle import global_bundle, global_pairs
 from geogs.tracking.tracker import Tracker, lone_tracker
 from geogs.world.segments import TrackState
-from geogs_synth.sequence.export import default_camera
+from geogs_synth.sequence.location import centred_camera
 from planted_walk import CAMERA, drift, planted_tracker
 from suite import Suite
 
@@ -73,7 +73,7 @@ def through_rooms(count: int) -> None:
     """Pairs and camera system of a walk through many rooms in this process."""
     torch.set_num_threads(1)
     walk = Suite.for_walk(12_000).walk(20_000, 0.6)
-    tracker = lone_tracker(default_camera(512, 288))
+    tracker = lone_tracker(centred_camera(512, 288))
     tracker.segment.status.state = TrackState.TRACKING
     for n, at in enumerate(np.linspace(0, len(walk) - 1, count).astype(int)):
         T_cw = torch.from_numpy(np.linalg.inv(walk[at]))

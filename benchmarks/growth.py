@@ -28,7 +28,7 @@ from geogs.tracking.flow.classical import ClassicalFlow
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import KeyframeTable
 from geogs.world.loops import Features, RelativePoses
-from geogs_synth.sequence.export import default_camera
+from geogs_synth.sequence.location import centred_camera
 
 STEP = 0.15
 LOOPS = 100
@@ -71,7 +71,7 @@ def way(count: int) -> torch.Tensor:
 
 def mapping(count: int, size: tuple[int, int]) -> dict[str, float]:
     """Steps of the mapper, and what the main thread does for the search of loops."""
-    camera, random = default_camera(*size), np.random.default_rng(0)
+    camera, random = centred_camera(*size), np.random.default_rng(0)
     grid = SampleGrid(camera)
     store = KeyframeTable.on(grid, ClassicalFlow(grid).encode, 128)
     segment, mapper = store.new_set(), Mapper(store, preset("fast").mapping)

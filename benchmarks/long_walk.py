@@ -38,7 +38,7 @@ from geogs.geometry.camera import Camera
 from geogs.mesh.extract import extract_mesh
 from geogs.slam import Slam
 from geogs.types import Frame, Trajectory
-from geogs_synth.sequence.export import default_camera
+from geogs_synth.sequence.location import centred_camera
 from portals import SuiteRaycaster
 from suite import Suite
 
@@ -77,7 +77,7 @@ class Block:
 def main() -> None:
     options = parse()
     suite = Suite.for_walk(round(options.pace * (options.walk or options.frames)))
-    camera = default_camera(*options.size)
+    camera = centred_camera(*options.size)
     name = f"{suite.rooms}-rooms-{camera.width}x{camera.height}"
     folder = options.folder / (name if options.pace == 1 else f"{name}-{options.pace:g}")
     rendered = min(options.images or options.frames, options.frames)

@@ -56,10 +56,10 @@ from geogs.world.loops import RelativePoses
 from geogs_synth.motion.handheld import FRAMES_PER_LAP, handheld_trajectory
 from geogs_synth.places.room import make_room
 from geogs_synth.raycast.raycaster import Raycaster
-from geogs_synth.sequence.export import default_camera
-from geogs_synth.sequence.tessellation import SeenSurface, scene_mesh
+from geogs_synth.sequence.location import centred_camera
+from geogs_synth.sequence.scene_mesh import SeenSurface, scene_mesh
 
-CAMERA = default_camera(320, 240)
+CAMERA = centred_camera(320, 240)
 EVERY = 4
 """Frames from keyframe to keyframe."""
 LAP = FRAMES_PER_LAP // EVERY

@@ -42,7 +42,7 @@ from geogs.world.keyframes import KeyframeSet, KeyframeTable
 from geogs_synth.motion.handheld import handheld_trajectory
 from geogs_synth.places.room import make_room
 from geogs_synth.raycast.raycaster import Raycaster
-from geogs_synth.sequence.export import default_camera
+from geogs_synth.sequence.location import centred_camera
 
 FRAMES_APART = 6
 """Frames between two views on the path."""
@@ -78,7 +78,7 @@ class Window:
 
     @staticmethod
     def make(views: int, disks: int, width: int, height: int, device: torch.device) -> "Window":
-        photo = default_camera(2 * width, 2 * height)
+        photo = centred_camera(2 * width, 2 * height)
         cameras = MapCameras(photo, photo.with_long_edge(max(width, height)), photo)
         scene = make_room(0)
         caster, poses = Raycaster(scene), handheld_trajectory(scene, FRAMES_APART * views)

@@ -30,12 +30,12 @@ from geogs.world.keyframes import KeyframeTable
 from geogs_synth.motion.handheld import handheld_trajectory
 from geogs_synth.places.room import make_room
 from geogs_synth.raycast.raycaster import Raycaster
-from geogs_synth.sequence.export import default_camera
+from geogs_synth.sequence.location import centred_camera
 
 
 def make_views(config: MappingConfig, width: int) -> tuple[list[MapView], MapCameras]:
     """Keyframes of a synthetic room with their true depth as prior."""
-    photo = default_camera(2 * width, 3 * width // 2)
+    photo = centred_camera(2 * width, 3 * width // 2)
     cameras = MapCameras(photo, photo.with_long_edge(width), photo)
     scene = make_room(0)
     caster = Raycaster(scene)

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
 from geogs.geometry.camera import Camera
-from geogs_synth.raycast.raycaster import Raycaster, View
+from geogs_synth.raycast.raycaster import Raycaster, RenderedView
 from suite import Suite
 
 _ROOMS_IN_MEMORY = 6
@@ -47,7 +47,7 @@ class SuiteRaycaster:
             depth[window][open_] = np.where(np.isfinite(found), found, 0)[open_]
         return image, depth
 
-    def _room(self, room: int, camera: Camera, T_wc: Float64[np.ndarray, "4 4"]) -> View:
+    def _room(self, room: int, camera: Camera, T_wc: Float64[np.ndarray, "4 4"]) -> RenderedView:
         if room not in self._casters:
             self._casters[room] = Raycaster(self.suite.room(room), self.threads)
         self._casters.move_to_end(room)

@@ -5,7 +5,7 @@
 
 Rooms whose walls are painted in one colour are tracked without a prior, with one that errs as
 networks do, and with one that is wrong by a factor of two and more in a third of each image (see
-``geogs_synth.prior``). Depth errors are relative, over the tracker's grid of all keyframes but the
+``degraded_prior.py``). Depth errors are relative, over the tracker's grid of all keyframes but the
 first and last, after the similarity that aligns the trajectory. With ``--map`` the whole system
 runs, and the errors are those of the depth and normals of the map seen from all keyframes.
 """
@@ -33,7 +33,7 @@ from geogs.types import Frame
 from geogs.world.grid import OFFSET, STRIDE
 from geogs_synth.motion.handheld import handheld_trajectory
 from geogs_synth.places.room import make_room
-from geogs_synth.raycast.raycaster import Raycaster, View
+from geogs_synth.raycast.raycaster import Raycaster, RenderedView
 
 PRIORS = {"none": None, "good": PLAUSIBLE, "patchy": PATCHY, "bad": BAD}
 
@@ -43,7 +43,7 @@ class Walk:
     """Views along a path."""
 
     camera: Camera
-    views: list[View]
+    views: list[RenderedView]
     T_wc: np.ndarray
 
 

@@ -13,7 +13,7 @@ from geogs.tracking.flow.classical import ClassicalFlow
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import KeyframeSet, KeyframeTable
 from geogs_synth.places.room import make_room
-from geogs_synth.raycast.raycaster import Raycaster, View
+from geogs_synth.raycast.raycaster import Raycaster, RenderedView
 from geogs_synth.scene.scene import Scene
 
 CAMERA = Camera(fx=260.0, fy=260.0, cx=191.5, cy=143.5, width=384, height=288)
@@ -40,7 +40,7 @@ def at_angle(scene: Scene, angle: float) -> np.ndarray:
     return T
 
 
-def views(scene: Scene, poses: Sequence[np.ndarray]) -> list[View]:
+def views(scene: Scene, poses: Sequence[np.ndarray]) -> list[RenderedView]:
     """Rendered with one thread."""
     return _rendered(Raycaster(scene, threads=1), poses)
 
@@ -51,33 +51,36 @@ def room(seed: int = 0) -> Raycaster:
     return Raycaster(make_room(seed), threads=1)
 
 
-def room_views(seed: int, poses: Sequence[np.ndarray]) -> list[View]:
+def room_views(seed: int, poses: Sequence[np.ndarray]) -> list[RenderedView]:
     """What cameras see of :func:`room`."""
     return _rendered(room(seed), poses)
 
 
-def _rendered(caster: Raycaster, poses: Sequence[np.ndarray]) -> list[View]:
+def _rendered(caster: Raycaster, poses: Sequence[np.ndarray]) -> list[RenderedView]:
     return [caster.render(CAMERA, T) for T in poses]
 
 
 def stretched(scene: Scene, factor: float) -> Scene:
     """The same room with everything longer along y: its pictures show the same things."""
     f = np.array([1.0, factor, 1.0])
-    along = np.abs(np.einsum("nij,i->nj", scene.rotation, np.array([0.0, 1.0, 0.0])))
-    half = scene.half * (1 + (factor - 1) * along**2)
-    return replace(scene, size=scene.size * f, centre=scene.centre * f, half=half)
+    s = scene.solids
+    along = np.abs(np.einsum("nij,i->nj", s.rotation, np.array([0.0, 1.0, 0.0])))
+    half = s.half * (1 + (factor - 1) * along**2)
+    return replace(scene, size=scene.size * f, solids=replace(s, centre=s.centre * f, half=half))
 
 
 def rearranged(scene: Scene, seed: int = 0, reach: float = 0.35) -> Scene:
     """The same things, but for the room itself, each moved by up to ``reach`` metres level."""
     rng = np.random.default_rng(seed)
     shift = rng.uniform(-reach, reach, (len(scene), 3)) * [1, 1, 0]
-    large = scene.bounding_half.max(1) > 1.6
-    return replace(scene, centre=np.where(large[:, None], scene.centre, scene.centre + shift))
+    s = scene.solids
+    large = s.bounding_half.max(1) > 1.6
+    centre = np.where(large[:, None], s.centre, s.centre + shift)
+    return replace(scene, solids=replace(s, centre=centre))
 
 
 def keyframes(
-    seen: Sequence[View], poses: Sequence[np.ndarray]
+    seen: Sequence[RenderedView], poses: Sequence[np.ndarray]
 ) -> tuple[KeyframeSet, ClassicalFlow]:
     """A store of the views with their true depth, and the operator that encoded them."""
     grid = SampleGrid(CAMERA)

@@ -5,10 +5,11 @@ import torch
 
 import geogs_synth.clips.clips as clips_module
 import geogs_synth.clips.sampler as sampler_module
-import geogs_synth.raycast.cuda as cuda_module
+import geogs_synth.raycast.cuda_caster as cuda_module
 from cuda_emulator import use_emulator
-from geogs_synth.camera.views import Views
-from geogs_synth.scene.rooms import NONE, Lights, Rooms, Solids, Surfaces
+from geogs_synth.camera.camera_batch import CameraBatch
+from geogs_synth.scene.rooms import Lights, Rooms, Surfaces
+from geogs_synth.scene.solids import NONE, SolidBatch, Solids
 from geogs_synth.textures.pyramids import TextureBank
 
 
@@ -19,7 +20,7 @@ def use_fast_rooms(patch: pytest.MonkeyPatch) -> None:
         patch.setattr(module, "caster_for", lambda _device: cuda_module.CudaCaster())
 
 
-def solids_of(*rows: tuple[int, list[float], list[float], torch.Tensor | None]) -> Solids:
+def solids_of(*rows: tuple[int, list[float], list[float], torch.Tensor | None]) -> SolidBatch:
     """One room's solids from kind, centre, half and rotation (none for upright)."""
     eye = torch.eye(3, dtype=torch.float64)
     return Solids(
@@ -30,11 +31,11 @@ def solids_of(*rows: tuple[int, list[float], list[float], torch.Tensor | None]) 
     )
 
 
-def nothing() -> Solids:
+def nothing() -> SolidBatch:
     return solids_of((NONE, [0, 0, 0], [1, 1, 1], None))
 
 
-def room_of(solids: Solids, views: int = 2) -> Rooms:
+def room_of(solids: SolidBatch, views: int = 2) -> Rooms:
     """A plain lit room of 4 x 5 x 3 metres."""
     n = (1, 6 + 2 * solids.kind.shape[1])
     f = {"dtype": torch.float64}
@@ -62,14 +63,14 @@ def room_of(solids: Solids, views: int = 2) -> Rooms:
     return Rooms(torch.tensor([[4.0, 5.0, 3.0]], **f), solids, surfaces, lights)
 
 
-def looking_along_y(*centres: list[float], width: int = 33, height: int = 25) -> Views:
+def looking_along_y(*centres: list[float], width: int = 33, height: int = 25) -> CameraBatch:
     """Upright cameras that look along +y, focal length 30 pixels."""
     R = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]], dtype=torch.float64)
     T = torch.eye(4, dtype=torch.float64).repeat(1, len(centres), 1, 1)
     T[..., :3, :3] = R
     T[..., :3, 3] = -torch.tensor(centres, dtype=torch.float64) @ R.T
     k = torch.tensor([[30.0, 30.0, (width - 1) / 2, (height - 1) / 2]], dtype=torch.float64)
-    return Views(T, k, width, height)
+    return CameraBatch(T, k, width, height)
 
 
 def small_bank() -> TextureBank:

@@ -14,10 +14,10 @@ from geogs.splat.map import DiskParameters, GaussianMap
 from geogs_synth.motion.handheld import handheld_trajectory
 from geogs_synth.places.room import make_room
 from geogs_synth.raycast.raycaster import Raycaster
-from geogs_synth.sequence.export import default_camera
+from geogs_synth.sequence.location import centred_camera
 from keyframe_samples import Sample, segment_of
 
-WORKING = default_camera(96, 72)
+WORKING = centred_camera(96, 72)
 CAMERAS = MapCameras(WORKING, WORKING.with_long_edge(40), WORKING.with_long_edge(80))
 CONFIG = Config().mapping
 UNIT = 2.0

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from geogs.errors import InputError
 from geogs_synth.camera.flaws import CameraKind, Flaws, camera_flaws
-from geogs_synth.motion.kinds import ROOM_MOTIONS, MotionKind
+from geogs_synth.motion.motion_kinds import ROOM_MOTIONS, MotionKind
 
 if TYPE_CHECKING:
     from geogs_synth.raycast.raycaster import Raycaster
@@ -124,13 +124,13 @@ def _is_there(cell: Cell, folder: Path) -> bool:
 
 def _raycaster(on_street: bool) -> "Raycaster":
     from geogs_synth.raycast.raycaster import Raycaster
-    from geogs_synth.sequence.stage import make_scene
+    from geogs_synth.sequence.location import make_scene
 
     return Raycaster(make_scene("driving" if on_street else "handheld", 0), _threads())
 
 
 def _render(cell: Cell, folder: Path, raycaster: "Raycaster | None") -> None:
-    from geogs_synth.sequence.export import write_sequence
+    from geogs_synth.sequence.replica_files import write_sequence
 
     write_sequence(
         folder, cell.frames, cell.width, cell.height,

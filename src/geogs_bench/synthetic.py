@@ -17,7 +17,7 @@ def synthetic_rooms(
     Raises:
         OutputError: it cannot be written.
     """
-    from geogs_synth.sequence.export import write_sequence
+    from geogs_synth.sequence.replica_files import write_sequence
 
     for seed in seeds:
         room = folder / f"synthetic-{seed}"

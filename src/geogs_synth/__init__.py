@@ -1,8 +1,9 @@
-"""Procedural scenes with exact truth: depth, normals, mesh, poses; for demo, tests, training.
+"""Procedural scenes with exact truth: for demo, tests, evaluation and training.
 
-``stage.make_stage`` gives a furnished room or a street and a motion through it;
-``raycast.Raycaster`` renders it from any pose, ``shooting.Shooting`` as a flawed camera sees it;
-``export.write_sequence`` does it all and writes a data set.
+``scene`` says what a scene is made of, ``raycast`` renders it. ``places`` furnishes rooms and
+builds streets through which ``motion`` leads a camera; ``sequence.replica_files`` films one with
+the flaws of a ``camera`` and writes a data set. ``clips`` draws batches of simpler rooms and films
+them for training.
 """
 
 from geogs.cli.command import Command

@@ -9,7 +9,7 @@ from geogs.cli.options import Given, parse_options
 from geogs.config import Seed
 from geogs.config.setting import Positional, Range, Settings
 from geogs_synth.camera.flaws import CameraKind, Flaws, camera_flaws
-from geogs_synth.motion.kinds import MotionKind
+from geogs_synth.motion.motion_kinds import MotionKind
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class SynthOptions(Settings):
     flaws: Flaws = field(default_factory=Flaws)
     """Single flaws, over those of the camera."""
     moving: Annotated[float, Range(0, 0.5)] = 0.0
-    """Share of the image that people cover who cross the view; 0 lets nothing move."""
+    """Fraction of the image that people cover who cross the view; 0 lets nothing move."""
     depth: bool = True
     """Write depth images too."""
     depth_sensor: bool = False
@@ -57,8 +57,8 @@ def main(argv: Sequence[str]) -> int:
     from rich.console import Console
     from rich.progress import Progress
 
-    from geogs_synth.camera.depth_sensor import DepthSensor
-    from geogs_synth.sequence.export import write_sequence
+    from geogs_synth.camera.measured_depth import DepthSensor
+    from geogs_synth.sequence.replica_files import write_sequence
 
     with Progress(console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task("rendering", total=options.frames)

@@ -31,21 +31,21 @@ class Draw:
         """Gaussian around zero."""
         return self._empty(*shape).normal_(0.0, deviation, generator=self._generator)
 
-    def chance(self, share: float, *shape: int) -> Bool[Tensor, "..."]:
+    def chance(self, probability: float, *shape: int) -> Bool[Tensor, "..."]:
         """True with the given probability."""
-        return self.uniform(0.0, 1.0, *shape) < share
+        return self.uniform(0.0, 1.0, *shape) < probability
 
     def integers(self, end: int, *shape: int) -> Int[Tensor, "..."]:
         """Even in 0..end-1."""
         return torch.randint(end, shape, generator=self._generator, device=self.device)
 
-    def choose(self, shares: Sequence[float | int], *shape: int) -> Int[Tensor, "..."]:
-        """Index of a share, drawn in proportion to them."""
-        value = self.uniform(0.0, sum(shares), *shape)
+    def choose(self, weights: Sequence[float | int], *shape: int) -> Int[Tensor, "..."]:
+        """Index of a weight, drawn in proportion to them."""
+        value = self.uniform(0.0, sum(weights), *shape)
         bound = 0.0
         chosen = torch.zeros(shape, dtype=torch.int64, device=self.device)
-        for index in range(1, len(shares)):
-            bound += shares[index - 1]
+        for index in range(1, len(weights)):
+            bound += weights[index - 1]
             chosen = torch.where(value >= bound, index, chosen)
         return chosen
 

@@ -6,7 +6,7 @@ from collections import deque
 from concurrent.futures import Future, ProcessPoolExecutor
 from functools import partial
 
-from geogs_synth.clips.options import RoomOptions
+from geogs_synth.clips.room_options import RoomOptions
 from geogs_synth.clips.sampler import Plan, draw_plan
 
 PROCESSES = 3

@@ -99,10 +99,10 @@ class _System:
     """Normal equations of one step; depths are diagonal."""
 
     hessian: Float[Tensor, "b n n"]
-    """Of the free poses, float64."""
+    """Between the free poses, float64."""
     gradient: Float[Tensor, "b n"]
     coupling: Float[Tensor, "b n q"]
-    """Of free poses and all inverse depths."""
+    """Between free poses and all inverse depths."""
     curvature: Float[Tensor, "b q"]
     depth_gradient: Float[Tensor, "b q"]
 

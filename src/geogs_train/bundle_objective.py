@@ -21,8 +21,8 @@ from geogs_train.bundle import (
     adjust,
     reproject,
 )
-from geogs_train.options import FlowTraining
-from geogs_train.pairs import MARGIN
+from geogs_train.flow_options import FlowTraining
+from geogs_train.flow_pairs import MARGIN
 from geogs_train.pose_loss import PoseLossOptions, pose_loss
 
 FLOOR = OwnFlowOptions().floor
@@ -94,7 +94,7 @@ class BundleObjective:
         return BundleBatch(clips.images.flatten(0, 1), cameras, edges, truth, start)
 
     def loss(self, network: FlowNetwork, batch: BundleBatch) -> Float[Tensor, ""]:
-        """Of all rounds, the last counting most."""
+        """The loss of all rounds, the last counting most."""
         options, edges = self.options, batch.edges
         clips, views = batch.truth.inverse_depth.shape[:2]
         device = batch.images.device

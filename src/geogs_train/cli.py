@@ -7,8 +7,8 @@ from typing import Annotated, Literal
 
 from geogs.cli.options import parse_options
 from geogs.config.setting import Positional, Settings
-from geogs_train.depth.options import DepthTraining
-from geogs_train.options import FlowTraining, RunOptions
+from geogs_train.depth.depth_options import DepthTraining
+from geogs_train.flow_options import FlowTraining, RunOptions
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ class Schedule(Protocol):
 
     @property
     def steps(self) -> int:
-        """Of the whole run."""
+        """Steps of the whole run."""
         ...
 
     @property
@@ -42,7 +42,7 @@ class Schedule(Protocol):
 
     @property
     def weight_decay(self) -> float:
-        """Of AdamW."""
+        """Weight decay of AdamW."""
         ...
 
     @property
@@ -57,7 +57,7 @@ class Schedule(Protocol):
 
     @property
     def seed(self) -> int:
-        """Of everything random."""
+        """Seed of everything random."""
         ...
 
 
@@ -107,12 +107,12 @@ class Course(Protocol):
         ...
 
     def batch(self, step: int, progress: float) -> Any:
-        """What a step learns from, when such a share of the run is done; the same whenever it is
+        """What a step learns from, when such a fraction of the run is done; the same whenever it is
         asked for."""
         ...
 
     def loss(self, network: Any, batch: Any) -> Float[Tensor, ""]:
-        """Of a batch; nothing random."""
+        """The loss of a batch; nothing random."""
         ...
 
     def examination(self, batches: int) -> Examination:

@@ -10,14 +10,14 @@ from torch import Tensor
 
 from geogs.tracking.flow.own import load_network
 from geogs.tracking.flow.own_network import FlowNetwork
-from geogs_synth.clips.kinds import NAMES
 from geogs_synth.clips.sampler import Plan, RoomSampler
+from geogs_synth.clips.scene_kinds import NAMES
 from geogs_train.ahead import PROCESSES, PlansAhead
 from geogs_train.course import Panels, Worker
-from geogs_train.export import export_weights
+from geogs_train.flow_options import FlowTraining
+from geogs_train.flow_validation import SceneScores, SceneValidation
 from geogs_train.objective import objective
-from geogs_train.options import FlowTraining
-from geogs_train.validation import SceneScores, SceneValidation
+from geogs_train.trained_weights import write_weights
 
 
 class FlowCourse:
@@ -74,7 +74,7 @@ class FlowCourse:
 
     def export(self, network: FlowNetwork, path: Path, step: int, scores: SceneScores) -> None:
         """As in the protocol."""
-        export_weights(network, path, step, scores)
+        write_weights(network, path, step, scores=scores)
 
     def close(self) -> None:
         """End the processes that draw rooms."""

@@ -8,8 +8,8 @@ from torch import Tensor
 
 from geogs.tracking.flow.lookup import RADIUS, WINDOW, correlation_windows
 from geogs.tracking.flow.own_network import FlowEstimate, ImageFeatures
-from geogs_train.options import FlowTraining
-from geogs_train.pairs import FlowBatch
+from geogs_train.flow_options import FlowTraining
+from geogs_train.flow_pairs import FlowBatch
 
 MAX_ERROR = 100.0
 """Errors beyond so many pixels count as such; nothing is learned from how far lost a cell is."""
@@ -62,8 +62,8 @@ def descriptor_loss(features: ImageFeatures, batch: FlowBatch) -> Float[Tensor, 
     for n, level in enumerate(features.pyramid.levels):
         at = away * level.scale
         inside = seen & (at.abs() <= RADIUS).all(-1)
-        share = (1 - (at[..., None] - places).abs()).clamp(min=0)  # e p 2 7
-        target = (share[..., 1, :, None] * share[..., 0, None, :]).flatten(-2)
+        portion = (1 - (at[..., None] - places).abs()).clamp(min=0)  # e p 2 7
+        target = (portion[..., 1, :, None] * portion[..., 0, None, :]).flatten(-2)
         total = total + _mean(-(target * windows[..., n, :]).sum(-1), inside.float())
     return total
 

@@ -9,15 +9,15 @@ import torch
 from torch import distributed
 
 from geogs.gpu.installation import require_device
-from geogs_train.checkpoint import read_options
 from geogs_train.course import Course, Worker
-from geogs_train.curves import draw_curves
-from geogs_train.depth.course import DepthCourse
-from geogs_train.depth.options import DepthTraining
+from geogs_train.depth.depth_course import DepthCourse
+from geogs_train.depth.depth_options import DepthTraining
 from geogs_train.flow_course import FlowCourse
-from geogs_train.options import FlowTraining, RunOptions
+from geogs_train.flow_options import FlowTraining, RunOptions
 from geogs_train.pace import shared
-from geogs_train.run import train
+from geogs_train.training_checkpoint import read_options
+from geogs_train.training_curves import draw_curves
+from geogs_train.training_run import train
 
 
 def launch(

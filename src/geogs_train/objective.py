@@ -9,10 +9,10 @@ from torch import Tensor
 from geogs.errors import InputError
 from geogs.tracking.flow.own_network import FlowEstimate, FlowNetwork, ImageFeatures
 from geogs_synth.clips.clips import ClipBatch
-from geogs_synth.clips.kinds import only_scene
+from geogs_synth.clips.scene_kinds import only_scene
 from geogs_train.flow_loss import flow_loss
-from geogs_train.options import FlowTraining
-from geogs_train.pairs import FlowBatch, flow_batch
+from geogs_train.flow_options import FlowTraining
+from geogs_train.flow_pairs import FlowBatch, flow_batch
 from geogs_train.starts import StartOptions
 
 
@@ -28,7 +28,7 @@ class Objective(Protocol):
         ...
 
     def loss(self, network: FlowNetwork, batch: Any) -> Float[Tensor, ""]:
-        """Of a batch that :meth:`prepare` made."""
+        """The loss of a batch that :meth:`prepare` made."""
         ...
 
 
@@ -45,7 +45,7 @@ class FlowObjective:
         return flow_batch(clips, StartOptions(far=self.options.far), generator)
 
     def loss(self, network: FlowNetwork, batch: FlowBatch) -> Float[Tensor, ""]:
-        """Of all iterations."""
+        """The loss of all iterations."""
         features, estimates, dense = run_network(network, batch, self.options.iterations)
         return flow_loss(features, estimates, dense, batch, self.options)
 

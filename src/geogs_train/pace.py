@@ -12,7 +12,7 @@ EVERY = 10
 
 
 class Clock:
-    """Share of a run of some minutes that is done; from where it was when it began."""
+    """Fraction of a run of some minutes that is done; from where it was when it began."""
 
     def __init__(self, minutes: float, begun: float, worker: Worker) -> None:
         self._seconds, self._begun, self._worker = 60 * minutes, begun, worker

@@ -19,11 +19,11 @@ class StartOptions:
     """Mean disturbance in pixels at least, drawn log-uniformly."""
     largest: float = 16.0
     cold: float = 0.15
-    """Share of the edges that start from no motion at all."""
+    """Fraction of the edges that start from no motion at all."""
     bleed: float = 0.6
-    """Share of the edges whose depth is blurred over the edges of things."""
+    """Fraction of the edges whose depth is blurred over the edges of things."""
     far: float = 0.0
-    """Share of the edges, beside the cold ones, that are off by between ``largest`` and
+    """Fraction of the edges, beside the cold ones, that are off by between ``largest`` and
     ``farthest``."""
     farthest: float = 64.0
 
@@ -73,7 +73,7 @@ def disturbed_starts(
     inverse = inverse * (0.6 * column(strength) * field[:, 0]).exp()
     patches = _smooth_field(normal(2, 6, 8), size)
     inverse = inverse * (1.5 * column(strength) * (patches[:, 0] - 1).clamp(min=0)).exp()
-    # Pose: turned by up to the amount, moved by a share of the depth.
+    # Pose: turned by up to the amount, moved by a fraction of the depth.
     focal = intrinsics[:, 0]
     turn = normal(3) * (0.5 * amount / focal)[:, None]
     shift = normal(3) * (0.5 * amount / focal / middle.clamp(min=1e-3))[:, None]

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from geogs_train.pairs import FlowBatch
+from geogs_train.flow_pairs import FlowBatch
 
 WARM_UP = 3
 """Steps taken before the recording, so that libraries have chosen their kernels."""

@@ -240,7 +240,7 @@ def test_published_tables_are_complete_and_their_means_are_those_printed():
 def test_without_a_true_surface_held_out_images_judge_the_mesh(tmp_path):
     from geogs_bench.scene import Scene, Truth
     from geogs_synth.places.room import make_room
-    from geogs_synth.sequence.tessellation import scene_mesh
+    from geogs_synth.sequence.scene_mesh import scene_mesh
     from posed_layouts import render_room, write_dtu
 
     room = render_room(6, 12, 160, 120)

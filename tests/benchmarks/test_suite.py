@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from geogs.errors import InputError
-from geogs_synth.sequence.export import default_camera
+from geogs_synth.sequence.location import centred_camera
 from portals import SuiteRaycaster
 from suite import ROOM, STEP, WALL, Suite
 
@@ -43,7 +43,7 @@ def test_the_walk_leads_through_every_room_and_back():
 @pytest.mark.long
 def test_rooms_are_drawn_from_seed_and_place_and_leave_room_for_the_camera():
     room, again = SUITE.room(1), Suite(4, seed=2).room(5)  # counted round the ring
-    assert np.array_equal(room.centre, again.centre)
+    assert np.array_equal(room.solids.centre, again.solids.centre)
     poses = SUITE.walk(1100)
     own = np.array([SUITE.nearest(T[:3, 3]) == 1 for T in poses])
     assert own.sum() > 150
@@ -52,7 +52,7 @@ def test_rooms_are_drawn_from_seed_and_place_and_leave_room_for_the_camera():
 
 @pytest.mark.long
 def test_other_rooms_are_seen_through_doors():
-    camera, caster = default_camera(96, 54), SuiteRaycaster(SUITE, threads=1)
+    camera, caster = centred_camera(96, 54), SuiteRaycaster(SUITE, threads=1)
     poses = SUITE.walk(120)
     T_wc = poses[60]
     assert SUITE.nearest(T_wc[:3, 3]) == 0

@@ -15,7 +15,7 @@ from geogs.loop.features import FeatureExtractor
 from geogs.loop.verification import DepthView, TwoViewVerifier
 from geogs.world.keyframes import KeyframeSet
 from geogs.world.loops import Features
-from geogs_synth.raycast.raycaster import View
+from geogs_synth.raycast.raycaster import RenderedView
 from loop_scenes import CAMERA, keyframes, orbit, room, room_views, stretched, views
 
 LAP = 18
@@ -26,7 +26,7 @@ DRIFT = torch.tensor([0.6, -0.3, 1.5, 0.3, 0.8, -0.2], dtype=torch.float64)
 
 
 @pytest.fixture(scope="module")
-def path() -> tuple[list[View], list[np.ndarray]]:
+def path() -> tuple[list[RenderedView], list[np.ndarray]]:
     """Once around a room and a little on."""
     scene = room(3).scene
     poses = orbit(scene, LAP) + orbit(scene, LAP, np.radians(4))[:AGAIN]

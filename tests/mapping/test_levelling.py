@@ -12,10 +12,10 @@ from geogs.mapping.mapper import Mapper
 from geogs_synth.motion.handheld import handheld_trajectory
 from geogs_synth.places.room import make_room
 from geogs_synth.raycast.raycaster import Raycaster
-from geogs_synth.sequence.export import default_camera
+from geogs_synth.sequence.location import centred_camera
 from keyframe_samples import Sample, segment_of
 
-CAMERA = default_camera(160, 120)
+CAMERA = centred_camera(160, 120)
 GAINS, OFFSETS = [1.0, 0.8, 0.65, 0.9], [0.0, 0.05, 0.1, -0.05]
 
 

@@ -15,12 +15,12 @@ from geogs.types import PoseCorrection
 from geogs_synth.motion.handheld import handheld_trajectory
 from geogs_synth.places.room import make_room
 from geogs_synth.raycast.raycaster import Raycaster
-from geogs_synth.sequence.export import default_camera
+from geogs_synth.sequence.location import centred_camera
 from keyframe_samples import Sample, add, segment_of
 
 pytestmark = pytest.mark.system
 
-CAMERA = default_camera(224, 168)
+CAMERA = centred_camera(224, 168)
 MAPPING = replace(
     Config().mapping,
     render_long_edge=112,

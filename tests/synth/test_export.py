@@ -15,11 +15,12 @@ from geogs.io.sources.sniff import open_source
 from geogs_synth.camera.flaws import Flaws, camera_flaws
 from geogs_synth.cli import main
 from geogs_synth.motion.handheld import handheld_trajectory
-from geogs_synth.motion.motions import room_motion
+from geogs_synth.motion.room_motions import room_motion
 from geogs_synth.places.room import make_room
 from geogs_synth.raycast.raycaster import Raycaster
 from geogs_synth.scene.scene import Scene
-from geogs_synth.sequence.export import default_camera, write_sequence
+from geogs_synth.sequence.location import centred_camera
+from geogs_synth.sequence.replica_files import write_sequence
 
 FRAMES, WIDTH, HEIGHT, SEED = 4, 96, 72, 2
 
@@ -53,7 +54,7 @@ def test_layout(sequence: Path) -> None:
 def test_round_trip(sequence: Path, scene: Scene, raycaster: Raycaster) -> None:
     """What is read back is what the raycaster gives for the poses and intrinsics read back."""
     parameters = json.loads((sequence / "cam_params.json").read_text())["camera"]
-    camera = default_camera(WIDTH, HEIGHT)
+    camera = centred_camera(WIDTH, HEIGHT)
     for name, value in (("w", WIDTH), ("h", HEIGHT), ("fx", camera.fx), ("cy", camera.cy)):
         assert parameters[name] == value
     poses = np.loadtxt(sequence / "traj.txt").reshape(-1, 4, 4)
@@ -74,7 +75,7 @@ def test_points_are_what_was_seen(sequence: Path, scene: Scene, raycaster: Rayca
     assert (points < scene.size + 1e-4).all()
     assert np.quantile(scene.clearance(points), 0.7) < 1e-4
     poses = handheld_trajectory(scene, FRAMES, SEED)
-    camera = default_camera(WIDTH, HEIGHT)
+    camera = centred_camera(WIDTH, HEIGHT)
     best = np.full(len(points), np.inf)
     for T_wc in poses:
         depth = raycaster.render(camera, T_wc).depth
@@ -133,7 +134,8 @@ def test_the_command_says_motion_and_flaws(tmp_path: Path, monkeypatch: pytest.M
     """Single flaws win over those of the camera."""
     asked = {}
     monkeypatch.setattr(
-        "geogs_synth.sequence.export.write_sequence", lambda *args, **options: asked.update(options)
+        "geogs_synth.sequence.replica_files.write_sequence",
+        lambda *args, **options: asked.update(options),
     )
     options = ["--motion", "handheld-5hz", "--camera", "action", "--flaws.readout", "0.03"]
     assert main([str(tmp_path), *options, "--moving", "0.2"]) == 0

@@ -5,8 +5,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from geogs_synth.motion.handheld import handheld_trajectory
-from geogs_synth.motion.kinds import ROOM_MOTIONS, MotionKind
-from geogs_synth.motion.motions import room_motion
+from geogs_synth.motion.motion_kinds import ROOM_MOTIONS, MotionKind
+from geogs_synth.motion.room_motions import room_motion
 from geogs_synth.places.room import make_room
 from geogs_synth.scene.scene import Scene
 

@@ -11,10 +11,11 @@ from geogs.geometry.camera import Camera
 from geogs.geometry.depth import normals_from_depth
 from geogs_synth.motion.handheld import handheld_trajectory
 from geogs_synth.places.room import make_room
-from geogs_synth.raycast.raycaster import Raycaster, View
-from geogs_synth.scene.scene import Scene, SceneBuilder, yaw_rotation
-from geogs_synth.sequence.export import default_camera
-from geogs_synth.sequence.tessellation import scene_mesh
+from geogs_synth.raycast.raycaster import Raycaster, RenderedView
+from geogs_synth.scene.builder import SceneBuilder, yaw_rotation
+from geogs_synth.scene.scene import Scene
+from geogs_synth.sequence.location import centred_camera
+from geogs_synth.sequence.scene_mesh import scene_mesh
 
 CAMERA = Camera(70.0, 72.0, 40.3, 29.1, 80, 60)
 
@@ -131,7 +132,7 @@ def test_depth_equals_the_mesh(room: Scene, raycaster: Raycaster, poses: np.ndar
         row, column = rng.integers(0, 60, 120), rng.integers(0, 80, 120)
         expected = _triangle_depths(room, _rays()[row, column], T_wc)
         errors.append(np.abs(view.depth[row, column] - expected))
-        is_box.append(room.kind[view.solid[row, column]] == 0)
+        is_box.append(room.solids.kind[view.solid[row, column]] == 0)
     error, box = np.concatenate(errors), np.concatenate(is_box)
     assert np.quantile(error[box], 0.99) < 1e-5
     assert np.quantile(error, 0.99) < 2e-3
@@ -139,7 +140,7 @@ def test_depth_equals_the_mesh(room: Scene, raycaster: Raycaster, poses: np.ndar
 
 def test_normals_agree_with_depth(raycaster: Raycaster, poses: np.ndarray) -> None:
     """Facing the camera, and equal to those of the depth map inside flat faces."""
-    camera = default_camera(160, 120)
+    camera = centred_camera(160, 120)
     view = raycaster.render(camera, poses[10])
     normal = torch.from_numpy(view.normal)
     assert ((normal * camera.rays()).sum(-1) < 0).all()
@@ -149,7 +150,9 @@ def test_normals_agree_with_depth(raycaster: Raycaster, poses: np.ndarray) -> No
     assert (angle < 1.0).float().mean() > 0.75
 
 
-def _warp(camera: Camera, view: View, T_wc: np.ndarray, T_wc_other: np.ndarray) -> np.ndarray:
+def _warp(
+    camera: Camera, view: RenderedView, T_wc: np.ndarray, T_wc_other: np.ndarray
+) -> np.ndarray:
     """Pixel (x, y) and depth in the other camera of every pixel."""
     T = torch.from_numpy(np.linalg.inv(T_wc_other) @ T_wc)
     points = camera.back_project(torch.from_numpy(view.depth).double())
@@ -159,7 +162,7 @@ def _warp(camera: Camera, view: View, T_wc: np.ndarray, T_wc_other: np.ndarray) 
 
 def test_two_views_agree(raycaster: Raycaster, poses: np.ndarray) -> None:
     """Warped into another frame, depth and colour are those seen there, but for occlusions."""
-    camera = default_camera(320, 240)
+    camera = centred_camera(320, 240)
     first, second = (raycaster.render(camera, poses[i]) for i in (0, 6))
     warped = _warp(camera, first, poses[0], poses[6]).astype(np.float32)
     x, y = warped[..., 0], warped[..., 1]
@@ -177,7 +180,7 @@ def test_two_views_agree(raycaster: Raycaster, poses: np.ndarray) -> None:
 
 def test_optical_flow_works(raycaster: Raycaster, poses: np.ndarray) -> None:
     """DIS flow over six frames is consistent both ways and agrees with the true flow."""
-    camera = default_camera(320, 240)
+    camera = centred_camera(320, 240)
     views = [raycaster.render(camera, poses[i]) for i in (20, 26)]
     grey = [cv2.cvtColor(view.image, cv2.COLOR_RGB2GRAY) for view in views]
     dis = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
@@ -194,7 +197,7 @@ def test_optical_flow_works(raycaster: Raycaster, poses: np.ndarray) -> None:
 
 def test_texture_is_everywhere(raycaster: Raycaster, poses: np.ndarray) -> None:
     """Nearly all 16 x 16 blocks hold detail, and the exposure suits."""
-    view = raycaster.render(default_camera(320, 240), poses[30])
+    view = raycaster.render(centred_camera(320, 240), poses[30])
     grey = cv2.cvtColor(view.image, cv2.COLOR_RGB2GRAY).astype(float)
     blocks = grey.reshape(15, 16, 20, 16).std((1, 3))
     assert (blocks > 3).mean() > 0.95
@@ -208,13 +211,13 @@ def test_same_seed_same_image(room: Scene, raycaster: Raycaster, poses: np.ndarr
     for name in ("image", "depth", "normal", "solid"):
         np.testing.assert_array_equal(getattr(view, name), getattr(again, name))
     other = make_room(1)
-    assert len(other) != len(room) or not np.allclose(other.centre, room.centre)
+    assert len(other) != len(room) or not np.allclose(other.solids.centre, room.solids.centre)
     assert not np.allclose(other.size, room.size)
 
 
 def test_resolution_keeps_geometry(raycaster: Raycaster, poses: np.ndarray) -> None:
     """A camera with a third of the pixels has its centres at every third pixel."""
-    large = default_camera(240, 180)
+    large = centred_camera(240, 180)
     small = large.resized(80, 60)
     fine, coarse = (raycaster.render(c, poses[5]) for c in (large, small))
     np.testing.assert_allclose(fine.depth[1::3, 1::3], coarse.depth, rtol=1e-6)

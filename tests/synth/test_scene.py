@@ -7,9 +7,10 @@ from geogs.errors import InputError
 from geogs_synth.motion.handheld import FRAMES_PER_LAP, handheld_trajectory
 from geogs_synth.places.room import make_room
 from geogs_synth.raycast.raycaster import Raycaster
-from geogs_synth.scene.scene import Scene, SceneBuilder, yaw_rotation
-from geogs_synth.sequence.export import default_camera
-from geogs_synth.sequence.tessellation import SeenSurface, scene_mesh
+from geogs_synth.scene.builder import SceneBuilder, yaw_rotation
+from geogs_synth.scene.scene import Scene
+from geogs_synth.sequence.location import centred_camera
+from geogs_synth.sequence.scene_mesh import SeenSurface, scene_mesh
 
 
 @pytest.fixture(scope="module", params=[0, 3])
@@ -78,7 +79,7 @@ def test_room_is_closed_and_of_the_right_size(room: Scene) -> None:
     assert (room.size > [4, 3.5, 2.4]).all()
     assert (room.size < [5.2, 4.5, 2.9]).all()
     assert len(room) > 150
-    view = Raycaster(room).render(default_camera(96, 72), handheld_trajectory(room, 1)[0])
+    view = Raycaster(room).render(centred_camera(96, 72), handheld_trajectory(room, 1)[0])
     assert (view.solid >= 0).all()
     assert view.depth.min() > 0.4
     assert view.depth.max() < 7
@@ -136,7 +137,7 @@ def test_seen_surface_keeps_one_exact_point_a_voxel() -> None:
     build, texture = _builder()
     build.rectangle((2, 2, 0), (4, 4), texture, np.eye(3))
     scene = build.build([4, 4, 3])
-    camera = default_camera(64, 48)
+    camera = centred_camera(64, 48)
     T_wc = np.eye(4)
     T_wc[:3, :3] = np.diag([1.0, -1.0, -1.0])
     T_wc[:3, 3] = [2, 2, 1.0]

@@ -6,18 +6,18 @@ import torch
 
 from geogs.errors import InputError
 from geogs_synth.camera.flaws import Flaws
-from geogs_synth.camera.lens import Lens
-from geogs_synth.camera.sensor import Sensor
-from geogs_synth.motion.motions import room_motion
+from geogs_synth.camera.image_sensor import Sensor
+from geogs_synth.camera.radial_camera import RadialCamera
+from geogs_synth.motion.room_motions import room_motion
 from geogs_synth.places.room import make_room
 from geogs_synth.places.walkers import crossing_walkers
 from geogs_synth.raycast.raycaster import Raycaster
 from geogs_synth.scene.scene import Scene
+from geogs_synth.sequence.location import centred_camera
 from geogs_synth.sequence.shooting import Shooting
-from geogs_synth.sequence.stage import centred_camera
 
 CAMERA = centred_camera(96, 72)
-LENS = Lens(CAMERA)
+LENS = RadialCamera(CAMERA)
 
 
 @pytest.fixture(scope="module")
@@ -32,13 +32,13 @@ def raycaster(scene: Scene) -> Raycaster:
 
 def _shooting(raycaster: Raycaster, flaws: Flaws, kind: str = "turning-60") -> Shooting:
     path = room_motion(kind, raycaster.scene).path
-    return Shooting(raycaster, Lens(CAMERA, flaws.k1, flaws.k2), path, flaws)
+    return Shooting(raycaster, RadialCamera(CAMERA, flaws.k1, flaws.k2), path, flaws)
 
 
 def test_rolling_rows_are_those_of_their_own_poses(raycaster: Raycaster) -> None:
     path = room_motion("turning-120", raycaster.scene).path
     times = 0.5 + (np.arange(72) / 71 - 0.5) * 0.03
-    lens = Lens(CAMERA, -0.2, 0.05)
+    lens = RadialCamera(CAMERA, -0.2, 0.05)
     view = raycaster.render_rolling(lens, path(times), times)
     for row in (0, 1, 20, 36, 71):
         still = raycaster.render(lens, path(times[row : row + 1])[0])
@@ -141,7 +141,7 @@ def test_sensor() -> None:
 def test_lens_is_opencv_s() -> None:
     """A pixel's ray, bent by the formula, is the pixel again; where nothing is bent, it is K^-1."""
     for k1, k2 in ((-0.25, 0.06), (0.1, -0.2), (0.3, 0.0)):
-        x, y = Lens(CAMERA, k1, k2).rays
+        x, y = RadialCamera(CAMERA, k1, k2).rays
         square = x * x + y * y
         bent = 1 + k1 * square + k2 * square * square
         u, v = CAMERA.fx * x * bent + CAMERA.cx, CAMERA.fy * y * bent + CAMERA.cy
@@ -149,7 +149,7 @@ def test_lens_is_opencv_s() -> None:
         np.testing.assert_allclose(v, np.tile(np.arange(72.0)[:, None], (1, 96)), atol=1e-9)
     np.testing.assert_array_equal(np.stack(LENS.rays, -1), CAMERA.rays(torch.float64)[..., :2])
     with pytest.raises(InputError, match="fold"):
-        Lens(CAMERA, -0.5, 0.0)
+        RadialCamera(CAMERA, -0.5, 0.0)
 
 
 def test_distorted_views_miss_no_solid(raycaster: Raycaster) -> None:
@@ -159,7 +159,7 @@ def test_distorted_views_miss_no_solid(raycaster: Raycaster) -> None:
     wide = centred_camera(800, 640, 0.35)
     straight = raycaster.render(wide, T_wc).depth
     for k1, k2 in ((-0.25, 0.06), (0.1, -0.2)):
-        lens = Lens(CAMERA, k1, k2)
+        lens = RadialCamera(CAMERA, k1, k2)
         depth = raycaster.render(lens, T_wc).depth
         x, y = lens.rays
         u = np.rint(wide.fx * x + wide.cx).astype(int)

@@ -9,11 +9,11 @@ import torch
 from geogs.errors import InputError
 from geogs_synth.places.street import DRIVE_METRES, drive, make_street
 from geogs_synth.places.traffic import street_traffic
-from geogs_synth.raycast.raycaster import Raycaster, View
+from geogs_synth.raycast.raycaster import Raycaster, RenderedView
 from geogs_synth.scene.scene import Scene
-from geogs_synth.sequence.export import write_sequence
-from geogs_synth.sequence.stage import STREET_FOCAL, centred_camera
-from geogs_synth.sequence.tessellation import SeenSurface, scene_mesh
+from geogs_synth.sequence.location import STREET_FOCAL, centred_camera
+from geogs_synth.sequence.replica_files import write_sequence
+from geogs_synth.sequence.scene_mesh import SeenSurface, scene_mesh
 
 CAMERA = centred_camera(124, 38, STREET_FOCAL)
 
@@ -30,7 +30,7 @@ def raycaster(street: Scene) -> Raycaster:
 
 
 @pytest.fixture(scope="module")
-def view(raycaster: Raycaster) -> View:
+def view(raycaster: Raycaster) -> RenderedView:
     return raycaster.render(CAMERA, drive(0).path(np.zeros(1))[0])
 
 
@@ -40,7 +40,7 @@ def _tilted_up(degrees: float) -> np.ndarray:
     return np.array([[1.0, 0, 0], [0, c, -s], [0, s, c]])
 
 
-def test_sky_has_no_depth_and_the_ground_has(raycaster: Raycaster, view: View) -> None:
+def test_sky_has_no_depth_and_the_ground_has(raycaster: Raycaster, view: RenderedView) -> None:
     assert (view.depth > 0).all()
     T_wc = drive(0).path(np.zeros(1))[0]
     T_wc[:3, :3] = T_wc[:3, :3] @ _tilted_up(30)
@@ -66,7 +66,7 @@ def test_sky_turns_with_the_camera_but_does_not_move(raycaster: Raycaster) -> No
     assert np.abs(up.image.astype(int) - raycaster.render(CAMERA, T_wc).image).max() > 20
 
 
-def test_depth_of_the_road_is_a_plane(view: View, street: Scene) -> None:
+def test_depth_of_the_road_is_a_plane(view: RenderedView, street: Scene) -> None:
     """Road sections lie 3 cm above the ground, every other one 4 mm higher."""
     T_wc = drive(0).path(np.zeros(1))[0]
     rays = CAMERA.rays(torch.float64).numpy()
@@ -96,7 +96,7 @@ def test_drive_is_forward_in_its_lane(street: Scene) -> None:
     assert np.abs(np.diff(turn)).max() < 2
 
 
-def test_traffic_covers_its_share(raycaster: Raycaster, street: Scene, view: View) -> None:
+def test_traffic_covers_its_share(raycaster: Raycaster, street: Scene, view: RenderedView) -> None:
     T_wc = drive(0).path(np.zeros(1))[0]
     for share in (0.1, 0.3):
         busy = raycaster.with_bodies(street_traffic(CAMERA, share))
@@ -108,7 +108,7 @@ def test_traffic_covers_its_share(raycaster: Raycaster, street: Scene, view: Vie
         np.testing.assert_array_equal(seen.depth[~moving], view.depth[~moving])
 
 
-def test_the_sky_is_no_surface(street: Scene, view: View) -> None:
+def test_the_sky_is_no_surface(street: Scene, view: RenderedView) -> None:
     vertices, _ = scene_mesh(street)
     assert np.abs(vertices).max() < 1000
     assert street.clearance(np.array([[24.0, 23.0, 17.0]])).min() > 1.0

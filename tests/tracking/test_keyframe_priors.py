@@ -18,7 +18,7 @@ from geogs.tracking.tracker import Tracker, lone_tracker
 from geogs.types import Frame, PoseCorrection
 from geogs_synth.motion.handheld import handheld_trajectory
 from geogs_synth.places.room import make_room
-from geogs_synth.raycast.raycaster import Raycaster, View
+from geogs_synth.raycast.raycaster import Raycaster, RenderedView
 
 pytestmark = pytest.mark.system
 
@@ -37,14 +37,14 @@ class Score:
 
 
 @pytest.fixture(scope="module")
-def walk() -> tuple[list[View], np.ndarray]:
+def walk() -> tuple[list[RenderedView], np.ndarray]:
     scene = with_bare_walls(make_room(0))
     T_wc = handheld_trajectory(scene, FRAMES)
     caster = Raycaster(scene)
     return [caster.render(CAMERA, T) for T in T_wc], T_wc
 
 
-def track(views: list[View], prior, config: PriorConfig | None = None) -> Tracker:
+def track(views: list[RenderedView], prior, config: PriorConfig | None = None) -> Tracker:
     tracker = lone_tracker(
         CAMERA, Config(tracking=CONFIG, prior=config or PriorConfig()), prior=prior
     )
@@ -54,7 +54,7 @@ def track(views: list[View], prior, config: PriorConfig | None = None) -> Tracke
     return tracker
 
 
-def score(tracker: Tracker, walk: tuple[list[View], np.ndarray]) -> Score:
+def score(tracker: Tracker, walk: tuple[list[RenderedView], np.ndarray]) -> Score:
     views, T_wc = walk
     keyframes = [tracker.keyframes[k] for k in tracker.segment.ids]
     x = torch.stack([torch.linalg.inv(k.T_cw)[:3, 3] for k in keyframes])

@@ -8,8 +8,8 @@ import torch
 from depth_tuples import TRAINING
 from geogs_train import pace
 from geogs_train.course import Worker
+from geogs_train.network_trainer import schedule
 from geogs_train.pace import Clock, shared
-from geogs_train.trainer import schedule
 
 CPU = Worker(torch.device("cpu"))
 

@@ -19,17 +19,17 @@ from geogs.tracking.flow.own_network import (
     NetworkOptions,
     cell_pixels,
 )
-from geogs_synth.clips.options import RoomOptions
+from geogs_synth.clips.room_options import RoomOptions
 from geogs_train.bundle import reproject
-from geogs_train.checkpoint import load_checkpoint, read_options, save_checkpoint
 from geogs_train.course import Worker
 from geogs_train.flow_course import FlowCourse
 from geogs_train.flow_loss import descriptor_loss, flow_loss
-from geogs_train.options import BundleTraining, FlowTraining
-from geogs_train.pairs import FlowBatch
-from geogs_train.scores import CellErrors, has_texture, summarise
+from geogs_train.flow_options import BundleTraining, FlowTraining
+from geogs_train.flow_pairs import FlowBatch
+from geogs_train.flow_scores import CellErrors, has_texture, summarise
+from geogs_train.network_trainer import Trainer, schedule
 from geogs_train.starts import StartOptions, disturbed_starts
-from geogs_train.trainer import Trainer, schedule
+from geogs_train.training_checkpoint import load_checkpoint, read_options, save_checkpoint
 from random_rooms import use_fast_rooms
 
 pytestmark = pytest.mark.system

@@ -5,6 +5,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from geogs_synth.camera.jpeg import compress
+from geogs_synth.camera.motion_blur import mean_of_displaced
 from geogs_synth.camera.random_flaws import RandomFlaws
 from geogs_synth.draw import Draw
 
@@ -41,19 +42,10 @@ def _blur(
     image: Float[Tensor, "n 3 h w"], displacements: Float[Tensor, "n t 2"]
 ) -> Float[Tensor, "n 3 h w"]:
     """The mean of displaced images."""
-    _n, _, h, w = image.shape
-    x = (torch.arange(w, device=image.device) + 0.5) * (2 / w) - 1
-    y = (torch.arange(h, device=image.device)[:, None] + 0.5) * (2 / h) - 1
-    grid = torch.stack(torch.broadcast_tensors(x, y), -1)
-    taps = displacements.shape[1]
+    h, w = image.shape[-2:]
     across, down = 2 * displacements[..., 0], 2 * displacements[..., 1] * (w / h)
-    total = torch.zeros_like(image)
-    for tap in range(taps):
-        shift = torch.stack([across[:, tap], down[:, tap]], -1)[:, None, None]
-        total += torch.nn.functional.grid_sample(
-            image, grid + shift, padding_mode="border", align_corners=False
-        )
-    return total / taps
+    shifts = torch.stack([across, down], -1)[:, :, None, None].unbind(1)
+    return mean_of_displaced(image, shifts)
 
 
 def _vignette(

@@ -22,9 +22,9 @@ class Flaws(Settings, group="flaws"):
     gain_drift: Annotated[float, Range(0, 3)] = 0.0
     """Stops by which the automatic exposure wanders to either side, within a few seconds."""
     colour_drift: Annotated[float, Range(0, 0.5)] = 0.0
-    """Share by which the white balance wanders between red and blue."""
+    """Fraction by which the white balance wanders between red and blue."""
     vignetting: Share = 0.0
-    """Share of the light that is lost in the corners."""
+    """Fraction of the light that is lost in the corners."""
     jpeg: Annotated[int, Range(1, 100)] | None = None
     """Quality of JPEG that the image goes through; none writes it as the format does."""
     k1: Annotated[float, Range(-0.5, 0.5)] = 0.0

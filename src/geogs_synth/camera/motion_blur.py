@@ -1,10 +1,12 @@
 """Blur of what moves while a camera looks: of everything where it moves itself, and of things."""
 
+from collections.abc import Sequence
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from geogs_synth.camera.views import Views
+from geogs_synth.camera.camera_batch import CameraBatch
 
 _TAPS = 11
 _MOST = 40.0
@@ -16,22 +18,30 @@ def exposed(
 ) -> Float[Tensor, "b v 3 h w"]:
     """The mean of linear light along the motion of each pixel, which is centred on it."""
     b, v, _, h, w = colour.shape
-    image, way = colour.flatten(0, 1), blur.flatten(0, 1).clamp(-_MOST, _MOST)
+    way = blur.flatten(0, 1).clamp(-_MOST, _MOST)
+    step = torch.stack([way[..., 0] * (2 / w), way[..., 1] * (2 / h)], -1)
+    shifts = [(tap / (_TAPS - 1) - 0.5) * step for tap in range(_TAPS)]
+    return mean_of_displaced(colour.flatten(0, 1), shifts).unflatten(0, (b, v))
+
+
+def mean_of_displaced(
+    image: Float[Tensor, "n 3 h w"], shifts: Sequence[Float[Tensor, "n #h #w 2"]]
+) -> Float[Tensor, "n 3 h w"]:
+    """The mean of an image displaced by each of some shifts, in half sizes of the image."""
+    h, w = image.shape[-2:]
     x = (torch.arange(w, device=image.device) + 0.5) * (2 / w) - 1
     y = (torch.arange(h, device=image.device)[:, None] + 0.5) * (2 / h) - 1
     grid = torch.stack(torch.broadcast_tensors(x, y), -1)
-    step = torch.stack([way[..., 0] * (2 / w), way[..., 1] * (2 / h)], -1)
     total = torch.zeros_like(image)
-    for tap in range(_TAPS):
-        at = grid + (tap / (_TAPS - 1) - 0.5) * step
+    for shift in shifts:
         total += torch.nn.functional.grid_sample(
-            image, at, padding_mode="border", align_corners=False
+            image, grid + shift, padding_mode="border", align_corners=False
         )
-    return (total / _TAPS).unflatten(0, (b, v))
+    return total / len(shifts)
 
 
 def motion_while_open(
-    views: Views,
+    views: CameraBatch,
     depth: Float[Tensor, "b v h w"],
     camera: Float[Tensor, "b v 6"],
     things: Float[Tensor, "b v h w 3"],

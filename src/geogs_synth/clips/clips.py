@@ -5,11 +5,11 @@ from dataclasses import dataclass
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from geogs_synth.camera.views import Views, pixel_grid, project, rays
-from geogs_synth.clips.unusual import Scene
+from geogs_synth.camera.camera_batch import CameraBatch, pixel_grid, project, rays
+from geogs_synth.clips.dynamics import Dynamics
 from geogs_synth.raycast.caster import FlowTruth
-from geogs_synth.raycast.select import caster_for
-from geogs_synth.scene.rooms import Solids
+from geogs_synth.raycast.casters import caster_for
+from geogs_synth.scene.solids import SolidBatch
 
 
 @dataclass(frozen=True)
@@ -28,27 +28,27 @@ class ClipBatch:
     """World to camera, OpenCV axes."""
     intrinsics: Float[Tensor, "b 4"]
     """fx fy cx cy in pixels, pixel centres at integers."""
-    solids: Solids
+    solids: SolidBatch
     """What stands in the rooms when the first view is taken; hides points from views."""
     solid: Int[Tensor, "b v h w"]
-    """Place of the solid that each pixel shows; -1 for the room itself."""
+    """FloorPose of the solid that each pixel shows; -1 for the room itself."""
     sweep: Float[Tensor, "b v 6"] | None = None
-    """What the cameras do while their rows are read, as in :class:`Views`."""
-    scene: Scene | None = None
+    """What the cameras do while their rows are read, as in :class:`CameraBatch`."""
+    dynamics: Dynamics | None = None
     """What is unusual; None where nothing is."""
 
     @property
-    def views(self) -> Views:
+    def views(self) -> CameraBatch:
         """The cameras."""
         height, width = self.depth.shape[-2:]
-        return Views(self.T_cw, self.intrinsics, width, height, self.sweep)
+        return CameraBatch(self.T_cw, self.intrinsics, width, height, self.sweep)
 
     def flow(self, first: int, second: int) -> FlowTruth:
         """Where the points that the view ``first`` sees are in the view ``second``."""
         points, solids = self.points(first), self.solids
-        if self.scene is not None:
-            points = points + (second - first) * self.scene.ways_of(self.solid[:, first])
-            solids = solids.moved_by(self.scene.ways, second)
+        if self.dynamics is not None:
+            points = points + (second - first) * self.dynamics.ways_of(self.solid[:, first])
+            solids = solids.moved_by(self.dynamics.ways, second)
         return caster_for(points.device).flow(solids, self.views, points, second)
 
     def still_flow(self, points: Float[Tensor, "b h w 3"], second: int) -> Float[Tensor, "b h w 2"]:

@@ -1,30 +1,23 @@
 """The light in random rooms."""
 
-from dataclasses import fields
-
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from geogs_synth.draw import Draw
+from geogs_synth.scene.batch import chosen
 from geogs_synth.scene.rooms import Lights
 
 MOST_LIGHTS = 3
 
 
 def draw_lights(draw: Draw, size: Float[Tensor, "b 3"], views: int, change: float) -> Lights:
-    """One to three lights under the ceiling; in a share of the rooms they change between views."""
+    """One to three lights under the ceiling; in some of the rooms they change between views."""
     b = len(size)
     first, second = _draw(draw, size), _draw(draw, size)
     moment = draw.integers(max(views - 1, 1), b) + 1
     later = draw.chance(change, b)[:, None] & (torch.arange(views) >= moment[:, None])
-
-    def per_view(before: Tensor, after: Tensor) -> Tensor:
-        pick = later.reshape(b, views, *[1] * (before.ndim - 2))
-        return torch.where(pick, after, before)
-
-    names = [f.name for f in fields(Lights)]
-    return Lights(*(per_view(getattr(first, n), getattr(second, n)) for n in names))
+    return chosen(later, second, first)
 
 
 def _draw(draw: Draw, size: Float[Tensor, "b 3"]) -> Lights:

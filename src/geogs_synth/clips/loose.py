@@ -4,9 +4,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from geogs_synth.clips.pieces import Place, Placed, boxes
+from geogs_synth.clips.pieces import FloorPose, StandingPiece, boxes
 from geogs_synth.draw import Draw, about_z
-from geogs_synth.scene.rooms import BOX, ELLIPSOID, FRUSTUM, Solids
+from geogs_synth.scene.solids import BOX, ELLIPSOID, FRUSTUM, SolidBatch, Solids
 
 Tops = Float[Tensor, "b t 6"]
 """Faces to stand on: centre (3), yaw, half extents (2)."""
@@ -14,7 +14,7 @@ _BOOKS = 6
 """In a row."""
 
 
-def clutter(draw: Draw, supports: Tops, count: int) -> Solids:
+def clutter(draw: Draw, supports: Tops, count: int) -> SolidBatch:
     """Small boxes, cones, cylinders, eggs and balls."""
     n = (len(supports), count)
     support = _choose(draw, supports, count)
@@ -29,7 +29,7 @@ def clutter(draw: Draw, supports: Tops, count: int) -> Solids:
     return Solids(kind, about_z(draw.uniform(-3.15, 3.15, *n)), centre, half)
 
 
-def books(draw: Draw, supports: Tops, rows: int) -> Placed:
+def books(draw: Draw, supports: Tops, rows: int) -> StandingPiece:
     """Rows of upright books, as high as each other to a degree, side by side."""
     n = (len(supports), rows)
     support = _choose(draw, supports, rows)
@@ -42,10 +42,10 @@ def books(draw: Draw, supports: Tops, rows: int) -> Placed:
     piece = boxes(*((u, 0 * u, h, t, depth[..., 0], h) for u, h, t in column))
     room = (support[..., 4:] - 0.12).clamp_min(0)
     position = _on(support, draw.uniform(-1, 1, *n, 2) * room)
-    return piece, Place(position, support[..., 3])
+    return piece, FloorPose(position, support[..., 3])
 
 
-def wires(draw: Draw, size: Float[Tensor, "b 3"], count: int) -> Solids:
+def wires(draw: Draw, size: Float[Tensor, "b 3"], count: int) -> SolidBatch:
     """Thin rods: upright, along a wall, or anyhow."""
     n = (len(size), count)
     radius = draw.log_uniform(0.004, 0.025, *n)
@@ -57,7 +57,7 @@ def wires(draw: Draw, size: Float[Tensor, "b 3"], count: int) -> Solids:
     return Solids(torch.full(n, FRUSTUM), rotation, _anywhere(draw, size, count), half)
 
 
-def turned(draw: Draw, size: Float[Tensor, "b 3"], count: int) -> Solids:
+def turned(draw: Draw, size: Float[Tensor, "b 3"], count: int) -> SolidBatch:
     """Slabs, boxes and ellipsoids turned anyhow, in the air too."""
     n = (len(size), count)
     half = draw.log_uniform(0.05, 0.5, *n, 3)

@@ -1,24 +1,25 @@
 """What the surfaces of random rooms look like."""
 
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from geogs_synth.clips.layout import Layout
+from geogs_synth.clips.furnishing import Furnishing
 from geogs_synth.draw import Draw
+from geogs_synth.scene.batch import gathered, joined
 from geogs_synth.scene.rooms import Surfaces
 
 _PLAIN = (0.5, 0.5, 0.5, 0.5, 0.2, 0.8)
-"""Share of the walls, the floor and the ceiling that have next to no texture."""
+"""Fraction of the walls, the floor and the ceiling that have next to no texture."""
 _PLAIN_SOLID = 0.35
 _SHOWS_IMAGE = (0.12, 0.12, 0.12, 0.12, 0.12, 0.04)
-"""Share of them that show images rather than materials."""
+"""Fraction of them that show images rather than materials."""
 _SOLID_SHOWS_IMAGE = 0.35
 
 
-def draw_surfaces(draw: Draw, layout: Layout, textures: int, materials: int) -> Surfaces:
+def draw_surfaces(draw: Draw, layout: Furnishing, textures: int, materials: int) -> Surfaces:
     """Looks of the room's six faces and of two surfaces of each solid.
 
     Of the ``textures`` in the bank the first ``materials`` are materials, the others images.
@@ -42,7 +43,7 @@ def draw_surfaces(draw: Draw, layout: Layout, textures: int, materials: int) -> 
     owner = torch.stack([2 * layout.material, 2 * layout.material + 1], -1).flatten().repeat(b, 1)
     # The ends of most solids look like their sides.
     owner = torch.where(draw.chance(0.6, b, 2 * n), owner - owner % 2, owner)
-    return _join(_pick(walls, wall), _pick(solids, owner))
+    return joined(gathered(walls, wall), gathered(solids, owner))
 
 
 def _texture(
@@ -95,7 +96,7 @@ def _matrix(scale: Float[Tensor, "b s"], angle: Float[Tensor, "b s"]) -> Float[T
 
 
 def _show_pictures(
-    draw: Draw, surfaces: Surfaces, layout: Layout, images: Int[Tensor, "b s"]
+    draw: Draw, surfaces: Surfaces, layout: Furnishing, images: Int[Tensor, "b s"]
 ) -> Surfaces:
     """What hangs on a wall shows about one image; some of it is a bright window or screen."""
     picture = layout.picture.repeat_interleave(2)
@@ -115,13 +116,3 @@ def _show_pictures(
         glow=torch.where(picture, bright, surfaces.glow),
         mirror=torch.where(picture, glass, surfaces.mirror),
     )
-
-
-def _pick(surfaces: Surfaces, index: Int[Tensor, "b s"]) -> Surfaces:
-    rows = torch.arange(len(index))[:, None]
-    return Surfaces(*(getattr(surfaces, f.name)[rows, index] for f in fields(Surfaces)))
-
-
-def _join(first: Surfaces, second: Surfaces) -> Surfaces:
-    names = [f.name for f in fields(Surfaces)]
-    return Surfaces(*(torch.cat([getattr(s, n) for s in (first, second)], 1) for n in names))

@@ -7,13 +7,14 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from geogs_synth.draw import Draw, about_z
-from geogs_synth.scene.rooms import BOX, ELLIPSOID, FRUSTUM, NONE, Solids
+from geogs_synth.scene.batch import chosen
+from geogs_synth.scene.solids import BOX, ELLIPSOID, FRUSTUM, NONE, SolidBatch, Solids
 
 BODIES, PARTS = 4, 3
 """Bodies of a scene, solids of each; they take the last places."""
 
 
-def people(draw: Draw, size: Float[Tensor, "b 3"]) -> tuple[Solids, Float[Tensor, "b parts 3"]]:
+def people(draw: Draw, size: Float[Tensor, "b 3"]) -> tuple[SolidBatch, Float[Tensor, "b parts 3"]]:
     """Legs, trunk and head of people anywhere in rooms; what each part moves by per view."""
     n = (len(size), BODIES)
     foot = draw.uniform(0.1, 0.9, *n, 2) * size[:, None, :2]
@@ -23,7 +24,7 @@ def people(draw: Draw, size: Float[Tensor, "b 3"]) -> tuple[Solids, Float[Tensor
 
 def _people(
     draw: Draw, foot: Float[Tensor, "b k 2"], there: Bool[Tensor, "b k"]
-) -> tuple[Solids, Float[Tensor, "b parts 3"]]:
+) -> tuple[SolidBatch, Float[Tensor, "b parts 3"]]:
     n = foot.shape[:2]
     tall, wide = draw.uniform(1.2, 1.95, *n), draw.uniform(0.13, 0.26, *n)
     zero = torch.zeros_like(tall)
@@ -42,12 +43,13 @@ def _people(
     # Legs and head do not move quite like the trunk.
     ways = way[:, :, None] * draw.uniform(0.8, 1.2, *n, PARTS, 1)
     ways = torch.nn.functional.pad(ways, (0, 1))
-    return _bodies(kind, rotation, centre + lean, half, there), ways.flatten(1, 2)
+    kind = torch.where(there[..., None], kind, NONE)
+    return Solids(kind, rotation, centre + lean, half).flatten(), ways.flatten(1, 2)
 
 
 def traffic(
     draw: Draw, middle: Float[Tensor, "3"], scale: float, scenes: int
-) -> tuple[Solids, Float[Tensor, "b parts 3"]]:
+) -> tuple[SolidBatch, Float[Tensor, "b parts 3"]]:
     """Cars on the road along x, and who walks beside it; scaled, around the middle."""
     n = (scenes, BODIES)
     x = draw.uniform(-12, 60, *n) * (1 - 2.0 * draw.chance(0.3, *n))
@@ -73,17 +75,10 @@ def traffic(
     rotation = about_z(draw.normal(0.05, *n))[:, :, None].expand(-1, -1, PARTS, -1, -1)
     ahead = draw.log_uniform(0.03, 3.0, *n) * torch.where(draw.chance(0.8, *n), -side, side)
     ways = torch.nn.functional.pad(ahead[..., None, None].expand(-1, -1, PARTS, -1), (0, 2))
-    cars = _bodies(kind, rotation, centre, half, draw.chance(0.9, *n))
+    kind = torch.where(draw.chance(0.9, *n)[..., None], kind, NONE)
+    cars = Solids(kind, rotation, centre, half).flatten()
     driving = draw.chance(0.65, *n).repeat_interleave(PARTS, 1)
-    solids = Solids(*(
-        torch.where(driving.reshape(*driving.shape, *[1] * (a.ndim - 2)), a, b)
-        for a, b in zip(vars(cars).values(), vars(walkers).values(), strict=True)
-    ))  # fmt: skip
+    solids = chosen(driving, cars, walkers)
     ways = torch.where(driving[..., None], ways.flatten(1, 2), steps)
     solids = replace(solids, centre=scale * solids.centre + middle, half=scale * solids.half)
     return solids, scale * ways
-
-
-def _bodies(kind: Tensor, rotation: Tensor, centre: Tensor, half: Tensor, there: Tensor) -> Solids:
-    kind = torch.where(there[..., None], kind, NONE)
-    return Solids(kind.flatten(1), rotation.flatten(1, 2), centre.flatten(1, 2), half.flatten(1, 2))

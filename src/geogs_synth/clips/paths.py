@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from geogs_synth.clips.options import MotionShares, RoomOptions
+from geogs_synth.clips.room_options import MotionWeights, RoomOptions
 from geogs_synth.draw import Draw, from_vector
 
 
@@ -22,7 +22,7 @@ class Paths:
     intrinsics: Float[Tensor, "b 4"]
     """fx fy cx cy in pixels."""
     crowd: Float[Tensor, "b"]
-    """Share of the image that things other than the walls should fill."""
+    """Fraction of the image that things other than the walls should fill."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class _Motion:
     turn: float
     """Largest rotation about each axis, degrees."""
     hold: tuple[float, float]
-    """Share of the turn that keeps the same point in view."""
+    """Fraction of the turn that keeps the same point in view."""
     along_axis: float = 0.0
     """0 moves anyhow, 1 along the optical axis."""
 
@@ -46,7 +46,7 @@ _KINDS = (
     _Motion((1e-4, 2e-4), 20.0, (0.0, 0.0)),
     _Motion((0.1, 0.8), 4.0, (0.0, 1.0), along_axis=1.0),
 )
-"""In the order of :class:`MotionShares`."""
+"""In the order of :class:`MotionWeights`."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class _Steps:
     spin: Float[Tensor, "b k 3"]
     """Rotation vector, camera frame."""
     hold: Float[Tensor, "b k"]
-    """Share of the turn that keeps the same point in view."""
+    """Fraction of the turn that keeps the same point in view."""
 
 
 def draw_paths(draw: Draw, options: RoomOptions, size: Float[Tensor, "b 3"]) -> Paths:
@@ -98,11 +98,11 @@ def draw_intrinsics(draw: Draw, options: RoomOptions, rooms: int) -> Float[Tenso
     return torch.stack([fx, fy, cx, cy], -1)
 
 
-def _draw_steps(draw: Draw, shares: MotionShares, forward: Float[Tensor, "b k 3"]) -> _Steps:
+def _draw_steps(draw: Draw, weights: MotionWeights, forward: Float[Tensor, "b k 3"]) -> _Steps:
     """All candidates of a room move in the same manner, so that none is taken less often."""
     b, k = forward.shape[:2]
     kind = draw.choose(
-        (shares.hand_held, shares.medium, shares.wide, shares.rotation, shares.forward), b
+        (weights.hand_held, weights.medium, weights.wide, weights.rotation, weights.forward), b
     )
     rows = [[*m.length, m.turn, *m.hold, m.along_axis] for m in _KINDS]
     numbers = torch.tensor(rows)[kind][:, None].expand(b, k, 6)
@@ -125,7 +125,7 @@ def _keep_in_view(
     start: Float[Tensor, "b k 3"],
     hold: Float[Tensor, "b k"],
 ) -> Float[Tensor, "b k v 3 3"]:
-    """Turns views by the share ``hold`` of what brings the point seen first back to its pixel."""
+    """Views turned by a fraction of what brings the point seen first back to its pixel."""
     before = (seen - start)[:, :, None].expand_as(centre)
     now = torch.nn.functional.normalize(seen[:, :, None] - centre, dim=-1)
     before = torch.nn.functional.normalize(before, dim=-1)

@@ -4,33 +4,23 @@ Each is built in a frame on the floor: x along the wall behind it, y into the ro
 piece centred on x = y = 0. All are drawn for b rooms and k pieces of a kind at once.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from geogs_synth.draw import Draw, about_z
-from geogs_synth.scene.rooms import BOX, ELLIPSOID, FRUSTUM
+from geogs_synth.scene.batch import chosen
+from geogs_synth.scene.solids import BOX, ELLIPSOID, FRUSTUM, SolidBatch, Solids, upright
 
 BOARDS, LEAVES = 5, 7
-"""Of a shelf, of a plant."""
+"""Number of boards of a shelf, of leaves of a plant."""
 Numbers = Float[Tensor, "b k"]
 
 
 @dataclass(frozen=True)
-class Piece:
-    """k pieces of p solids in the frame of their piece."""
-
-    kind: Int[Tensor, "b k p"]
-    rotation: Float[Tensor, "b k p 3 3"]
-    """Local to the piece's frame."""
-    centre: Float[Tensor, "b k p 3"]
-    half: Float[Tensor, "b k p 3"]
-
-
-@dataclass(frozen=True)
-class Place:
+class FloorPose:
     """Where k pieces stand."""
 
     position: Float[Tensor, "b k 3"]
@@ -39,12 +29,13 @@ class Place:
     """Radians."""
 
 
-Placed = tuple[Piece, Place]
+StandingPiece = tuple[SolidBatch, FloorPose]
+"""k pieces of p solids in the frame of their piece (b k p), and where they stand."""
 
 
 def stand(
     draw: Draw, size: Float[Tensor, "b 3"], half: Float[Tensor, "b k 2"], at_wall: float
-) -> Place:
+) -> FloorPose:
     """Places on the floor: backs to a wall, or anywhere and turned anyhow."""
     b, k = half.shape[:2]
     wall = draw.integers(4, b, k)
@@ -58,7 +49,7 @@ def stand(
     c, s = yaw.cos(), yaw.sin()
     fixed = torch.stack([c * x - s * y, s * x + c * y], -1)
     centre = torch.where(back[..., None], fixed, free) + 0.5 * size[:, None, :2]
-    return Place(torch.cat([centre, torch.zeros_like(centre[..., :1])], -1), yaw)
+    return FloorPose(torch.cat([centre, torch.zeros_like(centre[..., :1])], -1), yaw)
 
 
 def _lengths(size: Float[Tensor, "b 3"], wall: Int[Tensor, "b k"]) -> tuple[Numbers, Numbers]:
@@ -70,16 +61,13 @@ def _lengths(size: Float[Tensor, "b 3"], wall: Int[Tensor, "b k"]) -> tuple[Numb
     )
 
 
-def boxes(*rows: tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]) -> Piece:
+def boxes(*rows: tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]) -> SolidBatch:
     """Boxes from centre x, y, z and half extents x, y, z."""
     numbers = torch.stack([torch.stack(torch.broadcast_tensors(*r), -1) for r in rows], -2)
-    n = numbers.shape[:-1]
-    return Piece(
-        torch.full(n, BOX), torch.eye(3).expand(*n, 3, 3), numbers[..., :3], numbers[..., 3:]
-    )
+    return upright(torch.full(numbers.shape[:-1], BOX), numbers[..., :3], numbers[..., 3:])
 
 
-def cupboards(draw: Draw, size: Float[Tensor, "b 3"], count: int) -> Placed:
+def cupboards(draw: Draw, size: Float[Tensor, "b 3"], count: int) -> StandingPiece:
     """Boxes of all sizes on the floor: cupboards, chests, beds, pillars, a few round ones."""
     n = (len(size), count)
     w, d, h = (draw.log_uniform(*r, *n) for r in ((0.12, 0.9), (0.12, 0.42), (0.1, 1.1)))
@@ -87,18 +75,14 @@ def cupboards(draw: Draw, size: Float[Tensor, "b 3"], count: int) -> Placed:
     w, d, h = (torch.where(bed, x, y) for x, y in ((w + 0.5, w), (d + 0.4, d), (0.15 + 0.2 * h, h)))
     zero = torch.zeros_like(w)
     piece = boxes((zero, zero, h, w, d, h))
-    round_ = draw.chance(0.12, *n)[..., None]
+    round_ = draw.chance(0.12, *n)
     barrel = torch.stack([d, d * draw.uniform(0.5, 1.2, *n), h], -1)[..., None, :]
-    piece = Piece(
-        torch.where(round_, FRUSTUM, piece.kind),
-        piece.rotation,
-        piece.centre,
-        torch.where(round_[..., None], barrel, piece.half),
-    )
+    cylinder = replace(piece, kind=torch.full_like(piece.kind, FRUSTUM), half=barrel)
+    piece = chosen(round_, cylinder, piece)
     return piece, stand(draw, size, torch.stack([w, d], -1), 0.7)
 
 
-def tables(draw: Draw, size: Float[Tensor, "b 3"], count: int) -> Placed:
+def tables(draw: Draw, size: Float[Tensor, "b 3"], count: int) -> StandingPiece:
     """A top on four legs: tables, desks, stools."""
     n = (len(size), count)
     w, d = draw.log_uniform(0.2, 0.95, *n), draw.log_uniform(0.2, 0.5, *n)
@@ -107,7 +91,7 @@ def tables(draw: Draw, size: Float[Tensor, "b 3"], count: int) -> Placed:
     return piece, stand(draw, size, torch.stack([w, d], -1), 0.4)
 
 
-def chairs(draw: Draw, size: Float[Tensor, "b 3"], count: int) -> Placed:
+def chairs(draw: Draw, size: Float[Tensor, "b 3"], count: int) -> StandingPiece:
     """A seat with a back on four legs."""
     n = (len(size), count)
     w, height = draw.uniform(0.19, 0.3, *n), draw.uniform(0.38, 0.55, *n)
@@ -120,20 +104,17 @@ def chairs(draw: Draw, size: Float[Tensor, "b 3"], count: int) -> Placed:
     return piece, stand(draw, size, torch.stack([w, w], -1), 0.2)
 
 
-def _with_legs(draw: Draw, piece: Piece, w: Numbers, d: Numbers, height: Numbers) -> Piece:
+def _with_legs(
+    draw: Draw, piece: SolidBatch, w: Numbers, d: Numbers, height: Numbers
+) -> SolidBatch:
     thick = draw.log_uniform(0.008, 0.04, *w.shape)
     x, y, z = w - thick, d - thick, 0.5 * height
     legs = boxes(*((sx * x, sy * y, z, thick, thick, z) for sx in (-1, 1) for sy in (-1, 1)))
     kind = torch.where(draw.chance(0.4, *w.shape)[..., None], FRUSTUM, legs.kind)
-    return Piece(
-        torch.cat([piece.kind, kind], 2),
-        torch.cat([piece.rotation, legs.rotation], 2),
-        torch.cat([piece.centre, legs.centre], 2),
-        torch.cat([piece.half, legs.half], 2),
-    )
+    return Solids.join([piece, replace(legs, kind=kind)])
 
 
-def sofas(draw: Draw, size: Float[Tensor, "b 3"], count: int) -> Placed:
+def sofas(draw: Draw, size: Float[Tensor, "b 3"], count: int) -> StandingPiece:
     """A seat between two arms and a back."""
     n = (len(size), count)
     w, d = draw.uniform(0.4, 1.1, *n), draw.uniform(0.35, 0.5, *n)
@@ -148,7 +129,7 @@ def sofas(draw: Draw, size: Float[Tensor, "b 3"], count: int) -> Placed:
     return piece, stand(draw, size, torch.stack([w + 2 * thick, d], -1), 0.7)
 
 
-def shelves(draw: Draw, size: Float[Tensor, "b 3"], count: int) -> Placed:
+def shelves(draw: Draw, size: Float[Tensor, "b 3"], count: int) -> StandingPiece:
     """Boards between two sides."""
     n = (len(size), count)
     w, d = draw.uniform(0.3, 0.8, *n), draw.uniform(0.1, 0.22, *n)
@@ -159,18 +140,18 @@ def shelves(draw: Draw, size: Float[Tensor, "b 3"], count: int) -> Placed:
     return boxes(*boards, *sides), stand(draw, size, torch.stack([w, d], -1), 0.85)
 
 
-def lamps(draw: Draw, size: Float[Tensor, "b 3"], count: int) -> Placed:
+def lamps(draw: Draw, size: Float[Tensor, "b 3"], count: int) -> StandingPiece:
     """Shades below the ceiling."""
     n = (len(size), count)
     low, high = draw.uniform(0.05, 0.3, *n), draw.uniform(0.02, 0.2, *n)
     tall, drop = draw.uniform(0.03, 0.2, *n), draw.uniform(0.05, 0.7, *n)
     z = size[:, 2:] - drop - tall
     piece = boxes((0 * low, 0 * low, z, low, high, tall))
-    piece = Piece(torch.full_like(piece.kind, FRUSTUM), piece.rotation, piece.centre, piece.half)
+    piece = replace(piece, kind=torch.full_like(piece.kind, FRUSTUM))
     return piece, stand(draw, size, low[..., None].expand(*n, 2), 0.0)
 
 
-def pictures(draw: Draw, size: Float[Tensor, "b 3"], count: int) -> Placed:
+def pictures(draw: Draw, size: Float[Tensor, "b 3"], count: int) -> StandingPiece:
     """A frame and what it shows, thin boxes on a wall: pictures, windows, doors, switches."""
     n = (len(size), count)
     w, h = draw.log_uniform(0.05, 0.8, *n), draw.log_uniform(0.05, 0.8, *n)
@@ -183,7 +164,7 @@ def pictures(draw: Draw, size: Float[Tensor, "b 3"], count: int) -> Placed:
     return piece, stand(draw, size, torch.stack([w + rim, thick], -1), 1.0)
 
 
-def skirting(draw: Draw, size: Float[Tensor, "b 3"]) -> Placed:
+def skirting(draw: Draw, size: Float[Tensor, "b 3"]) -> StandingPiece:
     """A board along the foot of all four walls, in one piece."""
     b = len(size)
     thick, tall = draw.log_uniform(0.004, 0.012, b, 1), draw.log_uniform(0.02, 0.08, b, 1)
@@ -191,10 +172,10 @@ def skirting(draw: Draw, size: Float[Tensor, "b 3"]) -> Placed:
     rows = [(s * x, 0 * y, tall, thick, y, tall) for s in (-1, 1)]
     rows += [(0 * x, s * y, tall, x, thick, tall) for s in (-1, 1)]
     position = torch.stack([x, y, 0 * x], -1)
-    return boxes(*rows), Place(position, 0 * x)
+    return boxes(*rows), FloorPose(position, 0 * x)
 
 
-def plants(draw: Draw, size: Float[Tensor, "b 3"], count: int) -> Placed:
+def plants(draw: Draw, size: Float[Tensor, "b 3"], count: int) -> StandingPiece:
     """Flat ellipsoids turned anyhow above a pot."""
     n = (len(size), count)
     radius, tall = draw.uniform(0.06, 0.18, *n), draw.uniform(0.06, 0.2, *n)
@@ -203,19 +184,12 @@ def plants(draw: Draw, size: Float[Tensor, "b 3"], count: int) -> Placed:
     spread = draw.normal(1.0, *n, LEAVES, 3) * torch.tensor([0.12, 0.12, 0.15])
     centre = spread + (2 * tall + 0.2)[..., None, None] * torch.tensor([0.0, 0.0, 1.0])
     foot = torch.stack([0 * tall, 0 * tall, tall], -1)[:, :, None]
-    kind = torch.full((*n, LEAVES + 1), ELLIPSOID)
-    kind[..., 0] = FRUSTUM
-    eye = torch.eye(3).expand(*n, 1, 3, 3)
-    piece = Piece(
-        kind,
-        torch.cat([eye, draw.rotation(*n, LEAVES)], 2),
-        torch.cat([foot, centre], 2),
-        torch.cat([pot, half], 2),
-    )
+    leaves = Solids(torch.full((*n, LEAVES), ELLIPSOID), draw.rotation(*n, LEAVES), centre, half)
+    piece = Solids.join([upright(torch.full((*n, 1), FRUSTUM), foot, pot), leaves])
     return piece, stand(draw, size, radius[..., None].expand(*n, 2), 0.3)
 
 
-def tops(placed: Placed, which: int) -> Float[Tensor, "b k 6"]:
+def tops(placed: StandingPiece, which: int) -> Float[Tensor, "b k 6"]:
     """Upper face of a solid of each piece: centre (3), yaw, half extents (2)."""
     piece, place = placed
     rotation = about_z(place.yaw)

@@ -6,22 +6,23 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from geogs_synth.camera.camera_batch import CameraBatch
 from geogs_synth.camera.develop import develop
 from geogs_synth.camera.random_flaws import RandomFlaws, draw_flaws
-from geogs_synth.camera.views import Views
-from geogs_synth.clips.cameras import choose_cameras, too_near
 from geogs_synth.clips.clips import ClipBatch
-from geogs_synth.clips.kinds import only_scene
-from geogs_synth.clips.layout import draw_layout
+from geogs_synth.clips.dynamics import Dynamics, draw_dynamics
+from geogs_synth.clips.furnishing import draw_furnishing
 from geogs_synth.clips.lights import draw_lights
 from geogs_synth.clips.materials import draw_surfaces
-from geogs_synth.clips.options import RoomOptions
+from geogs_synth.clips.path_choice import choose_cameras, too_near
 from geogs_synth.clips.paths import Paths, draw_paths
-from geogs_synth.clips.unusual import Scene, draw_scene
+from geogs_synth.clips.room_options import RoomOptions
+from geogs_synth.clips.scene_kinds import only_scene
 from geogs_synth.draw import Draw
-from geogs_synth.raycast.caster import Rendering
-from geogs_synth.raycast.select import caster_for
-from geogs_synth.scene.rooms import Rooms, moved, room_per_view
+from geogs_synth.raycast.caster import RenderedRooms
+from geogs_synth.raycast.casters import caster_for
+from geogs_synth.scene.batch import moved
+from geogs_synth.scene.rooms import Rooms, room_per_view
 from geogs_synth.textures.bank import make_bank
 from geogs_synth.textures.pyramids import TextureBank
 
@@ -39,7 +40,7 @@ class Plan:
     rooms: Rooms
     paths: Paths
     flaws: RandomFlaws
-    scene: Scene | None = None
+    dynamics: Dynamics | None = None
     """What is unusual; None where nothing is."""
 
 
@@ -81,29 +82,31 @@ class RoomSampler:
         size, solids = plan.rooms.size, plan.rooms.solids
         views = choose_cameras(plan.paths, size, solids, options.width, options.height)
         solids = solids.without(too_near(solids, views))
-        scene = plan.scene
-        if scene is not None:
-            solids = scene.out_of_the_way(solids, views)
-            views = replace(views, sweep=scene.shake.sweep)
+        dynamics = plan.dynamics
+        if dynamics is not None:
+            solids = dynamics.out_of_the_way(solids, views)
+            views = replace(views, sweep=dynamics.shake.sweep)
         rooms = Rooms(size, solids, plan.rooms.surfaces, plan.rooms.lights)
-        if scene is None:
+        if dynamics is None:
             rendering = caster_for(self.device).render(rooms, self.bank, views)
             light = rendering.colour
         else:
-            rendering = self._render_moving(rooms, views, scene.ways)
-            light = scene.blurred(rendering, views)
+            rendering = self._render_moving(rooms, views, dynamics.ways)
+            light = dynamics.blurred(rendering, views)
         images = develop(Draw(self.device, *key), plan.flaws, light)
         return ClipBatch(
             images, light, rendering.depth, rendering.normal, views.T_cw,
-            views.intrinsics, solids, rendering.solid, views.sweep, scene,
+            views.intrinsics, solids, rendering.solid, views.sweep, dynamics,
         )  # fmt: skip
 
-    def _render_moving(self, rooms: Rooms, views: Views, ways: Float[Tensor, "b n 3"]) -> Rendering:
+    def _render_moving(
+        self, rooms: Rooms, views: CameraBatch, ways: Float[Tensor, "b n 3"]
+    ) -> RenderedRooms:
         """What every view sees where solids move by ``ways`` (metres) from view to view."""
         b, v = views.T_cw.shape[:2]
         rooms = room_per_view(rooms, v, ways)
         seen = caster_for(self.device).render(rooms, self.bank, views.as_rooms())
-        return Rendering(*(x.flatten(0, 1).unflatten(0, (b, v)) for x in vars(seen).values()))
+        return RenderedRooms(*(x.flatten(0, 1).unflatten(0, (b, v)) for x in vars(seen).values()))
 
 
 @torch.no_grad()
@@ -117,7 +120,7 @@ def draw_plan(
     key = (seed, int(options.validation), step, rank)
     draw = Draw(torch.device("cpu"), *key)
     size = _draw_sizes(draw, batch)
-    layout = draw_layout(draw, size, options.least_density, options.most_density)
+    layout = draw_furnishing(draw, size, options.least_density, options.most_density)
     surfaces = draw_surfaces(draw, layout, options.textures, materials)
     lights = draw_lights(draw, size, options.views, options.light_change)
     paths = draw_paths(draw, options, size)
@@ -125,8 +128,8 @@ def draw_plan(
     rooms = Rooms(size, layout.solids, surfaces, lights)
     if options.scenes == only_scene("usual"):
         return Plan(key, rooms, paths, flaws)
-    rooms, paths, scene = draw_scene(draw, options, rooms, paths, materials)
-    return Plan(key, rooms, paths, flaws, scene)
+    rooms, paths, dynamics = draw_dynamics(draw, options, rooms, paths, materials)
+    return Plan(key, rooms, paths, flaws, dynamics)
 
 
 def _draw_sizes(draw: Draw, rooms: int) -> Float[Tensor, "b 3"]:

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from geogs_synth.clips.kinds import SHAKEN, STREET
+from geogs_synth.clips.scene_kinds import SHAKEN, STREET
 from geogs_synth.draw import Draw
 
 _TURN = (0.15, 2.5)
@@ -17,7 +17,7 @@ _WAY = (0.001, 0.02)
 _DRIVE = (0.01, 0.06)
 """The same along the optical axis on a street."""
 _OFTEN = 0.4
-"""Share of the clips of other kinds in which the camera moves, too."""
+"""Fraction of the clips of other kinds in which the camera moves, too."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class Shake:
     exposure: Float[Tensor, "b v"]
     """How long each row looks."""
     objects: Float[Tensor, "b"]
-    """Share of what things move by from view to view that passes in this time."""
+    """Fraction of what things move by from view to view that passes in this time."""
 
     @property
     def sweep(self) -> Float[Tensor, "b v 6"]:

@@ -10,19 +10,20 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from geogs_synth.clips.layout import Layout
+from geogs_synth.clips.furnishing import Furnishing
 from geogs_synth.clips.lights import MOST_LIGHTS
 from geogs_synth.clips.materials import draw_surfaces
-from geogs_synth.clips.options import RoomOptions
 from geogs_synth.clips.paths import Paths, draw_intrinsics, looking
+from geogs_synth.clips.room_options import RoomOptions
 from geogs_synth.draw import Draw, from_vector
-from geogs_synth.scene.rooms import BOX, ELLIPSOID, FRUSTUM, NONE, Lights, Rooms, Solids, Surfaces
+from geogs_synth.scene.rooms import Lights, Rooms, Surfaces
+from geogs_synth.scene.solids import BOX, ELLIPSOID, FRUSTUM, NONE, SolidBatch, Solids, upright
 
 SCALE = 0.2
 SIZE = (300.0, 300.0, 120.0)
-"""Of the room that is the world, units."""
+"""Size of the room that is the world, units."""
 MIDDLE = (150.0, 150.0, 0.0)
-"""Of the road, which runs along x."""
+"""A point of the road, which runs along x."""
 _HOUSES, _CARS, _TREES, _POSTS = 22, 12, 6, 12
 _SUN = 100.0
 """Distance of the sun, units."""
@@ -34,27 +35,24 @@ def draw_street(
     """``count`` streets with so many places for solids, and candidate paths along them."""
     size = torch.tensor(SIZE).expand(count, 3).clone()
     solids = _solids(draw, count, places)
-    layout = Layout(solids, torch.arange(places), torch.zeros(places, dtype=torch.bool))
+    layout = Furnishing(solids, torch.arange(places), torch.zeros(places, dtype=torch.bool))
     surfaces = _surfaces(draw, draw_surfaces(draw, layout, options.textures, materials))
     rooms = Rooms(size, solids, surfaces, _lights(draw, count, options.views))
     return rooms, _paths(draw, options, count)
 
 
-def _solids(draw: Draw, b: int, places: int) -> Solids:
+def _solids(draw: Draw, b: int, places: int) -> SolidBatch:
     """In metres around the origin, then scaled."""
     parts = [*_houses(draw, b), _cars(draw, b), _trees(draw, b), _posts(draw, b)]
     solids = Solids.join(parts)
     empty = places - solids.kind.shape[1]
-    rest = Solids(
-        torch.full((b, empty), NONE), torch.eye(3).expand(b, empty, 3, 3), torch.zeros(b, empty, 3),
-        torch.ones(b, empty, 3),
-    )  # fmt: skip
+    rest = upright(torch.full((b, empty), NONE), torch.zeros(b, empty, 3), torch.ones(b, empty, 3))
     solids = Solids.join([solids, rest])
     middle = torch.tensor(MIDDLE)
     return replace(solids, centre=SCALE * solids.centre + middle, half=SCALE * solids.half)
 
 
-def _houses(draw: Draw, b: int) -> list[Solids]:
+def _houses(draw: Draw, b: int) -> list[SolidBatch]:
     """Fronts on both sides, some with gaps between them, and pavements."""
     rows = []
     for side in (-1, 1):
@@ -73,7 +71,7 @@ def _houses(draw: Draw, b: int) -> list[Solids]:
     return rows
 
 
-def _cars(draw: Draw, b: int) -> Solids:
+def _cars(draw: Draw, b: int) -> SolidBatch:
     """Parked ones: a body and what is above it."""
     n = (b, _CARS)
     half = torch.stack([
@@ -89,7 +87,7 @@ def _cars(draw: Draw, b: int) -> Solids:
     return Solids.join([_boxes(half, at, there), _boxes(top, above, there)])
 
 
-def _trees(draw: Draw, b: int) -> Solids:
+def _trees(draw: Draw, b: int) -> SolidBatch:
     n = (b, _TREES)
     x, y = draw.uniform(-10, 60, *n), draw.uniform(4, 9, *n) * (1 - 2.0 * draw.integers(2, *n))
     stem, radius = draw.uniform(1.0, 2.5, *n), draw.uniform(0.1, 0.25, *n)
@@ -97,27 +95,25 @@ def _trees(draw: Draw, b: int) -> Solids:
     foot = torch.stack([x, y, stem], -1)
     top = torch.stack([x, y, 2 * stem + 0.8 * crown[..., 2]], -1)
     there = draw.chance(0.5, *n)
-    eye = torch.eye(3).expand(*n, 3, 3)
     trunk = torch.stack([radius, 0.8 * radius, stem], -1)
     return Solids.join([
-        Solids(torch.where(there, FRUSTUM, NONE), eye, foot, trunk),
-        Solids(torch.where(there, ELLIPSOID, NONE), eye, top, crown),
+        upright(torch.where(there, FRUSTUM, NONE), foot, trunk),
+        upright(torch.where(there, ELLIPSOID, NONE), top, crown),
     ])  # fmt: skip
 
 
-def _posts(draw: Draw, b: int) -> Solids:
+def _posts(draw: Draw, b: int) -> SolidBatch:
     """Lamp posts, signs' posts, bollards."""
     n = (b, _POSTS)
     tall, radius = draw.log_uniform(0.4, 4.0, *n), draw.log_uniform(0.03, 0.15, *n)
     y = draw.uniform(4, 8, *n) * (1 - 2.0 * draw.integers(2, *n))
     at = torch.stack([draw.uniform(-8, 50, *n), y, tall], -1)
     kind = torch.where(draw.chance(0.6, *n), FRUSTUM, NONE)
-    return Solids(kind, torch.eye(3).expand(*n, 3, 3), at, torch.stack([radius, radius, tall], -1))
+    return upright(kind, at, torch.stack([radius, radius, tall], -1))
 
 
-def _boxes(half: Tensor, centre: Tensor, there: Tensor) -> Solids:
-    kind = torch.where(there, BOX, NONE)
-    return Solids(kind, torch.eye(3).expand(*kind.shape, 3, 3), centre, half)
+def _boxes(half: Tensor, centre: Tensor, there: Tensor) -> SolidBatch:
+    return upright(torch.where(there, BOX, NONE), centre, half)
 
 
 def _surfaces(draw: Draw, surfaces: Surfaces) -> Surfaces:

@@ -14,7 +14,7 @@ FRAMES_PER_LAP = 280
 """Frames after which the camera is back near its first view."""
 
 FRAMES_PER_SECOND = 30.0
-"""Of the path and its hand shake."""
+"""Rate of the path and its hand shake."""
 
 _KNOTS_PER_LAP = 9
 _MIN_CLEARANCE = 0.6
@@ -49,7 +49,7 @@ class HandheldPath:
         self._seed = seed
         self._frames_per_lap = frames_per_lap
         self.position, self.target = _clear_splines(scene, seed, frames_per_lap)
-        """Of the camera and of what it looks at, over one lap in [0, 1], without the shake."""
+        """Splines of the camera and of what it looks at over one lap in [0, 1], without shake."""
 
     def __call__(self, times: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n 4 4"]:
         """Camera-to-world poses at times in seconds."""

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from geogs_synth.scene.scene import Pair, SceneBuilder, yaw_rotation
+from geogs_synth.scene.builder import Pair, SceneBuilder, yaw_rotation
 from geogs_synth.textures import artwork, patterns
 
 

@@ -4,9 +4,10 @@ import numpy as np
 from jaxtyping import Float64
 
 from geogs_synth.motion.handheld import look_at
-from geogs_synth.motion.motions import Motion
-from geogs_synth.places.vehicles import Coachwork, car, make_coachwork
-from geogs_synth.scene.scene import Scene, SceneBuilder, Texture
+from geogs_synth.motion.room_motions import Motion
+from geogs_synth.places.vehicles import VehicleMaterials, car, draw_materials
+from geogs_synth.scene.builder import SceneBuilder
+from geogs_synth.scene.scene import Scene, Texture
 from geogs_synth.textures import artwork, facades, patterns
 
 LENGTH = 260.0
@@ -52,10 +53,10 @@ def make_street(seed: int = 0, length: float = LENGTH) -> Scene:
     rng = np.random.default_rng([seed, _STREET_STREAM])
     build = SceneBuilder(rng)
     _ground(build, rng, length)
-    coachwork = make_coachwork(build, rng)
+    materials = draw_materials(build, rng)
     for side in (-1, 1):
         _houses(build, rng, side, length)
-        _parked_cars(build, rng, side, length, coachwork)
+        _parked_cars(build, rng, side, length, materials)
         _kerbside(build, rng, side, length)
     _end(build, rng, length)
     sun = np.array([length / 2, _WIDTH / 2, 0]) + _SUN
@@ -155,12 +156,12 @@ def _parked_cars(
     rng: np.random.Generator,
     side: int,
     length: float,
-    coachwork: Coachwork,
+    materials: VehicleMaterials,
 ) -> None:
     x = rng.uniform(4, 10)
     while x < length - 8:
         place = _section(build, x, side * (_ROAD_HALF - 1.0), turned=side > 0)
-        car(place.at(0, 0, 0.03, yaw=rng.uniform(-0.03, 0.03)), rng, coachwork)
+        car(place.at(0, 0, 0.03, yaw=rng.uniform(-0.03, 0.03)), rng, materials)
         x += rng.uniform(5.2, 7.5) if rng.random() < 0.7 else rng.uniform(12, 26)
 
 

@@ -6,26 +6,34 @@ import numpy as np
 
 from geogs.geometry.camera import Camera
 from geogs_synth.places.street import LANE, LENGTH, driven, heading, on_road, start_of_drive
-from geogs_synth.places.vehicles import VAN_HEIGHT, VAN_LENGTH, VAN_WIDTH, car, make_coachwork, van
-from geogs_synth.scene.bodies import Body, Path
-from geogs_synth.scene.scene import Scene, SceneBuilder
+from geogs_synth.places.vehicles import (
+    VAN_HEIGHT,
+    VAN_LENGTH,
+    VAN_WIDTH,
+    car,
+    draw_materials,
+    van,
+)
+from geogs_synth.scene.bodies import Body, Path, upright_poses
+from geogs_synth.scene.builder import SceneBuilder
+from geogs_synth.scene.scene import Scene
 
 _ONCOMING, _ONCOMING_SPEED = 3, 9.0
 _GAP_WAVE, _GAP_PERIOD = 0.08, 7.0
 _STREAM = 0x7AF
 
 
-def street_traffic(camera: Camera, share: float, seed: int = 0) -> list[Body]:
-    """A van ahead that covers about ``share`` of the image, and oncoming cars."""
+def street_traffic(camera: Camera, coverage: float, seed: int = 0) -> list[Body]:
+    """A van ahead that covers about the fraction ``coverage`` of the image, and oncoming cars."""
     rng = np.random.default_rng([seed, _STREAM])
     covered = camera.fx * camera.fy * VAN_WIDTH * VAN_HEIGHT / (camera.width * camera.height)
-    gap = math.sqrt(covered / share) + VAN_LENGTH / 2
+    gap = math.sqrt(covered / coverage) + VAN_LENGTH / 2
     ahead = SceneBuilder(rng)
-    van(ahead, rng, make_coachwork(ahead, rng, 2))
+    van(ahead, rng, draw_materials(ahead, rng, 2))
     bodies = [Body(_shape(ahead), _follows(gap, seed))]
     for k in range(_ONCOMING):
         build = SceneBuilder(rng)
-        car(build, rng, make_coachwork(build, rng, 2))
+        car(build, rng, draw_materials(build, rng, 2))
         bodies.append(Body(_shape(build), _comes(k / _ONCOMING)))
     return bodies
 
@@ -56,10 +64,6 @@ def _comes(part: float) -> Path:
 
 def _placed(x: np.ndarray, left: float, turn: float) -> np.ndarray:
     """Body to world on the road, heading along it but for ``turn``."""
-    T_wb = np.tile(np.eye(4), (len(x), 1, 1))
     yaw = heading(x) + turn
-    T_wb[:, 0, 0] = T_wb[:, 1, 1] = np.cos(yaw)
-    T_wb[:, 1, 0], T_wb[:, 0, 1] = np.sin(yaw), -np.sin(yaw)
-    T_wb[:, :2, 3] = on_road(x, np.full(len(x), left))
-    T_wb[:, 2, 3] = 0.03
-    return T_wb
+    position = np.column_stack([on_road(x, np.full(len(x), left)), np.full(len(x), 0.03)])
+    return upright_poses(position, np.cos(yaw), np.sin(yaw))

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from geogs_synth.scene.scene import SceneBuilder
+from geogs_synth.scene.builder import SceneBuilder
 from geogs_synth.textures import artwork, patterns
 
 VAN_LENGTH, VAN_WIDTH, VAN_HEIGHT = 5.2, 2.0, 2.4
@@ -15,7 +15,7 @@ _TEXEL = 0.006
 
 
 @dataclass(frozen=True)
-class Coachwork:
+class VehicleMaterials:
     """Texture indices that vehicles share."""
 
     paints: tuple[int, ...]
@@ -24,7 +24,9 @@ class Coachwork:
     plates: tuple[int, ...]
 
 
-def make_coachwork(build: SceneBuilder, rng: np.random.Generator, colours: int = 12) -> Coachwork:
+def draw_materials(
+    build: SceneBuilder, rng: np.random.Generator, colours: int = 12
+) -> VehicleMaterials:
     """Draws the shared textures."""
 
     def paint() -> int:
@@ -33,7 +35,7 @@ def make_coachwork(build: SceneBuilder, rng: np.random.Generator, colours: int =
 
     glass = patterns.fabric(rng, (128, 256), (60, 70, 80), (140, 150, 160))
     rubber = patterns.plaster(rng, (96, 192), (52, 52, 56))
-    return Coachwork(
+    return VehicleMaterials(
         tuple(paint() for _ in range(colours)),
         build.texture(glass, _TEXEL),
         build.texture(rubber, _TEXEL),
@@ -41,32 +43,32 @@ def make_coachwork(build: SceneBuilder, rng: np.random.Generator, colours: int =
     )
 
 
-def car(build: SceneBuilder, rng: np.random.Generator, coachwork: Coachwork) -> None:
+def car(build: SceneBuilder, rng: np.random.Generator, materials: VehicleMaterials) -> None:
     """A car of about 4.2 x 1.75 x 1.45 m."""
     length, width = rng.uniform([3.8, 1.68], [4.5, 1.8])
-    paint = coachwork.paints[rng.integers(len(coachwork.paints))]
-    plate = coachwork.plates[rng.integers(len(coachwork.plates))]
+    paint = materials.paints[rng.integers(len(materials.paints))]
+    plate = materials.plates[rng.integers(len(materials.plates))]
     build.box((0, 0, 0.62), (length, width, 0.62), paint)
     build.ellipsoid((0.46 * length, 0, 0.6), (0.22, 0.46 * width, 0.26), paint)
     build.ellipsoid((-0.46 * length, 0, 0.66), (0.2, 0.46 * width, 0.28), paint)
-    build.box((-0.06 * length, 0, 1.12), (0.5 * length, 0.9 * width, 0.4), coachwork.glass)
+    build.box((-0.06 * length, 0, 1.12), (0.5 * length, 0.9 * width, 0.4), materials.glass)
     build.box((-0.06 * length, 0, 1.36), (0.46 * length, 0.88 * width, 0.1), paint)
-    _wheels(build, length, width, coachwork.rubber)
+    _wheels(build, length, width, materials.rubber)
     for side in (-1, 1):
         build.box((side * (length / 2 + 0.14), 0, 0.52), (0.16, 0.52, 0.14), plate)
 
 
-def van(build: SceneBuilder, rng: np.random.Generator, coachwork: Coachwork) -> None:
+def van(build: SceneBuilder, rng: np.random.Generator, materials: VehicleMaterials) -> None:
     """A box van with pictures on its sides and its doors."""
     picture = build.texture(artwork.abstract(rng, (320, 400)))
     load = VAN_LENGTH - 1.4
     middle = -VAN_LENGTH / 2 + load / 2
     cab = VAN_LENGTH / 2
     build.box((middle, 0, 1.45), (load, VAN_WIDTH, VAN_HEIGHT - 0.5), picture)
-    build.box((middle, 0, 0.45), (load, VAN_WIDTH - 0.1, 0.2), coachwork.rubber)
-    build.box((cab - 0.7, 0, 0.85), (1.4, VAN_WIDTH - 0.1, 0.9), coachwork.paints[0])
-    build.box((cab - 0.9, 0, 1.6), (1.0, VAN_WIDTH - 0.2, 0.7), coachwork.glass)
-    _wheels(build, VAN_LENGTH, VAN_WIDTH, coachwork.rubber)
+    build.box((middle, 0, 0.45), (load, VAN_WIDTH - 0.1, 0.2), materials.rubber)
+    build.box((cab - 0.7, 0, 0.85), (1.4, VAN_WIDTH - 0.1, 0.9), materials.paints[0])
+    build.box((cab - 0.9, 0, 1.6), (1.0, VAN_WIDTH - 0.2, 0.7), materials.glass)
+    _wheels(build, VAN_LENGTH, VAN_WIDTH, materials.rubber)
 
 
 def _wheels(build: SceneBuilder, length: float, width: float, dark: int) -> None:

@@ -7,8 +7,9 @@ from jaxtyping import Float64
 from scipy.interpolate import CubicSpline
 
 from geogs.geometry.camera import Camera
-from geogs_synth.scene.bodies import Body, Path
-from geogs_synth.scene.scene import Scene, SceneBuilder
+from geogs_synth.scene.bodies import Body, Path, upright_poses
+from geogs_synth.scene.builder import SceneBuilder
+from geogs_synth.scene.scene import Scene
 from geogs_synth.textures import patterns
 
 _HEIGHT = 1.72
@@ -18,7 +19,7 @@ _PACE = 1.2
 """Metres per second, past a camera that does not turn."""
 _GROUPS = 3
 _PAIR_FROM = 0.16
-"""Share of the image from which two walk side by side, so that they need not be too near."""
+"""Fraction of the image from which two walk side by side, so that they need not be too near."""
 _BOB, _STEP_RATE = 0.02, 1.8
 _KNOT_SECONDS = 0.5
 """Walkers follow where the camera looks only as evened out over this time."""
@@ -28,18 +29,18 @@ _STREAM = 0x9E0
 
 
 def crossing_walkers(
-    path: Path, seconds: float, camera: Camera, share: float, seed: int = 0
+    path: Path, seconds: float, camera: Camera, coverage: float, seed: int = 0
 ) -> list[Body]:
     """People who pass by before a camera, one group after the other, from either side.
 
-    While it passes, a group covers about ``share`` of the image: that sets its distance. They walk
-    around the camera, so that one that turns sees them, too.
+    While it passes, a group covers about the fraction ``coverage`` of the image: that sets its
+    distance. They walk around the camera, so that one that turns sees them, too.
 
     Args:
         path: of the camera.
         seconds: for which they are needed.
         camera: its intrinsics.
-        share: of the image, above 0 and at most 1/2.
+        coverage: fraction of the image, above 0 and at most 1/2.
         seed: of their looks.
     """
     rng = np.random.default_rng([seed, _STREAM])
@@ -47,8 +48,8 @@ def crossing_walkers(
     T_wc = path(times)
     yaw = np.unwrap(np.arctan2(T_wc[:, 1, 2], T_wc[:, 0, 2]))
     view = CubicSpline(times, np.column_stack([T_wc[:, :2, 3], yaw]))
-    abreast = 2 if share > _PAIR_FROM else 1
-    distance = _distance(T_wc, camera, share / abreast)
+    abreast = 2 if coverage > _PAIR_FROM else 1
+    distance = _distance(T_wc, camera, coverage / abreast)
     half_view = math.atan(camera.width / 2 / camera.fx)
     reach = half_view + abreast * _WIDTH / distance
     period = 2 * reach * distance / _PACE
@@ -61,8 +62,8 @@ def crossing_walkers(
     ]
 
 
-def _distance(T_wc: Float64[np.ndarray, "n 4 4"], camera: Camera, share: float) -> float:
-    """Metres at which a figure on the floor covers a share of the image, by bisection."""
+def _distance(T_wc: Float64[np.ndarray, "n 4 4"], camera: Camera, coverage: float) -> float:
+    """Metres at which a figure on the floor covers a fraction of the image, by bisection."""
     eye = float(T_wc[:, 2, 3].mean())
     pitch = float(np.arcsin(T_wc[:, 2, 2]).mean())
 
@@ -75,7 +76,7 @@ def _distance(T_wc: Float64[np.ndarray, "n 4 4"], camera: Camera, share: float) 
     near, far = 0.5, 30.0
     for _ in range(40):
         middle = math.sqrt(near * far)
-        near, far = (middle, far) if covered(middle) > share else (near, middle)
+        near, far = (middle, far) if covered(middle) > coverage else (near, middle)
     return near
 
 
@@ -90,15 +91,12 @@ def _crossing(
         x, y, yaw = view(times).T
         sense = np.where(turn % 2 == 0, 1.0, -1.0)
         bearing = yaw + sense * reach * (2 * part - 1) + aside
-        T_wb = np.tile(np.eye(4), (len(times), 1, 1))
-        # It faces the way it goes.
-        T_wb[:, 0, 0] = T_wb[:, 1, 1] = sense * np.cos(bearing)
-        T_wb[:, 1, 0], T_wb[:, 0, 1] = sense * np.sin(bearing), -sense * np.sin(bearing)
-        T_wb[:, 0, 3] = x + distance * np.cos(bearing)
-        T_wb[:, 1, 3] = y + distance * np.sin(bearing)
+        cosine, sine = np.cos(bearing), np.sin(bearing)
         bob = _BOB * np.cos(2 * np.pi * _STEP_RATE * times)
-        T_wb[:, 2, 3] = np.where(turn % _GROUPS == group, bob, _AWAY)
-        return T_wb
+        height = np.where(turn % _GROUPS == group, bob, _AWAY)
+        position = np.column_stack([x + distance * cosine, y + distance * sine, height])
+        # It faces the way it goes.
+        return upright_poses(position, sense * cosine, sense * sine)
 
     return path
 

@@ -6,9 +6,10 @@ from typing import Protocol, runtime_checkable
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from geogs_synth.camera.views import Views
+from geogs_synth.camera.camera_batch import CameraBatch
 from geogs_synth.raycast.rays import Hit
-from geogs_synth.scene.rooms import Rooms, Solids
+from geogs_synth.scene.rooms import Rooms
+from geogs_synth.scene.solids import SolidBatch
 from geogs_synth.textures.pyramids import TextureBank
 
 MARGIN = 1.5e-3
@@ -16,7 +17,7 @@ MARGIN = 1.5e-3
 
 
 @dataclass(frozen=True)
-class Rendering:
+class RenderedRooms:
     """What views see."""
 
     colour: Float[Tensor, "b v 3 h w"]
@@ -45,18 +46,18 @@ class FlowTruth:
 class RoomCaster(Protocol):
     """Casts rays at batches of rooms."""
 
-    def render(self, rooms: Rooms, bank: TextureBank, views: Views) -> Rendering:
+    def render(self, rooms: Rooms, bank: TextureBank, views: CameraBatch) -> RenderedRooms:
         """What every view sees."""
         ...
 
     def flow(
-        self, solids: Solids, views: Views, points: Float[Tensor, "b h w 3"], view: int
+        self, solids: SolidBatch, views: CameraBatch, points: Float[Tensor, "b h w 3"], view: int
     ) -> FlowTruth:
         """Where points of the world are in a view."""
         ...
 
     def first_hit(
-        self, size: Float[Tensor, "b 3"], solids: Solids, origin: Float[Tensor, "b m 3"],
+        self, size: Float[Tensor, "b 3"], solids: SolidBatch, origin: Float[Tensor, "b m 3"],
         direction: Float[Tensor, "b m 3"],
     ) -> Hit:  # fmt: skip
         """The first thing that each ray from inside a room meets."""

@@ -6,15 +6,15 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from geogs_synth.camera.lens import Lens
-from geogs_synth.raycast.scene_kernels import Solids
+from geogs_synth.camera.radial_camera import RadialCamera
+from geogs_synth.raycast.pixel_kernels import PlacedSolids
 from geogs_synth.scene.scene import Scene
 
 _NEAR = 1e-3
 
 
 @dataclass(frozen=True)
-class Placed:
+class PlacedScene:
     """The n solids of a scene before p cameras; ``q`` is p, or 1 where nothing moves."""
 
     scene: Scene
@@ -23,12 +23,12 @@ class Placed:
     """Local to world."""
     centre: Float64[np.ndarray, "q n 3"]
 
-    def solids(self, camera: int) -> Solids:
+    def solids(self, camera: int) -> PlacedSolids:
         """All solids for one of the cameras."""
         s = self.scene
-        return Solids(
-            kind=s.kind,
-            half=s.half,
+        return PlacedSolids(
+            kind=s.solids.kind,
+            half=s.solids.half,
             rotation=self.rotation[camera if len(self.rotation) > 1 else 0],
             origin=self._origin[camera],
             matrix=self._matrix[camera],
@@ -38,7 +38,7 @@ class Placed:
         )
 
     def bounds(
-        self, lens: Lens, cameras: Int64[np.ndarray, "k"] | None = None, margin: float = 0.0
+        self, lens: RadialCamera, cameras: Int64[np.ndarray, "k"] | None = None, margin: float = 0.0
     ) -> Int64[np.ndarray, "k n 4"]:
         """Left, top, right, bottom (exclusive) of the pixels that may see each solid."""
         some = slice(None) if cameras is None else cameras
@@ -47,7 +47,7 @@ class Placed:
         rotation = self.rotation if still else self.rotation[some]
         centre = self.centre if still else self.centre[some]
         signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
-        corners = self.scene.bounding_half[:, None] * signs
+        corners = self.scene.solids.bounding_half[:, None] * signs
         world = np.einsum("qnij,nkj->qnki", rotation, corners) + centre[:, :, None]
         local = (world - T_wc[:, None, None, :3, 3]) @ T_wc[:, None, :3, :3]
         x, y, z = np.moveaxis(local, -1, 0)

@@ -11,17 +11,18 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int64, UInt8
 
 from geogs.geometry.camera import Camera
-from geogs_synth.camera.lens import Lens
-from geogs_synth.raycast.placement import Placed
-from geogs_synth.raycast.scene_kernels import Lighting, Textures, cast_rows, shade_rows
+from geogs_synth.camera.radial_camera import RadialCamera
+from geogs_synth.raycast.pixel_kernels import Lighting, Textures, cast_rows, shade_rows
+from geogs_synth.raycast.placement import PlacedScene
 from geogs_synth.raycast.visibility_kernels import visibility_slices
 from geogs_synth.scene.bodies import Body
-from geogs_synth.scene.scene import Scene, SceneBuilder, Texture, joined
+from geogs_synth.scene.builder import SceneBuilder
+from geogs_synth.scene.scene import Scene, Texture, joined
 
 _LEVELS = 8
 _VOXEL = 0.14
 _MAX_CELLS = 60_000
-"""Of the volume that holds the light; larger scenes have larger cells."""
+"""Most cells of the volume that holds the light; larger scenes have larger ones."""
 _AMBIENT_REACH = 0.7
 """Metres over which solids darken the ambient light, in cells of the smallest size."""
 _SPHERE_SAMPLES = 24
@@ -35,7 +36,7 @@ _SKY_EMISSION = 0.95
 
 
 @dataclass(frozen=True)
-class View:
+class RenderedView:
     """What a camera sees, exact at the pixel centres."""
 
     image: UInt8[np.ndarray, "h w 3"]
@@ -119,14 +120,14 @@ class Raycaster:
         self._textures = _pack_textures(self._all.textures)
 
     def render(
-        self, camera: Camera | Lens, T_wc: Float64[np.ndarray, "4 4"], time: float = 0.0
-    ) -> View:
+        self, camera: Camera | RadialCamera, T_wc: Float64[np.ndarray, "4 4"], time: float = 0.0
+    ) -> RenderedView:
         """What a camera with pose camera-to-world ``T_wc`` sees, all rows at once.
 
         Depth, normal and solid are those of the ray through the pixel's centre; the colour is the
         mean over the pixel. ``time`` in seconds places the bodies.
         """
-        lens = camera if isinstance(camera, Lens) else Lens(camera)
+        lens = camera if isinstance(camera, RadialCamera) else RadialCamera(camera)
         placed = self._place(T_wc[None], np.array([time]))
         solids, bounds = placed.solids(0), placed.bounds(lens)[0]
         traced, (xs, ys) = _Traced.empty(lens.camera.height, lens.camera.width), lens.rays
@@ -146,15 +147,15 @@ class Raycaster:
 
     def render_rolling(
         self,
-        camera: Camera | Lens,
+        camera: Camera | RadialCamera,
         T_wc: Float64[np.ndarray, "h 4 4"],
         times: Float64[np.ndarray, "h"] | None = None,
-    ) -> View:
+    ) -> RenderedView:
         """What a camera sees whose row v is taken from the pose ``T_wc[v]`` at ``times[v]``.
 
         Row v is that of :meth:`render` at this pose and time.
         """
-        lens = camera if isinstance(camera, Lens) else Lens(camera)
+        lens = camera if isinstance(camera, RadialCamera) else RadialCamera(camera)
         height, width = lens.camera.height, lens.camera.width
         times = np.zeros(height) if times is None else times
         traced, (xs, ys) = _Traced.empty(height, width), lens.rays
@@ -182,14 +183,14 @@ class Raycaster:
         list(self._pool.map(work, edges[:-1], edges[1:]))
         return self._view(traced)
 
-    def _view(self, traced: "_Traced") -> View:
+    def _view(self, traced: "_Traced") -> RenderedView:
         depth, solid = traced.depth, traced.solid
         if self._sky is not None:
             solid[solid == self._sky] = -1
             traced.normal[solid < 0] = 0.0
         depth[solid < 0] = 0.0
         image = np.rint(traced.image).astype(np.uint8)
-        return View(image, depth.astype(np.float32), traced.normal, solid, traced.image)
+        return RenderedView(image, depth.astype(np.float32), traced.normal, solid, traced.image)
 
     def _in_bands(self, rows: int, work: Callable[[int, int], None]) -> None:
         """Runs ``work(first, last)`` over bands of rows, several per thread to even the load."""
@@ -198,31 +199,32 @@ class Raycaster:
 
     def _place(
         self, T_wc: Float64[np.ndarray, "p 4 4"], times: Float64[np.ndarray, "p"]
-    ) -> "Placed":
+    ) -> "PlacedScene":
         """All solids as p cameras at p times see them."""
         s = self._all
-        rotation, centre = s.rotation[None], s.centre[None]
+        rotation, centre = s.solids.rotation[None], s.solids.centre[None]
         if self._bodies:
             rotation = np.repeat(rotation, len(times), 0)
             centre = np.repeat(centre, len(times), 0)
             for first, body in self.bodies():
                 T_wb, own = body.path(times), slice(first, first + len(body.shape))
-                rotation[:, own] = T_wb[:, None, :3, :3] @ body.shape.rotation
-                centre[:, own] = body.shape.centre @ T_wb[:, :3, :3].transpose(0, 2, 1)
+                rotation[:, own] = T_wb[:, None, :3, :3] @ body.shape.solids.rotation
+                centre[:, own] = body.shape.solids.centre @ T_wb[:, :3, :3].transpose(0, 2, 1)
                 centre[:, own] += T_wb[:, None, :3, 3]
-        return Placed(s, T_wc, rotation, centre)
+        return PlacedScene(s, T_wc, rotation, centre)
 
     def _compute_lighting(self) -> Lighting:
         s = self.scene
         coarser = max(1.0, float(np.cbrt(s.size.prod() / _MAX_CELLS)) / _VOXEL)
         voxel, reach = coarser * _VOXEL, coarser * _AMBIENT_REACH
-        casts = (s.bounding_half.max(1) > coarser * _SHADOW_MIN_HALF) & (s.emission == 0)
+        large = s.solids.bounding_half.max(1) > coarser * _SHADOW_MIN_HALF
+        opaque = s.solids.at(large & (s.emission == 0))
         lights = np.array([(*light.position, light.radius) for light in s.lights]).reshape(-1, 4)
         colour = np.array([light.colour for light in s.lights]).reshape(-1, 3)
         nx, ny, nz = np.ceil(s.size / voxel).astype(int)
         volume = np.zeros((nz, ny, nx, 1 + len(lights)), np.float32)
-        radius = np.linalg.norm(s.bounding_half[casts], axis=1)
-        solids = s.kind[casts], s.half[casts], s.rotation[casts], s.centre[casts], radius
+        radius = np.linalg.norm(opaque.bounding_half, axis=1)
+        solids = opaque.kind, opaque.half, opaque.rotation, opaque.centre, radius
         sphere = _fibonacci_sphere(_SPHERE_SAMPLES)
 
         def fill(first: int, last: int) -> None:

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from geogs_synth.raycast.solid_kernels import closest_hits
-from geogs_synth.scene.rooms import Solids
+from geogs_synth.scene.solids import SolidBatch
 
 _TINY = 1e-9
 
@@ -27,7 +27,7 @@ class Hit:
 
 
 def closest_hit(
-    size: Float[Tensor, "b 3"], solids: Solids, origin: Float[Tensor, "b m 3"],
+    size: Float[Tensor, "b 3"], solids: SolidBatch, origin: Float[Tensor, "b m 3"],
     direction: Float[Tensor, "b m 3"],
 ) -> Hit:  # fmt: skip
     """The first thing that each ray from inside a room meets."""
@@ -37,7 +37,7 @@ def closest_hit(
 
 
 def occluded(
-    solids: Solids, origin: Float[Tensor, "b m 3"], direction: Float[Tensor, "b m 3"],
+    solids: SolidBatch, origin: Float[Tensor, "b m 3"], direction: Float[Tensor, "b m 3"],
     end: Float[Tensor, "b m"],
 ) -> Bool[Tensor, "b m"]:  # fmt: skip
     """Whether a solid is met before ``t = end``."""
@@ -45,7 +45,7 @@ def occluded(
 
 
 def _first(
-    solids: Solids, origin: Float[Tensor, "b m 3"], direction: Float[Tensor, "b m 3"],
+    solids: SolidBatch, origin: Float[Tensor, "b m 3"], direction: Float[Tensor, "b m 3"],
     end: Float[Tensor, "b m"],
 ) -> Hit:  # fmt: skip
     """The first solid before ``end``, or -1 there."""

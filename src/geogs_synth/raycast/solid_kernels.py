@@ -8,7 +8,7 @@ import math
 import numpy as np
 from numba import njit
 
-from geogs_synth.scene.scene import BOX, FRUSTUM
+from geogs_synth.scene.solids import BOX, FRUSTUM
 
 COMPILED = {"cache": True, "nogil": True, "error_model": "numpy"}
 """Options of all kernels."""

@@ -25,9 +25,9 @@ def visibility_slices(
 ):
     """Fills slices [first, last) of ``volume`` (nz, ny, nx, 1 + lights).
 
-    Channel 0 is ambient openness: twice the share of directions free of solids within
-    ``ambient_reach``, at most 1, since a wall hides half of them. The others are the seen share of
-    each light, a ball (x, y, z, radius), sampled at the points ``sphere`` of the unit sphere.
+    Channel 0 is ambient openness: twice the fraction of directions free of solids within
+    ``ambient_reach``, at most 1, since a wall hides half of them. The others are the seen fraction
+    of each light, a ball (x, y, z, radius), sampled at the points ``sphere`` of the unit sphere.
     """
     samples = len(sphere)
     for z in range(first, last):

@@ -1,64 +1,18 @@
-"""What a batch of random rooms is made of.
+"""Batches of random rooms, as training sees them: solids, surfaces, lights.
 
-World frame: z up, metres; a room fills [0, size]. A solid has a local frame and three numbers
-``half`` whose meaning depends on its kind, as in :mod:`geogs_synth.scene.scene`.
-
-Surfaces: 0..5 are the room's faces -x, +x, -y, +y, -z (floor), +z (ceiling); solid i has surface
-6 + 2 i around it and 7 + 2 i on its two faces along the local z axis (an ellipsoid only the first).
+A room fills [0, size]. Surfaces: 0..5 are the room's faces -x, +x, -y, +y, -z (floor), +z
+(ceiling); solid i has surface 6 + 2 i around it and 7 + 2 i on its two faces along the local z axis
+(an ellipsoid only the first).
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, is_dataclass, replace
-from typing import TypeVar
+from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
-from geogs.gpu.transfer import to_device
-
-NONE, BOX, FRUSTUM, ELLIPSOID = -1, 0, 1, 2
-
-Part = TypeVar("Part")
-
-
-@dataclass(frozen=True)
-class Solids:
-    """The solids of b rooms, n places each."""
-
-    kind: Int[Tensor, "b n"]
-    """BOX, FRUSTUM, ELLIPSOID, or NONE where a place is empty."""
-    rotation: Float[Tensor, "b n 3 3"]
-    """Local to world."""
-    centre: Float[Tensor, "b n 3"]
-    """World, metres."""
-    half: Float[Tensor, "b n 3"]
-    """Metres, by kind."""
-
-    @property
-    def bounding_half(self) -> Float[Tensor, "b n 3"]:
-        """Half extents of the bounding box in the local frame."""
-        radius = torch.maximum(self.half[..., 0], self.half[..., 1])
-        frustum = torch.stack([radius, radius, self.half[..., 2]], -1)
-        return torch.where((self.kind == FRUSTUM)[..., None], frustum, self.half)
-
-    def at(self, places: Int[Tensor, "k"]) -> "Solids":
-        """Some of the places of every room."""
-        return Solids(*(getattr(self, f.name)[:, places] for f in fields(Solids)))
-
-    def without(self, gone: Bool[Tensor, "b n"]) -> "Solids":
-        """The same places, some emptied."""
-        return replace(self, kind=torch.where(gone, NONE, self.kind))
-
-    def moved_by(self, ways: Float[Tensor, "b n 3"], steps: int | Tensor) -> "Solids":
-        """What moves by ``ways`` per step, that many steps later."""
-        return replace(self, centre=self.centre + steps * ways)
-
-    @staticmethod
-    def join(parts: Sequence["Solids"]) -> "Solids":
-        """All places of several sets, one after the other."""
-        names = [f.name for f in fields(Solids)]
-        return Solids(*(torch.cat([getattr(p, name) for p in parts], 1) for name in names))
+from geogs_synth.scene.batch import each
+from geogs_synth.scene.solids import SolidBatch
 
 
 @dataclass(frozen=True)
@@ -136,59 +90,25 @@ class Rooms:
 
     size: Float[Tensor, "b 3"]
     """Metres."""
-    solids: Solids
+    solids: SolidBatch
     surfaces: Surfaces
     lights: Lights
 
 
-def packed_solids(solids: Solids) -> Float[Tensor, "b n 16"]:
+def packed_solids(solids: SolidBatch) -> Float[Tensor, "b n 16"]:
     """What the kernels read: world-to-local rotation by rows, centre, half, kind."""
     rotation = solids.rotation.transpose(-1, -2).flatten(-2)
     rows = [rotation, solids.centre, solids.half, solids.kind[..., None]]
     return torch.cat([r.float() for r in rows], -1).contiguous()
 
 
-def moved(part: Part, device: torch.device) -> Part:
-    """Rooms, or a part of them, on a device, without waiting for it."""
-    return _each(part, lambda t: to_device(t.contiguous(), device))
-
-
-def only(part: Part, room: int) -> Part:
-    """One room, or a part of it, as a batch of its own."""
-    return _each(part, lambda t: t[room : room + 1])
-
-
-def chosen(which: Bool[Tensor, "b"], first: Part, second: Part) -> Part:
-    """Of each room what ``first`` says, or ``second``; rooms or parts of them."""
-    values = [(getattr(first, f.name), getattr(second, f.name)) for f in fields(first)]  # type: ignore[arg-type]
-    return type(first)(
-        *(
-            torch.where(which.reshape(-1, *[1] * (a.ndim - 1)), a, b)
-            if isinstance(a, Tensor)
-            else chosen(which, a, b)
-            for a, b in values
-        )
-    )
-
-
 def room_per_view(rooms: Rooms, views: int, ways: Float[Tensor, "b n 3"]) -> Rooms:
     """A room for each view, with what moves by ``ways`` from view to view where it is then."""
 
-    def repeated(part: Part) -> Part:
-        return _each(part, lambda t: t.repeat_interleave(views, 0))
+    def repeat(tensor: Tensor) -> Tensor:
+        return tensor.repeat_interleave(views, 0)
 
     step = torch.arange(views, device=ways.device).repeat(len(ways))[:, None, None]
-    solids = repeated(rooms.solids).moved_by(ways.repeat_interleave(views, 0), step)
-    lights = _each(rooms.lights, lambda t: t.flatten(0, 1)[:, None])
-    return Rooms(rooms.size.repeat_interleave(views, 0), solids, repeated(rooms.surfaces), lights)
-
-
-def _each(part: Part, change: Callable[[Tensor], Tensor]) -> Part:
-    """A dataclass of tensors, or of such dataclasses, with every tensor changed."""
-    values = [getattr(part, f.name) for f in fields(part)]  # type: ignore[arg-type]
-    return type(part)(
-        *(
-            change(v) if isinstance(v, Tensor) else _each(v, change) if is_dataclass(v) else v
-            for v in values
-        )
-    )
+    solids = each(repeat, rooms.solids).moved_by(repeat(ways), step)
+    lights = each(lambda t: t.flatten(0, 1)[:, None], rooms.lights)
+    return Rooms(repeat(rooms.size), solids, each(repeat, rooms.surfaces), lights)

@@ -7,9 +7,9 @@ import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
 from geogs_synth.camera.flaws import Flaws
-from geogs_synth.camera.lens import Lens
-from geogs_synth.camera.sensor import Sensor
-from geogs_synth.raycast.raycaster import Raycaster, View
+from geogs_synth.camera.image_sensor import Sensor
+from geogs_synth.camera.radial_camera import RadialCamera
+from geogs_synth.raycast.raycaster import Raycaster, RenderedView
 from geogs_synth.scene.bodies import Body, Path
 
 _SHARP = 0.5
@@ -26,10 +26,10 @@ class Shot:
     time: float
     """Seconds; mid-exposure of the middle row."""
     T_wc: Float64[np.ndarray, "4 4"]
-    """Of the middle row at mid-exposure."""
+    """Camera to world, for the middle row at mid-exposure."""
     image: UInt8[np.ndarray, "h w 3"]
     """RGB, with all flaws."""
-    truth: View
+    truth: RenderedView
     """What a camera of the same lens without a shutter sees from ``T_wc``."""
     moving: np.ndarray
     """h w, bool: where ``truth`` shows a body."""
@@ -44,7 +44,7 @@ class Shooting:
     def __init__(
         self,
         raycaster: Raycaster,
-        lens: Lens,
+        lens: RadialCamera,
         path: Path,
         flaws: Flaws | None = None,
         rate: float = 30.0,
@@ -70,7 +70,9 @@ class Shooting:
             image = self._sensor.develop(self._light(truth, T_wc, time), index, time)
         return Shot(time, T_wc, image, truth, moving)
 
-    def sample_times(self, truth: View, T_wc: np.ndarray, time: float) -> Float64[np.ndarray, "s"]:
+    def sample_times(
+        self, truth: RenderedView, T_wc: np.ndarray, time: float
+    ) -> Float64[np.ndarray, "s"]:
         """Times of the middle row at which its light is gathered; more of them where more moves."""
         exposure = self._flaws.exposure
         ends = time + exposure * np.array([-0.5, 0.5])
@@ -85,7 +87,9 @@ class Shooting:
         rows = self.lens.camera.height
         return (np.arange(rows) / (rows - 1) - 0.5) * self._flaws.readout
 
-    def _light(self, truth: View, T_wc: np.ndarray, time: float) -> Float32[np.ndarray, "h w 3"]:
+    def _light(
+        self, truth: RenderedView, T_wc: np.ndarray, time: float
+    ) -> Float32[np.ndarray, "h w 3"]:
         """Mean linear light in [0, 1] over the exposure."""
         times = self.sample_times(truth, T_wc, time)
         if len(times) == 1 and self._flaws.readout == 0:
@@ -95,13 +99,15 @@ class Shooting:
             light += (self._instant(one).shade / 255) ** 2
         return light / len(times)
 
-    def _instant(self, time: float) -> View:
+    def _instant(self, time: float) -> RenderedView:
         if self._flaws.readout == 0:
             return self._raycaster.render(self.lens, self._path(np.array([time]))[0], time)
         times = time + self.row_times()
         return self._raycaster.render_rolling(self.lens, self._path(times), times)
 
-    def _image_motion(self, truth: View, T_wc: np.ndarray, time: float, ends: np.ndarray) -> float:
+    def _image_motion(
+        self, truth: RenderedView, T_wc: np.ndarray, time: float, ends: np.ndarray
+    ) -> float:
         """Pixels by which the image moves most between two times."""
         step = max(1, self.lens.camera.width // _GRID)
         some = slice(step // 2, None, step)
@@ -114,7 +120,7 @@ class Shooting:
         at_ends = np.repeat(world[None], 2, 0)
         for first, body in self._raycaster.bodies():
             own = (solid >= first) & (solid < first + len(body.shape))
-            at_ends[:, own] = _carried(body, world[own], time, ends)
+            at_ends[:, own] = _moved_along(body, world[own], time, ends)
         T_cw = np.linalg.inv(self._path(ends))
         seen = at_ends @ T_cw[:, :3, :3].transpose(0, 2, 1) + T_cw[:, None, :3, 3]
         plane = seen[..., :2] / np.maximum(seen[..., 2:], 1e-3)
@@ -122,7 +128,7 @@ class Shooting:
         return float(moved.max() * self.lens.camera.fx)
 
 
-def _carried(
+def _moved_along(
     body: Body, world: np.ndarray, time: float, ends: np.ndarray
 ) -> Float64[np.ndarray, "e n 3"]:
     """Where points on a body at ``time`` are at other times."""

@@ -12,12 +12,14 @@ from geogs.io.writers.atomic import atomic_file, write_text
 from geogs.io.writers.trajectories import write_tum_trajectory
 from geogs.types import Trajectory
 from geogs_synth.camera.flaws import Flaws
-from geogs_synth.camera.lens import Lens
-from geogs_synth.motion.motions import Motion
-from geogs_synth.sequence.stage import Stage
+from geogs_synth.camera.radial_camera import RadialCamera
+from geogs_synth.motion.room_motions import Motion
+from geogs_synth.sequence.location import Location
 
 
-def write_camera(path: Path, stage: Stage, lens: Lens, flaws: Flaws, moving: float) -> None:
+def write_camera(
+    path: Path, location: Location, lens: RadialCamera, flaws: Flaws, moving: float
+) -> None:
     """Writes the intrinsics, with the distortion, for programs; the rest is for evaluation."""
     camera = lens.camera
     intrinsics: dict[str, Any] = {
@@ -27,18 +29,18 @@ def write_camera(path: Path, stage: Stage, lens: Lens, flaws: Flaws, moving: flo
         "fy": camera.fy,
         "cx": camera.cx,
         "cy": camera.cy,
-        "scale": stage.depth_scale,
+        "scale": location.depth_scale,
     }
     if lens.is_distorted:
         intrinsics["distortion"] = [lens.k1, lens.k2, 0.0, 0.0]
     parameters: dict[str, Any] = {
         "camera": intrinsics,
         "convention": "OpenCV axes, pixel centres at integer coordinates, depth = z",
-        "scene": stage.name,
+        "scene": location.name,
     }
-    if flaws != Flaws() or moving or stage.kind != "handheld":
-        parameters["motion"] = stage.kind
-        parameters["fps"] = stage.motion.rate
+    if flaws != Flaws() or moving or location.kind != "handheld":
+        parameters["motion"] = location.kind
+        parameters["fps"] = location.motion.rate
         parameters["readout"] = flaws.readout
         parameters["flaws"] = asdict(flaws)
         parameters["moving"] = moving

@@ -25,7 +25,7 @@ TRAINING_PHOTOGRAPHS = (
 )  # fmt: skip
 VALIDATION_PHOTOGRAPHS = ("chelsea.png", "gravel.png", "moon.png", "text.png", "retina.jpg")
 _MATERIALS = 0.6
-"""Share of the bank that is materials rather than images."""
+"""Fraction of the bank that is materials rather than images."""
 _LEAST_DRAWN = 192
 """Texels; the drawn textures need some room and are reduced where less is asked for."""
 
@@ -136,8 +136,8 @@ def _noise(rng: np.random.Generator, size: int) -> UInt8[np.ndarray, "s s 3"]:
     first, second = (np.asarray(_paint(rng), np.float32) for _ in range(2))
     if rng.random() < 0.5:  # shades of one colour
         second = first * rng.uniform(0.2, 0.8)
-    share = np.clip(0.5 + 0.33 * value, 0, 1)[..., None]
-    return np.clip(first * share + second * (1 - share), 0, 255).astype(np.uint8)
+    mix = np.clip(0.5 + 0.33 * value, 0, 1)[..., None]
+    return np.clip(first * mix + second * (1 - mix), 0, 255).astype(np.uint8)
 
 
 def _crop(rng: np.random.Generator, name: str, size: int) -> UInt8[np.ndarray, "s s 3"]:

@@ -78,8 +78,8 @@ def road(rng: np.random.Generator, length: float, width: float) -> UInt8[np.ndar
     paint[middle - line // 2 : middle + line // 2 + 1, : round(0.45 * shape[1])] = 1
     for edge in (round(0.13 * shape[0]), round(0.87 * shape[0])):
         paint[edge - line // 2 : edge + line // 2 + 1] = 1
-    share = (paint * np.clip(worn, 0, 1))[..., None]
-    return np.clip(image * (1 - share) + 225 * share, 4, 250).astype(np.uint8)
+    alpha = (paint * np.clip(worn, 0, 1))[..., None]
+    return np.clip(image * (1 - alpha) + 225 * alpha, 4, 250).astype(np.uint8)
 
 
 def sky(rng: np.random.Generator) -> UInt8[np.ndarray, "h w 3"]:
@@ -89,7 +89,7 @@ def sky(rng: np.random.Generator) -> UInt8[np.ndarray, "h w 3"]:
     rise = np.clip(latitude / 60, 0, 1)[..., None]
     image = (1 - rise) * np.array([214, 224, 236.0]) + rise * np.array([96, 142, 208.0])
     clouds = fractal_noise(rng, (h, w), (8, 12), 6, 0.6)[..., None]
-    share = np.clip(1.2 * clouds - 0.3, 0, 0.85) * np.clip(latitude / 8, 0, 1)[..., None]
-    image = np.broadcast_to(image, (h, w, 3)) * (1 - share) + 246 * share
+    alpha = np.clip(1.2 * clouds - 0.3, 0, 0.85) * np.clip(latitude / 8, 0, 1)[..., None]
+    image = np.broadcast_to(image, (h, w, 3)) * (1 - alpha) + 246 * alpha
     image = np.where(latitude[..., None] < -0.5, np.array([150, 152, 146.0]), image)
     return np.clip(image, 4, 250).astype(np.uint8)

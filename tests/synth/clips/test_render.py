@@ -6,17 +6,17 @@ from dataclasses import replace
 import pytest
 import torch
 
+from geogs_synth.camera.camera_batch import pixel_grid, rays
 from geogs_synth.camera.develop import develop
 from geogs_synth.camera.jpeg import compress
 from geogs_synth.camera.random_flaws import draw_flaws
-from geogs_synth.camera.views import pixel_grid, rays
 from geogs_synth.clips.clips import ClipBatch
-from geogs_synth.clips.options import RoomOptions
+from geogs_synth.clips.room_options import RoomOptions
 from geogs_synth.clips.sampler import RoomSampler
 from geogs_synth.draw import Draw
-from geogs_synth.raycast.cpu import CpuCaster
-from geogs_synth.raycast.distance import signed_distance, wall_distance
-from geogs_synth.scene.rooms import BOX, ELLIPSOID, FRUSTUM
+from geogs_synth.raycast.cpu_caster import CpuCaster
+from geogs_synth.raycast.solid_distance import signed_distance, wall_distance
+from geogs_synth.scene.solids import BOX, ELLIPSOID, FRUSTUM
 from random_rooms import looking_along_y, nothing, room_of, small_bank, solids_of, use_fast_rooms
 
 OPTIONS = RoomOptions(width=64, height=48, textures=8, texture_size=32, candidates=12)

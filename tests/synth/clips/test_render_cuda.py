@@ -5,20 +5,21 @@ from dataclasses import replace
 import pytest
 import torch
 
-import geogs_synth.raycast.cuda as cuda_module
+import geogs_synth.raycast.cuda_caster as cuda_module
 from cuda_emulator import use_emulator
-from geogs_synth.camera.views import Views, pixel_grid, rays
-from geogs_synth.clips.cameras import choose_cameras, too_near
-from geogs_synth.clips.layout import draw_layout
+from geogs_synth.camera.camera_batch import CameraBatch, pixel_grid, rays
+from geogs_synth.clips.furnishing import draw_furnishing
 from geogs_synth.clips.lights import draw_lights
 from geogs_synth.clips.materials import draw_surfaces
-from geogs_synth.clips.options import RoomOptions
+from geogs_synth.clips.path_choice import choose_cameras, too_near
 from geogs_synth.clips.paths import draw_paths
+from geogs_synth.clips.room_options import RoomOptions
 from geogs_synth.clips.sampler import RoomSampler
 from geogs_synth.draw import Draw
-from geogs_synth.raycast.cpu import CpuCaster
-from geogs_synth.raycast.cuda import MOST_SOLIDS, SOURCE, CudaCaster
-from geogs_synth.scene.rooms import Rooms, moved
+from geogs_synth.raycast.cpu_caster import CpuCaster
+from geogs_synth.raycast.cuda_caster import MOST_SOLIDS, SOURCE, CudaCaster
+from geogs_synth.scene.batch import moved
+from geogs_synth.scene.rooms import Rooms
 from random_rooms import small_bank
 
 HOST = torch.device("cpu")
@@ -35,7 +36,7 @@ def device(request, monkeypatch) -> torch.device:
     return torch.device("cuda")
 
 
-def furnished(device: torch.device) -> tuple[Rooms, Views]:
+def furnished(device: torch.device) -> tuple[Rooms, CameraBatch]:
     """Random rooms as they are trained with; on a GPU as large."""
     large = device.type == "cuda"
     width, height = (512, 384) if large else (45, 30)
@@ -44,7 +45,7 @@ def furnished(device: torch.device) -> tuple[Rooms, Views]:
     )
     draw = Draw(torch.device("cpu"), 3)
     size = draw.uniform(3.0, 6.0, 2 if large else 1, 3)
-    layout = draw_layout(draw, size, options.least_density, options.most_density)
+    layout = draw_furnishing(draw, size, options.least_density, options.most_density)
     surfaces = draw_surfaces(draw, layout, 2, 1)
     lights = draw_lights(draw, size, 2, 1.0)
     views = choose_cameras(draw_paths(draw, options, size), size, layout.solids, width, height)
@@ -52,7 +53,7 @@ def furnished(device: torch.device) -> tuple[Rooms, Views]:
     return moved(Rooms(size, solids, surfaces, lights), device), moved(views, device)
 
 
-def sweep_of(views: Views) -> torch.Tensor:
+def sweep_of(views: CameraBatch) -> torch.Tensor:
     """A few degrees and centimetres from the first row to the last."""
     g = torch.Generator().manual_seed(4)
     b, v = views.T_cw.shape[:2]
@@ -61,7 +62,7 @@ def sweep_of(views: Views) -> torch.Tensor:
     return sweep.to(views.T_cw)
 
 
-def seen_points(views: Views, depth: torch.Tensor) -> torch.Tensor:
+def seen_points(views: CameraBatch, depth: torch.Tensor) -> torch.Tensor:
     """World points at depths before the first view."""
     origin, direction = rays(views, 0, *pixel_grid(views))
     return (origin + depth.flatten(1)[..., None] * direction).unflatten(1, depth.shape[1:])

@@ -5,15 +5,15 @@ from dataclasses import replace
 import pytest
 import torch
 
+from geogs_synth.camera.camera_batch import pixel_grid, project, rays
 from geogs_synth.camera.motion_blur import exposed, motion_while_open
-from geogs_synth.camera.views import pixel_grid, project, rays
 from geogs_synth.clips.clips import ClipBatch
-from geogs_synth.clips.kinds import NAMES, STREET, draw_kinds, only_scene
-from geogs_synth.clips.options import RoomOptions, SceneShares
+from geogs_synth.clips.room_options import RoomOptions, SceneWeights
 from geogs_synth.clips.sampler import RoomSampler, draw_plan
+from geogs_synth.clips.scene_kinds import NAMES, STREET, draw_kinds, only_scene
 from geogs_synth.clips.shake import draw_shake
 from geogs_synth.draw import Draw, from_vector, turned
-from geogs_train.pairs import REPEATING, flow_batch
+from geogs_train.flow_pairs import REPEATING, flow_batch
 from geogs_train.starts import StartOptions
 from random_rooms import looking_along_y, use_fast_rooms
 
@@ -36,15 +36,15 @@ def film(sampler: RoomSampler, kind: str, count: int = 2) -> ClipBatch:
 
 def test_usual_rooms_are_what_they_were_before_there_were_others():
     plan = draw_plan(OPTIONS, 4, 0, 3, 2, 0)
-    other = draw_plan(replace(OPTIONS, scenes=SceneShares(shaken=1.0)), 4, 0, 3, 2, 0)
-    assert plan.scene is None
-    assert other.scene is not None
+    other = draw_plan(replace(OPTIONS, scenes=SceneWeights(shaken=1.0)), 4, 0, 3, 2, 0)
+    assert plan.dynamics is None
+    assert other.dynamics is not None
     assert torch.equal(plan.rooms.solids.centre, other.rooms.solids.centre)
     assert torch.equal(plan.paths.centre, other.paths.centre)
 
 
 def test_kinds_come_as_often_as_asked_for():
-    shares = SceneShares(usual=0.5, shaken=0.0, people=0.25, papered=0.0, bare=0.0, street=0.25)
+    shares = SceneWeights(usual=0.5, shaken=0.0, people=0.25, papered=0.0, bare=0.0, street=0.25)
     kind = draw_kinds(Draw(CPU, 1), shares, 4000)
     share = torch.bincount(kind, minlength=len(NAMES)) / 4000
     assert share.tolist() == pytest.approx([0.5, 0, 0.25, 0, 0, 0.25], abs=0.03)
@@ -109,9 +109,9 @@ def test_a_point_is_drawn_out_and_loses_no_light():
 
 def test_people_move_and_their_flow_is_their_own(sampler):
     clips = film(sampler, "people", 4)
-    assert clips.scene is not None
+    assert clips.dynamics is not None
     truth, still = clips.flow(0, 1), clips.still_flow(clips.points(0), 1)
-    moving = clips.scene.ways_of(clips.solid[:, 0]).norm(dim=-1) > 0
+    moving = clips.dynamics.ways_of(clips.solid[:, 0]).norm(dim=-1) > 0
     apart = (truth.pixels - still).norm(dim=-1)
     assert 0.005 < moving.float().mean() < 0.7
     assert apart[~moving].max() < 1e-3
@@ -139,7 +139,7 @@ def test_a_street_has_a_sky_that_stays_where_it_is_and_ground_below(sampler):
 
 def test_papered_walls_start_from_the_right_one(sampler):
     clips = film(sampler, "papered")
-    assert clips.scene is not None
+    assert clips.dynamics is not None
     generator = torch.Generator().manual_seed(0)
     batch = flow_batch(clips, StartOptions(cold=0.0), generator)
     still = torch.cat([clips.still_flow(clips.points(k), 1 - k) for k in (0, 1)])

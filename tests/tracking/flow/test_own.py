@@ -19,9 +19,9 @@ from geogs.tracking.flow.own_network import (
     cell_pixels,
 )
 from geogs.world.grid import SampleGrid
-from geogs_train.export import export_weights
-from geogs_train.scores import FlowScores
-from geogs_train.validation import SceneScores
+from geogs_train.flow_scores import FlowScores
+from geogs_train.flow_validation import SceneScores
+from geogs_train.trained_weights import write_weights
 
 SMALL = NetworkOptions(stem=8, middle=16, deep=16, hidden=16, context=16, motion=16)
 CAMERA = Camera(fx=80.0, fy=80.0, cx=51.5, cy=38.5, width=103, height=77)
@@ -36,7 +36,7 @@ def network() -> FlowNetwork:
 @pytest.fixture
 def operator(network, tmp_path) -> OwnFlow:
     path = tmp_path / "w.safetensors"
-    export_weights(network, path, 3, SceneScores(FlowScores(*[0.5] * 10), {}))
+    write_weights(network, path, 3, scores=SceneScores(FlowScores(*[0.5] * 10), {}))
     grid = SampleGrid(CAMERA)
     return OwnFlow(grid, path, ClassicalFlow(grid))
 
@@ -187,7 +187,7 @@ def test_cells_that_jump_from_a_warm_start_have_no_weight(operator):
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 def test_what_is_recorded_on_a_gpu_says_what_is_not(network, tmp_path, caplog):
     path = tmp_path / "w.safetensors"
-    export_weights(network, path, 3, SceneScores(FlowScores(*[0.5] * 10), {}))
+    write_weights(network, path, 3, scores=SceneScores(FlowScores(*[0.5] * 10), {}))
     grid = SampleGrid(CAMERA, "cuda")
     options = OwnFlowOptions(min_share=0.0, max_deviation=1e6)
     operator = OwnFlow(grid, path, CudaClassicalFlow(grid), options)

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from geogs.depth.network.calibration import TOLERANCE, DepthCalibration, right_logit
-from geogs_train.depth.calibrate import calibrated, logistic_fit
-from geogs_train.depth.scores import DepthErrors
+from geogs_train.depth.confidence_fit import calibrated, logistic_fit
+from geogs_train.depth.depth_scores import DepthErrors
 
 N = 60_000
 

@@ -9,11 +9,11 @@ import torch
 from depth_tuples import NETWORK, TRAINING, use_fast_rooms
 from geogs.cli.main import main
 from geogs.depth.network.weights import load_depth_network
-from geogs_train.checkpoint import load_checkpoint, read_options, save_checkpoint
 from geogs_train.course import Worker
-from geogs_train.depth.course import DepthCourse
-from geogs_train.depth.options import DepthTraining
-from geogs_train.trainer import Trainer
+from geogs_train.depth.depth_course import DepthCourse
+from geogs_train.depth.depth_options import DepthTraining
+from geogs_train.network_trainer import Trainer
+from geogs_train.training_checkpoint import load_checkpoint, read_options, save_checkpoint
 
 CPU = Worker(torch.device("cpu"))
 

@@ -9,7 +9,7 @@ from scipy.integrate import quad
 
 from depth_tuples import NETWORK, random_views
 from geogs.depth.network.model import DepthNetwork
-from geogs_train.depth.loss import (
+from geogs_train.depth.depth_loss import (
     CELL_SPREAD,
     angular,
     coarse_truth,
@@ -18,8 +18,8 @@ from geogs_train.depth.loss import (
     outlier_laplace,
     plane_loss,
 )
-from geogs_train.depth.options import DepthLossOptions
-from geogs_train.depth.tuples import DepthBatch
+from geogs_train.depth.depth_options import DepthLossOptions
+from geogs_train.depth.depth_tuples import DepthBatch
 
 
 def test_the_likelihood_is_a_density_over_errors():

@@ -9,9 +9,9 @@ import torch
 from depth_tuples import TRAINING, use_fast_rooms
 from geogs.depth.network.sweep import cell_rays
 from geogs_synth.clips.sampler import RoomSampler
-from geogs_train.depth.options import TupleOptions
-from geogs_train.depth.pool import ClipPool, StoredClips
-from geogs_train.depth.tuples import Chance, disturbed_poses, draw_tuples, known_range, relit
+from geogs_train.depth.clip_pool import ClipPool, StoredClips
+from geogs_train.depth.depth_options import TupleOptions
+from geogs_train.depth.depth_tuples import Chance, disturbed_poses, draw_tuples, known_range, relit
 
 EXACT = TupleOptions(dud=0.0, missing=0.0, disturbed=0.0, photometric=0.0)
 

@@ -1,0 +1,97 @@
+"""What stands where in random rooms."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from geogs_synth.clips import loose, pieces
+from geogs_synth.clips.pieces import BOARDS, StandingPiece
+from geogs_synth.draw import Draw, about_z
+from geogs_synth.scene.solids import NONE, SolidBatch, Solids
+
+
+@dataclass(frozen=True)
+class Furnishing:
+    """Solids of b rooms, and which of the n places belong together."""
+
+    solids: SolidBatch
+    material: Int[Tensor, "n"]
+    """The place whose surfaces a place shares; its own for most."""
+    picture: Bool[Tensor, "n"]
+    """Whether it hangs flat on a wall and shows an image."""
+
+
+@dataclass(frozen=True)
+class _Group:
+    """Places that are filled in the same way."""
+
+    solids: SolidBatch
+    per_material: int
+    """So many consecutive places have one material."""
+    picture: int = 0
+    """Every so many-th place is a picture; 0 for none."""
+
+
+def draw_furnishing(
+    draw: Draw, size: Float[Tensor, "b 3"], least: float, most: float
+) -> Furnishing:
+    """Furnishes rooms of these sizes; the densities are those of :class:`RoomOptions`."""
+    b = len(size)
+    density = draw.uniform(least, most, b)[:, None]
+    cupboards = pieces.cupboards(draw, size, 8)
+    tables = pieces.tables(draw, size, 3)
+    shelves = pieces.shelves(draw, size, 2)
+    furniture = (cupboards, tables, shelves)
+    standing = [draw.uniform(0, 1, *placed[1].yaw.shape) < density for placed in furniture]
+    floor = loose.floor(size)
+    supports = [(cupboards, standing[0], 0), (tables, standing[1], 0)]
+    supports += [(shelves, standing[2], k) for k in range(BOARDS)]
+    # What would stand on a piece that is not there stands on the floor.
+    faces = torch.cat(
+        [torch.where(there[..., None], pieces.tops(p, k), floor) for p, there, k in supports], 1
+    )
+    anywhere = torch.cat([floor.expand(-1, 6, -1), faces], 1)
+
+    def some(placed: StandingPiece) -> SolidBatch:
+        return _put(placed, draw.uniform(0, 1, *placed[1].yaw.shape) < density)
+
+    def scattered(solids: SolidBatch, factor: float = 1.0) -> SolidBatch:
+        return solids.without(draw.uniform(0, 1, *solids.kind.shape) > factor * density)
+
+    return _join(
+        _Group(_put(cupboards, standing[0]), 1),
+        _Group(_put(tables, standing[1]), 5),
+        _Group(some(pieces.chairs(draw, size, 2)), 6),
+        _Group(some(pieces.sofas(draw, size, 1)), 4),
+        _Group(_put(shelves, standing[2]), BOARDS + 2),
+        _Group(some(pieces.pictures(draw, size, 7)), 1, picture=2),
+        _Group(_put(pieces.skirting(draw, size), draw.chance(0.6, b, 1)), 4),
+        _Group(some(pieces.lamps(draw, size, 2)), 1),
+        _Group(some(pieces.plants(draw, size, 1)), 8),
+        _Group(some(loose.books(draw, faces, 3)), 1),
+        _Group(scattered(loose.clutter(draw, anywhere, 20), 1.2), 1),
+        _Group(scattered(loose.wires(draw, size, 5)), 1),
+        _Group(scattered(loose.turned(draw, size, 4), 0.6), 1),
+    )
+
+
+def _put(placed: StandingPiece, there: Bool[Tensor, "b k"]) -> SolidBatch:
+    """The solids of pieces in their places; some of the pieces are not there."""
+    piece, place = placed
+    turn = about_z(place.yaw)[:, :, None]
+    centre = (turn @ piece.centre[..., None])[..., 0] + place.position[:, :, None]
+    kind = torch.where(there[..., None], piece.kind, NONE)
+    return Solids(kind, turn @ piece.rotation, centre, piece.half).flatten()
+
+
+def _join(*groups: _Group) -> Furnishing:
+    material: list[int] = []
+    picture: list[bool] = []
+    for group in groups:
+        start, count = len(material), group.solids.kind.shape[1]
+        material += [start + k - k % group.per_material for k in range(count)]
+        picture += [group.picture > 0 and k % group.picture == 0 for k in range(count)]
+    solids = Solids.join([g.solids for g in groups])
+    return Furnishing(solids, torch.tensor(material), torch.tensor(picture))

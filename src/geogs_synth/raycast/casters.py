@@ -1,0 +1,12 @@
+"""The caster for a device."""
+
+import torch
+
+from geogs_synth.raycast.caster import RoomCaster
+from geogs_synth.raycast.cpu_caster import CpuCaster
+from geogs_synth.raycast.cuda_caster import CudaCaster
+
+
+def caster_for(device: torch.device) -> RoomCaster:
+    """Casts rays at rooms whose tensors are on the device."""
+    return CudaCaster() if device.type == "cuda" else CpuCaster()

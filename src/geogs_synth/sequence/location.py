@@ -1,0 +1,88 @@
+"""Where a sequence is taken: the scene, the camera's shape and the units that suit its size."""
+
+import math
+from dataclasses import dataclass
+
+from geogs.errors import InputError
+from geogs.geometry.camera import Camera
+from geogs_synth.motion.motion_kinds import MotionKind
+from geogs_synth.motion.room_motions import Motion, room_motion
+from geogs_synth.places.room import make_room
+from geogs_synth.places.street import drive, make_street
+from geogs_synth.places.traffic import street_traffic
+from geogs_synth.places.walkers import crossing_walkers
+from geogs_synth.scene.bodies import Body
+from geogs_synth.scene.scene import Scene
+
+ROOM_FOCAL = 0.7
+"""Focal length over width of the camera in rooms: 71 degrees across."""
+STREET_FOCAL = 0.58
+"""82 degrees across."""
+
+_MAX_SIZE = 8192
+
+
+@dataclass(frozen=True)
+class Location:
+    """A scene and a way through it."""
+
+    kind: MotionKind
+    name: str
+    seed: int
+    scene: Scene
+    motion: Motion
+    width: int
+    height: int
+    """Pixels of the images, where the user does not say."""
+    focal: float
+    """Focal length over the width of the image."""
+    depth_scale: float
+    """Units of the depth images per metre."""
+    voxel_cm: int
+    """Side of the cells of which each that was seen gives a point, centimetres."""
+    reach: float
+    """Metres of depth beyond which nothing counts as seen."""
+
+    def camera(self, width: int | None, height: int | None) -> Camera:
+        """The camera of the size asked for, its principal point in the middle of the image."""
+        return centred_camera(width or self.width, height or self.height, self.focal)
+
+    def bodies(self, camera: Camera, seconds: float, coverage: float) -> list[Body]:
+        """What moves in the camera's view and covers about this fraction of it."""
+        if self.kind == "driving":
+            return street_traffic(camera, coverage, self.seed)
+        return crossing_walkers(self.motion.path, seconds, camera, coverage, self.seed)
+
+
+def make_location(kind: MotionKind, seed: int = 0, scene: Scene | None = None) -> Location:
+    """The room or the street of the seed, and the motion through it.
+
+    ``scene``, if it is there already, is not made again.
+    """
+    scene = scene or make_scene(kind, seed)
+    if kind == "driving":
+        return Location(
+            kind, f"procedural street, seed {seed}", seed, scene, drive(seed),
+            width=1241, height=376, focal=STREET_FOCAL, depth_scale=256.0, voxel_cm=10, reach=40.0,
+        )  # fmt: skip
+    return Location(
+        kind, f"procedural room, seed {seed}", seed, scene, room_motion(kind, scene, seed),
+        width=320, height=240, focal=ROOM_FOCAL, depth_scale=6553.5, voxel_cm=1, reach=math.inf,
+    )  # fmt: skip
+
+
+def make_scene(kind: MotionKind, seed: int = 0) -> Scene:
+    """The room or the street of the seed that a motion goes through."""
+    return make_street(seed) if kind == "driving" else make_room(seed)
+
+
+def centred_camera(width: int, height: int, focal: float = ROOM_FOCAL) -> Camera:
+    """A camera with its principal point in the middle; ``focal`` is its length over the width.
+
+    Raises:
+        InputError: the image would be too small or too large.
+    """
+    if not (16 <= width <= _MAX_SIZE and 16 <= height <= _MAX_SIZE):
+        raise InputError(f"images must be 16 to {_MAX_SIZE} pixels a side, not {width}x{height}")
+    f = focal * width
+    return Camera(f, f, (width - 1) / 2, (height - 1) / 2, width, height)

@@ -1,0 +1,107 @@
+"""Clips of random rooms that stay on the device: more keyframes a second than can be rendered."""
+
+from dataclasses import dataclass, fields
+
+import torch
+from jaxtyping import Float, Float16, UInt8
+from torch import Tensor
+
+from geogs_synth.clips.clips import ClipBatch
+from geogs_synth.clips.sampler import Plan, RoomSampler
+from geogs_train.ahead import PlansAhead
+
+QUANTILES = (0.05, 0.5, 0.95)
+"""Quantiles of depth, which stand for what a tracker knows of a view."""
+
+
+@dataclass(frozen=True)
+class StoredClips:
+    """n clips of v views as they are kept."""
+
+    images: UInt8[Tensor, "n v 3 h w"]
+    depth: Float[Tensor, "n v h w"]
+    """Metres."""
+    normal: Float16[Tensor, "n v 3 h w"]
+    """Camera frame."""
+    T_cw: Float[Tensor, "n v 4 4"]
+    intrinsics: Float[Tensor, "n 4"]
+    quantiles: Float[Tensor, "n v 3"]
+    """Quantiles of depth, metres."""
+
+    @staticmethod
+    def of(clips: ClipBatch) -> "StoredClips":
+        """A batch of clips."""
+        coarse = clips.depth[..., ::4, ::4].flatten(2)
+        levels = torch.tensor(QUANTILES, device=coarse.device)
+        return StoredClips(
+            (clips.images * 255).round().to(torch.uint8),
+            clips.depth,
+            clips.normal.half(),
+            clips.T_cw,
+            clips.intrinsics,
+            coarse.quantile(levels, -1).movedim(0, -1),
+        )
+
+    def tensors(self) -> list[Tensor]:
+        """In the order of the fields."""
+        return [getattr(self, f.name) for f in fields(self)]
+
+
+class ClipPool:
+    """At turn t it holds the batches t to t + ``plans`` - 1 of an endless supply."""
+
+    def __init__(
+        self,
+        rooms: RoomSampler,
+        plans: int,
+        clips: int,
+        seed: int,
+        rank: int = 0,
+        processes: int = 0,
+    ) -> None:
+        """``processes`` draw rooms ahead, each batch of ``clips``; none draws them when needed."""
+        self._rooms, self._plans, self._clips, self._rank = rooms, plans, clips, rank
+        self._ahead = (
+            PlansAhead(rooms.options, rooms.bank.materials, seed, clips, rank, processes)
+            if processes
+            else None
+        )
+        self._stored: StoredClips | None = None
+        self._turn = 0
+
+    def at(self, turn: int) -> StoredClips:
+        """The clips of a turn; what was not there yet is rendered, and takes the oldest's place."""
+        if self._stored is None or not self._turn <= turn <= self._turn + self._plans:
+            self._stored, self._turn = None, turn
+            missing = range(turn, turn + self._plans)
+        else:
+            missing = range(self._turn + self._plans, turn + self._plans)
+        for number in missing:
+            self._put(number, StoredClips.of(self._rooms.film(self._plan(number))))
+        self._turn = turn
+        assert self._stored is not None
+        return self._stored
+
+    def empty(self) -> None:
+        """Free what is stored, and draw nothing ahead until clips are asked for again."""
+        self._stored = None
+        if self._ahead is not None:
+            self._ahead.rest()
+
+    def close(self) -> None:
+        """End the processes."""
+        if self._ahead is not None:
+            self._ahead.close()
+
+    def _plan(self, number: int) -> Plan:
+        if self._ahead is not None:
+            return self._ahead.plan(number)
+        return self._rooms.plan(number, self._clips, self._rank)
+
+    def _put(self, number: int, clips: StoredClips) -> None:
+        if self._stored is None:
+            empty = (x.new_empty(self._plans * self._clips, *x.shape[1:]) for x in clips.tensors())
+            self._stored = StoredClips(*empty)
+        start = number % self._plans * self._clips
+        for kept, new in zip(self._stored.tensors(), clips.tensors(), strict=True):
+            kept[start : start + self._clips] = new

@@ -1,0 +1,118 @@
+"""The depth network's course: keyframes drawn from pools of clips of random rooms."""
+
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from geogs.depth.network.model import DepthNetwork
+from geogs.depth.network.weights import load_depth_network
+from geogs_synth.clips.sampler import RoomSampler
+from geogs_synth.draw import Draw
+from geogs_train.course import Panels, Worker
+from geogs_train.depth.clip_pool import ClipPool
+from geogs_train.depth.confidence_fit import calibrated
+from geogs_train.depth.depth_loss import depth_loss
+from geogs_train.depth.depth_options import DepthTraining
+from geogs_train.depth.depth_scores import DepthErrors, DepthScores
+from geogs_train.depth.depth_tuples import Chance, DepthBatch, draw_tuples
+from geogs_train.depth.depth_validation import DepthValidation
+from geogs_train.trained_weights import write_weights
+
+CALIBRATION_BATCHES, CALIBRATION_SEED = 6, 9
+
+
+class DepthCourse:
+    """Small images first, then large ones, each size with a pool of its own."""
+
+    weights = "depth.safetensors"
+    curves: Panels = (
+        (
+            "mean relative error of depth",
+            ("absolute", "textured_absolute", "faint_absolute", "bare_absolute"),
+            True,
+        ),
+        ("median error of normals, degrees", ("normal", "textured_normal", "bare_normal"), True),
+        ("shares of validation pixels", ("within", "within_3", "within_5", "sure"), False),
+    )
+    recordable = False
+
+    def __init__(self, options: DepthTraining, worker: Worker) -> None:
+        self.options, self.worker = options, worker
+        large = RoomSampler(options.rooms, worker.device, options.seed)
+        small = RoomSampler(
+            replace(options.rooms, width=options.small_width, height=options.small_height),
+            worker.device,
+            options.seed + 1,
+            large.bank,
+        )
+        self._pools = [
+            self._pool(rooms, options.seed + n) for n, rooms in enumerate((large, small))
+        ]
+        self._held_out: DepthValidation | None = None
+
+    def network(self) -> DepthNetwork:
+        """As in the protocol."""
+        return DepthNetwork(self.options.network)
+
+    def compile(self, network: DepthNetwork) -> None:
+        """As in the protocol: what sees batches of one size, whatever the number of neighbours."""
+        for part in (network.context, network.body):
+            part.compile(dynamic=False)
+
+    @torch.no_grad()
+    def batch(self, step: int, progress: float) -> DepthBatch:
+        """As in the protocol; the size of the images and the number of neighbours are those of all
+        workers."""
+        options, device = self.options, self.worker.device
+        small = progress < options.small
+        if not small:
+            self._pools[True].empty()
+        clips = self._pools[small].at(step // options.pool.refresh)
+        shared = Draw(torch.device("cpu"), options.seed, step)
+        least, most = options.tuples.least_neighbours, options.tuples.most_neighbours
+        count = least + int(shared.integers(most - least + 1, 1))
+        seed = hash((options.seed, step, self.worker.rank)) % 2**62
+        chance = Chance(torch.Generator(device).manual_seed(seed))
+        size = options.small_batch if small else options.batch
+        batch = draw_tuples(clips, size, count, options.tuples, chance)
+        return replace(batch, progress=progress)
+
+    def loss(self, network: DepthNetwork, batch: DepthBatch) -> Float[Tensor, ""]:
+        """As in the protocol."""
+        return depth_loss(network(batch.views), batch, self.options.loss)
+
+    def examination(self, batches: int) -> DepthValidation:
+        """As in the protocol."""
+        found = DepthValidation(self.options, self.worker.device, batches)
+        count = min(batches, CALIBRATION_BATCHES)
+        self._held_out = DepthValidation(
+            self.options, self.worker.device, count, CALIBRATION_SEED, found.bank
+        )
+        return found
+
+    def load(self, path: Path) -> DepthNetwork:
+        """As in the protocol."""
+        return load_depth_network(path).network.requires_grad_(True)
+
+    def export(self, network: DepthNetwork, path: Path, step: int, scores: DepthScores) -> None:
+        """As in the protocol; calibrated on rooms that neither training nor validation show."""
+        assert self._held_out is not None  # by the examination
+        calibration = calibrated(DepthErrors.join(self._held_out.errors(network)))
+        write_weights(network, path, step, scores=scores, calibration=calibration)
+
+    def close(self) -> None:
+        """End the processes that draw rooms."""
+        for pool in self._pools:
+            pool.close()
+
+    def _pool(self, rooms: RoomSampler, seed: int) -> ClipPool:
+        options, worker = self.options.pool, self.worker
+        processes = 0
+        if worker.device.type == "cuda":
+            cores = len(os.sched_getaffinity(0)) // worker.count
+            processes = max(1, min(6, (cores - 2) // 2))
+        return ClipPool(rooms, options.plans, options.rooms, seed, worker.rank, processes)

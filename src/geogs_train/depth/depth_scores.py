@@ -1,0 +1,127 @@
+"""How good depths and normals are on textured, faint and bare surfaces, and whether they know."""
+
+from dataclasses import asdict, dataclass, field
+
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+from torch.nn import functional
+
+FAINT, TEXTURED = 0.4, 2.0
+"""Gradient of the undisturbed picture in 8-bit levels per pixel, root mean square over 9 x 9
+pixels: less is bare, more is textured, between them it is faint."""
+KINDS = ("textured", "faint", "bare")
+
+
+@dataclass(frozen=True)
+class DepthErrors:
+    """Errors of pixels, a row each."""
+
+    error: Float[Tensor, "n"]
+    """Logarithm of found over true depth."""
+    deviation: Float[Tensor, "n"]
+    """Predicted standard deviation of that."""
+    outlier: Float[Tensor, "n"]
+    """Predicted probability that the depth is an outlier."""
+    angle: Float[Tensor, "n"]
+    """Between found and true normals, degrees."""
+    kind: UInt8[Tensor, "n"]
+    """Index into ``KINDS``."""
+
+    @staticmethod
+    def join(parts: "list[DepthErrors]") -> "DepthErrors":
+        """All pixels of several batches."""
+        names = ("error", "deviation", "outlier", "angle", "kind")
+        return DepthErrors(*(torch.cat([getattr(p, n) for p in parts]) for n in names))
+
+
+@dataclass(frozen=True)
+class DepthScores:
+    """Over pixels of unseen rooms."""
+
+    absolute: float
+    """Mean relative error of depth."""
+    median: float
+    """Median relative error."""
+    within_3: float
+    """Fraction of pixels within a factor of 1.03."""
+    within_5: float
+    """Fraction within 1.05."""
+    normal: float
+    """Median error of normals, degrees."""
+    within: float
+    """Fraction of the pixels believed (outlier below 1/2) that err by less than two deviations."""
+    believed: float
+    """Fraction of pixels whose predicted probability to be an outlier is below 1/2."""
+    sure: float
+    """Fraction of pixels with a deviation below 3 %, believed."""
+    sure_absolute: float
+    """Mean relative error of those."""
+    textured_absolute: float
+    textured_within_5: float
+    textured_normal: float
+    faint_absolute: float
+    faint_within_5: float
+    faint_normal: float
+    bare_absolute: float
+    bare_within_5: float
+    bare_normal: float
+    scale: float = field(default=1.0)
+    """Mean over the believed pixels of absolute error over Laplace scale: 1 if calibrated."""
+
+    def line(self) -> str:
+        """On one line."""
+        return "  ".join(f"{name} {value:.4f}" for name, value in asdict(self).items())
+
+
+def summarise(pixels: DepthErrors) -> DepthScores:
+    """Scores of all pixels."""
+    relative = pixels.error.exp().sub(1).abs()
+    believed = pixels.outlier < 0.5
+    inside = pixels.error.abs() < 2 * pixels.deviation
+    sure = believed & (pixels.deviation < 0.03)
+    parts = {}
+    for index, kind in enumerate(KINDS):
+        of = pixels.kind == index
+        parts[f"{kind}_absolute"] = _mean(relative[of])
+        parts[f"{kind}_within_5"] = _within(pixels.error[of], 1.05)
+        parts[f"{kind}_normal"] = _median(pixels.angle[of])
+    ratio = pixels.error.abs() / (pixels.deviation / 2**0.5)
+    return DepthScores(
+        absolute=_mean(relative),
+        median=_median(relative),
+        within_3=_within(pixels.error, 1.03),
+        within_5=_within(pixels.error, 1.05),
+        normal=_median(pixels.angle),
+        within=_mean(inside[believed].float()),
+        believed=_mean(believed.float()),
+        sure=_mean(sure.float()),
+        sure_absolute=_mean(relative[sure]),
+        scale=_mean(ratio[believed]),
+        **parts,
+    )
+
+
+def texture_kind(light: Float[Tensor, "n 3 h w"]) -> UInt8[Tensor, "n h w"]:
+    """Texture at every pixel, from linear light before the camera: 0 textured, 1 faint, 2 bare."""
+    level = light.sqrt().mean((1, 2, 3), keepdim=True).square().clamp_min(1e-4)
+    grey = (0.2 / level * light).clamp(1e-5, 1).pow(1 / 2.2).mean(1, keepdim=True) * 255
+    padded = functional.pad(grey, (1, 1, 1, 1), mode="replicate")
+    across = 0.5 * (padded[..., 1:-1, 2:] - padded[..., 1:-1, :-2])
+    down = 0.5 * (padded[..., 2:, 1:-1] - padded[..., :-2, 1:-1])
+    energy = across.square() + down.square()
+    mean = functional.avg_pool2d(energy, 9, 1, 4, count_include_pad=False)[:, 0]
+    return (mean < TEXTURED**2).to(torch.uint8) + (mean < FAINT**2).to(torch.uint8)
+
+
+def _within(error: Tensor, factor: float) -> float:
+    limit = torch.tensor(factor).log().item()
+    return _mean((error.abs() < limit).float())
+
+
+def _mean(values: Tensor) -> float:
+    return float(values.mean()) if len(values) else float("nan")
+
+
+def _median(values: Tensor) -> float:
+    return float(values.median()) if len(values) else float("nan")

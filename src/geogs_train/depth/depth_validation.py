@@ -1,0 +1,81 @@
+"""The fixed validation set: tuples of rooms and textures that training never shows."""
+
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from geogs.depth.network.model import DepthNetwork
+from geogs.depth.network.views import DepthPrediction
+from geogs_synth.clips.sampler import RoomSampler
+from geogs_synth.textures.pyramids import TextureBank
+from geogs_train.depth.clip_pool import StoredClips
+from geogs_train.depth.depth_options import DepthTraining
+from geogs_train.depth.depth_scores import DepthErrors, DepthScores, summarise, texture_kind
+from geogs_train.depth.depth_tuples import Chance, DepthBatch, draw_tuples
+
+SEED = 3141
+EVERY = 3
+"""Every so many-th pixel across and down is looked at."""
+
+
+class DepthValidation:
+    """Keyframes of one size with neighbours; drawn once, kept on the device."""
+
+    def __init__(
+        self,
+        options: DepthTraining,
+        device: torch.device,
+        batches: int,
+        seed: int = SEED,
+        bank: TextureBank | None = None,
+    ) -> None:
+        """``bank`` may be that of another set."""
+        rooms = RoomSampler(replace(options.rooms, validation=True), device, seed, bank)
+        self.options, self.bank = options, rooms.bank
+        chance = Chance(torch.Generator(device).manual_seed(seed))
+        self.batches: list[DepthBatch] = []
+        self.kinds: list[UInt8[Tensor, "b h w"]] = []
+        tuples = options.tuples
+        span = tuples.most_neighbours - tuples.least_neighbours + 1
+        for number in range(batches):
+            clips = rooms.sample(number, options.pool.rooms)
+            count = tuples.least_neighbours + number % span
+            stored = StoredClips.of(clips)
+            batch = draw_tuples(stored, options.batch, count, tuples, chance)
+            clip, view = batch.place.unbind(1)
+            self.batches.append(batch)
+            self.kinds.append(texture_kind(clips.light[clip, view]))
+
+    @torch.no_grad()
+    def errors(self, network: DepthNetwork) -> list[DepthErrors]:
+        """Scores of a network, batch by batch."""
+        network.eval()
+        found = (network(b.views) for b in self.batches)
+        parts = [
+            pixel_errors(b, f, k) for b, f, k in zip(self.batches, found, self.kinds, strict=True)
+        ]
+        network.train()
+        return parts
+
+    def score(self, network: DepthNetwork) -> DepthScores:
+        """Scores of a network."""
+        return summarise(DepthErrors.join(self.errors(network)))
+
+
+def pixel_errors(
+    batch: DepthBatch, found: DepthPrediction, kind: UInt8[Tensor, "b h w"]
+) -> DepthErrors:
+    """Errors of some of the pixels of a batch."""
+    error = (found.depth(batch.views.typical) / batch.depth).log()
+    angle = angle_between(found.normal, batch.normal)
+    columns = (error, found.deviation(), found.outlier.sigmoid(), angle, kind)
+    return DepthErrors(*(c[:, ::EVERY, ::EVERY].flatten() for c in columns))
+
+
+def angle_between(
+    first: Float[Tensor, "b 3 h w"], second: Float[Tensor, "b 3 h w"]
+) -> Float[Tensor, "b h w"]:
+    """Degrees."""
+    return torch.rad2deg((first * second).sum(1).clamp(-1, 1).arccos())

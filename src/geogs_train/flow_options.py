@@ -1,0 +1,94 @@
+"""Settings of the training of the flow network."""
+
+from dataclasses import dataclass, field
+from typing import Annotated, Literal
+
+from geogs.config import Seed
+from geogs.config.setting import Count, Positive, Range, Settings, Share, Weight
+from geogs.tracking.flow.own_options import NetworkOptions
+from geogs_synth.clips.room_options import RoomOptions, SceneWeights
+
+
+@dataclass(frozen=True)
+class BundleTraining(Settings, group="training.bundle"):
+    """The second stage, through the dense bundle adjustment."""
+
+    rounds: Count = 3
+    """Rounds of flow and adjustment."""
+    reach: Count = 2
+    """Views of a clip at most so far apart are matched."""
+    pose: Weight = 10.0
+    """Weight of the error of relative poses, median depths plus radians."""
+    flow: Weight = 0.05
+    """Weight of the error of the flow that poses and depths induce, pixels."""
+    likelihood: Weight = 0.3
+    """Weight of the likelihood of the network's own flow."""
+
+
+@dataclass(frozen=True)
+class FlowTraining(Settings, group="training"):
+    """What a training run does; saved with every checkpoint."""
+
+    stage: Literal["flow", "bundle"] = "flow"
+    """Pairs of views with exact flow, or clips through the dense bundle adjustment."""
+    steps: Annotated[int, Range(1)] = 20_000
+    """Steps of the whole run; the learning rate ends at zero with the last."""
+    batch: Count = 16
+    """Clips per step and device."""
+    rooms: RoomOptions = field(
+        default_factory=lambda: RoomOptions(
+            width=416,
+            height=288,
+            scenes=SceneWeights(0.5, 0.12, 0.08, 0.08, 0.04, 0.18),
+        )
+    )
+    """What the clips show; every ordered pair of neighbouring views is an edge."""
+    far: Share = 0.2
+    """Fraction of the edges, beside those from nothing, whose start is off by 16 to 64 pixels."""
+    iterations: Count = 6
+    """Iterations of the network per edge."""
+    learning_rate: Positive = 8e-4
+    """Peak, reached after the warm-up."""
+    warmup: Count = 300
+    """Steps in which the learning rate grows from zero."""
+    weight_decay: Weight = 1e-4
+    clip: Positive = 1.0
+    """Largest norm of a gradient."""
+    ema: Annotated[float, Range(0, below=1)] = 0.999
+    """Decay of the running mean of the weights, which is what is validated and shipped."""
+    decay: Annotated[float, Range(above=0, most=1)] = 0.8
+    """Weight of an iteration's loss relative to the next."""
+    likelihood: Literal["joint", "separate"] = "joint"
+    """Whether the likelihood of the error trains the flow, too, or an absolute error does."""
+    absolute: Weight = 0.3
+    """Weight of log(1 + absolute error in pixels) beside a joint likelihood."""
+    dense: Weight = 0.5
+    """Weight of the same of the upsampled flow after the last iteration."""
+    descriptors: Weight = 0.3
+    """Weight of the cross-entropy between correlation windows and where the truth lies in them."""
+    occluded: Weight = 0.3
+    """Weight of cells that the other view does not see, relative to those that it sees."""
+    seed: Seed = 0
+    bundle: BundleTraining = field(default_factory=BundleTraining)
+    network: NetworkOptions = field(default_factory=NetworkOptions)
+
+
+@dataclass(frozen=True)
+class RunOptions(Settings, group="run"):
+    """How a run is watched and when it pauses."""
+
+    validate_every: Count = 1000
+    """Steps between validations, each with a checkpoint."""
+    validation_batches: Count = 8
+    minutes: Annotated[float | None, Range(above=0)] = None
+    """The run stops with a checkpoint after so many minutes, if any; it goes on with ``resume``."""
+    paced: bool = False
+    """Whether the run is as long as its minutes instead of its steps: the learning rate ends at
+    zero with the last minute. How many steps that are depends on the machine, and a run that goes
+    on has its minutes again for what was left."""
+    resume: bool = False
+    """Go on from the checkpoint in the output folder, with its settings."""
+    begin_with: str = ""
+    """Weights file to begin with; "" for random ones."""
+    fuse: bool = False
+    """Whether the network is compiled; worth its minute on a GPU."""

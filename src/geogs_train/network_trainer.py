@@ -1,0 +1,110 @@
+"""One training run of a network: steps, running mean of the weights, exact resume."""
+
+import math
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, distributed, nn
+
+from geogs_train.course import Course, Schedule, Worker
+from geogs_train.step_graph import StepGraph
+
+
+class Trainer:
+    """A network, its optimiser and the course that it takes.
+
+    Step n of a run depends on nothing but the seed, n, and the state after step n - 1, so that a
+    run that goes on from a checkpoint equals one that was never stopped (on the CPU to the last
+    bit).
+    """
+
+    def __init__(
+        self, course: Course, worker: Worker, fuse: bool = False, paced: bool = False
+    ) -> None:
+        """``paced``: ``progress`` is set by who calls, not by the fraction of the steps."""
+        self.course, self.worker = course, worker
+        self.options = options = course.options
+        torch.manual_seed(options.seed)
+        self.network = _on_device(course.network(), worker.device)
+        self.mean = _on_device(course.network(), worker.device).requires_grad_(False)
+        self.mean.load_state_dict(self.network.state_dict())
+        self._parameters = list(self.network.parameters())
+        self._gradient = _flat_gradient(self._parameters)
+        self.optimizer = torch.optim.AdamW(
+            self._parameters,
+            lr=options.learning_rate,
+            weight_decay=options.weight_decay,
+            fused=worker.device.type == "cuda",
+        )
+        self.step = 0
+        self.progress, self._paced = 0.0, paced
+        """``progress`` is the fraction of the run that is done; what is learnt depends on it."""
+        self._graph: StepGraph | None = None
+        if fuse:
+            course.compile(self.network)
+
+    def advance(self) -> Float[Tensor, ""]:
+        """Take a step; returns its loss, which stays on the device."""
+        options = self.options
+        loss = self._gradients(self.course.batch(self.step, self.progress))
+        if self.worker.count > 1:
+            distributed.all_reduce(self._gradient)
+            self._gradient /= self.worker.count
+        nn.utils.clip_grad_norm_(self._parameters, options.clip)
+        # A step from a loss that is not finite would be the last.
+        self._gradient.nan_to_num_(0.0, 0.0, 0.0)
+        for group in self.optimizer.param_groups:
+            group["lr"] = options.learning_rate * schedule(self.step, self.progress, options)
+        self.optimizer.step()
+        self.step += 1
+        if not self._paced:
+            self.progress = self.step / options.steps
+        decay = min(options.ema, (1 + self.step) / (10 + self.step))
+        with torch.no_grad():
+            means: list[Tensor] = [*self.mean.parameters()]
+            torch._foreach_lerp_(means, [*self._parameters], 1 - decay)
+        return loss
+
+    def begin_with(self, network: nn.Module) -> None:
+        """Take over the weights of a network of the same sizes."""
+        for mine in (self.network, self.mean):
+            mine.load_state_dict(network.state_dict())
+
+    def is_finite(self) -> bool:
+        """Whether all weights are."""
+        return bool(torch.stack([p.detach().isfinite().all() for p in self._parameters]).all())
+
+    def _gradients(self, batch: Any) -> Float[Tensor, ""]:
+        if self.worker.device.type != "cuda" or not self.course.recordable:
+            return self._compute(batch)
+        if self._graph is None:
+            self._graph = StepGraph(self._compute, batch)
+        return self._graph(batch).clone()
+
+    def _compute(self, batch: Any) -> Float[Tensor, ""]:
+        self._gradient.zero_()
+        loss = self.course.loss(self.network, batch)
+        loss.backward()
+        return loss.detach()
+
+
+def schedule(step: int, progress: float, options: Schedule) -> float:
+    """Learning rate of a step over its peak: half a cosine, begun with a linear warm-up."""
+    rate = 0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * min(progress, 1.0)))
+    return rate * min(1.0, (step + 1) / max(options.warmup, 1))
+
+
+def _on_device(network: nn.Module, device: torch.device) -> nn.Module:
+    """With the layout that convolutions are fast in (which PyTorch's stubs do not know)."""
+    return network.to(device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+
+
+def _flat_gradient(parameters: list[nn.Parameter]) -> Float[Tensor, "n"]:
+    """One buffer for all gradients, so that they are summed over the devices at once."""
+    flat = torch.zeros(sum(p.numel() for p in parameters), device=parameters[0].device)
+    at = 0
+    for p in parameters:
+        p.grad = flat.as_strided(p.shape, p.stride(), at)
+        at += p.numel()
+    return flat

@@ -1,0 +1,94 @@
+"""A training run from the first step or a checkpoint to its end: validation, curves, weights."""
+
+import json
+import time
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from geogs.errors import GeogsError, InputError
+from geogs_train.course import Course, Examination, Scores, Worker
+from geogs_train.flow_options import RunOptions
+from geogs_train.network_trainer import Trainer
+from geogs_train.pace import EVERY, Clock, shared
+from geogs_train.training_checkpoint import load_checkpoint, save_checkpoint
+
+LOG = "log.jsonl"
+REPORT_EVERY = 50
+"""Steps between lines of the log."""
+
+
+Progress = Callable[[str], None]
+"""Called with a line of text."""
+
+
+def train(
+    course: Course, run: RunOptions, out: Path, worker: Worker, progress: Progress
+) -> Scores | None:
+    """Train until the last step or the last minute; returns the last validation's scores.
+
+    The first worker writes ``checkpoint.safetensors``, ``log.jsonl`` and the course's weights
+    (their running mean in half precision) to ``out``. Ctrl-C ends it as the last minute does.
+
+    Raises:
+        InputError: the run is paced, but has no minutes.
+        GeogsError: the weights are no longer finite.
+    """
+    begin = time.monotonic()
+    if run.paced and run.minutes is None:
+        raise InputError("A paced run needs --run.minutes.")
+    trainer = Trainer(course, worker, run.fuse, run.paced)
+    if run.begin_with:
+        trainer.begin_with(course.load(Path(run.begin_with)))
+    if run.resume:
+        load_checkpoint(trainer, out)
+    first = worker.rank == 0
+    validation = course.examination(run.validation_batches) if first else None
+    out.mkdir(parents=True, exist_ok=True)
+    scores, since, at = None, time.monotonic(), trainer.step
+    clock = Clock(run.minutes, trainer.progress, worker) if run.paced and run.minutes else None
+    try:
+        while trainer.progress < 1:
+            if clock is not None and trainer.step % EVERY == 0:
+                trainer.progress = clock.progress()
+            loss = trainer.advance()
+            if trainer.step % REPORT_EVERY == 0:
+                value, now = float(loss), time.monotonic()
+                if not trainer.is_finite():
+                    raise GeogsError(f"The weights are no longer finite at step {trainer.step}.")
+                rate = (trainer.step - at) / (now - since)
+                since, at = now, trainer.step
+                if first:
+                    entry = {"step": trainer.step, "loss": value, "rate": rate}
+                    _log(out, {**entry, "minutes": (now - begin) / 60})
+                    progress(f"step {trainer.step}  {100 * trainer.progress:.0f} %  "
+                             f"loss {value:.3f}  {rate:.1f} steps/s")  # fmt: skip
+                late = run.minutes is not None and now - begin > 60 * run.minutes
+                if clock is None and shared(late, worker):
+                    break
+            if trainer.step % run.validate_every == 0 and validation is not None:
+                scores = _saved(trainer, validation, out, progress)
+                since, at = time.monotonic(), trainer.step
+    except KeyboardInterrupt:
+        progress("interrupted; writing what there is")
+    finally:
+        course.close()
+    if validation is not None:
+        scores = _saved(trainer, validation, out, progress)
+    return scores
+
+
+def _saved(trainer: Trainer, validation: Examination, out: Path, progress: Progress) -> Any:
+    """Validate, and write the checkpoint and the weights."""
+    scores = validation.score(trainer.mean)
+    _log(out, {"step": trainer.step, "scores": asdict(scores)})
+    progress(f"validation at step {trainer.step}: {scores.line()}")
+    save_checkpoint(trainer, out)
+    trainer.course.export(trainer.mean, out / trainer.course.weights, trainer.step, scores)
+    return scores
+
+
+def _log(out: Path, entry: dict) -> None:
+    with (out / LOG).open("a") as file:
+        file.write(json.dumps(entry) + "\n")
