@@ -25,7 +25,7 @@ from geogs.mapping.training.base import TrainingPlace
 from geogs.on_demand import OnDemand
 from geogs.stopwatch import Stopwatch
 from geogs.threads import on_one_torch_thread
-from geogs.types import MapSnapshot, RenderedKeyframe, SeenRows, Trajectory
+from geogs.types import MapSnapshot, RenderedKeyframe, SeenRows, Trajectory, Uncertainty
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import KeyframeTable
 
@@ -243,7 +243,7 @@ class Reconstruction:
         T_wc = torch.linalg.inv(torch.stack([self._poses[i] for i in order])).numpy()
         return Trajectory(np.array(times, np.float64), T_wc, np.ones(len(times), dtype=bool))
 
-    def uncertainty(self) -> None:
+    def uncertainty(self) -> Uncertainty | None:
         """Nothing: the poses were given."""
         return None
 

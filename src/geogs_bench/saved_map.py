@@ -7,7 +7,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from geogs.application.calibrate import with_shutter_found
-from geogs.application.checkpoints.run_state import RunCheckpoint, RunFacts, SavedRun
+from geogs.application.checkpoints.checkpoint import checkpoint_folder, write_checkpoint
+from geogs.application.checkpoints.run_state import RunMetadata, SavedRun, run_state
 from geogs.application.priors import open_prior
 from geogs.application.progress import RunProgress
 from geogs.application.results.result import Result
@@ -51,7 +52,7 @@ def _saved(place: Path, settings: RunSettings) -> SavedRun | None:
         saved = SavedRun(place)
     except InputError:
         return None
-    same = _without_rule(saved.facts.settings) == _without_rule(settings)
+    same = _without_rule(saved.metadata.settings) == _without_rule(settings)
     return saved if same else None
 
 
@@ -60,13 +61,17 @@ def _run_stream(place: Path, settings: RunSettings, progress: RunProgress) -> Sa
     config, device = settings.config, require_device(settings.device)
     source = with_shutter_found(open_source(settings.source, config.input))
     slam = Slam(source.camera, config, str(device), open_prior(config.prior, source.camera, device))
-    facts = RunFacts(settings, device.type, source.fingerprint(), None, shutter=source.shutter)
+    metadata = RunMetadata(
+        settings, device.type, source.fingerprint(), None, shutter=source.shutter
+    )
     progress.expect(source.length)
     for frame in source:
         progress.frame(slam.process(frame))
     slam.end_stream()
-    if not RunCheckpoint(prepare_output_folder(place), facts, 1.0, progress).write(slam, source):
+    state = run_state(metadata, slam, source)
+    if state is None:
         raise InputError("no map was started; there is nothing to correct.")
+    write_checkpoint(checkpoint_folder(prepare_output_folder(place)), state)
     return SavedRun(place)
 
 

@@ -88,7 +88,7 @@ def _is_begun(output: Path, settings: RunSettings) -> bool:
     if not has_checkpoint(output):
         return False
     try:
-        return SavedRun(output).facts.settings.deciding() == settings.deciding()
+        return SavedRun(output).metadata.settings.deciding() == settings.deciding()
     except InputError:
         return False
 

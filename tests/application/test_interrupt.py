@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from geogs.application.checkpoints.run_state import RunFacts
+from geogs.application.checkpoints.run_state import RunMetadata
 from geogs.application.interrupt import Interruption
 from geogs.application.machine.device import full_memory_in_a_sentence
 from geogs.application.run import continued
@@ -67,7 +67,7 @@ def test_errors_of_ours_stay_what_they_are():
 
 def test_a_run_that_lost_its_gpu_goes_on_on_the_cpu_where_that_is_asked_for():
     settings = RunSettings((Path("/videos/v.mp4"),))
-    facts = RunFacts(settings, "cuda", "0", None)
+    facts = RunMetadata(settings, "cuda", "0", None)
     on_cpu = replace(settings, device="cpu")
     assert continued(facts, on_cpu, Path("out")).device == "cpu"
     assert continued(facts, settings, Path("out")).device == "cuda"

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from geogs.application.calibrate import with_shutter_found
-from geogs.application.checkpoints.run_state import RunFacts, SavedRun
+from geogs.application.checkpoints.run_state import RunMetadata, SavedRun
 from geogs.application.interrupt import Interruption
 from geogs.application.progress import RunProgress
 from geogs.application.results.summary import source_summary
@@ -101,7 +101,7 @@ def test_a_resumed_run_has_the_shutter_it_began_with(folder):
     source = open_source(folder, InputConfig(INTRINSICS))
     settings = RunSettings((folder,), Config(input=InputConfig(INTRINSICS)))
     saved = SavedRun.__new__(SavedRun)
-    saved.facts = RunFacts(
+    saved.metadata = RunMetadata(
         settings, "cpu", source.fingerprint(), None, shutter=Shutter(0.02, "found")
     )
     assert saved.calibrated(source).shutter == Shutter(0.02, "found")

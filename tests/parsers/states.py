@@ -14,7 +14,7 @@ from geogs.application.checkpoints.checkpoint import (
     has_checkpoint,
     write_checkpoint,
 )
-from geogs.application.checkpoints.run_state import RunFacts, RunState, SavedRun
+from geogs.application.checkpoints.run_state import RunMetadata, RunState, SavedRun
 from geogs.application.settings import RunSettings
 from geogs.config import Config
 from geogs.geometry.camera import Camera
@@ -64,7 +64,7 @@ def begun(folder: Path) -> None:
     for k in range(3):
         image = np.roll(gradient_image(0), 2 * k, axis=1)
         slam.process(Frame(k, k / 30, image))
-    facts = RunFacts(RunSettings((folder / "v.mp4",)), "cpu", "0123456789abcdef", None)
+    facts = RunMetadata(RunSettings((folder / "v.mp4",)), "cpu", "0123456789abcdef", None)
     write_checkpoint(checkpoint_folder(folder), RunState(facts, slam.state()))
 
 

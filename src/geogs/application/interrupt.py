@@ -2,6 +2,7 @@
 
 import signal
 import threading
+from collections.abc import Callable
 from types import FrameType
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
@@ -27,6 +28,16 @@ class Stop:
         """A safe point inside a long stage: raises KeyboardInterrupt after a request."""
         if self.requested:
             raise KeyboardInterrupt
+
+    def lets_finish(self, work: Callable[[], object]) -> bool:
+        """Do some work; false where a request to stop ended it at a safe point."""
+        try:
+            work()
+        except KeyboardInterrupt:
+            if not self.requested:
+                raise
+            return False
+        return True
 
 
 class Interruption(Stop):

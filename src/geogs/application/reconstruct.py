@@ -7,10 +7,9 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Literal
 
-import torch
-
-from geogs.application.checkpoints.checkpoint import has_checkpoint
-from geogs.application.checkpoints.reconstruct_state import ReconstructCheckpoint, fingerprint
+from geogs.application.checkpoints.checkpoint import Checkpoint
+from geogs.application.checkpoints.reconstruct_state import ReconstructState, fingerprint, read_work
+from geogs.application.driver import Ending, Job, Work
 from geogs.application.forecast import reconstruction_forecast
 from geogs.application.interrupt import Stop
 from geogs.application.machine.device import compiled_kernels, full_memory_in_a_sentence
@@ -18,10 +17,9 @@ from geogs.application.output_forecast import OutputForecast
 from geogs.application.photos import open_photographs
 from geogs.application.posed_views import PosedViews, Report
 from geogs.application.progress import RunProgress
-from geogs.application.results.output_folder import free_folder, only_writer
+from geogs.application.results.output_folder import claimed, free_folder
 from geogs.application.results.result import Result, Written
-from geogs.application.results.surfaces import Snapshots, write_depth_mesh
-from geogs.application.results.write import write_results
+from geogs.application.results.surfaces import Snapshots
 from geogs.application.settings import ReconstructSettings
 from geogs.config import ReconstructConfig
 from geogs.config.idle import idle_settings
@@ -31,7 +29,6 @@ from geogs.gpu.installation import require_device
 from geogs.io.sources.posed.pose_check import PoseCheck, check_poses
 from geogs.io.sources.posed.posed_source import PosedSource
 from geogs.io.sources.sniff import open_posed_source
-from geogs.io.writers.atomic import prepare_output_folder
 from geogs.reconstruction import Reconstruction, ReconstructionState
 from geogs.threads import on_one_torch_thread
 
@@ -85,6 +82,7 @@ def reconstruct(
 
 
 @on_one_torch_thread
+@full_memory_in_a_sentence()
 def reconstruct_to_folder(
     settings: ReconstructSettings,
     progress: RunProgress | None = None,
@@ -106,83 +104,97 @@ def reconstruct_to_folder(
     finds_poses = settings.poses == "auto"
     progress.plan(reconstruction_forecast(finds_poses))
     if finds_poses:
-        name = expanded(settings.source).resolve().name
-        output = prepare_output_folder(settings.output or Path("out") / name)
-        with only_writer(output):
-            with full_memory_in_a_sentence(), stop:
+        wanted = Path("out") / expanded(settings.source).resolve().name
+    else:
+        source = open_posed_source(settings.source, config.input, settings.hold_out)
+        wanted = Path("out") / source.name
+        if not settings.resume:
+            wanted = free_folder(wanted, source.fingerprint())
+    with claimed(settings.output or wanted) as output:
+        if finds_poses:
+            with stop:
                 source = open_photographs(
-                    settings.source,
-                    config,
-                    output,
-                    settings.hold_out,
-                    settings.resume,
-                    progress,
+                    settings.source, config, output, settings.hold_out, settings.resume, progress,
                     stop,
-                )
-            return _to_folder(settings, source, output, device, clock, progress, stop)
-    source = open_posed_source(settings.source, config.input, settings.hold_out)
-    output = Path("out") / source.name
-    if not settings.resume:
-        output = free_folder(output, source.fingerprint())
-    output = prepare_output_folder(settings.output or output)
-    with only_writer(output):
-        return _to_folder(settings, source, output, device, clock, progress, stop)
-
-
-def _to_folder(
-    settings: ReconstructSettings,
-    source: PosedSource,
-    output: Path,
-    device: torch.device,
-    clock: "_Clock",
-    progress: RunProgress,
-    stop: Stop,
-) -> Written:
-    """The same once the source is opened and the folder is ours."""
-    config = settings.config
-    clock.excuse(compiled_kernels(device))
-    names = [Path(source.label(i)).name for i in range(len(source))]
-    made_from = fingerprint(config, settings.hold_out, names)
-    checkpoint = ReconstructCheckpoint(output, made_from, settings.checkpoint_every, progress)
-    snapshots = Snapshots(settings.snapshots)
-
-    def way_on() -> str:
-        kept = has_checkpoint(output)
-        return " The same command with --resume goes on from the last checkpoint." if kept else ""
-
-    progress.plan(reconstruction_forecast())
-    with full_memory_in_a_sentence(way_on), stop:
-        resumed = checkpoint.read() if settings.resume else None
-        checks = progress if settings.check_poses and settings.poses == "given" else None
+                )  # fmt: skip
+        clock.excuse(compiled_kernels(device))
+        progress.plan(reconstruction_forecast())
         scene = Reconstruction(source.camera, config, str(device), clock.left())
+        job = Job(settings, output, device, progress, stop)
+        return job.complete(MappedImages(scene, source, settings))
+
+
+class MappedImages(Work):
+    """Images whose poses are known, mapped with checkpoints and snapshots on the way."""
+
+    way_on = "The same command with --resume goes on from the last checkpoint."
+
+    def __init__(
+        self, scene: Reconstruction, source: PosedSource, settings: ReconstructSettings
+    ) -> None:
+        self._scene = scene
+        self._source = source
+        self._settings = settings
+        names = [Path(source.label(i)).name for i in range(len(source))]
+        self._made_from = fingerprint(settings.config, settings.hold_out, names)
+        self._snapshots = Snapshots(settings.snapshots)
+        self._has_depths = False
+
+    @property
+    def scene(self) -> Reconstruction:
+        """The map."""
+        return self._scene
+
+    @property
+    def source(self) -> PosedSource:
+        """The images."""
+        return self._source
+
+    def state(self) -> ReconstructState | None:
+        """What a checkpoint holds; nothing before the depths are done."""
+        if not self._has_depths:
+            return None
+        return ReconstructState(self._made_from, self._scene.state())
+
+    def write_more(self, job: Job) -> None:
+        """Write the snapshots."""
+        self._snapshots.write(job.output, self._scene, job.progress)
+
+    def complete(self, job: Job, checkpoint: Checkpoint) -> Ending:
+        """Search the depths, grow and train the map; or go on from a checkpoint.
+
+        Raises:
+            InputError: nothing can be gone on with, or the images show no scene.
+            KeyboardInterrupt: it was stopped before there was a map.
+        """
+        settings, scene, progress = self._settings, self._scene, job.progress
+        resumed = None
+        if settings.resume:
+            resumed = read_work(job.output, self._made_from)
+            place = resumed.mapper.place
+            done = f"step {place.steps} of {place.total}" if place.steps else "the depths"
+            progress.write(f"Going on after {done}, {resumed.seconds:.0f} s into the work.")
+        checks = progress if settings.check_poses and settings.poses == "given" else None
 
         def report(stage: str, fraction: float) -> None:
             progress.stage(stage, fraction)
             if stage == "growing":
-                progress.write(_chosen_views(scene, config))
-            snapshots.take(scene)
-            checkpoint.report(stage, scene)
-            stop.check()
+                progress.write(_chosen_views(scene, settings.config))
+            self._snapshots.take(scene)
+            self._has_depths |= stage in ("growing", "training")
+            if stage == "growing":
+                checkpoint.write()
+            elif self._has_depths:
+                checkpoint.write_if_due()
+            job.stop.check()
 
-        try:
-            _complete(scene, source, resumed, report, settings.budget is not None, checks)
-            finished, kept = True, False
-        except KeyboardInterrupt:
-            if not (stop.requested and len(scene.snapshot())):
-                raise
-            progress.write("Stopping early; keeping what there is. Press Ctrl-C again to quit.")
-            finished, kept = False, checkpoint.write(scene)
-        result = Result(scene, source, not finished, progress)
-        more = [lambda: snapshots.write(output, scene, progress)]
-        if settings.depth_mesh:
-            more.append(lambda: write_depth_mesh(output, scene, progress))
-        write_results(output, result, more, settings.keyframe_images)
-    if finished:
-        checkpoint.remove()
-    return Written(output, result, kept)
+        def work() -> None:
+            _complete(scene, self._source, resumed, report, settings.budget is not None, checks)
+
+        return job.map_known(scene, work, checkpoint)
 
 
-def _tell(progress: RunProgress | None, checked: Future[PoseCheck] | None) -> None:
+def _say_whether_poses_fit(progress: RunProgress | None, checked: Future[PoseCheck] | None) -> None:
     """Whether the poses fit the images. Raises InputError if they clearly do not."""
     if progress is not None and checked is not None:
         warning = checked.result().warning
@@ -212,9 +224,9 @@ def _complete(
             points = views.first_look()
         except InputError:
             # Whether the poses are of another convention says more than that nothing matches.
-            _tell(checks, checked)
+            _say_whether_poses_fit(checks, checked)
             raise
-        _tell(checks, checked)
+        _say_whether_poses_fit(checks, checked)
     views.choose(points)
     if not budgeted:
         views.give()

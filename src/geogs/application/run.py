@@ -10,29 +10,34 @@ from typing import Literal
 import torch
 
 from geogs.application.calibrate import self_calibrated, with_shutter_found
-from geogs.application.checkpoints.checkpoint import has_checkpoint
-from geogs.application.checkpoints.run_state import RunCheckpoint, RunFacts, SavedRun, frames_after
+from geogs.application.checkpoints.checkpoint import Checkpoint, has_checkpoint
+from geogs.application.checkpoints.run_state import (
+    RunMetadata,
+    RunState,
+    SavedRun,
+    frames_after,
+    run_state,
+)
+from geogs.application.driver import Ending, Job, Work
 from geogs.application.forecast import RunForecast
 from geogs.application.interrupt import Stop
-from geogs.application.machine.device import REMEDY, compiled_kernels, full_memory_in_a_sentence
+from geogs.application.machine.device import compiled_kernels, full_memory_in_a_sentence
 from geogs.application.priors import open_prior
 from geogs.application.progress import RunProgress
-from geogs.application.results.output_folder import free_folder, only_writer
-from geogs.application.results.result import Result, Written
+from geogs.application.results.output_folder import claimed, free_folder
+from geogs.application.results.result import Written
 from geogs.application.results.saved_result import SavedResult, load_result
-from geogs.application.results.surfaces import write_depth_mesh, write_stage
-from geogs.application.results.write import write_results
+from geogs.application.results.surfaces import write_stage
 from geogs.application.scale.apply import check_scale_source, make_metric
 from geogs.application.scale.source import scale_source
 from geogs.application.settings import RunSettings
 from geogs.application.viewer.observer import RunObserver
 from geogs.config import Config, InputConfig
 from geogs.config.idle import idle_settings
-from geogs.errors import DeviceError, InputError
+from geogs.errors import InputError
 from geogs.gpu.installation import require_device
 from geogs.io.sources.sniff import Stream, open_source
-from geogs.io.writers.atomic import prepare_output_folder
-from geogs.slam import Progress, Slam
+from geogs.slam import Slam
 from geogs.stopwatch import Stopwatch
 from geogs.threads import on_one_torch_thread
 from geogs.types import Frame
@@ -51,28 +56,36 @@ def run(
 ) -> Written:
     """Open the sources, calibrate, track and map every frame, write the results.
 
+    Where ``settings.offline`` says so, frames are placed by structure from motion instead.
+
     Raises:
         InputError: a source, a setting or a prior cannot be used.
         TrackingLost: no frame could be tracked.
         OutputError: a file cannot be written.
         DeviceError: the device cannot be used, or its memory was full; results so far are written.
+        KeyboardInterrupt: it was stopped before there was anything to keep, or twice.
     """
     progress, stop = progress or RunProgress(), stop or Stop()
     config, device = settings.config, require_device(settings.device)
-    for sentence in idle_settings(config):
-        progress.write(f"note: {sentence}")
     scale = scale_source(settings.scale_from)
-    former = None if settings.map is None else load_result(settings.map, device)
-    opened = open_source(
-        settings.source, config.input if former is None else seen_by(former, config)
-    )
+    if settings.offline and (scale is not None or config.input.depth != "none"):
+        raise InputError("--offline knows no metres: leave out --scale-from and --depth.")
+    for sentence in () if settings.offline else idle_settings(config):
+        progress.write(f"note: {sentence}")
+    base = None if settings.map is None else load_result(settings.map, device)
+    opened = open_source(settings.source, config.input if base is None else seen_by(base, config))
     check_scale_source(scale, opened)
     wanted = settings.output or free_folder(Path("out") / opened.name, opened.fingerprint())
-    if former is not None and wanted.resolve() == former.folder.resolve():
+    if base is not None and wanted.resolve() == base.folder.resolve():
         raise InputError(f"{wanted} holds the map to go on with; give another folder by -o.")
-    output = prepare_output_folder(wanted)
-    with only_writer(output):
-        return _run(settings, opened, former, output, device, progress, stop, observer)
+    with claimed(wanted) as output:
+        compiled_kernels(device)
+        job = Job(settings, output, device, progress, stop, observer)
+        if settings.offline:
+            from geogs.application.offline import PlacedOffline
+
+            return job.complete(PlacedOffline(config, opened))
+        return job.complete(_begun(settings, job, opened, base))
 
 
 def maps_at_the_end(settings: RunSettings, observer: RunObserver | None) -> bool:
@@ -82,52 +95,41 @@ def maps_at_the_end(settings: RunSettings, observer: RunObserver | None) -> bool
     return when == "after" or (when == "auto" and not is_shown)
 
 
-def seen_by(former: SavedResult, config: Config) -> InputConfig:
+def seen_by(base: SavedResult, config: Config) -> InputConfig:
     """How a source is read that the camera of an earlier result took, if nobody says otherwise."""
-    known = former.folder / "intrinsics.json"
+    known = base.folder / "intrinsics.json"
     if config.input.intrinsics.strip().lower() != "auto" or not known.is_file():
         return config.input
     return replace(config.input, intrinsics=str(known))
 
 
-def _run(
-    settings: RunSettings,
-    opened: Stream,
-    former: SavedResult | None,
-    output: Path,
-    device: torch.device,
-    progress: RunProgress,
-    stop: Stop,
-    observer: RunObserver | None,
-) -> Written:
-    """The same once the source is opened and the folder is ours."""
-    config = settings.config
-    compiled_kernels(device)
-    calibrated = self_calibrated(opened, config, device, progress, stop)
-    found = None if calibrated is opened else calibrated.calibration
-    prior = open_prior(config.prior, calibrated.camera, device)
+def _begun(
+    settings: RunSettings, job: Job, opened: Stream, base: SavedResult | None
+) -> "TrackedVideo":
+    """A system for an opened source, calibrated; in the map of ``base`` if that is given."""
+    config, progress, stop = settings.config, job.progress, job.stop
+    calibrated = self_calibrated(opened, config, job.device, progress, stop)
+    prior = open_prior(config.prior, calibrated.camera, job.device)
     # A system loads much; meanwhile the images tell of the shutter, which does not concern it.
-    with ThreadPoolExecutor(1, thread_name_prefix="system") as beside:
-        made = beside.submit(
-            Slam, calibrated.camera, config, str(device), prior, calibrated.is_live,
-            calibrated.mask, calibrated.black_is_masked, maps_at_the_end(settings, observer),
+    with ThreadPoolExecutor(1, thread_name_prefix="system") as thread:
+        made = thread.submit(
+            Slam, calibrated.camera, config, str(job.device), prior, calibrated.is_live,
+            calibrated.mask, calibrated.black_is_masked, maps_at_the_end(settings, job.observer),
         )  # fmt: skip
         source = with_shutter_found(calibrated, progress, stop)
         slam = made.result()
-    if former is not None:
-        slam.start_from(former.disks, former.keyframes)
-    if former is not None or source.is_live:
-        settings = replace(settings, checkpoint_every=0.0)  # neither can be gone on with
-    facts = RunFacts(
-        settings.absolute(), device.type, source.fingerprint(), found, shutter=source.shutter
+    if base is not None:
+        slam.start_from(base.disks, base.keyframes)
+    found = None if calibrated is opened else calibrated.calibration
+    metadata = RunMetadata(
+        settings.absolute(), job.device.type, source.fingerprint(), found, shutter=source.shutter
     )
-    if has_checkpoint(output):
+    if has_checkpoint(job.output):
         progress.write(
-            f"Starting anew; geogs run --resume {output} would go on with the unfinished run "
+            f"Starting anew; geogs run --resume {job.output} would go on with the unfinished run "
             "there, until the first checkpoint of this one."
         )
-    prepared = _Run(slam, source, settings, output, facts, progress, stop, observer)
-    return prepared.complete(iter(source))
+    return TrackedVideo(slam, source, iter(source), settings, metadata, job.output)
 
 
 @on_one_torch_thread
@@ -151,11 +153,10 @@ def resume(
     """
     progress, stop = progress or RunProgress(), stop or Stop()
     saved = SavedRun(output)
-    settings = continued(saved.facts, settings or saved.facts.settings, output)
+    settings = continued(saved.metadata, settings or saved.metadata.settings, output)
     config, device = settings.config, require_device(settings.device)
     source = saved.calibrated(open_source(settings.source, config.input))
-    output = prepare_output_folder(output)
-    with only_writer(output):
+    with claimed(output) as folder:
         compiled_kernels(device)
         prior = open_prior(config.prior, source.camera, device)
         slam = Slam(
@@ -164,153 +165,142 @@ def resume(
         )  # fmt: skip
         saved.restore(slam)
         progress.write(f"Going on after {slam.frames} frames.")
-        facts = replace(saved.facts, settings=settings.absolute(), device=device.type)
-        frames = frames_after(source, saved.facts.place)
-        prepared = _Run(slam, source, settings, output, facts, progress, stop, observer)
-        return prepared.complete(frames)
+        metadata = replace(saved.metadata, settings=settings.absolute(), device=device.type)
+        frames = frames_after(source, saved.metadata.place)
+        work = TrackedVideo(slam, source, frames, settings, metadata, folder)
+        return Job(settings, folder, device, progress, stop, observer).complete(work)
 
 
-def continued(facts: RunFacts, settings: RunSettings, output: Path) -> RunSettings:
+def continued(begun: RunMetadata, settings: RunSettings, output: Path) -> RunSettings:
     """Settings to go on with in a folder, on the kind of device that the run began on or the CPU.
 
     Raises:
         InputError: they would compute something else, or elsewhere.
     """
     elsewhere = settings.output is not None and settings.output.resolve() != output.resolve()
-    if elsewhere or settings.deciding() != facts.settings.deciding():
+    if elsewhere or settings.deciding() != begun.settings.deciding():
         raise InputError(
             "--resume goes on with the source and the settings of the run; leave out everything "
             "else but --device, --mesh, --checkpoint-every, --online-results, --depth-mesh, "
             "--keyframe-images and --scale-from."
         )
-    device = facts.device if settings.device == "auto" else settings.device
-    if not device.startswith(facts.device) and device != "cpu":
-        raise InputError(f"The run was on {facts.device}, and can only go on there.")
+    device = begun.device if settings.device == "auto" else settings.device
+    if not device.startswith(begun.device) and device != "cpu":
+        raise InputError(f"The run was on {begun.device}, and can only go on there.")
     return replace(settings, device=device)
 
 
-@dataclass(frozen=True)
-class _Run:
-    """A run that has been made ready."""
+@dataclass
+class TrackedVideo(Work):
+    """A video whose frames are tracked one by one, by a system that has been made ready."""
 
     slam: Slam
-    source: Stream
+    video: Stream
+    """Calibrated."""
+    frames: Generator[Frame, None, None]
+    """That are left."""
     settings: RunSettings
+    metadata: RunMetadata
     output: Path
-    facts: RunFacts
-    progress: RunProgress
-    stop: Stop
-    observer: RunObserver | None = None
     stages: list[str] = field(default_factory=list)
-    """Whose results have been written."""
 
-    def complete(self, frames: Generator[Frame, None, None]) -> Written:
-        """The frames that are left, the final stages, the files."""
-        slam, source, settings, output = self.slam, self.source, self.settings, self.output
-        progress = self.progress
-        checkpoint = RunCheckpoint(output, self.facts, settings.checkpoint_every, progress)
+    @property
+    def scene(self) -> Slam:
+        """The system."""
+        return self.slam
+
+    @property
+    def source(self) -> Stream:
+        """The video."""
+        return self.video
+
+    @property
+    def way_on(self) -> str:
+        """The command that goes on from the last checkpoint."""
+        on_cpu = ", with --device cpu on the CPU" if self.metadata.device != "cpu" else ""
+        return f"geogs run --resume {self.output} goes on from the last checkpoint{on_cpu}."
+
+    def state(self) -> RunState | None:
+        """What a checkpoint holds; nothing of what cannot be gone on with."""
+        if self.settings.map is not None or self.video.is_live:
+            return None
+        return run_state(self.metadata, self.slam, self.video)
+
+    def complete(self, job: Job, checkpoint: Checkpoint) -> Ending:
+        """The frames that are left, then the final stages."""
+        slam, video, progress = self.slam, self.video, job.progress
         progress.plan(
             RunForecast(
-                slam.config, slam.stopwatch, source.length, slam.defers_map, self.facts.device
+                slam.config, slam.stopwatch, video.length, slam.defers_map, self.metadata.device
             )
         )
-        progress.expect(source.length, slam.frames)
-        kept = False
-        with full_memory_in_a_sentence(self._way_on), self.stop:
-            with closing(frames):
-                full = not self._feed(frames, checkpoint)
-            if source.is_live and self.stop.requested:  # the usual end of what has none
-                self.stop.requested = False
-                progress.write("Stopping; finishing the map. Press Ctrl-C to stop that, too.")
-            interrupted = full or self.stop.requested
-            if interrupted:
-                why = "The GPU has no memory left" if full else "Stopping early"
-                progress.write(f"{why}; keeping what there is. Press Ctrl-C again to quit.")
-                kept = not full and checkpoint.write(slam, source)
-            slam.end_stream()
-            if not interrupted:
-                kept = checkpoint.write(slam, source)
-            self._write_stage("online")
-            interrupted |= not self._finish(correct=not interrupted)
-            make_metric(slam, source, scale_source(settings.scale_from), progress)
-            result = Result(slam, source, interrupted, progress)
-            more = [lambda: write_depth_mesh(output, slam, progress)]
-            more = more if settings.depth_mesh else []
-            write_results(output, result, more, settings.keyframe_images, self.stages)
-            if self.observer is not None:
-                self.observer.result(result)
-        if full:
-            raise DeviceError(
-                f"The memory of the GPU was full after {slam.frames} frames, whose results are in "
-                f"{output}/; {REMEDY}.{self._way_on()}"
-            )
-        if not interrupted:
-            checkpoint.remove()
-        return Written(output, result, interrupted and kept)
+        progress.expect(video.length, slam.frames)
+        with closing(self.frames):
+            ending = self._track(job, checkpoint)
+        if ending is not Ending.MEMORY_FULL and ending is not Ending.FINISHED:
+            checkpoint.write()
+        slam.end_stream()
+        if ending is Ending.FINISHED:
+            checkpoint.write()
+        self._write_stage("online", job)
+        ending = self._finish(job, ending)
+        make_metric(slam, video, scale_source(self.settings.scale_from), progress)
+        return ending
 
-    def _way_on(self) -> str:
-        """How to go on after a failure, behind another sentence; nothing if there is no way."""
-        if not has_checkpoint(self.output):
-            return ""
-        on_cpu = ", with --device cpu on the CPU" if self.facts.device != "cpu" else ""
-        return f" geogs run --resume {self.output} goes on from the last checkpoint{on_cpu}."
+    def _track(self, job: Job, checkpoint: Checkpoint) -> Ending:
+        """All frames through the system, until a request to stop."""
+        stop = job.stop
+        try:
+            if self.slam.is_ended:
+                next(self.frames, None)  # only what the source says of itself at its end
+            else:
+                self._track_each(job, checkpoint)
+        except torch.cuda.OutOfMemoryError:
+            torch.cuda.empty_cache()
+            job.stop_early("The GPU has no memory left")
+            return Ending.MEMORY_FULL
+        if self.video.is_live and stop.requested:  # the usual end of what has none
+            stop.requested = False
+            job.progress.write("Stopping; finishing the map. Press Ctrl-C to stop that, too.")
+        if not stop.requested:
+            return Ending.FINISHED
+        job.stop_early()
+        return Ending.STOPPED
 
-    def _feed(self, frames: Iterator[Frame], checkpoint: RunCheckpoint) -> bool:
-        """All frames through the system, until a request to stop; false if the GPU is full."""
+    def _track_each(self, job: Job, checkpoint: Checkpoint) -> None:
         slam = self.slam
-        if slam.is_ended:
-            next(frames, None)  # only what the source says of itself at its end
-            return True
+        for frame in _timed(self.frames, slam.stopwatch):
+            status = slam.process(frame)
+            job.progress.frame(status)
+            if job.observer is not None:
+                job.observer.frame(frame, status, slam)
+            if job.stop.requested:
+                return
+            checkpoint.write_if_due()
+
+    def _finish(self, job: Job, ending: Ending) -> Ending:
+        """The final stages; where these or the frames were cut short, a map in little time."""
         try:
-            for frame in _timed(frames, slam.stopwatch):
-                status = slam.process(frame)
-                self.progress.frame(status)
-                if self.observer is not None:
-                    self.observer.frame(frame, status, slam)
-                if self.stop.requested:
-                    break
-                checkpoint.after_frame(slam, self.source)
+            if ending is Ending.FINISHED and job.stop.lets_finish(lambda: self._adjust(job)):
+                return ending
+            self.slam.map_briefly(BRIEFLY, job.progress.stage)
         except torch.cuda.OutOfMemoryError:
             torch.cuda.empty_cache()
-            return False
-        return True
-
-    def _finish(self, correct: bool) -> bool:
-        """The final stages, if they are to be; false where they were not done to the end."""
-
-        def report(stage: str, fraction: float) -> None:
-            self.progress.stage(stage, fraction)
-            self.stop.check()
-
-        try:
-            if correct and self._adjust_and_refine(report):
-                return True
-            self.slam.map_briefly(BRIEFLY, self.progress.stage)
-        except torch.cuda.OutOfMemoryError:
-            torch.cuda.empty_cache()
-            self.progress.write(
+            job.progress.write(
                 "The GPU has no memory left for the final stages; keeping what there is."
             )
-        return False
+        return Ending.STOPPED if ending is Ending.FINISHED else ending
 
-    def _adjust_and_refine(self, report: Progress) -> bool:
-        """False if a request to stop cut it short."""
-        slam = self.slam
-        try:
-            slam.adjust(report)
-            if slam.will_refine:
-                self._write_stage("adjusted")
-            slam.refine(report)
-        except KeyboardInterrupt:
-            if not self.stop.requested:
-                raise
-            return False
-        return True
+    def _adjust(self, job: Job) -> None:
+        self.slam.adjust(job.report)
+        if self.slam.will_refine:
+            self._write_stage("adjusted", job)
+        self.slam.refine(job.report)
 
-    def _write_stage(self, name: Literal["online", "adjusted"]) -> None:
+    def _write_stage(self, name: Literal["online", "adjusted"], job: Job) -> None:
         """What there is by now, if it is asked for, and if there is a map."""
         if self.settings.online_results and not self.slam.defers_map:
-            write_stage(self.output, self.slam, self.progress, name)
+            write_stage(self.output, self.slam, job.progress, name)
             self.stages.append(name)
 
 

@@ -47,21 +47,15 @@ def main(argv: Sequence[str]) -> int:
         raise InputError("--map is gone on with by tracking; leave out --offline.")
 
     from geogs.application.interrupt import Interruption
+    from geogs.application.run import resume, run
 
     settings, stop = record(RunSettings, options), Interruption()
-    if options.offline and options.resume is None:
-        if options.viewer or options.record is not None:
-            raise InputError("--viewer and --record follow tracking, which --offline has none of.")
-        from geogs.application.offline import run_offline
-
-        written = followed(options, lambda progress: run_offline(settings, progress, stop))
-    else:
-        from geogs.application.run import resume, run
-
-        go = run if options.resume is None else partial(resume, options.resume)
-        observer = _observer(options)
-        with _keys(options, stop):
-            written = followed(options, lambda progress: go(settings, progress, stop, observer))
+    if options.offline and options.resume is None and (options.viewer or options.record):
+        raise InputError("--viewer and --record follow tracking, which --offline has none of.")
+    go = run if options.resume is None else partial(resume, options.resume)
+    observer = _observer(options)
+    with _keys(options, stop):
+        written = followed(options, lambda progress: go(settings, progress, stop, observer))
     if written.can_resume:
         print(f"geogs run --resume {written.output} goes on from here.")
     return 0
@@ -118,4 +112,4 @@ def _defaults(given: Given) -> RunOptions:
     folder = Path(given["resume"])
     if "preset" in given:
         raise InputError("--resume goes on with the run's settings; leave out --preset.")
-    return RunOptions(**vars(SavedRun(folder).facts.settings), resume=folder)
+    return RunOptions(**vars(SavedRun(folder).metadata.settings), resume=folder)

@@ -27,6 +27,7 @@ from geogs.application.checkpoints.checkpoint import (
 )
 from geogs.application.progress import RunProgress
 from geogs.errors import InputError, OutputError
+from geogs.stopwatch import Stopwatch
 from geogs.version import __version__
 from geogs.world.archive import Archive, Archived
 
@@ -60,7 +61,7 @@ def state(steps: int, archive: Archive | None = None, pictures: int = 3) -> Stat
 
 def read(output: Path) -> State:
     saved = SavedState(output, State)
-    return State(saved.facts("name"), saved.work("work"))
+    return State(saved.plain("name"), saved.work("work"))
 
 
 def assert_is(made: State, steps: int) -> None:
@@ -226,9 +227,9 @@ def test_where_nothing_can_be_written_that_is_said_once(tmp_path, monkeypatch):
     said: list[str] = []
     monkeypatch.setattr(RunProgress, "write", lambda _, text: said.append(text))
     (tmp_path / "checkpoint").touch()
-    checkpoint = Checkpoint(tmp_path, 0.001, RunProgress())
-    assert not checkpoint.write_state(lambda: state(1))
-    assert not checkpoint.write_state(lambda: state(1))
+    checkpoint = Checkpoint(tmp_path, 0.001, lambda: state(1), RunProgress(), Stopwatch())
+    assert not checkpoint.write()
+    assert not checkpoint.write()
     assert len(said) == 1
     assert said[0].startswith("No more checkpoints: ")
     assert "it is no folder" in said[0]

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from geogs.application.checkpoints import run_state
-from geogs.application.checkpoints.run_state import RunFacts
+from geogs.application.checkpoints.run_state import RunMetadata
 from geogs.application.run import continued
 from geogs.application.settings import RunSettings
 from geogs.cli.run import parse
@@ -22,7 +22,7 @@ class Saved:
 
     def __init__(self, output: Path) -> None:
         assert output == OUT
-        self.facts = RunFacts(BEGUN, "cpu", "", None)
+        self.metadata = RunMetadata(BEGUN, "cpu", "", None)
 
 
 @pytest.fixture(autouse=True)
@@ -34,7 +34,7 @@ def settings(*argv: str, device: str = "cpu") -> RunSettings:
     """With which the command would go on."""
     options = parse(["--resume", str(OUT), *argv])
     asked = RunSettings(**{name: getattr(options, name) for name in vars(BEGUN)})
-    return continued(RunFacts(BEGUN, device, "", None), asked, OUT)
+    return continued(RunMetadata(BEGUN, device, "", None), asked, OUT)
 
 
 def test_the_run_goes_on_as_it_was_begun():

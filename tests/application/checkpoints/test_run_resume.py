@@ -15,7 +15,8 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from geogs.application.checkpoints.run_state import RunCheckpoint, RunFacts, frames_after
+from geogs.application.checkpoints.checkpoint import Checkpoint
+from geogs.application.checkpoints.run_state import RunMetadata, frames_after, run_state
 from geogs.application.progress import RunProgress
 from geogs.application.results.saved_result import load_result
 from geogs.application.settings import RunSettings
@@ -293,15 +294,17 @@ def test_where_no_checkpoint_can_be_written_that_is_said_once(small_room, tmp_pa
     monkeypatch.setattr(RunProgress, "write", lambda _, text: said.append(text))
     source = open_source([small_room])
     slam = Slam(source.camera)
-    facts = RunFacts(RunSettings(), "cpu", source.fingerprint(), None, source.place)
+    metadata = RunMetadata(RunSettings(), "cpu", source.fingerprint(), None, source.place)
     (tmp_path / "checkpoint").touch()
-    checkpoint = RunCheckpoint(tmp_path, facts, 0.001, RunProgress())
+    checkpoint = Checkpoint(
+        tmp_path, 0.001, lambda: run_state(metadata, slam, source), RunProgress(), slam.stopwatch
+    )
     for _ in range(3):
         time.sleep(0.002)
-        checkpoint.after_frame(slam, source)
+        checkpoint.write_if_due()
     assert len(said) == 1
     assert said[0].startswith("No more checkpoints: ")
-    assert not checkpoint.write(slam, source)
+    assert not checkpoint.write()
 
 
 def test_reading_goes_on_where_it_was(tmp_path):

@@ -22,6 +22,7 @@ from geogs.application.machine.device import is_gpu_failure
 from geogs.application.progress import RunProgress
 from geogs.documents import UNUSABLE, in_short
 from geogs.errors import InputError, OutputError
+from geogs.stopwatch import Stopwatch
 from geogs.version import __version__
 from geogs.world.archive import Archive, SettledArchive
 from geogs.world.pack import pack, schema, unpack
@@ -33,37 +34,57 @@ _UNUSABLE = (
 )  # fmt: skip
 """What reading a file may end with that somebody made up."""
 
-# Checkpoints may take this part of the time.
-_WRITING_SHARE = 0.05
+_MAX_TIME_FRACTION = 0.05
+"""Of the time of the work, that writing checkpoints may take."""
 
 
 class Checkpoint:
     """Writes the state of some work now and then; says once where that fails, and goes on."""
 
-    def __init__(self, output: Path, every: float, progress: RunProgress) -> None:
-        """In a folder of results, every so many seconds, never if 0."""
+    def __init__(
+        self,
+        output: Path,
+        every: float,
+        state: Callable[[], object | None],
+        progress: RunProgress,
+        stopwatch: Stopwatch,
+    ) -> None:
+        """In a folder of results, every so many seconds, never if 0.
+
+        ``state`` gives the record to write; none while there is nothing to go on from.
+        """
         self._folder = checkpoint_folder(output)
         self._every = every
+        self._state = state
         self._progress = progress
+        self._stopwatch = stopwatch
         self._due = time.perf_counter() + every
+        self.is_complete = False
+        """Whether what was to be written last is there."""
 
-    @property
-    def is_due(self) -> bool:
-        """Whether its time has come."""
-        return self._every > 0 and time.perf_counter() >= self._due
+    def write_if_due(self) -> None:
+        """Write it when its time has come."""
+        if self._every > 0 and time.perf_counter() >= self._due:
+            self.write()
 
-    def write_state(self, state: Callable[[], object]) -> bool:
-        """Write the record that a call gives; whether there is a complete checkpoint of it now."""
-        if self._every <= 0:
+    def write(self) -> bool:
+        """Write the state as it is; whether there is a complete checkpoint of it now."""
+        with self._stopwatch("checkpoints"):
+            self.is_complete = self._write()
+        return self.is_complete
+
+    def _write(self) -> bool:
+        state = self._state() if self._every > 0 else None
+        if state is None:
             return False
         start = time.perf_counter()
         try:
-            write_checkpoint(self._folder, state())
+            write_checkpoint(self._folder, state)
         except OutputError as error:
             self._progress.write(f"No more checkpoints: {error}")
             self._every = 0.0
         now = time.perf_counter()
-        self._due = now + max(self._every, (now - start) / _WRITING_SHARE)
+        self._due = now + max(self._every, (now - start) / _MAX_TIME_FRACTION)
         return self._every > 0
 
     def remove(self) -> None:
@@ -93,7 +114,7 @@ class SavedState(Generic[S]):
             self._files = manifest.state
             self._values = json.loads(self._read("json"))
 
-    def facts(self, name: str) -> Any:
+    def plain(self, name: str) -> Any:
         """A field of the state without any array. Raises InputError if it is damaged."""
         with self.in_a_sentence():
             return unpack(self._kinds[name], self._values["state"].get(name), {}, {}, name=name)

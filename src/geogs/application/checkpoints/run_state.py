@@ -4,8 +4,7 @@ from collections.abc import Generator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from geogs.application.checkpoints.checkpoint import Checkpoint, SavedState
-from geogs.application.progress import RunProgress
+from geogs.application.checkpoints.checkpoint import SavedState
 from geogs.application.settings import RunSettings
 from geogs.errors import InputError
 from geogs.io.sources.calibration import Calibration
@@ -18,7 +17,7 @@ from geogs.types import Frame
 
 
 @dataclass(frozen=True)
-class RunFacts:
+class RunMetadata:
     """What a run is made of, beside its state."""
 
     settings: RunSettings
@@ -39,30 +38,15 @@ class RunFacts:
 class RunState:
     """What is stored of ``geogs run``."""
 
-    facts: RunFacts
+    metadata: RunMetadata
     slam: SlamState
 
 
-class RunCheckpoint(Checkpoint):
-    """Written between two frames when its time has come, and at the end of the stream."""
-
-    def __init__(self, output: Path, facts: RunFacts, every: float, progress: RunProgress) -> None:
-        """Every so many seconds it is written, never if 0."""
-        super().__init__(output, every, progress)
-        self._facts = facts
-
-    def after_frame(self, slam: Slam, source: Stream) -> None:
-        """Write it when its time has come."""
-        if self.is_due:
-            self.write(slam, source)
-
-    def write(self, slam: Slam, source: Stream) -> bool:
-        """Write it, if a map has been started; whether it has been."""
-        if not slam.segments.keyframe_ids:
-            return False
-        with slam.stopwatch("checkpoints"):
-            facts = replace(self._facts, place=source.place)
-            return self.write_state(lambda: RunState(facts, slam.state()))
+def run_state(metadata: RunMetadata, slam: Slam, source: Stream) -> RunState | None:
+    """What a checkpoint holds of a run as it is now; none before a map has been started."""
+    if not slam.segments.keyframe_ids:
+        return None
+    return RunState(replace(metadata, place=source.place), slam.state())
 
 
 class SavedRun:
@@ -71,7 +55,7 @@ class SavedRun:
     def __init__(self, output: Path) -> None:
         """Raises InputError if there is none, it is damaged, or another version wrote it."""
         self._saved = SavedState(output, RunState)
-        self.facts: RunFacts = self._saved.facts("facts")
+        self.metadata: RunMetadata = self._saved.plain("metadata")
 
     def restore(self, slam: Slam) -> None:
         """Give a new system the state. Raises InputError if that cannot be."""
@@ -81,14 +65,14 @@ class SavedRun:
 
     def calibrated(self, source: Stream) -> Stream:
         """The source as the run read it. Raises InputError if its files are not what they were."""
-        if source.fingerprint() != self.facts.fingerprint:
+        if source.fingerprint() != self.metadata.fingerprint:
             raise InputError(
                 f"{source.name} is not what it was when the run began (other files, or other "
                 "sizes); put it back, or start anew without --resume."
             )
-        found = self.facts.calibration
+        found = self.metadata.calibration
         calibrated = source if found is None else source.with_calibration(found)
-        return calibrated.with_shutter(self.facts.shutter)
+        return calibrated.with_shutter(self.metadata.shutter)
 
 
 def frames_after(source: Stream, place: ReadingPlace | JointPlace) -> Generator[Frame, None, None]:

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from geogs.documents import read_json
 from geogs.errors import InputError, OutputError
+from geogs.io.writers.atomic import prepare_output_folder
 
 _FILES = (
     "summary.json", "eval.json", "trajectory.tum", "keyframes.tum", "trajectory_uncertainty.csv",
@@ -66,6 +67,18 @@ def _is_locked(file: int, path: Path) -> bool:
         return False
 
 
+@contextmanager
+def claimed(folder: Path) -> Iterator[Path]:
+    """The folder of a result, made where there is none; inside, nobody else writes there.
+
+    Raises:
+        OutputError: it cannot be made or written, or another process writes there.
+    """
+    output = prepare_output_folder(folder)
+    with only_writer(output):
+        yield output
+
+
 def remove_previous_output(folder: Path, new_stages: Collection[str] = ()) -> None:
     """Delete the files of a previous output, so that none stays beside those of a new one.
 
@@ -117,7 +130,7 @@ def _begun_with(folder: Path) -> str | None:
     from geogs.application.checkpoints.run_state import SavedRun
 
     try:
-        return SavedRun(folder).facts.fingerprint
+        return SavedRun(folder).metadata.fingerprint
     except InputError:
         return None
 

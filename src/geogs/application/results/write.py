@@ -28,14 +28,14 @@ from geogs.types import RenderedKeyframe
 def write_results(
     output: str | Path,
     result: Result,
-    more: Sequence[Callable[[], None]] = (),
+    write_more: Callable[[], None] = lambda: None,
     keyframe_images: bool = True,
     new_stages: Collection[str] = (),
 ) -> None:
     """Write poses first, then map and mesh beside each other, what else was asked for, the report.
 
-    ``more`` writes the rest, which the summary then counts. ``keyframe_images`` says whether the
-    images of the keyframes are kept, too. Files of an earlier result in the folder are deleted;
+    ``write_more`` writes the rest, which the summary then counts. ``keyframe_images`` says whether
+    the images of the keyframes are kept, too. Files of an earlier result in the folder are deleted;
     ``new_stages`` names folders of stages that are of this one.
 
     Raises:
@@ -62,8 +62,7 @@ def write_results(
                 )
         with scene.stopwatch("keyframes"):
             written.result()
-    for write in more:
-        write()
+    write_more()
     lost = result.trajectory.states.count("lost")
     if lost > 0.2 * scene.frames:
         progress.write(

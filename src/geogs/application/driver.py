@@ -1,0 +1,152 @@
+"""The way of a command from its source to its files: the same for all that make a result."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
+from enum import Enum, auto
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import torch
+
+from geogs.application.checkpoints.checkpoint import Checkpoint, has_checkpoint
+from geogs.application.interrupt import Stop
+from geogs.application.machine.device import REMEDY, full_memory_in_a_sentence
+from geogs.application.progress import RunProgress
+from geogs.application.results.result import Result, Written
+from geogs.application.results.scene import MappedScene
+from geogs.application.results.surfaces import write_depth_mesh
+from geogs.application.results.write import write_results
+from geogs.application.settings import ReconstructSettings, RunSettings
+from geogs.application.viewer.observer import RunObserver
+from geogs.errors import DeviceError
+from geogs.io.sources.posed.posed_source import PosedSource
+from geogs.io.sources.sniff import Stream
+from geogs.stopwatch import Stopwatch
+
+if TYPE_CHECKING:
+    from geogs.reconstruction import Reconstruction
+
+
+class Ending(Enum):
+    """How work came to its end."""
+
+    FINISHED = auto()
+    STOPPED = auto()
+    """By a request; there is something to keep."""
+    MEMORY_FULL = auto()
+    """That of a GPU; there is something to keep."""
+
+
+class Work(ABC):
+    """Poses and a map from a source: what differs between the commands."""
+
+    stages: Collection[str] = ()
+    """Names of folders of the result that it has written on the way."""
+
+    @property
+    @abstractmethod
+    def scene(self) -> MappedScene:
+        """What is written, once the work has ended."""
+
+    @property
+    @abstractmethod
+    def source(self) -> Stream | PosedSource:
+        """What it was made from."""
+
+    @property
+    def stopwatch(self) -> Stopwatch:
+        """Seconds of its stages."""
+        return self.scene.stopwatch
+
+    @property
+    def way_on(self) -> str:
+        """How to go on from a checkpoint, in a sentence; empty where it makes none."""
+        return ""
+
+    def state(self) -> object | None:
+        """The record to go on from, as a checkpoint holds it; none while there is nothing yet."""
+        return None
+
+    @abstractmethod
+    def complete(self, job: "Job", checkpoint: Checkpoint) -> Ending:
+        """All of it up to the trained map, with checkpoints on the way.
+
+        Raises KeyboardInterrupt where it was stopped before there was anything to keep.
+        """
+
+    def write_more(self, job: "Job") -> None:  # noqa: B027  # most have none
+        """Write files besides those of every result."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """Where a command computes and writes, who follows it, and who may stop it."""
+
+    settings: RunSettings | ReconstructSettings
+    output: Path
+    device: torch.device
+    progress: RunProgress
+    stop: Stop
+    observer: RunObserver | None = None
+
+    def report(self, stage: str, fraction: float) -> None:
+        """Tell how far a stage is; raises KeyboardInterrupt after a request to stop."""
+        self.progress.stage(stage, fraction)
+        self.stop.check()
+
+    def stop_early(self, why: str = "Stopping early") -> None:
+        """Say that what there is will be kept."""
+        self.progress.write(f"{why}; keeping what there is. Press Ctrl-C again to quit.")
+
+    def map_known(
+        self, scene: "Reconstruction", work: Callable[[], None], checkpoint: Checkpoint
+    ) -> Ending:
+        """Do what maps a scene of known poses; where that is stopped, keep the map so far.
+
+        Raises KeyboardInterrupt where it is stopped before there is any.
+        """
+        if self.stop.lets_finish(work):
+            return Ending.FINISHED
+        if not len(scene.snapshot()):
+            raise KeyboardInterrupt
+        self.stop_early()
+        checkpoint.write()
+        return Ending.STOPPED
+
+    def complete(self, work: Work) -> Written:
+        """The work to its end, or until it is stopped, then the files of what there is by then.
+
+        Raises:
+            KeyboardInterrupt: it was stopped before there was anything to keep, or twice.
+            OutputError: a file cannot be written.
+            DeviceError: the memory of the device was full; results so far are written, if any.
+        """
+        settings, output, progress = self.settings, self.output, self.progress
+        every = settings.checkpoint_every if work.way_on else 0.0
+        checkpoint = Checkpoint(output, every, work.state, progress, work.stopwatch)
+
+        def way_on() -> str:
+            return f" {work.way_on}" if work.way_on and has_checkpoint(output) else ""
+
+        with full_memory_in_a_sentence(way_on), self.stop:
+            ending = work.complete(self, checkpoint)
+            finished, scene = ending is Ending.FINISHED, work.scene
+            result = Result(scene, work.source, not finished, progress)
+
+            def write_more() -> None:
+                work.write_more(self)
+                if settings.depth_mesh:
+                    write_depth_mesh(output, scene, progress)
+
+            write_results(output, result, write_more, settings.keyframe_images, work.stages)
+            if self.observer is not None:
+                self.observer.result(result)
+        if ending is Ending.MEMORY_FULL:
+            raise DeviceError(
+                f"The memory of the GPU was full after {scene.frames} frames, whose results are in "
+                f"{output}/; {REMEDY}.{way_on()}"
+            )
+        if finished and work.way_on:
+            checkpoint.remove()
+        return Written(output, result, not finished and checkpoint.is_complete)
