@@ -9,7 +9,6 @@ from torch import Tensor
 
 from geogs.application.checkpoints.checkpoint import Checkpoint
 from geogs.application.driver import Ending, Job, Work
-from geogs.application.forecast import reconstruction_forecast
 from geogs.application.photos import PlacedVideo, localiser, place_video
 from geogs.config import Config, ReconstructConfig
 from geogs.geometry.camera import Camera
@@ -60,7 +59,6 @@ class PlacedOffline(Work):
             KeyboardInterrupt: it was stopped before there was a map.
         """
         config = self._config
-        job.progress.plan(reconstruction_forecast(finds_poses=True))
         placed = place_video(self._source, config.seed, job.report, self._stopwatch)
         job.progress.write(
             f"{len(placed.numbers)} of {placed.sharp_frames} sharp frames have a pose; points are "

@@ -3,7 +3,6 @@
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from geogs.application.forecast import Forecast
     from geogs.slam import SlamStatus
 
 
@@ -12,9 +11,6 @@ class RunProgress:
 
     def write(self, text: str) -> None:
         """A sentence for the user; nothing if it is empty."""
-
-    def plan(self, forecast: "Forecast") -> None:
-        """What tells, from now on, how long the rest will take."""
 
     def expect(self, frames: int | None, begun: int = 0) -> None:
         """Before the first frame of so many, if known, of which ``begun`` were done before."""

@@ -10,7 +10,6 @@ from typing import Literal
 from geogs.application.checkpoints.checkpoint import Checkpoint
 from geogs.application.checkpoints.reconstruct_state import ReconstructState, fingerprint, read_work
 from geogs.application.driver import Ending, Job, Work
-from geogs.application.forecast import reconstruction_forecast
 from geogs.application.interrupt import Stop
 from geogs.application.machine.device import compiled_kernels, full_memory_in_a_sentence
 from geogs.application.output_forecast import OutputForecast
@@ -102,7 +101,6 @@ def reconstruct_to_folder(
     for sentence in idle_settings(config):
         progress.write(f"note: {sentence}")
     finds_poses = settings.poses == "auto"
-    progress.plan(reconstruction_forecast(finds_poses))
     if finds_poses:
         wanted = Path("out") / expanded(settings.source).resolve().name
     else:
@@ -118,7 +116,6 @@ def reconstruct_to_folder(
                     stop,
                 )  # fmt: skip
         clock.excuse(compiled_kernels(device))
-        progress.plan(reconstruction_forecast())
         scene = Reconstruction(source.camera, config, str(device), clock.left())
         job = Job(settings, output, device, progress, stop)
         return job.complete(MappedImages(scene, source, settings))

@@ -19,7 +19,6 @@ from geogs.application.checkpoints.run_state import (
     run_state,
 )
 from geogs.application.driver import Ending, Job, Work
-from geogs.application.forecast import RunForecast
 from geogs.application.interrupt import Stop
 from geogs.application.machine.device import compiled_kernels, full_memory_in_a_sentence
 from geogs.application.priors import open_prior
@@ -229,11 +228,6 @@ class TrackedVideo(Work):
     def complete(self, job: Job, checkpoint: Checkpoint) -> Ending:
         """The frames that are left, then the final stages."""
         slam, video, progress = self.slam, self.video, job.progress
-        progress.plan(
-            RunForecast(
-                slam.config, slam.stopwatch, video.length, slam.defers_map, self.metadata.device
-            )
-        )
         progress.expect(video.length, slam.frames)
         with closing(self.frames):
             ending = self._track(job, checkpoint)

@@ -1,4 +1,4 @@
-"""A run on the terminal: one line with how far it is and how long it will take; and a log."""
+"""A run on the terminal: one line with how far a stage is and how long it takes; and a log."""
 
 import logging
 import math
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, TextIO
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
-from geogs.application.forecast import Forecast
+from geogs.application.forecast import StageForecast
 from geogs.application.machine.device import peak_memory
 from geogs.application.progress import RunProgress
 from geogs.application.settings import Verbosity
@@ -40,18 +40,18 @@ class TerminalProgress(RunProgress):
         self._bar = Progress(
             TextColumn("{task.description}"),
             BarColumn(bar_width=24),
-            TextColumn("{task.fields[share]:>4}"),
+            TextColumn("{task.fields[percent]:>4}"),
             TextColumn("{task.fields[info]}"),
             TextColumn("{task.fields[left]}", style="cyan"),
             console=self._console,
             refresh_per_second=_REDRAWS,
             transient=True,
         )
-        self._task = self._bar.add_task("", total=1.0, share="", info="", left="", start=False)
-        self._forecast: Forecast | None = None
+        self._task = self._bar.add_task("", total=1.0, percent="", info="", left="", start=False)
+        self._forecast = StageForecast()
         self._frames: int | None = None
-        self._start = self._printed = time.perf_counter()
-        self._phase, self._phase_began, self._last = "", self._start, ""
+        self._printed = self._phase_began = time.perf_counter()
+        self._phase = self._last = ""
         self._memory, self._measured = "", -math.inf
         self._log: TextIO | None = None
         self._handler: logging.Handler | None = None
@@ -93,10 +93,6 @@ class TerminalProgress(RunProgress):
             Console(stderr=True, highlight=False).print(text, soft_wrap=True, markup=False)
         self._bar.console.print(text, soft_wrap=True, markup=False)
 
-    def plan(self, forecast: Forecast) -> None:
-        """Say from now on how long the rest will take."""
-        self._forecast = forecast
-
     def expect(self, frames: int | None, begun: int = 0) -> None:
         """Begin with the frames."""
         self._frames = frames
@@ -104,16 +100,16 @@ class TerminalProgress(RunProgress):
 
     def frame(self, status: "SlamStatus") -> None:
         """Move the line, with what there is to say beside it."""
-        left = None
-        if self._forecast is not None:
-            left = self._forecast.after_frame(status.frames, status.keyframes)
+        done = None if self._frames is None else status.frames / max(self._frames, status.frames)
+        # Frames up to the first keyframes cost other than those after.
+        left = self._forecast.left("frames" if status.keyframes else "first frames", done)
         parts = [f"{status.keyframes} keyframes"]
         if status.disks:  # else the map is made at the end
             parts.append(f"{status.disks / 1000:.1f}k disks")
         info = "  ".join([*parts, self._memory_used()])
         if status.state.value != "tracking":
             info += f"  {status.state.value}"
-        self._show(f"frame {status.frames}/{self._frames or '?'}", info, left)
+        self._show(f"frame {status.frames}/{self._frames or '?'}", info, done, left)
 
     def _memory_used(self) -> str:
         """At the fullest so far; asked no more often than the line is drawn."""
@@ -125,8 +121,7 @@ class TerminalProgress(RunProgress):
     def stage(self, name: str, fraction: float) -> None:
         """Move the line to a stage, or within it."""
         self._enter(name.split(":")[0])
-        left = None if self._forecast is None else self._forecast.after_stage(name, fraction)
-        self._show(f"{name} {fraction:.0%}", "", left)
+        self._show(name, "", fraction, self._forecast.left(name, fraction))
 
     def _enter(self, phase: str) -> None:
         """Begin another phase, if it is another."""
@@ -147,18 +142,20 @@ class TerminalProgress(RunProgress):
         if not self._console.is_terminal or self._verbosity.verbose:
             self._bar.console.print(text, soft_wrap=True, markup=False)
 
-    def _show(self, what: str, info: str, left: float | None) -> None:
-        """The line as it is now, or a line of text if it is time for one."""
+    def _show(self, what: str, info: str, done: float | None, left: float | None) -> None:
+        """The line as it is now, or a line of text if it is time for one.
+
+        ``done`` is the finished fraction of the stage, and ``left`` how many seconds it will take.
+        """
         now = time.perf_counter()
-        elapsed = now - self._start
-        share = None if left is None else elapsed / max(elapsed + left, 1e-9)
-        ahead = "" if left is None else f"{duration(left)} left"
+        percent = "" if done is None else f"{done:.0%}"
+        ahead = "" if left is None else f"about {duration(left)} left"
         self._last = f", {info}" if info else ""
         self._bar.update(
             self._task,
             description=f"{what:<20}",
-            completed=share or 0.0,
-            share="" if share is None else f"{share:.0%}",
+            completed=done or 0.0,
+            percent=percent,
             info=info,
             left=ahead,
         )
@@ -168,7 +165,7 @@ class TerminalProgress(RunProgress):
         if now - self._printed < every:
             return
         self._printed = now
-        text = "  ".join(filter(None, (what, info, ahead and f"about {ahead}")))
+        text = "  ".join(filter(None, (what, percent, info, ahead)))
         self.note(text)
         if not self._console.is_terminal:
             self._console.print(text, soft_wrap=True, markup=False)

@@ -21,12 +21,10 @@ def main(argv: Sequence[str]) -> int:
     """Run the command; returns the exit code."""
     options = parse_options(MeshOptions, argv, "mesh", _defaults)
 
-    from geogs.application.forecast import mesh_forecast
     from geogs.application.results.remesh import remesh
     from geogs.application.terminal import TerminalProgress
 
     with TerminalProgress() as progress:
-        progress.plan(mesh_forecast())
         path = remesh(options, progress)
     print(f"The mesh is {path}")
     return 0
