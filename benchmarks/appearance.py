@@ -20,7 +20,7 @@ from geogs.errors import GeogsError
 from geogs.io.sources.sniff import open_posed_source
 from geogs.io.writers.atomic import prepare_output_folder, write_text
 from geogs.io.writers.ply_writer import write_mesh
-from geogs.mesh.types import Mesh
+from geogs.mesh.triangle_mesh import Mesh
 from geogs_bench.appearance.baseline import appearance_mesh, train_appearance
 from geogs_bench.appearance.config import AppearanceConfig
 from geogs_bench.appearance.disks import AppearanceDisks

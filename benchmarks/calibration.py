@@ -23,7 +23,7 @@ import numpy as np
 import torch
 
 from geogs.config import InputConfig
-from geogs.evaluation.trajectory import evaluate_trajectory
+from geogs.evaluation.trajectory_errors import evaluate_trajectory
 from geogs.geometry.camera import Camera
 from geogs.io.sources.sniff import open_source
 from geogs.loop.global_bundle import global_bundle

@@ -30,7 +30,7 @@ import torch
 from scipy.spatial import cKDTree
 
 import geogs
-from geogs.evaluation.trajectory import TrajectoryErrors, evaluate_trajectory
+from geogs.evaluation.trajectory_errors import TrajectoryErrors, evaluate_trajectory
 from geogs.geometry.camera import Camera
 from geogs.types import Trajectory
 from geogs_fleet.cluster import ray_cluster

@@ -81,7 +81,7 @@ def errors(network, batch: FlowBatch, iterations: int) -> dict[str, torch.Tensor
     height, width = batch.images.shape[-2:]
     grid = SampleGrid(Camera(fx=1.0, fy=1.0, cx=0.0, cy=0.0, width=width, height=height))
     good = 2**0.5 * last.error.log_scale.exp().amax(-1) < own.max_deviation
-    good &= last.error.share[..., 0].sigmoid() > own.min_share
+    good &= last.error.logit[..., 0].sigmoid() > own.min_probability
     mine = torch.where(good[..., None], last.error.weight(own.floor), 0.0).float().cpu()
     truth, seen = (batch.at_cells(x).cpu() for x in (batch.truth, batch.visible))
     pixels = last.pixels.cpu()

@@ -33,7 +33,7 @@ import torch
 
 from geogs.application.results.surfaces import fusion_views
 from geogs.config import preset
-from geogs.evaluation.trajectory import evaluate_trajectory
+from geogs.evaluation.trajectory_errors import evaluate_trajectory
 from geogs.geometry.camera import Camera
 from geogs.mesh.extract import extract_mesh
 from geogs.slam import Slam

@@ -25,7 +25,7 @@ import torch
 
 from geogs.bundle.select import grid_fields
 from geogs.config import LoopConfig
-from geogs.evaluation.surface import read_surface
+from geogs.evaluation.surfaces.surface import read_surface
 from geogs.geometry.lie import se3_exp, se3_inverse, so3_log
 from geogs.loop.dense import dense_check
 from geogs.loop.detect import LoopDetector

@@ -33,9 +33,9 @@ from torch import Tensor
 
 from geogs.application.results.surfaces import fusion_views
 from geogs.config import Config, MapAblation, MappingConfig
-from geogs.evaluation.reconstruction import evaluate_reconstruction
-from geogs.evaluation.surface import Surface
-from geogs.evaluation.triangle_tree import TriangleTree
+from geogs.evaluation.surfaces.reconstruction_errors import evaluate_reconstruction
+from geogs.evaluation.surfaces.surface import Surface
+from geogs.evaluation.surfaces.triangle_tree import TriangleTree
 from geogs.geometry.lie import (
     quaternion_to_matrix,
     se3_exp,

@@ -25,8 +25,8 @@ from geogs.application.results.surfaces import fusion_views
 from geogs.config import Config
 from geogs.depth.completion import upsample_grid
 from geogs.errors import InputError
-from geogs.evaluation.reconstruction import evaluate_reconstruction
-from geogs.evaluation.surface import Surface, read_surface
+from geogs.evaluation.surfaces.reconstruction_errors import evaluate_reconstruction
+from geogs.evaluation.surfaces.surface import Surface, read_surface
 from geogs.geometry.camera import Camera
 from geogs.geometry.umeyama import umeyama
 from geogs.io.pose_files import read_replica_trajectory
@@ -34,7 +34,7 @@ from geogs.io.sources.sniff import open_source
 from geogs.loop.global_bundle import global_bundle
 from geogs.mapping.mapper import Mapper
 from geogs.mesh.extract import extract_mesh
-from geogs.mesh.types import DepthMapView, Mesh
+from geogs.mesh.triangle_mesh import DepthMapView, Mesh
 from geogs.tracking.tracker import lone_tracker
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import KeyframeSet, KeyframeTable
@@ -127,7 +127,7 @@ class Scorer:
         self.rows: list[dict] = []
 
     def _raycast(self) -> np.ndarray | None:
-        from geogs.evaluation.raster import render_mesh
+        from geogs.evaluation.surfaces.raster import render_mesh
 
         depths = [
             render_mesh(self.truth.vertices, self.truth.faces, self.render, np.linalg.inv(T))[0]

@@ -15,9 +15,9 @@ from PIL import Image
 from geogs.application.export.export import TOLERANCE
 from geogs.application.results.saved_result import load_result
 from geogs.application.results.surfaces import fusion_views
-from geogs.evaluation.textured import psnr, render_textured
 from geogs.mesh.texture.textured import texture_mesh
-from geogs.mesh.types import median_edge
+from geogs.mesh.triangle_mesh import median_edge
+from textured_view import psnr, render_textured
 
 
 def main() -> None:
@@ -41,7 +41,7 @@ def main() -> None:
     for number in held_out:
         view = views[number]
         drawn, hit = render_textured(
-            textured.vertices, textured.faces, textured.texture_place, textured.texture,
+            textured.vertices, textured.faces, textured.uv, textured.texture,
             result.camera, view.T_cw.numpy(),
         )  # fmt: skip
         gain = view.image[hit].mean(0) / np.maximum(drawn[hit].mean(0), 1.0)

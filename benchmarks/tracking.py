@@ -21,7 +21,7 @@ import numpy as np
 import torch
 
 from geogs.config import Config, TrackingConfig
-from geogs.evaluation.surface import read_surface
+from geogs.evaluation.surfaces.surface import read_surface
 from geogs.geometry.camera import Camera
 from geogs.geometry.umeyama import umeyama
 from geogs.loop.global_bundle import global_bundle

@@ -9,7 +9,7 @@ import numpy as np
 
 from depth_scene import WORKING, make_scene, trace
 from geogs.config import ReconstructConfig
-from geogs.evaluation.surface import read_surface, sample_surface
+from geogs.evaluation.surfaces.surface import read_surface, sample_surface
 from geogs.reconstruction import Reconstruction
 
 GEOGS = [sys.executable, "-m", "geogs.cli.main"]

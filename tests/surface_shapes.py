@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from geogs.evaluation.surface import Surface
+from geogs.evaluation.surfaces.surface import Surface
 from geogs.geometry.camera import Camera
 
 CAMERA = Camera(fx=100.0, fy=100.0, cx=79.5, cy=59.5, width=160, height=120)

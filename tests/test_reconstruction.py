@@ -26,7 +26,7 @@ from geogs.io.writers.map_file import load_map
 from geogs.mapping.depth_schedule import spread_order
 from geogs.mapping.first_look import distances_to_try
 from geogs.mapping.known_poses import depth_search
-from geogs.mesh.files import read_mesh
+from geogs.mesh.mesh_file import read_mesh
 from geogs.reconstruction import Reconstruction
 from keyframe_samples import Sample, segment_of
 from posed_scene import (

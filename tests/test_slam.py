@@ -17,11 +17,11 @@ from geogs.application.result_settings import RemeshSettings
 from geogs.application.results.remesh import mesh_settings, remesh
 from geogs.application.results.saved_result import load_result
 from geogs.cli import main as cli
-from geogs.evaluation.surface import read_surface
-from geogs.evaluation.trajectory import evaluate_trajectory
+from geogs.evaluation.surfaces.surface import read_surface
+from geogs.evaluation.trajectory_errors import evaluate_trajectory
 from geogs.io.pose_files import read_tum_trajectory
 from geogs.io.writers.map_file import load_map
-from geogs.mesh.files import read_mesh
+from geogs.mesh.mesh_file import read_mesh
 from geogs.slam import Slam
 from geogs.types import Frame, Trajectory
 from json_schema import faults

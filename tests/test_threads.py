@@ -8,11 +8,12 @@ import pytest
 import torch
 
 from geogs.config import MeshConfig
-from geogs.evaluation import reconstruction, toolbox, trajectory
+from geogs.evaluation import trajectory_errors
+from geogs.evaluation.surfaces import reconstruction_errors, toolbox
 from geogs.geometry.camera import Camera
 from geogs.mesh.colour import colour_mesh
 from geogs.mesh.extract import extract_mesh
-from geogs.mesh.types import DepthMapView, Mesh
+from geogs.mesh.triangle_mesh import DepthMapView, Mesh
 from geogs.threads import on_one_torch_thread, thread_map
 from geogs.types import Trajectory
 from surface_shapes import plane
@@ -65,9 +66,9 @@ def noting(note: Note, function: Callable) -> Callable:
 
 
 def compare_surfaces(note: Note, monkeypatch: pytest.MonkeyPatch) -> None:
-    sample = noting(note, reconstruction.sample_surface)
-    monkeypatch.setattr(reconstruction, "sample_surface", sample)
-    errors = reconstruction.evaluate_reconstruction(plane(2.0), plane(2.03), samples=2000)
+    sample = noting(note, reconstruction_errors.sample_surface)
+    monkeypatch.setattr(reconstruction_errors, "sample_surface", sample)
+    errors = reconstruction_errors.evaluate_reconstruction(plane(2.0), plane(2.03), samples=2000)
     assert errors.scores.accuracy_cm == pytest.approx(3.0, abs=0.01)
 
 
@@ -80,8 +81,8 @@ def compare_trajectories(note: Note, monkeypatch: pytest.MonkeyPatch) -> None:
     T_wc = np.tile(np.eye(4), (9, 1, 1))
     T_wc[:, :3, 3] = np.random.default_rng(0).normal(size=(9, 3))
     path = Trajectory(np.arange(9.0), T_wc, np.ones(9, bool))
-    monkeypatch.setattr(trajectory, "align", noting(note, trajectory.align))
-    assert trajectory.evaluate_trajectory(path, path).ate_rmse_cm < 1e-9
+    monkeypatch.setattr(trajectory_errors, "align", noting(note, trajectory_errors.align))
+    assert trajectory_errors.evaluate_trajectory(path, path).ate_rmse_cm < 1e-9
 
 
 @pytest.mark.parametrize(

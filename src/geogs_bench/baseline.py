@@ -16,7 +16,7 @@ from geogs_bench.runner import Task
 
 if TYPE_CHECKING:
     from geogs.io.sources.posed.posed_source import PosedSource
-    from geogs.mesh.types import Mesh
+    from geogs.mesh.triangle_mesh import Mesh
     from geogs_bench.appearance.disks import AppearanceDisks
     from geogs_bench.appearance.start_points import StartPoints
     from geogs_bench.appearance.trainer import AppearanceResult

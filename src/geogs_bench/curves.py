@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from geogs.evaluation.plots import new_figure, save_figure
+from geogs.evaluation.pages.plots import new_figure, save_figure
 from geogs_bench.record import Record
 
 

@@ -3,7 +3,13 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from geogs.evaluation.page import PictureSection, Section, TableSection, TextSection, write_page
+from geogs.evaluation.pages.page import (
+    PictureSection,
+    Section,
+    TableSection,
+    TextSection,
+    write_page,
+)
 from geogs.io.writers.atomic import write_text
 from geogs_bench.benchmark import Benchmark
 from geogs_bench.curves import plot_curves

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float64
 
 from geogs.documents import UNUSABLE, read_json, read_text
 from geogs.errors import InputError
-from geogs.evaluation.surface import Surface, read_surface
+from geogs.evaluation.surfaces.surface import Surface, read_surface
 from geogs.geometry.camera import Camera
 from geogs.io.pose_files import read_tum_trajectory
 from geogs.io.writers.intrinsics_file import read_camera

@@ -9,7 +9,7 @@ from tempfile import TemporaryDirectory
 from urllib.parse import quote
 
 from geogs.evaluation.duration import duration
-from geogs.evaluation.page import FiguresSection, HtmlSection, Section, write_page
+from geogs.evaluation.pages.page import FiguresSection, HtmlSection, Section, write_page
 from geogs_fleet.places import Place
 from geogs_fleet.row import Row
 

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from geogs.tracking.flow.lookup import RADIUS, WINDOW, correlation_windows
-from geogs.tracking.flow.own_network import FlowEstimate, ImageFeatures
+from geogs.tracking.flow.own_network import FlowEstimate, FlowFeatures
 from geogs_train.flow_options import FlowTraining
 from geogs_train.flow_pairs import FlowBatch
 
@@ -16,7 +16,7 @@ MAX_ERROR = 100.0
 
 
 def flow_loss(
-    features: ImageFeatures,
+    features: FlowFeatures,
     estimates: Sequence[FlowEstimate],
     dense: Float[Tensor, "e h w 2"],
     batch: FlowBatch,
@@ -45,7 +45,7 @@ def flow_loss(
     return total + options.descriptors * descriptor_loss(features, batch)
 
 
-def descriptor_loss(features: ImageFeatures, batch: FlowBatch) -> Float[Tensor, ""]:
+def descriptor_loss(features: FlowFeatures, batch: FlowBatch) -> Float[Tensor, ""]:
     """Cross-entropy of windows around the probes with the place of the truth in them.
 
     A window is read as logits over its 49 places; the truth is shared by the four around it.

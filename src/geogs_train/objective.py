@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from geogs.errors import InputError
-from geogs.tracking.flow.own_network import FlowEstimate, FlowNetwork, ImageFeatures
+from geogs.tracking.flow.own_network import FlowEstimate, FlowFeatures, FlowNetwork
 from geogs_synth.clips.clips import ClipBatch
 from geogs_synth.clips.scene_kinds import only_scene
 from geogs_train.flow_loss import flow_loss
@@ -66,7 +66,7 @@ def objective(options: FlowTraining) -> Objective:
 
 def run_network(
     network: FlowNetwork, batch: FlowBatch, iterations: int
-) -> tuple[ImageFeatures, list[FlowEstimate], Float[Tensor, "e h w 2"]]:
+) -> tuple[FlowFeatures, list[FlowEstimate], Float[Tensor, "e h w 2"]]:
     """Features, estimates of every iteration, upsampled flow of the last; bfloat16 on a GPU."""
     device = batch.images.device
     with torch.autocast(device.type, torch.bfloat16, enabled=device.type == "cuda"):

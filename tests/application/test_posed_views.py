@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 from geogs.application.posed_views import PosedViews
 from geogs.config import ReconstructConfig
-from geogs.evaluation.surface import read_surface
+from geogs.evaluation.surfaces.surface import read_surface
 from geogs.io.sources.posed.posed_source import PosedImage, PosedSource
 from geogs.io.sources.sniff import open_posed_source
 from geogs.mapping import first_look

@@ -10,7 +10,7 @@ import torch
 import geogs
 from geogs.config import Config, InputConfig
 from geogs.errors import InputError
-from geogs.evaluation.trajectory import evaluate_trajectory
+from geogs.evaluation.trajectory_errors import evaluate_trajectory
 from geogs.geometry.umeyama import umeyama
 from geogs.io.pose_files import read_tum_trajectory
 from geogs.types import Trajectory

@@ -8,7 +8,7 @@ import pytest
 
 from bench_results import poses, wall, write_result, write_truth
 from geogs.errors import InputError
-from geogs.evaluation.surface import Surface
+from geogs.evaluation.surfaces.surface import Surface
 from geogs.io.writers.ply_writer import write_mesh
 from geogs_bench import published as paper
 from geogs_bench.ablations import MAP_UPDATE

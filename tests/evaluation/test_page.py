@@ -2,7 +2,7 @@
 
 from html.parser import HTMLParser
 
-from geogs.evaluation.page import PictureSection, TableSection, TextSection, write_page
+from geogs.evaluation.pages.page import PictureSection, TableSection, TextSection, write_page
 
 
 class Elements(HTMLParser):

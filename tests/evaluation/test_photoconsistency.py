@@ -6,8 +6,8 @@ import torch
 from scipy.ndimage import gaussian_filter
 
 from geogs.errors import InputError
-from geogs.evaluation.photoconsistency import (
-    PhotoView,
+from geogs.evaluation.surfaces.photoconsistency import (
+    EvaluatedPhoto,
     choose_neighbours,
     evaluate_photoconsistency,
 )
@@ -37,11 +37,11 @@ def photograph(T_cw: np.ndarray, texture: np.ndarray) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def views() -> list[PhotoView]:
+def views() -> list[EvaluatedPhoto]:
     rough = gaussian_filter(np.random.default_rng(0).normal(size=(401, 401)), 2.0)
     texture = 128 + 60 * rough / rough.std()
     poses = [arc(a) for a in (0.0, 12.0, -12.0)]
-    return [PhotoView(photograph(T, texture), T) for T in poses]
+    return [EvaluatedPhoto(photograph(T, texture), T) for T in poses]
 
 
 def score(mesh, views, **options):
@@ -88,7 +88,7 @@ def test_what_is_hidden_in_the_neighbour_is_not_compared(views):
 def test_masks_limit_what_counts(views):
     mask = np.zeros((120, 160), bool)
     mask[40:80, 60:100] = True
-    view = PhotoView(views[0].image, views[0].T_cw, mask)
+    view = EvaluatedPhoto(views[0].image, views[0].T_cw, mask)
     small = plane(2.0, half=0.45)  # 45 pixels, more than the mask
     assert score(small, [view, *views[1:]]).coverage == 100
     assert score(small, views).coverage == pytest.approx(100 * 45**2 / (160 * 120), abs=1)
@@ -100,10 +100,10 @@ def test_neighbours_by_poses_alone():
     outwards = [arc(0.0, -2.0), arc(12.0, -2.0)]
     assert choose_neighbours(0, outwards, 3) == []
     with pytest.raises(InputError, match="from another side"):
-        score(plane(2.0), [PhotoView(np.zeros((120, 160, 3), np.uint8), np.eye(4))])
+        score(plane(2.0), [EvaluatedPhoto(np.zeros((120, 160, 3), np.uint8), np.eye(4))])
 
 
 def test_plain_images_cannot_be_judged(views):
-    plain = [PhotoView(np.full_like(v.image, 90), v.T_cw) for v in views]
+    plain = [EvaluatedPhoto(np.full_like(v.image, 90), v.T_cw) for v in views]
     with pytest.raises(InputError, match="no texture"):
         score(plane(2.0, half=2.0), plain)

@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from box_room import circle
-from geogs.evaluation.run_pictures import (
+from geogs.evaluation.pages.run_pictures import (
     depth_colours,
     draw_keyframes,
     draw_path,

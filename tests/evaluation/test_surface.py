@@ -5,17 +5,17 @@ import pytest
 import torch
 
 from geogs.errors import InputError
-from geogs.evaluation.icp import icp
-from geogs.evaluation.raster import render_mesh
-from geogs.evaluation.reconstruction import evaluate_reconstruction
-from geogs.evaluation.surface import (
+from geogs.evaluation.surfaces.icp import icp
+from geogs.evaluation.surfaces.raster import render_mesh
+from geogs.evaluation.surfaces.reconstruction_errors import evaluate_reconstruction
+from geogs.evaluation.surfaces.surface import (
     Surface,
     SurfaceDistance,
     closest_point_on_triangle,
     read_surface,
     sample_surface,
 )
-from geogs.evaluation.visibility import Visibility
+from geogs.evaluation.surfaces.visibility import Visibility
 from geogs.geometry.lie import se3_exp
 from geogs.io.writers.ply_writer import write_mesh
 from surface_shapes import CAMERA, NO_FACES, joined, plane

@@ -5,15 +5,15 @@ import pytest
 import torch
 
 from geogs.errors import InputError
-from geogs.evaluation.culling import cull_mesh, in_frustum
-from geogs.evaluation.icp import icp_points
-from geogs.evaluation.surface import Surface
-from geogs.evaluation.toolbox import (
+from geogs.evaluation.surfaces.icp import icp_points
+from geogs.evaluation.surfaces.surface import Surface
+from geogs.evaluation.surfaces.toolbox import (
     AREA_WEIGHTED,
     VERTEX_WEIGHTED,
     evaluate_samples,
     evaluate_vertices,
 )
+from geogs.evaluation.surfaces.visibility import cull_mesh, in_frustum
 from geogs.geometry.lie import se3_exp
 from surface_shapes import CAMERA, NO_FACES, joined, plane
 
@@ -57,7 +57,7 @@ def test_duplicate_and_loose_vertices_do_not_count():
 
 def test_duplicates_are_those_that_trimesh_merges():
     trimesh = pytest.importorskip("trimesh")
-    from geogs.evaluation.toolbox import _without_duplicates
+    from geogs.evaluation.surfaces.toolbox import _without_duplicates
 
     rng = np.random.default_rng(0)
     vertices = plane(1.0, cells=6).vertices[plane(1.0, cells=6).faces].reshape(-1, 3)

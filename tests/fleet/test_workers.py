@@ -15,7 +15,7 @@ from cluster_nodes import add_node, simulated_cluster
 from geogs.config import Config, MeshConfig
 from geogs.errors import DeviceError, InputError
 from geogs.io.writers.map_file import load_map_file
-from geogs.mesh.files import read_mesh
+from geogs.mesh.mesh_file import read_mesh
 from geogs_fleet.cluster import Share
 from geogs_fleet.join.join import join_parts
 from geogs_fleet.join.part import Part

@@ -5,7 +5,7 @@ import torch
 
 from geogs.geometry.camera import Camera
 from geogs.mesh.colour import colour_mesh
-from geogs.mesh.types import DepthMapView, Mesh
+from geogs.mesh.triangle_mesh import DepthMapView, Mesh
 
 CAMERA = Camera(fx=50.0, fy=50.0, cx=31.5, cy=23.5, width=64, height=48)
 

@@ -5,11 +5,11 @@ import pytest
 
 from geogs.errors import InputError
 from geogs.io.writers.ply_writer import write_mesh
-from geogs.mesh.decimate import MEAN_SHARE, QUANTILE, decimate
+from geogs.mesh.decimate import MEAN_FRACTION, QUANTILE, decimate
 from geogs.mesh.deviation import deviations
 from geogs.mesh.deviation_kernels import triangle_distance
-from geogs.mesh.files import read_mesh
-from geogs.mesh.types import Mesh
+from geogs.mesh.mesh_file import read_mesh
+from geogs.mesh.triangle_mesh import Mesh
 
 
 def hills(n: int = 60) -> Mesh:
@@ -74,7 +74,7 @@ def test_the_surface_stays_within_the_tolerance_and_keeps_its_border(tolerance):
     assert len(few.faces) < 0.5 * len(mesh.faces)
     away = deviations(mesh.vertices, few.vertices, few.faces)
     assert np.quantile(away, QUANTILE) <= tolerance * 1.1
-    assert away.mean() <= 1.1 * MEAN_SHARE * tolerance
+    assert away.mean() <= 1.1 * MEAN_FRACTION * tolerance
     assert border(few) == border(mesh)
     assert few.faces.min() == 0
     assert few.faces.max() == len(few.vertices) - 1

@@ -18,8 +18,8 @@ from geogs.io.writers.ply_writer import write_splats
 from geogs.mesh import tsdf
 from geogs.mesh.colour import colour_mesh
 from geogs.mesh.extract import extract_mesh
+from geogs.mesh.triangle_mesh import DepthMapView
 from geogs.mesh.tsdf import SparseTsdf, _plane_table, band_blocks
-from geogs.mesh.types import DepthMapView
 from geogs.types import MapSnapshot, RenderedKeyframe, Trajectory
 
 HAS_GPU = torch.cuda.is_available()

@@ -11,8 +11,8 @@ from geogs.mesh.clean import keep_faces
 from geogs.mesh.extract import extract_mesh
 from geogs.mesh.free_space import FreeSpace
 from geogs.mesh.holes import border_loops, close_holes
+from geogs.mesh.triangle_mesh import DepthMapView, Mesh
 from geogs.mesh.tsdf import BLOCK, SparseTsdf
-from geogs.mesh.types import DepthMapView, Mesh
 
 N = 21
 

@@ -8,7 +8,6 @@ import pytest
 import torch
 
 from geogs.errors import InputError
-from geogs.evaluation.textured import psnr, render_textured
 from geogs.geometry.camera import Camera
 from geogs.io.writers.exports.mesh_writers import write_textured_glb
 from geogs.mesh.texture.candidates import find_candidates
@@ -16,7 +15,8 @@ from geogs.mesh.texture.exposure import seam_corrections, view_gains
 from geogs.mesh.texture.labels import face_neighbours
 from geogs.mesh.texture.packing import pack, scale_that_fits
 from geogs.mesh.texture.textured import texture_mesh
-from geogs.mesh.types import DepthMapView, Mesh
+from geogs.mesh.triangle_mesh import DepthMapView, Mesh
+from textured_view import psnr, render_textured
 
 CAMERA = Camera(90.0, 90.0, 63.5, 47.5, 128, 96)
 DISTANCE = 2.0
@@ -43,7 +43,7 @@ def paint(points: np.ndarray) -> np.ndarray:
 
 def view(mesh: Mesh, x: float, y: float = 0.0, gain: float = 1.0) -> DepthMapView:
     """The wall from beside the origin, exactly."""
-    from geogs.evaluation.raster import render_mesh
+    from geogs.evaluation.surfaces.raster import render_mesh
 
     T_cw = np.eye(4)
     T_cw[:2, 3] = -x, -y
@@ -70,7 +70,7 @@ def test_a_view_that_was_not_used_looks_like_the_mesh_though_exposures_differ(te
     mesh, _, made = textured
     truth = view(mesh, 0.1, 0.05, (1.0 * 1.25 * 0.8 * 1.1) ** 0.25)
     drawn, hit = render_textured(
-        made.vertices, made.faces, made.texture_place, made.texture, CAMERA, truth.T_cw.numpy()
+        made.vertices, made.faces, made.uv, made.texture, CAMERA, truth.T_cw.numpy()
     )
     assert hit.mean() > 0.9
     assert psnr(drawn, truth.image, hit) > 32
@@ -84,7 +84,7 @@ def test_without_levelling_it_would_not(textured):
     candidates = find_candidates(mesh, views, 0.02)
     best = candidates.score.argmax(1)
     colour = candidates.colour[np.arange(len(best)), best]
-    from geogs.evaluation.raster import render_mesh
+    from geogs.evaluation.surfaces.raster import render_mesh
 
     _, face = render_mesh(mesh.vertices, mesh.faces, CAMERA, truth.T_cw.numpy())
     hit = face >= 0
@@ -133,7 +133,7 @@ def test_what_stands_before_the_wall_is_not_painted_on_it():
     red = (used[:, 0] > 240) & (used[:, 1] < 20)
     assert red.mean() < 0.05  # only beside patches, where nothing is drawn from
     drawn, hit = render_textured(
-        made.vertices, made.faces, made.texture_place, made.texture, CAMERA, np.eye(4)
+        made.vertices, made.faces, made.uv, made.texture, CAMERA, np.eye(4)
     )
     hit[:10] = hit[-10:] = hit[:, :10] = hit[:, -10:] = False  # no view shows all of these faces
     assert psnr(drawn, view(mesh, 0.0).image, hit) > 30
@@ -163,9 +163,7 @@ def test_trimesh_reads_places_texture_and_axes(textured, tmp_path):
     trimesh = pytest.importorskip("trimesh")
     _, _, made = textured
     path = tmp_path / "mesh.glb"
-    write_textured_glb(
-        path, made.vertices, made.faces, made.normals, made.texture_place, made.texture
-    )
+    write_textured_glb(path, made.vertices, made.faces, made.normals, made.uv, made.texture)
     read = trimesh.load(path, force="mesh", process=False)
     np.testing.assert_allclose(read.vertices, made.vertices * (1, -1, -1), atol=1e-6)
     np.testing.assert_array_equal(read.faces, made.faces)
@@ -174,7 +172,7 @@ def test_trimesh_reads_places_texture_and_axes(textured, tmp_path):
     assert np.abs(picture - made.texture).mean() < 3
     # trimesh has v upwards; the first row of the file's image is v = 0.
     height, width = made.texture.shape[:2]
-    uv = (made.texture_place + 0.5) / (width, height)
+    uv = (made.uv + 0.5) / (width, height)
     np.testing.assert_allclose(read.visual.uv, np.stack([uv[:, 0], 1 - uv[:, 1]], -1), atol=1e-6)
     data = path.read_bytes()
     (length,) = struct.unpack_from("<I", data, 12)

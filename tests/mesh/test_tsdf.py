@@ -10,12 +10,12 @@ from geogs.config import MeshConfig
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp
-from geogs.mesh import clean, surface
+from geogs.mesh import clean, level_set
 from geogs.mesh.clean import keep_components, remove_degenerate_faces
 from geogs.mesh.extract import extract_mesh, plan_volume
-from geogs.mesh.surface import extract_surface
+from geogs.mesh.level_set import extract_surface
+from geogs.mesh.triangle_mesh import DepthMapView, Mesh
 from geogs.mesh.tsdf import BLOCK, SparseTsdf, band_blocks, pack, unpack
-from geogs.mesh.types import DepthMapView, Mesh
 
 CAMERA = Camera(fx=120.0, fy=120.0, cx=79.5, cy=59.5, width=160, height=120)
 RADIUS = 0.4
@@ -160,7 +160,7 @@ def test_box_from_inside_spans_chunks_without_seams(monkeypatch):
     inwards = -(face_normals(mesh) * mesh.vertices[mesh.faces].mean(1)).sum(1)
     assert (inwards > 0).mean() > 0.9999  # no back faces
     assert len(np.unique(mesh.vertices, axis=0)) == len(mesh.vertices)
-    monkeypatch.setattr(surface, "CHUNK", 64)  # all in one piece, of course without seams
+    monkeypatch.setattr(level_set, "CHUNK", 64)  # all in one piece, of course without seams
     whole = extract_surface(tsdf, min_weight=1.0)
     assert np.array_equal(by_position(mesh), by_position(whole))
 

@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 
 import mutations
-from geogs.evaluation.dtu import read_dtu_reference
-from geogs.evaluation.surface import read_surface
+from geogs.evaluation.surfaces.dtu_errors import read_dtu_reference
+from geogs.evaluation.surfaces.surface import read_surface
 from geogs.io.writers.ply_writer import write_mesh
-from geogs.mesh.files import read_mesh
+from geogs.mesh.mesh_file import read_mesh
 from parsers.base import Parser, written
 
 ASCII = (

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from geogs.errors import InputError, OutputError
-from geogs.evaluation.surface import read_surface
+from geogs.evaluation.surfaces.surface import read_surface
 from geogs.io.pose_files import read_poses
 from geogs.io.sources.sniff import open_source
 from geogs_synth.camera.flaws import Flaws, camera_flaws

@@ -9,7 +9,7 @@ import pytest
 
 from geogs.config import Config, TrackingConfig
 from geogs.errors import TrackingLost
-from geogs.evaluation.trajectory import rotation_angle
+from geogs.evaluation.trajectory_errors import rotation_angle
 from geogs.tracking import start_up
 from geogs.tracking.flow.select import build_operator
 from geogs.tracking.graph import FrameGraph

@@ -14,7 +14,7 @@ from geogs.tracking.flow.lookup import CHANNELS, DescriptorPyramid, Edges, Pyram
 from geogs.tracking.flow.own import load_network
 from geogs.tracking.flow.own_network import (
     FlowEstimate,
-    ImageFeatures,
+    FlowFeatures,
     LaplaceMixture,
     NetworkOptions,
     cell_pixels,
@@ -104,7 +104,7 @@ def test_cold_starts_know_nothing():
     torch.testing.assert_close(start, pair["cells"].expand_as(start))
 
 
-def tiny_batch() -> tuple[FlowBatch, ImageFeatures]:
+def tiny_batch() -> tuple[FlowBatch, FlowFeatures]:
     rng = torch.Generator().manual_seed(0)
     height, width, gh, gw = 16, 24, 2, 3
     truth = torch.rand(1, height, width, 2, generator=rng) * 10
@@ -120,7 +120,7 @@ def tiny_batch() -> tuple[FlowBatch, ImageFeatures]:
     descriptors = torch.randn(1, 12 * 8 + 6, CHANNELS, generator=rng)
     source = torch.randn(1, gh * gw, CHANNELS, generator=rng)
     state = torch.zeros(1, 4, gh, gw)
-    return batch, ImageFeatures(source, DescriptorPyramid(descriptors, levels), state, state)
+    return batch, FlowFeatures(source, DescriptorPyramid(descriptors, levels), state, state)
 
 
 def estimate(pixels: torch.Tensor, log_scale: float) -> FlowEstimate:

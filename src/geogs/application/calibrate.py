@@ -9,7 +9,7 @@ import torch
 from geogs.application.interrupt import Stop
 from geogs.application.progress import RunProgress
 from geogs.config import Config
-from geogs.io.sources.calibration import Calibration, Refinement
+from geogs.io.sources.calibration import Calibration, FocalRefinement
 from geogs.io.sources.sniff import Stream
 from geogs.shutter.shutter import Shutter
 
@@ -81,13 +81,15 @@ def refined(
     ``working_focal`` is fx of the working images by ``calibration``, in their pixels.
     """
     if found.failure is not None:
-        said = Refinement(keyframes=found.keyframes, frames=found.frames, failure=found.failure)
+        said = FocalRefinement(
+            keyframes=found.keyframes, frames=found.frames, failure=found.failure
+        )
         origin = f"{calibration.origin}; the video does not tell: {found.failure}"
         return replace(calibration, origin=origin, refinement=said)
     factor = found.camera.fx / working_focal
     focal = calibration.fx * factor
     deviation = found.deviation * focal
-    said = Refinement(deviation, found.deviation_k1, found.keyframes, found.frames)
+    said = FocalRefinement(deviation, found.deviation_k1, found.keyframes, found.frames)
     was = "was assumed" if calibration.is_guess else f"says {calibration.fx:.1f}"
     origin = f"refined from the video: {focal:.1f} +- {deviation:.1f} pixels"
     if found.deviation_k1 is not None:

@@ -16,15 +16,19 @@ from geogs.application.results.report import shown_model, shown_views
 from geogs.application.results.saved_result import load_result
 from geogs.documents import read_json
 from geogs.errors import InputError
-from geogs.evaluation.model_view.records import Colouring, Legend, Model
-from geogs.evaluation.report import SAME_POSES_CM, Evaluation, write_report
-from geogs.evaluation.run_report import PICTURES, figures, run_figures, run_sections
-from geogs.evaluation.surface import read_surface
-from geogs.evaluation.trajectory import Alignment, TrajectoryErrors, evaluate_trajectory
-from geogs.evaluation.truth import TrueScene, read_true_scene, scaled
+from geogs.evaluation.model_view.shown_model import Colouring, Legend, ShownModel
+from geogs.evaluation.pages.evaluation_page import SAME_POSES_CM, Evaluation, write_report
+from geogs.evaluation.pages.run_page import PICTURES, figures, run_figures, run_sections
+from geogs.evaluation.surfaces.surface import read_surface
+from geogs.evaluation.trajectory_errors import (
+    Alignment,
+    TrajectoryErrors,
+    evaluate_trajectory,
+)
+from geogs.evaluation.true_scene import TrueScene, read_true_scene, scaled
 from geogs.io.pose_files import read_tum_trajectory
 from geogs.io.writers.intrinsics_file import read_camera
-from geogs.mesh.types import Mesh
+from geogs.mesh.triangle_mesh import Mesh
 from geogs.threads import on_one_torch_thread
 
 _ICP_PROTOCOLS = ("samples", "vertex")
@@ -139,8 +143,8 @@ def _draw(
     settings: EvalSettings, trajectory: TrajectoryErrors, surface: SurfaceComparison | None
 ) -> list[tuple[str, Path]]:
     """Pictures of this command, then those that the run left; titles and files."""
-    from geogs.evaluation import plots
-    from geogs.evaluation.shading import viewpoints
+    from geogs.evaluation.pages import plots
+    from geogs.evaluation.pages.shading import viewpoints
 
     folder = settings.output / "report"
     titles: dict[str, str] = {}
@@ -169,7 +173,7 @@ def _run_pictures(settings: EvalSettings) -> list[tuple[str, Path]]:
 
 def _model_beside_truth(
     folder: Path, trajectory: TrajectoryErrors, surface: SurfaceComparison | None
-) -> Model | None:
+) -> ShownModel | None:
     """What the page of an evaluated result shows; none where no map was saved.
 
     Args:
@@ -183,7 +187,7 @@ def _model_beside_truth(
         mesh = result.mesh
     except InputError:
         return None
-    from geogs.evaluation.plots import ERROR_STOPS, error_colours
+    from geogs.evaluation.pages.plots import ERROR_STOPS, error_colours
 
     T = trajectory.T_ref_est
 

@@ -10,18 +10,17 @@ from jaxtyping import Float
 
 from geogs.application.result_settings import EvalSettings
 from geogs.errors import InputError
-from geogs.evaluation.culling import cull_mesh
-from geogs.evaluation.masks import Silhouette, cull_by_masks, mesh_silhouettes
-from geogs.evaluation.photoconsistency import PhotoScores, evaluate_photoconsistency
-from geogs.evaluation.scores import SurfaceScores
-from geogs.evaluation.surface import Surface, read_surface
-from geogs.evaluation.truth import TrueScene, photographs, silhouettes
-from geogs.evaluation.visibility import Visibility
+from geogs.evaluation.surfaces.photoconsistency import PhotoScores, evaluate_photoconsistency
+from geogs.evaluation.surfaces.silhouettes import Silhouette, cull_by_masks, mesh_silhouettes
+from geogs.evaluation.surfaces.surface import Surface, read_surface
+from geogs.evaluation.surfaces.surface_scores import SurfaceScores
+from geogs.evaluation.surfaces.visibility import Visibility, cull_mesh
+from geogs.evaluation.true_scene import TrueScene, photographs, silhouettes
 from geogs.geometry.camera import Camera
 from geogs.io.writers.intrinsics_file import read_camera
 
 if TYPE_CHECKING:
-    from geogs.evaluation.reconstruction import SurfaceErrors
+    from geogs.evaluation.surfaces.surface_scores import SurfaceErrors
 
 _MASK_EDGE, _PHOTO_EDGE = 1600, 800
 _MILLIMETRES = 1000.0
@@ -78,7 +77,7 @@ def photoconsistency(settings: EvalSettings, scene: TrueScene, mesh: Surface) ->
 def _area(
     settings: EvalSettings, scene: TrueScene, mesh: Surface, truth: Surface, points: Surface | None
 ) -> SurfaceComparison:
-    from geogs.evaluation.reconstruction import evaluate_reconstruction
+    from geogs.evaluation.surfaces.reconstruction_errors import evaluate_reconstruction
 
     visibility = None
     if settings.cull:
@@ -101,7 +100,7 @@ def _toolbox(
     settings: EvalSettings, scene: TrueScene, mesh: Surface, truth: Surface
 ) -> SurfaceComparison:
     """The scripts' own measures; NICE-SLAM's culls both meshes, Splat-SLAM's the truth alone."""
-    from geogs.evaluation.toolbox import evaluate_samples, evaluate_vertices
+    from geogs.evaluation.surfaces.toolbox import evaluate_samples, evaluate_vertices
 
     threshold = settings.threshold or 0.05
     if settings.cull:
@@ -123,7 +122,7 @@ def _toolbox(
 def _object(
     settings: EvalSettings, scene: TrueScene, mesh: Surface, truth: Surface, points: Surface | None
 ) -> SurfaceComparison:
-    from geogs.evaluation.object import evaluate_object
+    from geogs.evaluation.surfaces.object_errors import evaluate_object
 
     errors = evaluate_object(
         mesh,
@@ -139,7 +138,7 @@ def _object(
 
 
 def _dtu(settings: EvalSettings, scene: TrueScene, mesh: Surface) -> SurfaceComparison:
-    from geogs.evaluation.dtu import evaluate_dtu, read_dtu_reference
+    from geogs.evaluation.surfaces.dtu_errors import evaluate_dtu, read_dtu_reference
 
     if settings.dtu_data is None:
         raise InputError("The DTU protocol needs --dtu-data, the folder with ObsMask and Points.")
@@ -157,8 +156,8 @@ def _dtu(settings: EvalSettings, scene: TrueScene, mesh: Surface) -> SurfaceComp
         errors.scores,
         Surface(cut.vertices / _MILLIMETRES, cut.faces),
         scan,
-        errors.data / _MILLIMETRES,
-        errors.d2s / _MILLIMETRES,
+        errors.reconstruction_points / _MILLIMETRES,
+        errors.accuracy / _MILLIMETRES,
         _REACH,
     )
 
@@ -200,7 +199,9 @@ def _occluder(truth: Surface) -> Surface:
     return truth
 
 
-def _comparison(errors: "SurfaceErrors", mesh: Surface, truth: Surface) -> SurfaceComparison:
+def _comparison(
+    errors: "SurfaceErrors[SurfaceScores]", mesh: Surface, truth: Surface
+) -> SurfaceComparison:
     return SurfaceComparison(
         errors.scores, mesh, truth, errors.reconstruction_points, errors.accuracy
     )

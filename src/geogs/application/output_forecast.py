@@ -156,7 +156,7 @@ def _cost(found: _Rehearsal, times_the_surface: float) -> OutputCost:
 
 def _make_ready(scene: Reconstruction, views: list[int]) -> None:
     """Load and compile what a mesh and its files need."""
-    from geogs.evaluation import run_pictures, run_report  # noqa: F401
+    from geogs.evaluation.pages import run_page, run_pictures  # noqa: F401
 
     with suppress(InputError):  # what one view shows is not sure enough for a surface
         extract_mesh(fusion_views(scene.depth_maps(of=views)), scene.config.mesh)

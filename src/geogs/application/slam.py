@@ -27,7 +27,7 @@ from geogs.io.writers.map_file import save_map_with_views
 from geogs.io.writers.trajectories import write_trajectories
 from geogs.io.writers.uncertainty import write_uncertainty
 from geogs.mapping.rendered import SurfaceMaps
-from geogs.mesh.types import Mesh
+from geogs.mesh.triangle_mesh import Mesh
 from geogs.priors.base import MonocularPrior
 from geogs.slam import Slam as Algorithm
 from geogs.slam import SlamStatus

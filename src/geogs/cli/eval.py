@@ -22,7 +22,7 @@ def main(argv: Sequence[str]) -> int:
     from rich.console import Console
 
     from geogs.application.evaluate import evaluate
-    from geogs.evaluation.report import table
+    from geogs.evaluation.pages.evaluation_page import table
 
     Console().print(table(evaluate(options)))
     return 0

@@ -20,7 +20,7 @@ from geogs.io.decoder_noise import decoder_noise
 LARGEST_PICTURE = 1 << 31
 """Bytes of a file."""
 _PIXELS_A_BYTE = 10_000
-"""Of a picture of nothing but black, compressed as well as any format can."""
+"""Pixels per byte of an all-black picture, compressed as well as any format can."""
 _HARMLESS = 1 << 24
 """Pixels that are decoded in no time, whatever the file holds."""
 

@@ -13,14 +13,13 @@ from jaxtyping import Bool, Int
 from torch import Tensor
 
 from geogs.config import MeshConfig
-from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.mesh.clean import cleaned
-from geogs.mesh.extract import VolumePlan
+from geogs.mesh.extract import VolumePlan, integrate
 from geogs.mesh.free_space import FreeSpace
-from geogs.mesh.surface import CHUNK, SurfacePart, stitched, surface_parts
+from geogs.mesh.level_set import CHUNK, SurfacePart, stitched, surface_parts
+from geogs.mesh.triangle_mesh import DepthMapView, Mesh
 from geogs.mesh.tsdf import BLOCK, BlockBox, SparseTsdf, band_blocks
-from geogs.mesh.types import DepthMapView, Mesh
 from geogs.threads import on_one_torch_thread
 
 
@@ -104,8 +103,7 @@ def mesh_block(
     """
     tsdf = SparseTsdf(plan.voxel, plan.truncation, device, box=box)
     for view in views:
-        weight = torch.where(view.depth <= plan.max_depth, view.weight, 0.0)
-        tsdf.integrate(view.depth, weight, view.camera, view.T_cw)
+        integrate(tsdf, view, plan)
     return MeshBlock(tuple(surface_parts(tsdf, min_weight)), FreeSpace.of(tsdf, min_weight))
 
 
@@ -116,13 +114,7 @@ def stitched_blocks(blocks: Sequence[MeshBlock], plan: VolumePlan, config: MeshC
         InputError: there is no surface.
     """
     mesh = stitched((part for block in blocks for part in block.parts), plan.voxel)
-    mesh = cleaned(mesh, config, FreeSpace.joined([block.free for block in blocks]))
-    if not len(mesh.faces):
-        raise InputError(
-            f"No surface was seen with a total weight of {config.min_weight:g}; lower min-weight "
-            f"or use more views."
-        )
-    return mesh
+    return cleaned(mesh, config, FreeSpace.joined([block.free for block in blocks]))
 
 
 def near(mesh: Mesh, box: BlockBox, plan: VolumePlan) -> Bool[np.ndarray, "n"]:

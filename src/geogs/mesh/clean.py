@@ -4,8 +4,9 @@ import numpy as np
 from jaxtyping import Int
 
 from geogs.config import MeshConfig
+from geogs.errors import InputError
 from geogs.mesh.holes import IsFree, close_holes
-from geogs.mesh.types import Mesh
+from geogs.mesh.triangle_mesh import Mesh
 
 LEAST_OF_LARGEST = 0.001
 """Parts with fewer faces than this fraction of the largest part's are removed: specks."""
@@ -14,11 +15,19 @@ CLOSED_HOLES = 8
 
 
 def cleaned(mesh: Mesh, config: MeshConfig, is_free: IsFree) -> Mesh:
-    """Without what is no surface, and with small holes closed where nobody looked through them."""
+    """Without what is no surface, and with small holes closed where nobody looked through them.
+
+    Raises InputError if no surface is left.
+    """
     mesh = remove_degenerate_faces(mesh)
     mesh = keep_components(
         mesh, config.min_component_faces, LEAST_OF_LARGEST, config.max_components
     )
+    if not len(mesh.faces):
+        raise InputError(
+            f"No surface was seen with a total weight of {config.min_weight:g}; lower min-weight "
+            "or use more views."
+        )
     return close_holes(mesh, CLOSED_HOLES, is_free)
 
 

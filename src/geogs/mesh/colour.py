@@ -9,7 +9,7 @@ from torch import Tensor
 
 from geogs.geometry.lie import transform
 from geogs.geometry.neighbors import nearest_neighbors
-from geogs.mesh.types import DepthMapView, Mesh
+from geogs.mesh.triangle_mesh import DepthMapView, Mesh
 from geogs.threads import on_one_torch_thread
 
 _GREY = 128

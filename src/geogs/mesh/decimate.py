@@ -5,19 +5,20 @@ from jaxtyping import Float, Int
 
 from geogs.mesh.clean import remove_degenerate_faces
 from geogs.mesh.deviation import deviations
-from geogs.mesh.types import Mesh, vertex_normals
+from geogs.mesh.triangle_mesh import Mesh, vertex_normals
 from geogs.threads import worker_count
 
 QUANTILE = 0.99
 """Part of the vertices that may not lie farther from the decimated surface than is allowed."""
-MEAN_SHARE = 0.15
-"""Of what is allowed, that they may lie away on average: else what is smooth would become facets,
+MEAN_FRACTION = 0.15
+"""Fraction of what is allowed that they may be off on average: else what is smooth becomes facets,
 all of it as far away as may be."""
-_WITNESSES = 10_000
-_SHARES = (0.25, 0.5, 0.75, 0.88)
-"""Of its triangles that a mesh is brought to next; a later one where those before are too few."""
+_SAMPLES = 10_000
+_FRACTIONS = (0.25, 0.5, 0.75, 0.88)
+"""Fractions of its triangles that a mesh is brought to next; a later
+one where those before leave too few."""
 _USUAL_GROWTH = 1.0
-"""Power of one over the share of triangles, by which deviations grow."""
+"""Power of one over the fraction of triangles, by which deviations grow."""
 _FEWEST = 200
 """Triangles below which nothing is gained."""
 
@@ -30,23 +31,23 @@ def decimate(mesh: Mesh, tolerance: float) -> Mesh:
     those of the vertices that each new one stands for. Of a mesh that this would not make smaller
     nothing changes.
 
-    Method: Garland and Heckbert (1997), as in fast-simplification. It is told how many triangles to
-    leave, so it is asked for a quarter, again and again, until that is too few; then for a half,
-    and so on. Deviations grow the faster the fewer triangles are left, so that what would be too
-    few even if they grew as before is not tried: trying takes longest there.
+    Method: Garland and Heckbert (1997), as in fast-simplification. It is given the number of
+    triangles to leave, so it is asked for a quarter, again and again, until that is too few; then
+    for a half, and so on. Deviations grow the faster the fewer triangles are left, so that what
+    would be too few even if they grew as before is not tried: trying takes longest there.
     """
     if tolerance <= 0 or len(mesh.faces) < _FEWEST:
         return mesh
-    witnesses = mesh.vertices[:: 1 + len(mesh.vertices) // _WITNESSES]
+    samples = mesh.vertices[:: 1 + len(mesh.vertices) // _SAMPLES]
     vertices, faces = mesh.vertices, mesh.faces
-    allowed, growth = np.array([tolerance, MEAN_SHARE * tolerance]), np.zeros(2)
+    allowed, growth = np.array([tolerance, MEAN_FRACTION * tolerance]), np.zeros(2)
     reached = np.zeros(2)
-    for share in _SHARES:
-        while len(faces) >= _FEWEST and (reached * share**-growth <= allowed).all():
-            fewer = _simplified(vertices, faces, share)
+    for fraction in _FRACTIONS:
+        while len(faces) >= _FEWEST and (reached * fraction**-growth <= allowed).all():
+            fewer = _simplified(vertices, faces, fraction)
             if len(fewer[1]) > 0.97 * len(faces) or not len(fewer[1]):
                 break
-            away = deviations(witnesses, *fewer)
+            away = deviations(samples, *fewer)
             deviation = np.array([np.quantile(away, QUANTILE), away.mean()])
             if (deviation > allowed).any():
                 break
@@ -58,13 +59,13 @@ def decimate(mesh: Mesh, tolerance: float) -> Mesh:
 
 
 def _growth(
-    before: Float[np.ndarray, "2"], after: Float[np.ndarray, "2"], share: float
+    before: Float[np.ndarray, "2"], after: Float[np.ndarray, "2"], fraction: float
 ) -> Float[np.ndarray, "2"]:
-    """The power of one over the share of triangles that deviations grew by; after the first, what
-    is usual."""
+    """The power of one over the fraction of triangles that deviations grew by; after the first,
+    what is usual."""
     if not (before > 0).all():
         return np.full(2, _USUAL_GROWTH)
-    return np.log(np.maximum(after / before, 1.0)) / -np.log(share)
+    return np.log(np.maximum(after / before, 1.0)) / -np.log(fraction)
 
 
 def with_at_most(mesh: Mesh, faces: int) -> Mesh:
@@ -77,12 +78,12 @@ def with_at_most(mesh: Mesh, faces: int) -> Mesh:
 
 
 def _simplified(
-    vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "m 3"], share: float
+    vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "m 3"], fraction: float
 ) -> tuple[Float[np.ndarray, "k 3"], Int[np.ndarray, "l 3"]]:
-    """About that share of the faces; borders stay."""
+    """About that fraction of the faces; borders stay."""
     import fast_simplification
 
-    count = max(int(share * len(faces)), 4)
+    count = max(int(fraction * len(faces)), 4)
     vertices, faces = fast_simplification.simplify(
         vertices, faces, target_count=count, preserve_border=True
     )

@@ -44,9 +44,9 @@ def triangle_distance(point, triangle):
         turn = (ey * rz - ez * ry) * nx + (ez * rx - ex * rz) * ny + (ex * ry - ey * rx) * nz
         inside = inside and turn >= 0
         squared = ex * ex + ey * ey + ez * ez
-        share = (rx * ex + ry * ey + rz * ez) / squared if squared > 0 else 0.0
-        share = min(max(share, 0.0), 1.0)
-        dx, dy, dz = rx - share * ex, ry - share * ey, rz - share * ez
+        fraction = (rx * ex + ry * ey + rz * ez) / squared if squared > 0 else 0.0
+        fraction = min(max(fraction, 0.0), 1.0)
+        dx, dy, dz = rx - fraction * ex, ry - fraction * ey, rz - fraction * ez
         nearest = min(nearest, math.sqrt(dx * dx + dy * dy + dz * dz))
     if not inside:
         return nearest

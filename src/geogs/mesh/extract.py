@@ -15,9 +15,9 @@ from geogs.mesh.clean import cleaned
 from geogs.mesh.colour import colour_mesh
 from geogs.mesh.decimate import decimate
 from geogs.mesh.free_space import FreeSpace
-from geogs.mesh.surface import extract_surface
+from geogs.mesh.level_set import extract_surface
+from geogs.mesh.triangle_mesh import DepthMapView, Mesh
 from geogs.mesh.tsdf import BLOCK, BYTES_PER_BLOCK, SparseTsdf, band_blocks, pack
-from geogs.mesh.types import DepthMapView, Mesh
 from geogs.threads import on_one_torch_thread
 
 _log = logging.getLogger(__name__)
@@ -107,11 +107,6 @@ def extract_mesh(
     mesh = extract_surface(tsdf, config.min_weight)
     mesh = cleaned(mesh, config, FreeSpace.of(tsdf, config.min_weight))
     del tsdf
-    if not len(mesh.faces):
-        raise InputError(
-            f"No surface was seen with a total weight of {config.min_weight:g}; lower min-weight "
-            f"or use more views."
-        )
     if config.colour and any(view.image is not None for view in views):
         report = None if progress is None else lambda done, of: progress("colour", done, of)
         mesh = colour_mesh(mesh, views, 2 * plan.voxel, report)
@@ -132,11 +127,16 @@ def fuse(
     device = views[0].depth.device
     tsdf = SparseTsdf(plan.voxel, plan.truncation, device, plan.blocks)
     for number, view in enumerate(views):
-        weight = torch.where(view.depth <= plan.max_depth, view.weight, 0.0)
-        tsdf.integrate(view.depth, weight, view.camera, view.T_cw)
+        integrate(tsdf, view, plan)
         if progress:
             progress("fuse", number + 1, len(views))
     return tsdf
+
+
+def integrate(tsdf: SparseTsdf, view: DepthMapView, plan: VolumePlan) -> None:
+    """Fuse a view into a volume, without what is farther away than planned."""
+    weight = torch.where(view.depth <= plan.max_depth, view.weight, 0.0)
+    tsdf.integrate(view.depth, weight, view.camera, view.T_cw)
 
 
 def _sample_points(
@@ -160,7 +160,7 @@ def _sample_points(
 
 
 def _area(points: Float[Tensor, "n 3"], voxel: float) -> float:
-    """Of the surface through the points.
+    """Area of the surface through the points.
 
     It is that of the cells of a coarse grid that hold a point: a plane at any slant meets about 1.5
     cells of area side^2 per side^2.

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from geogs.mesh.tsdf import BLOCK, LIMIT, SparseTsdf, pack
 
 FREE = 0.5
-"""Of the truncation; nearer to a surface than that may be its noise."""
+"""Fraction of the truncation; nearer to a surface than that may be its noise."""
 
 
 @dataclass(frozen=True)
@@ -20,12 +20,12 @@ class FreeSpace:
     voxel: float
     """Map units."""
     keys: Int[np.ndarray, "k"]
-    """Of the blocks, ascending, as ``pack`` makes them."""
+    """Keys of the blocks, ascending, as ``pack`` makes them."""
     bits: UInt8[np.ndarray, "k 64"]
 
     @staticmethod
     def of(tsdf: SparseTsdf, min_weight: float) -> "FreeSpace":
-        """Of the blocks that belong to the box of a volume."""
+        """Free voxels of the blocks that belong to the box of a volume."""
         own = tsdf.owns(tsdf.coordinates)
         is_free = (tsdf.weight[own] >= min_weight) & (tsdf.distance[own] > FREE)
         keys = pack(tsdf.coordinates[own]).cpu().numpy()
@@ -35,7 +35,7 @@ class FreeSpace:
 
     @staticmethod
     def joined(parts: Sequence["FreeSpace"]) -> "FreeSpace":
-        """Of volumes with the same voxels that share no block; at least one."""
+        """Free voxels of volumes with the same grid that share no block; at least one volume."""
         keys = np.concatenate([part.keys for part in parts])
         bits = np.concatenate([part.bits for part in parts])
         order = np.argsort(keys)

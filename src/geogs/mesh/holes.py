@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from geogs.mesh.types import Mesh, cross
+from geogs.mesh.triangle_mesh import Mesh, cross
 
 IsFree = Callable[[Float[np.ndarray, "k 3"]], Bool[np.ndarray, "k"]]
 """Which points lie in space that was seen to be free."""

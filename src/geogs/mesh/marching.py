@@ -12,11 +12,11 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Int8
 
 CORNERS = np.array([[c & 1, c >> 1 & 1, c >> 2 & 1] for c in range(8)])
-"""Of a cell, as steps from its lowest."""
+"""Corners of a cell, as steps from its lowest."""
 EDGES = np.array([[c, axis] for axis in range(3) for c in range(8) if not c >> axis & 1])
-"""Of a cell: lower corner and axis."""
+"""Edges of a cell: lower corner and axis."""
 MOST_TRIANGLES = 5
-"""Of a cell."""
+"""Faces of a cell."""
 
 Loop = list[int]
 """Edges of a cell that a piece of the surface passes in turn."""

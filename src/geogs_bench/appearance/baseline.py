@@ -7,7 +7,7 @@ import torch
 from geogs.config import MeshConfig
 from geogs.errors import DeviceError
 from geogs.mesh.extract import extract_mesh
-from geogs.mesh.types import Mesh
+from geogs.mesh.triangle_mesh import Mesh
 from geogs_bench.appearance.config import AppearanceConfig
 from geogs_bench.appearance.disks import AppearanceDisks
 from geogs_bench.appearance.fusion import depth_views

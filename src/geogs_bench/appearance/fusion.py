@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import torch
 
-from geogs.mesh.types import DepthMapView
+from geogs.mesh.triangle_mesh import DepthMapView
 from geogs_bench.appearance.config import AppearanceConfig
 from geogs_bench.appearance.depth import crossing_depth
 from geogs_bench.appearance.disks import AppearanceDisks

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from geogs.evaluation.surface import Surface
+from geogs.evaluation.surfaces.surface import Surface
 
 
 @dataclass(frozen=True)

@@ -6,11 +6,15 @@ import numpy as np
 
 from geogs.config import InputConfig
 from geogs.errors import InputError
-from geogs.evaluation.dtu import DtuScores, evaluate_dtu, read_dtu_reference
-from geogs.evaluation.masks import Silhouette, cull_by_masks
-from geogs.evaluation.object import MAX_DISTANCE, ObjectScores, evaluate_object
-from geogs.evaluation.surface import Surface, read_surface
-from geogs.evaluation.truth import silhouettes
+from geogs.evaluation.surfaces.dtu_errors import DtuScores, evaluate_dtu, read_dtu_reference
+from geogs.evaluation.surfaces.object_errors import (
+    MAX_DISTANCE,
+    ObjectScores,
+    evaluate_object,
+)
+from geogs.evaluation.surfaces.silhouettes import Silhouette, cull_by_masks
+from geogs.evaluation.surfaces.surface import Surface, read_surface
+from geogs.evaluation.true_scene import silhouettes
 from geogs.io.sources.sniff import open_posed_source
 from geogs_bench.record import SurfaceScore
 from geogs_bench.result import ResultFolder
@@ -74,7 +78,9 @@ def _scan_judge(scene: Scene, seed: int) -> Judge:
     def judge(mesh: Surface) -> tuple[tuple[SurfaceScore, ...], Comparison]:
         found = evaluate_dtu(cull_by_masks(mesh, masks), reference, seed)
         limit = found.scores.colour_limit_cm
-        return (_of_scan(found.scores),), Comparison(mesh, None, found.data, found.d2s / 10, limit)
+        return (_of_scan(found.scores),), Comparison(
+            mesh, None, found.reconstruction_points, found.accuracy / 10, limit
+        )
 
     return judge
 

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from geogs.errors import InputError
-from geogs.evaluation.trajectory import (
+from geogs.evaluation.trajectory_errors import (
     associate,
     best_rotation,
     evaluate_trajectory,

@@ -4,8 +4,8 @@ from pathlib import Path
 
 from geogs.config import InputConfig
 from geogs.errors import InputError
-from geogs.evaluation.photoconsistency import evaluate_photoconsistency
-from geogs.evaluation.truth import photographs
+from geogs.evaluation.surfaces.photoconsistency import evaluate_photoconsistency
+from geogs.evaluation.true_scene import photographs
 from geogs.io.sources.posed.posed_source import PosedSource
 from geogs.io.sources.sniff import open_posed_source
 from geogs_bench.record import PhotoScore

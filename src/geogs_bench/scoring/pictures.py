@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from geogs.evaluation import plots
-from geogs.evaluation.shading import viewpoints
+from geogs.evaluation.pages import plots
+from geogs.evaluation.pages.shading import viewpoints
 from geogs_bench.result import ResultFolder
 from geogs_bench.scoring.comparison import Comparison
 from geogs_bench.scoring.slam import StageErrors

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from geogs.errors import InputError
-from geogs.evaluation.surface import read_surface
+from geogs.evaluation.surfaces.surface import read_surface
 from geogs.io.writers.map_file import load_map
 from geogs_bench.record import CurvePoint, StageScore
 from geogs_bench.result import ResultFolder

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from geogs.errors import InputError
-from geogs.evaluation.trajectory import TrajectoryErrors, evaluate_trajectory
+from geogs.evaluation.trajectory_errors import TrajectoryErrors, evaluate_trajectory
 from geogs.types import Trajectory
 from geogs_bench.record import StageName, StageScore, SurfaceScore, TrajectoryScore
 from geogs_bench.result import ResultFolder

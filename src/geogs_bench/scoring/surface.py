@@ -6,10 +6,13 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float64
 
-from geogs.evaluation.culling import cull_mesh
-from geogs.evaluation.reconstruction import ReconstructionScores, evaluate_reconstruction
-from geogs.evaluation.surface import Surface, read_surface
-from geogs.evaluation.toolbox import evaluate_vertices
+from geogs.evaluation.surfaces.reconstruction_errors import (
+    ReconstructionScores,
+    evaluate_reconstruction,
+)
+from geogs.evaluation.surfaces.surface import Surface, read_surface
+from geogs.evaluation.surfaces.toolbox import evaluate_vertices
+from geogs.evaluation.surfaces.visibility import cull_mesh
 from geogs.geometry.camera import Camera
 from geogs_bench.record import SurfaceScore
 from geogs_bench.scene import Truth

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from geogs.evaluation.surface import Surface
+from geogs.evaluation.surfaces.surface import Surface
 
 _MOST_FACES = 4_000_000
 

@@ -21,7 +21,7 @@ from geogs.errors import InputError
 from geogs.io.writers.atomic import prepare_output_folder
 from geogs.io.writers.map_file import load_map_file
 from geogs.io.writers.ply_writer import write_mesh, write_splats
-from geogs.mesh.types import Mesh
+from geogs.mesh.triangle_mesh import Mesh
 from geogs.types import MapSnapshot
 from geogs.version import __version__
 from geogs_fleet.join.adjust import adjusted

@@ -13,7 +13,7 @@ from torch import Tensor
 from geogs.application.results.saved_result import load_result
 from geogs.geometry.camera import Camera
 from geogs.io.writers.keyframe_folder import image_path, read_image
-from geogs.mesh.types import DepthMapView
+from geogs.mesh.triangle_mesh import DepthMapView
 from geogs.on_demand import OnDemand
 
 

@@ -20,8 +20,8 @@ from geogs.mesh.blocks import (
 from geogs.mesh.colour import colour_mesh
 from geogs.mesh.decimate import decimate
 from geogs.mesh.extract import VolumePlan, plan_volume
+from geogs.mesh.triangle_mesh import Mesh
 from geogs.mesh.tsdf import BYTES_PER_BLOCK, BlockBox
-from geogs.mesh.types import Mesh
 from geogs_fleet.join.stored_views import StoredView, loaded, shares
 from geogs_fleet.workers import Workers
 

@@ -7,10 +7,10 @@ import torch
 from box_room import box, circle
 from browser import open_tab
 from geogs.application.results.report import ShownView, first_view, shown_model
-from geogs.evaluation.model_view.records import Colouring, Legend
-from geogs.evaluation.run_report import write_run_page
+from geogs.evaluation.model_view.shown_model import Colouring, Legend
+from geogs.evaluation.pages.run_page import write_run_page
 from geogs.geometry.camera import Camera
-from geogs.mesh.types import Mesh
+from geogs.mesh.triangle_mesh import Mesh
 from geogs.types import MapSnapshot, Trajectory
 
 CAMERA = Camera(80.0, 80.0, 63.5, 47.5, 128, 96)

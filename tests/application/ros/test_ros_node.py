@@ -13,7 +13,7 @@ from geogs.application.ros.messages import Messages
 from geogs.application.ros.node import CameraNode, run_node
 from geogs.application.ros.settings import NodeSettings
 from geogs.errors import InputError
-from geogs.mesh.types import Mesh
+from geogs.mesh.triangle_mesh import Mesh
 from geogs.types import MapSnapshot
 
 typesys = pytest.importorskip(

@@ -10,7 +10,7 @@ from box_room import box, circle
 from geogs.application.viewer.recording import Recorder
 from geogs.errors import InputError, OutputError
 from geogs.geometry.camera import Camera
-from geogs.mesh.types import Mesh
+from geogs.mesh.triangle_mesh import Mesh
 from geogs.slam import SlamStatus
 from geogs.types import Frame, MapSnapshot, Trajectory
 from geogs.world.segments import TrackState

@@ -6,18 +6,18 @@ import numpy as np
 import pytest
 
 from box_room import box, circle
-from geogs.evaluation.model_view.packing import STEPS, pack, webgl_axes
-from geogs.evaluation.model_view.records import (
+from geogs.evaluation.model_view.model_section import model_html
+from geogs.evaluation.model_view.packed_model import STEPS, pack, webgl_axes
+from geogs.evaluation.model_view.shown_model import (
     Colouring,
     DiskModel,
+    ImageExtent,
     KeyframeModel,
-    Lens,
-    Model,
     PathModel,
+    ShownModel,
     SurfaceModel,
 )
-from geogs.evaluation.model_view.section import model_html
-from geogs.evaluation.shading import level_axes
+from geogs.evaluation.pages.shading import level_axes
 
 
 def unpacked(content: bytes, place: list[int]) -> np.ndarray:
@@ -34,7 +34,7 @@ def unpacked(content: bytes, place: list[int]) -> np.ndarray:
 
 
 @pytest.fixture
-def model() -> Model:
+def model() -> ShownModel:
     vertices, faces = box((3.0, 2.0, 1.2))
     colours = np.arange(len(vertices) * 3, dtype=np.uint8).reshape(-1, 3)
     T_wc = circle()[:4]
@@ -46,8 +46,8 @@ def model() -> Model:
         quaternion.astype(np.float32),
         np.exp(random.uniform(-6, -2, (20, 2))).astype(np.float32),
     )
-    return Model(
-        level_axes(circle()), np.array([4.0, 5, 6]), np.zeros(3), Lens(0.8, 0.6),
+    return ShownModel(
+        level_axes(circle()), np.array([4.0, 5, 6]), np.zeros(3), ImageExtent(0.8, 0.6),
         SurfaceModel(vertices.astype(np.float32), faces, [Colouring("Colour", colours)]),
         [PathModel("Path", T_wc[:, :3, 3], ["tracked", "lost", "orientation only", "tracked"])],
         [KeyframeModel("<one>", T, b"jpeg%d" % i if i else None) for i, T in enumerate(T_wc)],

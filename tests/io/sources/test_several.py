@@ -12,7 +12,7 @@ import pytest
 from geogs.cli import main as cli
 from geogs.config import Config, DepthConfig, InputConfig, LoopConfig, MappingConfig, TrackingConfig
 from geogs.errors import InputError
-from geogs.evaluation.trajectory import evaluate_trajectory
+from geogs.evaluation.trajectory_errors import evaluate_trajectory
 from geogs.io.sources.several import PAUSE
 from geogs.io.sources.sniff import open_source
 from geogs.slam import Slam

@@ -13,9 +13,9 @@ from geogs.tracking.flow.own import OwnFlow, OwnFlowOptions, load_network
 from geogs.tracking.flow.own_network import (
     FlowEstimate,
     FlowNetwork,
+    FlowResidual,
     LaplaceMixture,
     NetworkOptions,
-    Residual,
     cell_pixels,
 )
 from geogs.world.grid import SampleGrid
@@ -63,7 +63,7 @@ def test_features_lie_on_the_sample_grid(network, size):
 
 @pytest.mark.parametrize("shift", [0, 1])
 def test_a_halving_block_is_centred_where_it_says(shift):
-    block = Residual(1, 1, shift)
+    block = FlowResidual(1, 1, shift)
     block.norm_first, block.norm_second = torch.nn.Identity(), torch.nn.Identity()
     for p in block.parameters():  # nothing may be cut off
         p.data.abs_()
@@ -83,7 +83,7 @@ def test_descriptors_of_the_pyramid_are_where_their_levels_say(network):
     x, y = 66, 74
     spot[..., y - 2 : y + 3, x - 2 : x + 3] = 1.0
     for module in network.encoder.modules():
-        if isinstance(module, Residual):
+        if isinstance(module, FlowResidual):
             module.norm_first, module.norm_second = torch.nn.Identity(), torch.nn.Identity()
     network.encoder.stem[1] = torch.nn.Identity()
     with torch.no_grad():
@@ -150,7 +150,7 @@ def test_grey_levels_are_the_classical_operators(operator):
 
 
 def test_cells_that_leave_the_image_have_no_weight(operator):
-    operator.options = OwnFlowOptions(min_share=0.0, max_deviation=1e6)
+    operator.options = OwnFlowOptions(min_probability=0.0, max_deviation=1e6)
     a, b = (operator.encode(i) for i in images(2))
     far = (operator.grid.pixels + 300.0)[None]
     near = operator.grid.pixels[None]
@@ -168,7 +168,7 @@ def test_weights_of_something_else_are_refused_in_one_sentence(tmp_path):
 
 
 def test_cells_that_jump_from_a_warm_start_have_no_weight(operator):
-    operator.options = OwnFlowOptions(min_share=0.0, max_deviation=1e6, polish=False)
+    operator.options = OwnFlowOptions(min_probability=0.0, max_deviation=1e6, polish=False)
     cells = operator.grid.pixels
     inner = operator.grid.inside(cells, margin=20.0)
     jumped = cells.clone()
@@ -189,7 +189,7 @@ def test_what_is_recorded_on_a_gpu_says_what_is_not(network, tmp_path, caplog):
     path = tmp_path / "w.safetensors"
     write_weights(network, path, 3, scores=SceneScores(FlowScores(*[0.5] * 10), {}))
     grid = SampleGrid(CAMERA, "cuda")
-    options = OwnFlowOptions(min_share=0.0, max_deviation=1e6)
+    options = OwnFlowOptions(min_probability=0.0, max_deviation=1e6)
     operator = OwnFlow(grid, path, CudaClassicalFlow(grid), options)
     a, b, c = (operator.encode(i) for i in images(3))
     with torch.inference_mode():

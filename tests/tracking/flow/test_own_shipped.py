@@ -68,7 +68,9 @@ def dim(image: np.ndarray, seed: int) -> np.ndarray:
 def test_its_flow_is_right_and_knows_how_right(views, light):
     grid = SampleGrid(CAMERA)
     classical = ClassicalFlow(grid)
-    alone = OwnFlowOptions(polish=False, inflation=1.0, floor=0.0, min_share=0.0, max_deviation=1e9)
+    alone = OwnFlowOptions(
+        polish=False, inflation=1.0, floor=0.0, min_probability=0.0, max_deviation=1e9
+    )
     operators = {"own": OwnFlow(grid, WEIGHTS, classical, alone), "classical": classical}
     errors: dict[str, list[torch.Tensor]] = {"own": [], "classical": []}
     inside = []

@@ -20,7 +20,7 @@ from geogs.io.writers.exports.mesh_writers import write_glb, write_obj, write_te
 from geogs.io.writers.ply_writer import write_points, write_splats
 from geogs.io.writers.trajectories import write_euroc, write_kitti, write_tum_trajectory
 from geogs.mesh.texture.textured import TexturedMesh, texture_mesh
-from geogs.mesh.types import DepthMapView, Mesh, median_edge
+from geogs.mesh.triangle_mesh import DepthMapView, Mesh, median_edge
 from geogs.threads import on_one_torch_thread
 
 Write = Callable[[SavedResult, ExportSettings, Path], Path]
@@ -135,7 +135,7 @@ def _glb(result: SavedResult, settings: ExportSettings, place: Path) -> Path:
     mesh, path = _mesh(result), _file(place, "mesh.glb")
     if settings.textured:
         m = textured(result, mesh, settings.texture_size)
-        write_textured_glb(path, m.vertices, m.faces, m.normals, m.texture_place, m.texture)
+        write_textured_glb(path, m.vertices, m.faces, m.normals, m.uv, m.texture)
         return path
     write_glb(path, mesh.vertices, mesh.faces, mesh.normals, mesh.colours)
     return path

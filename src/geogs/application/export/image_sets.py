@@ -14,7 +14,7 @@ from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.io.writers.atomic import atomic_file
 from geogs.io.writers.exports.colmap_writer import write_colmap_model
-from geogs.io.writers.exports.exported import PosedImage
+from geogs.io.writers.exports.exported import ExportedImage
 from geogs.io.writers.exports.maps import (
     STEPS,
     depth_unit,
@@ -98,7 +98,7 @@ def write_map_set(folder: Path, result: SavedResult, kind: Literal["depth", "nor
     write_description(folder / "description.json", result.camera, facts)
 
 
-def _write_images(folder: Path, result: SavedResult) -> list[PosedImage]:
+def _write_images(folder: Path, result: SavedResult) -> list[ExportedImage]:
     """Copy the images as they are kept; what they are called, and where they were taken."""
     views = result.views
     result.require_images()
@@ -109,7 +109,7 @@ def _write_images(folder: Path, result: SavedResult) -> list[PosedImage]:
             raise InputError(f"{kept} is missing; the result needs it.")
         with atomic_file(folder / "images" / kept.name) as stream:
             stream.write(kept.read_bytes())
-        images.append(PosedImage(kept.name, T_cw))
+        images.append(ExportedImage(kept.name, T_cw))
     return images
 
 

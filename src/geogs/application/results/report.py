@@ -9,19 +9,19 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from geogs.application.results.saved_result import SavedResult, load_result
-from geogs.evaluation.model_view.records import (
+from geogs.evaluation.model_view.shown_model import (
     Colouring,
     DiskModel,
+    ImageExtent,
     KeyframeModel,
-    Lens,
-    Model,
     PathModel,
+    ShownModel,
     SurfaceModel,
 )
-from geogs.evaluation.shading import level_axes, look_at_one_place
+from geogs.evaluation.pages.shading import level_axes, look_at_one_place
 from geogs.geometry.camera import Camera
 from geogs.mesh.decimate import with_at_most
-from geogs.mesh.types import Mesh
+from geogs.mesh.triangle_mesh import Mesh
 from geogs.types import MapSnapshot, RenderedKeyframe, Trajectory
 
 MOST_FACES, MOST_DISKS, MOST_IMAGES = 400_000, 100_000, 240
@@ -55,8 +55,8 @@ def write_report(
     Raises:
         OutputError: a file cannot be written.
     """
-    from geogs.evaluation import run_pictures
-    from geogs.evaluation.run_report import write_run_page
+    from geogs.evaluation.pages import run_pictures
+    from geogs.evaluation.pages.run_page import write_run_page
 
     folder.mkdir(exist_ok=True)
     run_pictures.draw_path(folder / "trajectory.png", trajectory)
@@ -81,7 +81,7 @@ def write_page_anew(folder: Path) -> None:
     Raises:
         OutputError: it cannot be written.
     """
-    from geogs.evaluation.run_report import write_run_page
+    from geogs.evaluation.pages.run_page import write_run_page
 
     if not (folder / "summary.json").is_file() or not (folder / "report").is_dir():
         return
@@ -121,7 +121,7 @@ def shown_model(
     disks: MapSnapshot | None,
     more_colourings: Callable[[Mesh], Sequence[Colouring]] = lambda mesh: (),
     true_path: Float[np.ndarray, "n 3"] | None = None,
-) -> Model:
+) -> ShownModel:
     """What the page of a result shows.
 
     Args:
@@ -157,8 +157,8 @@ def shown_model(
     posed = trajectory.T_wc[trajectory.tracked]
     posed = posed if len(posed) else trajectory.T_wc
     axes, eye, target = first_view(points, posed)
-    lens = Lens(camera.width / 2 / camera.fx, camera.height / 2 / camera.fy)
-    return Model(
+    lens = ImageExtent(camera.width / 2 / camera.fx, camera.height / 2 / camera.fy)
+    return ShownModel(
         axes, eye, target, lens, surface, paths, _keyframes(views, camera), disk_model, notes
     )
 

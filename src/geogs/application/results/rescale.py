@@ -15,7 +15,7 @@ from geogs.application.scale.find import find_scale
 from geogs.application.scale.scene import FoundScale, MeasurableScene, SeenKeyframe
 from geogs.application.scale.source import HOW, SensorScale, scale_source
 from geogs.errors import InputError
-from geogs.evaluation.truth import scaled
+from geogs.evaluation.true_scene import scaled
 from geogs.gpu.installation import require_device
 from geogs.io.ply_reader import read_ply
 from geogs.io.pose_files import read_tum_trajectory
@@ -25,7 +25,7 @@ from geogs.io.writers.map_file import load_map_file, save_map_with_views
 from geogs.io.writers.ply_writer import SH_DEGREE_0, write_mesh, write_splats
 from geogs.io.writers.trajectories import write_tum_trajectory
 from geogs.io.writers.uncertainty import HEADER, moved_rows
-from geogs.mesh.files import read_mesh
+from geogs.mesh.mesh_file import read_mesh
 from geogs.on_demand import OnDemand
 from geogs.types import MapSnapshot
 

@@ -11,7 +11,7 @@ from geogs.application.results.surfaces import surface_of
 from geogs.application.results.verdict import Verdict, verdict
 from geogs.io.sources.posed.posed_source import PosedSource
 from geogs.io.sources.sniff import Stream
-from geogs.mesh.types import Mesh
+from geogs.mesh.triangle_mesh import Mesh
 from geogs.types import MapSnapshot, RenderedKeyframe, Trajectory, Uncertainty
 
 

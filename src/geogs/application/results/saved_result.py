@@ -27,8 +27,8 @@ from geogs.io.writers.map_file import MapViews, load_map_views
 from geogs.io.writers.uncertainty import read_tracked
 from geogs.mapping.map_frame import MapFrame
 from geogs.mapping.rendered import MapRenderer, SurfaceMaps, SurfaceRules
-from geogs.mesh.files import read_mesh
-from geogs.mesh.types import Mesh
+from geogs.mesh.mesh_file import read_mesh
+from geogs.mesh.triangle_mesh import Mesh
 from geogs.on_demand import OnDemand
 from geogs.shutter.rows import CELL
 from geogs.threads import on_one_torch_thread

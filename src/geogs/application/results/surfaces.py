@@ -15,7 +15,7 @@ from geogs.io.writers.ply_writer import write_mesh
 from geogs.io.writers.trajectories import write_trajectories
 from geogs.mesh.colour import colour_mesh
 from geogs.mesh.extract import extract_mesh
-from geogs.mesh.types import DepthMapView, Mesh
+from geogs.mesh.triangle_mesh import DepthMapView, Mesh
 from geogs.on_demand import OnDemand
 from geogs.types import MapSnapshot, RenderedKeyframe
 

@@ -14,7 +14,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from geogs.geometry.lie import matrix_to_quaternion
-from geogs.mesh.types import Mesh
+from geogs.mesh.triangle_mesh import Mesh
 from geogs.types import MapSnapshot
 
 Make = Callable[..., Any]

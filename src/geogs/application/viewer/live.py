@@ -10,7 +10,7 @@ from jaxtyping import Float, UInt8
 
 from geogs.application.viewer.observer import RunObserver
 from geogs.application.viewer.window import Window
-from geogs.evaluation.layers import layer_picture
+from geogs.evaluation.pages.keyframe_layers import layer_picture
 from geogs.geometry.camera import Camera
 from geogs.types import Frame, MapSnapshot
 

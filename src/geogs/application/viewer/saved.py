@@ -8,7 +8,7 @@ from geogs.application.results.report import first_view
 from geogs.application.results.saved_result import SavedResult
 from geogs.application.viewer.window import Window
 from geogs.errors import InputError
-from geogs.evaluation.layers import layer_picture
+from geogs.evaluation.pages.keyframe_layers import layer_picture
 
 MOST_FRUSTA, MOST_IMAGES = 400, 60
 """Of the keyframes, evenly along the path."""

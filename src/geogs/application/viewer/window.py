@@ -11,11 +11,11 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from geogs.errors import InputError
-from geogs.evaluation.layers import LAYERS, Layer
-from geogs.evaluation.shading import level_axes
+from geogs.evaluation.pages.keyframe_layers import LAYERS, Layer
+from geogs.evaluation.pages.shading import level_axes
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import matrix_to_quaternion
-from geogs.mesh.types import Mesh
+from geogs.mesh.triangle_mesh import Mesh
 from geogs.types import MapSnapshot
 
 PATH, FRUSTUM, NOW = (242, 163, 58), (111, 177, 240), (255, 209, 102)

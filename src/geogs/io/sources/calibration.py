@@ -15,13 +15,13 @@ _LONGEST_EDGE = 1 << 20
 
 
 @dataclass(frozen=True)
-class Refinement:
+class FocalRefinement:
     """What the video itself said of the focal length."""
 
     deviation: float | None = None
     """Standard deviation of fx in pixels of the source's images; none where there is a failure."""
     deviation_k1: float | None = None
-    """Of the radial term; none where it was not asked for."""
+    """Standard deviation of the radial term; none where it was not asked for."""
     keyframes: int = 0
     frames: int = 0
     """Looked at."""
@@ -48,7 +48,7 @@ class Calibration:
     """Whether the focal length is only assumed."""
     is_nominal: bool = False
     """Whether the focal length is what the maker says of the lens, to a few percent."""
-    refinement: Refinement | None = None
+    refinement: FocalRefinement | None = None
     """What the video said of it, where it was asked."""
     lens: LensModel = "polynomial"
     """What the coefficients are of."""

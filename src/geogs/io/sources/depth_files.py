@@ -20,7 +20,7 @@ INVALID = 65535
 """What some sensors write where they saw nothing, beside 0."""
 
 LEAST_CONFIDENCE = 1
-"""Of a phone's lidar (0 low, 1 medium, 2 high) from which on a depth is taken."""
+"""Least confidence of a phone's lidar (0 low, 1 medium, 2 high) at which a depth is taken."""
 LONGEST = 32_000
 """Pixels of a side beyond which OpenCV interpolates nothing."""
 
@@ -35,7 +35,7 @@ class DepthCamera:
 
 
 @runtime_checkable
-class StoredDepth(Protocol):
+class RecordedDepth(Protocol):
     """A depth as it came."""
 
     sensor: DepthCamera | None
@@ -81,9 +81,9 @@ class DepthFile:
 class RectifiedDepth:
     """The same of the pixels of a working image, made when it is asked for."""
 
-    file: StoredDepth
+    file: RecordedDepth
     colour: Calibration
-    """Of the image as it came."""
+    """Camera of the image as it came."""
     rectifier: Rectifier
     """What made the working image."""
     offsets: Float[np.ndarray, "h w 2"] | None = None
@@ -115,14 +115,14 @@ def sampled(
     """
     known = (depth > 0).astype(np.float32)
     inverse = known / np.where(known > 0, depth, 1)
-    linear, share = (
+    linear, fraction = (
         cv2.remap(m, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0.0)
         for m in (inverse, known)
     )
     nearest = cv2.remap(
         inverse, x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0.0
     )
-    smooth = (share > 0.999) & (np.abs(linear - nearest) < SAME_SURFACE * nearest)
+    smooth = (fraction > 0.999) & (np.abs(linear - nearest) < SAME_SURFACE * nearest)
     chosen = np.where(smooth, linear, nearest)
     return np.where(chosen > 0, 1 / np.where(chosen > 0, chosen, 1), 0).astype(np.float32)
 

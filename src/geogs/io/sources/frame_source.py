@@ -19,7 +19,7 @@ from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.io.pictures import read_mask
 from geogs.io.sources.calibration import Calibration
-from geogs.io.sources.depth_files import RectifiedDepth, StoredDepth
+from geogs.io.sources.depth_files import RecordedDepth, RectifiedDepth
 from geogs.io.sources.frame_masks import FrameMasks, painted
 from geogs.io.sources.known_intrinsics import resolve_intrinsics
 from geogs.io.sources.pose_priors import chosen_poses
@@ -312,7 +312,7 @@ class Source:
         moved: Float[np.ndarray, "h w 2"] | None = None,
     ) -> MeasuredDepth | None:
         """Depth as it came, of the pixels of a working image, whose rows were ``moved``."""
-        if not (self.uses_depth and isinstance(depth, StoredDepth)):
+        if not (self.uses_depth and isinstance(depth, RecordedDepth)):
             return None
         return RectifiedDepth(depth, self.calibration, self._rectifier, moved)
 

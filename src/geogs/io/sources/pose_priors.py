@@ -59,10 +59,10 @@ class TimedPoses:
         if gap > LONGEST_GAP:
             return None
         a, b = (torch.from_numpy(T_wc[k]) for k in (before, after))
-        share = (seconds - times[before]) / gap if gap > 0 else 0.0
+        fraction = (seconds - times[before]) / gap if gap > 0 else 0.0
         T = a.clone()
-        T[:3, :3] = a[:3, :3] @ so3_exp(share * so3_log(a[:3, :3].mT @ b[:3, :3]))
-        T[:3, 3] = torch.lerp(a[:3, 3], b[:3, 3], share)
+        T[:3, :3] = a[:3, :3] @ so3_exp(fraction * so3_log(a[:3, :3].mT @ b[:3, :3]))
+        T[:3, 3] = torch.lerp(a[:3, 3], b[:3, 3], fraction)
         return measured_pose(T.numpy())
 
 

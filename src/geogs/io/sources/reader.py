@@ -38,9 +38,9 @@ class RawFrame:
     depth: MeasuredDepth | None = None
     """What a depth sensor saw at that time, as it came or of the pixels of a working image."""
     pose: MeasuredPose | None = None
-    """Of the upright image, by another tracker."""
+    """Pose of the upright image, by another tracker."""
     name: str = ""
-    """Of its file, or the number of the frame: by what a mask of its own is found."""
+    """Name of its file, or number of the frame, by which its mask is found."""
     rows: SeenRows | None = None
     """How those of a working image were rectified; none of a global shutter."""
 
@@ -59,7 +59,7 @@ class Reader(Protocol):
     name: str
     """Name of the sequence."""
     width: int
-    """Of the upright images, pixels."""
+    """Width of the upright images, pixels."""
     height: int
     quarter_turns: int
     """Clockwise quarter turns from the stored to the upright images."""

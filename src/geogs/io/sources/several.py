@@ -30,7 +30,7 @@ class SourceSpan:
     first_time: float
     """Seconds, in the joint time."""
     own_time: float
-    """Of its first frame in its own time."""
+    """Time of its first frame in its own clock."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,9 +40,9 @@ class JointPlace:
     frames: int = 0
     """Given, of all together."""
     time: float = 0.0
-    """Of the last, seconds in the joint time."""
+    """Time of the last, seconds in the joint time."""
     spans: tuple[SourceSpan, ...] = ()
-    """Of the sources that were begun."""
+    """Sources that were begun."""
     places: tuple[ReadingPlace, ...] = ()
     """In each of these."""
 

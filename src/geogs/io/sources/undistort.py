@@ -178,7 +178,7 @@ def _zoom_to(degrees: float, bends: _Bending) -> float:
 
 
 def _focal(degrees: float, camera: Camera) -> float:
-    """Of a pinhole image of the camera's size with a field of view along its longer side."""
+    """Focal length of a pinhole image of the camera's size by the view along its longer side."""
     return max(camera.width, camera.height) / 2 / math.tan(math.radians(degrees) / 2)
 
 

@@ -122,9 +122,9 @@ class MapViews:
     """The keyframes that a map's depth maps are made for, and all that those depend on."""
 
     camera: Camera
-    """Of the keyframes' images."""
+    """Camera of the keyframes' images."""
     render_camera: Camera
-    """Of the depth maps."""
+    """Camera of the depth maps."""
     min_alpha: float
     """Opacity above which the map hides what lies behind."""
     max_spread: float

@@ -1,1 +1,1 @@
-"""An image for a mesh: a view for each face, patches in an atlas, levelled where they meet."""
+"""An image for a mesh: a view for each face, patches in an atlas, exposure compensation."""

@@ -1,4 +1,4 @@
-"""The image of a textured mesh: patches side by side, their colours levelled."""
+"""The image of a textured mesh: patches side by side, their exposures compensated."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from jaxtyping import Float32, Float64, UInt8
 from geogs.mesh.texture.atlas_kernels import draw_triangles
 from geogs.mesh.texture.packing import scale_that_fits
 from geogs.mesh.texture.patches import Patches
-from geogs.mesh.types import DepthMapView
+from geogs.mesh.triangle_mesh import DepthMapView
 
 SWATCH = 3
 """Side of the square of one colour that faces get which no view shows, pixels."""
@@ -22,7 +22,7 @@ class Atlas:
 
     image: UInt8[np.ndarray, "h w 3"]
     corner: Float64[np.ndarray, "n 2"]
-    """Of each corner, pixels."""
+    """Position of each corner, pixels."""
     swatch: Float64[np.ndarray, "s 2"]
     """Middle of each plain colour, pixels."""
 
@@ -36,7 +36,7 @@ def draw_atlas(
     limit: int,
     progress: Callable[[int, int], None] = lambda done, of: None,
 ) -> Atlas:
-    """Draw the part of its view that each patch needs, levelled, into an atlas.
+    """Draw the part of its view that each patch needs, its exposure compensated, into an atlas.
 
     Args:
         patches: of the mesh.
@@ -100,8 +100,8 @@ def _patch(
     draw_triangles(local[corners], corrections[corners].astype(np.float64), drawn, covered)
     reach = (9, 9)
     spread = cv2.blur(drawn, reach, borderType=cv2.BORDER_CONSTANT)
-    share = cv2.blur(covered, reach, borderType=cv2.BORDER_CONSTANT)
+    fraction = cv2.blur(covered, reach, borderType=cv2.BORDER_CONSTANT)
     outside = covered == 0
-    drawn[outside] = spread[outside] / np.maximum(share[outside], 1e-6)[:, None]
-    levelled = crop.astype(np.float32) * gains[view] + drawn
-    return (levelled + 0.5).clip(0, 255).astype(np.uint8)
+    drawn[outside] = spread[outside] / np.maximum(fraction[outside], 1e-6)[:, None]
+    compensated = crop.astype(np.float32) * gains[view] + drawn
+    return (compensated + 0.5).clip(0, 255).astype(np.uint8)

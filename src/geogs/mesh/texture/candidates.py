@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int32, UInt8
 
-from geogs.mesh.types import DepthMapView, Mesh, cross
+from geogs.mesh.triangle_mesh import DepthMapView, Mesh, cross
 
 MOST = 8
 """Views of a face that are kept, those that show it best."""

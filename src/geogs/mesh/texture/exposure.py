@@ -31,9 +31,9 @@ def view_gains(candidates: Candidates, views: int) -> Float32[np.ndarray, "v 3"]
     gains = np.zeros((views, 3))
     if len(first):
         log_ratio = (np.log(other) - np.log(one)).astype(np.float64)
-        share = 1.0 / len(first)
+        fraction = 1.0 / len(first)
         for channel in range(3):
-            gains[:, channel] = _solve_gains(first, second, log_ratio[:, channel], views, share)
+            gains[:, channel] = _solve_gains(first, second, log_ratio[:, channel], views, fraction)
     limit = np.log(MAX_GAIN)
     return np.exp(gains.clip(-limit, limit)).astype(np.float32)
 
@@ -43,13 +43,13 @@ def _solve_gains(
     second: Int[np.ndarray, "n"],
     log_ratio: Float64[np.ndarray, "n"],
     views: int,
-    share: float,
+    fraction: float,
 ) -> Float64[np.ndarray, "v"]:
     """Log gains g with g_first - g_second = log_ratio, each pulled to zero a little."""
     gains = np.zeros(views)
     for _ in range(_ROUNDS):
         left = np.abs(gains[first] - gains[second] - log_ratio)
-        weight = share * views * _HUBER / np.maximum(left, _HUBER)
+        weight = fraction * views * _HUBER / np.maximum(left, _HUBER)
         rows = np.concatenate([first, second, first, second])
         columns = np.concatenate([first, second, second, first])
         values = np.concatenate([weight, weight, -weight, -weight])
@@ -65,7 +65,7 @@ def seam_corrections(
     edges: Int64[np.ndarray, "e 2"],
     colour: Float32[np.ndarray, "n 3"],
 ) -> Float32[np.ndarray, "n 3"]:
-    """What to add at each corner of a patch so that patches agree at the vertices they share.
+    """What to add at each corner of a patch so that patches agree at the vertices they fraction.
 
     Smooth within each patch (Lempitsky & Ivanov 2007): minimises the squared differences between
     corrected colours of corners at the same vertex, and those of corrections along edges.

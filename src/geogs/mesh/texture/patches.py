@@ -9,7 +9,7 @@ from jaxtyping import Float64, Int32, Int64
 from scipy.sparse.csgraph import connected_components
 
 from geogs.mesh.texture.candidates import image_pixels
-from geogs.mesh.types import DepthMapView, Mesh
+from geogs.mesh.triangle_mesh import DepthMapView, Mesh
 
 PADDING = 2
 """Pixels of the image around a patch that come along, so that sampling finds no foreign ones."""

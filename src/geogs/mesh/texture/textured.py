@@ -12,7 +12,7 @@ from geogs.mesh.texture.candidates import find_candidates
 from geogs.mesh.texture.exposure import seam_corrections, view_gains
 from geogs.mesh.texture.labels import choose_views, face_neighbours, without_odd_colours
 from geogs.mesh.texture.patches import Patches, cut_patches
-from geogs.mesh.types import DepthMapView, Mesh
+from geogs.mesh.triangle_mesh import DepthMapView, Mesh
 
 _GREY = 128
 _COLOUR_STEP = 8
@@ -28,7 +28,7 @@ class TexturedMesh:
     faces: Int32[np.ndarray, "m 3"]
     """In the order of the mesh that it was made from."""
     normals: Float[np.ndarray, "n 3"]
-    texture_place: Float[np.ndarray, "n 2"]
+    uv: Float[np.ndarray, "n 2"]
     """Pixels of the texture, whose centres are at integers."""
     texture: UInt8[np.ndarray, "h w 3"]
     """RGB."""
@@ -46,8 +46,8 @@ def texture_mesh(
     """Give a mesh an image, put together from those of the views.
 
     Each face gets the view that shows it largest and sharpest, with a preference for that of its
-    neighbours; the views' exposures are levelled, and what is left of the seams is spread over the
-    patches.
+    neighbours; the views' exposures are compensated, and what is left of the seams is
+    spread over the patches.
 
     Args:
         mesh: with colours for the faces that no view shows; grey without.

@@ -10,7 +10,7 @@ from torch import Tensor
 from geogs.types import FlowMatch
 
 Memories = Sequence[tuple[Any, Any]]
-"""Of each pair, what the operator returned as memory of the two directions; None for nothing."""
+"""What the operator returned as memory of each pair's two directions; None for nothing."""
 
 
 @runtime_checkable

@@ -149,7 +149,7 @@ class ClassicalFlow:
         return np.stack(rows)
 
     def _workers(self) -> ThreadPoolExecutor:
-        """Of the thread that asks: a frame does not wait behind all that a keyframe measures."""
+        """Workers of the calling thread: a frame does not wait behind what a keyframe measures."""
         found: ThreadPoolExecutor | None = getattr(self._local, "pool", None)
         if found is None:
             found = self._local.pool = ThreadPoolExecutor(worker_count())

@@ -44,7 +44,7 @@ FAR = 1e4
 """Cells beyond which a position is as good as lost."""
 WEIGHT_SCALE = 0.001
 """DROID-SLAM's factor on the weights."""
-DAMPING_SHARE, DAMPING_FLOOR = 0.2, 1e-7
+DAMPING_FACTOR, DAMPING_FLOOR = 0.2, 1e-7
 """DROID-SLAM's factor on the damping, and what it adds."""
 
 
@@ -224,7 +224,7 @@ class DroidFlow:
         with self._precision():
             eta = self.network.update.agg(hidden, index).damping.float()
         factor = STRIDE**2 / (WEIGHT_SCALE * self.options.deviation**2)
-        return factor * (DAMPING_SHARE * eta.flatten(1) + DAMPING_FLOOR)[index]
+        return factor * (DAMPING_FACTOR * eta.flatten(1) + DAMPING_FLOOR)[index]
 
     def _match(self, edges: _Revised, damping: Float[Tensor, "d p"]) -> FlowMatch:
         pixels = (OFFSET + STRIDE * edges.target).flatten(1, 2)

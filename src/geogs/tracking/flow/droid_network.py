@@ -31,7 +31,7 @@ DAMPING_SCALE = 0.01
 UPSAMPLING = 8
 """Edge of a cell in pixels."""
 MEAN, DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
-"""Of the red, green and blue of the images that the public encoders were trained on, in [0, 1]."""
+"""Red, green and blue of the images that the public encoders were trained on, in [0, 1]."""
 TRIMMED = tuple(
     f"update.{head}.2.{kind}" for head in ("weight", "delta") for kind in ("weight", "bias")
 )
@@ -75,7 +75,7 @@ def normalised(images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n 3 h w"]:
     return (images - mean) / deviation
 
 
-class ResidualBlock(nn.Module):
+class DroidResidualBlock(nn.Module):
     """Two 3 x 3 convolutions beside a shortcut, which is a convolution where the size changes."""
 
     def __init__(self, inputs: int, outputs: int, stride: int, norm: bool) -> None:
@@ -92,7 +92,7 @@ class ResidualBlock(nn.Module):
         return F.relu(self.downsample(x) + y)
 
 
-class Encoder(nn.Module):
+class DroidEncoder(nn.Module):
     """Features of an image at an eighth of its resolution.
 
     Cell (r, c) of the output is centred on pixel (8 r, 8 c). The instance norm of the matching
@@ -110,8 +110,8 @@ class Encoder(nn.Module):
 
     @staticmethod
     def _layer(inputs: int, outputs: int, stride: int, norm: bool) -> nn.Sequential:
-        first = ResidualBlock(inputs, outputs, stride, norm)
-        return nn.Sequential(first, ResidualBlock(outputs, outputs, 1, norm))
+        first = DroidResidualBlock(inputs, outputs, stride, norm)
+        return nn.Sequential(first, DroidResidualBlock(outputs, outputs, 1, norm))
 
     def forward(self, images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n c h8 w8"]:
         x = F.relu(self.norm(self.conv1(images)))
@@ -155,7 +155,7 @@ class FrameOutput:
 class GraphAggregation(nn.Module):
     """Mean over the edges of a source frame, read out as damping of its depth.
 
-    ``upmask``, the learned enlargement of depth, is held for the public weights to load; nothing
+    ``upmask``, the learned enlargement of depth, is kept for the public weights to load; nothing
     here enlarges depth by it.
     """
 
@@ -229,8 +229,8 @@ class DroidNetwork(nn.Module):
         super().__init__()
         self.size = size or DroidSize()
         features = self.size.features
-        self.fnet = Encoder(self.size.base, features, norm=True)
-        self.cnet = Encoder(self.size.base, 2 * features, norm=False)
+        self.fnet = DroidEncoder(self.size.base, features, norm=True)
+        self.cnet = DroidEncoder(self.size.base, 2 * features, norm=False)
         self.update = UpdateOperator(self.size)
 
     def features(self, images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n c h8 w8"]:

@@ -31,7 +31,7 @@ class ValidMask:
 
     @property
     def fraction(self) -> float:
-        """Of the cells that are valid."""
+        """Fraction of the cells that are valid."""
         return float(self.cells.mean())
 
 

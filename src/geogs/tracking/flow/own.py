@@ -23,8 +23,8 @@ from geogs.tracking.flow.filled import filled_positions
 from geogs.tracking.flow.lookup import DescriptorPyramid, Edges, PyramidLevel
 from geogs.tracking.flow.own_network import (
     FlowEstimate,
+    FlowFeatures,
     FlowNetwork,
-    ImageFeatures,
     NetworkOptions,
 )
 from geogs.types import FlowMatch
@@ -41,7 +41,7 @@ class OwnFlowOptions:
     """The same where a cheaper measurement will do."""
     cold_iterations: int = 8
     """From what the classical operator finds where nothing is known."""
-    min_share: float = 0.5
+    min_probability: float = 0.5
     """A cell that is matched with less probability has no weight."""
     max_deviation: float = 2.0
     """Nor has one whose flow may be off by more pixels."""
@@ -66,8 +66,8 @@ class OwnFlowOptions:
 class OwnImage:
     """An image as the network keeps it, on the device of the grid."""
 
-    features: ImageFeatures
-    """Of one image."""
+    features: FlowFeatures
+    """Features of one image."""
     classical: Any
     """What the classical operator keeps of it."""
 
@@ -98,7 +98,7 @@ class OwnFlow:
         # PyTorch's stubs do not know the memory format.
         self.network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self._levels: tuple[PyramidLevel, ...] = ()
-        """Of every image, known from the first on."""
+        """Pyramid levels of every image, known from the first on."""
         self._encoded = Recorded(self._features, "The flow network")
         self._refined = functools.cache(self._refinement)
 
@@ -113,7 +113,7 @@ class OwnFlow:
         pixels = to_device(torch.from_numpy(np.ascontiguousarray(image)), self.device)
         source, descriptors, hidden, context = self._encoded(pixels)
         pyramid = DescriptorPyramid(descriptors, self._levels)
-        features = ImageFeatures(source, pyramid, hidden, context)
+        features = FlowFeatures(source, pyramid, hidden, context)
         return OwnImage(features, self.classical.encode(image))
 
     def _features(self, pixels: UInt8[Tensor, "h w 3"]) -> Maps:
@@ -182,7 +182,7 @@ class OwnFlow:
             first: Tensor, second: Tensor, start: Tensor,
         ) -> Maps:  # fmt: skip
             pyramid = DescriptorPyramid(descriptors, self._levels)
-            features = ImageFeatures(source, pyramid, hidden, context)
+            features = FlowFeatures(source, pyramid, hidden, context)
             with self._autocast():
                 *_, last = self.network.iterate(features, Edges(first, second), start, iterations)
             return last.pixels, self._weight(last, start if is_warm else None)
@@ -219,8 +219,8 @@ class OwnFlow:
         certain = torch.cat([m.weight for m in matches])
         both = ((weight > 0) & (certain > 0)).all(-1, keepdim=True)
         variance = 1 / weight.clamp(min=1e-9) + 1 / certain.clamp(min=1e-9)
-        apart = ((theirs - pixels).square() / variance).amax(-1, keepdim=True)
-        join = both & (apart < self.options.agreement**2)
+        residual = ((theirs - pixels).square() / variance).amax(-1, keepdim=True)
+        join = both & (residual < self.options.agreement**2)
         total = weight + certain
         mean = (weight * pixels + certain * theirs) / total.clamp(min=1e-9)
         return torch.where(join, mean, pixels), torch.where(join, total, weight)
@@ -233,11 +233,11 @@ class OwnFlow:
         options, error = self.options, estimate.error
         deviation = 2**0.5 * error.log_scale.exp().amax(-1)
         good = (deviation < options.max_deviation) & self.grid.inside(estimate.pixels)
-        good &= error.share[..., 0].sigmoid() > options.min_share
+        good &= error.logit[..., 0].sigmoid() > options.min_probability
         if start is not None:
             moved = (estimate.pixels - start).masked_fill(~good[..., None], torch.nan)
-            apart = (moved - moved.nanmedian(1, keepdim=True).values).norm(dim=-1)
-            good &= apart < options.max_correction
+            correction = (moved - moved.nanmedian(1, keepdim=True).values).norm(dim=-1)
+            good &= correction < options.max_correction
         weight = error.weight(options.floor) / options.inflation**2
         return torch.where(good[..., None], weight, 0.0)
 
@@ -265,12 +265,12 @@ def load_network(path: Path) -> FlowNetwork:
     return network.eval().requires_grad_(False)
 
 
-def _stack(parts: Sequence[ImageFeatures]) -> ImageFeatures:
+def _stack(parts: Sequence[FlowFeatures]) -> FlowFeatures:
     """Features of several images as one."""
     if len(parts) == 1:
         return parts[0]
     descriptors = torch.cat([p.pyramid.descriptors for p in parts])
-    return ImageFeatures(
+    return FlowFeatures(
         torch.cat([p.source for p in parts]),
         DescriptorPyramid(descriptors, parts[0].pyramid.levels),
         torch.cat([p.hidden for p in parts]),

@@ -32,7 +32,7 @@ MIN_LOG_SCALE, MAX_LOG_SCALE = -4.5, 3.0
 
 
 @dataclass(frozen=True)
-class ImageFeatures:
+class FlowFeatures:
     """What the network keeps of images; cells are those of the sample grid."""
 
     source: Float[Tensor, "n p c"]
@@ -45,9 +45,9 @@ class ImageFeatures:
 
 @dataclass(frozen=True)
 class LaplaceMixture:
-    """Error of a flow along each axis: matched with probability ``share``, else not."""
+    """Error of a flow along each axis: matched with probability ``logit``, else not."""
 
-    share: Float[Tensor, "e p 1"]
+    logit: Float[Tensor, "e p 1"]
     """Logit of the probability that a cell is matched."""
     log_scale: Float[Tensor, "e p 2"]
     """Logarithm of the Laplace scale in pixels of a matched cell."""
@@ -55,19 +55,19 @@ class LaplaceMixture:
     """The same of a cell that is not matched; larger."""
 
     def variance(self) -> Float[Tensor, "e p 2"]:
-        """Of the whole mixture, pixels^2 (a Laplace distribution of scale b has 2 b^2)."""
-        p = self.share.sigmoid()
+        """Variance of the whole mixture, pixels^2 (a Laplace distribution of scale b has 2 b^2)."""
+        p = self.logit.sigmoid()
         return 2 * (p * (2 * self.log_scale).exp() + (1 - p) * (2 * self.log_outlier).exp())
 
     def weight(self, floor: float) -> Float[Tensor, "e p 2"]:
         """What a flow counts in an adjustment, 1 / pixel^2: the probability that the cell is
         matched, over the variance that it then has; ``floor`` is a deviation in pixels."""
-        return self.share.sigmoid() / (2 * (2 * self.log_scale).exp() + floor**2)
+        return self.logit.sigmoid() / (2 * (2 * self.log_scale).exp() + floor**2)
 
     def negative_log_likelihood(self, error: Float[Tensor, "e p 2"]) -> Float[Tensor, "e p"]:
-        """Of errors in pixels, mean over both axes."""
+        """Negative log-likelihood of errors in pixels, mean over both axes."""
         parts = []
-        for logit, log_scale in ((self.share, self.log_scale), (-self.share, self.log_outlier)):
+        for logit, log_scale in ((self.logit, self.log_scale), (-self.logit, self.log_outlier)):
             density = -error.abs() * (-log_scale).exp() - log_scale - 0.693147
             parts.append(functional.logsigmoid(logit) + density)
         return -torch.logaddexp(*parts).mean(-1)
@@ -84,26 +84,26 @@ class FlowEstimate:
 
 
 class FlowNetwork(nn.Module):
-    """Encoder, recurrent update, heads and convex upsampling."""
+    """FlowEncoder, recurrent update, heads and convex upsampling."""
 
     def __init__(self, options: NetworkOptions | None = None) -> None:
         super().__init__()
         self.options = options or NetworkOptions()
-        self.encoder = Encoder(self.options)
-        self.update = Update(self.options)
+        self.encoder = FlowEncoder(self.options)
+        self.update = FlowUpdate(self.options)
         self.upsampling = nn.Sequential(
             nn.Conv2d(self.options.hidden, 80, 3, padding=1),
             nn.ReLU(),
             nn.Conv2d(80, 9 * STRIDE * STRIDE, 1),
         )
 
-    def encode(self, images: Float[Tensor, "n 3 h w"]) -> ImageFeatures:
+    def encode(self, images: Float[Tensor, "n 3 h w"]) -> FlowFeatures:
         """Features of RGB images in [0, 1], on the cells of :class:`SampleGrid`."""
         return self.encoder(images)
 
     def iterate(
         self,
-        features: ImageFeatures,
+        features: FlowFeatures,
         edges: Edges,
         start: Float[Tensor, "e p 2"],
         iterations: int,
@@ -151,7 +151,7 @@ class FlowNetwork(nn.Module):
         return full[:, :height, :width]
 
 
-class Encoder(nn.Module):
+class FlowEncoder(nn.Module):
     """One trunk for descriptors and context, so that an image is read once.
 
     Pixel of a position i: 2 i at 1/2, 4 i at 1/4, 4 + 8 i at 1/8, where the cells are.
@@ -164,10 +164,14 @@ class Encoder(nn.Module):
         self.stem = nn.Sequential(
             nn.Conv2d(3, o.stem, 7, stride=2, padding=3), _norm(o.stem), nn.ReLU()
         )
-        self.at_half = Residual(o.stem, o.stem)
-        self.at_quarter = nn.Sequential(Residual(o.stem, o.middle, 1), Residual(o.middle, o.middle))
+        self.at_half = FlowResidual(o.stem, o.stem)
+        self.at_quarter = nn.Sequential(
+            FlowResidual(o.stem, o.middle, 1), FlowResidual(o.middle, o.middle)
+        )
         self.at_eighth = nn.Sequential(
-            Residual(o.middle, o.deep, 0), Residual(o.deep, o.deep), Residual(o.deep, o.deep)
+            FlowResidual(o.middle, o.deep, 0),
+            FlowResidual(o.deep, o.deep),
+            FlowResidual(o.deep, o.deep),
         )
         self.describe_cells = nn.Conv2d(o.deep, CHANNELS, 1)
         self.deep_to_quarter = nn.ConvTranspose2d(o.deep, o.middle, 3, stride=2)
@@ -189,7 +193,7 @@ class Encoder(nn.Module):
         )  # fmt: skip
         self.hidden = o.hidden
 
-    def forward(self, images: Float[Tensor, "n 3 h w"]) -> ImageFeatures:
+    def forward(self, images: Float[Tensor, "n 3 h w"]) -> FlowFeatures:
         height, width = images.shape[-2:]
         gh, gw = -(-(height - 7) // STRIDE), -(-(width - 7) // STRIDE)
         images = _replicated(images, (0, -width % STRIDE, 0, -height % STRIDE))
@@ -204,7 +208,7 @@ class Encoder(nn.Module):
             fields[2**step] = functional.avg_pool2d(fields[2 ** (step - 1)], 2, ceil_mode=True)
         state = self.state(eighth)[..., :gh, :gw]
         hidden, context = state.split([self.hidden, state.shape[1] - self.hidden], 1)
-        return ImageFeatures(
+        return FlowFeatures(
             _descriptors(self.describe_cells(eighth)[..., :gh, :gw]).flatten(2).mT.contiguous(),
             _pyramid({stride: fields[stride] for stride in self.levels}),
             hidden.tanh(),
@@ -212,7 +216,7 @@ class Encoder(nn.Module):
         )
 
 
-class Residual(nn.Module):
+class FlowResidual(nn.Module):
     """Two convolutions beside a shortcut; ``shift`` halves the resolution.
 
     Output i of a halving block is at input 2 i + 1 - shift.
@@ -236,7 +240,7 @@ class Residual(nn.Module):
         return (self.norm_second(self.second(y)) + self.shortcut(beside)).relu()
 
 
-class Update(nn.Module):
+class FlowUpdate(nn.Module):
     """One iteration: windows and flow in, a convolutional GRU, step and uncertainty out."""
 
     def __init__(self, options: NetworkOptions) -> None:
@@ -289,7 +293,7 @@ def _mixture(values: Float[Tensor, "e p k"]) -> LaplaceMixture:
 
 
 def _descriptors(x: Float[Tensor, "n c h w"]) -> Float[Tensor, "n c h w"]:
-    """Of one length, so that a perfect match has the correlation sqrt(c) and a random one 0."""
+    """Descriptors of one length: a perfect match correlates by sqrt(c), a random one by 0."""
     return CHANNELS**0.5 * functional.normalize(x.float(), dim=1)
 
 

@@ -26,7 +26,7 @@ def textured_fraction(grey: UInt8[np.ndarray, "h w"]) -> float:
 
 
 def smaller_eigenvalue(grey: UInt8[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
-    """Of the structure tensor averaged over 9 x 9 pixels, grey levels^2 / pixel^2."""
+    """Smaller eigenvalue of the structure tensor averaged over 9 x 9 pixels, levels^2 / pixel^2."""
     gx = cv2.Sobel(grey, cv2.CV_32F, 1, 0, scale=1 / 8)
     gy = cv2.Sobel(grey, cv2.CV_32F, 0, 1, scale=1 / 8)
     xx, yy, xy = (cv2.boxFilter(p, -1, (9, 9)) for p in (gx * gx, gy * gy, gx * gy))

@@ -11,7 +11,7 @@ import pytest
 
 from geogs.config import InputConfig
 from geogs.errors import InputError
-from geogs.evaluation.truth import read_true_scene
+from geogs.evaluation.true_scene import read_true_scene
 from geogs.io.sources.formats.colmap import read_model
 from geogs.io.sources.formats.dtu import decompose
 from geogs.io.sources.posed.posed_set import SparsePoints, renumbered

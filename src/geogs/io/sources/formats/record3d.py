@@ -31,7 +31,7 @@ from geogs.types import MeasuredPose
 
 _log = logging.getLogger(__name__)
 _LIDAR = (192, 256)
-"""Rows and columns of a depth whose size is not told."""
+"""Rows and columns of a depth whose size is not given."""
 _LARGEST_DEPTH = 1 << 26
 """Bytes of a compressed depth."""
 
@@ -152,12 +152,12 @@ class Record3dRecording:
         self.height, self.width = first.shape[:2]
         self.length: int | None = len(self._numbers)
         try:
-            facts: dict[str, Any] = json.loads(self._files.read("metadata", LARGEST_DOCUMENT))
-            self.fps = float(facts.get("fps") or 30)
-            self.calibration: Calibration | None = self._calibration(facts)
-            self._poses = _poses(facts.get("poses", []))
-            self._times = [float(t) for t in facts.get("frameTimestamps") or []]
-            self._size = _whole(facts, "dh", _LIDAR[0]), _whole(facts, "dw", _LIDAR[1])
+            metadata: dict[str, Any] = json.loads(self._files.read("metadata", LARGEST_DOCUMENT))
+            self.fps = float(metadata.get("fps") or 30)
+            self.calibration: Calibration | None = self._calibration(metadata)
+            self._poses = _poses(metadata.get("poses", []))
+            self._times = [float(t) for t in metadata.get("frameTimestamps") or []]
+            self._size = _whole(metadata, "dh", _LIDAR[0]), _whole(metadata, "dw", _LIDAR[1])
         except (*UNUSABLE, UnicodeDecodeError) as error:
             raise InputError(f"{path}: its metadata cannot be understood ({error}).") from None
         if not (0 < self.fps < 1e4):
@@ -195,11 +195,11 @@ class Record3dRecording:
         picture = decoded_bytes(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR).picture
         return None if picture is None else cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
 
-    def _calibration(self, facts: dict[str, Any]) -> Calibration | None:
-        if "K" not in facts:
+    def _calibration(self, metadata: dict[str, Any]) -> Calibration | None:
+        if "K" not in metadata:
             return None
-        K = np.array(facts["K"], dtype=np.float64).reshape(3, 3).T
-        width, height = _whole(facts, "w", self.width), _whole(facts, "h", self.height)
+        K = np.array(metadata["K"], dtype=np.float64).reshape(3, 3).T
+        width, height = _whole(metadata, "w", self.width), _whole(metadata, "h", self.height)
         return Calibration(
             K[0, 0], K[1, 1], K[0, 2], K[1, 2], width=width, height=height, origin="Record3D"
         ).fit(self.width, self.height)
@@ -225,8 +225,8 @@ def _poses(rows: object) -> dict[int, MeasuredPose]:
     return found
 
 
-def _whole(facts: dict[str, Any], name: str, default: int) -> int:
-    value = facts.get(name)
+def _whole(metadata: dict[str, Any], name: str, default: int) -> int:
+    value = metadata.get(name)
     return default if value is None else int(value)
 
 

@@ -66,7 +66,7 @@ def _read_pose(path: Path) -> Float64[np.ndarray, "4 4"]:
 
 
 def _calibration(folder: Path) -> Calibration | None:
-    """The colour camera of a scene, if it is told."""
+    """The colour camera of a scene, if it is given."""
     intrinsic = folder / "intrinsic" / "intrinsic_color.txt"
     return read_calibration(intrinsic) if intrinsic.is_file() else None
 

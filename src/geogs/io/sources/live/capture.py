@@ -31,8 +31,8 @@ class Capture:
             if not is_there or image is None:
                 raise InputError(f"{self.name} is open, but gives no image.")
             self.height, self.width = image.shape[:2]
-            told = float(capture.get(cv2.CAP_PROP_FPS))
-            self.fps = told if 1.0 <= told <= 1000.0 else 30.0
+            nominal = float(capture.get(cv2.CAP_PROP_FPS))
+            self.fps = nominal if 1.0 <= nominal <= 1000.0 else 30.0
         finally:
             capture.release()
 

@@ -18,7 +18,7 @@ class Feed(Protocol):
     kind: str
     name: str
     width: int
-    """Of the upright images, pixels."""
+    """Width of the upright images, pixels."""
     height: int
     fps: float
     """Frames per second, nominal."""
@@ -52,7 +52,7 @@ class LiveReader:
         return ()
 
     def read(self, start: int, stop: int | None, stride: int) -> Iterator[RawFrame]:
-        """Of frames ``start, start + stride, ...`` before ``stop`` the newest each time."""
+        """Read the newest of frames ``start, start + stride, ...`` before ``stop`` each time."""
         latest = Latest(_selected(self._feed.frames(), start, stop, stride))
         try:
             while (frame := latest.take()) is not None:

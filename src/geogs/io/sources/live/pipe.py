@@ -1,4 +1,4 @@
-"""Raw frames from a pipe: YUV4MPEG2, which says its own format, or bare pixels as told.
+"""Raw frames from a pipe: YUV4MPEG2, which says its own format, or bare pixels as given.
 
 YUV4MPEG2 is a line of header (``YUV4MPEG2 W640 H480 F30:1 C420``), then ``FRAME`` and the planes Y,
 Cb and Cr, again and again. Source: the manual page yuv4mpeg(5) of mjpegtools.
@@ -48,7 +48,7 @@ class RawFormat:
 
     @property
     def bytes(self) -> int:
-        """Of a frame."""
+        """Size of a frame."""
         area = self.width * self.height
         half = ((self.width + 1) // 2) * ((self.height + 1) // 2)
         return {"gray": area, "yuv420p": area + 2 * half}.get(self.pixels, 3 * area)
@@ -97,11 +97,11 @@ class Pipe:
     kind = "pipe"
     name = "pipe"
 
-    def __init__(self, stream: BufferedIOBase, told: str = "auto") -> None:
-        """``told`` is the format in words, or auto for YUV4MPEG2. Raises InputError."""
+    def __init__(self, stream: BufferedIOBase, given: str = "auto") -> None:
+        """``given`` is the format in words, or auto for YUV4MPEG2. Raises InputError."""
         self._stream = stream
         self._number = 0
-        if told == "auto":
+        if given == "auto":
             line = stream.readline(_LONGEST_LINE)
             if not line.startswith(_MAGIC):
                 raise InputError(
@@ -110,7 +110,7 @@ class Pipe:
                 )
             self._format = format_from_header(line)
         else:
-            self._format = format_from_words(told)
+            self._format = format_from_words(given)
         self.width, self.height = self._format.width, self._format.height
         self.fps = self._format.fps or 30.0
         self.calibration: Calibration | None = None

@@ -32,9 +32,9 @@ def conventions_for(kind: str) -> tuple[Convention, ...]:
 
 def _turned_camera(axes: list[list[int]]) -> Callable[[Poses], Poses]:
     """Row k of ``axes``: OpenCV's axis k in the axes of the camera as it was read."""
-    turn = np.eye(4)
-    turn[:3, :3] = axes
-    return lambda T_cw: turn @ T_cw
+    T = np.eye(4)
+    T[:3, :3] = axes
+    return lambda T_cw: T @ T_cw
 
 
 def _quaternion_order(T_cw: Poses) -> Poses:

@@ -49,7 +49,7 @@ class PoseCheck:
     """Outcome of the check."""
 
     given: Fit | None
-    """Of the poses as they are; none where no images could be matched."""
+    """Fit of the poses as they are; none where no images could be matched."""
     pairs: int
     """Pairs of images that could be matched."""
     warning: str | None

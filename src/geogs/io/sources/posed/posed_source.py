@@ -50,7 +50,7 @@ class PosedSource:
     """
 
     def __init__(self, posed: PosedSet, config: InputConfig, hold_out: int | None = None) -> None:
-        """Of the selected images every ``hold_out``-th is left out as if it were not there."""
+        """Every ``hold_out``-th of the selected images is left out as if it were not there."""
         posed = _selected(without_invalid_poses(_present(posed)), config)
         left_out = held_out_places(len(posed.files), hold_out)
         self.held_out: list[int] = [config.start + config.stride * i for i in left_out]

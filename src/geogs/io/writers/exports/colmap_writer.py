@@ -15,7 +15,7 @@ from jaxtyping import Float64
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import matrix_to_quaternion
 from geogs.io.writers.atomic import atomic_file, write_text
-from geogs.io.writers.exports.exported import PosedImage, SeenPoints
+from geogs.io.writers.exports.exported import ExportedImage, SeenPoints
 
 _PINHOLE = 1
 _UNKNOWN_ERROR = -1.0
@@ -25,7 +25,7 @@ _OBSERVATION = np.dtype([("x", "<f8"), ("y", "<f8"), ("point", "<i8")])
 def write_colmap_model(
     folder: Path,
     camera: Camera,
-    images: Sequence[PosedImage],
+    images: Sequence[ExportedImage],
     points: SeenPoints,
     as_text: bool = False,
 ) -> None:
@@ -63,7 +63,7 @@ def _observations(points: SeenPoints, image: int) -> np.ndarray:
 
 
 def _tracks(points: SeenPoints) -> list[np.ndarray]:
-    """Of each point the numbers of the images that see it, and its place in each one's list."""
+    """Numbers of the images that see each point, and its place in each one's list."""
     place = np.zeros(len(points.seen_image), np.int64)
     order = np.argsort(points.seen_image, kind="stable")
     counts = np.bincount(points.seen_image)
@@ -77,7 +77,7 @@ def _tracks(points: SeenPoints) -> list[np.ndarray]:
 def _write_text(
     folder: Path,
     camera: Camera,
-    images: Sequence[PosedImage],
+    images: Sequence[ExportedImage],
     poses: list[list[float]],
     points: SeenPoints,
     seen: list[np.ndarray],
@@ -104,7 +104,7 @@ def _write_text(
 def _write_binary(
     folder: Path,
     camera: Camera,
-    images: Sequence[PosedImage],
+    images: Sequence[ExportedImage],
     poses: list[list[float]],
     points: SeenPoints,
     seen: list[np.ndarray],

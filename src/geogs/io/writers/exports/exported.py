@@ -10,11 +10,11 @@ OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 @dataclass(frozen=True)
-class PosedImage:
+class ExportedImage:
     """An image that has been written, and where it was taken."""
 
     name: str
-    """Of the file, with its suffix."""
+    """Name of the file, with its suffix."""
     T_cw: Float64[np.ndarray, "4 4"]
     """World to camera, OpenCV axes."""
 

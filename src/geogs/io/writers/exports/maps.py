@@ -39,10 +39,10 @@ def write_npz(path: Path, name: str, values: Float32[np.ndarray, "..."]) -> None
         np.savez_compressed(stream, **{name: values})  # type: ignore[arg-type]
 
 
-def write_description(path: Path, camera: Camera, facts: dict[str, object]) -> None:
+def write_description(path: Path, camera: Camera, meaning: dict[str, object]) -> None:
     """``description.json``: the camera of the maps, and what their numbers mean."""
     pinhole = {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
-    document = {**pinhole, "first_pixel_centre": [0, 0], **facts}
+    document = {**pinhole, "first_pixel_centre": [0, 0], **meaning}
     write_text(path, json.dumps(document, indent=2) + "\n")
 
 

@@ -16,7 +16,7 @@ from geogs.io.writers.atomic import atomic_file
 from geogs.io.writers.exports.exported import OPENGL_FROM_OPENCV
 
 _QUALITY = 92
-"""Of the JPEG in a textured mesh."""
+"""Quality of the JPEG in a textured mesh."""
 _FLOAT, _UINT16, _UINT32 = 5126, 5123, 5125
 _VERTICES, _CORNERS = 34962, 34963
 _LINEAR, _LINEAR_MIPMAP, _CLAMP = 9729, 9987, 33071
@@ -129,11 +129,11 @@ def write_glb(
     The world is turned by a half turn about x, so that what was down in the first image is down.
     Colours are linear in the file, as glTF has them; ours are sRGB.
     """
-    turn = OPENGL_FROM_OPENCV[:3, :3]
+    axes = OPENGL_FROM_OPENCV[:3, :3]
     gltf = GltfBuffer()
     attributes = {
-        "POSITION": gltf.add(vertices @ turn, "VEC3", has_range=True),
-        "NORMAL": gltf.add(normals @ turn, "VEC3"),
+        "POSITION": gltf.add(vertices @ axes, "VEC3", has_range=True),
+        "NORMAL": gltf.add(normals @ axes, "VEC3"),
     }
     corners = gltf.add_corners(faces)
     if colours is not None:
@@ -148,22 +148,22 @@ def write_textured_glb(
     vertices: Float[np.ndarray, "n 3"],
     faces: Int[np.ndarray, "m 3"],
     normals: Float[np.ndarray, "n 3"],
-    texture_place: Float[np.ndarray, "n 2"],
+    uv: Float[np.ndarray, "n 2"],
     texture: UInt8[np.ndarray, "h w 3"],
 ) -> None:
     """Write glTF 2.0 in one file, with axes as ``write_glb`` has them and a JPEG inside.
 
     Light is in the texture already, so the material asks to be shown as it is
-    (KHR_materials_unlit); readers that do not know that see a rough surface. ``texture_place`` is
+    (KHR_materials_unlit); readers that do not know that see a rough surface. ``uv`` is
     in pixels of the texture, whose centres are at integers.
     """
-    turn = OPENGL_FROM_OPENCV[:3, :3]
+    axes = OPENGL_FROM_OPENCV[:3, :3]
     size = np.array(texture.shape[1::-1])
     gltf = GltfBuffer()
     attributes = {
-        "POSITION": gltf.add(vertices @ turn, "VEC3", has_range=True),
-        "NORMAL": gltf.add(normals @ turn, "VEC3"),
-        "TEXCOORD_0": gltf.add((texture_place + 0.5) / size, "VEC2"),
+        "POSITION": gltf.add(vertices @ axes, "VEC3", has_range=True),
+        "NORMAL": gltf.add(normals @ axes, "VEC3"),
+        "TEXCOORD_0": gltf.add((uv + 0.5) / size, "VEC2"),
     }
     corners = gltf.add_corners(faces)
     gltf.write(path, attributes, corners, gltf.textured(_jpeg(texture)))
@@ -183,12 +183,12 @@ def write_obj(
     colours: UInt8[np.ndarray, "n 3"] | None,
 ) -> None:
     """Write text with normals, y up as in ``write_glb``; sRGB from 0 to 1 stands behind x, y, z."""
-    turn = OPENGL_FROM_OPENCV[:3, :3]
-    rows = vertices @ turn
+    axes = OPENGL_FROM_OPENCV[:3, :3]
+    rows = vertices @ axes
     if colours is not None:
         rows = np.concatenate([rows, colours / 255.0], 1)
     lines = ["v " + " ".join(f"{x:.7g}" for x in row) for row in rows.tolist()]
-    lines += ["vn " + " ".join(f"{x:.5g}" for x in row) for row in (normals @ turn).tolist()]
+    lines += ["vn " + " ".join(f"{x:.5g}" for x in row) for row in (normals @ axes).tolist()]
     lines += [f"f {a}//{a} {b}//{b} {c}//{c}" for a, b, c in (faces + 1).tolist()]
     with atomic_file(path) as stream:
         stream.write(("\n".join(lines) + "\n").encode())
@@ -196,5 +196,5 @@ def write_obj(
 
 def linear(colours: UInt8[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
     """sRGB from 0 to 255 as light from 0 to 1 (IEC 61966-2-1)."""
-    share = colours / 255.0
-    return np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
+    level = colours / 255.0
+    return np.where(level <= 0.04045, level / 12.92, ((level + 0.055) / 1.055) ** 2.4)

@@ -12,7 +12,7 @@ import numpy as np
 
 from geogs.geometry.camera import Camera
 from geogs.io.writers.atomic import write_text
-from geogs.io.writers.exports.exported import OPENGL_FROM_OPENCV, PosedImage
+from geogs.io.writers.exports.exported import OPENGL_FROM_OPENCV, ExportedImage
 
 DEPTH_UNIT = 1e-3
 """Map units of a step of a depth image, as nerfstudio takes it where nothing is said."""
@@ -21,7 +21,7 @@ DEPTH_UNIT = 1e-3
 def write_transforms(
     path: Path,
     camera: Camera,
-    images: Sequence[PosedImage],
+    images: Sequence[ExportedImage],
     masked: Sequence[bool],
     depth_unit: float,
     points: str,

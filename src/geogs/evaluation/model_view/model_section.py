@@ -1,0 +1,48 @@
+"""The part of a page in which a model turns: markup, data, library and script, all inside."""
+
+import base64
+import html
+from importlib.resources import files
+
+from geogs.evaluation.model_view.packed_model import pack, to_json
+from geogs.evaluation.model_view.shown_model import ShownModel
+
+SCRIPTS = (
+    "unpack.js",
+    "stage.js",
+    "surface.js",
+    "disks.js",
+    "cameras.js",
+    "controls.js",
+    "main.js",
+)
+"""Scripts of the page, in the order in which they run; ``three.min.js`` comes before them."""
+
+
+def model_html(model: ShownModel) -> str:
+    """HTML of the model; it needs nothing from elsewhere, and one page holds one of them."""
+    scene, arrays, images = pack(model)
+    notes = " ".join(model.notes)
+    below = f"<p class=note>{html.escape(notes)}</p>" if notes else ""
+    library = f"<script>{_file('three.min.js')}</script>"
+    own = "\n".join(_file(name) for name in SCRIPTS)
+    return "\n".join([
+        f"<style>{_file('model.css')}</style>",
+        _file("model.html"),
+        below,
+        f'<script type="application/json" id="model-scene">{to_json(scene)}</script>',
+        _data("model-arrays", arrays),
+        _data("model-images", images),
+        library,
+        f"<script>(() => {{\n'use strict';\n{own}\n}})();</script>",
+    ])  # fmt: skip
+
+
+def _data(name: str, content: bytes) -> str:
+    text = base64.b64encode(content).decode("ascii")
+    return f'<script type="application/base64" id="{name}">{text}</script>'
+
+
+def _file(name: str) -> str:
+    place = files("geogs.evaluation.model_view").joinpath("browser", name)
+    return place.read_text(encoding="utf-8")

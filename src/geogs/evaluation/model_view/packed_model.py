@@ -1,0 +1,162 @@
+"""A model as few bytes that a page carries: arrays quantised, differenced, deflated.
+
+The page's own script, ``browser/unpack.js``, undoes this. Lengths lose less than a 65 535th of the
+extent of what they belong to, colours and triangles nothing.
+"""
+
+import json
+import zlib
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int, UInt
+
+from geogs.evaluation.model_view.shown_model import DiskModel, ShownModel, SurfaceModel
+from geogs.geometry.lie import matrix_to_quaternion, quaternion_multiply
+from geogs.geometry.morton import morton_codes
+
+STEPS = 65_535
+"""Steps of a quantised coordinate."""
+_QUATERNION = 127
+_SCALE_STEPS = 255
+_STATES = ("tracked", "orientation only", "lost")
+
+
+def pack(model: ShownModel) -> tuple[dict[str, Any], bytes, bytes]:
+    """What a page needs: its directory (for JSON), the deflated arrays, and the JPEG images.
+
+    All is turned to the axes of WebGL: x right, y up, z backward.
+    """
+    R = webgl_axes(model.axes)
+    arrays, images = _Arrays(), bytearray()
+    scene: dict[str, Any] = {
+        "eye": (R @ model.eye).tolist(),
+        "target": (R @ model.target).tolist(),
+        "lens": asdict(model.lens),
+    }
+    if model.surface is not None:
+        scene["surface"] = _surface(model.surface, R, arrays)
+    scene["paths"] = [
+        {
+            "name": path.name,
+            "points": arrays.add((path.points @ R.T).astype(np.float32).view(np.uint32)),
+            "states": path.states
+            and arrays.add(np.array([[_STATES.index(s)] for s in path.states], np.uint8)),
+        }
+        for path in model.paths
+    ]
+    scene["keyframes"] = []
+    for keyframe in model.keyframes:
+        T = np.eye(4)
+        T[:3] = R @ keyframe.T_wc[:3]
+        entry: dict[str, Any] = {"name": keyframe.name, "T_wc": T[:3].round(6).ravel().tolist()}
+        if keyframe.jpeg is not None:
+            entry["image"] = [len(images), len(keyframe.jpeg)]
+            images += keyframe.jpeg
+        scene["keyframes"].append(entry)
+    if model.disks is not None:
+        scene["disks"] = _disks(model.disks, R, arrays)
+    return scene, zlib.compress(bytes(arrays.content), 6), bytes(images)
+
+
+def webgl_axes(axes: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
+    """Rows right, up, backward, from rows right, forward, up."""
+    return np.stack([axes[0], axes[2], -axes[1]])
+
+
+def _surface(surface: SurfaceModel, R: np.ndarray, arrays: "_Arrays") -> dict[str, Any]:
+    """Vertices in the order of a space-filling curve, and triangles in that of the vertices."""
+    steps, box = quantised(surface.vertices @ R.T)
+    order = np.argsort(morton_codes(steps, 16), kind="stable")
+    rank = np.empty(len(order), np.int64)
+    rank[order] = np.arange(len(order))
+    return {
+        "box": box,
+        "vertices": arrays.add(steps[order]),
+        "faces": arrays.add(_face_differences(rank[surface.faces])),
+        "colourings": [
+            {
+                "name": colouring.name,
+                "colours": arrays.add(colouring.colours[order]),
+                "legend": colouring.legend and asdict(colouring.legend),
+            }
+            for colouring in surface.colourings
+        ],
+    }
+
+
+def _disks(disks: DiskModel, R: np.ndarray, arrays: "_Arrays") -> dict[str, Any]:
+    steps, box = quantised(disks.position @ R.T)
+    order = np.argsort(morton_codes(steps, 16), kind="stable")
+    own = torch.from_numpy(disks.quaternion / _norm(disks.quaternion)).double()
+    world = matrix_to_quaternion(torch.from_numpy(R)).expand_as(own)
+    rotation = quaternion_multiply(world, own).numpy()
+    rotation = np.where(rotation[:, :1] < 0, -rotation, rotation)
+    logs = np.log(np.maximum(disks.scale, 1e-12))
+    low, high = (float(f(logs)) if len(logs) else 0.0 for f in (np.min, np.max))
+    scale = np.rint((logs - low) / max(high - low, 1e-9) * _SCALE_STEPS)
+    return {
+        "box": box,
+        "position": arrays.add(steps[order]),
+        "quaternion": arrays.add(np.rint(rotation * _QUATERNION + 128).astype(np.uint8)[order]),
+        "scale": arrays.add(scale.astype(np.uint8)[order]),
+        "logs": [low, high],
+    }
+
+
+def quantised(
+    points: Float[np.ndarray, "n 3"],
+) -> tuple[UInt[np.ndarray, "n 3"], list[list[float]]]:
+    """Points as steps of their box (uint16), and the box: least coordinates, length of a step."""
+    if not len(points):
+        return np.zeros((0, 3), np.uint16), [[0.0] * 3, [1.0] * 3]
+    low, high = points.min(0).astype(np.float64), points.max(0).astype(np.float64)
+    step = np.maximum(high - low, 1e-12) / STEPS
+    steps = np.rint((points - low) / step).clip(0, STEPS).astype(np.uint16)
+    return steps, [low.tolist(), step.tolist()]
+
+
+def _face_differences(faces: Int[np.ndarray, "m 3"]) -> UInt[np.ndarray, "m 3"]:
+    """Triangles by their first vertex: that one, and how much higher the two others are.
+
+    The first is the least of the three, so that no difference is negative; the turn stays.
+    """
+    if not len(faces):
+        return np.zeros((0, 3), np.uint32)
+    first = faces.argmin(1)
+    turned = faces[np.arange(len(faces))[:, None], (first[:, None] + np.arange(3)) % 3]
+    turned = turned[np.lexsort((turned[:, 1], turned[:, 0]))]
+    turned[:, 1:] -= turned[:, :1]
+    return turned.astype(np.uint32)
+
+
+class _Arrays:
+    """Arrays one after the other: each the differences of its rows, column by column, and of
+    each column first all lowest bytes, then the next: so they deflate best."""
+
+    def __init__(self) -> None:
+        self.content = bytearray()
+
+    def add(self, values: UInt[np.ndarray, "n c"]) -> list[int]:
+        """Append an array of unsigned integers; its offset, rows, columns and bytes a number."""
+        size = values.dtype.itemsize
+        place = [len(self.content), *values.shape, size]
+        kind = values.dtype.newbyteorder("<")
+        for column in values.T:
+            difference = np.diff(column, prepend=column.dtype.type(0)).astype(kind)
+            # Zigzag: small steps down become small numbers, too.
+            signed = difference.view(kind.str.replace("u", "i")).astype(np.int64)
+            zigzag = ((signed << 1) ^ (signed >> 63)).astype(kind)
+            self.content += zigzag.view(np.uint8).reshape(-1, size).T.tobytes()
+        return place
+
+
+def _norm(rows: np.ndarray) -> np.ndarray:
+    return np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-12)
+
+
+def to_json(scene: dict[str, Any]) -> str:
+    """The directory as a script element may hold it."""
+    return json.dumps(scene, separators=(",", ":")).replace("<", "\\u003c")

@@ -1,0 +1,150 @@
+"""The errors as a table, as JSON, and as a page with the pictures."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from geogs.evaluation.model_view.model_section import model_html
+from geogs.evaluation.model_view.shown_model import ShownModel
+from geogs.evaluation.pages.page import (
+    FiguresSection,
+    HtmlSection,
+    PictureSection,
+    Section,
+    TableSection,
+    TextSection,
+    write_page,
+)
+from geogs.evaluation.surfaces.photoconsistency import PhotoScores
+from geogs.evaluation.surfaces.surface_scores import SurfaceScores
+from geogs.evaluation.trajectory_errors import TrajectoryErrors
+from geogs.io.writers.atomic import write_text
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+SAME_POSES_CM = 1e-4
+"""Errors up to which poses are those that were given, and not worth a table or a picture."""
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """All errors of a result; a part is none where its truth or its file was not there."""
+
+    trajectory: TrajectoryErrors | None
+    """Errors of every frame."""
+    keyframes: TrajectoryErrors | None
+    """Errors of the keyframes alone, with an alignment of their own."""
+    reconstruction: SurfaceScores | None
+    settings: dict[str, Any]
+    """What was compared and how."""
+    photo: PhotoScores | None = None
+    """How well the images agree on the surface."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        parts = {
+            "trajectory": self.trajectory,
+            "keyframes": self.keyframes,
+            "reconstruction": self.reconstruction,
+            "photoconsistency": self.photo,
+        }
+        scores = {name: None if part is None else part.as_dict() for name, part in parts.items()}
+        return scores | {"settings": self.settings}
+
+
+def groups(evaluation: Evaluation) -> list[tuple[str, list[tuple[str, str]]]]:
+    """Everything that is shown: headings with names (and units) and values."""
+    result = []
+    if evaluation.reconstruction is not None:
+        scores = evaluation.reconstruction
+        result.append((f"Surface, {scores.protocol}", scores.rows()))
+    if evaluation.photo is not None:
+        result.append(("Photoconsistency", evaluation.photo.rows()))
+    trajectory = []
+    named = {"all frames": evaluation.trajectory, "keyframes": evaluation.keyframes}
+    for name, errors in named.items():
+        if errors is not None:
+            trajectory += _trajectory_rows(name, errors)
+    return [*result, ("Trajectory", trajectory)] if trajectory else result
+
+
+def table(evaluation: Evaluation) -> "Table":
+    """The rows for a terminal."""
+    from rich.table import Table
+
+    result = Table("measure", "value", title="errors")
+    result.columns[1].justify = "right"
+    for heading, rows in groups(evaluation):
+        result.add_section()
+        result.add_row(heading, "", style="bold")
+        for name, value in rows:
+            result.add_row(name, value)
+    return result
+
+
+def write_report(
+    evaluation: Evaluation,
+    json_file: Path,
+    page: Path,
+    pictures: list[tuple[str, Path]],
+    run: Sequence[Section] = (),
+    title: str = "report",
+    judged: FiguresSection | None = None,
+    model: ShownModel | None = None,
+) -> None:
+    """Write ``eval.json`` and a page with the errors, the pictures and the run's own tables.
+
+    The page holds all that it shows.
+
+    Args:
+        evaluation: the errors.
+        json_file: for programs.
+        page: for people.
+        pictures: titles and files; those that are missing are left out.
+        run: what the run said of itself.
+        title: what was reconstructed.
+        judged: the verdict of the run; the errors stand beneath it.
+        model: what turns at the head.
+    """
+    write_text(json_file, json.dumps(evaluation.as_dict(), indent=2, default=str) + "\n")
+    judged = judged or FiguresSection("", None, ())
+    numbers = [*error_figures(evaluation), *judged.figures]
+    sections: list[Section] = [FiguresSection(judged.sentence, judged.is_good, numbers)]
+    sections += [HtmlSection(model_html(model))] if model is not None else []
+    sections += [TableSection(heading, (), rows) for heading, rows in groups(evaluation)]
+    sections += [PictureSection(title, file) for title, file in pictures]
+    sections += run
+    settings = json.dumps(evaluation.settings, indent=2, default=str)
+    sections.append(TextSection("Settings of the comparison", settings))
+    write_page(page, title, sections, "geogs, compared with the truth", is_whole=True)
+
+
+def error_figures(evaluation: Evaluation) -> list[tuple[str, str]]:
+    """The errors that matter most."""
+    result = []
+    path = evaluation.trajectory
+    if path is not None and path.ate_max_cm > SAME_POSES_CM:
+        result.append(("ATE RMSE", f"{path.ate_rmse_cm:.2f} cm"))
+    if evaluation.reconstruction is not None:
+        rows = [row for row in evaluation.reconstruction.rows() if not row[0].startswith(" ")]
+        result += rows[:3]
+    return result
+
+
+def _trajectory_rows(name: str, errors: TrajectoryErrors) -> list[tuple[str, str]]:
+    if errors.alignment == "none" and errors.ate_max_cm < SAME_POSES_CM:
+        return [(f"{name}: the true ones", f"{errors.pairs} poses")]
+    how = {"sim3": "Sim(3)", "se3": "SE(3)", "none": "not"}[errors.alignment]
+    return [
+        (f"ATE RMSE, {name}, {how} aligned (cm)", f"{errors.ate_rmse_cm:.3f}"),
+        ("  mean / median / max (cm)", f"{errors.ate_mean_cm:.3f} / {errors.ate_median_cm:.3f} / "
+         f"{errors.ate_max_cm:.3f}"),
+        ("  rotation RMSE (deg)", f"{errors.rotation_rmse_deg:.3f}"),
+        ("  scale (m per map unit)", f"{errors.scale:.5f}"),
+        ("  poses compared / estimated / true", f"{errors.pairs} / {errors.estimated} / "
+         f"{errors.reference}"),
+        ("  path length (m)", f"{errors.path_length_m:.2f}"),
+    ]  # fmt: skip

@@ -1,0 +1,191 @@
+"""Pictures of a result beside the truth, drawn by matplotlib without a display, written as PNG."""
+
+from collections.abc import Sequence
+from functools import partial
+from io import BytesIO
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+
+from geogs.evaluation.pages.shading import Sight, Viewpoint, level_axes, look
+from geogs.evaluation.surfaces.surface import Surface
+from geogs.evaluation.trajectory_errors import TrajectoryErrors
+from geogs.io.writers.atomic import atomic_file
+from geogs.threads import thread_map
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_TRUTH, _ESTIMATE = "0.45", "#0072b2"
+_ERROR_MAP = "YlOrRd"
+ERROR_STOPS = ("#ffffcc", "#fed976", "#fd8d3c", "#e2191c", "#800026")
+"""Colours of :func:`error_colours` from none to the worst, as CSS has them."""
+_UNKNOWN = 190
+
+
+def plot_trajectory(path: Path, errors: TrajectoryErrors) -> None:
+    """Aligned estimate over the truth, from above and from the side, coloured by its error."""
+    figure = new_figure(11.0, 4.6)
+    axes = level_axes(errors.truth)
+    origin = errors.truth[:, :3, 3].mean(0)
+    truth = (errors.truth[:, :3, 3] - origin) @ axes.T
+    estimate = (errors.aligned[:, :3, 3] - origin) @ axes.T
+    plots = []
+    for column, (name, vertical) in enumerate((("from above", 1), ("from the side", 2))):
+        plot = figure.add_subplot(1, 2, column + 1)
+        plot.plot(truth[:, 0], truth[:, vertical], color=_TRUTH, lw=2.5, label="truth")
+        x, y, colour = estimate[:, 0], estimate[:, vertical], 100 * errors.position_error
+        dots = plot.scatter(x, y, 7, colour, cmap="plasma", label="estimate", zorder=3)
+        _finish_map(plot, name, "m")
+        plots.append(plot)
+    figure.colorbar(dots, ax=plots, label="position error (cm)", shrink=0.8)
+    _save_maps(figure, path)
+
+
+def plot_error_over_time(path: Path, errors: TrajectoryErrors) -> None:
+    """Position error in cm and rotation error in degrees against time."""
+    figure = new_figure(10.0, 4.2)
+    order = np.argsort(errors.timestamps)
+    time = errors.timestamps[order] - errors.timestamps[order[0]]
+    rows = (
+        ("position error (cm)", 100 * errors.position_error, errors.ate_rmse_cm),
+        ("rotation error (deg)", errors.rotation_error, errors.rotation_rmse_deg),
+    )
+    for row, (label, values, rmse) in enumerate(rows):
+        plot = figure.add_subplot(2, 1, row + 1)
+        plot.plot(time, values[order], color=_ESTIMATE, lw=1)
+        plot.axhline(rmse, color=_TRUTH, ls="--", lw=1, label=f"RMSE {rmse:.3g}")
+        plot.set_ylabel(label)
+        plot.set_ylim(0, 1.15 * max(float(values.max()), 1e-9))
+        plot.margins(x=0.01)
+        plot.legend(loc="upper right")
+        plot.grid(alpha=0.3)
+    plot.set_xlabel("time (s)")
+    save_figure(figure, path)
+
+
+def plot_meshes(
+    path: Path,
+    rows: Sequence[
+        tuple[
+            str,
+            Float[np.ndarray, "n 3"],
+            Int[np.ndarray, "m 3"],
+            UInt8[np.ndarray, "n 3"] | None,
+        ]
+    ],
+    views: Sequence[Viewpoint],
+    error_limit_cm: float | None = None,
+) -> None:
+    """Shaded meshes, one row each (name, vertices, faces, vertex colours), one column a view.
+
+    With ``error_limit_cm`` a colour bar says what the colours of :func:`error_colours` mean.
+    """
+    camera = views[0].camera
+    figure = new_figure(4.2 * len(views), 0.5 + 4.2 * camera.height / camera.width * len(rows))
+    plots = []
+    sights: list[Sight] = []
+    for row, (name, vertices, faces, colours) in enumerate(rows):
+        if row == 0 or vertices is not rows[row - 1][1] or faces is not rows[row - 1][2]:
+            sights = thread_map(partial(look, vertices, faces), views)
+        for column, view in enumerate(views):
+            plot = figure.add_subplot(len(rows), len(views), row * len(views) + column + 1)
+            plot.imshow(sights[column].paint(colours))
+            plot.set(xticks=[], yticks=[])
+            if row == 0:
+                plot.set_title(view.name)
+            if column == 0:
+                plot.set_ylabel(name)
+            plots.append(plot)
+    if error_limit_cm is not None:
+        _colour_bar(figure, plots, _ERROR_MAP, (0.0, error_limit_cm), "distance to the truth (cm)")
+    save_figure(figure, path)
+
+
+def plot_beside_truth(
+    path: Path,
+    mesh: Surface,
+    truth: Surface | None,
+    colours: UInt8[np.ndarray, "n 3"],
+    views: Sequence[Viewpoint],
+    limit_cm: float,
+) -> None:
+    """A mesh, the truth if that is one, and the mesh in the colours of its error."""
+    rows: list[tuple[str, np.ndarray, np.ndarray, np.ndarray | None]] = [
+        ("reconstruction", mesh.vertices, mesh.faces, None),
+        ("its error", mesh.vertices, mesh.faces, colours),
+    ]
+    if truth is not None and truth.is_mesh:
+        rows.insert(1, ("truth", truth.vertices, truth.faces, None))
+    plot_meshes(path, rows, views, limit_cm)
+
+
+def error_colours(
+    vertices: Float[np.ndarray, "n 3"],
+    samples: Float[np.ndarray, "k 3"],
+    errors: Float[np.ndarray, "k"],
+    limit: float,
+    reach: float = np.inf,
+) -> UInt8[np.ndarray, "n 3"]:
+    """Colour of each vertex by the mean error of the three samples nearest to it.
+
+    Pale is 0, dark red ``limit`` (in the unit of the errors) and more; grey are vertices without a
+    sample within ``reach``, which were not compared.
+    """
+    from matplotlib import colormaps
+    from scipy.spatial import cKDTree
+
+    k = min(3, len(samples))
+    distance, nearest = (
+        found.reshape(len(vertices), k)
+        for found in cKDTree(samples).query(vertices, k=k, workers=-1)
+    )
+    fraction = (errors[nearest].mean(1) / limit).clip(0, 1)
+    colours = (255 * colormaps[_ERROR_MAP](fraction)[:, :3]).round().astype(np.uint8)
+    return np.where(distance[:, :1] <= reach, colours, np.uint8(_UNKNOWN))
+
+
+def new_figure(width: float, height: float) -> "Figure":
+    """A figure of its own (inches), outside of pyplot and its global state."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, height), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def _colour_bar(
+    figure: "Figure", plots: list["Axes"], colours: str, span: tuple[float, float], label: str
+) -> None:
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
+
+    scale = ScalarMappable(Normalize(*span), colours)
+    figure.colorbar(scale, ax=plots, label=label, shrink=0.6, pad=0.01)
+
+
+def _finish_map(plot: "Axes", name: str, unit: str) -> None:
+    plot.set_aspect("equal", adjustable="datalim")
+    plot.set_title(name)
+    plot.set_xlabel(f"right ({unit})")
+    plot.set_ylabel(f"{'forward' if 'above' in name else 'up'} ({unit})")
+    plot.grid(alpha=0.3)
+    plot.legend(loc="best")
+
+
+def _save_maps(figure: "Figure", path: Path) -> None:
+    """Save plots of equal scale: drawing settles their limits, whose tick labels then need room."""
+    figure.draw_without_rendering()
+    save_figure(figure, path)
+
+
+def save_figure(figure: "Figure", path: Path) -> None:
+    """Write a figure as PNG, completely or not at all."""
+    buffer = BytesIO()
+    figure.savefig(buffer, format="png", dpi=110, pil_kwargs={"compress_level": 3})
+    with atomic_file(path) as stream:
+        stream.write(buffer.getvalue())

@@ -1,0 +1,153 @@
+"""The page of a run: what happened in numbers, and the pictures that need no truth."""
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from geogs.documents import UNUSABLE
+from geogs.evaluation.duration import duration
+from geogs.evaluation.model_view.model_section import model_html
+from geogs.evaluation.model_view.shown_model import ShownModel
+from geogs.evaluation.pages.page import (
+    FiguresSection,
+    HtmlSection,
+    PictureSection,
+    Section,
+    TableSection,
+    write_page,
+)
+
+PICTURES = {
+    "keyframes.png": "Rendered keyframes",
+    "trajectory.png": "Trajectory",
+}
+"""Titles of the pictures that a run leaves in ``report/``, in the order of the page."""
+
+
+Show = Callable[[Any], str]
+
+
+def write_run_page(
+    folder: Path, summary: Mapping[str, Any], model: ShownModel | None = None
+) -> None:
+    """Write ``index.html`` into the folder of the pictures; it holds all that it shows.
+
+    Args:
+        folder: ``report/`` of a result.
+        summary: what ``summary.json`` holds; numbers that are not there are left out.
+        model: what turns at its head.
+
+    Raises:
+        OutputError: it cannot be written.
+    """
+    name = _shown(_plain, summary.get("source")) or "result"
+    head: list[Section] = [figures(summary, run_figures(summary))]
+    head += [HtmlSection(model_html(model))] if model is not None else []
+    pictures = [PictureSection(title, folder / file) for file, title in PICTURES.items()]
+    sections = [*head, *pictures, *run_sections(summary)]
+    write_page(folder / "index.html", name, sections, "geogs", is_whole=True)
+
+
+def figures(summary: Mapping[str, Any], numbers: list[tuple[str, str]]) -> FiguresSection:
+    """The verdict of a run above some numbers."""
+    verdict = summary.get("verdict")
+    if not isinstance(verdict, Mapping):
+        return FiguresSection("", None, numbers)
+    sentence = _shown(_plain, verdict.get("sentence"))
+    return FiguresSection(sentence, bool(verdict.get("is_reliable")), numbers)
+
+
+def run_figures(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """The numbers of a run that matter most."""
+    seconds, rates = summary.get("seconds"), summary.get("frames_per_second")
+    total = seconds.get("total") if isinstance(seconds, Mapping) else None
+    rate = rates.get("with_final_stages") if isinstance(rates, Mapping) else None
+    shown: list[tuple[str, Show, object]] = [
+        ("frames", _count, summary.get("frames")),
+        ("keyframes", _count, summary.get("keyframes")),
+        ("triangles", _count, summary.get("mesh_faces")),
+        ("disks", _count, summary.get("disks")),
+        ("time", _time, total),
+        ("frames/s", "{:.2f}".format, rate),
+    ]
+    return [(name, text) for name, show, value in shown if (text := _shown(show, value))]
+
+
+def run_sections(summary: Mapping[str, Any]) -> list[Section]:
+    """Tables of what ``summary.json`` holds: the run, and the seconds of its stages."""
+    rows_of_run = [
+        (title, text) for title, key, show in _RUN_ROWS if (text := _shown(show, summary.get(key)))
+    ]
+    sections: list[Section] = [TableSection("The run", (), rows_of_run)]
+    seconds = summary.get("seconds")
+    if isinstance(seconds, Mapping):
+        rows = [(name, _shown("{:.1f}".format, value)) for name, value in seconds.items()]
+        sections.append(TableSection("Time", ("stage", "seconds"), rows))
+    return sections
+
+
+def _shown(show: Show, value: object) -> str:
+    """A fact of the summary in words; nothing where it is none, or not what a run writes."""
+    try:
+        return "" if value is None else show(value)
+    except UNUSABLE:
+        return ""
+
+
+def _plain(value: object) -> str:
+    return str(value)
+
+
+def _time(value: object) -> str:
+    return duration(value) if isinstance(value, int | float) else ""
+
+
+def _count(value: object) -> str:
+    return f"{value:,}".replace(",", " ") if isinstance(value, int) else ""
+
+
+def _present(value: object) -> str:
+    """A number that is worth a line only if it is not 0."""
+    return _count(value) if value else ""
+
+
+def _memory(value: object) -> str:
+    return f"{value / 2**20:.0f} MiB" if isinstance(value, int | float) else ""
+
+
+def _rates(value: object) -> str:
+    if not isinstance(value, Mapping):
+        return ""
+    return ", ".join(f"{rate:.2f} {name.replace('_', ' ')}" for name, rate in value.items())
+
+
+def _spans(value: object) -> str:
+    if not isinstance(value, list) or not value:
+        return ""
+    shown = ", ".join(f"{first:.1f} to {last:.1f}" for first, last in value[:5])
+    return shown + (f" and {len(value) - 5} more" if len(value) > 5 else "")
+
+
+def _yes(value: object) -> str:
+    return "yes" if value else ""
+
+
+_RUN_ROWS = (
+    ("source", "source", _plain),
+    ("format", "kind", _plain),
+    ("frames", "frames", _count),
+    ("keyframes", "keyframes", _count),
+    ("skipped images", "skipped_images", _present),
+    ("lost (s)", "lost_spans", _spans),
+    ("only the orientation known (s)", "orientation_only_spans", _spans),
+    ("disks", "disks", _count),
+    ("mesh faces", "mesh_faces", _count),
+    ("frames per second", "frames_per_second", _rates),
+    ("computed on", "device", _plain),
+    ("peak memory", "peak_memory_bytes", _memory),
+    ("peak GPU memory", "peak_gpu_memory_bytes", _memory),
+    ("intrinsics", "intrinsics", _plain),
+    ("scale", "scale", _plain),
+    ("stopped early", "interrupted", _yes),
+    ("seed", "seed", _plain),
+)

@@ -1,0 +1,170 @@
+"""Pictures of a run that need no truth, drawn by OpenCV, as plotting libraries start slowly."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from geogs.evaluation.pages.shading import level_axes
+from geogs.io.writers.atomic import atomic_file
+from geogs.types import Trajectory
+
+_INK, _GRID, _PATH, _LOST = (60, 60, 60), (225, 225, 225), (0, 114, 178), (213, 94, 0)
+_CELL, _GAP, _HEAD, _BAR = 420, 6, 28, 90
+"""Pixels of the keyframes' picture: width of a cell, between cells, above and beside them."""
+_PANEL, _LEFT, _TOP, _BOTTOM = (540, 440), 58, 48, 44
+"""Pixels of a view of the path, width and height, and its margins."""
+_TICKS, _FINE = 6, 4
+"""About how many ticks an axis has; binary digits of a pixel's fraction that OpenCV is given."""
+
+
+def draw_path(path: Path, trajectory: Trajectory) -> None:
+    """The camera path from above and from the side, in map units; lost stretches are marked."""
+    axes = level_axes(trajectory.T_wc)
+    points = (trajectory.T_wc[:, :3, 3] - trajectory.T_wc[0, :3, 3]) @ axes.T
+    names = (("from above", "forward", 1), ("from the side", "up", 2))
+    panels = [
+        path_panel(points[:, [0, vertical]], ~trajectory.tracked, name, upwards)
+        for name, upwards, vertical in names
+    ]
+    _save(path, np.hstack(panels))
+
+
+def path_panel(
+    points: Float[np.ndarray, "n 2"], lost: Bool[np.ndarray, "n"], name: str, upwards: str
+) -> UInt8[np.ndarray, "h w 3"]:
+    """A path on a grid of equal scale, with its start and where it was lost."""
+    width, height = _PANEL
+    panel = np.full((height, width, 3), 255, np.uint8)
+    inner = np.array([width - _LEFT - 12, height - _TOP - _BOTTOM], float)
+    low, high = points.min(0), points.max(0)
+    scale = float((0.9 * inner / np.maximum(high - low, 1e-6)).min())
+    middle, centre = (low + high) / 2, np.array([_LEFT, _TOP]) + inner / 2
+
+    def place(p: Float[np.ndarray, "*k 2"]) -> Float[np.ndarray, "*k 2"]:
+        return centre + scale * (p - middle) * [1, -1]
+
+    step = tick_step(float(inner.max()) / scale)
+    for axis in (0, 1):
+        ends = (middle[axis] + np.array([-0.5, 0.5]) * inner[axis] / scale) / step
+        for number in range(int(np.ceil(ends[0])), int(np.floor(ends[1])) + 1):
+            at = place(np.eye(2)[axis] * (number * step - middle[axis]) + middle)
+            _tick(panel, axis, float(at[axis]), f"{number * step:.6g}", inner)
+    cv2.polylines(panel, [_fine(place(points))], False, _PATH, 2, cv2.LINE_AA, _FINE)
+    for p in _fine(place(points[lost])):
+        cv2.circle(panel, p.tolist(), 2 << _FINE, _LOST, -1, cv2.LINE_AA, _FINE)
+    (start,) = _fine(place(points[:1])).tolist()
+    cv2.circle(panel, start, 5 << _FINE, _PATH, -1, cv2.LINE_AA, _FINE)
+    _write(panel, name, (_LEFT, 18), 0.5)
+    _write(panel, f"{upwards} (map units)", (8, 38))
+    _write(panel, "right (map units)", (width // 2 - 40, height - 8))
+    cv2.circle(panel, (width - 170, 14), 5, _PATH, -1, cv2.LINE_AA)
+    _write(panel, "start", (width - 160, 18))
+    if lost.any():
+        cv2.circle(panel, (width - 80, 14), 3, _LOST, -1, cv2.LINE_AA)
+        _write(panel, "lost", (width - 70, 18))
+    return panel
+
+
+def tick_step(span: float) -> float:
+    """A round number of which about six make a span: one, two or five times a power of ten."""
+    rough = span / _TICKS
+    power = 10.0 ** np.floor(np.log10(rough))
+    return float(power * min((1, 2, 5, 10), key=lambda m: abs(np.log(m * power / rough))))
+
+
+def draw_keyframes(
+    path: Path,
+    images: Sequence[UInt8[np.ndarray, "ih iw 3"]],
+    depths: Sequence[Float[np.ndarray, "h w"]],
+    normals: Sequence[Float[np.ndarray, "h w 3"]],
+) -> None:
+    """One row a keyframe: image, rendered depth (one colour scale for all) and normals.
+
+    Depth is white where it is 0 or not finite; normals (camera frame) show x, y, z as red, green,
+    blue, from -1 dark to 1 bright, towards the camera being bright blue.
+    """
+    known = [d[np.isfinite(d) & (d > 0)] for d in depths]
+    values = np.concatenate(known) if known else np.zeros(0)
+    low, high = np.quantile(values, [0.01, 0.99]) if len(values) else (0.0, 1.0)
+    height = max(round(_CELL * images[0].shape[0] / images[0].shape[1]), 1)
+    rows = len(images)
+    width = 3 * _CELL + 2 * _GAP
+    picture = np.full((_HEAD + rows * (height + _GAP), width + _BAR, 3), 255, np.uint8)
+    for row, (image, depth, normal) in enumerate(zip(images, depths, normals, strict=True)):
+        shown = (image, depth_colours(depth, float(low), float(high)), normal_colours(normal))
+        top = _HEAD + row * (height + _GAP)
+        for column, cell in enumerate(shown):
+            left = column * (_CELL + _GAP)
+            is_smaller = cell.shape[1] > _CELL
+            way = cv2.INTER_AREA if is_smaller else cv2.INTER_NEAREST
+            fitted = cv2.resize(cell, (_CELL, height), interpolation=way)
+            picture[top : top + height, left : left + _CELL] = fitted
+    for column, title in enumerate(("image", "depth", "normals")):
+        _write(picture, title, (column * (_CELL + _GAP) + 4, 19), 0.5)
+    _depth_bar(picture[:, width + 10 :], float(low), float(high))
+    _save(path, picture)
+
+
+def depth_colours(
+    depth: Float[np.ndarray, "h w"], low: float, high: float
+) -> UInt8[np.ndarray, "h w 3"]:
+    """Depth from blue, near, to red, far; white where there is none."""
+    is_known = np.isfinite(depth) & (depth > 0)
+    fraction = (np.where(is_known, depth, low) - low) / max(high - low, 1e-12)
+    levels = (255 * fraction.clip(0, 1)).round().astype(np.uint8)
+    colours = cv2.applyColorMap(levels, cv2.COLORMAP_TURBO)[..., ::-1]
+    return np.where(is_known[..., None], colours, np.uint8(255))
+
+
+def normal_colours(normal: Float[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
+    """Normals of the camera's frame as colours; white where there is none."""
+    is_known = np.linalg.norm(normal, axis=-1, keepdims=True) > 0.5
+    colours = (255 * (0.5 + 0.5 * normal * [1, -1, -1]).clip(0, 1)).round().astype(np.uint8)
+    return np.where(is_known, colours, np.uint8(255))
+
+
+def _depth_bar(place: UInt8[np.ndarray, "h w 3"], low: float, high: float) -> None:
+    """What the colours of depth mean, drawn into a strip of the picture."""
+    top, length = _HEAD + 20, min(place.shape[0] - _HEAD - 40, 300)
+    if length < 20:
+        return
+    ramp = np.linspace(high, low, length)[:, None].repeat(14, 1)
+    place[top : top + length, :14] = depth_colours(np.maximum(ramp, 1e-12), low, high)
+    _write(place, "map units", (0, top - 8), 0.38)
+    for fraction in (0.0, 0.5, 1.0):
+        value = f"{high + fraction * (low - high):.3g}"
+        _write(place, value, (18, round(top + fraction * (length - 1)) + 4))
+
+
+def _tick(
+    panel: UInt8[np.ndarray, "h w 3"], axis: int, at: float, text: str, inner: np.ndarray
+) -> None:
+    """A line of the grid with its number; ``at`` is where it crosses the axis, in pixels."""
+    where, right, bottom = round(at), _LEFT + int(inner[0]), _TOP + int(inner[1])
+    if axis == 0 and _LEFT <= where <= right:
+        cv2.line(panel, (where, _TOP), (where, bottom), _GRID, 1)
+        _write(panel, text, (where - 4 * len(text), bottom + 16))
+    elif axis == 1 and _TOP <= where <= bottom:
+        cv2.line(panel, (_LEFT, where), (right, where), _GRID, 1)
+        _write(panel, text, (_LEFT - 6 - 8 * len(text), where + 4))
+
+
+def _fine(points: Float[np.ndarray, "n 2"]) -> np.ndarray:
+    """Points in the fractions of a pixel that OpenCV draws by."""
+    return np.round(points * (1 << _FINE)).astype(np.int32)
+
+
+def _write(
+    picture: UInt8[np.ndarray, "h w 3"], text: str, at: tuple[int, int], size: float = 0.42
+) -> None:
+    cv2.putText(picture, text, at, cv2.FONT_HERSHEY_SIMPLEX, size, _INK, 1, cv2.LINE_AA)
+
+
+def _save(path: Path, picture: UInt8[np.ndarray, "h w 3"]) -> None:
+    """Write a picture as PNG, completely or not at all."""
+    data = cv2.imencode(".png", picture[..., ::-1])[1]
+    with atomic_file(path) as stream:
+        stream.write(data.tobytes())

@@ -1,0 +1,153 @@
+"""Pictures of meshes without a graphics library."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
+
+from geogs.evaluation.surfaces.raster import render_mesh
+from geogs.geometry.camera import Camera
+
+_BACKGROUND = 255.0
+_GREY = 190.0
+_AMBIENT = 0.25
+_WIDTH = 480
+"""Width of a picture, pixels."""
+
+
+@dataclass(frozen=True)
+class Viewpoint:
+    """From where a mesh is looked at."""
+
+    name: str
+    camera: Camera
+    T_cw: Float[np.ndarray, "4 4"]
+    ceiling: float | None = None
+    """Height (along ``up``) above which faces are left out."""
+    up: Float[np.ndarray, "3"] | None = None
+
+
+@dataclass(frozen=True)
+class Sight:
+    """What the rays of a view meet: 2 x 2 rays a pixel."""
+
+    hit: Bool[np.ndarray, "fine_h fine_w"]
+    corners: Int[np.ndarray, "k 3"]
+    """Vertices of the face that each of the hitting rays meets."""
+    light: Float[np.ndarray, "k 1"]
+    """Brightness there, in [0, 1]."""
+
+    def paint(self, colours: UInt8[np.ndarray, "n 3"] | None = None) -> UInt8[np.ndarray, "h w 3"]:
+        """The picture (RGB): faces flat, grey or in the mean colour of their vertices."""
+        picture = np.full((*self.hit.shape, 3), _BACKGROUND)
+        colour = np.full((1, 3), _GREY)
+        if colours is not None:
+            colour = colours[self.corners].astype(np.float64).mean(1)
+        picture[self.hit] = self.light * colour
+        height, width = self.hit.shape[0] // 2, self.hit.shape[1] // 2
+        return picture.reshape(height, 2, width, 2, 3).mean((1, 3)).round().astype(np.uint8)
+
+
+def look(
+    vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "m 3"], view: Viewpoint
+) -> Sight:
+    """A mesh with a lamp at the camera: brightness is the cosine to the face's normal.
+
+    Both sides of a face are seen, as meshes of truth often have no orientation.
+    """
+    vertices = vertices.astype(np.float64)
+    if view.ceiling is not None and view.up is not None and len(faces):
+        height = (vertices @ view.up)[faces].mean(1)
+        faces = faces[height < view.ceiling]
+    camera = view.camera
+    fine = camera.resized(2 * camera.width, 2 * camera.height)
+    if not len(faces):
+        hit = np.zeros((fine.height, fine.width), bool)
+        return Sight(hit, np.zeros((0, 3), np.int64), np.zeros((0, 1)))
+    _, face = render_mesh(vertices, faces, fine, view.T_cw)
+    hit = face >= 0
+    corners = faces[face[hit]]
+    a, b, c = (vertices[corners[:, i]] for i in range(3))
+    normal = np.cross(b - a, c - a) @ view.T_cw[:3, :3].T
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True) + 1e-300
+    ray = fine.rays().numpy()[hit].astype(np.float64)
+    ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+    light = _AMBIENT + (1 - _AMBIENT) * np.abs((normal * ray).sum(1, keepdims=True))
+    return Sight(hit, corners, light)
+
+
+def level_axes(T_wc: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "3 3"]:
+    """Rows right, forward, up of the world as the camera was held.
+
+    Up is against the mean of the image's down axis (people hold cameras upright); right is the
+    direction of most motion at right angles to it.
+    """
+    up = -T_wc[:, :3, 1].mean(0)
+    norm = np.linalg.norm(up)
+    up = up / norm if norm > 1e-3 else np.array([0.0, 0.0, 1.0])
+    offset = T_wc[:, :3, 3] - T_wc[:, :3, 3].mean(0)
+    flat = offset - np.outer(offset @ up, up)
+    right = np.linalg.svd(flat, full_matrices=False)[2][0]
+    right = right - (right @ up) * up
+    if np.linalg.norm(right) < 1e-6:
+        right = np.cross(np.roll(np.eye(3)[np.abs(up).argmax()], 1), up)
+    right /= np.linalg.norm(right)
+    return np.stack([right, np.cross(up, right), up])
+
+
+def viewpoints(
+    vertices: Float[np.ndarray, "n 3"], T_wc: Float[np.ndarray, "k 4 4"], camera: Camera
+) -> list[Viewpoint]:
+    """The first camera, the one in the middle, and the whole from above without the ceiling.
+
+    Where all cameras look at one place, as at an object, the third is the camera that is turned
+    most from the other two.
+    """
+    inside = camera.with_long_edge(_WIDTH)
+    chosen = {"first frame": T_wc[0], "middle frame": T_wc[len(T_wc) // 2]}
+    around = look_at_one_place(T_wc)
+    if around:
+        cosine = T_wc[:, :3, 2] @ T_wc[[0, len(T_wc) // 2], :3, 2].T
+        chosen["another side"] = T_wc[cosine.max(1).argmin()]
+    views = [Viewpoint(name, inside, np.linalg.inv(T)) for name, T in chosen.items()]
+    return views if around else [*views, _from_above(vertices, T_wc, _WIDTH, inside.height)]
+
+
+def look_at_one_place(T_wc: Float[np.ndarray, "k 4 4"]) -> bool:
+    """Whether the optical axes of all cameras pass near one point in front of them.
+
+    The point nearest to all axes must be in front of every camera and, on average, at most a
+    tenth of its distance beside the axis; and the cameras must be apart by at least a tenth of it.
+    """
+    axes, centres = T_wc[:, :3, 2], T_wc[:, :3, 3]
+    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    offset = (across @ centres[..., None])[..., 0].sum(0)
+    focus = np.linalg.lstsq(across.sum(0), offset, rcond=None)[0]
+    along = ((focus - centres) * axes).sum(1)
+    if not (along > 0).all():
+        return False
+    beside = np.linalg.norm(focus - centres - along[:, None] * axes, axis=1)
+    spread = np.linalg.norm(centres - centres.mean(0), axis=1).max()
+    return bool(beside.mean() < 0.1 * along.mean() and spread > 0.1 * along.mean())
+
+
+def _from_above(
+    vertices: Float[np.ndarray, "n 3"],
+    T_wc: Float[np.ndarray, "k 4 4"],
+    width: int,
+    height: int,
+) -> Viewpoint:
+    """Nearly parallel rays from far above; what is higher than the cameras is cut away."""
+    axes = level_axes(T_wc)
+    local = vertices.astype(np.float64) @ axes.T
+    low, high = np.quantile(local, [0.005, 0.995], axis=0)
+    extent = np.maximum(high - low, 1e-6)
+    far = 30 * float(extent.max())
+    focal = 0.95 * far * min(width / extent[0], height / extent[1])
+    camera = Camera(focal, focal, (width - 1) / 2, (height - 1) / 2, width, height)
+    T_cw = np.eye(4)
+    T_cw[:3, :3] = np.stack([axes[0], -axes[1], -axes[2]])
+    centre = axes.T @ np.array([*(low + high)[:2] / 2, high[2] + far])
+    T_cw[:3, 3] = -T_cw[:3, :3] @ centre
+    ceiling = float(np.median(T_wc[:, :3, 3] @ axes[2]))
+    return Viewpoint("from above", camera, T_cw, ceiling, axes[2])

@@ -1,0 +1,46 @@
+"""Scores of a surface by one protocol, and the points they come from."""
+
+from dataclasses import dataclass
+from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
+
+import numpy as np
+from jaxtyping import Float
+
+
+@runtime_checkable
+class SurfaceScores(Protocol):
+    """Errors of a surface by one protocol."""
+
+    @property
+    def protocol(self) -> str:
+        """Its name."""
+        ...
+
+    @property
+    def colour_limit_cm(self) -> float:
+        """Distance that pictures show as the worst."""
+        ...
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        ...
+
+    def rows(self) -> list[tuple[str, str]]:
+        """Name with unit, and value, of what a table shows."""
+        ...
+
+
+S_co = TypeVar("S_co", bound=SurfaceScores, covariant=True)
+
+
+@dataclass(frozen=True)
+class SurfaceErrors(Generic[S_co]):
+    """Scores with the points they come from, in the unit and the frame of the truth."""
+
+    scores: S_co
+    reconstruction_points: Float[np.ndarray, "n 3"]
+    accuracy: Float[np.ndarray, "n"]
+    """Distance of each to the truth; inf where it is left out."""
+    truth_points: Float[np.ndarray, "m 3"]
+    completeness: Float[np.ndarray, "m"]
+    """Distance of each to the reconstruction; inf where it is left out."""

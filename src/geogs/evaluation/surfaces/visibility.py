@@ -1,0 +1,119 @@
+"""What the cameras of a trajectory saw of a surface: point by point, or triangle by triangle."""
+
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from geogs.errors import InputError
+from geogs.evaluation.surfaces.raster import render_mesh
+from geogs.evaluation.surfaces.surface import Surface
+from geogs.geometry.camera import Camera
+
+CullingRule = Literal["frustum", "occlusion"]
+
+
+class Visibility:
+    """Frustum and occlusion test against depth maps of an occluding mesh.
+
+    A point is seen by a view if it projects into the image in front of the camera and lies at
+    most ``tolerance`` behind the occluder's depth there (the rule of Neural RGB-D and GO-Surf,
+    which use 0.03 m). For a reconstruction the same rule leaves out what lies outside all frusta
+    or hidden behind the true surface; what stands in seen free space stays, and counts as error.
+    """
+
+    def __init__(
+        self,
+        occluder: Surface,
+        camera: Camera,
+        T_cw: Float[np.ndarray, "v 4 4"],
+        tolerance: float = 0.03,
+        long_edge: int = 320,
+    ) -> None:
+        """``T_cw`` are the world-to-camera poses to use, in the occluder's frame.
+
+        Depth maps are made at ``long_edge`` pixels, or the camera's own size if that is smaller.
+        """
+        self._camera = camera
+        if max(camera.width, camera.height) > long_edge:
+            self._camera = camera.with_long_edge(long_edge)
+        self._T_cw = T_cw
+        self._tolerance = tolerance
+        self._depths = [
+            render_mesh(occluder.vertices, occluder.faces, self._camera, T)[0].astype(np.float32)
+            for T in T_cw
+        ]
+
+    def seen(self, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
+        """Which points at least one view sees."""
+        result = np.zeros(len(points), bool)
+        for T, depth in zip(self._T_cw, self._depths, strict=True):
+            rest = np.flatnonzero(~result)
+            z, surface = self._look_up(points[rest], T, depth)
+            result[rest] = z <= surface + self._tolerance
+        return result
+
+    def _look_up(
+        self,
+        points: Float[np.ndarray, "n 3"],
+        T_cw: Float[np.ndarray, "4 4"],
+        depth: Float[np.ndarray, "h w"],
+    ) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
+        """Depth of the points and of the surface along their rays; -inf outside the image."""
+        camera = self._camera
+        x, y, z = (points @ T_cw[:3, :3].T + T_cw[:3, 3]).T
+        front = z > 1e-6
+        safe = np.where(front, z, 1.0)
+        u = np.rint(camera.fx * x / safe + camera.cx)
+        v = np.rint(camera.fy * y / safe + camera.cy)
+        inside = front & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
+        surface = np.full(len(points), -np.inf, np.float32)
+        surface[inside] = depth[v[inside].astype(int), u[inside].astype(int)]
+        return z, surface
+
+
+def cull_mesh(
+    mesh: Surface,
+    camera: Camera,
+    T_cw: Float[np.ndarray, "v 4 4"],
+    rule: CullingRule,
+    occluder: Surface | None = None,
+) -> Surface:
+    """The triangles that the cameras saw by one of two customary rules.
+
+    ``frustum`` (iMAP, NICE-SLAM) leaves out a triangle if none of its vertices is inside any
+    image in front of the camera; hidden ones stay. ``occlusion`` (Neural RGB-D, GO-Surf) asks
+    besides that a vertex be at most 3 cm behind the nearest surface in one of the views.
+
+    Args:
+        mesh: what to cut, in metres.
+        camera: of every view.
+        T_cw: world to camera of the views, in the frame of the mesh.
+        rule: which of the two.
+        occluder: what hides parts of the mesh; the mesh itself if none.
+
+    Raises:
+        InputError: nothing is left.
+    """
+    kept = in_frustum(mesh.vertices, camera, T_cw)[mesh.faces].any(1)
+    if rule == "occlusion":
+        seen = Visibility(occluder or mesh, camera, T_cw).seen(mesh.vertices)
+        kept &= seen[mesh.faces].any(1)
+    if not kept.any():
+        raise InputError("The cameras see no part of a mesh; are the poses in its frame?")
+    return mesh.part(kept)
+
+
+def in_frustum(
+    points: Float[np.ndarray, "n 3"], camera: Camera, T_cw: Float[np.ndarray, "v 4 4"]
+) -> Bool[np.ndarray, "n"]:
+    """Which points at least one view has inside its image, in front of it."""
+    result = np.zeros(len(points), bool)
+    for T in T_cw:
+        rest = np.flatnonzero(~result)
+        x, y, z = (points[rest] @ T[:3, :3].T + T[:3, 3]).T
+        safe = np.where(z > 0, z, 1.0)
+        u, v = camera.fx * x / safe + camera.cx, camera.fy * y / safe + camera.cy
+        inside = (u > -0.5) & (u < camera.width - 0.5) & (v > -0.5) & (v < camera.height - 0.5)
+        result[rest] = inside & (z > 0)
+    return result

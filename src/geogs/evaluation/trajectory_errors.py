@@ -1,0 +1,206 @@
+"""How far an estimated trajectory is from the true one."""
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+
+from geogs.errors import GeogsError, InputError
+from geogs.geometry.nearest_rotation import nearest_rotation
+from geogs.geometry.umeyama import umeyama
+from geogs.threads import on_one_torch_thread
+from geogs.types import Trajectory
+
+Alignment = Literal["sim3", "se3", "none"]
+
+
+@dataclass(frozen=True)
+class TrajectoryErrors:
+    """Absolute trajectory error after alignment, and what it rests on.
+
+    Lengths in cm where the name says so, else in metres (the unit of the reference).
+    """
+
+    ate_rmse_cm: float
+    ate_mean_cm: float
+    ate_median_cm: float
+    ate_max_cm: float
+    ate_std_cm: float
+    rotation_rmse_deg: float
+    """Angle between aligned and true orientation, root mean square."""
+    scale: float
+    """Length in the reference per length in the estimate."""
+    alignment: Alignment
+    pairs: int
+    """Poses that were compared."""
+    estimated: int
+    """Poses in the estimate."""
+    reference: int
+    """Poses in the reference."""
+    path_length_m: float
+    """Length of the compared part of the reference."""
+    T_ref_est: Float[np.ndarray, "4 4"]
+    """Similarity that moves the estimate into the reference frame."""
+    timestamps: Float[np.ndarray, "n"]
+    position_error: Float[np.ndarray, "n"]
+    """Metres, per pair."""
+    rotation_error: Float[np.ndarray, "n"]
+    """Degrees, per pair."""
+    aligned: Float[np.ndarray, "n 4 4"]
+    """Estimated camera-to-world poses in the reference frame."""
+    truth: Float[np.ndarray, "n 4 4"]
+
+    def as_dict(self) -> dict[str, Any]:
+        """The numbers without the per-pose arrays, for JSON."""
+        arrays = {"timestamps", "position_error", "rotation_error", "aligned", "truth"}
+        items = {k: getattr(self, k) for k in self.__dataclass_fields__ if k not in arrays}
+        return items | {"T_ref_est": self.T_ref_est.tolist()}
+
+
+def associate(
+    reference: Float[np.ndarray, "n"], estimate: Float[np.ndarray, "m"], max_difference: float
+) -> tuple[Int[np.ndarray, "k"], Int[np.ndarray, "k"]]:
+    """Indices of poses that are each other's nearest in time, at most ``max_difference`` s apart.
+
+    Both time series may be unsorted; no pose is used twice.
+    """
+    if not len(reference) or not len(estimate):
+        return np.zeros(0, np.int64), np.zeros(0, np.int64)
+    to_estimate = _nearest(reference, estimate)
+    to_reference = _nearest(estimate, reference)
+    index = np.arange(len(reference))
+    mutual = to_reference[to_estimate] == index
+    near = np.abs(estimate[to_estimate] - reference) <= max_difference
+    chosen = index[mutual & near]
+    return chosen, to_estimate[chosen]
+
+
+def align(
+    estimate: Float[np.ndarray, "n 3"], reference: Float[np.ndarray, "n 3"], how: Alignment
+) -> tuple[Float[np.ndarray, "4 4"], float]:
+    """Similarity (or rigid motion, or identity) moving ``estimate`` onto ``reference``; its scale.
+
+    Least squares over the positions (Umeyama 1991).
+    """
+    T = np.eye(4)
+    if how == "none":
+        return T, 1.0
+    scale, R, t = umeyama(
+        torch.from_numpy(np.ascontiguousarray(estimate, np.float64)),
+        torch.from_numpy(np.ascontiguousarray(reference, np.float64)),
+        with_scale=how == "sim3",
+    )
+    T[:3, :3], T[:3, 3] = (scale * R).numpy(), t.numpy()
+    return T, float(scale)
+
+
+def align_orientations(
+    estimate: Float[np.ndarray, "n 4 4"], reference: Float[np.ndarray, "n 4 4"]
+) -> Float[np.ndarray, "4 4"]:
+    """Rigid motion that fits orientations best (chordal mean) and takes the mean place to the
+    mean place."""
+    T = np.eye(4)
+    T[:3, :3] = best_rotation(estimate[:, :3, :3], reference[:, :3, :3])
+    T[:3, 3] = reference[:, :3, 3].mean(0) - T[:3, :3] @ estimate[:, :3, 3].mean(0)
+    return T
+
+
+def best_rotation(
+    estimate: Float[np.ndarray, "n 3 3"], reference: Float[np.ndarray, "n 3 3"]
+) -> Float[np.ndarray, "3 3"]:
+    """Rotation of the world of some orientations that takes them nearest to others."""
+    return nearest_rotation((reference @ estimate.transpose(0, 2, 1)).sum(0))
+
+
+@on_one_torch_thread
+def evaluate_trajectory(
+    estimate: Trajectory,
+    reference: Trajectory,
+    max_difference: float = 0.02,
+    alignment: Alignment = "sim3",
+) -> TrajectoryErrors:
+    """ATE of the camera positions, as ``evo_ape tum -a(s)`` computes it.
+
+    Poses are paired by time (:func:`associate`), the estimate is aligned (Sim(3) for monocular
+    runs, whose scale is free) and compared. Poses that are not finite are left out. Lost frames
+    (``tracked`` false) take part: their interpolated poses are part of the result. An estimate
+    that has orientations alone, all at one place, is aligned by these, at scale 1.
+
+    Raises InputError if fewer than three poses match in time or the motion does not determine an
+    alignment.
+    """
+    estimate, reference = finite_poses(estimate), finite_poses(reference)
+    i, j = associate(reference.timestamps, estimate.timestamps, max_difference)
+    if len(i) < 3:
+        raise InputError(_no_match(reference, estimate, len(i), max_difference))
+    truth, guess = reference.T_wc[i], estimate.T_wc[j]
+    if (guess[:, :3, 3] == guess[0, :3, 3]).all() and alignment != "none":
+        T, scale = align_orientations(guess, truth), 1.0
+    else:
+        try:
+            T, scale = align(guess[:, :3, 3], truth[:, :3, 3], alignment)
+        except GeogsError as reason:
+            raise InputError(f"The trajectories cannot be aligned: {reason}") from None
+    aligned = np.tile(np.eye(4), (len(guess), 1, 1))
+    aligned[:, :3, 3] = guess[:, :3, 3] @ T[:3, :3].T + T[:3, 3]
+    aligned[:, :3, :3] = T[:3, :3] / scale @ guess[:, :3, :3]
+    error = np.linalg.norm(aligned[:, :3, 3] - truth[:, :3, 3], axis=1)
+    angle = rotation_angle(aligned[:, :3, :3], truth[:, :3, :3])
+    steps = np.diff(truth[np.argsort(reference.timestamps[i]), :3, 3], axis=0)
+    return TrajectoryErrors(
+        ate_rmse_cm=100 * float(np.sqrt((error**2).mean())),
+        ate_mean_cm=100 * float(error.mean()),
+        ate_median_cm=100 * float(np.median(error)),
+        ate_max_cm=100 * float(error.max()),
+        ate_std_cm=100 * float(error.std()),
+        rotation_rmse_deg=float(np.sqrt((angle**2).mean())),
+        scale=scale,
+        alignment=alignment,
+        pairs=len(i),
+        estimated=len(estimate.timestamps),
+        reference=len(reference.timestamps),
+        path_length_m=float(np.linalg.norm(steps, axis=1).sum()),
+        T_ref_est=T,
+        timestamps=reference.timestamps[i],
+        position_error=error,
+        rotation_error=angle,
+        aligned=aligned,
+        truth=truth,
+    )
+
+
+def rotation_angle(
+    a: Float[np.ndarray, "n 3 3"], b: Float[np.ndarray, "n 3 3"]
+) -> Float[np.ndarray, "n"]:
+    """Angle between rotations in degrees; accurate near zero, where arccos of the trace is not."""
+    chord = np.linalg.norm(a - b, axis=(1, 2)) / 8**0.5
+    return np.degrees(2 * np.arcsin(np.clip(chord, 0, 1)))
+
+
+def finite_poses(trajectory: Trajectory) -> Trajectory:
+    """The trajectory without poses or times that are not finite."""
+    good = np.isfinite(trajectory.T_wc).all((1, 2)) & np.isfinite(trajectory.timestamps)
+    return Trajectory(trajectory.timestamps[good], trajectory.T_wc[good], trajectory.tracked[good])
+
+
+def _nearest(times: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """For each time the index of the nearest other."""
+    order = np.argsort(others, kind="stable")
+    ordered = others[order]
+    right = np.searchsorted(ordered, times).clip(0, len(others) - 1)
+    left = (right - 1).clip(0)
+    nearer = np.abs(ordered[left] - times) <= np.abs(ordered[right] - times)
+    return order[np.where(nearer, left, right)]
+
+
+def _no_match(reference: Trajectory, estimate: Trajectory, pairs: int, maximum: float) -> str:
+    spans = [
+        f"{t.timestamps.min():.3f} to {t.timestamps.max():.3f} s" if len(t.timestamps) else "empty"
+        for t in (estimate, reference)
+    ]
+    return (
+        f"Only {pairs} poses match within {maximum:g} s (estimate {spans[0]}, reference "
+        f"{spans[1]}); check that both use the same clock, or raise --max-diff."
+    )

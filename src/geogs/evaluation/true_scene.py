@@ -1,0 +1,80 @@
+"""True poses of whatever data set there is, and the images that belong to them."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from geogs.config import InputConfig
+from geogs.errors import InputError
+from geogs.evaluation.surfaces.photoconsistency import EvaluatedPhoto
+from geogs.evaluation.surfaces.silhouettes import Silhouette
+from geogs.io.pose_files import read_poses
+from geogs.io.sources.posed.posed_source import PosedSource
+from geogs.io.sources.sniff import holds_posed_images, open_posed_source
+from geogs.types import Trajectory
+
+_METRES = {"millimetres": 0.001}
+
+
+@dataclass(frozen=True)
+class TrueScene:
+    """The truth about the cameras."""
+
+    path: Path
+    trajectory: Trajectory
+    """In metres (or the data set's own unit where that is arbitrary)."""
+    metres: float = 1.0
+    """Per unit of the data set."""
+
+    def images(self, long_edge: int) -> PosedSource:
+        """The images with their poses in the data set's unit, at most ``long_edge`` pixels.
+
+        Raises:
+            InputError: there are none at the path.
+        """
+        return open_posed_source(self.path, InputConfig(long_edge=long_edge))
+
+
+def read_true_scene(path: Path) -> TrueScene:
+    """Read true poses: a pose file, a folder with one, or any image set with known poses.
+
+    Raises:
+        InputError: there are no poses.
+    """
+    try:
+        return TrueScene(path, read_poses(path))
+    except InputError as error:
+        if not path.exists() or (path.is_file() and path.suffix in (".txt", ".tum", ".csv")):
+            raise
+        try:
+            source = open_posed_source(path)
+        except InputError as why:
+            raise (why if holds_posed_images(path) else error) from None
+    metres = _METRES.get(source.scene_scale, 1.0)
+    T_wc = np.linalg.inv(source.T_cw)
+    T_wc[:, :3, 3] *= metres
+    trajectory = Trajectory(source.timestamps, T_wc, np.ones(len(T_wc), bool))
+    return TrueScene(path, trajectory, metres)
+
+
+def scaled(trajectory: Trajectory, factor: float) -> Trajectory:
+    """The trajectory in another unit of length."""
+    T_wc = trajectory.T_wc.copy()
+    T_wc[:, :3, 3] *= factor
+    return replace(trajectory, T_wc=T_wc)
+
+
+def silhouettes(source: PosedSource) -> list[Silhouette] | None:
+    """The masks of a data set, in its unit; none where an image has no mask."""
+    result = []
+    for image in source:
+        if image.mask is None:
+            return None
+        result.append(Silhouette(image.mask, source.camera, image.T_cw))
+    return result
+
+
+def photographs(source: PosedSource) -> list[EvaluatedPhoto]:
+    """The images of a data set with their masks, in its unit."""
+    return [EvaluatedPhoto(image.image, image.T_cw, image.mask) for image in source]

@@ -1,0 +1,155 @@
+"""From signed distances to triangles."""
+
+from collections import deque
+from collections.abc import Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from geogs.mesh.marching import march
+from geogs.mesh.triangle_mesh import Mesh
+from geogs.mesh.tsdf import BLOCK, LIMIT, SparseTsdf
+from geogs.threads import worker_count
+
+CHUNK = 16
+"""Blocks along a side of a chunk."""
+_SMALLEST = 1e-3
+
+
+@dataclass(frozen=True)
+class SurfacePart:
+    """The surface in one chunk of the space."""
+
+    chunk: tuple[int, int, int]
+    """Which of the chunks of :data:`CHUNK` blocks along a side."""
+    keys: Int[np.ndarray, "n"]
+    """Key of the voxel edge on which each vertex lies; the same in every part that has it."""
+    position: Float[np.ndarray, "n 3"]
+    """Positions of the vertices, in voxels."""
+    faces: Int[np.ndarray, "m 3"]
+
+
+def extract_surface(tsdf: SparseTsdf, min_weight: float = 1.5) -> Mesh:
+    """Triangles of the zero level, in the world frame of ``tsdf``.
+
+    Only cells whose eight voxels have at least ``min_weight`` give triangles: the far side of the
+    band, where distances end in voxels that nobody saw, is no surface. The space is worked
+    through in chunks of 128 voxels that share one layer; a vertex is identified by the voxel edge
+    it lies on, so chunks join without seams or double vertices.
+
+    Method: marching cubes (Lorensen and Cline 1987), see :mod:`geogs.mesh.marching`.
+    """
+    return stitched(surface_parts(tsdf, min_weight), tsdf.voxel)
+
+
+def surface_parts(tsdf: SparseTsdf, min_weight: float = 1.5) -> Iterator[SurfacePart]:
+    """The surface chunk by chunk, of those chunks that belong to the box of ``tsdf``."""
+    return (part for part in _marched(tsdf, min_weight) if len(part.faces))
+
+
+def _marched(tsdf: SparseTsdf, min_weight: float) -> Iterator[SurfacePart]:
+    """What threads make of the chunks, in their order; some are empty."""
+    with ThreadPoolExecutor(worker_count()) as threads:
+        waiting: deque[Future[SurfacePart]] = deque()
+        for chunk in _chunks(tsdf, min_weight):
+            waiting.append(threads.submit(_part, *chunk))
+            if len(waiting) > worker_count():  # chunks are large
+                yield waiting.popleft().result()
+        yield from (part.result() for part in waiting)
+
+
+def _part(
+    chunk: tuple[int, int, int],
+    origin: Int[np.ndarray, "3"],
+    distance: Float[np.ndarray, "x y z"],
+    cell: Bool[np.ndarray, "x y z"],
+) -> SurfacePart:
+    vertices, axis, triangles = march(distance, cell)
+    keys = _edge_keys(np.floor(vertices).astype(np.int64) + origin, axis)
+    return SurfacePart(chunk, keys, vertices + origin, triangles)
+
+
+def stitched(parts: Iterable[SurfacePart], voxel: float) -> Mesh:
+    """One mesh of the parts, which may come in any order and from several volumes."""
+    ordered = sorted(parts, key=lambda part: part.chunk)
+    if not ordered:
+        return Mesh.from_triangles(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32))
+    keys = np.concatenate([part.keys for part in ordered])
+    offsets = np.cumsum([0, *(len(part.keys) for part in ordered)])
+    faces = np.concatenate([p.faces + n for p, n in zip(ordered, offsets[:-1], strict=True)])
+    _, first, inverse = np.unique(keys, return_index=True, return_inverse=True)
+    vertices = np.concatenate([part.position for part in ordered])[first] * voxel
+    return Mesh.from_triangles(vertices.astype(np.float32), inverse[faces].astype(np.int32))
+
+
+def _chunks(
+    tsdf: SparseTsdf, min_weight: float
+) -> Iterator[tuple[tuple[int, int, int], np.ndarray, np.ndarray, np.ndarray]]:
+    """Chunk, first voxel, distances and cells of dense boxes that overlap by one voxel layer.
+
+    A cell is true at its upper corner if all its eight voxels were seen. Boxes without a cell or
+    without a zero are left out.
+    """
+    blocks = tsdf.coordinates
+    chunk_of = torch.div(blocks, CHUNK, rounding_mode="floor")
+    # A cell reaches one voxel up, so a chunk also needs the first layer of the next blocks.
+    for chunk in torch.unique(chunk_of, dim=0):
+        low = chunk * CHUNK
+        if not tsdf.owns(low):
+            continue
+        member = ((blocks >= low) & (blocks <= low + CHUNK)).all(-1).nonzero()[:, 0]
+        first = blocks[member].amin(0)
+        extent = blocks[member].amax(0) - first + 1
+        last = low + CHUNK
+        crop = torch.minimum(extent * BLOCK, (last - first) * BLOCK + 1).tolist()
+        if min(crop) < 2:
+            continue
+        place = blocks[member] - first
+        distance = _off_zero(_dense(tsdf.distance[member], place, extent, 1.0, crop))
+        weight = _dense(tsdf.weight[member], place, extent, 0.0, crop)
+        cell = _seen_cells(weight >= max(min_weight, 1e-6))
+        if bool(cell.any() & (distance.amin() < 0) & (distance.amax() > 0)):
+            x, y, z = chunk.tolist()
+            numbers = first.cpu().numpy() * BLOCK, distance.cpu().numpy(), cell.cpu().numpy()
+            yield (x, y, z), *numbers
+
+
+def _off_zero(distance: Float[Tensor, "x y z"]) -> Float[Tensor, "x y z"]:
+    """No value quite zero, so that a vertex lies strictly inside its edge."""
+    away = distance.abs().clamp(min=_SMALLEST)
+    return torch.where(distance < 0, -away, away)
+
+
+def _seen_cells(seen: Bool[Tensor, "x y z"]) -> Bool[Tensor, "x y z"]:
+    """Cells whose eight corners were seen, each at its upper corner."""
+    cell = seen
+    for axis in range(3):
+        length = cell.shape[axis]
+        both = cell.narrow(axis, 1, length - 1) & cell.narrow(axis, 0, length - 1)
+        cell = torch.cat([torch.zeros_like(cell.narrow(axis, 0, 1)), both], axis)
+    return cell
+
+
+def _dense(
+    values: Float[Tensor, "k 8 8 8"],
+    place: Int[Tensor, "k 3"],
+    extent: Int[Tensor, "3"],
+    fill: float,
+    crop: list[int],
+) -> Float[Tensor, "x y z"]:
+    nx, ny, nz = (int(n) for n in extent)
+    grid = values.new_full((nx, ny, nz, BLOCK, BLOCK, BLOCK), fill)
+    grid[place[:, 0], place[:, 1], place[:, 2]] = values
+    dense = grid.permute(0, 3, 1, 4, 2, 5).reshape(nx * BLOCK, ny * BLOCK, nz * BLOCK)
+    return dense[: crop[0], : crop[1], : crop[2]].contiguous()
+
+
+def _edge_keys(base: Int[np.ndarray, "n 3"], axis: Int[np.ndarray, "n"]) -> Int[np.ndarray, "n"]:
+    """A key of the voxel edge on which a vertex lies: its lower voxel and its axis."""
+    x, y, z = (base + LIMIT).T
+    width = 2 * LIMIT
+    return ((x * width + y) * width + z) * 4 + axis

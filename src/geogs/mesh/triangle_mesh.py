@@ -1,0 +1,76 @@
+"""The records of mesh extraction: what goes in and what comes out."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int32, UInt8
+from torch import Tensor
+
+from geogs.geometry.camera import Camera
+
+
+@dataclass(frozen=True, slots=True)
+class DepthMapView:
+    """One depth map with its pose, as rendered from the map."""
+
+    depth: Float[Tensor, "h w"]
+    """z in map units; zero, negative or not finite where nothing is known."""
+    weight: Float[Tensor, "h w"]
+    """Confidence, at least 0; 0 leaves the pixel out."""
+    camera: Camera
+    """Camera of the depth map."""
+    T_cw: Float[Tensor, "4 4"]
+    """World to camera, float64."""
+    image: UInt8[np.ndarray, "ih iw 3"] | None = None
+    """RGB of the same view, of any size; gives the vertices their colour."""
+
+    def valid(self) -> torch.Tensor:
+        """Pixels (h, w) that carry a depth."""
+        return torch.isfinite(self.depth) & (self.depth > 0) & (self.weight > 0)
+
+
+@dataclass(frozen=True, slots=True)
+class Mesh:
+    """Triangles in the world frame; faces turn counter-clockwise seen from free space."""
+
+    vertices: Float[np.ndarray, "n 3"]
+    """float32, map units."""
+    faces: Int32[np.ndarray, "m 3"]
+    normals: Float[np.ndarray, "n 3"]
+    """float32, unit, towards free space."""
+    colours: UInt8[np.ndarray, "n 3"] | None = None
+    """RGB."""
+
+    @staticmethod
+    def from_triangles(vertices: Float[np.ndarray, "n 3"], faces: np.ndarray) -> "Mesh":
+        """A mesh whose normals are computed from its faces."""
+        vertices = np.asarray(vertices, np.float32)
+        faces = np.asarray(faces, np.int32).reshape(-1, 3)
+        return Mesh(vertices, faces, vertex_normals(vertices, faces))
+
+
+def vertex_normals(
+    vertices: Float[np.ndarray, "n 3"], faces: Int32[np.ndarray, "m 3"]
+) -> Float[np.ndarray, "n 3"]:
+    """Unit normals, the mean of a vertex's faces weighted by area; zero where it has none."""
+    from geogs.mesh.face_kernels import normal_sums
+
+    total = normal_sums(np.ascontiguousarray(vertices), np.ascontiguousarray(faces))
+    length = np.linalg.norm(total, axis=1, keepdims=True)
+    return (total / np.where(length > 0, length, 1)).astype(np.float32)
+
+
+def cross(a: Float[np.ndarray, "n 3"], b: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    """Cross products of the rows, several times faster than NumPy's for long arrays."""
+    x, y, z = a.T
+    u, v, w = b.T
+    return np.stack([y * w - z * v, z * u - x * w, x * v - y * u], -1)
+
+
+def median_edge(mesh: Mesh) -> float:
+    """Median length of the edges of the faces; zero where there is none."""
+    if not len(mesh.faces):
+        return 0.0
+    corners = mesh.vertices.astype(np.float64)[mesh.faces]
+    return float(np.median(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)))
