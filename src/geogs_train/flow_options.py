@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
 from geogs.config import Seed
-from geogs.config.setting import Count, Positive, Range, Settings, Share, Weight
+from geogs.config.setting import Count, Fraction, Positive, Range, Settings, Weight
 from geogs.tracking.flow.own_options import NetworkOptions
 from geogs_synth.clips.room_options import RoomOptions, SceneWeights
 
@@ -43,7 +43,7 @@ class FlowTraining(Settings, group="training"):
         )
     )
     """What the clips show; every ordered pair of neighbouring views is an edge."""
-    far: Share = 0.2
+    far: Fraction = 0.2
     """Fraction of the edges, beside those from nothing, whose start is off by 16 to 64 pixels."""
     iterations: Count = 6
     """Iterations of the network per edge."""

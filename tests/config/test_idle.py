@@ -30,7 +30,7 @@ CASES = {
     "--mapping.depth.engine classical --mapping.depth.weights x": "the engine classical has none",
     "--mapping.disk.no-carve --mapping.disk.carve-every 3": "mapping.disk.carve-every does",
     "--mapping.loss.ablation.smoothness-rewards-edges": "rewards-edges does nothing",
-    "--mapping.loss.occlusion-share 0.1 --mapping.loss.occlusion 1": "mapping.loss.occlusion does",
+    "--mapping.loss.occlusion-ratio 0.1 --mapping.loss.occlusion 1": "mapping.loss.occlusion does",
     "--mapping.loss.colour --mapping.loss.l1-weight 0": "mapping.loss.colour does nothing",
     "--mapping.loss.measured-factor 2": "mapping.loss.measured-factor does nothing",
     "--prior.card omnidata": "prior.card does nothing",

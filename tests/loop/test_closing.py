@@ -11,7 +11,7 @@ from geogs.loop.closing import brought_forward
 from geogs.types import PoseCorrection
 from keyframe_samples import Sample, add
 
-OPTIONS = LoopConfig(strain=0.0, min_change=0.0, close_every=1)
+OPTIONS = LoopConfig(residual=0.0, min_change=0.0, close_every=1)
 FINAL = replace(NOTHING, finalized=(7,))
 """Of a frame at which a keyframe became final."""
 STEP = se3_exp(torch.tensor([0.02, -0.01, 0.03, 0.01, 0.02, -0.015], dtype=torch.float64))

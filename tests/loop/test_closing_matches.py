@@ -65,7 +65,7 @@ def test_depths_of_the_frame_graph_alone_are_taken_over():
 def closed(matches: bool) -> float:
     """Mean error of the relative translations of neighbours after the loop was closed."""
     tracker, loop = world(drift=0.06)
-    closer = closer_of(tracker, loop, LoopConfig(matches=matches, strain=0.0, min_change=0.0))
+    closer = closer_of(tracker, loop, LoopConfig(matches=matches, residual=0.0, min_change=0.0))
     closer.update(NOTHING, is_last=True)
     assert closer.table.closures == 1
     keyframes, error = tracker.keyframes, 0.0

@@ -81,7 +81,7 @@ MULTI = {
     "l1 plain": LossConfig(ncc_weight=0.0, l1_huber=0.0, l1_cut=1.0),
     "ssim": LossConfig(ssim_weight=0.4),
     "colour": LossConfig(
-        ssim_weight=0.4, colour=True, occlusion_share=0.05, l1_huber=0.0, l1_cut=1.0
+        ssim_weight=0.4, colour=True, occlusion_ratio=0.05, l1_huber=0.0, l1_cut=1.0
     ),
 }
 

@@ -238,7 +238,7 @@ PAIRS = {
     "ncc 11": {"ncc_weight": 0.5, "ncc_patch": 11, "ncc_reject": 1.5},
     "ssim": {"ssim_weight": 0.3},
     "colour": {"ssim_weight": 0.3, "l1_weight": 1.0, "ncc_weight": 0.5, "colour": True},
-    "tau": {"l1_weight": 1.0, "occlusion_share": 0.05},
+    "tau": {"l1_weight": 1.0, "occlusion_ratio": 0.05},
     "ssim, l1": {"ssim_weight": 0.3, "l1_weight": 1.0},
     "sobel": {
         "l1_weight": 1.0,

@@ -157,7 +157,7 @@ def test_colour_is_compared_as_printed_and_correlation_in_grey() -> None:
     )
     config = LossConfig(
         l1_weight=0.8, l1_huber=0.0, l1_cut=10.0, ssim_weight=0.2, ncc_weight=0.15, colour=True,
-        occlusion_share=0.05,
+        occlusion_ratio=0.05,
     )  # fmt: skip
     wrong = 1.02 * depth
     warped = warp(target.grey, wrong, CAMERA, CAMERA, REFERENCE, TARGET)

@@ -43,7 +43,7 @@ def mapped(samples: list[Sample], level: bool = True) -> Mapper:
         render_long_edge=80,
         lag=0,
         iterations=0,
-        photo=replace(Config().mapping.photo, level=level, min_parallax=0.5),
+        photo=replace(Config().mapping.photo, compensate_exposure=level, min_parallax=0.5),
     )
     mapper = Mapper(segment_of(samples, CAMERA).table, config)
     for n in range(len(samples)):

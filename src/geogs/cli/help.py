@@ -53,8 +53,7 @@ def _head(leaf: Leaf) -> str:
 
 def _explained(leaf: Leaf) -> str:
     """The help of an option with its default and its range."""
-    ranges = " and ".join(map(str, leaf.kind.ranges))
-    beside = "; ".join(text for text in (default_text(leaf), ranges) if text)
+    beside = "; ".join(text for text in (default_text(leaf), str(leaf.kind.range)) if text)
     return leaf.help + (f" ({beside})" if beside else "")
 
 

@@ -3,24 +3,19 @@
 The string under a field is its help text: meaning, unit, range.
 """
 
-from geogs.config.calibration import CalibrationConfig
-from geogs.config.depth import DepthConfig
 from geogs.config.input import InputConfig
-from geogs.config.known_poses import (
+from geogs.config.losses import LossAblation, LossConfig
+from geogs.config.mapping import DepthConfig, DiskConfig, MapAblation, MappingConfig, PhotoConfig
+from geogs.config.mesh import MeshConfig
+from geogs.config.priors import DepthSensorConfig, OdometryConfig, PriorConfig
+from geogs.config.reconstruct import (
     ReconstructConfig,
     SearchConfig,
     known_pose_mapping,
     reconstruct_preset,
 )
-from geogs.config.loop import LoopConfig
-from geogs.config.losses import LossAblation, LossConfig
-from geogs.config.mapping import DiskConfig, MapAblation, MappingConfig, PhotoConfig
-from geogs.config.mesh import MeshConfig
-from geogs.config.odometry import OdometryConfig
-from geogs.config.prior import PriorConfig
-from geogs.config.sensor import DepthSensorConfig
-from geogs.config.slam import Config, Preset, Seed, preset
-from geogs.config.tracking import TrackingConfig
+from geogs.config.run import Config, Preset, Seed, preset
+from geogs.config.tracking import CalibrationConfig, LoopConfig, TrackingConfig
 
 __all__ = [
     "CalibrationConfig",

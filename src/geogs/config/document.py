@@ -4,10 +4,10 @@ import sys
 from collections.abc import Sequence
 from typing import get_args
 
-from geogs.config.known_poses import ReconstructConfig, reconstruct_preset
 from geogs.config.leaves import Leaf, default_text, leaves
+from geogs.config.reconstruct import ReconstructConfig, reconstruct_preset
+from geogs.config.run import Config, Preset, preset
 from geogs.config.setting import Basic, Only, Settings
-from geogs.config.slam import Config, Preset, preset
 
 _INTRODUCTION = """\
 # Settings

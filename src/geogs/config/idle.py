@@ -2,13 +2,11 @@
 
 from collections.abc import Iterator
 
-from geogs.config.known_poses import ReconstructConfig
 from geogs.config.losses import LossConfig
 from geogs.config.mapping import DiskConfig, MappingConfig
-from geogs.config.odometry import OdometryConfig
-from geogs.config.prior import PriorConfig
-from geogs.config.sensor import DepthSensorConfig
-from geogs.config.slam import Config
+from geogs.config.priors import DepthSensorConfig, OdometryConfig, PriorConfig
+from geogs.config.reconstruct import ReconstructConfig
+from geogs.config.run import Config
 from geogs.config.tracking import TrackingConfig
 
 
@@ -83,7 +81,7 @@ def _losses(loss: LossConfig) -> Iterator[str]:
             "mapping.loss.ablation.smoothness-rewards-edges does nothing: "
             "mapping.loss.smoothness-weight is 0."
         )
-    if loss.occlusion_share > 0 and loss.occlusion != LossConfig.occlusion:
-        yield "mapping.loss.occlusion does nothing beside mapping.loss.occlusion-share."
+    if loss.occlusion_ratio > 0 and loss.occlusion != LossConfig.occlusion:
+        yield "mapping.loss.occlusion does nothing beside mapping.loss.occlusion-ratio."
     if loss.colour and max(loss.l1_weight, loss.ssim_weight) == 0:
         yield "mapping.loss.colour does nothing: L_1 and L_ssim have no weight."

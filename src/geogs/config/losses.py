@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
-from geogs.config.setting import Only, Range, Settings, Share, Weight
+from geogs.config.setting import Fraction, Only, Range, Settings, Weight
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class LossConfig(Settings, group="mapping.loss"):
     """L_ds, edge-aware smoothness of depth over its median."""
     l1_weight: Weight = 4.0
     """L_1, difference between a view and its neighbour warped into it."""
-    l1_huber: Share = 0.005
+    l1_huber: Fraction = 0.005
     """Grey difference (of 1) up to which L_1 is quadratic; 0 for the plain absolute value."""
     l1_cut: Annotated[float, Range(above="l1_huber", most=10)] = 0.1
     """Grey difference (of 1) from which L_1 is constant."""
@@ -53,14 +53,14 @@ class LossConfig(Settings, group="mapping.loss"):
     """Side of the correlation window in pixels of the photometric image."""
     ncc_reject: Annotated[float, Range(above=0, most=2)] = 0.9
     """Windows with 1 - NCC of this or more are taken for occluded or changed."""
-    ncc_texture: Share = 1e-6
+    ncc_texture: Fraction = 1e-6
     """A window of grey variance v weighs v / (v + this); 0 weighs all windows alike."""
     ssim_weight: Weight = 0.0
     """L_ssim, 1 - structural similarity; slow on a CPU."""
     occlusion: Annotated[float, Range(above=0, most=1e6)] = 2.25
     """Depth difference to the neighbour's depth from which a pixel is hidden, in pixels of the
     photometric image that it is worth at 10 degrees of parallax."""
-    occlusion_share: Annotated[float, Range(0, below=1)] = 0.0
+    occlusion_ratio: Annotated[float, Range(0, below=1)] = 0.0
     """The same as a part of the depth whatever the camera, the paper's tau; 0 takes the pixels."""
     colour: bool = False
     """L_1 and L_ssim over red, green and blue, as the paper has it, instead of grey; L_ncc is grey

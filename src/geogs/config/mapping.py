@@ -3,18 +3,17 @@
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Literal
 
-from geogs.config.depth import DepthConfig
 from geogs.config.losses import LossConfig
 from geogs.config.setting import (
     Angle,
     Basic,
     Count,
     CountOrZero,
+    Fraction,
     Only,
     Positive,
     Range,
     Settings,
-    Share,
     Weight,
 )
 
@@ -31,13 +30,13 @@ class DiskConfig(Settings, group="mapping.disk"):
 
     stride: Annotated[int, Range(1, 100)] = 3
     """A candidate every stride-th pixel of the render."""
-    insert_alpha: Share = 0.4
+    insert_alpha: Fraction = 0.4
     """A pixel gets a disk where the map's alpha is below this."""
     insert_behind: Weight = 0.05
     """... or where the map lies this fraction of the depth behind a sure depth."""
-    insert_confidence: Share = 0.3
+    insert_confidence: Fraction = 0.3
     """Least confidence of a depth that makes a disk at once; the rest follows later."""
-    fill_confidence: Share = 0.1
+    fill_confidence: Fraction = 0.1
     """Least confidence of a depth that makes a disk where nothing better has come since."""
     neighbours: Annotated[int, Range(4, 31)] = 12
     """Points of the local plane fit."""
@@ -46,7 +45,7 @@ class DiskConfig(Settings, group="mapping.disk"):
     bound_spacing: bool = True
     """Keep that distance within 0.3 to 1.5 of the distance between samples, so that a stray point
     makes neither a speck nor a blanket; off as in the paper."""
-    planarity_threshold: Share = 0.05
+    planarity_threshold: Fraction = 0.05
     """Below this planarity the initial scale shrinks."""
     planarity_shrink: Positive = 0.5
     """Factor of that shrinking; the paper's is 0.1."""
@@ -58,10 +57,10 @@ class DiskConfig(Settings, group="mapping.disk"):
     """Smallest standard deviation, in u."""
     prune_opacity: Annotated[float, Range(0, below=1)] = 0.05
     """Disks below this opacity are removed."""
-    split_share: Annotated[float, Range(0, below=1)] = 0.0
+    split_ratio: Annotated[float, Range(0, below=1)] = 0.0
     """Part of the disks that is split in two, where the losses pull hardest, each time that the
     training over all keyframes reaches a split."""
-    split_times: tuple[Share, ...] = (0.2, 0.35, 0.5)
+    split_times: tuple[Fraction, ...] = (0.2, 0.35, 0.5)
     """When that is, in parts of that training."""
     split_pixels: Weight = 1.0
     """Disks with no standard deviation above this many pixels at u are not split."""
@@ -81,7 +80,7 @@ class PhotoConfig(Settings, group="mapping.photo"):
     """Degrees."""
     max_parallax: Annotated[float, Range(above="min_parallax", most=180)] = 25.0
     """Degrees."""
-    looking_within: Angle = 35.0
+    max_view_angle: Angle = 35.0
     """Largest angle between the optical axes, degrees."""
     candidates: Annotated[int, Range(1, 1000)] = 6
     """Partners kept per keyframe."""
@@ -90,8 +89,22 @@ class PhotoConfig(Settings, group="mapping.photo"):
     fresh: bool = False
     """Render the partners anew in every step for the occlusion test, as the paper does; off takes
     what they showed when they were trained last."""
-    level: bool = True
+    compensate_exposure: bool = True
     """Bring all keyframes into the same light (gain and offset of their grey values) for L_1."""
+
+
+@dataclass(frozen=True)
+class DepthConfig(Settings, group="mapping.depth"):
+    """Dense depth of a keyframe before any disk is made."""
+
+    engine: Literal["auto", "classical", "network", "joint", "tracker"] = "auto"
+    """Who finds depth: matching without a network, the network of geogs train depth, both, each
+    where it is surer (auto on a GPU; on a CPU that is classical), or nobody: the tracker's own
+    depth, enlarged, as the paper has it."""
+    weights: str = ""
+    """Weights file of the network; "" takes the one that is found."""
+    planes: Annotated[int, Range(2, 256)] = 144
+    """Most planes of inverse depth that are searched, and half of them at least."""
 
 
 @dataclass(frozen=True)

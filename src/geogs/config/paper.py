@@ -6,11 +6,10 @@ ours where these do not fit.
 
 from dataclasses import replace
 
-from geogs.config.depth import DepthConfig
-from geogs.config.loop import LoopConfig
 from geogs.config.losses import LossAblation, LossConfig
-from geogs.config.mapping import DiskConfig, MapAblation, MappingConfig, PhotoConfig
-from geogs.config.prior import PriorConfig
+from geogs.config.mapping import DepthConfig, DiskConfig, MapAblation, MappingConfig, PhotoConfig
+from geogs.config.priors import PriorConfig
+from geogs.config.tracking import LoopConfig
 
 LONG_EDGE = 616
 """Pixels; as large as the front ends that the paper builds on have Replica's images."""
@@ -35,7 +34,7 @@ def paper_losses() -> LossConfig:
         ncc_reject=2.0,
         ncc_texture=0.0,
         ssim_weight=0.2,
-        occlusion_share=0.05,
+        occlusion_ratio=0.05,
         colour=True,
         photo_blur=0.0,
         ablation=LossAblation(depth_relative=False, smoothness_rewards_edges=True),
@@ -75,7 +74,7 @@ def paper_mapping() -> MappingConfig:
         pose_lr=4e-4,
         max_spread=_UNBOUNDED,
         disk=paper_disks(),
-        photo=PhotoConfig(per_step=1, fresh=True, level=False),
+        photo=PhotoConfig(per_step=1, fresh=True, compensate_exposure=False),
         depth=DepthConfig(engine="tracker"),
         loss=paper_losses(),
         ablation=MapAblation(map_update="coherent"),
@@ -92,14 +91,16 @@ def paper_known_pose_mapping(usual: MappingConfig) -> MappingConfig:
         photo_scale=1.0,
         max_spread=_UNBOUNDED,
         disk=replace(paper_disks(), insert_confidence=0.3, fill_confidence=0.1),
-        photo=PhotoConfig(candidates=8, looking_within=30.0, per_step=1, fresh=True, level=False),
+        photo=PhotoConfig(
+            candidates=8, max_view_angle=30.0, per_step=1, fresh=True, compensate_exposure=False
+        ),
         loss=replace(paper_losses(), depth_weight=0.0, normal_weight=0.0),
     )
 
 
 def paper_loops() -> LoopConfig:
     """Loops among places that the present poses show together, closed with all their matches."""
-    return LoopConfig(min_gap=52, appearance=0, strain=0.0, matches=True)
+    return LoopConfig(min_gap=52, appearance=0, residual=0.0, matches=True)
 
 
 def paper_prior() -> PriorConfig:

@@ -24,7 +24,7 @@ from geogs.errors import InputError
 _SECONDS = {"s": 1.0, "min": 60.0, "m": 60.0, "h": 3600.0}
 
 Bound = float | str
-"""A number, or the name of another setting of the group, or a sum of such: ``window + history``."""
+"""A number, or the name of another setting of the group."""
 
 
 @dataclass(frozen=True)
@@ -42,10 +42,15 @@ class Range:
     or_zero: bool = False
     """0 is allowed, too."""
 
-    def holds(self, value: float, group: object) -> bool:
-        """Whether a finite number lies in the range, given the other settings of its group."""
+    def holds(self, value: float, group: object = None) -> bool:
+        """Whether a finite number lies in the range, given the other settings of its group.
+
+        Without a group, bounds by other settings are not looked at.
+        """
         bounds = (self.least, self.most, self.above, self.below)
-        least, most, above, below = (_resolved(bound, group) for bound in bounds)
+        least, most, above, below = (
+            bound if not isinstance(bound, str) else getattr(group, bound, None) for bound in bounds
+        )
         return (self.or_zero and value == 0) or (
             (least is None or value >= least)
             and (most is None or value <= most)
@@ -57,7 +62,7 @@ class Range:
     def partners(self) -> tuple[str, ...]:
         """Names of the settings that the bounds refer to."""
         bounds = (self.least, self.most, self.above, self.below)
-        return tuple(name for bound in bounds if isinstance(bound, str) for name in _names(bound))
+        return tuple(bound for bound in bounds if isinstance(bound, str))
 
     def __str__(self) -> str:
         """Such as ``from 1 to 8``, ``above 0 and at most 1``, ``from 3 to 15 and odd``."""
@@ -103,7 +108,7 @@ class Unnamed:
     """A group whose settings stand at the top of the command line, without its name."""
 
 
-Share = Annotated[float, Range(0, 1)]
+Fraction = Annotated[float, Range(0, 1)]
 Angle = Annotated[float, Range(0, 180)]
 """Degrees."""
 Weight = Annotated[float, Range(0, 1e6)]
@@ -126,7 +131,8 @@ class Kind:
     """What may stand instead of a number, such as auto."""
     is_tuple: bool = False
     """Whether it is any number of such values."""
-    ranges: tuple[Range, ...] = ()
+    range: Range = Range()
+    """Of numbers."""
     marks: tuple[object, ...] = ()
     """What else the type says of it, such as :class:`Basic`."""
 
@@ -136,21 +142,21 @@ class Kind:
         origin, inner = get_origin(annotation), get_args(annotation)
         if origin is Annotated:
             return Kind.of(inner[0], (*inner[1:], *marks))
-        ranges = tuple(mark for mark in marks if isinstance(mark, Range))
-        marks = tuple(mark for mark in marks if not isinstance(mark, Range))
         if origin in (Union, types.UnionType) and len(inner) == 2:
             instead = get_args(inner[1]) if get_origin(inner[1]) is Literal else ()
             if inner[1] is type(None):
-                return replace(Kind.of(inner[0], (*ranges, *marks)), is_optional=True)
+                return replace(Kind.of(inner[0], marks), is_optional=True)
             if len(instead) == 1:
-                return replace(Kind.of(inner[0], (*ranges, *marks)), word=instead[0])
+                return replace(Kind.of(inner[0], marks), word=instead[0])
         if origin is tuple and len(inner) == 2 and inner[1] is ...:
-            return replace(Kind.of(inner[0], (*ranges, *marks)), is_tuple=True)
+            return replace(Kind.of(inner[0], marks), is_tuple=True)
+        bounds = next((mark for mark in marks if isinstance(mark, Range)), Range())
+        marks = tuple(mark for mark in marks if not isinstance(mark, Range))
         if origin is Literal:
-            return Kind(str, inner, ranges=ranges, marks=marks)
+            return Kind(str, inner, marks=marks)
         if annotation not in (bool, int, float, str, Path):
             raise TypeError(f"no setting can be of the type {annotation}")
-        return Kind(annotation, ranges=ranges, marks=marks)
+        return Kind(annotation, range=bounds, marks=marks)
 
     def allows(self, value: object, group: object = None) -> bool:
         """Whether a setting of this kind can be ``value``, given the others of its group.
@@ -191,8 +197,8 @@ class Kind:
         text = many if self.is_tuple else one
         if Time in self.marks:
             text += ", as seconds or such as 90s, 10m or 1h,"
-        if self.ranges:
-            text += " " + " and ".join(map(str, self.ranges))
+        if str(self.range):
+            text += f" {self.range}"
         if self.choices:
             text = " or ".join(self.choices)
         text = f"{self.word} or {text}" if self.word else text
@@ -207,7 +213,7 @@ class Kind:
         if isinstance(value, bool) or not isinstance(value, number):
             return False
         finite = isinstance(value, Integral) or math.isfinite(value)
-        return finite and all(r.holds(value, group) for r in self.ranges)  # type: ignore[arg-type]
+        return finite and self.range.holds(value, group)  # type: ignore[arg-type]
 
     def _read_one(self, text: str) -> object:
         units = [unit for unit in _SECONDS if Time in self.marks and text.endswith(unit)]
@@ -249,10 +255,8 @@ _SHORT.maxtuple = 16  # all that a setting has
 
 def refusal(name: str, value: object, kind: Kind, group: object = None) -> str:
     """The sentence for a value that a setting cannot have."""
-    partners = [name for bounds in kind.ranges for name in bounds.partners()]
-    known = []
-    if group is not None:
-        known = [f"{dashed(name)} is {getattr(group, name)}" for name in partners]
+    partners = () if group is None else kind.range.partners()
+    known = [f"{dashed(name)} is {getattr(group, name)}" for name in partners]
     beside = f" ({', '.join(known)})" if known else ""
     given = _SHORT.repr(value) if isinstance(value, str | int | tuple) else repr(value)
     return f"{dashed(name)} is {given}, but must be {kind}{beside}."
@@ -279,16 +283,6 @@ def _kinds(settings: type) -> Iterator[tuple[str, Kind]]:
     for field in fields(settings):  # type: ignore[arg-type]  # always a dataclass
         if group_of(field.type) is None:
             yield field.name, Kind.of(field.type)
-
-
-def _names(bound: str) -> list[str]:
-    return bound.split(" + ")
-
-
-def _resolved(bound: Bound | None, group: object) -> float | None:
-    if not isinstance(bound, str):
-        return bound
-    return None if group is None else sum(getattr(group, name) for name in _names(bound))
 
 
 def _shown(bound: Bound) -> str:

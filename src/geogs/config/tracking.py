@@ -1,9 +1,22 @@
-"""Settings of the front end."""
+"""Settings of the front end: self-calibration, tracking and loops."""
 
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-from geogs.config.setting import Basic, Count, Range, Settings, Share
+from geogs.config.setting import Basic, Count, CountOrZero, Fraction, Range, Settings, Weight
+
+
+@dataclass(frozen=True)
+class CalibrationConfig(Settings, group="calibration"):
+    """How intrinsics that nobody gave are found from the video itself.
+
+    Intrinsics that the user or a data set gives are never changed.
+    """
+
+    refine: Annotated[bool, Basic()] = True
+    """Whether a guessed focal length, or one from EXIF, is refined before the run."""
+    radial: Annotated[bool, Basic()] = False
+    """Also find one radial distortion term (OpenCV's k1) and undistort the images by it."""
 
 
 @dataclass(frozen=True)
@@ -17,9 +30,9 @@ class TrackingConfig(Settings, group="tracking"):
     """What measures image motion; auto takes classical, which needs no weights."""
     weights: Annotated[str, Basic()] = ""
     """File with the operator's weights; empty looks for one (geogs weights says where)."""
-    keyframe_flow: Share = 0.025
+    keyframe_flow: Fraction = 0.025
     """Median motion since the last keyframe that makes a frame a keyframe, of the long edge."""
-    keyframe_overlap: Share = 0.7
+    keyframe_overlap: Fraction = 0.7
     """A frame that has moved a fifth of that becomes one, too, when less than this fraction of the
     last keyframe finds a match in it."""
     init_keyframes: Annotated[int, Range(4, 1000)] = 12
@@ -31,3 +44,32 @@ class TrackingConfig(Settings, group="tracking"):
     moving: Annotated[float, Range(0, 1000)] = 3.0
     """A region is held for something that moves, and left out, where its matches contradict a rigid
     scene by this many times what is usual; 0 leaves nothing out."""
+
+
+@dataclass(frozen=True)
+class LoopConfig(Settings, group="loop"):
+    """Where loops are looked for and how many are kept.
+
+    Distances in the image are fractions of its longer side, so that they hold at any resolution.
+    """
+
+    enabled: Annotated[bool, Basic()] = True
+    """Look for loops, close them, and recognise places when the camera is lost."""
+    min_gap: Count = 15
+    """Keyframes that lie at least between the two views of a loop."""
+    appearance: CountOrZero = 5
+    """Candidates taken from the index per keyframe; 0 looks only where the present poses say."""
+    close_every: Count = 5
+    """Keyframes between two corrections, at least."""
+    residual: Weight = 5.0
+    """Squared error of a loop at the present poses, in its own variances, from which it calls for a
+    correction. Variances are cautious: right loops come to 1 or 2, where 7 would be exact."""
+    matches: bool = False
+    """Adjust the matches of loops and of the frame graph together with the relative poses, depths
+    included, when a loop is closed (the paper's Sim(3) bundle adjustment); off leaves it at the
+    relative poses."""
+    min_change: Weight = 0.002
+    """Corrections that move no keyframe by more than this are not worth it for the map: radians,
+    parts of its median depth, or of its scale."""
+    global_ba_every: Annotated[CountOrZero, Basic("--global-ba-every")] = 0
+    """Keyframes between two bundle adjustments of all keyframes; 0 leaves that to the end."""

@@ -156,7 +156,7 @@ class LoopCloser:
         known.loops = thinned(joined([known.loops, constraint]), MOST_LOOPS)
         ends = sorted({loop.first, loop.second})
         residual = strains(first.keyframes.poses(ends), between_positions(constraint, ends))
-        known.pending += bool((residual > self.config.strain).any())
+        known.pending += bool((residual > self.config.residual).any())
 
     def _constraint(self, loop: Loop) -> RelativePoses:
         return of_loop(self.segments.main.keyframes.table, loop)

@@ -246,7 +246,7 @@ def compared_planes(config: LossConfig) -> tuple[tuple[int, LossConfig], ...]:
 
 def occlusion_tolerance(config: LossConfig, camera: Camera) -> float:
     """Relative depth difference from which a pixel is hidden: tau, or what pixels come to."""
-    return config.occlusion_share or depth_tolerance(config.occlusion, camera)
+    return config.occlusion_ratio or depth_tolerance(config.occlusion, camera)
 
 
 def multi_view_loss(

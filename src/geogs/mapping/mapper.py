@@ -415,7 +415,7 @@ class Mapper:
 
     def _level(self, view: MapView) -> None:
         """Give a view's grey values the light of the partners that have it already."""
-        if view.is_levelled or not self.config.photo.level:
+        if view.is_levelled or not self.config.photo.compensate_exposure:
             return
         known = [self.views[i] for i in view.partners if self.views[i].is_levelled]
         self.pool.set_light(view.id, light_of(view, known))
@@ -521,11 +521,11 @@ class Mapper:
     def _split(self) -> None:
         """Split the disks that are pulled hardest; those below a pixel are small enough."""
         disk, optimizer = self.config.disk, self._training().optimizer
-        if disk.split_share == 0:
+        if disk.split_ratio == 0:
             return
         pixel = self.unit / self.cameras.render.fx
         chosen = worth_splitting(
-            self.map, optimizer.position_gradient, disk.split_share, disk.split_pixels * pixel
+            self.map, optimizer.position_gradient, disk.split_ratio, disk.split_pixels * pixel
         )
         ids = self.map.keyframe_id[chosen]
         optimizer.replace(chosen, split(self.map, chosen), torch.cat([ids, ids]))

@@ -40,7 +40,7 @@ def choose_partners(
         return []
     parallax, turn = parallax_degrees(view.place, [o.place for o in others], depth)
     usable = (config.min_parallax < parallax) & (parallax < config.max_parallax)
-    usable &= turn < config.looking_within
+    usable &= turn < config.max_view_angle
     scores = misfit(parallax, turn, config.parallax)
     scored = sorted((scores[i], o.id) for i, o in enumerate(others) if usable[i])
     return [i for _, i in scored[: config.candidates]]

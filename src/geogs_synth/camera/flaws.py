@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-from geogs.config.setting import Range, Settings, Share
+from geogs.config.setting import Fraction, Range, Settings
 
 CameraKind = Literal["clean", "phone", "kinect", "action"]
 """Cameras with typical flaws."""
@@ -23,7 +23,7 @@ class Flaws(Settings, group="flaws"):
     """Stops by which the automatic exposure wanders to either side, within a few seconds."""
     colour_drift: Annotated[float, Range(0, 0.5)] = 0.0
     """Fraction by which the white balance wanders between red and blue."""
-    vignetting: Share = 0.0
+    vignetting: Fraction = 0.0
     """Fraction of the light that is lost in the corners."""
     jpeg: Annotated[int, Range(1, 100)] | None = None
     """Quality of JPEG that the image goes through; none writes it as the format does."""

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Annotated
 
-from geogs.config.setting import Count, Range, Settings, Share, Weight
+from geogs.config.setting import Count, Fraction, Range, Settings, Weight
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class RoomOptions(Settings, group="training.rooms"):
     """Height of the images, pixels."""
     views: Annotated[int, Range(2, 100)] = 2
     """Per clip; 2 makes pairs, more make short smooth paths."""
-    least_density: Share = 0.12
+    least_density: Fraction = 0.12
     """Least fraction of the places for solids that a room fills (there are about 125)."""
     most_density: Annotated[float, Range("least_density", 1)] = 0.5
     """Largest fraction of them."""
@@ -65,9 +65,9 @@ class RoomOptions(Settings, group="training.rooms"):
     """Camera paths tried per clip; the first that suits is taken."""
     disturbance: Weight = 1.0
     """Strength of noise, blur, artefacts and changes of exposure; 0 leaves the images clean."""
-    clean: Share = 0.3
+    clean: Fraction = 0.3
     """Fraction of the clips that are nearly undisturbed."""
-    light_change: Share = 0.15
+    light_change: Fraction = 0.15
     """Fraction of the clips whose light changes between the views."""
     textures: Count = 256
     """Images in the texture bank."""

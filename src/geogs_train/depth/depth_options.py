@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from typing import Annotated
 
 from geogs.config import Seed
-from geogs.config.setting import Count, Positive, Range, Settings, Share, Weight
+from geogs.config.setting import Count, Fraction, Positive, Range, Settings, Weight
 from geogs.depth.network.options import DepthNetworkOptions
 from geogs_synth.clips.room_options import MotionWeights, RoomOptions
 
@@ -33,17 +33,17 @@ class TupleOptions(Settings, group="training.tuples"):
     """Baseline over the median depth from which on a view is a good neighbour."""
     most_baseline: Annotated[float, Range(above="least_baseline", most=10)] = 0.4
     """Baseline over the median depth up to which it is."""
-    dud: Share = 0.05
+    dud: Fraction = 0.05
     """Fraction of the neighbours that show another room."""
-    missing: Share = 0.05
+    missing: Fraction = 0.05
     """Fraction of the neighbours that are not there."""
-    disturbed: Share = 0.5
+    disturbed: Fraction = 0.5
     """Fraction of the keyframes whose neighbours' poses are wrong."""
     rotation: tuple[Annotated[float, Range(0, 10)], ...] = (0.02, 0.3)
     """Range of the deviation of a wrong pose's rotation about each axis, degrees."""
     translation: tuple[Annotated[float, Range(0, 1)], ...] = (0.003, 0.05)
     """Range of the deviation of its translation along each axis, over the baseline."""
-    focal: Share = 0.01
+    focal: Fraction = 0.01
     """Largest relative error of the focal length, in as many."""
     photometric: Weight = 0.5
     """Strength of what each view's light and colours are changed by, beside the camera's flaws."""
@@ -73,7 +73,7 @@ class DepthLossOptions(Settings, group="training.loss"):
     """Weight of the likelihood of depth, which only deviation and outliers learn from."""
     agreement: Weight = 0.1
     """Weight of what normals and normals of depth differ by."""
-    late: Share = 0.05
+    late: Fraction = 0.05
     """Fraction of the run after which the likelihoods count."""
 
 
@@ -87,7 +87,7 @@ class DepthTraining(Settings, group="training"):
     """Keyframes per step and device."""
     small_batch: Count = 24
     """The same in the steps with small images."""
-    small: Share = 0.6
+    small: Fraction = 0.6
     """Fraction of the run, its first, with small images."""
     rooms: RoomOptions = field(
         default_factory=lambda: RoomOptions(

@@ -2,7 +2,6 @@
 
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any
 
 from geogs.application.progress import RunProgress
 from geogs.application.result_settings import RemeshSettings
@@ -10,6 +9,7 @@ from geogs.application.results.report import write_page_anew
 from geogs.application.results.saved_result import load_result
 from geogs.application.results.surfaces import fusion_views
 from geogs.config import MeshConfig
+from geogs.config.old_names import present_values
 from geogs.documents import UNUSABLE, read_yaml
 from geogs.errors import InputError
 from geogs.gpu.installation import require_device
@@ -27,7 +27,7 @@ def mesh_settings(folder: Path) -> MeshConfig:
     if not path.is_file():
         return MeshConfig()
     try:
-        said: Any = read_yaml(path)["mesh"]
+        said = present_values(read_yaml(path)["mesh"], "mesh", path.name)
         known = {name.name: said[name.name] for name in fields(MeshConfig) if name.name in said}
     except UNUSABLE:
         raise InputError(f"{path} is damaged; give the settings of the mesh anew.") from None

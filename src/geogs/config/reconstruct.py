@@ -4,14 +4,13 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Annotated
 
-from geogs.config.depth import DepthConfig
 from geogs.config.input import InputConfig
 from geogs.config.losses import LossConfig
-from geogs.config.mapping import MappingConfig, PhotoConfig
+from geogs.config.mapping import DepthConfig, MappingConfig, PhotoConfig
 from geogs.config.mesh import MeshConfig
 from geogs.config.paper import paper_known_pose_mapping
+from geogs.config.run import Preset, Seed
 from geogs.config.setting import Basic, Count, Range, Settings
-from geogs.config.slam import Preset, Seed
 
 
 @dataclass(frozen=True)

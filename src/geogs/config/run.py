@@ -3,17 +3,13 @@
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Literal
 
-from geogs.config.calibration import CalibrationConfig
 from geogs.config.input import InputConfig
-from geogs.config.loop import LoopConfig
 from geogs.config.mapping import MappingConfig
 from geogs.config.mesh import MeshConfig
-from geogs.config.odometry import OdometryConfig
 from geogs.config.paper import LONG_EDGE, paper_loops, paper_mapping, paper_prior
-from geogs.config.prior import PriorConfig
-from geogs.config.sensor import DepthSensorConfig
+from geogs.config.priors import DepthSensorConfig, OdometryConfig, PriorConfig
 from geogs.config.setting import Count, Range, Settings
-from geogs.config.tracking import TrackingConfig
+from geogs.config.tracking import CalibrationConfig, LoopConfig, TrackingConfig
 
 Preset = Literal["fast", "default", "accurate", "paper"]
 Seed = Annotated[int, Range(0, 2**32 - 1)]
