@@ -84,14 +84,14 @@ def mapping(count: int, size: tuple[int, int]) -> dict[str, float]:
         keyframe.information = torch.full((grid.size,), 1e4)
         mapper.observe(n)
         depth = torch.full((render.height, render.width), 2.5)
-        mapper.pool.set_depth(n, DenseDepth(depth, torch.ones_like(depth), torch.tensor(2.5)))
-        mapper.mapped.append(n)
+        mapper.views[n].set_depth(DenseDepth(depth, torch.ones_like(depth), torch.tensor(2.5)))
+        mapper.table.mapped.append(n)
         detector._enter(n)
     view = mapper.views[count - 1]
     return {
-        "views whose depths check one": cost(lambda: mapper._depths.near(view)),
-        "views that vote on disks": cost(lambda: mapper._mapped_around(view, 96)),
-        "photometric partners": cost(lambda: mapper._choose_partners(view)),
+        "views whose depths check one": cost(lambda: mapper.depths.near(view)),
+        "views that vote on disks": cost(lambda: mapper.growth.voters(view)),
+        "photometric partners": cost(lambda: mapper.partners.choose(view)),
         "loop candidates by pose": cost(lambda: detector.candidates(count - 1)),
         "depths for the search of loops": cost(detector._depths),
         "poses of all keyframes": cost(lambda: segment.poses(segment.ids)),

@@ -46,7 +46,7 @@ from geogs.geometry.lie import (
 from geogs.geometry.neighbors import nearest_neighbors
 from geogs.geometry.umeyama import umeyama
 from geogs.loop.closure import close_loops
-from geogs.mapping.map_update import MapUpdate, plan_update, witness
+from geogs.mapping.map_update import MapUpdate, covisible_keyframe, plan_update
 from geogs.mapping.mapper import Mapper
 from geogs.mesh.extract import extract_mesh
 from geogs.types import PoseCorrection
@@ -234,8 +234,8 @@ class Judge:
     def row(self, name: str, mapper: Mapper, T_cw: Tensor, seconds: float) -> str:
         """A line of the table."""
         s, R, t = self.alignment(T_cw)
-        solid = mapper.map.opacity >= 0.5
-        x = mapper.map.position.detach().double()
+        solid = mapper.table.disks.opacity >= 0.5
+        x = mapper.table.disks.position.detach().double()
         world = s * x @ R.T + t
         accuracy = 100 * self.tree(world[solid].numpy()).mean()
         cells = [name, f"{accuracy:.2f}", *self.tearing(mapper), f"{double(mapper, float(s)):.1f}"]
@@ -246,10 +246,10 @@ class Judge:
 
     def tearing(self, mapper: Mapper) -> tuple[str, str]:
         """Median and 95th percentile; nothing once disks were dropped."""
-        if len(mapper.map) != len(self.position):
+        if len(mapper.table.disks) != len(self.position):
             return "", ""
         i, j = self.pairs
-        x = mapper.map.position.detach().double()
+        x = mapper.table.disks.position.detach().double()
         before, after = self.position[j] - self.position[i], x[j] - x[i]
         smooth = (self.stretch(x)[i] @ before[:, :, None])[:, :, 0]
         torn = (after.norm(dim=1) / smooth.norm(dim=1)).log().abs()
@@ -278,13 +278,13 @@ class Judge:
 
 def normals(mapper: Mapper) -> Tensor:
     """Of the disks."""
-    return quaternion_to_matrix(mapper.map.quaternion.detach().double())[:, :, 2]
+    return quaternion_to_matrix(mapper.table.disks.quaternion.detach().double())[:, :, 2]
 
 
 def neighbouring(mapper: Mapper, reach: int = 8) -> tuple[Tensor, Tensor]:
     """Pairs of disks of different keyframes, near in time and on one surface."""
-    x, n = mapper.map.position.detach().double(), normals(mapper)
-    anchor = mapper.map.keyframe_id
+    x, n = mapper.table.disks.position.detach().double(), normals(mapper)
+    anchor = mapper.table.disks.keyframe_id
     _, j = nearest_neighbors(x, x, 25)
     i = torch.arange(len(x))[:, None].expand_as(j)
     apart = (anchor[i] - anchor[j]).abs()
@@ -298,9 +298,9 @@ def neighbouring(mapper: Mapper, reach: int = 8) -> tuple[Tensor, Tensor]:
 
 def double(mapper: Mapper, metre: float, apart: int = 20) -> float:
     """Per cent of the disks that lie over or under the surface of another visit."""
-    solid = mapper.map.opacity >= 0.5
-    x = metre * mapper.map.position.detach().double()[solid]
-    n, anchor = normals(mapper)[solid], mapper.map.keyframe_id[solid]
+    solid = mapper.table.disks.opacity >= 0.5
+    x = metre * mapper.table.disks.position.detach().double()[solid]
+    n, anchor = normals(mapper)[solid], mapper.table.disks.keyframe_id[solid]
     _, j = nearest_neighbors(x, x, 48)
     offset = x[j] - x[:, None]
     height = (offset * n[:, None]).sum(2).abs()
@@ -359,8 +359,8 @@ def planning_time(mapper: Mapper, correction: PoseCorrection) -> float:
     """Seconds of planning alone, the better of two."""
 
     def plan() -> MapUpdate:
-        seen = [witness(v, correction) for v in mapper.views.values() if v.has_depth]
-        disks = mapper.map
+        seen = [covisible_keyframe(v, correction) for v in mapper.views.values() if v.has_depth]
+        disks = mapper.table.disks
         strategy = mapper.config.ablation.map_update
         return plan_update(disks.position, disks.keyframe_id, correction, strategy, seen)
 

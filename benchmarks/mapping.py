@@ -111,7 +111,9 @@ def build(keyframes: KeyframeSet, config: Config) -> Mapper:
             mapper.map_keyframe(ids[n - lag])
     for id in ids[max(0, len(ids) - lag) :]:
         mapper.map_keyframe(id)
-    print(f"online: {len(mapper.map)} disks, {time.perf_counter() - start:.1f} s", flush=True)
+    print(
+        f"online: {len(mapper.table.disks)} disks, {time.perf_counter() - start:.1f} s", flush=True
+    )
     return mapper
 
 
@@ -186,7 +188,7 @@ def report_map(name: str, mapper: Mapper, scorer: Scorer) -> None:
 def baselines(mapper: Mapper, scorer: Scorer, camera: Camera) -> None:
     """TSDF of the tracker's depth (all, sure) and of the searched keyframe depths."""
     every, sure, searched = [], [], []
-    for i in mapper.mapped:
+    for i in mapper.table.mapped:
         view = mapper.views[i]
         inverse, information = view.depth_view.inverse_depth, view.depth_view.information
         d = 1 / upsample_grid(inverse, camera, scorer.render)
@@ -240,7 +242,7 @@ def main() -> None:
     if not arguments.no_refine:
         start = time.perf_counter()
         mapper.refine()
-        print(f"refined: {len(mapper.map)} disks, {time.perf_counter() - start:.1f} s")
+        print(f"refined: {len(mapper.table.disks)} disks, {time.perf_counter() - start:.1f} s")
         if arguments.baselines:
             baselines(mapper, scorer, keyframes.grid.camera)
         report_map("map, final", mapper, scorer)

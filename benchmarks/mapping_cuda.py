@@ -28,17 +28,17 @@ from geogs.geometry.depth import normals_from_depth
 from geogs.geometry.lie import se3_inverse
 from geogs.losses import multi_view_loss, single_view_loss
 from geogs.losses.single_view import MIN_ALPHA
-from geogs.mapping.cameras import MapCameras
 from geogs.mapping.training.base import Batch
 from geogs.mapping.training.cuda.trainer import CudaTrainer
-from geogs.mapping.view import MapView
-from geogs.mapping.view_pool import ViewPool
+from geogs.mapping.view_arrays import MapCameras, ViewArrays
+from geogs.mapping.views import MapView, MapViews
 from geogs.splat.cuda import autograd
 from geogs.splat.init import initialise_disks
-from geogs.splat.map import DiskParameters, GaussianMap
 from geogs.splat.render import render_views
+from geogs.world.disks import DiskParameters, GaussianMap
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import KeyframeSet, KeyframeTable
+from geogs.world.map import MapTable
 from geogs_synth.motion.handheld import handheld_trajectory
 from geogs_synth.places.room import make_room
 from geogs_synth.raycast.raycaster import Raycaster
@@ -83,8 +83,8 @@ class Window:
         scene = make_room(0)
         caster, poses = Raycaster(scene), handheld_trajectory(scene, FRAMES_APART * views)
         own, depths = [], []
-        segment = KeyframeTable.on(SampleGrid(photo, device)).new_set()
-        pool = ViewPool(cameras, LossConfig(), device, views)
+        segment = KeyframeTable.on(SampleGrid(photo, device), None, views).new_set()
+        pool = _views(segment, cameras, device)
         for T_wc in poses[::FRAMES_APART]:
             depths.append(torch.from_numpy(caster.render(cameras.render, T_wc).depth).float())
             image = caster.render(photo, T_wc).image
@@ -100,16 +100,19 @@ class Window:
         return Window(cameras, batch, DiskParameters(*(p.to(device) for p in made)), unit)
 
 
+def _views(segment: KeyframeSet, cameras: MapCameras, device: torch.device) -> MapViews:
+    return MapViews(ViewArrays(MapTable.empty(device), segment.table, cameras, LossConfig()))
+
+
 def _view(
-    segment: KeyframeSet, pool: ViewPool, image: np.ndarray, T_wc: np.ndarray, depth: Tensor
+    segment: KeyframeSet, pool: MapViews, image: np.ndarray, T_wc: np.ndarray, depth: Tensor
 ) -> MapView:
     n, T_cw = len(segment), se3_inverse(torch.from_numpy(T_wc))
-    view = MapView(segment.add(n, n / 30, image, None, T_cw), pool)
-    pool.add(view.keyframe)
-    dense = depth.to(pool.device)
-    pool.set_depth(view.id, DenseDepth(dense, torch.ones_like(dense), depth.median()))
-    normal, _ = normals_from_depth(dense, pool.cameras.render)
-    pool.maps(view.id).constants = replace(view.known, prior_normal=normal)
+    view = pool.add(segment.add(n, n / 30, image, None, T_cw).id)
+    dense = depth.to(pool.arrays.device)
+    view.set_depth(DenseDepth(dense, torch.ones_like(dense), depth.median()))
+    normal, _ = normals_from_depth(dense, pool.arrays.cameras.render)
+    pool.arrays.load(view.id).constants = replace(view.known, prior_normal=normal)
     return view
 
 

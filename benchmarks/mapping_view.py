@@ -17,16 +17,16 @@ import torch
 from geogs.config import MappingConfig
 from geogs.depth.view import DenseDepth, KeyframeDepth
 from geogs.geometry.lie import se3_inverse
-from geogs.mapping.cameras import MapCameras
 from geogs.mapping.training.cpu import Trainer, view_loss
-from geogs.mapping.view import MapView
-from geogs.mapping.view_pool import ViewPool
+from geogs.mapping.view_arrays import MapCameras, ViewArrays
+from geogs.mapping.views import MapView, MapViews
 from geogs.splat.init import initialise_disks
-from geogs.splat.map import GaussianMap
 from geogs.splat.render import render
 from geogs.threads import worker_count
+from geogs.world.disks import GaussianMap
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import KeyframeTable
+from geogs.world.map import MapTable
 from geogs_synth.motion.handheld import handheld_trajectory
 from geogs_synth.places.room import make_room
 from geogs_synth.raycast.raycaster import Raycaster
@@ -40,15 +40,17 @@ def make_views(config: MappingConfig, width: int) -> tuple[list[MapView], MapCam
     scene = make_room(0)
     caster = Raycaster(scene)
     poses = handheld_trajectory(scene, 60)
-    views, pool = [], ViewPool(cameras, config.loss, torch.device("cpu"), 128)
     segment = KeyframeTable.on(SampleGrid(photo)).new_set()
+    views, pool = (
+        [],
+        MapViews(ViewArrays(MapTable.empty("cpu"), segment.table, cameras, config.loss)),
+    )
     for index in (0, 12, 24, 36, 48):
         image = caster.render(photo, poses[index]).image
         depth = caster.render(cameras.render, poses[index]).depth
         T_cw = se3_inverse(torch.from_numpy(poses[index]))
-        view = MapView(segment.add(index, index / 30, image, None, T_cw), pool)
-        pool.add(view.keyframe)
-        pool.set_depth(view.id, DenseDepth.of(KeyframeDepth(depth, np.ones_like(depth))))
+        view = pool.add(segment.add(index, index / 30, image, None, T_cw).id)
+        view.set_depth(DenseDepth.of(KeyframeDepth(depth, np.ones_like(depth))))
         view.rendered_depth = torch.from_numpy(depth)
         views.append(view)
     return views, cameras

@@ -19,8 +19,8 @@ import torch
 
 from geogs.geometry.camera import Camera
 from geogs.splat.cpu.rasterize import rasterize_backward, rasterize_forward
-from geogs.splat.map import DiskParameters
 from geogs.splat.render import render
+from geogs.world.disks import DiskParameters
 
 PROTOTYPES = Path(__file__).parents[2] / "shared" / "prototypes"
 CASES = [(20_000, 320, 240), (20_000, 640, 480), (50_000, 640, 480)]

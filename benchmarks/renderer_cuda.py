@@ -24,8 +24,8 @@ from torch import Tensor
 
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import matrix_to_quaternion, se3_inverse
-from geogs.splat.map import DiskParameters
 from geogs.splat.render import render
+from geogs.world.disks import DiskParameters
 
 CASES = [(100_000, 1200, 680), (30_000, 616, 344), (1_000_000, 1200, 680)]
 NEAR = 0.05

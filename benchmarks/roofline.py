@@ -22,8 +22,8 @@ from torch import Tensor
 from torch.profiler import ProfilerActivity, profile
 
 from geogs.gpu.kernels import kernels_for
-from geogs.splat.map import DiskParameters
 from geogs.splat.render import render
+from geogs.world.disks import DiskParameters
 from renderer_cuda import CASES, NEAR, Case, room_case
 from roofline_counts import TILE, Counts, count_work
 

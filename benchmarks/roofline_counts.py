@@ -10,8 +10,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from geogs.geometry.camera import Camera
-from geogs.splat.map import DiskParameters
 from geogs.splat.render import render
+from geogs.world.disks import DiskParameters
 
 TILE, PART_WIDTH, PART_HEIGHT, PARTS, CHUNK = 16, 8, 4, 8, 32
 """Pixels of a tile and of a warp's part of it; entries that a warp tests at once."""

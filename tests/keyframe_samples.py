@@ -8,9 +8,13 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from geogs.config import LossConfig
 from geogs.geometry.camera import Camera
+from geogs.mapping.view_arrays import MapCameras, ViewArrays
+from geogs.mapping.views import MapViews
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import Keyframe, KeyframeSet, KeyframeTable
+from geogs.world.map import MapTable
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,6 +39,12 @@ def segment_of(
     for sample in samples:
         add(segment, sample)
     return segment
+
+
+def views_of(keyframes: KeyframeTable, cameras: MapCameras, loss: LossConfig) -> MapViews:
+    """Views of a map without disks, which know none of the keyframes yet."""
+    table = MapTable.empty(keyframes.grid.device)
+    return MapViews(ViewArrays(table, keyframes, cameras, loss))
 
 
 def add(segment: KeyframeSet, sample: Sample) -> Keyframe:

@@ -6,8 +6,8 @@ import torch
 
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp
-from geogs.splat.map import DiskParameters
 from geogs.splat.render import render
+from geogs.world.disks import DiskParameters
 
 CAMERA = Camera(fx=50.0, fy=53.0, cx=22.4, cy=37.7, width=45, height=75)
 

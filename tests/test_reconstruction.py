@@ -23,9 +23,9 @@ from geogs.errors import InputError
 from geogs.io.pose_files import read_tum_trajectory
 from geogs.io.sources.sniff import open_posed_source
 from geogs.io.writers.map_file import load_map
-from geogs.mapping.depth_schedule import spread_order
 from geogs.mapping.first_look import distances_to_try
 from geogs.mapping.known_poses import depth_search
+from geogs.mapping.map_all import spread_order
 from geogs.mesh.mesh_file import read_mesh
 from geogs.reconstruction import Reconstruction
 from keyframe_samples import Sample, segment_of

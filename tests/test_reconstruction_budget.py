@@ -8,8 +8,9 @@ import pytest
 
 from depth_scene import WORKING, make_scene
 from geogs.mapping.mapper import Mapper
+from geogs.mapping.time_budget import OutputCost
 from geogs.mapping.training.cpu import Trainer
-from geogs.reconstruction import OutputCost, Reconstruction
+from geogs.reconstruction import Reconstruction
 from geogs.types import Trajectory
 from posed_scene import SMALL
 
@@ -63,7 +64,7 @@ def reconstructed(clock: FakeClock, budget: float) -> tuple[Reconstruction, list
             scene.add(views[i].image, views[i].T_cw, index=i)
 
     def more(count_of: Callable[[], int]) -> None:
-        scene.output_cost = OUTPUT
+        scene.budget.output_cost = OUTPUT
         asked.append(count_of())
         add(range(2, min(2 + asked[0], 5)))
 
@@ -79,7 +80,7 @@ def test_mesh_and_files_are_done_when_the_budget_ends(clock):
     assert clock.now - start == pytest.approx(20.0, rel=0.05)
     assert asked[0] >= 3
     assert scene.frames == scene.views == scene.with_depth == 5
-    assert scene.mapper.trained.steps > 100
+    assert scene.mapper.table.place.steps > 100
 
 
 def test_images_for_which_the_time_does_not_last_are_not_asked_for(clock):

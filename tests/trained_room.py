@@ -6,16 +6,15 @@ import torch
 from geogs.config import Config
 from geogs.depth.view import DenseDepth
 from geogs.geometry.lie import se3_inverse
-from geogs.mapping.cameras import MapCameras
 from geogs.mapping.training.base import Batch
-from geogs.mapping.view import MapView
-from geogs.mapping.view_pool import ViewPool
-from geogs.splat.map import DiskParameters, GaussianMap
+from geogs.mapping.view_arrays import MapCameras
+from geogs.mapping.views import MapView
+from geogs.world.disks import DiskParameters, GaussianMap
 from geogs_synth.motion.handheld import handheld_trajectory
 from geogs_synth.places.room import make_room
 from geogs_synth.raycast.raycaster import Raycaster
 from geogs_synth.sequence.location import centred_camera
-from keyframe_samples import Sample, segment_of
+from keyframe_samples import Sample, segment_of, views_of
 
 WORKING = centred_camera(96, 72)
 CAMERAS = MapCameras(WORKING, WORKING.with_long_edge(40), WORKING.with_long_edge(80))
@@ -39,15 +38,14 @@ def rendered_keyframes() -> list[tuple[Sample, np.ndarray]]:
 
 
 def make_views(rendered, device: torch.device, config=CONFIG) -> list[MapView]:
-    views, pool = [], ViewPool(CAMERAS, config.loss, device, 128)
     segment = segment_of([keyframe for keyframe, _ in rendered], WORKING, device)
+    views, pool = [], views_of(segment.table, CAMERAS, config.loss)
     for keyframe, (_, depth) in zip(segment, rendered, strict=True):
-        pool.add(keyframe)
-        view = MapView(keyframe, pool)
+        view = pool.add(keyframe.id)
         dense = torch.from_numpy(depth).float().to(device)
         confidence = torch.full_like(dense, 0.8)
-        pool.set_depth(view.id, DenseDepth(dense, confidence, dense.median().cpu()))
-        view.partners = [i for i in range(len(rendered)) if i != view.id][:2]
+        view.set_depth(DenseDepth(dense, confidence, dense.median().cpu()))
+        view.row.partners = [i for i in range(len(rendered)) if i != view.id][:2]
         views.append(view)
     return views
 

@@ -15,9 +15,9 @@ if TYPE_CHECKING:
     from geogs.geometry.camera import Camera
     from geogs.io.sources.sniff import open_posed_source, open_source
     from geogs.io.writers.map_file import load_map
-    from geogs.splat.map import GaussianMap
     from geogs.splat.render import render
     from geogs.types import Frame
+    from geogs.world.disks import GaussianMap
 
 __all__ = [
     "Camera",
@@ -42,7 +42,7 @@ _HOMES = {
     "Camera": "geogs.geometry.camera",
     "Config": "geogs.config",
     "Frame": "geogs.types",
-    "GaussianMap": "geogs.splat.map",
+    "GaussianMap": "geogs.world.disks",
     "PoseEstimate": "geogs.application.slam",
     "ReconstructConfig": "geogs.config",
     "Slam": "geogs.application.slam",

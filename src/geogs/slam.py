@@ -17,11 +17,10 @@ from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.loop.closer import LoopCloser
 from geogs.loop.global_bundle import global_bundle
-from geogs.mapping.all_at_once import map_all
 from geogs.mapping.background import BackgroundMapper
+from geogs.mapping.map_all import map_all
 from geogs.mapping.mapper import Mapper
 from geogs.mapping.rendered import MapRenderer
-from geogs.mapping.state import MapperState
 from geogs.priors.base import MonocularPrior
 from geogs.stopwatch import Stopwatch, StopwatchState
 from geogs.threads import on_one_torch_thread
@@ -46,6 +45,7 @@ from geogs.types import (
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import KeyframeTable, check_keyframes
 from geogs.world.loops import LoopTable, check_loops
+from geogs.world.map import MapTable
 from geogs.world.segments import SegmentTable, TrackState, check_segment
 
 R = TypeVar("R")
@@ -78,7 +78,7 @@ class SlamState:
     keyframes: KeyframeTable
     segments: SegmentTable
     loops: LoopTable
-    mapper: MapperState
+    mapper: MapTable
     stopwatch: StopwatchState
     frames: int
     waiting: list[int]
@@ -153,17 +153,18 @@ class Slam:
         """Maps until the stream ends, in a live system; then the mapper goes on from there."""
         self.mapper = self._new_mapper(self.keyframes)
 
-    def _new_mapper(self, keyframes: KeyframeTable) -> Mapper:
+    def _new_mapper(self, keyframes: KeyframeTable, table: MapTable | None = None) -> Mapper:
         c = self.config
-        return Mapper(keyframes, c.mapping, c.seed, c.sensor)
+        return Mapper(keyframes, c.mapping, c.seed, c.sensor, table)
 
     def state(self) -> SlamState:
         """What a checkpoint holds: to be written before the next frame, as it refers to all."""
         self.settle()
         self.segments.settle()
         self.loops.settle()
+        self.mapper.settle()
         return SlamState(
-            self.keyframes, self.segments.table, self.loops.table, self.mapper.state(),
+            self.keyframes, self.segments.table, self.loops.table, self.mapper.table,
             self.stopwatch.state(), self.frames, list(self._waiting), self.adjusted, self._is_ended,
             self.defers_map,
         )  # fmt: skip
@@ -188,10 +189,7 @@ class Slam:
         self.loops = LoopCloser(
             self.segments, self.config.loop, self.background is None, self.mask, state.loops
         )
-        for id in state.mapper.pool.maps:
-            if (mask := self._mask_of(id)) is not None:
-                self.mapper.pool.add(self.keyframes[id], mask)
-        self.mapper.load(state.mapper)
+        self.mapper = self._new_mapper(self.keyframes, state.mapper)
         self.stopwatch.load(state.stopwatch)
         self.frames, self._waiting = state.frames, deque(state.waiting)
         self.adjusted, self._is_ended = state.adjusted, state.is_ended
@@ -300,7 +298,7 @@ class Slam:
         self._adjust_now_and_then()
 
     def _status(self, state: TrackState) -> SlamStatus:
-        disks = len(self.mapper.map) if self.background is None else self.background.disks
+        disks = len(self.mapper.table.disks) if self.background is None else self.background.disks
         return SlamStatus(state, self.frames, len(self.segments.keyframe_ids), disks)
 
     @on_one_torch_thread
@@ -354,7 +352,7 @@ class Slam:
     @on_one_torch_thread
     def map_briefly(self, seconds: float, progress: Progress = _silent) -> None:
         """After an interruption: a map within about so many seconds where there is none yet."""
-        if self.defers_map and self._waiting and not len(self.mapper.map):
+        if self.defers_map and self._waiting and not len(self.mapper.table.disks):
             with self.stopwatch("final mapping"):
                 self._map_at_once(progress, seconds)
 
@@ -435,7 +433,7 @@ class Slam:
 
     def snapshot(self) -> MapSnapshot:
         """The disks as they are now."""
-        return self._ask(lambda mapper: mapper.map.snapshot())
+        return self._ask(lambda mapper: mapper.table.disks.snapshot())
 
     @on_one_torch_thread
     def renders(self) -> Sequence[RenderedKeyframe]:
@@ -527,7 +525,9 @@ class Slam:
 
     def _is_pose_step_due(self) -> bool:
         mapping = self.config.mapping
-        return mapping.pose_iterations > 0 and len(self.mapper.mapped) % mapping.pose_every == 0
+        return (
+            mapping.pose_iterations > 0 and len(self.mapper.table.mapped) % mapping.pose_every == 0
+        )
 
     def _mask_of(self, id: int) -> Bool[np.ndarray, "h w"] | None:
         """What a keyframe shows of the scene; none where that is all of its image."""

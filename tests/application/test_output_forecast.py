@@ -14,6 +14,7 @@ from geogs.application.output_forecast import (
     StageTimes,
 )
 from geogs.errors import InputError
+from geogs.mapping.time_budget import TimeBudget
 from geogs.reconstruction import Reconstruction
 from posed_scene import ball_and_wall
 
@@ -105,7 +106,7 @@ def test_the_second_rehearsal_counts_by_views_and_by_surface(rehearsal, rehearse
 def test_a_mesh_gets_what_triangles_there_is_time_for(rehearsal, monkeypatch, scene):
     clock, usual = rehearsal, scene.config.mesh
     whole = CAUTION * (0.5 + COARSER**2 * 3.0 * 3.0)
-    monkeypatch.setattr(Reconstruction, "budget_left", 0.5 * whole / MESH_SHARE)
+    monkeypatch.setattr(TimeBudget, "left", 0.5 * whole / MESH_SHARE)
     cost = OutputForecast(scene, clock).first(lambda places: 3.0)
     assert cost.once == pytest.approx(0.5 * whole)
     triangles = scene.config.mesh.triangle_budget
@@ -129,11 +130,11 @@ def test_a_rehearsal_without_a_surface_says_nothing_of_how_much_there_is(
 
 
 def test_a_rehearsal_takes_time_and_leaves_nothing(scene):
-    before = scene.mapper.state()
+    before = [*scene.mapper.table.mapped]
     forecast = OutputForecast(scene)
     cost, settled = forecast.first(lambda places: 1.5), forecast.settled(1e9)
     print(cost, settled)
     for found in (cost, settled):
         assert 0 < found.a_view < found.once < 120
-    assert scene.mapper.state().mapped == before.mapped
+    assert scene.mapper.table.mapped == before
     assert len(scene.snapshot()) > 0

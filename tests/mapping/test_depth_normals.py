@@ -8,20 +8,19 @@ import torch
 from geogs.config import LossConfig
 from geogs.depth.view import DenseDepth, KeyframeDepth
 from geogs.geometry.camera import Camera
-from geogs.mapping.cameras import MapCameras
-from geogs.mapping.view_pool import ViewPool
+from geogs.mapping.view_arrays import MapCameras
 from geogs.world.keyframes import Keyframe
-from keyframe_samples import Sample, segment_of
+from keyframe_samples import Sample, segment_of, views_of
 
 WORKING = Camera(80.0, 80.0, 47.5, 35.5, 96, 72)
 CAMERAS = MapCameras(WORKING, WORKING.with_long_edge(48), WORKING)
 SIZE = (36, 48)
 
 
-def keyframes() -> list[Keyframe]:
+def keyframes(resident: int = 8) -> list[Keyframe]:
     image = np.random.default_rng(0).integers(0, 255, (72, 96, 3), np.uint8)
     pose = torch.eye(4, dtype=torch.float64)
-    return list(segment_of([Sample(i, image, pose) for i in range(3)], WORKING))
+    return list(segment_of([Sample(i, image, pose) for i in range(3)], WORKING, resident=resident))
 
 
 def depth_with(normal: torch.Tensor | None) -> DenseDepth:
@@ -36,36 +35,36 @@ def facing() -> torch.Tensor:
 
 
 def test_they_reach_the_losses_and_come_back_from_the_archive():
-    made = keyframes()
-    pool = ViewPool(CAMERAS, LossConfig(), torch.device("cpu"), 1)
+    made = keyframes(resident=1)
+    pool = views_of(made[0].table, CAMERAS, LossConfig())
     for keyframe in made[:2]:
-        pool.add(keyframe)
-        pool.set_depth(keyframe.id, depth_with(facing()))
-    assert not pool.is_resident(made[0].id)
+        pool.add(keyframe.id)
+        pool[keyframe.id].set_depth(depth_with(facing()))
+    assert made[0].id not in pool.arrays.loaded
     for keyframe in made[:2]:
-        constants = pool.constants(keyframe.id)
+        constants = pool[keyframe.id].constants
         assert constants is not None
         assert torch.equal(constants.prior_normal, facing())
 
 
 def test_a_depth_without_normals_takes_them_away():
     (keyframe, *_) = keyframes()
-    pool = ViewPool(CAMERAS, LossConfig(), torch.device("cpu"), 8)
-    pool.add(keyframe)
-    pool.set_depth(keyframe.id, depth_with(facing()))
-    assert pool.constants(keyframe.id).prior_normal is not None
-    pool.set_depth(keyframe.id, depth_with(None))
-    assert pool.constants(keyframe.id).prior_normal is None
+    pool = views_of(keyframe.table, CAMERAS, LossConfig())
+    pool.add(keyframe.id)
+    pool[keyframe.id].set_depth(depth_with(facing()))
+    assert pool[keyframe.id].constants.prior_normal is not None
+    pool[keyframe.id].set_depth(depth_with(None))
+    assert pool[keyframe.id].constants.prior_normal is None
 
 
 def test_those_of_a_prior_come_first():
     (keyframe, *_) = keyframes()
     turned = torch.tensor([0.0, -0.6, -0.8])
     keyframe.prior_normal = turned.expand(72, 96, 3).half()
-    pool = ViewPool(CAMERAS, LossConfig(), torch.device("cpu"), 8)
-    pool.add(keyframe)
-    pool.set_depth(keyframe.id, depth_with(facing()))
-    found = pool.constants(keyframe.id).prior_normal
+    pool = views_of(keyframe.table, CAMERAS, LossConfig())
+    pool.add(keyframe.id)
+    pool[keyframe.id].set_depth(depth_with(facing()))
+    found = pool[keyframe.id].constants.prior_normal
     torch.testing.assert_close(found, turned.expand(*SIZE, 3), rtol=0, atol=2e-3)
 
 

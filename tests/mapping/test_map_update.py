@@ -8,8 +8,8 @@ import torch
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp, se3_inverse, sim3_exp, sim3_inverse, sim3_log, sim3_scale
 from geogs.mapping.map_update import (
+    CovisibleKeyframe,
     Strategy,
-    Witness,
     anchor_transforms,
     apply_each,
     plan_update,
@@ -87,10 +87,12 @@ def beside(i: float) -> torch.Tensor:
     return se3_inverse(T_wc)
 
 
-def flat(i: int, correction: PoseCorrection, depth: float = 2.0) -> Witness:
+def flat(i: int, correction: PoseCorrection, depth: float = 2.0) -> CovisibleKeyframe:
     """A keyframe that sees a surface square to it."""
     size = (CAMERA.height, CAMERA.width)
-    return Witness(i, CAMERA, correction.before[i], torch.full(size, depth), torch.full(size, 0.9))
+    return CovisibleKeyframe(
+        i, CAMERA, correction.before[i], torch.full(size, depth), torch.full(size, 0.9)
+    )
 
 
 def drift() -> PoseCorrection:
@@ -174,15 +176,15 @@ def test_each_layer_of_a_doubled_surface_goes_with_the_keyframes_that_see_it():
 
 
 def test_agreement_is_of_those_on_the_surface_within_the_image():
-    witness = flat(0, drift())
+    keyframe = flat(0, drift())
     x = torch.tensor(
         [[0, 1.5, 2], [0, 1.5, 2.06], [0, 1.5, 1.5], [0, 1.5, -2], [9, 1.5, 2], [1.9, 1.5, 2]],
         dtype=F64,
     )
-    say = agreement(x, witness)
+    confidence = agreement(x, keyframe)
     expected = torch.tensor([0.9, 0.9 * torch.exp(torch.tensor(-0.5)), 0, 0, 0], dtype=F64)
-    torch.testing.assert_close(say[:5], expected, rtol=1e-5, atol=1e-5)
-    assert 0 < say[5] < 0.9
+    torch.testing.assert_close(confidence[:5], expected, rtol=1e-5, atol=1e-5)
+    assert 0 < confidence[5] < 0.9
 
 
 def test_the_blend_is_the_weighted_mean_in_the_lie_algebra():

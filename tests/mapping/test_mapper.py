@@ -10,7 +10,7 @@ from geogs.config import Config, MappingConfig
 from geogs.geometry.lie import retract, se3_exp, se3_inverse
 from geogs.mapping.map_update import MapUpdate
 from geogs.mapping.mapper import Mapper
-from geogs.mapping.window import draw_views
+from geogs.mapping.training.base import draw_views
 from geogs.types import PoseCorrection
 from geogs_synth.motion.handheld import handheld_trajectory
 from geogs_synth.places.room import make_room
@@ -87,7 +87,7 @@ def test_the_map_renders_the_true_depth(mapper, sequence):
     assert depth_error(mapper, sequence[1]) < 3.0
     covered = np.mean([(r.depth > 0).float().mean() for r in mapper.renders()])
     assert covered > 0.95
-    assert 500 < len(mapper.map) < 12_000
+    assert 500 < len(mapper.table.disks) < 12_000
 
 
 def test_training_and_refining_make_it_better(sequence):
@@ -106,7 +106,7 @@ def test_a_short_training_looks_only_where_it_trained(sequence, monkeypatch):
     """Of more views than steps those that were trained; else all, each time."""
     mapper = build(sequence[0], replace(MAPPING, iterations=1))
     filled: list[int] = []
-    monkeypatch.setattr(mapper, "_insert", lambda view, confidence: filled.append(view.id))
+    monkeypatch.setattr(mapper.growth, "insert", lambda view, confidence: filled.append(view.id))
     mapper.train(6)
     assert [filled.count(i) for i in filled[:2]] == [2, 2]  # after two steps, and after four
     assert len(filled) == 2 + 4
@@ -118,8 +118,8 @@ def test_a_short_training_looks_only_where_it_trained(sequence, monkeypatch):
 @pytest.mark.long
 def test_same_seed_same_map(sequence):
     first, second = (build(sequence[0][:6]) for _ in range(2))
-    assert (first.map.position == second.map.position).all()
-    assert (first.map.opacity_logit == second.map.opacity_logit).all()
+    assert (first.table.disks.position == second.table.disks.position).all()
+    assert (first.table.disks.opacity_logit == second.table.disks.opacity_logit).all()
 
 
 def test_disturbed_poses_are_drawn_back_by_the_map(mapper, sequence):
@@ -230,22 +230,22 @@ def test_mapping_goes_on_in_corrected_units(sequence):
     errors = [np.abs(r - d)[(r > 0) & (d > 0)] for r, d in zip(renders, truth, strict=True)]
     median = 100 * float(np.median(np.concatenate(errors)))
     assert median == pytest.approx(depth_error(plain, truth), rel=0.15)
-    assert len(mapper.map) == pytest.approx(len(plain.map), rel=0.05)
+    assert len(mapper.table.disks) == pytest.approx(len(plain.table.disks), rel=0.05)
 
 
 def test_a_floater_is_carved_and_the_surface_stays(sequence):
     mapper = build(sequence[0][:6])
-    count = len(mapper.map)
+    count = len(mapper.table.disks)
     view = mapper.views[2]
     T_wc = view.T_wc.float()
     floater = (torch.tensor([[0.0, 0.0, 0.6]]) @ T_wc[:3, :3].T + T_wc[:3, 3]).expand(5, 3)
-    parts = mapper.map.parameters
+    parts = mapper.table.disks.parameters
     new = type(parts)(floater, *(p.detach()[:5] for p in parts[1:]))
-    mapper._training().optimizer.append(new, view.id)
-    mapper.prune()
-    left = mapper.map.position.detach()
+    mapper.table.disks.append(new, view.id)
+    mapper.growth.prune(list(mapper.views.values()))
+    left = mapper.table.disks.position.detach()
     assert not ((left - floater[0]).norm(dim=1) < 1e-3).any()
-    assert len(mapper.map) > 0.97 * count
+    assert len(mapper.table.disks) > 0.97 * count
 
 
 def test_windows_hold_the_newest_and_draw_older_ones():
@@ -274,17 +274,17 @@ def test_parked_views_change_nothing(sequence):
         mapper.refine()
         maps.append(mapper)
     held, parked = maps
-    assert sum(held.pool.is_resident(i) for i in held.views) == 7
-    assert sum(parked.pool.is_resident(i) for i in parked.views) == 2
-    for a, b in zip(held.map.parameters, parked.map.parameters, strict=True):
+    assert sum(i in held.views.arrays.loaded for i in held.views) == 7
+    assert sum(i in parked.views.arrays.loaded for i in parked.views) == 2
+    for a, b in zip(held.table.disks.parameters, parked.table.disks.parameters, strict=True):
         assert torch.equal(a, b)
-    for i in held.mapped:
+    for i in held.table.mapped:
         a, b = held.views[i], parked.views[i]
         assert torch.equal(a.dense.depth, b.dense.depth)
         assert torch.equal(a.known.edge, b.known.edge)
         assert torch.equal(a.known.prior_depth, b.known.prior_depth)
         assert torch.equal(a.photo.grey, b.photo.grey)
-        assert (a.typical_depth, a.partners) == (b.typical_depth, b.partners)
+        assert (a.typical_depth, a.row.partners) == (b.typical_depth, b.row.partners)
         if a.rendered_depth is not None:
             assert torch.equal(a.rendered_depth, b.rendered_depth)
     parked.keyframes[0].rescale(2.0)

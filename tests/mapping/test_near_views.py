@@ -6,12 +6,10 @@ import torch
 from geogs.config import Config
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp
-from geogs.mapping.cameras import MapCameras
-from geogs.mapping.near_views import NearViews
-from geogs.mapping.view import MapView
-from geogs.mapping.view_pool import ViewPool
+from geogs.mapping.view_arrays import MapCameras
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import KeyframeTable
+from keyframe_samples import views_of
 
 CAMERA = Camera(fx=60.0, fy=60.0, cx=31.5, cy=23.5, width=64, height=48)
 
@@ -19,17 +17,16 @@ CAMERA = Camera(fx=60.0, fy=60.0, cx=31.5, cy=23.5, width=64, height=48)
 def test_the_nearest_come_in_the_order_in_which_they_were_given():
     random = torch.Generator().manual_seed(1)
     config, store = Config(), KeyframeTable.on(SampleGrid(CAMERA))
-    segment, views = store.new_set(), {}
+    segment = store.new_set()
     cameras = MapCameras.of(CAMERA, config.mapping)
-    pool = ViewPool(cameras, config.mapping.loss, torch.device("cpu"), 128)
-    near, image = NearViews(views), np.zeros((48, 64, 3), np.uint8)
+    views, image = views_of(store, cameras, config.mapping.loss), np.zeros((48, 64, 3), np.uint8)
     for id in range(20):
         T = se3_exp(torch.randn(6, generator=random, dtype=torch.float64))
-        views[id] = MapView(segment.add(id, id / 30, image, None, T), pool)
+        views.add(segment.add(id, id / 30, image, None, T).id)
         away = [float(np.linalg.norm(v.place.center - views[id].place.center))
                 for v in views.values()]  # fmt: skip
         for count in (1, 5, 40):
             nearest = sorted(sorted(range(id + 1), key=lambda n: away[n])[:count])
-            assert [v.id for v in near.around(views[id], views, count)] == nearest
+            assert [v.id for v in views.near(views[id], views, count)] == nearest
     segment[3].T_cw = segment[11].T_cw
-    assert [v.id for v in near.around(views[11], views, 2)] == [3, 11]
+    assert [v.id for v in views.near(views[11], views, 2)] == [3, 11]

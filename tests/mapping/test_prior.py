@@ -11,16 +11,15 @@ from geogs.depth.view import DenseDepth, KeyframeDepth
 from geogs.geometry.camera import Camera
 from geogs.losses.cpu import fused_single_view
 from geogs.losses.single_view import single_view_loss
-from geogs.mapping.cameras import MapCameras
-from geogs.mapping.view import MapView
-from geogs.mapping.view_pool import ViewPool
+from geogs.mapping.view_arrays import MapCameras
+from geogs.mapping.views import MapView
 from geogs.priors.base import PriorMaps
 from geogs.tracking.flow.classical import ClassicalFlow
 from geogs.tracking.graph import FrameGraph
 from geogs.tracking.keyframe_priors import KeyframePriors
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import Keyframe, KeyframeTable
-from keyframe_samples import Sample, segment_of
+from keyframe_samples import Sample, segment_of, views_of
 
 WORKING = Camera(80.0, 80.0, 47.5, 35.5, 96, 72)
 CAMERAS = MapCameras(WORKING, WORKING.with_long_edge(48), WORKING)
@@ -48,12 +47,11 @@ def normals() -> torch.Tensor:
 
 
 def view(normal: torch.Tensor | None, loss: LossConfig) -> MapView:
-    pool = ViewPool(CAMERAS, loss, torch.device("cpu"), 128)
-    made = MapView(keyframe(normal), pool)
-    pool.add(made.keyframe)
+    pool = views_of(keyframe(normal).table, CAMERAS, loss)
+    made = pool.add(0)
     depth = KeyframeDepth(np.full((36, 48), 2.0, np.float32), np.full((36, 48), 0.5, np.float32))
     for _ in range(2):  # a depth that is replaced keeps what does not depend on it
-        pool.set_depth(made.id, DenseDepth.of(depth))
+        made.set_depth(DenseDepth.of(depth))
     return made
 
 

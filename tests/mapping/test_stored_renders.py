@@ -18,9 +18,9 @@ from geogs.mapping.stored_renders import StoredRender, stored_render
 from geogs.mesh.extract import extract_mesh
 from geogs.on_demand import OnDemand
 from geogs.reconstruction import Reconstruction
-from geogs.splat.map import DiskParameters
 from geogs.types import MapSnapshot, RenderedKeyframe, Trajectory
 from geogs.world.archive import Archive, Archived
+from geogs.world.disks import DiskParameters
 from posed_scene import ball_and_wall
 
 CAMERA = Camera(120.0, 120.0, 79.5, 59.5, 160, 120)
@@ -148,9 +148,11 @@ def test_the_maps_of_a_scene_are_those_of_its_disks(scene):
     renders = scene.renders()
     with torch.no_grad():
         camera, rules = mapper.cameras.render, SurfaceRules.of(mapper.config)
-        disks = DiskParameters.of(mapper.map.snapshot())
-        eager = [rendered_keyframe(mapper.views[i], disks, camera, rules) for i in mapper.mapped]
-        mapper.map.position.add_(0.1)
+        disks = DiskParameters.of(mapper.table.disks.snapshot())
+        eager = [
+            rendered_keyframe(mapper.views[i], disks, camera, rules) for i in mapper.table.mapped
+        ]
+        mapper.table.disks.position.add_(0.1)
     assert len(renders) == len(eager) == len(make_scene().views)
     for now, then in zip(renders, eager, strict=True):
         assert now.keyframe_id == then.keyframe_id
@@ -159,17 +161,17 @@ def test_the_maps_of_a_scene_are_those_of_its_disks(scene):
         assert torch.equal(now.weight, then.weight)
         assert np.array_equal(now.image, then.image)
     assert isinstance(renders[-2:], Sequence)
-    assert [r.keyframe_id for r in renders[-2:]] == mapper.mapped[-2:]
+    assert [r.keyframe_id for r in renders[-2:]] == mapper.table.mapped[-2:]
 
 
 def test_depths_are_read_when_they_are_asked_for(scene):
     maps = scene.depth_maps()
-    view = scene.mapper.views[scene.mapper.mapped[0]]
+    view = scene.mapper.views[scene.mapper.table.mapped[0]]
     first = maps[0].depth
     assert torch.equal(first, maps[0].depth)
     view.keyframe.rescale(2.0)
     assert torch.equal(2 * first, maps[0].depth)
-    assert [m.keyframe_id for m in maps[-2:]] == scene.mapper.mapped[-2:]
+    assert [m.keyframe_id for m in maps[-2:]] == scene.mapper.table.mapped[-2:]
 
 
 def test_no_keyframes_give_no_maps():

@@ -14,8 +14,8 @@ from geogs.splat.cpu.blend import blend_disk
 from geogs.splat.cpu.blend_backward import unblend_disk
 from geogs.splat.cpu.layout import exp_minus
 from geogs.splat.cpu.rasterize import rasterize_backward, rasterize_forward
-from geogs.splat.map import DiskParameters, GaussianMap
 from geogs.splat.render import RenderOutput, render
+from geogs.world.disks import DiskParameters, GaussianMap
 from splat_scenes import (
     CAMERA,
     MAPS,

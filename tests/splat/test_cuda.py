@@ -9,8 +9,8 @@ from cuda_emulator import use_emulator
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp
 from geogs.splat.cuda import rasterize
-from geogs.splat.map import DiskParameters, GaussianMap
 from geogs.splat.render import RenderOutput, render, render_views
+from geogs.world.disks import DiskParameters, GaussianMap
 from splat_scenes import (
     CAMERA,
     MAPS,

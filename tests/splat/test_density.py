@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from geogs.splat.density import split, worth_splitting
-from geogs.splat.map import DiskParameters, GaussianMap
 from geogs.splat.optimizer import LearningRates, MapOptimizer
+from geogs.world.disks import DiskParameters, GaussianMap
 
 RATES = LearningRates(1e-3, 1e-3, 1e-3, 1e-3)
 
@@ -18,7 +18,7 @@ def disks(scales: list[list[float]]) -> GaussianMap:
     parameters = DiskParameters(
         position, quarter, torch.tensor(scales).log(), torch.arange(n).float()
     )
-    return GaussianMap(parameters, torch.arange(n))
+    return GaussianMap.of(parameters, torch.arange(n))
 
 
 def test_the_hardest_pulled_of_the_large_disks_are_chosen() -> None:
@@ -51,7 +51,7 @@ def test_replaced_disks_keep_their_keyframe_and_start_without_moments() -> None:
     chosen = worth_splitting(scene, optimizer.position_gradient, 0.34, 0.05)
     assert chosen.tolist() == [True, False, False]
     ids = scene.keyframe_id[chosen]
-    optimizer.replace(chosen, split(scene, chosen), torch.cat([ids, ids]))
+    scene.replace(chosen, split(scene, chosen), torch.cat([ids, ids]))
     assert scene.keyframe_id.tolist() == [1, 2, 0, 0]
     assert optimizer.position_gradient.tolist() == pytest.approx([0.1, 1.0, 0.0, 0.0], rel=1e-4)
     assert scene.steps.tolist() == [1, 1, 0, 0]

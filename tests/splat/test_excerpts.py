@@ -9,18 +9,16 @@ from geogs.config import DiskConfig, MappingConfig
 from geogs.depth.view import DenseDepth
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp
-from geogs.mapping.cameras import MapCameras
 from geogs.mapping.training import cpu as training
 from geogs.mapping.training.cpu import Trainer
 from geogs.mapping.training.cuda.known_views import KnownViews
-from geogs.mapping.view import MapView
-from geogs.mapping.view_pool import ViewPool
+from geogs.mapping.view_arrays import MapCameras
+from geogs.mapping.views import MapView, MapViews
 from geogs.splat import init
 from geogs.splat.cpu.in_view import disks_in_view
-from geogs.splat.map import DiskParameters, GaussianMap
-from geogs.splat.optimizer import LearningRates, MapOptimizer
 from geogs.splat.render import render
-from keyframe_samples import Sample, add, segment_of
+from geogs.world.disks import DiskParameters, GaussianMap
+from keyframe_samples import Sample, add, segment_of, views_of
 
 CAMERA = Camera(60.0, 60.0, 47.5, 35.5, 96, 72)
 CAMERAS = MapCameras(CAMERA, CAMERA, CAMERA)
@@ -53,15 +51,14 @@ def test_no_disk_that_is_rendered_is_left_out():
 def views() -> list[MapView]:
     random = torch.Generator().manual_seed(1)
     made, segment = [], segment_of([], CAMERA)
-    pool = ViewPool(CAMERAS, LOSS, torch.device("cpu"), 128)
+    pool = views_of(segment.table, CAMERAS, LOSS)
     for n in range(2):
         image = torch.randint(0, 255, (72, 96, 3), dtype=torch.uint8, generator=random).numpy()
         T = se3_exp(torch.tensor([0.1 * n, 0, 0, 0, 0.02 * n, 0], dtype=torch.float64))
         add(segment, Sample(n, image, T))
-        pool.add(segment[n])
-        view = MapView(segment[n], pool)
+        view = pool.add(n)
         depth = 2 + torch.rand(72, 96, generator=random)
-        pool.set_depth(n, DenseDepth(depth, torch.ones_like(depth), depth.median()))
+        view.set_depth(DenseDepth(depth, torch.ones_like(depth), depth.median()))
         made.append(view)
     return made
 
@@ -76,7 +73,7 @@ def test_training_an_excerpt_is_training_the_map(monkeypatch):
         monkeypatch.setattr(training, "_LARGE_EXCERPT", share)
         disks = GaussianMap.empty()
         trainer = Trainer(disks, CAMERAS, config, 2.0)
-        trainer.optimizer.append(some_disks(2000), 5)
+        disks.append(some_disks(2000), 5)
         a, b = views()
         trainer.train([[(a, [b])], [(b, [a])], [(a, []), (b, [a])]], [1.0, 0.5, 0.7])
         assert trainer.disks is trainer.optimizer.disks is disks
@@ -86,7 +83,7 @@ def test_training_an_excerpt_is_training_the_map(monkeypatch):
     # Equal but for the rounding of loops that are cut at other disks.
     for p, q in zip(first.disks.parameters, second.disks.parameters, strict=True):
         torch.testing.assert_close(p, q, rtol=0, atol=2e-6)
-    for p, q in zip(first.optimizer.second, second.optimizer.second, strict=True):
+    for p, q in zip(first.disks.second, second.disks.second, strict=True):
         torch.testing.assert_close(p, q, rtol=1e-4, atol=1e-12)
     assert torch.equal(first.disks.steps, second.disks.steps)
     assert torch.equal(first.disks.seen, second.disks.seen)
@@ -96,16 +93,15 @@ def test_training_an_excerpt_is_training_the_map(monkeypatch):
 
 def test_dropping_recent_disks_leaves_the_old_in_place():
     disks = GaussianMap.empty()
-    optimizer = MapOptimizer(disks, LearningRates(1e-3, 1e-3, 1e-3, 1e-3))
-    optimizer.append(some_disks(1000), 0)
+    disks.append(some_disks(1000), 0)
     before = disks.position.detach().clone()
     for gone in ([900, 950], [0, 5], [995]):
         mask = torch.ones(len(disks), dtype=torch.bool)
         mask[gone] = False
-        optimizer.keep(mask)
+        disks.keep(mask)
         before = before[mask]
         assert torch.equal(disks.position.detach(), before)
-        assert len(optimizer.first[0]) == len(before)
+        assert len(disks.first[0]) == len(before)
 
 
 @pytest.mark.parametrize("spread", [1.0, 30.0])
@@ -125,10 +121,12 @@ def test_few_slots_serve_many_keyframes():
     known = KnownViews(CAMERAS, torch.device("cpu"), 2)
     a, b = views()
     pose = se3_exp(torch.full((6,), 0.2, dtype=torch.float64))
-    a.keyframe.poses[7] = pose
-    a.pool.add(replace(a.keyframe, id=7))
-    c = MapView(replace(a.keyframe, id=7), a.pool)
-    a.pool.set_depth(7, a.dense)
+    keyframes = a.arrays.keyframes
+    keyframes.arrays.put("image", 7, a.keyframe.image)
+    keyframes.poses[7] = pose
+    keyframes.set_of[0].put(replace(a.keyframe, id=7))
+    c = MapViews(a.arrays).add(7)
+    c.set_depth(a.dense)
     first = known.slots([a, b])
     known.table.rendered.fill_(1)
     addresses = known.table.pointers.clone()

@@ -8,9 +8,9 @@ import torch
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp
 from geogs.splat import reference
-from geogs.splat.map import DiskParameters
 from geogs.splat.reference import distortion
 from geogs.splat.render import RenderOutput, render
+from geogs.world.disks import DiskParameters
 
 CAMERA = Camera(fx=11.0, fy=12.0, cx=4.3, cy=3.1, width=9, height=7)
 IDENTITY = torch.eye(4, dtype=torch.float64)

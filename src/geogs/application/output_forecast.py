@@ -19,8 +19,9 @@ from geogs.application.results.report import write_report
 from geogs.application.results.surfaces import fusion_views
 from geogs.config import MeshConfig
 from geogs.errors import InputError
+from geogs.mapping.time_budget import OutputCost
 from geogs.mesh.extract import VolumePlan, extract_mesh, plan_volume
-from geogs.reconstruction import OutputCost, Reconstruction
+from geogs.reconstruction import Reconstruction
 
 _log = logging.getLogger(__name__)
 
@@ -106,10 +107,10 @@ class OutputForecast:
         in the set. Where little time is left, the scene's mesh gets a smaller budget of triangles.
         """
         scene = self._scene
-        self._views = scene.neighbouring(VIEWS)
+        self._views = _neighbouring(scene)
         _make_ready(scene, self._views[:1])
         self._found = _rehearse(scene, self._views, self._clock)
-        times = times_the_surface([scene.image_of(i) for i in self._views])
+        times = times_the_surface([scene.table.images[i] for i in self._views])
         # However much surface there is, its triangles are no more than this.
         most = scene.config.mesh.triangle_budget / max(self._found.triangles, 1)
         times = min(times, max(most, 1.0), MOST_SURFACE)
@@ -121,7 +122,7 @@ class OutputForecast:
         part of the seconds that are left."""
         scene, found = self._scene, self._found
         if found is None or found.seconds < WORTH * left:
-            self._views = self._views or scene.neighbouring(VIEWS)
+            self._views = self._views or _neighbouring(scene)
             found = _rehearse(scene, self._views, self._clock)
         try:
             whole = plan_volume(fusion_views(scene.depth_maps()), scene.config.mesh)
@@ -134,7 +135,7 @@ class OutputForecast:
         """The part of the triangles for which there is time; the scene's mesh is told so."""
         scene, mesh = self._scene, self._scene.config.mesh
         surface = CAUTION * COARSER**2 * times * found.surface
-        spare = MESH_SHARE * scene.budget_left - CAUTION * found.report
+        spare = MESH_SHARE * scene.budget.left - CAUTION * found.report
         if mesh.voxel is not None or surface <= max(spare, 0.0):
             return 1.0
         part = max(spare / surface, FEWEST_TRIANGLES)
@@ -142,6 +143,12 @@ class OutputForecast:
         if fewer < mesh.triangle_budget:
             scene.config = replace(scene.config, mesh=replace(mesh, triangle_budget=fewer))
         return part
+
+
+def _neighbouring(scene: Reconstruction) -> list[int]:
+    """Ids of mapped keyframes that were taken near each other."""
+    mapped, views = scene.table.map.mapped, scene.mapper.views
+    return [view.id for view in views.near(views[mapped[0]], mapped, VIEWS)]
 
 
 def _cost(found: _Rehearsal, times_the_surface: float) -> OutputCost:

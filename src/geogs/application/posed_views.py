@@ -10,15 +10,15 @@ from geogs.depth.view import Place
 from geogs.errors import InputError
 from geogs.io.sources.posed.posed_source import PosedSource
 from geogs.io.sources.reader import read_side_by_side
-from geogs.mapping.first_look import SmallImage, first_points
-from geogs.mapping.known_poses import FEWEST_POINTS, depth_search
-from geogs.mapping.view_choice import (
+from geogs.mapping.coverage import (
     Sightings,
     coverage_order,
     relative_sharpness,
     scene_points,
     sightings,
 )
+from geogs.mapping.first_look import SmallImage, first_points
+from geogs.mapping.known_poses import FEWEST_POINTS, depth_search
 from geogs.reconstruction import Reconstruction
 from geogs.types import Trajectory
 

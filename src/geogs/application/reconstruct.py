@@ -28,7 +28,7 @@ from geogs.gpu.installation import require_device
 from geogs.io.sources.posed.pose_check import PoseCheck, check_poses
 from geogs.io.sources.posed.posed_source import PosedSource
 from geogs.io.sources.sniff import open_posed_source
-from geogs.reconstruction import Reconstruction, ReconstructionState
+from geogs.reconstruction import Reconstruction, ReconstructionTable
 from geogs.threads import on_one_torch_thread
 
 FIRST_BATCH = 24
@@ -151,7 +151,7 @@ class MappedImages(Work):
         """What a checkpoint holds; nothing before the depths are done."""
         if not self._has_depths:
             return None
-        return ReconstructState(self._made_from, self._scene.state())
+        return ReconstructState(self._made_from, self._scene.settle())
 
     def write_more(self, job: Job) -> None:
         """Write the snapshots."""
@@ -168,7 +168,7 @@ class MappedImages(Work):
         resumed = None
         if settings.resume:
             resumed = read_work(job.output, self._made_from)
-            place = resumed.mapper.place
+            place = resumed.map.place
             done = f"step {place.steps} of {place.total}" if place.steps else "the depths"
             progress.write(f"Going on after {done}, {resumed.seconds:.0f} s into the work.")
         checks = progress if settings.check_poses and settings.poses == "given" else None
@@ -201,7 +201,7 @@ def _say_whether_poses_fit(progress: RunProgress | None, checked: Future[PoseChe
 def _complete(
     scene: Reconstruction,
     source: PosedSource,
-    resumed: ReconstructionState | None,
+    resumed: ReconstructionTable | None,
     report: Report,
     budgeted: bool,
     checks: RunProgress | None,
@@ -233,13 +233,13 @@ def _complete(
     forecast = OutputForecast(scene)
 
     def more(count_of: Callable[[], int]) -> None:
-        scene.output_cost = forecast.first(views.times_the_surface)
+        scene.budget.output_cost = forecast.first(views.times_the_surface)
         views.give(count_of())
 
     def reported(stage: str, fraction: float) -> None:
         report(stage, fraction)
         if stage == "growing":
-            scene.output_cost = forecast.settled(scene.seconds_left)
+            scene.budget.output_cost = forecast.settled(scene.budget.training_left)
 
     views.give(FIRST_BATCH)
     scene.finish(points, reported, more)

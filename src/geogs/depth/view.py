@@ -49,16 +49,6 @@ class DepthView(Place):
     """Sum over edges of w |dp/dd|^2; 0 where the tracker knows nothing."""
 
 
-@dataclass(frozen=True, slots=True)
-class DepthSearch:
-    """Where to look for a view's depth, where no tracker says. Map units."""
-
-    near: float
-    typical: float
-    """Median: neighbours are chosen for their parallax there."""
-    far: float
-
-
 @dataclass(slots=True)
 class KeyframeDepth:
     """Dense depth of one keyframe at the render size."""

@@ -144,7 +144,7 @@ class BackgroundMapper:
         def task() -> None:
             self._take(changed, event)
             what(self._mapper)
-            self.disks = len(self._mapper.map)
+            self.disks = len(self._mapper.table.disks)
 
         with self._news:
             self._raise()

@@ -58,11 +58,11 @@ def distances_to_try(views: Sequence[Place]) -> Float64[np.ndarray, "n"]:
     None where all cameras stand in the same place: then no depth shows.
     """
     centres = np.stack([v.center for v in views])
-    apart = np.linalg.norm(centres[:, None] - centres, axis=2)
-    extent = apart.max()
+    distance = np.linalg.norm(centres[:, None] - centres, axis=2)
+    extent = distance.max()
     if extent <= 1e-9 * max(1.0, float(np.abs(centres).max())):
         return np.empty(0)
-    nearest = np.where(apart > 1e-6 * extent, apart, np.inf).min(1)
+    nearest = np.where(distance > 1e-6 * extent, distance, np.inf).min(1)
     first = float(np.median(nearest)) / np.tan(np.radians(_WIDEST))
     last = extent / np.tan(np.radians(_NARROWEST))
     count = 2 + int(np.log(last / first) / np.log(_RATIO))
@@ -75,7 +75,7 @@ def first_points(
     working: Camera,
     progress: Callable[[float], None],
 ) -> Float64[np.ndarray, "n 3"]:
-    """Points of the scene that some of the images show without doubt, in the world.
+    """Points of the scene that some of the images show clearly, in the world.
 
     Of the distances that can be tried, those at the one where most pixels find a clear match.
 
@@ -93,12 +93,12 @@ def first_points(
     scouts = [chosen[i] for i in _spread(len(chosen), _SCOUTS)]
     distances = distances_to_try([places[i] for i in _spread(len(places), _CANDIDATES)])
     tasks = [(i, float(d)) for d in distances for i in scouts]
-    share = len(tasks) / max(len(tasks) + 3 * (len(chosen) - len(scouts)), 1)
-    found = look.points(tasks, lambda f: progress(share * f))
+    part = len(tasks) / max(len(tasks) + 3 * (len(chosen) - len(scouts)), 1)
+    found = look.points(tasks, lambda f: progress(part * f))
     best = max(range(len(distances)), key=lambda k: _count(found, float(distances[k])), default=0)
     others = [i for i in chosen if i not in scouts]
     tasks = [(i, float(d)) for d in distances[max(best - 1, 0) : best + 2] for i in others]
-    found |= look.points(tasks, lambda f: progress(share + (1 - share) * f))
+    found |= look.points(tasks, lambda f: progress(part + (1 - part) * f))
     wanted = max(distances.tolist(), key=lambda d: _count(found, d), default=0.0)
     points = [p for (_, d), p in found.items() if d == wanted]
     gathered = np.concatenate(points) if points else np.empty((0, 3))
@@ -196,9 +196,9 @@ class _FirstLook:
         others = [p for p in self._places if p.id != reference.id]
         if not others:
             return []
-        parallax, turn = parallax_degrees(reference, others, distance)
+        parallax, rotation = parallax_degrees(reference, others, distance)
         usable = (parallax > MIN_PARALLAX_DEG) & (parallax < MAX_PARALLAX_DEG)
-        usable &= turn < MAX_VIEW_ANGLE_DEG
+        usable &= rotation < MAX_VIEW_ANGLE_DEG
         others = [p for p, good in zip(others, usable, strict=True) if good]
         if len(others) < min(2, len(self._places) - 1):
             return []

@@ -1,16 +1,24 @@
-"""The dense depths of a mapper's keyframes: searched, measured, and checked by those around."""
+"""The dense depths of the map's keyframes: searched, measured, and checked by those around."""
+
+from collections.abc import Sequence
+from operator import attrgetter
+
+from jaxtyping import Bool, Float
+from torch import Tensor
 
 from geogs.config import DepthSensorConfig
 from geogs.depth.base import DepthEngine, Progress, silent
 from geogs.depth.sensor import joined
 from geogs.depth.sweep_neighbors import select_sweep_neighbours
-from geogs.mapping.near_views import NearViews
-from geogs.mapping.stored_maps import StoredDepth
-from geogs.mapping.view import MapView
-from geogs.mapping.view_pool import ViewPool
+from geogs.depth.view import DenseDepth, DepthView
+from geogs.mapping.dense_depths import get_depth, put_depth
+from geogs.mapping.partners import CANDIDATES
+from geogs.mapping.views import MapView, MapViews
+from geogs.on_demand import OnDemand
+from geogs.priors.depth_sensor import sensor_depth
+from geogs.world.arrays import ArrayTable
+from geogs.world.keyframes import Keyframe
 
-CANDIDATES = 128
-"""Nearest keyframes among which those are looked for that match or check one."""
 CHECKING_VIEWS = 8
 """Keyframes whose depth checks a new keyframe's depth and whose free space carves around it."""
 SEARCHED_TOGETHER = 32
@@ -23,17 +31,14 @@ class KeyframeDepths:
     def __init__(
         self,
         engine: DepthEngine,
-        views: dict[int, MapView],
-        pool: ViewPool,
+        views: MapViews,
         sensor: DepthSensorConfig | None = None,
     ) -> None:
-        self.sensor = sensor or DepthSensorConfig()
         self.engine = engine
         self.views = views
-        self._near = NearViews(views)
-        self.pool = pool
+        self.sensor = sensor or DepthSensorConfig()
 
-    def estimate(self, views: list[MapView], progress: Progress = silent) -> None:
+    def estimate(self, views: Sequence[MapView], progress: Progress = silent) -> None:
         """Search the depths of some views, not too many at once."""
 
         def on(done: float) -> None:
@@ -41,42 +46,69 @@ class KeyframeDepths:
 
         for start in range(0, len(views), SEARCHED_TOGETHER):
             batch = views[start : start + SEARCHED_TOGETHER]
-            self._search(batch, on)
+            searches = [v.row.search for v in batch]
+            depths = self.engine.estimate(
+                [v.depth_view for v in batch], [self._neighbours(v) for v in batch], on,
+                [None if s is None else (s.near, s.far) for s in searches],
+            )  # fmt: skip
+            for view, depth in zip(batch, depths, strict=True):
+                view.set_depth(self._with_sensor(view, depth))
 
-    def _search(self, views: list[MapView], progress: Progress) -> None:
-        references, neighbours = [v.depth_view for v in views], []
-        limits = [None if v.search is None else (v.search.near, v.search.far) for v in views]
-        for view in views:
-            depth = view.tracked_depth if view.search is None else view.search.typical
-            candidates = self._near.around(view, self.views, CANDIDATES)
-            places = [v.place for v in candidates]
-            chosen = select_sweep_neighbours(view.place, places, depth)
-            neighbours.append([candidates[i].depth_view for i in chosen])
-        depths = self.engine.estimate(references, neighbours, progress, limits)
-        for view, dense in zip(views, depths, strict=True):
-            sensed = view.sensed(self.sensor)
-            self.pool.set_depth(view.id, dense if sensed is None else joined(dense, *sensed))
-
-    def check(self, views: list[MapView]) -> None:
+    def check(self, views: Sequence[MapView]) -> None:
         """Let the neighbours' depths, as they were estimated, revise those of the views."""
-        checked: list[StoredDepth] = []
+        device, arrays, checked = self.views.arrays.device, ArrayTable(), []
         for start in range(0, len(views), SEARCHED_TOGETHER):
             batch = views[start : start + SEARCHED_TOGETHER]
             others = [[o.posed for o in self.near(view)] for view in batch]
             depths = self.engine.check([view.posed for view in batch], others)
             if len(views) == len(batch):
                 for view, depth in zip(views, depths, strict=True):
-                    self.pool.set_depth(view.id, depth)
+                    view.set_depth(depth)
                 return
-            checked += [StoredDepth.of(depth, 1.0, self.pool.archive) for depth in depths]
-        for view, stored in zip(views, checked, strict=True):
-            self.pool.set_depth(view.id, stored.load(1.0, self.pool.device))
+            pairs = zip(batch, depths, strict=True)
+            checked += [(v.id, put_depth(arrays, v.id, depth, 1.0)) for v, depth in pairs]
+        for id, stored in checked:
+            self.views[id].set_depth(get_depth(arrays, id, stored, 1.0, device))
 
     def near(self, view: MapView) -> list[MapView]:
         """The keyframes with a depth that see a view's surface best from elsewhere."""
-        around = self._near.around(view, self.views, CANDIDATES)
+        around = self.views.near(view, self.views, CANDIDATES)
         known = [v for v in around if v.has_depth and v.id != view.id]
-        places = [v.place for v in known]
-        depth = view.typical_depth
+        chosen = self._placed(view, known, view.typical_depth)
+        return chosen[:CHECKING_VIEWS]
+
+    def keep(self, points: Float[Tensor, "n 3"], views: Sequence[MapView]) -> Bool[Tensor, "n"]:
+        """World points that do not stand in the free space that some views see."""
+        known = [v for v in views if v.has_depth]
+        # Read one after the other where they are not in memory.
+        return self.engine.keep(points, OnDemand(known, attrgetter("posed")))
+
+    def _neighbours(self, view: MapView) -> list[DepthView]:
+        """What a view is matched with."""
+        search = view.row.search
+        depth = tracked_depth(view.keyframe) if search is None else search.typical
+        around = self.views.near(view, self.views, CANDIDATES)
+        return [v.depth_view for v in self._placed(view, around, depth)]
+
+    def _placed(self, view: MapView, others: list[MapView], depth: float) -> list[MapView]:
+        """Of other views those from which a depth is best seen, best first."""
+        places = [v.place for v in others]
         chosen = select_sweep_neighbours(view.place, places, depth)
-        return [known[i] for i in chosen[:CHECKING_VIEWS]]
+        return [others[i] for i in chosen]
+
+    def _with_sensor(self, view: MapView, searched: DenseDepth) -> DenseDepth:
+        """The searched depth, joined with what a sensor measured where it did."""
+        keyframe, render = view.keyframe, self.views.arrays.cameras.render
+        if keyframe.measured is None or (metres := keyframe.sensor_depth) is None:
+            return searched
+        found = sensor_depth(metres, self.sensor).resized(render.width, render.height)
+        inverse_depth, information = found.tensors(self.views.arrays.device)
+        scale = keyframe.scale
+        return joined(searched, inverse_depth / scale, information * scale**2)
+
+
+def tracked_depth(keyframe: Keyframe) -> float:
+    """Median depth of the cells whose depth the tracker knows fairly well, else of all."""
+    z = 1 / keyframe.inverse_depth.clamp(min=1e-3)
+    known = z / keyframe.confident_information.clamp(min=1e-12).sqrt() < 0.2
+    return float(z[known].median() if int(known.sum()) > 8 else z.median())

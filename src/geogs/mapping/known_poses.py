@@ -6,20 +6,21 @@ import numpy as np
 import torch
 from jaxtyping import Float64
 
-from geogs.depth.view import DepthSearch, Place
+from geogs.depth.view import Place
 from geogs.geometry.camera import Camera
-from geogs.mapping.view import MapView
+from geogs.mapping.views import MapView
+from geogs.world.map import DepthSearch
 
 FEWEST_POINTS = 100
 """Points of all views that tell where the scene is."""
 # Points of a view's own that say enough about its depths.
 _ENOUGH_POINTS = 50
-# Points that tell how far all views see, at most: more say the same.
-_TELLING_POINTS = 20_000
+# Points that say how far all views see, at most: more say the same.
+_MOST_POINTS = 20_000
 # Points taken from each dense depth.
 _POINTS_PER_VIEW = 2000
 # Least confidence of a pixel that gives a point.
-_SURE = 0.7
+_CONFIDENT = 0.7
 
 
 def depth_search(
@@ -46,20 +47,20 @@ def expect_depths(
     views: Iterable[MapView], points: Float64[np.ndarray, "n 3"], camera: Camera, margin: float
 ) -> None:
     """Let every view's depth be searched where these points say; its grid counts for nothing."""
-    points = points[:: 1 + len(points) // _TELLING_POINTS]
+    points = points[:: 1 + len(points) // _MOST_POINTS]
     for view in views:
-        view.search = depth_search(view.place, points, camera, margin)
+        view.row.search = depth_search(view.place, points, camera, margin)
 
 
 def dense_points(
     views: Sequence[MapView], camera: Camera, random: np.random.Generator
 ) -> Float64[np.ndarray, "n 3"]:
-    """World points of some sure pixels of each view's depth."""
+    """World points of some pixels of each view where its depth is confident."""
     rays = camera.rays(torch.float64).numpy()
     points = []
     for view in views:
         depth = view.dense.arrays()
-        v, u = np.nonzero(depth.confidence >= _SURE)
+        v, u = np.nonzero(depth.confidence >= _CONFIDENT)
         some = random.permutation(len(v))[:_POINTS_PER_VIEW]
         local = rays[v[some], u[some]] * depth.depth[v[some], u[some], None]
         T_cw = view.place.T_cw

@@ -21,8 +21,8 @@ from torch import Tensor
 from geogs.errors import GeogsError
 from geogs.geometry.lie import se3_inverse
 from geogs.geometry.umeyama import umeyama
-from geogs.mapping.similarity_field import Witness, blended_similarities
-from geogs.mapping.view import MapView
+from geogs.mapping.similarity_field import CovisibleKeyframe, blended_similarities
+from geogs.mapping.views import MapView
 from geogs.types import PoseCorrection
 
 Strategy = Literal["blended", "coherent", "per_keyframe"]
@@ -45,12 +45,12 @@ class MapUpdate:
     """Root mean square distance between targets and where the update puts the disks."""
 
 
-def witness(view: MapView, correction: PoseCorrection) -> Witness:
+def covisible_keyframe(view: MapView, correction: PoseCorrection) -> CovisibleKeyframe:
     """What a view with a depth saw, and from where, before a correction that it has taken over."""
     depth, scale = view.dense.depth, correction.scale.get(view.id, 1.0)
     T_cw = correction.before.get(view.id, view.T_cw)
-    return Witness(
-        view.id, view.pool.cameras.render, T_cw, depth if scale == 1.0 else depth * scale,
+    return CovisibleKeyframe(
+        view.id, view.arrays.cameras.render, T_cw, depth if scale == 1.0 else depth * scale,
         view.dense.confidence,
     )  # fmt: skip
 
@@ -81,15 +81,15 @@ def plan_update(
     anchor: Int[Tensor, "n"],
     correction: PoseCorrection,
     strategy: Strategy = "blended",
-    witnesses: Iterable[Witness] = (),
+    covisible: Iterable[CovisibleKeyframe] = (),
 ) -> MapUpdate:
     """The similarity of every disk for a pose correction, computed where the disks live.
 
     Disks whose anchor is not in the correction follow the corrected keyframe nearest in time.
     ``per_keyframe`` moves each with its anchor, ``coherent`` those whose anchors move by the one
     Sim(3) that fits their targets best (:func:`coherent_similarities`), ``blended`` each with the
-    ``witnesses`` that see it in place (with its anchor where none does), evened out among
-    neighbours; witnesses that the correction does not know say nothing.
+    ``covisible`` keyframes that see it in place (with its anchor where none does), evened out among
+    neighbours; those that the correction does not have count for nothing.
     """
     if len(position) == 0:
         return MapUpdate(torch.zeros(0, 4, 4, dtype=torch.float64), 0.0, 0.0)
@@ -103,8 +103,8 @@ def plan_update(
         S = coherent_similarities(x, target, own, _revisited(x, target, slot, correction))
     elif strategy == "blended" and (fit := _fit_similarity(x, target)) is not None:
         known = {int(i): n for n, i in enumerate(ids)}
-        heard = ((w, known[w.keyframe_id]) for w in witnesses if w.keyframe_id in known)
-        S = blended_similarities(x, own, fit, similarities, heard)
+        seen = ((k, known[k.keyframe_id]) for k in covisible if k.keyframe_id in known)
+        S = blended_similarities(x, own, fit, similarities, seen)
     return MapUpdate(S, _rms(target - x), _rms(target - apply_each(S, x)))
 
 

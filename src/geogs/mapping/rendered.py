@@ -13,10 +13,10 @@ from geogs.geometry.camera import Camera
 from geogs.geometry.depth import averaged_over_planes, normals_from_depth
 from geogs.losses.single_view import MIN_ALPHA
 from geogs.mapping.map_frame import MapFrame
-from geogs.mapping.view import MapView
-from geogs.splat.map import DiskParameters
+from geogs.mapping.views import MapView
 from geogs.splat.render import render
 from geogs.types import MapSnapshot, RenderedKeyframe
+from geogs.world.disks import DiskParameters
 
 _RADIUS = 3
 """Pixels around, whose tangent planes a depth is averaged over."""

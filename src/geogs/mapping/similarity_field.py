@@ -23,7 +23,7 @@ _AGREEMENT = 0.03
 _OWN = 0.1
 """Weight of the keyframe that made a disk; another's is at most one."""
 _BORDER = 8.0
-"""Pixels over which a keyframe's say fades towards the border of its image."""
+"""Pixels over which a keyframe's weight fades towards the border of its image."""
 _NEIGHBOURS = 32
 _ROUNDS = 4
 _SPREAD = 1.5
@@ -33,7 +33,7 @@ _PARTING = 0.2
 
 
 @dataclass(frozen=True, eq=False)
-class Witness:
+class CovisibleKeyframe:
     """What a keyframe saw before the correction, on the device of the map."""
 
     keyframe_id: int
@@ -52,31 +52,31 @@ def blended_similarities(
     own: Float[Tensor, "n 4 4"],
     reference: Float[Tensor, "4 4"],
     similarities: Float[Tensor, "k 4 4"],
-    witnesses: Iterable[tuple[Witness, int]],
+    covisible: Iterable[tuple[CovisibleKeyframe, int]],
 ) -> Float[Tensor, "n 4 4"]:
     """World similarities of disks at ``x``, float64.
 
-    ``own`` is the correction of the keyframe that made each; every witness, one at a time, comes
-    with the place of its own among the ``similarities``. Blends are means in the Lie algebra of
-    Sim(3) of what remains after ``reference``, which should be near all of them; they do not depend
-    on the origin of the world.
+    ``own`` is the correction of the keyframe that made each; every covisible keyframe, one at a
+    time, comes with the place of its own among the ``similarities``. Blends are means in the Lie
+    algebra of Sim(3) of what remains after ``reference``, which should be near all of them; they do
+    not depend on the origin of the world.
     """
     back = sim3_inverse(reference)
     total = _OWN * sim3_log(own @ back)
     weight = torch.full_like(x[:, 0], _OWN)
-    told = to_device(sim3_log(similarities.cpu() @ back.cpu()), x.device)
-    for witness, k in witnesses:
-        say = agreement(x, witness)
-        total += say[:, None] * told[k]
-        weight += say
+    corrections = to_device(sim3_log(similarities.cpu() @ back.cpu()), x.device)
+    for keyframe, k in covisible:
+        confidence = agreement(x, keyframe)
+        total += confidence[:, None] * corrections[k]
+        weight += confidence
     moved = x @ reference[:3, :3].T + reference[:3, 3]
     return sim3_exp(smoothed(x, moved, total / weight[:, None])) @ reference
 
 
-def agreement(x: Float[Tensor, "n 3"], witness: Witness) -> Float[Tensor, "n"]:
-    """In [0, 1]: how sure the witness is that there is a surface at each point."""
-    camera = witness.camera
-    T = witness.T_cw.to(x)
+def agreement(x: Float[Tensor, "n 3"], keyframe: CovisibleKeyframe) -> Float[Tensor, "n"]:
+    """In [0, 1]: the keyframe's confidence that there is a surface at each point."""
+    camera = keyframe.camera
+    T = keyframe.T_cw.to(x)
     y = x @ T[:3, :3].T + T[:3, 3]
     z = y[:, 2].clamp(min=1e-9)
     u, v = camera.fx * y[:, 0] / z + camera.cx, camera.fy * y[:, 1] / z + camera.cy
@@ -84,9 +84,9 @@ def agreement(x: Float[Tensor, "n 3"], witness: Witness) -> Float[Tensor, "n"]:
     seen = (y[:, 2] > 0) & (inwards > 0)
     column = torch.where(seen, u, 0.0).round().long()
     row = torch.where(seen, v, 0.0).round().long()
-    deviation = (z / witness.depth[row, column].to(x) - 1) / _AGREEMENT
-    say = (inwards / _BORDER).clamp(max=1.0) * witness.confidence[row, column].to(x)
-    return torch.where(seen, say * torch.exp(-0.5 * deviation.square()), 0.0)
+    deviation = (z / keyframe.depth[row, column].to(x) - 1) / _AGREEMENT
+    confidence = (inwards / _BORDER).clamp(max=1.0) * keyframe.confidence[row, column].to(x)
+    return torch.where(seen, confidence * torch.exp(-0.5 * deviation.square()), 0.0)
 
 
 def smoothed(
@@ -113,5 +113,5 @@ def smoothed(
 
 
 def _displacement(xi: Float[Tensor, "n 7"], x: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-    """Of points by small tangents, to first order."""
+    """How small tangents displace points, to first order."""
     return xi[:, :3] + torch.linalg.cross(xi[:, 3:6], x) + xi[:, 6:] * x

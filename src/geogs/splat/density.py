@@ -8,8 +8,8 @@ from torch import Tensor
 
 from geogs.config import DiskConfig
 from geogs.geometry.lie import quaternion_to_matrix
-from geogs.splat.map import DiskParameters, GaussianMap
 from geogs.splat.render import RenderOutput
+from geogs.world.disks import DiskParameters, GaussianMap
 
 _SPLIT_SHRINK = 1.6
 
@@ -36,7 +36,7 @@ def unexplained(
     confidence: Float[Tensor, "h w"],
     config: DiskConfig,
 ) -> Bool[Tensor, "h w"]:
-    """Pixels whose known depth the map does not show: too transparent, or behind a sure depth.
+    """Pixels whose known depth the map does not show: too transparent, or behind a confident depth.
 
     A map in front of the depth is no reason for a disk: it would be hidden, and made again from
     every keyframe. What stands in front wrongly is carved instead.
@@ -54,9 +54,9 @@ def worth_keeping(disks: GaussianMap, config: DiskConfig) -> Bool[Tensor, "n"]:
 
 
 def worth_splitting(
-    disks: GaussianMap, gradient: Float[Tensor, "n"], share: float, smallest: float
+    disks: GaussianMap, gradient: Float[Tensor, "n"], fraction: float, smallest: float
 ) -> Bool[Tensor, "n"]:
-    """The ``share`` of all disks on which the losses pull hardest, if they are large enough.
+    """The ``fraction`` of all disks on which the losses pull hardest, if they are large enough.
 
     A disk that fits its part of the surface is pulled to no side for long; one that is too large
     for it is pulled by every view somewhere else, and ``gradient``, the root mean square of its
@@ -64,7 +64,7 @@ def worth_splitting(
     (map units) can be split.
     """
     large = disks.scale.amax(1) > smallest
-    count = min(int(share * len(disks)), int(large.sum()))
+    count = min(int(fraction * len(disks)), int(large.sum()))
     chosen = torch.zeros_like(large)
     if count:
         pull = torch.where(large, gradient, -1.0)

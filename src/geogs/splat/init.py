@@ -11,7 +11,7 @@ from geogs.config import DiskConfig
 from geogs.geometry.lie import matrix_to_quaternion
 from geogs.geometry.neighbors import all_pairs_neighbors, nearest_neighbors
 from geogs.splat.cuda.local_planes import principal_planes
-from geogs.splat.map import DiskParameters
+from geogs.world.disks import DiskParameters
 
 # Part of the extent of some points within which their neighbours are looked for at first.
 _MARGIN = 0.05

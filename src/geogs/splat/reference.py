@@ -13,7 +13,7 @@ from torch.utils.checkpoint import checkpoint
 
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import quaternion_to_matrix
-from geogs.splat.map import DiskParameters
+from geogs.world.disks import DiskParameters
 
 MIN_ALPHA = 1 / 255
 """A disk is not blended into a pixel where its opacity is below this."""

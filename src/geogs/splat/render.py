@@ -8,10 +8,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from geogs.geometry.camera import Camera
-from geogs.splat.map import DiskParameters, GaussianMap
 from geogs.splat.reference import render_reference
 from geogs.threads import worker_count
 from geogs.types import MapSnapshot
+from geogs.world.disks import DiskParameters, GaussianMap
 
 Backend = Literal["auto", "reference", "cpu", "cuda"]
 

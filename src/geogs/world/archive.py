@@ -35,7 +35,7 @@ class Archive:
     For a checkpoint the file gets a name (``settle``), and what the last checkpoint refers to stays
     until the next one is complete (``release``). Every array has a checksum from when it was
     written, which is compared when a checkpoint is read: so a checkpoint costs what is new in it,
-    and damage is told before any work is done with it.
+    and damage is found before any work is done with it.
     """
 
     def __init__(self, folder: Path | str | None = None) -> None:

@@ -56,6 +56,10 @@ class ArrayTable:
         array: np.ndarray = self.recent(name).get(id, piece.load)
         return array
 
+    def load(self, name: str, id: int) -> np.ndarray:
+        """An array that there must be, as it was put."""
+        return self.pieces[name][id].load()
+
     def made(self, name: str, id: int, make: Callable[[], V]) -> V:
         """A value that can be made again, and is where it is not among those used last."""
         value: V = self.recent(name).get(id, make)
@@ -72,6 +76,6 @@ class ArrayTable:
         for name in {*self.pieces, *self._recent}:
             self.drop(name, id)
 
-    def recent(self, name: str) -> LruCache[int, Any]:
-        """Values of a name in memory."""
-        return self._recent.setdefault(name, LruCache(self.resident))
+    def recent(self, name: str, limit: int | None = None) -> LruCache[int, Any]:
+        """Values of a name in memory; as many as are resident, or another ``limit``."""
+        return self._recent.setdefault(name, LruCache(limit or self.resident))

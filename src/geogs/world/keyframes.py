@@ -3,7 +3,7 @@
 import copy
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -183,7 +183,7 @@ class Keyframe:
     def confident_information(self) -> Float[Tensor, "p"]:
         """Information less the error that no match removes: what others may trust depth by.
 
-        The relative deviation of depth is z / sqrt of this. What a prior adds is only told of where
+        The relative deviation of depth is z / sqrt of this. What a prior adds counts only where
         depth has been adjusted with it.
         """
         # What matches agree on is still wrong by a common error of poses and scale.
@@ -312,8 +312,8 @@ class KeyframeSet:
             raise KeyError(id)
         return self.table.keyframes[id]
 
-    def __contains__(self, id: int) -> bool:
-        return self.table.set_of.get(id) is self
+    def __contains__(self, id: object) -> bool:
+        return id in self.table.set_of and self.table.set_of[cast(int, id)] is self
 
     @property
     def grid(self) -> SampleGrid:
@@ -387,7 +387,7 @@ class KeyframeSet:
     def correct(self, correction: PoseCorrection) -> None:
         """Take over poses and scales of a loop closure or another global correction.
 
-        Who keeps something in world coordinates is told of it by ``take_corrections``.
+        Who keeps something in world coordinates asks for it by ``take_corrections``.
         """
         for id, T in correction.after.items():
             keyframe = self[id]

@@ -12,8 +12,8 @@ V = TypeVar("V")
 class LruCache(Generic[K, V]):
     """The values used last, at most ``limit`` of them; others are made again when they are wanted.
 
-    ``leave`` is told of each value that has to go, so that it can be stored or its place be given
-    to another. For any thread, if ``leave`` is; a value is made without holding others up.
+    ``leave`` is called with each value that has to go, so that it can be stored or its place be
+    given to another. For any thread, if ``leave`` is; a value is made without holding others up.
     """
 
     def __init__(self, limit: int, leave: Callable[[K, V], object] | None = None) -> None:
@@ -61,7 +61,7 @@ class LruCache(Generic[K, V]):
                 self._values.move_to_end(key)
 
     def drop(self, key: K) -> None:
-        """Forget a value, of which nobody is told."""
+        """Forget a value without calling ``leave``."""
         with self._lock:
             self._values.pop(key, None)
 

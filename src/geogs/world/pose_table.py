@@ -69,8 +69,8 @@ class PoseTable:
         away = np.linalg.norm(self.centres(ids) - self._centres[id], axis=1)
         within = np.flatnonzero(away < distance)
         within = within[np.argsort(away[within], kind="stable")]
-        apart = rotation_angles(self._rows[id], self.rows(ids[within]))
-        return ids[within[apart < angle]]
+        rotation = rotation_angles(self._rows[id], self.rows(ids[within]))
+        return ids[within[rotation < angle]]
 
     def _grow(self, least: int) -> None:
         more = max(least, 2 * len(self._rows), 64) - len(self._rows)

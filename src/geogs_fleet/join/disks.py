@@ -11,10 +11,10 @@ from geogs.geometry.lie import quaternion_to_matrix, se3_inverse
 from geogs.geometry.neighbors import nearest_neighbors
 from geogs.geometry.umeyama import umeyama
 from geogs.io.writers.map_file import load_map_file, save_map
-from geogs.mapping.similarity_field import Witness, blended_similarities
-from geogs.splat.map import DiskParameters, GaussianMap
+from geogs.mapping.similarity_field import CovisibleKeyframe, blended_similarities
 from geogs.threads import on_one_torch_thread
 from geogs.types import MapSnapshot
+from geogs.world.disks import DiskParameters, GaussianMap
 from geogs_fleet.join.graph import Placement
 from geogs_fleet.join.part import Part, PartViews, opened
 
@@ -42,15 +42,15 @@ def move_disks(
     x = result.disks.position.double()
     whole = overall(views, similarities).to(x)
 
-    def witnesses() -> Iterator[tuple[Witness, int]]:
+    def covisible() -> Iterator[tuple[CovisibleKeyframe, int]]:
         for n, T_cw in enumerate(torch.from_numpy(views.T_cw)):
             maps = result.render(T_cw)
-            witness = Witness(n, result.depth_camera, T_cw, maps.depth, maps.weight)
-            yield witness, n
+            keyframe = CovisibleKeyframe(n, result.depth_camera, T_cw, maps.depth, maps.weight)
+            yield keyframe, n
 
     S = whole.expand(len(x), 4, 4)
     if len(x) > 1:
-        S = blended_similarities(x, S, whole, similarities, witnesses())
+        S = blended_similarities(x, S, whole, similarities, covisible())
     save_map(after, transformed(result.disks, S), {})
     return len(x)
 
@@ -74,7 +74,7 @@ def transformed(disks: MapSnapshot, S: Float[Tensor, "n 4 4"]) -> MapSnapshot:
     if not len(disks):
         return disks
     none = torch.zeros(len(disks), dtype=torch.long, device=disks.position.device)
-    moved = GaussianMap(DiskParameters.of(disks), none)
+    moved = GaussianMap.of(DiskParameters.of(disks), none)
     with torch.no_grad():
         moved.transform(S)
     return moved.snapshot()

@@ -41,7 +41,7 @@ def interrupted(scene: Reconstruction, fraction: float) -> None:
 
 def write_work(output: Path, scene: Reconstruction) -> None:
     """A checkpoint of its work."""
-    write_checkpoint(checkpoint_folder(output), ReconstructState("these", scene.state()))
+    write_checkpoint(checkpoint_folder(output), ReconstructState("these", scene.settle()))
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +64,7 @@ def test_work_that_was_cut_off_is_gone_on_with(whole, tmp_path, fraction):
     second.resume(state, lambda stage, _: stages.append(stage))
     assert set(stages) == {"training"}
     assert second.elapsed > state.seconds
-    assert second.mapper.trained.steps == whole.mapper.trained.steps
+    assert second.mapper.table.place.steps == whole.mapper.table.place.steps
     counts = len(second.snapshot()), len(whole.snapshot())
     assert abs(counts[0] - counts[1]) < 0.05 * counts[1]
     errors, wanted = depth_errors(second), depth_errors(whole)
@@ -78,22 +78,23 @@ def test_a_restored_mapper_is_the_same(tmp_path):
     write_work(tmp_path, first)
     second = ball_and_wall()
     state = read_work(tmp_path, "these")
-    second._frame = first._frame
+    second._work_on(state)
     second._place_keyframes()
-    second.mapper.load(state.mapper)
-    assert second.mapper.trained == first.mapper.trained
-    assert second.mapper.unit == first.mapper.unit
+    assert second.mapper.table.place == first.mapper.table.place
+    assert second.mapper.table.unit == first.mapper.table.unit
     for a, b in zip(first.mapper.views.values(), second.mapper.views.values(), strict=True):
-        assert a.partners == b.partners
-        assert a.search == b.search
+        assert a.row.partners == b.row.partners
+        assert a.row.search == b.row.search
         assert torch.equal(a.known.prior_depth, b.known.prior_depth)
-    for a, b in zip(first.mapper.map.parameters, second.mapper.map.parameters, strict=True):
+    for a, b in zip(
+        first.mapper.table.disks.parameters, second.mapper.table.disks.parameters, strict=True
+    ):
         assert torch.equal(a, b)
-    assert torch.equal(first.mapper.map.steps, second.mapper.map.steps)
+    assert torch.equal(first.mapper.table.disks.steps, second.mapper.table.disks.steps)
     for name in ("first", "second"):
         rows = zip(
-            getattr(first.mapper.optimizer, name),
-            getattr(second.mapper.optimizer, name),
+            getattr(first.mapper.table.disks, name),
+            getattr(second.mapper.table.disks, name),
             strict=True,
         )
         assert all(torch.equal(a, b) for a, b in rows)

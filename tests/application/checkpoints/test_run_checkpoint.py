@@ -16,9 +16,9 @@ from geogs.config import Config, InputConfig
 from geogs.errors import InputError
 from geogs.io.sources.sniff import open_source
 from geogs.slam import Slam, SlamState
-from geogs.splat.rows import GrowingRows
 from geogs.world.archive import Archive, Archived
 from geogs.world.grid import SampleGrid
+from geogs.world.growing_rows import GrowingRows
 from geogs.world.keyframes import KeyframeSet
 from quick_systems import Work, quick_config
 from records import copied
@@ -61,8 +61,8 @@ def again(slam: Slam, output: Path, copy: Path) -> Slam:
 def assert_same(a: Slam, b: Slam) -> None:
     assert np.array_equal(a.trajectory().T_wc, b.trajectory().T_wc)
     assert np.array_equal(a.trajectory().tracked, b.trajectory().tracked)
-    assert len(a.mapper.map) == len(b.mapper.map)
-    for p, q in zip(a.mapper.map.parameters, b.mapper.map.parameters, strict=True):
+    assert len(a.mapper.table.disks) == len(b.mapper.table.disks)
+    for p, q in zip(a.mapper.table.disks.parameters, b.mapper.table.disks.parameters, strict=True):
         assert torch.equal(p, q)
     for own, other in zip(a.depth_maps(), b.depth_maps(), strict=True):
         assert torch.equal(own.depth, other.depth)
@@ -78,7 +78,7 @@ def test_a_system_goes_on_as_if_nothing_had_happened(frames, tmp_path, cut):
         images = [replace(f, follows_cut=f.index == cut) for f in images[:cut] + other_place[cut:]]
     for frame in images[:AT]:
         slam.process(frame)
-    assert len(slam.mapper.map) > 200
+    assert len(slam.mapper.table.disks) > 200
     assert len(slam.segments.trackers) == (1 if cut is None else 2)
     other = again(slam, tmp_path / "own", tmp_path / "copy")
     assert_nothing_is_forgotten(slam, other)
@@ -125,7 +125,7 @@ def assert_nothing_is_forgotten(slam: Slam, other: Slam) -> None:
         elif isinstance(a, int | float | str | bytes):
             assert a == b, name
         todo += [(x, y, f"{name}{part}") for part, x, y in parts(a, b)]
-    wanted = {"Tracker", "Keyframe", "MeasuredEdge", "MapView", "GaussianMap", "MapOptimizer"}
+    wanted = {"Tracker", "Keyframe", "MeasuredEdge", "MapView", "MapTable", "GaussianMap"}
     assert wanted | {"FrameRecorder", "LoopDetector", "AppearanceIndex"} <= kinds
 
 
@@ -159,11 +159,11 @@ def names(a: object) -> set[str]:
 def test_the_maps_in_memory_are_those_that_were(tracked, tmp_path):
     """A depth that a correction scaled is the same whether it stayed in memory or came back."""
     slam = tracked
-    id, maps = slam.mapper.pool._maps.items()[-1]
+    id, maps = slam.mapper.views.arrays.loaded.items()[-1]
     slam.keyframes[id].rescale(1.1)
     other = again(slam, tmp_path / "own", tmp_path / "copy")
-    assert [i for i, _ in other.mapper.pool._maps.items()][-1] == id
-    assert maps.scale == other.mapper.pool._maps.peek(id).scale != slam.keyframes[id].scale
+    assert [i for i, _ in other.mapper.views.arrays.loaded.items()][-1] == id
+    assert maps.scale == other.mapper.views.arrays.loaded.peek(id).scale != slam.keyframes[id].scale
     for own, theirs in ((s.mapper.views[id].dense for s in (slam, other)),):
         assert torch.equal(own.depth, theirs.depth)
         assert own.typical == theirs.typical
@@ -176,7 +176,7 @@ def test_a_state_of_another_camera_or_without_a_keyframe_is_one_sentence(tracked
     first, *rest = state.segments.segments[0].keyframes.members
     wrong = [
         replace(state, waiting=[99]),
-        replace(state, mapper=replace(state.mapper, mapped=[99])),
+        replace(state, mapper=replace(copied(state.mapper), mapped=[99])),
         with_keyframes(state, rest),
         with_keyframes(state, [first, first]),
     ]

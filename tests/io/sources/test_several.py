@@ -124,6 +124,6 @@ def test_the_map_shows_the_largest_of_videos_that_have_nothing_in_common():
     assert fates == ["apart", "world"]
     trajectory = slam.trajectory()
     assert trajectory.tracked.tolist() == [False] * 10 + [True] * 28
-    assert slam.mapper.keyframe_ids == slam.segments.keyframe_ids
-    assert slam.mapper.mapped == slam.segments.keyframe_ids
+    assert list(slam.mapper.views) == slam.segments.keyframe_ids
+    assert slam.mapper.table.mapped == slam.segments.keyframe_ids
     assert len(slam.snapshot()) > 200

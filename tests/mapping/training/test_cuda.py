@@ -14,7 +14,7 @@ from geogs.mapping.training.cpu import Trainer
 from geogs.mapping.training.cuda import trainer as cuda_trainer
 from geogs.mapping.training.cuda.trainer import CudaTrainer
 from geogs.splat.cuda import rasterize
-from geogs.splat.map import DiskParameters
+from geogs.world.disks import DiskParameters
 from keyframe_samples import Sample
 from trained_room import (
     CAMERAS,
@@ -121,12 +121,12 @@ def test_growing_and_dropping_between_steps(pair) -> None:
     more = DiskParameters(*(p.detach().clone() for p in fast.disks.parameters))
     capacity = fast.disks.capacity
     for _ in range(copies):
-        fast.optimizer.append(more, 1)
+        fast.disks.append(more, 1)
     assert fast.disks.capacity > capacity
     fast.train([[(views[1], [views[0]])]])
     n = len(fast.disks)
-    assert len(fast.optimizer.first[0]) == n
-    fast.optimizer.keep(fast.disks.keyframe_id == 1)
+    assert len(fast.disks.first[0]) == n
+    fast.disks.keep(fast.disks.keyframe_id == 1)
     before = fast.disks.position.detach().clone()
     fast.train([[(views[0], [])]] * 2)
     assert len(fast.disks) == n * copies // (copies + 1)

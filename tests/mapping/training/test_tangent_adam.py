@@ -2,7 +2,7 @@
 
 import torch
 
-from geogs.mapping.training.tangent_adam import TangentAdam
+from geogs.mapping.training.pose_refine import TangentAdam
 
 
 def test_equals_torch() -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 from geogs.application.checkpoints.checkpoint import SavedState
 from geogs.config import ReconstructConfig
 from geogs.errors import InputError
-from geogs.reconstruction import ReconstructionState
+from geogs.reconstruction import ReconstructionTable
 
 
 @dataclass(frozen=True)
@@ -18,7 +18,7 @@ class ReconstructState:
 
     made_from: str
     """Fingerprint of settings and images."""
-    work: ReconstructionState
+    work: ReconstructionTable
 
 
 def fingerprint(config: ReconstructConfig, hold_out: int | None, images: Sequence[str]) -> str:
@@ -28,7 +28,7 @@ def fingerprint(config: ReconstructConfig, hold_out: int | None, images: Sequenc
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-def read_work(output: Path, made_from: str) -> ReconstructionState:
+def read_work(output: Path, made_from: str) -> ReconstructionTable:
     """What was written into the results with the same fingerprint.
 
     Raises:

@@ -8,10 +8,10 @@ import torch
 from torch import Tensor
 
 from geogs.geometry.camera import Camera
-from geogs.splat.map import DiskParameters
 from geogs.splat.reference import blend, project_disks
 from geogs.splat.render import NEAR, Backend, render
 from geogs.threads import on_one_torch_thread
+from geogs.world.disks import DiskParameters
 
 MAP_TOLERANCE = 1e-3
 """Largest relative error (norms) of depth, normal, alpha and distortion."""

@@ -1,7 +1,6 @@
-"""What the mapper asks of whatever trains its map."""
+"""What the mapper asks of whatever trains its map, and which views take part in a step."""
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -9,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from geogs.config import MappingConfig
-from geogs.mapping.view import MapView
+from geogs.mapping.views import MapView
 from geogs.splat.optimizer import LearningRates, MapOptimizer
 
 Batch = list[tuple[MapView, list[MapView]]]
@@ -17,18 +16,6 @@ Batch = list[tuple[MapView, list[MapView]]]
 
 GRADIENT_LIMIT = 1e3
 """A disk whose gradient exceeds this has met a numerical accident (a nearly edge-on pixel)."""
-
-
-@dataclass(frozen=True, slots=True)
-class TrainingPlace:
-    """How far a long training is."""
-
-    steps: int = 0
-    """Done."""
-    total: int = 0
-    """To be done in all."""
-    seconds: float = 0.0
-    """Spent."""
 
 
 def learning_rates(config: MappingConfig, unit: float, factor: float = 1.0) -> LearningRates:
@@ -41,11 +28,44 @@ def learning_rates(config: MappingConfig, unit: float, factor: float = 1.0) -> L
     )
 
 
-def draw_partners(
-    view: MapView, views: dict[int, MapView], config: MappingConfig, random: np.random.Generator
+def draw_views(
+    mapped: list[int], steps: int, config: MappingConfig, random: np.random.Generator
+) -> list[list[int]]:
+    """Ids of the views of some training steps: from the recent window plus random older keyframes.
+
+    The older ones are drawn once for all steps, as they may have to be read from a file. With
+    ``views_per_step`` 0 every step has the whole window and its history, as the paper sums them;
+    otherwise that many of them at random, the newest in every third step.
+    """
+    window, older = mapped[-config.window :], mapped[: -config.window]
+    drawn = min(config.history, len(older))
+    history = [older[i] for i in random.choice(len(older), drawn, replace=False)] if drawn else []
+    pool = window + history
+    if config.views_per_step <= 0:
+        return [pool] * steps
+    views = []
+    for step in range(steps):
+        newest = [mapped[-1]] if step % 3 == 0 else []
+        more = max(0, min(config.views_per_step, len(pool)) - len(newest))
+        rest = [pool[i] for i in random.choice(len(pool), more, replace=False)]
+        views.append(list(dict.fromkeys(newest + rest)))
+    return views
+
+
+def draw_batch(
+    ids: Sequence[int],
+    views: Mapping[int, MapView],
+    config: MappingConfig,
+    random: np.random.Generator,
+) -> Batch:
+    """Some views, each with some of its partners at random."""
+    return [(views[i], _draw_partners(views[i], views, config, random)) for i in ids]
+
+
+def _draw_partners(
+    view: MapView, views: Mapping[int, MapView], config: MappingConfig, random: np.random.Generator
 ) -> list[MapView]:
-    """Some of a view's partners, at random."""
-    ids = [i for i in view.partners if i in views]
+    ids = [i for i in view.row.partners if i in views]
     count = min(config.photo.per_step, len(ids))
     return [views[ids[i]] for i in random.choice(len(ids), count, replace=False)] if count else []
 
@@ -63,7 +83,7 @@ class MapTrainer(Protocol):
         ...
 
     def refine_poses(
-        self, active: list[MapView], views: dict[int, MapView], config: MappingConfig
+        self, active: list[MapView], views: Mapping[int, MapView], config: MappingConfig
     ) -> dict[int, Float[Tensor, "4 4"]]:
         """Poses of the active keyframes that agree better with the map; the earliest stays."""
         ...

@@ -1,6 +1,6 @@
 """Training the map on a CPU, view by view."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,15 +11,15 @@ from torch import Tensor
 from geogs.config import MappingConfig
 from geogs.losses.cpu import fused_multi_view, fused_single_view
 from geogs.losses.single_view import MIN_ALPHA
-from geogs.mapping.cameras import MapCameras
 from geogs.mapping.training.base import GRADIENT_LIMIT, Batch, learning_rates
 from geogs.mapping.training.pose_refine import refine_poses
-from geogs.mapping.view import MapView
+from geogs.mapping.view_arrays import MapCameras
+from geogs.mapping.views import MapView
 from geogs.splat.cpu.in_view import disks_in_view
-from geogs.splat.map import DiskParameters, GaussianMap
 from geogs.splat.optimizer import MapOptimizer
 from geogs.splat.render import RenderOutput, render
 from geogs.threads import thread_map
+from geogs.world.disks import DiskParameters, GaussianMap
 
 # Part of the map up to which an excerpt is trained rather than all of it.
 _LARGE_EXCERPT = 0.7
@@ -79,16 +79,17 @@ class Trainer:
         On an excerpt of the map where the views can see no more than that, which changes nothing
         but rounding.
         """
-        whole, seen = self.optimizer, self._in_view(batches)
-        if not 0 < len(seen) <= _LARGE_EXCERPT * len(self.disks):
+        whole, optimizer, seen = self.disks, self.optimizer, self._in_view(batches)
+        if not 0 < len(seen) <= _LARGE_EXCERPT * len(whole):
             self._train(batches, factors)
             return
         part = whole.excerpt(seen)
         try:
-            self.optimizer, self.disks = part, part.disks
+            self.disks = part
+            self.optimizer = MapOptimizer(part, optimizer.learning_rates)
             self._train(batches, factors)
         finally:
-            self.optimizer, self.disks = whole, whole.disks
+            self.disks, self.optimizer = whole, optimizer
             whole.take_back(seen, part)
 
     def _train(self, batches: Sequence[Batch], factors: Sequence[float] | None) -> None:
@@ -113,7 +114,7 @@ class Trainer:
         return disks_in_view(self.disks.position, radius, poses, camera).nonzero()[:, 0]
 
     def refine_poses(
-        self, active: list[MapView], views: dict[int, MapView], config: MappingConfig
+        self, active: list[MapView], views: Mapping[int, MapView], config: MappingConfig
     ) -> dict[int, Float[Tensor, "4 4"]]:
         """Poses of the active keyframes that agree better with the map; the earliest stays."""
         return refine_poses(self.disks, active, views, self.cameras, config, self.unit)

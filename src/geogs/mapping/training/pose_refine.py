@@ -1,6 +1,6 @@
 """Pose-only refinement: the map stands still, the cameras move to agree with it (Eq. pose_loss)."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import torch
 from jaxtyping import Float
@@ -10,11 +10,39 @@ from geogs.config import MappingConfig
 from geogs.geometry.lie import retract
 from geogs.losses.cpu import fused_multi_view, fused_single_view
 from geogs.losses.single_view import MIN_ALPHA
-from geogs.mapping.cameras import MapCameras
-from geogs.mapping.training.tangent_adam import TangentAdam
-from geogs.mapping.view import MapView
-from geogs.splat.map import DiskParameters, GaussianMap
+from geogs.mapping.view_arrays import MapCameras
+from geogs.mapping.views import MapView
 from geogs.splat.render import render
+from geogs.world.disks import DiskParameters, GaussianMap
+
+
+class TangentAdam:
+    """Adam (Kingma & Ba 2015) on one small tensor.
+
+    As ``torch.optim.Adam``, whose first use imports PyTorch's compiler, which takes seconds.
+    """
+
+    def __init__(
+        self,
+        parameter: Tensor,
+        rate: float,
+        betas: tuple[float, float] = (0.9, 0.999),
+        eps: float = 1e-8,
+    ) -> None:
+        self.parameter, self.rate, self.betas, self.eps = parameter, rate, betas, eps
+        self._first, self._second = torch.zeros_like(parameter), torch.zeros_like(parameter)
+        self._steps = 0
+
+    @torch.no_grad()
+    def step(self, gradient: Tensor) -> None:
+        """Move the parameter against the gradient; numbers that are not finite count as zero."""
+        g = gradient.nan_to_num(nan=0.0, posinf=0.0, neginf=0.0)
+        self._steps += 1
+        self._first.lerp_(g, 1 - self.betas[0])
+        self._second.mul_(self.betas[1]).addcmul_(g, g, value=1 - self.betas[1])
+        c1, c2 = (1 - beta**self._steps for beta in self.betas)
+        self.parameter -= self.rate / c1 * self._first / ((self._second / c2).sqrt() + self.eps)
+
 
 Evaluate = Callable[[Float[Tensor, "k 4 4"]], tuple[float, Float[Tensor, ""]]]
 """Of the poses: the loss, and something differentiable whose gradient is the loss's."""
@@ -45,7 +73,7 @@ def descend(
 def refine_poses(
     disks: GaussianMap,
     active: list[MapView],
-    views: dict[int, MapView],
+    views: Mapping[int, MapView],
     cameras: MapCameras,
     config: MappingConfig,
     unit: float,
@@ -67,7 +95,7 @@ def refine_poses(
 def _pose_loss(
     disks: DiskParameters,
     active: list[MapView],
-    views: dict[int, MapView],
+    views: Mapping[int, MapView],
     poses: Float[Tensor, "k 4 4"],
     cameras: MapCameras,
     config: MappingConfig,
@@ -85,7 +113,7 @@ def _pose_loss(
             view.known, loss_config, unit,
         )  # fmt: skip
         depth = output.shown_depth(MIN_ALPHA)
-        for i in view.partners[:1]:
+        for i in view.row.partners[:1]:
             other = views[i]
             target = other.photo.at(pose_of.get(i, other.T_cw))
             total = total + fused_multi_view(

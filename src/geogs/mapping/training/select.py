@@ -1,9 +1,9 @@
 """Where the map is trained: on the CPU, or on the GPU that holds it."""
 
 from geogs.config import MappingConfig
-from geogs.mapping.cameras import MapCameras
 from geogs.mapping.training.base import MapTrainer
-from geogs.splat.map import GaussianMap
+from geogs.mapping.view_arrays import MapCameras
+from geogs.world.disks import GaussianMap
 
 
 def map_trainer(

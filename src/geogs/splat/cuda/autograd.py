@@ -8,7 +8,7 @@ from torch import Tensor
 from geogs.gpu.transfer import to_device
 from geogs.splat.cuda.pool import RasterizerPool
 from geogs.splat.cuda.rasterize import MapGradients, Maps, Views
-from geogs.splat.map import DiskParameters
+from geogs.world.disks import DiskParameters
 
 
 @functools.cache

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from geogs.geometry.camera import Camera
 from geogs.gpu.kernels import kernels_for
-from geogs.splat.map import DiskParameters
+from geogs.world.disks import DiskParameters
 
 SOURCE = Path(__file__).with_name("renderer.cu")
 TILE = 16

@@ -1,5 +1,7 @@
 """Pose-only refinement on a GPU: all active keyframes in one pass."""
 
+from collections.abc import Mapping
+
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -10,14 +12,14 @@ from geogs.gpu.transfer import to_device
 from geogs.mapping.training.cuda.known_views import KnownViews
 from geogs.mapping.training.cuda.window_pass import WindowPass
 from geogs.mapping.training.pose_refine import descend
-from geogs.mapping.view import MapView
-from geogs.splat.map import GaussianMap
+from geogs.mapping.views import MapView
+from geogs.world.disks import GaussianMap
 
 
 def refine_poses(
     disks: GaussianMap,
     active: list[MapView],
-    views: dict[int, MapView],
+    views: Mapping[int, MapView],
     known: KnownViews,
     window: WindowPass,
     config: MappingConfig,
@@ -28,11 +30,11 @@ def refine_poses(
     ``window`` has as many views as there are active keyframes, one partner each. Each step waits
     once, for the gradients of the poses, which are few and go on on the CPU.
     """
-    partners = [views[i] for view in active for i in view.partners[:1]]
+    partners = [views[i] for view in active for i in view.row.partners[:1]]
     slot = dict(zip((v.id for v in (*active, *partners)), known.slots([*active, *partners]),
                     strict=True))  # fmt: skip
     rows = [slot[v.id] for v in active]
-    rows += [slot[v.partners[0]] if v.partners else -1 for v in active]
+    rows += [slot[v.row.partners[0]] if v.row.partners else -1 for v in active]
     window.slots.copy_(to_device(torch.tensor(rows, dtype=torch.int32), disks.device))
     count = to_device(torch.tensor([len(disks)], dtype=torch.int32), disks.device)
 
@@ -66,7 +68,7 @@ def _evaluate(
 
 def _chain(
     active: list[MapView],
-    views: dict[int, MapView],
+    views: Mapping[int, MapView],
     poses: Float[Tensor, "b 4 4"],
     d_poses: Float[Tensor, "b 4 4"],
     d_motions: Float[Tensor, "b 3 4"],
@@ -75,7 +77,7 @@ def _chain(
     pose_of = {view.id: T for view, T in zip(active, poses, strict=True)}
     total = (poses * d_poses).sum()
     for k, view in enumerate(active):
-        for i in view.partners[:1]:
+        for i in view.row.partners[:1]:
             target = pose_of.get(i, views[i].T_cw)
             total = total + ((target @ se3_inverse(poses[k]))[:3] * d_motions[k]).sum()
     return total

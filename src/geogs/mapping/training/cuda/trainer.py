@@ -1,6 +1,6 @@
 """Training the map on a GPU: whole steps captured in CUDA graphs and replayed."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -11,15 +11,15 @@ from torch import Tensor
 from geogs.config import MappingConfig
 from geogs.gpu.kernels import kernels_for
 from geogs.gpu.transfer import to_device
-from geogs.mapping.cameras import MapCameras
 from geogs.mapping.training.base import GRADIENT_LIMIT, Batch, learning_rates
 from geogs.mapping.training.cuda.known_views import KnownViews
 from geogs.mapping.training.cuda.pose_refine import refine_poses
 from geogs.mapping.training.cuda.window_pass import WindowPass
-from geogs.mapping.view import MapView
+from geogs.mapping.view_arrays import MapCameras
+from geogs.mapping.views import MapView
 from geogs.splat.cuda import rasterize
-from geogs.splat.map import GaussianMap
 from geogs.splat.optimizer import MapOptimizer
+from geogs.world.disks import GaussianMap
 
 _ADAM = Path(rasterize.__file__).with_name("adam.cu")
 
@@ -64,7 +64,7 @@ class CudaTrainer:
         program.run(rows, np.ones(len(rows), np.float32) if factors is None else factors)
 
     def refine_poses(
-        self, active: list[MapView], views: dict[int, MapView], config: MappingConfig
+        self, active: list[MapView], views: Mapping[int, MapView], config: MappingConfig
     ) -> dict[int, Float[Tensor, "4 4"]]:
         """Poses of the active keyframes that agree better with the map; the earliest stays."""
         window = self._pose_pass
@@ -165,7 +165,7 @@ class _TrainingStep:
         bounds = (np.log(disk.min_scale * trainer.unit), np.log(disk.max_scale * trainer.unit))
         self._kernels["adam_step"](
             -(-self._capacity // 256), 256, self._capacity, self._count, p.rasterizer.status,
-            self._completed, *room, *p.d_disks, *optimizer.moments_room(),
+            self._completed, *room, *p.d_disks, *trainer.disks.moments_room(),
             *trainer.disks.counters_room, p.maps.visible, self._rates, *optimizer.betas,
             optimizer.eps, GRADIENT_LIMIT, *bounds,
         )  # fmt: skip

@@ -9,8 +9,8 @@ from geogs.geometry.camera import Camera
 from geogs.losses.cuda.view_table import ViewTable
 from geogs.losses.cuda.window import WindowLosses
 from geogs.splat.cuda.rasterize import MapGradients, Maps, Rasterizer, Views
-from geogs.splat.map import DiskParameters, GaussianMap
 from geogs.splat.render import NEAR
+from geogs.world.disks import DiskParameters, GaussianMap
 
 
 class WindowPass:

@@ -1,4 +1,4 @@
-"""Which of many images with known poses make a map: those that see all of it, from apart.
+"""Which of many images with known poses make a map: those that see all of it, from different sides.
 
 The scene is stood for by points. An image helps at a point that it sees as much as nobody has
 looked there yet, and as its ray makes an angle with the rays of the images chosen before that
@@ -149,7 +149,7 @@ def relative_sharpness(
 
     Args:
         T_cw: where they were taken.
-        typical: the usual depth, by which turns and ways are compared.
+        typical: the usual depth, by which rotations and translations are compared.
         detail: of each image, such as the bytes that it takes compressed.
     """
     own = np.asarray(detail, np.float64)

@@ -1,13 +1,45 @@
-"""The depths of many keyframes in an order and in groups that suit the time there is for them."""
+"""A map of many keyframes at once, in an order and in groups that suit the time there is for it."""
 
 import time
 from collections.abc import Callable, Sequence
 
-from geogs.mapping.mapper import Mapper
+from geogs.depth.base import Progress, silent
+from geogs.mapping.mapper import SEARCHED, Mapper
+from geogs.mapping.training.full import seconds_per_step
 from geogs.threads import worker_count
 
 # Keyframes whose depths are searched in one go, at most; and those that every map has at least.
 _AT_ONCE, _FIRST = 16, 4
+
+
+def map_all(
+    mapper: Mapper,
+    keyframe_ids: Sequence[int],
+    progress: Progress = silent,
+    time_budget: float | None = None,
+) -> None:
+    """Give observed keyframes their depths, grow the map with all of them, and train it.
+
+    An exception raised by ``progress`` keeps what there is by then. Of a time budget in seconds
+    about a part ``SEARCHED`` is for depths, of keyframes evenly spread over all; those that get
+    none are left out. Depths that there are already stay.
+    """
+    ids = [i for i in keyframe_ids if not mapper.views[i].has_depth]
+    until = None
+    if time_budget is not None:
+        ids, until = spread_order(ids), time.perf_counter() + SEARCHED * time_budget
+    # In groups that are as small as keeps all cores busy, so that an interruption is soon heard.
+    search_depths(mapper, ids, lambda done: progress(SEARCHED * done), until, group_size())
+    if not mapper.table.mapped:
+        return
+    mapper.check_depths()
+    mapper.grow()
+    steps = mapper.config.steps_at_once(len(keyframe_ids), mapper.keyframes.grid.on_gpu)
+    if time_budget is not None:  # but every keyframe is seen once
+        seconds = seconds_per_step(mapper.table, mapper.views, mapper.trainer, mapper.config)
+        affordable = int((1 - SEARCHED) * time_budget / seconds)
+        steps = min(steps, max(affordable, len(mapper.table.mapped)))
+    mapper.train(steps, lambda done: progress(SEARCHED + (1 - SEARCHED) * done))
 
 
 def spread_order(items: Sequence[int]) -> list[int]:

@@ -12,7 +12,7 @@ from geogs.depth.sweep_neighbors import (
     MIN_PARALLAX_DEG,
 )
 from geogs.geometry.camera import Camera
-from geogs.mapping.view_choice import (
+from geogs.mapping.coverage import (
     Sightings,
     coverage_order,
     relative_sharpness,

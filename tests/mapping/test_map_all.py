@@ -46,8 +46,8 @@ def followed(frames, defers_map: bool, count: int = FRAMES) -> Slam:
 def both(frames):
     """A finished system with a map that grew on the way, and one with a map of the end."""
     online, after = followed(frames, False), followed(frames, True)
-    assert online.mapper.mapped
-    assert not after.mapper.mapped
+    assert online.mapper.table.mapped
+    assert not after.mapper.table.mapped
     for slam in (online, after):
         slam.finish()
     return online, after
@@ -56,7 +56,7 @@ def both(frames):
 def test_poses_are_the_same_and_the_surface_nearly(both):
     online, after = both
     assert np.array_equal(online.trajectory().T_wc, after.trajectory().T_wc)
-    assert after.mapper.mapped == online.mapper.mapped
+    assert after.mapper.table.mapped == online.mapper.table.mapped
     assert after.is_refined
     for a, b in zip(online.renders(), after.renders(), strict=True):
         seen = (a.depth > 0) & (b.depth > 0)
@@ -85,7 +85,9 @@ def test_a_system_goes_on_from_a_checkpoint(frames, both, tmp_path: Path, seen: 
     other.finish()
     after = both[1]
     assert np.array_equal(other.trajectory().T_wc, after.trajectory().T_wc)
-    for p, q in zip(other.mapper.map.parameters, after.mapper.map.parameters, strict=True):
+    for p, q in zip(
+        other.mapper.table.disks.parameters, after.mapper.table.disks.parameters, strict=True
+    ):
         assert torch.equal(p, q)
 
 
@@ -98,14 +100,14 @@ def test_a_map_is_made_briefly_after_an_interruption(frames):
 
     with pytest.raises(Interrupted):  # while depths are searched
         slam.refine(interrupt)
-    assert len(slam.mapper.map) == 0
+    assert len(slam.mapper.table.disks) == 0
     slam.map_briefly(0.0)
-    mapped, disks = list(slam.mapper.mapped), len(slam.mapper.map)
+    mapped, disks = list(slam.mapper.table.mapped), len(slam.mapper.table.disks)
     assert mapped
     assert disks > 200
     assert len(slam.renders()) == len(mapped)
     slam.map_briefly(100.0)  # there is one now
-    assert (slam.mapper.mapped, len(slam.mapper.map)) == (mapped, disks)
+    assert (slam.mapper.table.mapped, len(slam.mapper.table.disks)) == (mapped, disks)
     assert not slam.is_refined
 
 

@@ -5,8 +5,8 @@ import torch
 
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp, se3_inverse, sim3_exp, transform
-from geogs.splat.map import DiskParameters, GaussianMap
 from geogs.splat.render import render
+from geogs.world.disks import DiskParameters, GaussianMap
 
 
 def disks(n: int, seed: int = 0) -> DiskParameters:

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from geogs.config import SearchConfig
-from geogs.mapping.time_shares import ViewCost, affordable_views, helpers, rounds
+from geogs.mapping.time_budget import ViewCost, affordable_views, helpers, rounds
 
 
 @pytest.mark.parametrize("repeat", [True, False])

@@ -1,0 +1,37 @@
+"""Dense depths of keyframes as arrays of a table."""
+
+import torch
+
+from geogs.depth.view import DenseDepth
+from geogs.world.arrays import ArrayTable
+from geogs.world.map import SearchedDepth
+
+
+def put_depth(arrays: ArrayTable, id: int, depth: DenseDepth, scale: float) -> SearchedDepth:
+    """Write the depth of a keyframe that has a scale now.
+
+    Raises:
+        OutputError: the disk is full, or cannot be written.
+    """
+    maps = depth.arrays()
+    arrays.put("depth", id, maps.depth)
+    arrays.put("confidence", id, maps.confidence)
+    if depth.normal is None:
+        arrays.drop("depth normal", id)
+    else:  # nobody measures with them
+        arrays.put("depth normal", id, depth.normal.half().cpu().numpy())
+    return SearchedDepth(depth.typical, scale)
+
+
+def get_depth(
+    arrays: ArrayTable, id: int, stored: SearchedDepth, scale: float, device: torch.device
+) -> DenseDepth:
+    """Read the depth of a keyframe at another scale of it."""
+    depth, confidence = (torch.from_numpy(arrays.load(n, id)) for n in ("depth", "confidence"))
+    if scale != stored.scale:
+        depth = depth * (scale / stored.scale)
+    normal = arrays.get("depth normal", id)
+    return DenseDepth(
+        depth.to(device), confidence.to(device), torch.tensor(stored.typical_at(scale)),
+        normal=None if normal is None else torch.from_numpy(normal).float().to(device),
+    )  # fmt: skip

@@ -1,0 +1,88 @@
+"""Disks that come and go: added where depths show more than the map, dropped in free space."""
+
+from collections.abc import Sequence
+
+import torch
+
+from geogs.config import MappingConfig
+from geogs.mapping.keyframe_depths import KeyframeDepths
+from geogs.mapping.views import MapView
+from geogs.splat.density import (
+    candidate_pixels,
+    split,
+    unexplained,
+    worth_keeping,
+    worth_splitting,
+)
+from geogs.splat.init import new_disks
+from geogs.splat.optimizer import MapOptimizer
+from geogs.splat.render import render
+from geogs.world.map import MapTable
+
+# Nearest keyframes that vote on a keyframe's disks; others are too far away to know better.
+_VOTERS = 96
+
+
+class Growth:
+    """Adds disks to a map and drops them, as the depths of its keyframes say."""
+
+    def __init__(self, table: MapTable, depths: KeyframeDepths, config: MappingConfig) -> None:
+        self.table = table
+        self.depths = depths
+        self.config = config
+
+    def voters(self, view: MapView) -> list[MapView]:
+        """The mapped keyframes whose votes on what a view shows count."""
+        return self.depths.views.near(view, self.table.mapped, _VOTERS)
+
+    def carve(self, views: Sequence[MapView]) -> None:
+        """Drop disks that some keyframes see in free space."""
+        disks = self.table.disks
+        if len(disks) and self.config.disk.carve:
+            disks.keep(self.depths.keep(disks.position.detach(), views))
+
+    def prune(self, views: Sequence[MapView]) -> None:
+        """Drop transparent and broken disks, too."""
+        self.table.disks.keep(worth_keeping(self.table.disks, self.config.disk))
+        self.carve(views)
+
+    @torch.no_grad()
+    def insert(self, view: MapView, min_confidence: float) -> None:
+        """Disks where the map does not explain a view's depth, by local planes."""
+        config, disks, random = self.config.disk, self.table.disks, self.table.random.of_torch
+        camera = self.depths.views.arrays.cameras.render
+        depth, confidence = view.dense.depth, view.dense.confidence
+        output = render(disks, camera, view.T_cw)
+        needed = unexplained(output, depth, confidence, config) & (confidence >= min_confidence)
+        v, u = candidate_pixels(camera.height, camera.width, config.stride, random)
+        v, u = v.to(depth.device), u.to(depth.device)
+        chosen = needed[v, u]
+        v, u = v[chosen], u[chosen]
+        z = depth[v, u]
+        T_wc = view.T_wc.float().to(depth.device)
+        rays = camera.rays(device=depth.device)[v, u]
+        points = (rays * z[:, None]) @ T_wc[:3, :3].T + T_wc[:3, 3]
+        if config.carve:
+            others = [other for other in self.voters(view) if other.id != view.id]
+            kept = self.depths.keep(points, others)
+            points, z = points[kept], z[kept]
+        if len(points) + len(disks) < config.neighbours or len(points) == 0:
+            return
+        footprint = config.stride * z / camera.fx
+        new = new_disks(
+            points, T_wc[:3, 3], footprint, disks.position.detach(), config, random,
+            self.config.ablation.initialisation,
+        )  # fmt: skip
+        disks.append(new, view.id)
+
+    def split(self, optimizer: MapOptimizer, unit: float) -> None:
+        """Split the disks that are pulled hardest; those below a pixel are small enough."""
+        config, disks = self.config.disk, self.table.disks
+        if config.split_ratio == 0:
+            return
+        pixel = unit / self.depths.views.arrays.cameras.render.fx
+        chosen = worth_splitting(
+            disks, optimizer.position_gradient, config.split_ratio, config.split_pixels * pixel
+        )
+        ids = disks.keyframe_id[chosen]
+        disks.replace(chosen, split(disks, chosen), torch.cat([ids, ids]))

@@ -1,0 +1,120 @@
+"""Which keyframes check each other by their images, and the exposure by which these differ."""
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn.functional import grid_sample
+
+from geogs.config import PhotoConfig
+from geogs.depth.sweep_neighbors import misfit, parallax_degrees
+from geogs.geometry.camera import Camera
+from geogs.geometry.lie import se3_inverse
+from geogs.gpu.transfer import to_device
+from geogs.losses.light import relative_light, same_light
+from geogs.mapping.views import MapView, MapViews
+from geogs.world.map import MapTable
+
+CANDIDATES = 128
+"""Nearest keyframes among which those are looked for that match or check one."""
+_STRIDE = 4
+"""Every fourth pixel of a dense depth, in both directions, is compared."""
+_CONFIDENT = 0.3
+"""Least confidence of its depth."""
+_DARK, _BRIGHT = 0.02, 0.98
+"""Grey values beyond which a sensor says no more than that."""
+
+
+class Partners:
+    """Chooses the photometric partners of mapped views and compensates the exposure of these."""
+
+    def __init__(self, views: MapViews, table: MapTable, config: PhotoConfig) -> None:
+        self._views, self._table, self._config = views, table, config
+
+    def choose(self, view: MapView) -> None:
+        """Partners of a view; it becomes a candidate for those before it."""
+        near = self._views.near(view, self._table.mapped, CANDIDATES)
+        view.row.partners = choose_partners(view, near, self._config)
+        for i in view.row.partners:
+            other = self._views[i]
+            ids = {*other.row.partners, view.id}
+            pool = [self._views[j] for j in ids if j in self._views]
+            other.row.partners = choose_partners(other, pool, self._config)
+
+    def compensate(self, view: MapView) -> None:
+        """Give a view's grey values the exposure of the partners where that is known."""
+        if view.row.exposure is not None or not self._config.compensate_exposure:
+            return
+        partners = [self._views[i] for i in view.row.partners]
+        known = [other for other in partners if other.row.exposure is not None]
+        view.set_exposure(exposure_of(view, known))
+
+    def choose_all(self) -> None:
+        """Partners of all mapped views, then their exposures."""
+        for i in self._table.mapped:
+            self.choose(self._views[i])
+        for i in self._table.mapped:
+            self.compensate(self._views[i])
+
+
+def choose_partners(view: MapView, others: list[MapView], config: PhotoConfig) -> list[int]:
+    """Ids of the keyframes best placed to check a view's depth by photo-consistency, best first."""
+    others = [o for o in others if o.id != view.id]
+    if not others:
+        return []
+    places = [o.place for o in others]
+    parallax, rotation = parallax_degrees(view.place, places, view.typical_depth)
+    usable = (config.min_parallax < parallax) & (parallax < config.max_parallax)
+    usable &= rotation < config.max_view_angle
+    scores = misfit(parallax, rotation, config.parallax)
+    scored = sorted((scores[i], o.id) for i, o in enumerate(others) if usable[i])
+    return [i for _, i in scored[: config.candidates]]
+
+
+def exposure_of(view: MapView, others: Sequence[MapView]) -> Float[Tensor, "2"]:
+    """Gain and offset that bring the grey values of a view to those of others.
+
+    The others' exposure is compensated already. The dense depth of the view tells where its pixels
+    are in them. Gain 1 and offset 0 where there is nothing to compare with.
+    """
+    if not others:
+        return same_light(view.dense.depth.device)
+    points, confident = _sparse_points(view)
+    (mine,), (inside,) = _sampled(view.photo.grey[None], view.photo.camera, points[None])
+    usable = confident & inside & _is_exposed(mine)
+    T_cw = torch.stack([other.T_cw for other in others]).cpu()
+    T = to_device((T_cw @ se3_inverse(view.T_cw).to(T_cw)).to(points.dtype), points.device)
+    greys = torch.stack([other.photo.grey for other in others])
+    there = points @ T[:, :3, :3].mT + T[:, None, :3, 3]
+    theirs, inside = _sampled(greys, view.photo.camera, there)
+    gain, offset = torch.stack([other.exposure for other in others])[..., None].unbind(1)
+    common = usable & inside & _is_exposed((theirs - offset) / gain)
+    return relative_light(mine.repeat(len(others)), theirs.flatten(), common.flatten())
+
+
+def _sparse_points(view: MapView) -> tuple[Float[Tensor, "n 3"], Bool[Tensor, "n"]]:
+    """Points of every fourth pixel of a view in its camera, and which depth is confident."""
+    depth = view.dense
+    rays = view.arrays.cameras.render.rays(device=depth.depth.device)[::_STRIDE, ::_STRIDE]
+    points = rays * depth.depth[::_STRIDE, ::_STRIDE, None]
+    confident = depth.confidence[::_STRIDE, ::_STRIDE] > _CONFIDENT
+    return points.reshape(-1, 3), confident.reshape(-1)
+
+
+def _sampled(
+    greys: Float[Tensor, "k h w"], camera: Camera, points: Float[Tensor, "k n 3"]
+) -> tuple[Float[Tensor, "k n"], Bool[Tensor, "k n"]]:
+    """What each image shows of points in its camera, and where it does."""
+    ahead = points[..., 2] > 1e-6
+    pixels, _ = camera.project(points)
+    edges = (camera.width - 1, camera.height - 1)
+    place = torch.stack([pixels[..., k] * (2 / edges[k]) - 1 for k in (0, 1)], -1)
+    inside = ahead & (place.abs() <= 1).all(-1)
+    place = torch.where(inside[..., None], place, 0.0)
+    shown = grid_sample(greys[:, None], place[:, None], align_corners=True)
+    return shown[:, 0, 0], inside
+
+
+def _is_exposed(grey: Float[Tensor, "*n"]) -> Bool[Tensor, "*n"]:
+    return (grey > _DARK) & (grey < _BRIGHT)

@@ -1,0 +1,129 @@
+"""The long training over all keyframes at the end."""
+
+import time
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from geogs.config import MappingConfig
+from geogs.depth.base import Progress
+from geogs.mapping.growth import Growth
+from geogs.mapping.training.base import MapTrainer, draw_batch
+from geogs.mapping.views import MapView, MapViews
+from geogs.world.map import MapTable, TrainingPlace
+
+# Steps between two reports of progress, at least.
+_REPORTED_STEPS = 20
+# Steps from which the time of one is judged, if they take so many seconds; else so often again.
+_REHEARSED_STEPS, _ENOUGH_SECONDS, _REHEARSALS = 16, 0.2, 8
+
+
+class FullTraining:
+    """Single-view steps over all mapped keyframes in random order, with falling learning rates.
+
+    On the way the map is pruned, filled and split, and poses are refined, as the settings say.
+    """
+
+    def __init__(
+        self,
+        table: MapTable,
+        views: MapViews,
+        trainer: MapTrainer,
+        growth: Growth,
+        config: MappingConfig,
+        refine_poses: Callable[[Sequence[int]], None],
+    ) -> None:
+        self._table, self._views, self._trainer = table, views, trainer
+        self._growth, self._config, self._refine_poses = growth, config, refine_poses
+        self._mapped = [views[i] for i in table.mapped]
+
+    def run(self, total: int, progress: Progress, until: float | None) -> None:
+        """Go on from the table's place to so many steps in all, or to a time of
+        ``time.perf_counter``: rates fall with the steps or with the time, whichever is nearer to
+        its end."""
+        table, config = self._table, self._config
+        begin, seconds_to_prune = time.perf_counter() - table.place.seconds, 0.0
+        prunes = max(total // 4, 1)
+        fills, splits, poses = self._events(total)
+        events = fills | splits | poses | set(range(prunes, total, prunes))
+        # Where time is short steps are few and slow, so that it is looked at the clock more often.
+        at_once = _REPORTED_STEPS if until is None else min(_REPORTED_STEPS, max(total // 50, 1))
+        stops = sorted(events | set(range(at_once, total, at_once)) | {total})
+        done = table.place.steps
+        for stop in (stop for stop in stops if stop > done):
+            late = 0.0
+            if until is not None:
+                end = until - seconds_to_prune
+                late = (time.perf_counter() - begin) / max(end - begin, 1e-9)
+            if late >= 1.0:
+                break
+            batches = [self._draw() for _ in range(done, stop)]
+            fractions = [max(step / total, late) for step in range(done + 1, stop + 1)]
+            self._trainer.train(batches, [config.lr_final**f for f in fractions])
+            done = stop
+            seen = self._trained_lately(total)
+            if done % prunes == 0 and done < total:
+                start = time.perf_counter()
+                self._growth.prune(seen)
+                seconds_to_prune = time.perf_counter() - start
+            if done in splits:
+                self._growth.split(self._trainer.optimizer, self._trainer.unit)
+            if done in poses:
+                self._refine_all_poses()
+            if done in fills:
+                for view in seen:
+                    self._growth.insert(view, config.disk.fill_confidence)
+            table.place = TrainingPlace(done, total, time.perf_counter() - begin)
+            progress(done / total)
+
+    def _events(self, total: int) -> tuple[set[int], set[int], set[int]]:
+        """Steps after which the map is filled, split, and poses are refined."""
+        rounds = self._config.final_pose_rounds
+        return (
+            {total // 3, 2 * total // 3},
+            {int(total * part) for part in self._config.disk.split_times},
+            {total * (n + 1) // (rounds + 1) for n in range(rounds)},
+        )
+
+    def _draw(self) -> list[tuple[MapView, list[MapView]]]:
+        """The view that comes next, each once before any comes again."""
+        table = self._table
+        if not table.order:
+            table.order = table.random.of_numpy.permutation(len(self._mapped)).tolist()
+        id = self._mapped[table.order.pop()].id
+        return draw_batch([id], self._views, self._config, table.random.of_numpy)
+
+    def _refine_all_poses(self) -> None:
+        """In windows that overlap by half, earliest first."""
+        mapped, step = self._table.mapped, max(self._config.window // 2, 1)
+        for start in range(0, max(len(mapped) - step, 1), step):
+            self._refine_poses(mapped[start : start + 2 * step])
+
+    def _trained_lately(self, total: int) -> list[MapView]:
+        """The views around which the map may have changed in a training of so many steps: all, but
+        of more views than steps those that have been trained."""
+        if len(self._mapped) <= total:
+            return self._mapped
+        left = set(self._table.order)
+        return [view for n, view in enumerate(self._mapped) if n not in left]
+
+
+def seconds_per_step(
+    table: MapTable, views: MapViews, trainer: MapTrainer, config: MappingConfig
+) -> float:
+    """What a training step takes, from some of them at full rate: from more where these are
+    quick."""
+
+    def rehearse(steps: int) -> float:
+        start = time.perf_counter()
+        drawn: Sequence[int] = table.random.of_numpy.choice(table.mapped, steps).tolist()
+        trainer.train([draw_batch([i], views, config, table.random.of_numpy) for i in drawn])
+        float(table.disks.position.detach().sum())  # waits for a GPU
+        return time.perf_counter() - start
+
+    rehearse(2)  # makes ready what is needed but once
+    seconds = rehearse(_REHEARSED_STEPS)
+    if seconds > _ENOUGH_SECONDS:
+        return seconds / _REHEARSED_STEPS
+    more = [rehearse(_REHEARSED_STEPS) for _ in range(_REHEARSALS)]
+    return float(np.median(more)) / _REHEARSED_STEPS

@@ -1,0 +1,287 @@
+"""What is large of the keyframes that mapping sees: in memory while it is used, else in a file."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float32, UInt8
+from torch import Tensor
+
+from geogs.config import LossConfig, MappingConfig
+from geogs.depth.view import DenseDepth
+from geogs.geometry.camera import Camera
+from geogs.losses.multi_view import PhotoView
+from geogs.losses.single_view import OUTSIDE, ViewConstants
+from geogs.mapping.dense_depths import get_depth, put_depth
+from geogs.mapping.read_ahead import Basis, ReadAhead
+from geogs.world.keyframes import Keyframe, KeyframeTable
+from geogs.world.lru import LruCache
+from geogs.world.map import MapTable
+
+DEPTHS_ON_GPU = 512
+"""Most depths that a GPU keeps of views that are not in use, as bringing one there takes longer
+than using it; at 320 x 180 pixels with normals they take 600 MB."""
+
+
+@dataclass(frozen=True)
+class MapCameras:
+    """One camera at the three sizes that mapping works with."""
+
+    working: Camera
+    """Of the images as the tracker sees them."""
+    render: Camera
+    """Of the rendered maps and keyframe depths."""
+    photo: Camera
+    """Of the images that L_mv compares."""
+
+    @staticmethod
+    def of(camera: Camera, config: MappingConfig) -> "MapCameras":
+        """The sizes that the settings ask for, none above the working image."""
+        working = max(camera.width, camera.height)
+        long_edge = min(config.render_long_edge, working)
+        photo = min(round(config.photo_scale * long_edge), working)
+        return MapCameras(camera, camera.with_long_edge(long_edge), camera.with_long_edge(photo))
+
+
+@dataclass(eq=False)
+class LoadedView:
+    """What is as large as an image: all but the depths follows from the keyframe's image."""
+
+    image: UInt8[np.ndarray, "wh ww 3"]
+    photo: Float[Tensor, "k ph pw"]
+    """Planes of the :class:`PhotoView` with exposure compensated, on the map's device."""
+    normal: Float[Tensor, "h w 3"] | None
+    """A prior's normals at the render size, on the map's device."""
+    depth: DenseDepth | None = None
+    scale: float = 1.0
+    """Of the keyframe when the depth was as it is here."""
+    constants: ViewConstants | None = None
+    rendered_depth: Float[Tensor, "h w"] | None = None
+    matched: tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "fh fw"]] | None = None
+    """Grey images of the :class:`DepthView`, once it was asked for."""
+    is_depth_written: bool = True
+    is_render_written: bool = True
+
+
+class ViewArrays:
+    """Images, depths and constants of the views of a map; those used last are in memory.
+
+    Depths follow the scale of their keyframes.
+    """
+
+    def __init__(
+        self, table: MapTable, keyframes: KeyframeTable, cameras: MapCameras, loss: LossConfig
+    ) -> None:
+        self.table = table
+        self.keyframes = keyframes
+        self.cameras = cameras
+        self.loss = loss
+        self.device = table.disks.device
+        self.loaded: LruCache[int, LoadedView] = LruCache(keyframes.resident, self._write)
+        """Those in memory; whoever asks uses ``load``."""
+        self._ahead = ReadAhead(
+            lambda id: self._with_constants(id, self._load(id)), self._basis, self.device
+        )
+        table.arrays.resident = keyframes.resident
+        for id in table.resident:
+            self.loaded.put(id, self._load(id, as_written=True))
+
+    def put_mask(self, id: int, mask: Bool[np.ndarray, "h w"]) -> None:
+        """What counts of a keyframe, by a mask of the size of its image."""
+        size = (self.cameras.render.width, self.cameras.render.height)
+        ratio = cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+        self.table.arrays.put("mask", id, ratio > 0.5)
+
+    def read_ahead(self, ids: Iterable[int]) -> None:
+        """Let threads bring some views back that will soon be asked for, and forget the views of
+        the last such call that were not."""
+        self._ahead.begin([i for i in ids if i not in self.loaded])
+
+    def settle(self) -> None:
+        """Write what has changed, which stays in memory, and note what is there."""
+        loaded = self.loaded.items()
+        for id, view in loaded:
+            self._write(id, view)
+        self.table.resident = [id for id, _ in loaded]
+
+    def load(self, id: int) -> LoadedView:
+        """Everything in memory, brought back if need be."""
+        loaded = self.loaded.get(id, lambda: self._ahead.take(id) or self._load(id))
+        return self._at_scale(id, loaded)
+
+    def mask(self, id: int) -> Bool[Tensor, "h w"] | None:
+        """Pixels of the render size that belong to the scene; none takes all."""
+        arrays = self.table.arrays
+        if not arrays.has("mask", id):
+            return None
+        return arrays.made(
+            "mask there", id, lambda: torch.from_numpy(arrays.load("mask", id)).to(self.device)
+        )
+
+    def has_depth(self, id: int) -> bool:
+        """Whether its depth has been estimated."""
+        loaded = self.loaded.peek(id)
+        return (self.table.views[id].depth if loaded is None else loaded.depth) is not None
+
+    def depth(self, id: int) -> DenseDepth:
+        """The dense depth, where there must be one."""
+        loaded = self.loaded.peek(id)
+        if loaded is None:
+            return self._read_depth(id, self.keyframes[id].scale)
+        depth = self._at_scale(id, loaded).depth
+        assert depth is not None, f"keyframe {id} has no depth yet"
+        return depth
+
+    def typical_depth(self, id: int) -> float:
+        """Median of the dense depth, map units."""
+        written = self.table.views[id].depth
+        if id not in self.loaded and written is not None:
+            return written.typical_at(self.keyframes[id].scale)
+        return self.depth(id).typical
+
+    def set_depth(self, id: int, depth: DenseDepth) -> None:
+        """Take over a dense depth, on which the losses' constants then live."""
+        keyframe, mask, render = self.keyframes[id], self.mask(id), self.cameras.render
+        if keyframe.moving is not None:
+            moving = keyframe.grid.enlarged(keyframe.moving, render.width, render.height)
+            depth = depth.unsure_where(moving)
+        if mask is not None:
+            depth = depth.within(mask)
+        loaded = self.loaded.peek(id)
+        if loaded is None:
+            self._write_depth(id, depth, keyframe.scale)
+            return
+        loaded.depth, loaded.scale, loaded.is_depth_written = depth, keyframe.scale, False
+        if loaded.constants is not None:
+            prior, confidence, normal = self._prior(id, loaded, depth)
+            loaded.constants = replace(
+                loaded.constants, prior_depth=prior.float(), confidence=confidence.float(),
+                prior_normal=normal,
+            )  # fmt: skip
+
+    def constants(self, id: int) -> ViewConstants | None:
+        """What the single-view losses need; None until the keyframe has a depth."""
+        return self._with_constants(id, self.load(id)).constants
+
+    def set_exposure(self, id: int, exposure: Float[Tensor, "2"]) -> None:
+        """Compensate the exposure of a view, for which that was not known."""
+        self.table.views[id].exposure = exposure
+        loaded = self.loaded.peek(id)
+        if loaded is not None:
+            loaded.photo = exposure[0] * loaded.photo + exposure[1]
+
+    def set_rendered_depth(self, id: int, depth: Float[Tensor, "h w"] | None) -> None:
+        """Take over the map's last rendering from a view, or that there is none any more."""
+        if depth is None:
+            self.table.arrays.drop("rendered depth", id)
+        if id in self.loaded or depth is not None:
+            loaded = self.load(id)
+            loaded.rendered_depth, loaded.is_render_written = depth, False
+
+    # --- from and to the file --------------------------------------------------------------
+
+    def _load(self, id: int, as_written: bool = False) -> LoadedView:
+        """The large parts of a view; its depth at the keyframe's scale, or as it was written."""
+        cameras, loss, keyframe, row = (
+            self.cameras,
+            self.loss,
+            self.keyframes[id],
+            self.table.views[id],
+        )
+        image = keyframe.image
+        photo = PhotoView.prepare(
+            image, cameras.photo, keyframe.T_cw, loss.photo_blur, self.device, loss.colour
+        ).planes
+        if row.exposure is not None:
+            photo = row.exposure[0] * photo + row.exposure[1]
+        normal = None
+        if loss.normal_weight:
+            normal = _shrunk_normal(keyframe, cameras.render, self.device)
+        loaded = LoadedView(image, photo, normal)
+        if row.depth is not None:
+            loaded.scale = row.depth.scale if as_written else keyframe.scale
+            loaded.depth = self._read_depth(id, loaded.scale)
+        rendered = self.table.arrays.get("rendered depth", id)
+        if rendered is not None:
+            loaded.rendered_depth = torch.from_numpy(rendered).to(self.device)
+        return loaded
+
+    def _with_constants(self, id: int, loaded: LoadedView) -> LoadedView:
+        if loaded.constants is None and loaded.depth is not None:
+            loaded.constants = ViewConstants.prepare(
+                loaded.image, self.cameras.render, *self._prior(id, loaded, loaded.depth)
+            )
+        return loaded
+
+    def _basis(self, id: int) -> Basis:
+        """All that is ever replaced of what a view is loaded from."""
+        keyframe, row = self.keyframes[id], self.table.views[id]
+        rendered = self.table.arrays.pieces.get("rendered depth", {}).get(id)
+        return keyframe, keyframe.scale, row.exposure, row.depth, rendered
+
+    def _write(self, id: int, loaded: LoadedView) -> None:
+        if not loaded.is_depth_written and loaded.depth is not None:
+            self._write_depth(id, loaded.depth, loaded.scale)
+        if not loaded.is_render_written and loaded.rendered_depth is not None:
+            self.table.arrays.put("rendered depth", id, loaded.rendered_depth.cpu().numpy())
+        loaded.is_depth_written = loaded.is_render_written = True
+
+    def _write_depth(self, id: int, depth: DenseDepth, scale: float) -> None:
+        arrays, row = self.table.arrays, self.table.views[id]
+        row.depth = put_depth(arrays, id, depth, scale)
+        if self.device.type == "cuda":
+            arrays.recent("depth there", DEPTHS_ON_GPU).put(id, (row.depth, depth))
+
+    def _read_depth(self, id: int, scale: float) -> DenseDepth:
+        """The depth that was written, at a scale of its keyframe."""
+        arrays, written = self.table.arrays, self.table.views[id].depth
+        assert written is not None, f"keyframe {id} has no depth yet"
+        if self.device.type == "cuda":
+            recent = arrays.recent("depth there", DEPTHS_ON_GPU)
+            known = recent.peek(id)
+            if known is not None and known[0] is written:
+                recent.put(id, known)
+                depth, typical = known[1], torch.tensor(written.typical_at(scale))
+                factor = scale / written.scale
+                return DenseDepth(
+                    depth.depth * factor, depth.confidence, typical, normal=depth.normal
+                )
+        return get_depth(arrays, id, written, scale, self.device)
+
+    def _at_scale(self, id: int, loaded: LoadedView) -> LoadedView:
+        """The view, whose depth follows the keyframe's scale."""
+        scale = self.keyframes[id].scale
+        if loaded.depth is not None and loaded.scale != scale:
+            self.set_depth(id, loaded.depth.scaled(scale / loaded.scale))
+        return loaded
+
+    def _prior(
+        self, id: int, loaded: LoadedView, depth: DenseDepth
+    ) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"], Float[Tensor, "h w 3"] | None]:
+        """Depth, its weight in L_d, and normals: a prior's, else those that came with the depth."""
+        is_measured, mask = self.keyframes[id].measured is not None, self.mask(id)
+        return (
+            depth.depth if mask is None else torch.where(mask, depth.depth, OUTSIDE),
+            depth.confidence * (self.loss.measured_factor if is_measured else 1.0),
+            depth.normal if loaded.normal is None else loaded.normal,
+        )
+
+
+def _shrunk_normal(
+    keyframe: Keyframe, render: Camera, device: torch.device | str
+) -> Float[Tensor, "h w 3"] | None:
+    """A keyframe's prior normals, averaged over the pixels of the render; zero where they differ.
+
+    An average shorter than a half comes from an edge or from pixels that are not known.
+    """
+    normal = keyframe.prior_normal
+    if normal is None:
+        return None
+    size = (render.width, render.height)
+    full = normal.detach().cpu().float().numpy()
+    mean = cv2.resize(full, size, interpolation=cv2.INTER_AREA)
+    length = np.linalg.norm(mean, axis=-1, keepdims=True)
+    unit = np.where(length > 0.5, mean / np.maximum(length, 1e-6), 0.0)
+    return torch.from_numpy(unit.astype(np.float32)).to(device)

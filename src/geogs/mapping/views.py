@@ -1,0 +1,165 @@
+"""Keyframes as mapping sees them: what losses and depth search ask of each."""
+
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from geogs.depth.view import DenseDepth, DepthView, Place, PosedDepth, depth_images
+from geogs.geometry.lie import se3_inverse
+from geogs.losses.light import same_light
+from geogs.losses.multi_view import PhotoView
+from geogs.losses.single_view import ViewConstants
+from geogs.mapping.view_arrays import ViewArrays
+from geogs.world.keyframes import Keyframe
+from geogs.world.map import ViewRow
+
+UNKNOWN = 1e3
+"""Relative deviation of a depth that is nobody's measurement: it outweighs nothing."""
+
+
+@dataclass(eq=False)
+class MapView:
+    """A keyframe with its row of the map's table, and what losses and depth search ask of it."""
+
+    id: int
+    row: ViewRow
+    arrays: ViewArrays
+
+    @property
+    def keyframe(self) -> Keyframe:
+        """Which has pose and scale."""
+        return self.arrays.keyframes[self.id]
+
+    @property
+    def T_cw(self) -> Float[Tensor, "4 4"]:
+        """World to camera, float64."""
+        return self.keyframe.T_cw
+
+    @property
+    def T_wc(self) -> Float[Tensor, "4 4"]:
+        """Camera to world, float64."""
+        return se3_inverse(self.T_cw)
+
+    @property
+    def place(self) -> Place:
+        """Where it was taken."""
+        return Place(self.id, self.T_cw.numpy())
+
+    @property
+    def mask(self) -> Bool[Tensor, "h w"] | None:
+        """Pixels of the render size that belong to the scene; none takes all."""
+        return self.arrays.mask(self.id)
+
+    @property
+    def depth_view(self) -> DepthView:
+        """What the depth estimation needs."""
+        loaded, (inverse_depth, information) = (
+            self.arrays.load(self.id),
+            self.keyframe.depth_field(),
+        )
+        if loaded.matched is None:
+            loaded.matched = depth_images(loaded.image, self.arrays.cameras.render)
+        if (search := self.row.search) is not None:  # the grid says what is usual, and hardly that
+            inverse_depth = np.full_like(inverse_depth, 1.0 / search.typical)
+            information = np.full_like(information, (search.typical / UNKNOWN) ** 2)
+        return DepthView(
+            self.id, self.T_cw.numpy(), *loaded.matched, loaded.image, inverse_depth, information
+        )
+
+    @property
+    def photo(self) -> PhotoView:
+        """What the multi-view losses need."""
+        return PhotoView.of(self.arrays.load(self.id).photo, self.arrays.cameras.photo, self.T_cw)
+
+    @property
+    def exposure(self) -> Float[Tensor, "2"]:
+        """Gain and offset that its photo has had."""
+        known = self.row.exposure
+        return same_light(self.arrays.device) if known is None else known
+
+    @property
+    def has_depth(self) -> bool:
+        """Whether its depth has been estimated."""
+        return self.arrays.has_depth(self.id)
+
+    @property
+    def dense(self) -> DenseDepth:
+        """The dense depth, where there must be one; what is not in memory stays where it is."""
+        return self.arrays.depth(self.id)
+
+    @property
+    def posed(self) -> PosedDepth:
+        """The dense depth with the view's pose, where there must be one."""
+        return PosedDepth(self.T_cw.numpy(), self.dense)
+
+    @property
+    def typical_depth(self) -> float:
+        """Median of the dense depth, map units."""
+        return self.arrays.typical_depth(self.id)
+
+    @property
+    def constants(self) -> ViewConstants | None:
+        """What the single-view losses need; None until the keyframe has a depth."""
+        return self.arrays.constants(self.id)
+
+    @property
+    def known(self) -> ViewConstants:
+        """The losses' constants, where there must be a depth."""
+        constants = self.constants
+        assert constants is not None, f"keyframe {self.id} has no depth yet"
+        return constants
+
+    @property
+    def rendered_depth(self) -> Float[Tensor, "h w"] | None:
+        """The map's last rendering from here, for occlusion tests by others."""
+        return self.arrays.load(self.id).rendered_depth
+
+    @rendered_depth.setter
+    def rendered_depth(self, depth: Float[Tensor, "h w"] | None) -> None:
+        self.arrays.set_rendered_depth(self.id, depth)
+
+    def set_depth(self, depth: DenseDepth) -> None:
+        """Take over a dense depth, on which the losses' constants then live."""
+        self.arrays.set_depth(self.id, depth)
+
+    def set_exposure(self, exposure: Float[Tensor, "2"]) -> None:
+        """Compensate its exposure, which was not known."""
+        self.arrays.set_exposure(self.id, exposure)
+
+
+class MapViews(Mapping[int, MapView]):
+    """The views of a map by keyframe, in the order in which they came."""
+
+    def __init__(self, arrays: ViewArrays) -> None:
+        self.arrays = arrays
+        self._views = {id: MapView(id, row, arrays) for id, row in arrays.table.views.items()}
+
+    def __getitem__(self, id: int) -> MapView:
+        return self._views[id]
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(self._views)
+
+    def __len__(self) -> int:
+        return len(self._views)
+
+    def add(self, id: int, mask: Bool[np.ndarray, "h w"] | None = None) -> MapView:
+        """Take up a keyframe; it has no depth outside a mask of the size of its image."""
+        if mask is not None:
+            self.arrays.put_mask(id, mask)
+        row = self.arrays.table.views[id] = ViewRow()
+        view = self._views[id] = MapView(id, row, self.arrays)
+        self.arrays.load(id)
+        return view
+
+    def near(self, view: MapView, ids: Collection[int], count: int) -> list[MapView]:
+        """The ``count`` of the views ``ids`` whose cameras are nearest to one's, which may be among
+        them, in the order of the ``ids``."""
+        if len(ids) > count:
+            several = np.fromiter(ids, np.int64, len(ids))
+            nearest = self.arrays.keyframes.poses.nearest(view.id, several, count)
+            ids = several[np.isin(several, nearest, assume_unique=True)].tolist()
+        return [self._views[i] for i in ids]

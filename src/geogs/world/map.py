@@ -1,0 +1,160 @@
+"""The map: disks, what mapping knows of each keyframe, and how far the training is."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from jaxtyping import Float32, UInt8
+from torch import Tensor
+
+from geogs.errors import InputError
+from geogs.world.arrays import NOT_STORED, ArrayTable
+from geogs.world.disks import GaussianMap
+from geogs.world.keyframes import KeyframeTable
+
+
+@dataclass(frozen=True, slots=True)
+class DepthSearch:
+    """Where to look for a keyframe's depth, where no tracker says. Map units."""
+
+    near: float
+    typical: float
+    """Median: neighbours are chosen for their parallax there."""
+    far: float
+
+
+@dataclass(frozen=True, slots=True)
+class SearchedDepth:
+    """What there is to say of a dense depth whose arrays are in the table."""
+
+    typical: float
+    """Median depth, map units."""
+    scale: float
+    """Of the keyframe when the depth was as it is there."""
+
+    def typical_at(self, scale: float) -> float:
+        """Median depth at another scale of the keyframe."""
+        return self.typical * (scale / self.scale)
+
+
+@dataclass(eq=False)
+class ViewRow:
+    """What mapping knows of a keyframe."""
+
+    partners: list[int] = field(default_factory=list)
+    """Ids of the keyframes whose images check this one's depth, best first."""
+    search: DepthSearch | None = None
+    """Where its depth is searched; none leaves that to the tracker's depth."""
+    exposure: Float32[Tensor, "2"] | None = None
+    """Gain and offset that compensate its exposure; none until known."""
+    depth: SearchedDepth | None = None
+    """None until it was searched."""
+
+
+@dataclass(frozen=True, slots=True)
+class TrainingPlace:
+    """How far a long training is."""
+
+    steps: int = 0
+    """Done."""
+    total: int = 0
+    """To be done in all."""
+    seconds: float = 0.0
+    """Spent."""
+
+
+@dataclass(eq=False)
+class RandomState:
+    """Where two generators of random numbers are: NumPy's PCG64, and PyTorch's on the CPU.
+
+    The numbers that are stored are those of the last ``settle``.
+    """
+
+    state: int
+    increment: int
+    has_half: int
+    half: int
+    """Of 64 bits that were drawn for 32."""
+    words: UInt8[Tensor, "n"]
+    """PyTorch's."""
+    of_numpy: np.random.Generator = field(init=False, repr=False, metadata=NOT_STORED)
+    of_torch: torch.Generator = field(init=False, repr=False, metadata=NOT_STORED)
+
+    @staticmethod
+    def seeded(seed: int) -> "RandomState":
+        """At the beginning of what a seed gives."""
+        drawn = np.random.default_rng(seed).bit_generator.state
+        inner, half = drawn["state"], (drawn["has_uint32"], drawn["uinteger"])
+        words = torch.Generator().manual_seed(seed).get_state()
+        return RandomState(inner["state"], inner["inc"], *half, words)
+
+    def __post_init__(self) -> None:
+        """Raises InputError if the numbers are no state that there is."""
+        self.of_numpy, self.of_torch = np.random.default_rng(0), torch.Generator()
+        try:
+            self.of_numpy.bit_generator.state = {
+                "bit_generator": "PCG64", "state": {"state": self.state, "inc": self.increment},
+                "has_uint32": self.has_half, "uinteger": self.half,
+            }  # fmt: skip
+            self.of_torch.set_state(self.words)
+        except (ValueError, TypeError, OverflowError, RuntimeError) as error:
+            raise InputError("the random numbers are in no state that there is") from error
+
+    def settle(self) -> None:
+        """Note where the generators are now."""
+        now = self.of_numpy.bit_generator.state
+        self.state, self.increment = now["state"]["state"], now["state"]["inc"]
+        self.has_half, self.half = now["has_uint32"], now["uinteger"]
+        self.words = self.of_torch.get_state()
+
+
+@dataclass(eq=False)
+class MapTable:
+    """The map and all that its making depends on, beside the keyframes."""
+
+    disks: GaussianMap
+    random: RandomState
+    views: dict[int, ViewRow] = field(default_factory=dict)
+    """By keyframe, in the order in which mapping came to know them."""
+    arrays: ArrayTable = field(default_factory=ArrayTable)
+    """Masks, dense depths with confidences and normals, and depths rendered from the disks."""
+    resident: list[int] = field(default_factory=list)
+    """Keyframes whose arrays were in memory when the table was settled, those used last at the end:
+    of these depths have been rounded at each change of scale."""
+    mapped: list[int] = field(default_factory=list)
+    """Keyframes whose depth is part of the map."""
+    given: list[int] = field(default_factory=list)
+    """Those of a saved map, which stay as they are."""
+    unit: float | None = None
+    """Median depth of the first keyframe, map units; none until it is mapped."""
+    place: TrainingPlace = TrainingPlace()
+    """How far the training over all keyframes is, at each report of its progress."""
+    order: list[int] = field(default_factory=list)
+    """Keyframes that it comes to next, by their places among those mapped."""
+
+    @staticmethod
+    def empty(device: torch.device | str, seed: int = 0) -> "MapTable":
+        """A map without disks."""
+        return MapTable(GaussianMap.empty(device), RandomState.seeded(seed))
+
+
+def check_map(table: MapTable, keyframes: KeyframeTable, size: tuple[int, int]) -> None:
+    """Look whether a table that was read is of these keyframes; ``size`` is height and width.
+
+    Raises:
+        InputError: it is incomplete, or of other keyframes.
+    """
+    if not {*table.mapped, *table.given, *table.resident} <= table.views.keys():
+        raise InputError("a view of the map is missing")
+    if not all(i in keyframes for i in table.views):
+        raise InputError("a keyframe of the map is missing")
+    if not all(0 <= n < len(table.mapped) for n in table.order):
+        raise InputError("the place in the training is none")
+    for id, row in table.views.items():
+        wanted = () if row.depth is None else ("depth", "confidence")
+        if not all(table.arrays.has(name, id) for name in wanted):
+            raise InputError(f"the depth of keyframe {id} is missing")
+        for name in (*wanted, "rendered depth", "mask"):
+            piece = table.arrays.pieces.get(name, {}).get(id)
+            if piece is not None and piece.shape != size:
+                raise InputError(f"the depth of keyframe {id} has another size")
