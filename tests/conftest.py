@@ -1,6 +1,7 @@
 """Run-time shape checks for the whole suite, what all tests share, and where the shared data is."""
 
 import fcntl
+import gc
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -26,6 +27,7 @@ def _typed_modules() -> list[str]:
     return sorted(names)
 
 
+gc.disable()  # until everything is imported, which stays
 torch.set_num_threads(1)  # as the system works; more only wait for each other
 jaxtyping.jaxtyped = lazy_check.jaxtyped  # what the hook decorates with
 jaxtyping.install_import_hook(_typed_modules(), "lazy_check.checked")
@@ -42,6 +44,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         used = item._fixtureinfo.name2fixturedefs.values()
         if any(made.scope == "module" for definitions in used for made in definitions):
             item.add_marker(pytest.mark.xdist_group(item.nodeid.partition("::")[0]))
+
+
+def pytest_collection_finish() -> None:
+    """What is there by now stays to the end: no collection of garbage looks through it again."""
+    gc.freeze()
+    gc.enable()
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:

@@ -44,8 +44,11 @@ class BaselineRunner:
 
     def settings(self, task: Task) -> dict[str, object]:
         """What concerns the baseline. Raises InputError if gsplat is missing or a value wrong."""
-        if importlib.util.find_spec("gsplat") is None:
-            raise InputError("the baseline with colour needs gsplat: pip install gsplat.")
+        for needed in ("gsplat", "pycolmap"):
+            if importlib.util.find_spec(needed) is None:
+                raise InputError(
+                    f"the baseline with colour needs {needed}: pip install 'geogs[bench]'."
+                )
         return asdict(settings_of(task))
 
     def run(self, task: Task) -> None:
@@ -69,7 +72,7 @@ class BaselineRunner:
         source = open_posed_source(task.source, settings.input, settings.hold_out)
         views = training_views(source)
         start = time.perf_counter()
-        points = find_start_points(views)
+        points = find_start_points(views, settings.seed)
         seconds = {"start points": time.perf_counter() - start}
         output = prepare_output_folder(task.output)
         result, mesh = _train(output, settings, views, points, str(device), seconds)
@@ -124,19 +127,40 @@ def _train(
     device: str,
     seconds: dict[str, float],
 ) -> "tuple[AppearanceResult, Mesh]":
-    """Train, writing a mesh at each snapshot; the seconds of both parts go into ``seconds``."""
-    from geogs_bench.appearance.baseline import appearance_mesh, train_appearance
+    """Train, writing a mesh at each snapshot; the seconds of both parts go into ``seconds``.
+
+    Meshes are made by the same fusion as the system's own maps.
+    """
+    import torch
+
+    from geogs.mesh.extract import extract_mesh
+    from geogs_bench.appearance.config import AppearanceConfig
+    from geogs_bench.appearance.depth import depth_views
+    from geogs_bench.appearance.gsplat_rasteriser import GsplatRasteriser
+    from geogs_bench.appearance.trainer import AppearanceTrainer
+
+    config = AppearanceConfig()
+    rasteriser = GsplatRasteriser(config.near)
+
+    def meshed(disks: "AppearanceDisks") -> "Mesh":
+        return extract_mesh(depth_views(disks, views, rasteriser, config), settings.mesh)
 
     def snapshot(at: float, disks: "AppearanceDisks") -> None:
         folder = prepare_output_folder(output / "snapshots" / f"{at:g}")
-        _write_mesh(folder / "mesh.ply", appearance_mesh(disks, views, settings.mesh))
+        _write_mesh(folder / "mesh.ply", meshed(disks))
 
-    result = train_appearance(
-        views, points, settings.budget, None, settings.seed, device, settings.snapshots, snapshot
+    trainer = AppearanceTrainer(
+        views, points.positions, points.colours, rasteriser, config, settings.seed, device
     )
+    try:
+        result = trainer.train(settings.budget, settings.snapshots, snapshot)
+    except torch.cuda.OutOfMemoryError as error:
+        raise DeviceError(
+            "The memory of the GPU is full; use fewer or smaller images for the baseline."
+        ) from error
     seconds["training"] = result.seconds
     start = time.perf_counter()
-    mesh = appearance_mesh(result.disks, views, settings.mesh)
+    mesh = meshed(result.disks)
     seconds["mesh"] = time.perf_counter() - start
     return result, mesh
 

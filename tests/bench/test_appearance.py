@@ -18,31 +18,17 @@ from geogs.mesh.extract import extract_mesh
 from geogs_bench.appearance import trainer as trainer_module
 from geogs_bench.appearance.config import AppearanceConfig
 from geogs_bench.appearance.densify import GradientStatistics, refine, split_disks
-from geogs_bench.appearance.depth import crossing_depth
-from geogs_bench.appearance.disks import AppearanceDisks, disks_at_points
-from geogs_bench.appearance.features import epipolar_distance, neighbour_pairs
-from geogs_bench.appearance.fusion import depth_views
+from geogs_bench.appearance.depth import crossing_depth, depth_views
+from geogs_bench.appearance.disks import AppearanceDisks, constant_from_colour, disks_at_points
 from geogs_bench.appearance.gsplat_rasteriser import GsplatRasteriser
 from geogs_bench.appearance.losses import normal_loss, photometric_loss, ssim
 from geogs_bench.appearance.optimizer import DiskOptimizer
-from geogs_bench.appearance.points_file import read_points, write_points
 from geogs_bench.appearance.rasteriser import MedianDisks, normals_of_depth, shifted_matrix
 from geogs_bench.appearance.schedule import RefinementClock, Schedule
-from geogs_bench.appearance.spherical_harmonics import (
-    basis,
-    constant_from_colour,
-    view_colours,
-)
-from geogs_bench.appearance.start_points import StartPoints, find_start_points, in_visual_hull
+from geogs_bench.appearance.start_points import find_start_points, in_visual_hull
 from geogs_bench.appearance.trainer import AppearanceTrainer
-from geogs_bench.appearance.triangulation import (
-    Observations,
-    Projections,
-    largest_parallax,
-    triangulate,
-)
 from geogs_bench.appearance.views import TrainingView, scene_scale
-from oracles.appearance_reference import ReferenceRasteriser
+from oracles.appearance_reference import ReferenceRasteriser, basis, view_colours
 
 pytestmark = pytest.mark.system
 
@@ -377,46 +363,6 @@ def test_scene_scale_is_the_radius_of_the_cameras() -> None:
     assert scene_scale(views, 1.1) == pytest.approx(2.2)
 
 
-def test_triangulation_is_exact_and_ignores_an_outlier() -> None:
-    random = np.random.default_rng(0)
-    views = plane_views(CAMERA, 6)
-    projections = Projections(
-        np.stack([v.T_cw for v in views]), np.array([[40.0, 42.0, 15.3, 11.2]] * 6)
-    )
-    points = random.uniform((-0.5, -0.5, 2.5), (0.5, 0.5, 3.5), (20, 3))
-    point, view = np.repeat(np.arange(20), 6), np.tile(np.arange(6), 20)
-    seen = Observations(point, view, np.zeros((120, 2)))
-    local = projections.local(points, seen)
-    pixel = local[:, :2] / local[:, 2:] * (40.0, 42.0) + (15.3, 11.2)
-    pixel[3] += (9.0, -7.0)
-    seen = Observations(point, view, pixel)
-    got = triangulate(projections, seen, 2.0)
-    np.testing.assert_allclose(got[1:], points[1:], atol=1e-9)
-    assert np.linalg.norm(got[0] - points[0]) < 0.02
-    angle = largest_parallax(projections, points, seen)
-    rays = points[7] - projections.centres()
-    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    assert angle[7] == pytest.approx(np.degrees(np.arccos((rays @ rays.T).min())))
-
-
-def test_epipolar_distance_is_that_to_the_line() -> None:
-    one, other = plane_views(CAMERA, 3)[:2]
-    point = np.array([0.2, -0.1, 2.8, 1.0])
-    K = CAMERA.matrix().numpy()
-    a, b = ((K @ (v.T_cw @ point)[:3]) for v in (one, other))
-    a, b = a[None, :2] / a[2], b[None, :2] / b[2]
-    assert epipolar_distance(one, other, a, b)[0] == pytest.approx(0, abs=1e-9)
-    assert 0.5 < epipolar_distance(one, other, a, np.add(b, (0.0, 2.0)))[0] < 2
-
-
-def test_neighbours_look_the_same_way() -> None:
-    views = plane_views(CAMERA, 4)
-    views.append(replace(views[0], T_cw=look_at((-0.6, 0.0, 0.0), (0.0, 0.0, -3.0))))
-    pairs = neighbour_pairs(views, 2)
-    assert (0, 1) in pairs
-    assert all(4 not in pair for pair in pairs)
-
-
 def test_start_points_lie_on_the_textured_plane() -> None:
     camera = Camera(260.0, 260.0, 159.5, 119.5, 320, 240)
     views = plane_views(camera, 5)
@@ -440,23 +386,6 @@ def test_start_points_need_texture() -> None:
     flat = [replace(v, image=np.full_like(v.image, 90)) for v in plane_views(CAMERA, 3)]
     with pytest.raises(InputError, match="too little texture"):
         find_start_points(flat)
-
-
-def test_points_file_keeps_positions_and_colours(tmp_path) -> None:
-    random = np.random.default_rng(0)
-    points = StartPoints(
-        random.random((7, 3)).astype(np.float32).astype(np.float64),
-        random.integers(0, 256, (7, 3), dtype=np.uint8),
-    )
-    write_points(tmp_path / "p.ply", points)
-    got = read_points(tmp_path / "p.ply")
-    np.testing.assert_array_equal(got.positions, points.positions)
-    np.testing.assert_array_equal(got.colours, points.colours)
-    (tmp_path / "no.ply").write_text("nothing")
-    with pytest.raises(InputError, match="no readable PLY"):
-        read_points(tmp_path / "no.ply")
-    with pytest.raises(InputError, match="does not exist"):
-        read_points(tmp_path / "missing.ply")
 
 
 def test_without_gsplat_one_sentence_says_how_to_get_it(monkeypatch) -> None:

@@ -19,10 +19,19 @@ from geogs_bench.appearance.rasteriser import (
     Rendering,
     normals_of_depth,
 )
-from geogs_bench.appearance.spherical_harmonics import view_colours
 
 MAX_ALPHA = 0.999
 MIN_TRANSMITTANCE = 1e-4
+
+# sqrt(1 / 4 pi), sqrt(3 / 4 pi), sqrt(15 / 4 pi), ...: norms of the real basis functions. The
+# signs follow the Condon-Shortley phase, which splatting's coefficients include.
+_C0 = 0.28209479177387814
+_C1 = 0.4886025119029199
+_C2 = (1.0925484305920792, 0.31539156525252005, 0.5462742152960396)
+_C3 = (
+    0.5900435899266435, 2.890611442640554, 0.4570457994644658, 0.3731763325901154,
+    1.445305721320277,
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -133,3 +142,35 @@ def _facing_normals(disks: AppearanceDisks, T_cw: Tensor) -> Float[Tensor, "n 3"
 
 def _centre(T_cw: Tensor) -> Float[Tensor, "3"]:
     return -T_cw[:3, :3].T @ T_cw[:3, 3]
+
+
+def basis(degree: int, directions: Float[Tensor, "n 3"]) -> Float[Tensor, "n k"]:
+    """Values of the basis functions in unit directions."""
+    x, y, z = directions.unbind(-1)
+    values = [torch.full_like(x, _C0)]
+    if degree > 0:
+        values += [-_C1 * y, _C1 * z, -_C1 * x]
+    if degree > 1:
+        a, b, c = _C2
+        values += [a * x * y, -a * y * z, b * (3 * z * z - 1), -a * x * z, c * (x * x - y * y)]
+    if degree > 2:
+        a, b, c, d, e = _C3
+        values += [
+            -a * y * (3 * x * x - y * y),
+            b * x * y * z,
+            -c * y * (5 * z * z - 1),
+            d * z * (5 * z * z - 3),
+            -c * x * (5 * z * z - 1),
+            e * z * (x * x - y * y),
+            -a * x * (x * x - 3 * y * y),
+        ]
+    return torch.stack(values, -1)
+
+
+def view_colours(
+    degree: int, directions: Float[Tensor, "n 3"], coefficients: Float[Tensor, "n k 3"]
+) -> Float[Tensor, "n 3"]:
+    """RGB, at least 0, of disks seen along ``directions`` (camera to disk, any length)."""
+    unit = torch.nn.functional.normalize(directions, dim=-1)
+    used = coefficients[:, : (degree + 1) ** 2]
+    return (torch.einsum("nk,nkc->nc", basis(degree, unit), used) + 0.5).clamp(min=0)

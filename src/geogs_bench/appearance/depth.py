@@ -1,6 +1,7 @@
-"""Depth of coloured disks: where each pixel's ray crosses its median disk."""
+"""Depth maps of coloured disks: where each pixel's ray crosses its median disk."""
 
 import math
+from collections.abc import Sequence
 
 import torch
 from jaxtyping import Float
@@ -8,8 +9,11 @@ from torch import Tensor
 
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import quaternion_to_matrix
+from geogs.mesh.triangle_mesh import DepthMapView
+from geogs_bench.appearance.config import AppearanceConfig
 from geogs_bench.appearance.disks import AppearanceDisks
-from geogs_bench.appearance.rasteriser import MIN_ALPHA, PIXEL_SHARPNESS, MedianDisks
+from geogs_bench.appearance.rasteriser import MIN_ALPHA, PIXEL_SHARPNESS, MedianDisks, Rasteriser
+from geogs_bench.appearance.views import TrainingView
 
 _MIN_FACING = 0.1
 """Smallest cosine between a ray and the normal of a disk whose plane it is crossed with."""
@@ -41,6 +45,28 @@ def crossing_depth(
     depth = torch.zeros(median.index.shape, device=disks.means.device)
     depth[has_depth] = z
     return depth
+
+
+@torch.no_grad()
+def depth_views(
+    disks: AppearanceDisks,
+    views: Sequence[TrainingView],
+    rasteriser: Rasteriser,
+    config: AppearanceConfig,
+) -> list[DepthMapView]:
+    """Depth of every view inside its mask; every pixel with a depth has weight 1."""
+    device = disks.means.device
+    maps = []
+    for view in views:
+        T_cw = torch.from_numpy(view.T_cw).float().to(device)
+        median = rasteriser.median_disks(disks, view.camera, T_cw)
+        depth = crossing_depth(disks, median, view.camera, T_cw, config.min_alpha)
+        if view.mask is not None:
+            depth = torch.where(torch.from_numpy(view.mask).to(device), depth, 0.0)
+        weight = (depth > 0).float()
+        T_cw_exact = torch.from_numpy(view.T_cw)
+        maps.append(DepthMapView(depth, weight, view.camera, T_cw_exact, view.image))
+    return maps
 
 
 def _crossing(

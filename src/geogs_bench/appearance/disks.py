@@ -10,11 +10,12 @@ from torch import Tensor
 
 from geogs.geometry.neighbors import nearest_neighbors
 from geogs_bench.appearance.config import AppearanceConfig
-from geogs_bench.appearance.spherical_harmonics import coefficient_count, constant_from_colour
 
 FLOATS_PER_DISK = 61
 """Numbers a disk in the file format of 2DGS: 3 + 3 (normal) + 48 + 1 + 2 + 4."""
 _NEIGHBOURS = 3
+_SH_CONSTANT = 0.28209479177387814
+"""The spherical harmonic of degree 0: sqrt(1 / 4 pi)."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +90,7 @@ def disks_at_points(
     size = distance.square().mean(1).sqrt().clamp(min=1e-7)
     quaternions = torch.rand((n, 4), generator=generator, device=device)
     logit = math.log(config.initial_opacity / (1 - config.initial_opacity))
-    rest = coefficient_count(config.sh_degree) - 1
+    rest = (config.sh_degree + 1) ** 2 - 1
     return AppearanceDisks(
         points.float(),
         quaternions,
@@ -98,3 +99,8 @@ def disks_at_points(
         constant_from_colour(colours.float())[:, None],
         torch.zeros((n, rest, 3), device=device),
     )
+
+
+def constant_from_colour(colour: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
+    """The coefficient of degree 0 that shows an RGB colour in [0, 1] from everywhere."""
+    return (colour - 0.5) / _SH_CONSTANT
