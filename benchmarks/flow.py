@@ -24,7 +24,7 @@ from geogs.geometry.lie import se3_inverse
 from geogs.io.pose_files import read_replica_trajectory
 from geogs.io.sources.sniff import open_source
 from geogs.networks.weights_files import PACKAGED
-from geogs.tracking.flow.classical import ClassicalFlow
+from geogs.tracking.flow.classical_flow import ClassicalFlow
 from geogs.tracking.flow.lookup import Edges
 from geogs.tracking.flow.own import load_network
 from geogs.tracking.flow.own_network import FlowNetwork, cell_pixels

@@ -23,7 +23,7 @@ import torch
 
 from geogs.geometry.camera import Camera
 from geogs.networks.weights_files import PACKAGED
-from geogs.tracking.flow.classical import ClassicalFlow
+from geogs.tracking.flow.classical_flow import ClassicalFlow
 from geogs.tracking.flow.own import OwnFlowOptions, load_network
 from geogs.world.grid import SampleGrid
 from geogs_synth.clips.sampler import RoomSampler

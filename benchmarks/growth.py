@@ -24,7 +24,7 @@ from geogs.loop.detect import LoopDetector
 from geogs.loop.pose_graph import PoseGraph, solve
 from geogs.loop.retrieval import AppearanceIndex
 from geogs.mapping.mapper import Mapper
-from geogs.tracking.flow.classical import ClassicalFlow
+from geogs.tracking.flow.classical_flow import ClassicalFlow
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import KeyframeTable
 from geogs.world.loops import Features, RelativePoses

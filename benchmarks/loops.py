@@ -31,7 +31,7 @@ from geogs.loop.dense import dense_check
 from geogs.loop.detect import LoopDetector
 from geogs.loop.retrieval import AppearanceIndex
 from geogs.loop.verification import DepthView, TwoViewVerifier
-from geogs.tracking.flow.classical import ClassicalFlow
+from geogs.tracking.flow.classical_flow import ClassicalFlow
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import KeyframeSet, KeyframeTable
 from tracking import Sequence, load

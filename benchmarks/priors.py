@@ -27,7 +27,7 @@ from geogs.geometry.umeyama import umeyama
 from geogs.loop.global_bundle import global_bundle
 from geogs.priors.base import DepthKind, MonocularPrior
 from geogs.slam import Slam
-from geogs.tracking.flow.texture import MIN_STRUCTURE, cell_structure, smaller_eigenvalue
+from geogs.tracking.flow.cell_texture import MIN_STRUCTURE, cell_structure, smaller_eigenvalue
 from geogs.tracking.tracker import Tracker, lone_tracker
 from geogs.types import Frame
 from geogs.world.grid import OFFSET, STRIDE

@@ -23,10 +23,10 @@ from geogs.config import Config, InputConfig, TrackingConfig
 from geogs.geometry.camera import Camera
 from geogs.io.sources.sniff import open_source
 from geogs.threads import on_one_torch_thread
-from geogs.tracking.flow.base import FlowOperator, Memories
 from geogs.tracking.flow.droid import DroidFlow
 from geogs.tracking.flow.droid_network import DroidNetwork
-from geogs.tracking.flow.select import build_operator
+from geogs.tracking.flow.flow_operator import FlowOperator, Memories
+from geogs.tracking.flow.operator_choice import build_operator
 from geogs.tracking.tracker import lone_tracker
 from geogs.types import FlowMatch, Frame
 from geogs.world.grid import SampleGrid

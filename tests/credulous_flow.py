@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from geogs.tracking.flow.base import Memories
-from geogs.tracking.flow.classical import ClassicalFlow, ClassicalImage
+from geogs.tracking.flow.classical_flow import ClassicalFlow, ClassicalImage
+from geogs.tracking.flow.flow_operator import Memories
 from geogs.types import FlowMatch
 
 

@@ -9,7 +9,7 @@ import torch
 
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_inverse
-from geogs.tracking.flow.classical import ClassicalFlow
+from geogs.tracking.flow.classical_flow import ClassicalFlow
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import KeyframeSet, KeyframeTable
 from geogs_synth.places.room import make_room

@@ -11,7 +11,7 @@ from geogs.bundle.projection import project
 from geogs.config import Config, TrackingConfig
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp, se3_inverse
-from geogs.tracking.flow.base import Memories
+from geogs.tracking.flow.flow_operator import Memories
 from geogs.tracking.tracker import Tracker, lone_tracker
 from geogs.types import FlowMatch
 from geogs.world.grid import SampleGrid

@@ -27,7 +27,7 @@ from geogs.threads import on_one_torch_thread
 from geogs.tracking.certainty import certainty
 from geogs.tracking.completion import Completion
 from geogs.tracking.flow.masked import valid_pixels
-from geogs.tracking.flow.select import build_operator
+from geogs.tracking.flow.operator_choice import build_operator
 from geogs.tracking.held import add_saved_keyframes
 from geogs.tracking.moving import moving_share
 from geogs.tracking.pose_deviation import PoseDeviation

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional
 
-from geogs.tracking.flow.texture import MIN_STRUCTURE
+from geogs.tracking.flow.cell_texture import MIN_STRUCTURE
 
 LARGE_MOTION = 16.0
 """Pixels from which on a motion counts as large."""

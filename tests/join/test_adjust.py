@@ -9,7 +9,7 @@ import torch
 
 from geogs.config import Config
 from geogs.loop.global_bundle import global_options
-from geogs.tracking.flow.select import build_operator
+from geogs.tracking.flow.operator_choice import build_operator
 from geogs.tracking.graph import FrameGraph
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import KeyframeTable

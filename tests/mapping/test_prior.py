@@ -14,7 +14,7 @@ from geogs.losses.single_view import single_view_loss
 from geogs.mapping.view_arrays import MapCameras
 from geogs.mapping.views import MapView
 from geogs.priors.base import PriorMaps
-from geogs.tracking.flow.classical import ClassicalFlow
+from geogs.tracking.flow.classical_flow import ClassicalFlow
 from geogs.tracking.graph import FrameGraph
 from geogs.tracking.keyframe_priors import KeyframePriors
 from geogs.world.grid import SampleGrid

@@ -13,11 +13,11 @@ from geogs.cli.main import main
 from geogs.config import Config, TrackingConfig
 from geogs.errors import InputError
 from geogs.networks import weights_files
-from geogs.networks.weights import read_tensors
+from geogs.networks.tensor_files import read_tensors
 from geogs.networks.weights_files import CATALOGUE, checksum, find_weights, weights_folders
-from geogs.tracking.flow.classical import ClassicalFlow
+from geogs.tracking.flow.classical_flow import ClassicalFlow
 from geogs.tracking.flow.droid import DroidFlow
-from geogs.tracking.flow.select import build_operator
+from geogs.tracking.flow.operator_choice import build_operator
 from geogs.tracking.tracker import lone_tracker
 from geogs.world.grid import SampleGrid
 from tracking_scenes import CAMERA

@@ -14,7 +14,7 @@ from geogs.depth.network.model import DepthNetwork
 from geogs.depth.network.options import DepthNetworkOptions
 from geogs.depth.network.weights import load_depth_network
 from geogs.geometry.camera import Camera
-from geogs.networks.weights import read_tensors
+from geogs.networks.tensor_files import read_tensors
 from geogs.priors.card import load_card
 from geogs.priors.onnx import OnnxPrior
 from geogs.tracking.flow.own import load_network

@@ -133,7 +133,7 @@ def test_one_place_is_told_from_noise_and_from_another():
 
 
 def test_a_smooth_flow_makes_noise_no_more_alike():
-    from geogs.tracking.flow.classical import ClassicalFlow
+    from geogs.tracking.flow.classical_flow import ClassicalFlow
 
     operator = ClassicalFlow(GRID)
     images = [render(HERE)[0], render(pose(0.05, yaw=0.02))[0]]

@@ -6,7 +6,7 @@ import torch
 
 from geogs.geometry.lie import se3_inverse
 from geogs.tracking.features import UNSURE, match_features, spread_positions, surer_flow
-from geogs.tracking.flow.classical import ClassicalFlow
+from geogs.tracking.flow.classical_flow import ClassicalFlow
 from geogs.types import FlowMatch
 from geogs.world.grid import SampleGrid
 from tracking_scenes import CAMERA, pose, render

@@ -10,7 +10,7 @@ from geogs.bundle.projection import project
 from geogs.bundle.select import grid_fields
 from geogs.tracking.evidence import MIN_WINDOWS
 from geogs.tracking.features import FeatureMatches
-from geogs.tracking.flow.classical import ClassicalFlow
+from geogs.tracking.flow.classical_flow import ClassicalFlow
 from geogs.tracking.graph import FrameGraph
 from geogs.tracking.motion import FrameLocator, pnp, pnp_features
 from geogs.tracking.proximity import frame_distances, proximity_pairs

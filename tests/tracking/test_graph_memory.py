@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from geogs.tracking.flow.base import FlowOperator, Memories
+from geogs.tracking.flow.flow_operator import FlowOperator, Memories
 from geogs.tracking.graph import FrameGraph
 from geogs.types import FlowMatch
 from geogs.world.grid import SampleGrid

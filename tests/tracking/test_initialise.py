@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from geogs.geometry.lie import se3_inverse
-from geogs.tracking.flow.classical import ClassicalFlow
+from geogs.tracking.flow.classical_flow import ClassicalFlow
 from geogs.tracking.graph import FrameGraph
 from geogs.tracking.initialise import _pose_of, placed_after
 from geogs.world.grid import SampleGrid

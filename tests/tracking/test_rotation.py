@@ -9,7 +9,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from geogs.geometry.lie import se3_inverse, so3_exp, so3_log
-from geogs.tracking.flow.classical import ClassicalFlow
+from geogs.tracking.flow.classical_flow import ClassicalFlow
 from geogs.tracking.rotation import (
     epipolar_squares,
     fit_rotation,

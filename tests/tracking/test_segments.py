@@ -12,7 +12,7 @@ from geogs.geometry.camera import Camera
 from geogs.geometry.lie import sim3_exp
 from geogs.geometry.umeyama import umeyama
 from geogs.loop.closer import LoopCloser
-from geogs.tracking.flow.select import build_operator
+from geogs.tracking.flow.operator_choice import build_operator
 from geogs.tracking.segments import Segments
 from geogs.tracking.tracker import lone_tracker
 from geogs.types import Frame

@@ -11,7 +11,7 @@ from geogs.config import Config, TrackingConfig
 from geogs.errors import TrackingLost
 from geogs.evaluation.trajectory_errors import rotation_angle
 from geogs.tracking import start_up
-from geogs.tracking.flow.select import build_operator
+from geogs.tracking.flow.operator_choice import build_operator
 from geogs.tracking.graph import FrameGraph
 from geogs.tracking.initialise import FORGIVING, Attempt, initialise
 from geogs.tracking.segments import Segments

@@ -208,7 +208,7 @@ def test_scores_are_means_over_the_right_cells():
 
 
 def test_texture_is_what_the_tracker_calls_texture():
-    from geogs.tracking.flow.texture import MIN_STRUCTURE, cell_structure
+    from geogs.tracking.flow.cell_texture import MIN_STRUCTURE, cell_structure
     from geogs.world.grid import OFFSET, STRIDE
 
     rng = np.random.default_rng(2)

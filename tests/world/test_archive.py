@@ -11,7 +11,7 @@ import torch
 from geogs.application.checkpoints.folder import CheckpointFolder
 from geogs.errors import OutputError
 from geogs.geometry.camera import Camera
-from geogs.tracking.flow.classical import ClassicalFlow
+from geogs.tracking.flow.classical_flow import ClassicalFlow
 from geogs.world.archive import Archive
 from geogs.world.arrays import ArrayTable
 from geogs.world.grid import SampleGrid

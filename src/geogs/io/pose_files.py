@@ -20,6 +20,8 @@ from geogs.types import Trajectory
 
 FRAMES_PER_SECOND = 30.0
 """Rate given to data sets that carry no time: frame k is at k / 30 s."""
+OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+"""Camera axes x right, y down, z forward from x right, y up, z backward; it is its own inverse."""
 
 _log = logging.getLogger(__name__)
 _POSE_FILE = re.compile(r"frame-(\d+)\.pose\.txt")
@@ -42,11 +44,19 @@ def read_tum_trajectory(path: str | Path) -> Trajectory:
     _check_quaternions(path, rows, valid)
     rows = _keep_poses(path, rows, valid)
     rows = rows[np.argsort(rows[:, 0], kind="stable")]
-    wxyz = rows[:, [7, 4, 5, 6]]
-    T_wc = np.tile(np.eye(4), (len(rows), 1, 1))
-    T_wc[:, :3, :3] = quaternion_to_matrix(torch.from_numpy(wxyz)).numpy()
-    T_wc[:, :3, 3] = rows[:, 1:4]
+    T_wc = poses_from(rows[:, 1:4], rows[:, 4:])
     return Trajectory(rows[:, 0].copy(), T_wc, np.ones(len(rows), dtype=bool))
+
+
+def poses_from(
+    position: Float[np.ndarray, "n 3"], xyzw: Float[np.ndarray, "n 4"]
+) -> Float[np.ndarray, "n 4 4"]:
+    """Camera-to-world matrices of positions and quaternions in the order of TUM files."""
+    T_wc = np.tile(np.eye(4), (len(position), 1, 1))
+    wxyz = np.ascontiguousarray(xyzw[:, [3, 0, 1, 2]])
+    T_wc[:, :3, :3] = quaternion_to_matrix(torch.from_numpy(wxyz)).numpy()
+    T_wc[:, :3, 3] = position
+    return T_wc
 
 
 def read_replica_trajectory(path: str | Path) -> Trajectory:

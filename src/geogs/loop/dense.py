@@ -10,7 +10,7 @@ from torch import Tensor
 from geogs.bundle.projection import project
 from geogs.geometry.lie import scaled, se3_inverse, so3_log
 from geogs.loop.verification import DEPTH_TOLERANCE, MAX_SCALE, MIN_CONSISTENT
-from geogs.tracking.flow.base import FlowOperator
+from geogs.tracking.flow.flow_operator import FlowOperator
 from geogs.tracking.motion import FrameLocator, FrameMotion
 from geogs.types import FlowMatch
 from geogs.world.grid import SampleGrid

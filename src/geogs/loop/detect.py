@@ -14,7 +14,7 @@ from geogs.config import LoopConfig
 from geogs.geometry.lie import se3_inverse
 from geogs.loop.dense import dense_check
 from geogs.loop.search import SUPPRESSION, Depths, PlaceRecognition, Query
-from geogs.tracking.flow.base import FlowOperator
+from geogs.tracking.flow.flow_operator import FlowOperator
 from geogs.tracking.motion import Recognition
 from geogs.tracking.proximity import frame_distances
 from geogs.world.keyframes import KeyframeTable

@@ -18,7 +18,7 @@ from geogs.bundle.select import (
 )
 from geogs.geometry.lie import se3_inverse
 from geogs.threads import thread_map
-from geogs.tracking.flow.base import FlowOperator
+from geogs.tracking.flow.flow_operator import FlowOperator
 from geogs.tracking.moving import judge, still_weight
 from geogs.tracking.odometry import Odometry
 from geogs.tracking.proximity import PAIRS_TOGETHER

@@ -19,8 +19,8 @@ from geogs.tracking.evidence import (
     matched_motion,
 )
 from geogs.tracking.features import FeatureMatches, match_features, surer_flow
-from geogs.tracking.flow.base import FlowOperator
 from geogs.tracking.flow.filled import filled_positions
+from geogs.tracking.flow.flow_operator import FlowOperator
 from geogs.types import FlowMatch
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import Keyframe

@@ -8,7 +8,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from geogs.config import TrackingConfig
-from geogs.tracking.flow.base import FlowOperator
+from geogs.tracking.flow.flow_operator import FlowOperator
 from geogs.tracking.keyframe_choice import calls_for_keyframe
 from geogs.tracking.motion import MIN_MATCHED, FlowChain
 from geogs.tracking.rotation import relative_rotation

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from geogs.bundle.select import grid_fields
 from geogs.geometry.lie import se3_inverse
-from geogs.tracking.flow.base import FlowOperator
+from geogs.tracking.flow.flow_operator import FlowOperator
 from geogs.types import FlowMatch, Frame
 from geogs.world.edges import pack_matches
 from geogs.world.frames import FrameLog, FrameRecord, Observation, RelativeRotation

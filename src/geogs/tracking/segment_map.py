@@ -9,7 +9,7 @@ from torch import Tensor
 
 from geogs.config import Config
 from geogs.priors.base import MonocularPrior
-from geogs.tracking.flow.base import FlowOperator
+from geogs.tracking.flow.flow_operator import FlowOperator
 from geogs.tracking.graph import FrameGraph
 from geogs.tracking.keyframe_priors import KeyframePriors
 from geogs.tracking.odometry import Odometry

@@ -12,7 +12,7 @@ from torch import Tensor
 from geogs.config import Config
 from geogs.errors import TrackingLost
 from geogs.priors.base import MonocularPrior
-from geogs.tracking.flow.base import FlowOperator
+from geogs.tracking.flow.flow_operator import FlowOperator
 from geogs.tracking.motion import Recognition
 from geogs.tracking.tracker import Tracker, TrackResult
 from geogs.types import Frame, Trajectory

@@ -14,8 +14,8 @@ from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_inverse
 from geogs.priors.base import MonocularPrior
 from geogs.tracking.early_frames import locate_early_frames
-from geogs.tracking.flow.base import FlowOperator
-from geogs.tracking.flow.select import build_operator
+from geogs.tracking.flow.flow_operator import FlowOperator
+from geogs.tracking.flow.operator_choice import build_operator
 from geogs.tracking.follower import Follower
 from geogs.tracking.keyframe_choice import KeyframeChoice
 from geogs.tracking.local_mapping import LocalMapping

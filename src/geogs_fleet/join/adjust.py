@@ -24,7 +24,7 @@ from geogs.geometry.camera import Camera
 from geogs.geometry.lie import move
 from geogs.loop.global_bundle import ROUNDS, SETTLED, global_options
 from geogs.threads import on_one_torch_thread
-from geogs.tracking.flow.select import build_operator
+from geogs.tracking.flow.operator_choice import build_operator
 from geogs.tracking.graph import FrameGraph
 from geogs.world.edges import PackedEdge
 from geogs.world.grid import SampleGrid

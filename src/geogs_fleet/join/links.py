@@ -18,8 +18,8 @@ from geogs.loop.retrieval import AppearanceIndex
 from geogs.loop.search import MIN_SCORE, SUPPRESSION
 from geogs.loop.verification import DepthView, TwoViewVerifier
 from geogs.threads import on_one_torch_thread
-from geogs.tracking.flow.base import FlowOperator
-from geogs.tracking.flow.select import build_operator
+from geogs.tracking.flow.flow_operator import FlowOperator
+from geogs.tracking.flow.operator_choice import build_operator
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import Keyframe, KeyframeSet, KeyframeTable
 from geogs.world.loops import Loop, RelativePoses

@@ -21,7 +21,7 @@ from geogs.loop.global_bundle import (
     SUPPRESSION,
 )
 from geogs.threads import on_one_torch_thread
-from geogs.tracking.flow.select import build_operator
+from geogs.tracking.flow.operator_choice import build_operator
 from geogs.tracking.graph import FrameGraph
 from geogs.tracking.proximity import RADIUS, proximity_pairs
 from geogs.tracking.row_errors import RowErrors, edge_shifts

@@ -14,9 +14,9 @@ from geogs.bundle.problem import BundleProblem
 from geogs.bundle.projection import linearise, relative_motion
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
-from geogs.tracking.flow.base import FlowOperator
 from geogs.tracking.flow.droid import DroidFlow, DroidOptions
 from geogs.tracking.flow.droid_network import DroidNetwork, DroidSize
+from geogs.tracking.flow.flow_operator import FlowOperator
 from geogs.tracking.graph import FrameGraph
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import KeyframeTable

@@ -9,7 +9,7 @@ from geogs.config import TrackingConfig
 from geogs.errors import InputError
 from geogs.loop.features import FeatureExtractor
 from geogs.tracking.flow.masked import MaskedFlow
-from geogs.tracking.flow.select import build_operator
+from geogs.tracking.flow.operator_choice import build_operator
 from geogs.world.grid import STRIDE, SampleGrid
 from tracking_scenes import CAMERA, pose, render
 

@@ -9,7 +9,7 @@ import torch
 
 from geogs.config import Config, TrackingConfig
 from geogs.tracking.flow.masked import MaskedFlow
-from geogs.tracking.flow.select import build_operator
+from geogs.tracking.flow.operator_choice import build_operator
 from geogs.tracking.tracker import lone_tracker
 from geogs.world.grid import STRIDE, SampleGrid
 from tracking_runs import CONFIG, error_cm

@@ -6,8 +6,8 @@ import torch
 
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
-from geogs.tracking.flow.classical import ClassicalFlow
-from geogs.tracking.flow.classical_cuda import CudaClassicalFlow
+from geogs.tracking.flow.classical_flow import ClassicalFlow
+from geogs.tracking.flow.classical_flow_cuda import CudaClassicalFlow
 from geogs.tracking.flow.lookup import Edges
 from geogs.tracking.flow.own import OwnFlow, OwnFlowOptions, load_network
 from geogs.tracking.flow.own_network import (

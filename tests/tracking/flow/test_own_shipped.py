@@ -8,7 +8,7 @@ import torch
 
 from geogs.geometry.camera import Camera
 from geogs.networks.weights_files import PACKAGED
-from geogs.tracking.flow.classical import ClassicalFlow
+from geogs.tracking.flow.classical_flow import ClassicalFlow
 from geogs.tracking.flow.own import OwnFlow, OwnFlowOptions
 from geogs.world.grid import OFFSET, STRIDE, SampleGrid
 from geogs_synth.motion.handheld import handheld_trajectory

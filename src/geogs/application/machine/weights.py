@@ -56,7 +56,7 @@ def verification(path: Path) -> str:
         f"verdict  {found.verdict}",
     ]
     if path.suffix != ".onnx":
-        from geogs.networks.weights import read_tensors  # loads PyTorch
+        from geogs.networks.tensor_files import read_tensors  # loads PyTorch
 
         tensors = read_tensors(path)
         numbers = sum(t.numel() for t in tensors.values())

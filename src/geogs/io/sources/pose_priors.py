@@ -22,9 +22,6 @@ NEAR = 0.02
 KEYWORDS = ("none", "auto", "prior")
 """What ``input.poses`` may be beside a file."""
 
-OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
-"""Camera axes x right, y down, z forward from x right, y up, z backward; it is its own inverse."""
-
 
 @runtime_checkable
 class KnowsPoses(Protocol):

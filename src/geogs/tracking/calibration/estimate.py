@@ -16,7 +16,7 @@ from geogs.tracking.calibration.degeneracy import Degeneracy
 from geogs.tracking.calibration.keyframes import ViewGatherer
 from geogs.tracking.calibration.stretch import FRAMES, Report, Stretch
 from geogs.tracking.calibration.sureness import Estimate, estimate, joined
-from geogs.tracking.flow.select import build_operator
+from geogs.tracking.flow.operator_choice import build_operator
 from geogs.types import Frame
 from geogs.world.grid import SampleGrid
 

@@ -12,7 +12,7 @@ from geogs.bundle.problem import BundleProblem
 from geogs.bundle.select import grid_fields
 from geogs.tracking.calibration.keyframes import View, on_cpu
 from geogs.tracking.calibration.start import Start
-from geogs.tracking.flow.base import FlowOperator
+from geogs.tracking.flow.flow_operator import FlowOperator
 from geogs.tracking.motion import pnp
 from geogs.world.grid import SampleGrid
 

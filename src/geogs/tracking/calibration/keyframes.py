@@ -11,8 +11,8 @@ from torch import Tensor
 from geogs.config import TrackingConfig
 from geogs.geometry.camera import Camera
 from geogs.tracking.features import surer_flows
-from geogs.tracking.flow.base import FlowOperator
 from geogs.tracking.flow.filled import filled_flow, filled_positions
+from geogs.tracking.flow.flow_operator import FlowOperator
 from geogs.tracking.keyframe_choice import calls_for_keyframe
 from geogs.tracking.motion import MIN_MATCHED, MIN_TEXTURE, FlowChain
 from geogs.types import FlowMatch, Frame

@@ -8,7 +8,7 @@ from geogs.tracking.calibration.growth import GrowingBundle
 from geogs.tracking.calibration.keyframes import View, ViewGatherer, flows_from_first
 from geogs.tracking.calibration.start import Start, candidates, try_candidate
 from geogs.tracking.calibration.sureness import relative_error
-from geogs.tracking.flow.base import FlowOperator
+from geogs.tracking.flow.flow_operator import FlowOperator
 from geogs.types import FlowMatch
 from geogs.world.grid import SampleGrid
 

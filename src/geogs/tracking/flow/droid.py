@@ -22,10 +22,9 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from geogs.errors import InputError
 from geogs.gpu.transfer import to_device
-from geogs.networks.weights import read_tensors
-from geogs.tracking.flow.base import Memories
+from geogs.networks.tensor_files import read_tensors
+from geogs.tracking.flow.cell_texture import grey_levels, textured_fraction
 from geogs.tracking.flow.correlation import CorrelationVolume
 from geogs.tracking.flow.droid_network import (
     CORRELATION_SCALE,
@@ -36,7 +35,7 @@ from geogs.tracking.flow.droid_network import (
     motion_features,
     on_cells,
 )
-from geogs.tracking.flow.texture import grey_levels, textured_fraction
+from geogs.tracking.flow.flow_operator import Memories, check_image_size
 from geogs.types import FlowMatch
 from geogs.world.grid import OFFSET, STRIDE, SampleGrid
 
@@ -166,12 +165,7 @@ class DroidFlow:
         return torch.autocast(self.device.type, torch.float16, enabled=self.grid.on_gpu)
 
     def _shown(self, image: UInt8[np.ndarray, "h w 3"]) -> Float[Tensor, "1 3 h8 w8"]:
-        camera = self.grid.camera
-        if image.shape != (camera.height, camera.width, 3):
-            raise InputError(
-                f"An image of shape {image.shape} does not fit a camera of "
-                f"{camera.width} x {camera.height} pixels."
-            )
+        check_image_size(image, self.grid.camera)
         sent = to_device(torch.from_numpy(np.ascontiguousarray(image)), self.device)
         rgb = sent.permute(2, 0, 1)[None]
         return on_cells(rgb.float() / 255)

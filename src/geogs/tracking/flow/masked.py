@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from geogs.errors import InputError
-from geogs.tracking.flow.base import FlowOperator, Memories
+from geogs.tracking.flow.flow_operator import FlowOperator, Memories
 from geogs.types import FlowMatch
 from geogs.world.grid import STRIDE, SampleGrid
 

@@ -18,8 +18,8 @@ from geogs.documents import in_short
 from geogs.errors import InputError
 from geogs.gpu.recorded import Maps, Recorded
 from geogs.gpu.transfer import to_device
-from geogs.tracking.flow.base import FlowOperator, Memories
 from geogs.tracking.flow.filled import filled_positions
+from geogs.tracking.flow.flow_operator import FlowOperator, Memories, check_image_size
 from geogs.tracking.flow.lookup import DescriptorPyramid, Edges, PyramidLevel
 from geogs.tracking.flow.own_network import (
     FlowEstimate,
@@ -104,12 +104,7 @@ class OwnFlow:
 
     @torch.inference_mode()
     def encode(self, image: UInt8[np.ndarray, "h w 3"]) -> OwnImage:
-        height, width = self.grid.camera.height, self.grid.camera.width
-        if image.shape != (height, width, 3):
-            raise InputError(
-                f"An image of shape {image.shape} does not fit a camera of {width} x {height} "
-                "pixels."
-            )
+        check_image_size(image, self.grid.camera)
         pixels = to_device(torch.from_numpy(np.ascontiguousarray(image)), self.device)
         source, descriptors, hidden, context = self._encoded(pixels)
         pyramid = DescriptorPyramid(descriptors, self._levels)

@@ -15,11 +15,11 @@ from jaxtyping import Float64
 
 from geogs.documents import UNUSABLE, read_json
 from geogs.errors import InputError
-from geogs.io.pose_files import FRAMES_PER_SECOND
+from geogs.io.pose_files import FRAMES_PER_SECOND, OPENCV_FROM_OPENGL
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.calibration_files import calibration_from_nerfstudio
 from geogs.io.sources.formats.image_files import ImageList, natural_key
-from geogs.io.sources.pose_priors import OPENCV_FROM_OPENGL, measured_pose, rigid
+from geogs.io.sources.pose_priors import measured_pose, rigid
 from geogs.io.sources.posed.posed_set import PosedFile, PosedSet
 from geogs.io.sources.posed.stored_pictures import has_alpha, stored_size
 

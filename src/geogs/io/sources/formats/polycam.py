@@ -7,11 +7,11 @@ import numpy as np
 
 from geogs.documents import UNUSABLE, read_json
 from geogs.errors import InputError
-from geogs.io.pose_files import FRAMES_PER_SECOND
+from geogs.io.pose_files import FRAMES_PER_SECOND, OPENCV_FROM_OPENGL
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.depth_files import DepthFile
 from geogs.io.sources.formats.image_files import ImageFile, ImageList, natural_key
-from geogs.io.sources.pose_priors import OPENCV_FROM_OPENGL, measured_pose, rigid
+from geogs.io.sources.pose_priors import measured_pose, rigid
 
 _PER_METRE = 1000.0
 _FOLDERS = (("corrected_cameras", "corrected_images"), ("cameras", "images"))

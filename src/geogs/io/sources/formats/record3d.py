@@ -16,16 +16,15 @@ from typing import Any, Protocol, runtime_checkable
 
 import cv2
 import numpy as np
-import torch
 from jaxtyping import Float32
 
 from geogs.documents import LARGEST_DOCUMENT, UNUSABLE, read_bytes
 from geogs.errors import InputError
-from geogs.geometry.lie import quaternion_to_matrix
 from geogs.io.pictures import LARGEST_PICTURE, decoded_bytes
+from geogs.io.pose_files import OPENCV_FROM_OPENGL, poses_from
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.depth_files import LEAST_CONFIDENCE, DepthCamera
-from geogs.io.sources.pose_priors import OPENCV_FROM_OPENGL, measured_pose, rigid
+from geogs.io.sources.pose_priors import measured_pose, rigid
 from geogs.io.sources.reader import RawFrame
 from geogs.types import MeasuredPose
 
@@ -216,9 +215,7 @@ def _poses(rows: object) -> dict[int, MeasuredPose]:
     for number, row in enumerate(table):
         if not np.isfinite(row).all() or np.linalg.norm(row[:4]) == 0:
             continue
-        T_wc = np.eye(4)
-        T_wc[:3, :3] = quaternion_to_matrix(torch.from_numpy(row[[3, 0, 1, 2]])).numpy()
-        T_wc[:3, 3] = row[4:]
+        (T_wc,) = poses_from(row[None, 4:], row[None, :4])
         pose = rigid(T_wc @ OPENCV_FROM_OPENGL)
         if pose is not None:
             found[number] = measured_pose(pose)

@@ -8,11 +8,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from geogs.documents import read_text
 from geogs.errors import InputError
-from geogs.geometry.lie import quaternion_to_matrix
+from geogs.io.pose_files import poses_from
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.depth_files import DepthFile
 from geogs.io.sources.formats.video import VideoFile
@@ -78,14 +77,11 @@ def _poses(path: Path, quarter_turns: int) -> dict[int, MeasuredPose]:
             f"{path} should have the columns {', '.join(_COLUMNS)}; copy it again."
         ) from None
     found = {}
-    for number, *place_and_turn in rows:
-        place, xyzw = np.array(place_and_turn[:3]), np.array(place_and_turn[3:])
-        if not (np.isfinite(number) and np.isfinite(xyzw).all() and np.linalg.norm(xyzw) > 0):
+    for number, *values in rows:
+        row = np.array([values])
+        if not (np.isfinite(number) and np.isfinite(row[:, 3:]).all() and row[:, 3:].any()):
             continue
-        T_wc = np.eye(4)
-        wxyz = torch.from_numpy(xyzw[[3, 0, 1, 2]])
-        T_wc[:3, :3], T_wc[:3, 3] = quaternion_to_matrix(wxyz).numpy(), place
-        pose = rigid(T_wc)
+        pose = rigid(poses_from(row[:, :3], row[:, 3:])[0])
         if pose is not None:
             found[int(number)] = measured_pose(turned_upright(pose, quarter_turns))
     return found

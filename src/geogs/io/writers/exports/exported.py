@@ -5,9 +5,6 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float32, Float64, Int64, UInt8
 
-OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
-"""Axes x right, y up, z backward from x right, y down, z forward."""
-
 
 @dataclass(frozen=True)
 class ExportedImage:

@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Int, UInt8, UInt16
 
+from geogs.io.pose_files import OPENCV_FROM_OPENGL
 from geogs.io.writers.atomic import atomic_file
-from geogs.io.writers.exports.exported import OPENGL_FROM_OPENCV
 
 _QUALITY = 92
 """Quality of the JPEG in a textured mesh."""
@@ -129,7 +129,7 @@ def write_glb(
     The world is turned by a half turn about x, so that what was down in the first image is down.
     Colours are linear in the file, as glTF has them; ours are sRGB.
     """
-    axes = OPENGL_FROM_OPENCV[:3, :3]
+    axes = OPENCV_FROM_OPENGL[:3, :3]
     gltf = GltfBuffer()
     attributes = {
         "POSITION": gltf.add(vertices @ axes, "VEC3", has_range=True),
@@ -157,7 +157,7 @@ def write_textured_glb(
     (KHR_materials_unlit); readers that do not know that see a rough surface. ``uv`` is
     in pixels of the texture, whose centres are at integers.
     """
-    axes = OPENGL_FROM_OPENCV[:3, :3]
+    axes = OPENCV_FROM_OPENGL[:3, :3]
     size = np.array(texture.shape[1::-1])
     gltf = GltfBuffer()
     attributes = {
@@ -183,7 +183,7 @@ def write_obj(
     colours: UInt8[np.ndarray, "n 3"] | None,
 ) -> None:
     """Write text with normals, y up as in ``write_glb``; sRGB from 0 to 1 stands behind x, y, z."""
-    axes = OPENGL_FROM_OPENCV[:3, :3]
+    axes = OPENCV_FROM_OPENGL[:3, :3]
     rows = vertices @ axes
     if colours is not None:
         rows = np.concatenate([rows, colours / 255.0], 1)

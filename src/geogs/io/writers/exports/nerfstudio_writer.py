@@ -11,8 +11,9 @@ from pathlib import Path
 import numpy as np
 
 from geogs.geometry.camera import Camera
+from geogs.io.pose_files import OPENCV_FROM_OPENGL
 from geogs.io.writers.atomic import write_text
-from geogs.io.writers.exports.exported import OPENGL_FROM_OPENCV, ExportedImage
+from geogs.io.writers.exports.exported import ExportedImage
 
 DEPTH_UNIT = 1e-3
 """Map units of a step of a depth image, as nerfstudio takes it where nothing is said."""
@@ -41,7 +42,7 @@ def write_transforms(
         stem = Path(image.name).stem
         frame = {
             "file_path": f"images/{image.name}",
-            "transform_matrix": (np.linalg.inv(image.T_cw) @ OPENGL_FROM_OPENCV).tolist(),
+            "transform_matrix": (np.linalg.inv(image.T_cw) @ OPENCV_FROM_OPENGL).tolist(),
             "depth_file_path": f"depth/{stem}.png",
             "normal_file_path": f"normals/{stem}.png",
         }

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from geogs.bundle.projection import project
-from geogs.tracking.flow.base import FlowOperator
-from geogs.tracking.flow.classical import ClassicalFlow, match_deviation
+from geogs.tracking.flow.classical_flow import ClassicalFlow, match_deviation
+from geogs.tracking.flow.flow_operator import FlowOperator
 from geogs.types import FlowMatch
 from geogs.world.grid import SampleGrid
 from tracking_scenes import CAMERA, pose, render

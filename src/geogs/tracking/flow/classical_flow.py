@@ -18,8 +18,8 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from geogs.threads import worker_count
-from geogs.tracking.flow.base import Memories
-from geogs.tracking.flow.texture import MIN_STRUCTURE, cell_structure
+from geogs.tracking.flow.cell_texture import MIN_STRUCTURE, cell_structure
+from geogs.tracking.flow.flow_operator import Memories
 from geogs.types import FlowMatch
 from geogs.world.grid import OFFSET, STRIDE, SampleGrid
 

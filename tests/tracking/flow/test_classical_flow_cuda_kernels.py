@@ -9,9 +9,9 @@ import torch
 
 from cuda_emulator import use_emulator
 from geogs.geometry.camera import Camera
-from geogs.tracking.flow import classical_cuda
-from geogs.tracking.flow.classical import ClassicalFlow, _DenseFlow
-from geogs.tracking.flow.classical_cuda import DEVIATION, SOURCES, CudaClassicalFlow
+from geogs.tracking.flow import classical_flow_cuda
+from geogs.tracking.flow.classical_flow import ClassicalFlow, _DenseFlow
+from geogs.tracking.flow.classical_flow_cuda import DEVIATION, SOURCES, CudaClassicalFlow
 from geogs.world.grid import SampleGrid
 
 ALPHA, GAMMA, DELTA, ZETA2, EPS2, RELAXATION = 30.0, 10.0, 2.0, 0.01, 1e-4, 1.5
@@ -20,7 +20,7 @@ ALPHA, GAMMA, DELTA, ZETA2, EPS2, RELAXATION = 30.0, 10.0, 2.0, 0.01, 1e-4, 1.5
 @pytest.fixture(params=["emulated", pytest.param("gpu", marks=pytest.mark.gpu)])
 def device(request, monkeypatch: pytest.MonkeyPatch) -> torch.device:
     if request.param == "emulated":
-        use_emulator(monkeypatch, classical_cuda)
+        use_emulator(monkeypatch, classical_flow_cuda)
         return torch.device("cpu")
     if not torch.cuda.is_available():
         pytest.skip("needs a GPU")
@@ -133,7 +133,7 @@ def test_refinement(device: torch.device, size: tuple[int, int], sweeps: int) ->
     table, warped, _kept = scene.on(device)
     before = torch.from_numpy(scene.flow).to(device)
     after = torch.full_like(before, float("nan"))
-    kernel = classical_cuda.kernels_for(SOURCES / "flow_refine.cu", device)["flow_refine"]
+    kernel = classical_flow_cuda.kernels_for(SOURCES / "flow_refine.cu", device)["flow_refine"]
     kernel(
         (-(-w // 24), -(-h // 24), 2), (32, 8), table, warped, before, after, h * w, w, h, 0,
         sweeps, ALPHA, GAMMA, DELTA, ZETA2, EPS2, RELAXATION,
@@ -152,7 +152,7 @@ def test_densification(device: torch.device) -> None:
     rng = np.random.default_rng(2)
     motion = rng.normal(0, 1.0, (2, len(origins_y), len(origins_x), 2)).astype(np.float32)
     flow = torch.full((2, h, w, 2), float("nan"), device=device)
-    kernel = classical_cuda.kernels_for(SOURCES / "flow_search.cu", device)["flow_densify"]
+    kernel = classical_flow_cuda.kernels_for(SOURCES / "flow_search.cu", device)["flow_densify"]
     patches = torch.from_numpy(motion).to(device)
     kernel((1, 3, 2), (32, 8), table, warped, patches, flow, h * w, w, h, 0)
     for d in (0, 1):

@@ -11,10 +11,10 @@ import torch
 from cuda_emulator import use_emulator
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
-from geogs.tracking.flow import classical_cuda
-from geogs.tracking.flow.base import FlowOperator
-from geogs.tracking.flow.classical import ClassicalFlow
-from geogs.tracking.flow.classical_cuda import CudaClassicalFlow
+from geogs.tracking.flow import classical_flow_cuda
+from geogs.tracking.flow.classical_flow import ClassicalFlow
+from geogs.tracking.flow.classical_flow_cuda import CudaClassicalFlow
+from geogs.tracking.flow.flow_operator import FlowOperator
 from geogs.world.grid import SampleGrid
 from tracking_scenes import CAMERA, pose, render
 
@@ -25,7 +25,7 @@ LARGE = Camera(256.0, 256.0, 255.5, 144.5, 512, 290)
 @pytest.fixture(params=["emulated", pytest.param("gpu", marks=pytest.mark.gpu)])
 def device(request, monkeypatch: pytest.MonkeyPatch) -> str:
     if request.param == "emulated":
-        use_emulator(monkeypatch, classical_cuda)
+        use_emulator(monkeypatch, classical_flow_cuda)
         return "cpu"
     if not torch.cuda.is_available():
         pytest.skip("needs a GPU")
@@ -138,7 +138,7 @@ def test_a_batch_is_its_single_pairs(device: str, monkeypatch: pytest.MonkeyPatc
         assert torch.equal(both[k].pixels[0], one[k].pixels[0])
         assert torch.equal(both[k].weight[0], one[k].weight[0])
     assert torch.equal(both[0].pixels[1], both[1].pixels[0])
-    monkeypatch.setattr(classical_cuda, "PAIRS_AT_ONCE", 1)
+    monkeypatch.setattr(classical_flow_cuda, "PAIRS_AT_ONCE", 1)
     parts = operator.measure(views, views[::-1], start, swapped)
     for k in (0, 1):
         assert torch.equal(both[k].pixels, parts[k].pixels)

@@ -7,10 +7,21 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from geogs.errors import InputError
+from geogs.geometry.camera import Camera
 from geogs.types import FlowMatch
 
 Memories = Sequence[tuple[Any, Any]]
 """What the operator returned as memory of each pair's two directions; None for nothing."""
+
+
+def check_image_size(image: UInt8[np.ndarray, "h w 3"], camera: Camera) -> None:
+    """Raises InputError for an image of another size than its camera's."""
+    if image.shape != (camera.height, camera.width, 3):
+        raise InputError(
+            f"An image of shape {image.shape} does not fit a camera of {camera.width} x "
+            f"{camera.height} pixels."
+        )
 
 
 @runtime_checkable

@@ -16,16 +16,11 @@ import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
-from geogs.errors import InputError
 from geogs.gpu.kernels import Kernel, kernels_for
 from geogs.gpu.transfer import to_device
-from geogs.tracking.flow.base import Memories
-from geogs.tracking.flow.classical import (
-    COARSE_DEVIATION,
-    MAX_DISAGREEMENT,
-    SMALL_IMAGE,
-)
-from geogs.tracking.flow.texture import MIN_STRUCTURE
+from geogs.tracking.flow.cell_texture import MIN_STRUCTURE
+from geogs.tracking.flow.classical_flow import COARSE_DEVIATION, MAX_DISAGREEMENT, SMALL_IMAGE
+from geogs.tracking.flow.flow_operator import Memories, check_image_size
 from geogs.types import FlowMatch
 from geogs.world.grid import SampleGrid
 
@@ -47,7 +42,7 @@ PAIRS_AT_ONCE = 48
 DEVIATION = (0.06, 0.8, 3.4)
 """Standard deviation of a match: constant (pixels), by disagreement, by roughness.
 
-As :func:`geogs.tracking.flow.classical.match_deviation`, fitted to this operator.
+As :func:`geogs.tracking.flow.classical_flow.match_deviation`, fitted to this operator.
 """
 
 
@@ -130,11 +125,7 @@ class CudaClassicalFlow:
 
     def encode(self, image: UInt8[np.ndarray, "h w 3"]) -> CudaImage:
         layout, grid = self._layout, self.grid
-        if image.shape != (layout.height, layout.width, 3):
-            raise InputError(
-                f"An image of shape {image.shape} does not fit a camera of "
-                f"{layout.width} x {layout.height} pixels."
-            )
+        check_image_size(image, grid.camera)
         staged = torch.empty(image.shape, dtype=torch.uint8, pin_memory=self.device.type == "cuda")
         staged.numpy()[...] = image
         rgb = staged.to(self.device, non_blocking=True)

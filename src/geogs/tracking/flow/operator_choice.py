@@ -5,7 +5,7 @@ from jaxtyping import Bool
 
 from geogs.config import TrackingConfig
 from geogs.networks.weights_files import find_weights
-from geogs.tracking.flow.base import FlowOperator
+from geogs.tracking.flow.flow_operator import FlowOperator
 from geogs.tracking.flow.masked import MaskedFlow
 from geogs.world.grid import SampleGrid
 
@@ -43,9 +43,9 @@ def _operator(config: TrackingConfig, grid: SampleGrid) -> FlowOperator:
 def _classical(grid: SampleGrid) -> FlowOperator:
     """The operator without a network."""
     if grid.on_gpu:
-        from geogs.tracking.flow.classical_cuda import CudaClassicalFlow
+        from geogs.tracking.flow.classical_flow_cuda import CudaClassicalFlow
 
         return CudaClassicalFlow(grid)
-    from geogs.tracking.flow.classical import ClassicalFlow
+    from geogs.tracking.flow.classical_flow import ClassicalFlow
 
     return ClassicalFlow(grid)
