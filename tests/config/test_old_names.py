@@ -52,5 +52,5 @@ def test_a_saved_config_is_read_by_the_present_names(tmp_path, caplog) -> None:
         assert mesh_settings(tmp_path) == MeshConfig(detail=2.5)
     said = "mesh.close-holes, mesh.max-depth in config.yaml are no longer settings and left out."
     assert [record.getMessage() for record in caplog.records] == [said]
-    old = {"share": 0.1, "far": 5.0, "near": 0.2}
-    assert present_values(old, "sensor", "x") == {"ratio": 0.1, "far": 5.0}
+    old = {"share": 0.1, "deviation": 5.0, "near": 0.2}
+    assert present_values(old, "sensor", "x") == {"ratio": 0.1, "deviation": 5.0}

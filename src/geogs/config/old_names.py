@@ -14,6 +14,7 @@ RENAMED = {
     "mapping.loss.occlusion-share": "mapping.loss.occlusion-ratio",
     "mapping.photo.level": "mapping.photo.compensate-exposure",
     "mapping.photo.looking-within": "mapping.photo.max-view-angle",
+    "odometry.turn": "odometry.rotation-drift",
     "search.depth-share": "search.depth-ratio",
     "sensor.share": "sensor.ratio",
 }
@@ -44,10 +45,10 @@ _REMOVED = {
     ),
     "mapping.loss": "min-alpha ncc-min-coverage ncc-min-variance smoothness-eta",
     "mesh": "close-holes max-depth min-component-fraction voxel-per-pixel",
-    "odometry": "agreement rotation turn",
+    "odometry": "agreement rotation",
     "prior": "caution depth deviation max-deviation reach reject rounds",
     "search": "first-batch first-edge first-views margin output-share",
-    "sensor": "edge lateral near",
+    "sensor": "edge far lateral near",
     "tracking": (
         "blur-share blur-wait cull-distance depth-window global-distance global-iterations "
         "global-pairs global-remeasure global-rounds global-suppression huber local-iterations "

@@ -19,8 +19,6 @@ class DepthSensorConfig(Settings, group="sensor"):
     and 24 mm at 4 m, as structured light and stereo have it."""
     ratio: Fraction = 0.005
     """Fraction of the depth that is wrong in common: calibration, temperature."""
-    far: Annotated[float, Range(above=0.1, most=1e4)] = 10.0
-    """Metres up to which depths are believed."""
 
 
 @dataclass(frozen=True)
@@ -28,13 +26,15 @@ class OdometryConfig(Settings, group="odometry"):
     """The noise of measured motions between keyframes, where ``input.poses`` uses them.
 
     The deviation along each axis of a motion by s metres is the root of ``deviation^2 +
-    (drift s)^2``.
+    (drift s)^2``, that of its rotation about each axis of ``0.15^2 + (rotation_drift s)^2``.
     """
 
     deviation: Positive = 0.003
     """Metres by which a position may be off from one keyframe to the next, however near."""
     drift: Fraction = 0.01
     """Fraction of the distance that is wrong besides."""
+    rotation_drift: Annotated[float, Range(0, 90)] = 0.3
+    """Degrees by which an orientation may be off with each metre."""
 
 
 @dataclass(frozen=True)

@@ -31,8 +31,8 @@ LATERAL = 0.5
 EDGE = 0.04
 """Relative step of depth between neighbouring pixels that is an edge, where nothing is believed,
 nor on the next pixels."""
-NEAR = 0.1
-"""Metres from which on depths are believed: no sensor measures nearer."""
+NEAR, FAR = 0.1, 10.0
+"""Metres between which depths are believed: sensors measure hardly anything nearer or farther."""
 _EVERYWHERE = np.ones((3, 3), np.uint8)
 _STEPS = 4.0
 """Deviations of the sensor that a step between neighbouring pixels exceeds at an edge, too."""
@@ -106,7 +106,7 @@ class SensorDepth:
 
 def sensor_depth(metres: Float32[np.ndarray, "h w"], config: DepthSensorConfig) -> SensorDepth:
     """What a picture of depth z, 0 where the sensor saw nothing, says of every pixel."""
-    known = (metres >= NEAR) & (metres <= config.far)
+    known = (metres >= NEAR) & (metres <= FAR)
     z = np.where(known, metres, 1.0).astype(np.float32)
     d = np.where(known, 1 / z, 0).astype(np.float32)
     # Holes neither make a step nor a gradient: the pixels around stand for them.

@@ -10,9 +10,8 @@ from torch import Tensor
 from geogs.config import OdometryConfig
 from geogs.geometry.lie import se3_inverse, so3_log
 
-ROTATION_DEG, ROTATION_DRIFT_DEG = 0.15, 0.3
-"""Deviation of an orientation from one keyframe to the next, however near, and what is added with
-each metre: gyroscopes and the images that apps track make it the better half of a pose."""
+ROTATION_DEG = 0.15
+"""Deviation of an orientation from one keyframe to the next, however near."""
 FIT = 16.8
 """Squared deviations (six numbers) up to which two motions fit: 99 % of those that do."""
 PROPOSALS = 256
@@ -42,7 +41,7 @@ def information_of(motion: Float[Tensor, "m 4 4"], config: OdometryConfig) -> Fl
     """Inverse variances of translation (metres) and rotation (radians) of measured motions."""
     distance = motion[:, :3, 3].norm(dim=1, keepdim=True)
     place = config.deviation**2 + (config.drift * distance) ** 2
-    turn = math.radians(1) ** 2 * (ROTATION_DEG**2 + (ROTATION_DRIFT_DEG * distance) ** 2)
+    turn = math.radians(1) ** 2 * (ROTATION_DEG**2 + (config.rotation_drift * distance) ** 2)
     return torch.cat([1 / place.expand(-1, 3), 1 / turn.expand(-1, 3)], 1)
 
 
