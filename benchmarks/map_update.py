@@ -217,7 +217,7 @@ class Judge:
     def __init__(self, walk: Walk, before: Mapper, with_mesh: bool) -> None:
         self.walk, self.with_mesh = walk, with_mesh
         self.tree = TriangleTree(walk.surface)
-        self.position = before.map.position.detach().double()
+        self.position = before.table.disks.position.detach().double()
         self.around = nearest_neighbors(self.position, self.position, 33)[1]
         self.pairs = neighbouring(before)
 

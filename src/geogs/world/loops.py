@@ -35,7 +35,7 @@ class Vocabulary:
     words: UInt8[np.ndarray, "w 32"] = field(default_factory=lambda: np.zeros((0, 32), np.uint8))
     keyframes: list[int] = field(default_factory=list)
     """Indexed so far, earliest first."""
-    counts: list[Int64[np.ndarray, "c 2"]] = field(default_factory=list)
+    counts: list[Int64[np.ndarray, "_ 2"]] = field(default_factory=list)
     """Of each of them: its words, ascending, and how often it contains them."""
 
 
