@@ -33,7 +33,7 @@ from geogs.mapping.training.cuda.trainer import CudaTrainer
 from geogs.mapping.view_arrays import MapCameras, ViewArrays
 from geogs.mapping.views import MapView, MapViews
 from geogs.splat.cuda import autograd
-from geogs.splat.init import initialise_disks
+from geogs.splat.init import NEIGHBOURS, initialise_disks
 from geogs.splat.render import render_views
 from geogs.world.disks import DiskParameters, GaussianMap
 from geogs.world.grid import SampleGrid
@@ -134,7 +134,7 @@ def _disks(
     centre = torch.stack([v.T_wc[:3, 3].float().cpu() for v in views]).mean(0)
     disk = MappingConfig().disk
     new = initialise_disks(
-        torch.cat(points), centre, torch.cat(spans), points[0][:0], neighbours=disk.neighbours,
+        torch.cat(points), centre, torch.cat(spans), points[0][:0], neighbours=NEIGHBOURS,
         scale_factor=SCALE, planarity_threshold=disk.planarity_threshold,
         planarity_shrink=disk.planarity_shrink, opacity=OPACITY,
     )  # fmt: skip

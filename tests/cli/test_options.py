@@ -182,10 +182,10 @@ def test_reconstruct_offers_nothing_that_only_tracking_heeds() -> None:
     offered = {leaf.name for leaf in leaves(reconstruct.ReconstructOptions, "reconstruct")}
     assert {"mapping.lr-final", "mapping.depth.planes", "search.repeat"} <= offered
     assert not {
-        "mapping.lag", "mapping.window", "mapping.history", "mapping.iterations",
+        "mapping.lag", "mapping.window", "mapping.iterations",
         "mapping.views-per-step", "mapping.final-iterations", "mapping.final-depth",
         "mapping.pose-iterations", "mapping.pose-lr", "mapping.ablation.map-update",
-        "mapping.disk.carve-every", "mapping.loss.normal-weight",
+        "mapping.loss.normal-weight",
     } & offered  # fmt: skip
     assert not any(name.startswith(("tracking.", "loop.", "calibration.")) for name in offered)
     with pytest.raises(InputError, match=r"geogs reconstruct has no option --mapping\.lag"):

@@ -28,7 +28,6 @@ CASES = {
     "--mapping.final-pose-rounds 2 --mapping.pose-iterations 0": "final-pose-rounds does nothing",
     "--loop.matches --loop.no-enabled": "loop.matches does nothing",
     "--mapping.depth.engine classical --mapping.depth.weights x": "the engine classical has none",
-    "--mapping.disk.no-carve --mapping.disk.carve-every 3": "mapping.disk.carve-every does",
     "--mapping.loss.ablation.smoothness-rewards-edges": "rewards-edges does nothing",
     "--mapping.loss.occlusion-ratio 0.1 --mapping.loss.occlusion 1": "mapping.loss.occlusion does",
     "--mapping.loss.colour --mapping.loss.l1-weight 0": "mapping.loss.colour does nothing",

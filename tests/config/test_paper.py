@@ -8,6 +8,7 @@ import pytest
 from geogs.config import preset, reconstruct_preset
 from geogs.config.leaves import default_text, leaves
 from geogs.config.setting import Settings
+from geogs.mapping.training.base import HISTORY
 
 PAGE = (Path(__file__).parents[2] / "docs" / "paper.md").read_text()
 
@@ -43,7 +44,7 @@ def test_the_page_tells_every_value_of_the_preset(
 def test_the_papers_printed_numbers() -> None:
     config = preset("paper")
     mapping, loss = config.mapping, config.mapping.loss
-    assert (mapping.iterations, mapping.history, mapping.views_per_step) == (7, 2, 0)
+    assert (mapping.iterations, HISTORY, mapping.views_per_step) == (7, 2, 0)
     assert config.tracking.init_keyframes == 12
     assert mapping.disk.planarity_shrink == 0.1
     assert 2e-4 <= mapping.pose_lr <= 6e-4

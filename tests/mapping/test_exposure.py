@@ -8,6 +8,7 @@ import torch
 
 from geogs.config import Config
 from geogs.geometry.lie import se3_inverse
+from geogs.mapping import partners
 from geogs.mapping.mapper import Mapper
 from geogs_synth.motion.handheld import handheld_trajectory
 from geogs_synth.places.room import make_room
@@ -38,13 +39,18 @@ def samples() -> list[Sample]:
     return made
 
 
+@pytest.fixture(autouse=True)
+def _near_partners(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(partners, "MIN_PARALLAX_DEG", 0.5)
+
+
 def mapped(samples: list[Sample], level: bool = True) -> Mapper:
     config = replace(
         Config().mapping,
         render_long_edge=80,
         lag=0,
         iterations=0,
-        photo=replace(Config().mapping.photo, compensate_exposure=level, min_parallax=0.5),
+        photo=replace(Config().mapping.photo, compensate_exposure=level),
     )
     mapper = Mapper(segment_of(samples, CAMERA).table, config)
     for n in range(len(samples)):

@@ -250,7 +250,7 @@ def test_a_floater_is_carved_and_the_surface_stays(sequence):
 
 def test_windows_hold_the_newest_and_draw_older_ones():
     random = np.random.default_rng(0)
-    config = replace(MAPPING, window=4, history=2, views_per_step=3)
+    config = replace(MAPPING, window=4, views_per_step=3)
     drawn = draw_views(list(range(20)), 60, config, random)
     assert all(19 in views for views in drawn[::3])
     assert all(len(views) <= 3 for views in drawn)

@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 
 from geogs.config.losses import LossConfig
-from geogs.config.mapping import DiskConfig, MappingConfig
+from geogs.config.mapping import MappingConfig
 from geogs.config.priors import DepthSensorConfig, OdometryConfig, PriorConfig
 from geogs.config.reconstruct import ReconstructConfig
 from geogs.config.run import Config
@@ -71,8 +71,6 @@ def _mapping(mapping: MappingConfig) -> Iterator[str]:
             f"mapping.depth.weights does nothing: the engine {mapping.depth.engine} has none; "
             "network or joint takes them."
         )
-    if not mapping.disk.carve and mapping.disk.carve_every != DiskConfig.carve_every:
-        yield "mapping.disk.carve-every does nothing: mapping.disk.carve is off."
 
 
 def _losses(loss: LossConfig) -> Iterator[str]:

@@ -30,16 +30,10 @@ class DiskConfig(Settings, group="mapping.disk"):
 
     stride: Annotated[int, Range(1, 100)] = 3
     """A candidate every stride-th pixel of the render."""
-    insert_alpha: Fraction = 0.4
-    """A pixel gets a disk where the map's alpha is below this."""
-    insert_behind: Weight = 0.05
-    """... or where the map lies this fraction of the depth behind a sure depth."""
     insert_confidence: Fraction = 0.3
     """Least confidence of a depth that makes a disk at once; the rest follows later."""
     fill_confidence: Fraction = 0.1
     """Least confidence of a depth that makes a disk where nothing better has come since."""
-    neighbours: Annotated[int, Range(4, 31)] = 12
-    """Points of the local plane fit."""
     scale_factor: Positive = 0.6
     """Initial standard deviation in distances to the nearest points."""
     bound_spacing: bool = True
@@ -55,31 +49,17 @@ class DiskConfig(Settings, group="mapping.disk"):
     """Largest standard deviation, in u."""
     min_scale: Annotated[float, Range(above=0, most="max_scale")] = 4e-4
     """Smallest standard deviation, in u."""
-    prune_opacity: Annotated[float, Range(0, below=1)] = 0.05
-    """Disks below this opacity are removed."""
     split_ratio: Annotated[float, Range(0, below=1)] = 0.0
     """Part of the disks that is split in two, where the losses pull hardest, each time that the
     training over all keyframes reaches a split."""
-    split_times: tuple[Fraction, ...] = (0.2, 0.35, 0.5)
-    """When that is, in parts of that training."""
-    split_pixels: Weight = 1.0
-    """Disks with no standard deviation above this many pixels at u are not split."""
     carve: bool = True
     """Remove disks that stand in the free space of keyframes, and make none there."""
-    carve_every: Annotated[Count, Only("run")] = 10
-    """Keyframes between votes of all keyframes against disks in free space."""
 
 
 @dataclass(frozen=True)
 class PhotoConfig(Settings, group="mapping.photo"):
     """Which keyframes check each other's depth by their images (L_mv)."""
 
-    parallax: Annotated[float, Range(above=0, most=180)] = 8.0
-    """Preferred parallax angle in degrees."""
-    min_parallax: Annotated[float, Range(0, below=180)] = 2.0
-    """Degrees."""
-    max_parallax: Annotated[float, Range(above="min_parallax", most=180)] = 25.0
-    """Degrees."""
     max_view_angle: Angle = 35.0
     """Largest angle between the optical axes, degrees."""
     candidates: Annotated[int, Range(1, 1000)] = 6
@@ -134,8 +114,6 @@ class MappingConfig(Settings, group="mapping"):
     """A keyframe is mapped once this many later ones exist, so that its depth can be searched."""
     window: Annotated[Count, Only("run")] = 8
     """Recent keyframes that are trained together."""
-    history: Annotated[CountOrZero, Only("run")] = 2
-    """Older keyframes drawn at random into each window."""
     iterations: Annotated[CountOrZero, Only("run")] = 8
     """Steps per keyframe."""
     views_per_step: Annotated[CountOrZero, Only("run")] = 2
@@ -152,12 +130,6 @@ class MappingConfig(Settings, group="mapping"):
     windows that overlap by half; 0 leaves them to the final bundle adjustment."""
     lr_position: Weight = 6e-4
     """Adam step of positions, in u."""
-    lr_quaternion: Weight = 4e-3
-    """Adam step of quaternions."""
-    lr_scale: Weight = 0.02
-    """Adam step of log scales."""
-    lr_opacity: Weight = 0.05
-    """Adam step of opacity logits."""
     lr_final: Annotated[float, Range(above=0, most=1)] = 0.1
     """Factor that the learning rates fall to over the final iterations."""
     pose_iterations: Annotated[CountOrZero, Only("run")] = 2

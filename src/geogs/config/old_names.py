@@ -21,7 +21,8 @@ RENAMED = {
 """Present names by the old ones."""
 _REMOVED = {
     "calibration": (
-        "enough frames keyframe-flow keyframes min-parallax start-keyframes stretches sure too-much"
+        "enough frames keyframe-flow keyframes min-parallax start-keyframes stretches sure "
+        "too-much"
     ),
     "loop": (
         "agreeing join-tolerance kept lag max-angle max-baseline max-distance max-loops measured "
@@ -43,7 +44,12 @@ _REMOVED = {
         "tracker-scale variance-floor violation-distance vote-confidence vote-free-views "
         "vote-support vote-violation window"
     ),
+    "mapping.disk": (
+        "carve-every insert-alpha insert-behind neighbours prune-opacity split-pixels split-times"
+    ),
+    "mapping": "history lr-opacity lr-quaternion lr-scale",
     "mapping.loss": "min-alpha ncc-min-coverage ncc-min-variance smoothness-eta",
+    "mapping.photo": "max-parallax min-parallax parallax",
     "mesh": "close-holes max-depth min-component-fraction voxel-per-pixel",
     "odometry": "agreement rotation",
     "prior": "caution depth deviation max-deviation reach reject rounds",

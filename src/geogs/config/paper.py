@@ -65,7 +65,6 @@ def paper_mapping() -> MappingConfig:
         photo_scale=1.0,
         lag=0,
         window=11,
-        history=2,
         iterations=7,
         views_per_step=0,
         final_iterations=0,

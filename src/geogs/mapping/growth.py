@@ -14,11 +14,14 @@ from geogs.splat.density import (
     worth_keeping,
     worth_splitting,
 )
-from geogs.splat.init import new_disks
+from geogs.splat.init import NEIGHBOURS, new_disks
 from geogs.splat.optimizer import MapOptimizer
 from geogs.splat.render import render
 from geogs.world.map import MapTable
 
+SPLIT_PIXELS = 1.0
+"""Disks with no standard deviation above this many pixels at the map's unit are not split: smaller
+ones show nothing more."""
 # Nearest keyframes that vote on a keyframe's disks; others are too far away to know better.
 _VOTERS = 96
 
@@ -43,7 +46,7 @@ class Growth:
 
     def prune(self, views: Sequence[MapView]) -> None:
         """Drop transparent and broken disks, too."""
-        self.table.disks.keep(worth_keeping(self.table.disks, self.config.disk))
+        self.table.disks.keep(worth_keeping(self.table.disks))
         self.carve(views)
 
     @torch.no_grad()
@@ -53,7 +56,7 @@ class Growth:
         camera = self.depths.views.arrays.cameras.render
         depth, confidence = view.dense.depth, view.dense.confidence
         output = render(disks, camera, view.T_cw)
-        needed = unexplained(output, depth, confidence, config) & (confidence >= min_confidence)
+        needed = unexplained(output, depth, confidence) & (confidence >= min_confidence)
         v, u = candidate_pixels(camera.height, camera.width, config.stride, random)
         v, u = v.to(depth.device), u.to(depth.device)
         chosen = needed[v, u]
@@ -66,7 +69,7 @@ class Growth:
             others = [other for other in self.voters(view) if other.id != view.id]
             kept = self.depths.keep(points, others)
             points, z = points[kept], z[kept]
-        if len(points) + len(disks) < config.neighbours or len(points) == 0:
+        if len(points) + len(disks) < NEIGHBOURS or len(points) == 0:
             return
         footprint = config.stride * z / camera.fx
         new = new_disks(
@@ -82,7 +85,7 @@ class Growth:
             return
         pixel = unit / self.depths.views.arrays.cameras.render.fx
         chosen = worth_splitting(
-            disks, optimizer.position_gradient, config.split_ratio, config.split_pixels * pixel
+            disks, optimizer.position_gradient, config.split_ratio, SPLIT_PIXELS * pixel
         )
         ids = disks.keyframe_id[chosen]
         disks.replace(chosen, split(disks, chosen), torch.cat([ids, ids]))

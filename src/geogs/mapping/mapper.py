@@ -36,6 +36,8 @@ from geogs.world.disks import DiskParameters
 from geogs.world.keyframes import KeyframeTable
 from geogs.world.map import MapTable, TrainingPlace, check_map
 
+CARVE_EVERY = 10
+"""Keyframes between votes of all keyframes around against disks in free space: bounds the time."""
 # Keyframes that say how the map moves with a correction, at most: neighbours say the same.
 _COVISIBLE = 256
 SEARCHED = 0.4
@@ -164,7 +166,7 @@ class Mapper:
         self.pause()
         trainer.train(batches)
         self.pause()
-        if len(mapped) % disk.carve_every == 0:
+        if len(mapped) % CARVE_EVERY == 0:
             self.growth.prune(self.growth.voters(view))
 
     def refine_poses(self, active: Sequence[int]) -> None:

@@ -16,6 +16,10 @@ from geogs.losses.light import relative_light, same_light
 from geogs.mapping.views import MapView, MapViews
 from geogs.world.map import MapTable
 
+BEST_PARALLAX_DEG = 8.0
+"""Preferred parallax: smaller ones tell less of depth, at larger ones surfaces look less alike."""
+MIN_PARALLAX_DEG, MAX_PARALLAX_DEG = 2.0, 25.0
+"""Least and largest parallax of partners."""
 CANDIDATES = 128
 """Nearest keyframes among which those are looked for that match or check one."""
 _STRIDE = 4
@@ -65,9 +69,9 @@ def choose_partners(view: MapView, others: list[MapView], config: PhotoConfig) -
         return []
     places = [o.place for o in others]
     parallax, rotation = parallax_degrees(view.place, places, view.typical_depth)
-    usable = (config.min_parallax < parallax) & (parallax < config.max_parallax)
+    usable = (parallax > MIN_PARALLAX_DEG) & (parallax < MAX_PARALLAX_DEG)
     usable &= rotation < config.max_view_angle
-    scores = misfit(parallax, rotation, config.parallax)
+    scores = misfit(parallax, rotation, BEST_PARALLAX_DEG)
     scored = sorted((scores[i], o.id) for i, o in enumerate(others) if usable[i])
     return [i for _, i in scored[: config.candidates]]
 

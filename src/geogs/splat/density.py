@@ -6,11 +6,16 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from geogs.config import DiskConfig
 from geogs.geometry.lie import quaternion_to_matrix
 from geogs.splat.render import RenderOutput
 from geogs.world.disks import DiskParameters, GaussianMap
 
+INSERT_ALPHA = 0.4
+"""A pixel gets a disk where the map's alpha is below this: most of the light passes ..."""
+INSERT_BEHIND = 0.05
+"""... or where the map lies this fraction of the depth behind a confident depth."""
+PRUNE_OPACITY = 0.05
+"""Disks below this opacity are removed: they hardly show."""
 _SPLIT_SHRINK = 1.6
 
 
@@ -34,23 +39,22 @@ def unexplained(
     render: RenderOutput,
     depth: Float[Tensor, "h w"],
     confidence: Float[Tensor, "h w"],
-    config: DiskConfig,
 ) -> Bool[Tensor, "h w"]:
     """Pixels whose known depth the map does not show: too transparent, or behind a confident depth.
 
     A map in front of the depth is no reason for a disk: it would be hidden, and made again from
     every keyframe. What stands in front wrongly is carved instead.
     """
-    empty = render.alpha < config.insert_alpha
-    behind = render.depth - depth > config.insert_behind * depth
+    empty = render.alpha < INSERT_ALPHA
+    behind = render.depth - depth > INSERT_BEHIND * depth
     return (depth > 0) & (empty | (behind & (confidence > 0.5)))
 
 
-def worth_keeping(disks: GaussianMap, config: DiskConfig) -> Bool[Tensor, "n"]:
+def worth_keeping(disks: GaussianMap) -> Bool[Tensor, "n"]:
     """Disks that are finite and not transparent."""
     finite = torch.stack([torch.isfinite(p).flatten(1).all(1) if p.ndim > 1 else torch.isfinite(p)
                           for p in disks.parameters]).all(0)  # fmt: skip
-    return finite & (disks.opacity > config.prune_opacity)
+    return finite & (disks.opacity > PRUNE_OPACITY)
 
 
 def worth_splitting(

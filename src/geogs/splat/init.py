@@ -13,6 +13,8 @@ from geogs.geometry.neighbors import all_pairs_neighbors, nearest_neighbors
 from geogs.splat.cuda.local_planes import principal_planes
 from geogs.world.disks import DiskParameters
 
+NEIGHBOURS = 12
+"""Points of the local plane fit: enough for noise to average, few enough to follow edges."""
 # Part of the extent of some points within which their neighbours are looked for at first.
 _MARGIN = 0.05
 
@@ -111,7 +113,7 @@ def new_disks(
     """
     disks = initialise_disks(
         points, camera_centre, footprint if config.bound_spacing else None, existing,
-        neighbours=config.neighbours, scale_factor=config.scale_factor,
+        neighbours=NEIGHBOURS, scale_factor=config.scale_factor,
         planarity_threshold=config.planarity_threshold,
         planarity_shrink=config.planarity_shrink, opacity=config.opacity,
     )  # fmt: skip

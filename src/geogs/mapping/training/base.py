@@ -14,6 +14,11 @@ from geogs.splat.optimizer import LearningRates, MapOptimizer
 Batch = list[tuple[MapView, list[MapView]]]
 """The views of one step, each with the partners that check it by their images."""
 
+LR_QUATERNION, LR_SCALE, LR_OPACITY = 4e-3, 0.02, 0.05
+"""Adam steps of quaternions, log scales and opacity logits: how large a step is there depends on no
+scene, as for the position it does."""
+HISTORY = 2
+"""Older keyframes drawn at random into each window, as in the paper, so that none is forgotten."""
 GRADIENT_LIMIT = 1e3
 """A disk whose gradient exceeds this has met a numerical accident (a nearly edge-on pixel)."""
 
@@ -22,9 +27,9 @@ def learning_rates(config: MappingConfig, unit: float, factor: float = 1.0) -> L
     """Adam steps in map units; ``unit`` is the map's typical depth."""
     return LearningRates(
         position=config.lr_position * unit * factor,
-        quaternion=config.lr_quaternion * factor,
-        log_scale=config.lr_scale * factor,
-        opacity_logit=config.lr_opacity * factor,
+        quaternion=LR_QUATERNION * factor,
+        log_scale=LR_SCALE * factor,
+        opacity_logit=LR_OPACITY * factor,
     )
 
 
@@ -38,7 +43,7 @@ def draw_views(
     otherwise that many of them at random, the newest in every third step.
     """
     window, older = mapped[-config.window :], mapped[: -config.window]
-    drawn = min(config.history, len(older))
+    drawn = min(HISTORY, len(older))
     history = [older[i] for i in random.choice(len(older), drawn, replace=False)] if drawn else []
     pool = window + history
     if config.views_per_step <= 0:

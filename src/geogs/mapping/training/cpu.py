@@ -11,7 +11,7 @@ from torch import Tensor
 from geogs.config import MappingConfig
 from geogs.losses.cpu import fused_multi_view, fused_single_view
 from geogs.losses.single_view import MIN_ALPHA
-from geogs.mapping.training.base import GRADIENT_LIMIT, Batch, learning_rates
+from geogs.mapping.training.base import GRADIENT_LIMIT, LR_SCALE, Batch, learning_rates
 from geogs.mapping.training.pose_refine import refine_poses
 from geogs.mapping.view_arrays import MapCameras
 from geogs.mapping.views import MapView
@@ -107,7 +107,7 @@ class Trainer:
         if not views or not len(self.disks):
             return torch.zeros(0, dtype=torch.int64)
         steps = 1.5 * len(batches)  # Adam's moves are about as long as the learning rate
-        growth, way = np.exp(steps * self.config.lr_scale), steps * self.config.lr_position
+        growth, way = np.exp(steps * LR_SCALE), steps * self.config.lr_position
         radius = REACH * growth * self.disks.scale.amax(1) + way * self.unit
         poses = torch.stack([view.T_cw for view in views.values()])
         camera = self.cameras.render

@@ -12,6 +12,8 @@ from geogs.mapping.training.base import MapTrainer, draw_batch
 from geogs.mapping.views import MapView, MapViews
 from geogs.world.map import MapTable, TrainingPlace
 
+SPLIT_TIMES = 0.2, 0.35, 0.5
+"""Fractions of the training at which disks are split; what is split late is not trained enough."""
 # Steps between two reports of progress, at least.
 _REPORTED_STEPS = 20
 # Steps from which the time of one is judged, if they take so many seconds; else so often again.
@@ -81,7 +83,7 @@ class FullTraining:
         rounds = self._config.final_pose_rounds
         return (
             {total // 3, 2 * total // 3},
-            {int(total * part) for part in self._config.disk.split_times},
+            {int(total * part) for part in SPLIT_TIMES},
             {total * (n + 1) // (rounds + 1) for n in range(rounds)},
         )
 
