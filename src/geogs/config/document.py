@@ -1,7 +1,7 @@
 """Writes docs/configuration.md: ``python -m geogs.config.document > docs/configuration.md``."""
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import get_args
 
 from geogs.config.leaves import Leaf, default_text, leaves
@@ -37,13 +37,15 @@ def document() -> str:
         row = _row(leaf, both.get(leaf.name), other.get(leaf.name))
         groups.setdefault(leaf.group, []).append(row)
     words = {kind.group: kind.__doc__ or "" for kind in _classes(run) + _classes(known_poses)}
-    parts = [_INTRODUCTION, "## Presets\n", _presets("run", run, preset)]
-    parts.append(_presets("reconstruct", known_poses, reconstruct_preset))
+    parts = [_INTRODUCTION, "## Presets\n", _presets("run", preset)]
+    parts.append(_presets("reconstruct", reconstruct_preset))
     for group, rows in groups.items():
-        where = [tree for tree in (both, other) if any(x.group == group for x in tree.values())]
-        only = (
-            "" if len(where) == 2 else " (`run` only)" if both in where else " (`reconstruct` only)"
-        )
+        where = [
+            command
+            for command, tree in (("run", both), ("reconstruct", other))
+            if any(leaf.group == group for leaf in tree.values())
+        ]
+        only = f" (`{where[0]}` only)" if len(where) == 1 else ""
         parts.append(f"## {group or 'At the top'}{only}\n")
         parts += [_paragraphs(words[group])] if group else []
         parts.append(_table(("setting", "default", "may be", "meaning"), rows))
@@ -61,19 +63,15 @@ def _row(leaf: Leaf, run: Leaf | None, known_poses: Leaf | None) -> list[str]:
     return [name, default, str(leaf.kind), leaf.help + beside]
 
 
-def _presets(command: str, usual: Settings, make: object) -> str:
+def _presets(command: str, make: Callable[[Preset], Settings]) -> str:
     """What each preset has that is not usual."""
-    names = [name for name in get_args(Preset) if name != "default"]
-    of = {name: {leaf.name: leaf for leaf in leaves(make(name))} for name in names}  # type: ignore[operator]
-    rows = [
-        [
-            _code(leaf.name),
-            *(_code(default_text(x)) for x in (leaf, *(of[n][leaf.name] for n in names))),
-        ]
-        for leaf in leaves(usual)
-        if any(of[name][leaf.name].default != leaf.default for name in names)
-    ]
-    return _table((f"`geogs {command}`", "default", *names), rows)
+    names = get_args(Preset)
+    rows = []
+    for some in zip(*(leaves(make(name)) for name in names), strict=True):
+        texts = [_code(default_text(leaf)) for leaf in some]
+        if len(set(texts)) > 1:
+            rows.append([_code(some[0].name), *texts])
+    return _table((f"`geogs {command}`", *names), rows)
 
 
 def _classes(tree: Settings) -> list[type[Settings]]:

@@ -4,37 +4,28 @@ from collections.abc import Iterator
 
 from geogs.config.losses import LossConfig
 from geogs.config.mapping import MappingConfig
-from geogs.config.priors import DepthSensorConfig, OdometryConfig, PriorConfig
+from geogs.config.priors import DepthSensorConfig, OdometryConfig
 from geogs.config.reconstruct import ReconstructConfig
 from geogs.config.run import Config
-from geogs.config.tracking import TrackingConfig
 
 
 def idle_settings(config: Config | ReconstructConfig) -> list[str]:
     """A sentence for every setting that was changed and does nothing, with what it would need."""
-    found = []
-    if isinstance(config, Config):
-        found += [*_tracking(config.tracking), *_prior(config.prior), *_run(config)]
-    return [*found, *_mapping(config.mapping), *_losses(config.mapping.loss)]
+    of_run = _run(config) if isinstance(config, Config) else ()
+    return [*of_run, *_mapping(config.mapping)]
 
 
-def _tracking(tracking: TrackingConfig) -> Iterator[str]:
+def _run(config: Config) -> Iterator[str]:
+    tracking, prior, mapping = config.tracking, config.prior, config.mapping
     if tracking.weights and tracking.operator in ("auto", "classical"):
         yield (
             "tracking.weights does nothing: the classical operator has none; tracking.operator "
             "own or droid takes them."
         )
-
-
-def _prior(prior: PriorConfig) -> Iterator[str]:
     if prior.card and not prior.model:
         yield "prior.card does nothing without prior.model."
     if prior.normal_card and not prior.normal_model:
         yield "prior.normal-card does nothing without prior.normal-model."
-
-
-def _run(config: Config) -> Iterator[str]:
-    mapping = config.mapping
     if config.input.depth == "none":
         if config.sensor != DepthSensorConfig():
             yield "sensor does nothing: input.depth is none, so that no measured depth is used."
@@ -66,14 +57,12 @@ def _run(config: Config) -> Iterator[str]:
 
 
 def _mapping(mapping: MappingConfig) -> Iterator[str]:
+    loss = mapping.loss
     if mapping.depth.weights and mapping.depth.engine in ("classical", "tracker"):
         yield (
             f"mapping.depth.weights does nothing: the engine {mapping.depth.engine} has none; "
             "network or joint takes them."
         )
-
-
-def _losses(loss: LossConfig) -> Iterator[str]:
     if loss.smoothness_weight == 0 and loss.ablation.smoothness_rewards_edges:
         yield (
             "mapping.loss.ablation.smoothness-rewards-edges does nothing: "

@@ -55,6 +55,11 @@ class Leaf:
         group = f"{self.group}." if self.group else ""
         return f"--{group}no-{dashed(self.path[-1])}"
 
+    def is_offered_by(self, command: str) -> bool:
+        """Whether a command heeds it: all but those for which :class:`Only` another is."""
+        only: Only | None = self.mark(Only)
+        return only is None or only.command == command
+
     def mark(self, kind: type) -> Any:
         """What its type says of it, such as :class:`Basic`; none if it does not."""
         return next((mark for mark in self.kind.marks if isinstance(mark, kind)), None)
@@ -65,13 +70,8 @@ def leaves(tree: object, command: str = "") -> tuple[Leaf, ...]:
 
     With a command, without those that are :class:`Only` for another.
     """
-    found = _of_kind(tree) if isinstance(tree, type) else tuple(_leaves(tree, (), ""))
-    others = [leaf.mark(Only) for leaf in found]
-    return tuple(
-        leaf
-        for leaf, only in zip(found, others, strict=True)
-        if not command or only is None or only.command == command
-    )
+    found = _of_class(tree) if isinstance(tree, type) else tuple(_leaves(tree, (), ""))
+    return tuple(leaf for leaf in found if not command or leaf.is_offered_by(command))
 
 
 def default_text(leaf: Leaf) -> str:
@@ -90,7 +90,7 @@ def default_of(field: Any) -> Any:
 
 
 @functools.cache
-def _of_kind(tree: type) -> tuple[Leaf, ...]:
+def _of_class(tree: type) -> tuple[Leaf, ...]:
     return tuple(_leaves(tree, (), ""))
 
 

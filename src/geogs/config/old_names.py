@@ -21,8 +21,7 @@ RENAMED = {
 """Present names by the old ones."""
 _REMOVED = {
     "calibration": (
-        "enough frames keyframe-flow keyframes min-parallax start-keyframes stretches sure "
-        "too-much"
+        "enough frames keyframe-flow keyframes min-parallax start-keyframes stretches sure too-much"
     ),
     "loop": (
         "agreeing join-tolerance kept lag max-angle max-baseline max-distance max-loops measured "

@@ -11,7 +11,7 @@ from geogs.config.priors import DepthSensorConfig, OdometryConfig, PriorConfig
 from geogs.config.setting import Count, Range, Settings
 from geogs.config.tracking import CalibrationConfig, LoopConfig, TrackingConfig
 
-Preset = Literal["fast", "default", "accurate", "paper"]
+Preset = Literal["default", "fast", "accurate", "paper"]
 Seed = Annotated[int, Range(0, 2**32 - 1)]
 
 

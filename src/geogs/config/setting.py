@@ -12,7 +12,7 @@ import functools
 import math
 import reprlib
 import types
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from numbers import Integral, Real
 from pathlib import Path
@@ -276,13 +276,8 @@ def group_of(annotation: Any) -> type | None:
 @functools.cache
 def kinds(settings: type) -> tuple[tuple[str, Kind], ...]:
     """Names and kinds of the settings of a dataclass, without its groups."""
-    return tuple(_kinds(settings))
-
-
-def _kinds(settings: type) -> Iterator[tuple[str, Kind]]:
-    for field in fields(settings):  # type: ignore[arg-type]  # always a dataclass
-        if group_of(field.type) is None:
-            yield field.name, Kind.of(field.type)
+    own = (f for f in fields(settings) if group_of(f.type) is None)  # type: ignore[arg-type]
+    return tuple((f.name, Kind.of(f.type)) for f in own)
 
 
 def _shown(bound: Bound) -> str:
