@@ -79,8 +79,8 @@ class DepthConfig(Settings, group="mapping.depth"):
 
     engine: Literal["auto", "classical", "network", "joint", "tracker"] = "auto"
     """Who finds depth: matching without a network, the network of geogs train depth, both, each
-    where it is surer (auto on a GPU; on a CPU that is classical), or nobody: the tracker's own
-    depth, enlarged, as the paper has it."""
+    where it is more confident (auto on a GPU; on a CPU that is classical), or nobody: the tracker's
+    own depth, enlarged, as the paper has it."""
     weights: str = ""
     """Weights file of the network; "" takes the one that is found."""
     planes: Annotated[int, Range(2, 256)] = 144
@@ -107,7 +107,7 @@ class MappingConfig(Settings, group="mapping"):
     photo_scale: Annotated[float, Range(0.1, 16)] = 2.0
     """The images of L_mv are this much larger than the render, at most the working image."""
     when: Annotated[Literal["auto", "online", "after"], Only("run")] = "auto"
-    """Map each keyframe as soon as it is settled, or all at once after the final bundle adjustment,
+    """Map each keyframe as soon as it is final, or all at once after the final bundle adjustment,
     which takes less time and shows nothing before; auto: after, where images come from files,
     nobody looks on, and the final training searches depths."""
     lag: Annotated[CountOrZero, Only("run")] = 4
