@@ -107,7 +107,7 @@ def test_a_bad_prior_costs_little(walk, alone: Score):
 def test_the_prior_adds_little_information_and_only_where_it_is_needed(walk, helped: Tracker):
     views, _ = walk
     told, alone, bare = [], [], []
-    for id in helped.keyframe_ids[1:-1]:
+    for id in helped.segment.ids[1:-1]:
         state, k = helped.keyframes[id], helped.keyframes[id]
         d = state.inverse_depth
         told.append(1 / (d * k.confident_information.clamp(min=1e-9).sqrt()))
@@ -123,7 +123,7 @@ def test_the_prior_adds_little_information_and_only_where_it_is_needed(walk, hel
 
 def test_scales_follow_the_unit(walk, helped: Tracker):
     """After a correction that halves lengths, prior and depth still say the same."""
-    id = helped.keyframe_ids[-2]
+    id = helped.segment.ids[-2]
     state = helped.keyframes[id]
     before = state.inverse_depth.clone(), state.prior.scale.clone(), state.prior.information.clone()
     poses = {id: state.T_cw.clone()}
