@@ -85,7 +85,7 @@ def play(
         now = time.perf_counter()
         if now < due:
             time.sleep(due - now)
-        before, made = dict(slam.stopwatch.seconds), slam.keyframes.next_id
+        before, made = dict(slam.stopwatch.seconds), slam.world.keyframes.next_id
         start = time.perf_counter()
         is_counted = counted_from is not None and start >= counted_from
         if profile is not None and is_counted:
@@ -99,9 +99,9 @@ def play(
             took.append(end - start)
             after = slam.stopwatch.seconds
             stages.append({k: s - before.get(k, 0.0) for k, s in after.items()})
-            kinds.append(kind(stages[-1], slam.keyframes.next_id > made))
+            kinds.append(kind(stages[-1], slam.world.keyframes.next_id > made))
             tracked += pose.is_tracked
-            behind = max(behind, slam.background.waiting if slam.background else 0)
+            behind = max(behind, getattr(slam.executor.mapping, "waiting", 0))
         newest = max(index + 1, int((end - began) * fps))
         dropped += min(newest, len(frames)) - index - 1
         index = newest

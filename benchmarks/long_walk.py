@@ -228,7 +228,7 @@ def follow(
         fresh = max(status.keyframes - known, 1)
         stages = {k: 1e3 * (now[k] - before.get(k, 0.0)) / fresh for k in now}
         gpu, total = 0.0, sum(stages.values())
-        if slam.mapper.table.disks.device.type == "cuda":
+        if slam.world.map.disks.device.type == "cuda":
             gpu = torch.cuda.max_memory_allocated() / 1e9
             torch.cuda.reset_peak_memory_stats()
         blocks.append(Block(

@@ -141,7 +141,7 @@ def map_score(slam: Slam, walk: Walk) -> MapScore:
     error, angle, where = (np.concatenate(v) for v in (errors, angles, bare))
     return MapScore(
         float(error.mean()), float(error[where].mean()), float((error[where] > 0.05).mean()),
-        float(angle.mean()), float(angle[where].mean()), len(slam.mapper.table.disks),
+        float(angle.mean()), float(angle[where].mean()), len(slam.world.map.disks),
     )  # fmt: skip
 
 

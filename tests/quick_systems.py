@@ -3,14 +3,14 @@
 from dataclasses import dataclass, replace
 
 from geogs.config import Config
-from geogs.slam import SlamState
+from geogs.world.world import World
 
 
 @dataclass
 class Work:
-    """A checkpoint of a system alone."""
+    """A checkpoint of a world alone."""
 
-    slam: SlamState
+    world: World
 
 
 def quick_config(**mapping: int) -> Config:

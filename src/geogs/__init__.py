@@ -10,11 +10,13 @@ if TYPE_CHECKING:
     from geogs import application
     from geogs.application.reconstruct import reconstruct
     from geogs.application.results.saved_result import load_result
-    from geogs.application.slam import PoseEstimate, Slam, track
+    from geogs.application.slam import load_slam, save_slam, slam_mesh, track
     from geogs.config import Config, ReconstructConfig
     from geogs.geometry.camera import Camera
     from geogs.io.sources.sniff import open_posed_source, open_source
     from geogs.io.writers.map_file import load_map
+    from geogs.pose_estimate import PoseEstimate
+    from geogs.slam import Slam
     from geogs.splat.render import render
     from geogs.types import Frame
     from geogs.world.disks import GaussianMap
@@ -31,10 +33,13 @@ __all__ = [
     "application",
     "load_map",
     "load_result",
+    "load_slam",
     "open_posed_source",
     "open_source",
     "reconstruct",
     "render",
+    "save_slam",
+    "slam_mesh",
     "track",
 ]
 
@@ -43,15 +48,18 @@ _HOMES = {
     "Config": "geogs.config",
     "Frame": "geogs.types",
     "GaussianMap": "geogs.world.disks",
-    "PoseEstimate": "geogs.application.slam",
+    "PoseEstimate": "geogs.pose_estimate",
     "ReconstructConfig": "geogs.config",
-    "Slam": "geogs.application.slam",
+    "Slam": "geogs.slam",
     "load_map": "geogs.io.writers.map_file",
     "load_result": "geogs.application.results.saved_result",
+    "load_slam": "geogs.application.slam",
     "open_posed_source": "geogs.io.sources.sniff",
     "open_source": "geogs.io.sources.sniff",
     "reconstruct": "geogs.application.reconstruct",
     "render": "geogs.splat.render",
+    "save_slam": "geogs.application.slam",
+    "slam_mesh": "geogs.application.slam",
     "track": "geogs.application.slam",
 }
 

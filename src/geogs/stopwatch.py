@@ -4,19 +4,21 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 
-@dataclass(frozen=True)
-class StopwatchState:
-    """What a checkpoint holds of a stopwatch; the fields are the stopwatch's."""
+@dataclass
+class StageTimes:
+    """Seconds that stages took so far; mutable."""
 
-    seconds: dict[str, float]
-    until_stream_end: float | None
+    seconds: dict[str, float] = field(default_factory=dict)
+    """By stage."""
+    until_stream_end: float | None = None
+    """Of all stages up to the end of the stream; none before it."""
 
 
 class _Here(threading.local):
-    """What is so in one thread and not in others."""
+    """Flag of each thread by itself."""
 
     is_aside = False
 
@@ -28,20 +30,21 @@ class Stopwatch:
     stages never overlap.
     """
 
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-        self.until_stream_end: float | None = None
-        """Seconds of all stages up to the end of the stream; none before it."""
+    def __init__(self, times: StageTimes | None = None) -> None:
+        """Adds to ``times``."""
+        self.times = times or StageTimes()
         self._is_running = False
         self._here = _Here()
 
-    def state(self) -> StopwatchState:
-        """What a checkpoint holds."""
-        return StopwatchState(dict(self.seconds), self.until_stream_end)
+    @property
+    def seconds(self) -> dict[str, float]:
+        """By stage."""
+        return self.times.seconds
 
-    def load(self, state: StopwatchState) -> None:
-        """Go on from where another was."""
-        self.seconds, self.until_stream_end = state.seconds, state.until_stream_end
+    @property
+    def until_stream_end(self) -> float | None:
+        """Seconds of all stages up to the end of the stream; none before it."""
+        return self.times.until_stream_end
 
     @property
     def total(self) -> float:
@@ -50,7 +53,7 @@ class Stopwatch:
 
     def end_stream(self) -> None:
         """What comes from now on comes after the stream."""
-        self.until_stream_end = self.total
+        self.times.until_stream_end = self.total
 
     @contextmanager
     def __call__(self, stage: str) -> Iterator[None]:

@@ -40,8 +40,9 @@ def correct_saved_map(settings: RunSettings, output: Path, progress: RunProgress
     place = output.parent / FOLDER
     saved = _saved(place, settings) or _run_stream(place, settings, progress)
     source = saved.calibrated(open_source(settings.source, settings.config.input))
-    slam = Slam(source.camera, settings.config, str(require_device(settings.device)))
-    saved.restore(slam)
+    device = require_device(settings.device)
+    with saved.world(device) as world:
+        slam = Slam(source.camera, settings.config, str(device), world=world)
     slam.adjust(progress.stage)
     write_results(output, Result(slam, source, False, progress), keyframe_images=False)
 

@@ -17,7 +17,7 @@ from geogs.application.settings import RunSettings
 from geogs.cli import main as cli
 from geogs.cli.speech import NOT_JUDGED, closing_message
 from geogs.io.pose_files import read_tum_trajectory
-from geogs.slam import SlamStatus
+from geogs.pose_estimate import PoseEstimate
 from posed_scene import vertices
 
 pytestmark = pytest.mark.system
@@ -114,7 +114,7 @@ class Impatient(geogs.application.RunProgress):
     def expect(self, frames: int | None, begun: int = 0) -> None:
         assert (frames, begun) == (FRAMES, 0)
 
-    def frame(self, status: SlamStatus) -> None:
+    def frame(self, status: PoseEstimate) -> None:
         self.seen = status.frames
         self.stop.requested = status.frames == self.frames
 

@@ -13,6 +13,7 @@ from geogs.application.settings import RunSettings
 from geogs.application.viewer.observer import RunObserver
 from geogs.config import Config
 from geogs.errors import InputError
+from geogs.executors.live import Live
 from geogs.io.sources.live.feeds import Played
 
 LAST = 24
@@ -39,7 +40,7 @@ class Onlooker(RunObserver):
         self.stop, self.states = stop, []
 
     def frame(self, frame, status, slam) -> None:
-        assert slam.background is not None
+        assert isinstance(slam.executor, Live)
         self.states.append(status.state.value)
         if frame.index == LAST:
             self.stop.request()

@@ -33,7 +33,7 @@ def first(small_room, tmp_path_factory):
     slam = geogs.Slam(source.camera, config())
     poses = list(geogs.track(source, slam=slam))
     slam.finish()
-    return slam, poses, slam.save(tmp_path_factory.mktemp("saved"))
+    return slam, poses, geogs.save_slam(slam, tmp_path_factory.mktemp("saved"))
 
 
 @pytest.mark.system
@@ -55,7 +55,7 @@ def test_poses_at_once_are_near_those_of_the_end(first):
 @pytest.mark.system
 def test_the_map_is_asked_and_kept(first):
     slam, _, folder = first
-    assert len(slam.mesh().faces) > 100
+    assert len(geogs.slam_mesh(slam).faces) > 100
     maps = slam.render(slam.trajectory().T_wc[5])
     assert maps.depth.shape == (48, 64)
     with pytest.raises(InputError, match="4x4"):
@@ -69,8 +69,8 @@ def test_the_map_is_asked_and_kept(first):
 @pytest.mark.system
 def test_another_video_is_found_in_a_saved_map(first, small_room):
     _, _, folder = first
-    slam = geogs.Slam.load(folder, config())
-    held = {i: slam.keyframes[i].T_cw for i in slam.segments.main.held}
+    slam = geogs.load_slam(folder, config())
+    held = {i: slam.world.keyframes[i].T_cw for i in slam.segments.main.held}
     before = len(slam.snapshot())
     source = geogs.open_source(small_room, InputConfig(start=SECOND, stop=END))
     poses = list(geogs.track(source, slam=slam))
@@ -86,7 +86,7 @@ def test_another_video_is_found_in_a_saved_map(first, small_room):
     there = truth[SECOND:END][trajectory.tracked][:, :3, 3]
     error = (scale * places @ R.T + t).numpy() - there
     assert 100 * np.sqrt(np.square(error).sum(1).mean()) < 3  # cm; 0.5 where this was written
-    assert all(torch.equal(slam.keyframes[i].T_cw, T) for i, T in held.items())
+    assert all(torch.equal(slam.world.keyframes[i].T_cw, T) for i, T in held.items())
     assert len(slam.snapshot()) > 0.7 * before
     assert len(slam.uncertainty().position) == len(slam.keyframe_trajectory().timestamps) > 0
 
@@ -94,7 +94,7 @@ def test_another_video_is_found_in_a_saved_map(first, small_room):
 @pytest.mark.system
 def test_what_shows_another_place_is_not_found(first):
     _, _, folder = first
-    slam = geogs.Slam.load(folder, config())
+    slam = geogs.load_slam(folder, config())
     noise = np.random.default_rng(0).integers(0, 255, (4, 96, 128, 3), np.uint8)
     assert not any(slam.process(image).is_tracked for image in noise)
     slam.finish()
@@ -135,7 +135,7 @@ def test_a_frame_does_not_wait_for_a_keyframe_that_is_being_completed(small_room
         pose = slam.process(frame)
         if pose.is_tracked and beside:
             assert 0 < pose.sigma_position < 0.1
-        beside += slam.completion.is_going_on
+        beside += slam.executor.is_completing
         if beside == 2:  # the frame of a keyframe, and the one after it
             before = pose.T_cw
             go_on.set()
@@ -167,14 +167,14 @@ def test_images_that_cannot_be_used_end_in_a_sentence():
     with pytest.raises(InputError, match="times have to increase"):
         slam.process(good, 2.0)
     assert slam.process(good).timestamp == pytest.approx(2.0 + 1 / 30)
-    assert slam.mesh() is None
+    assert geogs.slam_mesh(slam) is None
     with pytest.raises(InputError, match="no map to save"):
-        slam.save("nowhere")
+        geogs.save_slam(slam, "nowhere")
 
 
 def test_there_has_to_be_a_map_to_load(tmp_path):
     with pytest.raises(InputError, match="holds no result"):
-        geogs.Slam.load(tmp_path)
+        geogs.load_slam(tmp_path)
 
 
 @pytest.mark.gpu
@@ -189,6 +189,6 @@ def test_a_live_system_on_a_gpu_tracks_and_maps(small_room, tmp_path):
     slam.finish()
     assert slam.trajectory().tracked.mean() > 0.9
     assert len(slam.snapshot()) > 100
-    again = geogs.Slam.load(slam.save(tmp_path), config(), device="cuda", live=True)
+    again = geogs.load_slam(geogs.save_slam(slam, tmp_path), config(), device="cuda", live=True)
     assert next(geogs.track(source, slam=again)).is_tracked
     again.finish()

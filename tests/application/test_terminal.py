@@ -11,12 +11,12 @@ from geogs.application import terminal
 from geogs.application.settings import Verbosity
 from geogs.application.terminal import TerminalProgress
 from geogs.errors import OutputError
-from geogs.slam import SlamStatus
+from geogs.pose_estimate import PoseEstimate
 from geogs.world.segments import TrackState
 
 
-def status(frames: int) -> SlamStatus:
-    return SlamStatus(TrackState.TRACKING, frames, frames // 2, 1500)
+def status(frames: int) -> PoseEstimate:
+    return PoseEstimate(TrackState.TRACKING, frames, frames // 2, 1500)
 
 
 def a_run(progress: TerminalProgress) -> None:

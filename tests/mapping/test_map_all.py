@@ -47,7 +47,7 @@ def both(frames):
     """A finished system with a map that grew on the way, and one with a map of the end."""
     online, after = followed(frames, False), followed(frames, True)
     assert online.mapper.table.mapped
-    assert not after.mapper.table.mapped
+    assert not after.executor.mapper.table.mapped
     for slam in (online, after):
         slam.finish()
     return online, after
@@ -56,8 +56,8 @@ def both(frames):
 def test_poses_are_the_same_and_the_surface_nearly(both):
     online, after = both
     assert np.array_equal(online.trajectory().T_wc, after.trajectory().T_wc)
-    assert after.mapper.table.mapped == online.mapper.table.mapped
-    assert after.is_refined
+    assert after.executor.mapper.table.mapped == online.mapper.table.mapped
+    assert after.world.is_refined
     for a, b in zip(online.renders(), after.renders(), strict=True):
         seen = (a.depth > 0) & (b.depth > 0)
         assert seen.float().mean() > 0.9 * (a.depth > 0).float().mean()
@@ -76,9 +76,9 @@ def test_a_system_goes_on_from_a_checkpoint(frames, both, tmp_path: Path, seen: 
     slam = followed(frames, True, seen)
     if seen == FRAMES:
         slam.end_stream()
-    write_checkpoint(checkpoint_folder(tmp_path), Work(slam.state()))
-    other = Slam(slam.camera, slam.config)  # it is told by the state
-    other.restore(SavedState(tmp_path, Work).work("slam"))
+    write_checkpoint(checkpoint_folder(tmp_path), Work(slam.settled()))
+    world = SavedState(tmp_path, Work).work("world")
+    other = Slam(slam.camera, slam.config, world=world)
     for frame in frames[1][seen:]:
         other.process(frame)
     other.end_stream()
@@ -86,7 +86,9 @@ def test_a_system_goes_on_from_a_checkpoint(frames, both, tmp_path: Path, seen: 
     after = both[1]
     assert np.array_equal(other.trajectory().T_wc, after.trajectory().T_wc)
     for p, q in zip(
-        other.mapper.table.disks.parameters, after.mapper.table.disks.parameters, strict=True
+        other.executor.mapper.table.disks.parameters,
+        after.executor.mapper.table.disks.parameters,
+        strict=True,
     ):
         assert torch.equal(p, q)
 
@@ -100,15 +102,18 @@ def test_a_map_is_made_briefly_after_an_interruption(frames):
 
     with pytest.raises(Interrupted):  # while depths are searched
         slam.refine(interrupt)
-    assert len(slam.mapper.table.disks) == 0
-    slam.map_briefly(0.0)
-    mapped, disks = list(slam.mapper.table.mapped), len(slam.mapper.table.disks)
+    assert len(slam.world.map.disks) == 0
+    slam.refine(seconds=0.0)
+    mapped, disks = list(slam.world.map.mapped), len(slam.world.map.disks)
     assert mapped
     assert disks > 200
     assert len(slam.renders()) == len(mapped)
-    slam.map_briefly(100.0)  # there is one now
-    assert (slam.mapper.table.mapped, len(slam.mapper.table.disks)) == (mapped, disks)
-    assert not slam.is_refined
+    slam.refine(seconds=100.0)  # there is one now
+    assert (slam.world.map.mapped, len(slam.world.map.disks)) == (
+        mapped,
+        disks,
+    )
+    assert not slam.world.is_refined
 
 
 def test_without_a_keyframe_there_is_no_map(frames):
@@ -124,6 +129,8 @@ def test_what_needs_the_map_on_the_way_has_it(frames):
         replace(config.mapping, final_iterations=0),
         replace(config.mapping, final_depth=False),
     ):
-        assert not Slam(frames[0], replace(config, mapping=other), defers_map=True).defers_map
-    assert not Slam(frames[0], config).defers_map
-    assert Slam(frames[0], config, defers_map=True).defers_map
+        assert not Slam(
+            frames[0], replace(config, mapping=other), defers_map=True
+        ).world.maps_at_end
+    assert not Slam(frames[0], config).world.maps_at_end
+    assert Slam(frames[0], config, defers_map=True).world.maps_at_end

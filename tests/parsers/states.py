@@ -7,6 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
+import torch
 
 import mutations
 from geogs.application.checkpoints.checkpoint import (
@@ -65,16 +66,15 @@ def begun(folder: Path) -> None:
         image = np.roll(gradient_image(0), 2 * k, axis=1)
         slam.process(Frame(k, k / 30, image))
     facts = RunMetadata(RunSettings((folder / "v.mp4",)), "cpu", "0123456789abcdef", None)
-    write_checkpoint(checkpoint_folder(folder), RunState(facts, slam.state()))
+    write_checkpoint(checkpoint_folder(folder), RunState(facts, slam.settled()))
 
 
 def resumed(folder: Path) -> object:
     """A system with the state of the run."""
     if not has_checkpoint(folder):
         return None
-    saved, slam = SavedRun(folder), system()
-    saved.restore(slam)
-    return slam
+    with SavedRun(folder).world(torch.device("cpu")) as world:
+        return Slam(CAMERA, Config(), world=world)
 
 
 def resealed_and_resumed(folder: Path) -> object:

@@ -3,7 +3,7 @@
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from geogs.slam import SlamStatus
+    from geogs.pose_estimate import PoseEstimate
 
 
 class RunProgress:
@@ -15,7 +15,7 @@ class RunProgress:
     def expect(self, frames: int | None, begun: int = 0) -> None:
         """Before the first frame of so many, if known, of which ``begun`` were done before."""
 
-    def frame(self, status: "SlamStatus") -> None:
+    def frame(self, status: "PoseEstimate") -> None:
         """After each frame."""
 
     def stage(self, name: str, fraction: float) -> None:

@@ -30,6 +30,7 @@ from geogs.application.results.surfaces import write_stage
 from geogs.application.scale.apply import check_scale_source, make_metric
 from geogs.application.scale.source import scale_source
 from geogs.application.settings import RunSettings
+from geogs.application.slam import go_on_in
 from geogs.application.viewer.observer import RunObserver
 from geogs.config import Config, InputConfig
 from geogs.config.idle import idle_settings
@@ -118,7 +119,7 @@ def _begun(
         source = with_shutter_found(calibrated, progress, stop)
         slam = made.result()
     if base is not None:
-        slam.start_from(base.disks, base.keyframes)
+        go_on_in(slam, base)
     found = None if calibrated is opened else calibrated.calibration
     metadata = RunMetadata(
         settings.absolute(), job.device.type, source.fingerprint(), found, shutter=source.shutter
@@ -158,11 +159,11 @@ def resume(
     with claimed(output) as folder:
         compiled_kernels(device)
         prior = open_prior(config.prior, source.camera, device)
-        slam = Slam(
-            source.camera, config, str(device), prior, mask=source.mask,
-            black_is_masked=source.black_is_masked,
-        )  # fmt: skip
-        saved.restore(slam)
+        with saved.world(device) as world:
+            slam = Slam(
+                source.camera, config, str(device), prior, mask=source.mask,
+                black_is_masked=source.black_is_masked, world=world,
+            )  # fmt: skip
         progress.write(f"Going on after {slam.frames} frames.")
         metadata = replace(saved.metadata, settings=settings.absolute(), device=device.type)
         frames = frames_after(source, saved.metadata.place)
@@ -245,7 +246,7 @@ class TrackedVideo(Work):
         """All frames through the system, until a request to stop."""
         stop = job.stop
         try:
-            if self.slam.is_ended:
+            if self.slam.world.is_ended:
                 next(self.frames, None)  # only what the source says of itself at its end
             else:
                 self._track_each(job, checkpoint)
@@ -277,7 +278,7 @@ class TrackedVideo(Work):
         try:
             if ending is Ending.FINISHED and job.stop.lets_finish(lambda: self._adjust(job)):
                 return ending
-            self.slam.map_briefly(BRIEFLY, job.progress.stage)
+            self.slam.refine(job.progress.stage, BRIEFLY)
         except torch.cuda.OutOfMemoryError:
             torch.cuda.empty_cache()
             job.progress.write(
@@ -293,7 +294,7 @@ class TrackedVideo(Work):
 
     def _write_stage(self, name: Literal["online", "adjusted"], job: Job) -> None:
         """What there is by now, if it is asked for, and if there is a map."""
-        if self.settings.online_results and not self.slam.defers_map:
+        if self.settings.online_results and not self.slam.world.maps_at_end:
             write_stage(self.output, self.slam, job.progress, name)
             self.stages.append(name)
 

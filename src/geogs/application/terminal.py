@@ -19,7 +19,7 @@ from geogs.errors import OutputError
 from geogs.evaluation.duration import duration
 
 if TYPE_CHECKING:
-    from geogs.slam import SlamStatus
+    from geogs.pose_estimate import PoseEstimate
 
 _LOG_SECONDS, _VERBOSE_SECONDS = 20.0, 2.0
 """Where no terminal redraws the line, one of text comes this often, and with ``-v`` this often."""
@@ -98,7 +98,7 @@ class TerminalProgress(RunProgress):
         self._frames = frames
         self._enter("frames")
 
-    def frame(self, status: "SlamStatus") -> None:
+    def frame(self, status: "PoseEstimate") -> None:
         """Move the line, with what there is to say beside it."""
         done = None if self._frames is None else status.frames / max(self._frames, status.frames)
         # Frames up to the first keyframes cost other than those after.

@@ -10,7 +10,7 @@ from geogs.config import TrackingConfig
 from geogs.geometry.lie import se3_inverse
 from geogs.tracking.keyframe_choice import calls_for_keyframe
 from geogs.tracking.motion import MIN_KNOWN, MIN_TEXTURE, FrameLocator, FrameMotion
-from geogs.tracking.pose_deviation import PoseDeviation, pose_deviation
+from geogs.tracking.pose_deviation import DeviationOf, deviation_of
 from geogs.types import Frame
 from geogs.world.keyframes import Keyframe
 from geogs.world.segments import LastFrame
@@ -94,7 +94,6 @@ class Follower:
         self.frames.append(FollowedFrame(frame, encoded, motion, T_rel))
         return self.frames[-1]
 
-    def deviation(self) -> PoseDeviation:
-        """How well the last frame's pose is known relative to the keyframe it was located at."""
-        motion = self._motion
-        return pose_deviation(self._anchor.grid, self._anchor, motion.T_cw, motion.match)
+    def deviation(self) -> DeviationOf:
+        """Computes how well the last frame's pose is known relative to its keyframe."""
+        return deviation_of(self._anchor.grid, self._anchor, self._motion)

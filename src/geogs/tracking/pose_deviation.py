@@ -1,6 +1,9 @@
 """How well a frame's pose is known, by the matches that located it."""
 
+from collections.abc import Callable
+from copy import copy
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from jaxtyping import Float
@@ -9,10 +12,14 @@ from torch import Tensor
 from geogs.bundle.marginals import ALIKE
 from geogs.bundle.projection import linearise
 from geogs.geometry.lie import se3_inverse
+from geogs.tracking.motion import FrameMotion
 from geogs.tracking.trajectory import depth_aware_weight
 from geogs.types import FlowMatch
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import Keyframe
+
+DeviationOf = Callable[[], "PoseDeviation"]
+"""Computes a deviation, which takes as long as a good part of a frame."""
 
 
 @dataclass(frozen=True)
@@ -26,16 +33,15 @@ class PoseDeviation:
 
 
 def pose_deviation(
-    grid: SampleGrid, keyframe: Keyframe, T_cw: Float[Tensor, "4 4"], match: FlowMatch
+    grid: SampleGrid, keyframe: Keyframe, T_rel: Float[Tensor, "4 4"], match: FlowMatch
 ) -> PoseDeviation:
-    """What one edge, from a keyframe to a frame at ``T_cw``, leaves open of the frame's pose.
+    """What one edge, from a keyframe to a frame at ``T_rel`` from it, leaves open of the pose.
 
     The inverse of sum J^T W J over the cells, J the derivative of a cell's place by a left
     perturbation of the pose, and 1 / W the variance of its match and of what its depth's does to
     it; times ``ALIKE``, as neighbours err alike.
     """
-    T = (T_cw @ se3_inverse(keyframe.T_cw).to(T_cw))[None]
-    p = linearise(grid.camera, grid.rays, T.to(grid.device), keyframe.inverse_depth[None])
+    p = linearise(grid.camera, grid.rays, T_rel[None].to(grid.device), keyframe.inverse_depth[None])
     known = keyframe.confident_information[None]
     weight = depth_aware_weight(match.weight[:1], p.depth_jacobian, known) * p.valid[..., None]
     J = p.pose_jacobian[0]
@@ -47,3 +53,9 @@ def pose_deviation(
     squares = ALIKE * (inverse.diagonal() * scale.square()).reshape(2, 3).sum(-1)
     position, rotation = squares.clamp(min=0).sqrt().tolist()
     return PoseDeviation(position, rotation)
+
+
+def deviation_of(grid: SampleGrid, keyframe: Keyframe, motion: FrameMotion) -> DeviationOf:
+    """The same of a frame located at a keyframe, by what is known now, when it is asked for."""
+    T_rel = motion.T_cw @ se3_inverse(keyframe.T_cw).to(motion.T_cw)
+    return partial(pose_deviation, grid, copy(keyframe), T_rel, motion.match)

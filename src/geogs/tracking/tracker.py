@@ -22,7 +22,7 @@ from geogs.tracking.local_mapping import LocalMapping
 from geogs.tracking.localisation import Localiser
 from geogs.tracking.motion import MIN_KNOWN, MIN_TEXTURE, FrameMotion, Recognition
 from geogs.tracking.orientation_chain import Followed, OrientationFollower
-from geogs.tracking.pose_deviation import PoseDeviation, pose_deviation
+from geogs.tracking.pose_deviation import DeviationOf, deviation_of
 from geogs.tracking.segment_map import SegmentMap
 from geogs.tracking.start_up import StartUp
 from geogs.tracking.trajectory import solve_trajectory
@@ -102,13 +102,13 @@ class Tracker:
         """Whether a new keyframe waits to be completed."""
         return self._unfinished is not None
 
-    def deviation(self) -> PoseDeviation | None:
-        """How well the last frame's pose is known relative to the keyframes around; none if it has
-        no pose, or was placed with others at the start."""
+    def deviation(self) -> DeviationOf | None:
+        """Computes how well the last frame's pose is known relative to the keyframes around; none
+        if it has no pose, or was placed with others at the start."""
         motion, keyframes = self._motion, self.keyframes
         if motion is None or motion.keyframe not in keyframes:
             return None
-        return pose_deviation(keyframes.grid, keyframes[motion.keyframe], motion.T_cw, motion.match)
+        return deviation_of(keyframes.grid, keyframes[motion.keyframe], motion)
 
     def trajectory(self, elsewhere: Sequence[FrameRecord] = ()) -> Trajectory:
         """Poses of all frames seen so far, solved on the present keyframes.

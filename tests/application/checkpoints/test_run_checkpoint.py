@@ -15,11 +15,12 @@ from geogs.application.checkpoints.checkpoint import SavedState, checkpoint_fold
 from geogs.config import Config, InputConfig
 from geogs.errors import InputError
 from geogs.io.sources.sniff import open_source
-from geogs.slam import Slam, SlamState
+from geogs.slam import Slam
 from geogs.world.archive import Archive, Archived
 from geogs.world.grid import SampleGrid
 from geogs.world.growing_rows import GrowingRows
 from geogs.world.keyframes import KeyframeSet
+from geogs.world.world import World
 from quick_systems import Work, quick_config
 from records import copied
 
@@ -51,18 +52,22 @@ def tracked(frames) -> Slam:
 
 def again(slam: Slam, output: Path, copy: Path) -> Slam:
     """The same system once more, from its state; what is written later does not reach it."""
-    write_checkpoint(checkpoint_folder(output), Work(slam.state()))
+    write_checkpoint(checkpoint_folder(output), Work(slam.settled()))
     shutil.copytree(output, copy)
-    other = Slam(slam.camera, slam.config)
-    other.restore(SavedState(copy, Work).work("slam"))
+    world = SavedState(copy, Work).work("world")
+    other = Slam(slam.camera, slam.config, world=world)
     return other
 
 
 def assert_same(a: Slam, b: Slam) -> None:
     assert np.array_equal(a.trajectory().T_wc, b.trajectory().T_wc)
     assert np.array_equal(a.trajectory().tracked, b.trajectory().tracked)
-    assert len(a.mapper.table.disks) == len(b.mapper.table.disks)
-    for p, q in zip(a.mapper.table.disks.parameters, b.mapper.table.disks.parameters, strict=True):
+    assert len(a.executor.mapper.table.disks) == len(b.executor.mapper.table.disks)
+    for p, q in zip(
+        a.executor.mapper.table.disks.parameters,
+        b.executor.mapper.table.disks.parameters,
+        strict=True,
+    ):
         assert torch.equal(p, q)
     for own, other in zip(a.depth_maps(), b.depth_maps(), strict=True):
         assert torch.equal(own.depth, other.depth)
@@ -78,7 +83,7 @@ def test_a_system_goes_on_as_if_nothing_had_happened(frames, tmp_path, cut):
         images = [replace(f, follows_cut=f.index == cut) for f in images[:cut] + other_place[cut:]]
     for frame in images[:AT]:
         slam.process(frame)
-    assert len(slam.mapper.table.disks) > 200
+    assert len(slam.executor.mapper.table.disks) > 200
     assert len(slam.segments.trackers) == (1 if cut is None else 2)
     other = again(slam, tmp_path / "own", tmp_path / "copy")
     assert_nothing_is_forgotten(slam, other)
@@ -159,33 +164,35 @@ def names(a: object) -> set[str]:
 def test_the_maps_in_memory_are_those_that_were(tracked, tmp_path):
     """A depth that a correction scaled is the same whether it stayed in memory or came back."""
     slam = tracked
-    id, maps = slam.mapper.views.arrays.loaded.items()[-1]
-    slam.keyframes[id].rescale(1.1)
+    loaded = slam.executor.mapper.views.arrays.loaded
+    id, maps = loaded.items()[-1]
+    slam.world.keyframes[id].rescale(1.1)
     other = again(slam, tmp_path / "own", tmp_path / "copy")
-    assert [i for i, _ in other.mapper.views.arrays.loaded.items()][-1] == id
-    assert maps.scale == other.mapper.views.arrays.loaded.peek(id).scale != slam.keyframes[id].scale
-    for own, theirs in ((s.mapper.views[id].dense for s in (slam, other)),):
+    theirs = other.executor.mapper.views.arrays.loaded
+    assert [i for i, _ in theirs.items()][-1] == id
+    assert maps.scale == theirs.peek(id).scale != slam.world.keyframes[id].scale
+    for own, theirs in ((s.executor.mapper.views[id].dense for s in (slam, other)),):
         assert torch.equal(own.depth, theirs.depth)
         assert own.typical == theirs.typical
 
 
 def test_a_state_of_another_camera_or_without_a_keyframe_is_one_sentence(tracked):
-    camera, state = tracked.camera, tracked.state()
+    camera, state = tracked.camera, tracked.settled()
     with pytest.raises(InputError, match="of another camera"):
-        Slam(camera.resized(64, 48), quick(3)).restore(copied(state))
+        Slam(camera.resized(64, 48), quick(3), world=copied(state))
     first, *rest = state.segments.segments[0].keyframes.members
     wrong = [
-        replace(state, waiting=[99]),
+        replace(state, unmapped=[99]),
         replace(state, mapper=replace(copied(state.mapper), mapped=[99])),
         with_keyframes(state, rest),
         with_keyframes(state, [first, first]),
     ]
     for changed in wrong:
         with pytest.raises(InputError, match=r"is missing|has no place|not in its place"):
-            Slam(camera, quick(3)).restore(copied(changed))
+            Slam(camera, quick(3), world=copied(changed))
 
 
-def with_keyframes(state: SlamState, keyframes: list[int]) -> SlamState:
+def with_keyframes(state: World, keyframes: list[int]) -> World:
     """The state with other keyframes in its main map."""
     main = replace(state.segments.segments[0], keyframes=KeyframeSet(keyframes))
     return replace(state, segments=replace(state.segments, segments=[main]))

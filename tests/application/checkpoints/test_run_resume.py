@@ -24,7 +24,8 @@ from geogs.cli import main as cli
 from geogs.config import InputConfig
 from geogs.errors import InputError
 from geogs.io.sources.sniff import open_source
-from geogs.slam import Slam, SlamStatus
+from geogs.pose_estimate import PoseEstimate
+from geogs.slam import Slam
 from geogs.tracking.segments import Segments
 from geogs.types import Frame
 from geogs.version import __version__
@@ -160,7 +161,7 @@ def test_a_run_whose_gpu_fails_and_is_full_goes_on_each_time(
         24: torch.cuda.OutOfMemoryError("CUDA out of memory."),
     }
 
-    def failing(slam: Slam, frame: Frame) -> SlamStatus:
+    def failing(slam: Slam, frame: Frame) -> PoseEstimate:
         if slam.frames in fails:
             raise fails.pop(slam.frames)
         return process(slam, frame)

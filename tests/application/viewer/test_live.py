@@ -11,7 +11,7 @@ import torch
 from geogs.application.viewer.live import MOST_DISKS, LiveViewer
 from geogs.application.viewer.window import Window
 from geogs.geometry.camera import Camera
-from geogs.slam import SlamStatus
+from geogs.pose_estimate import PoseEstimate
 from geogs.types import Frame, MapSnapshot
 from geogs.world.segments import TrackState
 
@@ -98,7 +98,7 @@ def window() -> FakeWindow:
 
 def look(viewer: LiveViewer, slam: FakeSlam, number: int = 5) -> None:
     image = np.zeros((96, 128, 3), np.uint8)
-    status = SlamStatus(TrackState.TRACKING, number, 3, MOST_DISKS + 1)
+    status = PoseEstimate(TrackState.TRACKING, number, 3, MOST_DISKS + 1)
     viewer.frame(Frame(number, number / 30, image), status, slam)
 
 
@@ -121,7 +121,7 @@ def test_everything_is_shown_once_and_what_moved_moves(window, monkeypatch):
     for call in ("show_path", "show_camera", "show_picture", "follow", "say"):
         assert call in window.calls
     window.calls.clear()
-    slam.keyframes.poses[1][2, 3] = 0.5
+    slam.world.keyframes.poses[1][2, 3] = 0.5
     window.boxes["Follow"].value = False
     look(viewer, slam)
     wait(viewer)

@@ -11,7 +11,7 @@ from geogs.application.viewer.recording import Recorder
 from geogs.errors import InputError, OutputError
 from geogs.geometry.camera import Camera
 from geogs.mesh.triangle_mesh import Mesh
-from geogs.slam import SlamStatus
+from geogs.pose_estimate import PoseEstimate
 from geogs.types import Frame, MapSnapshot, Trajectory
 from geogs.world.segments import TrackState
 
@@ -43,7 +43,7 @@ def test_keyframes_map_and_mesh_are_recorded(tmp_path):
     image = random.integers(0, 255, (96, 128, 3), dtype=np.uint8)
     for number in range(12):
         slam.T_cw = torch.from_numpy(np.linalg.inv(slam.poses[number]))
-        status = SlamStatus(TrackState.TRACKING, number, number // 2, 50)
+        status = PoseEstimate(TrackState.TRACKING, number, number // 2, 50)
         recorder.frame(Frame(number, number / 30, image), status, slam)
     vertices, faces = box((3.0, 2.0, 1.2))
     result = SimpleNamespace(

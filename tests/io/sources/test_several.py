@@ -100,7 +100,7 @@ def test_all_keyframes_are_adjusted_on_the_way_where_asked_for():
         for frame in frames(path):
             slam.process(frame)
         slam.end_stream()
-        return slam.adjusted, evaluate_trajectory(slam.trajectory(), reference).ate_rmse_cm
+        return slam.world.adjusted, evaluate_trajectory(slam.trajectory(), reference).ate_rmse_cm
 
     assert run(0)[0] == 0
     adjusted, error = run(6)
@@ -124,6 +124,6 @@ def test_the_map_shows_the_largest_of_videos_that_have_nothing_in_common():
     assert fates == ["apart", "world"]
     trajectory = slam.trajectory()
     assert trajectory.tracked.tolist() == [False] * 10 + [True] * 28
-    assert list(slam.mapper.views) == slam.segments.keyframe_ids
-    assert slam.mapper.table.mapped == slam.segments.keyframe_ids
+    assert list(slam.executor.mapper.views) == slam.segments.keyframe_ids
+    assert slam.executor.mapper.table.mapped == slam.segments.keyframe_ids
     assert len(slam.snapshot()) > 200

@@ -1,8 +1,11 @@
 """The checkpoint of a run: all of its work so far, which survives Ctrl-C and kill."""
 
-from collections.abc import Generator
+from collections.abc import Generator, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+
+import torch
 
 from geogs.application.checkpoints.checkpoint import SavedState
 from geogs.application.settings import RunSettings
@@ -12,8 +15,9 @@ from geogs.io.sources.frame_source import ReadingPlace
 from geogs.io.sources.several import JointPlace, SeveralSources
 from geogs.io.sources.sniff import Stream
 from geogs.shutter.shutter import Shutter
-from geogs.slam import Slam, SlamState
+from geogs.slam import Slam
 from geogs.types import Frame
+from geogs.world.world import World
 
 
 @dataclass(frozen=True)
@@ -39,14 +43,14 @@ class RunState:
     """What is stored of ``geogs run``."""
 
     metadata: RunMetadata
-    slam: SlamState
+    world: World
 
 
 def run_state(metadata: RunMetadata, slam: Slam, source: Stream) -> RunState | None:
     """What a checkpoint holds of a run as it is now; none before a map has been started."""
     if not slam.segments.keyframe_ids:
         return None
-    return RunState(replace(metadata, place=source.place), slam.state())
+    return RunState(replace(metadata, place=source.place), slam.settled())
 
 
 class SavedRun:
@@ -57,11 +61,12 @@ class SavedRun:
         self._saved = SavedState(output, RunState)
         self.metadata: RunMetadata = self._saved.plain("metadata")
 
-    def restore(self, slam: Slam) -> None:
-        """Give a new system the state. Raises InputError if that cannot be."""
-        state = self._saved.work("slam", slam.device)
+    @contextmanager
+    def world(self, device: torch.device) -> Iterator[World]:
+        """What the run knew; making a system of it may raise InputError, in a sentence."""
+        world = self._saved.work("world", device)
         with self._saved.in_a_sentence():
-            slam.restore(state)
+            yield world
 
     def calibrated(self, source: Stream) -> Stream:
         """The source as the run read it. Raises InputError if its files are not what they were."""

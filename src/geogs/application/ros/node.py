@@ -10,10 +10,11 @@ import numpy as np
 
 from geogs.application.ros.messages import Messages
 from geogs.application.ros.settings import NodeSettings
-from geogs.application.slam import Slam
+from geogs.application.slam import save_slam, slam_mesh
 from geogs.errors import InputError
 from geogs.io.sources.ros.messages import calibration_of, picture_of
 from geogs.io.sources.undistort import Rectifier
+from geogs.slam import Slam
 
 _log = logging.getLogger(__name__)
 MOST_POSES = 10_000
@@ -126,7 +127,7 @@ class CameraNode:
         slam = self._slam
         assert slam is not None
         self._publish["cloud"](self._messages.cloud(seconds, slam.snapshot()))
-        mesh = slam.mesh() if self._settings.mesh else None
+        mesh = slam_mesh(slam) if self._settings.mesh else None
         if mesh is not None:
             self._publish["mesh"](self._messages.mesh(seconds, mesh))
 
@@ -135,7 +136,7 @@ class CameraNode:
         if self._slam is None or self._settings.output is None or not self._slam.frames:
             return
         self._slam.finish()
-        self._slam.save(self._settings.output)
+        save_slam(self._slam, self._settings.output)
 
 
 def _type(package: str, name: str) -> Any:

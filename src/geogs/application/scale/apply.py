@@ -67,7 +67,7 @@ def measurable(slam: Slam) -> MeasurableScene:
         return renderer.surface(torch.from_numpy(T_cw)).depth.double().cpu().numpy()
 
     def seen(id: int) -> SeenKeyframe:
-        keyframe = slam.keyframes[id]
+        keyframe = slam.world.keyframes[id]
         return SeenKeyframe(keyframe.T_cw.numpy(), keyframe.image)
 
     return MeasurableScene(

@@ -16,7 +16,8 @@ from geogs.types import Frame, MapSnapshot
 
 if TYPE_CHECKING:
     from geogs.application.results.result import Result
-    from geogs.slam import Slam, SlamStatus
+    from geogs.pose_estimate import PoseEstimate
+from geogs.slam import Slam
 
 SHARE = 0.02
 """Of the time that looking may take, of the run's thread and of the viewer's together."""
@@ -68,7 +69,7 @@ class LiveViewer(RunObserver):
         """Seconds of computing that looking has taken."""
         return self._used
 
-    def frame(self, frame: Frame, status: "SlamStatus", slam: "Slam") -> None:
+    def frame(self, frame: Frame, status: "PoseEstimate", slam: "Slam") -> None:
         """Take what there is to see, if there is time for it."""
         now = time.perf_counter()
         if self._next is not None or self._used > self._share * (now - self._start):
@@ -93,10 +94,10 @@ class LiveViewer(RunObserver):
         sentence = "" if result.verdict is None else result.verdict.sentence
         self._window.say(f"**{result.source.name}**: done\n\n{sentence}")
 
-    def _look(self, frame: Frame, status: "SlamStatus", slam: "Slam", now: float) -> Update:
+    def _look(self, frame: Frame, status: "PoseEstimate", slam: "Slam", now: float) -> Update:
         ids = tuple(slam.segments.keyframe_ids)
         # The table keeps places of keyframes that another thread may be removing.
-        T_wc = [np.linalg.inv(slam.keyframes.poses[i].numpy()) for i in ids]
+        T_wc = [np.linalg.inv(slam.world.keyframes.poses[i].numpy()) for i in ids]
         seen = slam.T_cw if status.state.value == "tracking" else None
         loops = len(slam.loops.detector.loops)
         words = (

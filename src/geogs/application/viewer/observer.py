@@ -7,7 +7,8 @@ from geogs.types import Frame
 
 if TYPE_CHECKING:
     from geogs.application.results.result import Result
-    from geogs.slam import Slam, SlamStatus
+    from geogs.pose_estimate import PoseEstimate
+from geogs.slam import Slam
 
 
 class RunObserver:
@@ -17,7 +18,7 @@ class RunObserver:
     work elsewhere.
     """
 
-    def frame(self, frame: Frame, status: "SlamStatus", slam: "Slam") -> None:
+    def frame(self, frame: Frame, status: "PoseEstimate", slam: "Slam") -> None:
         """After each frame."""
 
     def result(self, result: "Result") -> None:
@@ -30,7 +31,7 @@ class Observers(RunObserver):
     def __init__(self, several: Sequence[RunObserver]) -> None:
         self._several = several
 
-    def frame(self, frame: Frame, status: "SlamStatus", slam: "Slam") -> None:
+    def frame(self, frame: Frame, status: "PoseEstimate", slam: "Slam") -> None:
         """Tell each of them."""
         for observer in self._several:
             observer.frame(frame, status, slam)

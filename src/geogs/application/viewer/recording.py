@@ -12,7 +12,8 @@ from geogs.types import Frame
 
 if TYPE_CHECKING:
     from geogs.application.results.result import Result
-    from geogs.slam import Slam, SlamStatus
+    from geogs.pose_estimate import PoseEstimate
+from geogs.slam import Slam
 
 _EVERY = 5
 """Keyframes between two records of the map and of the path."""
@@ -46,7 +47,7 @@ class Recorder(RunObserver):
         self._stream.log("world", rerun.ViewCoordinates.RIGHT_HAND_Y_DOWN, static=True)
         self._keyframes = 0
 
-    def frame(self, frame: Frame, status: "SlamStatus", slam: "Slam") -> None:
+    def frame(self, frame: Frame, status: "PoseEstimate", slam: "Slam") -> None:
         """Record what a new keyframe changed."""
         seen = slam.T_cw
         if seen is None or status.keyframes <= self._keyframes:

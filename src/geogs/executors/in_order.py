@@ -1,0 +1,128 @@
+"""Stages one after the other, in the order of the frames; what other executors differ from."""
+
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from typing import TypeVar
+
+import numpy as np
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from geogs.executors.background_mapper import BackgroundMapper
+from geogs.mapping.mapper import Mapper
+from geogs.stopwatch import Stopwatch
+from geogs.tracking.pose_deviation import DeviationOf
+from geogs.tracking.segments import Recall, Segments
+from geogs.tracking.tracker import TrackResult
+from geogs.types import Frame, MapSnapshot, PoseCorrection
+from geogs.world.segments import TrackState
+
+R = TypeVar("R")
+
+Advance = Callable[[TrackResult], None]
+"""Closes loops, moves the map and maps, as what tracking changed calls for it."""
+Progress = Callable[[float], None]
+"""Called with the finished fraction in [0, 1]."""
+MaskOf = Callable[[int], Bool[np.ndarray, "h w"] | None]
+"""Which pixels of a keyframe, by id, show the scene; None for all."""
+
+
+class InOrder:
+    """Runs every stage at once, so that results depend on nothing but the frames."""
+
+    maps_at_end = False
+    """Whether there is no map until the stream has ended."""
+
+    def __init__(
+        self, segments: Segments, mapper: Mapper, stopwatch: Stopwatch, mask_of: MaskOf
+    ) -> None:
+        self.segments, self.mapper = segments, mapper
+        self.mapping: Mapper | BackgroundMapper = mapper
+        """What is told of keyframes and corrections: the mapper, or a thread that has one."""
+        self.stopwatch, self.mask_of = stopwatch, mask_of
+
+    # --- a frame -----------------------------------------------------------------------------
+
+    def frame(self) -> AbstractContextManager[object]:
+        """While somebody waits for the pose of a frame."""
+        return nullcontext()
+
+    def process(self, frame: Frame, recall: Recall, advance: Advance) -> TrackState:
+        """Track a frame and run the other stages on what that changed."""
+        with self.stopwatch("tracking"):
+            tracked = self.segments.track(frame, recall)
+        advance(tracked)
+        return tracked.state
+
+    @property
+    def T_cw(self) -> Float[Tensor, "4 4"] | None:
+        """World to camera where the camera was last seen, in whatever segment; none before that."""
+        return self.segments.current.T_cw
+
+    def deviation(self) -> DeviationOf | None:
+        """Computes how well the last frame's pose is known; none without a pose."""
+        return self.segments.current.deviation()
+
+    def settle(self) -> None:
+        """Wait for what the last frame began."""
+
+    def in_order(self) -> "InOrder":
+        """What runs the stages after the last frame; threads end."""
+        return self
+
+    def begin_anew(self, mapper: Mapper) -> None:
+        """Go on with a mapper that has no map yet."""
+        self.mapper = self.mapping = mapper
+
+    # --- the map -----------------------------------------------------------------------------
+
+    @property
+    def disks(self) -> int:
+        """Disks in the map."""
+        return len(self.mapper.table.disks)
+
+    def take_over(
+        self,
+        disks: MapSnapshot,
+        masks: dict[int, Bool[np.ndarray, "h w"]],
+        ids: Sequence[int],
+    ) -> None:
+        """Begin with a saved map, see :meth:`Mapper.take_over`."""
+        self.mapper.take_over(disks, masks, ids)
+
+    def correct(self, correction: PoseCorrection) -> None:
+        """Let the map follow a correction of the keyframes."""
+        self.mapping.correct(correction)
+
+    def map(
+        self, unmapped: list[int], final: Sequence[int], lag: int, active: Sequence[int]
+    ) -> None:
+        """Map keyframes with at least ``lag`` final successors, and refine ``active`` poses.
+
+        ``final`` became so just now, and ends ``unmapped``, from which go those that are mapped.
+        """
+        with self.stopwatch("mapping"):
+            for id in final:
+                self.mapping.observe(id, self.mask_of(id))
+            ready = unmapped[: max(len(unmapped) - lag, 0)]
+            for id in ready:
+                self.mapping.map_keyframe(id)
+            del unmapped[: len(ready)]
+        if ready:
+            self._refine_poses(active)
+
+    def _refine_poses(self, active: Sequence[int]) -> None:
+        """Let poses agree better with the map, once in so many keyframes."""
+        config = self.mapper.config
+        if config.pose_iterations and len(self.mapper.table.mapped) % config.pose_every == 0:
+            with self.stopwatch("pose refinement"):
+                self.mapper.refine_poses(active)
+
+    def refine(self, unmapped: list[int], progress: Progress, seconds: float | None) -> None:
+        """Train the map over all keyframes; not in limited time, as there is a map already."""
+        if seconds is None:
+            self.mapper.refine(progress)
+
+    def ask(self, question: Callable[[Mapper], R]) -> R:
+        """An answer from the mapper."""
+        return question(self.mapper)

@@ -1,0 +1,157 @@
+"""Frames at once, everything else in threads; results then depend on how fast the machine is."""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from functools import partial
+from typing import TypeVar
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from geogs.beside import Errand
+from geogs.executors.background_mapper import BackgroundMapper
+from geogs.executors.in_order import Advance, InOrder, MaskOf
+from geogs.mapping.mapper import Mapper
+from geogs.stopwatch import Stopwatch
+from geogs.threads import on_one_torch_thread
+from geogs.tracking.follower import Follower
+from geogs.tracking.pose_deviation import DeviationOf
+from geogs.tracking.segments import Recall, Segments
+from geogs.tracking.tracker import TrackResult
+from geogs.types import Frame, MapSnapshot
+from geogs.world.keyframes import KeyframeTable
+from geogs.world.segments import TrackState
+
+R = TypeVar("R")
+
+
+class Live(InOrder):
+    """Tracks in the caller's thread, completes keyframes in a second, and maps in a third.
+
+    While a keyframe is being completed frames are located at what it was; nobody else may touch
+    the segments then: :meth:`settle` comes first. On a GPU frames and keyframes share an urgent
+    stream, to which that of mapping gives way.
+    """
+
+    def __init__(
+        self,
+        segments: Segments,
+        mapper: Mapper,
+        stopwatch: Stopwatch,
+        mask_of: MaskOf,
+        new_mapper: Callable[[KeyframeTable], Mapper],
+        stream: "torch.cuda.Stream | None",
+    ) -> None:
+        """``new_mapper`` makes one of a copy of the keyframes; ``stream`` is the urgent one, in
+        which the segments' fields were made: see :func:`urgent_stream`."""
+        super().__init__(segments, mapper, stopwatch, mask_of)
+        self._stream = stream
+        self.mapping = self._background = BackgroundMapper(mapper.keyframes, new_mapper)
+        self._completion = Errand("keyframes")
+        self._follower: Follower | None = None
+
+    # --- a frame -----------------------------------------------------------------------------
+
+    @contextmanager
+    def frame(self) -> Iterator[None]:
+        """While somebody waits for the pose of a frame: mapping gives way."""
+        with self._background.giving_way(), torch.cuda.stream(self._stream):
+            yield
+
+    def process(self, frame: Frame, recall: Recall, advance: Advance) -> TrackState:
+        """Locate a frame; what it brings beyond its pose is done in the other threads."""
+        with self.stopwatch("tracking"):
+            if self._is_followed(frame):
+                return TrackState.TRACKING
+        with self.stopwatch("waiting"):
+            self.settle()
+        with self.stopwatch("tracking"):
+            tracked = self.segments.track(frame, recall)
+        if self.segments.current.is_unfinished:
+            self._follower = self.segments.current.follower()
+            self._completion.start(partial(self._complete, tracked, advance))
+        else:
+            advance(tracked)
+            self._wait_for_gpu()  # others may read what it has written
+        return tracked.state
+
+    @property
+    def is_completing(self) -> bool:
+        """Whether a keyframe is being completed."""
+        return self._completion.is_going_on
+
+    def _is_followed(self, frame: Frame) -> bool:
+        """Whether a frame was found while a keyframe is being completed."""
+        if self._follower is None or not self.is_completing:
+            return False
+        return self._follower.follow(frame) is not None
+
+    @on_one_torch_thread
+    def _complete(self, begun: TrackResult, advance: Advance) -> None:
+        with torch.cuda.stream(self._stream), self.stopwatch.aside():
+            result = self.segments.complete()
+            advance(replace(result, finalized=(*begun.finalized, *result.finalized)))
+
+    @property
+    def T_cw(self) -> Float[Tensor, "4 4"] | None:
+        """World to camera where the camera was last seen, in whatever segment; none before that."""
+        return super().T_cw if self._follower is None else self._follower.T_cw
+
+    def deviation(self) -> DeviationOf | None:
+        """Computes how well the last frame's pose is known; none without a pose."""
+        return super().deviation() if self._follower is None else self._follower.deviation()
+
+    def settle(self) -> None:
+        """Wait for the keyframe, and take over the frames that were found meanwhile."""
+        self._completion.wait()
+        if self._follower is None:
+            return
+        follower, self._follower = self._follower, None
+        with torch.cuda.stream(self._stream):
+            self.segments.tracker_of(follower.last.keyframe).take_over(follower)
+        self._wait_for_gpu()
+
+    def in_order(self) -> InOrder:
+        """What runs the stages after the last frame, on the map as the thread has made it."""
+        with self.stopwatch("mapping"):
+            mapper = self._background.settled()
+        return InOrder(self.segments, mapper, self.stopwatch, self.mask_of)
+
+    def _wait_for_gpu(self) -> None:
+        if self._stream is not None:
+            self._stream.synchronize()
+
+    # --- the map -----------------------------------------------------------------------------
+
+    @property
+    def disks(self) -> int:
+        """Disks in the map when a keyframe was last mapped."""
+        return self._background.disks
+
+    def take_over(
+        self,
+        disks: MapSnapshot,
+        masks: dict[int, Bool[np.ndarray, "h w"]],
+        ids: Sequence[int],
+    ) -> None:
+        """Begin with a saved map, see :meth:`Mapper.take_over`."""
+        take_over = partial(Mapper.take_over, disks=disks, masks=masks, ids=ids)
+        self._background.begin_with(take_over, ids)
+        if self._stream is not None:
+            torch.cuda.synchronize()  # the stream in which frames are tracked reads all this
+
+    def _refine_poses(self, active: Sequence[int]) -> None:
+        """Poses stay the tracker's, which does not wait for the map."""
+
+    def ask(self, question: Callable[[Mapper], R]) -> R:
+        """An answer from the mapper, from its thread."""
+        return self._background.ask(question)
+
+
+def urgent_stream(device: str) -> "torch.cuda.Stream | None":
+    """A stream of a GPU whose work goes before that of others; none on a CPU."""
+    where = torch.device(device)
+    return torch.cuda.Stream(where, priority=-1) if where.type == "cuda" else None

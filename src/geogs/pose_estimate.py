@@ -1,0 +1,57 @@
+"""Where the camera is, as far as it is known right after a frame."""
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from math import inf, nan
+
+from jaxtyping import Float64
+from torch import Tensor
+
+from geogs.geometry.lie import se3_inverse
+from geogs.tracking.pose_deviation import DeviationOf, PoseDeviation
+from geogs.world.segments import TrackState
+
+
+@dataclass(frozen=True)
+class PoseEstimate:
+    """A frame's pose and what there is of the map by then.
+
+    Later frames, loops and the final adjustment move it: ``Slam.trajectory`` has the poses of all
+    frames as they are known by then.
+    """
+
+    state: TrackState
+    frames: int
+    keyframes: int
+    disks: int
+    timestamp: float = nan
+    """Seconds."""
+    T_cw: Float64[Tensor, "4 4"] | None = None
+    """World to camera; none unless the camera is tracked in the main map."""
+    deviation: DeviationOf | None = field(default=None, repr=False, compare=False)
+    """Computes the deviation of the pose; none where nothing is known of it."""
+
+    @property
+    def T_wc(self) -> Float64[Tensor, "4 4"] | None:
+        """Camera to world."""
+        return None if self.T_cw is None else se3_inverse(self.T_cw)
+
+    @property
+    def is_tracked(self) -> bool:
+        """Whether there is a pose."""
+        return self.T_cw is not None
+
+    @property
+    def sigma_position(self) -> float:
+        """Standard deviation of the camera's centre relative to the map around it, map units, all
+        axes together; infinite where nothing is known of it."""
+        return inf if self._deviation is None else float(self._deviation.position)
+
+    @property
+    def sigma_rotation(self) -> float:
+        """Standard deviation of its orientation, radians; infinite where nothing is known of it."""
+        return inf if self._deviation is None else float(self._deviation.rotation)
+
+    @cached_property
+    def _deviation(self) -> PoseDeviation | None:
+        return None if self.deviation is None else self.deviation()

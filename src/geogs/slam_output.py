@@ -1,0 +1,184 @@
+"""What can be asked of a SLAM system at any time."""
+
+from collections.abc import Sequence
+from dataclasses import asdict
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from geogs.config import Config
+from geogs.errors import InputError
+from geogs.executors.in_order import InOrder
+from geogs.geometry.camera import Camera
+from geogs.loop.closer import LoopCloser
+from geogs.mapping.mapper import Mapper
+from geogs.mapping.rendered import MapRenderer, SurfaceMaps
+from geogs.pose_estimate import PoseEstimate
+from geogs.stopwatch import Stopwatch
+from geogs.threads import on_one_torch_thread
+from geogs.tracking.moving import moving_share
+from geogs.tracking.segments import Segments
+from geogs.types import (
+    MapSnapshot,
+    MetricScale,
+    RenderedKeyframe,
+    SeenRows,
+    Trajectory,
+    Uncertainty,
+)
+from geogs.world.segments import TrackState
+from geogs.world.world import World
+
+
+class SlamOutput:
+    """Reads the world; changes nothing of it."""
+
+    config: Config
+    world: World
+    """All that is known."""
+    segments: Segments
+    loops: LoopCloser
+    executor: InOrder
+    stopwatch: Stopwatch
+
+    @property
+    def camera(self) -> Camera:
+        """Pinhole of all images."""
+        return self.world.keyframes.grid.camera
+
+    @property
+    def frames(self) -> int:
+        """Images so far."""
+        return self.world.frames
+
+    @property
+    def will_refine(self) -> bool:
+        """Whether a refinement of the map follows the final bundle adjustment."""
+        return self.config.mapping.final_iterations != 0
+
+    @property
+    def metric_scale(self) -> MetricScale | None:
+        """By what lengths are metres: a known length, or a depth sensor; None where they are not.
+
+        All depths of a sensor share a part of their error, which is the scale's.
+        """
+        if self.world.metric_scale is not None or not self.segments.main.segment.is_metric:
+            return self.world.metric_scale
+        return MetricScale("depth sensor", 1.0, self.config.sensor.ratio)
+
+    @property
+    def T_cw(self) -> Float64[Tensor, "4 4"] | None:
+        """World to camera where the camera was last seen, in whatever segment; none before that."""
+        return self.executor.T_cw
+
+    @on_one_torch_thread
+    def settle(self) -> None:
+        """Wait until the world holds all that the last frame brings."""
+        self.executor.settle()
+
+    @on_one_torch_thread
+    def trajectory(self) -> Trajectory:
+        """Poses of all frames so far."""
+        self.settle()
+        with self.stopwatch("trajectory"):
+            return self.segments.trajectory()
+
+    def keyframe_trajectory(self) -> Trajectory:
+        """Poses of the keyframes alone."""
+        self.settle()
+        keyframes = [self.world.keyframes[i] for i in self.segments.main.segment.free]
+        T_wc = [torch.linalg.inv(k.T_cw).numpy() for k in keyframes]
+        times = np.array([k.timestamp for k in keyframes], dtype=np.float64)
+        return Trajectory(times, np.array(T_wc).reshape(-1, 4, 4), np.ones(len(times), dtype=bool))
+
+    def uncertainty(self) -> Uncertainty | None:
+        """How well the keyframes are known, by all matches of the last adjustment.
+
+        None before that: what is left of the matches until then are the latest alone. Where no map
+        could be started there is no keyframe, and nothing is known.
+        """
+        if self.world.is_ended and not self.segments.keyframe_ids:
+            return Uncertainty(*(np.zeros(0) for _ in range(4)))
+        return self.world.uncertainty
+
+    def particulars(self) -> dict[str, object]:
+        """What a summary says of segments, loops and things that move, ready for JSON."""
+        self.settle()
+        return {
+            "refined": self.world.is_refined,
+            "metric_scale": None if self.metric_scale is None else asdict(self.metric_scale),
+            "poses": self._pose_agreement(),
+            "moving": round(moving_share(self.segments.main.keyframes), 4),
+            "segments": [asdict(segment) for segment in self.segments.summary()],
+            "not_started": self.world.segments.why_not or None,
+            "loops": len(self.world.loops.loops),
+            "loop_closures": self.world.loops.closures,
+        }
+
+    def _pose_agreement(self) -> dict[str, object] | None:
+        """How far poses beside the images fit them; none where there are none."""
+        agreement = self.segments.main.map.odometry.agreement()
+        if not agreement.motions:
+            return None
+        return {
+            "motions": agreement.motions,
+            "fitting": round(agreement.share, 4),
+            "used": agreement.used,
+        }
+
+    def rows(self) -> dict[int, SeenRows]:
+        """When and where the rows of keyframes, by id, were seen, for those that were rectified."""
+        segment = self.segments.main.segment
+        known = segment.frames.rows
+        return {k.id: known[k.frame_index] for k in segment.keyframes if k.frame_index in known}
+
+    # --- the map -------------------------------------------------------------------------------
+
+    def snapshot(self) -> MapSnapshot:
+        """The disks as they are now."""
+        return self.executor.ask(lambda mapper: mapper.table.disks.snapshot())
+
+    @on_one_torch_thread
+    def renders(self) -> Sequence[RenderedKeyframe]:
+        """Depth, normal and reliability of the map as it is now, seen from every mapped keyframe.
+
+        Of a long video most are read from a temporary file when they are asked for.
+        """
+        with self.stopwatch("rendering"):
+            return self.executor.ask(Mapper.renders)
+
+    def renderer(self) -> MapRenderer:
+        """What shows the map as it is now from anywhere."""
+        return self.executor.ask(Mapper.renderer)
+
+    @on_one_torch_thread
+    def render(
+        self, T_cw: Float64[Tensor, "4 4"] | np.ndarray, camera: Camera | None = None
+    ) -> SurfaceMaps:
+        """Depth, normal and weight of the map as it is now, seen from a pose, world to camera.
+
+        ``camera`` is that of the keyframes' depth maps if none is given.
+        """
+        pose = torch.as_tensor(T_cw, dtype=torch.float64)
+        if pose.shape != (4, 4) or not bool(torch.isfinite(pose).all()):
+            raise InputError("A pose to render from is a 4x4 matrix of finite numbers.")
+        return self.renderer().surface(pose, camera)
+
+    def depth_maps(self) -> Sequence[RenderedKeyframe]:
+        """Depth and confidence of every mapped keyframe as searched, without the disks.
+
+        Each is read when it is asked for, as it is at that time.
+        """
+        return self.executor.ask(Mapper.depth_maps)
+
+    def _estimate(self, state: TrackState, timestamp: float) -> PoseEstimate:
+        """What is known right after a frame."""
+        counts = self.world.frames, len(self.segments.keyframe_ids), self.executor.disks
+        in_main = self.segments.current is self.segments.main and state is TrackState.TRACKING
+        T_cw = self.T_cw if in_main else None
+        if T_cw is None:
+            return PoseEstimate(state, *counts, timestamp)
+        T_cw, deviation = T_cw.detach().double().cpu().clone(), self.executor.deviation()
+        return PoseEstimate(state, *counts, timestamp, T_cw, deviation)

@@ -1,0 +1,57 @@
+"""The world: all that a system knows, as one tree of plain data; what a checkpoint holds."""
+
+from dataclasses import dataclass, field
+
+from geogs.errors import InputError
+from geogs.stopwatch import StageTimes
+from geogs.types import MetricScale, Uncertainty
+from geogs.world.keyframes import KeyframeTable, check_keyframes
+from geogs.world.loops import LoopTable, check_loops
+from geogs.world.map import MapTable
+from geogs.world.segments import SegmentTable, check_segment
+
+
+@dataclass(eq=False)
+class World:
+    """Live data of the stages, each of which takes it one step on."""
+
+    keyframes: KeyframeTable = field(default_factory=KeyframeTable)
+    """Poses, depths and images of all keyframes."""
+    segments: SegmentTable = field(default_factory=SegmentTable)
+    """What tracking knows of each segment of video: edges, frames, state."""
+    loops: LoopTable = field(default_factory=LoopTable)
+    map: MapTable | None = None
+    """Disks and dense depths."""
+    times: StageTimes = field(default_factory=StageTimes)
+    frames: int = 0
+    """Images so far."""
+    unmapped: list[int] = field(default_factory=list)
+    """Final keyframes that the map does not show yet, earliest first."""
+    adjusted: int = 0
+    """Keyframes at the last bundle adjustment of all."""
+    is_ended: bool = False
+    """Whether the stream has ended."""
+    maps_at_end: bool = False
+    """Whether keyframes are mapped all at once, after the stream."""
+    is_refined: bool = False
+    """Whether the map was trained over all keyframes at the end."""
+    uncertainty: Uncertainty | None = None
+    """Of the keyframes, by the last adjustment of all after the stream."""
+    metric_scale: MetricScale | None = None
+    """By what lengths were brought to metres."""
+
+
+def check_world(world: World) -> None:
+    """Check tables that were read against each other and the camera, whose grid is attached.
+
+    Raises InputError if something is missing or of another camera.
+    """
+    keyframes, segments = world.keyframes, world.segments.segments
+    for segment in segments:
+        segment.keyframes.attached(keyframes)
+    check_keyframes(keyframes, [segment.keyframes for segment in segments])
+    for segment in segments:
+        check_segment(segment, keyframes.grid)
+    if not all(i in keyframes for i in (*world.unmapped, *world.loops.keyframes)):
+        raise InputError("a keyframe is missing")
+    check_loops(world.loops)
