@@ -91,7 +91,7 @@ class KeyframeDepths:
         return [v.depth_view for v in self._placed(view, around, depth)]
 
     def _placed(self, view: MapView, others: list[MapView], depth: float) -> list[MapView]:
-        """Of other views those from which a depth is best seen, best first."""
+        """The other views from which a depth is best seen, best first."""
         places = [v.place for v in others]
         chosen = select_sweep_neighbours(view.place, places, depth)
         return [others[i] for i in chosen]

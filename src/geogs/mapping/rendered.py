@@ -59,7 +59,7 @@ class MapRenderer:
     disks: MapSnapshot
     frame: MapFrame
     camera: Camera
-    """Of the depth maps of keyframes."""
+    """Camera of the keyframes' depth maps."""
     rules: SurfaceRules
 
     @torch.no_grad()

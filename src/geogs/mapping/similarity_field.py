@@ -38,7 +38,7 @@ class CovisibleKeyframe:
 
     keyframe_id: int
     camera: Camera
-    """Of the depth."""
+    """Camera of the depth map."""
     T_cw: Float[Tensor, "4 4"]
     """World to camera, before the correction."""
     depth: Float[Tensor, "h w"]

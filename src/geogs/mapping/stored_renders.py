@@ -26,7 +26,7 @@ class StoredRender:
     timestamp: float
     mask: Bool[Tensor, "h w"] | None
     device: torch.device
-    """Of the maps that were rendered."""
+    """Where the maps were rendered."""
 
     def load(self) -> RenderedKeyframe:
         """The rendering with all that belongs to it in memory."""

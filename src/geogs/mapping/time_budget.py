@@ -75,7 +75,7 @@ class OutputCost:
     """For each of them."""
 
     def of(self, views: int) -> float:
-        """Of so many images."""
+        """Seconds for so many images."""
         return self.once + views * self.a_view
 
 

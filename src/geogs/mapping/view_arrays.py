@@ -30,11 +30,11 @@ class MapCameras:
     """One camera at the three sizes that mapping works with."""
 
     working: Camera
-    """Of the images as the tracker sees them."""
+    """The size of the images as the tracker sees them."""
     render: Camera
-    """Of the rendered maps and keyframe depths."""
+    """The size of the rendered maps and keyframe depths."""
     photo: Camera
-    """Of the images that L_mv compares."""
+    """The size of the images that L_mv compares."""
 
     @staticmethod
     def of(camera: Camera, config: MappingConfig) -> "MapCameras":
@@ -56,7 +56,7 @@ class LoadedView:
     """A prior's normals at the render size, on the map's device."""
     depth: DenseDepth | None = None
     scale: float = 1.0
-    """Of the keyframe when the depth was as it is here."""
+    """Scale of the keyframe when the depth was as it is here."""
     constants: ViewConstants | None = None
     rendered_depth: Float[Tensor, "h w"] | None = None
     matched: tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "fh fw"]] | None = None

@@ -41,7 +41,7 @@ class Archive:
     def __init__(self, folder: Path | str | None = None) -> None:
         self.folder = Path(folder or tempfile.gettempdir())
         self.name = f"archive-{uuid.uuid4().hex[:16]}"
-        """Of the file, once it is settled."""
+        """Name of the file, once it is settled."""
         self._free: dict[int, list[int]] = {}
         """Offsets of unused pieces, by their size."""
         self._gone: deque[tuple[int, int]] = deque()

@@ -12,7 +12,7 @@ from geogs.world.lru import LruCache
 V = TypeVar("V")
 
 NOT_STORED = {"stored": False}
-"""Of a field that belongs to the process and is left out of checkpoints."""
+"""Metadata of a field that belongs to the process and is left out of checkpoints."""
 RESIDENT = 128
 """Keyframes whose large arrays stay in memory, where nobody says otherwise."""
 

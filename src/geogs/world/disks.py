@@ -48,9 +48,9 @@ class GaussianMap:
     second: DiskParameters
     """Running means of their squares."""
     keyframe_id: Int64[Tensor, "n"]
-    """Of the keyframe that created a disk."""
+    """Keyframe that created a disk."""
     steps: Int64[Tensor, "n"]
-    """Of the optimiser."""
+    """Steps of the optimiser so far."""
     seen: Int64[Tensor, "n"]
     """Times that a disk was marked as seen."""
 

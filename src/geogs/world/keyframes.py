@@ -77,7 +77,7 @@ class Keyframe:
     inverse_depth: Float32[Tensor, "p"]
     """On the grid of its table."""
     information: Float32[Tensor, "p"]
-    """Of the matches, sum over edges of w |dp/dd|^2, and of a depth sensor; not of a prior."""
+    """Sum over matches of w |dp/dd|^2, and what a depth sensor adds; not a prior."""
     prior: KeyframePrior | None = None
     scale: float = 1.0
     """Factor by which corrections have multiplied the lengths around it; what was measured from it
@@ -85,7 +85,7 @@ class Keyframe:
     moving: Bool[Tensor, "p"] | None = None
     """Cells that show something dynamic; none where nobody has judged yet."""
     measured: MeasuredCells | None = None
-    """Of a depth sensor; none without, or where the map is not metric."""
+    """What a depth sensor says; none without, or where the map is not metric."""
     pose: MeasuredPose | None = None
     """By another tracker, in its own world; none where there is none."""
     table: "KeyframeTable" = field(init=False, repr=False, metadata=NOT_STORED)

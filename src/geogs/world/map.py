@@ -30,7 +30,7 @@ class SearchedDepth:
     typical: float
     """Median depth, map units."""
     scale: float
-    """Of the keyframe when the depth was as it is there."""
+    """Scale of the keyframe when the depth was as it is there."""
 
     def typical_at(self, scale: float) -> float:
         """Median depth at another scale of the keyframe."""
@@ -74,7 +74,7 @@ class RandomState:
     increment: int
     has_half: int
     half: int
-    """Of 64 bits that were drawn for 32."""
+    """What is left of 64 bits that were drawn for 32."""
     words: UInt8[Tensor, "n"]
     """PyTorch's."""
     of_numpy: np.random.Generator = field(init=False, repr=False, metadata=NOT_STORED)

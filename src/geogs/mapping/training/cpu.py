@@ -56,7 +56,7 @@ class _Pass:
     """What a view adds to a step."""
 
     gradients: list[Tensor]
-    """Of the disks' parameters."""
+    """Gradients of the disks' parameters."""
     loss: float
     depth: Float[Tensor, "h w"]
     """As the view shows it, within its mask."""

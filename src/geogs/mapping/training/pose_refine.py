@@ -45,7 +45,7 @@ class TangentAdam:
 
 
 Evaluate = Callable[[Float[Tensor, "k 4 4"]], tuple[float, Float[Tensor, ""]]]
-"""Of the poses: the loss, and something differentiable whose gradient is the loss's."""
+"""The loss of some poses, and something differentiable whose gradient is the loss's."""
 
 
 def descend(

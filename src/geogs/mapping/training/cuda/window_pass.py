@@ -59,7 +59,7 @@ class WindowPass:
         self.d_disks: DiskParameters | None = None
         self.d_poses: Float[Tensor, "b 4 4"] | None = None
         self.d_motions: Float[Tensor, "b p 12"] | None = None
-        """Of the loss, for the motion from a view to its partner, rows of the 3x4 matrix."""
+        """Gradient of the loss by the motion from a view to its partner, rows of 3x4 matrices."""
         if for_poses:
             self.d_poses = torch.zeros(views, 4, 4, dtype=torch.float64, device=device)
             self.d_motions = torch.zeros(views, partners, 12, dtype=torch.float64, device=device)
