@@ -82,17 +82,20 @@ def once(tmp_path_factory) -> Once:
 @pytest.fixture(scope="session")
 def room(once: Once) -> Path:
     """Sixty frames of a synthetic room with its truth, 256 x 192: for tests of accuracy."""
-    from geogs_synth.sequence.replica_files import write_sequence
-
-    return once("room", lambda folder: write_sequence(folder, 60, 256, 192))
+    return once("room", lambda folder: _write_room(folder, 256, 192))
 
 
 @pytest.fixture(scope="session")
 def small_room(once: Once) -> Path:
     """The same sixty frames at 128 x 96: for tests of how the parts work together."""
-    from geogs_synth.sequence.replica_files import write_sequence
+    return once("small-room", lambda folder: _write_room(folder, 128, 96))
 
-    return once("small-room", lambda folder: write_sequence(folder, 60, 128, 96))
+
+def _write_room(folder: Path, width: int, height: int) -> None:
+    from geogs_synth.sequence.replica_files import write_sequence
+    from lit_rooms import lit_room
+
+    write_sequence(folder, 60, width, height, raycaster=lit_room(0))
 
 
 @pytest.fixture

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import cache
 
 import numpy as np
 import torch
@@ -12,9 +11,9 @@ from geogs.geometry.lie import se3_inverse
 from geogs.tracking.flow.classical_flow import ClassicalFlow
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import KeyframeSet, KeyframeTable
-from geogs_synth.places.room import make_room
 from geogs_synth.raycast.raycaster import Raycaster, RenderedView
 from geogs_synth.scene.scene import Scene
+from lit_rooms import lit_room
 
 CAMERA = Camera(fx=260.0, fy=260.0, cx=191.5, cy=143.5, width=384, height=288)
 
@@ -45,15 +44,9 @@ def views(scene: Scene, poses: Sequence[np.ndarray]) -> list[RenderedView]:
     return _rendered(Raycaster(scene, threads=1), poses)
 
 
-@cache
-def room(seed: int = 0) -> Raycaster:
-    """A furnished room, lit once for all tests."""
-    return Raycaster(make_room(seed), threads=1)
-
-
 def room_views(seed: int, poses: Sequence[np.ndarray]) -> list[RenderedView]:
-    """What cameras see of :func:`room`."""
-    return _rendered(room(seed), poses)
+    """What cameras see of a furnished room."""
+    return _rendered(lit_room(seed), poses)
 
 
 def _rendered(caster: Raycaster, poses: Sequence[np.ndarray]) -> list[RenderedView]:

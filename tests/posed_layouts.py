@@ -1,6 +1,5 @@
 """One small synthetic room, written in every layout of images with known poses."""
 
-import functools
 import json
 import struct
 from dataclasses import dataclass
@@ -38,23 +37,14 @@ class Room:
         return c.fx, c.fy, c.cx + 0.5, c.cy + 0.5
 
 
-@functools.cache
-def raycaster_and_scene():
-    """One procedural room, furnished and lit once."""
-    from geogs_synth.places.room import make_room
-    from geogs_synth.raycast.raycaster import Raycaster
-
-    scene = make_room(3)
-    return Raycaster(scene, threads=1), scene
-
-
 def render_room(frames: int, step: int, width: int, height: int) -> Room:
     """A walk through the room."""
     from geogs_synth.motion.handheld import handheld_trajectory
+    from lit_rooms import lit_room
 
     camera = Camera(0.7 * width, 0.71 * width, width / 2 - 3.25, height / 2 + 1.5, width, height)
-    raycaster, scene = raycaster_and_scene()
-    T_wc = handheld_trajectory(scene, 120, 3)[: frames * step : step]
+    raycaster = lit_room(3)
+    T_wc = handheld_trajectory(raycaster.scene, 120, 3)[: frames * step : step]
     views = [raycaster.render(camera, T) for T in T_wc]
     points, seen_by = [], []
     K = camera.matrix().numpy()

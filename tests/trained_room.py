@@ -11,10 +11,9 @@ from geogs.mapping.view_arrays import MapCameras
 from geogs.mapping.views import MapView
 from geogs.world.disks import DiskParameters, GaussianMap
 from geogs_synth.motion.handheld import handheld_trajectory
-from geogs_synth.places.room import make_room
-from geogs_synth.raycast.raycaster import Raycaster
 from geogs_synth.sequence.location import centred_camera
 from keyframe_samples import Sample, segment_of, views_of
+from lit_rooms import lit_room
 
 WORKING = centred_camera(96, 72)
 CAMERAS = MapCameras(WORKING, WORKING.with_long_edge(40), WORKING.with_long_edge(80))
@@ -24,9 +23,8 @@ UNIT = 2.0
 
 def rendered_keyframes() -> list[tuple[Sample, np.ndarray]]:
     """Four keyframes of a room with their true depth at render size."""
-    scene = make_room(3)
-    caster = Raycaster(scene)
-    poses = handheld_trajectory(scene, 64)
+    caster = lit_room(3)
+    poses = handheld_trajectory(caster.scene, 64)
     out = []
     for index in range(0, 32, 8):
         view = caster.render(WORKING, poses[index])

@@ -28,6 +28,7 @@ from geogs_bench.report import markdown, write_report
 from geogs_bench.result import ResultFolder
 from geogs_bench.scoring.scores import score
 from geogs_bench.scoring.tessellation import with_short_edges
+from lit_rooms import lit_room
 
 pytestmark = pytest.mark.system
 
@@ -239,14 +240,13 @@ def test_published_tables_are_complete_and_their_means_are_those_printed():
 @pytest.mark.long
 def test_without_a_true_surface_held_out_images_judge_the_mesh(tmp_path):
     from geogs_bench.scene import Scene, Truth
-    from geogs_synth.places.room import make_room
     from geogs_synth.sequence.scene_mesh import scene_mesh
     from posed_layouts import render_room, write_dtu
 
     room = render_room(6, 12, 160, 120)
     scene = Scene("scan7", write_dtu(room, tmp_path / "scan7"), Truth(), kind="scan")
     write_result(tmp_path / "out", 0.0, None, posed=True)
-    write_mesh(tmp_path / "out" / "mesh.ply", *scene_mesh(make_room(3)))
+    write_mesh(tmp_path / "out" / "mesh.ply", *scene_mesh(lit_room(3).scene))
     with pytest.raises(InputError, match="held no image out"):
         score(scene, "reconstruct", ResultFolder(tmp_path / "out"), 0)
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())

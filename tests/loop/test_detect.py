@@ -16,7 +16,8 @@ from geogs.loop.verification import DepthView, TwoViewVerifier
 from geogs.world.keyframes import KeyframeSet
 from geogs.world.loops import Features
 from geogs_synth.raycast.raycaster import RenderedView
-from loop_scenes import CAMERA, keyframes, orbit, room, room_views, stretched, views
+from lit_rooms import lit_room
+from loop_scenes import CAMERA, keyframes, orbit, room_views, stretched, views
 
 LAP = 18
 AGAIN = 3
@@ -28,7 +29,7 @@ DRIFT = torch.tensor([0.6, -0.3, 1.5, 0.3, 0.8, -0.2], dtype=torch.float64)
 @pytest.fixture(scope="module")
 def path() -> tuple[list[RenderedView], list[np.ndarray]]:
     """Once around a room and a little on."""
-    scene = room(3).scene
+    scene = lit_room(3).scene
     poses = orbit(scene, LAP) + orbit(scene, LAP, np.radians(4))[:AGAIN]
     return room_views(3, poses), poses
 
@@ -200,7 +201,7 @@ def test_update_is_deterministic(path):
 @pytest.mark.long
 def test_a_room_of_another_shape_with_the_same_pictures_closes_no_loop(path):
     seen, poses = path
-    other = stretched(room(3).scene, 1.35)
+    other = stretched(lit_room(3).scene, 1.35)
     twins = orbit(other, LAP, np.radians(4))[:AGAIN]
     store, operator = keyframes(seen[:LAP] + views(other, twins), poses[:LAP] + twins)
     _drift(store, range(LAP, LAP + AGAIN))

@@ -5,7 +5,8 @@ import pytest
 
 from geogs.loop.features import FeatureExtractor
 from geogs.loop.retrieval import AppearanceIndex
-from loop_scenes import orbit, room, room_views
+from lit_rooms import lit_room
+from loop_scenes import orbit, room_views
 
 LAP = 18
 
@@ -13,13 +14,13 @@ LAP = 18
 @pytest.fixture(scope="module")
 def lap() -> list[np.ndarray]:
     """Images once around a room, 20 degrees apart."""
-    return [v.image for v in room_views(3, orbit(room(3).scene, LAP))]
+    return [v.image for v in room_views(3, orbit(lit_room(3).scene, LAP))]
 
 
 @pytest.fixture(scope="module")
 def again() -> list[np.ndarray]:
     """Four of the places, seen from 5 degrees aside."""
-    return [v.image for v in room_views(3, orbit(room(3).scene, LAP, np.radians(5))[::5])]
+    return [v.image for v in room_views(3, orbit(lit_room(3).scene, LAP, np.radians(5))[::5])]
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +70,7 @@ def test_exposure_does_not_matter(index, again, gain):
 @pytest.mark.long
 def test_other_rooms_score_far_less(index, again):
     here = min(index.query(image, count=1)[0].score for image in again)
-    for view in room_views(5, orbit(room(5).scene, 4)):
+    for view in room_views(5, orbit(lit_room(5).scene, 4)):
         there = index.query(view.image, count=1)
         assert not there or there[0].score < 0.3 * here
 

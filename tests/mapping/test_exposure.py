@@ -11,10 +11,9 @@ from geogs.geometry.lie import se3_inverse
 from geogs.mapping import partners
 from geogs.mapping.mapper import Mapper
 from geogs_synth.motion.handheld import handheld_trajectory
-from geogs_synth.places.room import make_room
-from geogs_synth.raycast.raycaster import Raycaster
 from geogs_synth.sequence.location import centred_camera
 from keyframe_samples import Sample, segment_of
+from lit_rooms import lit_room
 from records import copied
 
 CAMERA = centred_camera(160, 120)
@@ -24,8 +23,8 @@ GAINS, OFFSETS = [1.0, 0.8, 0.65, 0.9], [0.0, 0.05, 0.1, -0.05]
 @pytest.fixture(scope="module")
 def samples() -> list[Sample]:
     """Four keyframes with the true depth on the grid."""
-    scene = make_room(3)
-    caster, poses, made = Raycaster(scene), handheld_trajectory(scene, 64), []
+    caster, made = lit_room(3), []
+    poses = handheld_trajectory(caster.scene, 64)
     for n, (gain, offset) in enumerate(zip(GAINS, OFFSETS, strict=True)):
         view = caster.render(CAMERA, poses[6 * n])
         z = torch.from_numpy(view.depth[4 : CAMERA.height - 3 : 8, 4 : CAMERA.width - 3 : 8])

@@ -13,10 +13,9 @@ from geogs.mapping.mapper import Mapper
 from geogs.mapping.training.base import draw_views
 from geogs.types import PoseCorrection
 from geogs_synth.motion.handheld import handheld_trajectory
-from geogs_synth.places.room import make_room
-from geogs_synth.raycast.raycaster import Raycaster
 from geogs_synth.sequence.location import centred_camera
 from keyframe_samples import Sample, add, segment_of
+from lit_rooms import lit_room
 
 pytestmark = pytest.mark.system
 
@@ -34,9 +33,8 @@ MAPPING = replace(
 @pytest.fixture(scope="module")
 def sequence() -> tuple[list[Sample], list[np.ndarray]]:
     """Nine keyframes with noisy grid depth, a fifth of it wrong, and their true depth maps."""
-    scene = make_room(3)
-    caster = Raycaster(scene)
-    poses = handheld_trajectory(scene, 64)
+    caster = lit_room(3)
+    poses = handheld_trajectory(caster.scene, 64)
     random = np.random.default_rng(0)
     keyframes, truth = [], []
     for index in range(0, 63, 7):

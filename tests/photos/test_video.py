@@ -11,6 +11,7 @@ from geogs_photos.features import find_features
 from geogs_photos.localise import Localiser, matches_to_points
 from geogs_photos.sharp_frames import ChosenFrames, sharpest_frames, sharpness, stretch_length
 from geogs_photos.video import place_frames
+from lit_rooms import lit_room
 from posed_layouts import render_room
 
 
@@ -54,9 +55,8 @@ def test_a_frame_is_placed_against_points(tmp_path):
     """Points of the truth with the looks that two frames give them; a third frame is placed."""
     pytest.importorskip("pycolmap")
     room = render_room(3, 2, 320, 240)
-    from posed_layouts import raycaster_and_scene
 
-    raycaster, _ = raycaster_and_scene()
+    raycaster = lit_room(3)
     positions, looks = [], []
     for k in (0, 2):
         depth = raycaster.render(room.camera, room.T_wc[k]).depth

@@ -16,11 +16,11 @@ from geogs_synth.camera.flaws import Flaws, camera_flaws
 from geogs_synth.cli import main
 from geogs_synth.motion.handheld import handheld_trajectory
 from geogs_synth.motion.room_motions import room_motion
-from geogs_synth.places.room import make_room
 from geogs_synth.raycast.raycaster import Raycaster
 from geogs_synth.scene.scene import Scene
 from geogs_synth.sequence.location import centred_camera
 from geogs_synth.sequence.replica_files import write_sequence
+from lit_rooms import lit_room
 
 FRAMES, WIDTH, HEIGHT, SEED = 4, 96, 72, 2
 
@@ -34,13 +34,13 @@ def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def scene() -> Scene:
-    return make_room(SEED)
+def raycaster() -> Raycaster:
+    return lit_room(SEED)
 
 
 @pytest.fixture(scope="module")
-def raycaster(scene: Scene) -> Raycaster:
-    return Raycaster(scene)
+def scene(raycaster: Raycaster) -> Scene:
+    return raycaster.scene
 
 
 def test_layout(sequence: Path) -> None:

@@ -7,13 +7,13 @@ from scipy.spatial.transform import Rotation
 from geogs_synth.motion.handheld import handheld_trajectory
 from geogs_synth.motion.motion_kinds import ROOM_MOTIONS, MotionKind
 from geogs_synth.motion.room_motions import room_motion
-from geogs_synth.places.room import make_room
 from geogs_synth.scene.scene import Scene
+from lit_rooms import lit_room
 
 
 @pytest.fixture(scope="module")
 def room() -> Scene:
-    return make_room(1)
+    return lit_room(1).scene
 
 
 TIMES = np.arange(0, 10, 1 / 60)

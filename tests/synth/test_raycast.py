@@ -16,18 +16,19 @@ from geogs_synth.scene.builder import SceneBuilder, yaw_rotation
 from geogs_synth.scene.scene import Scene
 from geogs_synth.sequence.location import centred_camera
 from geogs_synth.sequence.scene_mesh import scene_mesh
+from lit_rooms import lit_room
 
 CAMERA = Camera(70.0, 72.0, 40.3, 29.1, 80, 60)
 
 
 @pytest.fixture(scope="module")
-def room() -> Scene:
-    return make_room(0)
+def raycaster() -> Raycaster:
+    return lit_room(0)
 
 
 @pytest.fixture(scope="module")
-def raycaster(room: Scene) -> Raycaster:
-    return Raycaster(room)
+def room(raycaster: Raycaster) -> Scene:
+    return raycaster.scene
 
 
 @pytest.fixture(scope="module")
@@ -206,7 +207,7 @@ def test_texture_is_everywhere(raycaster: Raycaster, poses: np.ndarray) -> None:
 
 
 def test_same_seed_same_image(room: Scene, raycaster: Raycaster, poses: np.ndarray) -> None:
-    again = Raycaster(make_room(0), threads=1).render(CAMERA, poses[0])
+    again = Raycaster(make_room(0), threads=2).render(CAMERA, poses[0])
     view = raycaster.render(CAMERA, poses[0])
     for name in ("image", "depth", "normal", "solid"):
         np.testing.assert_array_equal(getattr(view, name), getattr(again, name))

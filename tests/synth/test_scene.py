@@ -5,17 +5,22 @@ import pytest
 
 from geogs.errors import InputError
 from geogs_synth.motion.handheld import FRAMES_PER_LAP, handheld_trajectory
-from geogs_synth.places.room import make_room
 from geogs_synth.raycast.raycaster import Raycaster
 from geogs_synth.scene.builder import SceneBuilder, yaw_rotation
 from geogs_synth.scene.scene import Scene
 from geogs_synth.sequence.location import centred_camera
 from geogs_synth.sequence.scene_mesh import SeenSurface, scene_mesh
+from lit_rooms import lit_room
 
 
 @pytest.fixture(scope="module", params=[0, 3])
-def room(request: pytest.FixtureRequest) -> Scene:
-    return make_room(request.param)
+def raycaster(request: pytest.FixtureRequest) -> Raycaster:
+    return lit_room(request.param)
+
+
+@pytest.fixture(scope="module")
+def room(raycaster: Raycaster) -> Scene:
+    return raycaster.scene
 
 
 def _builder() -> tuple[SceneBuilder, int]:
@@ -75,11 +80,11 @@ def test_clearance_of_a_box() -> None:
     np.testing.assert_allclose(scene.clearance(points), [0.4, 0.3, 0.0, 0.5], atol=1e-12)
 
 
-def test_room_is_closed_and_of_the_right_size(room: Scene) -> None:
+def test_room_is_closed_and_of_the_right_size(raycaster: Raycaster, room: Scene) -> None:
     assert (room.size > [4, 3.5, 2.4]).all()
     assert (room.size < [5.2, 4.5, 2.9]).all()
     assert len(room) > 150
-    view = Raycaster(room).render(centred_camera(96, 72), handheld_trajectory(room, 1)[0])
+    view = raycaster.render(centred_camera(96, 72), handheld_trajectory(room, 1)[0])
     assert (view.solid >= 0).all()
     assert view.depth.min() > 0.4
     assert view.depth.max() < 7

@@ -9,25 +9,25 @@ from geogs_synth.camera.flaws import Flaws
 from geogs_synth.camera.image_sensor import Sensor
 from geogs_synth.camera.radial_camera import RadialCamera
 from geogs_synth.motion.room_motions import room_motion
-from geogs_synth.places.room import make_room
 from geogs_synth.places.walkers import crossing_walkers
 from geogs_synth.raycast.raycaster import Raycaster
 from geogs_synth.scene.scene import Scene
 from geogs_synth.sequence.location import centred_camera
 from geogs_synth.sequence.shooting import Shooting
+from lit_rooms import lit_room
 
 CAMERA = centred_camera(96, 72)
 LENS = RadialCamera(CAMERA)
 
 
 @pytest.fixture(scope="module")
-def scene() -> Scene:
-    return make_room(0)
+def raycaster() -> Raycaster:
+    return lit_room(0)
 
 
 @pytest.fixture(scope="module")
-def raycaster(scene: Scene) -> Raycaster:
-    return Raycaster(scene, 1)
+def scene(raycaster: Raycaster) -> Scene:
+    return raycaster.scene
 
 
 def _shooting(raycaster: Raycaster, flaws: Flaws, kind: str = "turning-60") -> Shooting:

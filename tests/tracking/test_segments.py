@@ -19,7 +19,8 @@ from geogs.types import Frame
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import KeyframeTable
 from geogs.world.segments import SegmentTable, TrackState
-from loop_scenes import at_angle, room
+from lit_rooms import lit_room
+from loop_scenes import at_angle
 
 pytestmark = pytest.mark.system
 
@@ -30,7 +31,7 @@ LOOPS = LoopConfig(min_gap=100)  # only between segments
 
 @cache
 def image(angle: float) -> np.ndarray:
-    return room().render(CAMERA, at_angle(room().scene, np.radians(angle))).image
+    return lit_room(0).render(CAMERA, at_angle(lit_room(0).scene, np.radians(angle))).image
 
 
 def stream(angles: Sequence[float | None], cuts: Sequence[int] = ()) -> list[Frame]:
@@ -61,7 +62,7 @@ def error_cm(segments: Segments, angles: Sequence[float | None]) -> float:
     trajectory = segments.trajectory()
     known = trajectory.tracked
     truth = np.stack([
-        at_angle(room().scene, np.radians(a or 0.0))[:3, 3] for a in angles
+        at_angle(lit_room(0).scene, np.radians(a or 0.0))[:3, 3] for a in angles
     ])[known]  # fmt: skip
     x, y = torch.from_numpy(trajectory.T_wc[known, :3, 3]), torch.from_numpy(truth)
     scale, R, t = umeyama(x, y)

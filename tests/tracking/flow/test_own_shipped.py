@@ -12,8 +12,7 @@ from geogs.tracking.flow.classical_flow import ClassicalFlow
 from geogs.tracking.flow.own import OwnFlow, OwnFlowOptions
 from geogs.world.grid import OFFSET, STRIDE, SampleGrid
 from geogs_synth.motion.handheld import handheld_trajectory
-from geogs_synth.places.room import make_room
-from geogs_synth.raycast.raycaster import Raycaster
+from lit_rooms import lit_room
 
 pytestmark = pytest.mark.system
 
@@ -24,9 +23,8 @@ PAIRS = ((0, 12), (60, 66), (110, 135))
 
 @pytest.fixture(scope="module")
 def views():
-    scene = make_room(3)
-    caster = Raycaster(scene, threads=1)
-    path = handheld_trajectory(scene, 140, seed=3)
+    caster = lit_room(3)
+    path = handheld_trajectory(caster.scene, 140, seed=3)
     return {k: (caster.render(CAMERA, path[k]), path[k]) for pair in PAIRS for k in pair}
 
 
