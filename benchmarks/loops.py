@@ -27,7 +27,7 @@ from geogs.bundle.select import grid_fields
 from geogs.config import LoopConfig
 from geogs.evaluation.surfaces.surface import read_surface
 from geogs.geometry.lie import se3_exp, se3_inverse, so3_log
-from geogs.loop.dense import dense_check
+from geogs.loop.dense_check import dense_check
 from geogs.loop.detect import LoopDetector
 from geogs.loop.retrieval import AppearanceIndex
 from geogs.loop.verification import DepthView, TwoViewVerifier

@@ -26,7 +26,9 @@ def scene(frames: int = 4, seed: int = 0) -> tuple[SampleGrid, BundleProblem]:
     weight = 0.5 + 4 * torch.rand(len(pairs), grid.size, 2, generator=g)
     free = torch.ones(frames, dtype=torch.bool)
     free[:2] = False
-    return grid, BundleProblem(T, d, source, target, pixels, weight, free, torch.ones_like(free))
+    return grid, BundleProblem(
+        T, d, source, target, free, torch.ones_like(free), pixels=pixels, weight=weight
+    )
 
 
 def disturbed(problem: BundleProblem, pose: float, depth: float, seed: int = 1) -> BundleProblem:

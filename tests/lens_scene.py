@@ -31,7 +31,9 @@ def lens_problem(
     weight = exact.valid[..., None].expand_as(pixels) / max(noise, 0.1) ** 2
     free = torch.ones(frames, dtype=torch.bool)
     free[0] = False
-    return BundleProblem(T, d, source, target, pixels, weight, free, torch.ones_like(free))
+    return BundleProblem(
+        T, d, source, target, free, torch.ones_like(free), pixels=pixels, weight=weight
+    )
 
 
 def disturbed(problem: BundleProblem, pose: float, depth: float) -> BundleProblem:

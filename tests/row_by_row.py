@@ -5,9 +5,9 @@ from collections.abc import Callable
 import numpy as np
 
 from geogs.geometry.camera import Camera
-from geogs.shutter.camera import RollingCamera
+from geogs.shutter.angular_motion import rotated
 from geogs.shutter.clip_tracks import ClipTracks
-from geogs.shutter.turning import rotated
+from geogs.shutter.rolling_camera import RollingCamera
 
 WIDE = RollingCamera(Camera(420.0, 420.0, 255.5, 191.5, 512, 384))
 FOCAL = 420.0

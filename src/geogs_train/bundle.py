@@ -6,9 +6,10 @@ is plain autograd, so that a network can be taught what measurements and weights
 adjusted poses and depths right (Teed and Deng, "DROID-SLAM", NeurIPS 2021, section 3.2).
 
 The edges of all clips are the same. Positions may be in pixels or in cells, if only intrinsics,
-positions and weights agree. Projection and the derivatives of points are the tracker's. Its stars
-are not used: made one by one they would give autograd a graph each, where here the sources of all
-clips are eliminated at once; nor its robust weights, since the network gives the weights.
+positions and weights agree. Projection and the derivatives of points are the tracker's. Its
+hyper-edges are not used: made one by one they would give autograd a graph each, where here the
+sources of all clips are eliminated at once; nor its robust weights, since the network gives the
+weights.
 """
 
 from dataclasses import dataclass
@@ -18,6 +19,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from geogs.bundle.projection import Projection, motion_rows, relative_motion, seen_from_targets
+from geogs.geometry.least_squares import Policy, Step, minimise
 from geogs.geometry.lie import retract, se3_adjoint
 
 
@@ -133,11 +135,16 @@ def adjust(
     its poses in that step.
     """
     options = options or ClipBundleOptions()
-    for _ in range(options.iterations):
-        system = _normal_equations(cameras, state, edges, matches, options)
-        xi, delta = _solve(system, options)
-        state = _moved(state, xi, delta, options)
-    return state
+
+    def linearised(state: ClipState) -> _System:
+        return _normal_equations(cameras, state, edges, matches, options)
+
+    def step(state: ClipState, system: _System, damping: float) -> Step[ClipState]:
+        """A clip that cannot be solved does not end the steps of the others."""
+        return Step(_moved(state, *_solve(system, damping, options.damping_floor), options))
+
+    policy = Policy(options.iterations, options.damping)
+    return minimise(state, linearised, step, policy).state
 
 
 def _jacobians(
@@ -210,13 +217,13 @@ def _summed(places: int, *parts: tuple[Tensor, Tensor]) -> Tensor:
     return total
 
 
-def _solve(system: _System, options: ClipBundleOptions) -> tuple[Tensor, Tensor]:
+def _solve(system: _System, damping: float, floor: float) -> tuple[Tensor, Tensor]:
     """Steps of the free poses (b, n), float64, and of all inverse depths (b, q)."""
     scaled = system.coupling / system.curvature[:, None]
     S = system.hessian - (scaled @ system.coupling.mT).double()
     right = system.gradient - (scaled @ system.depth_gradient[..., None])[..., 0].double()
     diagonal = S.diagonal(dim1=1, dim2=2).abs()
-    S = S + torch.diag_embed(options.damping * diagonal + options.damping_floor)
+    S = S + torch.diag_embed(damping * diagonal + floor)
     _, info = torch.linalg.cholesky_ex(S.detach())
     good = (info == 0) & torch.isfinite(S).all((1, 2)) & torch.isfinite(right).all(1)
     eye = torch.eye(S.shape[1], dtype=S.dtype, device=S.device)

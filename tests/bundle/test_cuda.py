@@ -10,16 +10,17 @@ import torch
 
 import geogs.bundle.cuda.dense as cuda_bundle
 import geogs.bundle.cuda.fields as cuda_fields
-import geogs.bundle.cuda.motion as cuda_motion
+import geogs.bundle.cuda.motion_only as cuda_motion
 import geogs.bundle.cuda.pairs as cuda_pairs
 from cuda_emulator import use_emulator
 from geogs.bundle.base import BundleOptions, BundleResult
 from geogs.bundle.dense import DenseBundle
+from geogs.bundle.depth_terms import DepthDamping, MeasuredDepths
 from geogs.bundle.fields import CpuFields
-from geogs.bundle.measured_motions import MeasuredMotions
-from geogs.bundle.motion import CpuMotion
+from geogs.bundle.motion_only import CpuMotion
+from geogs.bundle.motion_term import MeasuredMotions
 from geogs.bundle.pairs import CpuPairs
-from geogs.bundle.problem import BundleProblem, MeasuredDepths, MotionProblem
+from geogs.bundle.problem import BundleProblem, MotionProblem
 from geogs.bundle.projection import MIN_Z, linearise, project, relative_motion
 from geogs.config import Config
 from geogs.geometry.camera import Camera
@@ -71,7 +72,9 @@ def scene(camera: Camera, frames: int = 4, reach: int = 9, seed: int = 0) -> Bun
     free_depth[1] = False
     xi = 0.02 * torch.randn(frames, 6, generator=g, dtype=torch.float64) * free[:, None]
     start = d * (1 + 0.05 * torch.randn(d.shape, generator=g) * free_depth[:, None])
-    return BundleProblem(retract(xi, T), start, source, target, pixels, weight, free, free_depth)
+    return BundleProblem(
+        retract(xi, T), start, source, target, free, free_depth, pixels=pixels, weight=weight
+    )
 
 
 def on(problem: BundleProblem, device: torch.device) -> BundleProblem:
@@ -129,9 +132,9 @@ def test_damped_depths_match_the_cpu(device):
     damping = 2e3 * torch.rand(problem.inverse_depth.shape, generator=g)
     damping[2] = 0
     options = BundleOptions(2, huber=0.5)
-    damped = replace(problem, damping=damping)
+    damped = replace(problem, depth_terms=(DepthDamping(damping),))
     slow = DenseBundle(SampleGrid(camera)).solve(damped, options)
-    sent = replace(on(problem, device), damping=damping.to(device))
+    sent = replace(on(problem, device), depth_terms=(DepthDamping(damping.to(device)),))
     fast = cuda_bundle.CudaDenseBundle(SampleGrid(camera, device)).solve(sent, options)
     assert_same(fast, slow)
     plain = DenseBundle(SampleGrid(camera)).solve(problem, options)
@@ -144,11 +147,11 @@ def test_measured_depths_match_the_cpu(device):
     g = torch.Generator().manual_seed(6)
     known = torch.rand(problem.inverse_depth.shape, generator=g) < 0.7
     measured = MeasuredDepths(problem.inverse_depth + 0.05, 2e3 * known)
-    sensed = replace(problem, measured=measured)
+    sensed = replace(problem, depth_terms=(measured,))
     options = BundleOptions(2, huber=0.5)
     slow = DenseBundle(SampleGrid(camera)).solve(sensed, options)
     there = MeasuredDepths(measured.inverse_depth.to(device), measured.information.to(device))
-    sent = replace(on(problem, device), measured=there)
+    sent = replace(on(problem, device), depth_terms=(there,))
     fast = cuda_bundle.CudaDenseBundle(SampleGrid(camera, device)).solve(sent, options)
     assert_same(fast, slow)
     plain = DenseBundle(SampleGrid(camera)).solve(problem, options)
@@ -163,10 +166,10 @@ def test_measured_motions_match_the_cpu(device, frames):
     information = torch.tensor([1e6] * 3 + [1e7] * 3, dtype=torch.float64).expand(frames - 1, 6)
     off = se3_exp(0.01 * torch.ones(6, dtype=torch.float64))
     motions = MeasuredMotions(at, at + 1, off @ T[1:] @ se3_inverse(T[:-1]), information)
-    told = replace(problem, motions=motions)
+    told = replace(problem, pose_terms=(motions,))
     options = BundleOptions(2, huber=0.5)
     slow = DenseBundle(SampleGrid(camera)).solve(told, options)
-    sent = replace(on(problem, device), motions=motions)
+    sent = replace(on(problem, device), pose_terms=(motions,))
     fast = cuda_bundle.CudaDenseBundle(SampleGrid(camera, device)).solve(sent, options)
     assert_same(fast, slow)
     plain = DenseBundle(SampleGrid(camera)).solve(problem, options)

@@ -8,7 +8,8 @@ import torch
 from bundle_scenes import CAMERA, disturbed, scene
 from geogs.bundle.base import BundleOptions
 from geogs.bundle.dense import DenseBundle
-from geogs.bundle.problem import BundleProblem, MeasuredDepths
+from geogs.bundle.depth_terms import DepthDamping, MeasuredDepths
+from geogs.bundle.problem import BundleProblem
 from geogs.bundle.projection import linearise, relative_motion
 from geogs.geometry.lie import retract, se3_inverse
 from oracles.bundle_reference import gauss_newton_step
@@ -39,7 +40,7 @@ def test_damping_resists_the_depth_it_is_given_for():
     damping[1] = 3e3 * torch.rand(grid.size, generator=torch.Generator().manual_seed(2))
     damping[2, 7] = 1e9
     options = BundleOptions(iterations=1, huber=50.0)
-    damped = replace(problem, damping=damping)
+    damped = replace(problem, depth_terms=(DepthDamping(damping),))
     xi, delta = gauss_newton_step(damped, CAMERA, grid.rays, options)
     result = DenseBundle(grid).solve(damped, options)
     torch.testing.assert_close(result.T_cw, retract(xi, problem.T_cw), rtol=0, atol=2e-5)
@@ -63,7 +64,7 @@ def measured_anew(problem: BundleProblem, seed: int = 3) -> MeasuredDepths:
 @pytest.mark.parametrize("huber", [0.5, 50.0])
 def test_measured_depths_pull_as_in_the_reference(huber):
     grid, truth = scene()
-    problem = replace(disturbed(truth, 0.02, 0.05), measured=measured_anew(truth))
+    problem = replace(disturbed(truth, 0.02, 0.05), depth_terms=(measured_anew(truth),))
     free_depth = problem.free_depth.clone()
     free_depth[1] = False
     problem = replace(problem, free_depth=free_depth)
@@ -73,7 +74,7 @@ def test_measured_depths_pull_as_in_the_reference(huber):
     torch.testing.assert_close(result.T_cw, retract(xi, problem.T_cw), rtol=0, atol=2e-5)
     expected = problem.inverse_depth.double() + delta
     torch.testing.assert_close(result.inverse_depth.double(), expected, rtol=0, atol=5e-5)
-    plain = DenseBundle(grid).solve(replace(problem, measured=None), options)
+    plain = DenseBundle(grid).solve(replace(problem, depth_terms=()), options)
     assert float((plain.inverse_depth - result.inverse_depth).abs().max()) > 0.01
     assert float((result.information - plain.information).max()) > 10
 
@@ -84,7 +85,9 @@ def test_measured_depths_say_how_long_a_step_is():
     free[0] = False
     start = replace(
         disturbed(replace(truth, free_pose=free), 0.02, 0.05),
-        measured=MeasuredDepths(truth.inverse_depth, torch.full_like(truth.inverse_depth, 1e4)),
+        depth_terms=(
+            MeasuredDepths(truth.inverse_depth, torch.full_like(truth.inverse_depth, 1e4)),
+        ),
     )
     result = DenseBundle(grid).solve(start, BundleOptions(iterations=12, huber=10.0))
     centres = [
@@ -99,10 +102,10 @@ def test_what_was_measured_stays_known_without_matches():
     problem = replace(
         problem, source=problem.source[alone], target=problem.target[alone],
         pixels=problem.pixels[alone], weight=problem.weight[alone],
-        measured=measured_anew(problem),
+        depth_terms=(measured_anew(problem),),
     )  # fmt: skip
     result = DenseBundle(grid).solve(problem, BundleOptions(iterations=1))
-    assert torch.equal(result.information[3], problem.measured.information[3])
+    assert torch.equal(result.information[3], problem.depth_terms[0].information[3])
 
 
 def test_recovers_a_disturbed_scene():

@@ -60,7 +60,9 @@ def turning(sideways: float, seed: int = 0) -> tuple[SampleGrid, BundleProblem]:
     weight = torch.full_like(pixels, 4.0)  # half a pixel
     free = torch.ones(n, dtype=torch.bool)
     free[0] = False
-    return grid, BundleProblem(T, d, source, target, pixels, weight, free, torch.ones_like(free))
+    return grid, BundleProblem(
+        T, d, source, target, free, torch.ones_like(free), pixels=pixels, weight=weight
+    )
 
 
 def test_depth_is_open_when_the_camera_only_turns():
@@ -132,8 +134,8 @@ def test_parts_of_a_large_problem_are_fetched():
         return problem.pixels[edges], problem.weight[edges]
 
     streamed = StreamedProblem(
-        problem.T_cw, problem.inverse_depth, problem.source, problem.target, matches,
-        problem.free_pose, problem.free_depth,
+        problem.T_cw, problem.inverse_depth, problem.source, problem.target,
+        problem.free_pose, problem.free_depth, matches=matches,
     )  # fmt: skip
     one, other = (marginals(grid, p, replace(EXACT, chunk=7)) for p in (problem, streamed))
     assert len(parts) > 4

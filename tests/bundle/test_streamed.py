@@ -8,14 +8,15 @@ import torch
 from bundle_scenes import disturbed, scene
 from geogs.bundle.base import BundleOptions
 from geogs.bundle.dense import DenseBundle
-from geogs.bundle.problem import BundleProblem, MeasuredDepths, StreamedProblem
+from geogs.bundle.depth_terms import DepthDamping, MeasuredDepths
+from geogs.bundle.problem import BundleProblem, StreamedProblem
 from geogs.bundle.streamed import StreamedBundle
 
 
 def streamed(p: BundleProblem) -> StreamedProblem:
     return StreamedProblem(
-        p.T_cw, p.inverse_depth, p.source, p.target, lambda e: (p.pixels[e], p.weight[e]),
-        p.free_pose, p.free_depth, p.damping, p.measured,
+        p.T_cw, p.inverse_depth, p.source, p.target, p.free_pose, p.free_depth, p.depth_terms,
+        matches=lambda e: (p.pixels[e], p.weight[e]),
     )  # fmt: skip
 
 
@@ -27,13 +28,14 @@ def test_steps_are_those_of_the_dense_solver(chunk, damped):
     free_depth = problem.free_depth.clone()
     free_depth[1] = False
     g = torch.Generator().manual_seed(4)
-    damping = 500 * torch.rand(problem.inverse_depth.shape, generator=g) if damped else None
-    measured = MeasuredDepths(problem.inverse_depth + 0.03, 2e3 * damping / 500) if damped else None
+    damping = 500 * torch.rand(problem.inverse_depth.shape, generator=g)
+    measured = MeasuredDepths(problem.inverse_depth + 0.03, 2e3 * damping / 500)
+    terms = (DepthDamping(damping), measured) if damped else ()
     # Not all frames see each other, and one is seen by none.
     near = ((problem.source - problem.target).abs() <= 2) & (problem.source != 5)
     near &= problem.target != 5
     problem = replace(
-        problem, free_depth=free_depth, damping=damping, measured=measured,
+        problem, free_depth=free_depth, depth_terms=terms,
         source=problem.source[near], target=problem.target[near],
         pixels=problem.pixels[near], weight=problem.weight[near],
     )  # fmt: skip

@@ -1,6 +1,6 @@
 """The GPU's adjustment of large problems against the dense solver of the CPU."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import pytest
 import torch
@@ -10,8 +10,9 @@ from bundle_scenes import disturbed, scene
 from cuda_emulator import use_emulator
 from geogs.bundle.base import BundleOptions
 from geogs.bundle.dense import DenseBundle
-from geogs.bundle.measured_motions import MeasuredMotions
-from geogs.bundle.problem import BundleProblem, MeasuredDepths, StreamedProblem
+from geogs.bundle.depth_terms import DepthDamping, MeasuredDepths
+from geogs.bundle.motion_term import MeasuredMotions
+from geogs.bundle.problem import BundleProblem, StreamedProblem
 from geogs.world.grid import SampleGrid
 
 
@@ -28,15 +29,14 @@ def device(request, monkeypatch) -> torch.device:
 
 def streamed(p: BundleProblem, device: torch.device) -> StreamedProblem:
     """Dense tensors on the device, poses and structure on the CPU."""
-    measured = p.measured
-    if measured is not None:
-        measured = MeasuredDepths(
-            measured.inverse_depth.to(device), measured.information.to(device)
-        )
+    terms = (
+        replace(t, **{f.name: getattr(t, f.name).to(device) for f in fields(t)})
+        for t in p.depth_terms
+    )
     return StreamedProblem(
-        p.T_cw, p.inverse_depth.to(device), p.source, p.target,
-        lambda e: (p.pixels[e].to(device), p.weight[e].to(device)), p.free_pose, p.free_depth,
-        None if p.damping is None else p.damping.to(device), measured, p.motions,
+        p.T_cw, p.inverse_depth.to(device), p.source, p.target, p.free_pose, p.free_depth,
+        tuple(terms), p.pose_terms,
+        matches=lambda e: (p.pixels[e].to(device), p.weight[e].to(device)),
     )  # fmt: skip
 
 
@@ -48,15 +48,15 @@ def test_steps_are_those_of_the_dense_solver(device, edges, monkeypatch):
     free_depth = problem.free_depth.clone()
     free_depth[1] = False
     g = torch.Generator().manual_seed(4)
-    damping = measured = None
+    terms = ()
     if edges == 6:
         damping = 500 * torch.rand(problem.inverse_depth.shape, generator=g)
-        measured = MeasuredDepths(problem.inverse_depth + 0.03, 4 * damping)
+        terms = DepthDamping(damping), MeasuredDepths(problem.inverse_depth + 0.03, 4 * damping)
     # Not all frames see each other, and one is seen by none.
     near = ((problem.source - problem.target).abs() <= 2) & (problem.source != 5)
     near &= problem.target != 5
     problem = replace(
-        problem, free_depth=free_depth, damping=damping, measured=measured,
+        problem, free_depth=free_depth, depth_terms=terms,
         source=problem.source[near], target=problem.target[near],
         pixels=problem.pixels[near], weight=problem.weight[near],
     )  # fmt: skip
@@ -84,9 +84,9 @@ def test_measured_motions_count_as_in_the_dense_solver(device):
     options = BundleOptions(iterations=2, huber=0.5)
     solver = cuda_streamed.CudaStreamedBundle(SampleGrid(grid.camera, device))
     slow, without = (
-        DenseBundle(grid).solve(replace(problem, motions=m), options) for m in (motions, None)
+        DenseBundle(grid).solve(replace(problem, pose_terms=m), options) for m in ((motions,), ())
     )
-    fast = solver.solve(streamed(replace(problem, motions=motions), device), options)
+    fast = solver.solve(streamed(replace(problem, pose_terms=(motions,)), device), options)
     assert float((slow.T_cw - without.T_cw).abs().max()) > 3e-4
     torch.testing.assert_close(fast.T_cw, slow.T_cw, rtol=0, atol=2e-5)
 

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from geogs.config import Config
+from geogs.loop import global_bundle
 from geogs.loop.global_bundle import global_options
 from geogs.tracking.flow.operator_choice import build_operator
 from geogs.tracking.graph import FrameGraph
@@ -94,7 +95,8 @@ def test_parts_together_are_adjusted_as_one_problem(placed, tmp_path):
     assert torch.allclose(found[0].T_cw[0], placements[0].T_cw[0], rtol=0, atol=1e-12)
 
 
-def test_what_has_settled_is_not_matched_again(placed, tmp_path):
+def test_what_has_settled_is_not_matched_again(placed, tmp_path, monkeypatch):
+    monkeypatch.setattr(adjust, "ROUNDS", global_bundle.ROUNDS)
     parts, files, placements, gauge, _ = placed
     matched = []
 

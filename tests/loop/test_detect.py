@@ -9,7 +9,7 @@ import torch
 from geogs.config import LoopConfig
 from geogs.geometry.lie import se3_exp, se3_inverse, so3_log
 from geogs.loop import detect, search
-from geogs.loop.dense import dense_check
+from geogs.loop.dense_check import dense_check
 from geogs.loop.detect import LoopDetector
 from geogs.loop.features import FeatureExtractor
 from geogs.loop.verification import DepthView, TwoViewVerifier

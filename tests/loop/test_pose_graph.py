@@ -293,7 +293,7 @@ def test_a_step_matches_the_reference():
     )
     graph = replace(graph, start=T, matches=matches, relative=relative)
     options = PoseGraphOptions(
-        iterations=1, damping=1e-3, matches=MatchOptions(share=0.01, chunk=2)
+        iterations=1, damping=1e-3, matches=MatchOptions(factor=0.01, chunk=2)
     )
     fast = solve(graph, options)
     xi, delta = gauss_newton_step(graph, options.matches, options.damping)

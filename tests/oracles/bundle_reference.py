@@ -5,6 +5,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from geogs.bundle.base import BundleOptions
+from geogs.bundle.depth_terms import DepthDamping, MeasuredDepths
 from geogs.bundle.problem import BundleProblem
 from geogs.bundle.projection import MIN_Z
 from geogs.geometry.camera import Camera
@@ -39,7 +40,7 @@ def residuals(
 
 def motion_residuals(problem: BundleProblem, xi: Tensor) -> Float[Tensor, "m 6"]:
     """What is between the motions after the steps xi of poses and the measured ones."""
-    m, T = problem.motions, retract(xi, problem.T_cw)
+    (m,), T = problem.pose_terms, retract(xi, problem.T_cw)
     return torch.stack([
         se3_log(T[j] @ se3_inverse(T[i]) @ se3_inverse(measured))
         for i, j, measured in zip(m.source.tolist(), m.target.tolist(), m.T_ts, strict=True)
@@ -72,23 +73,25 @@ def gauss_newton_step(
     C = (Jd.mT @ (w[:, None] * Jd)).diagonal()
     mean = C.reshape(-1, p).mean(1).repeat_interleave(p)
     C = C + options.depth_damping * mean + 1e-8
-    if problem.damping is not None:
-        C = C + problem.damping.double().reshape(-1)[depth]
     pull = torch.zeros_like(delta)
-    if problem.measured is not None:
-        away = problem.measured.inverse_depth.double() - problem.inverse_depth.double()
-        a = problem.measured.information.double()
+    for term in problem.depth_terms:
+        if isinstance(term, DepthDamping):
+            C = C + term.curvature.double().reshape(-1)[depth]
+            continue
+        assert isinstance(term, MeasuredDepths)
+        away = term.inverse_depth.double() - problem.inverse_depth.double()
+        a = term.information.double()
         a = a * (3.0 / (a.sqrt() * away.abs()).clamp(min=3.0))
         C = C + a.reshape(-1)[depth]
-        pull = a * away
+        pull = pull + a * away
     C = torch.diag(C)
     H, E = Jx.mT @ (w[:, None] * Jx), Jx.mT @ (w[:, None] * Jd)
     v, b = Jx.mT @ (w * r), Jd.mT @ (w * r) + pull.reshape(-1)[depth]
-    if problem.motions is not None:
+    if problem.pose_terms:
         e = motion_residuals(problem, xi)
         Jm = torch.func.jacrev(lambda a: motion_residuals(problem, a).reshape(-1))(xi)
         Jm = Jm.reshape(-1, 6 * n)[:, pose]
-        a = problem.motions.information
+        a = problem.pose_terms[0].information
         a = a / (1 + (a * e * e).sum(-1, keepdim=True) / 3.0**2)
         H = H + Jm.mT @ (a.reshape(-1, 1) * Jm)
         v = v - Jm.mT @ (a * e).reshape(-1)

@@ -57,7 +57,7 @@ def gauss_newton_step(
     r = match_residuals(m, S, *zero)
     w = m.weight.double()
     norm = (w * r * r).sum(-1, keepdim=True).sqrt()
-    w = (options.share * w * (options.huber / norm.clamp(min=options.huber))).reshape(-1, 1)
+    w = (options.factor * w * (options.huber / norm.clamp(min=options.huber))).reshape(-1, 1)
     free = (~graph.fixed).repeat_interleave(7)
     seen = torch.zeros(n, dtype=torch.bool).index_fill_(0, m.source, True).repeat_interleave(p)
     Je, Jx, Jd = (

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from geogs.shutter.camera import RollingCamera
-from geogs.shutter.neighbours import with_turning
+from geogs.shutter.neighbours import with_angular_motion
+from geogs.shutter.rolling_camera import RollingCamera
 from rolling_scenes import RATE, READOUT, hand_held, rolling_frames
 from tracking_scenes import CAMERA
 
@@ -21,7 +21,7 @@ def video():
 def turnings(frames, wanted=lambda position: True):
     return {
         frame.index: np.concatenate([turning.rate, turning.acceleration])
-        for frame, turning in with_turning(frames, ROLLING, READOUT, wanted)
+        for frame, turning in with_angular_motion(frames, ROLLING, READOUT, wanted)
     }
 
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from geogs.geometry.camera import Camera
-from geogs.shutter.camera import RollingCamera
+from geogs.shutter.angular_motion import rotated
 from geogs.shutter.rates import FlowMeter, RayFlow, angular_velocity, parallax
-from geogs.shutter.turning import rotated
+from geogs.shutter.rolling_camera import RollingCamera
 from rolling_scenes import RATE, READOUT, global_image, rolling_image, turning
 from tracking_scenes import CAMERA
 

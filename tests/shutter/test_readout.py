@@ -4,9 +4,9 @@ import functools
 
 import pytest
 
-from geogs.shutter.camera import RollingCamera
 from geogs.shutter.first_reconstruction import first_reconstruction
 from geogs.shutter.readout import CLIP, FoundReadout, _Adjusted, _verdict, find_readout
+from geogs.shutter.rolling_camera import RollingCamera
 from geogs.types import Frame
 from rolling_scenes import RATE, hand_held, rolling_image
 from row_by_row import FOCAL, clip_of, scattered, shaken, steady

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from geogs.shutter import row_adjustment
+from geogs.shutter.clip_reconstruction import Reconstruction
 from geogs.shutter.first_reconstruction import first_reconstruction
-from geogs.shutter.reconstruction import Reconstruction
 from geogs.shutter.row_adjustment import NODES, interpolation, interpolation_slope, readout_equation
 from row_by_row import FOCAL, clip_of, scattered, shaken
 

@@ -6,18 +6,18 @@ import torch
 
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import so3_exp
-from geogs.shutter.camera import RollingCamera
+from geogs.shutter.angular_motion import AngularMotion
+from geogs.shutter.rolling_camera import RollingCamera
 from geogs.shutter.rows import RowOffsets
 from geogs.shutter.shutter import Shutter
-from geogs.shutter.turning import Turning
 
 CAMERA = Camera(420.0, 415.0, 255.0, 190.0, 512, 384)
-FAST = Turning(np.array([1.2, -1.5, 0.8]), np.array([10.0, -12.0, 8.0]))
+FAST = AngularMotion(np.array([1.2, -1.5, 0.8]), np.array([10.0, -12.0, 8.0]))
 """115 degrees per second, and shaken."""
 READOUT = 0.033
 
 
-def seen_at(rolling: RollingCamera, ray: np.ndarray, turning: Turning) -> np.ndarray:
+def seen_at(rolling: RollingCamera, ray: np.ndarray, turning: AngularMotion) -> np.ndarray:
     """The pixel at which a distant point is seen: the row's time and its place have to agree."""
     early, late = -0.75, 0.75
     for _ in range(60):  # bisection: a row passes the point once
@@ -46,13 +46,15 @@ def test_offsets_at_pixels_are_those_of_single_rays(distortion, quarter_turns):
 
 def test_a_camera_that_stands_or_reads_at_once_has_no_offsets():
     offsets = RowOffsets(RollingCamera(CAMERA, (-0.2, 0.05, 0.0, 0.0)), CAMERA)
-    assert not offsets(Turning(), READOUT).any()
+    assert not offsets(AngularMotion(), READOUT).any()
     assert not offsets(FAST, 0.0).any()
 
 
 def test_the_middle_row_stays_and_the_edges_go_opposite_ways():
     """At a steady turn to the side, half a readout moves a row by f w readout / 2."""
-    offsets = RowOffsets(RollingCamera(CAMERA), CAMERA)(Turning(np.array([0.0, 1.0, 0.0])), READOUT)
+    offsets = RowOffsets(RollingCamera(CAMERA), CAMERA)(
+        AngularMotion(np.array([0.0, 1.0, 0.0])), READOUT
+    )
     edge = 420 * 1.0 * READOUT / 2
     assert abs(offsets[191, 255, 0]) < 0.03
     assert offsets[0, 255, 0] == pytest.approx(-edge, rel=0.01)
@@ -62,7 +64,7 @@ def test_the_middle_row_stays_and_the_edges_go_opposite_ways():
 def test_parallax_moves_rows_by_its_own_velocity():
     """Beside no turn at all: x/z and y/z per second, at the row's own time."""
     drift = np.broadcast_to([0.3, 0.0], (12, 16, 2))
-    offsets = RowOffsets(RollingCamera(CAMERA), CAMERA)(Turning(parallax=drift), READOUT)
+    offsets = RowOffsets(RollingCamera(CAMERA), CAMERA)(AngularMotion(parallax=drift), READOUT)
     for row in (0, 100, 383):
         expected = 420 * 0.3 * READOUT * ((row + 0.5) / 384 - 0.5) * 384 / 383
         np.testing.assert_allclose(offsets[row, :, 0], expected, atol=0.02)
@@ -71,10 +73,10 @@ def test_parallax_moves_rows_by_its_own_velocity():
 
 def test_parallax_counts_little_where_the_rate_changes_fast():
     drift = np.broadcast_to([0.3, 0.0], (12, 16, 2))
-    shaken = Turning(acceleration=np.array([0.0, 60.0, 0.0]))
+    shaken = AngularMotion(acceleration=np.array([0.0, 60.0, 0.0]))
     offsets = RowOffsets(RollingCamera(CAMERA), CAMERA)
     alone = offsets(shaken, READOUT)
-    both = offsets(Turning(acceleration=shaken.acceleration, parallax=drift), READOUT)
+    both = offsets(AngularMotion(acceleration=shaken.acceleration, parallax=drift), READOUT)
     assert np.abs(both - alone).max() < 0.05 * 420 * 0.3 * READOUT / 2
 
 

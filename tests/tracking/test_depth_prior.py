@@ -47,7 +47,7 @@ def scene(seed: int = 0) -> tuple[SampleGrid, BundleProblem]:
     bare = (x > 20) & (x < 52) & (y > 10) & (y < 40)
     weight[:2, bare] = 0
     fixed = torch.zeros(3, dtype=torch.bool)
-    return grid, BundleProblem(T, d, source, target, pixels, weight, fixed, ~fixed)
+    return grid, BundleProblem(T, d, source, target, fixed, ~fixed, pixels=pixels, weight=weight)
 
 
 def disturbed(problem: BundleProblem, amount: float, seed: int = 1) -> BundleProblem:

@@ -7,10 +7,10 @@ import torch
 from geogs.bundle.projection import project
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp, se3_inverse
-from geogs.shutter.camera import RollingCamera
+from geogs.shutter.angular_motion import AngularMotion
+from geogs.shutter.rolling_camera import RollingCamera
 from geogs.shutter.rows import RowOffsets
 from geogs.shutter.shutter import Shutter
-from geogs.shutter.turning import Turning
 from geogs.tracking.row_errors import LONGEST_INTERVAL, RowErrors, _carried, lagrange
 from geogs.types import SeenRows, Trajectory
 from geogs.world.grid import SampleGrid
@@ -18,7 +18,7 @@ from geogs.world.grid import SampleGrid
 CAMERA = Camera(220.0, 215.0, 157.0, 121.0, 320, 240)
 GRID = SampleGrid(CAMERA)
 READOUT, RATE, COUNT, FRAME = 0.03, 30.0, 9, 4
-ASSUMED = Turning(np.array([0.05, -0.9, 0.1]), np.array([0.5, 0.2, -0.3]))
+ASSUMED = AngularMotion(np.array([0.05, -0.9, 0.1]), np.array([0.5, 0.2, -0.3]))
 """By how much rows were taken to turn; the camera turns by more, and moves."""
 
 

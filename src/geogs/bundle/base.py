@@ -2,13 +2,16 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Protocol, TypeVar, runtime_checkable
 
 from jaxtyping import Float
 from torch import Tensor
 
-from geogs.bundle.problem import BundleProblem, MotionProblem, StreamedProblem
+from geogs.bundle.problem import MotionProblem, Problem
+from geogs.bundle.terms import SharedBlock
 from geogs.world.keyframes import Keyframe
+
+P = TypeVar("P", bound=Problem, contravariant=True)
 
 
 @dataclass(frozen=True)
@@ -27,7 +30,8 @@ class BundleOptions:
     min_inverse_depth: float = 1e-3
     max_inverse_depth: float = 1e2
     tolerance: float = 0.0
-    """On the CPU, a step that moves no pose by this much (units, radians) is the last one."""
+    """A step that moves no pose by this much (units, radians) is the last one; the dense solver of
+    a GPU does not wait for that."""
 
 
 @dataclass(frozen=True)
@@ -42,26 +46,19 @@ class BundleResult:
     residual: Float[Tensor, "e"]
     """Root of the robustly weighted mean squared residual of each edge in pixels."""
     finite: bool
+    block: SharedBlock | None = None
+    """The shared unknowns of a problem that has some."""
 
 
 @runtime_checkable
-class BundleSolver(Protocol):
-    """What adjusts a problem."""
+class BundleSolver(Protocol[P]):
+    """What adjusts one kind of problem."""
 
-    def solve(self, problem: BundleProblem, options: BundleOptions | None = None) -> BundleResult:
-        """Take ``options.iterations`` damped Gauss-Newton steps.
+    def solve(self, problem: P, options: BundleOptions | None = None) -> BundleResult:
+        """Take ``options.iterations`` damped Gauss-Newton steps, or fewer (``tolerance``).
 
         A step that is not finite is not taken, and ``finite`` is False in the result.
         """
-        ...
-
-
-@runtime_checkable
-class LargeBundleSolver(Protocol):
-    """What adjusts a problem whose matches are fetched when they are needed."""
-
-    def solve(self, problem: StreamedProblem, options: BundleOptions | None = None) -> BundleResult:
-        """As a ``BundleSolver`` does; a small step may end it on either device."""
         ...
 
 
@@ -85,12 +82,12 @@ class MotionSolver(Protocol):
         huber: float,
         limit: float,
     ) -> tuple[Float[Tensor, "4 4"], Float[Tensor, "4 4"], Float[Tensor, "6"]]:
-        """Pose of a frame against one keyframe, and what tells whether it is right.
+        """Pose of a frame against one keyframe, and what says whether it is right.
 
         Cells without information do not count. Returns the pose; the motion from the keyframe to
-        it; and in one tensor the share of the cells that are matched, the share whose residual is
+        it; and in one tensor the fraction of the cells that are matched, that whose residual is
         below ``limit`` pixels, the medians over the matched of the residual and of the motion, in
-        pixels, which are not numbers where nothing is matched, the share of the cells that have
+        pixels, which are not numbers where nothing is matched, the fraction of the cells that have
         information, and of those that are matched and have known depth
         (``Keyframe.has_known_depth``). On a GPU all stays there, and nothing waits.
         """

@@ -1,11 +1,12 @@
-"""The reduced camera system of a large adjustment: only the blocks that exist.
+"""The camera system: the equations of all poses once the depths are eliminated; float64.
 
-Frames are put in reverse Cuthill-McKee order, which leaves a narrow band for a walk, also for one
-that comes back, and the band is factored by Cholesky's method. At worst, when all frames see each
-other, the band is the whole lower triangle.
+The dense one has the shared unknowns of a problem, too. That of a large adjustment has only the
+blocks that exist: frames are put in reverse Cuthill-McKee order, which leaves a narrow band for a
+walk, also for one that comes back, and the band is factored by Cholesky's method. At worst, when
+all frames see each other, the band is the whole lower triangle.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,8 +14,45 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from geogs.bundle.linearise import Star
+from geogs.bundle.hyper_edge import HyperEdge
 from geogs.bundle.problem import sources_within
+
+
+class DenseCameraSystem:
+    """Hessian and gradient over all poses, then shared unknowns."""
+
+    def __init__(self, free_pose: Bool[Tensor, "n"], free_shared: Sequence[bool] = ()) -> None:
+        self.frames = len(free_pose)
+        free = [*free_pose.repeat_interleave(6).tolist(), *free_shared]
+        self.free = torch.nonzero(torch.tensor(free))[:, 0]
+        """Which rows may move."""
+        self.hessian = torch.zeros(len(free), len(free), dtype=torch.float64)
+        self.gradient = self.hessian.new_zeros(len(free))
+
+    def add(self, edges: Iterable[HyperEdge]) -> None:
+        """Add what hyper-edges say of their unknowns."""
+        for edge in edges:
+            rows = edge.rows(self.frames)
+            hessian, gradient = edge.chained()
+            self.hessian.index_put_((rows[:, None], rows), hessian, accumulate=True)
+            self.gradient.index_add_(0, rows, gradient)
+
+    def solve(self, damping: float, floor: float) -> Float[Tensor, "v"] | None:
+        """Steps of all unknowns, zero for the fixed; None where the system is not definite.
+
+        The diagonal D is raised by ``damping`` |D| + ``floor``.
+        """
+        H, g, free = self.hessian, self.gradient, self.free
+        step = torch.zeros_like(g)
+        if not len(free):
+            return step
+        system = H[free[:, None], free]
+        system = system + torch.diag(damping * system.diagonal().abs() + floor)
+        factor, info = torch.linalg.cholesky_ex(system)
+        if int(info):
+            return None
+        step[free] = torch.cholesky_solve(g[free, None], factor)[:, 0]
+        return step if bool(torch.isfinite(step).all()) else None
 
 
 @dataclass(frozen=True)
@@ -32,7 +70,7 @@ class PoseSums:
 class SparseCameraSystem:
     """Blocks of the lower triangle over the free poses, and the right-hand side; all float64.
 
-    Stars are added one after the other, so that none has to be kept.
+    Hyper-edges are added one after the other, so that none has to be kept.
     """
 
     def __init__(
@@ -84,11 +122,11 @@ class SparseCameraSystem:
         free = self._free
         self._gradient.index_add_(0, self._slot[free], gradient[free])
 
-    def add(self, stars: Iterable[Star]) -> None:
-        """Add what the edges of some sources say of the poses."""
-        for star in stars:
-            block, gradient = star.pose_blocks()
-            at = self._slot[star.poses]
+    def add(self, edges: Iterable[HyperEdge]) -> None:
+        """Add what hyper-edges say of the poses; nothing may be shared."""
+        for edge in edges:
+            block, gradient = edge.pose_blocks()
+            at = self._slot[edge.poses]
             keep = at >= 0
             self._gradient.index_add_(0, at[keep], gradient[keep])
             keys, rows, columns = _lower(at, self._count)
@@ -112,14 +150,11 @@ class SparseCameraSystem:
         at = self._slot[sums.frame]
         self._gradient.index_add_(0, at[at >= 0], sums.gradient[at >= 0])
 
-    def solve(self, damping: float) -> Float[Tensor, "n 6"]:
-        """Steps of all frames, zero for the fixed, NaN where the system is not definite.
-
-        The diagonal D is raised by ``damping`` |D| + 0.01, as in the dense solver.
-        """
+    def solve(self, damping: float, floor: float) -> Float[Tensor, "v"] | None:
+        """As of the dense system."""
         xi = torch.zeros(len(self._free), 6, dtype=torch.float64)
         if not self._count:
-            return xi
+            return xi.reshape(-1)
         n, width = 6 * self._count, 6 * (self.bandwidth + 1)
         band = np.zeros((width, n), order="F")
         within = np.arange(6)
@@ -131,10 +166,10 @@ class SparseCameraSystem:
             lower = row >= column
             values = self._blocks[begin : begin + 4096].numpy()
             band[(row - column)[lower], column[lower]] = values[lower]
-        band[0] += damping * np.abs(band[0]) + 1e-2
+        band[0] += damping * np.abs(band[0]) + floor
         right = self._gradient.reshape(-1).numpy().copy()
         if not (np.isfinite(band).all() and np.isfinite(right).all()):
-            return xi.masked_fill(self._free[:, None], torch.nan)
+            return None
         from scipy.linalg import LinAlgError, solveh_banded
 
         try:
@@ -142,10 +177,10 @@ class SparseCameraSystem:
                 band, right, overwrite_ab=True, overwrite_b=True, lower=True, check_finite=False
             )
         except LinAlgError:
-            return xi.masked_fill(self._free[:, None], torch.nan)
+            return None
         found = torch.from_numpy(solution).reshape(self._count, 6)
         xi[self._free] = found[self._slot[self._free]]
-        return xi
+        return xi.reshape(-1) if np.isfinite(solution).all() else None
 
 
 def _ordered_slots(

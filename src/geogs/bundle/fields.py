@@ -1,4 +1,4 @@
-"""Fields on the sample grid on the CPU: filling holes, carrying depth from view to view."""
+"""Fields on the sample grid on the CPU: filling holes, propagating depth from view to view."""
 
 from collections.abc import Sequence
 

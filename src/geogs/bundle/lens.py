@@ -13,8 +13,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from geogs.bundle.blocks import SharedProjection
 from geogs.bundle.projection import Projection, motion_rows, relative_motion, seen_from_targets
+from geogs.bundle.terms import SharedProjection
 from geogs.geometry.camera import Camera
 
 _NEWTON_STEPS = 8

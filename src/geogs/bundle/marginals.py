@@ -1,29 +1,27 @@
 """How well an adjustment knows its poses and inverse depths: marginal variances at its solution.
 
-With the reduced camera system S of all stars (depths eliminated) and the coupling e of an inverse
+With the reduced camera system S of all terms (depths eliminated) and the coupling e of an inverse
 depth with the poses, ``var d = 1/c + e^T S^-1 e / c^2``: what its own matches leave open, and what
 the poses do. Source: the block inverse; Rosinol et al. 2023 use it for dense bundle adjustment.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from geogs.bundle.base import BundleOptions
-from geogs.bundle.linearise import Star, linearise_stars
-from geogs.bundle.problem import (
-    BundleProblem,
-    MeasuredDepths,
-    StreamedProblem,
-    source_chunks,
-    sources_within,
-)
+from geogs.bundle.flow_term import PinholeFlow, SourceFlow, linearised_sources, residual_norms
+from geogs.bundle.hyper_edge import HyperEdge
+from geogs.bundle.problem import BundleProblem, StreamedProblem, source_chunks, sources_within
 from geogs.bundle.projection import project, relative_motion
+from geogs.bundle.terms import BundleState, DepthTerm
 from geogs.geometry.lie import se3_inverse
 from geogs.world.grid import SampleGrid
+
+AnyProblem = BundleProblem | StreamedProblem
 
 ALIKE = 2.25
 """Matches of neighbouring cells err alike, and so do those of one cell along several edges: by how
@@ -43,8 +41,7 @@ class Marginals:
     """Covariance of the left perturbation of each pose; float64."""
     relative_depth: Float[Tensor, "n c"]
     """Deviation of the inverse depth of some cells of each frame, as a part of it."""
-
-    strain: Float[Tensor, "n"]
+    normalised_residual: Float[Tensor, "n"]
     """Median residual of the matches from each frame, in their own standard deviations (two
     dimensions): 1.2 where errors are as expected, more where the scene is not as modelled."""
 
@@ -57,7 +54,7 @@ class Marginals:
 
 def marginals(
     grid: SampleGrid,
-    problem: BundleProblem | StreamedProblem,
+    problem: AnyProblem,
     options: BundleOptions | None = None,
     alike: float = ALIKE,
     cells: int = 1024,
@@ -80,76 +77,79 @@ def marginals(
     pose = torch.stack([covariance[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] for k in range(n)])
     relative = torch.zeros(n, part.count)
     relative[problem.free_depth.cpu()] = torch.inf
-    for star in part.stars(options):
-        if star.depth is not None:
-            sigma = _depth_variance(star, covariance, alike).sqrt()
-            relative[star.frame] = sigma / part.inverse_depth[star.frame].clamp(min=1e-12)
-    return Marginals(pose, relative, _strain(problem, part, options))
+    for source in part.sources(options):
+        frame = source.frame
+        if bool(problem.free_depth[frame]):
+            sigma = _depth_variance(source.edges, covariance, alike).sqrt()
+            relative[frame] = sigma / part.inverse_depth[frame].clamp(min=1e-12)
+    return Marginals(pose, relative, _normalised_residual(problem, part, options))
 
 
 class _Thinned:
     """A problem with some of the cells, which stand for all of them; on the CPU."""
 
-    def __init__(
-        self, grid: SampleGrid, problem: BundleProblem | StreamedProblem, cells: int
-    ) -> None:
+    def __init__(self, grid: SampleGrid, problem: AnyProblem, cells: int) -> None:
         step = -(-grid.size // cells)
-        self._problem, self._camera, self._every = problem, grid.camera, slice(None, None, step)
-        self._rays = grid.rays[self._every].cpu()
-        self.count = len(self._rays)
-        self.share = self.count / grid.size
-        self.inverse_depth = problem.inverse_depth[:, self._every].cpu()
+        self._problem, self._cells = problem, slice(None, None, step)
+        self._flow = PinholeFlow(grid.camera, grid.rays[self._cells].cpu())
+        self.count = len(self._flow.rays)
+        self.fraction = self.count / grid.size
+        self.inverse_depth = problem.inverse_depth[:, self._cells].cpu()
 
-    def stars(self, options: BundleOptions) -> Iterator[Star]:
-        """All stars, in order."""
+    def sources(self, options: BundleOptions) -> Iterator[SourceFlow]:
+        """All sources, in order."""
         for part in self._parts(options):
-            yield from linearise_stars(
-                self._camera, self._rays, part, part.T_cw, self.inverse_depth, options
-            )
+            yield from linearised_sources(self._flow, part, part.start, options)
 
     def residuals(self, options: BundleOptions) -> Iterator[tuple[int, Float[Tensor, "m"]]]:
         """Of each source in order: norms of its matches' residuals in standard deviations."""
         for part in self._parts(options):
             i, j = part.source, part.target
-            at = project(
-                self._camera, self._rays, relative_motion(part.T_cw, i, j), self.inverse_depth[i]
-            )
-            norm = (part.weight * (part.pixels - at.pixels).square()).sum(-1).sqrt()
+            T_ji = relative_motion(part.T_cw, i, j)
+            at = project(self._flow.camera, self._flow.rays, T_ji, self.inverse_depth[i])
+            norm = residual_norms(at, part.pixels, part.weight)
             used = at.valid & (part.weight[..., 0] > 0)
             for frame, edges in sources_within(i):
                 yield frame, norm[edges][used[edges]]
 
     def _parts(self, options: BundleOptions) -> Iterator[BundleProblem]:
-        for chunk in source_chunks(self._problem.source.cpu(), options.chunk):
-            yield self._part(chunk)
+        """Some edges at a time, with the terms of depths."""
+        p, cells = self._problem, self._cells
+        terms = tuple(_ThinnedTerm(term, p.start, cells) for term in p.depth_terms)
+        for chunk in source_chunks(p.source.cpu(), options.chunk):
+            part = p.part(chunk)
+            yield BundleProblem(
+                p.T_cw.cpu(), self.inverse_depth, part.source.cpu(), part.target.cpu(),
+                p.free_pose.cpu(), p.free_depth.cpu(), terms,
+                pixels=part.pixels[:, cells].cpu(), weight=part.weight[:, cells].cpu(),
+            )  # fmt: skip
 
-    def _part(self, chunk: slice) -> BundleProblem:
-        p, every = self._problem, self._every
-        if isinstance(p, StreamedProblem):
-            pixels, weight = p.matches(chunk)
-        else:
-            pixels, weight = p.pixels[chunk], p.weight[chunk]
-        damping = None if p.damping is None else p.damping[:, every].cpu()
-        measured = None
-        if p.measured is not None:
-            both = (p.measured.inverse_depth, p.measured.information)
-            measured = MeasuredDepths(*(m[:, every].cpu() for m in both))
-        return BundleProblem(
-            p.T_cw.cpu(), self.inverse_depth, p.source[chunk].cpu(), p.target[chunk].cpu(),
-            pixels[:, every].cpu(), weight[:, every].cpu(), p.free_pose.cpu(), p.free_depth.cpu(),
-            damping, measured,
-        )  # fmt: skip
+
+@dataclass(frozen=True)
+class _ThinnedTerm:
+    """A term of depths on some of the cells."""
+
+    term: DepthTerm
+    state: BundleState
+    """With all cells."""
+    cells: slice
+    information: None = None
+
+    def of_frame(self, frame: int, state: BundleState) -> HyperEdge:
+        edges = self.term.of_frame(frame, self.state)
+        assert edges.depth is not None
+        return replace(edges, depth=edges.depth.on_cells(self.cells))
 
 
 def _pose_covariance(
-    problem: BundleProblem | StreamedProblem, part: _Thinned, options: BundleOptions
+    problem: AnyProblem, part: _Thinned, options: BundleOptions
 ) -> Float[Tensor, "m m"]:
     """Inverse of the reduced camera system over all poses, zero for the fixed ones."""
     n, fixed = len(problem.T_cw), ~problem.free_pose.cpu()
     H = torch.zeros(6 * n, 6 * n, dtype=torch.float64)
-    for star in part.stars(options):
-        rows = _rows(star.poses)
-        H[rows[:, None], rows] += star.chained()[0] / part.share
+    for source in part.sources(options):
+        rows = source.edges.rows(n)
+        H[rows[:, None], rows] += source.edges.chained()[0] / part.fraction
     if int(fixed.sum()) <= 1:
         origin = int(torch.nonzero(fixed)[0, 0]) if bool(fixed.any()) else 0
         along = _scaling(problem.T_cw.double().cpu(), origin)
@@ -165,15 +165,15 @@ def _pose_covariance(
     return covariance
 
 
-def _strain(
-    problem: BundleProblem | StreamedProblem, part: _Thinned, options: BundleOptions
+def _normalised_residual(
+    problem: AnyProblem, part: _Thinned, options: BundleOptions
 ) -> Float[Tensor, "n"]:
     """Median residual from each frame; infinite without matches."""
-    strain = torch.full((len(problem.T_cw),), torch.inf)
+    found = torch.full((len(problem.T_cw),), torch.inf)
     for frame, norm in part.residuals(options):
         if len(norm):
-            strain[frame] = norm.median()
-    return strain
+            found[frame] = norm.median()
+    return found
 
 
 def _scaling(T_cw: Float[Tensor, "n 4 4"], origin: int) -> Float[Tensor, "m"]:
@@ -184,16 +184,12 @@ def _scaling(T_cw: Float[Tensor, "n 4 4"], origin: int) -> Float[Tensor, "m"]:
 
 
 def _depth_variance(
-    star: Star, covariance: Float[Tensor, "m m"], alike: float
+    edges: HyperEdge, covariance: Float[Tensor, "m m"], alike: float
 ) -> Float[Tensor, "c"]:
-    """Of the inverse depths of a star, from its own matches and the covariance of its poses."""
-    depth, rows = star.depth, _rows(star.poses)
+    """Of the inverse depths of a source, by its own matches and the covariance of its poses."""
+    depth, rows = edges.depth, edges.rows(len(covariance) // 6)
     assert depth is not None
-    E = star.chain.mT.to(depth.coupling) @ depth.coupling
+    E = edges.chained_coupling()
     among = covariance[rows[:, None], rows].to(E)
     through_poses = (E * (among @ E)).sum(0) / depth.curvature.square()
-    return torch.where(star.information > 0, alike / depth.curvature + through_poses, torch.inf)
-
-
-def _rows(poses: Int[Tensor, "k"]) -> Int[Tensor, "c"]:
-    return (6 * poses[:, None] + torch.arange(6)).reshape(-1)
+    return torch.where(depth.information > 0, alike / depth.curvature + through_poses, torch.inf)

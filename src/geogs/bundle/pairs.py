@@ -45,11 +45,11 @@ class CpuPairs:
         shift = T.clone()
         shift[:, :3, :3] = torch.eye(3, dtype=T.dtype)
         total = valid = inside = torch.zeros(len(T))
-        for motion, share in ((T, rotation_weight), (shift, 1 - rotation_weight)):
+        for motion, factor in ((T, rotation_weight), (shift, 1 - rotation_weight)):
             p = project(grid.camera, rays, motion, d)
             flow = (p.pixels - pixels).norm(dim=-1)
-            total = total + share * (flow * p.valid).sum(1)
-            valid = valid + share * p.valid.float().sum(1)
+            total = total + factor * (flow * p.valid).sum(1)
+            valid = valid + factor * p.valid.float().sum(1)
             if motion is T:
                 inside = (grid.inside(p.pixels) & p.valid).float().mean(1)
         seen = (valid > 0.75 * int(keep.sum())) & (inside > LEAST_OVERLAP)

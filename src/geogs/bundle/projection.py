@@ -55,7 +55,7 @@ def seen_from_targets(
 ) -> tuple[Float[Tensor, "*b e p 3"], Bool[Tensor, "*b e p"], Float[Tensor, "*b e p"]]:
     """y = R ray + d t of every cell, whether it lies before the target, and its z.
 
-    Points with a z below ``MIN_Z`` are flagged, and their z is held at that.
+    Points with a z below ``MIN_Z`` are flagged, and their z is set to that.
     """
     R, t = T_ji[..., :3, :3].to(inverse_depth), T_ji[..., :3, 3].to(inverse_depth)
     y = rays @ R.mT + inverse_depth[..., None] * t[..., None, :]

@@ -10,6 +10,8 @@ from torch import Tensor
 
 from geogs.bundle.projection import MIN_Z, relative_motion
 from geogs.geometry.camera import Camera
+from geogs.geometry.least_squares import Policy, Step, minimise
+from geogs.geometry.robust import huber_weight
 
 BEHIND = 100.0
 """Residual of a match, in its deviations, whose cell would lie behind the target."""
@@ -60,21 +62,31 @@ def best_residuals(
     tx, ty, tz = T_ji[:, :3, 3].T[..., None]
     wx, wy = weight[..., 0] * camera.fx**2, weight[..., 1] * camera.fy**2
     ux, uy = (pixels[..., 0] - camera.cx) / camera.fx, (pixels[..., 1] - camera.cy) / camera.fy
-    d = inverse_depth
-    for n in range(iterations + 1):
+
+    def projected(d: Float[Tensor, "n p"]) -> tuple[Tensor, ...]:
+        """Where cells are seen, the inverse of z, whether they are in front, and residuals."""
         along = d[source]
         z = az + along * tz
         valid, q = z > MIN_Z, 1 / z.clamp(min=MIN_Z)
         x, y = (ax + along * tx) * q, (ay + along * ty) * q
         rx, ry = ux - x, uy - y
-        norm = (wx * rx * rx + wy * ry * ry).sqrt()
-        if n == iterations:
-            break
+        return x, y, q, valid, rx, ry, (wx * rx * rx + wy * ry * ry).sqrt()
+
+    def linearised(d: Float[Tensor, "n p"]) -> tuple[Tensor, Tensor]:
+        x, y, q, valid, rx, ry, norm = projected(d)
         jx, jy = (tx - tz * x) * q, (ty - tz * y) * q
-        share = valid * huber / norm.clamp(min=huber)
-        gx, gy = wx * jx * share, wy * jy * share
+        robust = valid * huber_weight(norm, huber)
+        gx, gy = wx * jx * robust, wy * jy * robust
         curvature = torch.zeros_like(d).index_add_(0, source, gx * jx + gy * jy)
-        gradient = torch.zeros_like(d).index_add_(0, source, gx * rx + gy * ry)
-        damping = 1e-3 * curvature.mean(1, keepdim=True) + 1e-8
-        d = (d + gradient / (curvature + damping)).clamp(*DEPTH_RANGE)
+        return curvature, torch.zeros_like(d).index_add_(0, source, gx * rx + gy * ry)
+
+    def step(
+        d: Float[Tensor, "n p"], linear: tuple[Tensor, Tensor], damping: float
+    ) -> Step[Tensor]:
+        curvature, gradient = linear
+        raised = damping * curvature.mean(1, keepdim=True) + 1e-8
+        return Step((d + gradient / (curvature + raised)).clamp(*DEPTH_RANGE))
+
+    d = minimise(inverse_depth, linearised, step, Policy(iterations, damping=1e-3)).state
+    *_, valid, _, _, norm = projected(d)
     return torch.where(valid | (wx == 0), norm, BEHIND)

@@ -9,14 +9,14 @@ from geogs.bundle.base import (
     BundleSolver,
     GridFields,
     KeyframePairs,
-    LargeBundleSolver,
     MotionSolver,
 )
+from geogs.bundle.problem import BundleProblem, StreamedProblem
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import KeyframeSet
 
 
-def bundle_solver(grid: SampleGrid) -> BundleSolver:
+def bundle_solver(grid: SampleGrid) -> BundleSolver[BundleProblem]:
     """The solver for the device of a grid."""
     if grid.on_gpu:
         from geogs.bundle.cuda.dense import CudaDenseBundle
@@ -27,7 +27,7 @@ def bundle_solver(grid: SampleGrid) -> BundleSolver:
     return DenseBundle(grid)
 
 
-def large_bundle_solver(grid: SampleGrid) -> LargeBundleSolver:
+def large_bundle_solver(grid: SampleGrid) -> BundleSolver[StreamedProblem]:
     """The solver for the device of a grid whose memory is bounded."""
     if grid.on_gpu:
         from geogs.bundle.cuda.streamed import CudaStreamedBundle
@@ -41,10 +41,10 @@ def large_bundle_solver(grid: SampleGrid) -> LargeBundleSolver:
 def motion_solver(grid: SampleGrid, cells: Int[Tensor, "p"] | None = None) -> MotionSolver:
     """The solver for the device of a grid; matches are those of some cells, or of all."""
     if grid.on_gpu:
-        from geogs.bundle.cuda.motion import CudaMotion
+        from geogs.bundle.cuda.motion_only import CudaMotion
 
         return CudaMotion(grid, cells)
-    from geogs.bundle.motion import CpuMotion
+    from geogs.bundle.motion_only import CpuMotion
 
     return CpuMotion(grid, cells)
 

@@ -53,7 +53,7 @@ class BlockSystem:
         gradient: Float[Tensor, "n 7"],
         damping: float,
     ) -> Float[Tensor, "n 7"] | None:
-        """The solution after the diagonal was raised by a share of it; None if it is singular.
+        """The solution after the diagonal was raised by a fraction of it; None if it is singular.
 
         What nothing ties down stays where it is.
         """

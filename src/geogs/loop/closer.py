@@ -24,7 +24,7 @@ from geogs.loop.constraints import (
     of_loop,
     of_poses,
     rescaled,
-    strains,
+    squared_errors,
     thinned,
 )
 from geogs.loop.detect import LoopDetector
@@ -155,8 +155,9 @@ class LoopCloser:
         known, constraint = self._of(first), self._constraint(loop)
         known.loops = thinned(joined([known.loops, constraint]), MOST_LOOPS)
         ends = sorted({loop.first, loop.second})
-        residual = strains(first.keyframes.poses(ends), between_positions(constraint, ends))
-        known.pending += bool((residual > self.config.residual).any())
+        poses = first.keyframes.poses(ends)
+        errors = squared_errors(poses, between_positions(constraint, ends))
+        known.pending += bool((errors > self.config.residual).any())
 
     def _constraint(self, loop: Loop) -> RelativePoses:
         return of_loop(self.segments.main.keyframes.table, loop)

@@ -29,7 +29,7 @@ class ClosingQuestion:
     relative: RelativePoses
     """Between places in ``ids``."""
     matches: MatchedEdges | None
-    held: int
+    fixed: int
     """Keyframes at the beginning that stay as they are."""
     is_metric: bool
 
@@ -37,7 +37,7 @@ class ClosingQuestion:
     def answer(self) -> LoopClosure | None:
         """The closing, for any thread; None if no loop is believed."""
         return close_loops(
-            self.ids, self.T_cw, self.relative, self.matches, None, self.held, self.is_metric
+            self.ids, self.T_cw, self.relative, self.matches, None, self.fixed, self.is_metric
         )
 
 

@@ -46,19 +46,21 @@ def close_loops(
     relative: RelativePoses,
     matches: MatchedEdges | None = None,
     options: ClosureOptions | None = None,
-    held: int = 1,
+    fixed: int = 1,
     is_metric: bool = False,
 ) -> LoopClosure | None:
     """Correct keyframes ``ids`` (ascending) by their loops; None if no loop is believed.
 
     Loops that contradict the others are left out, those that the kernel lets go of too, and matches
-    between their keyframes with them. The first keyframes, as many as are ``held``, keep pose and
+    between their keyframes with them. The first keyframes, as many as are ``fixed``, keep pose and
     unit; all keep their unit where the map ``is_metric``.
     """
     options = options or ClosureOptions()
     keep = consistent_loops(T_cw, relative, options.consistency)
-    fixed = torch.arange(len(T_cw)) < held
-    result = solve(PoseGraph(T_cw, relative.select(keep), fixed, None, is_metric), options.graph)
+    are_fixed = torch.arange(len(T_cw)) < fixed
+    result = solve(
+        PoseGraph(T_cw, relative.select(keep), are_fixed, None, is_metric), options.graph
+    )
     keep = keep.clone()
     keep[keep.clone()] = result.loop_weight >= options.least_weight
     if not bool((keep & relative.is_loop).any()):
@@ -66,7 +68,7 @@ def close_loops(
     kept = relative.select(keep)
     if matches is not None:
         believed = _without(matches, relative.select(~keep), kept)
-        result = solve(PoseGraph(result.S, kept, fixed, believed, is_metric), options.graph)
+        result = solve(PoseGraph(result.S, kept, are_fixed, believed, is_metric), options.graph)
     return LoopClosure(
         pose_correction(ids, T_cw, result.S),
         kept.rescaled(result.scale),

@@ -21,7 +21,7 @@ AGREEING_LOOPS = 2
 JOIN_TOLERANCE = 0.12
 """Within which they agree: radians, parts of the median depth, or of the scale; what segments drift
 by within themselves."""
-SETTLED = RelativePoseOptions(iterations=0)
+FITTED = RelativePoseOptions(iterations=0)
 """For edges that a bundle adjustment has fitted, with more than they tell alone."""
 
 
@@ -52,17 +52,17 @@ def of_edges(segment: KeyframeSet, edges: Mapping[Pair, Edge]) -> RelativePoses:
         pixels.float(),
         still_weight(segment, pairs, pixels, weight).float(),
     )
-    return _named(relative_poses(grid, matched, segment.poses(ids), False, SETTLED), ids)
+    return _named(relative_poses(grid, matched, segment.poses(ids), False, FITTED), ids)
 
 
 def of_poses(segment: KeyframeSet, ids: Sequence[int]) -> RelativePoses:
-    """Relative poses between neighbours in a list of ids, as sure as any can be."""
+    """Relative poses between neighbours in a list of ids, as certain as any can be."""
     if len(ids) < 2:
         return RelativePoses.none()
     T_cw = segment.poses(ids)
     depth = 1 / segment.inverse_depths(ids[1:]).median(1).values.cpu().double()
-    sure = 1 / torch.tensor([SETTLED.least_turn] * 6 + [SETTLED.least_scale]).double().square()
-    information = sure.repeat(len(ids) - 1, 1)
+    most = 1 / torch.tensor([FITTED.least_rotation] * 6 + [FITTED.least_scale]).double().square()
+    information = most.repeat(len(ids) - 1, 1)
     information[:, :3] /= depth[:, None].square()
     slots = torch.arange(len(ids))
     is_loop = torch.zeros(len(ids) - 1, dtype=torch.bool)
@@ -130,7 +130,7 @@ def thinned(relative: RelativePoses, most: int) -> RelativePoses:
     return relative.select((place >= n // 2) | (place % 2 == 0))
 
 
-def strains(T_cw: Float[Tensor, "n 4 4"], relative: RelativePoses) -> Float[Tensor, "e"]:
+def squared_errors(T_cw: Float[Tensor, "n 4 4"], relative: RelativePoses) -> Float[Tensor, "e"]:
     """Squared errors of relative poses between places at given poses, in their own variances."""
     now = T_cw[relative.target] @ se3_inverse(T_cw[relative.source])
     error = sim3_log(relative.G @ sim3_inverse(now))
@@ -140,7 +140,7 @@ def strains(T_cw: Float[Tensor, "n 4 4"], relative: RelativePoses) -> Float[Tens
 def disagreement(
     S: Float[Tensor, "*b 4 4"], other: Float[Tensor, "*b 4 4"], depth: Float[Tensor, "*b"]
 ) -> Float[Tensor, "*b"]:
-    """Largest of the turn in radians, the shift over a depth, and the change of scale."""
+    """Largest of the rotation in radians, the shift over a depth, and the change of scale."""
     error = sim3_log(S @ sim3_inverse(other)).abs()
-    shift, turn = error[..., :3].norm(dim=-1) / depth, error[..., 3:6].norm(dim=-1)
-    return torch.stack([shift, turn, error[..., 6]]).amax(0)
+    shift, rotation = error[..., :3].norm(dim=-1) / depth, error[..., 3:6].norm(dim=-1)
+    return torch.stack([shift, rotation, error[..., 6]]).amax(0)

@@ -12,7 +12,7 @@ from jaxtyping import Bool, UInt8
 
 from geogs.config import LoopConfig
 from geogs.geometry.lie import se3_inverse
-from geogs.loop.dense import dense_check
+from geogs.loop.dense_check import dense_check
 from geogs.loop.search import SUPPRESSION, Depths, PlaceRecognition, Query
 from geogs.tracking.flow.flow_operator import FlowOperator
 from geogs.tracking.motion import Recognition

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 
 from geogs.bundle.base import BundleOptions
-from geogs.loop.settled_rows import settle_rows
+from geogs.loop.row_correction import correct_rows
 from geogs.tracking.graph import HUBER
 from geogs.tracking.proximity import RADIUS, Pair, proximity_pairs
 from geogs.tracking.tracker import Tracker
@@ -25,7 +25,7 @@ MATCHED_TOGETHER = 16, 48
 """Pairs that are matched in one go, on the CPU and on a GPU."""
 PRIORS_TOGETHER = 32
 """Keyframes whose depths are adjusted with their priors at a time; bounds memory."""
-SETTLED = 0.02
+CONVERGED = 0.02
 """The rounds end when the reprojection of no more than this fraction of the pairs still moves."""
 SMALL_STEP = 1e-5
 """A round ends with a step that moves no pose by more, in units and radians."""
@@ -63,17 +63,17 @@ def global_bundle(
     for n in range(ROUNDS if pairs else 0):
         # Pairs of the same keyframe one after the other: images of old ones are read from a file.
         stale = sorted(graph.stale(pairs, REMEASURE))
-        if len(stale) <= SETTLED * len(pairs):
+        if len(stale) <= CONVERGED * len(pairs):
             break
         for start in range(0, len(stale), batch):
             graph.measure(stale[start : start + batch], fine=True, packed=True)
             if progress is not None:
-                share = (n + start / len(stale)) / ROUNDS
-                progress(share, "matching all keyframes")
+                done = (n + start / len(stale)) / ROUNDS
+                progress(done, "matching all keyframes")
         graph.adjust(list(graph.edges), free if fixed else ids[1:], free, options)
         graph.judge_moving(set(free), config.moving)
         odometry.look_at_all()
-    settle_rows(tracker, free if fixed else ids[1:], free, options)
+    correct_rows(tracker, free if fixed else ids[1:], free, options)
     for start in range(0, len(free), PRIORS_TOGETHER):
         tracker.map.priors.adjust(free[start : start + PRIORS_TOGETHER])  # moves no pose
     if progress is not None:

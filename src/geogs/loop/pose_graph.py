@@ -16,6 +16,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from geogs.geometry.least_squares import Policy, Step, minimise
 from geogs.geometry.lie import (
     retract,
     sim3_adjoint,
@@ -26,15 +27,8 @@ from geogs.geometry.lie import (
     sim3_small_adjoint,
 )
 from geogs.loop.block_system import BlockSystem
-from geogs.loop.matched_edges import (
-    BlockEquations,
-    LinearMatches,
-    MatchedEdges,
-    MatchOptions,
-    depth_step,
-    linearise_matches,
-    match_cost,
-)
+from geogs.loop.graph_terms import BlockEquations, GraphState, GraphTerm, LinearTerm
+from geogs.loop.matched_edges import MatchedEdges, MatchOptions, MatchTerm
 from geogs.types import PoseCorrection
 from geogs.world.loops import RelativePoses
 
@@ -102,12 +96,6 @@ class PoseGraphResult:
         return sim3_scale(self.S)
 
 
-@dataclass(frozen=True)
-class _State:
-    S: Float[Tensor, "n 4 4"]
-    inverse_depth: Tensor
-
-
 def relative_errors(S: Float[Tensor, "n 4 4"], relative: RelativePoses) -> Float[Tensor, "e 7"]:
     """``log(G S_i S_j^-1)`` of every relative pose."""
     return sim3_log(relative.G @ S[relative.source] @ sim3_inverse(S[relative.target]))
@@ -131,27 +119,34 @@ def solve(graph: PoseGraph, options: PoseGraphOptions | None = None) -> PoseGrap
     The kernel starts so wide that it is convex over the errors of all loops at the given poses.
     Every step lowers the cost at its stage; the result is deterministic.
     """
-    options = options or PoseGraphOptions()
-    none = torch.zeros(len(graph.start), 0)
-    depth = none if graph.matches is None else graph.matches.inverse_depth
-    start = _State(graph.start.double(), depth)
+    options, matches = options or PoseGraphOptions(), graph.matches
+    relative = RelativeTerm.of(graph.relative, options)
+    others = [] if matches is None else [MatchTerm(matches, options.matches)]
+    depth = None if matches is None else matches.inverse_depth
+    start = state = GraphState(graph.start.double(), depth)
     problem = _Problem(graph, options)
-    state, steps = start, 0
-    for width in problem.widths(start):
-        last = width == 1.0
-        state, taken = problem.descend(
-            state, width, options.iterations if last else options.stage_iterations
+    steps = 0
+    for width in relative.widths(start, options.convexity_step):
+        is_last = width == 1.0
+        problem.terms = [relative.widened(width), *others]
+        policy = Policy(
+            max_steps=options.iterations if is_last else options.stage_iterations,
+            damping=options.damping,
+            max_damping=options.max_damping,
+            least_damping=options.damping,
+            retries_unsolvable=True,
+            least_decrease=options.tolerance,
+            is_of_new_cost=True,
+            costs_anew=matches is not None,
+            enough=options.tolerance,
+            stall=1e-12,
         )
-        steps += taken
-    valid = problem.linearise(state, 0.0).valid
-    return PoseGraphResult(
-        state.S,
-        None if graph.matches is None else state.inverse_depth,
-        problem.weights(relative_errors(state.S, graph.relative), 1.0),
-        problem.cost(start, 1.0, valid),
-        problem.cost(state, 1.0, valid),
-        steps,
-    )
+        found = minimise(state, problem.linearise, problem.step, policy, cost)
+        state, steps = found.state, steps + found.steps
+    linear = problem.linearise(state)
+    weights = relative.robust_weights(relative_errors(state.S, graph.relative))
+    before, after = cost(start, linear), cost(state, linear)
+    return PoseGraphResult(state.S, state.inverse_depth, weights, before, after, steps)
 
 
 def pose_correction(
@@ -172,101 +167,120 @@ def pose_correction(
     )
 
 
+@dataclass(frozen=True)
+class RelativeTerm:
+    """The term of relative poses, loops by Geman and McClure's kernel."""
+
+    relative: RelativePoses
+    information: Float[Tensor, "e 7"]
+    limit: float
+    """Squared error at which a loop's influence fades."""
+
+    @staticmethod
+    def of(relative: RelativePoses, options: PoseGraphOptions) -> "RelativeTerm":
+        """With the kernel of the last stage."""
+        trust = 1 / options.drift if bool(relative.is_loop.any()) else 1.0
+        information = torch.where(
+            relative.is_loop[:, None], relative.information, trust * relative.information
+        )
+        return RelativeTerm(relative, information, options.loop_threshold)
+
+    def widened(self, width: float) -> "RelativeTerm":
+        """With a kernel so many times as wide."""
+        return replace(self, limit=width * self.limit)
+
+    def widths(self, state: GraphState, step: float) -> list[float]:
+        """Widening of the kernel's limit from stage to stage; the last is 1."""
+        widths = [1.0]
+        square = self.squares(relative_errors(state.S, self.relative))[self.relative.is_loop]
+        # Geman-McClure is convex up to a third of its squared threshold.
+        widest = 3 * float(square.max()) / self.limit if len(square) else 0.0
+        while widths[0] < widest:
+            widths.insert(0, widths[0] * step)
+        return widths
+
+    def squares(self, error: Float[Tensor, "e 7"]) -> Float[Tensor, "e"]:
+        """Squared errors in squared standard deviations."""
+        return (self.information * error.square()).sum(-1)
+
+    def robust_weights(self, error: Float[Tensor, "e 7"]) -> Float[Tensor, "e"]:
+        """Geman-McClure's weight (c^2 / (c^2 + |e|^2))^2 of loops, 1 of other edges."""
+        weight = (self.limit / (self.limit + self.squares(error))).square()
+        return torch.where(self.relative.is_loop, weight, torch.ones_like(weight))
+
+    def linearise(self, state: GraphState) -> "LinearRelative":
+        """As in the protocol."""
+        return LinearRelative(self, state.S)
+
+
+@dataclass(frozen=True)
+class LinearRelative:
+    """All relative poses at one state; they have no depths."""
+
+    term: RelativeTerm
+    S: Float[Tensor, "n 4 4"]
+
+    def equations(self, damping: float) -> BlockEquations:
+        """As in the protocol."""
+        relative = self.term.relative
+        e = relative_errors(self.S, relative)
+        J_i, J_j = relative_jacobians(relative, e)
+        W = self.term.information * self.term.robust_weights(e)[:, None]
+        i, j = relative.source, relative.target
+        WJ_i, WJ_j, r = W[..., None] * J_i, W[..., None] * J_j, (W * e)[..., None]
+        cross = J_i.mT @ WJ_j
+        gradient = torch.zeros(len(self.S), 7, dtype=torch.float64)
+        gradient.index_add_(0, i, -(J_i.mT @ r)[..., 0])
+        gradient.index_add_(0, j, -(J_j.mT @ r)[..., 0])
+        blocks = torch.cat([J_i.mT @ WJ_i, J_j.mT @ WJ_j, cross, cross.mT])
+        return BlockEquations(torch.cat([i, j, i, j]), torch.cat([i, j, j, i]), blocks, gradient)
+
+    def cost(self, state: GraphState) -> float:
+        """Sum of |e|^2 of trusted edges, of c^2 |e|^2 / (c^2 + |e|^2) of loops."""
+        term, limit = self.term, self.term.limit
+        square = term.squares(relative_errors(state.S, term.relative))
+        robust = torch.where(term.relative.is_loop, limit * square / (limit + square), square)
+        return float(robust.sum())
+
+    def depth_step(self, xi: Float[Tensor, "n 7"], damping: float) -> None:
+        """None."""
+
+
+def cost(state: GraphState, linear: Sequence[LinearTerm]) -> float:
+    """Sum over the terms."""
+    return sum(term.cost(state) for term in linear)
+
+
 class _Problem:
-    """Cost, weights and steps of one graph."""
+    """One graph as the least-squares loop sees it; its terms change from stage to stage."""
 
     def __init__(self, graph: PoseGraph, options: PoseGraphOptions) -> None:
         self.graph, self.options = graph, options
+        self.terms: list[GraphTerm] = []
         self._system: BlockSystem | None = None
         """Of the last step; the next has the same blocks."""
-        relative = graph.relative
-        trust = 1 / options.drift if bool(relative.is_loop.any()) else 1.0
-        self._information = torch.where(
-            relative.is_loop[:, None], relative.information, trust * relative.information
-        )
 
-    def widths(self, state: _State) -> list[float]:
-        """Widening of the kernel's threshold from stage to stage; the last is 1."""
-        relative, widths = self.graph.relative, [1.0]
-        square = self._squares(relative_errors(state.S, relative))[relative.is_loop]
-        # Geman-McClure is convex up to a third of its squared threshold.
-        widest = 3 * float(square.max()) / self.options.loop_threshold if len(square) else 0.0
-        while widths[0] < widest:
-            widths.insert(0, widths[0] * self.options.convexity_step)
-        return widths
+    def linearise(self, state: GraphState) -> list[LinearTerm]:
+        """All terms."""
+        return [term.linearise(state) for term in self.terms]
 
-    def weights(self, error: Float[Tensor, "e 7"], width: float) -> Float[Tensor, "e"]:
-        """Geman-McClure's factor (c^2 / (c^2 + |e|^2))^2 of loops, 1 of other edges."""
-        limit = width * self.options.loop_threshold
-        weight = (limit / (limit + self._squares(error))).square()
-        return torch.where(self.graph.relative.is_loop, weight, torch.ones_like(weight))
-
-    def cost(self, state: _State, width: float, valid: Bool[Tensor, "e p"]) -> float:
-        """Sum of |e|^2 of trusted edges, c^2 |e|^2 / (c^2 + |e|^2) of loops, Huber of matches."""
-        relative, limit = self.graph.relative, width * self.options.loop_threshold
-        square = self._squares(relative_errors(state.S, relative))
-        robust = torch.where(relative.is_loop, limit * square / (limit + square), square)
-        total = float(robust.sum())
-        if self.graph.matches is None:
-            return total
-        return total + match_cost(
-            self.graph.matches, state.S, state.inverse_depth, valid, self.options.matches
-        )
-
-    def descend(self, state: _State, width: float, iterations: int) -> tuple[_State, int]:
-        """Levenberg-Marquardt with one kernel; the new state and how many steps it took."""
-        damping, steps = self.options.damping, 0
-        linear = self.linearise(state, damping)
-        cost = self.cost(state, width, linear.valid)
-        while steps < iterations and damping <= self.options.max_damping:
-            candidate = self._step(state, width, linear, damping)
-            lowered = torch.inf if candidate is None else self.cost(candidate, width, linear.valid)
-            if candidate is None or not lowered < cost:
-                if candidate is not None and lowered - cost <= 1e-12 * cost:
-                    break
-                damping *= 10
-                linear = self.linearise(state, damping)
-                continue
-            gain = cost - lowered
-            state, steps = candidate, steps + 1
-            damping = max(damping / 10, self.options.damping)
-            linear = self.linearise(state, damping)
-            # Which matches are valid has changed with the state; without any nothing has.
-            cost = lowered if self.graph.matches is None else self.cost(state, width, linear.valid)
-            if gain <= self.options.tolerance * cost or cost < self.options.tolerance:
-                break
-        return state, steps
-
-    def linearise(self, state: _State, damping: float) -> LinearMatches:
-        """The matched edges at a state, their depths eliminated; nothing without any."""
-        if self.graph.matches is None:
-            index = torch.zeros(0, dtype=torch.long)
-            gradient = torch.zeros(len(state.S), 7, dtype=torch.float64)
-            none = BlockEquations(index, index, gradient.new_zeros(0, 7, 7), gradient)
-            return LinearMatches(none, (), torch.zeros(0, 0, dtype=torch.bool))
-        return linearise_matches(
-            self.graph.matches, state.S, state.inverse_depth, damping, self.options.matches
-        )
-
-    def _squares(self, error: Float[Tensor, "e 7"]) -> Float[Tensor, "e"]:
-        return (self._information * error.square()).sum(-1)
-
-    def _step(
-        self, state: _State, width: float, linear: LinearMatches, damping: float
-    ) -> _State | None:
-        """The state one damped step on; None where the system cannot be solved."""
-        parts = [self._relative_equations(state, width), linear.equations]
+    def step(
+        self, state: GraphState, linear: Sequence[LinearTerm], damping: float
+    ) -> Step[GraphState] | None:
+        """As in the protocol."""
+        parts = [term.equations(damping) for term in linear]
         if self.graph.is_metric:
-            parts = [_without_scale(part) for part in parts]
+            parts = [part.without_scale() for part in parts]
         xi = self._solve(parts, damping)
         if xi is None:
             return None
         S = torch.where(self.graph.fixed[:, None, None], state.S, retract(xi, state.S))
-        matches, limits = self.graph.matches, self.options.matches
-        if matches is None:
-            return _State(S, state.inverse_depth)
-        d = state.inverse_depth + depth_step(linear, xi, state.inverse_depth)
-        return _State(S, d.clamp(limits.min_inverse_depth, limits.max_inverse_depth))
+        d, limits = state.inverse_depth, self.options.matches
+        if d is not None:
+            steps = (term.depth_step(xi, damping) for term in linear)
+            d = sum((step for step in steps if step is not None), d)
+            d = d.clamp(limits.min_inverse_depth, limits.max_inverse_depth)
+        return Step(GraphState(S, d))
 
     def _solve(
         self, parts: Sequence[BlockEquations], damping: float
@@ -288,24 +302,3 @@ class _Problem:
             return None
         xi[free] = found
         return xi
-
-    def _relative_equations(self, state: _State, width: float) -> BlockEquations:
-        relative = self.graph.relative
-        e = relative_errors(state.S, relative)
-        J_i, J_j = relative_jacobians(relative, e)
-        W = self._information * self.weights(e, width)[:, None]
-        i, j = relative.source, relative.target
-        WJ_i, WJ_j, r = W[..., None] * J_i, W[..., None] * J_j, (W * e)[..., None]
-        cross = J_i.mT @ WJ_j
-        gradient = torch.zeros(len(state.S), 7, dtype=torch.float64)
-        gradient.index_add_(0, i, -(J_i.mT @ r)[..., 0])
-        gradient.index_add_(0, j, -(J_j.mT @ r)[..., 0])
-        blocks = torch.cat([J_i.mT @ WJ_i, J_j.mT @ WJ_j, cross, cross.mT])
-        return BlockEquations(torch.cat([i, j, i, j]), torch.cat([i, j, j, i]), blocks, gradient)
-
-
-def _without_scale(part: BlockEquations) -> BlockEquations:
-    """The same equations with nothing that moves a scale."""
-    rigid = torch.ones(7, dtype=torch.float64)
-    rigid[6] = 0
-    return replace(part, block=part.block * rigid[:, None] * rigid, gradient=part.gradient * rigid)

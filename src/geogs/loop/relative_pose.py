@@ -8,13 +8,15 @@ scale, this does not.
 """
 
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from geogs.bundle.linearise import weighed_residuals
+from geogs.bundle.flow_term import weighed_residuals
 from geogs.bundle.projection import LinearProjection, linearise
+from geogs.geometry.least_squares import Policy, Step, minimise
 from geogs.geometry.lie import move, se3_inverse
 from geogs.loop.matched_edges import MatchedEdges
 from geogs.world.grid import SampleGrid
@@ -27,24 +29,24 @@ class RelativePoseOptions:
 
     iterations: int = 8
     """At most."""
-    settled: float = 1e-6
+    converged: float = 1e-6
     """A step in which no number of a motion changes by more is the last."""
     huber: float = 3.0
     """Standard deviations beyond which a residual counts linearly."""
-    sure: float = 0.1
-    """1 / pixel^2: the weight from which a cell counts as matched."""
-    share: float = 0.01
-    """Of all cells that must be matched and in front of the target."""
+    min_weight: float = 0.1
+    """1 / pixel^2: from which a cell counts as matched."""
+    min_matched: float = 0.01
+    """Fraction of all cells that must be matched and in front of the target."""
     independent: float = 10.0
     """Measurements that the cells of an edge amount to, as neighbours err together; the source
     has 1. Measured: 30 or more on a rendered room."""
     damping: float = 1e-4
     """Added to the curvature of the six numbers of the motion, relative to its diagonal."""
-    least_turn: float = 2e-4
-    """Radians: no motion is surer than this, however well it fits; translation in the same
+    least_rotation: float = 2e-4
+    """Radians: least deviation of a motion, however well it fits; of a translation in the same
     proportion to the source's median depth."""
     least_scale: float = 2e-3
-    """No ratio of units is surer than this."""
+    """Least deviation of a ratio of units."""
     chunk: int = 24
     """Edges solved at a time; bounds memory."""
 
@@ -57,7 +59,7 @@ def relative_poses(
     options: RelativePoseOptions | None = None,
     start: Float[Tensor, "e 4 4"] | None = None,
 ) -> RelativePoses:
-    """Solve every edge; those with too few sure cells are left out.
+    """Solve every edge; those with too few matched cells are left out.
 
     Matches and depths may be on a GPU; poses are on the CPU, and so is the result.
 
@@ -65,8 +67,8 @@ def relative_poses(
 
     Covariance is ``sigma^2 diag(H^-1)`` with ``sigma^2 = sum w r^2`` divided not by the number of
     cells, but by ``options.independent``. A loop's scale is the median ratio of the depths at
-    matched cells; any other edge has scale 1, as unsure as its worst angle or its worst
-    translation relative to depth, whichever is less sure.
+    matched cells; any other edge has scale 1, with the deviation of its worst angle or of its
+    worst translation relative to depth, whichever is larger.
     """
     options = options or RelativePoseOptions()
     G, information, kept = [], [], []
@@ -97,29 +99,25 @@ def _solve_edges(
     options: RelativePoseOptions,
 ) -> tuple[Float[Tensor, "e 4 4"], Float[Tensor, "e 7"], Bool[Tensor, "e"]]:
     """Similarity, information and whether it is worth keeping, of each edge of a chunk."""
-    i, j = edges.source[chunk], edges.target[chunk]
-    pixels, weight, d = edges.pixels[chunk], edges.weight[chunk], edges.inverse_depth[i]
-    for _ in range(options.iterations):
-        p = linearise(edges.camera, edges.rays, T, d)
-        H, g, _ = _normal_equations(p, pixels, weight, options)
-        step = torch.linalg.solve(H, g).nan_to_num(0.0, 0.0, 0.0)
-        T = move(step, T)
-        if float(step.abs().max()) < options.settled:
-            break
-    p = linearise(edges.camera, edges.rays, T, d)
-    H, _, square = _normal_equations(p, pixels, weight, options)
+    j, weight = edges.target[chunk], edges.weight[chunk]
+    d = edges.inverse_depth[edges.source[chunk]]
+    linearised = partial(_linearised, edges, chunk, d, options.huber)
+    policy = Policy(options.iterations, options.damping, options.converged)
+    T = minimise(T, linearised, _step, policy).state
+    at = linearised(T)
+    p, H, square = at.projection, at.damped(options.damping), at.square
     variance = (
         square[:, None] / options.independent * torch.linalg.inv(H).diagonal(dim1=-2, dim2=-1)
     )
     depth = 1 / d.median(1).values.cpu().double()
-    least = options.least_turn**2 * torch.ones_like(variance)
+    least = options.least_rotation**2 * torch.ones_like(variance)
     least[:, :3] *= depth[:, None] ** 2
     variance = torch.maximum(variance, least)
     relative = torch.cat([variance[:, :3] / depth[:, None] ** 2, variance[:, 3:]], 1)
     scale_variance = relative.amax(1)
-    sure = (weight.mean(-1) > options.sure) & p.valid
+    matched = (weight.mean(-1) > options.min_weight) & p.valid
     if is_loop:
-        log_scale, measured = _depth_ratio(grid, edges, j, p, d, sure)
+        log_scale, measured = _depth_ratio(grid, edges, j, p, d, matched)
         known = torch.isfinite(log_scale)
         scale_variance = torch.where(known, measured, scale_variance)
         scale_variance = scale_variance.clamp(min=options.least_scale**2)
@@ -128,21 +126,46 @@ def _solve_edges(
         T[:, :3] *= scale[:, None, None]
         variance[:, :3] *= scale[:, None] ** 2
     information = 1 / torch.cat([variance, scale_variance[:, None]], 1)
-    keep = sure.double().mean(1).cpu() > options.share
+    keep = matched.double().mean(1).cpu() > options.min_matched
     keep = keep & torch.isfinite(information).all(1) & torch.isfinite(T).flatten(1).all(1)
     return T, information.nan_to_num(0.0, 0.0, 0.0), keep
 
 
-def _normal_equations(
-    p: LinearProjection, pixels: Tensor, weight: Tensor, options: RelativePoseOptions
-) -> tuple[Float[Tensor, "e 6 6"], Float[Tensor, "e 6"], Float[Tensor, "e"]]:
-    """Damped H, g and the robustly weighted sum of squared residuals; float64, on the CPU."""
-    r, w = weighed_residuals(p, pixels, weight, options.huber)
+@dataclass(frozen=True)
+class _LinearEdges:
+    """Edges at some motions; equations are float64 and on the CPU."""
+
+    projection: LinearProjection
+    hessian: Float[Tensor, "e 6 6"]
+    gradient: Float[Tensor, "e 6"]
+    square: Float[Tensor, "e"]
+    """Robustly weighted sum of squared residuals."""
+
+    def damped(self, damping: float) -> Float[Tensor, "e 6 6"]:
+        """The Hessians with raised diagonals."""
+        floor = damping * self.hessian.diagonal(dim1=-2, dim2=-1) + 1e-9
+        return self.hessian + torch.diag_embed(floor)
+
+
+def _linearised(
+    edges: MatchedEdges,
+    chunk: slice,
+    inverse_depth: Float[Tensor, "e p"],
+    huber: float,
+    T: Float[Tensor, "e 4 4"],
+) -> _LinearEdges:
+    p = linearise(edges.camera, edges.rays, T, inverse_depth)
+    r, w = weighed_residuals(p, edges.pixels[chunk], edges.weight[chunk], huber)
     wJ = (p.pose_jacobian * w.mT[:, None]).flatten(2)
     H = (wJ @ p.pose_jacobian.flatten(2).mT).cpu().double()
     g = (wJ @ r.mT.flatten(1)[..., None])[..., 0].cpu().double()
-    floor = options.damping * H.diagonal(dim1=-2, dim2=-1) + 1e-9
-    return H + torch.diag_embed(floor), g, (w * r.square()).sum((1, 2)).cpu().double()
+    return _LinearEdges(p, H, g, (w * r.square()).sum((1, 2)).cpu().double())
+
+
+def _step(T: Float[Tensor, "e 4 4"], linear: _LinearEdges, damping: float) -> Step[Tensor]:
+    """A motion whose step is not finite stays."""
+    step = torch.linalg.solve(linear.damped(damping), linear.gradient).nan_to_num(0.0, 0.0, 0.0)
+    return Step(move(step, T), float(step.abs().max()))
 
 
 def _depth_ratio(
@@ -151,16 +174,16 @@ def _depth_ratio(
     target: Int[Tensor, "e"],
     p: LinearProjection,
     inverse_depth: Float[Tensor, "e p"],
-    sure: Bool[Tensor, "e p"],
+    matched: Bool[Tensor, "e p"],
 ) -> tuple[Float[Tensor, "e"], Float[Tensor, "e"]]:
     """Log of a length in the target's unit over the same in the source's, and its variance.
 
-    The median over sure cells that fall into the target, and the square of the median deviation,
+    The median over matched cells that fall into the target, and the square of the median deviation,
     not divided by the number of cells. NaN where there is no such cell.
     """
     log_scale, variance = [], []
     for e, j in enumerate(target.tolist()):
-        at = sure[e] & grid.inside(p.pixels[e])
+        at = matched[e] & grid.inside(p.pixels[e])
         there = grid.sample_field(edges.inverse_depth[j][:, None], p.pixels[e][at])[:, 0]
         ratio = (inverse_depth[e][at] / (there * p.z[e][at])).double().log()
         centre = ratio.median() if len(ratio) else ratio.new_tensor(torch.nan)

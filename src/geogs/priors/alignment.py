@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from geogs.geometry.least_squares import Policy, Step, minimise
 from geogs.priors.base import DepthKind
 
 MIN_CELLS = 32
@@ -82,14 +83,21 @@ def _robust_line(
     if line is None:
         return None
     rows = torch.stack([x, torch.ones_like(x)], -1) / y[:, None]
-    for _ in range(_ROUNDS):
+
+    def linearised(line: Float[Tensor, "2"]) -> tuple[Tensor, Tensor]:
         error = rows @ line - 1
         width = _CUT * 1.4826 * _weighted_median(error.abs(), w) + 1e-6
         v = w / (1 + (error / width).square()).square()
         weighted = rows * v[:, None]
-        normal = rows.mT @ weighted
-        damping = 1e-9 * normal.diagonal()
-        line = torch.linalg.solve(normal + torch.diag(damping), weighted.sum(0))
+        return rows.mT @ weighted, weighted.sum(0)
+
+    def solved(
+        line: Float[Tensor, "2"], linear: tuple[Tensor, Tensor], damping: float
+    ) -> Step[Tensor]:
+        normal, right = linear
+        return Step(torch.linalg.solve(normal + torch.diag(damping * normal.diagonal()), right))
+
+    line = minimise(line, linearised, solved, Policy(_ROUNDS, damping=1e-9)).state
     a, b = line.tolist()
     return (a, b) if a > 0 and bool(torch.isfinite(line).all()) else None
 

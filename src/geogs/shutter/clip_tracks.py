@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
-from geogs.shutter.camera import RollingCamera
 from geogs.shutter.neighbours import Image
+from geogs.shutter.rolling_camera import RollingCamera
 from geogs.shutter.tracks import followed_points
 
 MOST_POINTS = 160

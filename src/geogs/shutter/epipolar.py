@@ -27,7 +27,7 @@ def relative_pose(
     Args:
         first: x/z and y/z of the matches in the first view.
         second: in the second view.
-        tolerance: error of an inlier, as a share of the focal length.
+        tolerance: error of an inlier, as a fraction of the focal length.
     """
     cv2.setRNGSeed(0)
     E, inliers = cv2.findEssentialMat(

@@ -3,13 +3,15 @@
 import numpy as np
 from jaxtyping import Bool, Float
 
+from geogs.geometry.least_squares import Policy, Step, minimise
+from geogs.geometry.robust import geman_mcclure_weight
+from geogs.shutter.clip_reconstruction import Reconstruction
 from geogs.shutter.clip_tracks import LEAST_POINTS, ClipTracks
 from geogs.shutter.epipolar import RelativePose, relative_pose
-from geogs.shutter.reconstruction import Reconstruction
 
 ROUNDS = 5
 """Gauss-Newton steps to the pose of an image."""
-LEAST_SHARE = 0.5
+LEAST_FRACTION = 0.5
 """Of the points, which both of the two views have to see."""
 _FEWEST = 8
 """Points that tell a pose; an image with fewer has that of the image before."""
@@ -20,14 +22,14 @@ def first_reconstruction(tracks: ClipTracks, tolerance: float) -> Reconstruction
 
     Args:
         tracks: of a clip.
-        tolerance: error of an inlier between two views, as a share of the focal length.
+        tolerance: error of an inlier between two views, as a fraction of the focal length.
 
     Returns:
         none where no two views agree on a motion.
     """
     count, n = tracks.seen.shape
     middle = tracks.middle
-    enough = np.flatnonzero(tracks.seen.sum(axis=1) >= max(LEAST_POINTS, LEAST_SHARE * n))
+    enough = np.flatnonzero(tracks.seen.sum(axis=1) >= max(LEAST_POINTS, LEAST_FRACTION * n))
     best, points = 0.0, None
     for far in {int(enough.min()), int(enough.max())} - {middle}:
         both = tracks.seen[far]
@@ -75,12 +77,20 @@ def _located(
     """The pose of one image, from that of a near one; the points stay where they are."""
     if seen.sum() < _FEWEST:
         return near
-    for _ in range(ROUNDS):
-        error = plane - near.projected()[0]
-        by_pose = near.derivatives_by_pose()[0].reshape(-1, 6)
-        weight = seen / (1 + (error**2).sum(1) / tolerance**2) ** 2
+
+    def linearised(at: Reconstruction) -> tuple[np.ndarray, np.ndarray]:
+        error = plane - at.projected()[0]
+        by_pose = at.derivatives_by_pose()[0].reshape(-1, 6)
+        weight = seen * geman_mcclure_weight((error**2).sum(1) / tolerance**2)
         weighted = np.repeat(weight, 2)[:, None] * by_pose
-        normal, right = weighted.T @ by_pose, weighted.T @ error.ravel()
-        step = np.linalg.solve(normal + (1e-6 * np.trace(normal) + 1e-12) * np.eye(6), right)
-        near = near.stepped(step[None], np.zeros_like(near.points))
-    return near
+        return weighted.T @ by_pose, weighted.T @ error.ravel()
+
+    def step(
+        at: Reconstruction, linear: tuple[np.ndarray, np.ndarray], damping: float
+    ) -> Step[Reconstruction]:
+        normal, right = linear
+        raised = normal + (damping * np.trace(normal) + 1e-12) * np.eye(6)
+        step = np.linalg.solve(raised, right)
+        return Step(at.stepped(step[None], np.zeros_like(at.points)))
+
+    return minimise(near, linearised, step, Policy(ROUNDS, damping=1e-6)).state

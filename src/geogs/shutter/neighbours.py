@@ -1,4 +1,4 @@
-"""The turning at each image of a video, from its flow to the images beside it."""
+"""The angular motion at each image of a video, from its flow to the images beside it."""
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
@@ -7,9 +7,9 @@ from typing import Generic, Protocol, TypeVar, runtime_checkable
 import numpy as np
 from jaxtyping import UInt8
 
-from geogs.shutter.camera import RollingCamera
+from geogs.shutter.angular_motion import AngularMotion, AngularStep, angular_motion_between
 from geogs.shutter.rates import FlowMeter, angular_velocity, parallax
-from geogs.shutter.turning import Step, Turning, turning_between
+from geogs.shutter.rolling_camera import RollingCamera
 
 
 @runtime_checkable
@@ -23,16 +23,16 @@ class Image(Protocol):
 
     @property
     def image(self) -> UInt8[np.ndarray, "h w 3"] | None:
-        """RGB, of the camera that the turning is asked of; none if it could not be read."""
+        """RGB, of the camera whose angular motion is asked for; none if it could not be read."""
         ...
 
 
 Picture = TypeVar("Picture", bound=Image)
 
 
-def with_turning(
+def with_angular_motion(
     images: Iterable[Picture], camera: RollingCamera, readout: float, wanted: Callable[[int], bool]
-) -> Iterator[tuple[Picture, Turning]]:
+) -> Iterator[tuple[Picture, AngularMotion]]:
     """Those images whose position is wanted, each with how the camera turned then.
 
     One image more than the one that is given has been read by then. What is given depends on an
@@ -46,17 +46,17 @@ def with_turning(
     """
     meter, position = FlowMeter(camera), -1
     last: _Seen[Picture] | None = None
-    before: Step | None = None
+    before: AngularStep | None = None
     for position, image in enumerate(images):
         here = _Seen(image, None if image.image is None else meter.small(image.image))
         after = None
         if last is not None and (wanted(position - 1) or wanted(position)):
             after = _step(meter, last, here, readout)
         if last is not None and wanted(position - 1):
-            yield last.image, turning_between(before, after)
+            yield last.image, angular_motion_between(before, after)
         before, last = after, here
     if last is not None and wanted(position):
-        yield last.image, turning_between(before, None)
+        yield last.image, angular_motion_between(before, None)
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class _Seen(Generic[Picture]):
 
 def _step(
     meter: FlowMeter, first: _Seen[Picture], second: _Seen[Picture], readout: float
-) -> Step | None:
+) -> AngularStep | None:
     interval = second.image.timestamp - first.image.timestamp
     if first.small is None or second.small is None or interval <= 0:
         return None
@@ -77,4 +77,4 @@ def _step(
     rate = angular_velocity(flow, interval, readout)
     if rate is None:
         return None
-    return Step(rate, interval, parallax(flow, rate, interval, readout))
+    return AngularStep(rate, interval, parallax(flow, rate, interval, readout))

@@ -8,8 +8,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from geogs.geometry.nearest_rotation import nearest_rotation
-from geogs.shutter.camera import RollingCamera
-from geogs.shutter.turning import rotated
+from geogs.geometry.robust import cauchy_weight
+from geogs.shutter.angular_motion import rotated
+from geogs.shutter.rolling_camera import RollingCamera
 
 LONG_EDGE = 256
 """Of the images that flow is measured on, at most, pixels."""
@@ -23,7 +24,7 @@ ROUNDS = 10
 SMOOTH = 1.0
 """Cells, standard deviation of the mean that parallax is smoothed by."""
 AGREEING = 0.2
-"""Share of the cells that have to agree with the rotation within twice the tolerance."""
+"""Fraction of the cells that have to agree with the rotation within twice the tolerance."""
 
 
 @dataclass(frozen=True)
@@ -92,9 +93,10 @@ def angular_velocity(
     """Mean radians per second between the middle rows of two images, in axes of the camera.
 
     The rotation that most cells agree on, by iteratively reweighted least squares (Cauchy's
-    weights, Procrustes' rotation). A point is seen in other rows of the two images, hence after
-    more or less than the interval: its rays are moved to the times of the middle rows by the
-    velocity itself.
+    weights, Procrustes' rotation). Each round has a closed solution, so that nothing is linearised
+    and the least-squares loop has no part in it. A point is seen in other rows of the two images,
+    hence after more or less than the interval: its rays are moved to the times of the middle rows
+    by the velocity itself.
 
     Args:
         flow: from the first image to the second.
@@ -115,7 +117,7 @@ def angular_velocity(
         rotation = nearest_rotation((second * weight[:, None]).T @ first)
         rate = _rotation_vector(rotation) / interval
         error = np.linalg.norm(second - first @ rotation.T, axis=1)
-        weight = flow.inside / (1 + (error / TOLERANCE) ** 2)
+        weight = flow.inside * cauchy_weight((error / TOLERANCE) ** 2)
     agreeing = (flow.inside & (error < 2 * TOLERANCE)).mean()
     return rate if agreeing >= AGREEING else None
 
@@ -123,7 +125,7 @@ def angular_velocity(
 def parallax(
     flow: RayFlow, rate: Float[np.ndarray, "3"], interval: float, readout: float
 ) -> tuple[Float[np.ndarray, "gh gw 2"], Float[np.ndarray, "gh gw 2"]]:
-    """What cells move beside a rotation, in the first image and carried to the second.
+    """What cells move beside a rotation, in the first image and propagated to the second.
 
     The translation of the camera, each cell at its own depth, and what moves by itself. It is
     smoothed over the cells around, by their median and a mean, and where nothing is known it comes

@@ -1,4 +1,4 @@
-"""How long a rolling shutter takes to read an image, told by the video itself.
+"""How long a rolling shutter takes to read an image, found in the video itself.
 
 Points are followed through clips of neighbouring images, and each clip is adjusted as a whole:
 poses, points, and one readout for all (``row_adjustment.py``). What tells it is that the velocity
@@ -9,15 +9,16 @@ stays the same. Errors of the matches change slowly and are hardly taken for it.
 import functools
 import itertools
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from geogs.shutter.camera import RollingCamera
+from geogs.geometry.least_squares import Policy, Step, minimise
+from geogs.shutter.clip_reconstruction import Reconstruction
 from geogs.shutter.clip_tracks import ClipTracks, clip_tracks
 from geogs.shutter.first_reconstruction import first_reconstruction
 from geogs.shutter.neighbours import Image
-from geogs.shutter.reconstruction import Reconstruction
+from geogs.shutter.rolling_camera import RollingCamera
 from geogs.shutter.row_adjustment import ReadoutEquation, readout_equation
 from geogs.threads import thread_map
 
@@ -27,26 +28,27 @@ CLIPS = 12
 """That are worth giving, from all over the video."""
 ENOUGH_CLIPS, ENOUGH = (5, 7, 9), 0.002
 """No more clips are looked at where so many leave a standard error of so many seconds."""
-SURE, SMALL = 3.0, 0.01
+CONFIDENT, SMALL = 3.0, 0.01
 """Nor where the readout is less than so many seconds by so many standard errors."""
 LONGEST_INTERVAL = 0.12
 """Seconds between two images; over more, nothing says how points move from one to the next."""
 FIRST_TOLERANCE = 1.2
 """Pixels of an inlier between the two views that a clip begins with."""
-EARLY_TOLERANCES, TOLERANCES = (4.0, 2.0, 1.2), (1.2, 0.6, 0.6, 0.3, 0.3, 0.3, 0.3, 0.3)
-"""Pixels of error at which a measurement counts for a quarter, of each step of the fit: of a clip
-alone as if its shutter were global, and of all together with the readout."""
+EARLY_TOLERANCES, TOLERANCES = (4.0, 2.0, 1.2), ((1.2, 1), (0.6, 2), (0.3, 5))
+"""Pixels of error at which a measurement counts for a quarter: of each step of the fit of a clip
+alone, as if its shutter were global, and of the stages of the fit of all together with the readout,
+with the number of their steps."""
 LARGEST_STEP = 0.015
 """Seconds."""
-SETTLED = 5e-5
+CONVERGED = 5e-5
 """Seconds of a step at the last tolerance after which there are no more."""
 MISFIT = 1.5
 """A clip whose error is so many times the median's is left out."""
 COMMON = 0.03
-"""Share of the error of the matches that they have in common, and that no number of them makes
+"""Fraction of the error of the matches that they have in common, and that no number of them makes
 less."""
 TREMOR = 0.02
-"""Share of the readout that is added for tremor between the images (jerks: 2 % too much)."""
+"""Fraction of the readout that is added for tremor between the images (jerks: 2 % too much)."""
 
 LONGEST, SHORTEST = 0.036, 0.002
 """Seconds of a readout that is believed; less is nothing to care about."""
@@ -86,6 +88,56 @@ class _Adjusted:
     reconstruction: Reconstruction
 
 
+@dataclass(frozen=True)
+class _Clips:
+    """What is adjusted: several clips and the readout that they have in common."""
+
+    clips: list[_Adjusted]
+    readout: float = 0.0
+    """Seconds."""
+    equations: list[ReadoutEquation] = field(default_factory=list)
+    """Of these clips, where they were linearised last."""
+
+    @property
+    def finite(self) -> list[_Adjusted]:
+        """The clips that have not diverged."""
+        return [c for c in self.clips if c.reconstruction.is_finite]
+
+
+@dataclass(frozen=True)
+class _CommonReadout:
+    """The least-squares problem of clips and their readout."""
+
+    tolerance: float
+    """Fraction of the focal length."""
+
+    def linearise(self, state: _Clips) -> _Clips:
+        """The clips that one readout may explain, with their equations; none if too few."""
+        clips = state.finite
+        if len(clips) < LEAST_CLIPS:
+            return _Clips([])
+        equations = thread_map(functools.partial(self._equation, state.readout), clips)
+        clips, equations = _fitting(clips, equations)
+        return _Clips(clips, state.readout, equations)
+
+    def _equation(self, readout: float, clip: _Adjusted) -> ReadoutEquation:
+        return readout_equation(clip.tracks, clip.reconstruction, readout, self.tolerance)
+
+    def step(self, state: _Clips, linear: _Clips, damping: float) -> Step[_Clips] | None:
+        """All clips after the step of the readout, which is limited."""
+        if not linear.clips:
+            return None
+        parts, readout = linear.equations, state.readout
+        step = sum(p.gradient for p in parts) / (sum(p.curvature for p in parts) + 1e-12)
+        step = float(np.clip(step, -LARGEST_STEP, LARGEST_STEP))
+        step = float(np.clip(readout + step, -1.5 * LONGEST, 1.5 * LONGEST)) - readout
+        moved = [
+            _Adjusted(c.tracks, part.stepped(c.reconstruction, step))
+            for c, part in zip(linear.clips, parts, strict=True)
+        ]
+        return Step(_Clips(moved, readout + step, parts), abs(step))
+
+
 def find_readout(
     clips: Iterable[Sequence[Image]],
     camera: RollingCamera,
@@ -111,7 +163,7 @@ def find_readout(
             break
         if enough in ENOUGH_CLIPS:
             found = _verdict(adjusted, focal)
-            if found.error <= ENOUGH or found.best + SURE * found.error < SMALL:
+            if found.error <= ENOUGH or found.best + CONFIDENT * found.error < SMALL:
                 break
     report(1.0)
     return found if found.clips == len(adjusted) else _verdict(adjusted, focal)
@@ -137,40 +189,37 @@ def _started(clip: Sequence[Image], camera: RollingCamera) -> _Adjusted | None:
     for tolerance in EARLY_TOLERANCES:
         if not start.is_finite:
             return None
-        start = readout_equation(tracks, start, 0.0, tolerance / focal).stepped(start, 0.0)
+        equation = functools.partial(
+            readout_equation, tracks, readout=0.0, tolerance=tolerance / focal
+        )
+        start = minimise(start, equation, _global_shutter_step, Policy(1)).state
     return _Adjusted(tracks, start)
+
+
+def _global_shutter_step(
+    at: Reconstruction, equation: ReadoutEquation, damping: float
+) -> Step[Reconstruction]:
+    return Step(equation.stepped(at, 0.0))
 
 
 def _verdict(clips: list[_Adjusted], focal: float) -> FoundReadout:
     """The readout that fits all clips best, and whether it is believed."""
-    readout, parts = 0.0, list[ReadoutEquation]()
-    for tolerance in TOLERANCES:
-        clips = [c for c in clips if c.reconstruction.is_finite]
-        if len(clips) < LEAST_CLIPS:
-            return FoundReadout(clips=len(clips))
-        equation = functools.partial(_equation, readout=readout, tolerance=tolerance / focal)
-        parts = thread_map(equation, clips)
-        clips, parts = _fitting(clips, parts)
-        step = sum(p.gradient for p in parts) / (sum(p.curvature for p in parts) + 1e-12)
-        step = float(np.clip(step, -LARGEST_STEP, LARGEST_STEP))
-        step = float(np.clip(readout + step, -1.5 * LONGEST, 1.5 * LONGEST)) - readout
-        readout += step
-        clips = [
-            _Adjusted(c.tracks, part.stepped(c.reconstruction, step))
-            for c, part in zip(clips, parts, strict=True)
-        ]
-        if tolerance == TOLERANCES[-1] and abs(step) < SETTLED:
-            break
+    state = _Clips(clips)
+    for tolerance, steps in TOLERANCES:
+        is_last = tolerance == TOLERANCES[-1][0]
+        policy = Policy(steps, tolerance=CONVERGED if is_last else 0.0)
+        common = _CommonReadout(tolerance / focal)
+        solution = minimise(state, common.linearise, common.step, policy)
+        state = solution.state
+        if not solution.finite:
+            return FoundReadout(clips=len(state.finite))
+    readout, parts = state.readout, state.equations
     if len(parts) < LEAST_CLIPS:
         return FoundReadout(clips=len(parts))
     error = float(np.hypot(_standard_error(parts), TREMOR * readout))
-    sure = error <= LARGEST_ERROR and readout >= LEAST_EVIDENCE * error
-    believed = sure and SHORTEST <= readout <= LONGEST
-    return FoundReadout(readout if believed else 0.0, readout, error, len(clips))
-
-
-def _equation(clip: _Adjusted, readout: float, tolerance: float) -> ReadoutEquation:
-    return readout_equation(clip.tracks, clip.reconstruction, readout, tolerance)
+    confident = error <= LARGEST_ERROR and readout >= LEAST_EVIDENCE * error
+    believed = confident and SHORTEST <= readout <= LONGEST
+    return FoundReadout(readout if believed else 0.0, readout, error, len(state.clips))
 
 
 def _fitting(

@@ -11,15 +11,16 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from geogs.geometry.robust import geman_mcclure_weight
+from geogs.shutter.clip_reconstruction import Reconstruction
 from geogs.shutter.clip_tracks import ClipTracks
-from geogs.shutter.reconstruction import Reconstruction
 
 NODES = 5
 """Images whose poses say where a point is between them. Fewer make little of quick tremor and the
 readout too long for it: of 27.6 ms, jerks tell 28.2 with five, 27.6 with nine. More make much of
 the poses' own errors, which say that nothing is sheared, where the true motion is steady."""
 DAMPING = 1e-6
-"""Share that is added to the curvatures of poses and points."""
+"""Fraction that is added to the curvatures of poses and points."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +36,7 @@ class ReadoutEquation:
     square: float
     """Weighted sum of squared errors."""
     still: tuple[Float[np.ndarray, "k 6"], Float[np.ndarray, "n 3"]]
-    """Steps of poses and points, the readout being held."""
+    """Steps of poses and points, the readout being fixed."""
     by_readout: tuple[Float[np.ndarray, "k 6"], Float[np.ndarray, "n 3"]]
     """By how much more they step for each second that the readout grows."""
 
@@ -54,21 +55,21 @@ def readout_equation(
         tracks: what is seen.
         at: poses and points.
         readout: seconds.
-        tolerance: error at which a measurement counts for a quarter, share of the focal length.
+        tolerance: error at which a measurement counts for a quarter, fraction of the focal length.
     """
     count = len(tracks.times)
     nodes = _nodes(count)
-    share, slope = interpolation(tracks, readout), interpolation_slope(tracks, readout)
+    blend, slope = interpolation(tracks, readout), interpolation_slope(tracks, readout)
     around = at.projected()[nodes]
-    error = tracks.plane - _blended(share, around)
+    error = tracks.plane - _blended(blend, around)
     square = (error**2).sum(axis=-1)
-    weight = tracks.seen / (1 + square / tolerance**2) ** 2 / tolerance**2
+    weight = tracks.seen * geman_mcclure_weight(square / tolerance**2) / tolerance**2
     root = np.sqrt(weight)
     by_own_pose, by_own_point = at.derivatives()
     by_poses = np.empty((*tracks.seen.shape, 2, NODES, 6))
     by_point = np.zeros_like(by_own_point)
     for j, node in enumerate(nodes.T):
-        part = (root * share[..., j])[..., None, None]
+        part = (root * blend[..., j])[..., None, None]
         np.multiply(part, by_own_pose[node], out=by_poses[..., j, :])
         by_point += part * by_own_point[node]
     other = root[..., None, None] * np.stack([error, _blended(slope, around)], axis=-1)
@@ -103,21 +104,21 @@ def _eliminated(
     root = np.linalg.cholesky(np.linalg.inv(normal))
     # What an image sees concerns the poses around it alone, so each adds to few columns.
     size = 6 * count + 2
-    H, told = np.zeros((size, size)), np.zeros((n, 3, size))
+    H, by_points = np.zeros((size, size)), np.zeros((n, 3, size))
     for own, point, nodes in zip(joined, by_point @ root, _nodes(count), strict=True):
         columns = np.r_[6 * nodes[0] : 6 * nodes[-1] + 6, size - 2 : size]
         flat = own.reshape(2 * n, -1)
         H[columns[:, None], columns] += flat.T @ flat
-        told[..., columns] += np.swapaxes(point, 1, 2) @ own
+        by_points[..., columns] += np.swapaxes(point, 1, 2) @ own
     kept = np.append(np.repeat(free, 6), [True, True])
-    told = told[..., kept]
-    flat = told.reshape(3 * n, -1)
+    by_points = by_points[..., kept]
+    flat = by_points.reshape(3 * n, -1)
     H = H[np.ix_(kept, kept)] - flat.T @ flat
     poses = H[:-2, :-2] + np.diag(DAMPING * H.diagonal()[:-2] + 1e-7 * H.diagonal()[:-2].mean())
     for_error, for_readout = np.linalg.solve(poses, H[:-2, -2:]).T
     steps = []
     for step, column in ((for_error, -2), (for_readout, -1)):
-        left = told[..., column] - told[..., :-2] @ step
+        left = by_points[..., column] - by_points[..., :-2] @ step
         points = (root @ left[..., None])[..., 0]
         all_poses = np.zeros((count, 6))
         all_poses[free] = step.reshape(-1, 6)
@@ -129,12 +130,12 @@ def _eliminated(
 
 
 def _blended(
-    share: Float[np.ndarray, "k n j"], around: Float[np.ndarray, "k j n 2"]
+    weights: Float[np.ndarray, "k n j"], around: Float[np.ndarray, "k j n 2"]
 ) -> Float[np.ndarray, "k n 2"]:
     """Sums over the nodes."""
-    blended = share[..., 0, None] * around[:, 0]
+    blended = weights[..., 0, None] * around[:, 0]
     for j in range(1, NODES):
-        blended += share[..., j, None] * around[:, j]
+        blended += weights[..., j, None] * around[:, j]
     return blended
 
 
@@ -145,20 +146,20 @@ def _nodes(count: int) -> Int[np.ndarray, "k j"]:
 
 
 def interpolation(tracks: ClipTracks, readout: float) -> Float[np.ndarray, "k n j"]:
-    """Shares that the nodes have in the place of a point at the time of its row (Lagrange)."""
+    """Weights of the nodes in where a point is at the time of its row (Lagrange)."""
     when = tracks.times[:, None] + readout * tracks.line_times
     at = tracks.times[_nodes(len(tracks.times))].T[..., None]
     ahead = when - at
-    shares = np.ones((*when.shape, NODES))
+    weights = np.ones((*when.shape, NODES))
     for j in range(NODES):
         for other in range(NODES):
             if other != j:
-                shares[..., j] *= ahead[other] / (at[j] - at[other])
-    return shares
+                weights[..., j] *= ahead[other] / (at[j] - at[other])
+    return weights
 
 
 def interpolation_slope(tracks: ClipTracks, readout: float) -> Float[np.ndarray, "k n j"]:
-    """Derivatives of the shares by the readout, 1 / s."""
+    """Derivatives of the weights by the readout, 1 / s."""
     small = 5e-4
     after, before = (interpolation(tracks, readout + by) for by in (small, -small))
     return (after - before) / (2 * small)

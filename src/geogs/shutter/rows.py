@@ -6,9 +6,9 @@ import torch
 from jaxtyping import Float
 
 from geogs.geometry.camera import Camera
-from geogs.shutter.camera import RollingCamera
+from geogs.shutter.angular_motion import AngularMotion, rotated
+from geogs.shutter.rolling_camera import RollingCamera
 from geogs.shutter.shutter import Shutter
-from geogs.shutter.turning import Turning, rotated
 from geogs.types import SeenRows
 
 CELL = 8
@@ -37,19 +37,19 @@ class RowOffsets:
         self._pixels = np.stack([u, v], axis=1)
         self._still = rolling.pixels(self._rays)
 
-    def nodes(self, turning: Turning, readout: float) -> Float[np.ndarray, "n 2"]:
+    def nodes(self, motion: AngularMotion, readout: float) -> Float[np.ndarray, "n 2"]:
         """Offsets in pixels of the rolling image at the nodes, row by row."""
         pixels = self._still
         velocity = None
-        if turning.parallax is not None:
-            velocity = self._sampled(turning.parallax)
+        if motion.parallax is not None:
+            velocity = self._sampled(motion.parallax)
             # What the rate's change within a readout leaves of the rotation is not parallax.
-            doubt = abs(readout) * np.linalg.norm(turning.acceleration)
+            error = abs(readout) * np.linalg.norm(motion.acceleration)
             square = (velocity**2).sum(1, keepdims=True)
-            velocity *= square / np.maximum(square + doubt**2, 1e-12)
+            velocity *= square / np.maximum(square + error**2, 1e-12)
         for _ in range(ROUNDS):
             times = readout * self._rolling.line_times(pixels)
-            rays = rotated(self._rays, turning.angles(times))
+            rays = rotated(self._rays, motion.angles(times))
             if velocity is not None:
                 rays[:, :2] += times[:, None] * velocity * rays[:, 2:]
             pixels = self._rolling.pixels(rays)
@@ -67,14 +67,14 @@ class RowOffsets:
         )  # fmt: skip
         return values[:, 0].astype(np.float64)
 
-    def __call__(self, turning: Turning, readout: float) -> Float[np.ndarray, "h w 2"]:
+    def __call__(self, motion: AngularMotion, readout: float) -> Float[np.ndarray, "h w 2"]:
         """Offsets in pixels of the rolling image at every pixel of the rectified one.
 
         Args:
-            turning: of the camera, at this image.
+            motion: of the camera, at this image.
             readout: seconds from the first to the last row.
         """
-        return self.dense(self.nodes(turning, readout))
+        return self.dense(self.nodes(motion, readout))
 
     def dense(self, nodes: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "h w 2"]:
         """Offsets at every pixel of the rectified image from those at the nodes."""

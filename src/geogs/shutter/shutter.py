@@ -18,7 +18,7 @@ class Shutter:
     origin: str = "taken for a global shutter"
     """Where that comes from, for the log and ``intrinsics.json``."""
     error: float = 0.0
-    """Standard error where the video told it, seconds."""
+    """Standard error where the video gave it, seconds."""
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.readout) and abs(self.readout) <= LONGEST):

@@ -69,7 +69,7 @@ def certainty(tracker: Tracker) -> Certainty:
         squares = found.pose.diagonal(dim1=-2, dim2=-1).reshape(-1, 2, 3).sum(-1).numpy()
         squares = squares + carried
         position[part], rotation[part] = np.sqrt(squares).T
-        depth[part], strain[part] = found.depth_deviation.numpy(), found.strain.numpy()
+        depth[part], strain[part] = found.depth_deviation.numpy(), found.normalised_residual.numpy()
         carried = squares[-1] if not tracker.segment.fixed else carried
     return Certainty(tuple(ids), position, rotation, depth, strain)
 
@@ -85,4 +85,4 @@ def _marginals(tracker: Tracker, ids: list[int]) -> Marginals | None:
     grid = tracker.keyframes.grid
     found = marginals(grid, problem, BundleOptions(huber=HUBER), cells=512)
     own = torch.tensor([frames.index(k) for k in ids])
-    return Marginals(found.pose[own], found.relative_depth[own], found.strain[own])
+    return Marginals(found.pose[own], found.relative_depth[own], found.normalised_residual[own])

@@ -10,6 +10,10 @@ the last sum over neighbouring nodes. HI-SLAM2 has 2 x 2 nodes without that last
 alpha as a number that belongs to its network's weights. Here weights of flow are inverse variances,
 so alpha is one, too: 1 / (deviation * d)^2; and with more nodes, held together by their usual
 differences, the prior lends its shape and the matches around a bare wall lend their scale.
+
+It is no term of :mod:`geogs.bundle` and does not go through its loop: a single step is taken, whose
+elimination is formed so that it does not cancel, and what is repeated is the judgement of the prior
+from the same start.
 """
 
 from dataclasses import dataclass
@@ -19,7 +23,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from geogs.bundle.linearise import weighed_residuals
+from geogs.bundle.flow_term import weighed_residuals
 from geogs.bundle.problem import BundleProblem
 from geogs.bundle.projection import linearise, relative_motion
 from geogs.config import PriorConfig
@@ -82,7 +86,7 @@ class DepthScaleStep:
 
 
 def node_weights(grid: SampleGrid, rows: int, columns: int) -> Float[Tensor, "p k"]:
-    """Share B of each node's scale in each cell; rows sum to one."""
+    """Weight B of each node's scale in each cell; rows sum to one."""
     y, x = (_hats(n, k, grid) for n, k in ((grid.height, rows), (grid.width, columns)))
     return torch.einsum("hr,wc->hwrc", y, x).reshape(grid.size, rows * columns)
 
@@ -206,11 +210,13 @@ def adjust_depth(
         error = torch.where(known, wanted / fitted.clamp(min=1e-12) - 1, 0.0)
         own = (deviation * fitted).square() + 1 / C.clamp(min=1e-12)
         trust = 1 / (1 + (error * fitted).square() / (_CAUCHY**2 * own))
-        sure = known * C / (C + _prior_weight(prior, start, basis, deviation).clamp(min=1e-12))
-        deviation = local_deviation(grid, error, sure)
+        confidence = (
+            known * C / (C + _prior_weight(prior, start, basis, deviation).clamp(min=1e-12))
+        )
+        deviation = local_deviation(grid, error, confidence)
         bent = _ROUGHNESS * roughness(grid, (start + step.scale) @ basis.mT)
         deviation = torch.hypot(deviation, bent)
-    overall = _weighted_quantile(error.abs(), sure, _AGREEING)
+    overall = _weighted_quantile(error.abs(), confidence, _AGREEING)
     used = (deviation < MAX_DEVIATION) & (overall < MAX_DISAGREEMENT)[:, None]
     used &= (start + step.scale > 0).all(1, keepdim=True)
     alpha = torch.where(used, trust * _prior_weight(prior, start, basis, deviation), 0.0)
@@ -229,17 +235,17 @@ def adjust_depth(
 def local_deviation(
     grid: SampleGrid,
     error: Float[Tensor, "n p"],
-    sure: Float[Tensor, "n p"],
+    confidence: Float[Tensor, "n p"],
 ) -> Float[Tensor, "n p"]:
-    """Relative deviation of the prior in every cell, by its errors in sure cells around it.
+    """Relative deviation of the prior in every cell, by its errors in well-known cells around it.
 
     The root of a weighted mean of squared errors in windows of three sizes, the smaller the more
-    it counts, and of that of a good prior, which stands alone where nothing is sure. ``sure`` in
-    [0, 1] says how well the matches know a cell, beside the prior.
+    it counts, and of that of a good prior, which stands alone where nothing is known.
+    ``confidence`` in [0, 1] says how well the matches know a cell, beside the prior.
     """
     shape = (-1, grid.height, grid.width)
-    square = (sure * error.square().clamp(max=1.0)).reshape(shape)
-    both = torch.cat([square, sure.reshape(shape)])
+    square = (confidence * error.square().clamp(max=1.0)).reshape(shape)
+    both = torch.cat([square, confidence.reshape(shape)])
     around = torch.full_like(both, _BELIEF, dtype=torch.float64)
     around[: len(square)] *= DEVIATION**2
     for multiple, cells in _EVIDENCE:
@@ -288,10 +294,10 @@ def _prior_weight(
 
 
 def _weighted_quantile(
-    values: Float[Tensor, "n p"], weight: Float[Tensor, "n p"], share: float
+    values: Float[Tensor, "n p"], weight: Float[Tensor, "n p"], fraction: float
 ) -> Float[Tensor, "n"]:
-    """Of every row, the value below which that share of its weight lies; NaN without weight."""
+    """The value of every row below which that fraction of its weight lies; NaN without weight."""
     ordered, order = values.sort(dim=1)
     total = weight.gather(1, order).cumsum(1)
-    place = torch.searchsorted(total, share * total[:, -1:]).clamp(max=values.shape[1] - 1)
+    place = torch.searchsorted(total, fraction * total[:, -1:]).clamp(max=values.shape[1] - 1)
     return torch.where(total[:, -1] > 0, ordered.gather(1, place)[:, 0], torch.nan)

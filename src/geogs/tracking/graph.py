@@ -8,7 +8,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from geogs.bundle.base import BundleOptions, BundleResult
-from geogs.bundle.problem import BundleProblem, MeasuredDepths, StreamedProblem
+from geogs.bundle.depth_terms import DepthDamping, MeasuredDepths
+from geogs.bundle.problem import BundleProblem, StreamedProblem
 from geogs.bundle.projection import project
 from geogs.bundle.select import (
     bundle_solver,
@@ -183,6 +184,11 @@ class FrameGraph:
             pixels, weight = edge_matches(self.keyframes.grid, edges[part])
             return pixels, still_weight(self.keyframes, directed[part], pixels, weight)
 
+        depth_terms = (
+            _frame_damping(edges, [slot[i] for i, _ in directed], len(ids)),
+            _measured([self.keyframes[k] for k in ids]),
+        )
+        motions = None if self.odometry is None else self.odometry.between(ids)
         problem = StreamedProblem(
             T_cw=self.keyframes.poses(ids),
             inverse_depth=self.keyframes.inverse_depths(ids),
@@ -191,9 +197,8 @@ class FrameGraph:
             matches=matches,
             free_pose=torch.tensor([k in poses for k in ids]),
             free_depth=torch.tensor([k in depths for k in ids]),
-            damping=_frame_damping(edges, [slot[i] for i, _ in directed], len(ids)),
-            measured=_measured([self.keyframes[k] for k in ids]),
-            motions=None if self.odometry is None else self.odometry.between(ids),
+            depth_terms=tuple(term for term in depth_terms if term is not None),
+            pose_terms=() if motions is None else (motions,),
         )
         return problem, ids
 
@@ -302,7 +307,7 @@ def _in_parts(
 
 def _frame_damping(
     edges: Sequence[Edge], source: Sequence[int], frames: int
-) -> Float[Tensor, "n p"] | None:
+) -> DepthDamping | None:
     """Damping of each frame: the mean over the edges that leave it; None where there is none."""
     given = [(e.damping, n) for e, n in zip(edges, source, strict=True) if e.damping is not None]
     if not given:
@@ -315,4 +320,4 @@ def _frame_damping(
         share = torch.nn.functional.one_hot(torch.tensor([n for _, n in part]), frames).float()
         share = share / count.clamp(min=1)
         total = total + share.mT.to(damping) @ damping
-    return total
+    return DepthDamping(total)

@@ -10,7 +10,7 @@ from itertools import pairwise
 
 import torch
 
-from geogs.bundle.measured_motions import MeasuredMotions
+from geogs.bundle.motion_term import MeasuredMotions
 from geogs.config import OdometryConfig
 from geogs.geometry.lie import se3_inverse
 from geogs.priors.odometry import ScaleVote, information_of, vote_on_scale

@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
+from geogs.geometry.least_squares import Policy, Step, minimise
 from geogs.geometry.nearest_rotation import nearest_rotation
 from geogs.tracking.initialise import rays_through, relative_pose
 from geogs.types import FlowMatch
@@ -111,14 +112,28 @@ def fit_rotation(grid: SampleGrid, match: FlowMatch) -> RotationFit | None:
     first, second = (x / np.linalg.norm(x, axis=1, keepdims=True) for x in (rays, seen))
     R = nearest_rotation(second.T @ first)
     some = slice(None, None, -(-len(pixels) // MOST_CELLS))
+    H = np.zeros((3, 3))
     for reach in SHARPENED:
-        for _ in range(2):
+
+        def linearised(
+            R: Float64[np.ndarray, "3 3"], reach: float = reach
+        ) -> Float64[np.ndarray, "3"]:
+            """The gradient; the Hessian is kept, also for what is said of the deviation."""
+            nonlocal H
             error, J = _linearised(rays[some] @ R.T, pixels[some], focal, centre)
-            say = weight[some] / (1 + (error**2).sum(1, keepdims=True) / (reach * edge) ** 2) ** 2
-            weighed = (say[..., None] * J).reshape(-1, 3).T
-            H = weighed @ J.reshape(-1, 3)
-            step = np.linalg.solve(H + 1e-9 * np.eye(3), weighed @ error.reshape(-1))
-            R = _exponential(step) @ R
+            square = (error**2).sum(1, keepdims=True) / (reach * edge) ** 2
+            robust = weight[some] / (1 + square) ** 2
+            weighted = (robust[..., None] * J).reshape(-1, 3).T
+            H = weighted @ J.reshape(-1, 3)
+            gradient: Float64[np.ndarray, "3"] = weighted @ error.reshape(-1)
+            return gradient
+
+        def step(
+            R: Float64[np.ndarray, "3 3"], gradient: Float64[np.ndarray, "3"], damping: float
+        ) -> Step[Float64[np.ndarray, "3 3"]]:
+            return Step(_exponential(np.linalg.solve(H + damping * np.eye(3), gradient)) @ R)
+
+        R = minimise(R, linearised, step, Policy(2, damping=1e-9)).state
     error, _ = _linearised(rays @ R.T, pixels, focal, centre)
     agreeing = float((np.linalg.norm(error, axis=1) < TOLERANCE * edge).mean())
     H *= len(pixels) / len(pixels[some])

@@ -11,18 +11,20 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from geogs.bundle.camera_system import PoseSums, SparseCameraSystem
-from geogs.bundle.dense import stepped
-from geogs.bundle.problem import source_chunks
+from geogs.bundle.dense import FLOOR
+from geogs.bundle.schur import stepped
 from geogs.bundle.select import grid_fields
-from geogs.bundle.streamed import StreamedBundle
+from geogs.bundle.streamed import StreamedSchur
+from geogs.bundle.terms import BundleState
 from geogs.config import Config
 from geogs.geometry.camera import Camera
+from geogs.geometry.least_squares import Policy, Step, minimise
 from geogs.geometry.lie import move
-from geogs.loop.global_bundle import ROUNDS, SETTLED, global_options
+from geogs.loop.global_bundle import CONVERGED, ROUNDS, global_options
 from geogs.threads import on_one_torch_thread
 from geogs.tracking.flow.operator_choice import build_operator
 from geogs.tracking.graph import FrameGraph
@@ -84,10 +86,19 @@ def adjusted(
     adjustment = _Adjustment(now, _beside(gauge), camera, config, workers, folder)
     folder.mkdir(parents=True, exist_ok=True)
     for _ in range(ROUNDS):
-        if adjustment.match() <= SETTLED * adjustment.pairs:
+        if adjustment.match() <= CONVERGED * adjustment.pairs:
             break
         adjustment.solve()
     return {n: replace(placements[n], T_cw=member.T_cw) for n, member in adjustment.members.items()}
+
+
+@dataclass(frozen=True)
+class _Poses:
+    """The poses of all keyframes, and the step to them that the depths have not followed yet."""
+
+    T_cw: Float[Tensor, "m 4 4"]
+    before: Float[Tensor, "m 4 4"] | None = None
+    step: Float[Tensor, "m 6"] | None = None
 
 
 class _Adjustment:
@@ -138,36 +149,30 @@ class _Adjustment:
         return sum(f.fresh for f in found)
 
     def solve(self) -> None:
-        """Gauss-Newton steps until they are small."""
+        """Gauss-Newton steps until they are small, and the depths after the last of them."""
+        options = global_options()
+        policy = Policy(options.iterations, options.damping, options.tolerance)
+        poses = _AllPoses(self)
+        found = minimise(_Poses(self.poses()), poses.linearise, poses.step, policy)
+        if found.finite:
+            self.follow(found.state, is_last=True)
+
+    def ends_of_edges(self) -> tuple[Int[Tensor, "e"], Int[Tensor, "e"]]:
+        """Sources and targets by the numbers of the whole, sorted by source."""
         first = np.zeros(max(self.first) + 1, np.int64)
         first[list(self.first)] = list(self.first.values())
         source, target = (first[self.ends[:, k]] + self.ends[:, k + 1] for k in (0, 2))
         order = np.argsort(source, kind="stable")
-        free = torch.arange(self.keyframes) > 0
-        source, target = source[order], target[order]
-        system = SparseCameraSystem(torch.from_numpy(source), torch.from_numpy(target), free)
-        options = global_options()
-        T, step = self._poses(), None
-        for _ in range(options.iterations):
-            system.clear()
-            for sums in self._follow(T, step):
-                if sums is not None:
-                    system.add_elsewhere_summed(sums)
-            T, step = self._poses(), system.solve(options.damping)
-            if not bool(torch.isfinite(step).all()):
-                return
-            moved = move(step, T)
-            self.members = {
-                n: replace(m, T_cw=moved[self.first[n] :][: len(m.T_cw)])
-                for n, m in self.members.items()
-            }
-            if float(step.abs().max()) < options.tolerance:
-                break
-        self._follow(T, step, is_last=True)
+        return torch.from_numpy(source[order]), torch.from_numpy(target[order])
 
-    def _follow(
-        self, T_before: Tensor, step: Tensor | None, is_last: bool = False
-    ) -> list[PoseSums | None]:
+    def place(self, T_cw: Float[Tensor, "m 4 4"]) -> None:
+        """Give all keyframes other poses."""
+        self.members = {
+            n: replace(m, T_cw=T_cw[self.first[n] :][: len(m.T_cw)])
+            for n, m in self.members.items()
+        }
+
+    def follow(self, poses: "_Poses", is_last: bool = False) -> list[PoseSums | None]:
         """Bring the depths after a step; what the parts say of the next."""
         jobs = []
         for n, own in self.members.items():
@@ -177,10 +182,10 @@ class _Adjustment:
             jobs.append(
                 StepJob(
                     own, others, first, leaving, self.camera, self.config,
-                    self._new(f"depths-{n}"), None if step is None else T_before, step, is_last,
+                    self._new(f"depths-{n}"), poses.before, poses.step, is_last,
                 )
             )  # fmt: skip
-        self.steps += step is not None
+        self.steps += poses.step is not None
         said = self.workers.map(f"adjusting, {self.steps} steps", follow, [(job,) for job in jobs])
         for job in jobs:
             if job.own.adjusted is not None:
@@ -188,13 +193,43 @@ class _Adjustment:
             self.members[job.own.number] = replace(job.own, adjusted=job.after)
         return said
 
-    def _poses(self) -> Float[Tensor, "m 4 4"]:
+    def poses(self) -> Float[Tensor, "m 4 4"]:
+        """Of all keyframes."""
         return torch.cat([member.T_cw for member in self.members.values()])
 
     def _new(self, name: str) -> Path:
         """A file that no job has written: one that is done again finds what the first found."""
         self.written += 1
         return self.folder / f"{name}-{self.written}.npz"
+
+
+class _AllPoses:
+    """The least-squares problem of all poses; the parts keep the depths."""
+
+    def __init__(self, adjustment: _Adjustment) -> None:
+        self.adjustment = adjustment
+        free = torch.arange(adjustment.keyframes) > 0
+        self.system = SparseCameraSystem(*adjustment.ends_of_edges(), free)
+
+    def linearise(self, state: _Poses) -> SparseCameraSystem:
+        """The depths of all parts follow the last step; what these then say of the poses."""
+        self.system.clear()
+        for sums in self.adjustment.follow(state):
+            if sums is not None:
+                self.system.add_elsewhere_summed(sums)
+        return self.system
+
+    def step(
+        self, state: _Poses, linear: SparseCameraSystem, damping: float
+    ) -> Step[_Poses] | None:
+        """As the loop asks for it; the parts' keyframes move at once."""
+        found = linear.solve(damping, FLOOR)
+        if found is None:
+            return None
+        xi = found.reshape(-1, 6)
+        moved = move(xi, state.T_cw)
+        self.adjustment.place(moved)
+        return Step(_Poses(moved, state.T_cw, xi), float(xi.abs().max()))
 
 
 @on_one_torch_thread
@@ -207,23 +242,21 @@ def follow(job: StepJob) -> PoseSums | None:
     graph, nodes = _known_graph(job, grid)
     own = graph.keyframes.ids[: len(job.own.T_cw)]
     problem, ids = graph.streamed_problem(list(graph.edges), [], own)
-    solver, chunks = StreamedBundle(grid), source_chunks(problem.source, options.chunk)
+    problem = replace(problem, free_pose=torch.ones(len(ids), dtype=torch.bool))
+    schur = StreamedSchur(problem, grid, options)
     numbers = torch.tensor([job.first[part] + place for part, place in (nodes[k] for k in ids)])
-    d, T = problem.inverse_depth, problem.T_cw
+    d = problem.inverse_depth
     if job.step is not None and job.T_before is not None:
-        before, step = job.T_before[numbers], job.step[numbers]
-        delta = solver.depth_steps(problem, before, d, step, options, chunks)
-        d = stepped(problem, before, d, step, delta, options)[1]
+        before, step = BundleState(job.T_before[numbers], d), job.step[numbers]
+        delta = schur.depth_steps(before, schur.system, step.reshape(-1))
+        d = stepped(problem, before, step, delta, options)[1]
     information = graph.keyframes.informations(own)
     sums: PoseSums | None = None
     if not job.is_last:
-        every = torch.ones(len(ids), dtype=torch.bool)
-        system = SparseCameraSystem(problem.source, problem.target, every)
-        for _, stars in solver.linearised(problem, T, d, options, chunks):
-            system.add(stars)
-            for star in stars:
-                information[star.frame] = star.information
-        sums = system.sums(numbers)
+        schur.add_matches(BundleState(problem.T_cw, d))
+        sources = torch.unique(problem.source)
+        information[sources] = schur.information[sources]
+        sums = schur.system.sums(numbers)
     depth = d[: len(own)]
     if job.is_last:
         depth = grid_fields(grid).fill(depth, information)

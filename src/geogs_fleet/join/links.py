@@ -13,7 +13,7 @@ from geogs.application.results.saved_result import SavedResult
 from geogs.config import Config, LoopConfig
 from geogs.geometry.camera import Camera
 from geogs.loop.constraints import of_loop
-from geogs.loop.dense import dense_check
+from geogs.loop.dense_check import dense_check
 from geogs.loop.retrieval import AppearanceIndex
 from geogs.loop.search import MIN_SCORE, SUPPRESSION
 from geogs.loop.verification import DepthView, TwoViewVerifier

@@ -30,7 +30,10 @@ def calibrated(pixels: DepthErrors) -> DepthCalibration:
 
 
 def logistic_fit(x: Float[Tensor, "n"], right: Bool[Tensor, "n"]) -> tuple[float, float]:
-    """Gain and offset of the logit that make the outcomes likeliest, by Newton's method."""
+    """Gain and offset of the logit that make the outcomes likeliest, by Newton's method.
+
+    A likelihood, not a sum of squares: the least-squares loop has no place for it.
+    """
     X = torch.stack([x, torch.ones_like(x)], 1)
     w = X.new_tensor([1.0, 0.0])
     ridge = 1e-3 * len(X) * torch.eye(2, dtype=X.dtype, device=X.device)

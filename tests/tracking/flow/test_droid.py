@@ -10,6 +10,7 @@ import torch
 from droid_state import public_state
 from geogs.bundle.base import BundleOptions
 from geogs.bundle.dense import DenseBundle
+from geogs.bundle.depth_terms import DepthDamping
 from geogs.bundle.problem import BundleProblem
 from geogs.bundle.projection import linearise, relative_motion
 from geogs.errors import InputError
@@ -129,7 +130,7 @@ def test_damping_and_weights_stand_in_the_proportion_of_droid(operator, views):
     projection = linearise(CAMERA, GRID.rays, T, d[:1])
     there, _ = operator.measure([views[0]], [views[1]], projection.pixels, projection.pixels)
     free = torch.ones(2, dtype=torch.bool)
-    problem = BundleProblem(T_cw, d, *edge, there.pixels, there.weight, ~free, free)
+    problem = BundleProblem(T_cw, d, *edge, ~free, free, pixels=there.pixels, weight=there.weight)
     ours = DenseBundle(GRID).solve(problem, BundleOptions(1, huber=1e9)).information[0]
 
     w = there.weight[0] * operator.options.deviation**2
@@ -228,9 +229,10 @@ def test_the_graph_adjusts_what_the_operator_measures():
     graph.measure(pairs)
     assert not torch.equal(graph.edges[0, 2].memory.hidden, before)
     problem, _ = graph.problem(list(graph.edges), [2], [0, 1, 2])
-    assert problem.damping is not None
-    assert float(problem.damping.min()) > 0
-    torch.testing.assert_close(problem.damping[0], graph.edges[0, 1].damping)
+    (damping,) = problem.depth_terms
+    assert isinstance(damping, DepthDamping)
+    assert float(damping.curvature.min()) > 0
+    torch.testing.assert_close(damping.curvature[0], graph.edges[0, 1].damping)
     # The network leaves the true reprojection as it is, so nothing moves.
     truth = store.poses([2])
     assert graph.adjust(list(graph.edges), [2], [0, 1, 2], BundleOptions()) is not None

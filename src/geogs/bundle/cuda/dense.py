@@ -9,8 +9,10 @@ from jaxtyping import Bool, Int
 from torch import Tensor
 
 from geogs.bundle.base import BundleOptions, BundleResult
-from geogs.bundle.linearise import motion_stars
-from geogs.bundle.problem import MEASURED_HUBER, BundleProblem
+from geogs.bundle.cuda.depth_terms import KernelDepthTerms
+from geogs.bundle.problem import BundleProblem
+from geogs.bundle.terms import BundleState
+from geogs.geometry.least_squares import Policy, Step, minimise
 from geogs.gpu.kernels import kernels_for
 from geogs.gpu.transfer import to_device
 from geogs.world.grid import SampleGrid
@@ -132,7 +134,7 @@ def _system_parts(
 
 
 class _Workspace:
-    """State of one solve on the device."""
+    """What one solve keeps on the device, the state that is adjusted among it."""
 
     def __init__(self, problem: BundleProblem, structure: _Structure, device: torch.device) -> None:
         d = problem.inverse_depth
@@ -140,47 +142,47 @@ class _Workspace:
         edges, cells = s.edges, d.shape[1]
         self.cells = cells
         # Poses and the sign of failure travel back together.
-        self.state = torch.zeros(16 * s.frames + 1, dtype=torch.float64, device=device)
-        self.state[: 16 * s.frames].copy_(to_device(problem.T_cw.reshape(-1), device))
-        self.T = self.state[: 16 * s.frames]
-        self.failed = self.state[16 * s.frames :].view(torch.int32)
+        self.memory = torch.zeros(16 * s.frames + 1, dtype=torch.float64, device=device)
+        self.memory[: 16 * s.frames].copy_(to_device(problem.T_cw.reshape(-1), device))
+        self.T = self.memory[: 16 * s.frames]
+        self.failed = self.memory[16 * s.frames :].view(torch.int32)
         self.inverse_depth = d.clone()
         size = 6 * s.poses
-        self.system = self.state.new_empty((size + 1) * size)
+        self.system = self.memory.new_empty((size + 1) * size)
         self.panels = -(-size // PANEL)
-        self.inverses = self.state.new_empty(self.panels * PANEL * PANEL)
+        self.inverses = self.memory.new_empty(self.panels * PANEL * PANEL)
         self.good = torch.empty(1, dtype=torch.int32, device=device)
-        self.xi = self.state.new_zeros(6 * s.frames)
-        self.blocks = self.state.new_empty(144 * len(s.pair_a))
-        self.vectors = self.state.new_empty(12 * len(s.pair_a))
-        self.motion = self.state.new_empty(12 * edges)
-        self.normal = self.state.new_empty(32 * edges)
+        self.xi = self.memory.new_zeros(6 * s.frames)
+        self.blocks = self.memory.new_empty(144 * len(s.pair_a))
+        self.vectors = self.memory.new_empty(12 * len(s.pair_a))
+        self.motion = self.memory.new_empty(12 * edges)
+        self.normal = self.memory.new_empty(32 * edges)
         self.coupling = d.new_empty(6 * edges * cells)
         self.curvature, self.gradient = d.new_empty(2, edges * cells).unbind()
         self.information = torch.zeros_like(d)
         self.inverse_curvature, self.depth_gradient, self.delta = d.new_empty(3, d.numel()).unbind()
         self.residual = d.new_zeros(edges)
-        self.damping = None if problem.damping is None else problem.damping.contiguous()
-        self.measured: tuple[Tensor | None, Tensor | None] = (None, None)
-        """Inverse depths measured beside the matches, and their information."""
-        if problem.measured is not None:
-            m = problem.measured
-            self.measured = (m.inverse_depth.contiguous(), m.information.contiguous())
+        self.depth_terms, self.block = KernelDepthTerms.of(problem.depth_terms), problem.block
+
+    @property
+    def state(self) -> BundleState:
+        """What is adjusted, where it is."""
+        return BundleState(self.T.reshape(-1, 4, 4), self.inverse_depth, self.block)
 
 
-def _add_motions(w: _Workspace, problem: BundleProblem, damping: float) -> None:
-    """Add what measured motions say to the assembled camera system, which waits for the poses."""
-    if problem.motions is None:
+def _add_pose_terms(w: _Workspace, problem: BundleProblem, damping: float) -> None:
+    """Add what is said of poses alone to the assembled camera system, which waits for them."""
+    if not problem.pose_terms:
         return
     n = w.structure.poses
     size = 6 * n
     slot = torch.full((len(problem.free_pose),), -1)
     slot[problem.free_pose.cpu()] = torch.arange(n)
-    stars = motion_stars(problem.motions, w.T.reshape(-1, 4, 4).cpu())
+    state = BundleState(w.T.reshape(-1, 4, 4).cpu(), problem.inverse_depth)
     added = torch.zeros(size + 1, size, dtype=torch.float64)
-    for star in stars:
-        block, gradient = star.pose_blocks()
-        at = slot[star.poses].tolist()
+    for edge in (edge for term in problem.pose_terms for edge in term.hyper_edges(state)):
+        block, gradient = edge.pose_blocks()
+        at = slot[edge.poses].tolist()
         for a, p in enumerate(at):
             if p < 0:
                 continue
@@ -203,27 +205,24 @@ class CudaDenseBundle:
     def __init__(self, grid: SampleGrid) -> None:
         self.grid = grid
         device = torch.device(grid.device)
-        self._step = kernels_for(Path(__file__).with_name("linearise.cu"), device)
-        self._solve = kernels_for(Path(__file__).with_name("solve.cu"), device)
+        self.kernels = kernels_for(Path(__file__).with_name("linearise.cu"), device)
+        self.solvers = kernels_for(Path(__file__).with_name("solve.cu"), device)
         self._last: tuple[tuple[bytes, ...], _Structure] | None = None
 
     def solve(self, problem: BundleProblem, options: BundleOptions | None = None) -> BundleResult:
-        """Take ``options.iterations`` damped Gauss-Newton steps.
+        """As in the protocol; poses are returned where they were given.
 
-        A step that is not finite is not taken and ``finite`` is False in the result. Poses are
-        returned where they were given.
+        Whether a step is small nobody waits for, so that ``tolerance`` plays no part.
         """
         options = options or BundleOptions()
         device = problem.inverse_depth.device
         w = _Workspace(problem, self._structure_of(problem, device), device)
-        pixels, weight = problem.pixels.contiguous(), problem.weight.contiguous()
-        for _ in range(options.iterations):
-            self._linearise(w, pixels, weight, options)
-            self._solve_cameras(w, problem, options)
-            self._move(w, options)
-        state = w.state.cpu()
-        T = state[:-1].reshape(-1, 4, 4).to(problem.T_cw.device)
-        finite = int(state[-1:].view(torch.int32)[0]) == 0
+        steps = _Steps(self, problem, options)
+        policy = Policy(options.iterations, options.damping)
+        minimise(w, steps.linearise, steps.step, policy)
+        memory = w.memory.cpu()
+        T = memory[:-1].reshape(-1, 4, 4).to(problem.T_cw.device)
+        finite = int(memory[-1:].view(torch.int32)[0]) == 0
         return BundleResult(T, w.inverse_depth, w.information, w.residual, finite)
 
     def _structure_of(self, problem: BundleProblem, device: torch.device) -> _Structure:
@@ -234,38 +233,59 @@ class CudaDenseBundle:
             self._last = key, _structure(problem, device)
         return self._last[1]
 
-    def _linearise(
-        self, w: _Workspace, pixels: Tensor, weight: Tensor, options: BundleOptions
+
+class _Steps:
+    """One adjustment as the least-squares loop sees it; the workspace is changed in place."""
+
+    def __init__(
+        self, bundle: CudaDenseBundle, problem: BundleProblem, options: BundleOptions
     ) -> None:
-        s, c, block = w.structure, self.grid.camera, block_size(w.cells)
-        self._step["linearise_edges"](
-            s.edges, block, w.T, w.inverse_depth, s.source, s.target, pixels, weight,
+        self.grid, self.problem, self.options = bundle.grid, problem, options
+        self.kernels, self.solvers = bundle.kernels, bundle.solvers
+        self.matches = problem.pixels.contiguous(), problem.weight.contiguous()
+
+    def linearise(self, state: _Workspace) -> None:
+        """Edges, summed up by source."""
+        w, s, c, options = state, state.structure, self.grid.camera, self.options
+        block = block_size(w.cells)
+        self.kernels["linearise_edges"](
+            s.edges, block, w.T, w.inverse_depth, s.source, s.target, *self.matches,
             self.grid.rays, w.cells, c.fx, c.fy, c.cx, c.cy, options.huber, w.motion, w.normal,
             w.coupling, w.curvature, w.gradient, w.residual,
         )  # fmt: skip
-        self._step["sum_sources"](
+        damping, *measured = w.depth_terms.arguments()
+        self.kernels["sum_sources"](
             s.frames, block, s.first, w.curvature, w.gradient, w.cells, options.depth_damping,
-            w.damping, w.inverse_depth, *w.measured, MEASURED_HUBER, w.information,
-            w.inverse_curvature, w.depth_gradient,
+            damping, w.inverse_depth, *measured, w.information, w.inverse_curvature,
+            w.depth_gradient,
         )  # fmt: skip
+        w.depth_terms.add_others(
+            range(s.frames), w.state, w.information, w.inverse_curvature, w.depth_gradient
+        )
 
-    def _solve_cameras(self, w: _Workspace, problem: BundleProblem, options: BundleOptions) -> None:
+    def step(self, state: _Workspace, linear: None, damping: float) -> Step[_Workspace]:
+        """All moves on the device, which keeps in mind whether one was not finite."""
+        self._solve_cameras(state, damping)
+        self._move(state)
+        return Step(state)
+
+    def _solve_cameras(self, w: _Workspace, damping: float) -> None:
         s = w.structure
         if not s.poses:
             return
-        self._step["eliminate_depths"](
+        self.kernels["eliminate_depths"](
             len(s.pair_a), block_size(w.cells), s.pair_a, s.pair_b, s.source, s.free_depth,
             w.coupling, w.inverse_curvature, w.depth_gradient, w.motion, w.normal, w.cells,
             w.blocks, w.vectors,
         )  # fmt: skip
-        self._step["assemble_system"](
+        self.kernels["assemble_system"](
             len(s.places), 256, s.places, s.first_part, s.parts, w.blocks, w.vectors, s.poses,
-            options.damping, w.system,
+            damping, w.system,
         )  # fmt: skip
-        _add_motions(w, problem, options.damping)
+        _add_pose_terms(w, self.problem, damping)
         if s.poses <= MAX_FEW:
             threads = min(256, 32 * s.poses)
-            self._solve["solve_few_poses"](1, threads, w.system, s.slot, s.poses, s.frames, w.xi)
+            self.solvers["solve_few_poses"](1, threads, w.system, s.slot, s.poses, s.frames, w.xi)
         else:
             self._solve_many_poses(w)
 
@@ -273,25 +293,25 @@ class CudaDenseBundle:
         """Cholesky's method panel by panel."""
         s, size = w.structure, 6 * w.structure.poses
         for k in range(0, size, PANEL):
-            self._solve["factor_panel"](1, 256, w.system, size, k, w.inverses, w.good)
+            self.solvers["factor_panel"](1, 256, w.system, size, k, w.inverses, w.good)
             # The right-hand side is a row below every panel.
             tiles = -(-(size + 1 - min(k + PANEL, size)) // TILE)
-            self._solve["substitute_panel"](tiles, 256, w.system, size, k, w.inverses)
+            self.solvers["substitute_panel"](tiles, 256, w.system, size, k, w.inverses)
             if k + PANEL < size:
-                self._solve["update_rest"]((tiles, tiles), 256, w.system, size, k)
+                self.solvers["update_rest"]((tiles, tiles), 256, w.system, size, k)
         threads = min(1024, 32 * s.poses)
-        self._solve["substitute_back"](
+        self.solvers["substitute_back"](
             1, threads, w.system, size, w.inverses, w.good, s.slot, s.frames, w.xi
         )
 
-    def _move(self, w: _Workspace, options: BundleOptions) -> None:
-        s, block = w.structure, block_size(w.cells)
+    def _move(self, w: _Workspace) -> None:
+        s, options, block = w.structure, self.options, block_size(w.cells)
         grid = (-(-w.cells // block), s.frames)
-        self._step["find_depth_steps"](
+        self.kernels["find_depth_steps"](
             grid, block, s.first, s.target, s.free_depth, w.motion, w.xi, w.coupling,
             w.inverse_curvature, w.depth_gradient, w.cells, w.delta, w.failed,
         )  # fmt: skip
-        self._step["take_steps"](
+        self.kernels["take_steps"](
             grid, block, s.slot, s.free_depth, w.xi, w.delta, w.cells, options.min_inverse_depth,
             options.max_inverse_depth, w.failed, w.T, w.inverse_depth,
         )  # fmt: skip

@@ -1,4 +1,4 @@
-"""Fields on the sample grid on the GPU: filling holes, carrying depth from view to view."""
+"""Fields on the sample grid on the GPU: filling holes, propagating depth from view to view."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -54,11 +54,11 @@ class CudaFields:
     ) -> tuple[Float[Tensor, "p"], Float[Tensor, "p"]]:
         """As in the protocol."""
         first = torch.zeros(1, dtype=torch.long)
-        depth, carried = self._carry(
+        depth, propagated = self._propagate(
             T_ji[None], torch.eye(4).to(T_ji)[None], first, inverse_depth[None], information[None],
             reproject=False,
         )  # fmt: skip
-        return depth[0], carried[0]
+        return depth[0], propagated[0]
 
     def reproject(
         self, keyframes: Sequence[Keyframe], T_cw: Sequence[Float[Tensor, "4 4"]]
@@ -66,7 +66,7 @@ class CudaFields:
         """As in the protocol."""
         rows = {k.id: k for k in keyframes}
         slot = {id: n for n, id in enumerate(rows)}
-        return self._carry(
+        return self._propagate(
             torch.stack(list(T_cw)),
             torch.stack([k.T_cw for k in rows.values()]),
             torch.tensor([slot[k.id] for k in keyframes]),
@@ -75,7 +75,7 @@ class CudaFields:
             reproject=True,
         )
 
-    def _carry(
+    def _propagate(
         self,
         T: Float[Tensor, "n 4 4"],
         T_source: Float[Tensor, "m 4 4"],

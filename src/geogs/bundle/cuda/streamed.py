@@ -6,7 +6,6 @@ the same kernels, their blocks added up, and forgotten; the camera system is spa
 the CPU. Once the poses' steps are known, edges are linearised a second time for the depths.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,9 +17,11 @@ from torch import Tensor
 from geogs.bundle.base import BundleOptions, BundleResult
 from geogs.bundle.camera_system import SparseCameraSystem
 from geogs.bundle.cuda.dense import block_size, joined_edges
-from geogs.bundle.dense import stepped
-from geogs.bundle.linearise import motion_stars
-from geogs.bundle.problem import MEASURED_HUBER, StreamedProblem, known_before, source_chunks
+from geogs.bundle.cuda.depth_terms import KernelDepthTerms
+from geogs.bundle.dense import FLOOR
+from geogs.bundle.problem import StreamedProblem, source_chunks
+from geogs.bundle.schur import SchurBundle
+from geogs.bundle.terms import BundleState
 from geogs.gpu.kernels import kernels_for
 from geogs.gpu.transfer import to_device
 from geogs.world.grid import SampleGrid
@@ -73,73 +74,96 @@ class _Linearised:
 
 
 class CudaStreamedBundle:
-    """Solver for one grid on its GPU, with the interface of ``StreamedBundle``."""
+    """Solver for one grid on its GPU, with the interface of ``StreamedBundle``.
+
+    Only inverse depths, matches and terms of depths are on the device.
+    """
 
     def __init__(self, grid: SampleGrid) -> None:
         self.grid = grid
         source = Path(__file__).with_name("linearise.cu")
-        self._step = kernels_for(source, torch.device(grid.device))
+        self.kernels = kernels_for(source, torch.device(grid.device))
 
     def solve(self, problem: StreamedProblem, options: BundleOptions | None = None) -> BundleResult:
-        """Take ``options.iterations`` damped Gauss-Newton steps, as the dense solver does.
+        """As in the protocol."""
+        return _CudaStreamedSchur(problem, self, options or BundleOptions()).adjusted()
 
-        Only inverse depths, matches and what belongs to them are on the device. A step that is not
-        finite is not taken, and ``finite`` is False in the result.
-        """
-        options = options or BundleOptions()
-        T, d = problem.T_cw, problem.inverse_depth
-        information, residual = known_before(problem), d.new_zeros(len(problem.source))
-        system = SparseCameraSystem(*problem.joined(), problem.free_pose)
+
+class _CudaStreamedSchur(SchurBundle[StreamedProblem, SparseCameraSystem]):
+    """One adjustment that keeps nothing but the camera system of what it linearises."""
+
+    def __init__(
+        self, problem: StreamedProblem, bundle: CudaStreamedBundle, options: BundleOptions
+    ) -> None:
+        super().__init__(problem, options)
+        self.grid, self.kernels = bundle.grid, bundle.kernels
+        self.depth_terms = KernelDepthTerms.of(problem.depth_terms)
+        self.system = SparseCameraSystem(*problem.joined(), problem.free_pose)
+        device = problem.inverse_depth.device
         edges = source_chunks(problem.source, EDGES_TOGETHER)
-        chunks = [_chunk(problem, part, system, d.device) for part in edges]
-        finite = True
-        for _ in range(options.iterations):
-            system.clear()
-            blocks = d.new_zeros(system.size, 36, dtype=torch.float64)
-            pull = d.new_zeros(len(T), 6, dtype=torch.float64)
-            for chunk in chunks:
-                linear = self._linearise(problem, chunk, T, d, options)
-                self._eliminate(chunk, linear, d.shape[1], blocks, pull)
-                information[chunk.sources.to(d.device)] = linear.information
-                residual[chunk.edges] = linear.residual
-            system.add_sums(blocks.cpu().reshape(-1, 6, 6), pull.cpu())
-            system.add(motion_stars(problem.motions, T))
-            xi = system.solve(options.damping)
-            delta = self._depth_steps(problem, chunks, T, d, xi, options)
-            if not bool(torch.isfinite(xi).all() and torch.isfinite(delta).all()):
-                finite = False
-                break
-            T, d = stepped(problem, T, d, xi, delta, options)
-            if float(xi.abs().max()) < options.tolerance:
-                break
-        return BundleResult(T, d, information, residual, finite)
+        self.chunks = [_chunk(problem, part, self.system, device) for part in edges]
 
-    def _linearise(
-        self,
-        problem: StreamedProblem,
-        chunk: _Chunk,
-        T: Float[Tensor, "n 4 4"],
-        d: Float[Tensor, "n p"],
-        options: BundleOptions,
-    ) -> _Linearised:
-        pixels, weight = (m.contiguous() for m in problem.matches(chunk.edges))
+    def linearise(self, state: BundleState) -> SparseCameraSystem:
+        """Chunk by chunk."""
+        T, d, system = state.T_cw, state.inverse_depth, self.system
+        system.clear()
+        blocks = d.new_zeros(system.size, 36, dtype=torch.float64)
+        pull = d.new_zeros(len(T), 6, dtype=torch.float64)
+        for chunk in self.chunks:
+            linear = self._linearise(state, chunk)
+            self._eliminate(chunk, linear, d.shape[1], blocks, pull)
+            self.information[chunk.sources.to(d.device)] = linear.information
+            self.residual[chunk.edges] = linear.residual
+        system.add_sums(blocks.cpu().reshape(-1, 6, 6), pull.cpu())
+        for term in self.problem.pose_terms:
+            system.add(term.hyper_edges(state))
+        return system
+
+    def solve_cameras(self, linear: SparseCameraSystem, damping: float) -> Tensor | None:
+        """On the CPU."""
+        return linear.solve(damping, FLOOR)
+
+    def depth_steps(
+        self, state: BundleState, linear: SparseCameraSystem, step: Float[Tensor, "v"]
+    ) -> Float[Tensor, "n p"]:
+        """By edges that are linearised a second time."""
+        d, xi = state.inverse_depth, step.reshape(-1, 6)
+        delta, cells = torch.zeros_like(d), d.shape[1]
+        failed = torch.zeros(1, dtype=torch.int32, device=d.device)
+        block = block_size(cells)
+        for chunk in self.chunks:
+            edges = self._linearise(state, chunk)
+            sources = len(chunk.sources)
+            steps = d.new_zeros(sources, cells)
+            self.kernels["find_depth_steps"](
+                (-(-cells // block), sources), block, chunk.first, chunk.target, chunk.free_depth,
+                edges.motion, to_device(xi[chunk.frames].reshape(-1), d.device), edges.coupling,
+                edges.inverse_curvature, edges.depth_gradient, cells, steps, failed,
+            )  # fmt: skip
+            delta[chunk.sources.to(d.device)] = steps
+        return delta
+
+    def _linearise(self, state: BundleState, chunk: _Chunk) -> _Linearised:
+        d, c, options = state.inverse_depth, self.grid.camera, self.options
+        pixels, weight = (m.contiguous() for m in self.problem.matches(chunk.edges))
         own = chunk.sources.to(d.device)
-        depth, c = d[own], self.grid.camera
+        depth = d[own]
         linear, cells = _Linearised(chunk, depth), d.shape[1]
-        poses = to_device(T[chunk.frames].reshape(-1), d.device)
-        self._step["linearise_edges"](
+        poses = to_device(state.T_cw[chunk.frames].reshape(-1), d.device)
+        self.kernels["linearise_edges"](
             len(chunk.source), block_size(cells), poses, depth, chunk.source, chunk.target, pixels,
             weight, self.grid.rays, cells, c.fx, c.fy, c.cx, c.cy, options.huber, linear.motion,
             linear.normal, linear.coupling, linear.curvature, linear.gradient, linear.residual,
         )  # fmt: skip
-        damping = None if problem.damping is None else problem.damping[own]
-        measured: tuple[Tensor | None, Tensor | None] = (None, None)
-        if problem.measured is not None:
-            measured = problem.measured.inverse_depth[own], problem.measured.information[own]
-        self._step["sum_sources"](
+        damping, *measured = self.depth_terms.arguments(own)
+        self.kernels["sum_sources"](
             len(own), block_size(cells), chunk.first, linear.curvature, linear.gradient, cells,
-            options.depth_damping, damping, depth, *measured, MEASURED_HUBER, linear.information,
+            options.depth_damping, damping, depth, *measured, linear.information,
             linear.inverse_curvature, linear.depth_gradient,
+        )  # fmt: skip
+        self.depth_terms.add_others(
+            chunk.sources.tolist(), state, linear.information, linear.inverse_curvature,
+            linear.depth_gradient,
         )  # fmt: skip
         return linear
 
@@ -154,7 +178,7 @@ class CudaStreamedBundle:
         """Add what a chunk says of the poses."""
         pairs = len(chunk.pair_a)
         found, vectors = blocks.new_empty(4 * pairs, 6, 6), blocks.new_empty(2 * pairs, 6)
-        self._step["eliminate_depths"](
+        self.kernels["eliminate_depths"](
             pairs, block_size(cells), chunk.pair_a, chunk.pair_b, chunk.source, chunk.free_depth,
             linear.coupling, linear.inverse_curvature, linear.depth_gradient, linear.motion,
             linear.normal, cells, found, vectors,
@@ -162,30 +186,6 @@ class CudaStreamedBundle:
         blocks.index_add_(0, chunk.added_to, found[chunk.added].flatten(1))
         blocks.index_add_(0, chunk.turned_to, found[chunk.turned].mT.flatten(1))
         pull.index_add_(0, chunk.pulled_to, vectors[chunk.pulled])
-
-    def _depth_steps(
-        self,
-        problem: StreamedProblem,
-        chunks: Sequence[_Chunk],
-        T: Float[Tensor, "n 4 4"],
-        d: Float[Tensor, "n p"],
-        xi: Float[Tensor, "n 6"],
-        options: BundleOptions,
-    ) -> Float[Tensor, "n p"]:
-        delta, cells = torch.zeros_like(d), d.shape[1]
-        failed = torch.zeros(1, dtype=torch.int32, device=d.device)
-        block = block_size(cells)
-        for chunk in chunks:
-            linear = self._linearise(problem, chunk, T, d, options)
-            sources = len(chunk.sources)
-            steps = d.new_zeros(sources, cells)
-            self._step["find_depth_steps"](
-                (-(-cells // block), sources), block, chunk.first, chunk.target, chunk.free_depth,
-                linear.motion, to_device(xi[chunk.frames].reshape(-1), d.device), linear.coupling,
-                linear.inverse_curvature, linear.depth_gradient, cells, steps, failed,
-            )  # fmt: skip
-            delta[chunk.sources.to(d.device)] = steps
-        return delta
 
 
 def _chunk(

@@ -33,12 +33,12 @@ from geogs.io.sources.reader import (
     read_side_by_side,
 )
 from geogs.io.sources.undistort import Rectifier
-from geogs.shutter.camera import RollingCamera
-from geogs.shutter.neighbours import with_turning
+from geogs.shutter.angular_motion import AngularMotion
+from geogs.shutter.neighbours import with_angular_motion
 from geogs.shutter.readout import CLIP, CLIPS
+from geogs.shutter.rolling_camera import RollingCamera
 from geogs.shutter.rows import RowOffsets
 from geogs.shutter.shutter import Shutter
-from geogs.shutter.turning import Turning
 from geogs.types import Frame, MeasuredDepth
 
 _log = logging.getLogger(__name__)
@@ -333,11 +333,11 @@ class Source:
 
         images = self._resized(start - before, stop)
         offsets = RowOffsets(rolling, self.camera)
-        for raw, turning in with_turning(images, rolling, readout, is_selected):
+        for raw, turning in with_angular_motion(images, rolling, readout, is_selected):
             if raw.image is None:
                 yield raw
                 continue
-            nodes = offsets.nodes(Turning() if turning.is_still else turning, readout)
+            nodes = offsets.nodes(AngularMotion() if turning.is_still else turning, readout)
             moved = None if turning.is_still else offsets.dense(nodes)
             image = self._rectifier.straightened(raw.image, moved)
             depth, rows = self._rectified(raw.depth, moved), offsets.seen(nodes, self.shutter)

@@ -11,7 +11,7 @@ from geogs.geometry.camera import Camera
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.frame_source import ReadingPlace, Source
 from geogs.io.sources.reader import RawFrame
-from geogs.shutter.camera import RollingCamera
+from geogs.shutter.rolling_camera import RollingCamera
 from geogs.shutter.shutter import Shutter
 from geogs.types import Frame
 

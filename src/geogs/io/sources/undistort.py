@@ -14,7 +14,7 @@ from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.geometry.distortion import LensModel, distorted_pixels
 from geogs.io.sources.calibration import Calibration
-from geogs.shutter.camera import RollingCamera
+from geogs.shutter.rolling_camera import RollingCamera
 
 FieldOfView = float | Literal["auto"]
 """Degrees along the longer side of the working image."""

@@ -7,9 +7,9 @@ import torch
 from torch import Tensor
 
 from geogs.bundle.lens import LensBlock
-from geogs.bundle.levenberg import LevenbergResult, solve_shared
 from geogs.bundle.problem import BundleProblem
 from geogs.bundle.select import grid_fields
+from geogs.bundle.shared import SharedResult, solve_shared
 from geogs.tracking.calibration.keyframes import View, on_cpu
 from geogs.tracking.calibration.start import Start
 from geogs.tracking.flow.flow_operator import FlowOperator
@@ -53,7 +53,7 @@ class GrowingBundle:
             self._depth.append(d)
             self._information.append(i)
         self._edges: dict[tuple[int, int], _Edge] = {}
-        self.result: LevenbergResult[LensBlock] | None = None
+        self.result: SharedResult[LensBlock] | None = None
 
     def __len__(self) -> int:
         return len(self._views)
@@ -125,10 +125,10 @@ class GrowingBundle:
             torch.stack(self._depth),
             torch.tensor([i for i, _ in directed]),
             torch.tensor([j for _, j in directed]),
-            torch.stack([e.pixels for e in edges]),
-            torch.stack([e.weight for e in edges]),
             free,
             torch.ones_like(free),
+            pixels=torch.stack([e.pixels for e in edges]),
+            weight=torch.stack([e.weight for e in edges]),
         )
 
     def adjust(self, radial: bool) -> bool:
@@ -143,7 +143,7 @@ class GrowingBundle:
         self._normalise()
         return True
 
-    def solve(self, radial: bool) -> LevenbergResult[LensBlock]:
+    def solve(self, radial: bool) -> SharedResult[LensBlock]:
         """The solution, with k1 as a variable too if ``radial``; nothing is taken over."""
         block = LensBlock(self.lens, self.grid.pixels, radial=radial)
         return solve_shared(self.problem(), block)

@@ -12,9 +12,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from geogs.bundle.lens import Lens, LensBlock
-from geogs.bundle.levenberg import LevenbergOptions, LevenbergResult, solve_shared
 from geogs.bundle.problem import BundleProblem
 from geogs.bundle.select import grid_fields
+from geogs.bundle.shared import OPTIONS, SharedResult, solve_shared
 from geogs.geometry.camera import Camera
 from geogs.tracking.calibration.keyframes import on_cpu, stacked, with_focal
 from geogs.tracking.initialise import best_two_view, two_view
@@ -70,7 +70,7 @@ def try_candidate(camera: Camera, flows: list[FlowMatch], min_parallax: float) -
     rows = torch.cat([depth[None], torch.ones(n - 1, grid.size)])
     problem = BundleProblem(
         torch.stack(poses), rows, torch.zeros(n - 1, dtype=torch.long), torch.arange(1, n),
-        pixels, weight, free, torch.ones(n, dtype=torch.bool),
+        free, torch.ones(n, dtype=torch.bool), pixels=pixels, weight=weight,
     )  # fmt: skip
     result = _adjusted(problem, LensBlock(Lens(camera), grid.pixels))
     if result is None:
@@ -82,11 +82,11 @@ def try_candidate(camera: Camera, flows: list[FlowMatch], min_parallax: float) -
     )  # fmt: skip
 
 
-def _adjusted(problem: BundleProblem, block: LensBlock) -> LevenbergResult[LensBlock] | None:
+def _adjusted(problem: BundleProblem, block: LensBlock) -> SharedResult[LensBlock] | None:
     """From forgiving to strict, always with the focal length."""
     result = None
     for huber in _HUBERS:
-        result = solve_shared(problem, block, LevenbergOptions(iterations=10, huber=huber))
+        result = solve_shared(problem, block, replace(OPTIONS, iterations=10, huber=huber))
         if not result.finite:
             return None
         block = result.block

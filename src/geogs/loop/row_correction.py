@@ -1,7 +1,7 @@
 """Rows of a rolling shutter in the adjustment of all keyframes, by the trajectory that it gives.
 
 The matches are those of images whose rows were rectified before anything was known of the scene.
-What is left is told by the adjusted trajectory and depths (``tracking/row_errors.py``), taken off
+What is left follows from the adjusted trajectory and depths (``tracking/row_errors.py``), taken off
 the matches, and everything is adjusted again. Flow is not measured anew. A readout that was found
 in the video, and may be off by some percent, is found once more on the way: it is right where all
 matches together would become neither better nor worse with another.
@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from geogs.bundle.base import BundleOptions
-from geogs.bundle.linearise import weighed_residuals
+from geogs.bundle.flow_term import weighed_residuals
 from geogs.bundle.projection import project
 from geogs.geometry.lie import se3_inverse
 from geogs.tracking.graph import FrameGraph
@@ -30,12 +30,12 @@ ROUNDS = 2
 READOUT_ROUNDS = 3
 """With another readout each, after these."""
 FIRST_STEP, FARTHEST = 0.04, 0.25
-"""Share of the readout that is tried first, and by which it changes at most."""
+"""Fraction of the readout that is tried first, and by which it changes at most."""
 EVIDENCE = 0.02
-"""Share of what matches say of the readout that counts, as those of an edge err together."""
+"""Fraction of what matches say of the readout that counts, as those of an edge err together."""
 
 
-def settle_rows(
+def correct_rows(
     tracker: Tracker, free_pose: Sequence[int], free_depth: Sequence[int], options: BundleOptions
 ) -> None:
     """Correct all matches for their rows and adjust again; nothing where no rows were rectified.
@@ -63,7 +63,7 @@ def settle_rows(
 
 
 class _Search:
-    """Where the gradient of a cost is zero, by secants, held by what was known before."""
+    """Where the gradient of a cost is zero, by secants, kept near what was known before."""
 
     def __init__(self) -> None:
         self.factor = 1.0

@@ -11,7 +11,7 @@ from geogs.bundle.base import BundleOptions
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp, se3_inverse
 from geogs.loop.global_bundle import global_bundle
-from geogs.loop.settled_rows import _readout_gradient, _Search, settle_rows
+from geogs.loop.row_correction import _readout_gradient, _Search, correct_rows
 from geogs.tracking.row_errors import RowErrors
 from geogs.tracking.tracker import Tracker, lone_tracker
 from geogs.tracking.trajectory import row_errors
@@ -109,9 +109,9 @@ def test_the_trajectory_straightens_rows_that_nothing_was_done_about(monkeypatch
 
     def settle(tracker, *others):
         bent.append(error(tracker.keyframes.poses(tracker.keyframes.ids)))
-        settle_rows(tracker, *others)
+        correct_rows(tracker, *others)
 
-    monkeypatch.setattr("geogs.loop.global_bundle.settle_rows", settle)
+    monkeypatch.setattr("geogs.loop.global_bundle.correct_rows", settle)
     global_bundle(tracker)
     assert bent[0] > 0.05
     assert error(tracker.keyframes.poses(tracker.keyframes.ids)) < 0.4 * bent[0]
@@ -142,7 +142,7 @@ def test_a_readout_that_was_told_is_kept(monkeypatch):
 
     monkeypatch.setattr(RowErrors, "with_readout", noted)
     tracker.map.graph.measure([(0, 1), (1, 2)], packed=True)
-    settle_rows(tracker, [1, 2], [0, 1, 2], BundleOptions())
+    correct_rows(tracker, [1, 2], [0, 1, 2], BundleOptions())
     assert factors == {1.0}
 
 
@@ -165,6 +165,6 @@ def test_nothing_happens_to_a_global_shutter():
     tracker.segment.frames.rows.clear()
     tracker.map.graph.measure([(0, 1)], packed=True)
     before = tracker.map.graph.edges[0, 1].position.clone()
-    settle_rows(tracker, [1], [0, 1], BundleOptions())
+    correct_rows(tracker, [1], [0, 1], BundleOptions())
     assert torch.equal(tracker.map.graph.edges[0, 1].position, before)
     assert torch.equal(tracker.keyframes[1].T_cw, pose(np.arange(COUNT))[1])

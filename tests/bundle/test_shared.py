@@ -1,38 +1,40 @@
 """Adjustment with a lens against its reference and known lenses."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
 from geogs.bundle.base import BundleOptions
+from geogs.bundle.flow_term import PinholeFlow, linearised_sources
 from geogs.bundle.lens import Lens, LensBlock
-from geogs.bundle.levenberg import LevenbergOptions, LinearSystem, solve_shared
-from geogs.bundle.linearise import linearise_stars
+from geogs.bundle.shared import OPTIONS, SharedFlow, SharedSchur, solve_shared
+from geogs.bundle.terms import BundleState
 from lens_scene import CAMERA, GRID, disturbed, lens_problem
 from oracles.calibration_reference import gauss_newton_step
 
 
-def test_stars_are_those_of_the_tracker_where_the_lens_is_its_pinhole():
+def test_edges_are_those_of_the_tracker_where_the_lens_is_its_pinhole():
     lens = Lens(CAMERA)
     problem = disturbed(lens_problem(lens, frames=4, noise=0.5), 0.01, 0.03)
-    T, d = problem.T_cw, problem.inverse_depth
     options = BundleOptions(huber=1.0, depth_damping=1e-3)
-    system = LinearSystem.of(problem, LensBlock(lens, GRID.pixels), T, d, 1.0, 1e-3)
-    for own, theirs in zip(
-        system.stars, linearise_stars(GRID.camera, GRID.rays, problem, T, d, options), strict=True
-    ):
+    state = BundleState(problem.T_cw, problem.inverse_depth, LensBlock(lens, GRID.pixels))
+    flows = SharedFlow(), PinholeFlow(GRID.camera, GRID.rays)
+    both = (linearised_sources(flow, problem, state, options) for flow in flows)
+    for source, tracked in zip(*both, strict=True):
+        own, theirs = source.edges, tracked.edges
         at = len(theirs.gradient)
-        assert (own.frame, own.shared, theirs.shared) == (theirs.frame, 2, 0)
+        assert (source.frame, own.shared, theirs.shared) == (tracked.frame, 2, 0)
         scale = theirs.hessian.diagonal().sqrt()
         error = (own.hessian[:at, :at] - theirs.hessian) / (scale[:, None] * scale)
         assert float(error.abs().max()) < 1e-5
         torch.testing.assert_close(
             own.gradient[:at] / scale, theirs.gradient / scale, rtol=1e-4, atol=1e-2
         )
-        torch.testing.assert_close(own.information, theirs.information, rtol=1e-4, atol=1e-3)
-        torch.testing.assert_close(own.residual, theirs.residual, rtol=1e-4, atol=1e-5)
+        torch.testing.assert_close(source.information, tracked.information, rtol=1e-4, atol=1e-3)
+        torch.testing.assert_close(source.residual, tracked.residual, rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize("huber", [0.5, 50.0])
@@ -41,10 +43,12 @@ def test_one_step_matches_the_dense_equations(huber):
     problem = disturbed(lens_problem(lens.moved(0.02, 0.01), frames=3), 0.01, 0.03)
     xi, unknowns, delta = gauss_newton_step(problem, CAMERA, GRID.pixels, 0.05, huber, 1e-5)
     block = LensBlock(lens, GRID.pixels, radial=True)
-    system = LinearSystem.of(problem, block, problem.T_cw, problem.inverse_depth, huber, 1e-5)
-    step = system.step(0.0)
+    shared = SharedSchur(problem, BundleOptions(huber=huber, depth_damping=1e-5))
+    state = BundleState(problem.T_cw, problem.inverse_depth, block)
+    linear = shared.linearise(state)
+    step = shared.solve_cameras(linear, 0.0)
     assert step is not None
-    depth = system.moved_depth(step, problem.inverse_depth)
+    depth = problem.inverse_depth + shared.depth_steps(state, linear, step)
     assert float(unknowns.abs().min()) > 1e-3
     torch.testing.assert_close(step[-2:], unknowns, rtol=2e-3, atol=2e-5)
     # Poses and depths agree up to the scale, which nothing measures.
@@ -61,8 +65,9 @@ def test_recovers_focal_length_and_radial_term():
     truth = Lens(CAMERA, -0.1)
     start = disturbed(lens_problem(truth), 0.01, 0.05)
     guess = Lens(CAMERA).moved(math.log(1.25))
-    options = LevenbergOptions(iterations=40, huber=100.0, least_decrease=1e-9)
-    result = solve_shared(start, LensBlock(guess, GRID.pixels, radial=True), options)
+    options = replace(OPTIONS, iterations=40, huber=100.0)
+    block = LensBlock(guess, GRID.pixels, radial=True)
+    result = solve_shared(start, block, options, least_decrease=1e-9)
     assert result.finite
     found = result.block.lens
     assert abs(found.camera.fx / CAMERA.fx - 1) < 1e-3

@@ -3,7 +3,7 @@
 import torch
 
 from bundle_scenes import disturbed, scene
-from geogs.bundle.motion import CpuMotion
+from geogs.bundle.motion_only import CpuMotion
 from geogs.bundle.problem import MotionProblem
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 from geogs.geometry.lie import so3_exp
-from geogs.shutter.reconstruction import Reconstruction
+from geogs.shutter.clip_reconstruction import Reconstruction
 
 
 def sample() -> Reconstruction:

@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 
 @dataclass(frozen=True)
-class Turning:
+class AngularMotion:
     """Angular velocity around the time of the middle row, in axes of the camera.
 
     A point that the camera has at X then, it has at ``Exp(rate t + acceleration t^2 / 2) X`` after
@@ -54,7 +54,7 @@ def cross(
 
 
 @dataclass(frozen=True)
-class Step:
+class AngularStep:
     """What the camera did between two images of a video."""
 
     rate: Float[np.ndarray, "3"]
@@ -65,7 +65,7 @@ class Step:
     """What things move beside that, x/z and y/z per second, in the first image and the second."""
 
 
-def turning_between(before: Step | None, after: Step | None) -> Turning:
+def angular_motion_between(before: AngularStep | None, after: AngularStep | None) -> AngularMotion:
     """The turning at an image from the steps to it and from it; none where one is not known.
 
     A mean rate is taken for the rate in the middle of its step; between two it is linear.
@@ -73,22 +73,24 @@ def turning_between(before: Step | None, after: Step | None) -> Turning:
     if before is None or after is None:
         known = before or after
         if known is None:
-            return Turning()
-        return Turning(known.rate, parallax=known.parallax and known.parallax[known is before])
-    apart = (before.interval + after.interval) / 2
-    share = before.interval / (2 * apart)
-    rate = before.rate + share * (after.rate - before.rate)
+            return AngularMotion()
+        return AngularMotion(
+            known.rate, parallax=known.parallax and known.parallax[known is before]
+        )
+    between = (before.interval + after.interval) / 2
+    fraction = before.interval / (2 * between)
+    rate = before.rate + fraction * (after.rate - before.rate)
     parallax = None
     if before.parallax is not None and after.parallax is not None:
-        parallax = _agreed(before.parallax[1], after.parallax[0], share)
-    return Turning(rate, (after.rate - before.rate) / apart, parallax)
+        parallax = _agreed(before.parallax[1], after.parallax[0], fraction)
+    return AngularMotion(rate, (after.rate - before.rate) / between, parallax)
 
 
 def _agreed(
-    before: Float[np.ndarray, "gh gw 2"], after: Float[np.ndarray, "gh gw 2"], share: float
+    before: Float[np.ndarray, "gh gw 2"], after: Float[np.ndarray, "gh gw 2"], fraction: float
 ) -> Float[np.ndarray, "gh gw 2"]:
     """Between the two, and the less of it the more they differ: flow that fails differs."""
-    mean, change = before + share * (after - before), after - before
-    square, doubt = (mean**2).sum(2, keepdims=True), (change**2).sum(2, keepdims=True)
-    weight: Float[np.ndarray, "gh gw 1"] = square / np.maximum(square + doubt, 1e-12)
+    mean, change = before + fraction * (after - before), after - before
+    square, error = (mean**2).sum(2, keepdims=True), (change**2).sum(2, keepdims=True)
+    weight: Float[np.ndarray, "gh gw 1"] = square / np.maximum(square + error, 1e-12)
     return weight * mean

@@ -113,7 +113,7 @@ def _depth_ratios(
     there: FrameMotion,
     T_ji: Float[Tensor, "4 4"],
 ) -> Float[Tensor, "m"]:
-    """Logarithm of the second's depth over the first's as seen from it, at the sure matches."""
+    """Logarithm of the second's depth over the first's as seen from it, at confident matches."""
     T = T_ji.to(grid.rays)
     pixels = there.match.pixels[0]
     forward = (grid.rays @ T[:3, :3].mT + first.inverse_depth[:, None] * T[:3, 3])[:, 2]
@@ -125,7 +125,7 @@ def _depth_ratios(
 
 
 def _consensus(ratios: Float[Tensor, "m"], tolerance: float) -> tuple[float, float]:
-    """Median ratio, and the share of the ratios that keep to it."""
+    """Median ratio, and the fraction of the ratios that keep to it."""
     if not len(ratios):
         return 1.0, 0.0
     middle = ratios.median()

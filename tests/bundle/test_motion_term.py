@@ -8,7 +8,7 @@ import torch
 from bundle_scenes import CAMERA, disturbed, scene
 from geogs.bundle.base import BundleOptions
 from geogs.bundle.dense import DenseBundle
-from geogs.bundle.measured_motions import MeasuredMotions
+from geogs.bundle.motion_term import MeasuredMotions
 from geogs.bundle.problem import BundleProblem, StreamedProblem
 from geogs.bundle.streamed import StreamedBundle
 from geogs.geometry.lie import move, retract, se3_exp, se3_inverse
@@ -36,7 +36,7 @@ def test_jacobians_match_finite_differences(noise):
     motions, T = chained(truth, noise), truth.T_cw
     n, step = len(T), 1e-6
     adjoint, hessian, gradient = motions.equations(T)
-    trust = motions.trust(motions.residual(T))
+    trust = motions.robust_weight(motions.residual(T))
     for m, (i, j) in enumerate(zip(motions.source, motions.target, strict=True)):
         numeric = []
         for k in range(12):
@@ -59,7 +59,7 @@ def test_step_matches_dense_normal_equations():
     free_depth = truth.free_depth.clone()
     free_depth[1] = False
     start = replace(
-        disturbed(truth, 0.02, 0.05), motions=chained(truth, 0.02), free_depth=free_depth
+        disturbed(truth, 0.02, 0.05), pose_terms=(chained(truth, 0.02),), free_depth=free_depth
     )
     options = BundleOptions(iterations=1, huber=0.5)
     xi, delta = gauss_newton_step(start, CAMERA, grid.rays, options)
@@ -67,13 +67,13 @@ def test_step_matches_dense_normal_equations():
     torch.testing.assert_close(result.T_cw, retract(xi, start.T_cw), rtol=0, atol=2e-5)
     expected = start.inverse_depth.double() + delta
     torch.testing.assert_close(result.inverse_depth.double(), expected, rtol=0, atol=5e-5)
-    plain = DenseBundle(grid).solve(replace(start, motions=None), options)
+    plain = DenseBundle(grid).solve(replace(start, pose_terms=()), options)
     assert float((plain.T_cw - result.T_cw).abs().max()) > 1e-3
 
 
 def test_streamed_steps_are_those_of_the_dense_solver():
     grid, truth = scene(frames=6)
-    p = replace(disturbed(truth, 0.02, 0.05), motions=chained(truth, 0.02))
+    p = replace(disturbed(truth, 0.02, 0.05), pose_terms=(chained(truth, 0.02),))
     # No match joins 3 with 4: only what was measured does.
     near = ((p.source - p.target).abs() <= 2) & ((p.source < 4) == (p.target < 4))
     p = replace(
@@ -81,8 +81,8 @@ def test_streamed_steps_are_those_of_the_dense_solver():
         weight=p.weight[near],
     )  # fmt: skip
     streamed = StreamedProblem(
-        p.T_cw, p.inverse_depth, p.source, p.target, lambda e: (p.pixels[e], p.weight[e]),
-        p.free_pose, p.free_depth, motions=p.motions,
+        p.T_cw, p.inverse_depth, p.source, p.target, p.free_pose, p.free_depth,
+        pose_terms=p.pose_terms, matches=lambda e: (p.pixels[e], p.weight[e]),
     )  # fmt: skip
     options = BundleOptions(iterations=3, huber=0.5, chunk=3)
     slow, fast = DenseBundle(grid).solve(p, options), StreamedBundle(grid).solve(streamed, options)
@@ -104,7 +104,7 @@ def of_wrong_size(truth: BundleProblem) -> BundleProblem:
 
 def test_measured_motions_say_how_long_a_step_is():
     grid, truth = scene(frames=6)
-    start = replace(of_wrong_size(truth), motions=chained(truth, 0.0))
+    start = replace(of_wrong_size(truth), pose_terms=(chained(truth, 0.0),))
     options = BundleOptions(iterations=40, huber=10.0, damping=1e-8)
     result = DenseBundle(grid).solve(start, options)
     before = (centres(start.T_cw) - centres(truth.T_cw)).norm(dim=1).max()
@@ -121,12 +121,12 @@ def test_motions_that_are_wrong_altogether_are_out_voted():
     options = BundleOptions(iterations=12, huber=10.0)
     found = {}
     for name, T in (("right", motions.T_ts), ("wrong", wrong)):
-        problem = replace(start, motions=replace(motions, T_ts=T))
+        problem = replace(start, pose_terms=(replace(motions, T_ts=T),))
         result = DenseBundle(grid).solve(problem, options)
         found[name] = float((centres(result.T_cw) - centres(truth.T_cw)).norm(dim=1).max())
     assert found["right"] < 1e-4
     assert found["wrong"] < 3e-4
     e = replace(motions, T_ts=wrong).residual(truth.T_cw)
-    trust = replace(motions, T_ts=wrong).trust(e)
+    trust = replace(motions, T_ts=wrong).robust_weight(e)
     assert float(trust[3]) < 1e-3
     assert float(trust[:3].min()) > 0.999

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from geogs.shutter.turning import rotated
+from geogs.shutter.angular_motion import rotated
 
 _NEAREST = 1e-3
 """Depth, in the unit of the points, below which a point is taken to be there."""
@@ -23,7 +23,7 @@ class Reconstruction:
 
     @property
     def is_finite(self) -> bool:
-        """Whether it has not gone astray."""
+        """Whether it has not diverged."""
         parts = (self.R, self.t, self.points)
         return all(bool(np.isfinite(part).all()) for part in parts)
 

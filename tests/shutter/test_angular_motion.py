@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 from geogs.geometry.lie import so3_exp
-from geogs.shutter.turning import Step, Turning, rotated, turning_between
+from geogs.shutter.angular_motion import AngularMotion, AngularStep, angular_motion_between, rotated
 
 
 def test_vectors_are_rotated_as_by_the_matrix_exponential():
@@ -18,7 +18,9 @@ def test_vectors_are_rotated_as_by_the_matrix_exponential():
 def test_a_linear_rate_is_found_from_its_means():
     """Steps of different length: the means of a rate a + b t are its values in their middles."""
     a, b = np.array([0.3, -0.2, 0.1]), np.array([4.0, 5.0, -6.0])
-    turning = turning_between(Step(a - 0.02 * b, 0.04), Step(a + 0.01 * b, 0.02))
+    turning = angular_motion_between(
+        AngularStep(a - 0.02 * b, 0.04), AngularStep(a + 0.01 * b, 0.02)
+    )
     np.testing.assert_allclose(turning.rate, a, atol=1e-12)
     np.testing.assert_allclose(turning.acceleration, b, atol=1e-9)
     np.testing.assert_allclose(
@@ -28,10 +30,10 @@ def test_a_linear_rate_is_found_from_its_means():
 
 def test_at_an_end_the_only_step_tells_and_without_one_the_camera_stands():
     rate = np.array([0.1, 0.2, 0.3])
-    for known in ((Step(rate, 0.03), None), (None, Step(rate, 0.03))):
-        turning = turning_between(*known)
+    for known in ((AngularStep(rate, 0.03), None), (None, AngularStep(rate, 0.03))):
+        turning = angular_motion_between(*known)
         np.testing.assert_array_equal(turning.rate, rate)
         assert not turning.acceleration.any()
         assert not turning.is_still
-    assert turning_between(None, None).is_still
-    assert Turning().is_still
+    assert angular_motion_between(None, None).is_still
+    assert AngularMotion().is_still

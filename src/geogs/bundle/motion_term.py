@@ -1,4 +1,4 @@
-"""Motions between frames that something else than the images has measured, as terms on poses."""
+"""The term of motions between frames that something else than the images has measured."""
 
 from dataclasses import dataclass
 
@@ -6,7 +6,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from geogs.bundle.hyper_edge import HyperEdge, RelativeEdges
+from geogs.bundle.terms import BundleState
 from geogs.geometry.lie import se3_adjoint, se3_inverse, se3_left_jacobian, se3_log
+from geogs.geometry.robust import cauchy_weight
 
 KNEE = 3.0
 """Deviations (of all six numbers together) at which a motion counts half as much. What lies far
@@ -15,11 +18,7 @@ beyond pulls less the farther it is, so that motions that are wrong altogether a
 
 @dataclass(frozen=True)
 class MeasuredMotions:
-    """Motions between pairs of frames, in the lengths of the map; robust by Cauchy's loss.
-
-    They join poses alone, so that the elimination of depths does not know of them. All is best on
-    the CPU.
-    """
+    """Motions between pairs of frames, in the lengths of the map; robust by Cauchy's loss."""
 
     source: Int[Tensor, "m"]
     target: Int[Tensor, "m"]
@@ -33,9 +32,9 @@ class MeasuredMotions:
         present = T_cw[self.target] @ se3_inverse(T_cw[self.source])
         return se3_log(present @ se3_inverse(self.T_ts))
 
-    def trust(self, residual: Float[Tensor, "m 6"]) -> Float[Tensor, "m"]:
-        """Cauchy's weight 1 / (1 + chi^2 / KNEE^2) of each motion."""
-        return 1 / (1 + (self.information * residual.square()).sum(-1) / KNEE**2)
+    def robust_weight(self, residual: Float[Tensor, "m 6"]) -> Float[Tensor, "m"]:
+        """Cauchy's of each motion, ``KNEE`` deviations being one."""
+        return cauchy_weight((self.information * residual.square()).sum(-1) / KNEE**2)
 
     def equations(
         self, T_cw: Float[Tensor, "n 4 4"]
@@ -48,5 +47,14 @@ class MeasuredMotions:
         present = T_cw[self.target] @ se3_inverse(T_cw[self.source])
         e = self.residual(T_cw)
         J = torch.linalg.inv(se3_left_jacobian(e))
-        JW = J.mT * (self.trust(e)[:, None] * self.information)[:, None]
+        JW = J.mT * (self.robust_weight(e)[:, None] * self.information)[:, None]
         return se3_adjoint(present), JW @ J, -(JW @ e[..., None])[..., 0]
+
+    def hyper_edges(self, state: BundleState) -> list[HyperEdge]:
+        """As in the protocol: one for each motion."""
+        ends = torch.stack([self.target, self.source], 1)
+        parts = (ends, *self.equations(state.T_cw))
+        return [
+            RelativeEdges(poses, hessian, gradient, adjoint=adjoint[None])
+            for poses, adjoint, hessian, gradient in zip(*parts, strict=True)
+        ]

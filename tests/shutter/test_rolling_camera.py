@@ -7,7 +7,7 @@ import pytest
 
 from geogs.geometry.camera import Camera
 from geogs.io.sources.formats.video import turn_upright
-from geogs.shutter.camera import RollingCamera
+from geogs.shutter.rolling_camera import RollingCamera
 
 LANDSCAPE = Camera(50.0, 50.0, 31.5, 23.5, 64, 48)
 PORTRAIT = Camera(50.0, 50.0, 23.5, 31.5, 48, 64)

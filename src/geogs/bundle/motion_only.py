@@ -4,9 +4,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from geogs.bundle.linearise import normal_equations, weighed_residuals
+from geogs.bundle.flow_term import normal_equations, weighed_residuals
 from geogs.bundle.problem import MotionProblem
 from geogs.bundle.projection import linearise, project
+from geogs.geometry.least_squares import Policy, Step, minimise
 from geogs.geometry.lie import move, se3_inverse
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import Keyframe
@@ -23,19 +24,27 @@ class CpuMotion:
         self, problem: MotionProblem, iterations: int = 4, huber: float = 3.0
     ) -> tuple[Float[Tensor, "n 4 4"], Float[Tensor, "e p 2"]]:
         """As in the protocol."""
-        camera, rays, d = self.grid.camera, self.rays, problem.inverse_depth
-        T, frame, inverse = problem.T_cw, problem.frame, se3_inverse(problem.T_source)
-        for _ in range(iterations):
-            p = linearise(camera, rays, T[frame] @ inverse, d)
+        camera, rays, d, frame = self.grid.camera, self.rays, problem.inverse_depth, problem.frame
+        to_source = se3_inverse(problem.T_source)
+
+        def linearised(T: Float[Tensor, "n 4 4"]) -> tuple[Tensor, Tensor]:
+            p = linearise(camera, rays, T[frame] @ to_source, d)
             r, w = weighed_residuals(p, problem.pixels, problem.weight, huber)
             edge_H, edge_g = normal_equations(p.pose_jacobian * w.mT[:, None], p.pose_jacobian, r)
             H = T.new_zeros(len(T), 6, 6).index_add_(0, frame, edge_H)
-            g = T.new_zeros(len(T), 6).index_add_(0, frame, edge_g)
-            damping = 1e-4 * H.diagonal(dim1=-2, dim2=-1) + 1e-6
-            xi = torch.linalg.solve(H + torch.diag_embed(damping), g)
-            T = move(xi.nan_to_num(0.0, 0.0, 0.0), T)
-        final = project(camera, rays, T[frame] @ inverse, d)
-        return T, problem.pixels - final.pixels
+            return H, T.new_zeros(len(T), 6).index_add_(0, frame, edge_g)
+
+        def step(
+            T: Float[Tensor, "n 4 4"], linear: tuple[Tensor, Tensor], damping: float
+        ) -> Step[Tensor]:
+            """A pose whose step is not finite stays."""
+            H, g = linear
+            raised = damping * H.diagonal(dim1=-2, dim2=-1) + 1e-6
+            xi = torch.linalg.solve(H + torch.diag_embed(raised), g)
+            return Step(move(xi.nan_to_num(0.0, 0.0, 0.0), T))
+
+        T = minimise(problem.T_cw, linearised, step, Policy(iterations, damping=1e-4)).state
+        return T, problem.pixels - project(camera, rays, T[frame] @ to_source, d).pixels
 
     def fit(
         self,
@@ -62,7 +71,8 @@ class CpuMotion:
         used = weight[:, 0] > 0
         error, flow = residual[0].norm(dim=-1), (pixels - self.grid.pixels).norm(dim=-1)
         agree = used & (error < limit)
-        matched, agreeing, known, sure = (x.float().mean() for x in (used, agree, informed, placed))
+        fractions = (x.float().mean() for x in (used, agree, informed, placed))
+        matched, agreeing, known, placed_fraction = fractions
         medians = error[used].median(), flow[used].median()
         T_ji = T[0] @ se3_inverse(keyframe.T_cw)
-        return T[0], T_ji, torch.stack([matched, agreeing, *medians, known, sure])
+        return T[0], T_ji, torch.stack([matched, agreeing, *medians, known, placed_fraction])

@@ -1,0 +1,55 @@
+"""Terms of single inverse depths: what resists their change, and what a sensor has measured."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from geogs.bundle.hyper_edge import DepthEquations, HyperEdge
+from geogs.bundle.terms import BundleState
+from geogs.geometry.robust import huber_weight
+
+MEASURED_HUBER = 3.0
+"""Deviations of a measured depth beyond which it counts linearly. Matches have a smaller knee: they
+are wrong altogether more often than what a sensor says away from edges."""
+
+
+@dataclass(frozen=True)
+class DepthDamping:
+    """Resistance to a change of each inverse depth that measures nothing: DROID-SLAM's eta."""
+
+    curvature: Float[Tensor, "n p"]
+    """Added to that of the matches, sum_e w |dp/dd|^2."""
+
+    @property
+    def information(self) -> None:
+        """None: it measures nothing."""
+        return
+
+    def of_frame(self, frame: int, state: BundleState) -> HyperEdge:
+        """As in the protocol."""
+        return of_depths(DepthEquations.alone(self.curvature[frame]))
+
+
+@dataclass(frozen=True)
+class MeasuredDepths:
+    """Inverse depths that were measured beside the matches, each on its own; robust by Huber."""
+
+    inverse_depth: Float[Tensor, "n p"]
+    information: Float[Tensor, "n p"]
+    """Inverse variances; 0 where nothing was measured."""
+
+    def of_frame(self, frame: int, state: BundleState) -> HyperEdge:
+        """As in the protocol: a and a (measured - d), a the information times Huber's weight."""
+        information = self.information[frame]
+        residual = self.inverse_depth[frame] - state.inverse_depth[frame]
+        norm = information.sqrt() * residual.abs()
+        curvature = information * huber_weight(norm, MEASURED_HUBER)
+        return of_depths(DepthEquations.alone(curvature, curvature * residual, curvature))
+
+
+def of_depths(depth: DepthEquations) -> HyperEdge:
+    """A hyper-edge that joins the depths of a frame with nothing."""
+    none = torch.zeros(0, 0, dtype=torch.float64)
+    return HyperEdge(torch.zeros(0, dtype=torch.long), none, none[0:0].flatten(), depth=depth)

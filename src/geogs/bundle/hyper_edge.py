@@ -1,0 +1,184 @@
+"""Residuals that share unknowns, linearised: what terms hand to solvers.
+
+A hyper-edge joins the poses of some frames, the inverse depths of one of them, and unknowns that
+the whole problem shares. It may be linearised in unknowns of its own, such as the relative motions
+of matches, with a chain to those of the problem. Depths are eliminated first, frame by frame, since
+each is tied to no other. Equations of depths are float32, all others float64.
+"""
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class DepthEquations:
+    """What is said of the inverse depths of a frame, and of others along with them."""
+
+    coupling: Float[Tensor, "m p"]
+    """sum w dr/du dr/dd, with the unknowns u of the hyper-edge."""
+    curvature: Float[Tensor, "p"]
+    """sum w |dr/dd|^2, and what else resists a change."""
+    gradient: Float[Tensor, "p"]
+    """-sum w r . dr/dd, the direction of descent."""
+    information: Float[Tensor, "p"]
+    """The part of the curvature that is known and not only a resistance."""
+
+    @staticmethod
+    def alone(
+        curvature: Float[Tensor, "p"],
+        gradient: Float[Tensor, "p"] | None = None,
+        information: Float[Tensor, "p"] | None = None,
+    ) -> "DepthEquations":
+        """Of depths that nothing else is tied to; no gradient or information is none."""
+        none, zero = curvature.new_zeros(0, len(curvature)), torch.zeros_like(curvature)
+        return DepthEquations(
+            none,
+            curvature,
+            zero if gradient is None else gradient,
+            zero if information is None else information,
+        )
+
+    def plus(self, other: "DepthEquations") -> "DepthEquations":
+        """Both, where nothing but depths is in the other."""
+        return DepthEquations(
+            self.coupling,
+            self.curvature + other.curvature,
+            self.gradient + other.gradient,
+            self.information + other.information,
+        )
+
+    def on_cells(self, cells: slice) -> "DepthEquations":
+        """Those of some of the cells; on the CPU."""
+        parts = (self.coupling, self.curvature, self.gradient, self.information)
+        return DepthEquations(*(part[..., cells].cpu() for part in parts))
+
+    def after(self, unknowns: Float[Tensor, "m"]) -> "DepthEquations":
+        """What is left of the depths alone after a step of all else: b - E^T u."""
+        left = self.gradient - self.coupling.mT @ unknowns.to(self.coupling)
+        return DepthEquations.alone(self.curvature, left, self.information)
+
+    @property
+    def solution(self) -> Float[Tensor, "p"]:
+        """The step of depths that nothing else is tied to any more."""
+        return self.gradient / self.curvature
+
+    def reduce(
+        self, hessian: Float[Tensor, "m m"], gradient: Float[Tensor, "m"]
+    ) -> tuple[Float[Tensor, "m m"], Float[Tensor, "m"]]:
+        """The equations of the unknowns without the depths: H - E C^-1 E^T, g - E C^-1 b."""
+        E, C = self.coupling, self.curvature
+        return (
+            hessian - ((E / C) @ E.mT).to(hessian),
+            gradient - (E @ (self.gradient / C)).to(gradient),
+        )
+
+
+@dataclass(frozen=True)
+class HyperEdge:
+    """Linearised residuals, in the steps of the poses and of the shared unknowns themselves."""
+
+    poses: Int[Tensor, "k"]
+    """Frames whose poses it joins."""
+    hessian: Float[Tensor, "m m"]
+    gradient: Float[Tensor, "m"]
+    """The direction of descent."""
+    shared: int = 0
+    """Number of the problem's shared unknowns, if it joins them; they come last."""
+    depth: DepthEquations | None = None
+
+    @property
+    def chain(self) -> Float[Tensor, "m c"]:
+        """From steps of ``poses``, then of shared unknowns, to its own unknowns."""
+        return torch.eye(len(self.gradient), dtype=self.gradient.dtype)
+
+    def rows(self, frames: int) -> Int[Tensor, "c"]:
+        """Where ``poses``, then shared unknowns stand behind each other in those of a problem."""
+        poses = (6 * self.poses[:, None] + torch.arange(6)).reshape(-1)
+        return torch.cat([poses, 6 * frames + torch.arange(self.shared)])
+
+    def chained(self) -> tuple[Float[Tensor, "c c"], Float[Tensor, "c"]]:
+        """Hessian and gradient over ``poses``, then shared unknowns."""
+        chain = self.chain
+        return chain.mT @ self.hessian @ chain, chain.mT @ self.gradient
+
+    def pose_blocks(self) -> tuple[Float[Tensor, "k k 6 6"], Float[Tensor, "k 6"]]:
+        """Hessian and gradient over ``poses`` in blocks, where nothing is shared."""
+        hessian, gradient = self.chained()
+        n = len(self.poses)
+        return hessian.reshape(n, 6, n, 6).transpose(1, 2), gradient.reshape(n, 6)
+
+    def chained_coupling(self) -> Float[Tensor, "c p"]:
+        """Coupling of the depths with ``poses``, then shared unknowns."""
+        assert self.depth is not None
+        return self.chain.mT.to(self.depth.coupling) @ self.depth.coupling
+
+    def depth_after(self, step: Float[Tensor, "v"], frames: int) -> DepthEquations:
+        """Equations of its depths after a step of all poses and shared unknowns."""
+        assert self.depth is not None
+        if not len(self.gradient):
+            return self.depth
+        depth = replace(self.depth, coupling=self.chained_coupling())
+        return depth.after(step[self.rows(frames)])
+
+    def joined(self, other: "HyperEdge") -> "HyperEdge":
+        """Both together, which share the depths of a frame."""
+        if self.depth is None or other.depth is None:
+            raise ValueError("Only hyper-edges of the depths of one frame are joined.")
+        if not len(other.gradient):
+            return replace(self, depth=self.depth.plus(other.depth))
+        poses = torch.unique(torch.cat([self.poses, other.poses]))
+        shared, size = max(self.shared, other.shared), 6 * len(poses)
+        depth = self.depth.plus(other.depth)
+        H = torch.zeros(size + shared, size + shared, dtype=torch.float64)
+        g, E = H.new_zeros(len(H)), depth.curvature.new_zeros(len(H), len(depth.curvature))
+        for part in (self, other):
+            places = torch.searchsorted(poses, part.poses)
+            at = replace(HyperEdge(places, H, g), shared=part.shared).rows(len(poses))
+            hessian, gradient = part.chained()
+            H[at[:, None], at] += hessian
+            g[at] += gradient
+            E[at] += part.chained_coupling()
+        return HyperEdge(poses, H, g, shared, replace(depth, coupling=E))
+
+    def eliminated(self) -> "HyperEdge":
+        """With the depths out of the equations of all else."""
+        assert self.depth is not None
+        hessian, gradient = self.depth.reduce(self.hessian, self.gradient)
+        return replace(self, hessian=hessian, gradient=gradient)
+
+    def without_coupling(self) -> "HyperEdge":
+        """Without what is most of it and only needed for its depths."""
+        assert self.depth is not None
+        none = self.depth.coupling.new_zeros(0, len(self.depth.curvature))
+        return replace(self, depth=replace(self.depth, coupling=none))
+
+
+@dataclass(frozen=True, kw_only=True)
+class RelativeEdges(HyperEdge):
+    """Edges from a source to its targets, linearised in the motions of the targets relative to it.
+
+    Only one Jacobian is formed; the chain to both poses is ``xi_rel = xi_j - Ad(T_ji) xi_i``. The
+    source is the last of the poses; beside the relative motions there may be shared unknowns.
+    """
+
+    adjoint: Float[Tensor, "e 6 6"]
+    """Of the motion T_ji of each edge."""
+
+    @property
+    def chain(self) -> Float[Tensor, "m c"]:
+        """As above."""
+        at = 6 * len(self.adjoint)
+        eye = torch.eye(len(self.gradient), dtype=torch.float64, device=self.adjoint.device)
+        source = torch.cat([-self.adjoint.flatten(0, 1), eye.new_zeros(self.shared, 6)])
+        return torch.cat([eye[:, :at], source, eye[:, at:]], 1)
+
+    def depth_after(self, step: Float[Tensor, "v"], frames: int) -> DepthEquations:
+        """Of the source's depths."""
+        if self.shared or self.depth is None:
+            return super().depth_after(step, frames)
+        xi = step[: 6 * frames].reshape(frames, 6)
+        relative = xi[self.poses[:-1]] - self.adjoint @ xi[self.poses[-1]]
+        return self.depth.after(relative.reshape(-1))

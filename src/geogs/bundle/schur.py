@@ -1,0 +1,85 @@
+"""Poses and inverse depths as the least-squares loop sees them, whoever linearises.
+
+Depths are eliminated source by source (Schur complement), the camera system that is left is solved,
+and the depths follow. Solvers differ in what they keep of linearised matches, and where.
+"""
+
+from abc import ABC, abstractmethod
+from typing import Generic, TypeVar
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from geogs.bundle.base import BundleOptions, BundleResult
+from geogs.bundle.problem import Problem
+from geogs.bundle.terms import BundleState
+from geogs.geometry.least_squares import Policy, Step, minimise
+from geogs.geometry.lie import move
+
+P = TypeVar("P", bound=Problem)
+L = TypeVar("L")
+
+
+class SchurBundle(ABC, Generic[P, L]):
+    """One adjustment; ``L`` is what is kept of a linearised problem."""
+
+    def __init__(self, problem: P, options: BundleOptions) -> None:
+        self.problem, self.options = problem, options
+        self.information = problem.known_before()
+        """As in ``BundleResult``, where the problem was linearised last."""
+        self.residual = problem.inverse_depth.new_zeros(len(problem.source))
+
+    @abstractmethod
+    def linearise(self, state: BundleState) -> L:
+        """The camera system, and what the depths are found by."""
+
+    @abstractmethod
+    def solve_cameras(self, linear: L, damping: float) -> Float[Tensor, "v"] | None:
+        """Steps of all poses, zero for the fixed, then of shared unknowns; None if not finite."""
+
+    @abstractmethod
+    def depth_steps(
+        self, state: BundleState, linear: L, step: Float[Tensor, "v"]
+    ) -> Float[Tensor, "n p"]:
+        """Steps of the free inverse depths that go with that of all else."""
+
+    def step(self, state: BundleState, linear: L, damping: float) -> Step[BundleState] | None:
+        """As the loop asks for it."""
+        step = self.solve_cameras(linear, damping)
+        if step is None:
+            return None
+        delta = self.depth_steps(state, linear, step)
+        if not bool(torch.isfinite(delta).all()):
+            return None
+        poses = 6 * len(state.T_cw)
+        xi = step[:poses].reshape(-1, 6)
+        T, d = stepped(self.problem, state, xi, delta, self.options)
+        block = None if state.block is None else state.block.moved(step[poses:])
+        return Step(BundleState(T, d, block), float(xi.abs().max()))
+
+    def adjusted(self) -> BundleResult:
+        """Gauss-Newton steps from where the problem begins."""
+        o = self.options
+        policy = Policy(o.iterations, o.damping, o.tolerance)
+        solution = minimise(self.problem.start, self.linearise, self.step, policy)
+        s = solution.state
+        return BundleResult(
+            s.T_cw, s.inverse_depth, self.information, self.residual, solution.finite, s.block
+        )
+
+
+def stepped(
+    problem: Problem,
+    state: BundleState,
+    xi: Float[Tensor, "n 6"],
+    delta: Float[Tensor, "n p"],
+    options: BundleOptions,
+) -> tuple[Float[Tensor, "n 4 4"], Float[Tensor, "n p"]]:
+    """Poses and inverse depths, each on its device, after a step of those that are free."""
+    T, d = state.T_cw, state.inverse_depth + delta
+    d = d.clamp(options.min_inverse_depth, options.max_inverse_depth)
+    return (
+        torch.where(problem.free_pose[:, None, None], move(xi, T), T),
+        torch.where(problem.free_depth[:, None].to(d.device), d, problem.inverse_depth),
+    )

@@ -1,0 +1,207 @@
+"""Bundle adjustment whose variables are also some that all edges share, such as a lens.
+
+Levenberg-Marquardt on the tracker's cost (:mod:`geogs.bundle.dense`) with a block of unknowns
+beside poses and inverse depths: depths are eliminated frame by frame, then poses and block are
+solved together in float64. The first pose is fixed; the scale, which nothing measures, is kept by a
+penalty along it, so that nothing else resists the block.
+
+What is summed over the cells of an edge is summed here in another order than by the tracker's term
+(:class:`~geogs.bundle.flow_term.PinholeFlow`), whose speed counts: the last bits of either's
+results depend on it.
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Generic, TypeVar, cast
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from geogs.bundle.base import BundleOptions
+from geogs.bundle.dense import DenseSchur, LinearBundle
+from geogs.bundle.flow_term import (
+    SourceFlow,
+    damped_curvature,
+    edge_residual,
+    residual_norms,
+    weighed_residuals,
+)
+from geogs.bundle.hyper_edge import DepthEquations, RelativeEdges
+from geogs.bundle.problem import BundleProblem, sources_within
+from geogs.bundle.projection import relative_motion
+from geogs.bundle.terms import BundleState, ProjectingBlock
+from geogs.geometry.least_squares import Policy, minimise
+from geogs.geometry.lie import se3_adjoint, se3_inverse
+from geogs.geometry.robust import huber_cost
+
+B = TypeVar("B", bound=ProjectingBlock)
+
+OPTIONS = BundleOptions(iterations=15, damping=1e-3, depth_damping=1e-5)
+"""Of an adjustment with shared unknowns; its iterations are linearisations at most."""
+LEAST_DECREASE = 1e-4
+"""Fraction of the cost; a step that lowers it by no more is the last one."""
+
+
+@dataclass(frozen=True)
+class SharedResult(Generic[B]):
+    """The adjusted problem, and how well the block is known."""
+
+    block: B
+    T_cw: Float[Tensor, "n 4 4"]
+    inverse_depth: Float[Tensor, "n p"]
+    information: Float[Tensor, "n p"]
+    """Sum over a frame's edges of w |dp/dd|^2."""
+    cost: float
+    """Mean over the matched cells of Huber's cost of a residual, in variances of a match."""
+    covariance: Float[Tensor, "m m"]
+    """Of the block's unknowns (zero for those that are no variables), see :func:`solve_shared`."""
+    finite: bool
+
+
+def solve_shared(
+    problem: BundleProblem,
+    block: B,
+    options: BundleOptions = OPTIONS,
+    least_decrease: float = LEAST_DECREASE,
+) -> SharedResult[B]:
+    """Adjust all free poses, all inverse depths and the block; every frame's depth is free.
+
+    The covariance is cluster-robust (Liang and Zeger's sandwich):
+    ``S^-1 (sum_i g_i g_i^T) S^-1`` with the reduced gradient ``g_i`` of each source frame, since
+    the errors of neighbouring cells, and of one cell in several targets, are alike; no noise level
+    and no count of independent cells is needed. A step that is not finite ends the adjustment.
+    """
+    shared = SharedSchur(problem, options)
+    start = BundleState(problem.T_cw, problem.inverse_depth, block)
+    policy = Policy(
+        max_trials=options.iterations,
+        damping=options.damping,
+        max_damping=1e3,
+        least_raised=1e-6,
+        least_decrease=least_decrease,
+    )
+    found = minimise(start, shared.linearise, shared.step, policy, shared.cost)
+    state, linear = found.state, found.linear or shared.linearise(found.state)
+    covariance = _covariance(linear)
+    return SharedResult(
+        cast(B, state.block),
+        state.T_cw,
+        state.inverse_depth,
+        shared.information,
+        found.cost,
+        covariance,
+        found.finite and bool(torch.isfinite(covariance).all()),
+    )
+
+
+class SharedSchur(DenseSchur):
+    """One adjustment with shared unknowns that projections depend on."""
+
+    floor = 1e-6
+
+    def __init__(self, problem: BundleProblem, options: BundleOptions) -> None:
+        super().__init__(problem, SharedFlow(), options)
+
+    def linearise(self, state: BundleState) -> LinearBundle:
+        """As without shared unknowns, and the scale is kept."""
+        linear = super().linearise(state)
+        system, T = linear.system, state.T_cw
+        diagonal = torch.zeros_like(system.gradient)
+        for source in linear.sources:
+            assert source.diagonal is not None
+            diagonal[source.edges.rows(len(T))] += source.diagonal
+        centre = se3_inverse(T[0])[:3, 3]
+        away = (T[:, :3, :3] @ centre + T[:, :3, 3]).double().cpu()
+        scale = torch.zeros_like(diagonal)
+        scale[: away.numel() * 2] = torch.cat([away, 0 * away], 1).reshape(-1)
+        scale = scale / scale.norm().clamp(min=1e-12)
+        system.hessian += diagonal.mean() * scale[:, None] * scale
+        return linear
+
+    def cost(self, state: BundleState, linear: LinearBundle | None = None) -> float:
+        """Mean of Huber's cost over matched cells; one behind its target is 10 hubers off.
+
+        Infinite where nothing is matched.
+        """
+        p, huber, source = self.problem, self.options.huber, self.problem.source
+        block = cast(ProjectingBlock, state.block)
+        at = block.project(state.T_cw, source, p.target, state.inverse_depth[source])
+        norm = residual_norms(at, p.pixels, p.weight)
+        norm = torch.where(at.valid, norm, torch.full_like(norm, 10 * huber))
+        cost = huber_cost(norm.square(), huber)
+        matched = p.weight[..., 0] > 0
+        if not bool(matched.any()):
+            return math.inf
+        return float((cost * matched).sum(dtype=torch.float64) / matched.sum())
+
+
+class SharedFlow:
+    """Dense flow whose projections depend on shared unknowns."""
+
+    def sources(
+        self, problem: BundleProblem, state: BundleState, options: BundleOptions
+    ) -> Iterator[SourceFlow]:
+        """As in the protocol; each with the diagonal of its equations, its depths being fixed."""
+        for frame, e in sources_within(problem.source):
+            yield _source(problem, state, options, frame, e)
+
+
+def _source(
+    problem: BundleProblem, state: BundleState, options: BundleOptions, frame: int, e: slice
+) -> SourceFlow:
+    source, targets = problem.source[e], problem.target[e]
+    block = cast(ProjectingBlock, state.block)
+    shared = len(block.free)
+    p = block.linearise(state.T_cw, source, targets, state.inverse_depth[source])
+    r, weight = weighed_residuals(p, problem.pixels[e], problem.weight[e], options.huber)
+    w, J, Jd = weight.mT[:, None], p.jacobian, p.depth_jacobian
+    wJ = J * w
+    H = (wJ.flatten(2) @ J.flatten(2).mT).double().cpu()
+    v = (wJ * r.mT[:, None]).sum((2, 3)).double().cpu()
+    E = (wJ * Jd[:, None]).sum(2)
+    wd = Jd * w[:, 0]
+    information, b = (wd * Jd).sum((0, 1)), (wd * r.mT).sum((0, 1))
+    # Relative motions of the edges, then the unknowns that they share.
+    at = 6 * len(targets)
+    hessian = torch.zeros(at + shared, at + shared, dtype=torch.float64)
+    hessian[:at, :at] = torch.block_diag(*H[:, :6, :6])
+    hessian[:at, at:] = H[:, :6, 6:].reshape(at, shared)
+    hessian[at:, :at] = hessian[:at, at:].mT
+    hessian[at:, at:] = H[:, 6:, 6:].sum(0)
+    gradient = torch.cat([v[:, :6].reshape(-1), v[:, 6:].sum(0)])
+    depth = DepthEquations(
+        torch.cat([E[:, :6].flatten(0, 1), E[:, 6:].sum(0)]),
+        damped_curvature(information, options.depth_damping),
+        b,
+        information,
+    )
+    poses = torch.cat([targets, source[:1]])
+    adjoint = se3_adjoint(relative_motion(state.T_cw, source, targets))
+    edges = RelativeEdges(poses, hessian, gradient, shared, depth, adjoint=adjoint)
+    return SourceFlow(frame, edges, edge_residual(r, weight), edges.chained()[0].diagonal())
+
+
+def _covariance(linear: LinearBundle) -> Float[Tensor, "m m"]:
+    """Of the block's unknowns, see :func:`solve_shared`."""
+    system, sources = linear.system, linear.sources
+    H, free, first = system.hessian, system.free, 6 * system.frames
+    out = H.new_zeros(len(H) - first, len(H) - first)
+    chosen = free[free >= first] - first
+    if not len(chosen) or len(sources) < 2:
+        return out
+    unit = H.new_zeros(len(free), len(chosen))
+    unit[-len(chosen) :] = torch.eye(len(chosen), dtype=H.dtype)
+    reduced = H[free[:, None], free]
+    rows, info = torch.linalg.solve_ex(reduced + 1e-9 * torch.diag(reduced.diagonal().abs()), unit)
+    if int(info):
+        return out + torch.nan
+    pull = H.new_zeros(len(H), len(chosen))
+    pull[free] = rows
+    each = torch.stack([
+        pull[s.edges.rows(system.frames)].mT @ s.edges.chained()[1] for s in sources
+    ])  # fmt: skip
+    each = each - each.mean(0)
+    out[chosen[:, None], chosen] = len(sources) / (len(sources) - 1) * each.mT @ each
+    return out

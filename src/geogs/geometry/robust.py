@@ -1,0 +1,34 @@
+"""Robust kernels: how much a residual counts, for arrays of NumPy and of PyTorch.
+
+Weights multiply the squares of reweighted least squares. A ``square`` is that of a residual over
+the deviation at which the kernel bends.
+"""
+
+from typing import TypeVar
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+A = TypeVar("A", Tensor, np.ndarray)
+
+
+def huber_weight(norm: Float[Tensor, "*n"], knee: float) -> Float[Tensor, "*n"]:
+    """Huber's weight ``min(1, knee / norm)``."""
+    return knee / norm.clamp(min=knee)
+
+
+def huber_cost(square: Float[Tensor, "*n"], knee: float) -> Float[Tensor, "*n"]:
+    """Huber's cost of squared residuals: they themselves up to the knee, linear beyond."""
+    return torch.where(square > knee**2, 2 * knee * square.sqrt() - knee**2, square)
+
+
+def cauchy_weight(square: A) -> A:
+    """Cauchy's weight ``1 / (1 + square)``."""
+    return 1 / (1 + square)
+
+
+def geman_mcclure_weight(square: A) -> A:
+    """Geman and McClure's weight ``1 / (1 + square)^2``."""
+    return 1 / (1 + square) ** 2
