@@ -1,19 +1,21 @@
 """Dense bundle adjustment on the GPU: a handful of launches per step, one wait per solve."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from geogs.bundle.base import BundleOptions, BundleResult
 from geogs.bundle.cuda.depth_terms import KernelDepthTerms
+from geogs.bundle.cuda.edges import EdgeArrays, LinearisedEdges, joined_edges
 from geogs.bundle.problem import BundleProblem
 from geogs.bundle.terms import BundleState
 from geogs.geometry.least_squares import Policy, Step, minimise
-from geogs.gpu.kernels import kernels_for
+from geogs.gpu.kernels import Kernel, kernels_for
 from geogs.gpu.transfer import to_device
 from geogs.world.grid import SampleGrid
 
@@ -25,37 +27,16 @@ TILE = 32
 """Rows and columns of the tiles of a larger system; ``TILE`` of the source."""
 
 
-def block_size(cells: int, most: int = 256) -> int:
-    """Threads of a block that goes over the cells of an edge: whole warps, 64 to ``most``."""
-    return max(64, min(-(-cells // 32) * 32, most))
-
-
-def edges_by_frame(
-    frame: Int[Tensor, "e"], frames: int, device: torch.device
-) -> tuple[Int[Tensor, "m"], Int[Tensor, "e"]]:
-    """Where the edges of each frame begin, and the end, in a list of all edges; and that list."""
-    order = torch.argsort(frame, stable=True)
-    first = torch.searchsorted(frame[order], torch.arange(frames + 1))
-    rows = to_device(torch.cat([first, order]), device, torch.int32)
-    return rows[: frames + 1], rows[frames + 1 :]
-
-
 @dataclass(frozen=True)
 class _Structure:
     """Which frames and edges there are and how they meet, as index arrays on the device."""
 
     poses: int
     """Number of free poses."""
-    source: Tensor
-    target: Tensor
-    first: Tensor
-    """First edge of each frame, and the end."""
+    edges: EdgeArrays
+    """All frames may be sources."""
     slot: Tensor
     """Place of each frame in the camera system, -1 where its pose is fixed."""
-    free_depth: Tensor
-    pair_a: Tensor
-    """Pairs a <= b of edges of one source that the elimination joins."""
-    pair_b: Tensor
     places: Tensor
     """Blocks of the camera system, see ``assemble_system``."""
     first_part: Tensor
@@ -64,10 +45,6 @@ class _Structure:
     @property
     def frames(self) -> int:
         return len(self.slot)
-
-    @property
-    def edges(self) -> int:
-        return len(self.source)
 
 
 def _structure(problem: BundleProblem, device: torch.device) -> _Structure:
@@ -81,22 +58,10 @@ def _structure(problem: BundleProblem, device: torch.device) -> _Structure:
     slot = np.where(free_pose, np.cumsum(free_pose) - 1, -1)
     poses = int(free_pose.sum())
     system = _system_parts(slot[source[a]], slot[target[a]], slot[target[b]], a == b, poses)
-    parts = [source, target, first, slot, free_depth, a, b, *system]
+    parts = [source, target, first, free_depth, a, b, slot, *system]
     sent = to_device(torch.from_numpy(np.concatenate(parts).astype(np.int32)), device)
-    return _Structure(poses, *sent.split([len(p) for p in parts]))
-
-
-def joined_edges(
-    first: Int[np.ndarray, "m"], free_depth: Bool[np.ndarray, "n"]
-) -> tuple[Int[np.ndarray, "k"], Int[np.ndarray, "k"]]:
-    """Pairs a <= b of edges of one source; only a = b where its depth is fixed."""
-    pairs = [np.zeros((2, 0), dtype=np.int64)]
-    for begin, end, joined in zip(first[:-1], first[1:], free_depth, strict=True):
-        count = end - begin
-        low = np.tril_indices(count) if joined else (np.arange(count), np.arange(count))
-        pairs.append(begin + np.stack(low))
-    b, a = np.concatenate(pairs, 1)
-    return a, b
+    pieces = sent.split([len(p) for p in parts])
+    return _Structure(poses, EdgeArrays(*pieces[:6]), *pieces[6:])
 
 
 def _system_parts(
@@ -133,35 +98,35 @@ def _system_parts(
     return places, first, part[order]
 
 
+class _Cameras:
+    """The camera system on the device."""
+
+    def __init__(self, structure: _Structure, like: Float[Tensor, "m"]) -> None:
+        size, pairs = 6 * structure.poses, len(structure.edges.pair_a)
+        self.system = like.new_empty((size + 1) * size)
+        """The right-hand side is its last row."""
+        self.inverses = like.new_empty(-(-size // PANEL) * PANEL * PANEL)
+        self.good = like.new_empty(1, dtype=torch.int32)
+        self.xi = like.new_zeros(6 * structure.frames)
+        self.blocks, self.vectors = like.new_empty(144 * pairs), like.new_empty(12 * pairs)
+
+
 class _Workspace:
     """What one solve keeps on the device, the state that is adjusted among it."""
 
-    def __init__(self, problem: BundleProblem, structure: _Structure, device: torch.device) -> None:
-        d = problem.inverse_depth
-        self.structure = s = structure
-        edges, cells = s.edges, d.shape[1]
-        self.cells = cells
+    def __init__(
+        self, problem: BundleProblem, structure: _Structure, kernels: Mapping[str, Kernel]
+    ) -> None:
+        d, frames = problem.inverse_depth, structure.frames
+        self.structure = structure
         # Poses and the sign of failure travel back together.
-        self.memory = torch.zeros(16 * s.frames + 1, dtype=torch.float64, device=device)
-        self.memory[: 16 * s.frames].copy_(to_device(problem.T_cw.reshape(-1), device))
-        self.T = self.memory[: 16 * s.frames]
-        self.failed = self.memory[16 * s.frames :].view(torch.int32)
-        self.inverse_depth = d.clone()
-        size = 6 * s.poses
-        self.system = self.memory.new_empty((size + 1) * size)
-        self.panels = -(-size // PANEL)
-        self.inverses = self.memory.new_empty(self.panels * PANEL * PANEL)
-        self.good = torch.empty(1, dtype=torch.int32, device=device)
-        self.xi = self.memory.new_zeros(6 * s.frames)
-        self.blocks = self.memory.new_empty(144 * len(s.pair_a))
-        self.vectors = self.memory.new_empty(12 * len(s.pair_a))
-        self.motion = self.memory.new_empty(12 * edges)
-        self.normal = self.memory.new_empty(32 * edges)
-        self.coupling = d.new_empty(6 * edges * cells)
-        self.curvature, self.gradient = d.new_empty(2, edges * cells).unbind()
-        self.information = torch.zeros_like(d)
-        self.inverse_curvature, self.depth_gradient, self.delta = d.new_empty(3, d.numel()).unbind()
-        self.residual = d.new_zeros(edges)
+        self.memory = torch.zeros(16 * frames + 1, dtype=torch.float64, device=d.device)
+        self.memory[: 16 * frames].copy_(to_device(problem.T_cw.reshape(-1), d.device))
+        self.T = self.memory[: 16 * frames]
+        self.failed = self.memory[16 * frames :].view(torch.int32)
+        self.inverse_depth, self.delta = d.clone(), d.new_empty(d.numel())
+        self.edges = LinearisedEdges(kernels, structure.edges, d)
+        self.cameras = _Cameras(structure, self.memory)
         self.depth_terms, self.block = KernelDepthTerms.of(problem.depth_terms), problem.block
 
     @property
@@ -192,7 +157,8 @@ def _add_pose_terms(w: _Workspace, problem: BundleProblem, damping: float) -> No
                     added[6 * p : 6 * p + 6, 6 * q : 6 * q + 6] += block[a, b]
     diagonal = added[:size].diagonal()
     diagonal += damping * diagonal.abs()
-    w.system += to_device(added.reshape(-1), w.system.device)
+    system = w.cameras.system
+    system += to_device(added.reshape(-1), system.device)
 
 
 class CudaDenseBundle:
@@ -216,14 +182,14 @@ class CudaDenseBundle:
         """
         options = options or BundleOptions()
         device = problem.inverse_depth.device
-        w = _Workspace(problem, self._structure_of(problem, device), device)
+        w = _Workspace(problem, self._structure_of(problem, device), self.kernels)
         steps = _Steps(self, problem, options)
         policy = Policy(options.iterations, options.damping)
         minimise(w, steps.linearise, steps.step, policy)
         memory = w.memory.cpu()
         T = memory[:-1].reshape(-1, 4, 4).to(problem.T_cw.device)
         finite = int(memory[-1:].view(torch.int32)[0]) == 0
-        return BundleResult(T, w.inverse_depth, w.information, w.residual, finite)
+        return BundleResult(T, w.inverse_depth, w.edges.information, w.edges.residual, finite)
 
     def _structure_of(self, problem: BundleProblem, device: torch.device) -> _Structure:
         """That of the last problem, if it is the same: edges are adjusted in rounds."""
@@ -246,22 +212,9 @@ class _Steps:
 
     def linearise(self, state: _Workspace) -> None:
         """Edges, summed up by source."""
-        w, s, c, options = state, state.structure, self.grid.camera, self.options
-        block = block_size(w.cells)
-        self.kernels["linearise_edges"](
-            s.edges, block, w.T, w.inverse_depth, s.source, s.target, *self.matches,
-            self.grid.rays, w.cells, c.fx, c.fy, c.cx, c.cy, options.huber, w.motion, w.normal,
-            w.coupling, w.curvature, w.gradient, w.residual,
-        )  # fmt: skip
-        damping, *measured = w.depth_terms.arguments()
-        self.kernels["sum_sources"](
-            s.frames, block, s.first, w.curvature, w.gradient, w.cells, options.depth_damping,
-            damping, w.inverse_depth, *measured, w.information, w.inverse_curvature,
-            w.depth_gradient,
-        )  # fmt: skip
-        w.depth_terms.add_others(
-            range(s.frames), w.state, w.information, w.inverse_curvature, w.depth_gradient
-        )
+        w, terms = state, state.depth_terms
+        w.edges.fill(self.grid, w.T, w.inverse_depth, self.matches, self.options, terms)
+        w.edges.add_terms(terms, range(w.structure.frames), w.state)
 
     def step(self, state: _Workspace, linear: None, damping: float) -> Step[_Workspace]:
         """All moves on the device, which keeps in mind whether one was not finite."""
@@ -270,48 +223,41 @@ class _Steps:
         return Step(state)
 
     def _solve_cameras(self, w: _Workspace, damping: float) -> None:
-        s = w.structure
+        s, c = w.structure, w.cameras
         if not s.poses:
             return
-        self.kernels["eliminate_depths"](
-            len(s.pair_a), block_size(w.cells), s.pair_a, s.pair_b, s.source, s.free_depth,
-            w.coupling, w.inverse_curvature, w.depth_gradient, w.motion, w.normal, w.cells,
-            w.blocks, w.vectors,
-        )  # fmt: skip
+        w.edges.eliminate(c.blocks, c.vectors)
         self.kernels["assemble_system"](
-            len(s.places), 256, s.places, s.first_part, s.parts, w.blocks, w.vectors, s.poses,
-            damping, w.system,
+            len(s.places), 256, s.places, s.first_part, s.parts, c.blocks, c.vectors, s.poses,
+            damping, c.system,
         )  # fmt: skip
         _add_pose_terms(w, self.problem, damping)
         if s.poses <= MAX_FEW:
             threads = min(256, 32 * s.poses)
-            self.solvers["solve_few_poses"](1, threads, w.system, s.slot, s.poses, s.frames, w.xi)
+            self.solvers["solve_few_poses"](1, threads, c.system, s.slot, s.poses, s.frames, c.xi)
         else:
-            self._solve_many_poses(w)
+            self._solve_many_poses(s, c)
 
-    def _solve_many_poses(self, w: _Workspace) -> None:
+    def _solve_many_poses(self, s: _Structure, c: _Cameras) -> None:
         """Cholesky's method panel by panel."""
-        s, size = w.structure, 6 * w.structure.poses
+        size = 6 * s.poses
         for k in range(0, size, PANEL):
-            self.solvers["factor_panel"](1, 256, w.system, size, k, w.inverses, w.good)
+            self.solvers["factor_panel"](1, 256, c.system, size, k, c.inverses, c.good)
             # The right-hand side is a row below every panel.
             tiles = -(-(size + 1 - min(k + PANEL, size)) // TILE)
-            self.solvers["substitute_panel"](tiles, 256, w.system, size, k, w.inverses)
+            self.solvers["substitute_panel"](tiles, 256, c.system, size, k, c.inverses)
             if k + PANEL < size:
-                self.solvers["update_rest"]((tiles, tiles), 256, w.system, size, k)
+                self.solvers["update_rest"]((tiles, tiles), 256, c.system, size, k)
         threads = min(1024, 32 * s.poses)
         self.solvers["substitute_back"](
-            1, threads, w.system, size, w.inverses, w.good, s.slot, s.frames, w.xi
+            1, threads, c.system, size, c.inverses, c.good, s.slot, s.frames, c.xi
         )
 
     def _move(self, w: _Workspace) -> None:
-        s, options, block = w.structure, self.options, block_size(w.cells)
-        grid = (-(-w.cells // block), s.frames)
-        self.kernels["find_depth_steps"](
-            grid, block, s.first, s.target, s.free_depth, w.motion, w.xi, w.coupling,
-            w.inverse_curvature, w.depth_gradient, w.cells, w.delta, w.failed,
-        )  # fmt: skip
+        s, options, edges = w.structure, self.options, w.edges
+        edges.find_depth_steps(w.cameras.xi, w.delta, w.failed)
         self.kernels["take_steps"](
-            grid, block, s.slot, s.free_depth, w.xi, w.delta, w.cells, options.min_inverse_depth,
+            (-(-edges.cells // edges.block), s.frames), edges.block, s.slot, s.edges.free_depth,
+            w.cameras.xi, w.delta, edges.cells, options.min_inverse_depth,
             options.max_inverse_depth, w.failed, w.T, w.inverse_depth,
         )  # fmt: skip

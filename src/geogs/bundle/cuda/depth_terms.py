@@ -32,15 +32,23 @@ class KernelDepthTerms:
                 others.append(term)
         return KernelDepthTerms(damping, measured, tuple(others))
 
-    def arguments(
-        self, rows: Tensor | slice = slice(None)
-    ) -> tuple[Tensor | None, Tensor | None, Tensor | None, float]:
-        """Of ``sum_sources``, for some of the frames."""
-        damping = None if self.damping is None else self.damping.curvature[rows].contiguous()
+    def of_rows(self, rows: Tensor) -> "KernelDepthTerms":
+        """What the kernel takes, for some of the frames alone."""
+        damping, measured = self.damping, self.measured
+        if damping is not None:
+            damping = DepthDamping(damping.curvature[rows])
+        if measured is not None:
+            measured = MeasuredDepths(measured.inverse_depth[rows], measured.information[rows])
+        return KernelDepthTerms(damping, measured, self.others)
+
+    @property
+    def arguments(self) -> tuple[Tensor | None, Tensor | None, Tensor | None, float]:
+        """Of ``sum_sources``."""
+        damping = None if self.damping is None else self.damping.curvature.contiguous()
         if self.measured is None:
             return damping, None, None, MEASURED_HUBER
-        measured = self.measured.inverse_depth[rows].contiguous()
-        return damping, measured, self.measured.information[rows].contiguous(), MEASURED_HUBER
+        measured = self.measured.inverse_depth.contiguous()
+        return damping, measured, self.measured.information.contiguous(), MEASURED_HUBER
 
     def add_others(
         self,

@@ -16,8 +16,8 @@ from torch import Tensor
 
 from geogs.bundle.base import BundleOptions, BundleResult
 from geogs.bundle.camera_system import SparseCameraSystem
-from geogs.bundle.cuda.dense import block_size, joined_edges
 from geogs.bundle.cuda.depth_terms import KernelDepthTerms
+from geogs.bundle.cuda.edges import EdgeArrays, LinearisedEdges, joined_edges
 from geogs.bundle.dense import FLOOR
 from geogs.bundle.problem import StreamedProblem, source_chunks
 from geogs.bundle.schur import SchurBundle
@@ -39,38 +39,18 @@ class _Chunk:
     """Of all frames, on the CPU."""
     frames: Tensor
     """Sources, then the other frames that their edges reach."""
-    source: Tensor
-    target: Tensor
-    """Of each edge, by the new numbers, int32 on the device; so are all that follow."""
-    first: Tensor
-    """First edge of each source, and the end."""
-    free_depth: Tensor
-    pair_a: Tensor
-    pair_b: Tensor
+    arrays: EdgeArrays
+    """By the new numbers."""
     added: Tensor
     """Blocks of the elimination that are added to the camera system as they are..."""
     added_to: Tensor
     """... and to which of its blocks."""
-    turned: Tensor
-    turned_to: Tensor
+    mirrored: Tensor
+    mirrored_to: Tensor
     """Likewise of those that are transposed first."""
     pulled: Tensor
     pulled_to: Tensor
     """Vectors of the elimination, and to the right-hand side of which pose they are added."""
-
-
-class _Linearised:
-    """What the kernels leave of a chunk."""
-
-    def __init__(self, chunk: _Chunk, inverse_depth: Float[Tensor, "s p"]) -> None:
-        d, edges, cells = inverse_depth, len(chunk.source), inverse_depth.shape[1]
-        self.motion = d.new_empty(12 * edges, dtype=torch.float64)
-        self.normal = d.new_empty(32 * edges, dtype=torch.float64)
-        self.coupling = d.new_empty(6 * edges * cells)
-        self.curvature, self.gradient = d.new_empty(2, edges * cells).unbind()
-        self.residual = d.new_zeros(edges)
-        self.information = torch.zeros_like(d)
-        self.inverse_curvature, self.depth_gradient = d.new_empty(2, d.numel()).unbind()
 
 
 class CudaStreamedBundle:
@@ -110,10 +90,14 @@ class _CudaStreamedSchur(SchurBundle[StreamedProblem, SparseCameraSystem]):
         blocks = d.new_zeros(system.size, 36, dtype=torch.float64)
         pull = d.new_zeros(len(T), 6, dtype=torch.float64)
         for chunk in self.chunks:
-            linear = self._linearise(state, chunk)
-            self._eliminate(chunk, linear, d.shape[1], blocks, pull)
-            self.information[chunk.sources.to(d.device)] = linear.information
-            self.residual[chunk.edges] = linear.residual
+            edges, pairs = self._linearise(state, chunk), len(chunk.arrays.pair_a)
+            found, vectors = blocks.new_empty(4 * pairs, 6, 6), blocks.new_empty(2 * pairs, 6)
+            edges.eliminate(found, vectors)
+            blocks.index_add_(0, chunk.added_to, found[chunk.added].flatten(1))
+            blocks.index_add_(0, chunk.mirrored_to, found[chunk.mirrored].mT.flatten(1))
+            pull.index_add_(0, chunk.pulled_to, vectors[chunk.pulled])
+            self.information[chunk.sources.to(d.device)] = edges.information
+            self.residual[chunk.edges] = edges.residual
         system.add_sums(blocks.cpu().reshape(-1, 6, 6), pull.cpu())
         for term in self.problem.pose_terms:
             system.add(term.hyper_edges(state))
@@ -128,64 +112,24 @@ class _CudaStreamedSchur(SchurBundle[StreamedProblem, SparseCameraSystem]):
     ) -> Float[Tensor, "n p"]:
         """By edges that are linearised a second time."""
         d, xi = state.inverse_depth, step.reshape(-1, 6)
-        delta, cells = torch.zeros_like(d), d.shape[1]
+        delta = torch.zeros_like(d)
         failed = torch.zeros(1, dtype=torch.int32, device=d.device)
-        block = block_size(cells)
         for chunk in self.chunks:
-            edges = self._linearise(state, chunk)
-            sources = len(chunk.sources)
-            steps = d.new_zeros(sources, cells)
-            self.kernels["find_depth_steps"](
-                (-(-cells // block), sources), block, chunk.first, chunk.target, chunk.free_depth,
-                edges.motion, to_device(xi[chunk.frames].reshape(-1), d.device), edges.coupling,
-                edges.inverse_curvature, edges.depth_gradient, cells, steps, failed,
-            )  # fmt: skip
+            steps = d.new_zeros(len(chunk.sources), d.shape[1])
+            moved = to_device(xi[chunk.frames].reshape(-1), d.device)
+            self._linearise(state, chunk).find_depth_steps(moved, steps, failed)
             delta[chunk.sources.to(d.device)] = steps
         return delta
 
-    def _linearise(self, state: BundleState, chunk: _Chunk) -> _Linearised:
-        d, c, options = state.inverse_depth, self.grid.camera, self.options
+    def _linearise(self, state: BundleState, chunk: _Chunk) -> LinearisedEdges:
+        d = state.inverse_depth
         pixels, weight = (m.contiguous() for m in self.problem.matches(chunk.edges))
         own = chunk.sources.to(d.device)
-        depth = d[own]
-        linear, cells = _Linearised(chunk, depth), d.shape[1]
-        poses = to_device(state.T_cw[chunk.frames].reshape(-1), d.device)
-        self.kernels["linearise_edges"](
-            len(chunk.source), block_size(cells), poses, depth, chunk.source, chunk.target, pixels,
-            weight, self.grid.rays, cells, c.fx, c.fy, c.cx, c.cy, options.huber, linear.motion,
-            linear.normal, linear.coupling, linear.curvature, linear.gradient, linear.residual,
-        )  # fmt: skip
-        damping, *measured = self.depth_terms.arguments(own)
-        self.kernels["sum_sources"](
-            len(own), block_size(cells), chunk.first, linear.curvature, linear.gradient, cells,
-            options.depth_damping, damping, depth, *measured, linear.information,
-            linear.inverse_curvature, linear.depth_gradient,
-        )  # fmt: skip
-        self.depth_terms.add_others(
-            chunk.sources.tolist(), state, linear.information, linear.inverse_curvature,
-            linear.depth_gradient,
-        )  # fmt: skip
-        return linear
-
-    def _eliminate(
-        self,
-        chunk: _Chunk,
-        linear: _Linearised,
-        cells: int,
-        blocks: Float[Tensor, "m 36"],
-        pull: Float[Tensor, "n 6"],
-    ) -> None:
-        """Add what a chunk says of the poses."""
-        pairs = len(chunk.pair_a)
-        found, vectors = blocks.new_empty(4 * pairs, 6, 6), blocks.new_empty(2 * pairs, 6)
-        self.kernels["eliminate_depths"](
-            pairs, block_size(cells), chunk.pair_a, chunk.pair_b, chunk.source, chunk.free_depth,
-            linear.coupling, linear.inverse_curvature, linear.depth_gradient, linear.motion,
-            linear.normal, cells, found, vectors,
-        )  # fmt: skip
-        blocks.index_add_(0, chunk.added_to, found[chunk.added].flatten(1))
-        blocks.index_add_(0, chunk.turned_to, found[chunk.turned].mT.flatten(1))
-        pull.index_add_(0, chunk.pulled_to, vectors[chunk.pulled])
+        depth, poses = d[own], to_device(state.T_cw[chunk.frames].reshape(-1), d.device)
+        edges, terms = LinearisedEdges(self.kernels, chunk.arrays, depth), self.depth_terms
+        edges.fill(self.grid, poses, depth, (pixels, weight), self.options, terms.of_rows(own))
+        edges.add_terms(terms, chunk.sources.tolist(), state)
+        return edges
 
 
 def _chunk(
@@ -204,12 +148,14 @@ def _chunk(
     column = np.stack([target[b], source[a], target[b], source[a]], 1).reshape(-1)
     place, mirror = system.places(row, column), system.places(column, row)
     mirror[np.repeat(a == b, 4)] = -1  # the elimination gives both sides
-    added, turned = np.flatnonzero(place >= 0), np.flatnonzero(mirror >= 0)
+    added, mirrored = np.flatnonzero(place >= 0), np.flatnonzero(mirror >= 0)
     same = np.flatnonzero(a == b)
     pulled = np.concatenate([2 * same, 2 * same + 1])
     pulled_to = np.concatenate([target[a[same]], source[a[same]]])
-    parts = [number[source], number[target], first, free, a, b, added, place[added], turned,
-             mirror[turned], pulled, pulled_to]  # fmt: skip
+    parts = [number[source], number[target], first, free, a, b, added, place[added], mirrored,
+             mirror[mirrored], pulled, pulled_to]  # fmt: skip
     sent = to_device(torch.from_numpy(np.concatenate(parts).astype(np.int32)), device)
     pieces = sent.split([len(p) for p in parts])
-    return _Chunk(edges, torch.from_numpy(own), torch.from_numpy(frames), *pieces)
+    return _Chunk(
+        edges, torch.from_numpy(own), torch.from_numpy(frames), EdgeArrays(*pieces[:6]), *pieces[6:]
+    )

@@ -1,0 +1,132 @@
+"""Edges on the GPU: which there are, and what the kernels leave of them.
+
+The dense and the streamed solver share these launches.
+"""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from geogs.bundle.base import BundleOptions
+from geogs.bundle.cuda.depth_terms import KernelDepthTerms
+from geogs.bundle.terms import BundleState
+from geogs.gpu.kernels import Kernel
+from geogs.gpu.transfer import to_device
+from geogs.world.grid import SampleGrid
+
+
+def block_size(cells: int, most: int = 256) -> int:
+    """Threads of a block that goes over the cells of an edge: whole warps, 64 to ``most``."""
+    return max(64, min(-(-cells // 32) * 32, most))
+
+
+def edges_by_frame(
+    frame: Int[Tensor, "e"], frames: int, device: torch.device
+) -> tuple[Int[Tensor, "m"], Int[Tensor, "e"]]:
+    """Where the edges of each frame begin, and the end, in a list of all edges; and that list."""
+    order = torch.argsort(frame, stable=True)
+    first = torch.searchsorted(frame[order], torch.arange(frames + 1))
+    rows = to_device(torch.cat([first, order]), device, torch.int32)
+    return rows[: frames + 1], rows[frames + 1 :]
+
+
+def joined_edges(
+    first: Int[np.ndarray, "m"], free_depth: Bool[np.ndarray, "n"]
+) -> tuple[Int[np.ndarray, "k"], Int[np.ndarray, "k"]]:
+    """Pairs a <= b of edges of one source; only a = b where its depth is fixed."""
+    pairs = [np.zeros((2, 0), dtype=np.int64)]
+    for begin, end, joined in zip(first[:-1], first[1:], free_depth, strict=True):
+        count = end - begin
+        low = np.tril_indices(count) if joined else (np.arange(count), np.arange(count))
+        pairs.append(begin + np.stack(low))
+    b, a = np.concatenate(pairs, 1)
+    return a, b
+
+
+@dataclass(frozen=True)
+class EdgeArrays:
+    """Which edges there are and how they meet, int32 on the device.
+
+    Frames have numbers of their own, the sources the first.
+    """
+
+    source: Tensor
+    target: Tensor
+    first: Tensor
+    """First edge of each source, and the end."""
+    free_depth: Tensor
+    """Of each source."""
+    pair_a: Tensor
+    """Pairs a <= b of edges of one source that the elimination joins."""
+    pair_b: Tensor
+
+
+class LinearisedEdges:
+    """What the kernels leave of edges and their sources, on the device."""
+
+    def __init__(
+        self, kernels: Mapping[str, Kernel], arrays: EdgeArrays, depth: Float[Tensor, "s p"]
+    ) -> None:
+        """``depth`` has the shape of the sources' inverse depths."""
+        edges, cells = len(arrays.source), depth.shape[1]
+        self.kernels, self.arrays, self.block = kernels, arrays, block_size(cells)
+        self.motion = depth.new_empty(12 * edges, dtype=torch.float64)
+        self.normal = depth.new_empty(32 * edges, dtype=torch.float64)
+        self.coupling = depth.new_empty(6 * edges * cells)
+        self.per_edge = depth.new_empty(2, edges * cells)
+        """Curvature and gradient of the depths of each edge's source, by it alone."""
+        self.residual = depth.new_zeros(edges)
+        self.information = torch.zeros_like(depth)
+        self.depths = depth.new_empty(2, depth.numel())
+        """Inverse damped curvature and gradient of all depths."""
+
+    @property
+    def cells(self) -> int:
+        """Of a source."""
+        return self.information.shape[1]
+
+    def fill(
+        self,
+        grid: SampleGrid,
+        poses: Float[Tensor, "m"],
+        depth: Float[Tensor, "s p"],
+        matches: tuple[Float[Tensor, "e p 2"], Float[Tensor, "e p 2"]],
+        options: BundleOptions,
+        terms: KernelDepthTerms,
+    ) -> None:
+        """Linearise all edges and sum up what they say of each source's depths."""
+        a, c, (curvature, gradient) = self.arrays, grid.camera, self.per_edge
+        self.kernels["linearise_edges"](
+            len(a.source), self.block, poses, depth, a.source, a.target, *matches, grid.rays,
+            self.cells, c.fx, c.fy, c.cx, c.cy, options.huber, self.motion, self.normal,
+            self.coupling, curvature, gradient, self.residual,
+        )  # fmt: skip
+        damping, *measured = terms.arguments
+        self.kernels["sum_sources"](
+            len(depth), self.block, a.first, curvature, gradient, self.cells,
+            options.depth_damping, damping, depth, *measured, self.information, *self.depths,
+        )  # fmt: skip
+
+    def add_terms(self, terms: KernelDepthTerms, frames: Iterable[int], state: BundleState) -> None:
+        """Add what terms without a kernel say of the depths of the sources, which are frames."""
+        terms.add_others(frames, state, self.information, *self.depths)
+
+    def eliminate(self, blocks: Tensor, vectors: Tensor) -> None:
+        """What each pair of edges says of the poses: four blocks and two vectors, depths gone."""
+        a = self.arrays
+        self.kernels["eliminate_depths"](
+            len(a.pair_a), self.block, a.pair_a, a.pair_b, a.source, a.free_depth, self.coupling,
+            *self.depths, self.motion, self.normal, self.cells, blocks, vectors,
+        )  # fmt: skip
+
+    def find_depth_steps(self, xi: Tensor, steps: Tensor, failed: Tensor) -> None:
+        """Steps of the sources' depths after those of all poses."""
+        a = self.arrays
+        self.kernels["find_depth_steps"](
+            (-(-self.cells // self.block), len(a.free_depth)), self.block, a.first, a.target,
+            a.free_depth, self.motion, xi, self.coupling, *self.depths, self.cells, steps, failed,
+        )  # fmt: skip
