@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from geogs.bundle.base import BundleOptions, BundleResult
+from geogs.bundle.camera_system import DenseCameraSystem
 from geogs.bundle.cuda.depth_terms import KernelDepthTerms
 from geogs.bundle.cuda.edges import EdgeArrays, LinearisedEdges, joined_edges
 from geogs.bundle.problem import BundleProblem
@@ -139,24 +140,15 @@ def _add_pose_terms(w: _Workspace, problem: BundleProblem, damping: float) -> No
     """Add what is said of poses alone to the assembled camera system, which waits for them."""
     if not problem.pose_terms:
         return
-    n = w.structure.poses
-    size = 6 * n
-    slot = torch.full((len(problem.free_pose),), -1)
-    slot[problem.free_pose.cpu()] = torch.arange(n)
+    poses = DenseCameraSystem(problem.free_pose.cpu())
     state = BundleState(w.T.reshape(-1, 4, 4).cpu(), problem.inverse_depth)
-    added = torch.zeros(size + 1, size, dtype=torch.float64)
-    for edge in (edge for term in problem.pose_terms for edge in term.hyper_edges(state)):
-        block, gradient = edge.pose_blocks()
-        at = slot[edge.poses].tolist()
-        for a, p in enumerate(at):
-            if p < 0:
-                continue
-            added[size, 6 * p : 6 * p + 6] += gradient[a]
-            for b, q in enumerate(at):
-                if 0 <= q <= p:
-                    added[6 * p : 6 * p + 6, 6 * q : 6 * q + 6] += block[a, b]
-    diagonal = added[:size].diagonal()
+    for term in problem.pose_terms:
+        poses.add(term.hyper_edges(state))
+    hessian = poses.hessian[poses.free[:, None], poses.free]
+    # Of the system on the device only the lower blocks are in use.
+    diagonal = hessian.diagonal()
     diagonal += damping * diagonal.abs()
+    added = torch.cat([hessian, poses.gradient[poses.free][None]])
     system = w.cameras.system
     system += to_device(added.reshape(-1), system.device)
 
