@@ -42,7 +42,8 @@ def complete_inverse_depth(
     """Fit a smooth surface to the tracker's inverse depth, weighted by its information.
 
     Minimises sum rho((x - d) / s) + sum w (second differences)^2 + a weak sum w (differences)^2,
-    by reweighted least squares with the Cauchy weight; w falls at image edges. s is the deviation
+    by reweighted least squares with the Cauchy weight (it is linear, so that each round solves for
+    it outright, beside the least-squares loop); w falls at image edges. s is the deviation
     of inverse depth, ``DEVIATION_SCALE`` / sqrt(information), plus 0.2 % of d. Cells without a
     finite positive value or with no information get theirs from around them.
     """

@@ -53,7 +53,8 @@ def vote_on_scale(
     """The scale at which most motions seen in the images fit those that were measured in metres.
 
     Each pair proposes the ratio of its lengths; the proposal with the highest sum of Cauchy's
-    weights is refined by reweighted least squares. Rotations have to fit, too.
+    weights is refined by reweighted least squares, each round solved outright as the scale is
+    linear, beside the least-squares loop. Rotations have to fit, too.
     """
     information = information_of(measured, config)
     turned = so3_log(measured[:, :3, :3].mT @ seen[:, :3, :3])

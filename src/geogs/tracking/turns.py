@@ -2,14 +2,21 @@
 
 from collections import defaultdict, deque
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from jaxtyping import Float64
 from torch import Tensor
 
+from geogs.geometry.least_squares import Policy, Step, minimise
 from geogs.geometry.lie import so3_exp, so3_log
 from geogs.world.frames import RelativeRotation
+
+if TYPE_CHECKING:
+    from scipy.sparse import csc_matrix
 
 ROUNDS = 3
 """Gauss-Newton steps that spread what rotations contradict each other by."""
@@ -39,8 +46,8 @@ def orientations(
     free = sorted(found.keys() - fixed.keys())
     moved = set(free)
     used = [link for link in links if link[0] in found and not moved.isdisjoint(link[:2])]
-    for _ in range(ROUNDS if free else 0):
-        _spread(found, free, used)
+    if free:
+        found = minimise(found, partial(_linearised, free, used), _stepped, Policy(ROUNDS)).state
     return {n: R for n, R in found.items() if n not in known}
 
 
@@ -69,16 +76,25 @@ def _followed(
     return found
 
 
-def _spread(
-    found: dict[int, Tensor], free: list[int], links: list[tuple[int, int, Tensor, float]]
-) -> None:
-    """A Gauss-Newton step over the free rotations, each moved from the left.
+@dataclass(frozen=True)
+class _Linear:
+    """Links at some rotations."""
+
+    free: list[int]
+    jacobian: "csc_matrix"
+    """Of three rows for each link by the steps of the free rotations, each moved from the left."""
+    error: Float64[np.ndarray, "n"]
+
+
+def _linearised(
+    free: list[int], links: list[tuple[int, int, Tensor, float]], found: dict[int, Tensor]
+) -> _Linear:
+    """What links say of the free rotations.
 
     With ``R_b R_a^T`` for the rotation R of b relative to a, the error is
     ``log(R (R_b R_a^T)^T)``; to first order it falls by ``phi_b - (R_b R_a^T) phi_a``.
     """
     from scipy.sparse import coo_matrix
-    from scipy.sparse.linalg import spsolve
 
     column = {n: 3 * k for k, n in enumerate(free)}
     first = torch.stack([found[a] for a, _, _, _ in links])
@@ -101,7 +117,13 @@ def _spread(
     J = coo_matrix(
         (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), shape
     ).tocsc()
-    step = spsolve((J.T @ J).tocsc(), J.T @ error.numpy().ravel())
+    return _Linear(free, J, error.numpy().ravel())
+
+
+def _stepped(found: dict[int, Tensor], linear: _Linear, damping: float) -> Step[dict[int, Tensor]]:
+    from scipy.sparse.linalg import spsolve
+
+    J = linear.jacobian
+    step = spsolve((J.T @ J).tocsc(), J.T @ linear.error)
     moves = so3_exp(torch.from_numpy(step).reshape(-1, 3))
-    for n, move in zip(free, moves, strict=True):
-        found[n] = move @ found[n]
+    return Step(found | {n: move @ found[n] for n, move in zip(linear.free, moves, strict=True)})

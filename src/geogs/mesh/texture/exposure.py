@@ -45,7 +45,10 @@ def _solve_gains(
     views: int,
     fraction: float,
 ) -> Float64[np.ndarray, "v"]:
-    """Log gains g with g_first - g_second = log_ratio, each pulled to zero a little."""
+    """Log gains g with g_first - g_second = log_ratio, each pulled to zero a little.
+
+    They are linear: each round solves for them outright, beside the least-squares loop.
+    """
     gains = np.zeros(views)
     for _ in range(_ROUNDS):
         left = np.abs(gains[first] - gains[second] - log_ratio)
