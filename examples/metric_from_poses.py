@@ -21,7 +21,7 @@ def main(video: str, poses: str) -> float | None:
     for frame in source:
         slam.process(frame)
     slam.finish()
-    said = slam.particulars()
+    said = slam.statistics()
     print("poses:", said["poses"])
     print("scale:", said["metric_scale"])
     return None if slam.metric_scale is None else slam.metric_scale.factor

@@ -231,7 +231,7 @@ class Reconstruction:
         """None: poses that were given are those of whole images."""
         return {}
 
-    def particulars(self) -> dict[str, object]:
+    def statistics(self) -> dict[str, object]:
         """Nothing that is not said of every result."""
         return {}
 

@@ -103,7 +103,7 @@ class SlamOutput:
             return Uncertainty(*(np.zeros(0) for _ in range(4)))
         return self.world.uncertainty
 
-    def particulars(self) -> dict[str, object]:
+    def statistics(self) -> dict[str, object]:
         """What a summary says of segments, loops and things that move, ready for JSON."""
         self.settle()
         return {

@@ -95,7 +95,7 @@ class OfflineScene(Reconstruction):
         times, placed = self.keyframe_trajectory().timestamps, self._placed
         return Uncertainty(times, placed.deviation, placed.rotation, placed.depth)
 
-    def particulars(self) -> dict[str, object]:
+    def statistics(self) -> dict[str, object]:
         """That nothing was tracked, and how the poses were found."""
         return {
             "offline": {

@@ -1,4 +1,4 @@
-"""Structure from motion of photographs and of videos, as a package beside this one registers it."""
+"""Structure from motion of photographs and of videos, as another package registers it."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -25,8 +25,8 @@ from geogs.types import Trajectory
 Report = Callable[[str, float], None]
 """Called with the name of a stage and its finished fraction in [0, 1]."""
 
-# Points of the scene by which the usual depth of each image is told, at most.
-_TELLING_POINTS = 4000
+# Points of the scene by which the usual depth of each image is found, at most.
+_MAX_DEPTH_POINTS = 4000
 
 
 class PosedViews:
@@ -110,6 +110,6 @@ def usual_depths(
     source: PosedSource, points: Float64[np.ndarray, "n 3"]
 ) -> Float64[np.ndarray, "v"]:
     """Median depth of the points that each image sees."""
-    some = points[:: 1 + len(points) // _TELLING_POINTS]
+    some = points[:: 1 + len(points) // _MAX_DEPTH_POINTS]
     places = [Place(i, T_cw) for i, T_cw in enumerate(source.T_cw)]
     return np.array([depth_search(p, some, source.camera, 1.0).typical for p in places])

@@ -12,7 +12,7 @@ from geogs.application.checkpoints.reconstruct_state import ReconstructState, fi
 from geogs.application.driver import Ending, Job, Work
 from geogs.application.interrupt import Stop
 from geogs.application.machine.device import compiled_kernels, full_memory_in_a_sentence
-from geogs.application.output_forecast import OutputForecast
+from geogs.application.output_cost import OutputForecast
 from geogs.application.photos import open_photographs
 from geogs.application.posed_views import PosedViews, Report
 from geogs.application.progress import RunProgress
@@ -32,7 +32,7 @@ from geogs.reconstruction import Reconstruction, ReconstructionTable
 from geogs.threads import on_one_torch_thread
 
 FIRST_BATCH = 24
-"""Images read before it is known for how many the time lasts: what one costs is told by some."""
+"""Images read before it is known for how many the time lasts: some show what one costs."""
 LEAST_BUDGET = 1.0
 """Seconds that are left of a budget at least, when reading and checking have used it up."""
 
@@ -208,7 +208,7 @@ def _complete(
 ) -> None:
     """Everything up to the trained map; what ``report`` raises ends it early.
 
-    ``checks`` is told where the poses do not fit the images; none where that is not looked at.
+    ``checks`` hears where the poses do not fit the images; none where that is not checked.
     """
     views = PosedViews(scene, source, report)
     if resumed is not None:
@@ -239,7 +239,7 @@ def _complete(
     def reported(stage: str, fraction: float) -> None:
         report(stage, fraction)
         if stage == "growing":
-            scene.budget.output_cost = forecast.settled(scene.budget.training_left)
+            scene.budget.output_cost = forecast.settled()
 
     views.give(FIRST_BATCH)
     scene.finish(points, reported, more)

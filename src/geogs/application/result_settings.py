@@ -18,7 +18,7 @@ Format = Literal[
 
 @dataclass(frozen=True)
 class ExportSettings(Settings):
-    """All that an export is told."""
+    """Settings of an export."""
 
     result: Annotated[Path, Positional()]
     """Folder of a result, as geogs run and geogs reconstruct write it."""
@@ -45,7 +45,7 @@ class ExportSettings(Settings):
 
 @dataclass(frozen=True)
 class RemeshSettings(Settings):
-    """All that the making of another mesh is told."""
+    """Settings of making another mesh."""
 
     result: Annotated[Path, Positional()]
     """Folder of a result, as geogs run and geogs reconstruct write it."""
@@ -59,7 +59,7 @@ class RemeshSettings(Settings):
 
 @dataclass(frozen=True)
 class RescaleSettings(Settings):
-    """All that the scaling of a result is told."""
+    """Settings of scaling a result."""
 
     result: Annotated[Path, Positional()]
     """Folder of a result, as geogs run writes it."""
@@ -73,7 +73,7 @@ class RescaleSettings(Settings):
 
 @dataclass(frozen=True)
 class EvalSettings(Settings):
-    """All that an evaluation is told."""
+    """Settings of an evaluation."""
 
     output: Annotated[Path, Positional()]
     """Folder of a result, as ``geogs run`` writes it."""

@@ -1,4 +1,4 @@
-"""What a run or a reconstruction is told: the same record for a command, a script, a checkpoint.
+"""What a run or a reconstruction is given: the same record for a command, a script, a checkpoint.
 
 Nothing here is imported but the settings, so that a command line can be read at once.
 """
@@ -15,7 +15,7 @@ from geogs.io.sources.address import live_address
 
 @dataclass(frozen=True)
 class RunSettings(Settings):
-    """All that a run is told: what it reads, how it computes, what it writes."""
+    """Settings of a run: what it reads, how it computes, what it writes."""
 
     source: Annotated[tuple[Path, ...], Positional(unless="resume")] = ()
     """Video file or folder; several of one place, by one camera, make one map. Or what does not
@@ -83,7 +83,7 @@ class RunSettings(Settings):
 
 @dataclass(frozen=True)
 class ReconstructSettings(Settings):
-    """All that a reconstruction from known poses is told."""
+    """Settings of a reconstruction from known poses."""
 
     source: Annotated[Path, Positional()] = Path()
     """Folder of images with poses, or the file with the poses; with --poses auto a folder of

@@ -93,7 +93,7 @@ def test_a_system_goes_on_as_if_nothing_had_happened(frames, tmp_path, cut):
     slam.end_stream()
     other.end_stream()
     assert_same(slam, other)
-    assert slam.particulars() == other.particulars()
+    assert slam.statistics() == other.statistics()
     assert other.stopwatch.seconds["tracking"] > 0
 
 

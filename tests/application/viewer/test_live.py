@@ -111,7 +111,7 @@ def wait(viewer: LiveViewer) -> None:
 
 def test_everything_is_shown_once_and_what_moved_moves(window, monkeypatch):
     monkeypatch.setattr("geogs.application.viewer.live._MAP_SECONDS", 1e6)
-    viewer, slam = LiveViewer(window, share=1.0), FakeSlam()
+    viewer, slam = LiveViewer(window, max_fraction=1.0), FakeSlam()
     look(viewer, slam)
     wait(viewer)
     assert [c for c in window.calls if c.startswith("keyframe")] == [
@@ -131,7 +131,7 @@ def test_everything_is_shown_once_and_what_moved_moves(window, monkeypatch):
 
 
 def test_a_window_that_hangs_holds_nothing_up(window):
-    viewer, slam = LiveViewer(window, share=1.0), FakeSlam()
+    viewer, slam = LiveViewer(window, max_fraction=1.0), FakeSlam()
     window.gate.clear()
 
     def look_on() -> None:
@@ -164,7 +164,7 @@ def test_no_more_than_its_share_of_the_time_is_used(window):
 
 
 def test_nobody_looking_and_a_pause_cost_nothing(window):
-    viewer, slam = LiveViewer(window, share=1.0), FakeSlam()
+    viewer, slam = LiveViewer(window, max_fraction=1.0), FakeSlam()
     window.clients = 0
     look(viewer, slam)
     window.clients = 1

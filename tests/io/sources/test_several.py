@@ -120,7 +120,7 @@ def test_the_map_shows_the_largest_of_videos_that_have_nothing_in_common():
     for frame in stream:
         slam.process(frame)
     slam.end_stream()
-    fates = [s["fate"] for s in slam.particulars()["segments"]]
+    fates = [s["fate"] for s in slam.statistics()["segments"]]
     assert fates == ["apart", "world"]
     trajectory = slam.trajectory()
     assert trajectory.tracked.tolist() == [False] * 10 + [True] * 28

@@ -65,7 +65,7 @@ class Manifest:
     """The files of the complete state, but for archives, whose arrays have checksums of their own;
     none if it was never completed."""
     files: list[str]
-    """All of ours that may be there, the manifest apart."""
+    """All of ours that may be there, but for the manifest."""
 
 
 class CheckpointFolder:

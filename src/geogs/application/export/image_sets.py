@@ -88,14 +88,14 @@ def write_map_set(folder: Path, result: SavedResult, kind: Literal["depth", "nor
         f"{id:06d}": T.tolist()
         for id, T in zip(result.views.keyframe_id, result.views.T_cw, strict=True)
     }
-    facts: dict[str, object] = {
+    layouts: dict[str, object] = {
         "depth": {"png": f"z along the optical axis in steps of {unit:g} map units, 0 unknown",
                   "png_unit": unit, "npz": "the same in map units"},
         "normals": {"png": f"2 v / {STEPS} - 1 of red, green, blue is x, y, z; black is unknown",
                     "npz": "x, y, z", "frame": "camera: x right, y down, z forward"},
     }  # fmt: skip
-    facts = {"values": facts[kind], "T_cw": poses}
-    write_description(folder / "description.json", result.camera, facts)
+    metadata = {"values": layouts[kind], "T_cw": poses}
+    write_description(folder / "description.json", result.camera, metadata)
 
 
 def _write_images(folder: Path, result: SavedResult) -> list[ExportedImage]:

@@ -52,14 +52,14 @@ def seen_points(
 def cloud(
     keyframes: Sequence[RenderedKeyframe], spacing: float = 1.0
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Positions, normals and colours of the surface that all sure depths show.
+    """Positions, normals and colours of the surface that all confident depths show.
 
     Of the points in a cube with edges of ``spacing`` pixels at the median depth one is kept.
 
     Raises:
         InputError: there is no depth, or a keyframe has no image.
     """
-    parts = [_lifted(keyframe, _sure(keyframe)) for keyframe in keyframes]
+    parts = [_lifted(keyframe, _confident(keyframe)) for keyframe in keyframes]
     places, normals, colours = (np.concatenate(part) for part in zip(*parts, strict=True))
     if not len(places):
         raise InputError("The map shows no surface; there are no points to export.")
@@ -77,7 +77,7 @@ def _sampled(
     each = max(1, -(-count // max(len(keyframes), 1)))
     parts = []
     for keyframe in keyframes:
-        chosen = _sure(keyframe)
+        chosen = _confident(keyframe)
         chosen = np.sort(random.choice(chosen, min(each, len(chosen)), replace=False))
         parts.append(_lifted(keyframe, chosen))
     if not parts:
@@ -86,10 +86,10 @@ def _sampled(
     return places, normals, colours
 
 
-def _sure(keyframe: RenderedKeyframe) -> Int64[np.ndarray, "n"]:
+def _confident(keyframe: RenderedKeyframe) -> Int64[np.ndarray, "n"]:
     """Pixels whose ray meets one surface, counted row by row."""
-    sure = (keyframe.weight >= 1) & (keyframe.depth > 0)
-    return np.flatnonzero(sure.cpu().numpy())
+    confident = (keyframe.weight >= 1) & (keyframe.depth > 0)
+    return np.flatnonzero(confident.cpu().numpy())
 
 
 def _lifted(

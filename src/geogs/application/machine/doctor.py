@@ -140,7 +140,7 @@ def _self_test(device: torch.device) -> Iterator[Finding]:
         yield Finding("self-test", f"{name}: relative error {errors}  OK")
         repeats = 20 if device.type == "cuda" else 3
         milliseconds = time_renderer(device, repeats=repeats)
-    except Exception as error:  # whatever is wrong here is what the user wants to be told
+    except Exception as error:  # whatever is wrong here is what the user wants to know
         problem = f"The renderer does not run on {device} ({_first_line(error)})."
         yield Finding("self-test", f"{name}: BAD", problem, is_fatal=True)
         return

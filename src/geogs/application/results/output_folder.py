@@ -104,7 +104,7 @@ def remove_previous_output(folder: Path, new_stages: Collection[str] = ()) -> No
 def free_folder(wanted: Path, fingerprint: str) -> Path:
     """The folder, or the next of its name with a number that holds no result of another source.
 
-    ``fingerprint`` tells sources of one name apart.
+    ``fingerprint`` distinguishes sources of one name.
     """
     for number in count(1):
         folder = wanted if number == 1 else wanted.with_name(f"{wanted.name}-{number}")
@@ -126,7 +126,7 @@ def _is_of_another(folder: Path, fingerprint: str) -> bool:
 
 
 def _begun_with(folder: Path) -> str | None:
-    """The source of an unfinished run; none where that cannot be told."""
+    """The source of an unfinished run; none where that is not known."""
     from geogs.application.checkpoints.run_state import SavedRun
 
     try:

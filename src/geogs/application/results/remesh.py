@@ -38,7 +38,7 @@ def remesh(settings: RemeshSettings, progress: RunProgress | None = None) -> Pat
     """Render the keyframes of a result, fuse their depths and write the mesh; the file's path.
 
     Where that is the mesh of the result, its page is made anew, too, without what an evaluation
-    had said of the former one.
+    had said of the previous one.
 
     On the CPU, with the settings of the run, the surface is that of the run to the last byte;
     colours differ by what JPEG does to the images.

@@ -54,7 +54,7 @@ class Result:
     @property
     def why_no_map(self) -> str | None:
         """Why no map could be started, where only orientations are known; else none."""
-        reason = self.scene.particulars().get("not_started")
+        reason = self.scene.statistics().get("not_started")
         return None if reason is None else str(reason)
 
     @cached_property
@@ -70,7 +70,7 @@ class Result:
     @cached_property
     def mesh(self) -> Mesh | None:
         """The surface of the map; none where none was found, or where depths are no evidence of
-        one, of which ``progress`` is told."""
+        one, which ``progress`` then says."""
         if self.verdict is not None and not self.verdict.has_shape:
             self.progress.write("No mesh: nothing tells the depths of what was seen.")
             return None

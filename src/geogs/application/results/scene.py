@@ -57,6 +57,6 @@ class MappedScene(Protocol):
         """Of keyframes, by id, whose rows were rectified: where and when they were seen."""
         ...
 
-    def particulars(self) -> Mapping[str, object]:
+    def statistics(self) -> Mapping[str, object]:
         """What else the summary says, ready for JSON."""
         ...

@@ -31,7 +31,7 @@ def summarise(result: Result) -> dict[str, object]:
         "keyframes": len(result.keyframes.timestamps),
         "lost_spans": lost_spans(result.trajectory),
         "orientation_only_spans": spans(result.trajectory, "orientation only"),
-        **particulars(scene),
+        **statistics(scene),
         "disks": len(result.map),
         "mesh_faces": 0 if mesh is None else len(mesh.faces),
         **time_summary(scene.stopwatch, scene.frames),
@@ -48,9 +48,9 @@ def summarise(result: Result) -> dict[str, object]:
     }
 
 
-def particulars(scene: MappedScene) -> dict[str, object]:
+def statistics(scene: MappedScene) -> dict[str, object]:
     """What the scene says of itself; where its lengths are metres, ``scale`` says by what."""
-    said = dict(scene.particulars())
+    said = dict(scene.statistics())
     metric = said.get("metric_scale")
     if isinstance(metric, dict):
         said["scale"] = f"metric ({metric['origin']})"

@@ -6,14 +6,14 @@ import numpy as np
 
 from geogs.types import Trajectory, Uncertainty
 
-MOST_LOST = 0.2
-"""Share of the frames without a pose above which nothing is called reliable."""
-MOST_TURNED = 0.5
+MAX_LOST = 0.2
+"""Fraction of the frames without a pose above which nothing is called reliable."""
+MAX_ORIENTATION_ONLY = 0.5
 """Likewise of frames of which no more than the orientation is known: what there is of a map is
 right, but it is not what the video is about."""
-MOST_OFF = 0.05
+MAX_POSITION_DEVIATION = 0.05
 """Deviation of the camera's place, of the extent of its path."""
-MOST_DEEP = 0.2
+MAX_DEPTH_DEVIATION = 0.2
 """Relative deviation of depths."""
 NO_SHAPE = 0.5
 """Relative deviation of depths from which on they are no evidence of a surface."""
@@ -27,9 +27,9 @@ class Verdict:
     sentence: str
     """For the terminal."""
     lost: float
-    """Share of the frames of which nothing is known."""
+    """Fraction of the frames of which nothing is known."""
     orientation_only: float
-    """Share of the frames of which no more than the orientation is known."""
+    """Fraction of the frames of which no more than the orientation is known."""
     position: float
     """Median deviation of the camera's place, of the extent of its path: the root of the mean
     squared distance from its middle."""
@@ -59,21 +59,21 @@ def verdict(
     extent = float(np.sqrt(np.square(places - places.mean(0)).sum(1).mean())) if len(places) else 0
     states = trajectory.states
     lost = states.count("lost") / len(states) if states else 1.0
-    turned = states.count("orientation only") / max(len(states), 1)
+    orientation_only = states.count("orientation only") / max(len(states), 1)
     if why_not:
         sentence = f"Rotation only: no shape. {why_not}"
-        return Verdict(False, sentence, lost, turned, *3 * [float("inf")])
+        return Verdict(False, sentence, lost, orientation_only, *3 * [float("inf")])
     position = _median(known.position) / max(extent, 1e-12)
     depth, rotation = _median(known.depth), float(np.degrees(_median(known.rotation)))
     reasons = []
-    if lost > MOST_LOST:
+    if lost > MAX_LOST:
         reasons.append(f"the camera was lost in {lost:.0%} of the frames")
-    if turned > MOST_TURNED:
-        reasons.append(f"of {turned:.0%} of the frames only the orientation is known")
-    if not position <= MOST_OFF:
-        reasons.append(f"its place is known only to {_share(position)} of the extent of its path")
-    if not depth <= MOST_DEEP:
-        reasons.append(f"depths are known only to {_share(depth)}")
+    if orientation_only > MAX_ORIENTATION_ONLY:
+        reasons.append(f"of {orientation_only:.0%} of the frames only the orientation is known")
+    if not position <= MAX_POSITION_DEVIATION:
+        reasons.append(f"its place is known only to {_percent(position)} of the extent of its path")
+    if not depth <= MAX_DEPTH_DEVIATION:
+        reasons.append(f"depths are known only to {_percent(depth)}")
     if reasons:
         sentence = f"Not to be relied on: {'; '.join(reasons)}."
     else:
@@ -81,12 +81,12 @@ def verdict(
             f"Trajectory and shape are reliable: the camera's place is known to {position:.1%} of "
             f"the extent of its path, depths to {depth:.1%}."
         )
-    return Verdict(not reasons, sentence, lost, turned, position, rotation, depth)
+    return Verdict(not reasons, sentence, lost, orientation_only, position, rotation, depth)
 
 
 def _median(values: np.ndarray) -> float:
     return float(np.median(values)) if len(values) else float("inf")
 
 
-def _share(value: float) -> str:
+def _percent(value: float) -> str:
     return f"{value:.0%}" if value < 10 else "nothing"

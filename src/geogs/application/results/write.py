@@ -53,8 +53,8 @@ def write_results(
     write_config(output / "config.yaml", scene.config)
     disks = result.map
     renders = result.renders if result.why_no_map is None else ()
-    with ThreadPoolExecutor(1, thread_name_prefix="map") as beside:
-        written = beside.submit(_write_map, output, result, renders, keyframe_images)
+    with ThreadPoolExecutor(1, thread_name_prefix="map") as thread:
+        written = thread.submit(_write_map, output, result, renders, keyframe_images)
         if (mesh := result.mesh) is not None:
             with scene.stopwatch("mesh"):
                 write_mesh(
@@ -86,8 +86,8 @@ def _write_map(
     with scene.stopwatch.aside():
         if result.why_no_map is None:
             views = write_keyframes(output, scene, source.camera, renders, keyframe_images)
-            facts = {"source": source.name, "seed": scene.config.seed}
-            save_map_with_views(output / "map.safetensors", disks, views, facts)
+            metadata = {"source": source.name, "seed": scene.config.seed}
+            save_map_with_views(output / "map.safetensors", disks, views, metadata)
         if len(disks):
             colours = splat_colours(disks, fusion_views(renders))
             write_splats(output / "splats.ply", disks, colours)

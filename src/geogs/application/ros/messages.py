@@ -44,9 +44,9 @@ class Messages:
     def pose(self, seconds: float, T_wc: Float64[Tensor, "4 4"]) -> Any:
         """``geometry_msgs/msg/PoseStamped`` of a camera."""
         w, x, y, z = matrix_to_quaternion(T_wc[:3, :3]).tolist()
-        turn = self.make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
+        rotation = self.make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
         place = self.point(T_wc[:3, 3].tolist())
-        pose = self.make("geometry_msgs/msg/Pose", position=place, orientation=turn)
+        pose = self.make("geometry_msgs/msg/Pose", position=place, orientation=rotation)
         return self.make("geometry_msgs/msg/PoseStamped", header=self.header(seconds), pose=pose)
 
     def path(self, seconds: float, poses: Sequence[Any]) -> Any:

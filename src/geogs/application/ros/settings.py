@@ -1,4 +1,4 @@
-"""What the node is told."""
+"""Settings of the node."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,7 +10,7 @@ from geogs.config.setting import Basic, Positive, Settings, Unnamed
 
 @dataclass(frozen=True)
 class NodeSettings(Settings):
-    """All that the node is told."""
+    """Settings of the node."""
 
     image: str = "/camera/image_raw"
     """Topic of the images: sensor_msgs/msg/Image or CompressedImage, by the end of its name."""

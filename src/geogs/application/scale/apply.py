@@ -47,7 +47,7 @@ def make_metric(
 
 
 def sentences_on_poses(found: Agreement) -> list[str]:
-    """What to tell of poses beside the images; nothing where there are none."""
+    """Sentences on poses given beside the images; none where there are none."""
     if not found.motions:
         return []
     fitting = f"{found.share:.0%} of {found.motions} motions between keyframes"

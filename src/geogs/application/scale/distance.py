@@ -54,13 +54,13 @@ def _one(
     both = np.array([known.first, known.second])
     rays = undistorted_rays(both, calibration.camera(), calibration.distortion, calibration.lens)
     ends, along = zip(*(_lifted(scene, depth, ray, known) for ray in rays), strict=True)
-    apart = ends[1] - ends[0]
-    length = float(np.linalg.norm(apart))
+    between = ends[1] - ends[0]
+    length = float(np.linalg.norm(between))
     focal = calibration.fx
     variance = 0.0
     for point, ray, deviation in zip(ends, rays, along, strict=True):
         variance += 2 * (CLICK * point[2] / focal) ** 2 / 2
-        towards = np.append(ray, 1.0) @ apart / length
+        towards = np.append(ray, 1.0) @ between / length
         variance += (towards * deviation) ** 2
     return known.metres / length, known.metres / length * variance**0.5 / length
 

@@ -25,7 +25,7 @@ class SeenKeyframe:
 
 @dataclass(frozen=True, eq=False)
 class MeasurableScene:
-    """A map whose unit is to be told."""
+    """A map whose unit is asked for."""
 
     camera: Camera
     """Of images."""
@@ -54,10 +54,9 @@ class FoundScale:
     deviation: float
     """Standard deviation of the factor, as a part of it."""
     origin: str
-    """What told it, in words."""
+    """By what it was found, in words."""
 
 
 def said(found: FoundScale) -> str:
     """A found scale in a sentence."""
-    share = f"{found.deviation:.1%}"
-    return f"Scale: {found.factor:.5g} metres to the map unit (+- {share}), by {found.origin}."
+    return f"Scale: {found.factor:.5g} metres to the map unit (+- {found.deviation:.1%}), by {found.origin}."

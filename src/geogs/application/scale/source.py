@@ -20,7 +20,7 @@ HOW = (
 
 @dataclass(frozen=True)
 class KnownDistance:
-    """Two pixels of a frame whose points are so far apart."""
+    """Two pixels of a frame whose points are so far from each other."""
 
     frame: int
     """Number of the frame in the source's selection, from 0."""

@@ -17,8 +17,8 @@ ANGLE = np.radians(1.5)
 """Least angle between two rays to a corner."""
 OUTLIER = 3.0
 """Pixels by which a corner may miss its triangulated place."""
-_SHARE = 0.003
-"""Part of a tag's size by which printing, focal length and blur leave it wrong in common."""
+_COMMON_ERROR = 0.003
+"""Fraction of a tag's size by which printing, focal length and blur leave it wrong in common."""
 _ROUNDS = 4
 
 Corners = Float64[np.ndarray, "4 2"]
@@ -57,7 +57,7 @@ def scale_by_tags(scene: MeasurableScene, known: TagSize) -> FoundScale:
         )
     middle = float(np.median(sizes))
     spread = 1.4826 * float(np.median(np.abs(np.array(sizes) - middle))) / middle
-    deviation = float(np.hypot(spread / max(tags, 1) ** 0.5 / 2, _SHARE))
+    deviation = float(np.hypot(spread / max(tags, 1) ** 0.5 / 2, _COMMON_ERROR))
     origin = f"{tags} tag{'s' * (tags > 1)} of {known.metres:g} m in {views} sightings"
     return FoundScale(known.metres / middle, deviation, origin)
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from geogs.pose_estimate import PoseEstimate
 from geogs.slam import Slam
 
-SHARE = 0.02
+MAX_TIME_FRACTION = 0.02
 """Of the time that looking may take, of the run's thread and of the viewer's together."""
 MOST_DISKS = 30_000
 _MAP_SECONDS = 3.0
@@ -46,11 +46,11 @@ class Update:
 class LiveViewer(RunObserver):
     """Shows a run in a window, by a thread of its own.
 
-    What comes while that is at work, or while it has used up its share of the time, is dropped.
+    What comes while that is at work, or while it has used up its fraction of the time, is dropped.
     """
 
-    def __init__(self, window: Window, share: float = SHARE) -> None:
-        self._window, self._share = window, share
+    def __init__(self, window: Window, max_fraction: float = MAX_TIME_FRACTION) -> None:
+        self._window, self._max_fraction = window, max_fraction
         self._follow = window.add_checkbox("Follow", True)
         self._pause = window.add_checkbox("Pause", False)
         self._next: Update | None = None
@@ -72,7 +72,7 @@ class LiveViewer(RunObserver):
     def frame(self, frame: Frame, status: "PoseEstimate", slam: "Slam") -> None:
         """Take what there is to see, if there is time for it."""
         now = time.perf_counter()
-        if self._next is not None or self._used > self._share * (now - self._start):
+        if self._next is not None or self._used > self._max_fraction * (now - self._start):
             return
         if self._pause.value or not self._window.clients:
             return

@@ -1,4 +1,4 @@
-"""What a viewer is told."""
+"""Settings of the viewers."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +13,7 @@ Port = Annotated[int, Range(1, 65535)]
 
 @dataclass(frozen=True)
 class ViewSettings(Settings):
-    """All that a viewer of a result is told."""
+    """Settings of a viewer of a result."""
 
     result: Annotated[Path, Positional()]
     """Folder of a result, as geogs run and geogs reconstruct write it."""
@@ -25,7 +25,7 @@ class ViewSettings(Settings):
 
 @dataclass(frozen=True)
 class LiveSettings(Settings):
-    """All that a viewer of a run is told."""
+    """Settings of a viewer of a run."""
 
     viewer: bool = False
     """Show the run in the browser while it goes on; needs pip install 'geogs[viewer]'."""

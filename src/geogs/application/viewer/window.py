@@ -198,7 +198,7 @@ class Window:
         size: float,
         image: UInt8[np.ndarray, "h w 3"] | None,
     ) -> Any:
-        turn, position = _place(T_wc)
+        quaternion, position = _place(T_wc)
         return self._server.scene.add_camera_frustum(
             name,
             fov=2 * float(np.arctan2(camera.height / 2, camera.fy)),
@@ -209,7 +209,7 @@ class Window:
             color=colour,
             image=image,
             format="jpeg",
-            wxyz=turn,
+            wxyz=quaternion,
             position=position,
             cast_shadow=False,
             receive_shadow=False,
@@ -236,5 +236,5 @@ def _place(T_wc: Float[np.ndarray, "4 4"]) -> tuple[np.ndarray, np.ndarray]:
     """Quaternion w, x, y, z and position."""
     import torch
 
-    turn = matrix_to_quaternion(torch.from_numpy(np.ascontiguousarray(T_wc[:3, :3])))
-    return turn.numpy(), T_wc[:3, 3]
+    quaternion = matrix_to_quaternion(torch.from_numpy(np.ascontiguousarray(T_wc[:3, :3])))
+    return quaternion.numpy(), T_wc[:3, 3]

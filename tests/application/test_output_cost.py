@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import pytest
 
-from geogs.application import output_forecast
-from geogs.application.output_forecast import (
+from geogs.application import output_cost
+from geogs.application.output_cost import (
     CAUTION,
     COARSER,
-    MESH_SHARE,
+    MAX_MESH_TIME,
     ONE_VIEW,
     OutputForecast,
     StageTimes,
@@ -74,8 +74,7 @@ def rehearsal(monkeypatch, rehearsed) -> FakeClock:
         clock.now += 0.2 * len(renders)
 
     def extract(views: list, config: object, progress: StageTimes | None = None) -> None:
-        is_rehearsal = len(views) > 1
-        assert config.min_weight == (ONE_VIEW if is_rehearsal else 1.5)
+        assert config.min_weight == ONE_VIEW
         rehearsed.append(len(views))
         for number in range(len(views)):
             clock.now += 1.0 if number == 0 else 0.3
@@ -85,9 +84,9 @@ def rehearsal(monkeypatch, rehearsed) -> FakeClock:
         if progress is not None:
             progress("merge", 1, 1)
 
-    monkeypatch.setattr(output_forecast, "write_report", draw)
-    monkeypatch.setattr(output_forecast, "write_keyframes", write)
-    monkeypatch.setattr(output_forecast, "extract_mesh", extract)
+    monkeypatch.setattr(output_cost, "write_report", draw)
+    monkeypatch.setattr(output_cost, "write_keyframes", write)
+    monkeypatch.setattr(output_cost, "extract_mesh", extract)
     return clock
 
 
@@ -106,7 +105,7 @@ def test_the_second_rehearsal_counts_by_views_and_by_surface(rehearsal, rehearse
 def test_a_mesh_gets_what_triangles_there_is_time_for(rehearsal, monkeypatch, scene):
     clock, usual = rehearsal, scene.config.mesh
     whole = CAUTION * (0.5 + COARSER**2 * 3.0 * 3.0)
-    monkeypatch.setattr(TimeBudget, "left", 0.5 * whole / MESH_SHARE)
+    monkeypatch.setattr(TimeBudget, "left", 0.5 * whole / MAX_MESH_TIME)
     cost = OutputForecast(scene, clock).first(lambda places: 3.0)
     assert cost.once == pytest.approx(0.5 * whole)
     triangles = scene.config.mesh.triangle_budget
@@ -120,19 +119,19 @@ def test_a_rehearsal_without_a_surface_says_nothing_of_how_much_there_is(
     def unsure(*of: object) -> None:
         raise InputError("no depth")
 
-    monkeypatch.setattr(output_forecast, "extract_mesh", unsure)
-    plan = output_forecast.plan_volume
-    monkeypatch.setattr(output_forecast, "plan_volume", unsure)
+    monkeypatch.setattr(output_cost, "extract_mesh", unsure)
+    plan = output_cost.plan_volume
+    monkeypatch.setattr(output_cost, "plan_volume", unsure)
     forecast = OutputForecast(scene, rehearsal)
     forecast.first(lambda places: 3.0)
-    monkeypatch.setattr(output_forecast, "plan_volume", plan)
-    assert forecast.settled(0.0).once == pytest.approx(CAUTION * 0.5)
+    monkeypatch.setattr(output_cost, "plan_volume", plan)
+    assert forecast.settled().once == pytest.approx(CAUTION * 0.5)
 
 
 def test_a_rehearsal_takes_time_and_leaves_nothing(scene):
     before = [*scene.mapper.table.mapped]
     forecast = OutputForecast(scene)
-    cost, settled = forecast.first(lambda places: 1.5), forecast.settled(1e9)
+    cost, settled = forecast.first(lambda places: 1.5), forecast.settled()
     print(cost, settled)
     for found in (cost, settled):
         assert 0 < found.a_view < found.once < 120

@@ -2,15 +2,13 @@
 
 Some of it is done once for each view, some once for each piece of the surface. Both are measured on
 views that show the same place, with larger voxels, and multiplied by how many views there are and
-how many more voxels the surface of all of them has. What is needed but once, such as compiled code,
-is made ready by then.
+how many more voxels the surface of all of them has.
 """
 
 import logging
 import tempfile
 import time
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -26,30 +24,25 @@ from geogs.reconstruction import Reconstruction
 _log = logging.getLogger(__name__)
 
 Clock = Callable[[], float]
-Share = Callable[[Sequence[int]], float]
 
 VIEWS = 3
-"""Views of the rehearsal; and of the one before it, which makes ready what is needed but once."""
+"""Views of the rehearsal; one of them alone makes ready what is needed but once, before it."""
 ONE_VIEW = 0.3
 """Weight from which a surface counts in a rehearsal: what one view has seen is part of it, too, as
 all views together are going to confirm it."""
 COARSER = 2.0
 """Times the voxels that all views are going to have, in a rehearsal."""
 CAUTION = 1.1
-"""By how much more is kept than was measured, on two CPU cores: a larger volume, with more vertices
-to look for in each image, and the disks, which are not there yet."""
-MOST_SURFACE = 4.0
+"""By how much more is kept than was measured: the whole volume is larger, and the disks are not
+there yet."""
+MAX_SURFACE = 4.0
 """Times the surface of the rehearsal that is expected at most before the depths tell it: of a large
 scene only a few views may be affordable, and then what was kept for its mesh is lost to them."""
-MESH_SHARE = 0.3
-"""Part of the time that is left which mesh and files may take; where they would take more, the mesh
+MAX_MESH_TIME = 0.3
+"""Fraction of the time left which mesh and files may take; where they would take more, the mesh
 gets fewer triangles."""
-FEWEST_TRIANGLES = 0.25
-"""Part of its triangles that it keeps in any case."""
-FEWEST = 1000
-"""Triangles below which nothing is gained."""
-WORTH = 0.05
-"""Part of the time that is left which a last rehearsal may take."""
+MIN_TRIANGLES = 0.25
+"""Fraction of its triangles that it keeps in any case, and not fewer than a thousand."""
 
 
 class StageTimes:
@@ -84,8 +77,6 @@ class _Rehearsal:
     """Of its volume, had its voxels been as small as planned."""
     triangles: int
     """Of its surface, likewise."""
-    seconds: float
-    """All of it."""
 
 
 class OutputForecast:
@@ -97,49 +88,44 @@ class OutputForecast:
     def __init__(self, scene: Reconstruction, clock: Clock = time.perf_counter) -> None:
         self._scene = scene
         self._clock = clock
-        self._views: list[int] = []
         self._found: _Rehearsal | None = None
 
-    def first(self, times_the_surface: Share) -> OutputCost:
-        """Once some depths have been searched: rehearsed twice.
+    def first(self, times_the_surface: Callable[[Sequence[int]], float]) -> OutputCost:
+        """Once some depths have been searched: rehearsed with these.
 
-        ``times_the_surface`` tells how much more surface all views show than some, given as places
+        ``times_the_surface`` gives how much more surface all views show than some, given as places
         in the set. Where little time is left, the scene's mesh gets a smaller budget of triangles.
         """
         scene = self._scene
-        self._views = _neighbouring(scene)
-        _make_ready(scene, self._views[:1])
-        self._found = _rehearse(scene, self._views, self._clock)
-        times = times_the_surface([scene.table.images[i] for i in self._views])
+        views = _neighbouring(scene)
+        _rehearse(scene, views[:1], self._clock)
+        found = self._found = _rehearse(scene, views, self._clock)
         # However much surface there is, its triangles are no more than this.
-        most = scene.config.mesh.triangle_budget / max(self._found.triangles, 1)
-        times = min(times, max(most, 1.0), MOST_SURFACE)
-        times *= self._affordable_triangles(self._found, times)
-        return _cost(self._found, COARSER**2 * times)
+        most = max(scene.config.mesh.triangle_budget / max(found.triangles, 1), 1.0)
+        times = min(times_the_surface([scene.table.images[i] for i in views]), most, MAX_SURFACE)
+        times *= self._affordable_triangles(found, times)
+        return _cost(found, COARSER**2 * times)
 
-    def settled(self, left: float) -> OutputCost:
-        """Once all depths have been checked: with these, rehearsed again if that is but a small
-        part of the seconds that are left."""
+    def settled(self) -> OutputCost:
+        """Once all depths have been checked: with the surface that these show."""
         scene, found = self._scene, self._found
-        if found is None or found.seconds < WORTH * left:
-            self._views = self._views or _neighbouring(scene)
-            found = _rehearse(scene, self._views, self._clock)
+        assert found is not None, "rehearsed before"
         try:
             whole = plan_volume(fusion_views(scene.depth_maps()), scene.config.mesh)
             times = whole.blocks / found.blocks if found.blocks else 1.0
-        except InputError:  # no view shows anything that is sure
+        except InputError:  # no view shows anything with confidence
             times = 1.0
         return _cost(found, COARSER**2 * times)
 
     def _affordable_triangles(self, found: _Rehearsal, times: float) -> float:
-        """The part of the triangles for which there is time; the scene's mesh is told so."""
+        """The part of the triangles for which there is time; the scene's mesh is set so."""
         scene, mesh = self._scene, self._scene.config.mesh
         surface = CAUTION * COARSER**2 * times * found.surface
-        spare = MESH_SHARE * scene.budget.left - CAUTION * found.report
+        spare = MAX_MESH_TIME * scene.budget.left - CAUTION * found.report
         if mesh.voxel is not None or surface <= max(spare, 0.0):
             return 1.0
-        part = max(spare / surface, FEWEST_TRIANGLES)
-        fewer = max(round(part * times * found.triangles), FEWEST)
+        part = max(spare / surface, MIN_TRIANGLES)
+        fewer = max(round(part * times * found.triangles), 1000)
         if fewer < mesh.triangle_budget:
             scene.config = replace(scene.config, mesh=replace(mesh, triangle_budget=fewer))
         return part
@@ -161,14 +147,6 @@ def _cost(found: _Rehearsal, times_the_surface: float) -> OutputCost:
     return OutputCost(once, a_view)
 
 
-def _make_ready(scene: Reconstruction, views: list[int]) -> None:
-    """Load and compile what a mesh and its files need."""
-    from geogs.evaluation.pages import run_page, run_pictures  # noqa: F401
-
-    with suppress(InputError):  # what one view shows is not sure enough for a surface
-        extract_mesh(fusion_views(scene.depth_maps(of=views)), scene.config.mesh)
-
-
 def _rehearse(scene: Reconstruction, views: list[int], clock: Clock) -> _Rehearsal:
     start, mesh, blocks, triangles = clock(), None, 0, 0
     with tempfile.TemporaryDirectory(prefix="geogs-rehearsal-") as folder:
@@ -186,7 +164,7 @@ def _rehearse(scene: Reconstruction, views: list[int], clock: Clock) -> _Rehears
         report = clock() - fused
     of_views += times.seconds.get("views", 0.0) * len(views) / max(len(views) - 1, 1)
     surface = times.seconds.get("surface", 0.0)
-    return _Rehearsal(report, of_views / len(views), surface, blocks, triangles, clock() - start)
+    return _Rehearsal(report, of_views / len(views), surface, blocks, triangles)
 
 
 def _coarse(config: MeshConfig, plan: VolumePlan) -> MeshConfig:
