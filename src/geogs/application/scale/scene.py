@@ -59,4 +59,5 @@ class FoundScale:
 
 def said(found: FoundScale) -> str:
     """A found scale in a sentence."""
-    return f"Scale: {found.factor:.5g} metres to the map unit (+- {found.deviation:.1%}), by {found.origin}."
+    metres = f"{found.factor:.5g} metres to the map unit (+- {found.deviation:.1%})"
+    return f"Scale: {metres}, by {found.origin}."
