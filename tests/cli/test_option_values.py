@@ -28,17 +28,17 @@ COMMANDS: dict[str, tuple[type, Parse, list[str]]] = {
     "reconstruct": (
         reconstruct.ReconstructOptions, reconstruct.parse, ["scene", "--device", "cpu"]
     ),
-    "eval": (eval.EvalOptions, plain(eval.EvalOptions, "eval"), ["out", "--gt", "truth"]),
-    "export": (export.ExportOptions, plain(export.ExportOptions, "export"),
+    "eval": (eval.EvalSettings, plain(eval.EvalSettings, "eval"), ["out", "--gt", "truth"]),
+    "export": (export.ExportSettings, plain(export.ExportSettings, "export"),
                ["out", "--to", "tum"]),
-    "mesh": (mesh.MeshOptions, plain(mesh.MeshOptions, "mesh"), ["out"]),
-    "scale": (scale.ScaleOptions, plain(scale.ScaleOptions, "scale"), ["out"]),
+    "mesh": (mesh.RemeshSettings, plain(mesh.RemeshSettings, "mesh"), ["out"]),
+    "scale": (scale.RescaleSettings, plain(scale.RescaleSettings, "scale"), ["out"]),
     "synth": (synth.SynthOptions, lambda argv: parse_options(
         synth.SynthOptions, argv, "synth", synth._defaults), ["out"]),
     "demo": (demo.DemoOptions, plain(demo.DemoOptions, "demo"), []),
     "doctor": (doctor.DoctorOptions, plain(doctor.DoctorOptions, "doctor"), []),
     "fleet": (fleet.FleetOptions, fleet.parse, ["v.mp4"]),
-    "view": (view.ViewOptions, plain(view.ViewOptions, "view"), ["out"]),
+    "view": (view.ViewSettings, plain(view.ViewSettings, "view"), ["out"]),
     "bench": (BenchOptions, plain(BenchOptions, "bench"), ["replica"]),
     "train flow": (TrainOptions, plain(TrainOptions, "train"), ["flow", "out"]),
     "train depth": (TrainDepthOptions, plain(TrainDepthOptions, "train"), ["depth", "out"]),

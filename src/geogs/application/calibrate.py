@@ -1,8 +1,10 @@
 """Before a run: focal length and shutter that nobody gave, from the video itself."""
 
 import math
+from collections.abc import Callable, Generator, Iterator
+from contextlib import closing
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import torch
 
@@ -17,6 +19,9 @@ if TYPE_CHECKING:
     from geogs.shutter.readout import FoundReadout
     from geogs.tracking.calibration.estimate import SelfCalibration
 
+T = TypeVar("T")
+F = TypeVar("F")
+
 
 def self_calibrated(
     source: Stream,
@@ -27,7 +32,7 @@ def self_calibrated(
 ) -> Stream:
     """The source with its focal length refined, if that is a guess or nominal and may be refined.
 
-    Where the video does not tell, or after a request to stop, the guess stays and ``progress`` is
+    Where the video does not tell, or after a request to stop, the guess stays and ``progress``
     says so.
     """
     config, progress, stop = config or Config(), progress or RunProgress(), stop or Stop()
@@ -40,34 +45,19 @@ def self_calibrated(
         return source
     from geogs.tracking.calibration.estimate import self_calibrate
 
-    frames = source.linked_frames()
-    with stop:
-
-        def report(fraction: float) -> None:
-            progress.stage("calibration", fraction)
-            stop.check()
-
-        try:
-            found = self_calibrate(
-                frames,
-                source.camera,
-                config.calibration.radial,
-                torch.device(device),
-                config.seed,
-                report,
-                source.mask,
-                source.black_is_masked,
-            )
-        except KeyboardInterrupt:
-            if not stop.requested:
-                raise
-            progress.write(
-                f"Calibration stopped; going on with {source.intrinsics_origin}. "
-                "Press Ctrl-C again to end."
-            )
-            return source
-        finally:
-            frames.close()
+    found = _found_in(
+        source.linked_frames(), "calibration", progress, stop,
+        lambda frames, report: self_calibrate(
+            frames, source.camera, config.calibration, torch.device(device), config.seed, report,
+            source.mask, source.black_is_masked,
+        ),
+    )  # fmt: skip
+    if found is None:
+        progress.write(
+            f"Calibration stopped; going on with {source.intrinsics_origin}. "
+            "Press Ctrl-C again to end."
+        )
+        return source
     calibration = refined(source.calibration, source.camera.fx, found)
     progress.write(_in_a_sentence(calibration, source.intrinsics_origin))
     return source.with_calibration(calibration)
@@ -126,25 +116,16 @@ def with_shutter_found(
         return source
     from geogs.shutter.readout import find_readout
 
-    clips = source.clips()
-    with stop:
-
-        def report(fraction: float) -> None:
-            progress.stage("shutter", fraction)
-            stop.check()
-
-        try:
-            found = find_readout(clips, source.rolling_camera, report)
-        except KeyboardInterrupt:
-            if not stop.requested:
-                raise
-            progress.write(
-                "The search for the shutter's readout is stopped; going on with a global shutter. "
-                "Press Ctrl-C again to end."
-            )
-            return source
-        finally:
-            clips.close()
+    found = _found_in(
+        source.clips(), "shutter", progress, stop,
+        lambda clips, report: find_readout(clips, source.rolling_camera, report),
+    )  # fmt: skip
+    if found is None:
+        progress.write(
+            "The search for the shutter's readout is stopped; going on with a global shutter. "
+            "Press Ctrl-C again to end."
+        )
+        return source
     if not found.is_believed:
         return source.with_shutter(Shutter(origin=_evidence(found)))
     progress.write(
@@ -161,3 +142,25 @@ def _evidence(found: "FoundReadout") -> str:
         return "the video does not tell"
     best, error = 1000 * found.best, 1000 * found.error
     return f"{found.clips} clips say {best:.1f} ms, standard error {error:.1f} ms"
+
+
+def _found_in(
+    images: Generator[T, None, None],
+    stage: str,
+    progress: RunProgress,
+    stop: Stop,
+    find: Callable[[Iterator[T], Callable[[float], None]], F],
+) -> F | None:
+    """What is found in some images; none after a request to stop."""
+
+    def report(fraction: float) -> None:
+        progress.stage(stage, fraction)
+        stop.check()
+
+    with stop, closing(images):
+        try:
+            return find(images, report)
+        except KeyboardInterrupt:
+            if not stop.requested:
+                raise
+            return None

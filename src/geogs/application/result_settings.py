@@ -18,7 +18,11 @@ Format = Literal[
 
 @dataclass(frozen=True)
 class ExportSettings(Settings):
-    """Settings of an export."""
+    """Write a result in the format of another program; docs/formats.md says how each is laid out.
+
+    Image sets: colmap, nerfstudio, depth, normals. Paths of the camera: kitti, euroc, tum.
+    Surfaces: glb, obj, cloud (PLY, LAS). Splats: splats (3DGS and 2DGS), gsplat (start values).
+    """
 
     result: Annotated[Path, Positional()]
     """Folder of a result, as geogs run and geogs reconstruct write it."""
@@ -45,7 +49,11 @@ class ExportSettings(Settings):
 
 @dataclass(frozen=True)
 class RemeshSettings(Settings):
-    """Settings of making another mesh."""
+    """Make the mesh of a result again, with other settings.
+
+    The keyframes' depth maps are rendered from the disks as the run rendered them; nothing is
+    tracked or trained.
+    """
 
     result: Annotated[Path, Positional()]
     """Folder of a result, as geogs run and geogs reconstruct write it."""
@@ -59,7 +67,11 @@ class RemeshSettings(Settings):
 
 @dataclass(frozen=True)
 class RescaleSettings(Settings):
-    """Settings of scaling a result."""
+    """Bring a result to metres by something whose length is known.
+
+    Trajectories, map, splats, meshes and summary are written in metres; exports are made anew by
+    geogs export.
+    """
 
     result: Annotated[Path, Positional()]
     """Folder of a result, as geogs run writes it."""
@@ -73,7 +85,10 @@ class RescaleSettings(Settings):
 
 @dataclass(frozen=True)
 class EvalSettings(Settings):
-    """Settings of an evaluation."""
+    """Compare a result with the truth: trajectory, and surface where a true one is found.
+
+    Writes eval.json and report/ into the result's folder and prints the table.
+    """
 
     output: Annotated[Path, Positional()]
     """Folder of a result, as ``geogs run`` writes it."""

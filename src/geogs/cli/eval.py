@@ -1,23 +1,14 @@
 """``geogs eval OUT --gt PATH``: errors of a result against the truth."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 from geogs.application.result_settings import EvalSettings
 from geogs.cli.options import parse_options
 
 
-@dataclass(frozen=True)
-class EvalOptions(EvalSettings):
-    """Compare a result with the truth: trajectory, and surface where a true one is found.
-
-    Writes eval.json and report/ into the result's folder and prints the table.
-    """
-
-
 def main(argv: Sequence[str]) -> int:
     """Run the command; returns the exit code."""
-    options = parse_options(EvalOptions, argv, "eval")
+    options = parse_options(EvalSettings, argv, "eval")
 
     from rich.console import Console
 

@@ -10,7 +10,10 @@ from geogs.config.setting import Basic, Positive, Settings, Unnamed
 
 @dataclass(frozen=True)
 class NodeSettings(Settings):
-    """Settings of the node."""
+    """Track a camera in ROS 2: publishes ~/pose, ~/path, ~/cloud and ~/mesh until Ctrl-C.
+
+    Needs rclpy, which comes with an installation of ROS 2 (source its setup file first).
+    """
 
     image: str = "/camera/image_raw"
     """Topic of the images: sensor_msgs/msg/Image or CompressedImage, by the end of its name."""

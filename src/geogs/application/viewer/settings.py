@@ -13,7 +13,11 @@ Port = Annotated[int, Range(1, 65535)]
 
 @dataclass(frozen=True)
 class ViewSettings(Settings):
-    """Settings of a viewer of a result."""
+    """Look at a result in the browser: mesh, disks, path, keyframes with depth and normals.
+
+    Needs pip install 'geogs[viewer]'; without it, open report/index.html of the result. Over ssh:
+    ssh -L 8080:localhost:8080 MACHINE, then http://localhost:8080 on your own machine.
+    """
 
     result: Annotated[Path, Positional()]
     """Folder of a result, as geogs run and geogs reconstruct write it."""
