@@ -48,8 +48,8 @@ def self_calibrated(
     found = _found_in(
         source.linked_frames(), "calibration", progress, stop,
         lambda frames, report: self_calibrate(
-            frames, source.camera, config.calibration, torch.device(device), config.seed, report,
-            source.mask, source.black_is_masked,
+            frames, source.camera, config.calibration.radial, torch.device(device), config.seed,
+            report, source.mask, source.black_is_masked,
         ),
     )  # fmt: skip
     if found is None:
