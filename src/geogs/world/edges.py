@@ -106,7 +106,7 @@ def in_steps(camera: Camera, shift: Float[Tensor, "*b 2"]) -> Int16[Tensor, "*b 
     return (shift / position_step(camera)).round().short()
 
 
-def check_edges(edges: Mapping[Pair, Edge], grid: SampleGrid, keyframes: Container[int]) -> None:
+def check_edges(edges: Mapping[Pair, Edge], grid: SampleGrid, keyframes: Container[object]) -> None:
     """Raise InputError where an edge is of another camera, or joins a keyframe that is missing."""
     for (i, j), edge in edges.items():
         cells = edge.position if isinstance(edge, PackedEdge) else edge.pixels
