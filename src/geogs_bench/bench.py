@@ -48,7 +48,7 @@ def bench(settings: BenchSettings, say: Callable[[str], None]) -> Benched:
 
 
 def _name(settings: BenchSettings) -> str:
-    """Of the benchmark: some have another for a switch."""
+    """Name of the benchmark: some have another for a switch."""
     name = settings.name
     if settings.known_poses:
         if name not in ("rooms", "rooms-known-poses"):

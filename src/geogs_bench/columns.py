@@ -25,7 +25,7 @@ _STAGES: dict[StageName, str] = {
     "depth fusion": "depth fusion",
     "final": "after refinement",
 }
-"""Of a run. The paper's online results are the second; it has no third."""
+"""Stages of a run. The paper's online results are the second; it has no third."""
 _RUN: tuple[StageName, ...] = ("online", "adjusted", "depth fusion", "final")
 _POSED: tuple[StageName, ...] = ("depth fusion", "final")
 

@@ -171,7 +171,7 @@ SCANNET = PublishedTable(
 )
 
 RGBD_METHODS = ("NICE-SLAM", "E-SLAM")
-"""Of the table of ScanNet, those that were given the depth of the sensor."""
+"""Methods of the table of ScanNet that were given the depth of the sensor."""
 
 TUM_RGBD = PublishedTable(
     "TUM-RGBD",

@@ -124,7 +124,7 @@ class Provenance:
 
     command: str
     commit: str
-    """Of the program, with ``+`` where files were changed; its version where it has no history."""
+    """Commit of the program, with ``+`` where files were changed; its version without a history."""
     machine: str
     device: str
     seed: int
@@ -156,7 +156,7 @@ class Record:
     scene: str
     variant: str
     folder: str
-    """Of the result, relative to that of the benchmark."""
+    """Folder of the result, relative to that of the benchmark."""
     provenance: Provenance
     cost: Cost | None = None
     stages: tuple[StageScore, ...] = ()

@@ -1,4 +1,4 @@
-"""What a benchmark is told."""
+"""Settings of a benchmark."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +10,7 @@ from geogs.config.setting import Basic, Positional, Positive, Settings, Time
 
 @dataclass(frozen=True)
 class BenchSettings(Settings):
-    """All that a benchmark is told."""
+    """All that a benchmark is given."""
 
     name: Annotated[str, Positional()]
     """Which benchmark, or list."""
@@ -23,9 +23,9 @@ class BenchSettings(Settings):
     variants: str = ""
     """Only these variants of an ablation, with commas between."""
     known_poses: bool = False
-    """Of rooms: reconstruct from known poses instead of SLAM."""
+    """Rooms: reconstruct from known poses instead of SLAM."""
     small: bool = False
-    """Of motions: few short sequences of small images, for two CPU cores."""
+    """Motions: few short sequences of small images, for two CPU cores."""
     budgets: Annotated[tuple[Positive, ...], Time] = ()
     """From known poses: seconds given to each reconstruction, several with commas between."""
     baseline: bool = False

@@ -152,8 +152,8 @@ def _published_mean(
     scenes: Sequence[str],
     variant: str | None,
 ) -> float | None:
-    """Of a variant where the table has such columns (over all the paper's scenes), else of the
-    scenes; a mean alone only where all the paper's scenes are there."""
+    """Value of a variant where the table has such columns (over all the paper's scenes), else of
+    the scenes; a mean alone only where all the paper's scenes are there."""
     complete = set(benchmark.scenes) <= set(scenes) and bool(benchmark.scenes)
     if variant is not None and variant in table.columns:
         return table.value(variant, metric)

@@ -36,7 +36,7 @@ class Job:
     settings: RunSettings
     """Without source and folder."""
     digest: str
-    """Of the settings."""
+    """Digest of the settings."""
     limits: Limits
     command: tuple[str, ...] = CHILD
     attempt: int = 1
@@ -74,7 +74,7 @@ def attempt(job: Job) -> Row:
 def _attempt(job: Job) -> tuple[State, str, dict[str, Any]]:
     """How it ended, why, and the summary of what there is."""
     place = Place(job.output)
-    (place / FILE).delete()  # of a former result, which is about to be replaced
+    (place / FILE).delete()  # of a previous result, which is about to be replaced
     folder = WorkFolder(place)
     source = Place(job.source.address).path or fetched(job.source, folder.scratch)
     settings = replace(job.settings, source=(source,), output=folder.path)

@@ -45,7 +45,7 @@ class JoinOptions(JoinSettings):
 
 
 def main(argv: Sequence[str]) -> int:
-    """Run the command; returns 0, or 1 where a source failed or a part stays apart."""
+    """Run the command; returns 0, or 1 where a source failed or a part could not be joined."""
     words = list(argv)
     if words and words[0] == "join":
         return _join(words[1:])
@@ -59,14 +59,14 @@ def main(argv: Sequence[str]) -> int:
     options = parse(words)
 
     from geogs_fleet.run import run_fleet
-    from geogs_fleet.terminal import TerminalFleet, closing_words
+    from geogs_fleet.terminal import TerminalFleet, closing_message
 
     begin = time.perf_counter()
     settings = record(FleetSettings, options)
     result = run_fleet(settings, TerminalFleet(options.quiet))
     seconds = time.perf_counter() - begin
     if not options.quiet:
-        print(closing_words(result.rows, result.computed, result.output, seconds))
+        print(closing_message(result.rows, result.computed, result.output, seconds))
     return EXIT_FAILED if any(row.state != "done" for row in result.rows) else 0
 
 
@@ -80,7 +80,7 @@ def _join(words: Sequence[str]) -> int:
     joint = run_join(record(JoinSettings, options), progress, progress.say)
     if not options.quiet:
         print(f"{joint.sentence}\nOpen {joint.output}/report/index.html in a browser.")
-    return EXIT_FAILED if joint.apart else 0
+    return EXIT_FAILED if joint.unjoined else 0
 
 
 def parse(argv: Sequence[str]) -> FleetOptions:

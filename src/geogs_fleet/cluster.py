@@ -16,7 +16,7 @@ _PASSING = "geogs: ends with its command"
 
 
 @dataclass(frozen=True)
-class Share:
+class Allocation:
     """What one source gets of a node."""
 
     cpus: int
@@ -52,7 +52,7 @@ def ray_cluster(address: str) -> Iterator[Any]:
         ray.shutdown()
 
 
-def share_of(ray: Any, settings: FleetSettings) -> Share:
+def allocation_for(ray: Any, settings: FleetSettings) -> Allocation:
     """What each source gets of the cluster, where settings leave that open.
 
     Raises:
@@ -66,8 +66,8 @@ def share_of(ray: Any, settings: FleetSettings) -> Share:
         cpus = settings.cpus
     else:
         if gpus:
-            shares = [n.get("CPU", 0.0) * gpus / n["GPU"] for n in nodes if n.get("GPU", 0.0)]
-            cpus = max(1, min(16, int(min(shares, default=1.0))))
+            parts = [n.get("CPU", 0.0) * gpus / n["GPU"] for n in nodes if n.get("GPU", 0.0)]
+            cpus = max(1, min(16, int(min(parts, default=1.0))))
     memory = settings.memory_limit
     memory_bytes = None if memory is None else int(memory * 2**30)
     wanted = {"CPU": float(cpus), "GPU": gpus, "memory": float(memory_bytes or 0)}
@@ -78,18 +78,20 @@ def share_of(ray: Any, settings: FleetSettings) -> Share:
             f"No machine of the cluster has {cpus} cores, {gpus:g} GPUs{memory_said} for a "
             "source; ask for less (--cpus, --gpus, --memory-limit)."
         )
-    return Share(cpus, gpus, memory_bytes, at_once)
+    return Allocation(cpus, gpus, memory_bytes, at_once)
 
 
-def as_task(ray: Any, function: Callable[..., Any], share: Share, retries: int = 0) -> Any:
-    """A function as a task of Ray that gets its share of a node.
+def as_task(
+    ray: Any, function: Callable[..., Any], allocation: Allocation, retries: int = 0
+) -> Any:
+    """A function as a task of Ray that gets so much of a node.
 
     Ray calls it again, up to so many times, where its node or its process is lost.
     """
     return ray.remote(function).options(
-        num_cpus=share.cpus,
-        num_gpus=share.gpus or None,
-        memory=share.memory,
+        num_cpus=allocation.cpus,
+        num_gpus=allocation.gpus or None,
+        memory=allocation.memory,
         max_retries=retries,
         scheduling_strategy="SPREAD",
     )
@@ -97,7 +99,9 @@ def as_task(ray: Any, function: Callable[..., Any], share: Share, retries: int =
 
 def _times(node: dict[str, float], wanted: dict[str, float]) -> int:
     """How many times a node has what is wanted."""
-    return min(int(node.get(name, 0.0) / share + 1e-9) for name, share in wanted.items() if share)
+    return min(
+        int(node.get(name, 0.0) / amount + 1e-9) for name, amount in wanted.items() if amount
+    )
 
 
 def _connect(ray: Any, address: str) -> None:

@@ -10,7 +10,7 @@ from geogs.config.setting import Basic, Positional
 from geogs.documents import read_json
 from geogs.errors import InputError
 from geogs.io.writers.atomic import prepare_output_folder
-from geogs_fleet.cluster import ray_cluster, share_of
+from geogs_fleet.cluster import allocation_for, ray_cluster
 from geogs_fleet.places import Place
 from geogs_fleet.progress import FleetProgress
 from geogs_fleet.run import run_fleet
@@ -28,7 +28,7 @@ PARTS = "parts"
 
 @dataclass(frozen=True)
 class JoinSettings(FleetSettings):
-    """All that the making of one place from many videos is told."""
+    """All that the making of one place from many videos is given."""
 
     source: Annotated[tuple[str, ...], Positional()] = ()
     """Parts of one place that overlap: videos and folders of images, as of geogs fleet run, which
@@ -57,13 +57,13 @@ def run_join(
         raise InputError("The joint result needs a folder that all machines see; give one (-o).")
     output = prepare_output_folder(path.absolute())
     with only_writer(output), ray_cluster(settings.address) as ray:
-        share = share_of(ray, settings)
+        allocation = allocation_for(ray, settings)
         parts = _parts(settings, output, progress, say)
 
         from geogs_fleet.join.join import join_parts
 
-        device = "cuda" if share.gpus else "cpu"
-        workers = RayWorkers(ray, share, settings.attempts, say)
+        device = "cuda" if allocation.gpus else "cpu"
+        workers = RayWorkers(ray, allocation, settings.attempts, say)
         return join_parts(parts, output, settings.config, workers, device, settings.adjust, say)
 
 

@@ -29,12 +29,12 @@ class Row:
     is_reliable: bool | None = None
     """The verdict; none where nothing was judged."""
     seconds: float = 0.0
-    """Of the attempt that ended it."""
+    """How long the attempt took that ended it."""
     attempts: int = 1
     node: str = ""
     """Name of the machine of that attempt."""
     numbers: dict[str, float] = field(default_factory=dict)
-    """Frames, keyframes, disks, mesh_faces, lost (share of the frames), peak_memory_bytes."""
+    """Frames, keyframes, disks, mesh_faces, lost (fraction of the frames), peak_memory_bytes."""
 
     @property
     def trouble(self) -> tuple[int, float]:

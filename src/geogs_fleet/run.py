@@ -11,7 +11,7 @@ from geogs.application.settings import RunSettings
 from geogs.errors import InputError
 from geogs.io.writers.atomic import prepare_output_folder
 from geogs_fleet.attempt import CHILD, Job
-from geogs_fleet.cluster import Share, ray_cluster, share_of
+from geogs_fleet.cluster import Allocation, allocation_for, ray_cluster
 from geogs_fleet.places import Place
 from geogs_fleet.progress import FleetProgress, Pace
 from geogs_fleet.row import FILE, Row, read_row
@@ -31,7 +31,7 @@ class FleetResult:
 
     output: str
     rows: list[Row]
-    """Of all sources, in their order."""
+    """Rows of all sources, in their order."""
     computed: int
     """How many were computed this time; the others were done before."""
 
@@ -60,12 +60,12 @@ def run_fleet(
         missing = [source for source in sources if source.name not in rows]
         if missing:
             with ray_cluster(settings.address) as ray:
-                share = share_of(ray, settings)
-                jobs = [_job(settings, source, output, share, digest) for source in missing]
+                allocation = allocation_for(ray, settings)
+                jobs = [_job(settings, source, output, allocation, digest) for source in missing]
                 jobs = [replace(job, command=tuple(command)) for job in jobs]
-                progress.begin(len(sources), len(rows), share.at_once)
-                pace, written = Pace(len(jobs), share.at_once), -_BETWEEN_TABLES
-                ended = rows_of(ray, jobs, share, settings.attempts)
+                progress.begin(len(sources), len(rows), allocation.at_once)
+                pace, written = Pace(len(jobs), allocation.at_once), -_BETWEEN_TABLES
+                ended = rows_of(ray, jobs, allocation, settings.attempts)
                 try:
                     for row in ended:
                         rows[row.name] = row
@@ -82,15 +82,15 @@ def run_fleet(
 
 
 def _job(
-    settings: FleetSettings, source: FleetSource, output: Place, share: Share, digest: str
+    settings: FleetSettings, source: FleetSource, output: Place, allocation: Allocation, digest: str
 ) -> Job:
     return Job(
         source,
         (output / source.name).address,
-        _run_settings(settings, "cuda" if share.gpus else "cpu"),
+        _run_settings(settings, "cuda" if allocation.gpus else "cpu"),
         digest,
-        Limits(settings.time_limit, share.memory),
-        threads=share.cpus,
+        Limits(settings.time_limit, allocation.memory),
+        threads=allocation.cpus,
     )
 
 
@@ -104,7 +104,7 @@ def _run_settings(settings: FleetSettings, device: str) -> RunSettings:
 
 
 def _digest(settings: RunSettings) -> str:
-    """Of what decides about a result; where it is computed does not."""
+    """Digest of what decides about a result; where it is computed does not."""
     deciding = replace(settings, checkpoint_every=60.0)
     return sha256(repr(deciding).encode()).hexdigest()[:16]
 

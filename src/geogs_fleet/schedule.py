@@ -9,7 +9,7 @@ from dataclasses import replace
 from typing import Any
 
 from geogs_fleet.attempt import Job, attempt
-from geogs_fleet.cluster import Share, as_task
+from geogs_fleet.cluster import Allocation, as_task
 from geogs_fleet.row import Row
 
 _LOOK = 0.5
@@ -17,14 +17,14 @@ _LOOK = 0.5
 
 
 def rows_of(
-    ray: Any, jobs: Iterable[Job], share: Share, attempts: int
+    ray: Any, jobs: Iterable[Job], allocation: Allocation, attempts: int
 ) -> Generator[Row, None, None]:
     """The row of every job, in the order in which they end; each job has exactly one.
 
     All jobs are handed to Ray at once. One whose node or process fails is handed in again, up to
     ``attempts`` times in all. When the caller stops listening, what is out is ended.
     """
-    task = as_task(ray, attempt, share)
+    task = as_task(ray, attempt, allocation)
     out: dict[Any, Job] = {task.remote(job): job for job in jobs}
     try:
         while out:

@@ -1,4 +1,4 @@
-"""What a fleet is told: which sources, where they are computed, what each may take."""
+"""Settings of a fleet: which sources, where they are computed, what each may take."""
 
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
@@ -9,7 +9,7 @@ from geogs.config.setting import Basic, Positional, Range, Settings, Time, Unnam
 
 @dataclass(frozen=True)
 class FleetSettings(Settings):
-    """All that a fleet of runs is told."""
+    """All that a fleet of runs is given."""
 
     source: Annotated[tuple[str, ...], Positional()] = ()
     """Videos and folders of images, patterns such as 'clips/*.mp4', folders of such, or text files

@@ -16,7 +16,7 @@ VIDEOS = frozenset({
 })  # fmt: skip
 """Endings by which a video in a folder is known; one that is named itself may have any."""
 _TABLES = frozenset({"rgb.txt", "traj.txt"})
-"""Of a data set, which is one source whatever else lies in it."""
+"""Files of a data set, which is one source whatever else lies in it."""
 _PATTERN = re.compile(r"[*?\[]")
 
 
@@ -27,7 +27,7 @@ class FleetSource:
     address: str
     """An absolute path, or an address that fsspec knows."""
     name: str
-    """Of its folder in the results; no other source of the fleet has it."""
+    """Name of its folder in the results; no other source of the fleet has it."""
 
 
 def find_sources(given: Sequence[str]) -> list[FleetSource]:

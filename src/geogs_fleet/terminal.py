@@ -33,7 +33,7 @@ class TerminalFleet(FleetProgress):
         self._console.print(sentence, markup=False)
 
 
-def closing_words(rows: list[Row], computed: int, output: str, seconds: float) -> str:
+def closing_message(rows: list[Row], computed: int, output: str, seconds: float) -> str:
     """What is said at the end, for the standard output."""
     failed = sum(row.state != "done" for row in rows)
     doubtful = sum(row.is_reliable is False for row in rows)

@@ -64,17 +64,17 @@ class WorkFolder:
     def leave(self) -> None:
         """After success: what was for the time of work only."""
         if self._place.path is None:
-            former = self._place / "checkpoint"
-            for name in former.listed():
-                (former / name).delete()
+            previous = self._place / "checkpoint"
+            for name in previous.listed():
+                (previous / name).delete()
         shutil.rmtree(self.scratch, ignore_errors=True)
 
     def _take_checkpoint(self) -> None:
         target = self.path / "checkpoint"
         shutil.rmtree(target, ignore_errors=True)
-        former = self._place / "checkpoint"
-        if _MANIFEST in former.listed():
-            former.download(target)
+        previous = self._place / "checkpoint"
+        if _MANIFEST in previous.listed():
+            previous.download(target)
 
 
 def fetched(source: FleetSource, scratch: Path) -> Path:

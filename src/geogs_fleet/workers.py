@@ -6,7 +6,7 @@ from contextlib import suppress
 from typing import Any, Protocol, TypeVar, TypeVarTuple, runtime_checkable
 
 from geogs.errors import DeviceError, GeogsError
-from geogs_fleet.cluster import Share, as_task
+from geogs_fleet.cluster import Allocation, as_task
 
 Ts = TypeVarTuple("Ts")
 R = TypeVar("R")
@@ -35,17 +35,17 @@ class RayWorkers:
     def __init__(
         self,
         ray: Any,
-        share: Share,
+        allocation: Allocation,
         attempts: int,
         say: Callable[[str], None] = lambda sentence: None,
     ) -> None:
-        """``share`` is what each job gets of a node; ``say`` is given a line for every stage."""
-        self._ray, self._share, self._attempts, self._say = ray, share, attempts, say
+        """``allocation``: what each job gets of a node; ``say`` is given a line for every stage."""
+        self._ray, self._allocation, self._attempts, self._say = ray, allocation, attempts, say
 
     @property
     def at_once(self) -> int:
         """How many jobs can be done at a time."""
-        return self._share.at_once
+        return self._allocation.at_once
 
     def map(self, stage: str, function: Callable[[*Ts], R], jobs: Sequence[tuple[*Ts]]) -> list[R]:
         """As in the protocol.
@@ -54,7 +54,7 @@ class RayWorkers:
             GeogsError: as ``function`` raises it, or a job failed as often as it was tried.
         """
         begin, ray = time.monotonic(), self._ray
-        task = as_task(ray, function, self._share, retries=self._attempts - 1)
+        task = as_task(ray, function, self._allocation, retries=self._attempts - 1)
         references = [task.remote(*job) for job in jobs]
         try:
             results: list[R] = ray.get(references)

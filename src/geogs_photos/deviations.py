@@ -47,8 +47,8 @@ def pose_deviations(
     if joint is None:
         unknown = np.full(len(images), np.inf)
         return unknown, unknown.copy()
-    place, turn = without_gauge(joint, T_cw)
-    return error * place, error * turn
+    centre, rotation = without_gauge(joint, T_cw)
+    return error * centre, error * rotation
 
 
 def without_gauge(
@@ -61,18 +61,18 @@ def without_gauge(
     the camera turn by R^T w in the world.
     """
     count = len(T_cw)
-    moves, turns = np.zeros((3 * count, 6 * count)), np.zeros((3 * count, 6 * count))
+    moves, rotations = np.zeros((3 * count, 6 * count)), np.zeros((3 * count, 6 * count))
     for k, T in enumerate(T_cw):
         back, t = T[:3, :3].T, T[:3, 3]
         rows, own = slice(3 * k, 3 * k + 3), slice(6 * k, 6 * k + 6)
         moves[rows, own] = back @ np.concatenate([-_cross(t), -np.eye(3)], 1)
-        turns[rows, own] = back @ np.concatenate([np.eye(3), np.zeros((3, 3))], 1)
+        rotations[rows, own] = back @ np.concatenate([np.eye(3), np.zeros((3, 3))], 1)
     centres = -np.einsum("nij,ni->nj", T_cw[:, :3, :3], T_cw[:, :3, 3])
     centres = centres - centres.mean(0)
     identity = np.tile(np.eye(3), (count, 1))
     rotated = np.concatenate([-_cross(c) for c in centres])
     similarity = np.concatenate([identity, rotated, centres.reshape(-1, 1)], 1)
-    return _left(moves, joint, similarity), _left(turns, joint, identity)
+    return _left(moves, joint, similarity), _left(rotations, joint, identity)
 
 
 def _left(

@@ -22,11 +22,11 @@ class Features:
     keypoints: Float32[np.ndarray, "n 4"]
     """Column and row (centres of pixels at integers), scale in pixels, direction in radians."""
     descriptors: UInt8[np.ndarray, "n 128"]
-    """Square roots of the shares of the gradients, times 512 (Arandjelovic & Zisserman 2012)."""
+    """Square roots of the fractions of the gradients, times 512 (Arandjelovic & Zisserman 2012)."""
 
     @classmethod
     def none(cls) -> "Features":
-        """Of a picture without any."""
+        """The features of a picture without any."""
         return cls(np.zeros((0, 4), np.float32), np.zeros((0, 128), np.uint8))
 
     def __len__(self) -> int:
@@ -70,5 +70,5 @@ def find_features(
 
 
 def _root_sift(raw: Float32[np.ndarray, "n 128"]) -> UInt8[np.ndarray, "n 128"]:
-    share = raw / np.maximum(raw.sum(axis=1, keepdims=True), 1e-9)
-    return np.round(512 * np.sqrt(share)).clip(0, 255).astype(np.uint8)
+    fraction = raw / np.maximum(raw.sum(axis=1, keepdims=True), 1e-9)
+    return np.round(512 * np.sqrt(fraction)).clip(0, 255).astype(np.uint8)

@@ -21,7 +21,7 @@ _RATIO = 0.8
 
 
 class Localiser:
-    """The points that the placed frames see, with their looks."""
+    """The points that the placed frames see, with their descriptors."""
 
     def __init__(self, video: PlacedVideo, camera: Camera, seed: int) -> None:
         """``camera`` is that of the frames to place."""
@@ -40,11 +40,11 @@ class Localiser:
         """World to camera of a frame of the video; none where too few points agree."""
         near = self._near(frame.index)
         positions = np.concatenate([self._positions[k] for k in near])
-        looks = np.concatenate([self._descriptors[k] for k in near])
+        descriptors = np.concatenate([self._descriptors[k] for k in near])
         features = find_features(frame.image)
         if len(features) < LEAST_INLIERS or len(positions) < LEAST_INLIERS:
             return None
-        own, known = matches_to_points(features.descriptors, looks, positions)
+        own, known = matches_to_points(features.descriptors, descriptors, positions)
         if len(own) < LEAST_INLIERS:
             return None
         pixels = features.keypoints[own, :2].astype(np.float64) + 0.5
@@ -64,14 +64,14 @@ class Localiser:
 
 def matches_to_points(
     own: UInt8[np.ndarray, "n 128"],
-    looks: UInt8[np.ndarray, "m 128"],
+    descriptors: UInt8[np.ndarray, "m 128"],
     positions: Float64[np.ndarray, "m 3"],
 ) -> tuple[Int64[np.ndarray, "k"], Int64[np.ndarray, "k"]]:
-    """Features and points that are each other's nearest in looks.
+    """Features and points that are each other's nearest by their descriptors.
 
     The second nearest has to be clearly farther, but for the same point as another frame sees it.
     """
-    distance = _squares(own.astype(np.float32), looks.astype(np.float32))
+    distance = _squares(own.astype(np.float32), descriptors.astype(np.float32))
     rows = np.arange(len(own))
     nearest = distance.argmin(1)
     best = distance[rows, nearest].copy()

@@ -82,8 +82,8 @@ def _best(count: int, pairs: Pairs, alike: Sequence[int]) -> Pairs:
 
 def _candidates(features: Sequence[Features], seed: int) -> Pairs:
     """Pairs of pictures whose features are spread alike."""
-    looks = vlad([f.largest(PREVIEW) for f in features], seed)
-    likeness = looks @ looks.T
+    appearance = vlad([f.largest(PREVIEW) for f in features], seed)
+    likeness = appearance @ appearance.T
     np.fill_diagonal(likeness, -np.inf)
     nearest = np.argpartition(-likeness, _CANDIDATES, axis=1)[:, :_CANDIDATES]
     return sorted({(min(i, j), max(i, j)) for i, row in enumerate(nearest.tolist()) for j in row})

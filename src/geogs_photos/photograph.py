@@ -21,7 +21,7 @@ class Lens:
 
     width: int
     height: int
-    """Of the picture as it is stored, pixels."""
+    """Size of the picture as it is stored, pixels."""
     words: tuple[str, ...] = ()
     """Make, model, lens and focal lengths from the EXIF."""
 

@@ -18,11 +18,11 @@ FEWEST, MOST = 40, 250
 
 @dataclass(frozen=True, slots=True)
 class ChosenFrames:
-    """Of each stretch of a video the sharpest frame."""
+    """The sharpest frame of each stretch of a video."""
 
     frames: tuple[Frame, ...]
     timestamps: Float64[np.ndarray, "n"]
-    """Of all frames of the video, seconds."""
+    """Times of all frames of the video, seconds."""
 
 
 def stretch_length(fps: float, length: int | None) -> int:

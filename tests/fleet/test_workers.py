@@ -16,7 +16,7 @@ from geogs.config import Config, MeshConfig
 from geogs.errors import DeviceError, InputError
 from geogs.io.writers.map_file import load_map_file
 from geogs.mesh.mesh_file import read_mesh
-from geogs_fleet.cluster import Share
+from geogs_fleet.cluster import Allocation
 from geogs_fleet.join.join import join_parts
 from geogs_fleet.join.part import Part
 from geogs_fleet.workers import RayWorkers
@@ -61,7 +61,7 @@ def slow_on_its_first_node(place: str, number: int) -> int:
 
 
 def workers(attempts: int = 3) -> RayWorkers:
-    return RayWorkers(ray, Share(1, 0.0, None, 2), attempts)
+    return RayWorkers(ray, Allocation(1, 0.0, None, 2), attempts)
 
 
 def test_results_are_in_the_order_of_the_jobs_and_errors_are_what_they_were(cluster):
@@ -98,7 +98,7 @@ def test_a_job_whose_node_is_removed_is_done_elsewhere_and_counts_once(cluster, 
 
     remover = threading.Thread(target=remove_when_begun, daemon=True)
     remover.start()
-    lost = RayWorkers(FirstOnThatNode(), Share(1, 0.0, None, 2), 3)
+    lost = RayWorkers(FirstOnThatNode(), Allocation(1, 0.0, None, 2), 3)
     jobs = [(str(tmp_path), n) for n in range(4)]
     assert lost.map("waiting", slow_on_its_first_node, jobs) == [100, 101, 102, 103]
     remover.join(600)

@@ -24,7 +24,7 @@ def test_two_parts_of_a_room_become_one_and_another_room_stays_apart(tmp_path, a
     parts = [Part(n, make_part(tmp_path / n, p, k)) for k, (n, p) in enumerate(zip("ab", PLACES))]  # noqa: B905
     parts.append(Part("x", make_part(tmp_path / "x", PLACES[0], 3, paint=9)))
     joint = join_parts(parts, tmp_path / "out", Config(), OneProcess(), adjust=adjust)
-    assert (joint.joined, joint.apart, joint.links >= 2) == (("a", "b"), ("x",), True)
+    assert (joint.joined, joint.unjoined, joint.links >= 2) == (("a", "b"), ("x",), True)
     result = load_result(tmp_path / "out")
     true = np.concatenate([true_frames(places) for places in PLACES])
     error = np.linalg.norm(result.trajectory.T_wc[:, :3, 3] - true[:, :3, 3], axis=1)

@@ -9,7 +9,7 @@ from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp
 from geogs.io.writers.keyframe_folder import write_image
 from geogs.mesh.extract import extract_mesh
-from geogs_fleet.join.stored_views import StoredView, loaded, shares
+from geogs_fleet.join.stored_views import StoredView, equal_runs, loaded
 from geogs_fleet.join.surface import joint_mesh, plan_space
 from one_process import OneProcess
 
@@ -49,8 +49,8 @@ def test_several_workers_make_the_mesh_of_one_volume(views):
 
 @pytest.mark.parametrize(("count", "parts"), [(0, 3), (2, 5), (10, 3), (7, 1)])
 def test_shares_are_all_of_it_and_about_equal(count, parts):
-    found = shares(count, parts)
-    assert [n for share in found for n in share] == list(range(count))
-    sizes = [len(share) for share in found]
+    found = equal_runs(count, parts)
+    assert [n for run in found for n in run] == list(range(count))
+    sizes = [len(run) for run in found]
     assert not sizes or (min(sizes) > 0 and max(sizes) - min(sizes) <= 1)
     assert len(sizes) == min(count, parts)

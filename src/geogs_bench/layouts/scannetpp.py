@@ -14,7 +14,7 @@ _VIDEO_RATE = 60.0
 """Frames per second of the iPhone videos."""
 
 _STRIDE = 2
-"""Of the 60 frames a second; the paper does not say which it used."""
+"""Stride through the 60 frames a second; the paper does not say which it used."""
 
 
 def find_scannetpp(root: Path) -> list[Scene]:

@@ -1,4 +1,4 @@
-"""How well a camera's motion was followed: share of the frames, positions, orientations."""
+"""How well a camera's motion was followed: fraction of the frames, positions, orientations."""
 
 from dataclasses import replace
 
@@ -68,25 +68,25 @@ def compare_motion(
     """
     reference, tracked = finite_poses(reference), finite_poses(tracked)
     i, j = associate(reference.timestamps, tracked.timestamps, _SAME_TIME)
-    share = 100 * len(i) / len(reference.timestamps)
+    percentage = 100 * len(i) / len(reference.timestamps)
     rotation = _rotation(reference, tracked if oriented is None else oriented)
     if len(i) < 3:
-        return MotionScore(share, rotation=rotation)
+        return MotionScore(percentage, rotation=rotation)
     places = reference.T_wc[i, :3, 3]
     path = float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum())
     if path < _LEAST_PATH:
-        return MotionScore(share, rotation=rotation)
+        return MotionScore(percentage, rotation=rotation)
     if np.ptp(tracked.T_wc[j, :3, 3], axis=0).max() == 0:  # all estimated positions are one
-        return MotionScore(share, rotation=rotation)
+        return MotionScore(percentage, rotation=rotation)
     try:
         ate = evaluate_trajectory(tracked, reference, _SAME_TIME).ate_rmse_cm
     except InputError:  # they are on a line
-        return MotionScore(share, rotation=rotation)
+        return MotionScore(percentage, rotation=rotation)
     extent = float(np.sqrt(np.square(places - places.mean(0)).sum(1).mean()))
     turned = 0 if oriented is None else len(finite_poses(oriented).timestamps) - len(i)
-    followed = share + 100 * turned / len(reference.timestamps)
+    followed = percentage + 100 * turned / len(reference.timestamps)
     good = followed >= _LEAST_FOLLOWED and ate <= 100 * _MOST_OFF * extent
-    return MotionScore(share, 0.0, rotation, ate, ate / path, is_reliable=good)
+    return MotionScore(percentage, 0.0, rotation, ate, ate / path, is_reliable=good)
 
 
 def _rotation(reference: Trajectory, oriented: Trajectory) -> float | None:

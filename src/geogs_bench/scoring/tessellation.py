@@ -21,8 +21,8 @@ def with_short_edges(mesh: Surface, longest: float) -> Surface:
         if not len(long) or len(faces) + len(long) > _MOST_FACES:
             return Surface(vertices, faces)
         # Turn each triangle so that its longest edge is the one from a to b.
-        turn = lengths[long].argmax(1)[:, None] + np.arange(3)
-        a, b, c = np.take_along_axis(faces[long], turn % 3, axis=1).T
+        order = lengths[long].argmax(1)[:, None] + np.arange(3)
+        a, b, c = np.take_along_axis(faces[long], order % 3, axis=1).T
         key = np.minimum(a, b) * len(vertices) + np.maximum(a, b)
         _, first, middle = np.unique(key, return_index=True, return_inverse=True)
         middle = middle.reshape(-1) + len(vertices)

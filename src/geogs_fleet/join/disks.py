@@ -91,7 +91,7 @@ def merge_disks(file: Path, before: Sequence[Path]) -> Bool[Tensor, "n"]:
 
 
 def is_covered(disks: MapSnapshot, others: MapSnapshot) -> Bool[Tensor, "n"]:
-    """Which disks lie on one of others that turns the same way, within its extent."""
+    """Which disks lie on one of others that faces the same way, within its extent."""
     covered = torch.zeros(len(disks), dtype=torch.bool)
     if not len(disks) or not len(others):
         return covered

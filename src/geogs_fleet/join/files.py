@@ -38,7 +38,7 @@ class JoinedPart:
 
     @property
     def trajectory(self) -> Trajectory:
-        """Of its frames, in the joint world and its own time."""
+        """Poses of its frames, in the joint world and its own time."""
         return moved_trajectory(self.result.trajectory, self.views, self.placement)
 
 
@@ -102,8 +102,8 @@ def write_map(
         has_mask=np.zeros(count, bool),
         has_images=True,
     )
-    facts = {"source": " + ".join(part.span.name for part in parts), "seed": config.seed}
-    save_map_with_views(output / "map.safetensors", disks, views, facts)
+    metadata = {"source": " + ".join(part.span.name for part in parts), "seed": config.seed}
+    save_map_with_views(output / "map.safetensors", disks, views, metadata)
     write_intrinsics(output / "intrinsics.json", camera)
     write_config(output / "config.yaml", config)
 
@@ -114,7 +114,7 @@ def write_summary(output: Path, summary: Mapping[str, object]) -> None:
 
 
 def fingerprint(parts: Sequence[SavedResult]) -> str:
-    """Of the parts: changes with theirs."""
+    """Fingerprint of the parts: changes with theirs."""
     words = [str(part.summary.get("fingerprint", part.folder)) for part in parts]
     return hashlib.sha256("\n".join(words).encode()).hexdigest()[:16]
 

@@ -19,7 +19,7 @@ class Gauge:
     """The parts that make one world."""
 
     world: dict[int, Float[Tensor, "4 4"]]
-    """Of each part in it, by number: the Sim(3) from the joint world to the part's."""
+    """Sim(3) from the joint world to that of each part in it, by the part's number."""
     links: tuple[Link, ...]
     """Between parts of the world that agree with it."""
 

@@ -37,14 +37,14 @@ from geogs_fleet.join.gauge import Gauge, common_gauge
 from geogs_fleet.join.graph import Placement, placed
 from geogs_fleet.join.links import Link, candidates, links_of
 from geogs_fleet.join.part import Part, PartViews, describe, opened
-from geogs_fleet.join.stored_views import render_views, shares
+from geogs_fleet.join.stored_views import equal_runs, render_views
 from geogs_fleet.join.surface import SpacePlan, coloured, joint_mesh, plan_space
 from geogs_fleet.join.trajectory import spans_of
 from geogs_fleet.workers import Workers
 
 _PAIRS = 24
 """Pairs of keyframes that are verified in one go."""
-_SHARES = 4
+_RUNS_PER_WORKER = 4
 """Runs of keyframes for each worker that are rendered in one go."""
 
 
@@ -54,7 +54,7 @@ class Joint:
 
     output: Path
     joined: tuple[str, ...]
-    apart: tuple[str, ...]
+    unjoined: tuple[str, ...]
     """Parts in which nothing of the others was recognised: their own results are all there is."""
     links: int
     summary: dict[str, Any] = field(default_factory=dict)
@@ -116,7 +116,7 @@ class _Join:
         """The mesh of the result that has been written, and colours of its disks."""
         folder = self.work / "renders"
         folder.mkdir(parents=True, exist_ok=True)
-        runs = shares(count, _SHARES * self.workers.at_once)
+        runs = equal_runs(count, _RUNS_PER_WORKER * self.workers.at_once)
         renders = [(self.output, run, folder, self.device) for run in runs]
         views = [v for some in self.workers.map("rendering", render_views, renders) for v in some]
         try:
@@ -158,7 +158,7 @@ def join_parts(
         device: where they render and fuse.
         adjust: whether keyframes are adjusted with the matches of overlapping parts; else links
             and parts alone say where they are.
-        say: is told how far the work is.
+        say: is given a line on how far the work is.
 
     Raises:
         InputError: a part cannot be used, or no two of them show one place.
@@ -196,7 +196,7 @@ def _joined(join: _Join, adjust: bool, say: Callable[[str], None], begin: float)
             f"No place of one part was recognised in another ({len(links)} single views alike); "
             "parts have to overlap, seen from similar sides."
         )
-    apart = [parts[n].name for n in range(len(parts)) if n not in gauge.world]
+    unjoined = [parts[n].name for n in range(len(parts)) if n not in gauge.world]
     say(f"{len(gauge.links)} links join {len(gauge.world)} of {len(parts)} parts.")
     with join.timed("pose graph"):
         placements = placed(views, gauge)
@@ -224,7 +224,7 @@ def _joined(join: _Join, adjust: bool, say: Callable[[str], None], begin: float)
     with join.timed("mesh"):
         mesh = join.surface(sum(len(p.views.T_cw) for p in placed_parts), disks)
     summary = {
-        **_facts(list(results.values()), gauge, apart, adjust),
+        **_statistics(list(results.values()), gauge, unjoined, adjust),
         "videos": [asdict(span) for span in spans],
         "frames": len(trajectory.timestamps),
         "lost_spans": lost_spans(trajectory),
@@ -240,33 +240,33 @@ def _joined(join: _Join, adjust: bool, say: Callable[[str], None], begin: float)
         join.output / "report", trajectory, written.keyframes, mesh, summary, written.disks
     )
     names = tuple(parts[n].name for n in gauge.parts)
-    return Joint(join.output, names, tuple(apart), len(gauge.links), summary)
+    return Joint(join.output, names, tuple(unjoined), len(gauge.links), summary)
 
 
-def _facts(
-    results: Sequence[SavedResult], gauge: Gauge, apart: Sequence[str], adjusted: bool
+def _statistics(
+    results: Sequence[SavedResult], gauge: Gauge, unjoined: Sequence[str], adjusted: bool
 ) -> dict[str, Any]:
     """What a summary says of the parts."""
     verdicts = [result.summary.get("verdict") for result in results]
-    doubted = [
+    unreliable = [
         result.name for result, verdict in zip(results, verdicts, strict=True)
         if isinstance(verdict, dict) and verdict.get("is_reliable") is False
     ]  # fmt: skip
-    whole = len(results) + len(apart)
+    whole = len(results) + len(unjoined)
     sentence = f"{len(results)} of {whole} parts are one place, by {len(gauge.links)} links."
-    if apart:
-        sentence += f" Nothing of the others was recognised in {', '.join(apart)}."
-    if doubted:
-        sentence += f" Not to be relied on by themselves: {', '.join(doubted)}."
+    if unjoined:
+        sentence += f" Nothing of the others was recognised in {', '.join(unjoined)}."
+    if unreliable:
+        sentence += f" Not to be relied on by themselves: {', '.join(unreliable)}."
     return {
         "source": " + ".join(str(result.summary.get("source", result.name)) for result in results),
         "kind": "joined parts",
         "fingerprint": fingerprint(results),
         "scale": "arbitrary (monocular)",
-        "verdict": {"is_reliable": not doubted and not apart, "sentence": sentence},
+        "verdict": {"is_reliable": not unreliable and not unjoined, "sentence": sentence},
         "keyframes": sum(len(result.views.keyframe_id) for result in results),
         "parts": [str(result.folder) for result in results],
-        "apart": list(apart),
+        "apart": list(unjoined),
         "links": len(gauge.links),
         "bundle_adjusted": adjusted,
         "versions": {"geogs": __version__, "torch": torch.__version__},

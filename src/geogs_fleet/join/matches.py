@@ -43,7 +43,7 @@ class Depths:
     information: Float32[Tensor, "n p"]
     """Inverse variances."""
     moving: Bool[Tensor, "n p"]
-    """Cells that are held for showing something that moves."""
+    """Cells that show something dynamic."""
 
     def give(self, keyframe: Keyframe, place: int) -> None:
         """Let a keyframe, the one at a place in the part, have its depths."""
@@ -99,11 +99,11 @@ class Matches:
     position: Int16[np.ndarray, "e p 2"]
     half_weight: Float16[np.ndarray, "e p 2"]
     poses: Float[np.ndarray, "e 2 4 4"]
-    """Of source and target when they were matched."""
+    """Poses of source and target when they were matched."""
     inverse_depth: Float32[np.ndarray, "e p"]
-    """Of the source at that time."""
+    """Inverse depth of the source at that time."""
     damping: Float32[np.ndarray, "d p"]
-    """Of the source's depth; of no edge where the flow gives none."""
+    """Damping of the source's depth; of no edge where the flow gives none."""
     shift: Int16[np.ndarray, "s p 2"]
     """To be added to the positions, for the rows of a rolling shutter; of no edge without one."""
 

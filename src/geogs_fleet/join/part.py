@@ -30,7 +30,7 @@ class Part:
     name: str
     """No other part has it."""
     folder: Path
-    """Of the result, as ``geogs run`` writes it."""
+    """The result, as ``geogs run`` writes it."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class PartViews:
 
     @property
     def median_depth(self) -> Float64[np.ndarray, "n"]:
-        """Of each keyframe."""
+        """Median depth of each keyframe."""
         return 1 / np.median(self.inverse_depth, axis=1).astype(np.float64)
 
     def outline(self) -> "PartViews":

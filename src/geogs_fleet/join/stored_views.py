@@ -60,7 +60,7 @@ def render_views(
     return made
 
 
-def shares(count: int, parts: int) -> list[tuple[int, ...]]:
+def equal_runs(count: int, parts: int) -> list[tuple[int, ...]]:
     """The numbers below ``count`` in so many runs of about equal length, none of them empty."""
     ends = np.linspace(0, count, min(max(parts, 1), max(count, 1)) + 1).round().astype(int)
     return [tuple(range(a, b)) for a, b in pairwise(ends) if b > a]

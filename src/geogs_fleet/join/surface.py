@@ -22,10 +22,10 @@ from geogs.mesh.decimate import decimate
 from geogs.mesh.extract import VolumePlan, plan_volume
 from geogs.mesh.triangle_mesh import Mesh
 from geogs.mesh.tsdf import BYTES_PER_BLOCK, BlockBox
-from geogs_fleet.join.stored_views import StoredView, loaded, shares
+from geogs_fleet.join.stored_views import StoredView, equal_runs, loaded
 from geogs_fleet.workers import Workers
 
-_TURNS = 3
+_BOXES_PER_WORKER = 3
 """Boxes for each worker, at least, so that none waits long for the last."""
 _NO_FACES = np.zeros((0, 3), np.int32)
 
@@ -74,14 +74,14 @@ def plan_space(views: Sequence[StoredView], config: MeshConfig, workers: Workers
     """
     volume = plan_volume(loaded(views), config)
     jobs = [
-        (tuple(views[n] for n in share), volume)
-        for share in shares(len(views), _TURNS * workers.at_once)
+        (tuple(views[n] for n in run), volume)
+        for run in equal_runs(len(views), _BOXES_PER_WORKER * workers.at_once)
     ]
     found = np.concatenate(workers.map("looking for surface", occupied, jobs))
     blocks = np.unique(found, axis=0)
     most = min(
         int(config.memory_limit * 2**30 / BYTES_PER_BLOCK),
-        1 + len(blocks) // (_TURNS * workers.at_once if workers.at_once > 1 else 1),
+        1 + len(blocks) // (_BOXES_PER_WORKER * workers.at_once if workers.at_once > 1 else 1),
     )
     boxes = boxes_of(blocks, most)
     seen = (tuple(v for v in views if _sees(v, volume, box)) for box in boxes)

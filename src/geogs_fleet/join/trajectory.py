@@ -23,7 +23,7 @@ class Span:
     first_time: float
     """Seconds, in the joint time."""
     own_time: float
-    """Of its first frame in its own time."""
+    """Time of its first frame in its own clock."""
 
     @property
     def shift(self) -> float:
@@ -50,13 +50,13 @@ def moved_trajectory(trajectory: Trajectory, views: PartViews, placement: Placem
     after = np.searchsorted(times, at).clip(min(1, len(times) - 1), len(times) - 1)
     before = (after - 1).clip(min=0)
     length = np.maximum(times[after] - times[before], 1e-12)
-    share = torch.from_numpy(((at - times[before]) / length).clip(0, 1))
+    fraction = torch.from_numpy(((at - times[before]) / length).clip(0, 1))
     T_wc = torch.from_numpy(trajectory.T_wc)
     first, second = (_moved(S[torch.from_numpy(n)], T_wc) for n in (before, after))
     moved = first.clone()
-    turn = so3_log(second[:, :3, :3] @ first[:, :3, :3].mT)
-    moved[:, :3, :3] = so3_exp(share[:, None] * turn) @ first[:, :3, :3]
-    moved[:, :3, 3] += share[:, None] * (second[:, :3, 3] - first[:, :3, 3])
+    rotation = so3_log(second[:, :3, :3] @ first[:, :3, :3].mT)
+    moved[:, :3, :3] = so3_exp(fraction[:, None] * rotation) @ first[:, :3, :3]
+    moved[:, :3, 3] += fraction[:, None] * (second[:, :3, 3] - first[:, :3, 3])
     return Trajectory(trajectory.timestamps, moved.numpy(), trajectory.tracked, trajectory.oriented)
 
 
