@@ -8,7 +8,7 @@ import pytest
 
 from geogs.config import InputConfig
 from geogs.errors import InputError
-from geogs.io.sources import frame_source
+from geogs.io.sources import clips
 from geogs.io.sources.frame_source import ReadingPlace, Source
 from geogs.io.sources.sniff import open_source
 from geogs.shutter.shutter import Shutter
@@ -115,20 +115,20 @@ def test_distortion_and_rows_are_undone_at_once(tmp_path):
 
 
 def test_clips_spread_over_the_selection(tmp_path, monkeypatch):
-    monkeypatch.setattr(frame_source, "CLIP", 3)
-    monkeypatch.setattr(frame_source, "CLIPS", 3)
+    monkeypatch.setattr(clips, "CLIP", 3)
+    monkeypatch.setattr(clips, "CLIPS", 3)
     for k in range(14):
         write_image(tmp_path / f"{k:03d}.png", np.full((48, 64, 3), k, np.uint8))
     source = open_source(tmp_path, InputConfig("50,50,31.5,23.5", start=1, stop=13, stride=2))
     given = [[int(raw.image[0, 0, 0]) for raw in clip] for clip in source.clips()]
     assert given == [[1, 2, 3], [5, 6, 7], [10, 11, 12]]
-    assert frame_source.clip_starts(0, 2) == []
-    assert frame_source.clip_starts(4, 5) == [4, 6]
-    assert frame_source.clip_starts(4, 4) == [4]
+    assert clips.clip_starts(0, 2) == []
+    assert clips.clip_starts(4, 5) == [4, 6]
+    assert clips.clip_starts(4, 4) == [4]
 
 
 def test_clips_of_a_video_are_those_of_its_images(tmp_path, monkeypatch):
-    monkeypatch.setattr(frame_source, "CLIP", 3)
+    monkeypatch.setattr(clips, "CLIP", 3)
     images = [np.full((48, 64, 3), 12 * k, np.uint8) for k in range(12)]
     write_video(tmp_path / "video.mp4", images)
     source = open_source(tmp_path / "video.mp4", InputConfig("50,50,31.5,23.5", start=1))

@@ -1,7 +1,7 @@
-"""A folder with a mask for each image, and how a hidden pixel is told in the image itself.
+"""A folder with a mask for each image, and how a masked-out pixel is marked in the image itself.
 
-What is hidden is painted black, and a pixel of the scene that is quite black becomes one level
-brighter: so the mask goes wherever the image does.
+Masked-out pixels are black, and a valid pixel that is quite black becomes one level brighter: so
+the mask goes wherever the image does.
 """
 
 from pathlib import Path
@@ -30,7 +30,7 @@ class FrameMasks:
     def find(self, name: str) -> Path | None:
         """The mask of ``0042.jpg`` or of frame ``42``: ``0042.png``, ``0042.jpg.png``, ``42.png``.
 
-        None where there is none: then nothing is hidden.
+        None where there is none: then all pixels are valid.
         """
         stem = Path(name).stem
         for known in (name, stem):
@@ -39,7 +39,7 @@ class FrameMasks:
         return self._by_number.get(int(stem)) if stem.isdecimal() else None
 
     def read(self, name: str, shape: tuple[int, int]) -> Bool[np.ndarray, "h w"] | None:
-        """The pixels of an image that show the scene; none where all do.
+        """The valid pixels of an image; none where all are.
 
         Raises:
             InputError: the mask is damaged.
@@ -48,10 +48,10 @@ class FrameMasks:
         return None if path is None else read_mask(path, shape)
 
 
-def painted(
-    image: UInt8[np.ndarray, "h w 3"], shown: Bool[np.ndarray, "h w"] | None
+def masked_out(
+    image: UInt8[np.ndarray, "h w 3"], valid: Bool[np.ndarray, "h w"] | None
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """The image with what is hidden black, and nothing else."""
+    """The image with masked-out pixels black, and no others."""
     dark = image.max(-1) == 0
     out = np.where(dark[..., None], np.uint8(1), image)
-    return out if shown is None else np.where(shown[..., None], out, np.uint8(0))
+    return out if valid is None else np.where(valid[..., None], out, np.uint8(0))

@@ -19,8 +19,9 @@ from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.io.pictures import read_mask
 from geogs.io.sources.calibration import Calibration
+from geogs.io.sources.clips import read_clips
 from geogs.io.sources.depth_files import RecordedDepth, RectifiedDepth
-from geogs.io.sources.frame_masks import FrameMasks, painted
+from geogs.io.sources.frame_masks import FrameMasks, masked_out
 from geogs.io.sources.known_intrinsics import resolve_intrinsics
 from geogs.io.sources.pose_priors import chosen_poses
 from geogs.io.sources.reader import (
@@ -30,12 +31,10 @@ from geogs.io.sources.reader import (
     fingerprint_of,
     of_one_size,
     read_ahead,
-    read_side_by_side,
 )
 from geogs.io.sources.undistort import Rectifier
 from geogs.shutter.angular_motion import AngularMotion
 from geogs.shutter.neighbours import with_angular_motion
-from geogs.shutter.readout import CLIP, CLIPS
 from geogs.shutter.rolling_camera import RollingCamera
 from geogs.shutter.rows import RowOffsets
 from geogs.shutter.shutter import Shutter
@@ -44,8 +43,6 @@ from geogs.types import Frame, MeasuredDepth
 _log = logging.getLogger(__name__)
 LEAST_EDGE = 12
 """Pixels of the shorter side of a working image."""
-MINUTE = 60.0
-"""Seconds of a video that are looked at for its readout."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,15 +108,15 @@ class Source:
 
     @property
     def black_is_masked(self) -> bool:
-        """Whether pixels of frames that are quite black show something else than the scene."""
+        """Whether pixels of frames that are quite black are masked out."""
         return self._masks is not None
 
     def _working_mask(self, path: Path) -> Bool[np.ndarray, "h w"]:
         """A mask for all images, straightened as they are."""
         return self._straight(read_mask(path, (self._reader.height, self._reader.width)))
 
-    def _straight(self, shown: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h2 w2"]:
-        grey = np.repeat(np.where(shown, np.uint8(255), np.uint8(0))[..., None], 3, 2)
+    def _straight(self, mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h2 w2"]:
+        grey = np.repeat(np.where(mask, np.uint8(255), np.uint8(0))[..., None], 3, 2)
         return self._rectifier(grey)[..., 0] > 127
 
     @property
@@ -187,29 +184,8 @@ class Source:
         return self._rectifier.rolling_camera(lines, turns)
 
     def clips(self) -> Generator[list[RawFrame], None, None]:
-        """Neighbouring images at working size as they came, from all over the selection.
-
-        They are as many as tell the readout; the stride does not count. A video can only be read
-        from its beginning on, so that they come from its first minute.
-        """
-        config, reader = self._config, self._reader
-        ends = [n for n in (config.stop, reader.length) if n is not None]
-        count = min(ends) - config.start if ends else CLIP * CLIPS
-        if len(reader.paths) > 1:
-            starts = clip_starts(config.start, count)
-            yield from read_side_by_side(lambda n: list(self._resized(n, n + CLIP)), starts)
-            return
-        starts = clip_starts(config.start, min(count, round(MINUTE * reader.fps)))
-        if not starts:
-            return
-        clip: list[RawFrame] = []
-        raws = reader.read(starts[0], starts[-1] + CLIP, 1)
-        for position, raw in enumerate(raws, starts[0]):
-            if any(start <= position < start + CLIP for start in starts):
-                clip.append(self._at_working_size(raw))
-            if position - CLIP + 1 in starts:
-                yield clip[-CLIP:]
-            del clip[:-CLIP]
+        """Neighbouring images at working size as they came, from all over the selection."""
+        return read_clips(self._reader, self._config, self._at_working_size)
 
     def _resized(self, start: int, stop: int | None) -> Iterator[RawFrame]:
         """Neighbours in the source at working size, lens and rows as they came."""
@@ -297,14 +273,14 @@ class Source:
             yield raw
 
     def _masked(self, working: Iterator[RawFrame]) -> Iterator[RawFrame]:
-        """Working images with what masks of their own hide painted black."""
+        """Working images with what masks of their own leave out black."""
         for raw in working:
             if self._masks is None or raw.image is None:
                 yield raw
                 continue
-            shown = self._masks.read(raw.name, (self._reader.height, self._reader.width))
-            straight = None if shown is None else self._straight(shown)
-            yield replace(raw, image=painted(raw.image, straight))
+            valid = self._masks.read(raw.name, (self._reader.height, self._reader.width))
+            straight = None if valid is None else self._straight(valid)
+            yield replace(raw, image=masked_out(raw.image, straight))
 
     def _rectified(
         self,
@@ -347,15 +323,6 @@ class Source:
         if self.skipped:
             return f"{self.name}: none of its {self.skipped} images can be used."
         return f"{self.name} ends before frame {self._config.start}; give a smaller start."
-
-
-def clip_starts(first: int, count: int) -> list[int]:
-    """Where clips begin that spread over ``count`` images from ``first`` on.
-
-    Those of a short video overlap by half.
-    """
-    clips = min(CLIPS, max(0, count - CLIP // 2) // (CLIP - CLIP // 2))
-    return [first + round(k * (count - CLIP) / max(clips - 1, 1)) for k in range(clips)]
 
 
 def shutter_of(readout: float | Literal["auto"]) -> Shutter:

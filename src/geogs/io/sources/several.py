@@ -120,7 +120,7 @@ class SeveralSources:
 
     @property
     def black_is_masked(self) -> bool:
-        """Whether pixels that are quite black show something else than the scene."""
+        """Whether pixels that are quite black are masked out."""
         return self._sources[0].black_is_masked
 
     @property

@@ -6,6 +6,7 @@ in the order w, x, y, z. Cameras, images and points are numbered from 1.
 
 import struct
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +23,28 @@ _UNKNOWN_ERROR = -1.0
 _OBSERVATION = np.dtype([("x", "<f8"), ("y", "<f8"), ("point", "<i8")])
 
 
+@dataclass(frozen=True)
+class _Model:
+    """What the three files hold."""
+
+    camera: Camera
+    names: list[str]
+    """Names of the images."""
+    poses: list[list[float]]
+    """Quaternion w, x, y, z and translation of each image."""
+    points: SeenPoints
+    seen: list[np.ndarray]
+    """Where each image sees which point."""
+    tracks: list[np.ndarray]
+    """Numbers of the images that see each point, and its place in each one's list."""
+
+    @property
+    def parameters(self) -> list[float]:
+        """Focal lengths and principal point, in COLMAP's pixels."""
+        c = self.camera
+        return [c.fx, c.fy, c.cx + 0.5, c.cy + 0.5]
+
+
 def write_colmap_model(
     folder: Path,
     camera: Camera,
@@ -34,23 +57,17 @@ def write_colmap_model(
     Raises:
         OutputError: a file cannot be written.
     """
-    poses = [_pose(image.T_cw) for image in images]
+    names, poses = [image.name for image in images], [_pose(image.T_cw) for image in images]
     seen = [_observations(points, number) for number in range(len(images))]
-    tracks = _tracks(points)
-    if as_text:
-        _write_text(folder, camera, images, poses, points, seen, tracks)
-    else:
-        _write_binary(folder, camera, images, poses, points, seen, tracks)
+    model = _Model(camera, names, poses, points, seen, _tracks(points))
+    write = _write_text if as_text else _write_binary
+    write(folder, model)
 
 
 def _pose(T_cw: Float64[np.ndarray, "4 4"]) -> list[float]:
     """Quaternion w, x, y, z and translation."""
     quaternion = matrix_to_quaternion(torch.from_numpy(T_cw[:3, :3])).numpy()
     return [*map(float, quaternion), *map(float, T_cw[:3, 3])]
-
-
-def _parameters(camera: Camera) -> list[float]:
-    return [camera.fx, camera.fy, camera.cx + 0.5, camera.cy + 0.5]
 
 
 def _observations(points: SeenPoints, image: int) -> np.ndarray:
@@ -74,56 +91,43 @@ def _tracks(points: SeenPoints) -> list[np.ndarray]:
     return np.split(rows, ends[:-1]) if len(ends) else []
 
 
-def _write_text(
-    folder: Path,
-    camera: Camera,
-    images: Sequence[ExportedImage],
-    poses: list[list[float]],
-    points: SeenPoints,
-    seen: list[np.ndarray],
-    tracks: list[np.ndarray],
-) -> None:
-    size = f"{camera.width} {camera.height}"
+def _write_text(folder: Path, model: _Model) -> None:
+    size = f"{model.camera.width} {model.camera.height}"
     lines = ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"]
-    lines.append(f"1 PINHOLE {size} " + _numbers(_parameters(camera)))
+    lines.append(f"1 PINHOLE {size} " + _numbers(model.parameters))
     write_text(folder / "cameras.txt", "\n".join([*lines, ""]))
     lines = ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME; then X, Y, POINT3D_ID"]
-    for number, (image, pose) in enumerate(zip(images, poses, strict=True)):
-        lines.append(f"{number + 1} {_numbers(pose)} 1 {image.name}")
-        lines.append(" ".join(f"{x:.4f} {y:.4f} {point}" for x, y, point in seen[number].tolist()))
+    images = zip(model.names, model.poses, model.seen, strict=True)
+    for number, (name, pose, seen) in enumerate(images, start=1):
+        lines.append(f"{number} {_numbers(pose)} 1 {name}")
+        lines.append(" ".join(f"{x:.4f} {y:.4f} {point}" for x, y, point in seen.tolist()))
     write_text(folder / "images.txt", "\n".join([*lines, ""]))
     lines = ["# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)"]
-    for number, track in enumerate(tracks):
-        colour = " ".join(map(str, points.colours[number].tolist()))
-        place = _numbers(points.positions[number].tolist())
+    for number, track in enumerate(model.tracks):
+        colour = " ".join(map(str, model.points.colours[number].tolist()))
+        position = _numbers(model.points.positions[number].tolist())
         views = " ".join(map(str, track.ravel().tolist()))
-        lines.append(f"{number + 1} {place} {colour} {_UNKNOWN_ERROR:g} {views}")
+        lines.append(f"{number + 1} {position} {colour} {_UNKNOWN_ERROR:g} {views}")
     write_text(folder / "points3D.txt", "\n".join([*lines, ""]))
 
 
-def _write_binary(
-    folder: Path,
-    camera: Camera,
-    images: Sequence[ExportedImage],
-    poses: list[list[float]],
-    points: SeenPoints,
-    seen: list[np.ndarray],
-    tracks: list[np.ndarray],
-) -> None:
+def _write_binary(folder: Path, model: _Model) -> None:
+    camera, points = model.camera, model.points
     with atomic_file(folder / "cameras.bin") as stream:
         stream.write(struct.pack("<QIiQQ", 1, 1, _PINHOLE, camera.width, camera.height))
-        stream.write(struct.pack("<4d", *_parameters(camera)))
+        stream.write(struct.pack("<4d", *model.parameters))
     with atomic_file(folder / "images.bin") as stream:
-        stream.write(struct.pack("<Q", len(images)))
-        for number, (image, pose) in enumerate(zip(images, poses, strict=True)):
-            stream.write(struct.pack("<I7dI", number + 1, *pose, 1))
-            stream.write(image.name.encode() + b"\0" + struct.pack("<Q", len(seen[number])))
-            stream.write(seen[number].tobytes())
+        stream.write(struct.pack("<Q", len(model.names)))
+        images = zip(model.names, model.poses, model.seen, strict=True)
+        for number, (name, pose, seen) in enumerate(images, start=1):
+            stream.write(struct.pack("<I7dI", number, *pose, 1))
+            stream.write(name.encode() + b"\0" + struct.pack("<Q", len(seen)))
+            stream.write(seen.tobytes())
     with atomic_file(folder / "points3D.bin") as stream:
-        stream.write(struct.pack("<Q", len(tracks)))
-        for number, track in enumerate(tracks):
-            place, colour = points.positions[number].tolist(), points.colours[number].tolist()
-            stream.write(struct.pack("<Q3d3Bd", number + 1, *place, *colour, _UNKNOWN_ERROR))
+        stream.write(struct.pack("<Q", len(model.tracks)))
+        for number, track in enumerate(model.tracks):
+            position, colour = points.positions[number].tolist(), points.colours[number].tolist()
+            stream.write(struct.pack("<Q3d3Bd", number + 1, *position, *colour, _UNKNOWN_ERROR))
             stream.write(struct.pack("<Q", len(track)) + track.astype("<u4").tobytes())
 
 
