@@ -9,7 +9,7 @@ does not say in one sentence what is wrong with a damaged file.
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float64, Int64, Shaped
@@ -67,7 +67,7 @@ class _Property:
         """Name of the field with the length of a list; no property is called so."""
         return f"length of {self.name}"
 
-    def fields(self, length: int) -> list[tuple]:
+    def fields(self, length: int) -> list[tuple[Any, ...]]:
         """Its part of a row, with a list of ``length``, as fields of a NumPy record."""
         if self.stored_length is None:
             return [(self.name, self.stored)]

@@ -25,8 +25,8 @@ from geogs.tracking.flow.own_network import (
     FlowEstimate,
     FlowFeatures,
     FlowNetwork,
-    NetworkOptions,
 )
+from geogs.tracking.flow.own_options import NetworkOptions
 from geogs.types import FlowMatch
 from geogs.world.grid import SampleGrid
 
