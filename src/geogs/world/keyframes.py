@@ -248,12 +248,6 @@ class KeyframeTable:
         twin.grid, twin.encode, twin.set_of = self.grid, self.encode, {}
         return twin
 
-    def take_over(self, other: "KeyframeTable") -> None:
-        """Go on with what another table, just read, holds."""
-        self.next_id, self.keyframes = other.next_id, other.keyframes
-        self.poses, self.arrays = other.poses, other.arrays
-        self.attached(self.grid, self.encode, self.resident)
-
     def __getitem__(self, id: int) -> Keyframe:
         return self.keyframes[id]
 
