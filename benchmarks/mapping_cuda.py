@@ -28,10 +28,10 @@ from geogs.geometry.depth import normals_from_depth
 from geogs.geometry.lie import se3_inverse
 from geogs.losses import multi_view_loss, single_view_loss
 from geogs.losses.single_view import MIN_ALPHA
-from geogs.mapping.training.base import Batch
+from geogs.mapping.keyframe_views import KeyframeViews, MapView
 from geogs.mapping.training.cuda.trainer import CudaTrainer
+from geogs.mapping.training.map_trainer import Batch
 from geogs.mapping.view_arrays import MapCameras, ViewArrays
-from geogs.mapping.views import MapView, MapViews
 from geogs.splat.cuda import autograd
 from geogs.splat.init import NEIGHBOURS, initialise_disks
 from geogs.splat.render import render_views
@@ -100,12 +100,12 @@ class Window:
         return Window(cameras, batch, DiskParameters(*(p.to(device) for p in made)), unit)
 
 
-def _views(segment: KeyframeSet, cameras: MapCameras, device: torch.device) -> MapViews:
-    return MapViews(ViewArrays(MapTable.empty(device), segment.table, cameras, LossConfig()))
+def _views(segment: KeyframeSet, cameras: MapCameras, device: torch.device) -> KeyframeViews:
+    return KeyframeViews(ViewArrays(MapTable.empty(device), segment.table, cameras, LossConfig()))
 
 
 def _view(
-    segment: KeyframeSet, pool: MapViews, image: np.ndarray, T_wc: np.ndarray, depth: Tensor
+    segment: KeyframeSet, pool: KeyframeViews, image: np.ndarray, T_wc: np.ndarray, depth: Tensor
 ) -> MapView:
     n, T_cw = len(segment), se3_inverse(torch.from_numpy(T_wc))
     view = pool.add(segment.add(n, n / 30, image, None, T_cw).id)

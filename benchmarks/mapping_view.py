@@ -17,9 +17,9 @@ import torch
 from geogs.config import MappingConfig
 from geogs.depth.view import DenseDepth, KeyframeDepth
 from geogs.geometry.lie import se3_inverse
-from geogs.mapping.training.cpu import Trainer, view_loss
+from geogs.mapping.keyframe_views import KeyframeViews, MapView
+from geogs.mapping.training.cpu import CpuTrainer, view_loss
 from geogs.mapping.view_arrays import MapCameras, ViewArrays
-from geogs.mapping.views import MapView, MapViews
 from geogs.splat.init import initialise_disks
 from geogs.splat.render import render
 from geogs.threads import worker_count
@@ -43,7 +43,7 @@ def make_views(config: MappingConfig, width: int) -> tuple[list[MapView], MapCam
     segment = KeyframeTable.on(SampleGrid(photo)).new_set()
     views, pool = (
         [],
-        MapViews(ViewArrays(MapTable.empty("cpu"), segment.table, cameras, config.loss)),
+        KeyframeViews(ViewArrays(MapTable.empty("cpu"), segment.table, cameras, config.loss)),
     )
     for index in (0, 12, 24, 36, 48):
         image = caster.render(photo, poses[index]).image
@@ -90,7 +90,7 @@ def main() -> None:
     config = replace(config, loss=replace(config.loss, smoothness_weight=0.01))
     views, cameras = make_views(config, options.width)
     disks = make_map(views, cameras, options.disks)
-    trainer = Trainer(disks, cameras, config, unit=2.5)
+    trainer = CpuTrainer(disks, cameras, config, unit=2.5)
     view, partners = views[2], [views[1], views[3]]
     stages: dict[str, list[float]] = {}
     for _ in range(options.repeat + 3):

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from geogs.config import LossConfig
 from geogs.geometry.camera import Camera
+from geogs.mapping.keyframe_views import KeyframeViews
 from geogs.mapping.view_arrays import MapCameras, ViewArrays
-from geogs.mapping.views import MapViews
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import Keyframe, KeyframeSet, KeyframeTable
 from geogs.world.map import MapTable
@@ -41,10 +41,10 @@ def segment_of(
     return segment
 
 
-def views_of(keyframes: KeyframeTable, cameras: MapCameras, loss: LossConfig) -> MapViews:
+def views_of(keyframes: KeyframeTable, cameras: MapCameras, loss: LossConfig) -> KeyframeViews:
     """Views of a map without disks, which know none of the keyframes yet."""
     table = MapTable.empty(keyframes.grid.device)
-    return MapViews(ViewArrays(table, keyframes, cameras, loss))
+    return KeyframeViews(ViewArrays(table, keyframes, cameras, loss))
 
 
 def add(segment: KeyframeSet, sample: Sample) -> Keyframe:

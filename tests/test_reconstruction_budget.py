@@ -9,7 +9,7 @@ import pytest
 from depth_scene import WORKING, make_scene
 from geogs.mapping.mapper import Mapper
 from geogs.mapping.time_budget import OutputCost
-from geogs.mapping.training.cpu import Trainer
+from geogs.mapping.training.cpu import CpuTrainer
 from geogs.reconstruction import Reconstruction
 from geogs.types import Trajectory
 from posed_scene import SMALL
@@ -40,13 +40,13 @@ def clock(monkeypatch) -> FakeClock:
         clock.now += SEARCH * len(ids)
         search_depths(mapper, ids)
 
-    def step(trainer: Trainer, batch: object) -> float:
+    def step(trainer: CpuTrainer, batch: object) -> float:
         clock.now += STEP
         return 0.0
 
     monkeypatch.setattr(time, "perf_counter", clock)
     monkeypatch.setattr(Mapper, "search_depths", searching)
-    monkeypatch.setattr(Trainer, "step", step)
+    monkeypatch.setattr(CpuTrainer, "step", step)
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
     return clock
 

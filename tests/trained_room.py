@@ -6,9 +6,9 @@ import torch
 from geogs.config import Config
 from geogs.depth.view import DenseDepth
 from geogs.geometry.lie import se3_inverse
-from geogs.mapping.training.base import Batch
+from geogs.mapping.keyframe_views import MapView
+from geogs.mapping.training.map_trainer import Batch
 from geogs.mapping.view_arrays import MapCameras
-from geogs.mapping.views import MapView
 from geogs.world.disks import DiskParameters, GaussianMap
 from geogs_synth.motion.handheld import handheld_trajectory
 from geogs_synth.sequence.location import centred_camera

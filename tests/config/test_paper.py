@@ -8,7 +8,7 @@ import pytest
 from geogs.config import preset, reconstruct_preset
 from geogs.config.leaves import default_text, leaves
 from geogs.config.setting import Settings
-from geogs.mapping.training.base import HISTORY
+from geogs.mapping.training.map_trainer import HISTORY
 
 PAGE = (Path(__file__).parents[2] / "docs" / "paper.md").read_text()
 

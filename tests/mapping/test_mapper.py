@@ -10,7 +10,7 @@ from geogs.config import Config, MappingConfig
 from geogs.geometry.lie import retract, se3_exp, se3_inverse
 from geogs.mapping.map_update import MapUpdate
 from geogs.mapping.mapper import Mapper
-from geogs.mapping.training.base import draw_views
+from geogs.mapping.training.map_trainer import draw_views
 from geogs.types import PoseCorrection
 from geogs_synth.motion.handheld import handheld_trajectory
 from geogs_synth.sequence.location import centred_camera

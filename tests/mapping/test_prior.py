@@ -11,8 +11,8 @@ from geogs.depth.view import DenseDepth, KeyframeDepth
 from geogs.geometry.camera import Camera
 from geogs.losses.cpu import fused_single_view
 from geogs.losses.single_view import single_view_loss
+from geogs.mapping.keyframe_views import MapView
 from geogs.mapping.view_arrays import MapCameras
-from geogs.mapping.views import MapView
 from geogs.priors.base import PriorMaps
 from geogs.tracking.flow.classical_flow import ClassicalFlow
 from geogs.tracking.graph import FrameGraph

@@ -6,8 +6,8 @@ import torch
 from geogs.config import Config
 from geogs.depth.view import DenseDepth
 from geogs.geometry.camera import Camera
+from geogs.mapping.keyframe_views import KeyframeViews
 from geogs.mapping.view_arrays import MapCameras
-from geogs.mapping.views import MapViews
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import KeyframeSet, KeyframeTable
 from keyframe_samples import views_of
@@ -15,7 +15,7 @@ from keyframe_samples import views_of
 CAMERA = Camera(fx=60.0, fy=60.0, cx=31.5, cy=23.5, width=64, height=48)
 
 
-def pool_of(count: int, resident: int) -> tuple[MapViews, KeyframeSet]:
+def pool_of(count: int, resident: int) -> tuple[KeyframeViews, KeyframeSet]:
     """A pool of views of noise at the depth of their number."""
     random, config = np.random.default_rng(0), Config().mapping
     segment = KeyframeTable.on(SampleGrid(CAMERA), None, resident).new_set()

@@ -9,11 +9,11 @@ from geogs.config import DiskConfig, MappingConfig
 from geogs.depth.view import DenseDepth
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp
+from geogs.mapping.keyframe_views import KeyframeViews, MapView
 from geogs.mapping.training import cpu as training
-from geogs.mapping.training.cpu import Trainer
+from geogs.mapping.training.cpu import CpuTrainer
 from geogs.mapping.training.cuda.known_views import KnownViews
 from geogs.mapping.view_arrays import MapCameras
-from geogs.mapping.views import MapView, MapViews
 from geogs.splat import init
 from geogs.splat.cpu.in_view import disks_in_view
 from geogs.splat.render import render
@@ -72,7 +72,7 @@ def test_training_an_excerpt_is_training_the_map(monkeypatch):
     for share in (0.7, 0.0):  # 0: always the whole map
         monkeypatch.setattr(training, "_LARGE_EXCERPT", share)
         disks = GaussianMap.empty()
-        trainer = Trainer(disks, CAMERAS, config, 2.0)
+        trainer = CpuTrainer(disks, CAMERAS, config, 2.0)
         disks.append(some_disks(2000), 5)
         a, b = views()
         trainer.train([[(a, [b])], [(b, [a])], [(a, []), (b, [a])]], [1.0, 0.5, 0.7])
@@ -125,7 +125,7 @@ def test_few_slots_serve_many_keyframes():
     keyframes.arrays.put("image", 7, a.keyframe.image)
     keyframes.poses[7] = pose
     keyframes.set_of[0].put(replace(a.keyframe, id=7))
-    c = MapViews(a.arrays).add(7)
+    c = KeyframeViews(a.arrays).add(7)
     c.set_depth(a.dense)
     first = known.slots([a, b])
     known.table.rendered.fill_(1)

@@ -12,8 +12,8 @@ from geogs.depth.sensor import joined
 from geogs.depth.sweep_neighbors import select_sweep_neighbours
 from geogs.depth.view import DenseDepth, DepthView
 from geogs.mapping.dense_depths import get_depth, put_depth
+from geogs.mapping.keyframe_views import KeyframeViews, MapView
 from geogs.mapping.partners import CANDIDATES
-from geogs.mapping.views import MapView, MapViews
 from geogs.on_demand import OnDemand
 from geogs.priors.depth_sensor import sensor_depth
 from geogs.world.arrays import ArrayTable
@@ -31,7 +31,7 @@ class KeyframeDepths:
     def __init__(
         self,
         engine: DepthEngine,
-        views: MapViews,
+        views: KeyframeViews,
         sensor: DepthSensorConfig | None = None,
     ) -> None:
         self.engine = engine

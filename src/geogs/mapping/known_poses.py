@@ -8,7 +8,7 @@ from jaxtyping import Float64
 
 from geogs.depth.view import Place
 from geogs.geometry.camera import Camera
-from geogs.mapping.views import MapView
+from geogs.mapping.keyframe_views import MapView
 from geogs.world.map import DepthSearch
 
 FEWEST_POINTS = 100

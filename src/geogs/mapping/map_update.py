@@ -21,8 +21,8 @@ from torch import Tensor
 from geogs.errors import GeogsError
 from geogs.geometry.lie import se3_inverse
 from geogs.geometry.umeyama import umeyama
+from geogs.mapping.keyframe_views import MapView
 from geogs.mapping.similarity_field import CovisibleKeyframe, blended_similarities
-from geogs.mapping.views import MapView
 from geogs.types import PoseCorrection
 
 Strategy = Literal["blended", "coherent", "per_keyframe"]

@@ -10,8 +10,9 @@ from jaxtyping import Bool
 from geogs.config import DepthSensorConfig, MappingConfig
 from geogs.depth.base import Progress, silent
 from geogs.depth.select import depth_engine
-from geogs.mapping.growth import Growth
+from geogs.mapping.disk_growth import DiskGrowth
 from geogs.mapping.keyframe_depths import KeyframeDepths
+from geogs.mapping.keyframe_views import KeyframeViews, MapView
 from geogs.mapping.map_frame import WORLD, MapFrame
 from geogs.mapping.map_update import MapUpdate, covisible_keyframe, plan_update
 from geogs.mapping.partners import Partners
@@ -24,11 +25,10 @@ from geogs.mapping.rendered import (
     shown_depth,
 )
 from geogs.mapping.stored_renders import StoredRender, stored_render
-from geogs.mapping.training.base import MapTrainer, draw_batch, draw_views
 from geogs.mapping.training.full import FullTraining
-from geogs.mapping.training.select import map_trainer
+from geogs.mapping.training.map_trainer import MapTrainer, draw_batch, draw_views
+from geogs.mapping.training.trainer_choice import map_trainer
 from geogs.mapping.view_arrays import MapCameras, ViewArrays
-from geogs.mapping.views import MapView, MapViews
 from geogs.on_demand import OnDemand
 from geogs.types import MapSnapshot, PoseCorrection, RenderedKeyframe
 from geogs.world.archive import Archive
@@ -77,13 +77,13 @@ class Mapper:
             table = MapTable.empty(keyframes.grid.device, seed)
         check_map(table, keyframes, (render.height, render.width))
         self.table = table
-        self.views = MapViews(ViewArrays(table, keyframes, self.cameras, config.loss))
+        self.views = KeyframeViews(ViewArrays(table, keyframes, self.cameras, config.loss))
         engine = depth_engine(
             table.disks.device, render, self.cameras.working, config.depth, keyframes.resident
         )
         self.depths = KeyframeDepths(engine, self.views, sensor)
         self.partners = Partners(self.views, table, config.photo)
-        self.growth = Growth(table, self.depths, config)
+        self.growth = DiskGrowth(table, self.depths, config)
         self._trainer: MapTrainer | None = None
         self.pause: Callable[[], None] = never_pause
         """Called between the parts of the work on a keyframe, where others may go first."""

@@ -13,7 +13,7 @@ from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_inverse
 from geogs.gpu.transfer import to_device
 from geogs.losses.light import relative_light, same_light
-from geogs.mapping.views import MapView, MapViews
+from geogs.mapping.keyframe_views import KeyframeViews, MapView
 from geogs.world.map import MapTable
 
 BEST_PARALLAX_DEG = 8.0
@@ -33,7 +33,7 @@ _DARK, _BRIGHT = 0.02, 0.98
 class Partners:
     """Chooses the photometric partners of mapped views and compensates the exposure of these."""
 
-    def __init__(self, views: MapViews, table: MapTable, config: PhotoConfig) -> None:
+    def __init__(self, views: KeyframeViews, table: MapTable, config: PhotoConfig) -> None:
         self._views, self._table, self._config = views, table, config
 
     def choose(self, view: MapView) -> None:

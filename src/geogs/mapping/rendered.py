@@ -12,8 +12,8 @@ from geogs.depth.view import DenseDepth
 from geogs.geometry.camera import Camera
 from geogs.geometry.depth import averaged_over_planes, normals_from_depth
 from geogs.losses.single_view import MIN_ALPHA
+from geogs.mapping.keyframe_views import MapView
 from geogs.mapping.map_frame import MapFrame
-from geogs.mapping.views import MapView
 from geogs.splat.render import render
 from geogs.types import MapSnapshot, RenderedKeyframe
 from geogs.world.disks import DiskParameters

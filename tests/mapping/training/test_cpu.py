@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from geogs import threads
-from geogs.mapping.training.cpu import Trainer, view_loss
+from geogs.mapping.training.cpu import CpuTrainer, view_loss
 from geogs.splat.render import render
 from trained_room import (
     CAMERAS,
@@ -26,8 +26,8 @@ def rendered():
     return rendered_keyframes()
 
 
-def trainer(rendered) -> Trainer:
-    return Trainer(make_map(rendered, CPU), CAMERAS, CONFIG, UNIT)
+def trainer(rendered) -> CpuTrainer:
+    return CpuTrainer(make_map(rendered, CPU), CAMERAS, CONFIG, UNIT)
 
 
 def test_gradients_are_those_of_the_summed_losses(rendered, monkeypatch):

@@ -10,7 +10,7 @@ import torch
 from cuda_emulator import use_emulator
 from geogs.geometry.lie import retract, se3_exp
 from geogs.losses.cuda import window
-from geogs.mapping.training.cpu import Trainer
+from geogs.mapping.training.cpu import CpuTrainer
 from geogs.mapping.training.cuda import trainer as cuda_trainer
 from geogs.mapping.training.cuda.trainer import CudaTrainer
 from geogs.splat.cuda import rasterize
@@ -46,13 +46,15 @@ def rendered() -> list[tuple[Sample, np.ndarray]]:
 
 
 @pytest.fixture
-def pair(rendered, device: torch.device) -> Callable[[], tuple[CudaTrainer, Trainer, list, list]]:
+def pair(
+    rendered, device: torch.device
+) -> Callable[[], tuple[CudaTrainer, CpuTrainer, list, list]]:
     """A CUDA and a CPU trainer of equal maps, each with its views."""
 
     def make(config=CONFIG):
         cpu = torch.device("cpu")
         fast = CudaTrainer(make_map(rendered, device), CAMERAS, config, UNIT, 128)
-        slow = Trainer(make_map(rendered, cpu), CAMERAS, config, UNIT)
+        slow = CpuTrainer(make_map(rendered, cpu), CAMERAS, config, UNIT)
         return fast, slow, make_views(rendered, device, config), make_views(rendered, cpu, config)
 
     return make

@@ -11,10 +11,10 @@ from torch import Tensor
 from geogs.config import MappingConfig
 from geogs.losses.cpu import fused_multi_view, fused_single_view
 from geogs.losses.single_view import MIN_ALPHA
-from geogs.mapping.training.base import GRADIENT_LIMIT, LR_SCALE, Batch, learning_rates
+from geogs.mapping.keyframe_views import MapView
+from geogs.mapping.training.map_trainer import GRADIENT_LIMIT, LR_SCALE, Batch, learning_rates
 from geogs.mapping.training.pose_refine import refine_poses
 from geogs.mapping.view_arrays import MapCameras
-from geogs.mapping.views import MapView
 from geogs.splat.cpu.in_view import disks_in_view
 from geogs.splat.optimizer import MapOptimizer
 from geogs.splat.render import RenderOutput, render
@@ -63,7 +63,7 @@ class _Pass:
     visible: Bool[Tensor, "n"]
 
 
-class Trainer:
+class CpuTrainer:
     """Adam on a map, view by view, on a CPU."""
 
     def __init__(self, disks: GaussianMap, cameras: MapCameras, config: MappingConfig, unit: float):

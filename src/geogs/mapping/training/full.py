@@ -7,9 +7,9 @@ import numpy as np
 
 from geogs.config import MappingConfig
 from geogs.depth.base import Progress
-from geogs.mapping.growth import Growth
-from geogs.mapping.training.base import MapTrainer, draw_batch
-from geogs.mapping.views import MapView, MapViews
+from geogs.mapping.disk_growth import DiskGrowth
+from geogs.mapping.keyframe_views import KeyframeViews, MapView
+from geogs.mapping.training.map_trainer import MapTrainer, draw_batch
 from geogs.world.map import MapTable, TrainingPlace
 
 SPLIT_TIMES = 0.2, 0.35, 0.5
@@ -29,9 +29,9 @@ class FullTraining:
     def __init__(
         self,
         table: MapTable,
-        views: MapViews,
+        views: KeyframeViews,
         trainer: MapTrainer,
-        growth: Growth,
+        growth: DiskGrowth,
         config: MappingConfig,
         refine_poses: Callable[[Sequence[int]], None],
     ) -> None:
@@ -111,7 +111,7 @@ class FullTraining:
 
 
 def seconds_per_step(
-    table: MapTable, views: MapViews, trainer: MapTrainer, config: MappingConfig
+    table: MapTable, views: KeyframeViews, trainer: MapTrainer, config: MappingConfig
 ) -> float:
     """What a training step takes, from some of them at full rate: from more where these are
     quick."""

@@ -10,8 +10,8 @@ from geogs.config import MappingConfig
 from geogs.geometry.lie import retract
 from geogs.losses.cpu import fused_multi_view, fused_single_view
 from geogs.losses.single_view import MIN_ALPHA
+from geogs.mapping.keyframe_views import MapView
 from geogs.mapping.view_arrays import MapCameras
-from geogs.mapping.views import MapView
 from geogs.splat.render import render
 from geogs.world.disks import DiskParameters, GaussianMap
 

@@ -8,8 +8,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from geogs.losses.cuda.view_table import ViewTable
+from geogs.mapping.keyframe_views import MapView
 from geogs.mapping.view_arrays import MapCameras
-from geogs.mapping.views import MapView
 from geogs.world.lru import LruCache
 
 

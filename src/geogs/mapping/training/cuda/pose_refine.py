@@ -9,10 +9,10 @@ from torch import Tensor
 from geogs.config import MappingConfig
 from geogs.geometry.lie import se3_inverse
 from geogs.gpu.transfer import to_device
+from geogs.mapping.keyframe_views import MapView
 from geogs.mapping.training.cuda.known_views import KnownViews
 from geogs.mapping.training.cuda.window_pass import WindowPass
 from geogs.mapping.training.pose_refine import descend
-from geogs.mapping.views import MapView
 from geogs.world.disks import GaussianMap
 
 

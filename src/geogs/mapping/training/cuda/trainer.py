@@ -11,12 +11,12 @@ from torch import Tensor
 from geogs.config import MappingConfig
 from geogs.gpu.kernels import kernels_for
 from geogs.gpu.transfer import to_device
-from geogs.mapping.training.base import GRADIENT_LIMIT, Batch, learning_rates
+from geogs.mapping.keyframe_views import MapView
 from geogs.mapping.training.cuda.known_views import KnownViews
 from geogs.mapping.training.cuda.pose_refine import refine_poses
 from geogs.mapping.training.cuda.window_pass import WindowPass
+from geogs.mapping.training.map_trainer import GRADIENT_LIMIT, Batch, learning_rates
 from geogs.mapping.view_arrays import MapCameras
-from geogs.mapping.views import MapView
 from geogs.splat.cuda import rasterize
 from geogs.splat.optimizer import MapOptimizer
 from geogs.world.disks import GaussianMap
@@ -25,7 +25,7 @@ _ADAM = Path(rasterize.__file__).with_name("adam.cu")
 
 
 class CudaTrainer:
-    """As :class:`geogs.mapping.training.cpu.Trainer`; the map never leaves the GPU.
+    """As :class:`geogs.mapping.training.cpu.CpuTrainer`; the map never leaves the GPU.
 
     The views of every step and the factors of the learning rates are uploaded once per call; the
     steps themselves, from the rendering to Adam, are one CUDA graph that reads its row of that

@@ -130,7 +130,7 @@ class MapView:
         self.arrays.set_exposure(self.id, exposure)
 
 
-class MapViews(Mapping[int, MapView]):
+class KeyframeViews(Mapping[int, MapView]):
     """The views of a map by keyframe, in the order in which they came."""
 
     def __init__(self, arrays: ViewArrays) -> None:

@@ -1,7 +1,7 @@
 """Where the map is trained: on the CPU, or on the GPU that holds it."""
 
 from geogs.config import MappingConfig
-from geogs.mapping.training.base import MapTrainer
+from geogs.mapping.training.map_trainer import MapTrainer
 from geogs.mapping.view_arrays import MapCameras
 from geogs.world.disks import GaussianMap
 
@@ -17,6 +17,6 @@ def map_trainer(
         from geogs.mapping.training.cuda.trainer import CudaTrainer
 
         return CudaTrainer(disks, cameras, config, unit, resident)
-    from geogs.mapping.training.cpu import Trainer
+    from geogs.mapping.training.cpu import CpuTrainer
 
-    return Trainer(disks, cameras, config, unit)
+    return CpuTrainer(disks, cameras, config, unit)

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from geogs.config import MappingConfig
-from geogs.mapping.views import MapView
+from geogs.mapping.keyframe_views import MapView
 from geogs.splat.optimizer import LearningRates, MapOptimizer
 
 Batch = list[tuple[MapView, list[MapView]]]

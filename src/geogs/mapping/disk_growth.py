@@ -6,7 +6,7 @@ import torch
 
 from geogs.config import MappingConfig
 from geogs.mapping.keyframe_depths import KeyframeDepths
-from geogs.mapping.views import MapView
+from geogs.mapping.keyframe_views import MapView
 from geogs.splat.density import (
     candidate_pixels,
     split,
@@ -26,7 +26,7 @@ ones show nothing more."""
 _VOTERS = 96
 
 
-class Growth:
+class DiskGrowth:
     """Adds disks to a map and drops them, as the depths of its keyframes say."""
 
     def __init__(self, table: MapTable, depths: KeyframeDepths, config: MappingConfig) -> None:
