@@ -16,7 +16,7 @@ import torch
 from geogs_train.course import Worker
 from geogs_train.depth.depth_course import DepthCourse
 from geogs_train.depth.depth_options import DepthTraining, PoolOptions
-from geogs_train.network_trainer import Trainer
+from geogs_train.network_trainer import NetworkTrainer
 
 
 def main() -> None:
@@ -45,7 +45,7 @@ def main() -> None:
             ),
         )
         course = DepthCourse(training, Worker(device))
-        trainer = Trainer(course, Worker(device), options.fuse)
+        trainer = NetworkTrainer(course, Worker(device), options.fuse)
         if neighbours == options.neighbours[0]:
             measure_rooms(course, training, device)
         for small in (True, False):
@@ -65,7 +65,7 @@ def measure_rooms(course: DepthCourse, training: DepthTraining, device: torch.de
 
 
 def measure_steps(
-    trainer: Trainer,
+    trainer: NetworkTrainer,
     course: DepthCourse,
     small: bool,
     neighbours: int,

@@ -26,12 +26,12 @@ from geogs.networks.weights_files import PACKAGED
 from geogs.tracking.flow.classical_flow import ClassicalFlow
 from geogs.tracking.flow.own import OwnFlowOptions, load_network
 from geogs.world.grid import SampleGrid
+from geogs_synth.clips.room_options import only_scene
 from geogs_synth.clips.sampler import RoomSampler
-from geogs_synth.clips.scene_kinds import only_scene
-from geogs_train.flow_options import FlowTraining
-from geogs_train.flow_pairs import FlowBatch, flow_batch
-from geogs_train.objective import run_network
-from geogs_train.starts import StartOptions
+from geogs_train.flow.flow_options import FlowTraining
+from geogs_train.flow.flow_pairs import FlowBatch, flow_batch
+from geogs_train.flow.objective import run_network
+from geogs_train.flow.starts import StartOptions
 
 EDGES = 6
 """Of a keyframe's cell in the tracker's window, about."""

@@ -63,17 +63,17 @@ def about_z(angle: Float[Tensor, "..."]) -> Float[Tensor, "... 3 3"]:
     return torch.stack([c, -s, o, s, c, o, o, o, i], -1).unflatten(-1, (3, 3))
 
 
-def turned(
+def rotated(
     vector: Float[Tensor, "*#n 3"], rotation: Float[Tensor, "*#n 3"]
 ) -> Float[Tensor, "*n 3"]:
-    """Vectors turned by rotation vectors, without a matrix for each of them."""
+    """Vectors rotated by rotation vectors, without a matrix for each of them."""
     angle = rotation.norm(dim=-1, keepdim=True)
     axis, vector = torch.broadcast_tensors(rotation / angle.clamp_min(1e-9), vector)
     once = torch.linalg.cross(axis, vector)
     return vector + angle.sin() * once + (1 - angle.cos()) * torch.linalg.cross(axis, once)
 
 
-def from_vector(vector: Float[Tensor, "... 3"]) -> Float[Tensor, "... 3 3"]:
+def rotation_matrix(vector: Float[Tensor, "... 3"]) -> Float[Tensor, "... 3 3"]:
     """Rotations by rotation vectors (axis times angle in radians)."""
     angle = vector.norm(dim=-1, keepdim=True)[..., None]
     x, y, z = (vector / angle[..., 0].clamp_min(1e-9)).unbind(-1)

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 from geogs.cli.options import parse_options
 from geogs.config.setting import Positional, Settings
 from geogs_train.depth.depth_options import DepthTraining
-from geogs_train.flow_options import FlowTraining, RunOptions
+from geogs_train.flow.flow_options import FlowTraining, TrainingRunOptions
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class TrainOptions(Settings):
     """Folder to write."""
     device: str = "auto"
     """auto (a GPU where there is one), cpu, cuda or cuda:1."""
-    run: RunOptions = field(default_factory=RunOptions)
+    run: TrainingRunOptions = field(default_factory=TrainingRunOptions)
     training: FlowTraining = field(default_factory=FlowTraining)
 
 
@@ -46,7 +46,7 @@ class TrainDepthOptions(Settings):
     """Folder to write."""
     device: str = "auto"
     """auto (a GPU where there is one), cpu, cuda or cuda:1."""
-    run: RunOptions = field(default_factory=RunOptions)
+    run: TrainingRunOptions = field(default_factory=TrainingRunOptions)
     training: DepthTraining = field(default_factory=DepthTraining)
 
 

@@ -22,7 +22,7 @@ class Worker:
 
 
 @runtime_checkable
-class Schedule(Protocol):
+class TrainingSchedule(Protocol):
     """The settings that every training has; those of a course have more."""
 
     @property
@@ -62,7 +62,7 @@ class Schedule(Protocol):
 
 
 @runtime_checkable
-class Scores(Protocol):
+class ValidationScores(Protocol):
     """What a validation says: a dataclass of numbers."""
 
     def line(self) -> str:
@@ -90,7 +90,7 @@ class Course(Protocol):
 
     @property
     def options(self) -> Any:
-        """A dataclass with the settings of a :class:`Schedule` and more."""
+        """A dataclass with the settings of a :class:`TrainingSchedule` and more."""
         ...
 
     @property

@@ -12,8 +12,8 @@ from geogs.gpu.installation import require_device
 from geogs_train.course import Course, Worker
 from geogs_train.depth.depth_course import DepthCourse
 from geogs_train.depth.depth_options import DepthTraining
-from geogs_train.flow_course import FlowCourse
-from geogs_train.flow_options import FlowTraining, RunOptions
+from geogs_train.flow.flow_course import FlowCourse
+from geogs_train.flow.flow_options import FlowTraining, TrainingRunOptions
 from geogs_train.pace import shared
 from geogs_train.training_checkpoint import read_options
 from geogs_train.training_curves import draw_curves
@@ -22,7 +22,7 @@ from geogs_train.training_run import train
 
 def launch(
     training: FlowTraining | DepthTraining,
-    run: RunOptions,
+    run: TrainingRunOptions,
     out: Path,
     device: str,
     progress: Callable[[str], None],

@@ -7,11 +7,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, distributed, nn
 
-from geogs_train.course import Course, Schedule, Worker
+from geogs_train.course import Course, TrainingSchedule, Worker
 from geogs_train.step_graph import StepGraph
 
 
-class Trainer:
+class NetworkTrainer:
     """A network, its optimiser and the course that it takes.
 
     Step n of a run depends on nothing but the seed, n, and the state after step n - 1, so that a
@@ -40,7 +40,7 @@ class Trainer:
         self.step = 0
         self.progress, self._paced = 0.0, paced
         """``progress`` is the fraction of the run that is done; what is learnt depends on it."""
-        self._graph: StepGraph | None = None
+        self._graph: StepGraph[Any] | None = None
         if fuse:
             course.compile(self.network)
 
@@ -89,7 +89,7 @@ class Trainer:
         return loss.detach()
 
 
-def schedule(step: int, progress: float, options: Schedule) -> float:
+def schedule(step: int, progress: float, options: TrainingSchedule) -> float:
     """Learning rate of a step over its peak: half a cosine, begun with a linear warm-up."""
     rate = 0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * min(progress, 1.0)))
     return rate * min(1.0, (step + 1) / max(options.warmup, 1))

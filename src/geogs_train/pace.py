@@ -28,6 +28,6 @@ def shared(value: float, worker: Worker) -> float:
     """The first worker's value, for all; they wait for each other."""
     if worker.count == 1:
         return value
-    told = torch.tensor([value], dtype=torch.float64, device=worker.device)
-    distributed.broadcast(told, 0)
-    return float(told.item())
+    first = torch.tensor([value], dtype=torch.float64, device=worker.device)
+    distributed.broadcast(first, 0)
+    return float(first.item())

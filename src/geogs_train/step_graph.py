@@ -1,25 +1,25 @@
 """A training step recorded as a CUDA graph: its two thousand launches cost the CPU one."""
 
 from collections.abc import Callable
-from dataclasses import fields, replace
+from dataclasses import Field, fields, replace
+from typing import Any, Generic, TypeVar
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from geogs_train.flow_pairs import FlowBatch
+Batch = TypeVar("Batch")
 
 WARM_UP = 3
 """Steps taken before the recording, so that libraries have chosen their kernels."""
 
 
-class StepGraph:
+class StepGraph(Generic[Batch]):
     """Loss and gradients of batches of one size; the gradients are added where they lie."""
 
-    def __init__(self, work: Callable[[FlowBatch], Float[Tensor, ""]], batch: FlowBatch) -> None:
-        self._batch = replace(
-            batch, **{f.name: getattr(batch, f.name).clone() for f in _tensors(batch)}
-        )
+    def __init__(self, work: Callable[[Batch], Float[Tensor, ""]], batch: Batch) -> None:
+        own = {f.name: getattr(batch, f.name).clone() for f in _tensors(batch)}
+        self._batch: Batch = replace(batch, **own)  # type: ignore[type-var]
         stream = torch.cuda.Stream()
         stream.wait_stream(torch.cuda.current_stream())
         with torch.cuda.stream(stream):
@@ -30,7 +30,7 @@ class StepGraph:
         with torch.cuda.graph(self._graph):
             self._loss = work(self._batch)
 
-    def __call__(self, batch: FlowBatch) -> Float[Tensor, ""]:
+    def __call__(self, batch: Batch) -> Float[Tensor, ""]:
         """Run on another batch of the same size; the loss is overwritten by the next call."""
         for f in _tensors(batch):
             getattr(self._batch, f.name).copy_(getattr(batch, f.name))
@@ -38,5 +38,5 @@ class StepGraph:
         return self._loss
 
 
-def _tensors(batch: FlowBatch) -> list:
+def _tensors(batch: Any) -> list[Field[Any]]:
     return [f for f in fields(batch) if isinstance(getattr(batch, f.name), Tensor)]

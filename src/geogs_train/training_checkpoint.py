@@ -13,14 +13,14 @@ from torch import Tensor
 from geogs.documents import UNUSABLE, in_short
 from geogs.errors import InputError
 from geogs.io.writers.atomic import atomic_file
-from geogs_train.network_trainer import Trainer
+from geogs_train.network_trainer import NetworkTrainer
 
 FILE = "checkpoint.safetensors"
 T = TypeVar("T")
 _PARTS = ("network", "mean", "first_moment", "second_moment")
 
 
-def save_checkpoint(trainer: Trainer, out: Path) -> None:
+def save_checkpoint(trainer: NetworkTrainer, out: Path) -> None:
     """Write all that the run needs to go on; the one before stays until the new one is whole.
 
     Raises:
@@ -58,7 +58,7 @@ def read_options(out: Path, kind: type[T]) -> T:
         raise InputError(f"The checkpoint in {out} is of another network ({reason}).") from error
 
 
-def load_checkpoint(trainer: Trainer, out: Path) -> None:
+def load_checkpoint(trainer: NetworkTrainer, out: Path) -> None:
     """Go on from a checkpoint; raises InputError where there is none or it is damaged."""
     header, tensors = _read(out, with_tensors=True)
     step, names = int(header["step"]), [name for name, _ in trainer.network.named_parameters()]

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from geogs.errors import GeogsError, InputError
-from geogs_train.course import Course, Examination, Scores, Worker
-from geogs_train.flow_options import RunOptions
-from geogs_train.network_trainer import Trainer
+from geogs_train.course import Course, Examination, ValidationScores, Worker
+from geogs_train.flow.flow_options import TrainingRunOptions
+from geogs_train.network_trainer import NetworkTrainer
 from geogs_train.pace import EVERY, Clock, shared
 from geogs_train.training_checkpoint import load_checkpoint, save_checkpoint
 
@@ -24,8 +24,8 @@ Progress = Callable[[str], None]
 
 
 def train(
-    course: Course, run: RunOptions, out: Path, worker: Worker, progress: Progress
-) -> Scores | None:
+    course: Course, run: TrainingRunOptions, out: Path, worker: Worker, progress: Progress
+) -> ValidationScores | None:
     """Train until the last step or the last minute; returns the last validation's scores.
 
     The first worker writes ``checkpoint.safetensors``, ``log.jsonl`` and the course's weights
@@ -38,7 +38,7 @@ def train(
     begin = time.monotonic()
     if run.paced and run.minutes is None:
         raise InputError("A paced run needs --run.minutes.")
-    trainer = Trainer(course, worker, run.fuse, run.paced)
+    trainer = NetworkTrainer(course, worker, run.fuse, run.paced)
     if run.begin_with:
         trainer.begin_with(course.load(Path(run.begin_with)))
     if run.resume:
@@ -79,7 +79,7 @@ def train(
     return scores
 
 
-def _saved(trainer: Trainer, validation: Examination, out: Path, progress: Progress) -> Any:
+def _saved(trainer: NetworkTrainer, validation: Examination, out: Path, progress: Progress) -> Any:
     """Validate, and write the checkpoint and the weights."""
     scores = validation.score(trainer.mean)
     _log(out, {"step": trainer.step, "scores": asdict(scores)})

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from geogs_synth.draw import turned
+from geogs_synth.draw import rotated
 
 MIN_Z = 0.01
 """Metres before a camera from where on points have a place in its image."""
@@ -78,7 +78,7 @@ def rays(
     centre = views.centre[:, view, None]
     if views.sweep is not None:
         fraction, (rotation, way) = views.row_fraction(y), views.swept(view)
-        d = turned(d, fraction * rotation)
+        d = rotated(d, fraction * rotation)
         centre = centre + torch.einsum("bij,bmj->bmi", views.R_wc[:, view], fraction * way)
     direction = torch.einsum("bij,bmj->bmi", views.R_wc[:, view], d)
     return centre.expand_as(direction), direction
@@ -98,7 +98,7 @@ def project(
         rotation, way = views.swept(view)
         for _ in range(ROUNDS):
             fraction = views.row_fraction(pixels[..., 1])
-            pixels, before = _pinhole(views, turned(middle - fraction * way, -fraction * rotation))
+            pixels, before = _pinhole(views, rotated(middle - fraction * way, -fraction * rotation))
     return pixels, before
 
 

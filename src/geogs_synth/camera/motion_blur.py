@@ -57,8 +57,8 @@ def motion_while_open(
     y = (torch.arange(h, device=depth.device)[:, None] - cy) / fy
     ray = torch.stack(torch.broadcast_tensors(x, y, torch.ones_like(depth)), -1)
     point = ray * depth[..., None]
-    turn, way = (p[:, :, None, None].expand_as(point) for p in camera.split(3, -1))
+    rotation, way = (p[:, :, None, None].expand_as(point) for p in camera.split(3, -1))
     moved = torch.einsum("bvij,bvhwj->bvhwi", views.T_cw[..., :3, :3], things)
-    rate = moved - way - torch.linalg.cross(turn, point)
+    rate = moved - way - torch.linalg.cross(rotation, point)
     across = (rate[..., :2] - ray[..., :2] * rate[..., 2:]) / depth[..., None].clamp_min(0.05)
     return across * torch.stack([fx, fy], -1)

@@ -92,8 +92,8 @@ def _blur(draw: Draw, some: _Clips) -> Float[Tensor, "n t 2"]:
     angle = draw.uniform(-3.15, 3.15, len(radius))
     way = torch.stack([angle.cos(), angle.sin()], -1) * length[:, None]
     k = torch.arange(TAPS)
-    turn = torch.stack([(2.4 * k).cos(), (2.4 * k).sin()], -1)
-    disc = ((k + 0.5) / TAPS).sqrt()[:, None] * turn
+    spiral = torch.stack([(2.4 * k).cos(), (2.4 * k).sin()], -1)
+    disc = ((k + 0.5) / TAPS).sqrt()[:, None] * spiral
     disc = disc - disc.mean(0)
     # The line in another order than the disc, or both would make one bent line.
     line = (k * 4 % TAPS) / (TAPS - 1) - 0.5

@@ -1,6 +1,6 @@
 """What is unusual in a batch of scenes: kinds, things that move, cameras that move as they look."""
 
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -12,8 +12,7 @@ from geogs_synth.clips.covering import bared, papered
 from geogs_synth.clips.movers import BODIES, PARTS, people, traffic
 from geogs_synth.clips.path_choice import too_near
 from geogs_synth.clips.paths import Paths
-from geogs_synth.clips.room_options import RoomOptions
-from geogs_synth.clips.scene_kinds import BARE, PAPERED, PEOPLE, STREET, draw_kinds
+from geogs_synth.clips.room_options import BARE, PAPERED, PEOPLE, STREET, RoomOptions
 from geogs_synth.clips.shake import Shake, draw_shake
 from geogs_synth.clips.street_clips import MIDDLE, SCALE, draw_street
 from geogs_synth.draw import Draw
@@ -28,7 +27,7 @@ class Dynamics:
     """What is unusual in each of b clips."""
 
     kind: Int[Tensor, "b"]
-    """Kind of the scene, :mod:`geogs_synth.clips.scene_kinds`."""
+    """Kind of the scene, its number in :mod:`geogs_synth.clips.room_options`."""
     shake: Shake
     ways: Float[Tensor, "b n 3"]
     """Metres by which the solid of a place moves from view to view."""
@@ -60,7 +59,7 @@ def draw_dynamics(
 ) -> tuple[Rooms, Paths, Dynamics]:
     """Makes of usual rooms, and paths in them, what the kinds of scenes are; on the host."""
     b, places = rooms.solids.kind.shape
-    kind = draw_kinds(draw, options.scenes, b)
+    kind = draw.choose(astuple(options.scenes), b)
     surfaces = papered(draw, rooms.surfaces, kind == PAPERED)
     rooms = Rooms(rooms.size, rooms.solids, bared(draw, surfaces, kind == BARE), rooms.lights)
     street = kind == STREET

@@ -73,17 +73,17 @@ def draw_furnishing(
         _Group(some(loose.books(draw, faces, 3)), 1),
         _Group(scattered(loose.clutter(draw, anywhere, 20), 1.2), 1),
         _Group(scattered(loose.wires(draw, size, 5)), 1),
-        _Group(scattered(loose.turned(draw, size, 4), 0.6), 1),
+        _Group(scattered(loose.slabs(draw, size, 4), 0.6), 1),
     )
 
 
 def _put(placed: StandingPiece, there: Bool[Tensor, "b k"]) -> SolidBatch:
     """The solids of pieces in their places; some of the pieces are not there."""
     piece, place = placed
-    turn = about_z(place.yaw)[:, :, None]
-    centre = (turn @ piece.centre[..., None])[..., 0] + place.position[:, :, None]
+    R = about_z(place.yaw)[:, :, None]
+    centre = (R @ piece.centre[..., None])[..., 0] + place.position[:, :, None]
     kind = torch.where(there[..., None], piece.kind, NONE)
-    return Solids(kind, turn @ piece.rotation, centre, piece.half).flatten()
+    return Solids(kind, R @ piece.rotation, centre, piece.half).flatten()
 
 
 def _join(*groups: _Group) -> Furnishing:

@@ -57,7 +57,7 @@ def wires(draw: Draw, size: Float[Tensor, "b 3"], count: int) -> SolidBatch:
     return Solids(torch.full(n, FRUSTUM), rotation, _anywhere(draw, size, count), half)
 
 
-def turned(draw: Draw, size: Float[Tensor, "b 3"], count: int) -> SolidBatch:
+def slabs(draw: Draw, size: Float[Tensor, "b 3"], count: int) -> SolidBatch:
     """Slabs, boxes and ellipsoids turned anyhow, in the air too."""
     n = (len(size), count)
     half = draw.log_uniform(0.05, 0.5, *n, 3)
@@ -79,8 +79,8 @@ def _choose(draw: Draw, supports: Tops, count: int) -> Float[Tensor, "b k 6"]:
 
 def _on(support: Float[Tensor, "b k 6"], offset: Float[Tensor, "b k 2"]) -> Float[Tensor, "b k 3"]:
     """Points at an offset from the centres of faces."""
-    turn = about_z(support[..., 3])[..., :2, :2]
-    xy = support[..., :2] + torch.einsum("bkij,bkj->bki", turn, offset)
+    R = about_z(support[..., 3])[..., :2, :2]
+    xy = support[..., :2] + torch.einsum("bkij,bkj->bki", R, offset)
     return torch.cat([xy, support[..., 2:3]], -1)
 
 

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from geogs_synth.clips.room_options import MotionWeights, RoomOptions
-from geogs_synth.draw import Draw, from_vector
+from geogs_synth.draw import Draw, rotation_matrix
 
 
 @dataclass(frozen=True)
@@ -31,10 +31,10 @@ class _Motion:
 
     length: tuple[float, float]
     """Metres between two views."""
-    turn: float
+    rotation: float
     """Largest rotation about each axis, degrees."""
     hold: tuple[float, float]
-    """Fraction of the turn that keeps the same point in view."""
+    """Fraction of the rotation that keeps the same point in view."""
     along_axis: float = 0.0
     """0 moves anyhow, 1 along the optical axis."""
 
@@ -58,7 +58,7 @@ class _Steps:
     spin: Float[Tensor, "b k 3"]
     """Rotation vector, camera frame."""
     hold: Float[Tensor, "b k"]
-    """Fraction of the turn that keeps the same point in view."""
+    """Fraction of the rotation that keeps the same point in view."""
 
 
 def draw_paths(draw: Draw, options: RoomOptions, size: Float[Tensor, "b 3"]) -> Paths:
@@ -70,7 +70,7 @@ def draw_paths(draw: Draw, options: RoomOptions, size: Float[Tensor, "b 3"]) -> 
     target[..., 2] = draw.uniform(0.05, 0.7, b, k) * size[:, 2:]
     forward = torch.nn.functional.normalize(target - start, dim=-1)
     roll = torch.where(draw.chance(0.1, b, k), draw.normal(0.5, b, k), draw.normal(0.06, b, k))
-    R0 = looking(forward) @ from_vector(torch.nn.functional.pad(roll[..., None], (2, 0)))
+    R0 = looking(forward) @ rotation_matrix(torch.nn.functional.pad(roll[..., None], (2, 0)))
     move = _draw_steps(draw, options.motions, forward)
 
     # Longer clips go further, but each of their steps is shorter.
@@ -83,7 +83,7 @@ def draw_paths(draw: Draw, options: RoomOptions, size: Float[Tensor, "b 3"]) -> 
         centre = centre + aside * move.way.norm(dim=-1)[:, :, None, None]
     seen = start + forward * draw.log_uniform(0.8, 4.0, b, k)[..., None]
     jitter = draw.normal(0.1, b, k, v, 3) * shaken
-    R = R0[:, :, None] @ from_vector((steps + jitter) * move.spin[:, :, None])
+    R = R0[:, :, None] @ rotation_matrix((steps + jitter) * move.spin[:, :, None])
     R = _keep_in_view(R, centre, seen, R0, start, move.hold)
     return Paths(R, centre, draw_intrinsics(draw, options, b), draw.uniform(0, 0.7, b))
 
@@ -104,16 +104,16 @@ def _draw_steps(draw: Draw, weights: MotionWeights, forward: Float[Tensor, "b k 
     kind = draw.choose(
         (weights.hand_held, weights.medium, weights.wide, weights.rotation, weights.forward), b
     )
-    rows = [[*m.length, m.turn, *m.hold, m.along_axis] for m in _KINDS]
+    rows = [[*m.length, m.rotation, *m.hold, m.along_axis] for m in _KINDS]
     numbers = torch.tensor(rows)[kind][:, None].expand(b, k, 6)
-    low, high, turn, hold_low, hold_high, along = numbers.unbind(-1)
+    low, high, rotation, hold_low, hold_high, along = numbers.unbind(-1)
     length = low * (high / low) ** draw.uniform(0, 1, b, k)
     sign = (1 - 2 * draw.integers(2, b, k))[..., None]
     axis = forward * sign + draw.normal(0.15, b, k, 3)
     way = torch.where(along[..., None] > 0, axis, draw.normal(1.0, b, k, 3))
     way = torch.nn.functional.normalize(way, dim=-1) * length[..., None]
     spin = draw.uniform(-1, 1, b, k, 3) * torch.tensor([1.0, 1.0, 0.5])
-    spin = spin * (turn * math.pi / 180)[..., None]
+    spin = spin * (rotation * math.pi / 180)[..., None]
     return _Steps(way, spin, hold_low + (hold_high - hold_low) * draw.uniform(0, 1, b, k))
 
 
@@ -132,7 +132,7 @@ def _keep_in_view(
     cross = torch.linalg.cross(before, now)
     sine = cross.norm(dim=-1, keepdim=True)
     angle = torch.atan2(sine, (before * now).sum(-1, keepdim=True))
-    return from_vector(cross / sine.clamp_min(1e-9) * angle * hold[..., None, None]) @ R
+    return rotation_matrix(cross / sine.clamp_min(1e-9) * angle * hold[..., None, None]) @ R
 
 
 def looking(forward: Float[Tensor, "... 3"]) -> Float[Tensor, "... 3 3"]:

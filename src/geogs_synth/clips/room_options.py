@@ -1,6 +1,6 @@
 """What the random rooms and the clips filmed in them are like."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Annotated
 
 from geogs.config.setting import Count, Fraction, Range, Settings, Weight
@@ -38,6 +38,16 @@ class SceneWeights(Settings, group="training.rooms.scenes"):
     """Next to no texture."""
     street: Weight = 0.0
     """Houses along a road, with cars and people that move, seen by who drives, walks or turns."""
+
+
+USUAL, SHAKEN, PEOPLE, PAPERED, BARE, STREET = range(6)
+SCENE_KINDS = tuple(field.name for field in fields(SceneWeights))
+"""Names of the kinds of scenes, by their numbers."""
+
+
+def only_scene(name: str) -> SceneWeights:
+    """Scenes of one kind."""
+    return SceneWeights(**{kind: float(kind == name) for kind in SCENE_KINDS})
 
 
 @dataclass(frozen=True)

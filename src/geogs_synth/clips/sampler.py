@@ -16,8 +16,7 @@ from geogs_synth.clips.lights import draw_lights
 from geogs_synth.clips.materials import draw_surfaces
 from geogs_synth.clips.path_choice import choose_cameras, too_near
 from geogs_synth.clips.paths import Paths, draw_paths
-from geogs_synth.clips.room_options import RoomOptions
-from geogs_synth.clips.scene_kinds import only_scene
+from geogs_synth.clips.room_options import RoomOptions, only_scene
 from geogs_synth.draw import Draw
 from geogs_synth.raycast.caster import RenderedRooms
 from geogs_synth.raycast.casters import caster_for

@@ -7,10 +7,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from geogs_synth.clips.scene_kinds import SHAKEN, STREET
+from geogs_synth.clips.room_options import SHAKEN, STREET
 from geogs_synth.draw import Draw
 
-_TURN = (0.15, 2.5)
+_ROTATION = (0.15, 2.5)
 """Degrees about each axis in the time in which all rows are read."""
 _WAY = (0.001, 0.02)
 """Metres along each axis in this time, in rooms."""
@@ -50,13 +50,13 @@ def draw_shake(draw: Draw, kind: Int[Tensor, "b"], views: int) -> Shake:
         whole = 0.6 * draw.normal(1.0, b, 1, 3) + 0.8 * draw.normal(1.0, *n, 3)
         return size[:, None, None] * whole
 
-    turn = vary(draw.log_uniform(*_TURN, b) * (math.pi / 180))
+    rotation = vary(draw.log_uniform(*_ROTATION, b) * (math.pi / 180))
     way = vary(draw.log_uniform(*_WAY, b))
     ahead = draw.log_uniform(*_DRIVE, b)[:, None, None] * draw.uniform(0.8, 1.2, *n, 1)
     ahead = torch.nn.functional.pad(ahead, (2, 0)) + 0.2 * way
     # Who drives turns slowly.
-    turn = torch.where(street, 0.3 * turn, turn)
-    rate = torch.cat([turn, torch.where(street, ahead, way)], -1) * shaken[:, None, None]
+    rotation = torch.where(street, 0.3 * rotation, rotation)
+    rate = torch.cat([rotation, torch.where(street, ahead, way)], -1) * shaken[:, None, None]
     long = draw.log_uniform(0.1, 1.0, b, 1) * draw.uniform(0.7, 1.3, *n)
     return Shake(
         rate=rate,

@@ -15,7 +15,7 @@ from geogs_synth.clips.lights import MOST_LIGHTS
 from geogs_synth.clips.materials import draw_surfaces
 from geogs_synth.clips.paths import Paths, draw_intrinsics, looking
 from geogs_synth.clips.room_options import RoomOptions
-from geogs_synth.draw import Draw, from_vector
+from geogs_synth.draw import Draw, rotation_matrix
 from geogs_synth.scene.rooms import Lights, Rooms, Surfaces
 from geogs_synth.scene.solids import BOX, ELLIPSOID, FRUSTUM, NONE, SolidBatch, Solids, upright
 
@@ -187,5 +187,5 @@ def _paths(draw: Draw, options: RoomOptions, b: int) -> Paths:
     spin = draw.uniform(-1, 1, b, k, 3) * torch.tensor([0.4, 1.0, 0.2]) * most
     progress = torch.arange(v) / max(math.sqrt(v - 1), 1.0)
     centre = start[:, :, None] + progress[:, None] * move[:, :, None]
-    R = looking(forward)[:, :, None] @ from_vector(progress[:, None] * spin[:, :, None])
+    R = looking(forward)[:, :, None] @ rotation_matrix(progress[:, None] * spin[:, :, None])
     return Paths(R, centre, draw_intrinsics(draw, options, b), torch.zeros(b))

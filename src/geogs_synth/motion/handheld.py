@@ -82,8 +82,8 @@ def _splines(
     """Position and look-at point over one lap in [0, 1]."""
     middle = scene.size[:2] / 2
     reach = shrink * (middle - 1.1)
-    turn = rng.choice((-1.0, 1.0)) * 2 * np.pi
-    angle = rng.uniform(0, 2 * np.pi) + turn * np.arange(_KNOTS_PER_LAP) / _KNOTS_PER_LAP
+    full = rng.choice((-1.0, 1.0)) * 2 * np.pi
+    angle = rng.uniform(0, 2 * np.pi) + full * np.arange(_KNOTS_PER_LAP) / _KNOTS_PER_LAP
     radius = rng.uniform(0.8, 1.1, _KNOTS_PER_LAP)
     height = rng.uniform(1.42, 1.62, _KNOTS_PER_LAP)
     outward = np.stack([np.cos(angle), np.sin(angle)], 1)
@@ -129,6 +129,6 @@ def with_shake(
     tremor = BSpline(knots, coefficients, 3)(frames)
     shaken = T_wc.copy()
     shaken[:, :3, 3] += _SHAKE_METRES * tremor[:, :3]
-    turn = Rotation.from_rotvec(_SHAKE_RADIANS * tremor[:, 3:]).as_matrix()
-    shaken[:, :3, :3] = T_wc[:, :3, :3] @ turn
+    rotation = Rotation.from_rotvec(_SHAKE_RADIANS * tremor[:, 3:]).as_matrix()
+    shaken[:, :3, :3] = T_wc[:, :3, :3] @ rotation
     return shaken

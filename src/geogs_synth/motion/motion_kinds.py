@@ -8,8 +8,5 @@ RoomMotionKind = Literal[
 ]  # fmt: skip
 """Through a room."""
 ROOM_MOTIONS: tuple[RoomMotionKind, ...] = get_args(RoomMotionKind)
-MotionKind = Literal[
-    "handheld", "slow-handheld", "handheld-5hz", "walking", "turning-30", "turning-60",
-    "turning-120", "pure-rotation", "turn-away", "rest-start", "jerks", "still", "driving",
-]  # fmt: skip
+MotionKind = Literal[RoomMotionKind, "driving"]
 """Through a room, or along a street."""

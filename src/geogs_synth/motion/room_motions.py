@@ -100,7 +100,7 @@ def _walking(scene: Scene, seed: int) -> Path:
         T_wc[:, :3, 3] += _SWAY * np.sin(stride)[:, None] * T_wc[:, :3, 0]
         T_wc[:, 2, 3] += _BOB * np.cos(step)
         nod = np.stack([np.sin(step), np.cos(stride), np.sin(stride)], 1)
-        return _turned(T_wc, np.radians(_GAIT_DEGREES) * nod)
+        return _rotated(T_wc, np.radians(_GAIT_DEGREES) * nod)
 
     return path
 
@@ -140,7 +140,7 @@ def _pure_rotation(scene: Scene, seed: int) -> Path:
         T_wc = look_at(centre, centre + ahead.T)
         T_wc[:, :3, 3] = position
         roll = np.radians(2 * np.sin(2 * np.pi * times / 4.7))
-        return _turned(T_wc, np.stack([0 * roll, 0 * roll, roll], 1))
+        return _rotated(T_wc, np.stack([0 * roll, 0 * roll, roll], 1))
 
     return path
 
@@ -158,7 +158,7 @@ def _turn_away(path: Path, seed: int) -> Path:
         turn = times - (_GOING + _STOPPING)
         there, back = (np.clip(t / _AWAY, 0, 1) for t in (turn, turn - _AWAY - _AWAY_HOLD))
         yaw = np.radians(_AWAY_DEGREES) * 0.5 * (np.cos(np.pi * back) - np.cos(np.pi * there))
-        return _turned(path(walked), np.stack([0 * yaw, sense * yaw, 0 * yaw], 1))
+        return _rotated(path(walked), np.stack([0 * yaw, sense * yaw, 0 * yaw], 1))
 
     return turned_away
 
@@ -188,7 +188,7 @@ def _with_jerks(path: Path, seed: int) -> Path:
             near = np.clip((times - middle) / _JERK_HALF_LENGTH, -1, 1)
             knock += 0.5 * (1 + np.cos(np.pi * near))[:, None] * size
         T_wc[:, :3, 3] += np.einsum("nij,nj->ni", T_wc[:, :3, :3], knock[:, 3:])
-        return _turned(T_wc, knock[:, :3])
+        return _rotated(T_wc, knock[:, :3])
 
     return jerky
 
@@ -200,7 +200,7 @@ def _still(scene: Scene, seed: int) -> Path:
     return lambda times: np.repeat(T_wc, len(times), 0)
 
 
-def _turned(
+def _rotated(
     T_wc: Float64[np.ndarray, "n 4 4"], angles: Float64[np.ndarray, "n 3"]
 ) -> Float64[np.ndarray, "n 4 4"]:
     """Poses turned in the camera's frame by rotation vectors."""

@@ -89,7 +89,7 @@ def _row_of_books(
 
 
 def _vase(build: SceneBuilder, rng: np.random.Generator, materials: Materials, size: float) -> None:
-    """A turned vase of three frustums standing on the frame's origin."""
+    """A thrown vase of three frustums standing on the frame's origin."""
     ceramic = _pick(rng, materials.ceramic)
     foot, belly, neck = size * rng.uniform([0.22, 0.38, 0.14], [0.3, 0.5, 0.22])
     build.frustum((0, 0, 0), (foot, belly), 0.45 * size, ceramic)
@@ -101,9 +101,9 @@ def _book_pile(build: SceneBuilder, rng: np.random.Generator, materials: Materia
     z = 0.0
     for _ in range(rng.integers(2, 5)):
         w, d, h = rng.uniform([0.2, 0.14, 0.02], [0.28, 0.2, 0.045])
-        turn = yaw_rotation(rng.uniform(-0.4, 0.4))
+        rotation = yaw_rotation(rng.uniform(-0.4, 0.4))
         cloth = _pick(rng, materials.cloth)
-        build.box((0, 0, z + h / 2), (w, d, h), cloth, front=materials.pages, rotation=turn)
+        build.box((0, 0, z + h / 2), (w, d, h), cloth, front=materials.pages, rotation=rotation)
         z += h
 
 
@@ -114,8 +114,8 @@ def _trinket(build: SceneBuilder, rng: np.random.Generator, materials: Materials
             _vase(build, rng, materials, rng.uniform(0.14, 0.26))
         case 1:
             r = rng.uniform(0.06, 0.1)
-            turn = yaw_rotation(rng.uniform(0, 6))
-            build.ellipsoid((0, 0, r), (r, r, r), _pick(rng, materials.ceramic), rotation=turn)
+            rotation = yaw_rotation(rng.uniform(0, 6))
+            build.ellipsoid((0, 0, r), (r, r, r), _pick(rng, materials.ceramic), rotation=rotation)
         case 2:
             _book_pile(build, rng, materials)
         case _:
@@ -162,8 +162,8 @@ def sofa(build: SceneBuilder, rng: np.random.Generator, materials: Materials, wi
         build.box((x, 0.31, seat + 0.26), size, materials.sofa, rotation=lean)
     for _ in range(3):
         x, pillow = rng.uniform(-0.4, 0.4) * inner, _pick(rng, materials.cushion)
-        turn = yaw_rotation(rng.uniform(-0.4, 0.4)) @ _pitch_rotation(0.4)
-        build.box((x, 0.5, seat + 0.2), (0.36, 0.11, 0.36), pillow, rotation=turn)
+        rotation = yaw_rotation(rng.uniform(-0.4, 0.4)) @ _pitch_rotation(0.4)
+        build.box((x, 0.5, seat + 0.2), (0.36, 0.11, 0.36), pillow, rotation=rotation)
 
 
 def _pitch_rotation(angle: float) -> np.ndarray:
@@ -247,9 +247,9 @@ def plant(build: SceneBuilder, rng: np.random.Generator, materials: Materials) -
         direction[2] = math.sin(rise)
         tilt = np.array([0, math.sin(rise), math.cos(rise)])
         centre = np.array([0, 0, 0.4 + 0.025 * k]) + 0.17 * direction
-        turn = yaw_rotation(yaw) @ _roll_about_y(-rise)
+        rotation = yaw_rotation(yaw) @ _roll_about_y(-rise)
         length = rng.uniform(0.12, 0.17) * (1.05 - 0.02 * tilt[1])
-        build.ellipsoid(centre, (length, 0.055, 0.008), materials.leaf, rotation=turn)
+        build.ellipsoid(centre, (length, 0.055, 0.008), materials.leaf, rotation=rotation)
 
 
 def _roll_about_y(angle: float) -> np.ndarray:

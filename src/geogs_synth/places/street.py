@@ -40,8 +40,8 @@ def heading(x: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n"]:
 
 def on_road(x: Float64[np.ndarray, "n"], left: Float64[np.ndarray, "n"]) -> np.ndarray:
     """n x 2 points ``left`` metres beside the middle of the road."""
-    turn = heading(x)
-    return middle_line(x) + left[:, None] * np.stack([-np.sin(turn), np.cos(turn)], 1)
+    yaw = heading(x)
+    return middle_line(x) + left[:, None] * np.stack([-np.sin(yaw), np.cos(yaw)], 1)
 
 
 def make_street(seed: int = 0, length: float = LENGTH) -> Scene:
@@ -104,12 +104,12 @@ def _seconds_of_drive(seed: int) -> float:
 
 
 def _section(
-    build: SceneBuilder, x: float, left: float = 0.0, turned: bool = False
+    build: SceneBuilder, x: float, left: float = 0.0, backwards: bool = False
 ) -> SceneBuilder:
-    """A frame beside the middle of the road: x along it, or against it where turned."""
+    """A frame beside the middle of the road: x along it, or against it where backwards."""
     at = np.array([x])
-    (px, py), turn = on_road(at, np.array([left]))[0], float(heading(at)[0])
-    return build.at(float(px), float(py), yaw=turn + (np.pi if turned else 0.0))
+    (px, py), yaw = on_road(at, np.array([left]))[0], float(heading(at)[0])
+    return build.at(float(px), float(py), yaw=yaw + (np.pi if backwards else 0.0))
 
 
 def _ground(build: SceneBuilder, rng: np.random.Generator, length: float) -> None:
@@ -139,7 +139,7 @@ def _houses(build: SceneBuilder, rng: np.random.Generator, side: int, length: fl
     while x < length:
         width, height, depth = rng.uniform([8, 6.0, 6], [14, 14.0, 8])
         middle = x + width / 2
-        house = _section(build, middle, side * (front_at + rng.uniform(0, 0.5)), turned=side > 0)
+        house = _section(build, middle, side * (front_at + rng.uniform(0, 0.5)), backwards=side > 0)
         front = build.texture(facades.facade(rng, width, height))
         house.box((0, -depth / 2, height / 2), (width, depth, height), plain, front=front)
         house.box((0, -depth / 2, height + 0.15), (width + 0.3, depth + 0.6, 0.3), plain)
@@ -160,7 +160,7 @@ def _parked_cars(
 ) -> None:
     x = rng.uniform(4, 10)
     while x < length - 8:
-        place = _section(build, x, side * (_ROAD_HALF - 1.0), turned=side > 0)
+        place = _section(build, x, side * (_ROAD_HALF - 1.0), backwards=side > 0)
         car(place.at(0, 0, 0.03, yaw=rng.uniform(-0.03, 0.03)), rng, materials)
         x += rng.uniform(5.2, 7.5) if rng.random() < 0.7 else rng.uniform(12, 26)
 

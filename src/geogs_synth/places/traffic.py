@@ -62,8 +62,8 @@ def _comes(part: float) -> Path:
     return path
 
 
-def _placed(x: np.ndarray, left: float, turn: float) -> np.ndarray:
-    """Body to world on the road, heading along it but for ``turn``."""
-    yaw = heading(x) + turn
+def _placed(x: np.ndarray, left: float, offset: float) -> np.ndarray:
+    """Body to world on the road, heading along it but for an ``offset`` in radians."""
+    yaw = heading(x) + offset
     position = np.column_stack([on_road(x, np.full(len(x), left)), np.full(len(x), 0.03)])
     return upright_poses(position, np.cos(yaw), np.sin(yaw))

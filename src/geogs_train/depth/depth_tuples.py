@@ -146,11 +146,11 @@ def disturbed_poses(
     """Poses that are off by what a tracker's are; in a fraction of the samples."""
     b, k = T.shape[:2]
     wrong = (chance.uniform(b, 1, 1) < options.disturbed).float()
-    turn = torch.deg2rad(chance.log_uniform(options.rotation, b, 1, 1)) * chance.normal(b, k, 3)
+    rotation = torch.deg2rad(chance.log_uniform(options.rotation, b, 1, 1)) * chance.normal(b, k, 3)
     baseline = T[..., :3, 3].norm(dim=-1, keepdim=True)
     shift = chance.log_uniform(options.translation, b, 1, 1) * baseline * chance.normal(b, k, 3)
-    # About the neighbour's own centre: a turn alone leaves the baseline as it is.
-    return se3_exp(wrong * torch.cat([shift, turn], -1)).to(T) @ T
+    # About the neighbour's own centre: a rotation alone leaves the baseline as it is.
+    return se3_exp(wrong * torch.cat([shift, rotation], -1)).to(T) @ T
 
 
 def relit(

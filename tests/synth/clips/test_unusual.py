@@ -1,6 +1,6 @@
 """Streets, people, patterns that repeat, cameras that move as they look."""
 
-from dataclasses import replace
+from dataclasses import astuple, replace
 
 import pytest
 import torch
@@ -8,13 +8,18 @@ import torch
 from geogs_synth.camera.camera_batch import pixel_grid, project, rays
 from geogs_synth.camera.motion_blur import exposed, motion_while_open
 from geogs_synth.clips.clips import ClipBatch
-from geogs_synth.clips.room_options import RoomOptions, SceneWeights
+from geogs_synth.clips.room_options import (
+    SCENE_KINDS,
+    STREET,
+    RoomOptions,
+    SceneWeights,
+    only_scene,
+)
 from geogs_synth.clips.sampler import RoomSampler, draw_plan
-from geogs_synth.clips.scene_kinds import NAMES, STREET, draw_kinds, only_scene
 from geogs_synth.clips.shake import draw_shake
-from geogs_synth.draw import Draw, from_vector, turned
-from geogs_train.flow_pairs import REPEATING, flow_batch
-from geogs_train.starts import StartOptions
+from geogs_synth.draw import Draw, rotated, rotation_matrix
+from geogs_train.flow.flow_pairs import REPEATING, flow_batch
+from geogs_train.flow.starts import StartOptions
 from random_rooms import looking_along_y, use_fast_rooms
 
 OPTIONS = RoomOptions(width=64, height=48, textures=8, texture_size=32, candidates=8)
@@ -45,10 +50,10 @@ def test_usual_rooms_are_what_they_were_before_there_were_others():
 
 def test_kinds_come_as_often_as_asked_for():
     shares = SceneWeights(usual=0.5, shaken=0.0, people=0.25, papered=0.0, bare=0.0, street=0.25)
-    kind = draw_kinds(Draw(CPU, 1), shares, 4000)
-    share = torch.bincount(kind, minlength=len(NAMES)) / 4000
+    kind = Draw(CPU, 1).choose(astuple(shares), 4000)
+    share = torch.bincount(kind, minlength=len(SCENE_KINDS)) / 4000
     assert share.tolist() == pytest.approx([0.5, 0, 0.25, 0, 0, 0.25], abs=0.03)
-    assert draw_kinds(Draw(CPU, 1), only_scene("street"), 5).tolist() == [STREET] * 5
+    assert Draw(CPU, 1).choose(astuple(only_scene("street")), 5).tolist() == [STREET] * 5
 
 
 def test_points_are_where_the_row_that_sees_them_says():
@@ -92,7 +97,7 @@ def test_blur_is_along_what_finite_differences_say():
 def _after(T_cw: torch.Tensor, twist: torch.Tensor) -> torch.Tensor:
 
     done = torch.eye(4, dtype=T_cw.dtype)
-    done[:3, :3], done[:3, 3] = from_vector(twist[:3]), twist[3:]
+    done[:3, :3], done[:3, 3] = rotation_matrix(twist[:3]), twist[3:]
     return torch.linalg.inv(done) @ T_cw
 
 
@@ -165,5 +170,5 @@ def test_vectors_are_turned_as_by_the_matrix():
     g = torch.Generator().manual_seed(3)
     vector, rotation = (torch.randn(5, 7, 3, generator=g, dtype=torch.float64) for _ in range(2))
     rotation[0, 0] = 0
-    expected = (from_vector(rotation) @ vector[..., None])[..., 0]
-    torch.testing.assert_close(turned(vector, rotation), expected)
+    expected = (rotation_matrix(rotation) @ vector[..., None])[..., 0]
+    torch.testing.assert_close(rotated(vector, rotation), expected)

@@ -19,8 +19,8 @@ from geogs.tracking.flow.own_network import (
     cell_pixels,
 )
 from geogs.world.grid import SampleGrid
-from geogs_train.flow_scores import FlowScores
-from geogs_train.flow_validation import SceneScores
+from geogs_train.flow.flow_scores import FlowScores
+from geogs_train.flow.flow_validation import SceneScores
 from geogs_train.trained_weights import write_weights
 
 SMALL = NetworkOptions(stem=8, middle=16, deep=16, hidden=16, context=16, motion=16)

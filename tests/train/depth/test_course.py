@@ -12,7 +12,7 @@ from geogs.depth.network.weights import load_depth_network
 from geogs_train.course import Worker
 from geogs_train.depth.depth_course import DepthCourse
 from geogs_train.depth.depth_options import DepthTraining
-from geogs_train.network_trainer import Trainer
+from geogs_train.network_trainer import NetworkTrainer
 from geogs_train.training_checkpoint import load_checkpoint, read_options, save_checkpoint
 
 CPU = Worker(torch.device("cpu"))
@@ -23,8 +23,8 @@ def fast_rooms(monkeypatch) -> None:
     use_fast_rooms(monkeypatch)
 
 
-def trainer_of(options: DepthTraining) -> Trainer:
-    return Trainer(DepthCourse(options, CPU), CPU)
+def trainer_of(options: DepthTraining) -> NetworkTrainer:
+    return NetworkTrainer(DepthCourse(options, CPU), CPU)
 
 
 class OneBatch(DepthCourse):
@@ -40,7 +40,7 @@ class OneBatch(DepthCourse):
 def test_one_batch_is_learnt_by_heart():
     options = replace(TRAINING, steps=60, learning_rate=3e-3, warmup=5)
     course = OneBatch(options, CPU)
-    trainer = Trainer(course, CPU)
+    trainer = NetworkTrainer(course, CPU)
     batch = course.batch(0, 0.0)
 
     def error() -> float:

@@ -9,11 +9,11 @@ from torch import Tensor
 from geogs.errors import InputError
 from geogs.tracking.flow.own_network import FlowEstimate, FlowFeatures, FlowNetwork
 from geogs_synth.clips.clips import ClipBatch
-from geogs_synth.clips.scene_kinds import only_scene
-from geogs_train.flow_loss import flow_loss
-from geogs_train.flow_options import FlowTraining
-from geogs_train.flow_pairs import FlowBatch, flow_batch
-from geogs_train.starts import StartOptions
+from geogs_synth.clips.room_options import only_scene
+from geogs_train.flow.flow_loss import flow_loss
+from geogs_train.flow.flow_options import FlowTraining
+from geogs_train.flow.flow_pairs import FlowBatch, flow_batch
+from geogs_train.flow.starts import StartOptions
 
 
 @runtime_checkable
@@ -59,7 +59,7 @@ def objective(options: FlowTraining) -> Objective:
             "The bundle stage is for still rooms: --training.rooms.scenes.* must be 0 for all "
             "kinds but usual."
         )
-    from geogs_train.bundle_objective import BundleObjective
+    from geogs_train.flow.bundle_objective import BundleObjective
 
     return BundleObjective(options)
 

@@ -74,7 +74,7 @@ class FlowTraining(Settings, group="training"):
 
 
 @dataclass(frozen=True)
-class RunOptions(Settings, group="run"):
+class TrainingRunOptions(Settings, group="run"):
     """How a run is watched and when it pauses."""
 
     validate_every: Count = 1000

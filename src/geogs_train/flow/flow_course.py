@@ -10,13 +10,13 @@ from torch import Tensor
 
 from geogs.tracking.flow.own import load_network
 from geogs.tracking.flow.own_network import FlowNetwork
+from geogs_synth.clips.room_options import SCENE_KINDS
 from geogs_synth.clips.sampler import Plan, RoomSampler
-from geogs_synth.clips.scene_kinds import NAMES
 from geogs_train.ahead import PROCESSES, PlansAhead
 from geogs_train.course import Panels, Worker
-from geogs_train.flow_options import FlowTraining
-from geogs_train.flow_validation import SceneScores, SceneValidation
-from geogs_train.objective import objective
+from geogs_train.flow.flow_options import FlowTraining
+from geogs_train.flow.flow_validation import SceneScores, SceneValidation
+from geogs_train.flow.objective import objective
 from geogs_train.trained_weights import write_weights
 
 
@@ -31,9 +31,13 @@ class FlowCourse:
             True,
         ),
         ("usual rooms: shares", ("usual.within", "usual.outliers", "usual.sure_share"), False),
-        ("error, pixels", tuple(f"others.{name}.epe" for name in NAMES[1:]), True),
-        ("median error, pixels", tuple(f"others.{name}.median" for name in NAMES[1:]), True),
-        ("within two deviations", tuple(f"others.{name}.within" for name in NAMES[1:]), False),
+        ("error, pixels", tuple(f"others.{name}.epe" for name in SCENE_KINDS[1:]), True),
+        ("median error, pixels", tuple(f"others.{name}.median" for name in SCENE_KINDS[1:]), True),
+        (
+            "within two deviations",
+            tuple(f"others.{name}.within" for name in SCENE_KINDS[1:]),
+            False,
+        ),
     )
 
     def __init__(self, options: FlowTraining, worker: Worker) -> None:

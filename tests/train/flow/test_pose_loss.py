@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from geogs.geometry.lie import retract, se3_exp
-from geogs_train.bundle import ClipCameras, ClipEdges, ClipState, reproject
-from geogs_train.pose_loss import (
+from geogs_train.flow.bundle import ClipCameras, ClipEdges, ClipState, reproject
+from geogs_train.flow.pose_loss import (
     PoseLossOptions,
     geodesic_errors,
     induced_flow_error,

@@ -5,14 +5,14 @@ from dataclasses import dataclass, replace
 import torch
 
 from geogs.tracking.flow.own_network import FlowNetwork
+from geogs_synth.clips.room_options import SCENE_KINDS, only_scene
 from geogs_synth.clips.sampler import RoomSampler
-from geogs_synth.clips.scene_kinds import NAMES, only_scene
 from geogs_synth.textures.pyramids import TextureBank
-from geogs_train.flow_options import FlowTraining
-from geogs_train.flow_pairs import FlowBatch, flow_batch
-from geogs_train.flow_scores import CellErrors, FlowScores, has_texture, summarise
-from geogs_train.objective import run_network
-from geogs_train.starts import StartOptions
+from geogs_train.flow.flow_options import FlowTraining
+from geogs_train.flow.flow_pairs import FlowBatch, flow_batch
+from geogs_train.flow.flow_scores import CellErrors, FlowScores, has_texture, summarise
+from geogs_train.flow.objective import run_network
+from geogs_train.flow.starts import StartOptions
 
 SEED = 2718
 
@@ -39,7 +39,7 @@ class SceneValidation:
         weights, few = options.rooms.scenes, max(1, batches // 2)
         self._others = {
             name: Validation(options, device, few, name, self._usual.bank)
-            for name in NAMES[1:]
+            for name in SCENE_KINDS[1:]
             if getattr(weights, name) > 0
         }
 

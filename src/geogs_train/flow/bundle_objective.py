@@ -12,7 +12,7 @@ from geogs.tracking.flow.own import OwnFlowOptions
 from geogs.tracking.flow.own_network import FlowNetwork, cell_pixels
 from geogs.world.grid import OFFSET, STRIDE
 from geogs_synth.clips.clips import ClipBatch
-from geogs_train.bundle import (
+from geogs_train.flow.bundle import (
     ClipBundleOptions,
     ClipCameras,
     ClipEdges,
@@ -21,9 +21,9 @@ from geogs_train.bundle import (
     adjust,
     reproject,
 )
-from geogs_train.flow_options import FlowTraining
-from geogs_train.flow_pairs import MARGIN
-from geogs_train.pose_loss import PoseLossOptions, pose_loss
+from geogs_train.flow.flow_options import FlowTraining
+from geogs_train.flow.flow_pairs import MARGIN
+from geogs_train.flow.pose_loss import PoseLossOptions, pose_loss
 
 FLOOR = OwnFlowOptions().floor
 """Deviation in pixels that no weight goes beyond, as in the operator."""

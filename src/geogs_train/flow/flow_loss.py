@@ -8,8 +8,8 @@ from torch import Tensor
 
 from geogs.tracking.flow.lookup import RADIUS, WINDOW, correlation_windows
 from geogs.tracking.flow.own_network import FlowEstimate, FlowFeatures
-from geogs_train.flow_options import FlowTraining
-from geogs_train.flow_pairs import FlowBatch
+from geogs_train.flow.flow_options import FlowTraining
+from geogs_train.flow.flow_pairs import FlowBatch
 
 MAX_ERROR = 100.0
 """Errors beyond so many pixels count as such; nothing is learned from how far lost a cell is."""

@@ -12,8 +12,8 @@ from geogs.tracking.flow.lookup import Edges
 from geogs.tracking.flow.own_network import cell_pixels
 from geogs.world.grid import OFFSET, STRIDE
 from geogs_synth.clips.clips import ClipBatch
-from geogs_synth.clips.scene_kinds import PAPERED
-from geogs_train.starts import StartOptions, disturbed_starts
+from geogs_synth.clips.room_options import PAPERED
+from geogs_train.flow.starts import StartOptions, disturbed_starts
 
 REPEATING = 5.0
 """Largest disturbance in pixels where patterns repeat: the right one of them is the nearest."""

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from geogs.geometry.lie import se3_inverse, se3_log
-from geogs_train.bundle import ClipCameras, ClipEdges, ClipState, relative_motions, reproject
+from geogs_train.flow.bundle import ClipCameras, ClipEdges, ClipState, relative_motions, reproject
 
 
 @dataclass(frozen=True)

@@ -75,9 +75,9 @@ def disturbed_starts(
     inverse = inverse * (1.5 * column(strength) * (patches[:, 0] - 1).clamp(min=0)).exp()
     # Pose: turned by up to the amount, moved by a fraction of the depth.
     focal = intrinsics[:, 0]
-    turn = normal(3) * (0.5 * amount / focal)[:, None]
+    rotation = normal(3) * (0.5 * amount / focal)[:, None]
     shift = normal(3) * (0.5 * amount / focal / middle.clamp(min=1e-3))[:, None]
-    T = se3_exp(torch.cat([shift, turn], -1)) @ T_ji
+    T = se3_exp(torch.cat([shift, rotation], -1)) @ T_ji
     R, t = T[:, None, None, :3, :3], T[:, None, None, :3, 3]
     y = (R @ rays[..., None])[..., 0] + inverse[..., None] * t
     z = y[..., 2:].clamp(min=0.05)

@@ -14,7 +14,7 @@ from geogs.bundle.projection import project, relative_motion
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import retract, se3_inverse
 from geogs.world.grid import SampleGrid
-from geogs_train.bundle import (
+from geogs_train.flow.bundle import (
     ClipBundleOptions,
     ClipCameras,
     ClipEdges,
@@ -23,7 +23,7 @@ from geogs_train.bundle import (
     adjust,
     reproject,
 )
-from geogs_train.bundle_objective import true_state
+from geogs_train.flow.bundle_objective import true_state
 from tracking_scenes import CAMERA as ROOM
 from tracking_scenes import pose, render
 
