@@ -54,8 +54,7 @@ TEXTS = ("nan", "inf", "-1e400", "x", "", "9" * 5000, "0x10", "none")
 def values(leaf: Leaf) -> set[str]:
     """Below, at and above the bounds, and what is no number at all."""
     found = set(TEXTS)
-    bounds = leaf.kind.range
-    for bound in (bounds.least, bounds.most, bounds.above, bounds.below):
+    for bound in leaf.kind.range.bounds:
         if isinstance(bound, int | float):
             step = 1 if leaf.kind.base is int else max(abs(bound), 1) * 1e-6
             found |= {f"{bound + k * step:.15g}" for k in (-1, 0, 1)}

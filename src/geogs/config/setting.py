@@ -42,14 +42,19 @@ class Range:
     or_zero: bool = False
     """0 is allowed, too."""
 
+    @property
+    def bounds(self) -> tuple[Bound | None, ...]:
+        """All four."""
+        return self.least, self.most, self.above, self.below
+
     def holds(self, value: float, group: object = None) -> bool:
         """Whether a finite number lies in the range, given the other settings of its group.
 
         Without a group, bounds by other settings are not looked at.
         """
-        bounds = (self.least, self.most, self.above, self.below)
         least, most, above, below = (
-            bound if not isinstance(bound, str) else getattr(group, bound, None) for bound in bounds
+            getattr(group, bound, None) if isinstance(bound, str) else bound
+            for bound in self.bounds
         )
         return (self.or_zero and value == 0) or (
             (least is None or value >= least)
@@ -61,8 +66,7 @@ class Range:
 
     def partners(self) -> tuple[str, ...]:
         """Names of the settings that the bounds refer to."""
-        bounds = (self.least, self.most, self.above, self.below)
-        return tuple(bound for bound in bounds if isinstance(bound, str))
+        return tuple(bound for bound in self.bounds if isinstance(bound, str))
 
     def __str__(self) -> str:
         """Such as ``from 1 to 8``, ``above 0 and at most 1``, ``from 3 to 15 and odd``."""
