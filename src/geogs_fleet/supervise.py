@@ -10,8 +10,8 @@ from pathlib import Path
 from tempfile import TemporaryFile
 from typing import Literal
 
-_SHORTEST, _LONGEST = 0.02, 0.5
-"""Seconds between two looks, which become rarer."""
+_LOOK = 0.5
+"""Seconds between two looks at what the process takes."""
 
 
 @dataclass(frozen=True)
@@ -52,50 +52,33 @@ def supervise(
         environment: its environment variables.
         meanwhile: called about twice a second.
     """
-    begin, pause = time.monotonic(), _SHORTEST
+    begin = time.monotonic()
     exceeded: Literal["", "time", "memory"] = ""
     with TemporaryFile() as said, log.open("ab") as errors:
         process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=said, stderr=errors, env=dict(environment)
         )
+        assert process.stdin is not None
         try:
-            _tell(process, message)
+            with suppress(BrokenPipeError):  # it has ended already, and how is asked later
+                process.stdin.write(message)
+                process.stdin.flush()
             while process.poll() is None:
-                exceeded = _exceeded(process.pid, time.monotonic() - begin, limits)
-                if exceeded:
+                if limits.seconds is not None and time.monotonic() - begin > limits.seconds:
+                    exceeded = "time"
+                    break
+                if limits.memory is not None and resident(process.pid) > limits.memory:
+                    exceeded = "memory"
                     break
                 meanwhile()
-                pause = min(1.2 * pause, _LONGEST)
-                _wait(process, pause)
+                with suppress(subprocess.TimeoutExpired):
+                    process.wait(_LOOK)
         finally:
             process.kill()
             process.wait()
-            if process.stdin is not None:
-                process.stdin.close()
+            process.stdin.close()
         said.seek(0)
         return Ending(process.returncode, said.read().decode("utf-8", "replace"), exceeded)
-
-
-def _tell(process: "subprocess.Popen[bytes]", message: bytes) -> None:
-    assert process.stdin is not None
-    try:
-        process.stdin.write(message)
-        process.stdin.flush()
-    except BrokenPipeError:  # it has ended already, and how is asked later
-        pass
-
-
-def _wait(process: "subprocess.Popen[bytes]", seconds: float) -> None:
-    with suppress(subprocess.TimeoutExpired):
-        process.wait(seconds)
-
-
-def _exceeded(process: int, seconds: float, limits: Limits) -> Literal["", "time", "memory"]:
-    if limits.seconds is not None and seconds > limits.seconds:
-        return "time"
-    if limits.memory is not None and resident(process) > limits.memory:
-        return "memory"
-    return ""
 
 
 def resident(process: int) -> int:

@@ -22,6 +22,7 @@ from geogs_fleet.join.graph import Placement
 from geogs_fleet.join.links import Link, loaded_keyframes
 from geogs_fleet.join.matches import Matches
 from geogs_fleet.join.part import Part, PartViews, describe, opened
+from geogs_fleet.join.records import read_record, write_record
 from joined_parts import CAMERA, make_part
 from one_process import OneProcess
 
@@ -51,9 +52,9 @@ def placed(tmp_path, monkeypatch):
     parts, files, placements = [], [], {}
     for n, places in enumerate(PLACES):
         parts.append(Part(str(n), make_part(tmp_path / str(n), places, 0)))
-        files.append(tmp_path / f"{n}.npz")
+        files.append(tmp_path / f"{n}.safetensors")
         describe(parts[-1], CAMERA, files[-1])
-        T = torch.from_numpy(PartViews.load(files[-1]).T_cw)
+        T = torch.from_numpy(read_record(PartViews, files[-1]).T_cw)
         T[:, :3, 3] += torch.from_numpy(rng.normal(0, 0.003, 3)) * (n > 0)
         placements[n] = Placement(T, torch.ones(len(T)))
     none = torch.zeros(0, dtype=torch.long)
@@ -76,13 +77,13 @@ def test_parts_together_are_adjusted_as_one_problem(placed, tmp_path):
     segment = KeyframeTable.on(grid, operator.encode).new_set()
     ids = {}
     for n, part in enumerate(parts):
-        views, T = PartViews.load(files[n]), placements[n].T_cw
+        views, T = read_record(PartViews, files[n]), placements[n].T_cw
         result = opened(part)
         for place, k in loaded_keyframes(segment, operator, result, views, range(4), T).items():
             ids[n, place] = k.id
     graph = FrameGraph(segment, operator)
     for path in workers.files:
-        for (a, b), edge in Matches.load(path).edges().items():
+        for (a, b), edge in read_record(Matches, path).edges().items():
             graph.edges[ids[a], ids[b]] = edge
     assert {(a // 4, b // 4) for a, b in graph.edges} == {
         (n, m) for n in range(3) for m in range(3) if abs(n - m) < 2
@@ -118,14 +119,14 @@ def test_a_part_that_matches_nothing_stays(placed, tmp_path):
     """One keyframe alone, too far from all others to see what they do."""
     parts, files, placements, gauge, config = placed
     lone = Part("lone", make_part(tmp_path / "lone", np.array([0.7, 0.8]), 0))
-    views = tmp_path / "lone.npz"
+    views = tmp_path / "lone.safetensors"
     describe(lone, CAMERA, views)
-    T = torch.from_numpy(PartViews.load(views).T_cw)[:1]
+    T = torch.from_numpy(read_record(PartViews, views).T_cw)[:1]
     T[:, :3, 3] += 50.0
     parts, files = [*parts[:2], lone], [*files[:2], views]
-    one = PartViews.load(views)
+    one = read_record(PartViews, views)
     fields = (one.T_cw[:1], one.timestamp[:1], one.inverse_depth[:1], one.information[:1])
-    PartViews(*fields, one.features[:1]).save(views)
+    write_record(views, PartViews(*fields, one.features[:1]))
     placements = {**placements, 2: Placement(T, torch.ones(1))}
     found = adjusted(
         parts, files, placements, gauge, CAMERA, config, OneProcess(), tmp_path / "work"

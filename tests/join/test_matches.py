@@ -14,6 +14,7 @@ from geogs.world.edges import position_step, unpacked_positions
 from geogs.world.grid import SampleGrid
 from geogs_fleet.join.matches import Matches, Member, match
 from geogs_fleet.join.part import Part, PartViews, describe
+from geogs_fleet.join.records import read_record
 from joined_parts import CAMERA, FRAMES, gauge, make_part
 
 GRID, CONFIG = SampleGrid(CAMERA), Config()
@@ -35,16 +36,16 @@ def matched(folder, number: int, with_rows: bool) -> tuple[Member, Matches]:
     part = Part(folder.name, make_part(folder, PLACES, number))
     if with_rows:
         write_rows(rows_path(folder), dict.fromkeys(range(len(PLACES)), rows()))
-    views = folder / "views.npz"
+    views = folder / "views.safetensors"
     describe(part, CAMERA, views)
     S = gauge(number)
-    T = torch.from_numpy(PartViews.load(views).T_cw) @ S
+    T = torch.from_numpy(read_record(PartViews, views).T_cw) @ S
     scale = sim3_scale(T)
     T_cw = T / scale[:, None, None]
     T_cw[:, 3] = T[:, 3]
-    member, file = Member(number, part, views, T_cw, scale), folder / "matches.npz"
+    member, file = Member(number, part, views, T_cw, scale), folder / "matches.safetensors"
     done = match(member, (), CAMERA, CONFIG, (), (file,))
-    found = Matches.load(file)
+    found = read_record(Matches, file)
     assert done.fresh == len(found.ends) // 2 > 5
     return member, found
 

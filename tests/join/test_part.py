@@ -11,6 +11,7 @@ from geogs.world.grid import SampleGrid
 from geogs.world.loops import Features
 from geogs_fleet.join.links import candidates
 from geogs_fleet.join.part import Part, PartViews, describe, opened, resampled
+from geogs_fleet.join.records import read_record
 from joined_parts import CAMERA, image, make_part, pose, seen, walls
 from saved_results import make_result
 
@@ -28,9 +29,9 @@ def test_another_camera_at_the_same_place_sees_the_same():
 
 def test_a_part_is_described_by_the_depths_that_its_map_shows(tmp_path):
     part = Part("a", make_part(tmp_path / "a", np.array([0.0, 0.1]), 0))
-    file = tmp_path / "views.npz"
+    file = tmp_path / "views.safetensors"
     assert describe(part, CAMERA, file) == 2
-    views, grid = PartViews.load(file), SampleGrid(CAMERA)
+    views, grid = read_record(PartViews, file), SampleGrid(CAMERA)
     for n, s in enumerate((0.0, 0.1)):
         depth = seen(pose(s), CAMERA)[0]
         x, y = grid.pixels.long().unbind(1)

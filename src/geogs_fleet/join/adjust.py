@@ -35,6 +35,7 @@ from geogs_fleet.join.gauge import Gauge
 from geogs_fleet.join.graph import Placement
 from geogs_fleet.join.matches import Depths, Directed, Matches, Member, match
 from geogs_fleet.join.part import Node, Part
+from geogs_fleet.join.records import read_record, write_record
 from geogs_fleet.workers import Workers
 
 _NO_IMAGE = np.zeros((1, 1, 3), np.uint8)
@@ -200,7 +201,7 @@ class _Adjustment:
     def _new(self, name: str) -> Path:
         """A file that no job has written: one that is done again finds what the first found."""
         self.written += 1
-        return self.folder / f"{name}-{self.written}.npz"
+        return self.folder / f"{name}-{self.written}.safetensors"
 
 
 class _AllPoses:
@@ -266,7 +267,7 @@ def follow(job: StepJob) -> PoseSums | None:
     none = torch.zeros(grid.size, dtype=torch.bool)
     moving = [graph.keyframes[id].moving for id in own]
     held = torch.stack([none if m is None else m for m in moving])
-    Depths(depth.contiguous(), information, held).save(job.after)
+    write_record(job.after, Depths(depth.contiguous(), information, held))
     return sums
 
 
@@ -274,7 +275,7 @@ def _known_graph(job: StepJob, grid: SampleGrid) -> tuple[FrameGraph, list[Node]
     """The edges that leave a part's keyframes, which come first; the node of each keyframe."""
     edges: dict[Directed, PackedEdge] = {}
     for path in job.matches:
-        edges |= Matches.load(path).edges()
+        edges |= read_record(Matches, path).edges()
     seen = {target for _, target in edges}
     segment = KeyframeTable.on(grid).new_set()
     nodes: list[Node] = []

@@ -17,6 +17,7 @@ from geogs.types import MapSnapshot
 from geogs.world.disks import DiskParameters, GaussianMap
 from geogs_fleet.join.graph import Placement
 from geogs_fleet.join.part import Part, PartViews, opened
+from geogs_fleet.join.records import read_record
 
 _NEAREST = 8
 _WITHIN = 2.0
@@ -37,7 +38,7 @@ def move_disks(
 
     The update of a map after a correction, see :mod:`geogs.mapping.similarity_field`.
     """
-    result, views = opened(part, device), PartViews.load(views_file)
+    result, views = opened(part, device), read_record(PartViews, views_file)
     similarities = placement.similarities(views.T_cw)
     x = result.disks.position.double()
     whole = overall(views, similarities).to(x)

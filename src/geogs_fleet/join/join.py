@@ -37,6 +37,7 @@ from geogs_fleet.join.gauge import Gauge, common_gauge
 from geogs_fleet.join.graph import Placement, placed
 from geogs_fleet.join.links import Link, candidates, links_of
 from geogs_fleet.join.part import Part, PartViews, describe, opened
+from geogs_fleet.join.records import read_record
 from geogs_fleet.join.stored_views import equal_runs, render_views
 from geogs_fleet.join.surface import SpacePlan, coloured, joint_mesh, plan_space
 from geogs_fleet.join.trajectory import spans_of
@@ -72,7 +73,7 @@ class _Join:
         self.parts, self.config, self.workers, self.device = list(parts), config, workers, device
         self.output = output
         self.work = output / "join"
-        self.files = [self.work / f"views-{n:04d}.npz" for n in range(len(parts))]
+        self.files = [self.work / f"views-{n:04d}.safetensors" for n in range(len(parts))]
         self.camera = opened(parts[0]).camera
         self.seconds: dict[str, float] = {}
 
@@ -83,7 +84,7 @@ class _Join:
         self.seconds[name] = round(time.perf_counter() - begin, 3)
 
     def links(self) -> list[Link]:
-        jobs, views = [], map(PartViews.load, self.files)  # one at a time
+        jobs, views = [], (read_record(PartViews, file) for file in self.files)  # one at a time
         for (a, b), pairs in candidates(views, self.config.loop).items():
             for start in range(0, len(pairs), _PAIRS):
                 jobs.append((
@@ -187,7 +188,7 @@ def _joined(join: _Join, adjust: bool, say: Callable[[str], None], begin: float)
         ]
         keyframes = sum(join.workers.map("describing", describe, described))
     say(f"{len(parts)} parts, {keyframes} keyframes.")
-    views = [PartViews.load(file).outline() for file in join.files]
+    views = [read_record(PartViews, file).outline() for file in join.files]
     with join.timed("linking"):
         links = join.links()
         gauge = common_gauge(views, links)

@@ -24,6 +24,7 @@ from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import Keyframe, KeyframeSet, KeyframeTable
 from geogs.world.loops import Loop, RelativePoses
 from geogs_fleet.join.part import Node, Part, PartViews, image_of, opened
+from geogs_fleet.join.records import read_record
 
 Candidates = dict[tuple[int, int], list[tuple[int, int]]]
 """By the numbers of two parts, the earlier first: places of keyframes in the one and the other."""
@@ -80,7 +81,7 @@ def links_of(
     """
     grid = SampleGrid(camera)
     verifier = TwoViewVerifier(camera)
-    views = [PartViews.load(path) for path in files]
+    views = [read_record(PartViews, path) for path in files]
     wanted: list[tuple[int, int, Tensor, float, int]] = []
     for a, b in pairs:
         one, other = (_seen(grid, v, n) for v, n in zip(views, (a, b), strict=True))

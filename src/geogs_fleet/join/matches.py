@@ -30,6 +30,7 @@ from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import Keyframe, KeyframeTable
 from geogs_fleet.join.links import loaded_keyframes
 from geogs_fleet.join.part import Node, Part, PartViews, opened
+from geogs_fleet.join.records import read_record, write_record
 
 Directed = tuple[Node, Node]
 """An edge: source and target."""
@@ -49,17 +50,6 @@ class Depths:
         """Let a keyframe, the one at a place in the part, have its depths."""
         keyframe.inverse_depth, keyframe.information = self.inverse[place], self.information[place]
         keyframe.moving = self.moving[place]
-
-    def save(self, path: Path) -> None:
-        """Write all to a file."""
-        np.savez(path, inverse=self.inverse, information=self.information, moving=self.moving)
-
-    @staticmethod
-    def load(path: Path) -> "Depths":
-        """Read what ``save`` wrote."""
-        with np.load(path, allow_pickle=False) as file:
-            names = ("inverse", "information", "moving")
-            return Depths(*(torch.from_numpy(file[name]) for name in names))
 
 
 @dataclass(frozen=True)
@@ -84,8 +74,8 @@ class Member:
     def depths(self) -> Depths:
         """As they are now."""
         if self.adjusted is not None:
-            return Depths.load(self.adjusted)
-        views, scale = PartViews.load(self.views), self.scale.float()[:, None]
+            return read_record(Depths, self.adjusted)
+        views, scale = read_record(PartViews, self.views), self.scale.float()[:, None]
         inverse, known = torch.from_numpy(views.inverse_depth), torch.from_numpy(views.information)
         return Depths(inverse * scale, known / scale.square(), torch.zeros_like(known).bool())
 
@@ -145,16 +135,6 @@ class Matches:
             found[(a, i), (b, j)] = PackedEdge(position, weight, poses[0], poses[1], depth, damping)
         return found
 
-    def save(self, path: Path) -> None:
-        """Write all to a file."""
-        np.savez(path, **vars(self))
-
-    @staticmethod
-    def load(path: Path) -> "Matches":
-        """Read what ``save`` wrote."""
-        with np.load(path, allow_pickle=False) as file:
-            return Matches(**{name: file[name] for name in file.files})
-
 
 @dataclass(frozen=True)
 class Matched:
@@ -190,13 +170,13 @@ def match(
     segment = KeyframeTable.on(grid, operator.encode).new_set()
     known: dict[Directed, PackedEdge] = {}
     for path in before:
-        known |= Matches.load(path).edges(as_found=True)
+        known |= read_record(Matches, path).edges(as_found=True)
     seen = {node for ends in known for node in ends} if known else _near(own, others)
     ids: dict[Node, int] = {}
     results = {member.number: opened(member.part) for member in members}
     for member in members:
         places = [k for n, k in member.nodes if member is own or (n, k) in seen]
-        views, depths = PartViews.load(member.views), member.depths()
+        views, depths = read_record(PartViews, member.views), member.depths()
         result = results[member.number]
         loaded = loaded_keyframes(segment, operator, result, views, places, member.T_cw)
         for place, keyframe in loaded.items():
@@ -223,7 +203,7 @@ def match(
     for member, path in zip(members, after, strict=True):
         its = {pair: e for pair, e in found.items() if pair[0][0] == member.number}
         leaving = Matches.of(its, shift, grid.size)
-        leaving.save(path)
+        write_record(path, leaving)
         ends.append(leaving.ends)
     return Matched(np.concatenate(ends), len(stale))
 
@@ -278,7 +258,7 @@ def _near(own: Member, others: Sequence[Member]) -> set[Node]:
     """Keyframes of others that are no further from one of its own than what they show."""
     around, near = _centres(own), set[Node]()
     for other in others:
-        depth = PartViews.load(other.views).median_depth / other.scale.numpy()
+        depth = read_record(PartViews, other.views).median_depth / other.scale.numpy()
         away = np.linalg.norm(_centres(other)[:, None] - around, axis=2).min(axis=1)
         near |= {(other.number, int(place)) for place in np.nonzero(away < depth)[0]}
     return near

@@ -16,6 +16,7 @@ from geogs.loop.features import FeatureExtractor
 from geogs.threads import on_one_torch_thread
 from geogs.world.grid import SampleGrid
 from geogs.world.loops import Features
+from geogs_fleet.join.records import write_record
 
 DEVIATION = 0.01
 """Relative deviation of a depth that a map was trained to show."""
@@ -58,29 +59,6 @@ class PartViews:
         middle = np.median(self.inverse_depth, axis=1, keepdims=True)
         return PartViews(self.T_cw, self.timestamp, middle, 0 * middle, ())
 
-    def save(self, path: Path) -> None:
-        """Write all to a file."""
-        counts = np.array([len(f) for f in self.features], np.int64)
-        none = np.zeros((0, 2), np.float32), np.zeros((0, 32), np.uint8)
-        np.savez(
-            path, T_cw=self.T_cw, timestamp=self.timestamp, inverse_depth=self.inverse_depth,
-            information=self.information, counts=counts,
-            pixels=np.concatenate([none[0], *(f.pixels for f in self.features)]),
-            descriptors=np.concatenate([none[1], *(f.descriptors for f in self.features)]),
-        )  # fmt: skip
-
-    @staticmethod
-    def load(path: Path) -> "PartViews":
-        """Read what ``save`` wrote."""
-        with np.load(path, allow_pickle=False) as file:
-            ends = np.cumsum(file["counts"])[:-1]
-            pixels, descriptors = (np.split(file[k], ends) for k in ("pixels", "descriptors"))
-            features = tuple(map(Features, pixels, descriptors))
-            return PartViews(
-                file["T_cw"], file["timestamp"], file["inverse_depth"], file["information"],
-                features[: len(file["T_cw"])],
-            )  # fmt: skip
-
 
 @on_one_torch_thread
 def describe(part: Part, camera: Camera, file: Path, device: str = "cpu") -> int:
@@ -101,7 +79,7 @@ def describe(part: Part, camera: Camera, file: Path, device: str = "cpu") -> int
         result.views.T_cw, result.views.timestamp, np.stack(depths), np.stack(known),
         tuple(features),
     )  # fmt: skip
-    views.save(file)
+    write_record(file, views)
     return len(depths)
 
 
