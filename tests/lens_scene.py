@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import torch
 
-from geogs.bundle.lens import Lens, LensBlock
+from geogs.bundle.lens import LensBlock, RadialLens
 from geogs.bundle.problem import BundleProblem
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp
@@ -15,7 +15,7 @@ GRID = SampleGrid(CAMERA)
 
 
 def lens_problem(
-    lens: Lens, frames: int = 5, noise: float = 0.0, seed: int = 0, motion: float = 1.0
+    lens: RadialLens, frames: int = 5, noise: float = 0.0, seed: int = 0, motion: float = 1.0
 ) -> BundleProblem:
     """Views of smooth random depth about 2 units away; noise in pixels, weights to match."""
     g = torch.Generator().manual_seed(7)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from geogs.bundle.lens import Lens, LensBlock, lens_rays
+from geogs.bundle.lens import LensBlock, RadialLens, lens_rays
 from geogs.bundle.projection import relative_motion
 from geogs.geometry.lie import retract
 from lens_scene import CAMERA, GRID, lens_problem
@@ -14,10 +14,10 @@ from oracles.calibration_reference import reproject
 
 @pytest.mark.parametrize("k1", [0.0, 0.15, -0.2])
 def test_jacobians_match_autograd(k1):
-    p = lens_problem(Lens(CAMERA, k1))
+    p = lens_problem(RadialLens(CAMERA, k1))
     T = relative_motion(p.T_cw, p.source, p.target)[:1]
     pixels, d = GRID.pixels.double(), p.inverse_depth[:1].double()
-    block = LensBlock(Lens(CAMERA, k1), pixels)
+    block = LensBlock(RadialLens(CAMERA, k1), pixels)
     fast = block.linearise(p.T_cw, p.source[:1], p.target[:1], d)
 
     def moved(xi, unknowns, delta):
@@ -37,7 +37,7 @@ def test_jacobians_match_autograd(k1):
 
 
 def test_the_lens_is_that_of_opencv():
-    lens = Lens(CAMERA, -0.12)
+    lens = RadialLens(CAMERA, -0.12)
     K, distortion = CAMERA.matrix().numpy(), np.array([-0.12, 0, 0, 0])
     pixels = GRID.pixels.double()
     rays = lens_rays(lens, pixels).rays

@@ -9,7 +9,7 @@ import torch
 
 from geogs.bundle.base import BundleOptions
 from geogs.bundle.flow_term import PinholeFlow, linearised_sources
-from geogs.bundle.lens import Lens, LensBlock
+from geogs.bundle.lens import LensBlock, RadialLens
 from geogs.bundle.shared import OPTIONS, SharedFlow, SharedSchur, solve_shared
 from geogs.bundle.terms import BundleState
 from lens_scene import CAMERA, GRID, disturbed, lens_problem
@@ -17,7 +17,7 @@ from oracles.calibration_reference import gauss_newton_step
 
 
 def test_edges_are_those_of_the_tracker_where_the_lens_is_its_pinhole():
-    lens = Lens(CAMERA)
+    lens = RadialLens(CAMERA)
     problem = disturbed(lens_problem(lens, frames=4, noise=0.5), 0.01, 0.03)
     options = BundleOptions(huber=1.0, depth_damping=1e-3)
     state = BundleState(problem.T_cw, problem.inverse_depth, LensBlock(lens, GRID.pixels))
@@ -39,7 +39,7 @@ def test_edges_are_those_of_the_tracker_where_the_lens_is_its_pinhole():
 
 @pytest.mark.parametrize("huber", [0.5, 50.0])
 def test_one_step_matches_the_dense_equations(huber):
-    lens = Lens(CAMERA, 0.05)
+    lens = RadialLens(CAMERA, 0.05)
     problem = disturbed(lens_problem(lens.moved(0.02, 0.01), frames=3), 0.01, 0.03)
     xi, unknowns, delta = gauss_newton_step(problem, CAMERA, GRID.pixels, 0.05, huber, 1e-5)
     block = LensBlock(lens, GRID.pixels, radial=True)
@@ -62,9 +62,9 @@ def test_one_step_matches_the_dense_equations(huber):
 
 
 def test_recovers_focal_length_and_radial_term():
-    truth = Lens(CAMERA, -0.1)
+    truth = RadialLens(CAMERA, -0.1)
     start = disturbed(lens_problem(truth), 0.01, 0.05)
-    guess = Lens(CAMERA).moved(math.log(1.25))
+    guess = RadialLens(CAMERA).moved(math.log(1.25))
     options = replace(OPTIONS, iterations=40, huber=100.0)
     block = LensBlock(guess, GRID.pixels, radial=True)
     result = solve_shared(start, block, options, least_decrease=1e-9)
@@ -78,8 +78,8 @@ def test_recovers_focal_length_and_radial_term():
 def test_deviations_are_those_of_repeated_measurements():
     errors, deviations = [], []
     for seed in range(16):
-        problem = lens_problem(Lens(CAMERA), frames=8, noise=0.3, seed=seed)
-        result = solve_shared(problem, LensBlock(Lens(CAMERA), GRID.pixels, radial=True))
+        problem = lens_problem(RadialLens(CAMERA), frames=8, noise=0.3, seed=seed)
+        result = solve_shared(problem, LensBlock(RadialLens(CAMERA), GRID.pixels, radial=True))
         lens = result.block.lens
         errors.append([math.log(lens.camera.fx / CAMERA.fx), lens.k1])
         deviations.append(result.covariance.diagonal().sqrt().tolist())
@@ -90,8 +90,8 @@ def test_deviations_are_those_of_repeated_measurements():
 
 
 def test_what_is_no_variable_stays():
-    problem = lens_problem(Lens(CAMERA, 0.05).moved(0.1))
-    lens = Lens(CAMERA, 0.05)
+    problem = lens_problem(RadialLens(CAMERA, 0.05).moved(0.1))
+    lens = RadialLens(CAMERA, 0.05)
     fixed = solve_shared(problem, LensBlock(lens, GRID.pixels, focal=False))
     assert fixed.block.lens == lens
     assert not fixed.covariance.any()
@@ -103,8 +103,8 @@ def test_what_is_no_variable_stays():
 
 
 def test_matches_that_are_not_finite_are_reported():
-    problem = lens_problem(Lens(CAMERA))
+    problem = lens_problem(RadialLens(CAMERA))
     problem.pixels[0, 0] = torch.nan
-    result = solve_shared(problem, LensBlock(Lens(CAMERA), GRID.pixels))
+    result = solve_shared(problem, LensBlock(RadialLens(CAMERA), GRID.pixels))
     assert not result.finite
-    assert result.block.lens == Lens(CAMERA)
+    assert result.block.lens == RadialLens(CAMERA)

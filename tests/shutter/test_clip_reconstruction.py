@@ -4,14 +4,14 @@ import numpy as np
 import torch
 
 from geogs.geometry.lie import so3_exp
-from geogs.shutter.clip_reconstruction import Reconstruction
+from geogs.shutter.clip_reconstruction import ClipReconstruction
 
 
-def sample() -> Reconstruction:
+def sample() -> ClipReconstruction:
     rng = np.random.default_rng(3)
     R = np.stack([so3_exp(torch.tensor(w)).numpy() for w in rng.normal(0, 0.2, (4, 3))])
     points = np.column_stack([rng.uniform(-0.6, 0.6, (7, 2)), rng.uniform(0.1, 1.5, 7)])
-    return Reconstruction(R, rng.normal(0, 0.2, (4, 3)), points)
+    return ClipReconstruction(R, rng.normal(0, 0.2, (4, 3)), points)
 
 
 def test_projections_one_by_one():

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from geogs.shutter import row_adjustment
-from geogs.shutter.clip_reconstruction import Reconstruction
+from geogs.shutter.clip_reconstruction import ClipReconstruction
 from geogs.shutter.first_reconstruction import first_reconstruction
 from geogs.shutter.row_adjustment import NODES, interpolation, interpolation_slope, readout_equation
 from row_by_row import FOCAL, clip_of, scattered, shaken
@@ -18,7 +18,7 @@ def tracks():
 
 
 @pytest.fixture(scope="module")
-def start(tracks) -> Reconstruction:
+def start(tracks) -> ClipReconstruction:
     found = first_reconstruction(tracks, 1.2 / FOCAL)
     assert found is not None
     return found
@@ -40,7 +40,7 @@ def test_interpolation_is_exact_for_polynomials(tracks):
     np.testing.assert_allclose(interpolation_slope(tracks, READOUT), slope, rtol=1e-3, atol=0.02)
 
 
-def errors(tracks, at: Reconstruction, readout: float) -> np.ndarray:
+def errors(tracks, at: ClipReconstruction, readout: float) -> np.ndarray:
     """One by one, 0 where nothing is seen."""
     share, count = interpolation(tracks, readout), len(tracks.times)
     projected, left = at.projected(), np.zeros_like(tracks.plane)

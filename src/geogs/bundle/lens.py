@@ -23,23 +23,23 @@ _LEAST_SLOPE = 0.1
 
 
 @dataclass(frozen=True)
-class Lens:
+class RadialLens:
     """A pinhole behind one radial term; the aspect and the principal point are known."""
 
     camera: Camera
     k1: float = 0.0
 
-    def moved(self, log_focal: float, k1: float = 0.0) -> "Lens":
+    def moved(self, log_focal: float, k1: float = 0.0) -> "RadialLens":
         """With the focal length times ``exp(log_focal)`` and ``k1`` added to the radial term."""
         c, factor = self.camera, math.exp(log_focal)
-        return Lens(replace(c, fx=c.fx * factor, fy=c.fy * factor), self.k1 + k1)
+        return RadialLens(replace(c, fx=c.fx * factor, fy=c.fy * factor), self.k1 + k1)
 
 
 @dataclass(frozen=True)
 class LensBlock:
     """A lens as a block of unknowns: log of the focal length, and k1."""
 
-    lens: Lens
+    lens: RadialLens
     pixels: Float[Tensor, "p 2"]
     """Of the cells."""
     focal: bool = True
@@ -118,7 +118,7 @@ class LensRays:
     """d x / d log f and d x / d k1 are these factors times x, and alike for y."""
 
 
-def lens_rays(lens: Lens, pixels: Float[Tensor, "p 2"]) -> LensRays:
+def lens_rays(lens: RadialLens, pixels: Float[Tensor, "p 2"]) -> LensRays:
     """Undistort pixels: Newton's method on the radius, s (1 + k1 s^2) = s_distorted."""
     c, k1 = lens.camera, lens.k1
     centre, focal = pixels.new_tensor([c.cx, c.cy]), pixels.new_tensor([c.fx, c.fy])
@@ -137,7 +137,7 @@ def lens_rays(lens: Lens, pixels: Float[Tensor, "p 2"]) -> LensRays:
     )
 
 
-def _to_pixels(lens: Lens, x: Float[Tensor, "e p 2"]) -> Float[Tensor, "e p 2"]:
+def _to_pixels(lens: RadialLens, x: Float[Tensor, "e p 2"]) -> Float[Tensor, "e p 2"]:
     c = lens.camera
     growth = 1 + lens.k1 * x.square().sum(-1, keepdim=True)
     return x * growth * x.new_tensor([c.fx, c.fy]) + x.new_tensor([c.cx, c.cy])

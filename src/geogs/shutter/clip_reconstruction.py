@@ -12,7 +12,7 @@ _NEAREST = 1e-3
 
 
 @dataclass(frozen=True)
-class Reconstruction:
+class ClipReconstruction:
     """A rigid scene and the way of the camera through it, up to scale."""
 
     R: Float[np.ndarray, "k 3 3"]
@@ -72,7 +72,7 @@ class Reconstruction:
 
     def stepped(
         self, poses: Float[np.ndarray, "k 6"], points: Float[np.ndarray, "n 3"]
-    ) -> "Reconstruction":
+    ) -> "ClipReconstruction":
         """After rotations on the left and moves of the poses, and moves of the points.
 
         The median inverse depth is one again afterwards.
@@ -82,7 +82,7 @@ class Reconstruction:
         R = np.swapaxes(turned.reshape(columns.shape), 1, 2)
         t, moved = self.t + poses[:, 3:], self.points + points
         scale = max(float(np.median(np.abs(moved[:, 2]))), 1e-9)
-        return Reconstruction(R, t * scale, moved / [1, 1, scale])
+        return ClipReconstruction(R, t * scale, moved / [1, 1, scale])
 
     def _turned(self) -> Float[np.ndarray, "k n 3"]:
         rays = np.concatenate([self.points[:, :2], np.ones((len(self.points), 1))], axis=1)

@@ -5,7 +5,7 @@ from jaxtyping import Bool, Float
 
 from geogs.geometry.least_squares import Policy, Step, minimise
 from geogs.geometry.robust import geman_mcclure_weight
-from geogs.shutter.clip_reconstruction import Reconstruction
+from geogs.shutter.clip_reconstruction import ClipReconstruction
 from geogs.shutter.clip_tracks import LEAST_POINTS, ClipTracks
 from geogs.shutter.epipolar import RelativePose, relative_pose
 
@@ -17,7 +17,7 @@ _FEWEST = 8
 """Points that tell a pose; an image with fewer has that of the image before."""
 
 
-def first_reconstruction(tracks: ClipTracks, tolerance: float) -> Reconstruction | None:
+def first_reconstruction(tracks: ClipTracks, tolerance: float) -> ClipReconstruction | None:
     """Poses and points from what is seen, all rows taken to be seen at once.
 
     Args:
@@ -47,11 +47,11 @@ def first_reconstruction(tracks: ClipTracks, tolerance: float) -> Reconstruction
         return None
     R, t = np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3))
     for way in (range(middle + 1, count), range(middle - 1, -1, -1)):
-        here = Reconstruction(np.eye(3)[None], np.zeros((1, 3)), points)
+        here = ClipReconstruction(np.eye(3)[None], np.zeros((1, 3)), points)
         for k in way:
             here = _located(here, tracks.plane[k], tracks.seen[k], 3 * tolerance)
             R[k], t[k] = here.R[0], here.t[0]
-    return Reconstruction(R, t, points)
+    return ClipReconstruction(R, t, points)
 
 
 def inverse_depths(
@@ -69,16 +69,16 @@ def inverse_depths(
 
 
 def _located(
-    near: Reconstruction,
+    near: ClipReconstruction,
     plane: Float[np.ndarray, "n 2"],
     seen: Bool[np.ndarray, "n"],
     tolerance: float,
-) -> Reconstruction:
+) -> ClipReconstruction:
     """The pose of one image, from that of a near one; the points stay where they are."""
     if seen.sum() < _FEWEST:
         return near
 
-    def linearised(at: Reconstruction) -> tuple[np.ndarray, np.ndarray]:
+    def linearised(at: ClipReconstruction) -> tuple[np.ndarray, np.ndarray]:
         error = plane - at.projected()[0]
         by_pose = at.derivatives_by_pose()[0].reshape(-1, 6)
         weight = seen * geman_mcclure_weight((error**2).sum(1) / tolerance**2)
@@ -86,8 +86,8 @@ def _located(
         return weighted.T @ by_pose, weighted.T @ error.ravel()
 
     def step(
-        at: Reconstruction, linear: tuple[np.ndarray, np.ndarray], damping: float
-    ) -> Step[Reconstruction]:
+        at: ClipReconstruction, linear: tuple[np.ndarray, np.ndarray], damping: float
+    ) -> Step[ClipReconstruction]:
         normal, right = linear
         raised = normal + (damping * np.trace(normal) + 1e-12) * np.eye(6)
         step = np.linalg.solve(raised, right)

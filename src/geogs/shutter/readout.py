@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from geogs.geometry.least_squares import Policy, Step, minimise
-from geogs.shutter.clip_reconstruction import Reconstruction
+from geogs.shutter.clip_reconstruction import ClipReconstruction
 from geogs.shutter.clip_tracks import ClipTracks, clip_tracks
 from geogs.shutter.first_reconstruction import first_reconstruction
 from geogs.shutter.neighbours import Image
@@ -85,7 +85,7 @@ class _Adjusted:
     """A clip and what is known of it so far."""
 
     tracks: ClipTracks
-    reconstruction: Reconstruction
+    reconstruction: ClipReconstruction
 
 
 @dataclass(frozen=True)
@@ -197,8 +197,8 @@ def _started(clip: Sequence[Image], camera: RollingCamera) -> _Adjusted | None:
 
 
 def _global_shutter_step(
-    at: Reconstruction, equation: ReadoutEquation, damping: float
-) -> Step[Reconstruction]:
+    at: ClipReconstruction, equation: ReadoutEquation, damping: float
+) -> Step[ClipReconstruction]:
     return Step(equation.stepped(at, 0.0))
 
 

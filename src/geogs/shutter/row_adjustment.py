@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from geogs.geometry.robust import geman_mcclure_weight
-from geogs.shutter.clip_reconstruction import Reconstruction
+from geogs.shutter.clip_reconstruction import ClipReconstruction
 from geogs.shutter.clip_tracks import ClipTracks
 
 NODES = 5
@@ -40,14 +40,14 @@ class ReadoutEquation:
     by_readout: tuple[Float[np.ndarray, "k 6"], Float[np.ndarray, "n 3"]]
     """By how much more they step for each second that the readout grows."""
 
-    def stepped(self, reconstruction: Reconstruction, readout: float) -> Reconstruction:
+    def stepped(self, reconstruction: ClipReconstruction, readout: float) -> ClipReconstruction:
         """Where poses and points go as the readout takes its own step."""
         poses, points = (a + readout * b for a, b in zip(self.still, self.by_readout, strict=True))
         return reconstruction.stepped(poses, points)
 
 
 def readout_equation(
-    tracks: ClipTracks, at: Reconstruction, readout: float, tolerance: float
+    tracks: ClipTracks, at: ClipReconstruction, readout: float, tolerance: float
 ) -> ReadoutEquation:
     """Linearised, what is measured weighted by Geman and McClure's loss.
 

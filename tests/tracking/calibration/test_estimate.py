@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import tracking_scenes
-from geogs.bundle.lens import Lens, lens_rays
+from geogs.bundle.lens import RadialLens, lens_rays
 from geogs.geometry.camera import Camera
 from geogs.tracking.calibration import stretch
 from geogs.tracking.calibration.estimate import self_calibrate
@@ -65,7 +65,7 @@ def test_the_radial_term_of_a_pinhole_is_none():
 @pytest.mark.long
 def test_finds_the_radial_term_of_a_distorting_lens():
     wide = Camera(CAMERA.fx, CAMERA.fy, 143.5, 107.5, 288, 216)
-    rays = lens_rays(Lens(CAMERA, -0.15), torch.from_numpy(pixels_of(CAMERA))).rays.numpy()
+    rays = lens_rays(RadialLens(CAMERA, -0.15), torch.from_numpy(pixels_of(CAMERA))).rays.numpy()
     at = (rays @ wide.matrix().numpy().T.astype(np.float32))[:, :2]
     at = at.reshape(CAMERA.height, CAMERA.width, 2)
     video = [

@@ -12,7 +12,7 @@ from torch import Tensor
 from geogs.bundle.base import BundleOptions, BundleResult
 from geogs.bundle.camera_system import DenseCameraSystem
 from geogs.bundle.cuda.depth_terms import KernelDepthTerms
-from geogs.bundle.cuda.edges import EdgeArrays, LinearisedEdges, joined_edges
+from geogs.bundle.cuda.linear_edges import EdgeArrays, LinearisedEdges, joined_edges
 from geogs.bundle.problem import BundleProblem
 from geogs.bundle.terms import BundleState
 from geogs.geometry.least_squares import Policy, Step, minimise

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from geogs.bundle.cuda.edges import block_size
+from geogs.bundle.cuda.linear_edges import block_size
 from geogs.gpu.kernels import kernels_for
 from geogs.gpu.transfer import to_device
 from geogs.world.grid import OFFSET, STRIDE, SampleGrid

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from geogs.bundle.cuda.edges import block_size, edges_by_frame
+from geogs.bundle.cuda.linear_edges import block_size, edges_by_frame
 from geogs.bundle.problem import MotionProblem
 from geogs.gpu.kernels import kernels_for
 from geogs.gpu.transfer import to_device

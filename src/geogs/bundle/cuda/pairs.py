@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from geogs.bundle.cuda.edges import block_size
+from geogs.bundle.cuda.linear_edges import block_size
 from geogs.gpu.kernels import Kernel, kernels_for
 from geogs.gpu.transfer import to_device
 from geogs.world.keyframes import KeyframeSet

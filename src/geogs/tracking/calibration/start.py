@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from geogs.bundle.lens import Lens, LensBlock
+from geogs.bundle.lens import LensBlock, RadialLens
 from geogs.bundle.problem import BundleProblem
 from geogs.bundle.select import grid_fields
 from geogs.bundle.shared import OPTIONS, SharedResult, solve_shared
@@ -31,7 +31,7 @@ _HUBERS = (30.0, 10.0, 3.0)
 class Start:
     """Keyframes placed by one candidate; on the CPU."""
 
-    lens: Lens
+    lens: RadialLens
     T_cw: Float[Tensor, "n 4 4"]
     inverse_depth: Float[Tensor, "p"]
     """Of the first keyframe."""
@@ -72,7 +72,7 @@ def try_candidate(camera: Camera, flows: list[FlowMatch], min_parallax: float) -
         torch.stack(poses), rows, torch.zeros(n - 1, dtype=torch.long), torch.arange(1, n),
         free, torch.ones(n, dtype=torch.bool), pixels=pixels, weight=weight,
     )  # fmt: skip
-    result = _adjusted(problem, LensBlock(Lens(camera), grid.pixels))
+    result = _adjusted(problem, LensBlock(RadialLens(camera), grid.pixels))
     if result is None:
         return None
     edge = max(camera.width, camera.height)
