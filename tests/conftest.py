@@ -39,7 +39,11 @@ Once = Callable[[str, Callable[[Path], object]], Path]
 
 @pytest.hookimpl(tryfirst=True)  # before pytest-xdist asks for the groups
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Tests that share what their module has made go to one process, which makes it once."""
+    """Tests that share what their module has made go to one process, which makes it once.
+
+    Tests of the whole system come first: the last ones are short, so no process waits for another.
+    """
+    items.sort(key=lambda item: item.get_closest_marker("system") is None)
     for item in items:
         used = item._fixtureinfo.name2fixturedefs.values()
         if any(made.scope == "module" for definitions in used for made in definitions):
