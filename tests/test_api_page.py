@@ -52,9 +52,9 @@ def test_every_way_in_has_an_example():
         "Slam(",
         "process(",
         ".pose",
-        "mesh()",
+        "slam_mesh(",
         "render(",
-        "save(",
-        "Slam.load(",
+        "save_slam(",
+        "load_slam(",
     ):
         assert name in text

@@ -70,7 +70,7 @@ def test_the_map_is_asked_and_kept(first):
 def test_another_video_is_found_in_a_saved_map(first, small_room):
     _, _, folder = first
     slam = geogs.load_slam(folder, config())
-    held = {i: slam.world.keyframes[i].T_cw for i in slam.segments.main.held}
+    held = {i: slam.world.keyframes[i].T_cw for i in slam.segments.main.segment.fixed}
     before = len(slam.snapshot())
     source = geogs.open_source(small_room, InputConfig(start=SECOND, stop=END))
     poses = list(geogs.track(source, slam=slam))

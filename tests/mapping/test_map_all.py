@@ -46,7 +46,7 @@ def followed(frames, defers_map: bool, count: int = FRAMES) -> Slam:
 def both(frames):
     """A finished system with a map that grew on the way, and one with a map of the end."""
     online, after = followed(frames, False), followed(frames, True)
-    assert online.mapper.table.mapped
+    assert online.executor.mapper.table.mapped
     assert not after.executor.mapper.table.mapped
     for slam in (online, after):
         slam.finish()
@@ -56,7 +56,7 @@ def both(frames):
 def test_poses_are_the_same_and_the_surface_nearly(both):
     online, after = both
     assert np.array_equal(online.trajectory().T_wc, after.trajectory().T_wc)
-    assert after.executor.mapper.table.mapped == online.mapper.table.mapped
+    assert after.executor.mapper.table.mapped == online.executor.mapper.table.mapped
     assert after.world.is_refined
     for a, b in zip(online.renders(), after.renders(), strict=True):
         seen = (a.depth > 0) & (b.depth > 0)

@@ -130,7 +130,7 @@ def test_frames_move_with_their_keyframe_when_a_correction_came_meanwhile(stream
 def test_a_follower_knows_what_it_cannot_do(stream):
     tracker, n = until_keyframe(stream)
     follower = tracker.follower()
-    assert follower.deviation().position < 0.1
+    assert follower.deviation()().position < 0.1
     black = np.zeros_like(stream[n].image)
     assert follower.follow(replace(stream[n], image=black)) is None
     assert follower.follow(replace(stream[n], image=black[:-8])) is None

@@ -183,7 +183,7 @@ def test_a_state_of_another_camera_or_without_a_keyframe_is_one_sentence(tracked
     first, *rest = state.segments.segments[0].keyframes.members
     wrong = [
         replace(state, unmapped=[99]),
-        replace(state, mapper=replace(copied(state.mapper), mapped=[99])),
+        replace(state, map=replace(copied(state.map), mapped=[99])),
         with_keyframes(state, rest),
         with_keyframes(state, [first, first]),
     ]

@@ -11,12 +11,12 @@ from geogs.types import Trajectory
 def test_rates_count_every_stage():
     """Up to the end of the stream loops, map updates and adjustments on the way count, too."""
     stopwatch = Stopwatch()
-    stopwatch.seconds = {
+    stopwatch.times.seconds = {
         "reading": 0.25, "tracking": 2.0, "loops": 0.5, "mapping": 1.0, "pose refinement": 0.25,
         "global bundle adjustment": 0.75, "map update": 0.25,
     }  # fmt: skip
     stopwatch.end_stream()
-    stopwatch.seconds |= {"map update": 0.5, "final mapping": 2.75, "mesh": 2.0}
+    stopwatch.times.seconds |= {"map update": 0.5, "final mapping": 2.75, "mesh": 2.0}
     summary = time_summary(stopwatch, frames=40)
     assert summary["frames_per_second"] == {"until_stream_end": 8.0, "with_final_stages": 4.0}
     assert summary["seconds"] == {**stopwatch.seconds, "total": 10.0}
@@ -24,7 +24,7 @@ def test_rates_count_every_stage():
 
 def test_what_knows_no_stream_has_one_rate():
     stopwatch = Stopwatch()
-    stopwatch.seconds = {"depth": 4.0, "mesh": 1.0}
+    stopwatch.times.seconds = {"depth": 4.0, "mesh": 1.0}
     assert time_summary(stopwatch, 10)["frames_per_second"] == {"with_final_stages": 2.0}
 
 

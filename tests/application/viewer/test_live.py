@@ -77,9 +77,9 @@ class FakeSlam:
         T = [torch.eye(4, dtype=torch.float64) for _ in range(3)]
         for i, pose in enumerate(T):
             pose[0, 3] = i
-        self.keyframes, self.T_cw = SimpleNamespace(poses=dict(enumerate(T))), T[2]
+        keyframes, loops = SimpleNamespace(poses=dict(enumerate(T))), SimpleNamespace(loops=[1])
+        self.world, self.T_cw = SimpleNamespace(keyframes=keyframes, loops=loops), T[2]
         self.segments = SimpleNamespace(keyframe_ids=[0, 1, 2])
-        self.loops = SimpleNamespace(detector=SimpleNamespace(loops=[1]))
 
     def snapshot(self) -> MapSnapshot:
         n = MOST_DISKS + 1

@@ -17,7 +17,7 @@ from geogs.types import Frame, MapSnapshot
 if TYPE_CHECKING:
     from geogs.application.results.result import Result
     from geogs.pose_estimate import PoseEstimate
-from geogs.slam import Slam
+    from geogs.slam import Slam
 
 MAX_TIME_FRACTION = 0.02
 """Of the time that looking may take, of the run's thread and of the viewer's together."""
@@ -99,7 +99,7 @@ class LiveViewer(RunObserver):
         # The table keeps places of keyframes that another thread may be removing.
         T_wc = [np.linalg.inv(slam.world.keyframes.poses[i].numpy()) for i in ids]
         seen = slam.T_cw if status.state.value == "tracking" else None
-        loops = len(slam.loops.detector.loops)
+        loops = len(slam.world.loops.loops)
         words = (
             f"frame {status.frames}: {status.state.value}\n\n{status.keyframes} keyframes, "
             f"{status.disks} disks, {loops} loops"

@@ -8,7 +8,7 @@ from geogs.types import Frame
 if TYPE_CHECKING:
     from geogs.application.results.result import Result
     from geogs.pose_estimate import PoseEstimate
-from geogs.slam import Slam
+    from geogs.slam import Slam
 
 
 class RunObserver:

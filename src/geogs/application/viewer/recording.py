@@ -13,7 +13,7 @@ from geogs.types import Frame
 if TYPE_CHECKING:
     from geogs.application.results.result import Result
     from geogs.pose_estimate import PoseEstimate
-from geogs.slam import Slam
+    from geogs.slam import Slam
 
 _EVERY = 5
 """Keyframes between two records of the map and of the path."""

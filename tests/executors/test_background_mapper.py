@@ -8,8 +8,8 @@ import torch
 
 from geogs.beside import RightOfWay
 from geogs.config import preset
+from geogs.executors.background_mapper import PATIENT, BackgroundMapper
 from geogs.geometry.camera import Camera
-from geogs.mapping.background import PATIENT, BackgroundMapper
 from geogs.mapping.mapper import Mapper, never_pause
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import KeyframeTable
