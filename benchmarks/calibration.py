@@ -28,7 +28,7 @@ from geogs.geometry.camera import Camera
 from geogs.io.sources.sniff import open_source
 from geogs.loop.global_bundle import global_bundle
 from geogs.threads import on_one_torch_thread
-from geogs.tracking.calibration.estimate import self_calibrate
+from geogs.tracking.calibration.self_calibration import self_calibrate
 from geogs.tracking.tracker import lone_tracker
 from geogs.types import Frame, Trajectory
 

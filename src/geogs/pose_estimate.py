@@ -8,7 +8,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from geogs.geometry.lie import se3_inverse
-from geogs.tracking.pose_deviation import DeviationOf, PoseDeviation
+from geogs.tracking.locate.pose_deviation import DeviationOf, PoseDeviation
 from geogs.world.segments import TrackState
 
 

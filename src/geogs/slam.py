@@ -24,8 +24,8 @@ from geogs.scene_mask import SceneMask
 from geogs.slam_output import SlamOutput
 from geogs.stopwatch import Stopwatch
 from geogs.threads import on_one_torch_thread
-from geogs.tracking.certainty import certainty
 from geogs.tracking.flow.operator_choice import build_operator
+from geogs.tracking.keyframe_uncertainty import keyframe_uncertainty
 from geogs.tracking.segments import Segments
 from geogs.tracking.tracker import TrackResult
 from geogs.types import Frame, MetricScale
@@ -188,7 +188,7 @@ class Slam(SlamOutput):
             global_bundle(main, lambda f, _: progress("bundle adjustment", f))
         if self.world.is_ended:
             with self.stopwatch("uncertainty"):
-                self.world.uncertainty = certainty(main).calibrated(main)
+                self.world.uncertainty = keyframe_uncertainty(main).calibrated(main)
         with self.stopwatch("global bundle adjustment"):
             self.loops.replaced_by_bundle()
         self.world.adjusted = len(main.segment.ids)

@@ -18,7 +18,7 @@ from geogs.mapping.rendered import MapRenderer, SurfaceMaps
 from geogs.pose_estimate import PoseEstimate
 from geogs.stopwatch import Stopwatch
 from geogs.threads import on_one_torch_thread
-from geogs.tracking.moving import moving_share
+from geogs.tracking.graph.dynamic_cells import dynamic_fraction
 from geogs.tracking.segments import Segments
 from geogs.types import (
     MapSnapshot,
@@ -110,7 +110,7 @@ class SlamOutput:
             "refined": self.world.is_refined,
             "metric_scale": None if self.metric_scale is None else asdict(self.metric_scale),
             "poses": self._pose_agreement(),
-            "moving": round(moving_share(self.segments.main.keyframes), 4),
+            "moving": round(dynamic_fraction(self.segments.main.keyframes), 4),
             "segments": [asdict(segment) for segment in self.segments.summary()],
             "not_started": self.world.segments.why_not or None,
             "loops": len(self.world.loops.loops),
@@ -124,7 +124,7 @@ class SlamOutput:
             return None
         return {
             "motions": agreement.motions,
-            "fitting": round(agreement.share, 4),
+            "fitting": round(agreement.fitting, 4),
             "used": agreement.used,
         }
 

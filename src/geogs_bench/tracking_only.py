@@ -19,7 +19,7 @@ from geogs.io.writers.uncertainty import write_uncertainty
 from geogs.loop.global_bundle import global_bundle
 from geogs.slam import Slam
 from geogs.threads import on_one_torch_thread
-from geogs.tracking.certainty import certainty
+from geogs.tracking.keyframe_uncertainty import keyframe_uncertainty
 
 
 @on_one_torch_thread
@@ -56,7 +56,7 @@ def track_to_folder(
         slam.loops.update(slam.segments.finish(), True)
         global_bundle(slam.segments.main)
         trajectory = slam.trajectory()
-        known = certainty(slam.segments.main).calibrated(slam.segments.main)
+        known = keyframe_uncertainty(slam.segments.main).calibrated(slam.segments.main)
         write_tum_trajectory(folder / "trajectory.tum", trajectory)
         write_uncertainty(folder / "trajectory_uncertainty.csv", trajectory, known)
         summary["lost_spans"] = lost_spans(trajectory)

@@ -16,8 +16,8 @@ from geogs.config import CalibrationConfig, Config, InputConfig
 from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.sniff import open_source
 from geogs.io.writers.intrinsics_file import write_intrinsics
-from geogs.tracking.calibration import estimate, stretch
-from geogs.tracking.calibration.estimate import SelfCalibration
+from geogs.tracking.calibration import self_calibration, stretch
+from geogs.tracking.calibration.self_calibration import SelfCalibration
 from tracking_scenes import CAMERA, pose, render
 
 
@@ -99,7 +99,7 @@ def test_a_camera_that_stands_still_leaves_the_guess(tmp_path):
 
 
 def test_what_is_given_or_not_wanted_is_left_alone(video, monkeypatch):
-    monkeypatch.setattr(estimate, "self_calibrate", pytest.fail)
+    monkeypatch.setattr(self_calibration, "self_calibrate", pytest.fail)
     given = open_source(video, InputConfig(intrinsics="140,140,95.5,71.5"))
     assert self_calibrated(given, Config()) is given
     guessed = open_source(video)
@@ -122,7 +122,7 @@ def test_ctrl_c_goes_on_with_the_guess(video, monkeypatch):
         report(0.1)
         pytest.fail("the request was not heard")
 
-    monkeypatch.setattr(estimate, "self_calibrate", interrupted)
+    monkeypatch.setattr(self_calibration, "self_calibrate", interrupted)
     source = open_source(video)
     listener = Listener()
     assert self_calibrated(source, Config(), progress=listener, stop=Interruption()) is source

@@ -11,7 +11,7 @@ from geogs.config import Config
 from geogs.loop import global_bundle
 from geogs.loop.global_bundle import global_options
 from geogs.tracking.flow.operator_choice import build_operator
-from geogs.tracking.graph import FrameGraph
+from geogs.tracking.graph.frame_graph import FrameGraph
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import KeyframeTable
 from geogs.world.loops import RelativePoses

@@ -12,9 +12,9 @@ from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp, se3_inverse
 from geogs.loop.global_bundle import global_bundle
 from geogs.loop.row_correction import _readout_gradient, _Search, correct_rows
-from geogs.tracking.row_errors import RowErrors
+from geogs.tracking.frames.pose_filling import row_errors
+from geogs.tracking.frames.row_errors import RowErrors
 from geogs.tracking.tracker import Tracker, lone_tracker
-from geogs.tracking.trajectory import row_errors
 from geogs.types import FlowMatch, SeenRows
 from geogs.world.grid import SampleGrid
 from geogs.world.segments import TrackState

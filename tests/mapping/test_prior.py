@@ -15,8 +15,8 @@ from geogs.mapping.keyframe_views import MapView
 from geogs.mapping.view_arrays import MapCameras
 from geogs.priors.base import PriorMaps
 from geogs.tracking.flow.classical_flow import ClassicalFlow
-from geogs.tracking.graph import FrameGraph
-from geogs.tracking.keyframe_priors import KeyframePriors
+from geogs.tracking.graph.frame_graph import FrameGraph
+from geogs.tracking.keyframes.monocular_priors import KeyframePriors
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import Keyframe, KeyframeTable
 from keyframe_samples import Sample, segment_of, views_of

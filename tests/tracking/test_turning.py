@@ -12,9 +12,9 @@ from geogs.errors import TrackingLost
 from geogs.evaluation.trajectory_errors import rotation_angle
 from geogs.tracking import start_up
 from geogs.tracking.flow.operator_choice import build_operator
-from geogs.tracking.graph import FrameGraph
-from geogs.tracking.initialise import FORGIVING, Attempt, initialise
+from geogs.tracking.graph.frame_graph import FrameGraph
 from geogs.tracking.segments import Segments
+from geogs.tracking.start.initialise import FORGIVING, Attempt, initialise
 from geogs.types import Frame, Trajectory
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import KeyframeTable
@@ -89,7 +89,7 @@ def test_a_start_that_is_far_off_is_tried_again_with_a_quarter_more(
     adjust = FrameGraph.adjust
     monkeypatch.setattr(FrameGraph, "adjust", adjusted)
     monkeypatch.setattr(start_up, "initialise", tried)
-    monkeypatch.setattr("geogs.tracking.initialise.MAX_DEVIATION", 1e-3)
+    monkeypatch.setattr("geogs.tracking.start.initialise.MAX_DEVIATION", 1e-3)
     path = [pose(0.08 * np.sin(0.2 * k), yaw=0.3 * np.sin(0.1 * k)) for k in range(40)]
     _, results = run(frames(path), replace(CONFIG, init_keyframes=8))
     assert results[-1].state is TrackState.INITIALIZING

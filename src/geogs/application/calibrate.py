@@ -17,7 +17,7 @@ from geogs.shutter.shutter import Shutter
 
 if TYPE_CHECKING:
     from geogs.shutter.readout import FoundReadout
-    from geogs.tracking.calibration.estimate import SelfCalibration
+    from geogs.tracking.calibration.self_calibration import SelfCalibration
 
 T = TypeVar("T")
 F = TypeVar("F")
@@ -43,12 +43,12 @@ def self_calibrated(
                 "--intrinsics fx,fy,cx,cy for a better result."
             )
         return source
-    from geogs.tracking.calibration.estimate import self_calibrate
+    from geogs.tracking.calibration.self_calibration import self_calibrate
 
     found = _found_in(
         source.linked_frames(), "calibration", progress, stop,
         lambda frames, report: self_calibrate(
-            frames, source.camera, config.calibration.radial, torch.device(device), config.seed,
+            frames, source.camera, config.calibration.radial, torch.device(device),
             report, source.mask, source.black_is_masked,
         ),
     )  # fmt: skip

@@ -16,7 +16,7 @@ from geogs.io.sources.calibration import Calibration
 from geogs.io.sources.sniff import Stream
 from geogs.reconstruction import Reconstruction
 from geogs.stopwatch import Stopwatch
-from geogs.tracking.gaps import bridged
+from geogs.tracking.frames.interpolation import bridged
 from geogs.types import Uncertainty
 
 

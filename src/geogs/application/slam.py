@@ -27,7 +27,7 @@ from geogs.mesh.triangle_mesh import Mesh
 from geogs.pose_estimate import PoseEstimate
 from geogs.slam import Slam
 from geogs.threads import on_one_torch_thread
-from geogs.tracking.held import add_saved_keyframes
+from geogs.tracking.keyframes.saved_keyframes import add_saved_keyframes
 
 
 def track(

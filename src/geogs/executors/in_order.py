@@ -11,7 +11,7 @@ from torch import Tensor
 from geogs.executors.background_mapper import BackgroundMapper
 from geogs.mapping.mapper import Mapper
 from geogs.stopwatch import Stopwatch
-from geogs.tracking.pose_deviation import DeviationOf
+from geogs.tracking.locate.pose_deviation import DeviationOf
 from geogs.tracking.segments import Recall, Segments
 from geogs.tracking.tracker import TrackResult
 from geogs.types import Frame, MapSnapshot, PoseCorrection

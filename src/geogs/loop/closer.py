@@ -28,7 +28,7 @@ from geogs.loop.constraints import (
     thinned,
 )
 from geogs.loop.detect import LoopDetector
-from geogs.tracking.motion import Recognition
+from geogs.tracking.locate.frame_locator import Recognition
 from geogs.tracking.segments import Segments
 from geogs.tracking.tracker import Tracker, TrackResult
 from geogs.types import PoseCorrection

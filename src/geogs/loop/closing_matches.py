@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from geogs.loop.matched_edges import MatchedEdges
-from geogs.tracking.moving import still_weight
+from geogs.tracking.graph.dynamic_cells import static_weight
 from geogs.world.edges import Edge, Pair, edge_matches
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import KeyframeSet
@@ -46,7 +46,7 @@ def closing_matches(
         torch.tensor([place[i] for i, _ in pairs]),
         torch.tensor([place[j] for _, j in pairs]),
         pixels.cpu().float(),
-        still_weight(segment, pairs, pixels, weight).cpu().float(),
+        static_weight(segment, pairs, pixels, weight).cpu().float(),
     )
 
 

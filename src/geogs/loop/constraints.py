@@ -10,7 +10,7 @@ from torch import Tensor
 from geogs.geometry.lie import scaled, se3_inverse, sim3_inverse, sim3_log
 from geogs.loop.matched_edges import MatchedEdges
 from geogs.loop.relative_pose import RelativePoseOptions, relative_poses
-from geogs.tracking.moving import still_weight
+from geogs.tracking.graph.dynamic_cells import static_weight
 from geogs.world.edges import Edge, Pair, edge_matches
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import KeyframeSet, KeyframeTable
@@ -50,7 +50,7 @@ def of_edges(segment: KeyframeSet, edges: Mapping[Pair, Edge]) -> RelativePoses:
         torch.tensor([slot[i] for i, _ in pairs]),
         torch.tensor([slot[j] for _, j in pairs]),
         pixels.float(),
-        still_weight(segment, pairs, pixels, weight).float(),
+        static_weight(segment, pairs, pixels, weight).float(),
     )
     return _named(relative_poses(grid, matched, segment.poses(ids), False, FITTED), ids)
 

@@ -11,7 +11,7 @@ from geogs.bundle.projection import project
 from geogs.geometry.lie import scaled, se3_inverse, so3_log
 from geogs.loop.verification import DEPTH_TOLERANCE, MAX_SCALE, MIN_CONSISTENT
 from geogs.tracking.flow.flow_operator import FlowOperator
-from geogs.tracking.motion import FrameLocator, FrameMotion
+from geogs.tracking.locate.frame_locator import FrameLocator, FrameMotion
 from geogs.types import FlowMatch
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import Keyframe

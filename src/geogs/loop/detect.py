@@ -15,8 +15,8 @@ from geogs.geometry.lie import se3_inverse
 from geogs.loop.dense_check import dense_check
 from geogs.loop.search import SUPPRESSION, Depths, PlaceRecognition, Query
 from geogs.tracking.flow.flow_operator import FlowOperator
-from geogs.tracking.motion import Recognition
-from geogs.tracking.proximity import frame_distances
+from geogs.tracking.graph.proximity import frame_distances
+from geogs.tracking.locate.frame_locator import Recognition
 from geogs.world.keyframes import KeyframeTable
 from geogs.world.loops import Loop, LoopCandidate, LoopTable, VerifiedCandidate
 

@@ -4,8 +4,8 @@ from collections.abc import Callable, Sequence
 
 from geogs.bundle.base import BundleOptions
 from geogs.loop.row_correction import correct_rows
-from geogs.tracking.graph import HUBER
-from geogs.tracking.proximity import RADIUS, Pair, proximity_pairs
+from geogs.tracking.graph.frame_graph import HUBER
+from geogs.tracking.graph.proximity import RADIUS, Pair, proximity_pairs
 from geogs.tracking.tracker import Tracker
 from geogs.types import PoseCorrection
 
@@ -57,7 +57,7 @@ def global_bundle(
     free = [k for k in ids if k not in fixed]
     pairs = global_pairs(tracker, ids)
     graph.edges.clear()
-    odometry.look_at_all()
+    odometry.update_scale_by_all()
     batch = MATCHED_TOGETHER[store.grid.on_gpu]
     options = global_options()
     for n in range(ROUNDS if pairs else 0):
@@ -71,8 +71,8 @@ def global_bundle(
                 done = (n + start / len(stale)) / ROUNDS
                 progress(done, "matching all keyframes")
         graph.adjust(list(graph.edges), free if fixed else ids[1:], free, options)
-        graph.judge_moving(set(free), config.moving)
-        odometry.look_at_all()
+        graph.update_dynamic(set(free), config.moving)
+        odometry.update_scale_by_all()
     correct_rows(tracker, free if fixed else ids[1:], free, options)
     for start in range(0, len(free), PRIORS_TOGETHER):
         tracker.map.priors.adjust(free[start : start + PRIORS_TOGETHER])  # moves no pose

@@ -1,10 +1,10 @@
 """Rows of a rolling shutter in the adjustment of all keyframes, by the trajectory that it gives.
 
 The matches are those of images whose rows were rectified before anything was known of the scene.
-What is left follows from the adjusted trajectory and depths (``tracking/row_errors.py``), taken off
-the matches, and everything is adjusted again. Flow is not measured anew. A readout that was found
-in the video, and may be off by some percent, is found once more on the way: it is right where all
-matches together would become neither better nor worse with another.
+What is left follows from the adjusted trajectory and depths (``frames/row_errors.py`` of tracking),
+taken off the matches, and everything is adjusted again. Flow is not measured anew. A readout that
+was found in the video, and may be off by some percent, is found once more on the way: it is right
+where all matches together would become neither better nor worse with another.
 """
 
 from collections.abc import Iterator, Sequence
@@ -17,11 +17,11 @@ from geogs.bundle.base import BundleOptions
 from geogs.bundle.flow_term import weighed_residuals
 from geogs.bundle.projection import project
 from geogs.geometry.lie import se3_inverse
-from geogs.tracking.graph import FrameGraph
-from geogs.tracking.moving import still_weight
-from geogs.tracking.row_errors import RowErrors, edge_shifts
+from geogs.tracking.frames.pose_filling import row_errors, shift_rows
+from geogs.tracking.frames.row_errors import RowErrors, edge_shifts
+from geogs.tracking.graph.dynamic_cells import static_weight
+from geogs.tracking.graph.frame_graph import FrameGraph
 from geogs.tracking.tracker import Tracker
-from geogs.tracking.trajectory import row_errors, shift_rows
 from geogs.world.edges import PackedEdge, Pair, edge_matches, in_steps
 from geogs.world.grid import SampleGrid
 
@@ -98,7 +98,7 @@ def _readout_gradient(
     for (part, before), (_, after) in both:
         T, depth = _relative(graph, part), keyframes.inverse_depths([i for i, _ in part])
         pixels, weight = edge_matches(grid, [measured[pair] for pair in part])
-        weight = still_weight(keyframes, part, pixels, weight)
+        weight = static_weight(keyframes, part, pixels, weight)
         p = project(grid.camera, grid.rays, T, depth)
         middle = pixels + (before + after) / 2
         residual, weight = weighed_residuals(p, middle, weight, options.huber)

@@ -12,7 +12,7 @@ from geogs.config import LoopConfig
 from geogs.loop.retrieval import AppearanceIndex
 from geogs.loop.verification import DepthView, TwoViewVerifier
 from geogs.threads import worker_count
-from geogs.tracking.motion import Recognition
+from geogs.tracking.locate.frame_locator import Recognition
 from geogs.world.grid import SampleGrid
 from geogs.world.loops import Features, LoopCandidate, LoopTable, VerifiedCandidate
 

@@ -8,9 +8,10 @@ from torch import Tensor
 
 from geogs.config import TrackingConfig
 from geogs.geometry.lie import se3_inverse
-from geogs.tracking.keyframe_choice import calls_for_keyframe
-from geogs.tracking.motion import MIN_KNOWN, MIN_TEXTURE, FrameLocator, FrameMotion
-from geogs.tracking.pose_deviation import DeviationOf, deviation_of
+from geogs.tracking.keyframes.keyframe_choice import calls_for_keyframe
+from geogs.tracking.locate.frame_locator import MIN_KNOWN, FrameLocator, FrameMotion
+from geogs.tracking.locate.pose_deviation import DeviationOf, deviation_of
+from geogs.tracking.matching.flow_chain import MIN_TEXTURE
 from geogs.types import Frame
 from geogs.world.keyframes import Keyframe
 from geogs.world.segments import LastFrame

@@ -9,13 +9,13 @@ from geogs.bundle.base import BundleOptions
 from geogs.bundle.select import grid_fields
 from geogs.config import TrackingConfig
 from geogs.geometry.lie import se3_inverse
-from geogs.tracking.graph import HUBER
-from geogs.tracking.motion import FrameMotion
-from geogs.tracking.moving import carried
-from geogs.tracking.proximity import RADIUS, frame_distances, proximity_pairs
-from geogs.tracking.segment_map import SegmentMap
-from geogs.tracking.sensing import stands_alone
-from geogs.tracking.start_up import MIN_KEYFRAMES
+from geogs.tracking.graph.dynamic_cells import propagated
+from geogs.tracking.graph.frame_graph import HUBER
+from geogs.tracking.graph.proximity import RADIUS, frame_distances, proximity_pairs
+from geogs.tracking.keyframes.segment_map import SegmentMap
+from geogs.tracking.keyframes.sensor_depth import stands_alone
+from geogs.tracking.locate.frame_locator import FrameMotion
+from geogs.tracking.start.start_up import MIN_KEYFRAMES
 from geogs.types import Frame
 from geogs.world.edges import edge_matches
 from geogs.world.frames import RelativeRotation
@@ -72,7 +72,7 @@ class LocalMapping:
             T, anchor.inverse_depth, anchor.information
         )
         if self.segment.is_metric:
-            self.map.sensing.join(keyframe, frame.depth)
+            self.map.sensor.join(keyframe, frame.depth)
         return keyframe
 
     def update(
@@ -88,9 +88,9 @@ class LocalMapping:
             self.keyframes.grid, [self.graph.edges[keyframe.id, anchor]]
         )
         moving = self.keyframes[anchor].moving
-        keyframe.moving = carried(self.keyframes.grid, moving, pixels, weight)
+        keyframe.moving = propagated(self.keyframes.grid, moving, pixels, weight)
         self._adjust()
-        self.map.odometry.look()
+        self.map.odometry.update_scale()
         return self._cull()
 
     def _connect(self, id: int, anchor: int) -> None:
@@ -110,8 +110,8 @@ class LocalMapping:
         breaks = self.segment.breaks
         broken = [p for p in pairs if any(p[0] < b <= p[1] for b in breaks)]
         there, back = frame_distances(self.keyframes, broken + [p[::-1] for p in broken]).chunk(2)
-        apart = {p for p, d in zip(broken, (there + back).tolist(), strict=True) if d == torch.inf}
-        pairs = [p for p in pairs if p not in apart]
+        unseen = {p for p, d in zip(broken, (there + back).tolist(), strict=True) if d == torch.inf}
+        pairs = [p for p in pairs if p not in unseen]
         self.graph.measure({*pairs, (anchor, id)}, fine=False)
 
     def _adjust(self) -> None:
@@ -127,7 +127,7 @@ class LocalMapping:
                 edges, poses, depths, BundleOptions(iterations=ITERATIONS, huber=HUBER)
             )
             if n == 0:
-                self.graph.judge_moving(deep, self.config.moving)
+                self.graph.update_dynamic(deep, self.config.moving)
             if n == ROUNDS - 1:
                 priors.adjust(depths)
         self.graph.release(moving)

@@ -13,7 +13,7 @@ from geogs.config import Config
 from geogs.errors import TrackingLost
 from geogs.priors.base import MonocularPrior
 from geogs.tracking.flow.flow_operator import FlowOperator
-from geogs.tracking.motion import Recognition
+from geogs.tracking.locate.frame_locator import Recognition
 from geogs.tracking.tracker import Tracker, TrackResult
 from geogs.types import Frame, Trajectory
 from geogs.world.keyframes import KeyframeTable

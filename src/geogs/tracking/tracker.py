@@ -13,19 +13,20 @@ from geogs.errors import InputError, TrackingLost
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_inverse
 from geogs.priors.base import MonocularPrior
-from geogs.tracking.early_frames import locate_early_frames
 from geogs.tracking.flow.flow_operator import FlowOperator
 from geogs.tracking.flow.operator_choice import build_operator
 from geogs.tracking.follower import Follower
-from geogs.tracking.keyframe_choice import KeyframeChoice
+from geogs.tracking.frames.pose_filling import solve_trajectory
+from geogs.tracking.keyframes.keyframe_choice import KeyframeChoice
+from geogs.tracking.keyframes.segment_map import SegmentMap
 from geogs.tracking.local_mapping import LocalMapping
-from geogs.tracking.localisation import Localiser
-from geogs.tracking.motion import MIN_KNOWN, MIN_TEXTURE, FrameMotion, Recognition
-from geogs.tracking.orientation_chain import Followed, OrientationFollower
-from geogs.tracking.pose_deviation import DeviationOf, deviation_of
-from geogs.tracking.segment_map import SegmentMap
-from geogs.tracking.start_up import StartUp
-from geogs.tracking.trajectory import solve_trajectory
+from geogs.tracking.locate.frame_locator import MIN_KNOWN, FrameMotion, Recognition
+from geogs.tracking.locate.localiser import Localiser
+from geogs.tracking.locate.orientation_follower import OrientationFollower
+from geogs.tracking.locate.pose_deviation import DeviationOf, deviation_of
+from geogs.tracking.matching.flow_chain import MIN_TEXTURE
+from geogs.tracking.start.early_frames import locate_early_frames
+from geogs.tracking.start.start_up import StartUp
 from geogs.types import Frame, Trajectory
 from geogs.world.frames import FrameRecord, RelativeRotation
 from geogs.world.grid import SampleGrid
@@ -145,11 +146,12 @@ class Tracker:
             if motion is not None:
                 return self._take(frame, encoded, motion)
         followed = self._orientation.follow(status.orientation, frame, encoded)
+        rotations = [] if followed is None else [followed.rotation]
         motion = self._localiser.relocalise(encoded, followed)
         if motion is not None:
-            return self._take(frame, encoded, motion, followed)
+            return self._take(frame, encoded, motion, rotations)
         status.frames_lost += followed is None or not followed.is_pure
-        return self._lose(frame, followed)
+        return self._lose(frame, rotations)
 
     def rejoin(self, frame: Frame, recognised: Sequence[Recognition]) -> TrackResult | None:
         """Take the next frame, which looks like some keyframes; None if it is at none of them."""
@@ -259,43 +261,37 @@ class Tracker:
 
     def _begin(self) -> None:
         """The map has just been started."""
-        self.map.odometry.look()
+        self.map.odometry.update_scale()
         locator, keyframes = self._localiser.locator, self.keyframes
         locate_early_frames(self.map.recorder, keyframes, locator, MIN_KNOWN)
         newest = keyframes[keyframes.ids[-1]]
-        self.segment.status.last = _at(newest, newest.timestamp)
+        self.segment.status.last = LastFrame.at(newest)
 
-    def _lose(self, frame: Frame, followed: Followed | None = None) -> TrackResult:
-        """The frame has no pose; no orientation, either, unless it was ``followed``."""
+    def _lose(self, frame: Frame, rotations: Sequence[RelativeRotation] = ()) -> TrackResult:
+        """The frame has no pose; no orientation, either, unless rotations say one."""
         status = self.segment.status
         if status.has_map:
             status.lose()
             status.misses += 1
-        rotations = [] if followed is None else [followed.rotation]
         self.map.recorder.add_untracked(frame.index, frame.timestamp, rotations)
-        state = status.state if followed is None else TrackState.TURNING
+        state = TrackState.TURNING if rotations else status.state
         return TrackResult(state, active=self.local.active)
 
     def _take(
-        self, frame: Frame, encoded: Any, motion: FrameMotion, followed: Followed | None = None
+        self,
+        frame: Frame,
+        encoded: Any,
+        motion: FrameMotion,
+        rotations: Sequence[RelativeRotation] = (),
     ) -> TrackResult:
         """The frame has been located: make it a keyframe where it is one, else log it."""
         status, self._motion = self.segment.status, motion
-        anchor = self.keyframes[motion.keyframe]
-        last = LastFrame(
-            anchor.id, motion.T_cw @ se3_inverse(anchor.T_cw), None, anchor.scale, frame.timestamp,
-            0.0,
-        )  # fmt: skip
-        before, T_before = status.last, self.T_cw
-        if before is not None and T_before is not None and status.state is TrackState.TRACKING:
-            last.velocity = motion.T_cw @ se3_inverse(T_before)
-            last.interval = frame.timestamp - before.timestamp
+        anchor, last = self.keyframes[motion.keyframe], self._located(frame, motion)
         if status.state is TrackState.LOST:
             self.segment.breaks.append(self.keyframes.table.next_id)
         status.state, status.misses, status.frames_lost = TrackState.TRACKING, 0, 0
-        self._orientation.located(status.orientation, frame, encoded)
         status.last = last
-        rotations = [] if followed is None else [followed.rotation]
+        self._orientation.located(status.orientation, frame, encoded)
         # Where few frames were measured, each of these is worth a keyframe.
         is_first_measured = (
             frame.depth is not None and self.segment.is_metric and anchor.measured is None
@@ -304,9 +300,20 @@ class Tracker:
             self.map.recorder.add(frame, encoded, anchor.id, last.T_rel, motion.match, rotations)
             return TrackResult(status.state, active=self.local.active)
         keyframe = self.local.insert(frame, encoded, motion)
-        status.last = _at(keyframe, keyframe.timestamp, last.velocity, last.interval)
+        status.last = LastFrame.at(keyframe, last.velocity, last.interval)
         self._unfinished = _Unfinished(keyframe, motion, rotations)
         return TrackResult(status.state, keyframe.id) if self._defers else self.complete()
+
+    def _located(self, frame: Frame, motion: FrameMotion) -> LastFrame:
+        """Where the frame is, and how the camera has moved since the one before."""
+        status, anchor, T_before = self.segment.status, self.keyframes[motion.keyframe], self.T_cw
+        velocity, interval, before = None, 0.0, status.last
+        is_tracking = status.state is TrackState.TRACKING
+        if before is not None and T_before is not None and is_tracking:
+            velocity = motion.T_cw @ se3_inverse(T_before)
+            interval = frame.timestamp - before.timestamp
+        T_rel = motion.T_cw @ se3_inverse(anchor.T_cw)
+        return LastFrame(anchor.id, T_rel, velocity, anchor.scale, frame.timestamp, interval)
 
 
 def lone_tracker(
@@ -322,14 +329,3 @@ def lone_tracker(
     operator = operator or build_operator(config.tracking, grid)
     segment = VideoSegment(keyframes=KeyframeTable.on(grid, operator.encode).new_set())
     return Tracker(segment, operator, config, prior, defers)
-
-
-def _at(
-    keyframe: Keyframe,
-    timestamp: float,
-    velocity: Float[Tensor, "4 4"] | None = None,
-    interval: float = 0.0,
-) -> LastFrame:
-    """The last frame where it is a keyframe."""
-    eye = torch.eye(4, dtype=torch.float64)
-    return LastFrame(keyframe.id, eye, velocity, keyframe.scale, timestamp, interval)

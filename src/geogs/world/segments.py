@@ -10,6 +10,7 @@ from enum import Enum
 from typing import Any, Literal
 
 import numpy as np
+import torch
 from jaxtyping import Float, Float32, Float64, UInt8
 from torch import Tensor
 
@@ -52,6 +53,14 @@ class LastFrame:
     """Seconds."""
     interval: float
     """Seconds that the motion took."""
+
+    @staticmethod
+    def at(
+        keyframe: Keyframe, velocity: Float[Tensor, "4 4"] | None = None, interval: float = 0.0
+    ) -> "LastFrame":
+        """The last frame where it is a keyframe."""
+        eye = torch.eye(4, dtype=torch.float64)
+        return LastFrame(keyframe.id, eye, velocity, keyframe.scale, keyframe.timestamp, interval)
 
     def T_cw(self, keyframe: Keyframe) -> Float[Tensor, "4 4"]:
         """World to camera by the keyframe's present pose and scale."""

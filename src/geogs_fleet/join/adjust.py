@@ -27,7 +27,7 @@ from geogs.geometry.lie import move
 from geogs.loop.global_bundle import CONVERGED, ROUNDS, global_options
 from geogs.threads import on_one_torch_thread
 from geogs.tracking.flow.operator_choice import build_operator
-from geogs.tracking.graph import FrameGraph
+from geogs.tracking.graph.frame_graph import FrameGraph
 from geogs.world.edges import PackedEdge
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import KeyframeTable
@@ -263,7 +263,7 @@ def follow(job: StepJob) -> PoseSums | None:
         depth = grid_fields(grid).fill(depth, information)
         for id, field in zip(own, depth, strict=True):
             graph.keyframes[id].inverse_depth = field
-        graph.judge_moving(set(own), job.config.tracking.moving)
+        graph.update_dynamic(set(own), job.config.tracking.moving)
     none = torch.zeros(grid.size, dtype=torch.bool)
     moving = [graph.keyframes[id].moving for id in own]
     held = torch.stack([none if m is None else m for m in moving])

@@ -22,9 +22,9 @@ from geogs.loop.global_bundle import (
 )
 from geogs.threads import on_one_torch_thread
 from geogs.tracking.flow.operator_choice import build_operator
-from geogs.tracking.graph import FrameGraph
-from geogs.tracking.proximity import RADIUS, proximity_pairs
-from geogs.tracking.row_errors import RowErrors, edge_shifts
+from geogs.tracking.frames.row_errors import RowErrors, edge_shifts
+from geogs.tracking.graph.frame_graph import FrameGraph
+from geogs.tracking.graph.proximity import RADIUS, proximity_pairs
 from geogs.world.edges import PackedEdge, Pair, in_steps
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import Keyframe, KeyframeTable
@@ -239,7 +239,7 @@ def _row_errors(
                 if place in rows:
                     known[id] = rows[place]
         own = RowErrors(grid, known, numbers, replace(trajectory, T_wc=T_wc))
-        found = own if found is None else found.beside(own)
+        found = own if found is None else found.merged(own)
     return found
 
 

@@ -1,7 +1,7 @@
 """What a run tells of poses beside the images."""
 
 from geogs.application.scale.apply import sentences_on_poses
-from geogs.tracking.odometry import Agreement
+from geogs.tracking.graph.odometry import Agreement
 
 
 def test_poses_that_do_not_fit_are_told():

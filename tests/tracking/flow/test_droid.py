@@ -18,7 +18,7 @@ from geogs.geometry.camera import Camera
 from geogs.tracking.flow.droid import DroidFlow, DroidOptions
 from geogs.tracking.flow.droid_network import DroidNetwork, DroidSize
 from geogs.tracking.flow.flow_operator import FlowOperator
-from geogs.tracking.graph import FrameGraph
+from geogs.tracking.graph.frame_graph import FrameGraph
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import KeyframeTable
 from tracking_scenes import CAMERA, pose, render

@@ -12,7 +12,7 @@ from geogs.errors import InputError
 from geogs.io.sources.sniff import Stream
 from geogs.on_demand import OnDemand
 from geogs.slam import Slam
-from geogs.tracking.odometry import Agreement
+from geogs.tracking.graph.odometry import Agreement
 from geogs.types import MetricScale
 
 

@@ -1,6 +1,6 @@
 """Motion and scenes that do not tell the focal length: seen in the flow, without any camera.
 
-A camera that only turns, or that looks at a plane, moves its image by a homography. A general
+A camera that only rotates, or that looks at a plane, moves its image by a homography. A general
 scene under translation does not.
 """
 
@@ -13,13 +13,13 @@ import numpy as np
 from jaxtyping import Float
 
 from geogs.geometry.camera import Camera
-from geogs.tracking.calibration.keyframes import on_cpu, with_focal
+from geogs.tracking.calibration.views import on_cpu, with_focal
 from geogs.types import FlowMatch
 from geogs.world.grid import SampleGrid
 
 MAX_COST = 6.0
 """Mean cost of a match, in variances, above which no pinhole camera explains the flow."""
-PLANAR_SHARE = 0.9
+PLANAR_FRACTION = 0.9
 """Of the matches; where one homography explains so many in every view, the scene is a plane."""
 _TOLERANCE = 1 / 400
 """Of the long edge: deviation from a homography that is still explained by it."""
@@ -41,7 +41,7 @@ class HomographyFit:
     """How well homographies explain the flow from one view to others."""
 
     explained: float
-    """Share of the matches, in the view that fits least."""
+    """Fraction of the matches, in the view that fits least."""
     parallax: float
     """Pixels of median motion that rotation leaves, in the view where that is most, at the field
     of view for which it is least."""
@@ -57,7 +57,7 @@ def degeneracy(camera: Camera, flows: list[FlowMatch], min_parallax: float) -> D
         return Degeneracy.STILL
     if fit.parallax < min_parallax:
         return Degeneracy.TURNING
-    return Degeneracy.PLANAR if fit.explained > PLANAR_SHARE else None
+    return Degeneracy.PLANAR if fit.explained > PLANAR_FRACTION else None
 
 
 def fit_homographies(camera: Camera, flows: list[FlowMatch]) -> HomographyFit | None:

@@ -4,16 +4,16 @@ from collections.abc import Callable
 
 from geogs.threads import thread_map
 from geogs.tracking.calibration.degeneracy import MAX_COST, Degeneracy, degeneracy
-from geogs.tracking.calibration.growth import GrowingBundle
-from geogs.tracking.calibration.keyframes import View, ViewGatherer, flows_from_first
-from geogs.tracking.calibration.start import Start, candidates, try_candidate
-from geogs.tracking.calibration.sureness import relative_error
+from geogs.tracking.calibration.focal_candidates import Start, candidates, try_candidate
+from geogs.tracking.calibration.focal_uncertainty import relative_error
+from geogs.tracking.calibration.growing_bundle import GrowingBundle
+from geogs.tracking.calibration.views import View, ViewGatherer, flows_from_first
 from geogs.tracking.flow.flow_operator import FlowOperator
 from geogs.types import FlowMatch
 from geogs.world.grid import SampleGrid
 
 FRAMES = 600
-"""Frames of the video that are looked at, at most, in all of its stretches: bounds the time."""
+"""Frames of the video that are used, at most, in all of its stretches: bounds the time."""
 START_KEYFRAMES = 12
 """Keyframes of a stretch that are solved first, and by which it then grows."""
 KEYFRAMES = 36
@@ -89,7 +89,7 @@ class Stretch:
         return best if best.cost <= MAX_COST else Degeneracy.UNEXPLAINED
 
     def grow(self, start: Start) -> GrowingBundle | None:
-        """Adjust, with more keyframes until the focal length is sure; None if it fails at once."""
+        """Adjust, with more keyframes until the focal length is known; None if it fails at once."""
         bundle = GrowingBundle(self.grid, self.operator, self._views, start)
         best = None
         while True:

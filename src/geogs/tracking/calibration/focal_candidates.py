@@ -1,0 +1,94 @@
+"""A first focal length: several fields of view tried on the same flows from one keyframe.
+
+Flow needs no focal length, so it is measured once. Every candidate places the keyframes by the
+essential matrix and PnP and is adjusted, the focal length with the rest; the least cost wins.
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from geogs.bundle.lens import LensBlock, RadialLens
+from geogs.bundle.problem import BundleProblem
+from geogs.bundle.select import grid_fields
+from geogs.bundle.shared import OPTIONS, SharedResult, solve_shared
+from geogs.geometry.camera import Camera
+from geogs.tracking.calibration.views import on_cpu, stacked, with_focal
+from geogs.tracking.matching.pnp import pnp
+from geogs.tracking.matching.two_view import best_two_view, two_view
+from geogs.types import FlowMatch
+from geogs.world.grid import SampleGrid
+
+FIELDS_OF_VIEW = (50.0, 70.0, 95.0)
+"""Degrees along the longer side, besides that of the guess."""
+_HUBERS = (30.0, 10.0, 3.0)
+
+
+@dataclass(frozen=True)
+class Start:
+    """Keyframes placed by one candidate; on the CPU."""
+
+    lens: RadialLens
+    T_cw: Float[Tensor, "n 4 4"]
+    inverse_depth: Float[Tensor, "p"]
+    """Of the first keyframe."""
+    information: Float[Tensor, "p"]
+    cost: float
+    field_of_view: float
+    """Degrees from which it began."""
+
+
+def candidates(camera: Camera) -> list[Camera]:
+    """The guess and cameras of other fields of view."""
+    edge = max(camera.width, camera.height)
+    focals = [camera.fx, *(edge / 2 / math.tan(math.radians(a / 2)) for a in FIELDS_OF_VIEW)]
+    return [with_focal(camera, f) for f in focals]
+
+
+def try_candidate(camera: Camera, flows: list[FlowMatch], min_parallax: float) -> Start | None:
+    """Place and adjust the keyframes from one focal length; None where it shows no parallax."""
+    flows = [on_cpu(f) for f in flows]
+    grid = SampleGrid(camera)
+    found = best_two_view((two_view(camera, match) for match in flows[1::2]), min_parallax)
+    if found is None:
+        return None
+    best, view = 1 + 2 * found[0], found[1]
+    depth = grid_fields(grid).fill(view.inverse_depth, view.good.float())
+    poses = [torch.eye(4, dtype=torch.float64)]
+    for n, match in enumerate(flows):
+        T = view.T_ji if n == best else pnp(
+            grid, depth, match.pixels[0], view.good & match.sure()[0]
+        )  # fmt: skip
+        poses.append(poses[-1] if T is None else T)
+    pixels, weight = stacked(flows)
+    n = len(flows) + 1
+    free = torch.ones(n, dtype=torch.bool)
+    free[0] = False
+    rows = torch.cat([depth[None], torch.ones(n - 1, grid.size)])
+    problem = BundleProblem(
+        torch.stack(poses), rows, torch.zeros(n - 1, dtype=torch.long), torch.arange(1, n),
+        free, torch.ones(n, dtype=torch.bool), pixels=pixels, weight=weight,
+    )  # fmt: skip
+    result = _adjusted(problem, LensBlock(RadialLens(camera), grid.pixels))
+    if result is None:
+        return None
+    edge = max(camera.width, camera.height)
+    return Start(
+        result.block.lens, result.T_cw, result.inverse_depth[0], result.information[0], result.cost,
+        2 * math.degrees(math.atan(edge / 2 / camera.fx)),
+    )  # fmt: skip
+
+
+def _adjusted(problem: BundleProblem, block: LensBlock) -> SharedResult[LensBlock] | None:
+    """From forgiving to strict, always with the focal length."""
+    result = None
+    for huber in _HUBERS:
+        result = solve_shared(problem, block, replace(OPTIONS, iterations=10, huber=huber))
+        if not result.finite:
+            return None
+        block = result.block
+        problem = replace(problem, T_cw=result.T_cw, inverse_depth=result.inverse_depth)
+    return result

@@ -1,0 +1,164 @@
+"""Keyframes with poses, inverse depths and flow around a lens that still changes."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from geogs.bundle.lens import LensBlock
+from geogs.bundle.problem import BundleProblem
+from geogs.bundle.select import grid_fields
+from geogs.bundle.shared import SharedResult, solve_shared
+from geogs.tracking.calibration.focal_candidates import Start
+from geogs.tracking.calibration.views import View, on_cpu
+from geogs.tracking.flow.flow_operator import FlowOperator
+from geogs.tracking.matching.pnp import pnp
+from geogs.world.grid import SampleGrid
+
+OFFSETS = (1, 3, 6)
+"""Every keyframe is matched with those so many before it."""
+_STALE = 0.3
+"""Pixels of median motion of the reprojection after which a pair is matched again."""
+_TOGETHER = 16
+"""Pairs that are matched in one go."""
+
+
+@dataclass
+class _Edge:
+    pixels: Tensor
+    weight: Tensor
+    reprojection: Tensor
+    fine: bool
+
+
+class GrowingBundle:
+    """Views placed so far, and the edges between them; mutable. Poses are on the CPU."""
+
+    def __init__(
+        self, grid: SampleGrid, operator: FlowOperator, views: list[View], start: Start
+    ) -> None:
+        self.grid = grid
+        """Of the guess: of its camera nothing but the size is used."""
+        self._operator = operator
+        self.lens = start.lens
+        self._views = views[: len(start.T_cw)]
+        device = grid.device
+        depth, known = start.inverse_depth.to(device), start.information.to(device)
+        self._T = list(start.T_cw)
+        self._depth = [grid_fields(grid).fill(depth, known)]
+        self._information = [known]
+        for T in self._T[1:]:
+            d, i = grid_fields(self._pinhole).transfer(T, self._depth[0], known)
+            self._depth.append(d)
+            self._information.append(i)
+        self._edges: dict[tuple[int, int], _Edge] = {}
+        self.result: SharedResult[LensBlock] | None = None
+
+    def __len__(self) -> int:
+        return len(self._views)
+
+    @property
+    def _pinhole(self) -> SampleGrid:
+        """The grid of the present focal length."""
+        return SampleGrid(self.lens.camera, self.grid.device)
+
+    def place(self, view: View) -> bool:
+        """Append the next view by PnP on the last one's depth; False if that fails."""
+        assert view.step is not None
+        grid, step = self._pinhole, on_cpu(view.step)
+        plain, depth = SampleGrid(self.lens.camera), self._depth[-1].cpu()
+        good = step.sure()[0] & (self._information[-1].cpu() > 0)
+        T = pnp(plain, depth, step.pixels[0], good)
+        if T is None:
+            return False
+        self._views.append(view)
+        self._T.append(T @ self._T[-1])
+        d, i = grid_fields(grid).transfer(T, self._depth[-1], self._information[-1])
+        self._depth.append(d)
+        self._information.append(i)
+        return True
+
+    def measure(self, fine: bool, tick: Callable[[], None] = lambda: None) -> None:
+        """Match every pair that is new, was matched less finely, or whose reprojection moved."""
+        n = len(self)
+        pairs = [(j - k, j) for j in range(n) for k in OFFSETS if j >= k]
+        both = pairs + [(j, i) for i, j in pairs]
+        where = dict(zip(both, self._reprojections(both), strict=True))
+        stale = [p for p in pairs if any(self._moved(e, where, fine) for e in (p, p[::-1]))]
+        for at in range(0, len(stale), _TOGETHER):
+            tick()
+            chunk = stale[at : at + _TOGETHER]
+            first, second = ([self._views[p[k]].encoded for p in chunk] for k in (0, 1))
+            forward = torch.stack([where[p] for p in chunk])
+            backward = torch.stack([where[p[::-1]] for p in chunk])
+            matches = self._operator.measure(first, second, forward, backward, fine=fine)
+            for m, match in enumerate(matches):
+                for k, p in enumerate(chunk):
+                    edge = p if m == 0 else p[::-1]
+                    self._edges[edge] = _Edge(match.pixels[k], match.weight[k], where[edge], fine)
+
+    def _moved(
+        self, edge: tuple[int, int], where: dict[tuple[int, int], Tensor], fine: bool
+    ) -> bool:
+        known = self._edges.get(edge)
+        if known is None or (fine and not known.fine):
+            return True
+        used = known.weight[:, 0] > 0
+        moved = (where[edge] - known.reprojection).norm(dim=-1)[used]
+        return not len(moved) or float(moved.median()) > _STALE
+
+    def _reprojections(self, directed: list[tuple[int, int]]) -> Tensor:
+        source, target = (torch.tensor([e[k] for e in directed]) for k in (0, 1))
+        depth = torch.stack([self._depth[i] for i, _ in directed])
+        block = LensBlock(self.lens, self.grid.pixels)
+        return block.project(torch.stack(self._T), source, target, depth).pixels
+
+    def problem(self) -> BundleProblem:
+        """All edges; every pose but the first is free."""
+        directed = sorted(self._edges)
+        edges = [self._edges[e] for e in directed]
+        free = torch.ones(len(self), dtype=torch.bool)
+        free[0] = False
+        return BundleProblem(
+            torch.stack(self._T),
+            torch.stack(self._depth),
+            torch.tensor([i for i, _ in directed]),
+            torch.tensor([j for _, j in directed]),
+            free,
+            torch.ones_like(free),
+            pixels=torch.stack([e.pixels for e in edges]),
+            weight=torch.stack([e.weight for e in edges]),
+        )
+
+    def adjust(self, radial: bool) -> bool:
+        """Solve for everything, k1 if ``radial``, and take it over; False if that fails."""
+        result = self.solve(radial)
+        if not result.finite:
+            return False
+        self.result, self.lens = result, result.block.lens
+        self._T = list(result.T_cw)
+        self._information = list(result.information)
+        self._depth = list(grid_fields(self.grid).fill(result.inverse_depth, result.information))
+        self._normalise()
+        return True
+
+    def solve(self, radial: bool) -> SharedResult[LensBlock]:
+        """The solution, with k1 as a variable too if ``radial``; nothing is taken over."""
+        block = LensBlock(self.lens, self.grid.pixels, radial=radial)
+        return solve_shared(self.problem(), block)
+
+    def _normalise(self) -> None:
+        """Median depth 1, so that limits and thresholds mean the same everywhere."""
+        known = torch.cat([d[i > 0] for d, i in zip(self._depth, self._information, strict=True)])
+        if not len(known):
+            return
+        scale = float(known.median())
+        self._depth = [d / scale for d in self._depth]
+        self._information = [i * scale**2 for i in self._information]
+        moved = []
+        for T in self._T:
+            T = T.clone()
+            T[:3, 3] *= scale
+            moved.append(T)
+        self._T = moved

@@ -1,0 +1,112 @@
+"""The focal length of a video, from the video: what its stretches say, and a verdict."""
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool
+
+from geogs.config import TrackingConfig
+from geogs.geometry.camera import Camera
+from geogs.threads import on_one_torch_thread
+from geogs.tracking.calibration.degeneracy import Degeneracy
+from geogs.tracking.calibration.focal_uncertainty import Estimate, estimate, joined
+from geogs.tracking.calibration.stretch import FRAMES, Report, Stretch
+from geogs.tracking.calibration.views import ViewGatherer
+from geogs.tracking.flow.operator_choice import build_operator
+from geogs.types import Frame
+from geogs.world.grid import SampleGrid
+
+STRETCHES = 4
+"""Stretches of the video that are used, at most, each after the one before it: bounds the time."""
+CONFIDENT = 0.01
+"""Relative deviation of the focal length from which no other stretch is used."""
+UNRELIABLE = 0.1
+"""Relative deviation above which the focal length is not believed and the guess is kept, which may
+be as good."""
+
+
+@dataclass(frozen=True)
+class SelfCalibration:
+    """What the video says of its camera."""
+
+    camera: Camera
+    """Of the working image; the guess where there is a ``failure``."""
+    k1: float = 0.0
+    deviation: float = math.inf
+    """Standard deviation of the focal length, relative."""
+    deviation_k1: float | None = None
+    """Standard deviation of k1; none where it was not asked for."""
+    keyframes: int = 0
+    frames: int = 0
+    """That were used."""
+    failure: str | None = None
+    """Why the video does not tell; "the camera only turns", for the middle of a sentence."""
+
+
+@on_one_torch_thread
+def self_calibrate(
+    frames: Iterable[Frame],
+    camera: Camera,
+    radial: bool = False,
+    device: torch.device | str = "cpu",
+    report: Report = lambda fraction: None,
+    mask: Bool[np.ndarray, "h w"] | None = None,
+    black_is_masked: bool = False,
+) -> SelfCalibration:
+    """Estimate the focal length, and k1 if ``radial``, of the camera that took ``frames``.
+
+    Aspect and principal point of ``camera`` are believed, its focal length is only one of several
+    to start from. Flow is measured by the operator without a network. Stretch after stretch of the
+    video is used until all together are confident. ``report`` is called with the fraction done;
+    what it raises passes through. Outside a ``mask`` nothing is matched, nor what is quite black
+    where ``black_is_masked``.
+    """
+    grid = SampleGrid(camera, device)
+    operator = build_operator(TrackingConfig(operator="classical"), grid, mask, black_is_masked)
+    gatherer = ViewGatherer(iter(frames), grid, operator)
+    estimates: list[Estimate] = []
+    failure = ""
+    for n in range(STRETCHES):
+        found = _ask(Stretch(grid, operator, gatherer, radial, _part_of(report, n)))
+        if isinstance(found, Estimate):
+            estimates.append(found)
+        else:
+            failure = failure or found
+        if gatherer.frames >= FRAMES or gatherer.is_over:
+            break
+        if estimates and joined(estimates).deviation < CONFIDENT:
+            break
+    if not estimates:
+        return SelfCalibration(camera, frames=gatherer.frames, failure=failure)
+    report(1.0)
+    return _verdict(camera, radial, joined(estimates), gatherer.frames)
+
+
+def _ask(stretch: Stretch) -> Estimate | str:
+    """What the next stretch says, or why it says nothing."""
+    start = stretch.start()
+    if isinstance(start, Degeneracy):
+        return start.value
+    bundle = stretch.grow(start)
+    return (
+        "its motion could not be followed" if bundle is None else estimate(bundle, stretch.radial)
+    )
+
+
+def _part_of(report: Report, n: int) -> Report:
+    """Report the n-th stretch as half of what is left, as nobody knows whether there is another."""
+    return lambda done: report(1 - 0.5**n * (1 - done / 2))
+
+
+def _verdict(guess: Camera, radial: bool, found: Estimate, frames: int) -> SelfCalibration:
+    """The estimate, or why it is not believed."""
+    if not found.deviation < UNRELIABLE:
+        failure = f"its motion leaves the focal length unsure by {100 * found.deviation:.0f} %"
+        return SelfCalibration(guess, keyframes=found.keyframes, frames=frames, failure=failure)
+    deviation_k1 = found.deviation_k1 if radial else None
+    return SelfCalibration(
+        found.camera, found.k1, found.deviation, deviation_k1, found.keyframes, frames
+    )

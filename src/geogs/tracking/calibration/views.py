@@ -1,0 +1,119 @@
+"""Keyframes of a camera about which nothing is known, and the flow between them."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from geogs.config import TrackingConfig
+from geogs.geometry.camera import Camera
+from geogs.tracking.flow.filled import filled_flow, filled_positions
+from geogs.tracking.flow.flow_operator import FlowOperator
+from geogs.tracking.keyframes.keyframe_choice import calls_for_keyframe
+from geogs.tracking.matching.flow_chain import MIN_MATCHED, MIN_TEXTURE, FlowChain
+from geogs.tracking.matching.sparse_features import guided_flows
+from geogs.types import FlowMatch, Frame
+from geogs.world.grid import SampleGrid
+from geogs.world.segments import ChainedPositions
+
+
+@dataclass(frozen=True)
+class View:
+    """A keyframe without a pose."""
+
+    frame: Frame
+    encoded: Any
+    step: FlowMatch | None
+    """From the keyframe before it; None for the first."""
+
+
+class ViewGatherer:
+    """Takes keyframes by image motion alone, which needs no focal length."""
+
+    def __init__(self, frames: Iterator[Frame], grid: SampleGrid, operator: FlowOperator) -> None:
+        self._frames, self._grid, self._operator = frames, grid, operator
+        self._config = TrackingConfig()
+        self._chain = FlowChain(grid, operator)
+        self._positions = ChainedPositions()
+        self.frames = 0
+        """Frames taken so far."""
+        self.is_over = False
+        """Whether no frame is left."""
+
+    def gather(
+        self, views: list[View], count: int, limit: int, tick: Callable[[], None]
+    ) -> list[View]:
+        """``views`` grown to ``count``, or less where ``limit`` frames are seen or none is left.
+
+        The frames begin anew where the view changes at once, with what comes after.
+        """
+        views = list(views)
+        edge = max(self._grid.camera.width, self._grid.camera.height)
+        while len(views) < count and self.frames < limit:
+            frame = next(self._frames, None)
+            if frame is None:
+                self.is_over = True
+                break
+            self.frames += 1
+            tick()
+            encoded = self._operator.encode(frame.image)
+            if self._operator.texture(encoded) < MIN_TEXTURE:
+                continue
+            step = None
+            if views:
+                match = self._chain.follow(self._positions, views[-1].encoded, encoded)
+                if match.matched < MIN_MATCHED:
+                    if len(views) >= count // 2:
+                        break
+                    views = []
+                elif not calls_for_keyframe(self._config, edge, match.flow, match.matched):
+                    continue
+                else:
+                    step = match.there
+            self._positions.reset()
+            views.append(View(frame, encoded, step))
+        return views
+
+
+def with_focal(camera: Camera, focal: float) -> Camera:
+    """The camera with fx = ``focal`` and the same aspect."""
+    return replace(camera, fx=focal, fy=focal * camera.fy / camera.fx)
+
+
+def flows_from_first(
+    grid: SampleGrid, operator: FlowOperator, views: list[View]
+) -> list[FlowMatch]:
+    """Flow from the first view to each later one: chained over the steps and measured again."""
+    there: Float[Tensor, "p 2"] = grid.pixels
+    encoded = [v.encoded for v in views]
+    steps = guided_flows(grid, operator, encoded[:-1], encoded[1:])
+    back = grid.pixels
+    flows = []
+    for k in range(1, len(views)):
+        step = views[k].step
+        assert step is not None
+        there = there + grid.sample_field(filled_flow(grid, step), there)
+        back_step = filled_positions(grid, steps[k - 1][1])
+        back = back_step + grid.sample_field(back - grid.pixels, back_step)
+        match, reverse = operator.measure(
+            [encoded[0]], [encoded[k]], there[None], back[None], fine=True
+        )
+        flows.append(match)
+        if float((match.weight[0, :, 0] > 0).float().mean()) < MIN_MATCHED:
+            break
+        there = filled_positions(grid, match)
+        back = filled_positions(grid, reverse)
+    return flows
+
+
+def on_cpu(match: FlowMatch) -> FlowMatch:
+    """Positions and weights, on the CPU."""
+    return FlowMatch(match.pixels.cpu(), match.weight.cpu())
+
+
+def stacked(matches: list[FlowMatch]) -> tuple[Float[Tensor, "e p 2"], Float[Tensor, "e p 2"]]:
+    """Positions and weights of several single edges."""
+    return torch.cat([m.pixels for m in matches]), torch.cat([m.weight for m in matches])

@@ -1,0 +1,121 @@
+"""Pose of every frame on the present keyframes, from the sparse flow kept along the way."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from geogs.bundle.problem import MotionProblem
+from geogs.bundle.projection import linearise
+from geogs.bundle.select import motion_solver
+from geogs.geometry.lie import se3_inverse
+from geogs.tracking.frames.frame_recorder import pose_of, sparse_cells
+from geogs.tracking.frames.interpolation import bridged
+from geogs.tracking.frames.rotation_averaging import orientations
+from geogs.tracking.frames.row_errors import RowErrors
+from geogs.types import Trajectory
+from geogs.world.edges import in_steps, unpacked_positions
+from geogs.world.frames import FrameLog, FrameRecord
+from geogs.world.keyframes import KeyframeSet
+
+SOLVED_TOGETHER = 64
+"""Frames whose poses are solved, or observations that are corrected, at a time; bounds memory."""
+ITERATIONS = 8
+"""Of the motion-only adjustment of a frame."""
+
+
+def solve_trajectory(
+    frames: FrameLog,
+    keyframes: KeyframeSet,
+    elsewhere: Sequence[FrameRecord] = (),
+    has_map: bool = True,
+) -> Trajectory:
+    """Poses of all frames seen so far on the present keyframes, real timestamps.
+
+    Of untracked frames, and those ``elsewhere`` on keyframes of other segments, the position is
+    interpolated between their neighbours, and the orientation is what relative rotations say, else
+    interpolated, too. Without a map (``has_map``) nothing but rotations is known of any.
+    """
+    records = sorted([*frames.records, *elsewhere], key=lambda r: r.index)
+    keyframe_at = {s.frame_index: s.id for s in keyframes}
+    located = frames.records if has_map else []
+    tracked = [r for r in located if r.anchor is not None and r.anchor in keyframes]
+    free = [r for r in tracked if r.index not in keyframe_at and r.observations]
+    solved: dict[int, Tensor] = {r.index: pose_of(r, keyframes) for r in tracked}
+    for start in range(0, len(free), SOLVED_TOGETHER):
+        part = free[start : start + SOLVED_TOGETHER]
+        poses = _solved(part, keyframes)
+        solved.update({r.index: T for r, T in zip(part, poses, strict=True)})
+    oriented = orientations(
+        {r.index: r.rotations for r in records}, {n: T[:3, :3] for n, T in solved.items()}
+    )
+    timestamps = np.array([r.timestamp for r in records], dtype=np.float64)
+    return bridged(
+        timestamps,
+        [solved.get(r.index) for r in records],
+        [oriented.get(r.index) for r in records],
+    )
+
+
+def row_errors(frames: FrameLog, keyframes: KeyframeSet) -> RowErrors | None:
+    """What rectified rows are off by at the present state; none where there are none."""
+    if not frames.rows:
+        return None
+    indices = sorted(record.index for record in frames.records)
+    return RowErrors(keyframes.grid, frames.rows, indices, solve_trajectory(frames, keyframes))
+
+
+def shift_rows(frames: FrameLog, keyframes: KeyframeSet, errors: RowErrors) -> None:
+    """Correct what was found of frames by the errors of their rows and their keyframes'."""
+    grid = keyframes.grid
+    cells = torch.nonzero(sparse_cells(grid))[:, 0]
+    seen = [(r, o) for r in frames.records for o in r.observations if o.keyframe in keyframes]
+    for start in range(0, len(seen), SOLVED_TOGETHER):
+        part = seen[start : start + SOLVED_TOGETHER]
+        ids = [o.keyframe for _, o in part]
+        T = errors.poses([r.index for r, _ in part]) @ se3_inverse(keyframes.poses(ids))
+        shifts = errors.of_matches(
+            [keyframes[k].frame_index for k in ids], [r.index for r, _ in part], T,
+            grid.rays[cells], keyframes.inverse_depths(ids)[:, cells],
+            unpacked_positions(grid, torch.stack([o.position for _, o in part])),
+        )  # fmt: skip
+        steps = in_steps(grid.camera, shifts)
+        for (_, observation), shift in zip(part, steps, strict=True):
+            observation.shift = shift
+
+
+def _solved(records: list[FrameRecord], keyframes: KeyframeSet) -> Float[Tensor, "n 4 4"]:
+    """Poses of frames by their observations."""
+    grid = keyframes.grid
+    cells = torch.nonzero(sparse_cells(grid))[:, 0]
+    pairs = [
+        (n, o) for n, r in enumerate(records) for o in r.observations if o.keyframe in keyframes
+    ]
+    start = torch.stack([pose_of(r, keyframes) for r in records])
+    if not pairs:
+        return start
+    ids = [o.keyframe for _, o in pairs]
+    frame = torch.tensor([n for n, _ in pairs])
+    depth = keyframes.inverse_depths(ids)[:, cells]
+    information = keyframes.informations(ids)[:, cells]
+    source = keyframes.poses(ids)
+    weight = torch.stack([o.half_weight for _, o in pairs]).float()
+    p = linearise(grid.camera, grid.rays[cells], start[frame] @ se3_inverse(source), depth)
+    weight = depth_aware_weight(weight, p.depth_jacobian, information)
+    pixels = unpacked_positions(grid, torch.stack([o.shifted for _, o in pairs]))
+    problem = MotionProblem(start, depth, source, frame, pixels, weight)
+    T, _ = motion_solver(grid, cells).solve(problem, iterations=ITERATIONS)
+    return T
+
+
+def depth_aware_weight(
+    weight: Float[Tensor, "e p 2"],
+    depth_jacobian: Float[Tensor, "e p 2"],
+    information: Float[Tensor, "e p"],
+) -> Float[Tensor, "e p 2"]:
+    """Inverse variance of a match plus that of the keyframe's depth propagated into the image."""
+    depth = depth_jacobian.square() / information.clamp(min=1e-12)[..., None]
+    variance = 1 / weight.clamp(min=1e-12) + depth
+    return (weight > 0) * (information > 0)[..., None] / variance

@@ -1,0 +1,243 @@
+"""What rectified rows are still off by, once the trajectory and the depths are known.
+
+Rows are rectified before anything is matched, by the motion that the flow between neighbouring
+images tells. The trajectory of all frames tells it better: a point of a frame is seen at the time
+of its row, and where it is then, the poses of the frames around say. What was assumed differs from
+that by fractions of a pixel, so the matches are corrected to first order and the images stay.
+"""
+
+import copy
+from collections.abc import Callable, Iterator, Mapping, Sequence
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from geogs.bundle.projection import project, seen_from_targets
+from geogs.geometry.lie import se3_inverse
+from geogs.shutter.rows import CELL
+from geogs.types import SeenRows, Trajectory
+from geogs.world.edges import Edge, Pair, edge_matches
+from geogs.world.grid import SampleGrid
+from geogs.world.keyframes import KeyframeSet
+
+NODES = 5
+"""Frames whose poses say where a point is at the time of its row."""
+LONGEST_INTERVAL = 0.07
+"""Seconds between two frames; over more, their poses say less of the rows than the video does."""
+TOGETHER = 64
+"""Edges that are corrected at a time; bounds memory."""
+LARGEST = 0.01
+"""Of the long edge; an error that seems larger is none of the rows."""
+
+
+class RowErrors:
+    """Errors of the rows of frames, at a state of the trajectory."""
+
+    def __init__(
+        self,
+        grid: SampleGrid,
+        rows: Mapping[int, SeenRows],
+        frames: Sequence[int],
+        trajectory: Trajectory,
+    ) -> None:
+        """``rows`` by frame; ``frames`` are those of the trajectory, in its order.
+
+        Frames without rows have no errors, nor have those with too few tracked neighbours.
+        """
+        self._grid, self._long_edge = grid, max(grid.camera.width, grid.camera.height)
+        nodes = _nodes(trajectory)
+        T_wc = torch.from_numpy(trajectory.T_wc)
+        self._T_cw = dict(zip(frames, se3_inverse(T_wc), strict=True))
+        self._rows: dict[int, SeenRows] = {}
+        self._factor = 1.0
+        self._times: dict[int, Float[Tensor, "5"]] = {}
+        self._motions: dict[int, Float[Tensor, "5 4 4"]] = {}
+        """From the camera at a frame to the camera at its nodes."""
+        for n, frame in enumerate(frames):
+            if frame in rows and nodes[n] is not None:
+                around = nodes[n]
+                times = trajectory.timestamps[around] - trajectory.timestamps[n]
+                self._rows[frame] = rows[frame]
+                self._times[frame] = torch.from_numpy(times).float()
+                self._motions[frame] = (se3_inverse(T_wc[around]) @ T_wc[n]).float()
+
+    def merged(self, other: "RowErrors") -> "RowErrors":
+        """Those of the frames of both, of one camera and one unit; their numbers differ."""
+        both = copy.copy(self)
+        for name in ("_T_cw", "_rows", "_times", "_motions"):
+            setattr(both, name, getattr(self, name) | getattr(other, name))
+        return both
+
+    @property
+    def doubt(self) -> float:
+        """Standard error of the readout, as a part of it; 0 where it was told, or nothing known."""
+        return next((rows.doubt for rows in self._rows.values()), 0.0)
+
+    def with_readout(self, factor: float) -> "RowErrors":
+        """The same, the readout being so many times what the rows were rectified by."""
+        other = copy.copy(self)
+        other._factor = factor
+        return other
+
+    def poses(self, frames: Sequence[int]) -> Float[Tensor, "n 4 4"]:
+        """World to camera of frames in the trajectory, float64."""
+        return torch.stack([self._T_cw[frame] for frame in frames])
+
+    def of_matches(
+        self,
+        source: Sequence[int],
+        target: Sequence[int],
+        T_ji: Float[Tensor, "e 4 4"],
+        rays: Float[Tensor, "p 3"],
+        inverse_depth: Float[Tensor, "e p"],
+        pixels: Float[Tensor, "e p 2"],
+    ) -> Float[Tensor, "e p 2"]:
+        """What is to be added to where cells were found, as if the rows of both frames were right.
+
+        What a cell of the source shows lies next to it, and what was found in the target, too; the
+        former is propagated to the target at the cell's own depth. Zero where the sum cannot be
+        right.
+
+        Args:
+            source: frame that each edge begins in.
+            target: and that it ends in.
+            T_ji: from the camera of the source to that of the target.
+            rays: of the cells of the source.
+            inverse_depth: of the cells.
+            pixels: where they were found in the target.
+        """
+        camera = self._grid.camera
+        own = pixels.new_tensor([camera.fx, camera.fy]) * rays[:, :2]
+        own = (own + pixels.new_tensor([camera.cx, camera.cy])).expand_as(pixels)
+        p = project(camera, rays, T_ji, inverse_depth)
+        there = self.of_pixels(target, pixels, inverse_depth / p.z)
+        moved = _propagated(
+            self._grid, T_ji, p.pixels, p.z, self.of_pixels(source, own, inverse_depth)
+        )
+        error = there - moved
+        believed = p.valid & (error.norm(dim=-1) < LARGEST * self._long_edge)
+        return torch.where(believed[..., None], error, 0.0)
+
+    def of_pixels(
+        self,
+        frames: Sequence[int],
+        pixels: Float[Tensor, "e p 2"],
+        inverse_depth: Float[Tensor, "e p"],
+    ) -> Float[Tensor, "e p 2"]:
+        """By how much what pixels of frames show lies next to them at the middle row's time.
+
+        The camera saw it in another position and at another time; by the poses around, the pixel's
+        own point was elsewhere then. The difference is what the pixel shows instead, to first
+        order.
+        """
+        error = torch.zeros_like(pixels)
+        known = [n for n, frame in enumerate(frames) if frame in self._rows]
+        if not known:
+            return error
+        names = [frames[n] for n in known]
+        at = torch.tensor(known, device=pixels.device)
+        shown, d = pixels[at], inverse_depth[at]
+        offset, seconds = self._seen(names, shown)
+        seconds = self._factor * seconds
+        T = torch.stack([self._motions[f] for f in names]).to(shown)
+        times = torch.stack([self._times[f] for f in names]).to(shown)
+        weights, camera = lagrange(times, seconds), self._grid.camera
+        focal, centre = (
+            shown.new_tensor([camera.fx, camera.fy]), shown.new_tensor([camera.cx, camera.cy])
+        )  # fmt: skip
+        plane = (shown - centre) / focal
+        rays = torch.cat([plane, torch.ones_like(plane[..., :1])], -1)
+        moved = torch.zeros_like(plane)
+        for j in range(NODES):
+            y, _, z = seen_from_targets(rays, T[:, j], d)
+            moved += weights[..., j, None] * (y[..., :2] / z[..., None])
+        error[at] = shown + offset - (moved * focal + centre)
+        return error
+
+    def _seen(
+        self, frames: Sequence[int], pixels: Float[Tensor, "e p 2"]
+    ) -> tuple[Float[Tensor, "e p 2"], Float[Tensor, "e p"]]:
+        """Offsets and seconds at pixels, bilinear between the nodes as the image was made."""
+        laid = [
+            torch.cat([self._rows[f].offset, self._rows[f].seconds[..., None]], -1) for f in frames
+        ]
+        field = torch.stack(laid).to(pixels).permute(0, 3, 1, 2)
+        size = pixels.new_tensor([field.shape[3] * CELL, field.shape[2] * CELL])
+        position = 2 * (pixels + CELL + 0.5) / size - 1
+        values = torch.nn.functional.grid_sample(
+            field, position[:, :, None], padding_mode="border", align_corners=False
+        )[..., 0]
+        return values[:, :2].mT, values[:, 2]
+
+
+def edge_shifts(
+    errors: RowErrors,
+    keyframes: KeyframeSet,
+    measured: Mapping[Pair, Edge],
+    frame_of: Callable[[int], int],
+) -> Iterator[tuple[list[Pair], Float[Tensor, "e p 2"]]]:
+    """Pixels by which the matches of edges are to be corrected, some edges at a time.
+
+    ``frame_of`` a keyframe's id is the number that ``errors`` have of its frame.
+    """
+    pairs, grid = sorted(measured), keyframes.grid
+    for start in range(0, len(pairs), TOGETHER):
+        part = pairs[start : start + TOGETHER]
+        source, target = ([pair[k] for pair in part] for k in (0, 1))
+        T_ji = keyframes.poses(target) @ se3_inverse(keyframes.poses(source))
+        pixels, _ = edge_matches(grid, [measured[pair] for pair in part])
+        yield part, errors.of_matches(
+            [frame_of(k) for k in source], [frame_of(k) for k in target], T_ji, grid.rays,
+            keyframes.inverse_depths(source), pixels,
+        )  # fmt: skip
+
+
+def lagrange(times: Float[Tensor, "e j"], at: Float[Tensor, "e p"]) -> Float[Tensor, "e p j"]:
+    """Weights of the values at ``times`` in that of the polynomial through them."""
+    count = times.shape[1]
+    weights = at.new_ones(*at.shape, count)
+    for j in range(count):
+        for other in range(count):
+            if other != j:
+                span = (times[:, j] - times[:, other])[:, None]
+                weights[..., j] *= (at - times[:, other, None]) / span
+    return weights
+
+
+def _nodes(trajectory: Trajectory) -> list[np.ndarray | None]:
+    """The frames around each whose poses are used; none where too few are known in a row."""
+    n = len(trajectory.timestamps)
+    linked = (np.diff(trajectory.timestamps) <= LONGEST_INTERVAL) & (
+        np.diff(trajectory.timestamps) > 0
+    )
+    linked &= trajectory.tracked[1:] & trajectory.tracked[:-1]
+    nodes: list[np.ndarray | None] = [None] * n
+    ends = np.flatnonzero(np.diff(np.concatenate([[False], linked, [False]]).astype(int)))
+    for first, last in ends.reshape(-1, 2):
+        if last - first + 1 < NODES:
+            continue
+        for frame in range(first, last + 1):
+            start = int(np.clip(frame - NODES // 2, first, last + 1 - NODES))
+            nodes[frame] = np.arange(start, start + NODES)
+    return nodes
+
+
+def _propagated(
+    grid: SampleGrid,
+    T_ji: Float[Tensor, "e 4 4"],
+    pixels: Float[Tensor, "e p 2"],
+    z: Float[Tensor, "e p"],
+    step: Float[Tensor, "e p 2"],
+) -> Float[Tensor, "e p 2"]:
+    """Small steps in the source, in pixels of the target, at constant inverse depth.
+
+    ``pixels`` and ``z`` are where the cells fall in the target, and their depth there over that in
+    the source.
+    """
+    camera = grid.camera
+    focal = pixels.new_tensor([camera.fx, camera.fy])
+    plane = (pixels - pixels.new_tensor([camera.cx, camera.cy])) / focal
+    moved = (step / focal) @ T_ji[:, :3, :2].to(step).mT
+    return focal * (moved[..., :2] - plane * moved[..., 2:]) / z[..., None]

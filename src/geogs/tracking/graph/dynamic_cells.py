@@ -1,0 +1,169 @@
+"""Dynamic objects: cells whose matches no depth explains, although the scene's poses are known.
+
+Matches with something that moves agree with each other, not with the scene. Over the pairs of a
+keyframe that were measured, what is left of a cell's matches at the depth that suits them best is
+several times what is left elsewhere. Such regions are *dynamic*: their matches, and those
+that end in them, count nowhere.
+"""
+
+from collections.abc import Mapping, Sequence
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn.functional import avg_pool2d
+
+from geogs.bundle.problem import source_chunks
+from geogs.bundle.rigidity import best_residuals
+from geogs.bundle.select import grid_fields
+from geogs.world.edges import Edge, Pair, edge_matches
+from geogs.world.grid import SampleGrid
+from geogs.world.keyframes import KeyframeSet
+
+LEAST_SCALE = 0.2
+"""Deviations of a match below which the usual residual of an edge is not taken to lie."""
+WORSE = 3.0
+"""Times the usual residual of all edges that of one of them is at most taken to be."""
+MOST = 10.0
+"""Times the usual residual that a single match can speak for motion."""
+ENOUGH = 0.7
+"""Matches per cell of a surrounding from which it can be decided."""
+FILLED = 0.8
+"""Fraction of a keyframe's cells beyond which it is the keyframe that does not suit the others."""
+REGION = 0.4
+"""Fraction of the cells around one that are dynamic, from which it is dynamic itself."""
+EDGES_TOGETHER = 128
+"""Directed edges, of some ten keyframes, decided in one go; bounds memory."""
+
+
+def static_weight(
+    keyframes: KeyframeSet,
+    directed: Sequence[Pair],
+    pixels: Float[Tensor, "e p 2"],
+    weight: Float[Tensor, "e p 2"],
+) -> Float[Tensor, "e p 2"]:
+    """Weights of matches, none of those from or to a cell that is dynamic."""
+    if all(keyframes[k].moving is None for k in {k for e in directed for k in e}):
+        return weight
+    return weight * _static(keyframes, directed, pixels)[..., None]
+
+
+def propagated(
+    grid: SampleGrid,
+    moving: Bool[Tensor, "p"] | None,
+    pixels: Float[Tensor, "p 2"],
+    weight: Float[Tensor, "p 2"],
+) -> Bool[Tensor, "p"] | None:
+    """Dynamic cells of an image, by the matches of its cells with one whose are known."""
+    if moving is None:
+        return None
+    cell, inside = grid.cells_of(pixels)
+    return moving[cell] & inside & (weight[:, 0] > 0)
+
+
+def dynamic_fraction(keyframes: KeyframeSet) -> float:
+    """Fraction of all cells that is dynamic; 0 without keyframes."""
+    found = [k.moving.float().mean().cpu() for k in keyframes if k.moving is not None]
+    return float(torch.stack(found).sum()) / len(keyframes) if found else 0.0
+
+
+def update_dynamic(
+    keyframes: KeyframeSet, edges: Mapping[Pair, Edge], decided: Sequence[Pair], threshold: float
+) -> None:
+    """Say anew of the sources of some directed edges which of their cells move.
+
+    ``decided`` are all edges of these sources that have a say; where they say too little of a cell,
+    it stays what it was. ``threshold`` is how many times the usual residual of its edges the mean
+    residual around a cell must be.
+    """
+    directed = sorted(decided)
+    if not directed:
+        return
+    source = torch.tensor([i for i, _ in directed])
+    for chunk in source_chunks(source, EDGES_TOGETHER):
+        residual, static = _residuals(keyframes, edges, directed[chunk])
+        ratio = (residual / _usual(residual, static)[:, None]).clamp(max=MOST)
+        ids, row = source[chunk].unique(return_inverse=True)
+        row = row.to(ratio.device)
+        total = ratio.new_zeros(len(ids), ratio.shape[1])
+        count = total.index_add(0, row, (~ratio.isnan()).to(ratio))
+        total = total.index_add(0, row, ratio.nan_to_num(0.0))
+        before = [keyframes[k].moving for k in ids.tolist()]
+        none = torch.zeros_like(static[0])
+        dynamic = torch.stack([none if b is None else b for b in before])
+        dynamic = dynamic_cells(keyframes.grid, total, count, dynamic, threshold)
+        for n, k in enumerate(ids.tolist()):
+            keyframes[k].moving = dynamic[n].clone()
+
+
+def dynamic_cells(
+    grid: SampleGrid,
+    total: Float[Tensor, "n p"],
+    count: Float[Tensor, "n p"],
+    before: Bool[Tensor, "n p"],
+    threshold: float,
+) -> Bool[Tensor, "n p"]:
+    """Regions of keyframes whose matches, ``count`` that add up to ``total``, exceed a threshold.
+
+    A cell that cannot be decided goes with its surroundings, and each with the majority of those
+    around it, so that what moves includes its border. All stay what they were ``before`` where none
+    can be decided or nearly all contradict: then the pose is wrong, or the image is.
+    """
+    near, seen = _mean(grid, total, 3), _mean(grid, count, 3)
+    known = seen >= ENOUGH
+    core = (near > threshold * seen) & known
+    is_known = known.any(1, keepdim=True) & (core.sum(1) <= FILLED * known.sum(1))[:, None]
+    filled = grid_fields(grid).fill(core.to(total), known.to(total))
+    return torch.where(is_known, _mean(grid, filled, 5) >= REGION, before)
+
+
+def _mean(grid: SampleGrid, values: Float[Tensor, "n p"], size: int) -> Float[Tensor, "n p"]:
+    """Mean over a square of cells around each, as far as it lies on the grid."""
+    image = values.view(-1, 1, grid.height, grid.width)
+    pooled = avg_pool2d(image, size, 1, size // 2, count_include_pad=False)
+    return pooled.view(values.shape)
+
+
+def _static(
+    keyframes: KeyframeSet, directed: Sequence[Pair], pixels: Float[Tensor, "e p 2"]
+) -> Bool[Tensor, "e p"]:
+    """Which matches neither leave nor reach a cell that is dynamic."""
+    grid = keyframes.grid
+    none = torch.zeros(grid.size, dtype=torch.bool, device=grid.device)
+
+    def moving(k: int) -> Bool[Tensor, "p"]:
+        found = keyframes[k].moving
+        return none if found is None else found
+
+    cell, inside = grid.cells_of(pixels)
+    source = torch.stack([moving(i) for i, _ in directed])
+    target = torch.stack([moving(j) for _, j in directed]).gather(1, cell)
+    return ~(source | (target & inside))
+
+
+def _residuals(
+    keyframes: KeyframeSet, edges: Mapping[Pair, Edge], directed: Sequence[Pair]
+) -> tuple[Float[Tensor, "e p"], Bool[Tensor, "e p"]]:
+    """Best residuals of some edges, not a number without a match; and what is static."""
+    grid = keyframes.grid
+    ids = sorted({k for e in directed for k in e})
+    slot = {k: n for n, k in enumerate(ids)}
+    pixels, weight = edge_matches(grid, [edges[e] for e in directed])
+    residual = best_residuals(
+        grid.camera, grid.rays, keyframes.poses(ids), keyframes.inverse_depths(ids),
+        torch.tensor([slot[i] for i, _ in directed]), torch.tensor([slot[j] for _, j in directed]),
+        pixels, weight,
+    )  # fmt: skip
+    residual = torch.where(weight[..., 0] > 0, residual, torch.nan)
+    return residual, _static(keyframes, directed, pixels)
+
+
+def _usual(residual: Float[Tensor, "e p"], static: Bool[Tensor, "e p"]) -> Float[Tensor, "e"]:
+    """Median residual of each edge over what is static, within what all edges know.
+
+    What moves may fill a keyframe, but not most of those that are decided together.
+    """
+    usual = torch.where(static, residual, torch.nan).nanmedian(1).values
+    common = usual.nanmedian().nan_to_num(LEAST_SCALE).clamp(min=LEAST_SCALE)
+    usual = torch.where(usual.isnan(), common, usual)
+    return torch.minimum(torch.maximum(usual, common), WORSE * common)

@@ -1,0 +1,316 @@
+"""The frame graph: which keyframes see each other, and the flow measured between them."""
+
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from geogs.bundle.base import BundleOptions, BundleResult
+from geogs.bundle.depth_terms import DepthDamping, MeasuredDepths
+from geogs.bundle.problem import BundleProblem, StreamedProblem
+from geogs.bundle.projection import project
+from geogs.bundle.select import (
+    bundle_solver,
+    grid_fields,
+    keyframe_pairs,
+    large_bundle_solver,
+)
+from geogs.geometry.lie import se3_inverse
+from geogs.threads import thread_map
+from geogs.tracking.flow.flow_operator import FlowOperator
+from geogs.tracking.graph.dynamic_cells import static_weight, update_dynamic
+from geogs.tracking.graph.odometry import Odometry
+from geogs.tracking.graph.proximity import PAIRS_TOGETHER
+from geogs.types import FlowMatch
+from geogs.world.edges import Edge, MeasuredEdge, PackedEdge, Pair, edge_matches, pack_matches
+from geogs.world.grid import SampleGrid
+from geogs.world.keyframes import Keyframe, KeyframeSet
+
+HUBER = 0.5
+"""Standard deviations of the flow beyond which a match counts linearly: the flow is more certain
+than it says."""
+STACKED_EDGES = 1024, 8192
+"""Directed edges up to which an adjustment has all matches in one piece, on CPU and GPU."""
+
+
+class FrameGraph:
+    """Pairs of keyframes with their flow in both directions."""
+
+    def __init__(
+        self,
+        keyframes: KeyframeSet,
+        operator: FlowOperator,
+        odometry: Odometry | None = None,
+        edges: dict[Pair, Edge] | None = None,
+    ) -> None:
+        """``odometry`` takes part in adjustments, where there is one; ``edges`` are those that are
+        measured already, and are changed in place."""
+        self.keyframes = keyframes
+        self.odometry = odometry
+        self.operator = operator
+        self.edges: dict[Pair, Edge] = {} if edges is None else edges
+        self.bundle = bundle_solver(keyframes.grid)
+
+    @property
+    def pairs(self) -> list[Pair]:
+        """Measured pairs."""
+        return [(i, j) for i, j in self.edges if i < j]
+
+    def remove_keyframe(self, id: int) -> None:
+        """Forget every edge of a keyframe."""
+        for directed in [e for e in self.edges if id in e]:
+            del self.edges[directed]
+
+    def retire(self, keep: Collection[int], least: int = 1) -> dict[Pair, Edge]:
+        """Take out the edges that join none of the given keyframes, and return them.
+
+        None where they are fewer than ``least``.
+        """
+        kept = set(keep)
+        old = {e: v for e, v in self.edges.items() if e[0] not in kept and e[1] not in kept}
+        if len(old) < least:
+            return {}
+        for directed in old:
+            del self.edges[directed]
+        return old
+
+    def replace(self, edges: Mapping[Pair, Edge]) -> None:
+        """Have these edges instead of all others."""
+        edges = dict(edges)
+        self.edges.clear()
+        self.edges.update(edges)
+
+    def reprojections(self, directed: Sequence[Pair]) -> Float[Tensor, "e p 2"]:
+        """Present positions of the cells of i in j for each directed edge (i, j)."""
+        if not directed:
+            return self.keyframes.grid.pixels.new_zeros(0, self.keyframes.grid.size, 2)
+        return keyframe_pairs(self.keyframes, directed).project()
+
+    def measure(self, pairs: Iterable[Pair], fine: bool = True, packed: bool = False) -> None:
+        """Measure the flow of pairs in both directions, starting from the reprojection.
+
+        ``packed`` edges take a third of the memory.
+        """
+        pairs = list(pairs)
+        if not pairs:
+            return
+        first, second = ([self.keyframes[p[k]].encoded for p in pairs] for k in (0, 1))
+        both = self.reprojections(pairs + [(j, i) for i, j in pairs])
+        forward, backward = both[: len(pairs)], both[len(pairs) :]
+        memory = [(self._memory((i, j)), self._memory((j, i))) for i, j in pairs]
+        there, back = self.operator.measure(
+            first, second, forward, backward, fine=fine, memory=memory
+        )
+        if packed:
+            self._keep_packed(pairs, there)
+            self._keep_packed([(j, i) for i, j in pairs], back)
+            return
+        for n, (i, j) in enumerate(pairs):
+            self.edges[i, j] = _edge_of(there, n, forward[n])
+            self.edges[j, i] = _edge_of(back, n, backward[n])
+
+    def _keep_packed(self, directed: Sequence[Pair], match: FlowMatch) -> None:
+        """Keep a measurement that started from the present state."""
+        position, half_weight = pack_matches(self.keyframes.grid, match.pixels, match.weight)
+        for n, (i, j) in enumerate(directed):
+            source, target = self.keyframes[i], self.keyframes[j]
+            self.edges[i, j] = PackedEdge(
+                position[n], half_weight[n], source.T_cw, target.T_cw, source.inverse_depth,
+                None if match.damping is None else match.damping[n],
+                None if match.memory is None else match.memory[n],
+            )  # fmt: skip
+
+    def _memory(self, directed: Pair) -> Any:
+        edge = self.edges.get(directed)
+        return None if edge is None else edge.memory
+
+    def release(self, moving: Collection[int]) -> None:
+        """Let go of what the operator keeps of edges that do not join a moving keyframe."""
+        for directed, edge in self.edges.items():
+            if directed[0] not in moving and directed[1] not in moving:
+                edge.memory = None
+
+    def stale(self, pairs: Sequence[Pair], tolerance: float) -> list[Pair]:
+        """Pairs that are new or whose reprojection has moved more than ``tolerance`` pixels.
+
+        The median over the matched cells of the direction that moved more counts.
+        """
+        known = [p for p in pairs if p in self.edges]
+        new = [p for p in pairs if p not in self.edges]
+        if not known:
+            return new
+        moved = self._moved(known + [(j, i) for i, j in known]).cpu().nan_to_num(torch.inf)
+        worst = torch.maximum(*moved.split(len(known)))
+        return new + [p for p, m in zip(known, worst.tolist(), strict=True) if m > tolerance]
+
+    def _moved(self, directed: Sequence[Pair]) -> Float[Tensor, "e"]:
+        """Median motion in pixels of the matched cells since they were measured."""
+        return _in_parts(self._moved_together, directed, self.keyframes.grid.on_gpu)
+
+    def _moved_together(self, directed: Sequence[Pair]) -> Float[Tensor, "e"]:
+        grid, edges = self.keyframes.grid, [self.edges[e] for e in directed]
+        _, weight = edge_matches(grid, edges)
+        return keyframe_pairs(self.keyframes, directed).moved(_reprojections(grid, edges), weight)
+
+    def problem(
+        self, directed: Sequence[Pair], free_pose: Iterable[int], free_depth: Iterable[int]
+    ) -> tuple[BundleProblem, list[int]]:
+        """The adjustment of the given edges, and the keyframe id of each of its frames."""
+        problem, ids = self.streamed_problem(directed, free_pose, free_depth)
+        return problem.part(slice(None)), ids
+
+    def streamed_problem(
+        self, directed: Sequence[Pair], free_pose: Iterable[int], free_depth: Iterable[int]
+    ) -> tuple[StreamedProblem, list[int]]:
+        """As :meth:`problem`, with the matches left where they are."""
+        directed = sorted(directed)
+        poses, depths = set(free_pose), set(free_depth)
+        ids = sorted({k for e in directed for k in e} | poses | depths)
+        slot = {k: n for n, k in enumerate(ids)}
+        edges = [self.edges[e] for e in directed]
+
+        def matches(part: slice) -> tuple[Tensor, Tensor]:
+            pixels, weight = edge_matches(self.keyframes.grid, edges[part])
+            return pixels, static_weight(self.keyframes, directed[part], pixels, weight)
+
+        depth_terms = (
+            _frame_damping(edges, [slot[i] for i, _ in directed], len(ids)),
+            _measured([self.keyframes[k] for k in ids]),
+        )
+        motions = None if self.odometry is None else self.odometry.between(ids)
+        problem = StreamedProblem(
+            T_cw=self.keyframes.poses(ids),
+            inverse_depth=self.keyframes.inverse_depths(ids),
+            source=torch.tensor([slot[i] for i, _ in directed], dtype=torch.long),
+            target=torch.tensor([slot[j] for _, j in directed], dtype=torch.long),
+            matches=matches,
+            free_pose=torch.tensor([k in poses for k in ids]),
+            free_depth=torch.tensor([k in depths for k in ids]),
+            depth_terms=tuple(term for term in depth_terms if term is not None),
+            pose_terms=() if motions is None else (motions,),
+        )
+        return problem, ids
+
+    def update_dynamic(self, ids: Collection[int], threshold: float) -> None:
+        """Say anew which cells of some keyframes move, by all their edges (:func:`update_dynamic`).
+
+        A threshold of 0 says nothing.
+        """
+        if threshold > 0:
+            update_dynamic(
+                self.keyframes, self.edges, [e for e in self.edges if e[0] in ids], threshold
+            )
+
+    def adjust(
+        self,
+        directed: Sequence[Pair],
+        free_pose: Sequence[int],
+        free_depth: Sequence[int],
+        options: BundleOptions,
+    ) -> BundleResult | None:
+        """Solve for poses and inverse depths and store them; None (nothing stored) on failure."""
+        if not directed:
+            return None
+        result, ids = self._solve(directed, free_pose, free_depth, options)
+        if not result.finite:
+            return None
+        depths, poses = set(free_depth), set(free_pose)
+        for n, k in enumerate(ids):
+            if k in poses:
+                self.keyframes[k].T_cw = result.T_cw[n]
+        rows = [n for n, k in enumerate(ids) if k in depths]
+        if rows:
+            depth = torch.stack([result.inverse_depth[n] for n in rows])
+            information = torch.stack([result.information[n] for n in rows])
+            filled = grid_fields(self.keyframes.grid).fill(depth, information)
+            for m, n in enumerate(rows):
+                keyframe = self.keyframes[ids[n]]
+                # Copies: a row would keep the whole stack in memory.
+                keyframe.inverse_depth = filled[m].clone()
+                keyframe.information = information[m].clone()
+        return result
+
+    def _solve(
+        self,
+        directed: Sequence[Pair],
+        free_pose: Sequence[int],
+        free_depth: Sequence[int],
+        options: BundleOptions,
+    ) -> tuple[BundleResult, list[int]]:
+        grid = self.keyframes.grid
+        if len(directed) <= STACKED_EDGES[grid.on_gpu]:
+            problem, ids = self.problem(directed, free_pose, free_depth)
+            return self.bundle.solve(problem, options), ids
+        streamed, ids = self.streamed_problem(directed, free_pose, free_depth)
+        return large_bundle_solver(grid).solve(streamed, options), ids
+
+
+def _measured(keyframes: Sequence[Keyframe]) -> MeasuredDepths | None:
+    """What depth sensors say of the cells of keyframes; none where there is nothing of any."""
+    if all(k.measured is None for k in keyframes):
+        return None
+    unknown = torch.zeros_like(keyframes[0].inverse_depth)
+    both = [
+        (unknown, unknown)
+        if k.measured is None
+        else (k.measured.inverse_depth, k.measured.information)
+        for k in keyframes
+    ]
+    inverse_depth, information = (torch.stack(m) for m in zip(*both, strict=True))
+    return MeasuredDepths(inverse_depth, information)
+
+
+def _edge_of(match: FlowMatch, n: int, reprojection: Float[Tensor, "p 2"]) -> MeasuredEdge:
+    """The n-th edge of a measurement."""
+    damping = None if match.damping is None else match.damping[n]
+    memory = None if match.memory is None else match.memory[n]
+    return MeasuredEdge(match.pixels[n], match.weight[n], reprojection, damping, memory)
+
+
+def _reprojections(grid: SampleGrid, edges: Sequence[Edge]) -> Float[Tensor, "e p 2"]:
+    """Where the cells fell when the flow of each edge was measured."""
+    packed = [e for e in edges if isinstance(e, PackedEdge)]
+    if packed and len(packed) == len(edges):
+        return _packed_reprojections(grid, packed)
+    return torch.stack([
+        e.reprojection if isinstance(e, MeasuredEdge) else _packed_reprojections(grid, [e])[0]
+        for e in edges
+    ])  # fmt: skip
+
+
+def _packed_reprojections(grid: SampleGrid, edges: Sequence[PackedEdge]) -> Float[Tensor, "e p 2"]:
+    """The same of packed edges, by the poses and depths of that time."""
+    source, target = (torch.stack([getattr(e, k) for e in edges]) for k in ("T_source", "T_target"))
+    depth = torch.stack([e.inverse_depth for e in edges])
+    return project(grid.camera, grid.rays, target @ se3_inverse(source), depth).pixels
+
+
+def _in_parts(
+    work: Callable[[Sequence[Pair]], Float[Tensor, "k"]], directed: Sequence[Pair], on_gpu: bool
+) -> Float[Tensor, "e"]:
+    """A number for each directed pair; some at a time, side by side on the CPU."""
+    size = PAIRS_TOGETHER[on_gpu]
+    if len(directed) <= size:
+        return work(directed)
+    parts = [directed[k : k + size] for k in range(0, len(directed), size)]
+    return torch.cat([work(p) for p in parts] if on_gpu else thread_map(work, parts))
+
+
+def _frame_damping(
+    edges: Sequence[Edge], source: Sequence[int], frames: int
+) -> DepthDamping | None:
+    """Damping of each frame: the mean over the edges that leave it; None where there is none."""
+    given = [(e.damping, n) for e, n in zip(edges, source, strict=True) if e.damping is not None]
+    if not given:
+        return None
+    count = torch.bincount(torch.tensor([n for _, n in given]), minlength=frames)
+    total = torch.zeros(frames, given[0][0].shape[0], device=given[0][0].device)
+    for start in range(0, len(given), STACKED_EDGES[0]):
+        part = given[start : start + STACKED_EDGES[0]]
+        damping = torch.stack([d for d, _ in part])
+        mean = torch.nn.functional.one_hot(torch.tensor([n for _, n in part]), frames).float()
+        mean = mean / count.clamp(min=1)
+        total = total + mean.mT.to(damping) @ damping
+    return DepthDamping(total)

@@ -1,0 +1,100 @@
+"""Which frames become keyframes."""
+
+import math
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from geogs.beside import Errand
+from geogs.config import TrackingConfig
+
+LEAST_FLOW = 0.2
+"""Fraction of the motion that makes a keyframe below which a lost overlap is none: the camera has
+hardly moved, so it is the image that is poor."""
+BLUR_RATIO = 0.7
+"""A frame with less than this fraction of the latest frames' sharpness is blurred ..."""
+BLUR_WAIT = 0.4
+"""... and becomes a keyframe only when it has moved by this much more: a sharper one may come."""
+_COMPARED = 12
+"""Latest frames among which one is sharp or blurred."""
+_EDGE = 320
+"""Longer side of the image in which sharpness is measured; below it, noise counts for less."""
+
+
+def calls_for_keyframe(
+    config: TrackingConfig, long_edge: int, flow: float, overlap: float, patience: float = 0.0
+) -> bool:
+    """Whether a frame is far enough from the last keyframe to become one.
+
+    ``flow`` is the median motion of the cells that are matched, in pixels, ``overlap`` the fraction
+    of the keyframe's cells that are. In forward motion the cells that move most leave the image or
+    are not matched any more, so that the median motion of the rest stays small while the overlap
+    goes. With ``patience`` it may come so much further.
+    """
+    enough = config.keyframe_flow * (1 + patience)
+    if overlap < config.keyframe_overlap / (1 + patience):
+        enough *= LEAST_FLOW
+    return flow >= enough * long_edge
+
+
+def sharpness(image: UInt8[np.ndarray, "h w 3"]) -> float:
+    """Energy of an image's gradients in the direction that has least, over the image's variance.
+
+    Blur by motion takes from the gradients along the motion, hardly from the variance. The number
+    says little by itself, for it follows what is seen; among neighbours in a video it tells
+    which are blurred.
+    """
+    height, width = image.shape[:2]
+    shrink = min(1.0, _EDGE / max(height, width))
+    size = (max(round(width * shrink), 1), max(round(height * shrink), 1))
+    grey = cv2.resize(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), size, interpolation=cv2.INTER_AREA)
+    grey = grey.astype(np.float32)
+    x, y = cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1)
+    xx, yy, xy = float((x * x).mean()), float((y * y).mean()), float((x * y).mean())
+    least = (xx + yy) / 2 - math.hypot((xx - yy) / 2, xy)  # eigenvalue of the mean outer product
+    return least / float(grey.var() + 1.0)
+
+
+class KeyframeChoice:
+    """Says which frames become keyframes, from their motion, overlap and sharpness."""
+
+    def __init__(
+        self, config: TrackingConfig, long_edge: int, recent: list[float] | None = None
+    ) -> None:
+        """``long_edge`` is that of the images, in pixels; ``recent`` the sharpness of the latest
+        frames, which is changed in place."""
+        self.config = config
+        self.long_edge = long_edge
+        self._recent = [] if recent is None else recent
+        self._concurrent = Errand("sharpness")
+
+    def see(self, image: UInt8[np.ndarray, "h w 3"]) -> None:
+        """Take note of the next frame, about which :meth:`calls_for` is asked.
+
+        Its sharpness is measured while it is tracked.
+        """
+        self._concurrent.start(lambda: self._note(sharpness(image)))
+
+    def settle(self) -> None:
+        """Wait until the latest frame has been noted."""
+        self._concurrent.wait()
+
+    def calls_for(self, flow: float, overlap: float) -> bool:
+        """Whether the frame seen last becomes one: see :func:`calls_for_keyframe`.
+
+        A frame that is blurred compared with the latest ones waits for a sharper one, though not
+        for long: nothing else sees what comes into view meanwhile.
+        """
+        patience = BLUR_WAIT if self._is_blurred() else 0.0
+        return calls_for_keyframe(self.config, self.long_edge, flow, overlap, patience)
+
+    def _note(self, value: float) -> None:
+        self._recent.append(value)
+        del self._recent[:-_COMPARED]
+
+    def _is_blurred(self) -> bool:
+        self.settle()
+        if len(self._recent) < 3:
+            return False
+        return self._recent[-1] < BLUR_RATIO * float(np.median(self._recent))

@@ -1,0 +1,86 @@
+"""Keyframes of a segment with all that comes with them: edges, priors, measured depth, log."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from geogs.config import Config
+from geogs.priors.base import MonocularPrior
+from geogs.tracking.flow.flow_operator import FlowOperator
+from geogs.tracking.frames.frame_recorder import FrameRecorder
+from geogs.tracking.graph.frame_graph import FrameGraph
+from geogs.tracking.graph.odometry import Odometry
+from geogs.tracking.keyframes.monocular_priors import KeyframePriors
+from geogs.tracking.keyframes.sensor_depth import SensorDepth
+from geogs.types import Frame
+from geogs.world.frames import RelativeRotation
+from geogs.world.keyframes import Keyframe
+from geogs.world.segments import VideoSegment
+
+
+class SegmentMap:
+    """Adds keyframes to a segment and removes them, so that all that is kept of them agrees."""
+
+    def __init__(
+        self,
+        segment: VideoSegment,
+        operator: FlowOperator,
+        config: Config,
+        prior: MonocularPrior | None = None,
+    ) -> None:
+        self.segment = segment
+        self.keyframes = keyframes = segment.keyframes
+        self.odometry = Odometry(keyframes, config.odometry, segment.odometry)
+        self.graph = FrameGraph(keyframes, operator, self.odometry, segment.edges)
+        self.recorder = FrameRecorder(segment.frames, keyframes, operator)
+        self.priors = KeyframePriors(self.graph, prior, config.prior)
+        self.sensor = SensorDepth(keyframes.grid, config.sensor)
+
+    @property
+    def operator(self) -> FlowOperator:
+        """Measures the flow between images."""
+        return self.graph.operator
+
+    def add(self, frame: Frame, encoded: Any, T_cw: Float[Tensor, "4 4"] | None = None) -> Keyframe:
+        """Make a frame a keyframe at a pose, the identity if none is given; depths are unknown."""
+        T_cw = torch.eye(4, dtype=torch.float64) if T_cw is None else T_cw
+        keyframe = self.keyframes.add(frame.index, frame.timestamp, frame.image, encoded, T_cw)
+        keyframe.pose = frame.pose
+        return keyframe
+
+    def complete(self, keyframe: Keyframe, rotations: Sequence[RelativeRotation]) -> None:
+        """Ask the prior about a new keyframe, and log its frame."""
+        self.priors.ask(keyframe)
+        self.recorder.add_keyframe(keyframe, rotations)
+
+    def cull(self, id: int, substitute: int) -> None:
+        """Make a keyframe an ordinary frame; those anchored to it move to a substitute."""
+        self.graph.remove_keyframe(id)
+        self.recorder.keyframe_removed(self.keyframes.remove(id), substitute)
+
+    def forget(self, ids: Sequence[int]) -> tuple[int, ...]:
+        """Give up keyframes, whose frames then have no pose; returns their ids."""
+        for id in ids:
+            self.graph.remove_keyframe(id)
+            self.recorder.keyframe_forgotten(self.keyframes.remove(id))
+        return tuple(ids)
+
+    def finalise(self, ids: Sequence[int]) -> tuple[int, ...]:
+        """Let keyframes be removed no more; returns those that could be until now."""
+        final = self.segment.final
+        known = set(final)
+        fresh = tuple(k for k in ids if k not in known)
+        for id in fresh:
+            if final:
+                self.recorder.finalise(final[-1], id)
+            final.append(id)
+        return fresh
+
+    def absorb(self, other: "SegmentMap") -> None:
+        """Take over the keyframes and frames of another map, already in this one's gauge."""
+        self.keyframes.absorb(other.keyframes)
+        self.graph.replace(dict(sorted({**self.graph.edges, **other.graph.edges}.items())))
+        self.recorder.absorb(other.recorder)

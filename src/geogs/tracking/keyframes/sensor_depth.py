@@ -1,0 +1,67 @@
+"""A depth sensor in the tracker: what it says of a keyframe's cells."""
+
+from collections.abc import Sequence
+
+import torch
+
+from geogs.bundle.select import grid_fields
+from geogs.config import DepthSensorConfig
+from geogs.priors.depth_sensor import sensor_depth
+from geogs.types import MeasuredDepth
+from geogs.world.grid import OFFSET, STRIDE, SampleGrid
+from geogs.world.keyframes import Keyframe, MeasuredCells
+
+
+class SensorDepth:
+    """Gives keyframes the depth that a sensor measured, in metres."""
+
+    def __init__(self, grid: SampleGrid, config: DepthSensorConfig) -> None:
+        self.grid = grid
+        self.config = config
+
+    def start(self, keyframe: Keyframe, depth: MeasuredDepth | None, least: float) -> bool:
+        """Give a first keyframe depths; False, and nothing done, where too few are known.
+
+        Cells that the sensor does not know are filled from those around, without information.
+        """
+        if not self._measure(keyframe, depth):
+            return False
+        measured = keyframe.measured
+        assert measured is not None
+        keyframe.inverse_depth, keyframe.information = measured.inverse_depth, measured.information
+        if float(keyframe.has_known_depth.float().mean()) < least:
+            keyframe.measured = None
+            return False
+        fields = grid_fields(self.grid)
+        keyframe.inverse_depth = fields.fill(measured.inverse_depth, measured.information)
+        return True
+
+    def join(self, keyframe: Keyframe, depth: MeasuredDepth | None) -> None:
+        """Let a new keyframe know what was measured, over the depth it was given by others."""
+        if not self._measure(keyframe, depth):
+            return
+        measured = keyframe.measured
+        assert measured is not None
+        known = measured.information > 0
+        depths = torch.where(known, measured.inverse_depth, keyframe.inverse_depth)
+        information = torch.where(known, measured.information, keyframe.information)
+        keyframe.inverse_depth = grid_fields(self.grid).fill(depths, information)
+        keyframe.information = information
+
+    def _measure(self, keyframe: Keyframe, depth: MeasuredDepth | None) -> bool:
+        """Keep the picture and what it says of the cells; False where there is none."""
+        metres = None if depth is None else depth.metres()
+        if metres is None:
+            return False
+        keyframe.sensor_depth = metres
+        grid = self.grid
+        cells = sensor_depth(metres, self.config).at_cells(OFFSET, STRIDE, grid.height, grid.width)
+        inverse_depth, information = (m.reshape(-1) for m in cells.tensors(grid.device))
+        keyframe.measured = MeasuredCells(inverse_depth, information)
+        return True
+
+
+def stands_alone(keyframes: Sequence[Keyframe]) -> bool:
+    """Whether the second of three keyframes is the only one of them whose depth was measured."""
+    before, middle, after = keyframes
+    return middle.measured is not None and before.measured is None and after.measured is None

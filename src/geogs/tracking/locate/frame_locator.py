@@ -1,0 +1,161 @@
+"""The motion of one frame against a keyframe of known depth."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from geogs.bundle.select import grid_fields, motion_solver
+from geogs.tracking.flow.flow_operator import FlowOperator
+from geogs.tracking.matching.photometric_check import PhotometricCheck, correlation_at
+from geogs.tracking.matching.pnp import pnp, pnp_features
+from geogs.tracking.matching.sparse_features import match_features
+from geogs.types import FlowMatch
+from geogs.world.grid import SampleGrid
+from geogs.world.keyframes import Keyframe
+
+MIN_KNOWN = 0.1
+"""Where the camera is cannot be told when the depth of less than this fraction of a keyframe is
+known to 30 % and found in the image: then it is followed as if it only rotated."""
+FIT_ITERATIONS = 6
+"""Steps of the motion-only adjustment of a frame."""
+FIT_HUBER = 5.0
+"""Standard deviations of the flow beyond which a match counts linearly in it."""
+
+FEATURE_CANDIDATES = 2
+"""Keyframes with which the features of a frame are compared when the camera is lost."""
+
+
+@dataclass(frozen=True)
+class FrameMotion:
+    """A frame located against a keyframe."""
+
+    keyframe: int
+    T_cw: Float[Tensor, "4 4"]
+    """float64."""
+    match: FlowMatch
+    """One edge, keyframe -> frame."""
+    flow: float
+    """Median motion of the matched cells in pixels: what the motion filter goes by."""
+    matched: float
+    """Fraction of the keyframe's cells with a match that agrees with the pose."""
+    overlap: float
+    """The same of those of its cells whose depth is known."""
+    known: float
+    """Fraction of the keyframe's cells that are matched and whose depth is known well enough to
+    tell where the camera is."""
+    residual: float
+    """Median distance in pixels between matches and reprojection."""
+    check: PhotometricCheck
+    """What the images say of it."""
+
+
+@dataclass(frozen=True)
+class Recognition:
+    """A keyframe that shows what an image shows."""
+
+    keyframe: int
+    T_rel: Float[Tensor, "4 4"]
+    """Keyframe's camera to the image's, float64."""
+
+
+class FrameLocator:
+    """Finds the pose of a frame from flow against keyframes, by motion-only adjustment.
+
+    A pose is believed where enough of the flow agrees with it, and the images do.
+    """
+
+    def __init__(
+        self,
+        grid: SampleGrid,
+        operator: FlowOperator,
+        min_matched: float,
+        max_residual: float,
+        min_ncc: float,
+    ) -> None:
+        self.grid = grid
+        self.operator = operator
+        self.min_matched = min_matched
+        self.max_residual = max_residual
+        self.min_ncc = min_ncc
+
+    def locate(
+        self,
+        keyframe: Keyframe,
+        encoded: Any,
+        T_guess: Float[Tensor, "4 4"],
+        is_expected: bool = True,
+    ) -> FrameMotion | None:
+        """Pose of a frame that is near ``T_guess``; None if too little agrees with any pose.
+
+        A frame that was not expected there has to pass the photometric check; one that was, only
+        where there is texture.
+        """
+        forward, backward = grid_fields(self.grid).reproject([keyframe], [T_guess])
+        match, _ = self.operator.measure(
+            [keyframe.encoded], [encoded], forward, backward, fine=False
+        )
+        T, T_ji, fit = motion_solver(self.grid).fit(
+            T_guess,
+            keyframe,
+            match.pixels[0],
+            match.weight[0],
+            iterations=FIT_ITERATIONS,
+            huber=FIT_HUBER,
+            limit=2 * self.max_residual,
+        )
+        seen = correlation_at(
+            self.grid,
+            self.operator.grey(keyframe.encoded),
+            self.operator.grey(encoded),
+            T_ji,
+            keyframe.inverse_depth,
+            keyframe.information,
+        )
+        # All at once, so that a GPU is waited for once.
+        found = torch.cat([T.reshape(-1), fit.to(T), seen.to(T)]).cpu()
+        _, agree, residual, flow, informed, known = found[16:22].tolist()
+        check = PhotometricCheck.of(found[22:24])
+        if agree < self.min_matched or not residual < self.max_residual:
+            return None
+        if not check.passes(self.min_ncc, is_expected):
+            return None
+        T_cw = found[:16].reshape(4, 4)
+        overlap = agree / informed
+        return FrameMotion(keyframe.id, T_cw, match, flow, agree, overlap, known, residual, check)
+
+    def locate_relative(
+        self, keyframe: Keyframe, encoded: Any, T_rel: Float[Tensor, "4 4"] | None
+    ) -> FrameMotion | None:
+        """Pose of a frame that was not expected near a guess relative to a keyframe, if any."""
+        if T_rel is None:
+            return None
+        T_guess = T_rel.to(keyframe.T_cw) @ keyframe.T_cw
+        return self.locate(keyframe, encoded, T_guess, is_expected=False)
+
+    def relocate(self, keyframe: Keyframe, encoded: Any) -> FrameMotion | None:
+        """Pose of a frame about which nothing is known, by flow from a cold start and PnP."""
+        there, _ = self.operator.measure([keyframe.encoded], [encoded], fine=False)
+        good = there.sure()[0] & (keyframe.information > 0)
+        T_rel = pnp(self.grid, keyframe.inverse_depth, there.pixels[0], good)
+        return self.locate_relative(keyframe, encoded, T_rel)
+
+    def relocate_by_features(self, keyframe: Keyframe, encoded: Any) -> FrameMotion | None:
+        """As :meth:`relocate`, by sparse features: the motion may be of any size."""
+        grey = self.operator.grey
+        found = match_features(grey(keyframe.encoded), grey(encoded))
+        T_rel = None if found is None else pnp_features(self.grid, keyframe, found)
+        return self.locate_relative(keyframe, encoded, T_rel)
+
+    def relocate_any(self, keyframes: Sequence[Keyframe], encoded: Any) -> FrameMotion | None:
+        """The first success of :meth:`relocate` over several keyframes, the likeliest first.
+
+        Where all fail, features are tried with the first ``FEATURE_CANDIDATES`` of them.
+        """
+        attempts = [(self.relocate, k) for k in keyframes]
+        attempts += [(self.relocate_by_features, k) for k in keyframes[:FEATURE_CANDIDATES]]
+        motions = (attempt(keyframe, encoded) for attempt, keyframe in attempts)
+        return next((motion for motion in motions if motion is not None), None)

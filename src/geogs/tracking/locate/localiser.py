@@ -1,0 +1,92 @@
+"""Where the camera is in a started map: near where it was, or anywhere when it is lost."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+
+from geogs.tracking.keyframes.segment_map import SegmentMap
+from geogs.tracking.locate.frame_locator import MIN_KNOWN, FrameLocator, FrameMotion, Recognition
+from geogs.tracking.locate.orientation_follower import Followed
+from geogs.tracking.locate.visible_keyframes import visible_keyframes
+from geogs.tracking.matching.flow_chain import MIN_MATCHED
+from geogs.tracking.matching.photometric_check import MIN_NCC
+from geogs.types import Frame
+from geogs.world.keyframes import Keyframe
+
+MAX_RESIDUAL = 0.008
+"""The camera is lost when the median reprojection error exceeds this, of the long edge."""
+RECOGNISED = 0.25
+"""A keyframe that an image was recognised as counts if this fraction of it finds a match: twice
+what is asked where the camera was expected."""
+TRIED = 5
+"""Recent keyframes, and as many older ones in turn, tried when the camera is lost."""
+RELOCALISE_EVERY = 5
+"""While a camera only rotates, its orientation says what it sees; only every so many frames it is
+searched for as if it could be anywhere."""
+
+
+class Localiser:
+    """Locates frames at the keyframes of a segment."""
+
+    def __init__(self, map: SegmentMap) -> None:
+        self.map = map
+        grid = map.keyframes.grid
+        edge = max(grid.camera.width, grid.camera.height)
+        self.locator = FrameLocator(grid, map.operator, MIN_MATCHED, MAX_RESIDUAL * edge, MIN_NCC)
+
+    def track(self, frame: Frame, encoded: Any) -> FrameMotion | None:
+        """The frame near where the last one was; None if the camera is not there."""
+        last = self.map.segment.status.last
+        if last is None:
+            return None
+        keyframe, locate = self.map.keyframes[last.keyframe], self.locator.locate
+        motion = locate(keyframe, encoded, last.predicted(keyframe, frame.timestamp))
+        if motion is None:
+            given = self.map.odometry.since(keyframe, frame.pose)
+            if given is not None:
+                motion = locate(keyframe, encoded, given @ keyframe.T_cw)
+        if motion is None and last.velocity is not None:
+            motion = locate(keyframe, encoded, last.T_cw(keyframe))
+        return self._with_depth(motion)
+
+    def relocalise(self, encoded: Any, followed: Followed | None) -> FrameMotion | None:
+        """The frame anywhere: first where the camera would be if it had only rotated."""
+        status, keyframes = self.map.segment.status, list(self.map.keyframes)
+        last = status.last
+        if last is not None and followed is not None and followed.R is not None:
+            rotation = torch.eye(4, dtype=torch.float64)
+            rotation[:3, :3] = followed.R
+            guess = rotation @ last.T_cw(self.map.keyframes[last.keyframe])
+            for keyframe in visible_keyframes(keyframes, guess):
+                motion = self.locator.locate(keyframe, encoded, guess, is_expected=False)
+                if self._with_depth(motion) is not None:
+                    return motion
+            if followed.is_pure and status.misses % RELOCALISE_EVERY:
+                return None
+        return self._with_depth(self.locator.relocate_any(self._candidates(keyframes), encoded))
+
+    def recognise(self, encoded: Any, recognised: Sequence[Recognition]) -> FrameMotion | None:
+        """The frame at one of some keyframes that look like it.
+
+        One is believed where the dense flow agrees with it over ``RECOGNISED`` of the cells.
+        """
+        for candidate in recognised:
+            if candidate.keyframe not in self.map.keyframes:
+                continue
+            keyframe = self.map.keyframes[candidate.keyframe]
+            motion = self.locator.locate_relative(keyframe, encoded, candidate.T_rel)
+            motion = self._with_depth(motion)
+            if motion is not None and motion.matched >= RECOGNISED:
+                return motion
+        return None
+
+    def _with_depth(self, motion: FrameMotion | None) -> FrameMotion | None:
+        """A motion that enough cells of known depth say."""
+        return None if motion is None or motion.known < MIN_KNOWN else motion
+
+    def _candidates(self, keyframes: list[Keyframe]) -> list[Keyframe]:
+        """Where to search for a lost camera: recent keyframes, and older ones by turns."""
+        recent, older = keyframes[: -TRIED - 1 : -1], keyframes[:-TRIED]
+        first = (self.map.segment.status.misses * TRIED) % max(len(older), 1)
+        return recent + (older[first:] + older[:first])[:TRIED]

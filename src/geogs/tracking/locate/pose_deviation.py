@@ -1,0 +1,61 @@
+"""How well a frame's pose is known, by the matches that located it."""
+
+from collections.abc import Callable
+from copy import copy
+from dataclasses import dataclass
+from functools import partial
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from geogs.bundle.marginals import ALIKE
+from geogs.bundle.projection import linearise
+from geogs.geometry.lie import se3_inverse
+from geogs.tracking.frames.pose_filling import depth_aware_weight
+from geogs.tracking.locate.frame_locator import FrameMotion
+from geogs.types import FlowMatch
+from geogs.world.grid import SampleGrid
+from geogs.world.keyframes import Keyframe
+
+DeviationOf = Callable[[], "PoseDeviation"]
+"""Computes a deviation, which takes as long as a good part of a frame."""
+
+
+@dataclass(frozen=True)
+class PoseDeviation:
+    """Standard deviations of a pose relative to the keyframe it was located at."""
+
+    position: float
+    """Of the camera's centre, all axes together, map units; infinite where nothing is known."""
+    rotation: float
+    """Of its orientation, radians."""
+
+
+def pose_deviation(
+    grid: SampleGrid, keyframe: Keyframe, T_rel: Float[Tensor, "4 4"], match: FlowMatch
+) -> PoseDeviation:
+    """What one edge, from a keyframe to a frame at ``T_rel`` from it, leaves open of the pose.
+
+    The inverse of sum J^T W J over the cells, J the derivative of a cell's position by a left
+    perturbation of the pose, and 1 / W the variance of its match and of what its depth's does to
+    it; times ``ALIKE``, as neighbours err alike.
+    """
+    p = linearise(grid.camera, grid.rays, T_rel[None].to(grid.device), keyframe.inverse_depth[None])
+    known = keyframe.confident_information[None]
+    weight = depth_aware_weight(match.weight[:1], p.depth_jacobian, known) * p.valid[..., None]
+    J = p.pose_jacobian[0]
+    H = torch.einsum("icp,jcp,pc->ij", J, J, weight[0]).double().cpu()
+    scale = H.diagonal().clamp(min=1e-30).rsqrt()
+    inverse, failed = torch.linalg.inv_ex(scale[:, None] * H * scale)
+    if int(failed):
+        return PoseDeviation(torch.inf, torch.inf)
+    squares = ALIKE * (inverse.diagonal() * scale.square()).reshape(2, 3).sum(-1)
+    position, rotation = squares.clamp(min=0).sqrt().tolist()
+    return PoseDeviation(position, rotation)
+
+
+def deviation_of(grid: SampleGrid, keyframe: Keyframe, motion: FrameMotion) -> DeviationOf:
+    """The same of a frame located at a keyframe, by what is known now, when it is asked for."""
+    T_rel = motion.T_cw @ se3_inverse(keyframe.T_cw).to(motion.T_cw)
+    return partial(pose_deviation, grid, copy(keyframe), T_rel, motion.match)

@@ -1,0 +1,62 @@
+"""Flow followed from a first image through those after it, while no depth is known."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+
+from geogs.tracking.flow.filled import filled_positions
+from geogs.tracking.flow.flow_operator import FlowOperator
+from geogs.tracking.matching.photometric_check import (
+    MIN_NCC,
+    PhotometricCheck,
+    correlation_matched,
+    matched_motion,
+)
+from geogs.tracking.matching.sparse_features import guided_flow
+from geogs.types import FlowMatch
+from geogs.world.grid import SampleGrid
+from geogs.world.segments import ChainedPositions
+
+MIN_TEXTURE = 0.05
+"""A frame is skipped when less than this fraction of it has structure."""
+MIN_MATCHED = 0.12
+"""The camera is lost when less than this fraction of a keyframe finds a match."""
+
+
+@dataclass(frozen=True)
+class ChainedMatch:
+    """The motion of a frame since the last keyframe while no depth is known."""
+
+    there: FlowMatch
+    """One edge, keyframe -> frame."""
+    flow: float
+    """Median motion of the matched cells in pixels."""
+    matched: float
+    """Fraction of the cells that are matched; 0 where the images do not agree there."""
+
+
+class FlowChain:
+    """Follows the flow from a first image through those after it, each starting from the last."""
+
+    def __init__(self, grid: SampleGrid, operator: FlowOperator) -> None:
+        self.grid = grid
+        self.operator = operator
+
+    def follow(self, chain: ChainedPositions, first: Any, encoded: Any) -> ChainedMatch:
+        """Match the first image with the next one, from where ``chain`` has come to."""
+        there, back = self.operator.measure([first], [encoded], chain.there, chain.back, fine=False)
+        there, back = guided_flow(self.grid, self.operator, first, encoded, there, back)
+        # What the images say where the flow, for want of a pose, leads.
+        images = self.operator.grey(first), self.operator.grey(encoded)
+        seen = correlation_matched(self.grid, *images, there.pixels[0])
+        moved = matched_motion(self.grid, there.pixels[0], there.weight[0])
+        # All at once, so that a GPU is waited for once.
+        found = torch.cat([moved, seen]).cpu()
+        matched, flow = found[:2].tolist()
+        if not PhotometricCheck.of(found[2:]).passes(MIN_NCC, is_expected=True):
+            matched = 0.0
+        if matched > 0:
+            chain.there = filled_positions(self.grid, there)[None]
+            chain.back = filled_positions(self.grid, back)[None]
+        return ChainedMatch(there, flow if matched else 0.0, matched)

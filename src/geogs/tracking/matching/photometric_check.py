@@ -1,0 +1,209 @@
+"""Photometric check of a location: whether the images agree at a pose.
+
+A flow that was smoothed agrees with itself, there and back, even between images that have nothing
+in common; that it does is no evidence. What two images show of one surface is: the window around a
+cell of the one correlates with what the other shows where the pose and the depth, not the flow, put
+it.
+"""
+
+from dataclasses import dataclass
+from math import gcd
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn import functional
+
+from geogs.gpu.transfer import to_device
+from geogs.world.grid import STRIDE, SampleGrid
+
+SIDE = STRIDE + 1
+"""Pixels along the edge of a window; those of neighbouring cells share their border."""
+MIN_NCC = 0.5
+"""A frame counts as located where the images agree: least median correlation (NCC) of windows of
+9 x 9 pixels, reprojected by pose and depth. Unlike images come to 0, one position to 0.7 and more.
+Where too few windows have texture the flow alone decides whether the camera is still where it was
+followed to; a map is never started, nor a camera found again, without evidence."""
+MIN_CONTRAST = 2.0
+"""Standard deviation in grey levels of a window with texture, after smoothing."""
+MAX_WINDOWS = 512
+"""Most windows that are compared, evenly spread; more would hardly move their median."""
+MIN_WINDOWS = 24
+"""Fewest windows whose median says something."""
+
+
+@dataclass(frozen=True)
+class PhotometricCheck:
+    """What the images say of a location."""
+
+    correlation: float
+    """Median normalised cross-correlation (NCC) of the windows, in [-1, 1]; 0 without any."""
+    windows: int
+    """How many there are: with texture and known depth, in view of both images."""
+
+    @staticmethod
+    def of(numbers: Float[Tensor, "2"]) -> "PhotometricCheck":
+        """What :func:`correlation_at` returns as plain numbers; waits for a GPU."""
+        correlation, windows = numbers.tolist()
+        return PhotometricCheck(correlation, int(windows))
+
+    def passes(self, min_correlation: float, is_expected: bool) -> bool:
+        """Whether a location is to be believed.
+
+        With too few windows the images say nothing. Then one is believed only where it ``is
+        expected``: near the one before it.
+        """
+        if self.windows < MIN_WINDOWS:
+            return is_expected
+        return self.correlation >= min_correlation
+
+
+def correlation_at(
+    grid: SampleGrid,
+    first: Float[Tensor, "h w"],
+    second: Float[Tensor, "h w"],
+    T_ji: Float[Tensor, "4 4"],
+    inverse_depth: Float[Tensor, "p"],
+    information: Float[Tensor, "p"],
+) -> Float[Tensor, "2"]:
+    """The numbers of a :class:`PhotometricCheck`, of two images in grey levels at a relative pose.
+
+    Depth is the first's, and unknown where it has no information. All tensors but the pose, which
+    may be on the CPU, are on the grid's device; so is the result, and nothing waits for a GPU.
+    """
+    if grid.on_gpu:
+        return _on_gpu(grid, first, second, T_ji, inverse_depth, information)
+    some = _spread(grid)
+    positions = reprojected_windows(grid, T_ji, inverse_depth)
+    return _median_correlation(grid, first, second, positions, information[some] > 0)
+
+
+def correlation_matched(
+    grid: SampleGrid,
+    first: Float[Tensor, "h w"],
+    second: Float[Tensor, "h w"],
+    pixels: Float[Tensor, "p 2"],
+) -> Float[Tensor, "2"]:
+    """:func:`correlation_at` where no pose is known: cells lie at ``pixels`` of the second.
+
+    Says less, since a flow leads where images look alike; but it cannot make them alike.
+    """
+    if grid.on_gpu:
+        return _on_gpu(grid, first, second, pixels=pixels)
+    some = _spread(grid)
+    positions = pixels[some, None] + _offsets(grid)
+    return _median_correlation(
+        grid, first, second, positions, torch.ones_like(positions[:, 0, 0]) > 0
+    )
+
+
+def matched_motion(
+    grid: SampleGrid, pixels: Float[Tensor, "p 2"], weight: Float[Tensor, "p 2"]
+) -> Float[Tensor, "2"]:
+    """Fraction of the cells that are matched, and their median motion in pixels, 0 without any.
+
+    On a GPU both stay there, and nothing waits.
+    """
+    if grid.on_gpu:
+        from geogs.tracking.cuda import evidence
+
+        return evidence.matched_motion(grid, pixels, weight)
+    used = weight[:, 0] > 0
+    median = _median_where((pixels - grid.pixels).norm(dim=-1), used)[:1]
+    return torch.cat([used.to(median).mean()[None], median])
+
+
+def _on_gpu(
+    grid: SampleGrid,
+    first: Float[Tensor, "h w"],
+    second: Float[Tensor, "h w"],
+    T_ji: Float[Tensor, "4 4"] | None = None,
+    inverse_depth: Float[Tensor, "p"] | None = None,
+    information: Float[Tensor, "p"] | None = None,
+    pixels: Float[Tensor, "p 2"] | None = None,
+) -> Float[Tensor, "2"]:
+    """The same by kernels: where a pose and depths put the cells, or at ``pixels``."""
+    from geogs.tracking.cuda.evidence import median_correlation
+
+    if T_ji is not None:
+        T_ji = to_device(T_ji, first.device)
+    return median_correlation(
+        grid, first, second, _spread(grid).step, MIN_CONTRAST**2, T_ji, inverse_depth, information,
+        pixels,
+    )  # fmt: skip
+
+
+def reprojected_windows(
+    grid: SampleGrid, T_ji: Float[Tensor, "4 4"], inverse_depth: Float[Tensor, "p"]
+) -> Float[Tensor, "n s 2"]:
+    """Where a second view sees the windows around some cells of the first, pixel by pixel.
+
+    The surface in a window is taken to have its cell's depth: the window is rotated, scaled and
+    sheared as that plane is. Pixels that are not before the second camera are not finite.
+    """
+    c, some = grid.camera, _spread(grid)
+    R, t = T_ji[:3, :3].to(grid.rays), T_ji[:3, 3].to(grid.rays)
+    middle = grid.rays[some] @ R.mT + inverse_depth[some, None] * t
+    around = _offsets(grid) @ torch.stack([R[:, 0] / c.fx, R[:, 1] / c.fy])
+    x, y, z = (middle[:, None] + around).unbind(-1)
+    z = torch.where(z > 1e-6, z, torch.nan)
+    return torch.stack([c.fx * x / z + c.cx, c.fy * y / z + c.cy], -1)
+
+
+def _median_correlation(
+    grid: SampleGrid,
+    first: Float[Tensor, "h w"],
+    second: Float[Tensor, "h w"],
+    positions: Float[Tensor, "n s 2"],
+    known: Bool[Tensor, "n"],
+) -> Float[Tensor, "2"]:
+    """Median NCC of the known windows with texture in the first image that the second shows."""
+    sides = (grid.camera.width - 1, grid.camera.height - 1)
+    position = torch.stack([positions[..., k] * (2 / sides[k]) - 1 for k in (0, 1)], -1)
+    seen = (position.abs() <= 1).flatten(1).all(1)
+    position = position.nan_to_num(0.0).clamp(-2, 2)
+    there = functional.grid_sample(second[None, None], position[None], align_corners=True)[0, 0]
+    a, b = (_smoothed(x) for x in (_windows(grid, first), there))
+    contrast, other = a.square().mean(1), b.square().mean(1)
+    ncc = (a * b).mean(1) / (contrast * other).sqrt().clamp(min=1e-6)
+    return _median_where(ncc, known & seen & (contrast > MIN_CONTRAST**2))
+
+
+def _windows(grid: SampleGrid, image: Float[Tensor, "h w"]) -> Float[Tensor, "n s"]:
+    """Windows around some cells; the border is repeated where one ends a pixel outside."""
+    image = functional.pad(image[None, None], (0, 1, 0, 1), mode="replicate")[0, 0]
+    every = image.unfold(0, SIDE, STRIDE).unfold(1, SIDE, STRIDE)
+    return every.reshape(grid.size, SIDE**2)[_spread(grid)]
+
+
+def _smoothed(windows: Float[Tensor, "n s"]) -> Float[Tensor, "n r"]:
+    """Means of 3 x 3 pixels about the window's mean: what noise and half a pixel change little."""
+    x = windows.reshape(-1, SIDE, SIDE)
+    x = x[:, :-2] + x[:, 1:-1] + x[:, 2:]
+    x = (x[..., :-2] + x[..., 1:-1] + x[..., 2:]).flatten(1) / 9
+    return x - x.mean(1, keepdim=True)
+
+
+def _median_where(values: Float[Tensor, "n"], counts: Bool[Tensor, "n"]) -> Float[Tensor, "2"]:
+    """Lower median of the values that count, 0 without any, and their number.
+
+    ``torch.nanmedian`` would wait for the GPU.
+    """
+    ordered = torch.where(counts, values, torch.inf).sort().values
+    number = counts.sum()
+    middle = ordered.gather(0, ((number - 1).clamp(min=0) // 2)[None])
+    return torch.cat([torch.where(number > 0, middle, 0.0), number[None].to(middle)])
+
+
+def _spread(grid: SampleGrid) -> slice:
+    """Every k-th cell, row by row: no more than are compared, and from all columns."""
+    step = -(-grid.size // MAX_WINDOWS)
+    while gcd(step, grid.width) > 1:
+        step += 1
+    return slice(None, None, step)
+
+
+def _offsets(grid: SampleGrid) -> Float[Tensor, "s 2"]:
+    """Pixels of a window from its middle, row by row."""
+    d = torch.arange(SIDE, dtype=torch.float32, device=grid.device) - SIDE // 2
+    return torch.stack([d.repeat(SIDE), d.repeat_interleave(SIDE)], -1)

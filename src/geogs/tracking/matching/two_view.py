@@ -1,0 +1,127 @@
+"""Relative pose of two views from their flow alone, and the depth that it gives."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float64, Int
+from torch import Tensor
+
+from geogs.geometry.camera import Camera
+from geogs.types import FlowMatch
+from geogs.world.grid import SampleGrid
+
+FARTHEST = 50.0
+"""Baselines beyond which a point says nothing on which of four poses is the right one."""
+
+
+@dataclass(frozen=True)
+class TwoView:
+    """The relative pose of a pair of views and the depth that it gives, up to scale; on the CPU."""
+
+    T_ji: Float[Tensor, "4 4"]
+    inverse_depth: Float[Tensor, "p"]
+    """Of the first view, median 1; 1 where it is not good."""
+    good: Bool[Tensor, "p"]
+    parallax: float
+    """Median motion in pixels that rotation does not explain."""
+
+
+def best_two_view(
+    views: Iterable[TwoView | None], min_parallax: float
+) -> tuple[int, TwoView] | None:
+    """The pair to start from, with its index; None where none has the parallax (pixels)."""
+    best, best_score = None, 0.0
+    for n, view in enumerate(views):
+        if view is None or view.parallax < min_parallax:
+            continue
+        # Parallax helps until the views no longer overlap.
+        score = min(view.parallax, 3 * min_parallax) * int(view.good.sum())
+        if score > best_score:
+            best, best_score = (n, view), score
+    return best
+
+
+def two_view(camera: Camera, match: FlowMatch) -> TwoView | None:
+    """Relative pose by the essential matrix and depth by triangulation, on the CPU."""
+    found = relative_pose(camera, match)
+    if found is None:
+        return None
+    T, inliers = found
+    p, q = SampleGrid(camera).pixels.double().numpy(), match.pixels[0].double().numpy()
+    K, count = camera.matrix().numpy(), len(p)
+    homogeneous = cv2.triangulatePoints(K @ np.eye(3, 4), K @ T[:3], p[inliers].T, q[inliers].T)
+    z = homogeneous[2] / np.where(np.abs(homogeneous[3]) < 1e-12, 1e-12, homogeneous[3])
+    median = np.median(z[z > 0])
+    near = (z > 0.1 * median) & (z < 10 * median)
+    z, inliers = z[near], inliers[near]
+    rotated = rays_through(p[inliers], K) @ (K @ T[:3, :3]).T
+    parallax = np.median(np.linalg.norm(q[inliers] - rotated[:, :2] / rotated[:, 2:], axis=1))
+    T[:3, 3] /= median
+    depth, known = torch.ones(count), torch.zeros(count, dtype=torch.bool)
+    depth[inliers], known[inliers] = torch.from_numpy(median / z).float(), True
+    return TwoView(torch.from_numpy(T), depth, known, float(parallax))
+
+
+def relative_pose(
+    camera: Camera, match: FlowMatch
+) -> tuple[Float64[np.ndarray, "4 4"], Int[np.ndarray, "n"]] | None:
+    """First camera to second by the essential matrix (MAGSAC), and the cells that agree with it.
+
+    The translation is a unit. None where too few cells are matched, or lie before both cameras.
+    """
+    used = match.sure()[0].numpy()
+    if used.sum() < 0.1 * len(used):
+        return None
+    p, q = SampleGrid(camera).pixels.double().numpy(), match.pixels[0].double().numpy()
+    K = camera.matrix().numpy()
+    try:
+        E, mask = cv2.findEssentialMat(p[used], q[used], K, cv2.USAC_MAGSAC, 0.9999, 0.7)
+    except cv2.error:  # OpenCV 5 fails an assertion where no sample gives a model
+        return None
+    if E is None or E.shape != (3, 3):
+        return None
+    agreeing = np.flatnonzero(used)[mask[:, 0] > 0]
+    R, t, in_front = _pose_of(E, rays_through(p[agreeing], K), rays_through(q[agreeing], K))
+    if in_front.sum() < 0.3 * used.sum():
+        return None
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = R, t
+    return T, agreeing[in_front]
+
+
+def rays_through(
+    pixels: Float64[np.ndarray, "n 2"], K: Float64[np.ndarray, "3 3"]
+) -> Float64[np.ndarray, "n 3"]:
+    """Rays of z = 1 through the pixels of a camera with the matrix K."""
+    return np.c_[(pixels - K[:2, 2]) / K[[0, 1], [0, 1]], np.ones(len(pixels))]
+
+
+def _pose_of(
+    E: Float64[np.ndarray, "3 3"],
+    first: Float64[np.ndarray, "n 3"],
+    second: Float64[np.ndarray, "n 3"],
+) -> tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray, "3"], Bool[np.ndarray, "n"]]:
+    """Of the four poses of an essential matrix the one that sees most points before both cameras.
+
+    Returns the rotation, the unit translation (first camera to second) and which points lie there,
+    nearer than ``FARTHEST`` baselines. From z R a + t = z' b for the rays a and b of a point its
+    two depths follow by the cross products with b and with R a.
+    """
+    R1, R2, t = cv2.decomposeEssentialMat(E)
+    t, best = t[:, 0], None
+    for R in (R1, R2):
+        rotated = first @ R.T
+        across = np.cross(rotated, second)
+        square = np.maximum((across**2).sum(1), 1e-30)
+        z_first = -(np.cross(t, second) * across).sum(1) / square
+        z_second = -(np.cross(t, rotated) * across).sum(1) / square
+        for sign in (1.0, -1.0):
+            z, other = sign * z_first, sign * z_second
+            seen = (z > 0) & (z < FARTHEST) & (other > 0) & (other < FARTHEST)
+            if best is None or seen.sum() > best[2].sum():
+                best = R, sign * t, seen
+    assert best is not None
+    return best

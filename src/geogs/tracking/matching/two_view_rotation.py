@@ -1,0 +1,182 @@
+"""Rotation of the camera between two views, and whether it did more than rotate.
+
+Two models explain a flow: the camera only rotated, or it moved as well. The second always fits
+better, having more freedom; which of them the flow speaks for is decided by Torr's geometric robust
+information criterion (GRIC, 1998), with the operator's own deviations.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float64
+from torch import Tensor
+
+from geogs.geometry.least_squares import Policy, Step, minimise
+from geogs.geometry.nearest_rotation import nearest_rotation
+from geogs.tracking.matching.two_view import rays_through, relative_pose
+from geogs.types import FlowMatch
+from geogs.world.grid import SampleGrid
+
+AGREEING = 0.4
+"""Fraction of the matched cells that must agree with a rotation for it to be believed."""
+SHARPENED = (0.1, 0.03, 0.01, 0.005, 0.005)
+"""Distances in the image, of the long edge, beyond which a cell loses its say, step by step."""
+TOLERANCE = 0.008
+"""Distance within which a cell agrees with a rotation, of the long edge."""
+MOST_CELLS = 1024
+"""That are fitted; evenly spread ones of more."""
+MIN_SIGMA = 0.1
+"""Pixels: no cell counts as more precise than this."""
+LEAST_DEVIATION = 2e-4
+"""Radians: no rotation is known better, whatever its many cells say; they err alike."""
+
+
+@dataclass(frozen=True)
+class RotationFit:
+    """The rotation that most of a flow agrees with."""
+
+    R: Float64[Tensor, "3 3"]
+    """First camera to second."""
+    agreeing: float
+    """Fraction of the matched cells within ``TOLERANCE``."""
+    deviation: float
+    """Standard deviation of the angle, radians."""
+    squares: Float64[np.ndarray, "n"]
+    """Squared error of each matched cell in the flow's variances."""
+
+
+@dataclass(frozen=True)
+class TwoViewRotation:
+    """Rotation of a view relative to another."""
+
+    R: Float64[Tensor, "3 3"]
+    """First camera to second."""
+    deviation: float
+    """Standard deviation of the angle, radians."""
+    is_pure: bool
+    """Whether nothing speaks for more than a rotation."""
+
+
+def two_view_rotation(grid: SampleGrid, match: FlowMatch) -> TwoViewRotation | None:
+    """The rotation between two views by the model that their flow (one edge) speaks for.
+
+    None where too few cells agree with either.
+    """
+    rotated = fit_rotation(grid, match)
+    if rotated is None:
+        return None
+    pair = FlowMatch(match.pixels.cpu(), match.weight.cpu())
+    moved = relative_pose(grid.camera, pair)
+    if moved is not None:
+        T_ji = torch.from_numpy(moved[0])
+        off = epipolar_squares(grid, pair, T_ji)
+        if gric(rotated.squares, 2, 3) > gric(off, 3, 5):
+            return TwoViewRotation(T_ji[:3, :3], rotated.deviation, False)
+    if rotated.agreeing < AGREEING:
+        return None
+    return TwoViewRotation(rotated.R, rotated.deviation, True)
+
+
+def gric(squares: Float64[np.ndarray, "n"], dimension: int, parameters: int) -> float:
+    """Torr's criterion of a model of two views; the smaller, the better the model.
+
+    Args:
+        squares: squared errors of the matches in their variances.
+        dimension: of what a match may lie on, in the space of its four coordinates: 2 where the
+            model says where a point is seen, 3 where it says only on which line.
+        parameters: of the model.
+    """
+    n, codimension = len(squares), 4 - dimension
+    robust = float(np.minimum(squares, 2 * codimension).sum())
+    return robust + dimension * n * math.log(4) + parameters * math.log(4 * max(n, 1))
+
+
+def fit_rotation(grid: SampleGrid, match: FlowMatch) -> RotationFit | None:
+    """The rotation that most of a flow (one edge) agrees with.
+
+    Gauss-Newton on the distances in the second image under Geman and McClure's loss, which is
+    sharpened from step to step. None where fewer than eight cells are matched.
+    """
+    camera, used = grid.camera, (match.weight[0, :, 0] > 0).cpu().numpy()
+    if used.sum() < 8:
+        return None
+    rays = grid.rays.double().cpu().numpy()[used]
+    pixels = match.pixels[0].double().cpu().numpy()[used]
+    weight = match.weight[0].double().cpu().numpy()[used]
+    weight = weight / (1 + MIN_SIGMA**2 * weight)
+    edge = max(camera.width, camera.height)
+    focal, centre = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
+    seen = rays_through(pixels, camera.matrix().numpy())
+    first, second = (x / np.linalg.norm(x, axis=1, keepdims=True) for x in (rays, seen))
+    R = nearest_rotation(second.T @ first)
+    some = slice(None, None, -(-len(pixels) // MOST_CELLS))
+    H = np.zeros((3, 3))
+    for reach in SHARPENED:
+
+        def linearised(
+            R: Float64[np.ndarray, "3 3"], reach: float = reach
+        ) -> Float64[np.ndarray, "3"]:
+            """The gradient; the Hessian is kept, also for what is said of the deviation."""
+            nonlocal H
+            error, J = _linearised(rays[some] @ R.T, pixels[some], focal, centre)
+            square = (error**2).sum(1, keepdims=True) / (reach * edge) ** 2
+            robust = weight[some] / (1 + square) ** 2
+            weighted = (robust[..., None] * J).reshape(-1, 3).T
+            H = weighted @ J.reshape(-1, 3)
+            gradient: Float64[np.ndarray, "3"] = weighted @ error.reshape(-1)
+            return gradient
+
+        def step(
+            R: Float64[np.ndarray, "3 3"], gradient: Float64[np.ndarray, "3"], damping: float
+        ) -> Step[Float64[np.ndarray, "3 3"]]:
+            return Step(_exponential(np.linalg.solve(H + damping * np.eye(3), gradient)) @ R)
+
+        R = minimise(R, linearised, step, Policy(2, damping=1e-9)).state
+    error, _ = _linearised(rays @ R.T, pixels, focal, centre)
+    agreeing = float((np.linalg.norm(error, axis=1) < TOLERANCE * edge).mean())
+    H *= len(pixels) / len(pixels[some])
+    deviation = max(math.sqrt(np.trace(np.linalg.inv(H + 1e-9 * np.eye(3)))), LEAST_DEVIATION)
+    return RotationFit(torch.from_numpy(R), agreeing, deviation, (weight * error**2).sum(1))
+
+
+def epipolar_squares(
+    grid: SampleGrid, match: FlowMatch, T_ji: Float[Tensor, "4 4"]
+) -> Float64[np.ndarray, "n"]:
+    """Squared distances of the matched cells from their epipolar lines, in the flow's variances."""
+    camera, used = grid.camera, match.weight[0, :, 0] > 0
+    t, R = T_ji[:3, 3].double().numpy(), T_ji[:3, :3].double().numpy()
+    rotated = grid.rays.cpu().double().numpy()[used.numpy()] @ R.T
+    normal = np.cross(t, rotated)  # of the plane of a ray and the baseline
+    line = normal[:, :2] / [camera.fx, camera.fy]
+    pixels = match.pixels[0][used].double().numpy() - [camera.cx, camera.cy]
+    off = (line * pixels).sum(1) + normal[:, 2]
+    weight = match.weight[0][used].double().numpy()
+    variance = (line**2 * (1 / weight + MIN_SIGMA**2)).sum(1)
+    squares: Float64[np.ndarray, "n"] = off**2 / np.maximum(variance, 1e-30)
+    return squares
+
+
+def _linearised(
+    points: Float64[np.ndarray, "n 3"],
+    pixels: Float64[np.ndarray, "n 2"],
+    focal: Float64[np.ndarray, "2"],
+    centre: Float64[np.ndarray, "2"],
+) -> tuple[Float64[np.ndarray, "n 2"], Float64[np.ndarray, "n 2 3"]]:
+    """What is missing from projections to where points are seen, and how a rotation moves them."""
+    z = np.maximum(points[:, 2], 1e-3)
+    x, y = points[:, 0] / z, points[:, 1] / z
+    J = np.stack([
+        np.stack([-x * y, 1 + x * x, -y], -1), np.stack([-1 - y * y, x * y, x], -1),
+    ], 1)  # fmt: skip
+    return pixels - (focal * np.stack([x, y], -1) + centre), J * focal[:, None]
+
+
+def _exponential(phi: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3 3"]:
+    """Rodrigues' formula."""
+    angle = float(np.linalg.norm(phi))
+    K = np.array([[0, -phi[2], phi[1]], [phi[2], 0, -phi[0]], [-phi[1], phi[0], 0]])
+    half = np.sinc(angle / (2 * np.pi))
+    R: Float64[np.ndarray, "3 3"] = np.eye(3) + np.sinc(angle / np.pi) * K + 0.5 * half**2 * K @ K
+    return R

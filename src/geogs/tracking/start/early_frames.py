@@ -1,0 +1,75 @@
+"""Poses of the frames from before a map was started."""
+
+import torch
+
+from geogs.geometry.lie import retract, se3_inverse, se3_log, so3_log
+from geogs.tracking.frames.frame_recorder import FrameRecorder
+from geogs.tracking.frames.rotation_averaging import orientations
+from geogs.tracking.locate.frame_locator import FrameLocator
+from geogs.tracking.locate.visible_keyframes import visible_keyframes
+from geogs.world.frames import FrameLog
+from geogs.world.keyframes import KeyframeSet
+
+MAX_DISAGREEMENT = 0.05
+"""Radians by which a frame's orientation may differ from one between its keyframes."""
+
+
+def place_between_keyframes(log: FrameLog, keyframes: KeyframeSet) -> None:
+    """Give the frames of a start a pose between their keyframes.
+
+    One whose rotations say another orientation has none: it was seen while the camera faced away
+    from both.
+    """
+    ordered = list(keyframes)
+    indices = [k.frame_index for k in ordered]
+    oriented = orientations(
+        {r.index: r.rotations for r in log.records},
+        {k.frame_index: k.T_cw[:3, :3] for k in ordered},
+    )
+    for record in log.records:
+        if record.anchor is None or record.anchor not in keyframes:
+            continue
+        n = indices.index(keyframes[record.anchor].frame_index)
+        a, b = ordered[n], ordered[min(n + 1, len(ordered) - 1)]
+        span = max(b.frame_index - a.frame_index, 1)
+        fraction = (record.index - a.frame_index) / span
+        xi = se3_log(b.T_cw @ se3_inverse(a.T_cw))
+        record.T_rel, record.scale = retract(fraction * xi, torch.eye(4).to(xi)), a.scale
+        R = oriented.get(record.index)
+        if R is not None:
+            angle = so3_log(R @ (record.T_rel @ a.T_cw)[:3, :3].mT).norm()
+            if float(angle) > MAX_DISAGREEMENT:
+                record.anchor = None
+
+
+def locate_early_frames(
+    recorder: FrameRecorder, keyframes: KeyframeSet, locator: FrameLocator, min_known: float
+) -> None:
+    """Locate the frames that have no pose between the keyframes of a start, the latest first.
+
+    Each is searched for where the camera was at the nearest time that is known, with the
+    orientation that relative rotations say.
+    """
+    waiting = recorder.take_unplaced()
+    candidates = list(keyframes)
+    if not waiting or not candidates:
+        return
+    oriented = orientations(
+        {r.index: r.rotations for r in recorder.log.records},
+        {k.frame_index: k.T_cw[:3, :3] for k in candidates},
+    )
+    centres = {k.frame_index: se3_inverse(k.T_cw)[:3, 3] for k in candidates}
+    for record, encoded in reversed(waiting):
+        record.anchor, R = None, oriented.get(record.index)
+        if R is None:
+            continue
+        nearest = min(centres, key=lambda index: abs(index - record.index))
+        guess = torch.eye(4, dtype=torch.float64)
+        guess[:3, :3], guess[:3, 3] = R, -R @ centres[nearest]
+        for keyframe in visible_keyframes(candidates, guess):
+            motion = locator.locate(keyframe, encoded, guess, is_expected=False)
+            if motion is not None and motion.known >= min_known:
+                T_rel = motion.T_cw @ se3_inverse(keyframe.T_cw)
+                recorder.place(record, keyframe.id, T_rel, motion.match)
+                centres[record.index] = se3_inverse(motion.T_cw)[:3, 3]
+                break

@@ -1,0 +1,169 @@
+"""Start-up: poses and depths of the first keyframes from flow alone.
+
+Identity poses with unit depth fall into mirrored minima, so the pose of one keyframe against the
+first comes from the essential matrix, the others follow by PnP on flows chained from the first, and
+dense bundle adjustment with re-measured flow polishes the whole.
+"""
+
+from collections.abc import Iterable, Sequence
+from enum import Enum
+from itertools import pairwise
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from geogs.bundle.base import BundleOptions
+from geogs.bundle.marginals import marginals
+from geogs.bundle.select import grid_fields
+from geogs.config import TrackingConfig
+from geogs.geometry.lie import se3_inverse
+from geogs.threads import thread_map
+from geogs.tracking.graph.frame_graph import HUBER, FrameGraph
+from geogs.tracking.graph.proximity import RADIUS
+from geogs.tracking.matching.photometric_check import MIN_NCC, PhotometricCheck, correlation_at
+from geogs.tracking.matching.pnp import pnp
+from geogs.tracking.matching.sparse_features import guided_flows
+from geogs.tracking.matching.two_view import TwoView, best_two_view, two_view
+from geogs.types import FlowMatch
+from geogs.world.grid import SampleGrid
+from geogs.world.keyframes import Keyframe, KeyframeSet
+
+MIN_PARALLAX = 0.005
+"""Motion that rotation does not explain, needed to try to start, of the long edge."""
+MAX_DEVIATION = 0.2
+"""The map is started when the depths of its first keyframes are known to this, in the median:
+relative standard deviation by what matches and poses leave open."""
+LEAST_SEEN = 0.4
+"""Fraction of the first keyframe's depths that a keyframe must see to be placed on them."""
+ROUNDS, FORGIVING = 6, 2
+"""Rounds of flow and adjustment; and those after which it shows whether depths are far too open:
+later ones find them more open yet."""
+FAR = 1.5
+"""Times the allowed deviation of depths beyond which one more keyframe is not going to help."""
+
+
+class Attempt(Enum):
+    """What came of trying to start."""
+
+    STARTED = "started"
+    FAILED = "failed"
+    FAR_OFF = "far off"
+    """Depths are so open that only many more keyframes may help."""
+
+
+def initialise(graph: FrameGraph, config: TrackingConfig, flows: Sequence[FlowMatch]) -> Attempt:
+    """Estimate all keyframes of the graph from nothing but the flows from the first to the others.
+
+    It fails if they show no parallax, if matches and poses leave their depths open
+    (``MAX_DEVIATION``), or if the images of two that follow each other do not correlate where
+    poses and depths put them (``MIN_NCC``).
+    On success poses, depths and information are set, the first pose is the identity and the median
+    depth over all keyframes is one unit.
+    """
+    segment = graph.keyframes
+    camera = segment.grid.camera
+    min_parallax = MIN_PARALLAX * max(camera.width, camera.height)
+    # Poses are guessed on the CPU.
+    flows = [FlowMatch(f.pixels.cpu(), f.weight.cpu()) for f in flows]
+    found = thread_map(lambda match: two_view(camera, match), flows)
+    best = best_two_view(found, min_parallax)
+    if best is None:
+        return Attempt.FAILED
+    _place_all(graph, flows, best)
+    for rounds in (range(FORGIVING), range(FORGIVING, ROUNDS)):
+        if not _polish(graph, config.moving, rounds):
+            return Attempt.FAILED
+        deviation = _depth_deviation(graph)
+        if deviation > FAR * MAX_DEVIATION:
+            return Attempt.FAR_OFF
+    if deviation > MAX_DEVIATION or not _passes_photometric_check(graph):
+        return Attempt.FAILED
+    return Attempt.STARTED
+
+
+def _place_all(graph: FrameGraph, flows: Sequence[FlowMatch], best: tuple[int, TwoView]) -> None:
+    """Poses by PnP on the first keyframe's depth, depths by propagating it; flows on the CPU.
+
+    Keyframes that no longer see it are placed on what the one before them was given.
+    """
+    segment = graph.keyframes
+    chosen, view = best
+    keyframes, fields = list(segment), grid_fields(segment.grid)
+    first = keyframes[0]
+    device, grid = segment.grid.device, SampleGrid(segment.grid.camera)
+    first.T_cw, known = torch.eye(4, dtype=torch.float64), view.good
+    first.information = known.float().to(device)
+    first.inverse_depth = fields.fill(view.inverse_depth.to(device), first.information)
+    depth = first.inverse_depth.cpu()
+    for n, (keyframe, match) in enumerate(zip(keyframes[1:], flows, strict=True)):
+        if n == chosen:
+            keyframe.T_cw = view.T_ji
+        else:
+            good = known & match.sure()[0]
+            T = None
+            if float(good.sum()) > LEAST_SEEN * float(known.sum()):
+                T = pnp(grid, depth, match.pixels[0], good)
+            keyframe.T_cw = placed_after(graph, keyframes[n], keyframe) if T is None else T
+        keyframe.inverse_depth, keyframe.information = fields.transfer(
+            keyframe.T_cw, first.inverse_depth, first.information
+        )
+
+
+def placed_after(graph: FrameGraph, before: Keyframe, keyframe: Keyframe) -> Float[Tensor, "4 4"]:
+    """Pose of a keyframe by PnP on the depth of the one before it, or that one's pose."""
+    grid, pair = graph.keyframes.grid, [before.encoded, keyframe.encoded]
+    ((match, _),) = guided_flows(grid, graph.operator, pair[:1], pair[1:])
+    T_rel = pnp(grid, before.inverse_depth, match.pixels[0], match.sure()[0])
+    return before.T_cw if T_rel is None else T_rel.to(before.T_cw) @ before.T_cw
+
+
+def _polish(graph: FrameGraph, moving: float, rounds: Iterable[int]) -> bool:
+    """Rounds of flow and adjustment, from forgiving to strict; then without what moves."""
+    segment, ids = graph.keyframes, graph.keyframes.ids
+    near = [(a, b) for n, a in enumerate(ids) for b in ids[n + 1 : n + 1 + RADIUS]]
+    for n in rounds:
+        graph.measure(graph.stale(near, 0.25), fine=n >= FORGIVING)
+        options = BundleOptions(iterations=4, huber=(30.0, 10.0, 3.0)[min(n, 2)])
+        if graph.adjust(list(graph.edges), ids[1:], ids, options) is None:
+            return False
+        normalise(segment)
+        if n >= FORGIVING:
+            graph.update_dynamic(ids, moving)
+    return True
+
+
+def _depth_deviation(graph: FrameGraph) -> float:
+    """Relative deviation of the depths, the poses being as open as they are: the median of all."""
+    ids = graph.keyframes.ids
+    problem, _ = graph.problem(list(graph.edges), ids[1:], ids)
+    found = marginals(graph.keyframes.grid, problem, BundleOptions(huber=HUBER))
+    return float(found.depth_deviation.median())
+
+
+def _passes_photometric_check(graph: FrameGraph) -> bool:
+    """Whether the images of all neighbours in time agree at their poses."""
+    grey, found = graph.operator.grey, []
+    for a, b in pairwise(graph.keyframes):
+        found.append(
+            correlation_at(
+                graph.keyframes.grid,
+                grey(a.encoded),
+                grey(b.encoded),
+                b.T_cw @ se3_inverse(a.T_cw),
+                a.inverse_depth,
+                a.information,
+            )
+        )
+    checks = map(PhotometricCheck.of, torch.stack(found).cpu())
+    return all(check.passes(MIN_NCC, is_expected=False) for check in checks)
+
+
+def normalise(segment: KeyframeSet) -> None:
+    """Move the first pose to the identity and scale so that the median depth is one unit."""
+    origin = se3_inverse(next(iter(segment)).T_cw)
+    for keyframe in segment:
+        keyframe.T_cw = keyframe.T_cw @ origin
+    depths = torch.cat([s.inverse_depth[s.information > 0] for s in segment])
+    if len(depths):
+        segment.rescale(float(depths.median()))

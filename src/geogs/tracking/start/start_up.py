@@ -1,0 +1,181 @@
+"""Before there is a map: gather keyframes until one can be started from them."""
+
+import math
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
+
+import torch
+
+from geogs.config import TrackingConfig
+from geogs.tracking.keyframes.keyframe_choice import KeyframeChoice
+from geogs.tracking.keyframes.segment_map import SegmentMap
+from geogs.tracking.locate.frame_locator import MIN_KNOWN
+from geogs.tracking.matching.flow_chain import MIN_MATCHED, FlowChain
+from geogs.tracking.matching.two_view_rotation import two_view_rotation
+from geogs.tracking.start.chained_flows import ChainedFlows
+from geogs.tracking.start.early_frames import place_between_keyframes
+from geogs.tracking.start.initialise import Attempt, initialise
+from geogs.types import FlowMatch, Frame
+from geogs.world.frames import RelativeRotation
+from geogs.world.grid import SampleGrid
+from geogs.world.segments import TrackState
+
+MIN_KEYFRAMES = 4
+MIN_OVERLAP = 0.3
+"""While the map cannot be started: fraction of the first keyframe that the last has to see still
+for the first to be kept."""
+MAX_MISSES = 5
+"""Frames without a match after which a start that has not succeeded begins anew."""
+MORE = 0.25
+"""Fraction of the keyframes that are to come before a start is tried again that was far off."""
+
+
+class StartUp:
+    """Chooses keyframes by the flow since the last, and starts the map once there are enough."""
+
+    def __init__(self, map: SegmentMap, choice: KeyframeChoice, config: TrackingConfig) -> None:
+        self.map, self.config, self._choice = map, config, choice
+        self.keyframes = map.keyframes
+        self._grid = SampleGrid(map.keyframes.grid.camera)
+        """On the CPU, where rotations are measured."""
+        self._chain = FlowChain(map.keyframes.grid, map.operator)
+        self._flows = ChainedFlows(map.graph)
+        self._progress = map.segment.start
+
+    def take(
+        self, frame: Frame, encoded: Any, rotations: Sequence[RelativeRotation] = ()
+    ) -> tuple[int, ...]:
+        """Take the next frame, of which rotations relative to others may be known already.
+
+        The segment's state says whether the map has been started. Returns the ids of keyframes
+        that were given up.
+        """
+        if frame.depth is not None:
+            given_up = self._start_metric(frame, encoded, rotations)
+            if given_up is not None:
+                return given_up
+        if not len(self.keyframes):
+            return self._gather(frame, encoded, rotations)
+        last = list(self.keyframes)[-1]
+        match = self._chain.follow(self._progress.flow, last.encoded, encoded)
+        if match.matched < MIN_MATCHED:
+            return self._miss(frame, encoded, rotations)
+        self._progress.misses = 0
+        there = FlowMatch(match.there.pixels.cpu(), match.there.weight.cpu())
+        measure = partial(_rotation, last.frame_index, self._grid, there)
+        if self._choice.calls_for(match.flow, match.matched):
+            return self._gather(frame, encoded, rotations, measure)
+        eye = torch.eye(4, dtype=torch.float64)
+        self.map.recorder.add(frame, encoded, last.id, eye, match.there, rotations)
+        self.map.recorder.measure_rotation(measure)
+        return ()
+
+    def finish(self) -> bool:
+        """Start with what there is; False if that cannot be."""
+        if len(self.keyframes) < MIN_KEYFRAMES:
+            return False
+        attempt = initialise(self.map.graph, self.config, self._flows.measure())
+        if attempt is Attempt.FAR_OFF:
+            self._progress.min_keyframes = math.ceil((1 + MORE) * len(self.keyframes))
+        if attempt is not Attempt.STARTED:
+            return False
+        self._flows.forget()
+        self.map.priors.adjust(self.keyframes.ids)
+        place_between_keyframes(self.map.recorder.log, self.keyframes)
+        self.map.segment.status.state = TrackState.TRACKING
+        return True
+
+    def why_not(self) -> str:
+        """What to tell somebody whose video could not be started with."""
+        if not len(self.keyframes):
+            return "No frame has enough texture to be tracked; check exposure and focus."
+        if len(self.keyframes) < MIN_KEYFRAMES:
+            return (
+                "The camera hardly moves (no parallax), so nothing can be reconstructed; "
+                "record a longer video in which the camera changes its place."
+            )
+        return (
+            "The images show no parallax (the camera only turns, or the scene is too far away); "
+            "move the camera sideways while recording."
+        )
+
+    def _start_metric(
+        self, frame: Frame, encoded: Any, rotations: Sequence[RelativeRotation]
+    ) -> tuple[int, ...] | None:
+        """Start the map at once from what a depth sensor saw; None where that is too little.
+
+        Returns the ids of the keyframes that were given up.
+        """
+        earlier = self.keyframes.ids
+        keyframe = self.map.add(frame, encoded)
+        if not self.map.sensor.start(keyframe, frame.depth, MIN_KNOWN):
+            self.keyframes.remove(keyframe.id)
+            return None
+        given_up = self._forget(earlier)
+        self.map.complete(keyframe, rotations)
+        self.map.segment.is_metric = True
+        self.map.segment.status.state = TrackState.TRACKING
+        return given_up
+
+    def _gather(
+        self,
+        frame: Frame,
+        encoded: Any,
+        rotations: Sequence[RelativeRotation],
+        measure: Callable[[], RelativeRotation | None] | None = None,
+    ) -> tuple[int, ...]:
+        """Add a keyframe to those the map will be started from, and start it with enough."""
+        keyframe = self.map.add(frame, encoded)
+        self._progress.flow.reset()
+        self.map.complete(keyframe, rotations)
+        if measure is not None:
+            self.map.recorder.measure_rotation(measure)
+        count, wanted = len(self.keyframes), self.config.init_keyframes
+        if count < max(wanted, MIN_KEYFRAMES):
+            return ()
+        if count >= self._progress.min_keyframes and self.finish():
+            return ()
+        # More keyframes may bring parallax. With twice as many every other one is left out; where
+        # the last no longer sees what the first saw, the first half is given up.
+        if count < 2 * wanted:
+            return ()
+        overlap = float((self._flows.measure()[-1].weight > 0).float().mean())
+        if overlap >= MIN_OVERLAP:
+            return self._thin_out()
+        return self._forget(self.keyframes.ids[: count // 2])
+
+    def _miss(
+        self, frame: Frame, encoded: Any, rotations: Sequence[RelativeRotation]
+    ) -> tuple[int, ...]:
+        """The view changed at once: wait for it to come back, start with what there is, or anew."""
+        self._progress.misses += 1
+        is_waiting = self._progress.misses < MAX_MISSES
+        if not is_waiting:
+            self._progress.misses = 0
+        if is_waiting or self.finish():
+            self.map.recorder.add_untracked(frame.index, frame.timestamp, rotations)
+            return ()
+        given_up = self._forget(self.keyframes.ids)
+        self._gather(frame, encoded, rotations)
+        return given_up
+
+    def _thin_out(self) -> tuple[int, ...]:
+        """Make every other keyframe an ordinary frame; the first and the last stay."""
+        ids = self.keyframes.ids
+        self._progress.min_keyframes = 0
+        for before, id in zip(ids[:-1:2], ids[1:-1:2], strict=False):
+            self.map.cull(id, before)
+        return tuple(ids[1:-1:2])
+
+    def _forget(self, ids: Sequence[int]) -> tuple[int, ...]:
+        """Drop the earliest keyframes of a start that failed."""
+        self._progress.flow.reset()
+        self._progress.min_keyframes = 0
+        return self.map.forget(ids)
+
+
+def _rotation(earlier: int, grid: SampleGrid, match: FlowMatch) -> RelativeRotation | None:
+    """Rotation of a frame relative to an earlier one, by the flow from there; all on the CPU."""
+    found = two_view_rotation(grid, match)
+    return None if found is None else RelativeRotation(earlier, found.R, found.deviation)

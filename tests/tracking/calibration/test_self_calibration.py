@@ -1,0 +1,124 @@
+"""The focal length of a video from its images alone, and what is said where it cannot be."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+import tracking_scenes
+from geogs.bundle.lens import RadialLens, lens_rays
+from geogs.geometry.camera import Camera
+from geogs.tracking.calibration import stretch
+from geogs.tracking.calibration.focal_uncertainty import LEAST_DEVIATION
+from geogs.tracking.calibration.self_calibration import self_calibrate
+from geogs.tracking.calibration.views import with_focal
+from geogs.types import Frame
+from tracking_scenes import CAMERA, frames, pose, render
+
+pytestmark = pytest.mark.system
+
+
+@pytest.fixture(autouse=True)
+def _few_keyframes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stretch, "START_KEYFRAMES", 8)
+    monkeypatch.setattr(stretch, "KEYFRAMES", 16)
+
+
+def swinging(count: int) -> list[np.ndarray]:
+    """A path sideways and forwards that turns one way and back."""
+    return [
+        pose(-0.5 + 0.04 * k, 0.1 * np.sin(0.5 * k), 0.3 * np.sin(0.2 * k), 0.35 * np.sin(0.3 * k))
+        for k in range(count)
+    ]
+
+
+@pytest.mark.parametrize("factor", [0.65, pytest.param(1.5, marks=pytest.mark.long)])
+def test_finds_the_focal_length_of_a_rendered_room(factor):
+    guess = with_focal(CAMERA, factor * CAMERA.fx)
+    shares = []
+    found = self_calibrate(frames(swinging(22)), guess, report=shares.append)
+    assert found.failure is None
+    error = abs(found.camera.fx / CAMERA.fx - 1)
+    print(f"{found.camera.fx:.2f} +- {100 * found.deviation:.2f} %, error {100 * error:.2f} %")
+    assert error < 0.01
+    assert error < 2.5 * found.deviation
+    assert LEAST_DEVIATION <= found.deviation < 0.05
+    assert found.camera.fx == pytest.approx(found.camera.fy)
+    assert (found.camera.cx, found.camera.cy) == (CAMERA.cx, CAMERA.cy)
+    assert found.k1 == 0
+    assert found.deviation_k1 is None
+    assert shares == sorted(shares)
+    assert shares[-1] == 1.0
+
+
+@pytest.mark.long
+def test_the_radial_term_of_a_pinhole_is_none():
+    found = self_calibrate(frames(swinging(22)), with_focal(CAMERA, 200.0), radial=True)
+    assert found.failure is None
+    assert found.deviation_k1 is not None
+    assert abs(found.k1) < max(0.02, 2.5 * found.deviation_k1)
+    assert abs(found.camera.fx / CAMERA.fx - 1) < 0.03
+
+
+@pytest.mark.long
+def test_finds_the_radial_term_of_a_distorting_lens():
+    wide = Camera(CAMERA.fx, CAMERA.fy, 143.5, 107.5, 288, 216)
+    rays = lens_rays(RadialLens(CAMERA, -0.15), torch.from_numpy(pixels_of(CAMERA))).rays.numpy()
+    at = (rays @ wide.matrix().numpy().T.astype(np.float32))[:, :2]
+    at = at.reshape(CAMERA.height, CAMERA.width, 2)
+    video = [
+        Frame(k, k / 30, cv2.remap(render(T, wide)[0], at, None, cv2.INTER_CUBIC))
+        for k, T in enumerate(swinging(22))
+    ]
+    found = self_calibrate(video, with_focal(CAMERA, 190.0), radial=True)
+    assert found.failure is None
+    assert found.deviation_k1 is not None
+    print(found)
+    assert abs(found.k1 + 0.15) < min(0.03, 2.5 * found.deviation_k1)
+    assert abs(found.camera.fx / CAMERA.fx - 1) < min(0.02, 2.5 * found.deviation)
+
+
+def pixels_of(camera: Camera) -> np.ndarray:
+    """x, y of every pixel, row by row."""
+    v, u = np.mgrid[: camera.height, : camera.width].astype(np.float32)
+    return np.stack([u, v], -1).reshape(-1, 2)
+
+
+def test_a_camera_that_only_turns_is_said_to():
+    path = [pose(0.0, 0.0, 0.0, 0.03 * k) for k in range(16)]
+    guess = with_focal(CAMERA, 120.0)
+    found = self_calibrate(frames(path), guess)
+    assert found.failure == "the camera only turns (no parallax)"
+    assert found.camera == guess
+
+
+def test_a_plane_is_said_to_be_one(monkeypatch):
+    plane, hidden = ((0.2, 0.1, 1.0), 2.5), ((0.0, 0.0, 1.0), 100.0)
+    monkeypatch.setattr(tracking_scenes, "PLANES", [plane, hidden])
+    guess = with_focal(CAMERA, 120.0)
+    found = self_calibrate(frames(swinging(16)), guess)
+    assert found.failure == "it shows a single plane"
+    assert found.camera == guess
+
+
+def test_a_camera_that_stands_still_is_said_to():
+    guess = with_focal(CAMERA, 120.0)
+    found = self_calibrate(frames([pose(0.0)] * 5), guess)
+    assert found.failure == "the camera hardly moves"
+    assert found.camera == guess
+    assert found.frames == 5
+
+
+def test_frames_without_texture_are_said_to_have_none():
+    grey = [replace(f, image=np.full_like(f.image, 90)) for f in frames([pose(0.0)] * 3)]
+    assert self_calibrate(grey, CAMERA).failure == "no frame has enough texture"
+
+
+def test_what_the_report_raises_passes_through():
+    def stop(fraction: float) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        self_calibrate(frames(swinging(4)), CAMERA, report=stop)

@@ -1,0 +1,55 @@
+"""Placing the keyframes of a start."""
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from geogs.geometry.lie import se3_inverse
+from geogs.tracking.flow.classical_flow import ClassicalFlow
+from geogs.tracking.graph.frame_graph import FrameGraph
+from geogs.tracking.matching.two_view import _pose_of
+from geogs.tracking.start.initialise import placed_after
+from geogs.world.grid import SampleGrid
+from geogs.world.keyframes import KeyframeTable
+from tracking_scenes import CAMERA, pose, render
+
+
+def test_a_keyframe_is_placed_on_the_depth_of_the_one_before_it() -> None:
+    before, after = pose(0.1, 0.05, -0.1, 0.02), pose(0.25, 0.0, 0.6, 0.05)
+    grid = SampleGrid(CAMERA)
+    operator = ClassicalFlow(grid)
+    store = KeyframeTable.on(grid).new_set()
+    for n, T_wc in enumerate((before, after)):
+        image, depth = render(T_wc)
+        T_cw = torch.from_numpy(np.linalg.inv(before))
+        state = store.add(n, n / 10, image, operator.encode(image), T_cw)
+        d = 1 / depth[4:-3:8, 4:-3:8].reshape(-1)
+        state.inverse_depth = torch.from_numpy(d.copy()).float()
+    found = placed_after(FrameGraph(store, operator), *store)
+    centre = se3_inverse(found)[:3, 3].numpy()
+    assert np.linalg.norm(centre - after[:3, 3]) < 0.02  # the step is 72 cm
+    # Where nothing is matched it stays where the one before it is.
+    noise = np.random.default_rng(0).integers(0, 255, (144, 192, 3), np.uint8)
+    unlike = store.add(2, 0.2, noise, operator.encode(noise), store[1].T_cw)
+    kept = placed_after(FrameGraph(store, operator), store[0], unlike)
+    torch.testing.assert_close(kept, store[0].T_cw)
+
+
+@pytest.mark.parametrize("t", [(0.3, 0.1, 0.02), (-0.3, 0.0, 0.1), (0.0, 0.05, -0.3)])
+def test_of_four_poses_of_an_essential_matrix_the_right_one_is_taken(t) -> None:
+    """Against the motion that was, and OpenCV's choice."""
+    rng = np.random.default_rng(3)
+    points = rng.uniform((-2, -2, 2), (2, 2, 6), (400, 3))
+    R, t = cv2.Rodrigues(np.array([0.1, -0.2, 0.05]))[0], np.array(t)
+    moved = points @ R.T + t
+    first, second = points / points[:, 2:], moved / moved[:, 2:]
+    cross = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
+    for E in (cross @ R, -cross @ R):
+        found, along, seen = _pose_of(E, first, second)
+        np.testing.assert_allclose(found, R, atol=1e-9)
+        np.testing.assert_allclose(along, t / np.linalg.norm(t), atol=1e-9)
+        count, theirs, direction, _ = cv2.recoverPose(E, first[:, :2], second[:, :2], np.eye(3))
+        assert seen.sum() == count == 400
+        np.testing.assert_allclose(theirs, found, atol=1e-9)
+        np.testing.assert_allclose(direction[:, 0], along, atol=1e-9)
