@@ -1,6 +1,6 @@
 """The terms of a Sim(3) pose graph: what a kind of measurement says of keyframes' similarities.
 
-A new kind is one class with :meth:`GraphTerm.linearise`, entered in ``pose_graph.solve``. Inverse
+A new kind is one class with :meth:`GraphTerm.linearise`, entered in ``PoseGraph.terms``. Inverse
 depths that a term has along with the similarities it eliminates itself. The graph is solved on the
 CPU, also where the tracker is on a GPU.
 """

@@ -45,6 +45,8 @@ class PoseGraph:
     matches: MatchedEdges | None = None
     is_metric: bool = False
     """Whether no unit drifts, so that all scales stay what they are at the start."""
+    terms: tuple[GraphTerm, ...] = ()
+    """What else is known of the similarities."""
 
 
 @dataclass(frozen=True)
@@ -121,7 +123,10 @@ def solve(graph: PoseGraph, options: PoseGraphOptions | None = None) -> PoseGrap
     """
     options, matches = options or PoseGraphOptions(), graph.matches
     relative = RelativeTerm.of(graph.relative, options)
-    others = [] if matches is None else [MatchTerm(matches, options.matches)]
+    others: list[GraphTerm] = [
+        *([] if matches is None else [MatchTerm(matches, options.matches)]),
+        *graph.terms,
+    ]
     depth = None if matches is None else matches.inverse_depth
     start = state = GraphState(graph.start.double(), depth)
     problem = _Problem(graph, options)
