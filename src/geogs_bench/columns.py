@@ -1,10 +1,14 @@
 """The columns from which the tables of the benchmarks are made."""
 
 from collections.abc import Callable, Sequence
+from typing import Literal
 
 from geogs_bench.benchmark import Column, Layout, Published
 from geogs_bench.published import PublishedTable
 from geogs_bench.record import Record, StageName, StageScore, Weighting
+
+Value = Callable[[Record], float | None]
+"""What a column shows of a record."""
 
 _MEASURES = (
     ("Acc", "accuracy", "{unit}"),
@@ -30,30 +34,18 @@ _RUN: tuple[StageName, ...] = ("online", "adjusted", "depth fusion", "final")
 _POSED: tuple[StageName, ...] = ("depth fusion", "final")
 
 
-def ate(stage: StageName) -> Callable[[Record], float | None]:
-    """RMSE over all frames."""
+def trajectory(stage: StageName, name: str) -> Value:
+    """A field of the score of a stage's trajectory."""
 
     def value(record: Record) -> float | None:
         scored = record.stage(stage)
-        return scored.trajectory.ate if scored and scored.trajectory else None
+        return getattr(scored.trajectory, name) if scored and scored.trajectory else None
 
     return value
 
 
-def keyframes_ate(stage: StageName) -> Callable[[Record], float | None]:
-    """RMSE over the keyframes."""
-
-    def value(record: Record) -> float | None:
-        scored = record.stage(stage)
-        return scored.trajectory.keyframes_ate if scored and scored.trajectory else None
-
-    return value
-
-
-def surface(
-    stage: StageName, weighting: Weighting, measure: str
-) -> Callable[[Record], float | None]:
-    """A field of a surface score."""
+def surface(stage: StageName, weighting: Weighting, measure: str) -> Value:
+    """A field of the score of a stage's surface."""
 
     def value(record: Record) -> float | None:
         scored = record.stage(stage)
@@ -63,11 +55,12 @@ def surface(
     return value
 
 
-def cost(name: str, factor: float = 1.0) -> Callable[[Record], float | None]:
-    """A field of what the run took, times ``factor``."""
+def figure(part: Literal["cost", "motion", "photo"], name: str, factor: float = 1.0) -> Value:
+    """A field of a part of a record, times ``factor``."""
 
     def value(record: Record) -> float | None:
-        found = None if record.cost is None else getattr(record.cost, name)
+        scored = getattr(record, part)
+        found = None if scored is None else getattr(scored, name)
         return None if found is None else factor * found
 
     return value
@@ -81,10 +74,15 @@ def trajectory_layout(published: PublishedTable | None = None) -> Layout:
         "Trajectory, ATE RMSE after Sim(3) alignment (cm)",
         (
             *(
-                Column(_STAGES[stage], ate(stage), 3, beside if stage == "adjusted" else None)
+                Column(
+                    _STAGES[stage],
+                    trajectory(stage, "ate"),
+                    3,
+                    beside if stage == "adjusted" else None,
+                )
                 for stage in stages
             ),
-            *(Column(f"keyframes {_STAGES[s]}", keyframes_ate(s), 3) for s in stages),
+            *(Column(f"keyframes {_STAGES[s]}", trajectory(s, "keyframes_ate"), 3) for s in stages),
         ),
     )
 
@@ -99,14 +97,7 @@ def rgbd_layout(
     if published is not None and not methods:
         methods = [row.method for row in published.rows]
 
-    def rigid(stage: StageName) -> Callable[[Record], float | None]:
-        def value(record: Record) -> float | None:
-            scored = record.stage(stage)
-            return scored.trajectory.rigid_ate if scored and scored.trajectory else None
-
-        return value
-
-    def printed(method: str) -> Callable[[Record], float | None]:
+    def printed(method: str) -> Value:
         def value(record: Record) -> float | None:
             if published is None or record.variant != variant:
                 return None
@@ -119,7 +110,7 @@ def rgbd_layout(
     source = "" if published is None else f" Published: {published.source}."
     return Layout(
         "Trajectory with the depth of the sensor, ATE RMSE after a rigid alignment (cm)",
-        (*(Column(_STAGES[stage], rigid(stage), 3) for stage in stages), *beside),
+        (*(Column(_STAGES[s], trajectory(s, "rigid_ate"), 3) for s in stages), *beside),
         f"Of results in metres alone.{source}",
     )
 
@@ -173,18 +164,14 @@ def dtu_layout(published: PublishedTable | None = None) -> Layout:
 
 def photo_layout() -> Layout:
     """Agreement of held-out images."""
-
-    def field(name: str) -> Callable[[Record], float | None]:
-        return lambda record: None if record.photo is None else getattr(record.photo, name)
-
     return Layout(
         "Photo-consistency of held-out views across the mesh",
         (
-            Column("agreement, holes count 0 (%)", field("score")),
-            Column("mean NCC", field("ncc"), 3),
-            Column("median NCC", field("ncc_median"), 3),
-            Column("coverage (%)", field("coverage")),
-            Column("held-out views", field("views"), 0),
+            Column("agreement, holes count 0 (%)", figure("photo", "score")),
+            Column("mean NCC", figure("photo", "ncc"), 3),
+            Column("median NCC", figure("photo", "ncc_median"), 3),
+            Column("coverage (%)", figure("photo", "coverage")),
+            Column("held-out views", figure("photo", "views"), 0),
         ),
         "Not a distance: no true surface was there.",
     )
@@ -192,21 +179,17 @@ def photo_layout() -> Layout:
 
 def motion_layout() -> Layout:
     """How every motion was followed."""
-
-    def field(name: str) -> Callable[[Record], float | None]:
-        return lambda record: None if record.motion is None else getattr(record.motion, name)
-
     return Layout(
         "Motions",
         (
-            Column("frames tracked (%)", field("tracked"), 1),
-            Column("orientation only (%)", field("turned"), 1),
-            Column("ATE over path (%)", field("relative"), 3),
-            Column("ATE (cm)", field("ate"), 2),
-            Column("rotation (degrees)", field("rotation"), 2),
-            Column("within 3 sigma (%)", field("within"), 1),
-            Column("is reliable", field("is_reliable"), 0),
-            Column("is called so", field("is_called_reliable"), 0),
+            Column("frames tracked (%)", figure("motion", "tracked"), 1),
+            Column("orientation only (%)", figure("motion", "turned"), 1),
+            Column("ATE over path (%)", figure("motion", "relative"), 3),
+            Column("ATE (cm)", figure("motion", "ate"), 2),
+            Column("rotation (degrees)", figure("motion", "rotation"), 2),
+            Column("within 3 sigma (%)", figure("motion", "within"), 1),
+            Column("is reliable", figure("motion", "is_reliable"), 0),
+            Column("is called so", figure("motion", "is_called_reliable"), 0),
         ),
         "Over the tracked frames; positions after a Sim(3) alignment, orientations after that of "
         "the world's axes. A camera that hardly moves has no ATE. Reliable (1) are an ATE below a "
@@ -220,7 +203,7 @@ def result_layout() -> Layout:
     def last(record: Record) -> StageScore | None:
         return record.stages[-1] if record.stages else None
 
-    def field(measure: str, *weightings: Weighting) -> Callable[[Record], float | None]:
+    def field(measure: str, *weightings: Weighting) -> Value:
         def value(record: Record) -> float | None:
             stage = last(record)
             found = [s for w in weightings if stage and (s := stage.surface(w))]
@@ -232,22 +215,19 @@ def result_layout() -> Layout:
         stage = last(record)
         return stage.trajectory.ate if stage and stage.trajectory else None
 
-    def agreement(record: Record) -> float | None:
-        return None if record.photo is None else record.photo.score
-
     surfaces: tuple[Weighting, Weighting] = ("area", "points")
     return Layout(
         "Results",
         (
-            Column("ATE after the stream (cm)", ate("online"), 3),
+            Column("ATE after the stream (cm)", trajectory("online", "ate"), 3),
             Column("ATE of the result (cm)", last_ate, 3),
             Column("Acc ({unit})", field("accuracy", *surfaces)),
             Column("Comp ({unit})", field("completeness", *surfaces)),
             Column("Comp.Rat (%)", field("ratio", "area"), 1),
             Column("CD ({unit})", field("chamfer", *surfaces)),
-            Column("agreement of held-out images (%)", agreement, 1),
-            Column("thousand disks", cost("disks", 1e-3), 1),
-            Column("seconds", cost("seconds"), 1),
+            Column("agreement of held-out images (%)", figure("photo", "score"), 1),
+            Column("thousand disks", figure("cost", "disks", 1e-3), 1),
+            Column("seconds", figure("cost", "seconds"), 1),
         ),
         "Of the result, whichever stage that is: rooms in cm, area-weighted, objects in mm, DTU by "
         "its protocol where the official files are there.",
@@ -257,13 +237,13 @@ def result_layout() -> Layout:
 COST = Layout(
     "Cost",
     (
-        Column("frames", cost("frames"), 0),
-        Column("seconds", cost("seconds"), 1),
-        Column("frames/s", cost("frames_per_second")),
-        Column("peak memory (GB)", cost("peak_memory_bytes", 1e-9)),
-        Column("peak GPU memory (GB)", cost("peak_gpu_memory_bytes", 1e-9)),
-        Column("thousand disks", cost("disks", 1e-3), 1),
-        Column("map (MB)", cost("map_bytes", 1e-6)),
+        Column("frames", figure("cost", "frames"), 0),
+        Column("seconds", figure("cost", "seconds"), 1),
+        Column("frames/s", figure("cost", "frames_per_second")),
+        Column("peak memory (GB)", figure("cost", "peak_memory_bytes", 1e-9)),
+        Column("peak GPU memory (GB)", figure("cost", "peak_gpu_memory_bytes", 1e-9)),
+        Column("thousand disks", figure("cost", "disks", 1e-3), 1),
+        Column("map (MB)", figure("cost", "map_bytes", 1e-6)),
     ),
     "Seconds are of the whole command; frames/s of SLAM count all up to the last frame.",
 )
