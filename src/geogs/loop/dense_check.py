@@ -95,8 +95,8 @@ def dense_check(
         reason = f"the depths differ by a factor of {scale_dense:.2f}"
     elif contradiction > MAX_CONTRADICTION:
         reason = f"one sees through {contradiction:.0%} of what the other shows"
-    elif not all(m.evidence.bears_out(MIN_NCC, is_expected=False) for m in (there, back)):
-        correlation = min(there.evidence.correlation, back.evidence.correlation)
+    elif not all(m.check.passes(MIN_NCC, is_expected=False) for m in (there, back)):
+        correlation = min(there.check.correlation, back.check.correlation)
         reason = f"the images correlate by only {correlation:.2f}"
     else:
         reason = ""

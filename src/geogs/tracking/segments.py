@@ -60,11 +60,6 @@ class Segments:
         self._new_tracker = partial(
             Tracker, operator=operator, config=config, prior=prior, defers=defers
         )
-        self.resume(table)
-
-    def resume(self, table: SegmentTable) -> None:
-        """Work on another table."""
-        self.table = table
         self._trackers = {segment.number: self._new_tracker(segment) for segment in table.segments}
         if not table.segments:
             self._begin_segment()

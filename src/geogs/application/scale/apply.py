@@ -50,7 +50,7 @@ def sentences_on_poses(found: Agreement) -> list[str]:
     """Sentences on poses given beside the images; none where there are none."""
     if not found.motions:
         return []
-    fitting = f"{found.share:.0%} of {found.motions} motions between keyframes"
+    fitting = f"{found.fitting:.0%} of {found.motions} motions between keyframes"
     if found.used:
         return [f"Poses beside the images: {fitting} fit what the images show."]
     return [
