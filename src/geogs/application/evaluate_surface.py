@@ -35,7 +35,7 @@ class SurfaceComparison:
     mesh: Surface
     truth: Surface
     points: Float[np.ndarray, "n 3"]
-    """Of the reconstruction, where it was compared."""
+    """Where the reconstruction was compared."""
     distance: Float[np.ndarray, "n"]
     """To the truth; inf where it did not count."""
     reach: float = np.inf

@@ -48,7 +48,7 @@ class PlacedOffline(Work):
 
     @property
     def stopwatch(self) -> Stopwatch:
-        """Of placing and mapping."""
+        """Seconds of placing and mapping."""
         return self._stopwatch
 
     def complete(self, job: Job, checkpoint: Checkpoint) -> Ending:

@@ -74,9 +74,9 @@ class _Rehearsal:
     surface: float
     """The surface that they show."""
     blocks: int
-    """Of its volume, had its voxels been as small as planned."""
+    """Blocks of its volume, had its voxels been as small as planned."""
     triangles: int
-    """Of its surface, likewise."""
+    """Triangles of its surface, likewise."""
 
 
 class OutputForecast:

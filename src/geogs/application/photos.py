@@ -32,7 +32,7 @@ class PlacedVideo:
     """Sharp frames of a video that have a pose, in time order, and the points that they see."""
 
     timestamps: Float64[np.ndarray, "n"]
-    """Of all frames of the video, seconds."""
+    """Times of all frames of the video, seconds."""
     sharp_frames: int
     """How many frames structure from motion was given."""
     numbers: tuple[int, ...]
@@ -40,17 +40,18 @@ class PlacedVideo:
     T_cw: Float64[np.ndarray, "m 4 4"]
     """World to camera."""
     deviation: Float64[np.ndarray, "m"]
-    """Of the camera's centre after the similarity that fits best; infinite where unknown."""
+    """Standard deviation of the camera's centre after the similarity that fits best; infinite where
+    unknown."""
     rotation: Float64[np.ndarray, "m"]
-    """Of its orientation, radians."""
+    """Standard deviation of its orientation, radians."""
     depth: Float64[np.ndarray, "m"]
-    """Of its points' depths, relative: the median."""
+    """Relative standard deviation of its points' depths: the median."""
     positions: tuple[Float64[np.ndarray, "_k 3"], ...]
-    """Of the points that each frame sees."""
+    """Points that each frame sees."""
     descriptors: tuple[UInt8[np.ndarray, "_k 128"], ...]
-    """Of the same points."""
+    """SIFT descriptors of the same points."""
     calibration: Calibration
-    """Of the frames as they were given."""
+    """Calibration of the frames as they were given."""
     error: float
     """Mean distance of the points from where they were seen, pixels."""
 

@@ -134,6 +134,6 @@ class EvalSettings(Settings):
     photo_every: Count = 8
     """In every so many images, which the result should not have used."""
     seed: Seed = 0
-    """Of the sampling."""
+    """Seed of the sampling."""
     plots: bool = True
     """Draw the pictures of the report."""

@@ -35,7 +35,7 @@ _UNUSABLE = (
 """What reading a file may end with that somebody made up."""
 
 _MAX_TIME_FRACTION = 0.05
-"""Of the time of the work, that writing checkpoints may take."""
+"""Fraction of the time of the work that writing checkpoints may take."""
 
 
 class Checkpoint:

@@ -56,11 +56,11 @@ class Manifest:
     geogs: str
     """The version that wrote it."""
     schema: str
-    """Of the state, see :func:`geogs.world.pack.schema`."""
+    """Hash of the state's types, see :func:`geogs.world.pack.schema`."""
     is_our_folder: bool
     """Whether geogs made it."""
     number: int
-    """Of the state that was begun last, from 1."""
+    """Number of the state that was begun last, from 1."""
     state: dict[str, Sum]
     """The files of the complete state, but for archives, whose arrays have checksums of their own;
     none if it was never completed."""

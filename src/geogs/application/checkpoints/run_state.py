@@ -29,7 +29,7 @@ class RunMetadata:
     device: str
     """cpu or cuda."""
     fingerprint: str
-    """Of the source."""
+    """Fingerprint of the source."""
     calibration: Calibration | None
     """Found before the run; none if the source's own was taken."""
     place: ReadingPlace | JointPlace = field(default_factory=ReadingPlace)

@@ -29,7 +29,7 @@ Write = Callable[[SavedResult, ExportSettings, Path], Path]
 TOLERANCE = 2.0
 """Median edges of the mesh that a face may lie off a depth map that shows it."""
 _SUFFIXES = frozenset({".csv", ".glb", ".las", ".laz", ".npz", ".obj", ".ply", ".tum", ".txt"})
-"""Of files; a folder is not named so."""
+"""Endings of files; a folder is not named so."""
 
 
 @on_one_torch_thread

@@ -130,6 +130,6 @@ def _observed(
 def _cosines(
     points: Float[Tensor, "k 3"], normals: Float[Tensor, "k 3"], T_cw: Float[Tensor, "4 4"]
 ) -> Float[Tensor, "k"]:
-    """Of the angles between normals in the world and the rays back to the camera."""
+    """Cosines of the angles between normals in the world and the rays back to the camera."""
     rays = torch.nn.functional.normalize(points, dim=-1)
     return -(rays * (normals @ T_cw[:3, :3].mT.to(normals))).sum(-1)

@@ -25,9 +25,9 @@ from geogs.mesh.triangle_mesh import Mesh
 from geogs.types import MapSnapshot, RenderedKeyframe, Trajectory
 
 MOST_FACES, MOST_DISKS, MOST_IMAGES = 400_000, 100_000, 240
-"""Of a page."""
+"""Most of each on a page."""
 IMAGE_BYTES = 1_800_000
-"""Of all images of a page together, about."""
+"""Bytes of all images of a page together, about."""
 _BYTES_A_PIXEL = 0.2
 _LONGEST_EDGE, _SHORTEST_EDGE = 480, 128
 _QUALITY = 75

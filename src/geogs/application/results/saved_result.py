@@ -49,17 +49,17 @@ class SavedResult:
 
     @property
     def name(self) -> str:
-        """Of the folder."""
+        """Name of the folder."""
         return self.folder.resolve().name
 
     @property
     def camera(self) -> Camera:
-        """Of the keyframes' images."""
+        """Camera of the keyframes' images."""
         return self.views.camera
 
     @property
     def depth_camera(self) -> Camera:
-        """Of the keyframes' depth maps."""
+        """Camera of the keyframes' depth maps."""
         return self.views.render_camera
 
     @cached_property

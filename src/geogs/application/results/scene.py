@@ -54,7 +54,7 @@ class MappedScene(Protocol):
         ...
 
     def rows(self) -> Mapping[int, SeenRows]:
-        """Of keyframes, by id, whose rows were rectified: where and when they were seen."""
+        """Where and when rectified rows of keyframes were seen, by id of the keyframe."""
         ...
 
     def statistics(self) -> Mapping[str, object]:

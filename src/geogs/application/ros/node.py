@@ -18,7 +18,7 @@ from geogs.slam import Slam
 
 _log = logging.getLogger(__name__)
 MOST_POSES = 10_000
-"""Of a path that is published; of a longer one the latest."""
+"""Most poses of a path that is published; of a longer one the latest."""
 
 
 def run_node(settings: NodeSettings) -> None:

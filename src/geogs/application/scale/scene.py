@@ -28,12 +28,12 @@ class MeasurableScene:
     """A map whose unit is asked for."""
 
     camera: Camera
-    """Of images."""
+    """Camera of the images."""
     depth_camera: Camera
-    """Of depths."""
+    """Camera of the depths."""
     keyframes: Sequence[SeenKeyframe]
     trajectory: Trajectory
-    """Of all frames."""
+    """Poses of all frames."""
     surface: Surface
 
     def points(

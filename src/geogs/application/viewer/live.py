@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from geogs.slam import Slam
 
 MAX_TIME_FRACTION = 0.02
-"""Of the time that looking may take, of the run's thread and of the viewer's together."""
+"""Fraction of the time that looking may take, of the run's thread and of the viewer's together."""
 MOST_DISKS = 30_000
 _MAP_SECONDS = 3.0
 """Least time between two looks at the map."""
@@ -35,7 +35,7 @@ class Update:
     picture: UInt8[np.ndarray, "h w 3"] | None
     camera: Camera
     T_wc: Float[np.ndarray, "4 4"] | None
-    """Of the camera now; none while it is not known."""
+    """Pose of the camera now; none while it is not known."""
     keyframe_ids: tuple[int, ...]
     keyframes: Float[np.ndarray, "k 4 4"]
     """Camera to world."""

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 _EVERY = 5
 """Keyframes between two records of the map and of the path."""
 _QUALITY = 70
-"""Of the JPEG images."""
+"""Quality of the JPEG images."""
 
 
 class Recorder(RunObserver):

@@ -11,7 +11,7 @@ from geogs.errors import InputError
 from geogs.evaluation.pages.keyframe_layers import layer_picture
 
 MOST_FRUSTA, MOST_IMAGES = 400, 60
-"""Of the keyframes, evenly along the path."""
+"""Most keyframes shown, evenly along the path."""
 _IMAGE_EDGE = 160
 
 

@@ -22,7 +22,7 @@ PATH, FRUSTUM, NOW = (242, 163, 58), (111, 177, 240), (255, 209, 102)
 _FAREWELL = 0.3
 """Seconds that the server takes to end."""
 PARTS = ("Mesh", "Disks", "Path", "Keyframes")
-"""Of the scene, by the names of their switches."""
+"""Parts of the scene, by the names of their switches."""
 
 
 class Window:
