@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from geogs.geometry.camera import Camera
-from geogs.tracking import evidence
+from geogs.tracking.matching import photometric_check
 from geogs.tracking.matching.photometric_check import (
     MAX_WINDOWS,
     MIN_CONTRAST,
@@ -90,7 +90,7 @@ def test_it_is_the_median_correlation_of_the_reprojected_windows(there):
     second, _ = view(there)
     T = relative(there)
     T[0, 3] += 0.02  # so that it is not one
-    step = evidence._spread(GRID).step
+    step = photometric_check._spread(GRID).step
     expected, count = reference(
         first.numpy(), second.numpy(), T.numpy(), inverse_depth.numpy(), step
     )
@@ -189,8 +189,8 @@ def test_only_windows_with_texture_and_depth_in_view_count():
 def test_windows_are_spread_over_an_image_of_any_size(width, height):
     grid = SampleGrid(Camera(300.0, 300.0, width / 2, height / 2, width, height))
     image = torch.from_numpy(np.random.default_rng(0).random((height, width))).float()
-    windows = evidence._windows(grid, image)
-    cells = grid.pixels[evidence._spread(grid)].long()
+    windows = photometric_check._windows(grid, image)
+    cells = grid.pixels[photometric_check._spread(grid)].long()
     assert MAX_WINDOWS / 2 < len(windows) <= MAX_WINDOWS or len(windows) == grid.size
     torch.testing.assert_close(windows[:, 40], image[cells[:, 1], cells[:, 0]])
     torch.testing.assert_close(windows[:, 0], image[cells[:, 1] - 4, cells[:, 0] - 4])

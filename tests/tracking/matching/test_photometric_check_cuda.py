@@ -1,12 +1,12 @@
-"""The evidence's kernels against the same in PyTorch."""
+"""Kernels of the photometric check against the same in PyTorch."""
 
 import pytest
 import torch
 
-import geogs.tracking.cuda.evidence as cuda_evidence
+import geogs.tracking.cuda.photometric_check as cuda_check
 from cuda_emulator import use_emulator
 from geogs.geometry.camera import Camera
-from geogs.tracking import evidence
+from geogs.tracking.matching import photometric_check
 from geogs.tracking.matching.photometric_check import (
     MIN_CONTRAST,
     correlation_at,
@@ -23,7 +23,7 @@ SIDES = [(192, 144), (95, 61), (511, 290)]
 def device(request, monkeypatch) -> torch.device:
     """Where the kernels run; emulated where there is no GPU."""
     if request.param == "emulated":
-        use_emulator(monkeypatch, cuda_evidence)
+        use_emulator(monkeypatch, cuda_check)
         return torch.device("cpu")
     if not torch.cuda.is_available():
         pytest.skip("needs a CUDA GPU")
@@ -32,8 +32,8 @@ def device(request, monkeypatch) -> torch.device:
 
 def by_kernels(grid: SampleGrid, device: torch.device, first, second, **where) -> torch.Tensor:
     there = {name: value.to(device).contiguous() for name, value in where.items()}
-    step = evidence._spread(grid).step
-    found = cuda_evidence.median_correlation(
+    step = photometric_check._spread(grid).step
+    found = cuda_check.median_correlation(
         SampleGrid(grid.camera, device), first.to(device), second.to(device), step,
         MIN_CONTRAST**2, **there,
     )  # fmt: skip
@@ -92,7 +92,7 @@ def test_the_motion_of_matches_is_what_pytorch_says(device, share):
     weight = (torch.rand(grid.size, 1, generator=g) < share).float().expand(-1, 2).contiguous()
     expected = matched_motion(grid, pixels, weight)
     there = SampleGrid(CAMERA, device)
-    found = cuda_evidence.matched_motion(there, pixels.to(device), weight.to(device)).cpu()
+    found = cuda_check.matched_motion(there, pixels.to(device), weight.to(device)).cpu()
     torch.testing.assert_close(found.float(), expected, rtol=1e-5, atol=1e-6)
     used = weight[:, 0] > 0
     assert float(found[0]) == pytest.approx(float(used.float().mean()), abs=1e-6)

@@ -105,9 +105,9 @@ def matched_motion(
     On a GPU both stay there, and nothing waits.
     """
     if grid.on_gpu:
-        from geogs.tracking.cuda import evidence
+        from geogs.tracking.cuda import photometric_check
 
-        return evidence.matched_motion(grid, pixels, weight)
+        return photometric_check.matched_motion(grid, pixels, weight)
     used = weight[:, 0] > 0
     median = _median_where((pixels - grid.pixels).norm(dim=-1), used)[:1]
     return torch.cat([used.to(median).mean()[None], median])
@@ -123,7 +123,7 @@ def _on_gpu(
     pixels: Float[Tensor, "p 2"] | None = None,
 ) -> Float[Tensor, "2"]:
     """The same by kernels: where a pose and depths put the cells, or at ``pixels``."""
-    from geogs.tracking.cuda.evidence import median_correlation
+    from geogs.tracking.cuda.photometric_check import median_correlation
 
     if T_ji is not None:
         T_ji = to_device(T_ji, first.device)

@@ -1,4 +1,4 @@
-"""Whether images bear a location out, on the GPU, in a few launches."""
+"""The photometric check of a location on the GPU, in a few launches."""
 
 from pathlib import Path
 
@@ -9,7 +9,7 @@ from torch import Tensor
 from geogs.gpu.kernels import kernels_for
 from geogs.world.grid import STRIDE, SampleGrid
 
-SOURCE = Path(__file__).with_name("evidence.cu")
+SOURCE = Path(__file__).with_name("photometric_check.cu")
 WINDOWS = 8
 """Windows of a block of threads."""
 
