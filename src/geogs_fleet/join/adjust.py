@@ -84,7 +84,7 @@ def adjusted(
         n: Member(n, parts[n], files[n], placements[n].T_cw, placements[n].scale)
         for n in gauge.parts
     }
-    adjustment = _Adjustment(now, _beside(gauge), camera, config, workers, folder)
+    adjustment = _Adjustment(now, gauge.linked, camera, config, workers, folder)
     folder.mkdir(parents=True, exist_ok=True)
     for _ in range(ROUNDS):
         if adjustment.match() <= CONVERGED * adjustment.pairs:
@@ -108,13 +108,13 @@ class _Adjustment:
     def __init__(
         self,
         members: dict[int, Member],
-        beside: Mapping[int, list[int]],
+        linked: Mapping[int, list[int]],
         camera: Camera,
         config: Config,
         workers: Workers,
         folder: Path,
     ) -> None:
-        self.members, self.beside, self.folder = members, beside, folder
+        self.members, self.linked, self.folder = members, linked, folder
         self.camera, self.config, self.workers = camera, config, workers
         counts = np.cumsum([0, *(len(m.T_cw) for m in members.values())]).tolist()
         self.first = dict(zip(members, counts[:-1], strict=True))
@@ -136,7 +136,7 @@ class _Adjustment:
         """Match what has moved; how many pairs."""
         jobs, written = [], []
         for n, own in self.members.items():
-            later = [m for m in self.beside[n] if m > n]
+            later = [m for m in self.linked[n] if m > n]
             paths = {(n, m): self._new(f"matches-{n}-{m}") for m in (n, *later)}
             before = tuple(self.matches[key] for key in paths if key in self.matches)
             others = tuple(self.members[m] for m in later)
@@ -177,9 +177,9 @@ class _Adjustment:
         """Bring the depths after a step; what the parts say of the next."""
         jobs = []
         for n, own in self.members.items():
-            others = tuple(self.members[m] for m in self.beside[n])
+            others = tuple(self.members[m] for m in self.linked[n])
             leaving = tuple(path for (_, m), path in self.matches.items() if m == n)
-            first = {m: self.first[m] for m in (n, *self.beside[n])}
+            first = {m: self.first[m] for m in (n, *self.linked[n])}
             jobs.append(
                 StepJob(
                     own, others, first, leaving, self.camera, self.config,
@@ -293,12 +293,3 @@ def _known_graph(job: StepJob, grid: SampleGrid) -> tuple[FrameGraph, list[Node]
     graph = FrameGraph(segment, build_operator(job.config.tracking, grid))
     graph.edges.update({(ids[a], ids[b]): edge for (a, b), edge in edges.items()})
     return graph, nodes
-
-
-def _beside(gauge: Gauge) -> dict[int, list[int]]:
-    """The parts that each is linked to, ascending."""
-    beside: dict[int, set[int]] = {n: set() for n in gauge.parts}
-    for link in gauge.links:
-        beside[link.first[0]].add(link.second[0])
-        beside[link.second[0]].add(link.first[0])
-    return {n: sorted(others) for n, others in beside.items()}

@@ -28,6 +28,15 @@ class Gauge:
         """Numbers of the parts, ascending."""
         return sorted(self.world)
 
+    @property
+    def linked(self) -> dict[int, list[int]]:
+        """The parts that each part is linked to, ascending."""
+        linked: dict[int, set[int]] = {n: set() for n in self.parts}
+        for link in self.links:
+            linked[link.first[0]].add(link.second[0])
+            linked[link.second[0]].add(link.first[0])
+        return {n: sorted(others) for n, others in linked.items()}
+
 
 @dataclass(frozen=True)
 class _Tie:

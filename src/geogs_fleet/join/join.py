@@ -2,8 +2,7 @@
 
 import shutil
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -22,6 +21,7 @@ from geogs.io.writers.atomic import prepare_output_folder
 from geogs.io.writers.map_file import load_map_file
 from geogs.io.writers.ply_writer import write_mesh, write_splats
 from geogs.mesh.triangle_mesh import Mesh
+from geogs.stopwatch import Stopwatch
 from geogs.types import MapSnapshot
 from geogs.version import __version__
 from geogs_fleet.join.adjust import adjusted
@@ -75,13 +75,7 @@ class _Join:
         self.work = output / "join"
         self.files = [self.work / f"views-{n:04d}.safetensors" for n in range(len(parts))]
         self.camera = opened(parts[0]).camera
-        self.seconds: dict[str, float] = {}
-
-    @contextmanager
-    def timed(self, name: str) -> Iterator[None]:
-        begin = time.perf_counter()
-        yield
-        self.seconds[name] = round(time.perf_counter() - begin, 3)
+        self.stopwatch = Stopwatch()
 
     def links(self) -> list[Link]:
         jobs, views = [], (read_record(PartViews, file) for file in self.files)  # one at a time
@@ -101,10 +95,7 @@ class _Join:
             (self.parts[n], self.files[n], placements[n], files[n], self.device) for n in numbers
         ]
         self.workers.map("moving maps", move_disks, moves)
-        beside = {tuple(sorted((k.first[0], k.second[0]))) for k in gauge.links}
-        merges = [
-            (files[n], [files[m] for m in numbers if m < n and (m, n) in beside]) for n in numbers
-        ]
+        merges = [(files[n], [files[m] for m in gauge.linked[n] if m < n]) for n in numbers]
         keep = self.workers.map("merging maps", merge_disks, merges)
         return joined_disks(
             [
@@ -181,7 +172,7 @@ def join_parts(
 
 def _joined(join: _Join, adjust: bool, say: Callable[[str], None], begin: float) -> Joint:
     parts, config = join.parts, join.config
-    with join.timed("describing"):
+    with join.stopwatch("describing"):
         described = [
             (part, join.camera, file, join.device)
             for part, file in zip(parts, join.files, strict=True)
@@ -189,7 +180,7 @@ def _joined(join: _Join, adjust: bool, say: Callable[[str], None], begin: float)
         keyframes = sum(join.workers.map("describing", describe, described))
     say(f"{len(parts)} parts, {keyframes} keyframes.")
     views = [read_record(PartViews, file).outline() for file in join.files]
-    with join.timed("linking"):
+    with join.stopwatch("linking"):
         links = join.links()
         gauge = common_gauge(views, links)
     if len(gauge.world) < 2:
@@ -199,10 +190,10 @@ def _joined(join: _Join, adjust: bool, say: Callable[[str], None], begin: float)
         )
     unjoined = [parts[n].name for n in range(len(parts)) if n not in gauge.world]
     say(f"{len(gauge.links)} links join {len(gauge.world)} of {len(parts)} parts.")
-    with join.timed("pose graph"):
+    with join.stopwatch("pose graph"):
         placements = placed(views, gauge)
     if adjust:
-        with join.timed("bundle adjustment"):
+        with join.stopwatch("bundle adjustment"):
             placements = adjusted(
                 parts, join.files, placements, gauge, join.camera, config, join.workers,
                 join.work / "adjust",
@@ -216,14 +207,15 @@ def _joined(join: _Join, adjust: bool, say: Callable[[str], None], begin: float)
         JoinedPart(results[n], views[n], placements[n], span)
         for n, span in zip(gauge.parts, spans, strict=True)
     ]
-    with join.timed("moving and merging maps"):
+    with join.stopwatch("moving and merging maps"):
         disks = join.disks(gauge, placements)
     say(f"{len(disks)} disks.")
     remove_previous_output(join.output)
     trajectory = write_poses(join.output, placed_parts)
     write_map(join.output, placed_parts, disks, join.camera, config)
-    with join.timed("mesh"):
+    with join.stopwatch("mesh"):
         mesh = join.surface(sum(len(p.views.T_cw) for p in placed_parts), disks)
+    seconds = join.stopwatch.seconds
     summary = {
         **_statistics(list(results.values()), gauge, unjoined, adjust),
         "videos": [asdict(span) for span in spans],
@@ -231,7 +223,10 @@ def _joined(join: _Join, adjust: bool, say: Callable[[str], None], begin: float)
         "lost_spans": lost_spans(trajectory),
         "disks": len(disks),
         "mesh_faces": 0 if mesh is None else len(mesh.faces),
-        "seconds": {**join.seconds, "total": round(time.perf_counter() - begin, 3)},
+        "seconds": {
+            name: round(spent, 3)
+            for name, spent in {**seconds, "total": time.perf_counter() - begin}.items()
+        },
         "peak_memory_bytes": peak_memory(),
         **device_summary(torch.device(join.device)),
     }
