@@ -50,7 +50,7 @@ def gathered(part: Part, index: Int[Tensor, "b m"]) -> Part:
     return each(lambda t: t[rows, index], part)
 
 
-def joined(first: Part, *others: Part) -> Part:
+def concatenated(first: Part, *others: Part) -> Part:
     """What each scene has along the second axis, one after the other."""
 
     def join(*tensors: Shaped[Tensor, "b ..."]) -> Tensor:
