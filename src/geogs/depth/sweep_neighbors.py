@@ -21,7 +21,7 @@ MAX_VIEW_ANGLE_DEG = 35.0
 MAX_BASELINE_COSINE = 0.97
 """Baselines closer to parallel than this are left to others where there is choice."""
 RANGE_MARGIN = 1.3
-"""Factor by which the searched depths go beyond what the tracker saw, which is not all."""
+"""Factor by which searched depths go beyond those that are known, which are not all."""
 RANGE_DEVIATION = 0.1
 """Relative deviation below which the tracker's depth counts for the range."""
 

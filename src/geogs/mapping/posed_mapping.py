@@ -6,6 +6,7 @@ from collections.abc import Callable
 import numpy as np
 
 from geogs.config import SearchConfig
+from geogs.depth.sweep_neighbors import RANGE_MARGIN
 from geogs.mapping import known_poses as known
 from geogs.mapping.first_look import SmallImage, first_points
 from geogs.mapping.map_all import group_size, search_depths, spread_order
@@ -16,8 +17,6 @@ from geogs.mapping.training.full import seconds_per_step
 More = Callable[[Callable[[], int]], None]
 """Adds at most as many further images as what it is given says, once it is asked."""
 
-RANGE_MARGIN = 1.3
-"""Factor by which searched depths go beyond those that are known, which are not all."""
 # Steps after which the next ones are expected to take as long.
 _ENOUGH_STEPS = 100
 
