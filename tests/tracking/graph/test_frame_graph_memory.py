@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from geogs.bundle.depth_terms import DepthDamping
 from geogs.tracking.flow.flow_operator import FlowOperator, Memories
 from geogs.tracking.graph.frame_graph import FrameGraph
 from geogs.types import FlowMatch
@@ -96,8 +97,11 @@ def test_damping_of_a_frame_is_the_mean_over_the_edges_that_leave_it(graph):
     graph.measure([(1, 2)])
     problem, ids = graph.problem(list(graph.edges), [2, 3], [0, 1, 2])
     assert ids == [0, 1, 2, 3]
-    assert problem.damping.shape == (4, GRID.size)
-    torch.testing.assert_close(problem.damping[:, 5], torch.tensor([101.0, 201.5, 301.5, 401.0]))
+    (damping,) = problem.depth_terms
+    assert isinstance(damping, DepthDamping)
+    assert damping.curvature.shape == (4, GRID.size)
+    expected = torch.tensor([101.0, 201.5, 301.5, 401.0])
+    torch.testing.assert_close(damping.curvature[:, 5], expected)
     for edge in graph.edges.values():
         edge.damping = None
-    assert graph.problem(list(graph.edges), [2, 3], [0, 1, 2])[0].damping is None
+    assert graph.problem(list(graph.edges), [2, 3], [0, 1, 2])[0].depth_terms == ()
