@@ -10,7 +10,7 @@ from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_inverse
 from geogs.loop.closer import LoopCloser
 from geogs.tracking.flow.classical_flow import ClassicalFlow
-from geogs.tracking.segments import Segments
+from geogs.tracking.segment_trackers import Segments
 from geogs.tracking.tracker import Tracker, TrackResult
 from geogs.types import FlowMatch
 from geogs.world.edges import MeasuredEdge

@@ -26,7 +26,7 @@ from geogs.stopwatch import Stopwatch
 from geogs.threads import on_one_torch_thread
 from geogs.tracking.flow.operator_choice import build_operator
 from geogs.tracking.keyframe_uncertainty import keyframe_uncertainty
-from geogs.tracking.segments import Segments
+from geogs.tracking.segment_trackers import Segments
 from geogs.tracking.tracker import TrackResult
 from geogs.types import Frame, MetricScale
 from geogs.world.grid import SampleGrid

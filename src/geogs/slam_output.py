@@ -19,7 +19,7 @@ from geogs.pose_estimate import PoseEstimate
 from geogs.stopwatch import Stopwatch
 from geogs.threads import on_one_torch_thread
 from geogs.tracking.graph.dynamic_cells import dynamic_fraction
-from geogs.tracking.segments import Segments
+from geogs.tracking.segment_trackers import Segments
 from geogs.types import (
     MapSnapshot,
     MetricScale,

@@ -13,7 +13,7 @@ from geogs.geometry.lie import sim3_exp
 from geogs.geometry.umeyama import umeyama
 from geogs.loop.closer import LoopCloser
 from geogs.tracking.flow.operator_choice import build_operator
-from geogs.tracking.segments import Segments
+from geogs.tracking.segment_trackers import Segments
 from geogs.tracking.tracker import lone_tracker
 from geogs.types import Frame
 from geogs.world.grid import SampleGrid

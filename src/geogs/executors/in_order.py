@@ -12,7 +12,7 @@ from geogs.executors.background_mapper import BackgroundMapper
 from geogs.mapping.mapper import Mapper
 from geogs.stopwatch import Stopwatch
 from geogs.tracking.locate.pose_deviation import DeviationOf
-from geogs.tracking.segments import Recall, Segments
+from geogs.tracking.segment_trackers import Recall, Segments
 from geogs.tracking.tracker import TrackResult
 from geogs.types import Frame, MapSnapshot, PoseCorrection
 from geogs.world.segments import TrackState

@@ -19,7 +19,7 @@ from geogs.stopwatch import Stopwatch
 from geogs.threads import on_one_torch_thread
 from geogs.tracking.follower import Follower
 from geogs.tracking.locate.pose_deviation import DeviationOf
-from geogs.tracking.segments import Recall, Segments
+from geogs.tracking.segment_trackers import Recall, Segments
 from geogs.tracking.tracker import TrackResult
 from geogs.types import Frame, MapSnapshot
 from geogs.world.keyframes import KeyframeTable

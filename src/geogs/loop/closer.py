@@ -29,7 +29,7 @@ from geogs.loop.constraints import (
 )
 from geogs.loop.detect import LoopDetector
 from geogs.tracking.locate.frame_locator import Recognition
-from geogs.tracking.segments import Segments
+from geogs.tracking.segment_trackers import Segments
 from geogs.tracking.tracker import Tracker, TrackResult
 from geogs.types import PoseCorrection
 from geogs.world.loops import Loop, LoopTable, RelativePoses, SegmentConstraints

@@ -33,7 +33,7 @@ class KeyframeUncertainty:
     rotation: Float64[np.ndarray, "n"]
     """Likewise of its orientation, radians."""
     depth: Float64[np.ndarray, "n"]
-    """Of its depths, as a part of them: the median."""
+    """Median relative deviation of its depths."""
     residual: Float64[np.ndarray, "n"]
     """Median residual of its matches, in their deviations."""
 
@@ -50,7 +50,7 @@ class KeyframeUncertainty:
 
 
 def keyframe_uncertainty(tracker: Tracker) -> KeyframeUncertainty:
-    """Of all keyframes of a tracker that has a map, from the edges that it has at present.
+    """Uncertainty of all keyframes of a tracker that has a map, from its present edges.
 
     In the world of a saved map: of those that it did not bring, relative to it.
 
@@ -78,7 +78,7 @@ def keyframe_uncertainty(tracker: Tracker) -> KeyframeUncertainty:
 
 
 def _marginals(tracker: Tracker, ids: list[int]) -> Marginals | None:
-    """Of some keyframes, by the edges between them; none where there are none."""
+    """Marginals of some keyframes, by the edges between them; none where there are none."""
     free = ids if tracker.segment.fixed else ids[1:]
     among = {*ids, *tracker.segment.fixed}
     edges = [e for e in tracker.map.graph.edges if among.issuperset(e)]

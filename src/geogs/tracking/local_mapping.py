@@ -12,8 +12,8 @@ from geogs.geometry.lie import se3_inverse
 from geogs.tracking.graph.dynamic_cells import propagated
 from geogs.tracking.graph.frame_graph import HUBER
 from geogs.tracking.graph.proximity import RADIUS, frame_distances, proximity_pairs
+from geogs.tracking.keyframes.measured_depth import stands_alone
 from geogs.tracking.keyframes.segment_map import SegmentMap
-from geogs.tracking.keyframes.sensor_depth import stands_alone
 from geogs.tracking.locate.frame_locator import FrameMotion
 from geogs.tracking.start.start_up import MIN_KEYFRAMES
 from geogs.types import Frame
@@ -33,7 +33,7 @@ PROXIMITY_DISTANCE = 0.2
 PROXIMITY_PAIRS = 2
 """Most such neighbours per keyframe: bounds the time."""
 ROUNDS = 2
-"""Of flow and adjustment per keyframe; the last is followed by the prior's."""
+"""Rounds of flow and adjustment per keyframe; the last is followed by the prior's."""
 ITERATIONS = 3
 """Gauss-Newton steps per round."""
 REMEASURE = 0.5

@@ -21,7 +21,7 @@ from geogs.tracking.keyframes.keyframe_choice import KeyframeChoice
 from geogs.tracking.keyframes.segment_map import SegmentMap
 from geogs.tracking.local_mapping import LocalMapping
 from geogs.tracking.locate.frame_locator import MIN_KNOWN, FrameMotion, Recognition
-from geogs.tracking.locate.localiser import Localiser
+from geogs.tracking.locate.localiser import SegmentLocaliser
 from geogs.tracking.locate.orientation_follower import OrientationFollower
 from geogs.tracking.locate.pose_deviation import DeviationOf, deviation_of
 from geogs.tracking.matching.flow_chain import MIN_TEXTURE
@@ -82,7 +82,7 @@ class Tracker:
             self.config, max(camera.width, camera.height), segment.sharpness
         )
         self._start_up = StartUp(self.map, self._choice, self.config)
-        self._localiser = Localiser(self.map)
+        self._localiser = SegmentLocaliser(self.map)
         self._orientation = OrientationFollower(grid, operator, self.config)
         self.local = LocalMapping(self.map, self.config)
         self._motion: FrameMotion | None = None

@@ -33,7 +33,7 @@ class MeasuredEdge:
     reprojection: Float[Tensor, "p 2"]
     """Where the cells fell when the flow was measured."""
     damping: Float[Tensor, "p"] | None = None
-    """Of the source's inverse depth, if the operator gives one."""
+    """Damping of the source's inverse depth, if the operator gives one."""
     memory: Any = field(default=None, metadata={"stored": False})
     """What the operator keeps of this edge, and can do without."""
 
@@ -54,9 +54,9 @@ class PackedEdge:
     """World to camera of the source when the flow was measured."""
     T_target: Float[Tensor, "4 4"]
     inverse_depth: Float[Tensor, "p"]
-    """Of the source when the flow was measured."""
+    """The source's when the flow was measured."""
     damping: Float[Tensor, "p"] | None = None
-    """Of the source's inverse depth, if the operator gives one."""
+    """Damping of the source's inverse depth, if the operator gives one."""
     memory: Any = field(default=None, metadata={"stored": False})
     """What the operator keeps of this edge, and can do without."""
 

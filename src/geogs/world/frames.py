@@ -53,7 +53,7 @@ class FrameRecord:
     T_rel: Float[Tensor, "4 4"]
     """Anchor keyframe to this frame."""
     scale: float = 1.0
-    """Of the anchor when that was measured."""
+    """Scale of the anchor when that was measured."""
     observations: list[Observation] = field(default_factory=list)
     rotations: list[RelativeRotation] = field(default_factory=list)
     """Relative to earlier frames: what is left to go by where there is no depth."""

@@ -48,7 +48,7 @@ class LastFrame:
     velocity: Float[Tensor, "4 4"] | None
     """Motion from the frame before; None where the camera had been lost."""
     scale: float
-    """Of the keyframe when the two were measured."""
+    """Scale of the keyframe when the two were measured."""
     timestamp: float
     """Seconds."""
     interval: float
@@ -161,7 +161,7 @@ class OdometryScale:
     scale: float | None = None
     """Metres to the unit of the map; none as long as the measured motions do not fit."""
     deviation: float = float("inf")
-    """Of the scale, relative."""
+    """Relative deviation of the scale."""
 
 
 @dataclass(eq=False)
@@ -182,7 +182,7 @@ class VideoSegment:
     breaks: list[int] = field(default_factory=list)
     """Keyframes that no motion links to the one before them."""
     sharpness: list[float] = field(default_factory=list)
-    """Of the latest frames."""
+    """Sharpness of the latest frames."""
     start: StartUpProgress = field(default_factory=StartUpProgress)
     odometry: OdometryScale = field(default_factory=OdometryScale)
     is_metric: bool = False

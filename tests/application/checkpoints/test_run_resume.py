@@ -26,7 +26,7 @@ from geogs.errors import InputError
 from geogs.io.sources.sniff import open_source
 from geogs.pose_estimate import PoseEstimate
 from geogs.slam import Slam
-from geogs.tracking.segments import Segments
+from geogs.tracking.segment_trackers import Segments
 from geogs.types import Frame
 from geogs.version import __version__
 from stopped_commands import STOPPED, stop

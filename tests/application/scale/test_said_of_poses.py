@@ -1,14 +1,14 @@
 """What a run tells of poses beside the images."""
 
 from geogs.application.scale.apply import sentences_on_poses
-from geogs.tracking.graph.odometry import Agreement
+from geogs.tracking.graph.measured_odometry import OdometryAgreement
 
 
 def test_poses_that_do_not_fit_are_told():
-    assert sentences_on_poses(Agreement(0, 0.0, float("inf"), False)) == []
-    (used,) = sentences_on_poses(Agreement(20, 0.85, 0.01, True))
+    assert sentences_on_poses(OdometryAgreement(0, 0.0, float("inf"), False)) == []
+    (used,) = sentences_on_poses(OdometryAgreement(20, 0.85, 0.01, True))
     assert used == (
         "Poses beside the images: 85% of 20 motions between keyframes fit what the images show."
     )
-    (refused,) = sentences_on_poses(Agreement(20, 0.05, float("inf"), False))
+    (refused,) = sentences_on_poses(OdometryAgreement(20, 0.05, float("inf"), False))
     assert refused.startswith("warning: the poses beside the images are not used: only 5% of 20")

@@ -13,7 +13,7 @@ from geogs.geometry.camera import Camera
 from geogs.tracking.calibration import stretch
 from geogs.tracking.calibration.focal_uncertainty import LEAST_DEVIATION
 from geogs.tracking.calibration.self_calibration import self_calibrate
-from geogs.tracking.calibration.views import with_focal
+from geogs.tracking.calibration.view_gatherer import with_focal
 from geogs.types import Frame
 from tracking_scenes import CAMERA, frames, pose, render
 

@@ -12,7 +12,7 @@ from geogs.errors import InputError
 from geogs.io.sources.sniff import Stream
 from geogs.on_demand import OnDemand
 from geogs.slam import Slam
-from geogs.tracking.graph.odometry import Agreement
+from geogs.tracking.graph.measured_odometry import OdometryAgreement
 from geogs.types import MetricScale
 
 
@@ -46,7 +46,7 @@ def make_metric(
     progress.write(said(found))
 
 
-def sentences_on_poses(found: Agreement) -> list[str]:
+def sentences_on_poses(found: OdometryAgreement) -> list[str]:
     """Sentences on poses given beside the images; none where there are none."""
     if not found.motions:
         return []

@@ -13,16 +13,16 @@ import numpy as np
 from jaxtyping import Float
 
 from geogs.geometry.camera import Camera
-from geogs.tracking.calibration.views import on_cpu, with_focal
+from geogs.tracking.calibration.view_gatherer import on_cpu, with_focal
 from geogs.types import FlowMatch
 from geogs.world.grid import SampleGrid
 
 MAX_COST = 6.0
 """Mean cost of a match, in variances, above which no pinhole camera explains the flow."""
 PLANAR_FRACTION = 0.9
-"""Of the matches; where one homography explains so many in every view, the scene is a plane."""
+"""Where one homography explains this fraction of the matches in all views, they show a plane."""
 _TOLERANCE = 1 / 400
-"""Of the long edge: deviation from a homography that is still explained by it."""
+"""Deviation, of the long edge, from a homography that is still explained by it."""
 _FIELDS_OF_VIEW = np.geomspace(25, 130, 15)
 
 

@@ -16,7 +16,7 @@ from geogs.bundle.problem import BundleProblem
 from geogs.bundle.select import grid_fields
 from geogs.bundle.shared import OPTIONS, SharedResult, solve_shared
 from geogs.geometry.camera import Camera
-from geogs.tracking.calibration.views import on_cpu, stacked, with_focal
+from geogs.tracking.calibration.view_gatherer import on_cpu, stacked, with_focal
 from geogs.tracking.matching.pnp import pnp
 from geogs.tracking.matching.two_view import best_two_view, two_view
 from geogs.types import FlowMatch
@@ -34,7 +34,7 @@ class Start:
     lens: RadialLens
     T_cw: Float[Tensor, "n 4 4"]
     inverse_depth: Float[Tensor, "p"]
-    """Of the first keyframe."""
+    """On the cells of the first keyframe."""
     information: Float[Tensor, "p"]
     cost: float
     field_of_view: float

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from geogs.geometry.camera import Camera
 from geogs.tracking.calibration.degeneracy import MAX_COST, Degeneracy
 from geogs.tracking.calibration.growing_bundle import GrowingBundle
-from geogs.tracking.calibration.views import with_focal
+from geogs.tracking.calibration.view_gatherer import with_focal
 
 STANDARD_ERRORS = 3.0
 """The adjustment's own standard error times this is taken for the deviation: matches of different
@@ -15,7 +15,7 @@ keyframes err alike too. Measured on rendered rooms, where errors are 1 to 7 sta
 LEAST_DEVIATION = 0.002
 """Relative: no focal length is known better, however many matches agree."""
 DISTORTION_FRACTION = 0.5
-"""Of the change of the focal length when k1 is free too: counts as deviation where it is not."""
+"""Fraction of the change of the focal length when k1 is free too that counts as deviation."""
 FIELDS_OF_VIEW = 15.0, 150.0
 """Degrees along the longer side; what lies outside is no pinhole camera's."""
 AGREEMENT = 3.0

@@ -11,7 +11,7 @@ from geogs.bundle.problem import BundleProblem
 from geogs.bundle.select import grid_fields
 from geogs.bundle.shared import SharedResult, solve_shared
 from geogs.tracking.calibration.focal_candidates import Start
-from geogs.tracking.calibration.views import View, on_cpu
+from geogs.tracking.calibration.view_gatherer import View, on_cpu
 from geogs.tracking.flow.flow_operator import FlowOperator
 from geogs.tracking.matching.pnp import pnp
 from geogs.world.grid import SampleGrid
@@ -39,7 +39,7 @@ class GrowingBundle:
         self, grid: SampleGrid, operator: FlowOperator, views: list[View], start: Start
     ) -> None:
         self.grid = grid
-        """Of the guess: of its camera nothing but the size is used."""
+        """Grid of the guess: of its camera nothing but the size is used."""
         self._operator = operator
         self.lens = start.lens
         self._views = views[: len(start.T_cw)]

@@ -14,7 +14,7 @@ from geogs.threads import on_one_torch_thread
 from geogs.tracking.calibration.degeneracy import Degeneracy
 from geogs.tracking.calibration.focal_uncertainty import Estimate, estimate, joined
 from geogs.tracking.calibration.stretch import FRAMES, Report, Stretch
-from geogs.tracking.calibration.views import ViewGatherer
+from geogs.tracking.calibration.view_gatherer import ViewGatherer
 from geogs.tracking.flow.operator_choice import build_operator
 from geogs.types import Frame
 from geogs.world.grid import SampleGrid
@@ -33,7 +33,7 @@ class SelfCalibration:
     """What the video says of its camera."""
 
     camera: Camera
-    """Of the working image; the guess where there is a ``failure``."""
+    """Camera of the working image; the guess where there is a ``failure``."""
     k1: float = 0.0
     deviation: float = math.inf
     """Standard deviation of the focal length, relative."""

@@ -7,7 +7,7 @@ from geogs.tracking.calibration.degeneracy import MAX_COST, Degeneracy, degenera
 from geogs.tracking.calibration.focal_candidates import Start, candidates, try_candidate
 from geogs.tracking.calibration.focal_uncertainty import relative_error
 from geogs.tracking.calibration.growing_bundle import GrowingBundle
-from geogs.tracking.calibration.views import View, ViewGatherer, flows_from_first
+from geogs.tracking.calibration.view_gatherer import View, ViewGatherer, flows_from_first
 from geogs.tracking.flow.flow_operator import FlowOperator
 from geogs.types import FlowMatch
 from geogs.world.grid import SampleGrid

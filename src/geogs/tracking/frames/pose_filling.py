@@ -23,7 +23,7 @@ from geogs.world.keyframes import KeyframeSet
 SOLVED_TOGETHER = 64
 """Frames whose poses are solved, or observations that are corrected, at a time; bounds memory."""
 ITERATIONS = 8
-"""Of the motion-only adjustment of a frame."""
+"""Steps of the motion-only adjustment of a frame."""
 
 
 def solve_trajectory(

@@ -82,7 +82,7 @@ class _Linear:
 
     free: list[int]
     jacobian: "csc_matrix"
-    """Of three rows for each link by the steps of the free rotations, each moved from the left."""
+    """Three rows for each link by the steps of the free rotations, each moved from the left."""
     error: Float64[np.ndarray, "n"]
 
 

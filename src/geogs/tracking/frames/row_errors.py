@@ -29,7 +29,7 @@ LONGEST_INTERVAL = 0.07
 TOGETHER = 64
 """Edges that are corrected at a time; bounds memory."""
 LARGEST = 0.01
-"""Of the long edge; an error that seems larger is none of the rows."""
+"""Fraction of the long edge; an error that seems larger is none of the rows."""
 
 
 class RowErrors:

@@ -21,7 +21,7 @@ from geogs.geometry.lie import se3_inverse
 from geogs.threads import thread_map
 from geogs.tracking.flow.flow_operator import FlowOperator
 from geogs.tracking.graph.dynamic_cells import static_weight, update_dynamic
-from geogs.tracking.graph.odometry import Odometry
+from geogs.tracking.graph.measured_odometry import Odometry
 from geogs.tracking.graph.proximity import PAIRS_TOGETHER
 from geogs.types import FlowMatch
 from geogs.world.edges import Edge, MeasuredEdge, PackedEdge, Pair, edge_matches, pack_matches

@@ -29,7 +29,7 @@ class _Spheres:
     centre: Float[Tensor, "n t 3"]
     radius: Float[Tensor, "n t"]
     fraction: Float[Tensor, "t"]
-    """Of the cells."""
+    """Fraction of the cells in each tile."""
 
     def around(self) -> "_Spheres":
         """One sphere around all of each keyframe."""

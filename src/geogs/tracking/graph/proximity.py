@@ -131,7 +131,7 @@ class _Suppression:
         return ~self._blocked[np.ix_(rows - a, columns - b)]
 
     def is_blocked(self, pair: Pair) -> bool:
-        """Of a pair between the rows and columns."""
+        """Whether a pair of the rows and columns may not be taken."""
         return bool(self._blocked[pair[0] - self._corner[0], pair[1] - self._corner[1]])
 
     def block(self, pair: Pair) -> None:

@@ -12,9 +12,9 @@ from geogs.priors.base import MonocularPrior
 from geogs.tracking.flow.flow_operator import FlowOperator
 from geogs.tracking.frames.frame_recorder import FrameRecorder
 from geogs.tracking.graph.frame_graph import FrameGraph
-from geogs.tracking.graph.odometry import Odometry
+from geogs.tracking.graph.measured_odometry import Odometry
+from geogs.tracking.keyframes.measured_depth import KeyframeDepthSensor
 from geogs.tracking.keyframes.monocular_priors import KeyframePriors
-from geogs.tracking.keyframes.sensor_depth import SensorDepth
 from geogs.types import Frame
 from geogs.world.frames import RelativeRotation
 from geogs.world.keyframes import Keyframe
@@ -37,7 +37,7 @@ class SegmentMap:
         self.graph = FrameGraph(keyframes, operator, self.odometry, segment.edges)
         self.recorder = FrameRecorder(segment.frames, keyframes, operator)
         self.priors = KeyframePriors(self.graph, prior, config.prior)
-        self.sensor = SensorDepth(keyframes.grid, config.sensor)
+        self.sensor = KeyframeDepthSensor(keyframes.grid, config.sensor)
 
     @property
     def operator(self) -> FlowOperator:

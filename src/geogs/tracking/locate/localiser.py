@@ -26,7 +26,7 @@ RELOCALISE_EVERY = 5
 searched for as if it could be anywhere."""
 
 
-class Localiser:
+class SegmentLocaliser:
     """Locates frames at the keyframes of a segment."""
 
     def __init__(self, map: SegmentMap) -> None:

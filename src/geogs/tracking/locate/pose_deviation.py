@@ -27,9 +27,9 @@ class PoseDeviation:
     """Standard deviations of a pose relative to the keyframe it was located at."""
 
     position: float
-    """Of the camera's centre, all axes together, map units; infinite where nothing is known."""
+    """The camera's centre, all axes together, map units; infinite where nothing is known."""
     rotation: float
-    """Of its orientation, radians."""
+    """Its orientation, radians."""
 
 
 def pose_deviation(

@@ -22,7 +22,7 @@ from geogs.world.grid import SampleGrid
 FEATURES = 2000
 """Most features per image."""
 MIN_CONTRAST = 0.01
-"""Of a feature, of the range of grey levels: OpenCV's is 0.04, which leaves a road empty."""
+"""Fraction of the range of grey levels: OpenCV's is 0.04, which leaves a road empty."""
 MAX_RATIO = 0.85
 """Largest distance to the most alike feature relative to that of the next."""
 EPIPOLAR_ERROR = 1.5

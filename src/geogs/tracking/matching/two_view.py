@@ -23,7 +23,7 @@ class TwoView:
 
     T_ji: Float[Tensor, "4 4"]
     inverse_depth: Float[Tensor, "p"]
-    """Of the first view, median 1; 1 where it is not good."""
+    """Inverse depth of the first view's cells, median 1; 1 where it is not good."""
     good: Bool[Tensor, "p"]
     parallax: float
     """Median motion in pixels that rotation does not explain."""
@@ -104,7 +104,7 @@ def _pose_of(
     first: Float64[np.ndarray, "n 3"],
     second: Float64[np.ndarray, "n 3"],
 ) -> tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray, "3"], Bool[np.ndarray, "n"]]:
-    """Of the four poses of an essential matrix the one that sees most points before both cameras.
+    """The one of the four poses of an essential matrix that sees most points before both cameras.
 
     Returns the rotation, the unit translation (first camera to second) and which points lie there,
     nearer than ``FARTHEST`` baselines. From z R a + t = z' b for the rays a and b of a point its

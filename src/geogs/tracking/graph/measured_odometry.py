@@ -32,15 +32,15 @@ LATEST = 200
 
 
 @dataclass(frozen=True)
-class Agreement:
+class OdometryAgreement:
     """How far measured motions fit those of the images."""
 
     motions: int
     """That were measured between neighbouring keyframes."""
     fitting: float
-    """Of these, those that fit within their deviations."""
+    """Fraction of these that fit within their deviations."""
     deviation: float
-    """Of the scale that they tell, as a part of it; infinite where they tell none."""
+    """Relative deviation of the scale that they say; infinite where they say none."""
     used: bool
     """Whether they took part."""
 
@@ -68,10 +68,12 @@ class Odometry:
         """Find the scale by all keyframes."""
         self._take(self._vote(self.keyframes.ids))
 
-    def agreement(self) -> Agreement:
+    def agreement(self) -> OdometryAgreement:
         """How far all motions fit, at the present poses."""
         vote = self._vote(self.keyframes.ids)
-        return Agreement(len(vote.fits), vote.share, vote.deviation, self.found.scale is not None)
+        return OdometryAgreement(
+            len(vote.fits), vote.share, vote.deviation, self.found.scale is not None
+        )
 
     def between(self, ids: Sequence[int]) -> MeasuredMotions | None:
         """Motions from each of some keyframes to the next, in the unit of the map.

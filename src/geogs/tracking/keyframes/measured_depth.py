@@ -12,7 +12,7 @@ from geogs.world.grid import OFFSET, STRIDE, SampleGrid
 from geogs.world.keyframes import Keyframe, MeasuredCells
 
 
-class SensorDepth:
+class KeyframeDepthSensor:
     """Gives keyframes the depth that a sensor measured, in metres."""
 
     def __init__(self, grid: SampleGrid, config: DepthSensorConfig) -> None:

@@ -9,7 +9,7 @@ from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_inverse
 from geogs.geometry.umeyama import umeyama
 from geogs.loop.global_bundle import global_bundle
-from geogs.tracking.graph.odometry import Odometry
+from geogs.tracking.graph.measured_odometry import Odometry
 from geogs.tracking.tracker import Tracker, lone_tracker
 from geogs.types import MeasuredPose
 from geogs.world.grid import SampleGrid
