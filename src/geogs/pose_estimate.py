@@ -26,7 +26,7 @@ class PoseEstimate:
     disks: int
     timestamp: float = nan
     """Seconds."""
-    T_cw: Float64[Tensor, "4 4"] | None = None
+    T_cw: Float64[Tensor, "4 4"] | None = field(default=None, compare=False)
     """World to camera; none unless the camera is tracked in the main map."""
     deviation: DeviationOf | None = field(default=None, repr=False, compare=False)
     """Computes the deviation of the pose; none where nothing is known of it."""

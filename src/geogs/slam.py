@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Bool
 
 from geogs.config import Config
+from geogs.errors import InputError
 from geogs.executors.deferred import Deferred
 from geogs.executors.in_order import InOrder
 from geogs.executors.live import Live, urgent_stream
@@ -79,43 +80,32 @@ class Slam(SlamOutput):
             InputError: images of that size cannot be tracked, or the world is of another camera.
             DeviceError: there is no such device, or it cannot be used.
         """
-        self.config = config or Config()
-        self.mask = SceneMask(mask, black_is_masked)
-        where, defers = str(require_device(device)), defers_map and self.config.mapping.may_follow
-        self.world = world or World(maps_at_end=defers and not live)
+        self.config = c = config or Config()
+        maps_at_end = defers_map and not live and c.mapping.may_follow
+        self.world = world or World(maps_at_end=maps_at_end)
         self.stopwatch = Stopwatch(self.world.times)
+        where, scene_mask = str(require_device(device)), SceneMask(mask, black_is_masked)
         stream = urgent_stream(where) if live else None
         with torch.cuda.stream(stream):
             grid = SampleGrid(camera, where)
-            operator = build_operator(self.config.tracking, grid, mask, black_is_masked)
-            keyframes = self.world.keyframes
-            keyframes.attached(grid, operator.encode, self.config.resident_keyframes)
+            operator = build_operator(c.tracking, grid, mask, black_is_masked)
+            keyframes = self.world.keyframes.attached(grid, operator.encode, c.resident_keyframes)
             check_world(self.world)
-            self.segments = Segments(
-                self.world.segments, keyframes, operator, self.config, prior, live
-            )
-            self.loops = LoopCloser(
-                self.segments, self.config.loop, not live, mask, self.world.loops
-            )
-            self.executor = self._executor(live, stream)
+            self.segments = Segments(self.world.segments, keyframes, operator, c, prior, live)
+            self.loops = LoopCloser(self.segments, c.loop, not live, mask, self.world.loops)
+            parts = self.segments, self._new_mapper(keyframes), self.stopwatch, scene_mask
+            if live:
+                self.executor: InOrder = Live(*parts, self._new_mapper, stream)
+            else:
+                self.executor = (Deferred if self.world.maps_at_end else InOrder)(*parts)
         self.world.map = self.executor.mapper.table
         self.pose: PoseEstimate | None = None
         """After the last frame; none before the first."""
-
-    def _executor(self, live: bool, stream: "torch.cuda.Stream | None") -> InOrder:
-        """What runs the stages."""
-        parts = self.segments, self._new_mapper(self.world.keyframes), self.stopwatch, self._mask_of
-        if live:
-            return Live(*parts, self._new_mapper, stream)
-        return Deferred(*parts) if self.world.maps_at_end else InOrder(*parts)
 
     def _new_mapper(self, keyframes: KeyframeTable) -> Mapper:
         """A mapper that goes on with the world's map."""
         c = self.config
         return Mapper(keyframes, c.mapping, c.seed, c.sensor, self.world.map)
-
-    def _mask_of(self, id: int) -> Bool[np.ndarray, "h w"] | None:
-        return self.mask.of(self.world.keyframes[id])
 
     def settled(self) -> World:
         """The world with all that threads have found, to be packed before the next frame."""
@@ -130,11 +120,13 @@ class Slam(SlamOutput):
     @on_one_torch_thread
     def process(self, image: Frame | np.ndarray, timestamp: float | None = None) -> PoseEstimate:
         """Take the next image, as :func:`input_frame` does; returns where the camera is."""
-        previous = None if self.pose is None else self.pose.timestamp
-        frame = input_frame(image, timestamp, self.camera, self.world.frames, previous)
+        world = self.world
+        if world.is_ended:
+            raise InputError("The stream has ended by finish(); save it, and load it to go on.")
+        frame = input_frame(image, timestamp, self.camera, world.frames, world.timestamp)
         with self.executor.frame():
-            state = self.executor.process(frame, self.loops.recognise, self._advance)
-            self.world.frames += 1
+            state = self.executor.track(frame, self.loops.recognise, self._advance)
+            world.frames, world.timestamp = world.frames + 1, frame.timestamp
             self.pose = self._estimate(state, frame.timestamp)
         return self.pose
 
@@ -230,6 +222,6 @@ class Slam(SlamOutput):
 
         What is in metres already stays, and so does a saved map that it goes on in.
         """
-        scale = scale_by_odometry(self.segments.main)
-        if self.metric_scale is None and scale is not None:
+        scale = None if self.metric_scale else scale_by_odometry(self.segments.main)
+        if scale is not None:
             self.rescale(scale)

@@ -22,6 +22,6 @@ class Deferred(InOrder):
             return
         for id in unmapped:
             if id not in self.mapper.views:  # else it was interrupted after that
-                self.mapper.observe(id, self.mask_of(id))
+                self.mapper.observe(id, self.mask.of(self.mapper.keyframes[id]))
         map_all(self.mapper, [*unmapped], progress, seconds)
         unmapped.clear()

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from geogs.executors.background_mapper import BackgroundMapper
 from geogs.mapping.mapper import Mapper
+from geogs.scene_mask import SceneMask
 from geogs.stopwatch import Stopwatch
 from geogs.tracking.locate.pose_deviation import DeviationOf
 from geogs.tracking.segment_trackers import Recall, Segments
@@ -23,8 +24,6 @@ Advance = Callable[[TrackResult], None]
 """Closes loops, moves the map and maps, as what tracking changed calls for it."""
 Progress = Callable[[float], None]
 """Called with the finished fraction in [0, 1]."""
-MaskOf = Callable[[int], Bool[np.ndarray, "h w"] | None]
-"""Which pixels of a keyframe, by id, show the scene; None for all."""
 
 
 class InOrder:
@@ -34,12 +33,12 @@ class InOrder:
     """Whether there is no map until the stream has ended."""
 
     def __init__(
-        self, segments: Segments, mapper: Mapper, stopwatch: Stopwatch, mask_of: MaskOf
+        self, segments: Segments, mapper: Mapper, stopwatch: Stopwatch, mask: SceneMask
     ) -> None:
         self.segments, self.mapper = segments, mapper
         self.mapping: Mapper | BackgroundMapper = mapper
         """What is told of keyframes and corrections: the mapper, or a thread that has one."""
-        self.stopwatch, self.mask_of = stopwatch, mask_of
+        self.stopwatch, self.mask = stopwatch, mask
 
     # --- a frame -----------------------------------------------------------------------------
 
@@ -47,7 +46,7 @@ class InOrder:
         """While somebody waits for the pose of a frame."""
         return nullcontext()
 
-    def process(self, frame: Frame, recall: Recall, advance: Advance) -> TrackState:
+    def track(self, frame: Frame, recall: Recall, advance: Advance) -> TrackState:
         """Track a frame and run the other stages on what that changed."""
         with self.stopwatch("tracking"):
             tracked = self.segments.track(frame, recall)
@@ -103,7 +102,7 @@ class InOrder:
         """
         with self.stopwatch("mapping"):
             for id in final:
-                self.mapping.observe(id, self.mask_of(id))
+                self.mapping.observe(id, self.mask.of(self.mapper.keyframes[id]))
             ready = unmapped[: max(len(unmapped) - lag, 0)]
             for id in ready:
                 self.mapping.map_keyframe(id)

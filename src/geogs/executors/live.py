@@ -13,8 +13,9 @@ from torch import Tensor
 
 from geogs.beside import Errand
 from geogs.executors.background_mapper import BackgroundMapper
-from geogs.executors.in_order import Advance, InOrder, MaskOf
+from geogs.executors.in_order import Advance, InOrder
 from geogs.mapping.mapper import Mapper
+from geogs.scene_mask import SceneMask
 from geogs.stopwatch import Stopwatch
 from geogs.threads import on_one_torch_thread
 from geogs.tracking.follower import Follower
@@ -41,13 +42,13 @@ class Live(InOrder):
         segments: Segments,
         mapper: Mapper,
         stopwatch: Stopwatch,
-        mask_of: MaskOf,
+        mask: SceneMask,
         new_mapper: Callable[[KeyframeTable], Mapper],
         stream: "torch.cuda.Stream | None",
     ) -> None:
         """``new_mapper`` makes one of a copy of the keyframes; ``stream`` is the urgent one, in
         which the segments' fields were made: see :func:`urgent_stream`."""
-        super().__init__(segments, mapper, stopwatch, mask_of)
+        super().__init__(segments, mapper, stopwatch, mask)
         self._stream = stream
         self.mapping = self._background = BackgroundMapper(mapper.keyframes, new_mapper)
         self._completion = Errand("keyframes")
@@ -61,7 +62,7 @@ class Live(InOrder):
         with self._background.giving_way(), torch.cuda.stream(self._stream):
             yield
 
-    def process(self, frame: Frame, recall: Recall, advance: Advance) -> TrackState:
+    def track(self, frame: Frame, recall: Recall, advance: Advance) -> TrackState:
         """Locate a frame; what it brings beyond its pose is done in the other threads."""
         with self.stopwatch("tracking"):
             if self._is_followed(frame):
@@ -118,7 +119,7 @@ class Live(InOrder):
         """What runs the stages after the last frame, on the map as the thread has made it."""
         with self.stopwatch("mapping"):
             mapper = self._background.settled()
-        return InOrder(self.segments, mapper, self.stopwatch, self.mask_of)
+        return InOrder(self.segments, mapper, self.stopwatch, self.mask)
 
     def _wait_for_gpu(self) -> None:
         if self._stream is not None:

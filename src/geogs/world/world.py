@@ -25,6 +25,8 @@ class World:
     times: StageTimes = field(default_factory=StageTimes)
     frames: int = 0
     """Images so far."""
+    timestamp: float | None = None
+    """Seconds of the last frame; none before the first."""
     unmapped: list[int] = field(default_factory=list)
     """Final keyframes that the map does not show yet, earliest first."""
     adjusted: int = 0

@@ -101,9 +101,9 @@ ANEW = (SampleGrid, Archive, MethodType, type)
 """Of the process, or compared elsewhere."""
 DROPPED = {
     "memory", "held",  # of a flow operator, of a GPU
-    "refusals", "_warned", "_motion",  # for who looks on
+    "rejected", "_warned", "_motion", "pose",  # for who looks on
     "_recent", "encoded", "_values", "own_encoded",  # made again
-    "operator", "_locator", "_search_thread", "_start", "_ahead",
+    "operator", "_locator", "_search_thread", "_start", "_ahead", "_trainer",
 }  # fmt: skip
 """In memory for speed alone, or of the process."""
 
