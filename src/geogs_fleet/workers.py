@@ -57,7 +57,7 @@ class RayWorkers:
         task = as_task(ray, function, self._allocation, retries=self._attempts - 1)
         references = [task.remote(*job) for job in jobs]
         try:
-            results: list[R] = ray.get(references)
+            results: list[R] = _results(ray, references)
         except ray.exceptions.RayTaskError as error:
             raise (error.cause if isinstance(error.cause, GeogsError) else error) from error
         except ray.exceptions.RayError as error:
@@ -65,9 +65,16 @@ class RayWorkers:
                 f"{stage.capitalize()} failed {self._attempts} times, as the machine or the "
                 "process was lost; is there enough memory?"
             ) from error
-        finally:
-            for reference in references:  # whatever is still under way; nothing if all is done
-                with suppress(Exception):
-                    ray.cancel(reference, force=True)
         self._say(f"{stage}: {len(jobs)} jobs, {time.monotonic() - begin:.1f} s")
         return results
+
+
+def _results(ray: Any, references: Sequence[Any]) -> Any:
+    """The results of all tasks; after an error or Ctrl-C what is still under way is ended."""
+    try:
+        return ray.get(references)
+    except BaseException:
+        for reference in references:
+            with suppress(Exception):
+                ray.cancel(reference, force=True)
+        raise
