@@ -9,6 +9,7 @@ here, and PyTorch is held to one while they work.
 import functools
 import itertools
 import os
+import sys
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import ParamSpec, TypeVar
@@ -114,3 +115,22 @@ def on_one_torch_thread(function: Callable[P, R]) -> Callable[P, R]:
             torch.set_num_threads(before)
 
     return wrapped
+
+
+SWITCH_SECONDS = 0.0001
+"""After which a thread that computes in Python lets another go on, while tracking and mapping share
+the interpreter; Python's own 5 ms, several times a frame, would be felt."""
+
+
+class QuickSwitching:
+    """Threads take turns often between ``begin`` and ``end``: process-wide, for a live system."""
+
+    def begin(self) -> "QuickSwitching":
+        """From now on."""
+        self._before = sys.getswitchinterval()
+        sys.setswitchinterval(min(SWITCH_SECONDS, self._before))
+        return self
+
+    def end(self) -> None:
+        """As it was before."""
+        sys.setswitchinterval(self._before)

@@ -6,9 +6,9 @@ import time
 import numpy as np
 import torch
 
-from geogs.beside import RightOfWay
+from geogs.concurrent import PriorityGate
 from geogs.config import preset
-from geogs.executors.background_mapper import PATIENT, BackgroundMapper
+from geogs.executors.background_mapper import MAX_WAITING, BackgroundMapper
 from geogs.geometry.camera import Camera
 from geogs.mapping.mapper import Mapper, never_pause
 from geogs.world.grid import SampleGrid
@@ -45,7 +45,7 @@ def test_each_thing_is_told_with_the_poses_of_its_time():
 def test_mapping_waits_while_a_frame_is_tracked_unless_it_is_far_behind():
     config, store = preset("fast").mapping, KeyframeTable.on(SampleGrid(CAMERA))
     background = BackgroundMapper(store, lambda keyframes: Mapper(keyframes, config))
-    background._way = RightOfWay(LONG)
+    background._gate = PriorityGate(LONG)
     waits: list[float] = []
 
     def pause(mapper: Mapper) -> None:
@@ -59,7 +59,7 @@ def test_mapping_waits_while_a_frame_is_tracked_unless_it_is_far_behind():
     with background.giving_way():
         release = threading.Event()
         background._tell(lambda _: release.wait(10))
-        for _ in range(PATIENT + 2):
+        for _ in range(MAX_WAITING + 2):
             background._tell(pause)
         release.set()
         while len(waits) < 3:

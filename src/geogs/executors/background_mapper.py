@@ -1,8 +1,6 @@
 """Mapping in a thread of its own, so that tracking never waits for it."""
 
-import sys
 import threading
-import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
@@ -10,61 +8,49 @@ from typing import TypeVar
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
-from torch import Tensor
+from jaxtyping import Bool
 
-from geogs.beside import RightOfWay
+from geogs.concurrent import PriorityGate
 from geogs.errors import GeogsError
+from geogs.executors.keyframe_mirror import KeyframeMirror
 from geogs.mapping.mapper import Mapper, never_pause
 from geogs.types import PoseCorrection
-from geogs.world.keyframes import Keyframe, KeyframeTable
+from geogs.world.keyframes import KeyframeTable
 
 R = TypeVar("R")
 
-SWITCH_SECONDS = 0.0001
-"""After which a thread that computes in Python lets another go on, while tracking and mapping share
-the interpreter; Python's own 5 ms, several times a frame, would be felt."""
-COURTESY_SECONDS = 0.05
+MAX_WAIT_SECONDS = 0.05
 """For which mapping waits at most, between two parts of its work, while a frame is tracked."""
-PATIENT = 12
-"""Things to be done up to which it waits at all, so that it does not fall behind for ever; each
+MAX_WAITING = 12
+"""Tasks up to which it waits at all, so that it does not fall behind for ever; each
 keyframe makes two, and a correction another."""
 
 
 class BackgroundMapper:
     """What a mapper is told, done later by a thread, in the order in which it was told.
 
-    The thread's mapper has keyframes of its own: copies of the store's, which are brought up to
-    date with each thing it is told, to what they were at that time. So neither sees the other in
-    the middle of its work, and tracking only ever pays for the copying of references. Poses that a
-    mapper would refine stay the tracker's. On a GPU the thread has a stream of its own, which gives
-    way to the tracker's if that has a higher priority.
+    The thread's mapper has keyframes of its own: copies, which are brought up to date with each
+    task to what they were when it was told. So neither sees the other in the middle of its work,
+    and tracking only ever pays for the copying of references. On a GPU the thread has a stream of
+    its own, which gives way to the tracker's if that has a higher priority.
     """
 
     def __init__(
         self, keyframes: KeyframeTable, new_mapper: Callable[[KeyframeTable], Mapper]
     ) -> None:
-        """``new_mapper`` makes the mapper of a store."""
-        self._store = keyframes
+        """``new_mapper`` makes the mapper of a table of keyframes."""
+        self._keyframes, self._mirror = keyframes, KeyframeMirror(keyframes)
         device = torch.device(keyframes.grid.device)
         self._stream = torch.cuda.Stream(device) if device.type == "cuda" else None
-        self._mirror = keyframes.mirror()
-        self._copies = self._mirror.new_set()
-        self._mapper = new_mapper(self._mirror)
+        self._mapper = new_mapper(self._mirror.table)
         self._mapper.pause = self._give_way
-        self._way = RightOfWay(COURTESY_SECONDS)
-        self._handed: dict[int, tuple[object, ...]] = {}
-        """Of each keyframe that was handed over, what it was then."""
+        self._gate = PriorityGate(MAX_WAIT_SECONDS)
         self._tasks: deque[Callable[[], None]] = deque()
         self._news = threading.Condition()
         self._is_closed = False
         self._failure: BaseException | None = None
         self.disks = 0
         """In the map when a keyframe was last finished."""
-        self.seconds = 0.0
-        """Spent by the thread."""
-        self._interval = sys.getswitchinterval()
-        sys.setswitchinterval(min(SWITCH_SECONDS, self._interval))
         self._thread = threading.Thread(target=self._work, name="mapping", daemon=True)
         self._thread.start()
 
@@ -75,13 +61,13 @@ class BackgroundMapper:
 
     def giving_way(self) -> AbstractContextManager[None]:
         """While a frame is tracked, for whose pose somebody waits."""
-        return self._way.taken()
+        return self._gate.taken()
 
     # --- what tracking tells ---------------------------------------------------------------
 
     def observe(self, id: int, mask: Bool[np.ndarray, "h w"] | None = None) -> None:
         """See ``Mapper.observe``."""
-        self._handed[id] = ()
+        self._mirror.follow([id])
         self._tell(lambda mapper: mapper.observe(id, mask))
 
     def map_keyframe(self, id: int) -> None:
@@ -94,7 +80,7 @@ class BackgroundMapper:
 
     def begin_with(self, take_over: Callable[[Mapper], object], ids: Sequence[int]) -> None:
         """Let the mapper take over a saved map, whose keyframes have these ids."""
-        self._handed |= dict.fromkeys(ids, ())
+        self._mirror.follow(ids)
         self._tell(take_over)
 
     def ask(self, question: Callable[[Mapper], R]) -> R:
@@ -127,22 +113,23 @@ class BackgroundMapper:
             self._is_closed = True
             self._news.notify()
         self._thread.join()
-        sys.setswitchinterval(self._interval)
         self._raise()
         self._mapper.pause = never_pause
-        self._mapper.move_to(self._store)
+        self._mapper.move_to(self._keyframes)
         return self._mapper
 
     # --- the hand-over ---------------------------------------------------------------------
 
     def _tell(self, what: Callable[[Mapper], object]) -> None:
-        changed, event = self._changed(), None
+        changed, event = self._mirror.changed(), None
         if self._stream is not None:
             event = torch.cuda.Event()
             event.record()
 
         def task() -> None:
-            self._take(changed, event)
+            if self._stream is not None and event is not None:
+                self._stream.wait_event(event)
+            self._mirror.update(changed, self._stream)
             what(self._mapper)
             self.disks = len(self._mapper.table.disks)
 
@@ -151,36 +138,6 @@ class BackgroundMapper:
             self._tasks.append(task)
             self._news.notify()
 
-    def _changed(self) -> list[tuple[Keyframe, Float[Tensor, "4 4"]]]:
-        """Copies of the keyframes that are not what they were when they were last handed over, and
-        their poses."""
-        changed = []
-        for id, before in self._handed.items():
-            keyframe = self._store[id]
-            now = _parts(keyframe)
-            if len(before) != len(now) or any(a is not b for a, b in zip(now, before, strict=True)):
-                self._handed[id] = now
-                changed.append((keyframe.copied_to(self._mirror), keyframe.T_cw))
-        return changed
-
-    def _take(
-        self,
-        changed: Sequence[tuple[Keyframe, Float[Tensor, "4 4"]]],
-        event: torch.cuda.Event | None,
-    ) -> None:
-        """Bring the thread's keyframes up to date: their fields are replaced, never changed."""
-        if self._stream is not None and event is not None:
-            self._stream.wait_event(event)
-        for keyframe, T_cw in changed:
-            keyframe.T_cw = T_cw
-            if keyframe.id in self._copies:
-                vars(self._copies[keyframe.id]).update(vars(keyframe))
-            else:
-                self._copies.put(keyframe)
-            for value in vars(keyframe).values():
-                if self._stream is not None and isinstance(value, Tensor) and value.is_cuda:
-                    value.record_stream(self._stream)
-
     # --- the thread ------------------------------------------------------------------------
 
     def _work(self) -> None:
@@ -188,14 +145,12 @@ class BackgroundMapper:
         with torch.cuda.stream(self._stream):
             while (task := self._next()) is not None:
                 self._give_way()
-                start = time.perf_counter()
                 try:
                     task()
                 except BaseException as error:
                     self._failure = error
                     self._tasks.clear()
                     return
-                self.seconds += time.perf_counter() - start
             self._wait_for_gpu()
 
     def _next(self) -> Callable[[], None] | None:
@@ -205,8 +160,8 @@ class BackgroundMapper:
             return self._tasks.popleft() if self._tasks else None
 
     def _give_way(self) -> None:
-        if len(self._tasks) <= PATIENT and not self._is_closed:
-            self._way.give()
+        if len(self._tasks) <= MAX_WAITING and not self._is_closed:
+            self._gate.give()
 
     def _wait_for_gpu(self) -> None:
         if self._stream is not None:
@@ -218,9 +173,3 @@ class BackgroundMapper:
             raise self._failure
         if self._failure is not None:
             raise RuntimeError("mapping failed in its thread") from self._failure
-
-
-def _parts(keyframe: Keyframe) -> tuple[object, ...]:
-    """All of a keyframe that is ever replaced."""
-    k = keyframe
-    return k.T_cw, k.inverse_depth, k.information, k.prior, k.scale, k.moving

@@ -11,13 +11,13 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from geogs.beside import Errand
+from geogs.concurrent import BackgroundTask
 from geogs.executors.background_mapper import BackgroundMapper
 from geogs.executors.in_order import Advance, InOrder
 from geogs.mapping.mapper import Mapper
 from geogs.scene_mask import SceneMask
 from geogs.stopwatch import Stopwatch
-from geogs.threads import on_one_torch_thread
+from geogs.threads import QuickSwitching, on_one_torch_thread
 from geogs.tracking.follower import Follower
 from geogs.tracking.locate.pose_deviation import DeviationOf
 from geogs.tracking.segment_trackers import Recall, Segments
@@ -51,7 +51,8 @@ class Live(InOrder):
         super().__init__(segments, mapper, stopwatch, mask)
         self._stream = stream
         self.mapping = self._background = BackgroundMapper(mapper.keyframes, new_mapper)
-        self._completion = Errand("keyframes")
+        self._completion = BackgroundTask("keyframes")
+        self._switching = QuickSwitching().begin()
         self._follower: Follower | None = None
 
     # --- a frame -----------------------------------------------------------------------------
@@ -119,6 +120,7 @@ class Live(InOrder):
         """What runs the stages after the last frame, on the map as the thread has made it."""
         with self.stopwatch("mapping"):
             mapper = self._background.settled()
+        self._switching.end()
         return InOrder(self.segments, mapper, self.stopwatch, self.mask)
 
     def _wait_for_gpu(self) -> None:

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from geogs.beside import Errand
+from geogs.concurrent import BackgroundTask
 from geogs.config import TrackingConfig
 
 LEAST_FLOW = 0.2
@@ -67,7 +67,7 @@ class KeyframeChoice:
         self.config = config
         self.long_edge = long_edge
         self._recent = [] if recent is None else recent
-        self._concurrent = Errand("sharpness")
+        self._concurrent = BackgroundTask("sharpness")
 
     def see(self, image: UInt8[np.ndarray, "h w 3"]) -> None:
         """Take note of the next frame, about which :meth:`calls_for` is asked.

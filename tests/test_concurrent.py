@@ -5,11 +5,11 @@ import time
 
 import pytest
 
-from geogs.beside import Errand, RightOfWay
+from geogs.concurrent import BackgroundTask, PriorityGate
 
 
 def test_an_errand_is_done_beside_and_waited_for():
-    errand, go_on, done = Errand("errand"), threading.Event(), []
+    errand, go_on, done = BackgroundTask("errand"), threading.Event(), []
     errand.start(lambda: done.append(go_on.wait(10)))
     assert errand.is_going_on
     assert done == []
@@ -21,7 +21,7 @@ def test_an_errand_is_done_beside_and_waited_for():
 
 
 def test_the_next_errand_waits_for_the_one_before():
-    errand, order = Errand("errand"), []
+    errand, order = BackgroundTask("errand"), []
 
     def slow() -> None:
         time.sleep(0.05)
@@ -34,7 +34,7 @@ def test_the_next_errand_waits_for_the_one_before():
 
 
 def test_what_an_errand_raises_is_raised_once_where_it_is_waited_for():
-    errand = Errand("errand")
+    errand = BackgroundTask("errand")
     errand.start(lambda: [][0])
     with pytest.raises(IndexError):
         errand.wait()
@@ -42,7 +42,7 @@ def test_what_an_errand_raises_is_raised_once_where_it_is_waited_for():
 
 
 def test_long_work_waits_for_what_is_urgent_and_no_longer_than_allowed():
-    way = RightOfWay(longest=0.1)
+    way = PriorityGate(longest=0.1)
     start = time.perf_counter()
     way.give()
     assert time.perf_counter() - start < 0.05
@@ -51,7 +51,7 @@ def test_long_work_waits_for_what_is_urgent_and_no_longer_than_allowed():
         way.give()
         waited = time.perf_counter() - start
     assert 0.09 < waited < 2.0
-    passed, way = threading.Event(), RightOfWay(longest=30.0)
+    passed, way = threading.Event(), PriorityGate(longest=30.0)
 
     def work() -> None:
         way.give()

@@ -6,7 +6,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 
 
-class Errand:
+class BackgroundTask:
     """One piece of work at a time, done by a thread of its own; who needs it done waits."""
 
     def __init__(self, name: str) -> None:
@@ -31,7 +31,7 @@ class Errand:
             work.result()
 
 
-class RightOfWay:
+class PriorityGate:
     """Lets short work that is urgent go before long work of another thread."""
 
     def __init__(self, longest: float) -> None:
