@@ -10,10 +10,10 @@ import pytest
 from geogs.config import Config, TrackingConfig
 from geogs.errors import TrackingLost
 from geogs.evaluation.trajectory_errors import rotation_angle
-from geogs.tracking import start_up
 from geogs.tracking.flow.operator_choice import build_operator
 from geogs.tracking.graph.frame_graph import FrameGraph
 from geogs.tracking.segment_trackers import Segments
+from geogs.tracking.start import start_up
 from geogs.tracking.start.initialise import FORGIVING, Attempt, initialise
 from geogs.types import Frame, Trajectory
 from geogs.world.grid import SampleGrid
