@@ -205,7 +205,7 @@ def test_correct_scales_depth_with_the_pose():
     tracker, _ = run(frames(PATH[:30]))
     id = tracker.segment.ids[2]
     keyframe = tracker.keyframes[id]
-    before = replace(keyframe)
+    before = keyframe.as_it_is()
     T = before.T_cw.clone()
     T[:3, 3] /= 2
     correction = PoseCorrection({id: before.T_cw}, {id: T}, {id: 2.0})
