@@ -117,7 +117,7 @@ def heard():
 
 @pytest.mark.usefixtures("heard")
 def test_ctrl_c_goes_on_with_the_guess(video, monkeypatch):
-    def interrupted(frames, camera, config, device, seed, report, *masks):
+    def interrupted(frames, camera, radial, device, report, *masks):
         signal.raise_signal(signal.SIGINT)
         report(0.1)
         pytest.fail("the request was not heard")

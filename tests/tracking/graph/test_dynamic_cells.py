@@ -28,7 +28,7 @@ THRESHOLD = 3.0
 
 def walked() -> FrameGraph:
     """Keyframes along a wall, each matched with all, their poses and depths true."""
-    graph = planted_tracker(FRAMES, CAMERA)[0].graph
+    graph = planted_tracker(FRAMES, CAMERA)[0].map.graph
     graph.measure([(i, j) for i in range(FRAMES) for j in range(i + 1, FRAMES)])
     return graph
 

@@ -154,7 +154,7 @@ def test_noise_is_located_nowhere_even_if_the_flow_believes_in_it():
         assert found.matched == 1.0
         assert found.residual < 1e-3
         assert found.check.windows > 300
-        assert found.evidence.correlation < 0.1
+        assert found.check.correlation < 0.1
         assert believing.relocate(state, encoded) is not None
         assert locator.locate(state, encoded, state.T_cw) is None
         assert locator.relocate(state, encoded) is None

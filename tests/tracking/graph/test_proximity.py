@@ -47,13 +47,13 @@ def test_keyframes_that_are_skipped_as_a_whole_have_no_tile_in_view():
         ids = store.ids
         spheres = overlap._spheres(store, ids, 2)
         planes = overlap._view_planes(store.grid.camera, store.poses(ids))
-        share = spheres.reach(*planes).float() @ spheres.share
-        expected = (share > 0.2 - 1e-6).numpy()
+        seen = spheres.reach(*planes).float() @ spheres.fraction
+        expected = (seen > 0.2 - 1e-6).numpy()
         assert np.array_equal(may_overlap(store, ids, ids, 0.2, 2), expected)
         assert may_overlap(store, ids, ids, 0.0, 2).all()
         skipped = ~spheres.around().reach(*planes)[..., 0]
         assert float(skipped.float().mean()) > 0.05
-        assert not (skipped & (share > 0)).any()
+        assert not (skipped & (seen > 0)).any()
 
 
 def test_pairs_of_many_keyframes_are_those_of_looking_at_all(monkeypatch):
