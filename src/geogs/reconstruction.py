@@ -19,7 +19,7 @@ from geogs.mapping.posed_mapping import More, PosedMapping
 from geogs.mapping.rendered import MapRenderer
 from geogs.mapping.time_budget import TimeBudget
 from geogs.on_demand import OnDemand
-from geogs.stopwatch import Stopwatch
+from geogs.stopwatch import StageProgress, Stopwatch, unwatched
 from geogs.threads import on_one_torch_thread
 from geogs.types import MapSnapshot, RenderedKeyframe, SeenRows, Trajectory, Uncertainty
 from geogs.world.grid import SampleGrid
@@ -29,13 +29,6 @@ from geogs.world.map import MapTable
 OUTPUT_RATIO = 0.2
 """Fraction of a given time that is kept for the mesh and the report until a few views have shown
 what these take."""
-
-Progress = Callable[[str, float], None]
-"""Called with the name of a stage and its finished fraction in [0, 1]."""
-
-
-def _silent(stage: str, fraction: float) -> None:
-    """Progress that nobody watches."""
 
 
 @dataclass(eq=False)
@@ -133,7 +126,7 @@ class Reconstruction:
     def finish(
         self,
         points: Float64[np.ndarray, "n 3"] | None = None,
-        progress: Progress = _silent,
+        progress: StageProgress = unwatched,
         more: More | None = None,
     ) -> None:
         """Depths of all images, the map from them, training; ``points`` of the scene help.
@@ -177,7 +170,7 @@ class Reconstruction:
         return self.table
 
     @on_one_torch_thread
-    def resume(self, table: ReconstructionTable, progress: Progress = _silent) -> None:
+    def resume(self, table: ReconstructionTable, progress: StageProgress = unwatched) -> None:
         """Instead of ``finish``, with the same images and settings: go on from the work of another.
 
         The time that it took counts.
@@ -260,6 +253,6 @@ class Reconstruction:
         more(count_of)
         self._place_keyframes()
 
-    def _train(self, progress: Progress, goes_on: bool = False) -> None:
+    def _train(self, progress: StageProgress, goes_on: bool = False) -> None:
         with self.stopwatch("training"):
             self._stage.train(lambda f: progress("training", f), goes_on)

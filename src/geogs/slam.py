@@ -1,6 +1,5 @@
 """Dense monocular SLAM on one page: track, close loops, move the map, map; adjust all, refine."""
 
-from collections.abc import Callable
 from functools import partial
 
 import numpy as np
@@ -23,7 +22,7 @@ from geogs.pose_estimate import PoseEstimate
 from geogs.priors.base import MonocularPrior
 from geogs.scene_mask import SceneMask
 from geogs.slam_output import SlamOutput
-from geogs.stopwatch import Stopwatch
+from geogs.stopwatch import StageProgress, Stopwatch, unwatched
 from geogs.threads import on_one_torch_thread
 from geogs.tracking.flow.operator_choice import build_operator
 from geogs.tracking.keyframe_uncertainty import keyframe_uncertainty
@@ -31,15 +30,7 @@ from geogs.tracking.segment_trackers import Segments
 from geogs.tracking.tracker import TrackResult
 from geogs.types import Frame, MetricScale
 from geogs.world.grid import SampleGrid
-from geogs.world.keyframes import KeyframeTable
 from geogs.world.world import World, check_world
-
-Progress = Callable[[str, float], None]
-"""Called with the name of a stage and its finished fraction in [0, 1]."""
-
-
-def _silent(stage: str, fraction: float) -> None:
-    """Progress that nobody watches."""
 
 
 class Slam(SlamOutput):
@@ -70,9 +61,8 @@ class Slam(SlamOutput):
             prior: sees every keyframe.
             live: return from :meth:`process` when the pose is known, and do the rest in threads;
                 else results are the same each time on a CPU.
-            mask: of the size of the images, true where they may show the scene; elsewhere nothing
-                is matched, searched or mapped; with ``black_is_masked`` nor are pixels of an image
-                that are quite black.
+            mask: true where images may show the scene; nothing else is matched, searched or mapped,
+                nor, with ``black_is_masked``, what is quite black in an image.
             defers_map: make the map in :meth:`refine`, of all keyframes at their final poses;
                 ``mapping.when`` may say otherwise.
 
@@ -93,7 +83,9 @@ class Slam(SlamOutput):
             check_world(self.world)
             self.segments = Segments(self.world.segments, keyframes, operator, c, prior, live)
             self.loops = LoopCloser(self.segments, c.loop, not live, mask, self.world.loops)
-            parts = self.segments, self._new_mapper(keyframes), self.stopwatch, scene_mask
+            self._new_mapper = partial(Mapper, config=c.mapping, seed=c.seed, sensor=c.sensor)
+            mapper = self._new_mapper(keyframes, table=self.world.map)
+            parts = self.segments, mapper, self.stopwatch, scene_mask
             if live:
                 self.executor: InOrder = Live(*parts, self._new_mapper, stream)
             else:
@@ -101,21 +93,6 @@ class Slam(SlamOutput):
         self.world.map = self.executor.mapper.table
         self.pose: PoseEstimate | None = None
         """After the last frame; none before the first."""
-
-    def _new_mapper(self, keyframes: KeyframeTable) -> Mapper:
-        """A mapper that goes on with the world's map."""
-        c = self.config
-        return Mapper(keyframes, c.mapping, c.seed, c.sensor, self.world.map)
-
-    def settled(self) -> World:
-        """The world with all that threads have found, to be packed before the next frame."""
-        self.settle()
-        self.segments.settle()
-        self.loops.settle()
-        self.executor.mapper.settle()
-        return self.world
-
-    # --- the stream ----------------------------------------------------------------------------
 
     @on_one_torch_thread
     def process(self, image: Frame | np.ndarray, timestamp: float | None = None) -> PoseEstimate:
@@ -149,8 +126,6 @@ class Slam(SlamOutput):
             with self.stopwatch("map update"):
                 self.executor.correct(correction)
 
-    # --- after the stream ----------------------------------------------------------------------
-
     @on_one_torch_thread
     def end_stream(self) -> None:
         """After the last frame: map what waits. What there is then is the online result."""
@@ -161,7 +136,6 @@ class Slam(SlamOutput):
             tracked = self.segments.finish()
         self.executor = self.executor.in_order()
         if tracked.is_new_main:
-            self.world.map = None
             self.executor.begin_anew(self._new_mapper(self.world.keyframes))
             self.segments.main.keyframes.take_corrections()
             self.world.unmapped.clear()
@@ -171,7 +145,7 @@ class Slam(SlamOutput):
             self.stopwatch.end_stream()
 
     @on_one_torch_thread
-    def adjust(self, progress: Progress = _silent) -> None:
+    def adjust(self, progress: StageProgress = unwatched) -> None:
         """Bundle-adjust all keyframes and let the map follow."""
         main = self.segments.main
         if not main.segment.ids:
@@ -181,13 +155,12 @@ class Slam(SlamOutput):
         if self.world.is_ended:
             with self.stopwatch("uncertainty"):
                 self.world.uncertainty = keyframe_uncertainty(main).calibrated(main)
-        with self.stopwatch("global bundle adjustment"):
-            self.loops.replaced_by_bundle()
+        self.loops.replaced_by_bundle()
         self.world.adjusted = len(main.segment.ids)
         self._update_map()
 
     @on_one_torch_thread
-    def refine(self, progress: Progress = _silent, seconds: float | None = None) -> None:
+    def refine(self, progress: StageProgress = unwatched, seconds: float | None = None) -> None:
         """Train the map over all keyframes, or make it of them where it was deferred.
 
         In about so many ``seconds``, as after an interruption, only where there is no map yet.
@@ -198,7 +171,7 @@ class Slam(SlamOutput):
         self.world.is_refined = self.will_refine and seconds is None
 
     @on_one_torch_thread
-    def finish(self, progress: Progress = _silent, correct: bool = True) -> None:
+    def finish(self, progress: StageProgress = unwatched, correct: bool = True) -> None:
         """End the stream if need be, adjust all keyframes, refine the map, bring it to metres.
 
         ``correct=False`` (after an interruption) keeps the online result as it stands.

@@ -78,6 +78,14 @@ class SlamOutput:
         """Wait until the world holds all that the last frame brings."""
         self.executor.settle()
 
+    def settled(self) -> World:
+        """The world with all that threads have found, to be packed before the next frame."""
+        self.settle()
+        self.segments.settle()
+        self.loops.settle()
+        self.executor.mapper.settle()
+        return self.world
+
     @on_one_torch_thread
     def trajectory(self) -> Trajectory:
         """Poses of all frames so far."""

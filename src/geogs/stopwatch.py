@@ -1,10 +1,17 @@
-"""Wall-clock seconds per stage."""
+"""Wall-clock seconds per stage, and how far it is."""
 
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+
+StageProgress = Callable[[str, float], None]
+"""Called with the name of a stage and its finished fraction in [0, 1]."""
+
+
+def unwatched(stage: str, fraction: float) -> None:
+    """Progress that nobody watches."""
 
 
 @dataclass

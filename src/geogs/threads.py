@@ -117,6 +117,13 @@ def on_one_torch_thread(function: Callable[P, R]) -> Callable[P, R]:
     return wrapped
 
 
+def opencv_on_one_thread() -> None:
+    """OpenCV computes in the caller's thread, process-wide: our own threads use the cores."""
+    import cv2
+
+    cv2.setNumThreads(1)
+
+
 SWITCH_SECONDS = 0.0001
 """After which a thread that computes in Python lets another go on, while tracking and mapping share
 the interpreter; Python's own 5 ms, several times a frame, would be felt."""

@@ -118,7 +118,7 @@ def _clusters(
 ) -> Float32[np.ndarray, "k 128"]:
     if count == 0:
         return np.zeros((1, 128), np.float32)
-    cv2.setRNGSeed(seed)
+    cv2.setRNGSeed(seed)  # process-wide: OpenCV has no generator for one call
     criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 15, 1.0)
     _, _, centres = cv2.kmeans(
         sample, count, np.zeros((len(sample), 1), np.int32), criteria, 1, cv2.KMEANS_PP_CENTERS

@@ -29,7 +29,7 @@ def relative_pose(
         second: in the second view.
         tolerance: error of an inlier, as a fraction of the focal length.
     """
-    cv2.setRNGSeed(0)
+    cv2.setRNGSeed(0)  # process-wide: OpenCV has no generator for one call
     E, inliers = cv2.findEssentialMat(
         first, second, np.eye(3), cv2.USAC_MAGSAC, _PROBABILITY, tolerance, _TRIES
     )

@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from geogs.threads import worker_count
+from geogs.threads import opencv_on_one_thread, worker_count
 from geogs.tracking.flow.cell_texture import MIN_STRUCTURE, cell_structure
 from geogs.tracking.flow.flow_operator import Memories
 from geogs.types import FlowMatch
@@ -95,7 +95,7 @@ class ClassicalFlow:
     """The DIS operator on one grid; directions and images are matched side by side in threads."""
 
     def __init__(self, grid: SampleGrid) -> None:
-        cv2.setNumThreads(1)
+        opencv_on_one_thread()
         self.grid = grid
         self._local = threading.local()
         self._full, self._half = _Level(grid, 1), _Level(grid, 2)

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
@@ -18,6 +17,7 @@ from geogs.documents import in_short
 from geogs.errors import InputError
 from geogs.gpu.recorded import Maps, Recorded
 from geogs.gpu.transfer import to_device
+from geogs.threads import opencv_on_one_thread
 from geogs.tracking.flow.filled import filled_positions
 from geogs.tracking.flow.flow_operator import FlowOperator, Memories, check_image_size
 from geogs.tracking.flow.lookup import DescriptorPyramid, Edges, PyramidLevel
@@ -88,7 +88,7 @@ class OwnFlow:
         classical: FlowOperator,
         options: OwnFlowOptions | None = None,
     ) -> None:
-        cv2.setNumThreads(1)
+        opencv_on_one_thread()
         self.grid = grid
         self.classical = classical
         self.options = options or OwnFlowOptions()
