@@ -71,7 +71,6 @@ class LoopCloser:
         self.detector = LoopDetector(
             tracker.keyframes.table, tracker.map.operator, config, waits, mask, self.table
         )
-        self._known = {segments.trackers[n]: c for n, c in self.table.constraints.items()}
         self._thread = None if waits else ThreadPoolExecutor(1, thread_name_prefix="closing")
         self._asked: _Asked | None = None
         """What the thread is at, or has answered."""
@@ -79,12 +78,8 @@ class LoopCloser:
         """Of the world: how often more than a closing has changed it."""
 
     def settle(self) -> None:
-        """Bring the table up to date: searches under way are finished, segments have their rank."""
+        """Bring the table up to date: searches under way are finished."""
         self.detector.settle()
-        trackers = self.segments.trackers
-        self.table.constraints = {
-            n: self._known[t] for n, t in enumerate(trackers) if t in self._known
-        }
 
     def remember(self, ids: Sequence[int]) -> None:
         """Know keyframes of a saved map again from now on; among themselves they make no loops."""
@@ -127,15 +122,18 @@ class LoopCloser:
             if order[e[1]] - order[e[0]] not in (2, 3)
         }
         held = of_poses(world.keyframes, sorted(world.segment.fixed))
-        self._known[world] = SegmentConstraints(joined([held, of_edges(world.keyframes, edges)]))
+        self.table.constraints[world.segment.number] = SegmentConstraints(
+            joined([held, of_edges(world.keyframes, edges)])
+        )
         self._retire(world)
 
     def _of(self, tracker: Tracker) -> SegmentConstraints:
-        if tracker not in self._known:
-            self._known[tracker] = SegmentConstraints(
-                of_poses(tracker.keyframes, sorted(tracker.segment.fixed))
-            )
-        return self._known[tracker]
+        """What is kept of the relative poses of a segment."""
+        known, number = self.table.constraints, tracker.segment.number
+        if number not in known:
+            fixed = sorted(tracker.segment.fixed)
+            known[number] = SegmentConstraints(of_poses(tracker.keyframes, fixed))
+        return known[number]
 
     def _retire(self, tracker: Tracker, least: int = 1) -> None:
         """Turn the edges that the local adjustment has left behind into relative poses.
@@ -214,7 +212,9 @@ class LoopCloser:
     def _merge(self, host: Tracker, guest: Tracker, S: Float[Tensor, "4 4"]) -> tuple[int, ...]:
         self._age += 1
         self._retire(guest)
-        theirs, ours = self._known.pop(guest, SegmentConstraints()), self._of(host)
+        known = self.table.constraints
+        theirs = known.pop(guest.segment.number, SegmentConstraints())
+        ours = self._of(host)
         # The loops between the two were measured in the guest's unit, too.
         correction = guest.keyframes.moved(S)
         _rescale(theirs, correction)

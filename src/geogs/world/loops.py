@@ -194,7 +194,7 @@ class LoopTable:
     between: list[Loop] = field(default_factory=list)
     """Those between two segments."""
     constraints: dict[int, SegmentConstraints] = field(default_factory=dict)
-    """By the position of the segment among all."""
+    """By the number of the segment."""
     closures: int = 0
     """Corrections by loops so far."""
 
