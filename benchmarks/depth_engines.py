@@ -17,10 +17,10 @@ import numpy as np
 import torch
 
 from geogs.config import DepthConfig
-from geogs.depth.base import DepthEngine
-from geogs.depth.select import depth_engine
+from geogs.depth.depth_engine import DepthEngine
+from geogs.depth.depth_view import DenseDepth, DepthView, PosedDepth, depth_images
+from geogs.depth.engine_choice import depth_engine
 from geogs.depth.sweep_neighbors import select_sweep_neighbours
-from geogs.depth.view import DenseDepth, DepthView, PosedDepth, depth_images
 from geogs.geometry.camera import Camera
 from geogs.geometry.depth import normals_from_depth
 from geogs.geometry.lie import se3_exp

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 from geogs.config import LoopConfig, preset
-from geogs.depth.view import DenseDepth
+from geogs.depth.depth_view import DenseDepth
 from geogs.geometry.lie import se3_inverse, sim3_exp, so3_exp
 from geogs.loop.consistency import consistent_loops
 from geogs.loop.detect import LoopDetector

@@ -16,11 +16,11 @@ import numpy as np
 import torch
 
 from geogs.depth.completion import complete_inverse_depth, upsample_grid
+from geogs.depth.depth_view import DepthView, KeyframeDepth, depth_view
 from geogs.depth.estimate import estimate_depth
 from geogs.depth.evidence import CONFIDENT_DEVIATION
 from geogs.depth.fusion import check_depth
 from geogs.depth.sweep_neighbors import select_sweep_neighbours
-from geogs.depth.view import DepthView, KeyframeDepth, depth_view
 from geogs.geometry.camera import Camera
 from geogs.geometry.umeyama import umeyama
 from geogs.world.grid import SampleGrid

@@ -23,7 +23,7 @@ import cv2
 import numpy as np
 import torch
 
-from geogs.bundle.select import grid_fields
+from geogs.bundle.device_choice import grid_fields
 from geogs.config import LoopConfig
 from geogs.evaluation.surfaces.surface import read_surface
 from geogs.geometry.lie import se3_exp, se3_inverse, so3_log

@@ -23,7 +23,7 @@ from torch import Tensor
 from torch.profiler import ProfilerActivity, profile
 
 from geogs.config import LossAblation, LossConfig, MappingConfig
-from geogs.depth.view import DenseDepth
+from geogs.depth.depth_view import DenseDepth
 from geogs.geometry.depth import normals_from_depth
 from geogs.geometry.lie import se3_inverse
 from geogs.losses import multi_view_loss, single_view_loss

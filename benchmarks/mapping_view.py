@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from geogs.config import MappingConfig
-from geogs.depth.view import DenseDepth, KeyframeDepth
+from geogs.depth.depth_view import DenseDepth, KeyframeDepth
 from geogs.geometry.lie import se3_inverse
 from geogs.mapping.keyframe_views import KeyframeViews, MapView
 from geogs.mapping.training.cpu import CpuTrainer, view_loss

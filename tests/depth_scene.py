@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from geogs.depth.view import DepthView, depth_images
+from geogs.depth.depth_view import DepthView, depth_images
 from geogs.geometry.camera import Camera
 
 WORKING = Camera(fx=160.0, fy=160.0, cx=95.5, cy=71.5, width=192, height=144)

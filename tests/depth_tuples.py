@@ -6,8 +6,8 @@ import torch
 import geogs_synth.clips.sampler as sampler_module
 import geogs_synth.raycast.cuda_caster as cuda_module
 from cuda_emulator import use_emulator
-from geogs.depth.network.options import DepthNetworkOptions
-from geogs.depth.network.views import StereoViews
+from geogs.depth.network.network_sizes import DepthNetworkOptions
+from geogs.depth.network.stereo_views import StereoViews
 from geogs_synth.clips.room_options import RoomOptions
 from geogs_train.depth.depth_options import DepthTraining, PoolOptions, TupleOptions
 

@@ -17,8 +17,8 @@ from geogs.application.results.remesh import mesh_settings, remesh
 from geogs.cli import main as cli
 from geogs.config import InputConfig
 from geogs.depth.classical import CpuDepthEngine
+from geogs.depth.depth_view import depth_view
 from geogs.depth.estimate import estimate_depth
-from geogs.depth.view import depth_view
 from geogs.errors import InputError
 from geogs.io.pose_files import read_tum_trajectory
 from geogs.io.sources.sniff import open_posed_source

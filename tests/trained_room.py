@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 from geogs.config import Config
-from geogs.depth.view import DenseDepth
+from geogs.depth.depth_view import DenseDepth
 from geogs.geometry.lie import se3_inverse
 from geogs.mapping.keyframe_views import MapView
 from geogs.mapping.training.map_trainer import Batch

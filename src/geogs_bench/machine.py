@@ -8,7 +8,7 @@ import subprocess
 from contextlib import suppress
 from pathlib import Path
 
-from geogs.gpu.source import PACKAGE
+from geogs.gpu.kernel_source import PACKAGE
 from geogs.version import __version__
 
 

@@ -10,18 +10,18 @@ import torch
 
 import geogs.bundle.cuda.dense as cuda_bundle
 import geogs.bundle.cuda.fields as cuda_fields
+import geogs.bundle.cuda.keyframe_pairs as cuda_pairs
 import geogs.bundle.cuda.motion_only as cuda_motion
-import geogs.bundle.cuda.pairs as cuda_pairs
 from cuda_emulator import use_emulator
-from geogs.bundle.base import BundleOptions, BundleResult
 from geogs.bundle.dense import DenseBundle
 from geogs.bundle.depth_terms import DepthDamping, MeasuredDepths
 from geogs.bundle.fields import CpuFields
+from geogs.bundle.keyframe_pairs import CpuPairs
 from geogs.bundle.motion_only import CpuMotion
 from geogs.bundle.motion_term import MeasuredMotions
-from geogs.bundle.pairs import CpuPairs
 from geogs.bundle.problem import BundleProblem, MotionProblem
 from geogs.bundle.projection import MIN_Z, linearise, project, relative_motion
+from geogs.bundle.protocols import BundleOptions, BundleResult
 from geogs.config import Config
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import retract, se3_exp, se3_inverse

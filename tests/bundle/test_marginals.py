@@ -6,11 +6,11 @@ import pytest
 import torch
 
 from bundle_scenes import CAMERA, scene
-from geogs.bundle.base import BundleOptions
 from geogs.bundle.dense import DenseBundle
 from geogs.bundle.marginals import marginals
 from geogs.bundle.problem import BundleProblem, StreamedProblem
 from geogs.bundle.projection import project, relative_motion
+from geogs.bundle.protocols import BundleOptions
 from geogs.geometry.lie import se3_exp, se3_inverse, se3_log
 from geogs.world.grid import SampleGrid
 from oracles.bundle_reference import residuals

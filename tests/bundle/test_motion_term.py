@@ -6,10 +6,10 @@ import pytest
 import torch
 
 from bundle_scenes import CAMERA, disturbed, scene
-from geogs.bundle.base import BundleOptions
 from geogs.bundle.dense import DenseBundle
 from geogs.bundle.motion_term import MeasuredMotions
 from geogs.bundle.problem import BundleProblem, StreamedProblem
+from geogs.bundle.protocols import BundleOptions
 from geogs.bundle.streamed import StreamedBundle
 from geogs.geometry.lie import move, retract, se3_exp, se3_inverse
 from oracles.bundle_reference import gauss_newton_step

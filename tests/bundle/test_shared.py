@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import torch
 
-from geogs.bundle.base import BundleOptions
 from geogs.bundle.flow_term import PinholeFlow, linearised_sources
 from geogs.bundle.lens import LensBlock, RadialLens
+from geogs.bundle.protocols import BundleOptions
 from geogs.bundle.shared import OPTIONS, SharedFlow, SharedSchur, solve_shared
 from geogs.bundle.terms import BundleState
 from lens_scene import CAMERA, GRID, disturbed, lens_problem

@@ -6,10 +6,10 @@ import pytest
 import torch
 
 from bundle_scenes import disturbed, scene
-from geogs.bundle.base import BundleOptions
 from geogs.bundle.dense import DenseBundle
 from geogs.bundle.depth_terms import DepthDamping, MeasuredDepths
 from geogs.bundle.problem import BundleProblem, StreamedProblem
+from geogs.bundle.protocols import BundleOptions
 from geogs.bundle.streamed import StreamedBundle
 
 

@@ -8,11 +8,11 @@ import torch
 import geogs.bundle.cuda.streamed as cuda_streamed
 from bundle_scenes import disturbed, scene
 from cuda_emulator import use_emulator
-from geogs.bundle.base import BundleOptions
 from geogs.bundle.dense import DenseBundle
 from geogs.bundle.depth_terms import DepthDamping, MeasuredDepths
 from geogs.bundle.motion_term import MeasuredMotions
 from geogs.bundle.problem import BundleProblem, StreamedProblem
+from geogs.bundle.protocols import BundleOptions
 from geogs.world.grid import SampleGrid
 
 

@@ -9,11 +9,11 @@ from torch import Tensor
 import geogs.bundle.cuda.dense as cuda_dense
 from bundle_scenes import disturbed, scene
 from cuda_emulator import use_emulator
-from geogs.bundle.base import BundleOptions
 from geogs.bundle.dense import DenseBundle
 from geogs.bundle.depth_terms import DepthDamping, MeasuredDepths
 from geogs.bundle.hyper_edge import DepthEquations, HyperEdge
 from geogs.bundle.problem import BundleProblem, StreamedProblem
+from geogs.bundle.protocols import BundleOptions
 from geogs.bundle.streamed import StreamedBundle
 from geogs.bundle.terms import BundleState
 from geogs.geometry.lie import se3_inverse

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from geogs.gpu.source import KernelSignature, kernel_signatures, read_source
+from geogs.gpu.kernel_source import KernelSignature, kernel_signatures, read_source
 
 HERE = Path(__file__).parent
 _POINTERS = {

@@ -5,7 +5,7 @@ import pytest
 
 from depth_scene import RENDER, make_scene, trace
 from geogs.depth.carve import count_votes, look_up, vote
-from geogs.depth.view import KeyframeDepth
+from geogs.depth.depth_view import KeyframeDepth
 
 
 def both(poses, depths):

@@ -22,14 +22,15 @@ from geogs.depth.completion import (
     upsample_grid,
 )
 from geogs.depth.confidence import depth_confidence
-from geogs.depth.cuda import check as check_module
 from geogs.depth.cuda import completion as completion_module
-from geogs.depth.cuda import refine as refine_module
-from geogs.depth.cuda import sweep as sweep_module
-from geogs.depth.cuda.engine import CudaDepthEngine
+from geogs.depth.cuda import fusion as check_module
+from geogs.depth.cuda import plane_sweep as sweep_module
+from geogs.depth.cuda import refinement as refine_module
+from geogs.depth.cuda.classical import CudaDepthEngine
 from geogs.depth.cuda.images import KeyframeImages, homographies
-from geogs.depth.cuda.refine import PixelPlaces, SlantedMaps, TrackerMaps
-from geogs.depth.cuda.sweep import PlaneSlots, SweptDepth
+from geogs.depth.cuda.plane_sweep import PlaneSlots, SweptDepth
+from geogs.depth.cuda.refinement import PixelPlaces, SlantedMaps, TrackerMaps
+from geogs.depth.depth_view import DenseDepth, KeyframeDepth, PosedDepth
 from geogs.depth.evidence import (
     choose_start,
     prior_weight,
@@ -38,7 +39,6 @@ from geogs.depth.evidence import (
     tracker_prior,
 )
 from geogs.depth.plane_sweep import SweepResult, matching_costs, plane_sweep
-from geogs.depth.view import DenseDepth, KeyframeDepth, PosedDepth
 from geogs.geometry.camera import Camera
 
 F = np.float32

@@ -11,15 +11,15 @@ from depth_scene import RENDER, WORKING, DepthScene, make_scene
 from geogs import threads
 from geogs.config import DepthConfig
 from geogs.depth.carve import vote
+from geogs.depth.depth_view import DenseDepth, KeyframeDepth, PosedDepth
+from geogs.depth.engine_choice import depth_engine
 from geogs.depth.estimate import estimate_depth
 from geogs.depth.fusion import check_depth
-from geogs.depth.select import depth_engine
 from geogs.depth.sweep_neighbors import (
     depth_range,
     parallax_degrees,
     select_sweep_neighbours,
 )
-from geogs.depth.view import DenseDepth, KeyframeDepth, PosedDepth
 
 
 @pytest.fixture(scope="module")

@@ -5,8 +5,8 @@ import math
 import pytest
 import torch
 
+from geogs.depth.depth_view import DenseDepth
 from geogs.depth.sensor import joined
-from geogs.depth.view import DenseDepth
 
 
 def searched(depth: float, confidence: float) -> DenseDepth:

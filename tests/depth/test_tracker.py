@@ -6,9 +6,9 @@ import torch
 
 from depth_scene import RENDER, WORKING, make_scene
 from geogs.config import DepthConfig, MappingConfig, ReconstructConfig
-from geogs.depth.select import depth_engine
-from geogs.depth.tracker import TrackerDepthEngine, enlarged_depth
-from geogs.depth.view import PosedDepth
+from geogs.depth.depth_view import PosedDepth
+from geogs.depth.engine_choice import depth_engine
+from geogs.depth.tracker_depth import TrackerDepthEngine, enlarged_depth
 from geogs.errors import InputError
 from geogs.reconstruction import Reconstruction
 from geogs.world.grid import OFFSET, STRIDE

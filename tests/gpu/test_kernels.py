@@ -10,8 +10,8 @@ import geogs
 from geogs.errors import DeviceError
 from geogs.gpu import cache, kernels
 from geogs.gpu.cache import cache_key, read_cubin, write_cubin
+from geogs.gpu.kernel_source import kernel_signatures, read_source
 from geogs.gpu.kernels import find_cubin, kernels_for
-from geogs.gpu.source import kernel_signatures, read_source
 
 SOURCES = sorted(Path(geogs.__file__).parent.rglob("*.cu"))
 PACKAGE_TYPES = {"int", "unsigned", "float", "double", "long long"}

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from geogs.depth.network.model import DepthNetwork
-from geogs.depth.network.options import DepthNetworkOptions
-from geogs.depth.network.views import StereoViews
+from geogs.depth.network.network_sizes import DepthNetworkOptions
+from geogs.depth.network.stereo_views import StereoViews
 from geogs.gpu.recorded import Recorded
 
 SMALL = DepthNetworkOptions(

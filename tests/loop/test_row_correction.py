@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from geogs.bundle.base import BundleOptions
+from geogs.bundle.protocols import BundleOptions
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp, se3_inverse
 from geogs.loop.global_bundle import global_bundle

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from geogs.config import LossConfig
-from geogs.depth.view import DenseDepth, KeyframeDepth
+from geogs.depth.depth_view import DenseDepth, KeyframeDepth
 from geogs.geometry.camera import Camera
 from geogs.mapping.view_arrays import MapCameras
 from geogs.world.keyframes import Keyframe

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from geogs.config import LossConfig, PriorConfig
-from geogs.depth.view import DenseDepth, KeyframeDepth
+from geogs.depth.depth_view import DenseDepth, KeyframeDepth
 from geogs.geometry.camera import Camera
 from geogs.losses.cpu import fused_single_view
 from geogs.losses.single_view import single_view_loss

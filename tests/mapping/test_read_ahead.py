@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 from geogs.config import Config
-from geogs.depth.view import DenseDepth
+from geogs.depth.depth_view import DenseDepth
 from geogs.geometry.camera import Camera
 from geogs.mapping.keyframe_views import KeyframeViews
 from geogs.mapping.view_arrays import MapCameras

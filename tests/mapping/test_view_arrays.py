@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from geogs.config import Config
-from geogs.depth.view import DenseDepth
+from geogs.depth.depth_view import DenseDepth
 from geogs.geometry.camera import Camera
 from geogs.mapping import view_arrays
 from geogs.mapping.dense_depths import get_depth

@@ -11,7 +11,7 @@ from safetensors.torch import save_file
 import mutations
 from geogs.depth.network.calibration import DepthCalibration
 from geogs.depth.network.model import DepthNetwork
-from geogs.depth.network.options import DepthNetworkOptions
+from geogs.depth.network.network_sizes import DepthNetworkOptions
 from geogs.depth.network.weights import load_depth_network
 from geogs.geometry.camera import Camera
 from geogs.networks.tensor_files import read_tensors

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from geogs.config import DiskConfig, MappingConfig
-from geogs.depth.view import DenseDepth
+from geogs.depth.depth_view import DenseDepth
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_exp
 from geogs.mapping.keyframe_views import KeyframeViews, MapView

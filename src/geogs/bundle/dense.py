@@ -11,10 +11,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from geogs.bundle.base import BundleOptions, BundleResult
 from geogs.bundle.camera_system import DenseCameraSystem
 from geogs.bundle.flow_term import FlowTerm, PinholeFlow, SourceFlow, linearised_sources
 from geogs.bundle.problem import BundleProblem, source_chunks
+from geogs.bundle.protocols import BundleOptions, BundleResult
 from geogs.bundle.schur import SchurBundle
 from geogs.bundle.terms import BundleState
 from geogs.threads import thread_map

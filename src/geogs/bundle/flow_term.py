@@ -13,10 +13,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from geogs.bundle.base import BundleOptions
 from geogs.bundle.hyper_edge import DepthEquations, HyperEdge, RelativeEdges
 from geogs.bundle.problem import BundleProblem, sources_within
-from geogs.bundle.projection import Projection, linearise, relative_motion
+from geogs.bundle.projection import CellProjection, linearise, relative_motion
+from geogs.bundle.protocols import BundleOptions
 from geogs.bundle.terms import BundleState
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_adjoint
@@ -134,7 +134,7 @@ def linearised_sources(
 
 
 def weighed_residuals(
-    p: Projection,
+    p: CellProjection,
     pixels: Float[Tensor, "e p 2"],
     weight: Float[Tensor, "e p 2"],
     huber: float,
@@ -172,7 +172,7 @@ def damped_curvature(curvature: Float[Tensor, "p"], fraction: float) -> Float[Te
 
 
 def residual_norms(
-    p: Projection, pixels: Float[Tensor, "e p 2"], weight: Float[Tensor, "e p 2"]
+    p: CellProjection, pixels: Float[Tensor, "e p 2"], weight: Float[Tensor, "e p 2"]
 ) -> Float[Tensor, "e p"]:
     """Norm of each residual in its own standard deviations."""
     return (weight * (pixels - p.pixels).square()).sum(-1).sqrt()

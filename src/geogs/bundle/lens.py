@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from geogs.bundle.projection import Projection, motion_rows, relative_motion, seen_from_targets
+from geogs.bundle.projection import CellProjection, motion_rows, relative_motion, seen_from_targets
 from geogs.bundle.terms import SharedProjection
 from geogs.geometry.camera import Camera
 
@@ -68,11 +68,11 @@ class LensBlock:
         source: Int[Tensor, "e"],
         target: Int[Tensor, "e"],
         inverse_depth: Float[Tensor, "e p"],
-    ) -> Projection:
+    ) -> CellProjection:
         """As in the protocol."""
         T_ji = relative_motion(T_cw, source, target)
         y, valid, z = seen_from_targets(self.rays.rays, T_ji, inverse_depth)
-        return Projection(_to_pixels(self.lens, y[..., :2] / z[..., None]), valid, z)
+        return CellProjection(_to_pixels(self.lens, y[..., :2] / z[..., None]), valid, z)
 
     def linearise(
         self,

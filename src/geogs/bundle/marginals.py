@@ -12,11 +12,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from geogs.bundle.base import BundleOptions
 from geogs.bundle.flow_term import PinholeFlow, SourceFlow, linearised_sources, residual_norms
 from geogs.bundle.hyper_edge import HyperEdge
 from geogs.bundle.problem import BundleProblem, StreamedProblem, source_chunks, sources_within
 from geogs.bundle.projection import project, relative_motion
+from geogs.bundle.protocols import BundleOptions
 from geogs.bundle.terms import BundleState, DepthTerm
 from geogs.geometry.lie import se3_inverse
 from geogs.world.grid import SampleGrid

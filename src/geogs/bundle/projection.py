@@ -21,7 +21,7 @@ MIN_Z = 0.05
 
 
 @dataclass(frozen=True)
-class Projection:
+class CellProjection:
     """Where the cells of the sources fall in the targets."""
 
     pixels: Float[Tensor, "*b e p 2"]
@@ -32,7 +32,7 @@ class Projection:
 
 
 @dataclass(frozen=True)
-class LinearProjection(Projection):
+class LinearProjection(CellProjection):
     """A projection with its first derivatives."""
 
     pose_jacobian: Float[Tensor, "e 6 2 p"]
@@ -81,13 +81,13 @@ def project(
     rays: Float[Tensor, "p 3"],
     T_ji: Float[Tensor, "e 4 4"],
     inverse_depth: Float[Tensor, "e p"],
-) -> Projection:
+) -> CellProjection:
     """Project the cells of source frames: p = pi(K y), see :func:`seen_from_targets`."""
     y, valid, z = seen_from_targets(rays, T_ji, inverse_depth)
     pixels = torch.stack(
         [camera.fx * y[..., 0] / z + camera.cx, camera.fy * y[..., 1] / z + camera.cy], -1
     )
-    return Projection(pixels, valid, z)
+    return CellProjection(pixels, valid, z)
 
 
 def linearise(

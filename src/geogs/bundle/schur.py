@@ -11,8 +11,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from geogs.bundle.base import BundleOptions, BundleResult
 from geogs.bundle.problem import Problem
+from geogs.bundle.protocols import BundleOptions, BundleResult
 from geogs.bundle.terms import BundleState
 from geogs.geometry.least_squares import Policy, Step, minimise
 from geogs.geometry.lie import move

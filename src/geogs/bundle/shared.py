@@ -19,7 +19,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from geogs.bundle.base import BundleOptions
 from geogs.bundle.dense import DenseSchur, LinearBundle
 from geogs.bundle.flow_term import (
     SourceFlow,
@@ -31,6 +30,7 @@ from geogs.bundle.flow_term import (
 from geogs.bundle.hyper_edge import DepthEquations, RelativeEdges
 from geogs.bundle.problem import BundleProblem, sources_within
 from geogs.bundle.projection import relative_motion
+from geogs.bundle.protocols import BundleOptions
 from geogs.bundle.terms import BundleState, ProjectingBlock
 from geogs.geometry.least_squares import Policy, minimise
 from geogs.geometry.lie import se3_adjoint, se3_inverse

@@ -13,11 +13,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from geogs.bundle.base import BundleOptions, BundleResult
 from geogs.bundle.camera_system import SparseCameraSystem
 from geogs.bundle.dense import FLOOR
 from geogs.bundle.flow_term import PinholeFlow, SourceFlow, linearised_sources
 from geogs.bundle.problem import StreamedProblem, source_chunks
+from geogs.bundle.protocols import BundleOptions, BundleResult
 from geogs.bundle.schur import SchurBundle
 from geogs.bundle.terms import BundleState
 from geogs.threads import thread_map, worker_count

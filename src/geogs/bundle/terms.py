@@ -18,7 +18,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from geogs.bundle.hyper_edge import HyperEdge
-from geogs.bundle.projection import Projection
+from geogs.bundle.projection import CellProjection
 
 B = TypeVar("B", bound="SharedBlock")
 
@@ -67,7 +67,7 @@ class PoseTerm(Protocol):
 
 
 @dataclass(frozen=True)
-class SharedProjection(Projection):
+class SharedProjection(CellProjection):
     """A projection with its first derivatives."""
 
     jacobian: Float[Tensor, "e c 2 p"]
@@ -105,7 +105,7 @@ class ProjectingBlock(SharedBlock, Protocol):
         source: Int[Tensor, "e"],
         target: Int[Tensor, "e"],
         inverse_depth: Float[Tensor, "e p"],
-    ) -> Projection:
+    ) -> CellProjection:
         """Where the cells of the sources fall in the targets; depths are those of the sources."""
         ...
 

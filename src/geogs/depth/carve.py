@@ -5,8 +5,8 @@ from collections.abc import Iterable
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int32
 
+from geogs.depth.depth_view import KeyframeDepth
 from geogs.depth.reprojection_kernels import relative_depths
-from geogs.depth.view import KeyframeDepth
 from geogs.geometry.camera import Camera
 
 VOTE_CONFIDENCE = 0.5

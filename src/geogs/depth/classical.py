@@ -10,8 +10,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from geogs.depth.base import Limits, Progress, silent
-from geogs.depth.view import DenseDepth, DepthView, PosedDepth
+from geogs.depth.depth_engine import Limits, Progress, silent
+from geogs.depth.depth_view import DenseDepth, DepthView, PosedDepth
 from geogs.geometry.camera import Camera
 from geogs.threads import thread_map
 

@@ -7,11 +7,11 @@ import numpy as np
 from geogs.config import DepthConfig
 from geogs.depth.completion import complete_inverse_depth
 from geogs.depth.confidence import depth_confidence
+from geogs.depth.depth_view import DepthView, KeyframeDepth
 from geogs.depth.evidence import choose_start, tracker_evidence, tracker_prior
 from geogs.depth.plane_sweep import plane_sweep, sweep_planes
 from geogs.depth.refinement import refine_depth
 from geogs.depth.sweep_neighbors import depth_range
-from geogs.depth.view import DepthView, KeyframeDepth
 from geogs.geometry.camera import Camera
 
 

@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Float64
 
 from geogs.depth.carve import look_up
+from geogs.depth.depth_view import KeyframeDepth
 from geogs.depth.reprojection_kernels import agree_on_depth, splat_depth
-from geogs.depth.view import KeyframeDepth
 from geogs.geometry.camera import Camera
 
 # Logistic regression of "relative error below 2 %" as in depth_confidence, with the neighbours'

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from geogs.depth import plane_sweep_kernels as kernels
-from geogs.depth.view import DepthView
+from geogs.depth.depth_view import DepthView
 from geogs.geometry.camera import Camera
 from geogs.threads import over_rows, run_chunks, worker_count
 

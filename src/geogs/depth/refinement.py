@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Float32
 
 from geogs.depth import refinement_kernels as kernels
+from geogs.depth.depth_view import DepthView
 from geogs.depth.evidence import DepthEvidence
 from geogs.depth.plane_sweep import VARIANCE_FLOOR
-from geogs.depth.view import DepthView
 from geogs.geometry.camera import Camera
 from geogs.threads import over_rows
 

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from geogs.depth.view import DenseDepth
+from geogs.depth.depth_view import DenseDepth
 
 RIGHT = 0.02
 """Relative error of a depth that is called right: what confidences are the chance of."""

@@ -11,7 +11,7 @@ import torch
 
 from geogs.errors import DeviceError
 from geogs.gpu.cache import cache_key, read_cubin, write_cubin
-from geogs.gpu.source import kernel_signatures, read_source
+from geogs.gpu.kernel_source import kernel_signatures, read_source
 
 if TYPE_CHECKING:
     from geogs.gpu.nvrtc import Nvrtc
@@ -46,7 +46,7 @@ def prepare_kernels(folder: Path, device: torch.device) -> int:
 
 @functools.cache
 def _device_kernels(source: Path, index: int) -> Mapping[str, Kernel]:
-    from geogs.gpu.driver import load_kernels
+    from geogs.gpu.cuda_driver import load_kernels
 
     text = read_source(source)
     signatures = list(kernel_signatures(text).values())

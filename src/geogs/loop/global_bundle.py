@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 
-from geogs.bundle.base import BundleOptions
+from geogs.bundle.protocols import BundleOptions
 from geogs.loop.row_correction import correct_rows
 from geogs.tracking.graph.frame_graph import HUBER
 from geogs.tracking.graph.proximity import RADIUS, Pair, proximity_pairs

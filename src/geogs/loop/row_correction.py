@@ -13,9 +13,9 @@ from dataclasses import replace
 from jaxtyping import Float
 from torch import Tensor
 
-from geogs.bundle.base import BundleOptions
 from geogs.bundle.flow_term import weighed_residuals
 from geogs.bundle.projection import project
+from geogs.bundle.protocols import BundleOptions
 from geogs.geometry.lie import se3_inverse
 from geogs.tracking.frames.pose_filling import row_errors, shift_rows
 from geogs.tracking.frames.row_errors import RowErrors, edge_shifts

@@ -2,7 +2,7 @@
 
 import torch
 
-from geogs.depth.view import DenseDepth
+from geogs.depth.depth_view import DenseDepth
 from geogs.world.arrays import ArrayTable
 from geogs.world.map import SearchedDepth
 

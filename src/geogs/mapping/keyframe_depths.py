@@ -7,10 +7,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from geogs.config import DepthSensorConfig
-from geogs.depth.base import DepthEngine, Progress, silent
+from geogs.depth.depth_engine import DepthEngine, Progress, silent
+from geogs.depth.depth_view import DenseDepth, DepthView
 from geogs.depth.sensor import joined
 from geogs.depth.sweep_neighbors import select_sweep_neighbours
-from geogs.depth.view import DenseDepth, DepthView
 from geogs.mapping.dense_depths import get_depth, put_depth
 from geogs.mapping.keyframe_views import KeyframeViews, MapView
 from geogs.mapping.partners import CANDIDATES

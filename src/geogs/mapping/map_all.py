@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable, Sequence
 
-from geogs.depth.base import Progress, silent
+from geogs.depth.depth_engine import Progress, silent
 from geogs.mapping.mapper import SEARCHED, Mapper
 from geogs.mapping.training.full import seconds_per_step
 from geogs.threads import worker_count

@@ -8,8 +8,8 @@ import torch
 from jaxtyping import Bool
 
 from geogs.config import DepthSensorConfig, MappingConfig
-from geogs.depth.base import Progress, silent
-from geogs.depth.select import depth_engine
+from geogs.depth.depth_engine import Progress, silent
+from geogs.depth.engine_choice import depth_engine
 from geogs.mapping.disk_growth import DiskGrowth
 from geogs.mapping.keyframe_depths import KeyframeDepths
 from geogs.mapping.keyframe_views import KeyframeViews, MapView

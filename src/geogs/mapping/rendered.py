@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from geogs.config import MappingConfig
-from geogs.depth.view import DenseDepth
+from geogs.depth.depth_view import DenseDepth
 from geogs.geometry.camera import Camera
 from geogs.geometry.depth import averaged_over_planes, normals_from_depth
 from geogs.losses.single_view import MIN_ALPHA

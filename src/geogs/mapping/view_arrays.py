@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Float32, UInt8
 from torch import Tensor
 
 from geogs.config import LossConfig, MappingConfig
-from geogs.depth.view import DenseDepth
+from geogs.depth.depth_view import DenseDepth
 from geogs.geometry.camera import Camera
 from geogs.losses.multi_view import PhotoView
 from geogs.losses.single_view import OUTSIDE, ViewConstants

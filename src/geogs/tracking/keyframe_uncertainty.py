@@ -6,8 +6,8 @@ import numpy as np
 import torch
 from jaxtyping import Float64
 
-from geogs.bundle.base import BundleOptions
 from geogs.bundle.marginals import Marginals, marginals
+from geogs.bundle.protocols import BundleOptions
 from geogs.tracking.graph.frame_graph import HUBER
 from geogs.tracking.tracker import Tracker
 from geogs.types import Uncertainty

@@ -5,8 +5,8 @@ from typing import Any
 
 import torch
 
-from geogs.bundle.base import BundleOptions
-from geogs.bundle.select import grid_fields
+from geogs.bundle.device_choice import grid_fields
+from geogs.bundle.protocols import BundleOptions
 from geogs.config import TrackingConfig
 from geogs.geometry.lie import se3_inverse
 from geogs.tracking.graph.dynamic_cells import propagated

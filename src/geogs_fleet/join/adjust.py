@@ -16,8 +16,8 @@ from torch import Tensor
 
 from geogs.bundle.camera_system import PoseSums, SparseCameraSystem
 from geogs.bundle.dense import FLOOR
+from geogs.bundle.device_choice import grid_fields
 from geogs.bundle.schur import stepped
-from geogs.bundle.select import grid_fields
 from geogs.bundle.streamed import StreamedSchur
 from geogs.bundle.terms import BundleState
 from geogs.config import Config

@@ -118,7 +118,7 @@ def _on_grid(
     result: SavedResult, T_cw: torch.Tensor, grid: SampleGrid
 ) -> tuple[np.ndarray, np.ndarray]:
     """Inverse depth and information of the cells, from the depth that the map shows."""
-    from geogs.bundle.select import grid_fields
+    from geogs.bundle.device_choice import grid_fields
 
     long_edge = max(result.depth_camera.width, result.depth_camera.height)
     camera = grid.camera.with_long_edge(long_edge)

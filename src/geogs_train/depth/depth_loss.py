@@ -12,9 +12,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional
 
-from geogs.depth.network.surface import normals_of
-from geogs.depth.network.sweep import cell_rays
-from geogs.depth.network.views import DepthPrediction
+from geogs.depth.network.plane_views import cell_rays
+from geogs.depth.network.stereo_views import DepthPrediction
+from geogs.depth.network.surface_normals import normals_of
 from geogs_train.depth.depth_options import DepthLossOptions
 from geogs_train.depth.depth_tuples import DepthBatch, has_truth
 

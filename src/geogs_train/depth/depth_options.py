@@ -5,7 +5,7 @@ from typing import Annotated
 
 from geogs.config import Seed
 from geogs.config.setting import Count, Fraction, Positive, Range, Settings, Weight
-from geogs.depth.network.options import DepthNetworkOptions
+from geogs.depth.network.network_sizes import DepthNetworkOptions
 from geogs_synth.clips.room_options import MotionWeights, RoomOptions
 
 

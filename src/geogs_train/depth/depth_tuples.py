@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from geogs.depth.network.search_range import RATIO
-from geogs.depth.network.views import StereoViews
+from geogs.depth.network.stereo_views import StereoViews
 from geogs.geometry.lie import se3_exp, se3_inverse
 from geogs_train.depth.clip_pool import StoredClips
 from geogs_train.depth.depth_options import TupleOptions

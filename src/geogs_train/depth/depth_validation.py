@@ -7,7 +7,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from geogs.depth.network.model import DepthNetwork
-from geogs.depth.network.views import DepthPrediction
+from geogs.depth.network.stereo_views import DepthPrediction
 from geogs_synth.clips.sampler import RoomSampler
 from geogs_synth.textures.pyramids import TextureBank
 from geogs_train.depth.clip_pool import StoredClips

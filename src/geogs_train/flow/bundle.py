@@ -18,7 +18,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from geogs.bundle.projection import Projection, motion_rows, relative_motion, seen_from_targets
+from geogs.bundle.projection import CellProjection, motion_rows, relative_motion, seen_from_targets
 from geogs.geometry.least_squares import Policy, Step, minimise
 from geogs.geometry.lie import retract, se3_adjoint
 
@@ -114,12 +114,12 @@ def relative_motions(T_cw: Float[Tensor, "b v 4 4"], edges: ClipEdges) -> Float[
     return relative_motion(T_cw, edges.source, edges.target)
 
 
-def reproject(cameras: ClipCameras, state: ClipState, edges: ClipEdges) -> Projection:
+def reproject(cameras: ClipCameras, state: ClipState, edges: ClipEdges) -> CellProjection:
     """Where the cells of every edge's source fall in its target."""
     T, d = relative_motions(state.T_cw, edges), state.inverse_depth[:, edges.source]
     y, valid, z = seen_from_targets(cameras.rays[:, None], T, d)
     focal, centre = cameras.focal_and_centre
-    return Projection(focal * y[..., :2] / z[..., None] + centre, valid, z)
+    return CellProjection(focal * y[..., :2] / z[..., None] + centre, valid, z)
 
 
 def adjust(
@@ -148,7 +148,7 @@ def adjust(
 
 
 def _jacobians(
-    cameras: ClipCameras, p: Projection, state: ClipState, edges: ClipEdges
+    cameras: ClipCameras, p: CellProjection, state: ClipState, edges: ClipEdges
 ) -> tuple[Float[Tensor, "b e 6 2 p"], Float[Tensor, "b e p 2"], Float[Tensor, "b e 6 6"]]:
     """d pixel / d xi of T_ji (left perturbation), d pixel / d inverse depth; Ad of T_ji."""
     d = state.inverse_depth[:, edges.source]

@@ -8,12 +8,12 @@ import torch
 
 from depth_scene import RENDER, WORKING, DepthScene, make_scene, trace
 from geogs.config import DepthConfig
-from geogs.depth.base import DepthEngine
+from geogs.depth.depth_engine import DepthEngine
+from geogs.depth.depth_view import PosedDepth
+from geogs.depth.engine_choice import depth_engine
 from geogs.depth.network import engine as network_engine
 from geogs.depth.network.engine import resampled
 from geogs.depth.network.search_range import RATIO, search_range
-from geogs.depth.select import depth_engine
-from geogs.depth.view import PosedDepth
 from geogs.geometry.depth import normals_from_depth
 
 CONFIG = DepthConfig(engine="network")

@@ -9,10 +9,10 @@ import torch
 
 from depth_scene import RENDER, WORKING, make_scene
 from geogs.config import DepthConfig
+from geogs.depth.depth_view import DenseDepth
+from geogs.depth.engine_choice import depth_engine
 from geogs.depth.network import engine as network_engine
 from geogs.depth.network.joint import AGREE, APART, REACH, joined
-from geogs.depth.select import depth_engine
-from geogs.depth.view import DenseDepth
 
 
 def random_depth(seed: int, normal: bool) -> DenseDepth:

@@ -10,8 +10,8 @@ from depth_tuples import NETWORK, random_views
 from geogs.depth.network.decoder import bounded, concentration, expected, facing
 from geogs.depth.network.layers import Norm, upsampled
 from geogs.depth.network.model import DepthNetwork
-from geogs.depth.network.surface import normals_of
-from geogs.depth.network.sweep import cell_rays
+from geogs.depth.network.plane_views import cell_rays
+from geogs.depth.network.surface_normals import normals_of
 from geogs.depth.network.volume import combined
 from geogs.geometry.camera import Camera
 from geogs.geometry.depth import normals_from_depth

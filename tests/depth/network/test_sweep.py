@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from geogs.depth.network.sweep import (
+from geogs.depth.network.plane_views import (
     cell_rays,
     log_planes,
     sample_cells,

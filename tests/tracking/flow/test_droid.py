@@ -8,11 +8,11 @@ import pytest
 import torch
 
 from droid_state import public_state
-from geogs.bundle.base import BundleOptions
 from geogs.bundle.dense import DenseBundle
 from geogs.bundle.depth_terms import DepthDamping
 from geogs.bundle.problem import BundleProblem
 from geogs.bundle.projection import linearise, relative_motion
+from geogs.bundle.protocols import BundleOptions
 from geogs.errors import InputError
 from geogs.geometry.camera import Camera
 from geogs.tracking.flow.droid import DroidFlow, DroidOptions

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from geogs.bundle.base import BundleOptions
+from geogs.bundle.protocols import BundleOptions
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import se3_inverse
 from geogs.tracking.graph.dynamic_cells import (

@@ -5,9 +5,9 @@ import pytest
 import torch
 
 from credulous_flow import CredulousFlow
-from geogs.bundle.base import BundleOptions
+from geogs.bundle.device_choice import grid_fields
 from geogs.bundle.projection import project
-from geogs.bundle.select import grid_fields
+from geogs.bundle.protocols import BundleOptions
 from geogs.tracking.flow.classical_flow import ClassicalFlow
 from geogs.tracking.graph.frame_graph import FrameGraph
 from geogs.tracking.graph.proximity import frame_distances, proximity_pairs

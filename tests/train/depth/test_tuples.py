@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from depth_tuples import TRAINING, use_fast_rooms
-from geogs.depth.network.sweep import cell_rays
+from geogs.depth.network.plane_views import cell_rays
 from geogs_synth.clips.sampler import RoomSampler
 from geogs_train.depth.clip_pool import ClipPool, StoredClips
 from geogs_train.depth.depth_options import TupleOptions

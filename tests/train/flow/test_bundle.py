@@ -7,10 +7,10 @@ import pytest
 import torch
 
 from bundle_scenes import CAMERA, disturbed, scene
-from geogs.bundle.base import BundleOptions
 from geogs.bundle.dense import DenseBundle
 from geogs.bundle.problem import BundleProblem
 from geogs.bundle.projection import project, relative_motion
+from geogs.bundle.protocols import BundleOptions
 from geogs.geometry.camera import Camera
 from geogs.geometry.lie import retract, se3_inverse
 from geogs.world.grid import SampleGrid

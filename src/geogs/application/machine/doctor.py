@@ -12,7 +12,7 @@ import torch
 from geogs.application.machine.self_test import check_renderer, time_renderer
 from geogs.errors import DeviceError
 from geogs.gpu import cache, installation, kernels
-from geogs.gpu.source import PACKAGE
+from geogs.gpu.kernel_source import PACKAGE
 from geogs.networks.weights_files import CATALOGUE, checksum, locate
 from geogs.threads import worker_count
 from geogs.version import __version__

@@ -9,11 +9,11 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from geogs.bundle.base import BundleOptions, BundleResult
 from geogs.bundle.camera_system import DenseCameraSystem
 from geogs.bundle.cuda.depth_terms import KernelDepthTerms
 from geogs.bundle.cuda.linear_edges import EdgeArrays, LinearisedEdges, joined_edges
 from geogs.bundle.problem import BundleProblem
+from geogs.bundle.protocols import BundleOptions, BundleResult
 from geogs.bundle.terms import BundleState
 from geogs.geometry.least_squares import Policy, Step, minimise
 from geogs.gpu.kernels import Kernel, kernels_for
@@ -175,7 +175,7 @@ class CudaDenseBundle:
         options = options or BundleOptions()
         device = problem.inverse_depth.device
         w = _Workspace(problem, self._structure_of(problem, device), self.kernels)
-        steps = _Steps(self, problem, options)
+        steps = _DenseSteps(self, problem, options)
         policy = Policy(options.iterations, options.damping)
         minimise(w, steps.linearise, steps.step, policy)
         memory = w.memory.cpu()
@@ -192,7 +192,7 @@ class CudaDenseBundle:
         return self._last[1]
 
 
-class _Steps:
+class _DenseSteps:
     """One adjustment as the least-squares loop sees it; the workspace is changed in place."""
 
     def __init__(

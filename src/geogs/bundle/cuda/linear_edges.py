@@ -11,8 +11,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from geogs.bundle.base import BundleOptions
 from geogs.bundle.cuda.depth_terms import KernelDepthTerms
+from geogs.bundle.protocols import BundleOptions
 from geogs.bundle.terms import BundleState
 from geogs.gpu.kernels import Kernel
 from geogs.gpu.transfer import to_device

@@ -14,12 +14,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from geogs.bundle.base import BundleOptions, BundleResult
 from geogs.bundle.camera_system import SparseCameraSystem
 from geogs.bundle.cuda.depth_terms import KernelDepthTerms
 from geogs.bundle.cuda.linear_edges import EdgeArrays, LinearisedEdges, joined_edges
 from geogs.bundle.dense import FLOOR
 from geogs.bundle.problem import StreamedProblem, source_chunks
+from geogs.bundle.protocols import BundleOptions, BundleResult
 from geogs.bundle.schur import SchurBundle
 from geogs.bundle.terms import BundleState
 from geogs.gpu.kernels import kernels_for

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float32, Float64
 from torch import Tensor
 
-from geogs.depth.view import DepthView
+from geogs.depth.depth_view import DepthView
 from geogs.geometry.camera import Camera
 from geogs.gpu.transfer import to_device
 

@@ -9,10 +9,10 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from geogs.depth.network.layers import Block, Residual, doubled, upsampled
-from geogs.depth.network.options import DepthNetworkOptions
-from geogs.depth.network.surface import normals_of
-from geogs.depth.network.sweep import cell_rays
-from geogs.depth.network.views import DepthPrediction
+from geogs.depth.network.network_sizes import DepthNetworkOptions
+from geogs.depth.network.plane_views import cell_rays
+from geogs.depth.network.stereo_views import DepthPrediction
+from geogs.depth.network.surface_normals import normals_of
 
 MOST_RESIDUAL = 2.0
 """Steps between planes by which a depth may be moved away from what the planes say."""
@@ -54,7 +54,7 @@ class VolumeNetwork(nn.Module):
         return x
 
 
-class Readout(nn.Module):
+class DepthReadout(nn.Module):
     """Reads the result off the features of the volume at 1/4 and the context at 1/2."""
 
     def __init__(self, options: DepthNetworkOptions) -> None:

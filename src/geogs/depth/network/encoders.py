@@ -6,8 +6,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from geogs.depth.network.layers import Block, Residual, doubled
-from geogs.depth.network.options import DepthNetworkOptions
-from geogs.depth.network.sweep import cell_rays
+from geogs.depth.network.network_sizes import DepthNetworkOptions
+from geogs.depth.network.plane_views import cell_rays
 
 
 class MatchingEncoder(nn.Module):

@@ -11,13 +11,13 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 from torch.nn import functional
 
-from geogs.depth.base import DepthEngine, Limits, Progress, silent
 from geogs.depth.completion import known_cells
+from geogs.depth.depth_engine import DepthEngine, Limits, Progress, silent
+from geogs.depth.depth_view import DenseDepth, DepthView, PosedDepth, dense_depths
 from geogs.depth.network.search_range import SearchRange, search_range
-from geogs.depth.network.views import DepthPrediction, StereoViews
+from geogs.depth.network.stereo_views import DepthPrediction, StereoViews
 from geogs.depth.network.weights import TrainedDepth
 from geogs.depth.sweep_neighbors import seen_inverse_depth
-from geogs.depth.view import DenseDepth, DepthView, PosedDepth, dense_depths
 from geogs.geometry.camera import Camera
 from geogs.gpu.recorded import Recorded
 from geogs.gpu.transfer import to_device

@@ -8,8 +8,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional
 
-from geogs.depth.base import DepthEngine, Limits, Progress, silent
-from geogs.depth.view import DenseDepth, DepthView, PosedDepth, dense_depths
+from geogs.depth.depth_engine import DepthEngine, Limits, Progress, silent
+from geogs.depth.depth_view import DenseDepth, DepthView, PosedDepth, dense_depths
 
 REACH = 0.03
 """Relative distance within which two depths are of one surface, and averaged."""

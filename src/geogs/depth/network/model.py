@@ -13,11 +13,11 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from geogs.depth.network.decoder import Readout, VolumeNetwork
+from geogs.depth.network.decoder import DepthReadout, VolumeNetwork
 from geogs.depth.network.encoders import ContextEncoder, MatchingEncoder, normalised
-from geogs.depth.network.options import DepthNetworkOptions
-from geogs.depth.network.sweep import log_planes
-from geogs.depth.network.views import DepthPrediction, StereoViews
+from geogs.depth.network.network_sizes import DepthNetworkOptions
+from geogs.depth.network.plane_views import log_planes
+from geogs.depth.network.stereo_views import DepthPrediction, StereoViews
 from geogs.depth.network.volume import PlaneVolume
 
 MULTIPLE = 32
@@ -34,7 +34,7 @@ class DepthNetwork(nn.Module):
         self.context = ContextEncoder(self.options)
         self.volume = PlaneVolume(self.options)
         self.body = VolumeNetwork(self.options)
-        self.readout = Readout(self.options)
+        self.readout = DepthReadout(self.options)
 
     def forward(self, views: StereoViews) -> DepthPrediction:
         """Depth of the keyframes; networks in bfloat16 on a GPU, geometry in float32."""

@@ -4,10 +4,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from geogs.depth.network.options import DepthNetworkOptions
+from geogs.depth.network.network_sizes import DepthNetworkOptions
+from geogs.depth.network.plane_views import PlaneViews, cell_rays, sample_cells, see_planes
 from geogs.depth.network.rating import rate_planes
-from geogs.depth.network.sweep import PlaneViews, cell_rays, sample_cells, see_planes
-from geogs.depth.network.views import StereoViews
+from geogs.depth.network.stereo_views import StereoViews
 
 VOXEL, PIXEL, PLANE = 4, 3, 3
 """Numbers beside the correlations of a plane in a cell; of a cell; of a plane in a view."""

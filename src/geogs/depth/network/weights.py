@@ -8,7 +8,7 @@ from safetensors import safe_open
 
 from geogs.depth.network.calibration import DepthCalibration
 from geogs.depth.network.model import DepthNetwork
-from geogs.depth.network.options import DepthNetworkOptions
+from geogs.depth.network.network_sizes import DepthNetworkOptions
 from geogs.documents import in_short
 from geogs.errors import InputError
 

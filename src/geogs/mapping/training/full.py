@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from geogs.config import MappingConfig
-from geogs.depth.base import Progress
+from geogs.depth.depth_engine import Progress
 from geogs.mapping.disk_growth import DiskGrowth
 from geogs.mapping.keyframe_views import KeyframeViews, MapView
 from geogs.mapping.training.map_trainer import MapTrainer, draw_batch

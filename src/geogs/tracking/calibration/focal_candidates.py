@@ -11,9 +11,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from geogs.bundle.device_choice import grid_fields
 from geogs.bundle.lens import LensBlock, RadialLens
 from geogs.bundle.problem import BundleProblem
-from geogs.bundle.select import grid_fields
 from geogs.bundle.shared import OPTIONS, SharedResult, solve_shared
 from geogs.geometry.camera import Camera
 from geogs.tracking.calibration.view_gatherer import on_cpu, stacked, with_focal

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from geogs.bundle.device_choice import grid_fields
 from geogs.bundle.lens import LensBlock
 from geogs.bundle.problem import BundleProblem
-from geogs.bundle.select import grid_fields
 from geogs.bundle.shared import SharedResult, solve_shared
 from geogs.tracking.calibration.focal_candidates import Start
 from geogs.tracking.calibration.view_gatherer import View, on_cpu

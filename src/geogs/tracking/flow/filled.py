@@ -3,7 +3,7 @@
 from jaxtyping import Float
 from torch import Tensor
 
-from geogs.bundle.select import grid_fields
+from geogs.bundle.device_choice import grid_fields
 from geogs.types import FlowMatch
 from geogs.world.grid import SampleGrid
 

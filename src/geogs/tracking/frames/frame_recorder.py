@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from geogs.bundle.select import grid_fields
+from geogs.bundle.device_choice import grid_fields
 from geogs.geometry.lie import se3_inverse
 from geogs.tracking.flow.flow_operator import FlowOperator
 from geogs.types import FlowMatch, Frame

@@ -7,9 +7,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from geogs.bundle.device_choice import motion_solver
 from geogs.bundle.problem import MotionProblem
 from geogs.bundle.projection import linearise
-from geogs.bundle.select import motion_solver
 from geogs.geometry.lie import se3_inverse
 from geogs.tracking.frames.frame_recorder import pose_of, sparse_cells
 from geogs.tracking.frames.interpolation import bridged

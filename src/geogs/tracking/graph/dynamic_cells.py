@@ -13,9 +13,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
+from geogs.bundle.device_choice import grid_fields
 from geogs.bundle.problem import source_chunks
 from geogs.bundle.rigidity import best_residuals
-from geogs.bundle.select import grid_fields
 from geogs.world.edges import Edge, Pair, edge_matches
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import KeyframeSet

@@ -7,16 +7,16 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from geogs.bundle.base import BundleOptions, BundleResult
 from geogs.bundle.depth_terms import DepthDamping, MeasuredDepths
-from geogs.bundle.problem import BundleProblem, StreamedProblem
-from geogs.bundle.projection import project
-from geogs.bundle.select import (
+from geogs.bundle.device_choice import (
     bundle_solver,
     grid_fields,
     keyframe_pairs,
     large_bundle_solver,
 )
+from geogs.bundle.problem import BundleProblem, StreamedProblem
+from geogs.bundle.projection import project
+from geogs.bundle.protocols import BundleOptions, BundleResult
 from geogs.geometry.lie import se3_inverse
 from geogs.threads import thread_map
 from geogs.tracking.flow.flow_operator import FlowOperator

@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from geogs.bundle.pairs import LEAST_OVERLAP
-from geogs.bundle.select import keyframe_pairs
+from geogs.bundle.device_choice import keyframe_pairs
+from geogs.bundle.keyframe_pairs import LEAST_OVERLAP
 from geogs.threads import thread_map
 from geogs.tracking.graph.overlap import alike_in_size, may_overlap
 from geogs.world.edges import Pair

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import torch
 
-from geogs.bundle.select import grid_fields
+from geogs.bundle.device_choice import grid_fields
 from geogs.config import DepthSensorConfig
 from geogs.priors.depth_sensor import sensor_depth
 from geogs.types import MeasuredDepth

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from geogs.bundle.select import grid_fields, motion_solver
+from geogs.bundle.device_choice import grid_fields, motion_solver
 from geogs.tracking.flow.flow_operator import FlowOperator
 from geogs.tracking.matching.photometric_check import PhotometricCheck, correlation_at
 from geogs.tracking.matching.pnp import pnp, pnp_features

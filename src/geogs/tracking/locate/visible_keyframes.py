@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from geogs.bundle.select import grid_fields
+from geogs.bundle.device_choice import grid_fields
 from geogs.world.keyframes import Keyframe
 
 CONSIDERED = 12

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from geogs.bundle.select import grid_fields
+from geogs.bundle.device_choice import grid_fields
 from geogs.tracking.flow.flow_operator import FlowOperator
 from geogs.types import FlowMatch
 from geogs.world.grid import SampleGrid

@@ -13,9 +13,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from geogs.bundle.base import BundleOptions
+from geogs.bundle.device_choice import grid_fields
 from geogs.bundle.marginals import marginals
-from geogs.bundle.select import grid_fields
+from geogs.bundle.protocols import BundleOptions
 from geogs.config import TrackingConfig
 from geogs.geometry.lie import se3_inverse
 from geogs.threads import thread_map

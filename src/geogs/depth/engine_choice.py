@@ -3,7 +3,7 @@
 import torch
 
 from geogs.config import DepthConfig
-from geogs.depth.base import DepthEngine
+from geogs.depth.depth_engine import DepthEngine
 from geogs.geometry.camera import Camera
 
 
@@ -26,7 +26,7 @@ def depth_engine(
     if engine == "classical":
         return classical
     if engine == "tracker":
-        from geogs.depth.tracker import TrackerDepthEngine
+        from geogs.depth.tracker_depth import TrackerDepthEngine
 
         return TrackerDepthEngine(classical, torch.device(device), render, working)
     from geogs.depth.network.engine import NetworkDepthEngine
@@ -52,7 +52,7 @@ def _classical(
     resident: int,
 ) -> DepthEngine:
     if torch.device(device).type == "cuda":
-        from geogs.depth.cuda.engine import CudaDepthEngine
+        from geogs.depth.cuda.classical import CudaDepthEngine
 
         return CudaDepthEngine(torch.device(device), render, working, resident, config.planes)
     from geogs.depth.classical import CpuDepthEngine

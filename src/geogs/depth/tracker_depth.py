@@ -7,9 +7,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from geogs.depth.base import DepthEngine, Limits, Progress, silent
 from geogs.depth.completion import known_cells, upsample_grid
-from geogs.depth.view import DenseDepth, DepthView, KeyframeDepth, PosedDepth
+from geogs.depth.depth_engine import DepthEngine, Limits, Progress, silent
+from geogs.depth.depth_view import DenseDepth, DepthView, KeyframeDepth, PosedDepth
 from geogs.geometry.camera import Camera
 
 VALID_DEVIATION = 0.3

@@ -14,7 +14,7 @@ from geogs.world.keyframes import Keyframe
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Place:
+class Viewpoint:
     """Where a keyframe was taken."""
 
     id: int
@@ -34,7 +34,7 @@ class Place:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class DepthView(Place):
+class DepthView(Viewpoint):
     """One keyframe: images, pose, and the tracker's depth on its grid."""
 
     grey: Float32[np.ndarray, "h w"]

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from geogs.depth.confidence import WEIGHTS
 from geogs.depth.cuda.images import KeyframeImages, upload
-from geogs.depth.cuda.sweep import SweptDepth
+from geogs.depth.cuda.plane_sweep import SweptDepth
 from geogs.depth.plane_sweep import VARIANCE_FLOOR
 from geogs.depth.refinement import (
     FIT_DEVIATION,

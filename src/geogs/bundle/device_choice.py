@@ -5,13 +5,13 @@ from collections.abc import Sequence
 from jaxtyping import Int
 from torch import Tensor
 
-from geogs.bundle.base import (
+from geogs.bundle.problem import BundleProblem, StreamedProblem
+from geogs.bundle.protocols import (
     BundleSolver,
     GridFields,
     KeyframePairs,
     MotionSolver,
 )
-from geogs.bundle.problem import BundleProblem, StreamedProblem
 from geogs.world.grid import SampleGrid
 from geogs.world.keyframes import KeyframeSet
 
@@ -63,9 +63,9 @@ def grid_fields(grid: SampleGrid) -> GridFields:
 def keyframe_pairs(keyframes: KeyframeSet, directed: Sequence[tuple[int, int]]) -> KeyframePairs:
     """Pairs (source, target) of keyframe ids."""
     if keyframes.grid.on_gpu:
-        from geogs.bundle.cuda.pairs import CudaPairs
+        from geogs.bundle.cuda.keyframe_pairs import CudaPairs
 
         return CudaPairs(keyframes, directed)
-    from geogs.bundle.pairs import CpuPairs
+    from geogs.bundle.keyframe_pairs import CpuPairs
 
     return CpuPairs(keyframes, directed)

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from geogs.depth import carve, fusion
 from geogs.depth.cuda.images import transforms, upload
-from geogs.depth.view import PosedDepth
+from geogs.depth.depth_view import PosedDepth
 from geogs.geometry.camera import Camera
 from geogs.gpu.kernels import kernels_for
 

@@ -10,17 +10,17 @@ import torch
 from jaxtyping import Bool, Float, Float32
 from torch import Tensor
 
-from geogs.depth.base import Limits, Progress, silent
 from geogs.depth.completion import complete_grid, edge_weights, known_cells
-from geogs.depth.cuda.check import check, vote
 from geogs.depth.cuda.completion import can_complete, complete
+from geogs.depth.cuda.fusion import check, vote
 from geogs.depth.cuda.images import KeyframeImages, homographies, image_pixels, upload
-from geogs.depth.cuda.refine import PixelPlaces, TrackerMaps, choose_start, judge, refine
-from geogs.depth.cuda.sweep import MAX_NEIGHBOURS, MAX_PLANES, PlaneSlots, sweep
+from geogs.depth.cuda.plane_sweep import MAX_NEIGHBOURS, MAX_PLANES, PlaneSlots, sweep
+from geogs.depth.cuda.refinement import PixelPlaces, TrackerMaps, choose_start, judge, refine
+from geogs.depth.depth_engine import Limits, Progress, silent
+from geogs.depth.depth_view import DenseDepth, DepthView, PosedDepth, dense_depths
 from geogs.depth.evidence import prior_weight, relative_precision
 from geogs.depth.plane_sweep import sweep_planes
 from geogs.depth.sweep_neighbors import depth_range
-from geogs.depth.view import DenseDepth, DepthView, PosedDepth, dense_depths
 from geogs.geometry.camera import Camera
 from geogs.threads import worker_count
 from geogs.world.lru import LruCache

@@ -6,7 +6,7 @@ from typing import Protocol, runtime_checkable
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from geogs.depth.view import DenseDepth, DepthView, PosedDepth
+from geogs.depth.depth_view import DenseDepth, DepthView, PosedDepth
 
 Progress = Callable[[float], None]
 """Called with the finished fraction."""

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import torch
 
 from geogs.errors import DeviceError
-from geogs.gpu.source import KernelSignature
+from geogs.gpu.kernel_source import KernelSignature
 
 Dimensions = int | tuple[int, ...]
 Argument = torch.Tensor | int | float | None
