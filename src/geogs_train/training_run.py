@@ -89,6 +89,6 @@ def _saved(trainer: NetworkTrainer, validation: Examination, out: Path, progress
     return scores
 
 
-def _log(out: Path, entry: dict) -> None:
+def _log(out: Path, entry: dict[str, Any]) -> None:
     with (out / LOG).open("a") as file:
         file.write(json.dumps(entry) + "\n")
